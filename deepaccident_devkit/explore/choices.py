@@ -155,14 +155,12 @@ def found_by(scenarios: Scenarios, choices: Choices, scores: Mapping[str, Model]
     for each in facets:
         others = missed == 0 if each.name not in masks else missed == ~masks[each.name]  # no other one missed it
         counts[each.name] = _counts(each, others & rest, chosen.get(each.name, ()))
-    rows = np.flatnonzero(rest & (missed == 0))
-    ranked, not_ready = _sorted(scenarios, choices, rows, scores)
+    ranked, not_ready = _sorted(scenarios, choices, np.flatnonzero(rest & (missed == 0)), scores)
     return Found(rows=ranked, counts=counts, faults=tuple(faults), waiting=(*waiting, *not_ready))
 
 
 def _matching(facet: Facet, values: Sequence[str]) -> BoolArray:
-    wanted = [place for place, value in enumerate(facet.values) if value in values]
-    return np.isin(facet.codes, wanted)
+    return np.isin(facet.codes, [place for place, value in enumerate(facet.values) if value in values])
 
 
 def _counts(facet: Facet, rows: BoolArray, chosen: Sequence[str]) -> tuple[dict[str, Any], ...]:

@@ -264,8 +264,7 @@ class Scene:
 
 def names_at(dataset: Dataset, frame: str, agents: Agents) -> tuple[str, ...]:
     """The chosen agents at a frame; first is the one whose view it is: the first one named, or the first one there."""
-    first = dataset.samples_of(frame)[0]
-    names = cooperating_agents(dataset, first, agents)
+    names = cooperating_agents(dataset, dataset.samples_of(frame)[0], agents)
     if agents is None or isinstance(agents, str) or not isinstance(agents, Sequence):
         return names
     return tuple(sorted(names, key=lambda name: name != agents[0]))

@@ -112,7 +112,6 @@ class Actors:
     def of(cls, actors: Sequence[Actor]) -> "Actors":
         """Gather actors, sorted by id."""
         ordered = tuple(sorted(actors, key=lambda actor: actor.actor_id))
-        counts = [len(actor.shape) for actor in ordered]
         return cls(
             all=ordered,
             actor_id=readonly(np.array([actor.actor_id for actor in ordered], dtype=np.int64)),
@@ -121,7 +120,7 @@ class Actors:
             size=readonly(np.array([actor.size for actor in ordered], dtype=np.float64)),
             origin=readonly(np.array([actor.origin for actor in ordered], dtype=np.float64)),
             solids=solids.concatenate([actor.shape for actor in ordered]),
-            solid_actor=readonly(np.repeat(np.arange(len(ordered)), counts)),
+            solid_actor=readonly(np.repeat(np.arange(len(ordered)), [len(actor.shape) for actor in ordered])),
             motions=_together([actor.motion for actor in ordered]),
         )
 

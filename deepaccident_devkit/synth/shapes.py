@@ -64,8 +64,7 @@ def lamps(x: float, side: float, height: float, depth: float = 0.3) -> list[Bloc
     z = (height, height + 0.13)
     across = ((side - 0.45, side - 0.08), (-side + 0.08, -side + 0.45))
     front = [Block((x - depth, x), y, z, LAMP, main=False) for y in across]
-    rear = [Block((-x, -x + depth), y, z, TAIL, main=False) for y in across]
-    return front + rear
+    return front + [Block((-x, -x + depth), y, z, TAIL, main=False) for y in across]
 
 
 def plates(x: float, height: float) -> list[Block]:

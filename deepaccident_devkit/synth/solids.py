@@ -40,8 +40,7 @@ class Solids:
         columns = {"corners": (count, 8, 3), "colors": (count, 6, 3), "facade": (count,), "main": (count,)}
         types = {"corners": np.float64, "colors": np.uint8, "facade": np.bool_, "main": np.bool_}
         for name, shape in columns.items():
-            array = checked(f"Solids.{name}", getattr(self, name), shape, types[name])
-            object.__setattr__(self, name, readonly(array))
+            object.__setattr__(self, name, readonly(checked(f"Solids.{name}", getattr(self, name), shape, types[name])))
 
     def __len__(self) -> int:
         """Number of solids."""

@@ -309,8 +309,7 @@ def kerb_house(spec: RoadSpec, corner: tuple[int, int]) -> Prop:
     kept = KERB_RADIUS - KERB_INSET - _MAST_ROOM
     near = max(near, spec.road_edge + KERB_RADIUS - kept / float(np.sqrt(2)))
     x, y = (_mirrored((near, near + _KERB_HOUSE_LENGTH), sign) for sign in corner)
-    wall = _WALLS[0]
-    return Prop(FIRST_BUILDING, (Block(x, y, (-BASEMENT, STOREY * _KERB_HOUSE_STOREYS + 0.8), wall, facade=True),))
+    return Prop(FIRST_BUILDING, (Block(x, y, (-BASEMENT, STOREY * _KERB_HOUSE_STOREYS + 0.8), _WALLS[0], facade=True),))
 
 
 def _quadrant(rng: np.random.Generator, spec: RoadSpec, sign_x: int, sign_y: int) -> Iterator[Block]:

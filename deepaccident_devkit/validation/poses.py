@@ -111,8 +111,7 @@ def _mounts(subject: Subject, agent: int) -> Iterator[Finding]:
         yield subject.finding(
             "lidar-height", subject.calib_where(agent), f"{expected}, {frames_text(np.flatnonzero(odd) + 1)}"
         )
-    mounts = {"lidar_to_ego": lidar, "lidar_to_Camera": calibs.camera_from_lidar[frames]}
-    for name, pose in mounts.items():
+    for name, pose in {"lidar_to_ego": lidar, "lidar_to_Camera": calibs.camera_from_lidar[frames]}.items():
         change = np.abs(pose - np.median(pose, axis=0))
         moved = change[..., :3, 3].reshape(len(pose), -1).max(axis=1)
         turned = change[..., :3, :3].reshape(len(pose), -1).max(axis=1)

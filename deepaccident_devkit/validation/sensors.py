@@ -297,8 +297,7 @@ def _many_off(off: IntArray, limit: tuple[int, float]) -> BoolArray:
 
 def _sample_boxes(subject: Subject, agent: int, frame: int) -> Boxes:
     """The boxes of one label in its LiDAR frame."""
-    rows = np.flatnonzero(subject.boxes.sample == agent * subject.num_frames + frame - 1)
-    return subject.lidar_boxes.select(rows)
+    return subject.lidar_boxes.select(np.flatnonzero(subject.boxes.sample == agent * subject.num_frames + frame - 1))
 
 
 def _bevs(subject: Subject, agent: int, paths: Mapping[int, ReleasePath], telling: list[int]) -> Iterator[Finding]:

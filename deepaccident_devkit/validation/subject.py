@@ -112,8 +112,7 @@ class Subject:
         from scipy.spatial import cKDTree
 
         tree = cKDTree(np.unique(tree_points(self.centers[rows], self.boxes.frame[rows], _UNTRACKED_PLACE), axis=0))
-        points = tree_points(places, frames, _UNTRACKED_PLACE)
-        distance, _ = tree.query(points, distance_upper_bound=_UNTRACKED_PLACE)
+        distance, _ = tree.query(tree_points(places, frames, _UNTRACKED_PLACE), distance_upper_bound=_UNTRACKED_PLACE)
         found: BoolArray = np.isfinite(distance)
         return found
 

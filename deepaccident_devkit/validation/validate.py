@@ -175,8 +175,7 @@ class ValidationReport(Report):
             whole: whether to list all that was found of a scenario.
         """
         most = sys.maxsize if whole else _LINES_A_SCENARIO
-        blocks = [self._head(), *self._scenario_blocks(most, notes=notes), *self._closing(notes=notes)]
-        return "\n\n".join(blocks)
+        return "\n\n".join([self._head(), *self._scenario_blocks(most, notes=notes), *self._closing(notes=notes)])
 
     def _head(self) -> str:
         depth = "every file decoded" if self.deep else "labels, calib, meta and file names (--deep decodes the rest)"

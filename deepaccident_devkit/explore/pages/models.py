@@ -265,13 +265,12 @@ def _address(**chosen: object) -> str:
 def _tested(number: ComparedNumber) -> dict[str, str]:
     """A headline number of both, and whether its difference is real."""
     unit: Any = number.unit
-    interval = "" if number.low is None or number.high is None else f"{number.low:+.3f} to {number.high:+.3f}"
     return {
         "name": str(number.headline),
         "a": value_text(number.a, unit),
         "b": value_text(number.b, unit),
         "difference": value_text(number.difference, unit, signed=True),
-        "interval": interval,
+        "interval": "" if number.low is None or number.high is None else f"{number.low:+.3f} to {number.high:+.3f}",
         "p": "–" if number.adjusted_p is None else f"{number.adjusted_p:.3f}",
         "decision": number.decision,
     }
@@ -295,13 +294,11 @@ def _row(a: Model, b: Model, each: ComparedSample) -> dict[str, Any]:
 def _sample(request: Request) -> Response:
     explorer, (a, b) = explorer_of(request), _pair(request)
     token = known_sample(request, a, b)
-    shared = a.rows.keys() & b.rows.keys()
-    before, after = beside_in_time(shared, token)
+    before, after = beside_in_time(a.rows.keys() & b.rows.keys(), token)
     job = differences_job(explorer, a, b)
     better = _asked_better(request)
     waits = titles([job])
     found: ComparedSamples | None = job.result
-    ranked = () if found is None else tuple(each.token for each in found.chosen(better))
     return page(
         request,
         "compare_sample.html",
@@ -312,7 +309,7 @@ def _sample(request: Request) -> Response:
         sides=[sample_context(explorer, model, token) for model in (a, b)],
         before=before,
         after=after,
-        place=place_in(ranked, token),
+        place=place_in(() if found is None else tuple(each.token for each in found.chosen(better)), token),
         better=better,
         address=partial(_address, better=better),
         swapped=_address(better=_OTHER.get(better, "")),

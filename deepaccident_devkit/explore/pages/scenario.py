@@ -111,8 +111,7 @@ def scenario_context(explorer: Explorer, token: str, model: str | None) -> dict[
 def _player(request: Request) -> Response:
     """The replay alone, for a page that shows two of them side by side."""
     explorer, token = explorer_of(request), token_of(request)
-    context = scenario_context(explorer, token, request.query_params.get("model"))
-    return page(request, "player.html", **context)
+    return page(request, "player.html", **scenario_context(explorer, token, request.query_params.get("model")))
 
 
 def _twin(request: Request) -> Response:

@@ -163,8 +163,7 @@ def moment_of(scenario: str, index: int, agents: tuple[str, ...]) -> Moment:
 
 def exported_agents(dataset: Dataset, scenario: str, agents: Agents) -> tuple[str, ...]:
     """The agents that an `agents=` argument means, in usual order; raises ChoiceError and NotAvailableError."""
-    first = agents_of(dataset, scenario)[0]
-    chosen = cooperating_agents(dataset, sample_token(scenario, first, 1), agents)
+    chosen = cooperating_agents(dataset, sample_token(scenario, agents_of(dataset, scenario)[0], 1), agents)
     return tuple(agent for agent in AGENTS if agent in chosen)
 
 
@@ -310,8 +309,7 @@ def box_segments(boxes: Boxes) -> FloatArray:
 
 def above(boxes: Boxes, row: int) -> FloatArray:
     """(3,) the place of a box's text."""
-    height = boxes.size[row, 2] / 2 + _TEXT_ABOVE
-    place: FloatArray = boxes.center[row] + np.array([0.0, 0.0, height])
+    place: FloatArray = boxes.center[row] + np.array([0.0, 0.0, boxes.size[row, 2] / 2 + _TEXT_ABOVE])
     return place
 
 

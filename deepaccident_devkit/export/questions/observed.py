@@ -182,9 +182,8 @@ class Observations:
         The agents of the set are not among them: `paths` has these.
         """
         moments = [self._moment(frame) for frame in window.frames]
-        boxes = concatenate([each[0] for each in moments], "world")
         return SeenRows(
-            boxes=boxes.transform(self._ego_from_world(window), "ego"),
+            boxes=concatenate([each[0] for each in moments], "world").transform(self._ego_from_world(window), "ego"),
             speed=np.concatenate([each[1] for each in moments]),
             seen_by=np.concatenate([each[2] for each in moments]),
             moment=np.repeat(np.arange(len(moments)), [len(each[0]) for each in moments]),
@@ -222,8 +221,7 @@ class Observations:
         """The speeds (N,) in rows of the labels of some agents."""
         first = np.zeros(len(AGENTS), dtype=np.int64)
         for agent in self.agents:
-            rows = self.dataset.annotation_rows(sample_token(self.scenario, agent, frame))
-            first[AGENTS.index(agent)] = rows.start
+            first[AGENTS.index(agent)] = self.dataset.annotation_rows(sample_token(self.scenario, agent, frame)).start
         said = self.dataset.columns("annotation")["velocity_label"]
         speed: FloatArray = np.linalg.norm(said[first[source] + row], axis=1)
         return speed

@@ -307,6 +307,5 @@ def _told(url: str) -> Iterator[None]:
     except OSError as error:
         if isinstance(error, DeepAccidentError):
             raise
-        missing = isinstance(error, FileNotFoundError)
-        what = "does not exist, or may not be listed" if missing else fault_text(error)
+        what = "does not exist, or may not be listed" if isinstance(error, FileNotFoundError) else fault_text(error)
         raise DatarootError(f"{url}: {what}; check the URL, and the credentials in the environment") from None

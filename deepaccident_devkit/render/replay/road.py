@@ -49,8 +49,7 @@ def road_picture(recording: Recording) -> dict[str, Any] | None:
     middles = np.array([pose.translation[:2] for pose in poses])
     low, high = middles.min(axis=0) - reach, middles.max(axis=0) + reach
     grounds = (_merged(seen, low, high, cell) if town is None else _mapped(town, low, high, cell) for cell in _CELLS)
-    pictures = map(_png, grounds)
-    png = next((each for each in pictures if len(each) <= _MOST), None)
+    png = next((each for each in map(_png, grounds) if len(each) <= _MOST), None)
     if png is None:
         return None
     left, top = recording.places([low[0], high[1]])

@@ -213,8 +213,7 @@ def camera_pictures(
         ]
         for (agent, channel), paths in files.items()
     }
-    frames = max(map(len, files.values()))
-    return _fitting(images, limit, _ladder(frames), progress=progress)
+    return _fitting(images, limit, _ladder(max(map(len, files.values()))), progress=progress)
 
 
 def _paths(recording: Recording, agent: str, channel: str) -> Iterator[ReleasePath]:

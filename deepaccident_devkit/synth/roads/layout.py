@@ -284,13 +284,12 @@ def parking_places(spec: RoadSpec) -> FloatArray:
         x, y = OUTWARD[arm]
         outward = np.arctan2(y, x)
         for side, yaw in ((1, outward + np.pi), (-1, outward)):
-            wrapped = np.arctan2(np.sin(yaw), np.cos(yaw))
             places.append(
                 np.column_stack(
                     [
                         along * x - side * beside * y,
                         along * y + side * beside * x,
-                        np.full(len(along), wrapped),
+                        np.full(len(along), np.arctan2(np.sin(yaw), np.cos(yaw))),
                     ]
                 )
             )

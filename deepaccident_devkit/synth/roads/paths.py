@@ -226,8 +226,7 @@ Piece = tuple[float, float, float]
 
 def quarter_turn(tangent: float, *, left: bool) -> list[Piece]:
     """Pieces that turn by a right angle, over `tangent` metres before and after where the two lines cross."""
-    radius = tangent / _shape()[0]
-    return _pieces(radius, 1.0 if left else -1.0)
+    return _pieces(tangent / _shape()[0], 1.0 if left else -1.0)
 
 
 def tangent_of_radius(radius: float) -> float:

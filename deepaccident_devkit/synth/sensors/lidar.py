@@ -194,8 +194,7 @@ def make_lidar(setting: Setting, agent: Agent) -> Lidar:
     place = (agent.box_from_ego @ agent.ego_from_lidar).translation
     body = rays_through(setting.actors.all[agent.row].size, place)
     solids = np.flatnonzero(setting.moving_owner == agent.row)
-    caster = make_caster(setting.moving_shapes.corners[solids])
-    distance, face = caster.cast(place, turned_rays(np.eye(3), body))
+    distance, face = make_caster(setting.moving_shapes.corners[solids]).cast(place, turned_rays(np.eye(3), body))
     first = setting.faces + FACES_A_SOLID * int(solids[0])
     return Lidar(row=agent.row, body=body, distance=distance, face=np.where(face >= 0, face + first, face))
 
@@ -252,8 +251,7 @@ def _cast_boxed(scene: Scene, lidar: Lidar, ground_from_lidar: SE3) -> tuple[Int
     setting = scene.setting
     near, others = rays_to_boxes(scene, ground_from_lidar, _others(setting.moving, lidar), setting.parked)
     wanted = near | others
-    met = np.isfinite(lidar.distance)
-    wanted[lidar.body[met]] = False
+    wanted[lidar.body[np.isfinite(lidar.distance)]] = False
     rows = np.flatnonzero(wanted)
     rays = turned_rays(ground_from_lidar.rotation, rows)
     distance, face = scene.cast(ground_from_lidar.translation, rays, near=np.flatnonzero(near[rows]))

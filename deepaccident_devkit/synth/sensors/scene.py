@@ -159,8 +159,7 @@ class Setting:
 
         The last two are for `caster.GROUND` and `caster.NOTHING`, so that every face can be used as an index.
         """
-        moving = np.repeat(self.moving_owner, FACES_A_SOLID)
-        return np.concatenate([self.still.face_owner, moving, [NOBODY, NOBODY]])
+        return np.concatenate([self.still.face_owner, np.repeat(self.moving_owner, FACES_A_SOLID), [NOBODY, NOBODY]])
 
     def frames(self, poses: FloatArray) -> FloatArray:
         """The actors' frames on the ground, (A, 4, 4), at poses (A, 3)."""
@@ -281,8 +280,7 @@ class Scene:
 
     def _cast_at_movers(self, origin: FloatArray, directions: AnyArray, rows: IntArray) -> tuple[AnyArray, AnyArray]:
         """How far the rays of `rows` go until they meet a moving road user, and the faces that they meet."""
-        rays = directions.take(rows, axis=0)
-        reached, met = self.caster.cast(origin if origin.ndim == 1 else origin[rows], rays)
+        reached, met = self.caster.cast(origin if origin.ndim == 1 else origin[rows], directions.take(rows, axis=0))
         return reached, met + self.setting.faces
 
 

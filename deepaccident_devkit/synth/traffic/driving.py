@@ -125,8 +125,7 @@ class Tracks:
     def __init__(
         self, paths: Sequence[Path], lateral: FloatArray, stops: BoolArray, paces: Sequence[Sequence[Stretch]] = ()
     ) -> None:
-        reach = max(path.length for path in paths) + _BEYOND
-        along = np.arange(0.0, reach, SPACING)
+        along = np.arange(0.0, max(path.length for path in paths) + _BEYOND, SPACING)
         distinct = {id(path): path for path in paths}
         order = {key: row for row, key in enumerate(distinct)}
         points = np.stack([np.stack(path.at(along), axis=-1) for path in distinct.values()])

@@ -311,8 +311,7 @@ def _pedestrian(rng: np.random.Generator, victim: ActorSpec, spec: ScenarioSpec)
 def _third_vehicle(rng: np.random.Generator, junction: Junction, free: list[Arm]) -> ActorSpec:
     """A vehicle that comes by an arm by which neither ego nor other comes, and reacts to nobody."""
     arm = free[int(rng.integers(len(free)))]
-    turns = junction.turns(arm)
-    turn: Turn = "straight" if "straight" in turns else "left"
+    turn: Turn = "straight" if "straight" in junction.turns(arm) else "left"
     return ActorSpec(
         role="background",
         category=rng.choice(["car", "car", "van", "motorcycle"]).item(),

@@ -229,8 +229,7 @@ class _Run:
     def decide(self, states: FloatArray, velocities: FloatArray, since: float, time: float) -> None:
         """Choose everyone's acceleration, `since` seconds after the start."""
         wheels, temper = self._wheels, self._temper
-        allowed = self._tracks.allowed_speed(wheels.along)
-        acceleration = free_acceleration(temper, wheels.speed, allowed)
+        acceleration = free_acceleration(temper, wheels.speed, self._tracks.allowed_speed(wheels.along))
         if self._rights is not None:
             acceleration = acceleration + self._for_others(self._rights, states, time)
         hardest = -hardest_braking(wheels.speed)
