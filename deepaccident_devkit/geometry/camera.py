@@ -151,8 +151,7 @@ class PinholeCamera(FrozenArrays):
         if level not in list(BoxVisibility):
             names = ", ".join(f"BoxVisibility.{one.name}" for one in BoxVisibility)
             raise ChoiceError(f"level: expected one of {names}, found {level!r}")
-        meets: BoolArray = self.box_visibility(boxes) <= level
-        return meets
+        return np.asarray(self.box_visibility(boxes) <= level)
 
 
 def _pixels(name: str, value: object) -> int:

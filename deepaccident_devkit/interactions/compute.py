@@ -274,6 +274,4 @@ def _least(values: FloatArray) -> FloatArray:
 
 def _first_least(values: FloatArray) -> IntArray:
     """(L,) positions of the first least of (L, F)."""
-    if not values.size:
-        return np.zeros(len(values), dtype=np.int64)
-    return np.asarray(values.argmin(axis=1))
+    return np.asarray(values.argmin(axis=1)) if values.size else np.zeros(len(values), dtype=np.int64)

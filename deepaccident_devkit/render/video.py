@@ -286,9 +286,7 @@ def views_of(
 
 
 def _view(given: object) -> View:
-    if callable(given):
-        return View(draw=given, layers=(), own=True)
-    return VIEWS[choice("what", given, VIEWS)]
+    return View(draw=given, layers=(), own=True) if callable(given) else VIEWS[choice("what", given, VIEWS)]
 
 
 def render_scenario_video(  # noqa: PLR0913 - each is a choice that stands on its own in a notebook

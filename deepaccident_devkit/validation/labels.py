@@ -206,8 +206,7 @@ def _repeated(keys: AnyArray) -> BoolArray:
     if not len(keys):
         return np.zeros(0, dtype=bool)
     _, inverse, count = np.unique(keys, axis=0, return_inverse=True, return_counts=True)
-    repeated: BoolArray = count[inverse.reshape(-1)] > 1
-    return repeated
+    return np.asarray(count[inverse.reshape(-1)] > 1)
 
 
 _CHECKS: tuple[Callable[[Subject], Iterator[Finding]], ...] = (

@@ -166,8 +166,7 @@ def _central(position: FloatArray) -> FloatArray:
     """(F, 2) m/s from positions (F, 2) at 10 Hz; one-sided at the ends, 0 for a single frame."""
     if len(position) < 2:
         return np.zeros_like(position)
-    velocity: FloatArray = np.gradient(position, FRAME_PERIOD, axis=0)
-    return velocity
+    return np.asarray(np.gradient(position, FRAME_PERIOD, axis=0))
 
 
 _CHECKS: tuple[Callable[[Subject, int], Iterator[Finding]], ...] = (_intrinsics, _cameras, _mounts, _path, _speed)

@@ -309,8 +309,7 @@ def box_segments(boxes: Boxes) -> FloatArray:
 
 def above(boxes: Boxes, row: int) -> FloatArray:
     """(3,) the place of a box's text."""
-    place: FloatArray = boxes.center[row] + np.array([0.0, 0.0, boxes.size[row, 2] / 2 + _TEXT_ABOVE])
-    return place
+    return np.asarray(boxes.center[row] + np.array([0.0, 0.0, boxes.size[row, 2] / 2 + _TEXT_ABOVE]))
 
 
 def segment_points(segments: FloatArray, color: str, alpha: float = 1.0) -> AnyArray:

@@ -89,9 +89,7 @@ def open_dataroot(
     if isinstance(located, str):
         return _opened_url(UrlSource(located), places, refresh=refresh)
     archives = _archives(located)
-    if not archives:
-        return located
-    return _opened_archives(located, archives, places, **how)
+    return _opened_archives(located, archives, places, **how) if archives else located
 
 
 def index_places(dataroot: Dataroot, index_dir: Path | None = None) -> Iterator[Path]:

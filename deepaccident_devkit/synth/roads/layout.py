@@ -270,8 +270,7 @@ _LAST = 110.0
 def slot_edges(spec: RoadSpec) -> FloatArray:
     """The edges of the parking slots, metres along an arm, (S + 1,)."""
     first = spec.stop_line[1] + _KEPT_FREE
-    edges: FloatArray = first + SLOT_LENGTH * np.arange(int((_LAST - first) / SLOT_LENGTH) + 1, dtype=np.float64)
-    return edges
+    return np.asarray(first + SLOT_LENGTH * np.arange(int((_LAST - first) / SLOT_LENGTH) + 1, dtype=np.float64))
 
 
 def parking_places(spec: RoadSpec) -> FloatArray:

@@ -54,8 +54,7 @@ def above_ground(corners: FloatArray, terrain: Terrain) -> FloatArray:
 def _outlines(corners: FloatArray, to_sun: FloatArray) -> IntArray:
     """Map cells (column, row) that the corners' shadows fall on, (P, 8, 2)."""
     fallen: FloatArray = corners[..., :2] - np.maximum(corners[..., 2:], 0.0) * (to_sun[:2] / to_sun[2])
-    cells: IntArray = np.floor((fallen + MAP_EXTENT) / MAP_RESOLUTION).astype(np.int64)
-    return cells
+    return np.asarray(np.floor((fallen + MAP_EXTENT) / MAP_RESOLUTION).astype(np.int64))
 
 
 _CELL = 0.4

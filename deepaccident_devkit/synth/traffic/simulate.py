@@ -255,8 +255,7 @@ class _Run:
         red = self._lights.gap(time, front, speed, temper)
         stop = np.minimum(red, waiting_gap(rights, front, rear, speed, temper.max_speed, red < np.inf))
         following = np.where(self._walks, 0.0, interaction(temper, speed, gap, leader_speed))
-        result: FloatArray = np.minimum(following, stopping(temper, speed, stop))
-        return result
+        return np.asarray(np.minimum(following, stopping(temper, speed, stop)))
 
 
 class _Lights:
@@ -310,8 +309,7 @@ def separation(poses_a: FloatArray, size_a: FloatArray, poses_b: FloatArray, siz
         along_b[..., 0] - half_b[..., 0] - half_a[..., 0] * cos - half_a[..., 1] * sin,
         along_b[..., 1] - half_b[..., 1] - half_a[..., 0] * sin - half_a[..., 1] * cos,
     ]
-    result: FloatArray = np.max(np.stack(np.broadcast_arrays(*gaps)), axis=0)
-    return result
+    return np.asarray(np.max(np.stack(np.broadcast_arrays(*gaps)), axis=0))
 
 
 def gap(poses_a: FloatArray, size_a: FloatArray, poses_b: FloatArray, size_b: FloatArray) -> FloatArray:
