@@ -153,12 +153,10 @@ def _tracks(subject: Subject) -> Iterator[Finding]:
     same = (subject.label_id[rows][1:] == subject.label_id[rows][:-1]) & (
         boxes.agent[rows][1:] == boxes.agent[rows][:-1]
     )
+    allowed = np.where(boxes.labels.category == CATEGORIES.index("pedestrian"), WALKER_SIZE_CHANGE, SIZE_CHANGE)
     for code, changed in (
         ("class-changes", boxes.labels.category[rows][1:] != boxes.labels.category[rows][:-1]),
-        (
-            "size-changes",
-            np.abs(np.diff(boxes.labels.size[rows], axis=0)).max(axis=1) > _size_change(subject)[rows[1:]],
-        ),
+        ("size-changes", np.abs(np.diff(boxes.labels.size[rows], axis=0)).max(axis=1) > allowed[rows[1:]]),
     ):
         yield from subject.label_findings(code, subject.mask(rows[1:][same & changed]), "changes along the track")
     step = np.diff(frame)
@@ -184,12 +182,6 @@ def _tracks(subject: Subject) -> Iterator[Finding]:
         yield from subject.label_findings(
             "track-gap", subject.mask(after[of_agent]), "near, and missing in the frames before"
         )
-
-
-def _size_change(subject: Subject) -> FloatArray:
-    """(N,) metres by which each box's size may change from frame to frame."""
-    walks = subject.boxes.labels.category == CATEGORIES.index("pedestrian")
-    return np.where(walks, WALKER_SIZE_CHANGE, SIZE_CHANGE)
 
 
 def _is_car(subject: Subject) -> BoolArray:

@@ -7,8 +7,10 @@ so every rendering is there again as points, on a topic that ends in `/points`.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import count
 from types import TracebackType
 from typing import IO, Any, Final
 
@@ -86,7 +88,7 @@ class Recording:
         self._writer.start(profile="", library=f"deepaccident_devkit {__version__}")
         self._schemas: dict[str, int] = {}
         self._topics: dict[str, int] = {}
-        self._sequence: dict[str, int] = {}
+        self._sequence: dict[str, Iterator[int]] = defaultdict(count)
 
     def __enter__(self) -> Recording:
         return self
@@ -104,14 +106,12 @@ class Recording:
             self._topics[topic] = self._writer.register_channel(
                 topic=topic, message_encoding="protobuf", schema_id=self._schema(message)
             )
-        sequence = self._sequence.get(topic, 0)
-        self._sequence[topic] = sequence + 1
         time = frame_nanoseconds(index)
         self._writer.add_message(
             channel_id=self._topics[topic],
             log_time=time,
             publish_time=time,
-            sequence=sequence,
+            sequence=next(self._sequence[topic]),
             data=message.SerializeToString(deterministic=True),
         )
 

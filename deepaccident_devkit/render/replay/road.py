@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import io
 from collections.abc import Sequence
 from typing import Any, Final
 
@@ -11,6 +10,7 @@ import numpy as np
 
 from deepaccident_devkit.geometry import SE3
 from deepaccident_devkit.release import BevImage
+from deepaccident_devkit.release.images import picture_bytes
 from deepaccident_devkit.release.npz import TAGS
 from deepaccident_devkit.render.captions import is_there
 from deepaccident_devkit.render.ground import map_beneath
@@ -117,6 +117,4 @@ def _png(cells: ByteArray) -> bytes:
 
     picture = Image.fromarray(cells)
     picture.putpalette([255, 255, 255, *(part for name in _GROUND for part in ImageColor.getrgb(BEV_COLORS[name]))])
-    written = io.BytesIO()
-    picture.save(written, "PNG", optimize=True, bits=2, transparency=0)
-    return written.getvalue()
+    return picture_bytes(picture, "PNG", optimize=True, bits=2, transparency=0)

@@ -208,9 +208,7 @@ class RoadSpec:
     @property
     def yielding_arms(self) -> tuple[Arm, ...]:
         """The arms that have a yield line: at a junction without lights, those of the road from south to north."""
-        if self.signalized:
-            return ()
-        return tuple(arm for arm in self.arms if arm in ("south", "north"))
+        return () if self.signalized else tuple(arm for arm in self.arms if arm in ("south", "north"))
 
     @property
     def lanes_edge(self) -> float:

@@ -282,11 +282,10 @@ def unplanned(
         stranger = _cutting_in(rng, victim)
     else:
         stranger = _third_vehicle(rng, junction, free)
-    actors = tuple(replace(actor, ignores=()) for actor in spec.actors)
     return replace(
         spec,
         design=None,
-        actors=(*actors, stranger),
+        actors=(*(replace(actor, ignores=()) for actor in spec.actors), stranger),
         meet=MeetSpec(actors=(victim.role, stranger.role), offset=float(rng.uniform(*_OFFSETS))),
     )
 

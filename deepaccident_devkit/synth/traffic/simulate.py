@@ -209,7 +209,11 @@ class _Run:
         self._delay = np.array([user.delay for user in users])
         self._rights = rights
         self._lights = _Lights(users, signals)
-        self._alarm = None if watched is None else _alarm(users, watched, self.size)
+        self._alarm = (
+            None
+            if watched is None
+            else Alarm(np.array(watched), self.size[[*watched]], np.array([users[row].alert for row in watched]))
+        )
         along = np.array([user.start for user in users]) - self._ahead
         self._on_path = self._tracks.at(along)
         x, y, yaw, _ = self._on_path
@@ -278,11 +282,6 @@ class _Lights:
         stops = (color != GREEN) & (gap > -0.5)
         stops &= (color != AMBER) | can_stop(temper, speed, gap)
         return np.where(stops, np.maximum(gap, 0.0), np.inf)
-
-
-def _alarm(users: Sequence[RoadUser], pair: tuple[int, int], size: FloatArray) -> Alarm:
-    rows = np.array(pair)
-    return Alarm(rows, size[rows], np.array([users[row].alert for row in pair]))
 
 
 def _first_contact(states: FloatArray, size: FloatArray, pair: tuple[int, int], low: int, high: int) -> int | None:

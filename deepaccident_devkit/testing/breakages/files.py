@@ -114,8 +114,7 @@ def label_right_handed(victim: Victim) -> Path:
 def labels_of_two_agents_swapped(victim: Victim) -> Path:
     """Two vehicles' labels are swapped at all frames."""
     for frame in victim.editor.frames:
-        files = (victim.editor.file(agent, "label", frame) for agent in (victim.agent, victim.other))
-        victim.editor.exchange(*files)
+        victim.editor.exchange(*(victim.editor.file(agent, "label", frame) for agent in (victim.agent, victim.other)))
     return victim.editor.folder(victim.agent, "label")
 
 
