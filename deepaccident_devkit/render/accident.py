@@ -318,7 +318,8 @@ def _draw_road(pair: Pair, index: int, reach: float, ax: Axes) -> None:
     away = [float(np.abs(pose.translation[:2] - place).max()) for pose in poses]
     if there:
         best = int(np.argmin(away))
-        draw_underlay(dataset.load_bev(there[best]), ax, target_from_ego=poses[best], view_range=reach + away[best])
+        image = dataset.load_bev(there[best])
+        draw_underlay(image, ax, target_from_ego=poses[best], view_range=reach + away[best])
 
 
 def _draw_scale(reach: float, ax: Axes, *, grid: bool) -> None:

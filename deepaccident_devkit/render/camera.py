@@ -229,7 +229,8 @@ def render_pointcloud_in_image(
 
 
 def _draw_agent(dataset: Dataset, source: SampleRecord, camera: RowArgument, seen: _Seen, ax: Axes) -> None:
-    points = seen(project_to_image(dataset, dataset.load_point_cloud(source, "lidar"), source, camera, colors=False))
+    cloud = dataset.load_point_cloud(source, "lidar")
+    points = seen(project_to_image(dataset, cloud, source, camera, colors=False))
     draw_points_in_image(points.pixels[points.mask], ax, color=AGENT_COLORS[source["agent"]])
 
 

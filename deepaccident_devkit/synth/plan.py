@@ -262,7 +262,8 @@ def plan_scenarios(config: SynthConfig) -> list[ScenarioPlan]:
     for number in range(config.scenarios):
         pair, second = divmod(number, 2) if twins else (number, 1)
         designs = config.design_round
-        plans.append(_plan(config, pair, own or read_design(designs[pair % len(designs)]), accident=second == 0))
+        template = own or read_design(designs[pair % len(designs)])
+        plans.append(_plan(config, pair, template, accident=second == 0))
     split_of = {
         token: name for name, tokens in plan_splits(plans).by_name().items() if name in SPLITS for token in tokens
     }

@@ -64,7 +64,8 @@ def lamps(x: float, side: float, height: float, depth: float = 0.3) -> list[Bloc
     z = (height, height + 0.13)
     across = ((side - 0.45, side - 0.08), (-side + 0.08, -side + 0.45))
     front = [Block((x - depth, x), y, z, LAMP, main=False) for y in across]
-    return front + [Block((-x, -x + depth), y, z, TAIL, main=False) for y in across]
+    rear = [Block((-x, -x + depth), y, z, TAIL, main=False) for y in across]
+    return front + rear
 
 
 def plates(x: float, height: float) -> list[Block]:

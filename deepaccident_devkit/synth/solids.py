@@ -40,7 +40,8 @@ class Solids:
         columns = {"corners": (count, 8, 3), "colors": (count, 6, 3), "facade": (count,), "main": (count,)}
         types = {"corners": np.float64, "colors": np.uint8, "facade": np.bool_, "main": np.bool_}
         for name, shape in columns.items():
-            object.__setattr__(self, name, readonly(checked(f"Solids.{name}", getattr(self, name), shape, types[name])))
+            array = checked(f"Solids.{name}", getattr(self, name), shape, types[name])
+            object.__setattr__(self, name, readonly(array))
 
     def __len__(self) -> int:
         """Number of solids."""

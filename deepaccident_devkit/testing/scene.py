@@ -223,7 +223,8 @@ def top_view_of(boxes: Boxes, object_ids: NDArray[np.uint16]) -> tuple[ByteArray
         places = corners[:, :2]
         if np.abs(places).max() * 2 < BEV_RESOLUTION * BEV_SHAPE[0]:
             outline = np.rint(_MIDDLE - places[:, ::-1] / BEV_RESOLUTION).astype(np.int32)  # OpenCV: column, row
-            cv2.fillConvexPoly(semantic, outline, TAGS["pedestrian" if CATEGORIES[code] == "pedestrian" else "vehicle"])
+            tag = TAGS["pedestrian" if CATEGORIES[code] == "pedestrian" else "vehicle"]
+            cv2.fillConvexPoly(semantic, outline, tag)
             cv2.fillConvexPoly(instance, outline, number)
     return semantic, instance
 

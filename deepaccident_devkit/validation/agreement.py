@@ -116,9 +116,8 @@ def _compare(subject: Subject, views: Views, first: int, second: int) -> Iterato
             yield subject.finding(code, where, _worst(views, bad, values, both, unit))
     other_class = both & (views.category[:, first] != views.category[:, second])
     if other_class.any():
-        yield subject.finding(
-            "classes-differ", where, f"{actors_text(views.actor[other_class])}, {frames_text(views.frame[other_class])}"
-        )
+        what = f"{actors_text(views.actor[other_class])}, {frames_text(views.frame[other_class])}"
+        yield subject.finding("classes-differ", where, what)
 
 
 def _worst(views: Views, bad: BoolArray, values: FloatArray, both: BoolArray, unit: str) -> str:
@@ -208,9 +207,8 @@ def _overlaps(subject: Subject, views: Views) -> Iterator[Finding]:
     over = (depth > POSITION) & (np.abs(np.diff(center[pairs, 2])[:, 0]) < size[pairs, 2].mean(axis=1))
     if over.any():
         who, when = actors_text(views.actor[pairs[over]].ravel()), frames_text(views.frame[pairs[over, 0]])
-        yield subject.finding(
-            "overlap-unnamed", subject.token, f"{who} overlap by up to {depth[over].max():.2f} m, {when}"
-        )
+        what = f"{who} overlap by up to {depth[over].max():.2f} m, {when}"
+        yield subject.finding("overlap-unnamed", subject.token, what)
 
 
 def _wrapped(angle: FloatArray) -> FloatArray:
@@ -304,9 +302,8 @@ def _agents(subject: Subject, meta: Meta) -> Iterator[Finding]:
         yield _at_meta(subject, "meta-pair", f"the colliding agents '{names}' are not the pair {collision.ids}")
     named = {agent for agent, actor in id_of.items() if actor in collision.ids}
     if not named <= set(collision.agents):
-        yield _at_meta(
-            subject, "meta-pair", f"the pair {collision.ids} has an agent that 'colliding agents' does not name"
-        )
+        what = f"the pair {collision.ids} has an agent that 'colliding agents' does not name"
+        yield _at_meta(subject, "meta-pair", what)
 
 
 def _pair(subject: Subject, meta: Meta) -> Iterator[Finding]:
@@ -324,9 +321,8 @@ def _pair(subject: Subject, meta: Meta) -> Iterator[Finding]:
             code = "pair-not-seen" if actor in agent_of else "counterpart-unknown"
             yield _at_meta(subject, code, f"nobody annotated actor {actor}")
         elif found != [name]:
-            yield _at_meta(
-                subject, "meta-pair", f"actor {actor} is a {shortened(name)}, the labels say {', '.join(found)}"
-            )
+            what = f"actor {actor} is a {shortened(name)}, the labels say {', '.join(found)}"
+            yield _at_meta(subject, "meta-pair", what)
 
 
 def _impact(subject: Subject, meta: Meta) -> Iterator[Finding]:

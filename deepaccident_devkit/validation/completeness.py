@@ -124,9 +124,8 @@ class Completeness(Report):
         if self.lacking:
             lines = [f"  {token}: {sum(kinds.values()):,}" for token, kinds in self.lacking.items()]
             more = [f"  … and {len(lines) - _LISTED:,} more (--json lists all)"] if len(lines) > _LISTED else []
-            blocks.append(
-                "\n".join([f"scenarios that lack files, and how many ({len(lines):,}):", *lines[:_LISTED], *more])
-            )
+            heading = f"scenarios that lack files, and how many ({len(lines):,}):"
+            blocks.append("\n".join([heading, *lines[:_LISTED], *more]))
         return "\n\n".join(blocks)
 
 

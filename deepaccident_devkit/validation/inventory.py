@@ -122,9 +122,8 @@ def _repeated(path: ReleasePath, tokens: list[str]) -> Iterator[Finding]:
     repeated = [shortened(token.replace("/", " ", 1)) for token, count in Counter(tokens).items() if count > 1]
     if repeated:
         more = f" and {len(repeated) - _NAMED} more" if len(repeated) > _NAMED else ""
-        yield make_finding(
-            "split-file-repeats", None, str(path), f"lists more than once: {', '.join(repeated[:_NAMED])}{more}"
-        )
+        what = f"lists more than once: {', '.join(repeated[:_NAMED])}{more}"
+        yield make_finding("split-file-repeats", None, str(path), what)
 
 
 def _assignment_findings(splits: SplitAssignment) -> Iterator[Finding]:

@@ -132,9 +132,8 @@ def _own_boxes(subject: Subject) -> Iterator[Finding]:
     far = np.zeros(len(subject.own), dtype=bool)
     far[rows] = np.linalg.norm(subject.centers[rows] - standing, axis=1) > OWN_OFFSET
     far[rows] |= np.abs(np.arctan2(np.sin(turn), np.cos(turn))) > OWN_TURN
-    yield from subject.label_findings(
-        "own-box-off", far, f"the own box is turned, or over {OWN_OFFSET} m off standing on the agent's origin"
-    )
+    what = f"the own box is turned, or over {OWN_OFFSET} m off standing on the agent's origin"
+    yield from subject.label_findings("own-box-off", far, what)
     first_line = np.full((subject.files.num_samples, 2), np.nan)
     labelled = np.repeat([agent in subject.files.scan.labelled for agent in subject.agents], subject.num_frames)
     first_line[labelled] = subject.files.labels.agent_velocity

@@ -92,9 +92,8 @@ def _camera_findings(subject: Subject, agent: int, code: str, bad: BoolArray, wh
     """A finding a camera for a mask (F, 6)."""
     for camera, frames in zip(CAMERAS, bad.T, strict=True):
         if frames.any():
-            yield subject.finding(
-                code, f"{subject.calib_where(agent)}: {camera}", f"{what}, {frames_text(np.flatnonzero(frames) + 1)}"
-            )
+            where = f"{subject.calib_where(agent)}: {camera}"
+            yield subject.finding(code, where, f"{what}, {frames_text(np.flatnonzero(frames) + 1)}")
 
 
 def _mounts(subject: Subject, agent: int) -> Iterator[Finding]:

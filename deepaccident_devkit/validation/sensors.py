@@ -203,9 +203,8 @@ def _image_sizes(subject: Subject, agent: int, channel: str, sizes: Mapping[int,
         expected = 2 * intrinsic[:2, 2]
         if np.abs(expected - (width, height)).max() > 1:
             path = subject.files.scenario.channel_path(subject.agents[agent], channel, frame)
-            yield subject.finding(
-                "image-size", str(path), f"is {width}x{height}, K says {expected[0]:.0f}x{expected[1]:.0f}"
-            )
+            what = f"is {width}x{height}, K says {expected[0]:.0f}x{expected[1]:.0f}"
+            yield subject.finding("image-size", str(path), what)
 
 
 def out_of_sequence(thumbnails: Mapping[int, FloatArray]) -> list[int]:

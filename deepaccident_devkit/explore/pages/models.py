@@ -299,6 +299,7 @@ def _sample(request: Request) -> Response:
     better = _asked_better(request)
     waits = titles([job])
     found: ComparedSamples | None = job.result
+    ranked = () if found is None else tuple(each.token for each in found.chosen(better))
     return page(
         request,
         "compare_sample.html",
@@ -309,7 +310,7 @@ def _sample(request: Request) -> Response:
         sides=[sample_context(explorer, model, token) for model in (a, b)],
         before=before,
         after=after,
-        place=place_in(() if found is None else tuple(each.token for each in found.chosen(better)), token),
+        place=place_in(ranked, token),
         better=better,
         address=partial(_address, better=better),
         swapped=_address(better=_OTHER.get(better, "")),

@@ -69,7 +69,8 @@ class MotionMaps:
         made = motion_labels_of(self._dataset, labelled.values(), self._config)
         for (agent, record), labels in zip(labelled.items(), made, strict=True):
             own = self._dataset.get("agent", record["agent_token"])["actor_id"]
-            message = cloud_message(self._points(labels.to_present(), agent, own), frame_id(agent, "ego"), moment.index)
+            points = self._points(labels.to_present(), agent, own)
+            message = cloud_message(points, frame_id(agent, "ego"), moment.index)
             recording.write(f"/{agent}/motion_labels/points", message, moment.index)
 
     def _points(self, labels: MotionLabels, agent: str, own_actor: int | None) -> AnyArray:

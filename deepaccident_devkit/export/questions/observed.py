@@ -182,8 +182,9 @@ class Observations:
         The agents of the set are not among them: `paths` has these.
         """
         moments = [self._moment(frame) for frame in window.frames]
+        boxes = concatenate([each[0] for each in moments], "world")
         return SeenRows(
-            boxes=concatenate([each[0] for each in moments], "world").transform(self._ego_from_world(window), "ego"),
+            boxes=boxes.transform(self._ego_from_world(window), "ego"),
             speed=np.concatenate([each[1] for each in moments]),
             seen_by=np.concatenate([each[2] for each in moments]),
             moment=np.repeat(np.arange(len(moments)), [len(each[0]) for each in moments]),

@@ -229,7 +229,8 @@ def _actor(
         strict=True,
     )
     for frame, place, yaw, speed, z, lean in moments:
-        states[frame - 1] = [*place, _milliradians(yaw), None if math.isnan(speed) else round(speed * 10), z, *lean]
+        known = None if math.isnan(speed) else round(speed * 10)
+        states[frame - 1] = [*place, _milliradians(yaw), known, z, *lean]
     return {
         "id": actor,
         "title": f"{category} {actor}" + (f" ({short_name(agent)})" if agent else ""),

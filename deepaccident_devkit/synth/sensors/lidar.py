@@ -194,7 +194,8 @@ def make_lidar(setting: Setting, agent: Agent) -> Lidar:
     place = (agent.box_from_ego @ agent.ego_from_lidar).translation
     body = rays_through(setting.actors.all[agent.row].size, place)
     solids = np.flatnonzero(setting.moving_owner == agent.row)
-    distance, face = make_caster(setting.moving_shapes.corners[solids]).cast(place, turned_rays(np.eye(3), body))
+    caster = make_caster(setting.moving_shapes.corners[solids])
+    distance, face = caster.cast(place, turned_rays(np.eye(3), body))
     first = setting.faces + FACES_A_SOLID * int(solids[0])
     return Lidar(row=agent.row, body=body, distance=distance, face=np.where(face >= 0, face + first, face))
 

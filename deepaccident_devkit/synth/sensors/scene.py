@@ -280,7 +280,8 @@ class Scene:
 
     def _cast_at_movers(self, origin: FloatArray, directions: AnyArray, rows: IntArray) -> tuple[AnyArray, AnyArray]:
         """How far the rays of `rows` go until they meet a moving road user, and the faces that they meet."""
-        reached, met = self.caster.cast(origin if origin.ndim == 1 else origin[rows], directions.take(rows, axis=0))
+        rays = directions.take(rows, axis=0)
+        reached, met = self.caster.cast(origin if origin.ndim == 1 else origin[rows], rays)
         return reached, met + self.setting.faces
 
 

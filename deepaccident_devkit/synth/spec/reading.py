@@ -99,9 +99,8 @@ class _Tree:
             value = self._loader.construct_object(raw)
         except (ValueError, LookupError, AttributeError, OverflowError) as error:  # of PyYAML, if a tag does not fit
             told = shortened(str(error))
-            raise self._error(
-                line, path, f"{raw.value[:40]!r} cannot be read ({told}); put it in quotes if it is a word"
-            ) from error
+            sentence = f"{raw.value[:40]!r} cannot be read ({told}); put it in quotes if it is a word"
+            raise self._error(line, path, sentence) from error
         if isinstance(value, int | float) and not isinstance(value, bool) and not _DECIMAL.fullmatch(raw.value):
             found = f"{shortened(raw.value)!r} is not a plain decimal number"
             raise self._error(line, path, f"{found}; write one, or put it in quotes if it is a word")
