@@ -165,11 +165,10 @@ def sample_lines(dataset: Dataset, sample: RowArgument) -> list[str]:
     record = dataset.get("sample", sample)
     files = [f"{record['token']}/{channel}" for channel in CHANNELS]
     paths = [dataset.sensor_path(token) for token in files]
-    boxes = dataset.get_boxes(record, "lidar")
     return [
         f"sample {record['token']}, t = {record['timestamp']:.1f} s",
         *(f"  {path}{'' if path.is_file() else '  (not here)'}" for path in paths),
-        *(f"  {box.token}: {box}" for box in boxes),
+        *(f"  {box.token}: {box}" for box in dataset.get_boxes(record, "lidar")),
     ]
 
 

@@ -53,8 +53,7 @@ def _linked(draw: Callable[..., Any]) -> Callable[..., Any]:
 
     def drawn(dataset: Dataset, token: str, *, latency: float, pose_noise: float, seed: int, **choices: Any) -> Any:
         noise = pose_noise or None  # noise with a mean of 0 m would still have a spread
-        link = Link(latency=latency, pose_noise=noise, seed=seed)
-        return draw(dataset, token, link=link, **choices)
+        return draw(dataset, token, link=Link(latency=latency, pose_noise=noise, seed=seed), **choices)
 
     return drawn
 

@@ -151,18 +151,16 @@ def found_by(scenarios: Scenarios, choices: Choices, scores: Mapping[str, Model]
     masks = {each.name: _matching(each, chosen[each.name]) for each in facets if each.name in chosen}
     rest, faults, waiting = _by_query(scenarios, choices, [name for name in choices.facets if name not in chosen])
     missed = sum((~mask for mask in masks.values()), np.zeros(len(scenarios), dtype=np.int64))
-    counts = {}
-    for each in facets:
-        others = missed == 0 if each.name not in masks else missed == ~masks[each.name]  # no other one missed it
-        counts[each.name] = _counts(each, others & rest, chosen.get(each.name, ()))
-    rows = np.flatnonzero(rest & (missed == 0))
-    ranked, not_ready = _sorted(scenarios, choices, rows, scores)
+    counts = {  # of the rows that no other facet misses
+        each.name: _counts(each, rest & (missed == ~masks.get(each.name, np.True_)), chosen.get(each.name, ()))
+        for each in facets
+    }
+    ranked, not_ready = _sorted(scenarios, choices, np.flatnonzero(rest & (missed == 0)), scores)
     return Found(rows=ranked, counts=counts, faults=tuple(faults), waiting=(*waiting, *not_ready))
 
 
 def _matching(facet: Facet, values: Sequence[str]) -> BoolArray:
-    wanted = [place for place, value in enumerate(facet.values) if value in values]
-    return np.isin(facet.codes, wanted)
+    return np.isin(facet.codes, [place for place, value in enumerate(facet.values) if value in values])
 
 
 def _counts(facet: Facet, rows: BoolArray, chosen: Sequence[str]) -> tuple[dict[str, Any], ...]:

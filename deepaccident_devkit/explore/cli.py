@@ -84,5 +84,4 @@ def explore(target: Path | None, predictions: tuple[Path, ...], **options: Any) 
         path = export_pages(dataset, target, where=where, **shown, **how)
         click.echo(f"written: {path}; open it in a browser")
         return
-    explorer = Explorer(dataset, **shown, workers=options["workers"])
-    show(explorer, open_browser=not no_open, say=click.echo, **server)
+    show(Explorer(dataset, **shown, workers=options["workers"]), open_browser=not no_open, say=click.echo, **server)

@@ -193,7 +193,6 @@ def _bar(group: Json, main: MainNumber | None) -> dict[str, Any]:
     """
     value = None if main is None else finite(group["headlines"].get(main.path))
     ends = None if main is None else _ends(group, main.path)
-    shown = None if main is None or ends is None else _percents(ends, main.limit)
     return {
         "value": UNKNOWN if group["value"] is None else group["value"],
         "samples": group["samples"],
@@ -201,7 +200,7 @@ def _bar(group: Json, main: MainNumber | None) -> dict[str, Any]:
         "text": "–" if main is None else value_text(value, main.unit),
         "interval": "" if main is None else _interval_text(ends, main.unit),
         "width": None if main is None or value is None else _percents([value], main.limit)[0],
-        "ends": shown,
+        "ends": None if main is None or ends is None else _percents(ends, main.limit),
     }
 
 
@@ -260,8 +259,7 @@ def _accident(row: Row, *, whole: bool) -> str:
 def _cases(row: Row, distance: str) -> str:
     tp, fp, fn = (_count(row, f"{case}_{distance}m") for case in _CASES)
     unknown: dict[str, Any] = {"id_error": None, "position_error": None, "time_error": None}
-    within = AccidentsWithin(distance=float(distance), tp=tp, fp=fp, fn=fn, accuracy=math.nan, **unknown)
-    return count_words(within)
+    return count_words(AccidentsWithin(distance=float(distance), tp=tp, fp=fp, fn=fn, accuracy=math.nan, **unknown))
 
 
 def _motion(row: Row, *, whole: bool) -> str:

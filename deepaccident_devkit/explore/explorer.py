@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import io
 import os
 import threading
 from collections import OrderedDict
@@ -23,6 +22,7 @@ from deepaccident_devkit.explore.models import Model, open_models
 from deepaccident_devkit.explore.scenarios import Scenarios
 from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.parallel import Store
+from deepaccident_devkit.release.images import picture_bytes
 from deepaccident_devkit.release.store.store import FileCache
 from deepaccident_devkit.render.boxes import EDGES, actor_color, recorders_of, segments_in_image
 from deepaccident_devkit.render.camera import best_view
@@ -233,9 +233,7 @@ def thumbnail(dataset: Dataset, record: ScenarioRecord) -> bytes:
         image = _photo(dataset, camera, pair)
     if image is None:
         image = _from_above(dataset, record, boxes, pair)
-    written = io.BytesIO()
-    image.save(written, "JPEG", quality=_QUALITY)
-    return written.getvalue()
+    return picture_bytes(image, "JPEG", quality=_QUALITY)
 
 
 def _last_images(dataset: Dataset, record: ScenarioRecord) -> tuple[int, list[tuple[str, str]]]:

@@ -123,8 +123,7 @@ class Scenarios:
     def facets(self) -> list[Facet]:
         """The facets, the most asked for first; without those of one value, and of those that are not ready."""
         found = dict(self._facets)
-        seen = self.values("accident_visibility")
-        if seen is not None:
+        if self.values("accident_visibility") is not None:
             found["accident_visibility"] = self._visibility
         order = [*_FIRST, *(name for name in found if name not in _FIRST)]
         return [found[name] for name in order if name in found and len(found[name].values) > 1]

@@ -287,15 +287,14 @@ class _Pages:
         )
 
     def _write_index(self, filters: Sequence[str], told: Sequence[Told]) -> None:
-        entries = [
-            entry(record, {name: cell(value) for name, value in each.measures.items()}, {})
-            for record, each in zip(self._records, told, strict=True)
-        ]
         self._write_page(
             INDEX,
             "written_list.html",
             "./",
-            entries=entries,
+            entries=[
+                entry(record, {name: cell(value) for name, value in each.measures.items()}, {})
+                for record, each in zip(self._records, told, strict=True)
+            ],
             slow=SLOW,
             release=self._dataset.version,
             python=find_call(filters),

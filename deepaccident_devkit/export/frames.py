@@ -31,10 +31,9 @@ def sensor_files(dataset: Dataset, scenario: str, agent: str, channel: str) -> d
     count = dataset.scenario[dataset.getind("scenario", scenario)]["num_frames"]
     folder = dataset.sensor_path(f"{sample_token(scenario, agent, 1)}/{channel}").parent
     ending = CHANNEL_FORMAT[channel]
-    sizes = frame_sizes(folder, ending)
     return {
         number: (folder / f"{folder.name}_{number:03d}.{ending}", size)
-        for number, size in sizes.items()
+        for number, size in frame_sizes(folder, ending).items()
         if number <= count
     }
 

@@ -248,9 +248,8 @@ class Moments:
         at = number - 1
         ego = carla_six(self._world_from_ego[at]).tolist()
         world_from_lidar = self._world_from_ego[at] @ self._ego_from[at, CHANNELS.index(LIDAR)]
-        cameras = {theirs: self._camera(ours, at, flip_pose(world_from_lidar)) for ours, theirs in CAMERA_NAMES.items()}
         return {
-            **cameras,
+            **{theirs: self._camera(ours, at, flip_pose(world_from_lidar)) for ours, theirs in CAMERA_NAMES.items()},
             "ego_speed": self._speed(at),
             "lidar_pose": carla_six(world_from_lidar).tolist(),
             "plan_trajectory": [  # where it went; a recording has no planned speed
@@ -293,9 +292,8 @@ class Moments:
     def _camera(self, name: str, at: int, raw_world_from_lidar: FloatArray) -> dict[str, Any]:
         lidar_to_camera = self._extrinsic[name][at]
         lens = stored_camera(self._dataset, f"{self.samples[at]}/{name}", self._files[name].get(at + 1))
-        world_from_camera = raw_world_from_lidar @ inverses(lidar_to_camera)
         return {
-            "cords": carla_six(flip_pose(world_from_camera)).tolist(),
+            "cords": carla_six(flip_pose(raw_world_from_lidar @ inverses(lidar_to_camera))).tolist(),
             "extrinsic": lidar_to_camera.tolist(),
             "intrinsic": lens.intrinsic.tolist(),
         }

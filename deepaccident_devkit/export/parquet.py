@@ -62,10 +62,9 @@ class Parquet(Format):
 
     def units(self, dataset: Dataset, scenarios: Sequence[str]) -> list[Unit]:
         """A shard each."""
-        found = shards(dataset, dict.fromkeys(scenarios, 1), self.shard_scenarios)
         return [
             Unit(name=f"{split}-{number:05d}-of-{len(groups):05d}", scenarios=group)
-            for split, groups in found.items()
+            for split, groups in shards(dataset, dict.fromkeys(scenarios, 1), self.shard_scenarios).items()
             for number, group in enumerate(groups)
         ]
 

@@ -161,9 +161,7 @@ def _fault(dataset: Dataset, scenario: str) -> str | None:
     if agents_of(dataset, scenario) != AGENTS:
         return "scenarios without all five agents"
     samples = [dataset.samples_of(frame_token(scenario, number)) for number in _keyframes(dataset, scenario)]
-    if not all(sample["labelled"] for moment in samples for sample in moment):
-        return "scenarios without labels"
-    return None
+    return None if all(sample["labelled"] for moment in samples for sample in moment) else "scenarios without labels"
 
 
 def _infos(folder: ScenarioFolder, agent: str, numbers: range, root_prefix: str) -> Iterator[dict[str, Any]]:

@@ -113,12 +113,11 @@ def sample_json(dataset: Dataset, sample: str, sizes: Mapping[str, tuple[int, in
     Raises TokenError.
     """
     record = dataset.sample.get(sample)
-    frame = dataset.frame.get(record["frame_token"])
     facts = {
         "token": sample,
         "scenario": record["scenario_token"],
         "agent": record["agent"],
-        "frame": frame["index"],
+        "frame": dataset.frame.get(record["frame_token"])["index"],
         "split": dataset.scenario.get(record["scenario_token"])["split"],
         **{name: record[name] for name in ("timestamp", "time_to_end", "time_to_impact", "velocity")},
         "world_from_ego": dataset.world_from(sample, "ego").matrix.tolist(),

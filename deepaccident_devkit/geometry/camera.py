@@ -135,8 +135,7 @@ class PinholeCamera(FrozenArrays):
                 f"expected boxes in this camera's optical frame, found {boxes.frame!r}; "
                 "transform them by camera_from_source first"
             )
-        corners = boxes.corners().reshape(-1, 3)
-        pixels, depth = self.project(corners)
+        pixels, depth = self.project(boxes.corners().reshape(-1, 3))
         seen = self.in_image(pixels, depth, min_depth=VISIBLE_DEPTH).reshape(-1, 8)
         in_front = (depth > IN_FRONT_DEPTH).reshape(-1, 8).all(axis=1)
         levels = [in_front & seen.all(axis=1), in_front & seen.any(axis=1)]
@@ -152,8 +151,7 @@ class PinholeCamera(FrozenArrays):
         if level not in list(BoxVisibility):
             names = ", ".join(f"BoxVisibility.{one.name}" for one in BoxVisibility)
             raise ChoiceError(f"level: expected one of {names}, found {level!r}")
-        meets: BoolArray = self.box_visibility(boxes) <= level
-        return meets
+        return np.asarray(self.box_visibility(boxes) <= level)
 
 
 def _pixels(name: str, value: object) -> int:

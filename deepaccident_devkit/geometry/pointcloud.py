@@ -162,5 +162,4 @@ def _within(name: str, values: FloatArray, limits: Range) -> BoolArray:
     low, high = checked(name, limits, (2,)).tolist()
     if not low <= high:
         raise GeometryError(f"{name}: expected a start and an end not before it, found {limits}")
-    within: BoolArray = (values >= low) & (values < high)
-    return within
+    return np.asarray((values >= low) & (values < high))

@@ -183,9 +183,7 @@ class SE3(FrozenArrays):
     def __matmul__(self, other: ArrayLike) -> FloatArray: ...
     def __matmul__(self, other: Any) -> Any:
         """Compose: `a_from_b @ b_from_c` is `a_from_c`; with points (N, 3), boxes or a point cloud, `apply`."""
-        if isinstance(other, SE3):
-            return trusted_se3(self.matrix @ other.matrix)
-        return self.apply(other)
+        return trusted_se3(self.matrix @ other.matrix) if isinstance(other, SE3) else self.apply(other)
 
     def __repr__(self) -> str:
         """Translation and yaw."""

@@ -111,8 +111,7 @@ def closing_speed(
     first: FloatArray, second: FloatArray, first_velocity: FloatArray, second_velocity: FloatArray
 ) -> FloatArray:
     """Speed (…,) with which the centres come closer; negative if they part, NaN if they are one point."""
-    apart = second[..., :2] - first[..., :2]
-    return _closing(apart, second_velocity - first_velocity)
+    return _closing(second[..., :2] - first[..., :2], second_velocity - first_velocity)
 
 
 def closing_speed_of_boxes(
@@ -235,8 +234,7 @@ def modified_ttc(
     shape = np.broadcast_shapes(first.shape[:-1], second.shape[:-1], *map(np.shape, given))
     motion = np.stack([np.broadcast_to(each, shape).ravel() for each in given], axis=-1)
     first, second = (np.broadcast_to(boxes, (*shape, 5)).reshape(-1, 5) for boxes in (first, second))
-    starts = range(0, len(first), _PAIRS_AT_ONCE)
-    parts = [slice(start, start + _PAIRS_AT_ONCE) for start in starts]
+    parts = [slice(start, start + _PAIRS_AT_ONCE) for start in range(0, len(first), _PAIRS_AT_ONCE)]
     times = [_accelerated(first[part], second[part], motion[part]) for part in parts]
     return np.concatenate([np.zeros(0), *times]).reshape(shape)
 

@@ -240,5 +240,4 @@ def _classes_around(classes: ByteArray, rows: IntArray, columns: IntArray, holes
         np.add.at(votes, (holes, classes[rows + down, columns + right]), 1)
     votes[:, 1] += votes[:, 2]
     votes[:, [0, 2]] = 0
-    result: ByteArray = votes.argmax(axis=1).astype(np.uint8)
-    return result
+    return np.asarray(votes.argmax(axis=1).astype(np.uint8))

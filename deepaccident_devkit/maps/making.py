@@ -194,11 +194,10 @@ def _joined(
             "train or val (the test split ships without)"
         )
     first, counts, agents = _cut(counts, agents)
-    origin = as_floats((low + first)[::-1] * config.resolution)
     return TownMap(
         town=town,
         resolution=config.resolution,
-        origin=origin,
+        origin=as_floats((low + first)[::-1] * config.resolution),
         counts=counts,
         agents=agents,
         hidden=hidden_ground(classes_of(counts), config.resolution),

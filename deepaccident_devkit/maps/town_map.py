@@ -201,20 +201,19 @@ def simplified(polygons: MultiPolygon, tolerance: float, least_area: float) -> M
 
 def geojson_of(town: str, areas: Mapping[Area, MultiPolygon]) -> bytes:
     """A FeatureCollection with one feature for each polygon of each area; coordinates have three decimals."""
-    features = [
-        {
-            "type": "Feature",
-            "properties": {"town": town, "area": area, "square_metres": round(part.area, 1)},
-            "geometry": {"type": "Polygon", "coordinates": _rings(part)},
-        }
-        for area, polygons in areas.items()
-        for part in polygons.geoms
-    ]
     collection = {
         "type": "FeatureCollection",
         "name": town,
         "coordinate_system": "local metres of the simulator's world, x and y, right-handed; no longitude and latitude",
-        "features": features,
+        "features": [
+            {
+                "type": "Feature",
+                "properties": {"town": town, "area": area, "square_metres": round(part.area, 1)},
+                "geometry": {"type": "Polygon", "coordinates": _rings(part)},
+            }
+            for area, polygons in areas.items()
+            for part in polygons.geoms
+        ],
     }
     return (json.dumps(collection, allow_nan=False, separators=(",", ":")) + "\n").encode()
 

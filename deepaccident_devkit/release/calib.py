@@ -193,8 +193,7 @@ def _surely_rigid(poses: FloatArray) -> BoolArray:
     with np.errstate(invalid="ignore", over="ignore"):
         off = np.abs(turns @ np.swapaxes(turns, -1, -2) - np.eye(3)).max(axis=(-1, -2))
         proper = (off < RIGID_TOLERANCE / 2) & (np.linalg.det(turns) > 0)
-    sure: BoolArray = proper & in_range(poses).all(axis=(-1, -2)) & (poses[..., 3, :] == _LAST_ROW).all(axis=-1)
-    return sure
+    return np.asarray(proper & in_range(poses).all(axis=(-1, -2)) & (poses[..., 3, :] == _LAST_ROW).all(axis=-1))
 
 
 def _first_value_fault(poses: FloatArray, intrinsics: FloatArray) -> str | None:

@@ -74,8 +74,7 @@ def scenario_hashes(dataset: Located, scenarios: Collection[str], **how: Unpack[
     from deepaccident_devkit.parallel import Places, run_batch  # here: opening a release waits for this module
 
     folders = scenario_folders(dataset, scenarios)
-    places = Places(reads=places_of(dataset.dataroot))
-    found = run_batch(folder_hashes, list(folders.values()), places=places, **how)
+    found = run_batch(folder_hashes, list(folders.values()), places=Places(reads=places_of(dataset.dataroot)), **how)
     return dict(zip(folders, found, strict=True))
 
 

@@ -137,6 +137,13 @@ def encode_jpeg(path: ReleasePath, image: ByteArray, quality: int = JPEG_QUALITY
     return bytes(encoded.tobytes())
 
 
+def picture_bytes(picture: Any, form: str, **how: Any) -> bytes:
+    """A Pillow image as the bytes of a file of a format, such as PNG; `how` are Pillow's options of that format."""
+    written = BytesIO()
+    picture.save(written, form, **how)
+    return written.getvalue()
+
+
 @contextmanager
 def _opened(path: ReleasePath, content: bytes | None, formats: tuple[str, ...]) -> Iterator[Any]:
     """Pillow's image of a file's bytes (None: a real file's), not too large; what it raises becomes SensorFileError."""

@@ -175,8 +175,7 @@ def read_lone_words(path: ReleasePath) -> list[tuple[int, str, bool]]:
 
     Raises as `read_label` does, if the file cannot be read.
     """
-    content = _content(path, ended=False)
-    lines = content.splitlines(keepends=True)
+    lines = _content(path, ended=False).splitlines(keepends=True)
     return [
         (number, shortened(words[0].decode(errors="replace")), not line.endswith((b"\n", b"\r")))
         for number, line in enumerate(lines, start=1)

@@ -83,8 +83,7 @@ def read_meta(path: ReleasePath) -> Meta:
     filled = [(number, line.strip()) for number, line in enumerate(lines, start=1) if line.strip()]
     if not filled:
         raise MetaError(f"{path}:1: expected '{_FIRST_LINE}', found an empty file; {REMEDY}")
-    entries = _entries(path, filled[1:])
-    return _parse(path, filled[0], entries)
+    return _parse(path, filled[0], _entries(path, filled[1:]))
 
 
 def write_meta(path: Path, meta: Meta) -> None:

@@ -133,8 +133,7 @@ def render_accident(
     cut = _cut_words(contact, record["num_frames"])
     usual = _IN_A_COLUMN if current_style().room == "column" else COUNTDOWN
     moments = _moments(seconds or usual, record["num_frames"])
-    there = agents_of(dataset, scenario)
-    first = sample_token(record["token"], there[0], record["num_frames"])
+    first = sample_token(record["token"], agents_of(dataset, scenario)[0], record["num_frames"])
     names = in_drawing_order([] if agents == [] else cooperating_agents(dataset, first, agents))
     fig = figure_or_new(fig, (_WIDTH * len(moments) + 0.8, 1.95 * len(names) + _WIDTH + 1.1), column=1.45)
     pair, best = Pair.of(dataset, contact), ""
@@ -145,8 +144,7 @@ def render_accident(
     axes, across = _panels(fig, len(names), len(moments))
     for column, (left, index) in enumerate(moments):
         for agent, ax in zip(names, axes[:, column], strict=False):
-            channel = draw_pair_in_camera(pair, agent, index, shown, ax)
-            _write_name(channel, ax)
+            _write_name(draw_pair_in_camera(pair, agent, index, shown, ax), ax)
         draw_pair_from_above(pair, index, shown, axes[-1, column])
         end = "the last frame" if cut or contact.touching else "the impact"
         _write_head(end if left == 0 else f"{left:g} s before", "black", axes[0, column], above=not across)
@@ -177,8 +175,7 @@ def draw_countdown(
         if agent not in agents:
             axes[agent].set_axis_off()
             continue
-        channel = draw_pair_in_camera(pair, agent, index, shown, axes[agent])
-        words = channel.replace("\n", " ")
+        words = draw_pair_in_camera(pair, agent, index, shown, axes[agent]).replace("\n", " ")
         axes[agent].set_title(f"{short_name(agent)}: {words}", fontsize="medium", color=AGENT_COLORS[agent])
     draw_pair_from_above(pair, index, shown, axes["above"])
     axes["above"].set_title(f"from above, {axes['above'].get_title()}", fontsize="medium")
@@ -232,8 +229,7 @@ class Pair:
         """Their boxes in world in a frame (number from 1), as far as they exist; without the agent that sees them."""
         there = self.tracks.at(index)
         own = None if seen_by is None else self.dataset.agent.get(f"{self.scenario}/{seen_by}")["actor_id"]
-        ids = [actor for actor in self.contact.actor_ids if actor != own]
-        return there.select(np.isin(there.actor_id, ids))
+        return there.select(np.isin(there.actor_id, [actor for actor in self.contact.actor_ids if actor != own]))
 
     def view(self, agent: str, index: int) -> tuple[str, BestView | None, int | None]:
         """The camera of an agent that shows the pair best in a frame, its view, and when it last had the pair.
@@ -459,7 +455,6 @@ def _write_head(words: str, color: str, ax: Axes, *, above: bool) -> None:
 
 def _write_name(words: str, ax: Axes) -> None:
     """Write a camera's name into the lower left corner of its panel, whatever is there."""
-    paper = {"facecolor": CASING_COLOR, "edgecolor": GRID_COLOR, "linewidth": 0.7, "pad": 1.5}
     ax.annotate(
         words,
         (0, 0),
@@ -467,7 +462,7 @@ def _write_name(words: str, ax: Axes) -> None:
         xycoords="axes fraction",
         textcoords="offset points",
         fontsize=text_size(),
-        bbox=paper,
+        bbox={"facecolor": CASING_COLOR, "edgecolor": GRID_COLOR, "linewidth": 0.7, "pad": 1.5},
         zorder=5,
         in_layout=False,
     )

@@ -121,8 +121,7 @@ def render_annotation(
 
     own = box.transform(dataset.world_from(sample, "ego").inverse(), "ego")
     x, y = own.center[0, :2].tolist()
-    view = BevView(view_range=margin, center=(x, y))
-    draw_bev(dataset, sample, view, chosen - {"image"}, axes["above"])
+    draw_bev(dataset, sample, BevView(view_range=margin, center=(x, y)), chosen - {"image"}, axes["above"])
     draw_boxes_from_above(own, axes["above"], color, fill=0.5, linewidths=2.5)
     axes["above"].set_title("ego frame of the agent", fontsize="medium")
 

@@ -172,8 +172,7 @@ def _edges_in_image(boxes: Boxes, camera: PinholeCamera) -> tuple[FloatArray, In
 
 def draw_ids_in_image(boxes: Boxes, camera: PinholeCamera, ax: Axes, colors: Sequence[str]) -> None:
     """Write the ids of tracked boxes of the camera's optical frame above them, if their top is in the image."""
-    top = boxes.corners()[:, (0, 1, 4, 5)].mean(axis=1)
-    pixels, depth = camera.project(top)
+    pixels, depth = camera.project(boxes.corners()[:, (0, 1, 4, 5)].mean(axis=1))
     seen = camera.in_image(pixels, depth, min_depth=NEAREST_DRAWN)
     _write_ids(pixels[seen], boxes.actor_id[seen], ax, [colors[row] for row in np.flatnonzero(seen).tolist()])
 

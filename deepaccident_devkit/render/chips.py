@@ -48,13 +48,6 @@ def place_chips(
     if avoid is not None:
         keep_free(ax, avoid)
     for number, (words, (x, y)) in enumerate(chips):
-        edge = GRID_COLOR if colors is None else colors[number]
-        paper = {
-            "facecolor": CASING_COLOR,
-            "edgecolor": edge,
-            "linewidth": 0.7,
-            "boxstyle": f"square,pad={_PAD / text_size()}",
-        }
         placer.chips.append(
             ax.annotate(
                 words,
@@ -65,7 +58,12 @@ def place_chips(
                 va="center",
                 color=OWN_COLOR,
                 fontsize=text_size(),
-                bbox=paper,
+                bbox={
+                    "facecolor": CASING_COLOR,
+                    "edgecolor": GRID_COLOR if colors is None else colors[number],
+                    "linewidth": 0.7,
+                    "boxstyle": f"square,pad={_PAD / text_size()}",
+                },
                 zorder=6,
                 clip_on=True,
                 in_layout=False,

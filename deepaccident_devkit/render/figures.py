@@ -51,8 +51,7 @@ def axes_or_new(ax: Axes | None, size: tuple[float, float] = (8, 8)) -> Axes:
 
     from deepaccident_devkit.render.own_figure import OwnFigure
 
-    inches = size_in_style(size, panels="one")
-    return plt.subplots(figsize=inches, layout="constrained", FigureClass=OwnFigure)[1]
+    return plt.subplots(figsize=size_in_style(size, panels="one"), layout="constrained", FigureClass=OwnFigure)[1]
 
 
 def figure_or_new(

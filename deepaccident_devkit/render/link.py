@@ -145,8 +145,7 @@ def render_link(
     _draw_shared(shared, shown, first)
     write_beside(first, f"{short_name(record['agent'])} receives", (0.0, 0.0), AGENT_COLORS[record["agent"]])
     for ax, (words, there) in zip(others, clouds.items(), strict=True):
-        view = BevView(view_range=reach, agents=agents, link=there)
-        draw_bev(dataset, record, view, shown - {"boxes", "ids"}, ax)
+        draw_bev(dataset, record, BevView(view_range=reach, agents=agents, link=there), shown - {"boxes", "ids"}, ax)
         ax.set(title=f"clouds {words}", anchor="C")
         if "boxes" in shown:
             truth = cooperative_boxes(dataset, record, agents=agents, frame="ego")

@@ -235,8 +235,7 @@ def _draw(maps: MotionMaps, style: MotionStyle, layers: Iterable[Layer] | None, 
         return _draw_maps(maps, shown, fig)
     trail = _at_present(maps)
     fig = figure_or_new(fig, (6.4, 6.8), panels="one", page=1.12, column=1.12)
-    panel = fig.subplots()
-    draw_trail_of(trail, shown, panel)
+    draw_trail_of(trail, shown, fig.subplots())
     draw_legend(fig, instance_handles(trail))
     return fig
 

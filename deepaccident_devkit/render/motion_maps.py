@@ -337,8 +337,7 @@ def _with_ids_and_grid(maps: MotionMaps, frame: int, shown: frozenset[Layer], ax
 
 
 def _draw_cells(ax: Axes, picture: AnyArray, maps: MotionMaps, **how: Any) -> None:
-    extent = (*maps.grid.x[:2], *maps.grid.y[:2])
-    ax.imshow(picture, origin="lower", extent=extent, interpolation="nearest", **how)
+    ax.imshow(picture, origin="lower", extent=(*maps.grid.x[:2], *maps.grid.y[:2]), interpolation="nearest", **how)
 
 
 def instance_handles(maps: MotionMaps) -> list[Artist]:

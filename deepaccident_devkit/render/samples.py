@@ -148,8 +148,7 @@ def render_frame(
         ChoiceError: no such layer, agent or configuration.
         NotAvailableError: an agent is not in this (partial) release.
     """
-    first = dataset.samples_of(dataset.get("frame", frame))[0]
-    names = cooperating_agents(dataset, first, agents)
+    names = cooperating_agents(dataset, dataset.samples_of(dataset.get("frame", frame))[0], agents)
     panel_layers(layers)  # refused before a figure is made
     fig = figure_or_new(fig, (14.5, 6.0), page=0.62, column=1.5)
     draw_shared_moment(dataset, frame, agents=names, layers=layers, fig=fig)
@@ -280,8 +279,7 @@ def render_calibration(
         draw_legend(fig, agent_handles(clouds))
     write_missing(axes[0, 0], missing_clouds_text([agent for agent in lookers if agent not in clouds]))
     whose = "each agent" if len(names) > 1 else short_name(names[0])
-    where = record["frame_token"] if is_frame else record["token"]
-    set_scene_title(fig, dataset, where, f"LiDAR of {whose}")
+    set_scene_title(fig, dataset, record["frame_token"] if is_frame else record["token"], f"LiDAR of {whose}")
     return fig
 
 

@@ -55,8 +55,7 @@ def draw_counts(table: CountTable, ax: Axes) -> Axes:
     for group in GROUPS[1:]:
         widths = [table.counts[value][group] for value in values]
         if any(widths):
-            colors = SPLIT_COLORS[group]
-            ax.barh(range(len(values)), widths, left=starts, color=colors, label=group, height=0.72)
+            ax.barh(range(len(values)), widths, left=starts, color=SPLIT_COLORS[group], label=group, height=0.72)
         starts = [start + width for start, width in zip(starts, widths, strict=True)]
     for position, total in enumerate(starts):
         share = f" ({100 * total / whole:.0f} %)" if whole else ""
@@ -194,8 +193,7 @@ def _scenarios(statistics: DatasetStatistics, fig: Figure) -> None:
         ("road_types", "collisions"),
     ]
     heights = [2 + max(len(statistics.counts[name].counts) for name in row) for row in rows]
-    axes = fig.subplot_mosaic([list(row) for row in rows], height_ratios=heights)
-    for name, ax in axes.items():
+    for name, ax in fig.subplot_mosaic([list(row) for row in rows], height_ratios=heights).items():
         draw_counts(statistics.counts[name], ax=ax)
 
 
@@ -223,8 +221,7 @@ def _actors(statistics: DatasetStatistics, fig: Figure) -> None:
 
 
 def _boxes(statistics: DatasetStatistics, fig: Figure) -> None:
-    axes = fig.subplot_mosaic([["length", "width"], ["height", "."]])
-    for field, ax in axes.items():
+    for field, ax in fig.subplot_mosaic([["length", "width"], ["height", "."]]).items():
         draw_quantiles(statistics.quantiles["box_sizes"], field, ax=ax)
 
 

@@ -264,8 +264,7 @@ class Scene:
 
 def names_at(dataset: Dataset, frame: str, agents: Agents) -> tuple[str, ...]:
     """The chosen agents at a frame; first is the one whose view it is: the first one named, or the first one there."""
-    first = dataset.samples_of(frame)[0]
-    names = cooperating_agents(dataset, first, agents)
+    names = cooperating_agents(dataset, dataset.samples_of(frame)[0], agents)
     if agents is None or isinstance(agents, str) or not isinstance(agents, Sequence):
         return names
     return tuple(sorted(names, key=lambda name: name != agents[0]))
@@ -287,9 +286,7 @@ def views_of(
 
 
 def _view(given: object) -> View:
-    if callable(given):
-        return View(draw=given, layers=(), own=True)
-    return VIEWS[choice("what", given, VIEWS)]
+    return View(draw=given, layers=(), own=True) if callable(given) else VIEWS[choice("what", given, VIEWS)]
 
 
 def render_scenario_video(  # noqa: PLR0913 - each is a choice that stands on its own in a notebook

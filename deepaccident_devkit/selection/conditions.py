@@ -63,8 +63,7 @@ class Condition:
 
     def holds(self, value: Value | tuple[Value, ...]) -> bool:
         """Whether a scenario with this value of the field, or with these, is wanted."""
-        several = value if isinstance(value, tuple) else (value,)
-        return any(map(self._has, several)) != self.negated
+        return any(map(self._has, value if isinstance(value, tuple) else (value,))) != self.negated
 
     def _has(self, value: Value) -> bool:
         return value in self.values or any(_within(value, *bounds) for bounds in self.ranges)

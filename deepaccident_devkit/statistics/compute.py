@@ -97,7 +97,6 @@ def dataset_statistics(
     histograms += pair_histograms
     if interactions:
         histograms += _interactions(chosen, **how)
-    counts = [*_scenario_counts(chosen), *_actor_counts(chosen)]
     return DatasetStatistics(
         dataroot=str(dataset.dataroot),
         version=dataset.version,
@@ -107,7 +106,7 @@ def dataset_statistics(
         frames=_by_group(chosen.group("frame")),
         samples=_by_group(chosen.group("sample")),
         unlabelled=chosen.unlabelled.counts,
-        counts={table.name: table for table in counts},
+        counts={table.name: table for table in [*_scenario_counts(chosen), *_actor_counts(chosen)]},
         histograms={table.name: table for table in histograms},
         quantiles={table.name: table for table in quantiles},
         collisions=pairs,
@@ -241,8 +240,7 @@ def _scenario_counts(chosen: _Chosen) -> list[CountTable]:
             (chosen.ends[scenario["token"]] if field == "end" else word_of(scenario, field)) or UNKNOWN
             for scenario in records
         ]
-        others = sorted(set(words) - {*known, UNKNOWN})
-        listed = [*known, *others, *({UNKNOWN} & set(words))]
+        listed = [*known, *sorted(set(words) - {*known, UNKNOWN}), *({UNKNOWN} & set(words))]
         counts = {}
         for word in listed:
             here = np.array([each == word for each in words], dtype=bool)

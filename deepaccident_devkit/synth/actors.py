@@ -112,7 +112,6 @@ class Actors:
     def of(cls, actors: Sequence[Actor]) -> "Actors":
         """Gather actors, sorted by id."""
         ordered = tuple(sorted(actors, key=lambda actor: actor.actor_id))
-        counts = [len(actor.shape) for actor in ordered]
         return cls(
             all=ordered,
             actor_id=readonly(np.array([actor.actor_id for actor in ordered], dtype=np.int64)),
@@ -121,7 +120,7 @@ class Actors:
             size=readonly(np.array([actor.size for actor in ordered], dtype=np.float64)),
             origin=readonly(np.array([actor.origin for actor in ordered], dtype=np.float64)),
             solids=solids.concatenate([actor.shape for actor in ordered]),
-            solid_actor=readonly(np.repeat(np.arange(len(ordered)), counts)),
+            solid_actor=readonly(np.repeat(np.arange(len(ordered)), [len(actor.shape) for actor in ordered])),
             motions=_together([actor.motion for actor in ordered]),
         )
 
@@ -223,15 +222,11 @@ def random_body(rng: np.random.Generator, category: str) -> Body:
     size: Size = tuple((np.array(MEDIAN_SIZES[category]) * factors).astype(np.float32).tolist())
     color, accent = _colors(rng, category)
     shape = shape_of(category, size, color, accent, model=int(rng.integers(len(MODELS[category]))))
-    return Body(category, size, shape, _random_origin(rng))
+    # an ego origin lies ahead of the box's centre, mostly by some centimetres, seldom by up to 0.3 m
+    return Body(category, size, shape, (round(float(_FARTHEST_ORIGIN * rng.random() ** 3), 4), 0.0))
 
 
 def _colors(rng: np.random.Generator, category: str) -> tuple[Color, Color]:
     paints = _CLOTHES if category == "pedestrian" else _PAINTS
     accents = _TRUCK_BOXES if category == "truck" else _CLOTHES
     return paints[rng.integers(len(paints))], accents[rng.integers(len(accents))]
-
-
-def _random_origin(rng: np.random.Generator) -> tuple[float, float]:
-    """Where an ego origin lies: ahead of the box's centre, mostly by some centimetres, seldom by up to 0.3 m."""
-    return round(float(_FARTHEST_ORIGIN * rng.random() ** 3), 4), 0.0

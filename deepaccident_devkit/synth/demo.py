@@ -190,12 +190,11 @@ def draw_accident(release: DeepAccident, out: Path) -> None:
     accident, before = _accident_and_before(release)
     ego = release.samples_of(before)[0]
     countdown = partial(release.render_accident, seconds=_COUNTDOWN, agents=("ego_vehicle", "infrastructure"))
-    labels = partial(release.render_motion_labels, config=_LABELS)
     drawings: tuple[tuple[tuple[float, float], Callable[..., Any], RowArgument], ...] = (
         ((17.0, 8.6), countdown, accident),
         ((20.0, 6.5), release.render_frame, before),
         ((16.0, 5.5), release.render_sample, ego),
-        ((11.0, 12.0), labels, ego),
+        ((11.0, 12.0), partial(release.render_motion_labels, config=_LABELS), ego),
     )
     for name, (size, render, record) in zip(PICTURES, drawings, strict=True):
         save_picture(render(record, fig=detached_figure(size)), out / name, dpi=80)

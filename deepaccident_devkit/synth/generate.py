@@ -11,6 +11,7 @@ import shutil
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -224,7 +225,7 @@ def make_release(
         places = Places(writes=(unfinished.folder,))
         how: dict[str, Any] = {"workers": count, "executor": executor, "progress": progress}
         try:
-            unfinished.store.run(_record, parts, label="recording", places=places, **how)
+            unfinished.store.run(partial(_record, unfinished), parts, label="recording", places=places, **how)
         finally:
             forget_scenario()
         if alone():
@@ -238,33 +239,21 @@ def make_release(
     return out
 
 
-@dataclass(frozen=True, slots=True)
-class _Part:
-    """A part of a scenario to record into the folder of an unfinished release."""
-
-    unfinished: Unfinished
-    name: str
-    job: RecordingJob
-
-
-def _parts(unfinished: Unfinished, config: SynthConfig, plan: ScenarioPlan) -> dict[str, _Part]:
+def _parts(unfinished: Unfinished, config: SynthConfig, plan: ScenarioPlan) -> dict[str, RecordingJob]:
     """The parts of a scenario by their names."""
     if config.sensors == "accidents":
         config = replace(config, sensors="all" if plan.accident else "none")
     parts = parts_of(config)
     names = {first: f"{plan.scenario_type}_{plan.name}_{first}of{parts}" for first in range(1, parts + 1)}
-    return {
-        name: _Part(unfinished, name, RecordingJob(unfinished.part(name), config, plan, first, parts))
-        for first, name in names.items()
-    }
+    return {name: RecordingJob(unfinished.part(name), config, plan, first, parts) for first, name in names.items()}
 
 
-def _record(part: _Part) -> None:
-    """Record a part, unless it is made."""
-    unfinished, name = part.unfinished, part.name
+def _record(unfinished: Unfinished, job: RecordingJob) -> None:
+    """Record a part of a scenario into the folder of an unfinished release, unless it is made."""
+    name = job.root.name
     if not unfinished.is_made(name):
         unfinished.clear(name)
-        record_scenario(part.job)
+        record_scenario(job)
         unfinished.note(name)
 
 

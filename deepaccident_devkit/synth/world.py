@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import accumulate
 
 import numpy as np
 
@@ -226,12 +227,6 @@ def yield_sign(spec: RoadSpec, arm: Arm) -> Prop:
     return Prop(POLE, (_column(x, y, (-0.1, 2.3), half=0.025), rim, face))
 
 
-def signal_head(arm: Arm, light: Prop, first_row: int) -> SignalHead:
-    """Where the lamps of an arm's traffic light are, whose first block has that row of the world's solids."""
-    red_row = first_row + len(light.blocks) - len(LAMP_COLORS)
-    return SignalHead(arm=arm, rows=(red_row, red_row + 1, red_row + 2))
-
-
 def lanterns(spec: RoadSpec) -> Iterator[Prop]:
     """Street lanterns along each arm, on its two sidewalks by turns."""
     for arm in spec.arms:
@@ -297,7 +292,7 @@ def houses(rng: np.random.Generator, spec: RoadSpec) -> list[Prop]:
     blocks = [block for sign_x in (1, -1) for sign_y in (1, -1) for block in _quadrant(rng, spec, sign_x, sign_y)]
     if spec.kind == "three-way":
         blocks += _closed_side(rng, spec)
-    return [_building(number, block) for number, block in enumerate(blocks)]
+    return [Prop(FIRST_BUILDING + number % _CODES, (block,)) for number, block in enumerate(blocks)]
 
 
 def kerb_house(spec: RoadSpec, corner: tuple[int, int]) -> Prop:
@@ -309,8 +304,7 @@ def kerb_house(spec: RoadSpec, corner: tuple[int, int]) -> Prop:
     kept = KERB_RADIUS - KERB_INSET - _MAST_ROOM
     near = max(near, spec.road_edge + KERB_RADIUS - kept / float(np.sqrt(2)))
     x, y = (_mirrored((near, near + _KERB_HOUSE_LENGTH), sign) for sign in corner)
-    wall = _WALLS[0]
-    return Prop(FIRST_BUILDING, (Block(x, y, (-BASEMENT, STOREY * _KERB_HOUSE_STOREYS + 0.8), wall, facade=True),))
+    return Prop(FIRST_BUILDING, (Block(x, y, (-BASEMENT, STOREY * _KERB_HOUSE_STOREYS + 0.8), _WALLS[0], facade=True),))
 
 
 def _quadrant(rng: np.random.Generator, spec: RoadSpec, sign_x: int, sign_y: int) -> Iterator[Block]:
@@ -353,16 +347,12 @@ def _mirrored(span: Span, sign: int) -> Span:
     return low, high
 
 
-def _building(number: int, block: Block) -> Prop:
-    return Prop(FIRST_BUILDING + number % _CODES, (block,))
-
-
 def _signals(junction: Junction, lights: list[Prop]) -> list[SignalHead]:
-    heads, row = [], 0
-    for arm, light in zip(junction.arms, lights, strict=False):
-        heads.append(signal_head(arm, light, row))
-        row += len(light.blocks)
-    return heads
+    """Where the lamps of the arms' traffic lights are, whose blocks are the first of the world's solids."""
+    ends = accumulate(len(light.blocks) for light in lights)  # the lamps are the last blocks of a light
+    return [
+        SignalHead(arm=arm, rows=(end - 3, end - 2, end - 1)) for arm, end in zip(junction.arms, ends, strict=False)
+    ]
 
 
 def _pole_corner(rng: np.random.Generator, junction: Junction, between: tuple[Arm, Arm]) -> Corner:

@@ -349,6 +349,4 @@ def _view(kind: Kind, array: Any) -> Any:
 
 
 def _buffer(content: Any, dtype: np.dtype[Any], count: int) -> AnyArray:
-    if not count:
-        return np.zeros(0, dtype=dtype)
-    return np.frombuffer(content, dtype=dtype, count=count)
+    return np.frombuffer(content, dtype=dtype, count=count) if count else np.zeros(0, dtype=dtype)

@@ -261,12 +261,11 @@ def velocities_that_fit(boxes: ScenarioBoxes, displacement: FloatArray) -> tuple
     speed = np.linalg.norm(displacement[:, :2], axis=1)
     telling = (label_id != OWN_ACTOR_ID) & (label_id != UNTRACKED_ID) & (label_id < STATIC_ACTOR_ID)
     rows = np.flatnonzero(telling & (speed > _LEAST_SPEED) & np.isfinite(said).all(axis=1))
-    angles = _angles(boxes)
-    fits = {}
-    for name in VELOCITY_FRAMES:
-        off = np.linalg.norm(turned(said[rows], angles[name][rows]) - displacement[rows, :2], axis=1)
-        fits[name] = off < _FITS[0] + _FITS[1] * speed[rows]
-    return rows, fits
+    limit = _FITS[0] + _FITS[1] * speed[rows]
+    return rows, {
+        name: np.linalg.norm(turned(said[rows], angle[rows]) - displacement[rows, :2], axis=1) < limit
+        for name, angle in _angles(boxes).items()
+    }
 
 
 def decoded_velocities(boxes: ScenarioBoxes, displacement: FloatArray, frame: str | None) -> FloatArray:

@@ -65,8 +65,7 @@ def scenario_rows(files: ScenarioFiles) -> dict[str, Columns]:
 
 def scenario_boxes(files: ScenarioFiles) -> ScenarioBoxes:
     """A scenario's boxes, and where each was recorded."""
-    labelled = _sample_labelled(files)
-    sample = np.repeat(np.flatnonzero(labelled), files.labels.num_boxes)
+    sample = np.repeat(np.flatnonzero(_sample_labelled(files)), files.labels.num_boxes)
     agent, frame = np.divmod(sample, files.scan.num_frames)
     actor_of_agent = np.array([_actor_id(files, name) for name in files.scan.agents], dtype=np.int64)
     label_id = files.labels.actor_id
@@ -258,8 +257,7 @@ def _signalized_design(meta: Meta) -> int | None:
     if side in ("left", "right"):
         return {frozenset({"straight"}): 1, frozenset({"straight", "left"}): 2}.get(directions)
     if side.startswith("opposite"):
-        designs = {frozenset({"straight", "left"}): 3, frozenset({"left", "right"}): 4}
-        return designs.get(directions)
+        return {frozenset({"straight", "left"}): 3, frozenset({"left", "right"}): 4}.get(directions)
     return None
 
 

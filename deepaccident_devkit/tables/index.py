@@ -301,8 +301,7 @@ def _written_tables(
         return "", {}
     assigned = [splits.split_of.get(each.token) for each in outcomes]
     made_from = [(each.token, each.contents, split) for each, split in zip(outcomes, assigned, strict=True)]
-    text = repr((SCHEMA_VERSION, made_from))
-    name = _TABLES + hashlib.blake2b(text.encode(), digest_size=8).hexdigest()
+    name = _TABLES + hashlib.blake2b(repr((SCHEMA_VERSION, made_from)).encode(), digest_size=8).hexdigest()
     folder, before = place_in(store.folder, name, opened=True), Index.read(store.folder)
     if before is not None and before.tables == name and before.is_whole():
         files = dict(before.table_files)

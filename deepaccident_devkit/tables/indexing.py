@@ -146,8 +146,7 @@ def index_scenario(store: Store, scenario: ScenarioFolder, *, check_files: bool 
     key = f"{SCHEMA_VERSION}:{times_digest(scenario)}"  # before anything is read: a later edit is noticed
     token, scan = scenario.token, scan_scenario(scenario)
     if not scan.agents and not scan.problems:
-        left_out = f"{token}: its calib folders hold no files; left out"
-        return Outcome(token=token, notices=(*scan.notices, left_out))
+        return Outcome(token=token, notices=(*scan.notices, f"{token}: its calib folders hold no files; left out"))
     faults: Sequence[Finding] = scan.problems
     content = None if faults else store.kept(token, key, "index")
     contents = None if content is None else streams_metadata(content)[_CONTENTS]

@@ -60,7 +60,6 @@ class RecordTables:
         recorders = recorders[np.isin(agent["name"][recorders], codes)]
         num_frames = self._tables.columns("scenario")["num_frames"][agent["scenario_row"][recorders]]
         samples = _spans(agent["first_sample_row"][recorders], num_frames)
-        boxes = _spans(sample["first_annotation_row"][samples], sample["num_annotations"][samples])
         return {
             "scenario": chosen,
             "agent": recorders,
@@ -70,7 +69,7 @@ class RecordTables:
             "calibrated_sensor": self._rows_with("calibrated_sensor", "agent_row", recorders),
             "ego_pose": samples,
             "instance": self._rows_with("instance", "scenario_row", chosen),
-            "annotation": boxes,
+            "annotation": _spans(sample["first_annotation_row"][samples], sample["num_annotations"][samples]),
             "track": self._rows_with("track", "scenario_row", chosen),
         }
 

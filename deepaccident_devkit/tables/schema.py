@@ -63,9 +63,7 @@ def _field_schema(column: Column) -> dict[str, Any]:
 
 def _kind_schema(kind: Kind) -> dict[str, Any]:  # noqa: PLR0911 - one a kind
     match kind:
-        case Derived():
-            return {"type": "string"}
-        case Word():
+        case Derived() | Word():
             return {"type": "string"}
         case Items(type=item, nullable=nullable):
             items = {"type": [item, "null"] if nullable else item}

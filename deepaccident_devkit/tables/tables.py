@@ -198,10 +198,8 @@ class OpenTables:
 
     def samples_of(self, frame: RowArgument) -> list[records.SampleRecord]:
         """The samples of one moment, one for each agent that is there, in the order of `taxonomy.AGENTS`."""
-        row = self.frame.row(token_of(frame))
-        record = self.frame[row]
-        scenario_row = self.scenario.row(record["scenario_token"])
-        agents = self._tables.resolver.agents_of(scenario_row).values()
+        record = self.frame[self.frame.row(token_of(frame))]
+        agents = self._tables.resolver.agents_of(self.scenario.row(record["scenario_token"])).values()
         return [self.sample[self._tables.resolver.sample_at(agent, record["index"])] for agent in agents]
 
     def split_scenarios(self, split: str | os.PathLike[str], *, missing: OnError = "raise") -> set[str]:
@@ -243,8 +241,7 @@ class OpenTables:
                     f"{self._own_split_text()}"
                 )
             return here.intersection(read_split_file(self._split_files[split]))
-        known = self._tables.views["scenario"]["split"]
-        if (known < 0).all():
+        if (self._tables.views["scenario"]["split"] < 0).all():
             raise NotAvailableError(
                 f"{self.dataroot}: the split of its scenarios is unknown: it has neither split files ({split}.txt) nor "
                 f"split folders ({split}/); put the release's split files into it, {self._own_split_text()}"

@@ -79,8 +79,7 @@ def deepaccident_broken(deepaccident_release: Path, tmp_path_factory: pytest.Tem
 
     def broken(name: str) -> BrokenRelease:
         checked_breakage(name)
-        root = tmp_path_factory.mktemp("deepaccident") / "broken"
-        return break_release(_copied(deepaccident_release, root), name)
+        return break_release(_copied(deepaccident_release, tmp_path_factory.mktemp("deepaccident") / "broken"), name)
 
     return broken
 

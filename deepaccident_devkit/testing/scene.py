@@ -52,9 +52,8 @@ def cameras(image_size: tuple[int, int]) -> dict[str, PinholeCamera]:
 
 def calib_of(agent: AgentName, world_from_ego: SE3, image_size: tuple[int, int]) -> Calib:
     """An agent's calib of one frame."""
-    height = 0.0 if agent == INFRASTRUCTURE else _LIDAR_HEIGHT
     return Calib(
-        ego_from_lidar=SE3.from_yaw(0.0, (0.0, 0.0, height)),
+        ego_from_lidar=SE3.from_yaw(0.0, (0.0, 0.0, 0.0 if agent == INFRASTRUCTURE else _LIDAR_HEIGHT)),
         world_from_ego=world_from_ego,
         camera_from_lidar={channel: _camera_from_lidar(yaw) for channel, yaw in _CAMERA_YAW.items()},
         intrinsic={channel: camera.intrinsic for channel, camera in cameras(image_size).items()},
@@ -262,8 +261,7 @@ class Recorder:
             own = VEHICLE_AGENTS.index(agent)
             world = world.select([own, *(row for row in range(len(world)) if row != own)])
         self._velocity = world.velocity[:, :2]
-        lidar_from_world = (self._calib.world_from_ego @ self._calib.ego_from_lidar).inverse()
-        self._boxes = world.transform(lidar_from_world, "lidar")
+        self._boxes = world.transform((self._calib.world_from_ego @ self._calib.ego_from_lidar).inverse(), "lidar")
         height = self._calib.ego_from_lidar.translation[2] if self._own.any() else POLE_HEIGHT
         self._cloud = cloud_of(self._boxes.select(~self._own), float(height))
 

@@ -57,8 +57,7 @@ def rotation_matrix(yaw: float, pitch: float, roll: float) -> FloatArray:
     about_z = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
     about_y = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
     about_x = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
-    rotation: FloatArray = about_z @ about_y @ about_x
-    return rotation
+    return np.asarray(about_z @ about_y @ about_x)
 
 
 @st.composite

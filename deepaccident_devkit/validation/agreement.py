@@ -219,8 +219,7 @@ def _wrapped(angle: FloatArray) -> FloatArray:
 def check_story(subject: Subject) -> Iterator[Finding]:
     """All that meta says, compared with the format and the recordings."""
     if subject.files.scenario.name in SHEER_CURTAINS:
-        what = "vehicles behind sheer curtains are marked invisible"
-        yield subject.finding("sheer-curtain", subject.token, what)
+        yield subject.finding("sheer-curtain", subject.token, "vehicles behind sheer curtains are marked invisible")
     yield from _name(subject)
     if subject.files.meta is not None:
         for check in _CHECKS:
@@ -272,10 +271,11 @@ def _words(subject: Subject, meta: Meta) -> Iterator[Finding]:
 def _counts(subject: Subject, meta: Meta) -> Iterator[Finding]:
     expected = meta.recorded_frames
     if expected != subject.num_frames:
-        what = (
-            f"counts {meta.simulated_frames} simulated frames, so {expected} recorded ones, found {subject.num_frames}"
+        yield _at_meta(
+            subject,
+            "meta-frames",
+            f"counts {meta.simulated_frames} simulated frames, so {expected} recorded ones, found {subject.num_frames}",
         )
-        yield _at_meta(subject, "meta-frames", what)
 
 
 def _folder(subject: Subject, meta: Meta) -> Iterator[Finding]:

@@ -148,6 +148,5 @@ def _twins(splits: SplitAssignment) -> Iterator[Finding]:
         if token not in splits.problems and token not in splits.contradictions
     }
     for twins in torn_twins(known):
-        sides = list(zip(twins.scenarios, twins.splits, strict=True))
-        for (token, mine), (other, theirs) in permutations(sides):
+        for (token, mine), (other, theirs) in permutations(zip(twins.scenarios, twins.splits, strict=True)):
             yield make_finding("twins-apart", token, token, f"is of {mine}, its twin {other} of {theirs}")

@@ -152,12 +152,10 @@ def _tracks(subject: Subject) -> Iterator[Finding]:
     same = (subject.label_id[rows][1:] == subject.label_id[rows][:-1]) & (
         boxes.agent[rows][1:] == boxes.agent[rows][:-1]
     )
+    allowed = np.where(boxes.labels.category == CATEGORIES.index("pedestrian"), WALKER_SIZE_CHANGE, SIZE_CHANGE)
     for code, changed in (
         ("class-changes", boxes.labels.category[rows][1:] != boxes.labels.category[rows][:-1]),
-        (
-            "size-changes",
-            np.abs(np.diff(boxes.labels.size[rows], axis=0)).max(axis=1) > _size_change(subject)[rows[1:]],
-        ),
+        ("size-changes", np.abs(np.diff(boxes.labels.size[rows], axis=0)).max(axis=1) > allowed[rows[1:]]),
     ):
         yield from subject.label_findings(code, subject.mask(rows[1:][same & changed]), "changes along the track")
     step = np.diff(frame)
@@ -185,12 +183,6 @@ def _tracks(subject: Subject) -> Iterator[Finding]:
         )
 
 
-def _size_change(subject: Subject) -> FloatArray:
-    """(N,) metres by which each box's size may change from frame to frame."""
-    walks = subject.boxes.labels.category == CATEGORIES.index("pedestrian")
-    return np.where(walks, WALKER_SIZE_CHANGE, SIZE_CHANGE)
-
-
 def _is_car(subject: Subject) -> BoolArray:
     """(N,) boxes of what has four wheels."""
     return np.isin(subject.boxes.labels.category, _FOUR_WHEELS)
@@ -205,8 +197,7 @@ def _repeated(keys: AnyArray) -> BoolArray:
     if not len(keys):
         return np.zeros(0, dtype=bool)
     _, inverse, count = np.unique(keys, axis=0, return_inverse=True, return_counts=True)
-    repeated: BoolArray = count[inverse.reshape(-1)] > 1
-    return repeated
+    return np.asarray(count[inverse.reshape(-1)] > 1)
 
 
 _CHECKS: tuple[Callable[[Subject], Iterator[Finding]], ...] = (

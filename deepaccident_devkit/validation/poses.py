@@ -110,8 +110,7 @@ def _mounts(subject: Subject, agent: int) -> Iterator[Finding]:
         yield subject.finding(
             "lidar-height", subject.calib_where(agent), f"{expected}, {frames_text(np.flatnonzero(odd) + 1)}"
         )
-    mounts = {"lidar_to_ego": lidar, "lidar_to_Camera": calibs.camera_from_lidar[frames]}
-    for name, pose in mounts.items():
+    for name, pose in {"lidar_to_ego": lidar, "lidar_to_Camera": calibs.camera_from_lidar[frames]}.items():
         change = np.abs(pose - np.median(pose, axis=0))
         moved = change[..., :3, 3].reshape(len(pose), -1).max(axis=1)
         turned = change[..., :3, :3].reshape(len(pose), -1).max(axis=1)
@@ -166,8 +165,7 @@ def _central(position: FloatArray) -> FloatArray:
     """(F, 2) m/s from positions (F, 2) at 10 Hz; one-sided at the ends, 0 for a single frame."""
     if len(position) < 2:
         return np.zeros_like(position)
-    velocity: FloatArray = np.gradient(position, FRAME_PERIOD, axis=0)
-    return velocity
+    return np.asarray(np.gradient(position, FRAME_PERIOD, axis=0))
 
 
 _CHECKS: tuple[Callable[[Subject, int], Iterator[Finding]], ...] = (_intrinsics, _cameras, _mounts, _path, _speed)

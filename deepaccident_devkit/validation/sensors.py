@@ -237,8 +237,7 @@ def _odd_in(frames: Sequence[int], thumbnails: Mapping[int, FloatArray]) -> list
 
 
 def _distance(first: FloatArray, second: FloatArray) -> FloatArray:
-    distance: FloatArray = np.abs(first - second).mean(axis=(1, 2, 3))
-    return distance
+    return np.asarray(np.abs(first - second).mean(axis=(1, 2, 3)))
 
 
 def _clouds(subject: Subject, agent: int, paths: Mapping[int, ReleasePath], telling: list[int]) -> Iterator[Finding]:
@@ -290,14 +289,12 @@ def _miscounted(boxes: Boxes, points: FloatArray) -> tuple[int, int, int]:
 
 def _many_off(off: IntArray, limit: tuple[int, float]) -> BoolArray:
     """Whether so many boxes, and so large a share, are off: (…, 3) counts of `_miscounted` → (…)."""
-    many: BoolArray = (off[..., 0] >= limit[0]) & (off[..., 0] >= limit[1] * off[..., 1])
-    return many
+    return np.asarray((off[..., 0] >= limit[0]) & (off[..., 0] >= limit[1] * off[..., 1]))
 
 
 def _sample_boxes(subject: Subject, agent: int, frame: int) -> Boxes:
     """The boxes of one label in its LiDAR frame."""
-    rows = np.flatnonzero(subject.boxes.sample == agent * subject.num_frames + frame - 1)
-    return subject.lidar_boxes.select(rows)
+    return subject.lidar_boxes.select(np.flatnonzero(subject.boxes.sample == agent * subject.num_frames + frame - 1))
 
 
 def _bevs(subject: Subject, agent: int, paths: Mapping[int, ReleasePath], telling: list[int]) -> Iterator[Finding]:
@@ -359,8 +356,7 @@ def _turned(places: FloatArray, orientation: str) -> FloatArray:
 def _hits(semantic: ByteArray, places: FloatArray) -> BoolArray:
     center = (BEV_SHAPE[0] - 1) / 2
     pixels: IntArray = np.rint(center - places / BEV_RESOLUTION).astype(np.int64)
-    hit: BoolArray = semantic[pixels[:, 0], pixels[:, 1]] == TAGS["vehicle"]
-    return hit
+    return np.asarray(semantic[pixels[:, 0], pixels[:, 1]] == TAGS["vehicle"])
 
 
 def _repeated(subject: Subject, checksums: Mapping[str, Sequence[tuple[str, str, int]]]) -> Iterator[Finding]:

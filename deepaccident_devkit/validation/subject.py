@@ -67,14 +67,12 @@ class Subject:
     @cached_property
     def seen(self) -> BoolArray:
         """(N,) tracked boxes of others: neither the recording agent itself nor untracked."""
-        seen: BoolArray = (self.label_id != OWN_ACTOR_ID) & (self.label_id != UNTRACKED_ID)
-        return seen
+        return np.asarray((self.label_id != OWN_ACTOR_ID) & (self.label_id != UNTRACKED_ID))
 
     @cached_property
     def own(self) -> BoolArray:
         """(N,) the recording agents' own rows."""
-        own: BoolArray = self.label_id == OWN_ACTOR_ID
-        return own
+        return np.asarray(self.label_id == OWN_ACTOR_ID)
 
     @cached_property
     def in_collision(self) -> BoolArray:
@@ -101,8 +99,7 @@ class Subject:
         hidden = self.seen & (labels.num_lidar_pts == 0) & ~labels.camera_visible & (distance < _SURE_REACH)
         furthest = np.zeros(len(self.agents))
         np.maximum.at(furthest, agent, distance)
-        reach: FloatArray = np.minimum(_SURE_REACH, _SHARE_OF_FURTHEST * furthest) * hidden.any()
-        return reach
+        return np.asarray(np.minimum(_SURE_REACH, _SHARE_OF_FURTHEST * furthest) * hidden.any())
 
     def has_untracked(self, agent: int, frames: IntArray, places: FloatArray) -> BoolArray:
         """Which places (M, 3) of the world an agent annotated as untracked (id −1) at the frames (M,)."""
@@ -112,10 +109,8 @@ class Subject:
         from scipy.spatial import cKDTree
 
         tree = cKDTree(np.unique(tree_points(self.centers[rows], self.boxes.frame[rows], _UNTRACKED_PLACE), axis=0))
-        points = tree_points(places, frames, _UNTRACKED_PLACE)
-        distance, _ = tree.query(points, distance_upper_bound=_UNTRACKED_PLACE)
-        found: BoolArray = np.isfinite(distance)
-        return found
+        distance, _ = tree.query(tree_points(places, frames, _UNTRACKED_PLACE), distance_upper_bound=_UNTRACKED_PLACE)
+        return np.asarray(np.isfinite(distance))
 
     @cached_property
     def lidar_boxes(self) -> Boxes:

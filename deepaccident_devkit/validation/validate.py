@@ -175,8 +175,7 @@ class ValidationReport(Report):
             whole: whether to list all that was found of a scenario.
         """
         most = sys.maxsize if whole else _LINES_A_SCENARIO
-        blocks = [self._head(), *self._scenario_blocks(most, notes=notes), *self._closing(notes=notes)]
-        return "\n\n".join(blocks)
+        return "\n\n".join([self._head(), *self._scenario_blocks(most, notes=notes), *self._closing(notes=notes)])
 
     def _head(self) -> str:
         depth = "every file decoded" if self.deep else "labels, calib, meta and file names (--deep decodes the rest)"
@@ -204,10 +203,11 @@ class ValidationReport(Report):
         if by_code:
             rank = {severity: place for place, severity in enumerate(SEVERITIES)}
             rows = sorted(by_code.items(), key=lambda item: (rank[item[0][0]], -item[1], item[0][1]))
-            lines = [f"{'kind':<24} {'how bad':<8} {'findings':>8}"]
-            for (severity, code, known), count in rows:
-                lines.append(f"{code:<24} {severity:<8} {count:>8}{'  known of the release' if known else ''}")
-            yield "\n".join(lines)
+            lines = (
+                f"{code:<24} {severity:<8} {count:>8}{'  known of the release' if known else ''}"
+                for (severity, code, known), count in rows
+            )
+            yield "\n".join([f"{'kind':<24} {'how bad':<8} {'findings':>8}", *lines])
         if self.velocity.boxes:
             shares = ", ".join(
                 f"{name} {count / self.velocity.boxes:.0%}" for name, count in self.velocity.fits.items()

@@ -265,13 +265,12 @@ def _address(**chosen: object) -> str:
 def _tested(number: ComparedNumber) -> dict[str, str]:
     """A headline number of both, and whether its difference is real."""
     unit: Any = number.unit
-    interval = "" if number.low is None or number.high is None else f"{number.low:+.3f} to {number.high:+.3f}"
     return {
         "name": str(number.headline),
         "a": value_text(number.a, unit),
         "b": value_text(number.b, unit),
         "difference": value_text(number.difference, unit, signed=True),
-        "interval": interval,
+        "interval": "" if number.low is None or number.high is None else f"{number.low:+.3f} to {number.high:+.3f}",
         "p": "–" if number.adjusted_p is None else f"{number.adjusted_p:.3f}",
         "decision": number.decision,
     }
@@ -295,8 +294,7 @@ def _row(a: Model, b: Model, each: ComparedSample) -> dict[str, Any]:
 def _sample(request: Request) -> Response:
     explorer, (a, b) = explorer_of(request), _pair(request)
     token = known_sample(request, a, b)
-    shared = a.rows.keys() & b.rows.keys()
-    before, after = beside_in_time(shared, token)
+    before, after = beside_in_time(a.rows.keys() & b.rows.keys(), token)
     job = differences_job(explorer, a, b)
     better = _asked_better(request)
     waits = titles([job])

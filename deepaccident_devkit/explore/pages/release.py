@@ -187,10 +187,10 @@ def _chosen(choices: Choices) -> list[tuple[str, str]]:
             left = tuple(each for each in values if each != value)
             facets = {**choices.facets, name: left} if left else {k: v for k, v in choices.facets.items() if k != name}
             chosen.append((f"{name}={value}", choices.address(facets=facets, page=1)))
-    for line in choices.lines:
-        query = "; ".join(each for each in choices.lines if each != line)
-        chosen.append((line, choices.address(query=query, page=1)))
-    return chosen
+    return chosen + [
+        (line, choices.address(query="; ".join(each for each in choices.lines if each != line), page=1))
+        for line in choices.lines
+    ]
 
 
 def _selection(request: Request) -> Response:

@@ -92,8 +92,7 @@ def static_routes() -> list[Route]:
 
 def asset(root: str, name: str) -> str:
     """The relative address of a style or script from a page whose way to the first page is `root`."""
-    content = assets()[name]
-    digest = hashlib.blake2b(content.encode(), digest_size=6).hexdigest()
+    digest = hashlib.blake2b(assets()[name].encode(), digest_size=6).hexdigest()
     return f"{root}static/{digest}/{name}"
 
 
@@ -101,9 +100,8 @@ def asset(root: str, name: str) -> str:
 def assets() -> dict[str, str]:
     """Name → text."""
     folder = files("deepaccident_devkit.explore") / "static"
-    own = {each.name: each.read_text(encoding="utf-8") for each in folder.iterdir() if each.name[0] != "_"}
     return {
-        **own,
+        **{each.name: each.read_text(encoding="utf-8") for each in folder.iterdir() if each.name[0] != "_"},
         "pages.css": page_style(),
         "replay.css": replay_style(),
         "replay-player.js": replay_script(),

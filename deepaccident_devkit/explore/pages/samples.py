@@ -243,8 +243,7 @@ def frames_ahead(explorer: Explorer, model: Model, token: str) -> list[float]:
     form = None if model.results is None else model.results.form
     if model.setup.task != "motion" or form is None or not is_sample(explorer.dataset, token):
         return []
-    left = float(explorer.dataset.get("sample", token)["time_to_end"])
-    last = min(model.setup.horizon, left)
+    last = min(model.setup.horizon, float(explorer.dataset.get("sample", token)["time_to_end"]))
     return [number * form.step for number in range(int((last + FRAME_PERIOD / 2) / form.step) + 1)]
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import math
 import re
 from collections.abc import Callable, Mapping
@@ -19,6 +18,7 @@ from deepaccident_devkit.explore.explorer import Explorer
 from deepaccident_devkit.explore.models import FORESEEN
 from deepaccident_devkit.explore.pages.responses import KEPT, explorer_of, page, picture, rendered, root_of, with_slash
 from deepaccident_devkit.interactions import interactions
+from deepaccident_devkit.release.images import picture_bytes
 from deepaccident_devkit.render import detached_figure, render_motion_labels, render_sample
 from deepaccident_devkit.render.boxes import recorders_of
 from deepaccident_devkit.render.replay import cloud_text, script_json
@@ -112,8 +112,7 @@ def scenario_context(explorer: Explorer, token: str, model: str | None) -> dict[
 def _player(request: Request) -> Response:
     """The replay alone, for a page that shows two of them side by side."""
     explorer, token = explorer_of(request), token_of(request)
-    context = scenario_context(explorer, token, request.query_params.get("model"))
-    return page(request, "player.html", **context)
+    return page(request, "player.html", **scenario_context(explorer, token, request.query_params.get("model")))
 
 
 def _twin(request: Request) -> Response:
@@ -282,9 +281,7 @@ def _jpeg(explorer: Explorer, sample: str, channel: str, width: int) -> bytes:
     lens = explorer.dataset.camera(sample, channel)
     size = min(width, lens.width), max(1, round(lens.height * min(width, lens.width) / lens.width))
     image = explorer.dataset.load_image(sample, channel, least=size[::-1], size=size[::-1])
-    written = io.BytesIO()
-    Image.fromarray(image).save(written, "JPEG", quality=_QUALITY)
-    return written.getvalue()
+    return picture_bytes(Image.fromarray(image), "JPEG", quality=_QUALITY)
 
 
 def _points(request: Request) -> Response:

@@ -7,8 +7,10 @@ so every rendering is there again as points, on a topic that ends in `/points`.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import count
 from types import TracebackType
 from typing import IO, Any, Final
 
@@ -86,7 +88,7 @@ class Recording:
         self._writer.start(profile="", library=f"deepaccident_devkit {__version__}")
         self._schemas: dict[str, int] = {}
         self._topics: dict[str, int] = {}
-        self._sequence: dict[str, int] = {}
+        self._sequence: dict[str, Iterator[int]] = defaultdict(count)
 
     def __enter__(self) -> Recording:
         return self
@@ -104,14 +106,12 @@ class Recording:
             self._topics[topic] = self._writer.register_channel(
                 topic=topic, message_encoding="protobuf", schema_id=self._schema(message)
             )
-        sequence = self._sequence.get(topic, 0)
-        self._sequence[topic] = sequence + 1
         time = frame_nanoseconds(index)
         self._writer.add_message(
             channel_id=self._topics[topic],
             log_time=time,
             publish_time=time,
-            sequence=sequence,
+            sequence=next(self._sequence[topic]),
             data=message.SerializeToString(deterministic=True),
         )
 
@@ -163,8 +163,7 @@ def moment_of(scenario: str, index: int, agents: tuple[str, ...]) -> Moment:
 
 def exported_agents(dataset: Dataset, scenario: str, agents: Agents) -> tuple[str, ...]:
     """The agents that an `agents=` argument means, in usual order; raises ChoiceError and NotAvailableError."""
-    first = agents_of(dataset, scenario)[0]
-    chosen = cooperating_agents(dataset, sample_token(scenario, first, 1), agents)
+    chosen = cooperating_agents(dataset, sample_token(scenario, agents_of(dataset, scenario)[0], 1), agents)
     return tuple(agent for agent in AGENTS if agent in chosen)
 
 
@@ -310,9 +309,7 @@ def box_segments(boxes: Boxes) -> FloatArray:
 
 def above(boxes: Boxes, row: int) -> FloatArray:
     """(3,) the place of a box's text."""
-    height = boxes.size[row, 2] / 2 + _TEXT_ABOVE
-    place: FloatArray = boxes.center[row] + np.array([0.0, 0.0, height])
-    return place
+    return np.asarray(boxes.center[row] + np.array([0.0, 0.0, boxes.size[row, 2] / 2 + _TEXT_ABOVE]))
 
 
 def segment_points(segments: FloatArray, color: str, alpha: float = 1.0) -> AnyArray:

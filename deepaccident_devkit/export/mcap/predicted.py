@@ -12,7 +12,7 @@ from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.evaluation.detection import DetectedBoxes
 from deepaccident_devkit.evaluation.predictions import Accident, MotionOutput
-from deepaccident_devkit.evaluation.results import Prediction, Results
+from deepaccident_devkit.evaluation.results import Results
 from deepaccident_devkit.export.mcap import Predictions
 from deepaccident_devkit.export.mcap.messages import (
     COLORED_POINT,
@@ -134,12 +134,9 @@ class PredictedScenes:
         """Write the predictions of a moment's samples; raises ConfigError or ResultsError."""
         for agent, sample in moment.samples.items():
             if self.has(sample):
-                _write(agent, self._of(sample), moment.index, recording)
-
-    def _of(self, sample: str) -> Prediction:
-        if isinstance(self._prediction, Results):
-            return self._prediction.prediction(sample)
-        return self._prediction[sample]
+                given = self._prediction
+                found = given.prediction(sample) if isinstance(given, Results) else given[sample]
+                _write(agent, found, moment.index, recording)
 
 
 def _write(agent: str, prediction: object, index: int, recording: Recording) -> None:
@@ -209,7 +206,8 @@ def _write_accidents(agent: str, accidents: Sequence[Accident], topic: str, inde
 
 
 def _sphere(place: Any) -> Any:
-    turn = np.array([1.0, 0.0, 0.0, 0.0])
     return SpherePrimitive(
-        pose=pose(place, turn), size=vector(np.full(3, _MARK)), color=color_message(PREDICTED_COLOR, 0.8)
+        pose=pose(place, np.array([1.0, 0.0, 0.0, 0.0])),
+        size=vector(np.full(3, _MARK)),
+        color=color_message(PREDICTED_COLOR, 0.8),
     )

@@ -211,8 +211,7 @@ class Story:
 
 
 def _log(text: str, index: int, recording: Recording, level: int = Log.INFO) -> None:
-    message = Log(timestamp=frame_timestamp(index), level=level, message=text, name=METADATA)
-    recording.write("/log", message, index)
+    recording.write("/log", Log(timestamp=frame_timestamp(index), level=level, message=text, name=METADATA), index)
 
 
 class Sensors:
@@ -245,8 +244,7 @@ class Sensors:
         (content, size), channel = read_jpeg(path), token.rsplit("/", 1)[1]
         frame = frame_id(agent, channel)
         image = CompressedImage(timestamp=frame_timestamp(index), frame_id=frame, data=content, format="jpeg")
-        calibration = _calibration(self._dataset, token, size, frame, index)
-        recording.write(f"/{frame}/calibration", calibration, index)
+        recording.write(f"/{frame}/calibration", _calibration(self._dataset, token, size, frame, index), index)
         recording.write(f"/{frame}/image", image, index)
 
     def _write_cloud(self, agent: str, sample: str, index: int, recording: Recording) -> None:
@@ -309,10 +307,9 @@ class Actors:
         for row, actor in enumerate(boxes.actor_id.tolist()):
             color = colors[row]
             trail, path = self._trail(actor, moment.index)
-            annotated = [name for bit, name in enumerate(AGENTS) if view.seen_by[row] >> bit & 1]
             facts = {
                 **self._facts(boxes, row, actor),
-                "annotated_by": ", ".join(annotated),
+                "annotated_by": ", ".join([name for bit, name in enumerate(AGENTS) if view.seen_by[row] >> bit & 1]),
                 "seen_by": ", ".join(agent for agent, actors in seen.items() if actor in actors),
             }
             name = str(actor)
@@ -373,8 +370,7 @@ class Actors:
 
     def _trail(self, actor: int, index: int) -> tuple[FloatArray, FloatArray]:
         """Where an actor was and where it will be, (n, 3) each, in world; both include the present."""
-        none = np.zeros((0, 3))
-        frames, centers = self._paths.get(actor, (np.zeros(0, dtype=np.int64), none))
+        frames, centers = self._paths.get(actor, (np.zeros(0, dtype=np.int64), np.zeros((0, 3))))
         past = (frames <= index) & (frames >= index - TRAIL_FRAMES)
         future = (frames >= index) & (frames <= index + TRAIL_FRAMES)
         return centers[past], centers[future]

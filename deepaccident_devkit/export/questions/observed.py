@@ -222,8 +222,7 @@ class Observations:
         """The speeds (N,) in rows of the labels of some agents."""
         first = np.zeros(len(AGENTS), dtype=np.int64)
         for agent in self.agents:
-            rows = self.dataset.annotation_rows(sample_token(self.scenario, agent, frame))
-            first[AGENTS.index(agent)] = rows.start
+            first[AGENTS.index(agent)] = self.dataset.annotation_rows(sample_token(self.scenario, agent, frame)).start
         said = self.dataset.columns("annotation")["velocity_label"]
         speed: FloatArray = np.linalg.norm(said[first[source] + row], axis=1)
         return speed

@@ -89,9 +89,7 @@ def open_dataroot(
     if isinstance(located, str):
         return _opened_url(UrlSource(located), places, refresh=refresh)
     archives = _archives(located)
-    if not archives:
-        return located
-    return _opened_archives(located, archives, places, **how)
+    return _opened_archives(located, archives, places, **how) if archives else located
 
 
 def index_places(dataroot: Dataroot, index_dir: Path | None = None) -> Iterator[Path]:
@@ -307,6 +305,5 @@ def _told(url: str) -> Iterator[None]:
     except OSError as error:
         if isinstance(error, DeepAccidentError):
             raise
-        missing = isinstance(error, FileNotFoundError)
-        what = "does not exist, or may not be listed" if missing else fault_text(error)
+        what = "does not exist, or may not be listed" if isinstance(error, FileNotFoundError) else fault_text(error)
         raise DatarootError(f"{url}: {what}; check the URL, and the credentials in the environment") from None

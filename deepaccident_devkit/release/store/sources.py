@@ -116,8 +116,7 @@ class UrlSource(Source):
     def read(self, archive: str, start: int, stop: int) -> bytes:
         """Bytes of an archive, or of a file."""
         files, root = self._files()
-        content = asked(lambda: files.cat_file(f"{root}/{archive}", start=start, end=stop))
-        return cast("bytes", content)
+        return cast("bytes", asked(lambda: files.cat_file(f"{root}/{archive}", start=start, end=stop)))
 
     def read_all(self, ranges: Sequence[Range]) -> list[bytes]:
         """Several parts, together: what lies close together comes as one."""

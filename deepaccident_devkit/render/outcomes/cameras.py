@@ -105,8 +105,7 @@ class CameraView:
         """Render lines (V, 2) in pixels, on wider ones that set them off from the image."""
         from matplotlib.collections import LineCollection
 
-        casing = CASINGS.get(color, CASING_COLOR)
-        below = LineCollection(lines, colors=casing, linewidths=width + _CASING, alpha=0.7)
+        below = LineCollection(lines, colors=CASINGS.get(color, CASING_COLOR), linewidths=width + _CASING, alpha=0.7)
         above = LineCollection(lines, colors=color, linewidths=width, linestyles=DASHED if dashed else "solid")
         self.ax.add_collection(below, autolim=False)  # the image has set the limits
         self.ax.add_collection(above, autolim=False)
@@ -173,8 +172,7 @@ def render_outcome_in_cameras(
     ahead = number * verdict.outcome.true.step if isinstance(verdict, MotionVerdict) else 0.0
     words = f"instances in {ahead:.1f} s" if ahead else ""
     fig = figure_or_new(fig, _SIZE)
-    axes = fig.subplot_mosaic([[*row] for row in CAMERA_GRID])
-    for channel, ax in axes.items():
+    for channel, ax in fig.subplot_mosaic([[*row] for row in CAMERA_GRID]).items():
         draw_outcome_in_camera(dataset, verdict, channel, frame=frame, ax=ax)
     draw_legend(fig, _handles(verdict))
     set_scene_title(fig, dataset, verdict.sample, words, below=verdict.words)
@@ -293,10 +291,9 @@ def _handles(verdict: Verdict) -> list[Artist]:
         ring = Line2D([], [], marker="o", fillstyle="none", color=COLLIDER_COLOR, label="accident to come", **how)
         return [ring, Line2D([], [], marker="x", color=FORESEEN_COLOR, label="foreseen", **how)]
     detects = isinstance(verdict, DetectionVerdict)
-    names = {"right": "detected" if detects else "right", "false": "false"}
     fills: list[Artist] = [
         Patch(label=words, facecolor=(OUTCOME_COLORS[kind], 0.4), edgecolor=OUTCOME_COLORS[kind])
-        for kind, words in names.items()
+        for kind, words in {"right": "detected" if detects else "right", "false": "false"}.items()
     ]
     pale = OUTCOME_COLORS["missed"]
     missed = Patch(label="missed", facecolor=pale, edgecolor=CASINGS[pale], linestyle=DASHED)

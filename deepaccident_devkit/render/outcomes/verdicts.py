@@ -139,8 +139,7 @@ def _of_motion(token: str, given: MotionOutput, label: MotionLabels, judge: Moti
         f"{within.false_positive} FP, {within.false_negative} FN"
         for name, within in judge.compute().ranges.items()
     ]
-    outcome = motion_outcome(given, label)
-    return MotionVerdict(sample=token, label=label, outcome=outcome, words="; ".join(ranges))
+    return MotionVerdict(sample=token, label=label, outcome=motion_outcome(given, label), words="; ".join(ranges))
 
 
 def _of_accident(

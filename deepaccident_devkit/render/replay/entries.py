@@ -101,8 +101,7 @@ def recording_of(dataset: Dataset, scenario: RowArgument | None, agents: Agents)
     NotAvailableError if the release has no scenario.
     """
     record = dataset.scenario[dataset.getind("scenario", default_scenario(dataset) if scenario is None else scenario)]
-    first = sample_token(record["token"], agents_of(dataset, record)[0], 1)
-    chosen = cooperating_agents(dataset, first, agents)
+    chosen = cooperating_agents(dataset, sample_token(record["token"], agents_of(dataset, record)[0], 1), agents)
     contact, unknown = None, ""
     try:
         contact = collision(dataset, record)

@@ -274,8 +274,7 @@ def notes(
 
     The settings are None if there is no picture; `most` is how many points a cloud may have.
     """
-    missing = [*_missing_pictures(files), *_pictures(files, settings), *_clouds(clouds, most)]
-    return [*_labels(recording), *missing]
+    return [*_labels(recording), *_missing_pictures(files), *_pictures(files, settings), *_clouds(clouds, most)]
 
 
 def served_notes(recording: Recording, files: CameraFiles, clouds: list[list[bool]]) -> list[str]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import io
 from collections.abc import Sequence
 from typing import Any, Final
 
@@ -11,6 +10,7 @@ import numpy as np
 
 from deepaccident_devkit.geometry import SE3
 from deepaccident_devkit.release import BevImage
+from deepaccident_devkit.release.images import picture_bytes
 from deepaccident_devkit.release.npz import TAGS
 from deepaccident_devkit.render.captions import is_there
 from deepaccident_devkit.render.ground import map_beneath
@@ -49,8 +49,7 @@ def road_picture(recording: Recording) -> dict[str, Any] | None:
     middles = np.array([pose.translation[:2] for pose in poses])
     low, high = middles.min(axis=0) - reach, middles.max(axis=0) + reach
     grounds = (_merged(seen, low, high, cell) if town is None else _mapped(town, low, high, cell) for cell in _CELLS)
-    pictures = map(_png, grounds)
-    png = next((each for each in pictures if len(each) <= _MOST), None)
+    png = next((each for each in map(_png, grounds) if len(each) <= _MOST), None)
     if png is None:
         return None
     left, top = recording.places([low[0], high[1]])
@@ -118,6 +117,4 @@ def _png(cells: ByteArray) -> bytes:
 
     picture = Image.fromarray(cells)
     picture.putpalette([255, 255, 255, *(part for name in _GROUND for part in ImageColor.getrgb(BEV_COLORS[name]))])
-    written = io.BytesIO()
-    picture.save(written, "PNG", optimize=True, bits=2, transparency=0)
-    return written.getvalue()
+    return picture_bytes(picture, "PNG", optimize=True, bits=2, transparency=0)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import io
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -16,6 +15,7 @@ from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.geometry.camera import IN_FRONT_DEPTH
 from deepaccident_devkit.parallel import own_threads, run_batch
 from deepaccident_devkit.release import read_image
+from deepaccident_devkit.release.images import picture_bytes
 from deepaccident_devkit.release.store import ReleasePath
 from deepaccident_devkit.render.replay.entries import Recording
 from deepaccident_devkit.support.arrays import AnyArray, ByteArray, FloatArray, IntArray, as_floats
@@ -213,8 +213,7 @@ def camera_pictures(
         ]
         for (agent, channel), paths in files.items()
     }
-    frames = max(map(len, files.values()))
-    return _fitting(images, limit, _ladder(frames), progress=progress)
+    return _fitting(images, limit, _ladder(max(map(len, files.values()))), progress=progress)
 
 
 def _paths(recording: Recording, agent: str, channel: str) -> Iterator[ReleasePath]:
@@ -293,9 +292,7 @@ def _jpeg(image: ByteArray, settings: PictureSettings, *, large: bool) -> bytes:
     picture = Image.fromarray(image)
     if width > most:
         picture = picture.resize((most, max(1, round(height * most / width))), reducing_gap=2.0)
-    written = io.BytesIO()
-    picture.save(written, "JPEG", quality=settings.quality, optimize=True)
-    return written.getvalue()
+    return picture_bytes(picture, "JPEG", quality=settings.quality, optimize=True)
 
 
 def most_points(clouds: int, limit: float) -> int:

@@ -168,8 +168,7 @@ def _paint_arm(view: ByteArray, beside: FloatArray, spec: RoadSpec, *, yields: b
     _paint(view, (across > 0.05) & (across < 0.2), before, YELLOW)
     for divider in range(1, spec.lanes):
         _paint(view, np.abs(across - divider * LANE_WIDTH) < 0.06, dashes, WHITE)
-    edge = np.abs(across - spec.lanes_edge) < 0.06
-    _paint(view, edge, dashes, WHITE)
+    _paint(view, np.abs(across - spec.lanes_edge) < 0.06, dashes, WHITE)
     _paint(view, (across > spec.lanes_edge) & (across < spec.road_edge), _slot_lines(along, spec), WHITE)
     low, high = spec.crosswalk
     _paint(view, _stripes(beside, spec.road_edge), (along > low) & (along < high), WHITE)
@@ -180,8 +179,7 @@ def _paint_arm(view: ByteArray, beside: FloatArray, spec: RoadSpec, *, yields: b
 
 
 def _slot_lines(along: FloatArray, spec: RoadSpec) -> BoolArray:
-    edges = slot_edges(spec)
-    return np.asarray(np.abs(along[:, None] - edges).min(axis=1) < 0.06)
+    return np.asarray(np.abs(along[:, None] - slot_edges(spec)).min(axis=1) < 0.06)
 
 
 def _stripes(beside: FloatArray, kerb: float) -> BoolArray:
@@ -287,8 +285,7 @@ class Junction:
     def stop_line(self, arm: Arm) -> FloatArray:
         """The line where those who come by this arm stop, (2, 2) metres: from the middle line to the lanes' edge."""
         self._check_arm(arm)
-        beside = np.array([0.0, self.spec.lanes_edge])
-        return readonly(_on_arm(arm, np.full(2, self.spec.stop_line[1]), beside))
+        return readonly(_on_arm(arm, np.full(2, self.spec.stop_line[1]), np.array([0.0, self.spec.lanes_edge])))
 
     def crosswalk(self, arm: Arm) -> Path:
         """The path across an arm's road, between the sidewalks: seen outward, from right to left; marked or not."""

@@ -208,9 +208,7 @@ class RoadSpec:
     @property
     def yielding_arms(self) -> tuple[Arm, ...]:
         """The arms that have a yield line: at a junction without lights, those of the road from south to north."""
-        if self.signalized:
-            return ()
-        return tuple(arm for arm in self.arms if arm in ("south", "north"))
+        return () if self.signalized else tuple(arm for arm in self.arms if arm in ("south", "north"))
 
     @property
     def lanes_edge(self) -> float:
@@ -270,8 +268,7 @@ _LAST = 110.0
 def slot_edges(spec: RoadSpec) -> FloatArray:
     """The edges of the parking slots, metres along an arm, (S + 1,)."""
     first = spec.stop_line[1] + _KEPT_FREE
-    edges: FloatArray = first + SLOT_LENGTH * np.arange(int((_LAST - first) / SLOT_LENGTH) + 1, dtype=np.float64)
-    return edges
+    return np.asarray(first + SLOT_LENGTH * np.arange(int((_LAST - first) / SLOT_LENGTH) + 1, dtype=np.float64))
 
 
 def parking_places(spec: RoadSpec) -> FloatArray:
@@ -284,13 +281,12 @@ def parking_places(spec: RoadSpec) -> FloatArray:
         x, y = OUTWARD[arm]
         outward = np.arctan2(y, x)
         for side, yaw in ((1, outward + np.pi), (-1, outward)):
-            wrapped = np.arctan2(np.sin(yaw), np.cos(yaw))
             places.append(
                 np.column_stack(
                     [
                         along * x - side * beside * y,
                         along * y + side * beside * x,
-                        np.full(len(along), wrapped),
+                        np.full(len(along), np.arctan2(np.sin(yaw), np.cos(yaw))),
                     ]
                 )
             )

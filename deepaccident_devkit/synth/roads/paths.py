@@ -106,8 +106,7 @@ class Path(FrozenArrays):
         around = _COARSE * _squares(points, self.xy[::_COARSE]).argmin(axis=1)
         window = np.clip(around[:, None] + np.arange(-_COARSE, _COARSE + 1), 0, len(self.xy) - 1)
         best = ((points[:, None] - self.xy[window]) ** 2).sum(axis=2).argmin(axis=1)
-        nearest: IntArray = window[np.arange(len(points)), best]
-        return nearest
+        return np.asarray(window[np.arange(len(points)), best])
 
 
 def crossing(path_a: Path, path_b: Path, *, within: float = _MEETING) -> Meeting | None:
@@ -211,8 +210,7 @@ def _near(points: FloatArray, path: Path, within: float) -> BoolArray:
 
 def _squares(points: FloatArray, others: FloatArray) -> FloatArray:
     """Squared distances (N, M) from each of the points (N, 2) to each of the others (M, 2)."""
-    squares: FloatArray = (points[:, None, 0] - others[:, 0]) ** 2 + (points[:, None, 1] - others[:, 1]) ** 2
-    return squares
+    return np.asarray((points[:, None, 0] - others[:, 0]) ** 2 + (points[:, None, 1] - others[:, 1]) ** 2)
 
 
 _ANGLE = np.pi / 4
@@ -226,8 +224,7 @@ Piece = tuple[float, float, float]
 
 def quarter_turn(tangent: float, *, left: bool) -> list[Piece]:
     """Pieces that turn by a right angle, over `tangent` metres before and after where the two lines cross."""
-    radius = tangent / _shape()[0]
-    return _pieces(radius, 1.0 if left else -1.0)
+    return _pieces(tangent / _shape()[0], 1.0 if left else -1.0)
 
 
 def tangent_of_radius(radius: float) -> float:

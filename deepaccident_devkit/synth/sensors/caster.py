@@ -92,8 +92,7 @@ class EmbreeCaster:
             ends = None if reach is None else reach.astype(np.float32)  # a copy, because Embree writes into it
             hits = self._scene.run(starts, rays, ends, query="INTERSECT", output=True)
             face, distance = hits["primID"] >> 1, hits["tfar"]
-            missed = face < 0
-            distance[missed] = np.inf
+            distance[face < 0] = np.inf
             face[face >= self._faces] = GROUND
         if self._plane:
             below = plane_distance(origin[..., 2], rays[:, 2])

@@ -252,8 +252,7 @@ def _cast_boxed(scene: Scene, lidar: Lidar, ground_from_lidar: SE3) -> tuple[Int
     setting = scene.setting
     near, others = rays_to_boxes(scene, ground_from_lidar, _others(setting.moving, lidar), setting.parked)
     wanted = near | others
-    met = np.isfinite(lidar.distance)
-    wanted[lidar.body[met]] = False
+    wanted[lidar.body[np.isfinite(lidar.distance)]] = False
     rows = np.flatnonzero(wanted)
     rays = turned_rays(ground_from_lidar.rotation, rows)
     distance, face = scene.cast(ground_from_lidar.translation, rays, near=np.flatnonzero(near[rows]))

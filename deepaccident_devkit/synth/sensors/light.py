@@ -223,8 +223,7 @@ def rain_streaks(size: tuple[int, int], rain: float, rng: np.random.Generator) -
     bright = (18 + 40 * near).astype(np.int64).tolist()
     for one, other, light in zip(first, last, bright, strict=True):
         cv2.line(streaks, one, other, light, 1, cv2.LINE_AA, 4)
-    blurred = cv2.GaussianBlur(streaks, (3, 3), 0)
-    return np.asarray(cv2.merge([blurred] * 3))
+    return np.asarray(cv2.merge([cv2.GaussianBlur(streaks, (3, 3), 0)] * 3))
 
 
 _CELLS = 600

@@ -255,8 +255,7 @@ def _add_ground(picture: ByteArray, rays: Rays, points: Points, ground: Ground, 
         here = shown & (rays.depth < end)
         shown ^= here
         for part in _part_of(here):
-            colors = ground.at(points.x[part], points.y[part], level)
-            cv2.copyTo(colors, here[part].view(np.uint8), picture[part])
+            cv2.copyTo(ground.at(points.x[part], points.y[part], level), here[part].view(np.uint8), picture[part])
 
 
 def _add_sky(picture: ByteArray, shown: BoolArray, points: Points, sky: Sky) -> None:

@@ -162,8 +162,7 @@ class Rig:
         rng = self._random(_CAMERAS, frame, agent)
         ground_from_lidar = agent.ground_from_lidar(scene)
         for camera in agent.cameras:
-            ground_from_camera = ground_from_lidar @ camera.lidar_from_camera
-            yield camera.channel, render(scene, around, camera, ground_from_camera, rng)
+            yield camera.channel, render(scene, around, camera, ground_from_lidar @ camera.lidar_from_camera, rng)
 
     def _random(self, purpose: int, frame: int, agent: Agent) -> np.random.Generator:
         return np.random.default_rng([*self.seed, purpose, frame, AGENTS.index(agent.name)])

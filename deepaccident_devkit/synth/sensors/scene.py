@@ -159,8 +159,7 @@ class Setting:
 
         The last two are for `caster.GROUND` and `caster.NOTHING`, so that every face can be used as an index.
         """
-        moving = np.repeat(self.moving_owner, FACES_A_SOLID)
-        return np.concatenate([self.still.face_owner, moving, [NOBODY, NOBODY]])
+        return np.concatenate([self.still.face_owner, np.repeat(self.moving_owner, FACES_A_SOLID), [NOBODY, NOBODY]])
 
     def frames(self, poses: FloatArray) -> FloatArray:
         """The actors' frames on the ground, (A, 4, 4), at poses (A, 3)."""

@@ -54,8 +54,7 @@ def above_ground(corners: FloatArray, terrain: Terrain) -> FloatArray:
 def _outlines(corners: FloatArray, to_sun: FloatArray) -> IntArray:
     """Map cells (column, row) that the corners' shadows fall on, (P, 8, 2)."""
     fallen: FloatArray = corners[..., :2] - np.maximum(corners[..., 2:], 0.0) * (to_sun[:2] / to_sun[2])
-    cells: IntArray = np.floor((fallen + MAP_EXTENT) / MAP_RESOLUTION).astype(np.int64)
-    return cells
+    return np.asarray(np.floor((fallen + MAP_EXTENT) / MAP_RESOLUTION).astype(np.int64))
 
 
 _CELL = 0.4
@@ -177,14 +176,13 @@ class Ground:
         picture = self.levels[level]
         scale = np.float32(len(picture) / (2 * MAP_EXTENT))
         shift = np.float32(MAP_EXTENT) * scale - np.float32(0.5)
-        outside = picture[0, 0].astype(float).tolist()
         found = cv2.remap(
             picture,
             x * scale + shift,
             y * scale + shift,
             cv2.INTER_LINEAR,
             borderMode=cv2.BORDER_CONSTANT,
-            borderValue=outside,
+            borderValue=picture[0, 0].astype(float).tolist(),
         )
         return np.asarray(found)
 
@@ -193,8 +191,7 @@ def still_ground(setting: Setting, light: Light, rng: np.random.Generator) -> Gr
     """The ground with the shadows of all that stands still; `rng` draws its grain."""
     lit = light.sky + light.sun * light.to_sun[2]
     plain = _picture(setting.world.ground, lit, light.wet_ground, rng)
-    corners = above_ground(setting.still.corners, setting.terrain)
-    add_shadows(plain, corners, light.to_sun, light.in_shadow)
+    add_shadows(plain, above_ground(setting.still.corners, setting.terrain), light.to_sun, light.in_shadow)
     return _with_coarser(plain, _coarser(plain, len(plain) // SHRINK))
 
 

@@ -84,8 +84,7 @@ def _completed(actor: ActorSpec, part: Part, spec: ScenarioSpec, rng: np.random.
         return replace(actor, category="pedestrian")
     if "lane" in part.fields or spec.road.lanes == 1:
         return actor
-    lane = int(rng.choice(usual_lanes(actor.turn, spec.road.lanes)))
-    return replace(actor, lane=lane)
+    return replace(actor, lane=int(rng.choice(usual_lanes(actor.turn, spec.road.lanes))))
 
 
 def _exchanged(spec: ScenarioSpec) -> ScenarioSpec:

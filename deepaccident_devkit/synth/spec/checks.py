@@ -219,8 +219,7 @@ def _check_crossing(meeting: Part, first: Part, second: Part, junctions: Sequenc
                     f"{_role(actor)} ({' '.join(map(str, way))})"
                     for actor, way in zip((first, second), ways, strict=True)
                 ]
-                sentence = f"the ways of {' and '.join(texts)} do not meet"
-                raise _fault(meeting, "actors", sentence, _way_to_meet(*ways))
+                raise _fault(meeting, "actors", f"the ways of {' and '.join(texts)} do not meet", _way_to_meet(*ways))
 
 
 def _way_to_meet(one: _Way, other: _Way) -> str:

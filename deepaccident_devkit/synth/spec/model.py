@@ -215,8 +215,7 @@ class OneOf:
 
     def alternatives(self) -> Iterator[Any]:
         """The values; of a range both ends."""
-        for option in self.options:
-            yield from option.alternatives()
+        return itertools.chain.from_iterable(option.alternatives() for option in self.options)
 
 
 @dataclass(frozen=True, slots=True)
@@ -262,15 +261,12 @@ class Part:
 
     def values(self, name: str) -> tuple[Any, ...]:
         """The alternatives of a field; its default if the file does not name it."""
-        if name in self.fields:
-            return tuple(self.fields[name].alternatives())
-        return (default_of(self.kind, name),)
+        return tuple(self.fields[name].alternatives()) if name in self.fields else (default_of(self.kind, name),)
 
     def instances(self) -> Iterator[Any]:
         """Each instance that can be drawn (of a range only its ends), made one at a time."""
         options = [tuple(_instances(choice)) for choice in self.fields.values()]
-        for values in itertools.product(*options):
-            yield self.kind(**dict(zip(self.fields, values, strict=True)))
+        return (self.kind(**dict(zip(self.fields, values, strict=True))) for values in itertools.product(*options))
 
     def line(self, name: str) -> str:
         """The line of a field; if the file does not name the field, the line of the part."""

@@ -249,8 +249,7 @@ def _read_one(node: Node, wanted: FieldType, path: str) -> Choice:
     value = spelled(value, wanted.words)
     fits = value in wanted.words if wanted.words else isinstance(value, wanted.base)
     if not fits:
-        remedy = _remedy(wanted, value) + meant_text(value, wanted.words)
-        raise _wrong(node, path, _described(wanted), node, remedy)
+        raise _wrong(node, path, _described(wanted), node, _remedy(wanted, value) + meant_text(value, wanted.words))
     return Fixed(value)
 
 

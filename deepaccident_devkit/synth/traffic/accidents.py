@@ -250,8 +250,7 @@ def lasts(stage: Stage, accident: Performance, frames: int | None) -> bool:
 
 def latest_end(stage: Stage, frames: int | None) -> float:
     """The time until which a normal scenario is simulated, seconds."""
-    longest = max(_LATEST_END, (frames or 0) * FRAME_PERIOD)
-    return stage.cast.begin + WARM_UP + longest
+    return stage.cast.begin + WARM_UP + max(_LATEST_END, (frames or 0) * FRAME_PERIOD)
 
 
 def _held(user: RoadUser, seconds: float) -> RoadUser:
@@ -277,8 +276,7 @@ def _later(user: RoadUser, seconds: float) -> RoadUser:
 
 def _keep_clear(stage: Stage, performance: Performance) -> bool:
     rows = list(range(len(stage.cast.users)))
-    size = _sizes(stage.cast.users)
-    return least_gap(performance.simulation.poses, size, rows, _CLEAR) >= _CLEAR
+    return least_gap(performance.simulation.poses, _sizes(stage.cast.users), rows, _CLEAR) >= _CLEAR
 
 
 def _perform(

@@ -109,10 +109,9 @@ def _wanted_steer(
     ahead = _LOOK_AHEAD[0] + _LOOK_AHEAD[1] * speed
     wanted = curvature - lateral / ahead**2 - 2 * turned / ahead
     most = _MAX_TANGENT / wheelbase
-    steer: FloatArray = np.arctan(
-        np.where(wheelbase < np.inf, wheelbase, 0.0) * np.minimum(np.maximum(wanted, -most), most)
+    return np.asarray(
+        np.arctan(np.where(wheelbase < np.inf, wheelbase, 0.0) * np.minimum(np.maximum(wanted, -most), most))
     )
-    return steer
 
 
 class Tracks:
@@ -125,8 +124,7 @@ class Tracks:
     def __init__(
         self, paths: Sequence[Path], lateral: FloatArray, stops: BoolArray, paces: Sequence[Sequence[Stretch]] = ()
     ) -> None:
-        reach = max(path.length for path in paths) + _BEYOND
-        along = np.arange(0.0, reach, SPACING)
+        along = np.arange(0.0, max(path.length for path in paths) + _BEYOND, SPACING)
         distinct = {id(path): path for path in paths}
         order = {key: row for row, key in enumerate(distinct)}
         points = np.stack([np.stack(path.at(along), axis=-1) for path in distinct.values()])
@@ -244,9 +242,7 @@ def _interaction(
 
 def lane_way(junction: Junction, route: Route, category: str) -> Path:
     """The path of a driver or rider on a route."""
-    if category != "cyclist":
-        return route.path
-    return _cyclist_path(junction.spec, route.from_arm, route.turn, route.lane)
+    return route.path if category != "cyclist" else _cyclist_path(junction.spec, route.from_arm, route.turn, route.lane)
 
 
 def lane_span(route: Route) -> tuple[float, float]:

@@ -282,11 +282,10 @@ def unplanned(
         stranger = _cutting_in(rng, victim)
     else:
         stranger = _third_vehicle(rng, junction, free)
-    actors = tuple(replace(actor, ignores=()) for actor in spec.actors)
     return replace(
         spec,
         design=None,
-        actors=(*actors, stranger),
+        actors=(*(replace(actor, ignores=()) for actor in spec.actors), stranger),
         meet=MeetSpec(actors=(victim.role, stranger.role), offset=float(rng.uniform(*_OFFSETS))),
     )
 
@@ -311,8 +310,7 @@ def _pedestrian(rng: np.random.Generator, victim: ActorSpec, spec: ScenarioSpec)
 def _third_vehicle(rng: np.random.Generator, junction: Junction, free: list[Arm]) -> ActorSpec:
     """A vehicle that comes by an arm by which neither ego nor other comes, and reacts to nobody."""
     arm = free[int(rng.integers(len(free)))]
-    turns = junction.turns(arm)
-    turn: Turn = "straight" if "straight" in turns else "left"
+    turn: Turn = "straight" if "straight" in junction.turns(arm) else "left"
     return ActorSpec(
         role="background",
         category=rng.choice(["car", "car", "van", "motorcycle"]).item(),

@@ -209,7 +209,11 @@ class _Run:
         self._delay = np.array([user.delay for user in users])
         self._rights = rights
         self._lights = _Lights(users, signals)
-        self._alarm = None if watched is None else _alarm(users, watched, self.size)
+        self._alarm = (
+            None
+            if watched is None
+            else Alarm(np.array(watched), self.size[[*watched]], np.array([users[row].alert for row in watched]))
+        )
         along = np.array([user.start for user in users]) - self._ahead
         self._on_path = self._tracks.at(along)
         x, y, yaw, _ = self._on_path
@@ -229,8 +233,7 @@ class _Run:
     def decide(self, states: FloatArray, velocities: FloatArray, since: float, time: float) -> None:
         """Choose everyone's acceleration, `since` seconds after the start."""
         wheels, temper = self._wheels, self._temper
-        allowed = self._tracks.allowed_speed(wheels.along)
-        acceleration = free_acceleration(temper, wheels.speed, allowed)
+        acceleration = free_acceleration(temper, wheels.speed, self._tracks.allowed_speed(wheels.along))
         if self._rights is not None:
             acceleration = acceleration + self._for_others(self._rights, states, time)
         hardest = -hardest_braking(wheels.speed)
@@ -256,8 +259,7 @@ class _Run:
         red = self._lights.gap(time, front, speed, temper)
         stop = np.minimum(red, waiting_gap(rights, front, rear, speed, temper.max_speed, red < np.inf))
         following = np.where(self._walks, 0.0, interaction(temper, speed, gap, leader_speed))
-        result: FloatArray = np.minimum(following, stopping(temper, speed, stop))
-        return result
+        return np.asarray(np.minimum(following, stopping(temper, speed, stop)))
 
 
 class _Lights:
@@ -280,11 +282,6 @@ class _Lights:
         stops = (color != GREEN) & (gap > -0.5)
         stops &= (color != AMBER) | can_stop(temper, speed, gap)
         return np.where(stops, np.maximum(gap, 0.0), np.inf)
-
-
-def _alarm(users: Sequence[RoadUser], pair: tuple[int, int], size: FloatArray) -> Alarm:
-    rows = np.array(pair)
-    return Alarm(rows, size[rows], np.array([users[row].alert for row in pair]))
 
 
 def _first_contact(states: FloatArray, size: FloatArray, pair: tuple[int, int], low: int, high: int) -> int | None:
@@ -311,8 +308,7 @@ def separation(poses_a: FloatArray, size_a: FloatArray, poses_b: FloatArray, siz
         along_b[..., 0] - half_b[..., 0] - half_a[..., 0] * cos - half_a[..., 1] * sin,
         along_b[..., 1] - half_b[..., 1] - half_a[..., 0] * sin - half_a[..., 1] * cos,
     ]
-    result: FloatArray = np.max(np.stack(np.broadcast_arrays(*gaps)), axis=0)
-    return result
+    return np.asarray(np.max(np.stack(np.broadcast_arrays(*gaps)), axis=0))
 
 
 def gap(poses_a: FloatArray, size_a: FloatArray, poses_b: FloatArray, size_b: FloatArray) -> FloatArray:

@@ -82,6 +82,8 @@ class BrokenRelease(ShortRepr):
 class ScenarioEditor:
     """One scenario's files, to be damaged; a release of hard links is safe, because no file is changed in place.
 
+    What writes, edits or removes returns where it did so.
+
     Attributes:
         root: the release's folder.
         scenario: the scenario's folder.
@@ -108,22 +110,25 @@ class ScenarioEditor:
         """The folder of the files of a kind."""
         return real_path(self.scenario.kind_folder(agent, kind))
 
-    def write(self, path: Path, content: bytes) -> None:
+    def write(self, path: Path, content: bytes) -> Path:
         """Make or replace a file."""
         self.changing(path)
         write_bytes(path, content)
+        return path
 
-    def remove(self, path: Path) -> None:
+    def remove(self, path: Path) -> Path:
         """Remove a file."""
         self.changing(path)
         path.unlink()
+        return path
 
-    def remove_folder(self, folder: Path) -> None:
+    def remove_folder(self, folder: Path) -> Path:
         """Remove a folder with all its contents; if there is none, do nothing."""
         for path in sorted(folder.rglob("*")):
             if path.is_file():
                 self.changing(path)
         shutil.rmtree(folder, ignore_errors=True)
+        return folder
 
     def rename(self, path: Path, name: str) -> None:
         """Give a file another name in its folder."""
@@ -140,13 +145,13 @@ class ScenarioEditor:
         """The words of a label file's lines."""
         return [line.split() for line in self.file(agent, "label", frame).read_text("ascii").splitlines()]
 
-    def write_rows(self, agent: str, frame: int, rows: Rows) -> None:
+    def write_rows(self, agent: str, frame: int, rows: Rows) -> Path:
         """Replace a label."""
-        self.write(self.file(agent, "label", frame), "\n".join(" ".join(row) for row in rows).encode("ascii"))
+        return self.write(self.file(agent, "label", frame), "\n".join(" ".join(row) for row in rows).encode("ascii"))
 
     def edit_rows(
         self, agent: str, frames: Sequence[int], edit: Callable[[list[str]], None], *, actor: int | None = None
-    ) -> None:
+    ) -> Path:
         """Apply `edit` to the words of each box line of the frames; with `actor`, only to lines with this id."""
         for frame in frames:
             rows = self.rows(agent, frame)
@@ -154,40 +159,43 @@ class ScenarioEditor:
                 if actor in (None, int(row[FIELD["id"]])):
                     edit(row)
             self.write_rows(agent, frame, rows)
+        return self.folder(agent, "label")
 
     def calib(self, agent: str, frame: int) -> dict[str, AnyArray]:
         """The dict in a calib file. Raises CalibError if the file is already damaged."""
         return read_calib(self.file(agent, "calib", frame), raw=True)
 
-    def write_calib(self, agent: str, frame: int, calib: Mapping[str, AnyArray]) -> None:
+    def write_calib(self, agent: str, frame: int, calib: Mapping[str, AnyArray]) -> Path:
         """Replace a calib file; nothing is checked."""
         path = self.file(agent, "calib", frame)
         self.changing(path)
         write_raw_calib(path, calib)
+        return path
 
-    def edit_calib(self, agent: str, frames: Sequence[int], key: str, edit: Callable[[AnyArray], AnyArray]) -> None:
+    def edit_calib(self, agent: str, frames: Sequence[int], key: str, edit: Callable[[AnyArray], AnyArray]) -> Path:
         """Replace one array in the calib files of the frames."""
         for frame in frames:
             calib = self.calib(agent, frame)
             self.write_calib(agent, frame, {**calib, key: edit(calib[key])})
+        return self.folder(agent, "calib")
 
     def array(self, agent: str, channel: str, frame: int) -> AnyArray:
         """The array of an npz file, unchanged."""
         return read_npz(self.file(agent, channel, frame), "lidar")
 
-    def write_array(self, agent: str, channel: str, frame: int, array: Any, *, key: str = KEY) -> None:
+    def write_array(self, agent: str, channel: str, frame: int, array: Any, *, key: str = KEY) -> Path:
         """Replace an npz file by one with any array, of objects too, under any key."""
         content = io.BytesIO()
         np.savez_compressed(content, **{key: array})
-        self.write(self.file(agent, channel, frame), content.getvalue())
+        return self.write(self.file(agent, channel, frame), content.getvalue())
 
     def meta_lines(self) -> list[str]:
         """The lines of the meta file."""
         return real_path(self.scenario.meta_path).read_text("ascii").splitlines()
 
-    def write_meta_lines(self, lines: Sequence[str]) -> None:
+    def write_meta_lines(self, lines: Sequence[str]) -> Path:
         """Replace the meta file."""
-        self.write(real_path(self.scenario.meta_path), "\n".join(lines).encode("ascii"))
+        return self.write(real_path(self.scenario.meta_path), "\n".join(lines).encode("ascii"))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -221,8 +229,12 @@ class Victim:
     def replace(self, kind: str, change: Callable[[bytes], bytes]) -> Path:
         """Change the bytes of the agent's file at the frame; returns its path."""
         path = self.file(kind)
-        self.editor.write(path, change(path.read_bytes()))
-        return path
+        return self.editor.write(path, change(path.read_bytes()))
+
+    def replace_array(self, channel: str, change: Callable[[AnyArray], AnyArray], *, key: str = KEY) -> Path:
+        """Change the array of the victim's npz file; returns the file."""
+        array = change(self.editor.array(self.agent, channel, self.frame))
+        return self.editor.write_array(self.agent, channel, self.frame, array, key=key)
 
 
 @dataclass(slots=True)

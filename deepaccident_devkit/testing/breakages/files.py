@@ -1,6 +1,5 @@
 """Files of labels, calib, meta and sensors that are missing, cannot be read, must not be run, or are wrong."""
 
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +14,6 @@ from deepaccident_devkit.errors import (
 )
 from deepaccident_devkit.release import read_image, write_image
 from deepaccident_devkit.release.store import real_path
-from deepaccident_devkit.support.arrays import AnyArray
 from deepaccident_devkit.taxonomy import BEV_CAMERA, LIDAR, OWN_ACTOR_ID
 from deepaccident_devkit.testing.breakages.breakage import FIELD, Group, Victim
 
@@ -27,8 +25,7 @@ def _set_field(victim: Victim, name: str, word: str) -> Path:
     """Change one word of the last box line."""
     rows = victim.editor.rows(victim.agent, victim.frame)
     rows[-1][FIELD[name]] = word
-    victim.editor.write_rows(victim.agent, victim.frame, rows)
-    return victim.file("label")
+    return victim.editor.write_rows(victim.agent, victim.frame, rows)
 
 
 @LABEL_FORM.enter("label-unreadable")
@@ -66,8 +63,7 @@ def label_field_missing(victim: Victim) -> Path:
     """A box line has 12 fields instead of 13."""
     rows = victim.editor.rows(victim.agent, victim.frame)
     del rows[-1][FIELD["num_lidar_pts"]]
-    victim.editor.write_rows(victim.agent, victim.frame, rows)
-    return victim.file("label")
+    return victim.editor.write_rows(victim.agent, victim.frame, rows)
 
 
 @LABEL_FORM.enter("label-unreadable")
@@ -93,16 +89,14 @@ def label_own_row_missing(victim: Victim) -> Path:
     """A vehicle's label lacks the row of the vehicle itself (id −100)."""
     rows = victim.editor.rows(victim.agent, victim.frame)
     others = [row for row in rows[1:] if int(row[FIELD["id"]]) != OWN_ACTOR_ID]
-    victim.editor.write_rows(victim.agent, victim.frame, [rows[0], *others])
-    return victim.file("label")
+    return victim.editor.write_rows(victim.agent, victim.frame, [rows[0], *others])
 
 
 @LABEL_MEANING.enter("duplicate-box", "duplicate-id")
 def label_line_twice(victim: Victim) -> Path:
     """The box line of a tracked actor is there twice."""
     rows = victim.editor.rows(victim.agent, victim.frame)
-    victim.editor.write_rows(victim.agent, victim.frame, [*rows, rows[2]])
-    return victim.file("label")
+    return victim.editor.write_rows(victim.agent, victim.frame, [*rows, rows[2]])
 
 
 @LABEL_MEANING.enter("headings-differ", "own-velocity", "positions-differ", "velocity-off")
@@ -113,16 +107,14 @@ def label_right_handed(victim: Victim) -> Path:
         for name in ("y", "yaw", "vy"):
             row[FIELD[name]] = repr(-float(row[FIELD[name]]))
 
-    victim.editor.edit_rows(victim.agent, victim.editor.frames, flip)
-    return victim.editor.folder(victim.agent, "label")
+    return victim.editor.edit_rows(victim.agent, victim.editor.frames, flip)
 
 
 @LABEL_MEANING.enter("meta-pair", "positions-differ", "sizes-differ")
 def labels_of_two_agents_swapped(victim: Victim) -> Path:
     """Two vehicles' labels are swapped at all frames."""
     for frame in victim.editor.frames:
-        files = (victim.editor.file(agent, "label", frame) for agent in (victim.agent, victim.other))
-        victim.editor.exchange(*files)
+        victim.editor.exchange(*(victim.editor.file(agent, "label", frame) for agent in (victim.agent, victim.other)))
     return victim.editor.folder(victim.agent, "label")
 
 
@@ -154,8 +146,7 @@ def calib_key_missing(victim: Victim) -> Path:
     """A calib file lacks a camera's intrinsic."""
     calib = victim.editor.calib(victim.agent, victim.frame)
     del calib["intrinsic_Camera_Front"]
-    victim.editor.write_calib(victim.agent, victim.frame, calib)
-    return victim.file("calib")
+    return victim.editor.write_calib(victim.agent, victim.frame, calib)
 
 
 @CALIB_FORM.enter("calib-unreadable")
@@ -187,15 +178,13 @@ def calib_wrong_k(victim: Victim) -> Path:
     def ordinary(raw: np.ndarray) -> np.ndarray:
         return np.array([[raw[0, 1], 0, raw[0, 0]], [0, raw[0, 1], raw[1, 0]], [0, 0, 1]])
 
-    victim.editor.edit_calib(victim.agent, victim.editor.frames, "intrinsic_Camera_Front", ordinary)
-    return victim.editor.folder(victim.agent, "calib")
+    return victim.editor.edit_calib(victim.agent, victim.editor.frames, "intrinsic_Camera_Front", ordinary)
 
 
 @CALIB_MEANING.enter("headings-differ", "own-box-apart", "positions-differ", "speed-off", "velocity-off")
 def calib_inverse(victim: Victim) -> Path:
     """An agent's poses are inverted: `ego_from_world`."""
-    victim.editor.edit_calib(victim.agent, victim.editor.frames, "ego_to_world", np.linalg.inv)
-    return victim.editor.folder(victim.agent, "calib")
+    return victim.editor.edit_calib(victim.agent, victim.editor.frames, "ego_to_world", np.linalg.inv)
 
 
 @CALIB_MEANING.enter("camera-misplaced")
@@ -217,22 +206,19 @@ def _edit_first_line(victim: Victim, word: int, new: str) -> Path:
     first, *rest = victim.editor.meta_lines()
     words = first.split()
     words[word] = new
-    victim.editor.write_meta_lines([" ".join(words), *rest])
-    return real_path(victim.editor.scenario.meta_path)
+    return victim.editor.write_meta_lines([" ".join(words), *rest])
 
 
 @META_FORM.enter("meta-unreadable")
 def meta_empty(victim: Victim) -> Path:
     """A meta file has no bytes."""
-    victim.editor.write_meta_lines([])
-    return real_path(victim.editor.scenario.meta_path)
+    return victim.editor.write_meta_lines([])
 
 
 @META_FORM.enter("meta-unreadable")
 def meta_cut(victim: Victim) -> Path:
     """A meta file ends within its first line."""
-    victim.editor.write_meta_lines([victim.editor.meta_lines()[0][:20]])
-    return real_path(victim.editor.scenario.meta_path)
+    return victim.editor.write_meta_lines([victim.editor.meta_lines()[0][:20]])
 
 
 @META_FORM.enter("meta-unreadable")
@@ -244,8 +230,7 @@ def meta_id_no_number(victim: Victim) -> Path:
 @META_MEANING.enter("meta-missing")
 def meta_missing(victim: Victim) -> Path:
     """A labelled scenario has no meta file."""
-    victim.editor.remove(real_path(victim.editor.scenario.meta_path))
-    return real_path(victim.editor.scenario.meta_path)
+    return victim.editor.remove(real_path(victim.editor.scenario.meta_path))
 
 
 @META_MEANING.enter("meta-frames")
@@ -270,13 +255,6 @@ def _half(content: bytes) -> bytes:
     return content[: len(content) // 2]
 
 
-def _rewritten(victim: Victim, channel: str, change: Callable[[AnyArray], AnyArray]) -> Path:
-    """The file of the victim's array, which is another one now."""
-    array = victim.editor.array(victim.agent, channel, victim.frame)
-    victim.editor.write_array(victim.agent, channel, victim.frame, change(array))
-    return victim.file(channel)
-
-
 @SENSOR_FORM.enter("sensor-unreadable", channel=CAMERA)
 def image_cut(victim: Victim) -> Path:
     """An image file ends in the middle."""
@@ -292,8 +270,7 @@ def image_empty(victim: Victim) -> Path:
 @SENSOR_MISSING.enter("sensor-frames-missing", channel=CAMERA)
 def image_missing(victim: Victim) -> Path:
     """An image file is missing."""
-    victim.editor.remove(victim.file(CAMERA))
-    return victim.file(CAMERA)
+    return victim.editor.remove(victim.file(CAMERA))
 
 
 @SENSOR_MEANING.enter("image-size", channel=CAMERA)
@@ -315,19 +292,19 @@ def lidar_cut(victim: Victim) -> Path:
 @SENSOR_FORM.enter("sensor-unreadable", channel=LIDAR)
 def lidar_three_columns(victim: Victim) -> Path:
     """A point cloud lacks the intensity."""
-    return _rewritten(victim, LIDAR, lambda points: points[:, :3])
+    return victim.replace_array(LIDAR, lambda points: points[:, :3])
 
 
 @SENSOR_FORM.enter("sensor-unreadable", channel=LIDAR)
 def lidar_objects(victim: Victim) -> Path:
     """A point cloud is an array of Python objects, which only a pickle can load."""
-    return _rewritten(victim, LIDAR, lambda points: points.astype(object))
+    return victim.replace_array(LIDAR, lambda points: points.astype(object))
 
 
 @SENSOR_MEANING.enter("points-differ", channel=LIDAR)
 def lidar_right_handed(victim: Victim) -> Path:
     """A point cloud has the other handedness."""
-    return _rewritten(victim, LIDAR, lambda points: points * np.array([1, -1, 1, 1], dtype=np.float32))
+    return victim.replace_array(LIDAR, lambda points: points * np.array([1, -1, 1, 1], dtype=np.float32))
 
 
 @SENSOR_FORM.enter("sensor-unreadable", channel=BEV_CAMERA)
@@ -339,7 +316,7 @@ def bev_cut(victim: Victim) -> Path:
 @SENSOR_FORM.enter("sensor-unreadable", channel=BEV_CAMERA)
 def bev_half_size(victim: Victim) -> Path:
     """A BEV array has 600 rows and columns."""
-    return _rewritten(victim, BEV_CAMERA, lambda picture: picture[::2, ::2])
+    return victim.replace_array(BEV_CAMERA, lambda picture: picture[::2, ::2])
 
 
 @SENSOR_MEANING.enter("bev-orientation", channel=BEV_CAMERA)

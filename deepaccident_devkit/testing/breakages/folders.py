@@ -26,15 +26,13 @@ SPLIT_FILES = Group("release", opening=SplitFileError, reading=SplitFileError)
 @BROKEN.enter("frames-missing")
 def label_missing(victim: Victim) -> Path:
     """A label file of one frame is missing."""
-    victim.editor.remove(victim.file("label"))
-    return victim.file("label")
+    return victim.editor.remove(victim.file("label"))
 
 
 @BROKEN.enter("frames-missing")
 def calib_missing(victim: Victim) -> Path:
     """A calib file of one frame is missing."""
-    victim.editor.remove(victim.file("calib"))
-    return victim.file("calib")
+    return victim.editor.remove(victim.file("calib"))
 
 
 @BROKEN.enter("frames-missing", "sensor-frames-missing")
@@ -57,10 +55,8 @@ def frame_number_short(victim: Victim) -> Path:
 @BROKEN.enter("agent-unlabelled", "folder-unreadable")
 def folder_is_a_file(victim: Victim) -> Path:
     """A file is where an agent's folder of labels must be."""
-    folder = victim.editor.folder(victim.agent, "label")
-    victim.editor.remove_folder(folder)
-    victim.editor.write(folder, b"")
-    return folder
+    folder = victim.editor.remove_folder(victim.editor.folder(victim.agent, "label"))
+    return victim.editor.write(folder, b"")
 
 
 @BROKEN.enter("two-places")
@@ -79,17 +75,13 @@ def scenario_twice(victim: Victim) -> Path:
 @ODD.enter("labels-without-calib")
 def agent_half_unpacked(victim: Victim) -> Path:
     """An agent has labels and sensor files, but no calib files."""
-    folder = victim.editor.folder(victim.agent, "calib")
-    victim.editor.remove_folder(folder)
-    return folder
+    return victim.editor.remove_folder(victim.editor.folder(victim.agent, "calib"))
 
 
 @ODD.enter("agent-unlabelled")
 def agent_unlabelled(victim: Victim) -> Path:
     """An agent has no labels, but the others have."""
-    folder = victim.editor.folder(victim.agent, "label")
-    victim.editor.remove_folder(folder)
-    return folder
+    return victim.editor.remove_folder(victim.editor.folder(victim.agent, "label"))
 
 
 @ODD.enter("ids-differ", "meta-pair", "own-box-apart", "sizes-differ")
@@ -115,8 +107,7 @@ def frames_swapped(victim: Victim) -> Path:
 def split_file_garbled(victim: Victim) -> Path:
     """A split file has a line of one word."""
     path = victim.editor.root / "val.txt"
-    victim.editor.write(path, path.read_bytes() + b"Town03\n")
-    return path
+    return victim.editor.write(path, path.read_bytes() + b"Town03\n")
 
 
 @ODD.enter("split-file-repeats")
@@ -124,8 +115,7 @@ def split_line_twice(victim: Victim) -> Path:
     """A split file lists a scenario twice."""
     files = (victim.editor.root / f"{split}.txt" for split in SPLITS)
     path = max(files, key=lambda path: path.stat().st_size)  # files of splits that were not made are empty
-    victim.editor.write(path, path.read_bytes() * 2)
-    return path
+    return victim.editor.write(path, path.read_bytes() * 2)
 
 
 LEGAL = Group("legal")
@@ -147,8 +137,7 @@ def label_short_lines(victim: Victim) -> Path:
 def label_header_only(victim: Victim) -> Path:
     """The infrastructure's label has no boxes."""
     rows = victim.editor.rows(INFRASTRUCTURE, victim.frame)
-    victim.editor.write_rows(INFRASTRUCTURE, victim.frame, rows[:1])
-    return victim.editor.file(INFRASTRUCTURE, "label", victim.frame)
+    return victim.editor.write_rows(INFRASTRUCTURE, victim.frame, rows[:1])
 
 
 @LEGAL.enter("velocity-unknown")
@@ -157,15 +146,13 @@ def label_velocity_nan(victim: Victim) -> Path:
     rows = victim.editor.rows(victim.agent, victim.frame)
     tracked = [row for row in rows[1:] if int(row[FIELD["id"]]) not in (OWN_ACTOR_ID, UNTRACKED_ID)]
     tracked[0][FIELD["vx"]] = tracked[0][FIELD["vy"]] = "nan"
-    victim.editor.write_rows(victim.agent, victim.frame, rows)
-    return victim.file("label")
+    return victim.editor.write_rows(victim.agent, victim.frame, rows)
 
 
 @LEGAL.enter("meta-incomplete")
 def meta_short(victim: Victim) -> Path:
     """A meta file ends after its third line."""
-    victim.editor.write_meta_lines(victim.editor.meta_lines()[:3])
-    return real_path(victim.editor.scenario.meta_path)
+    return victim.editor.write_meta_lines(victim.editor.meta_lines()[:3])
 
 
 @LEGAL.enter("no-collision-in-accident", "overlap-unnamed")
@@ -173,8 +160,9 @@ def meta_no_collision(victim: Victim) -> Path:
     """The meta file in an accident's folder names no collision."""
     first, _, *rest = victim.editor.meta_lines()
     words = first.split()
-    victim.editor.write_meta_lines([" ".join([words[0], *["-1"] * 7, words[8]]), " colliding agents: none none", *rest])
-    return real_path(victim.editor.scenario.meta_path)
+    return victim.editor.write_meta_lines(
+        [" ".join([words[0], *["-1"] * 7, words[8]]), " colliding agents: none none", *rest]
+    )
 
 
 @LEGAL.enter("agent-missing")
@@ -209,8 +197,7 @@ def split_lists_more(victim: Victim) -> Path:
     """A split file lists a scenario that was not downloaded."""
     path = victim.editor.root / "train.txt"
     more = b"type1_subtype2_normal Town07_type001_subtype0002_scenario00099\n"
-    victim.editor.write(path, path.read_bytes() + more)
-    return path
+    return victim.editor.write(path, path.read_bytes() + more)
 
 
 @LEGAL.enter()
@@ -225,14 +212,10 @@ def files_stray(victim: Victim) -> Path:
 @LEGAL.enter(channel=LIDAR)
 def lidar_other_key(victim: Victim) -> Path:
     """The only array of a point cloud has another name than `data`."""
-    points = victim.editor.array(victim.agent, LIDAR, victim.frame)
-    victim.editor.write_array(victim.agent, LIDAR, victim.frame, points, key="arr_0")
-    return victim.file(LIDAR)
+    return victim.replace_array(LIDAR, lambda points: points, key="arr_0")
 
 
 @LEGAL.enter(channel=LIDAR)
 def lidar_single(victim: Victim) -> Path:
     """A point cloud has single precision."""
-    points = victim.editor.array(victim.agent, LIDAR, victim.frame)
-    victim.editor.write_array(victim.agent, LIDAR, victim.frame, points.astype(np.float32))
-    return victim.file(LIDAR)
+    return victim.replace_array(LIDAR, lambda points: points.astype(np.float32))
