@@ -82,7 +82,7 @@ def test_accuracy_is_shown_over_bytes(release: Path, folder: Path) -> None:
         assert json.loads((bundle / "metrics_summary.json").read_text())["results"]["meta"]["bytes"]["samples"] == 20
     files = [folder / f"over.{kind}" for kind in ("png", "pdf", "csv", "json")]
     outs = [word for path in files for word in ("--out", path)]
-    text = told("evaluate", "compare", *bundles, "--over-bytes", "--style", "cvpr-page", "--resamples", 20, *outs)
+    text = told("evaluate", "compare", *bundles, "--style", "cvpr-page", "--resamples", 20, *outs)
     assert "\n".join(f"written: {path}" for path in files) in text
     assert (files[0].read_bytes()[1:4], files[1].read_bytes()[:4]) == (b"PNG", b"%PDF")
     points = json.loads(files[3].read_text())["points"]

@@ -123,7 +123,6 @@ WRONG = [
     (f"{RENDER.format('accident')} --seconds 9", "seconds: expected some from 0 to 0.5"),
     ("predict constant_velocty release --out out", "did you mean 'constant_velocity'"),
     ("predict constant_velocity release --out out --agents all --budget 0", "0 is not in the range x>=1"),
-    ("evaluate compare RELEASE RELEASE RELEASE", "differences are those of two evaluations; give --over-bytes"),
     ("evaluate compare RELEASE RELEASE --out numbers.txt", "--out: expected a file that ends in .csv, .json, .png"),
     ("safety report release", "Missing option '--out'"),
     ("safety raport release", "'raport' is not one of"),

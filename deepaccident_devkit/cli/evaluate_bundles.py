@@ -19,8 +19,7 @@ from deepaccident_devkit.cli.verbs import advanced, field_option, verb
 from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.evaluation import Resampling
 from deepaccident_devkit.evaluation.intervals import MOST_RESAMPLES
-from deepaccident_devkit.evaluation.runs import OverBytes, compare_bundles, read_bundle, verify_bundle
-from deepaccident_devkit.evaluation.runs import over_bytes as evaluations_over_bytes
+from deepaccident_devkit.evaluation.runs import OverBytes, compare_bundles, over_bytes, read_bundle, verify_bundle
 from deepaccident_devkit.evaluation.runs.verification import check_repeated
 from deepaccident_devkit.release import find_release
 from deepaccident_devkit.release.store import Dataroot, open_dataroot
@@ -78,11 +77,6 @@ def verify(
 @click.argument("a", type=PATH)
 @click.argument("b", type=PATH)
 @click.argument("more", type=PATH, nargs=-1)
-@click.option(
-    "--over-bytes",
-    is_flag=True,
-    help="In place of differences, show the main numbers of two or more evaluations over the bytes that partners send.",
-)
 @click.option("--common", is_flag=True, help="Compare only the samples that all evaluations have.")
 @field_option(Resampling, "resamples", option=advanced, type=click.IntRange(0, MOST_RESAMPLES))
 @click.option(
@@ -98,7 +92,6 @@ def compare(
     a: Path,
     b: Path,
     more: tuple[Path, ...],
-    over_bytes: bool,
     common: bool,
     resamples: int,
     out: tuple[Path, ...],
@@ -106,16 +99,14 @@ def compare(
 ) -> None:
     """Compare the evaluations in the folders A and B, and test which differences are statistically significant.
 
-    MORE evaluations need --over-bytes.
+    With MORE evaluations, show the main numbers of all over the bytes that partners send.
     """
     for path in out:
         if path.suffix.lower() not in _KINDS:
             raise click.BadParameter(f"--out: expected a file that ends in {', '.join(_KINDS)}, found {str(path)!r}")
-    if more and not over_bytes:
-        raise click.UsageError("differences are those of two evaluations; give --over-bytes to compare more")
     comparison = (
-        evaluations_over_bytes([a, b, *more], Resampling(resamples=resamples), common=common)
-        if over_bytes
+        over_bytes([a, b, *more], Resampling(resamples=resamples), common=common)
+        if more
         else compare_bundles(a, b, Resampling(resamples=resamples), common=common)
     )
     as_text = comparison.to_json()
