@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from itertools import groupby
 from typing import Any, ClassVar, Final, Generic, Literal, NamedTuple, TypeVar
 
 import numpy as np
 
 from deepaccident_devkit.evaluation.evaluator import Counts, Evaluator, ratio
-from deepaccident_devkit.evaluation.task import HEADLINE_UNITS, Row, TaskResult, Unit, protocol_of
+from deepaccident_devkit.evaluation.task import HEADLINE_UNITS, Row, TaskResult, Unit, plain, protocol_of
 from deepaccident_devkit.support.arrays import BoolArray, FloatArray, IntArray
 from deepaccident_devkit.support.text import natural_order
 
@@ -139,7 +139,8 @@ class MeansEvaluator(Evaluator[Result], Generic[Result]):
     @property
     def settings(self) -> dict[str, Any]:
         """The protocol's choices."""
-        return asdict(self.protocol)
+        choices: dict[str, Any] = plain(self.protocol)
+        return choices
 
     def add(self, token: str, counts: Counts) -> None:
         """Take a sample's counts (`Evaluator.add`); of samples with the same names these are kept once."""

@@ -1,7 +1,7 @@
 """`Forecast`: how an actor may go on; and how far such paths are from the recorded one.
 
 The errors by mode, and those of all actors together (`world_errors`), are the package av2's, which picks no mode. Which
-one counts is as argoverse-api's `eval_forecasting.py` says: that with the least error at the end.
+one counts is as `eval_forecasting.py` of `argoverse-api` says: that with the least error at the end.
 """
 
 from __future__ import annotations

@@ -31,7 +31,7 @@ def test_without_samples_there_is_nothing(protocol: str) -> None:
 def test_the_protocols() -> None:
     public = ("uniad", "stp3", "vad", "bev_planner")
     assert tuple(PLANNING_PROTOCOLS) == ("clean", *public, *(f"{name}_own_box" for name in public))
-    assert PlanningEvaluator().settings == {"leads": (3.0, 2.0, 1.0, 0.5), "most_acceleration": 10.0, "braking": 3.0}
+    assert PlanningEvaluator().settings == {"leads": [3.0, 2.0, 1.0, 0.5], "most_acceleration": 10.0, "braking": 3.0}
     assert (PLANNING.whole_recordings, PLANNING.needs_meta, PLANNING.vehicles_alone) == (True, True, True)
 
 
