@@ -26,13 +26,16 @@ def motion_counts(found: int, missed: int) -> dict[str, Any]:
     }
 
 
-def write_bundle(folder: Path, cells: Sequence[tuple[int, int]], *, twins: bool = False) -> Path:
+def write_bundle(
+    folder: Path, cells: Sequence[tuple[int, int]], *, twins: bool = False, sent: Mapping[str, Any] | None = None
+) -> Path:
     """A bundle of a sample a cluster, or of two that are equal: of an accident and of its twin.
 
     Args:
         folder: to write.
         cells: found and missed, of each cluster.
         twins: whether each accident has its twin.
+        sent: what the results note of the bytes that partners send.
     """
     counts: dict[str, Mapping[str, Any]] = {
         f"type1_subtype1_{kind}/Town03_{number:03d}/ego_vehicle/001": motion_counts(*each)
@@ -55,7 +58,7 @@ def write_bundle(folder: Path, cells: Sequence[tuple[int, int]], *, twins: bool 
         "agents": None,
         "counts": {"left_out": 0},
         "release": {"version": "v1", "dataroot": "data"},
-        "results": {"path": "results", "form": None},
+        "results": {"path": "results", "form": None, "meta": {} if sent is None else {"bytes": sent}},
         "breakdowns": {},
         "environment": {},
     }

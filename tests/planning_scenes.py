@@ -38,9 +38,9 @@ def scene(
         footprint=np.stack(actors, axis=1) if actors else np.zeros((frames, 0, 5)),
         is_pedestrian=np.zeros(len(ids), dtype=bool),
         seen=np.ones(len(ids), dtype=bool),
-        kind="accident",
+        is_twin=False,
         is_collider=partner,
-        partner=1 if partner else None,
+        partner=ids == 1,
         to_end=seconds,
         to_contact=np.nan,
     )

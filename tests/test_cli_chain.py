@@ -67,3 +67,24 @@ def test_five_agents_are_compared_with_one(release: Path, folder: Path) -> None:
     assert "motion, protocol released: 20 samples of 1 scenarios" in text
     numbers = {each["number"]: each for each in json.loads((folder / "compared.json").read_text())["numbers"]}
     assert numbers["ranges/100x100/pq"]["b"] > numbers["ranges/100x100/pq"]["a"]
+
+
+def test_accuracy_is_shown_over_bytes(release: Path, folder: Path) -> None:
+    """Of nobody, of those that fit into a budget, and of all."""
+    words = ("predict", "constant_velocity", release, "--split", "train", "--task", "accident", "--agents", "all")
+    told(*words, "--budget", 1500, "--out", folder / "some")
+    bundles = [folder / f"accuracy_{agents}" for agents in ("single", "some", "all")]
+    for agents, bundle in zip(("single", "some", "all"), bundles, strict=True):
+        options = ("--results", folder / agents / "accident.json", "--split", "train", "--out", bundle)
+        text = told("evaluate", "accident", release, *options, "--protocol", "boxes", "--resamples", 20)
+        assert "partners, payload boxes\n" in text
+        assert json.loads((bundle / "metrics_summary.json").read_text())["results"]["meta"]["bytes"]["samples"] == 20
+    files = [folder / f"over.{kind}" for kind in ("png", "pdf", "csv", "json")]
+    outs = [word for path in files for word in ("--out", path)]
+    text = told("evaluate", "compare", *bundles, "--over-bytes", "--style", "cvpr-page", "--resamples", 20, *outs)
+    assert "\n".join(f"written: {path}" for path in files) in text
+    assert (files[0].read_bytes()[1:4], files[1].read_bytes()[:4]) == (b"PNG", b"%PDF")
+    points = json.loads(files[3].read_text())["points"]
+    sizes = {each["evaluation"]: each["bytes"] for each in points}
+    assert sizes["accuracy_single"] == 0 < sizes["accuracy_some"] <= 1500 < sizes["accuracy_all"]
+    assert files[2].read_text().count("\n") == len(points) + 1

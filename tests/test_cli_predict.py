@@ -70,6 +70,19 @@ def test_predict_writes_plans_and_forecasts_that_are_evaluated(da_motion: DeepAc
     assert f"all {len(everything)} samples have a prediction" in told.output
 
 
+def test_predict_sends_what_fits_into_a_budget(da_motion: DeepAccident, tmp_path: Path) -> None:
+    words = ("constant_velocity", da_motion.dataroot, "--split", "train", "--task", "accident", "--workers", 1)
+    sent = {}
+    for name, options in (("single", ""), ("all", "--agents all"), ("some", "--agents all --budget 5000")):
+        run(*words, *options.split(), "--out", tmp_path / name)
+        results = read_results(tmp_path / name / "accident.json")
+        sent[name] = results.meta["bytes"]
+    assert results.meta["link"]["budget"] == 5000
+    assert results.meta["link"]["payload"] == "boxes"
+    assert (sent["single"]["mean"], sent["all"]["partners"], sent["some"]["budget"]) == (0.0, 4.0, 5000)
+    assert 0 < sent["some"]["mean"] <= 5000 < sent["all"]["mean"]
+
+
 def test_predict_takes_names_and_the_agents_that_are_there(da_motion: DeepAccident, tmp_path: Path) -> None:
     root = tmp_path / "release"
     shutil.copytree(da_motion.dataroot, root, ignore=shutil.ignore_patterns(".deepaccident", "infrastructure"))

@@ -35,6 +35,9 @@ UNUSED = [
     ("evaluate check results --split val", "--split changes nothing without --dataroot"),
     ("evaluate check results --on-error raise", "--on-error changes nothing without --dataroot"),
     (BASELINE + " --latency 0.2", "--latency changes nothing with --agents single"),
+    (BASELINE + " --budget 1000", "--budget changes nothing with --agents single"),
+    ("predict tiny release --out out --agents single --budget 1000", "--budget changes nothing with --agents single"),
+    (BASELINE + " --agents all --budget 1000 --seed 3", "--seed changes nothing without --pose-noise or --packet-loss"),
     (
         "predict constant_velocity release --out out --agents all --seed 3",
         "--seed changes nothing without --pose-noise",
@@ -119,6 +122,8 @@ WRONG = [
     (f"{RENDER.format('link')} --latency 0.25", "latency"),
     (f"{RENDER.format('accident')} --seconds 9", "seconds: expected some from 0 to 0.5"),
     ("predict constant_velocty release --out out", "did you mean 'constant_velocity'"),
+    ("predict constant_velocity release --out out --agents all --budget 0", "0 is not in the range x>=1"),
+    ("evaluate compare RELEASE RELEASE RELEASE", "differences are those of two evaluations; give --over-bytes"),
     ("evaluate compare RELEASE RELEASE --out numbers.txt", "--out: expected a file that ends in .csv, .json, .png"),
     ("safety report release", "Missing option '--out'"),
     ("safety raport release", "'raport' is not one of"),

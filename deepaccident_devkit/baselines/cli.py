@@ -31,10 +31,11 @@ from deepaccident_devkit.support.files import writable_folder
 from deepaccident_devkit.support.text import choice
 from deepaccident_devkit.taxonomy import VEHICLE_AGENTS
 from deepaccident_devkit.v2x import Link
+from deepaccident_devkit.v2x.messages import Payload
 
 _ALONE = "single"
 _SHIPPED = "tiny"
-_LINK = ("latency", "pose_noise", "packet_loss", "seed")
+_LINK = ("latency", "pose_noise", "packet_loss", "seed", "budget")
 """Their names as parameters of a verb."""
 _RELEASED_HORIZON = Baseline().horizon
 _USUAL = ("motion", "accident", "detection")
@@ -70,6 +71,7 @@ Examples:
 )
 @link_parameters()
 @field_option(Link, "packet_loss")
+@field_option(Link, "budget", type=click.IntRange(1), metavar="BYTES")
 @seed_parameter
 @click.option(
     "--samples",
@@ -100,7 +102,7 @@ def predict(model: str, purpose: Any, **options: Any) -> None:
         model = choice("MODEL, which is no file and no folder", model, (*MOTION_MODELS, _SHIPPED))
     if purpose == "all":
         refuse_unused("with --samples all, which are those of all scenarios", "scope")
-    seed, link = options["seed"], _link_of(options)
+    seed, link = options["seed"], _link_of(options, "boxes" if model in MOTION_MODELS else "bev")
     agents = names_or_configuration(options.pop("agents"))
     predicted = _by_baseline if model in MOTION_MODELS else _by_network
     predicted(model, purpose, agents=agents, link=link, seed=seed, **options)
@@ -168,10 +170,10 @@ def _samples(dataset: DeepAccident, purpose: Any, rules: Any, horizon: float, op
     return tokens
 
 
-def _link_of(options: dict[str, Any]) -> Link | None:
-    """Take the link's options out of the verb's; None if nothing happens to the partners' data."""
+def _link_of(options: dict[str, Any], payload: Payload) -> Link | None:
+    """Take the link's options out of the verb's; None if nothing happens to the partners' data, which are `payload`."""
     chosen = {name: options.pop(name) for name in _LINK}
     noise = chosen.pop("pose_noise") or None  # noise with a mean of 0 m would still have a spread
-    if not (chosen["latency"] or noise or chosen["packet_loss"]):
+    if not (chosen["latency"] or noise or chosen["packet_loss"] or chosen["budget"]):
         return None
-    return Link(pose_noise=noise, **chosen)
+    return Link(pose_noise=noise, payload=payload if chosen["budget"] else None, **chosen)

@@ -37,6 +37,7 @@ from deepaccident_devkit.release.fingerprints import digest_of
 from deepaccident_devkit.support.text import choice, path_of, settle_choices
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 from deepaccident_devkit.v2x import AgentConfig, Agents, Link, cooperating_agents
+from deepaccident_devkit.v2x.messages import Payload, traffic, traffic_note
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -53,7 +54,7 @@ class Baseline:
     Attributes:
         agents: who cooperates, as of `v2x.cooperating_agents`.
         model: how actors go on.
-        link: what happens to the partners' data; None for nothing.
+        link: what happens to the partners' data; None for nothing. They send boxes if it does not say another payload.
         horizon: seconds to look ahead, of motion and accidents; a multiple of 0.5. Plans and forecasts look at least
             3 s ahead.
     """
@@ -112,7 +113,8 @@ def predict_results(
 ) -> Path:
     """Write a baseline's predictions of samples to a results file (of motion, a folder); returns its path.
 
-    Scenario follows scenario there, in the order in which the samples name them.
+    Scenario follows scenario there, in the order in which the samples name them. Their notes have, as `bytes`, how much
+    partners send.
 
     The bytes do not depend on workers. If a call is interrupted, the same call continues it: only the scenarios at hand
     are lost. Several processes that are given the same `out` share the scenarios. Complete results of the same samples
@@ -153,7 +155,8 @@ def predict_results(
         if not work.is_done(path, scenarios):  # by another process meanwhile
             store.run(_predict, jobs, label=work.task, places=places, **how)
         if turn.alone() and not work.is_done(path, scenarios):
-            with work.writer(path) as whole:
+            sent = [each for job in jobs.values() for each in read_results(job.path).meta["bytes"]]
+            with work.writer(path, traffic_note(sent, work.baseline.link, work.payload)) as whole:
                 for job in jobs.values():
                     whole.add_part(read_results(job.path))
             store.remove()
@@ -195,15 +198,28 @@ class _Work:
     scenarios: tuple[str, ...]
 
     @property
+    def payload(self) -> Payload | int:
+        """What partners send."""
+        return (self.baseline.link and self.baseline.link.payload) or "boxes"
+
+    @property
     def meta(self) -> dict[str, Any]:
-        """The notes in its results."""
+        """The notes in its results, but the bytes that partners send, which follow from these and the samples."""
         horizon, release = self.baseline.horizon_of(self.task), release_note(self.dataset, self.scenarios)
         return {**self.baseline.meta(), "horizon": horizon, "release": release, "devkit": __version__}
 
     def digest(self, scenarios: Mapping[str, tuple[str, ...]]) -> str:
         """Of all that decides the results of these samples."""
         tokens = list(chain(*scenarios.values()))
-        return digest_of({"baseline": repr(self.baseline), "task": self.task, "tokens": tokens, "meta": self.meta})
+        return digest_of(
+            {
+                "baseline": repr(self.baseline),
+                "task": self.task,
+                "tokens": tokens,
+                "meta": self.meta,
+                "payload": self.payload,  # whose bytes each scenario's results note
+            }
+        )
 
     def is_done(self, path: Path, scenarios: Mapping[str, tuple[str, ...]]) -> bool:
         """Whether its results of these samples are there."""
@@ -212,15 +228,17 @@ class _Work:
         except ResultsError:  # nothing, or something else
             return False
         wanted = self.task, self.meta, tuple(chain(*scenarios.values()))
-        return (results.task, results.meta, results.tokens) == wanted
+        there = {name: value for name, value in results.meta.items() if name != "bytes"}
+        return (results.task, there, results.tokens) == wanted
 
-    def writer(self, path: Path) -> ResultsWriter:
-        """A writer of its results; raises ResultsError if something stands there."""
+    def writer(self, path: Path, sent: object = None) -> ResultsWriter:
+        """A writer of its results, with a note on the bytes; raises ResultsError if something stands there."""
+        meta = self.meta | {"bytes": sent}
         if self.task != "motion":
-            return ResultsWriter(path, self.task, meta=self.meta)
+            return ResultsWriter(path, self.task, meta=meta)
         config = self.baseline.config
         step = config.step * FRAME_PERIOD
-        return ResultsWriter(path, self.task, meta=self.meta, grid=config.grid, step=step, labels="released")
+        return ResultsWriter(path, self.task, meta=meta, grid=config.grid, step=step, labels="released")
 
 
 @dataclass(frozen=True, slots=True)
@@ -242,8 +260,11 @@ def _predict(job: _Job) -> None:
     work = job.work
     if job.path.exists():
         return
+    sent = [
+        traffic(work.dataset, token, work.baseline.agents, work.baseline.link, work.payload) for token in job.tokens
+    ]
     try:
-        with work.writer(job.path) as writer:
+        with work.writer(job.path, sent) as writer:
             for token in job.tokens:
                 writer.add(token, work.baseline.predict(work.dataset, work.task, token))
     except ResultsError as error:

@@ -19,11 +19,12 @@ from deepaccident_devkit.cli.verbs import advanced, field_option, verb
 from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.evaluation import Resampling
 from deepaccident_devkit.evaluation.intervals import MOST_RESAMPLES
-from deepaccident_devkit.evaluation.runs import compare_bundles, read_bundle, verify_bundle
+from deepaccident_devkit.evaluation.runs import OverBytes, compare_bundles, read_bundle, verify_bundle
+from deepaccident_devkit.evaluation.runs import over_bytes as evaluations_over_bytes
 from deepaccident_devkit.evaluation.runs.verification import check_repeated
 from deepaccident_devkit.release import find_release
 from deepaccident_devkit.release.store import Dataroot, open_dataroot
-from deepaccident_devkit.render.evaluation import render_comparison
+from deepaccident_devkit.render.evaluation import render_comparison, render_over_bytes
 from deepaccident_devkit.render.figures import PICTURE_SUFFIXES, save_picture
 from deepaccident_devkit.render.styles import current_style
 from deepaccident_devkit.reports import write_csv
@@ -76,23 +77,47 @@ def verify(
 @verb()
 @click.argument("a", type=PATH)
 @click.argument("b", type=PATH)
-@click.option("--common", is_flag=True, help="Compare only the samples that both evaluations have.")
+@click.argument("more", type=PATH, nargs=-1)
+@click.option(
+    "--over-bytes",
+    is_flag=True,
+    help="In place of differences, show the main numbers of two or more evaluations over the bytes that partners send.",
+)
+@click.option("--common", is_flag=True, help="Compare only the samples that all evaluations have.")
 @field_option(Resampling, "resamples", option=advanced, type=click.IntRange(0, MOST_RESAMPLES))
 @click.option(
     "--out",
     multiple=True,
     type=PATH,
-    help="File to write all numbers into (.csv or .json), or a figure of the differences "
+    help="File to write all numbers into (.csv or .json), or a figure "
     f"({', '.join(PICTURE_SUFFIXES)}); you can repeat this option.",
 )
 @figure_style_parameter
 @json_parameter
-def compare(a: Path, b: Path, common: bool, resamples: int, out: tuple[Path, ...], as_json: bool) -> None:
-    """Compare the evaluations in the folders A and B, and test which differences are statistically significant."""
+def compare(
+    a: Path,
+    b: Path,
+    more: tuple[Path, ...],
+    over_bytes: bool,
+    common: bool,
+    resamples: int,
+    out: tuple[Path, ...],
+    as_json: bool,
+) -> None:
+    """Compare the evaluations in the folders A and B, and test which differences are statistically significant.
+
+    MORE evaluations need --over-bytes.
+    """
     for path in out:
         if path.suffix.lower() not in _KINDS:
             raise click.BadParameter(f"--out: expected a file that ends in {', '.join(_KINDS)}, found {str(path)!r}")
-    comparison = compare_bundles(a, b, Resampling(resamples=resamples), common=common)
+    if more and not over_bytes:
+        raise click.UsageError("differences are those of two evaluations; give --over-bytes to compare more")
+    comparison = (
+        evaluations_over_bytes([a, b, *more], Resampling(resamples=resamples), common=common)
+        if over_bytes
+        else compare_bundles(a, b, Resampling(resamples=resamples), common=common)
+    )
     as_text = comparison.to_json()
     for path in out:
         if path.suffix.lower() == ".csv":
@@ -100,7 +125,11 @@ def compare(a: Path, b: Path, common: bool, resamples: int, out: tuple[Path, ...
         elif path.suffix.lower() == ".json":
             write_bytes(path, as_text.encode())
         else:
-            save_picture(render_comparison(comparison), path, dpi=None if current_style().few else _DPI)
+            save_picture(
+                render_over_bytes(comparison) if isinstance(comparison, OverBytes) else render_comparison(comparison),
+                path,
+                dpi=None if current_style().few else _DPI,
+            )
     click.echo(as_text if as_json else comparison.to_text())
     for path in out:
         click.echo(f"written: {path}", err=as_json)

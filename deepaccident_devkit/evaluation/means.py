@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import groupby
+from itertools import product
 from typing import Any, ClassVar, Final, Generic, Literal, NamedTuple, TypeVar
 
 import numpy as np
@@ -15,14 +16,6 @@ from deepaccident_devkit.evaluation.task import HEADLINE_UNITS, Row, TaskResult,
 from deepaccident_devkit.support.arrays import BoolArray, FloatArray, IntArray
 from deepaccident_devkit.support.text import natural_order
 
-Numbers = Mapping[str, Mapping[str, Mapping[str, float]]]
-Whole = Mapping[str, Mapping[str, Mapping[str, int]]]
-SAMPLES: Final = "samples"
-SCENARIO: Final = "scenario"
-NAMES: Final = "names"
-SUMS: Final = "sums"
-COUNTS: Final = "counts"
-NOTES: Final = "notes"
 MEAN_OF_SCENARIOS: Final = "mean of scenarios"
 """The row with the mean of the scenarios' own means of the main row, for evaluators that ask for it."""
 _PARTS: Final = 2.0**30
@@ -59,8 +52,8 @@ class MeansResult(TaskResult):
     main_row: ClassVar[str] = ""
 
     samples: int
-    means: Numbers
-    counted: Whole
+    means: Mapping[str, Mapping[str, Mapping[str, float]]]
+    counted: Mapping[str, Mapping[str, Mapping[str, int]]]
     notes: tuple[str, ...]
 
     def __init_subclass__(cls) -> None:
@@ -86,33 +79,29 @@ class Sums:
 
     def __init__(self) -> None:
         """Start with nothing."""
-        self._sums: dict[str, list[float]] = {}
-        self._notes: dict[str, int] = {}
+        self._numbers: dict[str, FloatArray] = {}
+        self._notes: Counter[str] = Counter()
 
-    def add(self, table: str, row: str, column: str, values: float | Iterable[float]) -> None:
-        """Add one value, or several; NaN are not counted."""
-        given = np.array([values] if isinstance(values, int | float) else list(values), dtype=np.float64)
-        self.add_rows(table, {row: np.ones(len(given), dtype=bool)}, {column: given})
+    def add(self, table: str, row: str, column: str, value: float) -> None:
+        """Add one value; NaN is not counted."""
+        self.add_rows(table, {row: np.ones(1, dtype=bool)}, {column: np.array([value])})
 
     def add_rows(self, table: str, rows: Mapping[str, BoolArray], columns: Mapping[str, FloatArray]) -> None:
         """Add values (N,) of columns to each row, of which its mask (N,) has them; NaN are not counted."""
-        values = np.stack([*columns.values()], axis=1)
+        values, masks = np.stack([*columns.values()], axis=1), np.stack([*rows.values()]).astype(np.float64)
         there = np.isfinite(values)
-        masks = np.stack([*rows.values()]).astype(np.float64)
-        sums, counts = masks @ np.where(there, _rounded(values), 0.0), masks @ there
-        for row, *numbers in zip(rows, sums.tolist(), counts.tolist(), strict=True):
-            for column, value, count in zip(columns, *numbers, strict=True):
-                place = self._sums.setdefault(f"{table}/{row}/{column}", [0.0, 0])
-                place[0] += value
-                place[1] += int(count)
+        numbers = np.stack([masks @ np.where(there, _rounded(values), 0.0), masks @ there], axis=-1).reshape(-1, 2)
+        for name, number in zip(product(rows, columns), numbers, strict=True):
+            path = "/".join((table, *name))
+            self._numbers[path] = self._numbers.get(path, 0.0) + number
 
     def note(self, text: str, count: int = 1) -> None:
         """Say that something was left out, so many times; the text has {} for how many of all samples."""
-        self._notes[text] = self._notes.get(text, 0) + count
+        self._notes[text] += count
 
     def counts(self, scenario: str | None = None) -> Counts:
         """As an evaluator keeps them; with a scenario's token, the row `MEAN_OF_SCENARIOS` has means of its means."""
-        return _counts(self._sums, self._notes) | ({} if scenario is None else {SCENARIO: scenario})
+        return _counts(self._numbers, self._notes) | ({} if scenario is None else {"scenario": scenario})
 
 
 class MeansEvaluator(Evaluator[Result], Generic[Result]):
@@ -144,52 +133,45 @@ class MeansEvaluator(Evaluator[Result], Generic[Result]):
 
     def add(self, token: str, counts: Counts) -> None:
         """Take a sample's counts (`Evaluator.add`); of samples with the same names these are kept once."""
-        super().add(token, {**counts, NAMES: sys.intern(counts[NAMES])})
+        super().add(token, {**counts, "names": sys.intern(counts["names"])})
 
     def pooled(self, counts: Collection[Counts]) -> Sequence[Counts]:
         """One set of counts: their sums."""
         by_scenario: dict[str | None, list[Counts]] = {}
         for each in counts:
-            by_scenario.setdefault(each.get(SCENARIO), []).append(each)
-        return [_pooled([self._of_scenario(name, _pooled(those)) for name, those in by_scenario.items()])]
+            by_scenario.setdefault(each.get("scenario"), []).append(each)
+        parts = [_pooled(those) if name is None else self._of_scenario(those) for name, those in by_scenario.items()]
+        return [_pooled(parts)]
 
-    def _of_scenario(self, name: str | None, counts: Counts) -> Counts:
+    def _of_scenario(self, counts: Collection[Counts]) -> Counts:
         """The sums of one scenario with its means."""
-        if name is None:  # sums of several, which have the means
-            return counts
-        sums, end = _by_path(counts), f"/{self.result_class.main_row}/"
+        whole, main = _pooled(counts), f"/{self.result_class.main_row}/"
+        numbers = _by_path(whole)
         means = {
-            path.replace(end, f"/{MEAN_OF_SCENARIOS}/"): [
-                float(_rounded(value / count)) if count else 0.0,
-                min(count, 1),
-            ]
-            for path, (value, count) in sums.items()
-            if end in path
+            path.replace(main, f"/{MEAN_OF_SCENARIOS}/"): np.array([_rounded(value / max(count, 1.0)), min(count, 1.0)])
+            for path, (value, count) in numbers.items()
+            if main in path
         }
-        return {**counts, **_counts(sums | means, counts[NOTES])}
+        return {**whole, **_counts(numbers | means, whole["notes"])}
 
     def drawn_numbers(self, parts: Sequence[Sequence[Counts]], times: IntArray, names: Sequence[str]) -> FloatArray:
         """The numbers of each draw (`Evaluator.drawn_numbers`): all sums are drawn at once."""
         pooled = [_by_path(self.pooled(part)[0]) for part in parts]
-        paths = [name.removeprefix("means/") for name in names]
-        given = np.array([[each.get(path, _NOTHING) for path in paths] for each in pooled])
-        sums, counts = np.moveaxis(given.reshape(len(parts), len(paths), 2), -1, 0)
-        drawn = times @ counts
-        return np.where(drawn > 0, times @ sums / np.maximum(drawn, 1), np.nan)
+        given = np.array([[each.get(name.removeprefix("means/"), np.zeros(2)) for name in names] for each in pooled])
+        sums, counts = (times @ each for each in np.moveaxis(given.reshape(len(parts), len(names), 2), -1, 0))
+        return np.where(counts > 0, sums / np.maximum(counts, 1), np.nan)
 
     def result_of(self, counts: Collection[Counts]) -> Result:
         """The means over some samples, in any order."""
         (pooled,) = self.pooled(counts)
-        sums = _by_path(pooled)
         means: dict[str, dict[str, dict[str, float]]] = {}
-        numbers: dict[str, dict[str, dict[str, int]]] = {}
-        for path in sorted(sums, key=self._place):
+        counted: dict[str, dict[str, dict[str, int]]] = {}
+        for path, (value, count) in sorted(_by_path(pooled).items(), key=lambda each: self._place(each[0])):
             table, row, column = path.split("/")
-            value, count = sums[path]
-            means.setdefault(table, {}).setdefault(row, {})[column] = ratio(value, count)
-            numbers.setdefault(table, {}).setdefault(row, {})[column] = int(count)
-        notes = tuple(text.format(f"{count:,}") for text, count in sorted(pooled[NOTES].items()))
-        return self.result_class(samples=pooled[SAMPLES], means=means, counted=numbers, notes=notes)
+            means.setdefault(table, {}).setdefault(row, {})[column] = ratio(float(value), float(count))
+            counted.setdefault(table, {}).setdefault(row, {})[column] = int(count)
+        notes = tuple(text.format(f"{count:,}") for text, count in sorted(pooled["notes"].items()))
+        return self.result_class(samples=pooled["samples"], means=means, counted=counted, notes=notes)
 
     def _place(self, path: str) -> tuple[Any, ...]:
         """Where a number comes: by the given order, and columns by that of the result's."""
@@ -199,42 +181,28 @@ class MeansEvaluator(Evaluator[Result], Generic[Result]):
         return *((at, natural_order(name)) for at, name in zip(known, names, strict=True)), columns.index(column)
 
 
-_NOTHING: Final = (0.0, 0)
-_Paths = Mapping[str, Sequence[float]]
-"""`table/row/column` → sum, and of how many."""
-
-
 def _rounded(values: FloatArray | float) -> FloatArray:
     return np.asarray(np.rint(np.multiply(values, _PARTS)) / _PARTS)
 
 
-def _counts(sums: _Paths, notes: Mapping[str, int]) -> dict[str, Any]:
-    values, numbers = zip(*sums.values(), strict=True) if sums else ((), ())
-    rows = [
-        f"{row}/{','.join(path.rpartition('/')[2] for path in paths)}"
-        for row, paths in groupby(sums, key=lambda path: path.rpartition("/")[0])
-    ]
-    return {NAMES: "\n".join(rows), SUMS: [*values], COUNTS: [*numbers], NOTES: dict(notes)}
+def _counts(numbers: Mapping[str, FloatArray], notes: Mapping[str, int]) -> dict[str, Any]:
+    """Paths `table/row/column` with the sum and of how many (2,), as JSON holds them."""
+    return {"names": "\n".join(numbers), "numbers": [each.tolist() for each in numbers.values()], "notes": dict(notes)}
 
 
-def _by_path(counts: Counts) -> dict[str, Sequence[float]]:
-    rows = (line.rpartition("/") for line in counts[NAMES].splitlines())
-    names = [f"{row}/{column}" for row, _, columns in rows for column in columns.split(",")]
-    return dict(zip(names, zip(counts[SUMS], counts[COUNTS], strict=True), strict=True))
+def _by_path(counts: Counts) -> dict[str, FloatArray]:
+    return dict(zip(filter(None, counts["names"].split("\n")), np.array(counts["numbers"]), strict=True))
 
 
 def _pooled(counts: Collection[Counts]) -> Counts:
     alike: dict[str, list[Counts]] = {}
-    sums: dict[str, list[float]] = {}
-    notes: dict[str, int] = {}
+    numbers: dict[str, FloatArray] = {}
+    notes: Counter[str] = Counter()
     for each in counts:
-        alike.setdefault(each[NAMES], []).append(each)
-        for text, count in each[NOTES].items():
-            notes[text] = notes.get(text, 0) + count
+        alike.setdefault(each["names"], []).append(each)
+        notes.update(each["notes"])
     for those in alike.values():  # few, of many samples
-        totals = [np.sum([each[part] for each in those], axis=0).tolist() for part in (SUMS, COUNTS)]
-        for path, value, count in zip(_by_path(those[0]), *totals, strict=True):
-            place = sums.setdefault(path, [0.0, 0])
-            place[0] += value
-            place[1] += count
-    return {SAMPLES: sum(each.get(SAMPLES, 1) for each in counts), **_counts(sums, notes)}
+        total = np.sum([each["numbers"] for each in those], axis=0)
+        for path, number in _by_path({**those[0], "numbers": total}).items():
+            numbers[path] = numbers.get(path, 0.0) + number
+    return {"samples": sum(each.get("samples", 1) for each in counts), **_counts(numbers, notes)}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import zlib
 from collections.abc import Iterator, Sequence
@@ -30,7 +31,7 @@ from deepaccident_devkit.evaluation.forecasting import Forecast, forecasts_of
 from deepaccident_devkit.evaluation.motion import MOTION_PROTOCOLS
 from deepaccident_devkit.evaluation.results import RESULTS_NAMES, ResultsTask
 from deepaccident_devkit.evaluation.runs.setups import release_note, scenario_of
-from deepaccident_devkit.export.torch import V2XDataset, collate
+from deepaccident_devkit.export.torch import V2XConfig, V2XDataset, collate
 from deepaccident_devkit.model.detection import decode_detections, detected_boxes
 from deepaccident_devkit.model.inputs import mirrored_boxes, model_inputs
 from deepaccident_devkit.model.motion import MotionMaps
@@ -40,6 +41,7 @@ from deepaccident_devkit.support.arrays import ShortRepr
 from deepaccident_devkit.support.files import writable_folder
 from deepaccident_devkit.taxonomy import CAMERAS, FRAME_PERIOD
 from deepaccident_devkit.v2x import AgentConfig, Agents, Link
+from deepaccident_devkit.v2x.messages import POSE_BYTES, traffic_note
 from deepaccident_devkit.v2x.tracks import scenario_tracks
 
 if TYPE_CHECKING:
@@ -69,7 +71,8 @@ class PredictConfig:
 
     Attributes:
         agents: who cooperates (`v2x.cooperating_agents`).
-        link: what happens to the partners' data; None for nothing.
+        link: what happens to the partners' data; None for nothing. For a budget the payload `bev` is the model's own
+            features.
         seed: of the latents' draws, which depend on it and on the sample alone.
         device: where the model is.
         workers: processes that read; 0 for this one.
@@ -101,8 +104,7 @@ def predictions(
         NotAvailableError: the release has no images.
     """
     check_images(dataset, tokens[:1])
-    given = model.config.inputs(config.agents, link=config.link, images_cache=config.images_cache)
-    data = V2XDataset(dataset, tokens, given)
+    data = V2XDataset(dataset, tokens, _inputs(model, config))
     loader: DataLoader[Any] = DataLoader(data, collate_fn=collate, num_workers=config.workers)  # type: ignore[arg-type]
     training = model.training
     model.eval()
@@ -111,6 +113,22 @@ def predictions(
             yield prediction_of(model, batch, config)
     finally:
         model.train(training)
+
+
+def _inputs(model: V2XFormer, config: PredictConfig) -> V2XConfig:
+    """What the model sees, over a link that knows how large its features are."""
+    link, own = config.link, _features(model)[0]
+    link = replace(link, payload=own) if link is not None and link.payload == "bev" else link
+    return model.config.inputs(config.agents, link=link, images_cache=config.images_cache)
+
+
+def _features(model: V2XFormer) -> tuple[int, dict[str, Any]]:
+    """Bytes of a partner's message, its own map of the present (`V2XFormer.encoded`) and its pose; form of the map."""
+    shape, dtype = [model.config.temporal.channels, *model.config.grid.shape], next(model.parameters()).dtype
+    return (
+        POSE_BYTES + math.prod(shape) * dtype.itemsize,
+        {"shape": shape, "dtype": str(dtype).removeprefix("torch.")},
+    )
 
 
 def check_images(dataset: Dataset, tokens: Sequence[str]) -> None:
@@ -242,4 +260,14 @@ def _meta(model: V2XFormer, dataset: Dataset, tokens: Sequence[str], config: Pre
         "seed": config.seed,
         "release": release_note(dataset, map(scenario_of, tokens)),
         "devkit": __version__,
+        "bytes": _sent(model, dataset, tokens, config),
     }
+
+
+def _sent(model: V2XFormer, dataset: Dataset, tokens: Sequence[str], config: PredictConfig) -> dict[str, Any]:
+    """The note on the bytes that partners send; those whose images are not there send none."""
+    check_images(dataset, tokens[:1])
+    size, form = _features(model)
+    senders = V2XDataset(dataset, tokens, replace(_inputs(model, config), past=1)).senders()
+    sent = [(size * (len(names) - 1), len(names) - 1) for names in senders]
+    return traffic_note(sent, config.link, "bev", **form)

@@ -328,6 +328,7 @@ def link_words(link: Link) -> str:
             words.append(f"headings by σ {np.degrees(noise.heading_std):.1f}°")
     if link.packet_loss:
         words.append(f"{100 * link.packet_loss:g} % of messages lost")
+    words += [] if link.budget is None else [f"at most {link.budget:,} bytes a frame"]
     return ", ".join(words)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -42,6 +42,7 @@ from deepaccident_devkit.render.styles import (
 from deepaccident_devkit.support.arrays import FloatArray
 from deepaccident_devkit.taxonomy import UNTRACKED_ID, short_name
 from deepaccident_devkit.v2x import Agents, Link, cooperating_agents, cooperative_boxes, transform
+from deepaccident_devkit.v2x.messages import messages
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
@@ -169,11 +170,20 @@ def shared_boxes(dataset: Dataset, sample: RowArgument, link: Link, agents: Agen
     partners = [agent for agent in cooperating_agents(dataset, sample, agents) if agent != record["agent"]]
     if not partners:
         raise ChoiceError(f"agents: expected a partner of {record['agent']}, found none; a link needs two agents")
+    arriving = {message.agent for message in messages(dataset, sample, agents, link)}  # together they may not fit
     return [
         SharedBoxes(
             agent=agent,
             true=_tracked(cooperative_boxes(dataset, sample, agents=[agent], frame="ego")),
-            received=_tracked(cooperative_boxes(dataset, sample, agents=[agent], frame="ego", link=link)),
+            received=_tracked(
+                cooperative_boxes(
+                    dataset,
+                    sample,
+                    agents=[agent],
+                    frame="ego",
+                    link=link if agent in arriving else replace(link, packet_loss=1.0),
+                )
+            ),
         )
         for agent in partners
     ]

@@ -5,9 +5,9 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from statistics import NormalDist
-from typing import Final
+from typing import Any, Final, Literal, get_args
 
 import numpy as np
 from numpy.typing import DTypeLike
@@ -16,7 +16,8 @@ from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ChoiceError, ConfigError
 from deepaccident_devkit.geometry import SE3
 from deepaccident_devkit.release.layout import MissingFiles
-from deepaccident_devkit.support.arrays import FloatArray, checked_number, checked_whole
+from deepaccident_devkit.support.arrays import FloatArray, checked_count, checked_number, checked_whole
+from deepaccident_devkit.support.text import choice
 from deepaccident_devkit.tables.tokens import sample_token
 from deepaccident_devkit.taxonomy import CAMERAS, FRAME_PERIOD, LIDAR, AgentName, OnError
 from deepaccident_devkit.v2x.agents import Agents, cooperating_agents
@@ -27,7 +28,12 @@ BOX_BYTES: Final = 9 * 4 + 4 + 1 + 4
 """Centre, size, yaw and horizontal velocity in single precision, an id, a class and a score."""
 POSE_BYTES: Final = 6 * 4
 """A 6-vector in single precision, which goes with every message."""
+_BEV_SHAPE: Final = (64, 200, 200)
+Payload = Literal["images", "cloud", "boxes", "bev"]
+"""The kinds of data that a message can have; `MessageSize` describes them."""
 _NORMAL: Final = NormalDist()
+_MOST: Final = 2**50
+"""Bytes that can be asked for."""
 _LONGEST: Final = 20.0
 """Seconds: no scenario is longer, so a longer latency is in milliseconds."""
 _FRAME_TOLERANCE: Final = 1e-6
@@ -86,15 +92,21 @@ class Link:
             poses.
         packet_loss: probability in [0, 1] that a partner's data do not arrive at a frame.
         seed: seed of all that is drawn.
+        budget: bytes a frame that all partners together can send to the ego. None is no limit. Each partner sends whose
+            message still fits, in the order of `cooperating_agents`; what is lost on its way takes no bytes.
+        payload: what a partner sends, for the budget: a kind of `MessageSize`, or the bytes of every message, such as
+            of features that all have one size; None without a budget.
     """
 
     latency: float = 0.0
     pose_noise: PoseNoise | float | None = None
     packet_loss: float = 0.0
     seed: int = 0
+    budget: int | None = None
+    payload: Payload | int | None = None
 
     def __post_init__(self) -> None:
-        """Check the numbers and convert them to Python's types; raises ConfigError."""
+        """Check the numbers and convert them to Python's types; raises ConfigError, or ChoiceError of the payload."""
         loss = checked_number("packet_loss", self.packet_loss, "a probability from 0 to 1", ConfigError)
         if not 0 <= loss <= 1:
             raise ConfigError(f"packet_loss: {loss:g} is no probability; choose a number from 0 to 1")
@@ -103,7 +115,18 @@ class Link:
             "pose_noise": _noise(self.pose_noise),
             "packet_loss": loss,
             "seed": checked_whole("seed", self.seed, "a whole number", ConfigError),
+            "budget": None if self.budget is None else checked_count("budget", self.budget, "bytes a frame", _MOST),
+            "payload": (
+                choice("payload", self.payload, (None, *get_args(Payload)))
+                if self.payload is None or isinstance(self.payload, str)
+                else checked_count("payload", self.payload, "bytes of every message", _MOST)
+            ),
         }
+        if self.budget is not None and self.payload is None:
+            raise ConfigError(
+                "budget: needs the kind of data that partners send; give payload='boxes' or another of "
+                f"{', '.join(get_args(Payload))}, or the bytes of every message"
+            )
         for name, value in checked.items():
             object.__setattr__(self, name, value)
 
@@ -212,7 +235,7 @@ def message_sizes(
     sample: RowArgument,
     *,
     agents: Agents = None,
-    bev_shape: tuple[int, int, int] = (64, 200, 200),
+    bev_shape: tuple[int, int, int] = _BEV_SHAPE,
     bev_dtype: DTypeLike = np.float32,
     clouds: bool = True,
     link: Link | None = None,
@@ -244,22 +267,74 @@ def message_sizes(
         MissingFileError: `clouds` is true, `on_missing` is `raise`, and a point cloud was not downloaded.
         SensorFileError: `clouds` is true and a point cloud cannot be read.
     """
-    bev = _bev_bytes(bev_shape, bev_dtype)
+    bev = POSE_BYTES + _bev_bytes(bev_shape, bev_dtype)
     files = MissingFiles(dataset.dataroot, on_missing)
     sizes: dict[str, MessageSize] = {}
     for message in messages(dataset, sample, agents, link):
-        images = [dataset.get("sample_data", f"{message.sample}/{camera}") for camera in CAMERAS]
-        path = dataset.sensor_path(f"{message.sample}/{LIDAR}")
-        counted = clouds and files.has(path, LIDAR)
-        points = len(dataset.load_point_cloud(message.sample, "lidar")) if counted else None
+        counted = clouds and files.has(dataset.sensor_path(f"{message.sample}/{LIDAR}"), LIDAR)
         sizes[message.agent] = MessageSize(
-            images=POSE_BYTES + sum(3 * image["width"] * image["height"] for image in images),
-            cloud=None if points is None else POSE_BYTES + POINT_BYTES * points,
-            boxes=POSE_BYTES + BOX_BYTES * len(dataset.boxes(message.sample, "lidar")),
-            bev=POSE_BYTES + bev,
+            images=message_bytes(dataset, message.sample, "images"),
+            cloud=message_bytes(dataset, message.sample, "cloud") if counted else None,
+            boxes=message_bytes(dataset, message.sample, "boxes"),
+            bev=bev,
         )
     files.tell()
     return sizes
+
+
+def message_bytes(dataset: Dataset, sample: str, payload: Payload | int | None) -> int:
+    """Bytes of the message that a sample's own agent sends at its frame, as `MessageSize` says; 0 for None.
+
+    Only for `cloud` a file is read. `bev` is of the shape and type that `message_sizes` takes without being told; for
+    other features give their bytes.
+
+    Raises:
+        TokenError: no such sample.
+        MissingFileError: a point cloud was not downloaded.
+        SensorFileError: a point cloud cannot be read.
+    """
+    if not isinstance(payload, str):
+        return payload or 0
+    if payload == "images":
+        images = (dataset.get("sample_data", f"{sample}/{camera}") for camera in CAMERAS)
+        return POSE_BYTES + sum(3 * int(image["width"]) * int(image["height"]) for image in images)
+    if payload == "cloud":
+        return POSE_BYTES + POINT_BYTES * len(dataset.load_point_cloud(sample, "lidar"))
+    boxes = dataset.columns("sample")["num_annotations"].item(dataset.getind("sample", sample))
+    return POSE_BYTES + (BOX_BYTES * int(boxes) if payload == "boxes" else _bev_bytes(_BEV_SHAPE, np.float32))
+
+
+def traffic(
+    dataset: Dataset, sample: RowArgument, agents: Agents, link: Link | None, payload: Payload | int
+) -> tuple[int, int]:
+    """Bytes that arrive from all partners at a sample's frame, and the number of these partners.
+
+    Raises what `messages` and `message_bytes` do.
+    """
+    own = dataset.get("sample", sample)["token"]
+    exact = None if link is None else replace(link, pose_noise=None)  # which changes no size, and takes time
+    sent = [
+        message_bytes(dataset, message.sample, payload)
+        for message in messages(dataset, own, agents, exact)
+        if message.sample != own
+    ]
+    return sum(sent), len(sent)
+
+
+def traffic_note(
+    found: Sequence[tuple[int, int]], link: Link | None, payload: Payload | int, **more: Any
+) -> dict[str, Any]:
+    """What results note of the bytes that partners send: means of the `traffic` of each sample, and `more`."""
+    total, partners = (sum(column) for column in zip(*found, strict=True)) if found else (0, 0)
+    return {
+        "payload": payload,
+        **more,
+        "samples": len(found),
+        "mean": total / max(len(found), 1),
+        "link": total / max(partners, 1),
+        "partners": partners / max(len(found), 1),
+        "budget": None if link is None else link.budget,
+    }
 
 
 def _bev_bytes(shape: Sequence[int], dtype: DTypeLike) -> int:
@@ -302,6 +377,8 @@ def messages(
 ) -> Iterator[Message]:
     """What the agents contribute at a sample and at the `sweeps` − 1 frames before it; nothing for a lost message.
 
+    With a budget, partners whose message does not fit contribute nothing either.
+
     By frame, the present first and then backwards, and for each frame by agent, the sample's own first. Raises what
     `cooperating_agents` does, and ConfigError of the link.
     """
@@ -309,12 +386,19 @@ def messages(
     names = cooperating_agents(dataset, sample, agents)
     scenario, ego, number = dataset.get("sample", sample)["token"].rsplit("/", 2)
     for index in range(int(number), max(int(number) - sweeps, 0), -1):
+        left = math.inf if link is None or link.budget is None else link.budget
         for agent in names:
             if link is None or agent == ego:
                 yield Message(agent=agent, sample=sample_token(scenario, agent, index), pose_error=None)
             elif index == int(number) or index > link.latency_frames:
                 message = _received(dataset, scenario, agent, index, link)
-                if message is not None:
+                size = (
+                    0
+                    if message is None or link.budget is None
+                    else message_bytes(dataset, message.sample, link.payload)
+                )
+                if message is not None and size <= left:
+                    left -= size
                     yield message
 
 

@@ -12,7 +12,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from deepaccident_devkit.evaluation.planning import CELL_PROTOCOLS, Plan
-from deepaccident_devkit.evaluation.planning.cells import CellNumbers, Steps, cell_numbers, occupied, touching
+from deepaccident_devkit.evaluation.planning.cells import cell_numbers, occupied, touching
 from deepaccident_devkit.evaluation.planning.contacts import first_contacts
 from deepaccident_devkit.geometry.box_arrays import corner_offsets
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
@@ -70,7 +70,7 @@ def test_the_rasters_are_those_of_the_code(folder: Path, protocol: str) -> None:
                 assert_array_equal(found, cells[step], err_msg=f"sample {sample}, step {step + 1}")
 
 
-def numbers_of(folder: Path, protocol: str) -> tuple[list[Steps], list[Steps], list[CellNumbers]]:
+def numbers_of(folder: Path, protocol: str) -> tuple[list[np.ndarray], list[np.ndarray], list[dict[str, np.ndarray]]]:
     """What plan and recorded path touch in each sample of the stored rasters, and the numbers."""
     inputs, cells, rules = arrays(folder / "inputs.npz"), rasters(folder, protocol), CELL_PROTOCOLS[protocol]
     if protocol == "uniad":
@@ -89,12 +89,12 @@ def numbers_of(folder: Path, protocol: str) -> tuple[list[Steps], list[Steps], l
 def test_the_numbers_are_those_of_the_code(folder: Path, protocol: str) -> None:
     told = arrays(folder / "outputs.npz")
     plans, trues, numbers = numbers_of(folder, protocol)
-    assert_array_equal([each.box for each in plans], told[f"{protocol}_plan_hit"])
-    assert_array_equal([each.box for each in trues], told[f"{protocol}_gt_hit"])
+    assert_array_equal([each[0] for each in plans], told[f"{protocol}_plan_hit"])
+    assert_array_equal([each[0] for each in trues], told[f"{protocol}_gt_hit"])
     prefix = "" if protocol in ("uniad", "stp3") else "plan_"
     names = {"l2": "L2", "collision": "obj_box_col", "point_collision": "obj_col"}
     for field, name in names.items():
-        found = np.array([getattr(each, field) for each in numbers])
+        found = np.array([each[field] for each in numbers])
         if protocol == "stp3":
             total, by_sample = told[f"stp3_total_{name}"], None
         elif protocol == "uniad":
@@ -105,8 +105,8 @@ def test_the_numbers_are_those_of_the_code(folder: Path, protocol: str) -> None:
         if by_sample is not None:
             assert_allclose(found, by_sample, rtol=1e-6, atol=1e-6)
     if protocol == "bev_planner":
-        assert_allclose(np.nanmean([each.l2 for each in numbers]), told["bev_planner_avg_L2"], rtol=1e-6)
-        assert_allclose(np.nanmean([each.collision for each in numbers]), told["bev_planner_avg_col"], rtol=1e-6)
+        assert_allclose(np.nanmean([each["l2"] for each in numbers]), told["bev_planner_avg_L2"], rtol=1e-6)
+        assert_allclose(np.nanmean([each["collision"] for each in numbers]), told["bev_planner_avg_col"], rtol=1e-6)
 
 
 @pytest.mark.parametrize("protocol", PUBLIC)
@@ -115,10 +115,10 @@ def test_a_plan_equal_to_the_recorded_path_never_collides(folder: Path, protocol
     touched = 0
     for sample, path in enumerate(inputs["gt_xy"].astype(np.float64)):
         found = touching(path, cells[sample], BOX, rules)
-        touched += int(found.box.sum())
+        touched += int(found[0].sum())
         numbers = cell_numbers(path, path, inputs["valid"][sample], (found, found), rules)
-        points = [] if rules.point_far_off else [numbers.point_collision]
-        for values in (numbers.l2, numbers.collision, *points):
+        points = [] if rules.point_far_off else [numbers["point_collision"]]
+        for values in (numbers["l2"], numbers["collision"], *points):
             assert not np.nan_to_num(values).any()
     assert touched  # and it does touch
 

@@ -95,3 +95,20 @@ def test_samples_before_the_first_data_are_refused_at_once(da: DeepAccident) -> 
     assert_refused((lambda: V2XDataset(da, tokens, behind), ConfigError, named))
     assert all(item["agent_valid"].all() for item in V2XDataset(da, tokens, V2XConfig(**late)))
     assert V2XDataset(da, tokens[3:], behind)[0]["agent_valid"].tolist() == [[True, True], [False, True]]
+
+
+def test_senders_are_those_whose_present_an_item_has(da: DeepAccident, da_partial: DeepAccident, sample: str) -> None:
+    for dataset, agents, link, most in (
+        (da, "all", None, 5),
+        (da, "all", Link(packet_loss=0.5, seed=1, budget=2500, payload=1000), 3),
+        (da_partial, "available", None, 3),  # the pole has no points
+    ):
+        samples = [sample, sample.replace("ego_vehicle", "other_vehicle")]
+        data = V2XDataset(dataset, samples, V2XConfig(agents=agents, link=link, on_missing="skip"))
+        items = [data[row] for row in range(len(data))]
+        expected = [
+            tuple(name for name, there in zip(item["agents"], item["agent_valid"][:, -1], strict=True) if there)
+            for item in items
+        ]
+        assert data.senders() == expected
+        assert 1 < max(map(len, expected)) <= most

@@ -10,7 +10,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
-from typing import Final, Literal, NamedTuple
+from typing import Final, Literal
 
 import numpy as np
 
@@ -25,7 +25,6 @@ HALF: Final = 50.0
 """Metres from the ego to the edges of the grid."""
 LIDAR_AHEAD: Final = 0.985793
 """Metres from nuScenes' ego origin to its LiDAR."""
-Rows = Literal["forward", "backward", "sideways"]
 Over = Literal["step", "mean", "any"]
 
 
@@ -56,7 +55,7 @@ class CellRules:
     box_over: Over = "mean"
     point_over: Over = "mean"
     cell: float = 0.5
-    rows: Rows = "forward"
+    rows: Literal["forward", "backward", "sideways"] = "forward"
     mirrored: bool = True
     drawn_ahead: float = 0.0
     box_ahead: float = 0.5
@@ -101,18 +100,6 @@ CELL_PROTOCOLS: Final[Mapping[str, CellRules]] = MappingProxyType(
 """Name of the code → its rules; `…_own_box` are the same with the box of DeepAccident."""
 
 
-class Steps(NamedTuple):
-    """What happens at each of the 6 steps of a path.
-
-    Attributes:
-        box: whether the ego's box touches an occupied cell.
-        point: whether the path's point lies in one.
-    """
-
-    box: BoolArray
-    point: BoolArray
-
-
 def occupied(corners: FloatArray, rules: CellRules) -> BoolArray:
     """(H, W) the cells that boxes (N, 4, 2) cover."""
     x, y = corners[..., 0] + rules.drawn_ahead, corners[..., 1]
@@ -131,109 +118,84 @@ def occupied(corners: FloatArray, rules: CellRules) -> BoolArray:
     return drawn.astype(bool)
 
 
-def touching(path: FloatArray, cells: BoolArray, ego: tuple[float, float], rules: CellRules) -> Steps:
-    """What a path (6, 2) touches of the cells (6, H, W) of its steps, with a box of this length and width."""
-    along, across = _box(ego, rules)
-    if rules.turned:
-        rows, columns = _turned_box(path, along, across, rules)
-    else:
-        rows, columns = _box_beside(path, along, across, rules)
+def touching(path: FloatArray, cells: BoolArray, ego: tuple[float, float], rules: CellRules) -> BoolArray:
+    """(2, 6) whether the ego's box, and the path's point, is on an occupied one of the cells (6, H, W) of each step.
+
+    Args:
+        path: (6, 2).
+        cells: from `occupied`.
+        ego: length and width of the agent's own box.
+        rules: the protocol.
+    """
     steps = np.arange(len(path))
-    box = np.asarray(cells[steps[:, None], rows, columns].any(axis=1))
+    row, column = _box(path, ego, rules)
+    box = cells[steps[:, None], row, column].any(axis=1)
     row, column = _point(path, rules)
     inside = (row >= 0) & (row < rules.size) & (column >= 0) & (column < rules.size)
-    point = np.zeros(len(path), dtype=bool)
-    point[inside] = cells[steps[inside], row[inside], column[inside]]
-    return Steps(box=box, point=point)
+    point = inside & cells[steps, np.where(inside, row, 0), np.where(inside, column, 0)]
+    return np.stack([box, point])
 
 
-def _box(ego: tuple[float, float], rules: CellRules) -> tuple[IntArray, IntArray]:
-    """The cells along and across of the box at the origin."""
-    length, width = rules.ego or ego
-    spans = []
-    for extent, ahead in ((length, rules.box_ahead), (width, 0.0)):
-        low, high = ((side * extent / 2 + ahead + rules.middle) / rules.cell for side in (-1, 1))
-        spans.append(np.arange(math.ceil(low), math.floor(high) + 1))
-    return spans[0], spans[1]
-
-
-def _box_beside(path: FloatArray, along: IntArray, across: IntArray, rules: CellRules) -> tuple[IntArray, IntArray]:
-    """(6, M) rows and columns of the box's cells, moved without turning and clipped to the grid."""
-    forward, aside = path[:, :1] / rules.cell, (-path[:, 1:] if rules.mirrored else path[:, 1:]) / rules.cell
-    ahead = np.repeat(along, len(across))
-    rows = rules.size - forward - ahead if rules.rows == "backward" else forward + ahead
-    columns = aside + np.tile(across, len(along))
-    row, column = (np.clip(np.trunc(each), 0, rules.size - 1).astype(np.int64) for each in (rows, columns))
-    return row, column
-
-
-def _turned_box(path: FloatArray, along: IntArray, across: IntArray, rules: CellRules) -> tuple[IntArray, IntArray]:
-    """(6, M) rows (y) and columns (x) of the box's cells, turned with the path."""
-    step = np.diff(path.astype(np.float32), axis=0, prepend=np.zeros((1, 2), dtype=np.float32))
-    far = np.hypot(step[:, 0], step[:, 1]) >= _LEAST_STEP
-    angle = np.where(far, np.arctan2(step[:, 1], step[:, 0]), 0.0)[:, None]
-    centre = (rules.size - 1) / 2
-    a, b = np.repeat(along, len(across)) - centre, np.tile(across, len(along)) - centre
-    x = np.round(a * np.cos(angle) - b * np.sin(angle) + centre)
-    y = np.round(a * np.sin(angle) + b * np.cos(angle) + centre)
-    columns, rows = (np.trunc(each + path[:, axis, None] / rules.cell) for axis, each in enumerate((x, y)))
-    row, column = (np.clip(each, 0, rules.size - 1).astype(np.int64) for each in (rows, columns))
-    return row, column
+def _box(path: FloatArray, ego: tuple[float, float], rules: CellRules) -> IntArray:
+    """(2, 6, M) rows and columns of the box's cells, clipped to the grid."""
+    spans = [
+        [(side * extent / 2 + ahead + rules.middle) / rules.cell for side in (-1, 1)]
+        for extent, ahead in zip(rules.ego or ego, (rules.box_ahead, 0.0), strict=True)
+    ]
+    along, across = np.meshgrid(
+        *(np.arange(math.ceil(low), math.floor(high) + 1) for low, high in spans), indexing="ij"
+    )
+    ahead, aside = along.ravel(), across.ravel()
+    x, y = path[:, :1] / rules.cell, path[:, 1:] / rules.cell
+    if rules.turned:
+        step = np.diff(path.astype(np.float32), axis=0, prepend=np.zeros((1, 2), dtype=np.float32))
+        far = np.hypot(step[:, 0], step[:, 1]) >= _LEAST_STEP
+        angle = np.where(far, np.arctan2(step[:, 1], step[:, 0]), 0.0)[:, None]
+        centre = (rules.size - 1) / 2
+        columns = np.round((ahead - centre) * np.cos(angle) - (aside - centre) * np.sin(angle) + centre) + x
+        rows = np.round((ahead - centre) * np.sin(angle) + (aside - centre) * np.cos(angle) + centre) + y
+    else:
+        rows = rules.size - x - ahead if rules.rows == "backward" else x + ahead
+        columns = aside + (-y if rules.mirrored else y)
+    return np.clip(np.trunc(np.stack([rows, columns])), 0, rules.size - 1).astype(np.int64)
 
 
 _LEAST_STEP: Final = 1.0
 """Metres."""
 
 
-def _point(path: FloatArray, rules: CellRules) -> tuple[IntArray, IntArray]:
-    """(6,) row and column of the path's points."""
+def _point(path: FloatArray, rules: CellRules) -> IntArray:
+    """(2, 6) rows and columns of the path's points."""
     x, y = path.T
     if rules.point_far_off:
-        quarter = rules.middle / 2
-        rows, columns = (quarter - x) / rules.cell, (quarter - y) / rules.cell
-    elif rules.rows == "sideways":
-        rows, columns = (y + rules.middle) / rules.cell, (x + rules.middle) / rules.cell
+        cells = np.stack([rules.middle / 2 - x, rules.middle / 2 - y])
     else:
-        rows, columns = (x + rules.middle) / rules.cell, ((-y if rules.mirrored else y) + rules.middle) / rules.cell
-    return np.trunc(rows).astype(np.int64), np.trunc(columns).astype(np.int64)
-
-
-class CellNumbers(NamedTuple):
-    """Of one path, at the horizons of 1, 2 and 3 s; NaN where the sample does not count.
-
-    Attributes:
-        l2: (3,) metres.
-        collision: (3,) share of the box's collisions.
-        point_collision: (3,) share of the points'.
-        left_out: (3,) share of steps that cannot collide, since the recorded path touches there.
-    """
-
-    l2: FloatArray
-    collision: FloatArray
-    point_collision: FloatArray
-    left_out: FloatArray
+        cells = np.stack([y, x] if rules.rows == "sideways" else [x, -y if rules.mirrored else y]) + rules.middle
+    return np.trunc(cells / rules.cell).astype(np.int64)
 
 
 def cell_numbers(
-    path: FloatArray, recorded: FloatArray, valid: BoolArray, found: tuple[Steps, Steps], rules: CellRules
-) -> CellNumbers:
-    """The numbers of a path (6, 2) beside the recorded one (6, 2), of which steps (6,) exist.
+    path: FloatArray, recorded: FloatArray, valid: BoolArray, touched: tuple[BoolArray, BoolArray], rules: CellRules
+) -> dict[str, FloatArray]:
+    """The numbers of a path (6, 2) beside the recorded one (6, 2), of which steps (6,) exist, at 1, 2 and 3 s.
 
-    `found` is what the two touch. At steps at which the recorded path's box touches, nothing collides, and the step
-    stays in the denominator.
+    `touched` is what `touching` gives of the two. At steps at which the recorded path's box touches, nothing collides,
+    and the step stays in the denominator: `left_out` is the share of such steps.
+
+    Returns:
+        Each (3,): `l2` metres; `collision`, `point_collision` and `left_out` shares. NaN if the sample does not count.
     """
-    if rules.whole_futures and not valid.all():
-        nothing = np.full(len(HORIZONS), np.nan)
-        return CellNumbers(nothing, nothing, nothing, nothing)
-    own, true = found
-    masked = true.box | ~valid
+    own, true = touched
+    masked = true[0] | ~valid
     error = np.where(valid, np.hypot(*(path - recorded).T), 0.0)
-    return CellNumbers(
-        l2=_over(error, rules.error),
-        collision=_over(own.box & ~masked, rules.box_over),
-        point_collision=_over(own.point & ~masked, rules.point_over),
-        left_out=_over(masked, "mean" if rules.box_over == "any" else rules.box_over),
-    )
+    by_step: dict[str, tuple[AnyArray, Over]] = {
+        "l2": (error, rules.error),
+        "collision": (own[0] & ~masked, rules.box_over),
+        "point_collision": (own[1] & ~masked, rules.point_over),
+        "left_out": (masked, "mean" if rules.box_over == "any" else rules.box_over),
+    }
+    counts = valid.all() or not rules.whole_futures
+    return {name: _over(values, how) if counts else np.full(3, np.nan) for name, (values, how) in by_step.items()}
 
 
 def _over(values: AnyArray, how: Over) -> FloatArray:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from itertools import product
+from typing import Final
 
 import numpy as np
 
@@ -21,6 +23,8 @@ _SLACK: Final = 1e-6
 """Seconds and metres: times are decimal numbers, and a path projected on itself loses digits."""
 _NEAREST: Final = 0.2
 """Seconds from a sample to the lead that it counts for: lists of samples count back from each recording's own end."""
+_TOUCHING: Final = 1e-9
+"""Metres of a gap that still counts as contact."""
 _FAR: Final = 1.0
 """Metres of a recorded way from which the share of it that is lost says something."""
 
@@ -40,55 +44,96 @@ class CleanPlanning:
     braking: float = 3.0
 
 
-class Driven(NamedTuple):
-    """A plan as it is driven.
+def add_clean(sums: Sums, plans: Mapping[str, Plan], scene: PlanningScene, rules: CleanPlanning) -> None:
+    """Add what plans do, among others that keep their recorded motion, to the sums.
 
-    Attributes:
-        contacts: with the others, for at least 3 s, up to the end of the plan or of the recording; with the partner up
-            to 3 s after the recording.
-        error: (N,) metres from the recorded path at each step of 0.5 s that was recorded.
-        lost: metres of the recorded way that it lacks at the end of the window.
-        way: metres of the recorded way up to there.
-        infeasible: whether an acceleration is above the limit.
-        brakes: whether a deceleration is above that of passengers' comfort.
-        known: seconds up to which neither the plan nor the recording is prolonged.
+    Args:
+        sums: of the sample.
+        plans: by the name of their row; the recorded path is the one called `recorded`.
+        scene: of the sample.
+        rules: the protocol.
     """
+    if len(scene.recorded) < 2:
+        sums.note("{} samples have no frame after them that counts; twins end where their accident does")
+        return
+    margin = _margin(scene)
+    found = {name: _contacts(plan, scene, margin) for name, plan in plans.items()}
+    true = found["recorded"]
+    if true.overlapping.any():
+        sums.note("{} actors overlap the ego at the present; they are left out", int(true.overlapping.sum()))
+    if scene.is_collider and not scene.is_twin and (reason := _unusable(scene, margin, true)):
+        sums.note(f"{scene.scenario}: {reason}; {{}} of its samples are left out")
+        return
+    role = "" if scene.is_collider else "bystander, "
+    leads = [
+        f"{role}lead {lead:g} s{suffix}"
+        for end, suffix in ((scene.to_end, ""), (scene.to_contact, " to contact"))
+        for lead in rules.leads
+        if abs(end - lead) <= _NEAREST + _SLACK
+    ]
+    for row, plan in plans.items():
+        for horizon in HORIZONS:
+            for column, value in _at_horizon(plan, scene, found[row], horizon).items():
+                sums.add(f"{horizon} s", row, column, value)
+        if leads:
+            numbers = _at_lead(plan, scene, found[row], true, rules)
+            for table, (column, value) in product(leads, numbers.items()):
+                sums.add(table, row, column, value)
 
-    contacts: Contacts
-    error: FloatArray
-    lost: float
-    way: float
-    infeasible: bool
-    brakes: bool
-    known: float
 
-
-def drive(plan: Plan, scene: PlanningScene, margin: float, rules: CleanPlanning) -> Driven:
-    """Drive a plan among others that keep their recorded motion; `margin` is that of the recorded pair's contact."""
-    known = min(float(plan.times[-1]), scene.duration)
-    partner = scene.actor_id == scene.partner
-    until = scene.duration + (HORIZON if partner.any() else 0.0)
+def _contacts(plan: Plan, scene: PlanningScene, margin: float) -> Contacts:
+    """With the others, for at least 3 s, up to the plan's end or the recording's; with the partner 3 s longer."""
+    until = scene.duration + (HORIZON if scene.partner.any() else 0.0)
     times = np.append(0.0, steps_of(FRAME_PERIOD, until))
-    contacts = first_contacts(
+    return first_contacts(
         box_path(plan.poses(times), scene.offset),
         scene.size,
-        _prolonged(scene.footprint, len(times), partner),
-        np.where(partner, margin, 0.0),
-        np.where(partner, until, max(known, min(scene.duration, HORIZONS[-1]))),
+        _prolonged(scene, len(times)),
+        np.where(scene.partner, margin, 0.0),
+        np.where(scene.partner, until, min(scene.duration, max(float(plan.times[-1]), HORIZONS[-1]))),
     )
-    steps = steps_of(STEP, min(scene.duration, HORIZONS[-1]))
-    away = plan.poses(steps) - recorded_poses(scene, steps)
+
+
+def _at_horizon(plan: Plan, scene: PlanningScene, contacts: Contacts, horizon: int) -> dict[str, float]:
+    """Errors and contacts of a plan up to a horizon; NaN where nothing is recorded."""
+    steps = steps_of(STEP, min(scene.duration, horizon))
+    away = np.hypot(*(plan.poses(steps) - recorded_poses(scene, steps))[:, :2].T)
+    touches = (contacts.time <= min(horizon, scene.duration) + _SLACK).any()
+    return {
+        "l2": float(away[-1]) if len(away) == round(horizon / STEP) else np.nan,
+        "l2_mean": float(away.mean()) if len(away) else np.nan,
+        "contact": 100.0 * touches if len(away) else np.nan,
+    }
+
+
+def _at_lead(
+    plan: Plan, scene: PlanningScene, contacts: Contacts, true: Contacts, rules: CleanPlanning
+) -> dict[str, float]:
+    """What a plan makes of the accident, or of what happens in its place in a twin."""
+    known = min(float(plan.times[-1]), scene.duration)
+    new = (contacts.time <= known + _SLACK) & (true.time > known + _SLACK) & ~scene.partner
     along, across = _accelerations(plan, scene.before)
     lost, way = _progress(plan, scene, known)
-    return Driven(
-        contacts=contacts,
-        error=np.hypot(*away[:, :2].T),
-        lost=lost,
-        way=way,
-        infeasible=bool(max(np.abs(along).max(), np.abs(across).max()) > rules.most_acceleration + _SLACK),
-        brakes=bool(along.min() < -rules.braking),
-        known=known,
-    )
+    hardest = max(np.abs(along).max(), np.abs(across).max())
+    numbers = {
+        "striking": 100.0 * (new & ~contacts.struck).any(),
+        "struck": 100.0 * (new & contacts.struck).any(),
+        "lost_way": lost,
+        "lost": 100.0 * lost / way if way > _FAR else np.nan,
+        "infeasible": 100.0 * (hardest > rules.most_acceleration + _SLACK),
+    }
+    if scene.is_twin:
+        numbers = {f"{name}_twins": value for name, value in numbers.items()}
+        numbers["braking_twins"] = 100.0 * (along.min() < -rules.braking)
+    for at in np.flatnonzero(scene.partner):
+        time = float(contacts.time[at])
+        numbers |= {
+            "avoided": 100.0 * np.isinf(time),
+            "impact_speed": float(contacts.speed[at]),
+            "relative_speed": float(contacts.relative_speed[at]),
+            "prolonged": 100.0 * (known + _SLACK < time < np.inf),
+        }
+    return {name: float(value) for name, value in numbers.items()}
 
 
 def box_path(poses: FloatArray, offset: FloatArray) -> FloatArray:
@@ -98,26 +143,20 @@ def box_path(poses: FloatArray, offset: FloatArray) -> FloatArray:
     return np.column_stack([x, poses[:, 1] + sine * offset[0] + cosine * offset[1], poses[:, 2]])
 
 
-def margin_of(scene: PlanningScene) -> float:
+def _margin(scene: PlanningScene) -> float:
     """The gap between the recorded pair at the end, which counts as contact; NaN without a partner."""
-    partner = np.flatnonzero(scene.actor_id == scene.partner)
-    if not len(partner):
-        return np.nan
-    x, y, yaw = box_path(scene.recorded[-1:], scene.offset)[0]
-    return float(gaps_of_pairs(np.array([x, y, *scene.size, yaw]), scene.footprint[-1, partner[0]])) + 1e-9
+    ego = np.concatenate([box_path(scene.recorded[-1:], scene.offset)[0, :2], scene.size, scene.recorded[-1, 2:]])
+    gaps = gaps_of_pairs(ego, scene.footprint[-1, scene.partner])
+    return float(gaps[0]) + _TOUCHING if len(gaps) else np.nan
 
 
-def _prolonged(footprint: FloatArray, frames: int, goes_on: FloatArray) -> FloatArray:
-    """(frames, A, 5) recorded footprints, and those of the actors that go on, straight on; others are not there."""
-    more = frames - len(footprint)
-    if not more:
-        return footprint
-    after = np.full((more, *footprint.shape[1:]), np.nan)
-    if len(footprint) > 1:
-        last = np.broadcast_to(footprint[-1], after.shape).copy()
-        last[..., :2] += np.arange(1, more + 1)[:, None, None] * (footprint[-1] - footprint[-2])[:, :2]
-        after = np.where(goes_on[:, None], last, after)
-    return np.concatenate([footprint, after])
+def _prolonged(scene: PlanningScene, frames: int) -> FloatArray:
+    """(frames, A, 5) recorded footprints, and later those of the partner, which goes straight on."""
+    known = scene.footprint
+    after = np.full((frames - len(known), *known.shape[1:]), np.nan)
+    last = np.broadcast_to(known[-1], after.shape).copy()
+    last[..., :2] += np.arange(1, len(after) + 1)[:, None, None] * (known[-1] - known[-2])[:, :2]
+    return np.concatenate([known, np.where(scene.partner[:, None], last, after)])
 
 
 def _accelerations(plan: Plan, before: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -145,57 +184,14 @@ def _progress(plan: Plan, scene: PlanningScene, until: float) -> tuple[float, fl
     return way - float(arcs[nearest] + share[nearest] * lengths[nearest]), way
 
 
-def add_plan(
-    sums: Sums, row: str, driven: Driven, recorded: Driven, scene: PlanningScene, rules: CleanPlanning
-) -> None:
-    """Add what a plan does to the sums, beside what the recorded path does."""
-    time = np.where(driven.contacts.overlapping, np.inf, driven.contacts.time)
-    for horizon in HORIZONS:
-        table, steps = f"{horizon} s", round(horizon / STEP)
-        sums.add(table, row, "l2", driven.error[steps - 1 : steps])
-        if len(driven.error):
-            sums.add(table, row, "l2_mean", float(driven.error[:steps].mean()))
-            touches = time.min(initial=np.inf) <= min(horizon, scene.duration) + _SLACK
-            sums.add(table, row, "contact", 100.0 * touches)
-    for ends, suffix in ((scene.to_end, ""), (scene.to_contact, " to contact")):
-        leads = [lead for lead in rules.leads if abs(ends - lead) <= _NEAREST + _SLACK]
-        for lead in leads:
-            role = "" if scene.is_collider else "bystander, "
-            _add_lead(sums, f"{role}lead {lead:g} s{suffix}", row, driven, recorded, scene)
-
-
-def _add_lead(sums: Sums, table: str, row: str, driven: Driven, recorded: Driven, scene: PlanningScene) -> None:
-    twin = "_twins" if scene.kind == "twin" else ""
-    contacts, partner = driven.contacts, scene.actor_id == scene.partner
-    at = np.flatnonzero(partner)
-    if len(at):
-        time = float(contacts.time[at[0]])
-        avoided = np.isinf(time)
-        sums.add(table, row, "avoided", 100.0 * avoided)
-        sums.add(table, row, "impact_speed", float(contacts.speed[at[0]]))
-        sums.add(table, row, "relative_speed", float(contacts.relative_speed[at[0]]))
-        sums.add(table, row, "prolonged", 100.0 * (driven.known + _SLACK < time < np.inf))
-    until = min(driven.known, recorded.known) + _SLACK
-    new = (contacts.time <= until) & (recorded.contacts.time > until) & ~contacts.overlapping & ~partner
-    sums.add(table, row, f"striking{twin}", 100.0 * bool((new & ~contacts.struck).any()))
-    sums.add(table, row, f"struck{twin}", 100.0 * bool((new & contacts.struck).any()))
-    sums.add(table, row, f"lost_way{twin}", driven.lost)
-    if driven.way > _FAR:
-        sums.add(table, row, f"lost{twin}", 100.0 * driven.lost / driven.way)
-    sums.add(table, row, f"infeasible{twin}", 100.0 * driven.infeasible)
-    if twin:
-        sums.add(table, row, "braking_twins", 100.0 * driven.brakes)
-
-
-def usable(scene: PlanningScene, margin: float, recorded: Driven) -> str:
+def _unusable(scene: PlanningScene, margin: float, true: Contacts) -> str:
     """Why an accident does not count, as half a sentence; empty if it does: the recorded path must meet the partner."""
-    at = np.flatnonzero(scene.actor_id == scene.partner)
-    if not len(at):
+    if not scene.partner.any():
         return "no label shows the partner from here on"
-    if recorded.contacts.overlapping[at[0]]:
+    if true.overlapping[scene.partner].any():
         return "the pair touches at the present already"
     if margin > MOST_MARGIN:
         return f"the pair is {margin:.2f} m apart at the end"
-    if not recorded.contacts.time[at[0]] <= scene.duration + _SLACK:
-        return "the recorded path does not meet the partner"
-    return ""
+    return (
+        "" if true.time[scene.partner][0] <= scene.duration + _SLACK else "the recorded path does not meet the partner"
+    )

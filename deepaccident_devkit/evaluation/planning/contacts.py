@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Final
 
@@ -49,41 +50,41 @@ def first_contacts(
         margins: (A,) metres of a gap that counts as contact.
         until: (A,) seconds.
     """
-    count = others.shape[1]
-    numbers = np.full((3, count), np.nan)
-    numbers[0] = np.inf
-    struck, overlapping = np.zeros(count, dtype=bool), np.zeros(count, dtype=bool)
-    if len(path) < 2:
-        return Contacts(
-            time=numbers[0], speed=numbers[1], relative_speed=numbers[2], struck=struck, overlapping=overlapping
-        )
     own = np.concatenate([path[:, :2], np.broadcast_to(size, (len(path), 2)), path[:, 2:]], axis=1)
     overlapping = gaps_of_pairs(own[:1], others[0]) <= margins
+    found = np.tile([np.inf, np.nan, np.nan, 0.0], (len(margins), 1))
     for actor in np.flatnonzero(_near(own, others, margins, until) & ~overlapping).tolist():
-        frames = np.flatnonzero(np.isfinite(others[:, actor, 0]))
-        first, last = int(frames[0]), int(frames[-1])
-        if last == first:
-            continue
-        rows = others[frames, actor]
-        values = (*rows[:, :2].T, np.unwrap(rows[:, 4]))
-        other = np.column_stack([np.interp(np.arange(first, last + 1), frames, each) for each in values])
-        paths = np.stack([path[first : last + 1], other])
-        pair = pair_of(paths, np.stack([size, np.median(rows[:, 2:4], axis=0)]), margin=float(margins[actor]))
-        window = (0.0, min(float(until[actor]), last * FRAME_PERIOD) - first * FRAME_PERIOD)
-        if window[1] <= 0:
-            continue
-        time = contact_times(pair, _NO_BRAKING, [1.0], window=window)
-        if not np.isfinite(time[0]):
-            continue
-        impact = impacts(pair, _NO_BRAKING, [1.0], time)
-        numbers[:, actor] = time[0] + first * FRAME_PERIOD, impact.speeds[0, 0], impact.relative_speeds[0]
-        ego, hit = (_pose_at(each, float(time[0])) for each in (pair.motions[0].poses, pair.motions[1].poses))
-        way = hit[:2] - ego[:2]
-        ahead = np.cos(ego[2]) * way[0] + np.sin(ego[2]) * way[1]
-        struck[actor] = impact.speeds[0, 0] <= _STANDS or ahead < -size[0] / 2
+        found[actor] = _contact(path, size, others[:, actor], float(margins[actor]), float(until[actor]))
+    time, speed, relative_speed, struck = found.T
     return Contacts(
-        time=numbers[0], speed=numbers[1], relative_speed=numbers[2], struck=struck, overlapping=overlapping
+        time=time, speed=speed, relative_speed=relative_speed, struck=struck.astype(bool), overlapping=overlapping
     )
+
+
+def _contact(
+    path: FloatArray, size: FloatArray, other: FloatArray, margin: float, until: float
+) -> tuple[float, float, float, float]:
+    """Time, speed, relative speed and whether the ego is struck, of a path and another's footprints (L, 5)."""
+    frames = np.flatnonzero(np.isfinite(other[:, 0]))
+    first, rows = int(frames[0]), other[frames]
+    window = 0.0, min(until, int(frames[-1]) * FRAME_PERIOD) - first * FRAME_PERIOD
+    if len(frames) < 2 or window[1] <= 0:
+        return _NOTHING
+    there = np.arange(first, frames[-1] + 1)
+    way = [np.interp(there, frames, each) for each in (rows[:, 0], rows[:, 1], np.unwrap(rows[:, 4]))]
+    sizes = np.stack([size, np.median(rows[:, 2:4], axis=0)])
+    pair = pair_of(np.stack([path[there], np.column_stack(way)]), sizes, margin=margin)
+    time = contact_times(pair, _NO_BRAKING, [1.0], window=window)
+    if np.isinf(time[0]):
+        return _NOTHING
+    impact = impacts(pair, _NO_BRAKING, [1.0], time)
+    ego, hit = (np.array([np.interp(time[0], each.times, values) for values in each.poses.T]) for each in pair.motions)
+    ahead = np.cos(ego[2]) * (hit[0] - ego[0]) + np.sin(ego[2]) * (hit[1] - ego[1])
+    speed, relative = float(impact.speeds[0, 0]), float(impact.relative_speeds[0])
+    return float(time[0]) + first * FRAME_PERIOD, speed, relative, speed <= _STANDS or ahead < -size[0] / 2
+
+
+_NOTHING: Final = (math.inf, math.nan, math.nan, 0.0)
 
 
 def _near(own: FloatArray, others: FloatArray, margins: FloatArray, until: FloatArray) -> BoolArray:
@@ -99,9 +100,3 @@ def _near(own: FloatArray, others: FloatArray, margins: FloatArray, until: Float
     least = np.where(there & in_time, apart, np.inf).min(axis=0)
     near: BoolArray = (least <= np.where(gone, 2.0, 1.0) * (step + ways) + gone) & there.any(axis=0)
     return near
-
-
-def _pose_at(poses: FloatArray, time: float) -> FloatArray:
-    """A pose at a time of a path at 10 Hz."""
-    frames = np.arange(len(poses)) * FRAME_PERIOD
-    return np.array([np.interp(time, frames, each) for each in poses.T])

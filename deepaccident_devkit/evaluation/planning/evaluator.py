@@ -21,7 +21,7 @@ from deepaccident_devkit.evaluation.planning.cells import (
     occupied,
     touching,
 )
-from deepaccident_devkit.evaluation.planning.clean import CleanPlanning, add_plan, drive, margin_of, usable
+from deepaccident_devkit.evaluation.planning.clean import CleanPlanning, add_clean
 from deepaccident_devkit.evaluation.planning.scene import (
     Plan,
     PlanningScene,
@@ -107,7 +107,7 @@ class PlanningEvaluator(MeansEvaluator[PlanningResult]):
         Args:
             token: of the sample.
             plans: one or more; the one with the highest score counts, of equal ones the first.
-            scene: from `planning_scene(dataset, token)`.
+            scene: from `planning_scene(dataset, token)`; for the rules of the public codes with `cut=False`.
 
         Raises:
             EvaluationError: there is no plan, it ends before the 3 s of the public codes, or the sample came before
@@ -126,27 +126,10 @@ def _counts(token: str, plans: Iterable[Plan], scene: PlanningScene, rules: Prot
     rows = {GIVEN: max(given, key=lambda each: each.score), **trivial_plans(scene)}
     sums = Sums()
     if isinstance(rules, CleanPlanning):
-        _add_clean(sums, rows, scene, rules)
+        add_clean(sums, rows, scene, rules)
     else:
         _add_cells(sums, token, rows, scene, rules)
     return sums.counts()
-
-
-def _add_clean(sums: Sums, rows: Mapping[str, Plan], scene: PlanningScene, rules: CleanPlanning) -> None:
-    if len(scene.recorded) < 2:
-        sums.note("{} samples are last frames, after which nothing is recorded")
-        return
-    margin = margin_of(scene)
-    driven = {name: drive(plan, scene, margin, rules) for name, plan in rows.items()}
-    recorded = driven[TRIVIAL[0]]
-    overlapping = int(recorded.contacts.overlapping.sum())
-    if overlapping:
-        sums.note("{} actors overlap the ego at the present; they are left out", overlapping)
-    if scene.partner is not None and (reason := usable(scene, margin, recorded)):
-        sums.note(f"{scene.scenario}: {reason}; {{}} of its samples are left out")
-        return
-    for name, each in driven.items():
-        add_plan(sums, name, each, recorded, scene, rules)
 
 
 def _add_cells(sums: Sums, token: str, rows: Mapping[str, Plan], scene: PlanningScene, rules: CellRules) -> None:
@@ -172,7 +155,7 @@ def _add_cells(sums: Sums, token: str, rows: Mapping[str, Plan], scene: Planning
     found = {name: touching(path, cells, ego, rules) for name, path in paths.items()}
     for name, path in paths.items():
         numbers = cell_numbers(path, true, valid, (found[name], found[TRIVIAL[0]]), rules)
-        for column, values in numbers._asdict().items():
+        for column, values in numbers.items():
             scaled = values if column == "l2" else 100.0 * values
             for table, value in zip((*_BY_HORIZON, _MEAN), (*scaled, scaled.mean()), strict=True):
                 sums.add(table, name, column, float(value))
@@ -190,7 +173,9 @@ PLANNING: Final = Task(
     kinds=("planning",),
     protocols=PLANNING_PROTOCOLS,
     evaluator=PlanningEvaluator,
-    truth=lambda dataset, token, _rules, _form, _horizon: (planning_scene(dataset, token),),
+    truth=lambda dataset, token, rules, _form, _horizon: (
+        planning_scene(dataset, token, cut=isinstance(rules, CleanPlanning)),
+    ),
     counts=_counts,
     result=lambda counts, rules: PlanningEvaluator(rules).result_of(counts),
     summary=PlanningResult.as_dict,

@@ -5,16 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Final, Literal
+from typing import Final
 
 import numpy as np
 
-from deepaccident_devkit.accidents.recorded import Accident, accident_of
+from deepaccident_devkit.accidents.recorded import Accident, accident_of, tried
 from deepaccident_devkit.accidents.replay import braking_plans, motion_of, replay
 from deepaccident_devkit.accidents.twins import twin_of
 from deepaccident_devkit.dataset import Dataset, RowArgument
-from deepaccident_devkit.errors import EvaluationError, GeometryError, NotAvailableError
-from deepaccident_devkit.evaluation.accident_truth import labelled_sample
+from deepaccident_devkit.errors import EvaluationError, GeometryError
+from deepaccident_devkit.evaluation.accident_truth import box_truth, labelled_sample
 from deepaccident_devkit.evaluation.predictions import ascending_times
 from deepaccident_devkit.geometry.conventions import inverses, stored_transforms
 from deepaccident_devkit.support.arrays import (
@@ -25,7 +25,7 @@ from deepaccident_devkit.support.arrays import (
     checked,
     checked_number,
 )
-from deepaccident_devkit.taxonomy import CATEGORIES, FRAME_PERIOD, INFRASTRUCTURE, OWN_ACTOR_ID
+from deepaccident_devkit.taxonomy import CATEGORIES, FRAME_PERIOD, OWN_ACTOR_ID
 from deepaccident_devkit.v2x.cooperation import visible_actors
 from deepaccident_devkit.v2x.tracks import scenario_tracks
 
@@ -63,19 +63,21 @@ class Plan(FrozenArrays):
 
         Without yaw, it is the direction of the step, kept where that is shorter than 0.1 m.
         """
-        moments, path = self.times, self.path
-        if moments[0] > 0:
-            moments, path = np.append(0.0, moments), np.vstack([np.zeros((1, 2)), path])
+        missing = int(self.times[0] > 0)
+        moments = np.append(np.zeros(missing), self.times)
+        path = np.vstack([np.zeros((missing, 2)), self.path])
         steps = np.diff(path, axis=0)
         if self.yaw is None:
-            yaw = _directions(steps)
+            turns = np.append(True, np.hypot(*steps.T) >= _TURNS)  # the first has none
+            last = np.maximum.accumulate(np.where(turns, np.arange(len(path)), 0))
+            yaw = np.append(0.0, np.arctan2(steps[:, 1], steps[:, 0]))[last]
         else:
-            yaw = np.unwrap(np.append(np.zeros(len(path) - len(self.yaw)), self.yaw))
+            yaw = np.append(np.zeros(missing), self.yaw)
+        values = np.column_stack([path, np.unwrap(yaw)])
         if len(path) > 1:
-            onward = steps[-1] / (moments[-1] - moments[-2])
-            moments = np.append(moments, moments[-1] + _ONWARD)
-            path, yaw = np.vstack([path, path[-1] + onward * _ONWARD]), np.append(yaw, yaw[-1])
-        return np.column_stack([np.interp(times, moments, each) for each in (*path.T, yaw)])
+            onward = (*steps[-1] * (_ONWARD / (moments[-1] - moments[-2])), 0.0)
+            moments, values = np.append(moments, moments[-1] + _ONWARD), np.vstack([values, values[-1] + onward])
+        return np.column_stack([np.interp(times, moments, each) for each in values.T])
 
 
 _ONWARD: Final = 1000.0
@@ -84,24 +86,11 @@ _TURNS: Final = 0.1
 """Metres: a shorter step keeps the heading."""
 
 
-def _directions(steps: FloatArray) -> FloatArray:
-    """(T + 1,) headings of a path of T steps, which have those of the steps that lead there; 0 at first."""
-    turns = np.hypot(*steps.T) >= _TURNS
-    last = np.maximum.accumulate(np.where(turns, np.arange(1, len(steps) + 1), 0))
-    directions = np.append(0.0, np.arctan2(steps[:, 1], steps[:, 0]))
-    return np.asarray(np.unwrap(directions[np.append(0, last)]))
-
-
-Kind = Literal["accident", "twin", "other"]
-"""Of a recording: somebody collides; somebody does in its twin; neither is known."""
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PlanningScene(FrozenArrays):
     """What a plan meets, from a sample's present on; the present ego frame, metres, seconds, radians.
 
-    Arrays are read-only. F frames at 10 Hz from the present to the recording's end, of a twin at most to the frame at
-    which its accident ends; A other actors.
+    Arrays are read-only. F frames at 10 Hz from the present to the recording's end; A other actors.
 
     Attributes:
         scenario: token.
@@ -113,10 +102,10 @@ class PlanningScene(FrozenArrays):
         footprint: (F, A, 5) x, y, length, width, yaw of the others; NaN where nobody annotated them.
         is_pedestrian: (A,).
         seen: (A,) whether the agent sees it at the present (docs/released_code.md, Visibility and attributes).
-        kind: of the recording.
+        is_twin: whether nobody collides here, but somebody does in the scenario's twin.
         is_collider: whether the agent is one of the pair, of a twin in its accident.
-        partner: actor id of the other of the pair; None unless the agent collides here.
-        to_end: seconds to the last frame of the accident, also of that of a twin; NaN for others.
+        partner: (A,) which is the other of the pair; none unless the agent collides here.
+        to_end: seconds to the last frame of the accident, also of that of a twin; NaN without one.
         to_contact: the same to the frame at which the pair begins to touch (`Contact.contact_frame`); NaN without one.
     """
 
@@ -129,9 +118,9 @@ class PlanningScene(FrozenArrays):
     footprint: FloatArray
     is_pedestrian: BoolArray
     seen: BoolArray
-    kind: Kind
+    is_twin: bool
     is_collider: bool
-    partner: int | None
+    partner: BoolArray
     to_end: float
     to_contact: float
 
@@ -141,40 +130,44 @@ class PlanningScene(FrozenArrays):
         return float((len(self.recorded) - 1) * FRAME_PERIOD)
 
 
-def planning_scene(dataset: Dataset, sample: RowArgument) -> PlanningScene:
+def planning_scene(dataset: Dataset, sample: RowArgument, *, cut: bool = True) -> PlanningScene:
     """What a plan of a sample's agent meets, from the labels of all agents.
+
+    Args:
+        dataset: the release.
+        sample: token or record.
+        cut: whether a twin ends where its accident does, and an accident at the last frame that shows the pair.
 
     Raises:
         TokenError: no such sample.
-        EvaluationError: the agent is the roadside, which does not drive, or its label has no row of its own.
-        NotAvailableError: the sample has no label.
+        EvaluationError: the label has no row of the agent itself, as that of the roadside.
+        NotAvailableError: the sample has no label, or the scenario no meta file.
     """
     there = labelled_sample(dataset, sample)
     token, agent = there["token"], dataset.get("agent", there["agent_token"])
-    if agent["name"] == INFRASTRUCTURE:
-        raise EvaluationError(f"{token}: the roadside does not drive; leave its samples out (--agents vehicles)")
-    scenario, present = dataset.get("scenario", there["scenario_token"]), int(token.rsplit("/", 1)[1])
     boxes = dataset.boxes(token, "ego")
     own = np.flatnonzero(boxes.actor_id == OWN_ACTOR_ID)
     if not len(own):
-        raise EvaluationError(f"{token}: its label has no row of the agent itself (id {OWN_ACTOR_ID})")
-    kind, accident = _story(dataset, scenario["token"])
-    last = scenario["num_frames"]
-    if accident is not None:
+        raise EvaluationError(
+            f"{token}: its label has no row of the agent itself (id {OWN_ACTOR_ID}), as that of the roadside, which "
+            "does not drive; leave such samples out (--agents vehicles)"
+        )
+    scenario, present = dataset.scenario.get(there["scenario_token"]), int(token.rsplit("/", 1)[1])
+    twin, last = twin_of(dataset, scenario), scenario["num_frames"]
+    stories = [tried(accident_of, dataset, each) for each in (scenario, twin) if each is not None]
+    accident = next((each for each in stories if isinstance(each, Accident)), None)
+    if accident is not None and cut:
         last = max(present, min(last, accident.last_frame))
-    poses = _ego_poses(dataset, token, present, last)
-    tracks = scenario_tracks(dataset, scenario)
-    inside = (tracks.index >= present) & (tracks.index <= last) & (tracks.actor_id != agent["actor_id"])
-    rows = np.flatnonzero(inside)
-    moved = tracks.boxes.select(rows).transform(dataset.world_from(token, "ego").inverse(), "ego")
-    actors, first, which = np.unique(moved.actor_id, return_index=True, return_inverse=True)
-    footprint = np.full((last - present + 1, len(actors), 5), np.nan)
-    outlines = np.column_stack([moved.center[:, :2], moved.size[:, :2], moved.yaw])
-    footprint[tracks.index[rows] - present, which] = outlines
+    truth = box_truth(dataset, token, (last - present) * FRAME_PERIOD)
+    others = np.flatnonzero(truth.actor_id != agent["actor_id"])
+    actors, tracks = truth.actor_id[others], scenario_tracks(dataset, scenario)
+    walkers = tracks.actor_id[tracks.boxes.category == CATEGORIES.index("pedestrian")]
+    is_twin = accident is not None and accident.scenario != scenario["token"]
     is_collider = accident is not None and agent["name"] in accident.agents
-    ids = accident.actor_ids if accident is not None and kind == "accident" else ()
+    pair = accident.actor_ids if accident is not None and is_collider and not is_twin else ()
     end = np.nan if accident is None else (accident.last_frame - present) * FRAME_PERIOD
     touching = None if accident is None else accident.touching
+    poses = _ego_poses(dataset, token, present, last)
     return PlanningScene(
         scenario=scenario["token"],
         recorded=poses[1:],
@@ -182,12 +175,12 @@ def planning_scene(dataset: Dataset, sample: RowArgument) -> PlanningScene:
         size=boxes.size[own[0], :2].copy(),
         offset=boxes.center[own[0], :2].copy(),
         actor_id=actors,
-        footprint=footprint,
-        is_pedestrian=moved.category[first] == CATEGORIES.index("pedestrian"),
+        footprint=truth.footprint[:, others],
+        is_pedestrian=np.isin(actors, walkers),
         seen=np.isin(actors, visible_actors(dataset, token, agents=[agent["name"]])),
-        kind=kind,
+        is_twin=is_twin,
         is_collider=is_collider,
-        partner=next((each for each in ids if is_collider and each != agent["actor_id"]), None),
+        partner=np.isin(actors, pair),
         to_end=end,
         to_contact=np.nan if touching is None else end - touching,
     )
@@ -206,24 +199,10 @@ def _ego_poses(dataset: Dataset, token: str, present: int, last: int) -> FloatAr
     return np.vstack([2 * poses[0] - poses[min(1, len(poses) - 1)], poses])
 
 
-def _story(dataset: Dataset, scenario: str) -> tuple[Kind, Accident | None]:
-    """The accident of a scenario, or of its twin; None where there is none, or no label shows the pair."""
-    twin = twin_of(dataset, scenario)
-    for kind, token in (("accident", scenario), ("twin", None if twin is None else twin["token"])):
-        try:
-            found = None if token is None else accident_of(dataset, token)
-        except NotAvailableError:
-            continue
-        if found is not None:
-            return kind, found  # type: ignore[return-value]  # of the two that are listed
-    return "other", None
-
-
 BRAKING: Final = 8.0
 """m/s² of full braking."""
 _REACH: Final = 3.0
-_STEP: Final = 0.5
-"""Seconds."""
+"""Seconds that these plans look ahead, at least."""
 
 
 def trivial_plans(scene: PlanningScene) -> Mapping[str, Plan]:
@@ -233,14 +212,14 @@ def trivial_plans(scene: PlanningScene) -> Mapping[str, Plan]:
     of 0.1 s, `standing` (at once) and `constant velocity` of 0.5 s; they look at least 3 s ahead.
     """
     fine = steps_of(FRAME_PERIOD, max(_REACH, scene.duration))
-    coarse = steps_of(_STEP, _REACH)
-    nowhere = np.zeros(len(coarse))
-    return {
-        "recorded": _plan_of(fine, recorded_poses(scene, fine)),
-        "standing": Plan(times=coarse, path=np.zeros((len(coarse), 2)), yaw=nowhere),
-        "constant velocity": Plan(times=coarse, path=coarse[:, None] * scene.before, yaw=nowhere),
-        "full braking": _plan_of(fine, _braked(scene, fine, 0.0)),
+    coarse = steps_of(0.5, _REACH)
+    poses = {
+        "recorded": (fine, recorded_poses(scene, fine)),
+        "standing": (coarse, np.zeros((len(coarse), 3))),
+        "constant velocity": (coarse, coarse[:, None] * np.append(scene.before, 0.0)),
+        "full braking": (fine, recorded_poses(scene, fine, 0.0)),
     }
+    return {name: Plan(times=times, path=each[:, :2], yaw=each[:, 2]) for name, (times, each) in poses.items()}
 
 
 def steps_of(step: float, until: float) -> FloatArray:
@@ -252,19 +231,10 @@ _SAME_TIME: Final = 1e-6
 """Share of a step by which a time that is meant to be a step's may miss it."""
 
 
-def recorded_poses(scene: PlanningScene, times: FloatArray) -> FloatArray:
-    """(N, 3) x, y, yaw of the recorded ego frame at times (N,), after its end straight on."""
-    return _braked(scene, times, np.inf)
-
-
-def _plan_of(times: FloatArray, poses: FloatArray) -> Plan:
-    return Plan(times=times, path=poses[:, :2], yaw=poses[:, 2])
-
-
-def _braked(scene: PlanningScene, times: FloatArray, start: float) -> FloatArray:
-    """(N, 3) poses at times on the recorded path, braking from some time on."""
+def recorded_poses(scene: PlanningScene, times: FloatArray, braking_from: float = np.inf) -> FloatArray:
+    """(N, 3) x, y, yaw of the recorded ego frame at times (N,), after its end straight on; braking from a time on."""
     if len(scene.recorded) < 2:
         return np.zeros((len(times), 3))
     motion = motion_of(scene.recorded, horizon=_ONWARD)
-    plans = braking_plans(motion, [start], BRAKING)
+    plans = braking_plans(motion, [braking_from], BRAKING)
     return replay(motion, plans, np.zeros(len(times), dtype=np.int64), times).poses

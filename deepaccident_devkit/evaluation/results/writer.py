@@ -202,7 +202,8 @@ class ResultsWriter:
         if there.meta.get("method") != asked.get("method"):  # all else differs with it
             there_is, wanted = (shortened(repr(meta.get("method"))) for meta in (there.meta, asked))
             return f" (of method {there_is}, not of {wanted})"
-        return f" ({differing_text(there.meta, asked) or 'of other samples'})"
+        notes = ({name: note for name, note in meta.items() if name != "bytes"} for meta in (there.meta, asked))
+        return f" ({differing_text(*notes) or 'of other samples'})"  # bytes follow from the rest
 
 
 @contextmanager

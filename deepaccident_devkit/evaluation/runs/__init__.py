@@ -15,6 +15,7 @@ from deepaccident_devkit.evaluation.runs.evaluation_run import (
     breakdowns_of,
     evaluate_results,
 )
+from deepaccident_devkit.evaluation.runs.over_bytes import BytesPoint, OverBytes, over_bytes
 from deepaccident_devkit.evaluation.runs.rows import read_rows, sample_rows
 from deepaccident_devkit.evaluation.runs.setups import (
     Coverage,
@@ -31,11 +32,13 @@ from deepaccident_devkit.rooms import names_of
 __all__ = [
     "BREAKDOWNS",
     "Bundle",
+    "BytesPoint",
     "ComparedNumber",
     "Comparison",
     "Coverage",
     "Difference",
     "EvaluationRun",
+    "OverBytes",
     "Partial",
     "ReleaseInfo",
     "ResultsInfo",
@@ -49,6 +52,7 @@ __all__ = [
     "default_selection",
     "evaluate_results",
     "evaluation_store",
+    "over_bytes",
     "prevented_accidents",
     "read_bundle",
     "read_rows",

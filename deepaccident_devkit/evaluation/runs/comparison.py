@@ -203,11 +203,8 @@ def compare_bundles(
     """
     chosen = resampling or Resampling()
     bundles = read_bundle(path_of(a)), read_bundle(path_of(b))
-    _check_rules(*bundles)
-    evaluators = bundles[0].evaluator(), bundles[1].evaluator()
-    tokens = _shared_tokens(bundles, evaluators, common=common)
+    evaluators, tokens = comparable(bundles, common=common)
     scenarios = list(dict.fromkeys(map(scenario_of, tokens)))
-    _check_truth(*bundles, scenarios)
     setup = bundles[0].setup
     results = [evaluator.compute(tokens) for evaluator in evaluators]
     shown = {each.path: each for result in results for each in headlines(setup.task, result)}
@@ -275,6 +272,18 @@ def _better(difference: float, headline: Headline | None) -> str | None:
     if headline is None or headline.higher_is_better is None:
         return None
     return "b" if (difference > 0) == headline.higher_is_better else "a"
+
+
+def comparable(bundles: Sequence[Bundle], *, common: bool) -> tuple[list[Evaluator[Any]], list[str]]:
+    """The counts of bundles, and the samples that all of them have; arguments and errors as of `compare_bundles`."""
+    for bundle in bundles[1:]:
+        _check_rules(bundles[0], bundle)
+    evaluators = [bundle.evaluator() for bundle in bundles]
+    tokens = set(evaluators[0].tokens)
+    for bundle, evaluator in zip(bundles[1:], evaluators[1:], strict=True):
+        tokens &= {*_shared_tokens((bundles[0], bundle), (evaluators[0], evaluator), common=common)}
+        _check_truth(bundles[0], bundle, list(dict.fromkeys(map(scenario_of, sorted(tokens)))))
+    return evaluators, sorted(tokens)
 
 
 def _check_rules(one: Bundle, other: Bundle) -> None:

@@ -14,6 +14,7 @@ from typing import Any, Final
 from deepaccident_devkit.errors import shortened
 from deepaccident_devkit.evaluation.results import Results
 from deepaccident_devkit.evaluation.runs.further import further_results
+from deepaccident_devkit.evaluation.runs.over_bytes import sent_bytes
 from deepaccident_devkit.evaluation.runs.setups import agent_of, scenario_of
 from deepaccident_devkit.evaluation.task import HEADLINE_UNITS
 from deepaccident_devkit.evaluation.warning.recordings import GIVEN
@@ -90,6 +91,7 @@ def _head(summary: Json) -> str:
         "samples": f"{counts['samples']} of {counts['scenarios']} scenarios: split {summary['split']}, list "
         f"{summary['samples']}, scope {summary['scope']}, {agents}, horizon {summary['horizon']:g} s",
         "predictions": f"{results['path']} ({results['fingerprint']}){others}",
+        **({"bytes": sent.text()} if (sent := sent_bytes(summary)) else {}),
         "release": f"{release['dataroot']} ({release['version']}, {release['fingerprint']})",
         "devkit": summary["devkit_version"],
     }
@@ -225,7 +227,7 @@ def _means_text(summary: Json) -> str:
     """The tables that headlines are of, and the names of the others."""
     tables = means_tables(summary["metrics"])
     main = {each["path"].split("/")[1] for each in summary["headlines"]} if tables else ()
-    others = ", ".join(name for name in tables if name not in main)
+    others = "; ".join(name for name in tables if name not in main)
     texts = [table.to_text() for name, table in tables.items() if name in main]
     return "\n\n".join([*texts, *([f"also in metrics_summary.json and the report: {others}"] if others else [])])
 

@@ -21,8 +21,9 @@ from deepaccident_devkit.export.torch.collate import V2XItem
 from deepaccident_devkit.export.torch.config import V2XConfig, augmented_boxes, augmented_six_vectors
 from deepaccident_devkit.motion import Augmentation, MotionLabelConfig, bev_segmentation
 from deepaccident_devkit.motion.sample_labels import motion_labels_of
-from deepaccident_devkit.support.arrays import checked_whole
+from deepaccident_devkit.support.arrays import IntArray, checked_whole
 from deepaccident_devkit.tables.tokens import agent_token
+from deepaccident_devkit.taxonomy import AgentName
 from deepaccident_devkit.v2x import cooperative_boxes
 
 if TYPE_CHECKING:
@@ -160,16 +161,29 @@ class V2XDataset(TorchDataset):
         augmentation = self.config.augmentation_of(int(self._epoch), position)
         return V2XItem(self._received_item(sample, augmentation) | self._target_items([sample], augmentation)[0])
 
+    def senders(self) -> list[tuple[AgentName, ...]]:
+        """For each item the agents whose data of the present it has, its own first; nothing is read but what is there.
+
+        Raises:
+            MissingFileError: a sensor file of a sample's own agent was not downloaded, or may not be skipped.
+        """
+        tokens = (self._dataset.sample[row]["token"] for row in self._rows.tolist())
+        return [tuple(self._arrived(token)[1][-1]) for token in tokens]
+
+    def _arrived(self, sample: str) -> tuple[tuple[AgentName, ...], sensor_data.Received, IntArray]:
+        """Who takes part, the messages that arrived, and how many files are lacking (`sensor_data.with_files`)."""
+        names = sensor_data.participants(self._dataset, sample, self.config.agents)
+        received = sensor_data.received(self._dataset, sample, names, self.config)
+        return names, *sensor_data.with_files(
+            self._dataset, sample, names, received, self.config, self._cache, needs_own=self._needs_own
+        )
+
     def _received_item(self, sample: str, augmentation: Augmentation) -> dict[str, Any]:
         """The sample's own tensors, and the sensor data that arrived."""
         import torch
 
         dataset, config = self._dataset, self.config
-        names = sensor_data.participants(dataset, sample, config.agents)
-        received = sensor_data.received(dataset, sample, names, config)
-        arrived, lacking = sensor_data.with_files(
-            dataset, sample, names, received, config, self._cache, needs_own=self._needs_own
-        )
+        names, arrived, lacking = self._arrived(sample)
         world_from_ego = dataset.world_from(sample, "ego").matrix @ np.linalg.inv(augmentation.matrix)
         item: dict[str, Any] = {
             "token": sample,

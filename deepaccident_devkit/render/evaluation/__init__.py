@@ -1,6 +1,7 @@
 """Figures of an evaluation, and the report with all of them. A panel's function takes `ax=` and returns the Axes."""
 
 from deepaccident_devkit.render.evaluation.figures import draw_motion_outcome
+from deepaccident_devkit.render.evaluation.over_bytes import render_over_bytes
 from deepaccident_devkit.render.evaluation.panels import render_breakdown, render_comparison
 from deepaccident_devkit.render.evaluation.report import save_report
 from deepaccident_devkit.render.evaluation.tasks import (
@@ -20,6 +21,7 @@ __all__ = [
     "render_breakdown",
     "render_comparison",
     "render_errors",
+    "render_over_bytes",
     "render_precision_recall",
     "render_predictors",
     "render_prevention",

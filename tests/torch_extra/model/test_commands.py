@@ -43,7 +43,8 @@ def test_the_same_command_again_finds_all_steps_done(trained: Path, release_root
 
 
 @pytest.mark.parametrize(
-    ("agents", "link"), [("all", ()), ("single", ()), ("+other", ("--pose-noise", 0.3, "--packet-loss", 0.5))]
+    ("agents", "link"),
+    [("all", ()), ("single", ()), ("+other", ("--pose-noise", 0.3, "--packet-loss", 0.5)), ("all", ("--budget", 1))],
 )
 def test_one_set_of_weights_predicts_for_any_agents(
     trained: Path, release_root: Path, tmp_path: Path, agents: str, link: tuple[object, ...]
@@ -63,6 +64,7 @@ def test_one_set_of_weights_predicts_for_any_agents(
     for task, (name, *protocol) in tasks.items():
         found, judged = read_results(out / name), ("--split", split, "--scope", "all", "--json", *protocol)
         assert (found.task, found.meta["agents"], found.meta["model"]["preset"]) == (task, agents, "tiny")
+        assert (found.meta["bytes"]["partners"] > 0) == (agents != "single" and "--budget" not in link)
         assert f"{task}: {len(found.tokens)} samples in {out / name}" in result.output
         assert run("evaluate", task, release_root, "--results", out / name, *judged).exit_code == 0
     assert read_results(out / "motion").form.grid.shape == (100, 100)

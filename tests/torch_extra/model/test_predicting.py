@@ -3,6 +3,7 @@
 import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -164,6 +165,62 @@ def test_results_are_written_and_read(
         for each in found:
             writer.add(each.token, each.motion)
     assert (tmp_path / "heads").is_dir()
+
+
+FEATURES = 24 + 8 * 40 * 40 * 4
+"""Bytes of the map that an agent of `small` sends, and its pose."""
+
+
+def sent(model: V2XFormer, da: DeepAccident, tokens: list[str], out: Path, config: PredictConfig) -> Any:
+    """What results note of the bytes."""
+    paths = predict_results(model, da, tokens, out, config)
+    notes = [read_results(path).meta["bytes"] for path in paths.values()]
+    assert notes[0] == notes[1] == notes[2]
+    return notes[0]
+
+
+def test_results_note_the_features_that_partners_send(
+    model: V2XFormer, da: DeepAccident, tokens: list[str], tmp_path: Path
+) -> None:
+    form = {"payload": "bev", "shape": [8, 40, 40], "dtype": "float32", "samples": 3, "budget": None}
+    means = {"mean": 4.0 * FEATURES, "link": float(FEATURES), "partners": 4.0}
+    assert sent(model, da, tokens, tmp_path / "all", ALL) == form | means
+    nothing = {"mean": 0.0, "link": 0.0, "partners": 0.0}
+    assert sent(model, da, tokens, tmp_path / "single", PredictConfig(agents="single")) == form | nothing
+    lossy = PredictConfig(link=Link(packet_loss=1.0))
+    assert sent(model, da, tokens, tmp_path / "lost", lossy) == form | nothing
+
+
+def test_a_budget_is_of_the_models_own_features(
+    model: V2XFormer, da: DeepAccident, tokens: list[str], tmp_path: Path
+) -> None:
+    config = PredictConfig(link=Link(budget=3 * FEATURES - 1, payload="bev"))
+    with patch.object(V2XFormer, "forward", autospec=True, side_effect=V2XFormer.forward) as forward:
+        note = sent(model, da, tokens, tmp_path / "some", config)
+    assert (note["partners"], note["mean"], note["budget"]) == (2.0, 2.0 * FEATURES, 3 * FEATURES - 1)
+    heard = [call.args[1].partners.tolist() for call in forward.call_args_list]
+    assert heard == [[[True, True, True, False, False]]] * 3
+
+
+def test_a_partner_without_images_sends_nothing(
+    model: V2XFormer, release_root: Path, moment: list[str], tmp_path: Path
+) -> None:
+    shutil.copytree(release_root, tmp_path / "part", ignore=shutil.ignore_patterns(".deepaccident"))
+    for folder in (tmp_path / "part").glob("*/infrastructure/Camera_*"):
+        shutil.rmtree(folder)
+    part = DeepAccident("v1", tmp_path / "part", verbose=False)
+    note = sent(model, part, moment[:1], tmp_path / "results", ALL)
+    assert (note["partners"], note["link"]) == (3.0, FEATURES)
+
+
+def test_results_of_a_release_without_images_are_refused_before_anything_is_written(
+    model: V2XFormer, release_root: Path, moment: list[str], tmp_path: Path
+) -> None:
+    shutil.copytree(release_root, tmp_path / "blind", ignore=shutil.ignore_patterns(".deepaccident", "Camera_*"))
+    blind = DeepAccident("v1", tmp_path / "blind", verbose=False)
+    call = partial(predict_results, model, blind, moment[:1], tmp_path / "out")
+    assert_refused((call, NotAvailableError, ("no images", "--sensors cameras")))
+    assert not list((tmp_path / "out").iterdir())
 
 
 class TestPerfectMaps:

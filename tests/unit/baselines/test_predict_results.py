@@ -167,7 +167,42 @@ def test_complete_results_stay_and_others_are_refused(
 def test_results_say_of_what_they_are(da_b: DeepAccident, tokens: list[str], wholes: Path) -> None:
     recordings = da_b.recordings({token.rsplit("/", 2)[0] for token in tokens})
     release = {"version": "v1", "index": da_b.tables_folder.name, "recordings": recordings}
-    assert read_results(wholes / "motion").meta == {**NOISY.meta(), "release": release, "devkit": __version__}
+    meta = read_results(wholes / "motion").meta
+    sent = meta.pop("bytes")
+    assert meta == {**NOISY.meta(), "release": release, "devkit": __version__}
+    early = [token[:-1] + str(int(token[-1]) - 1) for token in tokens]  # by the latency
+    sizes = [da_b.message_sizes(token, agents="+behind", clouds=False) for token in early]
+    whole = sum(each.boxes for by_agent in sizes for each in list(by_agent.values())[1:])
+    mean = whole / len(tokens)
+    assert sent == {
+        "payload": "boxes",
+        "samples": 16,
+        "mean": mean,
+        "link": mean,
+        "partners": 1.0,
+        "budget": None,
+    }
+
+
+def test_results_note_what_a_budget_lets_through(da_b: DeepAccident, tokens: list[str], tmp_path: Path) -> None:
+    sent = {}
+    for name, agents, link in (
+        ("single", "single", None),
+        ("all", "all", None),
+        ("features", "all", Link(budget=1_000_000, payload=400_000)),
+        ("none", "all", Link(budget=1, payload="boxes")),
+    ):
+        baseline, path = Baseline(agents=agents, link=link), tmp_path / f"{name}.json"
+        predict_results(da_b, "detection", tokens, path, baseline, workers=1)
+        assert is_predicted(da_b, "detection", tokens, path, baseline)
+        sent[name] = read_results(path).meta["bytes"]
+    assert (sent["single"]["mean"], sent["single"]["partners"], sent["single"]["payload"]) == (0.0, 0.0, "boxes")
+    assert (sent["all"]["partners"], sent["all"]["link"]) == (4.0, sent["all"]["mean"] / 4)
+    features = {"payload": 400_000, "mean": 800_000.0, "link": 400_000.0, "partners": 2.0, "budget": 1_000_000}
+    assert sent["features"] == {**features, "samples": 16}
+    assert sent["none"] == {**sent["single"], "budget": 1}
+    bodies = [(tmp_path / f"{name}.json").read_text().partition('\n"results": ')[2] for name in ("single", "none")]
+    assert bodies[0] == bodies[1] != ""
 
 
 def test_a_token_that_comes_twice_is_refused_at_once(

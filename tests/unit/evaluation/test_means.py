@@ -57,8 +57,9 @@ def values() -> list[list[float]]:
 def test_tables_rows_and_columns_stand_in_their_order() -> None:
     sums = Sums()
     for row in ("10 s", "b", "2 s", "all", "a"):
-        sums.add("early", row, "near", [1.0, 2.0])
-    sums.add("late", "a", "near", [])
+        for value in (1.0, 2.0):
+            sums.add("early", row, "near", value)
+    sums.add("late", "a", "near", np.nan)
     sums.add("late", "a", "far", np.nan)
     evaluator = LengthsEvaluator()
     evaluator.add("t", sums.counts())

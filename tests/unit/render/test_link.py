@@ -60,6 +60,13 @@ def test_a_lost_message_is_said(da_motion: DeepAccident, moving: Any) -> None:
     assert (legend_words(figure)[0], of_kind(figure.axes[0], Quiver)) == ("ego behind: nothing arrived", [])
 
 
+def test_partners_that_do_not_fit_together_send_nothing(da_motion: DeepAccident, moving: Any) -> None:
+    link = Link(budget=1500, payload=1000)
+    first, *others = shared_boxes(da_motion, moving, link)
+    assert (len(first.received), [len(each.received) for each in others]) == (len(first.true), [0, 0, 0])
+    assert len(first.true)
+
+
 def test_clouds_are_side_by_side(da: DeepAccident) -> None:
     sample, link = da.get_sample(da.scenario[0], "ego_vehicle", 5), Link(latency=0.2)
     _, now, late = drawn(da, sample, link, agents="+other", view_range=50.0).axes
@@ -87,3 +94,4 @@ def test_a_link_in_words() -> None:
     assert link_words(Link(latency=0.2)) == "latency 0.2 s"
     said = link_words(Link(pose_noise=PoseNoise(mean=0.3, heading_std=0.1), packet_loss=0.1))
     assert said == "latency 0 s, poses off by 0.3 m (σ 0.02 m), headings by σ 5.7°, 10 % of messages lost"
+    assert link_words(Link(budget=12_000, payload="boxes")) == "latency 0 s, at most 12,000 bytes a frame"

@@ -12,10 +12,13 @@ from numpy.testing import assert_allclose, assert_array_equal
 from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident, v2x
-from deepaccident_devkit.errors import ConfigError
+from deepaccident_devkit.errors import ChoiceError, ConfigError, MissingFileError
 from deepaccident_devkit.taxonomy import AGENTS
 from deepaccident_devkit.v2x import Link, PoseNoise
-from deepaccident_devkit.v2x.messages import messages
+from deepaccident_devkit.v2x.cooperation import seen_actors
+from deepaccident_devkit.v2x.messages import message_bytes, messages, traffic, traffic_note
+
+BEHIND = AGENTS[1]
 
 
 @pytest.fixture
@@ -212,7 +215,8 @@ def test_likely_mistakes_of_units_are_named() -> None:
 
 
 def test_nothing_happens_by_default_and_the_papers_spread_is_2_cm() -> None:
-    assert asdict(Link()) == {"latency": 0.0, "pose_noise": None, "packet_loss": 0.0, "seed": 0}
+    nothing = {"latency": 0.0, "pose_noise": None, "packet_loss": 0.0, "seed": 0, "budget": None, "payload": None}
+    assert asdict(Link()) == nothing
     assert asdict(PoseNoise()) == {"mean": 0.0, "std": 0.02, "heading_std": 0.0}
 
 
@@ -260,3 +264,101 @@ def test_draws_are_made_of_the_keys_digest() -> None:
     share = numbers(f"{key}/loss")[0]
     for loss, lost in ((share, False), (math.nextafter(share, 1), True)):
         assert Link(packet_loss=loss, seed=7).loses("scenario", "other_vehicle", 4) == lost
+
+
+def box_bytes(da: DeepAccident, sample: str) -> dict[str, int]:
+    """Partner → bytes of its boxes, in their order."""
+    sizes = da.message_sizes(sample, clouds=False)
+    return {agent: each.boxes for agent, each in sizes.items() if agent != sample.split("/")[2]}
+
+
+def senders(da: DeepAccident, sample: str, link: Link, agents: object = "all", sweeps: int = 1) -> list[str]:
+    return [message.agent for message in messages(da, sample, agents, link, sweeps=sweeps)]  # type: ignore[arg-type]
+
+
+def test_within_a_budget_each_partner_sends_that_still_fits(da_b: DeepAccident, sample: str) -> None:
+    sizes = box_bytes(da_b, sample)
+    total = sum(sizes.values())
+    for budget in (1, min(sizes.values()) - 1, *sizes.values(), total - 1, total):
+        expected, left = ["ego_vehicle"], budget
+        for agent, size in sizes.items():
+            if size <= left:
+                expected.append(agent)
+                left -= size
+        link = Link(budget=budget, payload="boxes")
+        assert senders(da_b, sample, link) == expected
+        assert list(da_b.message_sizes(sample, link=link, clouds=False)) == expected
+        assert traffic(da_b, sample, "all", link, "boxes") == (budget - left, len(expected) - 1)
+    assert senders(da_b, sample, link) == ["ego_vehicle", *sizes]
+
+
+def test_a_message_that_does_not_fit_does_not_keep_a_smaller_one_out(da_b: DeepAccident, sample: str) -> None:
+    sizes = box_bytes(da_b, sample)
+    large, small = max(sizes, key=sizes.__getitem__), min(sizes, key=sizes.__getitem__)
+    assert sizes[small] < sizes[large]
+    assert senders(da_b, sample, Link(budget=sizes[small], payload="boxes"), [large, small]) == [small]
+
+
+def test_a_budget_is_of_each_frame_and_of_what_arrives(da_b: DeepAccident, sample: str) -> None:
+    one = {"budget": 1500, "payload": 1000}
+    assert senders(da_b, sample, Link(**one), sweeps=2) == ["ego_vehicle", "ego_vehicle_behind"] * 2
+    seeds = [each for each in range(20) if Link(packet_loss=0.5, seed=each).loses(da_b.scenario[0]["token"], BEHIND, 4)]
+    assert seeds
+    for seed in seeds:
+        arriving = senders(da_b, sample, Link(packet_loss=0.5, seed=seed))
+        assert senders(da_b, sample, Link(packet_loss=0.5, seed=seed, **one)) == arriving[:2]
+
+
+def test_whoever_does_not_fit_is_not_heard(da_b: DeepAccident, sample: str) -> None:
+    alone, limited, everyone = (
+        seen_actors(da_b, sample, agents=agents, link=link)
+        for agents, link in (("single", None), ("all", Link(budget=1, payload="bev")), ("all", None))
+    )
+    assert_array_equal(limited.boxes.actor_id, alone.boxes.actor_id)
+    assert len(everyone.boxes) > len(alone.boxes)
+
+
+def test_bytes_of_a_message_are_those_of_its_sizes(da: DeepAccident, da_b: DeepAccident) -> None:
+    token = da.get_sample(da.scenario[0], "infrastructure", 3)["token"]
+    sizes = asdict(da.message_sizes(token, agents="single")["infrastructure"])
+    assert {kind: message_bytes(da, token, kind) for kind in sizes} == sizes  # type: ignore[arg-type]
+    assert [message_bytes(da, token, given) for given in (70, None)] == [70, 0]
+    blind = f"{da_b.scenario[0]['token']}/infrastructure/003"
+    assert_refused((lambda: message_bytes(da_b, blind, "cloud"), MissingFileError, "lidar01"))
+    assert message_bytes(da_b, blind, "boxes") == 24 + 45 * len(da_b.boxes(blind))
+
+
+def test_traffic_is_that_of_partners_after_latency_and_loss(da_b: DeepAccident, sample: str) -> None:
+    sizes, early = box_bytes(da_b, sample), box_bytes(da_b, sample.replace("/004", "/002"))
+    assert traffic(da_b, sample, "all", None, "boxes") == (sum(sizes.values()), 4)
+    assert traffic(da_b, sample, "all", Link(latency=0.2, pose_noise=0.3), "boxes") == (sum(early.values()), 4)
+    assert traffic(da_b, sample, "all", Link(packet_loss=1), "boxes") == (0, 0)
+    assert traffic(da_b, sample, "single", None, "boxes") == (0, 0)
+    assert traffic(da_b, sample, ["infrastructure"], None, 70) == (70, 1)
+
+
+def test_the_note_has_means_of_samples_and_links() -> None:
+    note = traffic_note([(300, 3), (0, 0), (200, 1)], Link(budget=400, payload="boxes"), "boxes", dtype="float32")
+    means = {"samples": 3, "mean": 500 / 3, "link": 125.0, "partners": 4 / 3, "budget": 400}
+    assert note == {"payload": "boxes", "dtype": "float32", **means}
+    empty = {"payload": 70, "samples": 0, "mean": 0.0, "link": 0.0, "partners": 0.0, "budget": None}
+    assert traffic_note([], None, 70) == empty
+    assert traffic_note([(0, 0)], None, 70) == {**empty, "samples": 1}
+
+
+def test_budgets_that_are_none() -> None:
+    bytes_ = r"expected a whole number from 1 to 1,125,899,906,842,624 \(bytes"
+    assert_refused(
+        *[
+            (partial(Link, budget=wrong, payload="boxes"), ConfigError, f"budget: {bytes_} a frame\\), found")
+            for wrong in (0, -1, 1.5, "many", True, 2**50 + 1)
+        ],
+        *[
+            (partial(Link, payload=wrong), ConfigError, f"payload: {bytes_} of every message\\), found")
+            for wrong in (0, 2.5, ["boxes"])
+        ],
+        (lambda: Link(payload="pictures"), ChoiceError, "payload: expected one of images, cloud, boxes, bev, or None"),
+        (lambda: Link(budget=9), ConfigError, "budget: needs the kind of data .* give payload='boxes' or another of"),
+    )
+    assert Link(budget=np.int64(2**50), payload=np.int64(1)) == Link(budget=2**50, payload=1)
+    assert Link(payload="bev").payload == "bev"

@@ -35,7 +35,7 @@ WRITTEN = {
     "messages.BOX_BYTES": "45",
     "messages.POSE_BYTES": "24",
     "messages.PoseNoise": "mean=0.0, std=0.02, heading_std=0.0",
-    "messages.Link": "latency=0.0, pose_noise=None, packet_loss=0.0, seed=0",
+    "messages.Link": "latency=0.0, pose_noise=None, packet_loss=0.0, seed=0, budget=None, payload=None",
     "messages.message_sizes": (
         "agents=None, bev_shape=(64, 200, 200), bev_dtype=<class 'numpy.float32'>, clouds=True, "
         "link=None, on_missing='raise'"

@@ -97,7 +97,7 @@ def test_actors_that_overlap_at_the_present_are_left_out_and_counted() -> None:
 
 
 def test_twins_are_the_price() -> None:
-    twin = replace(scene(10, partner=False), kind="twin", is_collider=True)
+    twin = replace(scene(10, partner=False), is_twin=True, is_collider=True)
     numbers = lead(result_of(twin), "full braking")
     assert numbers["lost_twins"] == pytest.approx(100 * (30 - 6.25) / 30, abs=0.1)
     assert (numbers["braking_twins"], "avoided" in numbers, "lost" in numbers) == (100, False, False)
@@ -150,7 +150,7 @@ def test_the_box_turns_with_the_ego_frame() -> None:
 def test_last_frames_have_no_numbers() -> None:
     found = result_of(scene(10, seconds=0.0))
     assert not found.means
-    assert found.notes == ("1 samples are last frames, after which nothing is recorded",)
+    assert found.notes == ("1 samples have no frame after them that counts; twins end where their accident does",)
 
 
 def test_trivial_plans_look_3_seconds_ahead() -> None:

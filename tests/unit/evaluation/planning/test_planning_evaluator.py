@@ -129,8 +129,8 @@ def test_a_scene_of_a_release(da_motion: DeepAccident) -> None:
     later = f"{scenario}/{agent}/{int(number) + left:03d}"
     there = da_motion.world_from(token, "ego").inverse() @ da_motion.world_from(later, "ego")
     assert found.recorded[-1, :2] == pytest.approx(there.translation[:2])
-    assert (found.kind, found.is_collider, found.to_end) == ("accident", True, pytest.approx(1.0))
-    assert found.partner in found.actor_id
+    assert (found.is_twin, found.is_collider, found.to_end) == (False, True, pytest.approx(1.0))
+    assert found.partner.sum() == 1
     own = da_motion.get("agent", f"{scenario}/{agent}")["actor_id"]
     assert own not in found.actor_id
     speed = np.hypot(*found.before)
@@ -141,12 +141,15 @@ def test_a_twin_is_cut_to_the_accident(da_motion: DeepAccident) -> None:
     token, _ = collider(da_motion)
     twin = token.replace("_accident/", "_normal/")
     found = planning_scene(da_motion, twin)
-    assert (found.kind, found.is_collider, found.partner) == ("twin", True, None)
+    assert (found.is_twin, found.is_collider, found.partner.any()) == (True, True, False)
     assert (found.to_end, len(found.recorded)) == (pytest.approx(1.0), 11)
+    scenario, _, number = twin.rsplit("/", 2)
+    left = da_motion.scenario.get(scenario)["num_frames"] - int(number)
+    assert len(planning_scene(da_motion, twin, cut=False).recorded) == left + 1
 
 
 def test_the_roadside_has_no_plan(da_motion: DeepAccident) -> None:
     token = collider(da_motion)[0]
     scenario, _, number = token.rsplit("/", 2)
-    with pytest.raises(EvaluationError, match="roadside does not drive"):
+    with pytest.raises(EvaluationError, match="roadside, which does not drive"):
         planning_scene(da_motion, f"{scenario}/infrastructure/{number}")

@@ -38,6 +38,7 @@ WRITTEN = {
     "evaluation_run.EvaluationRun.broken_down": "by=None, resampling=None",
     "evaluation_run.evaluate_results": "selection='val', allow_partial=False, out=None",
     "further.with_further": "resampling=None",
+    "over_bytes.over_bytes": "resampling=None, common=False",
     "rows.STAMP_KEY": "b'deepaccident'",
     "sanity.NOTHING_WRONG": "'Nothing looks wrong with the predictions.'",
     "sanity.CHECKED": "('motion', 'accident', 'detection')",

@@ -90,6 +90,47 @@ def test_what_a_results_file_holds(
     )
 
 
+def told_bytes(meta: object) -> list[str]:
+    results = {"path": "/p", "fingerprint": "g", "form": None, "meta": meta}
+    return [line[6:] for line in lines_of(summary_text({**SUMMARY, "results": results})) if line.startswith("bytes ")]
+
+
+@pytest.mark.parametrize(
+    ("sent", "told"),
+    [
+        ({"mean": 2900.4, "partners": 4}, "2,900 a sample (2^11.5), 0.23 Mbit/s at 10 Hz, 4.0 partners, payload boxes"),
+        ({"mean": 0, "partners": 0.0}, "0 a sample, 0.00 Mbit/s at 10 Hz, 0.0 partners, payload boxes"),
+        (
+            {"mean": 2.0**21, "partners": 1.5, "payload": 2**20, "shape": [8, 2]},
+            "2,097,152 a sample (2^21.0), 167.77 Mbit/s at 10 Hz, 1.5 partners, payload 1048576",
+        ),
+    ],
+    ids=["some", "none", "own"],
+)
+def test_bytes_stand_beside_the_numbers(sent: dict[str, Any], told: str) -> None:
+    assert told_bytes({"bytes": {"payload": "boxes", **sent}}) == [told]
+
+
+@pytest.mark.parametrize(
+    "meta",
+    [
+        None,
+        {},
+        {"bytes": None},
+        {"bytes": 7},
+        {"bytes": {"mean": 7.0}},
+        {"bytes": {"payload": "boxes", "mean": "many", "partners": 1}},
+        {"bytes": {"payload": "boxes", "mean": -7.0, "partners": 1}},
+        {"bytes": {"payload": "a\nb", "mean": 7.0, "partners": 1}},
+        {"bytes": {"payload": True, "mean": 7.0, "partners": 1}},
+        {"bytes": {"payload": "boxes", "mean": 7.0, "partners": None}},
+    ],
+    ids=["nothing", "empty", "none", "number", "part", "words", "negative", "lines", "flag", "unknown"],
+)
+def test_what_others_note_as_bytes_is_left_out_where_it_is_none(meta: object) -> None:
+    assert told_bytes(meta) == []
+
+
 SUMMARY: dict[str, Any] = {
     "task": "accident",
     "protocol": "boxes",
