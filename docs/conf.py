@@ -61,6 +61,8 @@ REFERENCE = {
         "evaluation.accident",
         "evaluation.detection",
         "evaluation.warning",
+        "evaluation.planning",
+        "evaluation.forecasting",
     ),
     "Results files and whole evaluations": (
         "evaluation.results",

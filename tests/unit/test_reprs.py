@@ -29,6 +29,8 @@ from deepaccident_devkit.evaluation import (
     MotionOutput,
     WarningEvaluator,
 )
+from deepaccident_devkit.evaluation.forecasting import ForecastingEvaluator
+from deepaccident_devkit.evaluation.planning import PlanningEvaluator
 from deepaccident_devkit.evaluation.runs import EvaluationRun
 from deepaccident_devkit.geometry import SE3, BevGrid, Boxes, LidarPointCloud
 from deepaccident_devkit.interactions import InteractionConfig, Interactions
@@ -100,6 +102,8 @@ OWN = {
     "AnticipationResult": lambda: WarningEvaluator("clean").compute(),
     "Contact": contact,
     "DetectionResult": lambda: DetectionEvaluator().compute(),
+    "ForecastingResult": lambda: ForecastingEvaluator().compute(),
+    "PlanningResult": lambda: PlanningEvaluator().compute(),
     "FieldResult": lambda: WarningEvaluator("field").compute(),
     "LidarPointCloud": cloud,
     "MotionHeads": heads,
@@ -114,6 +118,7 @@ OWN = {
 CHOICES = (
     "Config", "Protocol", "Spec", "Quirks", "Reading", "Warnings", "Selection", "Resampling", "PostProcessing", "View",
     "Accidents", "Link", "PoseNoise", "Augmentation", "BevGrid", "Baseline", "Release", "Form",
+    "Rules",
 )  # fmt: skip
 """Endings of the names of classes that are choices: their text has every field, as one would type it."""
 
