@@ -14,6 +14,7 @@ from typing import Any, Final
 from deepaccident_devkit.errors import MissingRoomError
 
 NEEDS: Final[Mapping[str, tuple[str, ...]]] = {
+    "audit": ("testing",),
     "explore": ("interactions", "maps", "safety"),
     "safety": ("interactions",),
     "synth.demo": ("baselines",),
@@ -52,6 +53,7 @@ ADDED: Final[Mapping[str, Mapping[str, str]]] = {
     "result": {"prevented": "safety.prevention:PREVENTED"},
     "table": {"interactions": "interactions.scenario:least_times"},
     "verb": {
+        "audit": "audit.cli:audit",
         "demo": "synth.demo:demo",
         "explore": "explore.cli:explore",
         "predict": "baselines.cli:predict",

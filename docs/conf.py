@@ -73,7 +73,7 @@ REFERENCE = {
     "Baselines": ("baselines",),
     "Pictures": ("render.figures.Layer", "render", "render.evaluation"),
     "Splits and queries": ("splits", "selection"),
-    "Validation and statistics": ("validation", "statistics"),
+    "Validation and statistics": ("validation", "statistics", "audit"),
     "Files of a release": ("release",),
     "Synthetic releases": ("synth", "synth.spec"),
     "The test kit": ("testing", "testing.plugin", "testing.strategies"),

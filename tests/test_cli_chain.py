@@ -78,6 +78,7 @@ def test_accuracy_is_shown_over_bytes(release: Path, folder: Path) -> None:
         options = ("--results", folder / agents / "accident.json", "--split", "train", "--out", bundle)
         text = told("evaluate", "accident", release, *options, "--protocol", "boxes", "--resamples", 20)
         assert "partners, payload boxes\n" in text
+        assert "partners, payload boxes<" in (bundle / "report.html").read_text(encoding="utf-8")
         assert json.loads((bundle / "metrics_summary.json").read_text())["results"]["meta"]["bytes"]["samples"] == 20
     files = [folder / f"over.{kind}" for kind in ("png", "pdf", "csv", "json")]
     outs = [word for path in files for word in ("--out", path)]

@@ -64,6 +64,7 @@ STAND_FOR = {
 }
 """What the words in capitals of a command line may be."""
 NOT_RUN = {
+    "audit ": "tests/test_cli_audit.py has them, and makes the files",
     "synth ": "tests/test_cli_synth.py has them; some take minutes",
     "safety describe OUT": "of what synth makes",
     "render accident OUT": "tests/unit/synth/test_own_files.py has it, on a release of a scenario file",

@@ -16,9 +16,10 @@ from deepaccident_devkit.errors import MissingRoomError
 
 TESTS = Path(__file__).parent
 PACKAGE = Path(deepaccident_devkit.__file__).parent
-RING = ("baselines", "explore", "interactions", "maps", "model", "safety", "synth", "testing")
+RING = ("audit", "baselines", "explore", "interactions", "maps", "model", "safety", "synth", "testing")
 MODULES_OF_THE_CORE = 200
 ASKED = {
+    "audit": ("verb('audit')",),
     "baselines": ("verb('predict')", "verb('demo')"),
     "explore": ("verb('explore')",),
     "interactions": (
@@ -40,7 +41,7 @@ ASKED = {
     "model": ("verb('train')", "verb('predict', str(da.dataroot), str(da.dataroot), '--out', 'predicted')"),
     "safety": ("da.describe(da.scenario[0])", "verb('safety')", "verb('explore')"),
     "synth": ("verb('synth')", "verb('demo')"),
-    "testing": (),
+    "testing": ("verb('audit')",),
 }
 """Room → what cannot be had without it, in terms of `PROBE`."""
 WORKS = (

@@ -37,7 +37,7 @@ from deepaccident_devkit.release.fingerprints import digest_of
 from deepaccident_devkit.support.text import choice, path_of, settle_choices
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 from deepaccident_devkit.v2x import AgentConfig, Agents, Link, cooperating_agents
-from deepaccident_devkit.v2x.messages import Payload, traffic, traffic_note
+from deepaccident_devkit.v2x.messages import Payload, checked_link, traffic, traffic_note
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -65,7 +65,8 @@ class Baseline:
     horizon: float = 2.0
 
     def __post_init__(self) -> None:
-        """Check the model; raises ChoiceError."""
+        """Check the model and the link; raises ChoiceError or ConfigError."""
+        checked_link(self.link)
         settle_choices(self, {"model": get_args(MotionModel)})
 
     @property
@@ -260,11 +261,14 @@ def _predict(job: _Job) -> None:
     work = job.work
     if job.path.exists():
         return
-    sent = [
-        traffic(work.dataset, token, work.baseline.agents, work.baseline.link, work.payload) for token in job.tokens
-    ]
     try:
-        with work.writer(job.path, sent) as writer:
+        with work.writer(
+            job.path,
+            [
+                traffic(work.dataset, token, work.baseline.agents, work.baseline.link, work.payload)
+                for token in job.tokens
+            ],
+        ) as writer:
             for token in job.tokens:
                 writer.add(token, work.baseline.predict(work.dataset, work.task, token))
     except ResultsError as error:

@@ -26,6 +26,7 @@ _OF_DASK = ("distributed", "tornado", "asyncio")
 _DEVELOPERS: Final = re.compile(r"extra == .(test|lint|docs)\b")
 """Requirements for work on the devkit itself."""
 _VERBS: Final = {
+    "audit": "Find splits that leak, scores that cheat, and columns that were misread.",
     "cache": "Write resized images for training.",
     "demo": "Make a small synthetic release, and a page on it.",
     "evaluate": "Evaluate results files; check and compare evaluations.",

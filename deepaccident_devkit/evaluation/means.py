@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from itertools import product
 from typing import Any, ClassVar, Final, Generic, Literal, NamedTuple, TypeVar
 
@@ -128,8 +128,7 @@ class MeansEvaluator(Evaluator[Result], Generic[Result]):
     @property
     def settings(self) -> dict[str, Any]:
         """The protocol's choices."""
-        choices: dict[str, Any] = plain(self.protocol)
-        return choices
+        return {name: plain(value) for name, value in asdict(self.protocol).items()}
 
     def add(self, token: str, counts: Counts) -> None:
         """Take a sample's counts (`Evaluator.add`); of samples with the same names these are kept once."""

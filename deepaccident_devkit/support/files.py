@@ -70,6 +70,12 @@ def replacing_folder(path: Path) -> Iterator[Path]:
         shutil.rmtree(temporary, ignore_errors=True)
 
 
+def check_free(out: Path) -> None:
+    """Raise ConfigError unless a folder can be made there: nothing is, or an empty folder."""
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise ConfigError(f"{out}: exists and is not an empty folder; choose another folder, or remove this one")
+
+
 def temporary_path(path: Path) -> Path:
     """A path beside `path` that no other thread, process or host uses."""
     return path.with_name(f".{path.name[:_NAME_LENGTH]}.{_writer(os.getpid())}-{secrets.randbits(32)}.tmp")

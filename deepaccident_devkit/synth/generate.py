@@ -18,7 +18,14 @@ from deepaccident_devkit._version import __version__
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.parallel import Places, Progress, Store
 from deepaccident_devkit.release.store.members import SPLIT_FILE_FOLDER
-from deepaccident_devkit.support.files import is_writable_folder, place_in, remove_in, temporary_of, write_bytes
+from deepaccident_devkit.support.files import (
+    check_free,
+    is_writable_folder,
+    place_in,
+    remove_in,
+    temporary_of,
+    write_bytes,
+)
 from deepaccident_devkit.support.json_text import parsed_json
 from deepaccident_devkit.support.reading import fault_text, read_bytes
 from deepaccident_devkit.support.text import differing_text, path_of
@@ -112,12 +119,6 @@ def unfinished_release(unfinished: Unfinished, config: SynthConfig) -> Iterator[
             nothing = unfinished.folder.is_dir() and not any(unfinished.folder.glob("kept/*"))
             if nothing and turn.alone(wait=False):
                 shutil.rmtree(unfinished.folder, ignore_errors=True)
-
-
-def check_free(out: Path) -> None:
-    """Raise ConfigError unless a release can be made there: nothing is, or an empty folder."""
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise ConfigError(f"{out}: exists and is not an empty folder; choose another folder, or remove this one")
 
 
 def _write_or_compare(path: Path, config: SynthConfig) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.release import Collision, Meta, ScenarioFolder, write_meta, write_split_file
 from deepaccident_devkit.release.store import real_path
-from deepaccident_devkit.support.files import replacing_folder
+from deepaccident_devkit.support.files import check_free, replacing_folder
 from deepaccident_devkit.support.text import choice, settle_choices
 from deepaccident_devkit.taxonomy import (
     AGENTS,
@@ -131,8 +131,7 @@ def write_small_release(out: Path, config: SmallRelease | None = None) -> Path:
         ConfigError: `out` is a file or is not empty.
     """
     wanted = config or SmallRelease()
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise ConfigError(f"{out}: exists and is not an empty folder; choose another folder, or remove this one")
+    check_free(out)
     stories = [story for story in _STORIES if story.split in wanted.splits]
     with replacing_folder(out) as root:
         for story in stories:

@@ -257,7 +257,8 @@ def message_sizes(
 
     Returns:
         Agent → sizes of what arrives. The sample's own agent (which sends nothing to itself) is first, if it is among
-        them. A partner whose message is lost is left out; a call without `link` gives the size of that message.
+        them. A partner whose message is lost, or does not fit into the budget, is left out; a call without `link` gives
+        the size of that message.
 
     Raises:
         TokenError: no such sample.
@@ -380,7 +381,7 @@ def messages(
     With a budget, partners whose message does not fit contribute nothing either.
 
     By frame, the present first and then backwards, and for each frame by agent, the sample's own first. Raises what
-    `cooperating_agents` does, and ConfigError of the link.
+    `cooperating_agents` does, ConfigError of the link, and with a budget what `message_bytes` does.
     """
     link = checked_link(link)
     names = cooperating_agents(dataset, sample, agents)

@@ -14,7 +14,7 @@ from typing import Final, Literal
 
 import numpy as np
 
-from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray, IntArray
+from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray, IntArray, ShortRepr
 
 STEPS: Final = 6
 STEP: Final = 0.5
@@ -29,7 +29,7 @@ Over = Literal["step", "mean", "any"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class CellRules:
+class CellRules(ShortRepr):
     """How one code counts; the quirks that were found in it, one field each.
 
     Attributes:

@@ -45,7 +45,7 @@ _LEFT_OUT: Final = (
 )
 _FAR_OFF: Final = "point_collision looks 25 m beside the path, as the code does; ignore it"
 _BY_HORIZON: Final = tuple(f"{horizon} s" for horizon in HORIZONS)
-_BY_LEAD: Final = tuple(f"lead {lead:g} s" for lead in CleanPlanning().leads)
+BY_LEAD: Final = tuple(f"lead {lead:g} s" for lead in CleanPlanning().leads)
 
 
 class PlanningResult(MeansResult):
@@ -53,7 +53,7 @@ class PlanningResult(MeansResult):
 
     __slots__ = ()
     task = "planning"
-    main_tables: ClassVar[Sequence[str]] = (*_BY_LEAD, *_BY_HORIZON, _MEAN)
+    main_tables: ClassVar[Sequence[str]] = (*BY_LEAD, *_BY_HORIZON, _MEAN)
     main_row = GIVEN
     columns: ClassVar[Mapping[str, Column]] = {
         "avoided": Column("%", "higher"),
@@ -94,7 +94,7 @@ class PlanningEvaluator(MeansEvaluator[PlanningResult]):
     result_class = PlanningResult
     protocols = PLANNING_PROTOCOLS
     order: ClassVar[Sequence[str]] = (
-        *(f"{role}{lead}{end}" for role in ("", "bystander, ") for end in ("", " to contact") for lead in _BY_LEAD),
+        *(f"{role}{lead}{end}" for role in ("", "bystander, ") for end in ("", " to contact") for lead in BY_LEAD),
         *_BY_HORIZON,
         _MEAN,
         GIVEN,

@@ -17,6 +17,7 @@ from deepaccident_devkit.evaluation.accident import AccidentEvaluator, compared_
 from deepaccident_devkit.evaluation.breakdowns import EVERYTHING, WITHIN_RECORDINGS, Breakdown
 from deepaccident_devkit.evaluation.detection import DetectedBoxes, DetectionEvaluator
 from deepaccident_devkit.evaluation.motion import MotionEvaluator
+from deepaccident_devkit.evaluation.planning.evaluator import BY_LEAD
 from deepaccident_devkit.evaluation.predictions import MotionOutput, frames_there, labels_at_present
 from deepaccident_devkit.evaluation.results import Results
 from deepaccident_devkit.evaluation.runs import EvaluationRun
@@ -197,10 +198,22 @@ def _warning(run: EvaluationRun) -> Iterator[RunFigure]:
         )
 
 
+def _planning(run: EvaluationRun) -> Iterator[RunFigure]:
+    if BY_LEAD[0] in run.result.means:
+        yield RunFigure(
+            name="plans",
+            caption="Accidents that plans avoid, over the progress that they lose in twins, where nothing happens, "
+            "with those that need no planner. Each line goes from the longest lead to the shortest.",
+            alt="Share of accidents avoided over the share of progress lost in twins, by plan and lead.",
+            draw=partial(tasks.render_plans, run.result),
+        )
+
+
 _FIGURES: Final[dict[str, Callable[[EvaluationRun], Iterator[RunFigure]]]] = {
     "accident": _accident,
     "detection": _detection,
     "motion": _motion,
+    "planning": _planning,
     "warning": _warning,
 }
 

@@ -16,6 +16,7 @@ from deepaccident_devkit.evaluation.intervals import LEAST_CLUSTERS
 from deepaccident_devkit.evaluation.results import Results
 from deepaccident_devkit.evaluation.runs import EvaluationRun
 from deepaccident_devkit.evaluation.runs.further import further_results
+from deepaccident_devkit.evaluation.runs.over_bytes import sent_bytes
 from deepaccident_devkit.evaluation.runs.sanity import NOTHING_WRONG
 from deepaccident_devkit.evaluation.runs.setups import TASKS
 from deepaccident_devkit.evaluation.runs.text import means_tables, predictor_tables, reading_notes
@@ -89,6 +90,7 @@ def _header(run: EvaluationRun, summary: Mapping[str, Any]) -> dict[str, str]:
         **({"horizon": f"{setup.horizon:g} s"} if TASKS[setup.task].has_horizon else {}),
         "results": run.results.path,
         "results' hash": run.results.fingerprint,
+        **({"bytes": sent.text()} if (sent := sent_bytes(summary)) else {}),
         "release": f"{run.release.version}, {run.release.dataroot}",
         "release's hash": run.release.fingerprint,
         "devkit": summary["devkit_version"],

@@ -18,10 +18,12 @@ from deepaccident_devkit.evaluation.detection import DetectionResult
 from deepaccident_devkit.evaluation.evaluator import Counts, ratio
 from deepaccident_devkit.evaluation.instances import panoptic_quality
 from deepaccident_devkit.evaluation.motion import RANGES, MotionEvaluator
+from deepaccident_devkit.evaluation.planning import PlanningResult
+from deepaccident_devkit.evaluation.planning.evaluator import BY_LEAD, GIVEN
 from deepaccident_devkit.evaluation.warning import AnticipationResult
 from deepaccident_devkit.render.boxes import write_beside
 from deepaccident_devkit.render.captions import set_title
-from deepaccident_devkit.render.chips import keep_free
+from deepaccident_devkit.render.chips import keep_free, place_chips
 from deepaccident_devkit.render.evaluation.panels import PANEL, Bar, draw_bars, draw_nothing
 from deepaccident_devkit.render.figures import axes_or_new, with_light_grid
 from deepaccident_devkit.render.styles import (
@@ -314,3 +316,31 @@ def render_predictors(result: AnticipationResult, *, ax: Axes | None = None) -> 
     ax.set(xlabel="chance that an accident's score is above\nanother recording's at the same moment")
     set_title(ax, f"Accidents distinguished from other recordings\n{group}", fontsize="medium")
     return ax
+
+
+@in_own_settings
+def render_plans(result: PlanningResult, *, ax: Axes | None = None) -> Axes:
+    """Render how many accidents plans avoid over what that costs, at the leads of the protocol `clean`.
+
+    Args:
+        result: of `PlanningEvaluator("clean").compute`.
+        ax: axes to render on; new ones if None.
+
+    Returns:
+        The axes, with a line for each plan, the trivial ones among them: from the longest lead, where it is named, to
+        the shortest.
+    """
+    ax, tables = axes_or_new(ax, PANEL), [table for name, table in result.means.items() if name in BY_LEAD]
+    lines = {
+        row: [(table[row].get("lost_twins", math.nan), table[row].get("avoided", math.nan)) for table in tables]
+        for row in (tables[0] if tables else ())
+    }
+    if not any(math.isfinite(lost + avoided) for points in lines.values() for lost, avoided in points):
+        return draw_nothing(ax, "no accident with a twin")
+    for (row, points), dash in zip(lines.items(), cycle(_DASHES), strict=False):
+        color = ESTIMATE_COLOR if row == GIVEN else TRUE_PLACE_COLOR
+        ax.plot(*zip(*points, strict=True), color=color, linestyle=dash, marker="o", markersize=4)
+        place_chips(ax, [(row, points[0])])
+    ax.set(xlabel="progress lost in twins (%)", ylabel="accidents avoided (%)", ymargin=0.1, xmargin=0.1)
+    set_title(ax, f"Accidents avoided, and what that costs\n{BY_LEAD[0]} (named) to {BY_LEAD[-1]}", fontsize="medium")
+    return with_light_grid(ax, "both")

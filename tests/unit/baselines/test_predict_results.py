@@ -205,6 +205,11 @@ def test_results_note_what_a_budget_lets_through(da_b: DeepAccident, tokens: lis
     assert bodies[0] == bodies[1] != ""
 
 
+def test_what_is_no_link_is_refused_at_once() -> None:
+    wrong: object = {"budget": 7}
+    assert_refused((lambda: Baseline(link=wrong), ConfigError, "link: expected a Link"))  # type: ignore[arg-type]
+
+
 def test_a_token_that_comes_twice_is_refused_at_once(
     da_b: DeepAccident, tokens: list[str], tmp_path: Path, predicted: list[str]
 ) -> None:

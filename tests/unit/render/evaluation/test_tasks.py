@@ -1,9 +1,11 @@
 """Panels of accident results: what they draw is what the counts say."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from drawing import legend_words, new_axes, words
+from planning_scenes import plan_at, scene
 from refusals import assert_refused
 from wording import lacking
 
@@ -15,10 +17,12 @@ from deepaccident_devkit.evaluation import (
     MotionEvaluator,
     WarningEvaluator,
 )
+from deepaccident_devkit.evaluation.planning import PlanningEvaluator
 from deepaccident_devkit.render.evaluation import (
     render_accuracy,
     render_alarms,
     render_errors,
+    render_plans,
     render_precision_recall,
     render_predictors,
     render_quality_by_time,
@@ -130,3 +134,15 @@ def test_motion_is_drawn_by_frame() -> None:
 
 def test_nothing_to_warn_of_is_said() -> None:
     assert "no recording" in words(render_predictors(WarningEvaluator().compute(), ax=new_axes()))
+
+
+def test_plans_stand_where_they_avoid_and_lose() -> None:
+    evaluator = PlanningEvaluator()
+    assert "no accident with a twin" in words(render_plans(evaluator.compute(), ax=new_axes()))
+    twin = replace(scene(10, partner=False), is_twin=True, is_collider=True)
+    for number, each in enumerate((scene(10), twin)):
+        evaluator.update(f"a/b/{number:03d}", [plan_at(10)], each)
+    ax = render_plans(evaluator.compute(), ax=new_axes())
+    assert not lacking(words(ax), "given", "recorded", "standing", "full braking", "constant velocity")
+    drawn = [line.get_xydata()[0].round(1).tolist() for line in ax.lines]
+    assert drawn == [[0, 0], [0, 0], [100, 100], [0, 0], [79.2, 100]]

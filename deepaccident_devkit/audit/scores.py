@@ -1,0 +1,186 @@
+"""Audit of scores of accidents: do they tell more than how long a clip is, or where it lies?"""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any, Final, cast
+
+import numpy as np
+
+from deepaccident_devkit.audit.report import AuditFinding, AuditReport
+from deepaccident_devkit.dataset import Dataset
+from deepaccident_devkit.errors import ResultsError, shortened
+from deepaccident_devkit.evaluation.breakdowns import cluster_of
+from deepaccident_devkit.evaluation.intervals import LEAST_CLUSTERS
+from deepaccident_devkit.evaluation.results import read_results
+from deepaccident_devkit.reports import Row
+from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray, IntArray, as_floats
+from deepaccident_devkit.support.json_text import parsed_json
+from deepaccident_devkit.support.reading import fault_text, read_bytes
+from deepaccident_devkit.support.text import counted, number_of, path_of
+
+RESAMPLES: Final = 400
+FOLLOWED: Final = (0.8, 0.5)
+"""Scores follow an attribute if the low ends of their rank correlations are beyond these: of all scenarios, and among
+those that end alike, where an attribute cannot stand for the truth."""
+_IS: Final[Mapping[str, tuple[str, str]]] = {
+    "length": ("a detector of short clips", "a detector of long clips"),
+    "folder": ("a detector of the folder `normal`", "a detector of the folder `accident`"),
+    "name": ("a detector of small numbers in names", "a detector of large numbers in names"),
+    "town": ("a detector of towns", "a detector of towns"),
+    "weather": ("a detector of weather", "a detector of weather"),
+    "actors": ("a detector of few actors", "a detector of many actors"),
+    "frame": ("a detector of early frames", "a detector of late frames"),
+}
+"""Attribute → what scores are that fall, or rise, with it."""
+_NOTES: Final = (
+    "Truth: meta names a collision. A scenario's score is its samples' highest; the frame is compared by samples.",
+    """AUC of an attribute: in the direction that fits; of town and weather, by the share of collisions among the other
+scenarios of the same word, without the twin.""",
+    """`with the scores`: Spearman's rank correlation, of town and weather by the mean score of the word. `among alike`:
+of ranks within the collisions and within the others, where no attribute can stand for the truth (of the frame, without
+collisions alone).""",
+    f"From, to: 95 % of {RESAMPLES} resamples of scenarios, twins together; −1 to 1 for fewer than {LEAST_CLUSTERS}.",
+)
+_REMEDY: Final = "give results of the task accident, a JSON object of token and score, or lines `token,score` in a .csv"
+
+
+def read_scores(path: str | os.PathLike[str]) -> dict[str, float]:
+    """Token of a sample or of a scenario → its score, the higher the surer of an accident.
+
+    Args:
+        path: results of the task `accident` (a sample's score is that of its surest accident, 0 without one), a JSON
+            object of token and score, or a .csv file of `token,score` in a line, whose lines without a token (which has
+            a `/`) do not count.
+
+    Raises:
+        ResultsError: it cannot be read, is something else, or a score is no finite number.
+    """
+    file = path_of(path, error=ResultsError)
+    try:
+        content = read_bytes(file, "results")
+        if file.suffix == ".csv":
+            pairs = (line.replace('"', "").rpartition(",") for line in content.decode("utf-8-sig").splitlines())
+            given: dict[str, Any] = {
+                token.strip(): number_of(score.strip()) for token, _, score in pairs if "/" in token
+            }
+        else:
+            given = dict(parsed_json(content))
+    except (OSError, TypeError, ValueError) as error:
+        raise ResultsError(f"{file}: {shortened(fault_text(error))}; {_REMEDY}") from error
+    if "results" in given and (results := read_results(file)).task == "accident":
+        given = {
+            token: max((each.score for each in cast("Any", results.prediction(token))), default=0.0)
+            for token in results.tokens
+        }
+    for token, score in given.items():
+        if type(score) not in (int, float) or not math.isfinite(score):
+            found = f"{shortened(token)}: {shortened(repr(score))}"
+            raise ResultsError(f"{file}: expected a score, found {found}; {_REMEDY}")
+    return given
+
+
+def audit_scores(
+    dataset: Dataset, scores: Mapping[str, float], split: str | os.PathLike[str] | None = None
+) -> AuditReport:
+    """Compare scores of accidents with the truth, and with what a detector should not go by.
+
+    Args:
+        dataset: the release.
+        scores: token of a sample or of a scenario → its score, as `read_scores` gives them.
+        split: only its scenarios: `train`, `val`, … or a split file; None for all that have a score.
+
+    Raises:
+        TokenError: a token is neither a sample's nor a scenario's.
+        ResultsError: no scenario with meta has a score.
+    """
+    of_sample, chosen = dataset.columns("sample")["scenario_row"], dataset.split_scenarios(split) if split else None
+    cases = [
+        (of_sample[dataset.getind("sample", token)], int(token.rpartition("/")[2]), score)
+        if token.count("/") > 1
+        else (dataset.getind("scenario", token), 0, score)
+        for token, score in scores.items()
+    ]
+    every = dataset.scenario[:]
+    counts = [each["weather"] is not None and (chosen is None or each["token"] in chosen) for each in every]
+    rows, frame, score = np.array([each for each in cases if counts[each[0]]], dtype=float).reshape(-1, 3).T
+    if not len(rows):
+        raise ResultsError("no scenario with meta has a score; give scores of a split whose meta is published")
+    scenario, of = np.unique(rows.astype(int), return_inverse=True)
+    highest = np.array([score[of == number].max() for number in range(len(scenario))])
+    records = [every[row] for row in scenario]
+    truth = np.array([each["collision"] is not None for each in records])
+    cluster = np.unique([cluster_of(each["token"]) for each in records], return_inverse=True)[1]
+    words = [np.array([str(dict(each)[word]) for each in records]) for word in ("town", "weather")]
+    columns: list[Any] = [
+        [each["num_frames"] for each in records],
+        [each["designed_accident"] for each in records],
+        [int(re.sub(r".*?(\d*)$", r"0\1", each["name"])) for each in records],
+        *(_means(each, highest) for each in words),
+        np.bincount(dataset.columns("instance")["scenario_row"], minlength=len(every))[scenario],
+        highest,
+    ]
+    found = _correlations(columns, truth * 1, cluster), _correlations([frame, score], truth[of] * -1, cluster[of])
+    columns[3:5] = (_means(each, truth, cluster) for each in words)
+    *areas, own = (_area(np.asarray(each, dtype=float), truth) for each in columns)
+    told, findings = list[Row](), list[AuditFinding]()
+    for name, area, numbers in zip(_IS, [*areas, _area(frame, truth[of])], np.concatenate(found), strict=True):
+        told.append((name, max(area, round(1 - area, 3)), *numbers.flatten().tolist()))
+        rises = bool(numbers[0, 0] > 0)
+        if ((numbers[:, 1] if rises else -numbers[:, 2]) > FOLLOWED).all():
+            what = (
+                f"these scores are those of {_IS[name][rises]}: their rank correlation with `{name}` is "
+                f"{numbers[0, 0]}, and {numbers[1, 0]} among scenarios that end alike. Alone, it has an AUC of "
+                f"{told[-1][1]}, they of {own}."
+            )
+            remedy = "Cut all clips alike, or compare moments of equal time to the end: deepaccident evaluate warning."
+            findings.append(AuditFinding(kind=name, what=what, remedy=remedy, number=len(records)))
+    heading = ("attribute", "AUC", "with the scores", "from", "to", "among alike", "from", "to")
+    return AuditReport(
+        findings=tuple(findings),
+        tables={"scores": [heading, ("the scores", own, *[None] * 6), *told]},
+        notes=(f"{counted(len(truth), 'scenario')} with meta and a score, {truth.sum()} with a collision.", *_NOTES),
+    )
+
+
+def _area(values: FloatArray, truth: BoolArray) -> float:
+    """The area under the ROC curve, of three decimals; 0.5 where all end alike."""
+    from scipy.stats import rankdata
+
+    hits, pairs = truth.sum(), truth.sum() * (~truth).sum()
+    return round(float((rankdata(values)[truth].sum() - hits * (hits + 1) / 2) / pairs), 3) if pairs else 0.5
+
+
+def _means(words: AnyArray, values: AnyArray, cluster: IntArray | None = None) -> FloatArray:
+    """(N,) mean value of each one's word, over all of the word or those of other clusters alone; 0 of none."""
+    others = (words[:, None] == words) & (True if cluster is None else cluster[:, None] != cluster)
+    return as_floats(others @ values.astype(float) / np.maximum(others.sum(axis=1), 1))
+
+
+def _correlations(columns: Sequence[Any], alike: IntArray, cluster: IntArray) -> FloatArray:
+    """(A, 2, 3) rank correlations of A columns with the last one, over all rows and within those that end alike.
+
+    With the ends of their intervals. `alike` is 0 or 1, below for rows that do not count there; 0 where nothing varies.
+    """
+    from scipy.stats import rankdata
+
+    table = np.column_stack(columns).astype(float)
+
+    def of(rows: IntArray) -> FloatArray:
+        groups = [rows, *(rows[alike[rows] == each] for each in (0, 1))]
+        ranks = [rankdata(table[each], axis=0) - (len(each) + 1) / 2 for each in groups]
+        products = [each.T @ each for each in (ranks[0], np.concatenate(ranks[1:]))]
+        return np.stack(
+            [each[:-1, -1] / np.sqrt(np.diag(each)[:-1] * each[-1, -1] + 1e-9) for each in products], axis=-1
+        )
+
+    parts = [np.flatnonzero(cluster == each) for each in np.unique(cluster)]
+    draws = np.random.default_rng(0).integers(len(parts), size=(RESAMPLES, len(parts)))
+    drawn = [of(np.concatenate([parts[part] for part in draw])) for draw in draws]
+    ends = (
+        np.quantile(drawn, (0.025, 0.975), axis=0) if len(parts) >= LEAST_CLUSTERS else [[[-1]], [[1]]] + 0 * drawn[0]
+    )
+    return np.stack([of(np.arange(len(table))), *ends], axis=-1).round(3)

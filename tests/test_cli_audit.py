@@ -1,0 +1,73 @@
+"""`deepaccident audit` as users call it: what was found has exit status 1, and files that cannot be used have 2."""
+
+import json
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+from verbs import called
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.cli import deepaccident
+from deepaccident_devkit.splits import official_split
+
+READER = """
+from pathlib import Path
+
+def read(dataroot):
+    files = sorted(Path(dataroot).glob("*/*/label/*/*.txt"))
+    rows = [line.split() for path in files for line in path.read_text().splitlines()[1:]]
+    return [{"ttc": float(row[11]), "x": float(row[1])} for row in rows]
+
+def wrong():
+    return []
+"""
+
+
+def test_splits(da: DeepAccident, tmp_path: Path) -> None:
+    files = sorted(official_split(da).save(tmp_path))
+    sides = [path for path in files if "mini" not in path.name]
+    assert len("".join(path.read_text() for path in sides).splitlines()) == len(da.scenario)
+    assert called("audit", "splits", *sides).output.startswith("Nothing was found.")
+    (tmp_path / "random.txt").write_text(f"{da.scenario[0]['token']}/ego_vehicle/001\n")
+    found = called("audit", "splits", *sides, tmp_path / "random.txt", "--json", status=1)
+    assert [each["kind"] for each in json.loads(found.stdout)["findings"]] == ["recordings", "twins"]
+
+
+def test_scores(da_b: DeepAccident, tmp_path: Path) -> None:
+    """Of six clips of one length: nothing is said of scores that nothing but the truth explains."""
+    path = tmp_path / "scores.csv"
+    lines = [f"{each['token']},{int(each['collision'] is not None)}" for each in da_b.scenario]
+    path.write_text("\n".join(["token,score", *lines]))
+    told = called("audit", "scores", da_b.dataroot, "--results", path).output
+    assert "6 scenarios with meta and a score" in told
+    assert "the scores 1.0" in " ".join(told.split())
+    train = called("audit", "scores", da_b.dataroot, "--results", path, "--split", "train", "--json").stdout
+    assert json.loads(train)["tables"]["scores"][0][:2] == ["attribute", "AUC"]
+
+
+def test_a_function(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "audited_reader.py").write_text(READER)
+    for target in ("audited_reader:read", tmp_path / "audited_reader.py:read"):
+        found = called("audit", "reader", target, status=1)
+        assert "FOUND misread: */ttc holds column 12 of the labels: the LiDAR points in the box" in found.output
+    with pytest.raises(TypeError, match="wrong"):
+        called("audit", "reader", "audited_reader:wrong")
+    for target in ("audited_reader:no", "no_such_module:read", "nowhere"):
+        refused = CliRunner().invoke(deepaccident, ["audit", "reader", target])
+        assert (refused.exit_code, "module:function or file.py:function" in refused.output) == (2, True)
+
+
+def test_a_folder_that_was_written(tmp_path: Path) -> None:
+    release, out = tmp_path / "release", tmp_path / "out"
+    assert f"written: {release}" in called("audit", "reader", "--make", release).output
+    assert DeepAccident(dataroot=release, verbose=False).scenario[0]["num_frames"] == 2
+    space: dict[str, object] = {}
+    exec(READER, space)  # noqa: S102
+    out.mkdir()
+    (out / "rows.json").write_text(json.dumps(space["read"](release)))  # type: ignore[operator]
+    found = json.loads(called("audit", "reader", out, "--json", status=1).stdout)
+    assert [each["kind"] for each in found["findings"]] == ["misread"]
+    assert found["tables"]["keys"][2] == ["rows/*/x", "column 2 of the labels", "184 of 200", ""]

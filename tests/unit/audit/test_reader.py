@@ -1,0 +1,231 @@
+"""Every misreading that public parsers commit is named, and a right reader is not blamed."""
+
+import json
+import math
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.audit import AuditReport, audit_reader, write_audit_release
+from deepaccident_devkit.errors import ConfigError
+from deepaccident_devkit.release import world_from_label_velocity
+from deepaccident_devkit.taxonomy import BEV_CAMERA
+
+Row = list[str]
+Reader = Callable[[str], Any]
+
+
+def labels(root: str) -> Iterator[tuple[list[float], list[Row]]]:
+    """Line 1 and the words of the other lines of each label."""
+    for path in sorted(Path(root).glob("*/*/label/*/*.txt")):
+        first, *lines = path.read_text().splitlines()
+        yield [float(word) for word in first.split()], [line.split() for line in lines]
+
+
+def rows(root: str) -> list[Row]:
+    return [row for _, lines in labels(root) for row in lines]
+
+
+def of_rows(make: Callable[[Row], Any]) -> Reader:
+    return lambda root: {"objects": [make(row) for row in rows(root)]}
+
+
+def arrays_of_bev(root: str) -> list[np.ndarray]:
+    return [np.load(path)["data"] for path in sorted(Path(root).glob(f"*/*/{BEV_CAMERA}/*/*.npz"))]
+
+
+def misread(report: AuditReport) -> dict[str, str]:
+    """Key → what it holds, of keys that are misread."""
+    return {str(row[0]): str(row[1]) for row in report.tables["keys"] if row[3] == "misread"}
+
+
+def holds(report: AuditReport) -> dict[str, str]:
+    return {str(row[0]): str(row[1]) for row in report.tables["keys"][1:]}
+
+
+def test_points_as_a_countdown() -> None:
+    names = ("ttc", "time_to_collision", "countdown", "timeToCollision", "collision_time")
+    report = audit_reader(of_rows(lambda row: dict.fromkeys(names, float(row[11])) | {"cls": row[0]}))
+    assert misread(report) == {f"objects/*/{name}": "column 12 of the labels" for name in names}
+    assert report.findings[0].what == (
+        "objects/*/ttc holds column 12 of the labels: the LiDAR points in the box; you read it as `ttc`."
+    )
+
+
+def test_line_1_as_speed_and_yaw_rate_or_a_position() -> None:
+    names = [("speed", "yaw_rate"), ("velocity", "angularVelocity"), ("pos_x", "pos_y")]
+    columns = ["line 1 of the labels, number 1", "line 1 of the labels, number 2"]
+    wrong = {name: place for pair in names for place, name in enumerate(pair)}
+    report = audit_reader(
+        lambda root: [{"ego": {name: first[place] for name, place in wrong.items()}} for first, _ in labels(root)]
+    )
+    assert misread(report) == {f"*/ego/{name}": columns[place] for name, place in wrong.items()}
+    assert "own velocity along the world's x" in report.findings[0].what
+
+
+def test_line_1_as_a_position_in_a_list() -> None:
+    report = audit_reader(
+        lambda root: {f"{number:03d}": {"position": first} for number, (first, _) in enumerate(labels(root))}
+    )
+    assert list(misread(report)) == ["*/position/*[0]", "*/position/*[1]"]
+
+
+def test_sizes_in_another_order() -> None:
+    wrong = {"width": "column 5", "height": "column 6", "length": "column 7"}
+    report = audit_reader(of_rows(lambda row: dict(zip(wrong, map(float, row[4:7]), strict=True))))
+    assert misread(report) == {f"objects/*/{name}": f"{column} of the labels" for name, column in wrong.items()}
+    report = audit_reader(of_rows(lambda row: {"whl": list(map(float, row[4:7])), "lwh": list(map(float, row[4:7]))}))
+    assert list(misread(report)) == [f"objects/*/whl/*[{place}]" for place in range(3)]
+    assert "you read it as `w`" in report.findings[0].what
+    assert holds(report)["objects/*/lwh/*[2]"] == "column 7 of the labels"
+
+
+@pytest.mark.parametrize("own", [True, False])
+def test_visibility_as_a_collision(own: bool) -> None:
+    flags = {"collided": lambda word: word == "True", "crash": lambda word: int(word == "True"), "is_hit": str}
+    report = audit_reader(
+        lambda root: [
+            {name: flag(row[12]) for name, flag in flags.items()} for row in rows(root) if own or row[10] != "-100"
+        ]
+    )
+    assert misread(report) == {f"*/{name}": "column 13 of the labels" for name in flags}
+
+
+def test_the_number_of_frames_as_a_speed() -> None:
+    def read(root: str) -> Any:
+        lines = [path.read_text().splitlines()[0].split() for path in sorted(Path(root).glob("*/meta/*.txt"))]
+        return {"scenes": [{"speed": float(words[-1]), "num_frames": int(words[-1])} for words in lines]}
+
+    report = audit_reader(read)
+    assert misread(report) == {"scenes/*/speed": "line 1 of meta, word 9"}
+    assert holds(report)["scenes/*/num_frames"] == "line 1 of meta, word 9"
+
+
+def test_undecoded_velocities() -> None:
+    names = ("velocity", "velocity_ego", "vel")
+    report = audit_reader(
+        of_rows(
+            lambda row: {
+                **{name: [float(row[8]), -float(row[9])] for name in names},
+                "raw_velocity": float(row[8]),
+                "vx": row[8],
+                "speed_y": round(float(row[9]), 2),
+            }
+        )
+    )
+    columns = [f"column {number} of the labels" for number in (9, 10)]
+    both = {f"objects/*/{name}/*[{place}]": columns[place] for name in names for place in (0, 1)}
+    assert misread(report) == both | {"objects/*/vx": columns[0], "objects/*/speed_y": columns[1]}
+    assert holds(report)["objects/*/raw_velocity"] == columns[0]
+    assert "of no frame until it is decoded" in report.findings[0].what
+    assert "v_world = Rz(−yaw) · (vx, vy)" in report.findings[0].remedy
+
+
+def test_the_bev_array_as_a_picture(tmp_path: Path) -> None:
+    def saved(root: str) -> Any:
+        for number, array in enumerate(arrays_of_bev(root)[:2]):
+            cv2.imwrite(str(tmp_path / f"{number}.jpg"), array)
+        return {"images": [str(tmp_path / f"{number}.jpg") for number in range(2)], "image_height": 1200}
+
+    for read, number in ((saved, 2), (lambda root: {"rgb": arrays_of_bev(root)[0][..., ::-1]}, 1)):
+        report = audit_reader(read)
+        assert [(finding.kind, finding.number) for finding in report.findings] == [("picture", number)]
+    assert (
+        audit_reader(lambda root: {"bev": arrays_of_bev(root)[0], "image": np.zeros((90, 160, 3), np.uint8)}).findings
+        == ()
+    )
+    for path in tmp_path.glob("*.jpg"):  # smaller pictures, in a folder
+        cv2.imwrite(str(path), cv2.resize(cv2.imread(str(path)), (300, 300), interpolation=cv2.INTER_AREA))
+    (tmp_path / "torn.png").write_bytes(b"\x89PNG")
+    assert audit_reader(tmp_path).findings[0].examples == ("0.jpg", "1.jpg")
+
+
+def decoded(root: str) -> Any:
+    """A right reader of its own."""
+    for first, lines in labels(root):
+        numbers = np.array([[float(word) for word in row[1:12]] for row in lines])
+        velocity = world_from_label_velocity(numbers[:, 7:9], numbers[:, 6])
+        yield {
+            "agent_velocity": first,
+            "speed": float(np.hypot(*first)),
+            "boxes": numbers[:, :7].astype(np.float32),
+            "velocity": np.round(velocity, 3),
+            "track_id": [row[10] for row in lines],
+            "numPoints": [int(row[11]) for row in lines],
+            "visible": [row[12] == "True" for row in lines],
+            "names": [row[0] for row in lines],
+        }
+
+
+def tables(root: str) -> Any:
+    dataset = DeepAccident(dataroot=root, verbose=False)
+    return {name: getattr(dataset, name)[:] for name in dataset.table_names}
+
+
+def test_a_right_reader_is_not_blamed() -> None:
+    report = audit_reader(lambda root: [*decoded(root)])
+    assert report.findings == ()
+    found = holds(report)
+    assert [found[f"*/boxes/*/*[{place}]"] for place in range(7)] == [
+        f"column {2 + place} of the labels" for place in range(7)
+    ]
+    assert found["*/agent_velocity/*[1]"] == "line 1 of the labels, number 2"
+    assert {name: found[f"*/{name}/*"] for name in ("track_id", "numPoints", "visible")} == {
+        "track_id": "column 11 of the labels",
+        "numPoints": "column 12 of the labels",
+        "visible": "column 13 of the labels",
+    }
+    assert not [key for key in found if "/velocity" in key or "speed" in key]
+
+
+def test_the_devkit_itself_is_not_blamed() -> None:
+    report = audit_reader(tables)
+    assert report.findings == ()
+    found = holds(report)
+    assert found["annotation/*/velocity_label/*[0]"] == "column 9 of the labels"
+    assert found["annotation/*/num_lidar_pts"] == "column 12 of the labels"
+    assert found["annotation/*/camera_visible"] == "column 13 of the labels"
+    assert found["sample/*/velocity/*[0]"] == "line 1 of the labels, number 1"
+    assert not [key for key in found if key.startswith(("annotation/*/velocity/", "track/*/velocity", "calibrated"))]
+
+
+def test_each_column_has_numbers_of_its_own(tmp_path: Path) -> None:
+    root = str(write_audit_release(tmp_path / "release"))
+    own = [first for first, _ in labels(root)]
+    others = [row for row in rows(root) if row[10] != "-100"]
+    columns = [*map(list, zip(*own, strict=True)), *([float(row[place]) for row in others] for place in range(1, 12))]
+    near = [{round(abs(number) + step, 2) for number in column for step in (-0.01, 0, 0.01)} for column in columns]
+    assert sum(map(len, near)) == len(set.union(*near))
+    for place in (1, 2, 8, 9, 11):
+        assert len({row[place] for row in others}) == len(others)
+    with pytest.raises(ConfigError, match="release"):
+        write_audit_release(tmp_path / "release")
+
+
+def test_what_was_written_of_the_release(tmp_path: Path) -> None:
+    root, out = write_audit_release(tmp_path / "release"), tmp_path / "out"
+    (out / "deep").mkdir(parents=True)
+    (out / "deep" / "boxes.json").write_text(
+        json.dumps([{"ttc": row[11], "score": float("nan")} for row in rows(str(root))])
+    )
+    assert misread(audit_reader(out)) == {"boxes/*/ttc": "column 12 of the labels"}
+    (out / "boxes.json").write_text("{")
+    with pytest.raises(ConfigError, match=r"out: a JSON file is no JSON"):
+        audit_reader(out)
+
+
+def test_nothing_that_is_known() -> None:
+    mixed = {"ttc": [None, math.inf, "x"], "image": None, "photo": "none.jpg", "deep": [[[]]], 1: {2: 3}}
+    for output in (None, [], "text", mixed):
+        report = audit_reader(lambda _, output=output: output)
+        assert (report.findings, report.notes) == ((), ("No key holds numbers of the release.",))
+
+
+def test_errors_of_a_reader_are_its_own() -> None:
+    with pytest.raises(ZeroDivisionError):
+        audit_reader(lambda _: 1 / 0)
