@@ -24,7 +24,7 @@ from deepaccident_devkit.evaluation.runs import (
     default_selection,
     evaluate_results,
 )
-from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
+from deepaccident_devkit.evaluation.runs.setups import TASKS, EvaluationSetup
 from deepaccident_devkit.motion import MotionLabelConfig
 
 BREAKDOWNS = ("all", "time_to_impact", "accident_visibility", "agent", "scenario_type")
@@ -43,6 +43,8 @@ def evaluation_run(
 ) -> EvaluationRun:
     """A run of predictions that are mostly right, for the same tokens always the same ones."""
     evaluator = setup.evaluator()
+    if setup.task in ("planning", "forecasting"):  # they look further ahead
+        tokens = default_selection(setup, "train").tokens(dataset)[::3]
     for number, token in enumerate(tokens):
         evaluator.update(token, *_arguments(dataset, setup, token, np.random.default_rng(number)))
     attributes = sample_attributes(dataset, tokens)
@@ -65,6 +67,12 @@ def evaluation_run(
 def _arguments(
     dataset: DeepAccident, setup: EvaluationSetup, token: str, source: np.random.Generator
 ) -> tuple[Any, ...]:
+    if setup.task in ("planning", "forecasting"):
+        from deepaccident_devkit.baselines import predict_forecasts, predict_plan  # a room, which may be missing
+
+        planned = setup.task == "planning"
+        predicted = [predict_plan(dataset, token)] if planned else predict_forecasts(dataset, token)
+        return predicted, *TASKS[setup.task].truth(dataset, token, setup.rules, None, setup.horizon)
     if setup.task == "detection":
         truth = detection_truth(dataset, token, setup.rules)
         keep = source.uniform(size=len(truth)) < 0.8
@@ -95,7 +103,7 @@ def _alarms(truth: BoxTruth | None, source: np.random.Generator) -> list[Acciden
 def stored_run(dataset: DeepAccident, setup: EvaluationSetup, path: Path) -> tuple[EvaluationRun, Results]:
     """The same predictions, written as results and evaluated from there."""
     selection = default_selection(setup, "train")
-    kind: ResultsTask = "detection" if setup.task == "detection" else "motion" if setup.task == "motion" else "accident"
+    kind: ResultsTask = "accident" if setup.task == "warning" else setup.task
     grid = MotionLabelConfig().grid if kind == "motion" else None
     with ResultsWriter(path, kind, meta=META, grid=grid) as writer:
         for number, token in enumerate(selection.tokens(dataset)):

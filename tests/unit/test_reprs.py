@@ -118,6 +118,7 @@ OWN = {
 CHOICES = (
     "Config", "Protocol", "Spec", "Quirks", "Reading", "Warnings", "Selection", "Resampling", "PostProcessing", "View",
     "Accidents", "Link", "PoseNoise", "Augmentation", "BevGrid", "Baseline", "Release", "Form",
+    "Rules",
 )  # fmt: skip
 """Endings of the names of classes that are choices: their text has every field, as one would type it."""
 

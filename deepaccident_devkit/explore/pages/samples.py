@@ -397,7 +397,7 @@ def sample_context(explorer: Explorer, model: Model, token: str) -> dict[str, An
         "number": "" if score is None or score.value is None else f"{name} {score.text}",
         "why_not": why_not(explorer, model, token),
         "rules": rules_words(model),
-        "tall": round(80 * SIZES[_task(model)][1]),
+        "tall": round(80 * SIZES.get(_task(model), (0.0, 0.0))[1]),
         "remedy": _remedy(model),
     }
 

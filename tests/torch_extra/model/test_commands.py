@@ -60,6 +60,7 @@ def test_one_set_of_weights_predicts_for_any_agents(
         "motion": ("motion", "--switch", "labels=clean"),
         "accident": ("accident.json", "--protocol", "boxes"),
         "detection": ("detection.json",),
+        "forecasting": ("forecasting.json", "--samples", "evaluate"),
     }
     for task, (name, *protocol) in tasks.items():
         found, judged = read_results(out / name), ("--split", split, "--scope", "all", "--json", *protocol)

@@ -27,6 +27,7 @@ from deepaccident_devkit.evaluation import (
     detection_truth,
     read_results,
 )
+from deepaccident_devkit.evaluation.forecasting import forecasting_truth
 from deepaccident_devkit.evaluation.motion import MOTION_PROTOCOLS
 from deepaccident_devkit.export.torch import V2XConfig, V2XDataset
 from deepaccident_devkit.model.detection import detection_targets
@@ -41,6 +42,7 @@ from deepaccident_devkit.model.results import (
     predictions,
 )
 from deepaccident_devkit.motion import MotionHeads, motion_labels
+from deepaccident_devkit.taxonomy import FRAME_PERIOD
 from deepaccident_devkit.v2x import Link
 
 Seeded = Callable[..., V2XFormer]
@@ -157,6 +159,7 @@ def test_results_are_written_and_read(
     model: V2XFormer, da: DeepAccident, tokens: list[str], found: list[SamplePrediction], tmp_path: Path
 ) -> None:
     paths = predict_results(model, da, tokens, tmp_path / "results")
+    assert [*paths] == ["motion", "accident", "detection", "forecasting"]
     for task, path in paths.items():
         results = read_results(path)
         assert (results.task, set(results.tokens), results.meta["agents"]) == (task, set(tokens), "all")
@@ -253,8 +256,9 @@ class TestPerfectMaps:
         np.testing.assert_allclose(*rows, atol=2e-3, rtol=0)
 
     def test_motion_maps_score_as_their_labels(
-        self, perfect: V2XFormer, da: DeepAccident, moment: list[str], monkeypatch: pytest.MonkeyPatch
+        self, perfect: V2XFormer, da: DeepAccident, moment: list[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
     ) -> None:
+        """And their instances go where the actors go that they are."""
         token, evaluator = moment[0], motion_evaluator(perfect)
         label = motion_labels(da, token, perfect.config.labels).to_present("bilinear")
         heads = MotionHeads.from_labels(label)
@@ -266,6 +270,18 @@ class TestPerfectMaps:
         evaluator.update(token, predict(perfect, da, [token])[0].motion, label)
         scores = evaluator.compute().ranges["100x100"]
         assert (scores.iou, scores.pq > 90) == (pytest.approx(100), True)
+        path = predict_results(perfect, da, [token], tmp_path)["forecasting"]
+        forecasts: Any = {each.actor_id: each for each in read_results(path).prediction(token)}  # type: ignore[union-attr]
+        truth, labels = forecasting_truth(da, token, 0.5), perfect.config.labels
+        steps = np.array([labels.step * FRAME_PERIOD])
+        far = [
+            np.linalg.norm(forecasts[actor].at(steps, here)[0, 0] - there)
+            for actor, here, there in zip(
+                truth.actor_id.tolist(), truth.present, truth.path[:, labels.step - 1], strict=True
+            )
+            if actor in forecasts and np.abs(here).max() < 35  # instances are cut at the maps' edges
+        ]
+        assert (len(far) > 3, max(far) < labels.grid.x[2]) == (True, True)  # a cell
 
 
 def told(change: Callable[[Any], Any]) -> Callable[..., Any]:

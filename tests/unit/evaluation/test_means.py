@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
@@ -130,8 +131,8 @@ def test_a_cluster_without_a_number_does_not_change_it() -> None:
     assert any("fewer than 6 clusters" in note and "means/late/all/far" in note for note in found.notes)
 
 
-def test_notes_count_over_the_samples() -> None:
-    evaluator = LengthsEvaluator()
+def test_notes_count_over_the_samples(tmp_path: Path) -> None:
+    evaluator = LengthsEvaluator("other")
     for number in range(3):
         sums = Sums()
         sums.note("{} are left out", 500 * number)
@@ -139,6 +140,7 @@ def test_notes_count_over_the_samples() -> None:
     result = evaluator.compute()
     assert (result.notes, result.samples, result.means) == (("1,500 are left out",), 3, {})
     assert evaluator.compute([]).samples == 0
+    assert LengthsEvaluator("other").resume(evaluator.save(tmp_path / "kept")).compute() == result
 
 
 @pytest.mark.parametrize("kind", [PlanningEvaluator, ForecastingEvaluator], ids=["planning", "forecasting"])

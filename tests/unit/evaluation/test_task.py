@@ -30,7 +30,14 @@ every_protocol = pytest.mark.parametrize(
 
 @pytest.mark.parametrize(
     ("task", "protocol"),
-    [("motion", "released"), ("accident", "boxes"), ("detection", "paper"), ("warning", "clean")],
+    [
+        ("motion", "released"),
+        ("accident", "boxes"),
+        ("detection", "paper"),
+        ("warning", "clean"),
+        ("planning", "clean"),
+        ("forecasting", "clean"),
+    ],
 )
 def test_read_truth_counts_result_summary(
     task: TaskName, protocol: str, da_motion: DeepAccident, tmp_path: Path

@@ -1,7 +1,9 @@
 """`ForecastingEvaluator`, on actors whose errors are known."""
 
+import json
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -158,6 +160,13 @@ def test_headlines_are_those_of_three_seconds() -> None:
         (f"min_ade {MAIN}", pytest.approx(1.55), "m"),
     ]
     assert {each.higher_is_better for each in headlines("forecasting", result)} == {False}
+
+
+def test_a_saved_evaluator_goes_on(tmp_path: Path) -> None:
+    evaluator = ForecastingEvaluator()
+    evaluator.update("a/b/ego_vehicle/001", [forecast(1, [3.0])], truth_of(5))
+    assert ForecastingEvaluator().resume(evaluator.save(tmp_path / "kept")).compute() == evaluator.compute()
+    assert json.loads(json.dumps(evaluator.settings)) == evaluator.settings
 
 
 def test_what_cannot_be_evaluated() -> None:

@@ -36,8 +36,13 @@ def refused(path: Path, *words: str) -> None:
 
 
 def with_entry(kind: str, **changes: Any) -> Document:
-    """Accidents or boxes whose second entry of the first sample is another; `...` takes the field away."""
-    told = plain.accidents() if kind == "accident" else plain.detections()
+    """Results whose second entry of the first sample is another; `...` takes the field away."""
+    told = {
+        "accident": plain.accidents,
+        "detection": plain.detections,
+        "planning": plain.plans,
+        "forecasting": plain.forecasts,
+    }[kind]()
     entry = {**told["results"][FIRST][1], **changes}
     told["results"][FIRST][1] = {name: value for name, value in entry.items() if value is not ...}
     return told
@@ -183,6 +188,31 @@ BOXES: dict[str, tuple[dict[str, Any], str]] = {
 def test_boxes(tmp_path: Path, kind: str) -> None:
     changes, words = BOXES[kind]
     path = plain.write_json(tmp_path / "detection.json", with_entry("detection", **changes))
+    refused(path, f"results of '{FIRST}': [1]{words}", "schema/results/README.md")
+
+
+PATHS: dict[str, tuple[str, dict[str, Any], str]] = {
+    "times that go back": ("planning", {"times": [1.0, 0.5]}, ": times: expected ascending seconds after the present"),
+    "a time before the present": ("planning", {"times": [-1, 0.5]}, ".times[0]: expected `float` >= 0.0"),
+    "fewer places than times": ("planning", {"path": [[1, 2]]}, ": path: "),
+    "no place": ("planning", {"times": [], "path": []}, ".times: expected `array` of length >= 1"),
+    "more headings than times": ("planning", {"yaw": [0, 0, 0]}, ": yaw: "),
+    "no score": ("planning", {"score": ...}, ": object missing required field `score`"),
+    "a place in space": ("planning", {"path": [[1, 2, 3], [1, 2, 3]]}, ".path[0]: expected `array` of length 2"),
+    "an actor twice": ("forecasting", {"id": 1236}, ".id: actor 1236 comes twice"),
+    "an actor's name": ("forecasting", {"id": "1240"}, ".id: expected `int`"),
+    "a mode of another length": ("forecasting", {"paths": [[[1, 2]], [[1, 2], [3, 4]]]}, ": paths: "),
+    "fewer probabilities": ("forecasting", {"probabilities": [1]}, ": paths: "),
+    "a probability above 1": ("forecasting", {"probabilities": [1.5, 0]}, ".probabilities[0]: expected `float` <= 1.0"),
+    "no mode": ("forecasting", {"paths": [], "probabilities": []}, ".paths: expected `array` of length >= 1"),
+    "an unknown field": ("forecasting", {"score": 1}, ": object contains unknown field `score`"),
+}
+
+
+@pytest.mark.parametrize("kind", PATHS)
+def test_paths(tmp_path: Path, kind: str) -> None:
+    task, changes, words = PATHS[kind]
+    path = plain.write_json(tmp_path / f"{task}.json", with_entry(task, **changes))
     refused(path, f"results of '{FIRST}': [1]{words}", "schema/results/README.md")
 
 

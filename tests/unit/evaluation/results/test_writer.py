@@ -18,6 +18,8 @@ from refusals import assert_refused
 
 from deepaccident_devkit.errors import ChoiceError, ResultsError, TokenError
 from deepaccident_devkit.evaluation import Accident, DetectedBoxes, instances_of
+from deepaccident_devkit.evaluation.forecasting import Forecast
+from deepaccident_devkit.evaluation.planning import Plan
 from deepaccident_devkit.evaluation.results import Results, ResultsWriter, read_results, reader
 from deepaccident_devkit.evaluation.results.writer import detection_entries
 from deepaccident_devkit.geometry import BevGrid
@@ -30,6 +32,10 @@ PREDICTIONS: dict[str, Callable[[], Any]] = {
     "motion": lambda: instances_of(plain.instance_arrays()["instance"], GRID),
     "accident": lambda: [Accident(positions=np.ones((2, 2)), time=0.5)],
     "detection": lambda: DetectedBoxes.from_arrays(np.ones((2, 3)), np.ones((2, 3)), [0, 1], [0.5, 1], frame="world"),
+    "planning": lambda: [Plan(times=[1.0], path=[(5.0, 0.5)]), Plan(times=[0.5], path=[(3, 0)], yaw=[0.1])],
+    "forecasting": lambda: [
+        Forecast(actor_id=actor, times=[0.5], paths=[[(actor, 1.5)]], probabilities=[0.25]) for actor in (7, 8)
+    ],
 }
 
 
@@ -146,6 +152,15 @@ class TestWriter:
                 ([], "expected DetectedBoxes, found list; make them with DetectedBoxes.from_arrays("),
                 (lidar, "expected boxes in the world frame, found lidar; give detected.transform(dataset."),
             ],
+            "planning": [
+                ([1], "expected a list of Plans, found int in it"),
+                (PREDICTIONS["forecasting"](), "expected a list of Plans, found Forecast in it"),
+                ([Plan(times=[1.0], path=[(1e7, 0)])], "[0].path[0][0]: expected `float` <="),
+            ],
+            "forecasting": [
+                (PREDICTIONS["planning"](), "expected a list of Forecasts, found Plan in it"),
+                (3, "expected a list of Forecasts, found int in it"),
+            ],
         }
         with ResultsWriter(tmp_path / "x", task) as writer:
             assert_refused(
@@ -189,6 +204,15 @@ def test_what_a_writer_refuses_at_once(tmp_path: Path, options: dict[str, Any], 
     assert_refused(
         (lambda: ResultsWriter(tmp_path / "x", "motion", **options), ResultsError, words),
     )
+
+
+def test_plans_and_forecasts_are_read_as_they_were_written(tmp_path: Path) -> None:
+    for task in ("planning", "forecasting"):
+        found: Any = write(tmp_path / task, task).prediction(SECOND)
+        given = PREDICTIONS[task]()
+        assert [type(each) for each in found] == [type(each) for each in given]
+        for one, other in zip(found, given, strict=True):
+            assert pickle.dumps(one) == pickle.dumps(other)
 
 
 def test_tasks_without_results(tmp_path: Path) -> None:

@@ -137,8 +137,9 @@ def site(da_motion: DeepAccident, tmp_path_factory: pytest.TempPathFactory) -> I
     )
     shutil.copytree(folder / "second", folder / HOSTILE)
     edit_summary(folder / HOSTILE, make_hostile)
-    for task in ("motion", "detection", "warning"):
-        setup = EvaluationSetup(task=task, protocol="clean" if task == "warning" else "released")
+    for task in ("motion", "detection", "warning", "forecasting"):
+        clean = task in ("warning", "forecasting")
+        setup = EvaluationSetup(task=task, protocol="clean" if clean else "released")
         runs[task], _ = stored_run(da, setup, folder / ("maps" if task == "motion" else f"{task}.json"))
         save_run(runs[task], folder / task, include_results=True)
     alone = written(folder / "alone.json", ELSEWHERE, tokens)
@@ -190,7 +191,7 @@ def main_number(run: EvaluationRun, token: str) -> float | None:
     return value if not np.isnan(value) else 0.0 if false else None
 
 
-@pytest.mark.parametrize("name", ["first", "motion", "detection", "warning"])
+@pytest.mark.parametrize("name", ["first", "motion", "detection", "warning", "forecasting"])
 def test_each_bar_leads_to_the_samples_of_its_group(site: Site, name: str) -> None:
     run, address = site.runs[name], of("model", name)
     links = [each for each in hrefs(site.page(address)) if each.startswith("samples?by=")]
@@ -268,7 +269,7 @@ def test_other_verdicts_are_those_of_the_evaluator(site: Site) -> None:
     assert "involvement " in verdict("warning", site.rows("warning")[a_sample(site, "warning")])
 
 
-@pytest.mark.parametrize("task", ["accident", "motion", "detection", "warning"])
+@pytest.mark.parametrize("task", ["accident", "motion", "detection", "warning", "planning", "forecasting"])
 def test_verdicts_of_a_strange_row_are_no_error(task: str) -> None:
     row = {"tp_5m": "<b>", "tp_..m": 1, "pq_1x1": "x", "pq_..x.": None, "iou_1x1": True, "truths": 1e400, "tp_.": [1]}
     for whole in (False, True):
@@ -284,6 +285,18 @@ def test_a_sample_shows_the_prediction_from_above_and_in_cameras(site: Site, nam
     answers = [site.get(urljoin(address, each)) for each in images(site.page(address))]
     told = [(each.status, each.headers["content-type"], each.body[:4]) for each in answers]
     assert told == [(200, "image/png", b"\x89PNG")] * 2
+
+
+def test_paths_of_actors_are_listed_by_their_errors_without_pictures(site: Site) -> None:
+    tokens = site.samples(of("model", "forecasting", "samples"))
+    errors = [site.rows("forecasting")[token]["min_fde 3 s, K = 6"] for token in tokens]
+    known = [each for each in errors if each is not None]
+    assert (sorted(tokens), errors[: len(known)]) == (sorted(site.rows("forecasting")), sorted(known, reverse=True))
+    assert known[0] > known[-1]
+    page = site.page(of("model", "forecasting", "sample", sample_path(tokens[0])))
+    assert ("There are no pictures of forecasting." in page, images(page)) == (True, [])
+    scenario = tokens[0].rsplit("/", 2)[0]
+    assert site.get(f"/scenario/{scenario}/?model=forecasting").status == 200
 
 
 def test_motion_is_shown_frame_by_frame(site: Site) -> None:

@@ -22,7 +22,7 @@ from deepaccident_devkit.errors import ConfigError, OutputFolderError
 from deepaccident_devkit.evaluation import instances_of
 from deepaccident_devkit.evaluation.results import ResultsWriter, read_results
 from deepaccident_devkit.evaluation.runs import default_selection, evaluate_results
-from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
+from deepaccident_devkit.evaluation.runs.setups import TASKS, EvaluationSetup
 from deepaccident_devkit.evaluation.task import headlines
 from deepaccident_devkit.motion import MotionLabelConfig
 from deepaccident_devkit.render.captions import moment_words, scene_words
@@ -40,6 +40,8 @@ SETUPS = (
     EvaluationSetup(task="detection"),
     EvaluationSetup(task="warning", protocol="clean"),
     EvaluationSetup(task="warning", protocol="clean"),
+    EvaluationSetup(task="planning", protocol="vad"),
+    EvaluationSetup(task="forecasting", protocol="clean"),
 )
 
 
@@ -60,7 +62,7 @@ def test_a_report_holds_all_and_asks_for_nothing(
     page = page_of(save_report(run, tmp_path))
     figures = sorted((tmp_path / "figures").iterdir())
     assert [path.stem for path in figures] == sorted(each.name for each in run_figures(run))
-    assert len(page.all("img")) == len(figures) >= (1 if setup.protocol == "clean" else 4)
+    assert len(page.all("img")) == len(figures) >= (1 if TASKS[setup.task].whole_recordings else 4)
     assert {str(image["src"])[:22] for image in page.all("img")} == {"data:image/png;base64,"}
     assert min(len(str(image["alt"])) for image in page.all("img")) > 10
     assert not holding([name for name, _ in page.found], "script", "link", "iframe", "object", "form")
@@ -71,7 +73,7 @@ def test_a_report_holds_all_and_asks_for_nothing(
     told = (run.release.fingerprint, run.results.fingerprint, setup.protocol, "deepaccident evaluate verify")
     clusters = "no intervals: of 1 cluster (an accident and its twin are one); at least 6 are needed"
     assert not lacking(page.text, clusters, *told, *numbers, *switches)
-    clean = ["TTC < 3 s, seen"] if setup.protocol == "clean" else []
+    clean = ["TTC < 3 s, seen"] if setup.task == "warning" else []
     assert holding(page.text, "PARTIAL", "TTC < 3 s, seen") == clean
 
 
@@ -170,13 +172,13 @@ def test_none_is_the_worst_where_all_are_alike(da_motion: DeepAccident, tmp_path
     assert [each.name for each in sample_figures(run, da_motion, results)] == [f"sample_best_{n}" for n in (1, 2, 3)]
 
 
-@pytest.mark.parametrize("task", ["motion", "accident", "detection", "warning"])
+@pytest.mark.parametrize("task", ["motion", "accident", "detection", "warning", "forecasting"])
 def test_samples_of_stored_results_are_ranked_and_drawn(task: Any, da_motion: DeepAccident, tmp_path: Path) -> None:
-    protocol = {"accident": "boxes", "warning": "clean"}.get(task, "released")
+    protocol = {"accident": "boxes", "warning": "clean", "forecasting": "clean"}.get(task, "released")
     run, results = stored_run(da_motion, EvaluationSetup(task=task, protocol=protocol), tmp_path / "results")
     figures = sample_figures(run, da_motion, results)
     ranked = [f"sample_{kind}_{number}" for kind in ("worst", "best") for number in (1, 2, 3)]
-    assert [each.name for each in figures] == ([] if task == "warning" else ranked)
+    assert [each.name for each in figures] == ([] if protocol == "clean" else ranked)
     values = [float(re.findall(r"\d+\.\d+", each.caption.rsplit(",", 1)[1])[-1]) for each in figures]
     assert values == sorted(values[:3]) + sorted(values[3:], reverse=True)
     assert max(values[:3], default=0) <= min(values[3:], default=0)
