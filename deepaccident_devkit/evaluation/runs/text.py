@@ -86,10 +86,11 @@ def _head(summary: Json) -> str:
     agents = "all agents" if summary["agents"] is None else ", ".join(summary["agents"])
     release, results, counts = summary["release"], summary["results"], summary["counts"]
     others = f"; {counts['left_out']} predictions of other samples left out" if counts.get("left_out") else ""
+    horizon = f", horizon {summary['horizon']:g} s" if "means" not in summary["metrics"] else ""
     lines = {
         "task": f"{summary['task']}, protocol {summary['protocol']}{f' with {switches}' if switches else ''}",
         "samples": f"{counts['samples']} of {counts['scenarios']} scenarios: split {summary['split']}, list "
-        f"{summary['samples']}, scope {summary['scope']}, {agents}, horizon {summary['horizon']:g} s",
+        f"{summary['samples']}, scope {summary['scope']}, {agents}{horizon}",
         "predictions": f"{results['path']} ({results['fingerprint']}){others}",
         **({"bytes": sent.text()} if (sent := sent_bytes(summary)) else {}),
         "release": f"{release['dataroot']} ({release['version']}, {release['fingerprint']})",
