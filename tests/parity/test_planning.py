@@ -148,3 +148,14 @@ def test_contacts_are_those_of_closed_forms(golden) -> None:
     assert ids[first] == told["contact"]
     numbers = [times[first], found.speed[first], found.relative_speed[first]]
     assert_allclose(numbers, [told[name] for name in ("t", "ego_speed", "relative_speed")], atol=1e-6)
+
+
+def test_the_definitions_disagree_as_the_page_says(folder: Path) -> None:
+    """Sample 35, of docs/protocols.md: one plan that drives through a car at 2.5 s."""
+    found = {protocol: numbers_of(folder, protocol)[2][35] for protocol in PUBLIC}
+    collisions = {protocol: (100 * each["collision"]).tolist() for protocol, each in found.items()}
+    sixth = pytest.approx(100 / 6)
+    assert collisions == {"uniad": [0] * 3, "stp3": [0, 0, sixth], "vad": [0, 0, sixth], "bev_planner": [0, 0, 100]}
+    assert_allclose(found["uniad"]["l2"], [0.78, 2.28, 5.16], atol=0.005)
+    for protocol in PUBLIC[1:]:
+        assert_allclose(found[protocol]["l2"], [0.55, 1.15, 2.23], atol=0.005)
