@@ -4,7 +4,7 @@ import sys
 from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import click
 
@@ -12,7 +12,7 @@ from deepaccident_devkit.audit.reader import audit_reader, write_audit_release
 from deepaccident_devkit.audit.report import AuditReport
 from deepaccident_devkit.audit.scores import audit_scores, read_scores
 from deepaccident_devkit.audit.splits import audit_splits
-from deepaccident_devkit.cli.options import PATH, json_parameter, reader_parameters
+from deepaccident_devkit.cli.options import PATH, json_parameter, reader_parameters, refuse_unused
 from deepaccident_devkit.cli.verbs import Verb
 from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.support.text import path_of
@@ -61,6 +61,7 @@ def reader(target: str, make: bool, as_json: bool) -> None:
     Exit status 1: something was misread.
     """
     if make:
+        refuse_unused("with --make", "as_json")
         path = write_audit_release(path_of(target))
         click.echo(f"written: {path}; let your reader write JSON of it, and give that folder in its place")
     else:
@@ -77,8 +78,7 @@ def _function(target: str) -> Callable[[str], object]:
     place, _, name = target.rpartition(":")
     sys.path.insert(0, str(Path(place).parent))  # of a module: here
     try:
-        function: Callable[[str], object] = getattr(import_module(Path(place).name.removesuffix(".py")), name)
+        return cast("Callable[[str], object]", getattr(import_module(Path(place).name.removesuffix(".py")), name))
     except (ImportError, AttributeError, ValueError) as error:
         expected = "expected a folder, module:function or file.py:function"
         raise click.UsageError(f"TARGET: {expected}, found {target!r} ({error})") from error
-    return function

@@ -85,17 +85,19 @@ def write_audit_release(out: Path) -> Path:
             labels = read_label(path, raw=True)
             place, own = np.arange(len(labels)), labels.actor_id[:, None] == OWN_ACTOR_ID
             line, rows = (start + step * (each + 10 * number)[:, None] for each in (place[:1], place))
-            numbered = replace(
-                labels,
-                agent_velocity=line[:, :2],
-                center=rows[:, 2:5],
-                size=rows[:, 5:8],
-                yaw=np.where(own, 0, rows[:, 8:9])[:, 0],
-                velocity=np.where(own, line[:, :2], rows[:, 9:11]),  # as in the release
-                num_lidar_pts=rows[:, 12].astype(int),
-                camera_visible=(place > 0) & (place < 8),
+            write_label(
+                path,
+                replace(
+                    labels,
+                    agent_velocity=line[:, :2],
+                    center=rows[:, 2:5],
+                    size=rows[:, 5:8],
+                    yaw=np.where(own, 0, rows[:, 8:9])[:, 0],
+                    velocity=np.where(own, line[:, :2], rows[:, 9:11]),  # as in the release
+                    num_lidar_pts=rows[:, 12].astype(int),
+                    camera_visible=(place > 0) & (place < 8),  # seven of ten, in a vehicle's the own one first
+                ),
             )
-            write_label(path, numbered)
             write_npz(Path(str(path).replace("label", BEV_CAMERA)).with_suffix(".npz"), _bev())
     return out
 
@@ -128,17 +130,18 @@ def audit_reader(reader: Callable[[str], object] | str | os.PathLike[str]) -> Au
             key = "/".join("*" if isinstance(each, int) else each for each in path).lstrip("/")
             held[key].append(leaf)
             held[f"{key}[{path[-1]}]"].append(leaf)  # a place of a list, such as [x, y, z]
-        named: dict[str, Any] = {str(path.relative_to(folder)): path for path in sorted(folder.rglob("*"))}
-        for key in [key for key in held if "[" not in key]:
-            named |= {
-                each if isinstance(each, str) else key: each for each in held[key] if isinstance(each, str | np.ndarray)
-            }
+        named: dict[str, Any] = {str(path.relative_to(folder)): path for path in sorted(folder.rglob("*"))} | {
+            each if isinstance(each, str) else key: each
+            for key in held
+            for each in held[key]
+            if "[" not in key and isinstance(each, str | np.ndarray)
+        }
         pictures = [name for name, each in named.items() if re.search(_PICTURE, name) and _is_bev(each)]
         labels = read_labels(sorted(release.glob("*/*/label/*/*.txt")), raw=True)
     boxes = [labels.center, labels.size, labels.yaw, labels.velocity, labels.actor_id, labels.num_lidar_pts]
     others = np.column_stack(boxes)[labels.actor_id != OWN_ACTOR_ID].T  # the own velocity is that of line 1
-    numbers = zip(_COLUMNS, [*labels.agent_velocity.T, *others, np.full(1, math.inf), np.full(1, 12.0)], strict=True)
-    columns = {place: np.abs(each) for place, each in numbers}
+    numbers = [*labels.agent_velocity.T, *others, np.full(1, math.inf), np.full(1, 12.0)]
+    columns = {place: np.abs(each) for place, each in zip(_COLUMNS, numbers, strict=True)}
     rows: dict[str, Row] = {}
     found = [("picture", "the BEV camera's array became an RGB picture: its channels are ids and classes", pictures)]
     for key, values in held.items():

@@ -45,6 +45,7 @@ of ranks within the collisions and within the others, where no attribute can sta
 collisions alone).""",
     f"From, to: 95 % of {RESAMPLES} resamples of scenarios, twins together; −1 to 1 for fewer than {LEAST_CLUSTERS}.",
 )
+_HEADING: Final = ("attribute", "AUC", "with the scores", "from", "to", "among alike", "from", "to")
 _REMEDY: Final = "give results of the task accident, a JSON object of token and score, or lines `token,score` in a .csv"
 
 
@@ -138,10 +139,9 @@ def audit_scores(
             )
             remedy = "Cut all clips alike, or compare moments of equal time to the end: deepaccident evaluate warning."
             findings.append(AuditFinding(kind=name, what=what, remedy=remedy, number=len(records)))
-    heading = ("attribute", "AUC", "with the scores", "from", "to", "among alike", "from", "to")
     return AuditReport(
         findings=tuple(findings),
-        tables={"scores": [heading, ("the scores", own, *[None] * 6), *told]},
+        tables={"scores": [_HEADING, ("the scores", own, *[None] * 6), *told]},
         notes=(f"{counted(len(truth), 'scenario')} with meta and a score, {truth.sum()} with a collision.", *_NOTES),
     )
 
