@@ -39,10 +39,10 @@ def test_scores(da_b: DeepAccident, tmp_path: Path) -> None:
     path = tmp_path / "scores.csv"
     lines = [f"{each['token']},{int(each['collision'] is not None)}" for each in da_b.scenario]
     path.write_text("\n".join(["token,score", *lines]))
-    told = called("audit", "scores", da_b.dataroot, "--results", path).output
+    told = called("audit", "scores", da_b.dataroot, path).output
     assert "6 scenarios with meta and a score" in told
     assert "the scores 1.0" in " ".join(told.split())
-    train = called("audit", "scores", da_b.dataroot, "--results", path, "--split", "train", "--json").stdout
+    train = called("audit", "scores", da_b.dataroot, path, "--split", "train", "--json").stdout
     assert json.loads(train)["tables"]["scores"][0][:2] == ["attribute", "AUC"]
 
 
@@ -62,7 +62,7 @@ def test_a_function(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_a_folder_that_was_written(tmp_path: Path) -> None:
     release, out = tmp_path / "release", tmp_path / "out"
-    assert f"written: {release}" in called("audit", "reader", "--make", release).output
+    assert f"written: {release}" in called("audit", "release", release).output
     assert DeepAccident(dataroot=release, verbose=False).scenario[0]["num_frames"] == 2
     space: dict[str, object] = {}
     exec(READER, space)  # noqa: S102

@@ -4,71 +4,67 @@ import sys
 from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, Final, cast
 
 import click
 
 from deepaccident_devkit.audit.reader import audit_reader, write_audit_release
-from deepaccident_devkit.audit.report import AuditReport
 from deepaccident_devkit.audit.scores import audit_scores, read_scores
 from deepaccident_devkit.audit.splits import audit_splits
-from deepaccident_devkit.cli.options import PATH, json_parameter, reader_parameters, refuse_unused
-from deepaccident_devkit.cli.verbs import Verb
+from deepaccident_devkit.cli.options import (
+    index_dir_parameter,
+    json_parameter,
+    on_error_parameter,
+    refuse_unused,
+    version_parameter,
+)
+from deepaccident_devkit.cli.verbs import WordChoice, verb
 from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.support.text import path_of
 
-
-@click.group()
-def audit() -> None:
-    """Find splits that leak, scores that go by something else, and columns that were misread."""
+_TOPICS: Final = {"splits": (2, None), "scores": (2, 2), "reader": (1, 1), "release": (1, 1)}
+"""Topic → how many things it is about, at least and at most."""
 
 
-@audit.command(cls=Verb, short_help="Find what stands on two sides of a split.")
-@click.argument("files", nargs=-1, required=True, type=PATH)
+@verb()
+@click.argument("topic", metavar="TOPIC", type=WordChoice(_TOPICS))
+@click.argument("targets", nargs=-1, required=True)
+@version_parameter
+@click.option("--split", help="Of scores: only this split: train, val, test, …, or a split file (.txt).")
+@index_dir_parameter
+@on_error_parameter
 @json_parameter
-def splits(files: tuple[Path, ...], as_json: bool) -> None:
-    """Find frames, recordings or twins on two sides of a split, and the mini release beside the full one.
+def audit(topic: str, targets: tuple[str, ...], split: str | None, as_json: bool, **release: Any) -> None:
+    """Find splits that leak, scores that go by something else, and columns that were misread.
 
-    Each of the FILES is a side. A line names a scenario, a sample or frame by its token, or any file of a release.
+    \b
+    splits FILES…        What stands on two sides, each file a side: frames, recordings, twins, mini beside full.
+    scores DATAROOT FILE What scores of accidents go by: length of the clip, folder, name, town, weather, actors.
+    reader TARGET        What a reader takes for something else. TARGET is a Python function, module:function or
+                         file.py:function, that is given a dataroot and returns what it read, and is run; or a folder
+                         with the JSON and pictures that your reader wrote of the release that `audit release` writes.
+    release OUT          Write that release into the new folder OUT.
+
+    FILE has results of the task accident, JSON of token and score, or CSV of token,score. A line of FILES names a
+    scenario, a sample or frame by its token, or any file of a release. docs/validation.md explains what is found.
     Exit status 1: something was found.
-    """
-    _tell(audit_splits(files), as_json=as_json)
-
-
-@audit.command(cls=Verb, short_help="Find what scores of accidents go by.")
-@reader_parameters
-@click.option("--results", required=True, type=PATH, help="Accidents, JSON of token and score, or CSV of token,score.")
-@click.option("--split", help="Only this split: train, val, test, …, or a split file (.txt).  [default: all]")
-@json_parameter
-def scores(results: Path, split: str | None, as_json: bool, **release: Any) -> None:
-    """Compare scores of accidents with how long a clip is, its folder, name, town, weather, actors and frames.
-
-    The score of a sample or of a scenario is the higher, the surer an accident. Exit status 1: the scores are those of
-    a detector of something else, such as short clips.
-    """
-    _tell(audit_scores(DeepAccident(**release), read_scores(results), split), as_json=as_json)
-
-
-@audit.command(cls=Verb, short_help="Find columns that a reader takes for something else.")
-@click.argument("target")
-@click.option("--make", is_flag=True, help="Write the release that is to be read into a new folder TARGET.")
-@json_parameter
-def reader(target: str, make: bool, as_json: bool) -> None:
-    """Say which column of the files each key of a reader's output holds, and which were read as something else.
-
-    TARGET is a Python function, module:function or file.py:function, that is given a dataroot and returns what it read;
-    or a folder with the JSON and pictures that your reader wrote of the release that --make writes. A function is run.
-    Exit status 1: something was misread.
-    """
-    if make:
-        refuse_unused("with --make", "as_json")
-        path = write_audit_release(path_of(target))
-        click.echo(f"written: {path}; let your reader write JSON of it, and give that folder in its place")
+    """  # noqa: D301 - \b is click's mark of lines that are not wrapped
+    least, most = _TOPICS[topic]
+    if not least <= len(targets) <= (most or len(targets)):
+        raise click.UsageError(f"{topic} is about {least}{'' if most else ' or more'}, found {len(targets)}: {targets}")
+    if topic != "scores":
+        refuse_unused(f"with {topic}", "version", "split", "index_dir", "on_error")
+    if topic == "release":
+        refuse_unused(f"with {topic}", "as_json")
+        path = write_audit_release(path_of(targets[0]))
+        click.echo(f"written: {path}; let your reader write JSON of it, and give that folder to `audit reader`")
+        return
+    if topic == "splits":
+        report = audit_splits(targets)
+    elif topic == "scores":
+        report = audit_scores(DeepAccident(dataroot=targets[0], **release), read_scores(targets[1]), split)
     else:
-        _tell(audit_reader(target if Path(target).is_dir() else _function(target)), as_json=as_json)
-
-
-def _tell(report: AuditReport, *, as_json: bool) -> None:
+        report = audit_reader(targets[0] if Path(targets[0]).is_dir() else _function(targets[0]))
     click.echo(report.to_json() if as_json else report.to_text())
     sys.exit(1 if report.findings else 0)
 
