@@ -98,7 +98,7 @@ def write_audit_release(out: Path) -> Path:
                     camera_visible=(place > 0) & (place < 8),  # seven of ten, in a vehicle's the own one first
                 ),
             )
-            write_npz(Path(str(path).replace("label", BEV_CAMERA)).with_suffix(".npz"), _bev())
+            write_npz(path.parents[2] / BEV_CAMERA / path.parent.name / f"{path.stem}.npz", _bev())
     return out
 
 

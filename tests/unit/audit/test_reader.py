@@ -208,7 +208,8 @@ def test_each_column_has_numbers_of_its_own(tmp_path: Path) -> None:
 
 
 def test_what_was_written_of_the_release(tmp_path: Path) -> None:
-    root, out = write_audit_release(tmp_path / "release"), tmp_path / "out"
+    root, out = write_audit_release(tmp_path / "labels" / "release"), tmp_path / "out"
+    assert len(arrays_of_bev(str(root))) == 20
     (out / "deep").mkdir(parents=True)
     (out / "deep" / "boxes.json").write_text(
         json.dumps([{"ttc": row[11], "score": float("nan")} for row in rows(str(root))])

@@ -141,6 +141,13 @@ def test_areas(release: DeepAccident) -> None:
     assert row_of(report, "length")[0] == round(sum(pairs) / len(pairs), 3)
 
 
+def test_leaving_a_scenario_out_of_its_own_share_makes_no_area(release: DeepAccident) -> None:
+    """Without twins, the other collisions of a collision's town are fewer, which must not look like a sign."""
+    scores = of_scenarios(release, lambda _each, rng: rng.random())
+    alone = {token: score for token, score in scores.items() if ("accident" in token) == (int(token[-5:]) < PAIRS / 2)}
+    assert row_of(audit_scores(release, alone), "town")[0] == 0.5
+
+
 def test_a_split_and_the_same_numbers_again(release: DeepAccident, tmp_path: Path) -> None:
     scores = of_scenarios(release, lambda _each, rng: rng.random())
     chosen = [token for token in scores if int(token[-5:]) < 8]
