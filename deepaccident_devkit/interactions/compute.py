@@ -146,8 +146,7 @@ def measured_pairs(motion: ActorMotion, config: InteractionConfig) -> Measured:
         values[name][place] = column
     under = np.zeros(shape, dtype=bool)
     under[place] = rows
-    joined = _moves_as_one(motion, pairs, values["gap"], config)
-    kept = ~joined
+    kept = ~_moves_as_one(motion, pairs, values["gap"], config)
     return Measured(
         pairs=pairs[kept],
         counts=counts[kept],
@@ -190,8 +189,7 @@ def _listed(motion: ActorMotion, config: InteractionConfig) -> IntArray:
         pairs = candidates[start : start + max(1, _AT_ONCE // max(1, frames))]
         pair, frame = np.nonzero(_may_be_under(motion, pairs, config))
         sides = [(pairs[pair, side], frame) for side in (0, 1)]
-        under = _under(motion, sides, config)
-        kept.append(pairs[np.unique(pair[under])])
+        kept.append(pairs[np.unique(pair[_under(motion, sides, config)])])
     return np.concatenate(kept)
 
 

@@ -251,8 +251,7 @@ def recorded_pet(first: Pieces, second: Pieces) -> float:
 def _parts(track: FloatArray) -> BoolArray:
     """(F − 1,) whether a piece begins at each frame but the last: it moves to the next one, or came from the last."""
     moves = np.abs(np.diff(track, axis=0)).max(axis=1) > _STILL
-    before = np.append(True, moves[:-1])
-    return np.asarray(moves | before)
+    return np.asarray(moves | np.append(True, moves[:-1]))
 
 
 def _near(first: Pieces, second: Pieces) -> BoolArray:
