@@ -82,8 +82,9 @@ class Looks(FrozenArrays):
 
     def files(self, dataset: Dataset) -> Iterator[ReleasePath]:
         """Where the pictures lie; they need not be there."""
-        for row in self.sample_rows.tolist():
-            yield dataset.sensor_path(f"{dataset.sample[row]['token']}/{BEV_CAMERA}")
+        return (
+            dataset.sensor_path(f"{dataset.sample[row]['token']}/{BEV_CAMERA}") for row in self.sample_rows.tolist()
+        )
 
 
 def looks_of(dataset: Dataset, scenario_row: int, config: TownMapConfig) -> list[Looks]:
@@ -240,5 +241,4 @@ def _classes_around(classes: ByteArray, rows: IntArray, columns: IntArray, holes
         np.add.at(votes, (holes, classes[rows + down, columns + right]), 1)
     votes[:, 1] += votes[:, 2]
     votes[:, [0, 2]] = 0
-    result: ByteArray = votes.argmax(axis=1).astype(np.uint8)
-    return result
+    return np.asarray(votes.argmax(axis=1).astype(np.uint8))
