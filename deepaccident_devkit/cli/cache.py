@@ -55,6 +55,5 @@ def cache(
     Give --split or --where: all images at 704x256 take 0.9 TB as raw pixels. --dry-run says how much yours take. If a
     run is interrupted, the same command continues it.
     """
-    names = tuple(words_of(channels)) or CAMERAS
-    images = ImageConfig(resize=resize[::-1], crop=crop, cameras=names, decode=decode)
+    images = ImageConfig(resize=resize[::-1], crop=crop, cameras=tuple(words_of(channels)) or CAMERAS, decode=decode)
     run_export(CachedImages, {"images": images, "codec": codec}, **options)
