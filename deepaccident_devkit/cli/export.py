@@ -141,8 +141,7 @@ def _own(kind: type[Any], chosen: dict[str, Any]) -> dict[str, Any]:
 def _nuscenes_options() -> tuple[Callable[[Any], Any], ...]:
     from deepaccident_devkit.export.nuscenes import NuScenes
 
-    fields = ("van", "lidar_axes", "sweeps")
-    return link_parameter, *(field_option(NuScenes, field, option=advanced) for field in fields)
+    return link_parameter, *(field_option(NuScenes, each, option=advanced) for each in ("van", "lidar_axes", "sweeps"))
 
 
 def _nuscenes() -> click.Command:
@@ -198,9 +197,13 @@ def _opencood() -> click.Command:
         metavar="NAME[,NAME…]",
         help=f"Which boxes become vehicles: {', '.join(CATEGORIES)}.",
     )
-    ego = field_option(OpenCood, "ego", type=WordChoice(VEHICLE_AGENTS))
     return _of_format(
-        "opencood", OpenCood, link_parameter, classes, ego, field_option(OpenCood, "without_clouds", option=advanced)
+        "opencood",
+        OpenCood,
+        link_parameter,
+        classes,
+        field_option(OpenCood, "ego", type=WordChoice(VEHICLE_AGENTS)),
+        field_option(OpenCood, "without_clouds", option=advanced),
     )
 
 

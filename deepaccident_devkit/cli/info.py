@@ -19,8 +19,6 @@ from deepaccident_devkit.cli.verbs import verb
 from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.overview import overview, scenario_lines
 
-_OF_STATISTICS = ("interactions", "out")
-
 
 def _list_fields(context: click.Context, _parameter: click.Parameter, wanted: bool) -> None:
     if wanted:
@@ -70,8 +68,12 @@ def info(
     With --where, list the scenarios that match all filters instead; with --json, their records.
     """
     if facts or not statistics:
-        why = "with --facts" if facts else "without --statistics"
-        refuse_unused(why, *_OF_STATISTICS, *(["statistics"] if facts else []))
+        refuse_unused(
+            "with --facts" if facts else "without --statistics",
+            "interactions",
+            "out",
+            *(["statistics"] if facts else []),
+        )
     dataset = DeepAccident(**(release | {"on_error": "skip"} if facts else release))
     chosen = dataset.find(*where) if where else None
     if facts:

@@ -52,8 +52,9 @@ def _linked(draw: Callable[..., Any]) -> Callable[..., Any]:
     """Turn a function that takes `link` into one that takes --latency, --pose-noise and --seed."""
 
     def drawn(dataset: Dataset, token: str, *, latency: float, pose_noise: float, seed: int, **choices: Any) -> Any:
-        noise = pose_noise or None  # noise with a mean of 0 m would still have a spread
-        return draw(dataset, token, link=Link(latency=latency, pose_noise=noise, seed=seed), **choices)
+        # noise with a mean of 0 m would still have a spread
+        link = Link(latency=latency, pose_noise=pose_noise or None, seed=seed)
+        return draw(dataset, token, link=link, **choices)
 
     return drawn
 

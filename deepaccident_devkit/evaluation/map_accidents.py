@@ -219,15 +219,11 @@ class InstanceAccident:
     @property
     def positions(self) -> FloatArray:
         """(2, 2) x forward, y left of the two that collide, at that moment; of those with a contact."""
-        if self.contact is None:
-            return np.full((2, 2), np.nan)
-        return self.tracks.at(self.contact.frame, self.contact.ids)
+        return np.full((2, 2), np.nan) if self.contact is None else self.tracks.at(self.contact.frame, self.contact.ids)
 
     def explicit(self, seconds: float) -> Accident | None:
         """It as an explicit accident without ids, `seconds` from frame to frame; None without a contact."""
-        if self.contact is None:
-            return None
-        return Accident(positions=self.positions, time=self.contact.frame * seconds)
+        return None if self.contact is None else Accident(positions=self.positions, time=self.contact.frame * seconds)
 
 
 def even(length: FloatArray) -> FloatArray:
@@ -252,8 +248,9 @@ def accident_of(
     """
     shapes = _shapes(instance, grid.orientation)
     size = np.array([grid.x[2], grid.y[2]])
-    contact = _contact(shapes, size, reading.danger_distance)
-    return InstanceAccident(tracks=_tracks(shapes, len(instance), grid, rules), contact=contact)
+    return InstanceAccident(
+        tracks=_tracks(shapes, len(instance), grid, rules), contact=_contact(shapes, size, reading.danger_distance)
+    )
 
 
 def _tracks(shapes: _Shapes, frames: int, grid: BevGrid, rules: LabelProtocol | None) -> InstanceTracks:

@@ -228,8 +228,11 @@ class MotionEvaluator(Evaluator[MotionResult]):
             for token in order
             for frame in range(self._counts[token]["frames"])
         ]
-        numbers = [number for number, token in enumerate(order) if token in set(selected)]
-        chosen = [{**self._counts[order[number]], "vpq": frames[number]} for number in numbers]
+        chosen = [
+            {**self._counts[token], "vpq": frames[number]}
+            for number, token in enumerate(order)
+            if token in set(selected)
+        ]
         return motion_result(chosen, self.protocol)
 
 
@@ -251,8 +254,7 @@ def motion_counts(
     prediction, label = checked_pair(prediction, label)
     frames = compared_frames(prediction, label, rules.labels)
     truth, grid = labels_at_present(label), label.config.grid
-    last = _last_maps(prediction, frames)
-    actors, instance = (prediction.grid.reorient(maps, grid.orientation) for maps in last)
+    actors, instance = (prediction.grid.reorient(each, grid.orientation) for each in _last_maps(prediction, frames))
     true_actors, true_instance = truth.segmentation[:frames] == 1, truth.instance[:frames]
     cells, vpq = [], []
     for extent in RANGES.values():

@@ -149,15 +149,13 @@ def impact_direction(first: FloatArray, first_velocity: FloatArray, second_veloc
 
 def time_exposed(times: FloatArray, threshold: float, step: float) -> FloatArray:
     """Time exposed TET (…,): seconds of moments (…, T), `step` apart, whose time to collision is within a threshold."""
-    result: FloatArray = (np.asarray(times) <= threshold).sum(axis=-1) * step
-    return result
+    return np.asarray((np.asarray(times) <= threshold).sum(axis=-1) * step)
 
 
 def time_integrated(times: FloatArray, threshold: float, step: float) -> FloatArray:
     """Time integrated TIT (…,), s²: sum of (threshold − time) · step over moments (…, T) within a threshold."""
     below = np.asarray(times) <= threshold
-    result: FloatArray = np.where(below, threshold - np.where(below, times, 0.0), 0.0).sum(axis=-1) * step
-    return result
+    return np.asarray(np.where(below, threshold - np.where(below, times, 0.0), 0.0).sum(axis=-1) * step)
 
 
 def nearest_approach(
@@ -241,22 +239,13 @@ def modified_ttc(
 
 def wrapped(angles: FloatArray) -> FloatArray:
     """Angles in (−π, π]."""
-    turned: FloatArray = np.pi - np.mod(np.pi - angles, 2 * np.pi)
-    return turned
+    return np.asarray(np.pi - np.mod(np.pi - angles, 2 * np.pi))
 
 
 def least_root(square: FloatArray, linear: FloatArray, constant: FloatArray) -> FloatArray:
-    """The least root above 0 of square·t² + linear·t + constant, whose constant is below 0; infinite without one.
-
-    In the form that loses no digits where the square is small.
-    """
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        inner = linear**2 - 4 * square * constant
-        half = -(linear + np.copysign(np.sqrt(inner), linear)) / 2
-        roots = np.stack(np.broadcast_arrays(constant / half, half / square))
-    roots = np.where(np.isfinite(roots) & (roots > 0), roots, np.inf)
-    least: FloatArray = roots.min(axis=0)
-    return least
+    """The least root above 0 of square·t² + linear·t + constant, whose constant is below 0; infinite without one."""
+    roots = _roots(square, linear, constant)
+    return np.asarray(np.where(roots > 0, roots, np.inf).min(axis=0))
 
 
 def _along_heading(
@@ -278,8 +267,7 @@ def _along_heading(
 def _closing(way: FloatArray, relative_velocity: FloatArray) -> FloatArray:
     """Speed with which a way (…, 2) gets shorter; NaN where it has no length."""
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        speeds: FloatArray = -_dot(way, relative_velocity) / _length(way)
-    return speeds
+        return np.asarray(-_dot(way, relative_velocity) / _length(way))
 
 
 def _known(values: FloatArray, source: FloatArray) -> FloatArray:
@@ -314,7 +302,7 @@ def _accelerated(first: FloatArray, second: FloatArray, motion: FloatArray) -> F
         linear = _along_sides(shares, speed_then)
         square = _along_sides(shares, np.where(moves, rates, 0.0)) / 2
         offsets = np.concatenate([constant - reach, constant + reach], axis=1)
-        times = begin + _roots(np.tile(square, 2), np.tile(linear, 2), offsets)
+        times = begin + np.hstack([*_roots(np.tile(square, 2), np.tile(linear, 2), offsets)])
         candidates.append(np.where(times >= 0, times, np.inf))
     return np.where(np.isnan(motion).any(axis=1), np.nan, _first_touch(candidates, (gap, reach), shares, motion))
 
@@ -358,11 +346,14 @@ def _travelled(times: FloatArray, speeds: FloatArray, rates: FloatArray, stops: 
 
 
 def _roots(square: FloatArray, linear: FloatArray, constant: FloatArray) -> FloatArray:
-    """Both roots (P, 2 N) of parabolas (P, N), infinite where there are none."""
+    """Both roots (2, …) of parabolas square·t² + linear·t + constant, infinite where there are none.
+
+    In the form that loses no digits where the square is small.
+    """
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         inner = linear**2 - 4 * square * constant
         half = -(linear + np.copysign(np.sqrt(inner), linear)) / 2
-        roots = np.concatenate([constant / half, half / square], axis=1)
+        roots = np.stack(np.broadcast_arrays(constant / half, half / square))
     return np.where(np.isfinite(roots), roots, np.inf)
 
 

@@ -282,5 +282,6 @@ def interactions_of_tracks(
 
 def computed_interactions(dataset: Dataset, token: str, config: InteractionConfig) -> Interactions:
     """The interactions of a scenario, made anew."""
-    frames = dataset.get("scenario", token)["num_frames"]
-    return interactions_of_tracks(token, scenario_tracks(dataset, token), frames, config)
+    return interactions_of_tracks(
+        token, scenario_tracks(dataset, token), dataset.get("scenario", token)["num_frames"], config
+    )

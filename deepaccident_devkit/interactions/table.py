@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
-from functools import cache
+from functools import cache, partial
 from types import MappingProxyType
 from typing import Annotated, Any, Final, TypedDict
 
@@ -62,11 +62,7 @@ class InteractionConfig:
     def __reduce__(self) -> tuple[Any, ...]:
         """Read-only mappings cannot be pickled."""
         values = {each.name: getattr(self, each.name) for each in fields(self)}
-        return _made, ({**values, "class_masses": dict(self.class_masses)},)
-
-
-def _made(values: Mapping[str, Any]) -> InteractionConfig:
-    return InteractionConfig(**values)
+        return partial(InteractionConfig, **{**values, "class_masses": dict(self.class_masses)}), ()
 
 
 def _not_negative(name: str, value: object) -> float:

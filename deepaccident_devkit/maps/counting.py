@@ -82,8 +82,9 @@ class Looks(FrozenArrays):
 
     def files(self, dataset: Dataset) -> Iterator[ReleasePath]:
         """Where the pictures lie; they need not be there."""
-        for row in self.sample_rows.tolist():
-            yield dataset.sensor_path(f"{dataset.sample[row]['token']}/{BEV_CAMERA}")
+        return (
+            dataset.sensor_path(f"{dataset.sample[row]['token']}/{BEV_CAMERA}") for row in self.sample_rows.tolist()
+        )
 
 
 def looks_of(dataset: Dataset, scenario_row: int, config: TownMapConfig) -> list[Looks]:

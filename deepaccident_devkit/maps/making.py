@@ -212,5 +212,8 @@ def _cut(counts: Counts, agents: Counts) -> tuple[IntArray, Counts, Counts]:
     if not len(rows):
         rows = columns = np.zeros(1, dtype=np.int64)
     kept_rows, kept_columns = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
-    first = np.array([rows[0], columns[0]])
-    return first, counts[:, kept_rows, kept_columns].copy(), agents[kept_rows, kept_columns].copy()
+    return (
+        np.array([rows[0], columns[0]]),
+        counts[:, kept_rows, kept_columns].copy(),
+        agents[kept_rows, kept_columns].copy(),
+    )

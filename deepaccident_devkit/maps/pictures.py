@@ -103,8 +103,7 @@ def _shown(drawn: TownMap, limits: tuple[tuple[float, float], ...], target_from_
     """The part of a map around what the limits of axes show, however they are turned."""
     middle = np.array([np.mean(each) for each in limits])
     reach = float(np.hypot(*(np.diff(each)[0] for each in limits)) / 2)
-    height = target_from_world.translation[2]
-    center: FloatArray = target_from_world.inverse().apply(np.array([[*middle, height]]))[0, :2]
+    center = target_from_world.inverse().apply(np.array([[*middle, target_from_world.translation[2]]]))[0, :2]
     return drawn.around(center, reach)
 
 

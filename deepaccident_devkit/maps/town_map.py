@@ -226,5 +226,4 @@ def _without_holes(polygon: Polygon, least_area: float) -> Polygon:
 
 
 def _rings(polygon: Polygon) -> list[list[list[float]]]:
-    rings = [polygon.exterior, *polygon.interiors]
-    return [np.round(np.asarray(ring.coords), _DECIMALS).tolist() for ring in rings]
+    return [np.round(np.asarray(ring.coords), _DECIMALS).tolist() for ring in (polygon.exterior, *polygon.interiors)]

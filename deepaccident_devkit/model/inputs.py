@@ -55,13 +55,11 @@ class ModelInputs:
 
     def to(self, device: torch.device | str) -> ModelInputs:
         """The same on another device."""
-        moved = {each.name: _moved(getattr(self, each.name), device) for each in fields(self)}
-        return replace(self, **moved)
+        return replace(self, **{each.name: _moved(getattr(self, each.name), device) for each in fields(self)})
 
     def of_egos(self, rows: Tensor) -> ModelInputs:
         """The same with some of the egos, by their positions (G',) int64."""
-        chosen = {name: getattr(self, name)[rows] for name in ("ego_rows", "ego_from_agent", "partners")}
-        return replace(self, **chosen)
+        return replace(self, **{name: getattr(self, name)[rows] for name in ("ego_rows", "ego_from_agent", "partners")})
 
 
 def model_inputs(batch: Mapping[str, Any], handedness: Handedness = "right", *, delay: int = 0) -> ModelInputs:
@@ -143,9 +141,5 @@ def _taken(values: Tensor, source: Tensor) -> Tensor:
 
 def _moved(value: Any, device: torch.device | str) -> Any:
     if isinstance(value, CameraGeometry):
-        return CameraGeometry(**{name: _moved(each, device) for name, each in _parts(value).items()})
+        return replace(value, **{each.name: _moved(getattr(value, each.name), device) for each in fields(value)})
     return value.to(device, non_blocking=True)
-
-
-def _parts(cameras: CameraGeometry) -> dict[str, Any]:
-    return {each.name: getattr(cameras, each.name) for each in fields(cameras)}

@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from deepaccident_devkit.errors import ConfigError, GeometryError
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.geometry.bev_grid import Axis
+from deepaccident_devkit.model.warps import precise
 from deepaccident_devkit.support.text import settle_choices
 from deepaccident_devkit.taxonomy import POLE_HEIGHT
 
@@ -145,9 +146,8 @@ class LiftSplat(nn.Module):
         expected = (*features.shape[:3], depths, rows, columns)
         if cells.shape != expected:
             raise GeometryError(f"cameras: expected cells {expected} for these features, found {tuple(cells.shape)}")
-        logits = self.depthnet(features.flatten(0, 2))
         # sums of thousands of points need more than half precision
-        logits = logits.to(torch.promote_types(logits.dtype, torch.float32))
+        logits = precise(self.depthnet(features.flatten(0, 2)))
         return self._splat(logits[:, :depths].softmax(1), logits[:, depths:], cells)
 
     @torch.no_grad()
@@ -193,9 +193,8 @@ class LiftSplat(nn.Module):
         point = (flat >= 0).nonzero().squeeze(1)
         pixel = point.div(of_camera, rounding_mode="floor") * of_pixel + point % of_pixel
         frame = point.div(of_camera * cells.shape[2], rounding_mode="floor")
-        features = context.flatten(2).transpose(1, 2).flatten(0, 1).index_select(0, pixel)
         chances = depth.flatten().index_select(0, point)[:, None]
-        features = features * chances
+        features = context.flatten(2).transpose(1, 2).flatten(0, 1).index_select(0, pixel) * chances
         cell = flat[point] + frame * (rows * columns)
         maps = features.new_zeros(samples * frames * rows * columns, context.shape[1])
         maps = maps.index_add_(0, cell, features)
@@ -214,8 +213,7 @@ def _frustum(config: LiftConfig) -> Tensor:
         u, v = ((torch.arange(count) + 0.5) * config.stride for count in (columns, rows))
     start, _, step = config.depth
     depth = start + step * torch.arange(depths, dtype=u.dtype)
-    frustum = torch.meshgrid(depth, v, u, indexing="ij")
-    return torch.stack(frustum[::-1], -1)
+    return torch.stack(torch.meshgrid(depth, v, u, indexing="ij")[::-1], -1)
 
 
 def _steps(name: str, axis: Axis) -> int:

@@ -155,7 +155,6 @@ def released() -> ModelConfig:
     and so are an augmentation of its own for each agent and the mixed order of agents in batches, which are mistakes.
     """
     along = (-51.2, 51.2, 0.8)
-    grid = BevGrid(x=along, y=along)
     return ModelConfig(
         images=ImageConfig(resize=(432, 768), crop=(176, 32, 256, 704), dtype="uint8"),
         encoder=SwinConfig(checkpointing=True),
@@ -172,7 +171,12 @@ def released() -> ModelConfig:
             voxel_rounding="trunc",
         ),
         temporal=TemporalConfig(
-            channels=64, grid=grid, frames=3, warp="stretched", chain="released", egomotion_input="raw"
+            channels=64,
+            grid=BevGrid(x=along, y=along),
+            frames=3,
+            warp="stretched",
+            chain="released",
+            egomotion_input="raw",
         ),
         fusion=ReleasedFusionConfig(channels=64),
         bev=BevEncodeConfig(),

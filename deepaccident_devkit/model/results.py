@@ -45,7 +45,7 @@ from deepaccident_devkit.v2x.messages import POSE_BYTES, traffic_note
 from deepaccident_devkit.v2x.tracks import scenario_tracks
 
 if TYPE_CHECKING:
-    from torch import Tensor
+    pass
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -151,8 +151,9 @@ def prediction_of(model: V2XFormer, batch: dict[str, Any], config: PredictConfig
         predicted = model(inputs, noise=model.noise(1, generator).to(config.device))
     [found] = decode_detections(predicted.detection, model.config.detection, model.config.decoding)
     motion = motion_output(MotionMaps(*(each[:, 0] for each in predicted.motion.maps)), model)
-    labels = model.config.labels
-    accident = foreseen_accident(motion, step=labels.step * FRAME_PERIOD, labels=model.config.labels_protocol)
+    accident = foreseen_accident(
+        motion, step=model.config.labels.step * FRAME_PERIOD, labels=model.config.labels_protocol
+    )
     return SamplePrediction(
         token=token,
         motion=motion,
@@ -165,13 +166,8 @@ def prediction_of(model: V2XFormer, batch: dict[str, Any], config: PredictConfig
 
 def motion_output(maps: MotionMaps, model: V2XFormer) -> MotionOutput:
     """The devkit's form of the maps (K, T, …) of one ego: centres as probabilities, on the labels' grid."""
-    arrays = [_numbers(each) for each in (maps.segmentation, maps.instance_center.sigmoid())]
-    vectors = [_numbers(each) for each in (maps.instance_offset, maps.instance_flow)]
-    return MotionOutput.from_arrays(*arrays, *vectors, grid=model.config.labels.grid)
-
-
-def _numbers(values: Tensor) -> Any:
-    return values.float().cpu().numpy()
+    given = maps.segmentation, maps.instance_center.sigmoid(), maps.instance_offset, maps.instance_flow
+    return MotionOutput.from_arrays(*(each.float().cpu().numpy() for each in given), grid=model.config.labels.grid)
 
 
 def predict_results(

@@ -104,10 +104,8 @@ class TrainConfig:
 
     def as_dict(self) -> dict[str, Any]:
         """All of it, as JSON holds it."""
-        described = asdict(self)
-        agents = self.agents
-        described["agents"] = agents.name if isinstance(agents, AgentConfig) else agents
-        return described
+        agents = self.agents.name if isinstance(self.agents, AgentConfig) else self.agents
+        return {**asdict(self), "agents": agents}
 
 
 def _expected(name: str) -> str:
@@ -236,8 +234,7 @@ def save_state(folder: Path, model: nn.Module, optimizer: AdamW, progress: Progr
     tensors = dict(model.state_dict())
     for number, state in optimizer.state_dict()["state"].items():
         tensors |= {f"{OPTIMIZER}{number}.{name}": torch.as_tensor(each) for name, each in state.items()}
-    noted = {**meta, "step": progress.step, "best": progress.best}
-    write_weights(folder / LAST, tensors, noted)
+    write_weights(folder / LAST, tensors, {**meta, "step": progress.step, "best": progress.best})
 
 
 def load_state(folder: Path, model: nn.Module, optimizer: AdamW, steps: int) -> Progress:

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 from torch.optim import AdamW
-from torch.utils.data import DataLoader, Sampler
+from torch.utils.data import DataLoader
 from torch.utils.data import Dataset as TorchDataset
 
 from deepaccident_devkit.dataset import Dataset
@@ -67,22 +67,12 @@ class Moments(TorchDataset[dict[str, Any]]):
         return self.data.item(position, epoch)
 
 
-class _Given(Sampler[int]):
-    """Numbers that an iterator gives."""
-
-    def __init__(self, numbers: Iterable[int]) -> None:
-        self._numbers = numbers
-
-    def __iter__(self) -> Iterator[int]:
-        return iter(self._numbers)
-
-
 def batches(moments: Moments, numbers: Iterable[int], config: TrainConfig, *, workers: int = 0) -> DataLoader[Any]:
     """Batches of moments in the order of their numbers (`positions`), read by worker processes, or by this one (0)."""
     return DataLoader(
         moments,
         batch_size=config.moments,
-        sampler=_Given(numbers),
+        sampler=numbers,
         collate_fn=collate_all_egos,
         num_workers=workers,
         pin_memory=False,
@@ -215,10 +205,11 @@ def training_batch(
         rows = rows[better.sum(1) < config.egos]
     moment, agent = inputs.ego_rows[rows].unbind(1)
     mask = frame_mask(batch["label_valid"][rows], inputs.frame_valid[moment, agent, :-1])
-    names = ("segmentation", "centerness", "offset", "flow")
     kept = rows.tolist()
     targets = Targets(
-        motion=MotionTargets(**{name: batch[name][rows] for name in names}, frame_mask=mask),
+        motion=MotionTargets(
+            **{name: batch[name][rows] for name in ("segmentation", "centerness", "offset", "flow")}, frame_mask=mask
+        ),
         boxes=[mirrored_boxes(batch["boxes"][row], model.handedness) for row in kept],
         categories=[batch["categories"][row] for row in kept],
         velocity_known=[batch["velocity_known"][row] for row in kept],

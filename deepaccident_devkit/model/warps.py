@@ -7,6 +7,7 @@ because `autocast` would round a matrix product to bfloat16, and metres need mor
 
 from __future__ import annotations
 
+from itertools import accumulate
 from typing import Literal
 
 import torch
@@ -59,10 +60,8 @@ def present_from_past(egomotion: Tensor, *, chain: Chain = "exact", bev_transfor
     E_t … E_{P−2}, which is wrong from the second frame before the present on. With a BEV augmentation A (N, 4, 4) it
     becomes A · product · A⁻¹.
     """
-    steps = matrices_from_six(egomotion).unbind(1)
-    products = list(steps[-1:])
-    for step in steps[-2::-1]:
-        products.append(_product(products[-1], step) if chain == "exact" else _product(step, products[-1]))
+    way = _product if chain == "exact" else lambda later, earlier: _product(earlier, later)
+    products = list(accumulate(matrices_from_six(egomotion).unbind(1)[::-1], way))
     stacked = torch.stack(products[::-1], 1) if products else egomotion.new_zeros(len(egomotion), 0, 4, 4)
     return _augmented(stacked, bev_transform)
 
@@ -75,6 +74,11 @@ def _augmented(transforms: Tensor, bev_transform: Tensor | None) -> Tensor:
     """A · transforms · A⁻¹ of transforms (N, T, 4, 4) and A (N, 4, 4)."""
     matrix = None if bev_transform is None else bev_transform[:, None]
     return between_augmented(transforms, matrix, matrix)
+
+
+def precise(values: Tensor) -> Tensor:
+    """In float32 at least, if mixed precision made them coarser: sums over maps overflow half precision."""
+    return values.to(torch.promote_types(values.dtype, torch.float32))
 
 
 WarpRule = Literal["stretched", "exact"]

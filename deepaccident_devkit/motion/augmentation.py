@@ -46,5 +46,4 @@ class Augmentation:
         turn[:2, :2] = [[cosine, -sine], [sine, cosine]]
         mirror = np.diag([1.0, -1.0 if self.flip else 1.0, 1.0, 1.0])
         stretch = np.diag([self.scale, self.scale, self.scale, 1.0])
-        result: FloatArray = mirror @ stretch @ turn
-        return result
+        return np.asarray(mirror @ stretch @ turn)

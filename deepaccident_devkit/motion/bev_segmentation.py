@@ -54,8 +54,7 @@ class BevSegmentation(ShortRepr):
 
     def mask(self, name: str) -> BoolArray:
         """(H, W) bool, the layer of a class. Raises ChoiceError."""
-        layer: BoolArray = self.masks[BEV_CLASSES.index(choice("class", name, BEV_CLASSES))]
-        return layer
+        return np.asarray(self.masks[BEV_CLASSES.index(choice("class", name, BEV_CLASSES))])
 
 
 def bev_segmentation(
@@ -92,8 +91,7 @@ def segmentation_of(
     tags = np.append(image.semantic.reshape(-1), np.uint8(0))[index]
     needed = [max(1, math.ceil(COVERAGE[name] * index.shape[-1])) for name in BEV_CLASSES]
     layers = [np.count_nonzero(tags == tag, axis=-1) >= pixels for tag, pixels in zip(_TAGS, needed, strict=True)]
-    known: BoolArray = np.all(index < image.semantic.size, axis=-1)
-    return BevSegmentation(grid=grid, masks=np.stack(layers), known=known)
+    return BevSegmentation(grid=grid, masks=np.stack(layers), known=np.all(index < image.semantic.size, axis=-1))
 
 
 @functools.lru_cache(maxsize=4)
@@ -109,5 +107,4 @@ def _pixels_of_cells(grid: BevGrid, augmentation: Augmentation | None) -> IntArr
     # from the middle of the image to a pixel's centre there are whole pixels and a half
     row, column = (np.rint(BEV_SHAPE[axis] / 2 - 0.5 - points[..., axis] / BEV_RESOLUTION) for axis in (0, 1))
     inside = (row >= 0) & (row < BEV_SHAPE[0]) & (column >= 0) & (column < BEV_SHAPE[1])
-    index = np.where(inside, row * BEV_SHAPE[1] + column, BEV_SHAPE[0] * BEV_SHAPE[1]).astype(np.int64)
-    return readonly(index)
+    return readonly(np.where(inside, row * BEV_SHAPE[1] + column, BEV_SHAPE[0] * BEV_SHAPE[1]).astype(np.int64))

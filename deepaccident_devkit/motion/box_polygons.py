@@ -184,9 +184,11 @@ def polygons_of(boxes: BoxRows, config: MotionLabelConfig) -> Polygons:
     moved = _moved(_constructed(boxes.center, boxes.size, boxes.yaw), pose[boxes.frame])
     own, own_frame = _own_boxes(boxes, moved, pose, config)
     drawn = _drawn(boxes, config)
-    others: AnyArray = _corners(_augmented(moved[drawn], config.augmentation))
-    if config.rules.pose == "yaw":
-        others = _leaning_corners(boxes, config.augmentation)[drawn]
+    others: AnyArray = (
+        _leaning_corners(boxes, config.augmentation)[drawn]
+        if config.rules.pose == "yaw"
+        else _corners(_augmented(moved[drawn], config.augmentation))
+    )
     if not config.rules.own_box_not_augmented:
         own = _augmented(own, config.augmentation)
     frame = np.concatenate([own_frame, boxes.frame[drawn]])
@@ -328,8 +330,7 @@ def _moved(boxes: Float32Array, pose: Float32Array) -> Float32Array:
     xyz = single_precision.product(pose[:, :3, :3], boxes[:, :3, None])[..., 0] + pose[:, :3, 3]
     # computed in float64 and then rounded: equal to torch's in nearly all cases, unlike numpy's own float32
     turned = np.arctan2(pose[:, 0, 1].astype(np.float64), pose[:, 0, 0]).astype(np.float32)
-    yaw = boxes[:, 6] + turned
-    return np.column_stack([xyz, boxes[:, 3:6], yaw])
+    return np.column_stack([xyz, boxes[:, 3:6], boxes[:, 6] + turned])
 
 
 def _augmented(boxes: Float32Array, augmentation: Augmentation | None) -> Float32Array:

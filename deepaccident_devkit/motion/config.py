@@ -311,16 +311,17 @@ class MotionLabelConfig:
         A switch with a default is younger than the first label files. It is there only with another value, so that a
         configuration of then has the same digest now.
         """
-        described = asdict(self)
-        described["grid"] = {"x": list(self.grid.x), "y": list(self.grid.y)}
-        described["orientation"] = self.grid.orientation
-        described["protocol"] = {
-            one.name: getattr(self.rules, one.name)
-            for one in fields(self.rules)
-            if getattr(self.rules, one.name) != one.default
+        return {
+            **asdict(self),
+            "grid": {"x": list(self.grid.x), "y": list(self.grid.y)},
+            "orientation": self.grid.orientation,
+            "protocol": {
+                one.name: getattr(self.rules, one.name)
+                for one in fields(self.rules)
+                if getattr(self.rules, one.name) != one.default
+            },
+            "agents": _agents_text(self.agents),
         }
-        described["agents"] = _agents_text(self.agents)
-        return described
 
     @classmethod
     def from_dict(cls, described: Mapping[str, Any]) -> MotionLabelConfig:

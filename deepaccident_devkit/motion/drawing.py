@@ -377,15 +377,14 @@ def following_centers(
         if runs is None
         else _seen_near(footprints, runs, lines, grid)
     )
-    warped = CoveredCells(
+    centers = CoveredCells(
         frame=footprints.frame[polygon] - 1,
         row=row,
         column=column,
         identity=footprints.identity[polygon],
         frames=len(next_from_this) + 1,
         ids=ids,
-    )
-    centers = warped.centers()
+    ).centers()
     centers[config.label_frames - 1 :: config.label_frames] = np.nan
     return centers
 

@@ -196,12 +196,11 @@ def group_cells(
     occurs[0] = not all_cells
     ids = (np.cumsum(occurs) - 1)[nearest]
     length = max(int(occurs.sum()), 1)
-    moved = position + flow
     return FrameGroups(
         ids=ids,
         count=np.bincount(ids, minlength=length).astype(np.float64),
         position_sum=np.stack([sums_by(ids, along, length) for along in position]),
-        moved_sum=np.stack([sums_by(ids, along, length) for along in moved]),
+        moved_sum=np.stack([sums_by(ids, along, length) for along in position + flow]),
     )
 
 
@@ -246,8 +245,7 @@ def _expected(before: FrameGroups, names: IntArray) -> tuple[IntArray, AnyArray]
 def _distances(first: AnyArray, second: AnyArray) -> AnyArray:
     """(N, M) float32 distances between points (N, 2) and (M, 2)."""
     apart = second - first[:, None]
-    distances: AnyArray = np.sqrt(apart[..., 0] * apart[..., 0] + apart[..., 1] * apart[..., 1])
-    return distances
+    return np.asarray(np.sqrt(apart[..., 0] * apart[..., 0] + apart[..., 1] * apart[..., 1]))
 
 
 def _linked(known: IntArray, distances: AnyArray, limit: float, newest: int) -> tuple[IntArray, int]:

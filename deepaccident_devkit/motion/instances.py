@@ -184,8 +184,6 @@ def predict_instances(heads: MotionHeads, settings: PostProcessing | str = "moti
     ]
     names = link_frames(groups, rules.link_distance)
     centers, counts = _paths(groups, names)
-    frame_ids = [group.ids for group in groups]
-    ids = [name[group.ids] for name, group in zip(names, groups, strict=True)]
     redrawn = None
     if rules.redraw:
         hulls = first_hulls(positions[0], groups[0].ids, groups[0].instances)
@@ -193,8 +191,8 @@ def predict_instances(heads: MotionHeads, settings: PostProcessing | str = "moti
     return LinkedInstances(
         settings=rules,
         orientation=heads.orientation,
-        instance=turn.raster(positions, ids),
-        frame_instance=turn.raster(positions, frame_ids),
+        instance=turn.raster(positions, [name[group.ids] for name, group in zip(names, groups, strict=True)]),
+        frame_instance=turn.raster(positions, [group.ids for group in groups]),
         redrawn=redrawn,
         frame_centers=[turn.points(frame) for frame in peaks],
         paths={

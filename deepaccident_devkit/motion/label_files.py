@@ -205,8 +205,7 @@ class LabelFiles(Mapping[str, MotionLabels]):
             raise TokenError(f"{self.folder}: has no labels of {token!r}; `deepaccident labels` can add them")
         recording, number = _parts(token)
         try:
-            stored = StoredLabels.read(self._archive(recording), f"{number:03d}")
-            return stored.labels(self.config)
+            return StoredLabels.read(self._archive(recording), f"{number:03d}").labels(self.config)
         except DAMAGED_ARCHIVE as error:
             self._open.pop(recording, None)
             path = label_path(self.folder, recording)
@@ -275,7 +274,7 @@ class _Work:
         digest = hashlib.blake2b(digest_size=16)
         what = frames if self.names is None else self.names  # a batch does not depend on the samples beside it
         digest.update(f"{FORMAT_VERSION} {self.config.digest} {recording} {what}".encode())
-        for array in _scenario_arrays(self.dataset, _scenario(recording)):
+        for array in _scenario_arrays(self.dataset, recording.rsplit("/", 1)[0]):
             digest.update(np.ascontiguousarray(array).tobytes())
         return digest.hexdigest()
 
@@ -344,11 +343,6 @@ def _with_kept(dataset: Dataset, root: Path, recording: str, frames: list[int], 
             "folder"
         ) from error
     return tuple(sorted({*frames, *kept}))
-
-
-def _scenario(recording: str) -> str:
-    """The token of a recording's scenario."""
-    return recording.rsplit("/", 1)[0]
 
 
 def _order(recording: str) -> tuple[str, int]:

@@ -131,8 +131,7 @@ class StoredLabels(ShortRepr):
     @classmethod
     def read(cls, archive: zipfile.ZipFile, folder: str) -> StoredLabels:
         """The arrays of a folder of an archive; raises what zipfile and numpy raise for damaged ones."""
-        names = [field.name for field in fields(cls)]
-        return cls(**{name: read_array(archive, f"{folder}/{name}", "motion_labels") for name in names})
+        return cls(**{each.name: read_array(archive, f"{folder}/{each.name}", "motion_labels") for each in fields(cls)})
 
 
 def write_array(archive: zipfile.ZipFile, name: str, array: AnyArray) -> None:
@@ -232,15 +231,17 @@ class Manifest:
 
     def write(self, root: Path) -> None:
         """Write the manifest into its folder."""
-        manifest = {
-            "format": FORMAT,
-            "version": FORMAT_VERSION,
-            "config_digest": self.config.digest,
-            "config": self.config.as_dict(),
-            "names": self.names,
-            "samples": dict(sorted(self.samples.items())),
-        }
-        text = json.dumps(manifest, indent=1)
+        text = json.dumps(
+            {
+                "format": FORMAT,
+                "version": FORMAT_VERSION,
+                "config_digest": self.config.digest,
+                "config": self.config.as_dict(),
+                "names": self.names,
+                "samples": dict(sorted(self.samples.items())),
+            },
+            indent=1,
+        )
         lists_in_a_line = re.sub(r"\[[^][{}]*\]", lambda found: " ".join(found[0].split()), text)
         write_bytes(root / MANIFEST, f"{lists_in_a_line}\n".encode())
 

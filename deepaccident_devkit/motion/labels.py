@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from types import MappingProxyType
 from typing import Any
 
@@ -73,7 +74,7 @@ class MotionLabels(FrozenArrays, Pictured):
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle a dict in place of its view, which cannot be pickled."""
         values = {field.name: getattr(self, field.name) for field in fields(self)}
-        return _remade, (values | {"id_map": dict(self.id_map)},)
+        return partial(MotionLabels, **(values | {"id_map": dict(self.id_map)})), ()
 
     def __repr__(self) -> str:
         """Frames, cells, actors, protocol and coordinate frame."""
@@ -157,10 +158,6 @@ class MotionLabels(FrozenArrays, Pictured):
         chosen = label_config(config)
         arrays: dict[str, Any] = from_batch(batch, chosen, names)
         return cls(config=chosen, id_map={}, at_present=at_present, **arrays)
-
-
-def _remade(values: dict[str, Any]) -> MotionLabels:
-    return MotionLabels(**values)
 
 
 def maps_to_present(
@@ -249,8 +246,7 @@ def _vector_turn(present_from_frame: AnyArray, config: MotionLabelConfig) -> Flo
     """(2, 2) how offset and flow (rows, columns) of a frame turn when it is warped to the present."""
     transform = present_from_frame if config.rules.right_handed else flip_pose(present_from_frame)
     metres_from_cells = _metres_from_cells(config.grid)
-    turn: FloatArray = np.linalg.inv(metres_from_cells) @ transform[:2, :2] @ metres_from_cells
-    return turn
+    return np.asarray(np.linalg.inv(metres_from_cells) @ transform[:2, :2] @ metres_from_cells)
 
 
 def _metres_from_cells(grid: BevGrid) -> FloatArray:

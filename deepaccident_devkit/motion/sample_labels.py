@@ -265,10 +265,7 @@ def _ego_from_lidar(dataset: Dataset, rows: IntArray, config: MotionLabelConfig)
         return ego_from_lidar
     world_from_ego = stored_transforms(dataset.columns("ego_pose")["matrix"][rows])
     world_from_level = conventions.six_vectors_of(world_from_ego) * (1, 1, 1, 0, 0, 1)
-    level_from_lidar: FloatArray = (
-        inverses(conventions.matrices_of_six(world_from_level)) @ world_from_ego @ ego_from_lidar
-    )
-    return level_from_lidar
+    return np.asarray(inverses(conventions.matrices_of_six(world_from_level)) @ world_from_ego @ ego_from_lidar)
 
 
 def _seen(
@@ -302,8 +299,7 @@ def _seen(
             infrastructure=(agents["name"][observer] == _POLE)[pole],
         )
         mask = by_points & (actor != UNTRACKED_ID)
-    seen: IntArray = _pairs(actor, row, frame, there.size)[mask & (actor != OWN_ACTOR_ID)]
-    return seen
+    return np.asarray(_pairs(actor, row, frame, there.size)[mask & (actor != OWN_ACTOR_ID)])
 
 
 def _observers(dataset: Dataset, sample: RowArgument, config: MotionLabelConfig) -> list[int]:
@@ -327,5 +323,4 @@ def _pairs(actor: AnyArray, row: IntArray, frame: IntArray, frames: int) -> IntA
 
     An untracked row is an actor of its own.
     """
-    pairs: IntArray = np.where(actor == UNTRACKED_ID, OWN_ACTOR_ID - 1 - row, actor) * frames + frame
-    return pairs
+    return np.asarray(np.where(actor == UNTRACKED_ID, OWN_ACTOR_ID - 1 - row, actor) * frames + frame)

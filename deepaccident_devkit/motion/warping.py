@@ -26,6 +26,7 @@ transformed points count. `source_from_target` maps points of the result's frame
 
 import functools
 from collections.abc import Callable, Mapping
+from itertools import accumulate
 from typing import Final, Literal, NamedTuple, get_args
 
 import numpy as np
@@ -48,7 +49,7 @@ from deepaccident_devkit.geometry.bev_grid import Orientation, axes_of
 from deepaccident_devkit.geometry.conventions import flip_pose, flip_six_vector
 from deepaccident_devkit.motion.augmentation import Augmentation
 from deepaccident_devkit.motion.config import LabelProtocol, label_protocol
-from deepaccident_devkit.support.arrays import AnyArray, FloatArray, as_numbers, checked
+from deepaccident_devkit.support.arrays import AnyArray, as_numbers, checked
 from deepaccident_devkit.support.text import choice
 from deepaccident_devkit.v2x import future_egomotion
 
@@ -101,10 +102,8 @@ def present_from_frames(
     """
     arithmetic = _ARITHMETIC[rules.warp]
     this_from_next = arithmetic.rigid_inverse(_native_matrices(egomotion, rules)[:-1])
-    chain = [np.eye(4, dtype=this_from_next.dtype)]
-    for step in this_from_next:
-        chain.append(arithmetic.product(chain[-1], step))
-    return _augmented(np.stack(chain), rules, augmentation)
+    chain = accumulate(this_from_next, arithmetic.product, initial=np.eye(4, dtype=this_from_next.dtype))
+    return _augmented(np.stack(list(chain)), rules, augmentation)
 
 
 def frames_from_next(egomotion: ArrayLike, rules: LabelProtocol, augmentation: Augmentation | None = None) -> AnyArray:
@@ -122,12 +121,9 @@ def present_from_past(egomotion: ArrayLike, rules: LabelProtocol, augmentation: 
     The released code and FIERY multiply the motions in the order of time, E_0 E_1, and so are wrong from the second
     moment before the present on; `exact` multiplies E_1 E_0.
     """
-    arithmetic = _ARITHMETIC[rules.warp]
-    steps = _native_matrices(egomotion, rules)
-    chain = list(steps[-1:])
-    for step in steps[-2::-1]:
-        pair = (chain[-1], step) if rules.warp == "exact" else (step, chain[-1])
-        chain.append(arithmetic.product(*pair))
+    product, steps = _ARITHMETIC[rules.warp].product, _native_matrices(egomotion, rules)
+    way = product if rules.warp == "exact" else lambda later, earlier: product(earlier, later)
+    chain = list(accumulate(steps[::-1], way))
     return _augmented(np.reshape(chain[::-1], steps.shape), rules, augmentation)
 
 
@@ -157,8 +153,7 @@ def sampling_matrix(target_from_source: ArrayLike, rules: LabelProtocol) -> AnyA
     """`source_from_target` of transforms (N, 4, 4), as the protocol computes it: in float32 or float64."""
     if rules.warp == "stretched":
         return single_precision.inverse(checked("target_from_source", target_from_source, (None, 4, 4), np.float32))
-    result: FloatArray = np.linalg.inv(checked("target_from_source", target_from_source, (None, 4, 4)))
-    return result
+    return np.asarray(np.linalg.inv(checked("target_from_source", target_from_source, (None, 4, 4))))
 
 
 def nearest_indices(

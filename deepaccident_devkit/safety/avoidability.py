@@ -112,8 +112,7 @@ class Avoidability(FrozenArrays):
     @property
     def slack(self) -> FloatArray:
         """(3, D) seconds from the last moment to brake to the end of the recording; NaN if nothing avoids it."""
-        slack: FloatArray = self.accident.duration - self.last_moments.time
-        return slack.reshape(len(BRAKERS), -1)
+        return np.reshape(self.accident.duration - self.last_moments.time, (len(BRAKERS), -1))
 
     @property
     def head_on(self) -> bool:
@@ -174,13 +173,12 @@ class Avoidability(FrozenArrays):
             }
 
     def _recorded(self) -> dict[str, Any]:
-        ranges = delta_v_ranges(self.accident.masses, self.relative_speed)
         return {
             "margin": self.check.margin,
             "time": round(self.check.time, 6),
             "speeds": known(self.check.speeds, 3),
             "delta_v": known(self.check.delta_v, 3),
-            "delta_v_ranges": known(ranges, 3),
+            "delta_v_ranges": known(delta_v_ranges(self.accident.masses, self.relative_speed), 3),
         }
 
     @property
@@ -289,9 +287,9 @@ def avoidability(
         NotAvailableError: the scenario lacks labels or meta, or its labels do not show the accident.
     """
     accident = accident_of(dataset, scenario)
-    if accident is None:
-        return None
-    return avoidability_of(accident, scenario_tracks(dataset, scenario), brakings=brakings)
+    return (
+        None if accident is None else avoidability_of(accident, scenario_tracks(dataset, scenario), brakings=brakings)
+    )
 
 
 def _secondary(
@@ -325,22 +323,20 @@ def secondary_contacts(
     found = []
     for other, which in product(_others(accident, tracks), (0, 1)):
         rows = np.flatnonzero(np.isfinite(starts[:, which]))
-        if not len(rows) or not _may_meet(accident.paths[which], accident.sizes[which], other):
-            continue
-        for row, time in zip(
-            rows, _new_contacts(accident, which, other, starts[rows], decelerations[rows]), strict=True
-        ):
-            if np.isfinite(time):
-                found.append(
-                    SecondaryContact(
-                        replay=int(row),
-                        actor_id=accident.actor_ids[which],
-                        other_id=other.actor_id,
-                        category=other.category,
-                        time=float(time),
-                        extrapolated=bool(time > accident.duration),
-                    )
+        if len(rows) and _may_meet(accident.paths[which], accident.sizes[which], other):
+            times = _new_contacts(accident, which, other, starts[rows], decelerations[rows])
+            found += [
+                SecondaryContact(
+                    replay=int(row),
+                    actor_id=accident.actor_ids[which],
+                    other_id=other.actor_id,
+                    category=other.category,
+                    time=float(time),
+                    extrapolated=bool(time > accident.duration),
                 )
+                for row, time in zip(rows, times, strict=True)
+                if np.isfinite(time)
+            ]
     return sorted(found, key=lambda each: (each.replay, each.time, each.other_id))
 
 
@@ -361,9 +357,8 @@ def _others(accident: Accident, tracks: ScenarioTracks) -> Iterator[_Other]:
     within = (tracks.index >= frames[0]) & (tracks.index <= frames[-1])
     for actor in np.unique(tracks.actor_id[within]).tolist():
         rows = np.flatnonzero(within & (tracks.actor_id == actor))
-        if actor in accident.actor_ids or len(rows) < 2:
-            continue
-        yield _other(tracks, rows, frames)
+        if actor not in accident.actor_ids and len(rows) >= 2:
+            yield _other(tracks, rows, frames)
 
 
 def _other(tracks: ScenarioTracks, rows: IntArray, frames: IntArray) -> _Other:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import product
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -92,14 +93,15 @@ def outcome_shares(accidents: Sequence[Avoidability]) -> list[OutcomeShares]:
     Args:
         accidents: computed for the same ways to brake.
     """
-    result = []
-    for group in GROUPS:
-        members = [each for each in accidents if group_of(each) == group]
-        for warned in WARNED:
-            told = [(each, found) for each in members if (found := outcomes_if_warned(each, warned)) is not None]
-            if told:
-                result.append(_shares(group, warned, told))
-    return result
+    told = {
+        (group, warned): [
+            (each, found)
+            for each in accidents
+            if group_of(each) == group and (found := outcomes_if_warned(each, warned)) is not None
+        ]
+        for group, warned in product(GROUPS, WARNED)
+    }
+    return [_shares(group, warned, those) for (group, warned), those in told.items() if those]
 
 
 def _shares(group: str, warned: str, told: Sequence[tuple[Avoidability, Outcomes]]) -> OutcomeShares:
@@ -182,16 +184,15 @@ class AvoidabilityReport(Report):
 
     def to_text(self) -> str:
         """Some aligned blocks for a terminal."""
-        counts = f"{len(self.accidents)} accidents"
         left_out = {"dropped, as the two are too far apart at the end": self.dropped, "skipped": self.skipped}
-        for word, which in left_out.items():
-            counts += f"; {len(which)} {word}" if which else ""
-        blocks = [f"DeepAccident {self.version} at {self.dataroot}\n{counts}"]
+        counts = [
+            f"{len(self.accidents)} accidents",
+            *(f"{len(each)} {word}" for word, each in left_out.items() if each),
+        ]
+        blocks = [f"DeepAccident {self.version} at {self.dataroot}\n{'; '.join(counts)}"]
         if self.accidents:
             blocks[0] += f"\n{counted_text([each.accident.touching for each in self.accidents])}"
-        blocks += [
-            self._group_text(group) for group in GROUPS if any(group_of(each) == group for each in self.accidents)
-        ]
+        blocks += [self._group_text(group) for group in GROUPS if self.members(group)]
         if self.margins:
             blocks.append(self._margins_text())
         blocks += [reasons_text(word, which) for word, which in left_out.items() if which]
@@ -234,8 +235,13 @@ class AvoidabilityReport(Report):
         """How many margins of the self-check there are of each size; the largest by name."""
         lines = [f"  {name}: {count}" for name, count in self.margin_counts.items() if count]
         largest = max(self.margins, key=lambda name: self.margins[name])
-        lines.append(f"  the largest: {self.margins[largest]:.3f} m, {largest}")
-        return "\n".join(["gaps at the last frame, which count as contact:", *lines])
+        return "\n".join(
+            [
+                "gaps at the last frame, which count as contact:",
+                *lines,
+                f"  the largest: {self.margins[largest]:.3f} m, {largest}",
+            ]
+        )
 
     def _last_moment_rows(self) -> Iterator[Row]:
         names = ("brakers", "deceleration", "avoidable", "last_moment", "slack", "switches", "extrapolated")
@@ -244,8 +250,7 @@ class AvoidabilityReport(Report):
             accident = each.accident
             who = [value for pair in zip(accident.actor_ids, accident.categories, strict=True) for value in pair]
             for row in each.last_moment_rows():
-                values = (row[name] for name in names)
-                yield (accident.scenario, group_of(each), *who, *values, len(row["secondary"]))
+                yield (accident.scenario, group_of(each), *who, *map(row.get, names), len(row["secondary"]))
 
     def _secondary_rows(self) -> Iterator[Row]:
         names = ("actor_id", "other_id", "category", "time", "extrapolated")
@@ -253,8 +258,7 @@ class AvoidabilityReport(Report):
         for each in self.accidents:
             for row in each.last_moment_rows():
                 for contact in row["secondary"]:
-                    values = (contact[name] for name in names)
-                    yield (each.accident.scenario, row["brakers"], row["deceleration"], *values)
+                    yield (each.accident.scenario, row["brakers"], row["deceleration"], *map(contact.get, names))
 
     def _share_rows(self) -> Iterator[Row]:
         yield (
@@ -264,8 +268,10 @@ class AvoidabilityReport(Report):
         for each in self.shares:
             for column, braking in enumerate(each.brakings):
                 for row, lead in enumerate(each.leads.tolist()):
-                    values = [*each.shares[row, column], each.extrapolated[row, column]]
-                    values += [each.relative_speed[row, column], *each.delta_v[row, column]]
+                    values = (
+                        *(*each.shares[row, column], each.extrapolated[row, column]),
+                        *(each.relative_speed[row, column], *each.delta_v[row, column]),
+                    )
                     key = (each.group, each.warned, braking.reaction, braking.deceleration, round(lead, 1))
                     yield (*key, int(each.accidents[row]), *(round(float(value), 6) for value in values))
 
@@ -335,14 +341,16 @@ def avoidability_report(
 def report_of(dataset: Dataset, found: Sequence[Avoidability | Dropped | Skipped | None]) -> AvoidabilityReport:
     """The report of what `looked_into` gave for scenarios, in their order."""
     accidents, dropped = those_of(Avoidability, found), those_of(Dropped, found)
-    margins = {each.accident.scenario: each.check.margin for each in accidents}
     return AvoidabilityReport(
         dataroot=str(dataset.dataroot),
         version=dataset.version,
         accidents=accidents,
         dropped=tuple(each.why for each in dropped),
         skipped=those_of(Skipped, found),
-        margins={**margins, **{each.why.scenario: each.margin for each in dropped}},
+        margins={
+            **{each.accident.scenario: each.check.margin for each in accidents},
+            **{each.why.scenario: each.margin for each in dropped},
+        },
     )
 
 

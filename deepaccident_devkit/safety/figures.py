@@ -114,8 +114,7 @@ def _draw(ax: Axes, shares: OutcomeShares, values: FloatArray) -> AxesImage:
     sides = shares.leads[0] - step / 2, shares.leads[enough].max(initial=0.0) + step / 2
     ax.set_yticks(range(rows), [f"{each.reaction:g} s, {each.deceleration:g} m/s²" for each in shares.brakings])
     ax.tick_params(labelsize=text_size())
-    extent = (*sides, rows - 0.5, -0.5)
-    return ax.imshow(values[enough].T, aspect="auto", extent=extent, interpolation="nearest")
+    return ax.imshow(values[enough].T, aspect="auto", extent=(*sides, rows - 0.5, -0.5), interpolation="nearest")
 
 
 @in_own_settings
@@ -165,8 +164,9 @@ def _draw_members(ax: Axes, order: Sequence[int]) -> None:
     """A dot in the colour of each agent of a set, a row a set."""
     for row, number in enumerate(order):
         for column, agent in enumerate(AGENTS):
-            there = agent in COALITIONS[number]
-            ax.plot(column, row, "o", color=AGENT_COLORS[agent] if there else "none", markersize=_DOT)
+            ax.plot(
+                column, row, "o", color=AGENT_COLORS[agent] if agent in COALITIONS[number] else "none", markersize=_DOT
+            )
     ax.set(xlim=(-0.6, len(AGENTS) - 0.4), ylim=(len(order) - 0.4, -0.6), yticks=[])
     ax.set_xticks(range(len(AGENTS)), [short_name(agent) for agent in AGENTS], rotation=90, fontsize=text_size())
     set_title(ax, "set of agents", fontsize=text_size())

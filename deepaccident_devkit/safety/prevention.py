@@ -70,7 +70,6 @@ _ALARMS: Final[Mapping[str, tuple[str, ScoresOf]]] = {
 """Which alarms warn → how tables call them, and the scores that are of them."""
 _AT_ONCE: Final = "0"
 """Name of no latency, as JSON has it."""
-_PEDESTRIAN: Final = "pedestrian"
 Frames = Mapping[str, Sequence[int]]
 """Agent → frame numbers of its samples."""
 
@@ -191,7 +190,7 @@ def _table(accident: Accident, own: tuple[bool, bool], frame: IntArray) -> Outco
         outcome=np.stack([each.outcome for each in ends]).astype(np.int8),
         extrapolated=np.stack([each.extrapolated for each in ends]),
         latencies=latencies,
-        pedestrian=_PEDESTRIAN in accident.categories,
+        pedestrian="pedestrian" in accident.categories,
     )
 
 
@@ -328,14 +327,14 @@ class PreventedEvaluator(Evaluator[PreventedResult]):
             fixed = reference_threshold(predictor)
             if draws_of(predictor) == 1:
                 yield predictor, self._figures(self._ends(recordings, predictor), fixed, math.nan, weight)
-                continue
-            drawn = [self._ends(recordings, predictor, draw) for draw in range(draws_of(predictor))]
-            quiet = [each[self._alarms].quiet_braking(weight) for each in drawn]
-            for name, thresholds in ((predictor, [fixed] * len(drawn)), (f"{predictor}{_QUIET}", quiet)):
-                yield (
-                    name,
-                    _mean([self._figures(*each, weight) for each in zip(drawn, thresholds, quiet, strict=True)]),
-                )
+            else:
+                drawn = [self._ends(recordings, predictor, draw) for draw in range(draws_of(predictor))]
+                quiet = [each[self._alarms].quiet_braking(weight) for each in drawn]
+                for name, thresholds in ((predictor, [fixed] * len(drawn)), (f"{predictor}{_QUIET}", quiet)):
+                    yield (
+                        name,
+                        _mean([self._figures(*each, weight) for each in zip(drawn, thresholds, quiet, strict=True)]),
+                    )
 
     def _notes(self, groups: Mapping[str, PreventionFigures]) -> Iterator[str]:
         for group, figures in groups.items():
@@ -406,9 +405,8 @@ def _cells(
 ) -> Iterator[str]:
     figures = given[alarms][latency][setting]
     avoided = None if lasting is None else given[lasting][latency][setting]["shares"][OUTCOMES[0]]
-    values = [*figures["shares"].values(), avoided]
-    values += [figures[name] for name in ("warned", "extrapolated", "braking_seconds_per_minute")]
-    yield from map(number_text, values)
+    others = (figures[name] for name in ("warned", "extrapolated", "braking_seconds_per_minute"))
+    yield from map(number_text, (*figures["shares"].values(), avoided, *others))
 
 
 def _notes(prevented: Json, group: str, given: Json) -> Iterator[str]:

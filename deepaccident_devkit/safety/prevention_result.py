@@ -316,8 +316,7 @@ class AlarmOutcomes:
     def _frames(self, recording: Recording) -> IntArray:
         """(T + 1,) frame number of each column of the scores; −1, no frame, of the one after the last."""
         step = round(1 / (self._series.fps * FRAME_PERIOD))
-        columns = self._series.scores.shape[1]
-        return np.append(recording.frame[0] + step * np.arange(columns), -1)
+        return np.append(recording.frame[0] + step * np.arange(self._series.scores.shape[1]), -1)
 
     def _at(self, threshold: float) -> _Alarms:
         """The alarms at a threshold; kept."""

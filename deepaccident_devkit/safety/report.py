@@ -168,11 +168,13 @@ def csv_row(row: AccidentRow) -> list[Any]:
     """The cells of `ROW_HEADING`."""
     told = row.to_dict()
     colliders = [each[name] for each in row.colliders for name in _OF_COLLIDERS]
-    measures = [told[name] for name in ("gap", "closing_speed", "impact_angle", "margin", "head_on", "time_exposed")]
+    measures = ("gap", "closing_speed", "impact_angle", "margin", "head_on", "time_exposed", "pet")
     moments = [row.last_moments.get(deceleration) for deceleration in DECELERATIONS]
     brakes = " ".join(each or "none" for each in row.brakes)
-    last = [told[name] for name in ("twin", "twin_parts", "story")]
-    return [row.scenario, *colliders, *measures, told["pet"], *row.leads.values(), brakes, *moments, *last]
+    return [
+        *(row.scenario, *colliders, *map(told.get, measures)),
+        *(*row.leads.values(), brakes, *moments, *map(told.get, ("twin", "twin_parts", "story"))),
+    ]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -73,8 +73,8 @@ def story_text(facts: Mapping[str, Any]) -> str:
 
 def actor_words(actor: Mapping[str, Any]) -> str:
     """What an actor is called: an agent by its role, any other road user by its class."""
-    role = _AGENTS.get(actor["agent"] or "")
-    return role or (f"a {actor['category']}" if actor["category"] else "a road user")
+    kind = f"a {actor['category']}" if actor["category"] else "a road user"
+    return _AGENTS.get(actor["agent"] or "", kind)
 
 
 def _collision(facts: Mapping[str, Any], accident: Mapping[str, Any]) -> str:
@@ -348,11 +348,10 @@ def _collider(
 def _seen(dataset: Dataset, accident: Accident) -> dict[str, float]:
     """Agent → seconds before the impact at which it alone first observes both; 0 if it never does."""
     there, observed = observed_actors(dataset, accident.scenario, accident.actor_ids)
-    leads: dict[str, float] = {}
-    for agent, of_both in zip(there, observed, strict=True):
-        both = of_both.all(axis=0)
-        leads[agent] = round((both.size - 1 - int(np.argmax(both))) * FRAME_PERIOD, 1) if both.any() else 0.0
-    return leads
+    return {
+        agent: round((both.size - 1 - int(np.argmax(both))) * FRAME_PERIOD, 1) if both.any() else 0.0
+        for agent, both in zip(there, observed[:, 0] & observed[:, 1], strict=True)
+    }
 
 
 def _braking(accident: Accident, braked: Avoidability) -> dict[str, Any]:
@@ -375,7 +374,7 @@ def _nearest(dataset: Dataset, record: ScenarioRecord, unknown: list[str]) -> di
     overlap = pairs.min_gap == 0
     rows = np.flatnonzero(overlap if overlap.any() else pairs.moving & np.isfinite(pairs.min_ttc))
     if not len(rows):
-        if not _labelled(dataset, record):
+        if not any(dataset.get_sample(record["token"], agent, 1)["labelled"] for agent in agents_of(dataset, record)):
             unknown.append(f"{record['token']} has no labels, which say where actors are")
         return None
     row = rows[np.argmin(pairs.min_ttc[rows])]
@@ -384,10 +383,6 @@ def _nearest(dataset: Dataset, record: ScenarioRecord, unknown: list[str]) -> di
         "min_ttc": known(pairs.min_ttc[row], 2),
         "min_gap": known(pairs.min_gap[row], 2),
     }
-
-
-def _labelled(dataset: Dataset, record: ScenarioRecord) -> bool:
-    return any(dataset.get_sample(record["token"], agent, 1)["labelled"] for agent in agents_of(dataset, record))
 
 
 def _actor(dataset: Dataset, scenario: str, actor_id: int) -> dict[str, Any]:

@@ -141,9 +141,7 @@ def matched_rows(first: Recording, second: Recording) -> dict[int, tuple[int, Ma
             other = other_rows.get(actor)
             if row not in result and other is not None and first.category[row] == second.category[other]:
                 result[row] = (other, "id")
-    for row, other in _by_start(first, second, result):
-        result[row] = (other, "start")
-    return result
+    return {**result, **{row: (other, "start") for row, other in _by_start(first, second, result)}}
 
 
 def _agent_rows(first: Recording, second: Recording) -> dict[int, int]:

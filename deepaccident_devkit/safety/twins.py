@@ -60,10 +60,6 @@ _OF_ACTORS: Final = (
 )
 _NAMED: Final = 2
 """Actors that a line names at most."""
-_APART: Final = "the recordings do not begin together, so that it is not known when they part"
-
-
-_NEVER: Final = 10**6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -162,15 +158,14 @@ class TwinDiff(FrozenArrays):
     @property
     def parting_frames(self) -> IntArray:
         """(N,) the first frame at which an actor is elsewhere or turned otherwise; 0 for one that never is."""
-        turned = np.abs(self.heading_differences) > self.parting.heading
-        parted = turned | (self.distances > self.parting.distance)
+        parted = (np.abs(self.heading_differences) > self.parting.heading) | (self.distances > self.parting.distance)
         return np.where(parted.any(axis=1), parted.argmax(axis=1) + 1, 0)
 
     @property
     def order(self) -> IntArray:
         """(N,) rows by when actors part: first those that do, then those that do not, then those in one alone."""
         frames = self.parting_frames
-        return np.lexsort((np.where(frames > 0, frames, _NEVER), ~self.in_both))
+        return np.lexsort((frames, frames == 0, ~self.in_both))
 
     @property
     def parting_frame(self) -> int | None:
@@ -185,8 +180,7 @@ class TwinDiff(FrozenArrays):
         Where they are not, the recordings begin at different moments (or the twin is another scene), and it is not
         known when they part.
         """
-        agents = [row for row, name in enumerate(self.agents) if name is not None]
-        apart = self.distances[agents]
+        apart = self.distances[[row for row, name in enumerate(self.agents) if name is not None]]
         moments = np.flatnonzero(~np.isnan(apart).all(axis=0))
         return not len(moments) or bool(np.nanmedian(apart[:, moments[0]]) <= self.parting.distance)
 
@@ -394,7 +388,8 @@ class TwinReport(Report):
             rows = [heading, *map(_line, self.diffs)]
             notes = "seconds from the first frame, and to the impact; nearest: the colliders' least gap in the twin (m)"
             apart = sum(not each.begins_together for each in self.diffs)
-            blocks.append(f"{columns_text(rows)}\n{notes}" + (f"\n{apart} of them: {_APART}" if apart else ""))
+            more = f"\n{apart} of them: the recordings do not begin together, so that it is not known when they part"
+            blocks.append(f"{columns_text(rows)}\n{notes}{more if apart else ''}")
         else:
             blocks.append("no accident has a twin here")
         if self.torn:
@@ -425,8 +420,12 @@ def twin_report(
     Raises:
         TokenError: no such scenario.
     """
-    work = partial(diff_of_accident, parting=parting or Parting())
-    return twins_of(dataset, each_scenario(work, dataset, scenarios, label="twins", **how))
+    return twins_of(
+        dataset,
+        each_scenario(
+            partial(diff_of_accident, parting=parting or Parting()), dataset, scenarios, label="twins", **how
+        ),
+    )
 
 
 def twins_of(dataset: Dataset, found: Sequence[TwinDiff | Skipped | None]) -> TwinReport:

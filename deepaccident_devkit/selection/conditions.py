@@ -6,6 +6,7 @@ import math
 import operator
 import re
 from collections.abc import Collection, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -63,10 +64,9 @@ class Condition:
 
     def holds(self, value: Value | tuple[Value, ...]) -> bool:
         """Whether a scenario with this value of the field, or with these, is wanted."""
-        return any(map(self._has, value if isinstance(value, tuple) else (value,))) != self.negated
-
-    def _has(self, value: Value) -> bool:
-        return value in self.values or any(_within(value, *bounds) for bounds in self.ranges)
+        several = value if isinstance(value, tuple) else (value,)
+        met = (each in self.values or any(_within(each, *bounds) for bounds in self.ranges) for each in several)
+        return any(met) != self.negated
 
 
 def parse_where(text: str) -> Filter:
@@ -158,10 +158,8 @@ def _number(field: Field, value: object) -> float:
     elif field.kind == "measure" and isinstance(value, float) and math.isfinite(value):
         number = value
     elif not isinstance(value, bool):
-        try:
+        with suppress(TypeError):
             number = operator.index(value)  # type: ignore[arg-type]
-        except TypeError:
-            number = None
     if number is None:
         raise ChoiceError(
             f"{field.name}: expected a number, a range such as 40..60 or a bound such as >=50, found {_shown(value)}"

@@ -173,10 +173,6 @@ def _trajectory_type(_: Dataset, scenario: ScenarioRecord) -> str | None:
     return STRAIGHT if road.startswith("four") and directions == ("straight", "straight") else TURNING
 
 
-def _accident_visibility(dataset: Dataset, scenario: ScenarioRecord) -> str | None:
-    return accident_visibility(dataset, scenario)
-
-
 def _closing_speed(dataset: Dataset, scenario: ScenarioRecord) -> float | None:
     if scenario["collision"] is None:
         return None
@@ -268,7 +264,7 @@ _DERIVED = (
         "accident_visibility",
         "word",
         "Whether ego sees the accident coming.",
-        _accident_visibility,
+        accident_visibility,
         VISIBILITIES,
         costly=True,
     ),

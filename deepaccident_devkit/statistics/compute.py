@@ -89,14 +89,11 @@ def dataset_statistics(
     """
     chosen = _Chosen(dataset, _rows_of(dataset, scenarios))
     pairs, pair_histograms = _collisions(chosen)
-    histograms = [_lengths(chosen), _ego_speeds(chosen), _actors(chosen)]
-    quantiles = [_ego_sizes(chosen), _box_sizes(chosen)]
-    for histogram, table in (_distances(chosen), _speeds(chosen)):
-        histograms.append(histogram)
-        quantiles.append(table)
-    histograms += pair_histograms
+    (distances, distance_quantiles), (speeds, speed_quantiles) = _distances(chosen), _speeds(chosen)
+    histograms = [_lengths(chosen), _ego_speeds(chosen), _actors(chosen), distances, speeds, *pair_histograms]
     if interactions:
         histograms += _interactions(chosen, **how)
+    quantiles = (_ego_sizes(chosen), _box_sizes(chosen), distance_quantiles, speed_quantiles)
     return DatasetStatistics(
         dataroot=str(dataset.dataroot),
         version=dataset.version,
@@ -106,7 +103,7 @@ def dataset_statistics(
         frames=_by_group(chosen.group("frame")),
         samples=_by_group(chosen.group("sample")),
         unlabelled=chosen.unlabelled.counts,
-        counts={table.name: table for table in [*_scenario_counts(chosen), *_actor_counts(chosen)]},
+        counts={table.name: table for table in (*_scenario_counts(chosen), *_actor_counts(chosen))},
         histograms={table.name: table for table in histograms},
         quantiles={table.name: table for table in quantiles},
         collisions=pairs,
@@ -142,8 +139,9 @@ class _Chosen:
         labelled = np.zeros(len(self.scenario_group), dtype=bool)
         labelled[self.column("sample", "scenario_row")[self.column("sample", "labelled")]] = True
         self.labelled_group = np.where(labelled, self.scenario_group, np.int8(-1))
-        without = _by_group(np.where(labelled, np.int8(-1), self.scenario_group))
-        self.unlabelled = LeftOut(what="scenarios without labels", counts=without)
+        self.unlabelled = LeftOut(
+            what="scenarios without labels", counts=_by_group(np.where(labelled, np.int8(-1), self.scenario_group))
+        )
         self.ends = {
             each["token"]: scenario_end(each, self.agents.get(each["token"], [])) for each in self.scenarios.values()
         }
@@ -240,11 +238,12 @@ def _scenario_counts(chosen: _Chosen) -> list[CountTable]:
             (chosen.ends[scenario["token"]] if field == "end" else word_of(scenario, field)) or UNKNOWN
             for scenario in records
         ]
-        listed = [*known, *sorted(set(words) - {*known, UNKNOWN}), *({UNKNOWN} & set(words))]
-        counts = {}
-        for word in listed:
-            here = np.array([each == word for each in words], dtype=bool)
-            counts[word] = _by_group(groups[here], frames[here] if counted == "frames" else None)
+        others = sorted(set(words) - {*known, UNKNOWN})
+        listed = [*known, *others, *({UNKNOWN} & set(words))]
+        rows = {word: [row for row, each in enumerate(words) if each == word] for word in listed}
+        counts = {
+            word: _by_group(groups[here], frames[here] if counted == "frames" else None) for word, here in rows.items()
+        }
         made.append(CountTable(name=name, title=title, field=field, counted=counted, counts=counts))
     return made
 
@@ -279,7 +278,7 @@ def _lengths(chosen: _Chosen) -> Histogram:
     lengths = np.array([scenario["num_frames"] for scenario in chosen.scenarios.values()], dtype=np.float64)
     groups = chosen.scenario_group[list(chosen.scenarios)]
     names = ("lengths", "Lengths of scenarios", "length", "frames")
-    return _histogram(names, "scenarios", lengths, groups, tuple(range(30, 101, 10)))
+    return _histogram(names, "scenarios", lengths, groups, range(30, 101, 10))
 
 
 def _ego_speeds(chosen: _Chosen) -> Histogram:
@@ -293,10 +292,9 @@ def _ego_speeds(chosen: _Chosen) -> Histogram:
 
 def _actors(chosen: _Chosen) -> Histogram:
     """Actors (instances) of each labelled scenario."""
-    numbers = np.bincount(chosen.column("instance", "scenario_row"), minlength=len(chosen.scenario_group))
+    numbers = np.bincount(chosen.column("instance", "scenario_row"), minlength=len(chosen.scenario_group)).astype(float)
     names = ("actors", "Actors a scenario", "actors", "actors")
-    edges = tuple(range(0, 201, 10))
-    return _histogram(names, "scenarios", numbers.astype(np.float64), chosen.labelled_group, edges, chosen.unlabelled)
+    return _histogram(names, "scenarios", numbers, chosen.labelled_group, range(0, 201, 10), chosen.unlabelled)
 
 
 def _ego_sizes(chosen: _Chosen) -> QuantileTable:
@@ -433,10 +431,11 @@ def _collisions(chosen: _Chosen) -> tuple[tuple[CollisionPair, ...], list[Histog
         what="collisions without a pair labelled at the last frame", counts=_by_group(np.array(without, dtype=np.int8))
     )
     groups = np.array([_PARTS.index(pair.split) for pair in pairs], dtype=np.int8)
-    bearings = [_wrapped(np.degrees(np.arctan2(pair.y, pair.x))) for pair in pairs]
     values = {
         ("collision_angles", "Collision angle", "angle", "°"): [pair.angle for pair in pairs],
-        ("collision_bearings", "Bearing of the other", "bearing", "°"): bearings,
+        ("collision_bearings", "Bearing of the other", "bearing", "°"): [
+            _wrapped(np.degrees(np.arctan2(pair.y, pair.x))) for pair in pairs
+        ],
     }
     histograms = [
         _histogram(names, "collisions", np.array(each, dtype=np.float64), groups, _ANGLES, left_out)

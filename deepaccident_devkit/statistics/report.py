@@ -23,7 +23,6 @@ from deepaccident_devkit.statistics.results import (
 from deepaccident_devkit.support.text import columns_text, number_text, share_text
 from deepaccident_devkit.taxonomy import CATEGORIES
 
-_PAIRS = "collision_pairs"
 _LIMITS = (0.5, 1.0, 1.5, 3.0)
 """Seconds; edges of the histogram of least times to collision."""
 
@@ -76,7 +75,10 @@ class DatasetStatistics(Report):
 
     def named_tables(self) -> dict[str, Iterable[Row]]:
         """All tables, and the colliding pairs."""
-        return {**{table.name: table.rows() for table in self.tables}, _PAIRS: collision_rows(self.collisions)}
+        return {
+            **{table.name: table.rows() for table in self.tables},
+            "collision_pairs": collision_rows(self.collisions),
+        }
 
     def to_text(self) -> str:
         """Some aligned blocks for a terminal: scenarios (without zeros), a line a category, what is left out."""
@@ -91,10 +93,7 @@ class DatasetStatistics(Report):
             head,
             columns_text([("", *self.groups)] + [(word, *self._cells(counts)) for word, counts in sums.items()]),
         ]
-        for table in self.counts.values():
-            if table.counted == "scenarios":
-                rows = [(value, *self._shares(table, value)) for value in table.counts if table.counts[value][TOTAL]]
-                blocks.append(columns_text([(table.field, *self.groups), *rows]))
+        blocks += [self._shares_text(table) for table in self.counts.values() if table.counted == "scenarios"]
         blocks += [self._lengths_text(), self._categories_text()]
         if CRITICAL in self.histograms:
             blocks.append(self._critical_text())
@@ -110,8 +109,14 @@ class DatasetStatistics(Report):
     def _cells(self, counts: Mapping[str, int]) -> list[str]:
         return [f"{counts[group]:,}" for group in self.groups]
 
-    def _shares(self, table: CountTable, value: str) -> list[str]:
-        return [share_text(table.counts[value][group], table.total(group)) for group in self.groups]
+    def _shares_text(self, table: CountTable) -> str:
+        """A row a value that occurs: how many of each group have it."""
+        rows = [
+            (value, *(share_text(counts[group], table.total(group)) for group in self.groups))
+            for value, counts in table.counts.items()
+            if counts[TOTAL]
+        ]
+        return columns_text([(table.field, *self.groups), *rows])
 
     def _lengths_text(self) -> str:
         lengths = self.histograms["lengths"]
@@ -124,11 +129,14 @@ class DatasetStatistics(Report):
     def _critical_text(self) -> str:
         """Scenarios in which a moving pair comes below some times to collision, of those with labels."""
         times = self.histograms[CRITICAL]
-        rows = []
-        for limit in _LIMITS:
-            counts = {group: sum(times.counts[group][: times.edges.index(limit)]) for group in self.groups}
-            labelled = {group: self.scenarios[group] - self.unlabelled[group] for group in self.groups}
-            rows.append((f"below {limit:g} s", *(share_text(counts[group], labelled[group]) for group in self.groups)))
+        labelled = {group: self.scenarios[group] - self.unlabelled[group] for group in self.groups}
+        rows = [
+            (
+                f"below {limit:g} s",
+                *(share_text(sum(times.counts[each][: times.edges.index(limit)]), labelled[each]) for each in labelled),
+            )
+            for limit in _LIMITS
+        ]
         return columns_text([("least TTC of moving pairs", *self.groups), *rows])
 
     def _categories_text(self) -> str:

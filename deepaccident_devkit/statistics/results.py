@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import astuple, dataclass, fields
+from itertools import pairwise
 from typing import TYPE_CHECKING, Final
 
 from deepaccident_devkit.support.arrays import ShortRepr
@@ -115,9 +116,7 @@ class Histogram(ShortRepr):
 
     def bin_labels(self) -> list[str]:
         """What each bin of whole numbers holds: `30–39`, …, `90–100`."""
-        last = len(self.edges) - 2
-        bins = enumerate(zip(self.edges[:-1], self.edges[1:], strict=True))
-        return [f"{low:g}–{high - (index < last):g}" for index, (low, high) in bins]
+        return [f"{low:g}–{high - (high < self.edges[-1]):g}" for low, high in pairwise(self.edges)]
 
     def rows(self) -> list[Row]:
         """A heading, a row a bin, and one of what lies outside."""
@@ -248,8 +247,7 @@ def _undesigned_end(scenario: ScenarioRecord, collision: CollisionRecord, agents
     missing = set(VEHICLE_AGENTS) - set(here)  # of a partial download: meta's names stand for their ids
     if None in here.values() or (missing and collision["agents"] is None):
         return None
-    known = [actor in here.values() or name in missing for actor, name in zip(collision["ids"], names, strict=True)]
-    if not all(known):
+    if not all(actor in here.values() or name in missing for actor, name in zip(collision["ids"], names, strict=True)):
         return WITH_OTHER
     story = ("road_type", "spawn_side", "ego_direction", "other_direction")
     return None if None in [scenario[word] for word in story] else NO_DESIGN  # type: ignore[literal-required]

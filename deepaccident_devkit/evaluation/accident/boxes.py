@@ -124,11 +124,12 @@ class BoxAccidents:
             )
         raised = named_alarms(checked_prediction(prediction), label, truth, self.reading)
         within = within_horizon(raised, truth)
-        judged = [alarm for alarm in within if _is_judged(alarm[0], truth)]
-        nearest = truth.nearest_pair(self.reading.danger_distance)
+        judged = [  # the alarms that the recording can refute
+            each for each in within if truth.accident is not None or each[0].time <= float(truth.time[-1]) + SLACK
+        ]
         return {
             "positive": truth.accident is not None,
-            "named": named(nearest, context),
+            "named": named(truth.nearest_pair(self.reading.danger_distance), context),
             "alarms": [_alarm(accident, ids, truth) for accident, ids in judged],
             "unjudged": len(within) - len(judged),
             "beyond": len(raised) - len(within),
@@ -145,10 +146,9 @@ class BoxAccidents:
             raise EvaluationError(
                 "context: the protocol 'boxes' needs its truth; make it with accident_context(…, horizon)"
             )
-        alarms = named_alarms(given, label, truth, self.reading)
         return ComparedAccidents(
             true=truth.accident,
-            predicted=tuple(alarm for alarm, _ in alarms),
+            predicted=tuple(alarm for alarm, _ in named_alarms(given, label, truth, self.reading)),
             unplaced=truth.unplaced if truth.is_unplaced else None,
         )
 
@@ -216,11 +216,6 @@ def _tallied(sample: Counts) -> dict[str, Any]:
     }
 
 
-def _is_judged(accident: Accident, truth: BoxTruth) -> bool:
-    """Whether the recording can refute an alarm."""
-    return truth.accident is not None or accident.time <= float(truth.time[-1]) + SLACK
-
-
 def _id_error(ids: Pair, truth: BoxTruth) -> int | None:
     """1 if these are not the two that collide; None if nobody collides."""
     if truth.accident is None or truth.accident.ids is None:
@@ -250,8 +245,7 @@ def _average_precision(alarms: Sequence[Sequence[float]], positives: int) -> flo
     place = np.searchsorted(steps, -score)
     raised = np.bincount(place, minlength=len(steps))
     right = np.bincount(place, true, len(steps))
-    precision = np.cumsum(right) / np.cumsum(raised)
-    return math.fsum((right / positives * precision).tolist())
+    return math.fsum((right / positives * (np.cumsum(right) / np.cumsum(raised))).tolist())
 
 
 def _share(part: float, whole: float) -> float | None:

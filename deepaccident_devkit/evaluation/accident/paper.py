@@ -123,7 +123,8 @@ class PaperAccidents:
             "named": named(actors, context),
             "instance_maps": isinstance(given, MotionOutput) and given.instances is not None,
             "explicit": not isinstance(given, MotionOutput),
-            "best": _nearest(alarms),
+            # the first with the least difference of positions; the first at all where there is no truth to differ from
+            "best": min(filter(None, alarms), key=lambda alarm: alarm["position"] or 0.0, default=None),
             "mean_first": next((alarm for alarm in (*alarms[-1:], *alarms[:-1]) if alarm), None),
         }
 
@@ -146,7 +147,12 @@ class PaperAccidents:
         given = _united(counts)
         chosen, other = sorted(get_args(SampleChoice), key=lambda choice: choice != self.sample_choice)
         result, beside = (tally_result(given[choice], ERRORS_AT) for choice in (chosen, other))
-        notes = _notes(given, result.samples)
+        notes = tuple(
+            f"{given[form]} of {result.samples} predictions were given as {words}: their truth is the labels' instance "
+            "map, not the released grouping and linking of the labels"
+            for form, words in _FORMS.items()
+            if given[form]
+        )
         return replace(result, notes=notes, beside={f"sample_choice={other}": beside})
 
     def pooled(self, counts: Collection[Counts]) -> list[Counts]:
@@ -187,22 +193,6 @@ def _alarm(found: InstanceAccident, truth: InstanceAccident, seconds: float) -> 
         position=position_difference(found.positions, truth.positions),
         time=(found.contact.frame - truth.contact.frame) * seconds,
         id_error=int(not same),
-    )
-
-
-def _nearest(alarms: Sequence[Alarm | None]) -> Alarm | None:
-    """The first with the smallest difference of positions; the first at all where there is no truth to differ from."""
-    there = [alarm for alarm in alarms if alarm]
-    return min(there, key=lambda alarm: alarm["position"] or 0.0, default=None)
-
-
-def _notes(given: Mapping[str, Any], samples: int) -> tuple[str, ...]:
-    """Sentences on predictions whose truth is not made of heads."""
-    return tuple(
-        f"{given[form]} of {samples} predictions were given as {words}: their truth is the labels' instance map, not "
-        "the released grouping and linking of the labels"
-        for form, words in _FORMS.items()
-        if given[form]
     )
 
 

@@ -196,12 +196,11 @@ def accident_counts(
         counts["fn"] = [1] * len(DISTANCES)
         return counts, true
     position, best, same = min(foreseen, key=lambda each: each[0])
-    errors = {"id": _others_named(best, true, same), "position": position, "time": 0.0}
-    for index, distance in enumerate(DISTANCES):
-        within = position <= distance
-        counts["tp" if within else "fp"][index] = 1
-        for name, error in errors.items():
-            counts[name][index] = error if within else 0
+    named_so = all(any((name, other) in same for other in true) for name in best)  # by the matches of their paths
+    errors = {"id": int(not named_so), "position": position, "time": 0.0}
+    within = [position <= distance for distance in DISTANCES]
+    counts |= {"tp": [int(each) for each in within], "fp": [int(not each) for each in within]}
+    counts |= {name: [error if each else 0 for each in within] for name, error in errors.items()}
     return counts, true
 
 
@@ -218,11 +217,6 @@ def _apart(alarm: tuple[DrawnPaths, Pair], true: tuple[DrawnPaths, Pair], frame:
     """Metres: the sum of the distances of the predicted from the true two, in the order with the smaller sum."""
     here, there = (np.array([each.paths[name][frame] for name in pair]) for each, pair in (alarm, true))
     return position_difference(here, there)
-
-
-def _others_named(alarm: Pair, true: Pair, same: Collection[Pair]) -> int:
-    """0 if the two predicted ones are the true ones, by the matches of their paths; else 1."""
-    return int(not all(any((name, other) in same for other in true) for name in alarm))
 
 
 def _united(counts: Collection[Counts]) -> Counts:
@@ -293,5 +287,4 @@ def _centers(key: IntArray, position: IntArray, shape: tuple[int, int]) -> tuple
     length = shape[0] * shape[1]
     count = np.bincount(key, minlength=length)
     sums = np.stack([np.bincount(key, along, length) for along in position], axis=-1)
-    centers = sums / np.maximum(count, 1)[:, None]
-    return centers.reshape(*shape, 2), count.reshape(shape) > 0
+    return (sums / np.maximum(count, 1)[:, None]).reshape(*shape, 2), count.reshape(shape) > 0

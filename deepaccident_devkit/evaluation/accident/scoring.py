@@ -216,8 +216,7 @@ ERRORS_AT: Final = 10.0
 
 def hit_of(alarms: Sequence[Alarm], distance: float) -> Alarm | None:
     """The first alarm that foresees the true accident nearer than a distance."""
-    near = (each for each in alarms if each["position"] is not None and each["position"] < distance - TIE)
-    return next(near, None)
+    return next((each for each in alarms if each["position"] is not None and each["position"] < distance - TIE), None)
 
 
 def foreseen(
@@ -255,12 +254,11 @@ def alarms_tally(sample: Counts, alarms: Sequence[Alarm]) -> Tally:
 
 def _cases_within(sample: Counts, alarms: Sequence[Alarm], distance: float) -> dict[str, Any]:
     hit = hit_of(alarms, distance) if sample["positive"] else None
-    errors = {name: None if hit is None else hit[name] for name in ERRORS}
     return {
         "tp": int(hit is not None),
         "fp": len(alarms) - int(hit is not None),
         "fn": int(sample["positive"] and hit is None),
-        **{name: [] if error is None else [abs(error)] for name, error in errors.items()},
+        **{name: [] if hit is None or hit[name] is None else [abs(hit[name])] for name in ERRORS},
     }
 
 

@@ -63,8 +63,10 @@ def sample_counts(token: str, prediction: DetectedBoxes, truth: Boxes, protocol:
                 f"{token}: {name} in frame {boxes.frame!r}, the protocol counts in {protocol.frame!r}; "
                 "transform them, or choose frame="
             )
-    counts = frame_counts(columns_of(prediction.boxes, prediction.scores), columns_of(truth), protocol)
-    return {"token": token, **counts}
+    return {
+        "token": token,
+        **frame_counts(columns_of(prediction.boxes, prediction.scores), columns_of(truth), protocol),
+    }
 
 
 class DetectionEvaluator(Evaluator[DetectionResult]):
@@ -165,8 +167,7 @@ def detection_matches(
         ChoiceError: no such protocol, or not one of its thresholds.
     """
     rules = detection_protocol(protocol)
-    middle = rules.thresholds[len(rules.thresholds) // 2]
-    chosen = threshold or rules.error_threshold or middle
+    chosen = threshold or rules.error_threshold or rules.thresholds[len(rules.thresholds) // 2]
     if chosen not in rules.thresholds:
         raise ChoiceError(f"threshold: expected one of {', '.join(map(str, rules.thresholds))}, found {threshold!r}")
     detected, true = columns_of(prediction.boxes, prediction.scores), columns_of(truth)

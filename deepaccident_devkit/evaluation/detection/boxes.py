@@ -42,7 +42,6 @@ _CHOICES: Final = {
 }
 _MOST_POINTS: Final = 10_000_000
 """Of all curves together."""
-_EVERY_CATEGORY: Final = tuple((name, (name,)) for name in CATEGORIES)
 
 
 def _check_classes(classes: tuple[tuple[str, tuple[str, ...]], ...]) -> None:
@@ -103,7 +102,7 @@ class DetectionProtocol:
             out of the means.
     """
 
-    classes: tuple[tuple[str, tuple[str, ...]], ...] = _EVERY_CATEGORY
+    classes: tuple[tuple[str, tuple[str, ...]], ...] = tuple((name, (name,)) for name in CATEGORIES)
     frame: str = "lidar"
     truth: TruthSource
     label_velocity: bool = False
@@ -155,8 +154,13 @@ class DetectionProtocol:
             raise ConfigError(
                 f"global_sort: the curve {self.curve!r} is by the order of all scores; choose curve='voc'"
             )
-        if self.error_threshold is not None:
-            self._check_errors(self.error_threshold)
+        if self.error_threshold is not None and (
+            self.error_threshold not in self.thresholds or len(self.ranges) > 1 or self.curve == "voc"
+        ):
+            raise ConfigError(
+                f"error_threshold: {self.error_threshold} needs to be one of the thresholds {self.thresholds}, a "
+                "single range, and another curve than voc; choose None for no errors"
+            )
 
     def limits(self, name: str) -> tuple[float, ...]:
         """The thresholds of a class by its name."""
@@ -167,16 +171,7 @@ class DetectionProtocol:
         """All choices, as JSON holds them."""
         return dict(json.loads(json.dumps(asdict(self))))
 
-    def _check_errors(self, threshold: float) -> None:
-        if threshold not in self.thresholds or len(self.ranges) > 1 or self.curve == "voc":
-            raise ConfigError(
-                f"error_threshold: {threshold} needs to be one of the thresholds {self.thresholds}, a single range, "
-                "and another curve than voc; choose None for no errors"
-            )
 
-
-_PAPER_AREA: Final = (-51.2, 51.2, -51.2, 51.2)
-_PAPER_THRESHOLDS: Final = (1.0, 2.0, 4.0)
 _RELEASED: Final = DetectionProtocol(
     truth="label",
     label_velocity=True,
@@ -211,9 +206,9 @@ DETECTION_PROTOCOLS: Final[Mapping[str, DetectionProtocol]] = {
     "paper": DetectionProtocol(
         truth="visible",
         own_box=False,
-        area=_PAPER_AREA,
+        area=(-51.2, 51.2, -51.2, 51.2),
         measure="distance_bev",
-        thresholds=_PAPER_THRESHOLDS,
+        thresholds=(1.0, 2.0, 4.0),
         matching="by_score",
         curve="nuscenes",
         min_recall=0.1,

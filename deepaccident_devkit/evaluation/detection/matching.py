@@ -158,9 +158,7 @@ def _overlap_of_matches(detections: BoxColumns, truth: BoxColumns, protocol: Det
     if protocol.scale_by_overlap:
         return as_floats(_iou_3d(detections, truth, protocol).diagonal())
     mine, theirs = as_floats(detections.size), as_floats(truth.size)
-    common = _product(np.minimum(mine, theirs))
-    union = _product(mine) + _product(theirs) - common
-    return np.divide(common, union, out=np.zeros_like(common), where=union > 0)
+    return _over_union(_product(np.minimum(mine, theirs)), _product(mine), _product(theirs))
 
 
 def _turn_between(detected: FloatArray, true: FloatArray, protocol: DetectionProtocol) -> FloatArray:
@@ -196,12 +194,12 @@ def _iou_3d(detections: BoxColumns, truth: BoxColumns, protocol: DetectionProtoc
     down = protocol.bottom_taken_as_top
     (low, high), (true_low, true_high) = _heights(detections, down=down), _heights(truth, down=down)
     shared = np.minimum(high[:, None], true_high) - np.maximum(low[:, None], true_low)
-    return _over_union(areas * np.maximum(shared, 0), _product(detections.size), _product(truth.size))
+    return _over_union(areas * np.maximum(shared, 0), _product(detections.size)[:, None], _product(truth.size))
 
 
 def _iou_bev(detections: BoxColumns, truth: BoxColumns, _: DetectionProtocol) -> FloatArray:
     areas = intersection_areas(detections.footprint, truth.footprint)
-    return _over_union(areas, _product(detections.size[:, :2]), _product(truth.size[:, :2]))
+    return _over_union(areas, _product(detections.size[:, :2])[:, None], _product(truth.size[:, :2]))
 
 
 def _heights(boxes: BoxColumns, *, down: bool) -> tuple[FloatArray, FloatArray]:
@@ -214,7 +212,7 @@ def _product(sizes: AnyArray) -> FloatArray:
 
 
 def _over_union(common: FloatArray, mine: FloatArray, theirs: FloatArray) -> FloatArray:
-    union = mine[:, None] + theirs - common
+    union = mine + theirs - common
     return np.divide(common, union, out=np.zeros_like(common), where=union > 0)
 
 
@@ -456,5 +454,6 @@ def _class_table(protocol: DetectionProtocol) -> IntArray:
 @lru_cache(maxsize=8)
 def _limits(protocol: DetectionProtocol) -> FloatArray:
     """(classes, thresholds) costs that pairs of each class must be below."""
-    limits = [[limit_of(one, protocol) for one in protocol.limits(name)] for name, _ in protocol.classes]
-    return readonly(np.array(limits))
+    return readonly(
+        np.array([[limit_of(one, protocol) for one in protocol.limits(name)] for name, _ in protocol.classes])
+    )

@@ -179,9 +179,10 @@ def verify_bundle(
         notes.append(f"cannot be evaluated again: {error}")
     else:
         found += _differences(bundle, run)
-        here = run.summary()["environment"]
-        for name, stored, now in differing(bundle.summary["environment"], here):
-            notes.append(f"evaluated with {name} {stored}, verified with {now}")
+        notes += [
+            f"evaluated with {name} {stored}, verified with {now}"
+            for name, stored, now in differing(bundle.summary["environment"], run.summary()["environment"])
+        ]
     if any(each.where.startswith(f"{SCENARIOS_FILE}: ") for each in found):
         notes.append(
             "numbers are made of the index, which does not see that a file was edited in place; bring it up to date "
@@ -200,13 +201,12 @@ def verify_bundle(
 def check_repeated(bundle: Bundle, given: Mapping[str, object]) -> None:
     """Raise ResultsError unless all `Bundle.outside_paths` are given; it says how to give them as they are there."""
     outside = bundle.outside_paths()
-    if all(given[name] is not None for name in outside):
-        return
-    options = " ".join(f"--{name} {shlex.quote(path)}" for name, path in outside.items())
-    raise ResultsError(
-        f"{bundle.folder}: names paths outside of it, which are opened only if you give them: deepaccident evaluate "
-        f"verify {shlex.quote(os.fspath(bundle.folder))} {options}"
-    )
+    if any(given[name] is None for name in outside):
+        options = " ".join(f"--{name} {shlex.quote(path)}" for name, path in outside.items())
+        raise ResultsError(
+            f"{bundle.folder}: names paths outside of it, which are opened only if you give them: deepaccident "
+            f"evaluate verify {shlex.quote(os.fspath(bundle.folder))} {options}"
+        )
 
 
 def _again(

@@ -199,7 +199,6 @@ class _Table:
             threshold = scores.threshold_of_highest_recall(weight) if math.isnan(r80) else r80
         else:
             threshold = operating
-        counted: dict[str, int] = {kind: int(weight[self._kind == kind].sum()) for kind in KINDS}
         after = partial(scores.tta0_after, threshold, weight)
         return AnticipationFigures(
             auc_ahead=scores.area_at_moments(weight),
@@ -213,7 +212,7 @@ class _Table:
             best_f1=scores.threshold_of_best_f1(weight),
             quiet=scores.threshold_of_alarm_time(weight),
             tta0_after={latency: after(latency) for latency in LATENCIES} if self._sees_others else {},
-            recordings=counted,
+            recordings={kind: int(weight[self._kind == kind].sum()) for kind in KINDS},
             twins=int(weight[self._pairs[:, 0]].sum()),
         )
 
@@ -244,8 +243,9 @@ def mean_of(parts: Sequence[Any]) -> Any:
     if isinstance(first, Mapping):
         return {name: mean_of([each[name] for each in parts]) for name in first}
     if is_dataclass(first) and not isinstance(first, type):
-        names = [each.name for each in fields(first)]
-        return replace(first, **{name: mean_of([getattr(each, name) for each in parts]) for name in names})
+        return replace(
+            first, **{each.name: mean_of([getattr(part, each.name) for part in parts]) for each in fields(first)}
+        )
     return first
 
 

@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 
 from deepaccident_devkit.evaluation.evaluator import ratio
-from deepaccident_devkit.evaluation.warning.recordings import MINUTE, ScoreSeries
+from deepaccident_devkit.evaluation.warning.recordings import MINUTE, ScoreSeries, shares
 from deepaccident_devkit.support.arrays import BoolArray, FloatArray, IntArray, ShortRepr
 
 WINDOW: Final = 3.0
@@ -82,9 +82,8 @@ class CleanScores:
         self._scores = np.where(valid, series.scores, -np.inf)
         lasting = np.minimum(self._scores[:, 1:], self._scores[:, :-1])
         self._lasting = np.concatenate([np.full((len(lasting), 1), -np.inf), lasting], axis=1)
-        columns = np.arange(series.scores.shape[1])
-        early = series.positive[:, None] & (series.toa[:, None] - columns > EARLY * series.fps + _SLACK)
-        self._early = valid & early
+        is_early = series.toa[:, None] - np.arange(series.scores.shape[1]) > EARLY * series.fps + _SLACK
+        self._early = valid & series.positive[:, None] & is_early
         # beyond all thresholds of use: those that a recording's highest score is
         self._levels = np.unique(self.highest[np.isfinite(self.highest)])[::-1]
         self._leads = series.leads(self._levels)
@@ -104,7 +103,7 @@ class CleanScores:
             return math.nan
         true, false = self._raised(weight)
         gained = np.diff(true, prepend=0.0) / self._accidents(weight)
-        return math.fsum((gained * _shares(true, true + false)).tolist())
+        return math.fsum((gained * shares(true, true + false)).tolist())
 
     def area_under_curve(self, weight: FloatArray) -> float:
         """The chance that an accident's highest score is above another recording's, ties half; NaN without both."""
@@ -127,7 +126,7 @@ class CleanScores:
         gained = np.diff(true, prepend=0.0) / self._accidents(weight)
         positive = self.series.positive
         seconds = np.where(np.isfinite(self._leads), self._leads, 0.0)[positive] * weight[positive, None]
-        return math.fsum((gained * _shares(seconds.sum(axis=0), true)).tolist())
+        return math.fsum((gained * shares(seconds.sum(axis=0), true)).tolist())
 
     def threshold_of_highest_recall(self, weight: FloatArray) -> float:
         """The highest threshold with the highest recall of all; infinite without any alarm that is right."""
@@ -142,17 +141,14 @@ class CleanScores:
     def threshold_of_precision(self, weight: FloatArray, precision: float = SAME_RECALL) -> float:
         """Of the thresholds with at least a precision that of the highest recall, then the highest; NaN if none has."""
         true, false = self._raised(weight)
-        good = np.flatnonzero((_shares(true, true + false) >= precision - _SLACK) & (true + false > 0))
-        if not len(good):
-            return math.nan
-        return float(self._levels[good[np.argmax(true[good])]])
+        good = np.flatnonzero((shares(true, true + false) >= precision - _SLACK) & (true + false > 0))
+        return float(self._levels[good[np.argmax(true[good])]]) if len(good) else math.nan
 
     def threshold_of_best_f1(self, weight: FloatArray) -> float:
         """The highest threshold of the best F1 over recordings; NaN without an accident."""
         true, false = self._raised(weight)
-        if not true.any():
-            return math.nan
-        return float(self._levels[np.argmax(2 * true / (true + false + self._accidents(weight)))])
+        whole = true + false + self._accidents(weight)
+        return float(self._levels[np.argmax(2 * true / whole)]) if true.any() else math.nan
 
     def threshold_of_alarm_time(self, weight: FloatArray, seconds_per_minute: float = 1.0) -> float:
         """The lowest threshold with at most so much time in alarm without an accident to come; NaN if none has."""
@@ -211,13 +207,11 @@ class CleanScores:
     def _raised(self, weight: FloatArray) -> tuple[FloatArray, FloatArray]:
         """(K,) accident recordings, and others, whose highest score is at least each level."""
         there = np.isfinite(self.highest)
-        sums: list[FloatArray] = []
-        for kind in (self.series.positive, ~self.series.positive):
-            chosen = kind & there
-            sums.append(
-                np.cumsum(np.bincount(self._place[chosen], weight[chosen], len(self._levels)).astype(np.float64))
-            )
-        return sums[0], sums[1]
+        true, false = (
+            np.cumsum(np.bincount(self._place[chosen], weight[chosen], len(self._levels)).astype(np.float64))
+            for chosen in (there & self.series.positive, there & ~self.series.positive)
+        )
+        return true, false
 
     def _recalls(self, weight: FloatArray) -> FloatArray:
         true, _ = self._raised(weight)
@@ -236,14 +230,9 @@ def _ranks(scores: FloatArray) -> IntArray:
 def _area(ranks: IntArray, positive: BoolArray, weight: FloatArray) -> float:
     """The area under the ROC curve; NaN without both kinds."""
     known = ranks >= 0
-    sides = [
+    here, below = (
         np.bincount(ranks[chosen], weight[chosen], int(ranks.max(initial=0)) + 1)
         for chosen in (known & positive, known & ~positive)
-    ]
-    here, below = sides
+    )
     pairs = here.sum() * below.sum()
     return float((here * (np.cumsum(below) - below / 2)).sum() / pairs) if pairs else math.nan
-
-
-def _shares(part: FloatArray, whole: FloatArray) -> FloatArray:
-    return np.asarray(np.divide(part, whole, out=np.zeros(len(whole)), where=whole > 0))

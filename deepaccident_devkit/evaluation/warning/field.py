@@ -25,6 +25,7 @@ from deepaccident_devkit.evaluation.warning.recordings import (
     parts_of,
     recordings_of,
     series_of,
+    shares,
 )
 from deepaccident_devkit.support.arrays import BoolArray, FloatArray, IntArray, ShortRepr
 from deepaccident_devkit.support.text import choice
@@ -132,13 +133,7 @@ def _recordings(series: ScoreSeries, code: FieldCode) -> tuple[FieldFigures, flo
     high = np.flatnonzero(levels.recall >= 0.8)
     if code == "dsta" and not len(high):
         raise IndexError("no recall of 0.8")
-    figures = FieldFigures(
-        average_precision=_area(levels),
-        mean_time=float(np.mean(levels.time)),
-        time_at_r80=_time_at_r80(levels),
-        precision_at_r80=float(levels.precision[high[0]]) if code == "dsta" else None,
-    )
-    return figures, float(levels.recall[-1])
+    return _of_levels(levels, precision_at_r80=float(levels.precision[high[0]]) if code == "dsta" else None)
 
 
 def _dad(series: ScoreSeries, _code: FieldCode) -> tuple[FieldFigures, float]:
@@ -152,11 +147,7 @@ def _dad(series: ScoreSeries, _code: FieldCode) -> tuple[FieldFigures, float]:
     known = np.isfinite(levels.precision)
     if not known.any():
         return _nothing("dad", "no alarm at any threshold"), math.nan
-    levels = _Points(levels.precision[known], levels.recall[known], levels.time[known])
-    figures = FieldFigures(
-        average_precision=_area(levels), mean_time=float(np.mean(levels.time)), time_at_r80=_time_at_r80(levels)
-    )
-    return figures, float(levels.recall[-1])
+    return _of_levels(_Points(levels.precision[known], levels.recall[known], levels.time[known]))
 
 
 def _drive(series: ScoreSeries, _code: FieldCode) -> tuple[FieldFigures, float]:
@@ -164,20 +155,10 @@ def _drive(series: ScoreSeries, _code: FieldCode) -> tuple[FieldFigures, float]:
     thresholds = np.arange(0, 1.1, 0.1)
     thresholds[[0, -1]] += (_NUDGE, -_NUDGE)
     counted = _frames(series, np.append(thresholds, 0.5))
-    at_half = (each[-1].item() for each in (counted.precision, counted.recall, counted.time))
+    precision, recall, time = (each[-1].item() for each in (counted.precision, counted.recall, counted.time))
     points = _Points(counted.precision[:-1], counted.recall[:-1], counted.time[:-1])
-    several = len(np.unique(points.recall)) > 1
-    levels = _levels(points, drop_lowest=several)
-    precision, recall, time = at_half
-    figures = FieldFigures(
-        average_precision=_area(levels),
-        mean_time=float(np.mean(levels.time)),
-        time_at_r80=_time_at_r80(levels),
-        precision_at_half=precision,
-        recall_at_half=recall,
-        time_at_half=time,
-    )
-    return figures, float(levels.recall[-1])
+    levels = _levels(points, drop_lowest=len(np.unique(points.recall)) > 1)
+    return _of_levels(levels, precision_at_half=precision, recall_at_half=recall, time_at_half=time)
 
 
 _FIGURES: Final = {"ustring": _recordings, "dsta": _recordings, "drive": _drive, "dad": _dad}
@@ -229,9 +210,9 @@ def _frames(series: ScoreSeries, thresholds: FloatArray) -> _Points:
     leads = series.leads(thresholds)[series.positive]
     warned: IntArray = np.isfinite(leads).sum(axis=0)
     return _Points(
-        _over(true, true + false),
-        _over(true, np.full(len(thresholds), len(right))),
-        _over(np.nansum(leads, axis=0), warned),
+        shares(true, true + false),
+        shares(true, np.full(len(thresholds), len(right))),
+        shares(np.nansum(leads, axis=0), warned),
     )
 
 
@@ -261,12 +242,15 @@ def _area(levels: _Points) -> float:
     return float(first + between.sum())
 
 
-def _time_at_r80(levels: _Points) -> float:
-    return float(levels.time[np.argmin(np.abs(levels.recall - 0.8))])
-
-
-def _over(part: IntArray | FloatArray, whole: IntArray) -> FloatArray:
-    return np.asarray(np.divide(part, whole, out=np.zeros(len(whole)), where=whole > 0))
+def _of_levels(levels: _Points, **more: float | None) -> tuple[FieldFigures, float]:
+    """The figures of all codes, with those of one alone; and the highest recall."""
+    figures = FieldFigures(
+        average_precision=_area(levels),
+        mean_time=float(np.mean(levels.time)),
+        time_at_r80=float(levels.time[np.argmin(np.abs(levels.recall - 0.8))]),
+        **more,  # type: ignore[arg-type]  # none of them is `note`
+    )
+    return figures, float(levels.recall[-1])
 
 
 def _nothing(code: FieldCode, why: str) -> FieldFigures:

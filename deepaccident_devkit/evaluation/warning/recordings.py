@@ -33,7 +33,7 @@ from deepaccident_devkit.evaluation.evaluator import Counts
 from deepaccident_devkit.evaluation.map_accidents import TIE, AccidentReading
 from deepaccident_devkit.evaluation.predictions import Accident, Prediction, checked_prediction
 from deepaccident_devkit.motion import MotionLabels
-from deepaccident_devkit.support.arrays import BoolArray, FloatArray, FrozenArrays, IntArray
+from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray, FrozenArrays, IntArray
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
 _SLACK: Final = 1e-6
@@ -86,6 +86,11 @@ class ScoreSeries(FrozenArrays):
         first = self.first(thresholds).astype(np.float64)
         first[first >= self.scores.shape[1]] = np.nan
         return np.asarray((self.toa[:, None] - first) / self.fps)
+
+
+def shares(part: AnyArray, whole: AnyArray) -> FloatArray:
+    """Parts of wholes (N,); 0 where a whole is 0."""
+    return np.asarray(np.divide(part, whole, out=np.zeros(len(whole)), where=whole > 0))
 
 
 MINUTE: Final = 60.0
@@ -344,10 +349,6 @@ def _recording(name: str, samples: Sequence[Counts], part: int) -> Recording:
     kind: Kind = first["kind"]
     ends = [each["frame"] + each["to_end"] for each in samples if each["to_end"] is not None]
     given = [[*each["alarms"], *([score, 0] for score in each["unjudged"])] for each in samples]
-    scores = {GIVEN: _scores(surest(each, kind) for each in given)}
-    for number, each in enumerate(REFERENCES):
-        known = [sample["references"][number] if sample["references"] else [None, None] for sample in samples]
-        scores[each] = _scores(known)
     return Recording(
         name=name,
         story=f"{cluster_of(scenario)}/{agent}",
@@ -356,7 +357,13 @@ def _recording(name: str, samples: Sequence[Counts], part: int) -> Recording:
         part=part,
         frame=frame,
         end=ends[0] if kind != "others" and ends else int(frame[-1]) + 1,
-        scores=scores,
+        scores={
+            GIVEN: _scores(surest(each, kind) for each in given),
+            **{
+                name: _scores(each["references"][number] if each["references"] else [None, None] for each in samples)
+                for number, name in enumerate(REFERENCES)
+            },
+        },
     )
 
 

@@ -16,7 +16,8 @@ from deepaccident_devkit.evaluation import DetectedBoxes
 from deepaccident_devkit.geometry import SE3
 from deepaccident_devkit.geometry.box_arrays import intersection_areas
 from deepaccident_devkit.model.detection.head import CODE_CHANNELS, ClassSlots, DetectionConfig, TaskMaps
-from deepaccident_devkit.model.detection.targets import gather_cells, precise
+from deepaccident_devkit.model.detection.targets import gather_cells
+from deepaccident_devkit.model.warps import precise
 from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray, IntArray, check_least
 from deepaccident_devkit.support.text import settle_choices
 
@@ -106,8 +107,7 @@ def rotated_iou(first: FloatArray, second: FloatArray) -> FloatArray:
 
 def _near(centers: FloatArray, radius: float) -> BoolArray:
     apart = centers[:, None] - centers
-    near: BoolArray = np.einsum("nmi,nmi->nm", apart, apart) <= radius**2
-    return near
+    return np.asarray(np.einsum("nmi,nmi->nm", apart, apart) <= radius**2)
 
 
 def _greedy(same: BoolArray, keep: int) -> IntArray:

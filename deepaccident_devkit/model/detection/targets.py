@@ -11,6 +11,7 @@ from torch import Tensor
 
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.model.detection.head import CODE_CHANNELS, CODE_SIZE, DetectionConfig, TaskMaps
+from deepaccident_devkit.model.warps import precise
 from deepaccident_devkit.support.arrays import check_least
 from deepaccident_devkit.support.text import settle_choices
 from deepaccident_devkit.taxonomy import CATEGORIES
@@ -272,8 +273,3 @@ def gather_cells(maps: Tensor, place: Tensor) -> Tensor:
     """Values (B, C, H, W) at cells (B, K), given as row · W + column: (B, K, C)."""
     channels = maps.shape[1]
     return maps.flatten(2).gather(2, place[:, None].expand(-1, channels, -1)).transpose(1, 2)
-
-
-def precise(values: Tensor) -> Tensor:
-    """In single precision, if mixed precision made them coarser."""
-    return values.to(torch.promote_types(values.dtype, torch.float32))

@@ -114,10 +114,9 @@ class AxialLayer(nn.Module):
     def __init__(self, config: CobevtConfig) -> None:
         super().__init__()
         width, hidden = config.channels, config.expansion * config.channels
-        near, far = Windows(size=config.window), Windows(size=config.window, strided=True)
-        self.window_attention = PreNorm(width, AgentWindowAttention(config, near))
+        self.window_attention = PreNorm(width, AgentWindowAttention(config, Windows(size=config.window)))
         self.window_feed_forward = PreNorm(width, FeedForward(width, hidden, config.dropout))
-        self.grid_attention = PreNorm(width, AgentWindowAttention(config, far))
+        self.grid_attention = PreNorm(width, AgentWindowAttention(config, Windows(size=config.window, strided=True)))
         self.grid_feed_forward = PreNorm(width, FeedForward(width, hidden, config.dropout))
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:

@@ -105,8 +105,7 @@ def _halved(in_channels: int, out_channels: int) -> nn.Sequential:
 
 
 def _convolution(in_channels: int, out_channels: int, *, stride: int = 1) -> tuple[nn.Conv2d, nn.BatchNorm2d]:
-    convolution = nn.Conv2d(in_channels, out_channels, 3, stride, padding=1, bias=False)
-    return convolution, nn.BatchNorm2d(out_channels)
+    return nn.Conv2d(in_channels, out_channels, 3, stride, padding=1, bias=False), nn.BatchNorm2d(out_channels)
 
 
 EncoderConfig = SwinConfig | SmallConvConfig

@@ -182,8 +182,7 @@ class Swin(nn.Module):
             features, larger = stage(features)
             if i in self.config.out_stages:
                 maps.append(self.get_submodule(f"norm{i}")(larger).permute(0, 3, 1, 2).contiguous())
-        fine, coarse = maps
-        return fine, coarse
+        return maps[0], maps[1]
 
 
 class PatchEmbedding(nn.Module):
@@ -297,11 +296,11 @@ def from_official(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
     Raises:
         ConfigError: a name is not one of Swin's.
     """
-    converted = {}
-    for name, tensor in weights.items():
-        if not _DROPPED.fullmatch(name):
-            converted[_renamed(name)] = _channel_major(tensor) if _MERGING.fullmatch(name) else tensor
-    return converted
+    return {
+        _renamed(name): _channel_major(tensor) if _MERGING.fullmatch(name) else tensor
+        for name, tensor in weights.items()
+        if not _DROPPED.fullmatch(name)
+    }
 
 
 def _renamed(name: str) -> str:

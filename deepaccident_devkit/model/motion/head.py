@@ -21,6 +21,7 @@ from deepaccident_devkit.model.motion.decoders import (
     SharedDecoder,
     SpatialDistribution,
 )
+from deepaccident_devkit.model.warps import precise
 from deepaccident_devkit.support.arrays import check_least
 from deepaccident_devkit.support.text import settle_choices
 
@@ -303,7 +304,7 @@ def segmentation_loss(logits: Tensor, target: Tensor, frame_mask: Tensor, config
 
     The target is (N, T, H, W) int64, whose ignored cells have no loss; the mask (N, T) bool.
     """
-    logits = _full(logits)
+    logits = precise(logits)
     losses = functional.cross_entropy(
         logits.flatten(0, 1),
         target.flatten(0, 1),
@@ -319,7 +320,7 @@ def segmentation_loss(logits: Tensor, target: Tensor, frame_mask: Tensor, config
 
 def center_loss(logits: Tensor, target: Tensor, frame_mask: Tensor, config: MotionLossConfig) -> Tensor:
     """Gaussian focal loss (CornerNet, arXiv:1808.01244) of (N, T, 1, H, W), over the discounted number of centres."""
-    logits = _full(logits)
+    logits = precise(logits)
     likely = logits.sigmoid().clamp(_CLIP, 1 - _CLIP)
     center = target == 1
     hit = -likely.log() * (1 - likely).square()
@@ -334,7 +335,7 @@ def vector_loss(vectors: Tensor, target: Tensor, frame_mask: Tensor, config: Mot
 
     A cell is ignored if either channel of the target has the mark; the frames' mask is (N, T) bool.
     """
-    vectors = _full(vectors)
+    vectors = precise(vectors)
     error = (vectors - target.to(vectors)).abs().sum(dim=2) * _discounts(vectors, config)[:, None, None]
     return _mean(error, (target != config.ignore_index).all(dim=2) & frame_mask[:, :, None, None])
 
@@ -344,8 +345,8 @@ def latent_loss(present: LatentDistribution, future: LatentDistribution, sample_
 
     Summed over the latent's channels, averaged over its cells and over the samples in `sample_mask` (N,) bool.
     """
-    mu, log_sigma = (_full(each) for each in present)
-    future_mu, future_log_sigma = (_full(each) for each in future)
+    mu, log_sigma = (precise(each) for each in present)
+    future_mu, future_log_sigma = (precise(each) for each in future)
     spread = (2 * (future_log_sigma - log_sigma)).exp() + ((future_mu - mu) * (-log_sigma).exp()).square()
     divergence = (log_sigma - future_log_sigma + (spread - 1) / 2).sum(dim=1)
     return _mean(divergence, sample_mask[:, None, None].expand_as(divergence))
@@ -359,8 +360,3 @@ def _discounts(like: Tensor, config: MotionLossConfig) -> Tensor:
 def _mean(values: Tensor, mask: Tensor) -> Tensor:
     """The mean of the values in the mask; zero, with zero gradients, if there are none."""
     return torch.where(mask, values, 0).sum() / mask.sum().clamp(min=1)
-
-
-def _full(values: Tensor) -> Tensor:
-    """In float32 at least: sums over maps overflow half precision."""
-    return values.to(torch.promote_types(values.dtype, torch.float32))
