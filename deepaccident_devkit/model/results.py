@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch.utils.data import DataLoader
@@ -43,9 +43,6 @@ from deepaccident_devkit.taxonomy import CAMERAS, FRAME_PERIOD
 from deepaccident_devkit.v2x import AgentConfig, Agents, Link
 from deepaccident_devkit.v2x.messages import POSE_BYTES, traffic_note
 from deepaccident_devkit.v2x.tracks import scenario_tracks
-
-if TYPE_CHECKING:
-    pass
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
