@@ -22,8 +22,8 @@ BOX = (0.0, 0.0)
 """The agent's own, which these rules do not take."""
 DRAW_WHAT_IS_THERE = ("uniad", "bev_planner")
 """They draw nothing at steps that are not recorded; the others draw what they are given."""
-HALF_WAY = {"vad": 6}
-"""The sample in which corners lie half-way between two cells, and float32 decides."""
+FLOATS = "vad"
+"""It makes corners of boxes in float32, which decides where one lies half-way between two cells."""
 
 
 @functools.cache
@@ -55,7 +55,7 @@ def drawn(objects: np.ndarray, step: int, protocol: str) -> np.ndarray:
 @pytest.mark.parametrize("protocol", PUBLIC)
 def test_the_rasters_are_those_of_the_code(folder: Path, protocol: str) -> None:
     inputs, stored = arrays(folder / "inputs.npz"), rasters(folder, protocol)
-    assert len(stored) == 40
+    assert len(stored)
     rules = CELL_PROTOCOLS[protocol]
     for sample, cells in enumerate(stored):
         objects = inputs["objects"][inputs["objects"][:, 0] == sample]
@@ -63,11 +63,10 @@ def test_the_rasters_are_those_of_the_code(folder: Path, protocol: str) -> None:
             if protocol in DRAW_WHAT_IS_THERE and not inputs["valid"][sample, step]:
                 assert not cells[step].any()
                 continue
-            found = occupied(drawn(objects, step + 1, protocol), rules)
-            if HALF_WAY.get(protocol) == sample:
-                assert (found != cells[step]).sum() <= 5
-            else:
-                assert_array_equal(found, cells[step], err_msg=f"sample {sample}, step {step + 1}")
+            corners = drawn(objects, step + 1, protocol)
+            half_way = protocol == FLOATS and (np.abs(corners / rules.cell % 1 - 0.5) < 1e-5).any()
+            off = occupied(corners, rules) != cells[step]
+            assert off.sum() <= (25 if half_way else 0), f"sample {sample}, step {step + 1}"
 
 
 def numbers_of(folder: Path, protocol: str) -> tuple[list[np.ndarray], list[np.ndarray], list[dict[str, np.ndarray]]]:
@@ -150,8 +149,9 @@ def test_contacts_are_those_of_closed_forms(golden) -> None:
     assert_allclose(numbers, [told[name] for name in ("t", "ego_speed", "relative_speed")], atol=1e-6)
 
 
-def test_the_definitions_disagree_as_the_page_says(folder: Path) -> None:
-    """Sample 35, of docs/protocols.md: one plan that drives through a car at 2.5 s."""
+def test_the_definitions_disagree_as_the_page_says() -> None:
+    """Sample 35 of our own goldens, in docs/protocols.md: one plan that drives through a car at 2.5 s."""
+    folder = Path(__file__).parents[1] / "data" / "golden" / "planning"
     found = {protocol: numbers_of(folder, protocol)[2][35] for protocol in PUBLIC}
     collisions = {protocol: (100 * each["collision"]).tolist() for protocol, each in found.items()}
     sixth = pytest.approx(100 / 6)
