@@ -12,7 +12,7 @@ from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -29,46 +29,58 @@ from deepaccident_devkit.support.text import number_of, path_of
 from deepaccident_devkit.taxonomy import BEV_CAMERA, BEV_SHAPE, CAMERAS, LIDAR, OWN_ACTOR_ID
 from deepaccident_devkit.testing import SmallRelease, write_small_release
 
-_COMPONENT, _CENTER = "(vel.*|speed)_[xy]_|_v_?[xy]_", "pos|_loc|cent|trans|coord|_[xyz]_"
-_COLUMNS: Final[Mapping[str, tuple[float, float, str, str]]] = {
-    "line 1 of the labels, number 1": (
-        14.05,
-        0.003,
-        "own velocity along the world's x",
-        "vel.*_[xy]_|_v_?[xy]_|speed_[xy]_",
+
+class _Column(NamedTuple):
+    """A column of the files.
+
+    Attributes:
+        first: its number in the first row of the release that readers are audited with.
+        step: what is added from row to row; 0 for a column that keeps what it has.
+        meaning: what it is.
+        right: a pattern of names that are right for it.
+    """
+
+    first: float
+    step: float
+    meaning: str
+    right: str
+
+
+_CENTER: Final = "pos|_loc|cent|trans|coord|_[xyz]_"
+_VELOCITY: Final = "vel.*_[xy]_|_v_?[xy]_|speed_[xy]_"
+_RAW: Final = "raw|label|undecoded|stored"
+_COLUMNS: Final[Mapping[str, _Column]] = {
+    "line 1 of the labels, number 1": _Column(14.05, 0.003, "own velocity along the world's x", _VELOCITY),
+    "line 1 of the labels, number 2": _Column(-15.05, -0.003, "own velocity along the world's y", _VELOCITY),
+    "column 2 of the labels": _Column(20.03, 0.03, "x of the box's centre in the LiDAR frame", _CENTER),
+    "column 3 of the labels": _Column(-31.03, -0.03, "y of the box's centre, to the right", _CENTER),
+    "column 4 of the labels": _Column(-1.61, -0.001, "z of the box's centre", _CENTER),
+    "column 5 of the labels": _Column(
+        4.513, 0.002, "the box's length; next are width and height", "length|_l_|size|dim"
     ),
-    "line 1 of the labels, number 2": (
-        -15.05,
-        -0.003,
-        "own velocity along the world's y",
-        "vel.*_[xy]_|_v_?[xy]_|speed_[xy]_",
+    "column 6 of the labels": _Column(2.013, 0.001, "the box's width; before it is the length", "width|_w_|size|dim"),
+    "column 7 of the labels": _Column(1.113, 0.001, "the box's height, after length and width", "height|_h_|size|dim"),
+    "column 8 of the labels": _Column(
+        2.513, 0.0015, "the box's yaw in the LiDAR frame, clockwise", "yaw_$|head|rot|angle"
     ),
-    "column 2 of the labels": (20.03, 0.03, "x of the box's centre in the LiDAR frame", _CENTER),
-    "column 3 of the labels": (-31.03, -0.03, "y of the box's centre, to the right", _CENTER),
-    "column 4 of the labels": (-1.61, -0.001, "z of the box's centre", _CENTER),
-    "column 5 of the labels": (4.513, 0.002, "the box's length; next are width and height", "length|_l_|size|dim"),
-    "column 6 of the labels": (2.013, 0.001, "the box's width; before it is the length", "width|_w_|size|dim"),
-    "column 7 of the labels": (1.113, 0.001, "the box's height, after length and width", "height|_h_|size|dim"),
-    "column 8 of the labels": (2.513, 0.0015, "the box's yaw in the LiDAR frame, clockwise", "yaw_$|head|rot|angle"),
-    "column 9 of the labels": (41.03, 0.03, "vx, of no frame until it is decoded", "raw|label|undecoded|stored"),
-    "column 10 of the labels": (-51.03, -0.03, "vy, of no frame until it is decoded", "raw|label|undecoded|stored"),
-    "column 11 of the labels": (0, 0, "the actor's id", "_ids?_|actor|track"),
-    "column 12 of the labels": (2103, 7, "the LiDAR points in the box", "point|pts|lidar|_num_|_count_"),
-    "column 13 of the labels": (0, 0, "whether a camera of the agent sees the box", "visib|seen|occl"),
-    "line 1 of meta, word 9": (12, 0, "the simulated frames, ten more than recorded", "frame|length|_num_|count|total"),
+    "column 9 of the labels": _Column(41.03, 0.03, "vx, of no frame until it is decoded", _RAW),
+    "column 10 of the labels": _Column(-51.03, -0.03, "vy, of no frame until it is decoded", _RAW),
+    "column 11 of the labels": _Column(0, 0, "the actor's id", "_ids?_|actor|track"),
+    "column 12 of the labels": _Column(2103, 7, "the LiDAR points in the box", "point|pts|lidar|_num_|_count_"),
+    "column 13 of the labels": _Column(0, 0, "whether a camera of the agent sees the box", "visib|seen|occl"),
+    "line 1 of meta, word 9": _Column(
+        12, 0, "the simulated frames, ten more than recorded", "frame|length|_num_|count|total"
+    ),
 }
-"""Place → the number in the first row, the step to the next, what it is, and a pattern of names that are right."""
+"""Place in the files → the column."""
 _BELIEFS: Final = "|".join(
-    ["ttc|tta_|countdown|time_to|remaining|rate_|speed|vel|_v_?[xyz]_|colli|crash|accident|_hit_"]
-    + [right for _, _, _, right in _COLUMNS.values()]
+    ["ttc|tta_|eta_|countdown|time_to|remaining|_left_|until|rate_|angular|accel|speed|vel|_v_|_v_?[xyz]_"]
+    + ["colli|crash|accident|_hit_"]
+    + [column.right for column in _COLUMNS.values()]
 )
 """Names that say what something is: of what no column has, and those that are right of some column."""
 _PICTURE: Final = r"(?i)image|img|rgb|picture|photo|\.(jpe?g|png)$"
 """Files, keys and paths that are called so may be pictures."""
-_REMEDIES: Final = {
-    "misread": "docs/format.md says what each column holds; of vx and vy, v_world = Rz(−yaw) · (vx, vy).",
-    "picture": "Keep the array: JPEG changes ids and classes. Channel 2 is the class, 1 + 256 · 0 the object.",
-}
 
 
 def write_audit_release(out: Path) -> Path:
@@ -125,44 +137,71 @@ def audit_reader(reader: Callable[[str], object] | str | os.PathLike[str]) -> Au
     with TemporaryDirectory() as temporary:
         release = write_audit_release(Path(temporary) / "release")
         folder = release if callable(reader) else path_of(reader)
-        held: dict[str, list[Any]] = defaultdict(list)
-        for path, leaf in _leaves(reader(str(release)) if callable(reader) else _written(folder)):
-            key = "/".join("*" if isinstance(each, int) else each for each in path).lstrip("/")
-            held[key].append(leaf)
-            held[f"{key}[{path[-1]}]"].append(leaf)  # a place of a list, such as [x, y, z]
-        named: dict[str, Any] = {str(path.relative_to(folder)): path for path in sorted(folder.rglob("*"))} | {
-            each if isinstance(each, str) else key: each
-            for key in held
-            for each in held[key]
-            if "[" not in key and isinstance(each, str | np.ndarray)
-        }
-        pictures = [name for name, each in named.items() if re.search(_PICTURE, name) and _is_bev(each)]
-        labels = read_labels(sorted(release.glob("*/*/label/*/*.txt")), raw=True)
-    boxes = [labels.center, labels.size, labels.yaw, labels.velocity, labels.actor_id, labels.num_lidar_pts]
-    others = np.column_stack(boxes)[labels.actor_id != OWN_ACTOR_ID].T  # the own velocity is that of line 1
-    numbers = [*labels.agent_velocity.T, *others, np.full(1, math.inf), np.full(1, 12.0)]
-    columns = {place: np.abs(each) for place, each in zip(_COLUMNS, numbers, strict=True)}
+        held = _by_key(reader(str(release)) if callable(reader) else _written(folder))
+        pictures = [name for name, each in _named(folder, held) if re.search(_PICTURE, name) and _is_bev(each)]
+        columns = _numbers_of(release)
     rows: dict[str, Row] = {}
-    found = [("picture", "the BEV camera's array became an RGB picture: its channels are ids and classes", pictures)]
+    findings = []
+    if pictures:
+        findings.append(
+            AuditFinding(
+                kind="picture",
+                what="the BEV camera's array became an RGB picture: its channels are ids and classes.",
+                remedy="Keep the array: JPEG changes ids and classes. Channel 2 is the class, 1 + 256 · 0 the object.",
+                number=len(pictures),
+                examples=tuple(pictures[:3]),
+            )
+        )
     for key, values in held.items():
         place, hits = _column(values, columns)
-        if hits and key.rpartition("[")[0] not in rows:
-            name, meaning, right = _name(key), *_COLUMNS[place][2:]
-            wrong = re.search(_BELIEFS, name) and not re.search(right, name)
-            rows[key] = (key, place, f"{hits} of {len(values)}", "misread" if wrong else "")
-            what = f"{key} holds {place}: {meaning}; you read it as `{name.strip('_')}`"
-            found += [("misread", what, [])] if wrong else []
-    return AuditReport(
-        findings=tuple(
-            AuditFinding(
-                kind=kind, what=f"{what}.", remedy=_REMEDIES[kind], number=len(each) or 1, examples=tuple(each[:3])
+        if not hits or key.rpartition("[")[0] in rows:  # the whole list is of one column
+            continue
+        name, column = _name(key), _COLUMNS[place]
+        is_wrong = re.search(_BELIEFS, name) is not None and not re.search(column.right, name)
+        rows[key] = (key, place, f"{hits} of {len(values)}", "misread" * is_wrong)
+        if is_wrong:
+            findings.append(
+                AuditFinding(
+                    kind="misread",
+                    what=f"{key} holds {place}: {column.meaning}; you read it as `{name.strip('_')}`.",
+                    remedy="docs/format.md says what each column holds; of vx and vy, v_world = Rz(−yaw) · (vx, vy).",
+                    number=1,
+                )
             )
-            for kind, what, each in found
-            if each or kind == "misread"
-        ),
+    return AuditReport(
+        findings=tuple(findings),
         tables={"keys": [("key", "holds", "values", ""), *rows.values()]},
         notes=() if rows or pictures else ("No key holds numbers of the release.",),
     )
+
+
+def _by_key(read: object) -> dict[str, list[Any]]:
+    """The leaves of what was read by their key, `annotations/*/size`; places of a list also by `…/size[0]`."""
+    held: dict[str, list[Any]] = defaultdict(list)
+    for path, leaf in _leaves(read):
+        key = "/".join("*" if isinstance(each, int) else each for each in path).lstrip("/")
+        held[key].append(leaf)
+        held[f"{key}[{path[-1]}]"].append(leaf)
+    return held
+
+
+def _named(folder: Path, held: Mapping[str, Sequence[Any]]) -> Iterator[tuple[str, Any]]:
+    """Name and what may be a picture: files of a folder, texts that may be paths, and arrays by their key."""
+    yield from ((str(path.relative_to(folder)), path) for path in sorted(folder.rglob("*")))
+    for key, leaves in held.items():
+        if "[" not in key:
+            yield from {each: each for each in leaves if isinstance(each, str)}.items()
+            yield from ((key, each) for each in leaves if isinstance(each, np.ndarray))
+
+
+def _numbers_of(release: Path) -> dict[str, FloatArray]:
+    """Place in the files → the numbers there, without their signs."""
+    labels = read_labels(sorted(release.glob("*/*/label/*/*.txt")), raw=True)
+    boxes = [labels.center, labels.size, labels.yaw, labels.velocity, labels.actor_id, labels.num_lidar_pts]
+    others = np.column_stack(boxes)[labels.actor_id != OWN_ACTOR_ID].T  # the own velocity is that of line 1
+    flags, frames = np.full(1, math.inf), np.full(1, _COLUMNS["line 1 of meta, word 9"].first)
+    numbers = [*labels.agent_velocity.T, *others, flags, frames]
+    return {place: np.abs(each) for place, each in zip(_COLUMNS, numbers, strict=True)}
 
 
 def _written(folder: Path) -> dict[str, Any]:
@@ -202,12 +241,17 @@ def _column(values: Sequence[Any], columns: Mapping[str, FloatArray]) -> tuple[s
 
 
 def _name(key: str) -> str:
-    """The name of a key as words between underscores, of places with their axis: `_velocity_x_`, `_w_` of `whl`."""
-    last = [each for each in ["", *key.split("/")] if each[:1] != "*"][-1].partition("[")[0]
-    words = "_".join(re.findall(r"[A-Z]?[a-z]+|[A-Z]+|\d+", last)).lower()
-    axes = words if re.fullmatch("[xyzwhl]{2,3}", words) else "xyz" if re.search("vel|speed", words) else ""
+    """The name of a key as words between underscores, and the axis of a place: `_velocity_x_`, `_w_` of `size_whl`."""
+    names = [each.partition("[")[0] for each in ["", *key.split("/")] if each[:1] != "*"]
+    told = "_".join(names[-2:]) if re.fullmatch("[xyz]", names[-1]) else names[-1]
+    words = "_".join(re.findall(r"[A-Z]?[a-z]+|[A-Z]+|\d+", told)).lower()
+    axes = words.rpartition("_")[2]
+    if not re.fullmatch("[xyzwhl]{2,3}", axes):
+        axes = "xyz" if re.search("vel|speed", words) else ""
     axis = "".join(axes[int(place) : int(place) + 1] for place in re.findall(r"\[(\d+)\]$", key))
-    return f"_{'' if words == axes and axis else words}_{axis}_".replace("___", "_").replace("__", "_")
+    if axis in ("w", "h", "l") or words == axes:  # which says it all
+        return f"_{axis or words}_"
+    return f"_{words}_{axis}_".replace("__", "_")
 
 
 def _is_bev(picture: Any) -> bool:

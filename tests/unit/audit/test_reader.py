@@ -230,3 +230,28 @@ def test_nothing_that_is_known() -> None:
 def test_errors_of_a_reader_are_its_own() -> None:
     with pytest.raises(ZeroDivisionError):
         audit_reader(lambda _: 1 / 0)
+
+
+@pytest.mark.parametrize(
+    ("name", "place", "column"),
+    [
+        ("eta", lambda row: float(row[11]), "column 12 of the labels"),
+        ("seconds_left", lambda row: int(row[11]), "column 12 of the labels"),
+        ("size_whl", lambda row: [float(word) for word in row[4:7]], "column 5 of the labels"),
+        ("boxWHL", lambda row: [float(word) for word in row[4:7]], "column 6 of the labels"),
+        ("v", lambda row: float(row[8]), "column 9 of the labels"),
+        ("velocity_xy", lambda row: [float(row[8]), float(row[9])], "column 9 of the labels"),
+    ],
+    ids=["eta", "left", "size_whl", "WHL", "v", "velocity_xy"],
+)
+def test_names_that_tell_what_a_reader_believes(name: str, place: Any, column: str) -> None:
+    found = misread(audit_reader(lambda root: [{name: place(row)} for row in rows(root) if row[10] != "-100"]))
+    assert column in found.values(), found
+
+
+def test_velocities_of_line_1_are_in_the_world_whatever_they_are_called() -> None:
+    def read(root: str) -> Any:
+        lines = [path.read_text().splitlines()[0].split() for path in sorted(Path(root).glob("*/*/label/*/*.txt"))]
+        return [{"velocity_xy": [float(words[0]), float(words[1])], "vel": {"x": float(words[0])}} for words in lines]
+
+    assert misread(audit_reader(read)) == {}
