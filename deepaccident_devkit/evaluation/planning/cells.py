@@ -183,13 +183,15 @@ def cell_numbers(
     and the step stays in the denominator: `left_out` is the share of such steps.
 
     Returns:
-        Each (3,): `l2` metres; `collision`, `point_collision` and `left_out` shares. NaN if the sample does not count.
+        Each (3,): `l2` metres, and `l2_endpoint`, which is at the horizon whatever the rules, NaN where nothing is
+        recorded then; `collision`, `point_collision` and `left_out` shares. NaN if the sample does not count.
     """
     own, true = touched
     masked = true[0] | ~valid
     error = np.where(valid, np.hypot(*(path - recorded).T), 0.0)
     by_step: dict[str, tuple[AnyArray, Over]] = {
         "l2": (error, rules.error),
+        "l2_endpoint": (np.where(valid, error, np.nan), "step"),
         "collision": (own[0] & ~masked, rules.box_over),
         "point_collision": (own[1] & ~masked, rules.point_over),
         "left_out": (masked, "mean" if rules.box_over == "any" else rules.box_over),

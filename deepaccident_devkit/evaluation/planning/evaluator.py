@@ -66,6 +66,7 @@ class PlanningResult(MeansResult):
         "collision": Column("%"),
         "point_collision": Column("%"),
         "left_out": Column("%", "neither"),
+        "l2_endpoint": Column("m", is_headline=False),
         "impact_speed": Column("m/s", is_headline=False),
         "relative_speed": Column("m/s", is_headline=False),
         "prolonged": Column("%", "neither", is_headline=False),
@@ -156,7 +157,7 @@ def _add_cells(sums: Sums, token: str, rows: Mapping[str, Plan], scene: Planning
     for name, path in paths.items():
         numbers = cell_numbers(path, true, valid, (found[name], found[TRIVIAL[0]]), rules)
         for column, values in numbers.items():
-            scaled = values if column == "l2" else 100.0 * values
+            scaled = values if column.startswith("l2") else 100.0 * values
             for table, value in zip((*_BY_HORIZON, _MEAN), (*scaled, scaled.mean()), strict=True):
                 sums.add(table, name, column, float(value))
 
