@@ -51,6 +51,8 @@ class Plan(FrozenArrays):
         times = ascending_times(self.times)
         path = checked("path", self.path, (len(times), 2)).copy()
         yaw = None if self.yaw is None else checked("yaw", self.yaw, (len(times),)).copy()
+        if not times[-1] > 0:
+            raise GeometryError("times: expected a plan for after the present, found the present alone")
         if not np.isfinite(path).all() or (yaw is not None and not np.isfinite(yaw).all()):
             raise GeometryError("path: not all numbers are finite; leave out what is not planned")
         checks = {"times": times, "path": path, "yaw": yaw, "score": checked_number("score", self.score)}

@@ -47,6 +47,7 @@ def test_what_cannot_be_evaluated() -> None:
             ("ends after 2 s", "3 s ahead", "clean"),
         ),
         (lambda: Plan(times=[1, 1], path=np.zeros((2, 2))), GeometryError, "times: expected ascending seconds"),
+        (lambda: Plan(times=[0], path=np.zeros((1, 2))), GeometryError, "times: expected a plan for after the present"),
         (lambda: Plan(times=[1, 2], path=np.zeros((3, 2))), GeometryError, "path: expected shape"),
         (lambda: Plan(times=[1, 2], path=np.full((2, 2), np.nan)), GeometryError, "path: not all numbers are finite"),
         (lambda: Plan(times=[1], path=np.zeros((1, 2)), yaw=[np.inf]), GeometryError, "not all numbers are finite"),
