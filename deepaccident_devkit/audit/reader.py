@@ -260,6 +260,8 @@ def _is_bev(picture: Any) -> bool:
 
     with suppress(ValueError, cv2.error):
         pixels = read_image(Path(picture)) if isinstance(picture, str | Path) else np.asarray(picture, dtype=np.uint8)
+        if pixels.ndim != 3 or pixels.shape[2] != 3 or not pixels.size:
+            return False
         small = cv2.resize(pixels, (12, 12), interpolation=cv2.INTER_AREA).astype(float)
         true = _bev()[50::100, 50::100]
         return small.shape == true.shape and bool(

@@ -113,7 +113,8 @@ def occupied(corners: FloatArray, rules: CellRules) -> BoolArray:
     import cv2
 
     drawn = np.zeros((rules.size, rules.size), dtype=np.uint8)
-    for polygon in cells.astype(np.int32):
+    there = (cells.max(axis=1) >= 0).all(axis=1) & (cells.min(axis=1) < rules.size).all(axis=1)
+    for polygon in cells[there].astype(np.int32):
         cv2.fillPoly(drawn, [polygon], 1)
     return drawn.astype(bool)
 
