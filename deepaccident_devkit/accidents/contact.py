@@ -23,7 +23,7 @@ _COARSE: Final = 0.32
 """Seconds of the longest intervals."""
 _HALVINGS: Final = 20
 """How often an interval is halved at most: down to 0.3 µs, in which a car moves by less than 0.01 mm."""
-_TOUCHING: Final = 1e-9
+TOUCHING: Final = 1e-9
 """Metres of a gap that still counts as contact."""
 
 
@@ -72,7 +72,7 @@ def pair_of(paths: ArrayLike, sizes: ArrayLike, *, margin: float | None = None) 
     first, second = (motion_of(path) for path in both)
     if margin is None:
         last = [np.concatenate([path[-1, :2], size, path[-1, 2:]]) for path, size in zip(both, flat, strict=True)]
-        margin = float(gaps_of_pairs(last[0], last[1])) + _TOUCHING
+        margin = float(gaps_of_pairs(last[0], last[1])) + TOUCHING
     return Pair(motions=(first, second), sizes=flat, margin=margin)
 
 

@@ -16,6 +16,7 @@ from deepaccident_devkit.errors import ResultsError, shortened
 from deepaccident_devkit.evaluation.breakdowns import cluster_of
 from deepaccident_devkit.evaluation.intervals import LEAST_CLUSTERS
 from deepaccident_devkit.evaluation.results import read_results
+from deepaccident_devkit.evaluation.warning.clean import roc_area
 from deepaccident_devkit.reports import Row
 from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray, IntArray, as_floats
 from deepaccident_devkit.support.json_text import parsed_json
@@ -129,9 +130,8 @@ def audit_scores(
     *areas, own = (_area(np.asarray(each, dtype=float), truth) for each in columns)
     told, findings = list[Row](), list[AuditFinding]()
     for name, area, numbers in zip(_IS, [*areas, _area(frame, truth[of])], np.concatenate(found), strict=True):
-        fitting = max(
-            area, 0.5 if name in ("town", "weather") else round(1 - area, 3)
-        )  # less leaves a share out too much
+        # of shares of others an AUC below a half is no fit: leaving one out pushes it there
+        fitting = max(area, 0.5 if name in ("town", "weather") else round(1 - area, 3))
         told.append((name, fitting, *numbers.flatten().tolist()))
         rises = bool(numbers[0, 0] > 0)
         if ((numbers[:, 1] if rises else -numbers[:, 2]) > FOLLOWED).all():
@@ -151,10 +151,8 @@ def audit_scores(
 
 def _area(values: FloatArray, truth: BoolArray) -> float:
     """The area under the ROC curve, of three decimals; 0.5 where all end alike."""
-    from scipy.stats import rankdata
-
-    hits, pairs = truth.sum(), truth.sum() * (~truth).sum()
-    return round(float((rankdata(values)[truth].sum() - hits * (hits + 1) / 2) / pairs), 3) if pairs else 0.5
+    area = roc_area(np.unique(values, return_inverse=True)[1], truth, np.ones(len(truth)))
+    return 0.5 if math.isnan(area) else round(area, 3)
 
 
 def _means(words: AnyArray, values: AnyArray, cluster: IntArray | None = None) -> FloatArray:

@@ -1,4 +1,4 @@
-"""The official metrics, and those that the paper describes: motion, accidents, detection, warnings.
+"""The official metrics, those that the paper describes, and those of others: see the packages of the tasks.
 
 Each task has a package, which counts arrays and sums the counts; `results` are predictions in files; `runs` evaluates
 them into bundles that others can check, and looks for mistakes in predictions (`runs.sanity`). `breakdown` sums by
@@ -19,9 +19,11 @@ from deepaccident_devkit.evaluation.accident import (
 from deepaccident_devkit.evaluation.breakdowns import Breakdown, SampleAttributes, breakdown, sample_attributes
 from deepaccident_devkit.evaluation.detection import DetectedBoxes, DetectionEvaluator, DetectionResult, detection_truth
 from deepaccident_devkit.evaluation.evaluator import Evaluator, evaluate_samples
+from deepaccident_devkit.evaluation.forecasting import Forecast, ForecastingEvaluator, ForecastingResult
 from deepaccident_devkit.evaluation.instances import match_trajectories, vpq_counts
 from deepaccident_devkit.evaluation.intervals import Resampling
 from deepaccident_devkit.evaluation.motion import MotionEvaluator, MotionResult, motion_counts
+from deepaccident_devkit.evaluation.planning import Plan, PlanningEvaluator, PlanningResult
 from deepaccident_devkit.evaluation.predictions import Accident, MotionOutput, instances_of
 from deepaccident_devkit.evaluation.results import Results, ResultsWriter, read_results
 from deepaccident_devkit.evaluation.warning import (
@@ -48,10 +50,16 @@ __all__ = [
     "Evaluator",
     "FieldResult",
     "FieldWarnings",
+    "Forecast",
+    "ForecastingEvaluator",
+    "ForecastingResult",
     "MotionEvaluator",
     "MotionOutput",
     "MotionResult",
     "PaperAccidents",
+    "Plan",
+    "PlanningEvaluator",
+    "PlanningResult",
     "Resampling",
     "Results",
     "ResultsWriter",

@@ -9,6 +9,7 @@ from typing import Final
 
 import numpy as np
 
+from deepaccident_devkit.accidents.contact import TOUCHING
 from deepaccident_devkit.accidents.outcomes import MOST_MARGIN
 from deepaccident_devkit.accidents.replay import HORIZON
 from deepaccident_devkit.evaluation.means import Sums
@@ -23,8 +24,6 @@ _SLACK: Final = 1e-6
 """Seconds and metres: times are decimal numbers, and a path projected on itself loses digits."""
 _NEAREST: Final = 0.2
 """Seconds from a sample to the lead that it counts for: lists of samples count back from each recording's own end."""
-_TOUCHING: Final = 1e-9
-"""Metres of a gap that still counts as contact."""
 _FAR: Final = 1.0
 """Metres of a recorded way from which the share of it that is lost says something."""
 
@@ -71,9 +70,12 @@ def add_clean(sums: Sums, plans: Mapping[str, Plan], scene: PlanningScene, rules
         for lead in rules.leads
         if abs(end - lead) <= _NEAREST + _SLACK
     ]
+    steps = steps_of(STEP, min(scene.duration, HORIZONS[-1]))
+    recorded = recorded_poses(scene, steps)
     for row, plan in plans.items():
+        away = np.hypot(*(plan.poses(steps) - recorded)[:, :2].T)
         for horizon in HORIZONS:
-            for column, value in _at_horizon(plan, scene, found[row], horizon).items():
+            for column, value in _at_horizon(away, scene, found[row], horizon).items():
                 sums.add(f"{horizon} s", row, column, value)
         if leads:
             numbers = _at_lead(plan, scene, found[row], true, rules)
@@ -94,14 +96,13 @@ def _contacts(plan: Plan, scene: PlanningScene, margin: float) -> Contacts:
     )
 
 
-def _at_horizon(plan: Plan, scene: PlanningScene, contacts: Contacts, horizon: int) -> dict[str, float]:
-    """Errors and contacts of a plan up to a horizon; NaN where nothing is recorded."""
-    steps = steps_of(STEP, min(scene.duration, horizon))
-    away = np.hypot(*(plan.poses(steps) - recorded_poses(scene, steps))[:, :2].T)
+def _at_horizon(away: FloatArray, scene: PlanningScene, contacts: Contacts, horizon: int) -> dict[str, float]:
+    """Errors (N,) at the recorded steps, and contacts, of a plan up to a horizon; NaN where nothing is recorded."""
+    last = round(horizon / STEP)
     touches = (contacts.time <= min(horizon, scene.duration) + _SLACK).any()
     return {
-        "l2": float(away[-1]) if len(away) == round(horizon / STEP) else np.nan,
-        "l2_mean": float(away.mean()) if len(away) else np.nan,
+        "l2": float(away[last - 1]) if len(away) >= last else np.nan,
+        "l2_mean": float(away[:last].mean()) if len(away) else np.nan,
         "contact": 100.0 * touches if len(away) else np.nan,
     }
 
@@ -147,7 +148,7 @@ def _margin(scene: PlanningScene) -> float:
     """The gap between the recorded pair at the end, which counts as contact; NaN without a partner."""
     ego = np.concatenate([box_path(scene.recorded[-1:], scene.offset)[0, :2], scene.size, scene.recorded[-1, 2:]])
     gaps = gaps_of_pairs(ego, scene.footprint[-1, scene.partner])
-    return float(gaps[0]) + _TOUCHING if len(gaps) else np.nan
+    return float(gaps[0]) + TOUCHING if len(gaps) else np.nan
 
 
 def _prolonged(scene: PlanningScene, frames: int) -> FloatArray:

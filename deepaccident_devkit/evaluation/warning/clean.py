@@ -107,14 +107,14 @@ class CleanScores:
 
     def area_under_curve(self, weight: FloatArray) -> float:
         """The chance that an accident's highest score is above another recording's, ties half; NaN without both."""
-        return _area(self._ranks, self.series.positive, weight)
+        return roc_area(self._ranks, self.series.positive, weight)
 
     def area_at_moments(self, weight: FloatArray) -> float:
         """The chance that an accident's score is above another recording's as long before the end, ties half.
 
         Mean over the moments of the last seconds at which there are both kinds; NaN without any.
         """
-        areas = [_area(ranks, self.series.positive, weight) for ranks in self._moments]
+        areas = [roc_area(ranks, self.series.positive, weight) for ranks in self._moments]
         known = [area for area in areas if not math.isnan(area)]
         return math.fsum(known) / len(known) if known else math.nan
 
@@ -227,8 +227,8 @@ def _ranks(scores: FloatArray) -> IntArray:
     return ranks
 
 
-def _area(ranks: IntArray, positive: BoolArray, weight: FloatArray) -> float:
-    """The area under the ROC curve; NaN without both kinds."""
+def roc_area(ranks: IntArray, positive: BoolArray, weight: FloatArray) -> float:
+    """The area under the ROC curve of weighted scores, by their ranks, −1 for no score; NaN without both kinds."""
     known = ranks >= 0
     here, below = (
         np.bincount(ranks[chosen], weight[chosen], int(ranks.max(initial=0)) + 1)
