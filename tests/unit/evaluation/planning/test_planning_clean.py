@@ -90,6 +90,14 @@ def test_who_stands_is_struck_by_a_follower() -> None:
     assert (numbers["striking"], numbers["struck"]) == (0, 100)
 
 
+def test_who_drives_is_struck_from_behind_its_rear_edge_alone() -> None:
+    follower, crosser = straight((-6, 0), 0.0, 10.0, 31), straight((9, -10), np.pi / 2, 5.0, 31)
+    behind = lead(result_of(scene(10, others=[follower]), plan=plan_at(5)))
+    beside = lead(result_of(scene(10, others=[crosser]), plan=plan_at(5)))
+    assert (behind["striking"], behind["struck"]) == (0, 100)
+    assert (beside["striking"], beside["struck"]) == (100, 0)
+
+
 def test_actors_that_overlap_at_the_present_are_left_out_and_counted() -> None:
     found = result_of(scene(10, others=[straight((0.5, 0.5), 0.0, 10.0, 31)]))
     assert lead(found)["striking"] == 0
