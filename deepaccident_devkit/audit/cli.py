@@ -51,7 +51,8 @@ def audit(topic: str, targets: tuple[str, ...], split: str | None, as_json: bool
     """  # noqa: D301 - \b is click's mark of lines that are not wrapped
     least, most = _TOPICS[topic]
     if not least <= len(targets) <= (most or len(targets)):
-        raise click.UsageError(f"{topic} is about {least}{'' if most else ' or more'}, found {len(targets)}: {' '.join(targets)}")
+        number = f"{least}{'' if most else ' or more'}"
+        raise click.UsageError(f"{topic} is about {number}, found {len(targets)}: {' '.join(targets)}")
     if topic != "scores":
         refuse_unused(f"with {topic}", "version", "split", "index_dir", "on_error")
     if topic == "release":
