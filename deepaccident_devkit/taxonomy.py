@@ -9,7 +9,7 @@ AgentName = Literal["ego_vehicle", "ego_vehicle_behind", "other_vehicle", "other
 Frame = Literal["world", "ego", "lidar"]
 OnError = Literal["raise", "skip"]
 Layout = Literal["A", "B"]
-ModelPreset = Literal["released", "tiny"]
+ModelPreset = Literal["released", "tiny", "tiny_lidar", "tiny_both"]
 StyleName = Literal["paper", "cvpr-column", "cvpr-page", "ieee-column", "ieee-page", "slide"]
 ModelFusion = Literal["mean", "max", "released", "disconet", "cobevt", "v2xvit"]
 """Of `deepaccident_devkit.model`; here, so that they can be listed without torch."""

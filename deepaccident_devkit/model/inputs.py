@@ -7,8 +7,9 @@ module asks for it.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from itertools import product
 from typing import Any, Final, Literal
 
 import torch
@@ -16,7 +17,7 @@ from torch import Tensor
 
 from deepaccident_devkit.model.lift import CameraGeometry
 from deepaccident_devkit.model.warps import six_from_matrices
-from deepaccident_devkit.taxonomy import INFRASTRUCTURE
+from deepaccident_devkit.taxonomy import INFRASTRUCTURE, POLE_HEIGHT
 
 Handedness = Literal["left", "right"]
 _MIRROR: Final = (1.0, -1.0, 1.0, 1.0)
@@ -29,8 +30,11 @@ class ModelInputs:
     """What the model sees, in its own frame: B moments of A agents, P frames (the present last), N cameras; G egos.
 
     Attributes:
-        images: (B, A, P, N, 3, h, w) uint8 RGB. A frame that did not arrive has the present's.
+        images: (B, A, P, N, 3, h, w) uint8 RGB. A frame that did not arrive has the present's. None for none.
         cameras: of these images, (B, A, P, N, …); `rotation` and `translation` are `ego_from_camera`, augmented.
+        points: (K, 4) float32, all LiDAR points: x y z in metres in the sender's frame, augmented, but z above the
+            road; and the intensity. A frame that did not arrive has the present's. None for none.
+        point_frames: (K,) int64, the frame of each point, of the B · A · P ones.
         egomotion: (B, A, P, 6) `next_from_this` of each agent's own frames, without the augmentation; the last row,
             and those of frames that did not arrive, are 0.
         frame_valid: (B, A, P) bool: the frames that arrived, up to the present without a gap.
@@ -42,8 +46,10 @@ class ModelInputs:
         delay: (B, A) int64: how old the data are, in frames of 0.1 s.
     """
 
-    images: Tensor
-    cameras: CameraGeometry
+    images: Tensor | None = None
+    cameras: CameraGeometry | None = None
+    points: Tensor | None = None
+    point_frames: Tensor | None = None
     egomotion: Tensor
     frame_valid: Tensor
     bev_transform: Tensor
@@ -63,7 +69,7 @@ class ModelInputs:
 
 
 def model_inputs(batch: Mapping[str, Any], handedness: Handedness = "right", *, delay: int = 0) -> ModelInputs:
-    """The inputs of a batch with images: of `collate`, with the first agent of each item as the ego, or of all egos.
+    """The inputs of a batch with images, points or both, of all its egos, or with each item's first agent as the ego.
 
     Args:
         batch: of `export.torch.collate` or `export.torch.collate_all_egos`.
@@ -84,18 +90,23 @@ def model_inputs(batch: Mapping[str, Any], handedness: Handedness = "right", *, 
     partners = heard & arrived[moment, :, -1]
     ages = torch.full(arrived.shape[:2], delay)
     ages[:, 0] = 0
-    roadside = [[name == INFRASTRUCTURE for name in names] for names in batch["agents"]]
+    roadside = torch.zeros(arrived.shape[:2], dtype=torch.bool)
+    for row, names in zip(roadside, batch["agents"], strict=True):
+        row[: len(names)] = torch.tensor([name == INFRASTRUCTURE for name in names])
+    points, point_frames = _points(batch["points"], source, roadside, handedness) if "points" in batch else (None, None)
     transform = _mirrored(batch["augmentation"].double(), handedness)
     return ModelInputs(
-        images=_taken(batch["images"], source),
-        cameras=_cameras(batch, source, handedness),
+        images=_taken(batch["images"], source) if "images" in batch else None,
+        cameras=_cameras(batch, source, handedness) if "images" in batch else None,
+        points=points,
+        point_frames=point_frames,
         egomotion=_egomotion(_mirrored(batch["agent_from_past"].double(), handedness), valid, transform),
         frame_valid=valid,
         bev_transform=transform.float(),
         ego_rows=rows,
         ego_from_agent=_mirrored(ego_from_agent, handedness).float(),
         partners=partners,
-        is_infrastructure=torch.tensor([row + [False] * (arrived.shape[1] - len(row)) for row in roadside]),
+        is_infrastructure=roadside,
         delay=ages,
     )
 
@@ -115,6 +126,24 @@ def _cameras(batch: Mapping[str, Any], source: Tensor, handedness: Handedness) -
         translation=ego_from_camera[..., :3, 3],
         intrinsics=_taken(batch["intrinsics"], source),
     )
+
+
+def _points(
+    clouds: Sequence[Sequence[Sequence[Tensor]]], source: Tensor, roadside: Tensor, handedness: Handedness
+) -> tuple[Tensor, Tensor]:
+    """All points (K, 4) and their frames (K,) of B items' agents' clouds (N, 4), from the frames `source` (B, A, P)."""
+    frames = source.shape[2]
+    none = torch.zeros((0, 4))
+    given = [
+        clouds[item][agent][int(source[item, agent, frame])] if agent < len(clouds[item]) else none
+        for item, agent, frame in product(*map(range, source.shape))
+    ]
+    lengths = torch.tensor([len(cloud) for cloud in given])
+    points = torch.cat([none, *given])
+    point_frames = torch.repeat_interleave(lengths)
+    # the origin of an infrastructure is on top of its pole
+    points[:, 2] += POLE_HEIGHT * roadside.flatten()[point_frames // frames]
+    return (points if handedness == "right" else points * points.new_tensor(_MIRROR)), point_frames
 
 
 def _egomotion(present_from_past: Tensor, valid: Tensor, transform: Tensor) -> Tensor:
@@ -142,4 +171,4 @@ def _taken(values: Tensor, source: Tensor) -> Tensor:
 def _moved(value: Any, device: torch.device | str) -> Any:
     if isinstance(value, CameraGeometry):
         return replace(value, **{each.name: _moved(getattr(value, each.name), device) for each in fields(value)})
-    return value.to(device, non_blocking=True)
+    return None if value is None else value.to(device, non_blocking=True)

@@ -1,10 +1,11 @@
-"""`ModelConfig`, all that a model is made of, and `V2XFormer`: all agents' images → the ego's future maps and boxes.
+"""`ModelConfig`, all that a model is made of, and `V2XFormer`: what all agents see → the ego's future maps, boxes.
 
 | step | from → to | where |
 |---|---|---|
 | the devkit's batch | tensors in the model's frame | `inputs` |
 | images | features of each image | `images` |
 | lift | features → a map from above, each frame of each agent | `lift` |
+| pillars | LiDAR points → the same, where a model has both joined with it | `pillars` |
 | time | P frames → one map of each agent | `temporal` |
 | placement | agents' maps → the ego's frame | `warps` |
 | fusion | agents' maps → one | `fusion` |
@@ -15,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -45,6 +46,7 @@ from deepaccident_devkit.model.motion import (
     MotionOutputs,
     MotionTargets,
 )
+from deepaccident_devkit.model.pillars import PillarConfig, PillarEncoder
 from deepaccident_devkit.model.temporal import TemporalConfig, temporal_model
 from deepaccident_devkit.model.warps import agents_mask, agents_to_ego
 from deepaccident_devkit.motion import MotionLabelConfig
@@ -53,14 +55,29 @@ from deepaccident_devkit.v2x import Agents, Link
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ModelConfig:
-    """A V2XFormer; quirks of the release are fields of its parts.
+class CameraConfig:
+    """How a model sees with cameras.
 
     Attributes:
         images: how images are prepared; uint8.
         rows: of the images, once they are filled with black at the bottom; None for as they are.
         encoder: of images.
         lift: from image features to a map seen from above.
+    """
+
+    images: ImageConfig
+    rows: int | None = None
+    encoder: EncoderConfig
+    lift: LiftConfig
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ModelConfig:
+    """A V2XFormer; quirks of the release are fields of its parts.
+
+    Attributes:
+        cameras: how it sees with cameras; None for not at all.
+        pillars: how it sees with LiDARs; None for not at all. The maps of both are joined.
         temporal: joins an agent's own frames.
         fusion: joins the agents.
         bev: the encoders before the heads.
@@ -75,10 +92,8 @@ class ModelConfig:
         decoding: from detection maps to boxes.
     """
 
-    images: ImageConfig
-    rows: int | None = None
-    encoder: EncoderConfig
-    lift: LiftConfig
+    cameras: CameraConfig | None = None
+    pillars: PillarConfig | None = None
     temporal: TemporalConfig
     fusion: FusionConfig
     bev: BevEncodeConfig | BevUNetConfig
@@ -94,15 +109,26 @@ class ModelConfig:
 
     def __post_init__(self) -> None:
         """Check what parts have to have in common; raises ConfigError."""
-        pairs = (
-            ("images.dtype", self.images.dtype, "uint8, which the model scales itself", "uint8"),
-            ("temporal.channels", self.temporal.channels, "lift.channels", self.lift.channels),
-            ("bev.in_channels", self.bev.in_channels, "lift.channels", self.lift.channels),
+        cameras, pillars, channels = self.cameras, self.pillars, self.temporal.channels
+        if cameras is None and pillars is None:
+            raise ConfigError("cameras, pillars: expected one of them or both; without, a model sees nothing")
+        pairs: list[tuple[str, Any, str, Any]] = [
+            ("bev.in_channels", self.bev.in_channels, "temporal.channels", channels),
             ("motion.in_channels", self.motion.in_channels, "bev.out_channels", self.bev.out_channels),
             ("detection.in_channels", self.detection.in_channels, "bev.out_channels", self.bev.out_channels),
             ("motion.future_frames", self.motion.future_frames, "labels.future_frames", self.labels.future_frames),
             ("temporal.frames", self.temporal.frames, "labels.receptive_field", self.labels.receptive_field),
-        )
+        ]
+        if cameras is not None:
+            pairs += [
+                ("images.dtype", cameras.images.dtype, "uint8, which the model scales itself", "uint8"),
+                ("lift.channels", cameras.lift.channels, "temporal.channels", channels),
+            ]
+        if pillars is not None:
+            pairs += [
+                ("pillars.channels", pillars.channels, "temporal.channels", channels),
+                ("pillars.grid", pillars.grid, "temporal.grid", self.temporal.grid),
+            ]
         for name, found, other, expected in pairs:
             if found != expected:
                 raise ConfigError(f"{name}: expected {expected!r}, as {other}, found {found!r}")
@@ -130,11 +156,13 @@ class ModelConfig:
             link: what happens to the partners' data.
             changes: other fields of `V2XConfig`, such as those of targets.
         """
-        given: dict[str, Any] = {"points": False, "boxes": None, "on_missing": "skip", **changes}
+        seen = {"images": None if self.cameras is None else self.cameras.images, "points": self.pillars is not None}
+        given: dict[str, Any] = {**seen, "boxes": None, "on_missing": "skip", **changes}
         past, step = self.labels.receptive_field, self.labels.step
-        return V2XConfig(agents=agents, link=link, past=past, step=step, images=self.images, **given)
+        return V2XConfig(agents=agents, link=link, past=past, step=step, **given)
 
 
+_Input = TypeVar("_Input")
 _DETECTION, _MOTION, _BOTH = "3dod", "motion", "shared"
 """Keys of encoders and decoders; the first two are the release's."""
 
@@ -165,8 +193,13 @@ class V2XFormer(nn.Module):
         super().__init__()
         self.config = config
         self.notes = {}
-        self.img_backbone, self.img_neck = image_encoder(config.encoder)
-        self.transformer = LiftSplat(config.lift)
+        if config.cameras is not None:
+            self.img_backbone, self.img_neck = image_encoder(config.cameras.encoder)
+            self.transformer = LiftSplat(config.cameras.lift)
+        if config.pillars is not None:
+            self.pillars = PillarEncoder(config.pillars)
+        if config.cameras is not None and config.pillars is not None:
+            self.join = nn.Conv2d(2 * config.temporal.channels, config.temporal.channels, 1)
         self.temporal_model = temporal_model(config.temporal)
         self.v2x_fusion = fusion(config.fusion)
         self.pts_bbox_head = TaskHeads(config)
@@ -191,22 +224,33 @@ class V2XFormer(nn.Module):
 
     def encoded(self, inputs: ModelInputs) -> Tensor:
         """Each agent's own map (B, A, C, H, W) of the present, in its own frame: what it would send."""
-        agents = inputs.images.shape[:2]
-        images = inputs.images.flatten(0, 3)
-        if not images.is_floating_point():
-            images = normalised(images)
-        if self.config.rows is not None:
-            images = functional.pad(images, (0, 0, 0, self.config.rows - images.shape[-2]))
-        features = self.img_neck(self.img_backbone(images))
-        features = features.unflatten(0, (agents.numel(), *inputs.images.shape[2:4]))
-        maps = self.transformer(features, inputs.cameras.flattened())
+        agents = inputs.frame_valid.shape[:2]
         maps = self.temporal_model(
-            maps,
+            self._seen(inputs),
             inputs.egomotion.flatten(0, 1),
             inputs.frame_valid.flatten(0, 1),
             inputs.bev_transform.repeat_interleave(agents[1], 0),
         )
         return maps.unflatten(0, agents)
+
+    def _seen(self, inputs: ModelInputs) -> Tensor:
+        """The maps (B · A, P, C, H, W) of all frames, each in its own; raises ConfigError if inputs lack something."""
+        samples, frames = inputs.frame_valid.flatten(0, 1).shape
+        seen: list[Tensor] = []
+        if (cameras := self.config.cameras) is not None:
+            images = _given("images", inputs.images).flatten(0, 3)
+            if not images.is_floating_point():
+                images = normalised(images)
+            if cameras.rows is not None:
+                images = functional.pad(images, (0, 0, 0, cameras.rows - images.shape[-2]))
+            features = self.img_neck(self.img_backbone(images)).unflatten(0, (samples, frames, -1))
+            seen.append(self.transformer(features, _given("images", inputs.cameras).flattened()))
+        if self.config.pillars is not None:
+            points, frame = _given("points", inputs.points), _given("points", inputs.point_frames)
+            seen.append(self.pillars(points, frame, samples * frames).unflatten(0, (samples, frames)))
+        if len(seen) == 1:
+            return seen[0]
+        return self.join(torch.cat(seen, 2).flatten(0, 1)).unflatten(0, (samples, frames))
 
     def fused(self, maps: Tensor, inputs: ModelInputs) -> Tensor:
         """One map (G, C, H, W) of each ego, in its own frame.
@@ -278,6 +322,13 @@ class TaskHeads(nn.Module):
             self.taskfeat_encoders[_DETECTION](fused),
             self.taskfeat_encoders[_MOTION](crop(fused, grid, motion_grid)),
         )
+
+
+def _given(name: str, value: _Input | None) -> _Input:
+    """An input that the model sees with; raises ConfigError if there is none."""
+    if value is None:
+        raise ConfigError(f"inputs: have no {name}, which this model sees with; make items by its config.inputs(…)")
+    return value
 
 
 def _ego_first(partners: Tensor, agent: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""The presets: `released`, the model of the release with its quirks, and `tiny`, which a laptop trains."""
+"""The presets: `released`, the model of the release with its quirks, and those that a laptop trains."""
 
 from __future__ import annotations
 
@@ -35,7 +35,8 @@ from deepaccident_devkit.model.fusion import (
 from deepaccident_devkit.model.images import SmallConvConfig, SwinConfig
 from deepaccident_devkit.model.lift import LiftConfig
 from deepaccident_devkit.model.motion import MotionHeadConfig, MotionLossConfig
-from deepaccident_devkit.model.network import ModelConfig, V2XFormer
+from deepaccident_devkit.model.network import CameraConfig, ModelConfig, V2XFormer
+from deepaccident_devkit.model.pillars import PillarConfig
 from deepaccident_devkit.model.temporal import TemporalConfig
 from deepaccident_devkit.motion import MotionLabelConfig
 from deepaccident_devkit.support.json_text import as_record
@@ -57,7 +58,7 @@ class ModelChoice:
     """A preset and what is changed in it: all that is needed to build a model again.
 
     Attributes:
-        preset: `released` or `tiny`.
+        preset: `released`, `tiny`, `tiny_lidar` or `tiny_both`.
         fusion: how agents are joined; None for the preset's.
         horizon: seconds that motion is predicted; None for 2.
     """
@@ -76,7 +77,7 @@ class ModelChoice:
         """The whole configuration."""
         config = PRESETS[self.preset]()
         if self.fusion is not None:
-            config = replace(config, fusion=fusion_config(self.fusion, config.lift.channels))
+            config = replace(config, fusion=fusion_config(self.fusion, config.temporal.channels))
         if self.horizon is not None:
             frames = self._frames(config)
             config = replace(
@@ -156,19 +157,21 @@ def released() -> ModelConfig:
     """
     along = (-51.2, 51.2, 0.8)
     return ModelConfig(
-        images=ImageConfig(resize=(432, 768), crop=(176, 32, 256, 704), dtype="uint8"),
-        encoder=SwinConfig(checkpointing=True),
-        lift=LiftConfig(
-            in_channels=512,
-            channels=64,
-            depth=(1.0, 60.0, 1.0),
-            x=along,
-            y=along,
-            z=(-30.0, 30.0, 60.0),
-            image_size=(256, 704),
-            stride=16,
-            frustum="corners",
-            voxel_rounding="trunc",
+        cameras=CameraConfig(
+            images=ImageConfig(resize=(432, 768), crop=(176, 32, 256, 704), dtype="uint8"),
+            encoder=SwinConfig(checkpointing=True),
+            lift=LiftConfig(
+                in_channels=512,
+                channels=64,
+                depth=(1.0, 60.0, 1.0),
+                x=along,
+                y=along,
+                z=(-30.0, 30.0, 60.0),
+                image_size=(256, 704),
+                stride=16,
+                frustum="corners",
+                voxel_rounding="trunc",
+            ),
         ),
         temporal=TemporalConfig(
             channels=64,
@@ -198,20 +201,22 @@ def tiny() -> ModelConfig:
     """
     along = (-50.0, 50.0, 1.0)
     return ModelConfig(
-        images=ImageConfig(resize=(90, 160), dtype="uint8", decode="scaled"),
-        rows=96,
-        encoder=SmallConvConfig(),
-        lift=LiftConfig(
-            in_channels=48,
-            channels=32,
-            depth=(2.0, 50.0, 2.0),
-            x=along,
-            y=along,
-            z=(-10.0, 10.0, 20.0),
-            image_size=(96, 160),
-            stride=8,
-            band=(-0.5, 2.5),
-            pooling="mean",
+        cameras=CameraConfig(
+            images=ImageConfig(resize=(90, 160), dtype="uint8", decode="scaled"),
+            rows=96,
+            encoder=SmallConvConfig(),
+            lift=LiftConfig(
+                in_channels=48,
+                channels=32,
+                depth=(2.0, 50.0, 2.0),
+                x=along,
+                y=along,
+                z=(-10.0, 10.0, 20.0),
+                image_size=(96, 160),
+                stride=8,
+                band=(-0.5, 2.5),
+                pooling="mean",
+            ),
         ),
         temporal=TemporalConfig(channels=32, grid=BevGrid(x=along, y=along), frames=2, kind="concat"),
         fusion=PoolFusionConfig(),
@@ -226,4 +231,17 @@ def tiny() -> ModelConfig:
     )
 
 
-PRESETS: Final[Mapping[str, Callable[[], ModelConfig]]] = MappingProxyType({"released": released, "tiny": tiny})
+def tiny_both() -> ModelConfig:
+    """`tiny`, which also sees with LiDARs."""
+    config = tiny()
+    return replace(config, pillars=PillarConfig(channels=config.temporal.channels, grid=config.grid))
+
+
+def tiny_lidar() -> ModelConfig:
+    """`tiny`, which sees with LiDARs in place of cameras."""
+    return replace(tiny_both(), cameras=None)
+
+
+PRESETS: Final[Mapping[str, Callable[[], ModelConfig]]] = MappingProxyType(
+    {"released": released, "tiny": tiny, "tiny_lidar": tiny_lidar, "tiny_both": tiny_both}
+)

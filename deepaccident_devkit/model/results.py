@@ -35,11 +35,11 @@ from deepaccident_devkit.export.torch import V2XConfig, V2XDataset, collate
 from deepaccident_devkit.model.detection import decode_detections, detected_boxes
 from deepaccident_devkit.model.inputs import mirrored_boxes, model_inputs
 from deepaccident_devkit.model.motion import MotionMaps
-from deepaccident_devkit.model.network import V2XFormer
+from deepaccident_devkit.model.network import ModelConfig, V2XFormer
 from deepaccident_devkit.motion import motion_labels_of
 from deepaccident_devkit.support.arrays import ShortRepr
 from deepaccident_devkit.support.files import writable_folder
-from deepaccident_devkit.taxonomy import CAMERAS, FRAME_PERIOD
+from deepaccident_devkit.taxonomy import CAMERAS, FRAME_PERIOD, LIDAR
 from deepaccident_devkit.v2x import AgentConfig, Agents, Link
 from deepaccident_devkit.v2x.messages import POSE_BYTES, traffic_note
 from deepaccident_devkit.v2x.tracks import scenario_tracks
@@ -98,9 +98,9 @@ def predictions(
 
     Raises:
         DeepAccidentError: as of `V2XDataset`.
-        NotAvailableError: the release has no images.
+        NotAvailableError: the release lacks what the model sees with.
     """
-    check_images(dataset, tokens[:1])
+    check_sensors(model.config, dataset, tokens[:1])
     data = V2XDataset(dataset, tokens, _inputs(model, config))
     loader: DataLoader[Any] = DataLoader(data, collate_fn=collate, num_workers=config.workers)  # type: ignore[arg-type]
     training = model.training
@@ -128,14 +128,20 @@ def _features(model: V2XFormer) -> tuple[int, dict[str, Any]]:
     )
 
 
-def check_images(dataset: Dataset, tokens: Sequence[str]) -> None:
-    """Raise NotAvailableError, with the remedy, if none of these samples has an image."""
-    paths = [dataset.sensor_path(f"{token}/{channel}") for token in tokens for channel in CAMERAS]
-    if paths and not any(path.exists() for path in paths):
-        raise NotAvailableError(
-            f"{paths[0]}: the model sees with cameras, and this release has no images of {tokens[0]}; unpack its "
-            "camera folders, or make a release with them: deepaccident synth OUT --sensors cameras"
-        )
+def check_sensors(model: ModelConfig, dataset: Dataset, tokens: Sequence[str]) -> None:
+    """Raise NotAvailableError, with the remedy, if none of these samples has files of a kind that the model sees."""
+    kinds = (
+        (model.cameras, CAMERAS, "cameras", "images", "camera folders"),
+        (model.pillars, (LIDAR,), "LiDARs", "point clouds", f"{LIDAR} folders"),
+    )
+    for part, channels, sensors, files, folders in kinds:
+        paths = [dataset.sensor_path(f"{token}/{channel}") for token in tokens for channel in channels]
+        if part is not None and paths and not any(path.exists() for path in paths):
+            raise NotAvailableError(
+                f"{paths[0]}: the model sees with {sensors}, and this release has no {files} of {tokens[0]}; unpack "
+                f"its {folders}, or make a release with them: deepaccident synth OUT --sensors "
+                f"{'cameras' if part is model.cameras else 'all'}"
+            )
 
 
 def prediction_of(model: V2XFormer, batch: dict[str, Any], config: PredictConfig) -> SamplePrediction:
@@ -258,8 +264,8 @@ def _meta(model: V2XFormer, dataset: Dataset, tokens: Sequence[str], config: Pre
 
 
 def _sent(model: V2XFormer, dataset: Dataset, tokens: Sequence[str], config: PredictConfig) -> dict[str, Any]:
-    """The note on the bytes that partners send; those whose images are not there send none."""
-    check_images(dataset, tokens[:1])
+    """The note on the bytes that partners send; those whose sensor files are not there send none."""
+    check_sensors(model.config, dataset, tokens[:1])
     size, form = _features(model)
     senders = V2XDataset(dataset, tokens, replace(_inputs(model, config), past=1)).senders()
     sent = [(size * (len(names) - 1), len(names) - 1) for names in senders]

@@ -23,7 +23,7 @@ from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.model.checkpoint import BEST, FINAL, load_weights, read_weights, write_weights
 from deepaccident_devkit.model.network import V2XFormer
 from deepaccident_devkit.model.presets import ModelChoice
-from deepaccident_devkit.model.results import PredictConfig, check_images
+from deepaccident_devkit.model.results import PredictConfig, check_sensors
 from deepaccident_devkit.model.training_run import (
     Place,
     Progress,
@@ -95,7 +95,7 @@ def train(  # noqa: PLR0913 - on what, to where, what, how, from what, and on wh
 
     Raises:
         ConfigError: another run is in the folder, there is no such device, or weights do not fit.
-        NotAvailableError: the split has no labelled samples, or the release no images.
+        NotAvailableError: the split has no labelled samples, or the release lacks what the model sees with.
         DeepAccidentError: as of `AllEgosDataset`.
     """
     config = TrainConfig() if config is None else config
@@ -103,7 +103,7 @@ def train(  # noqa: PLR0913 - on what, to where, what, how, from what, and on wh
         say = say if place.is_first else None
         folder = writable_folder(out)
         moments = Moments(dataset, choice.config, config, images_cache=images_cache)
-        check_images(dataset, moments.data.egos[0])
+        check_sensors(choice.config, dataset, moments.data.egos[0])
         run = _Run(
             folder=folder,
             notes=_notes(dataset, choice, config, weights),

@@ -737,19 +737,22 @@ def config(golden: GoldenModel) -> ModelConfig:
     own = {name: tuple(cells[f"{name}bound"]) for name in "xy"}
     return replace(
         whole,
-        encoder=SwinConfig(
-            embed_dims=swin["embed_dims"],
-            depths=tuple(swin["depths"]),
-            num_heads=tuple(swin["num_heads"]),
-            checkpointing=False,
-            neck_channels=small["img_neck"]["out_channels"],
-        ),
-        lift=replace(
-            whole.lift,
-            in_channels=lift["numC_input"],
-            depth=tuple(grid["dbound"]),
-            image_size=tuple(lift["input_dim"]),
-            **along,
+        cameras=replace(
+            whole.cameras,
+            encoder=SwinConfig(
+                embed_dims=swin["embed_dims"],
+                depths=tuple(swin["depths"]),
+                num_heads=tuple(swin["num_heads"]),
+                checkpointing=False,
+                neck_channels=small["img_neck"]["out_channels"],
+            ),
+            lift=replace(
+                whole.cameras.lift,
+                in_channels=lift["numC_input"],
+                depth=tuple(grid["dbound"]),
+                image_size=tuple(lift["input_dim"]),
+                **along,
+            ),
         ),
         temporal=replace(whole.temporal, grid=BevGrid(**along)),
         bev=BevEncodeConfig(

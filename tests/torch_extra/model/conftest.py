@@ -16,7 +16,7 @@ if importlib.util.find_spec("torch") is not None:
 
     torch.set_num_threads(1)  # several tests run side by side
 
-    from deepaccident_devkit.export.torch import ImageConfig, V2XConfig, V2XDataset, collate
+    from deepaccident_devkit.export.torch import V2XConfig, V2XDataset, collate
     from deepaccident_devkit.model.inputs import Handedness, ModelInputs, model_inputs
     from deepaccident_devkit.model.network import ModelConfig, V2XFormer
 
@@ -42,8 +42,7 @@ def seeded(da: DeepAccident, moment: list[str]) -> Callable[..., "V2XFormer"]:
     """
 
     @functools.cache
-    def inputs(images: "ImageConfig", past: int, handedness: "Handedness") -> "ModelInputs":
-        given = V2XConfig(agents="all", past=past, step=1, images=images, points=False, boxes=None)
+    def inputs(given: "V2XConfig", handedness: "Handedness") -> "ModelInputs":
         return model_inputs(collate([V2XDataset(da, moment[:1], given)[0]]), handedness)
 
     def made(config: "ModelConfig", seed: int = 0) -> "V2XFormer":
@@ -53,7 +52,7 @@ def seeded(da: DeepAccident, moment: list[str]) -> Callable[..., "V2XFormer"]:
             if isinstance(module, torch.nn.modules.batchnorm._BatchNorm):
                 module.momentum = 1.0
         with torch.no_grad():
-            model(inputs(config.images, config.temporal.frames, config.handedness))
+            model(inputs(config.inputs("all"), config.handedness))
         return model.eval()
 
     return made

@@ -17,7 +17,8 @@ from deepaccident_devkit.model import presets
 from deepaccident_devkit.model import training_loop as training
 from deepaccident_devkit.model.bev import BevEncodeConfig, BevUNetConfig
 from deepaccident_devkit.model.images import SmallConvConfig, SwinConfig
-from deepaccident_devkit.model.network import ModelConfig
+from deepaccident_devkit.model.network import CameraConfig, ModelConfig
+from deepaccident_devkit.model.pillars import PillarConfig
 from deepaccident_devkit.model.training_run import TrainConfig
 
 ALONG = (-50.0, 50.0, 2.5)
@@ -39,11 +40,19 @@ def small() -> ModelConfig:
     tiny = presets.tiny()
     return replace(
         tiny,
-        images=ImageConfig(resize=(36, 64), dtype="uint8"),
-        rows=48,
-        encoder=SmallConvConfig(widths=(8, 8, 8), branch=8, neck_channels=8),
-        lift=replace(
-            tiny.lift, in_channels=8, channels=8, depth=(2.0, 50.0, 4.0), x=ALONG, y=ALONG, image_size=(48, 64)
+        cameras=CameraConfig(
+            images=ImageConfig(resize=(36, 64), dtype="uint8"),
+            rows=48,
+            encoder=SmallConvConfig(widths=(8, 8, 8), branch=8, neck_channels=8),
+            lift=replace(
+                tiny.cameras.lift,
+                in_channels=8,
+                channels=8,
+                depth=(2.0, 50.0, 4.0),
+                x=ALONG,
+                y=ALONG,
+                image_size=(48, 64),
+            ),
         ),
         temporal=replace(tiny.temporal, channels=8, grid=BevGrid(x=ALONG, y=ALONG)),
         bev=BevUNetConfig(in_channels=8, out_channels=16, widths=(16, 16)),
@@ -53,22 +62,37 @@ def small() -> ModelConfig:
     )
 
 
+def small_both() -> ModelConfig:
+    """`small`, which also sees with LiDARs."""
+    config = small()
+    return replace(config, pillars=PillarConfig(channels=8, grid=config.grid, width=8))
+
+
+def small_lidar() -> ModelConfig:
+    """`small`, which sees with LiDARs alone."""
+    return replace(small_both(), cameras=None)
+
+
 def small_released() -> ModelConfig:
     """The wiring of `released` with all its quirks, two frames and a narrow encoder; the released kinds of layers."""
     released = presets.released()
     along = (-48.0, 48.0, 3.0)
     return replace(
         released,
-        images=ImageConfig(resize=(36, 64), crop=(4, 0, 32, 64), dtype="uint8"),
-        encoder=SwinConfig(embed_dims=8, depths=(1, 1, 1, 1), num_heads=(1, 2, 2, 4), window_size=4, neck_channels=16),
-        lift=replace(
-            released.lift,
-            in_channels=16,
-            channels=8,
-            depth=(1.0, 41.0, 5.0),
-            x=along,
-            y=along,
-            image_size=(32, 64),
+        cameras=CameraConfig(
+            images=ImageConfig(resize=(36, 64), crop=(4, 0, 32, 64), dtype="uint8"),
+            encoder=SwinConfig(
+                embed_dims=8, depths=(1, 1, 1, 1), num_heads=(1, 2, 2, 4), window_size=4, neck_channels=16
+            ),
+            lift=replace(
+                released.cameras.lift,
+                in_channels=16,
+                channels=8,
+                depth=(1.0, 41.0, 5.0),
+                x=along,
+                y=along,
+                image_size=(32, 64),
+            ),
         ),
         temporal=replace(released.temporal, channels=8, grid=BevGrid(x=along, y=along)),
         fusion=replace(released.fusion, channels=8, ego_channels=(1, 5)),

@@ -149,7 +149,9 @@ def test_a_released_checkpoint_without_its_fusion_fits_another_fusion(tmp_path: 
 def test_official_swin_weights_go_into_the_image_encoder(tmp_path: Path) -> None:
     """Microsoft's names and order of tokens, under `model`."""
     encoder = SwinConfig(embed_dims=8, depths=(1, 1), num_heads=(1, 1), out_stages=(0, 1))
-    config = replace(small(), encoder=encoder, lift=replace(small().lift, stride=4, in_channels=512))
+    cameras = small().cameras
+    cameras = replace(cameras, encoder=encoder, lift=replace(cameras.lift, stride=4, in_channels=512))
+    config = replace(small(), cameras=cameras)
     model, path, weight = V2XFormer(config), tmp_path / "swin.pth", torch.arange(16.0 * 32).view(16, 32)
     official = {
         "patch_embed.proj.weight": torch.full((8, 3, 4, 4), 2.0),

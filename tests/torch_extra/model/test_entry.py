@@ -26,7 +26,7 @@ TURNED = Augmentation(rotation=0.3, scale=1.04, flip=True)
 def given(config: ModelConfig) -> V2XConfig:
     """Three frames, so that there may be a gap."""
     labels = replace(config.labels, receptive_field=PAST)
-    return V2XConfig(agents="all", past=PAST, step=1, images=config.images, points=False, labels=labels)
+    return V2XConfig(agents="all", past=PAST, step=1, images=config.cameras.images, labels=labels)
 
 
 @pytest.fixture(scope="module", params=[Augmentation(), TURNED], ids=["plain", "augmented"])
@@ -54,8 +54,16 @@ def test_a_left_handed_model_sees_all_in_the_mirror(batch: dict[str, Any]) -> No
         np.testing.assert_allclose(getattr(left, name).numpy(), mirrored, atol=1e-5)
         assert name == "bev_transform" or np.abs(mirrored - getattr(right, name).numpy()).max() > 1e-3
     np.testing.assert_allclose(points(left).numpy(), flip_points(points(right).numpy()), atol=1e-4)
+    np.testing.assert_array_equal(left.points[:, :3].numpy(), flip_points(right.points[:, :3].numpy()))
     unchanged = attrgetter(
-        "images", "frame_valid", "ego_rows", "partners", "is_infrastructure", "delay", "cameras.intrinsics"
+        "images",
+        "point_frames",
+        "frame_valid",
+        "ego_rows",
+        "partners",
+        "is_infrastructure",
+        "delay",
+        "cameras.intrinsics",
     )
     assert same(unchanged(left), unchanged(right))
 

@@ -7,7 +7,7 @@ from typing import Any, get_args
 import pytest
 import torch
 from torch.testing import assert_close
-from torch_extra.model.small_model import small, small_released
+from torch_extra.model.small_model import small, small_both, small_lidar, small_released
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.export.torch import AllEgosDataset, RandomAugmentation, V2XDataset, collate, collate_all_egos
@@ -20,6 +20,7 @@ from deepaccident_devkit.taxonomy import ModelFusion
 Seeded = Callable[..., V2XFormer]
 Predicted = Callable[..., list[torch.Tensor]]
 FUSIONS = get_args(ModelFusion)
+BOTH = "cameras and LiDARs"
 
 
 def assert_same(found: list[torch.Tensor], expected: list[torch.Tensor], tolerance: float = 1e-4) -> None:
@@ -32,6 +33,8 @@ def apart(one: list[torch.Tensor], other: list[torch.Tensor]) -> float:
 
 
 def of_fusion(name: str) -> ModelConfig:
+    if name == BOTH:
+        return small_both()
     own = ReleasedFusionConfig(channels=8, ego_channels=(1, 5))  # the released numbers are of 64 channels
     return replace(small(), fusion=own if name == "released" else fusion_config(name, 8))
 
@@ -53,7 +56,7 @@ def egos_by_themselves(
 
 
 @pytest.mark.parametrize("agents", ["all", "single", "+other"])
-@pytest.mark.parametrize("make", [small, small_released])
+@pytest.mark.parametrize("make", [small, small_lidar, small_released])
 def test_all_egos_at_once_are_each_by_itself(
     da: DeepAccident,
     moment: list[str],
@@ -63,14 +66,16 @@ def test_all_egos_at_once_are_each_by_itself(
     make: Callable[[], ModelConfig],
 ) -> None:
     """With the devkit's own items of each ego."""
-    rows = slice(None) if make is small else slice(3, 4)
+    rows = slice(3, 4) if make is small_released else slice(None)
     assert egos_by_themselves(seeded(make()), predicted, da, moment, agents, rows) == moment
 
 
+@pytest.mark.parametrize("make", [small, small_lidar, small_both])
 def test_other_moments_of_a_batch_change_nothing(
-    da: DeepAccident, moment: list[str], config: ModelConfig, seeded: Seeded, predicted: Predicted
+    da: DeepAccident, moment: list[str], seeded: Seeded, predicted: Predicted, make: Callable[[], ModelConfig]
 ) -> None:
     """Nor does it matter that an item has fewer agents, or another augmentation."""
+    config = make()
     model = seeded(config)
     items = [
         alone(da, moment[0], config, "all"),
@@ -88,7 +93,7 @@ def test_other_moments_of_a_batch_change_nothing(
     assert_same(both, [torch.cat(each) for each in zip(*by_itself, strict=True)])
 
 
-@pytest.mark.parametrize("name", FUSIONS)
+@pytest.mark.parametrize("name", [*FUSIONS, BOTH])
 def test_the_order_of_partners_does_not_matter(
     da: DeepAccident, moment: list[str], seeded: Seeded, predicted: Predicted, name: str
 ) -> None:
@@ -96,11 +101,12 @@ def test_the_order_of_partners_does_not_matter(
     item = alone(da, moment[0], model.config, "all")
     tensors = ("agent_valid", "files_missing", "images", "ego_from_agent", "agent_from_past", "intrinsics")
     shuffled = item | {key: item[key][order] for key in (*tensors, "ego_from_camera", "image_from_ego")}
-    shuffled["agents"] = tuple(item["agents"][row] for row in order)
+    for key in {"agents", "points"} & item.keys():
+        shuffled[key] = type(item[key])(item[key][row] for row in order)
     assert_same(*[predicted(model, model_inputs(collate([each]))) for each in (item, shuffled)])
 
 
-@pytest.mark.parametrize("name", FUSIONS)
+@pytest.mark.parametrize("name", [*FUSIONS, BOTH])
 def test_partners_that_are_not_heard_leave_the_ego_alone(
     da: DeepAccident, moment: list[str], seeded: Seeded, predicted: Predicted, name: str
 ) -> None:

@@ -14,16 +14,28 @@ from torch_extra.model.small_model import small
 
 from deepaccident_devkit.errors import ChoiceError, ConfigError
 from deepaccident_devkit.export.images import ImageConfig
+from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.model import presets
 from deepaccident_devkit.model.bev import BevUNetConfig
 from deepaccident_devkit.model.checkpoint import FINAL, write_weights
 from deepaccident_devkit.model.fusion import CobevtConfig, DiscoNetConfig, PoolFusionConfig, V2XViTConfig
-from deepaccident_devkit.model.network import ModelConfig, V2XFormer
-from deepaccident_devkit.model.presets import PRESETS, ModelChoice, load_model, released, tiny
+from deepaccident_devkit.model.network import CameraConfig, ModelConfig, V2XFormer
+from deepaccident_devkit.model.pillars import PillarConfig
+from deepaccident_devkit.model.presets import (
+    PRESETS,
+    ModelChoice,
+    load_model,
+    released,
+    tiny,
+    tiny_both,
+    tiny_lidar,
+)
 from deepaccident_devkit.taxonomy import ModelFusion
 
+SIZES = [(tiny, 0.4e6, 0.6e6), (tiny_lidar, 0.2e6, 1e6), (tiny_both, 0.4e6, 1e6), (released, 82.5e6, 83.5e6)]
 
-@pytest.mark.parametrize(("preset", "least", "most"), [(tiny, 0.4e6, 0.6e6), (released, 82.5e6, 83.5e6)])
+
+@pytest.mark.parametrize(("preset", "least", "most"), SIZES)
 def test_presets_have_their_sizes(preset: Callable[[], ModelConfig], least: float, most: float) -> None:
     """The released one: 83.0 million, less the frustum."""
     with torch.device("meta"):
@@ -34,7 +46,7 @@ def test_released_has_the_quirks_of_the_release() -> None:
     """Each in its field (model.md section 9)."""
     config = released()
     assert {
-        "lift": (config.lift.frustum, config.lift.voxel_rounding),
+        "lift": (config.cameras.lift.frustum, config.cameras.lift.voxel_rounding),
         "temporal": (config.temporal.warp, config.temporal.chain, config.temporal.egomotion_input),
         "motion": (config.motion.posterior_ignore, config.motion.hidden_warp),
         "all": (config.handedness, config.labels.grid.orientation, config.labels_protocol),
@@ -116,14 +128,27 @@ def test_a_model_is_loaded_by_its_notes(tmp_path: Path, monkeypatch: pytest.Monk
     )
 
 
+def small_with(**lift: Any) -> CameraConfig:
+    """The cameras of `small` with another lift."""
+    cameras = small().cameras
+    assert cameras is not None
+    return replace(cameras, lift=replace(cameras.lift, **lift))
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"images": ImageConfig(resize=(36, 64))}, "images.dtype: expected 'uint8'"),
+        ({"cameras": None}, "cameras, pillars: expected one of them or both"),
         (
-            {"temporal": replace(small().temporal, channels=9)},
-            "temporal.channels: expected 8, as lift.channels, found 9",
+            {"cameras": replace(small().cameras, images=ImageConfig(resize=(36, 64)))},
+            "images.dtype: expected 'uint8'",
         ),
+        ({"cameras": small_with(channels=9)}, "lift.channels: expected 8, as temporal.channels, found 9"),
+        (
+            {"pillars": PillarConfig(channels=9, grid=small().grid)},
+            "pillars.channels: expected 8, as temporal.channels",
+        ),
+        ({"pillars": PillarConfig(channels=8, grid=BevGrid())}, "pillars.grid: expected BevGrid"),
         ({"bev": BevUNetConfig(in_channels=9, out_channels=16)}, "bev.in_channels: expected 8"),
         ({"motion": replace(small().motion, in_channels=9)}, "motion.in_channels: expected 16, as bev.out_channels"),
         ({"detection": replace(small().detection, in_channels=9)}, "detection.in_channels: expected 16"),
