@@ -234,7 +234,12 @@ def tiny() -> ModelConfig:
 def tiny_both() -> ModelConfig:
     """`tiny`, which also sees with LiDARs."""
     config = tiny()
-    return replace(config, pillars=PillarConfig(channels=config.temporal.channels, grid=config.grid))
+    return replace(
+        config,
+        pillars=PillarConfig(channels=config.temporal.channels, grid=config.grid),
+        motion=replace(config.motion, decoders="shuffled"),
+        motion_loss=replace(config.motion_loss, class_weights=(1.0, 2.0)),
+    )
 
 
 def tiny_lidar() -> ModelConfig:

@@ -205,7 +205,7 @@ class SeparateDecoders(nn.ModuleDict):
         """Make the layers for states of so many channels."""
         super().__init__(
             {
-                name: _decoder(channels, channels, count, rare=0 if name == "instance_center" else None)
+                name: _decoder(channels, channels, count, rare=slice(0, 1) if name == "instance_center" else None)
                 for name, count in _CHANNELS.items()
             }
         )
@@ -218,23 +218,27 @@ class SeparateDecoders(nn.ModuleDict):
 class SharedDecoder(nn.Module):
     """Our small decoder: all maps from the same few channels, brought to a finer grid."""
 
-    def __init__(self, channels: int, hidden: int, upsample: int) -> None:
+    def __init__(self, channels: int, hidden: int, upsample: int, *, shuffled: bool = False) -> None:
         """Make the layers: `hidden` channels after the 3 × 3 convolution, `upsample` cells of maps to one of states."""
         super().__init__()
-        self._upsample = upsample
-        self.layers = _decoder(channels, hidden, sum(_CHANNELS.values()), rare=_CHANNELS["segmentation"])
+        self._upsample, self._shuffled = upsample, shuffled
+        copies = upsample**2 if shuffled else 1
+        first = copies * _CHANNELS["segmentation"]
+        self.layers = _decoder(channels, hidden, copies * sum(_CHANNELS.values()), rare=slice(first, first + copies))
 
     def forward(self, states: Tensor) -> MotionMaps:
         """Decode states (M, C, H, W) to maps (M, …, H', W') on the finer grid."""
         maps = self.layers(states)
-        if self._upsample > 1:
+        if self._shuffled:
+            maps = functional.pixel_shuffle(maps, self._upsample)
+        elif self._upsample > 1:
             # after the 1 × 1 convolution: the same values as before it, from fewer channels
             maps = functional.interpolate(maps, scale_factor=self._upsample, mode="bilinear", align_corners=False)
         return MotionMaps(*maps.split(list(_CHANNELS.values()), dim=1))
 
 
-def _decoder(channels: int, hidden: int, outputs: int, *, rare: int | None) -> nn.Sequential:
-    """Two convolutions; `rare` is the output that is a centre's logit, if there is one."""
+def _decoder(channels: int, hidden: int, outputs: int, *, rare: slice | None) -> nn.Sequential:
+    """Two convolutions; `rare` says which outputs are centres' logits, if there are any."""
     last = nn.Conv2d(hidden, outputs, 1)
     if rare is not None:
         with torch.no_grad():

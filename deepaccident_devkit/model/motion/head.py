@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Final, Literal, NamedTuple
+from typing import Final, Literal, NamedTuple, get_args
 
 import torch
 from torch import Tensor, nn
@@ -31,8 +31,7 @@ LABEL_CHANNELS: Final = 6
 """Of a frame's maps as the posterior sees them: segmentation, centerness, offset and flow."""
 PosteriorIgnore = Literal["keep", "zero"]
 POSTERIOR_IGNORES: Final[tuple[PosteriorIgnore, ...]] = ("keep", "zero")
-Decoders = Literal["separate", "shared"]
-_DECODERS: Final[tuple[Decoders, ...]] = ("separate", "shared")
+Decoders = Literal["separate", "shared", "shuffled"]
 _CLIP: Final = 1e-4
 """Probabilities of a centre stay so far from 0 and 1."""
 
@@ -99,7 +98,8 @@ class MotionHeadConfig:
         future_frames: frames after the present.
         samples: random draws of a prediction; the mean comes on top.
         log_sigma: the smallest and the largest logarithm of a standard deviation.
-        decoders: `separate` convolutions for each map, as released, or `shared` ones.
+        decoders: `separate` convolutions for each map, as released, or `shared` ones, whose maps are brought to the
+            finer grid by bilinear interpolation, or `shuffled`: each finer cell has channels of its own.
         hidden: channels of the shared decoder; the separate ones have `in_channels`.
         upsample: how many cells of the maps and labels lie along a cell of the features; 1 if separate.
         posterior_ignore: what the posterior sees where offset and flow are ignored: the mark 255 as released (`keep`),
@@ -124,7 +124,7 @@ class MotionHeadConfig:
 
     def __post_init__(self) -> None:
         """Check the values; raises ConfigError."""
-        words = {"decoders": _DECODERS, "posterior_ignore": POSTERIOR_IGNORES, "hidden_warp": HIDDEN_WARPS}
+        words = {"decoders": get_args(Decoders), "posterior_ignore": POSTERIOR_IGNORES, "hidden_warp": HIDDEN_WARPS}
         settle_choices(self, words, error=ConfigError)
         check_least(self, in_channels=2, latent=1, future_frames=1, samples=0, hidden=1, upsample=1)
         if not self.log_sigma[0] < self.log_sigma[1]:
@@ -162,7 +162,7 @@ class MotionHead(nn.Module):
         self.task_heads: nn.Module = (
             SeparateDecoders(channels)
             if config.decoders == "separate"
-            else SharedDecoder(channels, config.hidden, config.upsample)
+            else SharedDecoder(channels, config.hidden, config.upsample, shuffled=config.decoders == "shuffled")
         )
         self.present_distribution, self.future_distribution = (
             SpatialDistribution(inputs, inputs // 2, config.latent, config.log_sigma)

@@ -149,6 +149,19 @@ def test_the_shared_decoder_may_project_before_it_upsamples() -> None:
     torch.testing.assert_close(torch.cat(decoder(states), dim=1), decoder.layers[-1](finer))
 
 
+def test_a_shuffled_decoder_has_channels_for_each_finer_cell() -> None:
+    """So that neighbours may differ; centres are as rare at first as with the others."""
+    decoder, states = SharedDecoder(4, 6, 2, shuffled=True).eval(), torch.zeros(3, 4, 5, 6)
+    with torch.no_grad():
+        maps = decoder(states)
+        assert [tuple(each.shape) for each in maps] == [(3, count, 10, 12) for count in (2, 1, 2, 2)]
+        corners = maps.segmentation[0, 1].unfold(0, 2, 2).unfold(1, 2, 2).flatten(2)
+    assert len(corners[0, 0].unique()) == 4
+    assert (corners == corners[0, 0]).all()
+    bias = decoder.layers[-1].bias.view(7, 4)
+    assert (bias == bias.new_tensor(-2.19)).all(1).tolist() == [False, False, True, False, False, False, False]
+
+
 def test_frames_that_do_not_count_change_no_loss() -> None:
     head, features, targets = head_and_data(SEPARATE)
     targets.frame_mask[0, 2] = targets.frame_mask[1] = False
@@ -235,7 +248,7 @@ def test_what_does_not_fit_is_refused() -> None:
     [
         (MotionHeadConfig, {"hidden_warp": "moved"}, "hidden_warp: expected one of none, warped, found 'moved'"),
         (MotionHeadConfig, {"posterior_ignore": "drop"}, "posterior_ignore: expected one of keep, zero, found 'drop'"),
-        (MotionHeadConfig, {"decoders": "none"}, "decoders: expected one of separate, shared, found 'none'"),
+        (MotionHeadConfig, {"decoders": "none"}, "decoders: expected one of separate, shared, shuffled, found 'none'"),
         (MotionHeadConfig, {"latent": 0}, "latent: expected a number from 1, found 0"),
         (MotionHeadConfig, {"log_sigma": (5, -5)}, r"smaller limit first, such as \(-5, 5\), found \(5, -5\)"),
         (MotionHeadConfig, {"upsample": 2}, "separate decoders keep the states' resolution, found 2; choose 1, or"),
