@@ -222,7 +222,7 @@ def tiny() -> ModelConfig:
         fusion=PoolFusionConfig(),
         bev=BevUNetConfig(),
         one_bev=True,
-        motion=MotionHeadConfig(in_channels=32, latent=8, decoders="shared", upsample=2),
+        motion=MotionHeadConfig(in_channels=32, latent=8, decoders="shared", upsample=2, detach=False),
         motion_loss=MotionLossConfig(class_weights=(1.0, 6.0)),
         detection=DetectionConfig(
             in_channels=32, shared_channels=24, class_slots=ONE_TASK, x=along, y=along, branches="joint", upsample=2
