@@ -8,13 +8,14 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 from deepaccident_devkit import taxonomy
+from deepaccident_devkit.accidents.twins import twin_of
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import FieldError, NotAvailableError
 from deepaccident_devkit.rooms import added
 from deepaccident_devkit.support.text import columns_text, possible_text
 from deepaccident_devkit.tables.columns import Choice, Column, Number, Struct
 from deepaccident_devkit.tables.records import table_spec
-from deepaccident_devkit.v2x import accident_visibility, collision
+from deepaccident_devkit.v2x import accident_visibility, collision, hidden_collider
 from deepaccident_devkit.v2x.agents import VISIBILITIES
 
 if TYPE_CHECKING:
@@ -183,6 +184,11 @@ def _closing_speed(dataset: Dataset, scenario: ScenarioRecord) -> float | None:
     return None if contact is None or math.isnan(contact.closing_speed) else contact.closing_speed
 
 
+def _hidden_collider(dataset: Dataset, scenario: ScenarioRecord) -> bool | None:
+    accident = scenario if scenario["collision"] is not None else twin_of(dataset, scenario)
+    return None if accident is None else hidden_collider(dataset, accident)
+
+
 def _of_moving_pairs(name: str) -> Field:
     """One of the fields that are measures of a scenario's interactions."""
 
@@ -267,6 +273,14 @@ _DERIVED = (
         accident_visibility,
         VISIBILITIES,
         costly=True,
+    ),
+    Field(
+        "hidden_collider",
+        "flag",
+        "Whether one of the pair is hidden from ego, 2 to 1 s before the impact; of a twin, in its accident.",
+        _hidden_collider,
+        costly=True,
+        groups=True,
     ),
 )
 FIELDS: Final = {

@@ -24,7 +24,8 @@ def find(dataset: Dataset, *where: str, **filters: FilterValue) -> list[Scenario
 
     Fields: every column of the scenario table (`town`, `weather`, `num_frames`, …); `collision` and what meta says of
     it (`contact_side`, `impact`, `collision_classes`, …); the groups of `--by` (`weather_group`, …); `closing_speed` in
-    m/s; how near moving pairs come (`min_ttc`, `min_pet`, `min_gap`, `max_drac`); and `accident_visibility`.
+    m/s; how near moving pairs come (`min_ttc`, `min_pet`, `min_gap`, `max_drac`); `accident_visibility` and
+    `hidden_collider`.
     `deepaccident_devkit.selection` explains fields, values and texts in full.
 
     Args:

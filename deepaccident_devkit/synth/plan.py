@@ -65,6 +65,9 @@ class SynthConfig:
         sensors: what to write besides labels, calib and meta: `all` sensors' files, with `accidents` those of
             accidents and none of their normal twins, with `cameras` the images alone (no point clouds, no BEV arrays),
             or `none`. Files that two of them write are the same. True and False mean `all` and `none`.
+        sensor_step: sensors' files are written of every so many-th frame alone, counted back from the last one as
+            samples are. With 5 there are all that the samples of `motion.samples` and their pasts need at 2 Hz, on a
+            fifth of the disk. Labels, calib and meta are of all frames, and the same for any step.
         view: `hidden` puts a house on the kerb of the corner between ego and other, who drive a little faster than
             with the view `open`. They see each other only about a second before they meet; the infrastructure sees
             both all the time. With None the scenario files decide.
@@ -90,6 +93,7 @@ class SynthConfig:
     layout: Layout = "A"
     seed: int = 0
     sensors: Sensors | bool = "all"
+    sensor_step: int = 1
     view: View | None = None
     designs: tuple[int, ...] = ()
     designed: bool = False
@@ -105,6 +109,7 @@ class SynthConfig:
         if self.frames is not None:
             _check_range("frames", self.frames, 1, MAX_FRAMES)
         _check_range("seed", self.seed, 0, None)
+        _check_range("sensor_step", self.sensor_step, 1, None)
         if isinstance(self.sensors, bool):
             object.__setattr__(self, "sensors", "all" if self.sensors else "none")
         words = {"layout": get_args(Layout), "sensors": get_args(Sensors), "view": (None, *get_args(View))}

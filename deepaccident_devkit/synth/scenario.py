@@ -6,7 +6,7 @@ It is recorded in parts; each part takes every nth frame, so that several proces
 import multiprocessing
 import threading
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import NamedTuple, cast
@@ -311,7 +311,8 @@ def record_scenario(job: RecordingJob) -> None:
     _share_cores()
     scenario, rig = _KEPT.made_ready(_Task(job.config, job.plan))
     labelled = job.plan.split != "test" or not job.config.unlabelled_test
-    recorder = _Recorder(folder=job.folder, scenario=scenario, rig=rig, labelled=labelled)
+    step = job.config.sensor_step
+    recorder = _Recorder(folder=job.folder, scenario=scenario, rig=rig, labelled=labelled, sensor_step=step)
     if labelled and job.first == 1:
         write_meta(real_path(job.folder.meta_path), scenario.meta)
     for frame in range(job.first, scenario.frames + 1, job.step):
@@ -374,10 +375,13 @@ class _Recorder:
     scenario: Scenario
     rig: Rig
     labelled: bool
+    sensor_step: int
 
     def record(self, frame: int) -> None:
         """Write the files of all agents at one frame, counted from 1."""
         time, rig = frame_timestamp(frame), self.rig
+        if (self.scenario.frames - frame) % self.sensor_step:
+            rig = replace(rig, clouds=False, studio=None)
         scene = rig.scene(time)
         around = rig.surroundings(scene, self._signals(time))
         for agent in rig.agents:

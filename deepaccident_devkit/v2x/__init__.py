@@ -10,6 +10,7 @@ from deepaccident_devkit.v2x.agents import (
     accident_visible,
     accident_visible_mask,
     cooperating_agents,
+    hidden_collider,
     pair_in_view,
 )
 from deepaccident_devkit.v2x.clouds import aggregate_point_cloud
@@ -48,6 +49,7 @@ __all__ = [
     "cooperative_boxes",
     "cooperative_view",
     "future_egomotion",
+    "hidden_collider",
     "map_pointcloud_to_image",
     "message_sizes",
     "pair_in_view",

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ChoiceError, GeometryError, NotAvailableError, TokenError
+from deepaccident_devkit.geometry.boxes import concatenate
 from deepaccident_devkit.support.arrays import BoolArray, as_numbers
 from deepaccident_devkit.support.text import choice, spelled
 from deepaccident_devkit.tables import visible_ids, visible_mask
@@ -36,6 +37,8 @@ _STEP: Final = 5
 _OBSERVED, _EVALUATED = 3, 4
 """Observations that count, the present one and two before it; and steps before the last frame at which the released
 code evaluates: 0.5, 1, 1.5 and 2 s."""
+_BEFORE: Final = (20, 10)
+"""Frames before the last one between which `hidden_collider` looks: 2 to 1 s."""
 _PARTNERS: Final[dict[AgentName, dict[Role, AgentName]]] = {
     "ego_vehicle": {
         "behind": "ego_vehicle_behind",
@@ -206,11 +209,7 @@ def accident_visibility(dataset: Dataset, scenario: RowArgument) -> str | None:
         TokenError: no such scenario.
     """
     record = dataset.scenario[dataset.getind("scenario", scenario)]
-    if record["collision"] is None:
-        return None
-    try:
-        agent = dataset.agent.get(f"{record['token']}/{VEHICLE_AGENTS[0]}")
-    except TokenError:  # a partial download without ego
+    if record["collision"] is None or (agent := _ego_of(dataset, record)) is None:
         return None
     moments = [record["num_frames"] - _STEP * step for step in range(1, _EVALUATED + 1)]
     seen = {_accident_visible(dataset, record, agent, index) for index in moments if index > 0}
@@ -219,6 +218,30 @@ def accident_visibility(dataset: Dataset, scenario: RowArgument) -> str | None:
     if len(seen) == 2:
         return "partial"
     return "visible" if True in seen else "invisible"
+
+
+def hidden_collider(dataset: Dataset, scenario: RowArgument) -> bool | None:
+    """Whether one of the colliding pair is hidden from `ego_vehicle` from 2 to 1 s before the last frame, the impact.
+
+    Ego sees it then at no frame, ten a second, as far as the recording reaches back: itself, by the released rule
+    (docs/released_code.md, Visibility and attributes). Those of `SHEER_CURTAINS` are not hidden.
+
+    Returns:
+        None if meta names no collision or is missing, or where it cannot be judged: meta does not say who ego is, or
+        one of the frames, or all of them, are missing.
+
+    Raises:
+        TokenError: no such scenario.
+    """
+    record = dataset.scenario[dataset.getind("scenario", scenario)]
+    collision, agent = record["collision"], _ego_of(dataset, record)
+    first, last = (record["num_frames"] - before for before in _BEFORE)
+    if collision is None or agent is None or agent["actor_id"] is None or last < 1:
+        return None
+    if record["name"] in SHEER_CURTAINS:
+        return False
+    seen = _has_in_view(dataset, agent, range(max(first, 1), last + 1), collision["ids"])
+    return None if seen is None else not seen
 
 
 def accident_visible(dataset: Dataset, sample: RowArgument) -> bool | None:
@@ -282,6 +305,14 @@ def pair_in_view(mask: ArrayLike, actor_ids: ArrayLike, pair: Collection[int], o
     return others <= set(visible_ids([mask], [actor_ids]).tolist())
 
 
+def _ego_of(dataset: Dataset, scenario: ScenarioRecord) -> AgentRecord | None:
+    """`ego_vehicle` of a scenario; None in a partial download without it."""
+    try:
+        return dataset.agent.get(f"{scenario['token']}/{VEHICLE_AGENTS[0]}")
+    except TokenError:
+        return None
+
+
 def _accident_visible(dataset: Dataset, scenario: ScenarioRecord, agent: AgentRecord, index: int) -> bool | None:
     if scenario["weather"] is None:  # there is no meta
         return None
@@ -291,17 +322,17 @@ def _accident_visible(dataset: Dataset, scenario: ScenarioRecord, agent: AgentRe
     if agent["actor_id"] is None and agent["name"] != INFRASTRUCTURE:
         return None
     moments = [index - _STEP * back for back in reversed(range(_OBSERVED))]
-    views = [_has_in_view(dataset, agent, moment, collision["ids"]) if moment > 0 else False for moment in moments]
+    views = [_has_in_view(dataset, agent, [moment], collision["ids"]) if moment > 0 else False for moment in moments]
     seen = [view for view in views if view is not None]
     return bool(accident_visible_mask(seen)) if len(seen) == _OBSERVED else None
 
 
-def _has_in_view(dataset: Dataset, agent: AgentRecord, index: int, pair: Sequence[int]) -> bool | None:
-    """Whether an agent itself sees the others of a pair at a frame; None without a label."""
-    sample = dataset.get_sample(agent["scenario_token"], agent["name"], index)
-    if not sample["labelled"]:
+def _has_in_view(dataset: Dataset, agent: AgentRecord, indices: Iterable[int], pair: Collection[int]) -> bool | None:
+    """Whether an agent itself sees each of the others of a pair at one of some frames; None if one has no label."""
+    samples = [dataset.get_sample(agent["scenario_token"], agent["name"], index) for index in indices]
+    if not all(sample["labelled"] for sample in samples):
         return None
-    boxes = dataset.boxes(sample, "lidar")
+    boxes = concatenate([dataset.boxes(sample, "lidar") for sample in samples], "lidar")
     mask = visible_mask(
         boxes.center[:, :2],
         boxes.category,

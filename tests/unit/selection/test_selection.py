@@ -9,7 +9,7 @@ from tiny import META, TYPE, label_lines, write_tiny_release
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, DeepAccidentError, FieldError
-from deepaccident_devkit.evaluation.breakdowns import ATTRIBUTES
+from deepaccident_devkit.evaluation.breakdowns import ATTRIBUTES, sample_attributes, tokens_by_value
 from deepaccident_devkit.interactions import scenario as interactions_module
 from deepaccident_devkit.selection import Filter, parse_where
 from deepaccident_devkit.selection.fields import FIELDS, group_texts
@@ -311,6 +311,27 @@ def test_scenarios_are_found_by_how_well_their_accident_is_seen(tmp_path: Path, 
     da = DeepAccident(dataroot=tmp_path, verbose=False)
     assert len(da.find(accident_visibility=expected)) == 1
     assert da.find(f"accident_visibility!={expected}") == da.find(accident_visibility=None) == []
+
+
+@pytest.mark.parametrize("hidden", [True, False])
+def test_a_hidden_collider_is_one_of_the_accident_and_of_its_twin(tmp_path: Path, hidden: bool) -> None:
+    """The rule itself is in tests/unit/v2x/test_agents.py. Without an accident it is not known."""
+
+    def lines(agent: str, frame: int) -> list[str]:
+        return [*label_lines(agent, frame), f"car 30 0 0 4.5 1.9 1.5 0 0 0 1212 {9 * (not hidden)} {not hidden}"]
+
+    accident, alone, first = named("Town03", 1), named("Town03", 2), TYPE.replace("accident", "normal")
+    for kind, name, meta in ((TYPE, accident, META), (first, accident, QUIET), (first, alone, QUIET)):
+        write_tiny_release(
+            tmp_path, scenario_type=kind, name=name, meta=meta, frames=20, agents=("ego_vehicle",), lines_of=lines
+        )
+    da = DeepAccident(dataroot=tmp_path, verbose=False)
+    pair, rest = [f"{TYPE}/{accident}", f"{first}/{accident}"], [f"{first}/{alone}"]
+    assert [one["token"] for one in da.find(hidden_collider=hidden)] == pair
+    assert [one["token"] for one in da.find(hidden_collider=None)] == rest
+    samples = {token: f"{token}/ego_vehicle/010" for token in (*pair, *rest)}
+    groups = tokens_by_value(sample_attributes(da, samples.values()), "hidden_collider")
+    assert groups == {str(hidden).lower(): [samples[token] for token in pair], None: [samples[token] for token in rest]}
 
 
 def test_the_most_critical_moving_pair(da_motion: DeepAccident, monkeypatch: pytest.MonkeyPatch) -> None:

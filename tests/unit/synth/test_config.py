@@ -16,6 +16,7 @@ RELEASED = ("for_released_code: the released code needs ", "leave one of")
         ({"frames": 0}, ("frames: 0 is not possible", "from 1 to 999")),
         ({"frames": 1000}, ("frames: 1000",)),
         ({"seed": -1}, ("seed: -1",)),
+        ({"sensor_step": 0}, ("sensor_step: 0 is not possible", "at least 1")),
         ({"image_size": (15, 9)}, ("width: 15",)),
         ({"image_size": (16, 8)}, ("height: 8",)),
         ({"image_size": (16,)}, ("expected (width, height)",)),

@@ -206,13 +206,27 @@ def test_exact_releases_differ_in_calib_and_counts_alone(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("sensors", "files"),
-    [("none", r"\.(txt|pkl)$"), ("cameras", r"\.(txt|pkl|jpg)$"), ("accidents", r"_accident/|\.(txt|pkl)$")],
+    ("fields", "files"),
+    [
+        ({"sensors": "none"}, r"\.(txt|pkl)$"),
+        ({"sensors": "cameras"}, r"\.(txt|pkl|jpg)$"),
+        ({"sensors": "accidents"}, r"_accident/|\.(txt|pkl)$"),
+        ({"sensor_step": 2}, r"\.(txt|pkl)$|_00[13]\.\w+$"),  # counted back from the last of three frames
+        ({"sensor_step": 9, "sensors": "cameras"}, r"\.(txt|pkl)$|_003\.jpg$"),
+    ],
     ids=str,
 )
-def test_with_fewer_sensors_the_other_files_are_the_same(tmp_path, release_root, config, digests, sensors, files):
-    fewer = digests(make_release(tmp_path / sensors, replace(config, sensors=sensors), workers=1))
+def test_with_fewer_sensors_the_other_files_are_the_same(tmp_path, release_root, config, digests, fields, files):
+    fewer = digests(make_release(tmp_path / "fewer", replace(config, **fields), workers=1))
     assert fewer == {name: content for name, content in digests(release_root).items() if re.search(files, name)}
+
+
+@pytest.mark.slow
+def test_sensors_of_some_frames_alone_are_missing_files_and_no_errors(tmp_path):
+    config = SynthConfig(scenarios=2, frames=3, image_size=(32, 18), sensors="cameras", sensor_step=2)
+    root = make_release(tmp_path / "out", config, workers=1)
+    found = validate_release(root, deep=True, workers=1)
+    assert {(each.code, each.severity) for each in found.findings} == {("sensor-frames-missing", "warning")}
 
 
 @pytest.mark.slow

@@ -23,6 +23,7 @@ from deepaccident_devkit.v2x import (
     accident_visible,
     accident_visible_mask,
     cooperating_agents,
+    hidden_collider,
     pair_in_view,
 )
 from deepaccident_devkit.v2x.agents import SHEER_CURTAINS
@@ -199,6 +200,40 @@ def test_an_accident_is_seen_at_the_four_moments_or_at_some(
     for index in range(1, frames + 1):
         now, missed = index in seen, sum(moment not in seen for moment in (index, index - 5, index - 10))
         assert accident_visible(da, f"{tiny.TOKEN}/ego_vehicle/{index:03d}") == (now or missed < 2), index
+
+
+@pytest.mark.parametrize(
+    ("frames", "seen", "expected"),
+    [
+        (30, (), True),
+        (30, {*range(1, 10), *range(21, 31)}, True),  # 2.1 s before the last frame, and 0.9 s
+        (30, {10}, False),
+        (30, {20}, False),
+        (30, {15}, False),
+        (12, {3}, True),
+        (12, {1}, False),
+        (10, (), None),
+    ],
+)
+def test_a_collider_is_hidden_if_ego_sees_it_at_no_frame_from_2_to_1_s_before_the_last(
+    tmp_path: Path, frames: int, seen: Collection[int], expected: bool | None
+) -> None:
+    assert hidden_collider(watched(tmp_path, seen, frames), tiny.TOKEN) is expected
+
+
+def test_whether_a_collider_is_hidden_may_be_unknown(tmp_path: Path, da: DeepAccident) -> None:
+    for place, release in (
+        ("silent", {"meta": None}),
+        ("unlabelled", {"labelled": False}),
+        ("nameless", {"meta": tiny.META.replace(" agents id: 1223 1236 1212 1237\n", "")}),
+        ("pole", {"agent": "infrastructure"}),
+    ):
+        assert hidden_collider(watched(tmp_path / place, (), **release), tiny.TOKEN) is None, place
+    bystander = tiny.META.replace("id: 1223 1236", "id: 1300 1236")
+    assert hidden_collider(watched(tmp_path / "one", (), meta=bystander), tiny.TOKEN)  # of two, one is seen
+    assert hidden_collider(da, next(scenario for scenario in da.scenario if scenario["collision"] is None)) is None
+    [curtain, *_] = SHEER_CURTAINS
+    assert hidden_collider(watched(tmp_path / "curtain", (), name=curtain), f"{tiny.TYPE}/{curtain}") is False
 
 
 def test_what_cannot_be_judged_and_what_always_counts_as_seen(tmp_path: Path, da: DeepAccident) -> None:
