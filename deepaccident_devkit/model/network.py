@@ -81,7 +81,7 @@ class ModelConfig:
         temporal: joins an agent's own frames.
         fusion: joins the agents.
         bev: the encoders before the heads.
-        one_bev: whether both heads share one encoder; the release has one each.
+        one_bev: whether both heads share one encoder, of the whole map; the release has one each.
         motion: the motion head.
         detection: the detection head.
         labels: the motion labels that it learns; their grid is the motion grid.
@@ -124,6 +124,10 @@ class ModelConfig:
                 ("images.dtype", cameras.images.dtype, "uint8, which the model scales itself", "uint8"),
                 ("lift.channels", cameras.lift.channels, "temporal.channels", channels),
             ]
+        if self.one_bev:
+            pairs.append(
+                ("temporal.grid", _extent(self.temporal.grid), "the extent of labels.grid", _extent(self.labels.grid))
+            )
         if pillars is not None:
             pairs += [
                 ("pillars.channels", pillars.channels, "temporal.channels", channels),
@@ -313,15 +317,19 @@ class TaskHeads(nn.Module):
 
     def _features(self, fused: Tensor) -> tuple[Tensor, Tensor]:
         config = self.config
-        grid = config.grid
-        motion_grid = config.labels.grid.with_orientation(grid.orientation)
         if config.one_bev:
-            both = self.taskfeat_encoders[_BOTH](crop(fused, grid, motion_grid))
+            both = self.taskfeat_encoders[_BOTH](fused)
             return both, both
+        motion_grid = config.labels.grid.with_orientation(config.grid.orientation)
         return (
             self.taskfeat_encoders[_DETECTION](fused),
-            self.taskfeat_encoders[_MOTION](crop(fused, grid, motion_grid)),
+            self.taskfeat_encoders[_MOTION](crop(fused, config.grid, motion_grid)),
         )
+
+
+def _extent(grid: BevGrid) -> tuple[float, ...]:
+    """Where a grid begins and ends along x and y."""
+    return (*grid.x[:2], *grid.y[:2])
 
 
 def _given(name: str, value: _Input | None) -> _Input:

@@ -237,8 +237,9 @@ def tiny_both() -> ModelConfig:
     return replace(
         config,
         pillars=PillarConfig(channels=config.temporal.channels, grid=config.grid),
-        motion=replace(config.motion, decoders="shuffled"),
+        motion=replace(config.motion, decoders="shuffled", upsample=4),
         motion_loss=replace(config.motion_loss, class_weights=(1.0, 2.0)),
+        labels=replace(config.labels, grid=BevGrid()),
     )
 
 
