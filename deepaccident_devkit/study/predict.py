@@ -1,0 +1,139 @@
+"""What a row predicts: by a model, also with spoilt inputs, by a baseline, or nothing and everything."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from deepaccident_devkit.baselines import predict_accidents, predict_detections, predict_motion
+from deepaccident_devkit.dataset import Dataset
+from deepaccident_devkit.errors import ConfigError, NotAvailableError
+from deepaccident_devkit.evaluation import Accident, DetectedBoxes, MotionOutput
+from deepaccident_devkit.evaluation.breakdowns import cluster_of
+from deepaccident_devkit.evaluation.runs.setups import scenario_of
+from deepaccident_devkit.geometry import Boxes
+from deepaccident_devkit.motion import MotionLabelConfig
+from deepaccident_devkit.study.recipe import Row
+from deepaccident_devkit.taxonomy import FRAME_PERIOD
+
+_OWN: Final = ("token", "agents", "agent_valid", "world_from_ego", "augmentation", "files_missing")
+"""Of an item of `V2XDataset`, what is the ego's or no agent's; all else has a place for each agent."""
+Predicted = tuple[str, MotionOutput, list[Accident], DetectedBoxes]
+"""Of a sample: its token, motion, accidents, and boxes in world."""
+
+
+def predictions_of(
+    row: Row, weights: Path | None, device: str, dataset: Dataset, tokens: Sequence[str], labels: MotionLabelConfig
+) -> Iterator[Predicted]:
+    """Predict samples, one after another.
+
+    Args:
+        row: what predicts.
+        weights: of a row that has some.
+        device: where a model is.
+        dataset: the release.
+        tokens: of the samples.
+        labels: of which motion is predicted.
+
+    Raises:
+        ConfigError: the weights were trained for other labels, or latency is longer than a sample's past.
+        NotAvailableError: there is no other pair of scenarios to take partners from.
+        DeepAccidentError: as of `model.predictions`, or of the baselines.
+    """
+    if weights is not None:
+        yield from _by_model(row, weights, device, dataset, tokens, labels)
+        return
+    horizon = labels.future_frames * labels.step * FRAME_PERIOD
+    for token in tokens:
+        if row.baseline is None:
+            yield _trivial(row, token, labels)
+            continue
+        seeing: dict[str, Any] = {"agents": row.cooperating, "link": row.link}
+        motion = predict_motion(dataset, token, model=row.baseline, config=labels, **seeing)
+        accidents = predict_accidents(dataset, token, model=row.baseline, horizon=horizon, **seeing)
+        yield token, motion, accidents, predict_detections(dataset, token, **seeing)
+
+
+def _by_model(
+    row: Row, weights: Path, device: str, dataset: Dataset, tokens: Sequence[str], labels: MotionLabelConfig
+) -> Iterator[Predicted]:
+    from deepaccident_devkit.export.torch import V2XDataset, collate
+    from deepaccident_devkit.model import PredictConfig, load_model, predictions
+    from deepaccident_devkit.model.results import prediction_of
+    from deepaccident_devkit.model.training_run import one_thread
+
+    model = load_model(weights).to(device).eval()
+    own = model.config.labels
+    if own.grid != labels.grid or model.config.labels_protocol != labels.protocol:
+        cell = own.grid.x[2]
+        raise ConfigError(
+            f"{weights}: was trained with cells of {cell:g} m and the labels {model.config.labels_protocol}; give "
+            f"`cell: {cell:g}` and `labels: {model.config.labels_protocol}` in the recipe's `test`"
+        )
+    config = PredictConfig(agents=row.cooperating, link=row.link, device=device)
+    if row.control is None:
+        found = predictions(model, dataset, tokens, config)
+    else:
+        given = model.config.inputs(config.agents, link=config.link)
+        items: Any = V2XDataset(dataset, tokens, given)
+        foreign: Any = V2XDataset(dataset, strangers_of(tokens), given) if row.control == "strangers" else None
+        changed = (
+            blanked(items[at]) if foreign is None else with_strangers(items[at], foreign[at])
+            for at in range(len(items))
+        )
+        found = (prediction_of(model, collate([item]), config) for item in changed)
+    with one_thread():
+        yield from ((each.token, each.motion, each.accidents, each.boxes) for each in found)
+
+
+def strangers_of(tokens: Sequence[str]) -> list[str]:
+    """For each sample one at the same place in the list of another pair's scenario, whose partners take part in it.
+
+    Raises NotAvailableError: all are of one pair.
+    """
+    scenarios: dict[str, list[str]] = {}
+    for token in tokens:
+        scenarios.setdefault(scenario_of(token), []).append(token)
+    names, chosen = list(scenarios), []
+    for at, name in enumerate(names):
+        others = [each for each in names[at + 1 :] + names[:at] if cluster_of(each) != cluster_of(name)]
+        if not others:
+            raise NotAvailableError(f"{name}: there is no other pair to take strangers from; test on several pairs")
+        given = scenarios[others[0]]
+        chosen += [given[min(rank, len(given) - 1)] for rank in range(len(scenarios[name]))]
+    return chosen
+
+
+def blanked(item: Mapping[str, Any]) -> dict[str, Any]:
+    """An item of `V2XDataset` with all images black, and no point in any cloud."""
+    changed = dict(item)
+    if "images" in item:
+        changed["images"] = item["images"] * 0
+    if "points" in item:
+        changed["points"] = [[cloud[:0] for cloud in of_agent] for of_agent in item["points"]]
+    return changed
+
+
+def with_strangers(item: Mapping[str, Any], stranger: Mapping[str, Any]) -> dict[str, Any]:
+    """An item whose partners' sensors and poses are those of another item's agents with the same names."""
+    changed = {name: _copied(value) for name, value in item.items() if name not in _OWN}
+    for slot, name in enumerate(item["agents"]):
+        if slot and name in stranger["agents"]:
+            for key, values in changed.items():
+                values[slot] = stranger[key][stranger["agents"].index(name)]
+    return {**item, **changed}
+
+
+def _copied(value: Any) -> Any:
+    return list(value) if isinstance(value, list) else value.clone()
+
+
+def _trivial(row: Row, token: str, labels: MotionLabelConfig) -> Predicted:
+    """An empty map, or one that is all one actor; no alarm, no box."""
+    shape = (1, labels.label_frames, *labels.grid.shape)
+    maps = np.full(shape, int(row.trivial == "everything"), dtype=np.int32)
+    empty = Boxes.from_arrays(np.zeros((0, 3)), np.zeros((0, 3)), [], frame="world")
+    return token, MotionOutput(grid=labels.grid, instances=maps), [], DetectedBoxes(boxes=empty, scores=np.zeros(0))

@@ -1,0 +1,327 @@
+"""A recipe: what a study trains and compares, read from a YAML file and checked as far as it can be without torch.
+
+`Recipe` describes the file, and docs/studies.md shows one. Every fault is a ConfigError that names the file, the key
+and the remedy.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import replace
+from itertools import chain, product
+from pathlib import Path
+from typing import Any, Final, Literal
+
+import msgspec
+
+from deepaccident_devkit.baselines.outlook import MotionModel
+from deepaccident_devkit.errors import ConfigError, DeepAccidentError
+from deepaccident_devkit.evaluation.breakdowns import attribute_name
+from deepaccident_devkit.evaluation.runs import SampleSelection
+from deepaccident_devkit.evaluation.runs.setups import SampleList, ScopeName
+from deepaccident_devkit.geometry import BevGrid
+from deepaccident_devkit.motion import MotionLabelConfig
+from deepaccident_devkit.selection.conditions import parse_where
+from deepaccident_devkit.study.numbers import NUMBERS
+from deepaccident_devkit.support.json_text import as_record
+from deepaccident_devkit.support.reading import fault_text, read_bytes
+from deepaccident_devkit.support.text import choice
+from deepaccident_devkit.synth import SynthConfig
+from deepaccident_devkit.synth.spec.reading import Node, parse_yaml
+from deepaccident_devkit.taxonomy import AGENTS, FRAME_PERIOD
+from deepaccident_devkit.v2x import AGENT_SETS, Link
+
+SHIPPED: Final = Path(__file__).parent / "recipes"
+DEFAULT_HORIZON: Final = 2.0
+_REACH: Final = 50.0
+"""Metres to each side of the ego that the labels show."""
+_EFFECTS: Final = ("latency", "pose_noise", "packet_loss", "budget")
+"""Of a row, what its `Link` has."""
+_LISTS: Final = ("agents", "horizon", *_EFFECTS)
+"""Of a row, what can be a list: a row each."""
+Source = Mapping[str, Any]
+"""A release: fields of `SynthConfig`, or `dataroot` and `version`."""
+
+
+class _Part(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A part of a recipe."""
+
+
+class Headline(_Part, frozen=True, kw_only=True):
+    """The comparison that is fixed before the study is run.
+
+    Attributes:
+        row: that should have more.
+        less: than this one.
+        number: of `NUMBERS`.
+        where: in which of the recipe's groups; None for all samples.
+    """
+
+    row: str
+    less: str
+    number: str = "apa"
+    where: str | None = None
+
+
+class TestedOn(_Part, frozen=True, kw_only=True):
+    """On what all rows are tested.
+
+    Attributes:
+        release: one of the recipe's.
+        split: `all`, or a split's name.
+        samples: of `SampleSelection`, and so are `scope` and `agents`.
+        scope: accidents alone, or their normal twins, too.
+        agents: whose samples.
+        horizon: seconds before the end from which samples are taken; None for the longest that a row looks ahead.
+        where: filters as `--where` takes them: pairs of scenarios stay of which one matches all.
+        cell: metres of a cell of motion labels. Models of the presets `tiny` have 1.
+        labels: their protocol. Models of the presets `tiny` have `clean`.
+    """
+
+    release: str
+    split: str = "all"
+    samples: SampleList = "evaluate"
+    scope: ScopeName = "all"
+    agents: tuple[str, ...] = ("ego_vehicle",)
+    horizon: float | None = None
+    where: tuple[str, ...] = ()
+    cell: float = 0.5
+    labels: str = "released"
+
+    def label_config(self, horizon: float | None) -> MotionLabelConfig:
+        """The labels that look so many seconds ahead; raises ConfigError or ChoiceError."""
+        along, plain = (-_REACH, _REACH, self.cell), MotionLabelConfig(protocol=self.labels)
+        frames = (horizon or DEFAULT_HORIZON) / (plain.step * FRAME_PERIOD)
+        if not (frames >= 1 and abs(frames - round(frames)) < 1e-6):
+            raise ConfigError(f"horizon: {horizon:g} s is no number of steps of 0.5 s; choose 0.5, 1, 1.5, …")
+        return replace(plain, grid=BevGrid(x=along, y=along), future_frames=round(frames))
+
+    def selection(self, split: Path | str, horizon: float) -> SampleSelection:
+        """The samples, of a split file; raises ChoiceError."""
+        return SampleSelection(
+            split=str(split), samples=self.samples, scope=self.scope, agents=self.agents, horizon=horizon
+        )
+
+
+class Row(_Part, frozen=True, kw_only=True):
+    """A line of the tables: what predicts, and with whose data.
+
+    Attributes:
+        name: of the line. In the file it may name keys that have lists, such as `late {latency} s`.
+        weights: of a model, one of the recipe's.
+        baseline: in place of a model, how actors go on that agents see by the labels.
+        trivial: in place of both, an empty map without alarms and boxes; or a map that is all one actor.
+        agents: who cooperates: a configuration, or agents' names with commas.
+        control: what is spoilt in a model's inputs: `blank`, all sensors of all agents; `strangers`, partners' data are
+            those of another pair of scenarios.
+        latency: of `Link`, and so are `pose_noise`, `packet_loss` and `budget`.
+        pose_noise: metres.
+        packet_loss: probability.
+        budget: bytes a frame; a partner sends a model's features, or boxes.
+        horizon: seconds that it looks ahead, None for 2; of a model its weights say it.
+        over: of one of several rows that differ in a number: its key, the number, and what they are called.
+    """
+
+    name: str
+    weights: str | None = None
+    baseline: MotionModel | None = None
+    trivial: Literal["nothing", "everything"] | None = None
+    agents: str = "all"
+    control: Literal["blank", "strangers"] | None = None
+    latency: float = 0.0
+    pose_noise: float = 0.0
+    packet_loss: float = 0.0
+    budget: int | None = None
+    horizon: float | None = None
+    over: tuple[str, float, str] | None = None
+
+    @property
+    def cooperating(self) -> str | list[str]:
+        """As `v2x.cooperating_agents` takes it."""
+        return self.agents if self.agents in AGENT_SETS else self.agents.split(",")
+
+    @property
+    def link(self) -> Link | None:
+        """What happens to partners' data; None for nothing. Raises ConfigError."""
+        chosen: dict[str, Any] = {name: getattr(self, name) for name in _EFFECTS if getattr(self, name)}
+        if self.budget:
+            chosen["payload"] = "bev" if self.weights else "boxes"
+        return Link(**chosen) if chosen else None
+
+    def check(self, weights: Collection[str], test: TestedOn) -> None:
+        """Raise ConfigError or ChoiceError if it cannot be."""
+        kinds = [name for name in ("weights", "baseline", "trivial") if getattr(self, name) is not None]
+        if len(kinds) != 1:
+            raise ConfigError(f"expected one of weights, baseline and trivial, found {' and '.join(kinds) or 'none'}")
+        if self.weights is None and self.control is not None:
+            raise ConfigError("control: spoils what a model sees; leave it out, or give weights")
+        if self.weights is not None and self.horizon is not None:
+            raise ConfigError("horizon: is what the weights were trained for; leave it out here")
+        if self.control is not None and self.budget is not None:
+            raise ConfigError("control, budget: do not go together; leave one out")
+        choice("weights", self.weights, (None, *weights))
+        for agent in () if self.agents in AGENT_SETS else self.cooperating:
+            choice("agents", agent, (*AGENT_SETS, *AGENTS))
+        self.link  # noqa: B018 - refuses what is no link
+        test.label_config(self.horizon)
+
+
+class Recipe(_Part, frozen=True, kw_only=True):
+    """A study.
+
+    Attributes:
+        title: of the page.
+        question: that the study answers.
+        releases: name → fields of `SynthConfig`, or `dataroot` and `version` of one that is there.
+        test: on what all rows are tested.
+        rows: the lines of the tables.
+        seeds: of the trainings; each row of a model is one of every seed.
+        weights: name → `release` to learn from, `from` which weights above (with their model), and fields of
+            `ModelChoice` and `TrainConfig`; or `file` alone, weights as `deepaccident predict` takes them.
+        groups: name → filters as `--where` takes them: numbers are also given of the pairs of scenarios of which one
+            matches all.
+        by: numbers are also given by these attributes, as `--by` takes them.
+        compare: pairs of rows, of which the differences are given, the first less the second.
+        headline: fixed beforehand; None for none.
+        name: of the folder of its results: the file's, and `-smoke`.
+    """
+
+    title: str
+    question: str
+    releases: dict[str, dict[str, Any]]
+    test: TestedOn
+    rows: tuple[Row, ...]
+    seeds: tuple[int, ...] = (1,)
+    weights: dict[str, dict[str, Any]] = {}
+    groups: dict[str, tuple[str, ...]] = {}
+    by: tuple[str, ...] = ()
+    compare: tuple[tuple[str, str], ...] = ()
+    headline: Headline | None = None
+    name: str = ""
+
+    @property
+    def pairs(self) -> list[tuple[str, str]]:
+        """The rows that are compared, those of the headline first."""
+        first = [] if self.headline is None else [(self.headline.row, self.headline.less)]
+        return list(dict.fromkeys([*first, *self.compare]))
+
+
+def read_recipe(recipe: str, *, smoke: bool = False) -> Recipe:
+    """A recipe from a file, or one that ships, by its name; `smoke` puts in place what its part `smoke` says.
+
+    Raises:
+        ConfigError: it is not there, cannot be read, or is no recipe.
+    """
+    path = Path(recipe)
+    if path.suffix not in (".yaml", ".yml"):
+        known = sorted(each.stem for each in SHIPPED.glob("*.yaml"))
+        path = SHIPPED / f"{choice('RECIPE, which is no file .yaml', recipe, known, error=ConfigError)}.yaml"
+    try:
+        text = read_bytes(path, "spec").decode()
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: {fault_text(error)}; give a file of YAML, in UTF-8") from error
+    told = _plain(parse_yaml(text.strip() or "{}", str(path)))
+    small = told.pop("smoke", None) if isinstance(told, dict) else None
+    if smoke and not isinstance(small, dict):
+        raise ConfigError(f"{path}: smoke: is missing; write this part, or leave out --smoke")
+    told = _merged(told, small) if smoke else told
+    with at(path, "the recipe"):
+        if isinstance(told, dict) and isinstance(told.get("rows"), list):
+            told["rows"] = [each for row in told["rows"] for each in _expanded(row)]
+        read = as_record(told, Recipe)
+    _check(path, read)
+    return msgspec.structs.replace(read, name=f"{path.stem}-smoke" if smoke else path.stem)
+
+
+@contextmanager
+def at(path: Path | str, place: str) -> Iterator[None]:
+    """Say of errors in the block where they are: of a recipe, at a key; raises ConfigError."""
+    try:
+        yield
+    except (DeepAccidentError, ValueError) as error:
+        raise ConfigError(f"{path}: {place}: {error}; docs/studies.md shows a recipe") from error
+
+
+def source_of(source: Source) -> SynthConfig | None:
+    """How a release is made; None for one that is there. Raises ConfigError, ChoiceError or ValueError."""
+    own = "dataroot" in source
+    possible = ("dataroot", "version") if own else [each.name for each in dataclasses.fields(SynthConfig)]
+    for key in source:
+        choice("key", key, possible)
+    given = {**source, "spec": Path(source["spec"])} if source.get("spec") else source
+    return None if own else as_record(given, SynthConfig)
+
+
+def _check(path: Path, recipe: Recipe) -> None:
+    """Compare the parts with one another, and with what the devkit has."""
+    names = [row.name for row in recipe.rows]
+    for name, source in recipe.releases.items():
+        with at(path, f"releases.{name}"):
+            source_of(source)
+    with at(path, "test"):
+        choice("release", recipe.test.release, recipe.releases)
+        recipe.test.selection(recipe.test.split, DEFAULT_HORIZON)
+        recipe.test.label_config(recipe.test.horizon)
+    above: list[str] = []
+    for name, plan in recipe.weights.items():
+        with at(path, f"weights.{name}"):
+            if "file" in plan and len(plan) > 1:
+                raise ConfigError("file: these weights are there; leave the other keys out")
+            if "file" not in plan:
+                choice("release", plan.get("release"), recipe.releases)
+            choice("from, which stands above", plan.get("from"), (None, *above))
+        above.append(name)
+    for row in recipe.rows:
+        with at(path, f"rows: {row.name}"):
+            row.check(recipe.weights, recipe.test)
+            if names.count(row.name) > 1:
+                raise ConfigError("name: is there twice; name the keys that have lists in it, such as {agents}")
+    with at(path, "test.where, groups and by"):
+        for text in (*recipe.test.where, *chain.from_iterable(recipe.groups.values())):
+            parse_where(text)
+        for by in recipe.by:
+            attribute_name(by)
+    with at(path, "compare and headline"):
+        for name in chain.from_iterable(recipe.pairs):
+            choice("row", name, names)
+        if recipe.headline is not None:
+            choice("number", recipe.headline.number, NUMBERS)
+            choice("where", recipe.headline.where, (None, *recipe.groups))
+
+
+def _expanded(row: Any) -> Iterator[Any]:
+    """The rows that one with lists stands for."""
+    lists = {key: row[key] for key in _LISTS if isinstance(row.get(key), list)} if isinstance(row, dict) else {}
+    if not lists:
+        yield row
+        return
+    numbers = [key for key in lists if key != "agents"]
+    for values in product(*lists.values()):
+        one = dict(zip(lists, values, strict=True))
+        name = _filled(str(row.get("name")), one)
+        over = (
+            (numbers[0], one[numbers[0]], _filled(str(row.get("name")), {**one, numbers[0]: "…"})) if numbers else None
+        )
+        yield {**row, **one, "name": name, "over": over}
+
+
+def _filled(name: str, values: Mapping[str, Any]) -> str:
+    for key, value in values.items():
+        name = name.replace(f"{{{key}}}", str(value))
+    return name
+
+
+def _merged(value: Any, changes: Any) -> Any:
+    """A value with another in its place; of two mappings, key by key."""
+    if not (isinstance(value, dict) and isinstance(changes, dict)):
+        return changes
+    return {**value, **{key: _merged(value.get(key), each) for key, each in changes.items()}}
+
+
+def _plain(node: Node) -> Any:
+    """A value as JSON holds it."""
+    if isinstance(node.value, Mapping):
+        return {key: _plain(entry) for key, entry in node.value.items()}
+    return [_plain(each) for each in node.value] if isinstance(node.value, tuple) else node.value

@@ -1,0 +1,256 @@
+"""The numbers of a study, from the counts of its samples; and these counts in a file, without any release.
+
+counted = read_counts("study/agents/counts.json.gz")
+summarised(counted)["headline"]
+"""
+
+from __future__ import annotations
+
+import gzip
+import json
+import os
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+from deepaccident_devkit.errors import ResultsError
+from deepaccident_devkit.evaluation.breakdowns import cluster_of
+from deepaccident_devkit.evaluation.runs.setups import scenario_of
+from deepaccident_devkit.reports import Report, Row
+from deepaccident_devkit.study.numbers import (
+    NUMBERS,
+    Evaluators,
+    Number,
+    Seeds,
+    differences,
+    evaluators_of,
+    plain_numbers,
+    row_numbers,
+    verdict,
+)
+from deepaccident_devkit.support.arrays import ShortRepr
+from deepaccident_devkit.support.files import write_bytes
+from deepaccident_devkit.support.json_text import parsed_json
+from deepaccident_devkit.support.reading import fault_text, read_bytes
+from deepaccident_devkit.support.text import columns_text, fixed_text, path_of
+
+ALL: Final = "all samples"
+"""The name of the group of all samples."""
+MAIN: Final = ("apa", "iou_100", "map", "hidden_foreground")
+"""Numbers that the terminal and the figures show, after the headline's."""
+_WORDS: Final = {
+    "wins": "{row} wins: it has more {number} than {less}, by {size}",
+    "loses": "{row} loses: it has less {number} than {less}, by {size}",
+    "not decided": "it is not decided whether {row} has more {number} than {less}: the difference is {size}",
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CountedRow(ShortRepr):
+    """What was counted of a row.
+
+    Attributes:
+        horizon: seconds that it looks ahead.
+        over: as of `recipe.Row`.
+        seeds: its evaluators by seed; of a row without, under an empty text.
+    """
+
+    horizon: float
+    over: Sequence[Any] | None
+    seeds: Seeds
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Counted(ShortRepr):
+    """All from which the numbers of a study follow.
+
+    Attributes:
+        told: `title`, `question`, `headline`, `compare` and `labels` of the recipe.
+        groups: name → tokens of its samples, those of `ALL` first.
+        rows: by name.
+    """
+
+    told: Mapping[str, Any]
+    groups: Mapping[str, Sequence[str]]
+    rows: Mapping[str, CountedRow]
+
+
+def write_counts(counted: Counted, path: str | os.PathLike[str]) -> None:
+    """Write all counts, packed; the same ones give the same bytes."""
+    rows = {
+        name: {"horizon": row.horizon, "over": row.over, "seeds": {seed: _counts(of) for seed, of in row.seeds.items()}}
+        for name, row in counted.rows.items()
+    }
+    told = {**counted.told, "groups": {name: list(tokens) for name, tokens in counted.groups.items()}, "rows": rows}
+    write_bytes(path_of(path), gzip.compress(json.dumps(told, separators=(",", ":")).encode(), mtime=0))
+
+
+def _counts(evaluators: Evaluators) -> dict[str, Any]:
+    return {kind: {token: each.counts[token] for token in sorted(each.tokens)} for kind, each in evaluators.items()}
+
+
+def read_counts(path: str | os.PathLike[str]) -> Counted:
+    """What `write_counts` wrote; raises ResultsError: it cannot be read, or is something else."""
+    source = path_of(path)
+    try:
+        told = parsed_json(gzip.decompress(read_bytes(source, "results")), constants=True)
+        rows = {name: counted_row(each, told["labels"]) for name, each in told.pop("rows").items()}
+        return Counted(groups=told.pop("groups"), rows=rows, told=told)
+    except (OSError, EOFError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise ResultsError(f"{source}: no counts of a study ({fault_text(error)}); run the study again") from error
+
+
+def counted_row(told: Mapping[str, Any], labels: str) -> CountedRow:
+    """A row from its `horizon`, `over` and counts: seed → what evaluates → token → counts."""
+    seeds: dict[str, Evaluators] = {}
+    for seed, kinds in told["seeds"].items():
+        seeds[seed] = evaluators_of(labels, told["horizon"])
+        for kind, evaluator in seeds[seed].items():
+            for token, each in kinds[kind].items():
+                evaluator.add(token, each)
+    return CountedRow(horizon=told["horizon"], over=told["over"], seeds=seeds)
+
+
+def summarised(counted: Counted) -> dict[str, Any]:
+    """All numbers of a study, as JSON holds them; the same counts give the same.
+
+    `rows`: name → `horizon`, `over` and `groups`: group → number (of `NUMBERS`) → `value`, `low` and `high` of the
+    interval, and the value of each of the `seeds`. `comparisons`: `row`, `less` and `groups` of their differences.
+    `headline`: the recipe's, with its difference, `verdict` and a `text`.
+    """
+    rows = {
+        name: {
+            "horizon": row.horizon,
+            "over": row.over,
+            "groups": {group: _numbers(row.seeds, tokens) for group, tokens in counted.groups.items()},
+        }
+        for name, row in counted.rows.items()
+    }
+    comparisons = [
+        {
+            "row": row,
+            "less": less,
+            "groups": {
+                group: _differences(counted.rows[row].seeds, counted.rows[less].seeds, tokens)
+                for group, tokens in counted.groups.items()
+            },
+        }
+        for row, less in counted.told["compare"]
+    ]
+    headline = counted.told["headline"]
+    return {
+        "title": counted.told["title"],
+        "question": counted.told["question"],
+        "headline": None if headline is None else _headline(headline, comparisons),
+        "groups": {
+            group: {"samples": len(tokens), "pairs": len({cluster_of(scenario_of(token)) for token in tokens})}
+            for group, tokens in counted.groups.items()
+        },
+        "rows": rows,
+        "comparisons": comparisons,
+    }
+
+
+def _numbers(seeds: Seeds, tokens: Sequence[str]) -> dict[str, dict[str, Any]]:
+    alone = {seed: plain_numbers({seed: each}, tokens) for seed, each in seeds.items() if seed}
+    return _with_seeds(row_numbers(seeds, tokens), alone)
+
+
+def _differences(row: Seeds, less: Seeds, tokens: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """A row without seeds, such as a baseline, is compared with each seed of the other."""
+    alone = {}
+    for seed in dict.fromkeys([*row, *less]):
+        if seed and all(seed in each or "" in each for each in (row, less)):
+            more, base = (plain_numbers({seed: each.get(seed, each.get("", {}))}, tokens) for each in (row, less))
+            alone[seed] = {name: _less(more[name], base[name]) for name in more}
+    return _with_seeds(differences(row, less, tokens), alone)
+
+
+def _less(value: float | None, other: float | None) -> float | None:
+    return None if value is None or other is None else value - other
+
+
+def _with_seeds(
+    numbers: Mapping[str, Number], alone: Mapping[str, Mapping[str, float | None]]
+) -> dict[str, dict[str, Any]]:
+    return {name: {**numbers[name], "seeds": {seed: each[name] for seed, each in alone.items()}} for name in NUMBERS}
+
+
+def _headline(headline: Mapping[str, Any], comparisons: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
+    """With what came out."""
+    row, less, number, where = (headline[name] for name in ("row", "less", "number", "where"))
+    pair = next(each for each in comparisons if (each["row"], each["less"]) == (row, less))
+    found = pair["groups"][where or ALL][number]
+    decided = verdict(found)
+    words = {
+        "row": f"`{row}`",
+        "less": f"`{less}`",
+        "number": NUMBERS[number][2],
+        "size": difference_text(found, number),
+    }
+    among = "" if where is None else f"Among `{where}`: "
+    return {**headline, **found, "verdict": decided, "text": f"{among}{_WORDS[decided].format_map(words)}."}
+
+
+def number_with_interval(found: Mapping[str, Any], number: str) -> str:
+    """`12.3 [10.1, 14.8]`, with as many decimals as the number has in tables; a dash for none."""
+    digits = 1 if NUMBERS[number][2].endswith("(%)") else 2
+    if found["value"] is None:
+        return "–"
+    ends = "" if found["low"] is None else f" [{fixed_text(found['low'], digits)}, {fixed_text(found['high'], digits)}]"
+    return fixed_text(found["value"], digits) + ends
+
+
+def difference_text(found: Mapping[str, Any], number: str) -> str:
+    """`+2.1 [0.4, 3.8]`."""
+    sign = "+" if found["value"] is not None and found["value"] > 0 else ""
+    return sign + number_with_interval(found, number)
+
+
+def main_numbers(summary: Mapping[str, Any]) -> list[str]:
+    """The headline's number first, then those of `MAIN`."""
+    first = [] if summary["headline"] is None else [summary["headline"]["number"]]
+    return list(dict.fromkeys([*first, *MAIN]))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class StudyReport(Report):
+    """What came out of a study.
+
+    Attributes:
+        summary: as `summarised`, with the `recipe`, whether it is its `smoke` version, and its `cells`.
+    """
+
+    summary: Mapping[str, Any]
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return dict(self.summary)
+
+    def named_tables(self) -> Mapping[str, Iterable[Row]]:
+        """`rows` and `comparisons`: a line for each number in each group."""
+        rows = [((name,), each["groups"]) for name, each in self.summary["rows"].items()]
+        pairs = [((each["row"], each["less"]), each["groups"]) for each in self.summary["comparisons"]]
+        return {"rows": self._table(("row",), rows), "comparisons": self._table(("row", "less"), pairs)}
+
+    def _table(self, heads: tuple[str, ...], lines: Sequence[tuple[tuple[str, ...], Any]]) -> Iterator[Row]:
+        seeds = list(
+            dict.fromkeys(seed for _, groups in lines for each in groups[ALL].values() for seed in each["seeds"])
+        )
+        yield (*heads, "group", "number", "value", "low", "high", *(f"seed {seed}" for seed in seeds))
+        for names, groups in lines:
+            for group, numbers in groups.items():
+                for number, each in numbers.items():
+                    ends = (each[name] for name in ("value", "low", "high"))
+                    yield (*names, group, number, *ends, *(each["seeds"].get(seed) for seed in seeds))
+
+    def to_text(self) -> str:
+        """The headline, and the rows with the main numbers."""
+        numbers = main_numbers(self.summary)
+        rows = [
+            [name, *(number_with_interval(each["groups"][ALL][number], number) for number in numbers)]
+            for name, each in self.summary["rows"].items()
+        ]
+        table = columns_text([["row", *(NUMBERS[number][2] for number in numbers)], *rows])
+        headline = self.summary["headline"]
+        return table if headline is None else f"{table}\n\n{headline['text']}"
