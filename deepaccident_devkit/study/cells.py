@@ -21,7 +21,6 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, cast
 
@@ -37,8 +36,9 @@ from deepaccident_devkit.release.layout import write_split_file
 from deepaccident_devkit.study.numbers import HIDDEN, HiddenActors, setups_of
 from deepaccident_devkit.study.predict import predictions_of
 from deepaccident_devkit.study.recipe import Row, TestedOn
-from deepaccident_devkit.support.files import replacing_folder
+from deepaccident_devkit.support.files import replacing_folder, write_bytes
 from deepaccident_devkit.support.json_text import parsed_json
+from deepaccident_devkit.support.reading import read_bytes
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
 if TYPE_CHECKING:
@@ -146,47 +146,18 @@ def machine(device: str) -> str:
     return f"{platform.platform()}, {os.cpu_count()} cores, Python {platform.python_version()}, {packages}, {device}"
 
 
-@dataclass(frozen=True, slots=True)
-class Weights:
-    """Weights of one seed.
+def taken(file: Path, folder: Path) -> dict[str, Any]:
+    """The work on weights that are there: a copy of them, so that they stay as they are."""
+    from deepaccident_devkit.model.checkpoint import FINAL
 
-    Attributes:
-        folder: of the run; or a file.
-        key: of the cell; or a checksum of the file.
-        choice: the model.
-        cell: that trains them; None for a file.
-    """
-
-    folder: Path
-    key: str
-    choice: ModelChoice
-    cell: Cell | None = None
+    write_bytes(folder / FINAL, read_bytes(file, "weights"))
+    return {}
 
 
-def weights_cell(
-    bench: Bench,
-    name: str,
-    release: Cell,
-    dataset: DeepAccident,
-    choice: ModelChoice,
-    config: TrainConfig,
-    start: Weights | None,
-) -> Weights:
-    """Weights that are trained on a release, which is opened as `dataset`."""
-    work = partial(_trained, dataset, choice, config, None if start is None else start.folder, bench.device)
-    decides = {
-        "release": release.key,
-        "model": choice.as_dict(),
-        "training": {**config.as_dict(), "split": Path(config.split).name},
-        "start": None if start is None else start.key,
-    }
-    cell = bench.cell("weights", name, work, **decides)
-    return Weights(cell.folder, cell.key, choice, cell)
-
-
-def _trained(
+def trained(
     dataset: DeepAccident, choice: ModelChoice, config: TrainConfig, start: Path | None, device: str, folder: Path
 ) -> dict[str, Any]:
+    """The work on weights that are trained, on a release, from others or from random ones (None)."""
     from deepaccident_devkit.model import train
     from deepaccident_devkit.model.training_run import one_thread, read_log
 
@@ -198,8 +169,8 @@ def _trained(
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class RowWork:
-    """Predicts and counts a row with one seed.
+class Counting:
+    """The work on a row with one seed: its samples are predicted and counted.
 
     Attributes:
         dataset: the release of the test.

@@ -58,10 +58,9 @@ NUMBERS: Final[Mapping[str, tuple[str, str, str]]] = {
 }
 """Number → the evaluator that has it, its path in the result, and its name in tables."""
 RESAMPLING: Final = Resampling()
+_NO_INTERVALS: Final = Resampling(resamples=0)
 Evaluators = Mapping[str, Evaluator[Any]]
 """One model's evaluators, by what they evaluate."""
-Number = dict[str, float | None]
-"""`value`, and with an interval `low` and `high`."""
 Seeds = Mapping[str, Evaluators]
 """Those of each of a row's seeds; of a row without, under an empty text."""
 
@@ -140,60 +139,47 @@ def _near(points: FloatArray, others: FloatArray) -> BoolArray:
     return np.asarray((apart <= NEAR).any(axis=1))
 
 
-def row_numbers(seeds: Seeds, tokens: Collection[str]) -> dict[str, Number]:
-    """The numbers of a row at some samples, all its seeds together: each sample comes once a seed."""
-    found: dict[str, Number] = {}
-    for kind, evaluator in _first(seeds).items():
-        clusters, paths = _clustered(seeds, kind, tokens), _paths(kind)
-        values = _values(evaluator, clusters, paths)
-        ends = intervals_of(evaluator, clusters, values, RESAMPLING).ends
-        for name, path in paths.items():
-            low, high = ends.get(path, (None, None))
-            found[name] = {"value": _known(values[path]), "low": low, "high": high}
-    return found
+def numbers_of_rows(tokens: Collection[str], row: Seeds, less: Seeds | None = None) -> dict[str, dict[str, Any]]:
+    """The numbers of a row at some samples, or how much more it has than another one, by their names in `NUMBERS`.
+
+    All seeds count together, each sample once a seed, and of two rows the same pairs of scenarios are left out for the
+    intervals. `seeds` has the value of each seed; a row without seeds is compared with each one of the other.
+
+    Returns:
+        Number → `value`, `low` and `high`, None where there is none, and `seeds`.
+    """
+    found, alone = _numbers(tokens, row, less, RESAMPLING), {}
+    for seed in dict.fromkeys(each for each in (*row, *(less or ())) if each):
+        one, other = (None if each is None else each.get(seed, each.get("")) for each in (row, less))
+        if one is not None and (less is None or other is not None):
+            alone[seed] = _numbers(tokens, {seed: one}, None if other is None else {seed: other}, _NO_INTERVALS)
+    return {
+        name: {**each, "seeds": {seed: numbers[name]["value"] for seed, numbers in alone.items()}}
+        for name, each in found.items()
+    }
 
 
-def plain_numbers(seeds: Seeds, tokens: Collection[str]) -> dict[str, float | None]:
-    """The same without intervals."""
-    found: dict[str, float | None] = {}
-    for kind, evaluator in _first(seeds).items():
-        values = _values(evaluator, _clustered(seeds, kind, tokens), _paths(kind))
-        found |= {name: _known(values[path]) for name, path in _paths(kind).items()}
-    return found
-
-
-def differences(other: Seeds, base: Seeds, tokens: Collection[str]) -> dict[str, Number]:
-    """How much more the first row has: the same pairs of scenarios are left out of both."""
-    found: dict[str, Number] = {}
-    for kind, evaluator in _first(base).items():
-        pair, paths = (_clustered(base, kind, tokens), _clustered(other, kind, tokens)), _paths(kind)
-        less, more = (_values(evaluator, each, paths) for each in pair)
-        values = {path: more[path] - less[path] for path in paths.values()}
-        ends = dict.fromkeys(values, (math.nan, math.nan))
-        if len(pair[0]) >= LEAST_CLUSTERS:
-            low, high, _ = difference_intervals(evaluator, pair, values, RESAMPLING)
-            ends = dict(zip(values, zip(low.tolist(), high.tolist(), strict=True), strict=True))
-        for name, path in paths.items():
-            found[name] = {"value": _known(values[path]), "low": _known(ends[path][0]), "high": _known(ends[path][1])}
-    return found
-
-
-def verdict(difference: Mapping[str, float | None]) -> str:
-    """`wins`, `loses` or `not decided`, by the interval of a difference."""
-    low, high = difference["low"], difference["high"]
-    if low is None or high is None or low <= 0 <= high:
-        return "not decided"
-    return "wins" if low > 0 else "loses"
-
-
-def _first(seeds: Seeds) -> Evaluators:
-    return next(iter(seeds.values()))
-
-
-def _values(evaluator: Evaluator[Any], clusters: Clusters, paths: Mapping[str, str]) -> dict[str, float]:
-    """Path → the number of all clusters together; NaN for none."""
-    numbers = numbers_of(evaluator.result_of([*chain.from_iterable(clusters)]))
-    return {path: numbers.get(path, math.nan) for path in paths.values()}
+def _numbers(
+    tokens: Collection[str], row: Seeds, less: Seeds | None, resampling: Resampling
+) -> dict[str, dict[str, float | None]]:
+    found: dict[str, dict[str, float | None]] = {}
+    for kind, evaluator in next(iter(row.values())).items():
+        paths = {path: name for name, (of, path, _) in NUMBERS.items() if of == kind}
+        sides = [_clustered(each, kind, tokens) for each in (row, less) if each is not None]
+        results = [numbers_of(evaluator.result_of([*chain.from_iterable(side)])) for side in sides]
+        values = {path: results[0].get(path, math.nan) for path in paths}
+        ends: Mapping[str, tuple[float, float]] = {}
+        if less is None:
+            ends = intervals_of(evaluator, sides[0], values, resampling).ends
+        else:
+            values = {path: value - results[1].get(path, math.nan) for path, value in values.items()}
+            if len(sides[0]) >= LEAST_CLUSTERS and resampling.resamples:
+                low, high, _ = difference_intervals(evaluator, (sides[1], sides[0]), values, resampling)
+                ends = dict(zip(values, zip(low.tolist(), high.tolist(), strict=True), strict=True))
+        for path, name in paths.items():
+            told = zip(("value", "low", "high"), (values[path], *ends.get(path, (math.nan, math.nan))), strict=True)
+            found[name] = {key: each if math.isfinite(each) else None for key, each in told}
+    return {name: found[name] for name in NUMBERS}
 
 
 def _clustered(seeds: Seeds, kind: str, tokens: Collection[str]) -> Clusters:
@@ -204,9 +190,9 @@ def _clustered(seeds: Seeds, kind: str, tokens: Collection[str]) -> Clusters:
     return [[*chain.from_iterable(parts)] for parts in zip(*of_seeds, strict=True)]
 
 
-def _paths(kind: str) -> dict[str, str]:
-    return {name: path for name, (found, path, _) in NUMBERS.items() if found == kind}
-
-
-def _known(value: float) -> float | None:
-    return value if math.isfinite(value) else None
+def verdict(difference: Mapping[str, Any]) -> str:
+    """`wins`, `loses` or `not decided`, by the interval of a difference."""
+    low, high = difference["low"], difference["high"]
+    if low is None or high is None or low <= 0 <= high:
+        return "not decided"
+    return "wins" if low > 0 else "loses"

@@ -63,7 +63,7 @@ def study_html(summary: Mapping[str, Any], figures: Sequence[tuple[Path, str]]) 
         summary=summary,
         header=_header(summary),
         pictures=[(read_bytes(path, "image"), f"{said} {words}", f"{said} {words}") for path, said in figures],
-        numbers={name: said for name, (_, _, said) in NUMBERS.items()},
+        numbers=[said for _, _, said in NUMBERS.values()],
         rows=[
             [name, *(_cell(each["groups"][ALL][number], number) for number in NUMBERS)] for name, each in _rows(summary)
         ],
@@ -97,11 +97,10 @@ def study_html(summary: Mapping[str, Any], figures: Sequence[tuple[Path, str]]) 
 def _header(summary: Mapping[str, Any]) -> dict[str, str]:
     tested = summary["groups"][ALL]
     took = sum(each["seconds"] for each in summary["cells"])
-    machines = {f"{each['machine']['system']}, {each['machine']['cores']} cores" for each in summary["cells"]}
+    machines = {each["machine"] for each in summary["cells"]}
     return {
         "question": summary["question"],
         "test": f"{tested['samples']:,} samples of {tested['pairs']:,} pairs of an accident and its twin",
-        "smoke": "yes: numbers say nothing" if summary["smoke"] else "no",
         "devkit": summary["devkit"],
         "made in": f"{took / 3600:.2f} hours of one process, on {'; '.join(sorted(machines))}",
     }

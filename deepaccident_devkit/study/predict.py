@@ -1,8 +1,10 @@
-"""What a row predicts: by a model, also with spoilt inputs, by a baseline, or nothing and everything."""
+"""What a row predicts: by a model, also with spoilt inputs, by a baseline, or what needs no thought."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from copy import copy
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -11,16 +13,17 @@ import numpy as np
 from deepaccident_devkit.baselines import predict_accidents, predict_detections, predict_motion
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import ConfigError, NotAvailableError
-from deepaccident_devkit.evaluation import Accident, DetectedBoxes, MotionOutput
+from deepaccident_devkit.evaluation import Accident, DetectedBoxes, MotionOutput, foreseen_accident
 from deepaccident_devkit.evaluation.breakdowns import cluster_of
 from deepaccident_devkit.evaluation.runs.setups import scenario_of
 from deepaccident_devkit.geometry import Boxes
-from deepaccident_devkit.motion import MotionLabelConfig
+from deepaccident_devkit.motion import MotionLabelConfig, motion_labels
 from deepaccident_devkit.study.recipe import Row
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
 _OWN: Final = ("token", "agents", "agent_valid", "world_from_ego", "augmentation", "files_missing")
 """Of an item of `V2XDataset`, what is the ego's or no agent's; all else has a place for each agent."""
+_Found = tuple[MotionOutput, list[Accident], DetectedBoxes]
 Predicted = tuple[str, MotionOutput, list[Accident], DetectedBoxes]
 """Of a sample: its token, motion, accidents, and boxes in world."""
 
@@ -46,15 +49,26 @@ def predictions_of(
     if weights is not None:
         yield from _by_model(row, weights, device, dataset, tokens, labels)
         return
-    horizon = labels.future_frames * labels.step * FRAME_PERIOD
     for token in tokens:
-        if row.baseline is None:
-            yield _trivial(row, token, labels)
-            continue
-        seeing: dict[str, Any] = {"agents": row.cooperating, "link": row.link}
+        found = _without_model(row, dataset, token, labels)
+        yield (token, *found)
+
+
+def _without_model(row: Row, dataset: Dataset, token: str, labels: MotionLabelConfig) -> _Found:
+    step, seeing = labels.step * FRAME_PERIOD, dict[str, Any](agents=row.cooperating, link=row.link)
+    if row.baseline is not None:
         motion = predict_motion(dataset, token, model=row.baseline, config=labels, **seeing)
+        horizon = labels.future_frames * step
         accidents = predict_accidents(dataset, token, model=row.baseline, horizon=horizon, **seeing)
-        yield token, motion, accidents, predict_detections(dataset, token, **seeing)
+        return motion, accidents, predict_detections(dataset, token, **seeing)
+    if row.trivial == "labels":
+        told = motion_labels(dataset, token, replace(labels, agents=row.cooperating)).to_present()
+        motion = MotionOutput(grid=labels.grid, instances=told.instance[None])
+        foreseen = foreseen_accident(motion, step=step, labels=str(labels.protocol))
+        return motion, [] if foreseen is None else [foreseen], predict_detections(dataset, token, **seeing)
+    maps = np.full((1, labels.label_frames, *labels.grid.shape), row.trivial == "everything", dtype=np.int32)
+    empty = Boxes.from_arrays(np.zeros((0, 3)), np.zeros((0, 3)), [], frame="world")
+    return MotionOutput(grid=labels.grid, instances=maps), [], DetectedBoxes(boxes=empty, scores=np.zeros(0))
 
 
 def _by_model(
@@ -99,11 +113,10 @@ def strangers_of(tokens: Sequence[str]) -> list[str]:
         scenarios.setdefault(scenario_of(token), []).append(token)
     names, chosen = list(scenarios), []
     for at, name in enumerate(names):
-        others = [each for each in names[at + 1 :] + names[:at] if cluster_of(each) != cluster_of(name)]
-        if not others:
+        other = next((each for each in names[at:] + names[:at] if cluster_of(each) != cluster_of(name)), None)
+        if other is None:
             raise NotAvailableError(f"{name}: there is no other pair to take strangers from; test on several pairs")
-        given = scenarios[others[0]]
-        chosen += [given[min(rank, len(given) - 1)] for rank in range(len(scenarios[name]))]
+        chosen += [scenarios[other][min(rank, len(scenarios[other]) - 1)] for rank in range(len(scenarios[name]))]
     return chosen
 
 
@@ -119,21 +132,13 @@ def blanked(item: Mapping[str, Any]) -> dict[str, Any]:
 
 def with_strangers(item: Mapping[str, Any], stranger: Mapping[str, Any]) -> dict[str, Any]:
     """An item whose partners' sensors and poses are those of another item's agents with the same names."""
-    changed = {name: _copied(value) for name, value in item.items() if name not in _OWN}
+    changed = {
+        name: copy(value) if isinstance(value, list) else value.clone()
+        for name, value in item.items()
+        if name not in _OWN
+    }
     for slot, name in enumerate(item["agents"]):
         if slot and name in stranger["agents"]:
             for key, values in changed.items():
                 values[slot] = stranger[key][stranger["agents"].index(name)]
     return {**item, **changed}
-
-
-def _copied(value: Any) -> Any:
-    return list(value) if isinstance(value, list) else value.clone()
-
-
-def _trivial(row: Row, token: str, labels: MotionLabelConfig) -> Predicted:
-    """An empty map, or one that is all one actor; no alarm, no box."""
-    shape = (1, labels.label_frames, *labels.grid.shape)
-    maps = np.full(shape, int(row.trivial == "everything"), dtype=np.int32)
-    empty = Boxes.from_arrays(np.zeros((0, 3)), np.zeros((0, 3)), [], frame="world")
-    return token, MotionOutput(grid=labels.grid, instances=maps), [], DetectedBoxes(boxes=empty, scores=np.zeros(0))

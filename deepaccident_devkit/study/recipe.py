@@ -7,9 +7,10 @@ and the remedy.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from itertools import chain, product
 from pathlib import Path
 from typing import Any, Final, Literal
@@ -41,8 +42,6 @@ _EFFECTS: Final = ("latency", "pose_noise", "packet_loss", "budget")
 """Of a row, what its `Link` has."""
 _LISTS: Final = ("agents", "horizon", *_EFFECTS)
 """Of a row, what can be a list: a row each."""
-Source = Mapping[str, Any]
-"""A release: fields of `SynthConfig`, or `dataroot` and `version`."""
 
 
 class _Part(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -98,12 +97,6 @@ class TestedOn(_Part, frozen=True, kw_only=True):
             raise ConfigError(f"horizon: {horizon:g} s is no number of steps of 0.5 s; choose 0.5, 1, 1.5, …")
         return replace(plain, grid=BevGrid(x=along, y=along), future_frames=round(frames))
 
-    def selection(self, split: Path | str, horizon: float) -> SampleSelection:
-        """The samples, of a split file; raises ChoiceError."""
-        return SampleSelection(
-            split=str(split), samples=self.samples, scope=self.scope, agents=self.agents, horizon=horizon
-        )
-
 
 class Row(_Part, frozen=True, kw_only=True):
     """A line of the tables: what predicts, and with whose data.
@@ -112,7 +105,8 @@ class Row(_Part, frozen=True, kw_only=True):
         name: of the line. In the file it may name keys that have lists, such as `late {latency} s`.
         weights: of a model, one of the recipe's.
         baseline: in place of a model, how actors go on that agents see by the labels.
-        trivial: in place of both, an empty map without alarms and boxes; or a map that is all one actor.
+        trivial: in place of both, `nothing`, an empty map without alarms and boxes; `everything`, a map that is all one
+            actor; or `labels`, what the agents see as the labels show it, the future too: more no model can say.
         agents: who cooperates: a configuration, or agents' names with commas.
         control: what is spoilt in a model's inputs: `blank`, all sensors of all agents; `strangers`, partners' data are
             those of another pair of scenarios.
@@ -127,7 +121,7 @@ class Row(_Part, frozen=True, kw_only=True):
     name: str
     weights: str | None = None
     baseline: MotionModel | None = None
-    trivial: Literal["nothing", "everything"] | None = None
+    trivial: Literal["nothing", "everything", "labels"] | None = None
     agents: str = "all"
     control: Literal["blank", "strangers"] | None = None
     latency: float = 0.0
@@ -150,18 +144,19 @@ class Row(_Part, frozen=True, kw_only=True):
             chosen["payload"] = "bev" if self.weights else "boxes"
         return Link(**chosen) if chosen else None
 
-    def check(self, weights: Collection[str], test: TestedOn) -> None:
+    def check(self, test: TestedOn) -> None:
         """Raise ConfigError or ChoiceError if it cannot be."""
         kinds = [name for name in ("weights", "baseline", "trivial") if getattr(self, name) is not None]
-        if len(kinds) != 1:
-            raise ConfigError(f"expected one of weights, baseline and trivial, found {' and '.join(kinds) or 'none'}")
-        if self.weights is None and self.control is not None:
-            raise ConfigError("control: spoils what a model sees; leave it out, or give weights")
-        if self.weights is not None and self.horizon is not None:
-            raise ConfigError("horizon: is what the weights were trained for; leave it out here")
-        if self.control is not None and self.budget is not None:
-            raise ConfigError("control, budget: do not go together; leave one out")
-        choice("weights", self.weights, (None, *weights))
+        model = self.weights is not None
+        wrong = {
+            f"expected one of weights, baseline and trivial, found {' and '.join(kinds) or 'none'}": len(kinds) != 1,
+            "control: spoils what a model sees; leave it out, or give weights": bool(self.control) and not model,
+            "horizon: is what the weights were trained for; leave it out here": self.horizon is not None and model,
+            "control, budget: do not go together; leave one out": bool(self.control and self.budget),
+        }
+        for told, found in wrong.items():
+            if found:
+                raise ConfigError(told)
         for agent in () if self.agents in AGENT_SETS else self.cooperating:
             choice("agents", agent, (*AGENT_SETS, *AGENTS))
         self.link  # noqa: B018 - refuses what is no link
@@ -244,7 +239,7 @@ def at(path: Path | str, place: str) -> Iterator[None]:
         raise ConfigError(f"{path}: {place}: {error}; docs/studies.md shows a recipe") from error
 
 
-def source_of(source: Source) -> SynthConfig | None:
+def source_of(source: Mapping[str, Any]) -> SynthConfig | None:
     """How a release is made; None for one that is there. Raises ConfigError, ChoiceError or ValueError."""
     own = "dataroot" in source
     possible = ("dataroot", "version") if own else [each.name for each in dataclasses.fields(SynthConfig)]
@@ -256,39 +251,40 @@ def source_of(source: Source) -> SynthConfig | None:
 
 def _check(path: Path, recipe: Recipe) -> None:
     """Compare the parts with one another, and with what the devkit has."""
-    names = [row.name for row in recipe.rows]
-    for name, source in recipe.releases.items():
-        with at(path, f"releases.{name}"):
-            source_of(source)
-    with at(path, "test"):
-        choice("release", recipe.test.release, recipe.releases)
-        recipe.test.selection(recipe.test.split, DEFAULT_HORIZON)
-        recipe.test.label_config(recipe.test.horizon)
-    above: list[str] = []
-    for name, plan in recipe.weights.items():
-        with at(path, f"weights.{name}"):
-            if "file" in plan and len(plan) > 1:
-                raise ConfigError("file: these weights are there; leave the other keys out")
-            if "file" not in plan:
-                choice("release", plan.get("release"), recipe.releases)
-            choice("from, which stands above", plan.get("from"), (None, *above))
-        above.append(name)
-    for row in recipe.rows:
-        with at(path, f"rows: {row.name}"):
-            row.check(recipe.weights, recipe.test)
-            if names.count(row.name) > 1:
-                raise ConfigError("name: is there twice; name the keys that have lists in it, such as {agents}")
-    with at(path, "test.where, groups and by"):
-        for text in (*recipe.test.where, *chain.from_iterable(recipe.groups.values())):
-            parse_where(text)
-        for by in recipe.by:
-            attribute_name(by)
-    with at(path, "compare and headline"):
-        for name in chain.from_iterable(recipe.pairs):
-            choice("row", name, names)
-        if recipe.headline is not None:
-            choice("number", recipe.headline.number, NUMBERS)
-            choice("where", recipe.headline.where, (None, *recipe.groups))
+    test, plans, names = recipe.test, recipe.weights, [row.name for row in recipe.rows]
+    filters = (*test.where, *chain.from_iterable(recipe.groups.values()))
+    number, where = ("apa", None) if recipe.headline is None else (recipe.headline.number, recipe.headline.where)
+    above = {name: (None, *list(plans)[:at_]) for at_, name in enumerate(plans)}
+    checks: list[tuple[str, Callable[[], object]]] = [
+        *((f"releases.{name}", partial(source_of, source)) for name, source in recipe.releases.items()),
+        ("test", partial(choice, "release", test.release, recipe.releases)),
+        ("test", partial(test.label_config, test.horizon)),
+        ("test", partial(SampleSelection, split=test.split, samples=test.samples, agents=test.agents)),
+        *((f"weights.{name}", partial(_check_plan, plans[name], recipe.releases, above[name])) for name in plans),
+        *((f"rows: {row.name}", partial(row.check, test)) for row in recipe.rows),
+        *((f"rows: {row.name}", partial(choice, "weights", row.weights, (None, *plans))) for row in recipe.rows),
+        *((f"rows: {name}", partial(_check_once, name, names)) for name in names),
+        *(("test.where, groups", partial(parse_where, text)) for text in filters),
+        *(("by", partial(attribute_name, by)) for by in recipe.by),
+        *(("compare, headline", partial(choice, "row", name, names)) for name in chain(*recipe.pairs)),
+        ("headline", partial(choice, "number", number, NUMBERS)),
+        ("headline", partial(choice, "where", where, (None, *recipe.groups))),
+    ]
+    for place, check in checks:
+        with at(path, place):
+            check()
+
+
+def _check_plan(plan: Mapping[str, Any], releases: Collection[str], above: Collection[str | None]) -> None:
+    if "file" in plan and len(plan) > 1:
+        raise ConfigError("file: these weights are there; leave the other keys out")
+    choice("release", plan.get("release"), (*releases, *([None] if "file" in plan else [])))
+    choice("from, which stands above", plan.get("from"), above)
+
+
+def _check_once(name: str, names: Sequence[str]) -> None:
+    if names.count(name) > 1:
+        raise ConfigError("name: is there twice; name the keys that have lists in it, such as {agents}")
 
 
 def _expanded(row: Any) -> Iterator[Any]:

@@ -7,6 +7,7 @@ import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, fields
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,29 +15,30 @@ import msgspec
 
 from deepaccident_devkit._version import __version__
 from deepaccident_devkit.deepaccident import DeepAccident
-from deepaccident_devkit.errors import NotAvailableError
 from deepaccident_devkit.evaluation.breakdowns import cluster_of, sample_attributes, tokens_by_value
+from deepaccident_devkit.evaluation.runs import SampleSelection
 from deepaccident_devkit.evaluation.runs.setups import release_note, scenario_of
 from deepaccident_devkit.release.fingerprints import fingerprint, scenario_hashes
 from deepaccident_devkit.rooms import need_room
 from deepaccident_devkit.selection import find
-from deepaccident_devkit.study.cells import Bench, Cell, RowWork, Weights, make, weights_cell
+from deepaccident_devkit.study.cells import Bench, Cell, Counting, make, taken, trained
 from deepaccident_devkit.study.page import save_study
-from deepaccident_devkit.study.recipe import DEFAULT_HORIZON, Recipe, Row, at, source_of
+from deepaccident_devkit.study.recipe import DEFAULT_HORIZON, Recipe, at, source_of
 from deepaccident_devkit.study.summary import ALL, Counted, StudyReport, counted_row, summarised
 from deepaccident_devkit.support.files import writable_folder
 from deepaccident_devkit.support.json_text import as_record
 from deepaccident_devkit.support.reading import file_checksum
 from deepaccident_devkit.support.text import choice, natural_order
-from deepaccident_devkit.synth import SynthConfig, make_release
+from deepaccident_devkit.synth import make_release
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
+    from deepaccident_devkit.model import ModelChoice
     from deepaccident_devkit.parallel import Engine
 
-_Seeds = Mapping[str, Weights]
-"""The weights of each seed; those of a file under an empty text."""
+_Weights = tuple["ModelChoice", dict[str, Cell]]
+"""The model, and the weights of each seed; those of a file under an empty text."""
 _Release = tuple[Cell, DeepAccident]
 
 
@@ -73,16 +75,21 @@ def run_study(
     cores = 1 if device.startswith("cuda") else os.cpu_count()
     engine: Any = {**how, "workers": how.get("workers") or cores}
     with bench.store.shared():
-        releases = {name: _release(bench, name, recipe, **how) for name in _used_releases(recipe)}
+        releases = {name: _release(bench, name, recipe, **how) for name in recipe.releases}
         weights = _weights(recipe, bench, releases, **engine)
         rows = _rows(recipe, bench, releases[recipe.test.release], weights)
-        cells = [*(cell for cell, _ in releases.values()), *_cells_of(weights)]
-        for_rows = [cell for of_row in rows.values() for cell in of_row.values()]
-        bench.make(for_rows, "rows", releases[recipe.test.release][1].places, **engine)
+        bench.make(
+            (cell for of in rows.values() for cell in of.values()),
+            "rows",
+            releases[recipe.test.release][1].places,
+            **engine,
+        )
         counted = _counted(recipe, releases[recipe.test.release][1], rows)
-        notes = [
-            {"kind": each.kind, "name": each.name, "key": each.key, **_notes(each)} for each in [*cells, *for_rows]
-        ]
+        cells = (
+            (cell for cell, _ in releases.values()),
+            *(of.values() for of in (*(of for _, of in weights.values()), *rows.values())),
+        )
+        notes = [{"kind": each.kind, "name": each.name, "key": each.key, **_notes(each)} for each in chain(*cells)]
     told = {"recipe": msgspec.to_builtins(recipe), "devkit": __version__, "cells": notes}
     report = StudyReport(summary=json.loads(json.dumps({**summarised(counted), **told})))
     save_study(report, counted, bench.out / recipe.name)
@@ -94,48 +101,32 @@ def _notes(cell: Cell) -> dict[str, Any]:
     return {name: value for name, value in (cell.kept or {}).items() if name != "counts"}
 
 
-def _used(recipe: Recipe) -> list[str]:
-    """The weights that rows have, and those that they begin from, which stand above them."""
-    used = {row.weights for row in recipe.rows}
-    for name in reversed(list(recipe.weights)):
-        if name in used:
-            used.add(recipe.weights[name].get("from"))
-    return [name for name in recipe.weights if name in used]
-
-
-def _used_releases(recipe: Recipe) -> list[str]:
-    used = {recipe.test.release, *(recipe.weights[name].get("release") for name in _used(recipe))}
-    return [name for name in recipe.releases if name in used]
-
-
 def _release(bench: Bench, name: str, recipe: Recipe, **how: Unpack[Engine]) -> _Release:
     """A release, made if it is not there, by all workers."""
-    source = recipe.releases[name]
-    config = source_of(source)
-    dataset: Any = None
+    source, config = recipe.releases[name], source_of(recipe.releases[name])
     if config is None:
-        dataset = DeepAccident(source.get("version", "v1"), source["dataroot"], verbose=False)
+        dataset = _opened(source)
         told = {**source, "release": release_note(dataset, _scenarios(dataset))}
-        cell = bench.cell("release", name, partial(_described, dataset, how), **told)
     else:
-        spec = None if config.spec is None else config.spec.read_text(encoding="utf-8")
-        told = {**asdict(config), "spec": spec}
-        cell = bench.cell("release", name, partial(_made, config, how), **told)
+        told = {**asdict(config), "spec": config.spec and config.spec.read_text(encoding="utf-8")}
+    cell = bench.cell("release", name, partial(_made, source, how), **told)
     make(cell)
-    return cell, dataset if config is None else DeepAccident("v1", cell.folder, verbose=False)
+    return cell, _opened(source, cell.folder)
 
 
-def _made(config: SynthConfig, how: Any, folder: Path) -> dict[str, Any]:
-    if not folder.is_dir():
+def _opened(source: Mapping[str, Any], folder: Path | None = None) -> DeepAccident:
+    return DeepAccident(source.get("version", "v1"), source.get("dataroot", folder), verbose=False)
+
+
+def _made(source: Mapping[str, Any], how: Any, folder: Path) -> dict[str, Any]:
+    """Make a release, if it is not there: how many scenarios it has, and its fingerprint."""
+    config = source_of(source)
+    if config is not None and not folder.is_dir():
         make_release(folder, config, **how)
-    return _described(DeepAccident("v1", folder, verbose=False), how, folder)
-
-
-def _described(dataset: DeepAccident, how: Mapping[str, Any], folder: Path) -> dict[str, Any]:
-    """How many scenarios a release has, and its fingerprint."""
-    folder.mkdir(parents=True, exist_ok=True)  # of a release that was there it has nothing
-    tokens, engine = _scenarios(dataset), {name: each for name, each in how.items() if name != "progress"}
-    return {"scenarios": len(tokens), "fingerprint": fingerprint(scenario_hashes(dataset, tokens, **engine))}
+    folder.mkdir(parents=True, exist_ok=True)  # of one that was there it has nothing
+    dataset, engine = _opened(source, folder), {name: each for name, each in how.items() if name != "progress"}
+    hashes = scenario_hashes(dataset, _scenarios(dataset), **engine)
+    return {"scenarios": len(hashes), "fingerprint": fingerprint(hashes)}
 
 
 def _scenarios(dataset: DeepAccident, split: str = "all") -> list[str]:
@@ -147,103 +138,112 @@ def _scenarios(dataset: DeepAccident, split: str = "all") -> list[str]:
 
 def _weights(
     recipe: Recipe, bench: Bench, releases: Mapping[str, _Release], **how: Unpack[Engine]
-) -> dict[str, _Seeds]:
-    """All weights, trained if they are not there: those together that begin from nothing, then from these, and on."""
-    found: dict[str, _Seeds] = {}
-    depths: dict[str, int] = {}
-    for name in _used(recipe):
-        start = recipe.weights[name].get("from")
-        depths[name] = 0 if start is None else depths[start] + 1
+) -> dict[str, _Weights]:
+    """All weights, made if they are not there: those together that begin from nothing, then from these, and on."""
+    found: dict[str, _Weights] = {}
+    waves: list[list[str]] = []
+    for name, plan in recipe.weights.items():
+        wave = next((at_ + 1 for at_, names in enumerate(waves) if plan.get("from") in names), 0)
+        waves += [[]] * (wave == len(waves))
+        waves[wave] = [*waves[wave], name]
         with at(recipe.name, f"weights.{name}"):
-            found[name] = _seeds(name, recipe, bench, releases, {} if start is None else found[start])
+            found[name] = _seeds(name, recipe, bench, releases, found)
     places = tuple(place for _, dataset in releases.values() for place in dataset.places)
-    for depth in sorted(set(depths.values())):
-        together = _cells_of({name: found[name] for name in found if depths[name] == depth})
-        bench.make(together, "trainings", places, **how)
+    for names in waves:
+        bench.make([cell for name in names for cell in found[name][1].values()], "weights", places, **how)
     return found
-
-
-def _cells_of(weights: Mapping[str, _Seeds]) -> list[Cell]:
-    return [each.cell for of in weights.values() for each in of.values() if each.cell is not None]
 
 
 def _seeds(
-    name: str, recipe: Recipe, bench: Bench, releases: Mapping[str, _Release], starts: _Seeds
-) -> dict[str, Weights]:
+    name: str, recipe: Recipe, bench: Bench, releases: Mapping[str, _Release], others: Mapping[str, _Weights]
+) -> _Weights:
     """The weights of one name; raises ConfigError, ChoiceError or ValueError."""
     from deepaccident_devkit.model import ModelChoice, TrainConfig, read_weights
 
-    plan = {key: each for key, each in recipe.weights[name].items() if key not in ("release", "from")}
+    plan = dict(recipe.weights[name])
     if "file" in plan:
         read = read_weights(plan["file"])
-        return {"": Weights(read.path, file_checksum(read.path), ModelChoice.from_dict(read.meta, read.path))}
+        cell = bench.cell("weights", name, partial(taken, read.path), file=file_checksum(read.path))
+        return ModelChoice.from_dict(read.meta, read.path), {"": cell}
+    (release, dataset), start = releases[plan.pop("release")], plan.pop("from", None)
     models, trainings = ([each.name for each in fields(kind)] for kind in (ModelChoice, TrainConfig))
     for key in plan:
         choice("key", key, [each for each in (*models, *trainings) if each != "seed"])
-    inherited = next(iter(starts.values())).choice.as_dict() if starts else {}
-    model = as_record({**inherited, **{key: plan[key] for key in models if key in plan}}, ModelChoice)
-    release, dataset = releases[recipe.weights[name]["release"]]
+    inherited, starts = others[start] if start else (ModelChoice(), {})
+    model = as_record({**inherited.as_dict(), **{key: plan[key] for key in models if key in plan}}, ModelChoice)
     given = {"validation": None, **{key: plan[key] for key in trainings if key in plan}}
-    given["split"] = str(bench.split(_scenarios(dataset, plan.get("split", "all"))))
-    made = {}
+    split, cells = bench.split(_scenarios(dataset, plan.get("split", "all"))), {}
     for seed in recipe.seeds:
-        config = as_record({**given, "seed": seed}, TrainConfig)
-        start = starts.get(str(seed), starts.get(""))
-        made[str(seed)] = weights_cell(bench, f"{name}, seed {seed}", release, dataset, model, config, start)
-    return made
+        config = as_record({**given, "split": str(split), "seed": seed}, TrainConfig)
+        first = starts.get(str(seed), starts.get(""))
+        work = partial(trained, dataset, model, config, None if first is None else first.folder, bench.device)
+        cells[str(seed)] = bench.cell(
+            "weights",
+            f"{name}, seed {seed}",
+            work,
+            release=release.key,
+            model=model.as_dict(),
+            training={**config.as_dict(), "split": split.name},
+            start=None if first is None else first.key,
+        )
+    return model, cells
 
 
-def _rows(recipe: Recipe, bench: Bench, release: _Release, weights: Mapping[str, _Seeds]) -> dict[str, dict[str, Cell]]:
+def _rows(
+    recipe: Recipe, bench: Bench, release: _Release, weights: Mapping[str, _Weights]
+) -> dict[str, dict[str, Cell]]:
     """Row → seed → its cell, all at the same samples."""
-    (cell, dataset), test = release, recipe.test
-    longest = test.horizon or max(_horizon(row, weights) for row in recipe.rows)
+    (cell, dataset), test, found = release, recipe.test, {}
+    horizons = {
+        row.name: (weights[row.weights][0] if row.weights else row).horizon or DEFAULT_HORIZON for row in recipe.rows
+    }
     scenarios = _matching(dataset, test.where, _scenarios(dataset, test.split), recipe, "test.where")
-    selection = test.selection(bench.split(scenarios), longest)
-    told = {"samples": {**selection.as_dict(), "split": Path(selection.split).name}, "test": [test.labels, test.cell]}
-    found: dict[str, dict[str, Cell]] = {}
+    selection = SampleSelection(
+        split=str(bench.split(scenarios)),
+        samples=test.samples,
+        scope=test.scope,
+        agents=test.agents,
+        horizon=test.horizon or max(horizons.values()),
+    )
+    samples = {**selection.as_dict(), "split": Path(selection.split).name}
     for row in recipe.rows:
-        horizon, seeds = _horizon(row, weights), weights.get(row.weights or "", {"": None})
-        changes = {
-            key: each for key, each in msgspec.to_builtins(row).items() if key not in ("name", "weights", "over")
-        }
-        for seed, of in seeds.items():
-            folder, key = (None, None) if of is None else (of.folder, of.key)
-            work = RowWork(
-                dataset=dataset,
-                row=row,
-                test=test,
-                selection=selection,
-                horizon=horizon,
-                weights=folder,
-                device=bench.device,
+        seeds: Mapping[str, Cell | None] = weights[row.weights][1] if row.weights else {"": None}
+        decides = {**msgspec.to_builtins(row), "horizon": horizons[row.name], "labels": [test.labels, test.cell]}
+        decides = {key: each for key, each in decides.items() if key not in ("name", "weights", "over")}
+        found[row.name] = {
+            seed: bench.cell(
+                "row",
+                f"{row.name}, seed {seed}" if seed else row.name,
+                Counting(
+                    dataset=dataset,
+                    row=row,
+                    test=test,
+                    selection=selection,
+                    horizon=horizons[row.name],
+                    weights=None if of is None else of.folder,
+                    device=bench.device,
+                ),
+                **decides,
+                samples=samples,
+                release=cell.key,
+                trained=None if of is None else of.key,
             )
-            decides = {**told, "row": {**changes, "horizon": horizon}, "weights": key, "release": cell.key}
-            name = f"{row.name}, seed {seed}" if seed else row.name
-            found.setdefault(row.name, {})[seed] = bench.cell("row", name, work, **decides)
+            for seed, of in seeds.items()
+        }
     return found
-
-
-def _horizon(row: Row, weights: Mapping[str, _Seeds]) -> float:
-    if row.weights is None:
-        return row.horizon or DEFAULT_HORIZON
-    return next(iter(weights[row.weights].values())).choice.horizon or DEFAULT_HORIZON
 
 
 def _matching(
     dataset: DeepAccident, where: Sequence[str], scenarios: Iterable[str], recipe: Recipe, place: str
 ) -> list[str]:
-    """Those scenarios of whose pair one matches all filters; raises ConfigError if there is none."""
+    """Those scenarios of whose pair one matches all filters; raises ConfigError."""
     with at(recipe.name, place):
         pairs = {cluster_of(record["token"]) for record in find(dataset, *where)}
-        found = [token for token in scenarios if cluster_of(token) in pairs]
-        if not found:
-            raise NotAvailableError("no pair of scenarios of the test matches; change the filters")
-    return found
+    return [token for token in scenarios if cluster_of(token) in pairs]
 
 
 def _counted(recipe: Recipe, dataset: DeepAccident, rows: Mapping[str, Mapping[str, Cell]]) -> Counted:
     """What was counted of all rows, and the groups of samples."""
-    made = {name: {seed: cell.kept or {} for seed, cell in cells.items()} for name, cells in rows.items()}
     told: Any = {
         "title": recipe.title,
         "question": recipe.question,
@@ -253,7 +253,7 @@ def _counted(recipe: Recipe, dataset: DeepAccident, rows: Mapping[str, Mapping[s
     }
     counted = {}
     for row in recipe.rows:
-        kept = made[row.name]
+        kept = {seed: cell.kept or {} for seed, cell in rows[row.name].items()}
         seeds = {seed: each["counts"] for seed, each in kept.items()}
         horizon = next(iter(kept.values()))["horizon"]
         counted[row.name] = counted_row({"horizon": horizon, "over": row.over, "seeds": seeds}, told["labels"])

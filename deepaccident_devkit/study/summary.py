@@ -20,12 +20,9 @@ from deepaccident_devkit.reports import Report, Row
 from deepaccident_devkit.study.numbers import (
     NUMBERS,
     Evaluators,
-    Number,
     Seeds,
-    differences,
     evaluators_of,
-    plain_numbers,
-    row_numbers,
+    numbers_of_rows,
     verdict,
 )
 from deepaccident_devkit.support.arrays import ShortRepr
@@ -118,22 +115,12 @@ def summarised(counted: Counted) -> dict[str, Any]:
     interval, and the value of each of the `seeds`. `comparisons`: `row`, `less` and `groups` of their differences.
     `headline`: the recipe's, with its difference, `verdict` and a `text`.
     """
-    rows = {
-        name: {
-            "horizon": row.horizon,
-            "over": row.over,
-            "groups": {group: _numbers(row.seeds, tokens) for group, tokens in counted.groups.items()},
-        }
-        for name, row in counted.rows.items()
-    }
+    rows, groups = counted.rows, counted.groups.items()
     comparisons = [
         {
             "row": row,
             "less": less,
-            "groups": {
-                group: _differences(counted.rows[row].seeds, counted.rows[less].seeds, tokens)
-                for group, tokens in counted.groups.items()
-            },
+            "groups": {group: numbers_of_rows(tokens, rows[row].seeds, rows[less].seeds) for group, tokens in groups},
         }
         for row, less in counted.told["compare"]
     ]
@@ -144,36 +131,18 @@ def summarised(counted: Counted) -> dict[str, Any]:
         "headline": None if headline is None else _headline(headline, comparisons),
         "groups": {
             group: {"samples": len(tokens), "pairs": len({cluster_of(scenario_of(token)) for token in tokens})}
-            for group, tokens in counted.groups.items()
+            for group, tokens in groups
         },
-        "rows": rows,
+        "rows": {
+            name: {
+                "horizon": row.horizon,
+                "over": row.over,
+                "groups": {group: numbers_of_rows(tokens, row.seeds) for group, tokens in groups},
+            }
+            for name, row in rows.items()
+        },
         "comparisons": comparisons,
     }
-
-
-def _numbers(seeds: Seeds, tokens: Sequence[str]) -> dict[str, dict[str, Any]]:
-    alone = {seed: plain_numbers({seed: each}, tokens) for seed, each in seeds.items() if seed}
-    return _with_seeds(row_numbers(seeds, tokens), alone)
-
-
-def _differences(row: Seeds, less: Seeds, tokens: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """A row without seeds, such as a baseline, is compared with each seed of the other."""
-    alone = {}
-    for seed in dict.fromkeys([*row, *less]):
-        if seed and all(seed in each or "" in each for each in (row, less)):
-            more, base = (plain_numbers({seed: each.get(seed, each.get("", {}))}, tokens) for each in (row, less))
-            alone[seed] = {name: _less(more[name], base[name]) for name in more}
-    return _with_seeds(differences(row, less, tokens), alone)
-
-
-def _less(value: float | None, other: float | None) -> float | None:
-    return None if value is None or other is None else value - other
-
-
-def _with_seeds(
-    numbers: Mapping[str, Number], alone: Mapping[str, Mapping[str, float | None]]
-) -> dict[str, dict[str, Any]]:
-    return {name: {**numbers[name], "seeds": {seed: each[name] for seed, each in alone.items()}} for name in NUMBERS}
 
 
 def _headline(headline: Mapping[str, Any], comparisons: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
