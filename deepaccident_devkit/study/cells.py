@@ -17,12 +17,15 @@ import gzip
 import json
 import os
 import platform
+import sys
 import time
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, cast
+
+import numpy as np
 
 from deepaccident_devkit._version import __version__
 from deepaccident_devkit.deepaccident import DeepAccident
@@ -139,10 +142,8 @@ def make(cell: Cell) -> None:
 
 def machine(device: str) -> str:
     """What one needs to know of a machine to understand times and last digits."""
-    from importlib.metadata import distributions
-
-    versions = {each.name: each.version for each in distributions() if each.name in ("numpy", "torch")}
-    packages = ", ".join(f"{name} {version}" for name, version in sorted(versions.items()))
+    torch = sys.modules.get("torch")
+    packages = f"numpy {np.__version__}" + (f", torch {torch.__version__}" if torch else "")
     return f"{platform.platform()}, {os.cpu_count()} cores, Python {platform.python_version()}, {packages}, {device}"
 
 
@@ -205,7 +206,7 @@ class Counting:
             found: Any = boxes.prediction(token)
             own = found.boxes.transform(dataset.world_from(token, "ego").inverse(), "ego")
             hidden.update(token, dataset, labels, moved, DetectedBoxes(boxes=own, scores=found.scores))
-        return {"horizon": self.horizon, "counts": {**counts, HIDDEN: dict(hidden.counts)}}
+        return {"counts": {**counts, HIDDEN: dict(hidden.counts)}}
 
     def _predict(self, place: Path) -> None:
         labels, tokens = self.test.label_config(self.horizon), self.selection.tokens(self.dataset)

@@ -65,7 +65,7 @@ Seeds = Mapping[str, Evaluators]
 """Those of each of a row's seeds; of a row without, under an empty text."""
 
 
-def setups_of(labels: str, horizon: float) -> dict[ResultsTask, EvaluationSetup]:
+def setups_of(labels: str, horizon: float = 2.0) -> dict[ResultsTask, EvaluationSetup]:
     """Task → by which rules it is evaluated."""
     return {
         "motion": EvaluationSetup(task="motion", protocol="paper", switches={"labels": labels}, horizon=horizon),
@@ -74,10 +74,9 @@ def setups_of(labels: str, horizon: float) -> dict[ResultsTask, EvaluationSetup]
     }
 
 
-def evaluators_of(labels: str, horizon: float) -> dict[str, Evaluator[Any]]:
-    """New evaluators by these rules, and that of hidden actors."""
-    setups = setups_of(labels, horizon)
-    return {**{task: setup.evaluator() for task, setup in setups.items()}, HIDDEN: HiddenActors()}
+def evaluators_of(labels: str) -> dict[str, Evaluator[Any]]:
+    """New evaluators by these rules, which are the same for every horizon, and that of hidden actors."""
+    return {**{task: setup.evaluator() for task, setup in setups_of(labels).items()}, HIDDEN: HiddenActors()}
 
 
 class HiddenActors(Evaluator[dict[str, float]]):
@@ -99,9 +98,9 @@ class HiddenActors(Evaluator[dict[str, float]]):
         self, token: str, dataset: Dataset, labels: MotionLabelConfig, motion: MotionOutput, boxes: DetectedBoxes
     ) -> None:
         """Count a sample; the boxes are in its ego frame, the motion is given as instance maps, the last one counts."""
-        drawn = motion_labels(dataset, token, labels).segmentation[0] > 0
         if motion.instances is None:
             raise EvaluationError(f"{token}: expected instance maps, found heads; read them from a results file")
+        drawn = motion_labels(dataset, token, labels).segmentation[0] > 0
         foreground = motion.grid.reorient(motion.instances[-1, 0] > 0, labels.grid.orientation)
         seen = seen_actors(dataset, token, agents=AVAILABLE, frame="ego")
         center, own_bit = seen.boxes.center[:, :2], 1 << AGENTS.index(agent_of(token))

@@ -7,9 +7,9 @@ and the remedy.
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
 from functools import partial
 from itertools import chain, product
 from pathlib import Path
@@ -18,6 +18,7 @@ from typing import Any, Final, Literal
 import msgspec
 
 from deepaccident_devkit.baselines.outlook import MotionModel
+from deepaccident_devkit.baselines.predict import path_times
 from deepaccident_devkit.errors import ConfigError, DeepAccidentError
 from deepaccident_devkit.evaluation.breakdowns import attribute_name
 from deepaccident_devkit.evaluation.runs import SampleSelection
@@ -31,7 +32,7 @@ from deepaccident_devkit.support.reading import fault_text, read_bytes
 from deepaccident_devkit.support.text import choice
 from deepaccident_devkit.synth import SynthConfig
 from deepaccident_devkit.synth.spec.reading import Node, parse_yaml
-from deepaccident_devkit.taxonomy import AGENTS, FRAME_PERIOD
+from deepaccident_devkit.taxonomy import AGENTS
 from deepaccident_devkit.v2x import AGENT_SETS, Link
 
 SHIPPED: Final = Path(__file__).parent / "recipes"
@@ -91,11 +92,8 @@ class TestedOn(_Part, frozen=True, kw_only=True):
 
     def label_config(self, horizon: float | None) -> MotionLabelConfig:
         """The labels that look so many seconds ahead; raises ConfigError or ChoiceError."""
-        along, plain = (-_REACH, _REACH, self.cell), MotionLabelConfig(protocol=self.labels)
-        frames = (horizon or DEFAULT_HORIZON) / (plain.step * FRAME_PERIOD)
-        if not (frames >= 1 and abs(frames - round(frames)) < 1e-6):
-            raise ConfigError(f"horizon: {horizon:g} s is no number of steps of 0.5 s; choose 0.5, 1, 1.5, …")
-        return replace(plain, grid=BevGrid(x=along, y=along), future_frames=round(frames))
+        frames, along = len(path_times(horizon or DEFAULT_HORIZON)), (-_REACH, _REACH, self.cell)
+        return MotionLabelConfig(grid=BevGrid(x=along, y=along), future_frames=frames, protocol=self.labels)
 
 
 class Row(_Part, frozen=True, kw_only=True):
@@ -203,6 +201,13 @@ class Recipe(_Part, frozen=True, kw_only=True):
         return list(dict.fromkeys([*first, *self.compare]))
 
 
+class _File(msgspec.Struct):
+    """What there must be before rows are made of lists."""
+
+    rows: list[dict[str, Any]]
+    smoke: dict[str, Any] = {}
+
+
 def read_recipe(recipe: str, *, smoke: bool = False) -> Recipe:
     """A recipe from a file, or one that ships, by its name; `smoke` puts in place what its part `smoke` says.
 
@@ -218,16 +223,15 @@ def read_recipe(recipe: str, *, smoke: bool = False) -> Recipe:
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: {fault_text(error)}; give a file of YAML, in UTF-8") from error
     told = _plain(parse_yaml(text.strip() or "{}", str(path)))
-    small = told.pop("smoke", None) if isinstance(told, dict) else None
-    if smoke and not isinstance(small, dict):
-        raise ConfigError(f"{path}: smoke: is missing; write this part, or leave out --smoke")
-    told = _merged(told, small) if smoke else told
     with at(path, "the recipe"):
-        if isinstance(told, dict) and isinstance(told.get("rows"), list):
-            told["rows"] = [each for row in told["rows"] for each in _expanded(row)]
-        read = as_record(told, Recipe)
+        file = as_record(told, _File)
+        if smoke and not file.smoke:
+            raise ConfigError("smoke: is missing; write this part, or leave out --smoke")
+        chosen = _merged(told, file.smoke if smoke else {}) | {"name": f"{path.stem}{'-smoke' * smoke}"}
+        chosen["rows"] = [row for each in chosen["rows"] for row in _expanded(each)]
+        read = as_record({key: each for key, each in chosen.items() if key != "smoke"}, Recipe)
     _check(path, read)
-    return msgspec.structs.replace(read, name=f"{path.stem}-smoke" if smoke else path.stem)
+    return read
 
 
 @contextmanager
@@ -287,26 +291,20 @@ def _check_once(name: str, names: Sequence[str]) -> None:
         raise ConfigError("name: is there twice; name the keys that have lists in it, such as {agents}")
 
 
-def _expanded(row: Any) -> Iterator[Any]:
+def _expanded(row: Mapping[str, Any]) -> Iterator[Mapping[str, Any]]:
     """The rows that one with lists stands for."""
-    lists = {key: row[key] for key in _LISTS if isinstance(row.get(key), list)} if isinstance(row, dict) else {}
-    if not lists:
-        yield row
-        return
-    numbers = [key for key in lists if key != "agents"]
+    lists = {key: row[key] for key in _LISTS if isinstance(row.get(key), list)}
+    key = next((key for key in lists if key != "agents"), None)
     for values in product(*lists.values()):
         one = dict(zip(lists, values, strict=True))
-        name = _filled(str(row.get("name")), one)
-        over = (
-            (numbers[0], one[numbers[0]], _filled(str(row.get("name")), {**one, numbers[0]: "…"})) if numbers else None
-        )
-        yield {**row, **one, "name": name, "over": over}
+        series = _filled(row.get("name"), {**one, key: "…"})
+        over = key and [key, one[key], series]
+        yield {**row, **one, "name": _filled(row.get("name"), one), "over": over} if one else row
 
 
-def _filled(name: str, values: Mapping[str, Any]) -> str:
-    for key, value in values.items():
-        name = name.replace(f"{{{key}}}", str(value))
-    return name
+def _filled(name: object, values: Mapping[Any, Any]) -> str:
+    """A name with the values of the keys that stand in it; `str.format` would also read attributes."""
+    return re.sub(r"\{(\w+)\}", lambda found: str(values.get(found[1], found[0])), str(name))
 
 
 def _merged(value: Any, changes: Any) -> Any:

@@ -15,6 +15,7 @@ import msgspec
 
 from deepaccident_devkit._version import __version__
 from deepaccident_devkit.deepaccident import DeepAccident
+from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.evaluation.breakdowns import cluster_of, sample_attributes, tokens_by_value
 from deepaccident_devkit.evaluation.runs import SampleSelection
 from deepaccident_devkit.evaluation.runs.setups import release_note, scenario_of
@@ -22,9 +23,10 @@ from deepaccident_devkit.release.fingerprints import fingerprint, scenario_hashe
 from deepaccident_devkit.rooms import need_room
 from deepaccident_devkit.selection import find
 from deepaccident_devkit.study.cells import Bench, Cell, Counting, make, taken, trained
+from deepaccident_devkit.study.numbers import HIDDEN
 from deepaccident_devkit.study.page import save_study
 from deepaccident_devkit.study.recipe import DEFAULT_HORIZON, Recipe, at, source_of
-from deepaccident_devkit.study.summary import ALL, Counted, StudyReport, counted_row, summarised
+from deepaccident_devkit.study.summary import ALL, Counted, StudyReport, counted_of, summarised
 from deepaccident_devkit.support.files import writable_folder
 from deepaccident_devkit.support.json_text import as_record
 from deepaccident_devkit.support.reading import file_checksum
@@ -62,7 +64,6 @@ def run_study(
 
     Raises:
         ConfigError: the recipe asks for weights or samples that cannot be, or something cannot be written.
-        NotAvailableError: a release has no such samples.
         SomeFailedError: some cells failed; the others are done.
         DeepAccidentError: as of `make_release`, `model.train` and `evaluate_results`.
     """
@@ -141,16 +142,15 @@ def _weights(
 ) -> dict[str, _Weights]:
     """All weights, made if they are not there: those together that begin from nothing, then from these, and on."""
     found: dict[str, _Weights] = {}
-    waves: list[list[str]] = []
+    depths: dict[str | None, int] = {None: -1}
     for name, plan in recipe.weights.items():
-        wave = next((at_ + 1 for at_, names in enumerate(waves) if plan.get("from") in names), 0)
-        waves += [[]] * (wave == len(waves))
-        waves[wave] = [*waves[wave], name]
+        depths[name] = depths[plan.get("from")] + 1
         with at(recipe.name, f"weights.{name}"):
             found[name] = _seeds(name, recipe, bench, releases, found)
     places = tuple(place for _, dataset in releases.values() for place in dataset.places)
-    for names in waves:
-        bench.make([cell for name in names for cell in found[name][1].values()], "weights", places, **how)
+    for depth in range(max(depths.values()) + 1):
+        together = [cell for name, (_, cells) in found.items() if depths[name] == depth for cell in cells.values()]
+        bench.make(together, "weights", places, **how)
     return found
 
 
@@ -205,6 +205,10 @@ def _rows(
         agents=test.agents,
         horizon=test.horizon or max(horizons.values()),
     )
+    with at(recipe.name, "test"):
+        if not scenarios:
+            raise ConfigError("where: no pair of scenarios matches; change the filters")
+        selection.tokens(dataset)
     samples = {**selection.as_dict(), "split": Path(selection.split).name}
     for row in recipe.rows:
         seeds: Mapping[str, Cell | None] = weights[row.weights][1] if row.weights else {"": None}
@@ -244,20 +248,15 @@ def _matching(
 
 def _counted(recipe: Recipe, dataset: DeepAccident, rows: Mapping[str, Mapping[str, Cell]]) -> Counted:
     """What was counted of all rows, and the groups of samples."""
-    told: Any = {
-        "title": recipe.title,
-        "question": recipe.question,
+    told = {
+        **{name: getattr(recipe, name) for name in ("title", "question")},
         "labels": recipe.test.labels,
         "headline": msgspec.to_builtins(recipe.headline),
         "compare": [list(pair) for pair in recipe.pairs],
+        "over": {row.name: row.over and list(row.over) for row in recipe.rows},
     }
-    counted = {}
-    for row in recipe.rows:
-        kept = {seed: cell.kept or {} for seed, cell in rows[row.name].items()}
-        seeds = {seed: each["counts"] for seed, each in kept.items()}
-        horizon = next(iter(kept.values()))["horizon"]
-        counted[row.name] = counted_row({"horizon": horizon, "over": row.over, "seeds": seeds}, told["labels"])
-    tokens = sorted(next(iter(next(iter(counted.values())).seeds.values()))["motion"].tokens)
+    counts = {name: {seed: (cell.kept or {})["counts"] for seed, cell in of.items()} for name, of in rows.items()}
+    tokens = sorted(next(iter(next(iter(counts.values())).values()))[HIDDEN])
     groups = {ALL: tokens}
     for name, where in recipe.groups.items():
         matching = set(_matching(dataset, where, map(scenario_of, tokens), recipe, f"groups.{name}"))
@@ -266,4 +265,4 @@ def _counted(recipe: Recipe, dataset: DeepAccident, rows: Mapping[str, Mapping[s
     for by in recipe.by:
         values = tokens_by_value(attributes, by)
         groups |= {f"{by}={value or 'unknown'}": values[value] for value in sorted(values, key=natural_order)}
-    return Counted(told=told, groups=groups, rows=counted)
+    return counted_of(counts, groups, told)

@@ -43,47 +43,31 @@ _WORDS: Final = {
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class CountedRow(ShortRepr):
-    """What was counted of a row.
-
-    Attributes:
-        horizon: seconds that it looks ahead.
-        over: as of `recipe.Row`.
-        seeds: its evaluators by seed; of a row without, under an empty text.
-    """
-
-    horizon: float
-    over: Sequence[Any] | None
-    seeds: Seeds
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class Counted(ShortRepr):
     """All from which the numbers of a study follow.
 
     Attributes:
-        told: `title`, `question`, `headline`, `compare` and `labels` of the recipe.
+        told: `title`, `question`, `headline`, `compare` and `labels` of the recipe, and `over` of its rows.
         groups: name → tokens of its samples, those of `ALL` first.
-        rows: by name.
+        rows: name → its evaluators by seed; of a row without seeds, under an empty text.
     """
 
     told: Mapping[str, Any]
     groups: Mapping[str, Sequence[str]]
-    rows: Mapping[str, CountedRow]
+    rows: Mapping[str, Seeds]
 
 
 def write_counts(counted: Counted, path: str | os.PathLike[str]) -> None:
     """Write all counts, packed; the same ones give the same bytes."""
     rows = {
-        name: {"horizon": row.horizon, "over": row.over, "seeds": {seed: _counts(of) for seed, of in row.seeds.items()}}
-        for name, row in counted.rows.items()
+        name: {
+            seed: {kind: {token: each.counts[token] for token in sorted(each.tokens)} for kind, each in of.items()}
+            for seed, of in seeds.items()
+        }
+        for name, seeds in counted.rows.items()
     }
-    told = {**counted.told, "groups": {name: list(tokens) for name, tokens in counted.groups.items()}, "rows": rows}
+    told = {**counted.told, "groups": counted.groups, "rows": rows}
     write_bytes(path_of(path), gzip.compress(json.dumps(told, separators=(",", ":")).encode(), mtime=0))
-
-
-def _counts(evaluators: Evaluators) -> dict[str, Any]:
-    return {kind: {token: each.counts[token] for token in sorted(each.tokens)} for kind, each in evaluators.items()}
 
 
 def read_counts(path: str | os.PathLike[str]) -> Counted:
@@ -91,27 +75,29 @@ def read_counts(path: str | os.PathLike[str]) -> Counted:
     source = path_of(path)
     try:
         told = parsed_json(gzip.decompress(read_bytes(source, "results")), constants=True)
-        rows = {name: counted_row(each, told["labels"]) for name, each in told.pop("rows").items()}
-        return Counted(groups=told.pop("groups"), rows=rows, told=told)
+        return counted_of(told.pop("rows"), told.pop("groups"), told)
     except (OSError, EOFError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise ResultsError(f"{source}: no counts of a study ({fault_text(error)}); run the study again") from error
 
 
-def counted_row(told: Mapping[str, Any], labels: str) -> CountedRow:
-    """A row from its `horizon`, `over` and counts: seed → what evaluates → token → counts."""
-    seeds: dict[str, Evaluators] = {}
-    for seed, kinds in told["seeds"].items():
-        seeds[seed] = evaluators_of(labels, told["horizon"])
-        for kind, evaluator in seeds[seed].items():
-            for token, each in kinds[kind].items():
-                evaluator.add(token, each)
-    return CountedRow(horizon=told["horizon"], over=told["over"], seeds=seeds)
+def counted_of(
+    counts: Mapping[str, Mapping[str, Any]], groups: Mapping[str, Sequence[str]], told: Mapping[str, Any]
+) -> Counted:
+    """From row → seed → what evaluates → token → counts."""
+    rows: dict[str, dict[str, Evaluators]] = {}
+    for name, seeds in counts.items():
+        for seed, kinds in seeds.items():
+            made = rows.setdefault(name, {})[seed] = evaluators_of(told["labels"])
+            for kind, evaluator in made.items():
+                for token, each in kinds[kind].items():
+                    evaluator.add(token, each)
+    return Counted(told=told, groups=groups, rows=rows)
 
 
 def summarised(counted: Counted) -> dict[str, Any]:
     """All numbers of a study, as JSON holds them; the same counts give the same.
 
-    `rows`: name → `horizon`, `over` and `groups`: group → number (of `NUMBERS`) → `value`, `low` and `high` of the
+    `rows`: name → `over` and `groups`: group → number (of `NUMBERS`) → `value`, `low` and `high` of the
     interval, and the value of each of the `seeds`. `comparisons`: `row`, `less` and `groups` of their differences.
     `headline`: the recipe's, with its difference, `verdict` and a `text`.
     """
@@ -120,7 +106,7 @@ def summarised(counted: Counted) -> dict[str, Any]:
         {
             "row": row,
             "less": less,
-            "groups": {group: numbers_of_rows(tokens, rows[row].seeds, rows[less].seeds) for group, tokens in groups},
+            "groups": {group: numbers_of_rows(tokens, rows[row], rows[less]) for group, tokens in groups},
         }
         for row, less in counted.told["compare"]
     ]
@@ -135,11 +121,10 @@ def summarised(counted: Counted) -> dict[str, Any]:
         },
         "rows": {
             name: {
-                "horizon": row.horizon,
-                "over": row.over,
-                "groups": {group: numbers_of_rows(tokens, row.seeds) for group, tokens in groups},
+                "over": counted.told["over"][name],
+                "groups": {group: numbers_of_rows(tokens, seeds) for group, tokens in groups},
             }
-            for name, row in rows.items()
+            for name, seeds in rows.items()
         },
         "comparisons": comparisons,
     }
