@@ -10,6 +10,7 @@ from deepaccident_devkit.cli.options import (
     engine_of,
     engine_parameters,
     figure_style_parameter,
+    refuse_unused,
     use_threads_sparingly,
 )
 from deepaccident_devkit.cli.verbs import verb
@@ -40,6 +41,8 @@ def study(recipe: str, out: Path, smoke: bool, device: str, **options: Any) -> N
     """
     use_threads_sparingly()
     chosen = read_recipe(recipe, smoke=smoke)
+    if not chosen.weights:
+        refuse_unused("with a recipe without weights", "device")
     report = run_study(chosen, out, device=device, progress=True, **engine_of(options))
     click.echo(report.to_text())
     click.echo(f"written: {out / chosen.name}; open {out / chosen.name / PAGE} in a browser")

@@ -28,8 +28,9 @@ MODELS: dict[str, Any] = {
     "seeds": [1, 2],
     "weights": {
         "trunk": {**TRAINED, "steps": 3},
-        "max": {**TRAINED, "from": "trunk", "fusion": "max", "horizon": 1.0, "steps": 2, "freeze": ["img_backbone."]},
+        "max": {**TRAINED, "from": "trunk", "fusion": "max", "steps": 2, "freeze": ["img_backbone."]},
         "given": {"file": "tiny"},
+        "near": {**TRAINED, "horizon": 0.5, "steps": 1},
     },
     "test": {"release": "test", "cell": 1.0, "labels": "clean", "horizon": 0.5},
     "headline": {"row": "all", "less": "single", "number": "iou_100"},
@@ -39,6 +40,7 @@ MODELS: dict[str, Any] = {
         {"name": "strangers", "weights": "trunk", "control": "strangers"},
         {"name": "max", "weights": "max"},
         {"name": "given", "weights": "given"},
+        {"name": "near", "weights": "near"},
         {"name": "sees all", "baseline": "constant_velocity"},
     ],
     "groups": {},
@@ -63,13 +65,22 @@ def summary(out: Path) -> dict[str, Any]:
 
 @pytest.mark.slow
 def test_each_seed_is_a_model_and_weights_begin_from_their_own(out: Path, summary: dict[str, Any]) -> None:
-    cells = {each["name"]: each for each in summary["cells"]}
-    folders = {name: out / "weights" / each["key"] for name, each in cells.items() if each["kind"] == "weights"}
-    assert list(folders) == ["trunk, seed 1", "trunk, seed 2", "max, seed 1", "max, seed 2", "given"]
+    cells = {each["name"]: each for each in summary["cells"] if each["kind"] == "weights"}
+    folders = {name: out / "weights" / each["key"] for name, each in cells.items()}
+    assert list(folders) == [
+        "trunk, seed 1",
+        "trunk, seed 2",
+        "max, seed 1",
+        "max, seed 2",
+        "given",
+        "near, seed 1",
+        "near, seed 2",
+    ]
     for seed in (1, 2):
         noted = read_weights(folders[f"max, seed {seed}"]).meta
         assert noted["from"] == str(folders[f"trunk, seed {seed}"])
-        assert (noted["fusion"], noted["horizon"], noted["training"]["seed"]) == ("max", 1.0, seed)
+        assert (noted["preset"], noted["fusion"], noted["training"]["seed"]) == ("tiny", "max", seed)
+        assert noted["training"]["freeze"] == ["img_backbone."]
         assert noted["training"]["validation"] is None
     assert [*summary["rows"]["all"]["groups"][ALL]["apa"]["seeds"]] == ["1", "2"]
     assert summary["rows"]["given"]["groups"][ALL]["apa"]["seeds"] == {}
@@ -85,7 +96,7 @@ def test_a_run_that_was_killed_ends_as_one_that_was_not(out: Path, tmp_path: Pat
     path, again = written(tmp_path, MODELS), tmp_path / "out"
     killed(path, again, MODULE, "add_to_log", 4)
     steps = sorted(len((each / "log.jsonl").read_text().splitlines()) for each in (again / "weights").iterdir())
-    assert steps == [1, 3]
+    assert steps == [1, 3]  # of two seeds; those that begin from nothing come first
     killed(path, again, "deepaccident_devkit.model.results", "prediction_of", 2)
     killed(path, again, "deepaccident_devkit.study.predict", "blanked", 1)
     run_study(read_recipe(str(path)), again, device="cpu", workers=2)
@@ -173,8 +184,8 @@ def test_a_row_predicts_as_the_model_does(da: DeepAccident) -> None:
 
 
 @pytest.mark.slow
-def test_a_row_that_fails_leaves_the_others(out: Path, tmp_path: Path) -> None:
+def test_a_row_that_fails_is_named(out: Path, tmp_path: Path) -> None:
     rows = [*MODELS["rows"][:1], {"name": "late", "weights": "trunk", "latency": 0.5}]
     changed = {**MODELS, "rows": rows, "compare": [], "headline": None}
-    with pytest.raises(SomeFailedError, match=r"1 of 2 failed:\n  row/.*: late, seed 1: latency"):
+    with pytest.raises(SomeFailedError, match=r"1 of 1 failed:\n  row/.*: late, seed 1: latency"):
         run_study(read_recipe(str(written(tmp_path, {**changed, "seeds": [1]}))), out, device="cpu", workers=1)
