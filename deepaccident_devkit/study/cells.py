@@ -19,11 +19,12 @@ import os
 import platform
 import sys
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, cast
+from statistics import fmean
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -31,14 +32,16 @@ from deepaccident_devkit._version import __version__
 from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.errors import ConfigError, DeepAccidentError
 from deepaccident_devkit.evaluation import DetectedBoxes, ResultsWriter, read_results
-from deepaccident_devkit.evaluation.results import RESULTS_NAMES
+from deepaccident_devkit.evaluation.results import RESULTS_NAMES, ResultsTask
 from deepaccident_devkit.evaluation.runs import SampleSelection, evaluate_results
+from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
+from deepaccident_devkit.motion import MotionLabelConfig
 from deepaccident_devkit.parallel import Places, Store
 from deepaccident_devkit.release.fingerprints import digest_of
 from deepaccident_devkit.release.layout import write_split_file
 from deepaccident_devkit.study.numbers import HIDDEN, HiddenActors, setups_of
 from deepaccident_devkit.study.predict import predictions_of
-from deepaccident_devkit.study.recipe import Row, TestedOn
+from deepaccident_devkit.study.recipe import Row
 from deepaccident_devkit.support.files import replacing_folder, write_bytes
 from deepaccident_devkit.support.json_text import parsed_json
 from deepaccident_devkit.support.reading import read_bytes
@@ -50,8 +53,6 @@ if TYPE_CHECKING:
     from deepaccident_devkit.model import ModelChoice, TrainConfig
     from deepaccident_devkit.parallel import Engine
 
-_LAST: Final = 50
-"""Steps of whose loss the mean is noted."""
 Work = Callable[[Path], dict[str, Any]]
 """Makes a cell in its folder, and gives what is kept of it, as JSON holds it."""
 
@@ -80,8 +81,7 @@ class Bench:
     def split(self, scenarios: Sequence[str]) -> Path:
         """A split file of scenarios, named by what it holds."""
         path = self.out / "splits" / f"{digest_of(scenarios)}.txt"
-        if not path.exists():
-            write_split_file(path, scenarios)
+        write_split_file(path, scenarios)
         return path
 
     def make(self, cells: Iterable[Cell], label: str, reads: tuple[Path, ...], **how: Unpack[Engine]) -> None:
@@ -136,8 +136,7 @@ def make(cell: Cell) -> None:
     except DeepAccidentError as error:
         raise type(error)(f"{cell.name}: {error}") from error
     notes = {"seconds": round(time.monotonic() - began, 1), "machine": machine(cell.bench.device), **told}
-    content = gzip.compress(json.dumps(notes).encode(), mtime=0)
-    cell.bench.store.keep(f"{cell.kind}/{cell.key}", cell.key, content)
+    cell.bench.store.keep(f"{cell.kind}/{cell.key}", cell.key, gzip.compress(json.dumps(notes).encode(), mtime=0))
 
 
 def machine(device: str) -> str:
@@ -158,15 +157,17 @@ def taken(file: Path, folder: Path) -> dict[str, Any]:
 def trained(
     dataset: DeepAccident, choice: ModelChoice, config: TrainConfig, start: Path | None, device: str, folder: Path
 ) -> dict[str, Any]:
-    """The work on weights that are trained, on a release, from others or from random ones (None)."""
+    """The work on weights that are trained, on a release, from others or from random ones (None).
+
+    It notes the mean loss of the last 50 steps, and the seconds of all, before a kill too.
+    """
     from deepaccident_devkit.model import train
     from deepaccident_devkit.model.training_run import one_thread, read_log
 
     with one_thread():
         train(dataset, folder, choice, config, weights=start, device=device)
     log = read_log(folder)
-    last = [row["loss"] for row in log[-_LAST:]]
-    return {"loss": sum(last) / len(last), "seconds": round(sum(row["seconds"] for row in log), 1)}
+    return {"loss": fmean(row["loss"] for row in log[-50:]), "seconds": round(sum(row["seconds"] for row in log), 1)}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -176,18 +177,16 @@ class Counting:
     Attributes:
         dataset: the release of the test.
         row: of the recipe.
-        test: of the recipe.
         selection: the samples.
-        horizon: seconds that the row looks ahead.
+        labels: of which motion is predicted, as far ahead as the row looks.
         weights: of a model.
         device: where it is.
     """
 
     dataset: DeepAccident
     row: Row
-    test: TestedOn
     selection: SampleSelection
-    horizon: float
+    labels: MotionLabelConfig
     weights: Path | None
     device: str
 
@@ -195,30 +194,33 @@ class Counting:
         """Write the results files, if they are not there; `counts`: what evaluates them → token → counts."""
         if not folder.is_dir():
             self._predict(folder)
-        dataset, counts = self.dataset, {}
-        for task, setup in setups_of(self.test.labels, self.horizon).items():
+        dataset, counts, hidden = self.dataset, {}, HiddenActors()
+        for task, setup in self._setups.items():
             run = evaluate_results(dataset, folder / RESULTS_NAMES[task], setup, self.selection, workers=1)
             counts[str(task)] = dict(run.evaluator.counts)
-        hidden, labels = HiddenActors(), self.test.label_config(self.horizon)
         motion, boxes = (read_results(folder / RESULTS_NAMES[task]) for task in ("motion", "detection"))
         for token in self.selection.tokens(dataset):
-            moved: Any = motion.prediction(token)
-            found: Any = boxes.prediction(token)
+            moved, found = cast("Any", motion.prediction(token)), cast("Any", boxes.prediction(token))
             own = found.boxes.transform(dataset.world_from(token, "ego").inverse(), "ego")
-            hidden.update(token, dataset, labels, moved, DetectedBoxes(boxes=own, scores=found.scores))
+            hidden.update(token, dataset, self.labels, moved, DetectedBoxes(boxes=own, scores=found.scores))
         return {"counts": {**counts, HIDDEN: dict(hidden.counts)}}
 
+    @property
+    def _setups(self) -> Mapping[ResultsTask, EvaluationSetup]:
+        horizon = self.labels.future_frames * self.labels.step * FRAME_PERIOD
+        return setups_of(str(self.labels.protocol), horizon)
+
     def _predict(self, place: Path) -> None:
-        labels, tokens = self.test.label_config(self.horizon), self.selection.tokens(self.dataset)
-        motion: Any = {"grid": labels.grid, "step": labels.step * FRAME_PERIOD, "labels": self.test.labels}
+        labels, tokens, dataset = self.labels, self.selection.tokens(self.dataset), self.dataset
+        motion: Any = {"grid": labels.grid, "step": labels.step * FRAME_PERIOD, "labels": labels.protocol}
         meta = {"method": self.row.name, "devkit": __version__}
         with replacing_folder(place) as folder, ExitStack() as stack:
             writers = [
                 ResultsWriter(folder / RESULTS_NAMES[task], task, meta=meta, **(motion if task == "motion" else {}))
-                for task in setups_of(self.test.labels, self.horizon)
+                for task in self._setups
             ]
             for writer in writers:
                 stack.enter_context(writer)
-            for token, *found in predictions_of(self.row, self.weights, self.device, self.dataset, tokens, labels):
-                for writer, each in zip(writers, cast("list[Any]", found), strict=True):
+            for token, found in predictions_of(self.row, self.weights, self.device, dataset, tokens, labels):
+                for writer, each in zip(writers, cast("Any", found), strict=True):
                     writer.add(token, each)

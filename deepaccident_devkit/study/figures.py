@@ -24,17 +24,10 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_PANEL: Final = (2.7, 0.26)
-"""Inches: the width of a panel, and the height of a row."""
+_PANEL: Final = 2.7
+"""Inches: the width of a panel."""
+_UNITS: Final = {"latency": "s", "pose_noise": "m", "packet_loss": "share", "budget": "bytes a frame", "horizon": "s"}
 _NOTE: Final = "lines: intervals of 95 % over pairs of scenarios; pale dots: single seeds"
-_AXES: Final[Mapping[str, str]] = {
-    "latency": "latency (s)",
-    "pose_noise": "error of partners' poses (m)",
-    "packet_loss": "share of messages that are lost",
-    "budget": "bytes a frame for all partners",
-    "horizon": "seconds ahead",
-}
-"""Keys of which rows can have several numbers → what the axis is called."""
 
 
 @in_own_settings
@@ -44,8 +37,7 @@ def rows_figure(summary: Mapping[str, Any]) -> Figure:
     It is one for files (`render.figures.write_report_figure`); in a paper's column it has the first two numbers.
     """
     rows = summary["rows"]
-    size = 1.8 + _PANEL[0] * len(_shown(summary)), 1.2 + _PANEL[1] * len(rows)
-    fig, panels = _panels(summary, size, sharey=True)
+    fig, panels = _panels(summary, beside=1.8, height=1.2 + 0.26 * len(rows), sharey=True)
     for number, ax in panels.items():
         _draw(ax, range(len(rows)), [each["groups"][ALL][number] for each in rows.values()], upright=False)
         with_light_grid(ax, "x")
@@ -64,33 +56,30 @@ def curves_of(summary: Mapping[str, Any]) -> list[str]:
 def curves_figure(summary: Mapping[str, Any], key: str) -> Figure:
     """The main numbers over one of `curves_of`, such as `latency`: a line for each series of rows; as `rows_figure`."""
     rows = [each for each in summary["rows"].values() if each["over"] and each["over"][0] == key]
-    fig, panels = _panels(summary, (0.6 + _PANEL[0] * len(_shown(summary)), 3.0))
+    fig, panels = _panels(summary, beside=0.6, height=3.0)
     for number, ax in panels.items():
         for at, name in enumerate(dict.fromkeys(row["over"][2] for row in rows)):
             own = [row for row in rows if row["over"][2] == name]
             found = [row["groups"][ALL][number] for row in own]
             color = SERIES_COLORS[at % len(SERIES_COLORS)]
             _draw(ax, [row["over"][1] for row in own], found, upright=True, color=color, label=name)
-        ax.set_xlabel(_AXES[key], fontsize=text_size())
+        ax.set_xlabel(f"{key.replace('_', ' ')} ({_UNITS[key]})", fontsize=text_size())
         with_light_grid(ax, "both")
     next(iter(panels.values())).legend(fontsize=text_size())
     return fig
 
 
-def _panels(summary: Mapping[str, Any], size: tuple[float, float], **shared: Any) -> tuple[Figure, dict[str, Axes]]:
-    """A figure with a panel for each main number."""
-    numbers = _shown(summary)
-    fig = report_figure(size, column=1.1)
+def _panels(
+    summary: Mapping[str, Any], *, beside: float, height: float, **shared: Any
+) -> tuple[Figure, dict[str, Axes]]:
+    """A figure with a panel for each main number; inches of the room beside them, and of its height."""
+    numbers = main_numbers(summary)[: 2 if current_style().room == "column" else None]
+    fig = report_figure((beside + _PANEL * len(numbers), height), column=1.1)
     panels = dict(zip(numbers, fig.subplots(1, len(numbers), squeeze=False, **shared)[0], strict=True))
     for number, ax in panels.items():
         set_title(ax, NUMBERS[number][2], fontsize=text_size())
     fig.supxlabel(_NOTE, fontsize=text_size(), color=MUTED_COLOR)
     return fig, panels
-
-
-def _shown(summary: Mapping[str, Any]) -> list[str]:
-    numbers = main_numbers(summary)
-    return numbers[:2] if current_style().room == "column" else numbers
 
 
 def _draw(

@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Mapping
 from itertools import chain
-from operator import itemgetter
 from typing import Any, Final
 
 import numpy as np
@@ -58,7 +57,6 @@ NUMBERS: Final[Mapping[str, tuple[str, str, str]]] = {
 }
 """Number → the evaluator that has it, its path in the result, and its name in tables."""
 RESAMPLING: Final = Resampling()
-_NO_INTERVALS: Final = Resampling(resamples=0)
 Evaluators = Mapping[str, Evaluator[Any]]
 """One model's evaluators, by what they evaluate."""
 Seeds = Mapping[str, Evaluators]
@@ -109,10 +107,9 @@ class HiddenActors(Evaluator[dict[str, float]]):
         found = boxes.boxes.center[boxes.scores >= LEAST_SCORE, :2]
         on_grid = found[labels.grid.index_of(found)[1]]
         counts = {"cells": foreground, "false_cells": foreground & ~drawn, "false_boxes": ~_near(on_grid, center)}
+        on_map, detected = _at_cells(foreground, actors, labels), _near(actors, found)
         for who, those in {"hidden": hidden, "seen": ~hidden}.items():
-            counts[who] = those
-            counts[f"{who}_foreground"] = those & _at_cells(foreground, actors, labels)
-            counts[f"{who}_detected"] = those & _near(actors, found)
+            counts |= {who: those, f"{who}_foreground": those & on_map, f"{who}_detected": those & detected}
         self.add(token, {name: int(each.sum()) for name, each in counts.items()})
 
     def result_of(self, counts: Collection[Counts]) -> dict[str, float]:
@@ -151,7 +148,9 @@ def numbers_of_rows(tokens: Collection[str], row: Seeds, less: Seeds | None = No
     for seed in dict.fromkeys(each for each in (*row, *(less or ())) if each):
         one, other = (None if each is None else each.get(seed, each.get("")) for each in (row, less))
         if one is not None and (less is None or other is not None):
-            alone[seed] = _numbers(tokens, {seed: one}, None if other is None else {seed: other}, _NO_INTERVALS)
+            alone[seed] = _numbers(
+                tokens, {seed: one}, None if other is None else {seed: other}, Resampling(resamples=0)
+            )
     return {
         name: {**each, "seeds": {seed: numbers[name]["value"] for seed, numbers in alone.items()}}
         for name, each in found.items()
@@ -183,15 +182,13 @@ def _numbers(
 
 def _clustered(seeds: Seeds, kind: str, tokens: Collection[str]) -> Clusters:
     """Of each pair of scenarios, in the order of their names, the counts of all its samples, with all seeds."""
-    names = {token: cluster_of(scenario_of(token)) for token in sorted(tokens)}
-    ordered = dict(sorted(names.items(), key=itemgetter(1)))
-    of_seeds = [evaluators[kind].clustered(ordered) for evaluators in seeds.values()]
+    ordered = sorted((cluster_of(scenario_of(token)), token) for token in tokens)
+    of_seeds = [evaluators[kind].clustered({token: name for name, token in ordered}) for evaluators in seeds.values()]
     return [[*chain.from_iterable(parts)] for parts in zip(*of_seeds, strict=True)]
 
 
 def verdict(difference: Mapping[str, Any]) -> str:
     """`wins`, `loses` or `not decided`, by the interval of a difference."""
     low, high = difference["low"], difference["high"]
-    if low is None or high is None or low <= 0 <= high:
-        return "not decided"
-    return "wins" if low > 0 else "loses"
+    decided = low is not None and high is not None and not low <= 0 <= high
+    return ("wins" if low > 0 else "loses") if decided else "not decided"

@@ -25,8 +25,6 @@ from deepaccident_devkit.support.pages import document
 from deepaccident_devkit.support.reading import read_bytes
 
 PAGE: Final = "index.html"
-SUMMARY: Final = "study.json"
-COUNTS: Final = "counts.json.gz"
 _DPI: Final = 150
 
 
@@ -41,14 +39,14 @@ def save_study(report: StudyReport, counted: Counted, folder: str | os.PathLike[
         OutputFolderError: its `figures` or `tables` is a link.
     """
     folder, summary = writable_folder(folder), report.summary
-    write_counts(counted, folder / COUNTS)
+    write_counts(counted, folder / "counts.json.gz")
     report.to_csv(place_in(folder, "tables", opened=True))
     pictures = place_in(folder, "figures", opened=True)
     drawn = [(write_report_figure(rows_figure(summary), pictures / "rows.png", dpi=_DPI), "The rows.")]
     for key in curves_of(summary):
         path = pictures / f"over_{key}.png"
         drawn.append((write_report_figure(curves_figure(summary, key), path, dpi=_DPI), f"Over {key}."))
-    write_bytes(folder / SUMMARY, (report.to_json() + "\n").encode())
+    write_bytes(folder / "study.json", (report.to_json() + "\n").encode())
     write_bytes(folder / PAGE, study_html(summary, drawn).encode())
     return folder / PAGE
 
@@ -56,19 +54,33 @@ def save_study(report: StudyReport, counted: Counted, folder: str | os.PathLike[
 def study_html(summary: Mapping[str, Any], figures: Sequence[tuple[Path, str]]) -> str:
     """The complete page; `figures` are PNG files, which become part of it, with what they show."""
     words = "Intervals of 95 %, over pairs of an accident and its twin; the tables have the numbers."
-    groups = [group for group in summary["groups"] if group != ALL]
+    tested, groups = summary["groups"][ALL], [group for group in summary["groups"] if group != ALL]
     return document(
         "study.html",
         style=page_style(),
         summary=summary,
-        header=_header(summary),
+        header={
+            "question": summary["question"],
+            "test": f"{tested['samples']:,} samples of {tested['pairs']:,} pairs of an accident and its twin",
+            "recipe": summary["recipe"]["name"],
+            "devkit": summary["devkit"],
+            "hours of one process": f"{sum(each['seconds'] for each in summary['cells']) / 3600:.2f}",
+            "made on": "; ".join(sorted({each["machine"] for each in summary["cells"]})),
+        },
         pictures=[(read_bytes(path, "image"), f"{said} {words}", f"{said} {words}") for path, said in figures],
         numbers=[said for _, _, said in NUMBERS.values()],
         rows=[
-            [name, *(_cell(each["groups"][ALL][number], number) for number in NUMBERS)] for name, each in _rows(summary)
+            [name, *(_cell(each["groups"][ALL][number], number) for number in NUMBERS)]
+            for name, each in summary["rows"].items()
         ],
         comparisons=[
-            [f"{each['row']} − {each['less']}", group, NUMBERS[number][2], _difference(found, number), verdict(found)]
+            [
+                f"{each['row']} − {each['less']}",
+                group,
+                NUMBERS[number][2],
+                (difference_text(found, number), _cell(found, number)[1]),
+                verdict(found),
+            ]
             for each in summary["comparisons"]
             for group, numbers in each["groups"].items()
             for number, found in numbers.items()
@@ -77,7 +89,7 @@ def study_html(summary: Mapping[str, Any], figures: Sequence[tuple[Path, str]]) 
         grouped={
             NUMBERS[number][2]: [
                 [name, *(_cell(each["groups"][group][number], number) for group in groups)]
-                for name, each in _rows(summary)
+                for name, each in summary["rows"].items()
             ]
             for number in main_numbers(summary)
         },
@@ -94,27 +106,7 @@ def study_html(summary: Mapping[str, Any], figures: Sequence[tuple[Path, str]]) 
     )
 
 
-def _header(summary: Mapping[str, Any]) -> dict[str, str]:
-    tested = summary["groups"][ALL]
-    took = sum(each["seconds"] for each in summary["cells"])
-    machines = {each["machine"] for each in summary["cells"]}
-    return {
-        "question": summary["question"],
-        "test": f"{tested['samples']:,} samples of {tested['pairs']:,} pairs of an accident and its twin",
-        "devkit": summary["devkit"],
-        "made in": f"{took / 3600:.2f} hours of one process, on {'; '.join(sorted(machines))}",
-    }
-
-
-def _rows(summary: Mapping[str, Any]) -> list[tuple[str, Mapping[str, Any]]]:
-    return list(summary["rows"].items())
-
-
 def _cell(found: Mapping[str, Any], number: str) -> tuple[str, str]:
     """A number with its interval, and below it those of single seeds."""
     alone = (number_with_interval({"value": each, "low": None}, number) for each in found["seeds"].values())
     return number_with_interval(found, number), ", ".join(alone)
-
-
-def _difference(found: Mapping[str, Any], number: str) -> tuple[str, str]:
-    return difference_text(found, number), _cell(found, number)[1]

@@ -23,15 +23,14 @@ from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
 _OWN: Final = ("token", "agents", "agent_valid", "world_from_ego", "augmentation", "files_missing")
 """Of an item of `V2XDataset`, what is the ego's or no agent's; all else has a place for each agent."""
-_Found = tuple[MotionOutput, list[Accident], DetectedBoxes]
-Predicted = tuple[str, MotionOutput, list[Accident], DetectedBoxes]
-"""Of a sample: its token, motion, accidents, and boxes in world."""
+Predicted = tuple[MotionOutput, list[Accident], DetectedBoxes]
+"""Of a sample: motion, accidents, and boxes in world."""
 
 
 def predictions_of(
     row: Row, weights: Path | None, device: str, dataset: Dataset, tokens: Sequence[str], labels: MotionLabelConfig
-) -> Iterator[Predicted]:
-    """Predict samples, one after another.
+) -> Iterator[tuple[str, Predicted]]:
+    """Predict samples, one after another; yields their tokens, too.
 
     Args:
         row: what predicts.
@@ -50,11 +49,10 @@ def predictions_of(
         yield from _by_model(row, weights, device, dataset, tokens, labels)
         return
     for token in tokens:
-        found = _without_model(row, dataset, token, labels)
-        yield (token, *found)
+        yield token, _without_model(row, dataset, token, labels)
 
 
-def _without_model(row: Row, dataset: Dataset, token: str, labels: MotionLabelConfig) -> _Found:
+def _without_model(row: Row, dataset: Dataset, token: str, labels: MotionLabelConfig) -> Predicted:
     step, seeing = labels.step * FRAME_PERIOD, dict[str, Any](agents=row.cooperating, link=row.link)
     if row.baseline is not None:
         motion = predict_motion(dataset, token, model=row.baseline, config=labels, **seeing)
@@ -73,16 +71,15 @@ def _without_model(row: Row, dataset: Dataset, token: str, labels: MotionLabelCo
 
 def _by_model(
     row: Row, weights: Path, device: str, dataset: Dataset, tokens: Sequence[str], labels: MotionLabelConfig
-) -> Iterator[Predicted]:
+) -> Iterator[tuple[str, Predicted]]:
     from deepaccident_devkit.export.torch import V2XDataset, collate
     from deepaccident_devkit.model import PredictConfig, load_model, predictions
     from deepaccident_devkit.model.results import prediction_of
     from deepaccident_devkit.model.training_run import one_thread
 
     model = load_model(weights).to(device).eval()
-    own = model.config.labels
-    if own.grid != labels.grid or model.config.labels_protocol != labels.protocol:
-        cell = own.grid.x[2]
+    cell = model.config.labels.grid.x[2]
+    if model.config.labels.grid != labels.grid or model.config.labels_protocol != labels.protocol:
         raise ConfigError(
             f"{weights}: was trained with cells of {cell:g} m and the labels {model.config.labels_protocol}; give "
             f"`cell: {cell:g}` and `labels: {model.config.labels_protocol}` in the recipe's `test`"
@@ -100,7 +97,7 @@ def _by_model(
         )
         found = (prediction_of(model, collate([item]), config) for item in changed)
     with one_thread():
-        yield from ((each.token, each.motion, each.accidents, each.boxes) for each in found)
+        yield from ((each.token, (each.motion, each.accidents, each.boxes)) for each in found)
 
 
 def strangers_of(tokens: Sequence[str]) -> list[str]:
@@ -122,12 +119,9 @@ def strangers_of(tokens: Sequence[str]) -> list[str]:
 
 def blanked(item: Mapping[str, Any]) -> dict[str, Any]:
     """An item of `V2XDataset` with all images black, and no point in any cloud."""
-    changed = dict(item)
-    if "images" in item:
-        changed["images"] = item["images"] * 0
-    if "points" in item:
-        changed["points"] = [[cloud[:0] for cloud in of_agent] for of_agent in item["points"]]
-    return changed
+    images = {name: item[name] * 0 for name in ("images",) if name in item}
+    points = {name: [[cloud[:0] for cloud in each] for each in item[name]] for name in ("points",) if name in item}
+    return {**item, **images, **points}
 
 
 def with_strangers(item: Mapping[str, Any], stranger: Mapping[str, Any]) -> dict[str, Any]:

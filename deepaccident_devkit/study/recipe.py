@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
 from itertools import chain, product
@@ -37,10 +37,10 @@ from deepaccident_devkit.v2x import AGENT_SETS, Link
 
 SHIPPED: Final = Path(__file__).parent / "recipes"
 DEFAULT_HORIZON: Final = 2.0
-_REACH: Final = 50.0
-"""Metres to each side of the ego that the labels show."""
 _EFFECTS: Final = ("latency", "pose_noise", "packet_loss", "budget")
 """Of a row, what its `Link` has."""
+_ALONE: Final = "file: these weights are there; leave the other keys out"
+_TWICE: Final = "name: is there twice; name the keys that have lists in it, such as {agents}"
 _LISTS: Final = ("agents", "horizon", *_EFFECTS)
 """Of a row, what can be a list: a row each."""
 
@@ -92,7 +92,7 @@ class TestedOn(_Part, frozen=True, kw_only=True):
 
     def label_config(self, horizon: float | None) -> MotionLabelConfig:
         """The labels that look so many seconds ahead; raises ConfigError or ChoiceError."""
-        frames, along = len(path_times(horizon or DEFAULT_HORIZON)), (-_REACH, _REACH, self.cell)
+        frames, along = len(path_times(horizon or DEFAULT_HORIZON)), (-50.0, 50.0, self.cell)
         return MotionLabelConfig(grid=BevGrid(x=along, y=along), future_frames=frames, protocol=self.labels)
 
 
@@ -142,23 +142,17 @@ class Row(_Part, frozen=True, kw_only=True):
             chosen["payload"] = "bev" if self.weights else "boxes"
         return Link(**chosen) if chosen else None
 
-    def check(self, test: TestedOn) -> None:
-        """Raise ConfigError or ChoiceError if it cannot be."""
+    @property
+    def faults(self) -> list[str]:
+        """What does not go together."""
         kinds = [name for name in ("weights", "baseline", "trivial") if getattr(self, name) is not None]
-        model = self.weights is not None
-        wrong = {
+        told = {
             f"expected one of weights, baseline and trivial, found {' and '.join(kinds) or 'none'}": len(kinds) != 1,
-            "control: spoils what a model sees; leave it out, or give weights": bool(self.control) and not model,
-            "horizon: is what the weights were trained for; leave it out here": self.horizon is not None and model,
-            "control, budget: do not go together; leave one out": bool(self.control and self.budget),
+            "control: spoils what a model sees; leave it out, or give weights": self.control and not self.weights,
+            "horizon: is what the weights were trained for; leave it out here": self.horizon and self.weights,
+            "control, budget: do not go together; leave one out": self.control and self.budget,
         }
-        for told, found in wrong.items():
-            if found:
-                raise ConfigError(told)
-        for agent in () if self.agents in AGENT_SETS else self.cooperating:
-            choice("agents", agent, (*AGENT_SETS, *AGENTS))
-        self.link  # noqa: B018 - refuses what is no link
-        test.label_config(self.horizon)
+        return [each for each, found in told.items() if found]
 
 
 class Recipe(_Part, frozen=True, kw_only=True):
@@ -219,10 +213,9 @@ def read_recipe(recipe: str, *, smoke: bool = False) -> Recipe:
         known = sorted(each.stem for each in SHIPPED.glob("*.yaml"))
         path = SHIPPED / f"{choice('RECIPE, which is no file .yaml', recipe, known, error=ConfigError)}.yaml"
     try:
-        text = read_bytes(path, "spec").decode()
+        told = _plain(parse_yaml(read_bytes(path, "spec").decode().strip() or "{}", str(path)))
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: {fault_text(error)}; give a file of YAML, in UTF-8") from error
-    told = _plain(parse_yaml(text.strip() or "{}", str(path)))
     with at(path, "the recipe"):
         file = as_record(told, _File)
         if smoke and not file.smoke:
@@ -256,19 +249,39 @@ def source_of(source: Mapping[str, Any]) -> SynthConfig | None:
 def _check(path: Path, recipe: Recipe) -> None:
     """Compare the parts with one another, and with what the devkit has."""
     test, plans, names = recipe.test, recipe.weights, [row.name for row in recipe.rows]
-    filters = (*test.where, *chain.from_iterable(recipe.groups.values()))
     number, where = ("apa", None) if recipe.headline is None else (recipe.headline.number, recipe.headline.where)
-    above = {name: (None, *list(plans)[:at_]) for at_, name in enumerate(plans)}
+    above = {name: (None, *list(plans)[:place]) for place, name in enumerate(plans)}
+    trained = [name for name in plans if "file" not in plans[name]]
     checks: list[tuple[str, Callable[[], object]]] = [
         *((f"releases.{name}", partial(source_of, source)) for name, source in recipe.releases.items()),
         ("test", partial(choice, "release", test.release, recipe.releases)),
         ("test", partial(test.label_config, test.horizon)),
         ("test", partial(SampleSelection, split=test.split, samples=test.samples, agents=test.agents)),
-        *((f"weights.{name}", partial(_check_plan, plans[name], recipe.releases, above[name])) for name in plans),
-        *((f"rows: {row.name}", partial(row.check, test)) for row in recipe.rows),
+        *(
+            (f"weights.{name}", partial(_refused, _ALONE))
+            for name in plans
+            if "file" in plans[name] and len(plans[name]) > 1
+        ),
+        *(
+            (f"weights.{name}", partial(choice, "release", plans[name].get("release"), recipe.releases))
+            for name in trained
+        ),
+        *(
+            (f"weights.{name}", partial(choice, "from, which stands above", plans[name].get("from"), above[name]))
+            for name in trained
+        ),
+        *((f"rows: {row.name}", partial(_refused, fault)) for row in recipe.rows for fault in row.faults),
         *((f"rows: {row.name}", partial(choice, "weights", row.weights, (None, *plans))) for row in recipe.rows),
-        *((f"rows: {name}", partial(_check_once, name, names)) for name in names),
-        *(("test.where, groups", partial(parse_where, text)) for text in filters),
+        *(
+            (f"rows: {row.name}", partial(choice, "agents", agent, (*AGENT_SETS, *AGENTS)))
+            for row in recipe.rows
+            for agent in row.cooperating
+            if row.agents not in AGENT_SETS
+        ),
+        *((f"rows: {row.name}", partial(getattr, row, "link")) for row in recipe.rows),
+        *((f"rows: {row.name}", partial(test.label_config, row.horizon)) for row in recipe.rows),
+        *((f"rows: {name}", partial(_refused, _TWICE)) for name in names if names.count(name) > 1),
+        *(("test.where, groups", partial(parse_where, text)) for text in chain(test.where, *recipe.groups.values())),
         *(("by", partial(attribute_name, by)) for by in recipe.by),
         *(("compare, headline", partial(choice, "row", name, names)) for name in chain(*recipe.pairs)),
         ("headline", partial(choice, "number", number, NUMBERS)),
@@ -279,16 +292,8 @@ def _check(path: Path, recipe: Recipe) -> None:
             check()
 
 
-def _check_plan(plan: Mapping[str, Any], releases: Collection[str], above: Collection[str | None]) -> None:
-    if "file" in plan and len(plan) > 1:
-        raise ConfigError("file: these weights are there; leave the other keys out")
-    choice("release", plan.get("release"), (*releases, *([None] if "file" in plan else [])))
-    choice("from, which stands above", plan.get("from"), above)
-
-
-def _check_once(name: str, names: Sequence[str]) -> None:
-    if names.count(name) > 1:
-        raise ConfigError("name: is there twice; name the keys that have lists in it, such as {agents}")
+def _refused(told: str) -> None:
+    raise ConfigError(told)
 
 
 def _expanded(row: Mapping[str, Any]) -> Iterator[Mapping[str, Any]]:
@@ -297,8 +302,7 @@ def _expanded(row: Mapping[str, Any]) -> Iterator[Mapping[str, Any]]:
     key = next((key for key in lists if key != "agents"), None)
     for values in product(*lists.values()):
         one = dict(zip(lists, values, strict=True))
-        series = _filled(row.get("name"), {**one, key: "…"})
-        over = key and [key, one[key], series]
+        over = key and [key, one[key], _filled(row.get("name"), {**one, key: "…"})]
         yield {**row, **one, "name": _filled(row.get("name"), one), "over": over} if one else row
 
 

@@ -73,8 +73,7 @@ def run_study(
 
         device = checked_device(device)
     bench = Bench(writable_folder(out).absolute(), device)
-    cores = 1 if device.startswith("cuda") else os.cpu_count()
-    engine: Any = {**how, "workers": how.get("workers") or cores}
+    engine: Any = {**how, "workers": how.get("workers") or (1 if device.startswith("cuda") else os.cpu_count())}
     with bench.store.shared():
         releases = {name: _release(bench, name, recipe, **how) for name in recipe.releases}
         weights = _weights(recipe, bench, releases, **engine)
@@ -90,16 +89,15 @@ def run_study(
             (cell for cell, _ in releases.values()),
             *(of.values() for of in (*(of for _, of in weights.values()), *rows.values())),
         )
-        notes = [{"kind": each.kind, "name": each.name, "key": each.key, **_notes(each)} for each in chain(*cells)]
-    told = {"recipe": msgspec.to_builtins(recipe), "devkit": __version__, "cells": notes}
-    report = StudyReport(summary=json.loads(json.dumps({**summarised(counted), **told})))
+        notes = [
+            {"kind": each.kind, "name": each.name, "key": each.key}
+            | {name: value for name, value in (each.kept or {}).items() if name != "counts"}
+            for each in chain(*cells)
+        ]
+    summary = {**summarised(counted), "recipe": msgspec.to_builtins(recipe), "devkit": __version__, "cells": notes}
+    report = StudyReport(summary=json.loads(json.dumps(summary)))
     save_study(report, counted, bench.out / recipe.name)
     return report
-
-
-def _notes(cell: Cell) -> dict[str, Any]:
-    """What was kept of a cell beside counts."""
-    return {name: value for name, value in (cell.kept or {}).items() if name != "counts"}
 
 
 def _release(bench: Bench, name: str, recipe: Recipe, **how: Unpack[Engine]) -> _Release:
@@ -171,16 +169,15 @@ def _seeds(
         choice("key", key, [each for each in (*models, *trainings) if each != "seed"])
     inherited, starts = others[start] if start else (ModelChoice(), {})
     model = as_record({**inherited.as_dict(), **{key: plan[key] for key in models if key in plan}}, ModelChoice)
-    given = {"validation": None, **{key: plan[key] for key in trainings if key in plan}}
     split, cells = bench.split(_scenarios(dataset, plan.get("split", "all"))), {}
     for seed in recipe.seeds:
-        config = as_record({**given, "split": str(split), "seed": seed}, TrainConfig)
+        given = {"validation": None, **{key: plan[key] for key in trainings if key in plan}, "split": str(split)}
+        config = as_record({**given, "seed": seed}, TrainConfig)
         first = starts.get(str(seed), starts.get(""))
-        work = partial(trained, dataset, model, config, None if first is None else first.folder, bench.device)
         cells[str(seed)] = bench.cell(
             "weights",
             f"{name}, seed {seed}",
-            work,
+            partial(trained, dataset, model, config, None if first is None else first.folder, bench.device),
             release=release.key,
             model=model.as_dict(),
             training={**config.as_dict(), "split": split.name},
@@ -209,11 +206,10 @@ def _rows(
         if not scenarios:
             raise ConfigError("where: no pair of scenarios matches; change the filters")
         selection.tokens(dataset)
-    samples = {**selection.as_dict(), "split": Path(selection.split).name}
     for row in recipe.rows:
         seeds: Mapping[str, Cell | None] = weights[row.weights][1] if row.weights else {"": None}
-        decides = {**msgspec.to_builtins(row), "horizon": horizons[row.name], "labels": [test.labels, test.cell]}
-        decides = {key: each for key, each in decides.items() if key not in ("name", "weights", "over")}
+        labels, told = test.label_config(horizons[row.name]), msgspec.to_builtins(row)
+        decides = {key: each for key, each in told.items() if key not in ("name", "weights", "over", "horizon")}
         found[row.name] = {
             seed: bench.cell(
                 "row",
@@ -221,14 +217,14 @@ def _rows(
                 Counting(
                     dataset=dataset,
                     row=row,
-                    test=test,
                     selection=selection,
-                    horizon=horizons[row.name],
+                    labels=labels,
                     weights=None if of is None else of.folder,
                     device=bench.device,
                 ),
                 **decides,
-                samples=samples,
+                labels=[test.labels, test.cell, horizons[row.name]],
+                samples={**selection.as_dict(), "split": Path(selection.split).name},
                 release=cell.key,
                 trained=None if of is None else of.key,
             )

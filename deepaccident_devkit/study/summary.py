@@ -1,7 +1,6 @@
 """The numbers of a study, from the counts of its samples; and these counts in a file, without any release.
 
-counted = read_counts("study/agents/counts.json.gz")
-summarised(counted)["headline"]
+`summarised(read_counts("studies/agents/counts.json.gz"))["headline"]` is what came out of one.
 """
 
 from __future__ import annotations
@@ -135,15 +134,10 @@ def _headline(headline: Mapping[str, Any], comparisons: Iterable[Mapping[str, An
     row, less, number, where = (headline[name] for name in ("row", "less", "number", "where"))
     pair = next(each for each in comparisons if (each["row"], each["less"]) == (row, less))
     found = pair["groups"][where or ALL][number]
-    decided = verdict(found)
-    words = {
-        "row": f"`{row}`",
-        "less": f"`{less}`",
-        "number": NUMBERS[number][2],
-        "size": difference_text(found, number),
-    }
+    size, said = difference_text(found, number), NUMBERS[number][2]
+    told = _WORDS[verdict(found)].format(row=f"`{row}`", less=f"`{less}`", number=said, size=size)
     among = "" if where is None else f"Among `{where}`: "
-    return {**headline, **found, "verdict": decided, "text": f"{among}{_WORDS[decided].format_map(words)}."}
+    return {**headline, **found, "verdict": verdict(found), "text": f"{among}{told}."}
 
 
 def number_with_interval(found: Mapping[str, Any], number: str) -> str:
@@ -172,7 +166,7 @@ class StudyReport(Report):
     """What came out of a study.
 
     Attributes:
-        summary: as `summarised`, with the `recipe`, whether it is its `smoke` version, and its `cells`.
+        summary: of `summarised`, with the `recipe`, the `devkit`'s version, and the `cells`.
     """
 
     summary: Mapping[str, Any]
