@@ -17,6 +17,7 @@ NEEDS: Final[Mapping[str, tuple[str, ...]]] = {
     "audit": ("testing",),
     "explore": ("interactions", "maps", "safety"),
     "safety": ("interactions",),
+    "study": ("baselines", "synth"),
     "synth.demo": ("baselines",),
 }
 """A room, or a module of one → the other rooms that it stands on; pyproject.toml holds all others to none."""
@@ -58,6 +59,7 @@ ADDED: Final[Mapping[str, Mapping[str, str]]] = {
         "explore": "explore.cli:explore",
         "predict": "baselines.cli:predict",
         "safety": "safety.cli:safety",
+        "study": "study.cli:study",
         "synth": "synth.cli:synth",
         "town-maps": "maps.cli:town_maps",
         "train": "model.cli:train",

@@ -91,6 +91,7 @@ REFERENCE = {
         "export.nuscenes.detections",
     ),
     "The model": ("model",),
+    "Studies": ("study",),
     "The explorer": ("explore",),
 }
 """Title of a page → what it lists: modules, classes, a type."""

@@ -69,6 +69,7 @@ NOT_RUN = {
     "safety describe OUT": "of what synth makes",
     "render accident OUT": "tests/unit/synth/test_own_files.py has it, on a release of a scenario file",
     "info s3:": "tests/cloud has releases on S3",
+    "study ": "tests/test_cli_study.py has their like; some take hours",
     "train ": "tests/torch_extra/model/test_commands.py has them; they need torch",
     "predict ": "likewise",
     "evaluate motion training_data": "of what predict makes; likewise",

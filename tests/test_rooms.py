@@ -16,11 +16,11 @@ from deepaccident_devkit.errors import MissingRoomError
 
 TESTS = Path(__file__).parent
 PACKAGE = Path(deepaccident_devkit.__file__).parent
-RING = ("audit", "baselines", "explore", "interactions", "maps", "model", "safety", "synth", "testing")
+RING = ("audit", "baselines", "explore", "interactions", "maps", "model", "safety", "study", "synth", "testing")
 MODULES_OF_THE_CORE = 200
 ASKED = {
     "audit": ("verb('audit')",),
-    "baselines": ("verb('predict')", "verb('demo')"),
+    "baselines": ("verb('predict')", "verb('demo')", "verb('study')"),
     "explore": ("verb('explore')",),
     "interactions": (
         "da.find(min_ttc='..1')",
@@ -40,7 +40,8 @@ ASKED = {
     ),
     "model": ("verb('train')", "verb('predict', str(da.dataroot), str(da.dataroot), '--out', 'predicted')"),
     "safety": ("da.describe(da.scenario[0])", "verb('safety')", "verb('explore')"),
-    "synth": ("verb('synth')", "verb('demo')"),
+    "study": ("verb('study')",),
+    "synth": ("verb('synth')", "verb('demo')", "verb('study')"),
     "testing": ("verb('audit')",),
 }
 """Room → what cannot be had without it, in terms of `PROBE`."""

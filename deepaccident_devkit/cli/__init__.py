@@ -40,6 +40,7 @@ _VERBS: Final = {
     "results": "Make results files of those of other tools.",
     "safety": "Look into accidents: who saw it first, when it was too late.",
     "split": "Make the official splits, or a split file of scenarios.",
+    "study": "Train and compare what a recipe says.",
     "synth": "Make a synthetic release.",
     "train": "Train the model.",
     "validate": "Print what is wrong, unusual or missing in a release.",

@@ -170,6 +170,17 @@ def processes(device: str) -> Iterator[Place]:
         distributed.destroy_process_group()
 
 
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Let torch compute on one thread in the block: the bits of sums depend on how many there are."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
+
 class _Row(msgspec.Struct):
     """What readers need of a row."""
 

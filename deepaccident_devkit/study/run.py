@@ -1,0 +1,264 @@
+"""`run_study`: from a recipe to its results, cell by cell."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, fields
+from functools import partial
+from itertools import chain
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+
+from deepaccident_devkit._version import __version__
+from deepaccident_devkit.deepaccident import DeepAccident
+from deepaccident_devkit.errors import ConfigError
+from deepaccident_devkit.evaluation.breakdowns import cluster_of, sample_attributes, tokens_by_value
+from deepaccident_devkit.evaluation.runs import SampleSelection
+from deepaccident_devkit.evaluation.runs.setups import release_note, scenario_of
+from deepaccident_devkit.release.fingerprints import fingerprint, scenario_hashes
+from deepaccident_devkit.rooms import need_room
+from deepaccident_devkit.selection import find
+from deepaccident_devkit.study.cells import Bench, Cell, Counting, make, taken, trained
+from deepaccident_devkit.study.numbers import HIDDEN
+from deepaccident_devkit.study.page import save_study
+from deepaccident_devkit.study.recipe import DEFAULT_HORIZON, Recipe, at, source_of
+from deepaccident_devkit.study.summary import ALL, Counted, StudyReport, counted_of, summarised
+from deepaccident_devkit.support.files import writable_folder
+from deepaccident_devkit.support.json_text import as_record
+from deepaccident_devkit.support.reading import file_checksum
+from deepaccident_devkit.support.text import choice, natural_order
+from deepaccident_devkit.synth import make_release
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
+    from deepaccident_devkit.model import ModelChoice
+    from deepaccident_devkit.parallel import Engine
+
+_Weights = tuple["ModelChoice", dict[str, Cell]]
+"""The model, and the weights of each seed; those of a file under an empty text."""
+_Release = tuple[Cell, DeepAccident]
+
+
+def run_study(
+    recipe: Recipe, out: str | os.PathLike[str], *, device: str = "auto", **how: Unpack[Engine]
+) -> StudyReport:
+    """Make what is not there of a study, and write its results into `out/NAME`, NAME that of the recipe.
+
+    After a kill the same call goes on. Studies with the same `out` share releases, weights and rows.
+
+    Args:
+        recipe: of `read_recipe`.
+        out: a folder, of one study or several.
+        device: of models: `auto`, `cpu`, `cuda`, …
+        **how: `workers` (None for as many as there are cores, of a GPU one), `executor` and `progress`, as
+            `parallel.Engine` says.
+
+    Returns:
+        What came out. The folder has it as `study.json`, `tables/*.csv`, `figures/*.png`, `index.html`, and the counts
+        of all samples as `counts.json.gz` (`read_counts`).
+
+    Raises:
+        ConfigError: the recipe asks for weights or samples that cannot be, or something cannot be written.
+        SomeFailedError: some cells failed; the others are done.
+        DeepAccidentError: as of `make_release`, `model.train` and `evaluate_results`.
+    """
+    if recipe.weights:
+        need_room("model", "a study with weights")
+        from deepaccident_devkit.model import checked_device
+
+        device = checked_device(device)
+    bench = Bench(writable_folder(out).absolute(), device)
+    engine: Any = {**how, "workers": how.get("workers") or (1 if device.startswith("cuda") else os.cpu_count())}
+    with bench.store.shared():
+        releases = {name: _release(bench, name, recipe, **how) for name in recipe.releases}
+        weights = _weights(recipe, bench, releases, **engine)
+        rows = _rows(recipe, bench, releases[recipe.test.release], weights)
+        bench.make(
+            (cell for of in rows.values() for cell in of.values()),
+            "rows",
+            releases[recipe.test.release][1].places,
+            **engine,
+        )
+        counted = _counted(recipe, releases[recipe.test.release][1], rows)
+        cells = (
+            (cell for cell, _ in releases.values()),
+            *(of.values() for of in (*(of for _, of in weights.values()), *rows.values())),
+        )
+        notes = [
+            {"kind": each.kind, "name": each.name, "key": each.key}
+            | {name: value for name, value in (each.kept or {}).items() if name != "counts"}
+            for each in chain(*cells)
+        ]
+    summary = {**summarised(counted), "recipe": msgspec.to_builtins(recipe), "devkit": __version__, "cells": notes}
+    report = StudyReport(summary=json.loads(json.dumps(summary)))
+    save_study(report, counted, bench.out / recipe.name)
+    return report
+
+
+def _release(bench: Bench, name: str, recipe: Recipe, **how: Unpack[Engine]) -> _Release:
+    """A release, made if it is not there, by all workers."""
+    source, config = recipe.releases[name], source_of(recipe.releases[name])
+    if config is None:
+        dataset = _opened(source)
+        told = {**source, "release": release_note(dataset, _scenarios(dataset))}
+    else:
+        told = {**asdict(config), "spec": config.spec and config.spec.read_text(encoding="utf-8")}
+    cell = bench.cell("release", name, partial(_made, source, how), **told)
+    make(cell)
+    return cell, _opened(source, cell.folder)
+
+
+def _opened(source: Mapping[str, Any], folder: Path | None = None) -> DeepAccident:
+    return DeepAccident(source.get("version", "v1"), source.get("dataroot", folder), verbose=False)
+
+
+def _made(source: Mapping[str, Any], how: Any, folder: Path) -> dict[str, Any]:
+    """Make a release, if it is not there: how many scenarios it has, and its fingerprint."""
+    config = source_of(source)
+    if config is not None and not folder.is_dir():
+        make_release(folder, config, **how)
+    folder.mkdir(parents=True, exist_ok=True)  # of one that was there it has nothing
+    dataset, engine = _opened(source, folder), {name: each for name, each in how.items() if name != "progress"}
+    hashes = scenario_hashes(dataset, _scenarios(dataset), **engine)
+    return {"scenarios": len(hashes), "fingerprint": fingerprint(hashes)}
+
+
+def _scenarios(dataset: DeepAccident, split: str = "all") -> list[str]:
+    """The tokens of a split; of `all`, of all scenarios."""
+    every = [record["token"] for record in dataset.scenario]
+    chosen = every if split == "all" else dataset.split_scenarios(split)
+    return [token for token in every if token in chosen]
+
+
+def _weights(
+    recipe: Recipe, bench: Bench, releases: Mapping[str, _Release], **how: Unpack[Engine]
+) -> dict[str, _Weights]:
+    """All weights, made if they are not there: those together that begin from nothing, then from these, and on."""
+    found: dict[str, _Weights] = {}
+    depths: dict[str | None, int] = {None: -1}
+    for name, plan in recipe.weights.items():
+        depths[name] = depths[plan.get("from")] + 1
+        with at(recipe.name, f"weights.{name}"):
+            found[name] = _seeds(name, recipe, bench, releases, found)
+    places = tuple(place for _, dataset in releases.values() for place in dataset.places)
+    for depth in range(max(depths.values()) + 1):
+        together = [cell for name, (_, cells) in found.items() if depths[name] == depth for cell in cells.values()]
+        bench.make(together, "weights", places, **how)
+    return found
+
+
+def _seeds(
+    name: str, recipe: Recipe, bench: Bench, releases: Mapping[str, _Release], others: Mapping[str, _Weights]
+) -> _Weights:
+    """The weights of one name; raises ConfigError, ChoiceError or ValueError."""
+    from deepaccident_devkit.model import ModelChoice, TrainConfig, read_weights
+
+    plan = dict(recipe.weights[name])
+    if "file" in plan:
+        read = read_weights(plan["file"])
+        cell = bench.cell("weights", name, partial(taken, read.path), file=file_checksum(read.path))
+        return ModelChoice.from_dict(read.meta, read.path), {"": cell}
+    (release, dataset), start = releases[plan.pop("release")], plan.pop("from", None)
+    models, trainings = ([each.name for each in fields(kind)] for kind in (ModelChoice, TrainConfig))
+    for key in plan:
+        choice("key", key, [each for each in (*models, *trainings) if each != "seed"])
+    inherited, starts = others[start] if start else (ModelChoice(), {})
+    model = as_record({**inherited.as_dict(), **{key: plan[key] for key in models if key in plan}}, ModelChoice)
+    split, cells = bench.split(_scenarios(dataset, plan.get("split", "all"))), {}
+    for seed in recipe.seeds:
+        given = {"validation": None, **{key: plan[key] for key in trainings if key in plan}, "split": str(split)}
+        config = as_record({**given, "seed": seed}, TrainConfig)
+        first = starts.get(str(seed), starts.get(""))
+        cells[str(seed)] = bench.cell(
+            "weights",
+            f"{name}, seed {seed}",
+            partial(trained, dataset, model, config, None if first is None else first.folder, bench.device),
+            release=release.key,
+            model=model.as_dict(),
+            training={**config.as_dict(), "split": split.name},
+            start=None if first is None else first.key,
+        )
+    return model, cells
+
+
+def _rows(
+    recipe: Recipe, bench: Bench, release: _Release, weights: Mapping[str, _Weights]
+) -> dict[str, dict[str, Cell]]:
+    """Row → seed → its cell, all at the same samples."""
+    (cell, dataset), test, found = release, recipe.test, {}
+    horizons = {
+        row.name: (weights[row.weights][0] if row.weights else row).horizon or DEFAULT_HORIZON for row in recipe.rows
+    }
+    scenarios = _matching(dataset, test.where, _scenarios(dataset, test.split), recipe, "test.where")
+    selection = SampleSelection(
+        split=str(bench.split(scenarios)),
+        samples=test.samples,
+        scope=test.scope,
+        agents=test.agents,
+        horizon=test.horizon or max(horizons.values()),
+    )
+    with at(recipe.name, "test"):
+        if not scenarios:
+            raise ConfigError("where: no pair of scenarios matches; change the filters")
+        selection.tokens(dataset)
+    for row in recipe.rows:
+        seeds: Mapping[str, Cell | None] = weights[row.weights][1] if row.weights else {"": None}
+        labels, told = test.label_config(horizons[row.name]), msgspec.to_builtins(row)
+        decides = {key: each for key, each in told.items() if key not in ("name", "weights", "over", "horizon")}
+        found[row.name] = {
+            seed: bench.cell(
+                "row",
+                f"{row.name}, seed {seed}" if seed else row.name,
+                Counting(
+                    dataset=dataset,
+                    row=row,
+                    selection=selection,
+                    labels=labels,
+                    weights=None if of is None else of.folder,
+                    device=bench.device,
+                ),
+                **decides,
+                labels=[test.labels, test.cell, horizons[row.name]],
+                samples={**selection.as_dict(), "split": Path(selection.split).name},
+                release=cell.key,
+                trained=None if of is None else of.key,
+            )
+            for seed, of in seeds.items()
+        }
+    return found
+
+
+def _matching(
+    dataset: DeepAccident, where: Sequence[str], scenarios: Iterable[str], recipe: Recipe, place: str
+) -> list[str]:
+    """Those scenarios of whose pair one matches all filters; raises ConfigError."""
+    with at(recipe.name, place):
+        pairs = {cluster_of(record["token"]) for record in find(dataset, *where)}
+    return [token for token in scenarios if cluster_of(token) in pairs]
+
+
+def _counted(recipe: Recipe, dataset: DeepAccident, rows: Mapping[str, Mapping[str, Cell]]) -> Counted:
+    """What was counted of all rows, and the groups of samples."""
+    told = {
+        **{name: getattr(recipe, name) for name in ("title", "question")},
+        "labels": recipe.test.labels,
+        "headline": msgspec.to_builtins(recipe.headline),
+        "compare": [list(pair) for pair in recipe.pairs],
+        "over": {row.name: row.over and list(row.over) for row in recipe.rows},
+    }
+    counts = {name: {seed: (cell.kept or {})["counts"] for seed, cell in of.items()} for name, of in rows.items()}
+    tokens = sorted(next(iter(next(iter(counts.values())).values()))[HIDDEN])
+    groups = {ALL: tokens}
+    for name, where in recipe.groups.items():
+        matching = set(_matching(dataset, where, map(scenario_of, tokens), recipe, f"groups.{name}"))
+        groups[name] = [token for token in tokens if scenario_of(token) in matching]
+    attributes = sample_attributes(dataset, tokens) if recipe.by else {}
+    for by in recipe.by:
+        values = tokens_by_value(attributes, by)
+        groups |= {f"{by}={value or 'unknown'}": values[value] for value in sorted(values, key=natural_order)}
+    return counted_of(counts, groups, told)

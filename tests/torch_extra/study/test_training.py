@@ -1,0 +1,191 @@
+"""Studies with models: what is trained, what spoilt inputs are, and that a killed run ends as one that was not."""
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from studies import BASELINES, killed, written
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.errors import ConfigError, SomeFailedError
+from deepaccident_devkit.export.torch import V2XDataset
+from deepaccident_devkit.model import PredictConfig, load_model, predictions, read_weights
+from deepaccident_devkit.model.presets import tiny
+from deepaccident_devkit.motion import MotionLabelConfig
+from deepaccident_devkit.study import read_recipe, run_study
+from deepaccident_devkit.study.predict import blanked, predictions_of, strangers_of, with_strangers
+from deepaccident_devkit.study.recipe import Row
+from deepaccident_devkit.study.summary import ALL
+
+SMALL = {"scenarios": 2, "frames": 8, "image_size": [64, 36], "sensors": "cameras", "view": "hidden", "designs": [1]}
+TRAINED = {"release": "training", "save_every": 1, "egos": 1}
+MODELS: dict[str, Any] = {
+    **BASELINES,
+    "releases": {"training": {"seed": 201, **SMALL}, "test": {"seed": 203, **SMALL, "scenarios": 4}},
+    "seeds": [1, 2],
+    "weights": {
+        "trunk": {**TRAINED, "steps": 3},
+        "max": {**TRAINED, "from": "trunk", "fusion": "max", "steps": 2, "freeze": ["img_backbone."]},
+        "given": {"file": "tiny"},
+        "near": {**TRAINED, "horizon": 0.5, "steps": 1},
+    },
+    "test": {"release": "test", "cell": 1.0, "labels": "clean", "horizon": 0.5},
+    "headline": {"row": "all", "less": "single", "number": "iou_100"},
+    "rows": [
+        {"name": "{agents}", "weights": "trunk", "agents": ["single", "all"]},
+        {"name": "black", "weights": "trunk", "control": "blank"},
+        {"name": "strangers", "weights": "trunk", "control": "strangers"},
+        {"name": "max", "weights": "max"},
+        {"name": "given", "weights": "given"},
+        {"name": "near", "weights": "near"},
+        {"name": "sees all", "baseline": "constant_velocity"},
+    ],
+    "groups": {},
+    "compare": [["all", "sees all"]],
+}
+MODULE = "deepaccident_devkit.model.training_loop"
+
+
+@pytest.fixture(scope="module")
+def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder in which the study of models has run."""
+    folder = tmp_path_factory.mktemp("models")
+    run_study(read_recipe(str(written(folder, MODELS))), folder / "out", device="cpu", workers=1)
+    return folder / "out"
+
+
+@pytest.fixture
+def summary(out: Path) -> dict[str, Any]:
+    told: dict[str, Any] = json.loads((out / "mine" / "study.json").read_text(encoding="utf-8"))
+    return told
+
+
+@pytest.mark.slow
+def test_each_seed_is_a_model_and_weights_begin_from_their_own(out: Path, summary: dict[str, Any]) -> None:
+    cells = {each["name"]: each for each in summary["cells"] if each["kind"] == "weights"}
+    folders = {name: out / "weights" / each["key"] for name, each in cells.items()}
+    assert list(folders) == [
+        "trunk, seed 1",
+        "trunk, seed 2",
+        "max, seed 1",
+        "max, seed 2",
+        "given",
+        "near, seed 1",
+        "near, seed 2",
+    ]
+    for seed in (1, 2):
+        noted = read_weights(folders[f"max, seed {seed}"]).meta
+        assert noted["from"] == str(folders[f"trunk, seed {seed}"])
+        assert (noted["preset"], noted["fusion"], noted["training"]["seed"]) == ("tiny", "max", seed)
+        assert noted["training"]["freeze"] == ["img_backbone."]
+        assert noted["training"]["validation"] is None
+    assert [*summary["rows"]["all"]["groups"][ALL]["apa"]["seeds"]] == ["1", "2"]
+    assert summary["rows"]["given"]["groups"][ALL]["apa"]["seeds"] == {}
+    assert [*summary["comparisons"][1]["groups"][ALL]["iou_100"]["seeds"]] == ["1", "2"]
+    assert summary["groups"][ALL] == {"samples": 4, "pairs": 2}
+    assert cells["trunk, seed 1"]["loss"] > 0
+    assert "torch" in cells["trunk, seed 1"]["machine"]
+
+
+@pytest.mark.slow
+def test_a_run_that_was_killed_ends_as_one_that_was_not(out: Path, tmp_path: Path) -> None:
+    """Amid the second training, then amid the first row, then amid a later one."""
+    path, again = written(tmp_path, MODELS), tmp_path / "out"
+    killed(path, again, MODULE, "add_to_log", 4)
+    steps = sorted(len((each / "log.jsonl").read_text().splitlines()) for each in (again / "weights").iterdir())
+    assert steps == [1, 3]  # of two seeds; those that begin from nothing come first
+    killed(path, again, "deepaccident_devkit.model.results", "prediction_of", 2)
+    killed(path, again, "deepaccident_devkit.study.predict", "blanked", 1)
+    run_study(read_recipe(str(path)), again, device="cpu", workers=2)
+    for name in ("counts.json.gz", "tables/rows.csv", "tables/comparisons.csv"):
+        assert (again / "mine" / name).read_bytes() == (out / "mine" / name).read_bytes()
+
+
+@pytest.mark.slow
+def test_other_steps_make_those_weights_and_their_rows_alone(out: Path, tmp_path: Path) -> None:
+    before = {path: path.stat().st_mtime_ns for path in (out / "cells" / "kept").rglob("*") if path.is_file()}
+    changed = {**MODELS, "weights": {**MODELS["weights"], "max": {**MODELS["weights"]["max"], "steps": 1}}}
+    run_study(read_recipe(str(written(tmp_path, changed))), out, device="cpu", workers=1)
+    after = {path: path.stat().st_mtime_ns for path in (out / "cells" / "kept").rglob("*") if path.is_file()}
+    assert before.items() < after.items()
+    assert sorted(path.parent.name for path in after.keys() - before.keys()) == ["row"] * 2 + ["weights"] * 2
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({"preset": "tiny_"}, "mine: weights.trunk: .*'tiny_'"),
+        ({"stepps": 3}, "mine: weights.trunk: key: expected one of .*did you mean 'steps'"),
+        ({"seed": 3}, "mine: weights.trunk: key: expected one of .*found 'seed'"),
+        ({"steps": 0}, "mine: weights.trunk: steps: expected a whole number from 1, found 0"),
+        ({"steps": "many"}, r"mine: weights.trunk: expected `int`, got `str` - at `\$.steps`"),
+        ({"horizon": 0.7}, "mine: weights.trunk: horizon: 0.7 s is no number of steps"),
+    ],
+)
+def test_weights_that_cannot_be_are_told_before_anything_is_trained(
+    changes: dict[str, Any], told: str, da: DeepAccident, tmp_path: Path
+) -> None:
+    plans = {"trunk": {"release": "test", **changes}}
+    rows = [{"name": "one", "weights": "trunk"}]
+    given = {"releases": {"test": {"dataroot": str(da.dataroot)}}, "weights": plans, "rows": rows}
+    recipe = {**BASELINES, **given, "compare": [], "headline": {"row": "one", "less": "one"}, "groups": {}}
+    with pytest.raises(ConfigError, match=told):
+        run_study(read_recipe(str(written(tmp_path, recipe))), tmp_path / "out", device="cpu", workers=1)
+
+
+@pytest.fixture(scope="module")
+def items(da: DeepAccident) -> Iterator[list[Any]]:
+    """A sample of each of two pairs, with pictures and points."""
+    tokens = [f"{scenario['token']}/ego_vehicle/004" for scenario in da.scenario]
+    given = tiny().inputs("all", points=True)
+    return [V2XDataset(da, own, given)[0] for own in (tokens[:1], strangers_of(tokens)[:1])]
+
+
+def test_blank_inputs_have_no_picture_and_no_point(items: list[Any]) -> None:
+    found = blanked(items[0])
+    assert items[0]["images"].any()
+    assert not found["images"].any()
+    assert found["images"].shape == items[0]["images"].shape
+    assert found["images"].dtype == items[0]["images"].dtype
+    assert {tuple(cloud.shape) for of_agent in found["points"] for cloud in of_agent} == {(0, 4)}
+    assert all(torch.equal(found[name], items[0][name]) for name in ("intrinsics", "ego_from_agent", "agent_valid"))
+
+
+def test_strangers_bring_sensors_and_poses_and_ego_keeps_its_own(items: list[Any]) -> None:
+    own, stranger = items
+    found = with_strangers(own, stranger)
+    for name in ("images", "intrinsics", "ego_from_camera", "image_from_ego", "agent_from_past", "ego_from_agent"):
+        assert torch.equal(found[name][0], own[name][0])
+        assert torch.equal(found[name][1:], stranger[name][1:])
+    assert all(torch.equal(a, b) for a, b in zip(found["points"][1], stranger["points"][1], strict=True))
+    assert all(torch.equal(a, b) for a, b in zip(found["points"][0], own["points"][0], strict=True))
+    assert (found["token"], found["agents"]) == (own["token"], own["agents"])
+    assert not torch.equal(own["images"][1:], stranger["images"][1:])
+
+
+def test_a_row_predicts_as_the_model_does(da: DeepAccident) -> None:
+    tokens = [f"{da.scenario[0]['token']}/ego_vehicle/004"]
+    shipped = read_weights("tiny").path
+    [(token, (motion, accidents, boxes))] = predictions_of(
+        Row(name="all", weights="a"), shipped, "cpu", da, tokens, tiny().labels
+    )
+    [expected] = predictions(load_model("tiny"), da, tokens, PredictConfig())
+    assert token == expected.token
+    assert [(each.time, each.score) for each in accidents] == [(each.time, each.score) for each in expected.accidents]
+    assert (boxes.scores == expected.boxes.scores).all()
+    assert motion.heads is not None
+    assert expected.motion.heads is not None
+    assert (motion.heads[-1].centerness == expected.motion.heads[-1].centerness).all()
+    with pytest.raises(ConfigError, match="was trained with cells of 1 m and the labels clean; give `cell: 1` and"):
+        [*predictions_of(Row(name="all", weights="a"), shipped, "cpu", da, tokens, MotionLabelConfig())]
+
+
+@pytest.mark.slow
+def test_a_row_that_fails_is_named(out: Path, tmp_path: Path) -> None:
+    rows = [*MODELS["rows"][:1], {"name": "late", "weights": "trunk", "latency": 0.5}]
+    changed = {**MODELS, "rows": rows, "compare": [], "headline": None}
+    with pytest.raises(SomeFailedError, match=r"1 of 1 failed:\n  row/.*: late, seed 1: latency"):
+        run_study(read_recipe(str(written(tmp_path, {**changed, "seeds": [1]}))), out, device="cpu", workers=1)

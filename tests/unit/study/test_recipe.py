@@ -1,0 +1,140 @@
+"""Recipes: what a file can say, and what is said of faults."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from deepaccident_devkit.errors import ConfigError
+from deepaccident_devkit.study import read_recipe
+from deepaccident_devkit.study.recipe import SHIPPED, Row
+
+PLAIN: dict[str, Any] = {
+    "title": "A study",
+    "question": "Does it help?",
+    "releases": {"test": {"seed": 3, "scenarios": 4}},
+    "test": {"release": "test"},
+    "rows": [{"name": "one", "baseline": "standing"}, {"name": "two", "trivial": "nothing"}],
+}
+MODEL = {"weights": {"trunk": {"release": "test"}}, "rows": [{"name": "one", "weights": "trunk"}]}
+
+
+def written(folder: Path, recipe: dict[str, Any]) -> str:
+    path = folder / "mine.yaml"
+    path.write_text(json.dumps(recipe), encoding="utf-8")  # JSON is YAML
+    return str(path)
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({"titel": "A study"}, "unknown field `titel`"),
+        ({"title": 3}, r"expected `str`, got `int` - at `\$.title`"),
+        ({"rows": None}, r"expected `array`, got `null` - at `\$.rows`"),
+        ({"rows": [{"name": "one"}]}, "rows: one: expected one of weights, baseline and trivial, found none"),
+        (
+            {"rows": [{"name": "one", "baseline": "flying"}]},
+            r"invalid enum value 'flying' - at `\$.rows\[0\].baseline`",
+        ),
+        ({"rows": [{"name": "one", "weights": "trunk"}]}, "rows: one: weights: expected one of .*found 'trunk'"),
+        ({"rows": [{"name": "one", "trivial": "nothing"}] * 2}, "rows: one: name: is there twice; name the keys"),
+        ({"rows": [{"name": "one", "baseline": "standing", "control": "blank"}]}, "control: spoils what a model sees"),
+        ({"rows": [{"name": "one", "baseline": "standing", "agents": "+front"}]}, "agents: expected one of .*'.front'"),
+        ({"rows": [{"name": "one", "baseline": "standing", "latency": 0.15}]}, "rows: one: latency: .*0.15"),
+        ({"rows": [{"name": "one", "baseline": "standing", "horizon": 0.7}]}, "rows: one: .*0.7.*0.5"),
+        ({"rows": [{"name": "a{latency}", "trivial": "nothing", "latencies": [1]}]}, "unknown field `latencies`"),
+        ({**MODEL, "rows": [{"name": "one", "weights": "trunk", "horizon": 3.0}]}, "horizon: is what the weights were"),
+        ({**MODEL, "weights": {"trunk": {"release": "tset"}}}, "weights.trunk: release: .*did you mean 'test'"),
+        ({**MODEL, "weights": {"trunk": {"release": "test", "from": "trunk"}}}, "from, which stands above: expected"),
+        (
+            {**MODEL, "weights": {"trunk": {"file": "tiny", "steps": 3}}},
+            "file: these weights are there; leave the other",
+        ),
+        ({"releases": {"test": {"sede": 3}}}, "releases.test: key: expected one of .*did you mean 'seed'"),
+        ({"releases": {"test": {"frames": 0}}}, "releases.test: .*frames: 0 is not possible; choose a number from 1"),
+        ({"test": {"release": "training"}}, "test: release: expected .*'training'"),
+        ({"test": {"release": "test", "where": ["town"]}}, r"test.where, groups: expected field=value"),
+        ({"test": {"release": "test", "labels": "cleam"}}, "test: .*did you mean 'clean'"),
+        ({"by": ["town_hall"]}, "by: by: expected one of .*'town_hall'"),
+        ({"compare": [["one", "three"]]}, "compare, headline: row: expected one of one, two, found 'three'"),
+        ({"headline": {"row": "one", "less": "two", "number": "apaa"}}, "headline: number: .*did you mean 'apa'"),
+        ({"headline": {"row": "one", "less": "two", "where": "hidden"}}, "headline: where: .*'hidden'"),
+    ],
+)
+def test_a_fault_is_named_with_its_file_its_key_and_a_remedy(
+    changes: dict[str, Any], told: str, tmp_path: Path
+) -> None:
+    path = written(tmp_path, {**PLAIN, **changes})
+    with pytest.raises(ConfigError, match=told) as raised:
+        read_recipe(path)
+    assert str(raised.value).startswith(f"{path}: ")
+
+
+def test_files_that_are_no_recipes(tmp_path: Path) -> None:
+    with pytest.raises(
+        ConfigError, match=r"RECIPE, which is no file \.yaml: expected one of agents, .*did you mean 'links'"
+    ):
+        read_recipe("link")
+    with pytest.raises(ConfigError, match=r"no.yaml: cannot be read .*; give a file of YAML"):
+        read_recipe(str(tmp_path / "no.yaml"))
+    (tmp_path / "no.yaml").write_text("a: &b {}\nc: *b\n")
+    with pytest.raises(ConfigError, match=r"no.yaml:2: c: aliases \(\*name\) are not read here"):
+        read_recipe(str(tmp_path / "no.yaml"))
+    (tmp_path / "no.yaml").write_text("\n")
+    with pytest.raises(ConfigError, match="the recipe: object missing required field `rows`"):
+        read_recipe(str(tmp_path / "no.yaml"))
+    (tmp_path / "no.yaml").write_text("- a\n")
+    with pytest.raises(ConfigError, match="the recipe: expected `object`, got `array`"):
+        read_recipe(str(tmp_path / "no.yaml"))
+    with pytest.raises(ConfigError, match="smoke: is missing; write this part, or leave out --smoke"):
+        read_recipe(written(tmp_path, PLAIN), smoke=True)
+
+
+def test_a_list_makes_a_row_each(tmp_path: Path) -> None:
+    rows = [
+        {"name": "{agents}, {latency} s", "baseline": "standing", "agents": ["single", "all"], "latency": [0.0, 0.5]},
+        {"name": "{agents.__class__} {weights}", "trivial": "nothing", "agents": ["all"]},
+    ]
+    found = read_recipe(written(tmp_path, {**PLAIN, "rows": rows})).rows
+    expected = [
+        Row(
+            name=f"{agents}, {late} s",
+            baseline="standing",
+            agents=agents,
+            latency=late,
+            over=("latency", late, f"{agents}, … s"),
+        )
+        for agents in ("single", "all")
+        for late in (0.0, 0.5)
+    ]
+    assert list(found) == [*expected, Row(name="{agents.__class__} {weights}", trivial="nothing")]
+    assert (found[0].link, found[1].link and found[1].link.latency_frames) == (None, 5)
+    assert Row(name="a", agents="ego_vehicle,other_vehicle").cooperating == ["ego_vehicle", "other_vehicle"]
+
+
+def test_the_smoke_part_replaces_what_it_names(tmp_path: Path) -> None:
+    small = {"releases": {"test": {"scenarios": 2}}, "rows": PLAIN["rows"][:1], "title": "Small"}
+    path = written(tmp_path, {**PLAIN, "smoke": small})
+    whole, smoke = read_recipe(path), read_recipe(path, smoke=True)
+    assert (whole.name, smoke.name, whole.title, smoke.title) == ("mine", "mine-smoke", "A study", "Small")
+    assert (len(whole.rows), len(smoke.rows)) == (2, 1)
+    assert (whole.releases["test"], smoke.releases["test"]) == (
+        {"seed": 3, "scenarios": 4},
+        {"seed": 3, "scenarios": 2},
+    )
+    assert whole.test == smoke.test
+
+
+def test_the_recipes_that_ship_share_releases_and_the_trunk() -> None:
+    names = sorted(each.stem for each in SHIPPED.glob("*.yaml"))
+    assert names == ["agents", "fusions", "horizons", "inputs", "links", "v2x", "visibility"]
+    found = [read_recipe(name) for name in names]
+    assert all(read_recipe(name, smoke=True).rows for name in names)
+    trained = [each for each in found if each.weights]
+    assert [each.name for each in found if not each.weights] == ["v2x"]
+    assert all(each.releases == trained[0].releases and each.test == trained[0].test for each in trained)
+    assert all(each.weights["trunk"] == trained[0].weights["trunk"] for each in trained)
+    assert all(each.seeds == trained[0].seeds for each in trained)
+    rows = {row.name for row in trained[0].rows}
+    assert {"black", "strangers", "nothing", "everything", "labels, all", "constant velocity, single"} < rows
