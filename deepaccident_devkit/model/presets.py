@@ -237,7 +237,7 @@ def tiny_both() -> ModelConfig:
     return replace(
         config,
         pillars=PillarConfig(channels=config.temporal.channels, grid=config.grid),
-        motion=replace(config.motion, decoders="shuffled", upsample=4),
+        motion=replace(config.motion, decoders="shuffled", upsample=4, samples=0),
         motion_loss=replace(config.motion_loss, class_weights=(1.0, 2.0)),
         labels=replace(config.labels, grid=BevGrid()),
     )

@@ -188,7 +188,7 @@ def report_figure(
     return detached_figure(size_in_style(size, panels=panels, heights=heights))
 
 
-def write_report_figure(figure: Figure, path: Path, *, dpi: float, words: dict[str, Any] | None = None) -> Path:
+def write_report_figure(figure: Figure, path: Path, *, dpi: float = 150, words: dict[str, Any] | None = None) -> Path:
     """Write a figure of a report into a PNG file, and for a paper or a slide also into a PDF file beside it."""
     style = current_style()
     if style.few:

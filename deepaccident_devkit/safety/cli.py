@@ -39,7 +39,6 @@ from deepaccident_devkit.safety.figures import (
 from deepaccident_devkit.safety.page import REPLAYS, save_safety_report
 from deepaccident_devkit.support.files import writable_folder, write_bytes
 
-_DPI: Final = 150
 Scenarios = Sequence[Any] | None
 """Those that a verb is about; None for all."""
 Files = dict[str, Callable[[Path], Path]]
@@ -58,9 +57,7 @@ def _replay_count(context: click.Context, parameter: click.Parameter, value: str
 
 def _picture(render: Callable[..., Any], size: tuple[float, float], *what: Any) -> Callable[[Path], Path]:
     """What renders a figure of this size into a file."""
-    return lambda path: write_report_figure(
-        render(*what, fig=report_figure(size, column=COLUMN_HEIGHT)), path, dpi=_DPI
-    )
+    return lambda path: write_report_figure(render(*what, fig=report_figure(size, column=COLUMN_HEIGHT)), path)
 
 
 def _lead_time(dataset: DeepAccident, chosen: Scenarios, *, kind: Any, **engine: Any) -> tuple[Any, Files]:

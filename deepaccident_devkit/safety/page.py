@@ -41,7 +41,6 @@ if TYPE_CHECKING:
 REPORT_FILE: Final = "report.html"
 REPLAYS: Final = 10
 """Replay pages that are made if nobody says how many."""
-_DPI: Final = 150
 _LEADS: Final = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 5.0)
 """Seconds of warning that the tables have columns for."""
 _WARNED: Final = {
@@ -103,7 +102,7 @@ def save_safety_report(
     written.append(folder / "safety.json")
     write_bytes(written[-1], report.to_json().encode())
     drawn, pictures = list(figures_of(report)), place_in(folder, "figures", opened=True)
-    figures = [(each, write_report_figure(each.draw(), pictures / f"{each.name}.png", dpi=_DPI)) for each in drawn]
+    figures = [(each, write_report_figure(each.draw(), pictures / f"{each.name}.png")) for each in drawn]
     names = {} if dataset is None else replay_names([row.scenario for row in by_severity(report.rows)][:replays])
     failed = {} if dataset is None else _make_replays(dataset, folder.absolute(), names, **how)
     pages = {scenario: name for scenario, name in names.items() if scenario not in failed}

@@ -25,7 +25,6 @@ from deepaccident_devkit.support.pages import document
 from deepaccident_devkit.support.reading import read_bytes
 
 PAGE: Final = "index.html"
-_DPI: Final = 150
 
 
 def save_study(report: StudyReport, counted: Counted, folder: str | os.PathLike[str]) -> Path:
@@ -42,10 +41,10 @@ def save_study(report: StudyReport, counted: Counted, folder: str | os.PathLike[
     write_counts(counted, folder / "counts.json.gz")
     report.to_csv(place_in(folder, "tables", opened=True))
     pictures = place_in(folder, "figures", opened=True)
-    drawn = [(write_report_figure(rows_figure(summary), pictures / "rows.png", dpi=_DPI), "The rows.")]
+    drawn = [(write_report_figure(rows_figure(summary), pictures / "rows.png"), "The rows.")]
     for key in curves_of(summary):
         path = pictures / f"over_{key}.png"
-        drawn.append((write_report_figure(curves_figure(summary, key), path, dpi=_DPI), f"Over {key}."))
+        drawn.append((write_report_figure(curves_figure(summary, key), path), f"Over {key}."))
     write_bytes(folder / "study.json", (report.to_json() + "\n").encode())
     write_bytes(folder / PAGE, study_html(summary, drawn).encode())
     return folder / PAGE

@@ -76,7 +76,7 @@ class TestedOn(_Part, frozen=True, kw_only=True):
         agents: whose samples.
         horizon: seconds before the end from which samples are taken; None for the longest that a row looks ahead.
         where: filters as `--where` takes them: pairs of scenarios stay of which one matches all.
-        cell: metres of a cell of motion labels. Models of the presets `tiny` have 1.
+        cell: metres of a cell of motion labels. Models of the preset `tiny` have 1.
         labels: their protocol. Models of the presets `tiny` have `clean`.
     """
 
@@ -223,8 +223,12 @@ def read_recipe(recipe: str, *, smoke: bool = False) -> Recipe:
         chosen = _merged(told, file.smoke if smoke else {}) | {"name": f"{path.stem}{'-smoke' * smoke}"}
         chosen["rows"] = [row for each in chosen["rows"] for row in _expanded(each)]
         read = as_record({key: each for key, each in chosen.items() if key != "smoke"}, Recipe)
-    _check(path, read)
-    return read
+    beside = {
+        name: {**source, "spec": str(path.parent / source["spec"])}
+        for name, source in read.releases.items()
+        if source.get("spec")
+    }
+    return _checked(path, msgspec.structs.replace(read, releases={**read.releases, **beside}))
 
 
 @contextmanager
@@ -246,8 +250,8 @@ def source_of(source: Mapping[str, Any]) -> SynthConfig | None:
     return None if own else as_record(given, SynthConfig)
 
 
-def _check(path: Path, recipe: Recipe) -> None:
-    """Compare the parts with one another, and with what the devkit has."""
+def _checked(path: Path, recipe: Recipe) -> Recipe:
+    """The recipe, whose parts fit one another, and what the devkit has; raises ConfigError."""
     test, plans, names = recipe.test, recipe.weights, [row.name for row in recipe.rows]
     number, where = ("apa", None) if recipe.headline is None else (recipe.headline.number, recipe.headline.where)
     above = {name: (None, *list(plans)[:place]) for place, name in enumerate(plans)}
@@ -290,6 +294,7 @@ def _check(path: Path, recipe: Recipe) -> None:
     for place, check in checks:
         with at(path, place):
             check()
+    return recipe
 
 
 def _refused(told: str) -> None:
