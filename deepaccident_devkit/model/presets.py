@@ -237,8 +237,8 @@ def tiny_both() -> ModelConfig:
     return replace(
         config,
         pillars=PillarConfig(channels=config.temporal.channels, grid=config.grid),
-        motion=replace(config.motion, decoders="shuffled", upsample=4, samples=0),
-        motion_loss=replace(config.motion_loss, class_weights=(1.0, 2.0)),
+        motion=replace(config.motion, decoders="shuffled", hidden=48, upsample=4, samples=0),
+        motion_loss=MotionLossConfig(offset=0.5, flow=0.5),  # vectors are twice as long in cells of 0.5 m
         labels=replace(config.labels, grid=BevGrid()),
     )
 
