@@ -17,7 +17,7 @@ if not HAS_TORCH:
     if os.environ.get("DEEPACCIDENT_REQUIRE_TORCH"):
         raise pytest.UsageError("DEEPACCIDENT_REQUIRE_TORCH is set, but torch is not installed")
     collect_ignore = [path.name for path in Path(__file__).parent.glob("*.py") if path.name != "test_installed.py"]
-    collect_ignore.append("model")
+    collect_ignore += ["model", "study"]
 
 
 @pytest.fixture(scope="session")

@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.model.checkpoint import read_weights
 from deepaccident_devkit.model.presets import tiny
 from deepaccident_devkit.taxonomy import OWN_ACTOR_ID
 from deepaccident_devkit.v2x import cooperating_agents, visible_instances
@@ -130,35 +129,3 @@ def same_numbers(again: dict[str, Any], told: dict[str, Any]) -> None:
         assert len(row["numbers"]) >= 10
         for key, each in row["numbers"].items():
             assert each == pytest.approx(told[name]["numbers"][key])
-
-
-@pytest.mark.slow
-def test_a_tiny_run_of_all_of_it(
-    scripts: dict[str, ModuleType], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setenv("OMP_NUM_THREADS", "1")
-    study, rows = scripts["study"], scripts["rows"]
-    run = study.Study(folder=tmp_path / "run", protocol=study.SMOKE)
-    study.run(run)
-    summary = json.loads((run.folder / study.SUMMARY).read_text())
-    assert (summary["smoke"], summary["samples"], summary["pairs"]) == (True, 4, 2)
-    found = {name: each["numbers"] for name, each in summary["rows"].items()}
-    assert found["labels, single"]["hidden_foreground"]["value"] == 0
-    assert found["labels, all"]["hidden_foreground"]["value"] == found["labels, all"]["hidden_detected"]["value"] == 1
-    assert found["labels, all"]["iou_100"]["value"] > 90 > found["everything"]["iou_100"]["value"] > 0
-    assert found["nothing"]["false_foreground"]["value"] is None
-    assert scripts["page"].page(summary).count("`all, strangers`") > 3
-    same_numbers(study.summarised(rows.read_counts(run.folder / study.COUNTS), study.SMOKE)["rows"], summary["rows"])
-
-    shipped = read_weights(run.folder / "shipped" / study.WEIGHTS).meta
-    assert shipped["scored"]["scores"] == summary["weights"]["scores"]
-    assert (shipped["made"]["arm"], shipped["made"]["release"]) == (
-        "all",
-        summary["releases"]["training"]["fingerprint"],
-    )
-
-    capsys.readouterr()
-    study.run(run)  # nothing is left to do
-    assert "…" not in capsys.readouterr().out
-    with pytest.raises(SystemExit, match="another protocol"):
-        study.run(study.Study(folder=run.folder, protocol=study.PROTOCOL))
