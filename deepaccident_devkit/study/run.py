@@ -32,6 +32,7 @@ from deepaccident_devkit.support.json_text import as_record
 from deepaccident_devkit.support.reading import file_checksum
 from deepaccident_devkit.support.text import choice, natural_order
 from deepaccident_devkit.synth import make_release
+from deepaccident_devkit.synth.generate import file_text
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -107,7 +108,7 @@ def _release(bench: Bench, name: str, recipe: Recipe, **how: Unpack[Engine]) -> 
         dataset = _opened(source)
         told = {**source, "release": release_note(dataset, _scenarios(dataset))}
     else:
-        told = {**asdict(config), "spec": config.spec and config.spec.read_text(encoding="utf-8")}
+        told = {**asdict(config), "spec": config.spec and file_text(config.spec)}
     cell = bench.cell("release", name, partial(_made, source, how), **told)
     make(cell)
     return cell, _opened(source, cell.folder)

@@ -136,7 +136,7 @@ def _write_or_compare(path: Path, config: SynthConfig) -> None:
 
 
 def _parsed(path: Path) -> dict[str, Any]:
-    text = _text(path)
+    text = file_text(path)
     try:
         there = parsed_json(text.encode())
     except ValueError as error:
@@ -144,7 +144,7 @@ def _parsed(path: Path) -> dict[str, Any]:
     return there if isinstance(there, dict) else {}
 
 
-def _text(path: Path) -> str:
+def file_text(path: Path) -> str:
     """A text file's content; raises ConfigError."""
     try:
         return read_bytes(path, "spec").decode()
@@ -154,7 +154,7 @@ def _text(path: Path) -> str:
 
 def _as_json(config: SynthConfig) -> dict[str, Any]:
     """All that the bytes of a release depend on, as JSON returns it; of the scenario file its text."""
-    text = None if config.spec is None else _text(config.spec)
+    text = None if config.spec is None else file_text(config.spec)
     fields = {"version": __version__, **asdict(config), "image_size": config.pixels, "spec": text}
     as_read: dict[str, Any] = json.loads(json.dumps(fields))
     return as_read
