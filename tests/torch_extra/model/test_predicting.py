@@ -14,7 +14,7 @@ import torch
 from refusals import assert_refused
 from scipy.special import logit
 from torch_extra.model.perfect import perfect_maps
-from torch_extra.model.small_model import small, small_released
+from torch_extra.model.small_model import small, small_both, small_lidar, small_released
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import NotAvailableError
@@ -138,6 +138,17 @@ def test_a_release_without_images_is_refused(
     blind, named = DeepAccident("v1", tmp_path / "blind", verbose=False), ("no images", "unpack", "--sensors cameras")
     assert_refused((lambda: predict(model, blind, moment[:1]), NotAvailableError, named))
     assert predict(model, blind, []) == []
+
+
+def test_a_release_without_point_clouds_is_refused_by_models_that_need_them(
+    model: V2XFormer, release_root: Path, moment: list[str], tmp_path: Path
+) -> None:
+    shutil.copytree(release_root, tmp_path / "flat", ignore=shutil.ignore_patterns(".deepaccident", "lidar01"))
+    flat, named = DeepAccident("v1", tmp_path / "flat", verbose=False), ("no point clouds", "--sensors all")
+    for config in (small_lidar(), small_both()):
+        needs = V2XFormer(config).eval()
+        assert_refused((partial(predict, needs, flat, moment[:1]), NotAvailableError, named))
+    assert len(predict(model, flat, moment[:1])) == 1
 
 
 def test_the_evaluators_take_predictions(
