@@ -73,7 +73,7 @@ def test_all_verbs_have_one_grammar_and_a_help_that_says_everything() -> None:
         if " DATAROOT" in text.splitlines()[0]:
             for name in NOT_OF_ALL.get(words[-1], (*OF_FILES, "--index-dir", "--on-error")):
                 assert f"  {name} " in (options if name in OF_FILES[:2] else advanced), words
-    assert len({words[0] for words, _ in commands(deepaccident) if words}) == 17
+    assert len({words[0] for words, _ in commands(deepaccident) if words}) == 18
 
 
 def test_versions_for_a_report() -> None:

@@ -288,6 +288,17 @@ def test_the_code_on_other_pages_runs(page: str, in_demo: Path) -> None:
     run_page(TOP / page)
 
 
+@pytest.mark.slow
+def test_the_page_of_studies(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Its first command, and its code, which reads what that has written."""
+    monkeypatch.chdir(tmp_path)
+    CliRunner().invoke(deepaccident, ["study", "v2x", "studies", "--smoke"], catch_exceptions=False)
+    run_page(DOCS / "studies.md", "python")
+    assert capsys.readouterr().out == "0.0\n"
+
+
 def test_no_page_has_code_that_no_test_runs() -> None:
     here = Path(__file__).read_text(encoding="utf-8")
     for page in PAGES:
