@@ -73,7 +73,7 @@ def run_study(
         from deepaccident_devkit.model import checked_device
 
         device = checked_device(device)
-    bench = Bench(writable_folder(out).absolute(), device)
+    bench = Bench(writable_folder(out).absolute(), device if recipe.weights else "cpu")
     engine: Any = {**how, "workers": how.get("workers") or (1 if device.startswith("cuda") else os.cpu_count())}
     with bench.store.shared():
         releases = {name: _release(bench, name, recipe, **how) for name in recipe.releases}

@@ -136,7 +136,7 @@ def _headline(headline: Mapping[str, Any], comparisons: Iterable[Mapping[str, An
     found = pair["groups"][where or ALL][number]
     size, said = difference_text(found, number), NUMBERS[number][2]
     told = _WORDS[verdict(found)].format(row=f"`{row}`", less=f"`{less}`", number=said, size=size)
-    among = "" if where is None else f"Among `{where}`: "
+    among = f"Among {f'`{where}`' if where else ALL}: "
     return {**headline, **found, "verdict": verdict(found), "text": f"{among}{told}."}
 
 
