@@ -16,6 +16,8 @@ from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.release import world_from_label_velocity
 from deepaccident_devkit.taxonomy import BEV_CAMERA
 
+pytestmark = pytest.mark.slow
+
 Row = list[str]
 Reader = Callable[[str], Any]
 

@@ -17,6 +17,8 @@ from deepaccident_devkit.evaluation import Accident
 from deepaccident_devkit.evaluation.results import ResultsWriter
 from deepaccident_devkit.splits import save_selection
 
+pytestmark = pytest.mark.slow
+
 PAIRS = 12
 SILENT = re.sub("^.*", "ClearNoon -1 -1 -1 -1 -1 -1 -1 14", META)
 Made = Callable[[Mapping[str, Any], np.random.Generator], float]

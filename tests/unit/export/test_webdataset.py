@@ -21,6 +21,8 @@ from deepaccident_devkit.export.webdataset import JSON_FIELDS, WebDataset
 from deepaccident_devkit.support.json_text import parsed_json
 from deepaccident_devkit.taxonomy import CAMERAS
 
+pytestmark = pytest.mark.slow
+
 FILES = [f"camera_{side}.jpg" for side in ("front", "front_left", "front_right", "back", "back_left", "back_right")]
 FILES += ["lidar.npy", "json"]
 

@@ -19,6 +19,8 @@ from deepaccident_devkit.synth.roads import ROAD_CODES, SIDEWALK
 from deepaccident_devkit.tables import clear_index
 from deepaccident_devkit.taxonomy import AGENTS, BEV_CAMERA
 
+pytestmark = pytest.mark.slow
+
 
 def middles(of: TownMap) -> FloatArray:
     """The middles of a map's cells (H · W, 2)."""

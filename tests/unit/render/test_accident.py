@@ -25,6 +25,8 @@ from deepaccident_devkit.render.video import render_scenario_video
 from deepaccident_devkit.taxonomy import AGENTS, CAMERAS, short_name
 from deepaccident_devkit.v2x.tracks import scenario_tracks
 
+pytestmark = pytest.mark.slow
+
 
 def accident_of(da: DeepAccident) -> Any:
     return next(scenario for scenario in da.scenario if scenario["collision"])
@@ -188,7 +190,6 @@ def test_the_pair_is_seen_up_to_the_impact(da_b: DeepAccident) -> None:
     assert_pair_is_seen(da_b, accident_of(da_b), (0.3, 0.2, 0.1, 0.0))
 
 
-@pytest.mark.slow
 def test_the_pair_of_each_design_is_seen_up_to_the_impact(da_designs: DeepAccident) -> None:
     for scenario in [scenario for scenario in da_designs.scenario if scenario["collision"]]:
         assert_pair_is_seen(da_designs, scenario, (0.4, 0.3, 0.2, 0.1, 0.0))

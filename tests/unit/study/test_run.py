@@ -18,6 +18,8 @@ from deepaccident_devkit.render import style
 from deepaccident_devkit.study import StudyReport, read_counts, read_recipe, run_study, summarised
 from deepaccident_devkit.study.summary import ALL
 
+pytestmark = pytest.mark.slow
+
 Run = Callable[..., StudyReport]
 
 
@@ -163,7 +165,6 @@ def test_rows_that_are_there_are_not_made_again(out: Path, run: Run) -> None:
     assert [*(out / "release").iterdir()] == releases
 
 
-@pytest.mark.slow
 def test_the_same_bits_twice_and_after_a_kill(out: Path, tmp_path: Path) -> None:
     path = written(tmp_path, BASELINES)
     killed(path, tmp_path / "out", "deepaccident_devkit.study.cells", "predictions_of", 2)
@@ -178,7 +179,6 @@ def test_the_same_bits_twice_and_after_a_kill(out: Path, tmp_path: Path) -> None
         assert (tmp_path / "out" / "mine" / name).read_bytes() == (out / "mine" / name).read_bytes()
 
 
-@pytest.mark.slow
 def test_a_release_that_is_there(out: Path, tmp_path: Path) -> None:
     (made,) = {each["key"] for each in summary_of(out)["cells"] if each["kind"] == "release"}
     given = {**BASELINES, "releases": {"test": {"dataroot": str(out / "release" / made)}}}

@@ -27,6 +27,8 @@ from deepaccident_devkit.statistics import dataset_statistics
 from deepaccident_devkit.synth import SynthConfig, make_release
 from deepaccident_devkit.v2x.collisions import default_scenario
 
+pytestmark = pytest.mark.slow
+
 ALARM = Accident(positions=[[5.0, 0.0], [8.0, 0.0]], time=1.0, score=0.5)
 
 
@@ -78,7 +80,6 @@ SAMPLES = 5 * 6
 """Of a scenario: five agents, every half second of 3 s."""
 
 
-@pytest.mark.slow
 def test_it_ends_no_evaluation_of_accidents(unplaced: SimpleNamespace, tmp_path: Path) -> None:
     boxes = run_of(unplaced, tmp_path / "boxes.json", "accident", "boxes").result
     # those from 2 s before the impact on
@@ -87,7 +88,6 @@ def test_it_ends_no_evaluation_of_accidents(unplaced: SimpleNamespace, tmp_path:
     assert run_of(unplaced, tmp_path / "paper.json", "accident", "paper").result.samples == 4 * SAMPLES
 
 
-@pytest.mark.slow
 def test_it_ends_no_evaluation_of_warnings_and_is_no_normal_scenario(unplaced: SimpleNamespace, tmp_path: Path) -> None:
     clean, field = (
         run_of(unplaced, tmp_path / f"{protocol}.json", "warning", protocol) for protocol in ("clean", "field")
@@ -122,7 +122,6 @@ def test_nothing_false_is_said(unplaced: SimpleNamespace) -> None:
     )
 
 
-@pytest.mark.slow
 def test_it_is_a_collision_everywhere(unplaced: SimpleNamespace, request: pytest.FixtureRequest) -> None:
     """Found, counted, skipped by name, shown."""
     dataset, token = unplaced.dataset, unplaced.token
