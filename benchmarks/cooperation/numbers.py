@@ -20,31 +20,12 @@ from deepaccident_devkit.evaluation.intervals import (
     numbers_of,
 )
 from deepaccident_devkit.motion import MotionLabelConfig, motion_labels
+from deepaccident_devkit.study.numbers import LEAST_SCORE, NEAR
+from deepaccident_devkit.study.numbers import NUMBERS as PATHS
 from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray
 from deepaccident_devkit.taxonomy import AGENTS, OWN_ACTOR_ID
 from deepaccident_devkit.v2x.cooperation import seen_actors
 
-NEAR: Final = 2.0
-"""Metres, from a box's centre to an actor's: so near, the actor is detected."""
-LEAST_SCORE: Final = 0.1
-"""Boxes with a lower score are not looked at when hidden actors are counted."""
-PATHS: Final[Mapping[str, tuple[str, str, str]]] = {
-    "iou_30": ("motion", "ranges/30x30/iou", "IoU 30x30 (%)"),
-    "vpq_30": ("motion", "ranges/30x30/pq", "VPQ 30x30 (%)"),
-    "iou_100": ("motion", "ranges/100x100/iou", "IoU 100x100 (%)"),
-    "vpq_100": ("motion", "ranges/100x100/pq", "VPQ 100x100 (%)"),
-    "apa": ("accident", "apa", "APA boxes"),
-    "precision": ("accident", "precision", "precision boxes"),
-    "recall": ("accident", "recall", "recall boxes"),
-    "map": ("detection", "mean_average_precision", "mAP (%)"),
-    "hidden_foreground": ("hidden", "hidden_foreground", "hidden, on the map"),
-    "seen_foreground": ("hidden", "seen_foreground", "seen, on the map"),
-    "false_foreground": ("hidden", "false_foreground", "false share of the map"),
-    "hidden_detected": ("hidden", "hidden_detected", "hidden, detected"),
-    "seen_detected": ("hidden", "seen_detected", "seen, detected"),
-    "false_boxes": ("hidden", "false_boxes", "false boxes a sample"),
-}
-"""Number → the evaluator that has it, its path in the result, and its name in tables."""
 Evaluators = Mapping[str, Evaluator[Any]]
 
 

@@ -222,7 +222,7 @@ def tiny() -> ModelConfig:
         fusion=PoolFusionConfig(),
         bev=BevUNetConfig(),
         one_bev=True,
-        motion=MotionHeadConfig(in_channels=32, latent=8, decoders="shared", upsample=2, detach=False),
+        motion=MotionHeadConfig(in_channels=32, latent=8, decoders="shared", upsample=2),
         motion_loss=MotionLossConfig(class_weights=(1.0, 6.0)),
         detection=DetectionConfig(
             in_channels=32, shared_channels=24, class_slots=ONE_TASK, x=along, y=along, branches="joint", upsample=2
@@ -237,7 +237,7 @@ def tiny_both() -> ModelConfig:
     return replace(
         config,
         pillars=PillarConfig(channels=config.temporal.channels, grid=config.grid),
-        motion=replace(config.motion, decoders="shuffled", hidden=48, upsample=4, samples=0),
+        motion=replace(config.motion, decoders="shuffled", hidden=48, upsample=4, samples=0, detach=False),
         motion_loss=MotionLossConfig(offset=0.5, flow=0.5),  # vectors are twice as long in cells of 0.5 m
         labels=replace(config.labels, grid=BevGrid()),
     )

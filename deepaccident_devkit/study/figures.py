@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 _PANEL: Final = 2.7
 """Inches: the width of a panel."""
 _UNITS: Final = {"latency": "s", "pose_noise": "m", "packet_loss": "share", "budget": "bytes a frame", "horizon": "s"}
-_NOTE: Final = "lines: intervals of 95 % over pairs of scenarios; pale dots: single seeds"
+_NOTE: Final = "lines: intervals of 95 % over pairs; pale dots: seeds"
 
 
 @in_own_settings
@@ -99,5 +99,10 @@ def _draw(
     (ax.vlines if upright else ax.hlines)(at, low, high, color=color, linewidth=1.4)
     ax.plot(*(alone if upright else alone[::-1]), "o", color=SERIES_COLORS[-1], markersize=3, zorder=1.5)
     ax.plot(
-        *((at, values) if upright else (values, at)), "o-" if upright else "o", color=color, label=label, markersize=5
+        *((at, values) if upright else (values, at)),
+        "o-" if upright else "o",
+        color=color,
+        label=label,
+        markersize=5,
+        clip_on=False,  # the whole dot at the end of a range
     )

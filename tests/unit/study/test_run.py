@@ -16,6 +16,7 @@ from deepaccident_devkit.evaluation.runs import SampleSelection, evaluate_result
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 from deepaccident_devkit.render import style
 from deepaccident_devkit.study import StudyReport, read_counts, read_recipe, run_study, summarised
+from deepaccident_devkit.study.figures import rows_figure
 from deepaccident_devkit.study.summary import ALL
 
 pytestmark = pytest.mark.slow
@@ -201,3 +202,8 @@ def test_figures_of_a_paper(run: Run, out: Path) -> None:
     with style("ieee-column"):
         run(name="paper")
     assert (out / "paper" / "figures" / "rows.pdf").read_bytes().startswith(b"%PDF")
+    with style("cvpr-column"):  # the narrowest
+        figure = rows_figure(summary_of(out))
+        figure.draw_without_rendering()
+    drawn = figure.get_tightbbox()
+    assert 0 <= drawn.x0 < drawn.x1 <= figure.get_figwidth()  # nothing is cut off
