@@ -17,6 +17,7 @@ from deepaccident_devkit import DeepAccident
 from deepaccident_devkit._version import __version__
 from deepaccident_devkit.model import PredictConfig, load_model, read_weights
 from deepaccident_devkit.model.checkpoint import write_weights
+from deepaccident_devkit.model.training_run import one_thread
 from deepaccident_devkit.model.training_step import validated
 from deepaccident_devkit.motion import samples
 from deepaccident_devkit.release.layout import write_split_file
@@ -65,8 +66,7 @@ def main(study: Path, name: str, seed: str) -> None:
 
 def scores(path: Path) -> dict[str, float]:
     """What weights score on the release of `SCORED`."""
-    torch.set_num_threads(1)
-    with tempfile.TemporaryDirectory() as folder:
+    with one_thread(), tempfile.TemporaryDirectory() as folder:
         config = {name: tuple(each) if isinstance(each, list) else each for name, each in SCORED.items()}
         release = DeepAccident("v1", make_release(Path(folder) / "release", SynthConfig(**config)), verbose=False)
         split = Path(folder) / "all.txt"

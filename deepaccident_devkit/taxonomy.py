@@ -12,7 +12,9 @@ Layout = Literal["A", "B"]
 ModelPreset = Literal["released", "tiny", "tiny_lidar", "tiny_both"]
 StyleName = Literal["paper", "cvpr-column", "cvpr-page", "ieee-column", "ieee-page", "slide"]
 ModelFusion = Literal["mean", "max", "released", "disconet", "cobevt", "v2xvit"]
-"""Of `deepaccident_devkit.model`; here, so that they can be listed without torch."""
+SHIPPED_WEIGHTS: Final = ("tiny", "tiny_lidar")
+"""Presets of which weights come with the devkit. These three are of `model`; here, so that they can be listed without
+torch."""
 
 AGENTS: Final[tuple[AgentName, ...]] = (
     "ego_vehicle",

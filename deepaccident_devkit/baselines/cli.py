@@ -29,12 +29,11 @@ from deepaccident_devkit.parallel import workers_kept
 from deepaccident_devkit.rooms import need_room
 from deepaccident_devkit.support.files import writable_folder
 from deepaccident_devkit.support.text import choice
-from deepaccident_devkit.taxonomy import VEHICLE_AGENTS
+from deepaccident_devkit.taxonomy import SHIPPED_WEIGHTS, VEHICLE_AGENTS
 from deepaccident_devkit.v2x import Link
 from deepaccident_devkit.v2x.messages import Payload
 
 _ALONE = "single"
-_SHIPPED = "tiny"
 _LINK = ("latency", "pose_noise", "packet_loss", "seed", "budget")
 """Their names as parameters of a verb."""
 _RELEASED_HORIZON = Baseline().horizon
@@ -93,13 +92,14 @@ Examples:
 def predict(model: str, purpose: Any, **options: Any) -> None:
     """Predict a split of the release in DATAROOT.
 
-    MODEL is the folder of a run of `deepaccident train`, a file of weights, or `tiny` for those that the devkit ships.
+    MODEL is the folder of a run of `deepaccident train`, a file of weights, or `tiny` or `tiny_lidar` for those
+    that the devkit ships.
     Or a baseline, which needs no training: `constant_velocity`, `constant_turn_rate` or `standing` say how actors go on
     that some agents see. The files motion/, accident.json, … are what `deepaccident evaluate` takes. The path that a
     baseline plans for a vehicle is its own, if it goes on so.
     """
     if not Path(model).exists():  # before PyTorch is asked for
-        model = choice("MODEL, which is no file and no folder", model, (*MOTION_MODELS, _SHIPPED))
+        model = choice("MODEL, which is no file and no folder", model, (*MOTION_MODELS, *SHIPPED_WEIGHTS))
     if purpose == "all":
         refuse_unused("with --samples all, which are those of all scenarios", "scope")
     seed, link = options["seed"], _link_of(options, "boxes" if model in MOTION_MODELS else "bev")
@@ -157,7 +157,7 @@ def _by_network(model: str, purpose: Any, *, agents: Any, link: Link | None, see
     paths = predict_results(network, dataset, tokens, options["out"], config, progress=True)
     for task, path in paths.items():
         click.echo(f"{task}: {len(tokens):,} samples in {path}")
-    if model == _SHIPPED and "scored" in network.notes:
+    if model in SHIPPED_WEIGHTS and "scored" in network.notes:
         click.echo(scores_text(network, dataset, tokens, paths["motion"]))
 
 

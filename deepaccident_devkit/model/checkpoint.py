@@ -28,13 +28,14 @@ from deepaccident_devkit.support.files import write_bytes
 from deepaccident_devkit.support.json_text import as_record, parsed_json, parsed_record
 from deepaccident_devkit.support.reading import fault_text, read_bytes
 from deepaccident_devkit.support.text import path_of
+from deepaccident_devkit.taxonomy import SHIPPED_WEIGHTS
 
 BEST: Final = "best.safetensors"
 FINAL: Final = "final.safetensors"
 LAST: Final = "last.safetensors"
 """In a run's folder: the weights with the best score; of a run that was not validated, those of the last step; and the
 state from which it goes on."""
-SHIPPED: Final = MappingProxyType({"tiny": Path(__file__).with_name("tiny.safetensors")})
+SHIPPED: Final = MappingProxyType({name: Path(__file__).with_name(f"{name}.safetensors") for name in SHIPPED_WEIGHTS})
 """Weights that come with the devkit, by name; their notes say how they were made, and what they score where."""
 OPTIMIZER: Final = "optimizer."
 """Beginning of the names of the optimizer's tensors in that state."""

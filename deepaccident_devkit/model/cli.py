@@ -63,7 +63,7 @@ Examples:
     "--from",
     "weights",
     type=PATH,
-    help="Run or file of weights to begin from, or `tiny`; or a checkpoint of the release, BEVerse or Swin.",
+    help="Run or file of weights to begin from, `tiny`, `tiny_lidar`, or a checkpoint of the release, BEVerse or Swin.",
 )
 @advanced(
     "--freeze", multiple=True, metavar="NAME", help="Do not train parameters whose names begin so; you can repeat this."
