@@ -214,7 +214,7 @@ def draw_model(release: DeepAccident, out: Path) -> bool:
         need_room("model", "the picture of a model")
         from deepaccident_devkit.model import PredictConfig, load_model, predictions
 
-        model = load_model("tiny")
+        model = load_model("tiny_lidar")
     except (MissingExtraError, MissingRoomError):
         return False
     accident, before = _accident_and_before(release)
