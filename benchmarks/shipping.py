@@ -8,6 +8,7 @@ what it measures, and a test makes the release and scores them again.
 import json
 import sys
 import tempfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -33,7 +34,7 @@ SCORED: Final[dict[str, Any]] = {
     "view": "hidden",
     "designs": [1, 2, 6, 7, 12],
 }
-"""The release of the scores; a test makes it again."""
+"""The release of the scores; a test makes it again. Its scenes are of other designs than those of the training."""
 AGENTS: Final = "all"
 _NOT_SHIPPED: Final = ("num_batches_tracked", "frustum")
 
@@ -59,15 +60,15 @@ def main(study: Path, name: str, seed: str) -> None:
     notes = {each: given.meta[each] for each in ("preset", "fusion", "horizon")} | {"made": made}
     path = HOMES / f"{preset}.safetensors"
     write_weights(path, tensors, notes, half=True)
-    scored = {"agents": AGENTS, "synth": SCORED, "scores": scores(path)}
+    scored = {"agents": AGENTS, "synth": SCORED, "scores": scores(path, SCORED)}
     write_weights(path, tensors, {**notes, "scored": scored}, half=True)
     print(f"{path}: {path.stat().st_size:,} bytes, {scored['scores']}")
 
 
-def scores(path: Path) -> dict[str, float]:
-    """What weights score on the release of `SCORED`."""
+def scores(path: Path, synth: Mapping[str, Any]) -> dict[str, float]:
+    """What weights score on a release, made by the fields of `SynthConfig`."""
     with one_thread(), tempfile.TemporaryDirectory() as folder:
-        config = {name: tuple(each) if isinstance(each, list) else each for name, each in SCORED.items()}
+        config = {name: tuple(each) if isinstance(each, list) else each for name, each in synth.items()}
         release = DeepAccident("v1", make_release(Path(folder) / "release", SynthConfig(**config)), verbose=False)
         split = Path(folder) / "all.txt"
         write_split_file(split, [record["token"] for record in release.scenario])

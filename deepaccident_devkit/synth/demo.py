@@ -30,7 +30,7 @@ from deepaccident_devkit.evaluation.task import headlines
 from deepaccident_devkit.geometry import SE3
 from deepaccident_devkit.motion import MotionLabelConfig, motion_labels
 from deepaccident_devkit.render import detached_figure, render_replay
-from deepaccident_devkit.render.boxes import collider_ids, draw_boxes_from_above, recorders_of, write_beside
+from deepaccident_devkit.render.boxes import draw_boxes_from_above, recorders_of, write_beside
 from deepaccident_devkit.render.evaluation import draw_motion_outcome, save_report
 from deepaccident_devkit.render.figures import save_picture
 from deepaccident_devkit.render.ground import draw_underlay
@@ -201,7 +201,7 @@ def draw_accident(release: DeepAccident, out: Path) -> None:
 
 
 def draw_model(release: DeepAccident, out: Path) -> bool:
-    """Render what the shipped model foresees a second before, by ego's cameras and by all agents', beside the truth.
+    """Render what the shipped model foresees a second before, by ego's LiDAR and by all agents', beside the truth.
 
     Beneath is the road, and above it the pair as it truly is at each of the two moments.
 
@@ -229,16 +229,16 @@ def draw_model(release: DeepAccident, out: Path) -> bool:
             draw_motion_outcome(found.motion, label, frame=frame, ax=ax)
             ax.set(xlim=(-_REACH, _REACH), ylim=(-_REACH, _REACH), title=f"{title}: {ax.get_title()}")
             draw_underlay(road, ax, target_from_ego=SE3.identity(), view_range=_REACH)
-            _draw_pair(release, token, moment, ax)
+            _draw_pair(release, accident, token, moment, ax)
     save_picture(fig, out / MODEL_PICTURE, dpi=80)
     return True
 
 
-def _draw_pair(release: DeepAccident, sample: str, moment: int, ax: Any) -> None:
-    """Render the true outlines of a sample's colliding pair at a frame, in the sample's ego frame, with names."""
-    scenario, _, _ = sample.rsplit("/", 2)
+def _draw_pair(release: DeepAccident, accident: ScenarioRecord, sample: str, moment: int, ax: Any) -> None:
+    """Render the true outlines of an accident's pair at a frame, in the ego frame of a sample, with names."""
+    scenario, collision = accident["token"], accident["collision"]
     boxes = scenario_tracks(release, scenario).at(moment)
-    boxes = boxes.select(np.isin(boxes.actor_id, [*collider_ids(release, sample)]))
+    boxes = boxes.select(np.isin(boxes.actor_id, collision["ids"] if collision else []))
     boxes = boxes.transform(release.world_from(sample, "ego").inverse(), "ego")
     draw_boxes_from_above(boxes, ax, [COLLIDER_COLOR] * len(boxes), fill=0, linewidths=2)
     recorders = recorders_of(release, scenario)
