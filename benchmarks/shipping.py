@@ -26,16 +26,18 @@ from deepaccident_devkit.synth import SynthConfig, make_release
 
 HOMES: Final = Path(__file__).parents[1] / "deepaccident_devkit" / "model"
 SCORED: Final[dict[str, Any]] = {
-    "scenarios": 2,
-    "frames": 40,
-    "image_size": [160, 90],
-    "seed": 208,
-    "sensor_step": 5,
-    "view": "hidden",
-    "designs": [1, 2, 6, 7, 12],
+    "agents": "all",
+    "synth": {
+        "scenarios": 2,
+        "frames": 40,
+        "image_size": [160, 90],
+        "seed": 208,
+        "sensor_step": 5,
+        "view": "hidden",
+        "designs": [1, 2, 6, 7, 12],
+    },
 }
-"""The release of the scores; a test makes it again. Its scenes are of other designs than those of the training."""
-AGENTS: Final = "all"
+"""Who cooperates for the scores, and on which release, of other designs than the training's; a test makes it again."""
 _NOT_SHIPPED: Final = ("num_batches_tracked", "frustum")
 
 
@@ -60,19 +62,20 @@ def main(study: Path, name: str, seed: str) -> None:
     notes = {each: given.meta[each] for each in ("preset", "fusion", "horizon")} | {"made": made}
     path = HOMES / f"{preset}.safetensors"
     write_weights(path, tensors, notes, half=True)
-    scored = {"agents": AGENTS, "synth": SCORED, "scores": scores(path, SCORED)}
-    write_weights(path, tensors, {**notes, "scored": scored}, half=True)
-    print(f"{path}: {path.stat().st_size:,} bytes, {scored['scores']}")
+    found = scores(path, SCORED)
+    write_weights(path, tensors, {**notes, "scored": {**SCORED, "scores": found}}, half=True)
+    print(f"{path}: {path.stat().st_size:,} bytes, {found}")
 
 
-def scores(path: Path, synth: Mapping[str, Any]) -> dict[str, float]:
-    """What weights score on a release, made by the fields of `SynthConfig`."""
+def scores(path: Path, scored: Mapping[str, Any]) -> dict[str, float]:
+    """What weights score with some agents on a release, as `SCORED` says both."""
     with one_thread(), tempfile.TemporaryDirectory() as folder:
-        config = {name: tuple(each) if isinstance(each, list) else each for name, each in synth.items()}
-        release = DeepAccident("v1", make_release(Path(folder) / "release", SynthConfig(**config)), verbose=False)
+        synth = {name: tuple(each) if isinstance(each, list) else each for name, each in scored["synth"].items()}
+        release = DeepAccident("v1", make_release(Path(folder) / "release", SynthConfig(**synth)), verbose=False)
         split = Path(folder) / "all.txt"
         write_split_file(split, [record["token"] for record in release.scenario])
-        return validated(load_model(path), release, samples(release, split, "all"), PredictConfig(agents=AGENTS))
+        config = PredictConfig(agents=scored["agents"])
+        return validated(load_model(path), release, samples(release, split, "all"), config)
 
 
 if __name__ == "__main__":

@@ -92,11 +92,10 @@ Examples:
 def predict(model: str, purpose: Any, **options: Any) -> None:
     """Predict a split of the release in DATAROOT.
 
-    MODEL is the folder of a run of `deepaccident train`, a file of weights, or `tiny` or `tiny_lidar` for those
-    that the devkit ships.
-    Or a baseline, which needs no training: `constant_velocity`, `constant_turn_rate` or `standing` say how actors go on
-    that some agents see. The files motion/, accident.json, … are what `deepaccident evaluate` takes. The path that a
-    baseline plans for a vehicle is its own, if it goes on so.
+    MODEL is the folder of a run of `deepaccident train`, a file of weights, or `tiny` or `tiny_lidar`, which the devkit
+    ships. Or a baseline, which needs no training: `constant_velocity`, `constant_turn_rate` or `standing` say how
+    actors go on that some agents see. The files motion/, accident.json, … are what `deepaccident evaluate` takes. The
+    path that a baseline plans for a vehicle is its own, if it goes on so.
     """
     if not Path(model).exists():  # before PyTorch is asked for
         model = choice("MODEL, which is no file and no folder", model, (*MOTION_MODELS, *SHIPPED_WEIGHTS))

@@ -1,6 +1,7 @@
 """The weights that come with the devkit: their size and notes, what they score, and where they are used."""
 
 import importlib
+import json
 from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
@@ -22,9 +23,16 @@ demo: Any = importlib.import_module("deepaccident_devkit.synth.demo")
 def test_they_are_small_halves_with_their_provenance(name: str) -> None:
     weights = read_weights(name)
     assert (weights.path, {each.dtype for each in weights.tensors.values()}) == (SHIPPED[name], {torch.float16})
-    assert weights.path.stat().st_size < 2e6
+    assert weights.path.stat().st_size < 1.3e6
     made = weights.meta["made"]
     assert (weights.meta["preset"], made["seed"], len(made["release"]) > 10) == (name, 1, True)
+
+
+def test_those_of_the_study_on_cooperation_have_its_scores() -> None:
+    study = Path(__file__).parents[3] / "benchmarks" / "cooperation" / "study.json"
+    told = read_weights("tiny").meta
+    assert told["made"]["seed"] == told["made"]["protocol"]["seeds"][0]
+    assert json.loads(study.read_text())["weights"]["scores"] == told["scored"]["scores"]
 
 
 @pytest.mark.slow
@@ -35,7 +43,7 @@ def test_they_score_what_their_notes_say(name: str, monkeypatch: pytest.MonkeyPa
     from benchmarks.shipping import scores
 
     told = read_weights(name).meta["scored"]
-    assert scores(SHIPPED[name], told["synth"]) == pytest.approx(told["scores"], abs=0.01)
+    assert scores(SHIPPED[name], told) == pytest.approx(told["scores"], abs=0.01)
     assert told["scores"]["iou"] > 0.1
 
 
