@@ -229,12 +229,13 @@ class Turn:
         return True
 
     def _is_there(self) -> bool:
-        """Whether the lock that is held is the one that others find by its name."""
+        """Whether the locks that are open are those that others find by their names."""
         try:
-            found, held = (self._store.folder / _LOCKS[0]).lstat(), os.fstat(self._lock)
+            found = [(self._store.folder / name).lstat() for name in _LOCKS]
+            held = [os.fstat(file) for file in (self._lock, self._making)]
         except OSError:
             return False
-        return (found.st_dev, found.st_ino) == (held.st_dev, held.st_ino)
+        return [(each.st_dev, each.st_ino) for each in found] == [(each.st_dev, each.st_ino) for each in held]
 
 
 @dataclass(frozen=True, slots=True)

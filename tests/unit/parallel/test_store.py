@@ -56,6 +56,17 @@ def test_one_goes_on_where_another_is_killed(tmp_path: Path) -> None:
     assert (tmp_path / "out").read_bytes() == WHOLE
 
 
+@pytest.mark.parametrize("removed", [".lock", ".making"])
+def test_who_holds_a_lock_that_is_gone_does_not_finish(tmp_path: Path, removed: str) -> None:
+    """Whoever comes next makes a new file of that name, and both would be alone."""
+    store = store_in(tmp_path)
+    with store.shared() as turn:
+        (store.folder / removed).unlink()
+        with store.shared() as another:
+            assert not turn.alone(wait=False)
+            assert another.alone(wait=False)
+
+
 def test_other_settings_are_made_again(tmp_path: Path) -> None:
     store, items = store_in(tmp_path), dict(zip(ITEMS, ITEMS, strict=True))
     (tmp_path / "marks").mkdir()
