@@ -193,11 +193,10 @@ def released() -> ModelConfig:
 
 
 def tiny() -> ModelConfig:
-    """Half a million parameters, 160 × 90 pixels, 100 × 100 cells of 1 m, labels `clean`, none of the quirks.
+    """Images of 160 × 90 pixels, features in cells of 1 m, labels `clean` of 0.5 m; none of the quirks.
 
-    Only points near the road count, and a cell has their mean, so that depths need not be learned from nothing.
-    Thresholds of the metrics are counted in cells, and so are twice as long in metres as the released ones: its numbers
-    (docs/model.md) never stand beside those of the released grid.
+    Only points near the road count, and a cell has their mean, so that depths need not be learned from nothing. The
+    decoders have channels for the finer cells of the labels, in place of finer maps. docs/model.md has its numbers.
     """
     along = (-50.0, 50.0, 1.0)
     return ModelConfig(
@@ -222,25 +221,21 @@ def tiny() -> ModelConfig:
         fusion=PoolFusionConfig(),
         bev=BevUNetConfig(),
         one_bev=True,
-        motion=MotionHeadConfig(in_channels=32, latent=8, decoders="shared", upsample=2),
-        motion_loss=MotionLossConfig(class_weights=(1.0, 6.0)),
+        motion=MotionHeadConfig(
+            in_channels=32, latent=8, decoders="shuffled", hidden=48, upsample=4, samples=0, detach=False
+        ),
+        motion_loss=MotionLossConfig(offset=0.5, flow=0.5),  # vectors count cells of half a metre
         detection=DetectionConfig(
             in_channels=32, shared_channels=24, class_slots=ONE_TASK, x=along, y=along, branches="joint", upsample=2
         ),
-        labels=MotionLabelConfig(grid=BevGrid(x=along, y=along), receptive_field=2, protocol="clean"),
+        labels=MotionLabelConfig(grid=BevGrid(), receptive_field=2, protocol="clean"),
     )
 
 
 def tiny_both() -> ModelConfig:
     """`tiny`, which also sees with LiDARs."""
     config = tiny()
-    return replace(
-        config,
-        pillars=PillarConfig(channels=config.temporal.channels, grid=config.grid),
-        motion=replace(config.motion, decoders="shuffled", hidden=48, upsample=4, samples=0, detach=False),
-        motion_loss=MotionLossConfig(offset=0.5, flow=0.5),  # vectors are twice as long in cells of 0.5 m
-        labels=replace(config.labels, grid=BevGrid()),
-    )
+    return replace(config, pillars=PillarConfig(channels=config.temporal.channels, grid=config.grid))
 
 
 def tiny_lidar() -> ModelConfig:

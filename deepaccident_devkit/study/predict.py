@@ -78,11 +78,10 @@ def _by_model(
     from deepaccident_devkit.model.training_run import one_thread
 
     model = load_model(weights).to(device).eval()
-    cell = model.config.labels.grid.x[2]
-    if model.config.labels.grid != labels.grid or model.config.labels_protocol != labels.protocol:
+    learned = model.config.labels_protocol
+    if learned != labels.protocol:
         raise ConfigError(
-            f"{weights}: was trained with cells of {cell:g} m and the labels {model.config.labels_protocol}; give "
-            f"`cell: {cell:g}` and `labels: {model.config.labels_protocol}` in the recipe's `test`"
+            f"{weights}: was trained with the labels {learned}; give `labels: {learned}` in the recipe's `test`"
         )
     config = PredictConfig(agents=row.cooperating, link=row.link, device=device)
     if row.control is None:

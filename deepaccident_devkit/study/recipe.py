@@ -23,7 +23,6 @@ from deepaccident_devkit.errors import ConfigError, DeepAccidentError
 from deepaccident_devkit.evaluation.breakdowns import attribute_name
 from deepaccident_devkit.evaluation.runs import SampleSelection
 from deepaccident_devkit.evaluation.runs.setups import SampleList, ScopeName
-from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.motion import MotionLabelConfig
 from deepaccident_devkit.selection.conditions import parse_where
 from deepaccident_devkit.study.numbers import NUMBERS
@@ -76,8 +75,7 @@ class TestedOn(_Part, frozen=True, kw_only=True):
         agents: whose samples.
         horizon: seconds before the end from which samples are taken; None for the longest that a row looks ahead.
         where: filters as `--where` takes them: pairs of scenarios stay of which one matches all.
-        cell: metres of a cell of motion labels. Models of the preset `tiny` have 1.
-        labels: their protocol. Models of the presets `tiny` have `clean`.
+        labels: the protocol of motion labels. Models of the presets `tiny` have `clean`.
     """
 
     release: str
@@ -87,13 +85,12 @@ class TestedOn(_Part, frozen=True, kw_only=True):
     agents: tuple[str, ...] = ("ego_vehicle",)
     horizon: float | None = None
     where: tuple[str, ...] = ()
-    cell: float = 0.5
     labels: str = "released"
 
     def label_config(self, horizon: float | None) -> MotionLabelConfig:
         """The labels that look so many seconds ahead; raises ConfigError or ChoiceError."""
-        frames, along = len(path_times(horizon or DEFAULT_HORIZON)), (-50.0, 50.0, self.cell)
-        return MotionLabelConfig(grid=BevGrid(x=along, y=along), future_frames=frames, protocol=self.labels)
+        frames = len(path_times(horizon or DEFAULT_HORIZON))
+        return MotionLabelConfig(future_frames=frames, protocol=self.labels)
 
 
 class Row(_Part, frozen=True, kw_only=True):

@@ -224,7 +224,7 @@ def _rows(
                     device=bench.device,
                 ),
                 **decides,
-                labels=[test.labels, test.cell, horizons[row.name]],
+                labels=[test.labels, horizons[row.name]],
                 samples={**selection.as_dict(), "split": Path(selection.split).name},
                 release=cell.key,
                 trained=None if of is None else of.key,

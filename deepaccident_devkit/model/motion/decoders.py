@@ -215,25 +215,19 @@ class SeparateDecoders(nn.ModuleDict):
         return MotionMaps(**{name: decoder(states) for name, decoder in self.items()})
 
 
-class SharedDecoder(nn.Module):
-    """Our small decoder: all maps from the same few channels, brought to a finer grid."""
+class ShuffledDecoder(nn.Module):
+    """Our small decoder: all maps from the same few channels; each finer cell has channels of its own."""
 
-    def __init__(self, channels: int, hidden: int, upsample: int, *, shuffled: bool = False) -> None:
+    def __init__(self, channels: int, hidden: int, upsample: int) -> None:
         """Make the layers: `hidden` channels after the 3 × 3 convolution, `upsample` cells of maps to one of states."""
         super().__init__()
-        self._upsample, self._shuffled = upsample, shuffled
-        copies = upsample**2 if shuffled else 1
-        first = copies * _CHANNELS["segmentation"]
-        self.layers = _decoder(channels, hidden, copies * sum(_CHANNELS.values()), rare=slice(first, first + copies))
+        self._upsample, cells = upsample, upsample**2
+        first = cells * _CHANNELS["segmentation"]
+        self.layers = _decoder(channels, hidden, cells * sum(_CHANNELS.values()), rare=slice(first, first + cells))
 
     def forward(self, states: Tensor) -> MotionMaps:
         """Decode states (M, C, H, W) to maps (M, …, H', W') on the finer grid."""
-        maps = self.layers(states)
-        if self._shuffled:
-            maps = functional.pixel_shuffle(maps, self._upsample)
-        elif self._upsample > 1:
-            # after the 1 × 1 convolution: the same values as before it, from fewer channels
-            maps = functional.interpolate(maps, scale_factor=self._upsample, mode="bilinear", align_corners=False)
+        maps = functional.pixel_shuffle(self.layers(states), self._upsample)
         return MotionMaps(*maps.split(list(_CHANNELS.values()), dim=1))
 
 

@@ -18,7 +18,7 @@ from deepaccident_devkit.model.motion.decoders import (
     LatentDistribution,
     MotionMaps,
     SeparateDecoders,
-    SharedDecoder,
+    ShuffledDecoder,
     SpatialDistribution,
 )
 from deepaccident_devkit.model.warps import precise
@@ -31,7 +31,7 @@ LABEL_CHANNELS: Final = 6
 """Of a frame's maps as the posterior sees them: segmentation, centerness, offset and flow."""
 PosteriorIgnore = Literal["keep", "zero"]
 POSTERIOR_IGNORES: Final[tuple[PosteriorIgnore, ...]] = ("keep", "zero")
-Decoders = Literal["separate", "shared", "shuffled"]
+Decoders = Literal["separate", "shuffled"]
 _CLIP: Final = 1e-4
 """Probabilities of a centre stay so far from 0 and 1."""
 
@@ -98,9 +98,9 @@ class MotionHeadConfig:
         future_frames: frames after the present.
         samples: random draws of a prediction; the mean comes on top.
         log_sigma: the smallest and the largest logarithm of a standard deviation.
-        decoders: `separate` convolutions for each map, as released, or `shared` ones, whose maps are brought to the
-            finer grid by bilinear interpolation, or `shuffled`: each finer cell has channels of its own.
-        hidden: channels of the shared decoder; the separate ones have `in_channels`.
+        decoders: `separate` convolutions for each map, as released, or `shuffled`: one decoder for all maps, in which
+            each finer cell has channels of its own.
+        hidden: channels of the one decoder; the separate ones have `in_channels`.
         upsample: how many cells of the maps and labels lie along a cell of the features; 1 if separate.
         posterior_ignore: what the posterior sees where offset and flow are ignored: the mark 255 as released (`keep`),
             or `zero`.
@@ -132,7 +132,7 @@ class MotionHeadConfig:
         if self.decoders == "separate" and self.upsample != 1:
             raise ConfigError(
                 f"upsample: separate decoders keep the states' resolution, found {self.upsample!r}; choose 1, or "
-                "decoders='shared'"
+                "decoders='shuffled'"
             )
 
 
@@ -162,7 +162,7 @@ class MotionHead(nn.Module):
         self.task_heads: nn.Module = (
             SeparateDecoders(channels)
             if config.decoders == "separate"
-            else SharedDecoder(channels, config.hidden, config.upsample, shuffled=config.decoders == "shuffled")
+            else ShuffledDecoder(channels, config.hidden, config.upsample)
         )
         self.present_distribution, self.future_distribution = (
             SpatialDistribution(inputs, inputs // 2, config.latent, config.log_sigma)

@@ -56,7 +56,7 @@ def small() -> ModelConfig:
         ),
         temporal=replace(tiny.temporal, channels=8, grid=BevGrid(x=ALONG, y=ALONG)),
         bev=BevUNetConfig(in_channels=8, out_channels=16, widths=(16, 16)),
-        motion=replace(tiny.motion, in_channels=16, latent=4, future_frames=2, hidden=8, samples=2),
+        motion=replace(tiny.motion, in_channels=16, latent=4, future_frames=2, hidden=8, upsample=2, samples=2),
         detection=replace(tiny.detection, in_channels=16, shared_channels=8, x=ALONG, y=ALONG),
         labels=replace(tiny.labels, grid=BevGrid(x=ALONG, y=ALONG), step=1, future_frames=2),
     )

@@ -20,12 +20,12 @@ from deepaccident_devkit.model.motion import (
     frame_mask,
     motion_losses,
 )
-from deepaccident_devkit.model.motion.decoders import FlowGru, SharedDecoder, warp_with_flow
+from deepaccident_devkit.model.motion.decoders import FlowGru, ShuffledDecoder, warp_with_flow
 from deepaccident_devkit.model.motion.head import center_loss, vector_loss
 
 # eight channels: a bottleneck of one channel of 3 × 3 cells can pass back a gradient of exactly 0
 SEPARATE = MotionHeadConfig(in_channels=8, latent=2, future_frames=2, samples=3)
-SHARED = dataclasses.replace(SEPARATE, decoders="shared", hidden=6, upsample=2)
+SHUFFLED = dataclasses.replace(SEPARATE, decoders="shuffled", hidden=6, upsample=2)
 LOSSES = MotionLossConfig()
 ROWS, COLUMNS = 10, 12
 CHANNELS = {"segmentation": 2, "instance_center": 1, "instance_offset": 2, "instance_flow": 2}
@@ -36,7 +36,7 @@ def _seeded() -> None:
     torch.manual_seed(0)
 
 
-@pytest.mark.parametrize("config", [SEPARATE, SHARED])
+@pytest.mark.parametrize("config", [SEPARATE, SHUFFLED])
 def test_shapes_with_and_without_targets(config) -> None:
     head, features, targets = head_and_data(config)
     size = (config.upsample * ROWS, config.upsample * COLUMNS)
@@ -48,7 +48,7 @@ def test_shapes_with_and_without_targets(config) -> None:
     assert predicted.future is None
 
 
-@pytest.mark.parametrize("config", [SEPARATE, SHARED])
+@pytest.mark.parametrize("config", [SEPARATE, SHUFFLED])
 @pytest.mark.parametrize("hidden_warp", ["none", "warped"])
 @pytest.mark.parametrize("detach", [True, False])
 def test_every_weight_learns(config, hidden_warp, detach) -> None:
@@ -69,9 +69,9 @@ def test_a_generator_repeats_the_draws() -> None:
 
 
 def test_the_mean_is_the_last_prediction_and_needs_no_draws() -> None:
-    head, features, _ = head_and_data(SHARED)
+    head, features, _ = head_and_data(SHUFFLED)
     drawn = head.eval()(features).maps
-    head.config = dataclasses.replace(SHARED, samples=0)
+    head.config = dataclasses.replace(SHUFFLED, samples=0)
     assert same([each[-1:] for each in drawn], list(head(features).maps))
     assert not torch.equal(drawn.instance_center[0], drawn.instance_center[-1])
 
@@ -84,7 +84,7 @@ def test_noise_decides_the_draws_of_the_future() -> None:
     assert torch.equal(draws[1][:, 0], mean[:, 0])  # the present
 
 
-@pytest.mark.parametrize("config", [SEPARATE, SHARED])
+@pytest.mark.parametrize("config", [SEPARATE, SHUFFLED])
 def test_at_first_one_cell_in_ten_is_a_centre(config) -> None:
     head, features, targets = head_and_data(config)
     assert 0.03 < head(features * 0, targets).maps.instance_center.sigmoid().mean().item() < 0.3
@@ -110,7 +110,7 @@ def test_the_posterior_sees_the_mark_of_ignored_cells_only_where_it_is_kept(post
 
 
 def test_the_posterior_sees_every_second_label_cell_if_maps_are_twice_as_fine() -> None:
-    _, _, targets = head_and_data(SHARED)
+    _, _, targets = head_and_data(SHUFFLED)
     parts = (targets.segmentation[:, :, None].float(), targets.centerness, targets.offset, targets.flow)
     seen = targets.posterior_input(stride=2, ignore="keep", ignore_index=255).unflatten(1, (2, 6))
     assert torch.equal(seen, torch.cat(parts, dim=2)[:, 1:, :, ::2, ::2])
@@ -143,15 +143,9 @@ def test_gradients_pass_from_frame_to_frame_only_if_not_detached(detach) -> None
     assert (state.grad is None or not state.grad.any()) is detach
 
 
-def test_the_shared_decoder_may_project_before_it_upsamples() -> None:
-    decoder, states = SharedDecoder(4, 6, 2).eval(), torch.rand(3, 4, 5, 6)
-    finer = nn.functional.interpolate(decoder.layers[:-1](states), scale_factor=2, mode="bilinear", align_corners=False)
-    torch.testing.assert_close(torch.cat(decoder(states), dim=1), decoder.layers[-1](finer))
-
-
 def test_a_shuffled_decoder_has_channels_for_each_finer_cell() -> None:
     """So that neighbours may differ; centres are as rare at first as with the others."""
-    decoder, states = SharedDecoder(4, 6, 2, shuffled=True).eval(), torch.zeros(3, 4, 5, 6)
+    decoder, states = ShuffledDecoder(4, 6, 2).eval(), torch.zeros(3, 4, 5, 6)
     with torch.no_grad():
         maps = decoder(states)
         assert [tuple(each.shape) for each in maps] == [(3, count, 10, 12) for count in (2, 1, 2, 2)]
@@ -175,7 +169,7 @@ def test_frames_that_do_not_count_change_no_loss() -> None:
 
 
 def test_a_batch_without_a_frame_that_counts_gives_zero_gradients() -> None:
-    head, features, targets = head_and_data(SHARED)
+    head, features, targets = head_and_data(SHUFFLED)
     nothing = targets._replace(frame_mask=torch.zeros_like(targets.frame_mask))
     losses = motion_losses(head(features.requires_grad_(), nothing), nothing, LOSSES)
     names = ["motion_seg", "motion_centerness", "motion_offset", "motion_flow", "motion_prob"]
@@ -218,7 +212,7 @@ def test_a_sample_without_its_past_has_no_frame_that_counts() -> None:
 
 
 def test_what_does_not_fit_is_refused() -> None:
-    head, features, targets = head_and_data(SHARED)
+    head, features, targets = head_and_data(SHUFFLED)
     assert_refused(
         (
             lambda: head(features[..., :5, :5], targets),
@@ -248,7 +242,7 @@ def test_what_does_not_fit_is_refused() -> None:
     [
         (MotionHeadConfig, {"hidden_warp": "moved"}, "hidden_warp: expected one of none, warped, found 'moved'"),
         (MotionHeadConfig, {"posterior_ignore": "drop"}, "posterior_ignore: expected one of keep, zero, found 'drop'"),
-        (MotionHeadConfig, {"decoders": "none"}, "decoders: expected one of separate, shared, shuffled, found 'none'"),
+        (MotionHeadConfig, {"decoders": "none"}, "decoders: expected one of separate, shuffled, found 'none'"),
         (MotionHeadConfig, {"latent": 0}, "latent: expected a number from 1, found 0"),
         (MotionHeadConfig, {"log_sigma": (5, -5)}, r"smaller limit first, such as \(-5, 5\), found \(5, -5\)"),
         (MotionHeadConfig, {"upsample": 2}, "separate decoders keep the states' resolution, found 2; choose 1, or"),

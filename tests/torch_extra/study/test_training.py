@@ -32,7 +32,7 @@ MODELS: dict[str, Any] = {
         "given": {"file": "tiny"},
         "near": {**TRAINED, "horizon": 0.5, "steps": 1},
     },
-    "test": {"release": "test", "cell": 1.0, "labels": "clean", "horizon": 0.5},
+    "test": {"release": "test", "labels": "clean", "horizon": 0.5},
     "headline": {"row": "all", "less": "single", "number": "iou_100"},
     "rows": [
         {"name": "{agents}", "weights": "trunk", "agents": ["single", "all"]},
@@ -180,7 +180,7 @@ def test_a_row_predicts_as_the_model_does(da: DeepAccident) -> None:
     assert motion.heads is not None
     assert expected.motion.heads is not None
     assert (motion.heads[-1].centerness == expected.motion.heads[-1].centerness).all()
-    with pytest.raises(ConfigError, match="was trained with cells of 1 m and the labels clean; give `cell: 1` and"):
+    with pytest.raises(ConfigError, match="was trained with the labels clean; give `labels: clean` in"):
         [*predictions_of(Row(name="all", weights="a"), shipped, "cpu", da, tokens, MotionLabelConfig())]
 
 
