@@ -1,10 +1,118 @@
-"""The page of the model, from the numbers of the study on cooperation."""
+"""The tables of studies, from what benchmarks/studies keeps of them: `python docs/make_tables.py model`.
 
+`python -m benchmarks.pages.model STUDIES/NAME…` keeps what a study's folder has.
+"""
+
+import gzip
+import json
+import sys
+from collections.abc import Iterable, Mapping
 from pathlib import Path
+from textwrap import fill
+from typing import Any, Final
 
-from benchmarks.cooperation import page
+from benchmarks.pages.marks import TOP, put, table
+from deepaccident_devkit.study.numbers import NUMBERS, verdict
+from deepaccident_devkit.study.recipe import SHIPPED
+from deepaccident_devkit.study.summary import ALL, difference_text, number_with_interval
+
+KEPT: Final = TOP / "benchmarks" / "studies"
+SHOWN: Final = ("apa", "iou_100", "vpq_100", "map", "hidden_foreground", "false_foreground")
+"""Numbers of the tables; the kept files have all."""
+OUTCOMES: Final = {"wins": "more", "loses": "less", "not decided": "not decided"}
+Summary = Mapping[str, Any]
+
+
+def keep(folder: Path) -> Path:
+    """Keep all numbers that came out of a study, without the paths of the machine."""
+    summary = json.loads((folder / "study.json").read_text(encoding="utf-8").replace(f"{SHIPPED}/", ""))
+    path = KEPT / f"{summary['recipe']['name']}.json.gz"
+    path.write_bytes(gzip.compress(json.dumps(summary, separators=(",", ":")).encode(), mtime=0))
+    return path
+
+
+def kept() -> dict[str, Summary]:
+    """The studies that are kept, by their names, in the order of the issue's tables."""
+    return {path.name.split(".")[0]: json.loads(gzip.decompress(path.read_bytes())) for path in KEPT.glob("*.json.gz")}
+
+
+def rows_table(summary: Summary, group: str) -> str:
+    """All rows at the samples of a group."""
+    rows = [
+        (f"`{name}`", *(number_with_interval(each["groups"][group][number], number) for number in SHOWN))
+        for name, each in summary["rows"].items()
+    ]
+    return table(("row", *(NUMBERS[number][2] for number in SHOWN)), rows)
+
+
+def differences_table(summary: Summary) -> str:
+    """The comparisons, at all samples and at those of the groups of pairs, with each seed's."""
+    named = [ALL, *summary["recipe"]["groups"]]
+    rows = [
+        (
+            f"`{each['row']}` less `{each['less']}`",
+            group,
+            NUMBERS[number][2],
+            difference_text(found, number),
+            ", ".join(difference_text({"value": one, "low": None}, number) for one in found["seeds"].values()),
+            OUTCOMES[verdict(found)],
+        )
+        for each in summary["comparisons"]
+        for group in named
+        for number in SHOWN[:3]
+        for found in [each["groups"][group][number]]
+    ]
+    return table(("difference", "among", "number", "value", "of each seed", "verdict"), rows)
+
+
+def made_text(summary: Summary) -> str:
+    """How a study was made."""
+    tested, cells = summary["groups"][ALL], summary["cells"]
+    hours = {kind: sum(each["seconds"] for each in cells if each["kind"] == kind) / 3600 for kind in CELLS}
+    spent = ", ".join(f"{CELLS[kind]} {each:.1f}" for kind, each in hours.items() if each)
+    seeds = sorted({seed for each in summary["rows"].values() for seed in each["groups"][ALL]["apa"]["seeds"]})
+    told = f"seeds {', '.join(seeds)}; " if seeds else ""
+    return (
+        f"{tested['samples']:,} samples of {tested['pairs']:,} pairs of an accident and its twin; {told}hours of one "
+        f"process: {spent}."
+    )
+
+
+CELLS: Final = {"release": "releases", "weights": "training", "row": "prediction and evaluation"}
+
+
+def study_text(name: str, summary: Summary) -> str:
+    """A study's section."""
+    groups = [ALL, *summary["recipe"]["groups"]]
+    paragraphs = [
+        f"## {summary['title']}",
+        wrapped(f"{summary['question']} `deepaccident study {name} studies`: {made_text(summary)}"),
+        *(wrapped(f"**{summary['headline']['text']}**") for _ in [0] if summary["headline"]),
+    ]
+    for group in groups:
+        pairs = summary["groups"][group]["pairs"]
+        paragraphs += [f"{group.capitalize()}, {pairs:,} pairs:", rows_table(summary, group)]
+    return "\n\n".join([*paragraphs, "Differences:", differences_table(summary)])
+
+
+def wrapped(text: str) -> str:
+    """A paragraph of the pages' width."""
+    return fill(text, 120, break_long_words=False, break_on_hyphens=False)
 
 
 def main(_release: Path | None = None) -> None:
-    """Write it."""
-    page.main()
+    """Write the page of tables, and the headline on the page of the model."""
+    studies = kept()
+    put("studies", "\n\n".join(study_text(name, each) for name, each in studies.items()))
+    put("headline", wrapped(f"**{studies['agents']['headline']['text']}**"))
+
+
+def keep_all(folders: Iterable[str]) -> None:
+    """Keep some."""
+    KEPT.mkdir(exist_ok=True)
+    for folder in folders:
+        print(keep(Path(folder)))
+
+
+if __name__ == "__main__":
+    keep_all(sys.argv[1:])
