@@ -1,4 +1,4 @@
-"""`python -m benchmarks.hidden_accidents RELEASE SPLIT`: what cooperation can gain where a collider is hidden from ego.
+"""`python -m benchmarks.hidden_accidents RELEASE SPLIT`: the table of what there is to gain, on docs/model.md.
 
 Three ways to foresee accidents from labels, each alone and with all agents: constant velocity of whom they see; a weak
 sight that finds a share of these, at wrong places and speeds, three seeds pooled; and a guess without any sight: an
@@ -11,6 +11,7 @@ from itertools import chain
 
 import numpy as np
 
+from benchmarks.pages.marks import put, table
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.baselines import Outlook, outlook
 from deepaccident_devkit.baselines.predict import accidents_ahead
@@ -23,6 +24,10 @@ from deepaccident_devkit.taxonomy import OWN_ACTOR_ID
 
 SEEDS, FOUND, OFF, SPEED_OFF = (1, 2, 3), 0.5, 0.7, 1.5
 """Of the weak sight: seeds, the share of actors found, metres and m/s of its errors."""
+WAYS = {"velocity": "constant velocity of whom they see", "weak": "the same of half of these, at wrong places"}
+HEAD = ("who foresees", "ego alone", "all agents", "difference", "decided from")
+BEFORE = 1.5
+"""Seconds before the end from which samples are taken, as in the recipes."""
 SURE = 1.96 + 0.84
 """Standard errors of a difference that is decided at 5 % with a chance of 80 %."""
 
@@ -50,20 +55,16 @@ def guess(dataset: DeepAccident, token: str, place: np.ndarray) -> list[Accident
 
 
 def main(root: str, split: str) -> None:
-    """Print it."""
+    """Write it."""
     dataset, setup = DeepAccident("v1", root, verbose=False), EvaluationSetup(task="accident", protocol="boxes")
     hidden = {record["token"]: cluster_of(record["token"]) for record in dataset.find(hidden_collider=True)}
     places = {hidden[each]: found.point for each in hidden if (found := dataset.collision(each)) is not None}
-    listed = SampleSelection(split=split, scope="all", agents=("ego_vehicle",)).tokens(dataset)
+    listed = SampleSelection(split=split, scope="all", agents=("ego_vehicle",), horizon=BEFORE).tokens(dataset)
     clusters: dict[str, list[str]] = {}
     for token in listed:
         if scenario_of(token) in hidden:
             clusters.setdefault(hidden[scenario_of(token)], []).append(token)
-    rows = {
-        (way, agents): [setup.evaluator() for _ in SEEDS]
-        for way in ("velocity", "weak")
-        for agents in ("single", "all")
-    }
+    rows = {(way, agents): [setup.evaluator() for _ in SEEDS] for way in WAYS for agents in ("single", "all")}
     guessed = setup.evaluator()
     for token in chain(*clusters.values()):
         context = accident_context(dataset, token, 2.0)
@@ -75,16 +76,19 @@ def main(root: str, split: str) -> None:
                 evaluator.update(
                     token, accidents_ahead(weak(whole, source) if way == "weak" else whole, 2.0), None, context
                 )
-    print(f"{len(clusters)} pairs, {len(guessed.tokens)} samples; guess: APA {guessed.compute().apa:.3f}")
-    for way in ("velocity", "weak"):
+    lines = []
+    for way, said in WAYS.items():
         pair = [
             [[each.counts[token] for token in tokens for each in rows[way, agents]] for tokens in clusters.values()]
             for agents in ("single", "all")
         ]
         alone, both = (guessed.result_of([*chain(*counts)]).apa for counts in pair)
         low, high, error = difference_intervals(guessed, (pair[0], pair[1]), {"apa": both - alone}, Resampling())
-        decided, ends = SURE * error[0], f"[{low[0]:+.3f}, {high[0]:+.3f}]"
-        print(f"{way}: single {alone:.3f}, all {both:.3f}, more {both - alone:+.3f} {ends}; decided from {decided:.3f}")
+        more = f"{both - alone:+.2f} [{low[0]:.2f}, {high[0]:.2f}]"
+        lines.append((said, f"{alone:.2f}", f"{both:.2f}", more, f"{SURE * error[0]:.2f}"))
+    lines.append(("a guess without sight", *[f"{guessed.compute().apa:.2f}"] * 2, "0", "–"))
+    told = f"Of {len(guessed.tokens):,} samples of {len(clusters):,} pairs with a hidden collider, APA by `boxes`:"
+    put("gain", f"{told}\n\n{table(HEAD, lines)}")
 
 
 if __name__ == "__main__":
