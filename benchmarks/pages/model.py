@@ -12,8 +12,10 @@ from textwrap import fill
 from typing import Any, Final
 
 from benchmarks.pages.marks import TOP, put, table
+from deepaccident_devkit.model.checkpoint import SHIPPED as SHIPPED_WEIGHTS
+from deepaccident_devkit.model.checkpoint import read_weights
 from deepaccident_devkit.study.numbers import NUMBERS, verdict
-from deepaccident_devkit.study.recipe import SHIPPED
+from deepaccident_devkit.study.recipe import SHIPPED as RECIPES
 from deepaccident_devkit.study.summary import ALL, difference_text, number_with_interval
 
 KEPT: Final = TOP / "benchmarks" / "studies"
@@ -25,7 +27,7 @@ Summary = Mapping[str, Any]
 
 def keep(folder: Path) -> Path:
     """Keep all numbers that came out of a study, without the paths of the machine."""
-    summary = json.loads((folder / "study.json").read_text(encoding="utf-8").replace(f"{SHIPPED}/", ""))
+    summary = json.loads((folder / "study.json").read_text(encoding="utf-8").replace(f"{RECIPES}/", ""))
     path = KEPT / f"{summary['recipe']['name']}.json.gz"
     path.write_bytes(gzip.compress(json.dumps(summary, separators=(",", ":")).encode(), mtime=0))
     return path
@@ -95,6 +97,36 @@ def study_text(name: str, summary: Summary) -> str:
     return "\n\n".join([*paragraphs, "Differences:", differences_table(summary)])
 
 
+def findings_table(studies: Mapping[str, Summary]) -> str:
+    """What was compared in all studies, at the hidden accidents and at all samples."""
+    rows = [
+        (
+            f"`{name}`",
+            f"`{each['row']}` less `{each['less']}`",
+            *(
+                difference_text(each["groups"][group]["apa"], "apa") if group in each["groups"] else "–"
+                for group in ("hidden", ALL)
+            ),
+            difference_text(each["groups"][ALL]["iou_100"], "iou_100"),
+        )
+        for name, summary in studies.items()
+        for each in summary["comparisons"]
+    ]
+    return table(("recipe", "difference", "APA, hidden collider", "APA, all samples", "IoU 100x100 (%), all"), rows)
+
+
+def weights_table() -> str:
+    """The weights that come with the devkit, with what their notes say."""
+    rows = []
+    for name, path in SHIPPED_WEIGHTS.items():
+        notes = read_weights(path).meta
+        made, scored = notes["made"], notes["scored"]["scores"]
+        scores = (f"{100 * scored[each]:.1f}" for each in ("iou", "vpq", "map"))
+        by = f"`{made['study']}`: `{made['weights']}`, seed {made['seed']}"
+        rows.append((f"`{name}`", by, f"{path.stat().st_size / 1e6:.1f}", *scores))
+    return table(("weights", "made by", "MB", "IoU 100x100 (%)", "VPQ 100x100 (%)", "mAP (%)"), rows)
+
+
 def wrapped(text: str) -> str:
     """A paragraph of the pages' width."""
     return fill(text, 120, break_long_words=False, break_on_hyphens=False)
@@ -105,6 +137,8 @@ def main(_release: Path | None = None) -> None:
     studies = kept()
     put("studies", "\n\n".join(study_text(name, each) for name, each in studies.items()))
     put("headline", wrapped(f"**{studies['agents']['headline']['text']}**"))
+    put("findings", findings_table(studies))
+    put("weights", weights_table())
 
 
 def keep_all(folders: Iterable[str]) -> None:
