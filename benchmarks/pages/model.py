@@ -15,7 +15,6 @@ from benchmarks.pages.marks import TOP, put, table
 from deepaccident_devkit.model.checkpoint import SHIPPED as SHIPPED_WEIGHTS
 from deepaccident_devkit.model.checkpoint import read_weights
 from deepaccident_devkit.study.numbers import NUMBERS, verdict
-from deepaccident_devkit.study.recipe import SHIPPED as RECIPES
 from deepaccident_devkit.study.summary import ALL, difference_text, number_with_interval
 
 KEPT: Final = TOP / "benchmarks" / "studies"
@@ -27,7 +26,10 @@ Summary = Mapping[str, Any]
 
 def keep(folder: Path) -> Path:
     """Keep all numbers that came out of a study, without the paths of the machine."""
-    summary = json.loads((folder / "study.json").read_text(encoding="utf-8").replace(f"{RECIPES}/", ""))
+    summary = json.loads((folder / "study.json").read_text(encoding="utf-8"))
+    for source in summary["recipe"]["releases"].values():
+        if "spec" in source:
+            source["spec"] = Path(source["spec"]).name
     path = KEPT / f"{summary['recipe']['name']}.json.gz"
     path.write_bytes(gzip.compress(json.dumps(summary, separators=(",", ":")).encode(), mtime=0))
     return path
