@@ -128,12 +128,12 @@ def test_the_smoke_part_replaces_what_it_names(tmp_path: Path) -> None:
 
 def test_the_recipes_that_ship_share_releases_and_the_trunk() -> None:
     names = sorted(each.stem for each in SHIPPED.glob("*.yaml"))
-    assert names == ["agents", "fusions", "horizons", "inputs", "links", "v2x", "visibility"]
+    assert names == ["agents", "fusions", "horizons", "inputs", "links", "overfit", "v2x", "visibility"]
     found = [read_recipe(name) for name in names]
     assert all(read_recipe(name, smoke=True).rows for name in names)
     assert [each.name for each in found if not each.weights] == ["v2x"]
     trained = [each for each in found if "trunk" in each.weights]
-    assert [each.name for each in found if each.weights and each not in trained] == ["horizons"]
+    assert [each.name for each in found if each.weights and each not in trained] == ["horizons", "inputs", "overfit"]
     assert len({str((each.releases["training"], each.weights["trunk"], each.seeds)) for each in trained}) == 1
     assert [each.name for each in trained if each.releases["test"] != trained[0].releases["test"]] == ["links"]
     rows = {row.name for row in trained[0].rows}
