@@ -15,7 +15,7 @@ NAMES = {
     "baselines": "what constant velocity foresees, by who cooperates",
     "facts": "the real release's facts beside a synthetic one, or beside --release",
     "labels": "cells in which label protocols differ",
-    "model": "cooperation of the small model, from benchmarks/cooperation/study.json",
+    "model": "the studies that benchmarks/studies keeps",
     "real": "the real scenario; needs --release",
     "safety": "outputs of the commands on the page",
     "synth": "what the generator makes; with --release, the real scenario beside it",

@@ -1,7 +1,6 @@
 """The weights that come with the devkit: their size and notes, what they score, and where they are used."""
 
 import importlib
-import json
 from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
@@ -26,13 +25,6 @@ def test_they_are_small_halves_with_their_provenance(name: str) -> None:
     assert weights.path.stat().st_size < 1.3e6
     made = weights.meta["made"]
     assert (weights.meta["preset"], made["seed"], len(made["release"]) > 10) == (name, 1, True)
-
-
-def test_those_of_the_study_on_cooperation_have_its_scores() -> None:
-    study = Path(__file__).parents[3] / "benchmarks" / "cooperation" / "study.json"
-    told = read_weights("tiny").meta
-    assert told["made"]["seed"] == told["made"]["protocol"]["seeds"][0]
-    assert json.loads(study.read_text())["weights"]["scores"] == told["scored"]["scores"]
 
 
 @pytest.mark.slow
