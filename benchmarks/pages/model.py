@@ -1,10 +1,13 @@
 """The tables of studies, from what benchmarks/studies keeps of them: `python docs/make_tables.py model`.
 
-`python -m benchmarks.pages.model STUDIES/NAME…` keeps what a study's folder has.
+`python -m benchmarks.pages.model STUDIES/NAME…` keeps what a study's folder has: all numbers, and the counts of
+accidents of each sample, row and seed, from which every APA follows with its interval. (Counts of boxes would take
+20 MB a study.)
 """
 
 import gzip
 import json
+import lzma
 import sys
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -12,12 +15,11 @@ from textwrap import fill
 from typing import Any, Final
 
 from benchmarks.pages.marks import TOP, put, table
-from deepaccident_devkit.model.checkpoint import SHIPPED as SHIPPED_WEIGHTS
-from deepaccident_devkit.model.checkpoint import read_weights
-from deepaccident_devkit.study.numbers import NUMBERS, verdict
+from deepaccident_devkit.study.numbers import NUMBERS, Seeds, evaluators_of, verdict
 from deepaccident_devkit.study.summary import ALL, difference_text, number_with_interval
 
 KEPT: Final = TOP / "benchmarks" / "studies"
+ORDER: Final = ("agents", "visibility", "fusions", "horizons", "links", "inputs", "overfit")
 SHOWN: Final = ("apa", "iou_100", "vpq_100", "map", "hidden_foreground", "false_foreground")
 """Numbers of the tables; the kept files have all."""
 OUTCOMES: Final = {"wins": "more", "loses": "less", "not decided": "not decided"}
@@ -30,14 +32,37 @@ def keep(folder: Path) -> Path:
     for source in summary["recipe"]["releases"].values():
         if "spec" in source:
             source["spec"] = Path(source["spec"]).name
-    path = KEPT / f"{summary['recipe']['name']}.json.gz"
-    path.write_bytes(gzip.compress(json.dumps(summary, separators=(",", ":")).encode(), mtime=0))
+    told = json.loads(gzip.decompress((folder / "counts.json.gz").read_bytes()))
+    accidents = {
+        row: {seed: counts["accident"] for seed, counts in seeds.items()} for row, seeds in told["rows"].items()
+    }
+    path = KEPT / f"{summary['recipe']['name']}.json.xz"
+    kept = {"summary": summary, "groups": told["groups"], "accidents": accidents}
+    path.write_bytes(lzma.compress(json.dumps(kept, separators=(",", ":")).encode()))
     return path
 
 
-def kept() -> dict[str, Summary]:
-    """The studies that are kept, by their names, in the order of the issue's tables."""
-    return {path.name.split(".")[0]: json.loads(gzip.decompress(path.read_bytes())) for path in KEPT.glob("*.json.gz")}
+def kept(name: str) -> dict[str, Any]:
+    """What is kept of a study: `summary`, `groups` → tokens, and `accidents`: row → seed → token → counts."""
+    found: dict[str, Any] = json.loads(lzma.decompress((KEPT / f"{name}.json.xz").read_bytes()))
+    return found
+
+
+def studies() -> dict[str, Summary]:
+    """The numbers of the studies that are kept, by their names, in the order of the pages."""
+    return {name: kept(name)["summary"] for name in ORDER if (KEPT / f"{name}.json.xz").is_file()}
+
+
+def accident_rows(kept: Mapping[str, Any]) -> dict[str, Seeds]:
+    """The evaluators of accidents of each row and seed, with their counts."""
+    rows: dict[str, Seeds] = {}
+    for name, seeds in kept["accidents"].items():
+        evaluators = {seed: evaluators_of(kept["summary"]["recipe"]["test"]["labels"])["accident"] for seed in seeds}
+        for seed, counts in seeds.items():
+            for token, each in counts.items():
+                evaluators[seed].add(token, each)
+        rows[name] = {seed: {"accident": each} for seed, each in evaluators.items()}
+    return rows
 
 
 def rows_table(summary: Summary, group: str) -> str:
@@ -47,6 +72,17 @@ def rows_table(summary: Summary, group: str) -> str:
         for name, each in summary["rows"].items()
     ]
     return table(("row", *(NUMBERS[number][2] for number in SHOWN)), rows)
+
+
+def by_table(summary: Summary, by: str, number: str) -> str:
+    """A number of all rows, at the samples of each value."""
+    named = {group: group.removeprefix(f"{by}=") for group in summary["groups"] if group.startswith(f"{by}=")}
+    rows = [
+        (f"`{name}`", *(number_with_interval(each["groups"][group][number], number) for group in named))
+        for name, each in summary["rows"].items()
+    ]
+    heads = (f"{said} ({summary['groups'][group]['samples']:,})" for group, said in named.items())
+    return table((f"{NUMBERS[number][2]}, by `{by}` (samples)", *heads), rows)
 
 
 def differences_table(summary: Summary) -> str:
@@ -96,6 +132,7 @@ def study_text(name: str, summary: Summary) -> str:
     for group in groups:
         pairs = summary["groups"][group]["pairs"]
         paragraphs += [f"{group.capitalize()}, {pairs:,} pairs:", rows_table(summary, group)]
+    paragraphs += [by_table(summary, by, number) for by in summary["recipe"]["by"] for number in ("apa", "recall")]
     return "\n\n".join([*paragraphs, "Differences:", differences_table(summary)])
 
 
@@ -119,8 +156,10 @@ def findings_table(studies: Mapping[str, Summary]) -> str:
 
 def weights_table() -> str:
     """The weights that come with the devkit, with what their notes say."""
+    from deepaccident_devkit.model.checkpoint import SHIPPED, read_weights
+
     rows = []
-    for name, path in SHIPPED_WEIGHTS.items():
+    for name, path in SHIPPED.items():
         notes = read_weights(path).meta
         made, scored = notes["made"], notes["scored"]["scores"]
         scores = (f"{100 * scored[each]:.1f}" for each in ("iou", "vpq", "map"))
@@ -136,10 +175,10 @@ def wrapped(text: str) -> str:
 
 def main(_release: Path | None = None) -> None:
     """Write the page of tables, and the headline on the page of the model."""
-    studies = kept()
-    put("studies", "\n\n".join(study_text(name, each) for name, each in studies.items()))
-    put("headline", wrapped(f"**{studies['agents']['headline']['text']}**"))
-    put("findings", findings_table(studies))
+    found = studies()
+    put("studies", "\n\n".join(study_text(name, each) for name, each in found.items()))
+    put("headline", wrapped(f"**{found['agents']['headline']['text']}**"))
+    put("findings", findings_table(found))
     put("weights", weights_table())
 
 

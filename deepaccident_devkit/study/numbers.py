@@ -177,7 +177,7 @@ def _numbers(
         for path, name in paths.items():
             told = zip(("value", "low", "high"), (values[path], *ends.get(path, (math.nan, math.nan))), strict=True)
             found[name] = {key: each if math.isfinite(each) else None for key, each in told}
-    return {name: found[name] for name in NUMBERS}
+    return {name: found[name] for name in NUMBERS if name in found}
 
 
 def _clustered(seeds: Seeds, kind: str, tokens: Collection[str]) -> Clusters:

@@ -17,9 +17,10 @@ from deepaccident_devkit.evaluation import Accident, DetectedBoxes, MotionOutput
 from deepaccident_devkit.evaluation.breakdowns import cluster_of
 from deepaccident_devkit.evaluation.runs.setups import scenario_of
 from deepaccident_devkit.geometry import Boxes
-from deepaccident_devkit.motion import MotionLabelConfig, motion_labels
+from deepaccident_devkit.motion import OWN_BOX_ID, MotionLabelConfig, motion_labels
 from deepaccident_devkit.study.recipe import Row
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
+from deepaccident_devkit.v2x.cooperation import visible_actors
 
 _OWN: Final = ("token", "agents", "agent_valid", "world_from_ego", "augmentation", "files_missing")
 """Of an item of `V2XDataset`, what is the ego's or no agent's; all else has a place for each agent."""
@@ -61,7 +62,10 @@ def _without_model(row: Row, dataset: Dataset, token: str, labels: MotionLabelCo
         return motion, accidents, predict_detections(dataset, token, **seeing)
     if row.trivial == "labels":
         told = motion_labels(dataset, token, replace(labels, agents=row.cooperating)).to_present()
-        motion = MotionOutput(grid=labels.grid, instances=told.instance[None])
+        seen = {OWN_BOX_ID, *visible_actors(dataset, token, **seeing).tolist()}
+        known = [number for actor, number in told.id_map.items() if actor in seen]  # not who comes into sight later
+        maps = np.where(np.isin(told.instance, known), told.instance, 0)
+        motion = MotionOutput(grid=labels.grid, instances=maps[None])
         foreseen = foreseen_accident(motion, step=step, labels=str(labels.protocol))
         return motion, [] if foreseen is None else [foreseen], predict_detections(dataset, token, **seeing)
     maps = np.full((1, labels.label_frames, *labels.grid.shape), row.trivial == "everything", dtype=np.int32)

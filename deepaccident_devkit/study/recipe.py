@@ -101,7 +101,8 @@ class Row(_Part, frozen=True, kw_only=True):
         weights: of a model, one of the recipe's.
         baseline: in place of a model, how actors go on that agents see by the labels.
         trivial: in place of both, `nothing`, an empty map without alarms and boxes; `everything`, a map that is all one
-            actor; or `labels`, what the agents see as the labels show it, the future too: more no model can say.
+            actor; or `labels`, whom the agents see at the present, as the labels show these, the future too: more a
+            model cannot say of them.
         agents: who cooperates: a configuration, or agents' names with commas.
         control: what is spoilt in a model's inputs: `blank`, all sensors of all agents; `strangers`, partners' data are
             those of another pair of scenarios.

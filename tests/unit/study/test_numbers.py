@@ -1,5 +1,6 @@
 """Hidden actors, intervals, verdicts, controls: on data whose answers are known."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -9,9 +10,10 @@ from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import EvaluationError, NotAvailableError
 from deepaccident_devkit.evaluation import DetectedBoxes, MotionOutput
 from deepaccident_devkit.geometry import BevGrid, Boxes
-from deepaccident_devkit.motion import MotionLabelConfig, motion_labels
+from deepaccident_devkit.motion import OWN_BOX_ID, MotionLabelConfig, motion_labels
 from deepaccident_devkit.study.numbers import HIDDEN, HiddenActors, evaluators_of, numbers_of_rows, verdict
-from deepaccident_devkit.study.predict import strangers_of, with_strangers
+from deepaccident_devkit.study.predict import predictions_of, strangers_of, with_strangers
+from deepaccident_devkit.study.recipe import Row
 from deepaccident_devkit.v2x import visible_instances
 from deepaccident_devkit.v2x.cooperation import seen_actors
 
@@ -108,6 +110,19 @@ def test_seeds_count_together_and_each_stands_beside(monkeypatch: pytest.MonkeyP
 )
 def test_the_verdict_follows_from_the_interval(low: float | None, high: float | None, told: str) -> None:
     assert verdict({"low": low, "high": high}) == told
+
+
+def test_labels_as_predictions_know_nobody_who_comes_into_sight_later(da: DeepAccident) -> None:
+    later, labels = 0, replace(LABELS, agents="single")
+    tokens = [f"{scenario['token']}/ego_vehicle_behind/001" for scenario in da.scenario]
+    row = Row(name="labels", trivial="labels", agents="single")
+    for token, (motion, _, _) in predictions_of(row, None, "cpu", da, tokens, LABELS):
+        told = motion_labels(da, token, labels).to_present()
+        seen = {int(each.rsplit("/", 1)[1]) for each in visible_instances(da, token, agents="single")} | {OWN_BOX_ID}
+        drawn = {actor for actor, number in told.id_map.items() if (told.instance == number).any()}
+        assert {told.id_map[actor] for actor in drawn & seen} == set(np.unique(motion.instances).tolist()) - {0}
+        later += len(drawn - seen)
+    assert later > 0
 
 
 def test_strangers_are_of_another_pair() -> None:
