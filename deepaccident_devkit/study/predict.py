@@ -57,15 +57,15 @@ def _without_model(row: Row, dataset: Dataset, token: str, labels: MotionLabelCo
     step, seeing = labels.step * FRAME_PERIOD, dict[str, Any](agents=row.cooperating, link=row.link)
     if row.baseline is not None:
         motion = predict_motion(dataset, token, model=row.baseline, config=labels, **seeing)
-        horizon = labels.future_frames * step
-        accidents = predict_accidents(dataset, token, model=row.baseline, horizon=horizon, **seeing)
-        return motion, accidents, predict_detections(dataset, token, **seeing)
+        ahead = predict_accidents(dataset, token, model=row.baseline, horizon=labels.future_frames * step, **seeing)
+        return motion, ahead, predict_detections(dataset, token, **seeing)
     if row.trivial == "labels":
         told = motion_labels(dataset, token, replace(labels, agents=row.cooperating)).to_present()
         seen = {OWN_BOX_ID, *visible_actors(dataset, token, **seeing).tolist()}
         known = [number for actor, number in told.id_map.items() if actor in seen]  # not who comes into sight later
-        maps = np.where(np.isin(told.instance, known), told.instance, 0)
-        motion = MotionOutput(grid=labels.grid, instances=maps[None])
+        motion = MotionOutput(
+            grid=labels.grid, instances=np.where(np.isin(told.instance, known), told.instance, 0)[None]
+        )
         foreseen = foreseen_accident(motion, step=step, labels=str(labels.protocol))
         return motion, [] if foreseen is None else [foreseen], predict_detections(dataset, token, **seeing)
     maps = np.full((1, labels.label_frames, *labels.grid.shape), row.trivial == "everything", dtype=np.int32)
