@@ -53,6 +53,7 @@ def assert_all_rows(dataset: DeepAccident, folder: Path) -> None:
         assert {split: list(map(repr, rows_of(folder, table, split))) for split in expected} == expected
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shard_scenarios", [1, 2, 32])
 def test_rows_are_the_records_in_shards_of_any_size(
     both_layouts: DeepAccident, tmp_path: Path, shard_scenarios: int

@@ -108,6 +108,7 @@ def test_a_moment_is_together_and_a_split_in_its_files(da: DeepAccident, exporte
         assert list(samples_in(path)) == wanted
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shard_size", [1, 25_000_000])
 def test_shards_of_any_size_hold_the_same_samples(
     da: DeepAccident, samples: dict[str, dict[str, bytes]], tmp_path: Path, shard_size: int

@@ -270,6 +270,7 @@ def test_the_page_names_every_member_and_key(da_motion: DeepAccident, tmp_path: 
     assert NOBODY == -(2**63)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", get_args(BatchNames))
 @pytest.mark.parametrize("config", ["deepaccident", "fiery", "clean", "oblong"])
 def test_batches_of_every_code_and_sample(small: DeepAccident, out: Path, name: BatchNames, config: str) -> None:
