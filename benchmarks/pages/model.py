@@ -22,6 +22,11 @@ KEPT: Final = TOP / "benchmarks" / "studies"
 ORDER: Final = ("agents", "visibility", "fusions", "horizons", "links", "inputs", "overfit")
 SHOWN: Final = ("apa", "iou_100", "vpq_100", "map", "hidden_foreground", "false_foreground")
 """Numbers of the tables; the kept files have all."""
+ANSWER: Final = ("apa", "precision", "recall", "iou_100", "map", "hidden_foreground")
+ANSWERING: Final = (
+    *("single", "all", "black", "strangers", "constant velocity, single", "constant velocity, all"),
+    *("labels, single", "labels, all"),
+)
 OUTCOMES: Final = {"wins": "more", "loses": "less", "not decided": "not decided"}
 Summary = Mapping[str, Any]
 
@@ -65,24 +70,33 @@ def accident_rows(kept: Mapping[str, Any]) -> dict[str, Seeds]:
     return rows
 
 
-def rows_table(summary: Summary, group: str) -> str:
-    """All rows at the samples of a group."""
+def rows_table(summary: Summary) -> str:
+    """All rows, at all samples."""
     rows = [
-        (f"`{name}`", *(number_with_interval(each["groups"][group][number], number) for number in SHOWN))
+        (f"`{name}`", *(number_with_interval(each["groups"][ALL][number], number) for number in SHOWN))
         for name, each in summary["rows"].items()
     ]
     return table(("row", *(NUMBERS[number][2] for number in SHOWN)), rows)
 
 
-def by_table(summary: Summary, by: str, number: str) -> str:
-    """A number of all rows, at the samples of each value."""
-    named = {group: group.removeprefix(f"{by}=") for group in summary["groups"] if group.startswith(f"{by}=")}
+def groups_table(summary: Summary) -> str:
+    """APA of all rows, in each group but that of all samples."""
+    groups = {group: each["samples"] for group, each in summary["groups"].items() if group != ALL}
     rows = [
-        (f"`{name}`", *(number_with_interval(each["groups"][group][number], number) for group in named))
+        (f"`{name}`", *(number_with_interval(each["groups"][group]["apa"], "apa") for group in groups))
         for name, each in summary["rows"].items()
     ]
-    heads = (f"{said} ({summary['groups'][group]['samples']:,})" for group, said in named.items())
-    return table((f"{NUMBERS[number][2]}, by `{by}` (samples)", *heads), rows)
+    return table(("APA boxes among (samples)", *(f"`{name}` ({size:,})" for name, size in groups.items())), rows)
+
+
+def answer_table(summary: Summary) -> str:
+    """What the headline's rows, the controls and the ceiling have, where the headline asks."""
+    where = summary["headline"]["where"]
+    rows = [
+        (f"`{name}`", *(number_with_interval(summary["rows"][name]["groups"][where][each], each) for each in ANSWER))
+        for name in ANSWERING
+    ]
+    return table(("row", *(NUMBERS[number][2] for number in ANSWER)), rows)
 
 
 def differences_table(summary: Summary) -> str:
@@ -123,17 +137,12 @@ CELLS: Final = {"release": "releases", "weights": "training", "row": "prediction
 
 def study_text(name: str, summary: Summary) -> str:
     """A study's section."""
-    groups = [ALL, *summary["recipe"]["groups"]]
     paragraphs = [
         f"## {summary['title']}",
         wrapped(f"{summary['question']} `deepaccident study {name} studies`: {made_text(summary)}"),
         *(wrapped(f"**{summary['headline']['text']}**") for _ in [0] if summary["headline"]),
     ]
-    for group in groups:
-        pairs = summary["groups"][group]["pairs"]
-        paragraphs += [f"{group.capitalize()}, {pairs:,} pairs:", rows_table(summary, group)]
-    paragraphs += [by_table(summary, by, number) for by in summary["recipe"]["by"] for number in ("apa", "recall")]
-    return "\n\n".join([*paragraphs, "Differences:", differences_table(summary)])
+    return "\n\n".join([*paragraphs, rows_table(summary), groups_table(summary), differences_table(summary)])
 
 
 def findings_table(studies: Mapping[str, Summary]) -> str:
@@ -178,6 +187,7 @@ def main(_release: Path | None = None) -> None:
     found = studies()
     put("studies", "\n\n".join(study_text(name, each) for name, each in found.items()))
     put("headline", wrapped(f"**{found['agents']['headline']['text']}**"))
+    put("answer", answer_table(found["agents"]))
     put("findings", findings_table(found))
     put("weights", weights_table())
 
