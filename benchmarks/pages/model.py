@@ -19,7 +19,7 @@ from deepaccident_devkit.study.numbers import NUMBERS, Seeds, evaluators_of, ver
 from deepaccident_devkit.study.summary import ALL, difference_text, number_with_interval
 
 KEPT: Final = TOP / "benchmarks" / "studies"
-ORDER: Final = ("agents", "visibility", "fusions", "horizons", "links", "inputs", "overfit")
+ORDER: Final = ("agents", "boxes", "visibility", "fusions", "horizons", "links", "inputs", "overfit")
 SHOWN: Final = ("apa", "iou_100", "vpq_100", "map", "hidden_foreground", "false_foreground")
 """Numbers of the tables; the kept files have all."""
 ANSWER: Final = ("apa", "precision", "recall", "iou_100", "map", "hidden_foreground")

@@ -14,6 +14,7 @@ from deepaccident_devkit.baselines.outlook import (
     turn_rates,
 )
 from deepaccident_devkit.baselines.predict import (
+    detected_accidents,
     predict_accidents,
     predict_detections,
     predict_forecasts,
@@ -31,6 +32,7 @@ __all__ = [
     "SeenActors",
     "constant_turn_rate",
     "constant_velocity",
+    "detected_accidents",
     "outlook",
     "predict_accidents",
     "predict_detections",

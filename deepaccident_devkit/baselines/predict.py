@@ -8,6 +8,7 @@ and go through the labels' own rasteriser and warps.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -20,9 +21,10 @@ from deepaccident_devkit.evaluation.forecasting import Forecast
 from deepaccident_devkit.evaluation.planning.scene import Plan
 from deepaccident_devkit.geometry import SE3
 from deepaccident_devkit.geometry.box_arrays import gaps_of_pairs
+from deepaccident_devkit.geometry.boxes import concatenate
 from deepaccident_devkit.motion import FrameBoxes, MotionLabelConfig, motion_labels_from_boxes
 from deepaccident_devkit.support.arrays import BoolArray, FloatArray, IntArray
-from deepaccident_devkit.taxonomy import AGENTS, CATEGORIES, FRAME_PERIOD, LIDAR, OWN_ACTOR_ID
+from deepaccident_devkit.taxonomy import AGENTS, CATEGORIES, FRAME_PERIOD, LIDAR, OWN_ACTOR_ID, UNTRACKED_ID
 from deepaccident_devkit.v2x import Agents, Link, future_egomotion
 from deepaccident_devkit.v2x.cooperation import SeenActors, seen_actors
 
@@ -41,6 +43,10 @@ _SAME_WAY: Final = np.radians(20)
 """Between the headings of two that drive one behind the other."""
 _SAME_LANE: Final = 1.0
 """Metres to the side within which one is straight ahead of the other."""
+_LIKELY: Final = 0.5
+"""The least score of a detected box that counts."""
+_ON_IT: Final = 2.0
+"""Metres from the ego's centre within which a detected box is the ego."""
 _PEDESTRIAN: Final = CATEGORIES.index("pedestrian")
 _ENOUGH_POINTS = 10.0
 """LiDAR points that add to a score half of what any number of them can add."""
@@ -149,6 +155,32 @@ def predict_accidents(
             raise ConfigError(f"{name}: expected a number above 0, found {value!r}")
     ahead = outlook(dataset, sample, agents=agents, model=model, link=link)
     return accidents_ahead(ahead, horizon, danger_distance)
+
+
+def detected_accidents(
+    dataset: Dataset, sample: RowArgument, detected: DetectedBoxes, *, horizon: float = 2.0
+) -> list[Accident]:
+    """The accidents that a detector's boxes mean at constant velocity, the surest first, without actors' ids.
+
+    Of the labels this reads the ego's own box, as a car knows itself; boxes on it are the ego, seen by partners.
+
+    Args:
+        dataset: the release.
+        sample: token or record: its agent is the ego.
+        detected: boxes of the sample, in world; those count that are more likely there than not.
+        horizon: seconds to look ahead.
+
+    Raises:
+        DeepAccidentError: as of `seen_actors`.
+    """
+    alone = seen_actors(dataset, sample)
+    own = alone.boxes.select(alone.boxes.actor_id == OWN_ACTOR_ID)
+    found = detected.boxes.select(detected.scores >= _LIKELY)
+    found = found.transform(dataset.world_from(sample, "ego").inverse(), own.frame)
+    apart = np.linalg.norm(found.center[:, None, :2] - own.center[None, :, :2], axis=-1)
+    boxes = concatenate([own, found.select((apart > _ON_IT).all(axis=1))], own.frame)
+    seen = replace(alone, boxes=boxes, seen_by=np.zeros(len(boxes), dtype=np.uint8))
+    return accidents_ahead(Outlook(seen=seen, turn_rate=np.zeros(len(boxes))), horizon)
 
 
 def predict_detections(
@@ -308,7 +340,7 @@ def _accident(outlook: Outlook, poses: FloatArray, pair: tuple[int, int], moment
 
 def _actor_id(outlook: Outlook, row: int) -> int | None:
     actor: int = outlook.seen.boxes.actor_id.item(row)
-    return outlook.seen.own_actor_id if actor == OWN_ACTOR_ID else actor
+    return {OWN_ACTOR_ID: outlook.seen.own_actor_id, UNTRACKED_ID: None}.get(actor, actor)
 
 
 def _one_a_site(alarms: list[Accident]) -> list[Accident]:

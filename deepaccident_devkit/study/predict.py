@@ -10,7 +10,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from deepaccident_devkit.baselines import predict_accidents, predict_detections, predict_motion
+from deepaccident_devkit.baselines import detected_accidents, predict_accidents, predict_detections, predict_motion
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import ConfigError, NotAvailableError
 from deepaccident_devkit.evaluation import Accident, DetectedBoxes, MotionOutput, foreseen_accident
@@ -82,8 +82,7 @@ def _by_model(
     from deepaccident_devkit.model.training_run import one_thread
 
     model = load_model(weights).to(device).eval()
-    learned = model.config.labels_protocol
-    if learned != labels.protocol:
+    if (learned := model.config.labels_protocol) != labels.protocol:
         raise ConfigError(
             f"{weights}: was trained with the labels {learned}; give `labels: {learned}` in the recipe's `test`"
         )
@@ -100,7 +99,13 @@ def _by_model(
         )
         found = (prediction_of(model, collate([item]), config) for item in changed)
     with one_thread():
-        yield from ((each.token, (each.motion, each.accidents, each.boxes)) for each in found)
+        for each in found:
+            ahead = (
+                each.accidents
+                if row.baseline is None
+                else detected_accidents(dataset, each.token, each.boxes, horizon=model.config.horizon)
+            )
+            yield each.token, (each.motion, ahead, each.boxes)
 
 
 def strangers_of(tokens: Sequence[str]) -> list[str]:

@@ -99,7 +99,8 @@ class Row(_Part, frozen=True, kw_only=True):
     Attributes:
         name: of the line. In the file it may name keys that have lists, such as `late {latency} s`.
         weights: of a model, one of the recipe's.
-        baseline: in place of a model, how actors go on that agents see by the labels.
+        baseline: how actors go on that agents see by the labels; with `weights`, that the model detects, for alarms in
+            place of those that follow from its maps.
         trivial: in place of both, `nothing`, an empty map without alarms and boxes; `everything`, a map that is all one
             actor; or `labels`, whom the agents see at the present, as the labels show these, the future too: more a
             model cannot say of them.
@@ -145,7 +146,9 @@ class Row(_Part, frozen=True, kw_only=True):
         """What does not go together."""
         kinds = [name for name in ("weights", "baseline", "trivial") if getattr(self, name) is not None]
         told = {
-            f"expected one of weights, baseline and trivial, found {' and '.join(kinds) or 'none'}": len(kinds) != 1,
+            "expected one of weights, baseline and trivial, or weights and the baseline constant_velocity, found "
+            f"{' and '.join(kinds) or 'none'}": len(kinds) != 1
+            and (kinds, self.baseline) != (["weights", "baseline"], "constant_velocity"),
             "control: spoils what a model sees; leave it out, or give weights": self.control and not self.weights,
             "horizon: is what the weights were trained for; leave it out here": self.horizon and self.weights,
             "control, budget: do not go together; leave one out": self.control and self.budget,

@@ -132,8 +132,9 @@ def summarised(counted: Counted) -> dict[str, Any]:
 def _headline(headline: Mapping[str, Any], comparisons: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
     """With what came out."""
     row, less, number, where = (headline[name] for name in ("row", "less", "number", "where"))
-    pair = next(each for each in comparisons if (each["row"], each["less"]) == (row, less))
-    found = pair["groups"][where or ALL][number]
+    found = next(
+        each["groups"][where or ALL][number] for each in comparisons if (each["row"], each["less"]) == (row, less)
+    )
     size, said = difference_text(found, number), NUMBERS[number][2]
     told = _WORDS[verdict(found)].format(row=f"`{row}`", less=f"`{less}`", number=said, size=size)
     among = f"Among {f'`{where}`' if where else ALL}: "

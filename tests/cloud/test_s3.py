@@ -28,7 +28,7 @@ def remote(request: pytest.FixtureRequest, bucket: str, tmp_path_factory: pytest
 
 
 def test_tables_and_files_have_the_same_bytes(remote: DeepAccident, da: DeepAccident) -> None:
-    for path in da.tables_folder.iterdir():
+    for path in filter(Path.is_file, da.tables_folder.iterdir()):  # another test may have kept more beside them
         assert (remote.tables_folder / path.name).read_bytes() == path.read_bytes()
     for sample in (da.sample[0]["token"], da.sample[40]["token"]):
         for channel in ("Camera_Back", "lidar01", "BEV_instance_camera"):

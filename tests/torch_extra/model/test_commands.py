@@ -68,7 +68,7 @@ def test_one_set_of_weights_predicts_for_any_agents(
         assert (found.meta["bytes"]["partners"] > 0) == (agents != "single" and "--budget" not in link)
         assert f"{task}: {len(found.tokens)} samples in {out / name}" in result.output
         assert run("evaluate", task, release_root, "--results", out / name, *judged).exit_code == 0
-    assert read_results(out / "motion").form.grid.shape == (100, 100)
+    assert read_results(out / "motion").form.grid.shape == (200, 200)
 
 
 def test_what_is_there_already_is_not_overwritten(trained: Path, release_root: Path, tmp_path: Path) -> None:

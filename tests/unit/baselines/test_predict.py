@@ -16,6 +16,7 @@ from deepaccident_devkit.baselines import (
     MotionModel,
     Outlook,
     SeenActors,
+    detected_accidents,
     outlook,
     predict_accidents,
     predict_detections,
@@ -27,14 +28,20 @@ from deepaccident_devkit.baselines import (
 )
 from deepaccident_devkit.baselines.predict import accidents_ahead, label_times, motion_of
 from deepaccident_devkit.errors import ChoiceError, ConfigError, DeepAccidentError, NotAvailableError
-from deepaccident_devkit.evaluation import AccidentEvaluator, DetectionEvaluator, MotionEvaluator, detection_truth
+from deepaccident_devkit.evaluation import (
+    AccidentEvaluator,
+    DetectedBoxes,
+    DetectionEvaluator,
+    MotionEvaluator,
+    detection_truth,
+)
 from deepaccident_devkit.evaluation.accident import accident_context
 from deepaccident_devkit.evaluation.motion import MOTION_PROTOCOLS
 from deepaccident_devkit.evaluation.results import read_results
 from deepaccident_devkit.geometry import BevGrid, Boxes
 from deepaccident_devkit.motion import OWN_BOX_ID, MotionLabelConfig, MotionLabels
 from deepaccident_devkit.support.arrays import FloatArray
-from deepaccident_devkit.taxonomy import CATEGORIES, LIDAR, OWN_ACTOR_ID
+from deepaccident_devkit.taxonomy import CATEGORIES, LIDAR, OWN_ACTOR_ID, UNTRACKED_ID
 from deepaccident_devkit.v2x import Link
 
 
@@ -76,6 +83,24 @@ def test_five_agents_foresee_what_one_does_not(da_hidden: DeepAccident, tokens: 
         score = together.compute().ranges["100x100"].pq
         assert score > least
         assert score > alone.compute().ranges["100x100"].pq + 10
+
+
+def test_boxes_of_a_detector_mean_the_accidents_of_those_actors(da_hidden: DeepAccident, tokens: list[str]) -> None:
+    """Nobody is named; unsure boxes do not count, nor those on the ego."""
+    for token in tokens:
+        boxes = seen_actors(da_hidden, token, agents="all", frame="world").boxes  # the first one is the ego
+        unnamed = replace(boxes, actor_id=np.full(len(boxes), UNTRACKED_ID))
+        found, unsure = (
+            detected_accidents(da_hidden, token, DetectedBoxes(boxes=unnamed, scores=np.full(len(boxes), score)))
+            for score in (0.5, 0.49)
+        )
+        named = predict_accidents(da_hidden, token, agents="all")
+        assert [each.ids for each in found] == [None] * len(named)
+        assert [(each.time, each.score) for each in found] == [(each.time, each.score) for each in named]
+        for each, other in zip(found, named, strict=True):
+            np.testing.assert_allclose(each.positions, other.positions, atol=1e-9)
+        assert unsure == []
+    assert named
 
 
 def test_the_hidden_accident_is_foreseen_by_the_pole_and_named(da_hidden: DeepAccident, tokens: list[str]) -> None:
