@@ -10,6 +10,7 @@ import torch
 from studies import BASELINES, killed, written
 
 from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.baselines import detected_accidents
 from deepaccident_devkit.errors import ConfigError, SomeFailedError
 from deepaccident_devkit.export.torch import V2XDataset
 from deepaccident_devkit.model import PredictConfig, load_model, predictions, read_weights
@@ -190,3 +191,20 @@ def test_a_row_that_fails_is_named(out: Path, tmp_path: Path) -> None:
     changed = {**MODELS, "rows": rows, "compare": [], "headline": None}
     with pytest.raises(SomeFailedError, match=r"1 of 1 failed:\n  row/.*: late, seed 1: latency"):
         run_study(read_recipe(str(written(tmp_path, {**changed, "seeds": [1]}))), out, device="cpu", workers=1)
+
+
+def test_a_row_of_weights_and_a_baseline_has_alarms_from_the_boxes(
+    da: DeepAccident, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    torch.set_num_threads(1)
+    monkeypatch.setattr("deepaccident_devkit.baselines.predict._LIKELY", 0.0)  # the weights are sure of little here
+    tokens, shipped = [f"{each['token']}/ego_vehicle/004" for each in da.scenario], read_weights("tiny_lidar").path
+    rows = (Row(name="boxes", weights="a", baseline="constant_velocity"), Row(name="maps", weights="a"))
+    told = [dict(predictions_of(row, shipped, "cpu", da, tokens, tiny().labels)) for row in rows]
+    for token, (_, accidents, boxes) in told[0].items():
+        expected = detected_accidents(da, token, boxes)
+        assert [(each.time, each.score) for each in accidents] == [(each.time, each.score) for each in expected]
+        assert (boxes.scores == told[1][token][2].scores).all()
+    alarms = [[(each.time, each.score) for _, accidents, _ in of.values() for each in accidents] for of in told]
+    assert alarms[0]
+    assert alarms[0] != alarms[1]
