@@ -55,6 +55,7 @@ def test_every_view_draws_the_first_accident_when_no_token_is_given(
     assert (drawn.shape[:2], len(colors) > 20, plt.get_fignums()) == (SIZE, True, [])
 
 
+@pytest.mark.slow
 def test_size_and_fonts_are_the_views_own_or_of_a_style(da: DeepAccident, tmp_path: Path) -> None:
     run("sample-data", da.dataroot, "--out", tmp_path / "own.png", "--dpi", 100)
     run("sample-data", da.dataroot, "--out", tmp_path / "paper.png", "--style", "paper")

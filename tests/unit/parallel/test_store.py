@@ -30,6 +30,7 @@ def marks(folder: Path) -> list[str]:
     return sorted(path.stem for path in (folder / "marks").iterdir())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("workers", [1, 2])
 def test_several_processes_share_a_folder(tmp_path: Path, workers: int) -> None:
     for each in [process(tmp_path, workers) for _ in range(3)]:
