@@ -15,7 +15,7 @@ from textwrap import fill
 from typing import Any, Final
 
 from benchmarks.pages.marks import TOP, put, table
-from deepaccident_devkit.study.numbers import NUMBERS, Seeds, evaluators_of, verdict
+from deepaccident_devkit.study.numbers import NUMBERS, Evaluators, Seeds, evaluators_of, verdict
 from deepaccident_devkit.study.summary import ALL, difference_text, number_with_interval
 
 KEPT: Final = TOP / "benchmarks" / "studies"
@@ -28,6 +28,7 @@ ANSWERING: Final = (
     *("labels, single", "labels, all"),
 )
 OUTCOMES: Final = {"wins": "more", "loses": "less", "not decided": "not decided"}
+CELLS: Final = {"release": "releases", "weights": "training", "row": "prediction and evaluation"}
 Summary = Mapping[str, Any]
 
 
@@ -42,8 +43,8 @@ def keep(folder: Path) -> Path:
         row: {seed: counts["accident"] for seed, counts in seeds.items()} for row, seeds in told["rows"].items()
     }
     path = KEPT / f"{summary['recipe']['name']}.json.xz"
-    kept = {"summary": summary, "groups": told["groups"], "accidents": accidents}
-    path.write_bytes(lzma.compress(json.dumps(kept, separators=(",", ":")).encode()))
+    content = {"summary": summary, "groups": told["groups"], "accidents": accidents}
+    path.write_bytes(lzma.compress(json.dumps(content, separators=(",", ":")).encode()))
     return path
 
 
@@ -58,45 +59,36 @@ def studies() -> dict[str, Summary]:
     return {name: kept(name)["summary"] for name in ORDER if (KEPT / f"{name}.json.xz").is_file()}
 
 
-def accident_rows(kept: Mapping[str, Any]) -> dict[str, Seeds]:
-    """The evaluators of accidents of each row and seed, with their counts."""
-    rows: dict[str, Seeds] = {}
-    for name, seeds in kept["accidents"].items():
-        evaluators = {seed: evaluators_of(kept["summary"]["recipe"]["test"]["labels"])["accident"] for seed in seeds}
+def accident_rows(study: Mapping[str, Any]) -> dict[str, Seeds]:
+    """The evaluators of accidents of each row and seed of what `kept` gives, with their counts."""
+    rows: dict[str, dict[str, Evaluators]] = {}
+    for name, seeds in study["accidents"].items():
         for seed, counts in seeds.items():
+            evaluator = evaluators_of(study["summary"]["recipe"]["test"]["labels"])["accident"]
             for token, each in counts.items():
-                evaluators[seed].add(token, each)
-        rows[name] = {seed: {"accident": each} for seed, each in evaluators.items()}
-    return rows
+                evaluator.add(token, each)
+            rows.setdefault(name, {})[seed] = {"accident": evaluator}
+    return dict(rows)
 
 
-def rows_table(summary: Summary) -> str:
-    """All rows, at all samples."""
+def rows_table(summary: Summary, columns: Mapping[str, tuple[str, str]], names: Iterable[str] = ()) -> str:
+    """Some rows, or all: what stands above a column → the group and the number of its cells."""
     rows = [
-        (f"`{name}`", *(number_with_interval(each["groups"][ALL][number], number) for number in SHOWN))
-        for name, each in summary["rows"].items()
+        (f"`{name}`", *(number_with_interval(groups[group][number], number) for group, number in columns.values()))
+        for name in names or summary["rows"]
+        for groups in [summary["rows"][name]["groups"]]
     ]
-    return table(("row", *(NUMBERS[number][2] for number in SHOWN)), rows)
+    return table(("row", *columns), rows)
 
 
-def groups_table(summary: Summary) -> str:
-    """APA of all rows, in each group but that of all samples."""
-    groups = {group: each["samples"] for group, each in summary["groups"].items() if group != ALL}
-    rows = [
-        (f"`{name}`", *(number_with_interval(each["groups"][group]["apa"], "apa") for group in groups))
-        for name, each in summary["rows"].items()
-    ]
-    return table(("APA boxes among (samples)", *(f"`{name}` ({size:,})" for name, size in groups.items())), rows)
+def numbers_in(group: str, numbers: Iterable[str]) -> dict[str, tuple[str, str]]:
+    """Columns of some numbers of one group."""
+    return {NUMBERS[number][2]: (group, number) for number in numbers}
 
 
 def answer_table(summary: Summary) -> str:
     """What the headline's rows, the controls and the ceiling have, where the headline asks."""
-    where = summary["headline"]["where"]
-    rows = [
-        (f"`{name}`", *(number_with_interval(summary["rows"][name]["groups"][where][each], each) for each in ANSWER))
-        for name in ANSWERING
-    ]
-    return table(("row", *(NUMBERS[number][2] for number in ANSWER)), rows)
+    return rows_table(summary, numbers_in(summary["headline"]["where"], ANSWER), ANSWERING)
 
 
 def differences_table(summary: Summary) -> str:
@@ -132,20 +124,20 @@ def made_text(summary: Summary) -> str:
     )
 
 
-CELLS: Final = {"release": "releases", "weights": "training", "row": "prediction and evaluation"}
-
-
 def study_text(name: str, summary: Summary) -> str:
-    """A study's section."""
-    paragraphs = [
-        f"## {summary['title']}",
-        wrapped(f"{summary['question']} `deepaccident study {name} studies`: {made_text(summary)}"),
-        *(wrapped(f"**{summary['headline']['text']}**") for _ in [0] if summary["headline"]),
-    ]
-    return "\n\n".join([*paragraphs, rows_table(summary), groups_table(summary), differences_table(summary)])
+    """A study's section: all rows at all samples, their APA in each group, and the differences."""
+    groups = {
+        f"APA, `{group}` ({each['samples']:,} samples)": (group, "apa")
+        for group, each in summary["groups"].items()
+        if group != ALL
+    }
+    made = f"{summary['question']} `deepaccident study {name} studies`: {made_text(summary)}"
+    told = [made, f"**{summary['headline']['text']}**"] if summary["headline"] else [made]
+    tables = rows_table(summary, numbers_in(ALL, SHOWN)), rows_table(summary, groups), differences_table(summary)
+    return "\n\n".join([f"## {summary['title']}", *map(wrapped, told), *tables])
 
 
-def findings_table(studies: Mapping[str, Summary]) -> str:
+def findings_table(found: Mapping[str, Summary]) -> str:
     """What was compared in all studies, at the hidden accidents and at all samples."""
     rows = [
         (
@@ -157,7 +149,7 @@ def findings_table(studies: Mapping[str, Summary]) -> str:
             ),
             difference_text(each["groups"][ALL]["iou_100"], "iou_100"),
         )
-        for name, summary in studies.items()
+        for name, summary in found.items()
         for each in summary["comparisons"]
     ]
     return table(("recipe", "difference", "APA, hidden collider", "APA, all samples", "IoU 100x100 (%), all"), rows)

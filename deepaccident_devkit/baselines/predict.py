@@ -167,7 +167,7 @@ def detected_accidents(
     Args:
         dataset: the release.
         sample: token or record: its agent is the ego.
-        detected: boxes of the sample, in world; those count that are more likely there than not.
+        detected: boxes of the sample, in any frame of it; those count that are more likely there than not.
         horizon: seconds to look ahead.
 
     Raises:
@@ -176,7 +176,8 @@ def detected_accidents(
     alone = seen_actors(dataset, sample)
     own = alone.boxes.select(alone.boxes.actor_id == OWN_ACTOR_ID)
     found = detected.boxes.select(detected.scores >= _LIKELY)
-    found = found.transform(dataset.world_from(sample, "ego").inverse(), own.frame)
+    ego_from_source = dataset.world_from(sample, own.frame).inverse() @ dataset.world_from(sample, found.frame)
+    found = found.transform(ego_from_source, own.frame)
     apart = np.linalg.norm(found.center[:, None, :2] - own.center[None, :, :2], axis=-1)
     boxes = concatenate([own, found.select((apart > _ON_IT).all(axis=1))], own.frame)
     seen = replace(alone, boxes=boxes, seen_by=np.zeros(len(boxes), dtype=np.uint8))

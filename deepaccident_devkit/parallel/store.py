@@ -230,12 +230,11 @@ class Turn:
 
     def _is_there(self) -> bool:
         """Whether the locks that are open are those that others find by their names."""
+        opened = zip(_LOCKS, (self._lock, self._making), strict=True)
         try:
-            found = [(self._store.folder / name).lstat() for name in _LOCKS]
-            held = [os.fstat(file) for file in (self._lock, self._making)]
+            return all(os.path.samestat((self._store.folder / name).lstat(), os.fstat(file)) for name, file in opened)
         except OSError:
             return False
-        return [(each.st_dev, each.st_ino) for each in found] == [(each.st_dev, each.st_ino) for each in held]
 
 
 @dataclass(frozen=True, slots=True)

@@ -85,10 +85,13 @@ def test_five_agents_foresee_what_one_does_not(da_hidden: DeepAccident, tokens: 
         assert score > alone.compute().ranges["100x100"].pq + 10
 
 
-def test_boxes_of_a_detector_mean_the_accidents_of_those_actors(da_hidden: DeepAccident, tokens: list[str]) -> None:
+@pytest.mark.parametrize("frame", ["world", "ego", "lidar"])
+def test_boxes_of_a_detector_mean_the_accidents_of_those_actors(
+    da_hidden: DeepAccident, tokens: list[str], frame: str
+) -> None:
     """Nobody is named; unsure boxes do not count, nor those on the ego."""
     for token in tokens:
-        boxes = seen_actors(da_hidden, token, agents="all", frame="world").boxes  # the first one is the ego
+        boxes = seen_actors(da_hidden, token, agents="all", frame=frame).boxes  # the first one is the ego
         unnamed = replace(boxes, actor_id=np.full(len(boxes), UNTRACKED_ID))
         found, unsure = (
             detected_accidents(da_hidden, token, DetectedBoxes(boxes=unnamed, scores=np.full(len(boxes), score)))
