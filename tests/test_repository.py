@@ -84,6 +84,7 @@ def slow_tests() -> dict[str, list[ast.FunctionDef]]:
     return found
 
 
+@pytest.mark.slow
 def test_the_list_of_slow_tests_is_complete() -> None:
     section = (TOP / "CONTRIBUTING.md").read_text(encoding="utf-8").split("## Slow tests")[1].split("\n## ")[0]
     rows = re.findall(r"^\| (`.*) \| .* \|$", section, re.MULTILINE)
@@ -93,6 +94,7 @@ def test_the_list_of_slow_tests_is_complete() -> None:
     assert {pattern for patterns in files.values() for pattern in patterns} == set(listed)
 
 
+@pytest.mark.slow
 def test_no_parity_and_no_property_is_slow() -> None:
     slow = slow_tests()
     assert [name for name in slow if name.startswith(("tests/parity/", "tests/property/"))] == []

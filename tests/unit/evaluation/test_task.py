@@ -35,8 +35,8 @@ every_protocol = pytest.mark.parametrize(
         ("accident", "boxes"),
         ("detection", "paper"),
         ("warning", "clean"),
-        ("planning", "clean"),
-        ("forecasting", "clean"),
+        pytest.param("planning", "clean", marks=pytest.mark.slow),
+        pytest.param("forecasting", "clean", marks=pytest.mark.slow),
     ],
 )
 def test_read_truth_counts_result_summary(
