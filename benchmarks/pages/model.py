@@ -92,23 +92,21 @@ def answer_table(summary: Summary) -> str:
 
 
 def differences_table(summary: Summary) -> str:
-    """The comparisons, at all samples and at those of the groups of pairs, with each seed's."""
-    named = [ALL, *summary["recipe"]["groups"]]
+    """The comparisons: of a group of pairs, else of all samples, with each seed's; the kept files have all others."""
+    group = next(iter(summary["recipe"]["groups"]), ALL)
     rows = [
         (
             f"`{each['row']}` less `{each['less']}`",
-            group,
             NUMBERS[number][2],
             difference_text(found, number),
             ", ".join(difference_text({"value": one, "low": None}, number) for one in found["seeds"].values()),
             OUTCOMES[verdict(found)],
         )
         for each in summary["comparisons"]
-        for group in named
-        for number in SHOWN[:3]
+        for number in SHOWN[:2]
         for found in [each["groups"][group][number]]
     ]
-    return table(("difference", "among", "number", "value", "of each seed", "verdict"), rows)
+    return table((f"difference, among `{group}`", "number", "value", "of each seed", "verdict"), rows)
 
 
 def made_text(summary: Summary) -> str:
