@@ -45,7 +45,12 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """A checkout that is on the path, but not installed, has no entry point for the test kit's plugin."""
+    """A checkout that is on the path, but not installed, has no entry point for the test kit's plugin.
+
+    Where a worker crashes, pytest-xdist (3.8) restarts it, and with tests by file then waits for ever: the run ends.
+    """
+    if getattr(config.option, "maxworkerrestart", "") is None:
+        config.option.maxworkerrestart = "0"
     manager = config.pluginmanager
     if not manager.has_plugin("deepaccident") and not manager.is_blocked("deepaccident"):
         manager.register(importlib.import_module("deepaccident_devkit.testing.plugin"), "deepaccident")

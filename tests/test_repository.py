@@ -39,6 +39,11 @@ def test_the_citation_is_of_this_version_and_of_the_paper() -> None:
     assert (citation["version"], paper["title"] in readme, paper["url"] in readme) == (__version__, True, True)
 
 
+def test_a_run_ends_where_a_worker_crashes(pytestconfig: pytest.Config) -> None:
+    """Restarted workers make pytest-xdist wait for ever, where the tests of a file stay together."""
+    assert pytestconfig.getoption("maxworkerrestart", "0") == "0"  # none without pytest-xdist
+
+
 def test_the_hooks_are_checks_of_ci() -> None:
     [local] = parsed(TOP / ".pre-commit-config.yaml")["repos"]
     for hook in local["hooks"]:

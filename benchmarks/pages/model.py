@@ -91,24 +91,6 @@ def answer_table(summary: Summary) -> str:
     return rows_table(summary, numbers_in(summary["headline"]["where"], ANSWER), ANSWERING)
 
 
-def differences_table(summary: Summary) -> str:
-    """The comparisons: of a group of pairs, else of all samples, with each seed's; the kept files have all others."""
-    group = next(iter(summary["recipe"]["groups"]), ALL)
-    rows = [
-        (
-            f"`{each['row']}` less `{each['less']}`",
-            NUMBERS[number][2],
-            difference_text(found, number),
-            ", ".join(difference_text({"value": one, "low": None}, number) for one in found["seeds"].values()),
-            OUTCOMES[verdict(found)],
-        )
-        for each in summary["comparisons"]
-        for number in SHOWN[:2]
-        for found in [each["groups"][group][number]]
-    ]
-    return table((f"difference, among `{group}`", "number", "value", "of each seed", "verdict"), rows)
-
-
 def made_text(summary: Summary) -> str:
     """How a study was made."""
     tested, cells = summary["groups"][ALL], summary["cells"]
@@ -123,34 +105,43 @@ def made_text(summary: Summary) -> str:
 
 
 def study_text(name: str, summary: Summary) -> str:
-    """A study's section: all rows at all samples, their APA in each group, and the differences."""
+    """A study's section: all rows at all samples, and their APA in each group that has accidents."""
     groups = {
         f"APA, `{group}` ({each['samples']:,} samples)": (group, "apa")
         for group, each in summary["groups"].items()
-        if group != ALL
+        if group != ALL and any(row["groups"][group]["apa"]["value"] is not None for row in summary["rows"].values())
     }
     made = f"{summary['question']} `deepaccident study {name} studies`: {made_text(summary)}"
     told = [made, f"**{summary['headline']['text']}**"] if summary["headline"] else [made]
-    tables = rows_table(summary, numbers_in(ALL, SHOWN)), rows_table(summary, groups), differences_table(summary)
+    tables = rows_table(summary, numbers_in(ALL, SHOWN)), rows_table(summary, groups)
     return "\n\n".join([f"## {summary['title']}", *map(wrapped, told), *tables])
 
 
 def findings_table(found: Mapping[str, Summary]) -> str:
-    """What was compared in all studies, at the hidden accidents and at all samples."""
-    rows = [
-        (
-            f"`{name}`",
-            f"`{each['row']}` less `{each['less']}`",
-            *(
-                difference_text(each["groups"][group]["apa"], "apa") if group in each["groups"] else "–"
-                for group in ("hidden", ALL)
-            ),
-            difference_text(each["groups"][ALL]["iou_100"], "iou_100"),
-        )
-        for name, summary in found.items()
-        for each in summary["comparisons"]
-    ]
-    return table(("recipe", "difference", "APA, hidden collider", "APA, all samples", "IoU 100x100 (%), all"), rows)
+    """What was compared in all studies, at the hidden accidents and at all samples; the kept files have all else."""
+    rows = []
+    for name, summary in found.items():
+        for each in summary["comparisons"]:
+            apa, everywhere = each["groups"]["hidden"]["apa"], each["groups"][ALL]
+            rows.append(
+                (
+                    f"`{name}`",
+                    f"`{each['row']}` less `{each['less']}`",
+                    difference_text(apa, "apa"),
+                    of_seeds(apa, "apa"),
+                    OUTCOMES[verdict(apa)],
+                    difference_text(everywhere["apa"], "apa"),
+                    difference_text(everywhere["iou_100"], "iou_100"),
+                    of_seeds(everywhere["iou_100"], "iou_100"),
+                )
+            )
+    heads = ("APA, hidden collider", "of each seed", "verdict", "APA, all samples", "IoU 100x100 (%), all")
+    return table(("recipe", "difference", *heads, "of each seed"), rows)
+
+
+def of_seeds(found: Mapping[str, Any], number: str) -> str:
+    """A difference's value for each seed."""
+    return ", ".join(difference_text({"value": one, "low": None}, number) for one in found["seeds"].values())
 
 
 def weights_table() -> str:

@@ -151,7 +151,7 @@ def streams(tables: Sequence[tuple[TableSpec, Columns]], metadata: Mapping[str, 
     """The rows of each table, with or without words, as compressed Arrow streams one after the other."""
     import pyarrow as pa
 
-    options = pa.ipc.IpcWriteOptions(compression="zstd", use_threads=False)  # Arrow 14's threads crash now and then
+    options = pa.ipc.IpcWriteOptions(compression="zstd", use_threads=False)  # a thread of Arrow 14 crashed here
     sink = pa.BufferOutputStream()
     for spec, columns in tables:
         with pa.ipc.new_stream(sink, arrow_schema(spec).with_metadata(dict(metadata or {})), options=options) as writer:
