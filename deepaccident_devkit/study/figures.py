@@ -65,7 +65,12 @@ def curves_figure(summary: Mapping[str, Any], key: str) -> Figure:
             _draw(ax, [row["over"][1] for row in own], found, upright=True, color=color, label=name)
         ax.set_xlabel(f"{key.replace('_', ' ')} ({_UNITS[key]})", fontsize=text_size())
         with_light_grid(ax, "both")
-    next(iter(panels.values())).legend(fontsize=text_size())
+    fig.legend(
+        *next(iter(panels.values())).get_legend_handles_labels(),
+        loc="outside upper center",
+        ncols=3,
+        fontsize=text_size(),
+    )
     return fig
 
 

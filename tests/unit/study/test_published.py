@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 from deepaccident_devkit.study import read_recipe
+from deepaccident_devkit.study.figures import curves_figure
 from deepaccident_devkit.study.numbers import numbers_of_rows
 
 TOP = Path(__file__).parents[3]
@@ -31,6 +32,14 @@ def test_the_pages_have_what_is_kept(pages: Any) -> None:
     assert pages.findings_table(found) in tables
     assert pages.answer_table(found["agents"]) in told
     assert " ".join(found["agents"]["headline"]["text"].split()) in " ".join(told.split())
+
+
+def test_the_names_of_curves_lie_above_the_panels(pages: Any) -> None:
+    figure = curves_figure(pages.kept("links")["summary"], "latency")
+    figure.draw_without_rendering()
+    [names] = figure.legends
+    assert names.get_window_extent().y0 >= max(panel.get_tightbbox().y1 for panel in figure.axes)
+    assert [text.get_text() for text in names.get_texts()] == ["late … s", "constant velocity late … s"]
 
 
 def parts(numbers: dict[str, Any]) -> list[float]:
