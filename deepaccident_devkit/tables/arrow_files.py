@@ -151,7 +151,7 @@ def streams(tables: Sequence[tuple[TableSpec, Columns]], metadata: Mapping[str, 
     """The rows of each table, with or without words, as compressed Arrow streams one after the other."""
     import pyarrow as pa
 
-    options = pa.ipc.IpcWriteOptions(compression="zstd", use_threads=False)  # a thread of Arrow 14 crashed here
+    options = pa.ipc.IpcWriteOptions(compression="zstd", use_threads=False)
     sink = pa.BufferOutputStream()
     for spec, columns in tables:
         with pa.ipc.new_stream(sink, arrow_schema(spec).with_metadata(dict(metadata or {})), options=options) as writer:
@@ -172,9 +172,10 @@ def read_streams(source: Any, specs: Sequence[TableSpec]) -> list[dict[str, Any]
     """Of each table stored column → values, as `streams` took them; None if they are not of these tables."""
     import pyarrow as pa
 
+    options = pa.ipc.IpcReadOptions(use_threads=False)  # a scenario's rows are few
     tables = []
     for spec in specs:
-        batches = list(pa.ipc.open_stream(source))  # to the stream's end, where the next one starts
+        batches = list(pa.ipc.open_stream(source, options=options))  # to the stream's end, where the next one starts
         if len(batches) != 1 or fault_of(spec, batches[0]):
             return None
         tables.append({name: unpacked(view) for name, view in views(spec, batches[0]).items()})
