@@ -2,6 +2,7 @@
 
 How each kind of column is stored in Arrow, and how it is read back without copying, is at the end.
 The rows of some tables that are kept together, such as a scenario's, are compressed Arrow streams one after the other.
+They are few, and neither written nor read by Arrow's threads, of which some have crashed (see pyproject.toml).
 """
 
 from collections.abc import Mapping, Sequence
@@ -172,7 +173,7 @@ def read_streams(source: Any, specs: Sequence[TableSpec]) -> list[dict[str, Any]
     """Of each table stored column → values, as `streams` took them; None if they are not of these tables."""
     import pyarrow as pa
 
-    options = pa.ipc.IpcReadOptions(use_threads=False)  # a scenario's rows are few
+    options = pa.ipc.IpcReadOptions(use_threads=False)
     tables = []
     for spec in specs:
         batches = list(pa.ipc.open_stream(source, options=options))  # to the stream's end, where the next one starts

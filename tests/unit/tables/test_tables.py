@@ -1,4 +1,7 @@
-"""Every key points at a row, every chain can be walked, on both layouts."""
+"""Every key points at a row, every chain can be walked, on both layouts; streams of rows."""
+
+import subprocess
+import sys
 
 import pytest
 
@@ -66,3 +69,26 @@ def test_an_instances_first_and_last_annotation_are_by_frame_then_agent(both_lay
         for each in both_layouts.instance
     }
     assert found == {token: (len(rows), min(rows)[-1], max(rows)[-1]) for token, rows in order.items()}
+
+
+STREAMED = """
+import os
+import numpy as np
+import pyarrow
+from deepaccident_devkit.tables.arrow_files import is_streamable, numpy_dtype, read_streams, streams, width
+from deepaccident_devkit.tables.records import table_specs
+
+def values(kind):
+    return np.zeros((500, width(kind)) if width(kind) > 1 else 500, numpy_dtype(kind))
+
+specs = [spec for spec in table_specs().values() if is_streamable(spec)]
+tables = [(spec, {column.stored: values(column.kind) for column in spec.stored_columns}) for spec in specs]
+before = len(os.listdir("/proc/self/task"))
+assert len(read_streams(pyarrow.BufferReader(streams(tables)), specs)) == len(specs) > 2
+print(len(os.listdir("/proc/self/task")) - before)
+"""
+
+
+def test_streams_are_written_and_read_without_threads() -> None:
+    ran = subprocess.run([sys.executable, "-c", STREAMED], check=False, capture_output=True, text=True)
+    assert (ran.stdout, ran.stderr) == ("0\n", "")
