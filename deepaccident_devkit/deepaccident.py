@@ -193,7 +193,7 @@ class DeepAccident(Dataset):
     def __repr__(self) -> str:
         """Version, place and size."""
         return (
-            f"DeepAccident(version={self.version!r}, dataroot={str(self.dataroot)!r}): {len(self.scenario):,} "
+            f"{type(self).__name__}(version={self.version!r}, dataroot={str(self.dataroot)!r}): {len(self.scenario):,} "
             f"scenarios, {len(self.sample):,} samples, {len(self.annotation):,} annotations"
         )
 

@@ -105,6 +105,10 @@ class SplitFileError(ReleaseError):
     """A split file cannot be read, or puts a scenario into two splits."""
 
 
+class SourceError(ReleaseError):
+    """A source's axes, ground or cameras are not those that the devkit means."""
+
+
 class BrokenReleaseError(ReleaseError):
     """Indexing found broken scenarios; the message lists every one of them."""
 

@@ -23,6 +23,7 @@ NEEDS: Final[Mapping[str, tuple[str, ...]]] = {
 """A room, or a module of one → the other rooms that it stands on; pyproject.toml holds all others to none."""
 _RESULT: Final = "safety.prevention_result"
 ADDED: Final[Mapping[str, Mapping[str, str]]] = {
+    "check": {"source": "nuscenes.check:check_source"},
     "field": dict.fromkeys(("min_ttc", "min_pet", "min_gap", "max_drac"), "interactions.scenario:each_of_moving_pairs"),
     "figures": {"prevented": "safety.prevention_figures:prevention_figures"},
     "method": {
@@ -51,6 +52,8 @@ ADDED: Final[Mapping[str, Mapping[str, str]]] = {
         "ground_at": "maps.pictures:ground_at",
         "map": "maps.pictures:map_beneath",
     },
+    "opener": {"nuscenes": "nuscenes.source:open_nuscenes"},
+    "writer": {"nuscenes": "nuscenes.results:write_detections"},
     "result": {"prevented": "safety.prevention:PREVENTED"},
     "table": {"interactions": "interactions.scenario:least_times"},
     "verb": {
@@ -58,6 +61,7 @@ ADDED: Final[Mapping[str, Mapping[str, str]]] = {
         "demo": "synth.demo:demo",
         "explore": "explore.cli:explore",
         "predict": "baselines.cli:predict",
+        "rigs": "nuscenes.cli:rigs",
         "safety": "safety.cli:safety",
         "study": "study.cli:study",
         "synth": "synth.cli:synth",
@@ -65,9 +69,9 @@ ADDED: Final[Mapping[str, Mapping[str, str]]] = {
         "train": "model.cli:train",
     },
 }
-"""Kind → name → where it is. `field`: of queries; `result`: of evaluations, beside their own, with its `figures`;
-`method`: of the facade; `name`: of a core module; `picture`: of `render`; `table`: of `statistics`; `verb`: of the
-command line."""
+"""Kind → name → where it is. `check`, `opener` and `writer`: of dataroots and results of nuScenes; `field`: of queries;
+`result`: of evaluations, beside their own, with its `figures`; `method`: of the facade; `name`: of a core module;
+`picture`: of `render`; `table`: of `statistics`; `verb`: of the command line."""
 
 
 def added(kind: str, name: str) -> Any:

@@ -91,6 +91,7 @@ REFERENCE = {
         "export.nuscenes.detections",
     ),
     "The model": ("model",),
+    "nuScenes": ("nuscenes", "nuscenes.items.NuScenesDataset", "nuscenes.check", "nuscenes.rigs", "nuscenes.results"),
     "Studies": ("study",),
     "The explorer": ("explore",),
 }

@@ -4,6 +4,8 @@
 """
 
 import tempfile
+from importlib.util import find_spec
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -11,17 +13,24 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
+from PIL import Image
 
 from benchmarks.pages.labels import ACTORS, CLEAN, COLLIDING, RELEASE, RELEASED, STEP, turn
 from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.export.bulk import export_release
+from deepaccident_devkit.export.nuscenes import NuScenes
 from deepaccident_devkit.geometry import Boxes
+from deepaccident_devkit.nuscenes import open_nuscenes
+from deepaccident_devkit.nuscenes.rig_figures import rigs_figure
+from deepaccident_devkit.nuscenes.rigs import rig_report
 from deepaccident_devkit.render import detached_figure, draw_motion_map, styles
 from deepaccident_devkit.render.boxes import draw_boxes_from_above
 from deepaccident_devkit.render.camera import best_view
-from deepaccident_devkit.render.figures import save_picture
+from deepaccident_devkit.render.figures import save_picture, write_figure
 from deepaccident_devkit.render.motion_maps import direction_colors
 from deepaccident_devkit.render.styles import AGENT_COLORS, COLLIDER_COLOR
 from deepaccident_devkit.synth import SynthConfig, make_release
+from deepaccident_devkit.synth.plan import RigName
 from deepaccident_devkit.synth.roads import Junction, RoadSpec
 from deepaccident_devkit.synth.roads.layout import OUTWARD
 from deepaccident_devkit.synth.spec import DESIGN_NUMBERS, read_design
@@ -43,6 +52,9 @@ KEY_STEP, KEY_ROW = 15.0, 7.0
 SEEDS = {1: 1, 2: 7, 3: 7, 4: 5, 5: 3, 6: 4, 7: 6, 8: 11, 9: 12, 10: 3, 11: 7, 12: 2}
 """Of a draw of each design in the daytime."""
 DESIGN_FRAMES = 25
+RIGS: tuple[RigName, ...] = ("released", "road")
+BOTH = SynthConfig(scenarios=2, frames=31, image_size=(480, 270), sensor_step=5, seed=4, designed=True)
+"""Shown as it is, and as nuScenes: from its first frame to its last, each fifth one has images."""
 FRAMES_BEFORE = 7
 """Of the impact, when the pictures are taken."""
 COLUMNS = 4
@@ -66,6 +78,9 @@ def render_all(images: Path) -> None:
     with tempfile.TemporaryDirectory() as folder:
         release = DeepAccident(dataroot=make_release(Path(folder) / "release", RELEASE), verbose=False)
         draw_labels(release, images / "motion_labels.png")
+        draw_rigs(Path(folder), images / "rigs.webp")
+        if find_spec("nuscenes") is not None:  # which has an environment of its own (docs/nuscenes.md)
+            draw_both_sources(Path(folder), images / "road.webp")
     draw_turn("instance", range(5), images / "labels_released_clean.png")
     draw_turn("flow", range(4), images / "labels_released_clean_flow.png")
     draw_half_cell(images / "labels_half_cell.png")
@@ -285,6 +300,35 @@ def draw_labels(release: DeepAccident, path: Path) -> None:
     figure = release.render_motion_labels(sample, fig=detached_figure((16.5, 12)))
     figure.axes[0].set(xlim=(-22, 33), ylim=(-28, 27))
     figure.savefig(path, dpi=72)
+
+
+def draw_rigs(folder: Path, path: Path) -> None:
+    """The two rigs of the generator."""
+    made = [
+        make_release(folder / name, SynthConfig(rig=name, frames=3, image_size=(64, 36), designed=True))
+        for name in RIGS
+    ]
+    report = rig_report(*(DeepAccident(dataroot=each, verbose=False) for each in made))
+    write_figure(rigs_figure(report), path, dpi=110)
+
+
+def draw_both_sources(folder: Path, path: Path) -> None:
+    """The same moment of a release, and of its export as the nuScenes devkit reads it."""
+    release = DeepAccident(dataroot=make_release(folder / "ours", BOTH), verbose=False)
+    export_release(release, folder / "nuscenes", NuScenes(agents=AGENTS[:1], lidar_axes="nuscenes"))
+    accident = next(scenario["token"] for scenario in release.scenario if scenario["collision"])
+    sources = {
+        accident: release,
+        f"nuscenes/{accident.replace('/', '-')}-ego_vehicle": open_nuscenes(folder / "nuscenes"),
+    }
+    pictures = []
+    for scenario, source in sources.items():
+        content = BytesIO()
+        source.render_sample(source.get_sample(scenario, "ego_vehicle", frame=BOTH.frames - 10)).savefig(
+            content, dpi=60
+        )
+        pictures.append(np.asarray(Image.open(content).convert("RGB")))
+    Image.fromarray(np.concatenate(pictures)).save(path, quality=85)
 
 
 def draw_turn(name: Any, frames: range, path: Path) -> None:

@@ -56,7 +56,7 @@ def test_a_broken_release_is_listed_and_may_be_skipped(own_release: Path) -> Non
 
 
 OF_FILES = ("--version", "--workers", "--scheduler")
-NOT_OF_ALL = {"validate": OF_FILES, "train": (), "explore": (), "results": ()}
+NOT_OF_ALL = {"validate": OF_FILES, "train": (), "explore": (), "results": (), "rigs": ()}
 """Verb on a release → the options of a release that it has; those that are left out run in one process, say."""
 
 
@@ -73,7 +73,7 @@ def test_all_verbs_have_one_grammar_and_a_help_that_says_everything() -> None:
         if " DATAROOT" in text.splitlines()[0]:
             for name in NOT_OF_ALL.get(words[-1], (*OF_FILES, "--index-dir", "--on-error")):
                 assert f"  {name} " in (options if name in OF_FILES[:2] else advanced), words
-    assert len({words[0] for words, _ in commands(deepaccident) if words}) == 18
+    assert len({words[0] for words, _ in commands(deepaccident) if words}) == 19
 
 
 def test_versions_for_a_report() -> None:

@@ -47,6 +47,7 @@ WORDS_A_MINUTE = 200
 PAGES = [TOP / "README.md", *sorted(DOCS.glob("*.md")), *sorted((TOP / "schema").glob("**/*.md"))]
 RUN_ELSEWHERE = {
     "docs/clusters.md": "tests/engines/test_page.py",
+    "docs/nuscenes.md": "tests/road/test_commands.py",
     "docs/pictures.md": "tests/unit/export/test_mcap.py",
     "docs/synth.md": "tests/unit/synth/test_synth_page.py",
     "docs/testing.md": "tests/unit/testing/test_page.py",
@@ -79,6 +80,10 @@ NOT_RUN = {
     "evaluate motion hidden_release": "likewise",
     "evaluate warning DATAROOT --results all_": "of what these predict; tests/test_cli_evaluate.py has their like",
     "results ": "tests/unit/export/nuscenes/test_detections.py has it, and makes the file",
+    "rigs data/": "tests/road/test_commands.py has it and its like; they need the nuScenes devkit",
+    "render sample data/": "likewise",
+    "evaluate motion data/": "likewise",
+    "evaluate detection data/": "likewise",
     "export mcap": "tests/unit/export has it, which has the extra",
     "explore ": "tests/browser/test_explore.py has it; it runs until Ctrl-C",
 }

@@ -16,7 +16,19 @@ from deepaccident_devkit.errors import MissingRoomError
 
 TESTS = Path(__file__).parent
 PACKAGE = Path(deepaccident_devkit.__file__).parent
-RING = ("audit", "baselines", "explore", "interactions", "maps", "model", "safety", "study", "synth", "testing")
+RING = (
+    "audit",
+    "baselines",
+    "explore",
+    "interactions",
+    "maps",
+    "model",
+    "nuscenes",
+    "safety",
+    "study",
+    "synth",
+    "testing",
+)
 MODULES_OF_THE_CORE = 200
 ASKED = {
     "audit": ("verb('audit')",),
@@ -39,6 +51,7 @@ ASKED = {
         "verb('explore')",
     ),
     "model": ("verb('train')", "verb('predict', str(da.dataroot), str(da.dataroot), '--out', 'predicted')"),
+    "nuscenes": ("verb('rigs')",),
     "safety": ("da.describe(da.scenario[0])", "verb('safety')", "verb('explore')"),
     "study": ("verb('study')",),
     "synth": ("verb('synth')", "verb('demo')", "verb('study')"),

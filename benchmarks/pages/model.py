@@ -20,6 +20,8 @@ from deepaccident_devkit.study.summary import ALL, difference_text, number_with_
 
 KEPT: Final = TOP / "benchmarks" / "studies"
 ORDER: Final = ("agents", "boxes", "visibility", "fusions", "horizons", "links", "inputs", "overfit")
+ROAD: Final = "road"
+"""The recipe whose numbers are on the page of nuScenes."""
 SHOWN: Final = ("apa", "iou_100", "vpq_100", "map", "hidden_foreground", "false_foreground")
 """Numbers of the tables; the kept files have all."""
 ANSWER: Final = ("apa", "precision", "recall", "iou_100", "map", "hidden_foreground")
@@ -28,6 +30,7 @@ ANSWERING: Final = (
     *("labels, single", "labels, all"),
 )
 OUTCOMES: Final = {"wins": "more", "loses": "less", "not decided": "not decided"}
+ON_THE_ROAD: Final = ("vpq_100", "iou_100", "map")
 CELLS: Final = {"release": "releases", "weights": "training", "row": "prediction and evaluation"}
 Summary = Mapping[str, Any]
 
@@ -40,7 +43,8 @@ def keep(folder: Path) -> Path:
             source["spec"] = Path(source["spec"]).name
     told = json.loads(gzip.decompress((folder / "counts.json.gz").read_bytes()))
     accidents = {
-        row: {seed: counts["accident"] for seed, counts in seeds.items()} for row, seeds in told["rows"].items()
+        row: {seed: counts.get("accident", {}) for seed, counts in seeds.items()}  # nuScenes has none
+        for row, seeds in told["rows"].items()
     }
     path = KEPT / f"{summary['recipe']['name']}.json.xz"
     content = {"summary": summary, "groups": told["groups"], "accidents": accidents}
@@ -96,7 +100,8 @@ def made_text(summary: Summary) -> str:
     tested, cells = summary["groups"][ALL], summary["cells"]
     hours = {kind: sum(each["seconds"] for each in cells if each["kind"] == kind) / 3600 for kind in CELLS}
     spent = ", ".join(f"{CELLS[kind]} {each:.1f}" for kind, each in hours.items() if each)
-    seeds = sorted({seed for each in summary["rows"].values() for seed in each["groups"][ALL]["apa"]["seeds"]})
+    rows = [each["groups"][ALL] for each in summary["rows"].values()]
+    seeds = sorted({seed for numbers in rows for each in numbers.values() for seed in each["seeds"]})
     told = f"seeds {', '.join(seeds)}; " if seeds else ""
     return (
         f"{tested['samples']:,} samples of {tested['pairs']:,} pairs of an accident and its twin; {told}hours of one "
@@ -139,6 +144,27 @@ def findings_table(found: Mapping[str, Summary]) -> str:
     return table(("recipe", "difference", *heads, "of each seed"), rows)
 
 
+def road_text(summary: Summary) -> str:
+    """What came out on the road: the headline, all rows, and all differences."""
+    differences = [
+        (
+            f"`{each['row']}` less `{each['less']}`",
+            *(difference_text(each["groups"][ALL][number], number) for number in ON_THE_ROAD),
+            of_seeds(each["groups"][ALL][ON_THE_ROAD[0]], ON_THE_ROAD[0]),
+        )
+        for each in summary["comparisons"]
+    ]
+    names = [NUMBERS[number][2] for number in ON_THE_ROAD]
+    return "\n\n".join(
+        [
+            wrapped(f"**{summary['headline']['text']}**"),
+            wrapped(made_text(summary)),
+            rows_table(summary, numbers_in(ALL, ON_THE_ROAD)),
+            table(("difference", *names, f"{names[0]} of each seed"), differences),
+        ]
+    )
+
+
 def of_seeds(found: Mapping[str, Any], number: str) -> str:
     """A difference's value for each seed."""
     return ", ".join(difference_text({"value": one, "low": None}, number) for one in found["seeds"].values())
@@ -171,6 +197,7 @@ def main(_release: Path | None = None) -> None:
     put("answer", answer_table(found["agents"]))
     put("findings", findings_table(found))
     put("weights", weights_table())
+    put("road", road_text(kept(ROAD)["summary"]))
 
 
 def keep_all(folders: Iterable[str]) -> None:

@@ -12,6 +12,7 @@ from deepaccident_devkit.cli.options import (
     PATH,
     engine_of,
     model_parameters,
+    open_release,
     refuse_unused,
     release_of,
     release_parameters,
@@ -26,7 +27,7 @@ from deepaccident_devkit.evaluation.results import RESULTS_NAMES
 from deepaccident_devkit.evaluation.runs.setups import agent_of
 from deepaccident_devkit.motion.sample_labels import no_samples_text
 from deepaccident_devkit.parallel import workers_kept
-from deepaccident_devkit.rooms import need_room
+from deepaccident_devkit.rooms import added, need_room
 from deepaccident_devkit.support.files import writable_folder
 from deepaccident_devkit.support.text import choice
 from deepaccident_devkit.taxonomy import SHIPPED_WEIGHTS, VEHICLE_AGENTS
@@ -121,7 +122,7 @@ def _by_baseline(model: Any, purpose: Any, *, agents: Any, link: Link | None, ou
     folder = writable_folder(out)
     released = chosen.horizon == _RELEASED_HORIZON and options["scope"] == "accident"
     engine = engine_of(options)
-    dataset = DeepAccident(**release_of(options), **engine)
+    dataset = open_release(**release_of(options), **engine)
     tokens = _samples(dataset, purpose, "released" if released else "paper", chosen.horizon, options)
     for task in asked:
         path, own = folder / RESULTS_NAMES[task], tokens
@@ -143,7 +144,7 @@ def _by_network(model: str, purpose: Any, *, agents: Any, link: Link | None, see
 
     device = checked_device(options["device"])
     network = load_model(Path(model)).to(device)
-    dataset = DeepAccident(**release_of(options))
+    dataset = open_release(**release_of(options))
     tokens = _samples(dataset, purpose, "paper", network.config.horizon, options)
     config = PredictConfig(
         agents=agents or "all",
@@ -156,6 +157,9 @@ def _by_network(model: str, purpose: Any, *, agents: Any, link: Link | None, see
     paths = predict_results(network, dataset, tokens, options["out"], config, progress=True)
     for task, path in paths.items():
         click.echo(f"{task}: {len(tokens):,} samples in {path}")
+    if dataset.layout == "nuScenes":
+        written = added("writer", "nuscenes")(dataset, paths["detection"])
+        click.echo(f"detection, for nuScenes' own evaluation: {written}")
     if model in SHIPPED_WEIGHTS and "scored" in network.notes:
         click.echo(scores_text(network, dataset, tokens, paths["motion"]))
 

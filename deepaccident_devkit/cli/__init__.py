@@ -38,6 +38,7 @@ _VERBS: Final = {
     "predict": "Predict with a trained model, or with a baseline.",
     "render": "Render pictures, videos and replays.",
     "results": "Make results files of those of other tools.",
+    "rigs": "Compare what the vehicles of two sources carry.",
     "safety": "Look into accidents: who saw it first, when it was too late.",
     "split": "Make the official splits, or a split file of scenarios.",
     "study": "Train and compare what a recipe says.",

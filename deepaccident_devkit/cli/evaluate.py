@@ -20,6 +20,7 @@ from deepaccident_devkit.cli.options import (
     figure_style_parameter,
     json_parameter,
     on_error_parameter,
+    open_release,
     refuse_unused,
     release_of,
     release_parameters,
@@ -208,7 +209,7 @@ def _evaluate(setup: EvaluationSetup, results: Path, *, by: tuple[str, ...], as_
     }
     if out is not None:
         checked_target(out, overwrite=options["overwrite"], asked=stated)  # before the release is indexed
-    dataset = DeepAccident(**release_of(options), **engine_of(options))
+    dataset = open_release(**release_of(options), **engine_of(options))
     if options.get("threshold_from") is not None:
         threshold = chosen_threshold(options["threshold_from"], options["threshold_by"], selection.tokens(dataset))
         setup = replace(setup, switches={**setup.switches, "threshold": threshold})
@@ -308,7 +309,7 @@ def check(results: Path, dataroot: Dataroot | None, version: str, **options: Any
     click.echo(results_text(opened))
     if dataroot is None:
         return
-    dataset = DeepAccident(version, dataroot, on_error=options["on_error"], **engine)
+    dataset = open_release(dataroot, version=version, on_error=options["on_error"], **engine)
     first = next(iter(TASK_PROTOCOLS[opened.task]))
     protocol = "boxes" if opened.task == "accident" else first  # the one that takes explicit accidents
     setup = EvaluationSetup(task=opened.task, protocol=protocol, horizon=options["horizon"])

@@ -19,7 +19,16 @@ from deepaccident_devkit.cli.verbs import advanced, field_option, verb
 from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.evaluation import Resampling
 from deepaccident_devkit.evaluation.intervals import MOST_RESAMPLES
-from deepaccident_devkit.evaluation.runs import OverBytes, compare_bundles, over_bytes, read_bundle, verify_bundle
+from deepaccident_devkit.evaluation.runs import (
+    Comparison,
+    OverBytes,
+    SideBySide,
+    compare_bundles,
+    over_bytes,
+    read_bundle,
+    side_by_side,
+    verify_bundle,
+)
 from deepaccident_devkit.evaluation.runs.verification import check_repeated
 from deepaccident_devkit.release import find_release
 from deepaccident_devkit.release.store import Dataroot, open_dataroot
@@ -99,16 +108,22 @@ def compare(
 ) -> None:
     """Compare the evaluations in the folders A and B, and test which differences are statistically significant.
 
-    With MORE evaluations, show the main numbers of all over the bytes that partners send.
+    With MORE evaluations, show the main numbers of all over the bytes that partners send. Evaluations of different
+    sources, which have no scenario in common, are shown side by side, each by its own rules.
     """
     for path in out:
         if path.suffix.lower() not in _KINDS:
             raise click.BadParameter(f"--out: expected a file that ends in {', '.join(_KINDS)}, found {str(path)!r}")
-    comparison = (
-        over_bytes([a, b, *more], Resampling(resamples=resamples), common=common)
-        if more
-        else compare_bundles(a, b, Resampling(resamples=resamples), common=common)
-    )
+    comparison: SideBySide | OverBytes | Comparison
+    bundles = [read_bundle(each) for each in (a, b, *more)]
+    if not common and not set.intersection(*(set(each.scenarios()) for each in bundles)):
+        comparison = side_by_side(bundles)
+        if any(path.suffix.lower() in PICTURE_SUFFIXES for path in out):
+            raise click.BadParameter("--out: these evaluations have no sample in common; give a file .csv or .json")
+    elif more:
+        comparison = over_bytes([a, b, *more], Resampling(resamples=resamples), common=common)
+    else:
+        comparison = compare_bundles(a, b, Resampling(resamples=resamples), common=common)
     as_text = comparison.to_json()
     for path in out:
         if path.suffix.lower() == ".csv":
@@ -116,11 +131,8 @@ def compare(
         elif path.suffix.lower() == ".json":
             write_bytes(path, as_text.encode())
         else:
-            save_picture(
-                render_over_bytes(comparison) if isinstance(comparison, OverBytes) else render_comparison(comparison),
-                path,
-                dpi=None if current_style().few else _DPI,
-            )
+            drawn: Any = render_over_bytes if isinstance(comparison, OverBytes) else render_comparison
+            save_picture(drawn(comparison), path, dpi=None if current_style().few else _DPI)
     click.echo(as_text if as_json else comparison.to_text())
     for path in out:
         click.echo(f"written: {path}", err=as_json)

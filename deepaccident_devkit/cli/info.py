@@ -9,6 +9,7 @@ import click
 from deepaccident_devkit.cli.options import (
     engine_of,
     json_parameter,
+    open_release,
     refuse_unused,
     release_parameters,
     say_report,
@@ -74,7 +75,7 @@ def info(
             "out",
             *(["statistics"] if facts else []),
         )
-    dataset = DeepAccident(**(release | {"on_error": "skip"} if facts else release))
+    dataset = open_release(**(release | {"on_error": "skip"} if facts else release))
     chosen = dataset.find(*where) if where else None
     if facts:
         from deepaccident_devkit.statistics import release_facts

@@ -6,9 +6,8 @@ from typing import Any, get_args
 import click
 
 from deepaccident_devkit.cli.agents import agent_names, agents_parameter
-from deepaccident_devkit.cli.options import engine_of, release_parameters, switches_of
+from deepaccident_devkit.cli.options import engine_of, open_release, release_parameters, switches_of
 from deepaccident_devkit.cli.verbs import WordChoice, advanced, field_option, verb
-from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.errors import NotAvailableError
 from deepaccident_devkit.motion import LABEL_PROTOCOLS, PRESETS, LabelProtocol, MotionLabelConfig, write_label_files
 from deepaccident_devkit.motion.batch_names import BatchNames
@@ -72,7 +71,7 @@ def labels(
     config = _config(options)
     chosen = agent_names(agents)
     Manifest.of(folder_path(out), config, names)  # before the release is indexed
-    dataset = DeepAccident(**options)
+    dataset = open_release(**options)
     tokens = [token for token in dataset.samples(split, purpose) if token.rsplit("/", 2)[1] in chosen]
     if not tokens:
         raise NotAvailableError(f"{split}: has no labelled samples of {', '.join(chosen)} for --samples {purpose}")

@@ -11,6 +11,9 @@ import click
 from click.core import ParameterSource
 
 from deepaccident_devkit.cli.verbs import Function, WordChoice, advanced, together
+from deepaccident_devkit.deepaccident import DeepAccident
+from deepaccident_devkit.release.layout import nuscenes_tables
+from deepaccident_devkit.rooms import added
 from deepaccident_devkit.support.files import write_bytes
 from deepaccident_devkit.support.json_text import parsed_json
 from deepaccident_devkit.taxonomy import VERSIONS, StyleName
@@ -121,6 +124,14 @@ release_parameters = together(dataroot_argument, release_options)
 def engine_of(options: Mapping[str, Any]) -> dict[str, Any]:
     """Of a verb's options, those that say what it runs on."""
     return {name: options[name] for name in ("workers", "executor")}
+
+
+def open_release(dataroot: Any, *, index_dir: Path | None = None, **how: Any) -> DeepAccident:
+    """The release that a verb is about; a dataroot of nuScenes is one, too."""
+    if isinstance(dataroot, Path) and nuscenes_tables(dataroot):
+        release: DeepAccident = added("opener", "nuscenes")(dataroot, index_dir)
+        return release
+    return DeepAccident(dataroot=dataroot, index_dir=index_dir, **how)
 
 
 def release_of(options: Mapping[str, Any]) -> dict[str, Any]:

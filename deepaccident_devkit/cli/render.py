@@ -12,6 +12,7 @@ from deepaccident_devkit.cli.agents import cooperating_parameter, link_parameter
 from deepaccident_devkit.cli.options import (
     PATH,
     frame_range_parameter,
+    open_release,
     pixel_size,
     refuse_unused,
     release_parameters,
@@ -21,7 +22,6 @@ from deepaccident_devkit.cli.options import (
 from deepaccident_devkit.cli.render_targets import picture_paths, rows_to_draw
 from deepaccident_devkit.cli.verbs import Verb, WordChoice, advanced, together, verb
 from deepaccident_devkit.dataset import Dataset
-from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.evaluation.results import read_results
 from deepaccident_devkit.render.accident import COUNTDOWN, render_accident
 from deepaccident_devkit.render.actors import render_annotation, render_instance
@@ -317,7 +317,7 @@ def _verb(name: str, picture: _Picture) -> click.Command:
         choices = {option: value for option, value in options.items() if value is not None}
         if not tokens and "results" in choices:
             tokens = read_results(choices["results"]).tokens[:1]
-        dataset = DeepAccident(**release)
+        dataset = open_release(**release)
         rows = rows_to_draw(dataset, picture.of, tokens, frames, picture.channels, latency=choices.get("latency", 0.0))
         looks = [word for word in styles if word in picture.styles]
         if looks:
@@ -378,7 +378,7 @@ def video(
     """
     release = {option: options.pop(option) for option in _RELEASE}
     check_target(out, size=options["size"], fps=options["fps"])  # before the release is indexed
-    dataset = DeepAccident(**release)
+    dataset = open_release(**release)
     path = render_scenario_video(
         dataset,
         scenario or default_scenario(dataset),
@@ -406,6 +406,6 @@ def replay(scenario: str | None, out: str, results: str | None, agents: tuple[st
     15 MB.
     """
     prediction = None if results is None else read_results(results)  # before the release is indexed
-    dataset, chosen = DeepAccident(**release), names_or_configuration(agents)
+    dataset, chosen = open_release(**release), names_or_configuration(agents)
     path = render_replay(dataset, scenario, out, prediction=prediction, agents=chosen, progress=True)
     click.echo(f"written: {path}, {path.stat().st_size / 1e6:.1f} MB; open it in a browser")

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 import operator
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import accumulate
 from math import gcd
-from typing import Any, Final, Literal, SupportsIndex, get_args
+from typing import Any, Final, Literal, NamedTuple, SupportsIndex, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -24,6 +25,42 @@ ImageDtype = Literal["float32", "uint8"]
 Decoding = Literal["full", "scaled"]
 _NO_MEAN: Final = (0.0, 0.0, 0.0)
 _NO_STD: Final = (1.0, 1.0, 1.0)
+
+
+class VirtualCamera(NamedTuple):
+    """A pinhole camera that takes the place of another one, with its pose: cameras of two rigs then look alike.
+
+    The image is scaled until its focal length is this one, to a whole pixel of its size, and moved by whole pixels
+    until its principal point is in the middle; what the camera did not see is black. So K is exact, and a little off
+    what is asked for.
+
+    Attributes:
+        focal: focal length, pixels.
+        height: of the image, pixels.
+        width: of the image, pixels.
+    """
+
+    focal: float
+    height: int
+    width: int
+
+    def taken(self, image: ByteArray, lens: PinholeCamera, decode: Decoding) -> tuple[ByteArray, FloatArray]:
+        """The image (height, width, 3) of a camera's whole one, and its K."""
+        height = max(round(lens.height * self.focal / lens.intrinsic[1, 1]), 1)
+        width = max(round(lens.width * self.focal / lens.intrinsic[0, 0]), 1)
+        intrinsic = lens.resized(width, height).intrinsic.copy()
+        left, top = np.rint(intrinsic[:2, 2] - (self.width / 2, self.height / 2)).astype(int).tolist()
+        intrinsic[:2, 2] -= (left, top)
+        result = np.zeros((3, self.height, self.width), dtype=np.uint8).transpose(1, 2, 0)
+        rows, columns = (
+            slice(max(first, 0), min(first + shown, whole))
+            for first, shown, whole in ((top, self.height, height), (left, self.width, width))
+        )
+        if rows.start < rows.stop and columns.start < columns.stop:
+            part = (rows.start, columns.start, rows.stop - rows.start, columns.stop - columns.start)
+            seen = resized_part(image, (height, width), part, decode)
+            result[rows.start - top : rows.stop - top, columns.start - left : columns.stop - left] = seen
+        return result, intrinsic
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -42,6 +79,7 @@ class ImageConfig:
             JPEG at the smallest of 1/1, 1/2, 1/4 and 1/8 that is no smaller than `resize` and resizes as OpenCV's area
             filter. A pixel is at most 1 of 255 from what these libraries make, but where `scaled` shrinks one axis and
             grows the other, for which OpenCV has another filter.
+        virtual_camera: in place of `resize` and `crop`: the pinhole camera that all images look as if taken by.
     """
 
     resize: tuple[int, int] | None = None
@@ -51,6 +89,7 @@ class ImageConfig:
     std: tuple[float, float, float] = _NO_STD
     cameras: tuple[str, ...] = CAMERAS
     decode: Decoding = "full"
+    virtual_camera: VirtualCamera | None = None
 
     def __post_init__(self) -> None:
         """Check every field, and convert sequences to tuples."""
@@ -68,6 +107,12 @@ class ImageConfig:
         if self.dtype == "uint8" and (self.mean, self.std) != (_NO_MEAN, _NO_STD):
             raise ConfigError("mean and std: uint8 images are not scaled; choose dtype='float32', or leave them out")
         self._set("cameras", _cameras(self.cameras))
+        if self.virtual_camera is not None:
+            focal, *size = self.virtual_camera
+            height, width = _pixels("virtual_camera", size, "height and width", (1, 1))
+            self._set("virtual_camera", VirtualCamera(focal, height, width))
+            if not 0 < focal < math.inf or (self.resize, self.crop) != (None, None):
+                raise ConfigError("virtual_camera: expected a focal length above 0, and no resize or crop beside it")
 
     def _set(self, name: str, value: object) -> None:
         object.__setattr__(self, name, value)
@@ -85,6 +130,9 @@ class ImageConfig:
             ConfigError: the crop reaches beyond the image.
         """
         lens = dataset.camera(camera)
+        if self.virtual_camera is not None:
+            image = dataset.load_image(camera)
+            return self.virtual_camera.taken(image, lens.resized(image.shape[1], image.shape[0]), self.decode)
         if self.resize is not None:
             image = dataset.load_image(camera, least=self.resize if self.decode == "scaled" else None)
             return resized_part(image, self.resize, self.crop, self.decode), self.intrinsic(lens, self.resize)

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
         scores_text,
     )
     from deepaccident_devkit.model.training_loop import train
-    from deepaccident_devkit.model.training_run import TrainConfig, checked_device
+    from deepaccident_devkit.model.training_run import SecondSource, TrainConfig, checked_device
 
 _HOMES = {
     **dict.fromkeys(("Loaded", "Weights", "load_weights", "read_weights", "write_weights"), "checkpoint"),
@@ -40,8 +40,7 @@ _HOMES = {
     **dict.fromkeys(("ModelConfig", "Predictions", "V2XFormer"), "network"),
     **dict.fromkeys(("PRESETS", "ModelChoice", "load_model"), "presets"),
     **dict.fromkeys(("PredictConfig", "SamplePrediction", "predict_results", "predictions", "scores_text"), "results"),
-    "TrainConfig": "training_run",
-    "checked_device": "training_run",
+    **dict.fromkeys(("SecondSource", "TrainConfig", "checked_device"), "training_run"),
     "train": "training_loop",
 }
 """Public name → its module."""
@@ -55,6 +54,7 @@ __all__ = [
     "PredictConfig",
     "Predictions",
     "SamplePrediction",
+    "SecondSource",
     "TrainConfig",
     "V2XFormer",
     "Weights",

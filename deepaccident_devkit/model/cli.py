@@ -10,15 +10,17 @@ from deepaccident_devkit.cli.options import (
     PATH,
     figure_style_parameter,
     model_parameters,
+    open_release,
     reader_parameters,
+    refuse_unused,
     release_of,
     use_threads_sparingly,
 )
 from deepaccident_devkit.cli.verbs import WordChoice, advanced, verb
-from deepaccident_devkit.deepaccident import DeepAccident
+from deepaccident_devkit.rooms import added
 from deepaccident_devkit.taxonomy import ModelFusion, ModelPreset
 
-_CHOICE = ("preset", "fusion", "horizon")
+_CHOICE = ("preset", "fusion", "horizon", "focal", "labels")
 _TRAINING = ("steps", "moments", "egos", "split", "validation", "samples", "seed", "bf16")
 _EXAMPLES = """\b
 Examples:
@@ -40,6 +42,16 @@ Examples:
     "--fusion", type=WordChoice(get_args(ModelFusion)), help="How the agents' maps are joined.  [default: the preset's]"
 )
 @click.option("--horizon", type=float, help="How many seconds to predict, in steps of 0.5.  [default: 2]")
+@advanced(
+    "--focal",
+    type=float,
+    help="Focal length in pixels of the virtual camera that all images look as if taken by.  [default: their own]",
+)
+@advanced(
+    "--labels",
+    type=WordChoice(["fiery"]),
+    help="Motion labels by FIERY's rules, as nuScenes is evaluated with.  [default: the preset's]",
+)
 @cooperating_parameter("Agents that cooperate with each ego", "all")
 @click.option("--split", default="train", show_default=True, help="Name of a split, or a split file (.txt).")
 @click.option(
@@ -65,6 +77,8 @@ Examples:
     type=PATH,
     help="Run or file of weights to begin from, `tiny`, `tiny_lidar`, or a checkpoint of the release, BEVerse or Swin.",
 )
+@click.option("--also", type=PATH, metavar="DATAROOT", help="Another release, or nuScenes, to learn from too.")
+@click.option("--mix", type=float, default=0.5, show_default=True, help="Share of the moments that are from --also.")
 @advanced(
     "--freeze", multiple=True, metavar="NAME", help="Do not train parameters whose names begin so; you can repeat this."
 )
@@ -72,13 +86,15 @@ Examples:
 @advanced("--bf16", is_flag=True, help="Compute in bfloat16, on GPUs.")
 @figure_style_parameter
 @click.option("--out", required=True, type=PATH, metavar="RUN", help="Folder of weights, log and curves.")
-def train(weights: Path | None, **options: Any) -> None:
-    """Train the model on the release in DATAROOT.
+def train(weights: Path | None, also: Path | None, mix: float, **options: Any) -> None:
+    """Train the model on the release in DATAROOT, or on nuScenes.
 
     If the command is interrupted or killed, the same command goes on from the last checkpoint.
     """
+    if also is None:
+        refuse_unused("without --also", "mix")
     use_threads_sparingly()
-    from deepaccident_devkit.model import ModelChoice, TrainConfig
+    from deepaccident_devkit.model import ModelChoice, SecondSource, TrainConfig
     from deepaccident_devkit.model import train as train_model
 
     validation = options["validation"]
@@ -89,7 +105,11 @@ def train(weights: Path | None, **options: Any) -> None:
         **{**{name: options[name] for name in _TRAINING}, "validation": None if validation == "none" else validation},
     )
     choice = ModelChoice(**{name: options[name] for name in _CHOICE})
-    dataset = DeepAccident(**release_of(options))
+    dataset = open_release(**release_of(options))
+    second = None if also is None else SecondSource(dataset=open_release(also, version="v1"), mix=mix)
+    for source in (dataset, *([] if second is None else [second.dataset])):
+        if source.layout == "nuScenes":
+            added("check", "source")(source)
     best = train_model(
         dataset,
         options["out"],
@@ -99,6 +119,7 @@ def train(weights: Path | None, **options: Any) -> None:
         device=options["device"],
         workers=options["workers"] or 0,
         images_cache=options["images_cache"],
+        also=second,
         say=click.echo,
     )
     click.echo(f"weights: {best}")

@@ -7,12 +7,12 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, Any, Final, get_args
+from typing import Annotated, Any, Final, Literal, get_args
 
 import msgspec
 
 from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.export.images import ImageConfig
+from deepaccident_devkit.export.images import ImageConfig, VirtualCamera
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.model.bev import BevEncodeConfig, BevUNetConfig
 from deepaccident_devkit.model.checkpoint import load_weights, read_weights
@@ -51,6 +51,8 @@ class _Described(msgspec.Struct):
     preset: ModelPreset
     fusion: ModelFusion | None
     horizon: Annotated[float, msgspec.Meta(gt=0, lt=1000)] | None
+    focal: Annotated[float, msgspec.Meta(gt=0, lt=10_000)] | None = None
+    labels: Literal["fiery"] | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -61,15 +63,20 @@ class ModelChoice:
         preset: `released`, `tiny`, `tiny_lidar` or `tiny_both`.
         fusion: how agents are joined; None for the preset's.
         horizon: seconds that motion is predicted; None for 2.
+        focal: focal length, pixels, of the virtual camera that images look as if taken by; None for their own.
+        labels: `fiery` for motion labels by FIERY's rules, as nuScenes is evaluated with; None for the preset's.
     """
 
     preset: ModelPreset = "tiny"
     fusion: ModelFusion | None = None
     horizon: float | None = None
+    focal: float | None = None
+    labels: Literal["fiery"] | None = None
 
     def __post_init__(self) -> None:
         """Check; raises ChoiceError or ConfigError."""
         settle_choices(self, {"preset": get_args(ModelPreset), "fusion": (None, *get_args(ModelFusion))})
+        settle_choices(self, {"labels": (None, "fiery")})
         self.config  # noqa: B018 - refuses what does not go together
 
     @property
@@ -85,11 +92,16 @@ class ModelChoice:
                 motion=replace(config.motion, future_frames=frames),
                 labels=replace(config.labels, future_frames=frames),
             )
+        if self.labels is not None:
+            config = replace(config, labels=self._labels_of(config))
+        if self.focal is not None:
+            config = replace(config, cameras=self._as_if_taken(config.cameras))
         return config
 
     def as_dict(self) -> dict[str, Any]:
         """All of it, as JSON holds it."""
-        return {"preset": self.preset, "fusion": self.fusion, "horizon": self.horizon}
+        later = {name: value for name in ("focal", "labels") if (value := getattr(self, name)) is not None}
+        return {"preset": self.preset, "fusion": self.fusion, "horizon": self.horizon, **later}  # older runs lack these
 
     @classmethod
     def from_dict(cls, described: Mapping[str, Any], path: Path) -> ModelChoice:
@@ -105,6 +117,24 @@ class ModelChoice:
                 f"{path}: does not say which model its weights are of ({error}); give weights of deepaccident train, "
                 "or begin a training from these: deepaccident train --from"
             ) from error
+
+    def _labels_of(self, config: ModelConfig) -> MotionLabelConfig:
+        given = config.labels
+        return MotionLabelConfig.preset(
+            "fiery",
+            grid=given.grid,
+            orientation=given.grid.orientation,
+            receptive_field=given.receptive_field,
+            future_frames=given.future_frames,
+        )
+
+    def _as_if_taken(self, cameras: CameraConfig | None) -> CameraConfig:
+        if cameras is None:
+            raise ConfigError("focal: the model has no cameras; leave it out")
+        images = cameras.images
+        size = images.crop[2:] if images.crop is not None else images.resize or (0, 0)
+        virtual = VirtualCamera(self.focal or 0, *size)
+        return replace(cameras, images=replace(images, resize=None, crop=None, virtual_camera=virtual))
 
     def _frames(self, config: ModelConfig) -> int:
         step = config.labels.step * FRAME_PERIOD

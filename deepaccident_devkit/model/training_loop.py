@@ -27,6 +27,7 @@ from deepaccident_devkit.model.results import PredictConfig, check_sensors
 from deepaccident_devkit.model.training_run import (
     Place,
     Progress,
+    SecondSource,
     TrainConfig,
     add_to_log,
     cut_log,
@@ -37,6 +38,7 @@ from deepaccident_devkit.model.training_run import (
 )
 from deepaccident_devkit.model.training_step import (
     SCORE,
+    MixedMoments,
     Moments,
     TrainingStep,
     batches,
@@ -44,7 +46,6 @@ from deepaccident_devkit.model.training_step import (
     generator_of,
     learning_rate,
     optimizer_of,
-    positions,
     training_batch,
     validated,
     validation_samples,
@@ -72,6 +73,7 @@ def train(  # noqa: PLR0913 - on what, to where, what, how, from what, and on wh
     device: str = "auto",
     workers: int = 0,
     images_cache: str | os.PathLike[str] | None = None,
+    also: SecondSource | None = None,
     say: Say | None = None,
 ) -> Path:
     """Train a model; the same call goes on with a run that was stopped or killed.
@@ -88,6 +90,7 @@ def train(  # noqa: PLR0913 - on what, to where, what, how, from what, and on wh
         device: `auto`, `cpu`, `cuda`, …
         workers: processes that read; 0 for this one.
         images_cache: of `V2XConfig`.
+        also: another source to learn from, whose moments come between those of `dataset`; it is not validated.
         say: told each validation; None for silence, and no progress bar.
 
     Returns:
@@ -102,11 +105,13 @@ def train(  # noqa: PLR0913 - on what, to where, what, how, from what, and on wh
     with processes(device) as place:
         say = say if place.is_first else None
         folder = writable_folder(out)
-        moments = Moments(dataset, choice.config, config, images_cache=images_cache)
-        check_sensors(choice.config, dataset, moments.data.egos[0])
+        moments: Moments | MixedMoments = (first := _moments(dataset, choice, config, images_cache))
+        if also is not None:
+            there = replace(config, split=also.split, agents="available")  # nuScenes has no partners
+            moments = MixedMoments((first, _moments(also.dataset, choice, there, None)), also.mix)
         run = _Run(
             folder=folder,
-            notes=_notes(dataset, choice, config, weights),
+            notes=_notes(dataset, choice, config, weights) | ({"also": also.as_dict()} if also else {}),
             dataset=dataset,
             moments=moments,
             config=config,
@@ -121,6 +126,13 @@ def train(  # noqa: PLR0913 - on what, to where, what, how, from what, and on wh
         if place.is_first:
             _claim(folder, run.notes)
         return run.trained(model.to(place.device))
+
+
+def _moments(dataset: Dataset, choice: ModelChoice, config: TrainConfig, images_cache: Any) -> Moments:
+    """Those of a source that has what the model sees with."""
+    moments = Moments(dataset, choice.config, config, images_cache=images_cache)
+    check_sensors(choice.config, dataset, moments.data.egos[0])
+    return moments
 
 
 def new_model(choice: ModelChoice, config: TrainConfig, weights: str | os.PathLike[str] | None, say: Say) -> V2XFormer:
@@ -169,7 +181,7 @@ class _Run:
     folder: Path
     notes: Mapping[str, Any]
     dataset: Dataset
-    moments: Moments
+    moments: Moments | MixedMoments
     config: TrainConfig
     place: Place
     predict: PredictConfig
@@ -184,8 +196,7 @@ class _Run:
         tokens = validation_samples(self.dataset, self.config)
         if self.place.is_first:
             cut_log(self.folder, progress.step)
-        numbers = positions(
-            len(self.moments),
+        numbers = self.moments.numbers(
             self.config,
             first=progress.step * self.config.moments,
             rank=self.place.rank,

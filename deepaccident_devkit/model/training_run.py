@@ -16,6 +16,7 @@ import torch
 from torch import Tensor, distributed, nn
 from torch.optim import AdamW
 
+from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import ConfigError, shortened
 from deepaccident_devkit.model.checkpoint import LAST, OPTIMIZER, read_weights, reason_of, write_weights
 from deepaccident_devkit.motion.sample_labels import Purpose
@@ -106,6 +107,30 @@ class TrainConfig:
         """All of it, as JSON holds it."""
         agents = self.agents.name if isinstance(self.agents, AgentConfig) else self.agents
         return {**asdict(self), "agents": agents}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SecondSource:
+    """Another release, or nuScenes, to learn from beside the first.
+
+    Attributes:
+        dataset: of it.
+        split: of it.
+        mix: share of all moments that are from it.
+    """
+
+    dataset: Dataset
+    split: str = "train"
+    mix: float = 0.5
+
+    def __post_init__(self) -> None:
+        """Check the share; raises ConfigError."""
+        if not 0 < checked_number("mix", self.mix, "a number", ConfigError) < 1:
+            raise ConfigError(f"mix: expected a share between 0 and 1, found {self.mix!r}")
+
+    def as_dict(self) -> dict[str, Any]:
+        """What a run notes of it."""
+        return {"index": self.dataset.tables_folder.name, "split": self.split, "mix": self.mix}
 
 
 def _expected(name: str) -> str:

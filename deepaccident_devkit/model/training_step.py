@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import count
 from typing import Any
 
 import torch
@@ -66,8 +67,35 @@ class Moments(TorchDataset[dict[str, Any]]):
         epoch, position = divmod(number, len(self.data))
         return self.data.item(position, epoch)
 
+    def numbers(self, config: TrainConfig, **place: int) -> Iterator[Any]:
+        """The numbers of a process's moments, without end; arguments as of `positions`."""
+        return positions(len(self), config, **place)
 
-def batches(moments: Moments, numbers: Iterable[int], config: TrainConfig, *, workers: int = 0) -> DataLoader[Any]:
+
+class MixedMoments(TorchDataset[dict[str, Any]]):
+    """The moments of two sources by turns; a number says which one, and which of its moments."""
+
+    def __init__(self, sources: tuple[Moments, Moments], mix: float) -> None:
+        """Take `mix` of all moments from the second source."""
+        self.sources, self.mix = sources, mix
+        self.model, self.data = sources[0].model, sources[0].data
+
+    def __getitem__(self, number: tuple[int, int]) -> dict[str, Any]:
+        """The moment of a number."""
+        return self.sources[number[0]][number[1]]
+
+    def numbers(self, config: TrainConfig, *, first: int, rank: int = 0, ranks: int = 1) -> Iterator[tuple[int, int]]:
+        """The numbers of a process's moments, without end: each source's in its own order, spread evenly."""
+        for number in count(first * ranks + rank, ranks):
+            before = math.floor(number * self.mix)
+            source = math.floor((number + 1) * self.mix) - before
+            ahead = before if source else number - before
+            yield source, next(positions(len(self.sources[source]), config, first=ahead))
+
+
+def batches(
+    moments: Moments | MixedMoments, numbers: Iterable[Any], config: TrainConfig, *, workers: int = 0
+) -> DataLoader[Any]:
     """Batches of moments in the order of their numbers (`positions`), read by worker processes, or by this one (0)."""
     return DataLoader(
         moments,

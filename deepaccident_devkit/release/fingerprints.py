@@ -7,7 +7,7 @@ import json
 import os
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from typing import TYPE_CHECKING, Any, Final, Protocol, runtime_checkable
 
 from deepaccident_devkit.errors import ReleaseError
 from deepaccident_devkit.release.layout import ScenarioFolder, find_release, frame_numbers, frame_sizes
@@ -57,6 +57,14 @@ class Located(Protocol):
         """`v1` or `v1-mini`."""
 
 
+@runtime_checkable
+class HasTruth(Protocol):
+    """A source whose truth is not in a release's files."""
+
+    def truth_hashes(self, scenario: str) -> ScenarioHashes:
+        """The hashes of a scenario's truth; raises TokenError."""
+
+
 def scenario_hashes(dataset: Located, scenarios: Collection[str], **how: Unpack[Engine]) -> dict[str, ScenarioHashes]:
     """The hashes of some scenarios' files, by token in order; those that are not in the release are left out.
 
@@ -71,6 +79,8 @@ def scenario_hashes(dataset: Located, scenarios: Collection[str], **how: Unpack[
         DatarootError: the release's folder is gone, or one of its folders cannot be listed.
         ReleaseError: a file cannot be read.
     """
+    if isinstance(dataset, HasTruth):
+        return {token: dataset.truth_hashes(token) for token in sorted(set(scenarios))}
     from deepaccident_devkit.parallel import Places, run_batch  # here: opening a release waits for this module
 
     folders = scenario_folders(dataset, scenarios)

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from itertools import islice
 from operator import attrgetter
 from pathlib import Path
-from typing import get_args
+from typing import Final, get_args
 
 from deepaccident_devkit.errors import DatarootError, MissingFileError, SplitFileError, VersionError, shortened
 from deepaccident_devkit.release.store import Entry, ReleasePath, is_folder, leads_back, listed, read_lines
@@ -36,6 +36,8 @@ _COPY = r"(?:Copy of )?({})(?:\W.*|_*\d.*|_+(?i:copy|part|old|new|backup)\w*)?"
 """The names that browsers, drives and people give to a copy, or to a part, of a folder of some names."""
 _MOST_ASIDE = 3
 """Folders that the error of a release without scenarios names at most."""
+NUSCENES_TABLE: Final = "scene.json"
+"""A table that every version of nuScenes has."""
 _FRAME_FILE = re.compile(r"_(\d{3,})\.\w+")
 _logger = logging.getLogger(__name__)
 
@@ -133,6 +135,8 @@ def find_release(root: ReleasePath, version: str = "v1") -> ReleaseLayout:
     folders = _folders_of(root, version)
     scenarios = [scenario for folder in folders for scenario in _scenarios_in(root, folder)]
     if not scenarios:
+        if isinstance(root, Path) and nuscenes_tables(root):
+            raise DatarootError(f"{root}: is a dataroot of nuScenes; open it with nuscenes.open_nuscenes")
         aside = "".join(
             f"; {path} {f'looks like {meant}: rename it' if meant else 'is a link that leads nowhere'}"
             for path, meant in islice(left_aside(root), _MOST_ASIDE)
@@ -150,6 +154,19 @@ def find_release(root: ReleasePath, version: str = "v1") -> ReleaseLayout:
         scenarios=tuple(sorted(scenarios, key=attrgetter("token", "folder"))),
         split_files=_split_files(root),
     )
+
+
+def nuscenes_tables(dataroot: str | os.PathLike[str]) -> Path | None:
+    """The folder of nuScenes' tables in a dataroot, or this folder itself; None where there is none.
+
+    Raises VersionError: the dataroot has several versions; give the folder of one.
+    """
+    given = Path(dataroot)
+    tables = (given / NUSCENES_TABLE, *given.glob(f"v1.0*/{NUSCENES_TABLE}"))
+    found = sorted(table.parent for table in tables if table.is_file())
+    if len(found) > 1:
+        raise VersionError(f"{given}: has several versions of nuScenes; give the folder of one, such as {found[0]}")
+    return found[0].absolute() if found else None
 
 
 def _version_remedy(version: object) -> str:

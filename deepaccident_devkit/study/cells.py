@@ -50,7 +50,7 @@ from deepaccident_devkit.taxonomy import FRAME_PERIOD
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
-    from deepaccident_devkit.model import ModelChoice, TrainConfig
+    from deepaccident_devkit.model import ModelChoice, SecondSource, TrainConfig
     from deepaccident_devkit.parallel import Engine
 
 Work = Callable[[Path], dict[str, Any]]
@@ -155,9 +155,15 @@ def taken(file: Path, folder: Path) -> dict[str, Any]:
 
 
 def trained(
-    dataset: DeepAccident, choice: ModelChoice, config: TrainConfig, start: Path | None, device: str, folder: Path
+    dataset: DeepAccident,
+    choice: ModelChoice,
+    config: TrainConfig,
+    start: Path | None,
+    also: SecondSource | None,
+    device: str,
+    folder: Path,
 ) -> dict[str, Any]:
-    """The work on weights that are trained, on a release, from others or from random ones (None).
+    """The work on weights that are trained, on a release or two, from others or from random ones (None).
 
     It notes the mean loss of the last 50 steps, and the seconds of all, before a kill too.
     """
@@ -165,7 +171,7 @@ def trained(
     from deepaccident_devkit.model.training_run import one_thread, read_log
 
     with one_thread():
-        train(dataset, folder, choice, config, weights=start, device=device)
+        train(dataset, folder, choice, config, weights=start, device=device, also=also)
     log = read_log(folder)
     return {"loss": fmean(row["loss"] for row in log[-50:]), "seconds": round(sum(row["seconds"] for row in log), 1)}
 
@@ -196,6 +202,8 @@ class Counting:
             self._predict(folder)
         dataset, counts, hidden = self.dataset, {}, HiddenActors()
         for task, setup in self._setups.items():
+            if task == "accident" and dataset.layout == "nuScenes":
+                continue  # it has none
             run = evaluate_results(dataset, folder / RESULTS_NAMES[task], setup, self.selection, workers=1)
             counts[str(task)] = dict(run.evaluator.counts)
         motion, boxes = (read_results(folder / RESULTS_NAMES[task]) for task in ("motion", "detection"))

@@ -16,6 +16,7 @@ from deepaccident_devkit.study.summary import (
     Counted,
     StudyReport,
     difference_text,
+    known_numbers,
     main_numbers,
     number_with_interval,
     write_counts,
@@ -67,9 +68,9 @@ def study_html(summary: Mapping[str, Any], figures: Sequence[tuple[Path, str]]) 
             "made on": "; ".join(sorted({each["machine"] for each in summary["cells"]})),
         },
         pictures=[(read_bytes(path, "image"), f"{said} {words}", f"{said} {words}") for path, said in figures],
-        numbers=[said for _, _, said in NUMBERS.values()],
+        numbers=[NUMBERS[number][2] for number in known_numbers(summary)],
         rows=[
-            [name, *(_cell(each["groups"][ALL][number], number) for number in NUMBERS)]
+            [name, *(_cell(each["groups"][ALL][number], number) for number in known_numbers(summary))]
             for name, each in summary["rows"].items()
         ],
         comparisons=[

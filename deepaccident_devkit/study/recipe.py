@@ -26,6 +26,7 @@ from deepaccident_devkit.evaluation.runs.setups import SampleList, ScopeName
 from deepaccident_devkit.motion import MotionLabelConfig
 from deepaccident_devkit.selection.conditions import parse_where
 from deepaccident_devkit.study.numbers import NUMBERS
+from deepaccident_devkit.support.arrays import checked_flag
 from deepaccident_devkit.support.json_text import as_record
 from deepaccident_devkit.support.reading import fault_text, read_bytes
 from deepaccident_devkit.support.text import choice
@@ -36,9 +37,12 @@ from deepaccident_devkit.v2x import AGENT_SETS, Link
 
 SHIPPED: Final = Path(__file__).parent / "recipes"
 DEFAULT_HORIZON: Final = 2.0
+NUSCENES: Final = "nuscenes"
+"""Of a release that is made: whether it is put into nuScenes' format."""
 _EFFECTS: Final = ("latency", "pose_noise", "packet_loss", "budget")
 """Of a row, what its `Link` has."""
 _ALONE: Final = "file: these weights are there; leave the other keys out"
+_MIX: Final = "mix: expected a share between 0 and 1, of all moments"
 _TWICE: Final = "name: is there twice; name the keys that have lists in it, such as {agents}"
 _LISTS: Final = ("agents", "horizon", *_EFFECTS)
 """Of a row, what can be a list: a row each."""
@@ -162,12 +166,14 @@ class Recipe(_Part, frozen=True, kw_only=True):
     Attributes:
         title: of the page.
         question: that the study answers.
-        releases: name → fields of `SynthConfig`, or `dataroot` and `version` of one that is there.
+        releases: name → fields of `SynthConfig`, or `dataroot` and `version` of one that is there. With `nuscenes:
+            true` what the ego vehicle recorded is put into nuScenes' format, and opened by its devkit.
         test: on what all rows are tested.
         rows: the lines of the tables.
         seeds: of the trainings; each row of a model is one of every seed.
-        weights: name → `release` to learn from, `from` which weights above (with their model), and fields of
-            `ModelChoice` and `TrainConfig`; or `file` alone, weights as `deepaccident predict` takes them.
+        weights: name → `release` to learn from, `also` another one beside it (of which the share `mix` of all moments
+            is), `from` which weights above (with their model), and fields of `ModelChoice` and `TrainConfig`; or `file`
+            alone, weights as `deepaccident predict` takes them.
         groups: name → filters as `--where` takes them: numbers are also given of the pairs of scenarios of which one
             matches all.
         by: numbers are also given by these attributes, as `--by` takes them.
@@ -244,10 +250,11 @@ def at(path: Path | str, place: str) -> Iterator[None]:
 def source_of(source: Mapping[str, Any]) -> SynthConfig | None:
     """How a release is made; None for one that is there. Raises ConfigError, ChoiceError or ValueError."""
     own = "dataroot" in source
-    possible = ("dataroot", "version") if own else [each.name for each in dataclasses.fields(SynthConfig)]
+    possible = ("dataroot", "version") if own else [NUSCENES, *(each.name for each in dataclasses.fields(SynthConfig))]
     for key in source:
         choice("key", key, possible)
-    given = {**source, "spec": Path(source["spec"])} if source.get("spec") else source
+    given = {**source, "spec": Path(source["spec"])} if source.get("spec") else dict(source)
+    checked_flag(NUSCENES, given.pop(NUSCENES, False))
     return None if own else as_record(given, SynthConfig)
 
 
@@ -271,6 +278,11 @@ def _checked(path: Path, recipe: Recipe) -> Recipe:
             (f"weights.{name}", partial(choice, "release", plans[name].get("release"), recipe.releases))
             for name in trained
         ),
+        *(
+            (f"weights.{name}", partial(choice, "also", plans[name].get("also"), (None, *recipe.releases)))
+            for name in trained
+        ),
+        *((f"weights.{name}", partial(_refused, _MIX)) for name in trained if not 0 < plans[name].get("mix", 0.5) < 1),
         *(
             (f"weights.{name}", partial(choice, "from, which stands above", plans[name].get("from"), above[name]))
             for name in trained

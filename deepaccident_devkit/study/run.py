@@ -19,13 +19,15 @@ from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.evaluation.breakdowns import cluster_of, sample_attributes, tokens_by_value
 from deepaccident_devkit.evaluation.runs import SampleSelection
 from deepaccident_devkit.evaluation.runs.setups import release_note, scenario_of
+from deepaccident_devkit.export.bulk import export_release
+from deepaccident_devkit.export.nuscenes import NuScenes
 from deepaccident_devkit.release.fingerprints import fingerprint, scenario_hashes
-from deepaccident_devkit.rooms import need_room
+from deepaccident_devkit.rooms import added, need_room
 from deepaccident_devkit.selection import find
 from deepaccident_devkit.study.cells import Bench, Cell, Counting, make, taken, trained
 from deepaccident_devkit.study.numbers import HIDDEN
 from deepaccident_devkit.study.page import save_study
-from deepaccident_devkit.study.recipe import DEFAULT_HORIZON, Recipe, at, source_of
+from deepaccident_devkit.study.recipe import DEFAULT_HORIZON, NUSCENES, Recipe, at, source_of
 from deepaccident_devkit.study.summary import ALL, Counted, StudyReport, counted_of, summarised
 from deepaccident_devkit.support.files import writable_folder
 from deepaccident_devkit.support.json_text import as_record
@@ -33,6 +35,7 @@ from deepaccident_devkit.support.reading import file_checksum
 from deepaccident_devkit.support.text import choice, natural_order
 from deepaccident_devkit.synth import make_release
 from deepaccident_devkit.synth.generate import file_text
+from deepaccident_devkit.taxonomy import AGENTS
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -109,20 +112,34 @@ def _release(bench: Bench, name: str, recipe: Recipe, **how: Unpack[Engine]) -> 
         told = {**source, "release": release_note(dataset, _scenarios(dataset))}
     else:
         told = {**asdict(config), "spec": config.spec and file_text(config.spec)}
+        if config.rig == "released":
+            del told["rig"]  # which keys of earlier studies do not have
+        if source.get(NUSCENES):
+            told[NUSCENES] = True
     cell = bench.cell("release", name, partial(_made, source, how), **told)
     make(cell)
     return cell, _opened(source, cell.folder)
 
 
 def _opened(source: Mapping[str, Any], folder: Path | None = None) -> DeepAccident:
+    if folder is not None and source.get(NUSCENES):
+        road: DeepAccident = added("opener", "nuscenes")(folder / NUSCENES)
+        added("check", "source")(road)
+        return road
     return DeepAccident(source.get("version", "v1"), source.get("dataroot", folder), verbose=False)
 
 
 def _made(source: Mapping[str, Any], how: Any, folder: Path) -> dict[str, Any]:
     """Make a release, if it is not there: how many scenarios it has, and its fingerprint."""
     config = source_of(source)
-    if config is not None and not folder.is_dir():
+    if config is not None and not source.get(NUSCENES) and not folder.is_dir():
         make_release(folder, config, **how)
+    elif config is not None and not (folder / NUSCENES).is_dir():
+        release = folder.with_name(f"{folder.name}-release")
+        if not release.is_dir():
+            make_release(release, config, **how)
+        form = NuScenes(agents=AGENTS[:1], lidar_axes="nuscenes", sweeps=False)
+        export_release(DeepAccident("v1", release, verbose=False), folder / NUSCENES, form, **how)
     folder.mkdir(parents=True, exist_ok=True)  # of one that was there it has nothing
     dataset, engine = _opened(source, folder), {name: each for name, each in how.items() if name != "progress"}
     hashes = scenario_hashes(dataset, _scenarios(dataset), **engine)
@@ -157,7 +174,7 @@ def _seeds(
     name: str, recipe: Recipe, bench: Bench, releases: Mapping[str, _Release], others: Mapping[str, _Weights]
 ) -> _Weights:
     """The weights of one name; raises ConfigError, ChoiceError or ValueError."""
-    from deepaccident_devkit.model import ModelChoice, TrainConfig, read_weights
+    from deepaccident_devkit.model import ModelChoice, SecondSource, TrainConfig, read_weights
 
     plan = dict(recipe.weights[name])
     if "file" in plan:
@@ -166,6 +183,13 @@ def _seeds(
         return ModelChoice.from_dict(read.meta, read.path), {"": cell}
     (release, dataset), start = releases[plan.pop("release")], plan.pop("from", None)
     models, trainings = ([each.name for each in fields(kind)] for kind in (ModelChoice, TrainConfig))
+    also, mix = plan.pop("also", None), plan.pop("mix", 0.5)
+    told: dict[str, Any] = {}
+    second = None
+    if also is not None:
+        other, there = releases[also]
+        second = SecondSource(dataset=there, split=str(bench.split(_scenarios(there))), mix=mix)
+        told["also"] = {"release": other.key, "mix": mix}
     for key in plan:
         choice("key", key, [each for each in (*models, *trainings) if each != "seed"])
     inherited, starts = others[start] if start else (ModelChoice(), {})
@@ -178,11 +202,12 @@ def _seeds(
         cells[str(seed)] = bench.cell(
             "weights",
             f"{name}, seed {seed}",
-            partial(trained, dataset, model, config, None if first is None else first.folder, bench.device),
+            partial(trained, dataset, model, config, None if first is None else first.folder, second, bench.device),
             release=release.key,
             model=model.as_dict(),
             training={**config.as_dict(), "split": split.name},
             start=None if first is None else first.key,
+            **told,
         )
     return model, cells
 

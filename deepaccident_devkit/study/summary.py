@@ -87,6 +87,8 @@ def counted_of(
     for name, seeds in counts.items():
         for seed, kinds in seeds.items():
             made = rows.setdefault(name, {})[seed] = evaluators_of(told["labels"])
+            for kind in [kind for kind in made if kind not in kinds]:
+                del made[kind]  # nuScenes has no accidents
             for kind, evaluator in made.items():
                 for token, each in kinds[kind].items():
                     evaluator.add(token, each)
@@ -159,7 +161,12 @@ def difference_text(found: Mapping[str, Any], number: str) -> str:
 def main_numbers(summary: Mapping[str, Any]) -> list[str]:
     """The headline's number first, then those of `MAIN`."""
     first = [] if summary["headline"] is None else [summary["headline"]["number"]]
-    return list(dict.fromkeys([*first, *MAIN]))
+    return [name for name in dict.fromkeys([*first, *MAIN]) if name in known_numbers(summary)]
+
+
+def known_numbers(summary: Mapping[str, Any]) -> list[str]:
+    """Those of `NUMBERS` that the study has: of nuScenes none of accidents."""
+    return list(next(iter(summary["rows"].values()))["groups"][ALL])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -26,6 +26,8 @@ from deepaccident_devkit.taxonomy import META_AGENTS, ROAD_TYPES, SPLITS, TOWNS,
 
 Sensors = Literal["all", "accidents", "cameras", "none"]
 """Which sensors' files a release has: of all, those of accidents alone, the images alone, or of none."""
+RigName = Literal["released", "road"]
+"""How a vehicle's sensors are mounted, and what their optics are."""
 MAX_FRAMES = 999
 MIN_IMAGE_SIZE = (16, 9)
 IMAGE_SIZE: Final = (480, 270)
@@ -80,6 +82,8 @@ class SynthConfig:
             where `spec` or the view `hidden` asks for one certain accident.
         spec: a scenario file (docs/synth.md) to use instead of the designs; every pair is one draw from it.
         unlabelled_test: whether the test split lacks labels, BEV arrays and meta, as the real one does.
+        rig: `released`, as vehicles of the release have it; or `road`, lower sensors, with the fields of view of
+            nuScenes' cameras and images that are softer, noisier and of other colours: what stands for another dataset.
         exact: whether calib files are the same at each frame, and `num_lidar_pts` is the exact number of points. If
             not, both are a little wrong, as in the real release.
         for_released_code: whether the released code must be able to read the release: images of 1600×900, layout `A`,
@@ -100,6 +104,7 @@ class SynthConfig:
     unplanned: float = 0.1
     spec: Path | None = None
     unlabelled_test: bool = False
+    rig: RigName = "released"
     exact: bool = False
     for_released_code: bool = False
 
@@ -113,6 +118,7 @@ class SynthConfig:
         if isinstance(self.sensors, bool):
             object.__setattr__(self, "sensors", "all" if self.sensors else "none")
         words = {"layout": get_args(Layout), "sensors": get_args(Sensors), "view": (None, *get_args(View))}
+        words["rig"] = get_args(RigName)
         settle_choices(self, words, error=ConfigError)
         if len(self.pixels) != 2:
             raise ConfigError(f"image_size: expected (width, height), found {self.image_size!r}")

@@ -353,6 +353,7 @@ def _made_ready(task: _Task) -> tuple[Scenario, Rig]:
         seed=(config.seed, plan.pair, int(plan.accident)),
         sensors=cast(Sensors, config.sensors),  # never True or False once the configuration is made
         exact=config.exact,
+        name=config.rig,
     )
     return scenario, rig
 

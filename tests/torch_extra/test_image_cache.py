@@ -71,6 +71,7 @@ def test_workers_read_the_cache(da: DeepAccident, folder: Path, tokens: list[str
         ({"images": replace(IMAGES, decode="scaled")}, "has decode='full', wanted is 'scaled'"),
         ({"images_cache": "nowhere"}, "nowhere holds no cache of images"),
         ({"images": None}, "images_cache: changes nothing without images"),
+        ({"images": ImageConfig(virtual_camera=(9, 9, 9))}, "leave out the virtual camera"),
     ],
 )
 def test_what_the_cache_cannot_serve_is_refused(

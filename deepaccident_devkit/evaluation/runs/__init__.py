@@ -24,6 +24,7 @@ from deepaccident_devkit.evaluation.runs.setups import (
     default_selection,
     evaluation_store,
 )
+from deepaccident_devkit.evaluation.runs.side_by_side import SideBySide, side_by_side
 from deepaccident_devkit.evaluation.runs.text import results_text, summary_text
 from deepaccident_devkit.evaluation.runs.verification import Difference, Verification, verify_bundle
 from deepaccident_devkit.release.fingerprints import ScenarioHashes, scenario_hashes
@@ -44,6 +45,7 @@ __all__ = [
     "ResultsInfo",
     "SampleSelection",
     "ScenarioHashes",
+    "SideBySide",
     "Verification",
     "breakdowns_of",
     "checked_target",
@@ -60,6 +62,7 @@ __all__ = [
     "sample_rows",
     "save_run",
     "scenario_hashes",
+    "side_by_side",
     "summary_text",
     "verify_bundle",
     "with_prevented",

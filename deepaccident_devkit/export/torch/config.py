@@ -101,6 +101,8 @@ class V2XConfig:
         settle_choices(self, {"on_missing": get_args(OnError)})
         if self.images_cache is not None and self.images is None:
             raise ConfigError("images_cache: changes nothing without images=ImageConfig(…); give that too")
+        if self.images_cache is not None and self.images is not None and self.images.virtual_camera is not None:
+            raise ConfigError("images_cache: has images as their own cameras took them; leave out the virtual camera")
         if isinstance(self.labels, MotionLabelConfig) and self.labels.augmentation is not None:
             raise ConfigError(
                 "labels: their augmentation is that of boxes, points and poses; give V2XConfig(augmentation=…) alone"

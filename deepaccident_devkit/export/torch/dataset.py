@@ -23,7 +23,7 @@ from deepaccident_devkit.motion import Augmentation, MotionLabelConfig, bev_segm
 from deepaccident_devkit.motion.sample_labels import motion_labels_of
 from deepaccident_devkit.support.arrays import IntArray, checked_whole
 from deepaccident_devkit.tables.tokens import agent_token
-from deepaccident_devkit.taxonomy import AgentName
+from deepaccident_devkit.taxonomy import IGNORED_ID, AgentName
 from deepaccident_devkit.v2x import cooperative_boxes
 
 if TYPE_CHECKING:
@@ -72,8 +72,9 @@ class V2XDataset(TorchDataset):
 
     - `boxes` (M, 9) float32: x y z l w h yaw vx vy; z of the centre. `velocity_known` (M,) bool: False where vx and vy
       are 0 because they are not known.
-    - `categories` (M,) int64, positions in `taxonomy.CATEGORIES`. `actor_ids` (M,) int64, as in the label (−100 is the
-      agent's own row) or, for cooperative boxes, CARLA's ids; −1 is untracked.
+    - `categories` (M,) int64, positions in `taxonomy.CATEGORIES`; −1 is to be ignored: a class of another source that
+      we do not have. `actor_ids` (M,) int64, as in the label (−100 is the agent's own row) or, for cooperative boxes,
+      CARLA's ids; −1 is untracked.
 
     With `labels`, all at the present or each frame in its own ego frame, as `to_present` says:
 
@@ -226,7 +227,7 @@ class V2XDataset(TorchDataset):
         return {
             "boxes": tensor(np.nan_to_num(augmented_boxes(boxes, augmentation)), np.float32),
             "velocity_known": tensor(np.isfinite(boxes.velocity).all(axis=1)),
-            "categories": tensor(boxes.category, np.int64),
+            "categories": tensor(np.where(boxes.actor_id < IGNORED_ID, boxes.category, -1), np.int64),
             "actor_ids": tensor(boxes.actor_id),
         }
 

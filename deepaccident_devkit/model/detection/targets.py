@@ -128,7 +128,8 @@ def detection_targets(
 
     Args:
         boxes: for each of B samples (M, 9): x y z l w h yaw vx vy, ego frame, z of the centre; metres, radians, m/s.
-        categories: for each sample (M,) indices into `taxonomy.CATEGORIES`; others are left out.
+        categories: for each sample (M,) indices into `taxonomy.CATEGORIES`; others are left out. Boxes of −1 are
+            ignored: where they lie, nothing that is found is wrong.
         head: cells and slots.
         config: None for ours.
         velocity_known: for each sample (M,) bool; None where every finite velocity is known.
@@ -138,7 +139,23 @@ def detection_targets(
     """
     rules = config or TargetConfig()
     placed = _placed(boxes, categories, velocity_known, head, rules)
-    return [_task_targets(placed, task, len(boxes), head, rules) for task in range(len(head.class_slots))]
+    made = [_task_targets(placed, task, len(boxes), head, rules) for task in range(len(head.class_slots))]
+    if all(bool((each >= 0).all()) for each in categories):
+        return made
+    ignored = torch.stack([_covered(box[each < 0], head) for box, each in zip(boxes, categories, strict=True)])[:, None]
+    return [one._replace(heatmap=torch.where(ignored, one.heatmap.clamp(min=_ANYTHING), one.heatmap)) for one in made]
+
+
+def _covered(boxes: Tensor, head: DetectionConfig) -> Tensor:
+    """Which cells (H, W) have their middle in one of the boxes (M, 9)."""
+    y, x = (
+        low + step * (torch.arange(count, device=boxes.device, dtype=boxes.dtype) + 0.5)
+        for (low, _, step), count in zip((head.y, head.x), head.shape, strict=True)
+    )
+    away_x, away_y = x[None, None] - boxes[:, 0, None, None], y[None, :, None] - boxes[:, 1, None, None]
+    cosine, sine = boxes[:, 6, None, None].cos(), boxes[:, 6, None, None].sin()
+    along, across = (away_x * cosine + away_y * sine).abs(), (away_y * cosine - away_x * sine).abs()
+    return ((along <= boxes[:, 3, None, None] / 2) & (across <= boxes[:, 4, None, None] / 2)).any(dim=0)
 
 
 def _placed(
@@ -209,6 +226,8 @@ def _task_targets(placed: _Placed, task: int, samples: int, head: DetectionConfi
     return TaskTargets(heatmap.view(samples, slots, rows, columns), box, place, mask, known)
 
 
+_ANYTHING = 1 - 1e-3
+"""Of the heatmap, in cells of ignored boxes: what is found there costs less than a trillionth (`heatmap_loss`)."""
 _CLIP = 1e-4
 """Probabilities stay this far from 0 and 1."""
 

@@ -11,20 +11,39 @@ from deepaccident_devkit.geometry.se3 import trusted_se3
 from deepaccident_devkit.release import Calib
 from deepaccident_devkit.support.arrays import FloatArray
 from deepaccident_devkit.synth.actors import Actor, Actors
+from deepaccident_devkit.synth.plan import RigName
 from deepaccident_devkit.synth.sensors.scene import Scene
 from deepaccident_devkit.synth.world import World
 from deepaccident_devkit.taxonomy import CAMERAS, INFRASTRUCTURE, VEHICLE_AGENTS, AgentName
 
-ABOVE_ROOF = 0.5
-"""A vehicle's LiDAR is as high above the ego origin on the road as its label box is high, and so many metres more."""
-BELOW_LIDAR = 0.3
-"""How much lower than the LiDAR a vehicle's cameras are, metres; the pole's cameras are as high as its LiDAR."""
 POLE_LENGTH, POLE_WIDTH = 4.9373, 8.9666
 """The pole's cameras are placed as on a vehicle of this length and width (metres) with the x and y axes exchanged."""
 _CAMERA_YAW = dict(zip(CAMERAS, np.deg2rad([0.0, 55.0, -55.0, 180.0, 110.0, -110.0]).tolist(), strict=True))
 _SIDES = dict(zip(CAMERAS, ((1, 0), (1, 1), (1, -1), (-1, 0), (-1, 1), (-1, -1)), strict=True))
 """Camera → its place on the box: 1 front or left, −1 back or right, 0 neither."""
-_FIELD_OF_VIEW = {camera: float(np.deg2rad(110.0 if camera == "Camera_Back" else 70.0)) for camera in CAMERAS}
+
+
+@dataclass(frozen=True, slots=True)
+class Mount:
+    """How a vehicle's sensors are mounted.
+
+    Attributes:
+        above_roof: metres of its LiDAR above its label box, which stands on the road.
+        below_lidar: how much lower its cameras are; the pole's cameras are as high as its LiDAR.
+        field_of_view: degrees, of all cameras but the one that looks back.
+        backwards: degrees, of that one.
+    """
+
+    above_roof: float
+    below_lidar: float
+    field_of_view: float
+    backwards: float
+
+
+MOUNTS: Mapping[RigName, Mount] = {
+    "released": Mount(0.5, 0.3, 70.0, 110.0),
+    "road": Mount(0.2, 0.4, 64.6, 89.3),  # nuScenes' focal lengths: 1266 and 809 pixels of 1600
+}
 _CLEAR_OF_HULL = 0.001
 """Metres from the face of the box to a camera, so that its rays do not begin inside the vehicle's body."""
 _OPTICAL_FROM_FORWARD = SE3(conventions.camera_from_lidar(np.eye(4)))
@@ -88,29 +107,33 @@ class Agent:
 
 
 def make_agents(
-    world: World, actors: Actors, ids: Mapping[AgentName, int], image_size: tuple[int, int]
+    world: World,
+    actors: Actors,
+    ids: Mapping[AgentName, int],
+    image_size: tuple[int, int],
+    mount: Mount = MOUNTS["released"],
 ) -> tuple[Agent, ...]:
     """The five agents, in the order of `taxonomy.AGENTS`; `ids` are the actors of the four that are vehicles."""
     rows = {name: actors.row_of(ids[name]) for name in VEHICLE_AGENTS}
-    vehicles = [_vehicle(name, row, actors.all[row], image_size) for name, row in rows.items()]
+    vehicles = [_vehicle(name, row, actors.all[row], image_size, mount) for name, row in rows.items()]
     pole = Agent(
         name=INFRASTRUCTURE,
         row=None,
         box_from_ego=world.lidar_pole,
         ego_from_lidar=SE3.identity(),
-        cameras=_cameras(_pole_places(), 0.0, image_size),
+        cameras=_cameras(_pole_places(), 0.0, image_size, mount),
     )
     return (*vehicles, pole)
 
 
-def _vehicle(name: AgentName, row: int, actor: Actor, image_size: tuple[int, int]) -> Agent:
+def _vehicle(name: AgentName, row: int, actor: Actor, image_size: tuple[int, int], mount: Mount) -> Agent:
     x, y = actor.origin
     return Agent(
         name=name,
         row=row,
         box_from_ego=SE3.from_rotation(np.eye(3), (x, y, 0.0)),
-        ego_from_lidar=SE3.from_rotation(np.eye(3), (0.0, 0.0, actor.size[2] + ABOVE_ROOF)),
-        cameras=_cameras(_vehicle_places(actor), -BELOW_LIDAR, image_size),
+        ego_from_lidar=SE3.from_rotation(np.eye(3), (0.0, 0.0, actor.size[2] + mount.above_roof)),
+        cameras=_cameras(_vehicle_places(actor), -mount.below_lidar, image_size, mount),
     )
 
 
@@ -127,13 +150,16 @@ def _pole_places() -> dict[str, tuple[float, float]]:
     return {camera: (-across * POLE_WIDTH / 2, along * POLE_LENGTH / 2) for camera, (along, across) in _SIDES.items()}
 
 
-def _cameras(places: dict[str, tuple[float, float]], height: float, image_size: tuple[int, int]) -> tuple[Camera, ...]:
+def _cameras(
+    places: dict[str, tuple[float, float]], height: float, image_size: tuple[int, int], mount: Mount
+) -> tuple[Camera, ...]:
     """All cameras at x, y in the LiDAR frame and at a height above the LiDAR, metres."""
+    views = dict.fromkeys(CAMERAS, mount.field_of_view) | {"Camera_Back": mount.backwards}
     return tuple(
         Camera(
             channel,
             _OPTICAL_FROM_FORWARD @ SE3.from_yaw(_CAMERA_YAW[channel], (x, y, height)).inverse(),
-            PinholeCamera.from_field_of_view(*image_size, _FIELD_OF_VIEW[channel]),
+            PinholeCamera.from_field_of_view(*image_size, float(np.deg2rad(views[channel]))),
         )
         for channel, (x, y) in places.items()
     )

@@ -11,9 +11,9 @@ from deepaccident_devkit.release import BevImage, Calib, Labels
 from deepaccident_devkit.release.npz import TAGS
 from deepaccident_devkit.support.arrays import ByteArray, FloatArray
 from deepaccident_devkit.synth.actors import Actors
-from deepaccident_devkit.synth.plan import Sensors
+from deepaccident_devkit.synth.plan import RigName, Sensors
 from deepaccident_devkit.synth.roads import MAP_EXTENT, MAP_RESOLUTION, TERRAIN, Arm, GroundMap, tag_of_code
-from deepaccident_devkit.synth.sensors.agents import Agent, make_agents, with_single_precision
+from deepaccident_devkit.synth.sensors.agents import MOUNTS, Agent, make_agents, with_single_precision
 from deepaccident_devkit.synth.sensors.annotate import annotate
 from deepaccident_devkit.synth.sensors.lidar import AIR_OF_WEATHER, Air, Lidar, Scan, make_lidar, scan
 from deepaccident_devkit.synth.sensors.render import Studio, Surroundings, render
@@ -88,6 +88,9 @@ def _window(middle: float, radius: float) -> slice:
     return slice(min(max(low, 0), BEV_SHAPE[0]), max(min(high, BEV_SHAPE[0]), 0))
 
 
+_BLUR, _NOISE = 0.7, 0.03
+"""Pixels, and as a share of white: of the optics of the rig `road`."""
+_GAMMA, _CONTRAST, _TINT = 0.8, 0.8, np.array([1.05, 1.0, 0.88], dtype=np.float32)
 _LOOK, _LIDAR, _CAMERAS = range(3)
 """The purposes of random numbers."""
 
@@ -120,6 +123,7 @@ class Rig:
         studio: it makes the images; None if there are none.
         seed: seed of all noise, so that the noise of a moment does not depend on what was recorded before.
         exact: whether calib files are ideal, and numbers of points exact.
+        name: of how it is mounted, and of its optics (`plan.SynthConfig`).
     """
 
     setting: Setting
@@ -130,6 +134,7 @@ class Rig:
     studio: Studio | None
     seed: tuple[int, ...]
     exact: bool
+    name: RigName = "released"
 
     def scene(self, time: float) -> Scene:
         """The scene at a time, seconds since the first recorded frame."""
@@ -162,13 +167,14 @@ class Rig:
         rng = self._random(_CAMERAS, frame, agent)
         ground_from_lidar = agent.ground_from_lidar(scene)
         for camera in agent.cameras:
-            yield camera.channel, render(scene, around, camera, ground_from_lidar @ camera.lidar_from_camera, rng)
+            picture = render(scene, around, camera, ground_from_lidar @ camera.lidar_from_camera, rng)
+            yield camera.channel, picture if self.name == "released" else _by_other_optics(picture, rng)
 
     def _random(self, purpose: int, frame: int, agent: Agent) -> np.random.Generator:
         return np.random.default_rng([*self.seed, purpose, frame, AGENTS.index(agent.name)])
 
 
-def make_rig(
+def make_rig(  # noqa: PLR0913 - where, who, under which sky, and what is recorded how
     world: World,
     actors: Actors,
     ids: Mapping[AgentName, int],
@@ -178,6 +184,7 @@ def make_rig(
     seed: tuple[int, ...],
     sensors: Sensors = "all",
     exact: bool = False,
+    name: RigName = "released",
 ) -> Rig:
     """The sensors of a scenario; `ids` are the actors of the four agents that are vehicles.
 
@@ -186,7 +193,7 @@ def make_rig(
     """
     weather, time_of_day = sky
     setting = Setting(world, actors)
-    agents = make_agents(world, actors, ids, image_size)
+    agents = make_agents(world, actors, ids, image_size, MOUNTS[name])
     rng = np.random.default_rng([*seed, _LOOK])
     return Rig(
         setting=setting,
@@ -197,4 +204,15 @@ def make_rig(
         studio=None if sensors == "none" else Studio(setting, weather, time_of_day, rng),
         seed=seed,
         exact=exact,
+        name=name,
     )
+
+
+def _by_other_optics(picture: ByteArray, rng: np.random.Generator) -> ByteArray:
+    """A picture (H, W, 3) that is softer, warmer, of less contrast, and noisier."""
+    import cv2
+
+    soft = cv2.GaussianBlur(picture, (0, 0), _BLUR).astype(np.float32) / 255
+    toned = (soft**_GAMMA - 0.5) * _CONTRAST + 0.5
+    noise = rng.standard_normal(picture.shape, dtype=np.float32) * _NOISE
+    return np.asarray(np.clip(np.rint((toned * _TINT + noise) * 255), 0, 255), dtype=np.uint8)

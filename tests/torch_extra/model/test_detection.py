@@ -305,3 +305,34 @@ def suppressed_by(*nms: NmsConfig) -> object:
 )
 def test_what_cannot_be_is_refused(make: Callable[[], object], sentence: str) -> None:
     assert_refused((make, DeepAccidentError, sentence))
+
+
+# --- boxes that are ignored
+
+
+@HEADS
+def test_what_is_found_on_ignored_boxes_is_not_wrong(config: DetectionConfig) -> None:
+    """Their cells cost nothing; all others, and all boxes of our classes, are as without them."""
+    boxes, categories = random_boxes(3, 6)
+    bus = torch.tensor([[1.0, -2.0, 0.0, 5.0, 3.0, 2.0, 0.6, 0.0, 0.0]])
+    plain = detection_targets([boxes], [categories], config)
+    ignoring = detection_targets([torch.cat([boxes, bus])], [torch.cat([categories, torch.tensor([-1])])], config)
+    maps = CenterHead(config)(features_of(config, 1))
+    covered = torch.zeros(config.shape, dtype=torch.bool)
+    for task, other in zip(plain, ignoring, strict=True):
+        assert same(task.box, other.box)
+        assert same(task.mask, other.mask)
+        assert same(task.heatmap == 1, other.heatmap == 1)
+        covered |= (task.heatmap != other.heatmap)[0].any(dim=0)
+    assert 10 <= int(covered.sum()) <= 20  # 15 square metres, in cells of a metre
+    rows, columns = covered.nonzero().T
+    place = torch.stack([columns - 7.5, rows - 5.5], dim=1) - bus[0, :2]
+    turn = torch.tensor([[math.cos(0.6), math.sin(0.6)], [-math.sin(0.6), math.cos(0.6)]])
+    assert ((place @ turn.T).abs() <= torch.tensor([2.5, 1.5])).all()
+    shouting = [one._replace(heatmap=torch.where(covered, one.heatmap + 9, one.heatmap)) for one in maps]
+    quiet, loud, counted = (
+        detection_losses(given, wanted)["task0.loss_heatmap"].item()
+        for given, wanted in ((maps, ignoring), (shouting, ignoring), (shouting, plain))
+    )
+    assert loud == pytest.approx(quiet, rel=1e-5)
+    assert counted > 1.5 * loud

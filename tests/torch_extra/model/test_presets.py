@@ -158,3 +158,20 @@ def small_with(**lift: Any) -> CameraConfig:
 )
 def test_parts_that_do_not_fit_are_named(changes: dict[str, Any], message: str) -> None:
     assert_refused((lambda: replace(small(), **changes), ConfigError, message))
+
+
+def test_a_virtual_camera_and_fierys_labels_are_noted_where_they_are_chosen(tmp_path: Path) -> None:
+    assert ModelChoice().as_dict() == {"preset": "tiny", "fusion": None, "horizon": None}  # as runs before noted it
+    choice = ModelChoice(focal=100.0, labels="fiery", horizon=1.0)
+    assert ModelChoice.from_dict(choice.as_dict(), tmp_path) == choice
+    config = choice.config
+    assert config.cameras.images == ImageConfig(virtual_camera=(100.0, 90, 160), dtype="uint8", decode="scaled")
+    assert (config.labels.protocol, config.labels.future_frames, config.labels.only_vehicle) == ("fiery", 2, True)
+    assert (config.labels.grid, config.labels.receptive_field) == (tiny().labels.grid, tiny().labels.receptive_field)
+    virtual = ModelChoice(preset="released", focal=500.0).config.cameras.images.virtual_camera
+    assert tuple(virtual) == (500.0, 256, 704)
+
+
+def test_a_model_without_cameras_has_no_focal_length() -> None:
+    with pytest.raises(ConfigError, match=r"focal: the model has no cameras"):
+        ModelChoice(preset="tiny_lidar", focal=100.0)

@@ -13,6 +13,7 @@ from dataclasses import replace
 from functools import partial
 from itertools import islice, product
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from unittest.mock import patch
 
@@ -42,6 +43,7 @@ from deepaccident_devkit.model.training_run import (
     read_log,
 )
 from deepaccident_devkit.model.training_step import (
+    MixedMoments,
     Moments,
     TrainingStep,
     batches,
@@ -117,6 +119,24 @@ def test_processes_share_each_epoch_and_go_on_in_its_middle(count: int, ranks: i
     for rank, part in enumerate(parts):
         rest = list(islice(positions(count, config, first=first, rank=rank, ranks=ranks), length))
         assert rest[: max(length - first, 0)] == part[first:]
+
+
+@given(st.integers(1, 9), st.integers(1, 9), st.floats(0.05, 0.95), st.integers(0, 40), st.integers(1, 3))
+def test_two_sources_come_by_turns_each_in_its_own_order(
+    one: int, other: int, mix: float, first: int, ranks: int
+) -> None:
+    config = TrainConfig(seed=3)
+    sources = [type("Counted", (SimpleNamespace,), {"__len__": lambda _, count=count: count})(model=None, data=None)
+               for count in (one, other)]  # fmt: skip
+    moments = MixedMoments((sources[0], sources[1]), mix)
+    whole = list(islice(moments.numbers(config, first=0), 60 * ranks))
+    assert abs(sum(source for source, _ in whole) - mix * len(whole)) <= 1
+    for source, count in enumerate((one, other)):
+        own = [number for of, number in whole if of == source]
+        assert own == list(islice(positions(count, config, first=0), len(own)))
+    rank = ranks - 1
+    mine = list(islice(moments.numbers(config, first=first, rank=rank, ranks=ranks), 60 - min(first, 59)))
+    assert mine[: max(60 - first, 0)] == whole[rank::ranks][first:]
 
 
 def test_each_step_draws_its_own_numbers() -> None:

@@ -11,8 +11,9 @@ from PIL import Image
 from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.errors import SensorFileError
-from deepaccident_devkit.export.images import ImageConfig, resized_part
+from deepaccident_devkit.errors import ConfigError, SensorFileError
+from deepaccident_devkit.export.images import ImageConfig, VirtualCamera, resized_part
+from deepaccident_devkit.geometry import PinholeCamera
 from deepaccident_devkit.release import read_image, write_image
 
 
@@ -86,3 +87,51 @@ def test_a_part_is_what_pillow_or_opencv_makes_of_the_whole(decode: str, data: s
     part = resized_part(image, size, (top, left, height, width), decode)
     difference = np.abs(part.astype(int) - whole[top : top + height, left : left + width])
     assert (difference.shape, difference.max() <= 1) == ((height, width, 3), True)
+
+
+@given(
+    st.floats(0.5, 2.0),
+    st.floats(0.4, 0.6),
+    st.floats(0.4, 0.6),
+    st.floats(20, 120),
+    st.integers(20, 90),
+    st.integers(20, 90),
+)
+def test_a_virtual_camera_sees_the_same_in_the_same_directions(
+    zoom: float, across: float, down: float, focal: float, height: int, width: int
+) -> None:
+    """Colours say where in the whole image a pixel was; by K, that is where its direction meets the whole image."""
+    v, u = np.mgrid[0:120, 0:160]
+    whole = np.stack([u, v, np.full_like(u, 200)], axis=-1).astype(np.uint8)
+    own = np.array([[100 * zoom, 0, 160 * across], [0, 110 * zoom, 120 * down], [0, 0, 1]])
+    image, intrinsic = VirtualCamera(focal, height, width).taken(whole, PinholeCamera(own, 160, 120), "full")
+    assert image.shape == (height, width, 3)
+    half_a_pixel = np.diag(own)[:2] / (160, 120) / 2  # of the scaled whole image's size
+    assert (np.abs(np.diag(intrinsic)[:2] - focal) <= half_a_pixel + 1e-9).all()
+    np.testing.assert_allclose(intrinsic[:2, 2], (width / 2, height / 2), atol=0.5 + 1e-9)
+    row, column = np.nonzero(image[..., 2] == 200)
+    rays = np.linalg.inv(intrinsic) @ np.stack([column + 0.5, row + 0.5, np.ones(len(row))])
+    at = (own @ rays)[:2] - 0.5
+    inner = ((at > 3) & (at < np.array([[156], [116]]))).all(axis=0)
+    np.testing.assert_allclose(image[row, column][inner, :2], at.T[inner], atol=2.1)
+    black = np.nonzero(image[..., 2] == 0)
+    rays = np.linalg.inv(intrinsic) @ np.stack([black[1] + 0.5, black[0] + 0.5, np.ones(len(black[0]))])
+    beyond = (own @ rays)[:2]
+    assert ((beyond < 1.5 / zoom + 3) | (beyond > np.array([[156], [116]]))).any(axis=0).all()
+
+
+def test_a_virtual_camera_takes_the_place_of_resizing(da: DeepAccident, camera: str) -> None:
+    image, intrinsic = ImageConfig(virtual_camera=VirtualCamera(40, 30, 50)).load(da, camera)
+    assert image.shape == (30, 50, 3)
+    other, _ = ImageConfig(virtual_camera=(40, 30, 50)).load(da, camera)
+    np.testing.assert_array_equal(image, other)
+    assert intrinsic[0, 0] == pytest.approx(40, rel=0.02)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"virtual_camera": (0, 9, 9)}, {"virtual_camera": (9, 0, 9)}, {"virtual_camera": (9, 9, 9), "resize": (9, 9)}],
+)
+def test_a_virtual_camera_that_cannot_be(wrong: dict) -> None:
+    with pytest.raises(ConfigError, match=r"virtual_camera: expected"):
+        ImageConfig(**wrong)

@@ -1,0 +1,30 @@
+"""`deepaccident rigs`: what the vehicles of one source, or of two, carry."""
+
+from pathlib import Path
+
+import click
+
+from deepaccident_devkit.cli.options import PATH, figure_style_parameter, json_parameter, open_release
+from deepaccident_devkit.cli.verbs import verb
+from deepaccident_devkit.nuscenes.rigs import rig_report
+
+
+@verb()
+@click.argument("first", type=PATH, metavar="DATAROOT")
+@click.argument("second", type=PATH, metavar="[OTHER]", required=False)
+@click.option("--out", type=PATH, metavar="FILE", help="Picture to write, such as rigs.png.")
+@figure_style_parameter
+@json_parameter
+def rigs(first: Path, second: Path | None, out: Path | None, as_json: bool) -> None:
+    """Print what cameras and LiDAR of a source see, and how its boxes are spread; beside those of OTHER.
+
+    Each is a release or a dataroot of nuScenes. With OTHER, the last lines say what a model that learned on DATAROOT
+    will find odd in OTHER.
+    """
+    report = rig_report(*(open_release(each) for each in (first, second) if each is not None))
+    click.echo(report.to_json() if as_json else report.to_text())
+    if out is not None:
+        from deepaccident_devkit.nuscenes.rig_figures import rigs_figure
+        from deepaccident_devkit.render.figures import write_report_figure
+
+        click.echo(f"written: {write_report_figure(rigs_figure(report), out)}", err=as_json)

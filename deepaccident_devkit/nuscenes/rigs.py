@@ -1,0 +1,240 @@
+"""What two sources' vehicles carry, side by side, and what a model that learned on one will find odd in the other."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+
+from deepaccident_devkit.dataset import Dataset
+from deepaccident_devkit.nuscenes.check import road_height
+from deepaccident_devkit.reports import Report, Row, record_rows
+from deepaccident_devkit.support.arrays import FloatArray
+from deepaccident_devkit.support.text import columns_text
+from deepaccident_devkit.taxonomy import (
+    AGENTS,
+    CAMERAS,
+    CATEGORIES,
+    FRAME_PERIOD,
+    IGNORED_ID,
+    LIDAR,
+    OWN_ACTOR_ID,
+    VEHICLE_AGENTS,
+)
+
+_SAMPLES: Final = 12
+_LANE_GAP: Final = 0.2
+"""Degrees of elevation between two lanes at least."""
+_LARGER: Final = 0.05
+_RISE: Final = 0.2
+"""Metres."""
+_TURN: Final = 2.0
+"""Degrees."""
+_SHARE: Final = 0.05
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CameraFacts:
+    """One camera of a vehicle.
+
+    Attributes:
+        camera: its channel.
+        width: of its images, pixels.
+        height: of its images.
+        focal: focal length as a share of the width.
+        field_of_view: degrees from the left edge to the right one.
+        looks: degrees to the left of x.
+        pitch: degrees upwards.
+        above: metres above the ego's origin.
+        overlap: degrees that it shares with the next camera to its left; below 0, that nobody sees between them.
+    """
+
+    camera: str
+    width: int
+    height: int
+    focal: float
+    field_of_view: float
+    looks: float
+    pitch: float
+    above: float
+    overlap: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RigFacts:
+    """One source; None where its files are not here.
+
+    Attributes:
+        name: the folder's.
+        cameras: of the first vehicle.
+        lidar_above: metres of the LiDAR above the ego's origin.
+        lanes: directions up and down in which the LiDAR looks.
+        points: of a cloud, the median.
+        reach: metres within which 99 % of them lie.
+        road: height of the road above the ego's origin, metres.
+        labels_a_second: how often a moment is labelled.
+        boxes: of a labelled sample, the mean.
+        shares: category → its share of the boxes; of classes that we do not have, `ignored`.
+    """
+
+    name: str
+    cameras: tuple[CameraFacts, ...]
+    lidar_above: float
+    lanes: int | None
+    points: float | None
+    reach: float | None
+    road: float | None
+    labels_a_second: float
+    boxes: float
+    shares: Mapping[str, float]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RigReport(Report):
+    """One source or two.
+
+    Attributes:
+        sources: their facts.
+        odd: what a model that learned on the first will find odd in the second, a sentence each.
+    """
+
+    sources: tuple[RigFacts, ...]
+    odd: tuple[str, ...]
+
+    def named_tables(self) -> dict[str, list[Row]]:
+        """A table of cameras for each source, and one of all else."""
+        tables = {f"cameras of {each.name}": record_rows(CameraFacts, each.cameras) for each in self.sources}
+        facts = ("lidar_above", "lanes", "points", "reach", "road", "labels_a_second", "boxes")
+        rows: list[Row] = [["", *(each.name for each in self.sources)]]
+        rows += [[name, *(getattr(each, name) for each in self.sources)] for name in facts]
+        rows += [
+            [f"share of {name}", *(each.shares.get(name, 0.0) for each in self.sources)]
+            for name in dict.fromkeys(name for each in self.sources for name in each.shares)
+        ]
+        return {**tables, "sources": rows}
+
+    def to_text(self) -> str:
+        """The tables, and below them what is odd."""
+        lines = [
+            f"{name}\n{columns_text([[_text(cell) for cell in row] for row in rows])}"
+            for name, rows in self.named_tables().items()
+        ]
+        names = [each.name for each in self.sources]
+        if len(names) > 1:
+            head = f"a model that learned on {names[0]} will find odd in {names[1]}:"
+            lines.append("\n".join([head, *(f"- {each}" for each in self.odd or ("nothing of this",))]))
+        return "\n\n".join(lines)
+
+
+def rig_report(*datasets: Dataset) -> RigReport:
+    """The facts of one source or two, of the first vehicle that each has; raises the errors of `Dataset`'s readers."""
+    sources = tuple(map(rig_facts, datasets))
+    return RigReport(sources=sources, odd=tuple(_odd(*sources)) if len(sources) == 2 else ())
+
+
+def rig_facts(dataset: Dataset) -> RigFacts:
+    """The facts of one source."""
+    view, boxes = dataset.columns("sample"), dataset.columns("annotation")
+    rows = np.flatnonzero(view["labelled"][:] & (view["agent"] == AGENTS.index(VEHICLE_AGENTS[0])))
+    apart = np.diff(rows)[np.diff(view["scenario_row"][rows]) == 0]
+    tokens = [dataset.sample[row]["token"] for row in rows.tolist()]
+    there = [token for token in tokens if dataset.sensor_path(token, LIDAR).exists()]
+    chosen = [
+        there[place] for place in np.unique(np.linspace(0, len(there) - 1, min(_SAMPLES, len(there))).astype(int))
+    ]
+    clouds = [dataset.load_point_cloud(token, "lidar").xyz for token in chosen]
+    own = np.isin(boxes["sample_row"], rows) & (boxes["actor_id"] != OWN_ACTOR_ID)
+    codes = np.where(boxes["actor_id"][own] >= IGNORED_ID, len(CATEGORIES), boxes["category"][own])
+    counts = np.bincount(codes, minlength=len(CATEGORIES) + 1) / max(len(codes), 1)
+    ranges = np.linalg.norm(np.concatenate(clouds), axis=1) if clouds else np.zeros(0)
+    roads = [road_height(dataset.load_point_cloud(token, "ego").xyz) for token in chosen]
+    return RigFacts(
+        name=dataset.dataroot.name,
+        cameras=tuple(_cameras(dataset, tokens[0])),
+        lidar_above=round(float(dataset.ego_from(tokens[0], LIDAR).translation[2]), 2),
+        lanes=_lanes(clouds[0]) if clouds else None,
+        points=float(np.median([len(cloud) for cloud in clouds])) if clouds else None,
+        reach=round(float(np.quantile(ranges, 0.99)), 1) if clouds else None,
+        road=round(float(np.nanmedian(roads)), 2) if clouds else None,
+        labels_a_second=round(1 / (FRAME_PERIOD * float(np.median(apart))), 1) if len(apart) else 0.0,
+        boxes=round(len(codes) / max(len(rows), 1), 1),
+        shares={name: round(share, 4) for name, share in zip((*CATEGORIES, "ignored"), counts.tolist(), strict=True)},
+    )
+
+
+def _cameras(dataset: Dataset, sample: str) -> Iterator[CameraFacts]:
+    """Those of a sample."""
+    axes = {camera: dataset.ego_from(sample, camera) for camera in CAMERAS}
+    looks = {camera: math.degrees(math.atan2(*pose.rotation[1::-1, 2])) for camera, pose in axes.items()}
+    lenses = {camera: dataset.camera(sample, camera) for camera in CAMERAS}
+    half = {camera: math.degrees(math.atan(each.width / 2 / each.intrinsic[0, 0])) for camera, each in lenses.items()}
+    for camera, pose in axes.items():
+        lens = lenses[camera]
+        turn, other = min(((looks[each] - looks[camera]) % 360, each) for each in CAMERAS if each != camera)
+        yield CameraFacts(
+            camera=camera,
+            width=lens.width,
+            height=lens.height,
+            focal=round(float(lens.intrinsic[0, 0] / lens.width), 3),
+            field_of_view=round(2 * half[camera], 1),
+            looks=180.0 if abs(looks[camera]) > 179.95 else round(looks[camera], 1) + 0.0,
+            pitch=round(math.degrees(math.asin(pose.rotation[2, 2])), 1) + 0.0,  # no -0
+            above=round(float(pose.translation[2]), 2),
+            overlap=round(half[camera] + half[other] - turn, 1),
+        )
+
+
+def _lanes(cloud: FloatArray) -> int:
+    """How many directions up and down a cloud's points lie in, from the LiDAR's origin."""
+    known = cloud[np.isfinite(cloud).all(axis=1)]
+    elevation = np.sort(np.degrees(np.arctan2(known[:, 2], np.hypot(known[:, 0], known[:, 1]))))
+    return int((np.diff(elevation) > _LANE_GAP).sum()) + 1
+
+
+def _odd(first: RigFacts, second: RigFacts) -> Iterator[str]:
+    """What differs so much that a model notices it."""
+    for one, other in zip(first.cameras, second.cameras, strict=True):
+        if apart := ", ".join(_apart(one, other)):
+            yield f"{one.camera}: {apart}"
+    rise = second.lidar_above - first.lidar_above
+    if abs(rise) >= _RISE:
+        yield f"the LiDAR is {abs(rise):.1f} m {_side(rise)}"
+    for name, words in (("lanes", "lanes of the LiDAR"), ("points", "points a cloud"), ("reach", "metres of reach")):
+        was, now = getattr(first, name), getattr(second, name)
+        if was and now and not 0.8 < now / was < 1.25:
+            yield f"{now:,.0f} {words}, not {was:,.0f}"
+    if first.labels_a_second != second.labels_a_second:
+        yield f"{second.labels_a_second:g} labels a second, not {first.labels_a_second:g}"
+    for name, share in first.shares.items():
+        there = second.shares[name]
+        if abs(there - share) >= _SHARE or (share > 0) != (there > 0):
+            yield f"{there:.0%} of the boxes are of the class {name}, not {share:.0%}"
+
+
+def _apart(one: CameraFacts, other: CameraFacts) -> Iterator[str]:
+    """What differs between two cameras of one name."""
+    larger = other.focal / one.focal
+    if abs(larger - 1) > _LARGER:
+        views = f"its field of view is {other.field_of_view:.0f} degrees, not {one.field_of_view:.0f}"
+        yield f"things look {larger:.2g} times as large in it, since {views}"
+    if abs(rise := other.above - one.above) >= _RISE:
+        yield f"it is {abs(rise):.1f} m {_side(rise)}"
+    if abs(turn := other.pitch - one.pitch) >= _TURN:
+        yield f"it looks {abs(turn):.0f} degrees {_side(turn)}"
+    if abs(turn := (other.looks - one.looks + 180) % 360 - 180) >= _TURN:
+        yield f"it is turned by {abs(turn):.0f} degrees to the {'left' if turn > 0 else 'right'}"
+    shape, wanted = other.width / other.height, one.width / one.height
+    if abs(shape / wanted - 1) > _LARGER:
+        yield f"its images are {shape:.2f} times as wide as high, not {wanted:.2f}"
+
+
+def _side(rise: float) -> str:
+    return "higher" if rise > 0 else "lower"
+
+
+def _text(cell: Any) -> str:
+    """A cell of a printed table."""
+    return "" if cell is None else f"{cell:,g}" if isinstance(cell, float) else str(cell)
