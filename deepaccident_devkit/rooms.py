@@ -47,13 +47,12 @@ ADDED: Final[Mapping[str, Mapping[str, str]]] = {
         "render.safety.render_lead_times": "safety.figures:render_lead_times",
         "render.safety.save_safety_report": "safety.page:save_safety_report",
     },
+    "opener": {"nuscenes": "nuscenes.source:open_nuscenes"},
     "picture": {
         "draw_town_map": "maps.pictures:draw_town_map",
         "ground_at": "maps.pictures:ground_at",
         "map": "maps.pictures:map_beneath",
     },
-    "opener": {"nuscenes": "nuscenes.source:open_nuscenes"},
-    "writer": {"nuscenes": "nuscenes.results:write_detections"},
     "result": {"prevented": "safety.prevention:PREVENTED"},
     "table": {"interactions": "interactions.scenario:least_times"},
     "verb": {
@@ -68,6 +67,7 @@ ADDED: Final[Mapping[str, Mapping[str, str]]] = {
         "town-maps": "maps.cli:town_maps",
         "train": "model.cli:train",
     },
+    "writer": {"nuscenes": "nuscenes.results:write_detections"},
 }
 """Kind → name → where it is. `check`, `opener` and `writer`: of dataroots and results of nuScenes; `field`: of queries;
 `result`: of evaluations, beside their own, with its `figures`; `method`: of the facade; `name`: of a core module;

@@ -17,7 +17,7 @@ import numpy as np
 
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import SourceError
-from deepaccident_devkit.geometry import Boxes
+from deepaccident_devkit.geometry import SE3, Boxes
 from deepaccident_devkit.support.arrays import ByteArray, FloatArray, IntArray, ShortRepr
 from deepaccident_devkit.taxonomy import AGENTS, CAMERAS, LIDAR, OWN_ACTOR_ID, VEHICLE_AGENTS
 
@@ -125,11 +125,8 @@ def check_source(dataset: Dataset) -> SourceCheck:
 
 def look_at(dataset: Dataset) -> SourceCheck:
     """What some of the labelled samples of the first vehicle show."""
-    view = dataset.columns("sample")
-    known = np.flatnonzero(view["labelled"][:] & (view["agent"] == AGENTS.index(VEHICLE_AGENTS[0])))
-    samples = [dataset.sample[row]["token"] for row in known.tolist()]
-    places = np.unique(np.linspace(0, len(samples) - 1, min(_SAMPLES, len(samples))).astype(int)).tolist()
-    chosen = [samples[place] for place in places]
+    samples = [dataset.sample[row]["token"] for row in labelled_rows(dataset).tolist()]
+    chosen = spread(samples, _SAMPLES)
     boxes = [_boxes(dataset, sample) for sample in chosen]
     clouds = [
         dataset.load_point_cloud(sample, "ego").xyz if dataset.sensor_path(sample, LIDAR).exists() else np.zeros((0, 3))
@@ -144,13 +141,26 @@ def look_at(dataset: Dataset) -> SourceCheck:
         road=_median(map(road_height, clouds)),
         boxes=_median(map(_floor, boxes)),
         lidar=_median(dataset.ego_from(sample, LIDAR).translation[2] for sample in chosen),
-        looks=np.array([_looks(dataset, chosen[0], camera) for camera in CAMERAS]),
+        looks=np.array([looks_to(dataset.ego_from(chosen[0], camera)) for camera in CAMERAS]),
         on_boxes=_share(clouds, boxes, _AS_THEY_ARE),
         on_mirrored=_share(clouds, boxes, _MIRRORED),
         num_seen=num_seen,
         in_images=in_images / np.maximum(num_seen, 1)[:, None],
         mirrored=float(views[:, 1].mean()) if len(views) >= _LEAST_BOXES else np.nan,
     )
+
+
+def labelled_rows(dataset: Dataset) -> IntArray:
+    """The rows of the labelled samples of the first vehicle."""
+    view = dataset.columns("sample")
+    return np.flatnonzero(view["labelled"][:] & (view["agent"] == AGENTS.index(VEHICLE_AGENTS[0])))
+
+
+def spread(samples: Sequence[str], most: int) -> list[str]:
+    """So many of them, evenly from the first to the last."""
+    return [
+        samples[place] for place in np.unique(np.linspace(0, len(samples) - 1, min(most, len(samples))).astype(int))
+    ]
 
 
 def _median(values: Iterable[float]) -> float:
@@ -172,9 +182,9 @@ def _turn(dataset: Dataset, sample: str, following: str) -> float:
     return float(np.degrees(np.arctan2(y, x))) if np.hypot(x, y) > _STEP else np.nan
 
 
-def _looks(dataset: Dataset, sample: str, camera: str) -> float:
-    x, y, _ = dataset.ego_from(sample, camera).rotation[:, 2]
-    return float(np.degrees(np.arctan2(y, x)))
+def looks_to(ego_from_camera: SE3) -> float:
+    """Degrees to the left of x."""
+    return float(np.degrees(np.arctan2(*ego_from_camera.rotation[1::-1, 2])))
 
 
 def road_height(points: FloatArray) -> float:

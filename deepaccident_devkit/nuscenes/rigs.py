@@ -10,20 +10,11 @@ from typing import Any, Final
 import numpy as np
 
 from deepaccident_devkit.dataset import Dataset
-from deepaccident_devkit.nuscenes.check import road_height
+from deepaccident_devkit.nuscenes.check import labelled_rows, looks_to, road_height, spread
 from deepaccident_devkit.reports import Report, Row, record_rows
 from deepaccident_devkit.support.arrays import FloatArray
 from deepaccident_devkit.support.text import columns_text
-from deepaccident_devkit.taxonomy import (
-    AGENTS,
-    CAMERAS,
-    CATEGORIES,
-    FRAME_PERIOD,
-    IGNORED_ID,
-    LIDAR,
-    OWN_ACTOR_ID,
-    VEHICLE_AGENTS,
-)
+from deepaccident_devkit.taxonomy import CAMERAS, CATEGORIES, FRAME_PERIOD, IGNORED_ID, LIDAR, OWN_ACTOR_ID
 
 _SAMPLES: Final = 12
 _LANE_GAP: Final = 0.2
@@ -138,19 +129,19 @@ def rig_report(*datasets: Dataset) -> RigReport:
 def rig_facts(dataset: Dataset) -> RigFacts:
     """The facts of one source."""
     view, boxes = dataset.columns("sample"), dataset.columns("annotation")
-    rows = np.flatnonzero(view["labelled"][:] & (view["agent"] == AGENTS.index(VEHICLE_AGENTS[0])))
+    rows = labelled_rows(dataset)
     apart = np.diff(rows)[np.diff(view["scenario_row"][rows]) == 0]
     tokens = [dataset.sample[row]["token"] for row in rows.tolist()]
     there = [token for token in tokens if dataset.sensor_path(token, LIDAR).exists()]
-    chosen = [
-        there[place] for place in np.unique(np.linspace(0, len(there) - 1, min(_SAMPLES, len(there))).astype(int))
-    ]
+    chosen = spread(there, _SAMPLES)
     clouds = [dataset.load_point_cloud(token, "lidar").xyz for token in chosen]
     own = np.isin(boxes["sample_row"], rows) & (boxes["actor_id"] != OWN_ACTOR_ID)
     codes = np.where(boxes["actor_id"][own] >= IGNORED_ID, len(CATEGORIES), boxes["category"][own])
     counts = np.bincount(codes, minlength=len(CATEGORIES) + 1) / max(len(codes), 1)
     ranges = np.linalg.norm(np.concatenate(clouds), axis=1) if clouds else np.zeros(0)
-    roads = [road_height(dataset.load_point_cloud(token, "ego").xyz) for token in chosen]
+    roads = [
+        road_height(dataset.ego_from(token, LIDAR).apply(each)) for token, each in zip(chosen, clouds, strict=True)
+    ]
     return RigFacts(
         name=dataset.dataroot.name,
         cameras=tuple(_cameras(dataset, tokens[0])),
@@ -168,7 +159,7 @@ def rig_facts(dataset: Dataset) -> RigFacts:
 def _cameras(dataset: Dataset, sample: str) -> Iterator[CameraFacts]:
     """Those of a sample."""
     axes = {camera: dataset.ego_from(sample, camera) for camera in CAMERAS}
-    looks = {camera: math.degrees(math.atan2(*pose.rotation[1::-1, 2])) for camera, pose in axes.items()}
+    looks = {camera: looks_to(pose) for camera, pose in axes.items()}
     lenses = {camera: dataset.camera(sample, camera) for camera in CAMERAS}
     half = {camera: math.degrees(math.atan(each.width / 2 / each.intrinsic[0, 0])) for camera, each in lenses.items()}
     for camera, pose in axes.items():
