@@ -30,5 +30,4 @@ DETECTION_NAMES: Final = MappingProxyType({**{name: name for name in CATEGORIES}
 
 def category_of(category: str) -> int:
     """The index of our category for one of nuScenes'; of an ignored one, what it is most like."""
-    other = "truck" if category.startswith("vehicle.") else "pedestrian"
-    return CATEGORIES.index(CLASSES.get(category, other))
+    return CATEGORIES.index(CLASSES.get(category, "truck" if category.startswith("vehicle.") else "pedestrian"))

@@ -80,8 +80,7 @@ class NuScenesRelease(DeepAccident):
         place = self._place(self.getind("sample", sample) * len(CHANNELS) + _LIDAR)
         if place is None:
             raise ConfigError(f"{sample}: is between two keyframes, of which alone nuScenes has samples")
-        token: str = self._files["token"][place].as_py()
-        return token
+        return str(self._files["token"][place])
 
     def sensor_frames(self, scenario: RowArgument) -> dict[tuple[str, str], tuple[int, ...]]:
         """As of `Dataset`: the keyframes, whose files nuScenes' tables name."""
@@ -141,7 +140,7 @@ def open_nuscenes(dataroot: str | os.PathLike[str], index_dir: Path | None = Non
         index_dir: where to keep the tables; by default in the dataroot, or in the user's cache.
 
     Raises:
-        DatarootError: there are no tables of nuScenes, or a scene lacks something.
+        DatarootError: there are no tables of nuScenes, they cannot be read, or a scene lacks something.
         VersionError: the folder holds several versions.
         MissingExtraError: the tables must be made, and the nuScenes devkit is not installed.
     """
@@ -152,12 +151,18 @@ def open_nuscenes(dataroot: str | os.PathLike[str], index_dir: Path | None = Non
         return NuScenesRelease(tables.parent, tables.name, kept)
     try:
         from nuscenes import NuScenes
+
+        nusc = NuScenes(tables.name, str(tables.parent), verbose=False)
     except ImportError as error:
         raise MissingExtraError(
             f"{tables}: the nuScenes devkit reads these tables, and needs Python 3.10 to 3.12 and numpy 1.26; there: "
             "pip install 'deepaccident_devkit[nuscenes]'"
         ) from error
-    return release_of(NuScenes(tables.name, str(tables.parent), verbose=False), index_dir)
+    except (AssertionError, LookupError, OSError, ValueError) as error:
+        raise DatarootError(
+            f"{tables}: the nuScenes devkit cannot read them ({type(error).__name__}: {error}); unpack them again"
+        ) from error
+    return release_of(nusc, index_dir)
 
 
 def release_of(nusc: Any, index_dir: Path | None = None) -> NuScenesRelease:
@@ -282,7 +287,6 @@ class _Scene:
         rows = scenario_rows(
             ScenarioFiles(scenario=place, scan=scan, meta=None, calibs=calibs, labels=self._labels(calibs))
         )
-        log = self._nusc.get("log", self._scene["log_token"])
         images = [self._nusc.get("sample_data", self._samples[0]["data"][name]) for name in CAMERA_CHANNELS.values()]
         for side in ("width", "height"):  # K says only where their middle may be
             values = np.array(rows["sample_data"][side]).reshape(self.frames, -1)
@@ -290,7 +294,7 @@ class _Scene:
             rows["sample_data"] = {**rows["sample_data"], side: values.ravel()}
         return {
             **rows,
-            "scenario": {**rows["scenario"], "town": [log["location"]]},
+            "scenario": {**rows["scenario"], "town": [self._nusc.get("log", self._scene["log_token"])["location"]]},
             "sample": {**rows["sample"], "labelled": np.arange(self.frames) % KEY_STEP == 0},
         }
 

@@ -1,5 +1,6 @@
 """A nuScenes dataroot is opened as a release: once by the nuScenes devkit, then from tables that are kept."""
 
+import json
 import pickle
 import shutil
 import sys
@@ -53,6 +54,18 @@ def test_what_is_no_dataroot_of_nuscenes(pair, tmp_path: Path) -> None:
     with pytest.raises(VersionError, match=r"several versions"):
         open_nuscenes(both)
     assert open_nuscenes(both / "v1.0-other").version == "v1.0-other"
+
+
+@pytest.mark.parametrize("damage", ["no category.json", "half a category.json", "a category too few"])
+def test_tables_that_cannot_be_read_are_named(pair, tmp_path: Path, damage: str) -> None:
+    folder = copied(pair.folder, tmp_path / "road")
+    table = folder / VERSION / "category.json"
+    content = json.loads(table.read_text())
+    table.unlink()
+    if damage != "no category.json":
+        table.write_text("[{" if damage == "half a category.json" else json.dumps(content[1:]))
+    with pytest.raises(DatarootError, match=rf"{VERSION}: the nuScenes devkit cannot read.*unpack them again"):
+        open_nuscenes(folder)
 
 
 def test_a_sample_that_lacks_a_camera_is_named(pair, tmp_path: Path) -> None:
