@@ -24,13 +24,18 @@ ROAD: Final = "road"
 """The recipe whose numbers are on the page of nuScenes."""
 SHOWN: Final = ("apa", "iou_100", "vpq_100", "map", "hidden_foreground", "false_foreground")
 """Numbers of the tables; the kept files have all."""
+GROUPS: Final = {"agents": ("hidden", "impact_step"), "visibility": ("accident_visibility",)}
+"""Recipe → how the groups begin whose APA its table has, where these are not the hidden accidents alone."""
+TRIVIAL: Final = ("nothing", "everything")
+TRIVIAL_OF: Final = "agents"
+"""The recipe whose table has the trivial rows: they are much the same in all."""
 ANSWER: Final = ("apa", "precision", "recall", "iou_100", "map", "hidden_foreground")
 ANSWERING: Final = (
     *("single", "all", "black", "strangers", "constant velocity, single", "constant velocity, all"),
     *("labels, single", "labels, all"),
 )
 OUTCOMES: Final = {"wins": "more", "loses": "less", "not decided": "not decided"}
-ON_THE_ROAD: Final = ("vpq_100", "iou_100", "map")
+ON_THE_ROAD: Final = ("map", "iou_100", "vpq_100")
 CELLS: Final = {"release": "releases", "weights": "training", "row": "prediction and evaluation"}
 Summary = Mapping[str, Any]
 
@@ -110,16 +115,18 @@ def made_text(summary: Summary) -> str:
 
 
 def study_text(name: str, summary: Summary) -> str:
-    """A study's section: all rows at all samples, and their APA in each group that has accidents."""
+    """A study's section: its rows at all samples, and their APA in some groups; the kept files have all."""
+    chosen = GROUPS.get(name, ("hidden",))
     groups = {
         f"APA, `{group}` ({each['samples']:,} samples)": (group, "apa")
         for group, each in summary["groups"].items()
-        if group != ALL and any(row["groups"][group]["apa"]["value"] is not None for row in summary["rows"].values())
+        if group.startswith(chosen)
     }
     made = f"{summary['question']} `deepaccident study {name} studies`: {made_text(summary)}"
     told = [made, f"**{summary['headline']['text']}**"] if summary["headline"] else [made]
-    tables = rows_table(summary, numbers_in(ALL, SHOWN)), rows_table(summary, groups)
-    return "\n\n".join([f"## {summary['title']}", *map(wrapped, told), *tables])
+    rows = [row for row in summary["rows"] if name == TRIVIAL_OF or row not in TRIVIAL]
+    columns = groups if name == "visibility" else numbers_in(ALL, SHOWN) | groups
+    return "\n\n".join([f"## {summary['title']}", *map(wrapped, told), rows_table(summary, columns, rows)])
 
 
 def findings_table(found: Mapping[str, Summary]) -> str:

@@ -7,8 +7,9 @@ module asks for it.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from itertools import product
 from typing import Any, Final, Literal
 
@@ -23,6 +24,9 @@ Handedness = Literal["left", "right"]
 _MIRROR: Final = (1.0, -1.0, 1.0, 1.0)
 _BOX_MIRROR: Final = (1.0, -1.0, 1.0, 1.0, 1.0, 1.0, -1.0, 1.0, -1.0)
 """Of x y z l w h yaw vx vy."""
+_OF_EGOS: Final = ("ego_rows", "ego_from_agent", "partners")
+_OF_AGENTS: Final = ("images", "cameras", "egomotion", "frame_valid", *_OF_EGOS[1:], "is_infrastructure", "delay")
+"""Attributes whose second axis is that of the agents."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -61,11 +65,14 @@ class ModelInputs:
 
     def to(self, device: torch.device | str) -> ModelInputs:
         """The same on another device."""
-        return replace(self, **{each.name: _moved(getattr(self, each.name), device) for each in fields(self)})
+        moved = partial(_mapped, lambda each: each.to(device, non_blocking=True))
+        return replace(self, **{each.name: moved(getattr(self, each.name)) for each in fields(self)})
 
     def of_egos(self, rows: Tensor) -> ModelInputs:
-        """The same with some of the egos, by their positions (G',) int64."""
-        return replace(self, **{name: getattr(self, name)[rows] for name in ("ego_rows", "ego_from_agent", "partners")})
+        """The same with some egos, by their positions (G',) int64, and without agents that none of them hears."""
+        some = replace(self, **{name: getattr(self, name)[rows] for name in _OF_EGOS})
+        heard = some.partners.any(0).index_fill(0, some.ego_rows[:, 1], value=True)
+        return some if heard.all() else _of_agents(some, heard)
 
 
 def model_inputs(batch: Mapping[str, Any], handedness: Handedness = "right", *, delay: int = 0) -> ModelInputs:
@@ -109,6 +116,21 @@ def model_inputs(batch: Mapping[str, Any], handedness: Handedness = "right", *, 
         is_infrastructure=roadside,
         delay=ages,
     )
+
+
+def _of_agents(inputs: ModelInputs, kept: Tensor) -> ModelInputs:
+    """The inputs with some of the agents, (A,) bool, among them all egos."""
+    place = kept.cumsum(0) - 1
+    changes = {name: _mapped(lambda each: each[:, kept], getattr(inputs, name)) for name in _OF_AGENTS}
+    changes["ego_rows"] = torch.stack([inputs.ego_rows[:, 0], place[inputs.ego_rows[:, 1]]], 1)
+    if inputs.points is not None and inputs.point_frames is not None:
+        frames = inputs.frame_valid.shape[2]
+        sender, frame = inputs.point_frames // frames, inputs.point_frames % frames
+        moment, agent = sender // len(kept), sender % len(kept)
+        there = kept[agent]
+        changes["points"] = inputs.points[there]
+        changes["point_frames"] = (((moment * int(kept.sum())) + place[agent]) * frames + frame)[there]
+    return replace(inputs, **changes)
 
 
 def mirrored_boxes(boxes: Tensor, handedness: Handedness) -> Tensor:
@@ -168,7 +190,8 @@ def _taken(values: Tensor, source: Tensor) -> Tensor:
     return values[first[:, None, None], second[:, None], source]
 
 
-def _moved(value: Any, device: torch.device | str) -> Any:
+def _mapped(change: Callable[[Tensor], Tensor], value: Any) -> Any:
+    """A tensor, or those of cameras, changed; None is None."""
     if isinstance(value, CameraGeometry):
-        return replace(value, **{each.name: _moved(getattr(value, each.name), device) for each in fields(value)})
-    return None if value is None else value.to(device, non_blocking=True)
+        return replace(value, **{each.name: change(getattr(value, each.name)) for each in fields(value)})
+    return None if value is None else change(value)

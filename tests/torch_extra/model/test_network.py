@@ -70,6 +70,28 @@ def test_all_egos_at_once_are_each_by_itself(
     assert egos_by_themselves(seeded(make()), predicted, da, moment, agents, rows) == moment
 
 
+@pytest.mark.parametrize(("agents", "left"), [("single", 2), ("+other", 3)])
+@pytest.mark.parametrize("make", [small, small_lidar, small_both])
+def test_agents_that_no_ego_hears_are_not_encoded(
+    da: DeepAccident,
+    moment: list[str],
+    seeded: Seeded,
+    predicted: Predicted,
+    agents: str,
+    left: int,
+    make: Callable[[], ModelConfig],
+) -> None:
+    """Of two moments; what is predicted for the egos that are left is what it was."""
+    model = seeded(make())
+    data = AllEgosDataset(da, [*moment, *(token[:-1] + "5" for token in moment)], model.config.inputs(agents))
+    inputs = model_inputs(collate_all_egos([data[0], data[1]]))
+    rows = torch.tensor([7, 3])  # the second moment's ego first
+    some = inputs.of_egos(rows)
+    assert inputs.frame_valid.shape[1] == 5
+    assert some.frame_valid.shape[1] == left
+    assert_same(predicted(model, some), [each[rows] for each in predicted(model, inputs)])
+
+
 @pytest.mark.parametrize("make", [small, small_lidar, small_both])
 def test_other_moments_of_a_batch_change_nothing(
     da: DeepAccident, moment: list[str], seeded: Seeded, predicted: Predicted, make: Callable[[], ModelConfig]
