@@ -30,6 +30,7 @@ include_patterns = [
     "ARCHITECTURE.md",
     "CHANGELOG.md",
     "CONTRIBUTING.md",
+    "RELEASING.md",
     "SECURITY.md",
 ]
 templates_path = ["templates"]
@@ -53,7 +54,7 @@ REFERENCE = {
     "The release": ("DeepAccident", "taxonomy", "reports", "errors"),
     "Boxes, poses, clouds, grids": ("geometry",),
     "V2X": ("v2x",),
-    "Safety": ("safety", "maps", "interactions"),
+    "Safety": ("safety", "render.safety", "maps", "interactions"),
     "Motion labels": ("motion",),
     "Evaluation": (
         "evaluation",
@@ -96,6 +97,8 @@ REFERENCE = {
     "The explorer": ("explore",),
 }
 """Title of a page → what it lists: modules, classes, a type."""
+INTERNAL = ("MOST_QUOTED", "MOST_SAID", "MOST_TOLD", "escaped", "shortened")
+"""What no page lists, of modules without `__all__`."""
 INTRODUCTION = """# API reference
 
 For everybody who programs with the devkit: all public names, with what they take, return and raise. A page to look
@@ -134,7 +137,7 @@ def _directive(name: str, seen: set[str]) -> str:
     except MissingExtraError:  # autodoc mocks what it lacks
         return f".. automodule:: {path}\n   :members:\n   :imported-members:"
     if public is None:
-        return f".. automodule:: {path}\n   :members:\n   :exclude-members: escaped, shortened"
+        return f".. automodule:: {path}\n   :members:\n   :exclude-members: {', '.join(INTERNAL)}"
     members = [each for each in public if each not in seen]
     seen.update(public)
     shown = f"\n   :members: {', '.join(members)}" if members else ""  # an empty list would be all

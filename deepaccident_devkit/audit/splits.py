@@ -1,17 +1,20 @@
-"""Audit of split files, the devkit's and other people's: what stands on two sides."""
+"""Audit of split files, the devkit's and other people's, and of releases: what stands on two sides."""
 
 from __future__ import annotations
 
 import os
 import re
 from collections import defaultdict
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Final
 
 from deepaccident_devkit.accidents.twins import torn_twins
 from deepaccident_devkit.audit.report import AuditFinding, AuditReport
 from deepaccident_devkit.errors import ConfigError, SplitFileError, shortened
+from deepaccident_devkit.parallel import run_batch
+from deepaccident_devkit.release import find_release
+from deepaccident_devkit.release.fingerprints import folder_hashes
 from deepaccident_devkit.release.store import read_lines
 from deepaccident_devkit.support.text import counted, path_of
 from deepaccident_devkit.taxonomy import MINI_SPLITS
@@ -34,20 +37,29 @@ _SAYS: Final = {
 def audit_splits(paths: Iterable[str | os.PathLike[str]]) -> AuditReport:
     """Look for frames, recordings or twins on two sides of a split, and for the mini release beside the full one.
 
+    Of releases, recordings are the same if names and label files are.
+
     Args:
-        paths: two or more files, a side each. A line names a scenario (`<type> <name>`, `<type>/<name>`), a sample or a
-            frame by its token, or any file of a release by its path; all names in a line count. It is of the mini
-            release if a folder before the scenario's type, the file's own name or its folder ends with the word `mini`
-            (`train_mini.txt` and `val_mini.txt` are of the full release).
+        paths: two or more files, or two or more dataroots, a side each. A line of a file names a scenario (`<type>
+            <name>`, `<type>/<name>`), a sample or a frame by its token, or any file of a release by its path; all names
+            in a line count. It is of the mini release if a folder before the scenario's type, the file's own name or
+            its folder ends with the word `mini` (`train_mini.txt` and `val_mini.txt` are of the full release).
 
     Raises:
-        ConfigError: there are fewer than two files.
+        ConfigError: there are fewer than two, or files and dataroots.
+        DatarootError: a folder is no release.
         MissingFileError: a file is not there.
         SplitFileError: a file cannot be read, or a line names no scenario with its type.
     """
-    sides = {str(path): sorted(set(_items(path_of(path)))) for path in paths}
-    if len(sides) < 2:
-        raise ConfigError(f"expected two or more split files, a side each, found {len(sides)}")
+    places = {str(path): path_of(path) for path in paths}
+    folders = [path.is_dir() for path in places.values()]
+    if len(places) < 2 or (any(folders) and not all(folders)):
+        raise ConfigError(
+            f"expected two or more split files, or dataroots, a side each, found {', '.join(places) or 'none'}"
+        )
+    if any(folders):
+        return _audit_releases(places)
+    sides = {side: sorted(set(_items(path))) for side, path in places.items()}
     on: dict[tuple[str, int], set[str]] = defaultdict(set)
     for side, token, frame in [(side, *item) for side, items in sides.items() for item in items]:
         on[token, 0].add(side)  # the recording
@@ -83,6 +95,24 @@ def audit_splits(paths: Iterable[str | os.PathLike[str]]) -> AuditReport:
                 *((side, len(dict(items)), sum(frame > 0 for _, frame in items)) for side, items in sides.items()),
             ]
         },
+    )
+
+
+def _audit_releases(sides: Mapping[str, Path]) -> AuditReport:
+    """Look for recordings that two releases have, by the hashes of their label files."""
+    where: dict[str, list[str]] = defaultdict(list)
+    scenarios = {side: find_release(path).scenarios for side, path in sides.items()}
+    for side, folders in scenarios.items():
+        for folder, hashes in zip(folders, run_batch(folder_hashes, folders), strict=True):
+            if hashes.label is not None:
+                where[hashes.label].append(f"{folder.token} of {side}")
+    cases = [" and ".join(each) for each in where.values() if len(each) > 1]
+    what = f"{counted(len(cases), 'recording')} with the same labels on two sides: what is tested was learnt."
+    remedy = "Make one of the two with another seed, or leave these recordings out."
+    found = AuditFinding(kind="recordings", what=what, remedy=remedy, number=len(cases), examples=tuple(cases[:3]))
+    return AuditReport(
+        findings=(found,) if cases else (),
+        tables={"sides": [("side", "recordings"), *((side, len(folders)) for side, folders in scenarios.items())]},
     )
 
 

@@ -54,6 +54,14 @@ def _list_fields(context: click.Context, _parameter: click.Parameter, wanted: bo
     help="Compare the release with what others measured of the real one instead; broken scenarios are left out, and "
     "counted (docs/validation.md).",
 )
+@click.option(
+    "--croissant",
+    is_flag=True,
+    help="Print the release's data card instead: Croissant metadata, as JSON-LD (docs/format.md).",
+)
+@click.option(
+    "--licence", metavar="TEXT", help="With --croissant: the licence that you have the data under, or its URL."
+)
 @json_parameter
 def info(
     where: tuple[str, ...],
@@ -61,6 +69,8 @@ def info(
     interactions: bool,
     out: str | None,
     facts: bool,
+    croissant: bool,
+    licence: str | None,
     as_json: bool,
     **release: Any,
 ) -> None:
@@ -68,6 +78,11 @@ def info(
 
     With --where, list the scenarios that match all filters instead; with --json, their records.
     """
+    if croissant:
+        refuse_unused("with --croissant", "where", "statistics", "interactions", "out", "facts", "as_json")
+        _say_card(open_release(**release), licence)
+        return
+    refuse_unused("without --croissant", "licence")
     if facts or not statistics:
         refuse_unused(
             "with --facts" if facts else "without --statistics",
@@ -96,6 +111,12 @@ def info(
         found = [f"{len(chosen)} of {len(dataset.scenario)} scenarios match", *scenario_lines(chosen)]
         none = f"no scenario matches {' and '.join(where)}; deepaccident info --fields lists what can be asked for"
         click.echo("\n".join(found) if chosen else none)
+
+
+def _say_card(dataset: DeepAccident, licence: str | None) -> None:
+    from deepaccident_devkit.validation import data_card
+
+    click.echo(json.dumps(data_card(dataset, licence=licence), indent=2, ensure_ascii=False))
 
 
 def _statistics(dataset: DeepAccident, chosen: list[Any] | None, out: str | None, *, as_json: bool, **how: Any) -> None:

@@ -21,6 +21,8 @@ from deepaccident_devkit.geometry import SE3, Boxes
 from deepaccident_devkit.support.arrays import ByteArray, FloatArray, IntArray, ShortRepr
 from deepaccident_devkit.taxonomy import AGENTS, CAMERAS, LIDAR, OWN_ACTOR_ID, VEHICLE_AGENTS
 
+__all__ = ["SourceCheck", "check_source", "look_at"]
+
 _SAMPLES: Final = 24
 _STEP: Final = 0.5
 """Metres from one sample to the next, from which on it is known where the ego goes."""

@@ -2,4 +2,6 @@
 
 from deepaccident_devkit.rooms import names_of
 
-__getattr__, __dir__ = names_of(__name__, ("render_avoidability", "render_lead_times", "save_safety_report"))
+__all__ = ["render_avoidability", "render_lead_times", "save_safety_report"]  # noqa: F822 - of the room
+
+__getattr__, __dir__ = names_of(__name__, __all__)

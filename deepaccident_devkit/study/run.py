@@ -9,7 +9,7 @@ from dataclasses import asdict, fields
 from functools import partial
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 
@@ -43,6 +43,8 @@ if TYPE_CHECKING:
     from deepaccident_devkit.model import ModelChoice
     from deepaccident_devkit.parallel import Engine
 
+_LATER: Final = {"rig": "released", "decimals": None}
+"""Settings of releases that keys of earlier studies do not have, and what they are without a word."""
 _Weights = tuple["ModelChoice", dict[str, Cell]]
 """The model, and the weights of each seed; those of a file under an empty text."""
 _Release = tuple[Cell, DeepAccident]
@@ -111,9 +113,8 @@ def _release(bench: Bench, name: str, recipe: Recipe, **how: Unpack[Engine]) -> 
         dataset = _opened(source)
         told = {**source, "release": release_note(dataset, _scenarios(dataset))}
     else:
-        told = {**asdict(config), "spec": config.spec and file_text(config.spec)}
-        if config.rig == "released":
-            del told["rig"]  # which keys of earlier studies do not have
+        settings = {name: each for name, each in asdict(config).items() if _LATER.get(name, ...) != each}
+        told = {**settings, "spec": config.spec and file_text(config.spec)}
         if source.get(NUSCENES):
             told[NUSCENES] = True
     cell = bench.cell("release", name, partial(_made, source, how), **told)

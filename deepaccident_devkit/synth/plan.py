@@ -24,8 +24,8 @@ from deepaccident_devkit.synth.traffic.lifelike import MISFILED, Kind, as_kind, 
 from deepaccident_devkit.tables.records import ScenarioRecord
 from deepaccident_devkit.taxonomy import META_AGENTS, ROAD_TYPES, SPLITS, TOWNS, Layout
 
-Sensors = Literal["all", "accidents", "cameras", "none"]
-"""Which sensors' files a release has: of all, those of accidents alone, the images alone, or of none."""
+Sensors = Literal["all", "accidents", "cameras", "clouds", "none"]
+"""Which sensors' files a release has: of all, those of accidents alone, images or clouds alone, or of none."""
 RigName = Literal["released", "road"]
 """How a vehicle's sensors are mounted, and what their optics are."""
 MAX_FRAMES = 999
@@ -66,7 +66,8 @@ class SynthConfig:
         seed: the same seed gives the same bytes (on the same machine with the same package versions).
         sensors: what to write besides labels, calib and meta: `all` sensors' files, with `accidents` those of
             accidents and none of their normal twins, with `cameras` the images alone (no point clouds, no BEV arrays),
-            or `none`. Files that two of them write are the same. True and False mean `all` and `none`.
+            with `clouds` the point clouds alone, or `none`. Files that two of them write are the same. True and False
+            mean `all` and `none`.
         sensor_step: sensors' files are written of every so many-th frame alone, counted back from the last one as
             samples are. With 5 there are all that the samples of `motion.samples` and their pasts need at 2 Hz, on a
             fifth of the disk. Labels, calib and meta are of all frames, and the same for any step.
@@ -86,6 +87,8 @@ class SynthConfig:
             nuScenes' cameras and images that are softer, noisier and of other colours: what stands for another dataset.
         exact: whether calib files are the same at each frame, and `num_lidar_pts` is the exact number of points. If
             not, both are a little wrong, as in the real release.
+        decimals: to how many decimals the numbers of labels and calib are rounded. Then they are the same bytes on any
+            machine, since processors differ in digits that are gone. None for all digits.
         for_released_code: whether the released code must be able to read the release: images of 1600×900, layout `A`,
             a labelled test split, and split files under `split_txt_files/` too. Settings that contradict it are
             refused.
@@ -106,6 +109,7 @@ class SynthConfig:
     unlabelled_test: bool = False
     rig: RigName = "released"
     exact: bool = False
+    decimals: int | None = None
     for_released_code: bool = False
 
     def __post_init__(self) -> None:
@@ -115,6 +119,8 @@ class SynthConfig:
             _check_range("frames", self.frames, 1, MAX_FRAMES)
         _check_range("seed", self.seed, 0, None)
         _check_range("sensor_step", self.sensor_step, 1, None)
+        if self.decimals is not None:
+            _check_range("decimals", self.decimals, 3, 15)  # with fewer a rotation would be none
         if isinstance(self.sensors, bool):
             object.__setattr__(self, "sensors", "all" if self.sensors else "none")
         words = {"layout": get_args(Layout), "sensors": get_args(Sensors), "view": (None, *get_args(View))}

@@ -312,7 +312,8 @@ def record_scenario(job: RecordingJob) -> None:
     scenario, rig = _KEPT.made_ready(_Task(job.config, job.plan))
     labelled = job.plan.split != "test" or not job.config.unlabelled_test
     step = job.config.sensor_step
-    recorder = _Recorder(folder=job.folder, scenario=scenario, rig=rig, labelled=labelled, sensor_step=step)
+    bev = job.config.sensors != "clouds"
+    recorder = _Recorder(folder=job.folder, scenario=scenario, rig=rig, labelled=labelled, bev=bev, sensor_step=step)
     if labelled and job.first == 1:
         write_meta(real_path(job.folder.meta_path), scenario.meta)
     for frame in range(job.first, scenario.frames + 1, job.step):
@@ -353,6 +354,7 @@ def _made_ready(task: _Task) -> tuple[Scenario, Rig]:
         seed=(config.seed, plan.pair, int(plan.accident)),
         sensors=cast(Sensors, config.sensors),  # never True or False once the configuration is made
         exact=config.exact,
+        decimals=config.decimals,
         name=config.rig,
     )
     return scenario, rig
@@ -376,6 +378,7 @@ class _Recorder:
     scenario: Scenario
     rig: Rig
     labelled: bool
+    bev: bool
     sensor_step: int
 
     def record(self, frame: int) -> None:
@@ -397,10 +400,10 @@ class _Recorder:
                     write_image(real_path(self.folder.channel_path(agent.name, channel, frame)), image)
 
     def _record_arrays(self, scene: Scene, points: Scan, agent: Agent, frame: int) -> None:
-        """Write the point cloud, and if there are labels also the BEV array, whose instances are labels too."""
+        """Write the point cloud, and if all is recorded and labelled also the BEV array, whose instances are labels."""
         place = real_path(self.folder.channel_path(agent.name, LIDAR, frame))
         write_lidar(place, points.xyz, intensity(points, self.rig.air))
-        if self.labelled:
+        if self.labelled and self.bev:
             bev = self.rig.bev(scene, agent)
             write_bev(real_path(self.folder.channel_path(agent.name, BEV_CAMERA, frame)), bev.semantic, bev.instance)
 

@@ -1,19 +1,126 @@
-"""The section on what stays has the versions there are, and packages say what is public."""
+"""What is public is what docs/public_names.json lists; the page on what stays has the versions there are."""
 
+import ast
+import inspect
+import json
 import re
 from importlib import import_module
 from pathlib import Path
+from types import ModuleType
+from typing import Any
 
 import pytest
 from scripts import loaded_script
 
+from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.evaluation.results import FORMAT_VERSION
 from deepaccident_devkit.evaluation.runs.bundles import SUMMARY_VERSION
 from deepaccident_devkit.motion import label_folder
 from deepaccident_devkit.tables.index import SCHEMA_VERSION
 
 TOP = Path(__file__).parents[2]
-PAGE = (TOP / "CONTRIBUTING.md").read_text(encoding="utf-8").split("## What stays")[1]
+PAGE = (TOP / "docs" / "stability.md").read_text(encoding="utf-8")
+CHANGED = """what is public is no longer what docs/public_names.json says:
+
+{}
+
+Was that wanted? docs/stability.md says which version may do it. Write it into CHANGELOG.md, with what to use instead,
+and run: python docs/make_public_names.py"""
+OLD = {
+    "rooms": {"geometry": {"Box": "class ()", "area": "(box: Box, scale: float=1.0) -> float", "gone": ": int"}},
+    "commands": {"deepaccident info": "DATAROOT --json"},
+    "daily": {"geometry.area": {"page": "docs/reading.md", "is": "(box: Box, scale: float=1.0) -> float"}},
+}
+
+
+@pytest.fixture(scope="module")
+def script() -> ModuleType:
+    return loaded_script("docs/make_public_names.py")
+
+
+@pytest.fixture(scope="module")
+def listed(script: ModuleType) -> dict[str, Any]:
+    return script.listed()
+
+
+def test_what_is_public_is_what_the_list_says(script: ModuleType, listed: dict[str, Any]) -> None:
+    changes = script.differences(json.loads(script.FILE.read_text(encoding="utf-8")), listed)
+    assert changes == [], CHANGED.format("\n".join(changes))
+    assert script.FILE.read_text(encoding="utf-8") == script.as_json(listed), "run: python docs/make_public_names.py"
+
+
+def test_a_change_is_named(script: ModuleType) -> None:
+    new = json.loads(json.dumps(OLD).replace("scale: float=1.0", "scale: float=2.0").replace("gone", "came"))
+    new["commands"]["deepaccident info"] += " --out"
+    new["daily"]["geometry.area"]["page"] = "docs/safety.md"
+    was, now = (f"(box: Box, scale: float={value}) -> float" for value in ("1.0", "2.0"))
+    assert script.differences(OLD, OLD) == []
+    assert script.differences(OLD, new) == [
+        "removed: geometry: gone",
+        "added: geometry: came",
+        "changed: deepaccident info\n    was DATAROOT --json\n    is  DATAROOT --json --out",
+        "changed: geometry.area, of daily use\n    was in docs/reading.md\n    is  in docs/safety.md",
+        f"changed: geometry: area\n    was {was}\n    is  {now}",
+    ]
+
+
+def test_names_of_daily_use_are_few_and_each_has_an_example_and_a_type(
+    script: ModuleType, listed: dict[str, Any]
+) -> None:
+    daily = listed["daily"]
+    assert 50 < len(daily) <= script.MOST
+    assert [name for name, found in daily.items() if not found["page"]] == [], "no page's Python uses these"
+    assert [name for name, found in daily.items() if not found["is"]] == [], "no room has these"
+    untyped = [name for name, found in daily.items() if not re.search(r": \w|-> |^= |^class", found["is"])]
+    assert untyped == []
+
+
+def test_no_public_name_begins_with_an_underscore(script: ModuleType) -> None:
+    names = [name for public in script.public_modules().values() for name in public]
+    assert len(names) > 500
+    assert [name for name in names if name.startswith("_")] == ["__version__"]
+
+
+def test_code_of_pages_imports_public_names_alone(script: ModuleType) -> None:
+    public = {(room, name) for room, names in script.public_modules().items() for name in names}
+    public |= {tuple(room.rsplit(".", 1)) for room in script.public_modules() if "." in room}
+    pages = [TOP / "README.md", *(TOP / "docs").glob("*.md"), *(TOP / "schema").rglob("*.md")]
+    imports = [
+        (node.module, alias.name)
+        for page in pages
+        for node in script.code_of(page)
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith(script.PACKAGE)
+        for alias in node.names
+    ]
+    assert len(imports) > 60
+    assert set(imports) - public == set()
+
+
+def parameters(said: str) -> list[str]:
+    """The names in the text of a function's parameters."""
+    [function] = ast.parse(f"def named{said}: ...").body
+    assert isinstance(function, ast.FunctionDef)
+    given = function.args
+    each = [*given.posonlyargs, *given.args, given.vararg, *given.kwonlyargs, given.kwarg]
+    return [parameter.arg for parameter in each if parameter]
+
+
+@pytest.mark.parametrize("room", ["geometry", "motion", "v2x", "evaluation.runs", "synth.spec"])
+def test_the_list_has_the_parameters_that_python_sees(room: str, listed: dict[str, Any]) -> None:
+    module = import_module(f"deepaccident_devkit.{room}")
+    functions = {name: said for name, said in listed["rooms"][module.__name__].items() if said.startswith("(")}
+    functions = {name: said for name, said in functions.items() if "." not in name}
+    for name, said in functions.items():
+        assert parameters(said) == [*inspect.signature(getattr(module, name)).parameters], name
+
+
+def test_the_list_has_the_members_that_python_sees(listed: dict[str, Any]) -> None:
+    names = {
+        name.partition(".")[2] for name in listed["rooms"]["deepaccident_devkit"] if name.startswith("DeepAccident.")
+    }
+    assert names == {name for name in dir(DeepAccident) if not name.startswith("_")}
+    said = listed["rooms"]["deepaccident_devkit"]["DeepAccident.motion_labels"]
+    assert ["self", *parameters(said)][1:] == [*inspect.signature(DeepAccident.motion_labels).parameters][1:]
 
 
 def test_it_has_the_versions_of_files_and_pythons() -> None:
@@ -23,6 +130,18 @@ def test_it_has_the_versions_of_files_and_pythons() -> None:
     ]
     pythons = re.findall(r"Python :: (3\.\d+)", (TOP / "pyproject.toml").read_text(encoding="utf-8"))
     assert f"Python {', '.join(pythons[:-1])} and {pythons[-1]}" in " ".join(PAGE.split())
+
+
+@pytest.mark.parametrize("page", ["docs/maintaining.md", "RELEASING.md"])
+def test_the_tests_that_the_page_names_are_there(page: str) -> None:
+    named = re.findall(r"`((?:tests|docs|deepaccident_devkit)/[\w./]+)`", (TOP / page).read_text(encoding="utf-8"))
+    assert named
+    assert [path for path in named if not (TOP / path).exists()] == []
+
+
+def test_releasing_takes_ten_steps() -> None:
+    page = (TOP / "RELEASING.md").read_text(encoding="utf-8")
+    assert re.findall(r"^(\d+)\. ", page, re.MULTILINE) == [str(step) for step in range(1, 11)]
 
 
 def test_every_package_of_the_reference_says_what_is_public() -> None:

@@ -37,6 +37,8 @@ if TYPE_CHECKING:
 
     from deepaccident_devkit.parallel import Engine
 
+__all__ = ["SanityReport", "check_sanity"]
+
 Group = Literal["place", "time", "size", "class"]
 NOTHING_WRONG: Final = "Nothing looks wrong with the predictions."
 _AXES: Final = {

@@ -1,12 +1,13 @@
 """All sensors of a scenario's agents, and what each of them records at a moment."""
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from deepaccident_devkit.geometry import SE3
+from deepaccident_devkit.geometry.se3 import trusted_se3
 from deepaccident_devkit.release import BevImage, Calib, Labels
 from deepaccident_devkit.release.npz import TAGS
 from deepaccident_devkit.support.arrays import ByteArray, FloatArray
@@ -123,6 +124,7 @@ class Rig:
         studio: it makes the images; None if there are none.
         seed: seed of all noise, so that the noise of a moment does not depend on what was recorded before.
         exact: whether calib files are ideal, and numbers of points exact.
+        decimals: to how many decimals labels and calib are rounded; None for all.
         name: of how it is mounted, and of its optics (`plan.SynthConfig`).
     """
 
@@ -134,6 +136,7 @@ class Rig:
     studio: Studio | None
     seed: tuple[int, ...]
     exact: bool
+    decimals: int | None = None
     name: RigName = "released"
 
     def scene(self, time: float) -> Scene:
@@ -149,7 +152,10 @@ class Rig:
         points = scan(scene, self.lidars[agent.name], ground_from_lidar, self.air, rng, boxed=not self.clouds)
         labels = annotate(scene, agent, world_from_ground, points, exact=self.exact)
         calib = agent.calib(world_from_ground @ ground_from_ego)
-        return Sighting(labels, calib if self.exact else with_single_precision(calib), points)
+        calib = calib if self.exact else with_single_precision(calib)
+        if self.decimals is not None:
+            labels, calib = _rounded_labels(labels, self.decimals), _rounded_calib(calib, self.decimals)
+        return Sighting(labels, calib, points)
 
     def bev(self, scene: Scene, agent: Agent) -> BevImage:
         """The picture of an agent's BEV camera."""
@@ -184,6 +190,7 @@ def make_rig(  # noqa: PLR0913 - where, who, under which sky, and what is record
     seed: tuple[int, ...],
     sensors: Sensors = "all",
     exact: bool = False,
+    decimals: int | None = None,
     name: RigName = "released",
 ) -> Rig:
     """The sensors of a scenario; `ids` are the actors of the four agents that are vehicles.
@@ -200,11 +207,29 @@ def make_rig(  # noqa: PLR0913 - where, who, under which sky, and what is record
         agents=agents,
         lidars={agent.name: make_lidar(setting, agent) for agent in agents},
         air=AIR_OF_WEATHER[weather],
-        clouds=sensors == "all",
-        studio=None if sensors == "none" else Studio(setting, weather, time_of_day, rng),
+        clouds=sensors in ("all", "clouds"),
+        studio=None if sensors in ("clouds", "none") else Studio(setting, weather, time_of_day, rng),
         seed=seed,
         exact=exact,
+        decimals=decimals,
         name=name,
+    )
+
+
+def _rounded_labels(labels: Labels, decimals: int) -> Labels:
+    names = ("agent_velocity", "center", "size", "yaw", "velocity")
+    return replace(labels, **{name: getattr(labels, name).round(decimals) for name in names})
+
+
+def _rounded_calib(calib: Calib, decimals: int) -> Calib:
+    def rounded(pose: SE3) -> SE3:
+        return trusted_se3(pose.matrix.round(decimals))
+
+    return Calib(
+        ego_from_lidar=rounded(calib.ego_from_lidar),
+        world_from_ego=rounded(calib.world_from_ego),
+        camera_from_lidar={channel: rounded(pose) for channel, pose in calib.camera_from_lidar.items()},
+        intrinsic={channel: matrix.round(decimals) for channel, matrix in calib.intrinsic.items()},
     )
 
 

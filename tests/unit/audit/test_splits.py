@@ -1,6 +1,7 @@
 """Splits of all kinds: the official one passes, and what leaks is told."""
 
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from random import Random
@@ -109,7 +110,7 @@ def test_mini_beside_the_full_release(sides: Sides, tmp_path: Path) -> None:
 
 
 def test_files_that_are_no_splits(sides: Sides, tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="expected two or more split files, a side each, found 1"):
+    with pytest.raises(ConfigError, match=r"two or more split files, or dataroots, a side each, found .*train\.txt"):
         sides(train=[TOKENS[0]])
     with pytest.raises(SplitFileError, match=r"val\.txt:2: expected a scenario's type and name, .*found 'Town03_x'"):
         sides(train=[TOKENS[0]], val=["", "Town03_x"])
@@ -122,3 +123,21 @@ def test_files_that_are_no_splits(sides: Sides, tmp_path: Path) -> None:
 
 def test_hostile_lines_end_soon(sides: Sides) -> None:
     assert numbers(sides(train=[f"{ACCIDENT}/" * 20_000 + TOKENS[0]], val=["_" * 100_000 + TOKENS[1]])) == {}
+
+
+def test_releases_share_recordings_of_a_name_and_the_same_labels(motion_root: Path, tmp_path: Path) -> None:
+    """Of a name alone nothing is said."""
+    for name in ("copy", "other"):
+        shutil.copytree(motion_root, tmp_path / name, ignore=shutil.ignore_patterns(".deepaccident"))
+    labels = sorted(tmp_path.glob("other/*/*/label/*/*_001.txt"))
+    for label in labels:
+        label.write_bytes(label.read_bytes() + b"\n")
+    [found] = audit_splits([motion_root, tmp_path / "copy"]).findings
+    assert (found.kind, found.number) == ("recordings", 2)
+    assert str(motion_root) in found.examples[0]
+    assert str(tmp_path / "copy") in found.examples[0]
+    report = audit_splits([motion_root, tmp_path / "other"])
+    assert (len(labels), report.findings) == (10, ())
+    assert report.tables["sides"][1:] == [(str(motion_root), 2), (str(tmp_path / "other"), 2)]
+    with pytest.raises(ConfigError, match=r"files, or dataroots, a side each, found .*motion, .*\.txt"):
+        audit_splits([motion_root, motion_root / "train.txt"])

@@ -205,11 +205,29 @@ def test_exact_releases_differ_in_calib_and_counts_alone(tmp_path):
 
 
 @pytest.mark.slow
+def test_rounded_numbers_are_the_same_ones_with_fewer_digits(tmp_path):
+    def made(decimals):
+        config = SynthConfig(scenarios=1, frames=2, sensors=False, seed=7, decimals=decimals)
+        return find_release(make_release(tmp_path / str(decimals), config, workers=1)).scenarios[0]
+
+    full, rounded = made(None), made(4)
+    for agent, frame in itertools.product(AGENTS, (1, 2)):
+        one, other = (read_label(scenario.label_path(agent, frame)) for scenario in (full, rounded))
+        for name in ("agent_velocity", "center", "size", "yaw", "velocity"):
+            np.testing.assert_array_equal(getattr(one, name).round(4), getattr(other, name))
+        np.testing.assert_array_equal(one.num_lidar_pts, other.num_lidar_pts)
+        one, other = (read_calib(scenario.calib_path(agent, frame), raw=True) for scenario in (full, rounded))
+        assert all(np.array_equal(matrix.round(4), other[name]) for name, matrix in one.items())
+    assert not validate_release(rounded.root, workers=1).findings
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("fields", "files"),
     [
         ({"sensors": "none"}, r"\.(txt|pkl)$"),
         ({"sensors": "cameras"}, r"\.(txt|pkl|jpg)$"),
+        ({"sensors": "clouds"}, r"\.(txt|pkl)$|/lidar01/"),
         ({"sensors": "accidents"}, r"_accident/|\.(txt|pkl)$"),
         ({"sensor_step": 2}, r"\.(txt|pkl)$|_00[13]\.\w+$"),  # counted back from the last of three frames
         ({"sensor_step": 9, "sensors": "cameras"}, r"\.(txt|pkl)$|_003\.jpg$"),
