@@ -14,6 +14,8 @@ work="$(mktemp -d)"
 trap 'rm -rf "$work"' EXIT
 unset PYTHONPATH
 export PIP_DISABLE_PIP_VERSION_CHECK=1 MPLBACKEND=Agg
+PYTHON="$(command -v "${PYTHON:-python3}")"
+source "$top/.ci/tools/python_of.sh"
 pythons=("$@")
 [ ${#pythons[@]} -gt 0 ] || pythons=(3.10 3.11 3.12 3.13)
 
@@ -23,7 +25,7 @@ declare -A newer=(
   [3.13]='numpy==2.1.* opencv-python-headless==4.10.* scipy==1.14.* shapely==2.0.* pillow==11.0.* pyyaml==6.0.2 matplotlib==3.9.* pyarrow==18.*'
 )
 
-python3 -m venv "$work/build"
+"$PYTHON" -m venv "$work/build"
 "$work/build/bin/pip" install --quiet build tomli
 "$work/build/bin/python" -m build --outdir "$work/dist" "$top" >/dev/null
 mapfile -t bounds < <("$work/build/bin/python" "$top/.ci/tools/lower_bounds.py" synth)
@@ -39,7 +41,7 @@ oldest_on() {
 }
 
 for version in "${pythons[@]}"; do
-  python="$(command -v "python$version" || compgen -G "$HOME/.pyenv/versions/$version.*/bin/python3")"
+  python="$(python_of "$version")"
   for distribution in "$work"/dist/*; do
     for libraries in oldest newest; do
       printf '\n== %s on Python %s, %s libraries (%s s)\n' "$(basename "$distribution")" "$version" "$libraries" "$SECONDS"

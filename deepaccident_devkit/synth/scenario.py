@@ -312,8 +312,7 @@ def record_scenario(job: RecordingJob) -> None:
     scenario, rig = _KEPT.made_ready(_Task(job.config, job.plan))
     labelled = job.plan.split != "test" or not job.config.unlabelled_test
     step = job.config.sensor_step
-    bev = job.config.sensors != "clouds"
-    recorder = _Recorder(folder=job.folder, scenario=scenario, rig=rig, labelled=labelled, bev=bev, sensor_step=step)
+    recorder = _Recorder(folder=job.folder, scenario=scenario, rig=rig, labelled=labelled, sensor_step=step)
     if labelled and job.first == 1:
         write_meta(real_path(job.folder.meta_path), scenario.meta)
     for frame in range(job.first, scenario.frames + 1, job.step):
@@ -378,7 +377,6 @@ class _Recorder:
     scenario: Scenario
     rig: Rig
     labelled: bool
-    bev: bool
     sensor_step: int
 
     def record(self, frame: int) -> None:
@@ -403,7 +401,7 @@ class _Recorder:
         """Write the point cloud, and if all is recorded and labelled also the BEV array, whose instances are labels."""
         place = real_path(self.folder.channel_path(agent.name, LIDAR, frame))
         write_lidar(place, points.xyz, intensity(points, self.rig.air))
-        if self.labelled and self.bev:
+        if self.labelled and self.rig.studio:
             bev = self.rig.bev(scene, agent)
             write_bev(real_path(self.folder.channel_path(agent.name, BEV_CAMERA, frame)), bev.semantic, bev.instance)
 
