@@ -45,12 +45,13 @@ for version in "${pythons[@]}"; do
   for distribution in "$work"/dist/*; do
     for libraries in oldest newest; do
       printf '\n== %s on Python %s, %s libraries (%s s)\n' "$(basename "$distribution")" "$version" "$libraries" "$SECONDS"
-      rm -rf "$work/tried"
+      cd "$work"
+      rm -rf tried
       "$python" -m venv "$work/tried/venv"
       wanted=()
       if [ "$libraries" = oldest ]; then mapfile -t wanted < <(oldest_on "$version"); fi
       "$work/tried/venv/bin/pip" install --quiet "$distribution[synth]" "${wanted[@]}"
-      cd "$work/tried"
+      cd tried
       venv/bin/deepaccident --version --all
       venv/bin/deepaccident demo >demo.log
       test -s deepaccident_demo/index.html
