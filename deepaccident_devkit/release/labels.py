@@ -4,14 +4,15 @@ The release writes `(vx, vy) = Rz(yaw) · v_world`, with the row's own yaw in th
 same in CARLA's left-handed axes and in the devkit's: mirroring negates both the angle and y. The agent's own row has
 yaw 0, so it reads as the world's.
 
-Files are parsed in bulk: the bodies of many files are joined and go through Arrow's CSV reader in one call. Files that
-this call cannot read (CRLF, blanks at line ends, one-token lines, faults) are tidied, or their fault is named.
+Files are parsed in bulk: the bodies of many files are joined, and Arrow casts their columns. Files that it cannot read
+(CRLF, blanks at line ends, one-token lines, faults) are tidied, or their fault is named.
 """
 
 import codecs
 import os
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -218,6 +219,7 @@ def _parse_batches(batches: Sequence[Sequence[ReleasePath]]) -> list[dict[str, A
         return [_parse_files(batch, [_content(path) for path in batch]) for batch in batches]
     from concurrent.futures import ThreadPoolExecutor
 
+    import_module("pyarrow")  # here: pyarrow 25.0.0 crashes after the thread has ended in which it was imported
     with ThreadPoolExecutor(min(_MOST_THREADS, os.cpu_count() or 1)) as pool:
         parts = [pool.submit(_parse_files, batch, [_content(path) for path in batch]) for batch in batches]
         return [part.result() for part in parts]
@@ -247,81 +249,76 @@ def _parse_joined(contents: Sequence[bytes]) -> dict[str, AnyArray] | None:
     import pyarrow as pa
 
     body_starts = [content.index(b"\n") + 1 for content in contents]
-    num_boxes = np.array([content.count(b"\n") - 1 for content in contents], dtype=np.int64)
     header = b"".join([content[:start] for content, start in zip(contents, body_starts, strict=True)])
     body = b"".join([memoryview(content)[start:] for content, start in zip(contents, body_starts, strict=True)])
-    # Arrow would take a carriage return for a line end, read hexadecimal integers and drop a byte order mark; a line
-    # of zero bytes would be skipped as one token
-    if any(odd in body for odd in (b"\r", b"x", b"X", b"\0")) or b"\r" in header:
-        return None
-    if header.startswith(codecs.BOM_UTF8) or body.startswith(codecs.BOM_UTF8):
+    if b"x" in body or b"X" in body:  # Arrow reads hexadecimal integers
         return None
     try:
-        header_table = _parse_csv(header, dict.fromkeys(_HEADER, pa.float64()))
-        body_table = _parse_csv(
-            body,
-            {
-                "class": pa.dictionary(pa.int32(), pa.string()),
-                **dict.fromkeys(_FLOAT_FIELDS, pa.float64()),
-                **dict.fromkeys(_INTEGER_FIELDS, pa.int64()),
-                "camera_visible": pa.bool_(),
-            },
-        )
+        header_words, words = _columns(header, _HEADER), _columns(body, FIELDS)
+        if header_words is None or words is None:
+            return None
+        num_boxes = np.array([content.count(b"\n") - 1 for content in contents], dtype=np.int64)
+        return _parse_columns(words, header_words, num_boxes)
     except pa.ArrowInvalid:
         return None
-    # blank lines vanish silently, so counts are compared
-    if header_table.num_rows != len(contents) or body_table.num_rows != num_boxes.sum():
-        return None
-    return _columns_of(body_table, header_table, num_boxes)
 
 
-def _parse_csv(content: bytes, types: dict[str, Any]) -> Any:
-    """A table of words between blanks, by name and type of its columns."""
+def _columns(content: bytes, names: Sequence[str]) -> dict[str, Any] | None:
+    """The words of each column, by its name; None unless each line has that many, with one blank between.
+
+    Not by Arrow's reader of CSV: up to 19 it writes beyond its memory where a line has too many words (apache/arrow
+    45497), and it starts a thread for each call.
+    """
     import pyarrow as pa
-    from pyarrow import csv
+    import pyarrow.compute as pc
 
-    if not content or content.isspace():
-        return pa.table({name: pa.array([], type=kind) for name, kind in types.items()})
-    return csv.read_csv(
-        pa.BufferReader(content),
-        # workers share the cores, so each parses on one
-        read_options=csv.ReadOptions(column_names=list(types), use_threads=False, block_size=len(content) + 1),
-        parse_options=csv.ParseOptions(delimiter=" ", quote_char=False, double_quote=False),
-        convert_options=csv.ConvertOptions(
-            column_types=types, null_values=[], true_values=["True"], false_values=["False"]
-        ),
-    )
+    characters = np.frombuffer(content, dtype=np.uint8)
+    ends = np.flatnonzero((characters == ord(" ")) | (characters == ord("\n")))
+    numbers = np.arange(len(ends))
+    if not np.array_equal(characters[ends] == ord("\n"), numbers % len(names) == len(names) - 1):
+        return None
+    buffers = [None, pa.py_buffer(np.append(0, ends + 1)), pa.py_buffer(content)]
+    words = pa.Array.from_buffers(pa.large_binary(), len(ends), buffers).cast(pa.large_string())
+    words = pc.ascii_rtrim(words, characters=" \n")
+    return {name: words.take(pa.array(numbers[at :: len(names)])) for at, name in enumerate(names)}
 
 
-def _columns_of(body: Any, header: Any, num_boxes: IntArray) -> dict[str, AnyArray]:
-    def numbers(table: Any, names: Sequence[str]) -> FloatArray:
-        return np.column_stack([table[name].to_numpy() for name in names])
+def _parse_columns(words: dict[str, Any], header: dict[str, Any], num_boxes: IntArray) -> dict[str, AnyArray]:
+    """Raises pyarrow.ArrowInvalid for what is none of its kind; an unknown class is −1."""
+    import pyarrow as pa
 
-    velocity = numbers(body, ("vx", "vy"))
+    def numbers(columns: dict[str, Any], names: Sequence[str]) -> FloatArray:
+        return np.column_stack([columns[name].cast(pa.float64()).to_numpy() for name in names])
+
+    velocity = numbers(words, ("vx", "vy"))
     velocity[~in_range(velocity)] = np.nan
     agent_velocity = numbers(header, _HEADER)
     agent_velocity[~in_range(agent_velocity)] = np.nan
+    visible = _codes(words["camera_visible"], ("False", "True"))
+    if (visible < 0).any():
+        raise pa.ArrowInvalid("a boolean is neither False nor True")
     return {
         "num_boxes": num_boxes,
         "agent_velocity": agent_velocity,
-        "category": _category_codes(body["class"]),
-        "center": numbers(body, ("x", "y", "z")),
-        "size": numbers(body, ("l", "w", "h")),
-        "yaw": body["yaw"].to_numpy(),
+        "category": _codes(words["class"], CATEGORIES),
+        "center": numbers(words, ("x", "y", "z")),
+        "size": numbers(words, ("l", "w", "h")),
+        "yaw": numbers(words, ("yaw",))[:, 0],
         "velocity": velocity,
-        "actor_id": body["id"].to_numpy(),
-        "num_lidar_pts": body["num_lidar_pts"].to_numpy(),
-        "camera_visible": body["camera_visible"].to_numpy(),
+        "actor_id": words["id"].cast(pa.int64()).to_numpy(),
+        "num_lidar_pts": words["num_lidar_pts"].cast(pa.int64()).to_numpy(),
+        "camera_visible": visible == 1,
     }
 
 
-def _category_codes(column: Any) -> AnyArray:
-    """Codes of class names; −1 for an unknown one."""
-    known = {name: code for code, name in enumerate(CATEGORIES)}
-    combined = column.combine_chunks()
-    codes = [known.get(name, -1) for name in combined.dictionary.to_pylist()]
-    taken: AnyArray = np.take(np.array(codes, dtype=np.int8), combined.indices.to_numpy())
-    return taken
+def _codes(words: Any, known: Sequence[str]) -> AnyArray:
+    """(N,) int8, the index of each word among those that are known, or −1."""
+    import pyarrow as pa
+    import pyarrow.compute as pc
+
+    found = pc.index_in(words, value_set=pa.array(known, pa.large_string()))
+    codes: AnyArray = found.fill_null(-1).to_numpy().astype(np.int8)
+    return codes
 
 
 def _has_fault(columns: dict[str, AnyArray]) -> bool:

@@ -2,7 +2,7 @@
 
 How each kind of column is stored in Arrow, and how it is read back without copying, is at the end.
 The rows of some tables that are kept together, such as a scenario's, are compressed Arrow streams one after the other.
-They are few, and neither written nor read by Arrow's threads, of which some have crashed (see pyproject.toml).
+They are few, and so neither written nor read by Arrow's threads.
 """
 
 from collections.abc import Mapping, Sequence

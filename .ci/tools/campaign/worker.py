@@ -21,7 +21,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import pyarrow.csv
+import pyarrow.compute
 import pyarrow.parquet
 import scipy.optimize
 import shapely
@@ -33,7 +33,7 @@ from campaign.mutations import MARKER, MUTATIONS
 from deepaccident_devkit.errors import DeepAccidentError
 from deepaccident_devkit.support.files import temporary_path
 
-assert all((pyarrow.csv, pyarrow.parquet, scipy.optimize, shapely))  # what the readers import when they need it
+assert all((pyarrow.compute, pyarrow.parquet, scipy.optimize, shapely))  # what the readers import when they need it
 if HAS_TORCH:
     importlib.import_module("campaign.healthy_weights")
 

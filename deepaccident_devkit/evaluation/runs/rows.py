@@ -146,10 +146,9 @@ def read_rows(path: Path) -> tuple[list[dict[str, Any]], dict[str, Any]]:
 def _table(content: bytes) -> Any:
     """The Arrow table in a Parquet file, whose values take no more memory than such a file may.
 
-       Texts stay in dictionaries until their lengths in all rows are known: a few bytes can stand for a long text in
-       millions of rows.
-    Raises OSError (it would take more), ValueError (a column is of another kind than
-       `write_rows` writes) or ArrowException (it is damaged).
+    Texts stay in dictionaries until their lengths in all rows are known: a few bytes can stand for a long text in
+    millions of rows. Raises OSError (it would take more), ValueError (a column is of another kind than `write_rows`
+    writes) or ArrowException (it is damaged).
     """
     import pyarrow as pa
     import pyarrow.compute as pc

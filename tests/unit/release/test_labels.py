@@ -1,3 +1,6 @@
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -351,6 +354,29 @@ def test_the_first_fault_among_many_boxes_is_named(write, line: int, ends: str) 
     lines[line - 1] = "bus 1"
     path = write(ends.join(lines))
     assert_refused((lambda: read_label(path), LabelError, rf"label\.txt:{line}: expected 13 fields, found 2: 'bus 1'"))
+
+
+READ = """
+import sys
+from pathlib import Path
+from deepaccident_devkit.errors import LabelError
+from deepaccident_devkit.release import read_label
+for path in sys.argv[1:]:
+    try:
+        read_label(Path(path))
+    except LabelError:
+        print("refused")
+"""
+
+
+def test_lines_of_too_many_words_are_read_in_arrows_own_memory(write) -> None:
+    """Arrow's reader of CSV, up to 19, writes beyond it (apache/arrow 45497)."""
+    texts = ("1 " * 100_000, f"{HEADER}\n" + "1 " * 100_000, f"{HEADER}\n" + f"{PARKED}\n" * 3000 + "1 " * 9000)
+    paths = [str(write(text, f"{number}.txt")) for number, text in enumerate(texts)]
+    environment = {**os.environ, "ARROW_DEBUG_MEMORY_POOL": "abort"}
+    words = [sys.executable, "-c", READ, *paths]
+    ran = subprocess.run(words, env=environment, check=False, capture_output=True, text=True)
+    assert (ran.returncode, ran.stdout, ran.stderr) == (0, "refused\n" * 3, "")
 
 
 @pytest.mark.parametrize(("end", "cut"), [("", True), (" ", True), ("\n", False)])
