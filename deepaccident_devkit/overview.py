@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     from deepaccident_devkit.tables.records import ScenarioRecord
 
 _UNKNOWN = "unknown"
+_ENDS = {"yes": "collision", "no": "no collision", _UNKNOWN: "collision unknown"}
+"""Whether a scenario has a collision → how a line says that."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -43,7 +45,7 @@ class Overview(Report):
         files: channel → files of these recordings.
         recordings: all recordings.
         samples: their moments: as many files has a channel of a whole release.
-        attributes: field → value → scenarios.
+        attributes: field → value → scenarios; of `collision` yes, no and unknown.
         left_out: broken scenarios that were skipped, by token.
     """
 
@@ -126,7 +128,10 @@ def overview(dataset: Dataset) -> Overview:
         files={channel: sum(counts) for channel, counts in files.items()},
         recordings=len(agents),
         samples=len(dataset.sample),
-        attributes={field: _counts(scenario[field] for scenario in scenarios) for field in SCENARIO_ATTRIBUTES},
+        attributes={
+            "collision": _counts(map(_collides, scenarios)),
+            **{field: _counts(scenario[field] for scenario in scenarios) for field in SCENARIO_ATTRIBUTES},
+        },
         left_out=[problem.scenario for problem in dataset.problems],
     )
 
@@ -135,8 +140,7 @@ def scenario_lines(scenarios: Iterable[ScenarioRecord]) -> list[str]:
     """A line a scenario: token, frames, split, weather and how it ended."""
     lines = []
     for scenario in scenarios:
-        end = "collision" if scenario["collision"] else "no collision"
-        end = "collision unknown" if scenario["weather"] is None else end  # there is no meta
+        end = _ENDS[_collides(scenario)]
         weather = f"{scenario['weather'] or _UNKNOWN} {scenario['time_of_day'] or ''}".strip()
         split = scenario["split"] or "split unknown"
         lines.append(f"{scenario['token']}  {scenario['num_frames']} frames  {split}  {weather}  {end}")
@@ -175,6 +179,12 @@ def sample_lines(dataset: Dataset, sample: RowArgument) -> list[str]:
 def table_text(left: str, right: str, rows: Sequence[tuple[str, str]]) -> str:
     """Two aligned columns under a heading."""
     return columns_text([(left, right), *rows])
+
+
+def _collides(scenario: ScenarioRecord) -> str:
+    if scenario["weather"] is None:
+        return _UNKNOWN  # there is no meta
+    return "yes" if scenario["collision"] else "no"
 
 
 def _counts(values: Iterable[object]) -> dict[str, int]:

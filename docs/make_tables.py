@@ -13,6 +13,7 @@ import click
 TOP = Path(__file__).parents[1]
 NAMES = {
     "baselines": "what constant velocity foresees, by who cooperates",
+    "benchmark": "the rows that benchmarks/v1 keeps",
     "facts": "the real release's facts beside a synthetic one, or beside --release",
     "labels": "cells in which label protocols differ",
     "model": "the studies that benchmarks/studies keeps",

@@ -330,4 +330,4 @@ NAMES = """
 
 def test_what_the_design_names_is_there() -> None:
     assert [name for name in NAMES.split() if not hasattr(DeepAccident, name)] == []
-    assert deepaccident_devkit.__version__ == "0.1.0"
+    assert deepaccident_devkit.__version__ == "1.0.0"

@@ -29,7 +29,13 @@ def test_synth_index_info_end_to_end(tmp_path: Path) -> None:
     assert "deepaccident info" in made.stdout
     assert "2 scenarios, 30 samples" in ran("index", out).stdout
     text = " ".join(ran("info", out).stdout.split())
-    wanted = ("layout B", "train 2 of 483", "type1_subtype1_accident 1", "Camera_Front 10")
+    wanted = (
+        "layout B",
+        "train 2 of 483",
+        "collision scenarios no 1 yes 1",
+        "type1_subtype1_accident 1",
+        "Camera_Front 10",
+    )
     assert [line for line in wanted if line not in text] == []
     counts = json.loads(ran("info", out, "--json").stdout)
     assert (counts["tables"]["sample"], counts["agents"]["infrastructure"]) == (30, 2)
@@ -42,6 +48,24 @@ def test_errors_are_one_message_and_status_2(tmp_path: Path) -> None:
     failed = ran("info", tmp_path / "nowhere", status=2)
     assert failed.stderr.startswith(f"error: {tmp_path / 'nowhere'}: does not exist; give the folder")
     assert failed.stdout == ""
+
+
+FAILING = """
+from deepaccident_devkit import cli
+from deepaccident_devkit.errors import MissingFileError
+
+def fail(command):
+    told = "Caught MissingFileError in DataLoader worker process 0.\\nOriginal Traceback (most recent call last):"
+    raise MissingFileError(f"{told}\\n  …\\ndeepaccident_devkit.errors.MissingFileError: a.jpg: no such file")
+
+cli.run_interruptibly = fail
+cli.main()
+"""
+
+
+def test_of_an_error_in_a_loaders_worker_the_message_is_told_alone() -> None:
+    failed = subprocess.run([sys.executable, "-c", FAILING], check=False, capture_output=True, text=True)
+    assert (failed.returncode, failed.stderr) == (2, "error: a.jpg: no such file\n")
 
 
 @pytest.mark.slow

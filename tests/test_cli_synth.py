@@ -7,7 +7,8 @@ import pytest
 from click.testing import CliRunner
 
 from deepaccident_devkit.release import find_release
-from deepaccident_devkit.synth import SynthConfig
+from deepaccident_devkit.synth import SynthConfig, make_release
+from deepaccident_devkit.synth.benchmark import described_release
 from deepaccident_devkit.synth.cli import synth
 from deepaccident_devkit.synth.spec import design_text, parse_spec
 
@@ -64,6 +65,33 @@ def test_every_option_reaches_the_configuration(tmp_path, made, monkeypatch, wor
 def test_without_options_scenarios_have_their_natural_length(tmp_path, made):
     assert f"{tmp_path}: 4 scenarios with five agents, layout A" in CliRunner().invoke(synth, [str(tmp_path)]).output
     assert made == [SynthConfig(frames=None)]
+
+
+@pytest.mark.slow
+def test_a_benchmark_is_made_and_compared(tmp_path, monkeypatch):
+    """One that is there is compared alone; which differences there are is told, and what else was asked for refused."""
+    config = SynthConfig(scenarios=1, frames=2, image_size=(32, 18), seed=6)
+    small = make_release(tmp_path / "small", config, workers=1)
+    module = sys.modules[synth.callback.__module__]
+    monkeypatch.setattr(module, "BENCHMARKS", {"v1": config})
+    wanted = described_release(small, workers=1)
+    monkeypatch.setattr(module, "published", lambda name: {"v1": wanted}[name])
+
+    def run(*words: str):
+        return CliRunner().invoke(synth, [str(tmp_path / "out"), "--benchmark", "v1", "--workers", "1", *words])
+
+    assert "--seed changes nothing with --benchmark, which says all of it" in run("--seed", "6").stderr
+    first = run("--sensors", "clouds")
+    assert (first.exit_code, first.stdout.splitlines()[0]) == (
+        0,
+        f"{tmp_path / 'out'}: is the benchmark v1 as published, 1 scenario",
+    )
+    [label] = (tmp_path / "out").glob("*/infrastructure/label/*/*_002.txt")
+    label.write_text(label.read_text().replace("car ", "van ", 1))
+    second = run()
+    assert second.exit_code == 1
+    told = ("out: is not the benchmark v1 as published:\n", "scenario00001: label files differ\n", "v1/lock.txt")
+    assert [each for each in told if each not in second.stderr] == []
 
 
 def test_labels_without_embree_are_said_to_take_long(tmp_path, made, monkeypatch):

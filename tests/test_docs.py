@@ -79,6 +79,7 @@ NOT_RUN = {
     "predict constant_velocity hidden_release": "benchmarks/pages/baselines.py does that and the next one",
     "evaluate motion hidden_release": "likewise",
     "evaluate warning DATAROOT --results all_": "of what these predict; tests/test_cli_evaluate.py has their like",
+    "evaluate verify benchmarks/": "tests/test_cli_evaluate.py has its like",
     "results ": "tests/unit/export/nuscenes/test_detections.py has it, and makes the file",
     "rigs data/": "tests/road/test_commands.py has it and its like; they need the nuScenes devkit",
     "render sample data/": "likewise",

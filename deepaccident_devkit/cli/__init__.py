@@ -111,5 +111,6 @@ def _run() -> None:
     try:
         run_interruptibly(deepaccident)
     except (DeepAccidentError, OSError) as error:  # an OSError: a full disk, a folder without permission
-        click.echo(f"error: {error}", err=True)
+        *_, told = str(error).rpartition(f".{type(error).__name__}: ")  # a loader's worker puts its traceback before it
+        click.echo(f"error: {told}", err=True)
         sys.exit(_FINDINGS_STATUS if isinstance(error, SomeFailedError) else _ERROR_STATUS)

@@ -80,8 +80,8 @@ def __getattr__(name: str) -> Any:
         import torch  # noqa: F401 - nothing here works without it
     except ModuleNotFoundError as error:
         raise MissingExtraError(
-            "the model needs PyTorch and safetensors: in a checkout, pip install '.[torch]' "
-            "(for PyTorch's CPU build alone: pip install torch --index-url https://download.pytorch.org/whl/cpu)"
+            f"the model needs PyTorch and safetensors, and {error.name} is not there: in a checkout, pip install "
+            "'.[torch]' (for PyTorch's CPU build alone: pip install torch --index-url https://download.pytorch.org/whl/cpu)"
         ) from error
     return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
 

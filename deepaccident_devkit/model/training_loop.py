@@ -6,7 +6,7 @@ import json
 import logging
 import os
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
@@ -114,6 +114,7 @@ def train(  # noqa: PLR0913 - on what, to where, what, how, from what, and on wh
             notes=_notes(dataset, choice, config, weights) | ({"also": also.as_dict()} if also else {}),
             dataset=dataset,
             moments=moments,
+            validated=validation_samples(dataset, config),
             config=config,
             place=place,
             predict=PredictConfig(
@@ -182,6 +183,7 @@ class _Run:
     notes: Mapping[str, Any]
     dataset: Dataset
     moments: Moments | MixedMoments
+    validated: Sequence[str]
     config: TrainConfig
     place: Place
     predict: PredictConfig
@@ -193,7 +195,6 @@ class _Run:
         optimizer = optimizer_of(model, self.config)
         progress = load_state(self.folder, model, optimizer, self.config.steps)
         step = self._wrapped(model)
-        tokens = validation_samples(self.dataset, self.config)
         if self.place.is_first:
             cut_log(self.folder, progress.step)
         numbers = self.moments.numbers(
@@ -208,7 +209,7 @@ class _Run:
             for number in bar:
                 row = self._step(number, step, optimizer, given)
                 bar.set_postfix(loss=f"{row['loss']:.3g}")
-                progress = self._after(number + 1, row, model, optimizer, progress, tokens)
+                progress = self._after(number + 1, row, model, optimizer, progress)
         best = self.folder / BEST
         return best if best.is_file() else self._weights(model, progress)
 
@@ -264,14 +265,14 @@ class _Run:
         model: V2XFormer,
         optimizer: AdamW,
         progress: Progress,
-        tokens: list[str],
     ) -> Progress:
         """Log a step and, every now and then, validate and save."""
         config, last = self.config, done == self.config.steps
         progress = replace(progress, step=done)
         row = dict(row)
-        if tokens and (done % config.validate_every == 0 or last):
-            scores = validated(model, self.dataset, tokens[self.place.rank :: self.place.ranks], self.predict)
+        if self.validated and (done % config.validate_every == 0 or last):
+            own = self.validated[self.place.rank :: self.place.ranks]
+            scores = validated(model, self.dataset, own, self.predict)
             row["validation"] = scores
             self.say(f"step {done:,}: {', '.join(f'{name} {value:.3f}' for name, value in scores.items())}")
             if progress.best is None or scores[SCORE] > progress.best:

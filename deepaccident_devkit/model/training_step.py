@@ -111,7 +111,10 @@ def validation_samples(dataset: Dataset, config: TrainConfig) -> list[str]:
     """Those that a run is validated with: two a second of the whole split, or evenly chosen ones of them."""
     if config.validation is None:
         return []
-    listed = samples(dataset, config.validation, "all")
+    try:
+        listed = samples(dataset, config.validation, "all")
+    except NotAvailableError as error:
+        raise NotAvailableError(f"{error} (--validation; none trains without it)") from error
     wanted = config.validation_samples
     if not wanted or wanted >= len(listed):
         return listed

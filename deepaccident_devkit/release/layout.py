@@ -137,7 +137,8 @@ def find_release(root: ReleasePath, version: str = "v1") -> ReleaseLayout:
     if not scenarios:
         if isinstance(root, Path) and nuscenes_tables(root):
             raise DatarootError(f"{root}: is a dataroot of nuScenes; open it with nuscenes.open_nuscenes")
-        aside = "".join(
+        aside = f"; it is of one scenario type: give {root.parent}" if SCENARIO_TYPE.fullmatch(root.name) else ""
+        aside += "".join(
             f"; {path} {f'looks like {meant}: rename it' if meant else 'is a link that leads nowhere'}"
             for path, meant in islice(left_aside(root), _MOST_ASIDE)
         )

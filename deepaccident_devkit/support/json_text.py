@@ -26,6 +26,7 @@ _STEPS: Final = np.zeros(256, dtype=np.int64)
 _STEPS[list(b"[{")], _STEPS[list(b"]}")] = 1, -1
 _GZIP: Final = b"\x1f\x8b"
 _PICKLE: Final = b"\x80"
+_ZIP: Final = b"PK\x03\x04"
 _SURROGATE: Final = re.compile("[\ud800-\udfff]")
 """Half of a character: JSON can write it alone, UTF-8 cannot."""
 _WRITTEN_SURROGATE: Final = re.compile(r"\\u[dD][89a-fA-F]")
@@ -62,6 +63,8 @@ def parsed_json(content: bytes, *, constants: bool = False, levels: int = MOST_L
 
     if content.startswith(_GZIP):
         raise ValueError("is compressed with gzip; unpack it")
+    if content.startswith(_ZIP):
+        raise ValueError("is a zip or npz archive; write JSON")
     if content.startswith(_PICKLE):
         raise ValueError("is a pickle; write JSON")
     _check_levels(content, levels)

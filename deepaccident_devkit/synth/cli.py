@@ -1,14 +1,17 @@
 """`deepaccident synth`: make a synthetic release."""
 
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import click
 
 from deepaccident_devkit.cli.options import PATH, engine_of, engine_parameters, pixel_size, refuse_unused
-from deepaccident_devkit.cli.verbs import advanced, field_option, verb
+from deepaccident_devkit.cli.verbs import WordChoice, advanced, field_option, verb
+from deepaccident_devkit.support.text import counted
 from deepaccident_devkit.synth import SynthConfig, make_release
-from deepaccident_devkit.synth.plan import IMAGE_SIZE, RELEASED_IMAGE_SIZE
+from deepaccident_devkit.synth.benchmark import BENCHMARKS, described_release, differences, published
+from deepaccident_devkit.synth.plan import IMAGE_SIZE, RELEASED_IMAGE_SIZE, Sensors
 from deepaccident_devkit.synth.sensors.caster import has_embree
 from deepaccident_devkit.synth.spec import DESIGN_NUMBERS, design_text, read_spec
 
@@ -17,7 +20,11 @@ Examples:
   deepaccident synth OUT --scenarios 24 --sensors none     only labels, all twelve designs
   deepaccident synth --show-design 3 > mine.yaml           print a scenario file to edit
   deepaccident synth OUT --design mine.yaml                make accidents from your file
-  deepaccident synth OUT --for-released-code               for the released DeepAccident code"""
+  deepaccident synth OUT --for-released-code               for the released DeepAccident code
+  deepaccident synth OUT --benchmark v1 --sensors cameras  a benchmark that everybody has the same
+"""
+_SHOWN: Final = 5
+"""How many differences from what is published are told."""
 
 
 def _show_design(context: click.Context, parameter: click.Parameter, value: str | None) -> None:
@@ -76,6 +83,12 @@ def _designs(context: click.Context, parameter: click.Parameter, given: tuple[st
 )
 @field_option(SynthConfig, "designed")
 @field_option(SynthConfig, "unplanned", option=advanced)
+@click.option(
+    "--benchmark",
+    type=WordChoice(BENCHMARKS),
+    help="Make the release of this benchmark, and say whether it is as published; with --sensors cameras or clouds, a "
+    "part of its files. One that is there is only compared. docs/benchmark.md says what it is for.",
+)
 @engine_parameters
 @click.option(
     "--show-design",
@@ -85,12 +98,16 @@ def _designs(context: click.Context, parameter: click.Parameter, given: tuple[st
     callback=_show_design,
     help="Print the scenario file of a design, as a start for your own, and stop; docs/synth.md lists them.",
 )
-def synth(out: Path, *, designs: dict[str, Any], **options: Any) -> None:
+def synth(out: Path, *, designs: dict[str, Any], benchmark: str | None, **options: Any) -> None:
     """Make a complete synthetic release in the new folder OUT.
 
     If a run is interrupted, the same command continues it.
     """
     how = engine_of(options)
+    if benchmark is not None:
+        refuse_unused("with --benchmark, which says all of it", *(set(options) | {"designs"}) - {*how, "sensors"})
+        _make_benchmark(out, benchmark, options["sensors"], how)
+        return
     options = {name: each for name, each in options.items() if name not in how} | designs
     if options["spec"] is not None or options["view"] == "hidden":
         refuse_unused("with a scenario file or --view hidden, which ask for one certain accident", "unplanned")
@@ -105,3 +122,17 @@ def synth(out: Path, *, designs: dict[str, Any], **options: Any) -> None:
     if config.spec is None or read_spec(config.spec).meets:
         layers = " --layers boxes" if config.sensors == "none" else ""
         click.echo(f"or:   deepaccident render accident {made}{layers} --out countdown.png")
+
+
+def _make_benchmark(out: Path, name: str, sensors: Sensors, how: dict[str, Any]) -> None:
+    """Make a benchmark's release if it is not there, and compare it; exit status 1 if it is not as published."""
+    if not (out.is_dir() and any(out.iterdir())):
+        make_release(out, replace(BENCHMARKS[name], sensors=sensors), progress=True, **how)
+    found = described_release(out, progress=True, **how)
+    if faults := differences(found, published(name)):
+        more = [f"and {len(faults) - _SHOWN} more"] if len(faults) > _SHOWN else []
+        told = "\n".join([f"{out}: is not the benchmark {name} as published:", *faults[:_SHOWN], *more])
+        remedy = f"Make it with the libraries of benchmarks/{name}/lock.txt"
+        raise click.ClickException(f"{told}\n{remedy}; evaluations of this release do not compare with others.")
+    click.echo(f"{out}: is the benchmark {name} as published, {counted(len(found['scenarios']), 'scenario')}")
+    click.echo(f"next: deepaccident info {out}")

@@ -87,8 +87,8 @@ class SynthConfig:
             nuScenes' cameras and images that are softer, noisier and of other colours: what stands for another dataset.
         exact: whether calib files are the same at each frame, and `num_lidar_pts` is the exact number of points. If
             not, both are a little wrong, as in the real release.
-        decimals: to how many decimals the numbers of labels and calib are rounded. Then they are the same bytes on any
-            machine, since processors differ in digits that are gone. None for all digits.
+        decimals: to how many decimals the numbers of labels, calib and meta are rounded. Then they are the same bytes
+            on any machine, since processors differ in digits that are gone. None for all digits.
         for_released_code: whether the released code must be able to read the release: images of 1600×900, layout `A`,
             a labelled test split, and split files under `split_txt_files/` too. Settings that contradict it are
             refused.

@@ -137,7 +137,7 @@ def build_scenario(config: SynthConfig, plan: ScenarioPlan) -> Scenario:
         ),
         actors=Actors.of(_actors(stage, recorded, ids)),
         agents=ids.agents,
-        meta=_meta(plan, stage, recorded, ids),
+        meta=_meta(plan, stage, recorded, ids, config.decimals),
         frames=recorded.frames,
         signals=None if stage.signals is None else stage.signals.shifted(-recorded.start),
         draws=draws,
@@ -238,8 +238,8 @@ def _actor(ids: _Ids, row: int, body: Body, motion: Motion) -> Actor:
     )
 
 
-def _meta(plan: ScenarioPlan, stage: Stage, recorded: Recorded, ids: _Ids) -> Meta:
-    spec, collision, planned = stage.spec, _collision(stage, recorded, ids), _pair_agents(stage)
+def _meta(plan: ScenarioPlan, stage: Stage, recorded: Recorded, ids: _Ids, decimals: int | None) -> Meta:
+    spec, collision, planned = stage.spec, _collision(stage, recorded, ids, decimals), _pair_agents(stage)
     ego, ego_behind, other, other_behind = (ids.agents[agent] for agent in VEHICLE_AGENTS)
     return Meta(
         weather=spec.weather,
@@ -255,7 +255,7 @@ def _meta(plan: ScenarioPlan, stage: Stage, recorded: Recorded, ids: _Ids) -> Me
     )
 
 
-def _collision(stage: Stage, recorded: Recorded, ids: _Ids) -> Collision | None:
+def _collision(stage: Stage, recorded: Recorded, ids: _Ids, decimals: int | None) -> Collision | None:
     impact, pair = recorded.impact, stage.cast.pair
     if impact is None or pair is None:
         return None
@@ -263,7 +263,7 @@ def _collision(stage: Stage, recorded: Recorded, ids: _Ids) -> Collision | None:
     return Collision(
         ids=(ids.actor[pair[0]], 0 if pair[1] == stage.unlabelled else ids.actor[pair[1]]),
         classes=(first.body.category, second.body.category),
-        impact=impact.strength,
+        impact=impact.strength if decimals is None else round(impact.strength, decimals),
         spawn_relation=impact.relation,
         contact_side=impact.side,
         agents=_pair_agents(stage),

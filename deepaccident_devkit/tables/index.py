@@ -382,9 +382,8 @@ def _problems_text(layout: ReleaseLayout, problems: Sequence[Problem]) -> str:
     for problem in problems:
         lines += [f"  {problem.scenario}", *_first_lines(problem.messages)]
     good = total - len(problems)
-    lines.append(
-        f"Mend them, or open the other {good} with on_error='skip' (--on-error skip)." if good else "Mend them first."
-    )
+    others = f"Mend them, or open the other {good} with on_error='skip' (--on-error skip)."
+    lines.append(others if good else "No other is left to open.")
     return "\n".join(lines)
 
 

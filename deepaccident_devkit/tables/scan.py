@@ -99,7 +99,8 @@ def scan_scenario(scenario: ScenarioFolder) -> ScenarioScan:
     has_meta = _is_there(scenario.meta_path)
     if labelled and not has_meta:
         notices.append(
-            f"{scenario.meta_path}: missing or not readable: weather and collision of this scenario are unknown"
+            f"{scenario.meta_path}: missing or not readable: weather and collision of this scenario are unknown, "
+            "and find(collision=…) leaves it out; find(designed_accident=True) goes by its folder"
         )
     num_frames = max((found[-1] for (agent, _), found in frames.items() if found and agent in agents), default=0)
     for agent in agents:

@@ -205,7 +205,8 @@ class Resolver:
     def _agent_row(self, scenario: str, agent: str) -> int:
         agents = self._agents[self._scenario_row(scenario)]
         if agent not in agents:
-            raise _UnknownError(f"the scenario's agents are {', '.join(agents)}{meant_text(agent, agents)}")
+            remedy = "; unpack its archive" if agent in AGENTS else meant_text(agent, agents)
+            raise _UnknownError(f"the scenario's agents are {', '.join(agents)}{remedy}")
         return agents[agent]
 
     def _index(self, scenario: str, word: str) -> int:

@@ -99,7 +99,9 @@ _SAYS: Final[Mapping[Group, Mapping[str, str]]] = {
         "frames reversed": "the first frame of a prediction is the present, and times are counted from there",
         "one step late": "frames and boxes show earlier moments; the first frame is the sample's own: no past",
     },
-    "size": dict.fromkeys(_ORDERS, "results files hold width, length, height; Boxes hold length, width, height"),
+    "size": dict.fromkeys(
+        _ORDERS, "Boxes and DetectedBoxes hold length, width, height; results files hold width, length, height"
+    ),
     "class": {_CLASSES: f"the classes are, counted from 0, {', '.join(CATEGORIES)}"},
 }
 """Group → mistakes that are undone on trial → what is right."""

@@ -174,8 +174,8 @@ class Coverage(ShortRepr):
         ]
         if self.extra and not (self.missing or self.unknown):
             parts.append(
-                "leave them out with --allow-partial (allow_partial=True); no sample lacks a prediction, so the "
-                "numbers are not partial then"
+                "leave them out with --allow-partial (allow_partial=True), or evaluate whole scenarios with --samples "
+                "all; no sample lacks a prediction, so the numbers are not partial then"
             )
         if self.agents:
             parts.append(

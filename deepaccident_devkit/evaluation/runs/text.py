@@ -289,8 +289,8 @@ def reading_notes(summary: Json) -> list[str]:
         notes += _predictions(form)
     elif summary["task"] == "detection" and released:
         notes.append(
-            "released: hidden boxes are truth, a class without true boxes counts as 0, velocities are compared with "
-            "the label's raw ones; --protocol paper leaves these out"
+            "released: hidden boxes and the agent's own are truth, a class without true boxes counts as 0, an error "
+            "as 1 where a recall is not reached, velocities are the label's raw ones; --protocol paper leaves these out"
         )
     return notes
 

@@ -367,8 +367,8 @@ class AllEgosDataset(V2XDataset):
         egos = [ego for ego in self.egos[position] if ego.rsplit("/", 2)[1] in there]
         if not egos:
             raise MissingFileError(
-                f"{self.egos[position][0]}: no agent has all its sensor files at this moment; leave it out, or "
-                "choose fewer cameras"
+                f"{self.egos[position][0]}: no agent has all its sensor files at this moment; take scenarios that "
+                "have them, by a split file (deepaccident split … --where … --out FILE.txt), or choose fewer cameras"
             )
         heard = [sensor_data.participants(self._dataset, ego, self._agents) for ego in egos]
         item["egos"] = tuple(egos)

@@ -87,8 +87,8 @@ def with_files(
     if needs_own and lacking[0, -1]:
         raise MissingFileError(
             f"{sample}: {lacking[0, -1]} of {len(channels)} sensor files of this sample's own agent are not there, and "
-            "on_missing='skip' leaves out other agents and frames alone; leave out such samples, or choose "
-            "points=False or fewer cameras"
+            "on_missing='skip' leaves out other agents and frames alone; leave out such samples "
+            "as docs/training.md shows, or choose points=False or fewer cameras"
         )
     there = [
         {name: message for name, message in moment.items() if not lacking[names.index(name), p]}

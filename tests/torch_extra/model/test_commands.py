@@ -101,6 +101,7 @@ def test_a_release_without_images(release_root_b: Path, trained: Path, tmp_path:
         (("--freeze", "nothing"), "no parameter's name begins with 'nothing'"),
         (("--from", "absent.pth"), "absent.pth: weights cannot be read"),
         (("--split", "nowhere"), "nowhere"),
+        (("--validation", "test"), "(--validation; none trains without it)"),
     ],
 )
 def test_wrong_options_are_one_line(release_root: Path, tmp_path: Path, words: tuple[object, ...], said: str) -> None:

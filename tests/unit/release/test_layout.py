@@ -77,7 +77,9 @@ def test_no_release_there(root: Path, version: str) -> None:
         (lambda: find_release(root, version), DatarootError if version == "v1" else VersionError, f"^{root}: ")
     )
     scenario(root)
+    of_type = root / ACCIDENT
     assert_refused(
+        (lambda: find_release(of_type), DatarootError, f"{of_type}: no scenario found; .* type: give {root}; expected"),
         (lambda: find_release(root, "v2"), VersionError, "unknown version 'v2'; known are v1, v1-mini"),
         (lambda: find_release(root, "v1-mini"), VersionError, (f"{root}: holds no mini release", "version='v1'")),
     )

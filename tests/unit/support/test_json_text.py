@@ -42,6 +42,7 @@ def test_levels_are_counted(far: int) -> None:
         (b"[1,\n x", r"is no JSON \(line 2, column 2\)"),
         (b"\x1f\x8b", "is compressed with gzip"),
         (b"\x80\x04", "is a pickle"),
+        (b"PK\x03\x04", "is a zip or npz archive"),
         (b'"\xff"', r"is no JSON \(not in UTF-8, or a number of thousands of digits\)"),
         (b'{"a": [{"b": 1, "b": 2}]}', "a: entry 0: b: stands there twice"),
         (b'{"a": {"b": NaN, "b": 1}, "a": 2}', "^a: stands there twice$"),

@@ -140,6 +140,7 @@ NOT_OF_STRANGERS = {
     "release/images.py": "the head of an image that the gate opened",
     "release/store/store.py": "the cache's own copies",
     "release/store/sources.py": "fsspec, and the directory of an archive that the gate or fsspec opened",
+    "synth/benchmark.py": "the package's own benchmarks",
     "synth/spec/catalogue.py": "the package's own designs",
 }
 

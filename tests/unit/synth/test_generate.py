@@ -211,6 +211,8 @@ def test_rounded_numbers_are_the_same_ones_with_fewer_digits(tmp_path):
         return find_release(make_release(tmp_path / str(decimals), config, workers=1)).scenarios[0]
 
     full, rounded = made(None), made(4)
+    impact, fewer = (read_meta(scenario.meta_path).collision.impact for scenario in (full, rounded))
+    assert impact != fewer == round(impact, 4)
     for agent, frame in itertools.product(AGENTS, (1, 2)):
         one, other = (read_label(scenario.label_path(agent, frame)) for scenario in (full, rounded))
         for name in ("agent_velocity", "center", "size", "yaw", "velocity"):

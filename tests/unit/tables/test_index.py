@@ -193,7 +193,7 @@ def test_partial_releases_are_indexed_as_what_they_are(tmp_path: Path, missing: 
         found = [own[name] for name in ("instance_token", "time_to_impact", "next")]
         assert found == [None, None, f"{tiny.TOKEN}/ego_vehicle/002/0"]
     if missing == "infrastructure":
-        named = "the scenario's agents are ego_vehicle, ego_vehicle_behind"
+        named = "the scenario's agents are ego_vehicle, .*, other_vehicle_behind; unpack its archive"
         assert_refused((lambda: release.get_sample(scenario, "infrastructure", 1), KeyError, named))
 
 
@@ -353,9 +353,8 @@ def test_scenarios_that_lack_the_same_are_told_in_one_line(root: Path, caplog: p
         meta.unlink()
     opened(root)
     (told,) = [record.getMessage() for record in caplog.records]
-    assert re.match(
-        rf"2 scenarios, such as {root / tiny.TYPE}/meta/.*: missing .* weather and collision .* unknown$", told
-    )
+    what = "missing .* weather and collision .* unknown, .*by its folder$"
+    assert re.match(rf"2 scenarios, such as {root / tiny.TYPE}/meta/.*: {what}", told)
 
 
 @pytest.mark.parametrize("frames", [3, 4, 6])

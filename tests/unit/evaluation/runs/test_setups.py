@@ -274,7 +274,7 @@ MISSING, EXTRA, UNKNOWN = ({"missing": ("a", "b")}, {"extra": ("c",)}, {"unknown
 def test_what_is_told_of_the_coverage(parts: list[dict[str, Any]], told: list[str]) -> None:
     found = Coverage(expected=6, **{name: each for part in parts for name, each in part.items()})
     assert found.is_complete is (parts == [])
-    texts = found.to_text().replace("True); no", "True), no").split("; ")
+    texts = found.to_text().replace("all; no", "all, no").split("; ")
     assert [text[: len(start)] for text, start in zip(texts, told, strict=True)] == told
 
 

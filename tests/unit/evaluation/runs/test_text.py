@@ -310,7 +310,7 @@ def test_few_paths() -> None:
 
 def test_detection_of_the_released_code() -> None:
     [note] = notes("detection")
-    assert note.startswith("released: hidden boxes are truth")
+    assert note.startswith("released: hidden boxes and the agent's own are truth")
     assert notes("detection", "paper") == []
 
 

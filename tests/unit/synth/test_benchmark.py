@@ -1,0 +1,153 @@
+"""Benchmarks: what is published is what is made, wherever it is made, and what differs is told."""
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from deepaccident_devkit.errors import ChoiceError
+from deepaccident_devkit.release import read_image, read_lidar, write_image, write_lidar
+from deepaccident_devkit.study.recipe import SHIPPED, read_recipe, source_of
+from deepaccident_devkit.synth.benchmark import BENCHMARKS, described_release, differences, published
+from deepaccident_devkit.synth.plan import plan_scenarios
+
+
+def more_points(path: Path) -> None:
+    path.write_text(re.sub(r"(\d+) (True|False)$", r"1\1 \2", path.read_text(), flags=re.MULTILINE))
+
+
+MAKE = """
+import json, sys
+from dataclasses import replace
+from pathlib import Path
+from deepaccident_devkit.release import find_release
+from deepaccident_devkit.synth.benchmark import BENCHMARKS, described
+from deepaccident_devkit.synth.plan import plan_scenarios
+from deepaccident_devkit.synth.scenario import RecordingJob, record_scenario
+root, sensors, numbers = Path(sys.argv[1]), sys.argv[2], map(int, sys.argv[3:])
+config = BENCHMARKS["v1"]
+plans = plan_scenarios(config)
+for number in numbers:
+    record_scenario(RecordingJob(root, replace(config, sensors=sensors), plans[number]))
+print(json.dumps({each.token: described(each) for each in find_release(root).scenarios}))
+"""
+"""Makes some scenarios of the benchmark, and says what is compared of them."""
+
+
+def elsewhere() -> dict[str, str]:
+    """The environment of another machine: its place, its hash seed, its threads, and an older processor for numpy."""
+    from numpy._core._multiarray_umath import __cpu_dispatch__, __cpu_features__
+
+    newer = [name for name in __cpu_dispatch__ if __cpu_features__[name]]
+    return {
+        **os.environ,
+        "LC_ALL": "C.UTF-8",
+        "LANG": "C.UTF-8",
+        "TZ": "Asia/Kathmandu",
+        "PYTHONHASHSEED": "4711",
+        "OMP_NUM_THREADS": "2",
+        "NPY_DISABLE_CPU_FEATURES": " ".join(newer),
+    }
+
+
+def made(root: Path, sensors: str, numbers: list[int], environment: dict[str, str]) -> dict[str, object]:
+    words = [sys.executable, "-W", "ignore", "-c", MAKE, str(root), sensors, *map(str, numbers)]
+    run = subprocess.run(words, env=environment, check=True, capture_output=True, text=True)
+    found: dict[str, object] = json.loads(run.stdout)
+    return found
+
+
+def test_what_is_published_is_what_is_planned() -> None:
+    plans = plan_scenarios(BENCHMARKS["v1"])
+    told = published("v1")["scenarios"]
+    assert sorted(told) == sorted(plan.token for plan in plans)
+    assert Counter(plan.accident for plan in plans) == {True: 120, False: 120}
+    assert {plan.design for plan in plans} == set(range(1, 13))
+    assert {len(each["images"]) for each in told.values()} == {30}
+    assert {row[0] for each in told.values() for row in (*each["images"], *each["clouds"])} == {8}
+    with pytest.raises(ChoiceError, match="benchmark: expected one of v1, found 'v2'"):
+        published("v2")
+
+
+def test_its_seed_is_of_no_release_that_anything_shipped_was_tuned_with() -> None:
+    recipes = [read_recipe(path) for path in sorted(SHIPPED.glob("*.yaml"))]
+    configs = [source_of(source) for recipe in recipes for source in recipe.releases.values()]
+    seeds = {config.seed for config in configs if config is not None}
+    assert len(seeds) > 5
+    assert BENCHMARKS["v1"].seed not in seeds | {12, 208}  # of the baselines' page, and of the shipped weights' scores
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("sensors", "numbers"), [("none", [0, 1, 67, 118, 239]), ("all", [102])])
+def test_it_is_made_elsewhere_too(tmp_path: Path, sensors: str, numbers: list[int]) -> None:
+    """Labels, meta and calib byte for byte."""
+    told = published("v1")
+    found = made(tmp_path / "there", sensors, numbers, elsewhere())
+    wanted = {token: told["scenarios"][token] for token in found}
+    assert len(found) == len(numbers)
+    assert differences({"splits": None, "scenarios": found}, {"splits": None, "scenarios": wanted}) == []
+
+
+def edited(path: Path, change: Callable[[np.ndarray], np.ndarray]) -> None:
+    if path.suffix == ".jpg":
+        write_image(path, change(read_image(path)))
+    else:
+        cloud = read_lidar(path)
+        write_lidar(path, change(cloud.xyz), cloud.intensity)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("files", "change", "told"),
+    [
+        ("*/*/label/*/*_002.txt", lambda path: path.write_bytes(b"9" + path.read_bytes()), "label files differ"),
+        ("*/*/label/*/*.txt", more_points, "points differ by more than the tolerance"),
+        ("*/*/calib/*/*_002.pkl", Path.unlink, "calib files differ"),
+        ("*/meta/*.txt", Path.unlink, "meta files differ"),
+        ("*/*/Camera_Back/*/*_003.jpg", Path.unlink, "images differ by more than the tolerance"),
+        (
+            "*/*/Camera_FrontLeft/*/*.jpg",
+            lambda path: edited(path, lambda pixels: cv2.flip(pixels, 1)),
+            "images differ by more than the tolerance",
+        ),
+        (
+            "*/*/Camera_Front/*/*.jpg",
+            lambda path: edited(path, lambda pixels: cv2.add(pixels, 8.0)),
+            "images differ by more than the tolerance",
+        ),
+        (
+            "*/*/lidar01/*/*.npz",
+            lambda path: edited(path, lambda points: np.add(points, (0, 0, 0.2))),
+            "clouds differ by more than the tolerance",
+        ),
+        ("train.txt", lambda path: path.write_text("Scenario\n"), "its split files differ"),
+    ],
+)
+def test_what_differs_is_told(
+    release_root: Path, tmp_path: Path, files: str, change: Callable[[Path], object], told: str
+) -> None:
+    root = tmp_path / "copy"
+    shutil.copytree(release_root, root, ignore=shutil.ignore_patterns(".deepaccident"))
+    wanted = described_release(root, workers=1)
+    for path in sorted(root.glob(files)):
+        change(path)
+    found = differences(described_release(root, workers=1), wanted)
+    assert {line.rpartition(": ")[2] for line in found} == {told}
+    assert [line.rpartition(": ")[0] for line in found] in (sorted(wanted["scenarios"]), [""])
+
+
+def test_scenarios_that_are_missing_or_new_are_told_and_missing_sensors_are_not() -> None:
+    nothing = {"label": "1", "meta": "2", "calib": "3", "points": [[2, 7.5]], "images": None, "clouds": None}
+    seen = {**nothing, "images": [[1, 2]], "clouds": [[3, 4]]}
+    wanted = {"splits": "4", "scenarios": {"a": seen, "b": seen}}
+    found = {"splits": "4", "scenarios": {"a": nothing, "c": nothing}}
+    assert differences(found, wanted) == ["b: is missing", "c: is not of the benchmark"]
