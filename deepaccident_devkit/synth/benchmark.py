@@ -71,7 +71,7 @@ def described_release(root: Path, **how: Unpack[Engine]) -> dict[str, Any]:
 
 
 def published(name: str) -> dict[str, Any]:
-    """What `described_release` says of a benchmark as it was published; raises ConfigError for an unknown one."""
+    """What `described_release` says of a benchmark as it was published; raises ChoiceError for an unknown one."""
     choice("benchmark", name, BENCHMARKS)
     content = (Path(__file__).parent / f"benchmark_{name}.json.xz").read_bytes()
     told: dict[str, Any] = json.loads(lzma.decompress(content))

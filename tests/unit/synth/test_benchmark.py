@@ -1,5 +1,6 @@
 """Benchmarks: what is published is what is made, wherever it is made, and what differs is told."""
 
+import importlib
 import json
 import os
 import re
@@ -15,10 +16,13 @@ import numpy as np
 import pytest
 
 from deepaccident_devkit.errors import ChoiceError
+from deepaccident_devkit.evaluation.runs.bundles import checksums_of, read_bundle
 from deepaccident_devkit.release import read_image, read_lidar, write_image, write_lidar
 from deepaccident_devkit.study.recipe import SHIPPED, read_recipe, source_of
 from deepaccident_devkit.synth.benchmark import BENCHMARKS, described_release, differences, published
 from deepaccident_devkit.synth.plan import plan_scenarios
+
+TOP = Path(__file__).parents[3]
 
 
 def more_points(path: Path) -> None:
@@ -76,6 +80,22 @@ def test_what_is_published_is_what_is_planned() -> None:
     assert {row[0] for each in told.values() for row in (*each["images"], *each["clouds"])} == {8}
     with pytest.raises(ChoiceError, match="benchmark: expected one of v1, found 'v2'"):
         published("v2")
+
+
+def test_the_page_has_what_is_kept_of_the_rows(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(TOP))
+    rows = importlib.import_module("benchmarks.pages.benchmark")
+    page = (TOP / "docs" / "benchmark.md").read_text(encoding="utf-8")
+    for name in rows.ROWS:
+        assert f"| `{name}` | {' | '.join(rows.text(name, column) for column in rows.NUMBERS)} |" in page
+        for task in rows.TASKS:
+            bundle = read_bundle(rows.KEPT / name / task)
+            assert checksums_of(bundle.folder) == bundle.checksums()
+            assert (bundle.setup.protocol, bundle.selection.split, bundle.selection.samples) == (
+                "paper",
+                "test",
+                "evaluate",
+            )
 
 
 def test_its_seed_is_of_no_release_that_anything_shipped_was_tuned_with() -> None:
