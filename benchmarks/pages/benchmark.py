@@ -18,7 +18,7 @@ from click.testing import CliRunner
 
 from benchmarks.pages.marks import TOP, put, table
 from deepaccident_devkit.cli import deepaccident
-from deepaccident_devkit.evaluation.runs.bundles import FILES_FILE, SUMMARY_FILE
+from deepaccident_devkit.evaluation.runs.bundles import FILES_FILE, SUMMARY_FILE, checksums_of
 from deepaccident_devkit.synth.benchmark import described_release
 
 KEPT = TOP / "benchmarks" / "v1"
@@ -59,7 +59,7 @@ def keep(release: Path, name: str) -> None:
         for task, results in TASKS.items():
             given = ("--results", str(made / "results" / results), "--split", "test", "--out", str(made / task))
             run("evaluate", task, str(release), "--protocol", "paper", *given)
-            without_pictures(made / task)
+            slim(made / task)
         shutil.make_archive(str(made / "results"), "xztar", made, "results")
         shutil.rmtree(made / "results")
         kept = KEPT / name
@@ -73,12 +73,15 @@ def round_numbers(path: Path) -> None:
     path.write_text(json.dumps(told, ensure_ascii=False, separators=(",", ":")), encoding="utf-8")
 
 
-def without_pictures(bundle: Path) -> None:
-    """Remove a bundle's figures and report, and what its list of files says of them."""
-    shutil.rmtree(bundle / "figures")
-    (bundle / "report.html").unlink()
+def slim(bundle: Path) -> None:
+    """Remove a bundle's figures and report, and where its release and results were; its list of files says so."""
+    shutil.rmtree(bundle / "figures", ignore_errors=True)
+    (bundle / "report.html").unlink(missing_ok=True)
+    told = json.loads((bundle / SUMMARY_FILE).read_text(encoding="utf-8"))
+    told["release"]["dataroot"], told["results"]["path"] = "v1", "results"
+    (bundle / SUMMARY_FILE).write_text(json.dumps(told, indent=1, ensure_ascii=False), encoding="utf-8")
     listed = json.loads((bundle / FILES_FILE).read_text(encoding="utf-8"))
-    listed["files"] = {name: each for name, each in listed["files"].items() if (bundle / name).exists()}
+    listed["files"] = checksums_of(bundle)
     (bundle / FILES_FILE).write_text(json.dumps(listed, indent=1), encoding="utf-8")
 
 
