@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from deepaccident_devkit.tables.records import ScenarioRecord
 
 _UNKNOWN = "unknown"
-_ENDS = {"yes": "collision", "no": "no collision", _UNKNOWN: "collision unknown"}
+_ENDS = {"true": "collision", "false": "no collision", _UNKNOWN: "collision unknown"}
 """Whether a scenario has a collision → how a line says that."""
 
 
@@ -45,7 +45,7 @@ class Overview(Report):
         files: channel → files of these recordings.
         recordings: all recordings.
         samples: their moments: as many files has a channel of a whole release.
-        attributes: field → value → scenarios; of `collision` yes, no and unknown.
+        attributes: field → value → scenarios; of `collision` true, false and unknown.
         left_out: broken scenarios that were skipped, by token.
     """
 
@@ -184,7 +184,7 @@ def table_text(left: str, right: str, rows: Sequence[tuple[str, str]]) -> str:
 def _collides(scenario: ScenarioRecord) -> str:
     if scenario["weather"] is None:
         return _UNKNOWN  # there is no meta
-    return "yes" if scenario["collision"] else "no"
+    return "true" if scenario["collision"] else "false"
 
 
 def _counts(values: Iterable[object]) -> dict[str, int]:

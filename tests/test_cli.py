@@ -32,7 +32,7 @@ def test_synth_index_info_end_to_end(tmp_path: Path) -> None:
     wanted = (
         "layout B",
         "train 2 of 483",
-        "collision scenarios no 1 yes 1",
+        "collision scenarios false 1 true 1",
         "type1_subtype1_accident 1",
         "Camera_Front 10",
     )

@@ -374,14 +374,17 @@ next();
 
 
 def test_a_minute_of_play_needs_no_more_memory(browser: Browser, recorded: Path) -> None:
-    """600 frames, as quickly as can be: nothing is made on the graphics processor, and the heap stays."""
+    """600 frames, as quickly as can be: nothing is made on the graphics processor, and the heap stays.
+
+    In parts, since on a slow machine the browser would not answer in time.
+    """
     browser.open(recorded, 390, 300)
     sizes = []
-    for frames in (12, 600):
+    for frames in (12, *[60] * 10):
         assert browser.driver.execute_async_script(PLAY, frames) == 0
         browser.driver.execute_cdp_cmd("HeapProfiler.collectGarbage", {})
         sizes.append(browser.driver.execute_cdp_cmd("Runtime.getHeapUsage", {})["usedSize"])
-    assert sizes[1] - sizes[0] < 1_000_000
+    assert sizes[-1] - sizes[0] < 1_000_000
 
 
 CHANNELS = {camera_name(channel): channel for channel in CAMERAS}
