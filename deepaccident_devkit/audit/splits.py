@@ -5,7 +5,8 @@ from __future__ import annotations
 import os
 import re
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -29,9 +30,10 @@ _SAYS: Final = {
     "frames": ("frame", "on two sides: what is tested was learnt"),
     "recordings": ("recording", "on two sides, as by a random split by frames: frames 0.1 s apart are nearly the same"),
     "twins": ("twin pair", "torn apart, as by a random split by names: twins share junction, traffic and weather"),
+    "copies": ("recording", "with the same labels on two sides: what is tested was learnt"),
     "mini": ("scenario", "of the mini release beside the full one: of equal names it has other recordings, much alike"),
 }
-"""Kind of finding → what is counted, and what it means."""
+"""Kind of finding, of releases `copies` → what is counted, and what it means."""
 
 
 def audit_splits(paths: Iterable[str | os.PathLike[str]]) -> AuditReport:
@@ -77,18 +79,9 @@ def audit_splits(paths: Iterable[str | os.PathLike[str]]) -> AuditReport:
             if each[0].startswith("mini:") and not each[1] and full and len(on[each] | full) > 1
         ],
     }
+    remedy = "Split by scenarios of one release, twins together: deepaccident split DATAROOT --out FOLDER."
     return AuditReport(
-        findings=tuple(
-            AuditFinding(
-                kind=kind,
-                what=f"{counted(len(cases), _SAYS[kind][0])} {_SAYS[kind][1]}.",
-                remedy="Split by scenarios of one release, twins together: deepaccident split DATAROOT --out FOLDER.",
-                number=len(cases),
-                examples=tuple(cases[:3]),
-            )
-            for kind, cases in found.items()
-            if cases
-        ),
+        findings=tuple(_finding(kind, _SAYS[kind], cases, remedy) for kind, cases in found.items() if cases),
         tables={
             "sides": [
                 ("side", "recordings", "frames named"),
@@ -101,18 +94,27 @@ def audit_splits(paths: Iterable[str | os.PathLike[str]]) -> AuditReport:
 def _audit_releases(sides: Mapping[str, Path]) -> AuditReport:
     """Look for recordings that two releases have, by the hashes of their label files."""
     where: dict[str, list[str]] = defaultdict(list)
+    of_labels = partial(folder_hashes, kinds=["label"])
     scenarios = {side: find_release(path).scenarios for side, path in sides.items()}
     for side, folders in scenarios.items():
-        for folder, hashes in zip(folders, run_batch(folder_hashes, folders), strict=True):
+        for folder, hashes in zip(folders, run_batch(of_labels, folders), strict=True):
             if hashes.label is not None:
                 where[hashes.label].append(f"{folder.token} of {side}")
     cases = [" and ".join(each) for each in where.values() if len(each) > 1]
-    what = f"{counted(len(cases), 'recording')} with the same labels on two sides: what is tested was learnt."
     remedy = "Make one of the two with another seed, or leave these recordings out."
-    found = AuditFinding(kind="recordings", what=what, remedy=remedy, number=len(cases), examples=tuple(cases[:3]))
     return AuditReport(
-        findings=(found,) if cases else (),
+        findings=(_finding("recordings", _SAYS["copies"], cases, remedy),) if cases else (),
         tables={"sides": [("side", "recordings"), *((side, len(folders)) for side, folders in scenarios.items())]},
+    )
+
+
+def _finding(kind: str, says: tuple[str, str], cases: Sequence[str], remedy: str) -> AuditFinding:
+    return AuditFinding(
+        kind=kind,
+        what=f"{counted(len(cases), says[0])} {says[1]}.",
+        remedy=remedy,
+        number=len(cases),
+        examples=tuple(cases[:3]),
     )
 
 

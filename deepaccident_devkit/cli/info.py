@@ -79,8 +79,11 @@ def info(
     With --where, list the scenarios that match all filters instead; with --json, their records.
     """
     if croissant:
+        from deepaccident_devkit.validation import data_card
+
         refuse_unused("with --croissant", "where", "statistics", "interactions", "out", "facts", "as_json")
-        _say_card(open_release(**release), licence)
+        card = data_card(open_release(**release), licence=licence)
+        click.echo(json.dumps(card, indent=2, ensure_ascii=False))
         return
     refuse_unused("without --croissant", "licence")
     if facts or not statistics:
@@ -111,12 +114,6 @@ def info(
         found = [f"{len(chosen)} of {len(dataset.scenario)} scenarios match", *scenario_lines(chosen)]
         none = f"no scenario matches {' and '.join(where)}; deepaccident info --fields lists what can be asked for"
         click.echo("\n".join(found) if chosen else none)
-
-
-def _say_card(dataset: DeepAccident, licence: str | None) -> None:
-    from deepaccident_devkit.validation import data_card
-
-    click.echo(json.dumps(data_card(dataset, licence=licence), indent=2, ensure_ascii=False))
 
 
 def _statistics(dataset: DeepAccident, chosen: list[Any] | None, out: str | None, *, as_json: bool, **how: Any) -> None:

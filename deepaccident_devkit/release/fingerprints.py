@@ -94,15 +94,16 @@ def scenario_folders(dataset: Located, scenarios: Collection[str]) -> dict[str, 
     return {token: folders[token] for token in sorted(set(scenarios)) if token in folders}
 
 
-def folder_hashes(scenario: ScenarioFolder) -> ScenarioHashes:
-    """The hashes of a scenario's files; raises DatarootError and ReleaseError as `scenario_hashes` does."""
+def folder_hashes(scenario: ScenarioFolder, kinds: Collection[FileKind] = ("label", "meta", "calib")) -> ScenarioHashes:
+    """The hashes of a scenario's files, of some kinds; raises DatarootError and ReleaseError as `scenario_hashes`."""
     base = scenario.root / scenario.folder / scenario.scenario_type
-    meta = [scenario.meta_path] if scenario.meta_path.is_file() else []
+    meta = [scenario.meta_path] if "meta" in kinds and scenario.meta_path.is_file() else []
     hashes = {"meta": _digest(meta, "meta", scenario.meta_path.parent)}
     for kind, ending in _ENDINGS.items():
         paths = [
             scenario.file(agent, kind, frame, ending)
             for agent in AGENTS
+            if kind in kinds
             for frame in frame_numbers(scenario.kind_folder(agent, kind), ending)[0]
         ]
         hashes[kind] = _digest(paths, kind, base)

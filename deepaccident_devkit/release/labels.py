@@ -12,7 +12,6 @@ import codecs
 import os
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -219,7 +218,8 @@ def _parse_batches(batches: Sequence[Sequence[ReleasePath]]) -> list[dict[str, A
         return [_parse_files(batch, [_content(path) for path in batch]) for batch in batches]
     from concurrent.futures import ThreadPoolExecutor
 
-    import_module("pyarrow")  # here: pyarrow 25.0.0 crashes after the thread has ended in which it was imported
+    import pyarrow as pa  # noqa: F401 - here: pyarrow 25.0.0 crashes after the thread has ended that imports it
+
     with ThreadPoolExecutor(min(_MOST_THREADS, os.cpu_count() or 1)) as pool:
         parts = [pool.submit(_parse_files, batch, [_content(path) for path in batch]) for batch in batches]
         return [part.result() for part in parts]
@@ -286,21 +286,26 @@ def _columns(content: bytes, names: Sequence[str]) -> dict[str, Any] | None:
 def _parse_columns(words: dict[str, Any], header: dict[str, Any], num_boxes: IntArray) -> dict[str, AnyArray]:
     """Raises pyarrow.ArrowInvalid for what is none of its kind; an unknown class is −1."""
     import pyarrow as pa
+    import pyarrow.compute as pc
 
     def numbers(columns: dict[str, Any], names: Sequence[str]) -> FloatArray:
         return np.column_stack([columns[name].cast(pa.float64()).to_numpy() for name in names])
+
+    def codes(name: str, known: Sequence[str]) -> AnyArray:
+        found = pc.index_in(words[name], value_set=pa.array(known, pa.large_string()))
+        return np.asarray(found.fill_null(-1), dtype=np.int8)
 
     velocity = numbers(words, ("vx", "vy"))
     velocity[~in_range(velocity)] = np.nan
     agent_velocity = numbers(header, _HEADER)
     agent_velocity[~in_range(agent_velocity)] = np.nan
-    visible = _codes(words["camera_visible"], ("False", "True"))
+    visible = codes("camera_visible", ("False", "True"))
     if (visible < 0).any():
         raise pa.ArrowInvalid("a boolean is neither False nor True")
     return {
         "num_boxes": num_boxes,
         "agent_velocity": agent_velocity,
-        "category": _codes(words["class"], CATEGORIES),
+        "category": codes("class", CATEGORIES),
         "center": numbers(words, ("x", "y", "z")),
         "size": numbers(words, ("l", "w", "h")),
         "yaw": numbers(words, ("yaw",))[:, 0],
@@ -309,16 +314,6 @@ def _parse_columns(words: dict[str, Any], header: dict[str, Any], num_boxes: Int
         "num_lidar_pts": words["num_lidar_pts"].cast(pa.int64()).to_numpy(),
         "camera_visible": visible == 1,
     }
-
-
-def _codes(words: Any, known: Sequence[str]) -> AnyArray:
-    """(N,) int8, the index of each word among those that are known, or −1."""
-    import pyarrow as pa
-    import pyarrow.compute as pc
-
-    found = pc.index_in(words, value_set=pa.array(known, pa.large_string()))
-    codes: AnyArray = found.fill_null(-1).to_numpy().astype(np.int8)
-    return codes
 
 
 def _has_fault(columns: dict[str, AnyArray]) -> bool:

@@ -58,7 +58,12 @@ def described(scenario: ScenarioFolder) -> dict[str, Any]:
     hashes, points = zip(*_labels(scenario), strict=True)
     seen = {"images": list(_images(scenario)), "clouds": list(_clouds(scenario))}
     sensors = {kind: rows if any(row[0] for row in rows) else None for kind, rows in seen.items()}
-    return {**folder_hashes(scenario).as_dict(), "label": digest_of(hashes), "points": points, **sensors}
+    return {
+        **folder_hashes(scenario, ["meta", "calib"]).as_dict(),
+        "label": digest_of(hashes),
+        "points": points,
+        **sensors,
+    }
 
 
 def described_release(root: Path, **how: Unpack[Engine]) -> dict[str, Any]:
@@ -73,9 +78,8 @@ def described_release(root: Path, **how: Unpack[Engine]) -> dict[str, Any]:
 def published(name: str) -> dict[str, Any]:
     """What `described_release` says of a benchmark as it was published; raises ChoiceError for an unknown one."""
     choice("benchmark", name, BENCHMARKS)
-    content = (Path(__file__).parent / f"benchmark_{name}.json.xz").read_bytes()
-    told: dict[str, Any] = json.loads(lzma.decompress(content))
-    return told
+    path = Path(__file__).parent / f"benchmark_{name}.json.xz"
+    return dict(json.loads(lzma.decompress(path.read_bytes())))
 
 
 def differences(found: Mapping[str, Any], wanted: Mapping[str, Any]) -> list[str]:
@@ -100,12 +104,11 @@ def differences(found: Mapping[str, Any], wanted: Mapping[str, Any]) -> list[str
 
 def _labels(scenario: ScenarioFolder) -> Iterator[tuple[str, list[float]]]:
     for agent in AGENTS:
-        frames = _frames(scenario, agent, "label", "txt")
-        labels = read_labels([scenario.label_path(agent, frame) for frame in frames], raw=True)
-        values = {each.name: getattr(labels, each.name) for each in fields(labels)}
-        points = values.pop("num_lidar_pts")
-        hashed = digest_of({name: value if name == "raw" else value.tolist() for name, value in values.items()})
-        yield hashed, [len(labels), points.mean().round(3).item() if len(labels) else 0.0]
+        paths = [scenario.label_path(agent, frame) for frame in _frames(scenario, agent, "label", "txt")]
+        labels = read_labels(paths, raw=True)
+        names = [each.name for each in fields(labels) if each.name != "num_lidar_pts"]
+        hashed = digest_of({name: np.asarray(getattr(labels, name)).tolist() for name in names})
+        yield hashed, [len(labels), labels.num_lidar_pts.mean().round(3).item() if len(labels) else 0.0]
 
 
 def _images(scenario: ScenarioFolder) -> Iterator[list[float]]:

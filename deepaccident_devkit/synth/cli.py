@@ -132,7 +132,9 @@ def _make_benchmark(out: Path, name: str, sensors: Sensors, how: dict[str, Any])
     if faults := differences(found, published(name)):
         more = [f"and {len(faults) - _SHOWN} more"] if len(faults) > _SHOWN else []
         told = "\n".join([f"{out}: is not the benchmark {name} as published:", *faults[:_SHOWN], *more])
-        remedy = f"Make it with the libraries of benchmarks/{name}/lock.txt"
-        raise click.ClickException(f"{told}\n{remedy}; evaluations of this release do not compare with others.")
+        raise click.ClickException(
+            f"{told}\nMake it with the libraries of benchmarks/{name}/lock.txt; evaluations of this release do not "
+            "compare with others."
+        )
     click.echo(f"{out}: is the benchmark {name} as published, {counted(len(found['scenarios']), 'scenario')}")
     click.echo(f"next: deepaccident info {out}")

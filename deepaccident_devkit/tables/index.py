@@ -383,8 +383,7 @@ def _problems_text(layout: ReleaseLayout, problems: Sequence[Problem]) -> str:
         lines += [f"  {problem.scenario}", *_first_lines(problem.messages)]
     good = total - len(problems)
     others = f"Mend them, or open the other {good} with on_error='skip' (--on-error skip)."
-    lines.append(others if good else "No other is left to open.")
-    return "\n".join(lines)
+    return "\n".join([*lines, others if good else "No other is left to open."])
 
 
 def _first_lines(messages: Sequence[str]) -> list[str]:

@@ -1,6 +1,7 @@
 """Hashes of a scenario's label, meta and calib files."""
 
 import os
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -8,7 +9,14 @@ import pytest
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ReleaseError
-from deepaccident_devkit.release.fingerprints import ScenarioHashes, digest_of, fingerprint, scenario_hashes
+from deepaccident_devkit.release import find_release
+from deepaccident_devkit.release.fingerprints import (
+    ScenarioHashes,
+    digest_of,
+    fingerprint,
+    folder_hashes,
+    scenario_hashes,
+)
 
 Find = Callable[[Path], Path]
 
@@ -43,6 +51,15 @@ def test_bytes_that_move_to_the_next_file_are_a_change(own_release: Path, scenar
     one.write_bytes(joined[:10])
     other.write_bytes(joined[10:])
     assert scenario_hashes(opened, [scenario])[scenario].label != before.label
+
+
+def test_files_of_other_kinds_are_not_read(own_release: Path, scenario: str) -> None:
+    folder = next(each for each in find_release(own_release).scenarios if each.token == scenario)
+    whole = folder_hashes(folder)
+    shutil.rmtree(folder.kind_folder("ego_vehicle", "calib"))
+    assert folder_hashes(folder, ["label"]) == ScenarioHashes(label=whole.label, meta=None, calib=None)
+    assert folder_hashes(folder, ["meta"]) == ScenarioHashes(label=None, meta=whole.meta, calib=None)
+    assert folder_hashes(folder).calib not in (None, whole.calib)
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="the system has no pipes")
