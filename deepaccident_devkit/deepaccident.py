@@ -105,7 +105,8 @@ class DeepAccident(Dataset):
             index_dir: where to keep the index, of this release alone; by default `<dataroot>/.deepaccident`, or the
                 user's cache folder where that cannot be written.
             workers: processes to index with; None chooses by the amount of work.
-            on_error: `raise` lists every broken scenario and raises; `skip` leaves them out and says so.
+            on_error: `raise` lists every broken scenario, or every archive that cannot be read, and raises; `skip`
+                leaves them out and says so.
             verbose: whether to show a progress bar while indexing.
             executor: any executor of `concurrent.futures` to index on, in place of own processes.
 
@@ -118,7 +119,7 @@ class DeepAccident(Dataset):
         """
         how: dict[str, Any] = {"workers": workers, "executor": executor, "progress": verbose}
         place = None if index_dir is None else Path(os.path.abspath(path_of(index_dir, "index_dir: expected a path")))  # noqa: PTH100
-        layout = find_release(open_dataroot(dataroot, place, **how), version)
+        layout = find_release(open_dataroot(dataroot, place, on_error=on_error, **how), version)
         for last_attempt in (False, True):
             index = open_index(layout, index_dir=place, on_error=on_error, **how)
             try:

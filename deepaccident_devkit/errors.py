@@ -74,7 +74,9 @@ class ReleaseError(FileError, ValueError):
 
 
 class DatarootError(ReleaseError, FileNotFoundError):
-    """The folder given does not exist or holds no release."""
+    """The folder given does not exist or holds no release, or its archives cannot be read; the message lists them."""
+
+    _is_list = True
 
 
 class VersionError(ReleaseError):

@@ -11,6 +11,7 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
+from deepaccident_devkit.errors import escaped
 from deepaccident_devkit.support.arrays import ShortRepr
 from deepaccident_devkit.support.files import writable_folder, write_bytes
 from deepaccident_devkit.support.text import columns_text, path_of
@@ -49,8 +50,8 @@ class Report(ShortRepr):
         return {}
 
     def to_json(self) -> str:
-        """`to_dict` as one JSON object."""
-        return json.dumps(self.to_dict(), indent=2, ensure_ascii=False)
+        """`to_dict` as one JSON object, in characters that UTF-8 has: a name of a file may have others."""
+        return escaped(json.dumps(self.to_dict(), indent=2, ensure_ascii=False))
 
     def to_text(self) -> str:
         """The tables, for a terminal."""

@@ -31,9 +31,8 @@ def edit(root: Path, name: str = tiny.NAME) -> None:
 
 
 def rewrite(path: Path, old: str, new: str) -> None:
-    """Change a file as a damaged disk or a restored archive does: its size and times stay, and its folder's too."""
-    before, folder = path.stat(), path.parent.stat()
+    """Change a file in place, and put its time back: its size and time stay, and its folder's state too."""
+    before = path.stat()
     path.write_text(path.read_text().replace(old, new))
     os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
-    os.utime(path.parent, ns=(folder.st_atime_ns, folder.st_mtime_ns))
     assert path.stat().st_size == before.st_size

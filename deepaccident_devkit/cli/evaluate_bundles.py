@@ -73,7 +73,9 @@ def verify(
     """
     bundle = read_bundle(folder)
     check_repeated(bundle, {"dataroot": dataroot, "results": results, "split": split})
-    layout = find_release(open_dataroot(dataroot or bundle.dataroot, index_dir, outside=True), bundle.release_version)
+    layout = find_release(
+        open_dataroot(dataroot or bundle.dataroot, index_dir, outside=True, on_error=on_error), bundle.release_version
+    )
     place = index_dir or place_outside(layout)
     dataset = DeepAccident(layout.version, layout.root, place, on_error=on_error, **engine)
     verification = verify_bundle(folder, dataset, results=results, split=split, progress=True, **engine)

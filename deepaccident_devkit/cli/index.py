@@ -29,8 +29,12 @@ def index(dataroot: Dataroot, version: str, on_error: OnError, check: bool, clea
         cleared = clear_index(dataroot, version=version, index_dir=options["index_dir"])
         click.echo("\n".join(f"removed {folder}" for folder in cleared) or f"{dataroot}: no index to remove")
         return
-    root = open_dataroot(dataroot, options["index_dir"], refresh=True, progress=True, **engine_of(options))
-    made = open_index(find_release(root, version), on_error=on_error, check_files=check, progress=True, **options)
+    root = open_dataroot(
+        dataroot, options["index_dir"], refresh=True, on_error=on_error, progress=True, **engine_of(options)
+    )
+    made = open_index(
+        find_release(root, version), on_error=on_error, check_times=True, check_files=check, progress=True, **options
+    )
     tables = Tables(made.tables_folder)
     counts = ", ".join(f"{len(tables.table(name)):,} {name}s" for name in ("scenario", "sample", "annotation"))
     click.echo(f"{made.tables_folder}: {counts}")

@@ -51,7 +51,7 @@ on_error_parameter = advanced(
     type=WordChoice(["raise", "skip"]),
     default="raise",
     show_default=True,
-    help="raise: list broken scenarios and stop. skip: leave them out.",
+    help="raise: list broken scenarios and archives, and stop. skip: leave them out.",
 )
 reader_parameters = together(
     dataroot_argument, version_parameter, workers_parameter, index_dir_parameter, on_error_parameter

@@ -52,9 +52,10 @@ def validate(
 ) -> None:
     """Print what is wrong, unusual or missing in the release in DATAROOT, worst scenario first.
 
-    The command reads the files and each scenario, not the index. The report ends with the files that are missing.
+    The command reads the files and each scenario, and says where the index is out of date. Archives that cannot be
+    read are listed, and left out. The report ends with the files that are missing.
     Exit status 0: there are only notes and known findings of the real release. 1: there are errors or other warnings.
-    2: the release cannot be read.
+    2: the release cannot be read. With --files: 1 if an archive cannot be read, else 0.
     """
     how |= {"scenarios": scenarios or None, "progress": sys.stderr.isatty()}
     if files:
@@ -62,7 +63,7 @@ def validate(
         del how["deep"], how["parts"]
         counted = release_completeness(dataroot, **how)
         click.echo(counted.to_json() if as_json else counted.to_text())
-        return
+        sys.exit(_FINDINGS_STATUS if counted.unreadable_archives else 0)
     if as_json:
         refuse_unused("with --json, which has all findings and notes", "whole")
     report = validate_release(dataroot, **how)

@@ -29,7 +29,7 @@ from deepaccident_devkit.errors import (
 )
 from deepaccident_devkit.export.format import Format, Link, Output, Tally, Unit, flat_name
 from deepaccident_devkit.parallel import Engine, Failure, Places, Store, Tried, check_failures, run_batch
-from deepaccident_devkit.release.fingerprints import digest_of, folder_hashes, scenario_folders, sensor_digest
+from deepaccident_devkit.release.fingerprints import checked_hashes, digest_of, scenario_folders, sensor_digest
 from deepaccident_devkit.release.layout import ScenarioFolder
 from deepaccident_devkit.selection import find
 from deepaccident_devkit.support.files import place_in, remove_in, remove_leftovers, temporary_of, write_bytes
@@ -199,6 +199,7 @@ def export_release(
         OutputFolderError: a link in the folder leads out of it; nothing is written there.
         NotAvailableError: no scenario or no sample is left to export, or the release has no such split.
         ChoiceError, FieldError: no such filter, or `workers` is less than 1.
+        IndexStoreError: label, meta or calib files have changed since the index was made.
         SomeFailedError: files of some scenarios cannot be read; the others are written, and the same call continues.
         WorkerError: a worker was killed, or cannot do the work.
     """
@@ -308,8 +309,9 @@ class Export:
         """What is compared of scenarios: the hashes of their truth, and of the lists of their sensor files."""
         sensors = self.form.sensors()
         return {
-            each.token: folder_hashes(each).as_dict() | ({_SENSORS: sensor_digest(each, sensors)} if sensors else {})
-            for each in folders
+            folder.token: checked_hashes(self.dataset, folder).as_dict()
+            | ({_SENSORS: sensor_digest(folder, sensors)} if sensors else {})
+            for folder in folders
         }
 
     def completed(self, before: Manifest, jobs: Mapping[str, Job], how: Engine) -> tuple[Manifest, int]:

@@ -5,11 +5,12 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any, Final, Protocol, runtime_checkable
+from functools import partial
+from typing import TYPE_CHECKING, Any, Final, Protocol, TypeAlias, runtime_checkable
 
-from deepaccident_devkit.errors import ReleaseError
+from deepaccident_devkit.errors import IndexStoreError, ReleaseError
 from deepaccident_devkit.release.layout import ScenarioFolder, find_release, frame_numbers, frame_sizes
 from deepaccident_devkit.release.store import ReleasePath, places_of, read_content
 from deepaccident_devkit.support.reading import FileKind
@@ -20,8 +21,11 @@ if TYPE_CHECKING:
 
     from deepaccident_devkit.parallel import Engine
 
+_Reader: TypeAlias = Callable[[ReleasePath, FileKind], bytes]
 _DIGEST_BYTES: Final = 16
 _ENDINGS: Final[Mapping[FileKind, str]] = {"label": "txt", "calib": "pkl"}
+INDEX_REMEDY: Final = "update it with: deepaccident index DATAROOT --check"
+"""What to do about an index that was made from other files."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -46,7 +50,7 @@ class ScenarioHashes:
 
 
 class Located(Protocol):
-    """An object that knows where a release is, such as a `Dataset`."""
+    """An opened release, such as a `Dataset`: where it is, and what its index was made from."""
 
     @property
     def dataroot(self) -> ReleasePath:
@@ -55,6 +59,9 @@ class Located(Protocol):
     @property
     def version(self) -> str:
         """`v1` or `v1-mini`."""
+
+    def indexed_hashes(self, scenario: str) -> ScenarioHashes | None:
+        """Return the hashes of the files that a scenario's rows were made from; None where they are unknown."""
 
 
 @runtime_checkable
@@ -66,9 +73,10 @@ class HasTruth(Protocol):
 
 
 def scenario_hashes(dataset: Located, scenarios: Collection[str], **how: Unpack[Engine]) -> dict[str, ScenarioHashes]:
-    """The hashes of some scenarios' files, by token in order; those that are not in the release are left out.
+    """Return the hashes of some scenarios' files by token, in order; scenarios that the release lacks are left out.
 
-    Reads the files themselves and not the index, which does not notice a file that was edited in place.
+    Reads the files, and compares them with those that the index was made from: it does not notice a file that was
+    written in place, so that numbers would be of other files than the hashes.
 
     Args:
         dataset: the release.
@@ -77,6 +85,7 @@ def scenario_hashes(dataset: Located, scenarios: Collection[str], **how: Unpack[
 
     Raises:
         DatarootError: the release's folder is gone, or one of its folders cannot be listed.
+        IndexStoreError: the index was made from other files.
         ReleaseError: a file cannot be read.
     """
     if isinstance(dataset, HasTruth):
@@ -84,8 +93,19 @@ def scenario_hashes(dataset: Located, scenarios: Collection[str], **how: Unpack[
     from deepaccident_devkit.parallel import Places, run_batch  # here: opening a release waits for this module
 
     folders = scenario_folders(dataset, scenarios)
-    found = run_batch(folder_hashes, list(folders.values()), places=Places(reads=places_of(dataset.dataroot)), **how)
-    return dict(zip(folders, found, strict=True))
+    work, places = partial(checked_hashes, dataset), Places(reads=places_of(dataset.dataroot))
+    return dict(zip(folders, run_batch(work, list(folders.values()), places=places, **how), strict=True))
+
+
+def checked_hashes(dataset: Located, scenario: ScenarioFolder) -> ScenarioHashes:
+    """Return the hashes of a scenario's files as they are now; raises as `scenario_hashes`."""
+    hashes, indexed = folder_hashes(scenario), dataset.indexed_hashes(scenario.token)
+    if indexed not in (None, hashes):
+        raise IndexStoreError(
+            f"{dataset.dataroot}: the index is out of date: files of {scenario.token} have changed since it was made; "
+            f"{INDEX_REMEDY}"
+        )
+    return hashes
 
 
 def scenario_folders(dataset: Located, scenarios: Collection[str]) -> dict[str, ScenarioFolder]:
@@ -94,11 +114,29 @@ def scenario_folders(dataset: Located, scenarios: Collection[str]) -> dict[str, 
     return {token: folders[token] for token in sorted(set(scenarios)) if token in folders}
 
 
-def folder_hashes(scenario: ScenarioFolder, kinds: Collection[FileKind] = ("label", "meta", "calib")) -> ScenarioHashes:
-    """The hashes of a scenario's files, of some kinds; raises DatarootError and ReleaseError as `scenario_hashes`."""
+def _read(path: ReleasePath, kind: FileKind) -> bytes:
+    return read_content(path, kind, ReleaseError)
+
+
+def folder_hashes(
+    scenario: ScenarioFolder,
+    kinds: Collection[FileKind] = ("label", "meta", "calib"),
+    read: _Reader = _read,
+) -> ScenarioHashes:
+    """Return the hashes of a scenario's files.
+
+    Args:
+        scenario: where the files lie.
+        kinds: of these kinds only; the hashes of others are None.
+        read: gives a file's bytes.
+
+    Raises:
+        DatarootError: a folder cannot be listed.
+        ReleaseError: a file cannot be read.
+    """
     base = scenario.root / scenario.folder / scenario.scenario_type
     meta = [scenario.meta_path] if "meta" in kinds and scenario.meta_path.is_file() else []
-    hashes = {"meta": _digest(meta, "meta", scenario.meta_path.parent)}
+    hashes = {"meta": _digest(meta, "meta", scenario.meta_path.parent, read)}
     for kind, ending in _ENDINGS.items():
         paths = [
             scenario.file(agent, kind, frame, ending)
@@ -106,7 +144,7 @@ def folder_hashes(scenario: ScenarioFolder, kinds: Collection[FileKind] = ("labe
             if kind in kinds
             for frame in frame_numbers(scenario.kind_folder(agent, kind), ending)[0]
         ]
-        hashes[kind] = _digest(paths, kind, base)
+        hashes[kind] = _digest(paths, kind, base, read)
     return ScenarioHashes(**hashes)
 
 
@@ -130,13 +168,13 @@ def digest_of(value: Any) -> str:
     return hashlib.blake2b(text.encode(), digest_size=_DIGEST_BYTES).hexdigest()
 
 
-def _digest(paths: Collection[ReleasePath], kind: FileKind, base: ReleasePath) -> str | None:
+def _digest(paths: Collection[ReleasePath], kind: FileKind, base: ReleasePath, read: _Reader) -> str | None:
     if not paths:
         return None
     digest = hashlib.blake2b(digest_size=_DIGEST_BYTES)
     for path in paths:
-        content = read_content(path, kind, ReleaseError)
+        content = read(path, kind)
         name = str(path).removeprefix(str(base)).replace(os.sep, "/").lstrip("/")
-        digest.update(f"{name} {len(content)}\n".encode())
+        digest.update(f"{name} {len(content)}\n".encode(errors="surrogateescape"))
         digest.update(content)
     return digest.hexdigest()

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Final, get_args
 
 from deepaccident_devkit.errors import DatarootError, MissingFileError, SplitFileError, VersionError, shortened
-from deepaccident_devkit.release.store import Entry, ReleasePath, is_folder, leads_back, listed, read_lines
+from deepaccident_devkit.release.store import Entry, ReleasePath, is_folder, leads_back, listed, read_content
 from deepaccident_devkit.release.store.members import (
     MINI_FOLDER,
     SCENARIO_TYPE,
@@ -338,7 +338,7 @@ def _entries(folder: ReleasePath, *, files: bool = False) -> list[Entry]:
 def read_split_file(path: ReleasePath, *, raw: bool = False, unique: bool = False) -> list[str]:
     """The scenarios of a split file, in its order, each once, as tokens `<scenario_type>/<scenario>`.
 
-    Blank lines, blanks at line ends and CRLF are read.
+    Blank lines, blanks at line ends and CRLF are read. A name that is not UTF-8 is as the system gives those of files.
 
     Args:
         path: the file.
@@ -349,7 +349,11 @@ def read_split_file(path: ReleasePath, *, raw: bool = False, unique: bool = Fals
         MissingFileError: there is no such file.
         SplitFileError: a line has not two words, the file is no text, or a scenario stands twice and `unique` is set.
     """
-    lines = read_lines(path, "split", SplitFileError, "restore it from the release")
+    remedy = "restore it from the release"
+    content = read_content(path, "split", SplitFileError, remedy)
+    if b"\0" in content:
+        raise SplitFileError(f"{path}: not a text file; {remedy}")
+    lines = content.decode("utf-8-sig", errors="surrogateescape").splitlines()
     words = [(number, tuple(line.split(maxsplit=2))) for number, line in enumerate(lines, start=1) if line.strip()]
     for number, line_words in words:
         if len(line_words) != 2:

@@ -76,8 +76,10 @@ _LIMIT: Final = re.compile(r"([a-z_]+)=(\w+)", re.ASCII)
 _SIZE: Final = re.compile(r"([1-9][0-9]{0,11})([KMGT]?)")
 _FACTORS: Final = {"": 1, "K": 1 << 10, "M": 1 << 20, "G": 1 << 30, "T": 1 << 40}
 _FLAGS: Final = os.O_RDONLY | getattr(os, "O_BINARY", 0) | getattr(os, "O_NONBLOCK", 0)  # no waiting for a pipe
-_END, _LARGE_END, _LOCATOR = b"PK\x05\x06", b"PK\x06\x06", b"PK\x06\x07"
-"""How the end of an archive, the end of a large one, and what leads to that, begin."""
+_MEMBER, _END, _LARGE_END, _LOCATOR = b"PK\x03\x04", b"PK\x05\x06", b"PK\x06\x06", b"PK\x06\x07"
+"""How a member of an archive, the end of an archive, the end of a large one, and what leads to that, begin."""
+_SHORT: Final = 256
+"""Bytes by which a web page can be told."""
 _END_LENGTH, _LARGE_END_LENGTH, _LOCATOR_LENGTH = 22, 56, 20
 _LONGEST_END: Final = _LARGE_END_LENGTH + _LOCATOR_LENGTH + _END_LENGTH + (1 << 16) - 1
 """Bytes at the end of a file among which its archive's end is: the last of it is a comment."""
@@ -307,7 +309,8 @@ def check_end(file: BinaryIO, most: int) -> None:
     tail = file.read(_LONGEST_END)
     end = tail.rfind(_END)
     if end < 0:
-        raise zipfile.BadZipFile("not a zip archive" if size else "the file is empty")
+        file.seek(0)
+        raise zipfile.BadZipFile(_no_end_text(file.read(_SHORT)))
     if end + _END_LENGTH + _number(tail, end + 20, 2) != len(tail):
         raise zipfile.BadZipFile("bytes follow the end of the archive")
     directory, large = _number(tail, end + 12, 4), end - _LOCATOR_LENGTH
@@ -318,6 +321,15 @@ def check_end(file: BinaryIO, most: int) -> None:
         directory = _number(tail, record + 40, 8)
     if directory > most:
         raise RefusedFileError(errno.EFBIG, f"the archive's directory has {directory:,} bytes, more than {most:,}")
+
+
+def _no_end_text(beginning: bytes) -> str:
+    """Say what a file without an archive's end is, by its first bytes."""
+    if beginning.startswith(_MEMBER):
+        return "its end is missing, so the download or the copy broke off"
+    if beginning.lstrip().startswith(b"<"):
+        return "not a zip archive, but a web page"
+    return "not a zip archive" if beginning else "the file is empty"
 
 
 def _number(content: bytes, place: int, length: int) -> int:

@@ -37,6 +37,8 @@ from deepaccident_devkit.tables.records import record_columns
 
 Columns = Mapping[str, Any]
 """Stored column name → array (or list, for words) of one table's rows."""
+HASHES = "hashes"
+"""A word of kept rows, and of the table of scenarios: the hashes of the files that these were made from, as JSON."""
 REMEDY = "mend it with: deepaccident index DATAROOT --check"
 """What to do with a damaged table."""
 
@@ -77,15 +79,15 @@ class TableWriter(ExitStack):
                 np.ascontiguousarray(values, dtype=numpy_dtype(column.kind)).tofile(collected)
         self.num_rows += len(columns[self._spec.stored_columns[0].stored or ""])
 
-    def finish(self) -> None:
-        """Write the table's file."""
+    def finish(self, words: Mapping[str, str]) -> None:
+        """Write the table's file, with words about the table as a whole."""
         import pyarrow as pa
 
         columns = {column.stored or "": self._collected(column) for column in self._spec.stored_columns}
         with (
             replacing(table_path(self._folder, self._spec.name)) as temporary,
             pa.OSFile(str(temporary), "wb") as sink,
-            pa.ipc.new_file(sink, arrow_schema(self._spec)) as writer,
+            pa.ipc.new_file(sink, arrow_schema(self._spec).with_metadata(dict(words))) as writer,
         ):
             writer.write_batch(record_batch(self._spec, columns))
 
@@ -104,7 +106,7 @@ def write_table(folder: Path, spec: TableSpec, columns: Columns) -> None:
     """Write a whole table at once."""
     with TableWriter(folder, spec) as writer:
         writer.append(columns)
-        writer.finish()
+        writer.finish({})
 
 
 class StoredTable:
@@ -114,6 +116,7 @@ class StoredTable:
         spec: its columns.
         views: stored column name → view of it (numpy arrays are read-only).
         num_rows: its length.
+        words: about the table as a whole, as `TableWriter.finish` took them.
     """
 
     def __init__(self, folder: Path, spec: TableSpec) -> None:
@@ -128,6 +131,7 @@ class StoredTable:
             if fault := fault_of(spec, batch):
                 raise OSError(fault)
             self.views = views(spec, batch)
+            self.words = _words(batch.schema)
         except FileNotFoundError:
             raise IndexStoreError(f"{path}: no such file: the index was made again; open the release again") from None
         except (OSError, pa.ArrowException, IndexError, ValueError) as error:
@@ -165,8 +169,11 @@ def streams_metadata(content: bytes) -> dict[str, str]:
     """The words of `streams`."""
     import pyarrow as pa
 
-    metadata = pa.ipc.open_stream(content).schema.metadata or {}
-    return {name.decode(): value.decode() for name, value in metadata.items()}
+    return _words(pa.ipc.open_stream(content).schema)
+
+
+def _words(schema: Any) -> dict[str, str]:
+    return {name.decode(): value.decode() for name, value in (schema.metadata or {}).items()}
 
 
 def read_streams(source: Any, specs: Sequence[TableSpec]) -> list[dict[str, Any]] | None:

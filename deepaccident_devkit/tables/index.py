@@ -5,10 +5,10 @@
       tables-<digest>/     one Arrow file a table
       kept/                the rows of each scenario, from which the tables are joined; see `parallel.Store`
 
-Opening compares the times of folders, meta and split files and the sizes of the tables with the manifest, and reads the
-tables' footers. Making it compares the times of every label and calib file, and with `check_files` the contents of all
-files, and reads only the scenarios that changed. Everything is written under a temporary name and renamed, the manifest
-last, so that a reader sees the old index or the new one.
+Opening compares the states of folders and meta files, the contents of split files and the sizes of the tables with the
+manifest, and reads the tables' footers. Making it compares the times and sizes of every label and calib file, and with
+`check_files` the contents of all files, and reads only the scenarios that changed. Everything is written under a
+temporary name and renamed, the manifest last, so that a reader sees the old index or the new one.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from deepaccident_devkit.support.reading import RefusedFileError, fault_text, fi
 from deepaccident_devkit.support.text import choice
 from deepaccident_devkit.tables.arrow_files import table_path
 from deepaccident_devkit.tables.records import SCHEMA_VERSION, table_specs
-from deepaccident_devkit.tables.scan import contents_digest, folder_digest
+from deepaccident_devkit.tables.scan import content_hashes, folder_digest
 from deepaccident_devkit.taxonomy import VERSIONS, OnError
 
 if TYPE_CHECKING:
@@ -71,7 +71,7 @@ class Problem(ShortRepr):
     Attributes:
         scenario: its token.
         messages: a sentence each, naming file, line and remedy.
-        contents: digest of its files as they were when this was found; empty if they are not the cause.
+        contents: hashes of its files as they were when this was found; empty if they are not the cause.
     """
 
     scenario: str
@@ -85,7 +85,7 @@ class Index(ShortRepr):
 
     Attributes:
         folder: where it lies.
-        fingerprint: digest of the release's folder, meta and split file times.
+        fingerprint: digest of the release's folders, meta and split files (`scan.folder_digest`).
         tables: name of the folder that holds the tables; empty if none could be made.
         table_files: the size and checksum of each file in it, by name.
         problems: the scenarios left out.
@@ -137,7 +137,7 @@ class Index(ShortRepr):
         if self.fingerprint != fingerprint or not self._has_sizes():
             return False
         broken = {problem.scenario: problem.contents for problem in self.problems if problem.contents}
-        return all(contents_digest(each) == broken[each.token] for each in layout.scenarios if each.token in broken)
+        return all(content_hashes(each) == broken[each.token] for each in layout.scenarios if each.token in broken)
 
     def is_whole(self) -> bool:
         """Whether the content of all tables is what was written; by size first, for a hole has gigabytes to read."""
@@ -153,6 +153,7 @@ def open_index(
     *,
     index_dir: Path | None = None,
     on_error: OnError = "raise",
+    check_times: bool = False,
     check_files: bool = False,
     **how: Unpack[Engine],
 ) -> Index:
@@ -164,8 +165,9 @@ def open_index(
         layout: the release.
         index_dir: where indexes are kept; by default in the dataroot, or in the user's cache if that is read-only.
         on_error: `raise` lists every broken scenario and raises; `skip` leaves them out and logs them.
-        check_files: compare the content of every label, calib and meta file, and of every file of the index, with
-            the checksums of the indexing; else only times and sizes are compared (schema/README.md).
+        check_times: compare the time and size of every label, calib and meta file, and the content of every table. If
+            not set, an index is opened where all folders are as they were (schema/README.md).
+        check_files: compare the content of every label, calib and meta file too.
         **how: of `parallel.Engine`: `workers`, `executor`, `progress`.
 
     Raises:
@@ -179,10 +181,10 @@ def open_index(
     """
     on_error = choice("on_error", on_error, get_args(OnError))
     _refuse_wrong_limits()
-    index = None if check_files else _current_index(layout, index_dir)
+    index = None if check_times or check_files else current_index(layout, index_dir)
     while index is None:
         folder = _writable_folder(layout, index_dir)
-        index = _made(layout, folder, check_files=check_files, **how) or _current_index(layout, index_dir)
+        index = _made(layout, folder, check_files=check_files, **how) or current_index(layout, index_dir)
     _accept(layout, index, on_error)
     return index
 
@@ -194,7 +196,7 @@ def index_folders(root: Dataroot, version: str, index_dir: Path | None = None) -
 
 def place_outside(layout: ReleaseLayout) -> Path | None:
     """The `index_dir` with which opening a release writes nothing into its folder: None where a good index is there."""
-    if _current_index(layout, None) is not None:
+    if current_index(layout) is not None:
         return None
     *_, cache = index_folders(layout.root, layout.version)
     return cache.parent
@@ -204,7 +206,8 @@ def _fingerprint(layout: ReleaseLayout) -> str:
     return folder_digest(layout.scenarios, layout.split_files.values())
 
 
-def _current_index(layout: ReleaseLayout, index_dir: Path | None) -> Index | None:
+def current_index(layout: ReleaseLayout, index_dir: Path | None = None) -> Index | None:
+    """Return the index that opening a release would use as it is; None if one would be made or updated."""
     fingerprint = _fingerprint(layout)
     found = map(Index.read, index_folders(layout.root, layout.version, index_dir))
     return next((index for index in found if index and index.is_current(layout, fingerprint)), None)
@@ -249,11 +252,11 @@ def _made(layout: ReleaseLayout, folder: Path, *, check_files: bool, **how: Unpa
         )
         if not turn.alone():
             return None
-        tables, files = _written_tables(store, [each for each in outcomes.values() if each.indexed], splits)
+        tables, files = _written_tables(store, [outcome for outcome in outcomes.values() if outcome.indexed], splits)
         broken = [
-            Problem(scenario=each.token, messages=each.messages, contents=each.contents)
-            for each in outcomes.values()
-            if each.messages
+            Problem(scenario=token, messages=outcome.messages, contents=outcome.contents)
+            for token, outcome in outcomes.items()
+            if outcome.messages
         ]
         misplaced = [Problem(scenario=token, messages=messages) for token, messages in splits.problems.items()]
         index = Index(
@@ -299,16 +302,17 @@ def _written_tables(
 
     if not outcomes:
         return "", {}
-    assigned = [splits.split_of.get(each.token) for each in outcomes]
-    made_from = [(each.token, each.contents, split) for each, split in zip(outcomes, assigned, strict=True)]
-    name = _TABLES + hashlib.blake2b(repr((SCHEMA_VERSION, made_from)).encode(), digest_size=8).hexdigest()
+    assigned = [splits.split_of.get(outcome.scenario.token) for outcome in outcomes]
+    hashes = json.dumps({outcome.scenario.token: json.loads(outcome.contents) for outcome in outcomes})
+    made_from = (SCHEMA_VERSION, hashes, [outcome.scenario.folder for outcome in outcomes], assigned)
+    name = _TABLES + hashlib.blake2b(repr(made_from).encode(), digest_size=8).hexdigest()
     folder, before = place_in(store.folder, name, opened=True), Index.read(store.folder)
     if before is not None and before.tables == name and before.is_whole():
         files = dict(before.table_files)
     else:
         remove_in(store.folder, name)  # damaged, or of a process that was stopped before its manifest
         with replacing_folder(folder) as temporary:
-            join_tables(temporary, [store.path(each.token) for each in outcomes], assigned)
+            join_tables(temporary, [store.path(each.scenario.token) for each in outcomes], assigned, hashes)
             files = table_files(temporary)
     return name, files
 

@@ -16,8 +16,8 @@ from deepaccident_devkit.geometry import quaternions
 from deepaccident_devkit.parallel import Store
 from deepaccident_devkit.release import ReleaseLayout, ScenarioFolder, read_meta, read_split_file
 from deepaccident_devkit.support.arrays import AnyArray
-from deepaccident_devkit.support.reading import observed
 from deepaccident_devkit.tables.arrow_files import (
+    HASHES,
     Columns,
     TableWriter,
     read_streams,
@@ -30,10 +30,8 @@ from deepaccident_devkit.tables.columns import NULL_INTEGER, Key, TableSpec
 from deepaccident_devkit.tables.records import SCHEMA_VERSION, table_specs
 from deepaccident_devkit.tables.scan import (
     Finding,
-    ScenarioFiles,
     ScenarioScan,
-    content_words,
-    contents_digest,
+    content_hashes,
     read_scenario,
     scan_scenario,
     times_digest,
@@ -46,7 +44,6 @@ _FROM_OTHERS: Mapping[str, Mapping[str, Callable[[Columns], AnyArray]]] = {
     "annotation": {"rotation": lambda rows: quaternions.from_yaw(rows["yaw"])}
 }
 """Table → column that is not kept, since it follows from others: a twentieth of the index."""
-_CONTENTS = "contents"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -124,13 +121,13 @@ class Outcome:
     """The outcome of indexing one scenario.
 
     Attributes:
-        token: the scenario's.
-        contents: digest of its files; empty if it has none.
+        scenario: which one.
+        contents: `content_hashes` of its files; empty if it has none.
         messages: what is wrong with it, a sentence each.
         notices: what was left aside.
     """
 
-    token: str
+    scenario: ScenarioFolder
     contents: str = ""
     messages: tuple[str, ...] = ()
     notices: tuple[str, ...] = ()
@@ -146,30 +143,19 @@ def index_scenario(store: Store, scenario: ScenarioFolder, *, check_files: bool 
     key = f"{SCHEMA_VERSION}:{times_digest(scenario)}"  # before anything is read: a later edit is noticed
     token, scan = scenario.token, scan_scenario(scenario)
     if not scan.agents and not scan.problems:
-        return Outcome(token=token, notices=(*scan.notices, f"{token}: its calib folders hold no files; left out"))
+        return Outcome(
+            scenario=scenario, notices=(*scan.notices, f"{token}: its calib folders hold no files; left out")
+        )
     faults: Sequence[Finding] = scan.problems
     content = None if faults else store.kept(token, key, "index")
-    contents = None if content is None else streams_metadata(content)[_CONTENTS]
-    if contents is None or (check_files and contents != contents_digest(scenario)):
-        files, faults, contents = _read(scenario, scan)
+    contents = None if content is None else streams_metadata(content).get(HASHES)
+    if contents is None or (check_files and contents != content_hashes(scenario)):
+        files, faults = (None, faults) if faults else read_scenario(scenario, scan)
+        contents = content_hashes(scenario) if files is None else files.hashes
         if files is not None:
             store.keep(token, key, rows_to_keep(scenario_rows(files), contents))
     notices = scan.notices if faults else (*scan.notices, *_end_notices(scenario, scan))
-    return Outcome(token=token, contents=contents, messages=tuple(map(str, faults)), notices=notices)
-
-
-def _read(scenario: ScenarioFolder, scan: ScenarioScan) -> tuple[ScenarioFiles | None, Sequence[Finding], str]:
-    """The files, None if there is a fault; the faults; and the digest of the contents that were read."""
-    if scan.problems:
-        return None, scan.problems, contents_digest(scenario)
-    words: dict[str, bytes] = {}
-
-    def note(path: object, content: bytes) -> None:
-        words[str(path)] = content_words(content)
-
-    with observed(note):
-        files, faults = read_scenario(scenario, scan)
-    return files, faults, contents_digest(scenario, words)
+    return Outcome(scenario=scenario, contents=contents, messages=tuple(map(str, faults)), notices=notices)
 
 
 def _end_notices(scenario: ScenarioFolder, scan: ScenarioScan) -> Iterator[str]:
@@ -183,14 +169,15 @@ def _end_notices(scenario: ScenarioFolder, scan: ScenarioScan) -> Iterator[str]:
 
 
 def rows_to_keep(tables: Mapping[str, Columns], contents: str) -> bytes:
-    """The rows of one scenario as they are kept, with the digest of the files that they were made from."""
-    return streams([(spec, tables[spec.name]) for spec in _kept_specs()], {_CONTENTS: contents})
+    """The rows of one scenario as they are kept, with the hashes of the files that they were made from."""
+    return streams([(spec, tables[spec.name]) for spec in _kept_specs()], {HASHES: contents})
 
 
-def join_tables(folder: Path, scenarios: Sequence[Path], splits: Sequence[str | None]) -> None:
+def join_tables(folder: Path, scenarios: Sequence[Path], splits: Sequence[str | None], hashes: str = "{}") -> None:
     """Write every table to a folder: row keys count on, scenario after scenario, whose kept rows and splits are given.
 
-    Raises OSError, and IndexStoreError if a file holds no rows of a scenario.
+    The table of scenarios carries the hashes of their files, by token, as JSON. Raises OSError, and IndexStoreError if
+    a file holds no rows of a scenario.
     """
     specs = table_specs()
     with ExitStack() as stack:
@@ -202,8 +189,8 @@ def join_tables(folder: Path, scenarios: Sequence[Path], splits: Sequence[str | 
             first_rows["ego_pose"] = first_rows["sample"]
             for name, writer in writers.items():
                 writer.append(_counted_on(specs[name], tables[name], first_rows))
-        for writer in writers.values():
-            writer.finish()
+        for name, writer in writers.items():
+            writer.finish({HASHES: hashes} if name == "scenario" else {})
     codes = np.arange(len(CATEGORIES))
     write_table(folder, specs["sensor"], sensor_rows())
     write_table(folder, specs["category"], {"name": codes, "index": codes})

@@ -1,19 +1,22 @@
 """A scenario's small files: which there are, what is in them and what is wrong with them; digests that tell changes."""
 
 import hashlib
+import json
 import os
-import zlib
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, Literal, TypeAlias
+from itertools import product
+from operator import attrgetter
+from typing import Any, Literal
 
 from deepaccident_devkit.errors import ReleaseError
 from deepaccident_devkit.release import Calibs, Labels, Meta, ScenarioFolder, read_calibs, read_labels, read_meta
+from deepaccident_devkit.release.fingerprints import folder_hashes
 from deepaccident_devkit.release.layout import frame_numbers
-from deepaccident_devkit.release.store import ReleasePath, StorePath, fetched, listed
+from deepaccident_devkit.release.store import Entry, ReleasePath, StorePath, fetched, listed
 from deepaccident_devkit.support.arrays import ShortRepr
-from deepaccident_devkit.support.reading import FileKind, fault_text, read_bytes
+from deepaccident_devkit.support.reading import FileKind, fault_text, observed, read_bytes
 from deepaccident_devkit.taxonomy import AGENTS, AgentName
 
 Severity = Literal["error", "warning", "note"]
@@ -22,7 +25,6 @@ SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
 ENDINGS = {"calib": "pkl", "label": "txt"}
 """Kind of small file → ending of its files."""
 _FRAMES_NAMED = 6
-_AnyPath: TypeAlias = ReleasePath | str
 _REMEDY = "unpack its archive again, or leave the scenario out with on_error='skip'"
 
 
@@ -84,6 +86,9 @@ class ScenarioScan:
 def scan_scenario(scenario: ScenarioFolder) -> ScenarioScan:
     """List a scenario's calib and label folders and check that they hold frames 1 to n for every agent."""
     problems: list[Finding] = []
+    if scenario.token.encode(errors="replace") != os.fsencode(scenario.token):
+        what, remedy = "the scenario's name is not UTF-8", "rename its folders and files"
+        problems.append(_broken(scenario, "odd-name", scenario.meta_path, what, remedy))
     frames = {
         (agent, kind): _frames(scenario, agent, kind, ending, problems)
         for agent in AGENTS
@@ -146,6 +151,7 @@ class ScenarioFiles:
         meta: None if the scenario has none.
         calibs: of every sample, agent by agent.
         labels: of every labelled sample, agent by agent.
+        hashes: of the files' bytes, as of `content_hashes`.
     """
 
     scenario: ScenarioFolder
@@ -153,6 +159,7 @@ class ScenarioFiles:
     meta: Meta | None
     calibs: Calibs
     labels: Labels
+    hashes: str = ""
 
     @property
     def num_samples(self) -> int:
@@ -182,25 +189,29 @@ def read_scenario(scenario: ScenarioFolder, scan: ScenarioScan) -> tuple[Scenari
     meta_paths = [scenario.meta_path] if scan.has_meta else []
     calib_paths = [scenario.calib_path(agent, n) for agent in scan.agents for n in frames]
     label_paths = [scenario.label_path(agent, n) for agent in scan.labelled for n in frames]
-    with fetched([*meta_paths, *calib_paths, *label_paths]):
+    contents: dict[str, bytes] = {}
+    paths = [*meta_paths, *calib_paths, *label_paths]
+    with fetched(paths), observed(lambda path, content: contents.update({str(path): content})):
         metas = attempt(_read_metas, "meta-unreadable", meta_paths)
         calibs = attempt(read_calibs, "calib-unreadable", calib_paths)
         labels = attempt(read_labels, "label-unreadable", label_paths)
     if faults:
         return None, faults
     meta = metas[0] if metas else None
-    return ScenarioFiles(scenario=scenario, scan=scan, meta=meta, calibs=calibs, labels=labels), []
+    hashes = content_hashes(scenario, contents)
+    return ScenarioFiles(scenario=scenario, scan=scan, meta=meta, calibs=calibs, labels=labels, hashes=hashes), []
 
 
 def _read_metas(paths: Sequence[ReleasePath]) -> list[Meta]:
     return [read_meta(path) for path in paths]
 
 
-def folder_digest(scenarios: Iterable[ScenarioFolder], files: Iterable[ReleasePath]) -> str:
-    """A digest of the times of the scenarios' calib and label folders and of some files; opens none of them.
+def folder_digest(scenarios: Iterable[ScenarioFolder], split_files: Iterable[ReleasePath]) -> str:
+    """Return a digest of the states of the scenarios' folders and meta files, and of the contents of split files.
 
-    It changes when a file is added, removed or renamed, not when one is edited in place; in a store, when an archive
-    changes.
+    It changes when a file is added, removed, renamed or replaced, also by a tool that puts all times back, for none can
+    put back a folder's ctime. It does not change when a label or calib file is written in place, nor when files get
+    hard links, which change the ctime of a file. In a store it changes with the list of the archives' members.
     """
     digest = hashlib.blake2b(digest_size=16)
     for scenario in scenarios:
@@ -210,68 +221,64 @@ def folder_digest(scenarios: Iterable[ScenarioFolder], files: Iterable[ReleasePa
         root = os.fspath(scenario.root)
         base = os.path.join(root, scenario.folder, scenario.scenario_type)  # noqa: PTH118 - 7,000 of them at start
         digest.update(os.fsencode(f"{scenario.folder}/{scenario.token}\n"))
-        paths = [f"{base}/{agent}/{kind}/{scenario.name}" for agent in AGENTS for kind in ("calib", "label")]
-        for path in [*paths, f"{base}/meta/{scenario.name}.txt"]:
-            digest.update(_stat_words(path))
-    for file in files:
-        digest.update(os.fsencode(file.name) + _stat_words(file))
+        folders = [f"{base}/{agent}/{kind}/{scenario.name}" for agent in AGENTS for kind in ENDINGS]
+        for path in [*folders, f"{base}/meta"]:
+            digest.update(_stat_words(path, ctime=True))
+        digest.update(_stat_words(f"{base}/meta/{scenario.name}.txt"))
+    for file in split_files:
+        digest.update(os.fsencode(file.name))
+        digest.update(_stat_words(file) if isinstance(file, StorePath) else _content_or_fault(file, "split"))
     return digest.hexdigest()
 
 
-def times_digest(scenario: ScenarioFolder) -> str:
-    """A digest of name, size and time of every label, calib and meta file of a scenario; opens none of them."""
-    return _digest(scenario, lambda path, _kind: _stat_words(path))
+def times_digest(scenario: ScenarioFolder, kinds: Iterable[str] = tuple(ENDINGS), *, ctime: bool = True) -> str:
+    """Return a digest of the names, sizes and times of a scenario's files of some kinds, and of meta; opens none.
 
-
-def contents_digest(scenario: ScenarioFolder, known: Mapping[str, bytes] | None = None) -> str:
-    """A digest of names and contents of a scenario's small files; of those read already, `content_words` are given."""
-    found = known or {}
-    return _digest(scenario, lambda path, kind: found.get(str(path)) or _words_of_file(path, kind))
-
-
-def content_words(content: bytes) -> bytes:
-    """What a file's content adds to `contents_digest`; a CRC, as it tells damage at a tenth of a hash's time."""
-    return f" {len(content)} {zlib.crc32(content):08x}\n".encode()
-
-
-def _digest(scenario: ScenarioFolder, words_of: Callable[[_AnyPath, FileKind], bytes]) -> str:
-    """A digest of where a scenario lies, and of each small file's name and what `words_of` its path and kind gives."""
+    With `ctime` it changes with whatever is done to a file, also if its time is put back, and if it gets a hard link.
+    """
     digest = hashlib.blake2b(os.fsencode(f"{scenario.folder}/{scenario.token}"), digest_size=16)
-    kinds: tuple[FileKind, ...] = ("calib", "label")
-    for agent in AGENTS:
-        for kind in kinds:
-            folder = scenario.kind_folder(agent, kind)
-            for name in _names(folder):
-                digest.update(os.fsencode(f"{agent}/{kind}/{name}") + words_of(_below(folder, name), kind))
-    digest.update(words_of(scenario.meta_path, "meta"))
+    for agent, kind in product(AGENTS, kinds):
+        with suppress(OSError):  # no such folder
+            for entry in sorted(listed(scenario.kind_folder(agent, kind)), key=attrgetter("name")):
+                digest.update(os.fsencode(f"{agent}/{kind}/{entry.name}") + _stat_words(entry, ctime=ctime))
+    digest.update(_stat_words(scenario.meta_path, ctime=ctime))
     return digest.hexdigest()
 
 
-def _words_of_file(path: _AnyPath, kind: FileKind) -> bytes:
+def content_hashes(scenario: ScenarioFolder, known: Mapping[str, bytes] | None = None) -> str:
+    """Return the hashes of a scenario's files (`ScenarioHashes`) as JSON; empty if a folder cannot be listed.
+
+    Args:
+        scenario: where the files lie.
+        known: path → bytes of files that were read before. The others are read now; of a file that cannot be read, the
+            fault counts.
+    """
+    contents = known or {}
+
+    def read(path: ReleasePath, kind: FileKind) -> bytes:
+        content = contents.get(str(path))
+        return _content_or_fault(path, kind) if content is None else content
+
     try:
-        return content_words(read_bytes(Path(path) if isinstance(path, str) else path, kind))
+        return json.dumps(folder_hashes(scenario, read=read).as_dict())
+    except ReleaseError:
+        return ""
+
+
+def _content_or_fault(path: ReleasePath, kind: FileKind) -> bytes:
+    try:
+        return read_bytes(path, kind)
     except OSError as error:
-        return f" {fault_text(error)}\n".encode()
+        return fault_text(error).encode()
 
 
-def _names(folder: ReleasePath) -> list[str]:
+def _stat_words(path: ReleasePath | Entry | str, *, ctime: bool = False) -> bytes:
     try:
-        return sorted(entry.name for entry in listed(folder))
-    except OSError:
-        return []
-
-
-def _below(folder: ReleasePath, name: str) -> _AnyPath:
-    """A file in a folder; a text, as there are a million of them."""
-    return f"{folder}{os.sep}{name}" if isinstance(folder, Path) else folder / name
-
-
-def _stat_words(path: _AnyPath) -> bytes:
-    try:
-        found = path.stat() if isinstance(path, StorePath) else os.stat(path)  # noqa: PTH116 - texts, as above
+        status = os.stat(path) if isinstance(path, str) else path.stat()  # noqa: PTH116 - there are 7,000 texts at start
     except OSError:
         return b" none\n"
-    return f" {found.st_size} {found.st_mtime_ns}\n".encode()
+    changed = getattr(status, "st_ctime_ns", 0) if ctime else 0
+    return f" {status.st_size} {status.st_mtime_ns} {changed}\n".encode()
 
 
 def _is_there(path: ReleasePath) -> bool:

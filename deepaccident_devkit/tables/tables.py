@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import shlex
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, NoReturn, TypeVar, cast, get_args, overload
 
@@ -20,10 +20,12 @@ from deepaccident_devkit.errors import (
     TokenError,
 )
 from deepaccident_devkit.release import read_split_file
+from deepaccident_devkit.release.fingerprints import ScenarioHashes
 from deepaccident_devkit.release.store import ReleasePath, places_of
+from deepaccident_devkit.support.json_text import as_record, parsed_json
 from deepaccident_devkit.support.nuscenes_names import field_remedy
 from deepaccident_devkit.support.text import choice, meant_text, path_of, spelled
-from deepaccident_devkit.tables.arrow_files import REMEDY, StoredTable, damaged_value
+from deepaccident_devkit.tables.arrow_files import HASHES, REMEDY, StoredTable, damaged_value
 from deepaccident_devkit.tables.columns import NULL_INTEGER, Choice, Column, Key, Number, Subset, Vector
 from deepaccident_devkit.tables.index import Problem
 from deepaccident_devkit.tables.records import table_spec, table_specs
@@ -166,6 +168,14 @@ class OpenTables:
         """Classes of road users."""
         return self._tables.table("category")
 
+    def indexed_hashes(self, scenario: str) -> ScenarioHashes | None:
+        """Return the hashes of the files that a scenario's rows were made from; None where they are unknown.
+
+        Raises:
+            IndexStoreError: the table that holds them is damaged.
+        """
+        return self._tables.hashes.get(scenario)
+
     def get(self, table: str, token: RowArgument) -> dict[str, Any]:
         """The record of a token, as a fresh dict; raises TableError or TokenError."""
         record: dict[str, Any] = self._tables.table(table).get(token_of(token))
@@ -269,6 +279,15 @@ class Tables:
 
     def __repr__(self) -> str:
         return f"Tables({str(self.folder)!r})"
+
+    @cached_property
+    def hashes(self) -> dict[str, ScenarioHashes]:
+        """Scenario token → hashes of the files that its rows were made from; raises IndexStoreError."""
+        words = self._stored["scenario"].words.get(HASHES, "{}")
+        try:
+            return as_record(parsed_json(words.encode()), dict[str, ScenarioHashes])
+        except ValueError as error:
+            raise IndexStoreError(f"{self.folder}: the hashes of its files are damaged; {REMEDY}") from error
 
     def table(self, name: str) -> Table[Any]:
         """One table's records; raises TableError."""

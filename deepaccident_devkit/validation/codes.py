@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+from deepaccident_devkit.release.fingerprints import INDEX_REMEDY
 from deepaccident_devkit.tables import Severity
 
 _RESTORE = "restore the scenario's files from the archive"
@@ -30,6 +31,22 @@ class Code:
 
 
 CODES: dict[str, Code] = {
+    # archives and the index
+    "archive-unreadable": Code(
+        "error",
+        "An archive is cut off, damaged, encrypted or no zip, and is left out.",
+        "fetch it again, or move it out of the folder: the others can be read without it",
+    ),
+    "archive-unfinished": Code(
+        "warning",
+        "An archive is left out, as its name is that of a download that has not ended.",
+        "let the download end, or start it again",
+    ),
+    "index-outdated": Code(
+        "warning",
+        "The index was made from other label, calib or meta files than those that are here.",
+        INDEX_REMEDY,
+    ),
     # files, as indexing sees them
     "folder-unreadable": Code("error", "A folder cannot be listed.", "unpack its archive again, or make it readable"),
     "folder-left-aside": Code(
@@ -42,7 +59,11 @@ CODES: dict[str, Code] = {
         "A symbolic link leads to nothing, to itself or to a folder that it lies in, and is not followed.",
         "remove it, or unpack in its place what should be there",
     ),
-    "odd-name": Code("error", "A label or calib file has no frame number in its name.", "rename it"),
+    "odd-name": Code(
+        "error",
+        "A label or calib file has no frame number in its name, or a scenario's name is not UTF-8.",
+        "rename it",
+    ),
     "frames-missing": Code("error", "An agent lacks label or calib files of some frames.", _RESTORE),
     "label-unreadable": Code("error", "A label file is damaged; the finding names the line.", _RESTORE_ONE),
     "calib-unreadable": Code("error", "A calib file is damaged, not rigid, or asks to run something.", _RESTORE_ONE),

@@ -12,7 +12,7 @@ from deepaccident_devkit.errors import ReleaseError, TokenError
 from deepaccident_devkit.parallel import Places, run_batch
 from deepaccident_devkit.release import ReleaseLayout, ScenarioFolder, find_release
 from deepaccident_devkit.release.layout import frame_sizes
-from deepaccident_devkit.release.store import Dataroot, open_dataroot, places_of
+from deepaccident_devkit.release.store import Dataroot, open_dataroot, places_of, refused_archives
 from deepaccident_devkit.reports import Report
 from deepaccident_devkit.support.arrays import ShortRepr
 from deepaccident_devkit.support.text import columns_text, counted, size_text
@@ -98,6 +98,8 @@ class Completeness(Report):
         total: the files of all of them; its agent is None, its channel `all`.
         splits: split → what is here of it; `unknown` for scenarios of no known split. The mini release is one split.
         lacking: scenario that is not whole → kind of file → how many are missing, of all agents.
+        unreadable_archives: a sentence each: which one, what is wrong with it, and what to do. Files that they may hold
+            are not here.
     """
 
     dataroot: str
@@ -107,10 +109,12 @@ class Completeness(Report):
     total: FileCount
     splits: Mapping[str, SplitFiles]
     lacking: Mapping[str, Mapping[str, int]]
+    unreadable_archives: Sequence[str]
 
     def to_text(self) -> str:
-        """Blocks for a terminal: each split, then the first scenarios that lack something."""
-        return f"DeepAccident {self.version} at {self.dataroot}\n{self.section()}"
+        """Blocks for a terminal: unreadable archives, each split, then the first scenarios that lack something."""
+        refused = [f"cannot be read: {sentence}" for sentence in self.unreadable_archives]
+        return "\n".join([f"DeepAccident {self.version} at {self.dataroot}", *refused, self.section()])
 
     def section(self) -> str:
         """The same without the release's name, as a part of another report."""
@@ -149,16 +153,31 @@ def release_completeness(
         **how: `workers`, `executor` and `progress`, as `parallel.Engine` says.
 
     Raises:
-        DatarootError: the folder is missing, holds no release, or a part of it cannot be listed.
+        DatarootError: the folder is missing, holds no release, or a part of it that is no archive cannot be listed.
         VersionError: the version is unknown or not under this folder.
         SplitFileError: a split file cannot be read.
         TokenError: one of `scenarios` is not there.
     """
-    layout = find_release(open_dataroot(root), version)
+    layout = readable_release(root, version)
     folders = chosen_scenarios(layout, scenarios)
     files = run_batch(files_of, folders, label="listing files", places=Places(reads=places_of(layout.root)), **how)
     tokens = [folder.token for folder in folders]
     return completeness(layout, zip(tokens, files, strict=True), str(root), selected=scenarios is not None)
+
+
+def readable_release(root: Dataroot, version: str) -> ReleaseLayout:
+    """Return what lies under a dataroot, except in archives that cannot be listed; perhaps no scenario is left then.
+
+    Raises:
+        DatarootError, VersionError: as of `find_release`, if all archives can be listed.
+    """
+    place = open_dataroot(root, on_error="skip")
+    try:
+        return find_release(place, version)
+    except ReleaseError:
+        if not refused_archives(place):
+            raise
+        return ReleaseLayout(root=place, version=version, layout="A", scenarios=())
 
 
 def chosen_scenarios(layout: ReleaseLayout, scenarios: Collection[str] | None) -> list[ScenarioFolder]:
@@ -217,6 +236,7 @@ def completeness(
         total=summed((count for counts in every.values() for count in counts), "all"),
         splits={split: _split_files(by_split.get(split, {}), lacking, expected.get(split)) for split in splits},
         lacking=dict(sorted(lacking.items())),
+        unreadable_archives=refused_archives(layout.root),
     )
 
 

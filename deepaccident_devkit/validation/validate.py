@@ -8,6 +8,7 @@ import os
 import sys
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,27 +17,26 @@ import numpy as np
 
 from deepaccident_devkit._version import __version__
 from deepaccident_devkit.dataset import Dataset, RowArgument
-from deepaccident_devkit.errors import ConfigError, TokenError
+from deepaccident_devkit.errors import ConfigError, IndexStoreError, ReleaseError
 from deepaccident_devkit.parallel import Places, Store, run_batch
-from deepaccident_devkit.release import ReleaseLayout, ScenarioFolder, find_release
+from deepaccident_devkit.release import ReleaseLayout, ScenarioFolder
 from deepaccident_devkit.release.layout import left_aside, names_without_calib
 from deepaccident_devkit.release.store import (
     Dataroot,
-    Entry,
-    ReleasePath,
+    StorePath,
     checksums_compared,
-    listed,
-    open_dataroot,
     places_of,
 )
 from deepaccident_devkit.reports import Report
 from deepaccident_devkit.support.files import writable_folder
+from deepaccident_devkit.support.json_text import as_record
 from deepaccident_devkit.support.reading import LIMITS_VARIABLE
 from deepaccident_devkit.support.text import counted
-from deepaccident_devkit.tables import SEVERITIES, Finding
+from deepaccident_devkit.tables import SEVERITIES, Finding, Tables, current_index
 from deepaccident_devkit.tables.boxes import VelocityFit, fit_velocities, total_fit
-from deepaccident_devkit.tables.scan import read_scenario, scan_scenario, times_digest
-from deepaccident_devkit.taxonomy import AGENTS, CHANNELS, VELOCITY_FRAMES
+from deepaccident_devkit.tables.scan import ENDINGS, finding_of, read_scenario, scan_scenario, times_digest
+from deepaccident_devkit.tables.tables import token_of
+from deepaccident_devkit.taxonomy import CHANNELS, VELOCITY_FRAMES
 from deepaccident_devkit.validation.agreement import check_agreement, check_story
 from deepaccident_devkit.validation.completeness import (
     Completeness,
@@ -44,6 +44,7 @@ from deepaccident_devkit.validation.completeness import (
     chosen_scenarios,
     completeness,
     files_of,
+    readable_release,
 )
 from deepaccident_devkit.validation.inventory import absences, check_splits, take_inventory
 from deepaccident_devkit.validation.labels import check_labels
@@ -59,6 +60,8 @@ if TYPE_CHECKING:
 NO_FIT = total_fit([])
 _LINES_A_SCENARIO = 8
 _ALL_LISTED = "(--all lists all)"
+_UNFINISHED = "*.zip.[cdp]*[dlt]"
+"""Names while a download is running: with `.part`, `.partial`, `.download` or `.crdownload` at their end."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -71,6 +74,7 @@ class ScenarioCheck:
         samples: agents times frames.
         files: how many are here and missing.
         velocity: what the labels' velocities fit.
+        hashes: of the files, as of `tables.scan.content_hashes`; empty if they cannot be read.
     """
 
     token: str
@@ -78,6 +82,7 @@ class ScenarioCheck:
     samples: int
     files: tuple[FileCount, ...]
     velocity: VelocityFit = NO_FIT
+    hashes: str = ""
 
     def to_json(self) -> str:
         """One JSON object, from which `of_json` makes an equal one."""
@@ -86,41 +91,14 @@ class ScenarioCheck:
     @classmethod
     def of_json(cls, text: bytes) -> ScenarioCheck:
         """The check that `to_json` wrote."""
-        stored = json.loads(text)  # names of files may have half characters
-        return cls(
-            token=stored["token"],
-            findings=tuple(Finding(**each) for each in stored["findings"]),
-            samples=stored["samples"],
-            files=tuple(FileCount(**each) for each in stored["files"]),
-            velocity=VelocityFit(**stored["velocity"]),
-        )
+        return as_record(json.loads(text), cls)  # names of files may have half characters
 
 
 def check_key(scenario: ScenarioFolder, *, deep: bool) -> str:
     """A digest of all that decides a scenario's check: the devkit, settings, names, sizes and times of its files."""
     settings = (__version__, deep, str(scenario.root), scenario.folder, os.environ.get(LIMITS_VARIABLE))
-    digest = hashlib.blake2b(f"{settings} {times_digest(scenario)}".encode(), digest_size=8)
-    for agent in AGENTS:
-        for channel in CHANNELS:
-            for words in (f"{agent}/{channel}", *_entries(scenario.kind_folder(agent, channel))):
-                digest.update(os.fsencode(f"{words}\n"))
-    return digest.hexdigest()
-
-
-def _entries(folder: ReleasePath) -> list[str]:
-    """Name, size and time of everything in a folder; nothing if it cannot be listed."""
-    try:
-        return sorted(f"{entry.name} {_times(entry)}" for entry in listed(folder))
-    except OSError:
-        return []
-
-
-def _times(entry: Entry) -> str:
-    try:
-        status = entry.stat()
-    except OSError:  # a link that leads nowhere
-        return "none"
-    return f"{status.st_size} {status.st_mtime_ns}"
+    times = times_digest(scenario, (*ENDINGS, *CHANNELS), ctime=False)
+    return hashlib.blake2b(f"{settings} {times}".encode(), digest_size=8).hexdigest()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -254,7 +232,7 @@ def validate_release(
     parts: Path | None = None,
     **how: Unpack[Engine],
 ) -> ValidationReport:
-    """Look for everything that is wrong, odd or missing in a release; needs no index.
+    """Look for everything that is wrong, odd or missing in a release; needs no index, and says if one is out of date.
 
     Args:
         root: the release, as of `DeepAccident`: a folder, archives, or a URL.
@@ -272,7 +250,7 @@ def validate_release(
         TokenError: one of `scenarios` is not there.
         ConfigError: `parts` cannot be written to.
     """
-    layout = find_release(open_dataroot(root), version)
+    layout = readable_release(root, version)
     folder = None if parts is None else writable_folder(parts)
     store = None if folder is None else Store(folder, folder, "validates scenarios", ConfigError)
     checks = _Work(deep=deep, store=store).run(chosen_scenarios(layout, scenarios), **how)
@@ -331,7 +309,11 @@ def _report(
     tokens = {check.token for check in checks}
     of_release = [finding for finding in of_release if finding.scenario is None or finding.scenario in tokens]
     of_release += _strays(layout) if scenarios is None else ()
-    files = ((check.token, check.files) for check in checks)
+    of_release += _outdated(layout, checks)
+    counts = ((check.token, check.files) for check in checks)
+    files = completeness(readable, counts, str(root), selected=scenarios is not None)
+    for sentence in files.unreadable_archives:
+        of_release.append(finding_of(ReleaseError(sentence), "archive-unreadable", None))
     return ValidationReport(
         dataroot=str(root),
         version=layout.version,
@@ -339,7 +321,7 @@ def _report(
         scenarios=len(checks),
         samples=sum(check.samples for check in checks),
         findings=worst_first([*of_release, *(finding for check in checks for finding in check.findings)]),
-        files=completeness(readable, files, str(root), selected=scenarios is not None),
+        files=files,
         velocity=total_fit([check.velocity for check in checks]),
         velocity_frames={check.token: check.velocity.best for check in checks},
     )
@@ -356,9 +338,7 @@ def findings(dataset: Dataset, scenario: RowArgument, *, deep: bool = False) -> 
     Raises:
         TokenError: the release has no such scenario.
     """
-    token = scenario.get("token") if isinstance(scenario, Mapping) else scenario
-    if not isinstance(token, str):
-        raise TokenError(f"scenario: expected a token or a record with one, found {scenario!r}")
+    token = token_of(scenario)
     report = validate_release(dataset.dataroot, dataset.version, deep=deep, workers=1, scenarios=[token])
     return [finding for finding in report.findings if finding.scenario == token]
 
@@ -395,7 +375,22 @@ def check_scenario(scenario: ScenarioFolder, *, deep: bool = False) -> ScenarioC
         samples=len(scan.agents) * scan.num_frames,
         files=files_of(scenario),
         velocity=velocity,
+        hashes="" if files is None else files.hashes,
     )
+
+
+def _outdated(layout: ReleaseLayout, checks: Sequence[ScenarioCheck]) -> Iterator[Finding]:
+    """Find the scenarios whose files are not those that the index was made from."""
+    index = current_index(layout)
+    if index is None or not index.tables:
+        return
+    with suppress(IndexStoreError):  # a damaged index; opening the release reports it
+        indexed = Tables(index.tables_folder).hashes
+        for check in checks:
+            before = indexed.get(check.token)
+            if check.hashes and before and before.as_dict() != json.loads(check.hashes):
+                what = "its label, calib or meta files have changed since the index was made"
+                yield make_finding("index-outdated", check.token, check.token, what)
 
 
 def _strays(layout: ReleaseLayout) -> Iterator[Finding]:
@@ -407,3 +402,5 @@ def _strays(layout: ReleaseLayout) -> Iterator[Finding]:
             yield make_finding("link-leads-nowhere", None, str(path), "its end is not there, or is a folder above it")
         else:
             yield make_finding("folder-left-aside", None, str(path), f"is not read; it looks like {meant}")
+    for path in Path(layout.root.store.place).rglob(_UNFINISHED) if isinstance(layout.root, StorePath) else ():
+        yield make_finding("archive-unfinished", None, str(path), "is not read; it looks like half a download")

@@ -355,6 +355,7 @@ def evaluate_results(
             the meta that the task needs, or samples cannot be evaluated.
         ChoiceError: no such split.
         NotAvailableError: the release has no such samples.
+        IndexStoreError: files of these scenarios have changed since the index was made.
         WorkerError: a worker was killed, or cannot do the work.
     """
     chosen = selection if isinstance(selection, SampleSelection) else default_selection(setup, selection)

@@ -32,7 +32,7 @@ from deepaccident_devkit.evaluation.warning.evaluator import WARNING
 from deepaccident_devkit.motion import LABEL_PROTOCOLS, MotionLabels, samples
 from deepaccident_devkit.motion.sample_labels import no_samples_text
 from deepaccident_devkit.parallel import Places, Store, unfinished_folder
-from deepaccident_devkit.release.fingerprints import digest_of
+from deepaccident_devkit.release.fingerprints import INDEX_REMEDY, digest_of
 from deepaccident_devkit.support.arrays import ShortRepr
 from deepaccident_devkit.support.files import remove_in
 from deepaccident_devkit.support.text import choice, path_of, settle_choices, spelled
@@ -237,7 +237,8 @@ def check_recordings(results: Results, dataset: Dataset) -> None:
         raise ResultsError(
             f"{results.path}: are of other recordings than {dataset.dataroot} has ({dataset.version}; results of "
             f"{note.get('version')}) for {len(others)} of {len(here)} scenarios, such as {others[0]}, although "
-            "they have the same names; evaluate with the release that was predicted, or predict this one"
+            "they have the same names; evaluate with the release that was predicted, or predict this one. If files of "
+            f"the release were restored or edited, the index may be out of date: {INDEX_REMEDY}"
         )
 
 

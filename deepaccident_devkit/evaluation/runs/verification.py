@@ -183,11 +183,6 @@ def verify_bundle(
             f"evaluated with {name} {stored}, verified with {now}"
             for name, stored, now in differing(bundle.summary["environment"], run.summary()["environment"])
         ]
-    if any(each.where.startswith(f"{SCENARIOS_FILE}: ") for each in found):
-        notes.append(
-            "numbers are made of the index, which does not see that a file was edited in place; bring it up to date "
-            "with: deepaccident index DATAROOT --check"
-        )
     if bundle.summary.get("sanity") is not None:
         notes.append("the sanity check is not made again")
     return Verification(

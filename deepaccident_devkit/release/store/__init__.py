@@ -1,6 +1,12 @@
 """Where a release's files are read: real folders, zip archives, or URLs. Nothing above `release` knows which."""
 
-from deepaccident_devkit.release.store.opening import INDEX_FOLDER, index_places, list_files_in, open_dataroot
+from deepaccident_devkit.release.store.opening import (
+    INDEX_FOLDER,
+    index_places,
+    list_files_in,
+    open_dataroot,
+    refused_archives,
+)
 from deepaccident_devkit.release.store.paths import (
     REMEDY,
     Dataroot,
@@ -37,4 +43,5 @@ __all__ = [
     "read_content",
     "read_lines",
     "real_path",
+    "refused_archives",
 ]

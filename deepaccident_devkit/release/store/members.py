@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import re
+import zlib
 from bisect import bisect_left
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -30,7 +31,7 @@ SCENARIO_TYPE: Final = re.compile(r"type\d+_subtype\d+_(?:accident|normal)")
 SPLIT_FILES: Final = tuple(f"{split}.txt" for split in (*SPLITS, *MINI_SPLITS))
 _FROM_MACOS: Final = "__MACOSX"
 """The folder that macOS adds to its archives."""
-FORM: Final = 2
+FORM: Final = 3
 """Counts up whenever the file's form or its meaning changes."""
 _HEAD: Final = b"deepaccident_members"
 _NUMBERS: Final = np.dtype(
@@ -114,7 +115,8 @@ class Members:
 
     Attributes:
         archives: their paths from the store's base.
-        states: of those of them at a URL whose changes must be noticed, bytes and a text that changes with them.
+        states: of all archives that were there, bytes and a text that changes with them.
+        lacking: those that could not be listed.
     """
 
     def __init__(self, path: Path) -> None:
@@ -132,6 +134,7 @@ class Members:
             _, offsets, content = names.buffers()
             self.archives: tuple[str, ...] = tuple(map(str, head["archives"]))
             self.states = {str(name): (int(size), str(text)) for name, (size, text) in head["states"].items()}
+            self.lacking = [archive for archive in self.states if archive not in self.archives]
             self._rows = {str(folder): (int(first), int(last)) for folder, first, last in head["folders"]}
             self._starts = np.frombuffer(offsets, np.int64) if offsets else np.zeros(1, np.int64)
             self._content = memoryview(content) if content else memoryview(b"")
@@ -174,6 +177,11 @@ class Members:
         low, high = self._rows.get(folder, (0, 0))
         return [(self._name(row).decode(errors="surrogateescape"), self._member(row)) for row in range(low, high)]
 
+    def number_of(self, member: Member) -> int:
+        """Return a number that changes with a file, and with the archive that it is in."""
+        state = self.states.get(self.archives[member.archive])
+        return member.version << 32 | zlib.crc32(repr(state).encode())
+
     def _name(self, row: int) -> bytes:
         return bytes(self._content[self._starts.item(row) : self._starts.item(row + 1)])
 
@@ -191,7 +199,7 @@ class Members:
 
 
 def write_members(path: Path, listings: Sequence[Listing], states: Mapping[str, tuple[int, str]]) -> None:
-    """Write the list of some archives' files; raises DatarootError for a file that is in it twice."""
+    """Write the list of some archives' files, as `Members` has it; raises DatarootError for a file that is twice."""
     import pyarrow as pa
 
     folders = sorted({folder for listing in listings for folder in listing.folders})

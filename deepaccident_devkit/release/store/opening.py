@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
 import os
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 from urllib.parse import unquote, urlsplit
@@ -34,11 +36,12 @@ from deepaccident_devkit.release.store.store import opened_store
 from deepaccident_devkit.support.files import is_writable_folder
 from deepaccident_devkit.support.reading import fault_text, open_file
 from deepaccident_devkit.support.text import path_text
+from deepaccident_devkit.taxonomy import OnError
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
-    from deepaccident_devkit.parallel import Engine
+    from deepaccident_devkit.parallel import Engine, Failure
 
 _States: TypeAlias = Mapping[str, tuple[int, str]]
 """File → its bytes, and a text that changes with it."""
@@ -48,6 +51,10 @@ _DEEPEST: Final = 3
 """Folders below a dataroot in which archives are looked for."""
 _LIST: Final = "files-"
 """How the name of a list of a store's files begins."""
+_WITHOUT_THEM: Final = (
+    "\nThe others can be read without them: move them out of the folder, or pass on_error='skip' (--on-error skip)."
+)
+_logger = logging.getLogger(__name__)
 
 
 def open_dataroot(
@@ -56,25 +63,28 @@ def open_dataroot(
     *,
     refresh: bool = False,
     outside: bool = False,
+    on_error: OnError = "raise",
     **how: Unpack[Engine],
 ) -> ReleasePath:
     """Where the files of a release are read.
 
     A folder that holds a release is read as it is. Of a zip, a folder of zips and a URL, the files are listed once,
-    beside the index; archives are listed again when their size or time changes, a URL's files when `refresh` is set.
+    beside the index; archives are listed again when they change or are replaced, a URL's files when `refresh` is set.
 
     Args:
         dataroot: a folder, a zip, a folder with zips (of any part of a release each), or a URL that fsspec can list.
         index_dir: where lists and indexes are kept; by default in the dataroot, or in the user's cache.
         refresh: list the files of a URL again.
         outside: keep a new list in the user's cache, not beside the archives.
+        on_error: what to do if archives cannot be listed: `raise` names all of them, `skip` leaves them out and logs
+            them, even if no other archive is there.
         **how: `workers`, `executor` and `progress`, as `parallel.Engine` says; for the lists of archives.
 
     Returns:
         The folder's absolute path, which need not be there; or the release's folder in a store.
 
     Raises:
-        DatarootError: an archive cannot be read, two hold the same file, or the URL cannot be listed.
+        DatarootError: archives cannot be read, two hold the same file, or the URL cannot be listed.
         IndexStoreError: the list cannot be kept or read.
         MissingExtraError: the URL needs fsspec, or one of its file systems.
     """
@@ -87,9 +97,15 @@ def open_dataroot(
     if outside:
         places.reverse()
     if isinstance(located, str):
-        return _opened_url(UrlSource(located), places, refresh=refresh)
+        return _opened_url(UrlSource(located), places, on_error, refresh=refresh)
     archives = _archives(located)
-    return _opened_archives(located, archives, places, **how) if archives else located
+    return _opened_archives(located, archives, places, on_error, **how) if archives else located
+
+
+def refused_archives(root: ReleasePath) -> list[str]:
+    """Return a sentence for each archive that was left out of a store: which one, what is wrong with it, a remedy."""
+    results = [] if isinstance(root, Path) else _listings(root.store.base, root.store.members.lacking)
+    return [result.message for result in results if not isinstance(result, Listing)]
 
 
 def index_places(dataroot: Dataroot, index_dir: Path | None = None) -> Iterator[Path]:
@@ -149,61 +165,89 @@ def _has_scenarios(folder: Path) -> bool:
     return False
 
 
-def _opened_archives(path: Path, archives: Sequence[Path], places: Sequence[Path], **how: Unpack[Engine]) -> StorePath:
+def _opened_archives(
+    path: Path, archives: Sequence[Path], places: Sequence[Path], on_error: OnError, **how: Unpack[Engine]
+) -> StorePath:
     base = path.parent if archives == [path] else path
     split_files = (path / below / name for below in ("", SPLIT_FILE_FOLDER) for name in SPLIT_FILES)
-    files = [*archives, *filter(Path.is_file, split_files)]
-    states = {file.relative_to(base).as_posix(): state_of(file) for file in files}
-    name = list_name(sorted(states.items()))
+    states, beside = _states(base, archives), _states(base, filter(Path.is_file, split_files))
+    found = sorted({**states, **beside}.items())
+    name = list_name(found)
     for known in (place / name for place in places if (place / name).is_file()):
         with suppress(IndexStoreError):  # a damaged list is made again
             return StorePath(opened_store(str(path), str(base), known))
-    jobs = [(str(archive), archive.relative_to(base).as_posix()) for archive in archives]
-    from deepaccident_devkit.parallel import Places, run_batch  # here: few dataroots are archives
+    listings = _accepted(str(path), _listings(str(base), states, (base,), **how), on_error)
+    written = _written(places, found, _with_loose(listings, beside), states)
+    return StorePath(opened_store(str(path), str(base), written))
 
-    listings = run_batch(_listed_archive, jobs, label="listing archives", places=Places(reads=(base,)), **how)
-    beside = {file: state for file, state in states.items() if _is_split(file)}
-    known = _written(places, name, _with_loose(listings, beside))
-    return StorePath(opened_store(str(path), str(base), known))
+
+def _states(base: Path, files: Iterable[Path]) -> _States:
+    return {file.relative_to(base).as_posix(): state_of(file) for file in files}
 
 
 def state_of(file: Path) -> tuple[int, str]:
-    """A file's bytes, and a text that changes with it."""
+    """A file's bytes, and a text that changes with it, also if its time is put back."""
     status = file.stat()
-    return status.st_size, str(status.st_mtime_ns)
+    return status.st_size, f"{status.st_mtime_ns} {status.st_ctime_ns}"
 
 
-def _listed_archive(job: tuple[str, str]) -> Listing:
-    path, name = job
-    try:
-        with open_file(Path(path)) as file:
-            return list_zip(file, name, path, os.fstat(file.fileno()).st_size)
-    except OSError as error:
-        if isinstance(error, DatarootError):
-            raise
-        raise DatarootError(f"{path}: {fault_text(error)}; make it readable, or fetch it again") from error
-
-
-def _opened_url(source: UrlSource, places: Sequence[Path], *, refresh: bool) -> StorePath:
+def _opened_url(source: UrlSource, places: Sequence[Path], on_error: OnError, *, refresh: bool) -> StorePath:
     url = source.url
     base = UrlSource(url.rpartition("/")[0]) if url.lower().endswith(_ENDING) else source
     with _told(url):
         known = None if refresh else _known_list(base, places)
         if known is None:
             archives, others = _files_at(base, url)
-            listings = [_listed_at(base, archive, size) for archive, (size, _) in archives.items()]
+            listings = _accepted(url, _listings(base.url, archives, workers=1), on_error)
             listings = _with_loose(listings, others)
-            if not any(listing.names for listing in listings):
+            if on_error == "raise" and not any(listing.names for listing in listings):
                 raise DatarootError(f"{url}: no file of a release found; give the URL that the release lies below")
-            known = _written(places, list_name([*archives.items(), *others.items()]), listings, archives)
+            known = _written(places, [*archives.items(), *others.items()], listings, archives)
     return StorePath(opened_store(url, base.url, known))
 
 
+def _listings(
+    base: str, archives: Iterable[str], places: tuple[Path, ...] = (), **how: Unpack[Engine]
+) -> list[Listing | Failure]:
+    """List archives by their paths from the base, a folder or a URL; a Failure says why one cannot be listed."""
+    from deepaccident_devkit.parallel import Places, Tried, run_batch  # here: few dataroots are archives
+
+    work = Tried(partial(_listing_of, base))
+    return run_batch(work, list(archives), label="listing archives", places=Places(reads=places), **how)
+
+
+def _listing_of(base: str, name: str) -> Listing:
+    shown = f"{base}/{name}"
+
+    def listing() -> Listing:
+        with UrlSource(base).opened(name) if "://" in base else open_file(Path(shown)) as file:
+            return list_zip(file, name, shown)
+
+    try:
+        return asked(listing)
+    except OSError as error:
+        if isinstance(error, DatarootError):
+            raise
+        raise DatarootError(f"{shown}: {fault_text(error)}; make it readable, or fetch it again") from error
+
+
+def _accepted(place: str, results: Sequence[Listing | Failure], on_error: OnError) -> list[Listing]:
+    """Return the listings of archives; those that cannot be listed are logged, or DatarootError names all of them."""
+    refused = [result.message for result in results if not isinstance(result, Listing)]
+    text = "\n  ".join([f"{place}: {len(refused)} of {len(results)} archives cannot be read:", *refused])
+    if refused and on_error == "raise":
+        raise DatarootError(text + _WITHOUT_THEM * (len(refused) < len(results)))
+    if refused:
+        _logger.warning("left out: %s", text)
+    return [result for result in results if isinstance(result, Listing)]
+
+
 def _known_list(base: UrlSource, places: Sequence[Path]) -> Path | None:
-    """The list of a URL's files that was made before, if its archives have not changed since; others are not asked."""
+    """The list of all of a URL's files, if its archives have not changed since; others are not asked."""
     for path in (path for place in places for path in list_files_in(place)):
         with suppress(IndexStoreError):
-            if all(base.state_of(archive) == state for archive, state in Members(path).states.items()):
+            members = Members(path)
+            if not members.lacking and all(base.state_of(name) == state for name, state in members.states.items()):
                 return path
     return None
 
@@ -223,14 +267,6 @@ def _files_at(base: UrlSource, url: str) -> tuple[_States, _States]:
     return archives, {name: state for name, state in files.items() if _is_split(name)}
 
 
-def _listed_at(base: UrlSource, archive: str, size: int) -> Listing:
-    def listing() -> Listing:
-        with base.opened(archive) as file:
-            return list_zip(file, archive, f"{base.url}/{archive}", size)
-
-    return asked(listing)
-
-
 def _is_split(path: str) -> bool:
     """Whether a file beside archives is a split file, by its path from the place."""
     folder, _, name = path.rpartition("/")
@@ -244,8 +280,8 @@ def _with_loose(listings: Sequence[Listing], files: _States) -> list[Listing]:
 
 
 def _loose(files: _States) -> list[Listing]:
-    """Files that are in no archive, a listing for each folder."""
-    folders: dict[str, list[str]] = {}
+    """Files that are in no archive, a listing for each folder; for the place itself also if it has none."""
+    folders: dict[str, list[str]] = {"": []}
     for path in files:
         folders.setdefault(path.rpartition("/")[0], []).append(path)
     listings = []
@@ -276,17 +312,21 @@ def list_name(states: Sequence[Any]) -> str:
 
 def _written(
     places: Sequence[Path],
-    name: str,
+    found: Sequence[Any],
     listings: Sequence[Listing],
-    states: _States | None = None,
+    states: _States,
 ) -> Path:
-    """Write the list of a store's files into the first place that can be written, and remove older ones there."""
+    """Write the list of a store's files into the first place that can be written, and remove older ones there.
+
+    Its name is that of what was found, unless archives could not be listed: these are looked at each time.
+    """
+    name = list_name([*found, *sorted(states.keys() - {listing.archive for listing in listings})])
     place = next((place for place in places if is_writable_folder(place)), None)
     if place is None:
         told = " or ".join(map(str, places))
         raise IndexStoreError(f"{told}: no place to write the index; give a writable folder with index_dir=")
     try:
-        write_members(place / name, listings, states or {})
+        write_members(place / name, listings, states)
         for path in list_files_in(place):
             if path.name != name:
                 path.unlink(missing_ok=True)

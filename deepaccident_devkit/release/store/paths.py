@@ -25,7 +25,7 @@ class StoreStatus:
     st_mode: int
     st_size: int
     st_mtime_ns: int
-    """A number that changes with the file."""
+    """A number that changes with the file, and with its archive."""
 
 
 @total_ordering
@@ -95,9 +95,10 @@ class StorePath:
 
     def stat(self) -> StoreStatus:
         """Size and kind; raises FileNotFoundError."""
-        member = self.store.members.find(self.inside)
+        members = self.store.members
+        member = members.find(self.inside)
         if member is not None:
-            return StoreStatus(stat.S_IFREG, member.size, member.version)
+            return StoreStatus(stat.S_IFREG, member.size, members.number_of(member))
         if self.is_dir():
             return StoreStatus(stat.S_IFDIR, 0, 0)
         raise FileNotFoundError(str(self))
@@ -182,7 +183,7 @@ def listed(folder: ReleasePath) -> list[Entry]:
         raise FileNotFoundError(str(folder))
     folders = [StoreEntry(name, StoreStatus(stat.S_IFDIR, 0, 0)) for name in members.folders_in(folder.inside)]
     files = [
-        StoreEntry(name, StoreStatus(stat.S_IFREG, member.size, member.version))
+        StoreEntry(name, StoreStatus(stat.S_IFREG, member.size, members.number_of(member)))
         for name, member in members.files_in(folder.inside)
     ]
     return [*folders, *files]

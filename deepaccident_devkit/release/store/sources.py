@@ -212,12 +212,13 @@ def source_of(base: str) -> Source:
     return UrlSource(base) if "://" in base else LocalSource(Path(base))
 
 
-def list_zip(file: BinaryIO, archive: str, shown: str, size: int) -> Listing:
-    """The files of a release in an archive of `size` bytes, which errors show as `shown`; only its directory is read.
+def list_zip(file: BinaryIO, archive: str, shown: str) -> Listing:
+    """The files of a release in an archive, which errors show as `shown`; only its directory is read.
 
     `archive` is its path from the store's place: the folders on it and its name without `.zip` count as folders that
     lead to the members. Raises DatarootError, also for a member that is encrypted or compressed by an unknown method.
     """
+    size = file.seek(0, os.SEEK_END)
     try:
         check_end(file, limit_of("archive"))
         with zipfile.ZipFile(file) as opened:
@@ -227,7 +228,7 @@ def list_zip(file: BinaryIO, archive: str, shown: str, size: int) -> Listing:
         raise DatarootError(f"{shown}: {fault_text(error)}{sound}") from error
     except DAMAGED_ARCHIVE as error:
         told = shortened(fault_text(error), MOST_TOLD)
-        raise DatarootError(f"{shown}: not a readable zip archive ({told}); {_REMEDY}") from error
+        raise DatarootError(f"{shown}: not a readable zip archive ({told}; {size:,} bytes); {_REMEDY}") from error
     leading = PurePosixPath(archive).with_suffix("").parts
     folder_of: dict[str, str | None] = {}
     number_of: dict[str, int] = {}

@@ -209,7 +209,7 @@ class Store:
         return member
 
     def _kept(self, name: str, member: Member) -> Path:
-        path = self._cache.path_of(f"{self.place}\n{name}\n{member.size} {member.version}", name.rpartition("/")[2])
+        path = self._cache.path_of(f"{self.place}\n{name}\n{self.members.number_of(member)}", name.rpartition("/")[2])
         if not self._cache.found(path, member.size):
             self._cache.put(path, self._bytes(name, member))
         return path

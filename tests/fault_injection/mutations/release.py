@@ -1,10 +1,15 @@
 """Splits, folders, and what a partial release lacks."""
 
+import os
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
+from deepaccident_devkit.release import find_release
+from deepaccident_devkit.tables import open_index
+from deepaccident_devkit.tables.scan import folder_digest
 from deepaccident_devkit.taxonomy import BEV_CAMERA, CHANNELS
 from fault_injection.kinds import Group
 from fault_injection.place import ENDINGS, Place
@@ -81,8 +86,30 @@ def _move_split_files(place: Place, rng: np.random.Generator) -> None:
         place.remove(path)
 
 
+def _rename(place: Place, rng: np.random.Generator) -> None:
+    odd = os.fsdecode(rng.choice([b"\xff\xfe", b"\xe4\xf6", b"\xc3", b"\xed\xb3\xbf"]))
+    for path in _files(place):
+        name = str(path.relative_to(place.root)).replace(place.scenario.name, odd)
+        place.write(place.root / name, path.read_bytes())
+        place.remove(path)
+
+
+def _index_of_others(place: Place, rng: np.random.Generator) -> None:
+    """Leave an index that takes a label for the one that it was made from, as if this was written in place."""
+    index = open_index(find_release(place.root))
+    path = place.file(place.any_agent(rng), "label", place.any_frame(rng))
+    place.write(path, path.read_bytes() + b"\n")
+    layout = find_release(place.root)
+    replace(index, fingerprint=folder_digest(layout.scenarios, layout.split_files.values())).write()
+
+
 GROUP.add(
     {
+        "name_not_utf8": ("The scenario's name is not UTF-8.", _rename),
+        "index_of_other_files": (
+            "A label was written in place, in a way that does no harm, after the index was made.",
+            _index_of_others,
+        ),
         "scenario_in_two_splits": (
             "A second split file lists the scenario.",
             lambda place, rng: _append(place, str(rng.choice(["val.txt", "test.txt"])), _line(place)),

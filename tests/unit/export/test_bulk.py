@@ -33,6 +33,7 @@ from deepaccident_devkit.errors import (
     ChoiceError,
     ConfigError,
     ExportError,
+    IndexStoreError,
     MissingFileError,
     NotAvailableError,
     SensorFileError,
@@ -49,8 +50,10 @@ from deepaccident_devkit.export.parquet import Parquet
 from deepaccident_devkit.export.questions import Questions
 from deepaccident_devkit.export.released_infos import ReleasedInfos
 from deepaccident_devkit.export.webdataset import WebDataset
+from deepaccident_devkit.release import find_release
 from deepaccident_devkit.release.fingerprints import fingerprint, scenario_hashes
 from deepaccident_devkit.support.files import temporary_of, temporary_path
+from deepaccident_devkit.tables import current_index
 from deepaccident_devkit.taxonomy import AGENTS
 
 SCENARIOS, PICTURES = 3, 18
@@ -110,10 +113,12 @@ def whole(small: DeepAccident, tmp_path_factory: pytest.TempPathFactory) -> Cont
 
 
 def edit_label(root: Path, token: str) -> None:
-    """Take the last box out of a label file, in place."""
+    """Put a label file without its last box in the place of one."""
     scenario_type, name = token.split("/")
     path = root / scenario_type / "ego_vehicle" / "label" / name / f"{name}_002.txt"
-    path.write_text("\n".join(path.read_text().splitlines()[:-1]) + "\n")
+    edited = path.with_name("edited")
+    edited.write_text("\n".join(path.read_text().splitlines()[:-1]) + "\n")
+    edited.replace(path)
 
 
 def remove_scenario(root: Path, token: str) -> None:
@@ -296,6 +301,16 @@ class TestRelease:
         assert_refused(*[(lambda: written(reopened(changing), out), ExportError, sentence)] * 2)
         assert states(out) == before
 
+    def test_files_that_the_index_was_not_made_from_are_refused(self, changing: Path, tmp_path: Path) -> None:
+        """What is written comes from the index, and the hashes beside it would be of other files."""
+        dataset = reopened(changing)
+        token = dataset.scenario[1]["token"]
+        label = next(changing.glob(f"{token.replace('/', '/ego_vehicle/label/')}/*_002.txt"))
+        label.write_text(label.read_text() + "\n")
+        named = ("the index is out of date", token, "deepaccident index DATAROOT --check")
+        assert_refused((lambda: written(dataset, tmp_path / "out"), IndexStoreError, named))
+        assert not (tmp_path / "out").exists()
+
     @pytest.mark.parametrize("grows", [True, False])
     def test_a_complete_export_of_another_split_file_is_refused(
         self, small: DeepAccident, tmp_path: Path, grows: bool
@@ -338,6 +353,12 @@ class TestRelease:
         kept = {name for name, state in states(out).items() if before.get(name) == state and name.endswith(".txt")}
         assert len(kept) >= (units - 1) * 4
         assert written(reopened(changing), out).written == 0
+
+    def test_links_to_its_files_leave_the_index_as_it_is(self, changing: Path, tmp_path: Path) -> None:
+        """A link changes a file's ctime."""
+        done = written(reopened(changing), tmp_path / "out")
+        assert done.tally.linked
+        assert current_index(find_release(changing)) is not None
 
     def test_sensor_files_that_a_format_does_not_need_change_nothing(self, changing: Path, tmp_path: Path) -> None:
         form = TinyFormat(agents=("other_vehicle",))

@@ -130,6 +130,7 @@ def test_another_release_and_agents_without_images_are_refused(
     kind, name = scenario.split("/")
     label = next((tmp_path / "edited" / kind / "ego_vehicle" / "label" / name).glob("*_002.txt"))
     label.write_text(label.read_text() + "\n")
+    edited = DeepAccident("v1", tmp_path / "edited", index_dir=tmp_path / "anew", verbose=False)
     changed = partial(cache.check_release, edited, [f"{scenario}/ego_vehicle"])
     assert_refused(
         (changed, ConfigError, ("another release", f"another state of {scenario}", "make a cache")),

@@ -6,10 +6,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.errors import ReleaseError
-from deepaccident_devkit.release import find_release
+from deepaccident_devkit.errors import IndexStoreError, ReleaseError
+from deepaccident_devkit.release import ScenarioFolder, find_release
 from deepaccident_devkit.release.fingerprints import (
     ScenarioHashes,
     digest_of,
@@ -30,31 +31,42 @@ def scenario(da_b: DeepAccident) -> str:
     return min(da_b.split_scenarios("train"))
 
 
+def folder_of(root: Path, scenario: str) -> ScenarioFolder:
+    return next(folder for folder in find_release(root).scenarios if folder.token == scenario)
+
+
 @pytest.mark.parametrize(
     ("kind", "pattern"),
     [("label", "ego_vehicle/label/*/*.txt"), ("calib", "ego_vehicle/calib/*/*.pkl"), ("meta", "meta/*.txt")],
 )
-def test_one_file_changes_one_hash(own_release: Path, scenario: str, kind: str, pattern: str) -> None:
+def test_one_file_changes_one_hash_and_the_index_is_refused(
+    own_release: Path, scenario: str, kind: str, pattern: str
+) -> None:
+    """Hashes are of the files that the index was made from: of others there are none."""
     opened = DeepAccident(dataroot=own_release, verbose=False)
-    before = scenario_hashes(opened, [scenario])[scenario].as_dict()
+    before = scenario_hashes(opened, [scenario])[scenario]
+    assert opened.indexed_hashes(scenario) == before == folder_hashes(folder_of(own_release, scenario))
     path = min(own_release.glob(f"train/*_accident/{pattern}"))
     path.write_bytes(path.read_bytes()[:-1] + b" ")
-    changed = scenario_hashes(opened, [scenario])[scenario].as_dict()
-    assert [name for name, value in before.items() if changed[name] != value] == [kind]
+    changed = folder_hashes(folder_of(own_release, scenario)).as_dict()
+    assert [name for name, value in before.as_dict().items() if changed[name] != value] == [kind]
+    named = (str(own_release), "the index is out of date", scenario, "deepaccident index DATAROOT --check")
+    assert_refused((lambda: scenario_hashes(opened, [scenario]), IndexStoreError, named))
+    others = opened.split_scenarios("val")
+    assert list(scenario_hashes(opened, others)) == sorted(others)
 
 
 def test_bytes_that_move_to_the_next_file_are_a_change(own_release: Path, scenario: str) -> None:
-    opened = DeepAccident(dataroot=own_release, verbose=False)
-    before = scenario_hashes(opened, [scenario])[scenario]
+    before = folder_hashes(folder_of(own_release, scenario))
     one, other = sorted(first(own_release, "label", "txt").parent.iterdir())[:2]
     joined = one.read_bytes() + other.read_bytes()
     one.write_bytes(joined[:10])
     other.write_bytes(joined[10:])
-    assert scenario_hashes(opened, [scenario])[scenario].label != before.label
+    assert folder_hashes(folder_of(own_release, scenario)).label != before.label
 
 
 def test_files_of_other_kinds_are_not_read(own_release: Path, scenario: str) -> None:
-    folder = next(each for each in find_release(own_release).scenarios if each.token == scenario)
+    folder = folder_of(own_release, scenario)
     whole = folder_hashes(folder)
     shutil.rmtree(folder.kind_folder("ego_vehicle", "calib"))
     assert folder_hashes(folder, ["label"]) == ScenarioHashes(label=whole.label, meta=None, calib=None)
@@ -73,9 +85,9 @@ def test_a_file_that_cannot_be_read_is_named(own_release: Path, scenario: str) -
 
 
 def test_no_meta_and_no_such_scenario(own_release: Path, scenario: str) -> None:
-    opened = DeepAccident(dataroot=own_release, verbose=False)
     for meta in own_release.glob("train/*/meta/*.txt"):
         meta.unlink()
+    opened = DeepAccident(dataroot=own_release, verbose=False)
     found = scenario_hashes(opened, [scenario, "type1_subtype1_accident/gone"])
     assert list(found) == [scenario]
     assert found[scenario].meta is None

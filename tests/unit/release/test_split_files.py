@@ -1,3 +1,4 @@
+import os
 from pathlib import Path
 
 import pytest
@@ -58,6 +59,11 @@ def test_binary_garbage_and_a_missing_file(path: Path) -> None:
             ("binary.txt: not a text file", "restore it from the release"),
         ),
     )
+
+
+def test_a_name_that_is_no_utf8_hides_no_other(path: Path) -> None:
+    path.write_bytes(f"{TYPE} {NAME}\n".encode() + b"type1_subtype1_accident \xff\xfe\n")
+    assert read_split_file(path) == [f"{TYPE}/{NAME}", f"type1_subtype1_accident/{os.fsdecode(bytes([255, 254]))}"]
 
 
 @pytest.mark.parametrize(

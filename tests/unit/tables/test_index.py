@@ -30,10 +30,13 @@ from deepaccident_devkit.errors import (
     VersionError,
 )
 from deepaccident_devkit.overview import overview
+from deepaccident_devkit.release import find_release
+from deepaccident_devkit.release.fingerprints import folder_hashes
 from deepaccident_devkit.support import files
 from deepaccident_devkit.tables import clear_index, indexing
 from deepaccident_devkit.tables import index as index_module
 from deepaccident_devkit.tables.index import MANIFEST_FILE, SCHEMA_VERSION
+from deepaccident_devkit.validation import validate_release
 
 
 def calib(root: Path, agent: str = "ego_vehicle", frame: int = 2) -> Path:
@@ -314,6 +317,28 @@ def test_a_path_that_is_no_utf8_is_refused(tmp_path: Path) -> None:
     odd = Path(os.fsdecode(os.fsencode(tmp_path) + b"/\xff"))
     odd.mkdir()
     assert_refused((lambda: opened(odd), DatarootError, "is not UTF-8"))
+
+
+def test_a_scenario_whose_name_is_no_utf8_is_broken_and_hides_no_other(root: Path) -> None:
+    """Its folders, and its line in a split file; the system gives such names, and Arrow has none."""
+    odd = os.fsdecode(b"Town03_type001_subtype0001_\xff\xfe")
+    tiny.write_tiny_release(root, name=odd)
+    (root / "train.txt").write_bytes(os.fsencode(f"{tiny.TOKEN}\n{tiny.TYPE}/{odd}\n".replace("/", " ")))
+    named = ("1 of 3 scenarios are broken", r"Town03_type001_subtype0001_\udcff\udcfe", "not UTF-8; rename its folders")
+    assert_refused((lambda: opened(root), BrokenReleaseError, named))
+    release = opened(root, on_error="skip")
+    assert [scenario["name"] for scenario in release.scenario] == [tiny.NAME, OTHER]
+    assert release.split_scenarios("train") == {tiny.TOKEN}
+    assert r"\udcff\udcfe" in overview(release).to_json()
+    for _ in range(2):  # looked at, and kept
+        report = validate_release(root, workers=1, parts=root.parent / "parts")
+        (finding,) = [finding for finding in report.findings if finding.code == "odd-name"]
+        assert (finding.severity, finding.scenario) == ("error", f"{tiny.TYPE}/{odd}")
+    assert len(folder_hashes(find_release(root).scenarios[2]).as_dict()) == 3
+    for path in sorted(root.rglob("*"), key=str, reverse=True):  # the remedy
+        if odd in path.name:
+            path.rename(path.with_name(path.name.replace(odd, THIRD)))
+    assert len(opened(root).scenario) == 3
 
 
 def test_an_open_release_outlives_a_new_index(root: Path) -> None:

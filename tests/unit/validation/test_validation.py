@@ -130,13 +130,13 @@ def test_velocities_in_another_frame_are_told_and_decoded(
     own_release: Path, name: str, angle: Callable[[float, float], float]
 ) -> None:
     truth = write_velocities(own_release, angle)
+    shutil.rmtree(own_release / ".deepaccident")
     report = validate_release(own_release)
     told = {(finding.code, finding.severity, finding.known) for finding in report.findings}
     assert (report.velocity.best, told) == (
         name,
         {("velocity-frame", "warning", False)} if name != "released" else set(),
     )
-    shutil.rmtree(own_release / ".deepaccident")
     release = DeepAccident(dataroot=own_release, verbose=False)
     frames = {scenario["token"]: scenario["velocity_frame"] for scenario in release.scenario}
     assert frames == report.velocity_frames == dict.fromkeys(frames, name)

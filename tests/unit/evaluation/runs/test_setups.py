@@ -323,7 +323,13 @@ def test_other_recordings_of_the_same_names_are_refused(da_b: DeepAccident, own_
     label = min(own_release.rglob(f"ego_vehicle/label/{da_b.scenario[0]['name']}/*_002.txt"))
     label.write_text("".join(label.read_text().splitlines(keepends=True)[:-1]))  # one box fewer
     other = DeepAccident("v1", own_release, verbose=False)
-    assert_refused((lambda: check_recordings(results, other), ResultsError, (str(results.path), "1 of 6", first)))
+    assert_refused(
+        (
+            lambda: check_recordings(results, other),
+            ResultsError,
+            (str(results.path), "1 of 6", first, "index DATAROOT --check"),
+        )
+    )
     check_recordings(results_of(da_b, tmp_path / "second.json", release_note(da_b, [second])), other)
 
 

@@ -1,16 +1,22 @@
 """Archives and URLs that cannot be read: the devkit's own errors, which name the archive and the remedy."""
 
+import json
+import os
 import shutil
 import struct
 import zipfile
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import BinaryIO
 
 import fsspec
 import pytest
 import tiny
 from packing import packed
 from refusals import assert_refused
+from tiny_index import OTHER
+from verbs import called
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import (
@@ -21,10 +27,11 @@ from deepaccident_devkit.errors import (
     NotAvailableError,
     SensorFileError,
 )
-from deepaccident_devkit.release.store import open_dataroot, real_path
+from deepaccident_devkit.release.store import open_dataroot, opening, real_path
 from deepaccident_devkit.release.store.members import Members
 from deepaccident_devkit.release.store.store import opened_store
-from deepaccident_devkit.validation import validate_release
+from deepaccident_devkit.support.reading import open_file
+from deepaccident_devkit.validation import release_completeness, validate_release
 
 _NAME = "type1_subtype1_accident/ego_vehicle/calib/a/a_001.pkl"
 
@@ -54,6 +61,141 @@ def test_a_truncated_archive_is_refused(small: Path, tmp_path: Path) -> None:
     named = ("small.zip: not a readable zip archive", "fetch the archive again")
     assert_refused((lambda: _opened(small, tmp_path), DatarootError, named))
     assert not [*tmp_path.glob("index/*")]
+
+
+BAD: dict[str, tuple[Callable[[bytes], bytes], str]] = {
+    "cut off": (lambda whole: whole[: len(whole) // 2], "its end is missing"),
+    "empty": (lambda _: b"", "the file is empty"),
+    "a web page": (lambda _: b"\n<!DOCTYPE html><html>Sign in</html>", "a web page"),
+    "without a directory": (lambda whole: whole.replace(b"PK\x01\x02", b"PK\x01\x00"), "directory"),
+    "zeros": (lambda whole: bytes(len(whole)), "not a zip archive"),
+}
+
+
+@pytest.fixture
+def zips(tmp_path: Path) -> Path:
+    """A release of two scenarios, a zip each, and bad archives of all kinds in a folder below."""
+    for name in (tiny.NAME, OTHER):
+        root = tiny.write_tiny_release(tmp_path / name, name=name)
+        packed(root, tmp_path / "zips" / f"{name}.zip")
+    whole = (tmp_path / "zips" / f"{OTHER}.zip").read_bytes()
+    (tmp_path / "zips" / "more").mkdir()
+    for name, (damage, _) in BAD.items():
+        (tmp_path / "zips" / "more" / f"{name}.zip").write_bytes(damage(whole))
+    return tmp_path / "zips"
+
+
+def test_all_bad_archives_are_named_at_once_with_the_ways_out(zips: Path) -> None:
+    named = (
+        "5 of 7 archives cannot be read",
+        *(f"more/{name}.zip: " for name in BAD),
+        *(said for _, said in BAD.values()),
+    )
+    ways = ("fetch the archive again", "move them out of the folder", "--on-error skip")
+    assert_refused((lambda: DeepAccident(dataroot=zips, verbose=False), DatarootError, (*named, *ways)))
+    for name in BAD:
+        (zips / "more" / f"{name}.zip").unlink()
+    assert len(DeepAccident(dataroot=zips, verbose=False).scenario) == 2
+
+
+def test_bad_archives_can_be_left_out(zips: Path, caplog: pytest.LogCaptureFixture) -> None:
+    release = DeepAccident(dataroot=zips, on_error="skip", verbose=False)
+    assert len(release.scenario) == 2
+    assert all(f"more/{name}.zip: " in caplog.text for name in BAD)
+    assert_refused((lambda: DeepAccident(dataroot=zips, verbose=False), DatarootError, "5 of 7 archives"))
+    (zips / f"{OTHER}.zip").rename(zips / "more" / "empty.zip")  # now it is whole
+    assert len(DeepAccident(dataroot=zips, on_error="skip", verbose=False).scenario) == 2
+    for name in BAD.keys() - {"empty"}:
+        (zips / "more" / f"{name}.zip").rename(zips.parent / f"{name}.zip")
+    assert release_completeness(zips, workers=1).unreadable_archives == []
+    assert len(DeepAccident(dataroot=zips, verbose=False).scenario) == 2
+
+
+def test_an_archive_that_no_longer_breaks_a_limit_is_read(zips: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing about the file has changed; in the same process, too."""
+    monkeypatch.setenv("DEEPACCIDENT_LIMITS", "archive=100")
+    assert len(release_completeness(zips, workers=1).unreadable_archives) == 7
+    monkeypatch.delenv("DEEPACCIDENT_LIMITS")
+    assert len(release_completeness(zips, workers=1).unreadable_archives) == 5
+
+
+def test_validate_lists_bad_archives_and_goes_on(zips: Path) -> None:
+    (zips / "half.zip.part").write_bytes(b"PK")
+    report = validate_release(zips, workers=1)
+    found = {Path(each.where).name: each for each in report.findings if each.code.startswith("archive-")}
+    assert report.scenarios == 2
+    assert found.keys() == {*(f"{name}.zip" for name in BAD), "half.zip.part"}
+    for name, (_, said) in BAD.items():
+        finding = found[f"{name}.zip"]
+        assert (finding.severity, finding.code, finding.scenario) == ("error", "archive-unreadable", None)
+        assert said in finding.what
+        assert f"{(zips / 'more' / f'{name}.zip').stat().st_size:,} bytes" in finding.what
+        assert finding.remedy == "fetch the archive again"
+    assert (found["half.zip.part"].severity, found["half.zip.part"].code) == ("warning", "archive-unfinished")
+    done = called("validate", zips, "--files", status=1)
+    assert all(f"more/{name}.zip" in done.stdout for name in BAD)
+    assert "2 scenarios here" in done.stdout
+    assert len(json.loads(called("validate", zips, "--files", "--json", status=1).stdout)["unreadable_archives"]) == 5
+
+
+def test_validate_of_bad_archives_alone(zips: Path, caplog: pytest.LogCaptureFixture) -> None:
+    report = validate_release(zips / "more", workers=1)
+    assert (report.scenarios, report.counts["error"]) == (0, 5)
+    assert "archive-unreadable" in called("validate", zips / "more", "--deep", status=1).stdout
+    assert "0 scenarios here" in called("validate", zips / "more" / "empty.zip", "--files", status=1).stdout
+    caplog.clear()
+    skipped = partial(DeepAccident, dataroot=zips / "more", on_error="skip", verbose=False)
+    assert_refused((skipped, DatarootError, "no scenario found"))
+    assert "5 of 5 archives cannot be read" in caplog.text
+
+
+def test_an_archive_that_cannot_be_opened_is_one_of_them(zips: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refused(path: Path) -> BinaryIO:
+        if path.name == f"{OTHER}.zip":
+            raise PermissionError(13, "Permission denied")
+        return open_file(path)
+
+    monkeypatch.setattr(opening, "open_file", refused)
+    report = validate_release(zips, workers=1)
+    assert (report.scenarios, len(report.files.unreadable_archives)) == (1, 6)
+    assert any(f"{OTHER}.zip: cannot be read (Permission denied)" in each for each in report.files.unreadable_archives)
+
+
+@pytest.mark.parametrize("way", ["in place", "in its place"])
+def test_an_archive_of_the_same_size_and_time_is_seen(tmp_path: Path, way: str) -> None:
+    root = tiny.write_tiny_release(tmp_path / "release")
+    zips = packed(root, tmp_path / "zips" / "all.zip").parent
+    before = DeepAccident(dataroot=zips, verbose=False)
+    label = next((root / tiny.TYPE / "ego_vehicle" / "label" / tiny.NAME).glob("*_002.txt"))
+    label.write_text(label.read_text().replace(" 1300 12 ", " 1300 72 "))
+    other, archive = packed(root, tmp_path / "other.zip"), zips / "all.zip"
+    status = archive.stat()
+    shutil.copyfile(other, archive) if way == "in place" else other.replace(archive)
+    os.utime(archive, ns=(status.st_atime_ns, status.st_mtime_ns))
+    assert archive.stat().st_size == status.st_size
+    after = DeepAccident(dataroot=zips, verbose=False)
+    token = f"{tiny.TOKEN}/ego_vehicle/002/1"
+    assert [each.get("annotation", token)["num_lidar_pts"] for each in (before, after)] == [12, 72]
+
+
+def test_an_archive_with_the_checksums_of_before_is_read_again(tmp_path: Path) -> None:
+    """One that was damaged inside: its directory says the same as that of the one that is fetched again."""
+    root = tiny.write_tiny_release(tmp_path / "release")
+    archive = packed(root, tmp_path / "all.zip")
+    whole = archive.read_bytes()
+    archive.write_bytes(whole.replace(b" 1300 12 ", b" 1300 72 "))
+    damaged = DeepAccident(dataroot=archive, verbose=False)
+    archive.write_bytes(whole)
+    mended = DeepAccident(dataroot=archive, verbose=False)
+    token = f"{tiny.TOKEN}/ego_vehicle/002/1"
+    assert [each.get("annotation", token)["num_lidar_pts"] for each in (damaged, mended)] == [72, 12]
+
+
+def test_a_link_to_an_archive_changes_no_table(tmp_path: Path) -> None:
+    archive = packed(tiny.write_tiny_release(tmp_path / "release"), tmp_path / "all.zip")
+    before = DeepAccident(dataroot=archive, verbose=False).tables_folder
+    os.link(archive, tmp_path / "linked.zip")
+    assert DeepAccident(dataroot=archive, verbose=False).tables_folder == before
 
 
 def test_two_archives_with_the_same_member_are_refused(small: Path, tmp_path: Path) -> None:
@@ -185,6 +327,13 @@ def test_a_url_of_a_truncated_archive_is_refused(small: Path, tmp_path: Path) ->
     memory, url = fsspec.filesystem("memory"), "memory://broken/all.zip"
     memory.pipe_file("/broken/all.zip", small.read_bytes()[:-10])
     assert_refused((lambda: _opened(url, tmp_path), DatarootError, (f"{url}: not a readable zip archive",)))
+    memory.pipe_file("/broken/small.zip", small.read_bytes())
+    for _ in range(2):
+        root = open_dataroot("memory://broken", tmp_path / "index", on_error="skip")
+        assert (len(root.store.members), root.store.members.lacking) == (1, ["all.zip"])  # type: ignore[union-attr]
+    memory.pipe_file("/broken/all.zip", b"")
+    named = ("1 of 2 archives", "broken/all.zip: ", "the file is empty", "can be read without them")
+    assert_refused((lambda: _opened("memory://broken", tmp_path), DatarootError, named))
     memory.rm("/broken", recursive=True)
 
 
