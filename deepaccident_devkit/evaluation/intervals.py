@@ -19,7 +19,7 @@ import numpy as np
 
 from deepaccident_devkit.errors import ConfigError, shortened
 from deepaccident_devkit.evaluation.evaluator import Counts, Evaluator
-from deepaccident_devkit.evaluation.task import HEADLINE_UNITS, LIMITS, Unit
+from deepaccident_devkit.evaluation.task import HEADLINE_UNITS, LIMITS, SIGNED_NUMBERS, Unit
 from deepaccident_devkit.support.arrays import FloatArray, IntArray, as_floats
 
 RESAMPLES: Final = 1000
@@ -97,8 +97,9 @@ def intervals_of(
     numbers = {name: each for name, each in numbers_of(result).items() if math.isfinite(each) and has_interval(name)}
     names, parts = list(numbers), parts_of(clusters, chosen)
     others = leaving_out(len(parts))
-    alone, left_out = np.split(numbers_of_draws(evaluator, parts, np.vstack([1 - others, others]), names), 2)
-    ranges = np.array([range_of(*each) for each in zip(names, alone.T, strict=True)]).reshape(-1, 2)
+    drawn = numbers_of_draws(evaluator, parts, np.vstack([1 - others, others]), names)
+    alone, left_out = np.split(drawn, 2)
+    ranges = np.array([range_of(*each) for each in zip(names, drawn.T, strict=True)]).reshape(-1, 2)
     having = np.isfinite(alone).sum(axis=0)
     values = np.array(list(numbers.values()))
     low, high = interval_ends(values, left_out, ranges, chosen.confidence, having)
@@ -284,8 +285,6 @@ _UNITS: Final[Mapping[str, Unit]] = MappingProxyType(
     }
 )
 """Pattern of paths → unit, of numbers that are no headlines."""
-_SIGNED: Final = ("lateness",)
-"""Numbers with a unit that can be below 0."""
 _WITHOUT: Final = (
     "false_recordings",
     *("within/*/distance", "threshold", "best_f1", "quiet", "quiet_braking"),
@@ -304,27 +303,29 @@ def has_interval(path: str) -> bool:
     return not _is_one_of(path, _WITHOUT)
 
 
-def range_of(path: str, alone: FloatArray) -> tuple[float, float]:
+def range_of(path: str, values: FloatArray) -> tuple[float, float]:
     """The least and the most that a number can be; infinite for no limit.
 
-    By its unit: shares are in [0, 1], percents in [0, 100], lengths and times from 0. A number that is not of the
-    devkit's own has no unit: it is taken for a share if no cluster is outside [0, 1], and else for one that is never
-    below 0 if none is.
+    A signed number (of `SIGNED_NUMBERS`) has no limit. Others have those of their unit: shares are in [0, 1], percents
+    in [0, 100], lengths and times from 0. A number that is not of the devkit's own has no unit: it is taken for a share
+    if it is in [0, 1] in all draws, and otherwise for one that is never below 0 if it is not in any.
 
     Args:
         path: of the number.
-        alone: (C,) what it is in each of the clusters; NaN where there is nothing to count.
+        values: (D,) what it is in draws of the clusters; NaN where there is nothing to count.
     """
+    if _is_one_of(path, SIGNED_NUMBERS):
+        return -math.inf, math.inf
     units = chain(HEADLINE_UNITS.items(), _UNITS.items())
     unit = next((unit for pattern, unit in units if _is_one_of(path, (pattern,))), None)
     if unit is not None:
-        return -math.inf if _is_one_of(path, _SIGNED) else 0.0, LIMITS.get(unit, math.inf)
-    there = alone[np.isfinite(alone)]
+        return 0.0, LIMITS.get(unit, math.inf)
+    there = values[np.isfinite(values)]
     least = there.min(initial=0.0)
     return (0.0, 1.0 if there.max(initial=0.0) <= 1 else math.inf) if least >= 0 else (-math.inf, math.inf)
 
 
-def _is_one_of(path: str, patterns: tuple[str, ...]) -> bool:
+def _is_one_of(path: str, patterns: Iterable[str]) -> bool:
     """Whether a pattern fits the path, or its end, as of the results `beside` others."""
     return any(fnmatchcase(path, pattern) or fnmatchcase(path, f"*/{pattern}") for pattern in patterns)
 

@@ -12,7 +12,15 @@ from typing import Any, ClassVar, Final, Generic, Literal, NamedTuple, TypeVar
 import numpy as np
 
 from deepaccident_devkit.evaluation.evaluator import Counts, Evaluator, ratio
-from deepaccident_devkit.evaluation.task import HEADLINE_UNITS, Row, TaskResult, Unit, plain, protocol_of
+from deepaccident_devkit.evaluation.task import (
+    HEADLINE_UNITS,
+    SIGNED_NUMBERS,
+    Row,
+    TaskResult,
+    Unit,
+    plain,
+    protocol_of,
+)
 from deepaccident_devkit.support.arrays import BoolArray, FloatArray, IntArray
 from deepaccident_devkit.support.text import natural_order
 
@@ -29,11 +37,13 @@ class Column(NamedTuple):
         unit: of its numbers.
         better: which numbers are better.
         is_headline: whether its numbers in the main row of the main tables are headlines.
+        is_signed: whether its numbers can be below 0.
     """
 
     unit: Unit
     better: Literal["higher", "lower", "neither"] = "lower"
     is_headline: bool = True
+    is_signed: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -66,6 +76,7 @@ class MeansResult(TaskResult):
         )
         super(MeansResult, cls).__init_subclass__()
         HEADLINE_UNITS.update({f"means/*/{name}": each.unit for name, each in cls.columns.items()})
+        SIGNED_NUMBERS.update(f"means/*/{name}" for name, each in cls.columns.items() if each.is_signed)
 
 
 Result = TypeVar("Result", bound=MeansResult)

@@ -222,13 +222,14 @@ class Headline:
 class Row:
     """Where a headline stands in a task's result; `*` is any key, and takes its place in the name.
 
-    A path has one unit in the results of all tasks.
+    A path has one unit in the results of all tasks. A number that can be below 0 is signed, whatever its unit.
     """
 
     path: str
     name: str
     unit: Unit
     better: Literal["higher", "lower", "neither"] = "lower"
+    is_signed: bool = False
 
 
 _SHOWN: Final = 4
@@ -236,6 +237,8 @@ _SHOWN: Final = 4
 _HIGHER_IS_BETTER: Final = {"higher": True, "lower": False, "neither": None}
 HEADLINE_UNITS: Final[dict[str, Unit]] = {}
 """Path of a headline, `*` for any key → its unit; of all results (`TaskResult`)."""
+SIGNED_NUMBERS: Final[set[str]] = set()
+"""Paths, likewise, of numbers that can be below 0."""
 
 
 class TaskResult(FrozenMappings):
@@ -248,9 +251,10 @@ class TaskResult(FrozenMappings):
     samples: int
 
     def __init_subclass__(cls) -> None:
-        """Make the units of its headlines known."""
+        """Make the units of its headlines known, and which of them are signed."""
         super().__init_subclass__()
         HEADLINE_UNITS.update({row.path: row.unit for row in cls.rows})
+        SIGNED_NUMBERS.update(row.path for row in cls.rows if row.is_signed)
 
     def __repr__(self) -> str:
         """How many samples, and the first headlines."""

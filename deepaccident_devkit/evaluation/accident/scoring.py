@@ -80,7 +80,7 @@ class AccidentResult(TaskResult):
         Row("id_error", "id_error", "share"),
         Row("position_error", "position_error", "m"),
         Row("time_error", "time_error", "s"),
-        Row("lateness", "lateness", "s", "neither"),
+        Row("lateness", "lateness", "s", "neither", is_signed=True),
     )
     within: Mapping[float, AccidentsWithin]
     apa: float

@@ -43,6 +43,13 @@ def made(
     return intervals_of(evaluator, clusters, result, resampling)
 
 
+class Totals(Ratios):
+    """Sums, under the name of a ratio."""
+
+    def result_of(self, counts: Collection[Counts]) -> Ratio:
+        return Ratio(float(sum(each["above"] for each in counts)))
+
+
 def wilson(share: float, count: float, t: float) -> tuple[float, float]:
     """Wilson's interval of `count` independent draws."""
     middle = (share + t**2 / 2 / count) / (1 + t**2 / count)
@@ -248,6 +255,10 @@ SHARES = (
     *("groups/all/operating/time_in_alarm", "figures/drive all/recall_at_half", "precision_at_half", "precision_at_5"),
     *("shares/a", "warned", "extrapolated"),
 )
+SIGNED = (
+    *(f"means/lead 2 s/given/{name}" for name in ("lost", "lost_way", "lost_twins", "lost_way_twins")),
+    *("means/lead 0.5 s/full braking/lost", "beside/leads=1/means/bystander, lead 1 s/given/lost_way"),
+)
 AMOUNTS = (
     *("min_ade", "min_fde", "position_error", "time_error", "mean_errors/ATE", "mean_errors/AOE", "mean_errors/AVE"),
     *("groups/all/mean_time", "operating/tta_hit", "operating/tta0", "groups/all/tta0_after/2", "time_at_r80"),
@@ -261,7 +272,7 @@ AMOUNTS = (
         *((path, (0, 100)) for path in PERCENTS),
         *((path, (0, 1)) for path in SHARES),
         *((path, (0, math.inf)) for path in AMOUNTS),
-        *((path, (-math.inf, math.inf)) for path in ("lateness", "beside/time/lateness", "theirs")),
+        *((path, (-math.inf, math.inf)) for path in ("lateness", "beside/time/lateness", "theirs", *SIGNED)),
     ],
 )
 def test_a_unit_tells_what_a_number_can_be(path: str, expected: tuple[float, float]) -> None:
@@ -282,6 +293,30 @@ def test_a_unit_tells_what_a_number_can_be(path: str, expected: tuple[float, flo
 )
 def test_a_number_of_others_is_what_its_clusters_are(alone: list[float], expected: tuple[float, float]) -> None:
     assert range_of("theirs", np.array(alone)) == expected
+
+
+def test_an_interval_crosses_zero_where_a_number_can_be_negative_and_shares_stay_shares() -> None:
+    """Of all numbers that a task has by name, a few clusters around 0 and around the most that each can be."""
+    signed = {path for path in HEADLINE_UNITS if range_of(path, np.array([])) == (-math.inf, math.inf)}
+    assert {path.rpartition("/")[2] for path in signed} == {path.rpartition("/")[2] for path in SIGNED} | {"lateness"}
+    source = np.random.default_rng(0)
+    for path in HEADLINE_UNITS:
+        least, most = limits = range_of(path, np.array([]))
+        width = most if math.isfinite(most) else 1.0
+        middles = [-0.02, 0.02] if path in signed else [0.02, 0.98]
+        for middle in np.multiply(middles, width):
+            left_out = np.clip(middle + source.normal(0, 0.02 * width, (12, 1)), least, most)
+            [low], [high] = interval_ends(np.array([middle]), left_out, np.array([limits]), 0.95)
+            assert least <= low < middle < high <= most
+            assert (low < 0 < high) == (path in signed), path
+
+
+def test_a_number_that_is_larger_of_all_clusters_than_of_each_is_no_share() -> None:
+    """One that adds up: its interval is by logarithms, and no note says that nothing changes it."""
+    clusters = [[{"above": 0.2 + 0.01 * at, "below": 0.0}] for at in range(12)]
+    found = intervals_of(Totals(), clusters, Totals().result_of([each for (each,) in clusters]))
+    assert found.notes == ()
+    assert 0 < found.ends["ratio"][0] < sum(each["above"] for (each,) in clusters) < found.ends["ratio"][1]
 
 
 def test_totals_settings_and_medians_have_no_interval() -> None:

@@ -4,13 +4,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from planning_scenes import CAR, GIVEN, SCENARIO, plan_at, scene, straight
 
+from deepaccident_devkit.evaluation.breakdowns import cluster_of
+from deepaccident_devkit.evaluation.intervals import intervals_of, leaving_out, numbers_of_draws, range_of
 from deepaccident_devkit.evaluation.planning import PlanningEvaluator, PlanningResult, PlanningScene, trivial_plans
 from deepaccident_devkit.evaluation.planning.clean import box_path
 from deepaccident_devkit.evaluation.planning.scene import Plan
+from deepaccident_devkit.evaluation.runs.setups import scenario_of
 
 TOKEN = f"{SCENARIO}/ego_vehicle/{{:03d}}"
 
@@ -109,6 +112,43 @@ def test_twins_are_the_price() -> None:
     numbers = lead(result_of(twin), "full braking")
     assert numbers["lost_twins"] == pytest.approx(100 * (30 - 6.25) / 30, abs=0.1)
     assert (numbers["braking_twins"], "avoided" in numbers, "lost" in numbers) == (100, False, False)
+
+
+def of_speeds(*speeds: float) -> tuple[PlanningEvaluator, list[str]]:
+    """Plans of these speeds in an accident recorded at 10 m/s and in its twin; a pair of scenarios a speed."""
+    evaluator, tokens = PlanningEvaluator(), []
+    twin = replace(scene(10, partner=False), is_twin=True, is_collider=True)
+    for number, speed in enumerate(speeds):
+        for ending, each in (("accident", scene(10)), ("normal", twin)):
+            tokens.append(f"type1_subtype1_{ending}/Town01_{number}/ego_vehicle/001")
+            evaluator.update(tokens[-1], [plan_at(speed)], each)
+    return evaluator, tokens
+
+
+def test_intervals_of_progress_lost_cross_zero() -> None:
+    """Of plans that go farther than the recording as often as not, a plain jackknife by t says the same."""
+    evaluator, tokens = of_speeds(7, 13, 8, 12, 9, 11, 9.5, 11.5)
+    clusters = evaluator.clustered({token: cluster_of(scenario_of(token)) for token in tokens})
+    paths = [f"means/lead 3 s/{GIVEN}/{name}" for name in ("lost", "lost_way", "lost_twins", "lost_way_twins")]
+    ends = intervals_of(evaluator, clusters, evaluator.compute()).ends
+    values = numbers_of_draws(evaluator, clusters, np.ones((1, 8), dtype=np.int64), paths)[0]
+    left_out = numbers_of_draws(evaluator, clusters, leaving_out(8), paths)
+    half = 2.365 * np.sqrt(7 / 8 * ((left_out - values) ** 2).sum(axis=0))
+    for path, value, expected in zip(paths, values, half, strict=True):
+        assert ends[path] == pytest.approx((value - expected, value + expected), rel=0.1)
+        assert ends[path][0] < 0 < ends[path][1]
+
+
+@settings(max_examples=10)
+@given(st.floats(0.0, 30.0), st.floats(1.0, 30.0), st.floats(-10.0, 10.0), st.booleans())
+def test_what_can_be_negative_is_a_signed_number(planned: float, recorded: float, aside: float, twin: bool) -> None:
+    true = replace(scene(recorded, partner=not twin), is_twin=twin, is_collider=True)
+    times = np.arange(1, 7) * 0.5
+    numbers = lead(result_of(true, plan=Plan(times=times, path=np.column_stack([times * planned, times * aside]))))
+    for column, value in numbers.items():
+        least, most = range_of(f"means/lead 3 s/{GIVEN}/{column}", np.array([value]))
+        assert np.isnan(value) or least - 1e-6 <= value <= most + 1e-6
+        assert (least < 0) == column.startswith("lost")
 
 
 def test_bystanders_have_tables_of_their_own() -> None:
