@@ -5,6 +5,7 @@ The attributes are those of scenarios (`selection`), and of samples.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from operator import itemgetter
@@ -31,13 +32,23 @@ WITHIN_RECORDINGS: Final = ("time_to_impact", "impact_step", "time_to_end", "acc
 """Attributes that differ within a recording: of no use to a task on whole recordings."""
 
 
+_NUSCENES_SCENE: Final = re.compile(rf"^nuscenes/(\w+_(?:accident|normal))-(.+?)(?:-(?:{'|'.join(AGENTS)}))?$")
+"""The token of a scene of our export to nuScenes, which stands for one agent's recording of a scenario."""
+
+
 def cluster_of(scenario: str) -> str:
-    """The cluster of an accident and its twin, of the same junction, traffic and weather: `type1_subtype1/Town03…`.
+    """Return the cluster of an accident and its twin, of the same junction, traffic and weather.
+
+    A scene of our export to nuScenes is of the cluster of its scenario, whichever agent recorded it.
 
     Args:
-        scenario: its token, `type1_subtype1_accident/Town03…`.
+        scenario: its token, such as `type1_subtype1_accident/Town03…`, or as
+            `nuscenes/type1_subtype1_accident-Town03…-ego_vehicle` of the export.
+
+    Returns:
+        The token without the ending of its type: `type1_subtype1/Town03…`.
     """
-    kind, slash, name = scenario.partition("/")
+    kind, slash, name = _NUSCENES_SCENE.sub(r"\1/\2", scenario).partition("/")
     return f"{kind.rpartition('_')[0] or kind}{slash}{name}"
 
 

@@ -95,14 +95,9 @@ def intervals_of(
     if len(clusters) < LEAST_CLUSTERS:
         return Intervals(ends={}, notes=(f"no intervals: {few_clusters(len(clusters))}",))
     numbers = {name: each for name, each in numbers_of(result).items() if math.isfinite(each) and has_interval(name)}
-    names, parts = list(numbers), parts_of(clusters, chosen)
-    others = leaving_out(len(parts))
-    drawn = numbers_of_draws(evaluator, parts, np.vstack([1 - others, others]), names)
-    alone, left_out = np.split(drawn, 2)
-    ranges = np.array([range_of(*each) for each in zip(names, drawn.T, strict=True)]).reshape(-1, 2)
-    having = np.isfinite(alone).sum(axis=0)
-    values = np.array(list(numbers.values()))
-    low, high = interval_ends(values, left_out, ranges, chosen.confidence, having)
+    names, values = list(numbers), np.array(list(numbers.values()))
+    drawn = draws_of_parts(evaluator, clusters, names, chosen)
+    low, high, having = ends_of_draws(names, values, drawn, chosen.confidence)
     found = np.isfinite(low)
     ends = {name: (float(low[at]), float(high[at])) for at, name in enumerate(names) if found[at]}
     without = {name: int(having[at]) for at, name in enumerate(names) if not found[at]}
@@ -132,6 +127,36 @@ def difference_intervals(
     unlimited = np.broadcast_to((-math.inf, math.inf), (len(names), 2))
     low, high = interval_ends(values, second - first, unlimited, resampling.confidence)
     return low, high, standard_errors(values, second - first)[0]
+
+
+def draws_of_parts(
+    evaluator: Evaluator[Any], clusters: Clusters, names: Iterable[str], resampling: Resampling
+) -> FloatArray:
+    """(2P, M) the numbers of these M names in each of the P parts of the clusters alone, then in all but each."""
+    parts = parts_of(clusters, resampling)
+    others = leaving_out(len(parts))
+    return numbers_of_draws(evaluator, parts, np.vstack([1 - others, others]), names)
+
+
+def ends_of_draws(
+    names: Iterable[str], values: FloatArray, drawn: FloatArray, confidence: float, *, limited: bool = True
+) -> tuple[FloatArray, FloatArray, IntArray]:
+    """Intervals of numbers from draws.
+
+    Args:
+        names: the paths of M numbers.
+        values: (M,) of all parts together.
+        drawn: (2P, M) of `draws_of_parts`.
+        confidence: as of `interval_ends`.
+        limited: whether they are what their names say; differences of such numbers have no limits.
+
+    Returns:
+        (M,) low and (M,) high ends (`interval_ends`), and (M,) how many parts have the number at all.
+    """
+    alone, left_out = np.split(drawn, 2)
+    ranges = [range_of(*each) if limited else (-math.inf, math.inf) for each in zip(names, drawn.T, strict=True)]
+    having = np.isfinite(alone).sum(axis=0)
+    return *interval_ends(values, left_out, np.reshape(ranges, (-1, 2)), confidence, having), having
 
 
 def few_clusters(count: int) -> str:

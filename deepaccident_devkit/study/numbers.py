@@ -1,14 +1,15 @@
 """The numbers of a study: actors that the ego cannot see, a row's numbers, and differences of two rows.
 
-Intervals are of 95 % over pairs of an accident and its twin. Where a row has several seeds, their models are pooled:
-a pair that is left out is left out of all of them.
+Where a row has several seeds, a number is the mean of theirs: the scores of two models are on different scales, so a
+curve over the boxes of both would be no model's. Intervals are of 95 % over pairs of an accident and its twin; a pair
+that is left out is left out of all seeds.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping
-from itertools import chain
+from collections.abc import Collection, Iterable, Mapping
+from operator import itemgetter
 from typing import Any, Final
 
 import numpy as np
@@ -20,16 +21,15 @@ from deepaccident_devkit.evaluation.breakdowns import cluster_of
 from deepaccident_devkit.evaluation.evaluator import Counts, ratio, total
 from deepaccident_devkit.evaluation.intervals import (
     LEAST_CLUSTERS,
-    Clusters,
     Resampling,
-    difference_intervals,
-    intervals_of,
+    draws_of_parts,
+    ends_of_draws,
     numbers_of,
 )
 from deepaccident_devkit.evaluation.results import ResultsTask
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup, agent_of, scenario_of
 from deepaccident_devkit.motion import MotionLabelConfig, motion_labels
-from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray
+from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray, known
 from deepaccident_devkit.taxonomy import AGENTS, OWN_ACTOR_ID
 from deepaccident_devkit.v2x import AVAILABLE
 from deepaccident_devkit.v2x.cooperation import seen_actors
@@ -138,53 +138,54 @@ def _near(points: FloatArray, others: FloatArray) -> BoolArray:
 def numbers_of_rows(tokens: Collection[str], row: Seeds, less: Seeds | None = None) -> dict[str, dict[str, Any]]:
     """The numbers of a row at some samples, or how much more it has than another one, by their names in `NUMBERS`.
 
-    All seeds count together, each sample once a seed, and of two rows the same pairs of scenarios are left out for the
-    intervals. `seeds` has the value of each seed; a row without seeds is compared with each one of the other.
+    A number is the mean of those of all seeds; there is none if a seed has none. For its interval the same pairs of
+    scenarios are left out of all seeds, and of both rows. `seeds` has the value of each seed; a row without seeds is
+    compared with each one of the other.
 
     Returns:
         Number → `value`, `low` and `high`, None where there is none, and `seeds`.
     """
-    found, alone = _numbers(tokens, row, less, RESAMPLING), {}
-    for seed in dict.fromkeys(each for each in (*row, *(less or ())) if each):
-        one, other = (None if each is None else each.get(seed, each.get("")) for each in (row, less))
-        if one is not None and (less is None or other is not None):
-            alone[seed] = _numbers(
-                tokens, {seed: one}, None if other is None else {seed: other}, Resampling(resamples=0)
-            )
-    return {
-        name: {**each, "seeds": {seed: numbers[name]["value"] for seed, numbers in alone.items()}}
-        for name, each in found.items()
-    }
-
-
-def _numbers(
-    tokens: Collection[str], row: Seeds, less: Seeds | None, resampling: Resampling
-) -> dict[str, dict[str, float | None]]:
-    found: dict[str, dict[str, float | None]] = {}
-    for kind, evaluator in next(iter(row.values())).items():
+    found: dict[str, dict[str, Any]] = {}
+    names = {token: cluster_of(scenario_of(token)) for token in tokens}
+    clusters = dict(sorted(names.items(), key=itemgetter(1, 0)))
+    for kind in next(iter(row.values())):
         paths = {path: name for name, (of, path, _) in NUMBERS.items() if of == kind}
-        sides = [_clustered(each, kind, tokens) for each in (row, less) if each is not None]
-        results = [numbers_of(evaluator.result_of([*chain.from_iterable(side)])) for side in sides]
-        values = {path: results[0].get(path, math.nan) for path in paths}
-        ends: Mapping[str, tuple[float, float]] = {}
-        if less is None:
-            ends = intervals_of(evaluator, sides[0], values, resampling).ends
-        else:
-            values = {path: value - results[1].get(path, math.nan) for path, value in values.items()}
-            if len(sides[0]) >= LEAST_CLUSTERS and resampling.resamples:
-                low, high, _ = difference_intervals(evaluator, (sides[1], sides[0]), values, resampling)
-                ends = dict(zip(values, zip(low.tolist(), high.tolist(), strict=True), strict=True))
-        for path, name in paths.items():
-            told = zip(("value", "low", "high"), (values[path], *ends.get(path, (math.nan, math.nan))), strict=True)
-            found[name] = {key: each if math.isfinite(each) else None for key, each in told}
+        ours = _values(row, kind, tokens, paths)
+        theirs = {"": np.zeros(len(paths))} if less is None else _values(less, kind, tokens, paths)
+        values = np.mean([*ours.values()], axis=0) - np.mean([*theirs.values()], axis=0)
+        low = high = np.full(len(paths), math.nan)
+        if len({*clusters.values()}) >= LEAST_CLUSTERS:
+            drawn = _drawn(row, kind, clusters, paths)
+            if less is not None:
+                drawn = drawn - _drawn(less, kind, clusters, paths)
+            low, high, _ = ends_of_draws(paths, values, drawn, RESAMPLING.confidence, limited=less is None)
+        seeds = {}
+        for seed in dict.fromkeys(filter(None, (*ours, *theirs))):
+            pair = [each.get(seed, each.get("")) for each in (ours, theirs)]
+            if pair[0] is not None and pair[1] is not None:
+                seeds[seed] = pair[0] - pair[1]
+        for at, name in enumerate(paths.values()):
+            ends = {"value": known(values[at]), "low": known(low[at]), "high": known(high[at])}
+            found[name] = {**ends, "seeds": {seed: known(each[at]) for seed, each in seeds.items()}}
     return {name: found[name] for name in NUMBERS if name in found}
 
 
-def _clustered(seeds: Seeds, kind: str, tokens: Collection[str]) -> Clusters:
-    """Of each pair of scenarios, in the order of their names, the counts of all its samples, with all seeds."""
-    ordered = sorted((cluster_of(scenario_of(token)), token) for token in tokens)
-    of_seeds = [evaluators[kind].clustered({token: name for name, token in ordered}) for evaluators in seeds.values()]
-    return [[*chain.from_iterable(parts)] for parts in zip(*of_seeds, strict=True)]
+def _values(seeds: Seeds, kind: str, tokens: Collection[str], paths: Iterable[str]) -> dict[str, FloatArray]:
+    """Return each seed's numbers (M,) at some samples, NaN for none."""
+    values = {}
+    for seed, evaluators in seeds.items():
+        numbers = numbers_of(evaluators[kind].compute(tokens))
+        values[seed] = np.array([numbers.get(path, math.nan) for path in paths])
+    return values
+
+
+def _drawn(seeds: Seeds, kind: str, clusters: Mapping[str, str], paths: Iterable[str]) -> FloatArray:
+    """Return the draws (2P, M) of `intervals.draws_of_parts`, the mean of those of the seeds that have a number."""
+    evaluators = [each[kind] for each in seeds.values()]
+    drawn = np.array([draws_of_parts(each, each.clustered(clusters), paths, RESAMPLING) for each in evaluators])
+    there = np.isfinite(drawn)
+    with np.errstate(invalid="ignore"):
+        return np.asarray(np.where(there, drawn, 0.0).sum(axis=0) / there.sum(axis=0))
 
 
 def verdict(difference: Mapping[str, Any]) -> str:

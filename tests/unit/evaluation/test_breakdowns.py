@@ -155,6 +155,12 @@ def test_groups_are_in_order_and_the_pole_is_left_out_beside(attributes, by, gro
     [
         ("type1_subtype1_accident/Town03_1", "type1_subtype1/Town03_1"),
         ("type1_subtype1_normal/Town03_1", "type1_subtype1/Town03_1"),
+        ("nuscenes/type1_subtype1_accident-Town03_1-ego_vehicle", "type1_subtype1/Town03_1"),
+        ("nuscenes/type1_subtype1_normal-Town03_1-ego_vehicle", "type1_subtype1/Town03_1"),
+        ("nuscenes/type1_subtype1_normal-Town03_1-ego_vehicle_behind", "type1_subtype1/Town03_1"),
+        ("nuscenes/type1_subtype1_normal-Town03_1-infrastructure", "type1_subtype1/Town03_1"),
+        ("nuscenes/type12_subtype2_accident-Town-3-vehicle", "type12_subtype2/Town-3-vehicle"),
+        ("nuscenes/scene-0061", "nuscenes/scene-0061"),
         ("other/Town03_1", "other/Town03_1"),
         ("other", "other"),
     ],

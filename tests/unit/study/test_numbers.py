@@ -14,15 +14,19 @@ from deepaccident_devkit.motion import OWN_BOX_ID, MotionLabelConfig, motion_lab
 from deepaccident_devkit.study.numbers import HIDDEN, HiddenActors, evaluators_of, numbers_of_rows, verdict
 from deepaccident_devkit.study.predict import predictions_of, strangers_of, with_strangers
 from deepaccident_devkit.study.recipe import Row
+from deepaccident_devkit.study.summary import ALL, Counted, summarised
 from deepaccident_devkit.v2x import visible_instances
 from deepaccident_devkit.v2x.cooperation import seen_actors
 
 LABELS = MotionLabelConfig(grid=BevGrid(x=(-50.0, 50.0, 1.0), y=(-50.0, 50.0, 1.0)), protocol="clean")
 
 
-def boxes_at(*places: tuple[float, float]) -> DetectedBoxes:
+SAMPLE = "type1_subtype1_accident/Town03_{}/ego_vehicle/010"
+
+
+def boxes_at(*places: tuple[float, float], frame: str = "ego") -> DetectedBoxes:
     center = np.array([(*place, 0.0) for place in places]).reshape(-1, 3)
-    made = Boxes.from_arrays(center, np.ones_like(center), np.zeros(len(center)), frame="ego")
+    made = Boxes.from_arrays(center, np.ones_like(center), np.zeros(len(center)), frame=frame)
     return DetectedBoxes(boxes=made, scores=np.ones(len(center)))
 
 
@@ -71,9 +75,80 @@ def seeds_of(*shares: float) -> dict[str, dict[str, Any]]:
             found = round(10 * share) + (pair + seed) % 2
             names = ("seen", "seen_foreground", "seen_detected", "cells", "false_cells", "false_boxes")
             counts = {"hidden": 10, "hidden_foreground": found, "hidden_detected": 0, **dict.fromkeys(names, 0)}
-            evaluators[HIDDEN].add(f"type1_subtype1_accident/Town03_{pair}/ego_vehicle/010", counts)
+            evaluators[HIDDEN].add(SAMPLE.format(pair), counts)
         made[str(seed)] = {HIDDEN: evaluators[HIDDEN]}
     return made
+
+
+def detections_of(*models: tuple[float, float], token: str = SAMPLE) -> dict[str, dict[str, Any]]:
+    """Seeds whose models give a score to true boxes and another one to false boxes, in ten pairs."""
+    made = {}
+    for seed, (true_score, false_score) in enumerate(models, 1):
+        evaluator = evaluators_of("clean")["detection"]
+        for pair in range(10):
+            truth = boxes_at((10.0, 0.0), frame="lidar").boxes
+            both = boxes_at((10.0, 5.0 * (not (pair + seed) % 4)), (30.0, 20.0), frame="lidar").boxes
+            found = DetectedBoxes(boxes=both, scores=np.array([true_score, false_score]))
+            evaluator.update(token.format(pair), found, truth)
+        made[str(seed)] = {"detection": evaluator}
+    return made
+
+
+@pytest.mark.parametrize("models", [((0.9, 0.8), (0.3, 0.2)), ((0.9, 0.8), (0.3, 0.4), (0.6, 0.6))])
+def test_a_number_over_seeds_is_the_mean_of_each_seeds_number(models: tuple[tuple[float, float], ...]) -> None:
+    """The curve over the boxes of both would rank the first model's false boxes above the second one's true boxes."""
+    seeds = detections_of(*models)
+    tokens = seeds["1"]["detection"].tokens
+    alone = [each["detection"].compute().mean_average_precision for each in seeds.values()]
+    found = numbers_of_rows(tokens, seeds)["map"]
+    assert [*found["seeds"].values()] == alone
+    assert found["value"] == pytest.approx(np.mean(alone))
+    assert found["low"] <= found["value"] <= found["high"]
+    worse = detections_of(*((false, true) for true, false in models))
+    more = numbers_of_rows(tokens, seeds, worse)["map"]
+    assert more["value"] == pytest.approx(np.mean([*more["seeds"].values()]))
+    assert min(more["seeds"].values()) <= more["value"] <= max(more["seeds"].values())
+
+
+def test_an_interval_over_seeds_is_the_jackknifes_of_their_mean() -> None:
+    """The same pairs are left out of all seeds, and of both rows."""
+    seeds, less = detections_of((0.9, 0.8), (0.3, 0.4)), detections_of((0.5, 0.6), (0.2, 0.9))
+    tokens = sorted(seeds["1"]["detection"].tokens)
+
+    def mean(chosen: list[str], row: dict[str, dict[str, Any]]) -> float:
+        return float(np.mean([each["detection"].compute(chosen).mean_average_precision for each in row.values()]))
+
+    left_out = [[token for token in tokens if token != without] for without in tokens]
+    changes = [mean(each, seeds) - mean(each, less) - mean(tokens, seeds) + mean(tokens, less) for each in left_out]
+    found = numbers_of_rows(tokens, seeds, less)["map"]
+    middle = (found["low"] + found["high"]) / 2
+    assert middle == pytest.approx(found["value"])
+    error = np.sqrt(9 / 10 * np.square(changes).sum())
+    assert 2.262 * error * 0.99 <= found["high"] - middle <= 4 * error  # wider: fewer degrees of freedom
+
+
+def test_a_number_that_a_seed_lacks_has_no_mean() -> None:
+    seeds = seeds_of(0.6, 0.7)
+    tokens = seeds["1"][HIDDEN].tokens
+    for token in tokens:
+        seeds["2"][HIDDEN]._counts[token] = {**seeds["2"][HIDDEN].counts[token], "hidden": 0}
+    found = numbers_of_rows(tokens, seeds)["hidden_foreground"]
+    assert (found["value"], found["low"], found["seeds"]) == (None, None, {"1": pytest.approx(0.65), "2": None})
+
+
+def test_recordings_of_an_export_to_nuscenes_are_in_the_pairs_of_their_release() -> None:
+    """Twenty recordings of ten accidents and their twins have the intervals of ten pairs."""
+    told: dict[str, Any] = {"title": "", "question": "", "labels": "clean", "headline": None, "compare": []}
+    found = []
+    for token in (SAMPLE, "nuscenes/type1_subtype1_accident-Town03_{}-ego_vehicle/ego_vehicle/010"):
+        row = detections_of((0.9, 0.8), token=token)
+        twins = detections_of((0.3, 0.8), token=token.replace("accident", "normal"))["1"]["detection"]
+        row["1"]["detection"].merge(twins)
+        tokens = sorted(row["1"]["detection"].tokens)
+        counted = Counted(told={**told, "over": {"a": None}}, groups={ALL: tokens}, rows={"a": row})
+        found.append(summarised(counted))
+    assert found[0] == found[1]
+    assert found[0]["groups"][ALL] == {"samples": 20, "pairs": 10}
 
 
 def test_seeds_count_together_and_each_stands_beside(monkeypatch: pytest.MonkeyPatch) -> None:
