@@ -183,9 +183,7 @@ def _drawn(seeds: Seeds, kind: str, clusters: Mapping[str, str], paths: Iterable
     """Return the draws (2P, M) of `intervals.draws_of_parts`, the mean of those of the seeds that have a number."""
     evaluators = [each[kind] for each in seeds.values()]
     drawn = np.array([draws_of_parts(each, each.clustered(clusters), paths, RESAMPLING) for each in evaluators])
-    there = np.isfinite(drawn)
-    with np.errstate(invalid="ignore"):
-        return np.asarray(np.where(there, drawn, 0.0).sum(axis=0) / there.sum(axis=0))
+    return np.asarray(np.ma.masked_invalid(drawn).mean(axis=0).filled(math.nan))
 
 
 def verdict(difference: Mapping[str, Any]) -> str:

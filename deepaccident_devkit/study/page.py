@@ -61,7 +61,8 @@ def study_html(summary: Mapping[str, Any], figures: Sequence[tuple[Path, str]]) 
         summary=summary,
         header={
             "question": summary["question"],
-            "test": f"{tested['samples']:,} samples of {tested['pairs']:,} pairs of an accident and its twin",
+            "test": f"{tested['samples']:,} samples of {tested['pairs']:,} pairs of an accident and its twin"
+            + ", which the training may have shown" * summary["recipe"]["test"]["includes_training"],
             "recipe": summary["recipe"]["name"],
             "devkit": summary["devkit"],
             "hours of one process": f"{sum(each['seconds'] for each in summary['cells']) / 3600:.2f}",

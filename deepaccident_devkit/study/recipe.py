@@ -7,13 +7,14 @@ and the remedy.
 from __future__ import annotations
 
 import dataclasses
+import math
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections import Counter
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
-from functools import partial
 from itertools import chain, product
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Annotated, Any, Final, Literal
 
 import msgspec
 
@@ -41,11 +42,12 @@ NUSCENES: Final = "nuscenes"
 """Of a release that is made: whether it is put into nuScenes' format."""
 _EFFECTS: Final = ("latency", "pose_noise", "packet_loss", "budget")
 """Of a row, what its `Link` has."""
-_ALONE: Final = "file: these weights are there; leave the other keys out"
-_MIX: Final = "mix: expected a share between 0 and 1, of all moments"
-_TWICE: Final = "name: is there twice; name the keys that have lists in it, such as {agents}"
 _LISTS: Final = ("agents", "horizon", *_EFFECTS)
 """Of a row, what can be a list: a row each."""
+MOST_ROWS: Final = 1000
+"""Rows of a recipe, when each list has become a row for each of its values."""
+_MOST_CHARACTERS: Final = 100_000
+"""Of a recipe, which PyYAML reads in a second or two; those that ship have up to 3,000."""
 
 
 class _Part(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -80,6 +82,8 @@ class TestedOn(_Part, frozen=True, kw_only=True):
         horizon: seconds before the end from which samples are taken; None for the longest that a row looks ahead.
         where: filters as `--where` takes them: pairs of scenarios stay of which one matches all.
         labels: the protocol of motion labels. Models of the presets `tiny` have `clean`.
+        includes_training: whether models may have learned from scenarios of the test, from their twins, or from other
+            recordings of them; if not, such a recipe is refused.
     """
 
     release: str
@@ -90,6 +94,7 @@ class TestedOn(_Part, frozen=True, kw_only=True):
     horizon: float | None = None
     where: tuple[str, ...] = ()
     labels: str = "released"
+    includes_training: bool = False
 
     def label_config(self, horizon: float | None) -> MotionLabelConfig:
         """The labels that look so many seconds ahead; raises ConfigError or ChoiceError."""
@@ -160,6 +165,30 @@ class Row(_Part, frozen=True, kw_only=True):
         return [each for each, found in told.items() if found]
 
 
+class Plan(msgspec.Struct, frozen=True, kw_only=True):
+    """What a recipe itself says of some weights; the other keys are fields of `ModelChoice` and `TrainConfig`.
+
+    Attributes:
+        release: to learn from, one of the recipe's; empty for weights that are there.
+        split: of it.
+        validation: the split of it whose score chooses the best weights; None for none.
+        also: another release to learn from; None for none.
+        also_split: of that one.
+        mix: share of all moments that are from it.
+        start: which weights above to begin from; `from` in the file.
+        file: weights that are there, as `deepaccident predict` takes them.
+    """
+
+    release: str = ""
+    split: str = "all"
+    validation: str | None = None
+    also: str | None = None
+    also_split: str = "all"
+    mix: float = 0.5
+    start: str | None = msgspec.field(default=None, name="from")
+    file: str | None = None
+
+
 class Recipe(_Part, frozen=True, kw_only=True):
     """A study.
 
@@ -171,9 +200,8 @@ class Recipe(_Part, frozen=True, kw_only=True):
         test: on what all rows are tested.
         rows: the lines of the tables.
         seeds: of the trainings; each row of a model is one of every seed.
-        weights: name → `release` to learn from, `also` another one beside it (of which the share `mix` of all moments
-            is), `from` which weights above (with their model), and fields of `ModelChoice` and `TrainConfig`; or `file`
-            alone, weights as `deepaccident predict` takes them.
+        weights: name → keys of `Plan`, and fields of `ModelChoice` and `TrainConfig`; or `file` alone. Weights that
+            begin `from` others have their model.
         groups: name → filters as `--where` takes them: numbers are also given of the pairs of scenarios of which one
             matches all.
         by: numbers are also given by these attributes, as `--by` takes them.
@@ -187,7 +215,7 @@ class Recipe(_Part, frozen=True, kw_only=True):
     releases: dict[str, dict[str, Any]]
     test: TestedOn
     rows: tuple[Row, ...]
-    seeds: tuple[int, ...] = (1,)
+    seeds: Annotated[tuple[Annotated[int, msgspec.Meta(ge=0, lt=1 << 62)], ...], msgspec.Meta(max_length=100)] = (1,)
     weights: dict[str, dict[str, Any]] = {}
     groups: dict[str, tuple[str, ...]] = {}
     by: tuple[str, ...] = ()
@@ -201,12 +229,25 @@ class Recipe(_Part, frozen=True, kw_only=True):
         first = [] if self.headline is None else [(self.headline.row, self.headline.less)]
         return list(dict.fromkeys([*first, *self.compare]))
 
+    def plan(self, weights: str) -> Plan:
+        """What it says of weights; raises ValueError."""
+        return as_record(self.weights[weights], Plan)
+
+
+class _Source(msgspec.Struct):
+    """The keys of a release that name files."""
+
+    dataroot: str = ""
+    version: str = ""
+    spec: str = ""
+
 
 class _File(msgspec.Struct):
-    """What there must be before rows are made of lists."""
+    """What there must be before rows are made of lists, and files are looked for."""
 
     rows: list[dict[str, Any]]
     smoke: dict[str, Any] = {}
+    releases: dict[str, _Source] = {}
 
 
 def read_recipe(recipe: str, *, smoke: bool = False) -> Recipe:
@@ -220,7 +261,10 @@ def read_recipe(recipe: str, *, smoke: bool = False) -> Recipe:
         known = sorted(each.stem for each in SHIPPED.glob("*.yaml"))
         path = SHIPPED / f"{choice('RECIPE, which is no file .yaml', recipe, known, error=ConfigError)}.yaml"
     try:
-        told = _plain(parse_yaml(read_bytes(path, "spec").decode().strip() or "{}", str(path)))
+        text = read_bytes(path, "spec").decode().strip()
+        if len(text) > _MOST_CHARACTERS:
+            raise ConfigError(f"{path}: has {len(text):,} characters, more than {_MOST_CHARACTERS:,}; split the study")
+        told = _plain(parse_yaml(text or "{}", str(path)))
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: {fault_text(error)}; give a file of YAML, in UTF-8") from error
     with at(path, "the recipe"):
@@ -228,14 +272,20 @@ def read_recipe(recipe: str, *, smoke: bool = False) -> Recipe:
         if smoke and not file.smoke:
             raise ConfigError("smoke: is missing; write this part, or leave out --smoke")
         chosen = _merged(told, file.smoke if smoke else {}) | {"name": f"{path.stem}{'-smoke' * smoke}"}
-        chosen["rows"] = [row for each in chosen["rows"] for row in _expanded(each)]
-        read = as_record({key: each for key, each in chosen.items() if key != "smoke"}, Recipe)
-    beside = {
-        name: {**source, "spec": str(path.parent / source["spec"])}
-        for name, source in read.releases.items()
-        if source.get("spec")
-    }
-    return _checked(path, msgspec.structs.replace(read, releases={**read.releases, **beside}))
+        chosen.pop("smoke", None)
+        file = as_record(chosen, _File)
+        count = sum(math.prod(map(len, _lists(row).values())) for row in file.rows)
+        if not 0 < count <= MOST_ROWS:
+            raise ConfigError(
+                f"rows: expected 1 to {MOST_ROWS:,}, found {count:,}: a list makes a row of each of its values, and "
+                "several lists a row of each combination; change the lists"
+            )
+        chosen["rows"] = [each for row in file.rows for each in _expanded(row)]
+        for name, source in file.releases.items():
+            if source.spec:
+                chosen["releases"][name]["spec"] = str(path.parent / source.spec)
+        read = as_record(chosen, Recipe)
+    return _checked(path, read)
 
 
 @contextmanager
@@ -260,63 +310,79 @@ def source_of(source: Mapping[str, Any]) -> SynthConfig | None:
 
 def _checked(path: Path, recipe: Recipe) -> Recipe:
     """The recipe, whose parts fit one another, and what the devkit has; raises ConfigError."""
-    test, plans, names = recipe.test, recipe.weights, [row.name for row in recipe.rows]
-    number, where = ("apa", None) if recipe.headline is None else (recipe.headline.number, recipe.headline.where)
-    above = {name: (None, *list(plans)[:place]) for place, name in enumerate(plans)}
-    trained = [name for name in plans if "file" not in plans[name]]
-    checks: list[tuple[str, Callable[[], object]]] = [
-        *((f"releases.{name}", partial(source_of, source)) for name, source in recipe.releases.items()),
-        ("test", partial(choice, "release", test.release, recipe.releases)),
-        ("test", partial(test.label_config, test.horizon)),
-        ("test", partial(SampleSelection, split=test.split, samples=test.samples, agents=test.agents)),
-        *(
-            (f"weights.{name}", partial(_refused, _ALONE))
-            for name in plans
-            if "file" in plans[name] and len(plans[name]) > 1
-        ),
-        *(
-            (f"weights.{name}", partial(choice, "release", plans[name].get("release"), recipe.releases))
-            for name in trained
-        ),
-        *(
-            (f"weights.{name}", partial(choice, "also", plans[name].get("also"), (None, *recipe.releases)))
-            for name in trained
-        ),
-        *((f"weights.{name}", partial(_refused, _MIX)) for name in trained if not 0 < plans[name].get("mix", 0.5) < 1),
-        *(
-            (f"weights.{name}", partial(choice, "from, which stands above", plans[name].get("from"), above[name]))
-            for name in trained
-        ),
-        *((f"rows: {row.name}", partial(_refused, fault)) for row in recipe.rows for fault in row.faults),
-        *((f"rows: {row.name}", partial(choice, "weights", row.weights, (None, *plans))) for row in recipe.rows),
-        *(
-            (f"rows: {row.name}", partial(choice, "agents", agent, (*AGENT_SETS, *AGENTS)))
-            for row in recipe.rows
-            for agent in row.cooperating
-            if row.agents not in AGENT_SETS
-        ),
-        *((f"rows: {row.name}", partial(getattr, row, "link")) for row in recipe.rows),
-        *((f"rows: {row.name}", partial(test.label_config, row.horizon)) for row in recipe.rows),
-        *((f"rows: {name}", partial(_refused, _TWICE)) for name in names if names.count(name) > 1),
-        *(("test.where, groups", partial(parse_where, text)) for text in chain(test.where, *recipe.groups.values())),
-        *(("by", partial(attribute_name, by)) for by in recipe.by),
-        *(("compare, headline", partial(choice, "row", name, names)) for name in chain(*recipe.pairs)),
-        ("headline", partial(choice, "number", number, NUMBERS)),
-        ("headline", partial(choice, "where", where, (None, *recipe.groups))),
-    ]
-    for place, check in checks:
-        with at(path, place):
-            check()
+    test, names = recipe.test, Counter(row.name for row in recipe.rows)
+    for name, source in recipe.releases.items():
+        with at(path, f"releases.{name}"):
+            source_of(source)
+    with at(path, "test"):
+        _check_name("release", test.release, recipe.releases)
+        test.label_config(test.horizon)
+        SampleSelection(split=test.split, samples=test.samples, agents=test.agents)
+    above: list[Any] = [None]
+    for name in recipe.weights:
+        with at(path, f"weights.{name}"):
+            _check_plan(recipe, name, above)
+        above.append(name)
+    for row in recipe.rows:
+        with at(path, f"rows: {row.name}"):
+            _check_row(row, recipe)
+            if names[row.name] > 1:
+                raise ConfigError("name: is there twice; name the keys that have lists in it, such as {agents}")
+    with at(path, "test.where, groups"):
+        for text in chain(test.where, *recipe.groups.values()):
+            parse_where(text)
+    with at(path, "by"):
+        for by in recipe.by:
+            attribute_name(by)
+    with at(path, "compare, headline"):
+        for name in chain(*recipe.pairs):
+            _check_name("row", name, names)
+        if recipe.headline is not None:
+            _check_name("number", recipe.headline.number, NUMBERS)
+            _check_name("where", recipe.headline.where, (None, *recipe.groups))
     return recipe
 
 
-def _refused(told: str) -> None:
-    raise ConfigError(told)
+def _check_plan(recipe: Recipe, name: str, above: Collection[Any]) -> None:
+    """Check what the recipe says of some weights, `above` are those before; raises ConfigError or ChoiceError."""
+    plan = recipe.plan(name)
+    if plan.file is not None:
+        if len(recipe.weights[name]) > 1:
+            raise ConfigError("file: these weights are there; leave the other keys out")
+        return
+    _check_name("release", plan.release, recipe.releases)
+    _check_name("also", plan.also, (None, *recipe.releases))
+    _check_name("from, which stands above", plan.start, above)
+    if not 0 < plan.mix < 1:
+        raise ConfigError(f"mix: expected a share between 0 and 1 of all moments, found {plan.mix!r}")
+
+
+def _check_name(kind: str, name: str | None, names: Collection[str | None]) -> None:
+    """Raise ChoiceError if a name is none of these, and ConfigError if it is spelled in another way."""
+    if choice(kind, name, names) != name:
+        raise ConfigError(f"{kind}: found {name!r}; write it with the same capital letters everywhere")
+
+
+def _check_row(row: Row, recipe: Recipe) -> None:
+    """Check a row by itself and with the others' names; raises ConfigError or ChoiceError."""
+    if row.faults:
+        raise ConfigError(row.faults[0])
+    _check_name("weights", row.weights, (None, *recipe.weights))
+    if row.agents not in AGENT_SETS:
+        for agent in row.cooperating:
+            _check_name("agents", agent, (*AGENT_SETS, *AGENTS))
+    recipe.test.label_config(row.horizon)
+    _ = row.link  # its effects are checked as it is made
+
+
+def _lists(row: Mapping[str, Any]) -> dict[str, list[Any]]:
+    """The lists of a row that stand for rows."""
+    return {key: row[key] for key in _LISTS if isinstance(row.get(key), list)}
 
 
 def _expanded(row: Mapping[str, Any]) -> Iterator[Mapping[str, Any]]:
     """The rows that one with lists stands for."""
-    lists = {key: row[key] for key in _LISTS if isinstance(row.get(key), list)}
+    lists = _lists(row)
     key = next((key for key in lists if key != "agents"), None)
     for values in product(*lists.values()):
         one = dict(zip(lists, values, strict=True))

@@ -7,7 +7,6 @@ import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, fields
 from functools import partial
-from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -26,8 +25,9 @@ from deepaccident_devkit.rooms import added, need_room
 from deepaccident_devkit.selection import find
 from deepaccident_devkit.study.cells import Bench, Cell, Counting, make, taken, trained
 from deepaccident_devkit.study.numbers import HIDDEN
+from deepaccident_devkit.study.overlap import Scenarios, known_scenarios
 from deepaccident_devkit.study.page import save_study
-from deepaccident_devkit.study.recipe import DEFAULT_HORIZON, NUSCENES, Recipe, at, source_of
+from deepaccident_devkit.study.recipe import DEFAULT_HORIZON, NUSCENES, Plan, Recipe, at, source_of
 from deepaccident_devkit.study.summary import ALL, Counted, StudyReport, counted_of, summarised
 from deepaccident_devkit.support.files import writable_folder
 from deepaccident_devkit.support.json_text import as_record
@@ -82,23 +82,26 @@ def run_study(
     engine: Any = {**how, "workers": how.get("workers") or (1 if device.startswith("cuda") else os.cpu_count())}
     with bench.store.shared():
         releases = {name: _release(bench, name, recipe, **how) for name in recipe.releases}
+        test, dataset = recipe.test, releases[recipe.test.release][1]
+        tested = _matching(dataset, test.where, _scenarios(dataset, test.split), recipe, "test.where")
+        if not test.includes_training:
+            _refuse_known_tests(recipe, releases, (dataset, tested))
         weights = _weights(recipe, bench, releases, **engine)
-        rows = _rows(recipe, bench, releases[recipe.test.release], weights)
+        rows = _rows(recipe, bench, releases[test.release], weights, tested)
         bench.make(
             (cell for of in rows.values() for cell in of.values()),
             "rows",
-            releases[recipe.test.release][1].places,
+            dataset.places,
             **engine,
         )
-        counted = _counted(recipe, releases[recipe.test.release][1], rows)
-        cells = (
-            (cell for cell, _ in releases.values()),
-            *(of.values() for of in (*(of for _, of in weights.values()), *rows.values())),
-        )
+        counted = _counted(recipe, dataset, rows)
+        cells = [cell for cell, _ in releases.values()]
+        for made in (*(seeds for _, seeds in weights.values()), *rows.values()):
+            cells += made.values()
         notes = [
             {"kind": each.kind, "name": each.name, "key": each.key}
             | {name: value for name, value in (each.kept or {}).items() if name != "counts"}
-            for each in chain(*cells)
+            for each in cells
         ]
     summary = {**summarised(counted), "recipe": msgspec.to_builtins(recipe), "devkit": __version__, "cells": notes}
     report = StudyReport(summary=json.loads(json.dumps(summary)))
@@ -133,12 +136,10 @@ def _opened(source: Mapping[str, Any], folder: Path | None = None) -> DeepAccide
 def _made(source: Mapping[str, Any], how: Any, folder: Path) -> dict[str, Any]:
     """Make a release, if it is not there: how many scenarios it has, and its fingerprint."""
     config = source_of(source)
-    if config is not None and not source.get(NUSCENES) and not folder.is_dir():
-        make_release(folder, config, **how)
-    elif config is not None and not (folder / NUSCENES).is_dir():
-        release = folder.with_name(f"{folder.name}-release")
-        if not release.is_dir():
-            make_release(release, config, **how)
+    release = folder.with_name(f"{folder.name}-release") if source.get(NUSCENES) else folder
+    if config is not None and not release.is_dir():
+        make_release(release, config, **how)
+    if release != folder and not (folder / NUSCENES).is_dir():
         form = NuScenes(agents=AGENTS[:1], lidar_axes="nuscenes", sweeps=False)
         export_release(DeepAccident("v1", release, verbose=False), folder / NUSCENES, form, **how)
     folder.mkdir(parents=True, exist_ok=True)  # of one that was there it has nothing
@@ -152,6 +153,23 @@ def _scenarios(dataset: DeepAccident, split: str = "all") -> list[str]:
     every = [record["token"] for record in dataset.scenario]
     chosen = every if split == "all" else dataset.split_scenarios(split)
     return [token for token in every if token in chosen]
+
+
+def _refuse_known_tests(recipe: Recipe, releases: Mapping[str, _Release], tested: Scenarios) -> None:
+    """Raise ConfigError if a training shows scenarios of the test, or their twins."""
+    for name in recipe.weights:
+        plan = recipe.plan(name)
+        splits = (plan.release, plan.split), (plan.release, plan.validation), (plan.also, plan.also_split)
+        for release, split in splits:
+            if release and split:
+                with at(recipe.name, f"weights.{name}"):
+                    learned = releases[release][1], _scenarios(releases[release][1], split)
+                    if known := known_scenarios(learned, tested):
+                        raise ConfigError(
+                            f"{release}, {split}: shows {len(known)} scenarios of the test, or their twins, such as "
+                            f"{known[0]}; change split, also_split or validation here, or the test's split, or say "
+                            "includes_training: true in test"
+                        )
 
 
 def _weights(
@@ -177,28 +195,30 @@ def _seeds(
     """The weights of one name; raises ConfigError, ChoiceError or ValueError."""
     from deepaccident_devkit.model import ModelChoice, SecondSource, TrainConfig, read_weights
 
-    plan = dict(recipe.weights[name])
-    if "file" in plan:
-        read = read_weights(plan["file"])
+    plan, given = recipe.plan(name), recipe.weights[name]
+    if plan.file is not None:
+        read = read_weights(plan.file)
         cell = bench.cell("weights", name, partial(taken, read.path), file=file_checksum(read.path))
         return ModelChoice.from_dict(read.meta, read.path), {"": cell}
-    (release, dataset), start = releases[plan.pop("release")], plan.pop("from", None)
+    release, dataset = releases[plan.release]
     models, trainings = ([each.name for each in fields(kind)] for kind in (ModelChoice, TrainConfig))
-    also, mix = plan.pop("also", None), plan.pop("mix", 0.5)
     told: dict[str, Any] = {}
     second = None
-    if also is not None:
-        other, there = releases[also]
-        second = SecondSource(dataset=there, split=str(bench.split(_scenarios(there))), mix=mix)
-        told["also"] = {"release": other.key, "mix": mix}
-    for key in plan:
-        choice("key", key, [each for each in (*models, *trainings) if each != "seed"])
-    inherited, starts = others[start] if start else (ModelChoice(), {})
-    model = as_record({**inherited.as_dict(), **{key: plan[key] for key in models if key in plan}}, ModelChoice)
-    split, cells = bench.split(_scenarios(dataset, plan.get("split", "all"))), {}
+    if plan.also is not None:
+        other, there = releases[plan.also]
+        also_split = bench.split(_scenarios(there, plan.also_split))
+        second = SecondSource(dataset=there, split=str(also_split), mix=plan.mix)
+        told["also"] = {"release": other.key, "mix": plan.mix}
+        if plan.also_split != "all":  # which it was in keys of earlier studies
+            told["also"]["split"] = also_split.name
+    for key in given:
+        choice("key", key, [each for each in (*Plan.__struct_encode_fields__, *models, *trainings) if each != "seed"])
+    inherited, starts = others[plan.start] if plan.start else (ModelChoice(), {})
+    model = as_record({**inherited.as_dict(), **{key: given[key] for key in models if key in given}}, ModelChoice)
+    split, cells = bench.split(_scenarios(dataset, plan.split)), {}
     for seed in recipe.seeds:
-        given = {"validation": None, **{key: plan[key] for key in trainings if key in plan}, "split": str(split)}
-        config = as_record({**given, "seed": seed}, TrainConfig)
+        training = {key: given[key] for key in trainings if key in given}
+        config = as_record({"validation": None, **training, "split": str(split), "seed": seed}, TrainConfig)
         first = starts.get(str(seed), starts.get(""))
         cells[str(seed)] = bench.cell(
             "weights",
@@ -214,14 +234,13 @@ def _seeds(
 
 
 def _rows(
-    recipe: Recipe, bench: Bench, release: _Release, weights: Mapping[str, _Weights]
+    recipe: Recipe, bench: Bench, release: _Release, weights: Mapping[str, _Weights], scenarios: Sequence[str]
 ) -> dict[str, dict[str, Cell]]:
-    """Row → seed → its cell, all at the same samples."""
+    """Row → seed → its cell, all at the same samples of some scenarios."""
     (cell, dataset), test, found = release, recipe.test, {}
     horizons = {
         row.name: (weights[row.weights][0] if row.weights else row).horizon or DEFAULT_HORIZON for row in recipe.rows
     }
-    scenarios = _matching(dataset, test.where, _scenarios(dataset, test.split), recipe, "test.where")
     selection = SampleSelection(
         split=str(bench.split(scenarios)),
         samples=test.samples,
@@ -272,7 +291,8 @@ def _matching(
 def _counted(recipe: Recipe, dataset: DeepAccident, rows: Mapping[str, Mapping[str, Cell]]) -> Counted:
     """What was counted of all rows, and the groups of samples."""
     told = {
-        **{name: getattr(recipe, name) for name in ("title", "question")},
+        "title": recipe.title,
+        "question": recipe.question,
         "labels": recipe.test.labels,
         "headline": msgspec.to_builtins(recipe.headline),
         "compare": [list(pair) for pair in recipe.pairs],

@@ -2,12 +2,15 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 from studies import written
 
 from deepaccident_devkit.errors import ConfigError
+from deepaccident_devkit.evaluation.breakdowns import cluster_of
 from deepaccident_devkit.study import read_recipe, run_study
+from deepaccident_devkit.study.overlap import known_scenarios
 
 SMALL = {"scenarios": 4, "frames": 16, "image_size": [64, 36], "sensor_step": 5}
 ROAD = {**SMALL, "rig": "road", "nuscenes": True}
@@ -42,6 +45,23 @@ def test_it_runs_and_has_no_numbers_of_accidents(tmp_path: Path) -> None:
     notes = json.loads((tmp_path / "out" / "weights" / trained["mixed, seed 1"] / "run.json").read_text())
     assert notes["also"]["mix"] == 0.5
     assert "APA" not in report.to_text()
+
+
+def test_an_export_to_nuscenes_is_known_by_its_actors(pair: Any) -> None:
+    """Its instances have other numbers, and its scenes other names."""
+    ours, theirs = ((each, [record["token"] for record in each.scenario]) for each in (pair.release, pair.road))
+    assert known_scenarios(ours, theirs) == theirs[1]
+    assert known_scenarios(theirs, ours) == ours[1]
+    assert known_scenarios((pair.road, theirs[1][:1]), ours)
+    assert {cluster_of(token) for token in theirs[1]} == {cluster_of(token) for token in ours[1]}
+
+
+def test_a_training_on_the_release_of_a_tested_export_is_refused(tmp_path: Path) -> None:
+    """It has more frames, other sensors, and the other format, but the same seed."""
+    releases = {**RECIPE["releases"], "simulation": {**SMALL, "seed": 3, "frames": 20}}
+    path = written(tmp_path, {**RECIPE, "releases": releases})
+    with pytest.raises(ConfigError, match=r"weights.simulation: simulation, all: shows \d+ scenarios of the test"):
+        run_study(read_recipe(str(path)), tmp_path / "out", device="cpu", workers=1)
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,7 @@
 """Studies with models: what is trained, what spoilt inputs are, and that a killed run ends as one that was not."""
 
 import json
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -131,9 +132,73 @@ def test_weights_that_cannot_be_are_told_before_anything_is_trained(
 ) -> None:
     plans = {"trunk": {"release": "test", **changes}}
     rows = [{"name": "one", "weights": "trunk"}]
-    given = {"releases": {"test": {"dataroot": str(da.dataroot)}}, "weights": plans, "rows": rows}
+    test = {**MODELS["test"], "includes_training": True}
+    given = {"releases": {"test": {"dataroot": str(da.dataroot)}}, "test": test, "weights": plans, "rows": rows}
     recipe = {**BASELINES, **given, "compare": [], "headline": {"row": "one", "less": "one"}, "groups": {}}
     with pytest.raises(ConfigError, match=told):
+        run_study(read_recipe(str(written(tmp_path, recipe))), tmp_path / "out", device="cpu", workers=1)
+
+
+def renumbered(root: Path, copy: Path) -> str:
+    """A copy of a release whose scenarios have other numbers."""
+    shutil.copytree(root, copy, ignore=shutil.ignore_patterns(".deepaccident", "Camera_*", "lidar01"))
+    for path in sorted(copy.rglob("*scenario0*"), key=lambda path: -len(path.parts)):
+        path.rename(path.with_name(path.name.replace("scenario0", "scenario7")))
+    for listed in copy.glob("*.txt"):
+        listed.write_text(listed.read_text().replace("scenario0", "scenario7"))
+    return str(copy)
+
+
+@pytest.mark.parametrize(
+    ("plan", "named"),
+    [
+        ({"release": "here"}, "here, all"),
+        ({"release": "here", "split": "train"}, "here, train"),
+        ({"release": "other", "also": "here"}, "here, all"),
+        ({"release": "other", "also": "here", "also_split": "train"}, "here, train"),
+        ({"release": "here", "split": "test", "validation": "train"}, "here, train"),
+        ({"release": "copy", "split": "train"}, "copy, train"),
+        ({"release": "other", "also": "copy"}, "copy, all"),
+    ],
+)
+def test_a_training_that_shows_the_test_is_refused(
+    plan: dict[str, Any], named: str, da: DeepAccident, da_b: DeepAccident, tmp_path: Path
+) -> None:
+    """Before anything is trained, and unless the recipe says so; a split that the test does not have is no fault."""
+    roots = {"here": str(da.dataroot), "other": str(da_b.dataroot), "copy": renumbered(da.dataroot, tmp_path / "copy")}
+    recipe = {
+        **MODELS,
+        "releases": {name: {"dataroot": root} for name, root in roots.items()},
+        "weights": {"one": {"release": "other", "preset": "tiny_"}, "two": {"preset": "tiny", **plan}},
+        "rows": [{"name": "all", "weights": "two"}],
+        "test": {"release": "here", "split": "train", "labels": "clean", "horizon": 0.5},
+        "headline": None,
+        "compare": [],
+    }
+    with pytest.raises(ConfigError, match=f"mine: weights.two: {named}: shows .* scenarios of the test") as raised:
+        run_study(read_recipe(str(written(tmp_path, recipe))), tmp_path / "out", device="cpu", workers=1)
+    assert "also_split" in str(raised.value)
+    assert "includes_training: true" in str(raised.value)
+    assert not (tmp_path / "out" / "weights").exists()
+    allowed = {**recipe, "test": {**recipe["test"], "includes_training": True}}
+    with pytest.raises(ConfigError, match=r"mine: weights.one: .*'tiny_'"):  # which comes next
+        run_study(read_recipe(str(written(tmp_path, allowed))), tmp_path / "out", device="cpu", workers=1)
+
+
+def test_splits_that_have_nothing_in_common_are_no_fault(da_b: DeepAccident, tmp_path: Path) -> None:
+    splits = {split: da_b.split_scenarios(split) for split in ("train", "val", "test")}
+    learned, tested = [split for split, scenarios in splits.items() if scenarios][:2]
+    plan = {"release": "here", "split": learned, "also": "here", "also_split": learned, "preset": "tiny_"}
+    recipe = {
+        **MODELS,
+        "releases": {"here": {"dataroot": str(da_b.dataroot)}},
+        "weights": {"one": plan},
+        "rows": [{"name": "all", "weights": "one"}],
+        "test": {"release": "here", "split": tested, "labels": "clean", "horizon": 0.5},
+        "headline": None,
+        "compare": [],
+    }
+    with pytest.raises(ConfigError, match=r"mine: weights.one: .*'tiny_'"):
         run_study(read_recipe(str(written(tmp_path, recipe))), tmp_path / "out", device="cpu", workers=1)
 
 

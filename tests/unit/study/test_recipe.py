@@ -8,7 +8,7 @@ import pytest
 
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.study import read_recipe
-from deepaccident_devkit.study.recipe import SHIPPED, Row
+from deepaccident_devkit.study.recipe import MOST_ROWS, SHIPPED, Row
 
 PLAIN: dict[str, Any] = {
     "title": "A study",
@@ -60,6 +60,21 @@ def written(folder: Path, recipe: dict[str, Any]) -> str:
         ({"test": {"release": "training"}}, "test: release: expected .*'training'"),
         ({"test": {"release": "test", "where": ["town"]}}, r"test.where, groups: expected field=value"),
         ({"test": {"release": "test", "labels": "cleam"}}, "test: .*did you mean 'clean'"),
+        ({"test": {"release": "TEST"}}, "test: release: found 'TEST'; write it with the same capital letters"),
+        ({"headline": {"row": "one", "less": "two", "number": "APA"}}, "headline: number: found 'APA'"),
+        ({"rows": []}, "rows: expected 1 to 1,000, found 0"),
+        ({"rows": [{"name": "one", "trivial": "nothing", "agents": []}]}, "rows: expected 1 to 1,000, found 0"),
+        ({"rows": [{"name": "one", "baseline": "standing", "horizon": 1e9}]}, "rows: one: horizon: 1000000000.0 s"),
+        ({"test": {"release": "test", "horizon": 1e12}}, "test: horizon: 1000000000000.0 s .* up to 100"),
+        ({"releases": {"test": {"spec": 3}}}, r"expected `str`, got `int` - at `\$.releases\[...\].spec`"),
+        ({"releases": {"test": {"dataroot": [1]}}}, r"expected `str`, got `array` - at `\$.releases\[...\].dataroot`"),
+        *(
+            ({**MODEL, "weights": {"trunk": {"release": "test", key: value}}}, f"weights.trunk: .*{key}")
+            for key, value in {"mix": "abc", "also": 3, "also_split": [1], "split": None, "from": ["a"]}.items()
+        ),
+        ({**MODEL, "weights": {"trunk": {"release": "test", "mix": 1.5}}}, "mix: expected a share .*found 1.5"),
+        ({"seeds": [-1]}, r"expected `int` >= 0 - at `\$.seeds\[0\]`"),
+        ({"seeds": list(range(101))}, r"length <= 100 - at `\$.seeds`"),
         ({"by": ["town_hall"]}, "by: by: expected one of .*'town_hall'"),
         ({"compare": [["one", "three"]]}, "compare, headline: row: expected one of one, two, found 'three'"),
         ({"headline": {"row": "one", "less": "two", "number": "apaa"}}, "headline: number: .*did you mean 'apa'"),
@@ -73,6 +88,40 @@ def test_a_fault_is_named_with_its_file_its_key_and_a_remedy(
     with pytest.raises(ConfigError, match=told) as raised:
         read_recipe(path)
     assert str(raised.value).startswith(f"{path}: ")
+
+
+@pytest.mark.parametrize("rows", [5, [5], {"a": 1}, None])
+def test_rows_of_the_smoke_part_are_rows(rows: Any, tmp_path: Path) -> None:
+    path = written(tmp_path, {**PLAIN, "smoke": {"rows": rows}})
+    with pytest.raises(ConfigError, match=r"mine.yaml: the recipe: expected .* got .* - at `\$.rows"):
+        read_recipe(path, smoke=True)
+
+
+def test_lists_in_many_keys_are_counted_before_they_are_multiplied_out(tmp_path: Path) -> None:
+    numbers = {key: [float(each) for each in range(100)] for key in ("horizon", "latency", "pose_noise", "packet_loss")}
+    row = {"name": "a", "baseline": "standing", **numbers, "agents": ["all"] * 100, "budget": list(range(1, 101))}
+    with pytest.raises(ConfigError, match=r"rows: expected 1 to 1,000, found 1,000,000,000,000: a list makes a row"):
+        read_recipe(written(tmp_path, {**PLAIN, "rows": [row]}))
+    many = [{"name": f"{{agents}} {each}", "trivial": "nothing", "agents": ["all", "single"]} for each in range(500)]
+    assert len(read_recipe(written(tmp_path, {**PLAIN, "rows": many})).rows) == MOST_ROWS
+    with pytest.raises(ConfigError, match="found 1,001"):
+        read_recipe(written(tmp_path, {**PLAIN, "rows": [*many, {"name": "one", "trivial": "nothing"}]}))
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"rows": [{"name": f"n{each}", "trivial": "nothing"} for each in range(28_000)]},
+        {"weights": {f"w{each}": {"release": "test"} for each in range(40_000)}},
+    ],
+)
+def test_a_recipe_of_too_many_characters_is_not_parsed(changes: dict[str, Any], tmp_path: Path) -> None:
+    path = written(tmp_path, {**PLAIN, **changes})
+    with pytest.raises(
+        ConfigError, match=r"has [\d,]+ characters, more than 100,000; split the study|more than"
+    ) as told:
+        read_recipe(path)
+    assert path in str(told.value)
 
 
 def test_files_that_are_no_recipes(tmp_path: Path) -> None:
