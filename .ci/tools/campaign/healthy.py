@@ -10,6 +10,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
+import yaml
 from packing import packed
 
 from deepaccident_devkit import DeepAccident
@@ -23,6 +24,7 @@ from deepaccident_devkit.export.images import ImageConfig
 from deepaccident_devkit.export.opencood import OpenCood
 from deepaccident_devkit.export.questions import Questions, WindowRules
 from deepaccident_devkit.motion import MotionLabelConfig, write_label_files
+from deepaccident_devkit.study.recipe import SHIPPED
 from deepaccident_devkit.synth.spec import design_text
 from deepaccident_devkit.taxonomy import CAMERAS, AgentName
 from deepaccident_devkit.testing import SmallRelease, write_small_release
@@ -41,6 +43,44 @@ SETUPS = {
 }
 
 
+RECIPE = {
+    "title": "Every key",
+    "question": "Is each of them read?",
+    "releases": {
+        "there": {"dataroot": "/data/DeepAccident", "version": "v1"},
+        "made": {"seed": 3, "scenarios": 4, "frames": 20, "spec": "scenes/mine.yaml", "nuscenes": True},
+    },
+    "weights": {
+        "first": {"release": "there", "split": "train", "preset": "tiny", "steps": 10, "learning_rate": 0.001},
+        "second": {"release": "made", "also": "there", "also_split": "val", "mix": 0.25, "from": "first"},
+        "given": {"file": "tiny"},
+    },
+    "test": {
+        "release": "made",
+        "split": "all",
+        "samples": "evaluate",
+        "scope": "all",
+        "agents": ["ego_vehicle"],
+        "horizon": 1.5,
+        "where": ["town=Town03"],
+        "labels": "clean",
+        "includes_training": True,
+    },
+    "seeds": [1, 2],
+    "rows": [
+        {"name": "{agents}, {latency} s", "weights": "first", "agents": ["single", "all"], "latency": [0.0, 0.2]},
+        {"name": "boxes", "weights": "second", "baseline": "constant_velocity", "budget": 1000, "packet_loss": 0.1},
+        {"name": "black", "weights": "given", "control": "blank"},
+        {"name": "off {pose_noise} m", "baseline": "standing", "pose_noise": [0.0, 0.5], "horizon": 2.0},
+        {"name": "nothing", "trivial": "nothing"},
+    ],
+    "groups": {"hidden": ["hidden_collider=true"]},
+    "by": ["impact_step"],
+    "compare": [["boxes", "black"]],
+    "headline": {"row": "boxes", "less": "nothing", "number": "map", "where": "hidden"},
+    "smoke": {"seeds": [1], "releases": {"made": {"scenarios": 2}}},
+}
+"""A recipe of a study."""
 HAS_TORCH = find_spec("torch") is not None
 
 
@@ -72,6 +112,10 @@ def make_healthy(folder: Path) -> Path:
     write_label_files(dataset, folder / "labels", tokens(dataset), LABELS, workers=1)
     (folder / "specs").mkdir()
     (folder / "specs" / "crossing.yaml").write_text(design_text(1), encoding="utf-8")
+    (folder / "recipes").mkdir()
+    for name in ("agents", "road"):
+        shutil.copy(SHIPPED / f"{name}.yaml", folder / "recipes")
+    (folder / "recipes" / "every_key.yaml").write_text(yaml.safe_dump(RECIPE, sort_keys=False), encoding="utf-8")
     _write_exports(dataset, sensors, folder)
     for method in ("stored", "deflated"):
         packed(folder / "small", folder / "zips" / f"{method}.zip", method)

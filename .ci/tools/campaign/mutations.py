@@ -23,8 +23,9 @@ Rng = np.random.Generator
 Change = Callable[[bytes, Rng], bytes]
 _JSON = ("json", "manifest", "record", "address")
 _ARCHIVES = ("zip", "pt")
+_YAML = ("yaml", "recipe")
 _OTHERS = ("journal", "images", "safetensors", "pth", *_ARCHIVES)
-FORMS = ("text", *_JSON, "lines", "yaml", "pickle", "npz", "image", "arrow", "parquet", "shard", *_OTHERS)
+FORMS = ("text", *_JSON, "lines", *_YAML, "pickle", "npz", "image", "arrow", "parquet", "shard", *_OTHERS)
 GROUPS = ("bytes", "numbers", "types", "bombs", "links", "names")
 MARKER = "a pickle has run"
 """The folder beside the changed files that a pickle makes whose code is run."""
@@ -36,7 +37,7 @@ _SPARSE = 5 << 30
 """Bytes of a file that is mostly a hole."""
 _MOST_ROWS, _MOST_BYTES = 40, 200_000
 """What a mutation that takes long keeps of an array."""
-_TEXTS = ("text", *_JSON, "lines", "yaml")
+_TEXTS = ("text", *_JSON, "lines", *_YAML)
 _NUMBER = re.compile(rb"-?\d+\.?\d*(?:[eE][-+]?\d+)?")
 
 
@@ -280,12 +281,12 @@ def json_key_twice(content: bytes, rng: Rng) -> bytes:
     return content[:begin] + content[begin:end] + b" 7, " + content[begin:]
 
 
-@by_content("types", *_JSON, "yaml")
+@by_content("types", *_JSON, *_YAML)
 def another_top(_before: bytes, rng: Rng) -> bytes:
     return any_of(rng, (b"[]", b"{}", b"null", b"1", b'"text"', b"[" * 50 + b"]" * 50, b"{}{}", b"NaN", b"true"))
 
 
-@by_content("types", "yaml")
+@by_content("types", *_YAML)
 def yaml_value_replaced(content: bytes, rng: Rng) -> bytes:
     tree = yaml.safe_load(content)
     inside = any_of(rng, [each for each in containers(tree) if each])
@@ -295,7 +296,7 @@ def yaml_value_replaced(content: bytes, rng: Rng) -> bytes:
     return yaml.safe_dump(tree).encode("utf-8", "surrogatepass")
 
 
-@by_path("types", "yaml")
+@by_path("types", *_YAML)
 def yaml_tags(path: Path, rng: Rng) -> None:
     made = json.dumps(str(path.parent / MARKER)).encode()
     tags = (b"!!python/object/apply:os.mkdir [" + made + b"]", b"!!python/name:os.system", b"!!binary aGk=", b"!!int x")
@@ -457,7 +458,7 @@ def many_lines(content: bytes, rng: Rng) -> bytes:
     return content + (b"\n" if not content.endswith(b"\n") else b"") + any_of(rng, (lines[-1], b"\n", b"-\n")) * 50_000
 
 
-@by_content("bombs", *_JSON, "yaml")
+@by_content("bombs", *_JSON, *_YAML)
 def deep_nesting(content: bytes, rng: Rng) -> bytes:
     depth = any_of(rng, (900, 5_000, 200_000))
     nest = any_of(rng, (b"[" * depth + b"]" * depth, b'{"a":' * depth + b"1" + b"}" * depth, b"[" * depth))
@@ -466,7 +467,7 @@ def deep_nesting(content: bytes, rng: Rng) -> bytes:
     return content[:begin] + nest + content[end:]
 
 
-@by_content("bombs", "yaml")
+@by_content("bombs", *_YAML)
 def many_laughs(content: bytes, rng: Rng) -> bytes:
     levels = [f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 9)}]" for n in range(1, 10)]
     return "\n".join(["a0: &a0 [lol]", *levels, content.decode()]).encode()
@@ -657,7 +658,7 @@ def json_key_with_an_odd_name(content: bytes, rng: Rng) -> bytes:
     return json.dumps(tree).encode()
 
 
-@by_content("names", "yaml")
+@by_content("names", *_YAML)
 def yaml_text_with_an_odd_name(content: bytes, rng: Rng) -> bytes:
     tree = yaml.safe_load(content)
     tree[any_of(rng, list(tree))] = any_of(rng, ODD_NAMES)

@@ -3,6 +3,7 @@
 import json
 from collections.abc import Mapping
 from functools import cache
+from math import prod
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -18,6 +19,7 @@ from deepaccident_devkit.export.bulk import export_release
 from deepaccident_devkit.export.image_cache import ImageCache
 from deepaccident_devkit.export.questions import read_answers, results_of_answers
 from deepaccident_devkit.parallel import cluster_executor, executors
+from deepaccident_devkit.study import Recipe, read_recipe
 from deepaccident_devkit.validation import validate_release
 
 assert other_mutations  # made for these
@@ -150,6 +152,23 @@ def _judge_findings(room: Room, sentences: list[str]) -> str | None:
     return f"no word of {untold[0]}, which is damaged" if untold else None
 
 
+# ---- recipes of studies
+
+
+def _judge_recipe(room: Room, read: Recipe) -> str | None:
+    """The same names in the same order, and a row for each value of the lists."""
+    said = plain.yaml_file(room.victim)
+    for part in ("title", "question"):
+        if getattr(read, part) != said[part]:
+            return f"another {part}"
+    for part in ("releases", "weights", "groups"):
+        if list(getattr(read, part)) != list(said.get(part, {})):
+            return f"other {part}"
+    keys = ("agents", "latency", "pose_noise", "packet_loss", "budget", "horizon")
+    lists = [[row[key] for key in keys if isinstance(row.get(key), list)] for row in said["rows"]]
+    return None if len(read.rows) == sum(prod(map(len, each)) for each in lists) else "another number of rows"
+
+
 _EXPORTED = Action(_exported, _judge_exported)
 _CACHED = Action(_cached, _judge_cached)
 _JOURNALS = ".deepaccident-parts/kept/opencood/*.paths"
@@ -161,6 +180,16 @@ KINDS = (
     Kind("questions' truth", "lines", "questions", "truth.jsonl", (Action(_answered, _judge_answers),)),
     Kind("images cache's list", "manifest", "cache", "cache.manifest.json", (_CACHED,)),
     Kind("images cache", "images", "cache", "*.images", (_CACHED,)),
+    Kind(
+        "study recipes",
+        "recipe",
+        "recipes",
+        "*.yaml",
+        (
+            Action(lambda room: read_recipe(str(room.victim)), _judge_recipe),
+            Action(lambda room: read_recipe(str(room.victim), smoke=True)),
+        ),
+    ),
     Kind("scheduler file", "address", "schedulers", "scheduler.json", (Action(_scheduled, _judge_scheduled),)),
     Kind(
         "zip of a release",

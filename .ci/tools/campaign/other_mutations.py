@@ -2,12 +2,15 @@
 
 import io
 import json
+import math
 import os
 import struct
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+
+import yaml
 
 from campaign.mutations import ODD_NAMES, Rng, any_of, by_content, by_path, containers, outside_of, replace, squeezed
 
@@ -94,6 +97,126 @@ def journal_of_another_unit(content: bytes, rng: Rng) -> bytes:
     return any_of(
         rng, (turned, content + content, content.decode().encode("utf-16"), b"\xff\xfe\0" + content, b"[]", b"{}")
     )
+
+
+# ---- recipes of studies
+
+_ODD = (
+    None,
+    True,
+    False,
+    0,
+    -1,
+    3.5,
+    1e9,
+    1e300,
+    math.inf,
+    math.nan,
+    10**18,
+    10**30,
+    "",
+    "x",
+    "\0",
+    [],
+    [1],
+    [[1]],
+    {},
+)
+"""In the place of a value."""
+_MANY = 3_000
+
+
+def _recipe(content: bytes) -> Any:
+    """The tree of a recipe, and all places of values in it: what they are inside of, and their key."""
+    tree = yaml.safe_load(content)
+    places = [
+        (inside, key)
+        for inside in containers(tree)
+        for key in (list(inside) if isinstance(inside, dict) else range(len(inside)))
+    ]
+    return tree, places
+
+
+def _yaml(tree: Any) -> bytes:
+    return yaml.safe_dump(tree, sort_keys=False).encode("utf-8", "surrogatepass")
+
+
+@by_content("types", "recipe")
+def recipe_value_of_another_type(content: bytes, rng: Rng) -> bytes:
+    tree, places = _recipe(content)
+    for _ in range(int(rng.integers(1, 4))):
+        inside, key = any_of(rng, places)
+        inside[key] = any_of(rng, _ODD)
+    return _yaml(tree)
+
+
+@by_content("types", "recipe")
+def recipe_key_added_or_left_out(content: bytes, rng: Rng) -> bytes:
+    """Keys that recipes know, where they do not belong."""
+    tree, places = _recipe(content)
+    known = sorted(
+        {str(key) for _, key in places} | {"mix", "also_split", "file", "spec", "validation", "over", "name"}
+    )
+    inside = any_of(rng, [each for each in containers(tree) if each and isinstance(each, dict)])
+    if rng.integers(2):
+        inside[any_of(rng, known)] = any_of(rng, (*_ODD, "test", "train", {"release": "test"}))
+    else:
+        del inside[any_of(rng, list(inside))]
+    return _yaml(tree)
+
+
+@by_content("numbers", "recipe")
+def recipe_number_beyond_bounds(content: bytes, rng: Rng) -> bytes:
+    tree, places = _recipe(content)
+    numbers = [(inside, key) for inside, key in places if isinstance(inside[key], int | float)]
+    inside, key = any_of(rng, numbers)
+    inside[key] = any_of(rng, (0, -1, 1e9, -1e9, 1e300, 10**12, 10**40, 0.1 + 1e-9, math.inf, -math.inf, math.nan))
+    return _yaml(tree)
+
+
+@by_content("bombs", "recipe")
+def recipe_multiplied(content: bytes, rng: Rng) -> bytes:
+    """Lists in several keys of a row, each with many values."""
+    tree, _ = _recipe(content)
+    count = any_of(rng, (10, 100, 1000))
+    lists = {key: [float(each) for each in range(count)] for key in ("latency", "pose_noise", "packet_loss", "horizon")}
+    row = {"name": "{latency} {agents}", "baseline": "standing", "agents": ["all"] * count, **lists}
+    tree["rows"] = any_of(rng, ([row], [*tree["rows"], row], [row] * 20))
+    return _yaml(tree)
+
+
+@by_content("bombs", "recipe")
+def recipe_of_many(content: bytes, rng: Rng) -> bytes:
+    """Thousands of rows, weights, releases, groups, pairs or seeds, or one that is very long."""
+    tree, _ = _recipe(content)
+    row, name = tree["rows"][-1], any_of(rng, ("a", "\u202e", "n" * 20))
+    part, value = any_of(
+        rng,
+        (
+            ("rows", [{**row, "name": f"{name}{each}"} for each in range(_MANY)]),
+            ("weights", {f"{name}{each}": {"file": "tiny"} for each in range(_MANY)}),
+            ("releases", {**tree["releases"], **{f"{name}{each}": {"scenarios": 2} for each in range(_MANY)}}),
+            ("groups", {f"{name}{each}": ["town=Town03"] for each in range(_MANY)}),
+            ("compare", [[row["name"], row["name"]]] * _MANY),
+            ("seeds", list(range(_MANY))),
+            ("by", ["impact_step"] * _MANY),
+            ("title", name * 50_000),
+            ("test", {**tree["test"], "where": [f"town={name * 30_000}"]}),
+            ("rows", [{**row, "name": name * 4_000}] * 10),
+        ),
+    )
+    return _yaml({**tree, part: value})
+
+
+@by_content("names", "recipe")
+def recipe_name_that_is_not_there(content: bytes, rng: Rng) -> bytes:
+    """A text becomes another one: in capital letters, that of something else, or an odd one."""
+    tree, places = _recipe(content)
+    texts = [(inside, key) for inside, key in places if isinstance(inside[key], str)]
+    inside, key = any_of(rng, texts)
+    other, name = any_of(rng, texts)
+    inside[key] = any_of(rng, (inside[key].upper(), other[name], f"{inside[key]} ", *ODD_NAMES))
+    return _yaml(tree)
 
 
 # ---- JSON: settings, notes, addresses
