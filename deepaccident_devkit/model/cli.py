@@ -123,4 +123,7 @@ def train(weights: Path | None, also: Path | None, mix: float, **options: Any) -
         say=click.echo,
     )
     click.echo(f"weights: {best}")
-    click.echo(f"next: deepaccident predict {options['out']} {options['dataroot']} --split val --out results")
+    click.echo(
+        f"next: deepaccident predict {options['out']} {options['dataroot']} --split val --out results\n"
+        "Numbers on the split that chose the weights (--validation, by default val) flatter them."
+    )
