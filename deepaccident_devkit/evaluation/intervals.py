@@ -121,12 +121,10 @@ def difference_intervals(
     Returns:
         (M,) low and (M,) high ends, NaN for none (`interval_ends`), and (M,) standard errors.
     """
-    names, values = list(differences), np.array(list(differences.values()))
-    parts = [parts_of(each, resampling) for each in pair]
-    first, second = (numbers_of_draws(evaluator, each, leaving_out(len(each)), names) for each in parts)
-    unlimited = np.broadcast_to((-math.inf, math.inf), (len(names), 2))
-    low, high = interval_ends(values, second - first, unlimited, resampling.confidence)
-    return low, high, standard_errors(values, second - first)[0]
+    values = np.array(list(differences.values()))
+    first, second = (draws_of_parts(evaluator, each, differences, resampling) for each in pair)
+    low, high, _ = ends_of_draws(differences, values, second - first, resampling.confidence, limited=False)
+    return low, high, standard_errors(values, np.split(second - first, 2)[1])[0]
 
 
 def draws_of_parts(
@@ -134,8 +132,8 @@ def draws_of_parts(
 ) -> FloatArray:
     """(2P, M) the numbers of these M names in each of the P parts of the clusters alone, then in all but each."""
     parts = parts_of(clusters, resampling)
-    others = leaving_out(len(parts))
-    return numbers_of_draws(evaluator, parts, np.vstack([1 - others, others]), names)
+    alone = np.eye(len(parts), dtype=np.int64)
+    return numbers_of_draws(evaluator, parts, np.vstack([alone, 1 - alone]), names)
 
 
 def ends_of_draws(
@@ -174,11 +172,6 @@ def parts_of(clusters: Clusters, resampling: Resampling) -> Clusters:
         return clusters
     order = np.random.default_rng(resampling.seed).permutation(len(clusters)).tolist()
     return [[counts for at in order[first::most] for counts in clusters[at]] for first in range(most)]
-
-
-def leaving_out(count: int) -> IntArray:
-    """(P, P) draws of P parts: each without one of them."""
-    return 1 - np.eye(count, dtype=np.int64)
 
 
 def numbers_of_draws(evaluator: Evaluator[Any], parts: Clusters, times: IntArray, names: Iterable[str]) -> FloatArray:

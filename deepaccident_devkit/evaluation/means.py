@@ -75,8 +75,10 @@ class MeansResult(TaskResult):
             if each.is_headline
         )
         super(MeansResult, cls).__init_subclass__()
-        HEADLINE_UNITS.update({f"means/*/{name}": each.unit for name, each in cls.columns.items()})
-        SIGNED_NUMBERS.update(f"means/*/{name}" for name, each in cls.columns.items() if each.is_signed)
+        for name, each in cls.columns.items():
+            HEADLINE_UNITS[f"means/*/{name}"] = each.unit
+            if each.is_signed:
+                SIGNED_NUMBERS.add(f"means/*/{name}")
 
 
 Result = TypeVar("Result", bound=MeansResult)

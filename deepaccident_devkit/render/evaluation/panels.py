@@ -60,32 +60,29 @@ def draw_bars(bars: Sequence[Bar], ax: Axes, limit: float | None = None) -> Axes
     """Render bars, the first on top, unknown values as dashes; the limit is the largest possible value, if known."""
     if not bars:
         return draw_nothing(ax)
-    starts, ends = [0.0], [0.0]
+    reached = [0.0]
     for row, bar in enumerate(bars):
-        end = 0.0
+        own = [0.0]
         if bar.value is not None:
             ax.barh(row, bar.value, height=0.66, color=bar.color)
-            starts.append(bar.value)
-            end = max(end, bar.value)
+            own.append(bar.value)
         if bar.value is not None and bar.interval is not None and all(map(math.isfinite, bar.interval)):
-            low, high = bar.interval
-            ax.plot((low, high), (row, row), color="black", linewidth=1.2, marker="|", markersize=7)
-            starts.append(low)
-            end = max(end, high)
+            ax.plot(bar.interval, (row, row), color="black", linewidth=1.2, marker="|", markersize=7)
+            own += bar.interval
         ax.annotate(
             "–" if bar.value is None else bar.text,
-            (end, row),
+            (max(own), row),
             (5, 0),
             textcoords="offset points",
             va="center",
             fontsize=text_size(),
             bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.5},  # over a line that marks a value
         )
-        ends.append(end)
-    if min(starts) < 0:
+        reached += own
+    if min(reached) < 0:
         limit = None  # of shares, which these are not
-    reach = max(ends) if limit is None else limit
-    ax.set(xlim=(min(starts), _BESIDE * (reach or 1.0)))
+    reach = max(reached) if limit is None else limit
+    ax.set(xlim=(min(reached), _BESIDE * (reach or 1.0)))
     if limit is not None:
         ax.set_xticks([limit * part / 5 for part in range(6)])
     labels = [f"{bar.label}\n{bar.below}".strip() for bar in bars]
