@@ -132,8 +132,8 @@ def draws_of_parts(
 ) -> FloatArray:
     """(2P, M) the numbers of these M names in each of the P parts of the clusters alone, then in all but each."""
     parts = parts_of(clusters, resampling)
-    alone = np.eye(len(parts), dtype=np.int64)
-    return numbers_of_draws(evaluator, parts, np.vstack([alone, 1 - alone]), names)
+    others = leaving_out(len(parts))
+    return numbers_of_draws(evaluator, parts, np.vstack([1 - others, others]), names)
 
 
 def ends_of_draws(
@@ -172,6 +172,11 @@ def parts_of(clusters: Clusters, resampling: Resampling) -> Clusters:
         return clusters
     order = np.random.default_rng(resampling.seed).permutation(len(clusters)).tolist()
     return [[counts for at in order[first::most] for counts in clusters[at]] for first in range(most)]
+
+
+def leaving_out(count: int) -> IntArray:
+    """(P, P) draws of P parts: each without one of them."""
+    return 1 - np.eye(count, dtype=np.int64)
 
 
 def numbers_of_draws(evaluator: Evaluator[Any], parts: Clusters, times: IntArray, names: Iterable[str]) -> FloatArray:

@@ -38,7 +38,7 @@ def known_scenarios(learned: Scenarios, tested: Scenarios) -> list[str]:
 
 
 def _actors(dataset: Dataset, scenarios: Collection[str], *, with_ids: bool) -> dict[str, _Actors]:
-    """Return the actors of each scenario: id, which is 0 without ids, and size to the centimetre."""
+    """Return the actors of each scenario: id, which is 0 without ids, and size in steps of 0.01 m."""
     instances = dataset.columns("instance")
     size = np.round(dataset.columns("annotation")["size"][instances["first_annotation_row"]], 2)
     actors = np.column_stack([instances["actor_id"] * with_ids, size])

@@ -46,6 +46,8 @@ _LISTS: Final = ("agents", "horizon", *_EFFECTS)
 """Of a row, what can be a list: a row each."""
 MOST_ROWS: Final = 1000
 """Rows of a recipe, when each list has become a row for each of its values."""
+Seeds = Annotated[tuple[Annotated[int, msgspec.Meta(ge=0, lt=1 << 62)], ...], msgspec.Meta(max_length=100)]
+"""Up to 100 numbers that fit into torch's generator."""
 _MOST_CHARACTERS: Final = 100_000
 """Of a recipe, which PyYAML reads in a second or two; those that ship have up to 3,000."""
 
@@ -215,7 +217,7 @@ class Recipe(_Part, frozen=True, kw_only=True):
     releases: dict[str, dict[str, Any]]
     test: TestedOn
     rows: tuple[Row, ...]
-    seeds: Annotated[tuple[Annotated[int, msgspec.Meta(ge=0, lt=1 << 62)], ...], msgspec.Meta(max_length=100)] = (1,)
+    seeds: Seeds = (1,)
     weights: dict[str, dict[str, Any]] = {}
     groups: dict[str, tuple[str, ...]] = {}
     by: tuple[str, ...] = ()
@@ -263,7 +265,7 @@ def read_recipe(recipe: str, *, smoke: bool = False) -> Recipe:
     try:
         text = read_bytes(path, "spec").decode().strip()
         if len(text) > _MOST_CHARACTERS:
-            raise ConfigError(f"{path}: has {len(text):,} characters, more than {_MOST_CHARACTERS:,}; split the study")
+            raise ConfigError(f"{path}: has more than 100,000 characters; split the study")
         told = _plain(parse_yaml(text or "{}", str(path)))
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: {fault_text(error)}; give a file of YAML, in UTF-8") from error

@@ -12,6 +12,7 @@ WRITTEN = {
     "numbers.numbers_of_rows": "less=None",
     "page.PAGE": "'index.html'",
     "recipe.DEFAULT_HORIZON": "2.0",
+    "recipe.MOST_ROWS": "1000",
     "recipe.NUSCENES": "'nuscenes'",
     "recipe.read_recipe": "smoke=False",
     "run.run_study": "device='auto'",

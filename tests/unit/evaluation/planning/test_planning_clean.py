@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from planning_scenes import CAR, GIVEN, SCENARIO, plan_at, scene, straight
 
 from deepaccident_devkit.evaluation.breakdowns import cluster_of
-from deepaccident_devkit.evaluation.intervals import intervals_of, numbers_of_draws, range_of
+from deepaccident_devkit.evaluation.intervals import intervals_of, leaving_out, numbers_of_draws, range_of
 from deepaccident_devkit.evaluation.planning import PlanningEvaluator, PlanningResult, PlanningScene, trivial_plans
 from deepaccident_devkit.evaluation.planning.clean import box_path
 from deepaccident_devkit.evaluation.planning.scene import Plan
@@ -132,7 +132,7 @@ def test_intervals_of_progress_lost_cross_zero() -> None:
     paths = [f"means/lead 3 s/{GIVEN}/{name}" for name in ("lost", "lost_way", "lost_twins", "lost_way_twins")]
     ends = intervals_of(evaluator, clusters, evaluator.compute()).ends
     values = numbers_of_draws(evaluator, clusters, np.ones((1, 8), dtype=np.int64), paths)[0]
-    left_out = numbers_of_draws(evaluator, clusters, 1 - np.eye(8, dtype=np.int64), paths)
+    left_out = numbers_of_draws(evaluator, clusters, leaving_out(8), paths)
     half = 2.365 * np.sqrt(7 / 8 * ((left_out - values) ** 2).sum(axis=0))
     for path, value, expected in zip(paths, values, half, strict=True):
         assert ends[path] == pytest.approx((value - expected, value + expected), rel=0.1)

@@ -14,6 +14,7 @@ from deepaccident_devkit.evaluation.detection import DetectionResult
 from deepaccident_devkit.evaluation.runs import ComparedNumber, Comparison
 from deepaccident_devkit.render import detached_figure
 from deepaccident_devkit.render.evaluation import render_breakdown, render_comparison
+from deepaccident_devkit.render.evaluation.panels import Bar, draw_bars
 from deepaccident_devkit.render.styles import AGENT_COLORS
 
 
@@ -32,6 +33,18 @@ def test_breakdowns_have_a_bar_and_an_interval_a_group(detected: DetectionResult
     assert (texts(ax), ax.get_xlabel()) == (["43.75 %", "–"], "mAP (%)")
     named = [label.get_text() for label in ax.get_yticklabels()]
     assert named == ["infrastructure\n5 samples, 2 scen.", "not known\n1 sample, 1 scen."]
+
+
+def test_an_interval_below_zero_is_within_the_panel() -> None:
+    """Of a percentage that can be negative, whose bars have no end at 100 %."""
+    bars = [Bar(label="lost", value=-1.7, interval=(-24.7, 21.3), text="-1.70 %"), Bar(label="none")]
+    ax = draw_bars(bars, new_axes(), 100.0)
+    low, high = ax.get_xlim()
+    assert low <= -24.7
+    assert 21.3 <= high < 40
+    positive = draw_bars([Bar(label="share", value=30.0, interval=(20.0, 40.0))], new_axes(), 100.0)
+    assert positive.get_xlim()[0] == 0
+    assert positive.get_xticks()[-1] == 100
 
 
 SIZE = (7.2, 5.0)
