@@ -60,6 +60,19 @@ def test_they_were_made_by_the_recipes_that_ship(name: str, pages: Any) -> None:
     assert [[each["row"], each["less"]] for each in told["comparisons"]] == [list(pair) for pair in recipe.pairs]
 
 
+@pytest.mark.parametrize("name", NAMES)
+def test_every_number_is_the_mean_of_its_seeds(name: str, pages: Any) -> None:
+    summary = pages.kept(name)["summary"]
+    for each in [*summary["rows"].values(), *summary["comparisons"]]:
+        for number in [number for numbers in each["groups"].values() for number in numbers.values()]:
+            seeds = [*number["seeds"].values()]
+            if None in seeds:
+                assert number["value"] is None
+            elif seeds:
+                assert number["value"] == pytest.approx(sum(seeds) / len(seeds))
+                assert number["low"] is None or number["low"] <= number["value"] <= number["high"]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name in NAMES if name != "road"])  # which has no accidents
 def test_every_apa_follows_from_the_kept_counts(name: str, pages: Any) -> None:
