@@ -35,7 +35,6 @@ PATH_HORIZON: Final = 3.0
 """Seconds that paths go on, at least, as the metrics of plans and of forecasts need them."""
 PATH_STEP: Final = 0.5
 """Seconds from one place of a path to the next."""
-_LONGEST_PATH_S: Final = 100.0
 _SITE: Final = 10.0
 """Metres within which two alarms are of one accident: the surer one is kept."""
 _MOVES: Final = 0.5
@@ -266,9 +265,9 @@ def predict_plan(
 
 
 def path_times(horizon: float) -> FloatArray:
-    """(T,) seconds after the present up to a horizon, in steps of 0.5; raises ConfigError if it is no such number."""
+    """(T,) seconds after the present up to a horizon, in steps of 0.5, of 100 at most; raises ConfigError otherwise."""
     steps = horizon / PATH_STEP
-    if not (0.5 <= horizon <= _LONGEST_PATH_S and abs(steps - round(steps)) < 1e-6):
+    if not (0.5 <= horizon <= 100 and abs(steps - round(steps)) < 1e-6):
         raise ConfigError(f"horizon: {horizon!r} s is no number of steps of 0.5 s; choose 0.5, 1, 1.5, … up to 100")
     return np.arange(1.0, round(steps) + 1) * PATH_STEP
 

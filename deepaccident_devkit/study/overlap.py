@@ -9,6 +9,7 @@ import numpy as np
 
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.evaluation.breakdowns import cluster_of
+from deepaccident_devkit.taxonomy import STATIC_ACTOR_ID
 
 _LEAST_SHARE: Final = 0.7
 """Of the actors of one of two recordings, which the other has too if both are of one scene. Of the generator, nearly
@@ -38,12 +39,15 @@ def known_scenarios(learned: Scenarios, tested: Scenarios) -> list[str]:
 
 
 def _actors(dataset: Dataset, scenarios: Collection[str], *, with_ids: bool) -> dict[str, _Actors]:
-    """Return the actors of each scenario: id, which is 0 without ids, and size in steps of 0.01 m."""
+    """Return the actors of each scenario: id, which is 0 without ids, and size in steps of 0.01 m.
+
+    With ids, parked ones are left out: a town has the same in all of its scenarios.
+    """
     instances = dataset.columns("instance")
     size = np.round(dataset.columns("annotation")["size"][instances["first_annotation_row"]], 2)
     actors = np.column_stack([instances["actor_id"] * with_ids, size])
     found = {}
     for token in scenarios:
         own = instances["scenario_row"] == dataset.getind("scenario", token)
-        found[token] = set(map(tuple, actors[own].tolist()))
+        found[token] = {tuple(actor) for actor in actors[own].tolist() if 0 <= actor[0] < STATIC_ACTOR_ID}
     return found

@@ -48,8 +48,6 @@ MOST_ROWS: Final = 1000
 """Rows of a recipe, when each list has become a row for each of its values."""
 Seeds = Annotated[tuple[Annotated[int, msgspec.Meta(ge=0, lt=1 << 62)], ...], msgspec.Meta(max_length=100)]
 """Up to 100 numbers that fit into torch's generator."""
-_MOST_CHARACTERS: Final = 100_000
-"""Of a recipe, which PyYAML reads in a second or two; those that ship have up to 3,000."""
 
 
 class _Part(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -264,7 +262,7 @@ def read_recipe(recipe: str, *, smoke: bool = False) -> Recipe:
         path = SHIPPED / f"{choice('RECIPE, which is no file .yaml', recipe, known, error=ConfigError)}.yaml"
     try:
         text = read_bytes(path, "spec").decode().strip()
-        if len(text) > _MOST_CHARACTERS:
+        if len(text) > 100_000:  # those that ship have up to 3,000; PyYAML would read more for many seconds
             raise ConfigError(f"{path}: has more than 100,000 characters; split the study")
         told = _plain(parse_yaml(text or "{}", str(path)))
     except (OSError, UnicodeDecodeError) as error:

@@ -3,7 +3,10 @@
 import shutil
 from collections.abc import Callable, Iterable
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
+import numpy as np
 import pytest
 
 from deepaccident_devkit import DeepAccident
@@ -84,3 +87,37 @@ def test_other_releases_of_the_generator_are_not_known(
     for learned in releases:
         for tested in releases:
             assert known_scenarios(learned, tested) == (tested[1] if learned is tested else [])
+
+
+def scene(name: str, moving: list[int], parked: int, layout: str = "A") -> tuple[Any, list[str]]:
+    """A release of one scenario with these actors, whose sizes follow from their ids."""
+    ids = np.array([*moving, *range(20_001, 20_001 + parked), -1])
+    rows = np.arange(len(ids))
+    tables = {
+        "instance": {"actor_id": ids, "scenario_row": 0 * rows, "first_annotation_row": rows},
+        "annotation": {"size": np.outer(ids % 1000, [0.01, 0.02, 0.03])},
+    }
+    return SimpleNamespace(layout=layout, dataroot=Path(name), columns=tables.get, getind=lambda *_: 0), [name]
+
+
+@pytest.mark.parametrize(
+    ("learned", "tested", "known"),
+    [
+        ([1, 2, 3, 4], [1, 2, 3, 9], True),
+        ([1, 2, 3, 4], [1, 2, 8, 9], False),
+        ([1, 2, 3, 4, 5, 6, 7, 8, 9, 10], [1, 2, 3, 4, 5, 6, 7], True),  # fewer frames
+        ([1, 2], [1, 2], False),  # may be chance
+        ([], [], False),
+    ],
+)
+def test_a_town_has_the_same_parked_vehicles_in_all_scenarios(
+    learned: list[int], tested: list[int], known: bool
+) -> None:
+    ours, theirs = scene("a", learned, 20), scene("b", tested, 20)
+    assert bool(known_scenarios(ours, theirs)) == bool(known_scenarios(theirs, ours)) == known
+
+
+def test_instances_of_nuscenes_are_compared_by_their_sizes() -> None:
+    """Their numbers are others: 1001 has the size of 1."""
+    assert known_scenarios(scene("a", [1, 2, 3, 4], 0), scene("b", [1001, 1002, 1003, 1004], 0, "nuScenes")) == ["b"]
+    assert known_scenarios(scene("a", [1, 2, 3, 4], 0), scene("b", [1001, 1002, 1003, 1004], 0)) == []
