@@ -14,7 +14,15 @@ import yaml
 from packing import packed
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.evaluation import Accident, DetectedBoxes, Resampling, accident_context, instances_of
+from deepaccident_devkit.evaluation import (
+    Accident,
+    DetectedBoxes,
+    Forecast,
+    Plan,
+    Resampling,
+    accident_context,
+    instances_of,
+)
 from deepaccident_devkit.evaluation.results import ResultsWriter
 from deepaccident_devkit.evaluation.runs import SampleSelection, evaluate_results, save_run
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
@@ -40,6 +48,8 @@ SETUPS = {
     "motion": EvaluationSetup(task="motion", horizon=HORIZON),
     "accident": EvaluationSetup(task="accident", protocol="boxes", horizon=HORIZON),
     "detection": EvaluationSetup(task="detection"),
+    "planning": EvaluationSetup(task="planning", protocol="clean", horizon=HORIZON),
+    "forecasting": EvaluationSetup(task="forecasting", protocol="clean", horizon=HORIZON),
 }
 
 
@@ -150,12 +160,13 @@ def copied(healthy: Path, home: Path) -> Path:
 
 def selection(task: str) -> SampleSelection:
     """The samples of the results of a task."""
-    return SampleSelection(split="train", samples="all", horizon=SETUPS[task].horizon)
+    agents = AGENTS[:1] if task in ("planning", "forecasting") else None  # the infrastructure does not drive
+    return SampleSelection(split="train", samples="all", agents=agents, horizon=SETUPS[task].horizon)
 
 
-def tokens(dataset: DeepAccident) -> list[str]:
+def tokens(dataset: DeepAccident, task: str = "motion") -> list[str]:
     """The samples that have a prediction."""
-    return list(selection("motion").tokens(dataset))
+    return list(selection(task).tokens(dataset))
 
 
 def _write_exports(dataset: DeepAccident, sensors: DeepAccident, folder: Path) -> None:
@@ -197,7 +208,7 @@ def _write_results(dataset: DeepAccident, path: Path, task: str) -> None:
     grid = LABELS.grid if task == "motion" else None
     path.parent.mkdir(exist_ok=True)
     with ResultsWriter(path, task, meta={"method": "a healthy one"}, grid=grid, step=HORIZON) as writer:  # type: ignore[arg-type]
-        for token in tokens(dataset):
+        for token in tokens(dataset, task):
             writer.add(token, _prediction(dataset, token, task))
 
 
@@ -208,6 +219,18 @@ def _prediction(dataset: DeepAccident, token: str, task: str) -> object:
     if task == "detection":
         boxes = dataset.boxes(token)
         return DetectedBoxes(boxes=boxes, scores=np.linspace(0.1, 1.0, len(boxes)))
+    times = [0.1, HORIZON]
+    if task == "planning":
+        plans = ([[1.0, 0.0], [5.0, 0.5]], [[0.5, 0.0], [2.0, 0.0]])
+        return [Plan(times=times, path=path, score=1.0 - place, yaw=[0.0, 0.1]) for place, path in enumerate(plans)]
+    if task == "forecasting":
+        paths = [[[1.0, 2.0], [3.0, 4.0]], [[1.0, 2.0], [1.0, 2.5]]]
+        actors = dataset.boxes(token).actor_id.tolist()
+        return [
+            Forecast(actor_id=actor, times=times, paths=paths, probabilities=[0.75, 0.25])
+            for actor in actors
+            if actor >= 0
+        ]
     truth = accident_context(dataset, token, HORIZON).truth
     true = None if truth is None else truth.accident
     return [] if true is None else [Accident(positions=true.positions, time=true.time, score=0.5)]

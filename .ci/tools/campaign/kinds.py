@@ -4,7 +4,7 @@
 """
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -218,6 +218,37 @@ def _judge_boxes(room: Room, read: Mapping[str, Any]) -> str | None:
     return None
 
 
+def _judge_plans(room: Room, read: Mapping[str, Any]) -> str | None:
+    return _fault_of_entries(
+        room,
+        read,
+        lambda plan: [plan.times.tolist(), plan.path.tolist(), plan.score, plan.yaw is not None and plan.yaw.tolist()],
+        lambda entry: [entry["times"], entry["path"], entry["score"], entry.get("yaw") or False],
+    )
+
+
+def _judge_forecasts(room: Room, read: Mapping[str, Any]) -> str | None:
+    return _fault_of_entries(
+        room,
+        read,
+        lambda each: [each.actor_id, each.times.tolist(), each.paths.tolist(), each.probabilities.tolist()],
+        lambda entry: [entry["id"], entry["times"], entry["paths"], entry["probabilities"]],
+    )
+
+
+def _fault_of_entries(
+    room: Room, read: Mapping[str, Any], facts: Callable[[Any], list[Any]], stated: Callable[[Any], list[Any]]
+) -> str | None:
+    """A sample whose predictions are not what the file states, entry by entry."""
+    entries = plain.json_file(room.victim)["results"]
+    if list(read) != list(entries):
+        return "other samples"
+    for token, predictions in read.items():
+        if list(map(facts, predictions)) != list(map(stated, entries[token])):
+            return f"{token}: other predictions"
+    return None
+
+
 def _judge_motion(room: Room, read: Mapping[str, Any]) -> str | None:
     shards = [path for path in (room.tree / "motion" / "shards").glob("*.npz") if path.is_file()]
     for token, output in read.items():
@@ -416,6 +447,20 @@ KINDS = {
             (Action(_predictions, _judge_boxes), _evaluation("detection")),
         ),
         Kind(
+            "planning results",
+            "json",
+            "results",
+            "planning",
+            (Action(_predictions, _judge_plans), _evaluation("planning")),
+        ),
+        Kind(
+            "forecasting results",
+            "json",
+            "results",
+            "forecasting",
+            (Action(_predictions, _judge_forecasts), _evaluation("forecasting")),
+        ),
+        Kind(
             "motion results",
             "json",
             "results",
@@ -430,6 +475,8 @@ KINDS = {
             (Action(_predictions, _judge_motion), _evaluation("motion")),
         ),
         Kind("bundle", "json", "bundles/accident", "*.json", _BUNDLE),
+        Kind("planning bundle", "json", "bundles/planning", "*.json", _BUNDLE),
+        Kind("forecasting bundle", "json", "bundles/forecasting", "*.json", _BUNDLE),
         Kind("bundle's samples", "parquet", "bundles/accident", "*.parquet", _BUNDLE),
         Kind("bundle's results", "npz", "bundles/motion", "results/motion/shards/*.npz", _BUNDLE),
         Kind("labels' list", "json", "labels", "manifest.json", (Action(_labels, _judge_labels),)),
