@@ -130,7 +130,7 @@ class ExportError(FileError, OSError):
 
 
 class OutputFolderError(FileError, OSError):
-    """A link, or a path, would lead what is written or removed out of the folder that it belongs to."""
+    """What is written or removed would not stay in its folder, or would replace a device, a pipe or a folder."""
 
 
 class ResultsError(FileError, ValueError):

@@ -3,6 +3,8 @@
 import os
 import re
 import signal
+import socket
+import stat
 import subprocess
 import sys
 import time
@@ -13,7 +15,9 @@ from pathlib import Path
 import pytest
 from PIL import Image
 from processes import wait_for
+from refusals import assert_refused
 
+from deepaccident_devkit.errors import ConfigError, OutputFolderError
 from deepaccident_devkit.render import detached_figure
 from deepaccident_devkit.render.figures import write_figure
 from deepaccident_devkit.support.files import (
@@ -23,6 +27,7 @@ from deepaccident_devkit.support.files import (
     replacing_folder,
     temporary_of,
     temporary_path,
+    writable_folder,
     write_bytes,
 )
 
@@ -163,3 +168,72 @@ def test_plain_names_are_names_on_any_file_system() -> None:
     assert all(re.fullmatch(r"[A-Za-z0-9_.-]{1,140}", name) and name.strip(".") for name in names.values())
     given = plain_names(["index.html", "../../up"], taken=["INDEX.html"])
     assert given == {"index.html": "index.html_2", "../../up": ".._.._up"}
+
+
+def a_socket(path: Path) -> None:
+    with socket.socket(socket.AF_UNIX) as server:
+        server.bind(str(path))
+
+
+def a_device(path: Path) -> None:
+    try:
+        os.mknod(path, stat.S_IFCHR | 0o600, os.makedev(1, 3))
+    except PermissionError:
+        pytest.skip("only root can make a device")
+
+
+def a_link_to_a_pipe(path: Path) -> None:
+    os.mkfifo(path.with_name("pipe"))
+    path.symlink_to("pipe")
+
+
+def a_link_to_an_open_file(path: Path) -> None:
+    """Like `/dev/stdout` where the output of a command goes to a file."""
+    opened = path.with_name("opened")
+    path.symlink_to(f"/proc/self/fd/{os.open(opened, os.O_CREAT | os.O_RDWR)}")
+
+
+@pytest.mark.parametrize(
+    "make", [os.mkfifo, a_socket, a_device, Path.mkdir, a_link_to_a_pipe, a_link_to_an_open_file]
+)
+def test_what_is_no_regular_file_is_not_replaced(tmp_path: Path, make: Callable[[Path], object]) -> None:
+    path = tmp_path / "output"
+    make(path)
+    before = {entry.name: entry.lstat() for entry in tmp_path.iterdir()}
+    seen: list[list[str]] = []
+
+    def write() -> None:
+        with replacing(path):
+            seen.append(names(tmp_path))
+
+    assert_refused(
+        (write, OutputFolderError, ("output: ", "not replaced", "give the path of a new file")),
+        (lambda: write_bytes(path, b"new"), OutputFolderError, "output: "),
+    )
+    assert not seen, "something was written beside it before it was refused"
+    assert {entry.name: entry.lstat() for entry in tmp_path.iterdir()} == before
+
+
+@pytest.mark.parametrize("make", [os.mkfifo, a_socket, a_device, Path.touch, a_link_to_a_pipe])
+def test_what_is_no_folder_is_not_replaced_by_one(tmp_path: Path, make: Callable[[Path], object]) -> None:
+    path = tmp_path / "output"
+    make(path)
+    before = names(tmp_path)
+    with pytest.raises(OutputFolderError, match=r"output: not a folder.* give the path"), replacing_folder(path):
+        pass
+    assert_refused(
+        (lambda: write_bytes(path / "file", b""), OutputFolderError, "output: not a folder"),
+        (lambda: writable_folder(path), ConfigError, "is a file; give a folder"),
+    )
+    assert names(tmp_path) == before
+
+
+def test_a_link_to_a_file_or_to_nothing_is_replaced_itself(tmp_path: Path) -> None:
+    target = tmp_path / "target"
+    for content in (b"first", b"second"):
+        (tmp_path / "link").unlink(missing_ok=True)
+        (tmp_path / "link").symlink_to(target)
+        write_bytes(tmp_path / "link", content)
+        assert not target.exists() or target.read_bytes() == b"kept"
+        assert (tmp_path / "link").read_bytes() == content
+        target.write_bytes(b"kept")
