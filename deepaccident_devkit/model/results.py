@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch.utils.data import DataLoader
 from tqdm.auto import tqdm
 
 from deepaccident_devkit._version import __version__
@@ -34,6 +33,7 @@ from deepaccident_devkit.evaluation.runs.setups import release_note, scenario_of
 from deepaccident_devkit.export.torch import V2XConfig, V2XDataset, collate
 from deepaccident_devkit.model.detection import decode_detections, detected_boxes
 from deepaccident_devkit.model.inputs import mirrored_boxes, model_inputs
+from deepaccident_devkit.model.loading import read_batches, worker_faults_named
 from deepaccident_devkit.model.motion import MotionMaps
 from deepaccident_devkit.model.network import ModelConfig, V2XFormer
 from deepaccident_devkit.motion import motion_labels_of
@@ -99,15 +99,17 @@ def predictions(
     Raises:
         DeepAccidentError: as of `V2XDataset`.
         NotAvailableError: the release lacks what the model sees with.
+        WorkerError: a worker process was killed, or cannot send what it has read.
     """
     check_sensors(model.config, dataset, tokens[:1])
     data = V2XDataset(dataset, tokens, _inputs(model, config))
-    loader: DataLoader[Any] = DataLoader(data, collate_fn=collate, num_workers=config.workers)  # type: ignore[arg-type]
     training = model.training
     model.eval()
     try:
-        for batch in tqdm(loader, desc="predicting", unit="sample", disable=not progress):
-            yield prediction_of(model, batch, config)
+        with worker_faults_named():
+            batches = read_batches(data, collate, config.workers)
+            for batch in tqdm(batches, desc="predicting", total=len(tokens), unit="sample", disable=not progress):
+                yield prediction_of(model, batch, config)
     finally:
         model.train(training)
 
@@ -209,7 +211,7 @@ def predict_results(
         "step": labels.step * FRAME_PERIOD,
         "labels": model.config.labels_protocol,
     }
-    with ExitStack() as stack:
+    with worker_faults_named(), ExitStack() as stack:
         writers = {
             task: ResultsWriter(path, task, meta=meta, **(form if task == "motion" else {}))
             for task, path in paths.items()

@@ -21,6 +21,7 @@ from deepaccident_devkit._version import __version__
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.model.checkpoint import BEST, FINAL, load_weights, read_weights, write_weights
+from deepaccident_devkit.model.loading import worker_faults_named
 from deepaccident_devkit.model.network import V2XFormer
 from deepaccident_devkit.model.presets import ModelChoice
 from deepaccident_devkit.model.results import PredictConfig, check_sensors
@@ -99,6 +100,7 @@ def train(  # noqa: PLR0913 - on what, to where, what, how, from what, and on wh
     Raises:
         ConfigError: another run is in the folder, there is no such device, or weights do not fit.
         NotAvailableError: the split has no labelled samples, or the release lacks what the model sees with.
+        WorkerError: a worker process was killed, or cannot send what it has read.
         DeepAccidentError: as of `AllEgosDataset`.
     """
     config = TrainConfig() if config is None else config
@@ -126,7 +128,8 @@ def train(  # noqa: PLR0913 - on what, to where, what, how, from what, and on wh
         model = new_model(choice, config, weights, run.say)  # what is refused leaves no run behind
         if place.is_first:
             _claim(folder, run.notes)
-        return run.trained(model.to(place.device))
+        with worker_faults_named():
+            return run.trained(model.to(place.device))
 
 
 def _moments(dataset: Dataset, choice: ModelChoice, config: TrainConfig, images_cache: Any) -> Moments:
@@ -203,7 +206,7 @@ class _Run:
             rank=self.place.rank,
             ranks=self.place.ranks,
         )
-        given = iter(batches(self.moments, numbers, self.config, workers=self.predict.workers))
+        given = batches(self.moments, numbers, self.config, workers=self.predict.workers)
         steps = range(progress.step, self.config.steps)
         with tqdm(steps, initial=progress.step, total=self.config.steps, unit="step", disable=not self.bar) as bar:
             for number in bar:

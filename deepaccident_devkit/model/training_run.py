@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -24,7 +24,7 @@ from deepaccident_devkit.support.arrays import checked_number, checked_whole
 from deepaccident_devkit.support.files import write_bytes
 from deepaccident_devkit.support.json_text import as_record, parsed_json
 from deepaccident_devkit.support.reading import fault_text, read_bytes
-from deepaccident_devkit.support.text import settle_choices
+from deepaccident_devkit.support.text import integer_of, settle_choices
 from deepaccident_devkit.v2x import AgentConfig, Agents
 
 _WHOLE: Final = {
@@ -38,6 +38,7 @@ _WHOLE: Final = {
 _SHARES: Final = ("warm_up", "partner_dropout", "alone")
 _ABOVE_ZERO: Final = ("learning_rate", "clip")
 NAME = "log.jsonl"
+_TORCHRUN: Final = "start all processes by torchrun, or unset WORLD_SIZE to train in this one"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -180,19 +181,33 @@ def checked_device(device: str) -> str:
 @contextmanager
 def processes(device: str) -> Iterator[Place]:
     """The place of this process, with `torchrun` together with the others until the block ends; raises ConfigError."""
-    ranks, local = int(os.environ.get("WORLD_SIZE", "1")), os.environ.get("LOCAL_RANK", "0")
+    ranks = _rank_number("WORLD_SIZE", 1, 1 << 16)
     chosen = checked_device(device)
     if ranks == 1:
         yield Place(device=chosen)
         return
-    if chosen == "cuda":
-        chosen = f"cuda:{local}"
-        torch.cuda.set_device(chosen)
-    distributed.init_process_group("nccl" if chosen.startswith("cuda") else "gloo")
+    rank, local = (_rank_number(name, 0, ranks - 1) for name in ("RANK", "LOCAL_RANK"))
+    try:
+        if chosen == "cuda":
+            chosen = f"cuda:{local}"
+            torch.cuda.set_device(chosen)
+        distributed.init_process_group("nccl" if chosen.startswith("cuda") else "gloo", rank=rank, world_size=ranks)
+    except (RuntimeError, ValueError) as error:
+        fault = shortened(str(error))
+        raise ConfigError(f"WORLD_SIZE={ranks}: the processes cannot train together ({fault}); {_TORCHRUN}") from error
     try:
         yield Place(device=chosen, rank=distributed.get_rank(), ranks=distributed.get_world_size())
     finally:
         distributed.destroy_process_group()
+
+
+def _rank_number(name: str, least: int, most: int) -> int:
+    """Read a number that torchrun puts into the environment; raises ConfigError."""
+    word = os.environ.get(name, str(least))
+    number = integer_of(word)
+    if number is None or not least <= number <= most:
+        raise ConfigError(f"{name}: expected a whole number from {least} to {most}, found {shortened(repr(word))}; {_TORCHRUN}")
+    return number
 
 
 @contextmanager
@@ -226,7 +241,7 @@ def read_log(folder: Path) -> list[dict[str, Any]]:
         lines = read_bytes(path, "bundle").split(b"\n")[:-1]
     except OSError as error:
         raise ConfigError(f"{path}: {fault_text(error)}; remove the file") from error
-    return [_row(f"{path}:{number}", line) for number, line in enumerate(lines, 1)]
+    return _rows(lines, path, 1)
 
 
 def cut_log(folder: Path, step: int) -> None:
@@ -241,15 +256,21 @@ def add_to_log(folder: Path, row: Mapping[str, Any]) -> None:
         file.write(f"{json.dumps(row)}\n")
 
 
-def _row(where: str, line: bytes) -> dict[str, Any]:
+def _rows(lines: Sequence[bytes], path: Path, first: int) -> list[dict[str, Any]]:
+    """Parse lines of a log, of which `first` is the first one's number; a fault is looked for in halves of them."""
     try:
-        row: dict[str, Any] = parsed_json(line)
-        as_record(row, _Row)
+        rows: list[dict[str, Any]] = parsed_json(b"[%s]" % b",\n".join(lines))
+        as_record(rows, list[_Row])
+        if len(rows) != len(lines):
+            raise ValueError(f"found {len(rows)} values in {len(lines)} lines")
     except ValueError as error:
-        raise ConfigError(
-            f"{where}: expected a JSON object with a step ({error}); remove the line, or the file"
-        ) from error
-    return row
+        if len(lines) == 1:
+            raise ConfigError(
+                f"{path}:{first}: expected a JSON object with a step ({error}); remove the line, or the file"
+            ) from error
+        half = len(lines) // 2
+        return _rows(lines[:half], path, first) + _rows(lines[half:], path, first + half)
+    return rows
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -11,7 +11,6 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 from torch.optim import AdamW
-from torch.utils.data import DataLoader
 from torch.utils.data import Dataset as TorchDataset
 
 from deepaccident_devkit.dataset import Dataset
@@ -22,6 +21,7 @@ from deepaccident_devkit.evaluation.motion import MOTION_PROTOCOLS
 from deepaccident_devkit.export.torch import AllEgosDataset, RandomAugmentation, collate_all_egos, merged_evaluator
 from deepaccident_devkit.model.detection import detection_losses, detection_targets
 from deepaccident_devkit.model.inputs import ModelInputs, mirrored_boxes, model_inputs
+from deepaccident_devkit.model.loading import read_batches
 from deepaccident_devkit.model.motion import MotionTargets, frame_mask, motion_losses
 from deepaccident_devkit.model.network import ModelConfig, V2XFormer
 from deepaccident_devkit.model.results import PredictConfig, predictions
@@ -95,16 +95,9 @@ class MixedMoments(TorchDataset[dict[str, Any]]):
 
 def batches(
     moments: Moments | MixedMoments, numbers: Iterable[Any], config: TrainConfig, *, workers: int = 0
-) -> DataLoader[Any]:
-    """Batches of moments in the order of their numbers (`positions`), read by worker processes, or by this one (0)."""
-    return DataLoader(
-        moments,
-        batch_size=config.moments,
-        sampler=numbers,
-        collate_fn=collate_all_egos,
-        num_workers=workers,
-        pin_memory=False,
-    )
+) -> Iterator[dict[str, Any]]:
+    """Read batches of moments in the order of their numbers (`positions`), as of `read_batches`."""
+    return read_batches(moments, collate_all_egos, workers, batch_size=config.moments, sampler=numbers)
 
 
 def validation_samples(dataset: Dataset, config: TrainConfig) -> list[str]:

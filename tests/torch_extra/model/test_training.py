@@ -40,6 +40,7 @@ from deepaccident_devkit.model.training_run import (
     checked_device,
     cut_log,
     load_state,
+    processes,
     read_log,
 )
 from deepaccident_devkit.model.training_step import (
@@ -55,6 +56,7 @@ from deepaccident_devkit.model.training_step import (
     training_batch,
     with_dropped_partners,
 )
+from deepaccident_devkit.support.json_text import parsed_json
 
 SHORT = replace(RUN, steps=2, validation=None, save_every=1)
 TESTS = Path(__file__).parents[2]
@@ -490,6 +492,25 @@ def test_the_log_is_read_up_to_a_line_that_is_cut_off(tmp_path: Path) -> None:
         assert_refused((lambda: read_log(tmp_path), ConfigError, told))
 
 
+def test_a_long_log_is_read_at_once(tmp_path: Path) -> None:
+    """A wrong line is found in halves: to parse each line by itself took half a minute for 60 MB."""
+    lines = [f'{{"step": {step}}}' for step in range(1, 4001)]
+    path, parsed = tmp_path / "log.jsonl", []
+
+    def counted(content: bytes) -> object:
+        parsed.append(len(content))
+        return parsed_json(content)
+
+    with patch("deepaccident_devkit.model.training_run.parsed_json", counted):
+        for fault in ("no json", '{"step": 1}, {"step": 2}', "", '{"step": -1}'):
+            path.write_text("\n".join([*lines, ""]))
+            assert [row["step"] for row in read_log(tmp_path)] == list(range(1, 4001))
+            path.write_text("\n".join([*lines[:3000], fault, *lines[3000:], ""]))
+            parsed.clear()
+            assert_refused((lambda: read_log(tmp_path), ConfigError, r"log\.jsonl:3001: expected .* remove the line"))
+            assert sum(parsed) < 5 * path.stat().st_size
+
+
 @pytest.mark.parametrize("linked", [Path.symlink_to, Path.hardlink_to])
 def test_a_run_adds_nothing_to_a_file_elsewhere(tmp_path: Path, linked: Callable[[Path, Path], None]) -> None:
     elsewhere, folder = tmp_path / "elsewhere.jsonl", tmp_path / "run"
@@ -523,6 +544,33 @@ def test_a_run_adds_nothing_to_a_file_elsewhere(tmp_path: Path, linked: Callable
 )
 def test_wrong_options_are_named(changes: dict[str, Any], error: type[DeepAccidentError], message: str) -> None:
     assert_refused((lambda: TrainConfig(**changes), error, message))
+
+
+@pytest.mark.parametrize(
+    ("variables", "facts"),
+    [
+        *((f"WORLD_SIZE={word}", ("WORLD_SIZE", repr(word))) for word in ("abc", "0", "-1", "1.5", "", "9" * 5000)),
+        ("WORLD_SIZE=2 RANK=2 LOCAL_RANK=0", ("RANK", "'2'")),
+        ("WORLD_SIZE=2 RANK=one", ("RANK", "'one'")),
+        ("WORLD_SIZE=2 RANK=1 LOCAL_RANK=-1", ("LOCAL_RANK", "'-1'")),
+        ("WORLD_SIZE=2 RANK=0", ("WORLD_SIZE=2", "MASTER_ADDR")),
+        ("WORLD_SIZE=2 RANK=0 MASTER_ADDR=127.0.0.1 MASTER_PORT=high", ("WORLD_SIZE=2", "high")),
+    ],
+    ids=lambda value: value[:60] if isinstance(value, str) else "",
+)
+def test_a_wrong_environment_is_refused(
+    variables: str, facts: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("RANK", "LOCAL_RANK", "MASTER_ADDR", "MASTER_PORT"):
+        monkeypatch.delenv(name, raising=False)
+    for name, _, word in (each.partition("=") for each in variables.split(" ")):
+        monkeypatch.setenv(name, word)
+
+    def begin() -> None:
+        with processes("cpu"):
+            pass
+
+    assert_refused((begin, ConfigError, (*(fact[:40] for fact in facts), "torchrun", "unset WORLD_SIZE")))
 
 
 def test_unknown_devices_and_releases_without_samples_are_refused(da: DeepAccident, tmp_path: Path) -> None:

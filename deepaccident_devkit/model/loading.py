@@ -1,0 +1,67 @@
+"""Batches that worker processes read; a worker that fails ends the run with an error instead of leaving it waiting."""
+
+from __future__ import annotations
+
+import multiprocessing
+import re
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from multiprocessing.queues import Queue
+from typing import Any, Final
+
+from torch._utils import ExceptionWrapper
+from torch.utils.data import DataLoader
+
+from deepaccident_devkit.errors import DeepAccidentError, WorkerError, shortened
+
+_WORKERS_FAULT: Final = re.compile(r"DataLoader worker|shared memory|ancdata")
+"""What torch says in this process if a worker failed, or if what it sent cannot be opened here."""
+_REMEDY: Final = (
+    "if memory or shared memory (/dev/shm) ran out, use fewer workers, or none (without --workers; workers=0 in Python)"
+)
+
+
+def read_batches(data: Any, collate: Callable[..., Any], workers: int, **options: Any) -> Iterator[dict[str, Any]]:
+    """Start to read batches by worker processes, or by this one (0).
+
+    Args:
+        data: A map-style dataset of torch.
+        collate: Makes a batch of items.
+        workers: Number of processes that read.
+        **options: Further options of `DataLoader`.
+
+    Raises:
+        WorkerError: The processes cannot be started.
+    """
+    try:
+        _ = [multiprocessing.Queue() for _ in range(workers and workers + 3)]  # torch, where it fails, prints tracebacks
+        return iter(
+            DataLoader(data, collate_fn=collate, num_workers=workers, worker_init_fn=_send_faults, **options)
+        )
+    except OSError as error:  # the system has no room for a lock or a process
+        raise WorkerError(f"worker processes cannot be started ({error}); {_REMEDY}") from error
+
+
+@contextmanager
+def worker_faults_named() -> Iterator[None]:
+    """Raise WorkerError where a worker of `read_batches` was killed or failed otherwise; the devkit's errors pass.
+
+    Torch may raise such an error at any time while the workers run, so the block is all that uses the batches.
+    """
+    try:
+        yield
+    except Exception as error:
+        if isinstance(error, DeepAccidentError) or not _WORKERS_FAULT.search(str(error)):
+            raise
+        text = str(error.__cause__ or "") or str(error)  # the cause names the signal that killed a worker
+        cause = shortened(text.strip().splitlines()[-1])
+        raise WorkerError(f"a worker process that reads samples failed ({cause}); {_REMEDY}") from error
+
+
+def _send_faults(_: int) -> None:
+    """Let this worker send the reason if it cannot send a batch: otherwise it prints that, and its reader waits."""
+    Queue._on_queue_feeder_error = _send_reason  # type: ignore[attr-defined] # noqa: SLF001 - multiprocessing's own hook
+
+
+def _send_reason(queue: Any, _: Exception, unsent: tuple[int, Any]) -> None:
+    queue.put((unsent[0], ExceptionWrapper(where="in DataLoader worker process")))

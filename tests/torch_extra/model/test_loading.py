@@ -1,0 +1,83 @@
+"""Batches of worker processes: whatever befalls a worker, its reader gets an error with the cause and a remedy."""
+
+import multiprocessing
+import os
+import signal
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from refusals import assert_refused
+
+from deepaccident_devkit.errors import SensorFileError, WorkerError
+from deepaccident_devkit.model.loading import read_batches, worker_faults_named
+
+REMEDY = ("/dev/shm", "fewer workers", "workers=0")
+
+
+class Unsendable:
+    def __reduce__(self) -> Any:
+        raise MemoryError("no room for the batch")
+
+
+def killed() -> None:
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def failing() -> None:
+    raise KeyError("a fault of the reader")
+
+
+def without_a_file() -> None:
+    raise SensorFileError("image.jpg: cannot be read; restore it from its archive")
+
+
+class Items:
+    """Items of which the second is made by a function that may fail."""
+
+    def __init__(self, make: Callable[[], object]) -> None:
+        self.make = make
+
+    def __len__(self) -> int:
+        return 3
+
+    def __getitem__(self, number: int) -> object:
+        return self.make() if number == 1 else number
+
+
+def read(make: Callable[[], object]) -> list[Any]:
+    with worker_faults_named():
+        return list(read_batches(Items(make), list, 1, timeout=60))
+
+
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
+@pytest.mark.parametrize(
+    ("make", "error", "facts"),
+    [
+        (killed, WorkerError, ("killed", *REMEDY)),
+        (failing, WorkerError, ("KeyError", "a fault of the reader", *REMEDY)),
+        (Unsendable, WorkerError, ("no room for the batch", *REMEDY)),
+        (without_a_file, SensorFileError, ("image.jpg", "restore it")),
+    ],
+)
+def test_a_worker_that_fails_ends_the_reading(make: Callable[[], object], error: type[Exception], facts: Any) -> None:
+    assert_refused((lambda: read(make), error, facts))
+
+
+def test_workers_that_cannot_start_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    def no_room() -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(multiprocessing, "Queue", no_room)
+    assert_refused((lambda: read(int), WorkerError, ("cannot be started", "No space left", *REMEDY)))
+
+
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
+def test_an_error_of_the_reader_itself_passes() -> None:
+    def stop() -> None:
+        with worker_faults_named():
+            next(read_batches(Items(int), list, 0))
+            raise RuntimeError("of the training")
+
+    assert_refused((stop, RuntimeError, "of the training"))
+    assert read(int) == [[0], [0], [2]]
