@@ -32,6 +32,7 @@ from deepaccident_devkit.render.replay import recording_of, served_replay
 from deepaccident_devkit.render.replay.entries import Recording
 from deepaccident_devkit.render.styles import COLLIDER_COLOR, MISSING_COLOR
 from deepaccident_devkit.support.arrays import as_floats
+from deepaccident_devkit.support.cores import usable_cores
 from deepaccident_devkit.support.files import is_writable_folder, place_in
 from deepaccident_devkit.tables.tokens import sample_token
 from deepaccident_devkit.taxonomy import CAMERAS
@@ -149,7 +150,7 @@ class Explorer:
 
 def _few_workers(scenarios: int) -> int:
     """Processes in the background, which leave others on the machine theirs; a small release needs none of its own."""
-    return max(2, min(4, (os.cpu_count() or 2) // 2)) if scenarios >= _MANY else 1
+    return max(2, min(4, usable_cores() // 2)) if scenarios >= _MANY else 1
 
 
 class Kept(Generic[Value]):

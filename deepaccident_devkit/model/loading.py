@@ -34,10 +34,10 @@ def read_batches(data: Any, collate: Callable[..., Any], workers: int, **options
         WorkerError: The processes cannot be started.
     """
     try:
-        _ = [multiprocessing.Queue() for _ in range(workers and workers + 3)]  # torch, where it fails, prints tracebacks
-        return iter(
-            DataLoader(data, collate_fn=collate, num_workers=workers, worker_init_fn=_send_faults, **options)
-        )
+        _ = [
+            multiprocessing.Queue() for _ in range(workers and workers + 3)
+        ]  # torch, where it fails, prints tracebacks
+        return iter(DataLoader(data, collate_fn=collate, num_workers=workers, worker_init_fn=_send_faults, **options))
     except OSError as error:  # the system has no room for a lock or a process
         raise WorkerError(f"worker processes cannot be started ({error}); {_REMEDY}") from error
 

@@ -206,7 +206,9 @@ def _rank_number(name: str, least: int, most: int) -> int:
     word = os.environ.get(name, str(least))
     number = integer_of(word)
     if number is None or not least <= number <= most:
-        raise ConfigError(f"{name}: expected a whole number from {least} to {most}, found {shortened(repr(word))}; {_TORCHRUN}")
+        raise ConfigError(
+            f"{name}: expected a whole number from {least} to {most}, found {shortened(repr(word))}; {_TORCHRUN}"
+        )
     return number
 
 

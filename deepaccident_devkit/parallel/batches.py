@@ -6,7 +6,6 @@ of the caller does not grow with the work.
 
 from __future__ import annotations
 
-import os
 import platform
 import time
 from collections.abc import Callable, Generator, Iterator, Sequence
@@ -25,6 +24,7 @@ from deepaccident_devkit.parallel.executors import (
     signals_put_off,
     width_of,
 )
+from deepaccident_devkit.support.cores import usable_cores
 from deepaccident_devkit.support.files import temporary_path
 
 if TYPE_CHECKING:
@@ -87,8 +87,8 @@ def run_batch(
     Args:
         work: an importable function of the devkit (workers import it by name).
         items: what it is applied to, one call an item.
-        workers: processes to use; 1 runs in this one; None takes as many as there are cores, or this process
-            alone if the work is too little for a pool or the caller is a worker itself.
+        workers: processes to use; 1 runs in this one; None takes as many as this process may use cores, or this
+            process alone if the work is too little for a pool or the caller is a worker itself.
         executor: any `concurrent.futures.Executor` to run on instead (a dask client's, MPI's, a thread pool).
         label: text of the progress bar.
         progress: whether to show one; or a function, as of `run_unordered`.
@@ -163,7 +163,7 @@ def _worker_count(workers: int | None, items: int) -> int:
     if workers is not None:
         return min(workers, max(items, 1))
     enough_work = 8  # starting a pool costs a second, a scenario a tenth of one
-    return max(1, min(os.cpu_count() or 1, items // enough_work))
+    return max(1, min(usable_cores(), items // enough_work))
 
 
 def _on(

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 from deepaccident_devkit._version import __version__
 from deepaccident_devkit.errors import MOST_TOLD, DeepAccidentError, MissingExtraError, WorkerError, shortened
+from deepaccident_devkit.support.cores import usable_cores
 from deepaccident_devkit.support.reading import fault_text, read_bytes
 
 if TYPE_CHECKING:
@@ -208,10 +209,10 @@ def own_workers(count: int) -> Iterator[Executor]:
 
 
 def own_threads() -> ThreadPoolExecutor:
-    """Threads of this process, one for each core, in a `with` block: for work whose libraries let other threads run."""
+    """Threads of this process, one for each usable core, in a `with` block: for work whose libraries let others run."""
     from concurrent.futures import ThreadPoolExecutor
 
-    return ThreadPoolExecutor(os.cpu_count())
+    return ThreadPoolExecutor(usable_cores())
 
 
 def _begin_worker() -> None:

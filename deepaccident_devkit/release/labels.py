@@ -9,7 +9,6 @@ Files are parsed in bulk: the bodies of many files are joined, and Arrow casts t
 """
 
 import codecs
-import os
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -30,6 +29,7 @@ from deepaccident_devkit.support.arrays import (
     in_range,
     readonly,
 )
+from deepaccident_devkit.support.cores import usable_cores
 from deepaccident_devkit.support.files import write_bytes
 from deepaccident_devkit.support.reading import LIMITS_VARIABLE, limit_of
 from deepaccident_devkit.support.text import integer_of, number_of
@@ -220,7 +220,7 @@ def _parse_batches(batches: Sequence[Sequence[ReleasePath]]) -> list[dict[str, A
 
     import pyarrow as pa  # noqa: F401 - here: pyarrow 25.0.0 crashes after the thread has ended that imports it
 
-    with ThreadPoolExecutor(min(_MOST_THREADS, os.cpu_count() or 1)) as pool:
+    with ThreadPoolExecutor(min(_MOST_THREADS, usable_cores())) as pool:
         parts = [pool.submit(_parse_files, batch, [_content(path) for path in batch]) for batch in batches]
         return [part.result() for part in parts]
 

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import gzip
 import json
-import os
 import platform
 import sys
 import time
@@ -42,6 +41,7 @@ from deepaccident_devkit.release.layout import write_split_file
 from deepaccident_devkit.study.numbers import HIDDEN, HiddenActors, setups_of
 from deepaccident_devkit.study.predict import predictions_of
 from deepaccident_devkit.study.recipe import Row
+from deepaccident_devkit.support.cores import usable_cores
 from deepaccident_devkit.support.files import replacing_folder, write_bytes
 from deepaccident_devkit.support.json_text import parsed_json
 from deepaccident_devkit.support.reading import read_bytes
@@ -143,7 +143,7 @@ def machine(device: str) -> str:
     """What one needs to know of a machine to understand times and last digits."""
     torch = sys.modules.get("torch")
     packages = f"numpy {np.__version__}" + (f", torch {torch.__version__}" if torch else "")
-    return f"{platform.platform()}, {os.cpu_count()} cores, Python {platform.python_version()}, {packages}, {device}"
+    return f"{platform.platform()}, {usable_cores()} cores, Python {platform.python_version()}, {packages}, {device}"
 
 
 def taken(file: Path, folder: Path) -> dict[str, Any]:

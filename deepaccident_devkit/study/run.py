@@ -29,6 +29,7 @@ from deepaccident_devkit.study.overlap import Scenarios, known_scenarios
 from deepaccident_devkit.study.page import save_study
 from deepaccident_devkit.study.recipe import DEFAULT_HORIZON, NUSCENES, Plan, Recipe, at, source_of
 from deepaccident_devkit.study.summary import ALL, Counted, StudyReport, counted_of, summarised
+from deepaccident_devkit.support.cores import usable_cores
 from deepaccident_devkit.support.files import writable_folder
 from deepaccident_devkit.support.json_text import as_record
 from deepaccident_devkit.support.reading import file_checksum
@@ -79,7 +80,7 @@ def run_study(
 
         device = checked_device(device)
     bench = Bench(writable_folder(out).absolute(), device if recipe.weights else "cpu")
-    engine: Any = {**how, "workers": how.get("workers") or (1 if device.startswith("cuda") else os.cpu_count())}
+    engine: Any = {**how, "workers": how.get("workers") or (1 if device.startswith("cuda") else usable_cores())}
     with bench.store.shared():
         releases = {name: _release(bench, name, recipe, **how) for name in recipe.releases}
         test, dataset = recipe.test, releases[recipe.test.release][1]

@@ -137,7 +137,9 @@ def _begun(path: Path) -> Path:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except (FileExistsError, NotADirectoryError) as error:
-        raise OutputFolderError(f"{path.parent}: not a folder, so no file can be written there; give another") from error
+        raise OutputFolderError(
+            f"{path.parent}: not a folder, so no file can be written there; give another"
+        ) from error
     _rid_of_leftovers(path.parent)
     return temporary_path(path)
 

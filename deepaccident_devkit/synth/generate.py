@@ -19,6 +19,7 @@ from deepaccident_devkit._version import __version__
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.parallel import Places, Progress, Store
 from deepaccident_devkit.release.store.members import SPLIT_FILE_FOLDER
+from deepaccident_devkit.support.cores import usable_cores
 from deepaccident_devkit.support.files import (
     check_free,
     is_writable_folder,
@@ -260,4 +261,4 @@ def _record(unfinished: Unfinished, job: RecordingJob) -> None:
 def _worker_count(config: SynthConfig, scenarios: int) -> int:
     """One worker for each core, or 1 if the work is too short for it: a frame with sensors takes up to a second."""
     frames = scenarios * (config.frames or _USUAL_FRAMES)
-    return (os.cpu_count() or 1) if frames >= (400 if config.sensors == "none" else 20) else 1
+    return usable_cores() if frames >= (400 if config.sensors == "none" else 20) else 1

@@ -193,9 +193,7 @@ def a_link_to_an_open_file(path: Path) -> None:
     path.symlink_to(f"/proc/self/fd/{os.open(opened, os.O_CREAT | os.O_RDWR)}")
 
 
-@pytest.mark.parametrize(
-    "make", [os.mkfifo, a_socket, a_device, Path.mkdir, a_link_to_a_pipe, a_link_to_an_open_file]
-)
+@pytest.mark.parametrize("make", [os.mkfifo, a_socket, a_device, Path.mkdir, a_link_to_a_pipe, a_link_to_an_open_file])
 def test_what_is_no_regular_file_is_not_replaced(tmp_path: Path, make: Callable[[Path], object]) -> None:
     path = tmp_path / "output"
     make(path)
