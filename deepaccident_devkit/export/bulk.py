@@ -3,7 +3,8 @@
 A folder has one manifest a format, and hidden beside it the store of what is written (`parallel.store`): of each unit
 its parts, a journal of the paths that it writes, and a record once it is done. By the paths a call removes what an
 earlier one wrote and would not be written today: of a scenario whose files have changed since, or that is not chosen
-any more. By the parts a complete export gets new sensor files without being written as a whole.
+any more. By the parts a complete export gets new sensor files without being written as a whole. Once it is complete,
+all of them lie packed in one hidden file, `.deepaccident-<format>.zip`, and the store is gone.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import zipfile
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
@@ -32,9 +34,16 @@ from deepaccident_devkit.parallel import Engine, Failure, Places, Store, Tried, 
 from deepaccident_devkit.release.fingerprints import checked_hashes, digest_of, scenario_folders, sensor_digest
 from deepaccident_devkit.release.layout import ScenarioFolder
 from deepaccident_devkit.selection import find
-from deepaccident_devkit.support.files import place_in, remove_in, remove_leftovers, temporary_of, write_bytes
+from deepaccident_devkit.support.files import (
+    place_in,
+    remove_in,
+    remove_leftovers,
+    replacing,
+    temporary_of,
+    write_bytes,
+)
 from deepaccident_devkit.support.json_text import parsed_record
-from deepaccident_devkit.support.reading import fault_text, read_bytes
+from deepaccident_devkit.support.reading import DAMAGED_ARCHIVE, fault_text, open_zip, read_bytes, read_member
 from deepaccident_devkit.support.text import differing_text, path_of
 
 if TYPE_CHECKING:
@@ -140,8 +149,8 @@ class Manifest:
             raise
         except OSError as error:
             raise ExportError(f"{folder}: cannot be read ({error}); choose another folder") from error
-        # a killed export may have left the store alone
-        strange = [each for each in others if each != _FOLDER and temporary_of(each) is None]
+        # a killed export may have left what it keeps alone
+        strange = [each for each in others if not each.startswith(".deepaccident-") and temporary_of(each) is None]
         if strange and not any(f"{each}{_ENDING}" in others for each in form.beside):
             raise ExportError(
                 f"{folder}: is not empty ({shortened(strange[0])}) and holds no {form.name} export; choose a new folder"
@@ -227,6 +236,10 @@ def export_release(
     if manifest.release:
         check_failures(zip(jobs, states, strict=True), str(root))
         if _is_current(root, manifest.release.scenarios, _all_states(jobs)):
+            if export.store.folder.is_dir():  # of version 1.0.0, or of a call that was killed
+                with export.store.shared() as turn:
+                    if turn.alone():
+                        export.put_away()
             return Exported(folder=root, written=0, kept=len(units), tally=manifest.written)
     whole, written = export.completed(manifest, jobs, how)
     return Exported(folder=root, written=written, kept=len(units) - written, tally=whole.written)
@@ -325,18 +338,19 @@ class Export:
 
         def begin() -> None:
             if by_another() is None:
+                self._take_out()
                 Manifest(format=self.form.name, settings=before.settings).write(self.root)
                 self._remove_others(jobs)
 
         with store.shared(begin, tidy=self._remove_half_written) as turn:
             if (whole := by_another()) is not None:
-                self._remove_kept()
+                self.store.remove(keep=True)
                 return whole, 0
             places = Places(reads=self.dataset.places, writes=(self.root,))
             done = store.run(self.write, jobs, label=self.form.name, places=places, **how)
             if turn.alone() and by_another() is None:
                 whole = self._finished(jobs, list(done.values()), before.settings)
-                self._remove_kept()
+                self.put_away()
                 whole.write(self.root)
             else:
                 whole = Manifest.of(self.root, self.form, before.settings)
@@ -360,8 +374,7 @@ class Export:
         """Write what spans units; the manifest of the complete export. If there is no sample, nothing is left."""
         if not any(each.tally.samples for each in done):
             self._remove_others(())
-            self.store.drop(self.form.name)
-            self._remove_kept()
+            self.put_away(pack=False)
             remove_in(self.root, f"{self.form.name}{_ENDING}")
             with suppress(OSError):  # there is another export
                 self.root.rmdir()
@@ -432,11 +445,34 @@ class Export:
         for each, _, _ in os.walk(self.root):
             remove_leftovers(Path(each))
 
-    def _remove_kept(self) -> None:
-        """Remove the locks, and without sensor files, which a later download may change, also what is kept."""
-        if not self.form.sensors():
-            self.store.drop(self.form.name)
+    def put_away(self, *, pack: bool = True) -> None:
+        """Remove the store; sensor files may change later, so what a later call needs then is packed into one file."""
+        if pack and self.form.sensors():
+            with replacing(self._archive) as temporary, zipfile.ZipFile(temporary, "w") as archive:
+                for path in sorted(path for path in self.kept.rglob("*") if path.is_file() and not path.is_symlink()):
+                    name = path.relative_to(self.kept).as_posix()
+                    archive.writestr(zipfile.ZipInfo(name), path.read_bytes())  # without a date
+        self.store.drop(self.form.name)
         self.store.remove(keep=any(self.store.folder.glob("kept/*")))  # another format's
+
+    @property
+    def _archive(self) -> Path:
+        return place_in(self.root, f".deepaccident-{self.form.name}.zip")
+
+    def _take_out(self) -> None:
+        """Unpack what a complete export has put away; raises ExportError if that is damaged."""
+        if not self._archive.exists():
+            return
+        try:
+            with open_zip(self._archive) as archive:
+                for entry in archive.infolist():
+                    write_bytes(place_in(self.kept, entry.filename), read_member(archive, entry, "bundle"))
+        except OSError:
+            raise
+        except DAMAGED_ARCHIVE as error:
+            remedy = "remove it, and the export is written again as a whole"
+            raise ExportError(f"{self._archive}: {fault_text(error)}; {remedy}") from error
+        self._archive.unlink()
 
 
 def _chosen(dataset: Dataset, form: Format) -> list[str]:

@@ -9,7 +9,6 @@ each image's first byte in the file and its length, 0 for an image that the rele
 
 from __future__ import annotations
 
-import mmap
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -30,7 +29,7 @@ from deepaccident_devkit.release.fingerprints import scenario_hashes
 from deepaccident_devkit.release.images import decode_image, encode_jpeg
 from deepaccident_devkit.support.arrays import ByteArray, FloatArray, IntArray
 from deepaccident_devkit.support.json_text import as_record
-from deepaccident_devkit.support.reading import check_size, fault_text, open_file
+from deepaccident_devkit.support.reading import check_size, fault_text, mapped_file
 from deepaccident_devkit.support.text import path_of, settle_choices, size_text
 from deepaccident_devkit.tables.tokens import sample_data_token, sample_token
 from deepaccident_devkit.taxonomy import AgentName
@@ -317,8 +316,7 @@ class _ImagesFile:
     def __init__(self, path: Path, cameras: int) -> None:
         """Map it; raises SensorFileError if it is not there, not whole, or not of so many cameras."""
         try:
-            with open_file(path) as file:
-                self._bytes = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+            self._bytes = memoryview(mapped_file(path)).cast("B")
             self._table = self._checked_table(cameras)
         except (OSError, ValueError) as error:
             raise SensorFileError(
@@ -329,7 +327,7 @@ class _ImagesFile:
     def image(self, row: int, camera: int) -> memoryview | None:
         """The bytes of an image, not copied; None if the release lacked it."""
         start, length = self._table[row, camera].tolist()
-        return memoryview(self._bytes)[start : start + length] if length else None
+        return self._bytes[start : start + length] if length else None
 
     def has(self, row: int, camera: int) -> bool:
         """Whether an image is in it."""

@@ -36,7 +36,7 @@ from deepaccident_devkit.release.store import index_places
 from deepaccident_devkit.support.arrays import FloatArray, IntArray
 from deepaccident_devkit.support.files import is_writable_folder, replacing_folder
 from deepaccident_devkit.support.json_text import parsed_json
-from deepaccident_devkit.support.reading import read_bytes
+from deepaccident_devkit.support.reading import mapped_file, read_bytes
 from deepaccident_devkit.support.text import path_of
 from deepaccident_devkit.tables.arrow_files import Columns
 from deepaccident_devkit.tables.build import scenario_rows
@@ -65,8 +65,7 @@ class NuScenesRelease(DeepAccident):
         Dataset.__init__(
             self, dataroot=dataroot, version=version, layout="nuScenes", split_files={}, tables_folder=tables_folder
         )
-        with pa.memory_map(str(tables_folder / _FILES)) as file:
-            self._files = pa.ipc.open_file(file).read_all()
+        self._files = pa.ipc.open_file(mapped_file(tables_folder / _FILES)).read_all()
         self._rows = self._files["row"].to_numpy()
         self._plain_filename = self._tables.resolver.filename
         self._tables.resolver.filename = self._filename  # type: ignore[method-assign]

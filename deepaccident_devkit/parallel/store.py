@@ -12,13 +12,17 @@ The folder is the devkit's own, and hidden from whoever uses what is made:
     kept/NAME     a result: its bytes, and a seal of these and of a key, which says what it was made from
 
 Locks are `flock`, which network file systems pass on (docs/clusters.md). The system takes them back from a process that
-ends, however it ends. A result is written under a temporary name and renamed: it is whole or not there.
+ends, however it ends. Where a file system has none, or does not answer, this process goes on as if it were the only
+one, and says so once. A result is written under a temporary name and renamed: it is whole or not there.
 """
 
 from __future__ import annotations
 
 import hashlib
+import logging
 import os
+import threading
+import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -28,14 +32,25 @@ from typing import Any, Final, Generic, TypeVar
 from deepaccident_devkit.errors import DeepAccidentError
 from deepaccident_devkit.parallel.batches import run_batch
 from deepaccident_devkit.parallel.failures import Failure, Tried, check_failures
-from deepaccident_devkit.support.files import place_in, remove_in, say_waiting, write_bytes
+from deepaccident_devkit.support.files import place_in, remove_in, write_bytes
 from deepaccident_devkit.support.reading import FileKind, read_bytes
+from deepaccident_devkit.support.text import warn_once
+
+logger = logging.getLogger(__name__)
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 _SEAL: Final = 16
 """Bytes after a result."""
 _LOCKS: Final = (".lock", ".making")
+_ANSWER_SECONDS: Final = 30.0
+"""How long a file system may take to say whether a lock is free."""
+_WAIT_HOURS: Final = 48
+"""How long another process may hold a lock: a scenario, or the whole work of another command."""
+_WAITING: Final = "%s: another process %s there; waiting for it, for at most %s hours"
+_POLL_SECONDS: Final = 0.1
+_without_locks: Final = set[int]()
+"""Devices of the file systems that have no locks, as this process has found."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,8 +124,8 @@ class Store:
 
         Raises:
             OutputFolderError: the folder or its lock is a link.
-            DeepAccidentError: of the kind `error`, for any OSError: the folder cannot be made or written to, its file
-                system has no locks, the disk is full.
+            DeepAccidentError: of the kind `error`, for any OSError: the folder cannot be made or written to, the disk
+                is full; or another process holds the lock too long.
         """
         turn = Turn(self)
         try:
@@ -125,8 +140,10 @@ class Store:
             remedy = "make room there, or choose another folder, and run it again"
             raise self.error(f"{self.out}: cannot be written ({error}); {remedy}") from error
         finally:
-            turn.tidy()
-            turn.end()
+            try:
+                turn.tidy()
+            finally:
+                turn.end()
 
     def run(self, work: Callable[[Item], Result], items: Mapping[str, Item], **how: Any) -> dict[str, Result]:
         """Apply `work` to every item that no other process has at hand; then to those, once they have been let go.
@@ -149,12 +166,27 @@ class Store:
         left = list(items.items())
         for wait in (False, True):
             if wait and left:
-                say_waiting(self.out, self.task)
+                logger.warning(_WAITING, self.out, self.task, _WAIT_HOURS)
             done = run_batch(Tried(_Alone(self, work, wait=wait)), left, **how) if left else []
             results |= {name: result for (name, _), result in zip(left, done, strict=True)}
             left = [each for each in left if isinstance(results[each[0]], _AtHand)]
         check_failures(results.items(), str(self.out))
         return {name: each for name, each in results.items() if not isinstance(each, Failure | _AtHand)}
+
+    def take(self, file: int, kind: int, *, wait: bool = False) -> bool:
+        """Take the lock of an open file; false if another process holds it and this one does not wait.
+
+        Raises DeepAccidentError, of the kind `error`, if another process holds it too long.
+        """
+        end = time.monotonic() + _WAIT_HOURS * 3600 * wait
+        while not _is_taken(file, kind, self.out):
+            if time.monotonic() > end:
+                if wait:
+                    remedy = f"end it, or if there is none any more, remove {self.folder}"
+                    raise self.error(f"{self.out}: another process has held a lock for {_WAIT_HOURS} hours; {remedy}")
+                return False
+            time.sleep(_POLL_SECONDS)
+        return True
 
     def lock_path(self, name: str) -> Path:
         """The lock of an item; raises OutputFolderError if a link leads there."""
@@ -181,7 +213,7 @@ class Turn:
                 begin()
                 os.ftruncate(self._lock, 0)
                 os.pwrite(self._lock, command, 0)
-            fcntl.flock(self._lock, fcntl.LOCK_UN)
+            self._take(self._lock, fcntl.LOCK_UN)
             self._take(self._lock, fcntl.LOCK_SH)
             others = os.pread(self._lock, len(command) + 1, 0) != command
             if not others and self._take(self._making, fcntl.LOCK_SH) and self._is_there():
@@ -196,7 +228,7 @@ class Turn:
 
         if self._making < 0:  # it could not join
             return False
-        fcntl.flock(self._making, fcntl.LOCK_UN)  # NFS: two that hold it together would wait for each other
+        self._take(self._making, fcntl.LOCK_UN)  # NFS: two that hold it together would wait for each other
         return self._take(self._making, fcntl.LOCK_EX, wait=wait) and self._is_there()
 
     def tidy(self) -> None:
@@ -205,7 +237,7 @@ class Turn:
         with suppress(OSError):
             if not self.alone(wait=False) or any(folder.glob("kept/*")):
                 return
-            if not any(_is_held(path) for path in folder.glob("locks/**/*") if path.is_file()):
+            if not any(self._is_held(path) for path in folder.glob("locks/**/*") if path.is_file()):
                 self._store.remove()
 
     def end(self) -> None:
@@ -216,17 +248,22 @@ class Turn:
         self._lock = self._making = -1
 
     def _take(self, file: int, kind: int, *, wait: bool = True) -> bool:
-        """Take the lock of an open file; false if another process holds it and this one does not wait."""
+        """Take the lock of an open file as `Store.take` does, and say so if that has to wait."""
+        if self._store.take(file, kind):
+            return True
+        if wait:
+            logger.warning(_WAITING, self._store.out, self._store.task, _WAIT_HOURS)
+        return wait and self._store.take(file, kind, wait=True)
+
+    def _is_held(self, lock: Path) -> bool:
+        """Whether a process has an item."""
         import fcntl
 
+        file = _opened(lock)
         try:
-            fcntl.flock(file, kind | fcntl.LOCK_NB)
-        except BlockingIOError:
-            if not wait:
-                return False
-            say_waiting(self._store.out, self._store.task)
-            fcntl.flock(file, kind)
-        return True
+            return not self._store.take(file, fcntl.LOCK_EX)
+        finally:
+            os.close(file)
 
     def _is_there(self) -> bool:
         """Whether the locks that are open are those that others find by their names."""
@@ -256,11 +293,7 @@ class _Alone(Generic[Item, Result]):
         name, item = named
         file = _opened(self.store.lock_path(name))
         try:
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | (0 if self.wait else fcntl.LOCK_NB))
-            except BlockingIOError:
-                return _AtHand()
-            return self.work(item)
+            return self.work(item) if self.store.take(file, fcntl.LOCK_EX, wait=self.wait) else _AtHand()
         finally:
             os.close(file)
 
@@ -279,18 +312,35 @@ def _opened(lock: Path) -> int:
             return os.open(lock, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
 
 
-def _is_held(lock: Path) -> bool:
-    """Whether a process has an item."""
+def _is_taken(file: int, kind: int, out: Path) -> bool:
+    """Ask for the lock of an open file; false if another process holds it, true if the file system has no locks.
+
+    The call is made in a thread of its own, since a file server that is gone may never answer it.
+    """
     import fcntl
 
-    file = _opened(lock)
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
+    device, faults = os.fstat(file).st_dev, list[OSError]()
+
+    def ask() -> None:
+        try:
+            fcntl.flock(file, kind | fcntl.LOCK_NB)
+        except OSError as error:
+            faults.append(error)
+
+    if device in _without_locks:
         return True
-    finally:
-        os.close(file)
-    return False
+    thread = threading.Thread(target=ask, daemon=True)
+    thread.start()
+    thread.join(_ANSWER_SECONDS)
+    if thread.is_alive():
+        faults.append(TimeoutError(f"no answer within {_ANSWER_SECONDS:g} s"))
+    if faults and not isinstance(faults[0], BlockingIOError):
+        _without_locks.add(device)
+        warn_once(
+            f"{out}: its file system has no locks that work ({faults.pop()}), so this goes on as if no other process "
+            "wrote there; do not run a command twice at once on this folder"
+        )
+    return not faults
 
 
 def _seal(key: str, content: bytes) -> bytes:

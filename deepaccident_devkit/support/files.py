@@ -11,7 +11,6 @@ removed from it inside. Devices, pipes, sockets and folders are never replaced b
 from __future__ import annotations
 
 import hashlib
-import logging
 import os
 import platform
 import re
@@ -28,8 +27,6 @@ from typing import Final
 from deepaccident_devkit.errors import ConfigError, OutputFolderError
 from deepaccident_devkit.support.reading import irregular_text
 from deepaccident_devkit.support.text import path_of
-
-logger = logging.getLogger(__name__)
 
 _TEMPORARY: Final = re.compile(
     r"\.(?P<name>.+?)\.(?:(?P<host>[0-9a-f]{8})-(?P<process>[1-9]\d{0,9})-(?P<start>\d+)-)?\d+\.tmp(?:\.\w+)?",
@@ -193,11 +190,6 @@ def _start(process: int) -> str | None:
         return None
     state, *facts = status.rpartition(")")[2].split()  # after its name, which may have brackets itself
     return "" if state in "ZX" else facts[18]  # a killed process whose parent does not ask for it is there still
-
-
-def say_waiting(folder: Path, task: str) -> None:
-    """Log that another process does something in a folder until which this one waits."""
-    logger.warning("%s: another process %s there; waiting for it", folder, task)
 
 
 def write_bytes(path: Path, content: bytes) -> None:

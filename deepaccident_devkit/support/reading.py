@@ -9,6 +9,7 @@ import errno
 import hashlib
 import io
 import math
+import mmap
 import os
 import re
 import stat
@@ -17,18 +18,19 @@ import tokenize
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from functools import lru_cache
 from operator import attrgetter
 from pathlib import Path
 from types import MappingProxyType
-from typing import BinaryIO, Final, Literal, Protocol, TypeAlias
+from typing import Any, BinaryIO, Final, Literal, Protocol, TypeAlias
 
 import numpy as np
 
 from deepaccident_devkit.errors import shortened
 from deepaccident_devkit.support.arrays import AnyArray
+from deepaccident_devkit.support.text import warn_once
 
 FileKind: TypeAlias = Literal[
     "label",
@@ -174,6 +176,23 @@ def open_file(path: Path) -> BinaryIO:
     """A regular file of any size, opened for readers that take it in bounded parts; raises as `read_bytes`."""
     descriptor, _ = _opened(path)
     return os.fdopen(descriptor, "rb")
+
+
+def mapped_file(path: Path) -> Any:
+    """Map a regular file of any size into memory, as a `pyarrow.Buffer`; raises as `open_file` does.
+
+    Some file systems can only map it as private memory, or not at all: then it is read, which is said once a folder.
+    """
+    import pyarrow as pa
+
+    with open_file(path) as file:
+        with suppress(OSError):
+            return pa.memory_map(str(path)).read_buffer()
+        with suppress(OSError):
+            return pa.py_buffer(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_COPY))
+        remedy = "another folder, for an index by --index-dir, needs less memory"
+        warn_once(f"{path.parent}: files cannot be mapped into memory there, so they are read as a whole; {remedy}")
+        return pa.py_buffer(file.read())
 
 
 def file_checksum(path: Path) -> str:

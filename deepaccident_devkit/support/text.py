@@ -2,12 +2,14 @@
 
 import base64
 import json
+import logging
 import math
 import os
 import re
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from difflib import get_close_matches
+from functools import cache
 from html import escape
 from pathlib import Path
 from types import MappingProxyType
@@ -22,6 +24,15 @@ _DIFFERING = 3
 """Differing values that a message shows at most."""
 _NUMBER: Final = re.compile(r"[+-]?((\d+\.?\d*|\.\d+)(e[+-]?\d+)?|nan|inf|infinity)", re.ASCII | re.IGNORECASE)
 _INTEGER: Final = re.compile(r"(-?)0*(\d{1,19})", re.ASCII)
+
+
+@cache
+def warn_once(text: str) -> None:
+    """Log a warning once, and not in a worker process, whose parent says it."""
+    import multiprocessing
+
+    if multiprocessing.parent_process() is None:
+        logging.getLogger(__name__).warning("%s", text)
 
 
 def columns_text(rows: Sequence[Sequence[str]], *, left: int = 1) -> str:

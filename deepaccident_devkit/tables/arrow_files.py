@@ -17,7 +17,7 @@ import numpy as np
 from deepaccident_devkit.errors import IndexStoreError, shortened
 from deepaccident_devkit.support.arrays import AnyArray, BitView
 from deepaccident_devkit.support.files import replacing
-from deepaccident_devkit.support.reading import irregular_text
+from deepaccident_devkit.support.reading import mapped_file
 from deepaccident_devkit.tables.columns import (
     NULL_INTEGER,
     Choice,
@@ -99,7 +99,11 @@ class TableWriter(ExitStack):
         if not self.num_rows:
             return np.zeros(shape, dtype=dtype)
         collected.flush()
-        return np.memmap(collected, dtype=dtype, mode="r", shape=shape)
+        try:
+            return np.memmap(collected, dtype=dtype, mode="r", shape=shape)
+        except OSError:  # its file system cannot map files
+            collected.seek(0)
+            return np.fromfile(collected, dtype=dtype).reshape(shape)
 
 
 def write_table(folder: Path, spec: TableSpec, columns: Columns) -> None:
@@ -125,9 +129,7 @@ class StoredTable:
 
         path = table_path(folder, spec.name)
         try:
-            if fault := irregular_text(path.stat().st_mode):
-                raise OSError(fault)
-            batch = pa.ipc.open_file(pa.memory_map(str(path))).get_batch(0)
+            batch = pa.ipc.open_file(mapped_file(path)).get_batch(0)
             if fault := fault_of(spec, batch):
                 raise OSError(fault)
             self.views = views(spec, batch)

@@ -21,7 +21,7 @@ import numpy as np
 from deepaccident_devkit.errors import DatarootError, IndexStoreError, shortened
 from deepaccident_devkit.support.arrays import AnyArray
 from deepaccident_devkit.support.files import replacing
-from deepaccident_devkit.support.reading import irregular_text
+from deepaccident_devkit.support.reading import mapped_file
 from deepaccident_devkit.taxonomy import MINI_SPLITS, SPLITS
 
 MINI_FOLDER: Final = "DeepAccident_mini"
@@ -124,9 +124,7 @@ class Members:
         import pyarrow as pa
 
         try:
-            if fault := irregular_text(path.stat().st_mode):
-                raise OSError(fault)
-            batch = pa.ipc.open_file(pa.memory_map(str(path))).get_batch(0)
+            batch = pa.ipc.open_file(mapped_file(path)).get_batch(0)
             head = json.loads(batch.schema.metadata[_HEAD])
             if head["form"] != FORM:
                 raise ValueError("of another version of the devkit")

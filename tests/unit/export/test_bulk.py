@@ -10,6 +10,7 @@ import subprocess
 import sys
 import threading
 import time
+import zipfile
 from collections import Counter
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
@@ -19,6 +20,7 @@ from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import killed
 import pytest
@@ -36,12 +38,13 @@ from deepaccident_devkit.errors import (
     IndexStoreError,
     MissingFileError,
     NotAvailableError,
+    OutputFolderError,
     SensorFileError,
     SomeFailedError,
     WorkerError,
 )
 from deepaccident_devkit.export import bulk
-from deepaccident_devkit.export.bulk import Exported, Format, Link, Output, Tally, export_release
+from deepaccident_devkit.export.bulk import Export, Exported, Format, Link, Manifest, Output, Tally, export_release
 from deepaccident_devkit.export.image_cache import CachedImages
 from deepaccident_devkit.export.images import ImageConfig
 from deepaccident_devkit.export.nuscenes import NuScenes
@@ -51,13 +54,14 @@ from deepaccident_devkit.export.questions import Questions
 from deepaccident_devkit.export.released_infos import ReleasedInfos
 from deepaccident_devkit.export.webdataset import WebDataset
 from deepaccident_devkit.release import find_release
+from deepaccident_devkit.parallel import Store
 from deepaccident_devkit.release.fingerprints import fingerprint, scenario_hashes
 from deepaccident_devkit.support.files import temporary_of, temporary_path
 from deepaccident_devkit.tables import current_index
 from deepaccident_devkit.taxonomy import AGENTS
 
 SCENARIOS, PICTURES = 3, 18
-MANIFEST = "tiny.manifest.json"
+MANIFEST, ARCHIVE = "tiny.manifest.json", ".deepaccident-tiny.zip"
 
 
 Contents = dict[str, bytes | None]
@@ -129,11 +133,7 @@ def remove_scenario(root: Path, token: str) -> None:
 
 def test_what_is_there(small: DeepAccident, tmp_path: Path) -> None:
     done = written(small, tmp_path / "deep" / "out")
-    files = {
-        name
-        for name, content in contents(done.folder).items()
-        if content is not None and not name.startswith(".deepaccident-parts/")
-    }
+    files = {name for name, content in contents(done.folder).items() if content is not None and name != ARCHIVE}
     assert len(files) == PICTURES + SCENARIOS * (1 + 3 + 1) + 1 + 1
     assert {MANIFEST, "counts.json"} < files
     assert (done.written, done.kept, done.tally.samples, done.tally.files) == (3, 0, PICTURES, SCENARIOS * 5 + 1)
@@ -271,6 +271,32 @@ def test_what_was_left_before_the_manifest_is_no_other_thing(
     assert contents(written(small, tmp_path).folder) == whole
 
 
+def test_a_complete_export_keeps_one_file_for_later_calls(
+    small: DeepAccident, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Loaders that list the folder would take a folder for a scenario, or for a class."""
+    assert [path.name for path in written(small, tmp_path / "out").folder.glob(".*")] == [ARCHIVE]
+    monkeypatch.setattr(TinyFormat, "sensors", lambda _: ())
+    assert not list(written(small, tmp_path / "other").folder.glob(".*"))
+
+
+def test_a_damaged_archive_of_a_complete_export_is_named(changing: Path, tmp_path: Path) -> None:
+    out = written(reopened(changing), tmp_path / "out").folder
+    next(changing.glob("*/ego_vehicle/Camera_Front/*/*_002.jpg")).unlink()
+    whole = (out / ARCHIVE).read_bytes()
+    for content in (b"", whole[:-40], whole[:200] + b"?" + whole[201:]):
+        (out / ARCHIVE).write_bytes(content)
+        assert_refused((lambda: written(reopened(changing), out), ExportError, (ARCHIVE, "remove it", "as a whole")))
+    for name in ("../../kept.txt", str(tmp_path / "kept.txt")):
+        with zipfile.ZipFile(out / ARCHIVE, "w") as archive:
+            archive.writestr(name, b"")
+        assert_refused((lambda: written(reopened(changing), out), OutputFolderError, "kept.txt"))
+    (out / ARCHIVE).unlink()
+    assert written(reopened(changing), out).written == SCENARIOS
+    assert contents(out) == contents(written(reopened(changing), tmp_path / "fresh").folder)
+    assert not list(tmp_path.rglob("kept.txt"))
+
+
 def test_an_export_beside_another(small: DeepAccident, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     class Beside(TinyFormat):
         name = "beside"
@@ -282,7 +308,7 @@ def test_an_export_beside_another(small: DeepAccident, tmp_path: Path, monkeypat
     monkeypatch.setattr(Beside, "finish", lambda *_: None)
     written(small, out, Beside())
     new = contents(out).keys() - before.keys()
-    assert {name for name in new if not name.startswith(".deepaccident-parts/kept/beside")} == {"beside.manifest.json"}
+    assert new == {".deepaccident-beside.zip", "beside.manifest.json"}
     assert written(small, out).kept == SCENARIOS
     assert_refused(
         (lambda: written(small, written(small, tmp_path / "other", Beside()).folder), ExportError, "is not empty")
@@ -369,10 +395,36 @@ class TestRelease:
 
     def test_parts_that_went_are_made_again_with_the_rest(self, changing: Path, tmp_path: Path) -> None:
         out = written(reopened(changing), tmp_path / "out").folder
-        shutil.rmtree(out / ".deepaccident-parts")
+        (out / ARCHIVE).unlink()
         assert written(reopened(changing), out).written == 0
         next(changing.glob("*/ego_vehicle/Camera_Front/*/*_002.jpg")).unlink()
         assert written(reopened(changing), out).written == SCENARIOS
+
+    @pytest.mark.parametrize("sensors_change", [False, True])
+    def test_the_working_folder_of_an_earlier_version_is_packed(
+        self, changing: Path, tmp_path: Path, sensors_change: bool
+    ) -> None:
+        """Version 1.0.0 left it in a complete export."""
+        out = written(reopened(changing), tmp_path / "out").folder
+        with zipfile.ZipFile(out / ARCHIVE) as archive:
+            archive.extractall(out / ".deepaccident-parts" / "kept" / "tiny")
+        (out / ARCHIVE).unlink()
+        if sensors_change:
+            next(changing.glob("*/ego_vehicle/Camera_Front/*/*_002.jpg")).unlink()
+        assert written(reopened(changing), out).written == sensors_change
+        assert contents(out) == contents(written(reopened(changing), tmp_path / "fresh").folder)
+
+    @pytest.mark.parametrize("moment", ["Store.drop", "Store.remove", "Manifest.write", "Export._remove_others"])
+    def test_a_call_that_is_killed_as_it_packs_or_unpacks(self, changing: Path, tmp_path: Path, moment: str) -> None:
+        name, method = moment.split(".")
+        kind = {"Store": Store, "Manifest": Manifest, "Export": Export}[name]
+        out = written(reopened(changing), tmp_path / "out").folder
+        next(changing.glob("*/ego_vehicle/Camera_Front/*/*_002.jpg")).unlink()
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(kind, method, Mock(side_effect=KeyboardInterrupt))
+            assert_refused((lambda: written(reopened(changing), out), KeyboardInterrupt, ()))
+        assert written(reopened(changing), out).folder == out
+        assert contents(out) == contents(written(reopened(changing), tmp_path / "fresh").folder)
 
     def test_an_unfinished_export_is_continued_with_the_new_state(self, changing: Path, tmp_path: Path) -> None:
         dataset = reopened(changing)
@@ -776,12 +828,10 @@ def test_a_worker_that_was_taken_for_lost_keeps_its_unit(
 
 
 def test_what_another_host_left_of_a_unit_is_removed(small: DeepAccident, tmp_path: Path) -> None:
-    written(small, tmp_path / "out")
+    stopped(small, tmp_path / "out", 2)
     kept = tmp_path / "out" / ".deepaccident-parts" / "kept" / "tiny"
     unit = min(each.name.removesuffix(".paths") for each in kept.glob("[!.]*.paths"))
     (kept / unit / "done").unlink()
-    manifest = tmp_path / "out" / "tiny.manifest.json"
-    manifest.write_text(json.dumps({**json.loads(manifest.read_text()), "release": None}))
     left = tmp_path / "out" / "folders" / f".{unit[:50]}.0123abcd-77-99-1.tmp"
     left.mkdir()
     written(small, tmp_path / "out")
