@@ -24,6 +24,10 @@ _NEEDED: Final = ("starlette", "uvicorn")
 PORTS: Final = range(8765, 8785)
 """Tried first; then the machine chooses one."""
 _LAST_PORT: Final = 0xFFFF
+_REQUEST_SECONDS: Final = 10.0
+"""Time in which a connection must bring a whole request."""
+_MOST_CONNECTIONS: Final = 200
+"""With more of them, the one that has been without a whole request for the longest time is closed."""
 _STOP_SECONDS: Final = 0.7
 """Time for answers that are being made when the server stops; then they are left to their threads."""
 _EXPOSED: Final = (
@@ -169,7 +173,7 @@ class _Running:
         self._server = uvicorn.Server(
             uvicorn.Config(
                 app,
-                http="h11",
+                http=_protocol(),
                 loop="asyncio",
                 ws="none",
                 lifespan="on",
@@ -213,6 +217,42 @@ class _Running:
         await self._server.serve(sockets=[self._listening])
         for connection in [*self._server.server_state.connections]:  # to readers who take nothing
             connection.transport.abort()
+
+
+def _protocol() -> type[asyncio.Protocol]:
+    """Return uvicorn's own protocol with a limit of time and number for what strangers can open without the token."""
+    from h11 import IDLE, SEND_BODY
+    from uvicorn.protocols.http.h11_impl import H11Protocol
+
+    class LimitedProtocol(H11Protocol):
+        """A connection that is closed if it does not bring whole requests."""
+
+        deadline: asyncio.TimerHandle | None = None
+
+        def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+            super().connection_made(transport)
+            self._set_deadline()
+            if len(self.connections) > _MOST_CONNECTIONS:
+                deadlines = {each.deadline.when(): each for each in self.connections if each.deadline}
+                deadlines[min(deadlines)].give_up()
+
+        def data_received(self, data: bytes) -> None:
+            super().data_received(data)
+            self._set_deadline()
+
+        def _set_deadline(self) -> None:
+            is_whole = self.conn.their_state not in (IDLE, SEND_BODY)
+            if is_whole and self.deadline is not None:
+                self.deadline.cancel()
+                self.deadline = None
+            elif not is_whole and self.deadline is None:
+                self.deadline = self.loop.call_later(_REQUEST_SECONDS, self.give_up)
+
+        def give_up(self) -> None:
+            self.deadline = None
+            self.transport.abort()
+
+    return LimitedProtocol
 
 
 class _TakenError(ConfigError):

@@ -1,9 +1,10 @@
 import socket
 import sys
 import threading
+import time
 import webbrowser
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from http.client import HTTPConnection
 from importlib import import_module
 from ipaddress import ip_address
@@ -311,3 +312,59 @@ def test_the_verb_makes_one_call(monkeypatch: pytest.MonkeyPatch, tmp_path: Path
     (_, target), options = verb("--out", "out", "--where", "town=Town03", "--where", "length=1..9")
     wanted = {**shared, "where": ("town=Town03", "length=1..9"), "workers": None, "progress": True}
     assert (target, options) == (Path("out"), wanted)
+
+
+HALF = b"GET /page HTTP/1.1\r\nHost: localhost"
+WHOLE = HALF + b"\r\n\r\n"
+SLOW = {
+    "nothing": (b"", b""),
+    "half a request": (HALF, b""),
+    "a header letter by letter": (HALF, b"a"),
+    "a body letter by letter": (b"POST /page HTTP/1.1\r\nHost: localhost\r\nContent-Length: 999\r\n\r\n", b"a"),
+    "half a request after a whole one": (WHOLE + HALF, b"a"),
+    "a body without an end": (
+        b"POST / HTTP/1.1\r\nHost: localhost\r\nTransfer-Encoding: chunked\r\n\r\n",
+        b"1\r\na\r\n",
+    ),
+}
+
+
+@pytest.mark.parametrize(("first", "later"), SLOW.values(), ids=SLOW)
+def test_who_sends_no_whole_request_in_time_is_cut_off(
+    first: bytes, later: bytes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "_REQUEST_SECONDS", 0.5)
+    with serving(TinyApp(), port=0) as served, socket.create_connection(("127.0.0.1", served.port)) as slow:
+        slow.sendall(first)
+        slow.settimeout(0.05)
+        end = time.monotonic() + AT_ONCE
+        is_open = True
+        while is_open:
+            assert time.monotonic() < end
+            try:
+                slow.sendall(later)
+                is_open = slow.recv(4096) != b""
+            except TimeoutError:
+                continue
+            except ConnectionError:
+                is_open = False
+        assert ask(served.port, "/page", cookie_of(served)).status == 200
+
+
+def test_half_requests_leave_room_for_whole_ones(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "_MOST_CONNECTIONS", 20)
+    app = TinyApp()
+    with serving(app, port=0) as served, ExitStack() as stack:
+        reader = stack.enter_context(shown(served, "/slow"))  # who waits for an answer keeps the connection
+        assert app.begun.wait(AT_ONCE)
+        half = [stack.enter_context(socket.create_connection(("127.0.0.1", served.port))) for _ in range(100)]
+        for each in half:
+            with suppress(ConnectionError):
+                each.sendall(HALF)
+        assert [ask(served.port, "/page", cookie_of(served)).status for _ in range(5)] == [200] * 5
+        for each in half[:50]:
+            each.settimeout(AT_ONCE)
+            with suppress(ConnectionError):
+                assert each.recv(1) == b""
+        app.go_on.set()
+        assert reader.getresponse().status == 200
