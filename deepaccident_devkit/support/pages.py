@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, Final
 from urllib.parse import quote
 
 from deepaccident_devkit._version import __version__
+from deepaccident_devkit.errors import escaped
 from deepaccident_devkit.support.text import counted, number_text
 from deepaccident_devkit.taxonomy import short_name
 
@@ -54,8 +55,8 @@ def environment() -> Environment:
 
 
 def rendered(template: str, **context: Any) -> str:
-    """A template of this name as text, with all that it shows."""
-    return environment().get_template(template).render(**context)
+    """A template of this name as text, with all that it shows; control characters are shown as in JSON."""
+    return escaped(environment().get_template(template).render(**context))
 
 
 def document(template: str, *, style: str, policy: str = _POLICY, script: str = "", **context: Any) -> str:

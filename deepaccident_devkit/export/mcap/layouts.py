@@ -10,7 +10,7 @@ from typing import Any
 from deepaccident_devkit.support.files import write_bytes
 from deepaccident_devkit.taxonomy import LIDAR
 
-_RERUN = '''"""Open {file} in rerun (0.41) with a layout: pip install rerun-sdk, then python {script}."""
+_RERUN = '''"""Open the recording beside this script in rerun (0.41) with a layout; needs: pip install rerun-sdk."""
 
 from pathlib import Path
 
@@ -38,7 +38,7 @@ values = show.TimeSeriesView(name="speeds (m/s), time to impact (s)", contents=l
 blueprint = show.Blueprint(show.Horizontal(scene, show.Vertical(*cameras, values), column_shares=[3, 2]))
 if __name__ == "__main__":
     rerun.init("deepaccident", spawn=True, default_blueprint=blueprint)
-    rerun.log_file_from_path(Path(__file__).with_name("{file}"))
+    rerun.log_file_from_path(Path(__file__).with_name({file!a}))
 '''
 
 
@@ -71,7 +71,6 @@ def write_layouts(path: Path, topics: Sequence[str]) -> None:
     layout = {"direction": "row", "first": "3D!scene", "second": side, "splitPercentage": 60}
     foxglove = {"configById": panels, "globalVariables": {}, "userNodes": {}, "layout": layout}
     write_bytes(path.with_suffix(".foxglove.json"), json.dumps(foxglove, indent=1).encode())
-    script = path.with_suffix(".rerun.py")
     scene = ["/road/points", "/actors/points", "/tf", *clouds]
-    text = _RERUN.format(file=path.name, script=script.name, scene=scene, cameras=cameras, values=values)
-    write_bytes(script, text.encode())
+    text = _RERUN.format(file=path.name, scene=scene, cameras=cameras, values=values)
+    write_bytes(path.with_suffix(".rerun.py"), text.encode())

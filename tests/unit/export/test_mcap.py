@@ -1,5 +1,6 @@
 """Files of MCAP, read back by the format's own library: what is in them, what goes in, and what errors say."""
 
+import ast
 import json
 import logging
 import re
@@ -33,6 +34,7 @@ from deepaccident_devkit.evaluation.detection import DetectedBoxes
 from deepaccident_devkit.evaluation.predictions import Accident, MotionOutput
 from deepaccident_devkit.evaluation.results import ResultsWriter, read_results
 from deepaccident_devkit.export.mcap import EPOCH, McapConfig, export_mcap
+from deepaccident_devkit.export.mcap.layouts import write_layouts
 from deepaccident_devkit.motion import MotionHeads, motion_labels
 from deepaccident_devkit.release.npz import TAGS
 from deepaccident_devkit.render.styles import AGENT_COLORS, COLLIDER_COLOR, MAP_COLORS
@@ -197,6 +199,17 @@ def test_layouts_beside_the_file_name_its_topics(path: Path, file: McapFile) -> 
     assert named <= {*file.messages}
     assert {"/road/points", "/actors", "/ego_vehicle/speed", "/time_to_impact"} <= named
     assert {*re.findall(r'"(\w+![^"]+)"', json.dumps(layout["layout"]))} == {*panels}
+
+
+@pytest.mark.parametrize("name", ['a"""; print(1); """', "b'\\", "c{d}%s", "new\nline", "caf\xe9 \udcff"])
+def test_no_name_of_a_file_is_code_in_its_script(name: str, tmp_path: Path) -> None:
+    write_layouts(tmp_path / f"{name}.mcap", [])
+    module = ast.parse((tmp_path / f"{name}.rerun.py").read_text())
+    statements = [ast.unparse(each) for each in module.body if isinstance(each, ast.Expr)]
+    assert statements == [repr(ast.get_docstring(module, clean=False))]
+    calls = [each for each in ast.walk(module) if isinstance(each, ast.Call)]
+    [names] = [each.args for each in calls if ast.unparse(each.func).endswith("with_name")]
+    assert [ast.literal_eval(each) for each in names] == [f"{name}.mcap"]
 
 
 def test_actors_are_the_union_of_all_annotations(da: DeepAccident, scenario: str, file: McapFile) -> None:

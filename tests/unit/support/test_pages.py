@@ -7,9 +7,10 @@ from typing import Any
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from jinja2 import DictLoader
 from report_page import Page
 
-from deepaccident_devkit.support.pages import breakable, environment, result_text
+from deepaccident_devkit.support.pages import breakable, document, environment, result_text
 
 TREE = '{% from "macros.html" import tree %}{{ tree(value) }}'
 
@@ -56,6 +57,15 @@ def test_results_have_three_decimals_or_digits() -> None:
 )
 def test_names_are_broken_between_words(name: str, broken: str) -> None:
     assert breakable(name) == broken
+
+
+def test_control_characters_of_names_are_shown_in_pages() -> None:
+    """Whoever prints a page in a terminal sees no colours, jumps or turned letters of a stranger's."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(environment(), "loader", DictLoader({"page.html": "<p>{{ name }}\n\t</p>"}))
+        page = document("page.html", style="", name="a\x1b[31m\x07\u202e\x9b\ud800é<")
+    assert page == r"<p>a\u001b[31m\u0007\u202e\u009b\ud800é&lt;" + "\n\t</p>"
+    assert page.encode()
 
 
 def test_templates_are_read_when_the_first_page_is_made() -> None:
