@@ -19,7 +19,6 @@ one, and says so once. A result is written under a temporary name and renamed: i
 from __future__ import annotations
 
 import hashlib
-import logging
 import os
 import threading
 import time
@@ -36,8 +35,6 @@ from deepaccident_devkit.support.files import place_in, remove_in, write_bytes
 from deepaccident_devkit.support.reading import FileKind, read_bytes
 from deepaccident_devkit.support.text import warn_once
 
-logger = logging.getLogger(__name__)
-
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 _SEAL: Final = 16
@@ -45,9 +42,8 @@ _SEAL: Final = 16
 _LOCKS: Final = (".lock", ".making")
 _ANSWER_SECONDS: Final = 30.0
 """How long a file system may take to say whether a lock is free."""
-_WAIT_HOURS: Final = 48
+_WAIT_HOURS: Final = 24
 """How long another process may hold a lock: a scenario, or the whole work of another command."""
-_WAITING: Final = "%s: another process %s there; waiting for it, for at most %s hours"
 _POLL_SECONDS: Final = 0.1
 _without_locks: Final = set[int]()
 """Devices of the file systems that have no locks, as this process has found."""
@@ -166,7 +162,7 @@ class Store:
         left = list(items.items())
         for wait in (False, True):
             if wait and left:
-                logger.warning(_WAITING, self.out, self.task, _WAIT_HOURS)
+                self.say_waiting()
             done = run_batch(Tried(_Alone(self, work, wait=wait)), left, **how) if left else []
             results |= {name: result for (name, _), result in zip(left, done, strict=True)}
             left = [each for each in left if isinstance(results[each[0]], _AtHand)]
@@ -178,15 +174,21 @@ class Store:
 
         Raises DeepAccidentError, of the kind `error`, if another process holds it too long.
         """
-        end = time.monotonic() + _WAIT_HOURS * 3600 * wait
+        end = time.monotonic() + _WAIT_HOURS * 3600
         while not _is_taken(file, kind, self.out):
-            if time.monotonic() > end:
-                if wait:
-                    remedy = f"end it, or if there is none any more, remove {self.folder}"
-                    raise self.error(f"{self.out}: another process has held a lock for {_WAIT_HOURS} hours; {remedy}")
+            if not wait:
                 return False
+            self.say_waiting()
+            if time.monotonic() > end:
+                remedy = f"end it, or if there is none any more, remove {self.folder}"
+                raise self.error(f"{self.out}: another process has held a lock for {_WAIT_HOURS} hours; {remedy}")
             time.sleep(_POLL_SECONDS)
         return True
+
+    def say_waiting(self) -> None:
+        """Say once that this process waits for another one, and for how long at most."""
+        hours = f"at most {_WAIT_HOURS} hours"
+        warn_once(f"{self.out}: another process {self.task} there; waiting for it, for {hours}")
 
     def lock_path(self, name: str) -> Path:
         """The lock of an item; raises OutputFolderError if a link leads there."""
@@ -209,14 +211,15 @@ class Turn:
         while True:
             self.end()
             self._lock, self._making = (_opened(place_in(self._store.folder, name, opened=True)) for name in _LOCKS)
-            if self._take(self._lock, fcntl.LOCK_EX, wait=others) and self._is_there():
+            take = self._store.take
+            if take(self._lock, fcntl.LOCK_EX, wait=others) and self._is_there():
                 begin()
                 os.ftruncate(self._lock, 0)
                 os.pwrite(self._lock, command, 0)
-            self._take(self._lock, fcntl.LOCK_UN)
-            self._take(self._lock, fcntl.LOCK_SH)
+            take(self._lock, fcntl.LOCK_UN)
+            take(self._lock, fcntl.LOCK_SH, wait=True)
             others = os.pread(self._lock, len(command) + 1, 0) != command
-            if not others and self._take(self._making, fcntl.LOCK_SH) and self._is_there():
+            if not others and take(self._making, fcntl.LOCK_SH, wait=True) and self._is_there():
                 return  # else another process has finished just now, or makes something else
 
     def alone(self, *, wait: bool = True) -> bool:
@@ -228,8 +231,8 @@ class Turn:
 
         if self._making < 0:  # it could not join
             return False
-        self._take(self._making, fcntl.LOCK_UN)  # NFS: two that hold it together would wait for each other
-        return self._take(self._making, fcntl.LOCK_EX, wait=wait) and self._is_there()
+        self._store.take(self._making, fcntl.LOCK_UN)  # NFS: two that hold it together would wait for each other
+        return self._store.take(self._making, fcntl.LOCK_EX, wait=wait) and self._is_there()
 
     def tidy(self) -> None:
         """Remove the store if nothing is kept and nobody makes items, nor a worker whose caller was stopped."""
@@ -237,7 +240,10 @@ class Turn:
         with suppress(OSError):
             if not self.alone(wait=False) or any(folder.glob("kept/*")):
                 return
-            if not any(self._is_held(path) for path in folder.glob("locks/**/*") if path.is_file()):
+            locks = folder / "locks"
+            held = _Alone(self._store, str, wait=False)
+            names = [str(path.relative_to(locks)) for path in locks.glob("**/*") if path.is_file()]
+            if not any(isinstance(held((name, "")), _AtHand) for name in names):
                 self._store.remove()
 
     def end(self) -> None:
@@ -246,24 +252,6 @@ class Turn:
             if file >= 0:
                 os.close(file)
         self._lock = self._making = -1
-
-    def _take(self, file: int, kind: int, *, wait: bool = True) -> bool:
-        """Take the lock of an open file as `Store.take` does, and say so if that has to wait."""
-        if self._store.take(file, kind):
-            return True
-        if wait:
-            logger.warning(_WAITING, self._store.out, self._store.task, _WAIT_HOURS)
-        return wait and self._store.take(file, kind, wait=True)
-
-    def _is_held(self, lock: Path) -> bool:
-        """Whether a process has an item."""
-        import fcntl
-
-        file = _opened(lock)
-        try:
-            return not self._store.take(file, fcntl.LOCK_EX)
-        finally:
-            os.close(file)
 
     def _is_there(self) -> bool:
         """Whether the locks that are open are those that others find by their names."""
@@ -334,13 +322,14 @@ def _is_taken(file: int, kind: int, out: Path) -> bool:
     thread.join(_ANSWER_SECONDS)
     if thread.is_alive():
         faults.append(TimeoutError(f"no answer within {_ANSWER_SECONDS:g} s"))
-    if faults and not isinstance(faults[0], BlockingIOError):
-        _without_locks.add(device)
-        warn_once(
-            f"{out}: its file system has no locks that work ({faults.pop()}), so this goes on as if no other process "
-            "wrote there; do not run a command twice at once on this folder"
-        )
-    return not faults
+    if not faults or isinstance(faults[0], BlockingIOError):
+        return not faults
+    _without_locks.add(device)
+    warn_once(
+        f"{out}: its file system has no locks that work ({faults[0]}), so this goes on as if no other process wrote "
+        "there; do not run a command twice at once on this folder"
+    )
+    return True
 
 
 def _seal(key: str, content: bytes) -> bytes:

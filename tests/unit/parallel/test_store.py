@@ -1,8 +1,10 @@
 """The store of one result an item."""
 
+import fcntl
 import os
 import subprocess
 import time
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -15,6 +17,8 @@ from stored import ITEMS, Work, made, process, store_in
 
 from deepaccident_devkit.errors import ConfigError, OutputFolderError, SomeFailedError
 from deepaccident_devkit.parallel import Store
+from deepaccident_devkit.parallel import store as module
+from deepaccident_devkit.support.text import warn_once
 
 WHOLE = b"\n".join(f"{name} {name} settings".encode() for name in ITEMS)
 
@@ -198,3 +202,64 @@ def test_what_cannot_be_written_is_an_error_of_the_caller(tmp_path: Path) -> Non
         ),
     )
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+@pytest.fixture
+def forgotten(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """What was found and said of file systems is forgotten, before and afterwards."""
+    monkeypatch.setattr(module, "_without_locks", set())
+    warn_once.cache_clear()
+    yield
+    warn_once.cache_clear()
+
+
+def not_locking(number: int) -> Callable[[int, int], None]:
+    def flock(_file: int, _kind: int) -> None:
+        raise OSError(number, os.strerror(number))
+
+    return flock
+
+
+def never_answering(_file: int, _kind: int) -> None:
+    time.sleep(3600)
+
+
+@pytest.mark.usefixtures("forgotten")
+@pytest.mark.parametrize(
+    ("flock", "reason"),
+    [
+        *((not_locking(number), os.strerror(number)) for number in (38, 37, 95, 22, 5, 13)),
+        (never_answering, "no answer within 0.2 s"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_a_file_system_without_locks(
+    flock: Callable[[int, int], None],
+    reason: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """ENOSYS of Lustre, ENOLCK of NFS, EOPNOTSUPP of FUSE, and whatever else: the work is done, which is said once."""
+    monkeypatch.setattr(fcntl, "flock", flock)
+    monkeypatch.setattr(module, "_ANSWER_SECONDS", 0.2)
+    for _ in range(2):
+        assert list(made(tmp_path).values()) == WHOLE.split(b"\n")
+        (tmp_path / "out").unlink()
+    [said] = [record.getMessage() for record in caplog.records]
+    assert [fact for fact in (str(tmp_path / "out"), "locks", reason, "twice at once") if fact not in said] == []
+    assert not store_in(tmp_path).folder.exists()
+
+
+@pytest.mark.usefixtures("forgotten")
+def test_a_lock_that_is_never_given_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(module, "_WAIT_HOURS", 0.0001)
+    one, other = (Store(tmp_path / "store", tmp_path / "out", "tests", ConfigError, name) for name in ("one", "other"))
+    facts = ("out: another process", "0.0001 hours", str(tmp_path / "store"))
+    with one.shared() as turn, one.shared():
+        assert_refused((lambda: other.shared().__enter__(), ConfigError, facts), (turn.alone, ConfigError, facts))
+    assert ["at most 0.0001 hours" in record.getMessage() for record in caplog.records] == [True]
+    with other.shared():
+        pass
