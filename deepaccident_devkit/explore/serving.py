@@ -8,13 +8,15 @@ import os
 import socket
 import sys
 import threading
+import time
 import webbrowser
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from ipaddress import IPv4Address, IPv6Address, ip_address
-from typing import Final
+from operator import itemgetter
+from typing import Any, Final
 
 from deepaccident_devkit.errors import ConfigError, MissingExtraError
 from deepaccident_devkit.explore.access import Access, App, Gate, HostPort, RootPath
@@ -27,7 +29,8 @@ _LAST_PORT: Final = 0xFFFF
 _REQUEST_SECONDS: Final = 10.0
 """Time in which a connection must bring a whole request."""
 _MOST_CONNECTIONS: Final = 200
-"""With more of them, the one that has been without a whole request for the longest time is closed."""
+"""With more of them, those that have waited for a whole request the longest are closed."""
+_SWEEP_SECONDS: Final = 0.1
 _STOP_SECONDS: Final = 0.7
 """Time for answers that are being made when the server stops; then they are left to their threads."""
 _EXPOSED: Final = (
@@ -173,7 +176,7 @@ class _Running:
         self._server = uvicorn.Server(
             uvicorn.Config(
                 app,
-                http=_protocol(),
+                http="h11",
                 loop="asyncio",
                 ws="none",
                 lifespan="on",
@@ -214,45 +217,27 @@ class _Running:
             self._ended.set()
 
     async def _serve(self) -> None:
+        closing = asyncio.create_task(self._close_unasking())
         await self._server.serve(sockets=[self._listening])
+        closing.cancel()
         for connection in [*self._server.server_state.connections]:  # to readers who take nothing
             connection.transport.abort()
 
+    async def _close_unasking(self) -> None:
+        """Close each connection that brings no whole request in time; and of too many, those that wait the longest."""
+        from h11 import IDLE, SEND_BODY
 
-def _protocol() -> type[asyncio.Protocol]:
-    """Return uvicorn's own protocol with a limit of time and number for what strangers can open without the token."""
-    from h11 import IDLE, SEND_BODY
-    from uvicorn.protocols.http.h11_impl import H11Protocol
-
-    class LimitedProtocol(H11Protocol):
-        """A connection that is closed if it does not bring whole requests."""
-
-        deadline: asyncio.TimerHandle | None = None
-
-        def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-            super().connection_made(transport)
-            self._set_deadline()
-            if len(self.connections) > _MOST_CONNECTIONS:
-                deadlines = {each.deadline.when(): each for each in self.connections if each.deadline}
-                deadlines[min(deadlines)].give_up()
-
-        def data_received(self, data: bytes) -> None:
-            super().data_received(data)
-            self._set_deadline()
-
-        def _set_deadline(self) -> None:
-            is_whole = self.conn.their_state not in (IDLE, SEND_BODY)
-            if is_whole and self.deadline is not None:
-                self.deadline.cancel()
-                self.deadline = None
-            elif not is_whole and self.deadline is None:
-                self.deadline = self.loop.call_later(_REQUEST_SECONDS, self.give_up)
-
-        def give_up(self) -> None:
-            self.deadline = None
-            self.transport.abort()
-
-    return LimitedProtocol
+        connections: Any = self._server.server_state.connections
+        since: dict[Any, float] = {}
+        while True:
+            await asyncio.sleep(_SWEEP_SECONDS)
+            now = time.monotonic()
+            asking = [(each, each.cycle) for each in connections if each.conn.their_state in (IDLE, SEND_BODY)]
+            since = {each: since.get(each, now) for each in asking}
+            too_many = len(connections) - _MOST_CONNECTIONS
+            for number, (connection, began) in enumerate(sorted(since.items(), key=itemgetter(1))):
+                if number < too_many or now - began > _REQUEST_SECONDS:
+                    connection[0].transport.abort()
 
 
 class _TakenError(ConfigError):
