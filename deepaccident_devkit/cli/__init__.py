@@ -110,7 +110,9 @@ def _run() -> None:
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s: %(message)s", handlers=[shown])
     try:
         run_interruptibly(deepaccident)
-    except (DeepAccidentError, OSError) as error:  # an OSError: a full disk, a folder without permission
+    except (DeepAccidentError, OSError, MemoryError) as error:  # OSErrors: a full disk, a folder without permission
         *_, told = str(error).rpartition(f".{type(error).__name__}: ")  # a loader's worker puts its traceback before it
+        if isinstance(error, MemoryError):
+            told = f"memory ran out {told}; use fewer workers (--workers), or a machine with more memory"
         click.echo(f"error: {told}", err=True)
         sys.exit(_FINDINGS_STATUS if isinstance(error, SomeFailedError) else _ERROR_STATUS)

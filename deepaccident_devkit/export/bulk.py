@@ -451,7 +451,7 @@ class Export:
             with replacing(self._archive) as temporary, zipfile.ZipFile(temporary, "w") as archive:
                 for path in sorted(path for path in self.kept.rglob("*") if path.is_file() and not path.is_symlink()):
                     name = path.relative_to(self.kept).as_posix()
-                    archive.writestr(zipfile.ZipInfo(name), path.read_bytes())  # without a date
+                    archive.writestr(zipfile.ZipInfo(name), read_bytes(path, "archive"))  # without a date
         self.store.drop(self.form.name)
         self.store.remove(keep=any(self.store.folder.glob("kept/*")))  # another format's
 
@@ -466,7 +466,7 @@ class Export:
         try:
             with open_zip(self._archive) as archive:
                 for entry in archive.infolist():
-                    write_bytes(place_in(self.kept, entry.filename), read_member(archive, entry, "bundle"))
+                    write_bytes(place_in(self.kept, entry.filename), read_member(archive, entry, "archive"))
         except OSError:
             raise
         except DAMAGED_ARCHIVE as error:

@@ -13,12 +13,10 @@ from torch._utils import ExceptionWrapper
 from torch.utils.data import DataLoader
 
 from deepaccident_devkit.errors import DeepAccidentError, WorkerError, shortened
+from deepaccident_devkit.parallel import FEWER_WORKERS, starting_workers
 
-_WORKERS_FAULT: Final = re.compile(r"DataLoader worker|shared memory|ancdata")
+_WORKERS_FAULT: Final = re.compile(r"DataLoader worker|</torch_|ancdata")
 """What torch says in this process if a worker failed, or if what it sent cannot be opened here."""
-_REMEDY: Final = (
-    "if memory or shared memory (/dev/shm) ran out, use fewer workers, or none (without --workers; workers=0 in Python)"
-)
 
 
 def read_batches(data: Any, collate: Callable[..., Any], workers: int, **options: Any) -> Iterator[dict[str, Any]]:
@@ -33,13 +31,9 @@ def read_batches(data: Any, collate: Callable[..., Any], workers: int, **options
     Raises:
         WorkerError: The processes cannot be started.
     """
-    try:
-        _ = [
-            multiprocessing.Queue() for _ in range(workers and workers + 3)
-        ]  # torch, where it fails, prints tracebacks
+    with starting_workers():
+        _ = [multiprocessing.Queue() for _ in range(workers and workers + 3)]  # where torch fails, it prints tracebacks
         return iter(DataLoader(data, collate_fn=collate, num_workers=workers, worker_init_fn=_send_faults, **options))
-    except OSError as error:  # the system has no room for a lock or a process
-        raise WorkerError(f"worker processes cannot be started ({error}); {_REMEDY}") from error
 
 
 @contextmanager
@@ -55,7 +49,7 @@ def worker_faults_named() -> Iterator[None]:
             raise
         text = str(error.__cause__ or "") or str(error)  # the cause names the signal that killed a worker
         cause = shortened(text.strip().splitlines()[-1])
-        raise WorkerError(f"a worker process that reads samples failed ({cause}); {_REMEDY}") from error
+        raise WorkerError(f"a worker process that reads samples failed ({cause}); {FEWER_WORKERS}") from error
 
 
 def _send_faults(_: int) -> None:

@@ -4,11 +4,18 @@ Every function that works on many scenarios or samples takes `workers` and `exec
 """
 
 from deepaccident_devkit.parallel.batches import Engine, Places, Progress, in_order, run_batch, run_unordered
-from deepaccident_devkit.parallel.executors import cluster_executor, own_threads, workers_kept
+from deepaccident_devkit.parallel.executors import (
+    FEWER_WORKERS,
+    cluster_executor,
+    own_threads,
+    starting_workers,
+    workers_kept,
+)
 from deepaccident_devkit.parallel.failures import Failure, Tried, check_failures
 from deepaccident_devkit.parallel.store import Store, unfinished_folder
 
 __all__ = [
+    "FEWER_WORKERS",
     "Engine",
     "Failure",
     "Places",
@@ -21,6 +28,7 @@ __all__ = [
     "own_threads",
     "run_batch",
     "run_unordered",
+    "starting_workers",
     "unfinished_folder",
     "workers_kept",
 ]

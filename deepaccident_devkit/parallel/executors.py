@@ -36,6 +36,9 @@ _USUAL_WIDTH: Final = 64
 MPI: Final = "mpi"
 SECONDS: Final = 10.0
 """How long an empty file of a scheduler may still get its address."""
+FEWER_WORKERS: Final = (
+    "if memory or shared memory (/dev/shm) ran out, use fewer workers, or none (for training: without --workers)"
+)
 _PACKAGE: Final = __name__.partition(".")[0]
 _kept: ContextVar[dict[int, ProcessPoolExecutor] | None] = ContextVar("kept", default=None)
 """Within `workers_kept`: number of processes → a pool of them that waits for work."""
@@ -182,6 +185,15 @@ def workers_kept() -> Iterator[None]:
 
 
 @contextmanager
+def starting_workers() -> Iterator[None]:
+    """Raise WorkerError if the system has no room for processes, or for their locks in shared memory."""
+    try:
+        yield
+    except OSError as error:
+        raise WorkerError(f"worker processes cannot be started ({error}); {FEWER_WORKERS}") from error
+
+
+@contextmanager
 def own_workers(count: int) -> Iterator[Executor]:
     """A pool of spawned processes: an error of an item lets the others end what they do; all else ends them at once.
 
@@ -194,7 +206,9 @@ def own_workers(count: int) -> Iterator[Executor]:
     kept = _kept.get()
     pool = kept.pop(count, None) if kept else None
     if pool is None:
-        pool = ProcessPoolExecutor(count, mp_context=multiprocessing.get_context("spawn"), initializer=_begin_worker)
+        with starting_workers():
+            context = multiprocessing.get_context("spawn")
+            pool = ProcessPoolExecutor(count, mp_context=context, initializer=_begin_worker)
     try:
         yield pool
     except BaseException as error:

@@ -188,7 +188,7 @@ def mapped_file(path: Path) -> Any:
     with open_file(path) as file:
         with suppress(OSError):
             return pa.memory_map(str(path)).read_buffer()
-        with suppress(OSError):
+        with suppress(OSError, ValueError):
             return pa.py_buffer(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_COPY))
         remedy = "another folder, for an index by --index-dir, needs less memory"
         warn_once(f"{path.parent}: files cannot be mapped into memory there, so they are read as a whole; {remedy}")

@@ -1,5 +1,6 @@
 """The gate: regular files only, none above its kind's limit, no waiting, messages of bounded length."""
 
+import errno
 import io
 import os
 import re
@@ -10,6 +11,7 @@ import zipfile
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -25,6 +27,7 @@ from deepaccident_devkit.support.reading import (
     check_size,
     file_checksum,
     limit_of,
+    mapped_file,
     open_file,
     open_zip,
     read_array,
@@ -46,6 +49,24 @@ def test_a_regular_file_is_read_whole(path: Path, size: int) -> None:
         assert file.read() == path.read_bytes()
 
 
+@pytest.mark.parametrize("impossible", [(), ("pyarrow.memory_map",), ("pyarrow.memory_map", "mmap.mmap")])
+def test_a_file_is_mapped_or_else_read(
+    tmp_path: Path,
+    impossible: tuple[str, ...],
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """Some file systems over FUSE cannot map files as shared memory (ENODEV), or not at all."""
+    for name in impossible:
+        monkeypatch.setattr(name, Mock(side_effect=OSError(errno.ENODEV, "No such device")))
+    for name, content in (("one", os.urandom(70_000)), ("two", b"\xff")):
+        (tmp_path / name).write_bytes(content)
+        assert memoryview(mapped_file(tmp_path / name)) == memoryview(content).cast("b")
+    said = [record.getMessage() for record in caplog.records]
+    assert [(str(tmp_path) in each, "--index-dir" in each) for each in said] == [(True, True)] * (len(impossible) == 2)
+    assert_refused((lambda: mapped_file(tmp_path / "gone"), FileNotFoundError, "gone"))
+
+
 def test_a_link_to_a_file_and_one_that_says_it_is_empty_are_read(path: Path, tmp_path: Path) -> None:
     (tmp_path / "there").write_bytes(b"content")
     path.symlink_to("there")
@@ -64,7 +85,7 @@ def test_a_link_to_a_file_and_one_that_says_it_is_empty_are_read(path: Path, tmp
     ],
     ids=["pipe", "folder", "device", "loop", "socket"],
 )
-@pytest.mark.parametrize("read", [lambda path: read_bytes(path, "label"), open_file])
+@pytest.mark.parametrize("read", [lambda path: read_bytes(path, "label"), open_file, mapped_file])
 def test_what_is_no_file_is_refused_at_once(path: Path, make, said: str, read) -> None:
     make(path)
     assert_refused((lambda: read(path), OSError, said))
@@ -135,6 +156,7 @@ NOT_OF_STRANGERS = {
     "explore/pages/responses.py": "the package's own styles and scripts",
     "explore/serving.py": "a browser",
     "export/questions/questions.py": "the parts that the export wrote",
+    "support/cores.py": "the system's limits",
     "support/pages.py": "the package's own templates",
     "parallel/store.py": "locks, of which nothing is believed",
     "release/images.py": "the head of an image that the gate opened",

@@ -1,5 +1,6 @@
 """Making, finding, refreshing, refusing and clearing indexes."""
 
+import errno
 import json
 import logging
 import os
@@ -208,6 +209,18 @@ def test_labels_without_calib_are_left_out_and_said_so(tmp_path: Path, caplog: p
         release = opened(root)
     assert "other_vehicle has labels but no calib files and is left out" in caplog.text
     assert len(release.agent) == 4
+
+
+@pytest.mark.parametrize("impossible", ["pyarrow.memory_map", "mmap.mmap"])
+def test_an_index_is_made_and_read_where_files_cannot_be_mapped(
+    root: Path, tmp_path: Path, impossible: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = opened(root, tmp_path / "other")
+    for name in {"pyarrow.memory_map", impossible}:
+        monkeypatch.setattr(name, Mock(side_effect=OSError(errno.ENODEV, "No such device")))
+    without = opened(root)
+    assert contents(without.tables_folder).keys() == contents(whole.tables_folder).keys()
+    assert all(list(getattr(without, name)) == list(getattr(whole, name)) for name in ("sample", "annotation"))
 
 
 def test_opening_again_reads_no_label(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
