@@ -316,7 +316,7 @@ class _ImagesFile:
     def __init__(self, path: Path, cameras: int) -> None:
         """Map it; raises SensorFileError if it is not there, not whole, or not of so many cameras."""
         try:
-            self._bytes = memoryview(mapped_file(path)).cast("B")
+            self._bytes: Any = memoryview(mapped_file(path)).cast("B")
             self._table = self._checked_table(cameras)
         except (OSError, ValueError) as error:
             raise SensorFileError(

@@ -202,7 +202,7 @@ def processes(device: str) -> Iterator[Place]:
 
 
 def _rank_number(name: str, least: int, most: int) -> int:
-    """Read a number that torchrun puts into the environment; raises ConfigError."""
+    """Read a number that `torchrun` puts into the environment; raises ConfigError."""
     word = os.environ.get(name, str(least))
     number = integer_of(word)
     if number is None or not least <= number <= most:

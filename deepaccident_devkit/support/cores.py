@@ -24,7 +24,7 @@ def quota_below(root: Path) -> float:
     """Return the cores that the control groups of this process and those above them allow, or infinity.
 
     Args:
-        root: Folder of `proc` and `sys`.
+        root: Top folder of the file system that lists them.
     """
     quotas = [math.inf]
     for version_1, group in _GROUP.findall(_text(root / "proc/self/cgroup")):
