@@ -7,7 +7,7 @@ from functools import cache
 from pathlib import Path
 
 _GROUP = re.compile(r"(?m)^\d+:(?:[^:]*,)?(cpu)?(?:,[^:]*)?:(/.*)$")
-"""A control group of a process as /proc lists it: `cpu` for version 1, and the path."""
+"""A control group of a process as the system lists it: `cpu` for version 1, and the path."""
 _QUOTA = re.compile(r"([1-9]\d*)\s+([1-9]\d*)\s*")
 """Microseconds of all cores together, and the period in which they may be used; `max` or -1 stand for no quota."""
 
