@@ -51,10 +51,13 @@ def test_errors_are_one_message_and_status_2(tmp_path: Path) -> None:
 
 
 FAILING = """
+import sys
 from deepaccident_devkit import cli
 from deepaccident_devkit.errors import MissingFileError
 
 def fail(command):
+    if "memory" in sys.argv:
+        raise MemoryError("Unable to allocate 9.9 TiB")
     told = "Caught MissingFileError in DataLoader worker process 0.\\nOriginal Traceback (most recent call last):"
     raise MissingFileError(f"{told}\\n  …\\ndeepaccident_devkit.errors.MissingFileError: a.jpg: no such file")
 
@@ -66,6 +69,8 @@ cli.main()
 def test_of_an_error_in_a_loaders_worker_the_message_is_told_alone() -> None:
     failed = subprocess.run([sys.executable, "-c", FAILING], check=False, capture_output=True, text=True)
     assert (failed.returncode, failed.stderr) == (2, "error: a.jpg: no such file\n")
+    failed = subprocess.run([sys.executable, "-c", FAILING, "memory"], check=False, capture_output=True, text=True)
+    assert (failed.returncode, failed.stderr[:24]) == (2, "error: memory ran out; u")
 
 
 @pytest.mark.slow

@@ -113,6 +113,6 @@ def _run() -> None:
     except (DeepAccidentError, OSError, MemoryError) as error:  # OSErrors: a full disk, a folder without permission
         *_, told = str(error).rpartition(f".{type(error).__name__}: ")  # a loader's worker puts its traceback before it
         if isinstance(error, MemoryError):
-            told = f"memory ran out {told}; use fewer workers (--workers), or a machine with more memory"
+            told = "memory ran out; use fewer workers (--workers), or a machine with more memory"
         click.echo(f"error: {told}", err=True)
         sys.exit(_FINDINGS_STATUS if isinstance(error, SomeFailedError) else _ERROR_STATUS)

@@ -15,7 +15,6 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from ipaddress import IPv4Address, IPv6Address, ip_address
-from operator import itemgetter
 from typing import Any, Final
 
 from deepaccident_devkit.errors import ConfigError, MissingExtraError
@@ -29,8 +28,9 @@ _LAST_PORT: Final = 0xFFFF
 _REQUEST_SECONDS: Final = 10.0
 """Time in which a connection must bring a whole request."""
 _MOST_CONNECTIONS: Final = 200
-"""With more of them, those that have waited for a whole request the longest are closed."""
+"""With more of them, those that have brought no whole request by the next look are closed."""
 _SWEEP_SECONDS: Final = 0.1
+"""Between two looks at all connections."""
 _STOP_SECONDS: Final = 0.7
 """Time for answers that are being made when the server stops; then they are left to their threads."""
 _EXPOSED: Final = (
@@ -224,20 +224,19 @@ class _Running:
             connection.transport.abort()
 
     async def _close_unasking(self) -> None:
-        """Close each connection that brings no whole request in time; and of too many, those that wait the longest."""
+        """Close each connection that brings no whole request in time, and of too many all that wait for one."""
         from h11 import IDLE, SEND_BODY
 
         connections: Any = self._server.server_state.connections
         since: dict[Any, float] = {}
         while True:
             await asyncio.sleep(_SWEEP_SECONDS)
-            now = time.monotonic()
+            now, allowed = time.monotonic(), _REQUEST_SECONDS if len(connections) <= _MOST_CONNECTIONS else 0.0
             asking = [(each, each.cycle) for each in connections if each.conn.their_state in (IDLE, SEND_BODY)]
             since = {each: since.get(each, now) for each in asking}
-            too_many = len(connections) - _MOST_CONNECTIONS
-            for number, (connection, began) in enumerate(sorted(since.items(), key=itemgetter(1))):
-                if number < too_many or now - began > _REQUEST_SECONDS:
-                    connection[0].transport.abort()
+            for (connection, _), began in since.items():
+                if now - began > allowed:
+                    connection.transport.abort()
 
 
 class _TakenError(ConfigError):

@@ -236,8 +236,8 @@ def export_release(
     if manifest.release:
         check_failures(zip(jobs, states, strict=True), str(root))
         if _is_current(root, manifest.release.scenarios, _all_states(jobs)):
-            if export.store.folder.is_dir():  # of version 1.0.0, or of a call that was killed
-                with export.store.shared() as turn:
+            if export.kept.is_dir():  # of version 1.0.0, or of a call that was killed
+                with suppress(OSError), export.store.shared() as turn:  # it may not be writable
                     if turn.alone():
                         export.put_away()
             return Exported(folder=root, written=0, kept=len(units), tally=manifest.written)

@@ -409,6 +409,9 @@ class TestRelease:
         with zipfile.ZipFile(out / ARCHIVE) as archive:
             archive.extractall(out / ".deepaccident-parts" / "kept" / "tiny")
         (out / ARCHIVE).unlink()
+        (out / ".deepaccident-parts" / ".lock").mkdir()  # as if the folder could not be written to
+        assert written(reopened(changing), out).kept == SCENARIOS
+        (out / ".deepaccident-parts" / ".lock").rmdir()
         if sensors_change:
             next(changing.glob("*/ego_vehicle/Camera_Front/*/*_002.jpg")).unlink()
         assert written(reopened(changing), out).written == sensors_change

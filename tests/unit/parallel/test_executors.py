@@ -1,10 +1,12 @@
 """Schedulers that cannot be used; working ones are in tests/engines."""
 
+import concurrent.futures
 import gc
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 from click.testing import CliRunner
@@ -12,7 +14,7 @@ from refusals import assert_refused
 
 from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.errors import MissingExtraError, WorkerError
-from deepaccident_devkit.parallel import cluster_executor
+from deepaccident_devkit.parallel import cluster_executor, run_batch
 from deepaccident_devkit.parallel.executors import fault_of_workers, width_of
 
 
@@ -107,3 +109,10 @@ def test_the_option_of_verbs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     absent = [*words, str(tmp_path / "absent.json")]
     invoke = partial(CliRunner().invoke, deepaccident, absent, catch_exceptions=False)
     assert_refused((invoke, WorkerError, f"^{absent[-1]}: no dask scheduler answers"))
+
+
+def test_processes_that_cannot_be_started_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The locks of a pool lie in /dev/shm, which may be full."""
+    monkeypatch.setattr(concurrent.futures, "ProcessPoolExecutor", Mock(side_effect=OSError(28, "No space left")))
+    facts = ("cannot be started", "No space left", "/dev/shm", "fewer workers")  # noqa: S108
+    assert_refused((lambda: run_batch(abs, range(9), workers=2), WorkerError, facts))
