@@ -180,19 +180,16 @@ class Kept(Generic[Value]):
                     return self._values[key]
             try:
                 value = make()
-                self._keep(key, value)
+                with self._lock:
+                    self._values[key] = value
+                    self._total += self._size(value)
+                    while self._total > self._most and len(self._values) > 1:
+                        _, old = self._values.popitem(last=False)
+                        self._total -= self._size(old)
             finally:
                 with self._lock:
                     self._making.pop(key, None)
         return value
-
-    def _keep(self, key: Hashable, value: Value) -> None:
-        with self._lock:
-            self._values[key] = value
-            self._total += self._size(value)
-            while self._total > self._most and len(self._values) > 1:
-                _, old = self._values.popitem(last=False)
-                self._total -= self._size(old)
 
 
 class KeptFiles:
@@ -229,9 +226,7 @@ def thumbnail(dataset: Dataset, record: ScenarioRecord) -> bytes:
     pair = boxes.select(np.isin(boxes.actor_id, [] if told is None else told["ids"]))
     samples = [sample_token(record["token"], agent, moment) for agent in agents_of(dataset, record)]
     camera = _camera(dataset, samples, pair)
-    image: Any = None
-    if camera is not None:
-        image = _photo(dataset, camera, pair)
+    image = None if camera is None else _photo(dataset, camera, pair)
     if image is None:
         image = _from_above(dataset, record, boxes, pair)
     return picture_bytes(image, "JPEG", quality=_QUALITY)

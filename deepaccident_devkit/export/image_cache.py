@@ -288,11 +288,6 @@ class ImageCache:
         )
 
 
-def _file_bytes(rows: int, cameras: int, images: int) -> int:
-    """The size of a file with images of so many bytes together."""
-    return _HEAD + rows * cameras * 2 * _NUMBER.itemsize + images
-
-
 def _write_images(path: Path, rows: int, cameras: int, images: Iterable[bytes | None]) -> None:
     """Write a file; the images are ordered by row, then camera, None for one that is not there."""
     table = np.zeros((rows, cameras, 2), dtype=_NUMBER)
@@ -335,14 +330,14 @@ class _ImagesFile:
 
     def _checked_table(self, wanted: int) -> IntArray:
         """The table; raises ValueError or OSError."""
-        numbers = np.frombuffer(self._bytes, dtype=_NUMBER, offset=len(_MAGIC), count=2) if self._is_ours() else None
-        if numbers is None:
+        if len(self._bytes) < _HEAD or self._bytes[: len(_MAGIC)] != _MAGIC:
             raise ValueError("is no file of cached images")
-        rows, cameras = numbers.tolist()
+        rows, cameras = np.frombuffer(self._bytes, dtype=_NUMBER, offset=len(_MAGIC), count=2).tolist()
         if cameras != wanted:
             raise ValueError(f"has {cameras} cameras, and its cache {wanted}")
-        check_size(_file_bytes(rows, cameras, 0), "bundle", "its table")
-        if rows < 0 or _file_bytes(rows, cameras, 0) > len(self._bytes):
+        end = _HEAD + rows * cameras * 2 * _NUMBER.itemsize
+        check_size(end, "bundle", "its table")
+        if rows < 0 or end > len(self._bytes):
             raise ValueError("is cut off")
         table = np.frombuffer(self._bytes, dtype=_NUMBER, offset=_HEAD, count=rows * cameras * 2)
         table = table.reshape(rows, cameras, 2)
@@ -352,9 +347,6 @@ class _ImagesFile:
             raise ValueError("is cut off")
         check_size(int(table[..., 1].max(initial=0)), "image", "an image")
         return table.astype(np.int64, copy=False)
-
-    def _is_ours(self) -> bool:
-        return len(self._bytes) >= _HEAD and self._bytes[: len(_MAGIC)] == _MAGIC
 
 
 def _images_path(scenario: str) -> str:

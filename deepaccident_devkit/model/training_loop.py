@@ -264,7 +264,7 @@ class _Run:
     def _after(
         self,
         done: int,
-        row: Mapping[str, Any],
+        row: dict[str, Any],
         model: V2XFormer,
         optimizer: AdamW,
         progress: Progress,
@@ -272,7 +272,6 @@ class _Run:
         """Log a step and, every now and then, validate and save."""
         config, last = self.config, done == self.config.steps
         progress = replace(progress, step=done)
-        row = dict(row)
         if self.validated and (done % config.validate_every == 0 or last):
             own = self.validated[self.place.rank :: self.place.ranks]
             scores = validated(model, self.dataset, own, self.predict)
@@ -286,7 +285,7 @@ class _Run:
             if last or done % config.save_every == 0 or "validation" in row:
                 save_state(self.folder, model, optimizer, progress, self.notes)
             if last or "validation" in row:
-                self._draw()
+                save_training(read_log(self.folder), self.folder.name, self.folder / CURVES)
         return progress
 
     def _weights(self, model: V2XFormer, progress: Progress, name: str = FINAL) -> Path:
@@ -295,6 +294,3 @@ class _Run:
         if self.place.is_first:
             write_weights(path, model.state_dict(), {**self.notes, "step": progress.step, "score": progress.best})
         return path
-
-    def _draw(self) -> None:
-        save_training(read_log(self.folder), self.folder.name, self.folder / CURVES)

@@ -17,7 +17,7 @@ from concurrent.futures import BrokenExecutor, CancelledError
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from deepaccident_devkit._version import __version__
 from deepaccident_devkit.errors import MOST_TOLD, DeepAccidentError, MissingExtraError, WorkerError, shortened
@@ -150,12 +150,8 @@ def _address_in(file: Path) -> str:
 
     Raises OSError or ValueError. Dask itself would wait for it for ever, and read anything.
     """
-    import msgspec  # here, as it takes some milliseconds
+    from deepaccident_devkit.support.json_text import as_record, parsed_json  # here, as it takes some milliseconds
 
-    from deepaccident_devkit.support.json_text import parsed_record
-
-    address = Annotated[str, msgspec.Meta(min_length=1, max_length=300)]
-    record: Any = msgspec.defstruct("_Scheduler", [("address", address)])
     end, content = time.monotonic() + SECONDS, b""
     while not content:
         with suppress(FileNotFoundError):
@@ -163,8 +159,7 @@ def _address_in(file: Path) -> str:
         if not content and time.monotonic() > end:
             raise FileNotFoundError(errno.ENOENT, "there is no such file, or it is empty")
         time.sleep(0 if content else 0.1)
-    told: str = parsed_record(content, record).address
-    return told
+    return as_record(parsed_json(content)["address"], str)
 
 
 @contextmanager

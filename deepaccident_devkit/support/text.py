@@ -11,6 +11,7 @@ from contextlib import suppress
 from difflib import get_close_matches
 from functools import cache
 from html import escape
+from itertools import chain
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, ClassVar, Final, TypeVar
@@ -40,19 +41,18 @@ def columns_text(rows: Sequence[Sequence[str]], *, left: int = 1) -> str:
     widths = [max(len(word) for word in column) for column in zip(*rows, strict=True)]
     lines = []
     for row in rows:
-        cells = [f"{word:<{width}}" for word, width in zip(row[:left], widths, strict=False)]
-        cells += [f"{word:>{width}}" for word, width in zip(row[left:], widths[left:], strict=True)]
-        lines.append("  ".join(cells).rstrip())
+        cells = map(str.ljust, row[:left], widths), map(str.rjust, row[left:], widths[left:])
+        lines.append("  ".join(chain(*cells)).rstrip())
     return "\n".join(lines)
 
 
 def natural_order(value: str | None) -> tuple[bool, float, str]:
     """A key that sorts words: numbers and those that begin with one (`2 s`) by size, then others; unknown ones last."""
     text = "none" if value is None else value
-    try:
-        return text == "none", float(text.split(" ")[0]), text
-    except ValueError:
-        return text == "none", math.inf, text
+    number = math.inf
+    with suppress(ValueError):
+        number = float(text.split(" ")[0])
+    return text == "none", number, text
 
 
 class Pictured:
@@ -140,22 +140,20 @@ def meant_text(wrong: object, possible: Iterable[object]) -> str:
 def spelled(value: Any, words: Iterable[str]) -> Any:
     """The one of some words that a text is, in whatever case of letters; the value itself if no word is like it."""
     lowered = value.lower() if isinstance(value, str) else None
-    for word in words:
-        if word.lower() == lowered:
-            return word
-    return value
+    return next((word for word in words if word.lower() == lowered), value)
 
 
 def differing_text(there: Mapping[str, Any], asked: Mapping[str, Any]) -> str:
     """`training/steps: 2, asked for 3; …`: which values differ from those asked for, the first ones; empty if none."""
     has, wanted = dict(_leaves(there)), dict(_leaves(json.loads(json.dumps(asked))))  # tuples are lists in a file
     changed = sorted(name for name in {*has, *wanted} if has.get(name) != wanted.get(name))
-    told = [
+    differences = [
         f"{name}: {shortened(repr(has.get(name)))}, asked for {shortened(repr(wanted.get(name)))}"
         for name in changed[:_DIFFERING]
     ]
-    more = [f"and {len(changed) - _DIFFERING} more"] if len(changed) > _DIFFERING else []
-    return "; ".join(told + more)
+    if len(changed) > _DIFFERING:
+        differences.append(f"and {len(changed) - _DIFFERING} more")
+    return "; ".join(differences)
 
 
 def _leaves(values: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any]]:
@@ -179,13 +177,12 @@ def choice(
     Small letters may stand for capital ones. `error` is another kind of error; `elsewhere` says of words that mean
     something in another place what to do with them.
     """
-    lowered = value.lower() if isinstance(value, str) else None
-    for word in words:
-        if value is word or (isinstance(word, str) and word.lower() == lowered):
-            return word
     expected = [word for word in words if word is not None]
+    chosen: Word = spelled(value, expected)
+    if any(chosen is word for word in words):
+        return chosen
     none = ", or None" if len(expected) < len(words) else ""
-    meant = elsewhere.get(lowered or "") or meant_text(value, expected)
+    meant = elsewhere.get(str(value).lower()) or meant_text(value, expected)
     raise error(f"{name}: expected one of {', '.join(expected)}{none}, found {value!r}{meant}")
 
 
