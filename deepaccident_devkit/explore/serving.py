@@ -8,7 +8,6 @@ import os
 import socket
 import sys
 import threading
-import time
 import webbrowser
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -228,14 +227,14 @@ class _Running:
         from h11 import IDLE, SEND_BODY
 
         connections: Any = self._server.server_state.connections
-        since: dict[Any, float] = {}
+        looks: dict[Any, int] = {}
         while True:
             await asyncio.sleep(_SWEEP_SECONDS)
-            now, allowed = time.monotonic(), _REQUEST_SECONDS if len(connections) <= _MOST_CONNECTIONS else 0.0
-            asking = [(each, each.cycle) for each in connections if each.conn.their_state in (IDLE, SEND_BODY)]
-            since = {each: since.get(each, now) for each in asking}
-            for (connection, _), began in since.items():
-                if now - began > allowed:
+            waiting = [(each, each.cycle) for each in connections if each.conn.their_state in (IDLE, SEND_BODY)]
+            looks = {key: looks.get(key, 0) + 1 for key in waiting}
+            most = 1 if len(connections) > _MOST_CONNECTIONS else _REQUEST_SECONDS / _SWEEP_SECONDS
+            for (connection, _), count in looks.items():
+                if count > most:
                     connection.transport.abort()
 
 
@@ -258,15 +257,8 @@ def _listen(host: str, port: int | None) -> socket.socket:
 def _listener(host: str, port: int) -> socket.socket:
     try:
         found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
-        family, kind, protocol, _, address = min(found, key=lambda each: each[0] != socket.AF_INET)
-        listening = socket.socket(family, kind, protocol)
-        try:
-            listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            listening.bind(address)
-            listening.listen()  # at once: two programs can bind the same port, and only one can listen
-        except BaseException:
-            listening.close()
-            raise
+        family, _, _, _, address = min(found, key=lambda each: each[0] != socket.AF_INET)
+        return socket.create_server(address, family=family, dualstack_ipv6=family == socket.AF_INET6)
     except PermissionError as error:
         raise ConfigError(f"port {port}: not allowed here; choose a port from 1024 on") from error
     except (OSError, UnicodeError) as error:
@@ -278,7 +270,6 @@ def _listener(host: str, port: int) -> socket.socket:
             f"host {host}: cannot listen there ({error}); give a name or an address of this machine (--address), or "
             "leave it out"
         ) from error
-    return listening
 
 
 def _names(host: str, bound: IPv4Address | IPv6Address) -> frozenset[str]:

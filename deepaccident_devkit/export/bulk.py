@@ -137,18 +137,17 @@ class Manifest:
         """
         own = f"{form.name}{_ENDING}"
         try:
-            if folder.exists() and not folder.is_dir():
-                raise ExportError(f"{folder}: is a file; give a folder")
             # before the look for a manifest: another process may write that now, and files only after it
-            others = [] if not folder.exists() else sorted(each.name for each in folder.iterdir())
-            if (folder / own).exists():
-                found = cls.read(folder, form.name)
-                found.check(folder, settings)
-                return found
-        except ExportError:
-            raise
+            others = sorted(path.name for path in folder.iterdir()) if folder.exists() else []
+            is_begun = (folder / own).exists()
+        except NotADirectoryError as error:
+            raise ExportError(f"{folder}: is a file; give a folder") from error
         except OSError as error:
             raise ExportError(f"{folder}: cannot be read ({error}); choose another folder") from error
+        if is_begun:
+            found = cls.read(folder, form.name)
+            found.check(folder, settings)
+            return found
         # a killed export may have left what it keeps alone
         strange = [each for each in others if not each.startswith(".deepaccident-") and temporary_of(each) is None]
         if strange and not any(f"{each}{_ENDING}" in others for each in form.beside):
@@ -236,10 +235,6 @@ def export_release(
     if manifest.release:
         check_failures(zip(jobs, states, strict=True), str(root))
         if _is_current(root, manifest.release.scenarios, _all_states(jobs)):
-            if export.kept.is_dir():  # of version 1.0.0, or of a call that was killed
-                with suppress(OSError), export.store.shared() as turn:  # it may not be writable
-                    if turn.alone():
-                        export.put_away()
             return Exported(folder=root, written=0, kept=len(units), tally=manifest.written)
     whole, written = export.completed(manifest, jobs, how)
     return Exported(folder=root, written=written, kept=len(units) - written, tally=whole.written)
@@ -350,7 +345,7 @@ class Export:
             done = store.run(self.write, jobs, label=self.form.name, places=places, **how)
             if turn.alone() and by_another() is None:
                 whole = self._finished(jobs, list(done.values()), before.settings)
-                self.put_away()
+                self._put_away()
                 whole.write(self.root)
             else:
                 whole = Manifest.of(self.root, self.form, before.settings)
@@ -374,7 +369,7 @@ class Export:
         """Write what spans units; the manifest of the complete export. If there is no sample, nothing is left."""
         if not any(each.tally.samples for each in done):
             self._remove_others(())
-            self.put_away(pack=False)
+            self._put_away(pack=False)
             remove_in(self.root, f"{self.form.name}{_ENDING}")
             with suppress(OSError):  # there is another export
                 self.root.rmdir()
@@ -445,7 +440,7 @@ class Export:
         for each, _, _ in os.walk(self.root):
             remove_leftovers(Path(each))
 
-    def put_away(self, *, pack: bool = True) -> None:
+    def _put_away(self, *, pack: bool = True) -> None:
         """Remove the store; sensor files may change later, so what a later call needs then is packed into one file."""
         if pack and self.form.sensors():
             with replacing(self._archive) as temporary, zipfile.ZipFile(temporary, "w") as archive:

@@ -32,7 +32,8 @@ def read_batches(data: Any, collate: Callable[..., Any], workers: int, **options
         WorkerError: The processes cannot be started.
     """
     with starting_workers():
-        _ = [multiprocessing.Queue() for _ in range(workers and workers + 3)]  # where torch fails, it prints tracebacks
+        if workers:
+            multiprocessing.Queue()  # torch would print tracebacks
         return iter(DataLoader(data, collate_fn=collate, num_workers=workers, worker_init_fn=_send_faults, **options))
 
 
@@ -47,9 +48,8 @@ def worker_faults_named() -> Iterator[None]:
     except Exception as error:
         if isinstance(error, DeepAccidentError) or not _WORKERS_FAULT.search(str(error)):
             raise
-        text = str(error.__cause__ or "") or str(error)  # the cause names the signal that killed a worker
-        cause = shortened(text.strip().splitlines()[-1])
-        raise WorkerError(f"a worker process that reads samples failed ({cause}); {FEWER_WORKERS}") from error
+        *_, cause = str(error).strip().splitlines()
+        raise WorkerError(f"a worker that reads samples failed ({shortened(cause)}); {FEWER_WORKERS}") from error
 
 
 def _send_faults(_: int) -> None:

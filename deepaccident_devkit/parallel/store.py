@@ -21,7 +21,6 @@ from __future__ import annotations
 import hashlib
 import os
 import threading
-import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -44,7 +43,6 @@ _ANSWER_SECONDS: Final = 30.0
 """How long a file system may take to say whether a lock is free."""
 _WAIT_HOURS: Final = 24
 """How long another process may hold a lock: a scenario, or the whole work of another command."""
-_POLL_SECONDS: Final = 0.1
 _without_locks: Final = set[int]()
 """Devices of the file systems that have no locks, as this process has found."""
 
@@ -174,21 +172,30 @@ class Store:
 
         Raises DeepAccidentError, of the kind `error`, if another process holds it too long.
         """
-        end = time.monotonic() + _WAIT_HOURS * 3600
-        while not _is_taken(file, kind, self.out):
-            if not wait:
-                return False
+        import fcntl
+
+        device = os.fstat(file).st_dev
+        if device in _without_locks:
+            return True
+        fault = _fault_of_lock(file, kind | fcntl.LOCK_NB, _ANSWER_SECONDS)
+        if wait and isinstance(fault, BlockingIOError):
             self.say_waiting()
-            if time.monotonic() > end:
+            fault = _fault_of_lock(file, kind, _WAIT_HOURS * 3600)
+            if isinstance(fault, TimeoutError):
                 remedy = f"end it, or if there is none any more, remove {self.folder}"
                 raise self.error(f"{self.out}: another process has held a lock for {_WAIT_HOURS} hours; {remedy}")
-            time.sleep(_POLL_SECONDS)
+        if fault is None or isinstance(fault, BlockingIOError):
+            return fault is None
+        _without_locks.add(device)
+        warn_once(
+            f"{self.out}: its file system has no locks that work ({fault}), so this goes on as if no other process "
+            "wrote there; do not run a command twice at once on this folder"
+        )
         return True
 
     def say_waiting(self) -> None:
         """Say once that this process waits for another one, and for how long at most."""
-        hours = f"at most {_WAIT_HOURS} hours"
-        warn_once(f"{self.out}: another process {self.task} there; waiting for it, for {hours}")
+        warn_once(f"{self.out}: another process {self.task} there; waiting for it, for at most {_WAIT_HOURS} hours")
 
     def lock_path(self, name: str) -> Path:
         """The lock of an item; raises OutputFolderError if a link leads there."""
@@ -300,36 +307,27 @@ def _opened(lock: Path) -> int:
             return os.open(lock, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
 
 
-def _is_taken(file: int, kind: int, out: Path) -> bool:
-    """Ask for the lock of an open file; false if another process holds it, true if the file system has no locks.
+def _fault_of_lock(file: int, kind: int, seconds: float) -> OSError | None:
+    """Ask for the lock of an open file; None if it is taken, TimeoutError if there is no answer in so many seconds.
 
     The call is made in a thread of its own, since a file server that is gone may never answer it.
     """
     import fcntl
 
-    device, faults = os.fstat(file).st_dev, list[OSError]()
+    fault: OSError | None = TimeoutError(f"no answer within {seconds:g} s")
 
     def ask() -> None:
+        nonlocal fault
         try:
-            fcntl.flock(file, kind | fcntl.LOCK_NB)
+            fcntl.flock(file, kind)
+            fault = None
         except OSError as error:
-            faults.append(error)
+            fault = error
 
-    if device in _without_locks:
-        return True
     thread = threading.Thread(target=ask, daemon=True)
     thread.start()
-    thread.join(_ANSWER_SECONDS)
-    if thread.is_alive():
-        faults.append(TimeoutError(f"no answer within {_ANSWER_SECONDS:g} s"))
-    if not faults or isinstance(faults[0], BlockingIOError):
-        return not faults
-    _without_locks.add(device)
-    warn_once(
-        f"{out}: its file system has no locks that work ({faults[0]}), so this goes on as if no other process wrote "
-        "there; do not run a command twice at once on this folder"
-    )
-    return True
+    thread.join(seconds)
+    return fault
 
 
 def _seal(key: str, content: bytes) -> bytes:

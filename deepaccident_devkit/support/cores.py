@@ -8,6 +8,8 @@ from pathlib import Path
 
 _GROUP = re.compile(r"(?m)^\d+:(?:[^:]*,)?(cpu)?(?:,[^:]*)?:(/.*)$")
 """A control group of a process as the system lists it: `cpu` for version 1, and the path."""
+_QUOTA_FILES = ("cpu.max", "cpu.cfs_quota_us", "cpu.cfs_period_us")
+"""Names of version 2, and of version 1."""
 _QUOTA = re.compile(r"([1-9]\d*)\s+([1-9]\d*)\s*")
 """Microseconds of all cores together, and the period in which they may be used; `max` or -1 stand for no quota."""
 
@@ -26,14 +28,13 @@ def quota_below(root: Path) -> float:
     Args:
         root: Top folder of the file system that lists them.
     """
-    quotas = [math.inf]
+    lowest = math.inf
     for version_1, group in _GROUP.findall(_text(root / "proc/self/cgroup")):
         folder = root / f"sys/fs/cgroup/{version_1}{group}"
         for level in (folder, *folder.parents):
-            words = _text(level / "cpu.max") or _text(level / "cpu.cfs_quota_us") + _text(level / "cpu.cfs_period_us")
-            if quota := _QUOTA.fullmatch(words):
-                quotas.append(int(quota[1]) / int(quota[2]))
-    return min(quotas)
+            if quota := _QUOTA.fullmatch("".join(_text(level / name) for name in _QUOTA_FILES)):
+                lowest = min(lowest, int(quota[1]) / int(quota[2]))
+    return lowest
 
 
 def _text(path: Path) -> str:

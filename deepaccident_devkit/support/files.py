@@ -38,8 +38,8 @@ _NAME_LENGTH: Final = 50
 """Characters of the final name that a temporary name has: names of files end at 255 bytes."""
 _ABANDONED_AFTER: Final = 24 * 3600.0
 """Seconds after the last change of a temporary file of another host, whose processes cannot be seen from here."""
-_OPEN_FILES: Final = re.compile(r"/proc/.*|/dev(/fd)?")
-"""Folders of the system whose entries stand for open files and devices."""
+_SYSTEM_FOLDER: Final = re.compile(r"/(proc|dev(?!/shm))(/.*)?")
+"""Folders whose entries stand for open files and devices, such as `/dev/stdout`."""
 
 
 @contextmanager
@@ -61,11 +61,8 @@ def replacing(path: Path) -> Iterator[Path]:
 def replacing_folder(path: Path) -> Iterator[Path]:
     """Yield a new empty folder beside `path`; it takes the place of `path` if the block succeeds, else is removed.
 
-    `path` itself must be missing or empty, so that nothing is ever deleted for it. Raises OutputFolderError if it is
-    no folder.
+    `path` itself must be missing or empty, so that nothing is ever deleted for it.
     """
-    if os.path.lexists(path) and (path.is_symlink() or not path.is_dir()):
-        raise OutputFolderError(f"{path}: not a folder, so it is not replaced by one; give the path of a new folder")
     temporary = _begun(path)
     try:
         temporary.mkdir()
@@ -116,14 +113,12 @@ def remove_leftovers(folder: Path, dead: Collection[str] = ()) -> None:
 def _check_replaceable(path: Path) -> None:
     """Raise OutputFolderError unless a file may be renamed to `path`: it is missing, a regular file or a link to one.
 
-    A link that leads nowhere may be replaced; one to an open file or a device, such as `/dev/stdout`, may not.
+    A link that leads nowhere may be replaced. Nothing is made in a folder of devices.
     """
     fault = None
-    if os.path.islink(path):  # noqa: PTH114 - Path.is_symlink raises for a name that is too long
-        target_folder = (path.parent / os.readlink(path)).parent  # noqa: PTH115 - a path of any form
-        if _OPEN_FILES.fullmatch(os.path.realpath(target_folder)):
-            fault = "a link to a device or an open file"
-    if fault is None and os.path.exists(path):  # noqa: PTH110 - as above
+    if _SYSTEM_FOLDER.fullmatch(os.path.realpath(path.parent)):
+        fault = "a device or an open file"
+    elif os.path.exists(path):  # noqa: PTH110 - Path.exists raises for a name that is too long
         fault = irregular_text(path.stat().st_mode)
     if fault:
         raise OutputFolderError(f"{path}: {fault}, so it is not replaced; give the path of a new file")
@@ -131,12 +126,7 @@ def _check_replaceable(path: Path) -> None:
 
 def _begun(path: Path) -> Path:
     """A temporary path, whose folder is there and rid of leftovers."""
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    except (FileExistsError, NotADirectoryError) as error:
-        raise OutputFolderError(
-            f"{path.parent}: not a folder, so no file can be written there; give another"
-        ) from error
+    path.parent.mkdir(parents=True, exist_ok=True)
     _rid_of_leftovers(path.parent)
     return temporary_path(path)
 
@@ -266,6 +256,6 @@ def writable_folder(folder: str | os.PathLike[str]) -> Path:
     if is_writable_folder(path):
         return path
     for part in (path, *path.parents):
-        if os.path.exists(part) and not os.path.isdir(part):  # noqa: PTH110, PTH112 - those of Path raise where it may not look
+        if os.path.isfile(part):  # noqa: PTH113 - Path.is_file raises where it may not look
             raise ConfigError(f"{path}: no file can be written there, {part} is a file; give a folder")
     raise ConfigError(f"{path}: no file can be written there; give a folder that you may write to")

@@ -9,7 +9,6 @@ import errno
 import hashlib
 import io
 import math
-import mmap
 import os
 import re
 import stat
@@ -181,17 +180,17 @@ def open_file(path: Path) -> BinaryIO:
 def mapped_file(path: Path) -> Any:
     """Map a regular file of any size into memory, as a `pyarrow.Buffer`; raises as `open_file` does.
 
-    Some file systems can only map it as private memory, or not at all: then it is read, which is said once a folder.
+    Some file systems cannot map files: then it is read, which is said once for a folder.
     """
     import pyarrow as pa
 
     with open_file(path) as file:
         with suppress(OSError):
             return pa.memory_map(str(path)).read_buffer()
-        with suppress(OSError, ValueError):
-            return pa.py_buffer(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_COPY))
-        remedy = "another folder, for an index by --index-dir, needs less memory"
-        warn_once(f"{path.parent}: files cannot be mapped into memory there, so they are read as a whole; {remedy}")
+        warn_once(
+            f"{path.parent}: files cannot be mapped into memory there, so they are read as a whole; another folder, "
+            "for an index by --index-dir, needs less memory"
+        )
         return pa.py_buffer(file.read())
 
 

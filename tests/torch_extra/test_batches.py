@@ -3,9 +3,7 @@
 import math
 import pickle
 import re
-import resource
 import shutil
-import sys
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -197,22 +195,6 @@ def test_workers_that_stay_hear_of_the_epoch(da: DeepAccident, tokens: list[str]
 def test_errors_come_out_of_workers_as_they_are(da_b: DeepAccident) -> None:
     loader = DataLoader(V2XDataset(da_b, [da_b.sample[0]["token"]]), num_workers=1, collate_fn=collate)
     assert_refused((lambda: next(iter(loader)), MissingFileError, "no such file"))
-
-
-def with_no_shared_memory(_: int) -> None:
-    resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))  # as when /dev/shm is full: no file of it can grow
-
-
-@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
-@pytest.mark.parametrize("collated", [collate, collate_fusion])
-def test_workers_without_shared_memory_send_the_same(
-    da: DeepAccident, tokens: list[str], collated: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(sys.modules[collate.__module__], "_COPIED_BYTES", 0)
-    data = V2XDataset(da, tokens[:2], V2XConfig(images=ImageConfig()))
-    workers = {"num_workers": 1, "timeout": 60, "worker_init_fn": with_no_shared_memory}
-    [batch] = DataLoader(data, batch_size=2, collate_fn=collated, **workers)
-    assert same(batch, collated([data[0], data[1]]))
 
 
 def test_a_dataset_pickles_cheaply(da: DeepAccident) -> None:

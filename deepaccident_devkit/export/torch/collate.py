@@ -28,8 +28,6 @@ _LISTS: Final = ("token", "agents", "points", *_OF_BOXES)
 """Keys that stay lists with one entry for each item: texts, and tensors of different lengths."""
 _OF_EGOS: Final = ("egos", "partners", "targets")
 """Keys of `AllEgosDataset` items alone."""
-_COPIED_BYTES: Final = 1 << 16
-"""Most bytes of a tensor that is copied to the reader: shared memory takes 1 ms to set up."""
 
 
 class V2XItem(dict[str, Any]):
@@ -169,19 +167,10 @@ def _sent(value: Any) -> Any:
         return type(value)(map(_sent, value))
     if isinstance(value, dict):
         return {key: _sent(each) for key, each in value.items()}
-    if isinstance(value, torch.Tensor) and (value.nbytes <= _COPIED_BYTES or not _is_shared(value)):
+    if isinstance(value, torch.Tensor) and value.nbytes <= 1 << 16:  # shared memory takes 1 ms to set up
         with suppress(TypeError, RuntimeError):  # numpy lacks its type, or it is on a GPU, or has a gradient
             return _ByValue(value.numpy())
     return value
-
-
-def _is_shared(tensor: Tensor) -> bool:
-    """Move a tensor into shared memory; false if that is full (Docker gives 64 MB), or files may not be that large."""
-    try:
-        tensor.share_memory_()
-    except (OSError, RuntimeError):
-        return False
-    return True
 
 
 ForkingPickler.register(V2XItem, lambda item: (V2XItem, (_sent(item),)))
@@ -211,9 +200,8 @@ def _joined(key: str, parts: Sequence[Tensor]) -> Tensor:
     if len(parts) == 1:
         return parts[0]
     if len({len(part) for part in parts}) == 1:
-        with suppress(OSError, RuntimeError):  # that is full
-            stacked: Tensor = default_collate(list(parts))  # in a worker, straight into shared memory
-            return stacked.flatten(0, 1)
+        stacked: Tensor = default_collate(list(parts))  # in a worker, straight into shared memory
+        return stacked.flatten(0, 1)
     return torch.cat(list(parts))
 
 

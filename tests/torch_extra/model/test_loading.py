@@ -2,11 +2,13 @@
 
 import multiprocessing
 import os
+import resource
 import signal
 from collections.abc import Callable
 from typing import Any
 
 import pytest
+import torch
 from refusals import assert_refused
 
 from deepaccident_devkit.errors import SensorFileError, WorkerError
@@ -22,6 +24,12 @@ class Unsendable:
 
 def killed() -> None:
     os.kill(os.getpid(), signal.SIGKILL)
+
+
+def without_shared_memory() -> torch.Tensor:
+    """As when /dev/shm is full: none of its files can grow."""
+    resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))
+    return torch.zeros(100_000)
 
 
 def failing() -> None:
@@ -54,7 +62,8 @@ def read(make: Callable[[], object]) -> list[Any]:
 @pytest.mark.parametrize(
     ("make", "error", "facts"),
     [
-        (killed, WorkerError, ("killed", *REMEDY)),
+        (killed, WorkerError, ("DataLoader worker", *REMEDY)),
+        (without_shared_memory, WorkerError, ("shared memory", *REMEDY)),
         (failing, WorkerError, ("KeyError", "a fault of the reader", *REMEDY)),
         (Unsendable, WorkerError, ("no room for the batch", *REMEDY)),
         (without_a_file, SensorFileError, ("image.jpg", "restore it")),

@@ -7,6 +7,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import time
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
@@ -56,7 +57,6 @@ from deepaccident_devkit.model.training_step import (
     training_batch,
     with_dropped_partners,
 )
-from deepaccident_devkit.support.json_text import parsed_json
 
 SHORT = replace(RUN, steps=2, validation=None, save_every=1)
 TESTS = Path(__file__).parents[2]
@@ -493,22 +493,18 @@ def test_the_log_is_read_up_to_a_line_that_is_cut_off(tmp_path: Path) -> None:
 
 
 def test_a_long_log_is_read_at_once(tmp_path: Path) -> None:
-    """A wrong line is found in halves: to parse each line by itself took half a minute for 60 MB."""
-    lines = [f'{{"step": {step}}}' for step in range(1, 4001)]
-    path, parsed = tmp_path / "log.jsonl", []
-
-    def counted(content: bytes) -> object:
-        parsed.append(len(content))
-        return parsed_json(content)
-
-    with patch("deepaccident_devkit.model.training_run.parsed_json", counted):
-        for fault in ("no json", '{"step": 1}, {"step": 2}', "", '{"step": -1}'):
-            path.write_text("\n".join([*lines, ""]))
-            assert [row["step"] for row in read_log(tmp_path)] == list(range(1, 4001))
-            path.write_text("\n".join([*lines[:3000], fault, *lines[3000:], ""]))
-            parsed.clear()
-            assert_refused((lambda: read_log(tmp_path), ConfigError, r"log\.jsonl:3001: expected .* remove the line"))
-            assert sum(parsed) < 5 * path.stat().st_size
+    """With the reader of strangers' JSON a log of 60 MB took half a minute."""
+    lines = [f'{{"step": {step}}}' for step in range(1, 50_001)]
+    path = tmp_path / "log.jsonl"
+    path.write_text("\n".join([*lines, ""]))
+    begin = time.process_time()
+    assert [row["step"] for row in read_log(tmp_path)] == list(range(1, 50_001))
+    middle = time.process_time()
+    assert len([json.loads(line) for line in lines]) == 50_000
+    assert middle - begin < 10 * (time.process_time() - middle)
+    for fault in ("no json", '{"step": 1}, {"step": 2}', "", '{"step": -1}', "[" * 100_000):
+        path.write_text("\n".join([*lines[:3000], fault, *lines[3000:], ""]))
+        assert_refused((lambda: read_log(tmp_path), ConfigError, r"log\.jsonl:3001: expected .* remove the line"))
 
 
 @pytest.mark.parametrize("linked", [Path.symlink_to, Path.hardlink_to])
@@ -549,10 +545,10 @@ def test_wrong_options_are_named(changes: dict[str, Any], error: type[DeepAccide
 @pytest.mark.parametrize(
     ("variables", "facts"),
     [
-        *((f"WORLD_SIZE={word}", ("WORLD_SIZE", repr(word))) for word in ("abc", "0", "-1", "1.5", "", "9" * 5000)),
-        ("WORLD_SIZE=2 RANK=2 LOCAL_RANK=0", ("RANK", "'2'")),
-        ("WORLD_SIZE=2 RANK=one", ("RANK", "'one'")),
-        ("WORLD_SIZE=2 RANK=1 LOCAL_RANK=-1", ("LOCAL_RANK", "'-1'")),
+        *((f"WORLD_SIZE={word}", (f"WORLD_SIZE={word}",)) for word in ("abc", "0", "-1", "1.5", "", "9" * 5000)),
+        ("WORLD_SIZE=2 RANK=2 LOCAL_RANK=0", ("RANK=2",)),
+        ("WORLD_SIZE=2 RANK=one", ("RANK=one",)),
+        ("WORLD_SIZE=99999999999999999999 RANK=0 MASTER_ADDR=127.0.0.1 MASTER_PORT=1", ("WORLD_SIZE=9999",)),
         ("WORLD_SIZE=2 RANK=0", ("WORLD_SIZE=2", "MASTER_ADDR")),
         ("WORLD_SIZE=2 RANK=0 MASTER_ADDR=127.0.0.1 MASTER_PORT=high", ("WORLD_SIZE=2", "high")),
     ],

@@ -187,13 +187,7 @@ def a_link_to_a_pipe(path: Path) -> None:
     path.symlink_to("pipe")
 
 
-def a_link_to_an_open_file(path: Path) -> None:
-    """Like `/dev/stdout` where the output of a command goes to a file."""
-    opened = path.with_name("opened")
-    path.symlink_to(f"/proc/self/fd/{os.open(opened, os.O_CREAT | os.O_RDWR)}")
-
-
-@pytest.mark.parametrize("make", [os.mkfifo, a_socket, a_device, Path.mkdir, a_link_to_a_pipe, a_link_to_an_open_file])
+@pytest.mark.parametrize("make", [os.mkfifo, a_socket, a_device, Path.mkdir, a_link_to_a_pipe])
 def test_what_is_no_regular_file_is_not_replaced(tmp_path: Path, make: Callable[[Path], object]) -> None:
     path = tmp_path / "output"
     make(path)
@@ -217,13 +211,18 @@ def test_what_is_no_folder_is_not_replaced_by_one(tmp_path: Path, make: Callable
     path = tmp_path / "output"
     make(path)
     before = names(tmp_path)
-    with pytest.raises(OutputFolderError, match=r"output: not a folder.* give the path"), replacing_folder(path):
+    with pytest.raises(NotADirectoryError), replacing_folder(path):
         pass
-    assert_refused(
-        (lambda: write_bytes(path / "file", b""), OutputFolderError, "output: not a folder"),
-        (lambda: writable_folder(path), ConfigError, "is a file; give a folder"),
-    )
+    assert_refused((lambda: writable_folder(path), ConfigError, "give a folder"))
     assert names(tmp_path) == before
+
+
+def test_nothing_is_written_among_devices_and_open_files(tmp_path: Path) -> None:
+    """Such as `/dev/stdout`, where the output of a command goes to a file."""
+    (tmp_path / "link").symlink_to("/proc/self/fd")
+    with (tmp_path / "opened").open("w") as opened:
+        for path in (Path(f"/proc/self/fd/{opened.fileno()}"), tmp_path / "link" / str(opened.fileno())):
+            assert_refused((lambda path=path: write_bytes(path, b"new"), OutputFolderError, ("open file", "new file")))
 
 
 def test_a_link_to_a_file_or_to_nothing_is_replaced_itself(tmp_path: Path) -> None:
