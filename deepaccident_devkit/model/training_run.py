@@ -101,9 +101,9 @@ class TrainConfig:
             _check_whole(name, getattr(self, name), least)
         if self.egos is not None:
             _check_whole("egos", self.egos, 1)
-        for name, (least, most, expected) in _NUMBERS.items():
+        for name, (lowest, highest, expected) in _NUMBERS.items():
             value = checked_number(name, getattr(self, name), "a number", ConfigError)
-            if not least <= value <= most:
+            if not lowest <= value <= highest:
                 raise ConfigError(f"{name}: expected {expected}, found {value!r}")
         settle_choices(self, {"samples": get_args(Purpose)})
         object.__setattr__(self, "freeze", tuple(self.freeze))
