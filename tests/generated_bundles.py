@@ -63,7 +63,7 @@ def write_bundle(
         "environment": {},
     }
     (folder / SUMMARY_FILE).write_text(json.dumps(summary))
-    scenarios = {token.rsplit("/", 2)[0]: {} for token in counts}
+    scenarios = {token.rsplit("/", 2)[0]: {"label": None, "meta": None, "calib": None} for token in counts}
     stated = {"format": SCENARIOS_FORMAT, "version": SUMMARY_VERSION, "scenarios": scenarios}
     (folder / SCENARIOS_FILE).write_text(json.dumps(stated))
     return folder

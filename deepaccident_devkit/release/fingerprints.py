@@ -5,15 +5,20 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import re
 from collections.abc import Callable, Collection, Iterable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, field
 from functools import partial
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any, Final, Protocol, TypeAlias, runtime_checkable
+
+import numpy as np
 
 from deepaccident_devkit.errors import IndexStoreError, ReleaseError
 from deepaccident_devkit.release.layout import ScenarioFolder, find_release, frame_numbers, frame_sizes
 from deepaccident_devkit.release.store import ReleasePath, places_of, read_content
 from deepaccident_devkit.support.reading import FileKind
+from deepaccident_devkit.support.sketches import Sketch, distance, sketch
 from deepaccident_devkit.taxonomy import AGENTS, CHANNEL_FORMAT
 
 if TYPE_CHECKING:
@@ -23,7 +28,12 @@ if TYPE_CHECKING:
 
 _Reader: TypeAlias = Callable[[ReleasePath, FileKind], bytes]
 _DIGEST_BYTES: Final = 16
-_ENDINGS: Final[Mapping[FileKind, str]] = {"label": "txt", "calib": "pkl"}
+_POINTS: Final = re.compile(rb" (\d{1,7})(?= (?:True|False)[ \t\r]*$)", re.MULTILINE)
+"""The number of LiDAR points in a line of a label."""
+_UNCOUNTED: Final = attrgetter("meta", "calib", "boxes")
+POINTS_TOLERANCE: Final = 12.0
+"""LiDAR points by which a scenario's boxes may differ: the root of the sum of their squares. docs/benchmark.md says how
+much was measured."""
 INDEX_REMEDY: Final = "update it with: deepaccident index DATAROOT --check"
 """What to do about an index that was made from other files."""
 
@@ -38,15 +48,25 @@ class ScenarioHashes:
         label: of all agents' label files.
         meta: of the meta file.
         calib: of all agents' calib files.
+        boxes: of all agents' label files without `num_lidar_pts`; None if unknown.
+        points: the sketch of `num_lidar_pts` of all boxes.
     """
 
     label: str | None
     meta: str | None
     calib: str | None
+    boxes: str | None = field(default=None, compare=False)
+    points: Sketch = field(default=(), compare=False)
 
     def as_dict(self) -> dict[str, str | None]:
-        """By name."""
-        return asdict(self)
+        """Return the hashes of whole files by name."""
+        return {"label": self.label, "meta": self.meta, "calib": self.calib}
+
+    def is_like(self, other: ScenarioHashes | None) -> bool:
+        """Return whether the files are the same, but for a few LiDAR points more or less in some boxes."""
+        if other is None or None in (self.boxes, other.boxes):
+            return self == other
+        return _UNCOUNTED(self) == _UNCOUNTED(other) and distance(self.points, other.points) <= POINTS_TOLERANCE
 
 
 class Located(Protocol):
@@ -118,34 +138,36 @@ def _read(path: ReleasePath, kind: FileKind) -> bytes:
     return read_content(path, kind, ReleaseError)
 
 
-def folder_hashes(
-    scenario: ScenarioFolder,
-    kinds: Collection[FileKind] = ("label", "meta", "calib"),
-    read: _Reader = _read,
-) -> ScenarioHashes:
+def folder_hashes(scenario: ScenarioFolder, read: _Reader = _read) -> ScenarioHashes:
     """Return the hashes of a scenario's files.
 
     Args:
         scenario: where the files lie.
-        kinds: of these kinds only; the hashes of others are None.
         read: gives a file's bytes.
 
     Raises:
         DatarootError: a folder cannot be listed.
         ReleaseError: a file cannot be read.
     """
-    base = scenario.root / scenario.folder / scenario.scenario_type
-    meta = [scenario.meta_path] if "meta" in kinds and scenario.meta_path.is_file() else []
-    hashes = {"meta": _digest(meta, "meta", scenario.meta_path.parent, read)}
-    for kind, ending in _ENDINGS.items():
+
+    def contents(kind: FileKind, ending: str) -> dict[ReleasePath, bytes]:
         paths = [
             scenario.file(agent, kind, frame, ending)
             for agent in AGENTS
-            if kind in kinds
             for frame in frame_numbers(scenario.kind_folder(agent, kind), ending)[0]
         ]
-        hashes[kind] = _digest(paths, kind, base, read)
-    return ScenarioHashes(**hashes)
+        return {path: read(path, kind) for path in paths}
+
+    labels, meta = contents("label", "txt"), scenario.meta_path
+    counts = [count for text in labels.values() for count in _POINTS.findall(text)]
+    base = scenario.root / scenario.folder / scenario.scenario_type
+    return ScenarioHashes(
+        label=_digest(labels, base),
+        meta=_digest({meta: read(meta, "meta")} if meta.is_file() else {}, meta.parent),
+        calib=_digest(contents("calib", "pkl"), base),
+        boxes=_digest({path: _POINTS.sub(b"", text) for path, text in labels.items()}, base),
+        points=sketch(np.array(counts, dtype=np.float32)),
+    )
 
 
 def sensor_digest(scenario: ScenarioFolder, sensors: Iterable[tuple[str, str]]) -> str:
@@ -159,7 +181,7 @@ def sensor_digest(scenario: ScenarioFolder, sensors: Iterable[tuple[str, str]]) 
 
 def fingerprint(hashes: Mapping[str, ScenarioHashes]) -> str:
     """One hash for the truth of several scenarios, in any order."""
-    return digest_of({token: asdict(each) for token, each in hashes.items()})
+    return digest_of({token: each.as_dict() for token, each in hashes.items()})
 
 
 def digest_of(value: Any) -> str:
@@ -168,12 +190,11 @@ def digest_of(value: Any) -> str:
     return hashlib.blake2b(text.encode(), digest_size=_DIGEST_BYTES).hexdigest()
 
 
-def _digest(paths: Collection[ReleasePath], kind: FileKind, base: ReleasePath, read: _Reader) -> str | None:
-    if not paths:
+def _digest(contents: Mapping[ReleasePath, bytes], base: ReleasePath) -> str | None:
+    if not contents:
         return None
     digest = hashlib.blake2b(digest_size=_DIGEST_BYTES)
-    for path in paths:
-        content = read(path, kind)
+    for path, content in contents.items():
         name = str(path).removeprefix(str(base)).replace(os.sep, "/").lstrip("/")
         digest.update(f"{name} {len(content)}\n".encode(errors="surrogateescape"))
         digest.update(content)

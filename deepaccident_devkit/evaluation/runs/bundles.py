@@ -8,7 +8,7 @@ import os
 import shutil
 import stat
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
@@ -22,6 +22,7 @@ from deepaccident_devkit.evaluation.runs.evaluation_run import SUMMARY_FORMAT, S
 from deepaccident_devkit.evaluation.runs.rows import Row, read_rows, sample_rows, write_rows
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup, SampleSelection, remove_checkpoints, scenario_of
 from deepaccident_devkit.evaluation.warning.recordings import GROUPS
+from deepaccident_devkit.release.fingerprints import ScenarioHashes
 from deepaccident_devkit.support.arrays import ShortRepr
 from deepaccident_devkit.support.files import remove_in, replacing_folder, temporary_path
 from deepaccident_devkit.support.json_text import Record, as_record, parsed_json
@@ -95,7 +96,7 @@ class _Summary(msgspec.Struct):
 class _Scenarios(msgspec.Struct):
     """Of `scenarios.json`: scenario → hashes of its label, meta and calib files."""
 
-    scenarios: dict[Line, dict[str, Line | None]]
+    scenarios: dict[Line, ScenarioHashes]
 
 
 class _Files(msgspec.Struct):
@@ -155,8 +156,8 @@ class Bundle(ShortRepr):
             named["split"] = self.summary["split"]
         return named
 
-    def scenarios(self) -> dict[str, dict[str, str | None]]:
-        """Scenario → hashes of its label, meta and calib files; raises ResultsError."""
+    def scenarios(self) -> dict[str, ScenarioHashes]:
+        """Return the hashes of each scenario's label, meta and calib files by token; raises ResultsError."""
         return _stated(self.folder / SCENARIOS_FILE, SCENARIOS_FORMAT, _Scenarios).scenarios
 
     def checksums(self) -> dict[str, str]:
@@ -240,10 +241,10 @@ def chosen_threshold(folder: Path, by: Chooser, tokens: Iterable[str]) -> float:
             threshold.
     """
     bundle = read_bundle(folder)
-    kind = tuple(bundle.summary.get(name) for name in ("task", "protocol"))
+    kind = bundle.setup.task, bundle.setup.protocol
     if kind != ("warning", "clean"):
         raise EvaluationError(
-            f"{folder}: is an evaluation of {' '.join(map(str, kind))}; expected one of warning, protocol clean"
+            f"{folder}: is an evaluation of {' '.join(kind)}; expected one of warning, protocol clean"
         )
     own = {cluster_of(scenario) for scenario in bundle.scenarios()}
     shared = sorted({scenario for scenario in map(scenario_of, tokens) if cluster_of(scenario) in own})
@@ -446,15 +447,14 @@ def _write(run: EvaluationRun, folder: Path, *, include_results: bool) -> None:
     counts = json.loads((folder / COUNTS_FILE).read_text(encoding="utf-8"))
     (folder / COUNTS_FILE).write_text(json.dumps(run.stamp | counts), encoding="utf-8")
     write_rows(folder / ROWS_FILE, sample_rows(run), run.stamp)
-    hashes = {token: each.as_dict() for token, each in run.release.scenarios.items()}
-    _write_json(folder / SCENARIOS_FILE, SCENARIOS_FORMAT, run, {"scenarios": hashes})
+    _write_json(folder / SCENARIOS_FILE, SCENARIOS_FORMAT, run, {"scenarios": dict(run.release.scenarios)})
     if include_results:
         _copy(Path(run.results.path), folder / RESULTS_FOLDER)
 
 
 def _write_json(path: Path, name: str, run: EvaluationRun, content: Mapping[str, Any]) -> None:
     stated = {"format": name, "version": SUMMARY_VERSION, **run.stamp, **content}
-    path.write_text(json.dumps(stated, indent=1), encoding="utf-8")
+    path.write_text(json.dumps(stated, indent=1, default=asdict), encoding="utf-8")
 
 
 def _copy(source: Path, folder: Path) -> None:

@@ -287,11 +287,11 @@ def comparable(bundles: Sequence[Bundle], *, common: bool) -> tuple[list[Evaluat
 
 
 def _check_rules(one: Bundle, other: Bundle) -> None:
-    tasks = [bundle.setup.task for bundle in (one, other)]
-    if tasks[0] != tasks[1]:
+    task, other_task = one.setup.task, other.setup.task
+    if task != other_task:
         raise EvaluationError(
-            f"{one.folder} is an evaluation of the task {tasks[0]}, {other.folder} one of {tasks[1]}; compare two of "
-            "the same task"
+            f"{one.folder} is an evaluation of the task {task}, {other.folder} one of {other_task}; compare two of the "
+            "same task"
         )
     stated = [{name: bundle.summary.get(name) for name in _SETUP} for bundle in (one, other)]
     cells = [_cells(bundle) for bundle in (one, other)]
@@ -317,8 +317,8 @@ def _cells(bundle: Bundle) -> dict[str, Any]:
 
 
 def _check_truth(one: Bundle, other: Bundle, scenarios: list[str]) -> None:
-    hashes = [bundle.scenarios() for bundle in (one, other)]
-    changed = [name for name in scenarios if hashes[0].get(name) != hashes[1].get(name)]
+    mine, theirs = one.scenarios(), other.scenarios()
+    changed = [name for name in scenarios if name not in mine or not mine[name].is_like(theirs.get(name))]
     if changed:
         raise EvaluationError(
             f"{one.folder} and {other.folder}: the label, meta or calib files of {len(changed)} scenarios are not the "
@@ -372,8 +372,9 @@ class Swaps:
 
 def swaps_of(clusters: int, resampling: Resampling) -> Swaps:
     """All swaps of so many clusters if they are at most `resamples`, else as many random ones."""
-    if 2 ** max(clusters - 1, 0) <= resampling.resamples:
-        numbers = np.arange(2 ** max(clusters - 1, 0))[:, None]
+    number = 2 ** max(clusters - 1, 0)
+    if number <= resampling.resamples:
+        numbers = np.arange(number)[:, None]
         return Swaps(swapped=(numbers << 1) >> np.arange(clusters) & 1 == 1, complete=True)
     source = np.random.default_rng(resampling.seed)
     return Swaps(swapped=source.integers(2, size=(resampling.resamples, clusters)) == 1, complete=False)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shlex
 from collections.abc import Callable, Collection, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -27,6 +28,7 @@ from deepaccident_devkit.evaluation.runs.bundles import (
 from deepaccident_devkit.evaluation.runs.evaluation_run import EvaluationRun, evaluate_results
 from deepaccident_devkit.evaluation.runs.further import further_names, with_further
 from deepaccident_devkit.evaluation.runs.rows import sample_rows
+from deepaccident_devkit.release.fingerprints import ScenarioHashes, fingerprint
 from deepaccident_devkit.reports import Report, Row, record_rows
 from deepaccident_devkit.support.arrays import ShortRepr
 from deepaccident_devkit.support.text import path_of
@@ -73,16 +75,14 @@ def differing(
     """
     if path in without:
         return
-    parts: Mapping[Any, tuple[Any, Any]] | None = None
+    parts: Mapping[Any, tuple[Any, Any]] = {}
+    stored, found = (value.as_dict() if isinstance(value, ScenarioHashes) else value for value in (stored, found))
     if isinstance(stored, Mapping) and isinstance(found, Mapping):
-        names = dict.fromkeys([*stored, *found])
-        parts = {name: (stored.get(name, ABSENT), found.get(name, ABSENT)) for name in names}
+        parts = {name: (stored.get(name, ABSENT), found.get(name, ABSENT)) for name in {**stored, **found}}
     elif isinstance(stored, list) and isinstance(found, list) and len(stored) == len(found):
         parts = dict(enumerate(zip(stored, found, strict=True)))
-    if parts is None:
-        if type(stored) is not type(found) or stored != found:
-            yield path, stored, found
-        return
+    elif type(stored) is not type(found) or stored != found:
+        yield path, stored, found
     for name, (one, other) in parts.items():
         yield from differing(one, other, without=without, path=f"{path}/{name}" if path else str(name))
 
@@ -236,11 +236,14 @@ def _resampling(part: Any) -> Resampling:
 def _differences(bundle: Bundle, run: EvaluationRun) -> Iterator[Difference]:
     """Of all files but their list."""
     elsewhere = ("split",) if "split" in bundle.outside_paths() else ()
-    for where, stored, found in differing(bundle.summary, run.summary(), without=(*_NOT_COMPARED, *elsewhere)):
+    truth, summary = dict(run.release.scenarios), run.summary()
+    with suppress(ResultsError):  # is a difference of the file, below
+        truth |= {token: hashes for token, hashes in bundle.scenarios().items() if hashes.is_like(truth.get(token))}
+        summary["release"]["fingerprint"] = fingerprint(truth)
+    for where, stored, found in differing(bundle.summary, summary, without=(*_NOT_COMPARED, *elsewhere)):
         yield Difference(where=f"{SUMMARY_FILE}: {where}", stored=stored, found=found)
-    hashes = {token: each.as_dict() for token, each in run.release.scenarios.items()}
     rows = {row["token"]: row for row in sample_rows(run)}
-    yield from _compared(SCENARIOS_FILE, bundle.scenarios, lambda _: hashes)
+    yield from _compared(SCENARIOS_FILE, bundle.scenarios, lambda _: truth)
     yield from _compared(COUNTS_FILE, bundle.counts, lambda _: dict(run.evaluator.counts))
     yield from _compared(ROWS_FILE, bundle.rows, lambda _: rows)
 

@@ -1,8 +1,8 @@
 """Hashes of a scenario's label, meta and calib files."""
 
 import os
-import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -65,13 +65,48 @@ def test_bytes_that_move_to_the_next_file_are_a_change(own_release: Path, scenar
     assert folder_hashes(folder_of(own_release, scenario)).label != before.label
 
 
-def test_files_of_other_kinds_are_not_read(own_release: Path, scenario: str) -> None:
+def points_changed(path: Path, change: Callable[[list[int]], list[int]]) -> None:
+    lines = [line.split(" ") for line in path.read_text().split("\n")]
+    rows = [words for words in lines if len(words) == 13]
+    for words, count in zip(rows, change([int(words[11]) for words in rows]), strict=True):
+        words[11] = str(count)
+    path.write_text("\n".join(map(" ".join, lines)))
+
+
+@pytest.mark.parametrize(
+    ("change", "is_like"),
+    [
+        (lambda counts: [counts[0] + 1, *counts[1:]], True),
+        (lambda counts: [counts[0] + 200, *counts[1:]], False),
+        (lambda counts: [*counts[1:], counts[0]], False),
+        (lambda counts: [0] * len(counts), False),
+    ],
+)
+def test_only_few_points_more_or_less_are_alike(
+    own_release: Path, scenario: str, change: Callable[[list[int]], list[int]], is_like: bool
+) -> None:
     folder = folder_of(own_release, scenario)
-    whole = folder_hashes(folder)
-    shutil.rmtree(folder.kind_folder("ego_vehicle", "calib"))
-    assert folder_hashes(folder, ["label"]) == ScenarioHashes(label=whole.label, meta=None, calib=None)
-    assert folder_hashes(folder, ["meta"]) == ScenarioHashes(label=None, meta=whole.meta, calib=None)
-    assert folder_hashes(folder).calib not in (None, whole.calib)
+    before = folder_hashes(folder)
+    points_changed(first(own_release, "label", "txt"), change)
+    after = folder_hashes(folder)
+    assert before != after
+    assert (before.is_like(after), after.is_like(before)) == (is_like, is_like)
+    assert before.boxes == after.boxes
+
+
+def test_other_boxes_or_unknown_ones_are_not_alike(own_release: Path, scenario: str) -> None:
+    folder = folder_of(own_release, scenario)
+    before = folder_hashes(folder)
+    unknown = ScenarioHashes(**before.as_dict())
+    assert before.is_like(unknown)
+    assert unknown.is_like(before)
+    path = first(own_release, "label", "txt")
+    words = path.read_text().split(" ")
+    path.write_text(" ".join([*words[:5], "9" + words[5], *words[6:]]))
+    after = folder_hashes(folder)
+    assert after.points == before.points
+    assert not any(mine.is_like(after) for mine in (before, unknown, replace(before, label=after.label)))
+    assert not before.is_like(None)
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="the system has no pipes")

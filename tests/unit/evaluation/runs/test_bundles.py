@@ -68,7 +68,7 @@ def test_holds_all_and_reads_back(run: EvaluationRun, results: Results, tmp_path
     assert (bundle.setup, bundle.selection) == (run.setup, run.selection)
     assert (str(bundle.dataroot), bundle.release_version) == (run.release.dataroot, "v1")
     assert bundle.results_path == results.path
-    assert bundle.scenarios() == {token: each.as_dict() for token, each in run.release.scenarios.items()}
+    assert bundle.scenarios() == run.release.scenarios
     assert bundle.checksums() == {name: file_checksum(folder / name) for name in FILES - {"files.json"}}
     assert run.evaluator.fresh().resume(folder / "counts.json").compute() == run.result
 

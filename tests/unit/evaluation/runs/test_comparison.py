@@ -317,7 +317,7 @@ def test_other_cells(motion_bundles: tuple[Path, Path], tmp_path: Path) -> None:
 def test_other_labels_and_another_devkit(saved: Save, results: Results) -> None:
     a, b, c = map(saved, "abc")
     token = min(results.tokens).rsplit("/", 2)[0]
-    changed(b / "scenarios.json", lambda stored: stored["scenarios"][token].update(label="0"))
+    changed(b / "scenarios.json", lambda stored: stored["scenarios"][token].update(label="0", boxes="0"))
     path = c / "counts.json"
     path.write_text(path.read_text().replace("of devkit ", "of devkit 9."))
     assert_refused(

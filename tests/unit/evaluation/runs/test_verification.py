@@ -13,13 +13,14 @@ import pytest
 from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.errors import ResultsError
+from deepaccident_devkit.errors import EvaluationError, ResultsError
 from deepaccident_devkit.evaluation import Resampling
 from deepaccident_devkit.evaluation.results import Results
 from deepaccident_devkit.evaluation.runs import (
     EvaluationRun,
     SampleSelection,
     Verification,
+    compare_bundles,
     evaluate_results,
     save_run,
     summary_text,
@@ -27,6 +28,7 @@ from deepaccident_devkit.evaluation.runs import (
 )
 from deepaccident_devkit.evaluation.runs.rows import read_rows, write_rows
 from deepaccident_devkit.evaluation.runs.verification import ABSENT, Difference, differing
+from deepaccident_devkit.support.reading import file_checksum
 
 Write = Callable[..., Results]
 SUMMARY_CHANGED = "files.json: metrics_summary.json"
@@ -132,6 +134,62 @@ def test_a_file_of_a_scenario(bundle: Path, own_release: Path, kind: str) -> Non
     assert "the index is out of date" in verification.notes[0]
     verification = verify(bundle, DeepAccident(dataroot=own_release, index_dir=own_release / "anew", verbose=False))
     assert found(verification) == ["metrics_summary.json: release/fingerprint", f"scenarios.json: {token}/{kind}"]
+
+
+def one_more_point(release: Path) -> None:
+    """As on another processor, in a box of another class than the agent's own row."""
+    path = min(release.glob("val/*/ego_vehicle/label/*/*_001.txt"))
+    lines = path.read_text().split("\n")
+    words = lines[-1].split(" ")
+    lines[-1] = " ".join([*words[:11], str(int(words[11]) + 1), words[12]])
+    path.write_text("\n".join(lines))
+
+
+def without_boxes(bundle: Path) -> None:
+    """Make it a bundle of devkit 1.0.0, which kept the hashes of whole files only."""
+    path = bundle / "scenarios.json"
+    changed(
+        path, lambda stored: [each.pop(name) for each in stored["scenarios"].values() for name in ("boxes", "points")]
+    )
+    changed(bundle / "files.json", lambda listed: listed["files"].update({path.name: file_checksum(path)}))
+
+
+def test_labels_with_a_few_other_points_are_the_same(
+    bundle: Path, own_release: Path, results: Results, run: EvaluationRun, selection: SampleSelection
+) -> None:
+    one_more_point(own_release)
+    opened = DeepAccident(dataroot=own_release, verbose=False)
+    assert verify(bundle, opened).is_same
+    again = evaluate_results(opened, results, run.setup, selection, workers=1)
+    other = save_run(again, bundle.with_name("other"))
+    assert compare_bundles(bundle, other, Resampling(resamples=10)).samples == 6
+    without_boxes(bundle)
+    token = min(opened.split_scenarios("val"))
+    assert found(verify(bundle, opened)) == [
+        "metrics_summary.json: release/fingerprint",
+        f"scenarios.json: {token}/label",
+    ]
+    with pytest.raises(EvaluationError, match="files of 1 scenarios are not the same"):
+        compare_bundles(bundle, other)
+
+
+def test_a_bundle_of_devkit_1_0_0_verifies_and_compares(bundle: Path, da_b: DeepAccident, run: EvaluationRun) -> None:
+    new = save_run(run, bundle.with_name("new"))
+    without_boxes(bundle)
+    assert verify(bundle, da_b).is_same
+    assert compare_bundles(bundle, new, Resampling(resamples=10)).samples == 6
+
+
+def test_hashes_of_a_stranger_are_text(bundle: Path, da_b: DeepAccident) -> None:
+    token = min(json.loads((bundle / "scenarios.json").read_text())["scenarios"])
+    for points in ([10**400] * 8, [1], [None] * 8):
+        changed(
+            bundle / "scenarios.json",
+            lambda stored, points=points: stored["scenarios"][token].update(label="\u202e", points=points),
+        )
+        text = verify(bundle, da_b).to_text()
+        assert "scenarios.json" in text
+        assert "\u202e" not in text
 
 
 def test_a_scenario_that_is_gone(bundle: Path, own_release: Path) -> None:
