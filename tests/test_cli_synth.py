@@ -84,13 +84,17 @@ def test_a_benchmark_is_made_and_compared(tmp_path, monkeypatch):
     first = run("--sensors", "clouds")
     assert (first.exit_code, first.stdout.splitlines()[0]) == (
         0,
-        f"{tmp_path / 'out'}: is the benchmark v1 as published, 1 scenario",
+        f"{tmp_path / 'out'}: is the benchmark v1 as published, 1 scenario: labels, num_lidar_pts, clouds",
     )
     [label] = (tmp_path / "out").glob("*/infrastructure/label/*/*_002.txt")
     label.write_text(label.read_text().replace("car ", "van ", 1))
     second = run()
     assert second.exit_code == 1
-    told = ("out: is not the benchmark v1 as published:\n", "scenario00001: label files differ\n", "v1/lock.txt")
+    told = (
+        "out: is not the benchmark v1 as published, 1 difference:\n",
+        "scenario00001: boxes differ\n",
+        "v1/lock.txt",
+    )
     assert [each for each in told if each not in second.stderr] == []
 
 

@@ -10,7 +10,13 @@ from deepaccident_devkit.cli.options import PATH, engine_of, engine_parameters, 
 from deepaccident_devkit.cli.verbs import WordChoice, advanced, field_option, verb
 from deepaccident_devkit.support.text import counted
 from deepaccident_devkit.synth import SynthConfig, make_release
-from deepaccident_devkit.synth.benchmark import BENCHMARKS, described_release, differences, published
+from deepaccident_devkit.synth.benchmark import (
+    BENCHMARKS,
+    compared_kinds,
+    described_release,
+    differences,
+    published,
+)
 from deepaccident_devkit.synth.plan import IMAGE_SIZE, RELEASED_IMAGE_SIZE, Sensors
 from deepaccident_devkit.synth.sensors.caster import has_embree
 from deepaccident_devkit.synth.spec import DESIGN_NUMBERS, design_text, read_spec
@@ -24,7 +30,7 @@ Examples:
   deepaccident synth OUT --benchmark v1 --sensors cameras  a benchmark that everybody has the same
 """
 _SHOWN: Final = 5
-"""How many differences from what is published are told."""
+"""Number of differences from what is published that are printed."""
 
 
 def _show_design(context: click.Context, parameter: click.Parameter, value: str | None) -> None:
@@ -115,9 +121,8 @@ def synth(out: Path, *, designs: dict[str, Any], benchmark: str | None, **option
     if config.sensors == "none" and not has_embree():
         click.echo("slow without the package embreex; in a checkout: pip install '.[synth]'", err=True)
     made = make_release(out, config, progress=True, **how)
-    scenarios = f"{config.scenarios} scenario{'s' if config.scenarios > 1 else ''}"
-    frames = "" if config.frames is None else f" of {config.frames} frame{'s' if config.frames > 1 else ''}"
-    click.echo(f"{made}: {scenarios}{frames} with five agents, layout {config.layout}")
+    frames = "" if config.frames is None else f" of {counted(config.frames, 'frame')}"
+    click.echo(f"{made}: {counted(config.scenarios, 'scenario')}{frames} with five agents, layout {config.layout}")
     click.echo(f"next: deepaccident info {made}")
     if config.spec is None or read_spec(config.spec).meets:
         layers = " --layers boxes" if config.sensors == "none" else ""
@@ -130,11 +135,12 @@ def _make_benchmark(out: Path, name: str, sensors: Sensors, how: dict[str, Any])
         make_release(out, replace(BENCHMARKS[name], sensors=sensors), progress=True, **how)
     found = described_release(out, progress=True, **how)
     if faults := differences(found, published(name)):
-        more = [f"and {len(faults) - _SHOWN} more"] if len(faults) > _SHOWN else []
-        told = "\n".join([f"{out}: is not the benchmark {name} as published:", *faults[:_SHOWN], *more])
         raise click.ClickException(
-            f"{told}\nMake it with the libraries of benchmarks/{name}/lock.txt; evaluations of this release do not "
-            "compare with others."
+            f"{out}: is not the benchmark {name} as published, {counted(len(faults), 'difference')}:\n"
+            + "\n".join(faults[:_SHOWN])
+            + f"\nMake it with the libraries of benchmarks/{name}/lock.txt; evaluations of this release do not compare "
+            "with others."
         )
-    click.echo(f"{out}: is the benchmark {name} as published, {counted(len(found['scenarios']), 'scenario')}")
+    compared = f"{counted(len(found['scenarios']), 'scenario')}: labels, {', '.join(compared_kinds(found))}"
+    click.echo(f"{out}: is the benchmark {name} as published, {compared}")
     click.echo(f"next: deepaccident info {out}")
