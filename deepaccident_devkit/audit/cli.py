@@ -39,7 +39,7 @@ def audit(topic: str, targets: tuple[str, ...], split: str | None, as_json: bool
 
     \b
     splits FILES…        What stands on two sides, each file a side: frames, recordings, twins, mini beside full.
-                         In place of files, dataroots: recordings that two releases have.
+                         In place of files, dataroots: recordings or twins that two share.
     scores DATAROOT FILE What scores of accidents go by: length of the clip, folder, name, town, weather, actors.
     reader TARGET        What a reader takes for something else. TARGET is a Python function, module:function or
                          file.py:function, that is given a dataroot and returns what it read, and is run; or a folder

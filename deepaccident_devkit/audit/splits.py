@@ -6,17 +6,18 @@ import os
 import re
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from functools import partial
+from itertools import combinations
 from pathlib import Path
 from typing import Final
 
 from deepaccident_devkit.accidents.twins import torn_twins
+from deepaccident_devkit.audit.releases import MIN_SHARED_ROAD_USERS, places_in, shared_moments
 from deepaccident_devkit.audit.report import AuditFinding, AuditReport
 from deepaccident_devkit.errors import ConfigError, SplitFileError, shortened
 from deepaccident_devkit.parallel import run_batch
 from deepaccident_devkit.release import find_release
-from deepaccident_devkit.release.fingerprints import folder_hashes
 from deepaccident_devkit.release.store import read_lines
+from deepaccident_devkit.reports import Row
 from deepaccident_devkit.support.text import counted, path_of
 from deepaccident_devkit.taxonomy import MINI_SPLITS
 
@@ -28,18 +29,22 @@ _NAMED: Final = re.compile(
 _MINI: Final = re.compile(r"(?<![a-z])mini(?=[/\\]|$)", re.IGNORECASE)
 _SAYS: Final = {
     "frames": ("frame", "on two sides: what is tested was learnt"),
-    "recordings": ("recording", "on two sides, as by a random split by frames: frames 0.1 s apart are nearly the same"),
+    "recordings": (
+        "recording",
+        "on two sides, whole or in part, as by a random split by frames: frames 0.1 s apart are nearly the same",
+    ),
     "twins": ("twin pair", "torn apart, as by a random split by names: twins share junction, traffic and weather"),
-    "copies": ("recording", "with the same labels on two sides: what is tested was learnt"),
     "mini": ("scenario", "of the mini release beside the full one: of equal names it has other recordings, much alike"),
 }
-"""Kind of finding, of releases `copies` → what is counted, and what it means."""
+"""Kind of finding → what is counted, and what it means."""
 
 
 def audit_splits(paths: Iterable[str | os.PathLike[str]]) -> AuditReport:
     """Look for frames, recordings or twins on two sides of a split, and for the mini release beside the full one.
 
-    Of releases, recordings are the same if names and label files are.
+    Of dataroots, two recordings are the same if at least three moving road users of equal ids are at the same places of
+    the world at one moment, or go on to them: whatever agents, frames and names each side has. Twins by name are twins
+    if they share a road user or a parked car.
 
     Args:
         paths: two or more files, or two or more dataroots, a side each. A line of a file names a scenario (`<type>
@@ -51,6 +56,7 @@ def audit_splits(paths: Iterable[str | os.PathLike[str]]) -> AuditReport:
         ConfigError: there are fewer than two, or files and dataroots.
         DatarootError: a folder is no release.
         MissingFileError: a file is not there.
+        ReleaseError: a label or calib file of a release cannot be read.
         SplitFileError: a file cannot be read, or a line names no scenario with its type.
     """
     places = {str(path): path_of(path) for path in paths}
@@ -61,61 +67,61 @@ def audit_splits(paths: Iterable[str | os.PathLike[str]]) -> AuditReport:
         )
     if any(folders):
         return _audit_releases(places)
-    sides = {side: sorted(set(_items(path))) for side, path in places.items()}
-    on: dict[tuple[str, int], set[str]] = defaultdict(set)
-    for side, token, frame in [(side, *item) for side, items in sides.items() for item in items]:
-        on[token, 0].add(side)  # the recording
-        on[token, frame].add(side)
-    told = {item: " and ".join(sorted(on[item])) for item in sorted(on)}
-    full = {side for token, frame in on if not token.startswith("mini:") for side in on[token, frame]}
-    twins = torn_twins({token: sides for (token, frame), sides in told.items() if not frame})
-    found = {
-        "frames": [f"{each[0]} frame {each[1]}: {told[each]}" for each in told if each[1] and len(on[each]) > 1],
-        "recordings": [f"{each[0]}: {told[each]}" for each in told if not each[1] and len(on[each]) > 1],
-        "twins": [" and ".join(map("{} in {}".format, each.scenarios, each.splits)) for each in twins],
-        "mini": [
-            f"{each[0]}: {told[each]}"
-            for each in told
-            if each[0].startswith("mini:") and not each[1] and full and len(on[each] | full) > 1
-        ],
+    on: dict[str, set[str]] = defaultdict(set)
+    for side, path in places.items():
+        for token, frame in _items(path):
+            on[token].add(side)
+            on[f"{token} frame {frame}" if frame else token].add(side)
+    recordings, frames = ({item: on[item] for item in sorted(on) if (" " in item) is of} for of in (False, True))
+    full = set[str]().union(*(sides for token, sides in recordings.items() if not token.startswith("mini:")))
+    mini = {token: sides | full for token, sides in recordings.items() if full and token.startswith("mini:")}
+    twins = torn_twins({token: " and ".join(sorted(sides)) for token, sides in recordings.items()})
+    cases = {
+        "frames": _shared(frames),
+        "recordings": _shared(recordings),
+        "twins": [" and ".join(map("{} in {}".format, pair.scenarios, pair.splits)) for pair in twins],
+        "mini": _shared(mini),
     }
     remedy = "Split by scenarios of one release, twins together: deepaccident split DATAROOT --out FOLDER."
-    return AuditReport(
-        findings=tuple(_finding(kind, _SAYS[kind], cases, remedy) for kind, cases in found.items() if cases),
-        tables={
-            "sides": [
-                ("side", "recordings", "frames named"),
-                *((side, len(dict(items)), sum(frame > 0 for _, frame in items)) for side, items in sides.items()),
-            ]
-        },
-    )
+    rows = [[side, *(sum(map({side}.issubset, on.values())) for on in (recordings, frames))] for side in places]
+    return _report(cases, remedy, [("side", "recordings", "frames named"), *rows])
+
+
+def _shared(on: Mapping[str, set[str]]) -> list[str]:
+    """Return which items are on two sides or more, and on which, a phrase each."""
+    return [f"{item}: {' and '.join(sorted(sides))}" for item, sides in on.items() if len(sides) > 1]
+
+
+def _report(cases: Mapping[str, Sequence[str]], remedy: str, rows: Sequence[Row]) -> AuditReport:
+    """Return the report of the cases of each kind, and of the sides, a row each with its number of recordings."""
+    findings = [
+        AuditFinding(
+            kind=kind,
+            what=f"{counted(len(texts), _SAYS[kind][0])} {_SAYS[kind][1]}.",
+            remedy=remedy,
+            number=len(texts),
+            examples=tuple(texts[:3]),
+        )
+        for kind, texts in cases.items()
+        if texts
+    ]
+    return AuditReport(findings=tuple(findings), tables={"sides": rows})
 
 
 def _audit_releases(sides: Mapping[str, Path]) -> AuditReport:
-    """Look for recordings that two releases have, by the hashes of their label files."""
-    where: dict[str, list[str]] = defaultdict(list)
-    of_labels = partial(folder_hashes, kinds=["label"])
-    scenarios = {side: find_release(path).scenarios for side, path in sides.items()}
-    for side, folders in scenarios.items():
-        for folder, hashes in zip(folders, run_batch(of_labels, folders), strict=True):
-            if hashes.label is not None:
-                where[hashes.label].append(f"{folder.token} of {side}")
-    cases = [" and ".join(each) for each in where.values() if len(each) > 1]
+    """Look for recordings of which parts stand in two releases, and for torn twins."""
+    releases = {side: find_release(path).scenarios for side, path in sides.items()}
+    places = {side: run_batch(places_in, scenarios, label="reading") for side, scenarios in releases.items()}
+    cases: dict[str, list[str]] = {"recordings": [], "twins": []}
+    for side, other in combinations(sides, 2):
+        for (row, other_row), moving in sorted(shared_moments(places[side], places[other]).items()):
+            one, two = releases[side][row].token, releases[other][other_row].token
+            twins = torn_twins({one: side, two: other})
+            if twins or moving >= MIN_SHARED_ROAD_USERS:
+                cases["twins" if twins else "recordings"].append(f"{one} of {side} and {two} of {other}")
     remedy = "Make one of the two with another seed, or leave these recordings out."
-    return AuditReport(
-        findings=(_finding("recordings", _SAYS["copies"], cases, remedy),) if cases else (),
-        tables={"sides": [("side", "recordings"), *((side, len(folders)) for side, folders in scenarios.items())]},
-    )
-
-
-def _finding(kind: str, says: tuple[str, str], cases: Sequence[str], remedy: str) -> AuditFinding:
-    return AuditFinding(
-        kind=kind,
-        what=f"{counted(len(cases), says[0])} {says[1]}.",
-        remedy=remedy,
-        number=len(cases),
-        examples=tuple(cases[:3]),
-    )
+    rows = [(side, sum(map(bool, map(len, recordings)))) for side, recordings in places.items()]
+    return _report(cases, remedy, [("side", "recordings"), *rows])
 
 
 def _items(path: Path) -> Iterator[tuple[str, int]]:

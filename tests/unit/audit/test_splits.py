@@ -1,6 +1,8 @@
 """Splits of all kinds: the official one passes, and what leaks is told."""
 
 import json
+import os
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -125,19 +127,114 @@ def test_hostile_lines_end_soon(sides: Sides) -> None:
     assert numbers(sides(train=[f"{ACCIDENT}/" * 20_000 + TOKENS[0]], val=["_" * 100_000 + TOKENS[1]])) == {}
 
 
-def test_releases_share_recordings_of_a_name_and_the_same_labels(motion_root: Path, tmp_path: Path) -> None:
-    """Of a name alone nothing is said."""
-    for name in ("copy", "other"):
-        shutil.copytree(motion_root, tmp_path / name, ignore=shutil.ignore_patterns(".deepaccident"))
-    labels = sorted(tmp_path.glob("other/*/*/label/*/*_001.txt"))
-    for label in labels:
-        label.write_bytes(label.read_bytes() + b"\n")
-    [found] = audit_splits([motion_root, tmp_path / "copy"]).findings
-    assert (found.kind, found.number) == ("recordings", 2)
-    assert str(motion_root) in found.examples[0]
-    assert str(tmp_path / "copy") in found.examples[0]
-    report = audit_splits([motion_root, tmp_path / "other"])
-    assert (len(labels), report.findings) == (10, ())
-    assert report.tables["sides"][1:] == [(str(motion_root), 2), (str(tmp_path / "other"), 2)]
+def copied(root: Path, copy: Path) -> Path:
+    """Link a release's files, which are removed and renamed in the copy, but not written."""
+    return Path(shutil.copytree(root, copy, ignore=shutil.ignore_patterns(".deepaccident"), copy_function=os.link))
+
+
+def unchanged(root: Path) -> None:
+    """Leave a release as it is."""
+
+
+def only_agents(root: Path, *agents: str) -> None:
+    for folder in root.glob("type*/*"):
+        if folder.name not in (*agents, "meta"):
+            shutil.rmtree(folder)
+
+
+def only_frames(root: Path, frames: range, first: int | None = None) -> None:
+    """Keep some frames, and count them from another first one."""
+    for path in sorted(root.glob("*/*/*/*/*_[0-9][0-9][0-9].*")):
+        stem, _, number = path.stem.rpartition("_")
+        if int(number) not in frames:
+            path.unlink()
+        elif first is not None:
+            path.rename(path.with_name(f"{stem}_{int(number) - frames[0] + first:03d}{path.suffix}"))
+
+
+def renamed(root: Path, change: Callable[[str], str]) -> None:
+    for path in sorted(root.rglob("Town*"), key=lambda path: -len(path.parts)):
+        path.rename(path.with_name(change(path.name)))
+
+
+def renumbered(root: Path) -> None:
+    renamed(root, lambda name: name.replace("scenario000", "scenario090"))
+
+
+def recounted(root: Path) -> None:
+    """One LiDAR point more in a box of each label file, as on another processor."""
+    for path in root.glob("*/*/label/*/*.txt"):
+        text = path.read_text()
+        path.unlink()
+        path.write_text(re.sub(r"(\d+) (True|False)$", lambda m: f"{int(m[1]) + 1} {m[2]}", text))
+
+
+def without(root: Path, ending: str) -> None:
+    for folder in root.glob(f"*_{ending}"):
+        shutil.rmtree(folder)
+
+
+@pytest.mark.parametrize(
+    ("mine", "theirs", "wanted"),
+    [
+        (unchanged, unchanged, {"recordings": 2, "twins": 2}),
+        (unchanged, recounted, {"recordings": 2, "twins": 2}),
+        (lambda root: without(root, "normal"), lambda root: without(root, "accident"), {"twins": 1}),
+        (
+            lambda root: only_agents(root, "ego_vehicle", "ego_vehicle_behind"),
+            lambda root: only_agents(root, "infrastructure", "other_vehicle"),
+            {"recordings": 2, "twins": 2},
+        ),
+        (
+            lambda root: only_frames(root, range(1, 18)),
+            lambda root: only_frames(root, range(18, 36)),
+            {"recordings": 2, "twins": 2},
+        ),
+        (
+            lambda root: only_frames(root, range(1, 36, 2)),
+            lambda root: only_frames(root, range(2, 36, 2), first=1),
+            {"recordings": 2, "twins": 2},
+        ),
+    ],
+    ids=["copy", "counts", "twins", "agents", "halves", "odd"],
+)
+def test_dataroots_with_parts_of_a_recording_on_both_sides(
+    motion_root: Path,
+    tmp_path: Path,
+    mine: Callable[[Path], None],
+    theirs: Callable[[Path], None],
+    wanted: dict[str, int],
+) -> None:
+    sides = copied(motion_root, tmp_path / "mine"), copied(motion_root, tmp_path / "theirs")
+    mine(sides[0])
+    theirs(sides[1])
+    report = audit_splits(sides)
+    assert numbers(report) == wanted
+    for finding in report.findings:
+        assert str(sides[0]) in finding.examples[0]
+        assert str(sides[1]) in finding.examples[0]
+    renumbered(sides[1])
+    if wanted != {"twins": 1}:
+        assert numbers(audit_splits(sides))["recordings"] >= 2
+
+
+def test_dataroots_with_other_scenarios_of_the_same_names(
+    motion_root: Path, release_root_b: Path, tmp_path: Path
+) -> None:
+    names = sorted({path.stem for path in motion_root.rglob("meta/*.txt")})
+    others = sorted({path.stem for path in release_root_b.rglob("meta/*.txt")})
+    other = copied(release_root_b, tmp_path / "other")
+    new_names = dict(zip(others, names, strict=False))
+    renamed(other, lambda name: re.sub(r"^Town\w*scenario\d+", lambda m: new_names.get(m[0], m[0]), name))
+    assert {*names} <= {path.stem for path in other.rglob("meta/*.txt")}
+    assert numbers(audit_splits([motion_root, other])) == {}
+
+
+def test_dataroots_without_labels_have_nothing_to_compare(motion_root: Path, tmp_path: Path) -> None:
+    other = copied(motion_root, tmp_path / "other")
+    for folder in sorted(other.glob("*/*/label/*")):
+        shutil.rmtree(folder)
+    report = audit_splits([motion_root, other])
+    assert report.tables["sides"] == [("side", "recordings"), (str(motion_root), 2), (str(other), 0)]
     with pytest.raises(ConfigError, match=r"files, or dataroots, a side each, found .*motion, .*\.txt"):
         audit_splits([motion_root, motion_root / "train.txt"])
