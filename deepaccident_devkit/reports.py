@@ -74,6 +74,38 @@ class Report(ShortRepr):
         return [write_csv(folder / f"{name}.csv", rows) for name, rows in self.named_tables().items()]
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CheckReport(Report):
+    """Base of reports on whether something is wrong, which therefore also say what they compared.
+
+    Attributes:
+        compared: what is compared → how many there were of it.
+        cannot_say: what could not be judged, and why, a sentence each.
+    """
+
+    compared: Mapping[str, int]
+    cannot_say: tuple[str, ...] = ()
+
+    @property
+    def is_good(self) -> bool:
+        """Whether nothing wrong was found."""
+        return True
+
+    @property
+    def exit_status(self) -> int:
+        """Return 1 if something is wrong, else 2 if nothing was compared, else 0."""
+        return 1 if not self.is_good else 0 if any(self.compared.values()) else 2
+
+    def to_text(self) -> str:
+        """The tables, and what was compared."""
+        return f"{Report.to_text(self)}\n\n{self.basis_text()}"
+
+    def basis_text(self) -> str:
+        """Return lines that say what was compared, and what could not be judged."""
+        compared = ", ".join(f"{number:,} {what}" for what, number in self.compared.items())
+        return "\n".join([f"Compared: {compared}.", *map("Cannot say: {}".format, self.cannot_say)])
+
+
 def write_csv(path: str | os.PathLike[str], rows: Iterable[Row]) -> Path:
     """Write rows, the heading first, into a file, over one that is there; None leaves a cell empty."""
     text, target = io.StringIO(newline=""), path_of(path)

@@ -1,9 +1,10 @@
 """`deepaccident audit`: what is wrong with splits, scores, or a reader of the files."""
 
 import sys
+import traceback
 from collections.abc import Callable
-from importlib import import_module
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import Any, Final, cast
 
 import click
@@ -20,6 +21,7 @@ from deepaccident_devkit.cli.options import (
 )
 from deepaccident_devkit.cli.verbs import WordChoice, verb
 from deepaccident_devkit.deepaccident import DeepAccident
+from deepaccident_devkit.errors import ConfigError, DeepAccidentError, ResultsError, TokenError
 from deepaccident_devkit.support.text import path_of
 
 _TOPICS: Final = {"splits": (2, None), "scores": (2, 2), "reader": (1, 1), "release": (1, 1)}
@@ -48,7 +50,7 @@ def audit(topic: str, targets: tuple[str, ...], split: str | None, as_json: bool
 
     FILE has results of the task accident, JSON of token and score, or CSV of token,score. A line of FILES names a
     scenario, a sample or frame by its token, or any file of a release. docs/validation.md explains what is found.
-    Exit status 1: something was found.
+    Exit status 1: something was found. 2: nothing was compared.
     """  # noqa: D301 - \b is click's mark of lines that are not wrapped
     least, most = _TOPICS[topic]
     if not least <= len(targets) <= (most or len(targets)):
@@ -64,11 +66,21 @@ def audit(topic: str, targets: tuple[str, ...], split: str | None, as_json: bool
     if topic == "splits":
         report = audit_splits(targets)
     elif topic == "scores":
-        report = audit_scores(DeepAccident(dataroot=targets[0], **release), read_scores(targets[1]), split)
+        scores = read_scores(targets[1])
+        try:
+            report = audit_scores(DeepAccident(dataroot=targets[0], **release), scores, split)
+        except (TokenError, ResultsError) as error:
+            raise ResultsError(f"{targets[1]}: {error}") from error
     else:
-        report = audit_reader(targets[0] if Path(targets[0]).is_dir() else _function(targets[0]))
+        try:
+            report = audit_reader(targets[0] if Path(targets[0]).is_dir() else _function(targets[0]))
+        except (click.ClickException, DeepAccidentError):
+            raise
+        except (Exception, SystemExit) as error:
+            traceback.print_exc()
+            raise ConfigError(f"{targets[0]}: ended with {type(error).__name__}, so nothing was compared") from error
     click.echo(report.to_json() if as_json else report.to_text())
-    sys.exit(1 if report.findings else 0)
+    sys.exit(report.exit_status)
 
 
 def _function(target: str) -> Callable[[str], object]:
@@ -76,7 +88,7 @@ def _function(target: str) -> Callable[[str], object]:
     place, _, name = target.rpartition(":")
     sys.path.insert(0, str(Path(place).parent))  # of a module: here
     try:
-        return cast("Callable[[str], object]", getattr(import_module(Path(place).name.removesuffix(".py")), name))
+        return cast("Callable[[str], object]", resolve_name(f"{Path(place).name.removesuffix('.py')}:{name}"))
     except (ImportError, AttributeError, ValueError) as error:
         expected = "expected a folder, module:function or file.py:function"
         raise click.UsageError(f"TARGET: {expected}, found {target!r} ({error})") from error

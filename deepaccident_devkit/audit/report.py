@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from deepaccident_devkit.reports import Report, Row
+from deepaccident_devkit.reports import CheckReport, Report, Row
 from deepaccident_devkit.support.arrays import ShortRepr
 
 
@@ -29,11 +29,11 @@ class AuditFinding(ShortRepr):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class AuditReport(Report):
-    """What an audit found.
+class AuditReport(CheckReport):
+    """What an audit found, and what it compared.
 
     Attributes:
-        findings: what is wrong; none if all is well.
+        findings: what is wrong; none if nothing of what was compared is.
         tables: name → rows, the heading first: what the findings rest on.
         notes: sentences on how the numbers were made, and on what was left out.
     """
@@ -42,14 +42,21 @@ class AuditReport(Report):
     tables: Mapping[str, Sequence[Row]]
     notes: tuple[str, ...] = ()
 
+    @property
+    def is_good(self) -> bool:
+        """Whether there is no finding."""
+        return not self.findings
+
     def named_tables(self) -> Mapping[str, Sequence[Row]]:
         """What the findings rest on."""
         return self.tables
 
     def to_text(self) -> str:
-        """A paragraph for each finding, then the tables and the notes."""
-        told = [
+        """A paragraph for each finding, what was compared, the tables and the notes."""
+        paragraphs = [
             "\n  ".join([f"FOUND {each.kind}: {each.what}", *map("such as {}".format, each.examples), each.remedy])
             for each in self.findings
         ]
-        return "\n\n".join([*(told or ["Nothing was found."]), Report.to_text(self), *self.notes])
+        if self.exit_status == 0:
+            paragraphs.append("Nothing was found.")
+        return "\n\n".join([*paragraphs, self.basis_text(), Report.to_text(self), *self.notes])

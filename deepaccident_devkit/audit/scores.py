@@ -5,14 +5,15 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Final, cast
 
 import numpy as np
 
 from deepaccident_devkit.audit.report import AuditFinding, AuditReport
 from deepaccident_devkit.dataset import Dataset
-from deepaccident_devkit.errors import ResultsError, shortened
+from deepaccident_devkit.errors import MOST_TOLD, ResultsError, shortened
 from deepaccident_devkit.evaluation.breakdowns import cluster_of
 from deepaccident_devkit.evaluation.intervals import LEAST_CLUSTERS
 from deepaccident_devkit.evaluation.results import read_results
@@ -47,16 +48,27 @@ collisions alone).""",
     f"From, to: 95 % of {RESAMPLES} resamples of scenarios, twins together; −1 to 1 for fewer than {LEAST_CLUSTERS}.",
 )
 _HEADING: Final = ("attribute", "AUC", "with the scores", "from", "to", "among alike", "from", "to")
-_REMEDY: Final = "give results of the task accident, a JSON object of token and score, or lines `token,score` in a .csv"
+_LINE: Final = re.compile(
+    r"""(?:"?\d*"?[,;\t|])?\s*"?(?P<token>[^\s,;|"]+/[^\s,;|"]+)"?\s*[,;\t|]\s*"?(?P<score>[^\s;|"]+)"?\s*"""
+)
+"""A token and its score in a table, perhaps behind the number of the row."""
+_REMEDY: Final = (
+    "give results of the task accident, a JSON object of token and score, or a .csv of lines `token,score`, with a "
+    "comma, a semicolon, a tab or a bar"
+)
+_ALIKE: Final = (
+    "scenarios that end alike hardly differ in it, so scores that go by it cannot be told apart from the truth here."
+)
+_FEW: Final = f"nothing can be found: all are equal, or fewer than {LEAST_CLUSTERS} scenarios (twins are one) have one."
 
 
 def read_scores(path: str | os.PathLike[str]) -> dict[str, float]:
-    """Token of a sample or of a scenario → its score, the higher the surer of an accident.
+    """Return the score of each token of a sample or of a scenario; the higher, the surer of an accident.
 
     Args:
-        path: results of the task `accident` (a sample's score is that of its surest accident, 0 without one), a JSON
-            object of token and score, or a .csv file of `token,score` in a line, whose lines without a token (which has
-            a `/`) do not count.
+        path: results of the task `accident` (a sample's score is that of its surest accident, 0 without one); JSON, an
+            object of token and score or a list of objects with `token` and `score`; or a table (a .csv file), in
+            whose lines a score follows a token (which has a `/`); lines without a token do not count.
 
     Raises:
         ResultsError: it cannot be read, is something else, or a score is no finite number.
@@ -64,25 +76,35 @@ def read_scores(path: str | os.PathLike[str]) -> dict[str, float]:
     file = path_of(path, error=ResultsError)
     try:
         content = read_bytes(file, "results")
-        if file.suffix == ".csv":
-            pairs = (line.replace('"', "").rpartition(",") for line in content.decode("utf-8-sig").splitlines())
-            given: dict[str, Any] = {
-                token.strip(): number_of(score.strip()) for token, _, score in pairs if "/" in token
-            }
+        if file.suffix.lower() in (".csv", ".tsv", ".txt"):
+            given: dict[str, Any] = dict(_pairs_of_table(content.decode("utf-8-sig")))
+        elif isinstance(document := parsed_json(content), list):
+            given = {entry["token"]: entry["score"] for entry in document}
         else:
-            given = dict(parsed_json(content))
-    except (OSError, TypeError, ValueError) as error:
-        raise ResultsError(f"{file}: {shortened(fault_text(error))}; {_REMEDY}") from error
+            given = dict(document)
+    except (TypeError, LookupError) as error:
+        raise ResultsError(f"{file}: expected an object of token and score, or a list of these; {_REMEDY}") from error
+    except (OSError, ValueError) as error:
+        raise ResultsError(f"{file}: {shortened(fault_text(error), MOST_TOLD)}; {_REMEDY}") from error
     if "results" in given and (results := read_results(file)).task == "accident":
         given = {
-            token: max((each.score for each in cast("Any", results.prediction(token))), default=0.0)
+            token: max((accident.score for accident in cast("Any", results.prediction(token))), default=0.0)
             for token in results.tokens
         }
     for token, score in given.items():
-        if type(score) not in (int, float) or not math.isfinite(score):
-            found = f"{shortened(token)}: {shortened(repr(score))}"
+        if type(score) not in (int, float) or not abs(score) < 1e300:
+            found = f"{shortened(str(token))}: {shortened(repr(score))}"
             raise ResultsError(f"{file}: expected a score, found {found}; {_REMEDY}")
     return given
+
+
+def _pairs_of_table(text: str) -> Iterator[tuple[str, float | None]]:
+    for number, line in enumerate(text.splitlines(), start=1):
+        if "/" in line:
+            found = _LINE.fullmatch(line)
+            if found is None:
+                raise ValueError(f"line {number}: expected a token and then its score, found {shortened(line)}")
+            yield found["token"], number_of(found["score"].replace(",", "."))
 
 
 def audit_scores(
@@ -99,52 +121,69 @@ def audit_scores(
         TokenError: a token is neither a sample's nor a scenario's.
         ResultsError: no scenario with meta has a score.
     """
-    of_sample, chosen = dataset.columns("sample")["scenario_row"], dataset.split_scenarios(split) if split else None
+    view, of_sample = dataset.columns("scenario"), dataset.columns("sample")["scenario_row"]
+    tokens = [record["token"] for record in dataset.scenario[:]]
     cases = [
         (of_sample[dataset.getind("sample", token)], int(token.rpartition("/")[2]), score)
         if token.count("/") > 1
         else (dataset.getind("scenario", token), 0, score)
         for token, score in scores.items()
     ]
-    every = dataset.scenario[:]
-    counts = [each["weather"] is not None and (chosen is None or each["token"] in chosen) for each in every]
-    rows, frame, score = np.array([each for each in cases if counts[each[0]]], dtype=float).reshape(-1, 3).T
+    chosen = [*dataset.split_scenarios(split)] if split else tokens
+    counts = np.isin(tokens, chosen) & np.array(view["weather"].is_valid())
+    rows, frame, score = np.array([case for case in cases if counts[case[0]]], dtype=float).reshape(-1, 3).T
     if not len(rows):
         raise ResultsError("no scenario with meta has a score; give scores of a split whose meta is published")
     scenario, of = np.unique(rows.astype(int), return_inverse=True)
-    highest = np.array([score[of == number].max() for number in range(len(scenario))])
-    records = [every[row] for row in scenario]
-    truth = np.array([each["collision"] is not None for each in records])
-    cluster = np.unique([cluster_of(each["token"]) for each in records], return_inverse=True)[1]
-    words = [np.array([str(dict(each)[word]) for each in records]) for word in ("town", "weather")]
-    columns: list[Any] = [
-        [each["num_frames"] for each in records],
-        [each["designed_accident"] for each in records],
-        [int(re.sub(r".*?(\d*)$", r"0\1", each["name"])) for each in records],
-        *(_means(each, highest) for each in words),
-        np.bincount(dataset.columns("instance")["scenario_row"], minlength=len(every))[scenario],
-        highest,
+    highest = np.full(len(scenario), -np.inf)
+    np.maximum.at(highest, of, score)
+    truth = np.array(view["collision"].is_valid())[scenario]
+    cluster = np.unique([cluster_of(tokens[row]) for row in scenario], return_inverse=True)[1]
+    words = [np.array(view[name])[scenario].astype(str) for name in ("town", "weather")]
+    columns: list[AnyArray] = [
+        view["num_frames"][scenario],
+        view["designed_accident"][scenario],
+        np.array([int(re.sub(r".*?(\d*)$", r"0\1", tokens[row])) for row in scenario]),
+        *(_means(values, highest) for values in words),
+        np.bincount(dataset.columns("instance")["scenario_row"], minlength=len(tokens))[scenario],
     ]
-    found = _correlations(columns, truth * 1, cluster), _correlations([frame, score], truth[of] * -1, cluster[of])
-    columns[3:5] = (_means(each, truth, cluster) for each in words)
-    *areas, own = (_area(np.asarray(each, dtype=float), truth) for each in columns)
-    told, findings = list[Row](), list[AuditFinding]()
-    for name, area, numbers in zip(_IS, [*areas, _area(frame, truth[of])], np.concatenate(found), strict=True):
+    correlations = [
+        *_correlations([*columns, highest], truth * 1, cluster),
+        *_correlations([frame, score], truth[of] * -1, cluster[of]),
+    ]
+    areas = [_area(values, truth) for values in columns]
+    areas[3:5] = [_area(_means(values, truth, cluster), truth) for values in words]
+    areas.append(_area(frame, truth[of]))
+    own = _area(highest, truth)
+    columns[3:] = *words, columns[5], frame
+    untold, table, findings = list[str](), list[Row](), list[AuditFinding]()
+    for name, values, area, (whole, alike) in zip(_IS, columns, areas, correlations, strict=True):
         # of shares of others an AUC below a half is no fit: leaving one out pushes it there
         fitting = max(area, 0.5 if name in ("town", "weather") else round(1 - area, 3))
-        told.append((name, fitting, *numbers.flatten().tolist()))
-        rises = bool(numbers[0, 0] > 0)
-        if ((numbers[:, 1] if rises else -numbers[:, 2]) > FOLLOWED).all():
+        table.append((name, fitting, *whole.tolist(), *alike.tolist()))
+        ends = truth[of] if name == "frame" else truth
+        numbers = sorted(Counter(zip(values, ends, strict=True)).values())
+        if sum(numbers[: -len({*ends})]) < 2:  # beside the usual value of each end
+            untold.append(name)
+        rises = bool(whole[0] > 0)
+        low, low_alike = (whole[1], alike[1]) if rises else (-whole[2], -alike[2])
+        is_followed = low_alike > FOLLOWED[1]
+        if name == "folder":  # those that end otherwise are too few for an interval
+            goes_by_folder = ((highest > highest.mean()) == (values == rises))[values != truth]
+            is_followed |= goes_by_folder.sum() > max(1, FOLLOWED[0] * len(goes_by_folder))
+        if low > FOLLOWED[0] and is_followed:
             what = (
-                f"these scores are those of {_IS[name][rises]}: their rank correlation with `{name}` is "
-                f"{numbers[0, 0]}, and {numbers[1, 0]} among scenarios that end alike. Alone, it has an AUC of "
-                f"{fitting}, they of {own}."
+                f"these scores are those of {_IS[name][rises]}: their rank correlation with `{name}` is {whole[0]}, "
+                f"and {alike[0]} among scenarios that end alike. Alone, it has an AUC of {fitting}, they of {own}."
             )
             remedy = "Cut all clips alike, or compare moments of equal time to the end: deepaccident evaluate warning."
-            findings.append(AuditFinding(kind=name, what=what, remedy=remedy, number=len(records)))
+            findings.append(AuditFinding(kind=name, what=what, remedy=remedy, number=len(truth)))
+    is_few = len({*cluster}) < LEAST_CLUSTERS or len({*highest}) == 1
     return AuditReport(
+        compared={"attributes with the scores": 0 if is_few else len(_IS) - len(untold)},
+        cannot_say=(*[_FEW] * is_few, *[f"{', '.join(untold)}: {_ALIKE}"] * bool(untold)),
         findings=tuple(findings),
-        tables={"scores": [_HEADING, ("the scores", own, *[None] * 6), *told]},
+        tables={"scores": [_HEADING, ("the scores", own, *[None] * 6), *table]},
         notes=(f"{counted(len(truth), 'scenario')} with meta and a score, {truth.sum()} with a collision.", *_NOTES),
     )
 

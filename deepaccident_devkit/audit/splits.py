@@ -93,7 +93,10 @@ def _shared(on: Mapping[str, set[str]]) -> list[str]:
 
 
 def _report(cases: Mapping[str, Sequence[str]], remedy: str, rows: Sequence[Row]) -> AuditReport:
-    """Return the report of the cases of each kind, and of the sides, a row each with its number of recordings."""
+    """Return the report of the cases of each kind, and of the sides, a row each with its number of recordings.
+
+    A side without a recording is compared with none.
+    """
     findings = [
         AuditFinding(
             kind=kind,
@@ -105,7 +108,9 @@ def _report(cases: Mapping[str, Sequence[str]], remedy: str, rows: Sequence[Row]
         for kind, texts in cases.items()
         if texts
     ]
-    return AuditReport(findings=tuple(findings), tables={"sides": rows})
+    sides = sum(bool(number) for _, number, *_ in rows[1:])
+    compared = {"sides": sides if sides > 1 else 0}
+    return AuditReport(compared=compared, findings=tuple(findings), tables={"sides": rows})
 
 
 def _audit_releases(sides: Mapping[str, Path]) -> AuditReport:

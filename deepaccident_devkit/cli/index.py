@@ -8,6 +8,7 @@ from deepaccident_devkit.cli.options import engine_of, refuse_unused, release_pa
 from deepaccident_devkit.cli.verbs import verb
 from deepaccident_devkit.release import find_release
 from deepaccident_devkit.release.store import Dataroot, open_dataroot
+from deepaccident_devkit.support.text import counted
 from deepaccident_devkit.tables import Tables, clear_index, open_index
 from deepaccident_devkit.taxonomy import OnError
 
@@ -38,3 +39,6 @@ def index(dataroot: Dataroot, version: str, on_error: OnError, check: bool, clea
     tables = Tables(made.tables_folder)
     counts = ", ".join(f"{len(tables.table(name)):,} {name}s" for name in ("scenario", "sample", "annotation"))
     click.echo(f"{made.tables_folder}: {counts}")
+    if check:
+        scenarios = counted(len(tables.table("scenario")), "scenario")
+        click.echo(f"compared: the tables, and the label, calib and meta files of {scenarios}")

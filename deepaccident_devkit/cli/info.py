@@ -1,6 +1,7 @@
 """`deepaccident info`: what a release holds, its statistics, and what scenarios can be found by."""
 
 import json
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -98,8 +99,9 @@ def info(
     if facts:
         from deepaccident_devkit.statistics import release_facts
 
-        say_report(release_facts(dataset, chosen, **engine_of(release)), [], None, as_json=as_json)
-        return
+        report = release_facts(dataset, chosen, **engine_of(release))
+        say_report(report, [], None, as_json=as_json)
+        sys.exit(report.exit_status)
     if chosen == [] and out is not None:
         raise click.UsageError("no scenario matches --where, so there is nothing to write; change it or omit --out")
     if statistics:

@@ -17,8 +17,6 @@ from deepaccident_devkit.cli.verbs import advanced, verb
 from deepaccident_devkit.release.store import Dataroot
 from deepaccident_devkit.validation import release_completeness, validate_release
 
-_FINDINGS_STATUS = 1
-
 
 @verb()
 @dataroot_argument
@@ -55,7 +53,7 @@ def validate(
     The command reads the files and each scenario, and says where the index is out of date. Archives that cannot be
     read are listed, and left out. The report ends with the files that are missing.
     Exit status 0: there are only notes and known findings of the real release. 1: there are errors or other warnings.
-    2: the release cannot be read. With --files: 1 if an archive cannot be read, else 0.
+    2: the release cannot be read, or has no file to compare. With --files: 1 if an archive cannot be read, else 0.
     """
     how |= {"scenarios": scenarios or None, "progress": sys.stderr.isatty()}
     if files:
@@ -63,10 +61,9 @@ def validate(
         del how["deep"], how["parts"]
         counted = release_completeness(dataroot, **how)
         click.echo(counted.to_json() if as_json else counted.to_text())
-        sys.exit(_FINDINGS_STATUS if counted.unreadable_archives else 0)
+        sys.exit(1 if counted.unreadable_archives else 0)
     if as_json:
         refuse_unused("with --json, which has all findings and notes", "whole")
     report = validate_release(dataroot, **how)
     click.echo(report.to_json() if as_json else report.to_text(notes=whole, whole=whole))
-    if not report.is_good:
-        sys.exit(_FINDINGS_STATUS)
+    sys.exit(report.exit_status)

@@ -1,5 +1,6 @@
 """`deepaccident rigs`: what the vehicles of one source, or of two, carry."""
 
+import sys
 from pathlib import Path
 
 import click
@@ -28,3 +29,4 @@ def rigs(first: Path, second: Path | None, out: Path | None, as_json: bool) -> N
         from deepaccident_devkit.render.figures import write_report_figure
 
         click.echo(f"written: {write_report_figure(rigs_figure(report), out)}", err=as_json)
+    sys.exit(report.exit_status)

@@ -5,17 +5,29 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, Final
+from operator import attrgetter
+from typing import Final
 
 import numpy as np
 
 from deepaccident_devkit.dataset import Dataset
+from deepaccident_devkit.errors import NotAvailableError
 from deepaccident_devkit.nuscenes.check import labelled_rows, looks_to, road_height, spread
-from deepaccident_devkit.reports import Report, Row, record_rows
+from deepaccident_devkit.reports import CheckReport, Row, record_rows
 from deepaccident_devkit.support.arrays import FloatArray
-from deepaccident_devkit.support.text import columns_text
-from deepaccident_devkit.taxonomy import CAMERAS, CATEGORIES, FRAME_PERIOD, IGNORED_ID, LIDAR, OWN_ACTOR_ID
+from deepaccident_devkit.taxonomy import (
+    CAMERAS,
+    CATEGORIES,
+    FRAME_PERIOD,
+    IGNORED_ID,
+    LIDAR,
+    OWN_ACTOR_ID,
+    VEHICLE_AGENTS,
+)
 
+_FACTS: Final = ("lidar_above", "lanes", "points", "reach", "road", "labels_a_second", "boxes")
+"""Numbers of `RigFacts`, beside the shares of classes."""
+_SHARES: Final = (*CATEGORIES, "ignored")
 _SAMPLES: Final = 12
 _LANE_GAP: Final = 0.2
 """Degrees of elevation between two lanes at least."""
@@ -84,7 +96,7 @@ class RigFacts:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class RigReport(Report):
+class RigReport(CheckReport):
     """One source or two.
 
     Attributes:
@@ -97,41 +109,45 @@ class RigReport(Report):
 
     def named_tables(self) -> dict[str, list[Row]]:
         """A table of cameras for each source, and one of all else."""
-        tables = {f"cameras of {each.name}": record_rows(CameraFacts, each.cameras) for each in self.sources}
-        facts = ("lidar_above", "lanes", "points", "reach", "road", "labels_a_second", "boxes")
-        rows: list[Row] = [["", *(each.name for each in self.sources)]]
-        rows += [[name, *(getattr(each, name) for each in self.sources)] for name in facts]
-        rows += [
-            [f"share of {name}", *(each.shares.get(name, 0.0) for each in self.sources)]
-            for name in dict.fromkeys(name for each in self.sources for name in each.shares)
-        ]
-        return {**tables, "sources": rows}
+        tables = {f"cameras of {source.name}": record_rows(CameraFacts, source.cameras) for source in self.sources}
+        columns = [(source.name, *attrgetter(*_FACTS)(source), *source.shares.values()) for source in self.sources]
+        names = ("", *_FACTS, *map("share of {}".format, _SHARES))
+        return {**tables, "sources": [*zip(names, *columns, strict=True)]}
 
     def to_text(self) -> str:
-        """The tables, and below them what is odd."""
-        lines = [
-            f"{name}\n{columns_text([[_text(cell) for cell in row] for row in rows])}"
-            for name, rows in self.named_tables().items()
-        ]
-        names = [each.name for each in self.sources]
-        if len(names) > 1:
-            head = f"a model that learned on {names[0]} will find odd in {names[1]}:"
-            lines.append("\n".join([head, *(f"- {each}" for each in self.odd or ("nothing of this",))]))
-        return "\n\n".join(lines)
+        """The tables, what was compared, and what is odd."""
+        names = [source.name for source in self.sources]
+        text = CheckReport.to_text(self)  # no `super()`: a dataclass with slots is another class
+        if len(names) == 1:
+            return text
+        odd = "".join(f"\n- {sentence}" for sentence in self.odd or ("nothing of what was compared",))
+        return f"{text}\n\na model that learned on {names[0]} will find odd in {names[1]}:{odd}"
 
 
 def rig_report(*datasets: Dataset) -> RigReport:
-    """The facts of one source or two, of the first vehicle that each has; raises the errors of `Dataset`'s readers."""
+    """The facts of one source or two, of the first vehicle that each has; raises the errors of `Dataset`'s readers.
+
+    Raises:
+        NotAvailableError: a source has no labels.
+    """
     sources = tuple(map(rig_facts, datasets))
-    return RigReport(sources=sources, odd=tuple(_odd(*sources)) if len(sources) == 2 else ())
+    missing = [name for name in _FACTS if None in map(attrgetter(name), sources)]
+    return RigReport(
+        compared={"cameras": len(CAMERAS), "other facts": len(_FACTS) + 1 - len(missing)},
+        cannot_say=(f"{', '.join(missing)}: a source has no files of the LiDAR.",) if missing else (),
+        sources=sources,
+        odd=tuple(_odd(*sources)) if len(sources) == 2 else (),
+    )
 
 
 def rig_facts(dataset: Dataset) -> RigFacts:
-    """The facts of one source."""
+    """The facts of one source; raises NotAvailableError if it has no labels."""
     view, boxes = dataset.columns("sample"), dataset.columns("annotation")
     rows = labelled_rows(dataset)
     apart = np.diff(rows)[np.diff(view["scenario_row"][rows]) == 0]
     tokens = [dataset.sample[row]["token"] for row in rows.tolist()]
+    if not tokens:
+        raise NotAvailableError(f"{dataset.dataroot}: no sample of {VEHICLE_AGENTS[0]} has labels, to compare with")
     there = [token for token in tokens if dataset.sensor_path(token, LIDAR).exists()]
     chosen = spread(there, _SAMPLES)
     clouds = [dataset.load_point_cloud(token, "lidar").xyz for token in chosen]
@@ -147,31 +163,32 @@ def rig_facts(dataset: Dataset) -> RigFacts:
         cameras=tuple(_cameras(dataset, tokens[0])),
         lidar_above=round(float(dataset.ego_from(tokens[0], LIDAR).translation[2]), 2),
         lanes=_lanes(clouds[0]) if clouds else None,
-        points=float(np.median([len(cloud) for cloud in clouds])) if clouds else None,
+        points=round(float(np.median([len(cloud) for cloud in clouds]))) if clouds else None,
         reach=round(float(np.quantile(ranges, 0.99)), 1) if clouds else None,
         road=round(float(np.nanmedian(roads)), 2) if clouds else None,
         labels_a_second=round(1 / (FRAME_PERIOD * float(np.median(apart))), 1) if len(apart) else 0.0,
-        boxes=round(len(codes) / max(len(rows), 1), 1),
-        shares={name: round(share, 4) for name, share in zip((*CATEGORIES, "ignored"), counts.tolist(), strict=True)},
+        boxes=round(len(codes) / len(rows), 1),
+        shares=dict(zip(_SHARES, counts.round(4).tolist(), strict=True)),
     )
 
 
 def _cameras(dataset: Dataset, sample: str) -> Iterator[CameraFacts]:
     """Those of a sample."""
-    axes = {camera: dataset.ego_from(sample, camera) for camera in CAMERAS}
-    looks = {camera: looks_to(pose) for camera, pose in axes.items()}
-    lenses = {camera: dataset.camera(sample, camera) for camera in CAMERAS}
-    half = {camera: math.degrees(math.atan(each.width / 2 / each.intrinsic[0, 0])) for camera, each in lenses.items()}
-    for camera, pose in axes.items():
-        lens = lenses[camera]
-        turn, other = min(((looks[each] - looks[camera]) % 360, each) for each in CAMERAS if each != camera)
+    looks = {camera: looks_to(dataset.ego_from(sample, camera)) for camera in CAMERAS}
+    half = {}
+    for camera in CAMERAS:
+        lens = dataset.camera(sample, camera)
+        half[camera] = math.degrees(math.atan(lens.width / 2 / lens.intrinsic[0, 0]))
+    for camera, angle in looks.items():
+        lens, pose = dataset.camera(sample, camera), dataset.ego_from(sample, camera)
+        turn, other = min(((looks[each] - angle) % 360, each) for each in CAMERAS if each != camera)
         yield CameraFacts(
             camera=camera,
             width=lens.width,
             height=lens.height,
             focal=round(float(lens.intrinsic[0, 0] / lens.width), 3),
             field_of_view=round(2 * half[camera], 1),
-            looks=180.0 if abs(looks[camera]) > 179.95 else round(looks[camera], 1) + 0.0,
+            looks=180.0 if abs(angle) > 179.95 else round(angle, 1) + 0.0,
             pitch=round(math.degrees(math.asin(pose.rotation[2, 2])), 1) + 0.0,  # no -0
             above=round(float(pose.translation[2]), 2),
             overlap=round(half[camera] + half[other] - turn, 1),
@@ -190,9 +207,7 @@ def _odd(first: RigFacts, second: RigFacts) -> Iterator[str]:
     for one, other in zip(first.cameras, second.cameras, strict=True):
         if apart := ", ".join(_apart(one, other)):
             yield f"{one.camera}: {apart}"
-    rise = second.lidar_above - first.lidar_above
-    if abs(rise) >= _RISE:
-        yield f"the LiDAR is {abs(rise):.1f} m {_side(rise)}"
+    yield from _moved("the LiDAR is {:.1f} m {}", _RISE, second.lidar_above - first.lidar_above)
     for name, words in (("lanes", "lanes of the LiDAR"), ("points", "points a cloud"), ("reach", "metres of reach")):
         was, now = getattr(first, name), getattr(second, name)
         if was and now and not 0.8 < now / was < 1.25:
@@ -211,21 +226,16 @@ def _apart(one: CameraFacts, other: CameraFacts) -> Iterator[str]:
     if abs(larger - 1) > _LARGER:
         views = f"its field of view is {other.field_of_view:.0f} degrees, not {one.field_of_view:.0f}"
         yield f"things look {larger:.2g} times as large in it, since {views}"
-    if abs(rise := other.above - one.above) >= _RISE:
-        yield f"it is {abs(rise):.1f} m {_side(rise)}"
-    if abs(turn := other.pitch - one.pitch) >= _TURN:
-        yield f"it looks {abs(turn):.0f} degrees {_side(turn)}"
-    if abs(turn := (other.looks - one.looks + 180) % 360 - 180) >= _TURN:
-        yield f"it is turned by {abs(turn):.0f} degrees to the {'left' if turn > 0 else 'right'}"
+    yield from _moved("it is {:.1f} m {}", _RISE, other.above - one.above)
+    yield from _moved("it looks {:.0f} degrees {}", _TURN, other.pitch - one.pitch)
+    turn = (other.looks - one.looks + 180) % 360 - 180
+    yield from _moved("it is turned by {:.0f} degrees to the {}", _TURN, turn, ("left", "right"))
     shape, wanted = other.width / other.height, one.width / one.height
     if abs(shape / wanted - 1) > _LARGER:
         yield f"its images are {shape:.2f} times as wide as high, not {wanted:.2f}"
 
 
-def _side(rise: float) -> str:
-    return "higher" if rise > 0 else "lower"
-
-
-def _text(cell: Any) -> str:
-    """A cell of a printed table."""
-    return "" if cell is None else f"{cell:,g}" if isinstance(cell, float) else str(cell)
+def _moved(sentence: str, least: float, change: float, sides: tuple[str, str] = ("higher", "lower")) -> Iterator[str]:
+    """Yield a sentence on a change of metres or degrees, with its size and side, unless it is too small to matter."""
+    if abs(change) >= least:
+        yield sentence.format(abs(change), sides[change < 0])

@@ -13,7 +13,7 @@ import numpy as np
 from deepaccident_devkit._version import __version__
 from deepaccident_devkit.accidents.recorded import each_scenario, those_of
 from deepaccident_devkit.dataset import Dataset, RowArgument
-from deepaccident_devkit.reports import Report
+from deepaccident_devkit.reports import CheckReport
 from deepaccident_devkit.statistics.real_facts import FACTS, Fact, Verdict
 from deepaccident_devkit.statistics.scenario_facts import ScenarioFacts, scenario_facts
 from deepaccident_devkit.support.arrays import FloatArray
@@ -34,7 +34,7 @@ _BROKEN: Final[Mapping[str, str]] = {"fields": "expected 13 fields", "gapless": 
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ReleaseFacts(Report):
+class ReleaseFacts(CheckReport):
     """All facts of a release. Nothing in it names a path, or whose release it is.
 
     Attributes:
@@ -96,12 +96,14 @@ def release_facts(
         name: sum((Counter(each.counts.get(name)) for each in found), Counter[str]())
         for name in dict.fromkeys(name for each in found for name in each.counts)
     }
+    facts = tuple(_compared(fact, parts[fact.key]) for fact in FACTS)
     return ReleaseFacts(
+        compared={f"of {len(facts)} facts": sum(fact.verdict != "cannot say" for fact in facts)},
         devkit=__version__,
         version=dataset.version,
         scenarios=len(found),
         left_out=len(broken),
-        facts=tuple(_compared(fact, parts[fact.key]) for fact in FACTS),
+        facts=facts,
         counts={name: dict(words.most_common(_SHOWN)) for name, words in counts.items()},
     )
 

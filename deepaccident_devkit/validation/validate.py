@@ -27,7 +27,7 @@ from deepaccident_devkit.release.store import (
     checksums_compared,
     places_of,
 )
-from deepaccident_devkit.reports import Report
+from deepaccident_devkit.reports import CheckReport, Report
 from deepaccident_devkit.support.files import writable_folder
 from deepaccident_devkit.support.json_text import as_record
 from deepaccident_devkit.support.reading import LIMITS_VARIABLE
@@ -62,6 +62,8 @@ _LINES_A_SCENARIO = 8
 _ALL_LISTED = "(--all lists all)"
 _UNFINISHED = "*.zip.[cdp]*[dlt]"
 """Names while a download is running: with `.part`, `.partial`, `.download` or `.crdownload` at their end."""
+_READ = ("calib", "label", "meta")
+"""Kinds of files that are always read."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -102,7 +104,7 @@ def check_key(scenario: ScenarioFolder, *, deep: bool) -> str:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ValidationReport(Report):
+class ValidationReport(CheckReport):
     """What was found in a release.
 
     Attributes:
@@ -179,11 +181,11 @@ class ValidationReport(Report):
     def _closing(self, *, notes: bool) -> Iterator[str]:
         by_code = Counter((finding.severity, finding.code, finding.known) for finding in self.findings)
         if by_code:
-            rank = {severity: place for place, severity in enumerate(SEVERITIES)}
-            rows = sorted(by_code.items(), key=lambda item: (rank[item[0][0]], -item[1], item[0][1]))
             lines = (
                 f"{code:<24} {severity:<8} {count:>8}{'  known of the release' if known else ''}"
-                for (severity, code, known), count in rows
+                for severity in SEVERITIES
+                for (grade, code, known), count in sorted(by_code.items(), key=lambda item: (-item[1], item[0][1]))
+                if grade == severity
             )
             yield "\n".join([f"{'kind':<24} {'how bad':<8} {'findings':>8}", *lines])
         if self.velocity.boxes:
@@ -198,6 +200,7 @@ class ValidationReport(Report):
                 f"  scenarios: {scenarios}; of {self.velocity.boxes:,} moving boxes fit: {shares}"
             )
         yield f"files: {self.files.section()}"
+        yield self.basis_text()
         hidden = self.counts["note"] and not notes
         verdict = ", ".join(counted(self.counts[severity], severity) for severity in SEVERITIES)
         yield verdict + (" (--all lists the notes)" if hidden else "")
@@ -205,15 +208,12 @@ class ValidationReport(Report):
 
 def worst_first(findings: Sequence[Finding]) -> list[Finding]:
     """Findings grouped by scenario: the one with the most errors first, then warnings; worst first within."""
-    rank = {severity: place for place, severity in enumerate(SEVERITIES)}
-    counts: dict[str | None, Counter[str]] = {}
-    for finding in findings:
-        counts.setdefault(finding.scenario, Counter())[finding.severity] += 1
+    counts = Counter((finding.scenario, finding.severity) for finding in findings)
 
     def place(finding: Finding) -> tuple[object, ...]:
-        of_scenario = counts[finding.scenario]
-        badness = [-of_scenario[severity] for severity in SEVERITIES]
-        return (finding.scenario is not None, *badness, finding.scenario or "", rank[finding.severity])
+        badness = [-counts[finding.scenario, severity] for severity in SEVERITIES]
+        rank = SEVERITIES.index(finding.severity)
+        return (finding.scenario is not None, badness, finding.scenario or "", rank)
 
     return sorted(findings, key=place)
 
@@ -314,7 +314,11 @@ def _report(
     files = completeness(readable, counts, str(root), selected=scenarios is not None)
     for sentence in files.unreadable_archives:
         of_release.append(finding_of(ReleaseError(sentence), "archive-unreadable", None))
+    here = Counter[str]()
+    for file in (file for check in checks for file in check.files if deep or file.channel in _READ):
+        here[f"{file.channel} files"] += file.expected - file.missing
     return ValidationReport(
+        compared=dict(here),
         dataroot=str(root),
         version=layout.version,
         deep=deep,

@@ -9,7 +9,7 @@ from refusals import assert_refused
 from report_page import Page
 
 from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.reports import Report, Row, Table, table_html
+from deepaccident_devkit.reports import CheckReport, Report, Row, Table, table_html
 
 HOSTILE = "<script>alert('1')</script>"
 
@@ -33,6 +33,25 @@ def test_all_forms_have_the_same_numbers(tmp_path: Path) -> None:
     page = Page(report.to_html())
     assert [len(page.all(tag)) for tag in ("table", "tr", "script")] == [2, 4, 0]
     assert HOSTILE in page.text
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Checked(CheckReport):
+    """Whether speeds are right."""
+
+    is_right: bool = True
+
+    @property
+    def is_good(self) -> bool:
+        return self.is_right
+
+
+def test_checks_say_what_they_compared() -> None:
+    for compared, is_right, status in (({"speeds": 1200, "names": 0}, True, 0), ({}, True, 2), ({"a": 0}, False, 1)):
+        report = Checked(compared=compared, is_right=is_right, cannot_say=("no name.",))
+        assert (report.exit_status, json.loads(report.to_json())["compared"]) == (status, compared)
+        assert report.to_text().endswith("\nCannot say: no name.")
+    assert "Compared: 3 speeds, 0 names." in Checked(compared={"speeds": 3, "names": 0}).to_text()
 
 
 def test_a_file_is_no_folder(tmp_path: Path) -> None:

@@ -3,6 +3,8 @@
 import json
 import math
 from collections.abc import Callable, Iterator
+from datetime import datetime, timezone
+from itertools import count, cycle
 from pathlib import Path
 from typing import Any
 
@@ -171,7 +173,8 @@ def tables(root: str) -> Any:
 
 def test_a_right_reader_is_not_blamed() -> None:
     report = audit_reader(lambda root: [*decoded(root)])
-    assert report.findings == ()
+    assert (report.findings, report.exit_status, report.compared["keys by their names"]) == ((), 0, 5)
+    assert report.to_text().startswith("Nothing was found.\n\nCompared: 5 keys by their names, 0 pictures.")
     found = holds(report)
     assert [found[f"*/boxes/*/*[{place}]"] for place in range(7)] == [
         f"column {2 + place} of the labels" for place in range(7)
@@ -218,20 +221,110 @@ def test_what_was_written_of_the_release(tmp_path: Path) -> None:
     )
     assert misread(audit_reader(out)) == {"boxes/*/ttc": "column 12 of the labels"}
     (out / "boxes.json").write_text("{")
-    with pytest.raises(ConfigError, match=r"out: a JSON file is no JSON"):
+    with pytest.raises(ConfigError, match=r"boxes\.json: is no JSON"):
         audit_reader(out)
 
 
-def test_nothing_that_is_known() -> None:
-    mixed = {"ttc": [None, math.inf, "x"], "image": None, "photo": "none.jpg", "deep": [[[]]], 1: {2: 3}}
-    for output in (None, [], "text", mixed):
-        report = audit_reader(lambda _, output=output: output)
-        assert (report.findings, report.notes) == ((), ("No key holds numbers of the release.",))
+@pytest.mark.parametrize(
+    ("output", "unread"),
+    [
+        (None, "NoneType"),
+        ([], ""),
+        ("text", "str"),
+        (b"\x80\xff", "bytes"),
+        (print, "function"),
+        ({"ttc": [None, math.inf, "x"], "image": None, "photo": "none.jpg", "deep": [[[]]], 1: {2: 3}}, ""),
+        ([{"when": datetime.now(timezone.utc)}], "datetime"),
+        ({"cloud": np.zeros((9000, 4))}, "ndarray"),
+    ],
+)
+def test_nothing_that_is_known_is_no_verdict(output: object, unread: str) -> None:
+    report = audit_reader(lambda _: output)
+    assert (report.findings, report.exit_status, any(report.compared.values())) == ((), 2, False)
+    assert "Nothing was found" not in report.to_text()
+    assert "Cannot say: no key holds numbers" in report.to_text()
+    assert unread in report.cannot_say[-1]
+
+
+def test_scaled_numbers_and_names_that_say_nothing_are_no_verdict() -> None:
+    report = audit_reader(of_rows(lambda row: {"ttc": float(row[11]) / 10, "length": float(row[5]) * 100}))
+    assert report.exit_status == 2
+    assert "objects/*/ttc" in report.cannot_say[1]
+    report = audit_reader(lambda root: [[float(row[11]), float(row[4])] for row in rows(root)])
+    assert (report.exit_status, len(holds(report))) == (2, 2)
+    partly = audit_reader(of_rows(lambda row: {"ttc": float(row[11]) / 10, "x": float(row[1])}))
+    assert (partly.exit_status, partly.compared["keys by their names"]) == (0, 1)
+    assert "objects/*/ttc" in partly.cannot_say[0]
+
+
+@pytest.mark.parametrize(
+    ("names", "wrong"),
+    [
+        ({"x": "y", "y": "x"}, ["objects/*/x", "objects/*/y"]),
+        ({"x": "z", "z": "x"}, ["objects/*/x", "objects/*/z"]),
+        ({"z": "y"}, ["objects/*/z"]),
+        ({"center": "yxz"}, ["objects/*/center/*[0]", "objects/*/center/*[1]"]),
+        ({"position_xy": "yx"}, ["objects/*/position_xy/*[0]", "objects/*/position_xy/*[1]"]),
+        ({"pos_x": "x", "posY": "z"}, ["objects/*/posY"]),
+        ({"center": "xyz", "center_yx": "yx", "cz": "z", "pos_y": "y"}, []),
+    ],
+)
+def test_axes_that_are_exchanged(names: dict[str, str], wrong: list[str]) -> None:
+    def read(row: Row) -> dict[str, Any]:
+        made = {name: [float(row["xyz".index(axis) + 1]) for axis in axes] for name, axes in names.items()}
+        return {name: values if values[1:] else values[0] for name, values in made.items()}
+
+    report = audit_reader(of_rows(read))
+    assert list(misread(report)) == wrong
+    assert all("nuScenes" in finding.remedy for finding in report.findings)
+    assert report.exit_status == (1 if wrong else 0)
+
+
+def test_rows_in_place_of_columns() -> None:
+    for order, wrong in (([1, 2, 3], 0), ([2, 1, 3], 2)):
+        columns = audit_reader(lambda root, order=order: {"pos": np.array(rows(root))[:, order].astype(float)})
+        assert len(columns.findings) == wrong
+        turned = audit_reader(lambda root, order=order: {"pos": np.array(rows(root))[:, order].astype(float).T})
+        assert (len(turned.findings), turned.compared["keys by their names"]) == (wrong, 3)
+
+
+def test_extents_along_other_axes() -> None:
+    report = audit_reader(of_rows(lambda row: dict(zip(("dy", "dx", "size_z"), map(float, row[4:7]), strict=True))))
+    assert list(misread(report)) == ["objects/*/dy", "objects/*/dx"]
+
+
+def test_what_has_no_end_is_cut(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("deepaccident_devkit.audit.reader.MOST_VALUES", 5000)
+    report = audit_reader(lambda root: cycle([{"ttc": float(row[11])} for row in rows(root)]))
+    assert (list(misread(report)), report.cannot_say) == (
+        ["*/ttc"],
+        ("not looked into: values after the first 5,000.",),
+    )
+    large = np.zeros((1000, 1000, 3), np.uint8)
+    report = audit_reader(lambda _: ({"image": large} for _ in count()))
+    assert (report.findings, report.exit_status, "values after" in report.cannot_say[1]) == ((), 2, True)
+
+
+def test_right_pictures_do_not_speak_for_numbers() -> None:
+    picture = {"image": np.zeros((90, 160, 3), np.uint8)}
+    report = audit_reader(lambda _: picture)
+    assert (report.exit_status, report.compared["pictures"]) == (0, 1)
+    assert audit_reader(lambda root: [picture, {"ttc": [float(row[11]) / 10 for row in rows(root)]}]).exit_status == 2
+    assert audit_reader(lambda _: [picture, object()]).exit_status == 2
+
+
+def test_files_of_other_formats_are_named_and_not_opened(tmp_path: Path) -> None:
+    (tmp_path / "evil.pkl").write_bytes(b"cos\nsystem\n(S'touch evil'\ntR.")
+    (tmp_path / "boxes.npz").write_bytes(b"PK")
+    report = audit_reader(tmp_path)
+    assert (report.exit_status, report.cannot_say[1]) == (2, "not looked into: boxes.npz, evil.pkl.")
+    assert audit_reader(tmp_path / "nowhere").exit_status == 2
 
 
 def test_errors_of_a_reader_are_its_own() -> None:
-    with pytest.raises(ZeroDivisionError):
-        audit_reader(lambda _: 1 / 0)
+    for reader in (lambda _: 1 / 0, lambda _: (1 / number for number in (1, 0))):
+        with pytest.raises(ZeroDivisionError):
+            audit_reader(reader)
 
 
 @pytest.mark.parametrize(

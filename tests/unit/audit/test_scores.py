@@ -96,9 +96,8 @@ def test_the_length_of_clips_is_told(release: DeepAccident, of: Any, score: Made
             of_samples,
             lambda each, rng: (each["collision"] is not None) * frame_of(each) / each["num_frames"] + rng.random() / 9,
         ),
-        (of_scenarios, lambda _each, _rng: 0.5),
     ],
-    ids=["random", "random samples", "truth", "truth with noise", "truth of samples", "rising", "constant"],
+    ids=["random", "random samples", "truth", "truth with noise", "truth of samples", "rising"],
 )
 def test_other_scores_are_not_told(release: DeepAccident, of: Any, score: Made) -> None:
     assert kinds(audit_scores(release, of(release, score))) == []
@@ -164,8 +163,67 @@ def test_a_split_and_the_same_numbers_again(release: DeepAccident, tmp_path: Pat
 def test_few_scenarios_give_no_verdict(release: DeepAccident) -> None:
     scores = of_scenarios(release, lambda each, _rng: -each["num_frames"])
     report = audit_scores(release, {token: scores[token] for token in scores if int(token[-5:]) < 3})
-    assert kinds(report) == []
+    assert (kinds(report), report.exit_status) == ([], 2)
     assert row_of(report, "length")[2:4] == [-1, 1]
+    assert "fewer than 6" in report.cannot_say[0]
+    assert "Nothing was found" not in report.to_text()
+
+
+def test_equal_scores_give_no_verdict(release: DeepAccident) -> None:
+    assert audit_scores(release, of_scenarios(release, lambda _each, _rng: 0.5)).exit_status == 2
+
+
+def test_what_cannot_be_told_apart_from_the_truth_is_said(release: DeepAccident) -> None:
+    """Each folder's word is right here."""
+    for score in (lambda each, _rng: each["designed_accident"], lambda _each, rng: rng.random()):
+        report = audit_scores(release, of_scenarios(release, score))
+        assert (kinds(report), report.exit_status) == ([], 0)
+        assert report.cannot_say[0].startswith("folder, weather, actors, frame: ")
+        assert "cannot be told apart from the truth here" in report.cannot_say[0]
+
+
+ODD = 3
+
+
+@pytest.fixture(scope="module")
+def odd_release(tmp_path_factory: pytest.TempPathFactory) -> DeepAccident:
+    """As in val, some scenarios end otherwise than their folder says: two without a collision, and one with."""
+    root = tmp_path_factory.mktemp("odd") / "release"
+    for number in range(PAIRS):
+        for kind, meta in (("accident", SILENT if number < 2 else META), ("normal", META if number == 2 else SILENT)):
+            write_tiny_release(
+                root,
+                frames=4,
+                agents=("ego_vehicle",),
+                scenario_type=f"type1_subtype1_{kind}",
+                name=f"Town03_type001_subtype0001_scenario{number:05d}",
+                meta=meta,
+            )
+    return DeepAccident(dataroot=root, verbose=False)
+
+
+@pytest.mark.parametrize(
+    ("score", "found"),
+    [
+        (lambda each, _rng: each["designed_accident"], ["folder"]),
+        (lambda each, _rng: -5.0 * each["designed_accident"], ["folder"]),
+        (lambda each, rng: each["designed_accident"] + 0.3 * rng.random(), ["folder"]),
+        (lambda each, rng: np.exp(each["designed_accident"] + 0.3 * rng.random()), ["folder"]),
+        (lambda each, _rng: each["collision"] is not None, []),
+        (lambda each, rng: (each["collision"] is not None) + 0.3 * rng.random(), []),
+        (lambda _each, rng: rng.random(), []),
+    ],
+)
+def test_the_folders_word_is_told_from_the_truth(odd_release: DeepAccident, score: Made, found: list[str]) -> None:
+    report = audit_scores(odd_release, of_scenarios(odd_release, score))
+    assert (kinds(report), report.exit_status) == (found, len(found))
+    assert "folder" not in report.cannot_say[0]
+
+
+def test_one_odd_scenario_does_not_tell(odd_release: DeepAccident) -> None:
+    scores = of_scenarios(odd_release, lambda each, _rng: each["designed_accident"])
+    report = audit_scores(odd_release, {token: scores[token] for token in scores if int(token[-5:]) >= ODD - 1})
+    assert (kinds(report), "folder" in report.cannot_say[0]) == ([], True)
 
 
 def test_refused(release: DeepAccident) -> None:
@@ -182,9 +240,22 @@ def test_files_of_scores(release: DeepAccident, tmp_path: Path) -> None:
     path = tmp_path / "scores.csv"
     path.write_text(f'token,score\n"{sample}",0.5\n\n{other}, 2e-1\n')
     assert read_scores(path) == {sample: 0.5, other: 0.2}
+    for number, lines in enumerate(
+        (
+            f",token,score\n0,{sample},0.5\n1,{other},2e-1\n",
+            f"0;{sample};0,5\r\n1;{other};0,2\r\n",
+            f"token\tscore\n{sample}\t0.5\n{other}\t.2",
+            f"| {sample} | 0.5 \n| {other} | 0.2",
+            f'\ufeff"0","{sample}","0.5"\n"1","{other}","0.2"\n',
+        )
+    ):
+        path = tmp_path / f"scores{number}.{('csv', 'tsv', 'TXT')[number % 3]}"
+        path.write_text(lines, encoding="utf-8", newline="")
+        assert read_scores(path) == {sample: 0.5, other: 0.2}, lines
     path = tmp_path / "scores.json"
-    path.write_text(json.dumps({sample: 1, other: 0.25}))
-    assert read_scores(path) == {sample: 1, other: 0.25}
+    for scores in ({sample: 1, other: 0.25}, [{"token": sample, "score": 1, "id": 3}, {"token": other, "score": 0.25}]):
+        path.write_text(json.dumps(scores))
+        assert read_scores(path) == {sample: 1, other: 0.25}
     accidents = [Accident(positions=np.zeros((2, 2)), time=1.0, score=score) for score in (0.3, 0.7)]
     with ResultsWriter(tmp_path / "results.json", "accident") as writer:
         writer.add(sample, accidents)
@@ -198,8 +269,15 @@ def test_files_of_scores(release: DeepAccident, tmp_path: Path) -> None:
         ("no.json", None, "cannot be read"),
         ("folder", None, "not a regular file"),
         ("odd.csv", f"{sample},much", "expected a score, found .*: None"),
+        ("odd.csv", f"score,token\n0.5,{sample}", "line 2: expected a token and then its score"),
+        ("odd.csv", f"{sample} 0.5", "line 1: .*a comma, a semicolon, a tab or a bar"),
+        ("odd.csv", f"{sample},0.5,1", "expected a score, found .*: None"),
+        ("odd.csv", "\x00".join(sample), "line 1: "),
+        ("odd.json", '[{"token": "a/b"}]', "expected an object of token and score"),
+        ("odd.json", "null", "expected an object of token and score"),
+        ("odd.json", f'{{"{sample}": 1{400 * "0"}}}', "expected a score, found"),
         ("odd.csv", f"{sample},nan", "expected a score, found .*: nan"),
-        ("odd.json", "[1, 2]", "give results of the task accident"),
+        ("odd.json", "[1, 2]", "expected an object of token and score"),
         ("odd.json", f'{{"{sample}": true}}', "expected a score, found .*: True"),
         ("odd.json", "{", "is no JSON"),
     ):

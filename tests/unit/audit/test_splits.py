@@ -123,6 +123,13 @@ def test_files_that_are_no_splits(sides: Sides, tmp_path: Path) -> None:
         audit_splits([tmp_path / "train.txt", tmp_path / "odd.txt"])
 
 
+def test_an_empty_side_is_compared_with_nothing(sides: Sides) -> None:
+    report = sides(train=[""], val=[TOKENS[0], TOKENS[1]])
+    assert (report.findings, report.exit_status, report.compared) == ((), 2, {"sides": 0})
+    assert "Nothing was found" not in report.to_text()
+    assert sides(train=[TOKENS[2]], test=[""], val=[TOKENS[0]]).compared == {"sides": 2}
+
+
 def test_hostile_lines_end_soon(sides: Sides) -> None:
     assert numbers(sides(train=[f"{ACCIDENT}/" * 20_000 + TOKENS[0]], val=["_" * 100_000 + TOKENS[1]])) == {}
 

@@ -53,8 +53,8 @@ from deepaccident_devkit.export.parquet import Parquet
 from deepaccident_devkit.export.questions import Questions
 from deepaccident_devkit.export.released_infos import ReleasedInfos
 from deepaccident_devkit.export.webdataset import WebDataset
-from deepaccident_devkit.release import find_release
 from deepaccident_devkit.parallel import Store
+from deepaccident_devkit.release import find_release
 from deepaccident_devkit.release.fingerprints import fingerprint, scenario_hashes
 from deepaccident_devkit.support.files import temporary_of, temporary_path
 from deepaccident_devkit.tables import current_index

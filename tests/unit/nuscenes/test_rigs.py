@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.errors import ConfigError
+from deepaccident_devkit.errors import ConfigError, NotAvailableError
 from deepaccident_devkit.nuscenes.check import look_at
 from deepaccident_devkit.nuscenes.rig_figures import rigs_figure
 from deepaccident_devkit.nuscenes.rigs import RigReport, rig_report
 from deepaccident_devkit.synth import SynthConfig, make_release
 from deepaccident_devkit.taxonomy import CAMERAS
+from deepaccident_devkit.testing import SmallRelease, write_small_release
 
 SMALL = {"scenarios": 2, "frames": 3, "image_size": (64, 36), "seed": 3, "unplanned": 0, "designed": True}
 
@@ -51,7 +52,8 @@ def test_what_is_odd_is_said_and_nothing_else(report: RigReport, sources: tuple[
     assert "lanes" not in "".join(report.odd)
     same = rig_report(sources[0], sources[0])
     assert same.odd == ()
-    assert "- nothing of this" in same.to_text()
+    assert "- nothing of what was compared" in same.to_text()
+    assert (report.compared, report.exit_status, report.cannot_say) == ({"cameras": 6, "other facts": 8}, 0, ())
     assert "find odd" not in rig_report(sources[0]).to_text()
 
 
@@ -59,6 +61,15 @@ def test_without_files_of_sensors_their_facts_are_unknown(da_b: DeepAccident) ->
     [facts] = rig_report(da_b).sources
     assert (facts.lanes, facts.points, facts.reach, facts.road) == (None,) * 4
     assert len(facts.cameras) == 6
+    report = rig_report(da_b, da_b)
+    assert (report.compared, report.exit_status) == ({"cameras": 6, "other facts": 4}, 0)
+    assert "Cannot say: lanes, points, reach, road: " in report.to_text()
+
+
+def test_without_labels_nothing_is_compared(tmp_path: Path) -> None:
+    root = write_small_release(tmp_path / "release", SmallRelease(splits=("test",), channels=()))
+    with pytest.raises(NotAvailableError, match=r"release: no sample of ego_vehicle has labels"):
+        rig_report(DeepAccident(dataroot=root, verbose=False))
 
 
 def test_the_picture_has_a_panel_for_each_and_the_classes(report: RigReport) -> None:

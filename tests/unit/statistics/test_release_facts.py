@@ -199,6 +199,16 @@ def test_rows_say_share_interval_and_verdict(many: Path) -> None:
     }
 
 
+def test_where_no_fact_can_be_compared_that_is_said(tmp_path: Path) -> None:
+    write_tiny_release(tmp_path, frames=3)
+    known = CliRunner().invoke(deepaccident, ["info", str(tmp_path), "--facts"], catch_exceptions=False)
+    none = CliRunner().invoke(deepaccident, ["info", str(tmp_path), "--facts", "--where", "collision=false"])
+    assert (known.exit_code, none.exit_code) == (0, 2)
+    assert f"Compared: 0 of {len(FACTS)} facts." in none.output
+    report = release_facts(DeepAccident(dataroot=tmp_path, verbose=False))
+    assert report.compared == {f"of {len(FACTS)} facts": sum(row.verdict != "cannot say" for row in report.facts)}
+
+
 def test_text_and_json_name_nobody_and_tell_what_is_left_out(tmp_path: Path) -> None:
     root = tmp_path / "Jane Doe's"
     for number, kinds in enumerate(({}, {}, {}, {"meta": None}, {"labelled": False})):

@@ -229,6 +229,11 @@ def test_opening_again_reads_no_label(root: Path, monkeypatch: pytest.MonkeyPatc
     assert opened(root).arrow("track").equals(first.arrow("track"))
 
 
+def test_a_check_says_what_it_compared(root: Path) -> None:
+    whole = CliRunner().invoke(deepaccident, ["index", str(root), "--check"])
+    assert (whole.exit_code, "label, calib and meta files of 2 scenarios\n" in whole.stdout) == (0, True)
+
+
 def test_a_refresh_reads_just_what_was_edited_added_or_removed(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     read: list[str] = []
     original = indexing.read_scenario

@@ -314,6 +314,19 @@ def test_at_the_impact_another_car_may_fill_the_view(
     assert ("image-out-of-sequence" in codes(validate_release(tmp_path, deep=True, scenarios=[token]))) is is_told
 
 
+def test_what_was_compared_is_said(own_release: Path) -> None:
+    report = validate_release(own_release)
+    assert (list(report.compared), report.exit_status) == (["calib files", "label files", "meta files"], 0)
+    assert f"Compared: {report.compared['calib files']:,} calib files, " in report.to_text()
+    assert json.loads(report.to_json())["compared"] == report.compared
+    for folder in own_release.glob("**/label"):
+        shutil.rmtree(folder)
+    report = validate_release(own_release, deep=True)
+    assert (report.is_good, report.exit_status) == (True, 0)
+    assert (report.compared["label files"], report.compared["Camera_Front files"]) == (0, 0)
+    assert " 0 label files, " in report.to_text()
+
+
 def test_json_has_everything_and_exit_status_tells(own_release: Path) -> None:
     def run(*words: str, status: int) -> str:
         return called("validate", own_release, *words, status=status).stdout
