@@ -100,9 +100,11 @@ def _alarms(truth: BoxTruth | None, source: np.random.Generator) -> list[Acciden
     return [found] if source.uniform() < 0.8 else []
 
 
-def stored_run(dataset: DeepAccident, setup: EvaluationSetup, path: Path) -> tuple[EvaluationRun, Results]:
-    """The same predictions, written as results and evaluated from there."""
-    selection = default_selection(setup, "train")
+def stored_run(
+    dataset: DeepAccident, setup: EvaluationSetup, path: Path, selection: SampleSelection | None = None
+) -> tuple[EvaluationRun, Results]:
+    """The same predictions, written as results and evaluated from there; by default of the split train."""
+    selection = selection or default_selection(setup, "train")
     kind: ResultsTask = "accident" if setup.task == "warning" else setup.task
     grid = MotionLabelConfig().grid if kind == "motion" else None
     with ResultsWriter(path, kind, meta=META, grid=grid) as writer:

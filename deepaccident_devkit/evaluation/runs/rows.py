@@ -23,7 +23,7 @@ Cells = Iterator[tuple[str, Any]]
 
 
 def sample_rows(run: EvaluationRun) -> list[Row]:
-    """One row a sample, by token: names → texts, numbers, or None where there is nothing to tell.
+    """List one row a sample, by token, all with the same columns: texts, numbers, or None where there is none.
 
     The first columns say which sample: token, scenario, agent, frame (from 1), time_to_impact (seconds to the recorded
     impact), accident_visibility. The others are what the sample alone has as result:
@@ -36,11 +36,12 @@ def sample_rows(run: EvaluationRun) -> list[Row]:
     - planning, forecasting: the headline numbers.
     """
     counts, cells = run.evaluator.counts, _CELLS[run.setup.task]
-    rows = (
+    rows = [
         _which(run, token) | dict(cells(run.evaluator.compute([token]), counts[token], run.setup.rules))
         for token in sorted(run.evaluator.tokens)
-    )
-    return [{name: plain(value) for name, value in row.items()} for row in rows]
+    ]
+    columns = dict.fromkeys(name for row in rows for name in row)  # a table of means has only what a sample counts in
+    return [{name: plain(row.get(name)) for name in columns} for row in rows]
 
 
 def _which(run: EvaluationRun, token: str) -> Row:
@@ -115,18 +116,18 @@ _VALUE_BYTES: Final = 32
 
 
 def write_rows(path: Path, rows: Sequence[Mapping[str, Any]], stamp: Mapping[str, Any]) -> None:
-    """Write rows (texts, numbers, booleans or None, of one kind in a column), with a stamp for the metadata.
-
-    Columns are those of any row, in the order met, null where a row has none.
-    """
-    import pyarrow as pa
+    """Write rows as a Parquet file, with a stamp in its metadata."""
     from pyarrow import parquet
 
-    names = list(dict.fromkeys(name for row in rows for name in row))
-    columns = {name: [row.get(name) for row in rows] for name in names}
-    arrays = [_column(values) for values in columns.values()]
-    table = pa.Table.from_arrays(arrays, names=names).replace_schema_metadata({STAMP_KEY: json.dumps(dict(stamp))})
-    parquet.write_table(table, path)
+    parquet.write_table(rows_table(rows).replace_schema_metadata({STAMP_KEY: json.dumps(dict(stamp))}), path)
+
+
+def rows_table(rows: Sequence[Mapping[str, Any]]) -> Any:
+    """Make the Arrow table of rows with the same columns: texts, numbers, booleans or None, of one kind in a column."""
+    import pyarrow as pa
+
+    names = list(rows[0]) if rows else []
+    return pa.Table.from_arrays([_column([row[name] for row in rows]) for name in names], names=names)
 
 
 def read_rows(path: Path) -> tuple[list[dict[str, Any]], dict[str, Any]]:

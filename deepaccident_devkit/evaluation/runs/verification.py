@@ -27,7 +27,7 @@ from deepaccident_devkit.evaluation.runs.bundles import (
 )
 from deepaccident_devkit.evaluation.runs.evaluation_run import EvaluationRun, evaluate_results
 from deepaccident_devkit.evaluation.runs.further import further_names, with_further
-from deepaccident_devkit.evaluation.runs.rows import sample_rows
+from deepaccident_devkit.evaluation.runs.rows import rows_table, sample_rows
 from deepaccident_devkit.release.fingerprints import ScenarioHashes, fingerprint
 from deepaccident_devkit.reports import Report, Row, record_rows
 from deepaccident_devkit.support.arrays import ShortRepr
@@ -242,7 +242,7 @@ def _differences(bundle: Bundle, run: EvaluationRun) -> Iterator[Difference]:
         summary["release"]["fingerprint"] = fingerprint(truth)
     for where, stored, found in differing(bundle.summary, summary, without=(*_NOT_COMPARED, *elsewhere)):
         yield Difference(where=f"{SUMMARY_FILE}: {where}", stored=stored, found=found)
-    rows = {row["token"]: row for row in sample_rows(run)}
+    rows = {row["token"]: row for row in rows_table(sample_rows(run)).to_pylist()}  # as a file would have them
     yield from _compared(SCENARIOS_FILE, bundle.scenarios, lambda _: truth)
     yield from _compared(COUNTS_FILE, bundle.counts, lambda _: dict(run.evaluator.counts))
     yield from _compared(ROWS_FILE, bundle.rows, lambda _: rows)

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from evaluation_runs import stored_run
 from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
@@ -21,12 +22,14 @@ from deepaccident_devkit.evaluation.runs import (
     SampleSelection,
     Verification,
     compare_bundles,
+    default_selection,
     evaluate_results,
     save_run,
     summary_text,
     verify_bundle,
 )
 from deepaccident_devkit.evaluation.runs.rows import read_rows, write_rows
+from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup, TaskName
 from deepaccident_devkit.evaluation.runs.verification import ABSENT, Difference, differing
 from deepaccident_devkit.support.reading import file_checksum
 
@@ -60,6 +63,31 @@ def test_nothing_differs(bundle: Path, da_b: DeepAccident) -> None:
     assert (verification.is_same, verification.samples, verification.notes) == (True, 6, ())
     assert verification.to_text() == f"{bundle}: the same; 6 samples evaluated again, all numbers are equal"
     assert verification.to_dict()["same"] is True
+
+
+@pytest.mark.parametrize(
+    ("task", "protocol"),
+    [
+        ("motion", "paper"),
+        ("accident", "boxes"),
+        ("detection", "opencood"),
+        ("warning", "clean"),
+        ("warning", "field"),
+        ("planning", "clean"),
+        ("planning", "uniad"),
+        ("forecasting", "clean"),
+    ],
+)
+def test_nothing_differs_whatever_the_task(da_b: DeepAccident, tmp_path: Path, task: TaskName, protocol: str) -> None:
+    """With groups, another horizon, and numbers that only some samples have."""
+    setup = EvaluationSetup(task=task, protocol=protocol, horizon=0.5)
+    selection = default_selection(setup, "val", agents=("ego_vehicle",), scope="all")
+    run, results = stored_run(da_b, setup, tmp_path / "results", selection)
+    bundle = save_run(run.broken_down(("all", "agent"), Resampling(resamples=10)), tmp_path / "bundle")
+    verification = verify(bundle, da_b, results=results)
+    assert (verification.is_same, verification.differences) == (True, ())
+    rows, _ = read_rows(bundle / "samples.parquet")
+    assert len({tuple(row) for row in rows}) == 1
 
 
 def test_with_results_inside_and_elsewhere(run: EvaluationRun, tmp_path: Path, own_release: Path) -> None:
