@@ -229,8 +229,11 @@ class Evaluator(ABC, Generic[Result]):
             raise EvaluationError(f"{source}: was saved by {maker}, this is {self.maker}; begin again")
         if settings != self.settings:
             raise EvaluationError(f"{source}: was saved with other settings ({settings}); begin again, or use those")
-        for token, each in counts.items():
-            self.add(token, each)
+        try:
+            for token, each in counts.items():
+                self.add(token, each)
+        except EvaluationError as error:
+            raise EvaluationError(f"{source}: {error}") from error
         self.repeated |= repeated
         return self
 

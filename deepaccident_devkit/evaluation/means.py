@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
@@ -11,6 +12,7 @@ from typing import Any, ClassVar, Final, Generic, Literal, NamedTuple, TypeVar
 
 import numpy as np
 
+from deepaccident_devkit.errors import EvaluationError
 from deepaccident_devkit.evaluation.evaluator import Counts, Evaluator, ratio
 from deepaccident_devkit.evaluation.task import (
     HEADLINE_UNITS,
@@ -22,7 +24,7 @@ from deepaccident_devkit.evaluation.task import (
     protocol_of,
 )
 from deepaccident_devkit.support.arrays import BoolArray, FloatArray, IntArray
-from deepaccident_devkit.support.text import natural_order
+from deepaccident_devkit.support.text import counted, natural_order
 
 MEAN_OF_SCENARIOS: Final = "mean of scenarios"
 """The row with the mean of the scenarios' own means of the main row, for evaluators that ask for it."""
@@ -108,9 +110,10 @@ class Sums:
             path = "/".join((table, *name))
             self._numbers[path] = self._numbers.get(path, 0.0) + number
 
-    def note(self, text: str, count: int = 1) -> None:
-        """Say that something was left out, so many times; the text has {} for how many of all samples."""
-        self._notes[text] += count
+    def note(self, text: str, count: float = 1) -> None:
+        """Say something of a number of things, if there are any: `{plan}` becomes `2 plans`, those of all samples."""
+        if count:
+            self._notes[text] += int(count)
 
     def counts(self, scenario: str | None = None) -> Counts:
         """As an evaluator keeps them; with a scenario's token, the row `MEAN_OF_SCENARIOS` has means of its means."""
@@ -145,7 +148,10 @@ class MeansEvaluator(Evaluator[Result], Generic[Result]):
 
     def add(self, token: str, counts: Counts) -> None:
         """Take a sample's counts (`Evaluator.add`); of samples with the same names these are kept once."""
-        super().add(token, {**counts, "names": sys.intern(counts["names"])})
+        names = counts.get("names")
+        if not (isinstance(names, str) and names.replace("\n", "").isprintable()):
+            raise EvaluationError(f"{token}: expected counts with the names of their numbers; evaluate again")
+        super().add(token, {**counts, "names": sys.intern(names)})
 
     def pooled(self, counts: Collection[Counts]) -> Sequence[Counts]:
         """One set of counts: their sums."""
@@ -182,7 +188,7 @@ class MeansEvaluator(Evaluator[Result], Generic[Result]):
             table, row, column = path.split("/")
             means.setdefault(table, {}).setdefault(row, {})[column] = ratio(float(value), float(count))
             counted.setdefault(table, {}).setdefault(row, {})[column] = int(count)
-        notes = tuple(text.format(f"{count:,}") for text, count in sorted(pooled["notes"].items()))
+        notes = tuple(_note_text(text, count) for text, count in sorted(pooled["notes"].items()))
         return self.result_class(samples=pooled["samples"], means=means, counted=counted, notes=notes)
 
     def _place(self, path: str) -> tuple[Any, ...]:
@@ -191,6 +197,11 @@ class MeansEvaluator(Evaluator[Result], Generic[Result]):
         known = [self.order.index(name) if name in self.order else len(self.order) for name in names]
         columns = list(self.result_class.columns)
         return *((at, natural_order(name)) for at, name in zip(known, names, strict=True)), columns.index(column)
+
+
+def _note_text(text: str, count: int) -> str:
+    """Put a number and its noun into a note, where the noun stands in braces."""
+    return re.sub(r"\{([^{}]+)\}", lambda noun: counted(count, noun[1]), text)
 
 
 def _rounded(values: FloatArray | float) -> FloatArray:

@@ -225,6 +225,11 @@ def ascending_times(values: ArrayLike) -> FloatArray:
     return times
 
 
+LONGEST_PATH: Final = 10.0
+"""Seconds: the times of a path that is longer are probably no seconds."""
+LONG_PATHS: Final = "suspicious: {path} longer than 10 s; times are in seconds, not in frames or milliseconds"
+
+
 def _checked_ids(ids: object) -> tuple[int, int] | None:
     if ids is None:
         return None

@@ -15,6 +15,7 @@ from deepaccident_devkit.errors import ConfigError, EvaluationError, shortened
 from deepaccident_devkit.evaluation.evaluator import Counts
 from deepaccident_devkit.evaluation.forecasting.metrics import (
     MISS_DISTANCE,
+    SAME_TIME,
     Forecast,
     actor_errors,
     collisions,
@@ -32,6 +33,7 @@ from deepaccident_devkit.evaluation.forecasting.truth import (
     forecasting_truth,
 )
 from deepaccident_devkit.evaluation.means import MEAN_OF_SCENARIOS, Column, MeansEvaluator, MeansResult, Sums
+from deepaccident_devkit.evaluation.predictions import LONG_PATHS, LONGEST_PATH
 from deepaccident_devkit.evaluation.task import Task
 from deepaccident_devkit.support.arrays import FloatArray, check_least
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
@@ -133,9 +135,12 @@ def _counts(token: str, forecasts: Iterable[Forecast], truth: ForecastingTruth, 
     if len(of_actor) < len(given):
         raise EvaluationError(f"{token}: expected Forecasts, one of each actor, found {shortened(repr(given))}")
     sums, actors = Sums(), set(truth.actor_id.tolist())
-    for text, missing in ((_WITHOUT, actors - of_actor.keys()), (_UNKNOWN, of_actor.keys() - actors)):
-        if missing:
-            sums.note(text, len(missing))
+    forecasts = [each for each in of_actor.values() if each.actor_id in actors]
+    sums.note(_WITHOUT, len(actors) - len(forecasts))
+    sums.note(_UNKNOWN, len(of_actor) - len(forecasts))
+    main, end = rules.horizons[0], rules.horizons[0] - SAME_TIME
+    sums.note(f"no numbers at {main:g} s: {{forecast}} ending earlier", sum(each.times[-1] < end for each in forecasts))
+    sums.note(LONG_PATHS, sum(each.times[-1] > LONGEST_PATH for each in forecasts))
     if not actors:
         return sums.counts(truth.scenario)
     paths, chances = _arrays(of_actor, truth)
@@ -186,8 +191,8 @@ def _together(
     return {"min_fde": fde[best], "min_ade": ade[best], "miss": missed[:, best].mean(), "collisions": hits.mean()}
 
 
-_WITHOUT: Final = "{} true actors have no forecast; they have no error, and count in `without`"
-_UNKNOWN: Final = "{} forecasts are of the agent itself, or of actors that no label shows then; they do not count"
+_WITHOUT: Final = "no forecast of {true actor}: without errors, counted in `without`"
+_UNKNOWN: Final = "not counted: {forecast} of the agent itself, or of an actor that no label shows then"
 FORECASTING: Final = Task(
     name="forecasting",
     kinds=("forecasting",),

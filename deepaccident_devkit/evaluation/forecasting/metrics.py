@@ -20,6 +20,8 @@ MISS_DISTANCE: Final = 2.0
 """Metres; a larger error at the end is a miss."""
 COLLISION_DISTANCE: Final = 1.0
 """Metres; centres that come nearer to each other collide."""
+SAME_TIME: Final = 1e-3
+"""Seconds by which a moment may miss the step that it is meant for, as sums of float32 do."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -64,10 +66,10 @@ class Forecast(FrozenArrays):
             times, paths = np.append(0.0, times), np.concatenate([start, paths], axis=1)
         if len(times) == 1:
             return np.full((len(paths), len(steps), 2), np.nan)
-        after = times.searchsorted(steps - _SLACK).clip(1, len(times) - 1)
+        after = times.searchsorted(steps - SAME_TIME).clip(1, len(times) - 1)
         share = ((steps - times[after - 1]) / (times[after] - times[after - 1]))[:, None]
         found = paths[:, after - 1] * (1 - share) + paths[:, after] * share
-        return np.where((steps <= times[-1] + _SLACK)[:, None], found, np.nan)
+        return np.where((steps <= times[-1] + SAME_TIME)[:, None], found, np.nan)
 
 
 def mode_errors(paths: FloatArray, truth: FloatArray, valid: BoolArray) -> tuple[FloatArray, FloatArray]:
@@ -80,11 +82,12 @@ def mode_errors(paths: FloatArray, truth: FloatArray, valid: BoolArray) -> tuple
 
     Returns:
         (N, K) the mean distance over the valid steps (ADE), and (N, K) the distance at the last step (FDE); NaN where
-        there is no such step, or no path.
+        there is no such step, or the path ends before the last one.
     """
     apart = np.where(valid[:, None], distances(paths, truth[:, None]), 0.0)
     steps = valid.sum(axis=1)[:, None]
-    ade = np.where(steps > 0, apart.sum(axis=-1) / np.maximum(steps, 1), np.nan)
+    counts = (steps > 0) & np.isfinite(paths[..., -1, :]).all(axis=-1)
+    ade = np.where(counts, apart.sum(axis=-1) / np.maximum(steps, 1), np.nan)
     return ade, np.where(valid[:, -1:], apart[..., -1], np.nan)
 
 
@@ -115,7 +118,8 @@ def actor_errors(
 
     Returns:
         (N,) each, NaN for none: `min_fde`, `miss` (1 or 0) and `brier_min_fde` need the last step, `min_ade` (of the
-        best mode) and `min_ade_any` (the least of any mode) the whole future, `cut_ade` (the same) any step.
+        best mode) and `min_ade_any` (the least of any mode) the whole future, `cut_ade` (the same) any step. All need
+        a path up to the last step.
     """
     first = np.argsort(-probabilities, axis=1, kind="stable")[:, :most]
     ade, fde, chance = (
@@ -158,7 +162,3 @@ def collisions(paths: FloatArray, distance: float = COLLISION_DISTANCE) -> BoolA
     apart = distances(paths[:, None], paths)
     apart[np.arange(len(paths)), np.arange(len(paths))] = np.inf
     return np.asarray((apart < distance).any(axis=(1, 3)))
-
-
-_SLACK: Final = 1e-6
-"""Seconds: decimal moments compare as they are meant."""

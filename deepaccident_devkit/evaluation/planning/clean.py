@@ -53,15 +53,15 @@ def add_clean(sums: Sums, plans: Mapping[str, Plan], scene: PlanningScene, rules
         rules: the protocol.
     """
     if len(scene.recorded) < 2:
-        sums.note("{} samples have no frame after them that counts; twins end where their accident does")
+        sums.note("no numbers of {sample} without a later frame that counts; twins end where their accident does")
         return
     margin = _margin(scene)
     found = {name: _contacts(plan, scene, margin) for name, plan in plans.items()}
     true = found["recorded"]
     if true.overlapping.any():
-        sums.note("{} actors overlap the ego at the present; they are left out", int(true.overlapping.sum()))
+        sums.note("left out: {actor} touching the ego at the present", int(true.overlapping.sum()))
     if scene.is_collider and not scene.is_twin and (reason := _unusable(scene, margin, true)):
-        sums.note(f"{scene.scenario}: {reason}; {{}} of its samples are left out")
+        sums.note(f"{scene.scenario}: {reason}; left out: {{sample}}")
         return
     role = "" if scene.is_collider else "bystander, "
     leads = [
@@ -152,12 +152,21 @@ def _margin(scene: PlanningScene) -> float:
 
 
 def _prolonged(scene: PlanningScene, frames: int) -> FloatArray:
-    """(frames, A, 5) recorded footprints, and later those of the partner, which goes straight on."""
-    known = scene.footprint
-    after = np.full((frames - len(known), *known.shape[1:]), np.nan)
-    last = np.broadcast_to(known[-1], after.shape).copy()
-    last[..., :2] += np.arange(1, len(after) + 1)[:, None, None] * (known[-1] - known[-2])[:, :2]
-    return np.concatenate([known, np.where(scene.partner[:, None], last, after)])
+    """Return the recorded footprints, (frames, A, 5), with the partner's going straight on after its last label.
+
+    Its velocity is that between its last two labels, however many frames are without one in between.
+    """
+    footprint = np.full((frames, *scene.footprint.shape[1:]), np.nan)
+    footprint[: len(scene.footprint)] = scene.footprint
+    for actor in np.flatnonzero(scene.partner):
+        labelled = np.flatnonzero(np.isfinite(footprint[:, actor, 0]))
+        if len(labelled) < 2:
+            continue
+        previous, last = labelled[-2:]
+        step = (footprint[last, actor] - footprint[previous, actor])[:2] / (last - previous)
+        footprint[last + 1 :, actor] = footprint[last, actor]
+        footprint[last + 1 :, actor, :2] += np.arange(1, frames - last)[:, None] * step
+    return footprint
 
 
 def _accelerations(plan: Plan, before: FloatArray) -> tuple[FloatArray, FloatArray]:

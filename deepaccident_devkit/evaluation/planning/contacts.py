@@ -50,6 +50,7 @@ def first_contacts(
         margins: (A,) metres of a gap that counts as contact.
         until: (A,) seconds.
     """
+    others = _without_gaps(others)
     own = np.concatenate([path[:, :2], np.broadcast_to(size, (len(path), 2)), path[:, 2:]], axis=1)
     overlapping = gaps_of_pairs(own[:1], others[0]) <= margins
     found = np.tile([np.inf, np.nan, np.nan, 0.0], (len(margins), 1))
@@ -64,16 +65,15 @@ def first_contacts(
 def _contact(
     path: FloatArray, size: FloatArray, other: FloatArray, margin: float, until: float
 ) -> tuple[float, float, float, float]:
-    """Time, speed, relative speed and whether the ego is struck, of a path and another's footprints (L, 5)."""
+    """Return time, speed, relative speed and whether the ego is struck, by another's footprints (L, 5) without gaps."""
     frames = np.flatnonzero(np.isfinite(other[:, 0]))
     first, rows = int(frames[0]), other[frames]
     window = 0.0, min(until, int(frames[-1]) * FRAME_PERIOD) - first * FRAME_PERIOD
     if len(frames) < 2 or window[1] <= 0:
         return _NOTHING
-    there = np.arange(first, frames[-1] + 1)
-    way = [np.interp(there, frames, each) for each in (rows[:, 0], rows[:, 1], np.unwrap(rows[:, 4]))]
+    way = np.column_stack([rows[:, :2], np.unwrap(rows[:, 4])])
     sizes = np.stack([size, np.median(rows[:, 2:4], axis=0)])
-    pair = pair_of(np.stack([path[there], np.column_stack(way)]), sizes, margin=margin)
+    pair = pair_of(np.stack([path[frames], way]), sizes, margin=margin)
     time = contact_times(pair, _NO_BRAKING, [1.0], window=window)
     if np.isinf(time[0]):
         return _NOTHING
@@ -96,7 +96,19 @@ def _near(own: FloatArray, others: FloatArray, margins: FloatArray, until: Float
     step = np.hypot(*np.diff(own[:, :2], axis=0).T).max()
     steps = np.diff(others[..., :2], axis=0)
     ways = np.where(np.isfinite(steps[..., 0]), np.hypot(steps[..., 0], steps[..., 1]), 0.0).max(axis=0, initial=0.0)
-    gone = there.sum(axis=0) < len(own)  # what is missing in between can be on a longer way
     least = np.where(there & in_time, apart, np.inf).min(axis=0)
-    near: BoolArray = (least <= np.where(gone, 2.0, 1.0) * (step + ways) + gone) & there.any(axis=0)
+    near: BoolArray = (least <= step + ways) & there.any(axis=0)
     return near
+
+
+def _without_gaps(others: FloatArray) -> FloatArray:
+    """Return footprints (L, A, 5) in which whoever is missing between two labels goes straight from one to the next."""
+    filled = others.copy()
+    for actor in range(others.shape[1]):
+        labelled = np.flatnonzero(np.isfinite(others[:, actor, 0]))
+        frames = np.arange(labelled[0], labelled[-1] + 1) if len(labelled) else labelled
+        if len(frames) > len(labelled):
+            rows = others[labelled, actor]
+            rows[:, 4] = np.unwrap(rows[:, 4])
+            filled[frames, actor] = np.column_stack([np.interp(frames, labelled, column) for column in rows.T])
+    return filled

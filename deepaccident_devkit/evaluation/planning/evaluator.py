@@ -29,6 +29,7 @@ from deepaccident_devkit.evaluation.planning.scene import (
     steps_of,
     trivial_plans,
 )
+from deepaccident_devkit.evaluation.predictions import LONG_PATHS, LONGEST_PATH
 from deepaccident_devkit.evaluation.task import Task
 from deepaccident_devkit.geometry.box_arrays import corner_offsets
 from deepaccident_devkit.support.arrays import BoolArray
@@ -43,6 +44,8 @@ _LEFT_OUT: Final = (
     "by these rules a plan that repeats the recorded accident has 0 % collisions: steps at which the recorded path "
     "touches, or is not recorded, are left out; left_out is their share"
 )
+_CONTINUED: Final = "continued straight on: {plan} ending before 3 s"
+_LARGE_YAW: Final = "suspicious: {plan} with a yaw beyond 2π; yaw is in radians, not in degrees"
 _FAR_OFF: Final = "point_collision looks 25 m beside the path, as the code does; ignore it"
 _BY_HORIZON: Final = tuple(f"{horizon} s" for horizon in HORIZONS)
 BY_LEAD: Final = tuple(f"lead {lead:g} s" for lead in CleanPlanning().leads)
@@ -124,9 +127,13 @@ def _counts(token: str, plans: Iterable[Plan], scene: PlanningScene, rules: Prot
     if others or not given:
         found = type(others[0]).__name__ if others else "none"
         raise EvaluationError(f"{token}: expected one Plan or more, found {found}")
-    rows = {GIVEN: max(given, key=lambda each: each.score), **trivial_plans(scene)}
+    plan = max(given, key=lambda each: each.score)
+    rows = {GIVEN: plan, **trivial_plans(scene)}
     sums = Sums()
+    sums.note(LONG_PATHS, plan.times[-1] > LONGEST_PATH)
+    sums.note(_LARGE_YAW, plan.yaw is not None and np.abs(plan.yaw).max() > 2 * np.pi)
     if isinstance(rules, CleanPlanning):
+        sums.note(_CONTINUED, plan.times[-1] < HORIZONS[-1] - FRAME_PERIOD / 2)
         add_clean(sums, rows, scene, rules)
     else:
         _add_cells(sums, token, rows, scene, rules)

@@ -135,10 +135,12 @@ def test_notes_count_over_the_samples(tmp_path: Path) -> None:
     evaluator = LengthsEvaluator("other")
     for number in range(3):
         sums = Sums()
-        sums.note("{} are left out", 500 * number)
+        sums.note("left out: {sample}", 500 * number)
+        sums.note("{plan} of {0.__class__}", number == 2)
         evaluator.add(str(number), sums.counts())
     result = evaluator.compute()
-    assert (result.notes, result.samples, result.means) == (("1,500 are left out",), 3, {})
+    assert result.notes == ("left out: 1,500 samples", "1 plan of 1 0.__class__")
+    assert (result.samples, result.means) == (3, {})
     assert evaluator.compute([]).samples == 0
     assert LengthsEvaluator("other").resume(evaluator.save(tmp_path / "kept")).compute() == result
 

@@ -84,7 +84,31 @@ def test_beyond_a_forecast_there_is_no_number_and_it_is_counted() -> None:
     assert (main["min_fde"], main["without"]) == ((3.0, 1), (round(2 / 3, 6), 3))
     assert cells(result, "1 s, K = 6", "all")["min_fde"] == (1.0, 2)
     assert np.isnan(result.means["5 s, K = 6"]["all"]["min_fde"])
-    assert result.notes == ("1 true actors have no forecast; they have no error, and count in `without`",)
+    assert [note.split(":")[0] for note in result.notes] == ["no forecast of 1 true actor", "no numbers at 3 s"]
+    assert result.notes[1].endswith(": 1 forecast ending earlier")
+
+
+def test_forecasts_cut_short_improve_nothing() -> None:
+    """Neither where the recording goes on, nor where it ends before the horizon."""
+    truth = truth_of(5, 2.0, 0.5)
+    cut = result_of(([forecast(actor, [0.01], (0.5,)) for actor in (1, 2, 3)], truth))
+    assert cells(cut, MAIN, "all") == {"without": (1.0, 1)}
+    assert "no numbers at 3 s: 3 forecasts ending earlier" in cut.notes
+    whole = result_of(([forecast(actor, [3.0]) for actor in (1, 2, 3)], truth))
+    assert cells(whole, MAIN, "all")["cut_ade"][1] == 3
+
+
+def test_times_summed_in_float32_reach_the_horizon() -> None:
+    seconds = np.cumsum(np.full(60, 0.05, dtype=np.float32), dtype=np.float32).astype(np.float64).tolist()
+    assert seconds[-1] != 3
+    result = result_of(([forecast(1, [3.0], seconds)], truth_of(5)))
+    assert cells(result, MAIN, "all")["min_fde"] == (pytest.approx(3, abs=1e-4), 1)
+    assert result.notes == ()
+
+
+def test_times_that_are_frames_are_suspicious() -> None:
+    result = result_of(([forecast(1, [3.0], (10.0, 20.0, 30.0))], truth_of(5)))
+    assert result.notes[0].startswith("suspicious: 1 path longer than 10 s")
 
 
 def test_a_short_future_counts_in_cut_ade_alone() -> None:
@@ -136,7 +160,7 @@ def test_forecasts_of_others_do_not_count() -> None:
     result = result_of(([forecast(1, [3.0]), forecast(9, [0.0])], truth_of(5)))
     assert cells(result, MAIN, "all")["min_fde"] == (3.0, 1)
     (note,) = result.notes
-    assert note.startswith("1 forecasts are of the agent itself, or of actors that no label shows then")
+    assert note == "not counted: 1 forecast of the agent itself, or of an actor that no label shows then"
 
 
 def test_a_sample_without_other_actors() -> None:

@@ -12,6 +12,7 @@ WRITTEN = {
     "evaluator.ForecastingProtocol": "horizons=(3.0, 1.0, 2.0, 5.0), modes=(6, 1), miss_distance=2.0",
     "metrics.MISS_DISTANCE": "2.0",
     "metrics.COLLISION_DISTANCE": "1.0",
+    "metrics.SAME_TIME": "0.001",
     "metrics.actor_errors": "miss_distance=2.0",
     "metrics.world_errors": "miss_distance=2.0",
     "metrics.collisions": "distance=1.0",

@@ -44,6 +44,9 @@ class TestForecast:
     def test_decimal_times_compare_as_they_are_meant(self) -> None:
         end = forecast((0.1 + 0.2,)).at(np.array([0.3]), np.zeros(2))
         assert_allclose(end, [[[3.0, 0.0]]], atol=1e-9)
+        summed = np.cumsum(np.full(300, 0.01, dtype=np.float32), dtype=np.float32).astype(np.float64)
+        assert summed[-1] != 3
+        assert_allclose(forecast(summed).at(np.array([3.0]), np.zeros(2)), [[[30.0, 0.0]]], atol=1e-2)
 
     def test_what_is_no_forecast(self) -> None:
         assert_refused(
@@ -96,8 +99,10 @@ class TestActors:
     def test_a_forecast_that_ends_early_has_no_number_where_the_truth_goes_on(self) -> None:
         found = errors([[1, 2, np.nan], [1, 1, np.nan]], [0.5, 0.5])
         assert all(np.isnan(each).all() for each in found.values())
-        cut = errors([[1, 2, np.nan], [1, 1, np.nan]], [0.5, 0.5], valid=np.array([[True, True, False]]))
+        cut = errors([[1, 2, np.nan], [1, 1, 3]], [0.5, 0.5], valid=np.array([[True, True, False]]))
         assert cut["cut_ade"].item() == 1
+        cut = errors([[1, 1, np.nan]], [1.0], valid=np.array([[True, True, False]]))
+        assert np.isnan(cut["cut_ade"].item())
 
     def test_of_no_actors_there_are_no_errors(self) -> None:
         none = np.zeros((0, 3), dtype=bool)

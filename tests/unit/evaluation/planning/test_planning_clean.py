@@ -12,6 +12,7 @@ from deepaccident_devkit.evaluation.breakdowns import cluster_of
 from deepaccident_devkit.evaluation.intervals import intervals_of, leaving_out, numbers_of_draws, range_of
 from deepaccident_devkit.evaluation.planning import PlanningEvaluator, PlanningResult, PlanningScene, trivial_plans
 from deepaccident_devkit.evaluation.planning.clean import box_path
+from deepaccident_devkit.evaluation.planning.contacts import first_contacts
 from deepaccident_devkit.evaluation.planning.scene import Plan
 from deepaccident_devkit.evaluation.runs.setups import scenario_of
 
@@ -80,6 +81,48 @@ def test_a_plan_that_ends_goes_straight_on() -> None:
     assert (lead(found)["avoided"], lead(found)["prolonged"]) == (0, 100)
 
 
+@pytest.mark.parametrize("frames", [slice(-2, -1), slice(-3, -1), slice(-12, -1), slice(1, -1)])
+def test_a_partner_goes_on_whatever_labels_it_lacks_before_the_last(frames: slice) -> None:
+    crossing = straight((14.2, -6.0), np.pi / 2, 2.0, 31)
+    labelled = replace(scene(4), footprint=crossing[:, None])
+    footprint = crossing[:, None].copy()
+    footprint[frames] = np.nan
+    lacking = replace(labelled, footprint=footprint)
+    late, given = result_of(labelled, plan=plan_at(3.5)), result_of(lacking, plan=plan_at(3.5))
+    assert (lead(late)["avoided"], lead(late)["prolonged"]) == (0, 100)
+    assert lead(given) == pytest.approx(lead(late))
+
+
+@pytest.mark.parametrize("gap", [0, 1, 5, 15, 20, 40])
+def test_contacts_with_actors_who_lack_labels_are_found(gap: int) -> None:
+    frames = gap + 21
+    path = np.column_stack([straight((0, 0), 0.0, 10.0, frames)[:, :2], np.zeros(frames)])
+    middle = (frames - 1) / 2 * 0.1
+    crossing = straight((10 * middle, -12 * middle), np.pi / 2, 12.0, frames)[:, None]
+    lacking = crossing.copy()
+    lacking[11 : 11 + gap] = np.nan
+    times = [
+        first_contacts(path, np.array(CAR), others, np.zeros(1), np.array([5.0])).time[0]
+        for others in (crossing, lacking)
+    ]
+    assert times[1] == pytest.approx(times[0])
+    assert times[0] < middle
+
+
+@pytest.mark.parametrize(
+    ("plan", "told"),
+    [
+        (plan_at(10), []),
+        (plan_at(10, seconds=0.5), ["continued straight on: 1 plan ending before 3 s"]),
+        (replace(plan_at(10), times=plan_at(10).times * 10), ["suspicious: 1 path longer than 10 s"]),
+        (replace(plan_at(10), yaw=np.linspace(0, 6.3, 6)), ["suspicious: 1 plan with a yaw beyond 2π"]),
+    ],
+)
+def test_notes_on_what_looks_wrong_in_a_plan(plan: Plan, told: list[str]) -> None:
+    notes = result_of(scene(10), plan=plan).notes
+    assert [note[: len(start)] for note, start in zip(notes, told, strict=True)] == told
+
+
 def test_new_collisions_are_of_whom_the_recording_does_not_touch() -> None:
     beside = straight((20, 4), 0.0, 0.0, 31)  # a parked car to the left
     swerve = Plan(times=np.array([1.0, 2.0, 3.0]), path=np.array([[10.0, 0.0], [20.0, 4.0], [20.0, 4.0]]))
@@ -104,7 +147,7 @@ def test_who_drives_is_struck_from_behind_its_rear_edge_alone() -> None:
 def test_actors_that_overlap_at_the_present_are_left_out_and_counted() -> None:
     found = result_of(scene(10, others=[straight((0.5, 0.5), 0.0, 10.0, 31)]))
     assert lead(found)["striking"] == 0
-    assert found.notes == ("1 actors overlap the ego at the present; they are left out",)
+    assert found.notes == ("left out: 1 actor touching the ego at the present",)
 
 
 def test_twins_are_the_price() -> None:
@@ -178,7 +221,7 @@ def gone_by(scene: PlanningScene, side: float) -> PlanningScene:
 def test_an_accident_that_the_recording_does_not_show_is_left_out_by_name() -> None:
     found = result_of(gone_by(scene(10), CAR[1] + 1.5))
     assert "lead 3 s" not in found.means
-    assert found.notes == (f"{SCENARIO}: the pair is 1.50 m apart at the end; 1 of its samples are left out",)
+    assert found.notes == (f"{SCENARIO}: the pair is 1.50 m apart at the end; left out: 1 sample",)
     near = result_of(gone_by(scene(10), CAR[1] + 0.5))
     assert lead(near, "recorded")["avoided"] == 0  # the gap at the end counts as contact
 
@@ -198,7 +241,8 @@ def test_the_box_turns_with_the_ego_frame() -> None:
 def test_last_frames_have_no_numbers() -> None:
     found = result_of(scene(10, seconds=0.0))
     assert not found.means
-    assert found.notes == ("1 samples have no frame after them that counts; twins end where their accident does",)
+    (note,) = result_of(scene(10, seconds=0.0), scene(10, seconds=0.0)).notes
+    assert ("of 1 sample " in found.notes[0], "of 2 samples " in note) == (True, True)
 
 
 def test_trivial_plans_look_3_seconds_ahead() -> None:
