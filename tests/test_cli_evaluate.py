@@ -210,7 +210,7 @@ def test_a_part_is_refused_unless_allowed_and_marked_everywhere(
 ) -> None:
     some = write_accidents(da_motion, tmp_path / "some.json", tokens[3:])
     words = ("accident", da_motion.dataroot, "--results", some, *LIST, "--protocol", "boxes")
-    told = ("3 of 8 samples have no prediction", "--allow-partial")
+    told = ("without a prediction: 3 of 8 samples", "--allow-partial")
     assert_refused((lambda: evaluate(*words, "--out", tmp_path / "bundle"), ResultsError, told))
     assert not list(tmp_path.glob("bundle*"))
     text = evaluate(*words, "--allow-partial", "--sanity", "--out", tmp_path / "bundle").stdout
@@ -282,7 +282,7 @@ class TestCheck:
         words = ("check", results["motion"], "--dataroot", da_motion.dataroot, "--split", "train")
         good = evaluate(*words, "--agents", ",".join(AGENTS)).stdout
         assert good.endswith("all 8 samples have a prediction, and nothing else has\n")
-        assert "12 of 20 samples have no prediction" in evaluate(*words, status=1).stdout
+        assert "without a prediction: 12 of 20 samples" in evaluate(*words, status=1).stdout
 
     def test_repeats_the_warnings_of_the_sanity_check(
         self, da_motion: DeepAccident, tmp_path: Path, tokens: list[str]

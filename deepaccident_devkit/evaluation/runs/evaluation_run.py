@@ -409,7 +409,8 @@ def _covered_tokens(
             "--horizon; in Python a SampleSelection), or evaluate the samples that have a prediction with "
             "allow_partial=True (--allow-partial), which marks every number as partial"
         )
-        raise ResultsError(f"{results.path}: {covered.to_text()}{remedy if covered.missing or covered.unknown else ''}")
+        is_enough = covered.options or not (covered.missing or covered.unknown)
+        raise ResultsError(f"{results.path}: {covered.to_text()}{'' if is_enough else remedy}")
     tokens = [token for token in selection.tokens(dataset) if token in results]
     if not tokens:
         raise ResultsError(f"{results.path}: {covered.to_text()}; nothing is left to evaluate")

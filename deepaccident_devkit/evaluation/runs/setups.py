@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import os
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field, replace
+from itertools import product
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Final, Literal, get_args
@@ -35,7 +37,7 @@ from deepaccident_devkit.parallel import Places, Store, unfinished_folder
 from deepaccident_devkit.release.fingerprints import INDEX_REMEDY, digest_of
 from deepaccident_devkit.support.arrays import ShortRepr
 from deepaccident_devkit.support.files import remove_in
-from deepaccident_devkit.support.text import choice, path_of, settle_choices, spelled
+from deepaccident_devkit.support.text import choice, counted, path_of, settle_choices, spelled
 from deepaccident_devkit.taxonomy import AGENTS, FRAME_PERIOD, MINI_SPLITS, SPLITS, VEHICLE_AGENTS
 
 __all__ = ["TASKS", "TASK_PROTOCOLS", "TASK_RESULTS", "EvaluationSetup", "SampleLoader", "TaskName"]
@@ -149,6 +151,7 @@ class Coverage(ShortRepr):
         unknown: tokens of predictions that are no samples of this release.
         splits: that the predictions are of.
         agents: likewise, in the order of `taxonomy.AGENTS`.
+        options: of `deepaccident evaluate`, by which exactly the predicted samples are evaluated; empty if unknown.
     """
 
     expected: int
@@ -157,6 +160,7 @@ class Coverage(ShortRepr):
     unknown: tuple[str, ...] = ()
     splits: tuple[str, ...] = ()
     agents: tuple[str, ...] = ()
+    options: str = ""
 
     @property
     def is_complete(self) -> bool:
@@ -164,23 +168,24 @@ class Coverage(ShortRepr):
         return not (self.missing or self.extra or self.unknown)
 
     def to_text(self) -> str:
-        """The differences: how many, three of each, and what predictions there are; or that all are there."""
+        """Say which options are missing; if that is unknown, how many samples, with three of each. Or that all fit."""
         if self.is_complete:
             return f"all {self.expected} samples have a prediction, and nothing else has"
         parts = [
-            _named(self.missing, f"of {self.expected} samples have no prediction"),
-            _named(self.extra, "predictions are of samples that are not evaluated"),
-            _named(self.unknown, "predictions are of no sample of this release"),
+            _named(self.missing, f"without a prediction: {len(self.missing)} of {counted(self.expected, 'sample')}"),
+            _named(self.extra, f"{counted(len(self.extra), 'prediction')} of samples that are not evaluated"),
+            _named(self.unknown, f"{counted(len(self.unknown), 'prediction')} of no sample of this release"),
         ]
+        if self.options:
+            remedy = "evaluate with these options, too, or predict again without them"
+            parts = [f"the predictions are of the samples of {self.options}: {remedy}"]
         if self.extra and not (self.missing or self.unknown):
             parts.append(
                 "leave them out with --allow-partial (allow_partial=True), or evaluate whole scenarios with --samples "
                 "all; no sample lacks a prediction, so the numbers are not partial then"
             )
-        if self.agents:
-            parts.append(
-                f"the predictions are of the splits {', '.join(self.splits)} and the agents {', '.join(self.agents)}"
-            )
+        if self.agents and not self.options:
+            parts.append(f"the predictions are of --split {', '.join(self.splits)} --agents {','.join(self.agents)}")
         return "; ".join(part for part in parts if part)
 
 
@@ -209,7 +214,22 @@ def coverage(dataset: Dataset, results: Collection[str], selection: SampleSelect
         unknown=tuple(token for token in others if token in unknown),
         splits=tuple(name for name in SPLITS if name in splits),
         agents=tuple(name for name in AGENTS if name in present),
+        options="" if unknown or given == set(expected) else _missing_options(dataset, given, selection, splits),
     )
+
+
+def _missing_options(dataset: Dataset, tokens: set[str], asked: SampleSelection, splits: Iterable[str]) -> str:
+    """Return the options that select exactly these samples, where they differ; empty if there are none."""
+    ends = [0.0, *(dataset.get("sample", token)["time_to_end"] for token in tokens)]
+    listed: SampleList = "all" if ends.count(0.0) > 1 else "evaluate"
+    scope: ScopeName = "accident" if all(map(_designed_accident, tokens)) else "all"
+    for split, horizon in product((asked.split, *splits), (asked.horizon, max(ends))):
+        made = replace(asked, split=split, samples=listed, scope=scope, horizon=horizon)
+        with suppress(ConfigError, NotAvailableError):
+            if set(made.tokens(dataset)) == tokens:
+                changed = asdict(made).items() - asdict(asked).items()
+                return " ".join(f"--{name} {value}" for name, value in sorted(changed))
+    return ""
 
 
 def release_note(dataset: Dataset, scenarios: Iterable[str]) -> dict[str, Any]:
@@ -254,7 +274,7 @@ def _named(tokens: Sequence[str], what: str) -> str:
     if not tokens:
         return ""
     more = ", …" if len(tokens) > _SHOWN else ""
-    return f"{len(tokens)} {what} ({', '.join(tokens[:_SHOWN])}{more})"
+    return f"{what} ({', '.join(tokens[:_SHOWN])}{more})"
 
 
 TASKS: Final[Mapping[str, Task]] = MappingProxyType(

@@ -124,12 +124,12 @@ class TestRefused:
             (
                 partial(evaluate, accidents, SETUP, selection),
                 ResultsError,
-                (f"some.json: 1 of 6 samples have no prediction ({tokens[0]})",),
+                (f"some.json: without a prediction: 1 of 6 samples ({tokens[0]})",),
             ),
             (
                 partial(evaluate, others, SETUP, selection, allow_partial=True),
                 ResultsError,
-                ("of the splits train", "nothing is left to evaluate"),
+                ("of --split train", "nothing is left to evaluate"),
             ),
         )
 

@@ -259,15 +259,15 @@ MISSING, EXTRA, UNKNOWN = ({"missing": ("a", "b")}, {"extra": ("c",)}, {"unknown
     ("parts", "told"),
     [
         ([], ["all 6 samples have a prediction, and nothing else has"]),
-        ([MISSING], ["2 of 6 samples have no prediction (a, b)"]),
-        ([EXTRA], ["1 predictions are of samples that are not evaluated (c)", "leave them out with --allow-partial"]),
-        ([UNKNOWN], ["3 predictions are of no sample of this release (d, e, f)"]),
-        ([MISSING, EXTRA], ["2 of 6 samples have no", "1 predictions are of samples that are not evaluated (c)"]),
-        ([EXTRA, UNKNOWN], ["1 predictions are of samples", "3 predictions are of no sample"]),
-        ([{"missing": tuple("abcd")}], ["4 of 6 samples have no prediction (a, b, c, …)"]),
+        ([MISSING], ["without a prediction: 2 of 6 samples (a, b)"]),
+        ([EXTRA], ["1 prediction of samples that are not evaluated (c)", "leave them out with --allow-partial"]),
+        ([UNKNOWN], ["3 predictions of no sample of this release (d, e, f)"]),
+        ([MISSING, EXTRA], ["without a prediction: 2 of 6", "1 prediction of samples that are not evaluated (c)"]),
+        ([EXTRA, UNKNOWN], ["1 prediction of samples", "3 predictions of no sample"]),
+        ([{"missing": tuple("abcd")}], ["without a prediction: 4 of 6 samples (a, b, c, …)"]),
         (
             [MISSING, {"splits": ("train", "val"), "agents": ("ego_vehicle",)}],
-            ["2 of 6 samples", "the predictions are of the splits train, val and the agents ego_vehicle"],
+            ["without a prediction: 2", "the predictions are of --split train, val --agents ego_vehicle"],
         ),
     ],
 )
@@ -291,9 +291,9 @@ def test_missing_extra_and_unknown_three_of_each(
     assert (found.expected, found.missing, found.extra) == (6, tuple(expected[:4]), tuple(sorted(extra)))
     assert found.unknown == ("mine/1", "mine/2", "mine/3", "mine/4")
     assert found.to_text().startswith(
-        f"4 of 6 samples have no prediction ({', '.join(expected[:3])}, …); "
-        f"2 predictions are of samples that are not evaluated ({', '.join(sorted(extra))}); "
-        "4 predictions are of no sample of this release (mine/1, mine/2, mine/3, …)"
+        f"without a prediction: 4 of 6 samples ({', '.join(expected[:3])}, …); "
+        f"2 predictions of samples that are not evaluated ({', '.join(sorted(extra))}); "
+        "4 predictions of no sample of this release (mine/1, mine/2, mine/3, …)"
     )
 
 
@@ -301,10 +301,40 @@ def test_what_the_predictions_are_of(da_b: DeepAccident, selection: SampleSelect
     others = SampleSelection(split="train", samples="all", scope="all", agents=("infrastructure", "ego_vehicle"))
     found = coverage(da_b, [*others.tokens(da_b), "mine"], selection)
     assert (found.splits, found.agents) == (("train",), ("ego_vehicle", "infrastructure"))
-    assert found.to_text().endswith(
-        "; the predictions are of the splits train and the agents ego_vehicle, infrastructure"
-    )
+    assert found.to_text().endswith("; the predictions are of --split train --agents ego_vehicle,infrastructure")
     assert "the predictions are of" not in coverage(da_b, ["mine"], selection).to_text()
+
+
+@pytest.mark.parametrize(
+    ("made", "asked", "options"),
+    [
+        ({"scope": "all"}, {}, "--scope all"),
+        ({"horizon": 3.0}, {}, "--horizon 3.0"),
+        ({"horizon": 1.0, "scope": "all"}, {"horizon": 2.0}, "--horizon 1.0 --scope all"),
+        ({"samples": "all", "scope": "all"}, {}, "--samples all --scope all"),
+        ({}, {"samples": "all", "scope": "all"}, "--samples evaluate --scope accident"),
+        ({"horizon": 3.0}, {"samples": "all", "scope": "all"}, "--horizon 3.0 --samples evaluate --scope accident"),
+        ({}, {"scope": "all"}, "--scope accident"),
+        ({"agents": ("ego_vehicle",)}, {}, ""),  # the text names the agents
+        ({"agents": ("ego_vehicle",), "scope": "all"}, {"agents": ("ego_vehicle",)}, "--scope all"),
+    ],
+)
+def test_the_options_that_are_missing(
+    da_motion: DeepAccident, made: dict[str, Any], asked: dict[str, Any], options: str
+) -> None:
+    selection = SampleSelection(**{"split": "train", **asked})
+    predicted = SampleSelection(**{"split": "train", **made}).tokens(da_motion)
+    found = coverage(da_motion, predicted, selection)
+    assert (found.options, found.is_complete) == (options, False)
+    assert found.to_text().startswith(f"the predictions are of the samples of {options}: ") == bool(options)
+    some = coverage(da_motion, predicted[1:], selection)  # of no list of options
+    assert (some.options, some.is_complete) == ("", False)
+
+
+def test_the_split_that_is_missing(da_b: DeepAccident, selection: SampleSelection, tmp_path: Path) -> None:
+    other = replace(selection, split="train")
+    assert coverage(da_b, other.tokens(da_b), selection).options == "--split train"
+    assert coverage(da_b, [], selection).options == ""
 
 
 def results_of(dataset: DeepAccident, path: Path, note: object) -> Results:

@@ -225,7 +225,7 @@ def test_a_scenario_that_is_gone(bundle: Path, own_release: Path) -> None:
         shutil.rmtree(folder)
     verification = verify(bundle, DeepAccident(dataroot=own_release, verbose=False))
     assert found(verification) == ["all numbers"]
-    assert "3 predictions are of no sample of this release" in verification.notes[0]
+    assert "3 predictions of no sample of this release" in verification.notes[0]
     assert verification.samples == 0
 
 
