@@ -281,8 +281,16 @@ class TestCheck:
     def test_against_a_release(self, da_motion: DeepAccident, results: dict[str, Path]) -> None:
         words = ("check", results["motion"], "--dataroot", da_motion.dataroot, "--split", "train")
         good = evaluate(*words, "--agents", ",".join(AGENTS)).stdout
-        assert good.endswith("all 8 samples have a prediction, and nothing else has\n")
-        assert "without a prediction: 12 of 20 samples" in evaluate(*words, status=1).stdout
+        assert "all 8 samples have a prediction, and nothing else has\nSanity check of 8 samples: " in good
+        assert "None of these mistakes was found: x mirrored, " in good
+        assert "the predictions are of the samples of --agents " in evaluate(*words, status=1).stdout
+
+    def test_of_other_samples_there_is_nothing_to_compare(
+        self, da_motion: DeepAccident, results: dict[str, Path]
+    ) -> None:
+        words = ("check", results["motion"], "--dataroot", da_motion.dataroot, "--split", "train", "--agents")
+        with pytest.raises(EvaluationError, match="no sample to look at"):
+            evaluate(*words, "other_vehicle")
 
     def test_repeats_the_warnings_of_the_sanity_check(
         self, da_motion: DeepAccident, tmp_path: Path, tokens: list[str]
@@ -291,10 +299,12 @@ class TestCheck:
             for token in tokens:
                 writer.add(token, [])
         words = (da_motion.dataroot, "--results", tmp_path / "empty.json", *LIST, "--protocol", "boxes", "--sanity")
-        told = [line for line in evaluate("accident", *words).stdout.splitlines() if line.startswith("WARNING: ")]
-        assert "predictions looked at are empty" in told[0]
+        told = evaluate("accident", *words, status=2).stdout.splitlines()[-3:]
+        assert told[0].startswith("Sanity check of 8 samples: 0 of 0 accidents")
+        assert "predictions looked at are empty" in told[1]
+        assert told[2].startswith("Cannot say whether a mistake was made")
         release = ("--dataroot", da_motion.dataroot, *LIST[:-2])
-        assert evaluate("check", tmp_path / "empty.json", *release).stdout.splitlines()[-len(told) :] == told
+        assert evaluate("check", tmp_path / "empty.json", *release, status=2).stdout.splitlines()[-3:] == told
 
 
 @pytest.mark.parametrize(

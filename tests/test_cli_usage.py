@@ -31,7 +31,6 @@ UNUSED = [
     ),
     (EVALUATE.format("detection") + " --samples all --horizon 3", "--horizon changes nothing with --samples all"),
     (EVALUATE.format("forecasting") + " --horizon 3", "--horizon changes nothing with --samples all: the protocol has"),
-    (EVALUATE.format("forecasting") + " --sanity", "--sanity cannot check forecasting results; leave it out"),
     ("evaluate check results --split val", "--split changes nothing without --dataroot"),
     ("evaluate check results --on-error raise", "--on-error changes nothing without --dataroot"),
     (BASELINE + " --latency 0.2", "--latency changes nothing with --agents single"),

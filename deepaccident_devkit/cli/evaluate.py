@@ -50,7 +50,7 @@ from deepaccident_devkit.evaluation.runs import (
 )
 from deepaccident_devkit.evaluation.runs.bundles import Chooser, chosen_threshold
 from deepaccident_devkit.evaluation.runs.further import with_further
-from deepaccident_devkit.evaluation.runs.sanity import CHECKED, check_sanity
+from deepaccident_devkit.evaluation.runs.sanity import check_sanity
 from deepaccident_devkit.evaluation.runs.setups import (
     TASK_PROTOCOLS,
     TASKS,
@@ -70,6 +70,8 @@ from deepaccident_devkit.rooms import added
 from deepaccident_devkit.taxonomy import AGENTS
 
 _FINDINGS_STATUS = 1
+_NOTHING_STATUS = 2
+"""Of a check that had nothing to compare."""
 _HELP = {
     "motion": "Evaluate predicted motion: IoU, VPQ and path errors.",
     "accident": "Evaluate predicted accidents: APA, and the errors in who, where and when.",
@@ -179,7 +181,10 @@ def _task_verb(task: TaskName) -> click.Command:
     )
     @field_option(Resampling, "resamples", option=advanced, type=click.IntRange(0, MOST_RESAMPLES))
     @click.option(
-        "--sanity", is_flag=True, help="Look for classic mistakes: mirrored axes, another frame, swapped classes, …"
+        "--sanity",
+        is_flag=True,
+        help="Look for classic mistakes, such as mirrored axes or another frame. Exit status 2: there is nothing to "
+        "compare.",
     )
     @click.option("--out", type=PATH, help="Folder to write all numbers, figures and a report into.")
     @click.option("--overwrite", is_flag=True, help="Replace an evaluation that is already in --out.")
@@ -228,6 +233,8 @@ def _evaluate(setup: EvaluationSetup, results: Path, *, by: tuple[str, ...], as_
     click.echo(json.dumps(summary, indent=1) if as_json else f"{shown}\n\n{text}".strip())
     if out is not None:
         click.echo(f"written: {out}", err=as_json)
+    if options["sanity"] and not summary["sanity"]["sought"]:
+        sys.exit(_NOTHING_STATUS)
 
 
 def _written(
@@ -270,8 +277,6 @@ def _refuse_unused(setup: EvaluationSetup, options: dict[str, Any]) -> None:
         added("result", "prevented")  # before long work, as its room may be missing
     if isinstance(setup.rules, FieldWarnings) and options["resamples"]:
         refuse_unused("with --protocol field, which has no intervals", "resamples")
-    if options["sanity"] and not set(TASKS[setup.task].kinds) & set(CHECKED):
-        raise click.UsageError(f"--sanity cannot check {setup.task} results; leave it out")
     if not TASKS[setup.task].has_horizon and _selection_of(setup, options).samples == "all":
         why = "detections are of the present" if setup.task == "detection" else "the protocol has its own"
         refuse_unused(f"with --samples all: {why}", "horizon")
@@ -299,8 +304,9 @@ def _selection_of(setup: EvaluationSetup, options: Mapping[str, Any]) -> SampleS
 def check(results: Path, dataroot: Dataroot | None, version: str, **options: Any) -> None:
     """Check every entry of the results file or folder RESULTS, and print a summary.
 
-    With --dataroot, also repeat the warnings of `evaluate … --sanity`.
-    Exit status 1: with --dataroot, samples of --split are missing, or RESULTS has others. 2: an entry is wrong.
+    With --dataroot, also look for the mistakes of `evaluate … --sanity`.
+    Exit status 1: with --dataroot, samples of --split are missing, or RESULTS has others. 2: an entry is wrong, or
+    there is nothing to compare.
     """
     if dataroot is None:
         refuse_unused("without --dataroot", *_OF_RELEASE)
@@ -318,10 +324,10 @@ def check(results: Path, dataroot: Dataroot | None, version: str, **options: Any
     covered = coverage(dataset, opened.tokens, selection)
     click.echo(f"{selection.text()}: {covered.to_text()}")
     shared = sorted(set(opened.tokens).intersection(selection.tokens(dataset)))
-    checked = shared and opened.task in CHECKED
-    warnings = check_sanity(dataset, opened, setup, shared, **engine).warnings_text() if checked else ""
-    if warnings:
-        click.echo(warnings)
+    sanity = check_sanity(dataset, opened, setup, shared, **engine)
+    click.echo(sanity.to_text())
+    if not sanity.sought:
+        sys.exit(_NOTHING_STATUS)
     if not covered.is_complete:
         sys.exit(_FINDINGS_STATUS)
 

@@ -28,7 +28,7 @@ from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.geometry.box_arrays import gaps, time_to_collision
 from deepaccident_devkit.motion import LABEL_PROTOCOLS, MotionLabelConfig, MotionLabels
 from deepaccident_devkit.support.arrays import FloatArray, FrozenArrays, IntArray, ShortRepr
-from deepaccident_devkit.support.text import choice
+from deepaccident_devkit.support.text import choice, counted
 from deepaccident_devkit.taxonomy import FRAME_PERIOD, INFRASTRUCTURE, OWN_ACTOR_ID
 from deepaccident_devkit.v2x.collisions import labelled_pair
 from deepaccident_devkit.v2x.cooperation import seen_actors
@@ -39,9 +39,9 @@ RELEASED_HORIZON: Final = 2.0
 SLACK: Final = FRAME_PERIOD / 2
 """Seconds: half a recorded frame, so that decimal moments compare as they are meant."""
 UNPLACED_NOTE: Final = (
-    "{} samples are of accidents of which no label shows both actors (meta names one without a label, or one twice); "
-    "they are left out"
+    "left out: {} of accidents of which no label shows both actors (meta names one without a label, or one twice)"
 )
+_BEYOND_NOTE: Final = "not counted: {} for later than the horizon"
 _MOVES: Final = 0.5
 """Metres that an actor must cover in the window to count as moving."""
 Involvement = Literal["ego_involved", "bystander", "infrastructure"]
@@ -262,6 +262,12 @@ def checked_facts(label: object, context: object) -> None:
             )
 
 
+def not_counted_notes(unplaced: int, beyond: int) -> list[str]:
+    """Say how many samples of unplaced accidents are left out, and how many alarms are for later than the horizon."""
+    counts = ((UNPLACED_NOTE, unplaced, "sample"), (_BEYOND_NOTE, beyond, "alarm"))
+    return [note.format(counted(count, noun)) for note, count, noun in counts if count]
+
+
 def labelled_sample(dataset: Dataset, sample: RowArgument) -> Any:
     """A sample's record; raises TokenError, and NotAvailableError if it has no label."""
     record = dataset.get("sample", sample)
@@ -421,7 +427,7 @@ def nearest_two(positions: FloatArray, identity: IntArray, center: FloatArray, g
 def position_difference(first: FloatArray, second: FloatArray) -> float:
     """The differences of two pairs of positions (2, 2), metres: the sum over the two, in the order that fits better."""
     apart = np.linalg.norm(first[:, None] - second, axis=-1)
-    return float(min(apart[0, 0] + apart[1, 1], apart[0, 1] + apart[1, 0]))
+    return float(min(apart.trace(), apart[::-1].trace()))
 
 
 def _named(alarm: Accident, truth: BoxTruth) -> Pair:

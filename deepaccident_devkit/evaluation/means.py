@@ -6,7 +6,7 @@ import re
 import sys
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from itertools import product
 from typing import Any, ClassVar, Final, Generic, Literal, NamedTuple, TypeVar
 
@@ -144,7 +144,7 @@ class MeansEvaluator(Evaluator[Result], Generic[Result]):
     @property
     def settings(self) -> dict[str, Any]:
         """The protocol's choices."""
-        return {name: plain(value) for name, value in asdict(self.protocol).items()}
+        return dict(plain(self.protocol))
 
     def add(self, token: str, counts: Counts) -> None:
         """Take a sample's counts (`Evaluator.add`); of samples with the same names these are kept once."""

@@ -42,7 +42,7 @@ from deepaccident_devkit.motion import (
     trajectories,
 )
 from deepaccident_devkit.support.arrays import AnyArray, FloatArray, ShortRepr
-from deepaccident_devkit.support.text import settle_choices
+from deepaccident_devkit.support.text import counted, settle_choices
 
 __all__ = [
     "MOTION_PROTOCOLS",
@@ -276,11 +276,19 @@ def motion_counts(
 
 def _last_maps(prediction: MotionOutput, frames: int) -> tuple[AnyArray, AnyArray]:
     """(T, H, W) which cells are actors, and instances, of the last prediction, as it lies."""
+    actors = actor_cells(prediction)[:frames]
     if prediction.instances is not None:
-        instances = prediction.instances[-1, :frames]
-        return instances > 0, instances
-    heads = first_frames((prediction.heads or ())[-1], frames)
-    return heads.segmentation[:, 1] > heads.segmentation[:, 0], predict_instances(heads, "motion").instance
+        return actors, prediction.instances[-1, :frames]
+    return actors, predict_instances(first_frames((prediction.heads or ())[-1], frames), "motion").instance
+
+
+def actor_cells(prediction: MotionOutput) -> AnyArray:
+    """(T, H, W) which cells are actors in the last prediction, as it lies."""
+    if prediction.instances is not None:
+        instances: AnyArray = prediction.instances[-1] > 0
+        return instances
+    segmentation = (prediction.heads or ())[-1].segmentation
+    return segmentation[:, 1] > segmentation[:, 0]
 
 
 def _path_counts(prediction: MotionOutput, truth: MotionLabels, frames: int) -> dict[str, float]:
@@ -342,7 +350,7 @@ def motion_result(counts: Collection[Counts], protocol: MotionProtocol) -> Motio
         path_false_negative=lost,
         samples=samples,
         frames=sums["frames"],
-        notes=(f"{number} of {samples} predictions: {_INSTANCE_MAPS}",) if number else (),
+        notes=(f"{number} of {counted(samples, 'prediction')}: {_INSTANCE_MAPS}",) if number else (),
     )
 
 
@@ -372,7 +380,4 @@ MOTION: Final = Task(
     protocols=MOTION_PROTOCOLS,
     evaluator=MotionEvaluator,
     truth=lambda *facts: (compared_labels(*facts),),
-    counts=lambda _token, *given: motion_counts(*given),
-    result=motion_result,
-    summary=MotionResult.as_dict,
 )

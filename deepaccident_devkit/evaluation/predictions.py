@@ -331,13 +331,7 @@ def first_frames(heads: MotionHeads, frames: int) -> MotionHeads:
     """Heads without the frames from `frames` on."""
     if len(heads.segmentation) == frames:
         return heads
-    return replace(
-        heads,
-        segmentation=heads.segmentation[:frames],
-        centerness=heads.centerness[:frames],
-        offset=heads.offset[:frames],
-        flow=heads.flow[:frames],
-    )
+    return replace(heads, **{name: getattr(heads, name)[:frames] for name in _AXES})
 
 
 def cells_within(grid: BevGrid, extent: float) -> tuple[slice, slice]:

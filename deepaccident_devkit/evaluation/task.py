@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, fields, is_dataclass, replace
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar, Final, Literal, NoReturn, TypeVar, get_args
@@ -12,7 +12,7 @@ import numpy as np
 
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import ChoiceError
-from deepaccident_devkit.evaluation.evaluator import Counts, Evaluator
+from deepaccident_devkit.evaluation.evaluator import Evaluator
 from deepaccident_devkit.reports import table_html
 from deepaccident_devkit.support.arrays import ShortRepr, known
 from deepaccident_devkit.support.text import choice, meant_text, possible_text
@@ -25,19 +25,16 @@ TaskName = Literal["motion", "accident", "detection", "warning", "planning", "fo
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Task:
-    """One task, whose five doors lead from a results file to numbers: read → truth → counts → result → summary.
+    """One task: how its predictions are read, what they are compared with, and the evaluator that does so.
 
     Attributes:
         name: of `TaskName`.
         kinds: the kinds of results that it is evaluated from.
         protocols: its rules by name.
-        evaluator: of some rules; keeps the counts of each sample between the doors `counts` and `result`.
+        evaluator: of some rules; its `update` takes a token, the prediction and all that `truth` gives.
         read: results, dataset, token, rules → the prediction of a sample, as the rules count it.
         truth: dataset, token, rules, how motion is stored (`Results.form`; None for other results), horizon in
             seconds → all that the prediction is compared with.
-        counts: token, prediction, all that `truth` gave, rules → what the sample adds.
-        result: the counts of samples, rules → their metrics.
-        summary: result → its numbers by name, as JSON holds them.
         whole_recordings: whether whole recordings are followed, so that attributes within them are of no use.
         needs_meta: whether the truth is in the scenarios' meta files.
         vehicles_alone: whether the roadside has no such predictions.
@@ -50,9 +47,6 @@ class Task:
     evaluator: Callable[[Any], Evaluator[Any]]
     read: Callable[[Any, Dataset, str, Any], Any] = lambda results, _dataset, token, _rules: results.prediction(token)
     truth: Callable[[Dataset, str, Any, Any, float], tuple[Any, ...]]
-    counts: Callable[..., Counts]
-    result: Callable[[Collection[Counts], Any], Any]
-    summary: Callable[[Any], dict[str, Any]]
     whole_recordings: bool = False
     needs_meta: bool = False
     vehicles_alone: bool = False

@@ -61,18 +61,6 @@ PROTOCOLS: Final[Mapping[str, AccidentProtocol]] = MappingProxyType(
 themselves and not with rasters."""
 
 
-def sample_counts(
-    _token: str,
-    prediction: Prediction,
-    label: MotionLabels | None,
-    context: AccidentContext | None,
-    protocol: AccidentProtocol,
-) -> Counts:
-    """What one sample adds: `counts` of `BoxAccidents`, `PaperAccidents`, or of `ReleasedAccidents` (motion alone)."""
-    checked_facts(label, context)
-    return dict(protocol.counts(checked_prediction(prediction), label, context or AccidentContext()))
-
-
 class AccidentEvaluator(Evaluator[AccidentResult]):
     """Accident prediction accuracy and the errors of the accidents that are foreseen.
 
@@ -119,7 +107,9 @@ class AccidentEvaluator(Evaluator[AccidentResult]):
             EvaluationError: the protocol cannot evaluate such a prediction or label, or the sample came before with
                 another outcome.
         """
-        self.add(token, sample_counts(token, prediction, label, context, self.protocol))
+        checked_facts(label, context)
+        counts = self.protocol.counts(checked_prediction(prediction), label, context or AccidentContext())
+        self.add(token, dict(counts))
 
     def result_of(self, counts: Collection[Counts]) -> AccidentResult:
         """The metrics of some samples' counts, in any order."""
@@ -153,8 +143,5 @@ ACCIDENT: Final = Task(
     protocols=PROTOCOLS,
     evaluator=AccidentEvaluator,
     truth=compared_facts,
-    counts=sample_counts,
-    result=lambda counts, protocol: protocol.result(counts),
-    summary=AccidentResult.as_dict,
     needs_meta=True,
 )

@@ -29,11 +29,11 @@ from deepaccident_devkit.evaluation.accident.scoring import (
 )
 from deepaccident_devkit.evaluation.accident_truth import (
     SLACK,
-    UNPLACED_NOTE,
     AccidentContext,
     BoxTruth,
     Pair,
     named_alarms,
+    not_counted_notes,
     position_difference,
     within_horizon,
 )
@@ -116,12 +116,7 @@ class BoxAccidents:
         Raises:
             EvaluationError: the context has no truth, or the prediction is neither maps nor accidents.
         """
-        truth = context.truth
-        if not isinstance(truth, BoxTruth):
-            raise EvaluationError(
-                "context: the accident protocol 'boxes' compares with boxes; give "
-                "accident_context(dataset, sample, horizon=2.0)"
-            )
+        truth = _truth_of(context)
         raised = named_alarms(checked_prediction(prediction), label, truth, self.reading)
         within = within_horizon(raised, truth)
         judged = [  # the alarms that the recording can refute
@@ -141,11 +136,7 @@ class BoxAccidents:
         self, given: MotionOutput | list[Accident], label: MotionLabels | None, context: AccidentContext
     ) -> ComparedAccidents:
         """Which accidents it sees; raises EvaluationError."""
-        truth = context.truth
-        if truth is None:
-            raise EvaluationError(
-                "context: the protocol 'boxes' needs its truth; make it with accident_context(…, horizon)"
-            )
+        truth = _truth_of(context)
         return ComparedAccidents(
             true=truth.accident,
             predicted=tuple(alarm for alarm, _ in named_alarms(given, label, truth, self.reading)),
@@ -160,13 +151,9 @@ class BoxAccidents:
             nothing = {distance: replace(each, accuracy=math.nan) for distance, each in base.within.items()}
             base = replace(base, apa=math.nan, within=nothing)
         at = base.within[ERRORS_AT]
-        late = given["beyond"]
-        beyond = [f"{late} alarms are for later than the horizon and do not count"] if late else []
-        if given["unplaced"]:
-            beyond.append(UNPLACED_NOTE.format(given["unplaced"]))
         return BoxAccidentResult(
             **{each.name: getattr(base, each.name) for each in fields(AccidentResult) if each.name != "notes"},
-            notes=(*base.notes, *beyond),
+            notes=(*base.notes, *not_counted_notes(given["unplaced"], given["beyond"])),
             precision=_share(at.tp, at.tp + at.fp),
             recall=_share(at.tp, base.positives),
             average_precision=_average_precision(given["alarms"], base.positives),
@@ -216,20 +203,24 @@ def _tallied(sample: Counts) -> dict[str, Any]:
     }
 
 
-def _id_error(ids: Pair, truth: BoxTruth) -> int | None:
-    """1 if these are not the two that collide; None if nobody collides."""
-    if truth.accident is None or truth.accident.ids is None:
-        return None
-    return int(set(ids) != set(truth.accident.ids))
+def _truth_of(context: AccidentContext) -> BoxTruth:
+    """Return the truth of the boxes; raises EvaluationError if there is none."""
+    if not isinstance(context.truth, BoxTruth):
+        raise EvaluationError(
+            "context: the accident protocol 'boxes' needs its truth, the labels' boxes; give "
+            "accident_context(dataset, sample, horizon=2.0)"
+        )
+    return context.truth
 
 
 def _alarm(accident: Accident, ids: Pair, truth: BoxTruth) -> dict[str, Any]:
-    if truth.accident is None:
+    true = truth.accident
+    if true is None:
         return foreseen(score=accident.score)
     return foreseen(
-        position=position_difference(accident.positions, truth.accident.positions),
-        time=accident.time - truth.accident.time,
-        id_error=_id_error(ids, truth),
+        position=position_difference(accident.positions, true.positions),
+        time=accident.time - true.time,
+        id_error=None if true.ids is None else int(set(ids) != set(true.ids)),
         score=accident.score,
     )
 

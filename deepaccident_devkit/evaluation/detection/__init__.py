@@ -49,26 +49,6 @@ __all__ = [
 ]
 
 
-def sample_counts(token: str, prediction: DetectedBoxes, truth: Boxes, protocol: DetectionProtocol) -> Counts:
-    """What one sample adds: what `frame_counts` has of its boxes, beside its token."""
-    if not isinstance(prediction, DetectedBoxes):
-        raise EvaluationError(
-            f"{token}: expected DetectedBoxes as the prediction, found {type(prediction).__name__}; make them with "
-            f"DetectedBoxes.from_arrays(center, size, yaw, scores, frame={protocol.frame!r}), of no rows "
-            "where nothing is detected"
-        )
-    for name, boxes in (("prediction", prediction.boxes), ("truth", checked_boxes("truth", truth))):
-        if boxes.frame != protocol.frame:
-            raise GeometryError(
-                f"{token}: {name} in frame {boxes.frame!r}, the protocol counts in {protocol.frame!r}; "
-                "transform them, or choose frame="
-            )
-    return {
-        "token": token,
-        **frame_counts(columns_of(prediction.boxes, prediction.scores), columns_of(truth), protocol),
-    }
-
-
 class DetectionEvaluator(Evaluator[DetectionResult]):
     """Counts matches of detected and true boxes by sample; `compute` makes curves and errors of them.
 
@@ -115,7 +95,21 @@ class DetectionEvaluator(Evaluator[DetectionResult]):
             GeometryError: the truth is not of boxes, or boxes are in another frame.
             EvaluationError: the prediction is not of boxes, or the sample came before, with another result.
         """
-        self.add(token, sample_counts(token, prediction, truth, self.protocol))
+        frame = self.protocol.frame
+        if not isinstance(prediction, DetectedBoxes):
+            raise EvaluationError(
+                f"{token}: expected DetectedBoxes as the prediction, found {type(prediction).__name__}; make them with "
+                f"DetectedBoxes.from_arrays(center, size, yaw, scores, frame={frame!r}), of no rows where nothing is "
+                "detected"
+            )
+        for name, boxes in (("prediction", prediction.boxes), ("truth", checked_boxes("truth", truth))):
+            if boxes.frame != frame:
+                raise GeometryError(
+                    f"{token}: {name} in frame {boxes.frame!r}, the protocol counts in {frame!r}; transform them, or "
+                    "choose frame="
+                )
+        counts = frame_counts(columns_of(prediction.boxes, prediction.scores), columns_of(truth), self.protocol)
+        self.add(token, {"token": token, **counts})
 
     def result_of(self, counts: Collection[Counts]) -> DetectionResult:
         """The metrics of some samples' counts, in any order."""
@@ -216,8 +210,5 @@ DETECTION: Final = Task(
     evaluator=DetectionEvaluator,
     read=_read,
     truth=lambda dataset, token, rules, _form, _horizon: (detection_truth(dataset, token, rules),),
-    counts=sample_counts,
-    result=detection_result,
-    summary=DetectionResult.as_dict,
     has_horizon=False,
 )

@@ -135,12 +135,12 @@ def _counts(token: str, forecasts: Iterable[Forecast], truth: ForecastingTruth, 
     if len(of_actor) < len(given):
         raise EvaluationError(f"{token}: expected Forecasts, one of each actor, found {shortened(repr(given))}")
     sums, actors = Sums(), set(truth.actor_id.tolist())
-    forecasts = [each for each in of_actor.values() if each.actor_id in actors]
-    sums.note(_WITHOUT, len(actors) - len(forecasts))
-    sums.note(_UNKNOWN, len(of_actor) - len(forecasts))
-    main, end = rules.horizons[0], rules.horizons[0] - SAME_TIME
-    sums.note(f"no numbers at {main:g} s: {{forecast}} ending earlier", sum(each.times[-1] < end for each in forecasts))
-    sums.note(LONG_PATHS, sum(each.times[-1] > LONGEST_PATH for each in forecasts))
+    ends = np.array([of_actor[actor].times[-1] for actor in of_actor.keys() & actors])
+    sums.note(_WITHOUT, len(actors) - len(ends))
+    sums.note(_UNKNOWN, len(of_actor) - len(ends))
+    main = rules.horizons[0]
+    sums.note(f"no numbers at {main:g} s: {{forecast}} ending earlier", (ends < main - SAME_TIME).sum())
+    sums.note(LONG_PATHS, (ends > LONGEST_PATH).sum())
     if not actors:
         return sums.counts(truth.scenario)
     paths, chances = _arrays(of_actor, truth)
@@ -152,8 +152,7 @@ def _counts(token: str, forecasts: Iterable[Forecast], truth: ForecastingTruth, 
         errors = actor_errors(path, true, valid, chances, most, rules.miss_distance)
         errors["without"] = np.where(valid[:, -1], np.isnan(errors["min_fde"]), np.nan)
         sums.add_rows(table, groups if most == rules.modes[0] else {EVERYBODY: groups[EVERYBODY]}, errors)
-        together = _together(path, true, chances, most, rules.miss_distance)
-        for column, value in together.items():
+        for column, value in _together(path, true, chances, most, rules.miss_distance).items():
             sums.add(table, TOGETHER, column, value)
     return sums.counts(truth.scenario)
 
@@ -199,9 +198,6 @@ FORECASTING: Final = Task(
     protocols=FORECASTING_PROTOCOLS,
     evaluator=ForecastingEvaluator,
     truth=lambda dataset, token, _rules, _form, _horizon: (forecasting_truth(dataset, token),),
-    counts=_counts,
-    result=lambda counts, rules: ForecastingEvaluator(rules).result_of(counts),
-    summary=ForecastingResult.as_dict,
     whole_recordings=True,
     has_horizon=False,
 )

@@ -49,10 +49,10 @@ class Forecast(FrozenArrays):
             raise GeometryError("paths: expected one mode or more of finite numbers; leave out what is not predicted")
         if not ((probabilities >= 0) & (probabilities <= 1)).all():
             raise GeometryError(f"probabilities: expected numbers from 0 to 1, found {probabilities.tolist()}")
-        object.__setattr__(self, "actor_id", checked_whole("actor id", self.actor_id))
-        object.__setattr__(self, "times", times)
-        object.__setattr__(self, "paths", paths)
-        object.__setattr__(self, "probabilities", probabilities)
+        actor_id = checked_whole("actor id", self.actor_id)
+        values = {"actor_id": actor_id, "times": times, "paths": paths, "probabilities": probabilities}
+        for name, value in values.items():
+            object.__setattr__(self, name, value)
         FrozenArrays.__post_init__(self)
 
     def at(self, steps: FloatArray, present: FloatArray) -> FloatArray:
@@ -127,8 +127,7 @@ def actor_errors(
     )
     best = np.argmin(np.where(np.isnan(fde), np.inf, fde), axis=1)[:, None]
     min_ade, min_fde, probability = (np.take_along_axis(each, best, 1)[:, 0] for each in (ade, fde, chance))
-    least = np.where(np.isnan(ade), np.inf, ade).min(axis=1, initial=np.inf)
-    least[np.isinf(least)] = np.nan
+    least = np.fmin.reduce(ade, axis=1)
     whole = valid.all(axis=1)
     return {
         "min_ade": np.where(whole, min_ade, np.nan),

@@ -14,7 +14,7 @@ from deepaccident_devkit.accidents.outcomes import MOST_MARGIN
 from deepaccident_devkit.accidents.replay import HORIZON
 from deepaccident_devkit.evaluation.means import Sums
 from deepaccident_devkit.evaluation.planning.cells import HORIZONS, STEP
-from deepaccident_devkit.evaluation.planning.contacts import Contacts, first_contacts
+from deepaccident_devkit.evaluation.planning.contacts import Contacts, first_contacts, without_gaps
 from deepaccident_devkit.evaluation.planning.scene import Plan, PlanningScene, recorded_poses, steps_of
 from deepaccident_devkit.geometry.box_arrays import gaps_of_pairs
 from deepaccident_devkit.support.arrays import FloatArray
@@ -152,21 +152,15 @@ def _margin(scene: PlanningScene) -> float:
 
 
 def _prolonged(scene: PlanningScene, frames: int) -> FloatArray:
-    """Return the recorded footprints, (frames, A, 5), with the partner's going straight on after its last label.
+    """Return (frames, A, 5) recorded footprints, and later those of the partner, which goes straight on.
 
-    Its velocity is that between its last two labels, however many frames are without one in between.
+    Its velocity is that between its last two labels, however many frames between them have none.
     """
-    footprint = np.full((frames, *scene.footprint.shape[1:]), np.nan)
-    footprint[: len(scene.footprint)] = scene.footprint
-    for actor in np.flatnonzero(scene.partner):
-        labelled = np.flatnonzero(np.isfinite(footprint[:, actor, 0]))
-        if len(labelled) < 2:
-            continue
-        previous, last = labelled[-2:]
-        step = (footprint[last, actor] - footprint[previous, actor])[:2] / (last - previous)
-        footprint[last + 1 :, actor] = footprint[last, actor]
-        footprint[last + 1 :, actor, :2] += np.arange(1, frames - last)[:, None] * step
-    return footprint
+    known = without_gaps(scene.footprint)
+    after = np.full((frames - len(known), *known.shape[1:]), np.nan)
+    last = np.broadcast_to(known[-1], after.shape).copy()
+    last[..., :2] += np.arange(1, len(after) + 1)[:, None, None] * (known[-1] - known[-2])[:, :2]
+    return np.concatenate([known, np.where(scene.partner[:, None], last, after)])
 
 
 def _accelerations(plan: Plan, before: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -200,7 +194,7 @@ def _unusable(scene: PlanningScene, margin: float, true: Contacts) -> str:
         return "no label shows the partner from here on"
     if true.overlapping[scene.partner].any():
         return "the pair touches at the present already"
-    if margin > MOST_MARGIN:
+    if not margin <= MOST_MARGIN:
         return f"the pair is {margin:.2f} m apart at the end"
     return (
         "" if true.time[scene.partner][0] <= scene.duration + _SLACK else "the recorded path does not meet the partner"

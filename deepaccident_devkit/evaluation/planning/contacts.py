@@ -50,7 +50,7 @@ def first_contacts(
         margins: (A,) metres of a gap that counts as contact.
         until: (A,) seconds.
     """
-    others = _without_gaps(others)
+    others = without_gaps(others)
     own = np.concatenate([path[:, :2], np.broadcast_to(size, (len(path), 2)), path[:, 2:]], axis=1)
     overlapping = gaps_of_pairs(own[:1], others[0]) <= margins
     found = np.tile([np.inf, np.nan, np.nan, 0.0], (len(margins), 1))
@@ -69,11 +69,10 @@ def _contact(
     frames = np.flatnonzero(np.isfinite(other[:, 0]))
     first, rows = int(frames[0]), other[frames]
     window = 0.0, min(until, int(frames[-1]) * FRAME_PERIOD) - first * FRAME_PERIOD
-    if len(frames) < 2 or window[1] <= 0:
+    if window[1] <= 0:
         return _NOTHING
-    way = np.column_stack([rows[:, :2], np.unwrap(rows[:, 4])])
     sizes = np.stack([size, np.median(rows[:, 2:4], axis=0)])
-    pair = pair_of(np.stack([path[frames], way]), sizes, margin=margin)
+    pair = pair_of(np.stack([path[frames], rows[:, [0, 1, 4]]]), sizes, margin=margin)
     time = contact_times(pair, _NO_BRAKING, [1.0], window=window)
     if np.isinf(time[0]):
         return _NOTHING
@@ -91,24 +90,21 @@ def _near(own: FloatArray, others: FloatArray, margins: FloatArray, until: Float
     """(A,) whether two can come to touch in time, by their distances at the frames and their ways between them."""
     reach = np.hypot(*own[0, 2:4]) / 2 + np.hypot(others[..., 2], others[..., 3]) / 2
     apart = np.hypot(others[..., 0] - own[:, None, 0], others[..., 1] - own[:, None, 1]) - reach - margins
-    there = np.isfinite(apart)
     in_time = np.arange(len(own))[:, None] * FRAME_PERIOD < until + FRAME_PERIOD
     step = np.hypot(*np.diff(own[:, :2], axis=0).T).max()
     steps = np.diff(others[..., :2], axis=0)
-    ways = np.where(np.isfinite(steps[..., 0]), np.hypot(steps[..., 0], steps[..., 1]), 0.0).max(axis=0, initial=0.0)
-    least = np.where(there & in_time, apart, np.inf).min(axis=0)
-    near: BoolArray = (least <= step + ways) & there.any(axis=0)
+    ways = np.fmax.reduce(np.hypot(steps[..., 0], steps[..., 1]), axis=0, initial=0.0)
+    near: BoolArray = np.fmin.reduce(np.where(in_time, apart, np.inf), axis=0) <= step + ways
     return near
 
 
-def _without_gaps(others: FloatArray) -> FloatArray:
-    """Return footprints (L, A, 5) in which whoever is missing between two labels goes straight from one to the next."""
-    filled = others.copy()
-    for actor in range(others.shape[1]):
-        labelled = np.flatnonzero(np.isfinite(others[:, actor, 0]))
-        frames = np.arange(labelled[0], labelled[-1] + 1) if len(labelled) else labelled
-        if len(frames) > len(labelled):
-            rows = others[labelled, actor]
-            rows[:, 4] = np.unwrap(rows[:, 4])
-            filled[frames, actor] = np.column_stack([np.interp(frames, labelled, column) for column in rows.T])
+def without_gaps(others: FloatArray) -> FloatArray:
+    """Return footprints (L, A, 5) without jumps of yaw; between two labels actors go straight where they have none."""
+    filled, frames = others.copy(), np.arange(len(others))
+    for rows in np.moveaxis(filled, 1, 0):
+        labelled = np.flatnonzero(np.isfinite(rows[:, 0]))
+        if len(labelled):
+            rows[labelled, 4] = np.unwrap(rows[labelled, 4])
+            columns = rows[labelled].T
+            rows[:] = np.column_stack([np.interp(frames, labelled, values, np.nan, np.nan) for values in columns])
     return filled

@@ -9,7 +9,6 @@ from typing import Any, ClassVar, Final
 import numpy as np
 
 from deepaccident_devkit.errors import EvaluationError
-from deepaccident_devkit.evaluation.evaluator import Counts
 from deepaccident_devkit.evaluation.means import Column, MeansEvaluator, MeansResult, Sums
 from deepaccident_devkit.evaluation.planning.cells import (
     CELL_PROTOCOLS,
@@ -60,12 +59,12 @@ class PlanningResult(MeansResult):
     main_row = GIVEN
     columns: ClassVar[Mapping[str, Column]] = {
         "avoided": Column("%", "higher"),
+        "contact": Column("%"),
         "striking": Column("%"),
         "striking_twins": Column("%"),
         "lost_twins": Column("%", is_signed=True),
         "l2": Column("m"),
         "l2_mean": Column("m"),
-        "contact": Column("%"),
         "collision": Column("%"),
         "point_collision": Column("%"),
         "left_out": Column("%", "neither"),
@@ -117,27 +116,22 @@ class PlanningEvaluator(MeansEvaluator[PlanningResult]):
             EvaluationError: there is no plan, it ends before the 3 s of the public codes, or the sample came before
                 with other counts.
         """
-        self.add(token, _counts(token, plans, scene, self.protocol))
-
-
-def _counts(token: str, plans: Iterable[Plan], scene: PlanningScene, rules: Protocol) -> Counts:
-    """What a sample adds."""
-    given: list[Any] = list(plans)
-    others = [each for each in given if not isinstance(each, Plan)]
-    if others or not given:
-        found = type(others[0]).__name__ if others else "none"
-        raise EvaluationError(f"{token}: expected one Plan or more, found {found}")
-    plan = max(given, key=lambda each: each.score)
-    rows = {GIVEN: plan, **trivial_plans(scene)}
-    sums = Sums()
-    sums.note(LONG_PATHS, plan.times[-1] > LONGEST_PATH)
-    sums.note(_LARGE_YAW, plan.yaw is not None and np.abs(plan.yaw).max() > 2 * np.pi)
-    if isinstance(rules, CleanPlanning):
-        sums.note(_CONTINUED, plan.times[-1] < HORIZONS[-1] - FRAME_PERIOD / 2)
-        add_clean(sums, rows, scene, rules)
-    else:
-        _add_cells(sums, token, rows, scene, rules)
-    return sums.counts()
+        given: list[Any] = list(plans)
+        others = [each for each in given if not isinstance(each, Plan)]
+        if others or not given:
+            found = type(others[0]).__name__ if others else "none"
+            raise EvaluationError(f"{token}: expected one Plan or more, found {found}")
+        plan = max(given, key=lambda each: each.score)
+        rows = {GIVEN: plan, **trivial_plans(scene)}
+        sums = Sums()
+        sums.note(LONG_PATHS, plan.times[-1] > LONGEST_PATH)
+        sums.note(_LARGE_YAW, plan.yaw is not None and np.abs(plan.yaw).max() > 2 * np.pi)
+        if isinstance(self.protocol, CleanPlanning):
+            sums.note(_CONTINUED, plan.times[-1] < HORIZONS[-1] - FRAME_PERIOD / 2)
+            add_clean(sums, rows, scene, self.protocol)
+        else:
+            _add_cells(sums, token, rows, scene, self.protocol)
+        self.add(token, sums.counts())
 
 
 def _add_cells(sums: Sums, token: str, rows: Mapping[str, Plan], scene: PlanningScene, rules: CellRules) -> None:
@@ -184,9 +178,6 @@ PLANNING: Final = Task(
     truth=lambda dataset, token, rules, _form, _horizon: (
         planning_scene(dataset, token, cut=isinstance(rules, CleanPlanning)),
     ),
-    counts=_counts,
-    result=lambda counts, rules: PlanningEvaluator(rules).result_of(counts),
-    summary=PlanningResult.as_dict,
     whole_recordings=True,
     needs_meta=True,
     vehicles_alone=True,

@@ -369,7 +369,10 @@ def _floats(values: Sequence[Iterable[float]], *shape: int) -> FloatArray:
 
 
 def plan_columns(results: Mapping[str, Sequence[PlanEntry]]) -> Columns:
-    """(N,) plans; raises ContentError for one whose lists do not go together."""
+    """(N,) plans; raises ContentError for one whose lists do not go together, or a sample without any."""
+    for token, given in results.items():
+        if not given:
+            raise ContentError(f"{entry_place(token)}: expected one plan or more, found none; leave the sample out")
     return _objects(
         results, lambda each: Plan(times=each.times, path=each.path, score=each.score, yaw=each.yaw or None)
     )

@@ -43,6 +43,7 @@ from deepaccident_devkit.evaluation.task import headlines, plain
 from deepaccident_devkit.parallel import run_batch, workers_kept
 from deepaccident_devkit.release.fingerprints import ScenarioHashes, fingerprint, scenario_hashes
 from deepaccident_devkit.support.arrays import ShortRepr
+from deepaccident_devkit.support.text import counted
 from deepaccident_devkit.taxonomy import SPLITS
 
 if TYPE_CHECKING:
@@ -97,18 +98,12 @@ class Partial:
 
     def text(self) -> str:
         """The mark that every number bears: `PARTIAL: 120 of 180 samples`."""
-        left_out = f", {self.extra} predictions left out" if self.extra else ""
-        return f"PARTIAL: {self.evaluated} of {self.expected} samples{left_out}"
+        left_out = f", {counted(self.extra, 'prediction')} left out" if self.extra else ""
+        return f"PARTIAL: {self.evaluated} of {counted(self.expected, 'sample')}{left_out}"
 
     def as_dict(self) -> dict[str, Any]:
         """By name, with the text as `mark`."""
-        return {
-            "missing": self.missing,
-            "extra": self.extra,
-            "expected": self.expected,
-            "evaluated": self.evaluated,
-            "mark": self.text(),
-        }
+        return asdict(self) | {"mark": self.text()}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -246,15 +241,9 @@ class EvaluationRun:
                 "dataroot": self.release.dataroot,
                 "fingerprint": self.release.fingerprint,
             },
-            "results": {
-                "path": self.results.path,
-                "task": self.results.task,
-                "fingerprint": self.results.fingerprint,
-                "meta": self.results.meta,
-                "form": self.results.form,
-            },
+            "results": self.results,
             "headlines": [{**asdict(each), "text": each.text()} for each in headlines(self.setup.task, self.result)],
-            "metrics": TASKS[self.setup.task].summary(self.result),
+            "metrics": self.result.as_dict(),
             "breakdowns": {each.by: self._breakdown(each) for each in self.breakdowns},
             "environment": {
                 "python": platform.python_version(),
@@ -281,7 +270,7 @@ class EvaluationRun:
                 "scenarios": group.scenarios,
                 "clusters": group.clusters,
                 "headlines": {each.path: each.value for each in headlines(self.setup.task, group.result)},
-                "metrics": TASKS[self.setup.task].summary(group.result),
+                "metrics": group.result.as_dict(),
                 "intervals": plain(group.intervals),
                 "notes": list(group.notes),
             }

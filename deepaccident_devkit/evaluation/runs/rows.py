@@ -126,8 +126,7 @@ def rows_table(rows: Sequence[Mapping[str, Any]]) -> Any:
     """Make the Arrow table of rows with the same columns: texts, numbers, booleans or None, of one kind in a column."""
     import pyarrow as pa
 
-    names = list(rows[0]) if rows else []
-    return pa.Table.from_arrays([_column([row[name] for row in rows]) for name in names], names=names)
+    return pa.table({name: _column([row[name] for row in rows]) for name in (rows[0] if rows else ())})
 
 
 def read_rows(path: Path) -> tuple[list[dict[str, Any]], dict[str, Any]]:

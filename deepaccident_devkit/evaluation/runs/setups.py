@@ -92,7 +92,7 @@ class SampleSelection:
             )
         listed = samples(dataset, self.split, self.samples, "paper", horizon=horizon, scope=self.scope)
         if self.samples == "all" and self.scope == "accident":
-            listed = [token for token in listed if _designed_accident(token)]
+            listed = [token for token in listed if token.partition("/")[0].endswith("_accident")]
         chosen = [token for token in listed if self.agents is None or agent_of(token) in self.agents]
         if not chosen:
             whose = "" if self.agents is None else f" of {', '.join(self.agents)}"
@@ -127,10 +127,6 @@ def scenario_of(token: str) -> str:
 def agent_of(token: str) -> str:
     """The agent's name in a sample's token; empty if it is no sample's token."""
     return token.rsplit("/", 2)[1] if token.count("/") > 1 else ""
-
-
-def _designed_accident(token: str) -> bool:
-    return token.split("/", 1)[0].endswith("_accident")
 
 
 def _agents(given: Sequence[str]) -> tuple[str, ...]:
@@ -179,13 +175,13 @@ class Coverage(ShortRepr):
         if self.options:
             remedy = "evaluate with these options, too, or predict again without them"
             parts = [f"the predictions are of the samples of {self.options}: {remedy}"]
+        elif self.agents:
+            parts.append(f"the predictions are of --split {', '.join(self.splits)} --agents {','.join(self.agents)}")
         if self.extra and not (self.missing or self.unknown):
             parts.append(
                 "leave them out with --allow-partial (allow_partial=True), or evaluate whole scenarios with --samples "
                 "all; no sample lacks a prediction, so the numbers are not partial then"
             )
-        if self.agents and not self.options:
-            parts.append(f"the predictions are of --split {', '.join(self.splits)} --agents {','.join(self.agents)}")
         return "; ".join(part for part in parts if part)
 
 
@@ -203,32 +199,43 @@ def coverage(dataset: Dataset, results: Collection[str], selection: SampleSelect
         NotAvailableError: likewise.
     """
     expected, given = selection.tokens(dataset), set(results)
-    others = sorted(given.difference(expected))
+    others = given.difference(expected)
     unknown = {token for token in others if not _is_sample(dataset, token)}
-    present = {agent_of(token) for token in given - unknown}
-    splits = {dataset.get("scenario", name)["split"] for name in set(map(scenario_of, given - unknown))}
+    present = set(map(agent_of, given - unknown))
+    of_scenarios = {dataset.get("scenario", name)["split"] for name in set(map(scenario_of, given - unknown))}
+    splits = tuple(name for name in SPLITS if name in of_scenarios)
+    agents = tuple(name for name in AGENTS if name in present)
+    is_known = given and not unknown and given != set(expected)
     return Coverage(
         expected=len(expected),
         missing=tuple(token for token in expected if token not in given),
-        extra=tuple(token for token in others if token not in unknown),
-        unknown=tuple(token for token in others if token in unknown),
-        splits=tuple(name for name in SPLITS if name in splits),
-        agents=tuple(name for name in AGENTS if name in present),
-        options="" if unknown or given == set(expected) else _missing_options(dataset, given, selection, splits),
+        extra=tuple(sorted(others - unknown)),
+        unknown=tuple(sorted(unknown)),
+        splits=splits,
+        agents=agents,
+        options=_missing_options(dataset, given, selection, splits, agents) if is_known else "",
     )
 
 
-def _missing_options(dataset: Dataset, tokens: set[str], asked: SampleSelection, splits: Iterable[str]) -> str:
+def _missing_options(
+    dataset: Dataset, tokens: set[str], asked: SampleSelection, splits: Iterable[str], agents: tuple[str, ...]
+) -> str:
     """Return the options that select exactly these samples, where they differ; empty if there are none."""
-    ends = [0.0, *(dataset.get("sample", token)["time_to_end"] for token in tokens)]
-    listed: SampleList = "all" if ends.count(0.0) > 1 else "evaluate"
-    scope: ScopeName = "accident" if all(map(_designed_accident, tokens)) else "all"
-    for split, horizon in product((asked.split, *splits), (asked.horizon, max(ends))):
-        made = replace(asked, split=split, samples=listed, scope=scope, horizon=horizon)
+    horizon = max(dataset.get("sample", token)["time_to_end"] for token in tokens)
+    choices: dict[str, tuple[Any, ...]] = {
+        "split": (asked.split, *splits),
+        "samples": get_args(SampleList),
+        "scope": get_args(ScopeName),
+        "agents": (asked.agents, agents),
+        "horizon": (asked.horizon, horizon),
+    }
+    for values in product(*choices.values()):
+        made = replace(asked, **dict(zip(choices, values, strict=True)))
         with suppress(ConfigError, NotAvailableError):
             if set(made.tokens(dataset)) == tokens:
                 changed = asdict(made).items() - asdict(asked).items()
-                return " ".join(f"--{name} {value}" for name, value in sorted(changed))
+                texts = {name: ",".join(value) if name == "agents" else value for name, value in sorted(changed)}
+                return " ".join(f"--{name} {text}" for name, text in texts.items())
     return ""
 
 
@@ -318,7 +325,7 @@ class EvaluationSetup:
         if not 0 < self.horizon <= _LONGEST_HORIZON:
             raise ConfigError(f"horizon: expected seconds above 0, at most {_LONGEST_HORIZON}, found {self.horizon!r}")
         object.__setattr__(self, "switches", FrozenDict(self.switches))
-        switched(TASKS[self.task].protocols[self.protocol], self.switches)  # refuses impossible choices
+        switched(protocols[protocol], self.switches)  # refuses impossible choices
 
     @property
     def rules(self) -> Any:
@@ -331,13 +338,7 @@ class EvaluationSetup:
 
     def as_dict(self) -> dict[str, Any]:
         """All of it, as JSON holds it, with the evaluator's own `settings`: every choice."""
-        return {
-            "task": self.task,
-            "protocol": self.protocol,
-            "switches": dict(self.switches),
-            "horizon": self.horizon,
-            "settings": self.evaluator().settings,
-        }
+        return asdict(self) | {"switches": dict(self.switches), "settings": self.evaluator().settings}
 
 
 def default_selection(
@@ -400,9 +401,9 @@ class SampleLoader:
                 "give motion results, or choose protocol 'paper' or 'boxes'"
             )
         form = self.results.form
-        if form is not None and (form.frames - 1) * form.step < self.setup.horizon - FRAME_PERIOD / 2:
+        if form is not None and (ahead := (form.frames - 1) * form.step) < self.setup.horizon - FRAME_PERIOD / 2:
             raise EvaluationError(
-                f"{self.results.path}: its predictions look {(form.frames - 1) * form.step:g} s ahead "
+                f"{self.results.path}: its predictions look {ahead:g} s ahead "
                 f"({form.frames} frames, {form.step:g} s apart, from the present on), less than the horizon of "
                 f"{self.setup.horizon:g} s; add the present frame if it is missing, or evaluate with a shorter horizon"
             )

@@ -19,7 +19,7 @@ from deepaccident_devkit.evaluation.runs.setups import agent_of, scenario_of
 from deepaccident_devkit.evaluation.task import HEADLINE_UNITS
 from deepaccident_devkit.evaluation.warning.recordings import GIVEN
 from deepaccident_devkit.reports import Table
-from deepaccident_devkit.support.text import columns_text
+from deepaccident_devkit.support.text import columns_text, counted
 
 SHOWN_BREAKDOWNS: Final = ("time_to_impact", "accident_visibility")
 _COLUMNS: Final = 5
@@ -30,6 +30,8 @@ _PUBLISHED_CELLS: Final = [-50.0, 50.0, 0.5]
 _PUBLISHED_PREDICTIONS: Final = 6
 _FEW_PATHS: Final = 0.9
 """Share of true paths with a match below which errors of paths say little of the others."""
+_MOST_INFEASIBLE: Final = 90
+"""Percent of plans from which on something is probably wrong with them."""
 _META: Final = 1000
 """Letters of the notes in results that are shown; they may hold a hash a scenario."""
 _TOLD: Final = ("best_f1", "quiet")
@@ -70,22 +72,22 @@ def summary_text(summary: Json, by: Sequence[str] = SHOWN_BREAKDOWNS) -> str:
     blocks = [
         ("evaluated", _head(summary)),
         ("results", _headlines(summary)),
-        *((("predictors", table),) if (table := predictors_text(summary["metrics"])) else ()),
-        *((("means", tables),) if (tables := _means_text(summary)) else ()),
+        ("predictors", predictors_text(summary["metrics"])),
+        ("means", _means_text(summary)),
         *((each.title, each.text(part)) for each, part in further_results(summary)),
-        ("counts", "\n".join(_counts(summary["metrics"]))),
+        ("counts", _counts(summary["metrics"])),
         *((f"by {name}", _breakdown(summary, name)) for name in by if name in summary["breakdowns"]),
+        ("notes", "\n".join([*notes_of(summary["metrics"]), *reading_notes(summary)])),
     ]
-    notes = "\n".join([*notes_of(summary["metrics"]), *reading_notes(summary)])
-    blocks += [("notes", notes)] if notes else []
-    return "\n\n".join(f"{title}{mark}\n{_indented(text)}" for title, text in blocks)
+    return "\n\n".join(f"{title}{mark}\n{_indented(text)}" for title, text in blocks if text)
 
 
 def _head(summary: Json) -> str:
     switches = ", ".join(f"{name}={value!r}" for name, value in summary["switches"].items())
     agents = "all agents" if summary["agents"] is None else ", ".join(summary["agents"])
     release, results, counts = summary["release"], summary["results"], summary["counts"]
-    others = f"; {counts['left_out']} predictions of other samples left out" if counts.get("left_out") else ""
+    left_out = counts.get("left_out", 0)
+    others = f"; left out: {counted(left_out, 'prediction')} of other samples" if left_out else ""
     horizon = f", horizon {summary['horizon']:g} s" if "means" not in summary["metrics"] else ""
     lines = {
         "task": f"{summary['task']}, protocol {summary['protocol']}{f' with {switches}' if switches else ''}",
@@ -96,8 +98,12 @@ def _head(summary: Json) -> str:
         "release": f"{release['dataroot']} ({release['version']}, {release['fingerprint']})",
         "devkit": summary["devkit_version"],
     }
-    width = max(map(len, lines))
-    return "\n".join(f"{name:<{width}}  {text}" for name, text in lines.items())
+    return _aligned(lines)
+
+
+def _aligned(lines: Json) -> str:
+    width = max(map(len, lines), default=0)
+    return "\n".join(f"{name:<{width}}  {text}".strip() for name, text in lines.items())
 
 
 def _headlines(summary: Json) -> str:
@@ -111,15 +117,16 @@ def _headlines(summary: Json) -> str:
         interval = [_interval(intervals.get(each["path"]))] if percent else []
         others = (_number(_at(part, each["path"])) for part in beside.values())
         rows.append((each["name"], each["text"], *interval, *others))
-    return "\n".join([columns_text(rows), *(groups[0]["notes"] if groups else [])])
+    notes = groups[0]["notes"] if groups else []
+    if percent:  # by the names of the rows, of which some may have no interval
+        names = [name for name, value, interval, *_ in rows if interval == "–" != value]
+        notes = [f"no interval of {', '.join(names)}: too few clusters have or change them"] * bool(names)
+    return "\n".join([columns_text(rows), *notes])
 
 
-def _counts(metrics: Json) -> Iterator[str]:
+def _counts(metrics: Json) -> str:
     """A line for each part of the metrics that holds whole numbers."""
-    found = dict(_whole_numbers(metrics, ""))
-    width = max(map(len, found), default=0)
-    for part, numbers in found.items():
-        yield f"{part:<{width}}  {', '.join(f'{name} {value}' for name, value in numbers.items())}".strip()
+    return _aligned({part: ", ".join(map(" ".join, numbers.items())) for part, numbers in _whole_numbers(metrics, "")})
 
 
 def _whole_numbers(part: Json, path: str) -> Iterator[tuple[str, dict[str, str]]]:
@@ -230,14 +237,12 @@ def _means_text(summary: Json) -> str:
     main = {each["path"].split("/")[1] for each in summary["headlines"]} if tables else ()
     others = "; ".join(name for name in tables if name not in main)
     texts = [table.to_text() for name, table in tables.items() if name in main]
-    return "\n\n".join([*texts, *([f"also in metrics_summary.json and the report: {others}"] if others else [])])
+    texts += [f"also in metrics_summary.json and the report: {others}"] * bool(others)
+    return "\n\n".join(texts)
 
 
 def _cell(figures: Json, path: str) -> str:
-    value: Any = figures
-    for name in path.split("/"):
-        value = value[name]
-    return number_text(value)
+    return number_text(_at(figures, path))
 
 
 def number_text(value: float | None) -> str:
@@ -260,11 +265,11 @@ def _operating(metrics: Json, given: Json) -> Iterator[str]:
 def results_text(results: Results) -> str:
     """A few aligned lines: whose predictions, of which samples, in which form."""
     tokens = results.tokens
-    agents = Counter(agent_of(token) for token in tokens)
+    agents = Counter(map(agent_of, tokens))
     lines = {
         "results": f"{results.task}, {results.path}",
         "fingerprint": results.fingerprint,
-        "samples": f"{len(tokens)} of {len({scenario_of(token) for token in tokens})} scenarios",
+        "samples": f"{len(tokens)} of {len(set(map(scenario_of, tokens)))} scenarios",
         "agents": ", ".join(f"{name} {count}" for name, count in sorted(agents.items())),
         "meta": shortened(json.dumps(results.meta, ensure_ascii=False), _META),
     }
@@ -274,8 +279,7 @@ def results_text(results: Results) -> str:
             f"{form.stored}, up to {form.predictions} predictions of {form.frames} frames, {form.step:g} s apart, "
             f"cells x {form.grid.x}, y {form.grid.y}, orientation {form.grid.orientation}, labels {form.labels}"
         )
-    width = max(map(len, lines))
-    return "\n".join(f"{name:<{width}}  {text}".rstrip() for name, text in lines.items())
+    return _aligned(lines)
 
 
 def reading_notes(summary: Json) -> list[str]:
@@ -287,12 +291,21 @@ def reading_notes(summary: Json) -> list[str]:
         notes += _paths(metrics)
     elif summary["task"] == "accident" and released and form is not None:
         notes += _predictions(form)
+    elif summary["task"] == "planning":
+        notes += _infeasible(metrics)
     elif summary["task"] == "detection" and released:
         notes.append(
             "released: hidden boxes and the agent's own are truth, a class without true boxes counts as 0, an error "
             "as 1 where a recall is not reached, velocities are the label's raw ones; --protocol paper leaves these out"
         )
     return notes
+
+
+def _infeasible(metrics: Json) -> Iterator[str]:
+    for table, rows in metrics["means"].items():
+        share = rows[GIVEN].get("infeasible") or 0.0
+        if share >= _MOST_INFEASIBLE:
+            yield f"suspicious: {share:.0f} % of the plans of {table} cannot be driven; --sanity looks for mistakes"
 
 
 def _cells(form: Json, ranges: Sequence[str]) -> Iterator[str]:

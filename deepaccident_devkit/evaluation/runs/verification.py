@@ -31,7 +31,7 @@ from deepaccident_devkit.evaluation.runs.rows import rows_table, sample_rows
 from deepaccident_devkit.release.fingerprints import ScenarioHashes, fingerprint
 from deepaccident_devkit.reports import Report, Row, record_rows
 from deepaccident_devkit.support.arrays import ShortRepr
-from deepaccident_devkit.support.text import path_of
+from deepaccident_devkit.support.text import counted, path_of
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -121,8 +121,9 @@ class Verification(Report):
 
     def to_text(self) -> str:
         """A line a difference, the first ones, and how many more there are."""
-        found = f"{len(self.differences)} differences; {self.samples} samples evaluated again"
-        same = f"the same; {self.samples} samples evaluated again, all numbers are equal"
+        again = f"{counted(self.samples, 'sample')} evaluated again"
+        found = f"{counted(len(self.differences), 'difference')}; {again}"
+        same = f"the same; {again}, all numbers are equal"
         lines = [f"{self.folder}: {same if self.is_same else found}"]
         lines += [f"  {each.text()}" for each in self.differences[:_SHOWN]]
         lines += [f"  and {len(self.differences) - _SHOWN} more"] * (len(self.differences) > _SHOWN)

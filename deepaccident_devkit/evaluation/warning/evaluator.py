@@ -11,7 +11,7 @@ from typing import Any, Final
 from deepaccident_devkit.evaluation.accident_truth import AccidentContext, checked_facts, compared_facts
 from deepaccident_devkit.evaluation.evaluator import Counts, Evaluator
 from deepaccident_devkit.evaluation.predictions import Prediction
-from deepaccident_devkit.evaluation.task import Task, TaskResult, protocol_of
+from deepaccident_devkit.evaluation.task import Task, protocol_of
 from deepaccident_devkit.evaluation.warning.anticipation import AnticipationResult, CleanWarnings
 from deepaccident_devkit.evaluation.warning.field import FieldResult, FieldWarnings
 from deepaccident_devkit.evaluation.warning.recordings import PART, parts_of, sample_counts
@@ -77,7 +77,8 @@ class WarningEvaluator(Evaluator[Any]):
             EvaluationError: the token is no sample's, the context or something in it is missing, the prediction is
                 neither, or the sample came before with another outcome.
         """
-        self.add(token, _counts(token, prediction, label, context, self.protocol))
+        checked_facts(label, context)
+        self.add(token, sample_counts(token, prediction, label, context or AccidentContext()))
 
     def result_of(self, counts: Collection[Counts]) -> Result:
         """The metrics of some samples' counts, in any order; of what `pooled` gives, too."""
@@ -109,26 +110,12 @@ class WarningEvaluator(Evaluator[Any]):
         return not isinstance(self.protocol, FieldWarnings)
 
 
-def _counts(
-    token: str,
-    prediction: Prediction,
-    label: MotionLabels | None,
-    context: AccidentContext | None,
-    _protocol: Protocol,
-) -> Counts:
-    checked_facts(label, context)
-    return sample_counts(token, prediction, label, context or AccidentContext())
-
-
 WARNING: Final = Task(
     name="warning",
     kinds=("motion", "accident"),
     protocols=WARNING_PROTOCOLS,
     evaluator=WarningEvaluator,
     truth=partial(compared_facts, references=True),
-    counts=_counts,
-    result=lambda counts, protocol: protocol.result(counts, references=True),
-    summary=TaskResult.as_dict,
     whole_recordings=True,
     needs_meta=True,
 )

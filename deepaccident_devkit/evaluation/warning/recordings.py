@@ -19,12 +19,12 @@ from deepaccident_devkit.errors import EvaluationError
 from deepaccident_devkit.evaluation.accident_truth import (
     REFERENCES,
     SLACK,
-    UNPLACED_NOTE,
     AccidentContext,
     BoxTruth,
     Involvement,
     Pair,
     named_alarms,
+    not_counted_notes,
     position_difference,
     within_horizon,
 )
@@ -292,14 +292,9 @@ def recordings_of(parts: Sequence[Collection[Counts]]) -> list[Recording]:
     ]
 
 
-def left_out_notes(samples: Collection[Counts]) -> Iterator[str]:
-    """What is said of samples and alarms that do not count."""
-    unplaced = sum(each["kind"] == UNPLACED for each in samples)
-    if unplaced:
-        yield UNPLACED_NOTE.format(unplaced)
-    beyond = sum(each["beyond"] for each in samples)
-    if beyond:
-        yield f"{beyond} alarms are for later than the horizon and do not count"
+def left_out_notes(samples: Collection[Counts]) -> list[str]:
+    """Say which samples and alarms do not count."""
+    return not_counted_notes(sum(each["kind"] == UNPLACED for each in samples), sum(each["beyond"] for each in samples))
 
 
 def series_of(recordings: Sequence[Recording], predictor: str, scores_of: ScoresOf, draw: int = 0) -> ScoreSeries:

@@ -17,7 +17,7 @@ from deepaccident_devkit.evaluation.results import Results
 from deepaccident_devkit.evaluation.runs import EvaluationRun
 from deepaccident_devkit.evaluation.runs.further import further_results
 from deepaccident_devkit.evaluation.runs.over_bytes import sent_bytes
-from deepaccident_devkit.evaluation.runs.sanity import NOTHING_WRONG
+from deepaccident_devkit.evaluation.runs.sanity import SanityReport
 from deepaccident_devkit.evaluation.runs.setups import TASKS
 from deepaccident_devkit.evaluation.runs.text import means_tables, predictor_tables, reading_notes
 from deepaccident_devkit.evaluation.task import Headline, headlines
@@ -61,7 +61,7 @@ def report_context(run: EvaluationRun) -> dict[str, Any]:
             for each in _headlines(run.setup.task, run.result)
         ],
         "interval": f"{percent}interval",
-        "interval_notes": () if group is None else group.notes,
+        "interval_notes": () if group is None or group.intervals else group.notes,
         "predictors": [*predictor_tables(told), *means_tables(told).values()],
         "further": {
             each.title.capitalize(): (each.tables(part), [*part["notes"], *part["interval_notes"]])
@@ -72,7 +72,7 @@ def report_context(run: EvaluationRun) -> dict[str, Any]:
         "counts": _counts(run.result, told),
         "breakdowns": [_breakdown(run.setup.task, each) for each in run.breakdowns if each.by not in same],
         "same": [f"{name.replace('_', ' ')} {value}" for name, value in same.items() if name != EVERYTHING],
-        "sanity": None if run.sanity is None else _sanity(run.sanity),
+        "sanity": None if run.sanity is None else SanityReport(**run.sanity),
         "choices": dict(_choices(run)),
     }
 
@@ -138,11 +138,6 @@ def _groups(task: str, broken: Breakdown[Any], groups: Sequence[Group[Any]], who
     how = f"{100 * broken.resampling.confidence:g} % intervals, if there are {LEAST_CLUSTERS} clusters"
     heading = [broken.by.replace("_", " "), "samples", "scenarios", *names]
     return {"heading": heading, "rows": rows, "caption": f"{whose}; {how}"}
-
-
-def _sanity(report: Mapping[str, Any]) -> dict[str, Any]:
-    """What a sanity check says, as `SanityReport.as_dict` has it."""
-    return {"warnings": report["warnings"], "said": [] if report["warnings"] else [NOTHING_WRONG]}
 
 
 def _choices(run: EvaluationRun) -> Iterator[tuple[str, Any]]:

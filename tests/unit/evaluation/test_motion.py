@@ -264,7 +264,7 @@ def test_the_choices_of_the_protocols_and_what_counts_hold() -> None:
     ranges = {"iou": 100.0, "pq": 100.0, "sq": 100.0, "rq": 100.0, **dict(zip(COUNTS, (5, 0, 0), strict=True))}
     far = {"iou": 100 / 3, "pq": 50.0, "sq": 100.0, "rq": 50.0, **dict(zip(COUNTS, (5, 5, 5), strict=True))}
     result = evaluator.compute().as_dict()
-    assert result.pop("notes")[0].startswith("1 of 1 predictions: given as instance maps")
+    assert result.pop("notes")[0].startswith("1 of 1 prediction: given as instance maps")
     assert result == {
         "ranges": {"30x30": ranges, "100x100": pytest.approx(far)},
         "min_ade": 0.0,

@@ -1,4 +1,4 @@
-"""The five doors of each task, the choices of its protocols, and the headlines and text of its results."""
+"""The doors of each task, the choices of its protocols, and the headlines and text of its results."""
 
 import copy
 import json
@@ -39,20 +39,17 @@ every_protocol = pytest.mark.parametrize(
         pytest.param("forecasting", "clean", marks=pytest.mark.slow),
     ],
 )
-def test_read_truth_counts_result_summary(
-    task: TaskName, protocol: str, da_motion: DeepAccident, tmp_path: Path
-) -> None:
+def test_read_truth_update_compute(task: TaskName, protocol: str, da_motion: DeepAccident, tmp_path: Path) -> None:
     setup = EvaluationSetup(task=task, protocol=protocol)
     run, results = stored_run(da_motion, setup, tmp_path / "results")
-    doors, counts = TASKS[task], []
-    assert results.task in doors.kinds
+    rules, evaluator = setup.rules, TASKS[task].evaluator(setup.rules)
+    assert results.task in TASKS[task].kinds
     for token in results.tokens:
-        prediction = doors.read(results, da_motion, token, setup.rules)
-        truth = doors.truth(da_motion, token, setup.rules, results.form, setup.horizon)
-        counts.append(doors.counts(token, prediction, *truth, setup.rules))
-    summary = doors.summary(doors.result(counts, setup.rules))
-    assert summary["samples"] == len(results) > 1
-    assert summary == run.result.as_dict()
+        prediction = TASKS[task].read(results, da_motion, token, rules)
+        truth = TASKS[task].truth(da_motion, token, rules, results.form, setup.horizon)
+        evaluator.update(token, prediction, *truth)
+    assert evaluator.compute().samples == len(results) > 1
+    assert evaluator.compute().as_dict() == run.result.as_dict()
 
 
 @pytest.mark.slow

@@ -299,8 +299,8 @@ def test_what_is_left_out_is_counted_and_said() -> None:
         "unplaced": False,
     }
     made = BOXES.result(counts)
-    assert made.notes == ("1 alarms are for later than the horizon and do not count", UNPLACED_NOTE.format(1))
-    left_out = {"at_impact": 0, "unplaced": 0, "notes": made.notes[:1]}
+    assert made.notes == (UNPLACED_NOTE.format("1 sample"), "not counted: 1 alarm for later than the horizon")
+    left_out = {"at_impact": 0, "unplaced": 0, "notes": made.notes[1:]}
     assert replace(made, **left_out) == BOXES.result([*kept, counts[-1]])
     for now in (kept, BOXES.pooled(kept)):  # counts that earlier versions kept do not say what was unplaced
         before = [{name: value for name, value in each.items() if name != "unplaced"} for each in now]

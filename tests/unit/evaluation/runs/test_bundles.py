@@ -13,7 +13,8 @@ from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit._version import __version__
-from deepaccident_devkit.errors import ResultsError
+from deepaccident_devkit.errors import EvaluationError, ResultsError
+from deepaccident_devkit.evaluation.means import Sums
 from deepaccident_devkit.evaluation.results import Results, read_results
 from deepaccident_devkit.evaluation.runs import (
     EvaluationRun,
@@ -25,7 +26,7 @@ from deepaccident_devkit.evaluation.runs import (
     read_rows,
     save_run,
 )
-from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
+from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup, TaskName
 from deepaccident_devkit.support.reading import file_checksum
 
 FILES = {"metrics_summary.json", "counts.json", "samples.parquet", "scenarios.json", "files.json"}
@@ -250,6 +251,49 @@ def test_a_summary_against_its_schema(run: EvaluationRun, tmp_path: Path, fault:
     with pytest.raises(ResultsError, match=rf"metrics_summary.json: does not say what was evaluated: {told}") as e:
         read_bundle(path.parent)
     assert len(str(e.value)) < 1000
+
+
+DAMAGED: dict[str, Callable[[Any], object]] = {
+    "no names": lambda counts: counts.pop("names"),
+    "names that are none": lambda counts: counts.update(names=7),
+    "names that move a cursor": lambda counts: counts.update(names=counts["names"].replace("given", "\x1b[2J", 1)),
+    "names of no table": lambda counts: counts.update(names=counts["names"].replace("/", "-")),
+    "too many names": lambda counts: counts.update(names=counts["names"] + "\nmore"),
+    "no numbers": lambda counts: counts.pop("numbers"),
+    "numbers of three": lambda counts: counts["numbers"][0].append(1.0),
+    "words for numbers": lambda counts: counts.update(numbers=[["a", "b"]] * len(counts["numbers"])),
+    "no notes": lambda counts: counts.pop("notes"),
+    "notes that are no numbers": lambda counts: counts.update(notes={"{sample}": "many"}),
+    "samples that are none": lambda counts: counts.update(samples=[]),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGED)
+@pytest.mark.parametrize("task", ["planning", "forecasting"])
+def test_damaged_counts_of_means(run: EvaluationRun, tmp_path: Path, task: TaskName, damage: str) -> None:
+    setup = EvaluationSetup(task=task, protocol="clean")
+    evaluator, sums = setup.evaluator(), Sums()
+    column = "avoided" if task == "planning" else "min_fde"
+    for table in ("1 s", "2 s"):
+        sums.add(table, "given", column, 1.0)
+    evaluator.add("a/b/ego_vehicle/001", sums.counts())
+    path = evaluator.save(tmp_path / "counts.json")
+    bundle = replace(read_bundle(save_run(run, tmp_path / "run")), folder=tmp_path, setup=setup)
+    assert bundle.evaluator().compute().samples == 1
+    content = read(path)
+    DAMAGED[damage](content["counts"]["a/b/ego_vehicle/001"])
+    path.write_text(json.dumps(content), encoding="utf-8")
+    with pytest.raises((ResultsError, EvaluationError), match=r"counts.json: ") as caught:
+        bundle.evaluator()
+    assert "\x1b" not in str(caught.value)
+
+
+def test_a_note_in_counts_is_no_format(tmp_path: Path) -> None:
+    evaluator, sums = EvaluationSetup(task="planning", protocol="clean").evaluator(), Sums()
+    sums.note("{:>999999999999} {0.__class__.__mro__} of {plan}")
+    evaluator.add("a/b/ego_vehicle/001", sums.counts())
+    (note,) = evaluator.compute().notes
+    assert len(note) < 100
 
 
 def test_scenarios_without_hashes_are_no_bundle_s(run: EvaluationRun, tmp_path: Path) -> None:

@@ -40,15 +40,14 @@ WRITTEN = {
     "further.with_further": "resampling=None",
     "over_bytes.over_bytes": "resampling=None, common=False",
     "rows.STAMP_KEY": "b'deepaccident'",
-    "sanity.NOTHING_WRONG": "'Nothing looks wrong with the predictions.'",
-    "sanity.CHECKED": "('motion', 'accident', 'detection')",
     "sanity.SAMPLES": "20",
     "sanity.LISTS": "60",
     "sanity.NEAR_IN_TIME": "0.15",
     "sanity.MOVING": "4.0",
     "sanity.STRAIGHT": "0.2617993877991494",
     "sanity.FEWEST_FRAMES": "3",
-    "sanity.Seen": "empty=False, scores=(), probabilities=False, headings=(0, 0)",
+    "sanity.SanityReport": "compared='', sought=()",
+    "sanity.Seen": "empty=False, scores=(), probabilities=False",
     "setups.LIST_STEP": "0.5",
     "setups.TASK_RESULTS": (
         "mappingproxy({'motion': ('motion',), 'accident': ('motion', 'accident'), "
@@ -56,7 +55,7 @@ WRITTEN = {
         "'forecasting': ('forecasting',)})"
     ),
     "setups.SampleSelection": "samples='evaluate', scope='accident', agents=None, horizon=2.0",
-    "setups.Coverage": "missing=(), extra=(), unknown=(), splits=(), agents=()",
+    "setups.Coverage": "missing=(), extra=(), unknown=(), splits=(), agents=(), options=''",
     "setups.EvaluationSetup": "protocol='released', switches=<factory>, horizon=2.0",
     "setups.default_selection": "split='val', samples=None, scope=None, agents=None",
     "setups.evaluation_store": "command=''",
@@ -88,5 +87,5 @@ def test_every_default_and_constant_written_out(tmp_path: Path) -> None:
     write_rows(tmp_path / "rows", [], {})
     assert (read_rows(tmp_path / "rows"), list(differing({}, {})), list(notes_of({}))) == (([], {}), [], [])
     assert (checked_target(tmp_path / "new"), breakdowns_of("warning")[:2]) == (tmp_path / "new", ("all", "agent"))
-    assert (SanityReport(samples=0, warnings=()).warnings_text(), Coverage(expected=1).is_complete) == ("", True)
+    assert (SanityReport(samples=0, warnings=()).sought, Coverage(expected=1).is_complete) == ((), True)
     assert_refused((lambda: compare_bundles(tmp_path / "a", tmp_path / "b"), ResultsError, ("no such folder",)))

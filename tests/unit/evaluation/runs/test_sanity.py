@@ -2,37 +2,46 @@
 
 import json
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import permutations
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 from memory_results import MemoryResults
+from planning_scenes import scene
 from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.baselines import predict_accidents, predict_detections, predict_motion
+from deepaccident_devkit.baselines import (
+    predict_accidents,
+    predict_detections,
+    predict_forecasts,
+    predict_motion,
+    predict_plan,
+)
 from deepaccident_devkit.errors import EvaluationError
 from deepaccident_devkit.evaluation.accident import accident_context
 from deepaccident_devkit.evaluation.detection import DetectedBoxes
+from deepaccident_devkit.evaluation.forecasting import Forecast, forecasting_truth
+from deepaccident_devkit.evaluation.planning import Plan, PlanningScene, planning_scene, trivial_plans
 from deepaccident_devkit.evaluation.predictions import Accident, MotionOutput, instances_of
+from deepaccident_devkit.evaluation.runs import default_selection
 from deepaccident_devkit.evaluation.runs import sanity as sanity_module
 from deepaccident_devkit.evaluation.runs.sanity import (
     SanityReport,
     Seen,
-    accident_tally,
-    are_followed,
-    are_near,
-    are_of_one_size,
     check_sanity,
     class_tally,
     facts_of,
     mistakes_of,
+    summed,
+    tallies_of,
     tally_of,
 )
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
-from deepaccident_devkit.geometry import BevGrid
+from deepaccident_devkit.geometry import SE3, BevGrid, Boxes
 from deepaccident_devkit.motion import MotionHeads
 
 Change = Callable[[DeepAccident, str, Any], Any]
@@ -47,6 +56,16 @@ AXES = {
     "turned right": [[0, 1], [-1, 0]],
 }
 """Name → matrix from true to given."""
+
+
+KINDS = {
+    "maps": "motion",
+    "heads": "motion",
+    "accidents": "accident",
+    "boxes": "detection",
+    "plans": "planning",
+    "forecasts": "forecasting",
+}
 
 
 @pytest.fixture(scope="module")
@@ -77,12 +96,36 @@ def right(da_motion: DeepAccident, tokens: list[str]) -> dict[str, dict[str, Any
         },
         "accidents": accidents,
         "boxes": detections,
+        "plans": {token: [recorded_plan(da_motion, token)] for token in samples_of_vehicles(da_motion)},
+        "forecasts": {token: recorded_forecasts(da_motion, token) for token in samples_of_vehicles(da_motion)[::7]},
     }
 
 
+def samples_of_vehicles(dataset: DeepAccident) -> list[str]:
+    return default_selection(EvaluationSetup(task="planning", protocol="clean"), "train").tokens(dataset)
+
+
+def recorded_plan(dataset: DeepAccident, token: str) -> Plan:
+    recorded = trivial_plans(planning_scene(dataset, token))["recorded"]
+    return replace(recorded, times=recorded.times[4::5], path=recorded.path[4::5], yaw=recorded.yaw[4::5])
+
+
+def recorded_forecasts(dataset: DeepAccident, token: str) -> list[Forecast]:
+    truth = forecasting_truth(dataset, token)
+    forecasts = []
+    for actor, path in zip(truth.actor_id.tolist(), truth.path[:, 4:30:5], strict=True):
+        known = np.isfinite(path[:, 0])
+        known = known & (np.cumsum(~known) == 0)
+        times = np.arange(1, 7)[known] / 2
+        if known.any():
+            forecasts.append(Forecast(actor_id=actor, times=times, paths=path[None, known], probabilities=[1.0]))
+    return forecasts
+
+
 def sanity(dataset: DeepAccident, kind: str, predictions: dict[str, Any], **how: Any) -> SanityReport:
-    task: Any = {"maps": "motion", "heads": "motion", "accidents": "accident", "boxes": "detection"}[kind]
-    setup = EvaluationSetup(task=task, protocol="boxes" if task == "accident" else "released")
+    task: Any = KINDS[kind]
+    protocols = {"accident": "boxes", "planning": "clean", "forecasting": "clean"}
+    setup = EvaluationSetup(task=task, protocol=protocols.get(task, "released"))
     return check_sanity(dataset, MemoryResults(task, predictions), setup, list(predictions), **how)
 
 
@@ -123,6 +166,65 @@ def of_centers(change: Callable[[np.ndarray, Any, Any], np.ndarray]) -> Change:
         return replace(given, boxes=replace(given.boxes, center=change(given.boxes.center, *poses)))
 
     return changed
+
+
+def of_height(change: Callable[[Boxes], np.ndarray]) -> Change:
+    def changed(_: DeepAccident, __: str, given: DetectedBoxes) -> DetectedBoxes:
+        center = np.column_stack([given.boxes.center[:, :2], change(given.boxes)])
+        return replace(given, boxes=replace(given.boxes, center=center))
+
+    return changed
+
+
+def of_paths(change: Callable[[np.ndarray, np.ndarray, Any], tuple[np.ndarray, np.ndarray]]) -> Change:
+    """By times and places (…, T, 2) of plans or forecasts, and the ego's pose."""
+
+    def changed(dataset: DeepAccident, token: str, given: list[Any]) -> list[Any]:
+        paths = []
+        for each in given:
+            name = "path" if isinstance(each, Plan) else "paths"
+            times, places = change(each.times, getattr(each, name), dataset.world_from(token, "ego"))
+            paths.append(replace(each, times=times, **{name: places}))
+        return paths
+
+    return changed
+
+
+def in_the_world(times: np.ndarray, places: np.ndarray, ego: Any) -> tuple[np.ndarray, np.ndarray]:
+    flat = places.reshape(-1, 2)
+    moved = ego.apply(np.column_stack([flat, np.zeros(len(flat))]))[:, :2]
+    return times, moved.reshape(places.shape)
+
+
+def late(times: np.ndarray, places: np.ndarray, _: Any) -> tuple[np.ndarray, np.ndarray]:
+    """The present first, under the time of the first step; of forecasts, whose present is not 0, without it."""
+    if places.ndim == 3:
+        return times + 0.5, places
+    return times, np.vstack([np.zeros(2), places[:-1]])
+
+
+def of_yaw(change: Callable[[np.ndarray], np.ndarray]) -> Change:
+    return lambda _, __, given: [replace(each, yaw=change(each.yaw)) for each in given]
+
+
+PATHS: dict[str, Change] = {
+    **{name: of_paths(lambda times, at, _, by=by: (times, at @ np.transpose(by))) for name, by in AXES.items()},
+    "world frame for ego frame": of_paths(in_the_world),
+    "steps for places": of_paths(
+        lambda times, at, _: (times, np.diff(at, axis=-2, prepend=2 * at[..., :1, :] - at[..., 1:2, :]))
+    ),
+    "one step late": of_paths(late),
+    "times in frames": of_paths(lambda times, at, _: (10 * times, at)),
+    "times in milliseconds": of_paths(lambda times, at, _: (1000 * times, at)),
+}
+"""Mistakes of plans and forecasts alike."""
+ON_CURVES: dict[str, Change] = {
+    **{name: PATHS[name] for name in AXES if name not in ("x mirrored", "turned left", "turned right")},
+    "yaw in degrees": of_yaw(np.rad2deg),
+    "yaw clockwise": of_yaw(np.negative),
+    "yaw clockwise from y": of_yaw(lambda yaw: np.pi / 2 - yaw),
+}
+"""Mistakes of plans that do not show, or not which one it is, on a straight way."""
 
 
 def in_ego(matrix: list[list[int]]) -> Change:
@@ -193,9 +295,38 @@ PLANTED: dict[tuple[str, str], Change] = {
         )
         for names in list(permutations(("length", "width", "height")))[1:]
     },
+    ("boxes", "half sizes"): of_boxes(size=lambda size: size / 2),
+    ("boxes", "double sizes"): of_boxes(size=lambda size: 2 * size),
+    ("boxes", "sizes do not fit"): of_boxes(size=lambda size: 100 * size),
+    ("boxes", "z of the lower face"): of_height(lambda boxes: boxes.center[:, 2] - boxes.size[:, 2] / 2),
+    ("boxes", "z of the upper face"): of_height(lambda boxes: boxes.center[:, 2] + boxes.size[:, 2] / 2),
+    ("boxes", "heights do not fit"): of_height(lambda boxes: boxes.center[:, 2] - 5),
+    ("boxes", "velocities per frame"): of_boxes(velocity=lambda velocity: velocity / 10),
+    ("boxes", "velocities per step"): of_boxes(velocity=lambda velocity: velocity / 2),
     ("boxes", "headings look random"): in_degrees,
     ("boxes", "classes swapped"): of_boxes(category=lambda category: np.array([1, 2, 3, 4, 5, 0])[category]),
+    **{("forecasts", name): change for name, change in PATHS.items()},
+    **{("plans", name): change for name, change in PATHS.items() if name not in ON_CURVES},
+    ("plans", "one step early"): of_paths(lambda times, at, _: (times, np.vstack([at[1:], 2 * at[-1] - at[-2]]))),
+    ("plans", "yaw from y"): of_yaw(lambda yaw: yaw - np.pi / 2),
+    ("plans", "yaw backwards"): of_yaw(lambda yaw: yaw - np.pi),
+    ("plans", "headings look random"): of_yaw(lambda yaw: yaw + np.pi / 3),
+    ("forecasts", "all 8 predictions looked at are empty"): lambda _, __, ___: [],
 }
+
+
+@dataclass(frozen=True)
+class Loaded:
+    """A loader of always the same plans and scene."""
+
+    dataset: Any
+    results: Any
+    plans: list[Plan]
+    scene: PlanningScene
+    places: None = None
+
+    def __call__(self, _: str) -> tuple[Any, ...]:
+        return self.plans, self.scene
 
 
 @pytest.mark.parametrize(("kind", "mistake"), PLANTED)
@@ -206,16 +337,39 @@ def test_each_mistake_is_named_as_exactly_that(
     report = sanity(da_motion, kind, planted)
     (warning,) = report.warnings
     assert warning.startswith(mistake)
-    assert report.to_text().endswith(f"WARNING: {warning}")
+    assert f"\nWARNING: {warning}" in report.to_text()
+    assert report.to_text().endswith("there is too little to compare.") == (not report.sought)
 
 
-@pytest.mark.parametrize("kind", ["maps", "heads", "accidents", "boxes"])
+@pytest.mark.parametrize("mistake", ["", *PATHS, *ON_CURVES, "yaw from y", "yaw backwards"])
+def test_mistakes_of_plans_on_curves(monkeypatch: pytest.MonkeyPatch, mistake: str) -> None:
+    """Of an ego that turns left at 8 m/s, by 23° a second, and stands 50 m beside the world's origin."""
+    seconds = np.arange(61) / 10
+    yaw = 0.4 * seconds
+    recorded = np.column_stack([20 * np.sin(yaw), 20 * (1 - np.cos(yaw)), yaw])
+    driven = replace(scene(8), recorded=recorded)
+    ego = SE3.from_yaw(0.7, (50.0, 30.0, 0.0))
+    dataset: Any = SimpleNamespace(world_from=lambda _, __: ego, places=())
+    plan = Plan(times=seconds[5:31:5], path=recorded[5:31:5, :2], yaw=yaw[5:31:5])
+    change = {**PATHS, **ON_CURVES, **{name: PLANTED["plans", name] for name in ("yaw from y", "yaw backwards")}}
+    plans = change[mistake](dataset, "", [plan]) if mistake else [plan]
+    results: Any = MemoryResults("planning", {f"{number}": plans for number in range(20)})
+    monkeypatch.setattr(sanity_module, "SampleLoader", lambda *_: Loaded(dataset, results, plans, driven))
+    report = check_sanity(
+        dataset, results, EvaluationSetup(task="planning", protocol="clean"), list(results.predictions)
+    )
+    assert [each.partition(":")[0] for each in report.warnings] == [mistake] * bool(mistake)
+    assert report.samples == 20
+
+
+@pytest.mark.parametrize("kind", KINDS)
 def test_right_predictions_raise_no_suspicion(
     da_motion: DeepAccident, right: dict[str, dict[str, Any]], kind: str
 ) -> None:
     report = sanity(da_motion, kind, right[kind])
     assert report.warnings == ()
-    assert report.to_text().endswith("\nNothing looks wrong with the predictions.")
+    assert "\nNone of these mistakes was found: x mirrored, " in report.to_text()
+    assert report.sought
     assert json.loads(json.dumps(report.as_dict(), allow_nan=False))["warnings"] == []
 
 
@@ -235,6 +389,14 @@ def shown(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[DeepAccident,
     )
 
 
+def at_another_speed(plan: Plan, factor: float) -> Plan:
+    return replace(plan, path=plan.poses(factor * plan.times)[:, :2])
+
+
+def moved_boxes(detected: DetectedBoxes) -> DetectedBoxes:
+    return replace(detected, boxes=replace(detected.boxes, center=detected.boxes.center + np.array([30, 0, 0])))
+
+
 HONEST: dict[str, tuple[str, Callable[[DeepAccident, str], Any]]] = {
     "baseline's maps": ("maps", predict_motion),
     "baseline's maps, turning": ("maps", lambda da, token: predict_motion(da, token, model="constant_turn_rate")),
@@ -249,6 +411,13 @@ HONEST: dict[str, tuple[str, Callable[[DeepAccident, str], Any]]] = {
         "accidents",
         lambda _, token: [Accident(positions=np.array([[10, 0], [13, 1]]), time=1.0, score=len(token))],
     ),
+    "baseline's plans": ("plans", lambda da, token: [predict_plan(da, token)]),
+    "standing": ("plans", lambda da, token: [predict_plan(da, token, model="standing")]),
+    "slow plans": ("plans", lambda da, token: [at_another_speed(recorded_plan(da, token), 0.8)]),
+    "fast plans": ("plans", lambda da, token: [at_another_speed(recorded_plan(da, token), 1.2)]),
+    "baseline's forecasts": ("forecasts", predict_forecasts),
+    "standing actors": ("forecasts", lambda da, token: predict_forecasts(da, token, model="standing")),
+    "boxes elsewhere": ("boxes", lambda da, token: moved_boxes(predict_detections(da, token, agents=None))),
     "baseline's boxes": ("boxes", predict_detections),
     "baseline's boxes, all agents": ("boxes", lambda da, token: predict_detections(da, token, agents=None)),
 }
@@ -259,8 +428,17 @@ def test_baselines_and_bad_predictions_raise_no_suspicion(
     da_motion: DeepAccident, tokens: list[str], name: str
 ) -> None:
     kind, predict = HONEST[name]
+    if kind in ("plans", "forecasts"):
+        tokens = samples_of_vehicles(da_motion)[:: 7 if kind == "forecasts" else 1]
     report = sanity(da_motion, kind, {token: predict(da_motion, token) for token in tokens})
     assert [each for each in report.warnings if "scores" not in each] == []
+
+
+def test_of_too_little_nothing_is_said(da_motion: DeepAccident, right: dict[str, dict[str, Any]]) -> None:
+    token = max(right["plans"])  # at the end of the recording
+    report = sanity(da_motion, "plans", {token: right["plans"][token]})
+    assert (report.sought, report.warnings) == ((), ())
+    assert report.to_text().endswith("Cannot say whether a mistake was made: there is too little to compare.")
 
 
 def test_equal_scores_are_told_only_where_they_count(da_motion: DeepAccident, right: dict[str, dict[str, Any]]) -> None:
@@ -309,8 +487,8 @@ def test_nothing_to_look_at(da_motion: DeepAccident, right: dict[str, dict[str, 
 def test_from_which_shares_on_a_mistake_is_suspected(
     name: str, task: str, undone: int, given: int, whole: int, *, suspected: bool
 ) -> None:
-    half = Seen(tallies={name: tally_of(undone / 2, given / 2, whole / 2)})
-    warnings = list(mistakes_of([half, half], task))
+    half = {name: tally_of(undone / 2, given / 2, whole / 2)}
+    warnings = list(mistakes_of(summed([half, half]), task))
     assert len(warnings) == suspected
     told = f"({undone / whole:.0%} of the truth is hit once that is undone, {given / whole:.0%} as it is)"
     assert all(each.startswith(f"{name}: ") and each.endswith(told) for each in warnings)
@@ -319,21 +497,19 @@ def test_from_which_shares_on_a_mistake_is_suspected(
 def test_the_worst_measurement_counts_and_the_best_mistake_of_a_group() -> None:
     two = np.array([[80.0, 20.0], [100.0, 100.0], [0.0, 0.0], [100.0, 100.0]])
     one = np.where([[0, 1], [0, 0], [0, 0], [0, 0]], 30.0, two)
-    (warning,) = mistakes_of(
-        [Seen(tallies={"x mirrored": two, "y mirrored": one, "one step late": tally_of(90, 0, 100)})], "motion"
-    )
+    (warning,) = mistakes_of({"x mirrored": two, "y mirrored": one, "one step late": tally_of(90, 0, 100)}, "motion")
     assert warning.startswith("y mirrored: ")  # and nothing of time beside it
     assert "(30% of the truth" in warning
     one_missed = np.array([[100.0, 0.0], [100.0, 1.0], [0.0, 0.0], [100.0, 1.0]])
-    assert list(mistakes_of([Seen(tallies={"x mirrored": one_missed})], "motion")) == []
+    assert list(mistakes_of({"x mirrored": one_missed}, "motion")) == []
 
 
 @pytest.mark.parametrize(("right", "every", "told"), [(4, 10, True), (5, 10, False), (0, 9, False)])
 def test_when_headings_look_random(right: int, every: int, *, told: bool) -> None:
-    warnings = list(
-        mistakes_of([Seen(tallies={}, headings=(right, every - 3)), Seen(tallies={}, headings=(0, 3))], "detection")
-    )
+    found = {"heading": tally_of(0, right, every)}
+    warnings = list(mistakes_of({**found, "place": tally_of(0, every, 5 * every)}, "detection"))
     assert [each.split(",")[0] for each in warnings] == [f"headings look random: {right} of {every} are right"] * told
+    assert list(mistakes_of({**found, "place": tally_of(0, every, 6 * every)}, "detection")) == []  # found by chance
 
 
 @pytest.mark.parametrize(
@@ -377,26 +553,22 @@ def test_classes_that_are_swapped(numbers: dict[tuple[int, int], int], swapped: 
     assert found[2].tolist() == [names[row, row] for row in changed]
 
 
-def test_what_is_near() -> None:
-    true = np.array([[0.0, 0.0, 0.0]])
-    found = np.array([[2.0, 0, 0], [1.99, 0, 0.69], [0, 0, 0.7], [0, 0, -0.71], [1.5, 1.5, 0], [-1.4, 1.4, -0.6]])
-    assert are_near(found, true).tolist() == [[False, True, False, False, False, True]]
-    way = np.array([[4.0, 0.0]])
-    for off, follows in (([0.99, 0.0], True), ([1.0, 0.0], False), ([0.0, -0.9], True), ([0.8, 0.8], False)):
-        assert are_followed(np.array([[9.0, 9, 0], [*off, 5]]), np.zeros((1, 2)), way).tolist() == [follows]
-    size = np.array([[4.0, 2.0, 1.0]])
-    sizes = np.array([[5.0, 1.5, 1.25], [5.1, 2, 1], [4, 1.4, 1], [4, 2, 1.3]])
-    assert are_of_one_size(sizes, size).tolist() == [True, False, False, False]
-
-
 @pytest.mark.parametrize(
-    ("undone", "given", "change", "tally"),
-    [(1.0, 3.0, 4.0, [1, 1, 0, 1]), (1.1, 0.9, 4.0, [0, 1, 1, 1]), (0.0, 0.0, 2.0, [0, 0, 0, 0]), (1, 1, 2.1, [1] * 4)],
+    ("undone", "given", "true", "hits"),
+    [
+        (1.0, 3.1, 0.0, [1, 1, 0, 1]),
+        (-1.1, 0.9, 0.0, [0, 0, 0, 0]),  # both may be right
+        (-1.2, 0.9, 0.0, [0, 1, 1, 1]),
+        (1.0, 3.1, np.nan, [0, 0, 0, 0]),
+        (np.nan, 0.0, 0.0, [0, 0, 0, 0]),
+    ],
 )
-def test_accidents_tell_only_where_both_cannot_be_near(
-    undone: float, given: float, change: float, tally: list[int]
+def test_only_what_cannot_be_right_in_both_ways_tells(
+    undone: float, given: float, true: float, hits: list[int]
 ) -> None:
-    assert accident_tally(undone, given, change, 1.0)[:, 0].tolist() == tally
+    found = tallies_of("time", {"late": np.array([undone])}, np.array([given]), np.array([true]), 1.0)
+    assert found["late"][:, 0].tolist() == hits
+    assert found["time"][2:, 0].tolist() == [given - true <= 1, np.isfinite(true)]
 
 
 def test_what_is_looked_at_and_asked_for() -> None:

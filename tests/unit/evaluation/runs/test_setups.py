@@ -315,7 +315,17 @@ def test_what_the_predictions_are_of(da_b: DeepAccident, selection: SampleSelect
         ({}, {"samples": "all", "scope": "all"}, "--samples evaluate --scope accident"),
         ({"horizon": 3.0}, {"samples": "all", "scope": "all"}, "--horizon 3.0 --samples evaluate --scope accident"),
         ({}, {"scope": "all"}, "--scope accident"),
-        ({"agents": ("ego_vehicle",)}, {}, ""),  # the text names the agents
+        ({"agents": ("ego_vehicle",)}, {}, "--agents ego_vehicle"),
+        (
+            {"agents": ("ego_vehicle", "infrastructure"), "scope": "all", "horizon": 1.0},
+            {},
+            "--agents ego_vehicle,infrastructure --horizon 1.0 --scope all",
+        ),
+        (
+            {},
+            {"agents": ("ego_vehicle",)},
+            "--agents ego_vehicle,ego_vehicle_behind,other_vehicle,other_vehicle_behind,infrastructure",
+        ),
         ({"agents": ("ego_vehicle",), "scope": "all"}, {"agents": ("ego_vehicle",)}, "--scope all"),
     ],
 )
@@ -327,11 +337,11 @@ def test_the_options_that_are_missing(
     found = coverage(da_motion, predicted, selection)
     assert (found.options, found.is_complete) == (options, False)
     assert found.to_text().startswith(f"the predictions are of the samples of {options}: ") == bool(options)
-    some = coverage(da_motion, predicted[1:], selection)  # of no list of options
+    some = coverage(da_motion, [*predicted[:1], *predicted[2:]], selection)  # of no list of options
     assert (some.options, some.is_complete) == ("", False)
 
 
-def test_the_split_that_is_missing(da_b: DeepAccident, selection: SampleSelection, tmp_path: Path) -> None:
+def test_the_split_that_is_missing(da_b: DeepAccident, selection: SampleSelection) -> None:
     other = replace(selection, split="train")
     assert coverage(da_b, other.tokens(da_b), selection).options == "--split train"
     assert coverage(da_b, [], selection).options == ""

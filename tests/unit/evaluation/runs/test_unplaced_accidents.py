@@ -84,7 +84,7 @@ def test_it_ends_no_evaluation_of_accidents(unplaced: SimpleNamespace, tmp_path:
     boxes = run_of(unplaced, tmp_path / "boxes.json", "accident", "boxes").result
     # those from 2 s before the impact on
     assert (boxes.unplaced, boxes.at_impact, boxes.samples) == (5 * 5, 5, 4 * SAMPLES - 5 * 5 - 5)
-    assert UNPLACED_NOTE.format(boxes.unplaced) in boxes.notes
+    assert UNPLACED_NOTE.format(f"{boxes.unplaced} samples") in boxes.notes
     assert run_of(unplaced, tmp_path / "paper.json", "accident", "paper").result.samples == 4 * SAMPLES
 
 
@@ -92,7 +92,7 @@ def test_it_ends_no_evaluation_of_warnings_and_is_no_normal_scenario(unplaced: S
     clean, field = (
         run_of(unplaced, tmp_path / f"{protocol}.json", "warning", protocol) for protocol in ("clean", "field")
     )
-    assert all(UNPLACED_NOTE.format(SAMPLES) in run.result.notes for run in (clean, field))
+    assert all(UNPLACED_NOTE.format(f"{SAMPLES} samples") in run.result.notes for run in (clean, field))
     recordings = [each.recordings for each in clean.result.groups.values()]
     assert [sum(each[kind] for each in recordings) for kind in ("accident", "twins", "others")] == [5, 10, 0]
     prevented = prevention_evaluator(unplaced.dataset, clean.evaluator, workers=1).compute()

@@ -112,7 +112,7 @@ def test_one_whose_results_have_other_samples_too(
     fewer = replace(selection, agents=("ego_vehicle",))
     part = evaluate_results(da_b, results, run.setup, fewer, allow_partial=True, workers=1)
     assert (part.partial, part.left_out) == (None, 4)
-    assert "; 4 predictions of other samples left out" in summary_text(part.summary())
+    assert "; left out: 4 predictions of other samples" in summary_text(part.summary())
     assert verify(save_run(part, tmp_path / "bundle"), da_b).is_same
 
 
@@ -241,7 +241,7 @@ def test_why_nothing_can_be_made_again_is_told_in_full(
     other = write_accidents(tmp_path / "other.json", results.tokens[1:])
     text = verify(bundle, da_b, results=other).to_text()
     assert "all numbers: stored 'evaluated', found absent" in text
-    assert f"note: cannot be evaluated again: {other.path}: 1 of 6 samples have no pred" in text
+    assert f"note: cannot be evaluated again: {other.path}: without a prediction: 1 of 6 samples" in text
     assert "marks every number as partial" in text
 
 

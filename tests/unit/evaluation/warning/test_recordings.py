@@ -231,8 +231,8 @@ def test_twins_are_paired_within_their_part() -> None:
 
 def test_what_is_left_out_is_said() -> None:
     lost, beyond = left_out_notes(ALL)
-    assert lost.startswith("1 samples are of accidents of which no label shows both")
-    assert beyond == "6 alarms are for later than the horizon and do not count"
+    assert lost.startswith("left out: 1 sample of accidents of which no label shows both")
+    assert beyond == "not counted: 6 alarms for later than the horizon"
     assert list(left_out_notes(CRASH)) == []
 
 
