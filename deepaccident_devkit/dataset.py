@@ -59,6 +59,14 @@ class Dataset(OpenTables):
                 raise nuscenes_names.missing_name(type(self), name, nuscenes_names.DATASET[name])
             return object.__getattribute__(self, name)  # raises as it did before
 
+    @property
+    def with_ignored(self) -> Dataset:
+        """This release with the boxes that count nowhere, too: those of classes that the devkit does not have.
+
+        A release of DeepAccident has none, and is its own. Such boxes have ids from `taxonomy.IGNORED_ID` on.
+        """
+        return self
+
     # poses
 
     def world_from(self, sample: RowArgument, frame: str) -> SE3:
@@ -128,6 +136,7 @@ class Dataset(OpenTables):
             target_from_lidar = self._world_from(row, frame).inverse() @ target_from_lidar
         return lidar_boxes.transform(target_from_lidar, frame)
 
+    @nuscenes_names.with_keywords_named
     def get_boxes(
         self,
         sample: RowArgument,
@@ -185,6 +194,7 @@ class Dataset(OpenTables):
 
     # sensor data
 
+    @nuscenes_names.with_keywords_named
     def get_sample_data_path(self, sample_data: RowArgument, channel: str | None = None) -> Path:
         """The path of a sensor file, which need not exist; arguments as of `get_sample_data`.
 

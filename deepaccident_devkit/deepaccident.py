@@ -15,6 +15,7 @@ from deepaccident_devkit.errors import IndexStoreError, escaped
 from deepaccident_devkit.release import find_release
 from deepaccident_devkit.release.store import Dataroot, open_dataroot
 from deepaccident_devkit.rooms import added
+from deepaccident_devkit.support.nuscenes_names import with_keywords_named
 from deepaccident_devkit.support.text import path_of
 from deepaccident_devkit.tables import open_index
 from deepaccident_devkit.taxonomy import OnError
@@ -85,6 +86,7 @@ class DeepAccident(Dataset):
         >>> da.get_boxes(da.sample[0], frame="ego")  # doctest: +SKIP
     """
 
+    @with_keywords_named
     def __init__(
         self,
         version: str = "v1",
@@ -187,6 +189,7 @@ class DeepAccident(Dataset):
         """Print each category's index, name and counts."""
         _print(overview.category_lines(self))
 
+    @with_keywords_named
     def list_sample(self, sample: RowArgument) -> None:
         """Print the files and boxes of a sample; raises TokenError."""
         _print(overview.sample_lines(self, sample))

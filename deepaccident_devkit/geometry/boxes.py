@@ -26,7 +26,7 @@ from deepaccident_devkit.support.arrays import (
     checked,
     readonly,
 )
-from deepaccident_devkit.support.nuscenes_names import BOX, BOX_MADE, without_names
+from deepaccident_devkit.support.nuscenes_names import BOX, BOX_MADE, with_keywords_named, without_names
 from deepaccident_devkit.support.text import Pictured
 from deepaccident_devkit.taxonomy import CAMERAS, CATEGORIES
 
@@ -468,6 +468,7 @@ class Box:
         """Whether any camera of the recording agent sees it."""
         return bool(self._boxes.camera_visible[0])
 
+    @with_keywords_named
     def corners(self) -> FloatArray:
         """The eight corners (3, 8) metres: four in front, then four behind (nuScenes order)."""
         return as_floats(self._boxes.corners()[0].T)
@@ -476,6 +477,7 @@ class Box:
         """The lower face's corners (3, 4): front right, front left, rear left, rear right."""
         return as_floats(self._boxes.bottom_corners()[0].T)
 
+    @with_keywords_named
     def translate(self, translation: ArrayLike) -> Box:
         """A new box moved by (3,) metres in its frame."""
         moved = SE3.from_rotation(np.eye(3), checked("translation", translation, (3,)))

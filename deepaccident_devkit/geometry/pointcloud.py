@@ -22,7 +22,7 @@ from deepaccident_devkit.support.arrays import (
     checked_number,
     readonly,
 )
-from deepaccident_devkit.support.nuscenes_names import CLOUD, without_names
+from deepaccident_devkit.support.nuscenes_names import CLOUD, with_keywords_named, without_names
 from deepaccident_devkit.support.text import Pictured
 
 Range = tuple[float, float]
@@ -81,6 +81,7 @@ class LidarPointCloud(FrozenArrays, Pictured):
         """x, y, z and intensity in one new array (N, 4) float64."""
         return np.column_stack([self.xyz, self.intensity])
 
+    @with_keywords_named
     def transform(self, target_from_source: SE3, frame: str) -> LidarPointCloud:
         """The same points in another frame. Raises GeometryError."""
         checked_transform("target_from_source", target_from_source)

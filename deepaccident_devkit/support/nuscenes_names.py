@@ -8,14 +8,17 @@ from inspect import signature
 from typing import Final, NoReturn, ParamSpec, TypeVar
 
 from deepaccident_devkit.errors import KeywordError, MissingNameError
+from deepaccident_devkit.support.text import meant_text
 
 T = TypeVar("T")
 P = ParamSpec("P")
 _PAGE: Final = "docs/reading.md"
 _SCENARIO_FIELDS: Final = "town, weather and time of day are fields of da.scenario"
-_NO_MAPS: Final = "there are no maps; da.load_bev(sample) shows the road from above"
+_MAPS: Final = "use da.town_map(town), made from the recordings, or da.load_bev(sample), the road from above"
 _NO_LIDARSEG: Final = "LiDAR points have no classes"
 _NO_ATTRIBUTES: Final = "boxes have no attributes"
+_COLORS: Final = "each category has its own colour; render.style() says how pictures look"
+_WITHOUT_NAME: Final = "give it without a name, as the first argument"
 _VIDEO: Final = "use da.render_scenario_video(scenario, path) or da.render_replay(scenario, path)"
 
 TABLES: Final[Mapping[str, str]] = {
@@ -24,7 +27,7 @@ TABLES: Final[Mapping[str, str]] = {
     "attribute": _NO_ATTRIBUTES,
     "visibility": "use camera_visible and num_lidar_pts of 'annotation'",
     "log": _SCENARIO_FIELDS,
-    "map": _NO_MAPS,
+    "map": _MAPS,
     "lidarseg": _NO_LIDARSEG,
     "panoptic": _NO_LIDARSEG,
 }
@@ -36,25 +39,43 @@ DATASET: Final[Mapping[str, str]] = {
     "attribute": _NO_ATTRIBUTES,
     "visibility": "use box.camera_visible and box.num_lidar_pts",
     "log": _SCENARIO_FIELDS,
-    "map": _NO_MAPS,
+    "map": _MAPS,
     "lidarseg": _NO_LIDARSEG,
     "panoptic": _NO_LIDARSEG,
     "explorer": "its functions are da's own, such as da.map_pointcloud_to_image",
+    "nusc": "its functions are da's own",
     "table_root": "use da.tables_folder",
+    "image_annotations": "use da.camera(sample, channel).boxes_in_image(boxes)",
+    "verbose": "it is only an argument, as in DeepAccident(verbose=False)",
+    "colormap": _COLORS,
+    "get_color": _COLORS,
+    "scenes": "use da.scenario",
     "list_scenes": "use da.list_scenarios()",
     "list_attributes": _NO_ATTRIBUTES,
-    "list_lidarseg_categories": _NO_LIDARSEG,
+    **dict.fromkeys(
+        (
+            *("list_lidarseg_categories", "load_lidarseg_cat_name_mapping", "get_sample_lidarseg_stats"),
+            *("lidarseg_idx2name_mapping", "lidarseg_name2idx_mapping", "list_panoptic_instances"),
+            *("render_scene_lidarseg", "render_scene_channel_lidarseg"),
+        ),
+        _NO_LIDARSEG,
+    ),
     "get_box": "use da.get_boxes(sample), where each box has its token",
     "box_velocity": "use box.velocity",
     "render_scene": _VIDEO,
     "render_scene_channel": _VIDEO,
-    "render_egoposes_on_map": "there are no maps; use da.render_bev(sample, layers=('bev', 'trajectories'))",
+    "render_egoposes_on_map": "use da.render_town_map(town), or da.render_bev(sample, layers=('map', 'trajectories'))",
+    "render_ego_centric_map": "use da.render_bev(sample, layers=('map',))",
 }
 """Attributes of nuScenes' `NuScenes` → what to use here."""
 
 BOX: Final[Mapping[str, str]] = {
     "name": "use box.category",
+    "label": "use box.category",
+    "score": "use DetectedBoxes of evaluation, which has scores",
+    "copy": "use copy.copy(box); no method changes a box",
     "render": "use render.draw_box(box, ax)",
+    "render_cv2": "use render.draw_box(box, ax)",
 }
 """Attributes of nuScenes' `Box` → what to use here."""
 
@@ -70,7 +91,10 @@ CLOUD: Final[Mapping[str, str]] = {
     "nbr_points": "use len(cloud)",
     "translate": "use cloud.transform(target_from_source, frame)",
     "rotate": "use cloud.transform(target_from_source, frame)",
+    "nbr_dims": "use cloud.points.shape[1]",
+    "subsample": "use cloud.select(rows)",
     "render_height": "use da.render_bev(sample)",
+    "render_intensity": "use cloud.intensity; no picture shows it",
 }
 """Attributes of nuScenes' `LidarPointCloud` → what to use here."""
 
@@ -80,13 +104,38 @@ KEYWORDS: Final[Mapping[str, str]] = {
     "with_anns": "boxes are one of the layers; layers=('image',) leaves them out",
     "box_vis_level": "use da.camera(sample, channel).boxes_in_image(boxes, level)",
     "axes_limit": "use da.render_bev(sample, view_range=40)",
-    "nsweeps": "use sweeps=",
-    "underlay_map": _NO_MAPS,
+    "nsweeps": "use da.render_bev(sample, sweeps=5)",
+    "underlay_map": "use da.render_bev(sample, layers=('map', 'points', 'boxes'))",
     "use_flat_vehicle_coordinates": "use da.get_boxes(sample, frame='ego')",
     "selected_anntokens": "choose among da.get_boxes(sample), where each box has its token",
-    "render_intensity": "use color_by=",
-    "show_lidarseg": _NO_LIDARSEG,
-    "show_panoptic": _NO_LIDARSEG,
+    "render_intensity": "use da.render_pointcloud_in_image(camera, sample, color_by='height')",
+    "extra_info": "use da.list_sample(sample), which prints all of its boxes",
+    "view": "views are from above, x of the frame upwards: da.render_bev(sample, frame='ego')",
+    "margin": "use da.render_annotation(annotation, margin=15) for one moment",
+    "dot_size": "draw the pixels of da.map_pointcloud_to_image(camera, sample) yourself",
+    "min_dist": "choose by the depth of what da.map_pointcloud_to_image(camera, sample) returns",
+    **dict.fromkeys(
+        ("pointsensor_token", "camera_token", "pointsensor_channel", "camera_channel"),
+        "give the camera's file and then the sample: da.render_pointcloud_in_image(camera, sample)",
+    ),
+    "wlh_factor": "use Box.from_wlh(box.center, box.wlh * factor, box.orientation, frame=box.frame)",
+    "transf_matrix": "use cloud.transform(SE3(matrix), frame)",
+    "map_resolution": "use da.town_map(town, config=TownMapConfig(resolution=0.1))",
+    "colormap": _COLORS,
+    **dict.fromkeys(
+        (
+            *("table_name", "sample_token", "sample_data_token", "sample_annotation_token", "anntoken"),
+            *("instance_token", "token", "x"),
+        ),
+        _WITHOUT_NAME,
+    ),
+    **dict.fromkeys(
+        (
+            *("show_lidarseg", "show_panoptic", "show_lidarseg_legend", "filter_lidarseg_labels"),
+            "lidarseg_preds_bin_path",
+        ),
+        _NO_LIDARSEG,
+    ),
 }
 """Arguments of nuScenes' methods → what to use here."""
 
@@ -141,18 +190,23 @@ def missing_name(owner: type, name: str, counterpart: str) -> MissingNameError:
 
 
 def with_keywords_named(function: Callable[P, T], module: str | None = None) -> Callable[P, T]:
-    """The same function, but in place of an argument of nuScenes' it names what to use, in a KeywordError.
+    """Return the same function, which raises a KeywordError for an argument that it does not have.
 
-    `module` is where the result lies, and where pickle finds it; None for the place of the function itself.
+    Of an argument of nuScenes' the error says what to use, of others which one may be meant. `module` is where the
+    result lies, and where pickle finds it; None for the place of the function itself.
     """
-    known = signature(function).parameters.keys()
+    known = signature(function).parameters
+    takes_any = any(parameter.kind is parameter.VAR_KEYWORD for parameter in known.values())
+    called = function.__qualname__.removesuffix(".__init__").rpartition(".")[2]
 
     @wraps(function)
     def checked(*arguments: P.args, **named: P.kwargs) -> T:
-        for name in named.keys() - known:
+        for name in sorted(named.keys() - known.keys()) if named else ():
             if name in KEYWORDS:
-                raise KeywordError(f"{function.__name__} has no argument {name!r}: {KEYWORDS[name]} (see {_PAGE})")
-        return function(*arguments, **named)  # which refuses all other names itself
+                raise KeywordError(f"{called} has no argument {name!r}: {KEYWORDS[name]} (see {_PAGE})")
+            if not takes_any:
+                raise KeywordError(f"{called} has no argument {name!r}{meant_text(name, known)}")
+        return function(*arguments, **named)
 
     checked.__module__ = module or function.__module__
     return checked

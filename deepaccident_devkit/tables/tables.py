@@ -23,7 +23,7 @@ from deepaccident_devkit.release import read_split_file
 from deepaccident_devkit.release.fingerprints import ScenarioHashes
 from deepaccident_devkit.release.store import ReleasePath, places_of
 from deepaccident_devkit.support.json_text import as_record, parsed_json
-from deepaccident_devkit.support.nuscenes_names import field_remedy
+from deepaccident_devkit.support.nuscenes_names import field_remedy, with_keywords_named
 from deepaccident_devkit.support.text import choice, meant_text, path_of, spelled
 from deepaccident_devkit.tables.arrow_files import HASHES, REMEDY, StoredTable, damaged_value
 from deepaccident_devkit.tables.columns import NULL_INTEGER, Choice, Column, Key, Number, Subset, Vector
@@ -176,15 +176,18 @@ class OpenTables:
         """
         return self._tables.hashes.get(scenario)
 
+    @with_keywords_named
     def get(self, table: str, token: RowArgument) -> dict[str, Any]:
         """The record of a token, as a fresh dict; raises TableError or TokenError."""
         record: dict[str, Any] = self._tables.table(table).get(token_of(token))
         return record
 
+    @with_keywords_named
     def getind(self, table: str, token: RowArgument) -> int:
         """The row of a token; raises TableError or TokenError."""
         return self._tables.table(table).row(token_of(token))
 
+    @with_keywords_named
     def field2token(self, table: str, field: str, query: Any) -> list[str]:
         """The tokens of all rows of a table whose field equals `query`; raises TableError or FieldError."""
         return self._tables.table(table).tokens_where(field, query)

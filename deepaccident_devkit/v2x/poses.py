@@ -19,6 +19,7 @@ from deepaccident_devkit.errors import ChoiceError, GeometryError
 from deepaccident_devkit.geometry import SE3, LidarPointCloud, PinholeCamera, conventions
 from deepaccident_devkit.geometry.conventions import inverses
 from deepaccident_devkit.support.arrays import BoolArray, ByteArray, FloatArray, FrozenArrays, checked
+from deepaccident_devkit.support.nuscenes_names import with_keywords_named
 
 Poses = Sequence[SE3] | ArrayLike
 """Poses of several agents or moments: SE3 objects, or an array (K, 4, 4)."""
@@ -167,6 +168,7 @@ def project_to_image(
     return ImagePoints(pixels=pixels, depth=depth, color=color, mask=mask)
 
 
+@with_keywords_named
 def map_pointcloud_to_image(
     dataset: Dataset, camera: RowArgument, sample: RowArgument | None = None, *, colors: bool = True
 ) -> ImagePoints:

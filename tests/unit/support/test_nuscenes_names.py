@@ -15,6 +15,7 @@ from refusals import assert_refused
 from deepaccident_devkit import DeepAccident, DeepAccidentError, render
 from deepaccident_devkit.errors import FieldError, KeywordError, MissingNameError, TableError
 from deepaccident_devkit.geometry import Box, Boxes, LidarPointCloud
+from deepaccident_devkit.maps import TownMapConfig
 from deepaccident_devkit.support import nuscenes_names
 from deepaccident_devkit.tables.records import table_specs
 
@@ -51,6 +52,28 @@ def test_none_of_the_names_is_here(kind: type, names: Mapping[str, str]) -> None
 def test_each_counterpart_is_here(names: Mapping[str, str]) -> None:
     found = re.findall(r"\b(da|box|cloud|render)\.(\w+)", "\n".join(names.values()))
     assert [(owner, name) for owner, name in found if not hasattr(NAMED[owner], name)] == []
+
+
+def test_each_argument_of_a_counterpart_is_here() -> None:
+    """In `da.render_bev(sample, sweeps=5)` there is a method `render_bev` with an argument `sweeps`."""
+    hints = [hint for names in (*(names for _, names in CLASSES), nuscenes_names.KEYWORDS) for hint in names.values()]
+    calls = re.findall(r"\b(?:(da|box|cloud|render)\.)?([A-Za-z_]\w+)\(((?:[^()]|\([^()]*\))*)\)", "\n".join(hints))
+    known = {"TownMapConfig": TownMapConfig, "DeepAccident": DeepAccident, "from_wlh": Box.from_wlh}
+    wrong = []
+    for owner, name, arguments in calls:
+        function = getattr(NAMED[owner], name) if owner else known.get(name)
+        given = re.findall(r"\b(\w+)=", re.sub(r"\([^()]*\)", "", arguments))
+        if given and not set(given) <= inspect.signature(function).parameters.keys():
+            wrong.append((name, given))
+    assert len(calls) > 30
+    assert wrong == []
+
+
+def test_maps_are_not_denied() -> None:
+    """The devkit makes maps of towns, though a release has none."""
+    for names in (nuscenes_names.TABLES, nuscenes_names.DATASET):
+        assert "da.town_map" in names["map"]
+    assert "map" in nuscenes_names.DATASET["render_egoposes_on_map"]
 
 
 def test_each_table_to_use_is_here() -> None:
@@ -96,16 +119,32 @@ def test_an_unknown_table_of_nuscenes_names_the_counterpart(da: DeepAccident, na
 @pytest.mark.parametrize("name", ["get_sample_data", *(each for each in render.__all__ if each.startswith("render_"))])
 def test_an_argument_of_nuscenes_names_the_counterpart(da: DeepAccident, name: str) -> None:
     method = getattr(da, name)
+    own = inspect.signature(method).parameters
     for argument, counterpart in nuscenes_names.KEYWORDS.items():
-        assert argument not in inspect.signature(method).parameters
+        if argument in own:
+            continue
         sentence = f"^{name} has no argument '{argument}': {re.escape(counterpart)} "
         with pytest.raises(KeywordError, match=sentence) as raised:
             method("x", **{argument: None})
         assert isinstance(raised.value, TypeError)
-    assert_refused(
-        (lambda: method("x", colour=1), TypeError, r"unexpected keyword argument 'colour'|missing .* argument")
-    )
+    wrong = r"has no argument 'colour'|unexpected keyword argument 'colour'|missing .* argument"
+    assert_refused((lambda: method("x", colour=1), TypeError, wrong))
     assert pickle.loads(pickle.dumps(method.__func__)) is method.__func__
+
+
+@pytest.mark.parametrize(
+    ("call", "argument", "meant"),
+    [
+        (lambda _: DeepAccident(root="x"), "root", "did you mean 'dataroot'?"),
+        (lambda _: DeepAccident(map_resolution=0.1), "map_resolution", "da.town_map"),
+        (lambda da: da.get(table_name="sample"), "table_name", "first argument"),
+        (lambda da: da.get_boxes(sample_data_token=None), "sample_data_token", "first argument"),
+        (lambda da: da.render_bev(da.sample[0], axis=None), "axis", "did you mean 'ax'?"),
+        (lambda da: da.get_boxes(da.sample[0])[0].corners(wlh_factor=2), "wlh_factor", "Box.from_wlh"),
+    ],
+)
+def test_a_misspelt_argument_is_named(da: DeepAccident, call, argument: str, meant: str) -> None:
+    assert_refused((lambda: call(da), KeywordError, (f"has no argument '{argument}'", meant)))
 
 
 @pytest.mark.parametrize("table", table_specs())
