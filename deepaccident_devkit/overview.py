@@ -33,12 +33,12 @@ class Overview(Report):
 
     Attributes:
         dataroot: its folder.
-        version: `v1` or `v1-mini`.
-        layout: `A`, `B` or `A+B`.
+        version: `v1` or `v1-mini`; of nuScenes such as `v1.0-mini`.
+        layout: `A`, `B` or `A+B`; or `nuScenes`.
         index: folder of the index's tables.
         tables: table → rows.
         splits: split → scenarios here; `unknown` for those of no known split.
-        expected: split (or the version, for mini) → scenarios of the whole release.
+        expected: split (or the version, for mini) → scenarios of the whole release; empty for nuScenes.
         agents: agent → scenarios that have it.
         labelled: agent → scenarios in which it has labels.
         channels: channel → recordings (scenario and agent) that have files of it.
@@ -109,7 +109,7 @@ def overview(dataset: Dataset) -> Overview:
     scenarios, agents = dataset.scenario[:], dataset.agent[:]
     samples = {agent["token"]: dataset.get("sample", agent["first_sample_token"]) for agent in agents}
     split_counts = Counter(scenario["split"] or _UNKNOWN for scenario in scenarios)
-    mini = dataset.version == "v1-mini"
+    expected = {"v1": EXPECTED_SCENARIOS, "v1-mini": {"v1-mini": EXPECTED_MINI_SCENARIOS}}
     files = _channel_files(dataset, scenarios)
     return Overview(
         dataroot=str(dataset.dataroot),
@@ -118,7 +118,7 @@ def overview(dataset: Dataset) -> Overview:
         index=str(dataset.tables_folder),
         tables={name: len(dataset.arrow(name)) for name in dataset.table_names},
         splits={name: split_counts[name] for name in (*SPLITS, _UNKNOWN) if split_counts[name] or name in SPLITS},
-        expected={dataset.version: EXPECTED_MINI_SCENARIOS} if mini else EXPECTED_SCENARIOS,
+        expected=expected.get(dataset.version, {}),
         agents={name: sum(agent["name"] == name for agent in agents) for name in AGENTS},
         labelled={
             name: sum(agent["name"] == name and samples[agent["token"]]["labelled"] for agent in agents)

@@ -72,7 +72,7 @@ UNKNOWN_ID: Final = 0
 STATIC_ACTOR_ID: Final = 20000
 """Ids from here on are parked vehicles."""
 IGNORED_ID: Final = 1_000_000_000
-"""Ids from here on are of actors whose class we do not have (nuScenes' buses): neither learned as boxes nor counted."""
+"""Ids from here on are of actors whose class we do not have (nuScenes' buses), which `Dataset.with_ignored` has."""
 
 VELOCITY_FRAMES: Final[dict[str, str]] = {
     "released": "the release's own: the world's, turned once more by the box's yaw in the LiDAR frame",

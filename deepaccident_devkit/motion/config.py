@@ -80,8 +80,8 @@ class LabelProtocol:
             motions have its handedness in these steps. The warp `fiery` needs `fiery`. It decides how halves of a cell
             are rounded; `MotionLabelConfig.grid` has the orientation of the labels.
         sight: when an agent sees an actor: `released`, by points and cameras, and untracked rows never; `camera`, where
-            a camera of the agent sees it (FIERY drops nuScenes' visibility 1). An untracked row is then seen by the
-            sample's own agent alone.
+            a camera of the agent sees it (FIERY drops nuScenes' visibility 1), of whatever class it is in nuScenes
+            (`Dataset.with_ignored`). An untracked row is then seen by the sample's own agent alone.
         pose: how boxes come to the ego's frame: `whole`, by the whole pose, each as an upright box there; `yaw`
             (FIERY), by the position and the yaw of the pose alone, in double precision, so that a box that leans has
             the footprint of its leaning bottom. The yaw is the sixth number of the pose's 6-vector, which differs from

@@ -281,6 +281,7 @@ class _Work:
 
 def _scenario_arrays(dataset: Dataset, scenario: str) -> Iterator[AnyArray]:
     """The columns of the tables that a scenario's labels are made from, of all agents."""
+    dataset = dataset.with_ignored
     row, samples = dataset.getind("scenario", scenario), dataset.columns("sample")
     first, last = samples["scenario_row"].searchsorted((row, row + 1))
     yield dataset.columns("ego_pose")["matrix"][first:last]

@@ -142,7 +142,7 @@ def rig_report(*datasets: Dataset) -> RigReport:
 
 def rig_facts(dataset: Dataset) -> RigFacts:
     """The facts of one source; raises NotAvailableError if it has no labels."""
-    view, boxes = dataset.columns("sample"), dataset.columns("annotation")
+    view, boxes = dataset.columns("sample"), dataset.with_ignored.columns("annotation")
     rows = labelled_rows(dataset)
     apart = np.diff(rows)[np.diff(view["scenario_row"][rows]) == 0]
     tokens = [dataset.sample[row]["token"] for row in rows.tolist()]

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Mapping
 from functools import wraps
 from inspect import signature
+from pathlib import Path
 from typing import Final, NoReturn, ParamSpec, TypeVar
 
 from deepaccident_devkit.errors import KeywordError, MissingNameError
@@ -13,149 +15,30 @@ from deepaccident_devkit.support.text import meant_text
 T = TypeVar("T")
 P = ParamSpec("P")
 _PAGE: Final = "docs/reading.md"
-_SCENARIO_FIELDS: Final = "town, weather and time of day are fields of da.scenario"
-_MAPS: Final = "use da.town_map(town), made from the recordings, or da.load_bev(sample), the road from above"
-_NO_LIDARSEG: Final = "LiDAR points have no classes"
-_NO_ATTRIBUTES: Final = "boxes have no attributes"
-_COLORS: Final = "each category has its own colour; render.style() says how pictures look"
-_WITHOUT_NAME: Final = "give it without a name, as the first argument"
-_VIDEO: Final = "use da.render_scenario_video(scenario, path) or da.render_replay(scenario, path)"
+_HINTS: Final = json.loads(Path(__file__).with_suffix(".json").read_bytes())
 
-TABLES: Final[Mapping[str, str]] = {
-    "scene": "use 'scenario'",
-    "sample_annotation": "use 'annotation', which is in the LiDAR frame (da.get_boxes gives world), or 'track'",
-    "attribute": _NO_ATTRIBUTES,
-    "visibility": "use camera_visible and num_lidar_pts of 'annotation'",
-    "log": _SCENARIO_FIELDS,
-    "map": _MAPS,
-    "lidarseg": _NO_LIDARSEG,
-    "panoptic": _NO_LIDARSEG,
-}
+
+def _hints(of: str) -> Mapping[str, str]:
+    return {name: hint for hint, names in _HINTS[of].items() for name in names}
+
+
+TABLES: Final = _hints("tables")
 """nuScenes' tables → what to use here."""
-
-DATASET: Final[Mapping[str, str]] = {
-    "scene": "use da.scenario",
-    "sample_annotation": "use da.annotation, which is in the LiDAR frame (da.get_boxes gives world), or da.track",
-    "attribute": _NO_ATTRIBUTES,
-    "visibility": "use box.camera_visible and box.num_lidar_pts",
-    "log": _SCENARIO_FIELDS,
-    "map": _MAPS,
-    "lidarseg": _NO_LIDARSEG,
-    "panoptic": _NO_LIDARSEG,
-    "explorer": "its functions are da's own, such as da.map_pointcloud_to_image",
-    "nusc": "its functions are da's own",
-    "table_root": "use da.tables_folder",
-    "image_annotations": "use da.camera(sample, channel).boxes_in_image(boxes)",
-    "verbose": "it is only an argument, as in DeepAccident(verbose=False)",
-    "colormap": _COLORS,
-    "get_color": _COLORS,
-    "scenes": "use da.scenario",
-    "list_scenes": "use da.list_scenarios()",
-    "list_attributes": _NO_ATTRIBUTES,
-    **dict.fromkeys(
-        (
-            *("list_lidarseg_categories", "load_lidarseg_cat_name_mapping", "get_sample_lidarseg_stats"),
-            *("lidarseg_idx2name_mapping", "lidarseg_name2idx_mapping", "list_panoptic_instances"),
-            *("render_scene_lidarseg", "render_scene_channel_lidarseg"),
-        ),
-        _NO_LIDARSEG,
-    ),
-    "get_box": "use da.get_boxes(sample), where each box has its token",
-    "box_velocity": "use box.velocity",
-    "render_scene": _VIDEO,
-    "render_scene_channel": _VIDEO,
-    "render_egoposes_on_map": "use da.render_town_map(town), or da.render_bev(sample, layers=('map', 'trajectories'))",
-    "render_ego_centric_map": "use da.render_bev(sample, layers=('map',))",
-}
-"""Attributes of nuScenes' `NuScenes` → what to use here."""
-
-BOX: Final[Mapping[str, str]] = {
-    "name": "use box.category",
-    "label": "use box.category",
-    "score": "use DetectedBoxes of evaluation, which has scores",
-    "copy": "use copy.copy(box); no method changes a box",
-    "render": "use render.draw_box(box, ax)",
-    "render_cv2": "use render.draw_box(box, ax)",
-}
+DATASET: Final = _hints("dataset")
+"""Attributes of nuScenes' `NuScenes` and `NuScenesExplorer` → what to use here."""
+BOX: Final = _hints("box")
 """Attributes of nuScenes' `Box` → what to use here."""
-
+CLOUD: Final = _hints("cloud")
+"""Attributes of nuScenes' `LidarPointCloud` → what to use here."""
+KEYWORDS: Final = _hints("keywords")
+"""Arguments of nuScenes' methods → what to use here."""
+FIELDS: Final = _hints("fields")
+"""Fields of nuScenes' records → what to use here."""
 BOX_MADE: Final = (
     "boxes[0] picks one, and nuScenes' Box(center, wlh, orientation) is Box.from_wlh(center, wlh, orientation, "
     f"frame='ego') (see {_PAGE})"
 )
 """What to use here in place of making nuScenes' `Box`."""
-
-CLOUD: Final[Mapping[str, str]] = {
-    "from_file": "use da.load_point_cloud(sample); of a path, release.read_lidar(path)",
-    "from_file_multisweep": "use da.aggregate_point_cloud(sample, agents='single', sweeps=5)",
-    "nbr_points": "use len(cloud)",
-    "translate": "use cloud.transform(target_from_source, frame)",
-    "rotate": "use cloud.transform(target_from_source, frame)",
-    "nbr_dims": "use cloud.points.shape[1]",
-    "subsample": "use cloud.select(rows)",
-    "render_height": "use da.render_bev(sample)",
-    "render_intensity": "use cloud.intensity; no picture shows it",
-}
-"""Attributes of nuScenes' `LidarPointCloud` → what to use here."""
-
-KEYWORDS: Final[Mapping[str, str]] = {
-    "out_path": "save what is returned: a figure with .savefig(path), axes with .figure.savefig(path)",
-    "verbose": "nothing opens a window; a notebook shows what is returned",
-    "with_anns": "boxes are one of the layers; layers=('image',) leaves them out",
-    "box_vis_level": "use da.camera(sample, channel).boxes_in_image(boxes, level)",
-    "axes_limit": "use da.render_bev(sample, view_range=40)",
-    "nsweeps": "use da.render_bev(sample, sweeps=5)",
-    "underlay_map": "use da.render_bev(sample, layers=('map', 'points', 'boxes'))",
-    "use_flat_vehicle_coordinates": "use da.get_boxes(sample, frame='ego')",
-    "selected_anntokens": "choose among da.get_boxes(sample), where each box has its token",
-    "render_intensity": "use da.render_pointcloud_in_image(camera, sample, color_by='height')",
-    "extra_info": "use da.list_sample(sample), which prints all of its boxes",
-    "view": "views are from above, x of the frame upwards: da.render_bev(sample, frame='ego')",
-    "margin": "use da.render_annotation(annotation, margin=15) for one moment",
-    "dot_size": "draw the pixels of da.map_pointcloud_to_image(camera, sample) yourself",
-    "min_dist": "choose by the depth of what da.map_pointcloud_to_image(camera, sample) returns",
-    **dict.fromkeys(
-        ("pointsensor_token", "camera_token", "pointsensor_channel", "camera_channel"),
-        "give the camera's file and then the sample: da.render_pointcloud_in_image(camera, sample)",
-    ),
-    "wlh_factor": "use Box.from_wlh(box.center, box.wlh * factor, box.orientation, frame=box.frame)",
-    "transf_matrix": "use cloud.transform(SE3(matrix), frame)",
-    "map_resolution": "use da.town_map(town, config=TownMapConfig(resolution=0.1))",
-    "colormap": _COLORS,
-    **dict.fromkeys(
-        (
-            *("table_name", "sample_token", "sample_data_token", "sample_annotation_token", "anntoken"),
-            *("instance_token", "token", "x"),
-        ),
-        _WITHOUT_NAME,
-    ),
-    **dict.fromkeys(
-        (
-            *("show_lidarseg", "show_panoptic", "show_lidarseg_legend", "filter_lidarseg_labels"),
-            "lidarseg_preds_bin_path",
-        ),
-        _NO_LIDARSEG,
-    ),
-}
-"""Arguments of nuScenes' methods → what to use here."""
-
-FIELDS: Final[Mapping[str, str]] = {
-    "data": "a sensor file's token is the sample's and a channel: da.get('sample_data', token + '/Camera_Front')",
-    "anns": "use da.get_boxes(sample), or the slice da.annotation_rows(sample) of da.annotation",
-    "scene_token": "use 'scenario_token'",
-    "category_name": "use 'category'",
-    "category_token": "use 'category'",
-    "first_sample_token": "each agent has samples of its own: it is a field of da.agent",
-    "last_sample_token": "each agent has samples of its own: it is a field of da.agent",
-    "nbr_samples": "use 'num_frames'",
-    "nbr_annotations": "use 'num_annotations'",
-    "attribute_tokens": _NO_ATTRIBUTES,
-    "visibility_token": "use 'camera_visible' and 'num_lidar_pts' of da.annotation",
-    "log_token": _SCENARIO_FIELDS,
-    "description": _SCENARIO_FIELDS,
-    "is_key_frame": "samples of all frames are labelled, at 10 Hz",
-}
-"""Fields of nuScenes' records → what to use here."""
 
 
 class AbsentName:

@@ -46,6 +46,7 @@ FileKind: TypeAlias = Literal[
     "spec",
     "archive",
     "weights",
+    "tables",
 ]
 NO_NAME: Final = "cannot be a file's name: it holds a NUL character, or half of a pair that stands for one character"
 _MIB: Final = 1 << 20
@@ -65,6 +66,7 @@ LIMITS: Final[Mapping[str, int]] = MappingProxyType(
         "spec": _MIB,
         "archive": 512 * _MIB,
         "weights": 4096 * _MIB,
+        "tables": 4096 * _MIB,
     }
 )
 """Kind of file → bytes that may be read of it at once, and that may be decoded from it at once.

@@ -30,6 +30,7 @@ class Trajectory(FrozenArrays):
         velocity: (T, 3) float64, m/s over the ground, NaN if unknown.
         agents: (T,) uint8, bit masks over `taxonomy.AGENTS`: who annotated it.
         present: frame number of the given sample, before which is the past; None without one.
+        times: (T,) float64, what `timestamp` says; None for a recording at 10 Hz.
     """
 
     instance: str
@@ -41,6 +42,7 @@ class Trajectory(FrozenArrays):
     velocity: FloatArray
     agents: AnyArray
     present: int | None = None
+    times: FloatArray | None = None
 
     def __len__(self) -> int:
         """Number of moments."""
@@ -49,7 +51,7 @@ class Trajectory(FrozenArrays):
     @property
     def timestamp(self) -> FloatArray:
         """(T,) seconds since the scenario's first frame."""
-        return as_floats((self.index - 1) * FRAME_PERIOD)
+        return as_floats((self.index - 1) * FRAME_PERIOD) if self.times is None else self.times
 
     @property
     def yaw(self) -> FloatArray:
@@ -88,10 +90,13 @@ def trajectory(
     elif frame != "world":
         raise ChoiceError(f"trajectory: frame {frame!r} is one of a sample; name it with sample=")
     moved = tracks.boxes.select(rows).transform(frame_from_world, frame)
+    first_frame = dataset.get("scenario", record["scenario_token"])["first_frame_token"]
+    frames = dataset.getind("frame", first_frame) + tracks.index[rows] - 1
     return Trajectory(
         instance=record["token"],
         frame=frame,
         index=tracks.index[rows],
+        times=dataset.columns("frame")["timestamp"][frames],
         agents=tracks.agents[rows],
         size=moved.size,
         present=present,

@@ -1,4 +1,4 @@
-"""The healthy files that cases change: small releases, an index, results, a bundle, labels, a scenario file, exports.
+"""The healthy files that cases change: small releases, an index, results, a bundle, labels, exports, nuScenes.
 
 With PyTorch also files of weights and a run of training.
 """
@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import yaml
+from nuscenes_dataroots import write_dataroot
 from packing import packed
 
 from deepaccident_devkit import DeepAccident
@@ -129,6 +130,7 @@ def make_healthy(folder: Path) -> Path:
     _write_exports(dataset, sensors, folder)
     for method in ("stored", "deflated"):
         packed(folder / "small", folder / "zips" / f"{method}.zip", method)
+    write_dataroot(folder / "road", keyframes=3, boxes=8)
     (folder / "schedulers").mkdir()
     told = {
         "type": "Scheduler",

@@ -1,6 +1,6 @@
 """Kinds of files: where the healthy ones lie, how a user reads them, and when what was read is wrong.
 
-`KINDS` has those of `other_kinds` and `weights_kinds` too.
+`KINDS` has those of `other_kinds`, `road_kinds` and `weights_kinds` too.
 """
 
 import json
@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from campaign import other_kinds, plain, weights_kinds
+from campaign import other_kinds, plain, road_kinds, weights_kinds
 from campaign.healthy import SETUPS, opened, selection
 from campaign.kind import Action, Kind, Room, dataset_of
 from campaign.mutations import HTML
@@ -486,6 +486,7 @@ KINDS = {
         Kind("index's tables", "arrow", "index", "v1/tables-*/*.arrow", _INDEX),
         Kind("index's rows", "shard", "index", "v1/kept/*/*", _INDEX),
         *other_kinds.KINDS,
+        *road_kinds.KINDS,
         *weights_kinds.KINDS,
     )
 }

@@ -21,7 +21,7 @@ from fault_injection.mutations.calib import Bomb
 
 Rng = np.random.Generator
 Change = Callable[[bytes, Rng], bytes]
-_JSON = ("json", "manifest", "record", "address")
+_JSON = ("json", "manifest", "record", "address", "tables")
 _ARCHIVES = ("zip", "pt")
 _YAML = ("yaml", "recipe")
 _OTHERS = ("journal", "images", "safetensors", "pth", *_ARCHIVES)

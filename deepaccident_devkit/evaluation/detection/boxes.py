@@ -26,7 +26,7 @@ from deepaccident_devkit.support.arrays import (
     checked,
 )
 from deepaccident_devkit.support.text import settle_choices
-from deepaccident_devkit.taxonomy import CATEGORIES, IGNORED_ID, OWN_ACTOR_ID, SMALL_CATEGORIES, UNTRACKED_ID
+from deepaccident_devkit.taxonomy import CATEGORIES, OWN_ACTOR_ID, SMALL_CATEGORIES, UNTRACKED_ID
 from deepaccident_devkit.v2x import Agents, cooperative_boxes
 
 TruthSource = Literal["label", "visible", "cooperative"]
@@ -414,7 +414,7 @@ def detection_truth(
         own = boxes.actor_id == OWN_ACTOR_ID
     if rules.label_velocity:
         boxes = _with_label_velocity(dataset, sample, boxes, rules)
-    return boxes.select((boxes.actor_id < IGNORED_ID) & (rules.own_box | ~own))
+    return boxes.select(rules.own_box | ~own)
 
 
 def _with_label_velocity(dataset: Dataset, sample: RowArgument, boxes: Boxes, rules: DetectionProtocol) -> Boxes:

@@ -218,12 +218,12 @@ class V2XDataset(TorchDataset):
         return items
 
     def _box_item(self, sample: str, augmentation: Augmentation) -> dict[str, Tensor]:
-        visible = self.config.visible
+        visible, dataset = self.config.visible, self._dataset.with_ignored
         if self.config.boxes == "cooperative":
             names = sensor_data.participants(self._dataset, sample, self.config.agents)
-            boxes = cooperative_boxes(self._dataset, sample, agents=names, frame="ego", visible=visible)
+            boxes = cooperative_boxes(dataset, sample, agents=names, frame="ego", visible=visible)
         else:
-            boxes = self._dataset.boxes(sample, "ego", visible)
+            boxes = dataset.boxes(sample, "ego", visible)
         return {
             "boxes": tensor(np.nan_to_num(augmented_boxes(boxes, augmentation)), np.float32),
             "velocity_known": tensor(np.isfinite(boxes.velocity).all(axis=1)),
