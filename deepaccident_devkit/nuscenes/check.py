@@ -2,7 +2,7 @@
 
 Four things agree in a good source: the ego moves along its x, the road lies at its origin, points lie on boxes, and
 boxes stand out in the images of their own cameras. The usual mistakes are tried too, so that the message names the one
-that was made. Points are believed before images, and nothing within its own error: a good source is not refused.
+that was made. Sides are told by points alone, and nothing is believed within its own error: a good source passes.
 """
 
 from __future__ import annotations
@@ -68,8 +68,8 @@ class SourceCheck(ShortRepr):
         lidar: height of the LiDAR.
         looks: (6,) degrees to the left of x to which each camera looks.
         held: (B, 2) of boxes that should hold points, the share of those with some: 0 or 1, as they are and mirrored.
-        contrasts: (S, 2, 6, 6) how much boxes, as they are and mirrored, stand out where a camera (row) should show
-            them, in the image of a camera (column): the mean logarithm.
+        contrasts: (S, 6, 6) how much boxes stand out where a camera (row) should show them, in the image of a camera
+            (column): the mean logarithm.
     """
 
     turns: FloatArray
@@ -109,24 +109,25 @@ class SourceCheck(ShortRepr):
             yield "how high the road lies, since there are few points and few boxes"
         if len(self.held) < _LEAST_VALUES:
             yield "whether y is to the left, since few boxes should hold points"
-        unclear = [name for name, own in zip(CAMERAS, _own(self._clearer()).T, strict=True) if not _is_above(own)]
+        unclear = [
+            name
+            for name, own in zip(CAMERAS, np.diagonal(self._clearer(), axis1=1, axis2=2).T, strict=True)
+            if not _is_above(own)
+        ]
         if unclear:
             yield f"whether the images are those of {', '.join(unclear)}, since boxes hardly stand out in them"
 
     def _side_fault(self) -> str:
-        """How boxes lie beside what points show, or images where points do not tell; empty if they do not."""
-        lies, mirrored = self.held.T
-        shares = f"points lie in {_mean(lies):.0%} of the boxes, in {_mean(mirrored):.0%} of them mirrored"
-        if _is_above(_LEAST_SHARE - lies):
-            return f"y is mirrored: {shares}" if _is_above(mirrored - lies) else f"boxes are in other places: {shares}"
-        clearer = _own(self.contrasts[:, 1]) - _own(self.contrasts[:, 0])
-        if _is_above(lies - _LEAST_SHARE) or not _is_above(clearer):
+        """How boxes lie beside what points show; empty if they do not."""
+        given, mirrored = self.held.T
+        shares = f"points lie in {_mean(given):.0%} of the boxes, in {_mean(mirrored):.0%} of them mirrored"
+        if not _is_above(_LEAST_SHARE - given):
             return ""
-        return "y is mirrored: boxes stand out in the images if they are mirrored, too"
+        return f"y is mirrored: {shares}" if _is_above(mirrored - given) else f"boxes are in other places: {shares}"
 
     def _clearer(self) -> FloatArray:
         """(S, 6, 6) the contrasts of boxes beside those of the same boxes, and of the same image."""
-        beside = self.contrasts[:, 0] - _mean(self.contrasts[:, 0], axis=2)
+        beside = self.contrasts - _mean(self.contrasts, axis=2)
         return np.asarray(beside - _mean(beside, axis=1))
 
     def _shown_elsewhere(self) -> list[str]:
@@ -145,11 +146,6 @@ class SourceCheck(ShortRepr):
     def _turned_away(self, turn: float) -> list[str]:
         nearest = np.abs((self.looks[:, None] - turn - _LOOKS + 180) % 360 - 180).argmin(axis=1).tolist()
         return [f"{CAMERAS[at]} looks where {CAMERAS[to]} should" for at, to in enumerate(nearest) if at != to]
-
-
-def _own(contrasts: FloatArray) -> FloatArray:
-    """(S, 6) contrasts in each camera's own image."""
-    return np.diagonal(contrasts, axis1=1, axis2=2)
 
 
 def _mean(values: FloatArray, axis: int | None = None) -> Any:
@@ -259,16 +255,14 @@ def _floor(boxes: Boxes) -> float:
 
 
 def _contrasts(dataset: Dataset, sample: str, boxes: Boxes) -> FloatArray:
-    """(2, 6, 6) of a sample, as `SourceCheck` has them."""
-    contrasts = np.full((2, len(CAMERAS), len(CAMERAS)), np.nan)
+    """(6, 6) of a sample, as `SourceCheck` has them."""
+    contrasts = np.full((len(CAMERAS), len(CAMERAS)), np.nan)
     if all(dataset.sensor_path(sample, camera).exists() for camera in CAMERAS):
         images = [dataset.load_image(sample, camera, least=_LEAST_SIZE) for camera in CAMERAS]
-        for side, row in np.ndindex(contrasts.shape[:2]):
-            shown = _rectangles(dataset, sample, CAMERAS[row], boxes.corners() * _SIDES[side])
+        for row, camera in zip(contrasts, CAMERAS, strict=True):
+            shown = _rectangles(dataset, sample, camera, boxes.corners())
             if len(shown):
-                contrasts[side, row] = [
-                    np.log1p([_contrast(image, *each) for each in shown]).mean() for image in images
-                ]
+                row[:] = [np.log1p([_contrast(image, *each) for each in shown]).mean() for image in images]
     return contrasts
 
 

@@ -60,11 +60,13 @@ class SceneTables:
         self._stamps = {sample.token: 1e-6 * sample.timestamp for sample in self._samples}
         self._files = [self._channels(sample) for sample in self._samples]
         self._boxes = [tables.rows_of("sample_annotation", sample) for sample in self._samples]
+        self._box_frames = np.repeat(np.arange(len(self._boxes)) * KEY_STEP, list(map(len, self._boxes)))
         self.frames = KEY_STEP * (len(self._samples) - 1) + 1
         self._world_from_ego, self._ego_from_sensor = self._poses(LIDAR_CHANNEL)
         self._rotations = np.reshape([self._unit(box) for box in chain(*self._boxes)], (-1, 4))
         self._ego_from_lidar = self._turned(upright=bool((np.abs(self._rotations[:, 1:3]) < _LEAN).all()))
         self._calibs = self._all_calibs(np.arange(self.frames))
+        self._columns = self._box_columns()
         self.tables = {every_class: self._rows(every_class=every_class) for every_class in (False, True)}
 
     def _chain(self) -> Iterator[Any]:
@@ -142,7 +144,14 @@ class SceneTables:
         stamps = np.array([*self._stamps.values()])
         is_key = np.arange(self.frames) % KEY_STEP == 0
         times = np.interp(np.arange(self.frames), np.flatnonzero(is_key), stamps - stamps[0]).round(6)
-        labels = self._labels(times, every_class=every_class)
+        chosen = (self._columns["actor_id"] < IGNORED_ID) | every_class
+        moved = np.diff(self._calibs.world_from_ego[:, :2, 3], axis=0, append=np.nan)
+        labels = Labels(
+            raw=False,
+            num_boxes=np.bincount(self._box_frames[chosen], minlength=self.frames),
+            agent_velocity=moved / np.diff(times, append=np.nan)[:, None],
+            **{name: column[chosen] for name, column in self._columns.items()},
+        )
         rows = scenario_rows(ScenarioFiles(scenario=place, scan=scan, meta=None, calibs=self._calibs, labels=labels))
         files = rows["sample_data"]
         tokens = [self._files[0][channel].token for channel in CAMERA_CHANNELS.values()]
@@ -187,24 +196,23 @@ class SceneTables:
             intrinsic=np.stack(intrinsics, axis=1)[before],
         )
 
-    def _labels(self, times: FloatArray, *, every_class: bool) -> Labels:
-        """Boxes at keyframes; actors are numbered as they appear, those of ignored classes from `IGNORED_ID` on."""
+    def _box_columns(self) -> dict[str, Any]:
+        """Columns of `Labels` of all boxes; actors are numbered as they appear, ignored ones from `IGNORED_ID` on."""
         boxes, follow, calibs = list(chain(*self._boxes)), self._source.follow, self._calibs
         names = [follow(follow(box, "instance_token"), "category_token").name for box in boxes]
-        frame = np.repeat(np.arange(len(self._boxes)) * KEY_STEP, list(map(len, self._boxes)))
         numbers: dict[str, int] = {}
         ids = [
             numbers.setdefault(box.instance_token, len(numbers) + 1) + (0 if name in CLASSES else IGNORED_ID)
             for box, name in zip(boxes, names, strict=True)
         ]
-        lidar_from_world = inverses(calibs.world_from_ego @ calibs.ego_from_lidar)[frame]
+        lidar_from_world = inverses(calibs.world_from_ego @ calibs.ego_from_lidar)[self._box_frames]
         turn, yaw = (
             lidar_from_world[:, :3, :3],
             _heading(lidar_from_world[:, :3, :3] @ quaternions.to_matrix(self._rotations)),
         )
         center = np.reshape([box.translation for box in boxes], (-1, 3, 1))
         velocity = np.reshape([self._velocity(box) for box in boxes], (-1, 2))
-        columns: dict[str, Any] = {
+        return {
             "category": np.array([category_of(name) for name in names], dtype=np.int8),
             "center": (turn @ center)[..., 0] + lidar_from_world[:, :3, 3],
             "size": np.reshape([box.size for box in boxes], (-1, 3))[:, [1, 0, 2]],
@@ -214,14 +222,6 @@ class SceneTables:
             "num_lidar_pts": np.array([box.num_lidar_pts for box in boxes], dtype=np.int64),
             "camera_visible": np.array([box.visibility_token != _UNSEEN for box in boxes], dtype=bool),
         }
-        chosen = (columns["actor_id"] < IGNORED_ID) | every_class
-        moved = np.diff(calibs.world_from_ego[:, :2, 3], axis=0, append=np.nan)
-        return Labels(
-            raw=False,
-            num_boxes=np.bincount(frame[chosen], minlength=self.frames),
-            agent_velocity=moved / np.diff(times, append=np.nan)[:, None],
-            **{name: column[chosen] for name, column in columns.items()},
-        )
 
     def _velocity(self, box: Any) -> FloatArray:
         """The velocity (2,) of a box in the world, m/s, as the nuScenes devkit derives it; NaN where it knows none."""
