@@ -333,10 +333,14 @@ class Dataset(OpenTables):
             SensorFileError: it cannot be read.
         """
         row, name = self._sample_row(sample), choice("frame", self.frame_name(frame), get_args(Frame))
-        cloud = read_lidar(self._channel_path(row, LIDAR))
+        cloud = self._lidar_cloud(row)
         if name == "lidar":
             return cloud
         return cloud.transform(self._world_from(row, name).inverse() @ self._world_from(row, "lidar"), name)
+
+    def _lidar_cloud(self, row: int) -> LidarPointCloud:
+        """Read the points of a row of `sample` in its LiDAR frame."""
+        return read_lidar(self._channel_path(row, LIDAR))
 
     def load_bev(self, sample: RowArgument) -> BevImage:
         """What the BEV instance camera of a sample's agent saw; forward is up (see `BevImage`).

@@ -16,7 +16,7 @@ from deepaccident_devkit.release.layout import nuscenes_tables
 from deepaccident_devkit.rooms import added
 from deepaccident_devkit.support.files import write_bytes
 from deepaccident_devkit.support.json_text import parsed_json
-from deepaccident_devkit.taxonomy import VERSIONS, OnError, StyleName
+from deepaccident_devkit.taxonomy import VERSIONS, StyleName
 
 _WORDS = {"yes": "true", "no": "false"}
 
@@ -126,14 +126,12 @@ def engine_of(options: Mapping[str, Any]) -> dict[str, Any]:
     return {name: options[name] for name in ("workers", "executor")}
 
 
-def open_release(
-    dataroot: Any, *, index_dir: Path | None = None, on_error: OnError = "raise", **how: Any
-) -> DeepAccident:
+def open_release(dataroot: Any, *, index_dir: Path | None = None, **how: Any) -> DeepAccident:
     """The release that a verb is about; a dataroot of nuScenes is one, too."""
     if isinstance(dataroot, Path) and nuscenes_tables(dataroot):
-        release: DeepAccident = added("opener", "nuscenes")(dataroot, index_dir, on_error)
+        release: DeepAccident = added("opener", "nuscenes")(dataroot, index_dir)
         return release
-    return DeepAccident(dataroot=dataroot, index_dir=index_dir, on_error=on_error, **how)
+    return DeepAccident(dataroot=dataroot, index_dir=index_dir, **how)
 
 
 def release_of(options: Mapping[str, Any]) -> dict[str, Any]:

@@ -207,7 +207,8 @@ def _labels(
     dataset: Dataset, group: Sequence[RowArgument], config: MotionLabelConfig, id_map: Mapping[int, int] | None
 ) -> Iterator[MotionLabels]:
     """The labels of S samples; the ids of each continue the map."""
-    dataset = dataset.with_ignored if config.rules.sight == "camera" else dataset
+    if config.rules.sight == "camera":
+        dataset = dataset.with_ignored
     row, columns = np.array([dataset.getind("sample", sample) for sample in group]), dataset.columns("sample")
     bare = row[~columns["labelled"][row]]
     if len(bare):

@@ -84,17 +84,17 @@ class SourceCheck(ShortRepr):
         """What is wrong, a sentence each."""
         way = float(np.degrees(np.angle(np.exp(1j * np.radians(self.turns)).sum())))
         turned = _is_above((np.abs(self.turns) > _ASIDE) - _MOST_ASIDE)
-        road = float(_mean(self.road))
+        road, floor = _mean(self.road), _mean(self.boxes)
         heights = (self.road, self.boxes - np.nan_to_num(road))
-        sunk = next((-_mean(each) for each in heights if _is_above(each * np.sign(_mean(each)) - _OFF)), None)
-        said = f"the road lies at {road:.1f} m, boxes stand at {_mean(self.boxes):.1f} m"
+        sunk = [-_mean(height) for height in heights if _is_above(height * np.sign(_mean(height)) - _OFF)]
+        where = f"the road lies at {road:.1f} m, boxes stand at {floor:.1f} m"
         side = self._side_fault()
         if self.lidar < _AT_ORIGIN and (turned or sunk):
-            yield f"the LiDAR's frame stands for the ego's: {said}, and it moves {way:.0f} degrees off x"
+            yield f"the LiDAR's frame stands for the ego's: {where}, and it moves {way:.0f} degrees off x"
         elif turned:
             yield f"x is not forward: the ego moves {way:.0f} degrees to the left of it"
         elif sunk:
-            yield f"sunk by {sunk:.1f} m: {said}"
+            yield f"sunk by {sunk[0]:.1f} m: {where}"
         elif side:
             yield side
         swapped = [*self._shown_elsewhere(), *self._turned_away(way if turned else 0)]
@@ -109,11 +109,8 @@ class SourceCheck(ShortRepr):
             yield "how high the road lies, since there are few points and few boxes"
         if len(self.held) < _LEAST_VALUES:
             yield "whether y is to the left, since few boxes should hold points"
-        unclear = [
-            name
-            for name, own in zip(CAMERAS, np.diagonal(self._clearer(), axis1=1, axis2=2).T, strict=True)
-            if not _is_above(own)
-        ]
+        clearer = self._clearer()
+        unclear = [name for code, name in enumerate(CAMERAS) if not _is_above(clearer[:, code, code])]
         if unclear:
             yield f"whether the images are those of {', '.join(unclear)}, since boxes hardly stand out in them"
 
@@ -135,13 +132,12 @@ class SourceCheck(ShortRepr):
 
         clearer = self._clearer()
         summed = np.nan_to_num(_mean(clearer, axis=0)[0]) + 1e-9 * np.eye(len(CAMERAS))
-        cameras, images = linear_sum_assignment(-summed)
-        moved = cameras != images
-        own, others = (clearer[:, cameras[moved], each[moved]] for each in (cameras, images))
-        if not (_is_above(others, tests=_ORDERS) and _is_above(others - own)):
+        cameras, images = linear_sum_assignment(summed, maximize=True)
+        moved = np.flatnonzero(cameras != images)
+        others = clearer[:, moved, images[moved]]
+        if not (_is_above(others, tests=_ORDERS) and _is_above(others - clearer[:, moved, moved])):
             return []
-        pairs = zip(cameras[moved].tolist(), images[moved].tolist(), strict=True)
-        return [f"{CAMERAS[to]} shows what {CAMERAS[at]} should" for at, to in pairs]
+        return [f"{CAMERAS[images[at]]} shows what {CAMERAS[at]} should" for at in moved.tolist()]
 
     def _turned_away(self, turn: float) -> list[str]:
         nearest = np.abs((self.looks[:, None] - turn - _LOOKS + 180) % 360 - 180).argmin(axis=1).tolist()
@@ -185,22 +181,19 @@ def check_source(dataset: Dataset) -> SourceCheck:
 def look_at(dataset: Dataset) -> SourceCheck:
     """What some of the labelled samples of the first vehicle show; raises as `check_source`, but no SourceError."""
     samples = [dataset.sample[row]["token"] for row in labelled_rows(dataset).tolist()]
-    chosen = spread([each for each in samples if dataset.sensor_path(each, LIDAR).exists()] or samples, _SAMPLES)
+    with_clouds = [sample for sample in samples if dataset.sensor_path(sample, LIDAR).exists()]
+    chosen = spread(with_clouds or samples, _SAMPLES)
     boxes = [dataset.with_ignored.boxes(sample, "ego") for sample in chosen]
     boxes = [each.select((each.num_lidar_pts >= _LEAST_POINTS) & (each.actor_id != OWN_ACTOR_ID)) for each in boxes]
-    clouds = [
-        dataset.load_point_cloud(sample, "ego").xyz if dataset.sensor_path(sample, LIDAR).exists() else np.zeros((0, 3))
-        for sample in chosen
-    ]
+    clouds = [dataset.load_point_cloud(sample, "ego").xyz for sample in chosen if with_clouds]
     held = [
         np.column_stack([each.count_points(points * side) > 0 for side in _SIDES])
-        for points, each in zip(clouds, boxes, strict=True)
-        if len(points)
+        for points, each in zip(clouds, boxes, strict=False)  # without any cloud none
     ]
     turns = np.array([_turn(dataset, *pair) for pair in pairwise(samples)])
     return SourceCheck(
         turns=turns[np.isfinite(turns)],
-        road=np.array([road_height(points) for points in clouds]),
+        road=np.array([road_height(points) for points in clouds] or [np.nan] * len(chosen)),
         boxes=np.array([_floor(each) for each in boxes]),
         lidar=float(np.median([dataset.ego_from(sample, LIDAR).translation[2] for sample in chosen])),
         looks=np.array([looks_to(dataset.ego_from(chosen[0], camera)) for camera in CAMERAS]),
@@ -242,9 +235,10 @@ def looks_to(ego_from_camera: SE3) -> float:
 
 def road_height(points: FloatArray) -> float:
     """The height at which most points around the ego lie; NaN without points."""
-    distance = np.hypot(points[:, 0], points[:, 1])
-    z = points[(distance > _AROUND[0]) & (distance < _AROUND[1]) & (np.abs(points[:, 2]) < _AROUND[0]), 2]
-    counts, edges = np.histogram(z, np.arange(-_AROUND[0], _AROUND[0], 0.1))
+    nearest, farthest = _AROUND
+    distance, height = np.hypot(*points[:, :2].T), points[:, 2]
+    z = height[(distance > nearest) & (distance < farthest) & (np.abs(height) < nearest)]
+    counts, edges = np.histogram(z, np.arange(-nearest, nearest, 0.1))
     return float(edges[counts.argmax()] + 0.05) if len(z) else np.nan
 
 
@@ -255,21 +249,21 @@ def _floor(boxes: Boxes) -> float:
 
 
 def _contrasts(dataset: Dataset, sample: str, boxes: Boxes) -> FloatArray:
-    """(6, 6) of a sample, as `SourceCheck` has them."""
+    """Return those of a sample (6, 6), as `SourceCheck` has them."""
     contrasts = np.full((len(CAMERAS), len(CAMERAS)), np.nan)
     if all(dataset.sensor_path(sample, camera).exists() for camera in CAMERAS):
         images = [dataset.load_image(sample, camera, least=_LEAST_SIZE) for camera in CAMERAS]
         for row, camera in zip(contrasts, CAMERAS, strict=True):
-            shown = _rectangles(dataset, sample, camera, boxes.corners())
+            shown = _rectangles(dataset, sample, camera, boxes)
             if len(shown):
                 row[:] = [np.log1p([_contrast(image, *each) for each in shown]).mean() for image in images]
     return contrasts
 
 
-def _rectangles(dataset: Dataset, sample: str, camera: str, corners: FloatArray) -> FloatArray:
-    """(K, 2, 2) middle and half size, as shares of the image, of the boxes, corners (N, 8, 3), that it should show."""
+def _rectangles(dataset: Dataset, sample: str, camera: str, boxes: Boxes) -> FloatArray:
+    """Return middle and half size (K, 2, 2), as shares of the image, of the boxes that it should show."""
     camera_from_ego = dataset.world_from(sample, camera).inverse() @ dataset.world_from(sample, "ego")
-    corners = camera_from_ego.apply(corners.reshape(-1, 3)).reshape(-1, 8, 3)
+    corners = boxes.transform(camera_from_ego, camera).corners()
     near = ((corners[..., 2] > _DEPTHS[0]) & (corners[..., 2] < _DEPTHS[1])).all(axis=1)
     lens = dataset.camera(sample, camera)
     pixels = lens.project(corners[near].reshape(-1, 3))[0].reshape(-1, 8, 2) / (lens.width, lens.height)

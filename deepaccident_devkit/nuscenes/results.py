@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from typing import Any, Final
 
 from deepaccident_devkit.errors import ResultsError
 from deepaccident_devkit.evaluation import DetectedBoxes, read_results
+from deepaccident_devkit.evaluation.results.writer import detection_entries
 from deepaccident_devkit.nuscenes.classes import DETECTION_NAMES
 from deepaccident_devkit.nuscenes.source import NuScenesRelease
 from deepaccident_devkit.support.files import write_bytes
-from deepaccident_devkit.taxonomy import CATEGORIES
 
 NAME: Final = "nuscenes_detections.json"
 _MOST: Final = 500
@@ -39,11 +40,13 @@ def write_detections(release: NuScenesRelease, results: Path) -> Path:
     if read.task != "detection":
         raise ResultsError(f"{results}: has results of {read.task}; nuScenes evaluates detections")
     found: dict[str, Any] = {release.nuscenes_token(token): read.prediction(token) for token in read.tokens}
-    sensors = {f"use_{name}": False for name in ("camera", "lidar", "radar", "map", "external")}
-    preset = str(read.meta.get("model", {}).get("preset", "tiny"))
-    seen = {"use_camera": preset != "tiny_lidar", "use_lidar": preset in ("tiny_lidar", "tiny_both")}
+    preset = read.meta.get("model", {}).get("preset", "tiny")
     document = {
-        "meta": sensors | seen,
+        "meta": {
+            "use_camera": preset != "tiny_lidar",
+            "use_lidar": preset in ("tiny_lidar", "tiny_both"),
+            **dict.fromkeys(("use_radar", "use_map", "use_external"), False),
+        },
         "results": {token: _entries(token, boxes) for token, boxes in found.items()},
     }
     path = results.parent / NAME
@@ -52,22 +55,11 @@ def write_detections(release: NuScenesRelease, results: Path) -> Path:
 
 
 def _entries(token: str, found: DetectedBoxes) -> list[dict[str, Any]]:
-    """The best boxes of a sample."""
-    entries = []
-    for row in (-found.scores).argsort(kind="stable")[:_MOST].tolist():
-        box, velocity = found.boxes[row], found.boxes.velocity[row, :2]
-        name = DETECTION_NAMES[CATEGORIES[int(found.boxes.category[row])]]
-        moving = bool((velocity**2).sum() > _MOVING**2)
-        entries.append(
-            {
-                "sample_token": token,
-                "translation": box.center.tolist(),
-                "size": box.wlh.tolist(),
-                "rotation": box.orientation.elements.tolist(),
-                "velocity": velocity.tolist(),
-                "detection_name": name,
-                "detection_score": float(found.scores[row]),
-                "attribute_name": _ATTRIBUTES[name][moving],
-            }
-        )
+    """Return the best boxes of a sample, with nuScenes' classes and attributes."""
+    best = (-found.scores).argsort(kind="stable")[:_MOST]
+    entries = detection_entries(token, DetectedBoxes(boxes=found.boxes.select(best), scores=found.scores[best]))
+    for entry in entries:
+        name, velocity = DETECTION_NAMES[entry["detection_name"]], entry["velocity"] or [math.nan, math.nan]
+        moving = math.hypot(*velocity) > _MOVING
+        entry |= {"detection_name": name, "velocity": velocity, "attribute_name": _ATTRIBUTES[name][moving]}
     return entries

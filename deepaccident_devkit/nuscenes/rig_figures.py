@@ -45,9 +45,9 @@ def _draw_cameras(ax: Axes, source: RigFacts) -> None:
         middle, half = 90 + each.looks, each.field_of_view / 2
         color = SERIES_COLORS[number % len(SERIES_COLORS)]
         ax.add_patch(Wedge((0, 0), 1, middle - half, middle + half, facecolor=color, alpha=0.3, edgecolor=color))
-        x, y = 0.72 * np.cos(np.radians(middle)), 0.72 * np.sin(np.radians(middle))
+        angle = np.radians(middle)
         words = f"{each.camera.removeprefix('Camera_')}\n{each.field_of_view:.0f}°, {each.above:.1f} m"
-        ax.text(x, y, words, ha="center", va="center", fontsize=text_size())
+        ax.text(0.72 * np.cos(angle), 0.72 * np.sin(angle), words, ha="center", va="center", fontsize=text_size())
     ax.set(xlim=(-1.15, 1.15), ylim=(-1.15, 1.15), xticks=[], yticks=[], aspect="equal")
     lidar = f"LiDAR {source.lidar_above:.1f} m" + (f", {source.lanes} lanes" if source.lanes else "")
     ax.set_title(source.name)

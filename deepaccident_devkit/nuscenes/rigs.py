@@ -37,6 +37,7 @@ _RISE: Final = 0.2
 _TURN: Final = 2.0
 """Degrees."""
 _SHARE: Final = 0.05
+_CLASSES: Final = (*CATEGORIES, "ignored")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -153,7 +154,7 @@ def rig_facts(dataset: Dataset) -> RigFacts:
     clouds = [dataset.load_point_cloud(token, "lidar").xyz for token in chosen]
     own = np.isin(boxes["sample_row"], rows) & (boxes["actor_id"] != OWN_ACTOR_ID)
     codes = np.where(boxes["actor_id"][own] >= IGNORED_ID, len(CATEGORIES), boxes["category"][own])
-    counts = np.bincount(codes, minlength=len(CATEGORIES) + 1) / max(len(codes), 1)
+    counts = np.bincount(codes, minlength=len(_CLASSES)) / max(len(codes), 1)
     ranges = np.linalg.norm(np.concatenate(clouds), axis=1) if clouds else np.zeros(0)
     roads = [
         road_height(dataset.ego_from(token, LIDAR).apply(each)) for token, each in zip(chosen, clouds, strict=True)
@@ -203,7 +204,7 @@ def _lanes(cloud: FloatArray) -> int:
 
 
 def _odd(first: RigFacts, second: RigFacts) -> Iterator[str]:
-    """What differs so much that a model notices it."""
+    """Yield what differs so much that a model notices it."""
     for one, other in zip(first.cameras, second.cameras, strict=True):
         if apart := ", ".join(_apart(one, other)):
             yield f"{one.camera}: {apart}"
@@ -221,7 +222,7 @@ def _odd(first: RigFacts, second: RigFacts) -> Iterator[str]:
 
 
 def _apart(one: CameraFacts, other: CameraFacts) -> Iterator[str]:
-    """What differs between two cameras of one name."""
+    """Yield what differs between two cameras of one name."""
     larger = other.focal / one.focal
     if abs(larger - 1) > _LARGER:
         views = f"its field of view is {other.field_of_view:.0f} degrees, not {one.field_of_view:.0f}"

@@ -1,10 +1,11 @@
-"""nuScenes' tables as records, read once and checked: an error names the table, the row's token and the field.
+"""nuScenes' tables as records: read once, and checked while they are read; an error names the table and the row.
 
-Only what keyframes use is checked. Rows that none of them leads to need the right types, and other tables are not read.
+Only the fields that keyframes use are read, and other tables are not.
 """
 
 from __future__ import annotations
 
+from collections import Counter, defaultdict
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Final
@@ -20,115 +21,86 @@ REMEDY: Final = "unpack the tables again, or correct what wrote them"
 _COORDINATE = Annotated[float, Meta(ge=-1e8, le=1e8)]
 _LENGTH = Annotated[float, Meta(gt=0, le=1e3)]
 _TURN = Annotated[float, Meta(ge=-1.1, le=1.1)]
-_MICROSECONDS = Annotated[float, Meta(ge=0, le=1 << 53)]
-_FOCAL = Annotated[float, Meta(ge=1, le=1e6)]
-_PIXELS = Annotated[int, Meta(ge=1, le=65535)]
-_NAME = Annotated[str, Meta(pattern=r"^[^/\x00-\x1f\x7f]+$", max_length=200)]
-_PLACE = tuple[_COORDINATE, _COORDINATE, _COORDINATE]
-_POSE: Final = {"translation": _PLACE, "rotation": tuple[_TURN, _TURN, _TURN, _TURN]}
-_FIELDS: Final[Mapping[str, Mapping[str, Any]]] = {
-    "scene": {"name": _NAME, "log_token": str, "first_sample_token": str},
-    "log": {"location": _NAME},
-    "sample": {"scene_token": str, "timestamp": _MICROSECONDS, "next": str},
-    "sensor": {"channel": str},
-    "calibrated_sensor": {**_POSE, "sensor_token": str},
-    "ego_pose": _POSE,
-    "category": {"name": str},
-    "instance": {"category_token": str},
-    "sample_data": {
-        **dict.fromkeys(("sample_token", "ego_pose_token", "calibrated_sensor_token", "filename"), str),
-        "is_key_frame": bool,
-    },
-    "sample_annotation": {
-        **_POSE,
-        **dict.fromkeys(("sample_token", "instance_token", "visibility_token", "prev", "next"), str),
-        "size": tuple[_LENGTH, _LENGTH, _LENGTH],
-        "num_lidar_pts": Annotated[int, Meta(ge=0, le=1 << 31)],
-    },
+_PIXELS = Annotated[int, Meta(ge=0, le=65535)]
+_NAME = Annotated[str, Meta(pattern=r"\A[^/\x00-\x1f\x7f]+\Z", max_length=200)]
+_VECTOR = tuple[_COORDINATE, _COORDINATE, _COORDINATE]
+_FIELD_TYPES: Final[Mapping[str, Any]] = {
+    "name": _NAME,
+    "location": _NAME,
+    "timestamp": Annotated[float, Meta(ge=0, le=1 << 53)],
+    "translation": _VECTOR,
+    "rotation": tuple[_TURN, _TURN, _TURN, _TURN],
+    "size": tuple[_LENGTH, _LENGTH, _LENGTH],
+    "camera_intrinsic": Annotated[list[_VECTOR], Meta(max_length=3)],
+    "is_key_frame": bool,
+    "filename": Annotated[str, Meta(pattern=r"(?s)\A(?!/)(?!(.*/)?\.\.(/|\Z))[^\x00]+\Z", max_length=4096)],
+    "width": _PIXELS,
+    "height": _PIXELS,
+    "num_lidar_pts": Annotated[int, Meta(ge=0, le=1 << 31)],
 }
-"""Table → field → what it holds. Metres; quaternions w, x, y, z; sizes are width, length, height."""
-_INTRINSIC = tuple[tuple[_FOCAL, _COORDINATE, _COORDINATE], tuple[_COORDINATE, _FOCAL, _COORDINATE], _PLACE]
+"""Field → its values; all others are texts. Metres, microseconds, quaternions w, x, y, z, sizes width, length, height.
 
-
-def _kinds(fields: Mapping[str, Mapping[str, Any]]) -> Mapping[str, Any]:
-    return {table: msgspec.defstruct(table, [("token", str), *own.items()]) for table, own in fields.items()}
-
-
-_ROWS: Final = _kinds(_FIELDS)
-OF_CAMERAS: Final = _kinds(
-    {"calibrated_sensor": {"camera_intrinsic": _INTRINSIC}, "sample_data": {"width": _PIXELS, "height": _PIXELS}}
-)
-"""Table → what rows of cameras have, too."""
+A file name leads to nothing above the dataroot.
+"""
+_FIELDS: Final = {
+    "scene": "name log_token first_sample_token",
+    "log": "location",
+    "sample": "scene_token timestamp next",
+    "sensor": "channel",
+    "calibrated_sensor": "sensor_token translation rotation camera_intrinsic",
+    "ego_pose": "translation rotation",
+    "category": "name",
+    "instance": "category_token",
+    "sample_data": "sample_token ego_pose_token calibrated_sensor_token filename is_key_frame width height",
+    "sample_annotation": "sample_token instance_token visibility_token translation rotation size num_lidar_pts",
+}
+"""Table → the fields that are read, besides the token."""
 _OWNERS: Final = {"sample": "scene_token", "sample_data": "sample_token", "sample_annotation": "sample_token"}
-"""Table → field that says to what its rows belong."""
+"""Table → the field that says to what its rows belong."""
 
 
 class Tables:
-    """The tables of a version of nuScenes; a row is checked when it is asked for.
+    """The tables of a version of nuScenes.
 
     Attributes:
         folder: of the tables.
-        entries: table → token → what the file says of the row; None where two rows have the token.
-        belonging: table → token of a scene or sample → tokens of the rows that belong to it, in the order of the table.
+        rows: table → token → row, in the order of the table.
     """
 
     def __init__(self, folder: Path) -> None:
-        """Read the tables; raises DatarootError for one that cannot be read, and for a row of an unknown sample."""
+        """Read the tables; raises DatarootError for a damaged row, and for one that belongs to no other."""
         self.folder = folder
-        self.entries: dict[str, dict[str, Any]] = {}
-        self.belonging: dict[str, dict[str, list[str]]] = {}
-        for table in _ROWS:
-            self._read(table)
-        for table in ("sample_data", "sample_annotation"):
-            for sample, tokens in self.belonging[table].items():
-                if sample not in self.entries["sample"]:
-                    fault = f"sample_token: sample.json has no {shortened(sample)!r}"
-                    raise DatarootError(self._sentence(table, tokens[0], fault))
+        self.rows = {table: self._read(table, fields.split()) for table, fields in _FIELDS.items()}
+        self._belonging: dict[tuple[str, str], list[Any]] = defaultdict(list)
+        for table, field in _OWNERS.items():
+            for row in self.rows[table].values():
+                owner = self.follow(row, field)
+                self._belonging[table, owner.token].append(row)
 
-    def row(self, table: str, token: str, kinds: Mapping[str, Any] = _ROWS) -> Any:
-        """Return the row of a known token as one of the kinds; raises DatarootError if it is damaged."""
-        entry = self.entries[table][token]
-        try:
-            if entry is None:
-                raise ValueError("token: two rows have it")
-            return as_record(entry, kinds[table])
-        except ValueError as error:
-            raise DatarootError(self._sentence(table, token, str(error))) from error
-
-    def follow(self, row: Any, field: str, table: str = "") -> Any:
-        """Return the row that a field leads to, in the table of the field's own name if no other is given.
-
-        Raises:
-            DatarootError: there is none, or it is damaged.
-        """
-        token, table = getattr(row, field), table or field.removesuffix("_token")
-        if token not in self.entries[table]:
+    def follow(self, row: Any, field: str) -> Any:
+        """Return the row that a field such as `scene_token` leads to; raises DatarootError if there is none."""
+        token, table = getattr(row, field), field.removesuffix("_token")
+        if token not in self.rows[table]:
             raise self.error(row, f"{field}: {table}.json has no {shortened(token)!r}")
-        return self.row(table, token)
+        return self.rows[table][token]
 
     def rows_of(self, table: str, owner: Any) -> list[Any]:
-        """Return the rows that belong to a scene or sample, in the order of the table; raises DatarootError."""
-        return [self.row(table, token) for token in self.belonging[table].get(owner.token, ())]
+        """Return the rows of a table that belong to a scene or sample, in the order of the table."""
+        return self._belonging[table, owner.token]
 
     def error(self, row: Any, fault: str) -> DatarootError:
         """Return the error of a row; the fault begins with a field."""
-        return DatarootError(self._sentence(type(row).__name__, row.token, fault))
+        return DatarootError(f"{self.folder / type(row).__name__}.json: {shortened(row.token)}: {fault}; {REMEDY}")
 
-    def _sentence(self, table: str, token: str, fault: str) -> str:
-        return f"{self.folder / table}.json: {shortened(token)}: {fault}; {REMEDY}"
-
-    def _read(self, table: str) -> None:
-        """Enter the rows of a table."""
-        path, owner = self.folder / f"{table}.json", _OWNERS.get(table)
-        entries = self.entries[table] = {}
-        groups = self.belonging[table] = {}
-        for number, entry in enumerate(read_table(path, list[Any])):
-            token = entry.get("token") if isinstance(entry, dict) else None
-            if not isinstance(token, str):
-                raise DatarootError(f"{path}: entry {number}: expected a row with a token; {REMEDY}")
-            entries[token] = None if token in entries else entry
-            if owner is not None:
-                groups.setdefault(str(entry.get(owner)), []).append(token)
+    def _read(self, table: str, fields: list[str]) -> dict[str, Any]:
+        """Return the rows of a table by their tokens."""
+        kind = msgspec.defstruct(table, [(field, _FIELD_TYPES.get(field, str)) for field in ("token", *fields)])
+        rows = read_table(self.folder / f"{table}.json", list[kind])  # type: ignore[valid-type]
+        by_token = {row.token: row for row in rows}
+        if len(by_token) < len(rows):
+            [(token, _)] = Counter(row.token for row in rows).most_common(1)
+            raise self.error(by_token[token], "token: two rows have it")
+        return by_token
 
 
 def read_table(path: Path, kind: Any) -> Any:

@@ -10,10 +10,7 @@ from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.geometry import SE3, Boxes, quaternions
 from deepaccident_devkit.geometry.boxes import trusted_boxes
-from deepaccident_devkit.support.arrays import AnyArray, FloatArray, FrozenArrays, IntArray, as_floats
-from deepaccident_devkit.taxonomy import FRAME_PERIOD
-
-_MOVED = ("center", "rotation", "velocity")
+from deepaccident_devkit.support.arrays import AnyArray, FloatArray, FrozenArrays, IntArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -24,34 +21,29 @@ class Trajectory(FrozenArrays):
         instance: token of the actor.
         frame: `world`, or a coordinate frame of the given sample.
         index: (T,) int64, frame numbers from 1, ascending; gaps where nobody annotated the actor.
+        timestamp: (T,) float64, seconds since the scenario's first frame.
         center: (T, 3) float64, metres.
         rotation: (T, 4) float64, unit quaternions w, x, y, z.
         size: (T, 3) float64, length, width, height, metres.
         velocity: (T, 3) float64, m/s over the ground, NaN if unknown.
         agents: (T,) uint8, bit masks over `taxonomy.AGENTS`: who annotated it.
         present: frame number of the given sample, before which is the past; None without one.
-        times: (T,) float64, what `timestamp` says; None for a recording at 10 Hz.
     """
 
     instance: str
     frame: str
     index: IntArray
+    timestamp: FloatArray
     center: FloatArray
     rotation: FloatArray
     size: FloatArray
     velocity: FloatArray
     agents: AnyArray
     present: int | None = None
-    times: FloatArray | None = None
 
     def __len__(self) -> int:
         """Number of moments."""
         return len(self.index)
-
-    @property
-    def timestamp(self) -> FloatArray:
-        """(T,) seconds since the scenario's first frame."""
-        return as_floats((self.index - 1) * FRAME_PERIOD) if self.times is None else self.times
 
     @property
     def yaw(self) -> FloatArray:
@@ -75,14 +67,15 @@ def trajectory(
         ChoiceError: no such frame, another frame than `world` without a sample, or a sample of another scenario.
     """
     record = dataset.get("instance", instance)
-    tracks = scenario_tracks(dataset, record["scenario_token"])
+    scenario = record["scenario_token"]
+    tracks = scenario_tracks(dataset, scenario)
     rows = np.flatnonzero(tracks.actor_id == record["actor_id"])
     frame, frame_from_world, present = dataset.frame_name(frame), SE3.identity(), None
     if sample is not None:
         there = dataset.get("sample", sample)
-        if there["scenario_token"] != record["scenario_token"]:
+        if there["scenario_token"] != scenario:
             raise ChoiceError(
-                f"trajectory: expected a sample of {record['scenario_token']}, found {there['token']}; "
+                f"trajectory: expected a sample of {scenario}, found {there['token']}; "
                 "scenarios take place in different worlds"
             )
         frame_from_world = dataset.world_from(there, frame).inverse()
@@ -90,17 +83,19 @@ def trajectory(
     elif frame != "world":
         raise ChoiceError(f"trajectory: frame {frame!r} is one of a sample; name it with sample=")
     moved = tracks.boxes.select(rows).transform(frame_from_world, frame)
-    first_frame = dataset.get("scenario", record["scenario_token"])["first_frame_token"]
+    first_frame = dataset.get("scenario", scenario)["first_frame_token"]
     frames = dataset.getind("frame", first_frame) + tracks.index[rows] - 1
     return Trajectory(
         instance=record["token"],
         frame=frame,
         index=tracks.index[rows],
-        times=dataset.columns("frame")["timestamp"][frames],
+        timestamp=dataset.columns("frame")["timestamp"][frames],
         agents=tracks.agents[rows],
+        center=moved.center,
+        rotation=moved.rotation,
         size=moved.size,
+        velocity=moved.velocity,
         present=present,
-        **{name: getattr(moved, name) for name in _MOVED},
     )
 
 
@@ -132,11 +127,10 @@ class ScenarioTracks(FrozenArrays):
 def scenario_tracks(dataset: Dataset, scenario: RowArgument) -> ScenarioTracks:
     """A scenario's rows of the track table as arrays; raises TokenError."""
     columns, scenario_row = dataset.columns("track"), dataset.getind("scenario", scenario)
-    first_frame = dataset.columns("scenario")["first_frame_row"].item(scenario_row)
-    frames = dataset.columns("scenario")["num_frames"].item(scenario_row)
+    scenarios = dataset.columns("scenario")
+    first_frame, frames = scenarios["first_frame_row"].item(scenario_row), scenarios["num_frames"].item(scenario_row)
     ends = np.array([first_frame, first_frame + frames], dtype=columns["frame_row"].dtype)
-    first, last = columns["frame_row"].searchsorted(ends)  # of another type, all rows would be copied
-    rows = slice(int(first), int(last))
+    rows = slice(*columns["frame_row"].searchsorted(ends).tolist())  # of another type, all rows would be copied
     count = rows.stop - rows.start
     boxes = trusted_boxes(
         "world",
