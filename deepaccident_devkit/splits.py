@@ -16,7 +16,7 @@ from deepaccident_devkit.errors import ConfigError, TokenError
 from deepaccident_devkit.release import write_split_file
 from deepaccident_devkit.reports import Report
 from deepaccident_devkit.support.files import replacing
-from deepaccident_devkit.support.text import columns_text, natural_order, path_of, share_text
+from deepaccident_devkit.support.text import columns_text, counted, members_of, natural_order, path_of, share_text
 from deepaccident_devkit.taxonomy import MINI_SPLITS, SCENARIO_ATTRIBUTES, SPLITS, VEHICLE_AGENTS
 
 if TYPE_CHECKING:
@@ -150,7 +150,8 @@ def save_selection(scenarios: Iterable[RowArgument], path: str | os.PathLike[str
     path = path_of(path)
     if path.suffix != ".txt":
         raise ConfigError(f"{path}: a split file's name ends in .txt; choose another name")
-    tokens = tuple(dict.fromkeys(_scenario_token(scenario) for scenario in scenarios))
+    chosen = members_of("scenarios", scenarios, "tokens or records of scenarios")
+    tokens = tuple(dict.fromkeys(_scenario_token(scenario) for scenario in chosen))
     return _write_all({path: tokens}, overwrite)[0]
 
 
@@ -189,7 +190,8 @@ class SplitReport(Report):
             ]
             blocks.append(columns_text([(field, *names), *rows]))
         if self.left_out:
-            blocks.append(f"left out, as ego_vehicle has five labels or fewer: {len(self.left_out)} scenarios")
+            scenarios = counted(len(self.left_out), "scenario")
+            blocks.append(f"left out, as ego_vehicle has five labels or fewer: {scenarios}")
         return "\n\n".join(blocks)
 
 

@@ -101,6 +101,8 @@ VERSIONS: Final = ("v1", "v1-mini")
 SPLITS: Final = ("train", "val", "test")
 MINI_SPLITS: Final = ("train_mini", "val_mini")
 """Subsets of train and val (not the mini release)."""
+SPLIT_CHOICES: Final = (*SPLITS, *MINI_SPLITS, "all")
+"""What `split=` can be by name; `all` is every scenario that is here, whatever its split."""
 EXPECTED_SCENARIOS: Final[dict[str, int]] = {"train": 483, "val": 104, "test": 104}
 EXPECTED_MINI_SCENARIOS: Final = 20
 

@@ -1,8 +1,10 @@
 """The facade as a user meets it: names, errors, ownership, pickling."""
 
+import math
 import multiprocessing
 import pickle
 from concurrent.futures import ProcessPoolExecutor
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +19,7 @@ from deepaccident_devkit.errors import (
     DatarootError,
     FieldError,
     MissingFileError,
+    NotAvailableError,
     SensorFileError,
     TableError,
     TokenError,
@@ -136,7 +139,11 @@ def test_unknown_tables_fields_channels_and_frames(da: DeepAccident) -> None:
         (lambda: da.boxes(sample, "camera"), ChoiceError, ("frame: expected one of world, ego, lidar, Camera_Front",)),
         (lambda: da.boxes(sample, visible="lidar"), ChoiceError, ("visible: expected one of camera, released, or N",)),
         (lambda: da.boxes(sample, velocity="mine"), ChoiceError, ("velocity: expected one of decoded, derived, lab",)),
-        (lambda: da.split_scenarios("training"), ChoiceError, ("split: expected one of train, val, test",)),
+        (
+            lambda: da.split_scenarios("training"),
+            ChoiceError,
+            ("split: expected one of train, val, test", "all, or a split file", "'train'?"),
+        ),
         (lambda: da.transform(sample, other), ChoiceError, ("expected two samples of one scenario",)),
         (lambda: da.sensor[8], IndexError, ("table 'sensor' has 8 rows, asked for row 8",)),
         (lambda: da.sample["token"], TableError, ("'sample' counts its rows", "found 'token'")),
@@ -183,6 +190,23 @@ def test_arguments_of_a_wrong_kind_are_our_errors(da: DeepAccident) -> None:
         *((lambda o=o: da.get_sample(da.scenario[0], "ego_vehicle", o), TokenError, number) for o in (1.7, "1", None)),
     )
     assert da.get_sample(da.scenario[0], "ego_vehicle", np.int64(2))["token"].endswith("/ego_vehicle/002")
+
+
+def test_a_sample_is_found_by_its_time_to_the_impact(da: DeepAccident) -> None:
+    accident, normal = da.find(collision=True)[0], da.find(collision=False)[0]
+    for sample in filter(lambda sample: sample["time_to_impact"] is not None, da.sample[:20]):
+        scenario, agent, _ = sample["token"].rsplit("/", 2)
+        assert da.get_sample(scenario, agent, time_to_impact=sample["time_to_impact"]) == sample
+    at = partial(da.get_sample, accident, "ego_vehicle")
+    assert at(time_to_impact=0)["token"] == f"{accident['token']}/ego_vehicle/{accident['num_frames']:03d}"
+    assert_refused(
+        (lambda: da.get_sample(normal, "ego_vehicle", time_to_impact=0), NotAvailableError, ("no collision", "frame=")),
+        (lambda: at(1, time_to_impact=0.1), TokenError, ("frame: expected", "time_to_impact=")),
+        *[
+            (partial(at, time_to_impact=wrong), TokenError, ("time_to_impact: expected",))
+            for wrong in (-0.1, 0.05, 99, math.inf, math.nan, "1")
+        ],
+    )
 
 
 def test_records_are_the_callers(da: DeepAccident) -> None:

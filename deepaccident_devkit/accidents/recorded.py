@@ -17,6 +17,7 @@ from deepaccident_devkit.geometry.box_arrays import signed_gaps
 from deepaccident_devkit.parallel import Places, in_order, run_unordered
 from deepaccident_devkit.reports import Row
 from deepaccident_devkit.support.arrays import FloatArray, FrozenArrays, IntArray, ShortRepr, checked
+from deepaccident_devkit.tables.tables import rows_of_scenarios
 from deepaccident_devkit.taxonomy import CATEGORIES, FRAME_PERIOD, AgentName
 from deepaccident_devkit.v2x.agents import agents_of
 from deepaccident_devkit.v2x.collisions import colliding_pair, contact_begin, labelled_together
@@ -209,8 +210,7 @@ def accidents_of(
     Raises:
         TokenError: no such scenario.
     """
-    chosen = range(len(dataset.scenario)) if scenarios is None else (dataset.getind("scenario", s) for s in scenarios)
-    found = [tried(accident_of, dataset, dataset.scenario[row]) for row in chosen]
+    found = [tried(accident_of, dataset, dataset.scenario[row]) for row in rows_of_scenarios(dataset, scenarios)]
     return [*those_of(Accident, found)], [*those_of(Skipped, found)]
 
 
@@ -267,8 +267,7 @@ def each_scenario(
         at_once: scenarios of a piece of work; 1 where one takes tenths of a second.
         **how: `workers`, `executor` and `progress`, as `parallel.Engine` says.
     """
-    chosen = range(len(dataset.scenario)) if scenarios is None else [dataset.getind("scenario", s) for s in scenarios]
-    rows = sorted(set(chosen))
+    rows = sorted(set(rows_of_scenarios(dataset, scenarios)))
     runs = [rows[first : first + at_once] for first in range(0, len(rows), at_once)]
     sizes, places = [len(run) for run in runs], Places(reads=dataset.places)
     parts = run_unordered(partial(_run, work, dataset), runs, sizes=sizes, places=places, label=label, **how)

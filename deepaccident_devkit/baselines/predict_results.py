@@ -36,7 +36,8 @@ from deepaccident_devkit.parallel import Places, Store, unfinished_folder
 from deepaccident_devkit.release.fingerprints import digest_of
 from deepaccident_devkit.support.text import choice, path_of, settle_choices
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
-from deepaccident_devkit.v2x import AgentConfig, Agents, Link, cooperating_agents
+from deepaccident_devkit.v2x import Agents, Link, cooperating_agents
+from deepaccident_devkit.v2x.agents import agents_note
 from deepaccident_devkit.v2x.messages import Payload, checked_link, traffic, traffic_note
 
 if TYPE_CHECKING:
@@ -94,10 +95,9 @@ class Baseline:
 
     def meta(self) -> dict[str, Any]:
         """Its notes in a results file, as JSON holds them."""
-        agents = self.agents.name if isinstance(self.agents, AgentConfig) else self.agents
         return {
             "method": f"baseline: what the agents see by the labels, {self.model.replace('_', ' ')}",
-            "agents": agents if agents is None or isinstance(agents, str) else list(agents),
+            "agents": agents_note(self.agents),
             "model": self.model,
             "link": None if self.link is None else asdict(self.link),
             "horizon": self.horizon,

@@ -92,7 +92,7 @@ _selection_parameters = together(
         "--split",
         default="val",
         show_default=True,
-        help="train, val, test, train_mini, val_mini, or a split file (.txt).",
+        help="train, val, test, train_mini, val_mini, all (every scenario that is here), or a split file (.txt).",
     ),
     click.option(
         "--samples",

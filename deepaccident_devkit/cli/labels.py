@@ -14,6 +14,7 @@ from deepaccident_devkit.motion.batch_names import BatchNames
 from deepaccident_devkit.motion.config import NO_PRESETS, slip_names
 from deepaccident_devkit.motion.label_folder import Manifest, folder_path
 from deepaccident_devkit.motion.sample_labels import Purpose
+from deepaccident_devkit.support.text import counted
 from deepaccident_devkit.v2x import AGENT_SETS
 
 _CONFIG_OPTIONS = ("preset", "protocol", "switches", "seen_by", "only_vehicle")
@@ -21,7 +22,7 @@ _CONFIG_OPTIONS = ("preset", "protocol", "switches", "seen_by", "only_vehicle")
 
 @verb()
 @release_parameters
-@click.option("--split", required=True, help="train, val, train_mini, val_mini, or a split file (.txt).")
+@click.option("--split", required=True, help="train, val, train_mini, val_mini, all, or a split file (.txt).")
 @click.option(
     "--out",
     required=True,
@@ -35,7 +36,8 @@ _CONFIG_OPTIONS = ("preset", "protocol", "switches", "seen_by", "only_vehicle")
     type=WordChoice(get_args(Purpose)),
     default="every",
     show_default=True,
-    help="every: all samples (10 Hz). all: two samples per second. train, evaluate: those of training and evaluation.",
+    help="every: all samples (10 Hz). all, keyframes: two samples per second. train, evaluate: those of training and "
+    "evaluation.",
 )
 @click.option(
     "--preset",
@@ -84,7 +86,8 @@ def labels(
         **engine_of(options),
         progress=True,
     )
-    click.echo(f"{done.samples:,} samples in {out}: {done.written} files written, {done.kept} were there already")
+    written = counted(done.written, "file")
+    click.echo(f"{counted(done.samples, 'sample')} in {out}: {written} written, {done.kept} were there already")
 
 
 def _config(options: dict[str, Any]) -> MotionLabelConfig:

@@ -170,6 +170,12 @@ Prediction = MotionOutput | Iterable[Accident]
 def instances_of(values: ArrayLike, grid: BevGrid) -> MotionOutput:
     """One prediction (T, H, W), or K of them (K, T, H, W), given as instance maps; raises GeometryError."""
     maps = as_numbers("instances", values, dtype=None)
+    height, width = _checked_grid(grid, None).shape
+    if maps.ndim not in (3, 4) or maps.shape[-2:] != (height, width):
+        raise GeometryError(
+            f"instances: expected shape (T, {height}, {width}), or (K, T, {height}, {width}) for K predictions, found "
+            f"{maps.shape}"
+        )
     return MotionOutput(grid=grid, instances=maps[None] if maps.ndim == 3 else maps)
 
 

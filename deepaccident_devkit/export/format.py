@@ -18,13 +18,14 @@ from typing import Any, ClassVar, Final, Literal, get_args
 
 from deepaccident_devkit._version import __version__
 from deepaccident_devkit.dataset import Dataset
-from deepaccident_devkit.errors import ChoiceError, SensorFileError
+from deepaccident_devkit.errors import SensorFileError
 from deepaccident_devkit.release.store import ReleasePath, StorePath
 from deepaccident_devkit.selection import parse_where
 from deepaccident_devkit.support.files import place_in, remove_in, replacing, replacing_folder
 from deepaccident_devkit.support.reading import fault_text, open_file, read_bytes
-from deepaccident_devkit.support.text import choice, settle_choices
-from deepaccident_devkit.taxonomy import AGENTS, CHANNELS, MINI_SPLITS, SPLITS
+from deepaccident_devkit.support.text import choices, members_of, settle_choices
+from deepaccident_devkit.tables.tables import split_choice
+from deepaccident_devkit.taxonomy import AGENTS, CHANNELS
 
 Link = Literal["hard", "symbolic", "copy"]
 _NO_LINKS: Final = (errno.EXDEV, errno.EPERM, errno.EACCES, errno.EMLINK, errno.ENOTSUP, errno.ENOSYS)
@@ -233,10 +234,8 @@ class Format(ABC):
         """Check the choices, give them their usual spelling, and put the agents in their usual order."""
         settle_choices(self, {"link": get_args(Link)})
         if isinstance(self.split, str) and not self.split.endswith(".txt"):
-            object.__setattr__(self, "split", choice("split", self.split, (*SPLITS, *MINI_SPLITS)))
-        for name in ("where", "agents"):
-            given = getattr(self, name)
-            object.__setattr__(self, name, (given,) if isinstance(given, str) else tuple(given))
+            object.__setattr__(self, "split", split_choice(self.split))
+        object.__setattr__(self, "where", tuple(members_of("where", self.where, "filters")))
         for text in self.where:
             parse_where(text)
         object.__setattr__(self, "agents", some_of("agents", self.agents, AGENTS))
@@ -269,9 +268,7 @@ class Format(ABC):
 
 def some_of(argument: str, given: Sequence[str], names: tuple[str, ...]) -> tuple[str, ...]:
     """Those of the names that are given, each once, in their usual order; raises ChoiceError, for none too."""
-    named = {choice(argument, name, names) for name in given}
-    if not named:
-        raise ChoiceError(f"{argument}: expected some of {', '.join(names)}, found none")
+    named = choices(argument, given, names)
     return tuple(name for name in names if name in named)
 
 

@@ -18,7 +18,7 @@ from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ConfigError, GeometryError
 from deepaccident_devkit.geometry import PinholeCamera
 from deepaccident_devkit.support.arrays import AnyArray, BoolArray, ByteArray, FloatArray, checked
-from deepaccident_devkit.support.text import choice, settle_choices
+from deepaccident_devkit.support.text import choices, settle_choices
 from deepaccident_devkit.taxonomy import CAMERAS
 
 ImageDtype = Literal["float32", "uint8"]
@@ -268,10 +268,9 @@ def _channels(name: str, given: ArrayLike) -> tuple[float, ...]:
 
 
 def _cameras(given: Iterable[str]) -> tuple[str, ...]:
-    listed = () if isinstance(given, str) or not isinstance(given, Iterable) else tuple(given)
-    names = tuple(choice("cameras", name, CAMERAS, error=ConfigError) for name in listed)
-    if not names or len(set(names)) != len(names):
-        raise ConfigError(f"cameras: expected a tuple of some of {', '.join(CAMERAS)}, each once; found {given!r}")
+    names = choices("cameras", given, CAMERAS, error=ConfigError)
+    if len(set(names)) != len(names):
+        raise ConfigError(f"cameras: expected each camera once, found {given!r}")
     return names
 
 

@@ -30,6 +30,7 @@ from deepaccident_devkit.support.arrays import BoolArray, FloatArray
 from deepaccident_devkit.support.files import place_in
 from deepaccident_devkit.tables.arrow_files import read_streams, streams
 from deepaccident_devkit.tables.columns import NULL_INTEGER
+from deepaccident_devkit.tables.tables import rows_of_scenarios
 from deepaccident_devkit.v2x.tracks import ScenarioTracks, scenario_tracks
 
 if TYPE_CHECKING:
@@ -201,8 +202,7 @@ def interactions_of(
         ChoiceError: `workers` is less than 1.
         WorkerError: a worker was killed, or cannot do the work.
     """
-    chosen = dataset.scenario[:] if scenarios is None else [dataset.get("scenario", each) for each in scenarios]
-    tokens = [record["token"] for record in chosen]
+    tokens = [dataset.scenario[row]["token"] for row in rows_of_scenarios(dataset, scenarios)]
     usual = (config or InteractionConfig()) == InteractionConfig()
     absent = [token for token in tokens if not (usual and kept_path(dataset, token).is_file())]
     made = run_unordered(

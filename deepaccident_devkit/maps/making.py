@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from deepaccident_devkit.dataset import Dataset, RowArgument
-from deepaccident_devkit.errors import ChoiceError, IndexStoreError, NotAvailableError
+from deepaccident_devkit.errors import IndexStoreError, NotAvailableError
 from deepaccident_devkit.maps.counting import (
     GROUND_CLASSES,
     Counts,
@@ -32,6 +32,7 @@ from deepaccident_devkit.support.arrays import IntArray, as_floats
 from deepaccident_devkit.support.files import place_in
 from deepaccident_devkit.support.reading import limit_of, open_zip, read_array
 from deepaccident_devkit.support.text import choice
+from deepaccident_devkit.tables.tables import rows_of_scenarios
 from deepaccident_devkit.taxonomy import BEV_CAMERA
 
 if TYPE_CHECKING:
@@ -103,7 +104,7 @@ def towns_of(dataset: Dataset, scenarios: Iterable[RowArgument] | None = None) -
     """
     if scenarios is None:
         return sorted(dataset.columns("scenario")["town"].unique().to_pylist())
-    return sorted({dataset.scenario[dataset.getind("scenario", each)]["town"] for each in scenarios})
+    return sorted({dataset.scenario[row]["town"] for row in rows_of_scenarios(dataset, scenarios)})
 
 
 def _scenarios_in(dataset: Dataset, town: str, scenarios: Iterable[RowArgument] | None) -> tuple[str, Sequence[int]]:
@@ -112,9 +113,7 @@ def _scenarios_in(dataset: Dataset, town: str, scenarios: Iterable[RowArgument] 
     rows = [dataset.getind("scenario", token) for token in dataset.field2token("scenario", "town", town)]
     if scenarios is None:
         return town, rows
-    if isinstance(scenarios, str):
-        raise ChoiceError(f"scenarios: expected several tokens or records, found {scenarios!r}; put it into a list")
-    wanted = {dataset.getind("scenario", each) for each in scenarios}
+    wanted = set(rows_of_scenarios(dataset, scenarios))
     chosen = [row for row in rows if row in wanted]
     if not chosen:
         raise NotAvailableError(f"none of the {len(wanted)} scenarios given is in {town}; leave scenarios= out for all")

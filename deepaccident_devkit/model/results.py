@@ -40,7 +40,8 @@ from deepaccident_devkit.motion import motion_labels_of
 from deepaccident_devkit.support.arrays import ShortRepr
 from deepaccident_devkit.support.files import writable_folder
 from deepaccident_devkit.taxonomy import CAMERAS, FRAME_PERIOD, LIDAR
-from deepaccident_devkit.v2x import AgentConfig, Agents, Link
+from deepaccident_devkit.v2x import Agents, Link
+from deepaccident_devkit.v2x.agents import agents_note
 from deepaccident_devkit.v2x.messages import POSE_BYTES, traffic_note
 from deepaccident_devkit.v2x.tracks import scenario_tracks
 
@@ -252,11 +253,10 @@ def scores_text(model: V2XFormer, dataset: Dataset, tokens: Sequence[str], path:
 
 def _meta(model: V2XFormer, dataset: Dataset, tokens: Sequence[str], config: PredictConfig) -> dict[str, Any]:
     """The notes in the results."""
-    agents = config.agents.name if isinstance(config.agents, AgentConfig) else config.agents
     return {
         "method": "V2XFormer of the devkit",
         "model": dict(model.notes),
-        "agents": agents if agents is None or isinstance(agents, str) else list(agents),
+        "agents": agents_note(config.agents),
         "link": None if config.link is None else asdict(config.link),
         "seed": config.seed,
         "release": release_note(dataset, map(scenario_of, tokens)),

@@ -25,8 +25,9 @@ from deepaccident_devkit.support.arrays import checked_number, checked_whole
 from deepaccident_devkit.support.files import write_bytes
 from deepaccident_devkit.support.json_text import as_record
 from deepaccident_devkit.support.reading import fault_text, read_bytes
-from deepaccident_devkit.support.text import settle_choices
-from deepaccident_devkit.v2x import AgentConfig, Agents
+from deepaccident_devkit.support.text import members_of, settle_choices
+from deepaccident_devkit.v2x import Agents
+from deepaccident_devkit.v2x.agents import agents_note
 
 _WHOLE: Final = {
     "steps": 1,
@@ -106,12 +107,13 @@ class TrainConfig:
             if not lowest <= value <= highest:
                 raise ConfigError(f"{name}: expected {expected}, found {value!r}")
         settle_choices(self, {"samples": get_args(Purpose)})
-        object.__setattr__(self, "freeze", tuple(self.freeze))
+        object.__setattr__(
+            self, "freeze", tuple(members_of("freeze", self.freeze, "beginnings of names", error=ConfigError))
+        )
 
     def as_dict(self) -> dict[str, Any]:
         """All of it, as JSON holds it."""
-        agents = self.agents.name if isinstance(self.agents, AgentConfig) else self.agents
-        return {**asdict(self), "agents": agents}
+        return {**asdict(self), "agents": agents_note(self.agents)}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -7,20 +7,19 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from types import MappingProxyType
 from typing import Any, Final, Literal, get_args
 
-from deepaccident_devkit.errors import ChoiceError, ConfigError
+from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.geometry.bev_grid import ORIENTATIONS, Orientation
 from deepaccident_devkit.motion.augmentation import Augmentation
 from deepaccident_devkit.support.arrays import checked_count, checked_flag, checked_setting
-from deepaccident_devkit.support.text import choice, spelled
-from deepaccident_devkit.taxonomy import AGENTS
-from deepaccident_devkit.v2x import AGENT_SETS, AgentConfig, Agents
-from deepaccident_devkit.v2x.agents import is_available
+from deepaccident_devkit.support.text import choice
+from deepaccident_devkit.v2x import AgentConfig, Agents
+from deepaccident_devkit.v2x.agents import checked_agents, is_available
 
 WarpRule = Literal["stretched", "exact", "fiery"]
 """How a raster is sampled when it is warped to another frame: see `motion.warping`."""
@@ -251,7 +250,7 @@ class MotionLabelConfig:
             "orientation": None,
             "ignore_index": _checked_mark(self.ignore_index, grid),
             "sigma": checked_setting("sigma", self.sigma, "cells from 0.01 to 10,000, such as 3", *_SIGMAS),
-            "agents": _checked_agents(self.agents),
+            "agents": None if is_available(self.agents) else checked_agents(self.agents),  # one digest for both
             "protocol": _NAMES.get(label_protocol(self.protocol), self.protocol),
             **{name: checked_count(name, getattr(self, name), what, _MOST_FRAMES) for name, what in _COUNTS.items()},
             **{
@@ -381,23 +380,6 @@ def _checked_mark(ignore_index: object, grid: BevGrid) -> int:
             f"ignore_index: {mark} may also be a number of cells in offset and flow; choose {least} to {_BYTE}"
         )
     return mark
-
-
-def _checked_agents(agents: object) -> AgentConfig | str | tuple[str, ...] | None:
-    if is_available(agents):
-        return None  # one digest for both
-    if agents is None or isinstance(agents, AgentConfig):
-        return agents
-    if isinstance(agents, str):
-        if spelled(agents, AGENTS) in AGENTS:
-            raise ChoiceError(f"agents: expected a configuration, found {agents!r}; for one agent give [{agents!r}]")
-        return choice("agents", agents, AGENT_SETS)
-    if not isinstance(agents, Iterable):
-        raise ChoiceError(f"agents: expected agents' names or a configuration, found {agents!r}")
-    names = tuple(choice("agents", agent, AGENTS) for agent in agents)
-    if not names:
-        raise ChoiceError("agents: expected at least one agent, found none; None or 'available' stands for all agents")
-    return names
 
 
 _DEEPACCIDENT: Final = MotionLabelConfig()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from itertools import islice
+from itertools import groupby, islice
 from typing import Final, Literal, get_args
 
 import numpy as np
@@ -20,7 +20,7 @@ from deepaccident_devkit.motion.drawing import labels_of
 from deepaccident_devkit.motion.labels import MotionLabels
 from deepaccident_devkit.motion.warping import egomotion
 from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray, IntArray, checked_number
-from deepaccident_devkit.support.text import choice
+from deepaccident_devkit.support.text import choice, choices
 from deepaccident_devkit.tables import visible_mask
 from deepaccident_devkit.tables.tables import token_of
 from deepaccident_devkit.tables.tokens import agent_token
@@ -35,12 +35,12 @@ from deepaccident_devkit.taxonomy import (
 )
 from deepaccident_devkit.v2x import cooperating_agents
 
-Purpose = Literal["train", "evaluate", "all", "every"]
+Purpose = Literal["train", "evaluate", "all", "keyframes", "every"]
 SampleProtocol = Literal["released", "paper"]
 Scope = Literal["accident", "all"]
 _KEY_STEP: Final = 5
 """Recorded frames from one key frame to the next, counted back from a scenario's last frame."""
-_STEPS: Final = {"train": 10, "evaluate": _KEY_STEP, "all": _KEY_STEP, "every": 1}
+_STEPS: Final = {"train": 10, "evaluate": _KEY_STEP, "all": _KEY_STEP, "keyframes": _KEY_STEP, "every": 1}
 _RELEASED_HORIZON: Final = 2.0
 _LIDAR: Final = CHANNELS.index(LIDAR)
 _POLE: Final = AGENTS.index(INFRASTRUCTURE)
@@ -56,6 +56,7 @@ def samples(
     *,
     horizon: float = _RELEASED_HORIZON,
     scope: Scope = "accident",
+    sensors: Iterable[str] = (),
 ) -> list[str]:
     """The labelled samples of a split that a model is trained on or evaluated at, of all agents.
 
@@ -64,18 +65,20 @@ def samples(
     - `train`: one a second, of normal and accident scenarios;
     - `evaluate`: two a second within the last `horizon` seconds except the last frame, of scenarios designed to end
       in an accident (`_accident` in their folder); `scope="all"` adds the normal ones;
-    - `all`: two a second, the whole of every scenario;
+    - `all`, or `keyframes`: two a second, the whole of every scenario, but not all of its samples;
     - `every`: all samples, ten a second.
 
     The released V2X class stops after 50 samples of a list in an unknown order; this function does not.
 
     Args:
         dataset: the release.
-        split: `train`, `val`, … or a split file, as `Dataset.split_scenarios` takes it.
-        purpose: `train`, `evaluate`, `all` or `every`.
+        split: `train`, `val`, …, `all` or a split file, as `Dataset.split_scenarios` takes it.
+        purpose: `train`, `evaluate`, `all`, `keyframes` or `every`.
         protocol: `released` has only a horizon of 2 s and accident scenarios; `paper` allows others.
         horizon: seconds before the end, a multiple of 0.5; only for `evaluate`.
         scope: `accident` or `all`; only for `evaluate`.
+        sensors: channels, such as `Camera_Front`: only samples whose own files of all of these are here, such as of a
+            partial download.
 
     Returns:
         Tokens by scenario, agent and time.
@@ -83,9 +86,10 @@ def samples(
     Raises:
         ChoiceError: no such split, purpose, protocol or scope.
         ConfigError: a horizon that is no multiple of 0.5 s, or one that the released protocol does not have.
-        NotAvailableError: the split is unknown, this release has no scenario of it, or none of its samples has labels
-            (the test split has none).
+        NotAvailableError: the split is unknown, this release has no scenario of it, none of its samples has labels
+            (the test split has none), or none has the files of the sensors.
     """
+    channels = choices("sensors", sensors, CHANNELS, empty=True)
     listed: str = choice("purpose", purpose, _STEPS)
     protocol = choice("protocol", protocol, get_args(SampleProtocol))
     scope = choice("scope", scope, get_args(Scope))
@@ -114,7 +118,25 @@ def samples(
         chosen &= (to_end > 0) & (to_end <= round(seconds / FRAME_PERIOD))
         if scope == "accident":
             chosen &= scenarios["designed_accident"][:][row]
-    return [dataset.sample[index]["token"] for index in np.flatnonzero(in_split & chosen).tolist()]
+    tokens = [dataset.sample[index]["token"] for index in np.flatnonzero(in_split & chosen).tolist()]
+    return _with_files(dataset, tokens, channels) if channels else tokens
+
+
+def _with_files(dataset: Dataset, tokens: Sequence[str], channels: Sequence[str]) -> list[str]:
+    """Keep the samples that have the files of these sensors; raises NotAvailableError if none has."""
+    kept: list[str] = []
+    for scenario, of_scenario in groupby(tokens, lambda token: token.rsplit("/", 2)[0]):
+        frames = dataset.sensor_frames(scenario)
+        for token in of_scenario:
+            agent, number = token.split("/")[-2:]
+            if all(int(number) in frames[agent, channel] for channel in channels):
+                kept.append(token)
+    if tokens and not kept:
+        raise NotAvailableError(
+            f"sensors: none of the {len(tokens)} samples has its files of {', '.join(channels)} in {dataset.dataroot}; "
+            "unpack their archives, or choose other sensors"
+        )
+    return kept
 
 
 def no_samples_text(dataset: Dataset, split: str | os.PathLike[str], scope: Scope) -> str:
@@ -134,9 +156,9 @@ def _splits_text(dataset: Dataset) -> str:
     return ", ".join(f"{name}: {count} scenario{'s' * (count != 1)}" for name, count in counts.items())
 
 
-def training_samples(dataset: Dataset, split: str | os.PathLike[str]) -> list[str]:
+def training_samples(dataset: Dataset, split: str | os.PathLike[str], *, sensors: Iterable[str] = ()) -> list[str]:
     """The samples that a model is trained on, one a second: `samples` for the purpose `train`; see there."""
-    return samples(dataset, split, "train")
+    return samples(dataset, split, "train", sensors=sensors)
 
 
 def evaluation_samples(

@@ -14,7 +14,7 @@ import numpy as np
 
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.selection.fields import Field, Value
-from deepaccident_devkit.support.text import possible_text
+from deepaccident_devkit.support.text import meant_text, possible_text
 
 FilterValue = Value | Collection[Value]
 """What a keyword of `find` takes: a value, or several values, one of which must match."""
@@ -137,7 +137,10 @@ def _single(field: Field, value: object, possible: list[str]) -> Value:
     if isinstance(value, str) and (word := _spelt(value, possible)) is not None:
         return word
     meant = value if isinstance(value, str) and len(value) <= _LONGEST else ""
-    raise ChoiceError(f"{field.name}: found {_shown(value)}; possible are {possible_text(meant, possible)}")
+    raise ChoiceError(
+        f"{field.name}: found {_shown(value)}; possible are {possible_text(meant, possible)}"
+        f"{meant_text(meant, possible)}"
+    )
 
 
 def _spelt(value: str, possible: Iterable[str]) -> str | None:

@@ -9,7 +9,6 @@ import numpy as np
 
 from deepaccident_devkit import taxonomy
 from deepaccident_devkit.dataset import Dataset, RowArgument
-from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.geometry import quaternions
 from deepaccident_devkit.rooms import added
 from deepaccident_devkit.statistics.report import DatasetStatistics
@@ -30,6 +29,7 @@ from deepaccident_devkit.statistics.results import (
     word_of,
 )
 from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray, IntArray
+from deepaccident_devkit.tables.tables import rows_of_scenarios
 from deepaccident_devkit.taxonomy import AGENTS, CATEGORIES, OWN_ACTOR_ID, STATIC_ACTOR_ID
 
 if TYPE_CHECKING:
@@ -87,7 +87,7 @@ def dataset_statistics(
         ChoiceError: `scenarios` is nothing of this, or `workers` is less than 1.
         WorkerError: a worker was killed, or cannot do the work.
     """
-    chosen = _Chosen(dataset, _rows_of(dataset, scenarios))
+    chosen = _Chosen(dataset, sorted(set(rows_of_scenarios(dataset, scenarios))))
     pairs, pair_histograms = _collisions(chosen)
     (distances, distance_quantiles), (speeds, speed_quantiles) = _distances(chosen), _speeds(chosen)
     histograms = [_lengths(chosen), _ego_speeds(chosen), _actors(chosen), distances, speeds, *pair_histograms]
@@ -108,17 +108,6 @@ def dataset_statistics(
         quantiles={table.name: table for table in quantiles},
         collisions=pairs,
     )
-
-
-def _rows_of(dataset: Dataset, scenarios: Chosen) -> Sequence[int]:
-    """The rows of scenarios, ascending; raises TokenError or ChoiceError."""
-    if isinstance(scenarios, str | Mapping):
-        scenarios = [scenarios]
-    if scenarios is None:
-        return range(len(dataset.scenario))
-    if not isinstance(scenarios, Iterable):
-        raise ChoiceError(f"scenarios: expected tokens or records of scenarios, found {scenarios!r}")
-    return sorted({dataset.getind("scenario", token) for token in scenarios})
 
 
 class _Chosen:

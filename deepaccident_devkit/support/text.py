@@ -21,6 +21,8 @@ from deepaccident_devkit.errors import ChoiceError, ConfigError, DeepAccidentErr
 Word = TypeVar("Word", bound=str | None)
 _LISTED = 20
 """Words that a message lists at most."""
+_STEM = 3
+"""Letters of the shortest word that is meant by a longer one which begins with it, as `val` by `validation`."""
 _DIFFERING = 3
 """Differing values that a message shows at most."""
 _NUMBER: Final = re.compile(r"[+-]?((\d+\.?\d*|\.\d+)(e[+-]?\d+)?|nan|inf|infinity)", re.ASCII | re.IGNORECASE)
@@ -118,13 +120,14 @@ def size_text(count: int) -> str:
 
 
 def possible_text(wrong: str, possible: Iterable[str]) -> str:
-    """The possible words in a line, those most like `wrong` first; of many, the first twenty and how many more."""
+    """The possible words in a line; of more than twenty, those most like `wrong` first, and how many more there are."""
     words = list(possible)
+    if len(words) <= _LISTED:
+        return ", ".join(words)
     lowered = {word.lower(): word for word in words}
     close = [lowered[word] for word in get_close_matches(wrong.lower(), lowered, n=3)]
     ordered = list(dict.fromkeys([*close, *words]))
-    more = f" and {len(ordered) - _LISTED} more" if len(ordered) > _LISTED else ""
-    return ", ".join(ordered[:_LISTED]) + more
+    return f"{', '.join(ordered[:_LISTED])} and {len(ordered) - _LISTED} more"
 
 
 def meant_text(wrong: object, possible: Iterable[object]) -> str:
@@ -134,6 +137,7 @@ def meant_text(wrong: object, possible: Iterable[object]) -> str:
         return ""
     start = wrong.lower()
     close = get_close_matches(start, lowered, n=1) or [word for word in lowered if word.startswith(start)]
+    close = close or [word for word in lowered if len(word) >= _STEM and start.startswith(word)]
     return f"; did you mean {lowered[close[0]]!r}?" if close else ""
 
 
@@ -171,11 +175,12 @@ def choice(
     *,
     error: type[DeepAccidentError] = ChoiceError,
     elsewhere: Mapping[str, str] = MappingProxyType({}),
+    also: str = "",
 ) -> Word:
     """The one of some words, None perhaps among them, that a caller means, in its own spelling; else ChoiceError.
 
     Small letters may stand for capital ones. `error` is another kind of error; `elsewhere` says of words that mean
-    something in another place what to do with them.
+    something in another place what to do with them; `also` says what can be given instead of a word.
     """
     expected = [word for word in words if word is not None]
     chosen: Word = spelled(value, expected)
@@ -183,7 +188,42 @@ def choice(
         return chosen
     none = ", or None" if len(expected) < len(words) else ""
     meant = elsewhere.get(str(value).lower()) or meant_text(value, expected)
-    raise error(f"{name}: expected one of {', '.join(expected)}{none}, found {value!r}{meant}")
+    raise error(f"{name}: expected one of {', '.join(expected)}{none}{also}, found {value!r}{meant}")
+
+
+def members_of(
+    argument: str, given: object, expected: str, *, error: type[DeepAccidentError] = ChoiceError
+) -> list[Any]:
+    """Return the members of a collection that a caller passes; a single text or record is a collection of one.
+
+    Raises:
+        ChoiceError: it is no collection; or another kind of error.
+    """
+    if isinstance(given, str | Mapping):
+        return [given]
+    if not isinstance(given, Iterable):
+        raise error(f"{argument}: expected {expected}, found {given!r}")
+    return list(given)
+
+
+def choices(
+    argument: str,
+    given: object,
+    words: Collection[Word],
+    *,
+    empty: bool = False,
+    error: type[DeepAccidentError] = ChoiceError,
+) -> tuple[Word, ...]:
+    """Return some of the possible words, in the caller's order and in their own spelling; a single one needs no list.
+
+    Raises:
+        ChoiceError: a word is not possible, or there is none although `empty` is False; or another kind of error.
+    """
+    expected = f"some of {', '.join(map(str, words))}"
+    members = members_of(argument, given, expected, error=error)
+    if not (members or empty):
+        raise error(f"{argument}: expected {expected}, found none")
+    return tuple(choice(argument, member, words, error=error) for member in members)
 
 
 def settle_choices(

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import os
 import shlex
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Generic, NoReturn, TypeVar, cast, get_args, overload
+from typing import TYPE_CHECKING, Any, Final, Generic, NoReturn, TypeVar, cast, get_args, overload
 
 import numpy as np
 
@@ -22,21 +22,24 @@ from deepaccident_devkit.errors import (
 from deepaccident_devkit.release import read_split_file
 from deepaccident_devkit.release.fingerprints import ScenarioHashes
 from deepaccident_devkit.release.store import ReleasePath, places_of
+from deepaccident_devkit.support.arrays import checked_number
 from deepaccident_devkit.support.json_text import as_record, parsed_json
 from deepaccident_devkit.support.nuscenes_names import field_remedy, with_keywords_named
-from deepaccident_devkit.support.text import choice, meant_text, path_of, spelled
+from deepaccident_devkit.support.text import choice, meant_text, members_of, path_of, spelled
 from deepaccident_devkit.tables.arrow_files import HASHES, REMEDY, StoredTable, damaged_value
 from deepaccident_devkit.tables.columns import NULL_INTEGER, Choice, Column, Key, Number, Subset, Vector
 from deepaccident_devkit.tables.index import Problem
 from deepaccident_devkit.tables.records import table_spec, table_specs
 from deepaccident_devkit.tables.tokens import Resolver
-from deepaccident_devkit.taxonomy import AGENTS, MINI_SPLITS, SPLITS, OnError
+from deepaccident_devkit.taxonomy import AGENTS, FRAME_PERIOD, MINI_SPLITS, SPLIT_CHOICES, OnError
 
 if TYPE_CHECKING:
     from deepaccident_devkit.tables import records
 
 Record = TypeVar("Record")
 _Getter = Callable[[int], Any]
+_SAME_FRAME: Final = 1e-6
+"""Frames by which a time may miss its frame."""
 RowArgument = str | Mapping[str, Any]
 """How a caller names a row: by its token, or by its record."""
 
@@ -203,11 +206,37 @@ class OpenTables:
         """
         return self._tables.views[self._tables.table(table).name]
 
-    def get_sample(self, scenario: RowArgument, agent: str, frame: int) -> records.SampleRecord:
-        """The sample of an agent at frame number `frame` (from 1) of a scenario; raises TokenError."""
-        if not isinstance(frame, int | np.integer):
-            raise TokenError(f"frame: expected a number from 1, found {frame!r}")
+    def get_sample(
+        self, scenario: RowArgument, agent: str, frame: int | None = None, *, time_to_impact: float | None = None
+    ) -> records.SampleRecord:
+        """Return the sample of an agent at a moment of a scenario.
+
+        Args:
+            scenario: token or record.
+            agent: its name.
+            frame: number of the frame, from 1.
+            time_to_impact: instead of a frame, seconds before the impact, which is the last frame; a multiple of 0.1.
+
+        Raises:
+            TokenError: no such scenario, agent or frame; or neither of `frame` and `time_to_impact` is given, or both.
+            NotAvailableError: the scenario has no collision, so that no impact is known.
+        """
+        if time_to_impact is not None and frame is None:
+            frame = self._frame_before_impact(scenario, time_to_impact)
+        elif time_to_impact is not None or not isinstance(frame, int | np.integer):
+            raise TokenError(f"frame: expected a number from 1, or time_to_impact= instead, found {frame!r}")
         return self.sample.get(f"{token_of(scenario)}/{spelled(agent, AGENTS)}/{frame:03d}")
+
+    def _frame_before_impact(self, scenario: RowArgument, seconds: float) -> int:
+        record = self.scenario.get(token_of(scenario))
+        if record["collision"] is None:
+            raise NotAvailableError(f"{record['token']}: has no collision by its meta file; give frame= instead")
+        steps = checked_number("time_to_impact", seconds, "seconds", TokenError) / FRAME_PERIOD
+        frames = round(steps) if np.isfinite(steps) else -1
+        if not 0 <= frames < record["num_frames"] or abs(steps - frames) > _SAME_FRAME:
+            longest = (record["num_frames"] - 1) / 10
+            raise TokenError(f"time_to_impact: expected 0, 0.1, 0.2, … up to {longest} s, found {seconds}")
+        return record["num_frames"] - frames
 
     def samples_of(self, frame: RowArgument) -> list[records.SampleRecord]:
         """The samples of one moment, one for each agent that is there, in the order of `taxonomy.AGENTS`."""
@@ -219,9 +248,9 @@ class OpenTables:
         """The tokens of this release's scenarios that belong to a split.
 
         Args:
-            split: `train`, `val`, `test`, `train_mini` or `val_mini`: those of it that are here. Or a split file of
-                your own, as a path object or a text that ends in `.txt`: blank lines, CRLF and a byte order mark are
-                fine, the same scenario in two lines is a fault.
+            split: `train`, `val`, `test`, `train_mini` or `val_mini`: those of it that are here; or `all` that are
+                here, whatever their split. Or a split file of your own, as a path object or a text that ends in
+                `.txt`: blank lines, CRLF and a byte order mark are fine, the same scenario in two lines is a fault.
             missing: a file's scenarios that are not in this release: `raise`, or `skip` them.
 
         Raises:
@@ -246,7 +275,9 @@ class OpenTables:
                 )
             return here.intersection(listed)
         unsplit = f"; for scenarios whose split is unknown {self._own_split_text().removeprefix('or ')}"
-        split = choice("split", split, (*SPLITS, *MINI_SPLITS), elsewhere={"unknown": unsplit})
+        split = split_choice(split, elsewhere={"unknown": unsplit})
+        if split == "all":
+            return here
         if split in MINI_SPLITS:
             if split not in self._split_files:
                 raise NotAvailableError(
@@ -436,12 +467,25 @@ def table_names() -> list[str]:
     return list(table_specs())
 
 
+def split_choice(split: str, **remedies: Any) -> str:
+    """Return the name of a split in its own spelling; raises ChoiceError. `remedies` are arguments of `choice`."""
+    return choice("split", split, SPLIT_CHOICES, also=", or a split file (its name ends in .txt)", **remedies)
+
+
 def token_of(row: RowArgument) -> str:
     """The token of a row given by token or record, as the whole API takes it; raises TokenError."""
     token = row.get("token") if isinstance(row, Mapping) else row
     if not isinstance(token, str):
         raise TokenError(f"expected a token or a record with one, found {row!r}")
     return token
+
+
+def rows_of_scenarios(tables: OpenTables, scenarios: RowArgument | Iterable[RowArgument] | None) -> Sequence[int]:
+    """Return the rows of scenarios in the order given, those of all for None; raises TokenError or ChoiceError."""
+    if scenarios is None:
+        return range(len(tables.scenario))
+    chosen = members_of("scenarios", scenarios, "tokens or records of scenarios")
+    return [tables.getind("scenario", scenario) for scenario in chosen]
 
 
 def _reopened(kind: type[OpenTables], arguments: dict[str, Any]) -> OpenTables:

@@ -12,7 +12,7 @@ from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.release import Collision, Meta, ScenarioFolder, write_meta, write_split_file
 from deepaccident_devkit.release.store import real_path
 from deepaccident_devkit.support.files import check_free, replacing_folder
-from deepaccident_devkit.support.text import choice, settle_choices
+from deepaccident_devkit.support.text import choices, settle_choices
 from deepaccident_devkit.taxonomy import (
     AGENTS,
     BEV_CAMERA,
@@ -56,15 +56,11 @@ class SmallRelease:
 
     def __post_init__(self) -> None:
         """Check every field; lists become tuples, so that equal configurations have equal hashes."""
-        for name in ("splits", "agents", "channels", "image_size"):
-            object.__setattr__(self, name, _as_tuple(name, getattr(self, name)))
+        object.__setattr__(self, "image_size", _as_tuple("image_size", self.image_size))
         settle_choices(self, {"layout": get_args(Layout)}, error=ConfigError)
         for name, known in (("splits", SPLITS), ("agents", AGENTS), ("channels", CHANNELS)):
-            named = tuple(choice(name, one, known, error=ConfigError) for one in getattr(self, name))
+            named = choices(name, getattr(self, name), known, empty=name == "channels", error=ConfigError)
             object.__setattr__(self, name, named)
-        for name, count in (("splits", len(self.splits)), ("agents", len(self.agents))):
-            if not count:
-                raise ConfigError(f"{name}: expected at least one, found none")
         if not 1 <= self.frames <= _MOST_FRAMES:
             raise ConfigError(f"frames: expected 1 to {_MOST_FRAMES}, found {self.frames}")
         if self.seed < 0:

@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from deepaccident_devkit.dataset import Dataset, RowArgument
-from deepaccident_devkit.errors import ChoiceError, GeometryError, NotAvailableError, TokenError
+from deepaccident_devkit.errors import GeometryError, NotAvailableError, TokenError
 from deepaccident_devkit.geometry.boxes import concatenate
 from deepaccident_devkit.support.arrays import BoolArray, as_numbers
-from deepaccident_devkit.support.text import choice, spelled
+from deepaccident_devkit.support.text import choice, choices
 from deepaccident_devkit.tables import visible_ids, visible_mask
 from deepaccident_devkit.taxonomy import AGENTS, INFRASTRUCTURE, VEHICLE_AGENTS, AgentName
 
@@ -68,13 +68,6 @@ _PARTNERS: Final[dict[AgentName, dict[Role, AgentName]]] = {
 """Ego → role → agent: the released V2X dataset's renaming (docs/released_code.md, Poses)."""
 
 
-def _names(argument: str, expected: str, given: Iterable[str]) -> tuple[str, ...]:
-    """Several names from a caller, checked; raises ChoiceError."""
-    if isinstance(given, str) or not isinstance(given, Iterable):
-        raise ChoiceError(f"{argument}: expected {expected}, found {given!r}")
-    return tuple(given)
-
-
 @dataclass(frozen=True, slots=True)
 class AgentConfig:
     """The agents that cooperate with an ego agent, named by their roles.
@@ -89,9 +82,7 @@ class AgentConfig:
 
     def __post_init__(self) -> None:
         """Check the roles; raises ChoiceError."""
-        named = _names("partners", "roles", self.partners)
-        roles: tuple[Role, ...] = tuple(choice("partners", role, get_args(Role)) for role in named)
-        object.__setattr__(self, "partners", roles)
+        object.__setattr__(self, "partners", choices("partners", self.partners, get_args(Role), empty=True))
 
     def agents_for(self, ego: str, *, side: Side = "ego_vehicle") -> tuple[AgentName, ...]:
         """The agents of this configuration by their own names, the ego first.
@@ -138,8 +129,27 @@ AVAILABLE: Final = "available"
 AGENT_SETS: Final = (*AGENT_CONFIGS, AVAILABLE)
 """The names that `agents=` takes beside agents' own."""
 Agents = AgentConfig | str | Sequence[str] | None
-"""What `agents=` can be: names of agents, a configuration or its name as seen from the sample's agent, or None or
-`available` for all agents that are there."""
+"""What `agents=` can be: one agent's name or several, a configuration or its name as seen from the sample's agent, or
+None or `available` for all agents that are there."""
+
+
+def checked_agents(agents: Agents) -> AgentConfig | str | tuple[AgentName, ...] | None:
+    """Return an `agents=` argument in its own spelling, with names of agents as a tuple; raises ChoiceError."""
+    if agents is None or isinstance(agents, AgentConfig):
+        return agents
+    if isinstance(agents, str):
+        agents = choice("agents", agents, (*AGENT_SETS, *AGENTS))
+        if agents in AGENT_SETS:
+            return agents
+    return choices("agents", agents, AGENTS)
+
+
+def agents_note(agents: Agents) -> str | list[str] | None:
+    """Return an `agents=` argument as the notes of results and trainings have it, for JSON; raises ChoiceError."""
+    checked = checked_agents(agents)
+    if isinstance(checked, AgentConfig):
+        return checked.name
+    return list(checked) if isinstance(checked, tuple) else checked
 
 
 def cooperating_agents(dataset: Dataset, sample: RowArgument, agents: Agents = None) -> tuple[AgentName, ...]:
@@ -157,9 +167,7 @@ def cooperating_agents(dataset: Dataset, sample: RowArgument, agents: Agents = N
     """
     scenario, ego, _ = dataset.get("sample", sample)["token"].rsplit("/", 2)
     there = agents_of(dataset, scenario)
-    wanted = there if agents is None or is_available(agents) else _named(agents, ego)
-    if not wanted:
-        raise ChoiceError("agents: expected at least one agent, found none")
+    wanted = _named(agents, ego, there)
     for agent in wanted:
         if agent not in there:
             raise NotAvailableError(
@@ -182,18 +190,13 @@ def agents_of(dataset: Dataset, scenario: RowArgument) -> tuple[AgentName, ...]:
     return tuple([AGENTS[code] for code in names["name"][first:last].tolist()])
 
 
-def _named(agents: AgentConfig | str | Sequence[str], ego: str) -> tuple[AgentName, ...]:
-    if isinstance(agents, AgentConfig):
-        return agents.agents_for(ego)
-    if isinstance(agents, str):
-        if spelled(agents, AGENTS) in AGENTS:
-            raise ChoiceError(
-                f"agents: expected one of {', '.join(AGENT_SETS)}, found {agents!r}; for that agent alone give "
-                f"[{agents!r}]"
-            )
-        return AGENT_CONFIGS[choice("agents", agents, AGENT_SETS)].agents_for(ego)
-    names = _names("agents", "agents' names or a configuration", agents)
-    return tuple(choice("agent", agent, AGENTS) for agent in names)
+def _named(agents: Agents, ego: str, there: tuple[AgentName, ...]) -> tuple[AgentName, ...]:
+    checked = checked_agents(agents)
+    if checked in (None, AVAILABLE):
+        return there
+    if isinstance(checked, str):
+        checked = AGENT_CONFIGS[checked]
+    return checked.agents_for(ego) if isinstance(checked, AgentConfig) else checked
 
 
 def accident_visibility(dataset: Dataset, scenario: RowArgument) -> str | None:

@@ -145,8 +145,8 @@ class Link:
         if sent < 1:
             raise ConfigError(
                 f"latency: {self.latency} s reaches back before the first frame of {scenario} from frame {index:03d}; "
-                f"the longest possible is {(index - 1) / 10} s, and this latency works from frame "
-                f"{self.latency_frames + 1:03d} on"
+                f"the longest possible is {(index - 1) / 10} s; choose a shorter latency, or a frame that has "
+                f"{self.latency_frames} others before it"
             )
         return sent
 

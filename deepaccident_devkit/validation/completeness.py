@@ -15,7 +15,7 @@ from deepaccident_devkit.release.layout import frame_sizes
 from deepaccident_devkit.release.store import Dataroot, open_dataroot, places_of, refused_archives
 from deepaccident_devkit.reports import Report
 from deepaccident_devkit.support.arrays import ShortRepr
-from deepaccident_devkit.support.text import columns_text, counted, size_text
+from deepaccident_devkit.support.text import columns_text, counted, members_of, size_text
 from deepaccident_devkit.tables.indexing import assign_splits
 from deepaccident_devkit.tables.scan import ENDINGS
 from deepaccident_devkit.taxonomy import (
@@ -120,9 +120,8 @@ class Completeness(Report):
         """The same without the release's name, as a part of another report."""
         total, here = self.total, self.total.expected - self.total.missing
         head = (
-            f"{counted(self.scenarios, 'scenario')} here, {self.whole:,} of them whole\n"
-            f"{here:,} of their {total.expected:,} files are here ({size_text(total.bytes)}), "
-            f"{total.missing:,} are missing"
+            f"{counted(self.scenarios, 'scenario')} here, {self.whole:,} whole\n"
+            f"files here: {here:,} of {total.expected:,} ({size_text(total.bytes)}), missing: {total.missing:,}"
         )
         blocks = [head, *(_split_text(name, split) for name, split in self.splits.items())]
         if self.lacking:
@@ -182,8 +181,11 @@ def readable_release(root: Dataroot, version: str) -> ReleaseLayout:
 
 def chosen_scenarios(layout: ReleaseLayout, scenarios: Collection[str] | None) -> list[ScenarioFolder]:
     """The scenarios of some tokens, None for all; raises TokenError."""
-    chosen = [folder for folder in layout.scenarios if scenarios is None or folder.token in scenarios]
-    unknown = sorted(set(scenarios or ()) - {folder.token for folder in chosen})
+    if scenarios is None:
+        return list(layout.scenarios)
+    tokens = set(members_of("scenarios", scenarios, "tokens of scenarios"))
+    chosen = [folder for folder in layout.scenarios if folder.token in tokens]
+    unknown = sorted(tokens - {folder.token for folder in chosen})
     if unknown:
         raise TokenError(
             f"{layout.root}: has no scenario {unknown[0]!r}; its folders name {len(layout.scenarios)} others"
@@ -280,7 +282,7 @@ def _split_files(
 
 def _split_text(name: str, split: SplitFiles) -> str:
     of_release = "" if split.expected is None else f" of the release's {split.expected}"
-    head = f"split {name}: {counted(split.scenarios, 'scenario')}{of_release} here, {split.whole:,} of them whole"
+    head = f"split {name}: {counted(split.scenarios, 'scenario')}{of_release} here, {split.whole:,} whole"
     if split.whole == split.scenarios:
         return head
     rows = [("missing files", *_COLUMNS), *((agent, *_missing_texts(split.files, agent)) for agent in AGENTS)]

@@ -192,7 +192,7 @@ def data_card(dataset: Dataset, *, licence: str | None = None) -> Json:
     told["rai:dataBiases"] += [f"{each.name}: {each.texts()[2]}" for each in FACTS if each.key in _SHORTCUTS]
     text = (
         "Accidents and normal traffic at junctions in the simulator CARLA, seen by up to five agents that can "
-        f"cooperate. Here are {found.scenarios[TOTAL]:,} scenarios, of which "
+        f"cooperate. Here are {found.scenarios[TOTAL]} scenarios, of which "
         f"{found.counts['collisions'].counts['yes'][TOTAL]:,} end in a collision, with {seen.recordings:,} recordings "
         f"of one agent each, {found.samples[TOTAL]:,} samples and {seen.tables['annotation']:,} annotated boxes."
         + ("" if licence else " The licence is not stated here; ask the dataset's authors for it.")

@@ -5,6 +5,7 @@ import pickle
 import re
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -114,10 +115,14 @@ def test_skipped_files_are_as_if_they_had_not_arrived(da: DeepAccident, da_parti
     """The pole has no LiDAR, and the ego no front camera: with the pole, images are of the other vehicles."""
     both = {"agents": ["ego_vehicle", "other_vehicle", "infrastructure"], "past": 2, "step": 1}
     images = V2XConfig(**both, on_missing="skip", points=False, images=ImageConfig())
-    skip, fewer = "infrastructure.*no such file; .* with on_missing='skip'", "1 of 6 sensor files .*or fewer cameras"
+    skip = "infrastructure.*no such file; .* with on_missing='skip'"
+    own = f"Camera_Front.*no such file; {sample} lacks 1 of the 6 .*cannot be skipped.*sensors=.'Camera_Front'"
     assert_refused(
         (lambda: V2XDataset(da_partial, [sample], V2XConfig(**both))[0], MissingFileError, skip),
-        (lambda: V2XDataset(da_partial, [sample], images)[0], MissingFileError, fewer),
+        *[
+            (partial(V2XDataset(da_partial, [sample], config).__getitem__, 0), MissingFileError, own)
+            for config in (images, replace(images, on_missing="raise"))
+        ],
     )
     item, whole = (V2XDataset(each, [sample], V2XConfig(**both, on_missing="skip"))[0] for each in (da_partial, da))
     missing = [[0, 0], [0, 0], [1, 1]]

@@ -20,7 +20,7 @@ from deepaccident_devkit.errors import (
     SensorFileError,
     TokenError,
 )
-from deepaccident_devkit.export.torch import ImageConfig, V2XConfig, V2XDataset
+from deepaccident_devkit.export.torch import AllEgosDataset, ImageConfig, V2XConfig, V2XDataset
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.motion import Augmentation, MotionLabelConfig, bev_segmentation
 from deepaccident_devkit.motion.sample_labels import motion_labels
@@ -174,13 +174,18 @@ def test_items_are_counted_as_a_sequences(da: DeepAccident, tokens: list[str]) -
 
 
 def test_samples_that_cannot_be(da: DeepAccident, tokens: list[str]) -> None:
-    one_alone = "tokens: expected a list of samples, found one alone"
+    one_alone = r"tokens: expected a list of samples, such as da\.training_samples\('train'\) or \[sample\], found"
     beyond = V2XConfig(images=ImageConfig(crop=(30, 0, 10, 64)))
     assert_refused(
         (lambda: V2XDataset(da, ["nowhere"]), TokenError, "nowhere"),
         (lambda: V2XDataset(da, tokens, V2XConfig(agents="everybody")), ChoiceError, "agents: expected one of"),
         (lambda: V2XDataset(da, tokens[0]), ConfigError, one_alone),
         (lambda: V2XDataset(da, da.sample[0]), ConfigError, one_alone),
+        *[(lambda of=of: of(da, "train"), ConfigError, one_alone) for of in (V2XDataset, AllEgosDataset)],
+        *[
+            (lambda of=of: of("release", tokens), ConfigError, "dataset: expected an open release.*found 'release'")
+            for of in (V2XDataset, AllEgosDataset)
+        ],
         (lambda: V2XDataset(da, tokens, {}), ConfigError, ("config: expected a V2XConfig", "found {}")),
         (lambda: V2XDataset(da, tokens, beyond)[0], ConfigError, "reach beyond an image of 36 × 64"),
     )
@@ -271,9 +276,10 @@ def test_labels_by_a_presets_name() -> None:
         ({"mean": (0.5, 0.5, np.nan)}, "mean: expected a number for each"),
         ({"dtype": "uint8", "mean": (0.5, 0.5, 0.5)}, "uint8 images are not scaled"),
         ({"cameras": ("Front",)}, "cameras: expected one of Camera_Front"),
-        ({"cameras": "Camera_Front"}, "cameras: expected a tuple of some of Camera_Front"),
-        ({"cameras": 6}, "cameras: expected a tuple"),
-        ({"cameras": ("Camera_Front", "Camera_Front")}, "each once"),
+        ({"cameras": "Front"}, "cameras: expected one of Camera_Front"),
+        ({"cameras": 6}, "cameras: expected some of Camera_Front"),
+        ({"cameras": ()}, "cameras: expected some of Camera_Front"),
+        ({"cameras": ("Camera_Front", "Camera_Front")}, "cameras: expected each camera once"),
     ],
 )
 def test_image_configurations_that_cannot_be(fields: dict[str, object], message: str) -> None:

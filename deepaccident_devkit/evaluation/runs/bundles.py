@@ -28,7 +28,7 @@ from deepaccident_devkit.support.files import remove_in, replacing_folder, tempo
 from deepaccident_devkit.support.json_text import Record, as_record, parsed_json
 from deepaccident_devkit.support.reading import check_size, fault_text, file_checksum, irregular_text, read_bytes
 from deepaccident_devkit.support.text import differing_text, path_of
-from deepaccident_devkit.taxonomy import MINI_SPLITS, SPLITS
+from deepaccident_devkit.taxonomy import SPLIT_CHOICES
 
 SUMMARY_FILE: Final = "metrics_summary.json"
 COUNTS_FILE: Final = "counts.json"
@@ -152,7 +152,7 @@ class Bundle(ShortRepr):
         named = {"dataroot": self.dataroot}
         if self.results_copy() is None:
             named["results"] = self.summary["results"]["path"]
-        if self.summary["split"] not in (*SPLITS, *MINI_SPLITS):
+        if self.summary["split"] not in SPLIT_CHOICES:
             named["split"] = self.summary["split"]
         return named
 

@@ -14,7 +14,6 @@ from typing import Any, Final, Literal, get_args
 from deepaccident_devkit._version import __version__
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import (
-    ChoiceError,
     ConfigError,
     EvaluationError,
     NotAvailableError,
@@ -37,8 +36,8 @@ from deepaccident_devkit.parallel import Places, Store, unfinished_folder
 from deepaccident_devkit.release.fingerprints import INDEX_REMEDY, digest_of
 from deepaccident_devkit.support.arrays import ShortRepr
 from deepaccident_devkit.support.files import remove_in
-from deepaccident_devkit.support.text import choice, counted, path_of, settle_choices, spelled
-from deepaccident_devkit.taxonomy import AGENTS, FRAME_PERIOD, MINI_SPLITS, SPLITS, VEHICLE_AGENTS
+from deepaccident_devkit.support.text import choice, choices, counted, path_of, settle_choices, spelled
+from deepaccident_devkit.taxonomy import AGENTS, FRAME_PERIOD, SPLIT_CHOICES, SPLITS, VEHICLE_AGENTS
 
 __all__ = ["TASKS", "TASK_PROTOCOLS", "TASK_RESULTS", "EvaluationSetup", "SampleLoader", "TaskName"]
 
@@ -70,7 +69,7 @@ class SampleSelection:
 
     def __post_init__(self) -> None:
         """Check and put the agents in order; raises ChoiceError."""
-        object.__setattr__(self, "split", spelled(os.fspath(self.split), (*SPLITS, *MINI_SPLITS)))
+        object.__setattr__(self, "split", spelled(os.fspath(self.split), SPLIT_CHOICES))
         settle_choices(self, {"samples": get_args(SampleList), "scope": get_args(ScopeName)})
         if self.agents is not None:
             object.__setattr__(self, "agents", _agents(self.agents))
@@ -130,9 +129,7 @@ def agent_of(token: str) -> str:
 
 
 def _agents(given: Sequence[str]) -> tuple[str, ...]:
-    names = [choice("agents", name, AGENTS) for name in ([given] if isinstance(given, str) else given)]
-    if not names:
-        raise ChoiceError("agents: expected at least one agent, or None for all, found none")
+    names = choices("agents", given, AGENTS)
     return tuple(name for name in AGENTS if name in names)
 
 
@@ -368,7 +365,7 @@ def default_selection(
         split=os.fspath(split),
         samples=listed,
         scope=scope or ("all" if listed == "all" else "accident"),
-        agents=None if agents is None else tuple(agents),
+        agents=None if agents is None else _agents(agents),
         horizon=setup.horizon,
     )
 

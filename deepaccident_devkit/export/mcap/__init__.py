@@ -24,7 +24,7 @@ from deepaccident_devkit.evaluation.results import Prediction, Results
 from deepaccident_devkit.motion import MotionLabelConfig
 from deepaccident_devkit.motion.config import label_config
 from deepaccident_devkit.support.arrays import checked_whole
-from deepaccident_devkit.support.text import choice, path_of, possible_text
+from deepaccident_devkit.support.text import choices, path_of, possible_text
 from deepaccident_devkit.taxonomy import CAMERAS, LIDAR
 from deepaccident_devkit.v2x import Agents
 
@@ -136,9 +136,7 @@ def _channel_names(given: object) -> tuple[str, ...]:
     """Names of channels in the order of `EXPORTED_CHANNELS`; raises ChoiceError."""
     if given is None:
         return EXPORTED_CHANNELS
-    if isinstance(given, str) or not isinstance(given, Iterable):
-        raise ChoiceError(f"channels: expected names of channels, found {given!r}")
-    named = {choice("channels", name, EXPORTED_CHANNELS) for name in given}
+    named = choices("channels", given, EXPORTED_CHANNELS, empty=True)
     return tuple(name for name in EXPORTED_CHANNELS if name in named)
 
 

@@ -30,7 +30,7 @@ from deepaccident_devkit.export.questions.observed import (
 from deepaccident_devkit.support.arrays import ShortRepr
 from deepaccident_devkit.support.files import write_bytes
 from deepaccident_devkit.support.reading import read_bytes
-from deepaccident_devkit.support.text import Word, choice, settle_choices, spelled
+from deepaccident_devkit.support.text import Word, choice, choices, settle_choices, spelled
 from deepaccident_devkit.tables.tokens import sample_token
 from deepaccident_devkit.taxonomy import AGENTS, CAMERAS, FRAME_PERIOD, VEHICLE_AGENTS, AgentName
 from deepaccident_devkit.v2x.agents import AGENT_SETS, agents_of, cooperating_agents
@@ -179,7 +179,7 @@ def _observers(given: str | Sequence[str]) -> str | tuple[str, ...]:
 
 def _names(argument: str, given: str | Sequence[str], words: Sequence[Word]) -> tuple[Word, ...]:
     """A name or several, each once, in their usual order; raises ChoiceError."""
-    named = {choice(argument, name, words) for name in ([given] if isinstance(given, str) else given)}
+    named = choices(argument, given, words, empty=True)
     return tuple(name for name in words if name in named)
 
 

@@ -22,6 +22,7 @@ from deepaccident_devkit.export.torch.config import V2XConfig, augmented_boxes, 
 from deepaccident_devkit.motion import Augmentation, MotionLabelConfig, bev_segmentation
 from deepaccident_devkit.motion.sample_labels import motion_labels_of
 from deepaccident_devkit.support.arrays import IntArray, checked_whole
+from deepaccident_devkit.tables.tables import token_of
 from deepaccident_devkit.tables.tokens import agent_token
 from deepaccident_devkit.taxonomy import IGNORED_ID, AgentName
 from deepaccident_devkit.v2x import cooperative_boxes
@@ -113,11 +114,9 @@ class V2XDataset(TorchDataset):
 
         if config is not None and not isinstance(config, V2XConfig):
             raise ConfigError(f"config: expected a V2XConfig, such as V2XConfig(agents='all'), found {config!r}")
-        if isinstance(tokens, str | Mapping):
-            raise ConfigError(f"tokens: expected a list of samples, found one alone; pass [{tokens!r}]")
         self.config = V2XConfig() if config is None else config
         self._dataset = dataset
-        self._rows = np.array([dataset.getind("sample", token) for token in tokens], dtype=np.int64)
+        self._rows = np.array(_sample_rows(dataset, tokens), dtype=np.int64)
         self._check_agents()
         self._check_labelled()
         self._check_latency()
@@ -302,6 +301,18 @@ class V2XDataset(TorchDataset):
             )
 
 
+def _sample_rows(dataset: Dataset, tokens: Iterable[RowArgument]) -> list[int]:
+    """Return the rows of samples; raises ConfigError and TokenError."""
+    if not isinstance(dataset, Dataset):
+        raise ConfigError(f"dataset: expected an open release, DeepAccident(dataroot=…), found {dataset!r}")
+    if isinstance(tokens, str | Mapping):
+        raise ConfigError(
+            "tokens: expected a list of samples, such as da.training_samples('train') or [sample], found "
+            f"{token_of(tokens)!r}"
+        )
+    return [dataset.getind("sample", token) for token in tokens]
+
+
 def tensor(values: ArrayLike, dtype: DTypeLike | None = None) -> Tensor:
     """A tensor with memory of its own: the devkit's arrays are read-only, and torch has no read-only tensors."""
     import torch
@@ -344,8 +355,8 @@ class AllEgosDataset(V2XDataset):
         if config.link is not None:
             raise ConfigError("link: each ego receives its own messages; use V2XDataset for data that came over a link")
         moments: dict[tuple[str, str], list[str]] = {}
-        for token in tokens:
-            sample = dataset.get("sample", token)["token"]
+        for row in _sample_rows(dataset, tokens):
+            sample = dataset.sample[row]["token"]
             scenario, _, frame = sample.rsplit("/", 2)
             moments.setdefault((scenario, frame), []).append(sample)
         self.egos = list(moments.values())

@@ -70,26 +70,35 @@ def with_files(
 ) -> tuple[Received, IntArray]:
     """The messages whose sensor files are all there, and how many files each agent and frame (A, P) lacks.
 
-    With a cache, images are there if it has them. Raises MissingFileError, by `on_missing`, or if a sample `needs_own`.
+    With a cache, images are there if it has them.
+
+    Raises:
+        MissingFileError: a file is not there, by `on_missing`; or one of the sample's own at the present is not, and it
+            `needs_own`.
     """
     channels = (*[LIDAR] * config.points, *(() if config.images is None else config.images.cameras))
-    files = MissingFiles(dataset.dataroot, config.on_missing)
+    skippable = MissingFiles(dataset.dataroot, config.on_missing)
+    necessary = MissingFiles(dataset.dataroot, "skip")  # their error has another remedy than skipping
 
-    def lacks(token: str, channel: str) -> bool:
+    def lacks(token: str, channel: str, *, own: bool) -> bool:
         if cache is not None and channel != LIDAR:
-            return config.on_missing == "skip" and not cache.has(token)  # else the error comes from loading it
-        return not files.has(dataset.sensor_path(token), channel)
+            return (own or config.on_missing == "skip") and not cache.has(token)  # else the error comes from loading it
+        return not (necessary if own else skippable).has(dataset.sensor_path(token), channel)
 
     lacking = np.zeros((len(names), len(arrived)), dtype=np.int64)
-    for p, moment in enumerate(arrived):
-        for name, message in moment.items():
-            lacking[names.index(name), p] = sum(lacks(f"{message.sample}/{channel}", channel) for channel in channels)
-    if needs_own and lacking[0, -1]:
-        raise MissingFileError(
-            f"{sample}: {lacking[0, -1]} of {len(channels)} sensor files of this sample's own agent are not there, and "
-            "on_missing='skip' leaves out other agents and frames alone; leave out such samples "
-            "as docs/training.md shows, or choose points=False or fewer cameras"
-        )
+    for p in reversed(range(len(arrived))):  # the present first, whose lack cannot be helped
+        for name, message in arrived[p].items():
+            own = needs_own and message.sample == sample
+            absent = [channel for channel in channels if lacks(f"{message.sample}/{channel}", channel, own=own)]
+            if own and absent:
+                where = "" if cache is None or absent[0] == LIDAR else " in the cache of images"
+                raise MissingFileError(
+                    f"{dataset.sensor_path(f'{sample}/{absent[0]}')}: no such file{where}; {sample} lacks "
+                    f"{len(absent)} of the {len(channels)} files of its own agent, which cannot be skipped; unpack the "
+                    "archives that hold them, choose other sensors, or take only samples that have them: "
+                    f"da.training_samples(split, sensors={list(channels)})"
+                )
+            lacking[names.index(name), p] = len(absent)
     there = [
         {name: message for name, message in moment.items() if not lacking[names.index(name), p]}
         for p, moment in enumerate(arrived)

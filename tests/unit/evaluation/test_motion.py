@@ -9,7 +9,7 @@ import pytest
 from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.errors import ChoiceError, EvaluationError
+from deepaccident_devkit.errors import ChoiceError, EvaluationError, GeometryError
 from deepaccident_devkit.evaluation.motion import MOTION_PROTOCOLS, MotionEvaluator, MotionProtocol, motion_counts
 from deepaccident_devkit.evaluation.predictions import MotionOutput, instances_of
 from deepaccident_devkit.geometry import BevGrid
@@ -81,6 +81,12 @@ def test_instance_maps_are_told_and_recorded_frames_counted(labels: dict[str, Mo
     assert all(each.true_positive > 0 for each in result.ranges.values())
     assert (result.samples, result.frames) == (len(labels), 2 * (5 + 3 + 1))
     assert result.notes[0].startswith(f"{len(labels)} of {len(labels)} predictions: given as instance maps")
+
+
+@pytest.mark.parametrize("shape", [(200, 200), (5, 100, 100), (1, 5, 200, 100), (1, 1, 5, 200, 200)])
+def test_maps_of_another_shape_are_refused_with_the_shape_that_was_given(shape: tuple[int, ...]) -> None:
+    names = ("(T, 200, 200)", "(K, T, 200, 200)", f"found {shape}")
+    assert_refused((lambda: instances_of(np.zeros(shape, dtype=int), CONFIG.grid), GeometryError, names))
 
 
 def test_the_labels_as_heads_find_most(labels: dict[str, MotionLabels]) -> None:

@@ -110,7 +110,7 @@ def test_unknown_words_are_refused() -> None:
         ),
         *[
             (partial(MotionLabelConfig, agents=agents), ChoiceError, "agents: expected")
-            for agents in ("nobody", ["pole"], [], 5, "ego_vehicle")
+            for agents in ("nobody", ["pole"], [], 5)
         ],
         (lambda: MotionLabelConfig(grid=BevGrid((-50, 50, 0.3))), ConfigError, "is not a whole number of cells"),
     )

@@ -292,7 +292,7 @@ def test_what_is_no_sample_and_agents_that_do_not_exist(small: DeepAccident) -> 
         (lambda: small.motion_labels_of(f"{EGO}/001"), ChoiceError, "put it into a list"),
         *[
             (lambda wrong=wrong: MotionLabelConfig(agents=wrong), ChoiceError, r"agents?: expected")
-            for wrong in ("everybody", "ego_vehicle", ("pole",), ())
+            for wrong in ("everybody", ("pole",), ())
         ],
     )
 
@@ -348,6 +348,8 @@ def test_the_paper_leaves_horizon_and_scope_open(da_motion: DeepAccident, every_
     for scenario in da_motion.scenario:
         assert _frames(tokens, scenario["token"], "infrastructure") == [5, 10, 15, 20, 25, 30]
     assert len(samples(da_motion, every_scenario, "all")) == 2 * 5 * 7
+    assert samples(da_motion, every_scenario, "Keyframes") == samples(da_motion, every_scenario, "all")
+    assert samples(da_motion, "all", "all") == samples(da_motion, every_scenario, "all")
     assert samples(da_motion, every_scenario, "every") == [sample["token"] for sample in da_motion.sample]
     assert {
         token[-3:] for token in samples(da_motion, every_scenario, "evaluate", "paper", horizon=0.5, scope="all")
@@ -388,11 +390,40 @@ def test_a_split_that_was_not_unpacked_says_so(da_motion: DeepAccident) -> None:
     assert str(told.value).endswith(f"or choose another split: it has {here.pop()}: 2 scenarios")
 
 
+def test_samples_of_a_partial_release_can_be_those_that_have_their_files(
+    da: DeepAccident, da_partial: DeepAccident
+) -> None:
+    """The pole has no LiDAR there, and the ego no front camera."""
+    whole = da.samples("train", "every")
+    assert da.samples("train", "every", sensors=("Camera_Front", "lidar01")) == whole
+    for sensors in ("lidar01", ["Camera_Front"], ("lidar01", "camera_front")):
+        channels = [sensors] if isinstance(sensors, str) else sensors
+        there = [
+            token
+            for token in da_partial.samples("train", "every")
+            if all(da_partial.sensor_path(token, channel).is_file() for channel in channels)
+        ]
+        assert da_partial.samples("train", "every", sensors=sensors) == there != whole
+    assert da_partial.training_samples("train", sensors="lidar01") == [
+        token for token in da_partial.training_samples("train") if da_partial.sensor_path(token, "lidar01").is_file()
+    ]
+
+
 def test_choices_and_horizons_that_there_are_not(da_motion: DeepAccident) -> None:
     """Horizons are numbers of half seconds, and the released protocol has one."""
     evaluate = partial(samples, da_motion, "train", "evaluate")
     assert_refused(
-        (lambda: samples(da_motion, "train", "testing"), ChoiceError, ("purpose", "train, evaluate, all, every")),
+        (
+            lambda: samples(da_motion, "train", "testing"),
+            ChoiceError,
+            ("purpose", "train, evaluate, all, keyframes, every"),
+        ),
+        (lambda: samples(da_motion, "train", "all", sensors=["lidar"]), ChoiceError, ("sensors: expected", "lidar01")),
+        (
+            lambda: samples(da_motion, "train", "all", sensors=["lidar01"]),
+            NotAvailableError,
+            ("none of the", "lidar01", "unpack"),
+        ),
         (partial(evaluate, "boxes"), ChoiceError, ("protocol: expected one of released, paper",)),
         (partial(evaluate, "paper", scope="some"), ChoiceError, ("scope: expected one of accident, all",)),
         (partial(evaluate, horizon=3.0), ConfigError, ("protocol='paper'",)),

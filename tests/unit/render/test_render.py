@@ -163,7 +163,7 @@ REFUSED: list[tuple[Draw, type[Exception], str]] = [
     (lambda da, sample: da.render_visibility(sample, frame="Camera_Front"), ChoiceError, "frame: expected one of"),
     (lambda da, sample: da.render_bev(sample, agents="ego_vehicle"), ChoiceError, "agents: expected one of single"),
     (lambda da, sample: da.render_frame(sample.rsplit("/", 2)[0] + "/004", agents="pole"), ChoiceError, "agents: "),
-    (lambda da, sample: da.render_visibility(sample, agents=["me"]), ChoiceError, "agent: expected one of"),
+    (lambda da, sample: da.render_visibility(sample, agents=["me"]), ChoiceError, "agents: expected one of"),
     (lambda da, sample: da.render_link(sample, Link(), agents="single"), ChoiceError, "agents: expected a partner of"),
     (lambda da, sample: da.render_link(sample, Link(latency=5.0)), ConfigError, "reaches back before the first frame"),
     (lambda da, _: da.render_visibility("nobody"), TokenError, "has no token 'nobody'"),

@@ -209,7 +209,13 @@ NUMBER = "num_frames: expected a number, a range such as 40..60"
     [
         ({"wether": "Clear"}, FieldError, ("cannot be found by 'wether'; the fields are weather, ",)),
         ("frame=1", FieldError, ("cannot be found by 'frame'",)),
-        ({"weather": "heavyrain"}, ChoiceError, ("weather: found 'heavyrain'; possible are HardRain, ", "WetCloudy")),
+        (
+            {"weather": "heavyrain"},
+            ChoiceError,
+            ("weather: found 'heavyrain'; possible are Clear, ", "WetCloudy; did you mean 'HardRain'?"),
+        ),
+        ({"town": "town3"}, ChoiceError, ("possible are Town01, Town02, Town03", "; did you mean 'Town03'?")),
+        ({"time_of_day": "night_time"}, ChoiceError, ("Noon, Sunset, Night; did you mean 'Night'?",)),
         ("town==", ChoiceError, ("town: found '='; possible are Town01",)),
         ({"type": "normal"}, ChoiceError, ("scenario_type: found 'normal'; possible are ", "type1_subtype2_normal")),
         ({"accident_visibility": "seen"}, ChoiceError, ("'seen'; possible are visible, partial, invisible",)),

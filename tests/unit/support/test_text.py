@@ -116,6 +116,9 @@ def test_every_option_with_words_takes_them_in_any_case() -> None:
 
 @pytest.mark.parametrize("wrong", ["qqq", None, 3, ["left"]])
 def test_a_word_that_is_like_none_has_no_suggestion(wrong: Any) -> None:
+    splits = ("train", "val", "test")
+    meant = [meant_text(wrong, splits) for wrong in ("validation", "training", "Testing")]
+    assert meant == [f"; did you mean {split!r}?" for split in ("val", "train", "test")]
     assert meant_text("qqq", ["left", "right"]) == meant_text("", ["left"]) == meant_text(None, ["left"]) == ""
     told = r"^turn: expected one of left, right, found .*[^?]$"
     assert_refused(

@@ -1,9 +1,10 @@
 """Whose sight counts: configurations of agents, and who of them sees an accident."""
 
 import itertools
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,9 +13,18 @@ from numpy.testing import assert_array_equal
 from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.accidents.recorded import accidents_of
+from deepaccident_devkit.baselines import Baseline
 from deepaccident_devkit.errors import ChoiceError, GeometryError, NotAvailableError, TokenError
+from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup, SampleSelection, default_selection
+from deepaccident_devkit.export.images import ImageConfig
+from deepaccident_devkit.export.mcap import McapConfig
+from deepaccident_devkit.export.opencood import OpenCood
+from deepaccident_devkit.maps.making import towns_of
 from deepaccident_devkit.motion import MotionLabelConfig
+from deepaccident_devkit.render.video import names_at
 from deepaccident_devkit.taxonomy import AGENTS
+from deepaccident_devkit.testing import SmallRelease
 from deepaccident_devkit.v2x import (
     AGENT_CONFIGS,
     AGENT_SETS,
@@ -27,6 +37,7 @@ from deepaccident_devkit.v2x import (
     pair_in_view,
 )
 from deepaccident_devkit.v2x.agents import SHEER_CURTAINS
+from deepaccident_devkit.validation import validate_release
 
 EGO, EGO_BEHIND, OTHER, OTHER_BEHIND, POLE = AGENTS
 
@@ -71,13 +82,44 @@ def test_what_an_agents_argument_means(da_b: DeepAccident) -> None:
     assert cooperating_agents(da_b, sample, "Available") == cooperating_agents(da_b, sample, None)
     assert_refused(
         (
-            lambda: cooperating_agents(da_b, sample, POLE),
+            lambda: cooperating_agents(da_b, sample, "bus"),
             ChoiceError,
-            r"expected one of single, .*found 'infrastructure'; .*\['infrastructure'\]",
+            "one of single, .*infrastructure, found 'bus'",
         ),
-        (lambda: cooperating_agents(da_b, sample, []), ChoiceError, "at least one agent"),
+        (lambda: cooperating_agents(da_b, sample, []), ChoiceError, "expected some of ego_vehicle, .*found none"),
         (lambda: cooperating_agents(da_b, sample + "9"), TokenError, "table 'sample' has no token"),
     )
+
+
+@pytest.mark.parametrize(
+    ("make", "several", "single"),
+    [
+        (lambda names: AgentConfig("mine", names), ("behind",), "Behind"),
+        (lambda names: MotionLabelConfig(agents=names), [POLE], POLE),
+        (lambda names: ImageConfig(cameras=names), ("Camera_Front",), "camera_front"),
+        (lambda names: McapConfig(channels=names), ["lidar01"], "LIDAR01"),
+        (lambda names: OpenCood(classes=names), ("van",), "van"),
+        (lambda names: OpenCood(agents=names), (EGO,), EGO),
+        (lambda names: SampleSelection(split="val", agents=names), (POLE,), POLE),
+        (lambda names: default_selection(EvaluationSetup(task="accident"), "val", agents=names), (POLE,), POLE),
+        (lambda names: SmallRelease(splits=names), ["val"], "val"),
+        (lambda names: Baseline(agents=names).meta(), [POLE], "Infrastructure"),
+    ],
+)
+def test_a_single_name_is_a_list_of_one(make: Callable[[Any], object], several: object, single: str) -> None:
+    assert make(single) == make(several)
+
+
+def test_a_single_agent_or_scenario_counts_as_a_list_of_one(da_b: DeepAccident) -> None:
+    sample, scenario = f"{da_b.scenario[0]['token']}/{OTHER}/002", da_b.scenario[0]
+    assert cooperating_agents(da_b, sample, "Infrastructure") == (POLE,)
+    assert da_b.visible_instances(sample, agents=POLE) == da_b.visible_instances(sample, agents=[POLE])
+    assert names_at(da_b, da_b.frame[0]["token"], OTHER) == (OTHER,)
+    for single in (scenario, scenario["token"]):
+        [accident] = accidents_of(da_b, single)[0]
+        assert accident.scenario == scenario["token"]
+        assert towns_of(da_b, single) == [scenario["town"]]
+    assert validate_release(da_b.dataroot, scenarios=scenario["token"]).scenarios == 1
 
 
 def test_an_agent_that_was_not_downloaded_is_named(tmp_path: Path) -> None:
@@ -120,16 +162,20 @@ def test_names_roles_sides_and_views_that_are_none(da_b: DeepAccident) -> None:
             ("side: expected one of ego_vehicle, other_vehicle", "'left'"),
         ),
         *[
-            (partial(da_b.cooperative_boxes, sample, agents=wrong), ChoiceError, ("agents' names or a configuration",))
+            (
+                partial(da_b.cooperative_boxes, sample, agents=wrong),
+                ChoiceError,
+                ("agents: expected some of ego_vehicle",),
+            )
             for wrong in (3, 2.5, object())
         ],
         *[
-            (partial(cooperating_agents, da_b, sample, wrong), ChoiceError, ("agent: expected one of ego_vehicle",))
+            (partial(cooperating_agents, da_b, sample, wrong), ChoiceError, ("agents: expected one of ego_vehicle",))
             for wrong in ([None], [3], [np.zeros(2)])
         ],
         *[
-            (partial(AgentConfig, "mine", wrong), ChoiceError, ("partners: expected roles",))
-            for wrong in (3, "behind", None)
+            (partial(AgentConfig, "mine", wrong), ChoiceError, ("partners: expected some of behind",))
+            for wrong in (3, None)
         ],
         *[
             (partial(accident_visible_mask, views), GeometryError, ("in_view: expected",))

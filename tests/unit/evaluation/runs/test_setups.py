@@ -220,7 +220,14 @@ def test_wrong_choices_and_a_horizon_between_samples(da_b: DeepAccident) -> None
         (partial(chosen, samples="some"), ChoiceError, ("samples: expected one of evaluate, all", "'some'")),
         (partial(chosen, scope="normal"), ChoiceError, ("scope: expected one of accident, all", "'normal'")),
         (partial(chosen, agents=("ego",)), ChoiceError, ("agents: expected one of", "did you mean 'ego_vehicle'")),
-        (partial(chosen, agents=()), ChoiceError, ("agents: expected at least one agent, or None for all",)),
+        (
+            partial(chosen, agents=()),
+            ChoiceError,
+            (
+                "agents: expected some of ego_vehicle",
+                "found none",
+            ),
+        ),
         (
             lambda: chosen(horizon=1.2).tokens(da_b),
             ConfigError,
