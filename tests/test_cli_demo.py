@@ -1,6 +1,7 @@
 """`deepaccident demo`: what it makes, where it refuses to, and whether its reader can see the crash coming."""
 
 import importlib
+import json
 import re
 import shlex
 from dataclasses import replace
@@ -60,7 +61,13 @@ def test_the_next_steps_run_as_they_are_printed(made_demo: tuple[Path, str], mon
     page = page_of(out / "index.html").text
     for command in commands:
         assert f"deepaccident {command}" in page
-        run(*shlex.split(command))
+        for part in command.split(" && deepaccident "):
+            run(*shlex.split(part))
+    # the table, the report and the fifth step are of the same samples
+    ((single, five),) = re.findall(r"\bAPA(\d\.\d{3})(\d\.\d{3})", page)
+    for bundle, apa in (("evaluation/single_vehicle", single), ("five_agents/evaluation", five)):
+        summary = json.loads((out / bundle / "metrics_summary.json").read_bytes())
+        assert f"{summary['metrics']['apa']:.3f}" == apa
     assert served == ["model/single_vehicle/"]  # with its verdicts
 
 

@@ -89,9 +89,8 @@ _REACH: Final = 35.0
 """Metres from ego to the edge of the model's picture."""
 _LABELS: Final = MotionLabelConfig(future_frames=2)
 """The released labels, but they end at the impact."""
-_SELECTION: Final = SampleSelection(split="train", scope="all")
-_BEFORE: Final = SampleSelection(split="train", agents=("ego_vehicle",), horizon=4.0)
-"""The samples of the table: ego's in the last four seconds before the crash."""
+_SELECTION: Final = SampleSelection(split="train", scope="all", agents=("ego_vehicle",), horizon=4.0)
+"""The samples of the table and of the report: ego's in the last four seconds of the accident and of its twin."""
 _AGENTS: Final = {"single": "single vehicle", "all": "five agents"}
 _NUMBERS: Final[Mapping[ResultsTask, tuple[str, Mapping[str, str]]]] = {
     "motion": ("paper", {"IoU (%)": "iou 100x100", "VPQ (%)": "vpq 100x100"}),
@@ -307,16 +306,16 @@ def _make_release(out: Path, workers: int | None, bar: tqdm[Any]) -> None:
 
 
 def demo_table(release: DeepAccident) -> list[list[str]]:
-    """How well ego alone and five agents foresee the crash: a heading, and a line of text for each of the two."""
-    tokens = _BEFORE.tokens(release)
+    """How well ego alone and five agents foresee crashes: a heading, and a line of text for each of the two."""
+    tokens = _SELECTION.tokens(release)
     rows = [["", *(heading for _, numbers in _NUMBERS.values() for heading in numbers)]]
     for agents, name in _AGENTS.items():
-        baseline, row = Baseline(agents=agents, horizon=_BEFORE.horizon), [name]
+        baseline, row = Baseline(agents=agents, horizon=_SELECTION.horizon), [name]
         with TemporaryDirectory() as folder:
             for task, (protocol, numbers) in _NUMBERS.items():
                 path = predict_results(release, task, tokens, Path(folder) / task, baseline, workers=1)
-                setup = EvaluationSetup(task=task, protocol=protocol, horizon=_BEFORE.horizon)
-                run = evaluate_results(release, path, setup, _BEFORE, workers=1)
+                setup = EvaluationSetup(task=task, protocol=protocol, horizon=_SELECTION.horizon)
+                run = evaluate_results(release, path, setup, _SELECTION, workers=1)
                 found = {each.name: each for each in headlines(task, run.result)}
                 row += [found[number].text().removesuffix(" %") for number in numbers.values()]
         rows.append(row)
@@ -327,8 +326,9 @@ def _evaluate(release: DeepAccident, out: Path) -> None:
     """Evaluate what the baseline of a single vehicle predicts, and write a report and a bundle."""
     path = out / _RESULTS
     path.unlink(missing_ok=True)  # of an earlier demo
-    results = read_results(predict_results(release, "accident", _SELECTION.tokens(release), path, workers=1))
-    setup = EvaluationSetup(task="accident", protocol="boxes")
+    baseline, tokens = Baseline(agents="single", horizon=_SELECTION.horizon), _SELECTION.tokens(release)
+    results = read_results(predict_results(release, "accident", tokens, path, baseline, workers=1))
+    setup = EvaluationSetup(task="accident", protocol="boxes", horizon=_SELECTION.horizon)
     run = evaluate_results(release, results, setup, _SELECTION, workers=1).broken_down()
     folder = place_in(out, REPORT_FOLDER, opened=True)
     save_report(run, folder, dataset=release, results=results)
@@ -336,9 +336,9 @@ def _evaluate(release: DeepAccident, out: Path) -> None:
 
 
 def _next_steps(out: Path) -> tuple[NextStep, ...]:
-    names = ("release", "five_agents", "own", _SCENARIO_FILE, f"{REPORT_FOLDER}/{_RUN}")
-    root, five, own, scenario, bundle = (shlex.quote(str(out / name)) for name in names)
-    of_both = f"--split {_SELECTION.split} --scope {_SELECTION.scope}"
+    names = ("release", "five_agents", "own", _SCENARIO_FILE, f"{REPORT_FOLDER}/{_RUN}", "five_agents/evaluation")
+    root, five, own, scenario, bundle, second = (shlex.quote(str(out / name)) for name in names)
+    of_both = f"--split {_SELECTION.split} --scope {_SELECTION.scope} --horizon {_SELECTION.horizon:g}"
     return (
         NextStep("See what the release holds:", f"deepaccident info {root} --where collision=true"),
         NextStep(
@@ -352,7 +352,8 @@ def _next_steps(out: Path) -> tuple[NextStep, ...]:
         ),
         NextStep(
             "Evaluate that, and compare it with the report:",
-            f"deepaccident evaluate accident {root} --results {five}/accident.json {of_both} --protocol boxes",
+            f"deepaccident evaluate accident {root} --results {five}/accident.json {of_both} --protocol boxes "
+            f"--agents ego_vehicle --allow-partial --out {second} && deepaccident evaluate compare {bundle} {second}",
         ),
         NextStep(
             "Edit the scenario file of the accident, such as its weather, and see what happens in it:",
