@@ -16,7 +16,7 @@ from deepaccident_devkit.release import find_release
 from deepaccident_devkit.release.store import Dataroot, open_dataroot
 from deepaccident_devkit.rooms import added
 from deepaccident_devkit.support.nuscenes_names import with_keywords_named
-from deepaccident_devkit.support.text import path_of
+from deepaccident_devkit.support.text import counted, path_of
 from deepaccident_devkit.tables import open_index
 from deepaccident_devkit.taxonomy import OnError
 
@@ -197,8 +197,9 @@ class DeepAccident(Dataset):
     def __repr__(self) -> str:
         """Version, place and size."""
         return (
-            f"{type(self).__name__}(version={self.version!r}, dataroot={str(self.dataroot)!r}): {len(self.scenario):,} "
-            f"scenarios, {len(self.sample):,} samples, {len(self.annotation):,} annotations"
+            f"{type(self).__name__}(version={self.version!r}, dataroot={str(self.dataroot)!r}): "
+            f"{counted(len(self.scenario), 'scenario')}, {counted(len(self.sample), 'sample')}, "
+            f"{counted(len(self.annotation), 'annotation')}"
         )
 
 

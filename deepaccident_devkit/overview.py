@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.reports import Report
-from deepaccident_devkit.support.text import columns_text, natural_order
+from deepaccident_devkit.support.text import columns_text, counted, natural_order
 from deepaccident_devkit.taxonomy import (
     AGENTS,
     CHANNELS,
@@ -150,7 +150,7 @@ def scenario_lines(scenarios: Iterable[ScenarioRecord]) -> list[str]:
 def agent_lines(dataset: Dataset) -> list[str]:
     """A line for each agent name, with the number of its scenarios."""
     counts = Counter(agent["name"] for agent in dataset.agent)
-    return [f"{name}  {counts[name]} scenarios" for name in AGENTS]
+    return [f"{name}  {counted(counts[name], 'scenario')}" for name in AGENTS]
 
 
 def category_lines(dataset: Dataset) -> list[str]:

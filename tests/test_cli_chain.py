@@ -64,7 +64,7 @@ def test_five_agents_are_compared_with_one(release: Path, folder: Path) -> None:
         options = ("--results", folder / agents / "motion", "--split", "train", "--out", bundle, "--resamples", 0)
         told("evaluate", "motion", release, *options)
     text = told("evaluate", "compare", *bundles, "--out", folder / "compared.json")
-    assert "motion, protocol released: 20 samples of 1 scenarios" in text
+    assert "motion, protocol released: 20 samples of 1 scenario" in text
     numbers = {each["number"]: each for each in json.loads((folder / "compared.json").read_text())["numbers"]}
     assert numbers["ranges/100x100/pq"]["b"] > numbers["ranges/100x100/pq"]["a"]
 

@@ -32,7 +32,7 @@ def test_from_a_damaged_release_to_a_page(own_release: Path, tmp_path: Path) -> 
 @pytest.mark.parametrize(("wanted", "replays"), [("None", 0), ("all", 1)])
 def test_some_scenarios_and_as_many_replays(da_motion: DeepAccident, tmp_path: Path, wanted: str, replays: int) -> None:
     words = ("report", da_motion.dataroot, "--out", tmp_path, "--workers", 1, "--where", "collision=true")
-    assert "1 accidents of 1 scenarios\n" in run(*words, "--replays", wanted).output
+    assert "1 accident of 1 scenario\n" in run(*words, "--replays", wanted).output
     assert len(list(tmp_path.glob("replays/*"))) == replays
     assert (tmp_path / "accidents.csv").is_file()
 

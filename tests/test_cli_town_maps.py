@@ -59,7 +59,7 @@ def test_one_town_as_json(root: Path, tmp_path: Path) -> None:
 def test_scenarios_may_be_chosen(root: Path, tmp_path: Path) -> None:
     seen, _ = towns(root)
     made = run(root, "--out", tmp_path, "--where", f"town={seen}", "--where", "collision=true")
-    assert ("from 10 pictures of 1 scenarios" in made.stdout, "left out" in made.stderr) == (True, False)
+    assert ("from 10 pictures of 1 scenario " in made.stdout, "left out" in made.stderr) == (True, False)
 
 
 def test_a_release_without_bev_cameras(da_b: DeepAccident, tmp_path: Path) -> None:

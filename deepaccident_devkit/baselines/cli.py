@@ -29,7 +29,7 @@ from deepaccident_devkit.motion.sample_labels import no_samples_text
 from deepaccident_devkit.parallel import workers_kept
 from deepaccident_devkit.rooms import added, need_room
 from deepaccident_devkit.support.files import writable_folder
-from deepaccident_devkit.support.text import choice
+from deepaccident_devkit.support.text import choice, counted
 from deepaccident_devkit.taxonomy import SHIPPED_WEIGHTS, VEHICLE_AGENTS
 from deepaccident_devkit.v2x import Link
 from deepaccident_devkit.v2x.messages import Payload
@@ -130,7 +130,7 @@ def _by_baseline(model: Any, purpose: Any, *, agents: Any, link: Link | None, ou
             own = [token for token in tokens if agent_of(token) in VEHICLE_AGENTS]
         kept = is_predicted(dataset, task, own, path, chosen)
         predict_results(dataset, task, own, path, chosen, **engine, progress=True)
-        click.echo(f"{task}: {len(own):,} samples in {path}{', which were there already' if kept else ''}")
+        click.echo(f"{task}: {counted(len(own), 'sample')} in {path}{', which were there already' if kept else ''}")
 
 
 def _by_network(model: str, purpose: Any, *, agents: Any, link: Link | None, seed: int, **options: Any) -> None:
@@ -156,7 +156,7 @@ def _by_network(model: str, purpose: Any, *, agents: Any, link: Link | None, see
     )
     paths = predict_results(network, dataset, tokens, options["out"], config, progress=True)
     for task, path in paths.items():
-        click.echo(f"{task}: {len(tokens):,} samples in {path}")
+        click.echo(f"{task}: {counted(len(tokens), 'sample')} in {path}")
     if dataset.layout == "nuScenes":
         written = added("writer", "nuscenes")(dataset, paths["detection"])
         click.echo(f"detection, for nuScenes' own evaluation: {written}")

@@ -16,6 +16,7 @@ from deepaccident_devkit.release.layout import nuscenes_tables
 from deepaccident_devkit.rooms import added
 from deepaccident_devkit.support.files import write_bytes
 from deepaccident_devkit.support.json_text import parsed_json
+from deepaccident_devkit.support.text import counted
 from deepaccident_devkit.taxonomy import VERSIONS, StyleName
 
 _WORDS = {"yes": "true", "no": "false"}
@@ -166,7 +167,7 @@ def say_report(report: Any, written: Sequence[Path], folder: Path | None, *, as_
     """Print a report, and how many files were written into a folder before: nothing written depends on the print."""
     click.echo(report.to_json() if as_json else report.to_text())
     if folder is not None:
-        click.echo(f"written: {len(written)} files in {folder}", err=as_json)
+        click.echo(f"written: {counted(len(written), 'file')} in {folder}", err=as_json)
 
 
 def words_of(given: Sequence[str]) -> list[str]:

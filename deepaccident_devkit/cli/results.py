@@ -7,6 +7,7 @@ import click
 
 from deepaccident_devkit.cli.options import DATAROOT, PATH, refuse_unused, release_options
 from deepaccident_devkit.cli.verbs import verb
+from deepaccident_devkit.support.text import counted
 
 _FILE = click.Path(path_type=Path, exists=True, dir_okay=False)
 
@@ -56,7 +57,7 @@ def _of_detections(file: Path, out: Path, release: dict[str, Any]) -> None:
     with ResultsWriter(out, "detection", meta=found.meta) as writer:
         for token, boxes in found.boxes.items():
             writer.add(token, boxes)
-    click.echo(f"{out}: {sum(map(len, found.boxes.values())):,} boxes of {len(found.boxes):,} samples")
+    click.echo(f"{out}: {sum(map(len, found.boxes.values())):,} boxes of {counted(len(found.boxes), 'sample')}")
     for name, count in found.left_out.items():
         click.echo(f"left out: {count:,} boxes of the class {name}, which DeepAccident does not have")
 

@@ -15,7 +15,7 @@ from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.evaluation.evaluator import Evaluator
 from deepaccident_devkit.reports import table_html
 from deepaccident_devkit.support.arrays import ShortRepr, known
-from deepaccident_devkit.support.text import choice, meant_text, possible_text
+from deepaccident_devkit.support.text import choice, counted, meant_text, possible_text
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -254,11 +254,12 @@ class TaskResult(FrozenMappings):
         """How many samples, and the first headlines."""
         found = headlines(self.task, self)
         shown = [f"{each.name} {each.text()}" for each in found[:_SHOWN]]
-        return f"{type(self).__name__}({self.samples:,} samples: {', '.join(shown)}{', …' * (len(found) > _SHOWN)})"
+        more = ", …" * (len(found) > _SHOWN)
+        return f"{type(self).__name__}({counted(self.samples, 'sample')}: {', '.join(shown)}{more})"
 
     def _repr_html_(self) -> str:
         rows = [(each.name, each.text()) for each in headlines(self.task, self)]
-        return table_html([("number", "value"), *rows], f"{type(self).__name__}, {self.samples:,} samples")
+        return table_html([("number", "value"), *rows], f"{type(self).__name__}, {counted(self.samples, 'sample')}")
 
 
 def headlines(task: str, result: object) -> tuple[Headline, ...]:

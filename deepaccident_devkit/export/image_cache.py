@@ -30,7 +30,7 @@ from deepaccident_devkit.release.images import decode_image, encode_jpeg
 from deepaccident_devkit.support.arrays import ByteArray, FloatArray, IntArray
 from deepaccident_devkit.support.json_text import as_record
 from deepaccident_devkit.support.reading import check_size, fault_text, mapped_file
-from deepaccident_devkit.support.text import path_of, settle_choices, size_text
+from deepaccident_devkit.support.text import counted, path_of, settle_choices, size_text
 from deepaccident_devkit.tables.tokens import sample_data_token, sample_token
 from deepaccident_devkit.taxonomy import AgentName
 from deepaccident_devkit.v2x.agents import agents_of
@@ -175,7 +175,7 @@ class ImageCache:
         return type(self), (self.folder,)
 
     def __repr__(self) -> str:
-        return f"ImageCache({self.folder}, {len(self._scenarios)} scenarios, {self.codec})"
+        return f"ImageCache({self.folder}, {counted(len(self._scenarios), 'scenario')}, {self.codec})"
 
     def check(self, config: ImageConfig) -> None:
         """Refuse images that it cannot give. It can crop those that it has whole, and leave out cameras.

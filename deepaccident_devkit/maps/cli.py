@@ -11,6 +11,7 @@ from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.errors import NotAvailableError
 from deepaccident_devkit.maps.making import town_map, towns_of
 from deepaccident_devkit.support.files import writable_folder
+from deepaccident_devkit.support.text import counted
 
 
 @verb("town-maps", short_help="Write the roads and sidewalks of each town as GeoJSON.")
@@ -47,5 +48,5 @@ def town_maps(where: tuple[str, ...], out: str, as_json: bool, **release: Any) -
 def _town_line(told: dict[str, Any]) -> str:
     return (
         f"{told['path']}: {told['drivable_square_metres']:,.0f} m² of road, from {told['looks']:,} pictures of "
-        f"{told['scenarios']:,} scenarios ({told['missing']:,} missing, {told['damaged']:,} damaged)"
+        f"{counted(told['scenarios'], 'scenario')} ({told['missing']:,} missing, {told['damaged']:,} damaged)"
     )

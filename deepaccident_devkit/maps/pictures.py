@@ -19,6 +19,7 @@ from deepaccident_devkit.render.ground import draw_ground
 from deepaccident_devkit.render.styles import BEV_COLORS, MAP_COLORS, MUTED_COLOR, in_own_settings
 from deepaccident_devkit.support.arrays import ByteArray, FloatArray
 from deepaccident_devkit.support.nuscenes_names import with_keywords_named
+from deepaccident_devkit.support.text import counted
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -60,7 +61,7 @@ def draw_whole_map(drawn: TownMap, ax: Axes) -> Axes:
         for name, color in MAP_COLORS.items()
     ]
     draw_legend(ax, handles, loc="upper center", bbox_to_anchor=(0.5, 0), borderaxespad=4.5)
-    ax.set_title(f"{drawn.town}: {drawn.looks:,} pictures of {drawn.scenarios} scenarios")
+    ax.set_title(f"{drawn.town}: {drawn.looks:,} pictures of {counted(drawn.scenarios, 'scenario')}")
     return ax
 
 

@@ -42,7 +42,7 @@ from deepaccident_devkit.release.fingerprints import digest_of
 from deepaccident_devkit.support.arrays import AnyArray
 from deepaccident_devkit.support.files import place_in, replacing
 from deepaccident_devkit.support.reading import DAMAGED_ARCHIVE, open_zip, read_array
-from deepaccident_devkit.support.text import choice
+from deepaccident_devkit.support.text import choice, counted
 from deepaccident_devkit.tables.tokens import parse_number
 from deepaccident_devkit.taxonomy import AGENTS, CHANNELS, LIDAR
 from deepaccident_devkit.v2x import cooperating_agents
@@ -178,7 +178,7 @@ class LabelFiles(Mapping[str, MotionLabels]):
     __eq__, __hash__ = object.__eq__, object.__hash__  # those of a mapping would read all files
 
     def __repr__(self) -> str:
-        return f"<motion labels: {len(self):,} samples in {self.folder}>"
+        return f"<motion labels: {counted(len(self), 'sample')} in {self.folder}>"
 
     def __len__(self) -> int:
         """Number of samples."""

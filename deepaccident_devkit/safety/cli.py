@@ -38,6 +38,7 @@ from deepaccident_devkit.safety.figures import (
 )
 from deepaccident_devkit.safety.page import REPLAYS, save_safety_report
 from deepaccident_devkit.support.files import writable_folder, write_bytes
+from deepaccident_devkit.support.text import counted
 
 Scenarios = Sequence[Any] | None
 """Those that a verb is about; None for all."""
@@ -174,7 +175,7 @@ def _describe(dataset: DeepAccident, chosen: Scenarios, out: Path | None, *, as_
         for reason in () if as_json else each.facts["unknown"]:
             click.echo(f"  not known: {reason}")
     if out is not None:
-        click.echo(f"written: {len(lines)} scenarios in {out}", err=as_json)
+        click.echo(f"written: {counted(len(lines), 'scenario')} in {out}", err=as_json)
 
 
 def _report(dataset: DeepAccident, chosen: Scenarios, folder: Path, replays: int | None, **engine: Any) -> None:
@@ -183,5 +184,5 @@ def _report(dataset: DeepAccident, chosen: Scenarios, folder: Path, replays: int
     found = safety_report(dataset, chosen, progress=True, **engine)
     written = save_safety_report(found, folder, dataset=dataset, replays=replays, progress=True, **engine)
     left_out = f"; {len(found.left_out)} reasons for what is left out are in the page" if found.left_out else ""
-    click.echo(f"{len(found.rows)} accidents of {found.scenarios} scenarios{left_out}")
-    click.echo(f"written: {len(written)} files in {folder}; open {written[-1]} in a browser")
+    click.echo(f"{counted(len(found.rows), 'accident')} of {counted(found.scenarios, 'scenario')}{left_out}")
+    click.echo(f"written: {counted(len(written), 'file')} in {folder}; open {written[-1]} in a browser")

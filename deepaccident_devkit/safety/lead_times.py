@@ -34,7 +34,7 @@ from deepaccident_devkit.safety.observation import (
     shapley_values,
 )
 from deepaccident_devkit.support.arrays import BoolArray, FloatArray, FrozenArrays, IntArray, known
-from deepaccident_devkit.support.text import columns_text
+from deepaccident_devkit.support.text import columns_text, counted
 from deepaccident_devkit.taxonomy import AGENTS, AgentName, short_name
 
 if TYPE_CHECKING:
@@ -339,9 +339,10 @@ class LeadTimeLedger(Report):
 
     def to_text(self) -> str:
         """A table of the accidents and of their means, for a terminal."""
+        with_ego = sum(each.ego_collides for each in self.accidents)
         counts = (
-            f"{len(self.accidents)} accidents, {sum(each.ego_collides for each in self.accidents)} of them with {EGO} "
-            f"among the colliders; {self.without_accident} scenarios without an accident; {len(self.skipped)} skipped"
+            f"{counted(len(self.accidents), 'accident')}, {with_ego} of them with {EGO} among the colliders; "
+            f"{counted(self.without_accident, 'scenario')} without an accident; {len(self.skipped)} skipped"
         )
         head = f"Lead times: DeepAccident {self.version} at {self.dataroot}\nobserved: {self.rule.text}\n{counts}"
         blocks = [f"{head}\n{CAVEAT}"]

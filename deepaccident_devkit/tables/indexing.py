@@ -16,6 +16,7 @@ from deepaccident_devkit.geometry import quaternions
 from deepaccident_devkit.parallel import Store
 from deepaccident_devkit.release import ReleaseLayout, ScenarioFolder, read_meta, read_split_file
 from deepaccident_devkit.support.arrays import AnyArray
+from deepaccident_devkit.support.text import counted
 from deepaccident_devkit.tables.arrow_files import (
     HASHES,
     Columns,
@@ -88,7 +89,7 @@ def assign_splits(layout: ReleaseLayout) -> SplitAssignment:
         unlisted=tuple(sorted(tokens - set(in_files))) if set(SPLITS) <= set(listed) else (),
         contradictions=_contradictions(listed, in_folder),
         notices=tuple(
-            f"{layout.split_files[split]}: lists {count} scenarios that are not in this release"
+            f"{layout.split_files[split]}: lists {counted(count, 'scenario')} not in this release"
             for split, count in missing.items()
             if count
         ),

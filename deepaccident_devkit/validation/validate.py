@@ -161,7 +161,7 @@ class ValidationReport(CheckReport):
         depth = "every file decoded" if self.deep else "labels, calib, meta and file names (--deep decodes the rest)"
         return (
             f"DeepAccident {self.version} at {self.dataroot}\n"
-            f"{self.scenarios} scenarios, {self.samples:,} samples: {depth}"
+            f"{counted(self.scenarios, 'scenario')}, {counted(self.samples, 'sample')}: {depth}"
         )
 
     def _scenario_blocks(self, most: int, *, notes: bool) -> Iterator[str]:

@@ -45,7 +45,7 @@ from deepaccident_devkit.evaluation.results.records import (
 from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.support.arrays import AnyArray, FloatArray, IntArray
 from deepaccident_devkit.support.reading import NO_NAME, fault_text, irregular_text, read_bytes
-from deepaccident_devkit.support.text import path_of
+from deepaccident_devkit.support.text import counted, path_of
 from deepaccident_devkit.taxonomy import CATEGORIES, UNTRACKED_ID
 
 if TYPE_CHECKING:
@@ -84,7 +84,7 @@ class Results:
         return Results, (self.path, self.task, self.fingerprint)
 
     def __repr__(self) -> str:
-        return f"<{self.task} results: {len(self):,} samples in {self.path}>"
+        return f"<{self.task} results: {counted(len(self), 'sample')} in {self.path}>"
 
     def __len__(self) -> int:
         """Number of samples."""

@@ -34,7 +34,7 @@ from deepaccident_devkit.evaluation.runs.verification import differing
 from deepaccident_devkit.evaluation.task import Headline, headlines, plain
 from deepaccident_devkit.reports import Report, Row, record_rows
 from deepaccident_devkit.support.arrays import BoolArray, FloatArray, ShortRepr, known
-from deepaccident_devkit.support.text import columns_text, path_of
+from deepaccident_devkit.support.text import columns_text, counted, path_of
 
 Family = Literal["main", "headlines", "other"]
 """What a number is tested with: by itself, with all other headlines, or not at all."""
@@ -124,8 +124,9 @@ class Comparison(Report):
     def to_text(self) -> str:
         """A table of the headlines, how many other numbers differ, and what to make of that."""
         marks = [f"a, b: only the samples that both have; {self.left_out} left out"] if self.left_out else []
+        samples, scenarios = counted(self.samples, "sample"), counted(self.scenarios, "scenario")
         head = [
-            f"{self.task}, protocol {self.protocol}: {self.samples} samples of {self.scenarios} scenarios",
+            f"{self.task}, protocol {self.protocol}: {samples} of {scenarios}",
             f"clusters: {self.clusters} (an accident and its twin are one)",
             f"a: {self.a}",
             f"b: {self.b}",
@@ -332,7 +333,7 @@ def _shared_tokens(
     mine, theirs = (each.tokens for each in evaluators)
     if mine != theirs and not common:
         counted = "; ".join(
-            f"{len(alone)} samples only in {bundle.folder} ({', '.join(_first(sorted(alone)))})"
+            f"{counted(len(alone), 'sample')} only in {bundle.folder} ({', '.join(_first(sorted(alone)))})"
             for bundle, alone in zip(bundles, (mine - theirs, theirs - mine), strict=True)
             if alone
         )

@@ -20,7 +20,7 @@ from deepaccident_devkit.evaluation.runs.comparison import comparable
 from deepaccident_devkit.evaluation.runs.setups import scenario_of
 from deepaccident_devkit.evaluation.task import Unit, headlines, value_text
 from deepaccident_devkit.reports import Report, Row, record_rows
-from deepaccident_devkit.support.text import columns_text, path_of
+from deepaccident_devkit.support.text import columns_text, counted, path_of
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
 
@@ -111,7 +111,8 @@ class OverBytes(Report):
                 for each in self.points
             ),
         ]
-        return f"{self.task}, protocol {self.protocol}: {self.samples} samples\n\n{columns_text(rows, left=2)}"
+        head = f"{self.task}, protocol {self.protocol}: {counted(self.samples, 'sample')}"
+        return f"{head}\n\n{columns_text(rows, left=2)}"
 
     def named_tables(self) -> dict[str, list[Row]]:
         """A line a point."""

@@ -12,6 +12,7 @@ from deepaccident_devkit.render.chips import keep_free, place_chips
 from deepaccident_devkit.render.evaluation.panels import PANEL
 from deepaccident_devkit.render.figures import figure_or_new, with_light_grid
 from deepaccident_devkit.render.styles import ESTIMATE_COLOR, MUTED_COLOR, current_style, in_own_settings, text_size
+from deepaccident_devkit.support.text import counted
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -34,7 +35,7 @@ def render_over_bytes(report: OverBytes, *, fig: Figure | None = None) -> Figure
     names = list(dict.fromkeys(each.headline for each in report.points))[: 2 * columns]
     rows = -(-len(names) // columns) or 1
     fig = figure_or_new(fig, (PANEL[0] * columns, PANEL[1] * rows + 0.7), column=0.75 * rows)
-    set_title(fig, f"{report.task}, protocol {report.protocol}: {report.samples:,} samples")
+    set_title(fig, f"{report.task}, protocol {report.protocol}: {counted(report.samples, 'sample')}")
     fig.supxlabel(
         f"bytes a sample, as powers of 2\nwhiskers: {100 * report.resampling.confidence:g} % intervals",
         fontsize=text_size(),

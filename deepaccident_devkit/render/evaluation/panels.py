@@ -20,6 +20,7 @@ from deepaccident_devkit.render.styles import (
     in_own_settings,
     text_size,
 )
+from deepaccident_devkit.support.text import counted
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -155,8 +156,8 @@ def render_comparison(comparison: Comparison, *, fig: Figure | None = None) -> F
     heights = [_AXIS + _ROW * len(rows) for rows in panels.values()] or [_AXIS]
     fig = figure_or_new(fig, (_WIDTH, _TITLE + sum(heights)))
     title = (
-        f"{comparison.task}, protocol {comparison.protocol}: {comparison.samples:,} samples of "
-        f"{comparison.scenarios:,} scenarios"
+        f"{comparison.task}, protocol {comparison.protocol}: {counted(comparison.samples, 'sample')} of "
+        f"{counted(comparison.scenarios, 'scenario')}"
     )
     color = WARNING_COLOR if comparison.partial else None
     set_title(fig, "\n".join([title, *comparison.partial]), fontsize=11, color=color)

@@ -178,7 +178,7 @@ def test_it_is_printed_for_a_release_that_cannot_be_indexed(tmp_path: Path) -> N
         for kind in ("calib", *CAMERAS[1:]):
             shutil.rmtree(tmp_path / TYPE / agent / kind)
     text = run(tmp_path, "--workers", 1).stdout
-    assert f"12 scenarios here, 0 of them whole\n{12 * 27:,} of their {12 * 51} files are here" in text
+    assert f"12 scenarios here, 0 whole\nfiles here: {12 * 27:,} of {12 * 51} (" in text
     assert max(map(len, text.splitlines()[1:])) <= 100
     assert text.count("  … and 2 more (--json lists all)") == 1
     assert json.loads(run(tmp_path, "--json").stdout) == asdict(release_completeness(tmp_path, workers=1))
