@@ -308,9 +308,10 @@ class Dataset(OpenTables):
         Args:
             sample_data: token or record of a camera's sensor file; with `channel`, of a sample.
             channel: the camera, such as `Camera_Front`; None where `sample_data` names it.
-            least: a height and width that suffice, for speed: a JPEG is decoded at 1/2, 1/4 or 1/8 of its size if that
+            least: a (height, width) that suffices, for speed: a JPEG is decoded at 1/2, 1/4 or 1/8 of its size if that
                 is no smaller. None decodes all of it.
-            size: a height and width to resize it to, by Pillow's bilinear filter; None keeps its own.
+            size: (height, width), as of arrays, to which it is resized by Pillow's bilinear filter; None keeps its own.
+                Videos (`render_scenario_video`) count the other way round: (width, height).
 
         Raises:
             TokenError: no such sensor file.

@@ -36,6 +36,7 @@ from deepaccident_devkit.support.text import choice, path_of
 from deepaccident_devkit.tables.tokens import frame_token, sample_token
 from deepaccident_devkit.taxonomy import CAMERAS
 from deepaccident_devkit.v2x import Agents, cooperating_agents
+from deepaccident_devkit.v2x.agents import checked_agents
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -76,7 +77,8 @@ def check_target(path: Path, *, size: tuple[int, int], fps: float) -> None:
         raise ChoiceError(f"size: expected width and height of at least 16 pixels, found {size}")
     if path.suffix.lower() == ".mp4":
         if any(side % 2 for side in size):
-            raise ChoiceError(f"size: expected an even width and height, which MP4 needs, found {size}")
+            even = tuple(side - side % 2 for side in size)
+            raise ChoiceError(f"size: expected an even width and height, which MP4 needs, found {size}; give {even}")
         try:
             import av  # noqa: F401 - whether it is installed
         except ImportError:
@@ -265,9 +267,9 @@ class Scene:
 def names_at(dataset: Dataset, frame: str, agents: Agents) -> tuple[str, ...]:
     """The chosen agents at a frame; first is the one whose view it is: the first one named, or the first one there."""
     names = cooperating_agents(dataset, dataset.samples_of(frame)[0], agents)
-    if agents is None or isinstance(agents, str) or not isinstance(agents, Sequence):
-        return names
-    return tuple(sorted(names, key=lambda name: name != agents[0]))
+    checked = checked_agents(agents)
+    first = checked[0] if isinstance(checked, tuple) else names[0]
+    return tuple(sorted(names, key=first.__ne__))
 
 
 def views_of(
@@ -319,7 +321,7 @@ def render_scenario_video(  # noqa: PLR0913 - each is a choice that stands on it
             first one named, or the first one there; their boxes and points from above are of all of `agents`.
         layers: each view renders those of them that it has; None for the default of each view.
         frames: numbers of frames, from 1, in the order given; or a slice of the list of all frames; None for all.
-        size: width and height, pixels; even numbers for MP4.
+        size: (width, height), pixels; even numbers for MP4. `load_image` counts as arrays do: (height, width).
         fps: frames a second; the recordings have 10.
         **how: as of `parallel.Engine`, with a bar unless `progress` says otherwise. By default this process alone calls
             functions of your own; others can do so if these are importable from a module.

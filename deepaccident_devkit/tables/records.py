@@ -59,7 +59,7 @@ class CollisionRecord(TypedDict):
 
 
 class ScenarioRecord(TypedDict):
-    """One recording of 40 to 100 frames at an intersection, seen by up to five agents."""
+    """One recording of 36 to 100 frames at an intersection, seen by up to five agents."""
 
     token: Annotated[str, Derived(doc="`<scenario_type>/<name>`; a name alone occurs under several types.")]
     name: Annotated[str, Word(doc="Folder name, `<Town>_type001_subtype000<k>_scenario000<nn>`.")]

@@ -44,7 +44,7 @@ from deepaccident_devkit.motion import predict_instances
 from deepaccident_devkit.support.arrays import AnyArray
 from deepaccident_devkit.support.files import replacing, replacing_folder
 from deepaccident_devkit.support.reading import file_checksum, open_file, read_bytes
-from deepaccident_devkit.support.text import choice, differing_text, path_of
+from deepaccident_devkit.support.text import choice, counted, differing_text, path_of
 from deepaccident_devkit.taxonomy import CATEGORIES
 
 _BODY, _END = ',\n"results": {', "\n}\n}\n"
@@ -111,7 +111,7 @@ class ResultsWriter:
 
     def __repr__(self) -> str:
         """Its task and path, and how many samples it has written."""
-        return f"ResultsWriter({self.task} to {self.path}: {len(self._tokens):,} samples)"
+        return f"ResultsWriter({self.task} to {self.path}: {counted(len(self._tokens), 'sample')})"
 
     def __enter__(self) -> ResultsWriter:
         """Begin beside the path; raises ResultsError if nothing can be written there."""
@@ -147,7 +147,8 @@ class ResultsWriter:
         """Write the prediction of a sample.
 
         Args:
-            token: of the sample; each one once.
+            token: of the sample; each one once. Whether the release has it is not known here: `evaluate check
+                --dataroot` tells.
             prediction: of motion a MotionOutput, all of one grid and number of frames; of accidents those that are
                 foreseen, [] for none; of detection the boxes, in the world frame; of planning one or more Plans; of
                 forecasting the Forecasts, one an actor.

@@ -86,7 +86,7 @@ def test_errors_come_before_anything_is_drawn(video: Callable[..., Path], tmp_pa
 
     assert_refused(
         (write("v.avi"), ChoiceError, ("path", ".mp4, .gif, .webp", "v.avi")),
-        (write(size=(161, 90)), ChoiceError, ("size", "even width and height", "MP4")),
+        (write(size=(161, 90)), ChoiceError, ("size", "even width and height", "MP4", "give (160, 90)")),
         (write(size=(0, 90)), ChoiceError, ("size", "at least 16 pixels")),
         (write(fps=0), ChoiceError, ("fps", "above 0")),
         (write(what="film"), ChoiceError, ("what", "frame, sample, accident", "'film'")),
