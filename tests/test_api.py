@@ -140,9 +140,9 @@ def test_unknown_tables_fields_channels_and_frames(da: DeepAccident) -> None:
         (lambda: da.boxes(sample, visible="lidar"), ChoiceError, ("visible: expected one of camera, released, or N",)),
         (lambda: da.boxes(sample, velocity="mine"), ChoiceError, ("velocity: expected one of decoded, derived, lab",)),
         (
-            lambda: da.split_scenarios("training"),
+            lambda: da.split_scenarios("validation"),
             ChoiceError,
-            ("split: expected one of train, val, test", "all, or a split file", "'train'?"),
+            ("split: expected one of train, val, test", "all, or a split file", "'val'?"),
         ),
         (lambda: da.transform(sample, other), ChoiceError, ("expected two samples of one scenario",)),
         (lambda: da.sensor[8], IndexError, ("table 'sensor' has 8 rows, asked for row 8",)),

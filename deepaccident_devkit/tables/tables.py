@@ -224,7 +224,7 @@ class OpenTables:
         if time_to_impact is not None and frame is None:
             frame = self._frame_before_impact(scenario, time_to_impact)
         elif time_to_impact is not None or not isinstance(frame, int | np.integer):
-            raise TokenError(f"frame: expected a number from 1, or time_to_impact= instead, found {frame!r}")
+            raise TokenError(f"frame: expected a number from 1, found {frame!r}; or give time_to_impact= instead")
         return self.sample.get(f"{token_of(scenario)}/{spelled(agent, AGENTS)}/{frame:03d}")
 
     def _frame_before_impact(self, scenario: RowArgument, seconds: float) -> int:
