@@ -24,7 +24,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
-from deepaccident_devkit.errors import BrokenReleaseError, DatarootError, IndexStoreError, VersionError
+from deepaccident_devkit.errors import BrokenReleaseError, DatarootError, IndexStoreError, VersionError, escaped
 from deepaccident_devkit.release import ReleaseLayout
 from deepaccident_devkit.release.store import Dataroot, index_places, list_files_in, places_of
 from deepaccident_devkit.support.arrays import ShortRepr
@@ -370,14 +370,14 @@ def _accept(layout: ReleaseLayout, index: Index, on_error: OnError) -> None:
     if not index.tables:
         raise DatarootError(f"{layout.root}: its scenarios hold no calib files; unpack the calib archives")
     for problem in index.problems:
-        logger.warning("left out %s: %s", problem.scenario, " | ".join(problem.messages))
+        logger.warning("left out %s", escaped(f"{problem.scenario}: {' | '.join(problem.messages)}"))
     places: dict[str, list[str]] = {}
     for notice in index.notices:
         place, _, words = notice.partition(": ")
         places.setdefault(words, []).append(place)
     for words, (first, *others) in places.items():  # one sentence of all that lack the same
         head = f"{1 + len(others)} scenarios, such as {first}" if others else first
-        logger.warning("%s: %s", head, words)
+        logger.warning("%s", escaped(f"{head}: {words}"))
 
 
 def _problems_text(layout: ReleaseLayout, problems: Sequence[Problem]) -> str:

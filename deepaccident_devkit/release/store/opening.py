@@ -16,7 +16,7 @@ from urllib.parse import unquote, urlsplit
 
 import numpy as np
 
-from deepaccident_devkit.errors import DatarootError, DeepAccidentError, IndexStoreError
+from deepaccident_devkit.errors import DatarootError, DeepAccidentError, IndexStoreError, escaped
 from deepaccident_devkit.release.store.members import (
     FORM,
     MINI_FOLDER,
@@ -238,7 +238,7 @@ def _accepted(place: str, results: Sequence[Listing | Failure], on_error: OnErro
     if refused and on_error == "raise":
         raise DatarootError(text + _WITHOUT_THEM * (len(refused) < len(results)))
     if refused:
-        _logger.warning("left out: %s", text)
+        _logger.warning("left out: %s", escaped(text))
     return [result for result in results if isinstance(result, Listing)]
 
 
