@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from deepaccident_devkit.parallel import Engine
 
 BENCHMARKS: Final[Mapping[str, SynthConfig]] = {
-    "v1": SynthConfig(scenarios=240, image_size=(320, 180), seed=20261201, sensor_step=5, decimals=4)
+    "v1": SynthConfig(scenarios=240, image_size=(320, 180), seed=20261201, sensor_step=5, decimals=4, traffic="v1")
 }
 """Benchmark → what it is made of. Whatever the generator learns, these stay as they are, byte for byte."""
 TOLERANCES: Final[Mapping[str, float]] = {

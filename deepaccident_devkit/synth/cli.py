@@ -89,6 +89,7 @@ def _designs(context: click.Context, parameter: click.Parameter, given: tuple[st
 )
 @field_option(SynthConfig, "designed")
 @field_option(SynthConfig, "unplanned", option=advanced)
+@field_option(SynthConfig, "traffic", option=advanced)
 @click.option(
     "--benchmark",
     type=WordChoice(BENCHMARKS),

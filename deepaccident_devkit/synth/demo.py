@@ -76,7 +76,7 @@ background: {vehicles: [6, 12], two_wheelers: [2, 6], parked: [3, 9], walking: [
 weather: Clear
 time_of_day: Noon
 """
-RELEASE: Final = SynthConfig(scenarios=2, frames=40, seed=1, sensors="accidents")
+RELEASE: Final = SynthConfig(scenarios=2, frames=40, seed=1, sensors="accidents", traffic="v1")
 _MARK: Final = ".deepaccident_demo"
 """The file by which the demo knows a folder as its own."""
 _SCENARIO_FILE: Final = "accident.yaml"

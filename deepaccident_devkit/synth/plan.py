@@ -20,7 +20,7 @@ from deepaccident_devkit.synth.spec import (
     read_design,
     read_spec,
 )
-from deepaccident_devkit.synth.traffic.lifelike import MISFILED, Kind, as_kind, draw_kind, paths_join
+from deepaccident_devkit.synth.traffic.lifelike import MISFILED, TRAFFICS, Kind, as_kind, draw_kind, paths_join
 from deepaccident_devkit.tables.records import ScenarioRecord
 from deepaccident_devkit.taxonomy import META_AGENTS, ROAD_TYPES, SPLITS, TOWNS, Layout
 
@@ -28,6 +28,8 @@ Sensors = Literal["all", "accidents", "cameras", "clouds", "none"]
 """Which sensors' files a release has: of all, those of accidents alone, images or clouds alone, or of none."""
 RigName = Literal["released", "road"]
 """How a vehicle's sensors are mounted, and what their optics are."""
+TrafficName = Literal["v1", "v2"]
+"""Versions of the lifelike traffic, as in `lifelike.TRAFFICS`."""
 MAX_FRAMES = 999
 MIN_IMAGE_SIZE = (16, 9)
 IMAGE_SIZE: Final = (480, 270)
@@ -42,6 +44,8 @@ OFFICIAL_FROM_PAIRS: Final = 12
 """From this many pairs on the official procedure splits a release; with fewer it would leave val and test empty."""
 _GOLDEN_RATIO: Final = 0.6180339887498949
 """The fractional parts of its multiples fill [0, 1) evenly, for any number of them."""
+_ROOT_OF_2: Final = 1.4142135623730951
+"""The same is true of this number, independently."""
 _MINI_SHARE: Final = Fraction(1, 5)
 """The largest share of its split that a mini split may hold."""
 _PLAN_STREAM: Final = 1
@@ -82,6 +86,8 @@ class SynthConfig:
         unplanned: share of clean accidents that differ from the design: with a pedestrian or a third vehicle. It is 0
             where `spec` or the view `hidden` asks for one certain accident.
         spec: a scenario file (docs/synth.md) to use instead of the designs; every pair is one draw from it.
+        traffic: Version of the accidents and of the traffic where they are not `designed`: `v2`, or `v1` for those of
+            version 1.0.
         unlabelled_test: whether the test split lacks labels, BEV arrays and meta, as the real one does.
         rig: `released`, as vehicles of the release have it; or `road`, lower sensors, with the fields of view of
             nuScenes' cameras and images that are softer, noisier and of other colours: what stands for another dataset.
@@ -106,6 +112,7 @@ class SynthConfig:
     designed: bool = False
     unplanned: float = 0.1
     spec: Path | None = None
+    traffic: TrafficName = "v2"
     unlabelled_test: bool = False
     rig: RigName = "released"
     exact: bool = False
@@ -124,7 +131,7 @@ class SynthConfig:
         if isinstance(self.sensors, bool):
             object.__setattr__(self, "sensors", "all" if self.sensors else "none")
         words = {"layout": get_args(Layout), "sensors": get_args(Sensors), "view": (None, *get_args(View))}
-        words["rig"] = get_args(RigName)
+        words |= {"rig": get_args(RigName), "traffic": get_args(TrafficName)}
         settle_choices(self, words, error=ConfigError)
         if len(self.pixels) != 2:
             raise ConfigError(f"image_size: expected (width, height), found {self.image_size!r}")
@@ -216,6 +223,11 @@ class ScenarioPlan:
     def collides(self) -> bool:
         """Whether there is a collision in it."""
         return self.accident != self.misfiled
+
+    @property
+    def grazes(self) -> bool:
+        """Whether a vehicle scrapes along another one beside the accident, the same in both scenarios of a pair."""
+        return self.kind is not None and self.pair * _ROOT_OF_2 % 1 < self.kind.traffic.grazes
 
     @property
     def scenario_type(self) -> str:
@@ -315,13 +327,13 @@ def plan_splits(plans: Sequence[ScenarioPlan]) -> Splits:
 def _plan(config: SynthConfig, pair: int, template: SpecTemplate, *, accident: bool) -> ScenarioPlan:
     rng = np.random.default_rng([config.seed, pair, _PLAN_STREAM])
     town = TOWNS[int(rng.integers(len(TOWNS)))]
-    unplanned = bool(rng.random() < config.unplanned) and config.spec is None and config.view != "hidden"
+    unplanned = rng.random() < config.unplanned and config.spec is None and config.view != "hidden"
     spec = draw(template, rng)
     traits, kind, misfiled = Traits.of(spec), None, False
     if config.lifelike:
-        kind = draw_kind(np.random.default_rng([config.seed, pair, _KIND_STREAM]), spec)
+        kind = draw_kind(np.random.default_rng([config.seed, pair, _KIND_STREAM]), spec, TRAFFICS[config.traffic])
         of_folder = np.random.default_rng([config.seed, pair, _KIND_STREAM, accident])
-        unplanned, misfiled = kind.pair is None, bool(of_folder.random() < MISFILED[accident])
+        unplanned, misfiled = kind.pair is None, of_folder.random() < MISFILED[accident]
     if config.view == "hidden" and traits.spawn_side not in ("left", "right"):
         place = "" if config.spec is None else f"{template.place('actors')}: "
         others = "designs" if config.spec is None else "arms"
@@ -348,7 +360,7 @@ def _seen(spec: ScenarioSpec, view: View, rng: np.random.Generator) -> ScenarioS
     if view == "open":
         return replace(spec, view=view)
     actors = tuple(
-        replace(actor, lane=0, max_speed=float(rng.uniform(*_HIDDEN_SPEEDS)))
+        replace(actor, lane=0, max_speed=rng.uniform(*_HIDDEN_SPEEDS))
         if actor.role in ("ego", "other")
         else replace(actor, lane=0)
         for actor in spec.actors

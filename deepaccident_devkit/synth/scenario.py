@@ -47,6 +47,7 @@ from deepaccident_devkit.synth.traffic.accidents import (
     set_stage,
     try_accident,
     usual_duration,
+    with_graze,
 )
 from deepaccident_devkit.synth.traffic.driving import PERIOD
 from deepaccident_devkit.synth.traffic.lifelike import ON_FOOT
@@ -114,14 +115,15 @@ def build_scenario(config: SynthConfig, plan: ScenarioPlan) -> Scenario:
     of_world, of_traffic, of_ids, of_end = map(np.random.default_rng, np.random.SeedSequence(seeds).spawn(4))
     while True:
         stage, accident, draws = _first_good_draw(of_traffic, config, plan)
-        collides = accident if plan.collides else None
         recorded = (
-            _twin(of_end, stage, config, plan)
-            if collides is None
-            else recorded_accident(of_end, stage, collides, config.frames)
+            recorded_accident(of_end, stage, accident, config.frames)
+            if accident and plan.collides
+            else _twin(of_end, stage, config, plan)
         )
         if recorded is not None:
             break
+    if plan.grazes:
+        recorded = with_graze(stage, recorded)
     spec = stage.spec
     ego, other = (spec.actor(role).from_arm or "west" for role in ("ego", "other"))
     ids = _Ids.of(of_ids, stage)
@@ -154,7 +156,7 @@ def _first_good_draw(
         spec = plan.draw(rng)
         junction = Junction(spec.road)
         if plan.unplanned:
-            on_foot = None if plan.kind is None else plan.kind.labelled and bool(rng.random() < ON_FOOT)
+            on_foot = None if plan.kind is None else plan.kind.labelled and rng.random() < ON_FOOT
             spec = unplanned(rng, spec, junction, on_foot=on_foot)
         stage = set_stage(rng, spec, junction, usual_duration(rng, config.frames, plan.kind), plan.kind)
         if spec.meet is None:
@@ -175,15 +177,15 @@ def _first_good_draw(
 def _twin(rng: np.random.Generator, stage: Stage, config: SynthConfig, plan: ScenarioPlan) -> Recorded | None:
     """The recording of a normal scenario; None where all is as in the real release and another draw is needed."""
     normal = perform_twin(stage, latest_end(stage, config.frames))
-    if normal is None and plan.kind is not None:
+    if normal is not None:
+        return recorded_normal(rng, stage, normal, config.frames)
+    if plan.kind is not None:
         return None
-    if normal is None:
-        where = "in the normal twin too" if stage.spec.meet else "although all obey the rules"
-        raise ConfigError(
-            f"{plan.template.place('actors')}: the road users collide {where}, even if one of them comes later; let "
-            "them start farther from each other"
-        )
-    return recorded_normal(rng, stage, normal, config.frames)
+    where = "in the normal twin too" if stage.spec.meet else "although all obey the rules"
+    raise ConfigError(
+        f"{plan.template.place('actors')}: the road users collide {where}, even if one of them comes later; let "
+        "them start farther from each other"
+    )
 
 
 class _Ids(NamedTuple):
@@ -272,8 +274,10 @@ def _collision(stage: Stage, recorded: Recorded, ids: _Ids, decimals: int | None
 
 def _pair_agents(stage: Stage) -> tuple[AgentName | None, AgentName | None]:
     """The agents of the two who are timed to meet; None for a road user that is no agent, or if nobody is timed."""
-    first, second = (stage.users[row] for row in stage.cast.pair) if stage.cast.pair else (None, None)
-    return AGENT_OF_ROLE.get(first.role) if first else None, AGENT_OF_ROLE.get(second.role) if second else None
+    first, second = (
+        (AGENT_OF_ROLE.get(stage.users[row].role) for row in stage.cast.pair) if stage.cast.pair else (None, None)
+    )
+    return first, second
 
 
 @dataclass(frozen=True, slots=True)

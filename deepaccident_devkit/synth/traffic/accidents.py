@@ -16,10 +16,11 @@ from deepaccident_devkit.synth.spec.checks import LEADERS
 from deepaccident_devkit.synth.spec.model import Role
 from deepaccident_devkit.synth.traffic.background import ParkedVehicle, background_users, parked_vehicles
 from deepaccident_devkit.synth.traffic.driving import RoadUser, middle_of
+from deepaccident_devkit.synth.traffic.grazes import swerves
 from deepaccident_devkit.synth.traffic.lifelike import (
     NORMAL_FRAMES,
     Kind,
-    accident_frames,
+    accident_duration,
     beyond_contact,
     crowded,
     lively,
@@ -61,6 +62,8 @@ _SHORTEST = 36
 """The fewest frames of a recording with a kind of accident."""
 _EARLIEST, _LATEST_END = 5.5, 10.0
 """The least time from the beginning until the pair meets, and the latest end of a normal scenario, seconds."""
+_BEFORE_GRAZE, _AFTER_GRAZE = 1.5, 1.0
+"""Seconds from the beginning of the recording to a contact beside the accident, and from that to the end, at least."""
 _ARRIVAL = 25.0
 """A normal scenario also ends when ego is so many metres past the middle of the junction."""
 
@@ -156,7 +159,8 @@ def set_stage(
     background = background_users(rng, spec, junction, cast.users, signals, cast.begin + hold)
     parked = tuple(parked_vehicles(rng, spec, junction, [user for user in cast.users if user.walks]))
     if kind is not None:
-        background, parked = [lively(rng, user) for user in background], crowded(rng, parked)
+        background = [lively(rng, user, kind.traffic, cast.begin + hold) for user in background]
+        parked = crowded(rng, parked)
     return Stage(
         spec=spec,
         junction=junction,
@@ -212,11 +216,11 @@ def recorded_accident(rng: np.random.Generator, stage: Stage, performance: Perfo
     None records all frames that there are, within limits.
     """
     pair = stage.cast.pair or (0, 0)
-    size = np.array([stage.users[row].body.size[:2] for row in pair])
+    size = _sizes([stage.users[row] for row in pair])
     impact = impact_of(performance.simulation, pair, size)
     end = impact.time
     if stage.kind is not None:
-        simulation, after = beyond_contact(rng, performance.simulation, pair, size)
+        simulation, after = beyond_contact(rng, performance.simulation, pair, size, stage.kind.traffic)
         performance, end = replace(performance, simulation=simulation), end + after
     count = frames or _natural_frames(stage, end)
     return Recorded(performance=performance, start=end - FRAME_PERIOD * (count - 1), frames=count, impact=impact)
@@ -231,13 +235,26 @@ def recorded_normal(rng: np.random.Generator, stage: Stage, performance: Perform
         natural = int(rng.integers(*NORMAL_FRAMES))
     if frames is None:
         return Recorded(performance=performance, start=begin, frames=natural, impact=None)
-    end = max(begin + FRAME_PERIOD * (natural - 1), begin + FRAME_PERIOD * (frames - 1))
+    end = begin + FRAME_PERIOD * (max(natural, frames) - 1)
     return Recorded(performance=performance, start=end - FRAME_PERIOD * (frames - 1), frames=frames, impact=None)
+
+
+def with_graze(stage: Stage, recorded: Recorded) -> Recorded:
+    """Return a recording in which a driver scrapes along another, none of them in the accident, if any pass closely."""
+    performance, pair = recorded.performance, stage.cast.pair or ()
+    users = [stage.users[row] for row in performance.present]
+    drivers = [place for place, row in enumerate(performance.present) if row not in pair and not users[place].walks]
+    window = (recorded.start + _BEFORE_GRAZE, recorded.start + FRAME_PERIOD * recorded.frames - _AFTER_GRAZE)
+    touching = _touching(stage, users, performance.simulation)
+    for two, simulation in swerves(performance.simulation, _sizes(users), drivers, window):
+        if sorted(_touching(stage, users, simulation)) == sorted([*touching, two]):
+            return replace(recorded, performance=replace(performance, simulation=simulation))
+    return recorded
 
 
 def usual_duration(rng: np.random.Generator, frames: int | None, kind: Kind | None = None) -> float:
     """Seconds from the beginning until the pair meets: drawn, or as many as the wanted number of frames needs."""
-    usual = rng.uniform(_EARLIEST, _LATEST_END + 0.3) if kind is None else accident_frames(rng) * FRAME_PERIOD
+    usual = accident_duration(rng, kind.traffic) if kind else rng.uniform(_EARLIEST, _LATEST_END + 0.3)
     natural = float(usual)
     return natural if frames is None else max(natural, frames * FRAME_PERIOD + 1.5)
 
@@ -310,11 +327,11 @@ def _touching(stage: Stage, users: Sequence[RoadUser], simulation: Simulation) -
     poses = np.concatenate(
         [simulation.poses, np.broadcast_to(standing, (len(simulation.time), *standing.shape))], axis=1
     )
-    size = np.concatenate([_sizes(users), np.array([v.body.size[:2] for v in stage.parked]).reshape(-1, 2)])
+    size = _sizes([*users, *stage.parked])
     return [(i, j) for i, j in touching_pairs(poses, size, _MARGIN) if i < len(users)]
 
 
-def _sizes(users: Sequence[RoadUser]) -> FloatArray:
+def _sizes(users: Sequence[RoadUser | ParkedVehicle]) -> FloatArray:
     return np.array([user.body.size[:2] for user in users])
 
 
@@ -324,7 +341,7 @@ def _signal_plan(rng: np.random.Generator, cast: Cast) -> SignalPlan:
     lawful = [cast.users[row] for row in rows if "signal" not in cast.users[row].ignores]
     arms = [user.route.from_arm for user in lawful if user.route is not None]
     axis = AXIS_OF_ARM[arms[0]] if arms else "west-east"
-    return plan_with_green(axis, 0.0, float(rng.uniform(*_GREEN_TIMES)), float(rng.uniform(*_GREEN_SHARE)))
+    return plan_with_green(axis, 0.0, rng.uniform(*_GREEN_TIMES), rng.uniform(*_GREEN_SHARE))
 
 
 def _natural_frames(stage: Stage, end: float) -> int:
@@ -398,11 +415,8 @@ def touching_pairs(poses: FloatArray, size: FloatArray, margin: float) -> list[t
 
     Poses are (S, A, 3) x, y (metres), yaw (radians) of the boxes' centres, sizes (A, 2) length and width, metres.
     """
-    found = []
-    for i, j in _near_pairs(poses, size, margin):
-        if (separation(poses[:, i], size[i], poses[:, j], size[j]) < margin).any():
-            found.append((i, j))
-    return found
+    near = _near_pairs(poses, size, margin)
+    return [(i, j) for i, j in near if separation(poses[:, i], size[i], poses[:, j], size[j]).min() < margin]
 
 
 def least_gap(poses: FloatArray, size: FloatArray, rows: list[int], enough: float) -> float:
@@ -415,8 +429,8 @@ def least_gap(poses: FloatArray, size: FloatArray, rows: list[int], enough: floa
 def _near_pairs(poses: FloatArray, size: FloatArray, margin: float) -> list[tuple[int, int]]:
     """Pairs of rows that may come nearer than `margin`."""
     moments = np.concatenate([poses[::_LOOK_STEP], poses[-1:]])
-    x, y = moments[..., 0], moments[..., 1]
-    square = (x[:, :, None] - x[:, None, :]) ** 2 + (y[:, :, None] - y[:, None, :]) ** 2
+    delta = moments[:, :, None, :2] - moments[:, None, :, :2]
+    square = (delta**2).sum(axis=-1)
     radius = np.hypot(size[:, 0], size[:, 1]) / 2
     near = (square < (radius[:, None] + radius + margin + _NEAR) ** 2).any(axis=0)
     rows, columns = np.nonzero(np.triu(near, 1))

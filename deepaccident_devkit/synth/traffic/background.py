@@ -93,7 +93,7 @@ def _driver(
 ) -> RoadUser | None:
     category = str(rng.choice(categories))
     body, manner = random_body(rng, category), MANNERS[category]
-    max_speed = float(rng.uniform(*manner.max_speed))
+    max_speed = rng.uniform(*manner.max_speed)
     for _ in range(_TRIES):
         route = _random_route(rng, junction, category)
         coming = rng.random() < 0.75
@@ -148,7 +148,7 @@ def _walker(rng: np.random.Generator, sidewalks: Sequence[Path]) -> RoadUser:
     path = sidewalks[int(rng.integers(len(sidewalks)))]
     path = shifted(path if rng.random() < 0.5 else path.reversed(), float(-rng.uniform(*_SIDEWALK_OFFSETS)))
     body, manner = random_body(rng, "pedestrian"), MANNERS["pedestrian"]
-    speed = float(rng.uniform(*manner.max_speed))
+    speed = rng.uniform(*manner.max_speed)
     start = float(path.length / 2 + rng.uniform(-55, 45))
     return RoadUser(role="pedestrian", body=body, path=path, start=start, start_speed=speed, max_speed=speed)
 
@@ -166,9 +166,9 @@ def _crosser(
     if not arms:
         return None
     arm = arms[rng.integers(len(arms))]
-    delay = float(rng.uniform(0.0, 8.0))
+    delay = rng.uniform(0.0, 8.0)
     body, manner = random_body(rng, "pedestrian"), MANNERS["pedestrian"]
-    speed = float(rng.uniform(*manner.max_speed))
+    speed = rng.uniform(*manner.max_speed)
     path = junction.crosswalk(arm)
     path = shifted(path if rng.random() < 0.5 else path.reversed(), float(-rng.uniform(*_CROSSWALK_OFFSETS)))
     needed = path.length / speed
@@ -242,7 +242,7 @@ def _in_the_way(place: FloatArray, user: RoadUser) -> bool:
 def _nearest(rng: np.random.Generator, actor: ActorSpec, places: FloatArray) -> int:
     """The row of the slot (N, 3) that is nearest to the place that a file gives for a vehicle."""
     out = np.array(OUTWARD[actor.from_arm or "west"], dtype=np.float64)
-    distance = actor.start_distance if actor.start_distance is not None else float(rng.uniform(*_DISTANCES))
+    distance = actor.start_distance if actor.start_distance is not None else rng.uniform(*_DISTANCES)
     left = np.array([-out[1], out[0]])
     side = 1.0 if actor.side == "right" else -1.0
     along, beside = places[:, :2] @ out, side * (places[:, :2] @ left)
@@ -252,5 +252,5 @@ def _nearest(rng: np.random.Generator, actor: ActorSpec, places: FloatArray) -> 
 
 def _parked(rng: np.random.Generator, category: str, place: FloatArray) -> ParkedVehicle:
     x, y, yaw = place.tolist()
-    shift = float(rng.uniform(-_SHIFT, _SHIFT))
+    shift = rng.uniform(-_SHIFT, _SHIFT)
     return ParkedVehicle(random_body(rng, category), (x + shift * np.cos(yaw), y + shift * np.sin(yaw), yaw))

@@ -137,12 +137,12 @@ def cast_actors(
             pair = None
         else:
             if kind is not None:
-                users = [lively(rng, user) if row not in pair else user for row, user in enumerate(users)]
+                for row, user in enumerate(users):
+                    users[row] = user if row in pair else lively(rng, user, kind.traffic, begin)
                 for row, place in zip(pair, meeting, strict=True):
                     stops = kind.stops and spec.meet.actors[0] == users[row].role
-                    users[row] = erring(rng, users[row], place, stops=stops)
-            ahead = [_ahead(spec, role) for role in spec.meet.actors]
-            places = [place + more for place, more in zip(meeting, ahead, strict=True)]
+                    users[row] = erring(rng, users[row], place, kind.traffic, stops=stops)
+            places = [place + _ahead(spec, role) for place, role in zip(meeting, spec.meet.actors, strict=True)]
             approaches = [drive_alone(users[row], to=place) for row, place in zip(pair, places, strict=True)]
             for row, place, late, approach in zip(pair, places, (0.0, spec.meet.offset), approaches, strict=True):
                 users[row] = approach.at(approach.time_to(place) + begin - late)
@@ -183,10 +183,10 @@ def _ahead(spec: ScenarioSpec, role: Role) -> float:
 def _drawn(rng: np.random.Generator, actor: ActorSpec, junction: Junction, *, timed: bool) -> RoadUser:
     """A road user that follows nobody; if `timed`, it starts far away and standing, if the file gives no start."""
     body, manner = random_body(rng, actor.category), MANNERS[actor.category]
-    max_speed = actor.max_speed if actor.max_speed is not None else float(rng.uniform(*manner.max_speed))
+    max_speed = actor.max_speed if actor.max_speed is not None else rng.uniform(*manner.max_speed)
     arm = actor.from_arm or "west"
     if actor.role == "pedestrian":
-        distance = actor.start_distance if actor.start_distance is not None else float(rng.uniform(22, 50))
+        distance = actor.start_distance if actor.start_distance is not None else rng.uniform(22, 50)
         path = road_crossing(junction.spec, arm, distance, actor.side)
         return RoadUser(
             role=actor.role,
@@ -203,7 +203,7 @@ def _drawn(rng: np.random.Generator, actor: ActorSpec, junction: Junction, *, ti
     if actor.start_distance is not None:
         start, speed = middle_of(route) - actor.start_distance, max_speed
     elif not timed:
-        start, speed = middle_of(route) - float(rng.uniform(*_STARTS)), 0.8 * max_speed
+        start, speed = middle_of(route) - rng.uniform(*_STARTS), 0.8 * max_speed
     return RoadUser(
         role=actor.role,
         body=body,
@@ -214,7 +214,7 @@ def _drawn(rng: np.random.Generator, actor: ActorSpec, junction: Junction, *, ti
         route=route,
         span=lane_span(route),
         ignores=actor.ignores,
-        alert=max(float(rng.uniform(*_ALERTS)), 0.0) if timed else 0.0,
+        alert=max(rng.uniform(*_ALERTS), 0.0) if timed else 0.0,
     )
 
 
@@ -230,19 +230,21 @@ def _way(junction: Junction, route: Route, actor: ActorSpec) -> Path:
 def _follower(rng: np.random.Generator, actor: ActorSpec, leader: RoadUser, path: Path) -> RoadUser:
     """A road user behind its leader, as fast as the leader, on a path that begins like the leader's."""
     body, manner = random_body(rng, actor.category), MANNERS[actor.category]
-    gap = actor.gap if actor.gap is not None else float(rng.uniform(*_GAPS))
-    own_speed = actor.max_speed if actor.max_speed is not None else float(rng.uniform(*manner.max_speed))
+    gap = actor.gap if actor.gap is not None else rng.uniform(*_GAPS)
+    own_speed = actor.max_speed if actor.max_speed is not None else rng.uniform(*manner.max_speed)
+    start = leader.start - (leader.body.size[0] + body.size[0]) / 2 - gap
     return RoadUser(
         role=actor.role,
         body=body,
         path=path,
-        start=leader.start - (leader.body.size[0] + body.size[0]) / 2 - gap,
+        start=start,
         start_speed=leader.start_speed,
         max_speed=max(own_speed, leader.max_speed if leader.brisk else _KEEPING_UP * leader.max_speed),
         delay=leader.delay,
         route=leader.route,
         span=leader.span,
         ignores=leader.ignores,
+        pace=tuple((begin, end - leader.start + start, speed) for begin, end, speed in leader.pace if begin == 0.0),
         brisk=leader.brisk,
     )
 
@@ -286,16 +288,16 @@ def unplanned(
         spec,
         design=None,
         actors=(*(replace(actor, ignores=()) for actor in spec.actors), stranger),
-        meet=MeetSpec(actors=(victim.role, stranger.role), offset=float(rng.uniform(*_OFFSETS))),
+        meet=MeetSpec(actors=(victim.role, stranger.role), offset=rng.uniform(*_OFFSETS)),
     )
 
 
 def _pedestrian(rng: np.random.Generator, victim: ActorSpec, spec: ScenarioSpec) -> ActorSpec:
     """A pedestrian who steps onto the road in front of the victim, behind the hump if there is one on its arm."""
     arm, hump = victim.from_arm or "west", spec.road.hump
-    distance = float(rng.uniform(*_STEP_OUT))
+    distance = rng.uniform(*_STEP_OUT)
     if hump is not None and hump.arm == arm:
-        distance = hump.distance - float(rng.uniform(*_BEHIND_CREST))
+        distance = hump.distance - rng.uniform(*_BEHIND_CREST)
     side: Side = "right" if rng.random() < 0.7 else "left"
     return ActorSpec(
         role="pedestrian",
@@ -303,7 +305,7 @@ def _pedestrian(rng: np.random.Generator, victim: ActorSpec, spec: ScenarioSpec)
         from_arm=arm,
         side=side,
         start_distance=distance,
-        max_speed=float(rng.uniform(*_STEP_OUT_SPEEDS)),
+        max_speed=rng.uniform(*_STEP_OUT_SPEEDS),
     )
 
 
@@ -317,7 +319,7 @@ def _third_vehicle(rng: np.random.Generator, junction: Junction, free: list[Arm]
         from_arm=arm,
         turn=turn,
         lane=junction.spec.lanes - 1,
-        max_speed=float(rng.uniform(*_THIRD_SPEEDS)),
+        max_speed=rng.uniform(*_THIRD_SPEEDS),
         ignores=("signal", "priority"),
     )
 
@@ -329,7 +331,7 @@ def _cutting_in(rng: np.random.Generator, victim: ActorSpec) -> ActorSpec:
         category=rng.choice(["car", "car", "van"]).item(),
         from_arm=victim.from_arm,
         lane=1 - victim.lane,
-        max_speed=float(rng.uniform(*_THIRD_SPEEDS)),
-        lane_change=float(rng.uniform(*_CUT_IN)),
+        max_speed=rng.uniform(*_THIRD_SPEEDS),
+        lane_change=rng.uniform(*_CUT_IN),
         ignores=("signal", "priority"),
     )

@@ -299,8 +299,8 @@ def separation(poses_a: FloatArray, size_a: FloatArray, poses_b: FloatArray, siz
     """
     turn = poses_b[..., 2] - poses_a[..., 2]
     cos, sin = np.abs(np.cos(turn)), np.abs(np.sin(turn))
-    along_a = np.abs(_relative(poses_a, poses_b[..., :2]))
-    along_b = np.abs(_relative(poses_b, poses_a[..., :2]))
+    along_a = np.abs(relative(poses_a, poses_b[..., :2]))
+    along_b = np.abs(relative(poses_b, poses_a[..., :2]))
     half_a, half_b = size_a / 2, size_b / 2
     gaps = [
         along_a[..., 0] - half_a[..., 0] - half_b[..., 0] * cos - half_b[..., 1] * sin,
@@ -319,8 +319,8 @@ def gap(poses_a: FloatArray, size_a: FloatArray, poses_b: FloatArray, size_b: Fl
     return gaps_of_pairs(_footprints(poses_a, size_a), _footprints(poses_b, size_b))
 
 
-def _relative(poses: FloatArray, points: FloatArray) -> FloatArray:
-    """Points (…, 2) in the frames of poses (…, 3)."""
+def relative(poses: FloatArray, points: FloatArray) -> FloatArray:
+    """Return points (…, 2) in the frames of poses (…, 3)."""
     delta = points - poses[..., :2]
     cos, sin = np.cos(poses[..., 2]), np.sin(poses[..., 2])
     return np.stack([cos * delta[..., 0] + sin * delta[..., 1], cos * delta[..., 1] - sin * delta[..., 0]], axis=-1)

@@ -8,7 +8,7 @@ import pytest
 from deepaccident_devkit.synth.plan import SynthConfig, plan_scenarios
 from deepaccident_devkit.synth.scenario import build_scenario
 from deepaccident_devkit.synth.spec import draw, read_design
-from deepaccident_devkit.synth.traffic.lifelike import KINDS, draw_kind, paths_join
+from deepaccident_devkit.synth.traffic.lifelike import KINDS, TRAFFICS, draw_kind, paths_join
 from deepaccident_devkit.synth.traffic.simulate import separation
 
 pytestmark = pytest.mark.slow
@@ -88,7 +88,9 @@ def test_agents_start_slowly_and_some_become_fast(built):
             for actor in scenario.agents.values()
         ]
     )
-    assert ((speeds[::3] < 0.5).mean() > 0.15, np.median(speeds[::3]) < 7.0, 15.0 < speeds.max() < 18.5) == (True,) * 3
+    assert 2.5 < np.median(speeds[::3]) < 4.5
+    assert (speeds[::3] < 0.5).any()
+    assert 15.0 < speeds.max() < 18.7
 
 
 def test_parked_vehicles_overlap_in_some_scenarios(built):
@@ -107,4 +109,4 @@ def test_only_paths_that_join_give_merges():
         rng = np.random.default_rng(design)
         drawn = [draw(read_design(design), rng) for _ in range(60)]
         assert {paths_join(spec) for spec in drawn} == {joins}
-        assert (merge in {draw_kind(rng, spec) for spec in drawn}) == joins
+        assert (merge in [draw_kind(rng, spec, TRAFFICS["v2"]) for spec in drawn]) == joins
