@@ -83,7 +83,7 @@ TRAFFICS: Final[Mapping[str, Traffic]] = {
         standing=0.96,
         waits=(-4.5, -4.0),
         timed=True,
-        grazes=0.5,
+        grazes=0.45,
         no_touch=0.17,
     ),
 }
