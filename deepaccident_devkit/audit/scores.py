@@ -86,6 +86,8 @@ def read_scores(path: str | os.PathLike[str]) -> dict[str, float]:
         raise ResultsError(f"{file}: expected an object of token and score, or a list of these; {_REMEDY}") from error
     except (OSError, ValueError) as error:
         raise ResultsError(f"{file}: {shortened(fault_text(error), MOST_TOLD)}; {_REMEDY}") from error
+    if not given:
+        raise ResultsError(f"{file}: has no token with a score; {_REMEDY}")
     if "results" in given and (results := read_results(file)).task == "accident":
         given = {
             token: max((accident.score for accident in cast("Any", results.prediction(token))), default=0.0)

@@ -140,7 +140,7 @@ def _wilson(share: float, number: float) -> tuple[float, float]:
     """The ends of Wilson's 95 % interval of a share of so many cases."""
     half = _Z * math.sqrt(share * (1 - share) / number + (_Z / 2 / number) ** 2)
     low, high = ((share + _Z**2 / 2 / number + each) / (1 + _Z**2 / number) for each in (-half, half))
-    return max(low, 0.0), min(high, 1.0)
+    return max(low, 0.0), min(high + 1e-12, 1.0)  # which rounding would keep from 1
 
 
 def _verdict(fact: Fact, here: float) -> Verdict:

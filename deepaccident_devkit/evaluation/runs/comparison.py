@@ -332,13 +332,13 @@ def _shared_tokens(
 ) -> list[str]:
     mine, theirs = (each.tokens for each in evaluators)
     if mine != theirs and not common:
-        counted = "; ".join(
+        alone_text = "; ".join(
             f"{counted(len(alone), 'sample')} only in {bundle.folder} ({', '.join(_first(sorted(alone)))})"
             for bundle, alone in zip(bundles, (mine - theirs, theirs - mine), strict=True)
             if alone
         )
         raise EvaluationError(
-            f"{counted}; evaluate both at the same samples, or compare those that both have with common=True (--common)"
+            f"{alone_text}; evaluate both at the same samples, or compare those that both have with common=True (--common)"
         )
     shared = sorted(mine & theirs)
     if not shared:

@@ -68,7 +68,7 @@ def test_without_files_of_sensors_their_facts_are_unknown(da_b: DeepAccident) ->
 
 def test_without_labels_nothing_is_compared(tmp_path: Path) -> None:
     root = write_small_release(tmp_path / "release", SmallRelease(splits=("test",), channels=()))
-    with pytest.raises(NotAvailableError, match=r"release: no sample of ego_vehicle has labels"):
+    with pytest.raises(NotAvailableError, match=r"release: ego_vehicle has no labels"):
         rig_report(DeepAccident(dataroot=root, verbose=False))
 
 

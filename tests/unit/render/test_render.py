@@ -161,7 +161,7 @@ REFUSED: list[tuple[Draw, type[Exception], str]] = [
     of_range("render_link", -5.0, Link()),
     (lambda da, sample: da.render_bev(sample, frame="Camera_Front"), ChoiceError, "frame: expected one of world, ego,"),
     (lambda da, sample: da.render_visibility(sample, frame="Camera_Front"), ChoiceError, "frame: expected one of"),
-    (lambda da, sample: da.render_bev(sample, agents="ego_vehicle"), ChoiceError, "agents: expected one of single"),
+    (lambda da, sample: da.render_bev(sample, agents="ego"), ChoiceError, "agents: expected one of single"),
     (lambda da, sample: da.render_frame(sample.rsplit("/", 2)[0] + "/004", agents="pole"), ChoiceError, "agents: "),
     (lambda da, sample: da.render_visibility(sample, agents=["me"]), ChoiceError, "agents: expected one of"),
     (lambda da, sample: da.render_link(sample, Link(), agents="single"), ChoiceError, "agents: expected a partner of"),

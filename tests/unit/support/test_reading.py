@@ -149,6 +149,7 @@ OTHER_WAYS_TO_READ = re.compile(
 NOT_OF_STRANGERS = {
     "support/reading.py": "the gate",
     "support/files.py": "the system's processes",
+    "audit/reader.py": "labels that were written a line before",
     "cli/process.py": "nothing: the null device",
     "synth/demo.py": "the mark of the demo's own folder",
     "evaluation/runs/bundles.py": "counts that were written a line before",
@@ -157,6 +158,7 @@ NOT_OF_STRANGERS = {
     "explore/serving.py": "a browser",
     "export/questions/questions.py": "the parts that the export wrote",
     "support/cores.py": "the system's limits",
+    "support/nuscenes_names.py": "the package's own hints",
     "support/pages.py": "the package's own templates",
     "parallel/store.py": "locks, of which nothing is believed",
     "release/images.py": "the head of an image that the gate opened",

@@ -241,7 +241,7 @@ def test_the_ends_of_each_range() -> None:
         (
             lambda: Link(latency=0.3).frame_sent("scenario", 3),
             ConfigError,
-            r"of scenario from frame 003; the longest possible is 0\.2 s, .* 004 on",
+            r"of scenario from frame 003; the longest possible is 0\.2 s; .* has 3 others before it",
         ),
     )
 

@@ -45,6 +45,7 @@ from deepaccident_devkit.evaluation.runs.comparison import (
     undecided,
 )
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
+from deepaccident_devkit.support.text import counted
 
 Write = Callable[..., Results]
 Save = Callable[..., Path]
@@ -394,7 +395,7 @@ def test_names_of_many_samples_are_cut(tmp_path: Path, count: int, shown: int) -
     with pytest.raises(EvaluationError, match="only in") as raised:
         compare_bundles(one, more, FEW)
     told, names = str(raised.value).split(";")[0].split(" (")
-    assert (told, len(names.split(", "))) == (f"{count} samples only in {more}", shown)
+    assert (told, len(names.split(", "))) == (f"{counted(count, 'sample')} only in {more}", shown)
     assert names.endswith("type1_subtype1_accident/Town03_003/ego_vehicle/001, …)") is (count > 3)
 
 

@@ -188,7 +188,7 @@ def test_other_predictions_alone_do_not_mark(
         (
             lambda: evaluate_results(da_b, results, SETUP, selection),
             ResultsError,
-            r"\); leave them out with --allow-partial .*; no sample",
+            r"; leave them out with --allow-partial .*; no sample",
         ),
     )
     run = evaluate_results(da_b, results, SETUP, selection, allow_partial=True, workers=1)

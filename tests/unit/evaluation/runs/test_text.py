@@ -415,9 +415,8 @@ def test_numbers(value: float | None, text: str) -> None:
 
 def stored(monkeypatch: pytest.MonkeyPatch, **summary: Any) -> None:
     """A bundle with this summary, of one scenario."""
-    bundle = SimpleNamespace(
-        summary={"task": "warning", "protocol": "clean", **summary}, scenarios=lambda: {TRAINED: "hash"}
-    )
+    setup = SimpleNamespace(task=summary.get("task", "warning"), protocol=summary.get("protocol", "clean"))
+    bundle = SimpleNamespace(setup=setup, summary=summary, scenarios=lambda: {TRAINED: "hash"})
     monkeypatch.setattr(bundles, "read_bundle", lambda _: bundle)
 
 
