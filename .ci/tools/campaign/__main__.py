@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-EACH = 150
+EACH = 100
 _TOP = Path(__file__).parents[3]
 sys.path.insert(0, str(_TOP / "tests"))  # for what it shares with the tests
 

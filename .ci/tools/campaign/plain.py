@@ -40,7 +40,7 @@ def label(path: Path) -> tuple[tuple[float, ...], list[tuple[Any, ...]]]:
 
 def meta(path: Path) -> dict[str, Any]:
     """The first line's nine words and the further lines by their keys."""
-    lines = path.read_bytes().decode("utf-8-sig").splitlines()
+    lines = path.read_bytes().decode("utf-8-sig", errors="surrogateescape").splitlines()
     first, *others = [line.strip() for line in lines if line.strip()]
     words = first.split()
     assert len(words) == 9, words
@@ -48,8 +48,8 @@ def meta(path: Path) -> dict[str, Any]:
 
 
 def split_file(path: Path) -> list[str]:
-    """The scenarios of a split file."""
-    lines = path.read_bytes().decode("utf-8-sig").splitlines()
+    """The scenarios of a split file, whose bytes that are not UTF-8 are those of file names."""
+    lines = path.read_bytes().decode("utf-8-sig", errors="surrogateescape").splitlines()
     return list(dict.fromkeys("/".join(line.split()) for line in lines if line.strip()))
 
 
