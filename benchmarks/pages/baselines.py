@@ -16,7 +16,7 @@ from deepaccident_devkit.synth import SynthConfig, make_release
 from deepaccident_devkit.v2x import AGENT_CONFIGS
 
 RELEASES = {
-    "ordinary": SynthConfig(scenarios=24, frames=40, seed=12, sensors=False),
+    "ordinary": SynthConfig(scenarios=24, frames=40, seed=12, sensors=False, traffic="v1"),
     "designed": SynthConfig(scenarios=24, frames=40, seed=12, sensors=False, designed=True),
     "hidden": SynthConfig(scenarios=24, frames=40, seed=12, sensors=False, view="hidden"),
 }

@@ -15,7 +15,7 @@ from deepaccident_devkit.evaluation.runs.text import predictor_tables
 from deepaccident_devkit.evaluation.warning.recordings import GIVEN
 from deepaccident_devkit.synth import SynthConfig, make_release
 
-RELEASE = SynthConfig(scenarios=60, frames=None, seed=7, sensors=False)
+RELEASE = SynthConfig(scenarios=60, frames=None, seed=7, sensors=False, traffic="v1")
 DESIGNED = replace(RELEASE, designed=True)
 """The clean accidents, which are easier to foresee."""
 SPLIT, HORIZON, GROUP = "train", 2.0, "ego_involved"
