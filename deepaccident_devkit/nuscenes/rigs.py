@@ -11,7 +11,6 @@ from typing import Final
 import numpy as np
 
 from deepaccident_devkit.dataset import Dataset
-from deepaccident_devkit.errors import NotAvailableError
 from deepaccident_devkit.nuscenes.check import labelled_rows, looks_to, road_height, spread
 from deepaccident_devkit.reports import CheckReport, Row, record_rows
 from deepaccident_devkit.support.arrays import FloatArray
@@ -22,7 +21,6 @@ from deepaccident_devkit.taxonomy import (
     IGNORED_ID,
     LIDAR,
     OWN_ACTOR_ID,
-    VEHICLE_AGENTS,
 )
 
 _FACTS: Final = ("lidar_above", "lanes", "points", "reach", "road", "labels_a_second", "boxes")
@@ -147,8 +145,6 @@ def rig_facts(dataset: Dataset) -> RigFacts:
     rows = labelled_rows(dataset)
     apart = np.diff(rows)[np.diff(view["scenario_row"][rows]) == 0]
     tokens = [dataset.sample[row]["token"] for row in rows.tolist()]
-    if not tokens:
-        raise NotAvailableError(f"{dataset.dataroot}: no sample of {VEHICLE_AGENTS[0]} has labels, to compare with")
     there = [token for token in tokens if dataset.sensor_path(token, LIDAR).exists()]
     chosen = spread(there, _SAMPLES)
     clouds = [dataset.load_point_cloud(token, "lidar").xyz for token in chosen]

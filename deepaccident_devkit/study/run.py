@@ -150,10 +150,9 @@ def _made(source: Mapping[str, Any], how: Any, folder: Path) -> dict[str, Any]:
 
 
 def _scenarios(dataset: DeepAccident, split: str = "all") -> list[str]:
-    """The tokens of a split; of `all`, of all scenarios."""
-    every = [record["token"] for record in dataset.scenario]
-    chosen = every if split == "all" else dataset.split_scenarios(split)
-    return [token for token in every if token in chosen]
+    """The tokens of a split's scenarios, in the order of the release."""
+    chosen = dataset.split_scenarios(split)
+    return [record["token"] for record in dataset.scenario if record["token"] in chosen]
 
 
 def _refuse_known_tests(recipe: Recipe, releases: Mapping[str, _Release], tested: Scenarios) -> None:

@@ -37,6 +37,8 @@ _SPARSE = 5 << 30
 """Bytes of a file that is mostly a hole."""
 _MOST_ROWS, _MOST_BYTES = 40, 200_000
 """What a mutation that takes long keeps of an array."""
+_MOST_ADDED = 100_000_000
+"""Bytes of lines that are added."""
 _TEXTS = ("text", *_JSON, "lines", *_YAML)
 _NUMBER = re.compile(rb"-?\d+\.?\d*(?:[eE][-+]?\d+)?")
 
@@ -454,8 +456,8 @@ def endless_line(content: bytes, rng: Rng) -> bytes:
 
 @by_content("bombs", *_TEXTS)
 def many_lines(content: bytes, rng: Rng) -> bytes:
-    lines = content.splitlines(keepends=True)
-    return content + (b"\n" if not content.endswith(b"\n") else b"") + any_of(rng, (lines[-1], b"\n", b"-\n")) * 50_000
+    line = any_of(rng, (content.splitlines(keepends=True)[-1], b"\n", b"-\n"))
+    return content + (b"\n" if not content.endswith(b"\n") else b"") + line * min(50_000, _MOST_ADDED // len(line))
 
 
 @by_content("bombs", *_JSON, *_YAML)
