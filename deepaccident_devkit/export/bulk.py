@@ -446,6 +446,8 @@ class Export:
             with replacing(self._archive) as temporary, zipfile.ZipFile(temporary, "w") as archive:
                 for path in sorted(path for path in self.kept.rglob("*") if path.is_file() and not path.is_symlink()):
                     name = path.relative_to(self.kept).as_posix()
+                    if not name.isprintable():
+                        continue  # a stranger's, and zip has no such names
                     archive.writestr(zipfile.ZipInfo(name), read_bytes(path, "archive"))  # without a date
         self.store.drop(self.form.name)
         self.store.remove(keep=any(self.store.folder.glob("kept/*")))  # another format's
