@@ -77,8 +77,8 @@ class Kind:
         return not self.needs or find_spec(self.needs) is not None
 
     def files(self, tree: Path) -> list[Path]:
-        """The files of this kind."""
-        return sorted(path for path in tree.glob(self.pattern) if path.is_file())
+        """The files of this kind that are not empty."""
+        return sorted(path for path in tree.glob(self.pattern) if path.is_file() and path.stat().st_size)
 
 
 @cache
