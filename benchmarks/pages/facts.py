@@ -8,11 +8,11 @@ from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.statistics import ReleaseFacts, release_facts
 from deepaccident_devkit.synth import SynthConfig, make_release
 
-RELEASE = SynthConfig(scenarios=400, frames=None, seed=5, sensors=False)
+RELEASE = SynthConfig(scenarios=180, frames=None, seed=5, sensors=False)
 
 
 def main(release: Path | None) -> None:
-    """Measure, and write the table into docs/synth.md; without a release, a quarter of an hour or two."""
+    """Measure, and write the table into docs/synth.md; without a release, some ten minutes."""
     with tempfile.TemporaryDirectory() as folder:
         root = release or make_release(Path(folder) / "release", RELEASE, workers=2)
         report = release_facts(DeepAccident(dataroot=root, index_dir=Path(folder) / "index", verbose=False))
