@@ -17,7 +17,7 @@ import tokenize
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import lru_cache
 from operator import attrgetter
@@ -187,8 +187,11 @@ def mapped_file(path: Path) -> Any:
     import pyarrow as pa
 
     with open_file(path) as file:
-        with suppress(OSError):
+        try:
             return pa.memory_map(str(path)).read_buffer()
+        except OSError as error:
+            if os.strerror(errno.ENOMEM) in str(error):
+                raise  # there is no room to read it either
         warn_once(
             f"{path.parent}: files cannot be mapped into memory there, so they are read as a whole; another folder, "
             "for an index by --index-dir, needs less memory"

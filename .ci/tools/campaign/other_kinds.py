@@ -144,9 +144,11 @@ def _validated_zip(room: Room) -> list[str]:
 
 
 def _judge_findings(room: Room, sentences: list[str]) -> str | None:
-    """`validate` tells of a member whose checksum is another."""
+    """`validate` tells of an archive that cannot be read, or of a member whose checksum is another."""
     if long := next((each for each in sentences if len(each) > 2000), None):
         return f"a sentence of {len(long)} characters"
+    if any(room.victim.name in each for each in sentences):
+        return None
     damaged = [name for name, (_, right) in plain.members(room.victim).items() if not right]
     untold = [name for name in damaged if not any(name.rpartition("/")[2] in each for each in sentences)]
     return f"no word of {untold[0]}, which is damaged" if untold else None
