@@ -398,7 +398,8 @@ def test_every_counterpart_of_a_nuscenes_call_exists(code: str) -> None:
         named(expression)
         return
     keywords = {keyword.arg: keyword.value for keyword in expression.keywords if keyword.arg}
-    of_instance = isinstance(expression.func, ast.Attribute)
+    owner = getattr(expression.func, "value", None)  # of a method its object, or its class: `geometry.Box.from_wlh`
+    of_instance = owner is not None and not getattr(owner, "attr", "").istitle()
     inspect.signature(named(expression.func)).bind(*([None] if of_instance else []), *expression.args, **keywords)
 
 
