@@ -18,6 +18,7 @@ one, and says so once. A result is written under a temporary name and renamed: i
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import os
 import threading
@@ -222,7 +223,8 @@ class Turn:
             if take(self._lock, fcntl.LOCK_EX, wait=others) and self._is_there():
                 begin()
                 os.ftruncate(self._lock, 0)
-                os.pwrite(self._lock, command, 0)
+                if os.pwrite(self._lock, command, 0) < len(command):
+                    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
             take(self._lock, fcntl.LOCK_UN)
             take(self._lock, fcntl.LOCK_SH, wait=True)
             others = os.pread(self._lock, len(command) + 1, 0) != command
