@@ -72,5 +72,7 @@ def _text(values: Sequence[float], unit: str, between: str = ", ") -> str:
     return f"{between.join(f'{scale * each:.3g}' for each in values)} {sign}".rstrip()
 
 
-FACTS: Final = as_record(json.loads(Path(__file__).with_suffix(".json").read_bytes()), tuple[Fact, ...])
+FACTS: Final[tuple[Fact, ...]] = as_record(
+    json.loads(Path(__file__).with_suffix(".json").read_bytes()), tuple[Fact, ...]
+)
 """Every row of the table, in its order, as `real_facts.json` has them."""
