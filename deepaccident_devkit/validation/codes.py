@@ -4,6 +4,7 @@ import json
 from dataclasses import dataclass
 from pathlib import Path
 
+from deepaccident_devkit.release.fingerprints import INDEX_REMEDY
 from deepaccident_devkit.tables import Severity
 
 
@@ -26,7 +27,11 @@ class Code:
     deep: bool = False
 
 
+_DATA = json.loads(Path(__file__).with_suffix(".json").read_bytes())
+_REMEDIES = {**_DATA["remedies"], "update the index": INDEX_REMEDY}
+"""Name of a remedy that several kinds share → its text; other kinds have a text of their own."""
 CODES: dict[str, Code] = {
-    name: Code(**fields) for name, fields in json.loads(Path(__file__).with_suffix(".json").read_bytes()).items()
+    name: Code(**{**fields, "remedy": _REMEDIES.get(fields["remedy"], fields["remedy"])})
+    for name, fields in _DATA["codes"].items()
 }
 """Name of a kind of finding → what `codes.json` says of it."""
