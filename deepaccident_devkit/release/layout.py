@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Final, get_args
 
 from deepaccident_devkit.errors import DatarootError, MissingFileError, SplitFileError, VersionError, shortened
-from deepaccident_devkit.release.store import Entry, ReleasePath, is_folder, leads_back, listed, read_content
+from deepaccident_devkit.release.store import Entry, ReleasePath, is_folder, leads_back, listed, read_lines
 from deepaccident_devkit.release.store.members import (
     MINI_FOLDER,
     SCENARIO_TYPE,
@@ -350,10 +350,9 @@ def read_split_file(path: ReleasePath, *, raw: bool = False, unique: bool = Fals
         SplitFileError: a line has not two words, the file is no text, or a scenario stands twice and `unique` is set.
     """
     remedy = "restore it from the release"
-    content = read_content(path, "split", SplitFileError, remedy)
-    if b"\0" in content:
+    lines = read_lines(path, "split", SplitFileError, remedy, errors="surrogateescape")
+    if any("\0" in line for line in lines):
         raise SplitFileError(f"{path}: not a text file; {remedy}")
-    lines = content.decode("utf-8-sig", errors="surrogateescape").splitlines()
     words = [(number, tuple(line.split(maxsplit=2))) for number, line in enumerate(lines, start=1) if line.strip()]
     for number, line_words in words:
         if len(line_words) != 2:

@@ -131,10 +131,15 @@ def read_content(path: ReleasePath, kind: FileKind, fault: type[ReleaseError], r
         raise fault(f"{path}: {fault_text(error)}; {remedy}") from error
 
 
-def read_lines(path: ReleasePath, kind: FileKind, fault: type[ReleaseError], remedy: str = REMEDY) -> list[str]:
-    """The lines of a UTF-8 file, without line ends; raises as `read_content` does, and `fault` if it is no text."""
+def read_lines(
+    path: ReleasePath, kind: FileKind, fault: type[ReleaseError], remedy: str = REMEDY, *, errors: str = "strict"
+) -> list[str]:
+    """The lines of a UTF-8 file, without line ends; raises as `read_content` does, and `fault` if it is no text.
+
+    `errors` says what to do with bytes that are not UTF-8, as of `bytes.decode`.
+    """
     try:
-        return read_content(path, kind, fault, remedy).decode("utf-8-sig").splitlines()
+        return read_content(path, kind, fault, remedy).decode("utf-8-sig", errors=errors).splitlines()
     except UnicodeDecodeError as error:
         raise fault(f"{path}: not a text file ({error.reason}); {remedy}") from error
 
