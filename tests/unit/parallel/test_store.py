@@ -72,6 +72,15 @@ def test_who_holds_a_lock_that_is_gone_does_not_finish(tmp_path: Path, removed: 
             assert another.alone(wait=False)
 
 
+def test_a_disk_that_takes_half_of_a_locks_text_is_full(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nobody else has written it, so there is nobody to wait for."""
+    write = os.pwrite
+    monkeypatch.setattr(os, "pwrite", lambda file, content, place: write(file, content[:3], place))
+    store = Store(tmp_path / "store", tmp_path / "out", "tests", ConfigError, "settings")
+    facts = (str(tmp_path / "out"), "No space left", "make room there")
+    assert_refused((lambda: store.shared().__enter__(), ConfigError, facts))
+
+
 def test_other_settings_are_made_again(tmp_path: Path) -> None:
     store, items = store_in(tmp_path), dict(zip(ITEMS, ITEMS, strict=True))
     (tmp_path / "marks").mkdir()
