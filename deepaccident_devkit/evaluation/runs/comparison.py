@@ -338,7 +338,8 @@ def _shared_tokens(
             if alone
         )
         raise EvaluationError(
-            f"{alone_text}; evaluate both at the same samples, or compare those of both with common=True (--common)"
+            f"{alone_text}; evaluate both at the same samples, or compare those that both have with common=True "
+            "(--common)"
         )
     shared = sorted(mine & theirs)
     if not shared:
