@@ -350,7 +350,7 @@ def evaluate_results(
     chosen = selection if isinstance(selection, SampleSelection) else default_selection(setup, selection)
     loader = SampleLoader(dataset, results if isinstance(results, Results) else read_results(results), setup)
     check_recordings(loader.results, dataset)
-    covered = coverage(dataset, loader.results.tokens, chosen)
+    covered = coverage(dataset, loader.results.tokens, chosen, explain=not allow_partial)
     tokens = _covered_tokens(dataset, loader.results, chosen, covered, allow_partial=allow_partial)
     if TASKS[setup.task].needs_meta:
         check_metas(dataset, tokens, chosen.split)

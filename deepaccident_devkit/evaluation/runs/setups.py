@@ -182,13 +182,17 @@ class Coverage(ShortRepr):
         return "; ".join(part for part in parts if part)
 
 
-def coverage(dataset: Dataset, results: Collection[str], selection: SampleSelection) -> Coverage:
+def coverage(
+    dataset: Dataset, results: Collection[str], selection: SampleSelection, *, explain: bool = True
+) -> Coverage:
     """Compare the tokens of results with the samples that a selection has.
 
     Args:
         dataset: the release.
         results: tokens of the predictions.
         selection: what is to be evaluated.
+        explain: whether to look for `Coverage.options`, which lists the release's samples many times. It is done anyway
+            if no sample has a prediction.
 
     Raises:
         ChoiceError: as of `SampleSelection.tokens`, of the selection itself.
@@ -202,6 +206,7 @@ def coverage(dataset: Dataset, results: Collection[str], selection: SampleSelect
     of_scenarios = {dataset.get("scenario", name)["split"] for name in set(map(scenario_of, given - unknown))}
     splits = tuple(name for name in SPLITS if name in of_scenarios)
     agents = tuple(name for name in AGENTS if name in present)
+    is_sought = explain or given.isdisjoint(expected)
     is_known = given and not unknown and given != set(expected)
     return Coverage(
         expected=len(expected),
@@ -210,7 +215,7 @@ def coverage(dataset: Dataset, results: Collection[str], selection: SampleSelect
         unknown=tuple(sorted(unknown)),
         splits=splits,
         agents=agents,
-        options=_missing_options(dataset, given, selection, splits, agents) if is_known else "",
+        options=_missing_options(dataset, given, selection, splits, agents) if is_sought and is_known else "",
     )
 
 
@@ -219,15 +224,15 @@ def _missing_options(
 ) -> str:
     """Return the options that select exactly these samples, where they differ; empty if there are none."""
     horizon = max(dataset.get("sample", token)["time_to_end"] for token in tokens)
-    choices: dict[str, tuple[Any, ...]] = {
+    possible: dict[str, tuple[Any, ...]] = {
         "split": (asked.split, *splits),
         "samples": get_args(SampleList),
         "scope": get_args(ScopeName),
         "agents": (asked.agents, agents),
         "horizon": (asked.horizon, horizon),
     }
-    for values in product(*choices.values()):
-        made = replace(asked, **dict(zip(choices, values, strict=True)))
+    for values in product(*map(dict.fromkeys, possible.values())):
+        made = replace(asked, **dict(zip(possible, values, strict=True)))
         with suppress(ConfigError, NotAvailableError):
             if set(made.tokens(dataset)) == tokens:
                 changed = asdict(made).items() - asdict(asked).items()
