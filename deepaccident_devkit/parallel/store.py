@@ -31,7 +31,7 @@ from typing import Any, Final, Generic, TypeVar
 from deepaccident_devkit.errors import DeepAccidentError
 from deepaccident_devkit.parallel.batches import run_batch
 from deepaccident_devkit.parallel.failures import Failure, Tried, check_failures
-from deepaccident_devkit.support.files import place_in, remove_in, write_bytes
+from deepaccident_devkit.support.files import place_in, remove_in, write_own
 from deepaccident_devkit.support.reading import FileKind, read_bytes
 from deepaccident_devkit.support.text import warn_once
 
@@ -89,7 +89,7 @@ class Store:
 
     def keep(self, name: str, key: str, content: bytes) -> None:
         """Keep a result in place of an earlier one of this name; raises OSError or OutputFolderError."""
-        write_bytes(self.path(name), content + _seal(key, content))
+        write_own(self.path(name), content + _seal(key, content))
 
     def drop(self, name: str) -> None:
         """Remove a result, if it is there; raises OSError or OutputFolderError."""

@@ -188,6 +188,13 @@ def write_bytes(path: Path, content: bytes) -> None:
         temporary.write_bytes(content)
 
 
+def write_own(path: Path, content: bytes) -> None:
+    """Write a file in a folder that only the devkit writes to: a pipe, a socket or a folder in its place is damage."""
+    if path.exists() and not path.is_file():
+        remove_in(path.parent, path.name)
+    write_bytes(path, content)
+
+
 def place_in(folder: Path, path: str | PurePath, *, opened: bool = False) -> Path:
     """The path of something below a folder; writing or removing it changes nothing outside, or OutputFolderError.
 

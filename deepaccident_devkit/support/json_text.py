@@ -101,6 +101,8 @@ def as_record(value: object, kind: type[Record]) -> Record:
     except msgspec.ValidationError as error:
         said = str(error)
         raise ValueError(shortened(said[:1].lower() + said[1:])) from error
+    except OverflowError as error:  # msgspec 0.19 says it so
+        raise ValueError("number out of range") from error
 
 
 def _check_levels(content: bytes, most: int) -> None:

@@ -34,7 +34,7 @@ from deepaccident_devkit.support.files import (
     remove_in,
     replacing_folder,
     temporary_of,
-    write_bytes,
+    write_own,
 )
 from deepaccident_devkit.support.reading import RefusedFileError, fault_text, file_checksum, limit_of, read_bytes
 from deepaccident_devkit.support.text import choice
@@ -126,7 +126,7 @@ class Index(ShortRepr):
         content = {"schema_version": SCHEMA_VERSION, **asdict(self)}
         del content["folder"]
         text = json.dumps({**content, "checksum": _checksum(content)}, indent=1)
-        write_bytes(self.folder / MANIFEST_FILE, text.encode())
+        write_own(self.folder / MANIFEST_FILE, text.encode())
 
     def is_current(self, layout: ReleaseLayout, fingerprint: str) -> bool:
         """Whether nothing was added or removed, the tables are there, and no broken scenario was changed.

@@ -57,6 +57,7 @@ WRITTEN = {
     "setups.SampleSelection": "samples='evaluate', scope='accident', agents=None, horizon=2.0",
     "setups.Coverage": "missing=(), extra=(), unknown=(), splits=(), agents=(), options=''",
     "setups.EvaluationSetup": "protocol='released', switches=<factory>, horizon=2.0",
+    "setups.coverage": "explain=True",
     "setups.default_selection": "split='val', samples=None, scope=None, agents=None",
     "setups.evaluation_store": "command=''",
     "text.SHOWN_BREAKDOWNS": "('time_to_impact', 'accident_visibility')",
