@@ -189,9 +189,9 @@ def write_bytes(path: Path, content: bytes) -> None:
 
 
 def write_own(path: Path, content: bytes) -> None:
-    """Write a file in a folder that only the devkit writes to: a pipe, a socket or a folder in its place is damage."""
-    if path.exists() and not path.is_file():
-        remove_in(path.parent, path.name)
+    """Write a file in a folder that only the devkit writes to; a pipe or a socket in its place is damage, and goes."""
+    if path.exists() and not (path.is_file() or path.is_dir()):
+        path.unlink()
     write_bytes(path, content)
 
 
