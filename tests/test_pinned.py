@@ -13,14 +13,19 @@ from typing import Any
 
 import numpy as np
 import pytest
+from studies import BASELINES, written
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.baselines import predict_results
 from deepaccident_devkit.evaluation.runs import SampleSelection, default_selection, evaluate_results
-from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
+from deepaccident_devkit.evaluation.runs.setups import TASK_PROTOCOLS, EvaluationSetup
+from deepaccident_devkit.export.bulk import export_release
+from deepaccident_devkit.export.nuscenes import NuScenes
 from deepaccident_devkit.geometry.quaternions import to_matrix
 from deepaccident_devkit.interactions import interactions
 from deepaccident_devkit.motion import LABEL_PROTOCOLS, PRESETS, MotionLabelConfig, motion_labels
+from deepaccident_devkit.nuscenes import open_nuscenes
+from deepaccident_devkit.study import read_recipe, run_study
 
 FILE = Path(__file__).parent / "data" / "pinned.json"
 EVALUATED = {
@@ -31,8 +36,20 @@ EVALUATED = {
     },
     "accident": {"accident": ("paper", "boxes")},
     "detection": {"detection": ("released", "released_iou", "paper", "opencood")},
+    "planning": {"planning": tuple(TASK_PROTOCOLS["planning"])},
+    "forecasting": {"forecasting": tuple(TASK_PROTOCOLS["forecasting"])},
 }
 """Kind of results → task → protocols."""
+COLLIDING_AGENTS = ("ego_vehicle_behind", "other_vehicle")
+"""Agents whose predicted plans lead to collisions; other plans hardly show a fault."""
+STUDY: dict[str, Any] = {
+    **BASELINES,
+    "rows": [{"name": "sees {agents}", "baseline": "constant_velocity", "agents": ["single", "all"]}],
+    "groups": {"accidents": ["collision=true"]},
+    "compare": [],
+}
+"""Recipe of a study of baselines, except for the folder of its release."""
+LABEL_FIELDS = ("instance", "centerness", "offset", "flow", "future_egomotion", "valid", "id_map")
 Pins = dict[str, list[Any]]
 
 
@@ -74,6 +91,11 @@ def same(found: Any, expected: Any) -> bool:
 
 def tables(da: DeepAccident, _: DeepAccident, __: Path) -> Pins:
     """Each column of each table."""
+    return pins_of_tables(da)
+
+
+def pins_of_tables(da: DeepAccident) -> Pins:
+    """Pin each column of each table."""
     return {
         f"{table}.{column}": pin(turns(column, da.arrow(table)[column].to_pylist()))
         for table in da.table_names
@@ -103,16 +125,17 @@ def labels(_: DeepAccident, da: DeepAccident, __: Path) -> Pins:
     configs = {name: MotionLabelConfig.preset(name) for name in PRESETS}
     configs |= {f"protocol {name}": MotionLabelConfig(protocol=name) for name in LABEL_PROTOCOLS}
     made = {name: motion_labels(da, token, config) for name, config in configs.items()}
-    fields = ("instance", "centerness", "offset", "flow", "future_egomotion", "valid", "id_map")
-    return {f"{name}.{field}": pin(getattr(each, field)) for name, each in made.items() for field in fields}
+    return {f"{name}.{field}": pin(getattr(each, field)) for name, each in made.items() for field in LABEL_FIELDS}
 
 
 def evaluations(_: DeepAccident, da: DeepAccident, folder: Path) -> Pins:
     """Predictions of a baseline; counts and numbers of each task and protocol."""
-    split, mine = folder / "everything.txt", {"samples": "all", "scope": "all", "agents": ("ego_vehicle",)}
+    split, found = folder / "everything.txt", {}
     split.write_text("".join(each["token"].replace("/", " ") + "\n" for each in da.scenario))
-    tokens, found = SampleSelection(split=str(split), **mine).tokens(da), {}
     for kind, tasks in EVALUATED.items():
+        agents = COLLIDING_AGENTS if kind == "planning" else ("ego_vehicle",)
+        mine = {"samples": "all", "scope": "all", "agents": agents}
+        tokens = SampleSelection(split=str(split), **mine).tokens(da)
         path = predict_results(da, kind, tokens, folder / (kind if kind == "motion" else f"{kind}.json"))
         for task, protocol in [(task, protocol) for task, protocols in tasks.items() for protocol in protocols]:
             setup = EvaluationSetup(task=task, protocol=protocol)
@@ -123,7 +146,47 @@ def evaluations(_: DeepAccident, da: DeepAccident, folder: Path) -> Pins:
     return found
 
 
-SECTIONS: list[Callable[[DeepAccident, DeepAccident, Path], Pins]] = [tables, pairs, labels, evaluations]
+def study(_: DeepAccident, da: DeepAccident, folder: Path) -> Pins:
+    """Pin all numbers of a study of baselines, its comparisons and the groups of its samples."""
+    recipe = {**STUDY, "releases": {"test": {"dataroot": str(da.dataroot)}}}
+    path = written(folder, recipe)
+    summary = run_study(read_recipe(str(path)), folder / "out", workers=1).to_dict()
+    found = {
+        f"rows {name} {group}": pin(numbers)
+        for name, row in summary["rows"].items()
+        for group, numbers in row["groups"].items()
+    }
+    found |= {
+        f"comparisons {comparison['row']} - {comparison['less']} {group}": pin(numbers)
+        for comparison in summary["comparisons"]
+        for group, numbers in comparison["groups"].items()
+    }
+    return {**found, "groups": pin(summary["groups"]), "headline": pin(summary["headline"])}
+
+
+def nuscenes(_: DeepAccident, da: DeepAccident, folder: Path) -> Pins:
+    """Pin the tables, boxes, labels and evaluations of a release in nuScenes' format."""
+    export_release(da, folder / "dataroot", NuScenes(agents=("ego_vehicle",)))
+    road = open_nuscenes(folder / "dataroot")
+    tokens = [record["token"] for record in road.sample if record["labelled"]]
+    found = {f"tables {name}": value for name, value in pins_of_tables(road).items()}
+    for frame in ("world", "ego", "lidar"):
+        found[f"boxes {frame}"] = pin([road.boxes(token, frame).center for token in tokens])
+    for protocol in LABEL_PROTOCOLS:
+        label = motion_labels(road, tokens[3], MotionLabelConfig(protocol=protocol))
+        for field in LABEL_FIELDS:
+            found[f"labels {protocol}.{field}"] = pin(getattr(label, field))
+    path = predict_results(road, "detection", tokens, folder / "detection.json")
+    for protocol in EVALUATED["detection"]["detection"]:
+        setup = EvaluationSetup(task="detection", protocol=protocol)
+        selection = default_selection(setup, "all", samples="all", scope="all")
+        run = evaluate_results(road, path, setup, selection)
+        found[f"detection {protocol} numbers"] = pin(run.summary()["metrics"])
+    return found
+
+
+Section = Callable[[DeepAccident, DeepAccident, Path], Pins]
+SECTIONS: list[Section] = [tables, pairs, labels, evaluations, study, nuscenes]
 
 
 @pytest.mark.parametrize("section", SECTIONS, ids=lambda section: section.__name__)

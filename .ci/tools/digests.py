@@ -2,12 +2,13 @@
 
 Both read the same releases, made by BEFORE with a fixed seed, one after the other in the same folder, so that paths in
 files are equal. A worker in each checkout writes a JSON file of names and digests: tables, labels, predictions, counts
-and summaries of all protocols, exports, a generated release. A name that a checkout cannot compute has the error as its
-digest. Then the names that changed, came and went are printed. Exit status 1 if there is one that no --expect names.
+and summaries of all protocols, studies, exports, releases in nuScenes' format, a generated release. A name that a
+checkout cannot compute has the error as its digest. Then the names that changed, came and went are printed. Exit status
+1 if there is one that no --expect names.
 
     python .ci/tools/digests.py ../main . --expect 'evaluate/warning/boxes/*' --expect 'export/*.manifest.json'
 
-It takes some four minutes of a processor.
+It takes about six minutes of a processor.
 """
 
 import argparse
@@ -23,7 +24,11 @@ import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from fnmatch import fnmatchcase
+from importlib import import_module
+from importlib.util import find_spec
+from itertools import chain, product
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 RELEASES = {
@@ -48,6 +53,69 @@ EXPORTS = {
     "webdataset": ("sensors", ["export", "webdataset"]),
 }
 """Name → the release that is exported, and the command; what ends in --split gets a split file of all scenarios."""
+NUSCENES_EXPORTS = {
+    "labelled": ["--agents", "ego_vehicle,other_vehicle"],
+    "sensors": ["--lidar-axes", "nuscenes", "--no-sweeps"],
+}
+"""Release that is exported to nuScenes' format and opened again → options of the export."""
+NUSCENES_TASKS = ("motion", "detection", "forecasting")
+"""Tasks evaluated on nuScenes, which has no accidents and no boxes of the own vehicle."""
+STUDIES: dict[str, dict[str, Any]] = {
+    "partners": {
+        "title": "Partners",
+        "question": "What do partners add?",
+        "headline": {
+            "row": "sees all",
+            "less": "sees single",
+            "number": "iou_100",
+            "where": "accidents",
+        },
+        "releases": {"test": {"dataroot": "releases/labelled"}},
+        "test": {"release": "test"},
+        "rows": [
+            {
+                "name": "sees {agents}",
+                "baseline": "constant_velocity",
+                "agents": ["single", "all"],
+            },
+            {"name": "late {latency} s", "baseline": "constant_turn_rate", "latency": [0.2, 0.5]},
+            {"name": "off", "baseline": "standing", "pose_noise": 0.5, "packet_loss": 0.1},
+            {"name": "labels", "trivial": "labels"},
+            {"name": "nothing", "trivial": "nothing"},
+            {"name": "everything", "trivial": "everything"},
+        ],
+        "groups": {"accidents": ["collision=true"]},
+        "by": ["impact_step", "weather"],
+        "compare": [["labels", "nothing"]],
+    },
+    "nuscenes": {
+        "title": "A study of a release in nuScenes' format",
+        "question": "What does a baseline reach?",
+        "releases": {
+            "test": {
+                "seed": 980,
+                "scenarios": 2,
+                "frames": 16,
+                "image_size": [32, 18],
+                "sensor_step": 5,
+                "rig": "road",
+                "nuscenes": True,
+            }
+        },
+        "test": {"release": "test", "samples": "all", "labels": "fiery", "horizon": 0.5},
+        "rows": [
+            {"name": "standing", "baseline": "standing", "agents": "single", "horizon": 0.5},
+            {
+                "name": "constant velocity",
+                "baseline": "constant_velocity",
+                "agents": "single",
+                "horizon": 0.5,
+            },
+        ],
+        "compare": [["constant velocity", "standing"]],
+    },
+}
+"""Name → recipe of a study without models."""
 FILES_LEFT_OUT = {
     "*.deepaccident*": "marks of how far an export is, for the devkit alone",
     "*.manifest.json": "names the version of the devkit and of what it kept",
@@ -63,6 +131,19 @@ KEYS_LEFT_OUT = {
     "results": "where the predictions are, and notes with a version; they have digests of their own",
 }
 """Key of an evaluation's summary that is not compared → why."""
+STUDY_KEYS_LEFT_OUT = {"devkit": "a version", "recipe": "the same in both checkouts"}
+"""Key of a study's summary that is not compared → why."""
+CELL_KEYS_LEFT_OUT = {
+    "key": "depends on the version",
+    "machine": "versions of libraries",
+    "seconds": "a time",
+}
+"""Key of a study's cell that is not compared → why."""
+STUDY_FILES_LEFT_OUT = {
+    "index.html": "has times and versions, and otherwise shows the numbers and figures",
+    "study.json": "has times and versions; its numbers are compared one by one",
+}
+"""File of a study's results that is not compared → why."""
 SPLIT = "everything.txt"
 """Name of a split file of all scenarios of the labelled release."""
 SHOWN = 20
@@ -132,6 +213,28 @@ class Found:
                 self.digests[name] = digest(found)
 
 
+def first_of(*names: str) -> ModuleType:
+    """Import the first of several modules that exists; raises ModuleNotFoundError if none does.
+
+    A folder without `__init__.py`, such as one that git left with nothing but bytecode, is none.
+    """
+    for name in names:
+        try:
+            spec = find_spec(name)
+        except ModuleNotFoundError as error:
+            if not name.startswith(f"{error.name}."):
+                raise  # the parent package exists, but lacks something that it imports
+            continue
+        if spec is not None and spec.origin is not None:
+            return import_module(name)
+    raise ModuleNotFoundError(f"none of these modules exists: {', '.join(names)}")
+
+
+def plugin(name: str) -> ModuleType:
+    """Import a module that has moved below `plugins`, from there or from where it was before."""
+    return first_of(f"deepaccident_devkit.plugins.{name}", f"deepaccident_devkit.{name}")
+
+
 def command(*arguments: str) -> None:
     """Run a command of the devkit in this process, silently; older checkouts spell some options otherwise."""
     import click
@@ -158,12 +261,12 @@ def _as_before(arguments: Sequence[str]) -> list[str]:
     return "\0".join(words).replace("--sensors\0none", "--no-sensors").replace("--size", size).split("\0")
 
 
-def digests_of_files(folder: Path) -> Digests:
-    """Relative path → hash of the content of each file; of a link, where it leads to."""
-    found = {}
+def digests_of_files(folder: Path, left_out: Iterable[str] = FILES_LEFT_OUT) -> Digests:
+    """Map the relative path of each file to a hash of its content, or of where a link leads to."""
+    patterns, found = tuple(left_out), {}
     for path in sorted(folder.rglob("*")):
         name = path.relative_to(folder).as_posix()
-        if not path.is_dir() and not any(fnmatchcase(name, pattern) for pattern in FILES_LEFT_OUT):
+        if not path.is_dir() and not any(fnmatchcase(name, pattern) for pattern in patterns):
             found[name] = digest(str(path.readlink()) if path.is_symlink() else path.read_bytes())
     return found
 
@@ -205,17 +308,26 @@ def digests_of_pairs(dataset: Any, scenario: str) -> Digests:
     }
 
 
-def add_labels(found: Found, dataset: Any, sensors: Any) -> None:
-    """Motion labels by each preset and protocol, and targets of segmentation."""
-    from deepaccident_devkit.motion import LABEL_PROTOCOLS, PRESETS, MotionLabelConfig, bev_segmentation
+def add_labels(found: Found, name: str, dataset: Any) -> None:
+    """Add digests of the motion labels by each preset and protocol."""
+    from deepaccident_devkit.motion import LABEL_PROTOCOLS, PRESETS, MotionLabelConfig
 
-    configs = {name: MotionLabelConfig.preset(name) for name in PRESETS}
-    configs |= {f"protocol {name}": MotionLabelConfig(protocol=name) for name in LABEL_PROTOCOLS}
-    configs |= {"agents single": MotionLabelConfig(agents="single"), "vehicles": MotionLabelConfig(only_vehicle=True)}
-    for name, config in configs.items():
-        found.add(f"labels/{name}", digests_of_labels, dataset, config)
-    for token in some_samples(sensors, 6):
-        found.add(f"labels/segmentation/{token}", bev_segmentation, sensors, token)
+    configs = {preset: MotionLabelConfig.preset(preset) for preset in PRESETS}
+    configs |= {f"protocol {protocol}": MotionLabelConfig(protocol=protocol) for protocol in LABEL_PROTOCOLS}
+    configs |= {
+        "agents single": MotionLabelConfig(agents="single"),
+        "vehicles": MotionLabelConfig(only_vehicle=True),
+    }
+    for choice, config in configs.items():
+        found.add(f"labels/{name}/{choice}", digests_of_labels, dataset, config)
+
+
+def add_segmentation(found: Found, dataset: Any) -> None:
+    """Add digests of the targets of segmentation, which need the images from above."""
+    from deepaccident_devkit.motion import bev_segmentation
+
+    for token in some_samples(dataset, 6):
+        found.add(f"labels/segmentation/{token}", bev_segmentation, dataset, token)
 
 
 def digests_of_labels(dataset: Any, config: Any) -> Digests:
@@ -228,55 +340,117 @@ def digests_of_labels(dataset: Any, config: Any) -> Digests:
 
 
 def some_samples(dataset: Any, count: int) -> list[str]:
-    """Tokens of about this many samples, of all scenarios and agents in turn."""
-    tokens = [record["token"] for record in dataset.sample]
-    return tokens[7 :: len(tokens) // count]
+    """Return the tokens of about this many labelled samples, of all scenarios and agents."""
+    tokens = [record["token"] for record in dataset.sample if record["labelled"]]
+    step = max(len(tokens) // count, 1)
+    return tokens[7 % step :: step]
 
 
-def baselines() -> Mapping[str, Any]:
-    """Those whose predictions are evaluated."""
-    from deepaccident_devkit.baselines import Baseline
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Evaluated:
+    """A release on which predictions of baselines are evaluated.
+
+    Attributes:
+        name: Name of the release in digests.
+        dataset: The release.
+        split: Split file of all its scenarios.
+        folder: Folder for the results files of the predictions.
+        baselines: Baselines by name.
+        tasks: Names of the tasks; None for all.
+        scope: Scope of the evaluated samples; None for the default of each task.
+    """
+
+    name: str
+    dataset: Any
+    split: Path
+    folder: Path
+    baselines: Mapping[str, Any]
+    tasks: Sequence[str] | None = None
+    scope: str | None = None
+
+
+def baselines() -> dict[str, Any]:
+    """Return the baselines whose predictions are evaluated."""
     from deepaccident_devkit.v2x import Link
 
+    baseline = plugin("baselines").Baseline
     noisy = Link(latency=0.2, pose_noise=0.4, packet_loss=0.1, seed=977)
     return {
-        "constant velocity": Baseline(),
-        "turn rate of all, noisy": Baseline(agents="all", model="constant_turn_rate", link=noisy, horizon=3.0),
+        "constant velocity": baseline(),
+        "turn rate of all, noisy": baseline(agents="all", model="constant_turn_rate", link=noisy, horizon=3.0),
     }
 
 
-def add_evaluations(found: Found, dataset: Any, split: Path, folder: Path) -> None:
-    """Predictions of baselines; counts, numbers and breakdowns of each protocol of each task that takes them."""
-    from deepaccident_devkit.baselines import predict_results
+def add_evaluations(found: Found, evaluated: Evaluated) -> None:
+    """Add digests of predictions, and of evaluations by each protocol of each task."""
     from deepaccident_devkit.evaluation import read_results
-    from deepaccident_devkit.evaluation.runs import SampleSelection
     from deepaccident_devkit.evaluation.runs.setups import TASK_PROTOCOLS, TASK_RESULTS
 
-    tokens = SampleSelection(split=str(split), samples="all", scope="all").tokens(dataset)
-    for name, baseline in baselines().items():
-        for kind in ("motion", "accident", "detection"):
-            path = folder / name / (kind if kind == "motion" else f"{kind}.json")
-            path.parent.mkdir(parents=True, exist_ok=True)
-            results = read_results(predict_results(dataset, kind, tokens, path, baseline))
-            found.add(f"predicted/{name}/{kind}", map, results.prediction, tokens)
-            for task, protocol in [(task, each) for task, of in TASK_PROTOCOLS.items() for each in of]:
-                maps_alone = (task, protocol) == ("accident", "released")
-                if kind in (("motion",) if maps_alone else TASK_RESULTS[task]):
-                    told = f"evaluate/{task}/{protocol}/{name}, {kind}"
-                    found.add(told, digests_of_evaluation, dataset, results, task, protocol, split)
+    dataset, predict_results = evaluated.dataset, plugin("baselines").predict_results
+    tasks = tuple(evaluated.tasks or TASK_PROTOCOLS)
+    kinds = tuple(dict.fromkeys(chain.from_iterable(TASK_RESULTS[task] for task in tasks)))
+    for (name, baseline), kind in product(evaluated.baselines.items(), kinds):
+        label = f"{evaluated.name}/{name}, {kind}"
+        path = evaluated.folder / name / (kind if kind == "motion" else f"{kind}.json")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        tokens = predicted_samples(evaluated, kind)
+        results = read_results(predict_results(dataset, kind, tokens, path, baseline, workers=1))
+        found.add(f"predicted/{label}", map, results.prediction, tokens)
+        if kind == "motion":
+            found.add(f"predicted/{label}, as forecasts", motion_forecasts, dataset, results)
+        for task, protocol in protocols_of(tasks, kind):
+            digest_name = f"evaluate/{task}/{protocol}/{label}"
+            found.add(digest_name, digests_of_evaluation, evaluated, results, task, protocol)
 
 
-def digests_of_evaluation(dataset: Any, results: Any, task: Any, protocol: str, split: Path) -> Digests:
-    """The numbers of an evaluation by name, and digests of its breakdowns and of the samples' counts."""
+def predicted_samples(evaluated: Evaluated, kind: str) -> list[str]:
+    """Return the tokens of all samples that have predictions of a kind of results."""
+    from deepaccident_devkit.evaluation.runs import default_selection
+    from deepaccident_devkit.evaluation.runs.setups import TASK_PROTOCOLS, EvaluationSetup
+
+    # each kind of results has the name of the task that it is made for
+    setup = EvaluationSetup(task=kind, protocol=next(iter(TASK_PROTOCOLS[kind])))
+    selection = default_selection(setup, evaluated.split, samples="all", scope="all")
+    tokens: list[str] = selection.tokens(evaluated.dataset)
+    return tokens
+
+
+def protocols_of(tasks: Iterable[str], kind: str) -> Iterator[tuple[str, str]]:
+    """Yield the task and protocol of each evaluation that takes results of a kind."""
+    from deepaccident_devkit.evaluation.runs.setups import TASK_PROTOCOLS, TASK_RESULTS
+
+    for task in tasks:
+        for protocol in TASK_PROTOCOLS[task]:
+            takes_maps_only = (task, protocol) == ("accident", "released")
+            if kind in (("motion",) if takes_maps_only else TASK_RESULTS[task]):
+                yield task, protocol
+
+
+def motion_forecasts(dataset: Any, results: Any) -> list[Any]:
+    """Return the forecasts that predicted motion gives of some samples."""
+    from deepaccident_devkit.evaluation.forecasting import forecasting_truth, forecasts_of
+
+    forecasts = []
+    for token in results.tokens[:: max(len(results.tokens) // 20, 1)]:
+        truth = forecasting_truth(dataset, token)
+        forecasts.append(forecasts_of(results.prediction(token), truth.actor_id, truth.present))
+    return forecasts
+
+
+def digests_of_evaluation(evaluated: Evaluated, results: Any, task: Any, protocol: str) -> Digests:
+    """Return the numbers of an evaluation by name, and digests of breakdowns and of counts."""
     from deepaccident_devkit.evaluation import Resampling
-    from deepaccident_devkit.evaluation.runs import default_selection, evaluate_results, with_prevented
+    from deepaccident_devkit.evaluation.runs import default_selection, evaluate_results
     from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 
-    setup, resampling = EvaluationSetup(task=task, protocol=protocol), Resampling(resamples=30)
-    run = evaluate_results(dataset, results, setup, default_selection(setup, split), allow_partial=True)
+    dataset, resampling = evaluated.dataset, Resampling(resamples=30)
+    setup = EvaluationSetup(task=task, protocol=protocol)
+    selection = default_selection(setup, evaluated.split, scope=evaluated.scope)
+    # pools of processes would take longer to start than the work itself
+    run = evaluate_results(dataset, results, setup, selection, allow_partial=True, workers=1)
     run = run.broken_down(None, resampling)
     if (task, protocol) == ("warning", "clean"):
-        run = with_prevented(run, dataset, resampling)
+        run = plugin("safety.prevention").with_prevented(run, dataset, resampling)
     summary = {name: each for name, each in run.summary().items() if name not in KEYS_LEFT_OUT}
     breakdowns = summary.pop("breakdowns")
     return {
@@ -284,6 +458,114 @@ def digests_of_evaluation(dataset: Any, results: Any, task: Any, protocol: str, 
         **{f"breakdowns/{by}": digest(each) for by, each in breakdowns.items()},
         "counts of samples": digest(dict(run.evaluator.counts)),
     }
+
+
+def add_studies(found: Found, folder: Path) -> None:
+    """Add digests of studies without models, and of the recipes that ship."""
+    for name in STUDIES:
+        found.add(f"study/{name}", digests_of_study, name, folder)
+    found.add("recipe", digests_of_recipes)
+
+
+def digests_of_study(name: str, folder: Path) -> Digests:
+    """Run a study; return digests of its numbers and files."""
+    study = plugin("study")
+    recipe = folder / f"{name}.yaml"
+    recipe.parent.mkdir(exist_ok=True)
+    recipe.write_text(json.dumps(STUDIES[name]))  # JSON is YAML
+    report = study.run_study(study.read_recipe(str(recipe)), folder / "out", workers=1)
+    summary = {k: value for k, value in report.to_dict().items() if k not in STUDY_KEYS_LEFT_OUT}
+    summary["cells"] = [
+        {key: value for key, value in cell.items() if key not in CELL_KEYS_LEFT_OUT} for cell in summary["cells"]
+    ]
+    files = digests_of_files(folder / "out" / name, STUDY_FILES_LEFT_OUT)
+    return {**dict(leaves(summary, depth=5)), **files}
+
+
+def digests_of_recipes() -> Digests:
+    """Return a digest of each recipe that ships, as it is and for a quick trial."""
+    from msgspec import to_builtins
+
+    study = plugin("study")
+    names = sorted(path.stem for path in plugin("study.recipe").SHIPPED.glob("*.yaml"))
+    digests = {}
+    for name, smoke in product(names, (False, True)):
+        recipe = to_builtins(study.read_recipe(name, smoke=smoke))
+        for source in recipe["releases"].values():
+            if source.get("spec"):
+                source["spec"] = Path(source["spec"]).name  # its folder is in the checkout
+        digests[f"{name}{'-smoke' * smoke}"] = digest(recipe)
+    return digests
+
+
+def add_nuscenes(found: Found, here: Path) -> None:
+    """Add digests of exports to nuScenes' format, opened as releases."""
+    for name, options in NUSCENES_EXPORTS.items():
+        dataroot = here / "nuscenes" / name
+        release = here / "releases" / name
+        command("export", "nuscenes", str(release), "--out", str(dataroot), *options)
+        dataset, label = plugin("nuscenes").open_nuscenes(dataroot), f"nuscenes {name}"
+        add_tables(found, label, dataset)
+        every_box = f"tables/{label}/annotation with ignored"
+        found.add(every_box, digests_of_tables, dataset.with_ignored, "annotation")
+        add_labels(found, label, dataset)
+        found.add(f"check/{label}", plugin("nuscenes.check").check_source, dataset)
+        if name == "sensors":
+            for token in some_samples(dataset, 6):
+                found.add(f"sensors/{label}/{token}", digests_of_sensors, dataset, token)
+        else:
+            add_nuscenes_evaluations(found, label, dataset, dataroot.with_name(f"{name} predicted"))
+
+
+def add_nuscenes_evaluations(found: Found, name: str, dataset: Any, folder: Path) -> None:
+    """Add digests of evaluations on nuScenes, and of detections in nuScenes' own format."""
+    split = folder / SPLIT
+    write_split(split, dataset)
+    baseline = {"constant velocity": baselines()["constant velocity"]}
+    evaluated = Evaluated(
+        name=name,
+        dataset=dataset,
+        split=split,
+        folder=folder,
+        baselines=baseline,
+        tasks=NUSCENES_TASKS,
+        scope="all",  # none of its scenarios is designed to end in an accident
+    )
+    add_evaluations(found, evaluated)
+    results = folder / "constant velocity" / "detection.json"
+    own_format = f"predicted/{name}/constant velocity, nuScenes' detections"
+    found.add(own_format, nuscenes_detections, dataset, results)
+
+
+def nuscenes_detections(dataset: Any, results: Path) -> bytes:
+    """Return the file of detections that nuScenes' own evaluation reads."""
+    from deepaccident_devkit.evaluation import ResultsWriter, read_results
+
+    detections = read_results(results)
+    copied = results.with_name("detections without notes.json")
+    with ResultsWriter(copied, "detection") as writer:  # notes of a model are expected, if any
+        for token in detections.tokens:
+            writer.add(token, detections.prediction(token))
+    path: Path = plugin("nuscenes.results").write_detections(dataset, copied)
+    return path.read_bytes()
+
+
+def digests_of_sensors(dataset: Any, token: str) -> Digests:
+    """Return digests of a sample's point cloud, cameras, images and token in nuScenes."""
+    from deepaccident_devkit.taxonomy import CAMERAS
+
+    parts = {"lidar": dataset.load_point_cloud(token), "token": dataset.nuscenes_token(token)}
+    for camera in CAMERAS:
+        image = dataset.load_image(token, camera)
+        parts[camera] = [image, dataset.camera(token, camera), dataset.ego_from(token, camera)]
+    return {name: digest(part) for name, part in parts.items()}
+
+
+def write_split(path: Path, dataset: Any) -> None:
+    """Write a split file of all scenarios of a release."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    lines = [record["token"].replace("/", " ") + "\n" for record in dataset.scenario]
+    path.write_text("".join(lines))
 
 
 def digests_of_export(name: str, here: Path) -> Digests:
@@ -310,7 +592,21 @@ def work(out: Path) -> None:
     print(f"  {deepaccident_devkit.__file__}", flush=True)
     here, found = Path.cwd(), Found()
     dataset, sensors = (DeepAccident("v1", here / "releases" / name, verbose=False) for name in RELEASES)
-    (here / SPLIT).write_text("".join(record["token"].replace("/", " ") + "\n" for record in dataset.scenario))
+    write_split(here / SPLIT, dataset)
+
+    def labels() -> None:
+        add_labels(found, "labelled", dataset)
+        add_segmentation(found, sensors)
+
+    def evaluations() -> None:
+        evaluated = Evaluated(
+            name="labelled",
+            dataset=dataset,
+            split=here / SPLIT,
+            folder=here / "predicted",
+            baselines=baselines(),
+        )
+        add_evaluations(found, evaluated)
 
     def exports() -> None:
         for name in EXPORTS:
@@ -320,9 +616,11 @@ def work(out: Path) -> None:
         "synth": lambda: found.add("synth", digests_of_generated, here),
         "tables of labels": lambda: add_tables(found, "labelled", dataset),
         "tables with sensors": lambda: add_tables(found, "sensors", sensors),
-        "labels": lambda: add_labels(found, dataset, sensors),
-        "evaluations": lambda: add_evaluations(found, dataset, here / SPLIT, here / "predicted"),
+        "labels": labels,
+        "evaluations": evaluations,
+        "studies": lambda: add_studies(found, here / "studies"),
         "exports": exports,
+        "nuScenes": lambda: add_nuscenes(found, here),
     }
     for name, section in sections.items():
         before = len(found.digests)
