@@ -24,7 +24,7 @@ from deepaccident_devkit.evaluation.runs import (
     default_selection,
     evaluate_results,
 )
-from deepaccident_devkit.evaluation.runs.setups import TASKS, EvaluationSetup
+from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 from deepaccident_devkit.motion import MotionLabelConfig
 
 BREAKDOWNS = ("all", "time_to_impact", "accident_visibility", "agent", "scenario_type")
@@ -72,7 +72,7 @@ def _arguments(
 
         planned = setup.task == "planning"
         predicted = [predict_plan(dataset, token)] if planned else predict_forecasts(dataset, token)
-        return predicted, *TASKS[setup.task].truth(dataset, token, setup.rules, None, setup.horizon)
+        return predicted, *setup.evaluator().truth(dataset, token, None, setup.horizon)
     if setup.task == "detection":
         truth = detection_truth(dataset, token, setup.rules)
         keep = source.uniform(size=len(truth)) < 0.8

@@ -18,7 +18,7 @@ from studies import BASELINES, written
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.baselines import predict_results
 from deepaccident_devkit.evaluation.runs import SampleSelection, default_selection, evaluate_results
-from deepaccident_devkit.evaluation.runs.setups import TASK_PROTOCOLS, EvaluationSetup
+from deepaccident_devkit.evaluation.runs.setups import TASKS, EvaluationSetup
 from deepaccident_devkit.export.bulk import export_release
 from deepaccident_devkit.export.nuscenes import NuScenes
 from deepaccident_devkit.geometry.quaternions import to_matrix
@@ -36,8 +36,8 @@ EVALUATED = {
     },
     "accident": {"accident": ("paper", "boxes")},
     "detection": {"detection": ("released", "released_iou", "paper", "opencood")},
-    "planning": {"planning": tuple(TASK_PROTOCOLS["planning"])},
-    "forecasting": {"forecasting": tuple(TASK_PROTOCOLS["forecasting"])},
+    "planning": {"planning": tuple(TASKS["planning"].protocols)},
+    "forecasting": {"forecasting": tuple(TASKS["forecasting"].protocols)},
 }
 """Kind of results → task → protocols."""
 COLLIDING_AGENTS = ("ego_vehicle_behind", "other_vehicle")

@@ -384,11 +384,11 @@ def baselines() -> dict[str, Any]:
 def add_evaluations(found: Found, evaluated: Evaluated) -> None:
     """Add digests of predictions, and of evaluations by each protocol of each task."""
     from deepaccident_devkit.evaluation import read_results
-    from deepaccident_devkit.evaluation.runs.setups import TASK_PROTOCOLS, TASK_RESULTS
+    from deepaccident_devkit.evaluation.runs.setups import TASKS
 
     dataset, predict_results = evaluated.dataset, plugin("baselines").predict_results
-    tasks = tuple(evaluated.tasks or TASK_PROTOCOLS)
-    kinds = tuple(dict.fromkeys(chain.from_iterable(TASK_RESULTS[task] for task in tasks)))
+    tasks = tuple(evaluated.tasks or TASKS)
+    kinds = tuple(dict.fromkeys(chain.from_iterable(result_kinds(TASKS[task]) for task in tasks)))
     for (name, baseline), kind in product(evaluated.baselines.items(), kinds):
         label = f"{evaluated.name}/{name}, {kind}"
         path = evaluated.folder / name / (kind if kind == "motion" else f"{kind}.json")
@@ -403,13 +403,19 @@ def add_evaluations(found: Found, evaluated: Evaluated) -> None:
             found.add(digest_name, digests_of_evaluation, evaluated, results, task, protocol)
 
 
+def result_kinds(task: Any) -> tuple[str, ...]:
+    """Return the kinds of results that a task is evaluated from; checkouts before November 30 called them `kinds`."""
+    kinds: tuple[str, ...] = task.result_kinds if hasattr(task, "result_kinds") else task.kinds
+    return kinds
+
+
 def predicted_samples(evaluated: Evaluated, kind: str) -> list[str]:
     """Return the tokens of all samples that have predictions of a kind of results."""
     from deepaccident_devkit.evaluation.runs import default_selection
-    from deepaccident_devkit.evaluation.runs.setups import TASK_PROTOCOLS, EvaluationSetup
+    from deepaccident_devkit.evaluation.runs.setups import TASKS, EvaluationSetup
 
     # each kind of results has the name of the task that it is made for
-    setup = EvaluationSetup(task=kind, protocol=next(iter(TASK_PROTOCOLS[kind])))
+    setup = EvaluationSetup(task=kind, protocol=next(iter(TASKS[kind].protocols)))
     selection = default_selection(setup, evaluated.split, samples="all", scope="all")
     tokens: list[str] = selection.tokens(evaluated.dataset)
     return tokens
@@ -417,12 +423,12 @@ def predicted_samples(evaluated: Evaluated, kind: str) -> list[str]:
 
 def protocols_of(tasks: Iterable[str], kind: str) -> Iterator[tuple[str, str]]:
     """Yield the task and protocol of each evaluation that takes results of a kind."""
-    from deepaccident_devkit.evaluation.runs.setups import TASK_PROTOCOLS, TASK_RESULTS
+    from deepaccident_devkit.evaluation.runs.setups import TASKS
 
     for task in tasks:
-        for protocol in TASK_PROTOCOLS[task]:
+        for protocol in TASKS[task].protocols:
             takes_maps_only = (task, protocol) == ("accident", "released")
-            if kind in (("motion",) if takes_maps_only else TASK_RESULTS[task]):
+            if kind in (("motion",) if takes_maps_only else result_kinds(TASKS[task])):
                 yield task, protocol
 
 

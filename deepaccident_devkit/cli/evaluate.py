@@ -52,12 +52,10 @@ from deepaccident_devkit.evaluation.runs.bundles import Chooser, chosen_threshol
 from deepaccident_devkit.evaluation.runs.further import with_further
 from deepaccident_devkit.evaluation.runs.sanity import check_sanity
 from deepaccident_devkit.evaluation.runs.setups import (
-    TASK_PROTOCOLS,
     TASKS,
     EvaluationSetup,
     SampleList,
     ScopeName,
-    TaskName,
     check_recordings,
     label_rules,
 )
@@ -72,16 +70,8 @@ from deepaccident_devkit.taxonomy import AGENTS
 _FINDINGS_STATUS = 1
 _NOTHING_STATUS = 2
 """Of a check that had nothing to compare."""
-_HELP = {
-    "motion": "Evaluate predicted motion: IoU, VPQ and path errors.",
-    "accident": "Evaluate predicted accidents: APA, and the errors in who, where and when.",
-    "detection": "Evaluate detected boxes: AP and errors.",
-    "warning": "Evaluate warnings: how early they come before accidents, and how often an alarm is false.",
-    "planning": "Evaluate planned paths: collisions, and distances from the recorded path.",
-    "forecasting": "Evaluate actors' predicted paths: minADE, minFDE, misses.",
-}
 _LINES = {
-    **_HELP,
+    **{name: evaluator_class.description for name, evaluator_class in TASKS.items()},
     "check": "Check every entry of a results file.",
     "compare": "Compare two evaluations, and test the differences.",
     "verify": "Repeat an evaluation and list all differences.",
@@ -142,11 +132,12 @@ def _attributes(context: click.Context, parameter: click.Parameter, names: tuple
         raise click.BadParameter(str(error), context, parameter) from error
 
 
-def _task_verb(task: TaskName) -> click.Command:
+def _task_verb(task: str) -> click.Command:
     """The verb of one task."""
-    protocols = list(TASK_PROTOCOLS[task])
+    protocols = list(TASKS[task].protocols)
+    text = f"{TASKS[task].description}\n\nThe predictions are compared with the labels of the release in DATAROOT."
 
-    @verb(task, help=f"{_HELP[task]}\n\nThe predictions are compared with the labels of the release in DATAROOT.")
+    @verb(task, help=text)
     @release_parameters
     @click.option("--results", required=True, type=PATH, help="Results file or folder with the predictions.")
     @_selection_parameters
@@ -316,7 +307,7 @@ def check(results: Path, dataroot: Dataroot | None, version: str, **options: Any
     if dataroot is None:
         return
     dataset = open_release(dataroot, version=version, on_error=options["on_error"], **engine)
-    first = next(iter(TASK_PROTOCOLS[opened.task]))
+    first = next(iter(TASKS[opened.task].protocols))
     protocol = "boxes" if opened.task == "accident" else first  # the one that takes explicit accidents
     setup = EvaluationSetup(task=opened.task, protocol=protocol, horizon=options["horizon"])
     selection = _selection_of(setup, options)
@@ -333,7 +324,7 @@ def check(results: Path, dataroot: Dataroot | None, version: str, **options: Any
 
 
 def _verb(name: Any) -> click.Command:
-    if name in _HELP:
+    if name in TASKS:
         return _task_verb(name)
     if name == "check":
         return check

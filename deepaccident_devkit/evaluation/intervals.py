@@ -11,15 +11,13 @@ import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from fnmatch import fnmatchcase
-from itertools import chain
-from types import MappingProxyType
 from typing import Any, Final
 
 import numpy as np
 
 from deepaccident_devkit.errors import ConfigError, shortened
 from deepaccident_devkit.evaluation.evaluator import Counts, Evaluator
-from deepaccident_devkit.evaluation.task import HEADLINE_UNITS, LIMITS, SIGNED_NUMBERS, Unit
+from deepaccident_devkit.evaluation.task import LIMITS, Row
 from deepaccident_devkit.support.arrays import FloatArray, IntArray, as_floats
 
 RESAMPLES: Final = 1000
@@ -97,7 +95,7 @@ def intervals_of(
     numbers = {name: each for name, each in numbers_of(result).items() if math.isfinite(each) and has_interval(name)}
     names, values = list(numbers), np.array(list(numbers.values()))
     drawn = draws_of_parts(evaluator, clusters, names, chosen)
-    low, high, having = ends_of_draws(names, values, drawn, chosen.confidence)
+    low, high, having = ends_of_draws(names, values, drawn, chosen.confidence, evaluator.result_class.rows)
     found = np.isfinite(low)
     ends = {name: (float(low[at]), float(high[at])) for at, name in enumerate(names) if found[at]}
     without = {name: int(having[at]) for at, name in enumerate(names) if not found[at]}
@@ -123,7 +121,7 @@ def difference_intervals(
     """
     values = np.array(list(differences.values()))
     first, second = (draws_of_parts(evaluator, each, differences, resampling) for each in pair)
-    low, high, _ = ends_of_draws(differences, values, second - first, resampling.confidence, limited=False)
+    low, high, _ = ends_of_draws(differences, values, second - first, resampling.confidence)
     return low, high, standard_errors(values, np.split(second - first, 2)[1])[0]
 
 
@@ -137,7 +135,11 @@ def draws_of_parts(
 
 
 def ends_of_draws(
-    names: Iterable[str], values: FloatArray, drawn: FloatArray, confidence: float, *, limited: bool = True
+    names: Iterable[str],
+    values: FloatArray,
+    drawn: FloatArray,
+    confidence: float,
+    rows: Sequence[Row] | None = None,
 ) -> tuple[FloatArray, FloatArray, IntArray]:
     """Intervals of numbers from draws.
 
@@ -146,13 +148,16 @@ def ends_of_draws(
         values: (M,) of all parts together.
         drawn: (2P, M) of `draws_of_parts`.
         confidence: as of `interval_ends`.
-        limited: whether they are what their names say; differences of such numbers have no limits.
+        rows: Rows of the result that the numbers are of (`range_of`); None for differences, which have no limits.
 
     Returns:
         (M,) low and (M,) high ends (`interval_ends`), and (M,) how many parts have the number at all.
     """
     alone, left_out = np.split(drawn, 2)
-    ranges = [range_of(*each) if limited else (-math.inf, math.inf) for each in zip(names, drawn.T, strict=True)]
+    if rows is None:
+        ranges = [(-math.inf, math.inf)] * len(values)
+    else:
+        ranges = [range_of(name, draws, rows) for name, draws in zip(names, drawn.T, strict=True)]
     having = np.isfinite(alone).sum(axis=0)
     return *interval_ends(values, left_out, np.reshape(ranges, (-1, 2)), confidence, having), having
 
@@ -279,35 +284,6 @@ def _some(names: Sequence[str]) -> str:
     return ", ".join(names) if more <= 0 else f"{', '.join(names[:_NAMED])} and {more} others"
 
 
-_UNITS: Final[Mapping[str, Unit]] = MappingProxyType(
-    {
-        "ranges/*/sq": "%",
-        "ranges/*/rq": "%",
-        "mean_iou": "%",
-        "iou/*": "%",
-        "path_accuracy": "share",
-        "area_under_curve": "share",
-        "mean_time": "s",
-        "recall": "share",
-        "precision": "share",
-        "time_in_alarm": "share",
-        "early_share": "share",
-        "tta_hit": "s",
-        "tta0": "s",
-        "tta0_after/*": "s",
-        "time_at_r80": "s",
-        "time_at_half": "s",
-        "precision_at_*": "share",
-        "recall_at_half": "share",
-        "alarm_seconds_per_minute": "1/min",
-        "episodes_per_minute": "1/min",
-        "shares/*": "share",
-        "warned": "share",
-        "extrapolated": "share",
-        "braking_seconds_per_minute": "1/min",
-    }
-)
-"""Pattern of paths → unit, of numbers that are no headlines."""
 _WITHOUT: Final = (
     "false_recordings",
     *("within/*/distance", "threshold", "best_f1", "quiet", "quiet_braking"),
@@ -326,26 +302,25 @@ def has_interval(path: str) -> bool:
     return not _is_one_of(path, _WITHOUT)
 
 
-def range_of(path: str, values: FloatArray) -> tuple[float, float]:
-    """The least and the most that a number can be; infinite for no limit.
+def range_of(path: str, values: FloatArray, rows: Sequence[Row]) -> tuple[float, float]:
+    """Return the least and the most that a number can be; infinite for no limit.
 
-    A signed number (of `SIGNED_NUMBERS`) has no limit. Others have those of their unit: shares are in [0, 1], percents
-    in [0, 100], lengths and times from 0. A number that is not of the devkit's own has no unit: it is taken for a share
-    if it is in [0, 1] in all draws, and otherwise for one that is never below 0 if it is not in any.
+    Shares are in [0, 1], percents in [0, 100], other numbers with a unit from 0 on, and signed numbers have no limit. A
+    number without a row is taken for a share if it is in [0, 1] in all draws, and otherwise for one that is never below
+    0 if no draw is.
 
     Args:
-        path: of the number.
-        values: (D,) what it is in draws of the clusters; NaN where there is nothing to count.
+        path: Path of the number.
+        values: Numbers in draws of the clusters, shape (D,); NaN where there is nothing to count.
+        rows: Rows of the result, whose paths are patterns; the first that fits the path or its end gives the unit.
     """
-    if _is_one_of(path, SIGNED_NUMBERS):
+    row = next((row for row in rows if _is_one_of(path, (row.path,))), None)
+    if row is not None:
+        return (-math.inf, math.inf) if row.is_signed else (0.0, LIMITS.get(row.unit, math.inf))
+    finite = values[np.isfinite(values)]
+    if finite.min(initial=0.0) < 0:
         return -math.inf, math.inf
-    units = chain(HEADLINE_UNITS.items(), _UNITS.items())
-    unit = next((unit for pattern, unit in units if _is_one_of(path, (pattern,))), None)
-    if unit is not None:
-        return 0.0, LIMITS.get(unit, math.inf)
-    there = values[np.isfinite(values)]
-    least = there.min(initial=0.0)
-    return (0.0, 1.0 if there.max(initial=0.0) <= 1 else math.inf) if least >= 0 else (-math.inf, math.inf)
+    return 0.0, 1.0 if finite.max(initial=0.0) <= 1 else math.inf
 
 
 def _is_one_of(path: str, patterns: Iterable[str]) -> bool:

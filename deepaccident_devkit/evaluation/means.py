@@ -6,23 +6,15 @@ import re
 import sys
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
-from typing import Any, ClassVar, Final, Generic, Literal, NamedTuple, TypeVar
+from typing import Any, ClassVar, Final, Generic, TypeVar
 
 import numpy as np
 
 from deepaccident_devkit.errors import EvaluationError
 from deepaccident_devkit.evaluation.evaluator import Counts, Evaluator, ratio
-from deepaccident_devkit.evaluation.task import (
-    HEADLINE_UNITS,
-    SIGNED_NUMBERS,
-    Row,
-    TaskResult,
-    Unit,
-    plain,
-    protocol_of,
-)
+from deepaccident_devkit.evaluation.task import Row, TaskResult
 from deepaccident_devkit.support.arrays import BoolArray, FloatArray, IntArray
 from deepaccident_devkit.support.text import counted, natural_order
 
@@ -32,25 +24,31 @@ _PARTS: Final = 2.0**30
 """Of 1: sums have no finer numbers."""
 
 
-class Column(NamedTuple):
-    """A column of the tables.
+_ANY_CELL: Final = "means/*/*/"
+"""Beginning of the path of a column's row."""
 
-    Attributes:
-        unit: of its numbers.
-        better: which numbers are better.
-        is_headline: whether its numbers in the main row of the main tables are headlines.
-        is_signed: whether its numbers can be below 0.
+
+def table_rows(columns: Sequence[Row], main_tables: Sequence[str], main_row: str) -> tuple[Row, ...]:
+    """Return the rows of a result's tables: first the headlines by column, then one row for each column.
+
+    Args:
+        columns: One row for each column of the tables, with the column's name as its path.
+        main_tables: Tables whose numbers in `main_row` are headlines, unless their column says otherwise.
+        main_row: Row of the tables.
     """
-
-    unit: Unit
-    better: Literal["higher", "lower", "neither"] = "lower"
-    is_headline: bool = True
-    is_signed: bool = False
+    numbers = [replace(column, path=_ANY_CELL + column.path, is_headline=False) for column in columns]
+    headline_columns = [column for column in columns if column.is_headline]
+    headline_rows = [
+        replace(column, path=f"means/{table}/{main_row}/{column.path}", name=f"{column.path} {table}")
+        for column in headline_columns
+        for table in main_tables
+    ]
+    return (*headline_rows, *numbers)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class MeansResult(TaskResult):
-    """Means of a number of samples.
+    """Means of a number of samples; `table_rows` makes the `rows` of a subclass.
 
     Attributes:
         samples: that were counted.
@@ -59,28 +57,10 @@ class MeansResult(TaskResult):
         notes: sentences on what was left out.
     """
 
-    columns: ClassVar[Mapping[str, Column]] = {}
-    main_tables: ClassVar[Sequence[str]] = ()
-    main_row: ClassVar[str] = ""
-
     samples: int
     means: Mapping[str, Mapping[str, Mapping[str, float]]]
     counted: Mapping[str, Mapping[str, Mapping[str, int]]]
     notes: tuple[str, ...]
-
-    def __init_subclass__(cls) -> None:
-        """Make headlines of the columns, and the units of all numbers known."""
-        cls.rows = tuple(
-            Row(f"means/{table}/{cls.main_row}/{name}", f"{name} {table}", each.unit, each.better)
-            for name, each in cls.columns.items()
-            for table in cls.main_tables
-            if each.is_headline
-        )
-        super(MeansResult, cls).__init_subclass__()
-        for name, each in cls.columns.items():
-            HEADLINE_UNITS[f"means/*/{name}"] = each.unit
-            if each.is_signed:
-                SIGNED_NUMBERS.add(f"means/*/{name}")
 
 
 Result = TypeVar("Result", bound=MeansResult)
@@ -123,28 +103,10 @@ class Sums:
 class MeansEvaluator(Evaluator[Result], Generic[Result]):
     """Base of evaluators whose numbers are means; see the subclasses for what is counted."""
 
-    result_class: type[Result]
-    protocols: ClassVar[Mapping[str, Any]]
     order: ClassVar[Sequence[str]] = ()
     """Names of tables and rows that come before the others, in their order."""
-
-    def __init__(self, protocol: Any = "") -> None:
-        """Start without samples.
-
-        Args:
-            protocol: of `protocols` by name, the first if none is given, or your own.
-
-        Raises:
-            ChoiceError: no protocol has that name, or it is of another type.
-        """
-        super().__init__()
-        kinds: Any = tuple({type(each) for each in self.protocols.values()})
-        self.protocol = protocol_of(protocol or next(iter(self.protocols)), kinds, self.protocols)
-
-    @property
-    def settings(self) -> dict[str, Any]:
-        """The protocol's choices."""
-        return dict(plain(self.protocol))
+    main_row: ClassVar[str] = ""
+    """Row that `MEAN_OF_SCENARIOS` is made from."""
 
     def add(self, token: str, counts: Counts) -> None:
         """Take a sample's counts (`Evaluator.add`); of samples with the same names these are kept once."""
@@ -163,7 +125,7 @@ class MeansEvaluator(Evaluator[Result], Generic[Result]):
 
     def _of_scenario(self, counts: Collection[Counts]) -> Counts:
         """The sums of one scenario with its means."""
-        whole, main = _pooled(counts), f"/{self.result_class.main_row}/"
+        whole, main = _pooled(counts), f"/{self.main_row}/"
         numbers = _by_path(whole)
         means = {
             path.replace(main, f"/{MEAN_OF_SCENARIOS}/"): np.array([_rounded(value / max(count, 1.0)), min(count, 1.0)])
@@ -184,19 +146,21 @@ class MeansEvaluator(Evaluator[Result], Generic[Result]):
         (pooled,) = self.pooled(counts)
         means: dict[str, dict[str, dict[str, float]]] = {}
         counted: dict[str, dict[str, dict[str, int]]] = {}
-        for path, (value, count) in sorted(_by_path(pooled).items(), key=lambda each: self._place(each[0])):
+        columns = [row.path.removeprefix(_ANY_CELL) for row in self.result_class.rows if row.path.startswith(_ANY_CELL)]
+        for path, (value, count) in sorted(_by_path(pooled).items(), key=lambda item: self._place(item[0], columns)):
             table, row, column = path.split("/")
             means.setdefault(table, {}).setdefault(row, {})[column] = ratio(float(value), float(count))
             counted.setdefault(table, {}).setdefault(row, {})[column] = int(count)
         notes = tuple(_note_text(text, count) for text, count in sorted(pooled["notes"].items()))
-        return self.result_class(samples=pooled["samples"], means=means, counted=counted, notes=notes)
+        result: Result = self.result_class(samples=pooled["samples"], means=means, counted=counted, notes=notes)
+        return result
 
-    def _place(self, path: str) -> tuple[Any, ...]:
-        """Where a number comes: by the given order, and columns by that of the result's."""
+    def _place(self, path: str, columns: Sequence[str]) -> tuple[Any, ...]:
+        """Return the sort key of a number: `order` for tables and rows, `columns` for columns; raises ValueError."""
         *names, column = path.split("/")
-        known = [self.order.index(name) if name in self.order else len(self.order) for name in names]
-        columns = list(self.result_class.columns)
-        return *((at, natural_order(name)) for at, name in zip(known, names, strict=True)), columns.index(column)
+        places = [self.order.index(name) if name in self.order else len(self.order) for name in names]
+        keys = [(place, natural_order(name)) for place, name in zip(places, names, strict=True)]
+        return *keys, columns.index(column)
 
 
 def _note_text(text: str, count: int) -> str:

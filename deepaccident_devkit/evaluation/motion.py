@@ -1,4 +1,4 @@
-"""How well a model foresees where all actors are: IoU, VPQ, minADE, minFDE, miss rate; the task `MOTION`."""
+"""How well a model foresees where all actors are: IoU, VPQ, minADE, minFDE, miss rate; the task `motion`."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from itertools import chain
 from types import MappingProxyType
 from typing import Any, ClassVar, Final
 
+from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.evaluation.evaluator import Counts, Evaluator, ratio, total
 from deepaccident_devkit.evaluation.instances import (
     SegmentationCounts,
@@ -31,7 +32,7 @@ from deepaccident_devkit.evaluation.predictions import (
     first_frames,
     labels_at_present,
 )
-from deepaccident_devkit.evaluation.task import Row, Task, TaskResult, protocol_of
+from deepaccident_devkit.evaluation.task import Row, TaskResult
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.motion import (
     LABEL_PROTOCOLS,
@@ -136,13 +137,15 @@ class MotionResult(TaskResult):
         notes: sentences that a reader of the numbers should know.
     """
 
-    task: ClassVar[str] = "motion"
     rows: ClassVar[tuple[Row, ...]] = (
-        Row("ranges/*/iou", "iou *", "%", "higher"),
-        Row("ranges/*/pq", "vpq *", "%", "higher"),
-        Row("min_ade", "min_ade", "m"),
-        Row("min_fde", "min_fde", "m"),
-        Row("miss_rate", "miss_rate", "share"),
+        Row("ranges/*/iou", "%", "higher", name="iou *"),
+        Row("ranges/*/pq", "%", "higher", name="vpq *"),
+        Row("min_ade", "m"),
+        Row("min_fde", "m"),
+        Row("miss_rate", "share"),
+        Row("ranges/*/sq", "%", "higher", is_headline=False),
+        Row("ranges/*/rq", "%", "higher", is_headline=False),
+        Row("path_accuracy", "share", "higher", is_headline=False),
     )
     ranges: Mapping[str, RangeResult]
     min_ade: float
@@ -166,6 +169,13 @@ class MotionEvaluator(Evaluator[MotionResult]):
     0.0
     """
 
+    task = "motion"
+    description = "Evaluate predicted motion: IoU, VPQ and path errors."
+    result_kinds: ClassVar[tuple[str, ...]] = ("motion",)
+    protocols = MOTION_PROTOCOLS
+    result_class = MotionResult
+    main_numbers: ClassVar[tuple[str, ...]] = ("ranges/100x100/pq", "ranges/100x100/iou")
+
     def __init__(self, protocol: str | MotionProtocol = "released", *, trajectories: bool = True) -> None:
         """Start without samples.
 
@@ -177,14 +187,17 @@ class MotionEvaluator(Evaluator[MotionResult]):
         Raises:
             ChoiceError: no protocol has that name.
         """
-        super().__init__()
-        self.protocol = protocol_of(protocol, MotionProtocol, MOTION_PROTOCOLS)
+        super().__init__(protocol)
         self.trajectories = trajectories
 
     @property
     def settings(self) -> dict[str, Any]:
         """The protocol's choices, and whether paths are compared."""
         return {"protocol": asdict(self.protocol), "trajectories": self.trajectories}
+
+    def truth(self, dataset: Dataset, token: str, form: Any, horizon: float, /) -> tuple[MotionLabels | None]:
+        """Return the sample's motion labels, on the grid of the results."""
+        return (compared_labels(dataset, token, self.protocol, form, horizon),)
 
     def update(self, token: str, prediction: MotionOutput, label: MotionLabels) -> None:
         """Count one sample.
@@ -203,6 +216,21 @@ class MotionEvaluator(Evaluator[MotionResult]):
     def result_of(self, counts: Collection[Counts]) -> MotionResult:
         """The metrics of some samples' counts, in any order."""
         return motion_result(counts, self.protocol)
+
+    def sample_row(self, token: str) -> dict[str, Any]:
+        """Return IoU and PQ (percent), instances and cells by range, then the paths and their errors (m)."""
+        result = self.compute([token])
+        row: dict[str, Any] = {"frames": result.frames}
+        for (name, part), cells in zip(result.ranges.items(), self._counts[token]["cells"], strict=True):
+            row |= {f"iou_{name}": part.iou, f"pq_{name}": part.pq}
+            row |= {
+                f"tp_{name}": part.true_positive,
+                f"fp_{name}": part.false_positive,
+                f"fn_{name}": part.false_negative,
+            }
+            row |= {f"cells_{case}_{name}": count for case, count in zip(("tp", "fp", "fn"), cells, strict=True)}
+        paths = ("paths", "path_true_positive", "path_false_positive", "path_false_negative")
+        return row | {name: getattr(result, name) for name in (*paths, "min_ade", "min_fde", "miss_rate")}
 
     def pooled(self, counts: Collection[Counts]) -> list[Counts]:
         """The samples' counts as those of one sample of one frame, which have the same result."""
@@ -372,12 +400,3 @@ def _range_result(cells: Sequence[int], vpq: Sequence[Sequence[float]], protocol
         false_positive=alarms,
         false_negative=missed,
     )
-
-
-MOTION: Final = Task(
-    name="motion",
-    kinds=("motion",),
-    protocols=MOTION_PROTOCOLS,
-    evaluator=MotionEvaluator,
-    truth=lambda *facts: (compared_labels(*facts),),
-)

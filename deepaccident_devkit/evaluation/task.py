@@ -1,57 +1,22 @@
-"""`Task`: what is evaluated, from a results file to numbers; the choices of protocols, and results with headlines."""
+"""What tasks share beside `Evaluator`: protocols and their switches, and results that know their rows."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields, is_dataclass, replace
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, ClassVar, Final, Literal, NoReturn, TypeVar, get_args
+from typing import TYPE_CHECKING, Any, ClassVar, Final, Literal, NoReturn, TypeVar, cast
 
 import numpy as np
 
-from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import ChoiceError
-from deepaccident_devkit.evaluation.evaluator import Evaluator
 from deepaccident_devkit.reports import table_html
 from deepaccident_devkit.support.arrays import ShortRepr, known
 from deepaccident_devkit.support.text import choice, counted, meant_text, possible_text
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
-
-TaskName = Literal["motion", "accident", "detection", "warning", "planning", "forecasting"]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Task:
-    """One task: how its predictions are read, what they are compared with, and the evaluator that does so.
-
-    Attributes:
-        name: of `TaskName`.
-        kinds: the kinds of results that it is evaluated from.
-        protocols: its rules by name.
-        evaluator: of some rules; its `update` takes a token, the prediction and all that `truth` gives.
-        read: results, dataset, token, rules → the prediction of a sample, as the rules count it.
-        truth: dataset, token, rules, how motion is stored (`Results.form`; None for other results), horizon in
-            seconds → all that the prediction is compared with.
-        whole_recordings: whether whole recordings are followed, so that attributes within them are of no use.
-        needs_meta: whether the truth is in the scenarios' meta files.
-        vehicles_alone: whether the roadside has no such predictions.
-        has_horizon: whether the horizon of a setup says how far ahead it looks.
-    """
-
-    name: TaskName
-    kinds: tuple[str, ...]
-    protocols: Mapping[str, Any]
-    evaluator: Callable[[Any], Evaluator[Any]]
-    read: Callable[[Any, Dataset, str, Any], Any] = lambda results, _dataset, token, _rules: results.prediction(token)
-    truth: Callable[[Dataset, str, Any, Any, float], tuple[Any, ...]]
-    whole_recordings: bool = False
-    needs_meta: bool = False
-    vehicles_alone: bool = False
-    has_horizon: bool = True
-
 
 Kind = TypeVar("Kind")
 Rules = TypeVar("Rules", bound="DataclassInstance")
@@ -112,9 +77,11 @@ def _of_kind(name: str, rules: DataclassInstance, field: str, value: Any) -> Any
     return value
 
 
-def protocol_of(given: object, kind: type[Kind], named: Mapping[str, Kind]) -> Kind:
-    """A protocol by its name, or as it is given if it is of a kind; raises ChoiceError."""
-    return given if isinstance(given, kind) else named[choice("protocol", given, named)]
+def protocol_of(protocol: object, protocols: Mapping[str, Kind]) -> Kind:
+    """Return a protocol by its name, or as given if it is of the class of one of them; raises ChoiceError."""
+    if isinstance(protocol, tuple(map(type, protocols.values()))):
+        return cast("Kind", protocol)
+    return protocols[choice("protocol", protocol, protocols)]
 
 
 def as_tuples(value: Any) -> Any:
@@ -214,78 +181,70 @@ class Headline:
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """Where a headline stands in a task's result; `*` is any key, and takes its place in the name.
+    """Describes one number of a result, or all numbers whose paths fit a pattern.
 
-    A path has one unit in the results of all tasks. A number that can be below 0 is signed, whatever its unit.
+    Attributes:
+        path: Path of the number in the result; `*` stands for any key.
+        unit: Unit of the number.
+        better: Which numbers are better.
+        name: Short name for tables, in which `*` stands for the key; empty for the last part of the path.
+        is_signed: Whether the number can be below 0.
+        is_headline: Whether the number is a headline; `*` in the path of a headline is exactly one key.
     """
 
     path: str
-    name: str
     unit: Unit
     better: Literal["higher", "lower", "neither"] = "lower"
+    name: str = ""
     is_signed: bool = False
+    is_headline: bool = True
 
 
 _SHOWN: Final = 4
 """Headlines in a result's text."""
 _HIGHER_IS_BETTER: Final = {"higher": True, "lower": False, "neither": None}
-HEADLINE_UNITS: Final[dict[str, Unit]] = {}
-"""Path of a headline, `*` for any key → its unit; of all results (`TaskResult`)."""
-SIGNED_NUMBERS: Final[set[str]] = set()
-"""Paths, likewise, of numbers that can be below 0."""
 
 
 class TaskResult(FrozenMappings):
-    """Base of the results of a task's evaluators: its text, and what a notebook shows, are its headlines."""
+    """Base of the results of evaluators; `repr` and notebooks show the headlines.
+
+    Attributes:
+        rows: Describes every number of the result that is no total and no setting; headlines come in this order.
+        samples: Number of samples.
+    """
 
     __slots__ = ()
 
-    task: ClassVar[str]
     rows: ClassVar[tuple[Row, ...]] = ()
     samples: int
 
-    def __init_subclass__(cls) -> None:
-        """Make the units of its headlines known, and which of them are signed."""
-        super().__init_subclass__()
-        HEADLINE_UNITS.update({row.path: row.unit for row in cls.rows})
-        SIGNED_NUMBERS.update(row.path for row in cls.rows if row.is_signed)
-
     def __repr__(self) -> str:
-        """How many samples, and the first headlines."""
-        found = headlines(self.task, self)
-        shown = [f"{each.name} {each.text()}" for each in found[:_SHOWN]]
-        more = ", …" * (len(found) > _SHOWN)
-        return f"{type(self).__name__}({counted(self.samples, 'sample')}: {', '.join(shown)}{more})"
+        """Return the number of samples and the first headlines."""
+        numbers = headlines(self)
+        texts = [f"{number.name} {number.text()}" for number in numbers[:_SHOWN]]
+        more = ", …" * (len(numbers) > _SHOWN)
+        return f"{type(self).__name__}({counted(self.samples, 'sample')}: {', '.join(texts)}{more})"
 
     def _repr_html_(self) -> str:
-        rows = [(each.name, each.text()) for each in headlines(self.task, self)]
+        rows = [(number.name, number.text()) for number in headlines(self)]
         return table_html([("number", "value"), *rows], f"{type(self).__name__}, {counted(self.samples, 'sample')}")
 
 
-def headlines(task: str, result: object) -> tuple[Headline, ...]:
-    """The headline numbers of a result, the most important first.
+def headlines(result: TaskResult) -> tuple[Headline, ...]:
+    """Return the headline numbers of a result, the most important first.
 
-    Args:
-        task: of `TaskName`.
-        result: of that task's evaluator.
-
-    Returns:
-        Those that this result has: a protocol without a number (the released accidents have no precision) has no such
-        headline either.
-
-    Raises:
-        ChoiceError: no such task.
+    A number that the protocol does not have is left out: the released accidents have no precision.
     """
-    choice("task", task, get_args(TaskName))
     return tuple(
         Headline(
-            name=row.name.replace("*", key),
+            name=(row.name or row.path.rpartition("/")[2]).replace("*", key),
             value=known(value),
             unit=row.unit,
             higher_is_better=_HIGHER_IS_BETTER[row.better],
             path=row.path.replace("*", key),
         )
-        for row in getattr(result, "rows", ())
+        for row in result.rows
+        if row.is_headline
         for key, value in _found(result, row.path)
     )
 

@@ -18,7 +18,6 @@ from deepaccident_devkit.evaluation.runs.bundles import SUMMARY_FILE, Line
 from deepaccident_devkit.evaluation.runs.setups import TASKS
 from deepaccident_devkit.evaluation.task import LIMITS, value_text
 from deepaccident_devkit.explore.scenarios import UNKNOWN
-from deepaccident_devkit.render.evaluation.figures import MAIN_NUMBERS
 from deepaccident_devkit.render.outcomes.above import count_words
 from deepaccident_devkit.support.json_text import as_record
 from deepaccident_devkit.support.pages import scalar
@@ -171,7 +170,7 @@ def _facts(bundle: Bundle) -> dict[str, str]:
 def _main_number(summary: Json) -> MainNumber | None:
     """The first of the task's main numbers that the result has."""
     there = {each["path"]: each for each in summary["headlines"]}
-    path = next((each for each in MAIN_NUMBERS.get(summary["task"], ()) if each in there), None)
+    path = next((path for path in TASKS[summary["task"]].main_numbers if path in there), None)
     if path is None:
         return None
     unit: Any = there[path]["unit"]

@@ -15,11 +15,10 @@ import numpy as np
 from deepaccident_devkit.errors import EvaluationError
 from deepaccident_devkit.evaluation.results import Results, read_results
 from deepaccident_devkit.evaluation.runs import Bundle, read_bundle
-from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup, TaskName, scenario_of
+from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup, scenario_of
 from deepaccident_devkit.evaluation.task import headlines, value_text
 from deepaccident_devkit.explore.background import Job, Jobs
 from deepaccident_devkit.explore.evaluations import finite
-from deepaccident_devkit.render.evaluation.figures import MAIN_NUMBERS
 from deepaccident_devkit.support.arrays import FloatArray
 
 if TYPE_CHECKING:
@@ -81,8 +80,7 @@ class Model:
         """The rules: of the bundle, or those by which such results are looked at without one."""
         if self.bundle is not None:
             return self.bundle.setup
-        kind: Any = self.results.task if self.results is not None else "accident"
-        task: TaskName = kind
+        task = self.results.task if self.results is not None else "accident"
         form = None if self.results is None else self.results.form
         horizon = 2.0 if form is None else min(2.0, (form.frames - 1) * form.step)
         return EvaluationSetup(task=task, protocol=_PROTOCOL_OF.get(task, "clean"), horizon=horizon or 0.5)
@@ -130,16 +128,17 @@ class Model:
     def _scores(self) -> Scores | None:
         if self.bundle is None:
             return None
-        evaluator, task = self.bundle.evaluator(), self.setup.task
-        known = {each.path: each for each in headlines(task, evaluator.compute())}
-        main = next((known[path] for path in MAIN_NUMBERS[task] if path in known), None)
+        evaluator = self.bundle.evaluator()
+        known = {each.path: each for each in headlines(evaluator.compute())}
+        paths = evaluator.main_numbers
+        main = next((known[path] for path in paths if path in known), None)
         if main is None:  # this protocol has no such number
-            return Scores(name=MAIN_NUMBERS[task][0], higher_is_better=True, samples={}, scenarios={})
+            return Scores(name=paths[0] if paths else "", higher_is_better=True, samples={}, scenarios={})
         higher = main.higher_is_better is not False
 
         def score(tokens: Sequence[str]) -> Score:
             result = evaluator.compute(tokens)
-            value = next((each.value for each in headlines(task, result) if each.path == main.path), None)
+            value = next((each.value for each in headlines(result) if each.path == main.path), None)
             return Score(value, value_text(value, main.unit))
 
         by_scenario: dict[str, list[str]] = {}

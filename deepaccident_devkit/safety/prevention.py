@@ -23,7 +23,7 @@ from deepaccident_devkit.evaluation.intervals import Resampling
 from deepaccident_devkit.evaluation.runs import EvaluationRun
 from deepaccident_devkit.evaluation.runs.further import FurtherResult, with_further
 from deepaccident_devkit.evaluation.runs.text import number_text
-from deepaccident_devkit.evaluation.warning import CleanWarnings, WarningEvaluator
+from deepaccident_devkit.evaluation.warning import WARNING_PROTOCOLS, CleanWarnings, WarningEvaluator
 from deepaccident_devkit.evaluation.warning.anticipation import LATENCIES, draws_of, mean_of, reference_threshold
 from deepaccident_devkit.evaluation.warning.recordings import (
     GIVEN,
@@ -200,6 +200,9 @@ class PreventedEvaluator(Evaluator[PreventedResult]):
     `compute` gives a `PreventedResult`. `evaluation.runs.prevented_accidents` makes the tables and takes the counts.
     """
 
+    protocols = WARNING_PROTOCOLS
+    result_class = PreventedResult
+
     def __init__(self, outcomes: AccidentOutcomes, protocol: str | CleanWarnings = "clean") -> None:
         """Start without samples.
 
@@ -211,25 +214,18 @@ class PreventedEvaluator(Evaluator[PreventedResult]):
             EvaluationError: it is another protocol, which has no recordings with scores.
             ChoiceError: no protocol has that name.
         """
-        super().__init__()
-        self._warnings = WarningEvaluator(protocol)
-        if not isinstance(self._warnings.protocol, CleanWarnings):
+        super().__init__(protocol)
+        if not isinstance(self.protocol, CleanWarnings):
             raise EvaluationError(
-                "protocol: prevented accidents are counted by the protocol clean, found "
-                f"{type(self._warnings.protocol).__name__}"
+                f"protocol: prevented accidents are counted by the protocol clean, found {type(self.protocol).__name__}"
             )
-        self._rules, self._outcomes = self._warnings.protocol, outcomes
-
-    @property
-    def settings(self) -> dict[str, Any]:
-        """The protocol's choices."""
-        return self._warnings.settings
+        self._outcomes = outcomes
 
     def update(self, token: str, *arguments: Any) -> None:
         """Count one sample, as `WarningEvaluator.update` does; raises EvaluationError."""
-        counting = self._warnings.fresh()
-        counting.update(token, *arguments)
-        self.add(token, counting.counts[token])
+        warnings = WarningEvaluator(self.protocol)
+        warnings.update(token, *arguments)
+        self.add(token, warnings.counts[token])
 
     def result_of(self, counts: Collection[Counts]) -> PreventedResult:
         """The figures of some samples' counts, in any order, without references and curves."""
@@ -268,7 +264,7 @@ class PreventedEvaluator(Evaluator[PreventedResult]):
         curves: Mapping[str, PreventionCurve] | None = None,
     ) -> PreventedResult:
         return PreventedResult(
-            operating_by="budget" if self._rules.threshold is None else "given",
+            operating_by="budget" if self.protocol.threshold is None else "given",
             alarms=self._alarms,
             groups=made[GIVEN],
             references={name: each for name, each in made.items() if name != GIVEN},
@@ -281,7 +277,7 @@ class PreventedEvaluator(Evaluator[PreventedResult]):
     @property
     def _alarms(self) -> str:
         """A predictor that names nobody has no right alarms."""
-        return next(name for name, (_, scores_of) in _ALARMS.items() if scores_of == self._rules.scores_of)
+        return next(name for name, (_, scores_of) in _ALARMS.items() if scores_of == self.protocol.scores_of)
 
     def _groups(self, recordings: Sequence[Recording]) -> Iterator[tuple[str, list[Recording]]]:
         """Group → its recordings, accidents of pedestrians apart; those without an accident are in both."""
@@ -303,7 +299,7 @@ class PreventedEvaluator(Evaluator[PreventedResult]):
         main = ends[self._alarms]
         weight = np.ones(len(main.part)) if draw is None else draw[main.part].astype(np.float64)
         quiet = main.quiet_braking(weight)
-        threshold = quiet if self._rules.threshold is None else self._rules.threshold
+        threshold = quiet if self.protocol.threshold is None else self.protocol.threshold
         return self._figures(ends, threshold, quiet, weight)
 
     def _figures(
@@ -347,7 +343,7 @@ class PreventedEvaluator(Evaluator[PreventedResult]):
                 "an alarm that is over before the driver brakes costs nothing, but counts as a warning: compare with "
                 "'random per frame, quiet', and with the share 'if lasting', where alarms must outlast the reaction"
             )
-        if groups and self._rules.threshold is None:
+        if groups and self.protocol.threshold is None:
             yield (
                 f"the threshold is the lowest with at most {BUDGET:g} braking second a minute on these very "
                 "recordings, which flatters; take it from another split, evaluated with --prevented: --threshold-from "

@@ -9,7 +9,7 @@ import math
 from bisect import bisect_left
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Final
+from typing import ClassVar, Final
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from deepaccident_devkit.accidents.outcomes import BRAKINGS, OUTCOMES, Braking
 from deepaccident_devkit.accidents.recorded import Skipped
 from deepaccident_devkit.errors import EvaluationError
 from deepaccident_devkit.evaluation.evaluator import ratio
-from deepaccident_devkit.evaluation.task import FrozenMappings
+from deepaccident_devkit.evaluation.task import FrozenMappings, Row
 from deepaccident_devkit.evaluation.warning.recordings import MINUTE, AlarmRuns, Recording, ScoresOf, series_of
 from deepaccident_devkit.support.arrays import BoolArray, FloatArray, FrozenArrays, IntArray, ShortRepr
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
@@ -174,6 +174,12 @@ class PreventedResult(FrozenMappings):
         notes: sentences that a reader of the numbers should know.
     """
 
+    rows: ClassVar[tuple[Row, ...]] = (
+        Row("shares/*", "share", "neither", is_headline=False),
+        Row("warned", "share", "higher", is_headline=False),
+        Row("extrapolated", "share", "neither", is_headline=False),
+        Row("braking_seconds_per_minute", "1/min", is_headline=False),
+    )
     operating_by: str
     alarms: str
     groups: Mapping[str, PreventionFigures]

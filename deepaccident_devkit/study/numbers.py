@@ -148,17 +148,17 @@ def numbers_of_rows(tokens: Collection[str], row: Seeds, less: Seeds | None = No
     found: dict[str, dict[str, Any]] = {}
     names = {token: cluster_of(scenario_of(token)) for token in tokens}
     clusters = dict(sorted(names.items(), key=itemgetter(1, 0)))
-    for kind in next(iter(row.values())):
+    for kind, evaluator in next(iter(row.values())).items():
         paths = {path: name for name, (of, path, _) in NUMBERS.items() if of == kind}
         ours = _values(row, kind, tokens, paths)
         theirs = {"": np.zeros(len(paths))} if less is None else _values(less, kind, tokens, paths)
         values = np.mean([*ours.values()], axis=0) - np.mean([*theirs.values()], axis=0)
         low = high = np.full(len(paths), math.nan)
         if len({*clusters.values()}) >= LEAST_CLUSTERS:
-            drawn = _drawn(row, kind, clusters, paths)
+            drawn, rows = _drawn(row, kind, clusters, paths), evaluator.result_class.rows
             if less is not None:
-                drawn = drawn - _drawn(less, kind, clusters, paths)
-            low, high, _ = ends_of_draws(paths, values, drawn, RESAMPLING.confidence, limited=less is None)
+                drawn, rows = drawn - _drawn(less, kind, clusters, paths), None
+            low, high, _ = ends_of_draws(paths, values, drawn, RESAMPLING.confidence, rows)
         seeds = {}
         for seed in dict.fromkeys(filter(None, (*ours, *theirs))):
             pair = [each.get(seed, each.get("")) for each in (ours, theirs)]

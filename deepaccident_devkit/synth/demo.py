@@ -316,7 +316,7 @@ def demo_table(release: DeepAccident) -> list[list[str]]:
                 path = predict_results(release, task, tokens, Path(folder) / task, baseline, workers=1)
                 setup = EvaluationSetup(task=task, protocol=protocol, horizon=_SELECTION.horizon)
                 run = evaluate_results(release, path, setup, _SELECTION, workers=1)
-                found = {each.name: each for each in headlines(task, run.result)}
+                found = {each.name: each for each in headlines(run.result)}
                 row += [found[number].text().removesuffix(" %") for number in numbers.values()]
         rows.append(row)
     return rows

@@ -1,12 +1,13 @@
-"""How well accidents are foreseen, by three protocols: the task `ACCIDENT` and its evaluator."""
+"""How well accidents are foreseen, by three protocols: the task `accident`."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict
 from types import MappingProxyType
-from typing import Any, Final
+from typing import Any, ClassVar, Final
 
+from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.evaluation.accident.boxes import BoxAccidents
 from deepaccident_devkit.evaluation.accident.paper import PaperAccidents
 from deepaccident_devkit.evaluation.accident.released import ReleasedAccidents
@@ -28,7 +29,6 @@ from deepaccident_devkit.evaluation.accident_truth import (
 from deepaccident_devkit.evaluation.evaluator import Counts, Evaluator
 from deepaccident_devkit.evaluation.map_accidents import AccidentReading
 from deepaccident_devkit.evaluation.predictions import Prediction, checked_prediction
-from deepaccident_devkit.evaluation.task import Task, protocol_of
 from deepaccident_devkit.motion import MotionLabels
 
 __all__ = [
@@ -69,22 +69,26 @@ class AccidentEvaluator(Evaluator[AccidentResult]):
     0
     """
 
-    def __init__(self, protocol: str | AccidentProtocol = "released") -> None:
-        """Start without samples.
+    task = "accident"
+    description = "Evaluate predicted accidents: APA, and the errors in who, where and when."
+    result_kinds: ClassVar[tuple[str, ...]] = ("motion", "accident")
+    protocols = PROTOCOLS
+    result_class = AccidentResult
+    main_numbers: ClassVar[tuple[str, ...]] = ("apa", "position_error")
+    needs_meta = True
 
-        Args:
-            protocol: of `PROTOCOLS` by name, or one of them with other fields.
-
-        Raises:
-            ChoiceError: no protocol has that name, or it is of another type.
-        """
-        super().__init__()
-        self.protocol = protocol_of(protocol, AccidentProtocol, PROTOCOLS)  # type: ignore[arg-type]  # a union is a kind too
+    protocol: AccidentProtocol
 
     @property
     def settings(self) -> dict[str, Any]:
         """The protocol and its choices."""
         return {"protocol": type(self.protocol).__name__, "choices": asdict(self.protocol)}
+
+    def truth(
+        self, dataset: Dataset, token: str, form: Any, horizon: float, /
+    ) -> tuple[MotionLabels | None, AccidentContext]:
+        """Return the labels that the protocol compares with, None for none, and the accident to come."""
+        return compared_facts(dataset, token, self.protocol, form, horizon)
 
     def update(
         self,
@@ -115,6 +119,17 @@ class AccidentEvaluator(Evaluator[AccidentResult]):
         """The metrics of some samples' counts, in any order."""
         return self.protocol.result(counts)
 
+    def sample_row(self, token: str) -> dict[str, Any]:
+        """Return whether an accident comes, cases by metres allowed, and the errors within the largest distance."""
+        result = self.compute([token])
+        truth = next((name for name, count in result.truths.items() if count), None)
+        row: dict[str, Any] = {"positive": bool(result.positives), "truth": truth}
+        for distance, within in result.within.items():
+            row |= {f"{case}_{distance:g}m": getattr(within, case) for case in ("tp", "fp", "fn")}
+        widest = result.within[max(result.within)]
+        errors = {"position_error": widest.position_error, "time_error": widest.time_error, "id_error": widest.id_error}
+        return row | {name: None if error is None else float(error) for name, error in errors.items()}
+
     def pooled(self, counts: Collection[Counts]) -> Sequence[Counts]:
         """Fewer counts with the same result."""
         return self.protocol.pooled(counts)
@@ -135,13 +150,3 @@ def compared_accidents(
         EvaluationError: the prediction is neither motion nor accidents, or the protocol lacks its truth.
     """
     return protocol.compared(checked_prediction(prediction), label, context)
-
-
-ACCIDENT: Final = Task(
-    name="accident",
-    kinds=("motion", "accident"),
-    protocols=PROTOCOLS,
-    evaluator=AccidentEvaluator,
-    truth=compared_facts,
-    needs_meta=True,
-)

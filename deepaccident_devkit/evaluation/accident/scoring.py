@@ -69,18 +69,17 @@ class AccidentResult(TaskResult):
         beside: results of other choices that are always printed too, by `name=value`.
     """
 
-    task: ClassVar[str] = "accident"
     rows: ClassVar[tuple[Row, ...]] = (
-        Row("apa", "apa", "share", "higher"),
-        Row("precision", "precision", "share", "higher"),
-        Row("recall", "recall", "share", "higher"),
-        Row("false_alarm_rate", "false_alarm_rate", "share"),
-        Row("average_precision", "average_precision", "share", "higher"),
-        Row("within/*/accuracy", "accuracy@*", "share", "higher"),
-        Row("id_error", "id_error", "share"),
-        Row("position_error", "position_error", "m"),
-        Row("time_error", "time_error", "s"),
-        Row("lateness", "lateness", "s", "neither", is_signed=True),
+        Row("apa", "share", "higher"),
+        Row("precision", "share", "higher"),
+        Row("recall", "share", "higher"),
+        Row("false_alarm_rate", "share"),
+        Row("average_precision", "share", "higher"),
+        Row("within/*/accuracy", "share", "higher", name="accuracy@*"),
+        Row("id_error", "share"),
+        Row("position_error", "m"),
+        Row("time_error", "s"),
+        Row("lateness", "s", "neither", is_signed=True),
     )
     within: Mapping[float, AccidentsWithin]
     apa: float

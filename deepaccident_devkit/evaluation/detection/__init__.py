@@ -1,13 +1,11 @@
-"""Detection metrics: average precision and errors of boxes, by the released code's rules, the paper's and others.
-
-The task is `DETECTION`.
-"""
+"""The task `detection`: average precision and errors of boxes, by the released code's rules, the paper's and others."""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -31,7 +29,6 @@ from deepaccident_devkit.evaluation.detection.matching import (
 )
 from deepaccident_devkit.evaluation.detection.result import DetectionResult, Ledger, detection_result, drawn_results
 from deepaccident_devkit.evaluation.evaluator import Counts, Evaluator
-from deepaccident_devkit.evaluation.task import Task
 from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.geometry.boxes import checked_boxes
 from deepaccident_devkit.support.arrays import FrozenArrays, IntArray
@@ -63,6 +60,16 @@ class DetectionEvaluator(Evaluator[DetectionResult]):
         protocol: the rules, with the switches that were given.
     """
 
+    task = "detection"
+    description = "Evaluate detected boxes: AP and errors."
+    result_kinds: ClassVar[tuple[str, ...]] = ("detection",)
+    protocols = DETECTION_PROTOCOLS
+    result_class = DetectionResult
+    main_numbers: ClassVar[tuple[str, ...]] = ("mean_average_precision",)
+    has_horizon = False
+
+    protocol: DetectionProtocol
+
     def __init__(self, protocol: str | DetectionProtocol = "released", **switches: Any) -> None:
         """Start without samples.
 
@@ -74,13 +81,22 @@ class DetectionEvaluator(Evaluator[DetectionResult]):
             ChoiceError: no such protocol, switch or choice.
             ConfigError: choices that exclude each other.
         """
-        super().__init__()
-        self.protocol = detection_protocol(protocol, **switches)
+        super().__init__(detection_protocol(protocol, **switches))
 
     @property
     def settings(self) -> dict[str, Any]:
         """The protocol's choices."""
         return self.protocol.as_dict()
+
+    def read(self, results: Any, dataset: Dataset, token: str) -> DetectedBoxes:
+        """Return the boxes, which results hold in the world, in the protocol's frame around the agent."""
+        boxes: DetectedBoxes = results.prediction(token)
+        frame = self.protocol.frame
+        return boxes.transform(dataset.world_from(token, frame).inverse(), frame)
+
+    def truth(self, dataset: Dataset, token: str, /, *_unused: Any) -> tuple[Boxes]:
+        """Return the true boxes in the protocol's frame."""
+        return (detection_truth(dataset, token, self.protocol),)
 
     def update(self, token: str, prediction: DetectedBoxes, truth: Boxes) -> None:
         """Take a sample.
@@ -114,6 +130,13 @@ class DetectionEvaluator(Evaluator[DetectionResult]):
     def result_of(self, counts: Collection[Counts]) -> DetectionResult:
         """The metrics of some samples' counts, in any order."""
         return detection_result(counts, self.protocol)
+
+    def sample_row(self, token: str) -> dict[str, int]:
+        """Return how many boxes count, and true positives by threshold, over all classes and ranges."""
+        counts, thresholds = self._counts[token], self.protocol.thresholds
+        hits = Counter(cell % len(thresholds) for cell in counts["tp"][0])
+        row = {"truths": sum(counts["truths"]), "detections": len(counts["detections"][0])}
+        return row | {f"tp_{threshold:g}": hits[level] for level, threshold in enumerate(thresholds)}
 
     def resampled(self, parts: Sequence[Sequence[Counts]], times: IntArray) -> Iterator[DetectionResult]:
         """The result of each draw (`Evaluator.resampled`); what does not depend on the draw is made once."""
@@ -195,20 +218,3 @@ def _holders(ring: Ring, rules: DetectionProtocol, level: int) -> Mapping[int, i
         counts = {candidate: bool(ring.counts[candidate // classes]) for candidate in reach}
         taken = nearest_by_truth(reach, counts, ring.truth_counts.tolist()).holder
     return {truth: candidate // classes for truth, candidate in taken.items()}
-
-
-def _read(results: Any, dataset: Dataset, token: str, rules: DetectionProtocol) -> DetectedBoxes:
-    """The boxes, which results hold in the world, in the protocol's frame around the agent."""
-    found: DetectedBoxes = results.prediction(token)
-    return found.transform(dataset.world_from(token, rules.frame).inverse(), rules.frame)
-
-
-DETECTION: Final = Task(
-    name="detection",
-    kinds=("detection",),
-    protocols=DETECTION_PROTOCOLS,
-    evaluator=DetectionEvaluator,
-    read=_read,
-    truth=lambda dataset, token, rules, _form, _horizon: (detection_truth(dataset, token, rules),),
-    has_horizon=False,
-)

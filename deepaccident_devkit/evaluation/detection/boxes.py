@@ -238,7 +238,7 @@ def detection_protocol(protocol: str | DetectionProtocol, **switches: Any) -> De
         ChoiceError: no such protocol or choice.
         ConfigError: choices that cannot be.
     """
-    return switched(protocol_of(protocol, DetectionProtocol, DETECTION_PROTOCOLS), switches)
+    return switched(protocol_of(protocol, DETECTION_PROTOCOLS), switches)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -44,14 +44,13 @@ class DetectionResult(TaskResult, FrozenArrays):
         samples: number of samples.
     """
 
-    task: ClassVar[str] = "detection"
     rows: ClassVar[tuple[Row, ...]] = (
-        Row("mean_average_precision", "mAP", "%", "higher"),
-        Row("mean_errors/ATE", "mATE", "m"),
-        Row("mean_errors/ASE", "mASE", "1 - overlap"),
-        Row("mean_errors/AOE", "mAOE", "rad"),
-        Row("mean_errors/AVE", "mAVE", "m/s"),
-        Row("class_average_precision/*", "AP *", "%", "higher"),
+        Row("mean_average_precision", "%", "higher", name="mAP"),
+        Row("mean_errors/ATE", "m", name="mATE"),
+        Row("mean_errors/ASE", "1 - overlap", name="mASE"),
+        Row("mean_errors/AOE", "rad", name="mAOE"),
+        Row("mean_errors/AVE", "m/s", name="mAVE"),
+        Row("class_average_precision/*", "%", "higher", name="AP *"),
     )
     mean_average_precision: float
     class_average_precision: Mapping[str, float]

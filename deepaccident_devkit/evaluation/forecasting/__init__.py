@@ -1,7 +1,6 @@
-"""Predicted paths of other actors, compared with the recorded ones: the task `FORECASTING` and its evaluator."""
+"""Predicted paths of other actors, compared with the recorded ones: the task `forecasting`."""
 
 from deepaccident_devkit.evaluation.forecasting.evaluator import (
-    FORECASTING,
     FORECASTING_PROTOCOLS,
     ForecastingEvaluator,
     ForecastingProtocol,
@@ -12,7 +11,6 @@ from deepaccident_devkit.evaluation.forecasting.of_motion import forecasts_of
 from deepaccident_devkit.evaluation.forecasting.truth import ForecastingTruth, forecasting_truth
 
 __all__ = [
-    "FORECASTING",
     "FORECASTING_PROTOCOLS",
     "Forecast",
     "ForecastingEvaluator",

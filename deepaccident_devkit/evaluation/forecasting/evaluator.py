@@ -7,10 +7,11 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from types import MappingProxyType
-from typing import ClassVar, Final
+from typing import Any, ClassVar, Final
 
 import numpy as np
 
+from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import ConfigError, EvaluationError, shortened
 from deepaccident_devkit.evaluation.evaluator import Counts
 from deepaccident_devkit.evaluation.forecasting.metrics import (
@@ -32,9 +33,9 @@ from deepaccident_devkit.evaluation.forecasting.truth import (
     ForecastingTruth,
     forecasting_truth,
 )
-from deepaccident_devkit.evaluation.means import MEAN_OF_SCENARIOS, Column, MeansEvaluator, MeansResult, Sums
+from deepaccident_devkit.evaluation.means import MEAN_OF_SCENARIOS, MeansEvaluator, MeansResult, Sums, table_rows
 from deepaccident_devkit.evaluation.predictions import LONG_PATHS, LONGEST_PATH
-from deepaccident_devkit.evaluation.task import Task
+from deepaccident_devkit.evaluation.task import Row
 from deepaccident_devkit.support.arrays import FloatArray, check_least
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
@@ -81,19 +82,20 @@ class ForecastingResult(MeansResult):
     """
 
     __slots__ = ()
-    task = "forecasting"
-    main_tables: ClassVar[Sequence[str]] = (table_name(3, 6), table_name(3, 1))
-    main_row = EVERYBODY
-    columns: ClassVar[Mapping[str, Column]] = {
-        "min_fde": Column("m"),
-        "min_ade": Column("m"),
-        "miss": Column("share"),
-        "brier_min_fde": Column("m"),
-        "min_ade_any": Column("m", is_headline=False),
-        "cut_ade": Column("m", is_headline=False),
-        "without": Column("share", is_headline=False),
-        "collisions": Column("share", is_headline=False),
-    }
+    rows: ClassVar[tuple[Row, ...]] = table_rows(
+        columns=(
+            Row("min_fde", "m"),
+            Row("min_ade", "m"),
+            Row("miss", "share"),
+            Row("brier_min_fde", "m"),
+            Row("min_ade_any", "m", is_headline=False),
+            Row("cut_ade", "m", is_headline=False),
+            Row("without", "share", is_headline=False),
+            Row("collisions", "share", is_headline=False),
+        ),
+        main_tables=(table_name(3, 6), table_name(3, 1)),
+        main_row=EVERYBODY,
+    )
 
 
 class ForecastingEvaluator(MeansEvaluator[ForecastingResult]):
@@ -105,13 +107,26 @@ class ForecastingEvaluator(MeansEvaluator[ForecastingResult]):
     0
     """
 
-    result_class = ForecastingResult
+    task = "forecasting"
+    description = "Evaluate actors' predicted paths: minADE, minFDE, misses."
+    result_kinds: ClassVar[tuple[str, ...]] = ("forecasting",)
     protocols = FORECASTING_PROTOCOLS
+    result_class = ForecastingResult
+    main_numbers: ClassVar[tuple[str, ...]] = ("means/3 s, K = 6/all/min_fde",)
+    needs_whole_recordings = True
+    has_horizon = False
+
+    protocol: ForecastingProtocol
+    main_row = EVERYBODY
     order: ClassVar[Sequence[str]] = (
         *(table_name(horizon, modes) for horizon in (3, 1, 2, 5) for modes in (6, 1)),
         *(EVERYBODY, MEAN_OF_SCENARIOS, TOGETHER),
         *(*CLASSES, *ROLES, *SEEN, *TO_IMPACT, *MOTIONS),
     )
+
+    def truth(self, dataset: Dataset, token: str, /, *_unused: Any) -> tuple[ForecastingTruth]:
+        """Return the recorded paths of all actors that a label shows at the present."""
+        return (forecasting_truth(dataset, token),)
 
     def update(self, token: str, forecasts: Iterable[Forecast], truth: ForecastingTruth) -> None:
         """Count one sample.
@@ -192,12 +207,3 @@ def _together(
 
 _WITHOUT: Final = "no forecast of {true actor}: without errors, counted in `without`"
 _UNKNOWN: Final = "not counted: {forecast} of the agent itself, or of an actor that no label shows then"
-FORECASTING: Final = Task(
-    name="forecasting",
-    kinds=("forecasting",),
-    protocols=FORECASTING_PROTOCOLS,
-    evaluator=ForecastingEvaluator,
-    truth=lambda dataset, token, _rules, _form, _horizon: (forecasting_truth(dataset, token),),
-    whole_recordings=True,
-    has_horizon=False,
-)

@@ -3,7 +3,6 @@
 from deepaccident_devkit.evaluation.planning.cells import CELL_PROTOCOLS, CellRules
 from deepaccident_devkit.evaluation.planning.clean import CleanPlanning
 from deepaccident_devkit.evaluation.planning.evaluator import (
-    PLANNING,
     PLANNING_PROTOCOLS,
     PlanningEvaluator,
     PlanningResult,
@@ -12,7 +11,6 @@ from deepaccident_devkit.evaluation.planning.scene import Plan, PlanningScene, p
 
 __all__ = [
     "CELL_PROTOCOLS",
-    "PLANNING",
     "PLANNING_PROTOCOLS",
     "CellRules",
     "CleanPlanning",

@@ -8,8 +8,9 @@ from typing import Any, ClassVar, Final
 
 import numpy as np
 
+from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import EvaluationError
-from deepaccident_devkit.evaluation.means import Column, MeansEvaluator, MeansResult, Sums
+from deepaccident_devkit.evaluation.means import MeansEvaluator, MeansResult, Sums, table_rows
 from deepaccident_devkit.evaluation.planning.cells import (
     CELL_PROTOCOLS,
     HORIZONS,
@@ -29,7 +30,7 @@ from deepaccident_devkit.evaluation.planning.scene import (
     trivial_plans,
 )
 from deepaccident_devkit.evaluation.predictions import LONG_PATHS, LONGEST_PATH
-from deepaccident_devkit.evaluation.task import Task
+from deepaccident_devkit.evaluation.task import Row
 from deepaccident_devkit.geometry.box_arrays import corner_offsets
 from deepaccident_devkit.support.arrays import BoolArray
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
@@ -54,33 +55,34 @@ class PlanningResult(MeansResult):
     """Tables by horizon, and in `clean` by lead; rows are the plans that are given and the trivial ones."""
 
     __slots__ = ()
-    task = "planning"
-    main_tables: ClassVar[Sequence[str]] = (*BY_LEAD, *_BY_HORIZON, _MEAN)
-    main_row = GIVEN
-    columns: ClassVar[Mapping[str, Column]] = {
-        "avoided": Column("%", "higher"),
-        "contact": Column("%"),
-        "striking": Column("%"),
-        "striking_twins": Column("%"),
-        "lost_twins": Column("%", is_signed=True),
-        "l2": Column("m"),
-        "l2_mean": Column("m"),
-        "collision": Column("%"),
-        "point_collision": Column("%"),
-        "left_out": Column("%", "neither"),
-        "l2_endpoint": Column("m", is_headline=False),
-        "impact_speed": Column("m/s", is_headline=False),
-        "relative_speed": Column("m/s", is_headline=False),
-        "prolonged": Column("%", "neither", is_headline=False),
-        "struck": Column("%", is_headline=False),
-        "struck_twins": Column("%", is_headline=False),
-        "lost": Column("%", is_headline=False, is_signed=True),
-        "lost_way": Column("m", is_headline=False, is_signed=True),
-        "lost_way_twins": Column("m", is_headline=False, is_signed=True),
-        "infeasible": Column("%", is_headline=False),
-        "infeasible_twins": Column("%", is_headline=False),
-        "braking_twins": Column("%", is_headline=False),
-    }
+    rows: ClassVar[tuple[Row, ...]] = table_rows(
+        columns=(
+            Row("avoided", "%", "higher"),
+            Row("contact", "%"),
+            Row("striking", "%"),
+            Row("striking_twins", "%"),
+            Row("lost_twins", "%", is_signed=True),
+            Row("l2", "m"),
+            Row("l2_mean", "m"),
+            Row("collision", "%"),
+            Row("point_collision", "%"),
+            Row("left_out", "%", "neither"),
+            Row("l2_endpoint", "m", is_headline=False),
+            Row("impact_speed", "m/s", is_headline=False),
+            Row("relative_speed", "m/s", is_headline=False),
+            Row("prolonged", "%", "neither", is_headline=False),
+            Row("struck", "%", is_headline=False),
+            Row("struck_twins", "%", is_headline=False),
+            Row("lost", "%", is_headline=False, is_signed=True),
+            Row("lost_way", "m", is_headline=False, is_signed=True),
+            Row("lost_way_twins", "m", is_headline=False, is_signed=True),
+            Row("infeasible", "%", is_headline=False),
+            Row("infeasible_twins", "%", is_headline=False),
+            Row("braking_twins", "%", is_headline=False),
+        ),
+        main_tables=(*BY_LEAD, *_BY_HORIZON, _MEAN),
+        main_row=GIVEN,
+    )
 
 
 class PlanningEvaluator(MeansEvaluator[PlanningResult]):
@@ -94,8 +96,18 @@ class PlanningEvaluator(MeansEvaluator[PlanningResult]):
     0
     """
 
-    result_class = PlanningResult
+    task = "planning"
+    description = "Evaluate planned paths: collisions, and distances from the recorded path."
+    result_kinds: ClassVar[tuple[str, ...]] = ("planning",)
     protocols = PLANNING_PROTOCOLS
+    result_class = PlanningResult
+    main_numbers: ClassVar[tuple[str, ...]] = ("means/3 s/given/l2",)
+    needs_whole_recordings = True
+    needs_meta = True
+    vehicles_only = True
+    has_horizon = False
+
+    protocol: Protocol
     order: ClassVar[Sequence[str]] = (
         *(f"{role}{lead}{end}" for role in ("", "bystander, ") for end in ("", " to contact") for lead in BY_LEAD),
         *_BY_HORIZON,
@@ -103,6 +115,10 @@ class PlanningEvaluator(MeansEvaluator[PlanningResult]):
         GIVEN,
         *TRIVIAL,
     )
+
+    def truth(self, dataset: Dataset, token: str, /, *_unused: Any) -> tuple[PlanningScene]:
+        """Return what happens around the ego vehicle; the rules of the public codes count in whole recordings."""
+        return (planning_scene(dataset, token, cut=isinstance(self.protocol, CleanPlanning)),)
 
     def update(self, token: str, plans: Iterable[Plan], scene: PlanningScene) -> None:
         """Count one sample.
@@ -168,18 +184,3 @@ def _drawn(scene: PlanningScene, rules: CellRules) -> BoolArray:
     if rules.objects == "vehicles":
         return ~scene.is_pedestrian
     return scene.seen if rules.objects == "seen" else np.isfinite(scene.footprint[0, :, 0])
-
-
-PLANNING: Final = Task(
-    name="planning",
-    kinds=("planning",),
-    protocols=PLANNING_PROTOCOLS,
-    evaluator=PlanningEvaluator,
-    truth=lambda dataset, token, rules, _form, _horizon: (
-        planning_scene(dataset, token, cut=isinstance(rules, CleanPlanning)),
-    ),
-    whole_recordings=True,
-    needs_meta=True,
-    vehicles_alone=True,
-    has_horizon=False,
-)

@@ -208,7 +208,7 @@ def compare_bundles(
     scenarios = list(dict.fromkeys(map(scenario_of, tokens)))
     setup = bundles[0].setup
     results = [evaluator.compute(tokens) for evaluator in evaluators]
-    shown = {each.path: each for result in results for each in headlines(setup.task, result)}
+    shown = {each.path: each for result in results for each in headlines(result)}
     first, second = (numbers_of(result) for result in results)
     names = list(dict.fromkeys([*(name for name in shown if name in {**first, **second}), *first, *second]))
     values = np.array([[numbers.get(name, math.nan) for name in names] for numbers in (first, second)])

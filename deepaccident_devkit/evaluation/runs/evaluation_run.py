@@ -24,7 +24,8 @@ from deepaccident_devkit.evaluation.breakdowns import (
     breakdown,
     sample_attributes,
 )
-from deepaccident_devkit.evaluation.evaluator import Evaluator, evaluate_samples
+from deepaccident_devkit.evaluation.counting import evaluate_samples
+from deepaccident_devkit.evaluation.evaluator import Evaluator
 from deepaccident_devkit.evaluation.intervals import Resampling
 from deepaccident_devkit.evaluation.results import Results, read_results
 from deepaccident_devkit.evaluation.runs.setups import (
@@ -72,7 +73,7 @@ BREAKDOWNS: Final = (
 
 def breakdowns_of(task: str) -> tuple[str, ...]:
     """What a task's results are broken down by if nothing else is asked for: warnings by whole recordings alone."""
-    whole = TASKS[task].whole_recordings
+    whole = TASKS[task].needs_whole_recordings
     return tuple(name for name in BREAKDOWNS if not (whole and name in WITHIN_RECORDINGS))
 
 
@@ -242,7 +243,7 @@ class EvaluationRun:
                 "fingerprint": self.release.fingerprint,
             },
             "results": self.results,
-            "headlines": [{**asdict(each), "text": each.text()} for each in headlines(self.setup.task, self.result)],
+            "headlines": [{**asdict(each), "text": each.text()} for each in headlines(self.result)],
             "metrics": self.result.as_dict(),
             "breakdowns": {each.by: self._breakdown(each) for each in self.breakdowns},
             "environment": {
@@ -269,7 +270,7 @@ class EvaluationRun:
                 "samples": group.samples,
                 "scenarios": group.scenarios,
                 "clusters": group.clusters,
-                "headlines": {each.path: each.value for each in headlines(self.setup.task, group.result)},
+                "headlines": {each.path: each.value for each in headlines(group.result)},
                 "metrics": group.result.as_dict(),
                 "intervals": plain(group.intervals),
                 "notes": list(group.notes),

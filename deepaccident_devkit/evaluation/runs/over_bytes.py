@@ -159,7 +159,7 @@ def over_bytes(
                 low=ends[each.path][0] if each.path in ends else None,
                 high=ends[each.path][1] if each.path in ends else None,
             )
-            for each in headlines(task, result)
+            for each in headlines(result)
             if each.value is not None
         ]
     shown = [name for name, count in Counter(each.headline for each in points).items() if count == len(bundles)]

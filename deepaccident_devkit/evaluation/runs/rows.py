@@ -3,43 +3,33 @@
 from __future__ import annotations
 
 import json
-from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
 from deepaccident_devkit.errors import MOST_TOLD, ResultsError, shortened
-from deepaccident_devkit.evaluation.accident import AccidentResult
-from deepaccident_devkit.evaluation.detection import DetectionProtocol
-from deepaccident_devkit.evaluation.evaluator import Counts
-from deepaccident_devkit.evaluation.motion import MotionResult
 from deepaccident_devkit.evaluation.runs.evaluation_run import EvaluationRun
-from deepaccident_devkit.evaluation.task import TaskResult, headlines, plain
+from deepaccident_devkit.evaluation.task import plain
 from deepaccident_devkit.support.json_text import parsed_json
 from deepaccident_devkit.support.reading import check_size, fault_text, read_bytes
 
 Row = dict[str, Any]
-Cells = Iterator[tuple[str, Any]]
 
 
 def sample_rows(run: EvaluationRun) -> list[Row]:
     """List one row a sample, by token, all with the same columns: texts, numbers, or None where there is none.
 
     The first columns say which sample: token, scenario, agent, frame (from 1), time_to_impact (seconds to the recorded
-    impact), accident_visibility. The others are what the sample alone has as result:
+    impact), accident_visibility. The others are the evaluator's `sample_row`:
 
     - motion: by range IoU and PQ (percent) and instances over all frames, cells of IoU, paths and their errors (m);
     - accident: `positive` (an accident comes), whom the truth names, by metres allowed tp, fp and fn, and the errors
       (m, s) of what is foreseen within the largest distance;
     - detection: true boxes and detections that count, and true positives by threshold, over all classes and ranges;
     - warning: the plain values of the sample's counts, and how many entries its lists have;
-    - planning, forecasting: the headline numbers.
+    - planning, forecasting: the headlines of the sample.
     """
-    counts, cells = run.evaluator.counts, _CELLS[run.setup.task]
-    rows = [
-        _which(run, token) | dict(cells(run.evaluator.compute([token]), counts[token], run.setup.rules))
-        for token in sorted(run.evaluator.tokens)
-    ]
+    rows = [_which(run, token) | run.evaluator.sample_row(token) for token in sorted(run.evaluator.tokens)]
     columns = dict.fromkeys(name for row in rows for name in row)  # a table of means has only what a sample counts in
     return [{name: plain(row.get(name)) for name in columns} for row in rows]
 
@@ -56,59 +46,6 @@ def _which(run: EvaluationRun, token: str) -> Row:
     }
 
 
-def _motion_cells(result: MotionResult, counts: Counts, _rules: object) -> Cells:
-    yield "frames", result.frames
-    for (name, part), cells in zip(result.ranges.items(), counts["cells"], strict=True):
-        instances = part.true_positive, part.false_positive, part.false_negative
-        yield f"iou_{name}", part.iou
-        yield f"pq_{name}", part.pq
-        yield from zip((f"{each}_{name}" for each in ("tp", "fp", "fn")), instances, strict=True)
-        yield from zip((f"cells_{each}_{name}" for each in ("tp", "fp", "fn")), cells, strict=True)
-    counts_of_paths = ("paths", "path_true_positive", "path_false_positive", "path_false_negative")
-    yield from ((name, getattr(result, name)) for name in (*counts_of_paths, "min_ade", "min_fde", "miss_rate"))
-
-
-def _accident_cells(result: AccidentResult, _counts: Counts, _rules: object) -> Cells:
-    yield "positive", bool(result.positives)
-    yield "truth", next((name for name, count in result.truths.items() if count), None)
-    for distance, within in result.within.items():
-        for case in ("tp", "fp", "fn"):
-            yield f"{case}_{distance:g}m", getattr(within, case)
-    widest = result.within[max(result.within)]
-    for error in ("position_error", "time_error", "id_error"):
-        value = getattr(widest, error)
-        yield error, None if value is None else float(value)
-
-
-def _detection_cells(_result: object, counts: Counts, rules: DetectionProtocol) -> Cells:
-    levels = len(rules.thresholds)
-    found = Counter(cell % levels for cell in counts["tp"][0])
-    yield "truths", sum(counts["truths"])
-    yield "detections", len(counts["detections"][0])
-    for level, threshold in enumerate(rules.thresholds):
-        yield f"tp_{threshold:g}", found[level]
-
-
-def _plain_cells(_result: object, counts: Counts, _rules: object) -> Cells:
-    for name, value in counts.items():
-        if isinstance(value, list | tuple | Mapping):
-            yield f"{name}_count", len(value)
-        else:
-            yield name, value
-
-
-def _headline_cells(result: TaskResult, _counts: Counts, _rules: object) -> Cells:
-    yield from ((each.name, each.value) for each in headlines(result.task, result))
-
-
-_CELLS: Final[Mapping[str, Callable[[Any, Counts, Any], Cells]]] = {
-    "motion": _motion_cells,
-    "accident": _accident_cells,
-    "detection": _detection_cells,
-    "warning": _plain_cells,
-    "planning": _headline_cells,
-    "forecasting": _headline_cells,
-}
 STAMP_KEY: Final = b"deepaccident"
 """Of the metadata: one JSON object."""
 _VALUE_BYTES: Final = 32

@@ -8,7 +8,6 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from itertools import product
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, Final, Literal, get_args
 
 from deepaccident_devkit._version import __version__
@@ -20,16 +19,16 @@ from deepaccident_devkit.errors import (
     ResultsError,
     TokenError,
 )
-from deepaccident_devkit.evaluation.accident import ACCIDENT
-from deepaccident_devkit.evaluation.detection import DETECTION
+from deepaccident_devkit.evaluation.accident import AccidentEvaluator
+from deepaccident_devkit.evaluation.detection import DetectionEvaluator
 from deepaccident_devkit.evaluation.evaluator import Evaluator
-from deepaccident_devkit.evaluation.forecasting import FORECASTING
-from deepaccident_devkit.evaluation.motion import MOTION
-from deepaccident_devkit.evaluation.planning import PLANNING
+from deepaccident_devkit.evaluation.forecasting import ForecastingEvaluator
+from deepaccident_devkit.evaluation.motion import MotionEvaluator
+from deepaccident_devkit.evaluation.planning import PlanningEvaluator
 from deepaccident_devkit.evaluation.predictions import compared_labels
 from deepaccident_devkit.evaluation.results import Results
-from deepaccident_devkit.evaluation.task import FrozenDict, Task, TaskName, switched
-from deepaccident_devkit.evaluation.warning.evaluator import WARNING
+from deepaccident_devkit.evaluation.task import FrozenDict, switched
+from deepaccident_devkit.evaluation.warning import WarningEvaluator
 from deepaccident_devkit.motion import LABEL_PROTOCOLS, MotionLabels, samples
 from deepaccident_devkit.motion.sample_labels import no_samples_text
 from deepaccident_devkit.parallel import Places, Store, unfinished_folder
@@ -39,7 +38,7 @@ from deepaccident_devkit.support.files import remove_in
 from deepaccident_devkit.support.text import choice, choices, counted, path_of, settle_choices, spelled
 from deepaccident_devkit.taxonomy import AGENTS, FRAME_PERIOD, SPLIT_CHOICES, SPLITS, VEHICLE_AGENTS
 
-__all__ = ["TASKS", "TASK_PROTOCOLS", "TASK_RESULTS", "EvaluationSetup", "SampleLoader", "TaskName"]
+__all__ = ["TASKS", "EvaluationSetup", "SampleLoader"]
 
 SampleList = Literal["evaluate", "all"]
 ScopeName = Literal["accident", "all"]
@@ -112,7 +111,7 @@ class SampleSelection:
         return f"split {self.split}, samples {self.samples}{within}, scope {self.scope}, {whose}"
 
 
-def label_rules(task: TaskName) -> dict[str, str]:
+def label_rules(task: str) -> dict[str, str]:
     """What to say of the name of a protocol of labels that is given as a protocol of a task."""
     given = "; choose the labels by the switch labels={0!r} (--switch labels={0})" if task == "motion" else ""
     return {name: f"; {name!r} is a protocol of labels{given.format(name)}" for name in LABEL_PROTOCOLS}
@@ -286,18 +285,18 @@ def _named(tokens: Sequence[str], what: str) -> str:
     return f"{what} ({', '.join(tokens[:_SHOWN])}{more})"
 
 
-TASKS: Final[Mapping[str, Task]] = MappingProxyType(
-    {task.name: task for task in (MOTION, ACCIDENT, DETECTION, WARNING, PLANNING, FORECASTING)}
-)
-"""All tasks by name; a new one has a line here, and its name in `TaskName`."""
-TASK_PROTOCOLS: Final[Mapping[str, Mapping[str, Any]]] = MappingProxyType(
-    {name: task.protocols for name, task in TASKS.items()}
-)
-"""Task → its protocols by name."""
-TASK_RESULTS: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
-    {name: task.kinds for name, task in TASKS.items()}
-)
-"""Task → the kinds of results that it is evaluated from."""
+TASKS: Final[dict[str, type[Evaluator[Any]]]] = {
+    evaluator_class.task: evaluator_class
+    for evaluator_class in (
+        MotionEvaluator,
+        AccidentEvaluator,
+        DetectionEvaluator,
+        WarningEvaluator,
+        PlanningEvaluator,
+        ForecastingEvaluator,
+    )
+}
+"""All tasks by name; a new one has a line here."""
 _LONGEST_HORIZON: Final = 100
 """Seconds; recordings are shorter."""
 
@@ -307,13 +306,13 @@ class EvaluationSetup:
     """What is evaluated, and by which rules; two of equal ones give comparable numbers.
 
     Attributes:
-        task: of `TaskName`.
-        protocol: the name of one of the task's (`TASK_PROTOCOLS`).
+        task: Name of a task, of `TASKS`.
+        protocol: Name of one of the task's `protocols`.
         switches: choices of the protocol that are changed, by name (`task.switch_names`).
         horizon: seconds that the predictions look ahead; detection has none.
     """
 
-    task: TaskName
+    task: str
     protocol: str = "released"
     switches: Mapping[str, Any] = field(default_factory=dict)
     horizon: float = 2.0
@@ -336,7 +335,7 @@ class EvaluationSetup:
 
     def evaluator(self) -> Evaluator[Any]:
         """A new evaluator of these rules."""
-        return TASKS[self.task].evaluator(self.rules)
+        return TASKS[self.task](self.rules)
 
     def as_dict(self) -> dict[str, Any]:
         """All of it, as JSON holds it, with the evaluator's own `settings`: every choice."""
@@ -363,9 +362,9 @@ def default_selection(
     Raises:
         ChoiceError: no such list, scope or agent.
     """
-    if agents is None and TASKS[setup.task].vehicles_alone:
+    if agents is None and TASKS[setup.task].vehicles_only:
         agents = VEHICLE_AGENTS
-    listed: SampleList = samples or ("all" if TASKS[setup.task].whole_recordings else "evaluate")
+    listed: SampleList = samples or ("all" if TASKS[setup.task].needs_whole_recordings else "evaluate")
     return SampleSelection(
         split=os.fspath(split),
         samples=listed,
@@ -391,7 +390,7 @@ class SampleLoader:
 
     def __post_init__(self) -> None:
         """Check that the results are of a kind that the rules take, and look far enough; raises EvaluationError."""
-        kinds = TASKS[self.setup.task].kinds
+        kinds = TASKS[self.setup.task].result_kinds
         if self.results.task not in kinds:
             raise EvaluationError(
                 f"{self.results.path}: holds {self.results.task} results; {self.setup.task} is evaluated from "
@@ -416,14 +415,13 @@ class SampleLoader:
         return Places(reads=(*self.dataset.places, self.results.path))
 
     def __call__(self, token: str) -> tuple[Any, ...]:
-        """Prediction, truth and other arguments of the evaluator."""
-        rules, form, horizon = self.setup.rules, self.results.form, self.setup.horizon
-        truth = TASKS[self.setup.task].truth(self.dataset, token, rules, form, horizon)
+        """Return the prediction of a sample and its truth, which the evaluator's `update` takes."""
+        truth = self.setup.evaluator().truth(self.dataset, token, self.results.form, self.setup.horizon)
         return self.prediction(token), *truth
 
     def prediction(self, token: str) -> Any:
-        """The prediction of a sample, boxes in the protocol's frame."""
-        return TASKS[self.setup.task].read(self.results, self.dataset, token, self.setup.rules)
+        """Return the prediction of a sample, boxes in the protocol's frame."""
+        return self.setup.evaluator().read(self.results, self.dataset, token)
 
     def label(self, token: str) -> MotionLabels | None:
         """The sample's motion labels that the results are compared with; None where there is none."""

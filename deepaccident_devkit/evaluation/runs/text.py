@@ -15,8 +15,7 @@ from deepaccident_devkit.errors import shortened
 from deepaccident_devkit.evaluation.results import Results
 from deepaccident_devkit.evaluation.runs.further import further_results
 from deepaccident_devkit.evaluation.runs.over_bytes import sent_bytes
-from deepaccident_devkit.evaluation.runs.setups import agent_of, scenario_of
-from deepaccident_devkit.evaluation.task import HEADLINE_UNITS
+from deepaccident_devkit.evaluation.runs.setups import TASKS, agent_of, scenario_of
 from deepaccident_devkit.evaluation.warning.recordings import GIVEN
 from deepaccident_devkit.reports import Table
 from deepaccident_devkit.support.text import columns_text, counted
@@ -203,16 +202,17 @@ def predictors_text(metrics: Json) -> str:
     return "\n\n".join(each.to_text() for each in predictor_tables(metrics))
 
 
-def means_tables(metrics: Json) -> dict[str, Table]:
+def means_tables(summary: Json) -> dict[str, Table]:
     """The tables of a summary of means by name; `n` is of how many, and stands behind means of fewer.
 
     Numbers are the columns, or where they are more than the rows, these.
     """
-    tables = {}
+    tables, metrics = {}, summary["metrics"]
+    units = {row.path.rpartition("/")[2]: row.unit for row in TASKS[summary["task"]].result_class.rows}
     for name, means in (metrics.get("means") or {}).items():
         counted = metrics["counted"][name]
         columns = dict.fromkeys(column for row in means.values() for column in row)
-        headings = (f"{each}, {HEADLINE_UNITS[f'means/*/{each}']}" for each in columns)
+        headings = (f"{column}, {units[column]}" for column in columns)
         most = {row: max(counts.values()) for row, counts in counted.items()}
         cells = [(name, "n", *headings)]
         for row, values in means.items():
@@ -233,7 +233,7 @@ def _mean(value: float | None, count: int, most: int) -> str:
 
 def _means_text(summary: Json) -> str:
     """The tables that headlines are of, and the names of the others."""
-    tables = means_tables(summary["metrics"])
+    tables = means_tables(summary)
     main = {each["path"].split("/")[1] for each in summary["headlines"]} if tables else ()
     others = "; ".join(name for name in tables if name not in main)
     texts = [table.to_text() for name, table in tables.items() if name in main]

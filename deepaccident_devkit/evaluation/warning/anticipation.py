@@ -6,13 +6,13 @@ import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import partial
-from typing import Any, ClassVar, Final, get_args
+from typing import Any, Final, get_args
 
 import numpy as np
 
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.evaluation.evaluator import Counts, ratio
-from deepaccident_devkit.evaluation.task import FrozenMappings, Row, TaskResult
+from deepaccident_devkit.evaluation.task import FrozenMappings
 from deepaccident_devkit.evaluation.warning.clean import CleanScores, OperatingPoint
 from deepaccident_devkit.evaluation.warning.recordings import (
     GIVEN,
@@ -28,6 +28,7 @@ from deepaccident_devkit.evaluation.warning.recordings import (
     series_of,
     twin_pairs,
 )
+from deepaccident_devkit.evaluation.warning.result import WarningResult
 from deepaccident_devkit.support.arrays import FloatArray, IntArray
 from deepaccident_devkit.support.text import settle_choices
 
@@ -84,7 +85,7 @@ class AnticipationFigures(FrozenMappings):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class AnticipationResult(TaskResult):
+class AnticipationResult(WarningResult):
     """The result of the protocol `clean`.
 
     Attributes:
@@ -96,16 +97,6 @@ class AnticipationResult(TaskResult):
         notes: sentences that a reader of the numbers should know.
     """
 
-    task: ClassVar[str] = "warning"
-    rows: ClassVar[tuple[Row, ...]] = (
-        Row("groups/*/auc_ahead", "auc_ahead *", "share", "higher"),
-        Row("groups/*/twin_wins", "twin_wins *", "share", "higher"),
-        Row("groups/*/average_precision", "AP *", "share", "higher"),
-        Row("groups/*/operating/precision", "precision *", "share", "higher"),
-        Row("groups/*/operating/time_in_alarm", "time_in_alarm *", "share"),
-        Row("groups/*/operating/recall", "recall *", "share", "higher"),
-        Row("groups/*/operating/tta0", "tta0 *", "s", "higher"),
-    )
     samples: int
     operating_by: str
     groups: Mapping[str, AnticipationFigures]

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict
-from functools import partial
 from types import MappingProxyType
-from typing import Any, Final
+from typing import Any, ClassVar, Final
 
+from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.evaluation.accident_truth import AccidentContext, checked_facts, compared_facts
 from deepaccident_devkit.evaluation.evaluator import Counts, Evaluator
 from deepaccident_devkit.evaluation.predictions import Prediction
-from deepaccident_devkit.evaluation.task import Task, protocol_of
 from deepaccident_devkit.evaluation.warning.anticipation import AnticipationResult, CleanWarnings
 from deepaccident_devkit.evaluation.warning.field import FieldResult, FieldWarnings
 from deepaccident_devkit.evaluation.warning.recordings import PART, parts_of, sample_counts
+from deepaccident_devkit.evaluation.warning.result import WarningResult
 from deepaccident_devkit.motion import MotionLabels
 from deepaccident_devkit.support.arrays import IntArray
 
@@ -39,22 +38,22 @@ class WarningEvaluator(Evaluator[Any]):
     0
     """
 
-    def __init__(self, protocol: str | Protocol = "clean") -> None:
-        """Start without samples.
+    task = "warning"
+    description = "Evaluate warnings: how early they come before accidents, and how often an alarm is false."
+    result_kinds: ClassVar[tuple[str, ...]] = ("motion", "accident")
+    protocols = WARNING_PROTOCOLS
+    result_class = WarningResult
+    main_numbers: ClassVar[tuple[str, ...]] = ("groups/ego_involved/auc_ahead",)
+    needs_whole_recordings = True
+    needs_meta = True
 
-        Args:
-            protocol: of `WARNING_PROTOCOLS` by name, or your own.
+    protocol: Protocol
 
-        Raises:
-            ChoiceError: no protocol has that name, or it is of another type.
-        """
-        super().__init__()
-        self.protocol = protocol_of(protocol, Protocol, WARNING_PROTOCOLS)  # type: ignore[arg-type]  # a union is a kind too
-
-    @property
-    def settings(self) -> dict[str, Any]:
-        """The protocol's choices."""
-        return asdict(self.protocol)
+    def truth(
+        self, dataset: Dataset, token: str, form: Any, horizon: float, /
+    ) -> tuple[MotionLabels | None, AccidentContext]:
+        """Return the labels that maps are compared with, None for alarms, and the accident to come."""
+        return compared_facts(dataset, token, self.protocol, form, horizon, references=True)
 
     def update(
         self,
@@ -91,6 +90,14 @@ class WarningEvaluator(Evaluator[Any]):
         result: Result = super().compute(tokens)
         return result
 
+    def sample_row(self, token: str) -> dict[str, Any]:
+        """Return the plain values of the sample's counts, and how many entries its lists have."""
+        row: dict[str, Any] = {}
+        for name, value in self._counts[token].items():
+            is_list = isinstance(value, list | tuple | Mapping)
+            row |= {f"{name}_count": len(value)} if is_list else {name: value}
+        return row
+
     def pooled(self, counts: Collection[Counts]) -> Sequence[Counts]:
         """Counts with the same result, of which no recording is put together with others' recordings.
 
@@ -108,14 +115,3 @@ class WarningEvaluator(Evaluator[Any]):
     def has_intervals(self) -> bool:
         """The protocol `field` has none: its numbers take long, and are only for comparison with published ones."""
         return not isinstance(self.protocol, FieldWarnings)
-
-
-WARNING: Final = Task(
-    name="warning",
-    kinds=("motion", "accident"),
-    protocols=WARNING_PROTOCOLS,
-    evaluator=WarningEvaluator,
-    truth=partial(compared_facts, references=True),
-    whole_recordings=True,
-    needs_meta=True,
-)

@@ -10,12 +10,11 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
-from typing import ClassVar, Final, Literal, get_args
+from typing import Final, Literal, get_args
 
 import numpy as np
 
 from deepaccident_devkit.evaluation.evaluator import Counts
-from deepaccident_devkit.evaluation.task import Row, TaskResult
 from deepaccident_devkit.evaluation.warning.recordings import (
     GIVEN,
     PREDICTORS,
@@ -27,6 +26,7 @@ from deepaccident_devkit.evaluation.warning.recordings import (
     series_of,
     shares,
 )
+from deepaccident_devkit.evaluation.warning.result import WarningResult
 from deepaccident_devkit.support.arrays import BoolArray, FloatArray, IntArray, ShortRepr
 from deepaccident_devkit.support.text import choice
 
@@ -262,7 +262,7 @@ def _nothing(code: FieldCode, why: str) -> FieldFigures:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class FieldResult(TaskResult):
+class FieldResult(WarningResult):
     """The result of the protocol `field`: not comparable between codes, and predictors that know nothing can win.
 
     Attributes:
@@ -273,12 +273,6 @@ class FieldResult(TaskResult):
         notes: sentences that a reader of the numbers should know: why numbers are NaN.
     """
 
-    task: ClassVar[str] = "warning"
-    rows: ClassVar[tuple[Row, ...]] = (
-        Row("figures/*/average_precision", "AP *", "share", "higher"),
-        Row("figures/*/mean_time", "mTTA *", "s", "higher"),
-        Row("figures/*/time_at_r80", "TTA@R80 *", "s", "higher"),
-    )
     samples: int
     figures: Mapping[str, FieldFigures]
     references: Mapping[str, Mapping[str, FieldFigures]]

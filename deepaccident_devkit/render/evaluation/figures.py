@@ -21,7 +21,7 @@ from deepaccident_devkit.evaluation.planning.evaluator import BY_LEAD
 from deepaccident_devkit.evaluation.predictions import MotionOutput, frames_there, labels_at_present
 from deepaccident_devkit.evaluation.results import Results
 from deepaccident_devkit.evaluation.runs import EvaluationRun
-from deepaccident_devkit.evaluation.runs.setups import TASKS, SampleLoader
+from deepaccident_devkit.evaluation.runs.setups import SampleLoader
 from deepaccident_devkit.evaluation.task import Headline, headlines
 from deepaccident_devkit.evaluation.warning import AnticipationResult
 from deepaccident_devkit.motion import MotionLabels
@@ -46,16 +46,6 @@ _AROUND_BARS: Final = 1.1
 """Inches of a title, ticks and labels."""
 _GID: Final = "token"
 """Marks what a figure is made of: words to be copied, not to be read, may be small."""
-MAIN_NUMBERS: Final = {
-    "motion": ("ranges/100x100/pq", "ranges/100x100/iou"),
-    "accident": ("apa", "position_error"),
-    "detection": ("mean_average_precision",),
-    "warning": ("groups/ego_involved/auc_ahead",),
-    "planning": ("means/3 s/given/l2",),
-    "forecasting": ("means/3 s, K = 6/all/min_fde",),
-}
-"""Task → paths of the headline numbers that figures show by attribute. The first one is shown by all attributes, and
-samples are ranked by it; the others are shown only by time to impact."""
 _BY_TIME: Final = "time_to_impact"
 _EACH: Final = 3
 """How many of the worst, and of the best, samples are shown."""
@@ -113,13 +103,13 @@ def run_figures(run: EvaluationRun) -> tuple[RunFigure, ...]:
     own = [*_FIGURES[run.setup.task](run)] if run.setup.task in _FIGURES else []
     for name, told in run.further.items():
         own += added("figures", name)(told.groups[0].result)
-    left_out = (EVERYTHING, *(WITHIN_RECORDINGS if TASKS[run.setup.task].whole_recordings else ()))
+    left_out = (EVERYTHING, *(WITHIN_RECORDINGS if run.evaluator.needs_whole_recordings else ()))
     broken = {each.by: each for each in run.breakdowns if each.by not in left_out and len(each.groups) > 1}
-    numbers = [path for path in MAIN_NUMBERS[run.setup.task] if _headline(run.setup.task, run.result, path) is not None]
+    numbers = [path for path in run.evaluator.main_numbers if _headline(run.result, path) is not None]
     pairs = [(path, each) for path in numbers[:1] for each in broken.values()]
     pairs[1:1] = [(path, broken[_BY_TIME]) for path in numbers[1:] if _BY_TIME in broken]
-    shown = [(path, each) for path, each in pairs if _has_numbers(run.setup.task, each, path)]
-    return (*own, *(_by(run.setup.task, each, path) for path, each in shown))
+    shown = [(path, each) for path, each in pairs if _has_numbers(each, path)]
+    return (*own, *(_by(each, path) for path, each in shown))
 
 
 def _accident(run: EvaluationRun) -> Iterator[RunFigure]:
@@ -218,8 +208,8 @@ _FIGURES: Final[dict[str, Callable[[EvaluationRun], Iterator[RunFigure]]]] = {
 }
 
 
-def _by(task: str, broken: Breakdown[Any], path: str) -> RunFigure:
-    values = [(group.value or UNKNOWN, _headline(task, group.result, path)) for group in broken.groups]
+def _by(broken: Breakdown[Any], path: str) -> RunFigure:
+    values = [(group.value or UNKNOWN, _headline(group.result, path)) for group in broken.groups]
     name = next(headline.name for _, headline in values if headline is not None)
     words = ", ".join(f"{value} {'–' if headline is None else headline.text()}" for value, headline in values)
     by, percent = broken.by.replace("_", " "), 100 * broken.resampling.confidence
@@ -227,18 +217,18 @@ def _by(task: str, broken: Breakdown[Any], path: str) -> RunFigure:
         name=f"{path.rsplit('/', 1)[-1]}_by_{broken.by}",
         caption=f"{name} by {by}; whiskers: {percent:g} % intervals over clusters of scenarios, if there are enough.",
         alt=f"{name} by {by}: {words}.",
-        draw=partial(render_breakdown, task, broken, path),
+        draw=partial(render_breakdown, broken, path),
         height=max(PANEL[1], _ROW * len(broken.groups) + _AROUND_BARS),
     )
 
 
-def _has_numbers(task: str, broken: Breakdown[Any], path: str) -> bool:
-    shown = [_headline(task, group.result, path) for group in broken.groups]
+def _has_numbers(broken: Breakdown[Any], path: str) -> bool:
+    shown = [_headline(group.result, path) for group in broken.groups]
     return any(each is not None and each.value is not None for each in shown)
 
 
-def _headline(task: str, result: object, path: str) -> Headline | None:
-    return next((each for each in headlines(task, result) if each.path == path), None)
+def _headline(result: Any, path: str) -> Headline | None:
+    return next((each for each in headlines(result) if each.path == path), None)
 
 
 def listed(values: Iterable[tuple[str, float | None]]) -> str:
@@ -250,9 +240,9 @@ def listed(values: Iterable[tuple[str, float | None]]) -> str:
 def sample_figures(run: EvaluationRun, dataset: Dataset, results: Results) -> tuple[RunFigure, ...]:
     """The worst and the best samples of a run by its task's main number, the worst first.
 
-    Samples with nothing to count are left out. Tasks that follow whole recordings have none.
+    Samples with nothing to count are left out. Only motion, accidents and detections can be seen from above.
     """
-    if TASKS[run.setup.task].whole_recordings:
+    if not isinstance(run.evaluator, (MotionEvaluator, AccidentEvaluator, DetectionEvaluator)):
         return ()
     ranked = _ranked(run)
     count = min(_EACH, len(ranked) // 2)
@@ -321,14 +311,11 @@ def _draw(load: SampleLoader, token: str, text: str, *, ax: Axes) -> Axes:
 def _ranked(run: EvaluationRun) -> list[tuple[str, str]]:
     """Tokens with their main number in words, the worst first."""
     found: list[tuple[float, str, str]] = []
-    path = MAIN_NUMBERS[run.setup.task][0]
+    path = run.evaluator.main_numbers[0]
     for token in sorted(run.evaluator.tokens):
-        shown = headlines(run.setup.task, run.evaluator.compute([token]))
-        found += [
-            (each.value, token, f"{each.name} {each.text()}")
-            for each in shown
-            if each.path == path and each.value is not None
-        ]
+        number = _headline(run.evaluator.compute([token]), path)
+        if number is not None and number.value is not None:
+            found.append((number.value, token, f"{number.name} {number.text()}"))
     return [(token, text) for _, token, text in sorted(found)]
 
 

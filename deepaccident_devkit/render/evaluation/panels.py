@@ -100,11 +100,10 @@ def draw_nothing(ax: Axes, why: str = "nothing to count") -> Axes:
 
 
 @in_own_settings
-def render_breakdown(task: str, broken: Breakdown[Any], number: str, *, ax: Axes | None = None) -> Axes:
+def render_breakdown(broken: Breakdown[Any], number: str, *, ax: Axes | None = None) -> Axes:
     """Render one headline number of each group as a bar, with its interval as a whisker.
 
     Args:
-        task: whose headline numbers they are.
         broken: the result of `breakdown`.
         number: path of the number, as in `Headline`: `apa`, `ranges/30x30/iou`.
         ax: axes to render on; new ones if None.
@@ -114,7 +113,7 @@ def render_breakdown(task: str, broken: Breakdown[Any], number: str, *, ax: Axes
     """
     ax, bars, shown = axes_or_new(ax, PANEL), [], None
     for group in broken.groups:
-        headline = next((each for each in headlines(task, group.result) if each.path == number), None)
+        headline = next((each for each in headlines(group.result) if each.path == number), None)
         shown = headline or shown
         bars.append(_bar(group, headline, AGENT_COLORS.get(group.value or "", ESTIMATE_COLOR)))
     draw_bars(bars, ax, None if shown is None else LIMITS.get(shown.unit))

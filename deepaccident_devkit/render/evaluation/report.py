@@ -18,7 +18,6 @@ from deepaccident_devkit.evaluation.runs import EvaluationRun
 from deepaccident_devkit.evaluation.runs.further import further_results
 from deepaccident_devkit.evaluation.runs.over_bytes import sent_bytes
 from deepaccident_devkit.evaluation.runs.sanity import SanityReport
-from deepaccident_devkit.evaluation.runs.setups import TASKS
 from deepaccident_devkit.evaluation.runs.text import means_tables, predictor_tables, reading_notes
 from deepaccident_devkit.evaluation.task import Headline, headlines
 from deepaccident_devkit.render.evaluation.figures import RunFigure, run_figures, sample_figures, save_figure
@@ -58,11 +57,11 @@ def report_context(run: EvaluationRun) -> dict[str, Any]:
         "header": _header(run, summary),
         "headlines": [
             [each.name, each.text(), _interval_text(each, group), _BETTER[each.higher_is_better]]
-            for each in _headlines(run.setup.task, run.result)
+            for each in _headlines(run.result)
         ],
         "interval": f"{percent}interval",
         "interval_notes": () if group is None or group.intervals else group.notes,
-        "predictors": [*predictor_tables(told), *means_tables(told).values()],
+        "predictors": [*predictor_tables(told), *means_tables(summary).values()],
         "further": {
             each.title.capitalize(): (each.tables(part), [*part["notes"], *part["interval_notes"]])
             for each, part in further_results(summary)
@@ -70,7 +69,7 @@ def report_context(run: EvaluationRun) -> dict[str, Any]:
         "whole_numbers": {name: result_text(value) for name, value in told.items() if isinstance(value, int)},
         "said": [*(told.get("notes") or ()), *reading_notes(summary)],
         "counts": _counts(run.result, told),
-        "breakdowns": [_breakdown(run.setup.task, each) for each in run.breakdowns if each.by not in same],
+        "breakdowns": [_breakdown(each) for each in run.breakdowns if each.by not in same],
         "same": [f"{name.replace('_', ' ')} {value}" for name, value in same.items() if name != EVERYTHING],
         "sanity": None if run.sanity is None else SanityReport(**run.sanity),
         "choices": dict(_choices(run)),
@@ -87,7 +86,7 @@ def _header(run: EvaluationRun, summary: Mapping[str, Any]) -> dict[str, str]:
         **{name: scalar(run.results.meta[name]) for name in _SHOWN_META if name in run.results.meta},
         "samples": f"{summary['counts']['samples']:,} of {summary['counts']['scenarios']:,} scenarios",
         "selection": run.selection.text(),
-        **({"horizon": f"{setup.horizon:g} s"} if TASKS[setup.task].has_horizon else {}),
+        **({"horizon": f"{setup.horizon:g} s"} if run.evaluator.has_horizon else {}),
         "results": run.results.path,
         "results' hash": run.results.fingerprint,
         **({"bytes": sent.text()} if (sent := sent_bytes(summary)) else {}),
@@ -117,22 +116,22 @@ def _columns(value: Any) -> Any:
     return [["", *plain], *([key, *(result_text(each.get(name)) for name in plain)] for key, each in value.items())]
 
 
-def _breakdown(task: str, broken: Breakdown[Any]) -> dict[str, Any]:
+def _breakdown(broken: Breakdown[Any]) -> dict[str, Any]:
     """A table for an attribute, and one of only the vehicles if the numbers of samples differ."""
     vehicles = broken.without_infrastructure
     differ = sum(each.samples for each in vehicles) != sum(each.samples for each in broken.groups)
     return {
         "by": broken.by.replace("_", " "),
-        "all": _groups(task, broken, broken.groups, "all agents"),
-        "vehicles": _groups(task, broken, vehicles, "without the roadside") if differ else None,
+        "all": _groups(broken, broken.groups, "all agents"),
+        "vehicles": _groups(broken, vehicles, "without the roadside") if differ else None,
     }
 
 
-def _groups(task: str, broken: Breakdown[Any], groups: Sequence[Group[Any]], whose: str) -> dict[str, Any]:
-    names = list(dict.fromkeys(each.name for group in groups for each in _headlines(task, group.result)))
+def _groups(broken: Breakdown[Any], groups: Sequence[Group[Any]], whose: str) -> dict[str, Any]:
+    names = list(dict.fromkeys(each.name for group in groups for each in _headlines(group.result)))
     rows = []
     for group in groups:
-        known = {each.name: (each.text(), _interval_text(each, group)) for each in _headlines(task, group.result)}
+        known = {each.name: (each.text(), _interval_text(each, group)) for each in _headlines(group.result)}
         label = UNKNOWN if group.value is None else group.value
         rows.append([label, f"{group.samples:,}", f"{group.scenarios:,}", *(known.get(name, "–") for name in names)])
     how = f"{100 * broken.resampling.confidence:g} % intervals, if there are {LEAST_CLUSTERS} clusters"
@@ -150,10 +149,10 @@ def _choices(run: EvaluationRun) -> Iterator[tuple[str, Any]]:
         yield "What the results say about themselves", run.results.meta
 
 
-def _headlines(task: str, result: object) -> list[Headline]:
+def _headlines(result: Any) -> list[Headline]:
     """The headlines as a report shows them: a class without true boxes has no value, also where the rules count 0."""
     paths = {f"class_average_precision/{name}" for name in _absent_classes(result)}
-    return [replace(each, value=None) if each.path in paths else each for each in headlines(task, result)]
+    return [replace(each, value=None) if each.path in paths else each for each in headlines(result)]
 
 
 def _absent_classes(result: object) -> list[str]:

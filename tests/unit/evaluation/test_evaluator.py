@@ -95,7 +95,7 @@ def test_runs_and_evaluators_of_other_settings_makers_or_versions_do_not_go_toge
         (lambda: Sums(scale=2.0).resume(path), EvaluationError, ("state.json", "saved with other settings", "1.0")),
         (lambda: Others().resume(path), EvaluationError, ("saved by Sums of devkit", "this is Others", "begin again")),
     )
-    monkeypatch.setattr("deepaccident_devkit.evaluation.evaluator.__version__", "99")
+    monkeypatch.setattr("deepaccident_devkit.evaluation.sample_counts.__version__", "99")
     assert_refused((lambda: Sums().resume(path), EvaluationError, ("was saved by", "this is Sums of devkit 99")))
 
 

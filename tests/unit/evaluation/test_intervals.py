@@ -3,6 +3,7 @@
 import math
 from collections.abc import Collection, Sequence
 from functools import partial
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -28,8 +29,9 @@ from deepaccident_devkit.evaluation.intervals import (
     range_of,
 )
 from deepaccident_devkit.evaluation.motion import MotionEvaluator
-from deepaccident_devkit.evaluation.runs.setups import TASK_PROTOCOLS, EvaluationSetup
-from deepaccident_devkit.evaluation.task import HEADLINE_UNITS
+from deepaccident_devkit.evaluation.runs.setups import TASKS, EvaluationSetup
+from deepaccident_devkit.evaluation.task import Row
+from deepaccident_devkit.safety.prevention_result import PreventedResult
 
 
 def made(
@@ -233,13 +235,13 @@ def test_the_numbers_of_a_result() -> None:
     )
 
 
+OWN_ROWS = tuple(chain.from_iterable(each.result_class.rows for each in TASKS.values()))
+ROWS: tuple[Row, ...] = (*OWN_ROWS, *PreventedResult.rows)
 PERCENTS = (
     "ranges/30x30/iou",
     "ranges/30x30/pq",
     "ranges/30x30/sq",
     "ranges/30x30/rq",
-    "iou/road",
-    "mean_iou",
     "mean_average_precision",
     "class_average_precision/car",
 )
@@ -252,7 +254,12 @@ SHARES = (
         "groups/all/area_under_curve",
         "groups/all/operating/early_share",
     ),
-    *("groups/all/operating/time_in_alarm", "figures/drive all/recall_at_half", "precision_at_half", "precision_at_5"),
+    *(
+        "groups/all/operating/time_in_alarm",
+        "figures/drive all/recall_at_half",
+        "precision_at_half",
+        "precision_at_r80",
+    ),
     *("shares/a", "warned", "extrapolated"),
 )
 SIGNED = (
@@ -261,7 +268,8 @@ SIGNED = (
 )
 AMOUNTS = (
     *("min_ade", "min_fde", "position_error", "time_error", "mean_errors/ATE", "mean_errors/AOE", "mean_errors/AVE"),
-    *("groups/all/mean_time", "operating/tta_hit", "operating/tta0", "groups/all/tta0_after/2", "time_at_r80"),
+    *("groups/all/mean_time", "operating/tta_hit", "operating/tta0", "groups/all/tta0_after/2"),
+    "figures/dad all/time_at_r80",
     *("time_at_half", "episodes_per_minute", "alarm_seconds_per_minute", "braking_seconds_per_minute"),
 )
 
@@ -276,7 +284,7 @@ AMOUNTS = (
     ],
 )
 def test_a_unit_tells_what_a_number_can_be(path: str, expected: tuple[float, float]) -> None:
-    assert range_of(path, np.array([-0.5, 0.5])) == expected
+    assert range_of(path, np.array([-0.5, 0.5]), ROWS) == expected
 
 
 @pytest.mark.parametrize(
@@ -292,16 +300,17 @@ def test_a_unit_tells_what_a_number_can_be(path: str, expected: tuple[float, flo
     ],
 )
 def test_a_number_of_others_is_what_its_clusters_are(alone: list[float], expected: tuple[float, float]) -> None:
-    assert range_of("theirs", np.array(alone)) == expected
+    assert range_of("theirs", np.array(alone), ROWS) == expected
 
 
 def test_an_interval_crosses_zero_where_a_number_can_be_negative_and_shares_stay_shares() -> None:
     """Of all numbers that a task has by name, a few clusters around 0 and around the most that each can be."""
-    signed = {path for path in HEADLINE_UNITS if range_of(path, np.array([])) == (-math.inf, math.inf)}
+    paths = [row.path for row in ROWS]
+    signed = {path for path in paths if range_of(path, np.array([]), ROWS) == (-math.inf, math.inf)}
     assert {path.rpartition("/")[2] for path in signed} == {path.rpartition("/")[2] for path in SIGNED} | {"lateness"}
     source = np.random.default_rng(0)
-    for path in HEADLINE_UNITS:
-        least, most = limits = range_of(path, np.array([]))
+    for path in paths:
+        least, most = limits = range_of(path, np.array([]), ROWS)
         width = most if math.isfinite(most) else 1.0
         middles = [-0.02, 0.02] if path in signed else [0.02, 0.98]
         for middle in np.multiply(middles, width):
@@ -322,15 +331,16 @@ def test_a_number_that_is_larger_of_all_clusters_than_of_each_is_no_share() -> N
 def test_totals_settings_and_medians_have_no_interval() -> None:
     without = ("false_recordings", "within/5/distance", "median_warning", "threshold", "at/best_f1", "quiet")
     assert [has_interval(path) for path in (*without, "beside/a=b/within/5/distance")] == [False] * 7
-    assert all(has_interval(path.replace("*", "5")) for path in HEADLINE_UNITS)
+    assert all(has_interval(path.replace("*", "5")) for path in (row.path for row in ROWS))
 
 
-@pytest.mark.parametrize("task", TASK_PROTOCOLS)
+@pytest.mark.parametrize("task", TASKS)
 def test_every_number_of_the_devkits_own_has_a_unit(task: str) -> None:
     """Else it would be taken for what its clusters are, and change with them."""
-    for protocol in TASK_PROTOCOLS[task]:  # type: ignore[index]
-        for path in numbers_of(EvaluationSetup(task=task, protocol=protocol).evaluator().compute()):  # type: ignore[arg-type]
-            guesses = {range_of(path, np.array(alone)) for alone in ([0.5], [2.0], [-1.0])}
+    rows = TASKS[task].result_class.rows
+    for protocol in TASKS[task].protocols:
+        for path in numbers_of(EvaluationSetup(task=task, protocol=protocol).evaluator().compute()):
+            guesses = {range_of(path, np.array(alone), rows) for alone in ([0.5], [2.0], [-1.0])}
             assert len(guesses) == 1 or not has_interval(path), path
 
 

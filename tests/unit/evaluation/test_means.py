@@ -12,19 +12,18 @@ from numpy.testing import assert_array_equal
 from deepaccident_devkit.evaluation.evaluator import Evaluator
 from deepaccident_devkit.evaluation.forecasting import ForecastingEvaluator
 from deepaccident_devkit.evaluation.intervals import Resampling, intervals_of, numbers_of, numbers_of_draws
-from deepaccident_devkit.evaluation.means import MEAN_OF_SCENARIOS, Column, MeansEvaluator, MeansResult, Sums
+from deepaccident_devkit.evaluation.means import MEAN_OF_SCENARIOS, MeansEvaluator, MeansResult, Sums, table_rows
 from deepaccident_devkit.evaluation.planning import PlanningEvaluator
-from deepaccident_devkit.evaluation.task import headlines
+from deepaccident_devkit.evaluation.task import Row, headlines
 
 
 class Lengths(MeansResult):
     """Of a test."""
 
     __slots__ = ()
-    task = "forecasting"
-    main_tables: ClassVar[Sequence[str]] = ("late",)
-    main_row = "all"
-    columns: ClassVar[Mapping[str, Column]] = {"far": Column("m", "higher"), "near": Column("m", is_headline=False)}
+    rows: ClassVar[tuple[Row, ...]] = table_rows(
+        columns=(Row("far", "m", "higher"), Row("near", "m", is_headline=False)), main_tables=("late",), main_row="all"
+    )
 
 
 class LengthsEvaluator(MeansEvaluator[Lengths]):
@@ -33,6 +32,7 @@ class LengthsEvaluator(MeansEvaluator[Lengths]):
     result_class = Lengths
     protocols: ClassVar[Mapping[str, Any]] = {"clean": Resampling(), "other": Resampling(seed=1)}
     order: ClassVar[Sequence[str]] = ("late", "early", "all")
+    main_row = "all"
 
     def update(self, token: str, *arguments: Any) -> None:
         scenario, values = arguments
@@ -72,7 +72,7 @@ def test_tables_rows_and_columns_stand_in_their_order() -> None:
     }
     assert [*result.means["late"]["a"]] == ["far", "near"]
     assert (result.counted["late"]["a"], result.counted["early"]["a"]) == ({"far": 0, "near": 0}, {"near": 2})
-    assert headlines("forecasting", result) == ()
+    assert headlines(result) == ()
     assert LengthsEvaluator("other").settings["seed"] == 1
 
 

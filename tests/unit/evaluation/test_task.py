@@ -1,12 +1,14 @@
-"""The doors of each task, the choices of its protocols, and the headlines and text of its results."""
+"""The contract of each task, the choices of its protocols, and the headlines and text of its results."""
 
 import copy
 import json
 import math
 import pickle
+import re
 from dataclasses import replace
+from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pytest
@@ -19,12 +21,13 @@ from deepaccident_devkit.evaluation.accident import PaperAccidents
 from deepaccident_devkit.evaluation.detection import DETECTION_PROTOCOLS
 from deepaccident_devkit.evaluation.intervals import numbers_of
 from deepaccident_devkit.evaluation.motion import MotionEvaluator
-from deepaccident_devkit.evaluation.runs.setups import TASK_PROTOCOLS, TASKS, EvaluationSetup, TaskName
+from deepaccident_devkit.evaluation.results import ResultsTask
+from deepaccident_devkit.evaluation.runs.setups import TASKS, EvaluationSetup
 from deepaccident_devkit.evaluation.task import FrozenDict, headlines, plain, switch_names, switched, value_text
 
 TOP = Path(__file__).parents[3]
 every_protocol = pytest.mark.parametrize(
-    ("task", "protocol"), [(task, protocol) for task, protocols in TASK_PROTOCOLS.items() for protocol in protocols]
+    ("task", "protocol"), [(task, protocol) for task in TASKS for protocol in TASKS[task].protocols]
 )
 
 
@@ -39,14 +42,14 @@ every_protocol = pytest.mark.parametrize(
         pytest.param("forecasting", "clean", marks=pytest.mark.slow),
     ],
 )
-def test_read_truth_update_compute(task: TaskName, protocol: str, da_motion: DeepAccident, tmp_path: Path) -> None:
+def test_read_truth_update_compute(task: str, protocol: str, da_motion: DeepAccident, tmp_path: Path) -> None:
     setup = EvaluationSetup(task=task, protocol=protocol)
     run, results = stored_run(da_motion, setup, tmp_path / "results")
-    rules, evaluator = setup.rules, TASKS[task].evaluator(setup.rules)
-    assert results.task in TASKS[task].kinds
+    evaluator = TASKS[task](protocol)
+    assert results.task in TASKS[task].result_kinds
     for token in results.tokens:
-        prediction = TASKS[task].read(results, da_motion, token, rules)
-        truth = TASKS[task].truth(da_motion, token, rules, results.form, setup.horizon)
+        prediction = evaluator.read(results, da_motion, token)
+        truth = evaluator.truth(da_motion, token, results.form, setup.horizon)
         evaluator.update(token, prediction, *truth)
     assert evaluator.compute().samples == len(results) > 1
     assert evaluator.compute().as_dict() == run.result.as_dict()
@@ -60,27 +63,51 @@ def test_a_sample_enters_few_modules(monkeypatch: pytest.MonkeyPatch) -> None:
     made = walks()
     for walk in ("motion, released", "accident, boxes"):
         own = [module for module in made[walk] if module.startswith("deepaccident_devkit.evaluation")]
-        assert len(made[walk]) <= 35, walk
-        assert len(own) <= 10, walk
+        assert len(made[walk]) <= 37, walk
+        assert len(own) <= 12, walk
 
 
-def test_what_each_task_is() -> None:
-    facts = {name: (task.name, task.kinds, task.whole_recordings, task.needs_meta) for name, task in TASKS.items()}
-    assert facts == {
-        "motion": ("motion", ("motion",), False, False),
-        "accident": ("accident", ("motion", "accident"), False, True),
-        "detection": ("detection", ("detection",), False, False),
-        "warning": ("warning", ("motion", "accident"), True, True),
-        "planning": ("planning", ("planning",), True, True),
-        "forecasting": ("forecasting", ("forecasting",), True, False),
-    }
-    assert [name for name, task in TASKS.items() if task.vehicles_alone] == ["planning"]
-    assert [name for name, task in TASKS.items() if not task.has_horizon] == ["detection", "planning", "forecasting"]
+@pytest.mark.parametrize("task", TASKS)
+def test_each_task_implements_the_contract(task: str) -> None:
+    evaluator_class = TASKS[task]
+    assert evaluator_class.task == task
+    assert re.fullmatch("Evaluate .*[.]", evaluator_class.description)
+    assert {"truth", "update"} <= vars(evaluator_class).keys()
+    assert set(evaluator_class.result_kinds) <= {*get_args(ResultsTask)}
+    assert evaluator_class().protocol == next(iter(evaluator_class.protocols.values()))
+    headline_paths = [row.path for row in evaluator_class.result_class.rows if row.is_headline]
+    assert evaluator_class.main_numbers
+    for path in evaluator_class.main_numbers:
+        assert any(fnmatchcase(path, headline) for headline in headline_paths), path
 
 
 @every_protocol
-def test_each_choice_of_every_protocol_can_be_given(task: TaskName, protocol: str) -> None:
-    rules = TASK_PROTOCOLS[task][protocol]
+def test_every_protocol_makes_an_evaluator_and_its_kind_of_result(task: str, protocol: str) -> None:
+    rules, evaluator = TASKS[task].protocols[protocol], TASKS[task](protocol)
+    assert (evaluator.protocol, TASKS[task](rules).protocol) == (rules, rules)
+    assert isinstance(evaluator.compute(), TASKS[task].result_class)
+    assert evaluator.compute().samples == 0
+    assert evaluator.settings == TASKS[task](rules).settings
+    assert_refused((lambda: TASKS[task]("none"), ChoiceError, ("protocol", protocol, "'none'")))
+
+
+def test_what_each_task_is() -> None:
+    facts = {name: (each.result_kinds, each.needs_whole_recordings, each.needs_meta) for name, each in TASKS.items()}
+    assert facts == {
+        "motion": (("motion",), False, False),
+        "accident": (("motion", "accident"), False, True),
+        "detection": (("detection",), False, False),
+        "warning": (("motion", "accident"), True, True),
+        "planning": (("planning",), True, True),
+        "forecasting": (("forecasting",), True, False),
+    }
+    assert [name for name, each in TASKS.items() if each.vehicles_only] == ["planning"]
+    assert [name for name, each in TASKS.items() if not each.has_horizon] == ["detection", "planning", "forecasting"]
+
+
+@every_protocol
+def test_each_choice_of_every_protocol_can_be_given(task: str, protocol: str) -> None:
+    rules = TASKS[task].protocols[protocol]
     for name in switch_names(rules):
         value: Any = rules
         for part in name.split("."):
@@ -111,7 +138,7 @@ def test_choices_may_be_of_a_part_lists_for_tuples_and_null_where_one_takes_it()
         (DETECTION_PROTOCOLS["paper"], {"min_recall": None}, ("min_recall", "a number, such as 0.1", "None")),
         (DETECTION_PROTOCOLS["paper"], {"own_box": 1}, ("own_box", "true or false, such as False", "1")),
         (DETECTION_PROTOCOLS["paper"], {"thresholds": 1}, ("thresholds", "a list, such as (1.0, 2.0, 4.0)", "found 1")),
-        (TASK_PROTOCOLS["warning"]["field"], {"scores_of": "pair"}, ("no switch 'scores_of'", "it has none")),
+        (TASKS["warning"].protocols["field"], {"scores_of": "pair"}, ("no switch 'scores_of'", "it has none")),
     ],
 )
 def test_choices_that_are_none(rules: Any, switches: dict[str, Any], words: tuple[str, ...]) -> None:
@@ -119,9 +146,9 @@ def test_choices_that_are_none(rules: Any, switches: dict[str, Any], words: tupl
 
 
 @every_protocol
-def test_each_headline_is_a_number_of_the_result_by_its_path(task: TaskName, protocol: str) -> None:
+def test_each_headline_is_a_number_of_the_result_by_its_path(task: str, protocol: str) -> None:
     result = EvaluationSetup(task=task, protocol=protocol).evaluator().compute()
-    known, found = numbers_of(result), headlines(task, result)
+    known, found = numbers_of(result), headlines(result)
     assert len({each.name for each in found}) == len(found)
     assert len(found) > 2 or task in ("warning", "planning", "forecasting")  # by group, of which there is none yet
     for each in found:
@@ -141,8 +168,8 @@ HEADLINES = {
 @pytest.mark.parametrize(
     ("task", "protocol"), [("motion", "released"), ("accident", "boxes"), ("detection", "opencood")]
 )
-def test_headlines_have_names_units_and_a_better_side(task: TaskName, protocol: str) -> None:
-    found = headlines(task, EvaluationSetup(task=task, protocol=protocol).evaluator().compute())
+def test_headlines_have_names_units_and_a_better_side(task: str, protocol: str) -> None:
+    found = headlines(EvaluationSetup(task=task, protocol=protocol).evaluator().compute())
     sides = {True: "+", False: "-", None: " "}
     assert [f"{each.name} {each.unit}{sides[each.higher_is_better]}" for each in found] == HEADLINES[task].split(", ")
 
@@ -173,7 +200,6 @@ def test_the_text_of_a_result_is_its_first_headlines() -> None:
         repr(EvaluationSetup(task="warning", protocol="clean").evaluator().compute())
         == "AnticipationResult(0 samples: )"
     )
-    assert_refused((lambda: headlines("maps", None), ChoiceError, ("task", "motion, accident, detection", "maps")))
 
 
 def test_results_within_others_and_arrays_are_plain_too() -> None:

@@ -178,12 +178,12 @@ def test_a_sample_without_other_actors() -> None:
 
 def test_headlines_are_those_of_three_seconds() -> None:
     result = result_of(([forecast(1, [3.0])], truth_of(5)))
-    assert [(each.name, each.value, each.unit) for each in headlines("forecasting", result)[:3]] == [
+    assert [(each.name, each.value, each.unit) for each in headlines(result)[:3]] == [
         (f"min_fde {MAIN}", 3.0, "m"),
         (f"min_fde {ALONE}", 3.0, "m"),
         (f"min_ade {MAIN}", pytest.approx(1.55), "m"),
     ]
-    assert {each.higher_is_better for each in headlines("forecasting", result)} == {False}
+    assert {each.higher_is_better for each in headlines(result)} == {False}
 
 
 def test_a_saved_evaluator_goes_on(tmp_path: Path) -> None:

@@ -2,7 +2,7 @@
 
 from written_out import written_out
 
-from deepaccident_devkit.evaluation.forecasting.evaluator import FORECASTING, FORECASTING_PROTOCOLS
+from deepaccident_devkit.evaluation.forecasting.evaluator import FORECASTING_PROTOCOLS, ForecastingEvaluator
 
 WRITTEN = {
     "evaluator.TOGETHER": "'together'",
@@ -35,4 +35,5 @@ WRITTEN = {
 
 def test_every_default_and_constant_written_out() -> None:
     assert written_out("deepaccident_devkit.evaluation.forecasting") == WRITTEN
-    assert (FORECASTING.whole_recordings, FORECASTING.needs_meta, [*FORECASTING_PROTOCOLS]) == (True, False, ["clean"])
+    facts = ForecastingEvaluator.needs_whole_recordings, ForecastingEvaluator.needs_meta, [*FORECASTING_PROTOCOLS]
+    assert facts == (True, False, ["clean"])

@@ -189,7 +189,7 @@ def test_what_can_be_negative_is_a_signed_number(planned: float, recorded: float
     times = np.arange(1, 7) * 0.5
     numbers = lead(result_of(true, plan=Plan(times=times, path=np.column_stack([times * planned, times * aside]))))
     for column, value in numbers.items():
-        least, most = range_of(f"means/lead 3 s/{GIVEN}/{column}", np.array([value]))
+        least, most = range_of(f"means/lead 3 s/{GIVEN}/{column}", np.array([value]), PlanningResult.rows)
         assert np.isnan(value) or least - 1e-6 <= value <= most + 1e-6
         assert (least < 0) == column.startswith("lost")
 

@@ -11,7 +11,6 @@ from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, EvaluationError, GeometryError
 from deepaccident_devkit.evaluation.planning import (
     CELL_PROTOCOLS,
-    PLANNING,
     PLANNING_PROTOCOLS,
     Plan,
     PlanningEvaluator,
@@ -32,7 +31,8 @@ def test_the_protocols() -> None:
     public = ("uniad", "stp3", "vad", "bev_planner")
     assert tuple(PLANNING_PROTOCOLS) == ("clean", *public, *(f"{name}_own_box" for name in public))
     assert PlanningEvaluator().settings == {"leads": [3.0, 2.0, 1.0, 0.5], "most_acceleration": 10.0, "braking": 3.0}
-    assert (PLANNING.whole_recordings, PLANNING.needs_meta, PLANNING.vehicles_alone) == (True, True, True)
+    facts = PlanningEvaluator.needs_whole_recordings, PlanningEvaluator.needs_meta, PlanningEvaluator.vehicles_only
+    assert facts == (True, True, True)
 
 
 def test_what_cannot_be_evaluated() -> None:

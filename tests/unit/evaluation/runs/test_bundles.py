@@ -26,7 +26,7 @@ from deepaccident_devkit.evaluation.runs import (
     read_rows,
     save_run,
 )
-from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup, TaskName
+from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 from deepaccident_devkit.support.reading import file_checksum
 
 FILES = {"metrics_summary.json", "counts.json", "samples.parquet", "scenarios.json", "files.json"}
@@ -270,7 +270,7 @@ DAMAGED: dict[str, Callable[[Any], object]] = {
 
 @pytest.mark.parametrize("damage", DAMAGED)
 @pytest.mark.parametrize("task", ["planning", "forecasting"])
-def test_damaged_counts_of_means(run: EvaluationRun, tmp_path: Path, task: TaskName, damage: str) -> None:
+def test_damaged_counts_of_means(run: EvaluationRun, tmp_path: Path, task: str, damage: str) -> None:
     setup = EvaluationSetup(task=task, protocol="clean")
     evaluator, sums = setup.evaluator(), Sums()
     column = "avoided" if task == "planning" else "min_fde"

@@ -32,7 +32,6 @@ from deepaccident_devkit.evaluation.runs.setups import (
     Coverage,
     EvaluationSetup,
     SampleLoader,
-    TaskName,
     checkpoint_path,
     remove_checkpoints,
     scenario_of,
@@ -135,7 +134,7 @@ class TestRefused:
 
     @pytest.mark.parametrize(("task", "protocol"), [("accident", "boxes"), ("warning", "clean")])
     def test_scenarios_without_meta_are_counted_before_the_start(
-        self, da_b: DeepAccident, own_release: Path, tmp_path: Path, task: TaskName, protocol: str
+        self, da_b: DeepAccident, own_release: Path, tmp_path: Path, task: str, protocol: str
     ) -> None:
         every = SampleSelection(split="train", samples="all", scope="all")
         silent = [scenario["token"] for scenario in da_b.find(split="train")][:1]

@@ -11,7 +11,7 @@ from deepaccident_devkit.evaluation.runs.bundles import checked_target
 from deepaccident_devkit.evaluation.runs.evaluation_run import breakdowns_of
 from deepaccident_devkit.evaluation.runs.rows import read_rows, write_rows
 from deepaccident_devkit.evaluation.runs.sanity import SanityReport
-from deepaccident_devkit.evaluation.runs.setups import TASK_PROTOCOLS, Coverage, EvaluationSetup, default_selection
+from deepaccident_devkit.evaluation.runs.setups import TASKS, Coverage, EvaluationSetup, default_selection
 from deepaccident_devkit.evaluation.runs.text import notes_of
 from deepaccident_devkit.evaluation.runs.verification import differing
 
@@ -49,11 +49,6 @@ WRITTEN = {
     "sanity.SanityReport": "compared='', sought=()",
     "sanity.Seen": "empty=False, scores=(), probabilities=False",
     "setups.LIST_STEP": "0.5",
-    "setups.TASK_RESULTS": (
-        "mappingproxy({'motion': ('motion',), 'accident': ('motion', 'accident'), "
-        "'detection': ('detection',), 'warning': ('motion', 'accident'), 'planning': ('planning',), "
-        "'forecasting': ('forecasting',)})"
-    ),
     "setups.SampleSelection": "samples='evaluate', scope='accident', agents=None, horizon=2.0",
     "setups.Coverage": "missing=(), extra=(), unknown=(), splits=(), agents=(), options=''",
     "setups.EvaluationSetup": "protocol='released', switches=<factory>, horizon=2.0",
@@ -82,7 +77,7 @@ PROTOCOLS = {
 
 def test_every_default_and_constant_written_out(tmp_path: Path) -> None:
     assert written_out("deepaccident_devkit.evaluation.runs") == WRITTEN
-    assert {task: tuple(protocols) for task, protocols in TASK_PROTOCOLS.items()} == PROTOCOLS
+    assert {task: tuple(evaluator_class.protocols) for task, evaluator_class in TASKS.items()} == PROTOCOLS
     setup = EvaluationSetup(task="motion")
     assert default_selection(setup).text() == "split val, samples evaluate (the last 2 s), scope accident, all agents"
     write_rows(tmp_path / "rows", [], {})

@@ -28,7 +28,7 @@ from deepaccident_devkit.evaluation.predictions import label_config
 from deepaccident_devkit.evaluation.results import Results, ResultsWriter, read_results
 from deepaccident_devkit.evaluation.runs import Coverage, SampleSelection, coverage, default_selection
 from deepaccident_devkit.evaluation.runs.setups import (
-    TASK_PROTOCOLS,
+    TASKS,
     EvaluationSetup,
     SampleLoader,
     agent_of,
@@ -41,7 +41,7 @@ from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.motion import MotionLabels
 from deepaccident_devkit.synth import SynthConfig, make_release
 
-ALL = [(task, protocol) for task, protocols in TASK_PROTOCOLS.items() for protocol in protocols]
+ALL = [(task, protocol) for task, evaluator_class in TASKS.items() for protocol in evaluator_class.protocols]
 
 
 class TestSetup:
@@ -58,7 +58,7 @@ class TestSetup:
         setup = EvaluationSetup(task=task, protocol=protocol)
         evaluator = setup.evaluator()
         assert type(evaluator) is kinds[task]
-        assert (setup.rules, setup.as_dict()["settings"]) == (TASK_PROTOCOLS[task][protocol], evaluator.settings)
+        assert (setup.rules, setup.as_dict()["settings"]) == (TASKS[task].protocols[protocol], evaluator.settings)
         assert pickle.loads(pickle.dumps(setup)) == setup
 
     def test_switches_come_to_the_evaluator_and_cannot_be_changed(self) -> None:

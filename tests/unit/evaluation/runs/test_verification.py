@@ -29,7 +29,7 @@ from deepaccident_devkit.evaluation.runs import (
     verify_bundle,
 )
 from deepaccident_devkit.evaluation.runs.rows import read_rows, write_rows
-from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup, TaskName
+from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 from deepaccident_devkit.evaluation.runs.verification import ABSENT, Difference, differing
 from deepaccident_devkit.support.reading import file_checksum
 
@@ -78,7 +78,7 @@ def test_nothing_differs(bundle: Path, da_b: DeepAccident) -> None:
         ("forecasting", "clean"),
     ],
 )
-def test_nothing_differs_whatever_the_task(da_b: DeepAccident, tmp_path: Path, task: TaskName, protocol: str) -> None:
+def test_nothing_differs_whatever_the_task(da_b: DeepAccident, tmp_path: Path, task: str, protocol: str) -> None:
     """With groups, another horizon, and numbers that only some samples have."""
     setup = EvaluationSetup(task=task, protocol=protocol, horizon=0.5)
     selection = default_selection(setup, "val", agents=("ego_vehicle",), scope="all")

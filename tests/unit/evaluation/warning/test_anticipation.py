@@ -112,7 +112,7 @@ def test_a_siren_pays_in_precision_and_time() -> None:
     assert references["always"]["ego_involved"] == siren | {"operating": POINT | {"threshold": 1.0}}
     better = ("auc_ahead", "twin_wins", "AP", "precision")  # the costs before what grows with more alarms
     rows = [*((name, "share", True) for name in better), ("time_in_alarm", "share", False), ("recall", "share", True)]
-    assert [(each.name, each.unit, each.higher_is_better) for each in headlines("warning", result)] == [
+    assert [(each.name, each.unit, each.higher_is_better) for each in headlines(result)] == [
         (f"{name} ego_involved", *facts) for name, *facts in (*rows, ("tta0", "s", True))
     ]
 

@@ -7,7 +7,6 @@ from refusals import assert_refused
 from deepaccident_devkit.errors import ChoiceError, EvaluationError
 from deepaccident_devkit.evaluation.accident import AccidentContext
 from deepaccident_devkit.evaluation.warning import WARNING_PROTOCOLS, WarningEvaluator
-from deepaccident_devkit.evaluation.warning.evaluator import WARNING
 
 
 @pytest.mark.parametrize("protocol", WARNING_PROTOCOLS)
@@ -20,7 +19,8 @@ def test_the_protocols_and_their_choices() -> None:
     choices = {"clean": {"scores_of": "pair", "threshold": None}, "field": {}}
     assert {name: WarningEvaluator(name).settings for name in WARNING_PROTOCOLS} == choices
     assert WarningEvaluator().protocol == WARNING_PROTOCOLS["clean"]
-    assert (WARNING.whole_recordings, WARNING.needs_meta, WARNING.kinds) == (True, True, ("motion", "accident"))
+    facts = WarningEvaluator.needs_whole_recordings, WarningEvaluator.needs_meta, WarningEvaluator.result_kinds
+    assert facts == (True, True, ("motion", "accident"))
 
 
 def test_what_cannot_be_evaluated() -> None:

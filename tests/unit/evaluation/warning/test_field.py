@@ -119,7 +119,7 @@ def test_what_a_result_holds(*, references: bool) -> None:
     assert all([*each] == names for each in made.references.values())
     assert made.figures["drive bystander"].precision_at_half == pytest.approx(12 / (12 + 19))
     rows = (("AP", "share"), ("mTTA", "s"), ("TTA@R80", "s"))
-    assert [(each.name, each.unit, each.higher_is_better) for each in headlines("warning", made)] == [
+    assert [(each.name, each.unit, each.higher_is_better) for each in headlines(made)] == [
         (f"{row} {name}", unit, True) for row, unit in rows for name in names
     ]
     *said, last = made.notes

@@ -26,7 +26,7 @@ def test_breakdowns_have_a_bar_and_an_interval_a_group(detected: DetectionResult
     known = group("infrastructure", detected, 5, mean_average_precision=(40.0, 50.0))
     groups = (known, group(None, DetectionEvaluator("paper").compute(), 1))
     broken = Breakdown(by="agent", groups=groups, without_infrastructure=(), resampling=Resampling())
-    ax = render_breakdown("detection", broken, "mean_average_precision", ax=new_axes())
+    ax = render_breakdown(broken, "mean_average_precision", ax=new_axes())
     (bar,) = ax.patches
     assert (bar.get_width(), to_hex(bar.get_facecolor())) == (43.75, AGENT_COLORS["infrastructure"])
     assert_array_equal(ax.lines[0].get_xdata(), (40, 50))

@@ -62,13 +62,13 @@ def test_a_report_holds_all_and_asks_for_nothing(
     page = page_of(save_report(run, tmp_path))
     figures = sorted((tmp_path / "figures").iterdir())
     assert [path.stem for path in figures] == sorted(each.name for each in run_figures(run))
-    assert len(page.all("img")) == len(figures) >= (1 if TASKS[setup.task].whole_recordings else 4)
+    assert len(page.all("img")) == len(figures) >= (1 if TASKS[setup.task].needs_whole_recordings else 4)
     assert {str(image["src"])[:22] for image in page.all("img")} == {"data:image/png;base64,"}
     assert min(len(str(image["alt"])) for image in page.all("img")) > 10
     assert not holding([name for name, _ in page.found], "script", "link", "iframe", "object", "form")
     assert {str(link["href"]) for link in page.all("a")} == {f"#{each['id']}" for each in page.all("section")}
     assert sum(map(warning_pixels, figures)) == 0
-    numbers = [words for each in headlines(setup.task, run.result) for words in (each.name, each.text())]
+    numbers = [words for each in headlines(run.result) for words in (each.name, each.text())]
     switches = re.findall(r"'(\w+)':", str(run.setup.as_dict()["settings"]))
     told = (run.release.fingerprint, run.results.fingerprint, setup.protocol, "deepaccident evaluate verify")
     clusters = "no intervals: of 1 cluster (an accident and its twin are one); at least 6 are needed"
