@@ -23,9 +23,11 @@ from deepaccident_devkit.evaluation.accident.paper import PaperAccidents
 from deepaccident_devkit.evaluation.detection import DETECTION_PROTOCOLS, DetectionProtocol
 from deepaccident_devkit.evaluation.map_accidents import AccidentReading
 from deepaccident_devkit.evaluation.motion import MOTION_PROTOCOLS, MotionProtocol
+from deepaccident_devkit.evaluation.runs.setups import TASKS
 from deepaccident_devkit.evaluation.warning import WARNING_PROTOCOLS, CleanWarnings
 from deepaccident_devkit.geometry import Box, Boxes, LidarPointCloud, PinholeCamera
 from deepaccident_devkit.motion import LabelProtocol, MotionLabelConfig, PostProcessing
+from deepaccident_devkit.safety.prevention_result import PreventedResult
 from deepaccident_devkit.selection.fields import FIELDS, full_name
 from deepaccident_devkit.synth import SynthConfig, make_release
 from deepaccident_devkit.validation import CODES
@@ -198,6 +200,14 @@ def test_every_choice_of_the_metrics_is_explained(choices: type[Any]) -> None:
 @pytest.mark.parametrize("name", [*MOTION_PROTOCOLS, *DETECTION_PROTOCOLS, *PROTOCOLS, *WARNING_PROTOCOLS])
 def test_every_protocol_of_the_metrics_is_explained(name: str) -> None:
     assert f"`{name}`" in (DOCS / "protocols.md").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("result_class", [*(each.result_class for each in TASKS.values()), PreventedResult])
+def test_every_number_of_a_result_is_explained(result_class: type[Any]) -> None:
+    page = (DOCS / "protocols.md").read_text(encoding="utf-8")
+    numbers = [row.path.removesuffix("/*").rpartition("/")[2] for row in result_class.rows]
+    assert numbers
+    assert [number for number in numbers if f"`{number}`" not in page] == []
 
 
 def test_the_code_on_safety_runs(in_labels_demo: Path) -> None:
