@@ -30,11 +30,11 @@ from benchmarks.labels_postprocess import clear_heads
 from benchmarks.labels_warp import make_labels
 from benchmarks.measure import Figure, one_core
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.exact.outlines import TOLERANCE, pair_gaps
 from deepaccident_devkit.export.bulk import export_release
 from deepaccident_devkit.export.nuscenes import NuScenes
 from deepaccident_devkit.motion import MotionLabels, predict_instances
-from deepaccident_devkit.synth import SynthConfig, make_release
+from deepaccident_devkit.motion.reference_arithmetic.outlines import TOLERANCE, pair_gaps
+from deepaccident_devkit.plugins.synth import SynthConfig, make_release
 
 Work = Callable[[], object]
 ROUNDS, LEAST_SECONDS = 15, 0.02

@@ -16,7 +16,7 @@ from benchmarks.loader_rivals import rivals
 from benchmarks.measure import Figure, has_torch
 from benchmarks.releases import copied_release
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.synth import make_release
+from deepaccident_devkit.plugins.synth import make_release
 from deepaccident_devkit.taxonomy import AGENTS
 
 EPOCHS = 5

@@ -20,8 +20,8 @@ from benchmarks.measure import best_of, one_core
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.export import bulk
 from deepaccident_devkit.export.opencood import OpenCood
-from deepaccident_devkit.parallel import cluster_executor, run_batch, store
-from deepaccident_devkit.parallel.executors import own_workers
+from deepaccident_devkit.support.parallel import cluster_executor, run_batch, store
+from deepaccident_devkit.support.parallel.executors import own_workers
 
 WARMING_S = 0.5
 

@@ -16,9 +16,9 @@ import click
 
 from benchmarks.releases import labels_only_release
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.baselines import predict_results
 from deepaccident_devkit.evaluation.runs import default_selection, evaluate_results
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
+from deepaccident_devkit.plugins.baselines import predict_results
 
 PACKAGE, EVALUATION = "deepaccident_devkit", "deepaccident_devkit.evaluation"
 WALKS = (

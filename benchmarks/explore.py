@@ -23,7 +23,7 @@ import numpy as np
 
 from benchmarks.measure import Figure
 from benchmarks.scale import write_whole_release
-from deepaccident_devkit.synth import SynthConfig, make_release
+from deepaccident_devkit.plugins.synth import SynthConfig, make_release
 
 LISTS = (
     "/",

@@ -14,7 +14,6 @@ from benchmarks.measure import Figure, best_of, one_core
 from benchmarks.releases import copied_release
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.export.bulk import Format, export_release
-from deepaccident_devkit.export.image_cache import CachedImages
 from deepaccident_devkit.export.images import ImageConfig
 from deepaccident_devkit.export.mmdet3d import Mmdet3d
 from deepaccident_devkit.export.nuscenes import NuScenes
@@ -23,8 +22,9 @@ from deepaccident_devkit.export.parquet import Parquet
 from deepaccident_devkit.export.questions import Questions, WindowRules
 from deepaccident_devkit.export.released_infos import ReleasedInfos
 from deepaccident_devkit.export.webdataset import WebDataset
+from deepaccident_devkit.plugins.synth import SynthConfig, make_release
 from deepaccident_devkit.release import find_release
-from deepaccident_devkit.synth import SynthConfig, make_release
+from deepaccident_devkit.training.image_cache import CachedImages
 
 CACHE = CachedImages(images=ImageConfig(resize=(396, 704), crop=(140, 0, 256, 704)), where=("length>=1",))
 QUESTIONS = Questions(window=WindowRules(observe=0.0, stride=0.5))

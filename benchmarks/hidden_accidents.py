@@ -13,13 +13,13 @@ import numpy as np
 
 from benchmarks.pages.marks import put, table
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.baselines import Outlook, outlook
-from deepaccident_devkit.baselines.predict import accidents_ahead
 from deepaccident_devkit.evaluation import Accident, Resampling
-from deepaccident_devkit.evaluation.accident_truth import accident_context
 from deepaccident_devkit.evaluation.breakdowns import cluster_of
 from deepaccident_devkit.evaluation.intervals import difference_intervals
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup, SampleSelection, scenario_of
+from deepaccident_devkit.evaluation.truth import accident_context
+from deepaccident_devkit.plugins.baselines import Outlook, outlook
+from deepaccident_devkit.plugins.baselines.predict import accidents_ahead
 from deepaccident_devkit.taxonomy import OWN_ACTOR_ID
 
 SEEDS, FOUND, OFF, SPEED_OFF = (1, 2, 3), 0.5, 0.7, 1.5

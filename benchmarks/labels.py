@@ -14,7 +14,6 @@ from benchmarks import labels_postprocess, labels_warp
 from benchmarks.measure import Figure, best_of, one_core
 from benchmarks.releases import labels_only_release
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.exact.polygon_fill import filled_cells
 from deepaccident_devkit.motion import (
     LABEL_PROTOCOLS,
     FrameBoxes,
@@ -24,6 +23,7 @@ from deepaccident_devkit.motion import (
     write_label_files,
 )
 from deepaccident_devkit.motion.drawing import LabelMaps
+from deepaccident_devkit.motion.reference_arithmetic.polygon_fill import filled_cells
 
 OBJECTS, STEP = 30, 0.5
 RELEASED_MS = 112

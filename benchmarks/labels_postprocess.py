@@ -3,9 +3,9 @@
 import numpy as np
 
 from benchmarks.measure import Figure, best_of, one_core
-from deepaccident_devkit.exact.polygon_fill import filled_cells
 from deepaccident_devkit.motion.grouping import MotionHeads
 from deepaccident_devkit.motion.instances import predict_instances
+from deepaccident_devkit.motion.reference_arithmetic.polygon_fill import filled_cells
 
 FRAMES, OBJECTS, CELLS = 5, 30, 200
 REPEATS, NOISY_REPEATS = 40, 10

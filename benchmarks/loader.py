@@ -18,10 +18,10 @@ from benchmarks.measure import Figure, best_of, has_torch, one_core
 from benchmarks.releases import copied_release
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.export.bulk import export_release
-from deepaccident_devkit.export.image_cache import CachedImages
 from deepaccident_devkit.export.images import ImageConfig
-from deepaccident_devkit.synth import SynthConfig, make_release
+from deepaccident_devkit.plugins.synth import SynthConfig, make_release
 from deepaccident_devkit.taxonomy import AGENTS
+from deepaccident_devkit.training.image_cache import CachedImages
 
 RELEASE = SynthConfig(scenarios=1, frames=2, image_size=(1600, 900), seed=7, unplanned=0, designed=True)
 SCENARIOS = 4
@@ -71,7 +71,7 @@ def measure() -> list[Figure]:
 
 def ways(dataset: DeepAccident, caches: Path | None, agents: tuple[str, ...]) -> dict[str, Any]:
     """Each way to make the items, of the first agent's samples; out of caches only if there are any."""
-    from deepaccident_devkit.export.torch import V2XConfig, V2XDataset
+    from deepaccident_devkit.training.torch import V2XConfig, V2XDataset
 
     tokens = [record["token"] for record in dataset.sample if record["agent"] == agents[0]]
     base = V2XConfig(agents=agents, points=False, boxes=None, images=SCALED)

@@ -42,7 +42,7 @@ class Figure:
 def has_torch(benchmark: str) -> bool:
     """Whether what needs PyTorch can be measured; else says that it is not."""
     try:
-        import deepaccident_devkit.export.torch  # noqa: F401
+        import deepaccident_devkit.training.torch  # noqa: F401
     except MissingExtraError as error:
         click.echo(f"{benchmark}: training images are not measured; {error}", err=True)
         return False

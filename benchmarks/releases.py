@@ -3,8 +3,8 @@
 import shutil
 from pathlib import Path
 
+from deepaccident_devkit.plugins.synth import SynthConfig, make_release
 from deepaccident_devkit.release import find_release
-from deepaccident_devkit.synth import SynthConfig, make_release
 from deepaccident_devkit.taxonomy import AGENTS
 
 WHOLE_SAMPLES, WHOLE_BYTES = 285_000, 310e9

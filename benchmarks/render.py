@@ -6,8 +6,8 @@ from pathlib import Path
 
 from benchmarks.measure import Figure, best_of, one_core
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.render.video import Scene, views_of
-from deepaccident_devkit.synth import SynthConfig, make_release
+from deepaccident_devkit.plugins.synth import SynthConfig, make_release
+from deepaccident_devkit.render.video import VideoScene, views_of
 
 FRAMES, SIZE = 40, (1280, 720)
 REPEATS = 3
@@ -26,7 +26,7 @@ def pictures_s(dataset: DeepAccident) -> list[Figure]:
     figures = []
     with one_core():
         for name in PICTURES:
-            scene = Scene(dataset=dataset, views=views_of(name, None), agents=None, width=SIZE[0], height=SIZE[1])
+            scene = VideoScene(dataset=dataset, views=views_of(name, None), agents=None, width=SIZE[0], height=SIZE[1])
             seconds = best_of(REPEATS, partial(scene.picture, token))
             bound = 1.0 if name == "frame" else None
             figures.append(Figure(name=f"render_{name}_s", value=seconds, unit="s", bound=bound))

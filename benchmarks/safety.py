@@ -35,7 +35,7 @@ from deepaccident_devkit.interactions import (
     time_to_collision_1d,
 )
 from deepaccident_devkit.interactions.scenario import FOLDER
-from deepaccident_devkit.synth import SynthConfig, make_release
+from deepaccident_devkit.plugins.synth import SynthConfig, make_release
 
 CHECKOUT = "SSMS_ON_PLANE"
 """Environment variable with the folder of a clone."""

@@ -15,16 +15,16 @@ from typing import Any, Final
 import torch
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit._version import __version__
-from deepaccident_devkit.model import PredictConfig, load_model, read_weights
-from deepaccident_devkit.model.checkpoint import write_weights
-from deepaccident_devkit.model.training_run import one_thread
-from deepaccident_devkit.model.training_step import validated
-from deepaccident_devkit.motion import samples
+from deepaccident_devkit.plugins.model import PredictConfig, load_model, read_weights
+from deepaccident_devkit.plugins.model.checkpoint import write_weights
+from deepaccident_devkit.plugins.model.training_run import one_thread
+from deepaccident_devkit.plugins.model.training_step import validated
+from deepaccident_devkit.plugins.synth import SynthConfig, make_release
 from deepaccident_devkit.release.layout import write_split_file
-from deepaccident_devkit.synth import SynthConfig, make_release
+from deepaccident_devkit.selection.samples import samples
+from deepaccident_devkit.support.version import __version__
 
-HOMES: Final = Path(__file__).parents[1] / "deepaccident_devkit" / "model"
+HOMES: Final = Path(__file__).parents[1] / "deepaccident_devkit" / "plugins" / "model"
 SCORED: Final[dict[str, Any]] = {
     "agents": "all",
     "synth": {

@@ -4,8 +4,8 @@ import tempfile
 from pathlib import Path
 
 from benchmarks.measure import Figure, best_of
+from deepaccident_devkit.plugins.synth import SynthConfig, make_release
 from deepaccident_devkit.release import find_release
-from deepaccident_devkit.synth import SynthConfig, make_release
 
 LABELS = SynthConfig(scenarios=12, frames=None, sensors=False, designed=True)
 """Of natural length, 40 to 100 frames."""

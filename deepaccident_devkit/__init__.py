@@ -2,9 +2,9 @@
 
 from typing import TYPE_CHECKING, Any
 
-from deepaccident_devkit._version import __version__
 from deepaccident_devkit.errors import DeepAccidentError
 from deepaccident_devkit.support.text import Pictured
+from deepaccident_devkit.support.version import __version__
 
 if TYPE_CHECKING:
     from deepaccident_devkit.deepaccident import DeepAccident

@@ -42,8 +42,8 @@ __all__ = ["VISIBLE", "Dataset", "RowArgument", "VelocitySource", "Visible"]
 
 Visible = Literal["camera", "released"]
 VelocitySource = Literal["decoded", "derived", "label"]
+# What a caller can call a frame → its one name.
 _FRAMES: Final[Mapping[str, str]] = {name: name for name in (*get_args(Frame), *CHANNELS)} | {LIDAR: "lidar"}
-"""What a caller can call a frame → its one name."""
 VISIBLE: Final = (None, *get_args(Visible))
 """What `visible=` can be."""
 

@@ -4,17 +4,14 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
-from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from deepaccident_devkit import overview
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import IndexStoreError, escaped
 from deepaccident_devkit.release import find_release
 from deepaccident_devkit.release.store import Dataroot, open_dataroot
-from deepaccident_devkit.rooms import added
 from deepaccident_devkit.support.nuscenes_names import with_keywords_named
 from deepaccident_devkit.support.text import counted, path_of
 from deepaccident_devkit.tables import open_index
@@ -22,7 +19,7 @@ from deepaccident_devkit.taxonomy import OnError
 
 
 class _Later:
-    """A function of a package that is slow to import, or of a room: imported at its first use, and then kept.
+    """A function of a package that is slow to import: imported at its first use, and then kept.
 
     `DeepAccident` binds functions of all layers, and reading tables should not wait for the import of those that
     render.
@@ -56,22 +53,17 @@ class _Package:
         return _Later(lambda: getattr(import_module(self._name), name))
 
 
-class _Ring:
-    """The same for the rooms of the ring, which need not be there: what they add to the facade."""
-
-    def __getattr__(self, name: str) -> _Later:
-        return _Later(partial(added, "method", name))
-
-
 if TYPE_CHECKING:
     from concurrent.futures import Executor
 
-    from deepaccident_devkit import interactions as pairs
-    from deepaccident_devkit import maps, motion, render, safety, selection, v2x, validation
-    from deepaccident_devkit.maps import pictures as map_pictures
+    from deepaccident_devkit import descriptions, maps, motion, render, selection, v2x, validation
+    from deepaccident_devkit import interactions as interactions_of_pairs
+    from deepaccident_devkit.selection import samples as sample_lists
 else:
-    motion, render, selection, v2x, validation = map(_Package, ("motion", "render", "selection", "v2x", "validation"))
-    map_pictures = maps = pairs = safety = _Ring()
+    descriptions, maps, motion, render, selection, v2x, validation = map(
+        _Package, ("descriptions", "maps", "motion", "render", "selection", "v2x", "validation")
+    )
+    interactions_of_pairs, sample_lists = _Package("interactions"), _Package("selection.samples")
 
 
 class DeepAccident(Dataset):
@@ -149,15 +141,15 @@ class DeepAccident(Dataset):
     trajectory = v2x.trajectory
     collision = v2x.collision
     message_sizes = v2x.message_sizes
-    interactions = pairs.interactions
+    interactions = interactions_of_pairs.interactions
     town_map = maps.town_map
-    describe = safety.describe
+    describe = descriptions.describe
     motion_labels = motion.motion_labels
     motion_labels_of = motion.motion_labels_of
     bev_segmentation = motion.bev_segmentation
-    samples = motion.samples
-    training_samples = motion.training_samples
-    evaluation_samples = motion.evaluation_samples
+    samples = sample_lists.samples
+    training_samples = sample_lists.training_samples
+    evaluation_samples = sample_lists.evaluation_samples
     findings = validation.findings
     render_sample = render.render_sample
     render_frame = render.render_frame
@@ -175,24 +167,32 @@ class DeepAccident(Dataset):
     render_evaluation = render.render_evaluation
     render_scenario_video = render.render_scenario_video
     render_replay = render.render_replay
-    render_town_map = map_pictures.render_town_map
+    render_town_map = render.render_town_map
 
     def list_scenarios(self) -> None:
         """Print a line for each scenario."""
-        _print(overview.scenario_lines(self.scenario))
+        from deepaccident_devkit.statistics.overview import scenario_lines
+
+        _print(scenario_lines(self.scenario))
 
     def list_agents(self) -> None:
         """Print the number of scenarios of each agent."""
-        _print(overview.agent_lines(self))
+        from deepaccident_devkit.statistics.overview import agent_lines
+
+        _print(agent_lines(self))
 
     def list_categories(self) -> None:
         """Print each category's index, name and counts."""
-        _print(overview.category_lines(self))
+        from deepaccident_devkit.statistics.overview import category_lines
+
+        _print(category_lines(self))
 
     @with_keywords_named
     def list_sample(self, sample: RowArgument) -> None:
         """Print the files and boxes of a sample; raises TokenError."""
-        _print(overview.sample_lines(self, sample))
+        from deepaccident_devkit.statistics.overview import sample_lines
+
+        _print(sample_lines(self, sample))
 
     def __repr__(self) -> str:
         """Version, place and size."""

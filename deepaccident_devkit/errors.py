@@ -195,5 +195,5 @@ class MissingExtraError(UnavailableError, ImportError):
     """An optional dependency is needed and not installed."""
 
 
-class MissingRoomError(UnavailableError, ImportError):
-    """A part of the devkit is needed that this installation lacks."""
+class MissingPluginError(UnavailableError, ImportError):
+    """A plug-in is needed that this installation lacks."""

@@ -51,10 +51,17 @@ napoleon_attr_annotations = False  # signatures have the types
 napoleon_use_ivar = True  # attributes are a list below their class, not an entry each
 
 REFERENCE = {
-    "The release": ("DeepAccident", "taxonomy", "reports", "errors"),
+    "The release": ("DeepAccident", "taxonomy", "support.reports", "errors"),
     "Boxes, poses, clouds, grids": ("geometry",),
     "V2X": ("v2x",),
-    "Safety": ("safety", "render.safety", "maps", "interactions"),
+    "Collisions and interactions": ("collisions", "interactions", "descriptions", "maps"),
+    "Safety": (
+        "plugins.safety",
+        "plugins.safety.prevention",
+        "plugins.safety.prevention_result",
+        "plugins.safety.figures",
+        "plugins.safety.page",
+    ),
     "Motion labels": ("motion",),
     "Evaluation": (
         "evaluation",
@@ -71,16 +78,16 @@ REFERENCE = {
         "evaluation.runs",
         "evaluation.runs.sanity",
     ),
-    "Baselines": ("baselines",),
+    "Baselines": ("plugins.baselines",),
     "Pictures": ("render.figures.Layer", "render", "render.evaluation"),
-    "Splits and queries": ("splits", "selection"),
-    "Validation and statistics": ("validation", "statistics", "audit"),
+    "Splits, samples and queries": ("selection", "selection.samples", "selection.splits"),
+    "Validation and statistics": ("validation", "statistics", "plugins.audit"),
     "Files of a release": ("release",),
-    "Synthetic releases": ("synth", "synth.spec"),
+    "Synthetic releases": ("plugins.synth", "plugins.synth.spec"),
     "The test kit": ("testing", "testing.plugin", "testing.strategies"),
     "Other frameworks": (
-        "export.torch",
-        "export.image_cache",
+        "training.torch",
+        "training.image_cache",
         "export.mcap",
         "export.bulk",
         "export.opencood.OpenCood",
@@ -91,10 +98,17 @@ REFERENCE = {
         "export.webdataset.WebDataset",
         "export.nuscenes.detections",
     ),
-    "The model": ("model",),
-    "nuScenes": ("nuscenes", "nuscenes.items.NuScenesDataset", "nuscenes.check", "nuscenes.rigs", "nuscenes.results"),
-    "Studies": ("study",),
-    "The explorer": ("explore",),
+    "The model": ("plugins.model",),
+    "nuScenes": (
+        "plugins.nuscenes",
+        "plugins.nuscenes.items.NuScenesDataset",
+        "plugins.nuscenes.check",
+        "plugins.nuscenes.sensor_setups",
+        "plugins.nuscenes.results",
+    ),
+    "Plug-ins": ("plugins", "evaluation.evaluator", "evaluation.means", "evaluation.task.Row"),
+    "Studies": ("plugins.study",),
+    "The explorer": ("plugins.explore",),
 }
 """Title of a page → what it lists: modules, classes, a type."""
 INTERNAL = ("MOST_QUOTED", "MOST_SAID", "MOST_TOLD", "escaped", "shortened")

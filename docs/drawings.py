@@ -20,21 +20,21 @@ from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.export.bulk import export_release
 from deepaccident_devkit.export.nuscenes import NuScenes
 from deepaccident_devkit.geometry import Boxes
-from deepaccident_devkit.nuscenes import open_nuscenes
-from deepaccident_devkit.nuscenes.rig_figures import rigs_figure
-from deepaccident_devkit.nuscenes.rigs import rig_report
+from deepaccident_devkit.plugins.nuscenes import open_nuscenes
+from deepaccident_devkit.plugins.nuscenes.sensor_setup_figures import sensor_setups_figure
+from deepaccident_devkit.plugins.nuscenes.sensor_setups import sensor_setup_report
+from deepaccident_devkit.plugins.synth import SynthConfig, make_release
+from deepaccident_devkit.plugins.synth.plan import RigName
+from deepaccident_devkit.plugins.synth.roads import Junction, RoadSpec
+from deepaccident_devkit.plugins.synth.roads.layout import OUTWARD
+from deepaccident_devkit.plugins.synth.spec import DESIGN_NUMBERS, read_design
+from deepaccident_devkit.plugins.synth.traffic.driving import middle_of, road_crossing
 from deepaccident_devkit.render import detached_figure, draw_motion_map, styles
 from deepaccident_devkit.render.boxes import draw_boxes_from_above
 from deepaccident_devkit.render.camera import best_view
 from deepaccident_devkit.render.figures import save_picture, write_figure
 from deepaccident_devkit.render.motion_maps import direction_colors
 from deepaccident_devkit.render.styles import AGENT_COLORS, COLLIDER_COLOR
-from deepaccident_devkit.synth import SynthConfig, make_release
-from deepaccident_devkit.synth.plan import RigName
-from deepaccident_devkit.synth.roads import Junction, RoadSpec
-from deepaccident_devkit.synth.roads.layout import OUTWARD
-from deepaccident_devkit.synth.spec import DESIGN_NUMBERS, read_design
-from deepaccident_devkit.synth.traffic.driving import middle_of, road_crossing
 from deepaccident_devkit.taxonomy import AGENTS, short_name
 from deepaccident_devkit.v2x import Contact
 
@@ -308,8 +308,8 @@ def draw_rigs(folder: Path, path: Path) -> None:
         make_release(folder / name, SynthConfig(rig=name, frames=3, image_size=(64, 36), designed=True))
         for name in RIGS
     ]
-    report = rig_report(*(DeepAccident(dataroot=each, verbose=False) for each in made))
-    write_figure(rigs_figure(report), path, dpi=110)
+    report = sensor_setup_report(*(DeepAccident(dataroot=each, verbose=False) for each in made))
+    write_figure(sensor_setups_figure(report), path, dpi=110)
 
 
 def draw_both_sources(folder: Path, path: Path) -> None:

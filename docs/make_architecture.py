@@ -17,9 +17,9 @@ PICTURE = TOP / "docs" / "images" / "layers.svg"
 WIDTH, MARGIN, GAP = 1080, 16, 8
 TOP_OF_TEXT, LINE, LETTER = 18, 16, 5.9
 """Pixels."""
-_COLORS = {"data": "#dbe9f6", "work": "#e5f2df", "use": "#fbeed5", "ring": "#efe3f3"}
+_COLORS = {"data": "#dbe9f6", "work": "#e5f2df", "use": "#fbeed5", "plugins": "#efe3f3"}
 _KINDS = {
-    "ring": "the ring: may be left out",
+    "plugins": "plug-ins: may be left out",
     "use": "what people call",
     "work": "what is computed and rendered",
     "data": "the release and its tables",
@@ -71,10 +71,10 @@ def picture() -> str:
 
 
 def _kind(rows: list[list[str]], number: int) -> str:
-    """The ring stands on all; below the data set lies what reads it, and above the facade what is called by people."""
+    """Plug-ins stand on all; below the data set lies what reads it, and above the facade what is called by people."""
     above = [name for row in rows[: number + 1] for name in row]
-    if "safety" in rows[number]:
-        return "ring"
+    if "plugins" in rows[number]:
+        return "plugins"
     return "data" if "dataset" in above else "work" if "export" in above else "use"
 
 

@@ -38,7 +38,7 @@ same text in the terminal.
 model. |
 | `deepaccident evaluate motion DATAROOT --results R --out DIR` | Evaluates predictions. `motion` can be `accident`, \
 `detection` or `warning`. |
-| `deepaccident evaluate verify DIR --dataroot DATAROOT` | Repeats an evaluation and lists all differences. |
+| `deepaccident check bundle DIR --dataroot DATAROOT` | Repeats an evaluation and lists all differences. |
 | `deepaccident evaluate compare A B` | Compares two evaluations and tests which differences are significant. |
 
 DATAROOT is the folder of a release: your download, a synthetic release, or `deepaccident_demo/release`. The exit status

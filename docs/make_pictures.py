@@ -22,16 +22,16 @@ from PIL import Image
 from selenium import webdriver
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.baselines import Baseline, predict_results
 from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.evaluation.results import read_results
 from deepaccident_devkit.evaluation.runs import SampleSelection, evaluate_results, save_run
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
-from deepaccident_devkit.explore import Explorer, make_app
-from deepaccident_devkit.explore.serving import Served, serving
+from deepaccident_devkit.plugins.baselines import Baseline, predict_results
+from deepaccident_devkit.plugins.explore import Explorer, make_app
+from deepaccident_devkit.plugins.explore.serving import Served, serving
+from deepaccident_devkit.plugins.synth import SynthConfig, make_release
+from deepaccident_devkit.plugins.synth.demo import SCENARIO
 from deepaccident_devkit.support.files import write_bytes
-from deepaccident_devkit.synth import SynthConfig, make_release
-from deepaccident_devkit.synth.demo import SCENARIO
 
 PAGE = Path(__file__).parent / "pictures.md"
 IMAGES = PAGE.parent / "images"

@@ -17,7 +17,6 @@ from typing import Any
 import click
 
 from deepaccident_devkit.cli import deepaccident
-from deepaccident_devkit.rooms import ADDED
 
 TOP = Path(__file__).parents[1]
 FILE = TOP / "docs" / "public_names.json"
@@ -40,14 +39,16 @@ DAILY = {
     ),
     "evaluation.results": "read_results",
     "evaluation.runs": "evaluate_results save_run verify_bundle compare_bundles",
-    "baselines": "predict_accidents predict_detections predict_motion",
-    "export.torch": "V2XDataset V2XConfig ImageConfig collate",
+    "plugins.baselines": "predict_accidents predict_detections predict_motion",
+    "training.torch": "V2XDataset V2XConfig ImageConfig collate",
     "export.bulk": "export_release",
-    "safety": "accident_of outcomes_of lead_times avoidability safety_report twin_diff",
-    "render.safety": "save_safety_report",
+    "collisions": "accident_of outcomes_of",
+    "descriptions": "avoidability",
+    "plugins.safety": "lead_times safety_report twin_diff",
+    "plugins.safety.page": "save_safety_report",
     "validation": "release_completeness",
-    "nuscenes": "open_nuscenes",
-    "synth": "SynthConfig make_release",
+    "plugins.nuscenes": "open_nuscenes",
+    "plugins.synth": "SynthConfig make_release",
     "testing": "write_small_release broken_release",
 }
 """Room, or the class that users know by its name → the names of daily use."""
@@ -226,9 +227,7 @@ def _names(module: str) -> dict[str, tuple[str, ast.stmt | str]]:
                 found.setdefault(ast.unparse(target), (module, node))  # a function that is wrapped stays itself
         elif isinstance(node, ast.ImportFrom) and node.module:
             found |= {alias.asname or alias.name: (node.module, alias.name) for alias in node.names}
-    added = {name.rpartition("."): there.split(":") for name, there in ADDED["name"].items()}
-    place = module.removeprefix(f"{PACKAGE}.")
-    return found | {name: (_dotted(there[0]), there[1]) for (room, _, name), there in added.items() if room == place}
+    return found
 
 
 @cache
@@ -250,7 +249,7 @@ def _said(module: str, node: ast.stmt, *, bound: bool = False) -> str:
     if isinstance(node, ast.AnnAssign) and ast.unparse(node.annotation) != "Final":
         return f": {ast.unparse(node.annotation)}"
     value = _text(node.value) if isinstance(node, ast.Assign | ast.AnnAssign) and node.value else ""
-    if module.endswith("._version"):
+    if module.endswith(".version"):
         return ": str"  # which a release changes
     return f"= {value}" if len(value) <= LONGEST else f"= {value[:LONGEST]}…"
 

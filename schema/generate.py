@@ -14,10 +14,10 @@ from deepaccident_devkit.tables.arrow_files import arrow_type
 from deepaccident_devkit.tables.columns import (
     Choice,
     Column,
+    ColumnKind,
     Derived,
     Items,
     Key,
-    Kind,
     Number,
     Struct,
     Subset,
@@ -88,7 +88,7 @@ def _field_schema(column: Column) -> dict[str, Any]:
     return {**described, "x-unit": unit} if unit else described
 
 
-def _kind_schema(kind: Kind) -> dict[str, Any]:  # noqa: PLR0911 - one a kind
+def _kind_schema(kind: ColumnKind) -> dict[str, Any]:  # noqa: PLR0911 - one a kind
     match kind:
         case Derived() | Word():
             return {"type": "string"}
@@ -136,7 +136,7 @@ def _column_markdown(column: Column) -> str:
     return f"| `{column.field}` | {stored}{null} | {meaning}{f' [{unit}]' if unit else ''} |"
 
 
-def _type_text(kind: Kind) -> str:
+def _type_text(kind: ColumnKind) -> str:
     match kind:
         case Vector():
             return f"float64 × {kind.length}"

@@ -7,8 +7,8 @@ from http.client import HTTPConnection
 
 import anyio.to_thread
 
-from deepaccident_devkit.explore.access import App, Receive, Scope, Send
-from deepaccident_devkit.explore.serving import Served
+from deepaccident_devkit.plugins.explore.access import App, AsgiScope, Receive, Send
+from deepaccident_devkit.plugins.explore.serving import Served
 
 Pairs = tuple[tuple[str, str], ...]
 
@@ -17,11 +17,11 @@ class TinyApp:
     """Answers with the paths that it got; some paths are special. `/slow` ends when `go_on` is set."""
 
     def __init__(self) -> None:
-        self.scopes: list[Scope] = []
+        self.scopes: list[AsgiScope] = []
         self.begun = threading.Event()
         self.go_on = threading.Event()
 
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+    async def __call__(self, scope: AsgiScope, receive: Receive, send: Send) -> None:
         if scope["type"] == "lifespan":
             await self._lifespan(receive, send)
             return

@@ -25,7 +25,7 @@ settings.load_profile("repeatable")
 
 DATA = Path(__file__).parent / "data"
 MADE = os.environ.get("DEEPACCIDENT_TEST_RELEASES")
-"""The folder of the session's releases, if another session has made them (tests/test_rooms.py)."""
+"""The folder of the session's releases, if another session has made them (tests/test_plugins.py)."""
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -78,7 +78,7 @@ def made(name: str, factory: pytest.TempPathFactory, **config: Any) -> Path:
     """A synthetic release of this name with clean accidents, made now unless another session or process has."""
     if MADE is not None:
         return Path(MADE) / name
-    from deepaccident_devkit.synth import SynthConfig, make_release
+    from deepaccident_devkit.plugins.synth import SynthConfig, make_release
 
     folder = factory.getbasetemp()
     root = (folder.parent if "PYTEST_XDIST_WORKER" in os.environ else folder) / "synthetic" / name
@@ -102,7 +102,7 @@ def release_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def made_demo(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     """The folder of a demo with few frames and small images, and what `deepaccident demo` printed."""
     out = tmp_path_factory.mktemp("demo") / "of a reader"
-    demo = importlib.import_module("deepaccident_devkit.synth.demo")
+    demo = importlib.import_module("deepaccident_devkit.plugins.synth.demo")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(demo, "RELEASE", replace(demo.RELEASE, frames=12, image_size=(64, 36)))
         result = CliRunner().invoke(demo.demo, [str(out)], catch_exceptions=False)

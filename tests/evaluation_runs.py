@@ -68,7 +68,10 @@ def _arguments(
     dataset: DeepAccident, setup: EvaluationSetup, token: str, source: np.random.Generator
 ) -> tuple[Any, ...]:
     if setup.task in ("planning", "forecasting"):
-        from deepaccident_devkit.baselines import predict_forecasts, predict_plan  # a room, which may be missing
+        from deepaccident_devkit.plugins.baselines import (  # a room, which may be missing
+            predict_forecasts,
+            predict_plan,
+        )
 
         planned = setup.task == "planning"
         predicted = [predict_plan(dataset, token)] if planned else predict_forecasts(dataset, token)

@@ -6,15 +6,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from deepaccident_devkit.geometry import quaternions
+from deepaccident_devkit.plugins.synth.scenario import RecordingJob, Scenario, build_scenario
+from deepaccident_devkit.plugins.synth.sensors.agents import Agent
+from deepaccident_devkit.plugins.synth.sensors.annotate import TRACKING_RANGE, camera_visible
+from deepaccident_devkit.plugins.synth.sensors.lidar import Scan
+from deepaccident_devkit.plugins.synth.sensors.rig import make_rig
+from deepaccident_devkit.plugins.synth.sensors.scene import Scene
+from deepaccident_devkit.plugins.synth.shapes import BOX_CLEARANCE
+from deepaccident_devkit.plugins.synth.traffic.simulate import separation
 from deepaccident_devkit.release import Meta, write_calib, write_label, write_meta
-from deepaccident_devkit.synth.scenario import RecordingJob, Scenario, build_scenario
-from deepaccident_devkit.synth.sensors.agents import Agent
-from deepaccident_devkit.synth.sensors.annotate import TRACKING_RANGE, camera_visible
-from deepaccident_devkit.synth.sensors.lidar import Scan
-from deepaccident_devkit.synth.sensors.rig import make_rig
-from deepaccident_devkit.synth.sensors.scene import Scene
-from deepaccident_devkit.synth.shapes import BOX_CLEARANCE
-from deepaccident_devkit.synth.traffic.simulate import separation
 from deepaccident_devkit.taxonomy import AGENTS, frame_timestamp
 
 STEP, STEPS_A_FRAME = 0.02, 5

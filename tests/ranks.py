@@ -16,7 +16,7 @@ from deepaccident_devkit.errors import EvaluationError
 from deepaccident_devkit.evaluation import AccidentEvaluator, DetectionEvaluator, MotionEvaluator, detection_truth
 from deepaccident_devkit.evaluation.detection import DetectedBoxes
 from deepaccident_devkit.evaluation.evaluator import Evaluator
-from deepaccident_devkit.export.torch import RandomAugmentation, V2XConfig, V2XDataset, collate, merged_evaluator
+from deepaccident_devkit.training.torch import RandomAugmentation, V2XConfig, V2XDataset, collate, merged_evaluator
 
 RANKS = 2
 

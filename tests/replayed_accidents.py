@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 from hypothesis import strategies as st
 
-from deepaccident_devkit.accidents.recorded import Accident
+from deepaccident_devkit.collisions.recorded import Accident
 
 CAR = (4.0, 2.0, 1.5)
 STEP = 0.1

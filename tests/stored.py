@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.parallel import Store
+from deepaccident_devkit.support.parallel import Store
 
 ITEMS = tuple(f"type/{number:02d}" for number in range(12))
 

@@ -36,7 +36,7 @@ BASELINES: dict[str, Any] = {
 _KILLED = """
 import os, signal, sys
 from importlib import import_module
-from deepaccident_devkit.study import read_recipe, run_study
+from deepaccident_devkit.plugins.study import read_recipe, run_study
 
 module, name, after, path, out = sys.argv[1:]
 place, calls = import_module(module), []

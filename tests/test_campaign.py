@@ -13,7 +13,7 @@ from campaign.pool import drawn, run
 from campaign.stops import VERBS, Stop, run_stops
 from campaign.worker import Case
 
-from deepaccident_devkit.support.reading import LIMITS
+from deepaccident_devkit.support.reading import BYTE_LIMITS
 
 TOP = Path(__file__).parents[1]
 PAGE = TOP / "docs" / "validation.md"
@@ -80,4 +80,4 @@ def test_the_limits_of_the_security_page_are_those_of_the_code() -> None:
     stated = {
         kind: int(size) << 20 for kind, size in re.findall(r"^\| `(\w+)` \|[^|]*\| (\d+) MiB \|$", text, re.MULTILINE)
     }
-    assert stated == LIMITS
+    assert stated == BYTE_LIMITS

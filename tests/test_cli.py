@@ -17,9 +17,9 @@ from verbs import called, commands, ran
 from deepaccident_devkit import DeepAccident, __version__
 from deepaccident_devkit.cli import deepaccident, verbs
 from deepaccident_devkit.motion import LABEL_PROTOCOLS, LabelFiles, MotionLabelConfig
+from deepaccident_devkit.plugins.synth import SynthConfig
 from deepaccident_devkit.release import read_split_file
-from deepaccident_devkit.splits import official_split
-from deepaccident_devkit.synth import SynthConfig
+from deepaccident_devkit.selection.splits import official_split
 
 
 @pytest.mark.slow
@@ -85,7 +85,8 @@ def test_a_broken_release_is_listed_and_may_be_skipped(own_release: Path) -> Non
 
 
 OF_FILES = ("--version", "--workers", "--scheduler")
-NOT_OF_ALL = {"validate": OF_FILES, "train": (), "explore": (), "results": (), "rigs": ()}
+NOT_OF_ALL = {"validate": OF_FILES, "release": OF_FILES, "scores": ("--version",)}
+NOT_OF_ALL |= dict.fromkeys(("train", "explore", "results", "sensor-setups"), ())
 """Verb on a release → the options of a release that it has; those that are left out run in one process, say."""
 
 
@@ -120,7 +121,7 @@ def test_index_check_sees_an_edit_that_folder_times_hide(own_release: Path) -> N
     label = next(own_release.glob("train/*/ego_vehicle/label/*/*_001.txt"))
     label.write_text("\n".join(label.read_text().splitlines()[:-1]) + "\n")
     before, after = (json.loads(ran("info", own_release, "--json").stdout)["tables"]["annotation"] for _ in range(2))
-    ran("index", own_release, "--check")
+    ran("check", "index", own_release)
     checked = json.loads(ran("info", own_release, "--json").stdout)["tables"]["annotation"]
     assert (after, checked) == (before, before - 1)
 

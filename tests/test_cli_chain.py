@@ -40,7 +40,7 @@ def folder(release: Path) -> Path:
 
 @pytest.mark.parametrize("name", ["motion", "accident.json", "detection.json"])
 def test_results_are_valid_and_of_the_split(release: Path, folder: Path, name: str) -> None:
-    valid = told("evaluate", "check", folder / "all" / name, "--dataroot", release, "--split", "train")
+    valid = told("check", "results", folder / "all" / name, "--dataroot", release, "--split", "train")
     assert "all 20 samples have a prediction, and nothing else has" in valid
 
 
@@ -55,7 +55,7 @@ def test_each_evaluation_is_verified(release: Path, folder: Path, task: str, nam
     summary = json.loads((out / "metrics_summary.json").read_text())
     assert (summary["task"], summary["protocol"], summary["counts"]["samples"]) == (task, protocol, 20)
     assert (out / "report.html").stat().st_size > 50_000
-    assert "all numbers are equal" in told("evaluate", "verify", out, "--dataroot", release, *results)
+    assert "all numbers are equal" in told("check", "bundle", out, "--dataroot", release, *results)
 
 
 def test_five_agents_are_compared_with_one(release: Path, folder: Path) -> None:

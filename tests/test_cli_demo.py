@@ -17,9 +17,9 @@ from verbs import called
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.synth import make_release
+from deepaccident_devkit.plugins.synth import make_release
 
-demo: Any = importlib.import_module("deepaccident_devkit.synth.demo")
+demo: Any = importlib.import_module("deepaccident_devkit.plugins.synth.demo")
 
 
 def run(*words: str) -> str:
@@ -50,7 +50,9 @@ def test_the_page_shows_all_that_was_made(made_demo: tuple[Path, str]) -> None:
 @pytest.mark.slow
 def test_the_next_steps_run_as_they_are_printed(made_demo: tuple[Path, str], monkeypatch: pytest.MonkeyPatch) -> None:
     served: list[object] = []
-    monkeypatch.setattr("deepaccident_devkit.explore.serving.serve", lambda _, **how: served.append(how["page"]))
+    monkeypatch.setattr(
+        "deepaccident_devkit.plugins.explore.serving.serve", lambda _, **how: served.append(how["page"])
+    )
     out, printed = made_demo
     assert printed.rstrip().endswith(str(out / "index.html"))
     steps = re.findall(r"^(\d of 7: \w+), which takes some \d+ s$", printed, re.MULTILINE)

@@ -222,12 +222,12 @@ def test_a_part_is_refused_unless_allowed_and_marked_everywhere(
 
 class TestVerify:
     def test_the_same(self, bundle: Path, da_motion: DeepAccident) -> None:
-        done = run("verify", bundle, "--dataroot", da_motion.dataroot, "--on-error", "skip")
+        done = ran("check", "bundle", bundle, "--dataroot", da_motion.dataroot, "--on-error", "skip")
         assert "the same; 8 samples evaluated again" in done.stdout
 
     def test_paths_in_a_bundle_are_to_be_repeated(self, bundle: Path, da_motion: DeepAccident) -> None:
-        told = run("verify", bundle, status=2).stderr
-        command = f"deepaccident evaluate verify {shlex.quote(str(bundle))} --dataroot {da_motion.dataroot}\n"
+        told = ran("check", "bundle", bundle, status=2).stderr
+        command = f"deepaccident check bundle {shlex.quote(str(bundle))} --dataroot {da_motion.dataroot}\n"
         assert (told.count("\n"), told.endswith(command)) == (1, True)
 
     def test_nothing_is_written_into_the_release(
@@ -237,13 +237,13 @@ class TestVerify:
         shutil.copytree(da_motion.dataroot, copied, ignore=shutil.ignore_patterns(".deepaccident"))
         monkeypatch.setenv("XDG_CACHE_HOME", str(cache))
         before = sorted(copied.rglob("*"))
-        evaluate("verify", bundle, "--dataroot", copied)
+        called("check", "bundle", bundle, "--dataroot", copied)
         assert sorted(copied.rglob("*")) == before
         assert list(cache.rglob("manifest.json"))
         shutil.rmtree(cache)
-        evaluate("verify", bundle, "--dataroot", copied, "--index-dir", tmp_path / "index")
+        called("check", "bundle", bundle, "--dataroot", copied, "--index-dir", tmp_path / "index")
         DeepAccident(dataroot=copied, verbose=False)
-        evaluate("verify", bundle, "--dataroot", copied)
+        called("check", "bundle", bundle, "--dataroot", copied)
         assert not cache.exists()
 
 
@@ -276,21 +276,32 @@ class TestCompare:
 class TestCheck:
     def test_tells_what_it_holds(self, results: dict[str, Path]) -> None:
         for kind, task in (("motion", "motion"), ("accidents", "accident"), ("boxes", "detection")):
-            assert evaluate("check", results[kind]).stdout.startswith(f"results      {task}, {results[kind]}\n")
+            assert called("check", "results", results[kind]).stdout.startswith(
+                f"results      {task}, {results[kind]}\n"
+            )
 
     def test_against_a_release(self, da_motion: DeepAccident, results: dict[str, Path]) -> None:
-        words = ("check", results["motion"], "--dataroot", da_motion.dataroot, "--split", "train")
-        good = evaluate(*words, "--agents", ",".join(AGENTS)).stdout
+        words = ("check", "results", results["motion"], "--dataroot", da_motion.dataroot, "--split", "train")
+        good = called(*words, "--agents", ",".join(AGENTS)).stdout
         assert "all 8 samples have a prediction, and nothing else has\nSanity check of 8 samples: " in good
         assert "None of these mistakes was found: x mirrored, " in good
-        assert "the predictions are of the samples of --agents " in evaluate(*words, status=1).stdout
+        assert "the predictions are of the samples of --agents " in called(*words, status=1).stdout
 
     def test_of_other_samples_there_is_nothing_to_compare(
         self, da_motion: DeepAccident, results: dict[str, Path]
     ) -> None:
-        words = ("check", results["motion"], "--dataroot", da_motion.dataroot, "--split", "train", "--agents")
+        words = (
+            "check",
+            "results",
+            results["motion"],
+            "--dataroot",
+            da_motion.dataroot,
+            "--split",
+            "train",
+            "--agents",
+        )
         with pytest.raises(EvaluationError, match="no sample to look at"):
-            evaluate(*words, "other_vehicle")
+            called(*words, "other_vehicle")
 
     def test_repeats_the_warnings_of_the_sanity_check(
         self, da_motion: DeepAccident, tmp_path: Path, tokens: list[str]
@@ -304,7 +315,7 @@ class TestCheck:
         assert "predictions looked at are empty" in told[1]
         assert told[2].startswith("Cannot say whether a mistake was made")
         release = ("--dataroot", da_motion.dataroot, *LIST[:-2])
-        assert evaluate("check", tmp_path / "empty.json", *release, status=2).stdout.splitlines()[-3:] == told
+        assert called("check", "results", tmp_path / "empty.json", *release, status=2).stdout.splitlines()[-3:] == told
 
 
 @pytest.mark.parametrize(
@@ -376,8 +387,8 @@ def test_prevented_accidents_are_stored_shown_and_verified(prevention: Path, da_
     report = page_of(prevention / "report.html").text
     assert ("Prevented accidents" in report, "random per frame, quiet" in report) == (True, True)
     assert (prevention / "figures" / "prevention_ego_involved.png").is_file()
-    words, path = ("verify", prevention, "--dataroot", da_motion.dataroot), prevention / "metrics_summary.json"
-    assert "the same; " in evaluate(*words).output
+    words, path = ("check", "bundle", prevention, "--dataroot", da_motion.dataroot), prevention / "metrics_summary.json"
+    assert "the same; " in called(*words).output
     for told, change in {
         "prevented/groups/ego_involved/quiet_braking: stored 0.5, found 1.0": lambda text: text.replace(
             '"quiet_braking": 1.0', '"quiet_braking": 0.5'
@@ -387,8 +398,8 @@ def test_prevented_accidents_are_stored_shown_and_verified(prevention: Path, da_
         ),
     }.items():
         with changed(path, change):
-            assert told in evaluate(*words, status=1).output
-            assert json.loads(evaluate(*words, "--json", status=1).stdout)["differences"]
+            assert told in called(*words, status=1).output
+            assert json.loads(called(*words, "--json", status=1).stdout)["differences"]
 
 
 def test_a_threshold_of_little_braking_from_another_split(

@@ -149,7 +149,7 @@ def test_ten_moments(number: signal.Signals, status: int, release_root_b: Path, 
             time.sleep(whole * moment / 9)
             ended = (stopped(process, number), process.returncode)
         assert ended in [([LINE], status), ([], 0)], moment  # at the end there is nothing to stop
-        with started(*words, out, "--check") as process:  # removes locks that were left at the very end, too
+        with started("check", *words, out) as process:  # removes locks that were left at the very end, too
             assert lines_of(process) == []
         assert files(out) == files(tmp_path / "whole")
 

@@ -8,11 +8,11 @@ from refusals import assert_refused
 from verbs import called
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.baselines import Baseline
 from deepaccident_devkit.errors import NotAvailableError, ResultsError
 from deepaccident_devkit.evaluation.results import read_results
 from deepaccident_devkit.evaluation.runs import read_bundle
-from deepaccident_devkit.splits import save_selection
+from deepaccident_devkit.plugins.baselines import Baseline
+from deepaccident_devkit.selection.splits import save_selection
 from deepaccident_devkit.v2x import Link
 
 pytestmark = pytest.mark.slow
@@ -65,7 +65,7 @@ def test_predict_writes_plans_and_forecasts_that_are_evaluated(da_motion: DeepAc
     assert any(row["min_fde 3 s, K = 1"] is not None for row in rows.values())
     assert "seen by nobody" in (tmp_path / "bundle" / "report.html").read_text(encoding="utf-8")
     told = called(
-        "evaluate", "check", tmp_path / "forecasting.json", "--dataroot", da_motion.dataroot, "--split", "train"
+        "check", "results", tmp_path / "forecasting.json", "--dataroot", da_motion.dataroot, "--split", "train"
     )
     assert f"all {len(everything)} samples have a prediction" in told.output
 

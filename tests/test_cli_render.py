@@ -13,10 +13,10 @@ from refusals import assert_refused
 from verbs import called
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.baselines import predict_results
 from deepaccident_devkit.cli.render import render
 from deepaccident_devkit.cli.render_targets import rows_to_draw
 from deepaccident_devkit.errors import ChoiceError, NotAvailableError, TokenError
+from deepaccident_devkit.plugins.baselines import predict_results
 from deepaccident_devkit.render import detached_figure, render_bev, render_sample_data
 from deepaccident_devkit.render.figures import figure_of_pixels, save_picture
 from deepaccident_devkit.taxonomy import AGENTS, CAMERAS, LIDAR, OWN_ACTOR_ID

@@ -10,7 +10,7 @@ from report_page import page_of
 from verbs import called
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.safety import avoidability_report
+from deepaccident_devkit.plugins.safety import avoidability_report
 
 pytestmark = pytest.mark.slow
 

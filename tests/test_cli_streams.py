@@ -14,9 +14,9 @@ import pytest
 from click.testing import CliRunner
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.baselines import predict_results
 from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.cli.process import Stream
+from deepaccident_devkit.plugins.baselines import predict_results
 
 HOSTILE = "town\x1b[31m\x07\x9b\u202e\udcff"
 SHOWN = r"town\u001b[31m\u0007\u009b\u202e\udcff"

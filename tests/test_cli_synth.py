@@ -6,11 +6,11 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
+from deepaccident_devkit.plugins.synth import SynthConfig, make_release
+from deepaccident_devkit.plugins.synth.benchmark import described_release
+from deepaccident_devkit.plugins.synth.cli import synth
+from deepaccident_devkit.plugins.synth.spec import design_text, parse_spec
 from deepaccident_devkit.release import find_release
-from deepaccident_devkit.synth import SynthConfig, make_release
-from deepaccident_devkit.synth.benchmark import described_release
-from deepaccident_devkit.synth.cli import synth
-from deepaccident_devkit.synth.spec import design_text, parse_spec
 
 
 @pytest.fixture

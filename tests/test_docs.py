@@ -27,9 +27,9 @@ from deepaccident_devkit.evaluation.runs.setups import TASKS
 from deepaccident_devkit.evaluation.warning import WARNING_PROTOCOLS, CleanWarnings
 from deepaccident_devkit.geometry import Box, Boxes, LidarPointCloud, PinholeCamera
 from deepaccident_devkit.motion import LabelProtocol, MotionLabelConfig, PostProcessing
-from deepaccident_devkit.safety.prevention_result import PreventedResult
+from deepaccident_devkit.plugins.safety.prevention_result import PreventedResult
+from deepaccident_devkit.plugins.synth import SynthConfig, make_release
 from deepaccident_devkit.selection.fields import FIELDS, full_name
-from deepaccident_devkit.synth import SynthConfig, make_release
 from deepaccident_devkit.validation import CODES
 
 pytestmark = pytest.mark.slow
@@ -48,10 +48,11 @@ COUNTERPARTS = sorted(
 WORDS_A_MINUTE = 200
 PAGES = [TOP / "README.md", *sorted(DOCS.glob("*.md")), *sorted((TOP / "schema").glob("**/*.md"))]
 RUN_ELSEWHERE = {
+    "docs/plugins.md": "tests/test_plugin_package.py",
     "docs/clusters.md": "tests/engines/test_page.py",
     "docs/nuscenes.md": "tests/road/test_commands.py",
     "docs/pictures.md": "tests/unit/export/test_mcap.py",
-    "docs/synth.md": "tests/unit/synth/test_synth_page.py",
+    "docs/synth.md": "tests/unit/plugins/synth/test_synth_page.py",
     "docs/testing.md": "tests/unit/testing/test_page.py",
     "docs/training.md": "tests/torch_extra/test_batches.py",
     "schema/motion_labels.md": "tests/unit/motion/test_label_files.py",
@@ -67,10 +68,12 @@ STAND_FOR = {
 }
 """What the words in capitals of a command line may be."""
 NOT_RUN = {
-    "audit ": "tests/test_cli_audit.py has them, and makes the files",
+    "check splits": "tests/test_cli_audit.py has them, and makes the files",
+    "check scores": "likewise",
+    "check reader": "likewise",
     "synth ": "tests/test_cli_synth.py has them; some take minutes",
     "safety describe OUT": "of what synth makes",
-    "render accident OUT": "tests/unit/synth/test_own_files.py has it, on a release of a scenario file",
+    "render accident OUT": "tests/unit/plugins/synth/test_own_files.py has it, on a release of a scenario file",
     "info s3:": "tests/cloud has releases on S3",
     "study ": "tests/test_cli_study.py has their like; some take hours",
     "train ": "tests/torch_extra/model/test_commands.py has them; they need torch",
@@ -81,9 +84,9 @@ NOT_RUN = {
     "predict constant_velocity hidden_release": "benchmarks/pages/baselines.py does that and the next one",
     "evaluate motion hidden_release": "likewise",
     "evaluate warning DATAROOT --results all_": "of what these predict; tests/test_cli_evaluate.py has their like",
-    "evaluate verify benchmarks/": "tests/test_cli_evaluate.py has its like",
+    "check bundle benchmarks/": "tests/test_cli_evaluate.py has its like",
     "results ": "tests/unit/export/nuscenes/test_detections.py has it, and makes the file",
-    "rigs data/": "tests/road/test_commands.py has it and its like; they need the nuScenes devkit",
+    "sensor-setups data/": "tests/road/test_commands.py has it and its like; they need the nuScenes devkit",
     "render sample data/": "likewise",
     "evaluate motion data/": "likewise",
     "evaluate detection data/": "likewise",

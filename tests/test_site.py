@@ -11,8 +11,7 @@ from scripts import loaded_script
 import deepaccident_devkit
 
 DOCS = Path(__file__).parents[1] / "docs"
-NOT_FOR_USERS = {"accidents", "cli", "dataset", "deepaccident", "exact", "overview", "parallel", "rooms", "support"}
-NOT_FOR_USERS |= {"tables"}
+NOT_FOR_USERS = {"cli", "dataset", "deepaccident", "tables"}
 """Command line, base of the facade, and what only the devkit itself calls."""
 CONFIGURATION = loaded_script("docs/conf.py")
 

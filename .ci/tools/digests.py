@@ -488,12 +488,19 @@ def digests_of_study(name: str, folder: Path) -> Digests:
     return {**dict(leaves(summary, depth=5)), **files}
 
 
+def shipped_recipes() -> Path:
+    """Return the folder of shipped recipes; checkouts before November 30 called it `SHIPPED`."""
+    recipe = plugin("study.recipe")
+    folder: Path = recipe.SHIPPED_RECIPES if hasattr(recipe, "SHIPPED_RECIPES") else recipe.SHIPPED
+    return folder
+
+
 def digests_of_recipes() -> Digests:
     """Return a digest of each recipe that ships, as it is and for a quick trial."""
     from msgspec import to_builtins
 
     study = plugin("study")
-    names = sorted(path.stem for path in plugin("study.recipe").SHIPPED.glob("*.yaml"))
+    names = sorted(path.stem for path in shipped_recipes().glob("*.yaml"))
     digests = {}
     for name, smoke in product(names, (False, True)):
         recipe = to_builtins(study.read_recipe(name, smoke=smoke))

@@ -7,12 +7,12 @@ from pathlib import Path
 
 from benchmarks.pages.marks import put, table
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.baselines import Baseline, predict_results
 from deepaccident_devkit.evaluation.breakdowns import Group
 from deepaccident_devkit.evaluation.intervals import numbers_of
 from deepaccident_devkit.evaluation.runs import SampleSelection, compare_bundles, evaluate_results, save_run
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
-from deepaccident_devkit.synth import SynthConfig, make_release
+from deepaccident_devkit.plugins.baselines import Baseline, predict_results
+from deepaccident_devkit.plugins.synth import SynthConfig, make_release
 from deepaccident_devkit.v2x import AGENT_CONFIGS
 
 RELEASES = {

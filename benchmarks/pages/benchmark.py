@@ -1,7 +1,7 @@
 """The rows of docs/benchmark.md: `python -m benchmarks.pages.benchmark RELEASE` predicts, evaluates and keeps them.
 
 Each row is a folder of benchmarks/v1: `results.tar.xz`, and a bundle of each task without its pictures, which
-`deepaccident evaluate verify` repeats. `python docs/make_tables.py benchmark` makes the page's table of the bundles
+`deepaccident check bundle` repeats. `python docs/make_tables.py benchmark` makes the page's table of the bundles
 that are kept. With `--published RELEASE` what is published of the release itself is written (`synth/benchmark.py`),
 with `--lock` the lock file.
 """
@@ -19,10 +19,10 @@ from click.testing import CliRunner
 from benchmarks.pages.marks import TOP, put, table
 from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.evaluation.runs.bundles import FILES_FILE, SUMMARY_FILE, checksums_of
-from deepaccident_devkit.synth.benchmark import described_release
+from deepaccident_devkit.plugins.synth.benchmark import described_release
 
 KEPT = TOP / "benchmarks" / "v1"
-PUBLISHED = TOP / "deepaccident_devkit" / "synth" / "benchmark_v1.json.xz"
+PUBLISHED = TOP / "deepaccident_devkit" / "plugins" / "synth" / "benchmark_v1.json.xz"
 ROWS = {
     f"{model}_{agents}": (model, agents)
     for model in ("constant_velocity", "tiny", "tiny_lidar")

@@ -5,8 +5,8 @@ from pathlib import Path
 
 from benchmarks.pages.marks import put, table
 from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.plugins.synth import SynthConfig, make_release
 from deepaccident_devkit.statistics import ReleaseFacts, release_facts
-from deepaccident_devkit.synth import SynthConfig, make_release
 
 RELEASE = SynthConfig(scenarios=180, frames=None, seed=5, sensors=False)
 

@@ -19,7 +19,7 @@ from deepaccident_devkit.motion import (
     MotionLabels,
     motion_labels_from_boxes,
 )
-from deepaccident_devkit.synth import SynthConfig, make_release
+from deepaccident_devkit.plugins.synth import SynthConfig, make_release
 from deepaccident_devkit.taxonomy import CATEGORIES
 from deepaccident_devkit.v2x import future_egomotion
 

@@ -15,8 +15,8 @@ from textwrap import fill
 from typing import Any, Final
 
 from benchmarks.pages.marks import TOP, put, table
-from deepaccident_devkit.study.numbers import NUMBERS, Evaluators, Seeds, evaluators_of, verdict
-from deepaccident_devkit.study.summary import ALL, difference_text, number_with_interval
+from deepaccident_devkit.plugins.study.numbers import NUMBERS, Evaluators, EvaluatorsBySeed, evaluators_of, verdict
+from deepaccident_devkit.plugins.study.summary import ALL, difference_text, number_with_interval
 
 KEPT: Final = TOP / "benchmarks" / "studies"
 ORDER: Final = ("agents", "boxes", "visibility", "fusions", "horizons", "links", "inputs", "overfit")
@@ -68,7 +68,7 @@ def studies() -> dict[str, Summary]:
     return {name: kept(name)["summary"] for name in ORDER if (KEPT / f"{name}.json.xz").is_file()}
 
 
-def accident_rows(study: Mapping[str, Any]) -> dict[str, Seeds]:
+def accident_rows(study: Mapping[str, Any]) -> dict[str, EvaluatorsBySeed]:
     """The evaluators of accidents of each row and seed of what `kept` gives, with their counts."""
     rows: dict[str, dict[str, Evaluators]] = {}
     for name, seeds in study["accidents"].items():
@@ -179,7 +179,7 @@ def of_seeds(found: Mapping[str, Any], number: str) -> str:
 
 def weights_table() -> str:
     """The weights that come with the devkit, with what their notes say."""
-    from deepaccident_devkit.model.checkpoint import SHIPPED, read_weights
+    from deepaccident_devkit.plugins.model.checkpoint import SHIPPED, read_weights
 
     rows = []
     for name, path in SHIPPED.items():

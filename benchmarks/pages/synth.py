@@ -14,13 +14,13 @@ import numpy as np
 
 from benchmarks.pages import synth_beside
 from benchmarks.pages.marks import put
+from deepaccident_devkit.plugins.synth import SynthConfig
+from deepaccident_devkit.plugins.synth.plan import plan_scenarios
+from deepaccident_devkit.plugins.synth.scenario import Scenario, build_scenario
+from deepaccident_devkit.plugins.synth.sensors.rig import make_rig
+from deepaccident_devkit.plugins.synth.spec import DESIGN_NUMBERS, read_design
+from deepaccident_devkit.plugins.synth.traffic.simulate import gap, separation
 from deepaccident_devkit.release import Labels
-from deepaccident_devkit.synth import SynthConfig
-from deepaccident_devkit.synth.plan import plan_scenarios
-from deepaccident_devkit.synth.scenario import Scenario, build_scenario
-from deepaccident_devkit.synth.sensors.rig import make_rig
-from deepaccident_devkit.synth.spec import DESIGN_NUMBERS, read_design
-from deepaccident_devkit.synth.traffic.simulate import gap, separation
 from deepaccident_devkit.tables import visible_mask
 from deepaccident_devkit.tables.build import accident_type
 from deepaccident_devkit.taxonomy import AGENTS, INFRASTRUCTURE, VEHICLE_AGENTS, frame_timestamp

@@ -8,6 +8,10 @@ from statistics import mean
 import numpy as np
 import yaml
 
+from deepaccident_devkit.plugins.synth import SynthConfig, make_release
+from deepaccident_devkit.plugins.synth.plan import plan_scenarios
+from deepaccident_devkit.plugins.synth.scenario import RecordingJob, forget_scenario, record_scenario
+from deepaccident_devkit.plugins.synth.spec import design_text
 from deepaccident_devkit.release import (
     Labels,
     ScenarioFolder,
@@ -20,10 +24,6 @@ from deepaccident_devkit.release import (
     read_meta,
 )
 from deepaccident_devkit.support.arrays import BoolArray, FloatArray
-from deepaccident_devkit.synth import SynthConfig, make_release
-from deepaccident_devkit.synth.plan import plan_scenarios
-from deepaccident_devkit.synth.scenario import RecordingJob, forget_scenario, record_scenario
-from deepaccident_devkit.synth.spec import design_text
 from deepaccident_devkit.taxonomy import AGENTS, CATEGORIES, INFRASTRUCTURE, LIDAR, OWN_ACTOR_ID, STATIC_ACTOR_ID
 
 Numbers = dict[str, float]

@@ -7,13 +7,13 @@ from pathlib import Path
 
 from benchmarks.pages.marks import put, table
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.baselines import outlook
-from deepaccident_devkit.baselines.predict import accidents_ahead
 from deepaccident_devkit.evaluation import Accident, WarningEvaluator
 from deepaccident_devkit.evaluation.accident import AccidentContext, accident_context
 from deepaccident_devkit.evaluation.runs.text import predictor_tables
 from deepaccident_devkit.evaluation.warning.recordings import GIVEN
-from deepaccident_devkit.synth import SynthConfig, make_release
+from deepaccident_devkit.plugins.baselines import outlook
+from deepaccident_devkit.plugins.baselines.predict import accidents_ahead
+from deepaccident_devkit.plugins.synth import SynthConfig, make_release
 
 RELEASE = SynthConfig(scenarios=60, frames=None, seed=7, sensors=False, traffic="v1")
 DESIGNED = replace(RELEASE, designed=True)

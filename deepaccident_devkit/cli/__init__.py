@@ -1,4 +1,4 @@
-"""The command line: `deepaccident <verb>`, one module for each verb; those of a room are there.
+"""The command line: `deepaccident <verb>`, one module for each verb; plug-ins add theirs.
 
 A verb parses, makes one library call and prints. Exit status: 0 good, 1 findings, 2 error; 130 after Ctrl-C, 143 after
 SIGTERM, 141 if the reader of the output went away.
@@ -9,59 +9,57 @@ import os
 import platform
 import re
 import sys
+from functools import partial
 from importlib import import_module
 from typing import Final
 
 import click
 
-from deepaccident_devkit._version import __version__
 from deepaccident_devkit.cli.process import lasting_streams, run_interruptibly
 from deepaccident_devkit.cli.verbs import LazyVerbs
 from deepaccident_devkit.errors import DeepAccidentError, SomeFailedError
+from deepaccident_devkit.support.plugins import LazyVerb, Plugin
+from deepaccident_devkit.support.version import __version__
 
 _ERROR_STATUS = 2
 _FINDINGS_STATUS = 1
+# Loggers of its parts.
 _OF_DASK = ("distributed", "tornado", "asyncio")
-"""Loggers of its parts."""
+# Requirements for work on the devkit itself.
 _DEVELOPERS: Final = re.compile(r"extra == .(test|lint|docs)\b")
-"""Requirements for work on the devkit itself."""
-_VERBS: Final = {
-    "audit": "Find splits that leak, scores that cheat, and columns that were misread.",
+# Verb of the core, each in a module of its name → its line in the list of verbs.
+_SUMMARIES: Final = {
+    "check": "Check a release, an index, results, an evaluation, splits or a reader.",
     "cache": "Write resized images for training.",
-    "demo": "Make a small synthetic release, and a page on it.",
-    "evaluate": "Evaluate results files; check and compare evaluations.",
-    "explore": "Show a release in the browser.",
+    "evaluate": "Evaluate results files; compare evaluations.",
     "export": "Write data in the formats of other tools.",
     "index": "Make, update or remove the index of a release.",
     "info": "Print what a release holds, its statistics, its index.",
     "labels": "Write motion labels.",
-    "predict": "Predict with a trained model, or with a baseline.",
     "render": "Render pictures, videos and replays.",
     "results": "Make results files of those of other tools.",
-    "rigs": "Compare what the vehicles of two sources carry.",
-    "safety": "Look into accidents: who saw it first, when it was too late.",
     "split": "Make the official splits, or a split file of scenarios.",
-    "study": "Train and compare what a recipe says.",
-    "synth": "Make a synthetic release.",
-    "train": "Train the model.",
     "validate": "Print what is wrong, unusual or missing in a release.",
 }
 
 
-def _verb(name: str) -> click.Command:
-    """A verb: one of a room, or of this package; raises MissingRoomError."""
-    from deepaccident_devkit.rooms import ADDED, added  # here: the list of verbs needs none of it
+def _core_verb(name: str) -> click.Command:
+    verb: click.Command = getattr(import_module(f"{__name__}.{name}"), name)
+    return verb
 
-    found: click.Command = (
-        added("verb", name) if name in ADDED["verb"] else getattr(import_module(f"{__name__}.{name}"), name)
-    )
-    return found
+
+def _plugin_verbs(plugin: Plugin) -> dict[str, LazyVerb]:
+    """Return the verbs that a plug-in offers, except those of groups, such as `check splits`."""
+    return {name: verb for name, verb in plugin.verbs.items() if " " not in name}
+
+
+_VERBS: Final = {name: LazyVerb(summary, partial(_core_verb, name)) for name, summary in _SUMMARIES.items()}
 
 
 @click.group(
     cls=LazyVerbs,
     verbs=_VERBS,
-    load=_verb,
+    read_plugin=_plugin_verbs,
     invoke_without_command=True,
     no_args_is_help=True,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},

@@ -8,9 +8,9 @@ import click
 from deepaccident_devkit.cli.export import bulk_parameters, run_export
 from deepaccident_devkit.cli.options import channels_parameter, pixel_size, words_of
 from deepaccident_devkit.cli.verbs import advanced, field_option, verb
-from deepaccident_devkit.export.image_cache import CachedImages
 from deepaccident_devkit.export.images import ImageConfig
 from deepaccident_devkit.taxonomy import CAMERAS
+from deepaccident_devkit.training.image_cache import CachedImages
 
 
 def _part(context: click.Context, parameter: click.Parameter, value: str | None) -> tuple[int, int, int, int] | None:

@@ -1,4 +1,4 @@
-"""`deepaccident evaluate`: the metrics of a results file on a release, and a check of the file."""
+"""`deepaccident evaluate` and `deepaccident check results`: the metrics of a results file, and a check of it."""
 
 import json
 import sys
@@ -7,7 +7,7 @@ from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, Final, get_args
 
 import click
 
@@ -49,7 +49,7 @@ from deepaccident_devkit.evaluation.runs import (
     summary_text,
 )
 from deepaccident_devkit.evaluation.runs.bundles import Chooser, chosen_threshold
-from deepaccident_devkit.evaluation.runs.further import with_further
+from deepaccident_devkit.evaluation.runs.further import extra_result, with_further
 from deepaccident_devkit.evaluation.runs.sanity import check_sanity
 from deepaccident_devkit.evaluation.runs.setups import (
     TASKS,
@@ -57,25 +57,20 @@ from deepaccident_devkit.evaluation.runs.setups import (
     SampleList,
     ScopeName,
     check_recordings,
+    evaluator_class,
     label_rules,
 )
 from deepaccident_devkit.evaluation.runs.text import SHOWN_BREAKDOWNS
 from deepaccident_devkit.evaluation.warning import CleanWarnings, FieldWarnings
-from deepaccident_devkit.parallel import workers_kept
 from deepaccident_devkit.release.fingerprints import digest_of
 from deepaccident_devkit.release.store import Dataroot
-from deepaccident_devkit.rooms import added
+from deepaccident_devkit.support.parallel import workers_kept
+from deepaccident_devkit.support.plugins import LazyVerb, Plugin
 from deepaccident_devkit.taxonomy import AGENTS
 
 _FINDINGS_STATUS = 1
+# Of a check that had nothing to compare.
 _NOTHING_STATUS = 2
-"""Of a check that had nothing to compare."""
-_LINES = {
-    **{name: evaluator_class.description for name, evaluator_class in TASKS.items()},
-    "check": "Check every entry of a results file.",
-    "compare": "Compare two evaluations, and test the differences.",
-    "verify": "Repeat an evaluation and list all differences.",
-}
 _OF_RELEASE = ("version", "split", "samples", "scope", "agents", "horizon", "on_error")
 _selection_parameters = together(
     click.option(
@@ -134,8 +129,9 @@ def _attributes(context: click.Context, parameter: click.Parameter, names: tuple
 
 def _task_verb(task: str) -> click.Command:
     """The verb of one task."""
-    protocols = list(TASKS[task].protocols)
-    text = f"{TASKS[task].description}\n\nThe predictions are compared with the labels of the release in DATAROOT."
+    evaluator = evaluator_class(task)
+    protocols = list(evaluator.protocols)
+    text = f"{evaluator.description}\n\nThe predictions are compared with the labels of the release in DATAROOT."
 
     @verb(task, help=text)
     @release_parameters
@@ -265,10 +261,10 @@ def _refuse_unused(setup: EvaluationSetup, options: dict[str, Any]) -> None:
             "--protocol clean"
         )
     if options.get("prevented"):
-        added("result", "prevented")  # before long work, as its room may be missing
+        extra_result("prevented")  # before long work, as its plug-in may be missing
     if isinstance(setup.rules, FieldWarnings) and options["resamples"]:
         refuse_unused("with --protocol field, which has no intervals", "resamples")
-    if not TASKS[setup.task].has_horizon and _selection_of(setup, options).samples == "all":
+    if not evaluator_class(setup.task).has_horizon and _selection_of(setup, options).samples == "all":
         why = "detections are of the present" if setup.task == "detection" else "the protocol has its own"
         refuse_unused(f"with --samples all: {why}", "horizon")
 
@@ -285,14 +281,14 @@ def _selection_of(setup: EvaluationSetup, options: Mapping[str, Any]) -> SampleS
     )
 
 
-@verb()
+@verb("results")
 @click.argument("results", type=PATH)
 @click.option("--dataroot", type=DATAROOT, help="Also compare the samples with those of this release.")
 @version_parameter
 @_selection_parameters
 @engine_parameters
 @on_error_parameter
-def check(results: Path, dataroot: Dataroot | None, version: str, **options: Any) -> None:
+def check_results(results: Path, dataroot: Dataroot | None, version: str, **options: Any) -> None:
     """Check every entry of the results file or folder RESULTS, and print a summary.
 
     With --dataroot, also look for the mistakes of `evaluate … --sanity`.
@@ -307,7 +303,7 @@ def check(results: Path, dataroot: Dataroot | None, version: str, **options: Any
     if dataroot is None:
         return
     dataset = open_release(dataroot, version=version, on_error=options["on_error"], **engine)
-    first = next(iter(TASKS[opened.task].protocols))
+    first = next(iter(evaluator_class(opened.task).protocols))
     protocol = "boxes" if opened.task == "accident" else first  # the one that takes explicit accidents
     setup = EvaluationSetup(task=opened.task, protocol=protocol, horizon=options["horizon"])
     selection = _selection_of(setup, options)
@@ -323,16 +319,23 @@ def check(results: Path, dataroot: Dataroot | None, version: str, **options: Any
         sys.exit(_FINDINGS_STATUS)
 
 
-def _verb(name: Any) -> click.Command:
-    if name in TASKS:
-        return _task_verb(name)
-    if name == "check":
-        return check
-    from deepaccident_devkit.cli.evaluate_bundles import compare, verify  # one renders, and so imports matplotlib
+def _compare() -> click.Command:
+    from deepaccident_devkit.cli.evaluate_bundles import compare  # it renders, and so imports matplotlib
 
-    return compare if name == "compare" else verify
+    return compare
 
 
-@click.group(cls=LazyVerbs, verbs=_LINES, load=_verb)
+def _task_verbs(plugin: Plugin) -> dict[str, LazyVerb]:
+    """Return the verbs of a plug-in's tasks."""
+    return {name: LazyVerb(task.summary, partial(_task_verb, name)) for name, task in plugin.tasks.items()}
+
+
+_VERBS: Final = {
+    **{name: LazyVerb(task.description, partial(_task_verb, name)) for name, task in TASKS.items()},
+    "compare": LazyVerb("Compare two evaluations, and test the differences.", _compare),
+}
+
+
+@click.group(cls=LazyVerbs, verbs=_VERBS, read_plugin=_task_verbs)
 def evaluate() -> None:
-    """Evaluate results files; check and compare evaluations."""
+    """Evaluate results files; compare evaluations."""

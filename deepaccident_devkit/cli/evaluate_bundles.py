@@ -1,4 +1,4 @@
-"""`deepaccident evaluate verify|compare`: repeat an evaluation, or compare two."""
+"""`deepaccident check bundle` and `deepaccident evaluate compare`: repeat an evaluation, or compare two."""
 
 import sys
 from pathlib import Path
@@ -35,8 +35,8 @@ from deepaccident_devkit.release.store import Dataroot, open_dataroot
 from deepaccident_devkit.render.evaluation import render_comparison, render_over_bytes
 from deepaccident_devkit.render.figures import PICTURE_SUFFIXES, save_picture
 from deepaccident_devkit.render.styles import current_style
-from deepaccident_devkit.reports import write_csv
 from deepaccident_devkit.support.files import write_bytes
+from deepaccident_devkit.support.reports import write_csv
 from deepaccident_devkit.tables import place_outside
 from deepaccident_devkit.taxonomy import OnError
 
@@ -45,7 +45,7 @@ _KINDS = (".csv", ".json", *PICTURE_SUFFIXES)
 _DPI = 130
 
 
-@verb()
+@verb("bundle")
 @click.argument("folder", metavar="DIR", type=PATH)
 @click.option("--dataroot", type=DATAROOT, help="Folder of the release; without it, nothing is done.")
 @click.option("--results", type=PATH, help="Results file or folder.  [default: the copy in DIR, if any]")

@@ -2,6 +2,7 @@
 
 import shutil
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -22,7 +23,7 @@ from deepaccident_devkit.cli.verbs import LazyVerbs, WordChoice, advanced, field
 from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.errors import ExportError
 from deepaccident_devkit.motion import PRESETS
-from deepaccident_devkit.rooms import added
+from deepaccident_devkit.support.plugins import LazyFormat, LazyVerb, Plugin
 from deepaccident_devkit.support.text import choice, counted, size_text
 from deepaccident_devkit.taxonomy import AGENTS, CAMERAS, CATEGORIES, LIDAR, VEHICLE_AGENTS
 from deepaccident_devkit.v2x.collisions import default_scenario
@@ -32,28 +33,6 @@ if TYPE_CHECKING:
 
 _CONTINUED: Final = "If a run is interrupted, the same command continues it."
 _WAYS: Final = {"hard": "hard links", "symbolic": "symbolic links", "copy": "copies"}
-_LINES: Final = {
-    "mcap": "Write a scenario as an interactive 3D scene (MCAP).",
-    "mmdet3d": "Write infos for mmdet3d, or for the released code.",
-    "nuscenes": "Write nuScenes tables and their sensor files.",
-    "opencood": "Write OPV2V's folders, for OpenCOOD, V2X-ViT, CoAlign and HEAL.",
-    "parquet": "Write all tables as Parquet files, for datasets, DuckDB, Polars and pandas.",
-    "questions": "Write questions on what happens next, for language models.",
-    "town-maps": "Write the roads and sidewalks of each town as GeoJSON.",
-    "webdataset": "Write samples with images, LiDAR and boxes as tar files, for webdataset.",
-}
-_HELP: Final = {
-    "nuscenes": "Write scenarios of the release in DATAROOT for the nuScenes devkit 1.2 and all that reads nuScenes."
-    "\n\nKeyframes are at 2 Hz, sweeps at 10 Hz. Images are linked, clouds are written: those of a whole release take "
-    "about 210 GB, and 42 GB with --no-sweeps; the nuScenes devkit holds its tables in 6 GB of memory, or 4 GB. "
-    f"--dry-run says how large yours are. {_CONTINUED}",
-    "opencood": "Write scenarios of the release in DATAROOT as OPV2V has them: a folder each, with yaml, json and pcd "
-    f"files.\n\n{_CONTINUED}",
-    "parquet": "Write all tables of the release in DATAROOT as Parquet files by split, with tokens in place of row "
-    f"numbers.\n\n{_CONTINUED}",
-    "webdataset": "Write samples of the release in DATAROOT as tar files: the images, the LiDAR points, and the rest "
-    f"as JSON.\n\n{_CONTINUED}",
-}
 link_parameter = advanced(
     "--link",
     type=WordChoice(_WAYS),
@@ -118,10 +97,18 @@ def _counts(tally: "Tally", done: str) -> str:
     return f"{f'{tally.files:,}' if tally.files else 'a few'} files {done} ({size_text(tally.bytes)})"
 
 
-def _of_format(name: str, kind: type[Any], *options: Callable[[Any], Any]) -> click.Command:
-    """The verb of a format, whose own options set fields of the format."""
+def _of_format(kind: type[Any], *options: Callable[[Any], Any], summary: str = "", text: str = "") -> click.Command:
+    """Return the verb of a format, whose own options set fields of the format.
 
-    @verb(name, short_help=_LINES[name], help=_HELP.get(name, _LINES[name]))
+    Args:
+        kind: The format.
+        *options: Options of its own.
+        summary: Line in the list of formats; empty for the one in `_VERBS`.
+        text: Help; empty for the summary.
+    """
+    summary = summary or _VERBS[kind.name].summary
+
+    @verb(kind.name, short_help=summary, help=text or summary)
     @bulk_parameters()
     @together(*options)
     def export_format(**chosen: Any) -> None:
@@ -147,7 +134,14 @@ def _nuscenes_options() -> tuple[Callable[[Any], Any], ...]:
 def _nuscenes() -> click.Command:
     from deepaccident_devkit.export.nuscenes import NuScenes
 
-    return _of_format("nuscenes", NuScenes, *_nuscenes_options())
+    return _of_format(
+        NuScenes,
+        *_nuscenes_options(),
+        text="Write scenarios of the release in DATAROOT for the nuScenes devkit 1.2 and all that reads nuScenes."
+        "\n\nKeyframes are at 2 Hz, sweeps at 10 Hz. Images are linked, clouds are written: those of a whole release "
+        "take about 210 GB, and 42 GB with --no-sweeps; the nuScenes devkit holds its tables in 6 GB of memory, or "
+        f"4 GB. --dry-run says how large yours are. {_CONTINUED}",
+    )
 
 
 def _mmdet3d() -> click.Command:
@@ -157,7 +151,7 @@ def _mmdet3d() -> click.Command:
 
     released = [field_option(ReleasedInfos, field, option=advanced) for field in ("root_prefix", "drop_empty")]
 
-    @verb(short_help=_LINES["mmdet3d"])
+    @verb(short_help=_VERBS["mmdet3d"].summary)
     @bulk_parameters()
     @click.option(
         "--style",
@@ -198,19 +192,24 @@ def _opencood() -> click.Command:
         help=f"Which boxes become vehicles: {', '.join(CATEGORIES)}.",
     )
     return _of_format(
-        "opencood",
         OpenCood,
         link_parameter,
         classes,
         field_option(OpenCood, "ego", type=WordChoice(VEHICLE_AGENTS)),
         field_option(OpenCood, "without_clouds", option=advanced),
+        text="Write scenarios of the release in DATAROOT as OPV2V has them: a folder each, with yaml, json and pcd "
+        f"files.\n\n{_CONTINUED}",
     )
 
 
 def _parquet() -> click.Command:
     from deepaccident_devkit.export.parquet import Parquet
 
-    return _of_format("parquet", Parquet)
+    return _of_format(
+        Parquet,
+        text="Write all tables of the release in DATAROOT as Parquet files by split, with tokens in place of row "
+        f"numbers.\n\n{_CONTINUED}",
+    )
 
 
 def _webdataset() -> click.Command:
@@ -225,7 +224,13 @@ def _webdataset() -> click.Command:
         metavar="MB",
         help="Size of a tar file, about.",
     )
-    return _of_format("webdataset", WebDataset, field_option(WebDataset, "frames"), size)
+    return _of_format(
+        WebDataset,
+        field_option(WebDataset, "frames"),
+        size,
+        text="Write samples of the release in DATAROOT as tar files: the images, the LiDAR points, and the rest as "
+        f"JSON.\n\n{_CONTINUED}",
+    )
 
 
 def _questions() -> click.Command:
@@ -241,7 +246,7 @@ def _questions() -> click.Command:
         ),
     )
 
-    @verb(short_help=_LINES["questions"])
+    @verb(short_help=_VERBS["questions"].summary)
     @bulk_parameters(observing)
     @field_option(WindowRules, "observe")
     @field_option(WindowRules, "ahead", type=click.IntRange(min=1))
@@ -297,7 +302,7 @@ def _camera_names(given: tuple[str, ...]) -> tuple[str, ...]:
     return CAMERAS if "all" in names else tuple(names) or CAMERAS[:1]
 
 
-@verb("mcap", short_help=_LINES["mcap"])
+@verb("mcap", short_help="Write a scenario as an interactive 3D scene (MCAP).")
 @release_parameters
 @click.argument("scenario", required=False)
 @click.option("--out", required=True, type=PATH, metavar="FILE", help="File to write, such as accident.mcap.")
@@ -345,19 +350,37 @@ def _mcap(
     click.echo(f"{made}: {token}, {size}; open it in Foxglove, or with: python {script}")
 
 
-_VERBS: Final[dict[str, Callable[[], click.Command]]] = {
-    "mcap": lambda: _mcap,
-    "mmdet3d": _mmdet3d,
-    "nuscenes": _nuscenes,
-    "opencood": _opencood,
-    "parquet": _parquet,
-    "questions": _questions,
-    "town-maps": lambda: added("verb", "town-maps"),
-    "webdataset": _webdataset,
+def _town_maps() -> click.Command:
+    from deepaccident_devkit.cli.town_maps import town_maps
+
+    return town_maps
+
+
+# Format → its line in the list of formats, and the function that makes its verb.
+_VERBS: Final = {
+    "mcap": LazyVerb("Write a scenario as an interactive 3D scene (MCAP).", lambda: _mcap),
+    "mmdet3d": LazyVerb("Write infos for mmdet3d, or for the released code.", _mmdet3d),
+    "nuscenes": LazyVerb("Write nuScenes tables and their sensor files.", _nuscenes),
+    "opencood": LazyVerb("Write OPV2V's folders, for OpenCOOD, V2X-ViT, CoAlign and HEAL.", _opencood),
+    "parquet": LazyVerb("Write all tables as Parquet files, for datasets, DuckDB, Polars and pandas.", _parquet),
+    "questions": LazyVerb("Write questions on what happens next, for language models.", _questions),
+    "town-maps": LazyVerb("Write the roads and sidewalks of each town as GeoJSON.", _town_maps),
+    "webdataset": LazyVerb("Write samples with images, LiDAR and boxes as tar files, for webdataset.", _webdataset),
 }
-"""Name → what makes the verb."""
 
 
-@click.group(cls=LazyVerbs, verbs=_LINES, load=lambda name: _VERBS[name]())
+def _format_verbs(plugin: Plugin) -> dict[str, LazyVerb]:
+    """Return the verbs of a plug-in's formats, whose fields have no options of their own."""
+    return {
+        name: LazyVerb(export_format.summary, partial(_plugin_format, export_format))
+        for name, export_format in plugin.export_formats.items()
+    }
+
+
+def _plugin_format(export_format: LazyFormat) -> click.Command:
+    return _of_format(export_format.load(), link_parameter, summary=export_format.summary)
+
+
+@click.group(cls=LazyVerbs, verbs=_VERBS, read_plugin=_format_verbs)
 def export() -> None:
     """Write data in the formats of other tools."""

@@ -1,4 +1,4 @@
-"""`deepaccident index`: make or refresh the index ahead of time, or remove it."""
+"""`deepaccident index` and `deepaccident check index`: make, refresh, check or remove an index."""
 
 from typing import Any
 
@@ -16,29 +16,46 @@ from deepaccident_devkit.taxonomy import OnError
 @verb()
 @release_parameters
 @click.option(
-    "--check", is_flag=True, help="Compare the content of each label, calib and meta file and of the tables, not times."
-)
-@click.option(
     "--clear",
     is_flag=True,
     help="Remove the index instead, from its own folder and from your cache. The release itself stays as it is.",
 )
-def index(dataroot: Dataroot, version: str, on_error: OnError, check: bool, clear: bool, **options: Any) -> None:
+def index(dataroot: Dataroot, version: str, on_error: OnError, clear: bool, **options: Any) -> None:
     """Make or update the index of the release in DATAROOT, and print where it is."""
     if clear:
-        refuse_unused("with --clear, which makes no index", "check", "workers", "on_error")
+        refuse_unused("with --clear, which makes no index", "workers", "on_error")
         cleared = clear_index(dataroot, version=version, index_dir=options["index_dir"])
         click.echo("\n".join(f"removed {folder}" for folder in cleared) or f"{dataroot}: no index to remove")
         return
+    _update(dataroot, version, on_error, check_files=False, **options)
+
+
+@verb("index")
+@release_parameters
+def check_index(dataroot: Dataroot, version: str, on_error: OnError, **options: Any) -> None:
+    """Compare the index of the release in DATAROOT with the content of all label, calib and meta files, and mend it.
+
+    `deepaccident index` compares the times of these files instead.
+    """
+    tables = _update(dataroot, version, on_error, check_files=True, **options)
+    scenarios = counted(len(tables.table("scenario")), "scenario")
+    click.echo(f"compared: the tables, and the label, calib and meta files of {scenarios}")
+
+
+def _update(dataroot: Dataroot, version: str, on_error: OnError, *, check_files: bool, **options: Any) -> Tables:
+    """Make or update an index, print where it is, and return its tables."""
     root = open_dataroot(
         dataroot, options["index_dir"], refresh=True, on_error=on_error, progress=True, **engine_of(options)
     )
     made = open_index(
-        find_release(root, version), on_error=on_error, check_times=True, check_files=check, progress=True, **options
+        find_release(root, version),
+        on_error=on_error,
+        check_times=True,
+        check_files=check_files,
+        progress=True,
+        **options,
     )
     tables = Tables(made.tables_folder)
     counts = ", ".join(f"{len(tables.table(name)):,} {name}s" for name in ("scenario", "sample", "annotation"))
     click.echo(f"{made.tables_folder}: {counts}")
-    if check:
-        scenarios = counted(len(tables.table("scenario")), "scenario")
-        click.echo(f"compared: the tables, and the label, calib and meta files of {scenarios}")
+    return tables

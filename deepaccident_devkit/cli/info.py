@@ -19,7 +19,7 @@ from deepaccident_devkit.cli.options import (
 )
 from deepaccident_devkit.cli.verbs import verb
 from deepaccident_devkit.deepaccident import DeepAccident
-from deepaccident_devkit.overview import overview, scenario_lines
+from deepaccident_devkit.statistics.overview import overview, scenario_lines
 
 
 def _list_fields(context: click.Context, _parameter: click.Parameter, wanted: bool) -> None:

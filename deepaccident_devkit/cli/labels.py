@@ -12,8 +12,8 @@ from deepaccident_devkit.errors import NotAvailableError
 from deepaccident_devkit.motion import LABEL_PROTOCOLS, PRESETS, LabelProtocol, MotionLabelConfig, write_label_files
 from deepaccident_devkit.motion.batch_names import BatchNames
 from deepaccident_devkit.motion.config import NO_PRESETS, slip_names
-from deepaccident_devkit.motion.label_folder import Manifest, folder_path
-from deepaccident_devkit.motion.sample_labels import Purpose
+from deepaccident_devkit.motion.label_folder import LabelManifest, folder_path
+from deepaccident_devkit.selection.samples import Purpose
 from deepaccident_devkit.support.text import counted
 from deepaccident_devkit.v2x import AGENT_SETS
 
@@ -72,7 +72,7 @@ def labels(
     """
     config = _config(options)
     chosen = agent_names(agents)
-    Manifest.of(folder_path(out), config, names)  # before the release is indexed
+    LabelManifest.of(folder_path(out), config, names)  # before the release is indexed
     dataset = open_release(**options)
     tokens = [token for token in dataset.samples(split, purpose) if token.rsplit("/", 2)[1] in chosen]
     if not tokens:

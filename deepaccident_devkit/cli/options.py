@@ -12,10 +12,10 @@ from click.core import ParameterSource
 
 from deepaccident_devkit.cli.verbs import Function, WordChoice, advanced, together
 from deepaccident_devkit.deepaccident import DeepAccident
-from deepaccident_devkit.release.layout import nuscenes_tables
-from deepaccident_devkit.rooms import added
+from deepaccident_devkit.errors import DatarootError
 from deepaccident_devkit.support.files import write_bytes
 from deepaccident_devkit.support.json_text import parsed_json
+from deepaccident_devkit.support.plugins import Opener, offers
 from deepaccident_devkit.support.text import counted
 from deepaccident_devkit.taxonomy import VERSIONS, StyleName
 
@@ -104,7 +104,7 @@ def engine_parameters(run_verb: Function) -> Function:
     def run(*arguments: Any, scheduler: str | None, **options: Any) -> Any:
         if scheduler is None:
             return run_verb(*arguments, executor=None, **options)
-        from deepaccident_devkit.parallel import cluster_executor  # here: most verbs start without it
+        from deepaccident_devkit.support.parallel import cluster_executor  # here: most verbs start without it
 
         refuse_unused("with a scheduler, which has workers of its own", "workers")
         # workers have working folders of their own
@@ -128,11 +128,24 @@ def engine_of(options: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def open_release(dataroot: Any, *, index_dir: Path | None = None, **how: Any) -> DeepAccident:
-    """The release that a verb is about; a dataroot of nuScenes is one, too."""
-    if isinstance(dataroot, Path) and nuscenes_tables(dataroot):
-        release: DeepAccident = added("opener", "nuscenes")(dataroot, index_dir)
-        return release
-    return DeepAccident(dataroot=dataroot, index_dir=index_dir, **how)
+    """Return the release that a verb is about; plug-ins open dataroots of other datasets, such as nuScenes."""
+    opener = _opener(dataroot, own=True)
+    if opener is None:
+        try:
+            return DeepAccident(dataroot=dataroot, index_dir=index_dir, **how)
+        except DatarootError:  # perhaps somebody else's plug-in knows it
+            opener = _opener(dataroot, own=False)
+            if opener is None:
+                raise
+    return opener.open_release(dataroot, index_dir)
+
+
+def _opener(dataroot: Any, *, own: bool) -> Opener | None:
+    """Return the plug-ins' opener that recognizes a dataroot; None if it is a URL, or none does."""
+    if not isinstance(dataroot, Path):
+        return None
+    openers = offers(lambda plugin: plugin.openers, own=own).by_name.values()
+    return next((opener for opener in openers if opener.recognizes(dataroot)), None)
 
 
 def release_of(options: Mapping[str, Any]) -> dict[str, Any]:

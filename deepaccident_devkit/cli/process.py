@@ -20,12 +20,12 @@ from deepaccident_devkit.errors import escaped
 
 _ENDING: Final = (signal.SIGINT, signal.SIGTERM)
 _LINE: Final = b"interrupted; no file is half-written, and the same command can be run again\n"
+# Time for the verb to remove its temporary files; then the process ends as it is.
 _TIDYING_SECONDS: Final = 1.5
-"""Time for the verb to remove its temporary files; then the process ends as it is."""
+# Seconds after which a signal is sent once more whose exception Python ignored.
 _AGAIN_AFTER: Final = 0.02
-"""Seconds after which a signal is sent once more whose exception Python ignored."""
+# Seconds: some programs send a signal to a process and then to its group.
 _SAME_SIGNAL: Final = 0.2
-"""Seconds: some programs send a signal to a process and then to its group."""
 # how a text of a progress bar begins: at the start of the line, or it only moves up to another bar's line
 _OF_BARS: Final = re.compile(r"\r|\n*(?:\x1b\[A)+\Z")
 

@@ -8,7 +8,7 @@ import click
 from deepaccident_devkit.cli.options import PATH, json_parameter, refuse_unused, release_parameters, where_parameter
 from deepaccident_devkit.cli.verbs import verb
 from deepaccident_devkit.deepaccident import DeepAccident
-from deepaccident_devkit.splits import OFFICIAL_SEED, official_split, save_selection, split_report
+from deepaccident_devkit.selection.splits import OFFICIAL_SEED, official_split, save_selection, split_report
 
 
 @verb()

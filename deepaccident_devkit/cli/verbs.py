@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_args, get_origin, g
 
 import click
 
+from deepaccident_devkit.errors import MissingPluginError
+from deepaccident_devkit.support.plugins import LazyVerb, Offers, Plugin, offers
 from deepaccident_devkit.support.text import meant_text
 
 Function = TypeVar("Function", bound=Callable[..., Any])
@@ -26,33 +28,71 @@ class LazyVerbs(click.Group):
     """
 
     def __init__(
-        self, *arguments: Any, verbs: Mapping[str, str], load: Callable[[str], click.Command], **options: Any
+        self,
+        *arguments: Any,
+        verbs: Mapping[str, LazyVerb],
+        read_plugin: Callable[[Plugin], Mapping[str, LazyVerb]],
+        **options: Any,
     ) -> None:
-        """Take what `click.Group` takes, verbs with a line on each, and what gives the verb of a name."""
+        """Take what `click.Group` takes.
+
+        Args:
+            *arguments: Of `click.Group`.
+            verbs: The group's own verbs by name.
+            read_plugin: Gives the verbs that a plug-in adds to the group.
+            **options: Of `click.Group`.
+        """
         super().__init__(*arguments, **options)
         self._verbs = verbs
-        self._load = load
+        self._read_plugin = read_plugin
+
+    def _offers(self, *, own: bool = False) -> Offers[LazyVerb]:
+        """Return what plug-ins add; the devkit's own ones only with `own`, which reads no entry points."""
+        return offers(self._read_plugin, self._verbs, own=own)
+
+    def _all_verbs(self) -> dict[str, LazyVerb]:
+        return {**self._verbs, **self._offers().by_name}
 
     def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002 - click's signature
-        """The verbs in alphabetical order, as click lists commands."""
-        return sorted(self._verbs)
+        """Return the verbs in alphabetical order, as click lists commands."""
+        return sorted(self._all_verbs())
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:  # noqa: ARG002 - click's signature
-        """The verb of a name; None if there is none."""
-        return self._load(cmd_name) if cmd_name in self._verbs else None
+        """Return the verb of a name; None if there is none."""
+        for verbs in (self._verbs, self._offers(own=True).by_name):
+            if cmd_name in verbs:
+                return verbs[cmd_name].load()
+        found = self._offers().by_name.get(cmd_name)
+        if found is None:
+            return None
+        try:
+            return found.load()
+        except Exception as error:
+            raise MissingPluginError(f"{cmd_name}: its plug-in fails with {type(error).__name__}: {error}") from error
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:  # noqa: ARG002 - click's signature
-        """Write the list of verbs."""
+        """Write the list of verbs, and which plug-ins were left out."""
         with formatter.section("Commands"):
-            formatter.write_dl(sorted(self._verbs.items()))
+            formatter.write_dl([(name, verb.summary) for name, verb in sorted(self._all_verbs().items())])
+        if refusals := self._offers().refusals_text():
+            formatter.write_paragraph()
+            formatter.write_text(refusals)
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        """The verb that the first word names; for a word that is nearly one, the error names the verb."""
-        meant = get_close_matches(args[0], self._verbs, n=1)
-        if meant and args[0] not in self._verbs and not ctx.resilient_parsing:
-            ctx.fail(f"No such command '{args[0]}'. Did you mean '{meant[0]}'?")
+        """Return the verb that the first word names.
+
+        The error for an unknown word names the verb that was probably meant, and the plug-ins that were left out.
+        """
+        command = self.get_command(ctx, args[0])
+        if command is not None:
+            return args[0], command, args[1:]
+        if not ctx.resilient_parsing and args[0][:1].isalnum():
+            meant = get_close_matches(args[0], self._all_verbs(), n=1)
+            hint = f" Did you mean '{meant[0]}'?" if meant else ""
+            refusals = self._offers().refusals_text()
+            ctx.fail(f"No such command '{args[0]}'.{hint}" + (f"\n{refusals}" if refusals else ""))
         return super().resolve_command(ctx, args)
 
 

@@ -28,12 +28,12 @@ if TYPE_CHECKING:
 
 _FRAMES_PER_SECOND: Final = round(1 / FRAME_PERIOD)
 NO_IMPACT: Final = "no impact"
+# Attributes that differ within a recording: of no use to a task on whole recordings.
 WITHIN_RECORDINGS: Final = ("time_to_impact", "impact_step", "time_to_end", "accident_visibility")
-"""Attributes that differ within a recording: of no use to a task on whole recordings."""
 
 
+# The token of a scene of our export to nuScenes, which stands for one agent's recording of a scenario.
 _NUSCENES_SCENE: Final = re.compile(rf"^nuscenes/(\w+_(?:accident|normal))-(.+?)(?:-(?:{'|'.join(AGENTS)}))?$")
-"""The token of a scene of our export to nuScenes, which stands for one agent's recording of a scenario."""
 
 
 def cluster_of(scenario: str) -> str:
@@ -88,8 +88,8 @@ class SampleAttributes(ShortRepr):
 
 EVERYTHING: Final = "all"
 _OF_SAMPLES: Final = ("agent", "accident_visibility", "time_to_impact", "impact_step", "time_to_end")
+# What results can be broken down by; `all` is not to break them down.
 ATTRIBUTES: Final = (EVERYTHING, *(name for name, field in FIELDS.items() if field.groups), *_OF_SAMPLES)
-"""What results can be broken down by; `all` is not to break them down."""
 
 
 def attribute_name(name: str) -> str:
@@ -143,11 +143,11 @@ def _attributes(sample: SampleRecord, story: Mapping[str, str | None], *, visibl
     )
 
 
-Result = TypeVar("Result")
+_Result = TypeVar("_Result")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Group(FrozenMappings, Generic[Result]):
+class Group(FrozenMappings, Generic[_Result]):
     """The samples that share a value.
 
     Attributes:
@@ -162,7 +162,7 @@ class Group(FrozenMappings, Generic[Result]):
     """
 
     value: str | None
-    result: Result
+    result: _Result
     samples: int
     scenarios: int
     clusters: int
@@ -171,7 +171,7 @@ class Group(FrozenMappings, Generic[Result]):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Breakdown(FrozenMappings, Generic[Result]):
+class Breakdown(FrozenMappings, Generic[_Result]):
     """Results by one attribute.
 
     Attributes:
@@ -182,17 +182,17 @@ class Breakdown(FrozenMappings, Generic[Result]):
     """
 
     by: str
-    groups: tuple[Group[Result], ...]
-    without_infrastructure: tuple[Group[Result], ...]
+    groups: tuple[Group[_Result], ...]
+    without_infrastructure: tuple[Group[_Result], ...]
     resampling: Resampling
 
 
 def breakdown(
-    evaluator: Evaluator[Result],
+    evaluator: Evaluator[_Result],
     attributes: Mapping[str, SampleAttributes],
     by: str,
     resampling: Resampling | None = None,
-) -> Breakdown[Result]:
+) -> Breakdown[_Result]:
     """Results of an evaluator's samples, by the values of an attribute.
 
     The same bits for any order of the samples, of the attributes, and of the parts that were merged.
@@ -223,8 +223,8 @@ def breakdown(
 
 
 def _groups(
-    evaluator: Evaluator[Result], attributes: Mapping[str, SampleAttributes], by: str, resampling: Resampling
-) -> tuple[Group[Result], ...]:
+    evaluator: Evaluator[_Result], attributes: Mapping[str, SampleAttributes], by: str, resampling: Resampling
+) -> tuple[Group[_Result], ...]:
     by_value = tokens_by_value(attributes, by)
     ordered: list[str | None] = sorted(by_value, key=natural_order)
     if by == "agent":
@@ -233,12 +233,12 @@ def _groups(
 
 
 def _group(
-    evaluator: Evaluator[Result],
+    evaluator: Evaluator[_Result],
     value: str | None,
     tokens: Sequence[str],
     attributes: Mapping[str, SampleAttributes],
     resampling: Resampling,
-) -> Group[Result]:
+) -> Group[_Result]:
     names = {token: cluster_of(attributes[token].scenario) for token in tokens}
     clusters = evaluator.clustered(dict(sorted(names.items(), key=itemgetter(1))))
     result = evaluator.compute(tokens)

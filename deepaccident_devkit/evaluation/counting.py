@@ -10,19 +10,19 @@ from typing import TYPE_CHECKING, Any, Final, Generic, TypeAlias, TypeVar
 
 from deepaccident_devkit.errors import EvaluationError
 from deepaccident_devkit.evaluation.evaluator import Evaluator, EvaluatorT
-from deepaccident_devkit.parallel import Places, Store, run_batch
 from deepaccident_devkit.release.fingerprints import digest_of
 from deepaccident_devkit.support.json_text import parsed_json
+from deepaccident_devkit.support.parallel import Places, Store, run_batch
 from deepaccident_devkit.support.text import path_of
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
-    from deepaccident_devkit.parallel import Engine
+    from deepaccident_devkit.support.parallel import Engine
 
 Task = TypeVar("Task")
+# Samples that a worker evaluates at once, and a killed run can lose.
 _BATCH: Final = 8
-"""Samples that a worker evaluates at once, and a killed run can lose."""
 
 
 def evaluate_samples(
@@ -98,8 +98,8 @@ class _Batch(Generic[Task]):
         return f"{self.evaluator.maker} {self.evaluator.settings}"
 
 
+# An evaluator with the counts of a batch, and why some of its samples have none.
 _Counted: TypeAlias = tuple[Any, dict[str, EvaluationError]]
-"""An evaluator with the counts of a batch, and why some of its samples have none."""
 
 
 def _done(batches: Sequence[_Batch[Any]], store: Store | None, how: dict[str, Any]) -> Sequence[_Counted]:

@@ -20,11 +20,11 @@ from deepaccident_devkit.support.arrays import FloatArray, IntArray
 
 __all__ = ["Counts", "Evaluator", "EvaluatorT", "ratio", "total"]
 
-Result = TypeVar("Result")
+_Result = TypeVar("_Result")
 EvaluatorT = TypeVar("EvaluatorT", bound="Evaluator[Any]")
 
 
-class Evaluator(SampleCounts, Generic[Result]):
+class Evaluator(SampleCounts, Generic[_Result]):
     """One task: what its predictions are compared with, what a sample adds, and the result of many samples.
 
     A new task is a subclass in a folder of its own, and its name in the tuple of `runs.setups.TASKS`. It defines:
@@ -96,7 +96,7 @@ class Evaluator(SampleCounts, Generic[Result]):
         """Count one sample: its token, then its prediction and its truth; passes the counts to `add`."""
 
     @abstractmethod
-    def result_of(self, counts: Collection[Counts]) -> Result:
+    def result_of(self, counts: Collection[Counts]) -> _Result:
         """Return the metrics of some samples' counts, in any order."""
 
     # What a task can change
@@ -115,7 +115,7 @@ class Evaluator(SampleCounts, Generic[Result]):
         result: Any = self.compute([token])
         return {number.name: number.value for number in headlines(result)}
 
-    def compute(self, tokens: Iterable[str] | None = None) -> Result:
+    def compute(self, tokens: Iterable[str] | None = None) -> _Result:
         """Return the metrics of all samples, or of some.
 
         Args:
@@ -151,7 +151,7 @@ class Evaluator(SampleCounts, Generic[Result]):
         """Whether the numbers can be computed many times; if not, they have no intervals and no tests."""
         return True
 
-    def resampled(self, parts: Sequence[Sequence[Counts]], times: IntArray) -> Iterator[Result]:
+    def resampled(self, parts: Sequence[Sequence[Counts]], times: IntArray) -> Iterator[_Result]:
         """Yield the result of each of D draws of groups of samples.
 
         Args:

@@ -71,8 +71,8 @@ def iou(counts: Iterable[SegmentationCounts], *, absent: float = 0.0) -> float:
 
 CLASSES: Final = ("background", "instances")
 """What is counted: cells without any instance, as if they were one, and the instances."""
+# Entries of a histogram of pairs of ids; ids that would need more are renumbered.
 _MOST_PAIRS: Final = 4_000_000
-"""Entries of a histogram of pairs of ids; ids that would need more are renumbered."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -219,12 +219,12 @@ def _matches(
 
 
 Paths = Mapping[int, FloatArray]
+# Metres, the mean over the frames, within which two paths can be the same.
 _GATE: Final = 4.0
-"""Metres, the mean over the frames, within which two paths can be the same."""
+# Metres: a larger mean error, or final error, counts as this.
 _ADE_LIMIT, _FDE_LIMIT = 8.0, 10.0
-"""Metres: a larger mean error, or final error, counts as this."""
+# Metres; a larger final error is a miss.
 _MISS_DISTANCE: Final = 5.0
-"""Metres; a larger final error is a miss."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

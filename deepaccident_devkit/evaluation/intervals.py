@@ -20,18 +20,18 @@ from deepaccident_devkit.evaluation.evaluator import Counts, Evaluator
 from deepaccident_devkit.evaluation.task import LIMITS, Row
 from deepaccident_devkit.support.arrays import FloatArray, IntArray, as_floats
 
+# The default, to evaluate and to compare, in the library and on the command line.
 RESAMPLES: Final = 1000
-"""The default, to evaluate and to compare, in the library and on the command line."""
 MOST_RESAMPLES: Final = 100_000
+# Fewer have no interval, since its coverage would be too low; and no test at 5 % can decide with fewer.
 LEAST_CLUSTERS: Final = 6
-"""Fewer have no interval, since its coverage would be too low; and no test at 5 % can decide with fewer."""
+# More clusters are joined to so many parts: it costs less, and t hardly changes from 99 degrees of freedom on.
 _MOST_PARTS: Final = 100
-"""More clusters are joined to so many parts: it costs less, and t hardly changes from 99 degrees of freedom on."""
+# Changes below this share of a number (or of its range) are of rounding.
 _ROUNDING: Final = 1e-9
-"""Changes below this share of a number (or of its range) are of rounding."""
 _NAMED: Final = 3
+# The counts of each cluster's samples.
 Clusters = Sequence[Sequence[Counts]]
-"""The counts of each cluster's samples."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -284,12 +284,12 @@ def _some(names: Sequence[str]) -> str:
     return ", ".join(names) if more <= 0 else f"{', '.join(names[:_NAMED])} and {more} others"
 
 
+# Totals, settings, and medians, which jump when a cluster is left out: the jackknife does not hold for them.
 _WITHOUT: Final = (
     "false_recordings",
     *("within/*/distance", "threshold", "best_f1", "quiet", "quiet_braking"),
     "median_*",
 )
-"""Totals, settings, and medians, which jump when a cluster is left out: the jackknife does not hold for them."""
 
 
 def numbers_of(result: object) -> dict[str, float]:

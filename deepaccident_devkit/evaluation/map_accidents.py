@@ -19,8 +19,8 @@ from deepaccident_devkit.geometry.bev_grid import Orientation, cells_in
 from deepaccident_devkit.motion import LabelProtocol, MotionHeads, predict_instances
 from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray, FrozenArrays, IntArray
 
+# The number of pairs of corner and side in one batch: bounds the memory.
 _PAIRS_AT_ONCE = 1 << 18
-"""The number of pairs of corner and side in one batch: bounds the memory."""
 
 
 def convex_hulls(points: IntArray, group: IntArray) -> FloatArray:
@@ -143,8 +143,8 @@ def _parts(way: FloatArray, first: FloatArray, second: FloatArray) -> BoolArray:
     return np.asarray(near > far)
 
 
+# Lengths that differ by less, in metres, are equal: means of cells are inexact in the last bits.
 TIE: Final = 1e-9
-"""Lengths that differ by less, in metres, are equal: means of cells are inexact in the last bits."""
 _TIE_DECIMALS: Final = 9
 
 

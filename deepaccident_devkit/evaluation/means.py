@@ -20,12 +20,12 @@ from deepaccident_devkit.support.text import counted, natural_order
 
 MEAN_OF_SCENARIOS: Final = "mean of scenarios"
 """The row with the mean of the scenarios' own means of the main row, for evaluators that ask for it."""
+# Of 1: sums have no finer numbers.
 _PARTS: Final = 2.0**30
-"""Of 1: sums have no finer numbers."""
 
 
+# Beginning of the path of a column's row.
 _ANY_CELL: Final = "means/*/*/"
-"""Beginning of the path of a column's row."""
 
 
 def table_rows(columns: Sequence[Row], main_tables: Sequence[str], main_row: str) -> tuple[Row, ...]:
@@ -63,7 +63,7 @@ class MeansResult(TaskResult):
     notes: tuple[str, ...]
 
 
-Result = TypeVar("Result", bound=MeansResult)
+_Result = TypeVar("_Result", bound=MeansResult)
 
 
 class Sums:
@@ -100,7 +100,7 @@ class Sums:
         return _counts(self._numbers, self._notes) | ({} if scenario is None else {"scenario": scenario})
 
 
-class MeansEvaluator(Evaluator[Result], Generic[Result]):
+class MeansEvaluator(Evaluator[_Result], Generic[_Result]):
     """Base of evaluators whose numbers are means; see the subclasses for what is counted."""
 
     order: ClassVar[Sequence[str]] = ()
@@ -141,7 +141,7 @@ class MeansEvaluator(Evaluator[Result], Generic[Result]):
         sums, counts = (times @ each for each in np.moveaxis(given.reshape(len(parts), len(names), 2), -1, 0))
         return np.where(counts > 0, sums / np.maximum(counts, 1), np.nan)
 
-    def result_of(self, counts: Collection[Counts]) -> Result:
+    def result_of(self, counts: Collection[Counts]) -> _Result:
         """The means over some samples, in any order."""
         (pooled,) = self.pooled(counts)
         means: dict[str, dict[str, dict[str, float]]] = {}
@@ -152,7 +152,7 @@ class MeansEvaluator(Evaluator[Result], Generic[Result]):
             means.setdefault(table, {}).setdefault(row, {})[column] = ratio(float(value), float(count))
             counted.setdefault(table, {}).setdefault(row, {})[column] = int(count)
         notes = tuple(_note_text(text, count) for text, count in sorted(pooled["notes"].items()))
-        result: Result = self.result_class(samples=pooled["samples"], means=means, counted=counted, notes=notes)
+        result: _Result = self.result_class(samples=pooled["samples"], means=means, counted=counted, notes=notes)
         return result
 
     def _place(self, path: str, columns: Sequence[str]) -> tuple[Any, ...]:

@@ -54,8 +54,8 @@ __all__ = [
     "motion_counts",
 ]
 
+# Name, as the released code prints it → metres: side of a square around the ego in which IoU and VPQ are counted.
 RANGES: Final[Mapping[str, float]] = MappingProxyType({"30x30": 30.0, "100x100": 100.0})
-"""Name, as the released code prints it → metres: side of a square around the ego in which IoU and VPQ are counted."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -84,9 +84,9 @@ MOTION_PROTOCOLS: Final[Mapping[str, MotionProtocol]] = MappingProxyType(
 ranges: so `paper` is the released code, except that a number with nothing to count is NaN and not 0."""
 
 
+# How instances are read off heads, and off labels, for minADE, minFDE and miss rate. The released code has these
+# errors from the accident evaluation, which links and cuts out instances by other rules than VPQ's.
 _READ_FOR_PATHS: Final = replace(POST_PROCESSING["accident"], redraw=False)
-"""How instances are read off heads, and off labels, for minADE, minFDE and miss rate. The released code has these
-errors from the accident evaluation, which links and cuts out instances by other rules than VPQ's."""
 _PATH_COUNTS: Final = ("true_positive", "false_positive", "false_negative")
 _PATHS: Final = ("ade", "fde", "missed", "count", *_PATH_COUNTS)
 _INSTANCE_MAPS: Final = (

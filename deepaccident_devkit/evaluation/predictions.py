@@ -26,8 +26,8 @@ from deepaccident_devkit.support.arrays import (
 )
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
+# Of K stacked predictions; centerness may lack that of its only channel.
 _AXES: Final = {"segmentation": (5,), "centerness": (4, 5), "offset": (5,), "flow": (5,)}
-"""Of K stacked predictions; centerness may lack that of its only channel."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -231,8 +231,8 @@ def ascending_times(values: ArrayLike) -> FloatArray:
     return times
 
 
+# Seconds: the times of a path that is longer are probably no seconds.
 LONGEST_PATH: Final = 10.0
-"""Seconds: the times of a path that is longer are probably no seconds."""
 LONG_PATHS: Final = "suspicious: {path} longer than 10 s; times are in seconds, not in frames or milliseconds"
 
 
@@ -248,8 +248,8 @@ def _checked_ids(ids: object) -> tuple[int, int] | None:
     return first, second
 
 
+# Cells: edges of a range fall on edges of cells, apart from rounding.
 _TINY: Final = 1e-6
-"""Cells: edges of a range fall on edges of cells, apart from rounding."""
 
 
 def compared_labels(dataset: Dataset, token: str, rules: Any, form: Any, horizon: float) -> MotionLabels | None:

@@ -10,12 +10,12 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
-from deepaccident_devkit._version import __version__
 from deepaccident_devkit.errors import EvaluationError
 from deepaccident_devkit.support.files import write_bytes
 from deepaccident_devkit.support.json_text import parsed_json
 from deepaccident_devkit.support.reading import fault_text, read_bytes
 from deepaccident_devkit.support.text import path_of
+from deepaccident_devkit.support.version import __version__
 
 Counts = Mapping[str, Any]
 """What one sample adds: names → whole numbers, floats, None, or nested lists of them; as JSON holds it."""

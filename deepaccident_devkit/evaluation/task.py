@@ -11,18 +11,18 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final, Literal, NoReturn, TypeV
 import numpy as np
 
 from deepaccident_devkit.errors import ChoiceError
-from deepaccident_devkit.reports import table_html
 from deepaccident_devkit.support.arrays import ShortRepr, known
+from deepaccident_devkit.support.reports import table_html
 from deepaccident_devkit.support.text import choice, counted, meant_text, possible_text
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
-Kind = TypeVar("Kind")
+_Kind = TypeVar("_Kind")
 Rules = TypeVar("Rules", bound="DataclassInstance")
 _WORDS: Final[Mapping[type | None, str]] = {bool: "true or false", float: "a number", str: "a word", tuple: "a list"}
+# A kind of value → the types that are of it; a bool is an int to Python, so that it comes first.
 _LIKE: Final[Mapping[type, tuple[type, ...]]] = {bool: (bool,), float: (float, int), str: (str,), tuple: (tuple,)}
-"""A kind of value → the types that are of it; a bool is an int to Python, so that it comes first."""
 
 
 def switch_names(rules: DataclassInstance) -> list[str]:
@@ -77,10 +77,10 @@ def _of_kind(name: str, rules: DataclassInstance, field: str, value: Any) -> Any
     return value
 
 
-def protocol_of(protocol: object, protocols: Mapping[str, Kind]) -> Kind:
+def protocol_of(protocol: object, protocols: Mapping[str, _Kind]) -> _Kind:
     """Return a protocol by its name, or as given if it is of the class of one of them; raises ChoiceError."""
     if isinstance(protocol, tuple(map(type, protocols.values()))):
-        return cast("Kind", protocol)
+        return cast("_Kind", protocol)
     return protocols[choice("protocol", protocol, protocols)]
 
 
@@ -89,11 +89,11 @@ def as_tuples(value: Any) -> Any:
     return tuple(as_tuples(each) for each in value) if isinstance(value, list | tuple) else value
 
 
-Key = TypeVar("Key")
-Value = TypeVar("Value")
+_Key = TypeVar("_Key")
+_Value = TypeVar("_Value")
 
 
-class FrozenDict(dict[Key, Value]):
+class FrozenDict(dict[_Key, _Value]):
     """A dict that does not change, and so has a hash where its values have one.
 
     A dict and not a view of one, since `dataclasses.asdict`, `copy.deepcopy` and `pickle` refuse views.
@@ -152,8 +152,8 @@ def _frozen(value: Any) -> Any:
 
 
 Unit = Literal["%", "share", "m", "s", "rad", "m/s", "1 - overlap", "1/min"]
+# The most that a number of a unit can be; others have no limit.
 LIMITS: Final[Mapping[Unit, float]] = MappingProxyType({"%": 100.0, "share": 1.0, "1 - overlap": 1.0})
-"""The most that a number of a unit can be; others have no limit."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -200,8 +200,8 @@ class Row:
     is_headline: bool = True
 
 
+# Headlines in a result's text.
 _SHOWN: Final = 4
-"""Headlines in a result's text."""
 _HIGHER_IS_BETTER: Final = {"higher": True, "lower": False, "neither": None}
 
 

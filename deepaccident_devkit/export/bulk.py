@@ -20,7 +20,6 @@ from pathlib import Path, PurePosixPath
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, Final, Literal, TypeAlias
 
-from deepaccident_devkit._version import __version__
 from deepaccident_devkit.errors import (
     ConfigError,
     ExportError,
@@ -29,8 +28,7 @@ from deepaccident_devkit.errors import (
     ReleaseError,
     shortened,
 )
-from deepaccident_devkit.export.format import Format, Link, Output, Tally, Unit, flat_name
-from deepaccident_devkit.parallel import Engine, Failure, Places, Store, Tried, check_failures, run_batch
+from deepaccident_devkit.export.format import Format, LinkKind, Output, Tally, Unit, flat_name
 from deepaccident_devkit.release.fingerprints import checked_hashes, digest_of, scenario_folders, sensor_digest
 from deepaccident_devkit.release.layout import ScenarioFolder
 from deepaccident_devkit.selection import find
@@ -43,31 +41,33 @@ from deepaccident_devkit.support.files import (
     write_bytes,
 )
 from deepaccident_devkit.support.json_text import parsed_record
+from deepaccident_devkit.support.parallel import Engine, Failure, Places, Store, Tried, check_failures, run_batch
 from deepaccident_devkit.support.reading import DAMAGED_ARCHIVE, fault_text, open_zip, read_bytes, read_member
 from deepaccident_devkit.support.text import differing_text, path_of
+from deepaccident_devkit.support.version import __version__
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
     from deepaccident_devkit.dataset import Dataset
 
-__all__ = ["Exported", "Format", "Link", "Manifest", "Output", "Tally", "Unit", "export_release", "flat_name"]
+__all__ = ["Exported", "Format", "LinkKind", "Manifest", "Output", "Tally", "Unit", "export_release", "flat_name"]
 
 _FOLDER: Final = ".deepaccident-parts"
 _ENDING: Final = ".manifest.json"
 _DONE: Final = "done"
 _PATHS: Final = ".paths"
+# Paths that no export notes: out of its folder, or to what it keeps there itself. Somebody else wrote those.
 _REFUSED: Final = re.compile(r"(.*/)?(\.{0,2}|\.deepaccident[^/]*|[^/]*\.manifest\.json)(/.*)?", re.DOTALL)
-"""Paths that no export notes: out of its folder, or to what it keeps there itself. Somebody else wrote those."""
+# Characters of a path; no system opens a longer one.
 _LONGEST: Final = 4096
-"""Characters of a path; no system opens a longer one."""
+# Counts up when the content of a done-record changes.
 _RECORD: Final = 2
-"""Counts up when the content of a done-record changes."""
+# Name of the hash of the list of a scenario's sensor files, beside the hashes of its truth.
 _SENSORS: Final = "sensors"
-"""Name of the hash of the list of a scenario's sensor files, beside the hashes of its truth."""
 States: TypeAlias = "Mapping[str, dict[str, str | None]]"
-Job: TypeAlias = "tuple[Unit, States | Failure]"
-"""A unit, and the states of its scenarios."""
+# A unit, and the states of its scenarios.
+_Job: TypeAlias = "tuple[Unit, States | Failure]"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -322,7 +322,7 @@ class Export:
             for folder in folders
         }
 
-    def completed(self, before: Manifest, jobs: Mapping[str, Job], how: Engine) -> tuple[Manifest, int]:
+    def completed(self, before: Manifest, jobs: Mapping[str, _Job], how: Engine) -> tuple[Manifest, int]:
         """Write what is left, beside others that write it; the manifest, and how many units are new."""
         store = self.store
 
@@ -351,7 +351,7 @@ class Export:
                 whole = Manifest.of(self.root, self.form, before.settings)
         return whole, sum(each.new for each in done.values())
 
-    def write(self, job: Job) -> _Done:
+    def write(self, job: _Job) -> _Done:
         """Write a unit, unless it was written from the same files before."""
         unit, states = job
         if isinstance(states, Failure):
@@ -365,7 +365,7 @@ class Export:
         self.store.keep(name, key, json.dumps(asdict(output.tally)).encode())
         return _Done(output.tally, new=True)
 
-    def _finished(self, jobs: Mapping[str, Job], done: Sequence[_Done], settings: dict[str, Any]) -> Manifest:
+    def _finished(self, jobs: Mapping[str, _Job], done: Sequence[_Done], settings: dict[str, Any]) -> Manifest:
         """Write what spans units; the manifest of the complete export. If there is no sample, nothing is left."""
         if not any(each.tally.samples for each in done):
             self._remove_others(())
@@ -482,7 +482,7 @@ def _chosen(dataset: Dataset, form: Format) -> list[str]:
     return chosen
 
 
-def _all_states(jobs: Mapping[str, Job]) -> dict[str, dict[str, str | None]]:
+def _all_states(jobs: Mapping[str, _Job]) -> dict[str, dict[str, str | None]]:
     """The states of the scenarios of all units, none of which has failed."""
     return {
         token: state

@@ -16,7 +16,6 @@ from itertools import product
 from pathlib import Path
 from typing import Any, ClassVar, Final, Literal, get_args
 
-from deepaccident_devkit._version import __version__
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import SensorFileError
 from deepaccident_devkit.release.store import ReleasePath, StorePath
@@ -24,15 +23,16 @@ from deepaccident_devkit.selection import parse_where
 from deepaccident_devkit.support.files import place_in, remove_in, replacing, replacing_folder
 from deepaccident_devkit.support.reading import fault_text, open_file, read_bytes
 from deepaccident_devkit.support.text import choices, members_of, settle_choices
+from deepaccident_devkit.support.version import __version__
 from deepaccident_devkit.tables.tables import split_choice
 from deepaccident_devkit.taxonomy import AGENTS, CHANNELS
 
-Link = Literal["hard", "symbolic", "copy"]
+LinkKind = Literal["hard", "symbolic", "copy"]
+# What a file system answers that cannot make a link; a full disk is another matter.
 _NO_LINKS: Final = (errno.EXDEV, errno.EPERM, errno.EACCES, errno.EMLINK, errno.ENOTSUP, errno.ENOSYS)
-"""What a file system answers that cannot make a link; a full disk is another matter."""
 _DIGEST: Final = re.compile(r"-[0-9a-f]{16}\Z")
+# Of a name made from a token; the devkit's and the formats' endings come to it, and systems allow 255.
 _MOST_CHARACTERS: Final = 150
-"""Of a name made from a token; the devkit's and the formats' endings come to it, and systems allow 255."""
 README: Final = "README.md"
 SPLIT_NAMES: Final[Mapping[str | None, str]] = {"train": "train", "val": "validation", "test": "test", None: "unknown"}
 """A scenario's split → what files are called by it; `datasets` expects these words."""
@@ -96,7 +96,7 @@ class Output:
         self,
         folder: Path,
         parts: Path,
-        link: Link,
+        link: LinkKind,
         tally: Tally | None = None,
         note: Callable[[str], object] = lambda _: None,
     ) -> None:
@@ -167,14 +167,14 @@ class Output:
         return place_in(self.folder, path)
 
 
-def _linked(source: Path, target: Path, link: Link, *, symbolic: bool) -> str:
+def _linked(source: Path, target: Path, link: LinkKind, *, symbolic: bool) -> str:
     """Make `target` show `source`, and say how."""
     ways: dict[str, Callable[[], object]] = {
         "hard": lambda: os.link(source, target),
         "symbolic": lambda: target.symlink_to(source),
         "copy": lambda: shutil.copyfile(source, target),
     }
-    for way in get_args(Link)[get_args(Link).index(link) :]:
+    for way in get_args(LinkKind)[get_args(LinkKind).index(link) :]:
         if symbolic or way != "symbolic":
             try:
                 ways[way]()
@@ -217,7 +217,7 @@ class Format(ABC):
     split: str | os.PathLike[str] | None = None
     where: tuple[str, ...] = ()
     agents: tuple[str, ...] = AGENTS
-    link: Link = "hard"
+    link: LinkKind = "hard"
 
     name: ClassVar[str]
     """One word, as on the command line."""
@@ -232,7 +232,7 @@ class Format(ABC):
 
     def __post_init__(self) -> None:
         """Check the choices, give them their usual spelling, and put the agents in their usual order."""
-        settle_choices(self, {"link": get_args(Link)})
+        settle_choices(self, {"link": get_args(LinkKind)})
         if isinstance(self.split, str) and not self.split.endswith(".txt"):
             object.__setattr__(self, "split", split_choice(self.split))
         object.__setattr__(self, "where", tuple(members_of("where", self.where, "filters")))
@@ -261,8 +261,9 @@ class Format(ABC):
     def write(self, dataset: Dataset, unit: Unit, output: Output) -> None:
         """Write a unit, and count its samples (`output.tally`); called again for the same one after an interruption."""
 
-    @abstractmethod
-    def finish(self, dataset: Dataset, units: Sequence[Unit], output: Output, parts: Callable[[Unit], Path]) -> None:
+    def finish(  # noqa: B027 - some formats write nothing more
+        self, dataset: Dataset, units: Sequence[Unit], output: Output, parts: Callable[[Unit], Path]
+    ) -> None:
         """Write what spans units, from the parts that they left; called again after an interruption."""
 
 

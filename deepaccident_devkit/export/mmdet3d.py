@@ -27,7 +27,13 @@ from deepaccident_devkit.errors import ExportError
 from deepaccident_devkit.export.bulk import Manifest
 from deepaccident_devkit.export.frames import keyframes, stored_camera
 from deepaccident_devkit.export.nuscenes import NuScenes
-from deepaccident_devkit.export.nuscenes.scenes import CAMERA_CHANNELS, TURNS, VERSION, sensor_path, token
+from deepaccident_devkit.export.nuscenes.scenes import (
+    AXES_ROTATIONS,
+    CAMERA_CHANNELS,
+    NUSCENES_VERSION,
+    sensor_path,
+    token,
+)
 from deepaccident_devkit.geometry import SE3
 from deepaccident_devkit.release.pickles import pickled_items, write_joined
 from deepaccident_devkit.support.files import write_bytes
@@ -37,17 +43,17 @@ from deepaccident_devkit.taxonomy import LIDAR, OWN_ACTOR_ID
 if TYPE_CHECKING:
     from deepaccident_devkit.dataset import Dataset
     from deepaccident_devkit.export.bulk import Output, Unit
-    from deepaccident_devkit.export.nuscenes.scenes import Scene, Van
+    from deepaccident_devkit.export.nuscenes.scenes import AgentScene, Van
 
-CLASSES: Final = (
+NUSCENES_CLASSES: Final = (
     *("car", "truck", "trailer", "bus", "construction_vehicle", "bicycle", "motorcycle", "pedestrian"),
     *("traffic_cone", "barrier"),
 )
 """NuScenes' ten classes, in the order of the client's labels."""
 LABELS: Final = MappingProxyType({"car": 0, "truck": 1, "cyclist": 5, "motorcycle": 6, "pedestrian": 7})
 """Our class → its label; vans are said to be cars or trucks."""
+# How many clouds before a keyframe an info names at most: one second.
 _SWEEPS: Final = 10
-"""How many clouds before a keyframe an info names at most: one second."""
 _PART: Final = "infos.jsonl"
 
 
@@ -84,9 +90,9 @@ class Mmdet3d(NuScenes):
             split = dataset.get("scenario", unit.scenarios[0])["split"] or "unknown"
             folders.setdefault(split, []).append(parts(unit))
         about = {
-            "categories": {name: label for label, name in enumerate(CLASSES)},
+            "categories": {name: label for label, name in enumerate(NUSCENES_CLASSES)},
             "dataset": "nuscenes",
-            "version": VERSION,
+            "version": NUSCENES_VERSION,
             "info_version": "1.1",
         }
         for split, places in sorted(folders.items()):
@@ -101,9 +107,9 @@ def _placed(folders: Iterable[Path]) -> Iterator[dict[str, Any]]:
     return ({"sample_idx": place, **json.loads(line)} for place, line in enumerate(lines))
 
 
-def _infos(scene: Scene, form: NuScenes, output: Output) -> Iterator[dict[str, Any]]:
+def _infos(scene: AgentScene, form: NuScenes, output: Output) -> Iterator[dict[str, Any]]:
     """The infos of a scene's keyframes, without `sample_idx`."""
-    ours_from_theirs = SE3.from_rotation(TURNS[form.lidar_axes]).inverse()
+    ours_from_theirs = SE3.from_rotation(AXES_ROTATIONS[form.lidar_axes]).inverse()
     for number in keyframes(scene.last):
         sample = scene.sample(number)
         ego_from_lidar = scene.dataset.ego_from(sample, LIDAR) @ ours_from_theirs
@@ -143,7 +149,7 @@ def _infos(scene: Scene, form: NuScenes, output: Output) -> Iterator[dict[str, A
         }
 
 
-def _sweep(scene: Scene, number: int, lidar_from_world: SE3, ours_from_theirs: SE3) -> dict[str, Any]:
+def _sweep(scene: AgentScene, number: int, lidar_from_world: SE3, ours_from_theirs: SE3) -> dict[str, Any]:
     """A cloud before a keyframe, whose LiDAR frame is given.
 
     The client turns points by the transpose of `lidar2sensor` and subtracts its fourth column unturned. So that column
@@ -165,7 +171,9 @@ def _sweep(scene: Scene, number: int, lidar_from_world: SE3, ours_from_theirs: S
     }
 
 
-def _instances(scene: Scene, sample: str, van: Van, theirs_from_ours: SE3, output: Output) -> Iterator[dict[str, Any]]:
+def _instances(
+    scene: AgentScene, sample: str, van: Van, theirs_from_ours: SE3, output: Output
+) -> Iterator[dict[str, Any]]:
     """The boxes of a keyframe as in the nuScenes export, without the agent's own; the client makes NaN velocities 0."""
     boxes = scene.dataset.boxes(sample, "lidar", velocity="derived")
     others = boxes.select(boxes.actor_id != OWN_ACTOR_ID).transform(theirs_from_ours, "lidar")
@@ -186,6 +194,6 @@ def _instances(scene: Scene, sample: str, van: Van, theirs_from_ours: SE3, outpu
         }
 
 
-def _file(scene: Scene, channel: str, number: int) -> PurePosixPath:
+def _file(scene: AgentScene, channel: str, number: int) -> PurePosixPath:
     """The path of a sensor file in the folder of the nuScenes export."""
     return PurePosixPath(sensor_path(scene.name, channel, scene.stamp(number), key=scene.is_key(number)))

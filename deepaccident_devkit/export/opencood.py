@@ -55,10 +55,11 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
+# Our split → their folder.
 _SPLITS: Final[Mapping[str | None, str]] = {"train": "train", "val": "validate", "test": "test", None: "unknown"}
-"""Our split → their folder."""
 _AGENTS: Final = "agents.json"
-CAMERA_NAMES: Final[Mapping[str, str]] = {
+# Our camera → theirs. OPV2V has four: front, right rear, left rear, back; loaders leave out the other two.
+_CAMERA_NAMES: Final[Mapping[str, str]] = {
     "Camera_Front": "camera0",
     "Camera_BackRight": "camera1",
     "Camera_BackLeft": "camera2",
@@ -66,7 +67,6 @@ CAMERA_NAMES: Final[Mapping[str, str]] = {
     "Camera_FrontLeft": "camera4",
     "Camera_FrontRight": "camera5",
 }
-"""Our camera → theirs. OPV2V has four: front, right rear, left rear, back; loaders leave out the other two."""
 _KMH: Final = 3.6
 _POINT: Final = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("rgb", "<u4")])
 
@@ -99,7 +99,7 @@ class OpenCood(Format):
 
     def write(self, dataset: Dataset, unit: Unit, output: Output) -> None:
         """Write a scenario's folder, which appears when it is whole."""
-        recording = Recording(dataset, unit.scenarios[0], self.agents, self.ego, self.without_clouds)
+        recording = _Recording(dataset, unit.scenarios[0], self.agents, self.ego, self.without_clouds)
         recording.count(output)
         if recording.frames:  # loaders stop at a scenario without agents
             with output.whole_folder(f"{_SPLITS[recording.record['split']]}/{unit.name}") as folder:
@@ -126,8 +126,8 @@ class OpenCood(Format):
                 samples,
             )
 
-    def _write_agent(self, recording: Recording, agent: str, output: Output) -> None:
-        moments = Moments(recording, agent, self.classes)
+    def _write_agent(self, recording: _Recording, agent: str, output: Output) -> None:
+        moments = _Moments(recording, agent, self.classes)
         files = recording.files[agent]
         for number in recording.frames:
             stem, facts = f"{recording.folders[agent]}/{number:06d}", moments.facts(number, output)
@@ -135,7 +135,7 @@ class OpenCood(Format):
             output.write(f"{stem}.json", json.dumps(facts).encode())  # CoAlign and HEAL read it in place of the yaml
             if number in files[LIDAR]:
                 output.write(f"{stem}.pcd", pcd_bytes(read_lidar(files[LIDAR][number][0], raw=True)))
-            for camera, name in CAMERA_NAMES.items():
+            for camera, name in _CAMERA_NAMES.items():
                 if number in files[camera]:
                     output.link(files[camera][number][0], f"{stem}_{name}.png")
 
@@ -147,7 +147,7 @@ def _yaml(content: Mapping[str, Any]) -> bytes:
     return str(yaml.dump(content, Dumper=dumper, default_flow_style=None)).encode()
 
 
-class Recording:
+class _Recording:
     """A scenario's agents, their folders and their sensor files.
 
     Attributes:
@@ -215,14 +215,14 @@ class Recording:
         return sum(len(files[channel]) for files in self._there.values())
 
 
-class Moments:
+class _Moments:
     """The moments of one agent of a scenario, computed at once.
 
     Attributes:
         samples: tokens, by frame.
     """
 
-    def __init__(self, recording: Recording, agent: str, classes: tuple[str, ...]) -> None:
+    def __init__(self, recording: _Recording, agent: str, classes: tuple[str, ...]) -> None:
         """Take an agent, and the classes that count as vehicles; raises TokenError."""
         self._dataset = dataset = recording.dataset
         self._files, numbers = recording.files[agent], [CATEGORIES.index(name) for name in classes]
@@ -241,7 +241,7 @@ class Moments:
         self._ego_from = sensors.reshape(count, len(CHANNELS), 4, 4)
         samples = dataset.columns("sample")
         self._velocity, self._labelled = (samples[name][first : first + count] for name in ("velocity", "labelled"))
-        self._extrinsic = {name: self._camera_from_lidar(name) for name in CAMERA_NAMES}
+        self._extrinsic = {name: self._camera_from_lidar(name) for name in _CAMERA_NAMES}
 
     def facts(self, number: int, output: Output) -> dict[str, Any]:
         """All that the file of a frame says; frames are counted from 1. What it leaves out is counted in `output`."""
@@ -249,7 +249,7 @@ class Moments:
         ego = carla_six(self._world_from_ego[at]).tolist()
         world_from_lidar = self._world_from_ego[at] @ self._ego_from[at, CHANNELS.index(LIDAR)]
         return {
-            **{theirs: self._camera(ours, at, flip_pose(world_from_lidar)) for ours, theirs in CAMERA_NAMES.items()},
+            **{theirs: self._camera(ours, at, flip_pose(world_from_lidar)) for ours, theirs in _CAMERA_NAMES.items()},
             "ego_speed": self._speed(at),
             "lidar_pose": carla_six(world_from_lidar).tolist(),
             "plan_trajectory": [  # where it went; a recording has no planned speed

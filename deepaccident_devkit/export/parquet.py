@@ -14,17 +14,17 @@ from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.export.bulk import Format, Output, Unit
 from deepaccident_devkit.export.format import README, SPLIT_NAMES, readme, shards
 from deepaccident_devkit.support.arrays import IntArray
-from deepaccident_devkit.tables.columns import Key, Kind, Number, Vector
+from deepaccident_devkit.tables.columns import ColumnKind, Key, Number, Vector
 from deepaccident_devkit.tables.record_tables import RecordTables
 from deepaccident_devkit.tables.records import table_specs
 
 if TYPE_CHECKING:
     from deepaccident_devkit.dataset import Dataset
 
-ROWS: Final = 50_000
+ROW_GROUP_SIZE: Final = 50_000
 """Rows of a group at most: what is in memory at once."""
+# Tables that are the same for all splits, and small.
 _ONCE: Final = ("sensor", "category")
-"""Tables that are the same for all splits, and small."""
 _ONLY_FILE: Final = "all-00000-of-00001.parquet"
 _ORDER: Final = (*SPLIT_NAMES.values(), "all")
 _NOTES: Final = """\
@@ -103,8 +103,8 @@ def _pieces(maker: RecordTables, table: str, rows: IntArray, split: str | None) 
     """The rows of a table, some at a time, with their split."""
     import pyarrow as pa
 
-    for start in range(0, len(rows), ROWS):
-        piece = maker.table(table, rows[start : start + ROWS])
+    for start in range(0, len(rows), ROW_GROUP_SIZE):
+        piece = maker.table(table, rows[start : start + ROW_GROUP_SIZE])
         if "split" not in piece.column_names:
             piece = piece.append_column("split", pa.array([split] * len(piece), type=pa.string()))
         yield piece
@@ -149,7 +149,7 @@ def _body(rows: Mapping[str, Mapping[str, int]]) -> str:
     return "\n".join(lines)
 
 
-def _meaning(kind: Kind) -> str:
+def _meaning(kind: ColumnKind) -> str:
     """A column's documentation, with the unit or the table that its tokens are of."""
     if isinstance(kind, Key):
         return f"→ `{kind.table}`. {kind.doc}"

@@ -34,13 +34,13 @@ from deepaccident_devkit.v2x.agents import agents_of
 
 logger = logging.getLogger(__name__)
 
+# The splits that have a file, and the version that the converter writes into it.
 _SPLITS: Final[Mapping[str, str]] = {
     "train": "v1.0-trainval",
     "val": "v1.0-trainval",
     "train_mini": "v1.0-mini",
     "val_mini": "v1.0-mini",
 }
-"""The splits that have a file, and the version that the converter writes into it."""
 _ENDING: Final = ".infos"
 _EMPTY: Final = "without_boxes.txt"
 

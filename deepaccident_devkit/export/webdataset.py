@@ -31,10 +31,10 @@ from deepaccident_devkit.v2x.agents import agents_of
 if TYPE_CHECKING:
     from deepaccident_devkit.dataset import Dataset
 
-CAMERA_NAMES: Final[Mapping[str, str]] = {
+# Our channel → its name in shards: `Camera_FrontLeft` is `camera_front_left`.
+_CAMERA_NAMES: Final[Mapping[str, str]] = {
     camera: re.sub(r"(?<=[a-z])(?=[A-Z])", "_", camera).lower() for camera in CAMERAS
 }
-"""Our channel → its name in shards: `Camera_FrontLeft` is `camera_front_left`."""
 
 _NUMBERS: Final = ["float64"]
 _ROWS: Final = [_NUMBERS]
@@ -48,7 +48,7 @@ JSON_TYPES: Final[Mapping[str, Any]] = {
     "ego_from_lidar": _ROWS,
     "cameras": {
         name: {"ego_from_camera": _ROWS, "intrinsic": _ROWS, "width": "int64", "height": "int64"}
-        for name in CAMERA_NAMES.values()
+        for name in _CAMERA_NAMES.values()
     },
     "labelled": "bool",
     "boxes": {
@@ -80,17 +80,17 @@ the LiDAR frame, `category`, `actor_id` (−100 the agent itself, −1 untracked
 
 An unknown velocity of a box is null three times; `numpy.array(boxes["velocity"], dtype=float)` makes it NaN.
 """
-Frames = Literal["every", "keyframes"]
+FrameChoice = Literal["every", "keyframes"]
+# Of a sample's JSON and of the headers of its files, about; shards are divided by it.
 _FACTS_BYTES: Final = 20_000
-"""Of a sample's JSON and of the headers of its files, about; shards are divided by it."""
 _IN_SHARDS: Final = (*CAMERAS, LIDAR)
+# Without these `datasets` guesses by five samples: wrongly if one of them lacks an image or an impact.
 _TYPES: Final[Mapping[str, Any]] = {
-    **{f"{name}.jpg": "image" for name in CAMERA_NAMES.values()},
+    **{f"{name}.jpg": "image" for name in _CAMERA_NAMES.values()},
     "lidar.npy": [["float32"]],
     "json": JSON_TYPES,
     **dict.fromkeys(("__key__", "__url__"), "string"),
 }
-"""Without these `datasets` guesses by five samples: wrongly if one of them lacks an image or an impact."""
 _BODY: Final = """\
 A sample is one agent at one frame. The names of its files begin with `<type>/<scenario>/<agent>/<NNN>`, in which a dot
 is written as %2E. Samples are ordered by scenario, then frame, then agent: those of one moment follow each other. The
@@ -122,7 +122,9 @@ def sample_json(dataset: Dataset, sample: str, sizes: Mapping[str, tuple[int, in
         **{name: record[name] for name in ("timestamp", "time_to_end", "time_to_impact", "velocity")},
         "world_from_ego": dataset.world_from(sample, "ego").matrix.tolist(),
         "ego_from_lidar": dataset.ego_from(sample, LIDAR).matrix.tolist(),
-        "cameras": {name: _camera(dataset, sample, camera, sizes.get(camera)) for camera, name in CAMERA_NAMES.items()},
+        "cameras": {
+            name: _camera(dataset, sample, camera, sizes.get(camera)) for camera, name in _CAMERA_NAMES.items()
+        },
         "labelled": record["labelled"],
         "boxes": _boxes(dataset, sample),
     }
@@ -171,7 +173,7 @@ class WebDataset(Format):
         ConfigError: `shard_size` is less than 1.
     """
 
-    frames: Frames = "every"
+    frames: FrameChoice = "every"
     shard_size: int = 10**9
 
     name: ClassVar[str] = "webdataset"
@@ -180,7 +182,7 @@ class WebDataset(Format):
     def __post_init__(self) -> None:
         """Check the choice and the size too."""
         super().__post_init__()
-        settle_choices(self, {"frames": get_args(Frames)})
+        settle_choices(self, {"frames": get_args(FrameChoice)})
         if self.shard_size < 1:
             raise ConfigError(f"shard_size: expected a number of bytes from 1, found {self.shard_size}")
 
@@ -274,7 +276,7 @@ class _Recording:
             token = sample_token(self._scenario, agent, number)
             key = token.replace("%", "%25").replace(".", "%2E")  # readers cut a name at its first dot
             sizes = {}
-            for camera, name in CAMERA_NAMES.items():
+            for camera, name in _CAMERA_NAMES.items():
                 if number in self._files[agent, camera]:
                     path, _ = self._files[agent, camera][number]
                     content = read_image_bytes(path)

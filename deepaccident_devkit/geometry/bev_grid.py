@@ -21,8 +21,8 @@ from deepaccident_devkit.support.text import choice, settle_choices
 Orientation = Literal["devkit", "released", "fiery"]
 Axis = tuple[float, float, float]
 ORIENTATIONS: tuple[Orientation, ...] = get_args(Orientation)
+# The largest distance of a range from a whole number of cells, because decimal cell sizes are not exact in binary.
 _WHOLE = 1e-6
-"""The largest distance of a range from a whole number of cells, because decimal cell sizes are not exact in binary."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,7 +129,7 @@ class BevGrid:
         array = as_numbers("raster", raster, dtype=None)
         if array.shape[-2:] != self.shape:
             raise GeometryError(f"raster: expected shape (…, {self.shape[0]}, {self.shape[1]}), found {array.shape}")
-        return turned(turned(array, self.orientation), target.orientation)
+        return _turned(_turned(array, self.orientation), target.orientation)
 
     def _laid_out(self, devkit: FloatArray) -> FloatArray:
         """An array (rows, columns, …) in the devkit's orientation, changed to this one."""
@@ -138,7 +138,7 @@ class BevGrid:
         return devkit if self.orientation == "devkit" else devkit[::-1]
 
 
-def turned(raster: AnyArray, orientation: Orientation) -> AnyArray:
+def _turned(raster: AnyArray, orientation: Orientation) -> AnyArray:
     """A raster (…, rows, columns) from the devkit's orientation to another, or back: each is its own inverse."""
     if orientation == "fiery":
         return raster.swapaxes(-1, -2)
@@ -198,16 +198,16 @@ def to_orientation(
     source, target = (choice("orientation", name, ORIENTATIONS) for name in (source, target))
     if source == target:
         return array
-    devkit = turned(array, source)
+    devkit = _turned(array, source)
     if not vectors:
-        return turned(devkit, target)
+        return _turned(devkit, target)
     if array.ndim < 3 or array.shape[-3] != 2:
         raise GeometryError(f"vectors: expected shape (…, 2, H, W), found {array.shape}")
     down, along = devkit[..., 0, :, :], devkit[..., 1, :, :]
     result = np.stack(vectors_in(down, along, source, target), axis=-3)
     if ignore is not None:
         np.copyto(result, ignore, where=((down == ignore) & (along == ignore))[..., None, :, :])
-    return turned(result, target)
+    return _turned(result, target)
 
 
 def vectors_in(down: AnyArray, along: AnyArray, source: Orientation, target: Orientation) -> tuple[AnyArray, AnyArray]:

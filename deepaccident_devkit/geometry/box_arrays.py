@@ -13,7 +13,7 @@ from deepaccident_devkit.errors import GeometryError
 from deepaccident_devkit.support.arrays import AnyArray, FloatArray, IntArray
 from deepaccident_devkit.taxonomy import CATEGORIES
 
-COLUMNS: dict[str, tuple[tuple[int | None, ...], type]] = {
+BOX_COLUMNS: dict[str, tuple[tuple[int | None, ...], type]] = {
     "center": ((None, 3), np.float64),
     "size": ((None, 3), np.float64),
     "rotation": ((None, 4), np.float64),
@@ -25,18 +25,18 @@ COLUMNS: dict[str, tuple[tuple[int | None, ...], type]] = {
     "row": ((None,), np.int64),
 }
 _FINITE = ("center", "size", "rotation")
+# How far the norm of a quaternion may be from 1; it is then scaled to 1.
 _UNIT_TOLERANCE = 1e-3
-"""How far the norm of a quaternion may be from 1; it is then scaled to 1."""
+# Corners as shares of (length, width), counter-clockwise from front left.
 _SIGNS = np.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]]) / 2
-"""Corners as shares of (length, width), counter-clockwise from front left."""
 PAIRS_AT_ONCE = 1 << 14
 """Pairs that are computed together; it limits the memory for the areas and gaps of many pairs."""
+# Cells of the coarse grid along x and along y, over the ground that the boxes cover.
 _CELLS = 128
-"""Cells of the coarse grid along x and along y, over the ground that the boxes cover."""
 POINTS_AT_ONCE = 1 << 13
 """Points that are processed together: the arrays are so small that their memory is reused, which halves the time."""
+# Pairs of windows and points that are processed together: their memory fits into the processor's cache.
 _WINDOWS_AT_ONCE = 1 << 17
-"""Pairs of windows and points that are processed together: their memory fits into the processor's cache."""
 
 
 def check_numbers(columns: dict[str, AnyArray]) -> None:

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from deepaccident_devkit.errors import GeometryError
 from deepaccident_devkit.geometry import box_arrays, quaternions
-from deepaccident_devkit.geometry.box_arrays import COLUMNS
+from deepaccident_devkit.geometry.box_arrays import BOX_COLUMNS
 from deepaccident_devkit.geometry.conventions import checked_frame
 from deepaccident_devkit.geometry.se3 import SE3, checked_transform
 from deepaccident_devkit.support.arrays import (
@@ -79,7 +79,7 @@ class Boxes(FrozenArrays, Pictured):
             raise GeometryError(f"Boxes.sample: expected a token or None, found {self.sample!r}")
         count = len(checked("Boxes.center", self.center, (None, 3)))
         columns: dict[str, AnyArray] = {}
-        for name, (shape, dtype) in COLUMNS.items():
+        for name, (shape, dtype) in BOX_COLUMNS.items():
             given = box_arrays.category_codes(self.category) if name == "category" else getattr(self, name)
             columns[name] = checked(f"Boxes.{name}", given, (count, *shape[1:]), dtype).copy()
         box_arrays.check_numbers(columns)
@@ -114,9 +114,9 @@ class Boxes(FrozenArrays, Pictured):
             "row": np.arange(count),
             **columns,
         }
-        unknown = set(given) - set(COLUMNS)
+        unknown = set(given) - set(BOX_COLUMNS)
         if unknown:
-            raise GeometryError(f"Boxes has no column {sorted(unknown)}; it has {list(COLUMNS)}")
+            raise GeometryError(f"Boxes has no column {sorted(unknown)}; it has {list(BOX_COLUMNS)}")
         return cls(
             frame=frame,
             center=center,  # type: ignore[arg-type]  # checked in __post_init__
@@ -279,7 +279,7 @@ class Boxes(FrozenArrays, Pictured):
 
     def _picked(self, which: slice | AnyArray) -> Boxes:
         """The boxes of a slice, a mask or an array of rows; raises numpy's IndexError."""
-        return trusted_boxes(self.frame, {name: getattr(self, name)[which] for name in COLUMNS}, self.sample)
+        return trusted_boxes(self.frame, {name: getattr(self, name)[which] for name in BOX_COLUMNS}, self.sample)
 
     def _points_within(self, points: FloatArray) -> tuple[IntArray, IntArray]:
         """Rows of boxes and rows of points (P, 3), one pair for each point in a box."""
@@ -327,7 +327,7 @@ def concatenate(parts: list[Boxes], frame: str) -> Boxes:
     samples = {part.sample for part in parts}
     return trusted_boxes(
         frame,
-        {name: np.concatenate([getattr(part, name) for part in parts]) for name in COLUMNS},
+        {name: np.concatenate([getattr(part, name) for part in parts]) for name in BOX_COLUMNS},
         samples.pop() if len(samples) == 1 else None,
     )
 

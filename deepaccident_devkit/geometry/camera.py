@@ -27,8 +27,8 @@ VISIBLE_DEPTH = 1.0
 """A corner in the image counts as seen from this distance on, metres (as in the nuScenes devkit)."""
 IN_FRONT_DEPTH = 0.1
 """All corners of a visible box must be so many metres in front of the camera (as in the nuScenes devkit)."""
+# The known frames whose axes are not optical.
 _NO_PINHOLE: Final = (*get_args(Frame), LIDAR, BEV_CAMERA)
-"""The known frames whose axes are not optical."""
 
 
 class BoxVisibility(IntEnum):

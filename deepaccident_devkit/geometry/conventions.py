@@ -23,10 +23,10 @@ LAST_ROW = (0.0, 0.0, 0.0, 1.0)
 _S = np.array([1.0, -1.0, 1.0])
 _S4 = np.array([1.0, -1.0, 1.0, 1.0])
 _SIX = np.array([1.0, -1.0, 1.0, -1.0, 1.0, -1.0])
+# Q: a camera frame with x forward, y left, z up → the optical frame.
 _OPTICAL_FROM_FORWARD = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
-"""Q: a camera frame with x forward, y left, z up → the optical frame."""
+# Q·S: CARLA's camera axes → the optical frame.
 _OPTICAL_FROM_RAW = _OPTICAL_FROM_FORWARD * _S
-"""Q·S: CARLA's camera axes → the optical frame."""
 
 
 def checked_frame(name: str, frame: object) -> str:

@@ -25,9 +25,9 @@ from deepaccident_devkit.support.arrays import (
 from deepaccident_devkit.support.nuscenes_names import CLOUD, with_keywords_named, without_names
 from deepaccident_devkit.support.text import Pictured
 
-Range = tuple[float, float]
+CoordinateRange = tuple[float, float]
+# Columns that only some clouds have, and the types of their numbers.
 _SOURCES: Final = {"agent": np.int8, "time_lag": np.float32}
-"""Columns that only some clouds have, and the types of their numbers."""
 
 
 @without_names(CLOUD)
@@ -97,7 +97,12 @@ class LidarPointCloud(FrozenArrays, Pictured):
             raise GeometryError(f"{which!r} does not pick from {len(self)} points: {error}") from error
 
     def crop(
-        self, grid: BevGrid | None = None, *, x: Range | None = None, y: Range | None = None, z: Range | None = None
+        self,
+        grid: BevGrid | None = None,
+        *,
+        x: CoordinateRange | None = None,
+        y: CoordinateRange | None = None,
+        z: CoordinateRange | None = None,
     ) -> LidarPointCloud:
         """The points above or below the cells of `grid` and within the given ranges, in their order.
 
@@ -145,7 +150,7 @@ class LidarPointCloud(FrozenArrays, Pictured):
         return {name: column for name, column in columns.items() if column is not None}
 
 
-def concatenate(parts: Sequence[LidarPointCloud], frame: str) -> LidarPointCloud:
+def concatenate_clouds(parts: Sequence[LidarPointCloud], frame: str) -> LidarPointCloud:
     """All points of `parts`, in order; every part must be in `frame`, or GeometryError is raised.
 
     A column that not every part has, such as `time_lag`, is None.
@@ -159,7 +164,7 @@ def concatenate(parts: Sequence[LidarPointCloud], frame: str) -> LidarPointCloud
     return LidarPointCloud(**{name: np.concatenate([each[name] for each in columns]) for name in shared}, frame=frame)
 
 
-def _within(name: str, values: FloatArray, limits: Range) -> BoolArray:
+def _within(name: str, values: FloatArray, limits: CoordinateRange) -> BoolArray:
     low, high = checked(name, limits, (2,)).tolist()
     if not low <= high:
         raise GeometryError(f"{name}: expected a start and an end not before it, found {limits}")

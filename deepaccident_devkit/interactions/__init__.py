@@ -1,6 +1,6 @@
 """Pairs of road users: how near they come to each other, how fast, and how soon they would touch."""
 
-from deepaccident_devkit.accidents.recorded import CLASS_MASSES, masses_of
+from deepaccident_devkit.collisions.recorded import CLASS_MASSES, masses_of
 from deepaccident_devkit.geometry import time_to_collision
 from deepaccident_devkit.geometry.box_arrays import gaps_of_pairs
 from deepaccident_devkit.interactions.encroachment import conflict_area_pet, post_encroachment_time

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from deepaccident_devkit.accidents.recorded import masses_of
+from deepaccident_devkit.collisions.recorded import masses_of
 from deepaccident_devkit.geometry import time_to_collision
 from deepaccident_devkit.geometry.box_arrays import gaps_of_pairs, normals
 from deepaccident_devkit.interactions.encroachment import pieces_of, recorded_pet
@@ -107,8 +107,8 @@ def _accelerations(speed: FloatArray) -> FloatArray:
     return np.asarray(np.where(known, around, 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1))
 
 
+# Pairs times frames that are looked at together.
 _AT_ONCE = 1 << 17
-"""Pairs times frames that are looked at together."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -15,10 +15,10 @@ from deepaccident_devkit.geometry.box_arrays import along, half_extents, normals
 from deepaccident_devkit.support.arrays import BoolArray, FloatArray, FrozenArrays, IntArray
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
+# Below this two strips do not cross.
 _PARALLEL = 1e-12
-"""Below this two strips do not cross."""
+# Metres by which two boxes may be apart where they touch by calculation.
 _TOUCHING = 1e-9
-"""Metres by which two boxes may be apart where they touch by calculation."""
 
 
 def post_encroachment_time(
@@ -178,10 +178,10 @@ def _range_of(g: FloatArray, a: FloatArray, b: FloatArray, r: FloatArray) -> tup
     return np.where(empty, np.inf, least), np.where(empty, -np.inf, most)
 
 
+# Metres; an actor that moves less between all frames of a stretch stands in it, which is one piece then.
 _STILL = 1e-3
-"""Metres; an actor that moves less between all frames of a stretch stands in it, which is one piece then."""
+# Pairs of pieces that are compared before it is looked which can still be nearer.
 _ROUND = 1 << 12
-"""Pairs of pieces that are compared before it is looked which can still be nearer."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -20,10 +20,10 @@ from deepaccident_devkit.geometry.box_arrays import (
 )
 from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray
 
+# Metres by which two boxes may be apart where they touch by calculation.
 _TOLERANCE = 1e-9
-"""Metres by which two boxes may be apart where they touch by calculation."""
+# Pairs that are computed together: what they need then fits into the processor's cache.
 _PAIRS_AT_ONCE = 1 << 9
-"""Pairs that are computed together: what they need then fits into the processor's cache."""
 
 
 def time_to_collision_1d(

@@ -25,9 +25,9 @@ from deepaccident_devkit.interactions.table import (
     array_names,
     interaction_specs,
 )
-from deepaccident_devkit.parallel import Places, Store, in_order, run_unordered
 from deepaccident_devkit.support.arrays import BoolArray, FloatArray
 from deepaccident_devkit.support.files import place_in
+from deepaccident_devkit.support.parallel import Places, Store, in_order, run_unordered
 from deepaccident_devkit.tables.arrow_files import read_streams, streams
 from deepaccident_devkit.tables.columns import NULL_INTEGER
 from deepaccident_devkit.tables.tables import rows_of_scenarios
@@ -36,7 +36,7 @@ from deepaccident_devkit.v2x.tracks import ScenarioTracks, scenario_tracks
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
-    from deepaccident_devkit.parallel import Engine
+    from deepaccident_devkit.support.parallel import Engine
 
 
 logger = logging.getLogger(__name__)
@@ -44,8 +44,8 @@ logger = logging.getLogger(__name__)
 FOLDER: Final = "interactions"
 VERSION: Final = "1"
 """Counted up where the same tracks give other numbers, so that kept files are made again."""
+# Scenarios whose interactions take some seconds, if none are kept.
 _WORTH_A_BAR: Final = 32
-"""Scenarios whose interactions take some seconds, if none are kept."""
 
 
 def kept_path(dataset: Dataset, scenario: str) -> Path:
@@ -228,13 +228,13 @@ def _least(values: FloatArray) -> float:
     return float(values.min(initial=math.inf))
 
 
+# The fields of queries that are measures of the pairs each of which moves at some frame.
 _MEASURES: Final[Mapping[str, Callable[[InteractionPairs, BoolArray], float]]] = {
     "min_ttc": lambda pairs, moving: _least(pairs.min_ttc[moving]),
     "min_pet": lambda pairs, moving: _least(np.abs(pairs.pet[moving])),
     "min_gap": lambda pairs, moving: _least(pairs.min_gap[moving]),
     "max_drac": lambda pairs, moving: float(pairs.max_drac[moving].max(initial=0.0)),
 }
-"""The fields of queries that are measures of the pairs each of which moves at some frame."""
 
 
 def measures_of_moving_pairs(found: Interactions) -> dict[str, float | None]:

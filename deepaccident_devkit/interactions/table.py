@@ -14,7 +14,7 @@ from typing import Annotated, Any, Final, TypedDict
 
 import numpy as np
 
-from deepaccident_devkit.accidents.recorded import CLASS_MASSES
+from deepaccident_devkit.collisions.recorded import CLASS_MASSES
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray, FrozenArrays, IntArray, checked_number
 from deepaccident_devkit.tables.columns import Key, Number, TableSpec, Vector
@@ -151,14 +151,14 @@ class InteractionPairRecord(TypedDict):
     ]
 
 
-ROWS: Final = "interaction"
+_ROWS: Final = "interaction"
 PAIRS: Final = "interaction_pair"
 
 
 @cache
 def interaction_specs() -> Mapping[str, TableSpec]:
     """The derived tables: of pairs at moments, and of pairs."""
-    return {ROWS: spec_of(ROWS, InteractionRecord), PAIRS: spec_of(PAIRS, InteractionPairRecord)}
+    return {_ROWS: spec_of(_ROWS, InteractionRecord), PAIRS: spec_of(PAIRS, InteractionPairRecord)}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -282,7 +282,7 @@ class Interactions(FrozenArrays):
     def to_arrow(self) -> Any:
         """A `pyarrow.Table` with the fields of `interaction` (schema/README.md), tokens as texts."""
         columns = {"frame_token": _frame_tokens(self.scenario, self.frame)}
-        return _arrow_table(ROWS, self, columns | _actor_tokens(self.scenario, self.actor_ids))
+        return _arrow_table(_ROWS, self, columns | _actor_tokens(self.scenario, self.actor_ids))
 
 
 _FRAMES = ("min_ttc_frame", "min_gap_frame")

@@ -29,15 +29,15 @@ GROUND_CLASSES: Final = ("road", "road_line", "sidewalk", "other")
 """What the ground of a cell can be; `other` is whatever else CARLA has a tag for: grass, buildings, trees, water."""
 HIDING: Final = ("pedestrian", "vehicle")
 """What moves and hides the ground: a picture says nothing of the cells beneath."""
+# CARLA's tag of what has none.
 _UNLABELLED: Final = 0
-"""CARLA's tag of what has none."""
+# Row and column of the agent.
 _MIDDLE: Final = (BEV_SHAPE[0] - 1) / 2
-"""Row and column of the agent."""
-REACH: Final = BEV_RESOLUTION * BEV_SHAPE[0] / 2
-"""Metres that a picture shows to each side of its agent."""
+# Metres that a picture shows to each side of its agent.
+_REACH: Final = BEV_RESOLUTION * BEV_SHAPE[0] / 2
+# Square metres of a hole that parked vehicles can make: two lorries. A larger one may be a yard.
 _LARGEST: Final = 60.0
-"""Square metres of a hole that parked vehicles can make: two lorries. A larger one may be a yard."""
-Counts = NDArray[np.uint16]
+PixelCounts = NDArray[np.uint16]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -127,8 +127,8 @@ class Window(FrozenArrays):
     """
 
     corner: tuple[int, int]
-    counts: Counts
-    agents: Counts
+    counts: PixelCounts
+    agents: PixelCounts
     looks: int
     missing: int
     damaged: int
@@ -151,7 +151,7 @@ def count_scenario(dataset: Dataset, config: TownMapConfig, scenario_row: int) -
 
 
 def _add_looks(
-    dataset: Dataset, recording: Looks, resolution: float, low: IntArray, counts: Counts, seen: BoolArray
+    dataset: Dataset, recording: Looks, resolution: float, low: IntArray, counts: PixelCounts, seen: BoolArray
 ) -> list[str]:
     """Add one agent's pictures to `counts`, and the cells that it saw to `seen`; says what became of each picture."""
     outcomes = []
@@ -198,7 +198,7 @@ def codes_in_world(tags: ByteArray, world_from_ego: FloatArray, resolution: floa
 
 def cells_around(poses: FloatArray, resolution: float) -> tuple[IntArray, IntArray]:
     """Row and column of the first cell that pictures from poses (N, 4, 4) can show, and of the one past the last."""
-    half = REACH * np.abs(poses[:, :2, :2]).sum(axis=2)
+    half = _REACH * np.abs(poses[:, :2, :2]).sum(axis=2)
     low = np.floor((poses[:, :2, 3] - half).min(axis=0) / resolution)
     high = np.ceil((poses[:, :2, 3] + half).max(axis=0) / resolution)
     return low[::-1].astype(np.int64), high[::-1].astype(np.int64)

@@ -18,7 +18,7 @@ from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import IndexStoreError, NotAvailableError
 from deepaccident_devkit.maps.counting import (
     GROUND_CLASSES,
-    Counts,
+    PixelCounts,
     TownMapConfig,
     Window,
     cells_around,
@@ -27,10 +27,10 @@ from deepaccident_devkit.maps.counting import (
     looks_of,
 )
 from deepaccident_devkit.maps.town_map import TownMap, classes_of
-from deepaccident_devkit.parallel import Places, Store, run_unordered
 from deepaccident_devkit.support.arrays import IntArray, as_floats
 from deepaccident_devkit.support.files import place_in
-from deepaccident_devkit.support.reading import limit_of, open_zip, read_array
+from deepaccident_devkit.support.parallel import Places, Store, run_unordered
+from deepaccident_devkit.support.reading import byte_limit, open_zip, read_array
 from deepaccident_devkit.support.text import choice
 from deepaccident_devkit.tables.tables import rows_of_scenarios
 from deepaccident_devkit.taxonomy import BEV_CAMERA
@@ -38,12 +38,12 @@ from deepaccident_devkit.taxonomy import BEV_CAMERA
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
-    from deepaccident_devkit.parallel import Engine
+    from deepaccident_devkit.support.parallel import Engine
 
 _DEFAULT = TownMapConfig()
 _FOLDER: Final = "town_maps"
+# Counts up whenever the same pictures give another map, or the file's form changes.
 _FORMAT: Final = 2
-"""Counts up whenever the same pictures give another map, or the file's form changes."""
 _ARRAYS: Final = ("origin", "counts", "agents", "hidden")
 _NUMBERS: Final = ("scenarios", "looks", "missing", "damaged")
 
@@ -164,7 +164,7 @@ def _keep(dataset: Dataset, key: str, made: TownMap) -> None:
     """Keep a map, if its file can be written and would be read again; the same map gives the same bytes."""
     content, numbers = io.BytesIO(), np.array([getattr(made, name) for name in _NUMBERS], dtype=np.int64)
     np.savez_compressed(content, **{name: getattr(made, name) for name in _ARRAYS}, numbers=numbers)
-    if made.counts.nbytes <= limit_of("index") and dataset.tables_folder.is_dir():
+    if made.counts.nbytes <= byte_limit("index") and dataset.tables_folder.is_dir():
         with suppress(OSError):  # a folder that may not be written to
             _store(dataset).keep(key, key, content.getvalue())
 
@@ -205,7 +205,7 @@ def _joined(
     )
 
 
-def _cut(counts: Counts, agents: Counts) -> tuple[IntArray, Counts, Counts]:
+def _cut(counts: PixelCounts, agents: PixelCounts) -> tuple[IntArray, PixelCounts, PixelCounts]:
     """The first cell, the counts and the agents of what is left without the edges where nothing was seen."""
     rows, columns = (np.flatnonzero((agents > 0).any(axis=axis)) for axis in (1, 0))
     if not len(rows):

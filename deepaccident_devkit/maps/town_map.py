@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 
 Area = Literal["drivable", "road_line", "sidewalk"]
 AREAS: Final[tuple[Area, ...]] = get_args(Area)
+# Of metres in GeoJSON.
 _DECIMALS: Final = 3
-"""Of metres in GeoJSON."""
 _ROAD, _ROAD_LINE, _SIDEWALK, _OTHER = range(1, len(GROUND_CLASSES) + 1)
 
 
@@ -154,7 +154,7 @@ class TownMap(FrozenArrays):
             ChoiceError: no such area.
         """
         exact = outlines(self.area(of), self.origin, self.resolution)
-        return simplified(exact, self.resolution if tolerance is None else tolerance, least_area)
+        return simplified_polygons(exact, self.resolution if tolerance is None else tolerance, least_area)
 
     def to_geojson(self, path: str | os.PathLike[str]) -> Path:
         """Write the drivable area and the sidewalks as GeoJSON, a feature for each polygon; returns the path.
@@ -186,7 +186,7 @@ def _surface_and_all(counts: NDArray[np.uint16]) -> tuple[NDArray[np.uint32], ND
     return counts[:_ROAD_LINE].sum(axis=0, dtype=np.uint32), counts.sum(axis=0, dtype=np.uint32)
 
 
-def simplified(polygons: MultiPolygon, tolerance: float, least_area: float) -> MultiPolygon:
+def simplified_polygons(polygons: MultiPolygon, tolerance: float, least_area: float) -> MultiPolygon:
     """Polygons whose outlines may move by `tolerance` metres, without smaller islands and holes, square metres."""
     import shapely
 

@@ -35,13 +35,7 @@ from deepaccident_devkit.motion.instances import (
 )
 from deepaccident_devkit.motion.label_files import LabelFiles, LabelsWritten, write_label_files
 from deepaccident_devkit.motion.labels import MotionLabels
-from deepaccident_devkit.motion.sample_labels import (
-    evaluation_samples,
-    motion_labels,
-    motion_labels_of,
-    samples,
-    training_samples,
-)
+from deepaccident_devkit.motion.sample_labels import motion_labels, motion_labels_of
 from deepaccident_devkit.motion.warping import agents_to_ego, past_to_present
 
 __all__ = [
@@ -66,16 +60,13 @@ __all__ = [
     "agents_to_ego",
     "bev_segmentation",
     "config_from_names",
-    "evaluation_samples",
     "labels_from_polygons",
     "motion_labels",
     "motion_labels_from_boxes",
     "motion_labels_of",
     "past_to_present",
     "predict_instances",
-    "samples",
     "segmentation_of",
-    "training_samples",
     "trajectories",
     "write_label_files",
 ]

@@ -37,7 +37,7 @@ from deepaccident_devkit.support.text import choice
 BatchNames = Literal["fiery", "beverse", "deepaccident"]
 MAPS: Final = ("segmentation", "instance", "centerness", "offset", "flow")
 VECTOR_MAPS: Final = ("offset", "flow")
-HEADS: Final[Mapping[str, str]] = MappingProxyType(
+HEAD_NAMES: Final[Mapping[str, str]] = MappingProxyType(
     {
         "segmentation": "segmentation",
         "centerness": "instance_center",

@@ -15,14 +15,14 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from deepaccident_devkit.errors import GeometryError
-from deepaccident_devkit.exact import single_precision
-from deepaccident_devkit.exact.polygon_fill import topmost
 from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.geometry.bev_grid import axes_of
 from deepaccident_devkit.geometry.conventions import flip_pose
 from deepaccident_devkit.geometry.se3 import trusted_se3
 from deepaccident_devkit.motion.augmentation import Augmentation
 from deepaccident_devkit.motion.config import MotionLabelConfig
+from deepaccident_devkit.motion.reference_arithmetic import single_precision
+from deepaccident_devkit.motion.reference_arithmetic.polygon_fill import topmost
 from deepaccident_devkit.support.arrays import (
     AnyArray,
     BoolArray,
@@ -37,14 +37,14 @@ from deepaccident_devkit.taxonomy import CATEGORIES, OWN_ACTOR_ID, UNTRACKED_ID
 
 OWN_BOX_ID: Final = -101
 """Key of the ego's own box in `MotionLabels.id_map`, as the released code has it."""
+# The agent's box in the released code if it finds no row of the agent itself; it has the size of a Lincoln car.
 _DEFAULT_SIZE: Final = (3.99, 1.85, 1.62)
-"""The agent's box in the released code if it finds no row of the agent itself; it has the size of a Lincoln car."""
+# mmdet3d's corners 0, 3, 7, 4 from above, in lengths and widths.
 _CORNERS: Final = np.array([[-1, -1], [-1, 1], [1, 1], [1, -1]], dtype=np.float32) / 2
-"""mmdet3d's corners 0, 3, 7, 4 from above, in lengths and widths."""
 _UP: Final = np.array([0, 0, 1, 0, 0, 0, 0], dtype=np.float32)
 _COLUMNS: Final = attrgetter("center", "size", "yaw", "actor_id", "category", "visible")
+# In cells: corners farther away are moved to this distance, which is far outside the grid.
 _FAR: Final = 2**24
-"""In cells: corners farther away are moved to this distance, which is far outside the grid."""
 _PEDESTRIAN: Final = CATEGORIES.index("pedestrian")
 
 

@@ -357,7 +357,7 @@ def _agents_text(agents: Agents) -> Any:
     return agents if agents is None or isinstance(agents, str) else list(agents)
 
 
-def label_config(config: MotionLabelConfig | str | None) -> MotionLabelConfig:
+def resolved_label_config(config: MotionLabelConfig | str | None) -> MotionLabelConfig:
     """A configuration as given, by a preset's name, or the released one for None; raises ChoiceError or ConfigError."""
     if config is None or isinstance(config, str):
         return MotionLabelConfig() if config is None else MotionLabelConfig.preset(config)

@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from deepaccident_devkit.errors import ConfigError, GeometryError
-from deepaccident_devkit.exact.single_precision import SamplingLine
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.geometry.bev_grid import cells_in, vectors_in
 from deepaccident_devkit.motion.box_polygons import (
@@ -23,8 +22,9 @@ from deepaccident_devkit.motion.box_polygons import (
     box_polygons,
     footprints_of,
 )
-from deepaccident_devkit.motion.config import LabelProtocol, MotionLabelConfig, label_config
+from deepaccident_devkit.motion.config import LabelProtocol, MotionLabelConfig, resolved_label_config
 from deepaccident_devkit.motion.labels import MotionLabels
+from deepaccident_devkit.motion.reference_arithmetic.single_precision import SamplingLine
 from deepaccident_devkit.motion.warping import frames_from_next, nearest_indices, sampling_lines, sampling_matrix
 from deepaccident_devkit.support.arrays import (
     AnyArray,
@@ -39,14 +39,14 @@ from deepaccident_devkit.support.arrays import (
 )
 from deepaccident_devkit.taxonomy import UNTRACKED_ID
 
+# The largest id: float32 holds all whole numbers up to here.
 _MOST_IDS: Final = 2**24
-"""The largest id: float32 holds all whole numbers up to here."""
+# exp(−x) is 0 in float32 from here on.
 _VANISHED: Final = 104.0
-"""exp(−x) is 0 in float32 from here on."""
+# In cells, around a footprint: half a cell for the nearest sampling, and some for the rounding of the points.
 _MARGIN: Final = 0.75
-"""In cells, around a footprint: half a cell for the nearest sampling, and some for the rounding of the points."""
+# In cells: with the first sample point farther away, the rounding of float32 would outgrow the margin.
 _FARTHEST: Final = 2.0**16
-"""In cells: with the first sample point farther away, the rounding of float32 would outgrow the margin."""
 
 
 def motion_labels_from_boxes(
@@ -76,7 +76,7 @@ def motion_labels_from_boxes(
         ConfigError: a wrong id, or any id where the protocol does not keep ids between samples.
         ChoiceError: no such preset.
     """
-    chosen = label_config(config)
+    chosen = resolved_label_config(config)
     polygons = box_polygons(frames, chosen, is_vehicle=is_vehicle)
     return labels_from_polygons(polygons, egomotion, chosen, valid=valid, id_map=id_map)
 
@@ -90,7 +90,7 @@ def labels_from_polygons(
     id_map: Mapping[int, int] | None = None,
 ) -> MotionLabels:
     """The motion labels of footprints, each frame in its own ego frame; see `motion_labels_from_boxes`."""
-    config = label_config(config)
+    config = resolved_label_config(config)
     if len(polygons) != config.label_frames:
         raise GeometryError(
             f"frames: expected {config.label_frames}, the present and {config.future_frames} after it, "

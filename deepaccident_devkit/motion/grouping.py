@@ -16,16 +16,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from deepaccident_devkit.errors import GeometryError
-from deepaccident_devkit.exact.peaks import nearest_peaks
 from deepaccident_devkit.geometry.bev_grid import ORIENTATIONS, Orientation, to_orientation
 from deepaccident_devkit.motion.labels import MotionLabels
+from deepaccident_devkit.motion.reference_arithmetic.peaks import nearest_peaks
 from deepaccident_devkit.support.arrays import AnyArray, FloatArray, IntArray, ShortRepr, as_numbers, checked, readonly
 from deepaccident_devkit.support.text import settle_choices
 
 LABEL_LOGIT: Final = 10.0
 """The right class's logit when the released evaluation treats labels as a prediction; the other class has 0."""
+# In cells: no offset or flow may be longer; the squares of much longer ones overflow in float32.
 _LARGEST: Final = 1e15
-"""In cells: no offset or flow may be longer; the squares of much longer ones overflow in float32."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -11,12 +11,12 @@ from typing import Final, Literal, get_args
 import numpy as np
 
 from deepaccident_devkit.errors import ConfigError, GeometryError
-from deepaccident_devkit.exact.contours import first_hulls, redrawn_cells
-from deepaccident_devkit.exact.peaks import find_peaks
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.geometry.bev_grid import ORIENTATIONS, Orientation, cells_in, to_orientation
 from deepaccident_devkit.motion.config import LabelProtocol, label_protocol
 from deepaccident_devkit.motion.grouping import LABEL_LOGIT, FrameGroups, MotionHeads, group_cells, link_frames, sums_by
+from deepaccident_devkit.motion.reference_arithmetic.contours import first_hulls, redrawn_cells
+from deepaccident_devkit.motion.reference_arithmetic.peaks import find_peaks
 from deepaccident_devkit.support.arrays import (
     AnyArray,
     BoolArray,

@@ -22,11 +22,11 @@ import numpy as np
 
 from deepaccident_devkit.errors import ChoiceError, LabelFilesError, NotAvailableError, TokenError
 from deepaccident_devkit.motion.batch_names import BatchNames
-from deepaccident_devkit.motion.config import MotionLabelConfig, label_config
+from deepaccident_devkit.motion.config import MotionLabelConfig, resolved_label_config
 from deepaccident_devkit.motion.label_folder import (
-    FORMAT_VERSION,
+    LABEL_FORMAT_VERSION,
     MANIFEST,
-    Manifest,
+    LabelManifest,
     StoredLabels,
     batch_path,
     folder_path,
@@ -37,10 +37,10 @@ from deepaccident_devkit.motion.label_folder import (
 )
 from deepaccident_devkit.motion.labels import MotionLabels
 from deepaccident_devkit.motion.sample_labels import motion_labels_of
-from deepaccident_devkit.parallel import Places
 from deepaccident_devkit.release.fingerprints import digest_of
 from deepaccident_devkit.support.arrays import AnyArray
 from deepaccident_devkit.support.files import place_in, replacing
+from deepaccident_devkit.support.parallel import Places
 from deepaccident_devkit.support.reading import DAMAGED_ARCHIVE, open_zip, read_array
 from deepaccident_devkit.support.text import choice, counted
 from deepaccident_devkit.tables.tokens import parse_number
@@ -51,7 +51,7 @@ if TYPE_CHECKING:
     from typing_extensions import Unpack
 
     from deepaccident_devkit.dataset import Dataset, RowArgument
-    from deepaccident_devkit.parallel import Engine
+    from deepaccident_devkit.support.parallel import Engine
 
 _OPEN_FILES: Final = 8
 
@@ -104,14 +104,14 @@ def write_label_files(
         NotAvailableError: a sample has no label, or an agent whose sight counts is not in this (partial) release.
         SomeFailedError: labels of some samples cannot be made; the others are written, and the same call continues.
     """
-    root, chosen = folder_path(folder), label_config(config)
+    root, chosen = folder_path(folder), resolved_label_config(config)
     names = choice("names", names, (*get_args(BatchNames), None))
     wanted = _by_recording(dataset, tokens)
     _check_agents(dataset, wanted, chosen)
-    Manifest.of(root, chosen, names)
+    LabelManifest.of(root, chosen, names)
     store = label_store(root, digest_of({"config": chosen.digest, "names": names, "samples": wanted}))
     with store.shared(tidy=partial(remove_half_written, root)) as turn:
-        manifest = Manifest.of(root, chosen, names)
+        manifest = LabelManifest.of(root, chosen, names)
         if not (root / MANIFEST).exists():
             manifest.write(root)
         files = {
@@ -125,7 +125,7 @@ def write_label_files(
             **how,
         )
         if turn.alone():
-            manifest = Manifest.of(root, chosen, names)
+            manifest = LabelManifest.of(root, chosen, names)
             manifest.samples.update({recording: list(frames) for recording, frames in files.items()})
             manifest.write(root)
             store.remove()
@@ -153,14 +153,14 @@ class LabelFiles(Mapping[str, MotionLabels]):
             ConfigError: the labels are of another configuration.
         """
         self.folder = folder_path(folder)
-        manifest = Manifest.read(self.folder)
+        manifest = LabelManifest.read(self.folder)
         if manifest.names is not None:
             raise LabelFilesError(
                 f"{self.folder}: holds batches of {manifest.names}, which np.load opens (schema/motion_labels.md); for "
                 "LabelFiles run `deepaccident labels` without --names on another folder"
             )
         if config is not None:
-            manifest.check(self.folder, label_config(config))
+            manifest.check(self.folder, resolved_label_config(config))
         if not manifest.samples:
             raise LabelFilesError(f"{self.folder}: its labels are not complete; run `deepaccident labels` on it again")
         self.config = manifest.config
@@ -273,7 +273,7 @@ class _Work:
         """A digest of all that files are made from: configuration, samples or names, and the scenario's rows."""
         digest = hashlib.blake2b(digest_size=16)
         what = frames if self.names is None else self.names  # a batch does not depend on the samples beside it
-        digest.update(f"{FORMAT_VERSION} {self.config.digest} {recording} {what}".encode())
+        digest.update(f"{LABEL_FORMAT_VERSION} {self.config.digest} {recording} {what}".encode())
         for array in _scenario_arrays(self.dataset, recording.rsplit("/", 1)[0]):
             digest.update(np.ascontiguousarray(array).tobytes())
         return digest.hexdigest()
@@ -332,7 +332,9 @@ def _check_agents(dataset: Dataset, wanted: Mapping[str, list[int]], config: Mot
             cooperating_agents(dataset, f"{recording}/{frames[0]:03d}", config.agents)
 
 
-def _with_kept(dataset: Dataset, root: Path, recording: str, frames: list[int], manifest: Manifest) -> tuple[int, ...]:
+def _with_kept(
+    dataset: Dataset, root: Path, recording: str, frames: list[int], manifest: LabelManifest
+) -> tuple[int, ...]:
     """The frames that a file should have: the requested ones and those that it has; raises LabelFilesError."""
     kept = manifest.samples.get(recording, [])
     try:

@@ -21,10 +21,10 @@ from deepaccident_devkit.motion.batch_names import BatchNames
 from deepaccident_devkit.motion.config import MotionLabelConfig
 from deepaccident_devkit.motion.drawing import CoveredCells, label_maps
 from deepaccident_devkit.motion.labels import MotionLabels
-from deepaccident_devkit.parallel import Store
 from deepaccident_devkit.support.arrays import AnyArray, IntArray, ShortRepr, checked
 from deepaccident_devkit.support.files import place_in, temporary_of, write_bytes
 from deepaccident_devkit.support.json_text import parsed_json
+from deepaccident_devkit.support.parallel import Store
 from deepaccident_devkit.support.reading import check_size, fault_text, read_array, read_bytes
 from deepaccident_devkit.support.text import path_of
 from deepaccident_devkit.taxonomy import AGENTS
@@ -143,19 +143,19 @@ def write_array(archive: zipfile.ZipFile, name: str, array: AnyArray) -> None:
     archive.writestr(entry, buffer.getvalue(), zipfile.ZIP_DEFLATED, compresslevel=1)
 
 
-FORMAT: Final = "DeepAccident motion labels"
-FORMAT_VERSION: Final = 1
+LABEL_FORMAT: Final = "DeepAccident motion labels"
+LABEL_FORMAT_VERSION: Final = 1
 """Increased when the files' contents change, or the labels of the same configuration and release."""
 MANIFEST: Final = "manifest.json"
+# Of the maps of a sample, in memory, at least.
 _CELL_BYTES: Final = 16
-"""Of the maps of a sample, in memory, at least."""
 _UNFINISHED: Final = ".unfinished"
 _WRITTEN: Final = re.compile(rf"{re.escape(MANIFEST)}|({'|'.join(AGENTS)}|\d{{3}})\.npz")
 _RECORDING: Final = re.compile(rf"(?!\.)[^/\\\0]{{1,255}}/(?!\.)[^/\\\0]{{1,255}}/({'|'.join(AGENTS)})")
 
 
 @dataclass(frozen=True, slots=True)
-class Manifest:
+class LabelManifest:
     """The manifest of a folder of labels.
 
     Attributes:
@@ -170,7 +170,7 @@ class Manifest:
     names: BatchNames | None = None
 
     @classmethod
-    def of(cls, root: Path, config: MotionLabelConfig, names: BatchNames | None = None) -> Manifest:
+    def of(cls, root: Path, config: MotionLabelConfig, names: BatchNames | None = None) -> LabelManifest:
         """The manifest of a folder into which labels of a configuration will be written; changes nothing.
 
         Raises:
@@ -195,7 +195,7 @@ class Manifest:
         return cls(config, {}, names)
 
     @classmethod
-    def read(cls, root: Path) -> Manifest:
+    def read(cls, root: Path) -> LabelManifest:
         """The manifest that a folder has; raises LabelFilesError."""
         path = root / MANIFEST
         if not path.exists():
@@ -233,8 +233,8 @@ class Manifest:
         """Write the manifest into its folder."""
         text = json.dumps(
             {
-                "format": FORMAT,
-                "version": FORMAT_VERSION,
+                "format": LABEL_FORMAT,
+                "version": LABEL_FORMAT_VERSION,
                 "config_digest": self.config.digest,
                 "config": self.config.as_dict(),
                 "names": self.names,
@@ -287,15 +287,17 @@ def _is_half_written(name: str) -> bool:
 
 
 def _check_version(path: Path, form: object, version: object) -> None:
-    if form != FORMAT or not isinstance(version, int):
-        raise ValueError(f"expected a manifest of {FORMAT}, found one of {form!r}, version {version!r}")
-    if version != FORMAT_VERSION:
+    if form != LABEL_FORMAT or not isinstance(version, int):
+        raise ValueError(f"expected a manifest of {LABEL_FORMAT}, found one of {form!r}, version {version!r}")
+    if version != LABEL_FORMAT_VERSION:
         kind, remedy = (
-            ("a newer", "update the devkit, or") if version > FORMAT_VERSION else ("an older", "use that devkit, or")
+            ("a newer", "update the devkit, or")
+            if version > LABEL_FORMAT_VERSION
+            else ("an older", "use that devkit, or")
         )
         raise LabelFilesError(
-            f"{path}: {kind} devkit's labels (format version {version}, this devkit's is {FORMAT_VERSION}); {remedy} "
-            "make the labels again in an empty folder"
+            f"{path}: {kind} devkit's labels (format version {version}, this devkit's is {LABEL_FORMAT_VERSION}); "
+            f"{remedy} make the labels again in an empty folder"
         )
 
 

@@ -11,11 +11,16 @@ from typing import Any
 import numpy as np
 
 from deepaccident_devkit.errors import NotAvailableError
-from deepaccident_devkit.exact.single_precision import OUTSIDE, CellIndices, blend_cells, take_cells
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.geometry.conventions import flip_pose
 from deepaccident_devkit.motion.batch_names import MAPS, BatchNames, from_batch, to_batch
-from deepaccident_devkit.motion.config import MotionLabelConfig, label_config
+from deepaccident_devkit.motion.config import MotionLabelConfig, resolved_label_config
+from deepaccident_devkit.motion.reference_arithmetic.single_precision import (
+    OUTSIDE,
+    CellIndices,
+    blend_cells,
+    take_cells,
+)
 from deepaccident_devkit.motion.warping import (
     WarpMode,
     checked_mode,
@@ -155,7 +160,7 @@ class MotionLabels(FrozenArrays, Pictured):
             FieldError: the batch lacks an array.
             GeometryError: an array has another shape than the configuration says.
         """
-        chosen = label_config(config)
+        chosen = resolved_label_config(config)
         arrays: dict[str, Any] = from_batch(batch, chosen, names)
         return cls(config=chosen, id_map={}, at_present=at_present, **arrays)
 

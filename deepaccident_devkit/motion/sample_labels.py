@@ -1,33 +1,29 @@
-"""The motion labels of samples of a release, and which samples models are trained on and evaluated at."""
+"""The motion labels of samples of a release."""
 
 from __future__ import annotations
 
-import os
-from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from itertools import groupby, islice
-from typing import Final, Literal, get_args
+from itertools import islice
+from typing import Final
 
 import numpy as np
 
 from deepaccident_devkit.dataset import Dataset, RowArgument
-from deepaccident_devkit.errors import ChoiceError, ConfigError, NotAvailableError
+from deepaccident_devkit.errors import ChoiceError, NotAvailableError
 from deepaccident_devkit.geometry import conventions
 from deepaccident_devkit.geometry.conventions import inverses, stored_transforms
 from deepaccident_devkit.motion.box_polygons import BoxRows, polygons_of
-from deepaccident_devkit.motion.config import MotionLabelConfig, label_config
+from deepaccident_devkit.motion.config import MotionLabelConfig, resolved_label_config
 from deepaccident_devkit.motion.drawing import labels_of
 from deepaccident_devkit.motion.labels import MotionLabels
 from deepaccident_devkit.motion.warping import egomotion
-from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray, IntArray, checked_number
-from deepaccident_devkit.support.text import choice, choices
+from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from deepaccident_devkit.tables import visible_mask
 from deepaccident_devkit.tables.tables import token_of
 from deepaccident_devkit.tables.tokens import agent_token
 from deepaccident_devkit.taxonomy import (
     AGENTS,
     CHANNELS,
-    FRAME_PERIOD,
     INFRASTRUCTURE,
     LIDAR,
     OWN_ACTOR_ID,
@@ -35,142 +31,10 @@ from deepaccident_devkit.taxonomy import (
 )
 from deepaccident_devkit.v2x import cooperating_agents
 
-Purpose = Literal["train", "evaluate", "all", "keyframes", "every"]
-SampleProtocol = Literal["released", "paper"]
-Scope = Literal["accident", "all"]
-_KEY_STEP: Final = 5
-"""Recorded frames from one key frame to the next, counted back from a scenario's last frame."""
-_STEPS: Final = {"train": 10, "evaluate": _KEY_STEP, "all": _KEY_STEP, "keyframes": _KEY_STEP, "every": 1}
-_RELEASED_HORIZON: Final = 2.0
 _LIDAR: Final = CHANNELS.index(LIDAR)
 _POLE: Final = AGENTS.index(INFRASTRUCTURE)
+# Samples whose labels are made together: a moment's agents. More take more memory, and no less time.
 _AT_ONCE: Final = 5
-"""Samples whose labels are made together: a moment's agents. More take more memory, and no less time."""
-
-
-def samples(
-    dataset: Dataset,
-    split: str | os.PathLike[str],
-    purpose: Purpose,
-    protocol: SampleProtocol = "released",
-    *,
-    horizon: float = _RELEASED_HORIZON,
-    scope: Scope = "accident",
-    sensors: Iterable[str] = (),
-) -> list[str]:
-    """The labelled samples of a split that a model is trained on or evaluated at, of all agents.
-
-    Frames are counted back from a scenario's last one, which in an accident scenario is the collision:
-
-    - `train`: one a second, of normal and accident scenarios;
-    - `evaluate`: two a second within the last `horizon` seconds except the last frame, of scenarios designed to end
-      in an accident (`_accident` in their folder); `scope="all"` adds the normal ones;
-    - `all`, or `keyframes`: two a second, the whole of every scenario, but not all of its samples;
-    - `every`: all samples, ten a second.
-
-    The released V2X class stops after 50 samples of a list in an unknown order; this function does not.
-
-    Args:
-        dataset: the release.
-        split: `train`, `val`, …, `all` or a split file, as `Dataset.split_scenarios` takes it.
-        purpose: `train`, `evaluate`, `all`, `keyframes` or `every`.
-        protocol: `released` has only a horizon of 2 s and accident scenarios; `paper` allows others.
-        horizon: seconds before the end, a multiple of 0.5; only for `evaluate`.
-        scope: `accident` or `all`; only for `evaluate`.
-        sensors: channels, such as `Camera_Front`: only samples whose own files of all of these are here, such as of a
-            partial download.
-
-    Returns:
-        Tokens by scenario, agent and time.
-
-    Raises:
-        ChoiceError: no such split, purpose, protocol or scope.
-        ConfigError: a horizon that is no multiple of 0.5 s, or one that the released protocol does not have.
-        NotAvailableError: the split is unknown, this release has no scenario of it, none of its samples has labels
-            (the test split has none), or none has the files of the sensors.
-    """
-    channels = choices("sensors", sensors, CHANNELS, empty=True)
-    listed: str = choice("purpose", purpose, _STEPS)
-    protocol = choice("protocol", protocol, get_args(SampleProtocol))
-    scope = choice("scope", scope, get_args(Scope))
-    seconds = checked_number("horizon", horizon, "a number of seconds", ConfigError)
-    steps = seconds / (_KEY_STEP * FRAME_PERIOD)
-    if not (1 <= steps < float("inf") and abs(steps - round(steps)) < 1e-6):
-        raise ConfigError(f"horizon: {horizon} s is no multiple of 0.5 s; choose 0.5, 1, 1.5, …")
-    if protocol == "released" and (seconds != _RELEASED_HORIZON or scope != "accident"):
-        raise ConfigError("the released protocol looks 2 s ahead in accident scenarios; choose protocol='paper'")
-
-    scenario_tokens = dataset.split_scenarios(split)
-    if not scenario_tokens:
-        raise NotAvailableError(
-            f"{split}: no scenario of this split is in {dataset.dataroot}; unpack that part of the release, or choose "
-            f"another split: it has {_splits_text(dataset)}"
-        )
-    wanted = np.isin(np.arange(len(dataset.scenario)), [dataset.getind("scenario", one) for one in scenario_tokens])
-    columns, scenarios = dataset.columns("sample"), dataset.columns("scenario")
-    row = columns["scenario_row"]
-    in_split = wanted[row] & columns["labelled"][:]
-    if not in_split.any():
-        raise NotAvailableError(f"{split}: none of its samples here has labels (the test split has none)")
-    to_end = scenarios["num_frames"][row] - (columns["frame_row"] - scenarios["first_frame_row"][row] + 1)
-    chosen = to_end % _STEPS[listed] == 0
-    if listed == "evaluate":
-        chosen &= (to_end > 0) & (to_end <= round(seconds / FRAME_PERIOD))
-        if scope == "accident":
-            chosen &= scenarios["designed_accident"][:][row]
-    tokens = [dataset.sample[index]["token"] for index in np.flatnonzero(in_split & chosen).tolist()]
-    return _with_files(dataset, tokens, channels) if channels else tokens
-
-
-def _with_files(dataset: Dataset, tokens: Sequence[str], channels: Sequence[str]) -> list[str]:
-    """Keep the samples that have the files of these sensors; raises NotAvailableError if none has."""
-    kept: list[str] = []
-    for scenario, of_scenario in groupby(tokens, lambda token: token.rsplit("/", 2)[0]):
-        frames = dataset.sensor_frames(scenario)
-        for token in of_scenario:
-            agent, number = token.split("/")[-2:]
-            if all(int(number) in frames[agent, channel] for channel in channels):
-                kept.append(token)
-    if tokens and not kept:
-        raise NotAvailableError(
-            f"sensors: none of the {len(tokens)} samples has its files of {', '.join(channels)} in {dataset.dataroot}; "
-            "unpack their archives, or choose other sensors"
-        )
-    return kept
-
-
-def no_samples_text(dataset: Dataset, split: str | os.PathLike[str], scope: Scope) -> str:
-    """What to do where a split of a release has labelled samples, but a list has none of them."""
-    scenarios = [dataset.get("scenario", token) for token in sorted(dataset.split_scenarios(split))]
-    if scope == "accident" and not any(scenario["designed_accident"] for scenario in scenarios):
-        return (
-            f"the scope accident, which is the default, leaves out all {len(scenarios)} of its scenarios, since none "
-            "was designed to end in an accident; use scope='all' (--scope all)"
-        )
-    return "choose others"
-
-
-def _splits_text(dataset: Dataset) -> str:
-    """`train: 2 scenarios, split unknown: 1 scenario`."""
-    counts = Counter(scenario["split"] or "split unknown" for scenario in dataset.scenario)
-    return ", ".join(f"{name}: {count} scenario{'s' * (count != 1)}" for name, count in counts.items())
-
-
-def training_samples(dataset: Dataset, split: str | os.PathLike[str], *, sensors: Iterable[str] = ()) -> list[str]:
-    """The samples that a model is trained on, one a second: `samples` for the purpose `train`; see there."""
-    return samples(dataset, split, "train", sensors=sensors)
-
-
-def evaluation_samples(
-    dataset: Dataset,
-    split: str | os.PathLike[str],
-    protocol: SampleProtocol = "released",
-    *,
-    horizon: float = _RELEASED_HORIZON,
-    scope: Scope = "accident",
-) -> list[str]:
-    """The samples that a model is evaluated at: `samples` for the purpose `evaluate`; see there."""
-    return samples(dataset, split, "evaluate", protocol, horizon=horizon, scope=scope)
 
 
 def motion_labels(
@@ -201,7 +65,7 @@ def motion_labels(
         NotAvailableError: the sample has no label, or an agent whose sight counts is not in this (partial) release.
         ChoiceError: no such agent or configuration of agents.
     """
-    return next(_labels(dataset, [sample], label_config(config), id_map))
+    return next(_labels(dataset, [sample], resolved_label_config(config), id_map))
 
 
 def motion_labels_of(
@@ -220,7 +84,7 @@ def motion_labels_of(
     """
     if isinstance(samples, str | Mapping):
         raise ChoiceError(f"samples: expected tokens or records of samples, found {samples!r}; put it into a list")
-    chosen, left = label_config(config), iter(samples)
+    chosen, left = resolved_label_config(config), iter(samples)
     groups = iter(lambda: list(islice(left, _AT_ONCE)), [])
     return (labels for group in groups for labels in _labels(dataset, group, chosen, None))
 

@@ -33,8 +33,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from deepaccident_devkit.errors import GeometryError
-from deepaccident_devkit.exact import single_precision
-from deepaccident_devkit.exact.single_precision import (
+from deepaccident_devkit.geometry import BevGrid, conventions
+from deepaccident_devkit.geometry.bev_grid import Orientation, axes_of
+from deepaccident_devkit.geometry.conventions import flip_pose, flip_six_vector
+from deepaccident_devkit.motion.augmentation import Augmentation
+from deepaccident_devkit.motion.config import LabelProtocol, label_protocol
+from deepaccident_devkit.motion.reference_arithmetic import single_precision
+from deepaccident_devkit.motion.reference_arithmetic.single_precision import (
     OUTSIDE,
     CellIndices,
     SamplingLine,
@@ -44,18 +49,13 @@ from deepaccident_devkit.exact.single_precision import (
     stretched_lines,
     take_cells,
 )
-from deepaccident_devkit.geometry import BevGrid, conventions
-from deepaccident_devkit.geometry.bev_grid import Orientation, axes_of
-from deepaccident_devkit.geometry.conventions import flip_pose, flip_six_vector
-from deepaccident_devkit.motion.augmentation import Augmentation
-from deepaccident_devkit.motion.config import LabelProtocol, label_protocol
 from deepaccident_devkit.support.arrays import AnyArray, as_numbers, checked
 from deepaccident_devkit.support.text import choice
 from deepaccident_devkit.v2x import future_egomotion
 
 WarpMode = Literal["nearest", "bilinear"]
+# How many cells float32 can number.
 _COUNTABLE: Final = 2**24
-"""How many cells float32 can number."""
 
 
 class _Arithmetic(NamedTuple):

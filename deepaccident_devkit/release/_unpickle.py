@@ -17,10 +17,10 @@ from typing import Any, Final, NoReturn, TypeAlias
 
 from deepaccident_devkit.errors import shortened
 
+# Characters of a number written as text: reading it takes time in proportion to the square of them.
 _LONGEST_NUMBER: Final = 32
-"""Characters of a number written as text: reading it takes time in proportion to the square of them."""
+# Of a call, which copies them; a path has one for each part.
 _MOST_ARGUMENTS: Final = 64
-"""Of a call, which copies them; a path has one for each part."""
 
 
 class Machine:
@@ -190,7 +190,47 @@ def _pushes(value: _Step) -> _Step:
     return step
 
 
+# opcode → the value that it pushes onto the stack
+_PUSHED: Final[Mapping[bytes, _Step]] = {
+    pickle.GET: lambda machine: machine.get(int(machine.digits())),
+    pickle.BINGET: lambda machine: machine.get(machine.number(1)),
+    pickle.LONG_BINGET: lambda machine: machine.get(machine.number(4)),
+    pickle.NONE: lambda _: None,
+    pickle.NEWTRUE: lambda _: True,
+    pickle.NEWFALSE: lambda _: False,
+    pickle.INT: lambda machine: _whole(machine.digits()),
+    pickle.LONG: lambda machine: _whole(machine.digits()),
+    pickle.FLOAT: lambda machine: float(machine.digits()),
+    pickle.BININT1: lambda machine: machine.number(1),
+    pickle.BININT2: lambda machine: machine.number(2),
+    pickle.BININT: lambda machine: int.from_bytes(machine.take(4), "little", signed=True),
+    pickle.LONG1: lambda machine: int.from_bytes(machine.counted(1), "little", signed=True),
+    pickle.BINFLOAT: lambda machine: struct.unpack(">d", machine.take(8))[0],
+    # text: of Python 2 (read as latin1), and of Python 3
+    pickle.STRING: lambda machine: codecs.escape_decode(machine.line()[1:-1])[0].decode("latin1"),
+    pickle.SHORT_BINSTRING: lambda machine: machine.counted(1).decode("latin1"),
+    pickle.BINSTRING: lambda machine: machine.counted(4).decode("latin1"),
+    pickle.UNICODE: lambda machine: machine.line().decode("raw-unicode-escape"),
+    pickle.SHORT_BINUNICODE: lambda machine: machine.counted(1).decode("utf-8", "surrogatepass"),
+    pickle.BINUNICODE: lambda machine: machine.counted(4).decode("utf-8", "surrogatepass"),
+    pickle.SHORT_BINBYTES: lambda machine: machine.noted(1),
+    pickle.BINBYTES: lambda machine: machine.noted(4),
+    pickle.BYTEARRAY8: lambda machine: machine.noted(8),
+    pickle.EMPTY_TUPLE: lambda _: (),
+    pickle.TUPLE1: lambda machine: tuple(machine.items(1)),
+    pickle.TUPLE2: lambda machine: tuple(machine.items(2)),
+    pickle.TUPLE3: lambda machine: tuple(machine.items(3)),
+    pickle.TUPLE: lambda machine: tuple(machine.items()),
+    pickle.EMPTY_LIST: lambda _: [],
+    pickle.LIST: Machine.items,
+    pickle.EMPTY_DICT: lambda _: {},
+    pickle.GLOBAL: lambda machine: machine.known(f"{machine.line().decode()} {machine.line().decode()}"),
+    pickle.STACK_GLOBAL: lambda machine: machine.known(" ".join(machine.items(2))),
+    pickle.BINPERSID: Machine.referred,
+    pickle.REDUCE: Machine.called,
+}
 _STEPS: Final[Mapping[bytes, _Step]] = {
+    **{opcode: _pushes(value) for opcode, value in _PUSHED.items()},
     pickle.PROTO: lambda machine: machine.take(1),
     pickle.FRAME: Machine.frame,
     pickle.STOP: Machine.stop,
@@ -199,46 +239,10 @@ _STEPS: Final[Mapping[bytes, _Step]] = {
     pickle.BINPUT: lambda machine: machine.put(machine.number(1)),
     pickle.LONG_BINPUT: lambda machine: machine.put(machine.number(4)),
     pickle.MEMOIZE: lambda machine: machine.put(len(machine.memo)),
-    pickle.GET: _pushes(lambda machine: machine.get(int(machine.digits()))),
-    pickle.BINGET: _pushes(lambda machine: machine.get(machine.number(1))),
-    pickle.LONG_BINGET: _pushes(lambda machine: machine.get(machine.number(4))),
-    pickle.NONE: _pushes(lambda _: None),
-    pickle.NEWTRUE: _pushes(lambda _: True),
-    pickle.NEWFALSE: _pushes(lambda _: False),
-    pickle.INT: _pushes(lambda machine: _whole(machine.digits())),
-    pickle.LONG: _pushes(lambda machine: _whole(machine.digits())),
-    pickle.FLOAT: _pushes(lambda machine: float(machine.digits())),
-    pickle.BININT1: _pushes(lambda machine: machine.number(1)),
-    pickle.BININT2: _pushes(lambda machine: machine.number(2)),
-    pickle.BININT: _pushes(lambda machine: int.from_bytes(machine.take(4), "little", signed=True)),
-    pickle.LONG1: _pushes(lambda machine: int.from_bytes(machine.counted(1), "little", signed=True)),
-    pickle.BINFLOAT: _pushes(lambda machine: struct.unpack(">d", machine.take(8))[0]),
-    # text: of Python 2 (read as latin1), and of Python 3
-    pickle.STRING: _pushes(lambda machine: codecs.escape_decode(machine.line()[1:-1])[0].decode("latin1")),
-    pickle.SHORT_BINSTRING: _pushes(lambda machine: machine.counted(1).decode("latin1")),
-    pickle.BINSTRING: _pushes(lambda machine: machine.counted(4).decode("latin1")),
-    pickle.UNICODE: _pushes(lambda machine: machine.line().decode("raw-unicode-escape")),
-    pickle.SHORT_BINUNICODE: _pushes(lambda machine: machine.counted(1).decode("utf-8", "surrogatepass")),
-    pickle.BINUNICODE: _pushes(lambda machine: machine.counted(4).decode("utf-8", "surrogatepass")),
-    pickle.SHORT_BINBYTES: _pushes(lambda machine: machine.noted(1)),
-    pickle.BINBYTES: _pushes(lambda machine: machine.noted(4)),
-    pickle.BYTEARRAY8: _pushes(lambda machine: machine.noted(8)),
-    pickle.EMPTY_TUPLE: _pushes(lambda _: ()),
-    pickle.TUPLE1: _pushes(lambda machine: tuple(machine.items(1))),
-    pickle.TUPLE2: _pushes(lambda machine: tuple(machine.items(2))),
-    pickle.TUPLE3: _pushes(lambda machine: tuple(machine.items(3))),
-    pickle.TUPLE: _pushes(lambda machine: tuple(machine.items())),
-    pickle.EMPTY_LIST: _pushes(lambda _: []),
-    pickle.LIST: _pushes(Machine.items),
     pickle.APPEND: lambda machine: machine.extend(machine.items(1)),
     pickle.APPENDS: lambda machine: machine.extend(machine.items()),
-    pickle.EMPTY_DICT: _pushes(lambda _: {}),
     pickle.DICT: Machine.filled,
     pickle.SETITEM: lambda machine: machine.fill(machine.items(2)),
     pickle.SETITEMS: lambda machine: machine.fill(machine.items()),
-    pickle.GLOBAL: _pushes(lambda machine: machine.known(f"{machine.line().decode()} {machine.line().decode()}")),
-    pickle.STACK_GLOBAL: _pushes(lambda machine: machine.known(" ".join(machine.items(2)))),
-    pickle.BINPERSID: _pushes(Machine.referred),
-    pickle.REDUCE: _pushes(Machine.called),
     pickle.BUILD: Machine.build,
 }

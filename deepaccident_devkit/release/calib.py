@@ -13,18 +13,26 @@ from deepaccident_devkit.geometry import SE3, conventions
 from deepaccident_devkit.geometry.se3 import RIGID_TOLERANCE, rigid_fault
 from deepaccident_devkit.release.pickles import load_arrays, load_stacked, pickled
 from deepaccident_devkit.release.store import REMEDY, ReleasePath, read_content
-from deepaccident_devkit.support.arrays import LARGEST, AnyArray, BoolArray, FloatArray, ShortRepr, in_range, readonly
+from deepaccident_devkit.support.arrays import (
+    LARGEST_NUMBER,
+    AnyArray,
+    BoolArray,
+    FloatArray,
+    ShortRepr,
+    in_range,
+    readonly,
+)
 from deepaccident_devkit.support.files import write_bytes
 from deepaccident_devkit.taxonomy import CAMERAS
 
 _EGO_KEYS = ("lidar_to_ego", "ego_to_world")
 _CAMERA_KEYS = tuple(f"lidar_to_{camera}" for camera in CAMERAS)
 _INTRINSIC_KEYS = tuple(f"intrinsic_{camera}" for camera in CAMERAS)
+# Every key of a calib file and the shape of its array.
 KEYS: dict[str, tuple[int, int]] = {
     **dict.fromkeys((*_EGO_KEYS, *_CAMERA_KEYS), (4, 4)),
     **dict.fromkeys(_INTRINSIC_KEYS, (3, 3)),
 }
-"""Every key of a calib file and the shape of its array."""
 _POSE_KEYS = (*_EGO_KEYS, *_CAMERA_KEYS)
 _LAST_ROW = np.array([0.0, 0.0, 0.0, 1.0])
 
@@ -199,7 +207,7 @@ def _surely_rigid(poses: FloatArray) -> BoolArray:
 def _first_value_fault(poses: FloatArray, intrinsics: FloatArray) -> str | None:
     faults = [f"{key}: {fault}" for key, pose in zip(_POSE_KEYS, poses, strict=True) if (fault := rigid_fault(pose))]
     faults += [
-        f"{key}: holds NaN or infinity, or a number beyond {LARGEST:.0e}"
+        f"{key}: holds NaN or infinity, or a number beyond {LARGEST_NUMBER:.0e}"
         for key, matrix in zip((*_POSE_KEYS, *_INTRINSIC_KEYS), (*poses, *intrinsics), strict=True)
         if not in_range(matrix).all()
     ]

@@ -16,22 +16,22 @@ from typing import Any, Final, NamedTuple, TypeAlias
 from deepaccident_devkit.release._unpickle import Machine, dict_of
 from deepaccident_devkit.support.reading import DAMAGED_ARCHIVE, open_zip, read_member
 
+# What a file that is no checkpoint, a damaged or a hostile one can raise; a Warning where warnings are errors.
 FAULTS: Final = (pickle.UnpicklingError, TypeError, AttributeError, IndexError, Warning, *DAMAGED_ARCHIVE)
-"""What a file that is no checkpoint, a damaged or a hostile one can raise; a Warning where warnings are errors."""
-SIZES: Final[Mapping[str, int]] = {
+# Kind of numbers, as PyTorch calls it → bytes of one.
+NUMBER_BYTES: Final[Mapping[str, int]] = {
     **dict.fromkeys(("float64", "int64"), 8),
     **dict.fromkeys(("float32", "int32"), 4),
     **dict.fromkeys(("float16", "bfloat16", "int16"), 2),
     **dict.fromkeys(("int8", "uint8", "bool"), 1),
 }
-"""Kind of numbers, as PyTorch calls it → bytes of one."""
+# How a file begins that is no zip: two pickles, of a number that stands for the format, and of its version.
 _OLD: Final = b"\x80\x02\x8a\nl\xfc\x9cF\xf9 j\xa8P\x19.\x80\x02M\xe9\x03."
-"""How a file begins that is no zip: two pickles, of a number that stands for the format, and of its version."""
+# Some 30 are a tensor.
 _MOST_OPCODES: Final = 500_000
-"""Some 30 are a tensor."""
 _MOST_DIMENSIONS: Final = 64
+# From a storage's name to its bytes; raises one of `FAULTS`.
 Storages: TypeAlias = Callable[[str], bytes | memoryview]
-"""From a storage's name to its bytes; raises one of `FAULTS`."""
 
 
 class StoredTensor(NamedTuple):
@@ -39,7 +39,7 @@ class StoredTensor(NamedTuple):
 
     Attributes:
         storage: its name.
-        dtype: kind of numbers, one of `SIZES`.
+        dtype: kind of numbers, one of `NUMBER_BYTES`.
         offset: of the first element, in elements.
         shape: of the tensor, which may be too large for the storage.
         strides: in elements, one for each dimension.
@@ -54,7 +54,7 @@ class StoredTensor(NamedTuple):
     @property
     def size(self) -> int:
         """Bytes that a copy of it takes."""
-        return math.prod(self.shape) * SIZES[self.dtype]
+        return math.prod(self.shape) * NUMBER_BYTES[self.dtype]
 
 
 def read_checkpoint(content: bytes) -> tuple[object, Storages]:
@@ -94,7 +94,7 @@ def _of_old_file(content: bytes) -> tuple[object, Storages]:
         if type(name) is not str:
             raise ValueError("a storage whose name is no text is not allowed")
         first = at + 8  # bytes that say how many elements it has
-        at = first + int.from_bytes(content[at:first], "little") * SIZES[kinds[name]]
+        at = first + int.from_bytes(content[at:first], "little") * NUMBER_BYTES[kinds[name]]
         storages[name] = memoryview(content)[first:at]
     if at != len(content):
         raise ValueError("its storages do not end where the file does")
@@ -107,7 +107,7 @@ def _read(content: bytes, kinds: dict[str, str], start: int = 0) -> Machine:
     def storage(notes: Any) -> StoredTensor:
         what, kind, name, _device, _count, *view = notes
         # first of all types: the hash of a tuple can take all time
-        if {type(kind), type(name)} != {str} or what != "storage" or kind not in SIZES or any(view):
+        if {type(kind), type(name)} != {str} or what != "storage" or kind not in NUMBER_BYTES or any(view):
             raise ValueError("a storage of another form is not allowed")
         kinds[name] = kind
         return StoredTensor(name, kind, 0, (), ())
@@ -131,6 +131,7 @@ def _tensor(storage: StoredTensor, offset: Any, shape: Any, strides: Any, *_furt
     return storage._replace(offset=offset, shape=tuple(shape), strides=tuple(strides))
 
 
+# What a pickle may name, and what stands for it.
 _NAMES: Final[Mapping[str, object]] = {
     "collections OrderedDict": _ordered,
     **{f"torch._utils _rebuild_{name}": _tensor for name in ("tensor", "tensor_v2")},
@@ -142,7 +143,7 @@ _NAMES: Final[Mapping[str, object]] = {
         (
             *("numpy dtype", "numpy ndarray", "_codecs encode", "torch device", "pathlib PosixPath"),
             *(f"numpy.{core}.multiarray {name}" for core in ("core", "_core") for name in ("scalar", "_reconstruct")),
-            *(f"torch {kind}" for kind in SIZES),
+            *(f"torch {kind}" for kind in NUMBER_BYTES),
         ),
         lambda *_: None,
     ),
@@ -157,4 +158,3 @@ _NAMES: Final[Mapping[str, object]] = {
     "torch ByteStorage": "uint8",
     "torch BoolStorage": "bool",
 }
-"""What a pickle may name, and what stands for it."""

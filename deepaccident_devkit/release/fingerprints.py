@@ -24,18 +24,18 @@ from deepaccident_devkit.taxonomy import AGENTS, CHANNEL_FORMAT
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
-    from deepaccident_devkit.parallel import Engine
+    from deepaccident_devkit.support.parallel import Engine
 
 _Reader: TypeAlias = Callable[[ReleasePath, FileKind], bytes]
 _DIGEST_BYTES: Final = 16
+# The number of LiDAR points in a line of a label.
 _POINTS: Final = re.compile(rb" (\d{1,7})(?= (?:True|False)[ \t\r]*$)", re.MULTILINE)
-"""The number of LiDAR points in a line of a label."""
 _UNCOUNTED: Final = attrgetter("meta", "calib", "boxes")
+# LiDAR points by which a scenario's boxes may differ: the root of the sum of their squares. docs/benchmark.md says how
+# much was measured.
 POINTS_TOLERANCE: Final = 12.0
-"""LiDAR points by which a scenario's boxes may differ: the root of the sum of their squares. docs/benchmark.md says how
-much was measured."""
-INDEX_REMEDY: Final = "update it with: deepaccident index DATAROOT --check"
-"""What to do about an index that was made from other files."""
+# What to do about an index that was made from other files.
+INDEX_REMEDY: Final = "update it with: deepaccident check index DATAROOT"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -110,7 +110,7 @@ def scenario_hashes(dataset: Located, scenarios: Collection[str], **how: Unpack[
     """
     if isinstance(dataset, HasTruth):
         return {token: dataset.truth_hashes(token) for token in sorted(set(scenarios))}
-    from deepaccident_devkit.parallel import Places, run_batch  # here: opening a release waits for this module
+    from deepaccident_devkit.support.parallel import Places, run_batch  # here: opening a release waits for this module
 
     folders = scenario_folders(dataset, scenarios)
     work, places = partial(checked_hashes, dataset), Places(reads=places_of(dataset.dataroot))

@@ -18,13 +18,13 @@ from deepaccident_devkit.support.files import write_bytes
 from deepaccident_devkit.support.reading import check_size, fault_text, open_file
 
 JPEG_QUALITY = 90
+# What decoding a damaged image can raise.
 _DAMAGED = (OSError, SyntaxError, ValueError, struct.error, EOFError, MemoryError, OverflowError, zlib.error)
-"""What decoding a damaged image can raise."""
+# Others have decoders that start programs.
 _FORMATS = ("JPEG", "PNG")
-"""Others have decoders that start programs."""
 _BYTES_A_PIXEL = 3
+# In the data of a JPEG.
 _MARKER = re.compile(rb"\xff[^\x00]", re.DOTALL)
-"""In the data of a JPEG."""
 
 
 def read_image(

@@ -20,7 +20,7 @@ from deepaccident_devkit.errors import LabelError, shortened
 from deepaccident_devkit.geometry import Boxes, conventions, quaternions
 from deepaccident_devkit.release.store import ReleasePath, read_content
 from deepaccident_devkit.support.arrays import (
-    LARGEST,
+    LARGEST_NUMBER,
     AnyArray,
     BoolArray,
     FloatArray,
@@ -31,7 +31,7 @@ from deepaccident_devkit.support.arrays import (
 )
 from deepaccident_devkit.support.cores import usable_cores
 from deepaccident_devkit.support.files import write_bytes
-from deepaccident_devkit.support.reading import LIMITS_VARIABLE, limit_of
+from deepaccident_devkit.support.reading import LIMITS_VARIABLE, byte_limit
 from deepaccident_devkit.support.text import integer_of, number_of
 from deepaccident_devkit.taxonomy import CATEGORIES
 
@@ -43,33 +43,33 @@ def label_from_world_velocity(velocity: FloatArray, yaw: FloatArray) -> FloatArr
         velocity: (N, 2) m/s in world.
         yaw: (N,) radians, each box's in the LiDAR frame of the label, of the same handedness.
     """
-    return turned(velocity, yaw)
+    return turned_vectors(velocity, yaw)
 
 
 def world_from_label_velocity(velocity: FloatArray, yaw: FloatArray) -> FloatArray:
     """(N, 2) m/s in world: the inverse of `label_from_world_velocity`; NaN stays NaN."""
-    return turned(velocity, -yaw)
+    return turned_vectors(velocity, -yaw)
 
 
-def turned(vectors: FloatArray, angle: FloatArray) -> FloatArray:
+def turned_vectors(vectors: FloatArray, angle: FloatArray) -> FloatArray:
     """Vectors (N, 2) turned by angles (N,), from the first axis to the second."""
     cos, sin = np.cos(angle), np.sin(angle)
     x, y = vectors[:, 0], vectors[:, 1]
     return np.column_stack([cos * x - sin * y, sin * x + cos * y])
 
 
-FIELDS = ("class", "x", "y", "z", "l", "w", "h", "yaw", "vx", "vy", "id", "num_lidar_pts", "camera_visible")
-"""The 13 fields of a box line, in order."""
-_FINITE_FIELDS = FIELDS[1:8]
-_FLOAT_FIELDS = FIELDS[1:10]
+# The 13 fields of a box line, in order.
+LABEL_FIELDS = ("class", "x", "y", "z", "l", "w", "h", "yaw", "vx", "vy", "id", "num_lidar_pts", "camera_visible")
+_FINITE_FIELDS = LABEL_FIELDS[1:8]
+_FLOAT_FIELDS = LABEL_FIELDS[1:10]
 _INTEGER_FIELDS = ("id", "num_lidar_pts")
 _HEADER = ("speed_x", "speed_y")
 _FILES_A_CALL = 250
 _MOST_THREADS = 4
+# Of the longest lines; a file that is as large as it may be has so many lines at the most.
 _BYTES_A_LINE = 192
-"""Of the longest lines; a file that is as large as it may be has so many lines at the most."""
+# Lines among which a fault is looked for one by one.
 _LINES_A_STEP = 1000
-"""Lines among which a fault is looked for one by one."""
 _REMEDY = "restore the file from its archive, or leave the scenario out with on_error='skip'"
 
 
@@ -238,7 +238,7 @@ def _content(path: ReleasePath, *, ended: bool = True) -> bytes:
     """A file's bytes, of not too many lines, ending in a line end if `ended`."""
     content = read_content(path, "label", LabelError, _REMEDY).removeprefix(codecs.BOM_UTF8)
     lines = max(content.count(b"\n"), content.count(b"\r"))
-    if lines > (most := limit_of("label") // _BYTES_A_LINE):
+    if lines > (most := byte_limit("label") // _BYTES_A_LINE):
         sound = f"if it is sound, set {LIMITS_VARIABLE}=label={_BYTES_A_LINE * lines}"
         raise LabelError(f"{path}: has {lines:,} lines, more than {most:,}; {sound}; {_REMEDY}")
     return content if content.endswith(b"\n") or not ended else content + b"\n"
@@ -254,7 +254,7 @@ def _parse_joined(contents: Sequence[bytes]) -> dict[str, AnyArray] | None:
     if b"x" in body or b"X" in body:  # Arrow reads hexadecimal integers
         return None
     try:
-        header_words, words = _columns(header, _HEADER), _columns(body, FIELDS)
+        header_words, words = _columns(header, _HEADER), _columns(body, LABEL_FIELDS)
         if header_words is None or words is None:
             return None
         num_boxes = np.array([content.count(b"\n") - 1 for content in contents], dtype=np.int64)
@@ -329,7 +329,7 @@ def _tidied(content: bytes) -> bytes:
 
 def _split(line: bytes) -> list[bytes]:
     """The words of a line; of one with too many, the last is all the rest."""
-    return line.split(maxsplit=len(FIELDS))
+    return line.split(maxsplit=len(LABEL_FIELDS))
 
 
 def _first_fault(paths: Sequence[ReleasePath], contents: Sequence[bytes]) -> LabelError:
@@ -375,10 +375,15 @@ def _header_fault(words: Sequence[str]) -> str | None:
 
 
 def _line_fault(words: Sequence[str]) -> str | None:
-    if len(words) != len(FIELDS):
-        return f"expected {len(FIELDS)} fields, found {_counted(words)}: {_quoted(words)}"
+    if len(words) != len(LABEL_FIELDS):
+        return f"expected {len(LABEL_FIELDS)} fields, found {_counted(words)}: {_quoted(words)}"
     return next(
-        (fault for fault in (_field_fault(name, word) for name, word in zip(FIELDS, words, strict=True)) if fault), None
+        (
+            fault
+            for fault in (_field_fault(name, word) for name, word in zip(LABEL_FIELDS, words, strict=True))
+            if fault
+        ),
+        None,
     )
 
 
@@ -395,12 +400,12 @@ def _field_fault(name: str, word: str) -> str | None:
         if number is None:
             expected = "a number"
         elif name in _FINITE_FIELDS and not in_range(number):
-            expected = f"a finite number up to {LARGEST:.0e}"
+            expected = f"a finite number up to {LARGEST_NUMBER:.0e}"
     return expected and f"{name} is {shortened(word)!r}, expected {expected}"
 
 
 def _counted(words: Sequence[str]) -> str:
-    return str(len(words)) if len(words) <= len(FIELDS) else f"more than {len(FIELDS)}"
+    return str(len(words)) if len(words) <= len(LABEL_FIELDS) else f"more than {len(LABEL_FIELDS)}"
 
 
 def _quoted(words: Sequence[str]) -> str:

@@ -15,7 +15,14 @@ from pathlib import Path
 from typing import Final, get_args
 
 from deepaccident_devkit.errors import DatarootError, MissingFileError, SplitFileError, VersionError, shortened
-from deepaccident_devkit.release.store import Entry, ReleasePath, is_folder, leads_back, listed, read_lines
+from deepaccident_devkit.release.store import (
+    FolderEntry,
+    ReleasePath,
+    folder_entries,
+    is_folder,
+    leads_back,
+    read_lines,
+)
 from deepaccident_devkit.release.store.members import (
     MINI_FOLDER,
     SCENARIO_TYPE,
@@ -32,12 +39,12 @@ _UNLISTABLE_REMEDY = "unpack its archive again, or make it readable"
 _ABOVE_TYPES = (*SPLIT_FOLDERS, MINI_FOLDER)
 _IN_TYPE = ("meta", *AGENTS)
 _KINDS = ("calib", "label", *CHANNEL_FORMAT)
+# The names that browsers, drives and people give to a copy, or to a part, of a folder of some names.
 _COPY = r"(?:Copy of )?({})(?:\W.*|_*\d.*|_+(?i:copy|part|old|new|backup)\w*)?"
-"""The names that browsers, drives and people give to a copy, or to a part, of a folder of some names."""
+# Folders that the error of a release without scenarios names at most.
 _MOST_ASIDE = 3
-"""Folders that the error of a release without scenarios names at most."""
+# A table that every version of nuScenes has.
 NUSCENES_TABLE: Final = "scene.json"
-"""A table that every version of nuScenes has."""
 _FRAME_FILE = re.compile(r"_(\d{3,})\.\w+")
 _logger = logging.getLogger(__name__)
 
@@ -207,7 +214,9 @@ def frame_sizes(folder: ReleasePath, ending: str) -> dict[int, int]:
     return dict(sorted(sizes.items()))
 
 
-def _frame_entries(folder: ReleasePath, entries: Iterable[Entry], ending: str) -> Iterator[tuple[int | None, Entry]]:
+def _frame_entries(
+    folder: ReleasePath, entries: Iterable[FolderEntry], ending: str
+) -> Iterator[tuple[int | None, FolderEntry]]:
     """A folder's entries with an ending, each with its frame number; None if the name has none."""
     stem = folder.name
     for entry in entries:
@@ -259,7 +268,7 @@ def left_aside(root: ReleasePath) -> Iterator[tuple[ReleasePath, str | None]]:
 
 def _aside_in(folder: ReleasePath, known: Sequence[str]) -> Iterator[tuple[ReleasePath, str | None]]:
     """What `left_aside` tells of one folder, in which these names (patterns) are read; of others only links."""
-    entries: list[Entry] = []
+    entries: list[FolderEntry] = []
     with suppress(DatarootError):  # told where its scenarios are read
         entries = _entries(folder, files=True)
     for entry in sorted(entries, key=lambda entry: entry.name):
@@ -325,10 +334,10 @@ def _subfolders(folder: ReleasePath, *, loops: bool = False) -> list[str]:
     return [entry.name for entry in entries if not entry.name.startswith(".") and is_folder(entry, loops=loops)]
 
 
-def _entries(folder: ReleasePath, *, files: bool = False) -> list[Entry]:
+def _entries(folder: ReleasePath, *, files: bool = False) -> list[FolderEntry]:
     """What lies in a folder; nothing if there is no such folder, nor, with `files`, if a file is in its place."""
     try:
-        return listed(folder)
+        return folder_entries(folder)
     except OSError as error:
         if isinstance(error, FileNotFoundError) or (files and isinstance(error, NotADirectoryError)):
             return []

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from deepaccident_devkit.errors import MetaError, shortened
 from deepaccident_devkit.release.store import REMEDY, ReleasePath, read_lines
-from deepaccident_devkit.support.arrays import LARGEST, ShortRepr, in_range
+from deepaccident_devkit.support.arrays import LARGEST_NUMBER, ShortRepr, in_range
 from deepaccident_devkit.support.files import write_bytes
 from deepaccident_devkit.support.text import integer_of, number_of
 from deepaccident_devkit.taxonomy import META_AGENTS, TIMES_OF_DAY, UNTRACKED_ID, WARM_UP_FRAMES, AgentName
@@ -206,6 +206,6 @@ def _integer(where: str, what: str, word: str) -> int:
 def _finite(where: str, what: str, word: str) -> float:
     value = number_of(word)
     if value is None or not in_range(value):
-        found = f"found {shortened(word)!r} (at most {LARGEST:.0e} counts)"
+        found = f"found {shortened(word)!r} (at most {LARGEST_NUMBER:.0e} counts)"
         raise MetaError(f"{where}: {what}: expected a finite number, {found}; {REMEDY}")
     return value

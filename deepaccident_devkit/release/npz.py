@@ -20,15 +20,15 @@ from deepaccident_devkit.taxonomy import BEV_RESOLUTION, BEV_SHAPE
 
 KEY = "data"
 _ENDING = ".npy"
+# How a `.npy` file begins.
 _BARE_ARRAY = b"\x93NUMPY"
-"""How a `.npy` file begins."""
 _FAST = 1
 """Level of compression: a BEV array of 4.3 MB takes 10 ms; zlib's default level takes 20 to 30, for a quarter of it.
 
 Of a cloud's numbers, of single precision, half of each is zeros; a higher level saves little more.
 """
+# The CARLA semantic tags that the reference renderer uses.
 TAGS: dict[str, int] = {"pedestrian": 4, "road_line": 6, "road": 7, "sidewalk": 8, "vehicle": 10}
-"""The CARLA semantic tags that the reference renderer uses."""
 
 
 def read_npz(path: ReleasePath, kind: FileKind) -> AnyArray:

@@ -22,21 +22,22 @@ _PROTOCOL: Final = 3
 _BEGIN: Final = pickle.PROTO + bytes([_PROTOCOL])
 _OLD_NAME: Final = b"cnumpy.core.multiarray\n"
 _NEW_NAME: Final = b"cnumpy._core.multiarray\n"
+# A calib file has 263 to 543.
 MOST_OPCODES: Final = 10_000
-"""A calib file has 263 to 543."""
+# Containers within each other; a calib file has 1.
 _DEEPEST: Final = 20
-"""Containers within each other; a calib file has 1."""
+# Bytes that values may take beyond those of the pickle, which may hold an array twice and store it once.
 _ROOM: Final = 1 << 20
-"""Bytes that values may take beyond those of the pickle, which may hold an array twice and store it once."""
+# Bytes of a value, at least.
 _A_VALUE: Final = 64
-"""Bytes of a value, at least."""
+# Layouts that are remembered; the calib files of a release have few, which differ in what is in their arrays.
 _MOST_LAYOUTS: Final = 16
-"""Layouts that are remembered; the calib files of a release have few, which differ in what is in their arrays."""
 _LONGEST_SENTENCE: Final = 200
+# The only dtypes allowed: numpy itself would evaluate other strings.
 _PLAIN_NUMBER: Final = re.compile(r"[<>=|]?[fiub][1-9][0-9]?", re.ASCII)
-"""The only dtypes allowed: numpy itself would evaluate other strings."""
+# What numpy's pickles of a number's dtype say after version and byte order: no fields, no size of its own.
 _NUMBER_STATE: Final = (None, None, None, -1, -1, 0)
-"""What numpy's pickles of a number's dtype say after version and byte order: no fields, no size of its own."""
+# What damaged or hostile bytes can raise.
 _FAULTS: Final = (
     pickle.UnpicklingError,
     AttributeError,
@@ -47,7 +48,6 @@ _FAULTS: Final = (
     ValueError,
     Warning,  # where warnings are errors
 )
-"""What damaged or hostile bytes can raise."""
 
 
 def load_arrays(content: bytes) -> Any:
@@ -169,8 +169,8 @@ class _Layout(NamedTuple):
         }
 
 
+# The latest first.
 layouts: list[_Layout] = []
-"""The latest first."""
 
 
 class _Kind:

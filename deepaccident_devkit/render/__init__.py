@@ -20,9 +20,9 @@ from deepaccident_devkit.render.outcomes import draw_accident_outcome, draw_dete
 from deepaccident_devkit.render.replay import render_replay
 from deepaccident_devkit.render.samples import render_calibration, render_frame, render_sample
 from deepaccident_devkit.render.styles import style
+from deepaccident_devkit.render.town_map import render_town_map
 from deepaccident_devkit.render.video import render_scenario_video
 from deepaccident_devkit.render.visibility import render_visibility, render_visibility_matrix
-from deepaccident_devkit.rooms import names_of
 from deepaccident_devkit.support.nuscenes_names import with_keywords_named
 
 __all__ = [
@@ -60,5 +60,3 @@ if not TYPE_CHECKING:  # the types stay those of the functions themselves
     for _name in __all__:
         if _name.startswith("render_") and _name in globals():
             globals()[_name] = with_keywords_named(globals()[_name], __name__)
-
-__getattr__, __dir__ = names_of(__name__, __all__)  # what the room `maps` adds

@@ -49,41 +49,41 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 PAIR_LAYERS: Final[tuple[Layer, ...]] = (*CAMERA_LAYERS, "bev", "trajectories", "grid")
+# Frames for which the last camera that saw the pair is kept.
 _REMEMBERED: Final = 10
-"""Frames for which the last camera that saw the pair is kept."""
+# Metres around the place of contact that are shown, at least and at most.
 _LEAST, _MOST = 9.0, 24.0
-"""Metres around the place of contact that are shown, at least and at most."""
+# Metres around the pair.
 _MARGIN: Final = 2.5
-"""Metres around the pair."""
+# Seconds of the paths that led to the contact.
 _PAST: Final = 3.0
-"""Seconds of the paths that led to the contact."""
+# Share of an image's width that is shown at least: who looks must still see where it is.
 _LEAST_CROP: Final = 0.4
-"""Share of an image's width that is shown at least: who looks must still see where it is."""
+# Points: the size of the cross at the place of contact.
 _CROSS: Final = 9.0
-"""Points: the size of the cross at the place of contact."""
+# Share of a panel's width and height that the places of tags keep to its edges.
 _EDGE: Final = 0.01
-"""Share of a panel's width and height that the places of tags keep to its edges."""
+# Points, about, at the top of an image in which tags may cover a car: it may fill the image.
 _FREE: Final = 22.0
-"""Points, about, at the top of an image in which tags may cover a car: it may fill the image."""
 _HIDDEN: Final = (0, (3, 2))
+# Seconds before the impact.
 COUNTDOWN: Final = (2.0, 1.0, 0.5, 0.0)
-"""Seconds before the impact."""
 _IN_A_COLUMN: Final = (1.0, 0.0)
 _SHOWN: Final[tuple[Layer, ...]] = ("image", "bev", "boxes", "trajectories", "grid")
+# Width of a panel in inches.
 _WIDTH: Final = 3.3
-"""Width of a panel in inches."""
+# Inches of a camera's panel below which agents are left out.
 _LEAST_WIDTH: Final = 1.6
-"""Inches of a camera's panel below which agents are left out."""
+# Letters that a line above a panel of a small picture has room for.
 _SHORT: Final = 16
-"""Letters that a line above a panel of a small picture has room for."""
+# Inches of words above a row, for letters of one point.
 _ROW_WORDS: Final = 0.03
-"""Inches of words above a row, for letters of one point."""
+# Of a small picture that panels should cover, by the estimate of `_width`.
 _ENOUGH: Final = 0.6
-"""Of a small picture that panels should cover, by the estimate of `_width`."""
+# Inches of the height that titles take, about.
 _TITLE: Final = 1.0
-"""Inches of the height that titles take, about."""
+# The panels of a video's picture.
 _MOSAIC: Final[list[Any]] = [[*AGENTS[:3]], ["above", *AGENTS[3:]], ["above", "speeds", "speeds"]]
-"""The panels of a video's picture."""
 _DASHES: Final = ("-", "--")
 
 
@@ -136,7 +136,7 @@ def render_accident(
     first = sample_token(record["token"], agents_of(dataset, scenario)[0], record["num_frames"])
     names = in_drawing_order([] if agents == [] else cooperating_agents(dataset, first, agents))
     fig = figure_or_new(fig, (_WIDTH * len(moments) + 0.8, 1.95 * len(names) + _WIDTH + 1.1), column=1.45)
-    pair, best = Pair.of(dataset, contact), ""
+    pair, best = CollidingPair.of(dataset, contact), ""
     room = _agents_with_room(fig, len(names), len(moments)) if agents is None else len(names)
     if room < len(names):
         best = f"{room} of {len(names)} agents"
@@ -169,7 +169,7 @@ def draw_countdown(
     record = dataset.get("frame", frame)
     index = record["index"]
     contact = _contact(dataset, record["scenario_token"], "the view 'frame'")
-    pair = Pair.of(dataset, contact)
+    pair = CollidingPair.of(dataset, contact)
     axes = fig.subplot_mosaic(_MOSAIC, height_ratios=(1, 1, 0.8))
     for agent in AGENTS:
         if agent not in agents:
@@ -207,7 +207,7 @@ def accident_words(dataset: Dataset, contact: Contact) -> str:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Pair:
+class CollidingPair:
     """Two actors that collide in a scenario (a token), where all actors are, and the short names of the two by id."""
 
     dataset: Dataset
@@ -217,7 +217,7 @@ class Pair:
     tags: dict[int, str]
 
     @classmethod
-    def of(cls, dataset: Dataset, contact: Contact) -> Pair:
+    def of(cls, dataset: Dataset, contact: Contact) -> CollidingPair:
         """The pair of a contact."""
         scenario = contact.frame.rsplit("/", 1)[0]
         tracks = scenario_tracks(dataset, scenario)
@@ -247,7 +247,7 @@ class Pair:
         return there[0], None, None
 
 
-def draw_pair_in_camera(pair: Pair, agent: str, index: int, layers: Collection[Layer], ax: Axes) -> str:
+def draw_pair_in_camera(pair: CollidingPair, agent: str, index: int, layers: Collection[Layer], ax: Axes) -> str:
     """Render the part of an agent's image that has the pair, with tags; dashed if no camera of the agent sees them.
 
     The frame is a number from 1. Returns the camera's short name, and how long ago it saw the pair if it does not now.
@@ -272,7 +272,7 @@ def draw_pair_in_camera(pair: Pair, agent: str, index: int, layers: Collection[L
     return name
 
 
-def draw_pair_from_above(pair: Pair, index: int, layers: Collection[Layer], ax: Axes) -> None:
+def draw_pair_from_above(pair: CollidingPair, index: int, layers: Collection[Layer], ax: Axes) -> None:
     """Render a frame (number from 1) around the place of contact, in world, as near as the pair allows.
 
     The layers are `bev` (the road), `boxes`, `velocities`, `ids`, `trajectories` (of the pair, up to the contact) and
@@ -309,7 +309,7 @@ def number_words(value: float) -> str:
     return f"{value:.1f}" if np.isfinite(value) else "unknown"
 
 
-def _draw_road(pair: Pair, index: int, reach: float, ax: Axes) -> None:
+def _draw_road(pair: CollidingPair, index: int, reach: float, ax: Axes) -> None:
     """Render the ground from the BEV camera that is nearest to the contact; nothing if there is no file."""
     dataset, place = pair.dataset, pair.contact.point[:2]
     samples = [sample_token(pair.scenario, agent, index) for agent in agents_of(dataset, pair.scenario)]
@@ -340,7 +340,7 @@ def _draw_scale(reach: float, ax: Axes, *, grid: bool) -> None:
     keep_free(ax, [[(left, low), (left + metres, low)]], margin=(-2, -2, 2, 2 * text_size()))
 
 
-def _write_tags_in_image(pair: Pair, actors: list[int], bounds: FloatArray, ax: Axes) -> None:
+def _write_tags_in_image(pair: CollidingPair, actors: list[int], bounds: FloatArray, ax: Axes) -> None:
     """Write tags above what the panel shows of boxes with bounds (N, 4), pixels; of two, at their outer sides."""
     (left, right), (bottom, top) = ax.get_xlim(), ax.get_ylim()
     cars = bounds.reshape(-1, 2, 2).clip((left, top), (right, bottom))
@@ -357,7 +357,7 @@ def _write_tags_in_image(pair: Pair, actors: list[int], bounds: FloatArray, ax: 
     keep_free(ax, cars)
 
 
-def _write_tags_from_above(pair: Pair, both: Boxes, ax: Axes) -> None:
+def _write_tags_from_above(pair: CollidingPair, both: Boxes, ax: Axes) -> None:
     """Write tags beside boxes of the pair, each at the end that is away from the other."""
     middle = both.center[:, :2].mean(axis=0) if len(both) > 1 else pair.contact.point[:2]
     away = both.center[:, :2] - middle
@@ -435,7 +435,7 @@ def _agents_with_room(fig: Figure, agents: int, moments: int) -> int:
     return max((number for number, area in areas.items() if area > enough), default=max(areas, key=areas.__getitem__))
 
 
-def _best_agents(pair: Pair, agents: Sequence[str], frames: Sequence[int], number: int) -> list[str]:
+def _best_agents(pair: CollidingPair, agents: Sequence[str], frames: Sequence[int], number: int) -> list[str]:
     """So many of the agents: the ego, and those in whose images most, and of equals the largest, of the pair is."""
     views = {agent: [pair.view(agent, index)[1] for index in frames] for agent in agents}
     seen = {agent: [(view.shown, view.area) for view in views[agent] if view is not None] for agent in agents}
@@ -468,7 +468,7 @@ def _write_name(words: str, ax: Axes) -> None:
     )
 
 
-def _draw_speeds(pair: Pair, index: int, ax: Axes) -> None:
+def _draw_speeds(pair: CollidingPair, index: int, ax: Axes) -> None:
     """Render the pair's speeds over the seconds before the impact: strong up to the present, pale after it."""
     tracks = pair.tracks
     impact = int(tracks.index.max())

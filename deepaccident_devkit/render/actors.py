@@ -48,12 +48,13 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _POSSIBLE: Final = tuple(layer for layer in LAYERS if layer in {"image", *BEV_LAYERS})
+# In an inch, if they are one point high.
 _LETTERS: Final = 104
-"""In an inch, if they are one point high."""
 _DEFAULT: Final[tuple[Layer, ...]] = ("image", "bev", "points", "boxes", "grid")
 _LAYERS: Final[tuple[Layer, ...]] = ("image", "bev", "boxes", "trajectories", "grid")
 _CROPS: Final = ("first", "second", "third", "fourth")
 _BESIDE: Final[list[Any]] = [["path", "first", "second"], ["path", "speed", "seen"]]
+# The panels of an actor over time, by what there is room for.
 _MOSAICS: Final[Mapping[str, dict[str, Any]]] = {
     "all": {
         "mosaic": [["path", "first", "second"], ["path", "third", "fourth"], ["speed", "points", "seen"]],
@@ -63,7 +64,7 @@ _MOSAICS: Final[Mapping[str, dict[str, Any]]] = {
     "slide": {"mosaic": _BESIDE, "width_ratios": (1.9, 1, 1)},
     "column": {"mosaic": [["path"] * 2, ["first", "second"], ["seen"] * 2], "height_ratios": (2.0, 0.6, 0.8)},
 }
-"""The panels of an actor over time, by what there is room for."""
+# The panels of one box.
 _BOX_MOSAICS: Final[Mapping[str, dict[str, Any]]] = {
     "all": {
         "mosaic": [["camera", "above"], ["words", "words"]],
@@ -73,10 +74,9 @@ _BOX_MOSAICS: Final[Mapping[str, dict[str, Any]]] = {
     "page": {"mosaic": [["camera", "above"]], "width_ratios": (16, 10)},
     "column": {"mosaic": [["camera"], ["above"]], "height_ratios": (9, 16)},
 }
-"""The panels of one box."""
 _FRAMES_A_SECOND: Final = round(1 / FRAME_PERIOD)
+# At least so many metres are rendered around the path, on each side.
 _AROUND: Final = 10.0
-"""At least so many metres are rendered around the path, on each side."""
 
 
 @in_own_settings

@@ -33,7 +33,7 @@ from deepaccident_devkit.render.captions import (
 )
 from deepaccident_devkit.render.chips import keep_free
 from deepaccident_devkit.render.figures import Layer, axes_or_new, axis_words, check_view_range, layers_of, widening
-from deepaccident_devkit.render.ground import draw_underlay, map_beneath
+from deepaccident_devkit.render.ground import draw_underlay
 from deepaccident_devkit.render.styles import (
     AGENT_COLORS,
     CASING_COLOR,
@@ -43,7 +43,7 @@ from deepaccident_devkit.render.styles import (
     POINT_COLOR,
     in_own_settings,
 )
-from deepaccident_devkit.rooms import added
+from deepaccident_devkit.render.town_map import draw_town_map, map_beneath
 from deepaccident_devkit.support.arrays import FloatArray
 from deepaccident_devkit.support.text import settle_choices
 from deepaccident_devkit.taxonomy import BEV_CAMERA, AgentName, Frame, short_name
@@ -74,15 +74,15 @@ BEV_LAYERS: Final[tuple[Layer, ...]] = (
     "grid",
 )
 BEV_DEFAULT: Final[tuple[Layer, ...]] = ("bev", "points", "boxes", "grid")
-Shown = tuple[frozenset[str], tuple[AgentName, ...]]
-"""What a view from above shows: the colours of its boxes and, of several agents, those whose points it has."""
+# What a view from above shows: the colours of its boxes and, of several agents, those whose points it has.
+_ViewContent = tuple[frozenset[str], tuple[AgentName, ...]]
 _OF_BOXES: Final = frozenset(("boxes", "ids", "velocities", "trajectories"))
+# Metres outside the picture up to which a box may still reach into it.
 _BEYOND: Final = 5.0
-"""Metres outside the picture up to which a box may still reach into it."""
+# An arrow head, metres of an agent's ego frame.
 _MARK: Final = np.array([[1.8, 0.0], [-1.2, 1.1], [-0.6, 0.0], [-1.2, -1.1]])
-"""An arrow head, metres of an agent's ego frame."""
+# How opaque agents' points are.
 _PALE: Final = 0.55
-"""How opaque agents' points are."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -191,7 +191,7 @@ def render_bev(  # noqa: PLR0913 - each is a choice that stands on its own in a 
     return ax
 
 
-def draw_bev(dataset: Dataset, sample: RowArgument, view: BevView, layers: frozenset[Layer], ax: Axes) -> Shown:
+def draw_bev(dataset: Dataset, sample: RowArgument, view: BevView, layers: frozenset[Layer], ax: Axes) -> _ViewContent:
     """Render a panel of `render_bev`, with its arguments and errors; returns what a legend explains."""
     record = dataset.sample[dataset.getind("sample", sample)]
     names = cooperating_agents(dataset, record, view.agents)
@@ -206,7 +206,7 @@ def draw_bev(dataset: Dataset, sample: RowArgument, view: BevView, layers: froze
     if "map" in layers or ("bev" in layers and not has_ground):
         town = map_beneath(dataset, record["scenario_token"], make="map" in layers)
     if town is not None:
-        added("picture", "draw_town_map")(town, ax, target_from_world=target_from_world)
+        draw_town_map(town, ax, target_from_world=target_from_world)
     if has_ground:
         image = dataset.load_bev(record)
         reach = float(view.half.max()) + float(np.abs(center - target_from_ego.translation[:2]).max())

@@ -36,24 +36,24 @@ if TYPE_CHECKING:
     from matplotlib.collections import LineCollection
     from matplotlib.patches import PathPatch
 
+# The twelve edges of a box between its corners, in `Box.corners` order; the first four are its front.
 EDGES = ((0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7))
-"""The twelve edges of a box between its corners, in `Box.corners` order; the first four are its front."""
+# Metres from the middle of the mark of a small actor, from above, to its rim: about a car's width in all.
 _MARK_RADIUS: Final = 1.0
-"""Metres from the middle of the mark of a small actor, from above, to its rim: about a car's width in all."""
+# Points: it is at least as large, so that it is found in a view of a whole town.
 _LEAST_RADIUS: Final = 2.0
-"""Points: it is at least as large, so that it is found in a view of a whole town."""
+# Corners of the marks, by matplotlib's names.
 _CORNERS: Final[Mapping[str, int]] = {"o": 16, "D": 4, "^": 3}
-"""Corners of the marks, by matplotlib's names."""
+# Metres a second of the arrow in a corner that gives the scale of the others.
 _KEY_SPEED = 10
-"""Metres a second of the arrow in a corner that gives the scale of the others."""
+# Points: the width of an edge in an image, and by how much its casing is wider.
 _EDGE, _CASING = 1.2, 1.2
-"""Points: the width of an edge in an image, and by how much its casing is wider."""
+# Metres in front of the camera at which edges are cut off.
 NEAREST_DRAWN = 0.1
-"""Metres in front of the camera at which edges are cut off."""
+# How opaque the far end of a trail is.
 _FAINTEST: Final = 0.1
-"""How opaque the far end of a trail is."""
+# Metres: an actor that moves less has no trail.
 _STANDING: Final = 0.5
-"""Metres: an actor that moves less has no trail."""
 
 
 @in_own_settings

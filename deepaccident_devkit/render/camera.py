@@ -51,16 +51,16 @@ if TYPE_CHECKING:
     from deepaccident_devkit.tables.records import SampleRecord
 
 _STEPS: Final = np.stack(np.meshgrid(*[np.linspace(-1, 1, 5)] * 3), axis=-1).reshape(-1, 1, 3)
+# (125, 8) weights of a box's corners, of points spread evenly over it.
 _LATTICE: Final = ((1 + CORNER_SIGNS * _STEPS) / 2).prod(axis=2)
-"""(125, 8) weights of a box's corners, of points spread evenly over it."""
 CAMERA_LAYERS: Final[tuple[Layer, ...]] = ("image", "points", "boxes", "ids", "velocities")
 CAMERA_DEFAULT: Final[tuple[Layer, ...]] = ("image", "boxes")
 _Seen = Callable[[ImagePoints], ImagePoints]
 ColorBy = Literal["depth", "height", "agent"]
+# Metres from the camera at which the colours of depth begin and end.
 _DEPTHS: Final = (0.0, 50.0)
-"""Metres from the camera at which the colours of depth begin and end."""
+# Metres above the origin of the camera's agent at which the colours of height begin and end.
 _HEIGHTS: Final = (-1.0, 6.0)
-"""Metres above the origin of the camera's agent at which the colours of height begin and end."""
 
 
 @in_own_settings

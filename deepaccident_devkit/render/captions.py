@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final, cast
 import numpy as np
 
 from deepaccident_devkit.dataset import Dataset
-from deepaccident_devkit.release.store import listed
+from deepaccident_devkit.release.store import folder_entries
 from deepaccident_devkit.render.boxes import in_drawing_order
 from deepaccident_devkit.render.styles import (
     AGENT_COLORS,
@@ -31,28 +31,28 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from matplotlib.font_manager import FontProperties
 
+# Where a title is best broken.
 _BREAKS: Final = re.compile(r"(?<=/)|(?<=, )|(?<=: )|(?<=; )")
-"""Where a title is best broken."""
+# Of a figure's width that a title may take.
 _TITLE_SHARE: Final = 0.92
-"""Of a figure's width that a title may take."""
+# How small letters may become, by size, before a title is broken into lines.
 _LEAST_SHRINKING: Final = 0.85
-"""How small letters may become, by size, before a title is broken into lines."""
+# Of a panel's width: what is beside the axes moves their title to one side, and few pixels make letters wider.
 _PANEL_SHARE: Final = 0.78
-"""Of a panel's width: what is beside the axes moves their title to one side, and few pixels make letters wider."""
+# Points of a token's letters: it is there to be copied, not to be read.
 _TOKEN_TEXT: Final = 7.5
-"""Points of a token's letters: it is there to be copied, not to be read."""
+# Marks the token in a figure.
 _BENEATH: Final = "token"
-"""Marks the token in a figure."""
 _CAPITALS: Final = re.compile(r"(?<=[a-z])(?=[A-Z])")
+# A place in axes, so that nothing stands beside them.
 INSIDE: Final[Mapping[str, Any]] = {"loc": "upper right", "frameon": True, "framealpha": 0.85}
-"""A place in axes, so that nothing stands beside them."""
+# Inches of a sign and the blanks around it, for letters of one point.
 _HANDLE: Final = 0.044
-"""Inches of a sign and the blanks around it, for letters of one point."""
+# Of a panel's width, for a legend below it.
 _LEGEND_SHARE: Final = 0.86
-"""Of a panel's width, for a legend below it."""
 _SPACING: Final[Mapping[str, Any]] = {"handlelength": 1.2, "columnspacing": 1.0}
+# Mark the words of a grey panel, and those for a title, so that `missing_words` finds them.
 _MISSING, _LACKS = "missing", "lacks"
-"""Mark the words of a grey panel, and those for a title, so that `missing_words` finds them."""
 _NO_CLOUD: Final = "no LiDAR file of "
 
 
@@ -301,7 +301,7 @@ def draw_missing_image(dataset: Dataset, sample_data: str, ax: Axes) -> None:
 def absence_text(dataset: Dataset, sample_data: str) -> str:
     """Why a sensor's file, by its token, is not there: the folder has files of other frames, or none at all."""
     folder = dataset.sensor_path(sample_data).parent
-    return "no file of this frame" if folder.is_dir() and listed(folder) else "not downloaded"
+    return "no file of this frame" if folder.is_dir() and folder_entries(folder) else "not downloaded"
 
 
 def write_missing(ax: Axes, words: str) -> None:

@@ -17,17 +17,17 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.text import Annotation
 
+# In points, in a notebook; `text_size` is that of the style.
 SMALLEST_TEXT: Final = 9
-"""In points, in a notebook; `text_size` is that of the style."""
+# Points of white around words.
 _PAD: Final = 1.5
-"""Points of white around words."""
+# Points from a place to its chip, the nearest first.
 _RINGS: Final = np.array([2.0, 5.0, 9.0, 14.0, 20.0, 28.0, 38.0, 50.0, 65.0, 85.0, 110.0])
-"""Points from a place to its chip, the nearest first."""
+# Points from a place from which a line leads to its chip.
 _LEADER: Final = 16.0
-"""Points from a place from which a line leads to its chip."""
 _TURNS: Final = np.radians([60, 120, 0, 180, -60, -120, 90, -90, 30, 150, -30, -150])
+# Directions from a place to its chip, the best first.
 _WAYS: Final = np.column_stack([np.cos(_TURNS), np.sin(_TURNS)])
-"""Directions from a place to its chip, the best first."""
 
 
 def place_chips(

@@ -28,10 +28,10 @@ Layer = Literal[
 above, `labels` what the motion labels say."""
 LAYERS: tuple[Layer, ...] = get_args(Layer)
 _UNDATED: Final[Mapping[str, dict[str, Any]]] = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}
+# Width by height of a view from above on a slide.
 _WIDE: Final = 1.6
-"""Width by height of a view from above on a slide."""
+# How often a figure is laid out at most; of its width or height, how far a panel that does not move may move.
 _PASSES, _STILL = 4, 1e-5
-"""How often a figure is laid out at most; of its width or height, how far a panel that does not move may move."""
 PICTURE_SUFFIXES: Final = (".png", ".pdf", ".svg", ".jpg", ".webp")
 
 

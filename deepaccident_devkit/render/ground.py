@@ -7,31 +7,17 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from deepaccident_devkit.dataset import Dataset
-from deepaccident_devkit.errors import MissingRoomError
 from deepaccident_devkit.geometry import SE3
 from deepaccident_devkit.release import BevImage
 from deepaccident_devkit.release.npz import TAGS
 from deepaccident_devkit.render.styles import BEV_COLORS
-from deepaccident_devkit.rooms import added
 from deepaccident_devkit.support.arrays import ByteArray
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+# Pixels of a BEV camera along a side, about: panels of a video have fewer, and more take time.
 _MOST_PIXELS: Final = 400
-"""Pixels of a BEV camera along a side, about: panels of a video have fewer, and more take time."""
-
-
-def map_beneath(dataset: Dataset, scenario: str, *, make: bool) -> Any:
-    """What `maps.pictures.map_beneath` finds; None too where that room is missing, if no map is to be made."""
-    try:
-        find = added("picture", "map")
-    except MissingRoomError:
-        if make:
-            raise
-        return None
-    return find(dataset, scenario, make=make)
 
 
 def draw_underlay(image: BevImage, ax: Axes, *, target_from_ego: SE3, view_range: float) -> None:

@@ -15,10 +15,10 @@ from deepaccident_devkit.support.arrays import IntArray
 from deepaccident_devkit.v2x import map_pointcloud_to_image
 from deepaccident_devkit.v2x.poses import ImagePoints, camera_of
 
+# Square cells across an image.
 _COLUMNS: Final = 50
-"""Square cells across an image."""
+# A point is seen up to its cell's depth times this, and so many metres more.
 _SHARE, _METRES = 1.1, 1.0
-"""A point is seen up to its cell's depth times this, and so many metres more."""
 
 
 def hiding(dataset: Dataset, camera: RowArgument) -> Callable[[ImagePoints], ImagePoints]:

@@ -55,10 +55,10 @@ _LAYERS: Final[tuple[Layer, ...]] = ("points", "boxes", "ids", "grid")
 _SHOWN: Final[tuple[Layer, ...]] = ("points", "boxes", "grid")
 
 
+# Metres around the agents and the pair.
 _AROUND: Final = 8.0
-"""Metres around the agents and the pair."""
+# Metres to each side that are shown at least and at most.
 _REACHES: Final = (25.0, 60.0)
-"""Metres to each side that are shown at least and at most."""
 _DASHED: Final = (0, (2, 1))
 _RECEIVER: Final[Mapping[str, Any]] = {
     "linestyle": "none",

@@ -15,7 +15,7 @@ from deepaccident_devkit.render.boxes import collider_ids, recorder_ids
 from deepaccident_devkit.render.captions import draw_legend, set_scene_title
 from deepaccident_devkit.render.figures import Layer, axes_or_new, figure_or_new, layers_of, settled
 from deepaccident_devkit.render.motion_maps import (
-    MAPS,
+    DRAWN_MAPS,
     DrawnMap,
     MotionMaps,
     draw_key,
@@ -32,8 +32,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+# `maps`: one panel for each map and frame; `trail`: one panel, the present opaque and later frames paler.
 MotionStyle = Literal["maps", "trail"]
-"""`maps`: one panel for each map and frame; `trail`: one panel, the present opaque and later frames paler."""
 _MAP_LAYERS: Final[tuple[Layer, ...]] = ("labels", "velocities", "ids", "grid")
 TRAIL_LAYERS: Final[tuple[Layer, ...]] = ("labels", "trajectories", "ids", "grid")
 _SHOWN: Final[dict[MotionStyle, tuple[Layer, ...]]] = {
@@ -42,10 +42,10 @@ _SHOWN: Final[dict[MotionStyle, tuple[Layer, ...]]] = {
 }
 _POSSIBLE: Final[dict[MotionStyle, tuple[Layer, ...]]] = {"maps": _MAP_LAYERS, "trail": TRAIL_LAYERS}
 _FEW_MAPS: Final = ("instance", "flow")
+# How many frames maps show in a small picture.
 _FEW_FRAMES: Final = {"column": 1, "page": 3, "slide": 3}
-"""How many frames maps show in a small picture."""
+# Width of the column that explains the colours, in widths of a panel.
 _KEY_WIDTH: Final = 0.5
-"""Width of the column that explains the colours, in widths of a panel."""
 
 
 @in_own_settings
@@ -185,7 +185,7 @@ def draw_motion_map(
     Raises:
         ChoiceError: no such map, frame or layer.
     """
-    name = choice("map", name, MAPS)
+    name = choice("map", name, DRAWN_MAPS)
     maps, shown = _maps(labels, marked), layers_of(layers, _SHOWN["maps"], _MAP_LAYERS)
     if frame not in range(len(maps.valid)):
         raise ChoiceError(f"frame: expected 0 to {len(maps.valid) - 1}, found {frame!r}")

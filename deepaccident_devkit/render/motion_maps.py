@@ -33,13 +33,13 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 DrawnMap = Literal["instance", "centerness", "offset", "flow"]
-MAPS: Final[tuple[DrawnMap, ...]] = get_args(DrawnMap)
+DRAWN_MAPS: Final[tuple[DrawnMap, ...]] = get_args(DrawnMap)
+# How opaque the last frame of a trail is; the present is 1.
 PALEST: Final = 0.22
-"""How opaque the last frame of a trail is; the present is 1."""
+# Points of the edge of the own box.
 _OWN_EDGE: Final = 1.0
-"""Points of the edge of the own box."""
+# Grey of what does not move.
 _STILL: Final = 0.92
-"""Grey of what does not move."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -73,7 +73,7 @@ class MotionMaps(FrozenArrays):
     @property
     def names(self) -> tuple[DrawnMap, ...]:
         """The names of the maps that are not None."""
-        return tuple(name for name in MAPS if getattr(self, name) is not None)
+        return tuple(name for name in DRAWN_MAPS if getattr(self, name) is not None)
 
     def vectors(self, name: DrawnMap) -> AnyArray:
         """`offset` or `flow`, (T, 2, H, W); raises ChoiceError if it is not there."""

@@ -20,10 +20,10 @@ if TYPE_CHECKING:
 _INCHES: Final = (3.6, 3.2)
 _DPI: Final = 80
 _MOST_POINTS: Final = 20_000
+# More are thinned out: a picture must not take long.
 _MOST_BOXES: Final = 1_000
-"""More are thinned out: a picture must not take long."""
+# Points.
 _LETTERS: Final = 7
-"""Points."""
 _LEVEL_FROM_OPTICAL: Final = SE3.from_rotation([[0, 0, 1], [-1, 0, 0], [0, -1, 0]])
 
 

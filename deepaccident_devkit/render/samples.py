@@ -39,32 +39,32 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+# The places of the six cameras in a picture of all of them.
 CAMERA_GRID: Final = (
     ("Camera_FrontLeft", "Camera_Front", "Camera_FrontRight"),
     ("Camera_BackLeft", "Camera_Back", "Camera_BackRight"),
 )
-"""The places of the six cameras in a picture of all of them."""
+# The same in a figure of about 16 to 9.
 _TALL_GRID: Final = (
     ("Camera_Front", "Camera_Back"),
     ("Camera_FrontLeft", "Camera_FrontRight"),
     ("Camera_BackLeft", "Camera_BackRight"),
 )
-"""The same in a figure of about 16 to 9."""
+# The least width by height of a figure with room for three cameras and a view from above side by side.
 _WIDE: Final = 2.1
-"""The least width by height of a figure with room for three cameras and a view from above side by side."""
+# Metres: the least reach of a view that agents share, and what it shows around them.
 _LEAST_SHARED, _AROUND_SHARED = 30.0, 12.0
-"""Metres: the least reach of a view that agents share, and what it shows around them."""
+# Of the width, for cameras beside a shared view.
 _MOST_CAMERAS: Final = 0.66
-"""Of the width, for cameras beside a shared view."""
+# Inches of room for words above and below panels, beside them, and for a panel's title, for letters of one point.
 _ABOUT, _BESIDE, _TITLE = 0.178, 0.08, 0.02
-"""Inches of room for words above and below panels, beside them, and for a panel's title, for letters of one point."""
+# Width by height at most of a view that agents share.
 _WIDEST: Final = 2.2
-"""Width by height at most of a view that agents share."""
 MOMENT_LAYERS: Final = tuple(layer for layer in LAYERS if layer in {*CAMERA_LAYERS, *BEV_LAYERS})
 CALIBRATION_LAYERS: Final[tuple[Layer, ...]] = ("image", "points", "boxes", "ids")
 _DEFAULT: Final[tuple[Layer, ...]] = ("image", "points", "boxes")
+# Metres from the camera up to which boxes are rendered: farther ones are as small as the errors to be found.
 _FARTHEST: Final = 60.0
-"""Metres from the camera up to which boxes are rendered: farther ones are as small as the errors to be found."""
 _COLUMNS: Final = 3
 
 

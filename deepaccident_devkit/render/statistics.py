@@ -41,11 +41,11 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _DPI = 120
+# Percents: a smaller share has no number.
 _LEAST_SHARE: Final = 0.1
-"""Percents: a smaller share has no number."""
 _Draw = Callable[[DatasetStatistics, "Figure"], None]
+# Inches of a page of A4 in landscape.
 _WIDTH: Final = 10.7
-"""Inches of a page of A4 in landscape."""
 
 
 def draw_counts(table: CountTable, ax: Axes) -> Axes:
@@ -253,8 +253,8 @@ _FIGURES: Mapping[str, tuple[tuple[float, float], _Draw]] = {
     "motion": ((_WIDTH, 8), _motion),
     "collisions": ((_WIDTH, 5.2), _collisions),
 }
+# The groups that `render_statistics` renders → width and height of their figures in inches.
 STATISTICS_FIGURES: Final[Mapping[str, tuple[float, float]]] = {group: size for group, (size, _) in _FIGURES.items()}
-"""The groups that `render_statistics` renders → width and height of their figures in inches."""
 
 
 @in_own_settings

@@ -20,12 +20,12 @@ from deepaccident_devkit.support.pages import part
 from deepaccident_devkit.support.text import choice
 from deepaccident_devkit.taxonomy import AGENTS, SPLITS, StyleName
 
+# Blue, cyan, orange, dark yellow and purple; too pale for words on white, which are dark.
 AGENT_COLORS: Mapping[str, str] = dict(
     zip(AGENTS, ("#2b6fe0", "#2fc0cc", "#fa7b40", "#dfb000", "#563083"), strict=True)
 )
-"""Blue, cyan, orange, dark yellow and purple; too pale for words on white, which are dark."""
+# The colliding pair.
 COLLIDER_COLOR = "#c4001a"
-"""The colliding pair."""
 CATEGORY_COLORS: Mapping[str, str] = {
     "car": "#63717e",
     "truck": "#323f4b",
@@ -34,6 +34,7 @@ CATEGORY_COLORS: Mapping[str, str] = {
     "motorcycle": "#7b8996",
     "pedestrian": "#1d272f",
 }
+# Hues of the classes, for pictures that are about them: all eyes tell them from each other and from the pair's red.
 CLASS_COLORS: Mapping[str, str] = {
     "car": "#40409f",
     "truck": "#402040",
@@ -42,25 +43,25 @@ CLASS_COLORS: Mapping[str, str] = {
     "motorcycle": "#ff8000",
     "pedestrian": "#9f00ff",
 }
-"""Hues of the classes, for pictures that are about them: all eyes tell them from each other and from the pair's red."""
+# matplotlib's markers of the classes whose boxes are too small to be found from above.
 CATEGORY_MARKERS: Mapping[str, str] = {"cyclist": "D", "motorcycle": "^", "pedestrian": "o"}
-"""matplotlib's markers of the classes whose boxes are too small to be found from above."""
+# Instances of motion maps, by turns.
 INSTANCE_COLORS = ("#63717e", "#b5c3cf", "#4a5864", "#94a2b0", "#323f4b", "#7b8996")
-"""Instances of motion maps, by turns."""
+# A mark for the recording agent itself, in addition to the colour of its part in the accident.
 OWN_COLOR = "#111111"
-"""A mark for the recording agent itself, in addition to the colour of its part in the accident."""
+# Edges around marks and lines that lie on pictures.
 CASING_COLOR = "#ffffff"
-"""Edges around marks and lines that lie on pictures."""
+# LiDAR points that are not coloured by a value.
 POINT_COLOR = "#9a9a9a"
-"""LiDAR points that are not coloured by a value."""
+# LiDAR points in images; the nearest are yellow.
 DEPTH_COLORMAP = "viridis_r"
-"""LiDAR points in images; the nearest are yellow."""
 HEIGHT_COLORMAP = "cividis"
+# The same for pages, from low to high.
 HEIGHT_COLORS = ("#00224e", "#434e6c", "#7d7c78", "#bcae6c", "#fee838")
-"""The same for pages, from low to high."""
 CENTERNESS_COLORMAP = "Greys"
+# Flow forward, to the left, backward and to the right; between them the colours are mixed.
 DIRECTION_COLORS = ("#2a78c2", "#2a9d6f", "#c9b23a", "#8a5fb0")
-"""Flow forward, to the left, backward and to the right; between them the colours are mixed."""
+# CARLA's tags in the BEV camera, in pale colours: boxes are rendered over them.
 BEV_COLORS: Mapping[str, str] = {
     "road": "#e9e9ec",
     "road_line": "#ffffff",
@@ -68,33 +69,33 @@ BEV_COLORS: Mapping[str, str] = {
     "vehicle": "#d3d9e0",
     "pedestrian": "#d3d9e0",
 }
-"""CARLA's tags in the BEV camera, in pale colours: boxes are rendered over them."""
+# The ground of a town's map that is alone in its picture.
 MAP_COLORS: Mapping[str, str] = {"road": "#868f98", "road_line": "#ffffff", "sidewalk": "#d8c8a0", "other": "#dde4e0"}
-"""The ground of a town's map that is alone in its picture."""
 GRID_COLOR = "#d0d0d0"
+# The place of an image that is not there.
 MISSING_COLOR = "#dddddd"
-"""The place of an image that is not there."""
+# Less important words.
 MUTED_COLOR = "#666666"
-"""Less important words."""
+# The true place of something that is also rendered at another place.
 TRUE_PLACE_COLOR = "#8a8a8a"
-"""The true place of something that is also rendered at another place."""
+# Predictions that are right, predictions that are false, and truths that are missed: green, sand and pale grey.
 OUTCOME_COLORS: Mapping[str, str] = {"right": "#23644d", "false": "#a98c52", "missed": "#bcc0c3"}
-"""Predictions that are right, predictions that are false, and truths that are missed: green, sand and pale grey."""
+# Predictions without a verdict: mauve.
 PREDICTED_COLOR = "#a8679b"
-"""Predictions without a verdict: mauve."""
+# Lines or bars of the same kind for several values of one number, the strictest value first.
 SERIES_COLORS = ("#1a3344", "#4b667c", "#8399ac", "#b5c3cf")
-"""Lines or bars of the same kind for several values of one number, the strictest value first."""
 SPLIT_COLORS: Mapping[str, str] = dict(
     zip((*SPLITS, "unknown"), ("#284052", "#627a8e", "#9badbe", "#d3d8dc"), strict=True)
 )
+# A number with an interval.
 ESTIMATE_COLOR = "#3d627d"
-"""A number with an interval."""
+# Important words, dark brown: the words of a warning are not the colliding pair.
 WARNING_COLOR = "#6b4a10"
-"""Important words, dark brown: the words of a warning are not the colliding pair."""
+# Links and the focus of the keyboard on pages.
 LINK_COLOR = "#2f4a63"
-"""Links and the focus of the keyboard on pages."""
+# Background of a frame that is not recorded.
 BEYOND_COLOR = "#e4e4e4"
-"""Background of a frame that is not recorded."""
+# Dark for readers whose system is.
 COLORS: Final = f"""
 :root {{ color-scheme: light; --paper: #fff; --ink: #1c1c1c; --soft: #444; --dim: #555; --line: #ececec;
   --rule: {GRID_COLOR}; --accent: {LINK_COLOR}; --caution: {WARNING_COLOR};
@@ -105,12 +106,11 @@ COLORS: Final = f"""
     --warning: color-mix(in srgb, var(--caution) 40%, #fff); --block: #292929; --edge: #777; }}
 }}
 """
-"""Dark for readers whose system is."""
 Drawing = TypeVar("Drawing", bound=Callable[..., Any])
+# Inches of a picture's height that words take, about: they shrink less than the picture.
 _ROOM_FOR_WORDS: Final = 0.5
-"""Inches of a picture's height that words take, about: they shrink less than the picture."""
+# Type 42: the letters of a PDF file stay letters, as publishers ask.
 _FONTS: Final = {"pdf.fonttype": 42, "ps.fonttype": 42}
-"""Type 42: the letters of a PDF file stay letters, as publishers ask."""
 _applied: ContextVar[_Style | None] = ContextVar("applied", default=None)
 _ONE_AT_A_TIME: Final = RLock()  # matplotlib has its settings once for all threads
 
@@ -166,8 +166,8 @@ def _printed(panel: float, figure: float) -> _Style:
     return _small(7, dpi=300, panel=panel, figure=figure, room="column" if figure < _COLUMN else "page")
 
 
+# Inches: a narrower picture is a column of a paper.
 _COLUMN: Final = 4.0
-"""Inches: a narrower picture is a column of a paper."""
 _STYLES: Final[Mapping[str, _Style]] = {
     "paper": _printed(3.5, 7.16),
     "cvpr-column": _printed(3.25, 3.25),

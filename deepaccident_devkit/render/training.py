@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 _PANEL: Final = (3.4, 2.4)
 _COLUMNS: Final = 3
 _DPI: Final = 120
+# Steps are averaged in at most so many groups, so that a curve shows its way and not its noise.
 _MEANS: Final = 60
-"""Steps are averaged in at most so many groups, so that a curve shows its way and not its noise."""
 
 
 @in_own_settings

@@ -15,7 +15,6 @@ import numpy as np
 
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ChoiceError, MissingExtraError
-from deepaccident_devkit.parallel import Engine, Places, in_order, run_unordered
 from deepaccident_devkit.render.accident import PAIR_LAYERS, draw_countdown
 from deepaccident_devkit.render.bev import BEV_LAYERS, render_bev
 from deepaccident_devkit.render.camera import CAMERA_DEFAULT, CAMERA_LAYERS, draw_camera
@@ -32,6 +31,7 @@ from deepaccident_devkit.render.styles import in_own_settings
 from deepaccident_devkit.render.visibility import VISIBILITY_LAYERS, render_visibility, render_visibility_matrix
 from deepaccident_devkit.support.arrays import ByteArray
 from deepaccident_devkit.support.files import replacing
+from deepaccident_devkit.support.parallel import Engine, Places, in_order, run_unordered
 from deepaccident_devkit.support.text import choice, path_of
 from deepaccident_devkit.tables.tokens import frame_token, sample_token
 from deepaccident_devkit.taxonomy import CAMERAS
@@ -46,20 +46,20 @@ if TYPE_CHECKING:
 
     from deepaccident_devkit.tables.records import FrameRecord
 
+# Quality of H.264: 0 loses nothing, 51 is the worst.
 _CRF: Final = "20"
-"""Quality of H.264: 0 loses nothing, 51 is the worst."""
 _WEBP_QUALITY: Final = 70
+# Colours of a GIF; one more is kept for pixels that do not change.
 _COLORS: Final = 255
-"""Colours of a GIF; one more is kept for pixels that do not change."""
+# About so many pixels of all pictures are used to choose the palette.
 _LOOKED_AT: Final = 2_000_000
-"""About so many pixels of all pictures are used to choose the palette."""
+# Renders a moment, given by its record, on an empty figure; its result is not used.
 OwnView = Callable[[Dataset, "FrameRecord", "Figure"], object]
-"""Renders a moment, given by its record, on an empty figure; its result is not used."""
 _DPI: Final = 100.0
+# Pixels that stay free beside a view.
 _EDGE: Final = 5
-"""Pixels that stay free beside a view."""
+# A picture with so many pixels has `_DPI` pixels an inch; larger ones have more, so words keep their share.
 _DPI_AT: Final = 1280 * 720
-"""A picture with so many pixels has `_DPI` pixels an inch; larger ones have more, so words keep their share."""
 
 
 def check_target(path: Path, *, size: tuple[int, int], fps: float) -> None:
@@ -142,16 +142,16 @@ def _save_animation(path: Path, images: Sequence[Image], fps: float, **how: Any)
     first.save(path, save_all=True, append_images=others, duration=round(1000 / fps), loop=0, **how)
 
 
+# Suffix → the writer of such files.
 SUFFIXES: Final[Mapping[str, Callable[[Path, Iterable[ByteArray], float], None]]] = {
     ".mp4": _write_mp4,
     ".gif": _write_gif,
     ".webp": _write_webp,
 }
-"""Suffix → the writer of such files."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class View:
+class _View:
     """One way to render a moment.
 
     Attributes:
@@ -201,27 +201,27 @@ def _draw_channel(channel: str, dataset: Dataset, sample: str, *, layers: tuple[
     draw_camera(dataset, dataset.get("sample_data", f"{sample}/{channel}"), shown, ax)
 
 
-VIEWS: Final[Mapping[str, View]] = {
-    "frame": View(draw=draw_shared_moment, of="frame", layers=MOMENT_LAYERS, share=2, inches=12.8),
-    "sample": View(draw=render_sample, layers=MOMENT_LAYERS, share=2, inches=12.8),
-    "accident": View(draw=draw_countdown, of="frame", layers=PAIR_LAYERS, share=2, inches=12.8),
-    "bev": View(draw=render_bev, canvas="ax", layers=BEV_LAYERS, inches=4.6),
-    "visibility": View(draw=render_visibility, canvas="ax", layers=VISIBILITY_LAYERS),
-    "visibility_matrix": View(draw=render_visibility_matrix, canvas="ax", takes=("agents",), layers=()),
-    "calibration": View(draw=render_calibration, of="frame", layers=CALIBRATION_LAYERS, share=2, inches=12.0),
-    "labels": View(
+# The views by name; cameras are those of the first agent.
+VIEWS: Final[Mapping[str, _View]] = {
+    "frame": _View(draw=draw_shared_moment, of="frame", layers=MOMENT_LAYERS, share=2, inches=12.8),
+    "sample": _View(draw=render_sample, layers=MOMENT_LAYERS, share=2, inches=12.8),
+    "accident": _View(draw=draw_countdown, of="frame", layers=PAIR_LAYERS, share=2, inches=12.8),
+    "bev": _View(draw=render_bev, canvas="ax", layers=BEV_LAYERS, inches=4.6),
+    "visibility": _View(draw=render_visibility, canvas="ax", layers=VISIBILITY_LAYERS),
+    "visibility_matrix": _View(draw=render_visibility_matrix, canvas="ax", takes=("agents",), layers=()),
+    "calibration": _View(draw=render_calibration, of="frame", layers=CALIBRATION_LAYERS, share=2, inches=12.0),
+    "labels": _View(
         draw=partial(render_motion_labels, style="trail"), takes=("layers",), layers=TRAIL_LAYERS, inches=5.5
     ),
     **{
-        channel: View(draw=partial(_draw_channel, channel), canvas="ax", takes=("layers",), layers=CAMERA_LAYERS)
+        channel: _View(draw=partial(_draw_channel, channel), canvas="ax", takes=("layers",), layers=CAMERA_LAYERS)
         for channel in CAMERAS
     },
 }
-"""The views by name; cameras are those of the first agent."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Scene:
+class VideoScene:
     """How every frame of a video is rendered.
 
     Attributes:
@@ -233,7 +233,7 @@ class Scene:
     """
 
     dataset: Dataset
-    views: tuple[tuple[View, tuple[Layer, ...] | None], ...]
+    views: tuple[tuple[_View, tuple[Layer, ...] | None], ...]
     agents: Agents
     width: int
     height: int
@@ -251,7 +251,7 @@ class Scene:
 
     @in_own_settings
     def _drawn(
-        self, view: View, width: int, frame: str, agents: Sequence[str], layers: tuple[Layer, ...] | None
+        self, view: _View, width: int, frame: str, agents: Sequence[str], layers: tuple[Layer, ...] | None
     ) -> ByteArray:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
 
@@ -274,7 +274,7 @@ def names_at(dataset: Dataset, frame: str, agents: Agents) -> tuple[str, ...]:
 
 def views_of(
     what: str | OwnView | Iterable[str | OwnView], layers: Iterable[Layer] | None
-) -> tuple[tuple[View, tuple[Layer, ...] | None], ...]:
+) -> tuple[tuple[_View, tuple[Layer, ...] | None], ...]:
     """The named views, each with those of the layers that it has; raises ChoiceError."""
     given: list[Any] = [what] if isinstance(what, str) or callable(what) else list(what)
     if not given:
@@ -287,8 +287,8 @@ def views_of(
     return tuple((view, tuple(layer for layer in view.layers if layer in chosen)) for view in views)
 
 
-def _view(given: object) -> View:
-    return View(draw=given, layers=(), own=True) if callable(given) else VIEWS[choice("what", given, VIEWS)]
+def _view(given: object) -> _View:
+    return _View(draw=given, layers=(), own=True) if callable(given) else VIEWS[choice("what", given, VIEWS)]
 
 
 def render_scenario_video(  # noqa: PLR0913 - each is a choice that stands on its own in a notebook
@@ -344,7 +344,7 @@ def render_scenario_video(  # noqa: PLR0913 - each is a choice that stands on it
     tokens = [frame_token(record["token"], number) for number in _numbers(frames, record["num_frames"])]
     names_at(dataset, tokens[0], agents)  # before any worker starts
     own = [view.draw for view, _ in views if view.own]
-    scene = Scene(dataset=dataset, views=views, agents=agents, width=width, height=height)
+    scene = VideoScene(dataset=dataset, views=views, agents=agents, width=width, height=height)
     engine: Engine = {"progress": True, **how, "workers": _workers(own, how.get("workers"))}
     drawn = run_unordered(scene.picture, tokens, label="frames", places=Places(reads=dataset.places), **engine)
     with closing(in_order(drawn)) as pictures:

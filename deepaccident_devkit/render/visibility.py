@@ -57,28 +57,28 @@ from deepaccident_devkit.v2x.cooperation import visible_actors
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+# The slashes of a frame's token, `<scenario_type>/<name>/<NNN>`; a sample's token has one more, for the agent.
 _FRAME_SLASHES: Final = 2
-"""The slashes of a frame's token, `<scenario_type>/<name>/<NNN>`; a sample's token has one more, for the agent."""
 VISIBILITY_LAYERS: Final[tuple[Layer, ...]] = ("points", "boxes", "ids", "velocities", "visibility", "grid")
 _SHOWN: Final[tuple[Layer, ...]] = ("boxes", "visibility", "grid")
+# Metres that are shown around the agents and the colliding pair.
 _MARGIN: Final = 10.0
-"""Metres that are shown around the agents and the colliding pair."""
+# At least so many metres are shown to each side.
 _LEAST: Final = 25.0
-"""At least so many metres are shown to each side."""
+# Points from one agent's dot to the next.
 _SLOT: Final = 4.6
-"""Points from one agent's dot to the next."""
+# Points from an actor's box up to its dots.
 _ABOVE: Final = 5.0
-"""Points from an actor's box up to its dots."""
+# Of the width of the view that a line lies to the right of its way, so that two that look at each other have two.
 _ASIDE: Final = 0.006
-"""Of the width of the view that a line lies to the right of its way, so that two that look at each other have two."""
+# Of half the view, between its edge and a box that has made it larger.
 _EDGE: Final = 0.05
-"""Of half the view, between its edge and a box that has made it larger."""
+# Of the table's width, about: where the middle of the picture is, with the names of actors on the left.
 _MIDDLE: Final = 0.36
-"""Of the table's width, about: where the middle of the picture is, with the names of actors on the left."""
 _MOST_ROWS: Final = 24
 _ROWS_OF_A_SLIDE: Final = 14
+# Relative luminance (as in sRGB) of a colour from which black text on it is easier to read.
 _BRIGHT: Final = 0.3
-"""Relative luminance (as in sRGB) of a colour from which black text on it is easier to read."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -1,4 +1,4 @@
-"""Finding scenarios by their attributes: `da.find(...)`, the texts of `--where`, and the groups of `--by`.
+"""Selecting scenarios by their attributes (`da.find(...)`, `--where`, the groups of `--by`), and lists of samples.
 
 **Fields.** A filter names a column of the scenario table, or something that is derived from the table; `deepaccident
 info --fields` lists them with their values. `--by` of `deepaccident evaluate` takes those of few values, and

@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 
 from deepaccident_devkit.errors import ChoiceError
-from deepaccident_devkit.selection.fields import Field, Value
+from deepaccident_devkit.selection.fields import Field, FieldValue
 from deepaccident_devkit.support.text import meant_text, possible_text
 
-FilterValue = Value | Collection[Value]
+FilterValue = FieldValue | Collection[FieldValue]
 """What a keyword of `find` takes: a value, or several values, one of which must match."""
 
 _TEXT = re.compile(r"\s*(\w+)\s*(!=|>=|<=|=|>|<)(.*)", re.DOTALL)
@@ -25,10 +25,10 @@ _RANGE = re.compile(rf"({_NUMBER})?\s*\.\.\s*({_NUMBER})?")
 _BOUND = re.compile(rf"(>=|<=|>|<)\s*({_NUMBER})")
 _UNKNOWN = ("unknown", "none")
 _FLAGS = {"true": True, "yes": True, "false": False, "no": False}
+# Types that Python takes for collections and a filter does not; of these only a str can be a value.
 _SINGLE = (str, bytes, bytearray, Mapping, np.ndarray)
-"""Types that Python takes for collections and a filter does not; of these only a str can be a value."""
+# Characters of a wrong value that a message shows.
 _LONGEST = 60
-"""Characters of a wrong value that a message shows."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,11 +58,11 @@ class Condition:
     """
 
     field: Field
-    values: frozenset[Value]
+    values: frozenset[FieldValue]
     ranges: tuple[tuple[float | None, float | None], ...]
     negated: bool
 
-    def holds(self, value: Value | tuple[Value, ...]) -> bool:
+    def holds(self, value: FieldValue | tuple[FieldValue, ...]) -> bool:
         """Whether a scenario with this value of the field, or with these, is wanted."""
         several = value if isinstance(value, tuple) else (value,)
         met = (each in self.values or any(_within(each, *bounds) for bounds in self.ranges) for each in several)
@@ -103,10 +103,10 @@ def keyword_filter(name: str, value: FilterValue) -> Filter:
     return Filter(name, tuple(value) if several else (value,))  # type: ignore[arg-type]
 
 
-def condition_of(wanted: Filter, field: Field, here: Iterable[Value]) -> Condition:
+def condition_of(wanted: Filter, field: Field, here: Iterable[FieldValue]) -> Condition:
     """Check a filter against its field, whose values in this release are always possible; raises ChoiceError."""
     possible = list(dict.fromkeys([*field.known, *sorted({str(value) for value in here if value is not None})]))
-    singles: set[Value] = set()
+    singles: set[FieldValue] = set()
     ranges = []
     for given in wanted.values:
         value = given.item() if isinstance(given, np.generic) else given
@@ -118,7 +118,7 @@ def condition_of(wanted: Filter, field: Field, here: Iterable[Value]) -> Conditi
     return Condition(field, frozenset(singles), tuple(ranges), wanted.negated)
 
 
-def _single(field: Field, value: object, possible: list[str]) -> Value:
+def _single(field: Field, value: object, possible: list[str]) -> FieldValue:
     """One value of a field, in the field's own type."""
     if value is None or (isinstance(value, str) and value.lower() in _UNKNOWN):
         return None
@@ -218,7 +218,7 @@ def _ends(sign: str, number: float) -> tuple[float | None, float | None]:
     return (number, None) if sign.startswith(">") else (None, number)
 
 
-def _within(value: Value, lowest: float | None, highest: float | None) -> bool:
+def _within(value: FieldValue, lowest: float | None, highest: float | None) -> bool:
     if not isinstance(value, int | float):
         return False
     return (lowest is None or lowest <= value) and (highest is None or value <= highest)

@@ -8,10 +8,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 from deepaccident_devkit import taxonomy
-from deepaccident_devkit.accidents.twins import twin_of
+from deepaccident_devkit.collisions.twins import twin_of
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import FieldError, NotAvailableError
-from deepaccident_devkit.rooms import added
 from deepaccident_devkit.support.text import columns_text, possible_text
 from deepaccident_devkit.tables.columns import Choice, Column, Number, Struct
 from deepaccident_devkit.tables.records import table_spec
@@ -21,12 +20,12 @@ from deepaccident_devkit.v2x.agents import VISIBILITIES
 if TYPE_CHECKING:
     from deepaccident_devkit.tables.records import ScenarioRecord
 
-Value = str | int | float | bool | None
-_Read = Callable[[Dataset, "ScenarioRecord"], Value | tuple[Value, ...]]
-_ReadAll = Callable[[Dataset, "Sequence[ScenarioRecord]"], Iterable[Value]]
-Kind = Literal["word", "number", "measure", "flag"]
+FieldValue = str | int | float | bool | None
+_Read = Callable[[Dataset, "ScenarioRecord"], FieldValue | tuple[FieldValue, ...]]
+_ReadAll = Callable[[Dataset, "Sequence[ScenarioRecord]"], Iterable[FieldValue]]
+FieldKind = Literal["word", "number", "measure", "flag"]
 
-STRAIGHT: Final = "straight_straight"
+_STRAIGHT: Final = "straight_straight"
 TURNING: Final = "one_of_the_agents_turning"
 _WEATHER_GROUPS: Final = {"Rain": "Rainy", "Cloudy": "Cloudy", "Clear": "Clear"}
 _OF_MOVING_PAIRS: Final = {
@@ -36,8 +35,8 @@ _OF_MOVING_PAIRS: Final = {
     "max_drac": "The most deceleration that a moving pair needs to avoid a crash (m/s²).",
 }
 _SHORT = {"type": "scenario_type", "length": "num_frames"}
+# Columns of words that are not limited, yet few.
 _FEW: Final = ("scenario_type", "town")
-"""Columns of words that are not limited, yet few."""
 _KNOWN: dict[str, Sequence[str | int]] = {
     "town": taxonomy.TOWNS,
     "weather": taxonomy.WEATHERS,
@@ -65,7 +64,7 @@ class Field:
     """
 
     name: str
-    kind: Kind
+    kind: FieldKind
     doc: str
     read: _Read
     known: Sequence[str | int] = ()
@@ -80,7 +79,9 @@ class Field:
             return {"flag": "true, false", "number": "numbers", "measure": "numbers"}.get(self.kind, "words")
         return ", ".join(map(str, self.known))
 
-    def values(self, dataset: Dataset, scenarios: Sequence[ScenarioRecord]) -> Iterable[Value | tuple[Value, ...]]:
+    def values(
+        self, dataset: Dataset, scenarios: Sequence[ScenarioRecord]
+    ) -> Iterable[FieldValue | tuple[FieldValue, ...]]:
         """Its values of scenarios, in their order."""
         if self.read_all is not None:
             return self.read_all(dataset, scenarios)
@@ -122,7 +123,7 @@ def _text(value: Any) -> str | None:
 
 def _column(column: Column) -> Field:
     """The field that is a column of the scenario table."""
-    kind: Kind = "word"
+    kind: FieldKind = "word"
     if isinstance(column.kind, Number):
         kind = "flag" if column.kind.dtype == "bool" else "number"
     known = _KNOWN.get(column.field, column.kind.values if isinstance(column.kind, Choice) else ())
@@ -171,7 +172,7 @@ def _trajectory_type(_: Dataset, scenario: ScenarioRecord) -> str | None:
     road, directions = scenario["road_type"], (scenario["ego_direction"], scenario["other_direction"])
     if road is None or None in directions:
         return None
-    return STRAIGHT if road.startswith("four") and directions == ("straight", "straight") else TURNING
+    return _STRAIGHT if road.startswith("four") and directions == ("straight", "straight") else TURNING
 
 
 def _closing_speed(dataset: Dataset, scenario: ScenarioRecord) -> float | None:
@@ -193,8 +194,9 @@ def _of_moving_pairs(name: str) -> Field:
     """One of the fields that are measures of a scenario's interactions."""
 
     def read_all(dataset: Dataset, scenarios: Sequence[ScenarioRecord]) -> Iterable[float | None]:
-        values: Iterable[float | None] = added("field", name)(name, dataset, scenarios)
-        return values
+        from deepaccident_devkit.interactions.scenario import each_of_moving_pairs  # other fields do without it
+
+        return each_of_moving_pairs(name, dataset, scenarios)
 
     def read(dataset: Dataset, scenario: ScenarioRecord) -> float | None:
         return next(iter(read_all(dataset, [scenario])))
@@ -224,7 +226,7 @@ _DERIVED = (
         "word",
         "Straight_straight at four-way junctions alone.",
         _trajectory_type,
-        (STRAIGHT, TURNING),
+        (_STRAIGHT, TURNING),
         groups=True,
     ),
     Field(

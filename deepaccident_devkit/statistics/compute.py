@@ -10,7 +10,7 @@ import numpy as np
 from deepaccident_devkit import taxonomy
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.geometry import quaternions
-from deepaccident_devkit.rooms import added
+from deepaccident_devkit.interactions.scenario import least_times
 from deepaccident_devkit.statistics.report import DatasetStatistics
 from deepaccident_devkit.statistics.results import (
     CRITICAL,
@@ -18,7 +18,7 @@ from deepaccident_devkit.statistics.results import (
     GROUPS,
     PROBABILITIES,
     TOTAL,
-    UNKNOWN,
+    UNKNOWN_SPLIT,
     CollisionPair,
     CountTable,
     Histogram,
@@ -35,19 +35,20 @@ from deepaccident_devkit.taxonomy import AGENTS, CATEGORIES, OWN_ACTOR_ID, STATI
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
-    from deepaccident_devkit.parallel import Engine
+    from deepaccident_devkit.support.parallel import Engine
     from deepaccident_devkit.tables.records import AgentRecord, ScenarioRecord
 
 Chosen = RowArgument | Iterable[RowArgument] | None
 """Tokens or records of scenarios, or a single one; None for all."""
+# The groups that the total is made of; a row's code counts in them, −1 for rows that do not count.
 _PARTS: Final = GROUPS[1:]
-"""The groups that the total is made of; a row's code counts in them, −1 for rows that do not count."""
 _EGO: Final = AGENTS[0]
 _SIZES: Final = ("length", "width", "height")
 _BIN: Final = 30
+# Twelve bins around 0°, 30°, …, 330°.
 _ANGLES: Final = tuple(range(-_BIN // 2, 360, _BIN))
-"""Twelve bins around 0°, 30°, …, 330°."""
 _TTCS: Final = (0.0, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 7.5, 10.0)
+# Table of counts → title, field, words that are there in any case, what is counted.
 _OF_SCENARIOS: Final[Mapping[str, tuple[str, str, Sequence[str], str]]] = {
     "scenario_types": ("Scenario types", "scenario_type", (), "scenarios"),
     "towns": ("Towns", "town", taxonomy.TOWNS, "scenarios"),
@@ -59,7 +60,6 @@ _OF_SCENARIOS: Final[Mapping[str, tuple[str, str, Sequence[str], str]]] = {
     "collisions": ("Ended in a collision", "collision", ("yes", "no"), "scenarios"),
     "ends": ("How scenarios ended", "end", ENDS, "scenarios"),
 }
-"""Table of counts → title, field, words that are there in any case, what is counted."""
 
 
 def dataset_statistics(
@@ -151,7 +151,7 @@ class _Chosen:
 
 def _split_of(scenario: ScenarioRecord) -> str:
     """The group, besides the total, that a scenario counts for."""
-    return scenario["split"] or UNKNOWN
+    return scenario["split"] or UNKNOWN_SPLIT
 
 
 def _by_group(groups: AnyArray, weights: Iterable[int] | None = None) -> dict[str, int]:
@@ -224,11 +224,11 @@ def _scenario_counts(chosen: _Chosen) -> list[CountTable]:
     frames = np.array([scenario["num_frames"] for scenario in records], dtype=np.int64)
     for name, (title, field, known, counted) in _OF_SCENARIOS.items():
         words = [
-            (chosen.ends[scenario["token"]] if field == "end" else word_of(scenario, field)) or UNKNOWN
+            (chosen.ends[scenario["token"]] if field == "end" else word_of(scenario, field)) or UNKNOWN_SPLIT
             for scenario in records
         ]
-        others = sorted(set(words) - {*known, UNKNOWN})
-        listed = [*known, *others, *({UNKNOWN} & set(words))]
+        others = sorted(set(words) - {*known, UNKNOWN_SPLIT})
+        listed = [*known, *others, *({UNKNOWN_SPLIT} & set(words))]
         rows = {word: [row for row, each in enumerate(words) if each == word] for word in listed}
         counts = {
             word: _by_group(groups[here], frames[here] if counted == "frames" else None) for word, here in rows.items()
@@ -375,7 +375,7 @@ def _distribution(
 
 def _interactions(chosen: _Chosen, **how: Unpack[Engine]) -> list[Histogram]:
     """The least time to collision of pairs of which each moves at some frame, and of scenarios."""
-    pairs: list[FloatArray] = added("table", "interactions")(chosen.dataset, list(chosen.scenarios.values()), **how)
+    pairs = least_times(chosen.dataset, list(chosen.scenarios.values()), **how)
     codes = chosen.scenario_group[list(chosen.scenarios)]
     of_pairs = np.concatenate([np.zeros(0), *pairs])
     of_scenarios = np.array([each.min(initial=np.inf) for each in pairs])
@@ -460,7 +460,7 @@ def _pair(
     return CollisionPair(
         scenario=scenario["token"],
         split=_split_of(scenario),
-        end=chosen.ends[scenario["token"]] or UNKNOWN,
+        end=chosen.ends[scenario["token"]] or UNKNOWN_SPLIT,
         actor=names[0],
         category=categories[0],
         other=names[1],

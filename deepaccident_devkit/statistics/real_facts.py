@@ -14,8 +14,8 @@ from typing import Final, Literal
 from deepaccident_devkit.support.arrays import ShortRepr
 from deepaccident_devkit.support.json_text import as_record
 
-Verdict = Literal["agree", "differ", "cannot say"]
-Kind = Literal["all", "some", "share", "mean", "median", "few", "most", "least", "area", "range"]
+FactVerdict = Literal["agree", "differ", "cannot say"]
+FactKind = Literal["all", "some", "share", "mean", "median", "few", "most", "least", "area", "range"]
 """What is compared: a share (that must be all, or some, or is a number), a mean, a median, percentiles where there are
 few real cases, the most, the least, an AUC, or a median that lies in a range."""
 
@@ -44,7 +44,7 @@ class Fact(ShortRepr):
 
     key: str
     name: str
-    kind: Kind
+    kind: FactKind
     confidence: Literal["A", "B", "C", ""] = ""
     source: str = ""
     real_cases: int = 0
@@ -55,7 +55,7 @@ class Fact(ShortRepr):
     ends: tuple[float, float] | None = None
     cases: int = 0
     scenarios: int = 0
-    verdict: Verdict = "cannot say"
+    verdict: FactVerdict = "cannot say"
 
     def texts(self) -> tuple[str, ...]:
         """A table's cells: fact, confidence, others, here, cases, verdict."""

@@ -10,27 +10,27 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from deepaccident_devkit._version import __version__
-from deepaccident_devkit.accidents.recorded import each_scenario, those_of
+from deepaccident_devkit.collisions.recorded import each_scenario, those_of
 from deepaccident_devkit.dataset import Dataset, RowArgument
-from deepaccident_devkit.reports import CheckReport
-from deepaccident_devkit.statistics.real_facts import FACTS, Fact, Verdict
-from deepaccident_devkit.statistics.scenario_facts import ScenarioFacts, scenario_facts
+from deepaccident_devkit.statistics.real_facts import FACTS, Fact, FactVerdict
+from deepaccident_devkit.statistics.scenario_facts import ScenarioFacts, counted_scenario_facts
 from deepaccident_devkit.support.arrays import FloatArray
+from deepaccident_devkit.support.reports import CheckReport
+from deepaccident_devkit.support.version import __version__
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
-    from deepaccident_devkit.parallel import Engine
+    from deepaccident_devkit.support.parallel import Engine
 
 FEWEST: Final = 10
 """Scenarios with a case, from which on a share, mean, median, percentile or AUC says something."""
 MANY: Final = 50
 """Real cases from which on a real share is taken as it is."""
+# Standard errors of a 95 % interval; words that are listed, the most common ones.
 _Z, _SHOWN = 1.96, 20
-"""Standard errors of a 95 % interval; words that are listed, the most common ones."""
+# Fact → what the message of a scenario that breaks it says.
 _BROKEN: Final[Mapping[str, str]] = {"fields": "expected 13 fields", "gapless": "lacks frames"}
-"""Fact → what the message of a scenario that breaks it says."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -87,7 +87,7 @@ def release_facts(
         ChoiceError: `workers` is less than 1.
         WorkerError: a worker was killed, or cannot do the work.
     """
-    found = those_of(ScenarioFacts, each_scenario(scenario_facts, dataset, scenarios, label="facts", **how))
+    found = those_of(ScenarioFacts, each_scenario(counted_scenario_facts, dataset, scenarios, label="facts", **how))
     broken = [" ".join(problem.messages) for problem in dataset.problems]
     parts = {fact.key: [each.values[fact.key] for each in found if fact.key in each.values] for fact in FACTS}
     for key, phrase in _BROKEN.items():
@@ -143,7 +143,7 @@ def _wilson(share: float, number: float) -> tuple[float, float]:
     return max(low, 0.0), min(high + 1e-12, 1.0)  # which rounding would keep from 1
 
 
-def _verdict(fact: Fact, here: float) -> Verdict:
+def _verdict(fact: Fact, here: float) -> FactVerdict:
     """Whether a release that has `here` agrees with a fact; docs/validation.md says when."""
     low, high = fact.ends or (here, here)
     agrees = fact.limits[0] <= here <= fact.limits[1]

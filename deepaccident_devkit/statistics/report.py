@@ -6,7 +6,6 @@ from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from deepaccident_devkit.reports import Report
 from deepaccident_devkit.statistics.results import (
     CRITICAL,
     GROUPS,
@@ -16,15 +15,16 @@ from deepaccident_devkit.statistics.results import (
     CountTable,
     Histogram,
     QuantileTable,
-    Row,
-    Table,
+    StatisticsRow,
+    StatisticsTable,
     collision_rows,
 )
+from deepaccident_devkit.support.reports import Report
 from deepaccident_devkit.support.text import columns_text, number_text, share_text
 from deepaccident_devkit.taxonomy import CATEGORIES
 
+# Seconds; edges of the histogram of least times to collision.
 _LIMITS = (0.5, 1.0, 1.5, 3.0)
-"""Seconds; edges of the histogram of least times to collision."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -60,7 +60,7 @@ class DatasetStatistics(Report):
     collisions: tuple[CollisionPair, ...]
 
     @property
-    def tables(self) -> tuple[Table, ...]:
+    def tables(self) -> tuple[StatisticsTable, ...]:
         """All tables: counts, histograms, quantiles."""
         return (*self.counts.values(), *self.histograms.values(), *self.quantiles.values())
 
@@ -73,7 +73,7 @@ class DatasetStatistics(Report):
         """For JSON; None for what has no value."""
         return {**asdict(self), "probabilities": PROBABILITIES}
 
-    def named_tables(self) -> dict[str, Iterable[Row]]:
+    def named_tables(self) -> dict[str, Iterable[StatisticsRow]]:
         """All tables, and the colliding pairs."""
         return {
             **{table.name: table.rows() for table in self.tables},

@@ -14,8 +14,8 @@ if TYPE_CHECKING:
     from deepaccident_devkit.tables.records import AgentRecord, CollisionRecord, ScenarioRecord
 
 TOTAL: Final = "total"
-UNKNOWN: Final = "unknown"
-GROUPS: Final = (TOTAL, *SPLITS, UNKNOWN)
+UNKNOWN_SPLIT: Final = "unknown"
+GROUPS: Final = (TOTAL, *SPLITS, UNKNOWN_SPLIT)
 """The groups of counts: all scenarios, those of each split, those whose split is unknown."""
 
 NO_ACCIDENT: Final = "no accident"
@@ -37,8 +37,8 @@ CRITICAL: Final = "scenario_min_ttcs"
 PROBABILITIES: Final = (0.0, 0.05, 0.25, 0.5, 0.75, 0.95, 1.0)
 """Of all quantiles; the first and last are the extremes."""
 
-Cell = str | int | float | None
-Row = tuple[Cell, ...]
+_Cell = str | int | float | None
+StatisticsRow = tuple[_Cell, ...]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -78,9 +78,9 @@ class CountTable(ShortRepr):
         """Everything that is counted in a group."""
         return sum(row[group] for row in self.counts.values())
 
-    def rows(self) -> list[Row]:
+    def rows(self) -> list[StatisticsRow]:
         """A heading, then a row a value."""
-        rows: list[Row] = [(value, *row.values()) for value, row in self.counts.items()]
+        rows: list[StatisticsRow] = [(value, *row.values()) for value, row in self.counts.items()]
         return [(self.field, *GROUPS), *rows]
 
 
@@ -118,7 +118,7 @@ class Histogram(ShortRepr):
         """What each bin of whole numbers holds: `30–39`, …, `90–100`."""
         return [f"{low:g}–{high - (high < self.edges[-1]):g}" for low, high in pairwise(self.edges)]
 
-    def rows(self) -> list[Row]:
+    def rows(self) -> list[StatisticsRow]:
         """A heading, a row a bin, and one of what lies outside."""
         bins = zip(self.edges[:-1], self.edges[1:], *self.counts.values(), strict=True)
         heading = (f"{self.field} from ({self.unit})", f"to ({self.unit})", *GROUPS)
@@ -176,7 +176,7 @@ class QuantileTable(ShortRepr):
         values = self.row(field, category, group).values
         return None if values is None else values[PROBABILITIES.index(0.5)]
 
-    def rows(self) -> list[Row]:
+    def rows(self) -> list[StatisticsRow]:
         """A heading, then a row a field, category and group."""
         names = [f"q{round(100 * probability)} ({self.unit})" for probability in PROBABILITIES]
         absent = (None,) * len(PROBABILITIES)
@@ -218,12 +218,12 @@ class CollisionPair(ShortRepr):
     y: float
 
 
-def collision_rows(pairs: tuple[CollisionPair, ...]) -> list[Row]:
+def collision_rows(pairs: tuple[CollisionPair, ...]) -> list[StatisticsRow]:
     """A heading, then a row a pair."""
     return [tuple(field.name for field in fields(CollisionPair)), *(astuple(pair) for pair in pairs)]
 
 
-Table = CountTable | Histogram | QuantileTable
+StatisticsTable = CountTable | Histogram | QuantileTable
 
 
 def scenario_end(scenario: ScenarioRecord, agents: Sequence[AgentRecord]) -> str | None:

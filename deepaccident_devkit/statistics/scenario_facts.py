@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from deepaccident_devkit.accidents.twins import twin_of
+from deepaccident_devkit.collisions.twins import twin_of
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import shortened
 from deepaccident_devkit.geometry.box_arrays import gaps_of_pairs, signed_gaps
@@ -38,13 +38,14 @@ from deepaccident_devkit.v2x.tracks import scenario_tracks
 if TYPE_CHECKING:
     from deepaccident_devkit.tables.records import ScenarioRecord
 
-MOVING: Final = 0.5
-"""m/s; up to it an actor stands."""
-SECONDS: Final = (1, 2, 3, 4, 5)
-"""The seconds ahead in which a collision is to be foreseen, and at which positions are."""
+# m/s; up to it an actor stands.
+_MOVING_SPEED: Final = 0.5
+# The seconds ahead in which a collision is to be foreseen, and at which positions are.
+_SECONDS_AHEAD: Final = (1, 2, 3, 4, 5)
+# Frames in a second and in half of one, over which a velocity is measured.
 _SECOND, _HALF = 10, 5
-"""Frames in a second and in half of one, over which a velocity is measured."""
 _PEDESTRIAN: Final = CATEGORIES.index("pedestrian")
+# Field of meta → its known words.
 _WORDS: Final[Mapping[str, tuple[str, ...]]] = {
     "weather": WEATHERS,
     "road_type": ROAD_TYPES,
@@ -52,7 +53,6 @@ _WORDS: Final[Mapping[str, tuple[str, ...]]] = {
     "ego_direction": DIRECTIONS,
     "other_direction": DIRECTIONS,
 }
-"""Field of meta → its known words."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -69,7 +69,7 @@ class ScenarioFacts:
     counts: Mapping[str, Mapping[str, int]]
 
 
-def scenario_facts(dataset: Dataset, record: ScenarioRecord) -> ScenarioFacts:
+def counted_scenario_facts(dataset: Dataset, record: ScenarioRecord) -> ScenarioFacts:
     """The facts of one scenario; raises MetaError where its meta file has become unreadable."""
     folder = ScenarioFolder(dataset.dataroot, record["folder"], record["scenario_type"], record["name"], AGENTS)
     seen, frame, collision = _Seen(dataset, record), record["velocity_frame"], record["collision"]
@@ -164,7 +164,7 @@ def _of_meta(seen: _Seen, record: ScenarioRecord, meta: Meta) -> dict[str, Array
     pairs = {"designed": VEHICLE_AGENTS[::2], "behind": VEHICLE_AGENTS[1::2], "follower": VEHICLE_AGENTS[1:3]}
     return values | {
         "frames_by_meta": [frames == meta.recorded_frames],
-        "short": [frames - 1 < SECONDS[-1] * _SECOND],
+        "short": [frames - 1 < _SECONDS_AHEAD[-1] * _SECOND],
         "relation_known": [collision.spawn_relation in ("same", "opposite")],
         "relation_opposite": [collision.spawn_relation == "opposite"],
         "contact_known": [collision.contact_side in ("front", "front_side", "rear", "rear_side")],
@@ -210,7 +210,7 @@ def _of_agents(seen: _Seen) -> dict[str, ArrayLike]:
         "pitch": np.degrees(np.arcsin(np.abs(cars[:, 2, 0]).clip(max=1))),
         "start_speed": speed[seen.column("sample", "timestamp")[seen.drives] == 0],
         "speed": speed,
-        "slow": [(known < MOVING).mean()] if len(known) else [],
+        "slow": [(known < _MOVING_SPEED).mean()] if len(known) else [],
         "fast": [(known > 15).mean()] if len(known) else [],
         "pole_height": poles[:1, 2, 3] - below,
         "sensors_stay": places["number"][np.unique(of)] == 1,
@@ -228,7 +228,7 @@ def _of_labels(seen: _Seen) -> dict[str, ArrayLike]:
     own, vehicles = (np.bincount(sample[rows], minlength=len(seen.drives)) for rows in (ids == OWN_ACTOR_ID, vehicle))
     boxes = np.where(seen.by_ego[..., None], seen.boxes, np.nan)[seen.vehicle]
     pairs = np.stack(np.triu_indices(len(boxes), 1))
-    gaps, moves = gaps_of_pairs(*boxes[pairs]), (np.hypot(*seen.velocity[seen.vehicle].T) > MOVING).T[pairs]
+    gaps, moves = gaps_of_pairs(*boxes[pairs]), (np.hypot(*seen.velocity[seen.vehicle].T) > _MOVING_SPEED).T[pairs]
     here, movers = np.isfinite(gaps) & moves.any(axis=0), moves.sum(axis=0)[gaps == 0]
     least = [
         np.fmin.reduce(gaps[here[:, now], now + 1 : now + 2 * _SECOND + 1], axis=None, initial=np.inf)
@@ -254,15 +254,15 @@ def _foreseen(seen: _Seen, *, collided: bool) -> dict[str, ArrayLike]:
     recorded, or the impact lies in it.
     """
     found: dict[str, list[tuple[float, bool]]] = {}
-    end, times = seen.frames - 1, np.arange(1, _SECOND * SECONDS[-1] + 1) / _SECOND
+    end, times = seen.frames - 1, np.arange(1, _SECOND * _SECONDS_AHEAD[-1] + 1) / _SECOND
     for now in range(_SECOND, end, _SECOND):
         here, velocity = seen.boxes[:, now, None], seen.recent[:, now, None]
         pairs = np.stack(np.triu_indices(len(here), 1))
-        mixed = (np.linalg.norm(velocity[pairs, 0], axis=-1) > MOVING).any(axis=0)
+        mixed = (np.linalg.norm(velocity[pairs, 0], axis=-1) > _MOVING_SPEED).any(axis=0)
         ahead = here + np.pad(velocity * times[:, None], ((0, 0), (0, 0), (0, 3)))
         stand = _least_gaps(here, *pairs[:, ~mixed]).min()
         least = _least_gaps(ahead, *pairs[:, mixed]).reshape(-1, _SECOND).min(axis=1)
-        for second, gap in zip(SECONDS, least.tolist(), strict=True):
+        for second, gap in zip(_SECONDS_AHEAD, least.tolist(), strict=True):
             hit = collided and now + _SECOND * (second - 1) < end <= now + _SECOND * second
             if hit or now + _SECOND * second <= end:
                 found.setdefault(f"foreseen_{second}", []).append((gap, hit))
@@ -283,10 +283,12 @@ def _least_gaps(boxes: FloatArray, first: IntArray, second: IntArray) -> FloatAr
 
 def _extrapolated(seen: _Seen) -> dict[str, ArrayLike]:
     """How far actors are from where constant velocity puts them: every half second, at 1 to 5 s, as long as seen."""
-    now, seconds = np.arange(_HALF, seen.frames, _HALF), np.array(SECONDS)
-    places = np.pad(seen.boxes[..., :2], ((0, 0), (0, _SECOND * SECONDS[-1]), (0, 0)), constant_values=np.nan)
+    now, seconds = np.arange(_HALF, seen.frames, _HALF), np.array(_SECONDS_AHEAD)
+    places = np.pad(seen.boxes[..., :2], ((0, 0), (0, _SECOND * _SECONDS_AHEAD[-1]), (0, 0)), constant_values=np.nan)
     expected = places[:, now, None] + seen.recent[:, now, None] * seconds[:, None]
-    error = np.linalg.norm(places[:, now[:, None] + _SECOND * seconds] - expected, axis=-1).reshape(-1, len(SECONDS))
+    error = np.linalg.norm(places[:, now[:, None] + _SECOND * seconds] - expected, axis=-1).reshape(
+        -1, len(_SECONDS_AHEAD)
+    )
     error = error[np.isfinite(error).any(axis=1)]
-    last = len(SECONDS) - 1 - np.isfinite(error)[:, ::-1].argmax(axis=1)
+    last = len(_SECONDS_AHEAD) - 1 - np.isfinite(error)[:, ::-1].argmax(axis=1)
     return {"ade": np.nanmean(error, axis=1), "fde": error[np.arange(len(error)), last]}

@@ -1,1 +1,1 @@
-"""What all rooms use and no reader of theirs needs to open: arrays and texts checked, files read and written, pages."""
+"""Help that all packages use: arrays and texts checked, files read and written, reports, pages, plug-ins."""

@@ -21,14 +21,14 @@ BoolArray = NDArray[np.bool_]
 ByteArray = NDArray[np.uint8]
 AnyArray = NDArray[Any]
 _FLOAT64: Final = np.dtype(np.float64)
+# Kinds of element types.
 _NUMBERS: Final = "biuf"
-"""Kinds of element types."""
-LARGEST: Final = 1e9
-"""Metres, m/s, pixels, …: a larger number in a file is damage and counts as infinite; squares would overflow."""
+# Metres, m/s, pixels, …: a larger number in a file is damage and counts as infinite; squares would overflow.
+LARGEST_NUMBER: Final = 1e9
 _LONGEST_FIELDS: Final = 160
 _LONGEST_VALUE: Final = 80
+# In texts of records: characters of all fields and of one, and entries of a collection that are shown.
 _FEW: Final = 4
-"""In texts of records: characters of all fields and of one, and entries of a collection that are shown."""
 
 
 def keep_freed(size: int = 31 * 2**20) -> None:
@@ -234,7 +234,7 @@ def as_floats(values: ArrayLike) -> FloatArray:
 
 def in_range(numbers: AnyArray | float) -> BoolArray:
     """Which numbers are neither NaN nor infinite, nor as large as no sound file has them."""
-    small: BoolArray = np.abs(numbers) <= np.float64(LARGEST)  # half precision has no 1e9
+    small: BoolArray = np.abs(numbers) <= np.float64(LARGEST_NUMBER)  # half precision has no 1e9
     return small
 
 

@@ -6,12 +6,12 @@ import re
 from functools import cache
 from pathlib import Path
 
+# A control group of a process as the system lists it: `cpu` for version 1, and the path.
 _GROUP = re.compile(r"(?m)^\d+:(?:[^:]*,)?(cpu)?(?:,[^:]*)?:(/.*)$")
-"""A control group of a process as the system lists it: `cpu` for version 1, and the path."""
+# Names of version 2, and of version 1.
 _QUOTA_FILES = ("cpu.max", "cpu.cfs_quota_us", "cpu.cfs_period_us")
-"""Names of version 2, and of version 1."""
+# Microseconds of all cores together, and the period in which they may be used; `max` or -1 stand for no quota.
 _QUOTA = re.compile(r"([1-9]\d*)\s+([1-9]\d*)\s*")
-"""Microseconds of all cores together, and the period in which they may be used; `max` or -1 stand for no quota."""
 
 
 def usable_cores() -> int:

@@ -28,18 +28,18 @@ from deepaccident_devkit.errors import ConfigError, OutputFolderError
 from deepaccident_devkit.support.reading import irregular_text
 from deepaccident_devkit.support.text import path_of
 
+# A temporary name. Earlier versions wrote `.NAME.PROCESS.tmp`; a library may add the suffix that it writes by.
 _TEMPORARY: Final = re.compile(
     r"\.(?P<name>.+?)\.(?:(?P<host>[0-9a-f]{8})-(?P<process>[1-9]\d{0,9})-(?P<start>\d+)-)?\d+\.tmp(?:\.\w+)?",
     re.DOTALL,
 )
-"""A temporary name. Earlier versions wrote `.NAME.PROCESS.tmp`; a library may add the suffix that it writes by."""
 _PLAIN_LENGTH: Final = 120
+# Characters of the final name that a temporary name has: names of files end at 255 bytes.
 _NAME_LENGTH: Final = 50
-"""Characters of the final name that a temporary name has: names of files end at 255 bytes."""
+# Seconds after the last change of a temporary file of another host, whose processes cannot be seen from here.
 _ABANDONED_AFTER: Final = 24 * 3600.0
-"""Seconds after the last change of a temporary file of another host, whose processes cannot be seen from here."""
+# Folders whose entries stand for open files and devices, such as `/dev/stdout`.
 _SYSTEM_FOLDER: Final = re.compile(r"/(proc|dev(?!/shm))(/.*)?")
-"""Folders whose entries stand for open files and devices, such as `/dev/stdout`."""
 
 
 @contextmanager

@@ -17,8 +17,8 @@ from deepaccident_devkit.errors import shortened
 
 Record = TypeVar("Record")
 
+# The largest depth of nested objects and lists; the devkit's files have some ten.
 MOST_LEVELS: Final = 64
-"""The largest depth of nested objects and lists; the devkit's files have some ten."""
 _BLOCK: Final = 1 << 20
 _QUOTE: Final = ord('"')
 _OTHERS: Final = bytes(set(range(256)) - set(b'[]{}"'))
@@ -27,8 +27,8 @@ _STEPS[list(b"[{")], _STEPS[list(b"]}")] = 1, -1
 _GZIP: Final = b"\x1f\x8b"
 _PICKLE: Final = b"\x80"
 _ZIP: Final = b"PK\x03\x04"
+# Half of a character: JSON can write it alone, UTF-8 cannot.
 _SURROGATE: Final = re.compile("[\ud800-\udfff]")
-"""Half of a character: JSON can write it alone, UTF-8 cannot."""
 _WRITTEN_SURROGATE: Final = re.compile(r"\\u[dD][89a-fA-F]")
 
 

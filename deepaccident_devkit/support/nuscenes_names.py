@@ -12,7 +12,7 @@ from typing import Final, NoReturn, ParamSpec, TypeVar
 from deepaccident_devkit.errors import KeywordError, MissingNameError
 from deepaccident_devkit.support.text import meant_text
 
-T = TypeVar("T")
+_T = TypeVar("_T")
 P = ParamSpec("P")
 _PAGE: Final = "docs/reading.md"
 _HINTS: Final = json.loads(Path(__file__).with_suffix(".json").read_bytes())
@@ -22,23 +22,23 @@ def _hints(of: str) -> Mapping[str, str]:
     return {name: hint for hint, names in _HINTS[of].items() for name in names}
 
 
+# nuScenes' tables → what to use here.
 TABLES: Final = _hints("tables")
-"""nuScenes' tables → what to use here."""
+# Attributes of nuScenes' `NuScenes` and `NuScenesExplorer` → what to use here.
 DATASET: Final = _hints("dataset")
-"""Attributes of nuScenes' `NuScenes` and `NuScenesExplorer` → what to use here."""
+# Attributes of nuScenes' `Box` → what to use here.
 BOX: Final = _hints("box")
-"""Attributes of nuScenes' `Box` → what to use here."""
+# Attributes of nuScenes' `LidarPointCloud` → what to use here.
 CLOUD: Final = _hints("cloud")
-"""Attributes of nuScenes' `LidarPointCloud` → what to use here."""
+# Arguments of nuScenes' methods → what to use here.
 KEYWORDS: Final = _hints("keywords")
-"""Arguments of nuScenes' methods → what to use here."""
-FIELDS: Final = _hints("fields")
-"""Fields of nuScenes' records → what to use here."""
+# Fields of nuScenes' records → what to use here.
+FIELD_HINTS: Final = _hints("fields")
+# What to use here in place of making nuScenes' `Box`.
 BOX_MADE: Final = (
     "boxes[0] picks one, and nuScenes' Box(center, wlh, orientation) is Box.from_wlh(center, wlh, orientation, "
     f"frame='ego') (see {_PAGE})"
 )
-"""What to use here in place of making nuScenes' `Box`."""
 
 
 class AbsentName:
@@ -56,10 +56,10 @@ class AbsentName:
         raise missing_name(owner, self._name, self._counterpart)
 
 
-def without_names(counterparts: Mapping[str, str]) -> Callable[[type[T]], type[T]]:
+def without_names(counterparts: Mapping[str, str]) -> Callable[[type[_T]], type[_T]]:
     """A decorator of a class that has none of these names, and says so with the counterpart of each."""
 
-    def put(owner: type[T]) -> type[T]:
+    def put(owner: type[_T]) -> type[_T]:
         for name, counterpart in counterparts.items():
             setattr(owner, name, AbsentName(name, counterpart))
         return owner
@@ -72,7 +72,7 @@ def missing_name(owner: type, name: str, counterpart: str) -> MissingNameError:
     return MissingNameError(f"{owner.__name__} has no {name!r}: {counterpart} (see {_PAGE})")
 
 
-def with_keywords_named(function: Callable[P, T], module: str | None = None) -> Callable[P, T]:
+def with_keywords_named(function: Callable[P, _T], module: str | None = None) -> Callable[P, _T]:
     """Return the same function, which raises a KeywordError for an argument that it does not have.
 
     Of an argument of nuScenes' the error says what to use, of others which one may be meant. `module` is where the
@@ -83,7 +83,7 @@ def with_keywords_named(function: Callable[P, T], module: str | None = None) -> 
     called = function.__qualname__.removesuffix(".__init__").rpartition(".")[2]
 
     @wraps(function)
-    def checked(*arguments: P.args, **named: P.kwargs) -> T:
+    def checked(*arguments: P.args, **named: P.kwargs) -> _T:
         for name in sorted(named.keys() - known.keys()) if named else ():
             if name in KEYWORDS:
                 raise KeywordError(f"{called} has no argument {name!r}: {KEYWORDS[name]} (see {_PAGE})")
@@ -103,5 +103,5 @@ def table_remedy(name: object) -> str:
 
 def field_remedy(name: object) -> str:
     """What to say of a record's field that is nuScenes'; empty for all others."""
-    counterpart = FIELDS.get(name) if isinstance(name, str) else None
+    counterpart = FIELD_HINTS.get(name) if isinstance(name, str) else None
     return f": {counterpart} (see {_PAGE})" if counterpart else ""

@@ -15,20 +15,20 @@ from importlib.resources import files
 from typing import TYPE_CHECKING, Any, Final
 from urllib.parse import quote
 
-from deepaccident_devkit._version import __version__
 from deepaccident_devkit.errors import escaped
 from deepaccident_devkit.support.text import counted, number_text
+from deepaccident_devkit.support.version import __version__
 from deepaccident_devkit.taxonomy import short_name
 
 if TYPE_CHECKING:
     from jinja2 import Environment
     from markupsafe import Markup
 
+# A browser loads nothing and runs nothing, even if a name in the results tries to.
 _POLICY: Final = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
-"""A browser loads nothing and runs nothing, even if a name in the results tries to."""
 _MOST_DIGITS: Final = 6
+# Where a name may be broken.
 _JOINTS: Final = re.compile(r"(?<=[/_=])(?=\w)|(?=@)")
-"""Where a name may be broken."""
 
 
 @cache
@@ -37,7 +37,10 @@ def environment() -> Environment:
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     made = Environment(
-        loader=PackageLoader("deepaccident_devkit"), autoescape=True, undefined=StrictUndefined, trim_blocks=True
+        loader=PackageLoader("deepaccident_devkit.support"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
     )
     made.filters |= {
         "agent": short_name,
@@ -72,7 +75,7 @@ def document(template: str, *, style: str, policy: str = _POLICY, script: str = 
 
 def part(name: str) -> str:
     """A file beside the templates that is no template, such as a script."""
-    return (files("deepaccident_devkit") / "templates" / name).read_text(encoding="utf-8")
+    return (files("deepaccident_devkit.support") / "templates" / name).read_text(encoding="utf-8")
 
 
 def source_hash(text: str) -> str:

@@ -50,7 +50,7 @@ FileKind: TypeAlias = Literal[
 ]
 NO_NAME: Final = "cannot be a file's name: it holds a NUL character, or half of a pair that stands for one character"
 _MIB: Final = 1 << 20
-LIMITS: Final[Mapping[str, int]] = MappingProxyType(
+BYTE_LIMITS: Final[Mapping[str, int]] = MappingProxyType(
     {
         "label": 48 * _MIB,
         "meta": _MIB,
@@ -73,22 +73,23 @@ LIMITS: Final[Mapping[str, int]] = MappingProxyType(
 
 The release and the devkit write far less. The index's tables have no limit: they are mapped, and not read at once.
 """
+# The environment variable that changes limits, here and in worker processes: `label=200M lidar=1G`.
 LIMITS_VARIABLE: Final = "DEEPACCIDENT_LIMITS"
-"""The environment variable that changes limits, here and in worker processes: `label=200M lidar=1G`."""
 _LIMIT: Final = re.compile(r"([a-z_]+)=(\w+)", re.ASCII)
 _SIZE: Final = re.compile(r"([1-9][0-9]{0,11})([KMGT]?)")
 _FACTORS: Final = {"": 1, "K": 1 << 10, "M": 1 << 20, "G": 1 << 30, "T": 1 << 40}
 _FLAGS: Final = os.O_RDONLY | getattr(os, "O_BINARY", 0) | getattr(os, "O_NONBLOCK", 0)  # no waiting for a pipe
+# How a member of an archive, the end of an archive, the end of a large one, and what leads to that, begin.
 _MEMBER, _END, _LARGE_END, _LOCATOR = b"PK\x03\x04", b"PK\x05\x06", b"PK\x06\x06", b"PK\x06\x07"
-"""How a member of an archive, the end of an archive, the end of a large one, and what leads to that, begin."""
+# Bytes by which a web page can be told.
 _SHORT: Final = 256
-"""Bytes by which a web page can be told."""
 _END_LENGTH, _LARGE_END_LENGTH, _LOCATOR_LENGTH = 22, 56, 20
+# Bytes at the end of a file among which its archive's end is: the last of it is a comment.
 _LONGEST_END: Final = _LARGE_END_LENGTH + _LOCATOR_LENGTH + _END_LENGTH + (1 << 16) - 1
-"""Bytes at the end of a file among which its archive's end is: the last of it is a comment."""
+# Bytes of the directory of a results file or a bundle.
 _MOST_DIRECTORY: Final = 4 << 20
-"""Bytes of the directory of a results file or a bundle."""
 _HEADER_READERS: Final = {(1, 0): "read_array_header_1_0", (2, 0): "read_array_header_2_0"}
+# What reading a damaged archive, or an array in it, can raise.
 DAMAGED_ARCHIVE: Final = (
     OSError,
     ValueError,
@@ -105,7 +106,6 @@ DAMAGED_ARCHIVE: Final = (
     zipfile.BadZipFile,
     zlib.error,
 )
-"""What reading a damaged archive, or an array in it, can raise."""
 
 
 class StoredFile(Protocol):
@@ -122,10 +122,10 @@ class RefusedFileError(OSError):
     """A file that the gate does not let in; its `strerror` is a clause without the path."""
 
 
-def limit_of(kind: FileKind) -> int:
+def byte_limit(kind: FileKind) -> int:
     """Bytes that a file of a kind, or what is decoded from it, may have; or RefusedFileError."""
     changed = os.environ.get(LIMITS_VARIABLE)
-    return LIMITS[kind] if not changed else _changed_limits(changed).get(kind, LIMITS[kind])
+    return BYTE_LIMITS[kind] if not changed else _changed_limits(changed).get(kind, BYTE_LIMITS[kind])
 
 
 def bytes_of(text: str) -> int | None:
@@ -153,7 +153,7 @@ def _read(path: Path, kind: FileKind) -> bytes:
         if len(content) < size or os.read(descriptor, 1):  # a file that grows, or does not know its size
             with os.fdopen(os.dup(descriptor), "rb") as file:
                 file.seek(0)
-                content = file.read(limit_of(kind) + 1)
+                content = file.read(byte_limit(kind) + 1)
             check_size(len(content), kind)
     finally:
         os.close(descriptor)
@@ -210,7 +210,7 @@ def file_checksum(path: Path) -> str:
 
 def check_size(size: int, kind: FileKind, what: str = "") -> None:
     """RefusedFileError of what would be larger than its kind may be; `what` has this size, empty for the file."""
-    if size > (limit := limit_of(kind)):
+    if size > (limit := byte_limit(kind)):
         head = f"{what} takes" if what else "has"
         more = f"more than {limit:,}, the limit for {kind}; if the file is sound, set {LIMITS_VARIABLE}={kind}"
         raise RefusedFileError(errno.EFBIG, f"{head} {size:,} bytes, {more}={-(-size // _MIB)}M")
@@ -258,8 +258,8 @@ def _changed_limits(text: str) -> Mapping[str, int]:
     for word in text.replace(",", " ").split():
         found = _LIMIT.fullmatch(word)
         size = None if found is None else bytes_of(found[2])
-        if found is None or size is None or found[1] not in LIMITS:
-            known = ", ".join(LIMITS)
+        if found is None or size is None or found[1] not in BYTE_LIMITS:
+            known = ", ".join(BYTE_LIMITS)
             said = f"{LIMITS_VARIABLE}: expected <kind>=<bytes> with K, M or G, such as label=200M, of {known}; found"
             raise RefusedFileError(errno.EINVAL, f"{said} {shortened(word)!r}")
         limits[found[1]] = size

@@ -17,11 +17,11 @@ import numpy as np
 from deepaccident_devkit.support.arrays import Float32Array, readonly
 
 Sketch: TypeAlias = tuple[float, ...]
-NUMBERS: Final = 8
-"""Number of sums in a sketch."""
+# Number of sums in a sketch.
+_SUM_COUNT: Final = 8
 _UNKNOWN: Final = 1e9
+# Number of values after which the same signs are used again.
 _PERIOD: Final = 1 << 18
-"""Number of values after which the same signs are used again."""
 
 
 def sketch(values: Any) -> Sketch:
@@ -37,13 +37,13 @@ def whole_numbers(sums: Any) -> Sketch:
 
 def distance(one: Sketch, other: Sketch) -> float:
     """Estimate how far the vectors of two sketches are apart; infinite if one of them is none."""
-    if len(one) != NUMBERS or len(other) != NUMBERS:
+    if len(one) != _SUM_COUNT or len(other) != _SUM_COUNT:
         return math.inf
-    return math.dist(one, other) / math.sqrt(NUMBERS)
+    return math.dist(one, other) / math.sqrt(_SUM_COUNT)
 
 
 @cache
 def _signs() -> Float32Array:
     """Return the signs of a period's values in each sum, (8, P) of −1 and 1."""
     drawn = np.frombuffer(hashlib.shake_256(b"sketches").digest(_PERIOD), dtype=np.uint8)
-    return readonly(np.unpackbits(drawn).reshape(NUMBERS, _PERIOD).astype(np.float32) * 2 - 1)
+    return readonly(np.unpackbits(drawn).reshape(_SUM_COUNT, _PERIOD).astype(np.float32) * 2 - 1)

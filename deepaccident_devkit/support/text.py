@@ -18,13 +18,13 @@ from typing import Any, ClassVar, Final, TypeVar
 
 from deepaccident_devkit.errors import ChoiceError, ConfigError, DeepAccidentError, shortened
 
-Word = TypeVar("Word", bound=str | None)
+AnyText = TypeVar("AnyText", bound=str | None)
+# Words that a message lists at most.
 _LISTED = 20
-"""Words that a message lists at most."""
+# Letters of the shortest word that is meant by a longer one which begins with it, as `val` by `validation`.
 _STEM = 3
-"""Letters of the shortest word that is meant by a longer one which begins with it, as `val` by `validation`."""
+# Differing values that a message shows at most.
 _DIFFERING = 3
-"""Differing values that a message shows at most."""
 _NUMBER: Final = re.compile(r"[+-]?((\d+\.?\d*|\.\d+)(e[+-]?\d+)?|nan|inf|infinity)", re.ASCII | re.IGNORECASE)
 _INTEGER: Final = re.compile(r"(-?)0*(\d{1,19})", re.ASCII)
 
@@ -171,19 +171,19 @@ def _leaves(values: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, A
 def choice(
     name: str,
     value: object,
-    words: Collection[Word],
+    words: Collection[AnyText],
     *,
     error: type[DeepAccidentError] = ChoiceError,
     elsewhere: Mapping[str, str] = MappingProxyType({}),
     also: str = "",
-) -> Word:
+) -> AnyText:
     """The one of some words, None perhaps among them, that a caller means, in its own spelling; else ChoiceError.
 
     Small letters may stand for capital ones. `error` is another kind of error; `elsewhere` says of words that mean
     something in another place what to do with them; `also` says what can be given instead of a word.
     """
     expected = [word for word in words if word is not None]
-    chosen: Word = spelled(value, expected)
+    chosen: AnyText = spelled(value, expected)
     if any(chosen is word for word in words):
         return chosen
     none = ", or None" if len(expected) < len(words) else ""
@@ -209,11 +209,11 @@ def members_of(
 def choices(
     argument: str,
     given: object,
-    words: Collection[Word],
+    words: Collection[AnyText],
     *,
     empty: bool = False,
     error: type[DeepAccidentError] = ChoiceError,
-) -> tuple[Word, ...]:
+) -> tuple[AnyText, ...]:
     """Return some of the possible words, in the caller's order and in their own spelling; a single one needs no list.
 
     Raises:

@@ -22,10 +22,10 @@ from deepaccident_devkit.tables.columns import (
     NULL_INTEGER,
     Choice,
     Column,
+    ColumnKind,
     Derived,
     Items,
     Key,
-    Kind,
     Number,
     Struct,
     Subset,
@@ -35,17 +35,19 @@ from deepaccident_devkit.tables.columns import (
 )
 from deepaccident_devkit.tables.records import record_columns
 
-Columns = Mapping[str, Any]
+ColumnArrays = Mapping[str, Any]
 """Stored column name → array (or list, for words) of one table's rows."""
 HASHES = "hashes"
 """A word of kept rows, and of the table of scenarios: the hashes of the files that these were made from, as JSON."""
-REMEDY = "mend it with: deepaccident index DATAROOT --check"
+DAMAGED_INDEX_REMEDY = "mend it with: deepaccident check index DATAROOT"
 """What to do with a damaged table."""
 
 
 def damaged_value(table: str) -> IndexStoreError:
     """The error for a row key, a count or a code beyond what it counts: only damage to a file makes one."""
-    return IndexStoreError(f"the index is damaged: table '{table}' holds a value out of its range; {REMEDY}")
+    return IndexStoreError(
+        f"the index is damaged: table '{table}' holds a value out of its range; {DAMAGED_INDEX_REMEDY}"
+    )
 
 
 def table_path(folder: Path, table: str) -> Path:
@@ -69,7 +71,7 @@ class TableWriter(ExitStack):
             for column in spec.stored_columns
         }
 
-    def append(self, columns: Columns) -> None:
+    def append(self, columns: ColumnArrays) -> None:
         """Add rows; every stored column must be there, all of one length."""
         for column in self._spec.stored_columns:
             values, collected = columns[column.stored or ""], self._columns[column.stored]
@@ -106,7 +108,7 @@ class TableWriter(ExitStack):
             return np.fromfile(collected, dtype=dtype).reshape(shape)
 
 
-def write_table(folder: Path, spec: TableSpec, columns: Columns) -> None:
+def write_table(folder: Path, spec: TableSpec, columns: ColumnArrays) -> None:
     """Write a whole table at once."""
     with TableWriter(folder, spec) as writer:
         writer.append(columns)
@@ -130,14 +132,16 @@ class StoredTable:
         path = table_path(folder, spec.name)
         try:
             batch = pa.ipc.open_file(mapped_file(path)).get_batch(0)
-            if fault := fault_of(spec, batch):
+            if fault := _batch_fault(spec, batch):
                 raise OSError(fault)
             self.views = views(spec, batch)
             self.words = _words(batch.schema)
         except FileNotFoundError:
             raise IndexStoreError(f"{path}: no such file: the index was made again; open the release again") from None
         except (OSError, pa.ArrowException, IndexError, ValueError) as error:
-            raise IndexStoreError(f"{path}: cannot be read ({shortened(str(error))}); {REMEDY}") from error
+            raise IndexStoreError(
+                f"{path}: cannot be read ({shortened(str(error))}); {DAMAGED_INDEX_REMEDY}"
+            ) from error
         self.spec = spec
         self._path = path
         self._batch = batch
@@ -150,11 +154,11 @@ class StoredTable:
 
         table = pa.Table.from_batches([self._batch])
         if fault := value_fault_of(self.spec, table):
-            raise IndexStoreError(f"{self._path}: damaged ({shortened(fault)}); {REMEDY}")
+            raise IndexStoreError(f"{self._path}: damaged ({shortened(fault)}); {DAMAGED_INDEX_REMEDY}")
         return table
 
 
-def streams(tables: Sequence[tuple[TableSpec, Columns]], metadata: Mapping[str, str] | None = None) -> bytes:
+def streams(tables: Sequence[tuple[TableSpec, ColumnArrays]], metadata: Mapping[str, str] | None = None) -> bytes:
     """The rows of each table, with or without words, as compressed Arrow streams one after the other."""
     import pyarrow as pa
 
@@ -186,7 +190,7 @@ def read_streams(source: Any, specs: Sequence[TableSpec]) -> list[dict[str, Any]
     tables = []
     for spec in specs:
         batches = list(pa.ipc.open_stream(source, options=options))  # to the stream's end, where the next one starts
-        if len(batches) != 1 or fault_of(spec, batches[0]):
+        if len(batches) != 1 or _batch_fault(spec, batches[0]):
             return None
         tables.append({name: unpacked(view) for name, view in views(spec, batches[0]).items()})
     return tables
@@ -197,7 +201,7 @@ def is_streamable(spec: TableSpec) -> bool:
     return not any(isinstance(column.kind, Word | Struct) for column in spec.stored_columns)
 
 
-def numpy_dtype(kind: Kind) -> np.dtype[Any]:
+def numpy_dtype(kind: ColumnKind) -> np.dtype[Any]:
     """The element type of a fixed-width column (bool one byte a row, as long as it is not packed)."""
     if isinstance(kind, Key):
         return np.dtype(np.int32)
@@ -208,13 +212,13 @@ def numpy_dtype(kind: Kind) -> np.dtype[Any]:
     return np.dtype(kind.dtype if isinstance(kind, Number) else np.float64)
 
 
-def width(kind: Kind) -> int:
+def width(kind: ColumnKind) -> int:
     """Elements a row of a fixed-width column."""
     return kind.length if isinstance(kind, Vector) else 1
 
 
 @cache
-def arrow_type(kind: Kind) -> Any:
+def arrow_type(kind: ColumnKind) -> Any:
     """The Arrow type of a stored column."""
     import pyarrow as pa
 
@@ -241,7 +245,7 @@ def arrow_schema(spec: TableSpec) -> Any:
     )
 
 
-def record_batch(spec: TableSpec, columns: Columns) -> Any:
+def record_batch(spec: TableSpec, columns: ColumnArrays) -> Any:
     """One Arrow record batch over columns; numbers are not copied (bools are packed)."""
     import pyarrow as pa
 
@@ -258,7 +262,7 @@ def views(spec: TableSpec, batch: Any) -> dict[str, Any]:
     }
 
 
-def fault_of(spec: TableSpec, batch: Any) -> str | None:
+def _batch_fault(spec: TableSpec, batch: Any) -> str | None:
     """Why a batch that was read from a file is not one of the table's, None if its parts fit together.
 
     Fixed-width columns are not read: only their sizes are checked, at no cost for a table of any length. Words and
@@ -277,7 +281,7 @@ def fault_of(spec: TableSpec, batch: Any) -> str | None:
 
 
 def value_fault_of(spec: TableSpec, table: Any) -> str | None:
-    """What Arrow itself could not read of a table that is whole by `fault_of`; None if there is nothing.
+    """What Arrow itself could not read of a table that is whole by `_batch_fault`; None if there is nothing.
 
     Reads the codes of all choices, those of 8.6 million rows in 20 ms. The devkit's own views use no dictionary.
     """
@@ -306,7 +310,7 @@ def unpacked(view: Any) -> Any:
 def _struct_type(record: type) -> Any:
     import pyarrow as pa
 
-    def field_type(kind: Kind) -> Any:
+    def field_type(kind: ColumnKind) -> Any:
         if isinstance(kind, Items):
             return pa.list_(pa.int64() if kind.type == "integer" else pa.string(), 2)
         return arrow_type(kind)
@@ -343,7 +347,7 @@ def _validity(data: AnyArray, length: int) -> Any:
     return None if valid.all() else pa.py_buffer(np.packbits(valid, bitorder="little"))
 
 
-def _view(kind: Kind, array: Any) -> Any:
+def _view(kind: ColumnKind, array: Any) -> Any:
     if isinstance(kind, Word | Struct | Derived):
         return array
     if isinstance(kind, Choice):

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from deepaccident_devkit.geometry import quaternions
 from deepaccident_devkit.release import Labels
-from deepaccident_devkit.release.labels import turned
+from deepaccident_devkit.release.labels import turned_vectors
 from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray, IntArray, ShortRepr, as_floats
 from deepaccident_devkit.tables.columns import NULL_INTEGER
 from deepaccident_devkit.taxonomy import (
@@ -33,13 +33,13 @@ NEAR_INFRASTRUCTURE = 15.0
 _SMALL = np.array([name in SMALL_CATEGORIES for name in CATEGORIES])
 LEAST_BOXES: Final = 20
 """With fewer moving boxes it is not known how a scenario's velocities are written."""
+# m/s; slower actors are not used.
 _LEAST_SPEED = 1.0
-"""m/s; slower actors are not used."""
+# m/s, and as a share of the speed, within which a velocity fits.
 _FITS = (0.5, 0.15)
-"""m/s, and as a share of the speed, within which a velocity fits."""
 _LEAST_SHARE = 0.5
+# Share of the best frame's boxes from which the release's own frame is taken instead.
 _AS_GOOD = 0.95
-"""Share of the best frame's boxes from which the release's own frame is taken instead."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -263,7 +263,7 @@ def velocities_that_fit(boxes: ScenarioBoxes, displacement: FloatArray) -> tuple
     rows = np.flatnonzero(telling & (speed > _LEAST_SPEED) & np.isfinite(said).all(axis=1))
     limit = _FITS[0] + _FITS[1] * speed[rows]
     return rows, {
-        name: np.linalg.norm(turned(said[rows], angle[rows]) - displacement[rows, :2], axis=1) < limit
+        name: np.linalg.norm(turned_vectors(said[rows], angle[rows]) - displacement[rows, :2], axis=1) < limit
         for name, angle in _angles(boxes).items()
     }
 
@@ -274,7 +274,7 @@ def decoded_velocities(boxes: ScenarioBoxes, displacement: FloatArray, frame: st
     A label has no vertical velocity: it is taken from the displacement, and is 0 without one. None for the frame is the
     release's own way.
     """
-    over_ground = turned(boxes.labels.velocity, _angles(boxes)[frame or RELEASED_VELOCITY_FRAME])
+    over_ground = turned_vectors(boxes.labels.velocity, _angles(boxes)[frame or RELEASED_VELOCITY_FRAME])
     own = boxes.labels.actor_id == OWN_ACTOR_ID
     over_ground[own] = boxes.labels.velocity[own]  # in world, whatever the others' are in
     velocity = np.column_stack([over_ground, np.nan_to_num(displacement[:, 2])])

@@ -10,7 +10,7 @@ from deepaccident_devkit.geometry import quaternions
 from deepaccident_devkit.release import Calibs, Meta
 from deepaccident_devkit.support.arrays import AnyArray, FloatArray, IntArray
 from deepaccident_devkit.tables import boxes as box_rules
-from deepaccident_devkit.tables.arrow_files import Columns
+from deepaccident_devkit.tables.arrow_files import ColumnArrays
 from deepaccident_devkit.tables.boxes import ScenarioBoxes, decoded_velocities, displacement_velocities, fit_velocities
 from deepaccident_devkit.tables.columns import NULL_INTEGER
 from deepaccident_devkit.tables.scan import ScenarioFiles
@@ -42,7 +42,7 @@ ROTATION_TOLERANCE: Final = 1e-5
 _INTRINSIC_TOLERANCE = 1e-6
 
 
-def scenario_rows(files: ScenarioFiles) -> dict[str, Columns]:
+def scenario_rows(files: ScenarioFiles) -> dict[str, ColumnArrays]:
     """The rows of every table but `sensor` and `category`, which are the same for all scenarios."""
     boxes = scenario_boxes(files)
     instance_rows, instance_of_box = box_rules.instances(boxes)
@@ -80,7 +80,7 @@ def scenario_boxes(files: ScenarioFiles) -> ScenarioBoxes:
     )
 
 
-def _scenario_row(files: ScenarioFiles, velocity_frame: str | None) -> Columns:
+def _scenario_row(files: ScenarioFiles, velocity_frame: str | None) -> ColumnArrays:
     scenario, meta = files.scenario, files.meta
     signalized = "_subtype1_" in f"{scenario.scenario_type}_"
     collision = asdict(meta.collision) if meta and meta.collision else None
@@ -105,7 +105,7 @@ def _scenario_row(files: ScenarioFiles, velocity_frame: str | None) -> Columns:
     }
 
 
-def _agent_rows(files: ScenarioFiles, boxes: ScenarioBoxes) -> Columns:
+def _agent_rows(files: ScenarioFiles, boxes: ScenarioBoxes) -> ColumnArrays:
     count = len(files.scan.agents)
     category = np.full(count, NULL_INTEGER)
     size = np.full((count, 3), np.nan)
@@ -123,7 +123,7 @@ def _agent_rows(files: ScenarioFiles, boxes: ScenarioBoxes) -> Columns:
     }
 
 
-def _frame_rows(files: ScenarioFiles) -> Columns:
+def _frame_rows(files: ScenarioFiles) -> ColumnArrays:
     count = files.scan.num_frames
     previous, following = neighbour_rows(count, 1)
     return {
@@ -136,7 +136,7 @@ def _frame_rows(files: ScenarioFiles) -> Columns:
     }
 
 
-def _sample_rows(files: ScenarioFiles) -> Columns:
+def _sample_rows(files: ScenarioFiles) -> ColumnArrays:
     agents, frames = len(files.scan.agents), files.scan.num_frames
     labelled = _sample_labelled(files)
     velocity = np.full((files.num_samples, 2), np.nan)
@@ -164,7 +164,7 @@ def _sample_rows(files: ScenarioFiles) -> Columns:
 
 def _annotation_rows(
     files: ScenarioFiles, boxes: ScenarioBoxes, instance_of_box: AnyArray, world_velocities: FloatArray
-) -> Columns:
+) -> ColumnArrays:
     labels = files.labels
     previous, following = box_rules.chains(boxes)
     return {
@@ -187,7 +187,9 @@ def _annotation_rows(
     }
 
 
-def _track_rows(boxes: ScenarioBoxes, annotations: Columns, centers: FloatArray, velocities: FloatArray) -> Columns:
+def _track_rows(
+    boxes: ScenarioBoxes, annotations: ColumnArrays, centers: FloatArray, velocities: FloatArray
+) -> ColumnArrays:
     instance_of_box = annotations["instance_row"]
     chosen, agents = box_rules.tracks(boxes, instance_of_box)
     return {
@@ -261,7 +263,7 @@ def _signalized_design(meta: Meta) -> int | None:
     return None
 
 
-def sensor_tables(calibs: Calibs, *, agents: int, frames: int) -> dict[str, Columns]:
+def sensor_tables(calibs: Calibs, *, agents: int, frames: int) -> dict[str, ColumnArrays]:
     """The rows of one scenario's sensor tables; `calibs` holds its samples agent by agent."""
     values = _sensor_values(calibs)
     calibrated_sensors, calibrated_sensor_of = _calibrated_sensor_rows(values, agents, frames)
@@ -275,7 +277,7 @@ def sensor_tables(calibs: Calibs, *, agents: int, frames: int) -> dict[str, Colu
     }
 
 
-def sensor_rows() -> Columns:
+def sensor_rows() -> ColumnArrays:
     """The rows of table `sensor`, the same for all scenarios."""
     return {"channel": np.arange(len(CHANNELS)), "modality": _channel_modalities()}
 
@@ -292,7 +294,7 @@ def timestamps(frames: int) -> FloatArray:
     return np.array([frame_timestamp(index) for index in range(1, frames + 1)])
 
 
-def _sample_data_rows(calibs: Calibs, calibrated_sensor_of: IntArray, agents: int, frames: int) -> Columns:
+def _sample_data_rows(calibs: Calibs, calibrated_sensor_of: IntArray, agents: int, frames: int) -> ColumnArrays:
     """Columns in the order sample, channel."""
     samples, channels = len(calibs), len(CHANNELS)
     previous, following = (
@@ -317,7 +319,7 @@ def _sample_data_rows(calibs: Calibs, calibrated_sensor_of: IntArray, agents: in
     }
 
 
-def _calibrated_sensor_rows(values: FloatArray, agents: int, frames: int) -> tuple[Columns, IntArray]:
+def _calibrated_sensor_rows(values: FloatArray, agents: int, frames: int) -> tuple[ColumnArrays, IntArray]:
     """The distinct values of each agent's sensors by first occurrence; (samples, channels) which of them each is."""
     row_of = np.zeros(values.shape[:2], dtype=np.int64)
     chosen: list[FloatArray] = []
@@ -353,7 +355,7 @@ def _sensor_values(calibs: Calibs) -> FloatArray:
     return np.concatenate([matrix.reshape(samples, channels, 16), intrinsic.reshape(samples, channels, 9)], axis=-1)
 
 
-def _ego_pose_rows(calibs: Calibs, agents: int, frames: int) -> Columns:
+def _ego_pose_rows(calibs: Calibs, agents: int, frames: int) -> ColumnArrays:
     pose = calibs.world_from_ego
     return {
         "translation": pose[:, :3, 3],

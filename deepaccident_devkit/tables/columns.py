@@ -88,7 +88,7 @@ class Struct(_Documented):
     record: type
 
 
-Kind = Derived | Key | Number | Vector | Choice | Subset | Word | Items | Struct
+ColumnKind = Derived | Key | Number | Vector | Choice | Subset | Word | Items | Struct
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,7 +104,7 @@ class Column:
 
     field: str
     stored: str | None
-    kind: Kind
+    kind: ColumnKind
     nullable: bool
 
 

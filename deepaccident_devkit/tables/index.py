@@ -36,7 +36,7 @@ from deepaccident_devkit.support.files import (
     temporary_of,
     write_own,
 )
-from deepaccident_devkit.support.reading import RefusedFileError, fault_text, file_checksum, limit_of, read_bytes
+from deepaccident_devkit.support.reading import RefusedFileError, byte_limit, fault_text, file_checksum, read_bytes
 from deepaccident_devkit.support.text import choice
 from deepaccident_devkit.tables.arrow_files import table_path
 from deepaccident_devkit.tables.records import SCHEMA_VERSION, table_specs
@@ -46,21 +46,21 @@ from deepaccident_devkit.taxonomy import VERSIONS, OnError
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
-    from deepaccident_devkit.parallel import Engine, Store
+    from deepaccident_devkit.support.parallel import Engine, Store
     from deepaccident_devkit.tables.indexing import Outcome, SplitAssignment
 
 logger = logging.getLogger(__name__)
 
 MANIFEST_FILE = "manifest.json"
 _TABLES = "tables-"
+# What earlier versions put beside these.
 _EARLIER = ("shards", ".unfinished")
-"""What earlier versions put beside these."""
+# Paths of files that a devkit puts into an index folder.
 _FILE = re.compile(
     rf"{re.escape(MANIFEST_FILE)}|\.lock|\.making|\.unfinished|(.+/)?(kept|locks|thumbnails)/.+|shards/.+\.arrow"
     rf"|\.?{_TABLES}[^/]+/([^/]+\.arrow|town_map-\w+\.npz)|(.+/)?\.[^/]+\.tmp",
     re.DOTALL,
 )
-"""Paths of files that a devkit puts into an index folder."""
 _NAMED = 5
 
 
@@ -216,7 +216,7 @@ def current_index(layout: ReleaseLayout, index_dir: Path | None = None) -> Index
 def _refuse_wrong_limits() -> None:
     """Raise IndexStoreError before every file counts as broken, and a good index is made again of what is left."""
     try:
-        limit_of("index")
+        byte_limit("index")
     except RefusedFileError as error:
         raise IndexStoreError(fault_text(error)) from None
 
@@ -235,7 +235,9 @@ def _made(layout: ReleaseLayout, folder: Path, *, check_files: bool, **how: Unpa
 
     Broken scenarios do not stop it: they are listed in the manifest. Damaged rows and tables are made again.
     """
-    from deepaccident_devkit.parallel import Places  # here, as below: opening an index that is there needs none of it
+    from deepaccident_devkit.support.parallel import (
+        Places,  # here, as below: opening an index that is there needs none of it
+    )
     from deepaccident_devkit.tables.indexing import assign_splits, index_scenario
 
     _refuse_newer(folder)
@@ -276,7 +278,7 @@ def _made(layout: ReleaseLayout, folder: Path, *, check_files: bool, **how: Unpa
 
 
 def _store(folder: Path, command: str) -> Store:
-    from deepaccident_devkit.parallel import Store
+    from deepaccident_devkit.support.parallel import Store
 
     return Store(folder, folder, "makes an index", IndexStoreError, command)
 

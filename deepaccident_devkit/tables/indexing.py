@@ -13,13 +13,13 @@ import numpy as np
 
 from deepaccident_devkit.errors import IndexStoreError
 from deepaccident_devkit.geometry import quaternions
-from deepaccident_devkit.parallel import Store
 from deepaccident_devkit.release import ReleaseLayout, ScenarioFolder, read_meta, read_split_file
 from deepaccident_devkit.support.arrays import AnyArray
+from deepaccident_devkit.support.parallel import Store
 from deepaccident_devkit.support.text import counted
 from deepaccident_devkit.tables.arrow_files import (
     HASHES,
-    Columns,
+    ColumnArrays,
     TableWriter,
     read_streams,
     streams,
@@ -39,12 +39,12 @@ from deepaccident_devkit.tables.scan import (
 )
 from deepaccident_devkit.taxonomy import CATEGORIES, MINI_SPLITS, SPLITS
 
+# Tables that are the same for every scenario and are not kept with any.
 _SHARED_TABLES = ("sensor", "category")
-"""Tables that are the same for every scenario and are not kept with any."""
-_FROM_OTHERS: Mapping[str, Mapping[str, Callable[[Columns], AnyArray]]] = {
+# Table → column that is not kept, since it follows from others: a twentieth of the index.
+_FROM_OTHERS: Mapping[str, Mapping[str, Callable[[ColumnArrays], AnyArray]]] = {
     "annotation": {"rotation": lambda rows: quaternions.from_yaw(rows["yaw"])}
 }
-"""Table → column that is not kept, since it follows from others: a twentieth of the index."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -169,7 +169,7 @@ def _end_notices(scenario: ScenarioFolder, scan: ScenarioScan) -> Iterator[str]:
         )
 
 
-def rows_to_keep(tables: Mapping[str, Columns], contents: str) -> bytes:
+def rows_to_keep(tables: Mapping[str, ColumnArrays], contents: str) -> bytes:
     """The rows of one scenario as they are kept, with the hashes of the files that they were made from."""
     return streams([(spec, tables[spec.name]) for spec in _kept_specs()], {HASHES: contents})
 

@@ -14,10 +14,10 @@ from deepaccident_devkit.support.text import meant_text, spelled
 from deepaccident_devkit.tables.columns import (
     Choice,
     Column,
+    ColumnKind,
     Derived,
     Items,
     Key,
-    Kind,
     Number,
     Struct,
     Subset,
@@ -374,7 +374,7 @@ def _column(field: str, hint: Any) -> Column:
     return Column(field, _stored_name(field, kind), kind, nullable)
 
 
-def _stored_name(field: str, kind: Kind) -> str | None:
+def _stored_name(field: str, kind: ColumnKind) -> str | None:
     if isinstance(kind, Derived):
         return None
     if isinstance(kind, Key):

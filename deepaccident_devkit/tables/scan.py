@@ -14,7 +14,7 @@ from deepaccident_devkit.errors import ReleaseError
 from deepaccident_devkit.release import Calibs, Labels, Meta, ScenarioFolder, read_calibs, read_labels, read_meta
 from deepaccident_devkit.release.fingerprints import folder_hashes
 from deepaccident_devkit.release.layout import frame_numbers
-from deepaccident_devkit.release.store import Entry, ReleasePath, StorePath, fetched, listed
+from deepaccident_devkit.release.store import FolderEntry, ReleasePath, StorePath, fetched, folder_entries
 from deepaccident_devkit.support.arrays import ShortRepr
 from deepaccident_devkit.support.reading import FileKind, fault_text, observed, read_bytes
 from deepaccident_devkit.taxonomy import AGENTS, AgentName
@@ -22,7 +22,7 @@ from deepaccident_devkit.taxonomy import AGENTS, AgentName
 Severity = Literal["error", "warning", "note"]
 SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
 """Worst first: `error` cannot be indexed or cannot be true, `warning` is probably wrong, `note` is worth knowing."""
-ENDINGS = {"calib": "pkl", "label": "txt"}
+SMALL_FILE_ENDINGS = {"calib": "pkl", "label": "txt"}
 """Kind of small file → ending of its files."""
 _FRAMES_NAMED = 6
 _REMEDY = "unpack its archive again, or leave the scenario out with on_error='skip'"
@@ -92,7 +92,7 @@ def scan_scenario(scenario: ScenarioFolder) -> ScenarioScan:
     frames = {
         (agent, kind): _frames(scenario, agent, kind, ending, problems)
         for agent in AGENTS
-        for kind, ending in ENDINGS.items()
+        for kind, ending in SMALL_FILE_ENDINGS.items()
     }
     agents = tuple(agent for agent in AGENTS if frames[agent, "calib"])
     notices = [
@@ -221,7 +221,7 @@ def folder_digest(scenarios: Iterable[ScenarioFolder], split_files: Iterable[Rel
         root = os.fspath(scenario.root)
         base = os.path.join(root, scenario.folder, scenario.scenario_type)  # noqa: PTH118 - 7,000 of them at start
         digest.update(os.fsencode(f"{scenario.folder}/{scenario.token}\n"))
-        folders = [f"{base}/{agent}/{kind}/{scenario.name}" for agent in AGENTS for kind in ENDINGS]
+        folders = [f"{base}/{agent}/{kind}/{scenario.name}" for agent in AGENTS for kind in SMALL_FILE_ENDINGS]
         for path in [*folders, f"{base}/meta"]:
             digest.update(_stat_words(path, ctime=True))
         digest.update(_stat_words(f"{base}/meta/{scenario.name}.txt"))
@@ -231,7 +231,9 @@ def folder_digest(scenarios: Iterable[ScenarioFolder], split_files: Iterable[Rel
     return digest.hexdigest()
 
 
-def times_digest(scenario: ScenarioFolder, kinds: Iterable[str] = tuple(ENDINGS), *, ctime: bool = True) -> str:
+def times_digest(
+    scenario: ScenarioFolder, kinds: Iterable[str] = tuple(SMALL_FILE_ENDINGS), *, ctime: bool = True
+) -> str:
     """Return a digest of the names, sizes and times of a scenario's files of some kinds, and of meta; opens none.
 
     With `ctime` it changes with whatever is done to a file, also if its time is put back, and if it gets a hard link.
@@ -239,7 +241,7 @@ def times_digest(scenario: ScenarioFolder, kinds: Iterable[str] = tuple(ENDINGS)
     digest = hashlib.blake2b(os.fsencode(f"{scenario.folder}/{scenario.token}"), digest_size=16)
     for agent, kind in product(AGENTS, kinds):
         with suppress(OSError):  # no such folder
-            for entry in sorted(listed(scenario.kind_folder(agent, kind)), key=attrgetter("name")):
+            for entry in sorted(folder_entries(scenario.kind_folder(agent, kind)), key=attrgetter("name")):
                 digest.update(os.fsencode(f"{agent}/{kind}/{entry.name}") + _stat_words(entry, ctime=ctime))
     digest.update(_stat_words(scenario.meta_path, ctime=ctime))
     return digest.hexdigest()
@@ -272,7 +274,7 @@ def _content_or_fault(path: ReleasePath, kind: FileKind) -> bytes:
         return fault_text(error).encode()
 
 
-def _stat_words(path: ReleasePath | Entry | str, *, ctime: bool = False) -> bytes:
+def _stat_words(path: ReleasePath | FolderEntry | str, *, ctime: bool = False) -> bytes:
     try:
         status = os.stat(path) if isinstance(path, str) else path.stat()  # noqa: PTH116 - there are 7,000 texts at start
     except OSError:

@@ -26,20 +26,20 @@ from deepaccident_devkit.support.arrays import checked_number
 from deepaccident_devkit.support.json_text import as_record, parsed_json
 from deepaccident_devkit.support.nuscenes_names import field_remedy, with_keywords_named
 from deepaccident_devkit.support.text import choice, meant_text, members_of, path_of, spelled
-from deepaccident_devkit.tables.arrow_files import HASHES, REMEDY, StoredTable, damaged_value
+from deepaccident_devkit.tables.arrow_files import DAMAGED_INDEX_REMEDY, HASHES, StoredTable, damaged_value
 from deepaccident_devkit.tables.columns import NULL_INTEGER, Choice, Column, Key, Number, Subset, Vector
 from deepaccident_devkit.tables.index import Problem
 from deepaccident_devkit.tables.records import table_spec, table_specs
-from deepaccident_devkit.tables.tokens import Resolver
+from deepaccident_devkit.tables.tokens import ColumnViews, Resolver
 from deepaccident_devkit.taxonomy import AGENTS, FRAME_PERIOD, MINI_SPLITS, SPLIT_CHOICES, OnError
 
 if TYPE_CHECKING:
     from deepaccident_devkit.tables import records
 
-Record = TypeVar("Record")
+_Record = TypeVar("_Record")
 _Getter = Callable[[int], Any]
+# Frames by which a time may miss its frame.
 _SAME_FRAME: Final = 1e-6
-"""Frames by which a time may miss its frame."""
 RowArgument = str | Mapping[str, Any]
 """How a caller names a row: by its token, or by its record."""
 
@@ -300,16 +300,23 @@ class OpenTables:
 class Tables:
     """All tables of an index, memory-mapped: they stay readable when another process remakes the index."""
 
-    def __init__(self, folder: Path) -> None:
-        """Open the tables in `folder`; raises IndexStoreError if they cannot be read."""
+    def __init__(self, folder: Path, resolver: Callable[[ColumnViews], Resolver] = Resolver) -> None:
+        """Open the tables in `folder`; raises IndexStoreError if they cannot be read.
+
+        Args:
+            folder: Folder with one Arrow file per table.
+            resolver: Makes what finds rows, tokens and files; other datasets name their files otherwise.
+        """
         self.folder = folder
         self._stored = {name: StoredTable(folder, spec) for name, spec in table_specs().items()}
         self._tables: dict[str, Table[Any]] = {}
         self.views = {name: stored.views for name, stored in self._stored.items()}
         try:
-            self.resolver = Resolver(self.views)
+            self.resolver = resolver(self.views)
         except (IndexError, TypeError, ValueError) as error:
-            raise IndexStoreError(f"{folder}: its scenarios and agents do not fit together; {REMEDY}") from error
+            raise IndexStoreError(
+                f"{folder}: its scenarios and agents do not fit together; {DAMAGED_INDEX_REMEDY}"
+            ) from error
 
     def __repr__(self) -> str:
         return f"Tables({str(self.folder)!r})"
@@ -321,7 +328,9 @@ class Tables:
         try:
             return as_record(parsed_json(words.encode()), dict[str, ScenarioHashes])
         except ValueError as error:
-            raise IndexStoreError(f"{self.folder}: the hashes of its files are damaged; {REMEDY}") from error
+            raise IndexStoreError(
+                f"{self.folder}: the hashes of its files are damaged; {DAMAGED_INDEX_REMEDY}"
+            ) from error
 
     def table(self, name: str) -> Table[Any]:
         """One table's records; raises TableError."""
@@ -334,7 +343,7 @@ class Tables:
             return self._tables[known]
 
 
-class Table(Sequence[Record], Generic[Record]):
+class Table(Sequence[_Record], Generic[_Record]):
     """The rows of a table; each access makes a fresh dict, which is the caller's.
 
     Attributes:
@@ -359,10 +368,10 @@ class Table(Sequence[Record], Generic[Record]):
         return self._stored.num_rows
 
     @overload
-    def __getitem__(self, row: int) -> Record: ...
+    def __getitem__(self, row: int) -> _Record: ...
     @overload
-    def __getitem__(self, row: slice) -> list[Record]: ...
-    def __getitem__(self, row: int | slice) -> Record | list[Record]:
+    def __getitem__(self, row: slice) -> list[_Record]: ...
+    def __getitem__(self, row: int | slice) -> _Record | list[_Record]:
         """The record of a row, or the records of a slice."""
         if isinstance(row, slice):
             return [self._record(position) for position in range(*row.indices(len(self)))]
@@ -373,14 +382,14 @@ class Table(Sequence[Record], Generic[Record]):
             raise IndexError(f"table '{self.name}' has {len(self)} rows, asked for row {row}")
         return self._record(position)
 
-    def __iter__(self) -> Iterator[Record]:
+    def __iter__(self) -> Iterator[_Record]:
         return (self._record(row) for row in range(len(self)))
 
     def __repr__(self) -> str:
         fields = ", ".join(field for field, _ in self._getters)
         return f"<table '{self.name}': {len(self):,} rows of {fields}>"
 
-    def get(self, token: str) -> Record:
+    def get(self, token: str) -> _Record:
         """The record of a token; raises TokenError."""
         return self._record(self.row(token))
 
@@ -395,9 +404,9 @@ class Table(Sequence[Record], Generic[Record]):
         except IndexError as error:
             raise damaged_value(self.name) from error
 
-    def _record(self, row: int) -> Record:
+    def _record(self, row: int) -> _Record:
         try:
-            return cast(Record, RecordDict({field: getter(row) for field, getter in self._getters}))
+            return cast(_Record, RecordDict({field: getter(row) for field, getter in self._getters}))
         except IndexError as error:
             raise damaged_value(self.name) from error
 

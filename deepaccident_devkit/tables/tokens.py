@@ -30,7 +30,7 @@ FORMS = {
     "category": "<name>",
 }
 """Table → the form of its tokens; `<scenario>` stands for `<scenario_type>/<name>`."""
-Views = Mapping[str, Mapping[str, Any]]
+ColumnViews = Mapping[str, Mapping[str, Any]]
 """Table → stored column → view of it."""
 _NUM_WORDS = {
     table: form.replace("<scenario>", "<scenario_type>/<name>").count("/") + 1 for table, form in FORMS.items()
@@ -79,7 +79,7 @@ def parse_number(word: str, width: int = 1) -> int | None:
 class Resolver:
     """Finds the row of a token and makes the token of a row, for every table."""
 
-    def __init__(self, views: Views) -> None:
+    def __init__(self, views: ColumnViews) -> None:
         """Note where each scenario's and agent's rows begin; `views` may open tables when asked for them."""
         self._views = views
         scenario, agent = views["scenario"], views["agent"]

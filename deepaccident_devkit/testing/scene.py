@@ -32,6 +32,7 @@ from deepaccident_devkit.taxonomy import (
     INFRASTRUCTURE,
     LIDAR,
     OWN_ACTOR_ID,
+    POLE_HEIGHT,
     UNTRACKED_ID,
     VEHICLE_AGENTS,
     AgentName,
@@ -39,12 +40,12 @@ from deepaccident_devkit.taxonomy import (
 
 _LIDAR_HEIGHT = 1.94
 _CAMERA_YAW = dict(zip(CAMERAS, np.deg2rad([0.0, 55.0, -55.0, 180.0, 110.0, -110.0]).tolist(), strict=True))
+# Metres from the LiDAR's axis to a camera, and from the LiDAR down to it.
 _CAMERA_RADIUS, _CAMERA_DROP = 1.0, 0.3
-"""Metres from the LiDAR's axis to a camera, and from the LiDAR down to it."""
 _OPTICAL_FROM_FORWARD = SE3.from_rotation([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 
 
-def cameras(image_size: tuple[int, int]) -> dict[str, PinholeCamera]:
+def _cameras(image_size: tuple[int, int]) -> dict[str, PinholeCamera]:
     """Channel → camera for images of `image_size` (width, height): the back camera has 110°, the others 70°."""
     fields = {channel: np.deg2rad(110.0 if channel == "Camera_Back" else 70.0) for channel in CAMERAS}
     return {channel: PinholeCamera.from_field_of_view(*image_size, field) for channel, field in fields.items()}
@@ -56,7 +57,7 @@ def calib_of(agent: AgentName, world_from_ego: SE3, image_size: tuple[int, int])
         ego_from_lidar=SE3.from_yaw(0.0, (0.0, 0.0, 0.0 if agent == INFRASTRUCTURE else _LIDAR_HEIGHT)),
         world_from_ego=world_from_ego,
         camera_from_lidar={channel: _camera_from_lidar(yaw) for channel, yaw in _CAMERA_YAW.items()},
-        intrinsic={channel: camera.intrinsic for channel, camera in cameras(image_size).items()},
+        intrinsic={channel: camera.intrinsic for channel, camera in _cameras(image_size).items()},
     )
 
 
@@ -71,12 +72,12 @@ FAR_ACTOR_ID = 1399
 """The pedestrian that is untracked (−1) in every label."""
 PAIR: tuple[AgentName, AgentName] = ("ego_vehicle", "other_vehicle")
 """The two that collide."""
+# How many metres the other vehicle and its follower are farther back in a normal scenario.
 _DELAY = 15.0
-"""How many metres the other vehicle and its follower are farther back in a normal scenario."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class RoadUser:
+class _MovingBox:
     """A box on the ground that moves straight ahead; ground frame, right-handed, metres.
 
     Attributes:
@@ -98,23 +99,23 @@ class RoadUser:
 
 _SOUTH_TO_NORTH, _EAST_TO_WEST = np.pi / 2, np.pi
 _CAR, _VAN = (4.6, 1.9, 1.5), (4.5, 2.0, 2.0)
+# At the last frame the ego's front touches the left side of the other vehicle: the boxes overlap by 0.1 m.
 _AGENTS = (
-    RoadUser(actor_id=1223, category="car", size=_CAR, end=(-1.4, -1.75), yaw=0.0, speed=9.0),
-    RoadUser(actor_id=1236, category="van", size=_VAN, end=(-11.4, -1.75), yaw=0.0, speed=9.0),
-    RoadUser(actor_id=1212, category="car", size=_CAR, end=(1.75, -1.75), yaw=_SOUTH_TO_NORTH, speed=7.0),
-    RoadUser(actor_id=1237, category="car", size=_CAR, end=(1.75, -12.0), yaw=_SOUTH_TO_NORTH, speed=7.0),
+    _MovingBox(actor_id=1223, category="car", size=_CAR, end=(-1.4, -1.75), yaw=0.0, speed=9.0),
+    _MovingBox(actor_id=1236, category="van", size=_VAN, end=(-11.4, -1.75), yaw=0.0, speed=9.0),
+    _MovingBox(actor_id=1212, category="car", size=_CAR, end=(1.75, -1.75), yaw=_SOUTH_TO_NORTH, speed=7.0),
+    _MovingBox(actor_id=1237, category="car", size=_CAR, end=(1.75, -12.0), yaw=_SOUTH_TO_NORTH, speed=7.0),
 )
-"""At the last frame the ego's front touches the left side of the other vehicle: the boxes overlap by 0.1 m."""
 _TRAFFIC = (
-    RoadUser(actor_id=1301, category="truck", size=(8.4, 2.6, 3.6), end=(18.0, 1.75), yaw=_EAST_TO_WEST, speed=6.0),
-    RoadUser(actor_id=1302, category="cyclist", size=(1.64, 0.5, 1.77), end=(5.5, 12.0), yaw=np.pi / 2, speed=4.0),
-    RoadUser(actor_id=1303, category="motorcycle", size=(2.2, 0.86, 1.5), end=(-1.75, 20.0), yaw=-np.pi / 2, speed=7.0),
-    RoadUser(actor_id=1304, category="pedestrian", size=(0.4, 0.4, 1.86), end=(-8.0, 6.0), yaw=0.0, speed=1.2),
-    RoadUser(actor_id=20001, category="car", size=_CAR, end=(-24.0, -5.5), yaw=0.0, speed=0.0),
-    RoadUser(actor_id=FAR_ACTOR_ID, category="pedestrian", size=(0.4, 0.4, 1.86), end=(70, 8), yaw=2.2, speed=0.0),
+    _MovingBox(actor_id=1301, category="truck", size=(8.4, 2.6, 3.6), end=(18.0, 1.75), yaw=_EAST_TO_WEST, speed=6.0),
+    _MovingBox(actor_id=1302, category="cyclist", size=(1.64, 0.5, 1.77), end=(5.5, 12.0), yaw=np.pi / 2, speed=4.0),
+    _MovingBox(
+        actor_id=1303, category="motorcycle", size=(2.2, 0.86, 1.5), end=(-1.75, 20.0), yaw=-np.pi / 2, speed=7.0
+    ),
+    _MovingBox(actor_id=1304, category="pedestrian", size=(0.4, 0.4, 1.86), end=(-8.0, 6.0), yaw=0.0, speed=1.2),
+    _MovingBox(actor_id=20001, category="car", size=_CAR, end=(-24.0, -5.5), yaw=0.0, speed=0.0),
+    _MovingBox(actor_id=FAR_ACTOR_ID, category="pedestrian", size=(0.4, 0.4, 1.86), end=(70, 8), yaw=2.2, speed=0.0),
 )
-POLE_HEIGHT = 4.0
-"""Height of the infrastructure's LiDAR above the ground, metres."""
 _POLE = (8.0, 8.0, POLE_HEIGHT)
 
 
@@ -129,7 +130,7 @@ class SmallScene:
     """
 
     world_from_ground: SE3
-    users: Sequence[RoadUser]
+    users: Sequence[_MovingBox]
     frames: int
 
     def boxes(self, frame: int) -> Boxes:
@@ -169,13 +170,13 @@ def small_scene(rng: np.random.Generator, *, frames: int, accident: bool) -> Sma
     return SmallScene(world_from_ground=SE3.from_yaw(yaw, (x, y, 0.3)), users=(*agents, *_TRAFFIC), frames=frames)
 
 
+# The most points on a box, and the number of points on a box 1 m away; it becomes smaller with the distance.
 _MOST_POINTS, _POINT_METRES = 20, 120.0
-"""The most points on a box, and the number of points on a box 1 m away; it becomes smaller with the distance."""
 _GROUND_RADII, _GROUND_POINTS = (6.0, 12.0, 24.0), 12
 _LIDAR_RANGE = 65.0
 _LEAST_DEPTH = 0.5
+# RGB of each of `taxonomy.CATEGORIES`.
 _COLORS = np.array([(200, 40, 40), (40, 80, 200), (40, 160, 60), (220, 180, 40), (160, 60, 180), (240, 120, 40)])
-"""RGB of each of `taxonomy.CATEGORIES`."""
 _MIDDLE = (BEV_SHAPE[0] - 1) / 2
 
 
@@ -191,7 +192,7 @@ def cloud_of(boxes: Boxes, lidar_height: float) -> FloatArray:
     return np.concatenate(parts).astype(np.float32).astype(np.float64)
 
 
-def picture_of(
+def _picture_of(
     boxes: Boxes, camera: PinholeCamera, *, sky: tuple[int, int, int], road: tuple[int, int, int]
 ) -> ByteArray:
     """A picture (H, W, 3), RGB: sky, road, and the outlines of optical boxes in their classes' colours, far ones first.
@@ -242,8 +243,8 @@ def _ground(lidar_height: float) -> FloatArray:
     return np.column_stack([places, np.full(len(places), -lidar_height)])
 
 
+# It gives a quarter of the bytes of the writer's default, which is faster.
 _BEV_COMPRESSION = 6
-"""It gives a quarter of the bytes of the writer's default, which is faster."""
 
 
 class Recorder:
@@ -253,7 +254,7 @@ class Recorder:
         self, folder: ScenarioFolder, scene: SmallScene, agent: AgentName, frame: int, image_size: tuple[int, int]
     ) -> None:
         self._folder, self._agent, self._frame = folder, agent, frame
-        self._cameras = cameras(image_size)
+        self._cameras = _cameras(image_size)
         self._calib = calib_of(agent, scene.world_from_ego(agent, frame), image_size)
         world = scene.boxes(frame)
         self._own = np.arange(len(world)) < (agent in VEHICLE_AGENTS)  # the own row, if any, comes first
@@ -290,7 +291,7 @@ class Recorder:
         boxes = self._boxes.select(~self._own).transform(self._calib.camera_from_lidar[channel], channel)
         sky = (120 + 12 * AGENTS.index(self._agent), 130 + 12 * CAMERAS.index(channel), 200)
         road = (40 + self._frame, 40 + self._frame, 45 + self._frame)
-        return picture_of(boxes, self._cameras[channel], sky=sky, road=road)
+        return _picture_of(boxes, self._cameras[channel], sky=sky, road=road)
 
     def _labels(self) -> Labels:
         """The contents of the label, without the numbers of points."""

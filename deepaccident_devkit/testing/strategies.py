@@ -35,7 +35,7 @@ try:
 except ModuleNotFoundError as error:
     raise MissingExtraError("the strategies need hypothesis: in a checkout, pip install '.[testing]'") from error
 
-T = TypeVar("T")
+_T = TypeVar("_T")
 
 ANGLES = st.floats(-np.pi, np.pi, allow_nan=False)
 """Radians in [−π, π]."""
@@ -255,7 +255,7 @@ def small_releases() -> st.SearchStrategy[SmallRelease]:
     )
 
 
-def _some_of(names: Sequence[T]) -> st.SearchStrategy[tuple[T, ...]]:
+def _some_of(names: Sequence[_T]) -> st.SearchStrategy[tuple[_T, ...]]:
     """One or more of some names, in their order."""
     chosen = st.sets(st.sampled_from(names), min_size=1)
     return chosen.map(lambda some: tuple(name for name in names if name in some))

@@ -23,23 +23,24 @@ from deepaccident_devkit.taxonomy import AGENTS, INFRASTRUCTURE, VEHICLE_AGENTS,
 if TYPE_CHECKING:
     from deepaccident_devkit.tables.records import AgentRecord, ScenarioRecord
 
-Role = Literal["behind", "other", "other_behind", "infrastructure"]
+PartnerRole = Literal["behind", "other", "other_behind", "infrastructure"]
 """The role of a partner: the vehicle behind the ego, the two vehicles of the other side, the infrastructure."""
-Side = Literal["ego_vehicle", "other_vehicle"]
+VehicleSide = Literal["ego_vehicle", "other_vehicle"]
 SHEER_CURTAINS: Final = (
     "Town05_type001_subtype0002_scenario00035",
     "Town05_type001_subtype0002_scenario00004",
 )
 """Names of scenarios whose vehicles a CARLA bug marks invisible: the released code never counts them as unseen."""
 VISIBILITIES: Final = ("visible", "partial", "invisible")
+# Frames between two observations: the released code works at 2 Hz.
 _STEP: Final = 5
-"""Frames between two observations: the released code works at 2 Hz."""
+# Observations that count, the present one and two before it; and steps before the last frame at which the released
+# code evaluates: 0.5, 1, 1.5 and 2 s.
 _OBSERVED, _EVALUATED = 3, 4
-"""Observations that count, the present one and two before it; and steps before the last frame at which the released
-code evaluates: 0.5, 1, 1.5 and 2 s."""
+# Frames before the last one between which `hidden_collider` looks: 2 to 1 s.
 _BEFORE: Final = (20, 10)
-"""Frames before the last one between which `hidden_collider` looks: 2 to 1 s."""
-_PARTNERS: Final[dict[AgentName, dict[Role, AgentName]]] = {
+# Ego → role → agent: the released V2X dataset's renaming (docs/released_code.md, Poses).
+_PARTNERS: Final[dict[AgentName, dict[PartnerRole, AgentName]]] = {
     "ego_vehicle": {
         "behind": "ego_vehicle_behind",
         "other": "other_vehicle",
@@ -65,7 +66,6 @@ _PARTNERS: Final[dict[AgentName, dict[Role, AgentName]]] = {
         "infrastructure": "infrastructure",
     },
 }
-"""Ego → role → agent: the released V2X dataset's renaming (docs/released_code.md, Poses)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,13 +78,13 @@ class AgentConfig:
     """
 
     name: str
-    partners: tuple[Role, ...] = ()
+    partners: tuple[PartnerRole, ...] = ()
 
     def __post_init__(self) -> None:
         """Check the roles; raises ChoiceError."""
-        object.__setattr__(self, "partners", choices("partners", self.partners, get_args(Role), empty=True))
+        object.__setattr__(self, "partners", choices("partners", self.partners, get_args(PartnerRole), empty=True))
 
-    def agents_for(self, ego: str, *, side: Side = "ego_vehicle") -> tuple[AgentName, ...]:
+    def agents_for(self, ego: str, *, side: VehicleSide = "ego_vehicle") -> tuple[AgentName, ...]:
         """The agents of this configuration by their own names, the ego first.
 
         Seen from a vehicle, `behind` is the other vehicle of its side (for a vehicle behind: the one in front), and
@@ -103,9 +103,9 @@ class AgentConfig:
             ChoiceError: no such agent or side.
         """
         agent = choice("agent", ego, AGENTS)
-        side = choice("side", side, get_args(Side))
+        side = choice("side", side, get_args(VehicleSide))
         if agent == INFRASTRUCTURE:
-            named: Mapping[Role, AgentName] = {**_PARTNERS[side], "infrastructure": side}
+            named: Mapping[PartnerRole, AgentName] = {**_PARTNERS[side], "infrastructure": side}
         else:
             named = _PARTNERS[agent]
         return (agent, *(named[role] for role in self.partners))

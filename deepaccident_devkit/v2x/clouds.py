@@ -9,7 +9,7 @@ import numpy as np
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.geometry import SE3, Boxes, LidarPointCloud, quaternions
-from deepaccident_devkit.geometry.pointcloud import concatenate
+from deepaccident_devkit.geometry.pointcloud import concatenate_clouds
 from deepaccident_devkit.release.layout import MissingFiles
 from deepaccident_devkit.support.arrays import FloatArray, checked_whole
 from deepaccident_devkit.taxonomy import AGENTS, LIDAR, OnError
@@ -77,7 +77,7 @@ def aggregate_point_cloud(
         agent = np.full(len(cloud), AGENTS.index(message.agent), dtype=np.int8)
         parts.append(replace(cloud, agent=agent, time_lag=np.full(len(cloud), lag, dtype=np.float32)))
     files.tell()
-    return concatenate(parts, frame)
+    return concatenate_clouds(parts, frame)
 
 
 def moved_points(points: FloatArray, then: Boxes, now: Boxes) -> FloatArray:

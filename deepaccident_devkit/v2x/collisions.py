@@ -25,11 +25,11 @@ if TYPE_CHECKING:
 ContactSide = Literal["front", "rear", "left", "right"]
 CONTACT_GAP: Final = 1.5
 """The largest gap at the last frame, metres, with which a pair can collide within the next tenth of a second."""
+# Metres of a gap at the last frame, beside those of a tenth of a second, with which a pair can still collide.
 _LEEWAY: Final = 0.3
-"""Metres of a gap at the last frame, beside those of a tenth of a second, with which a pair can still collide."""
+# Metres; outlines this near touch, and overlap if they reach farther into each other; the direction of the shortest
+# line between two outlines is used from there on.
 _TOUCHING: Final = 0.02
-"""Metres; outlines this near touch, and overlap if they reach farther into each other; the direction of the shortest
-line between two outlines is used from there on."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

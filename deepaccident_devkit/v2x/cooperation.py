@@ -23,7 +23,7 @@ from deepaccident_devkit.taxonomy import AGENTS, INFRASTRUCTURE, OWN_ACTOR_ID, U
 from deepaccident_devkit.v2x.agents import Agents
 from deepaccident_devkit.v2x.messages import Link, Message, messages
 
-SAME_PLACE: Final = 0.5
+SAME_ACTOR_DISTANCE: Final = 0.5
 """Metres: two agents' boxes of one class whose centres are nearer than this are of the same untracked actor."""
 
 
@@ -262,7 +262,7 @@ def _repeated(boxes: Boxes, agent: AnyArray, loose: IntArray, chosen: IntArray) 
     """Which untracked rows are at the place of a tracked actor, or of an untracked row of an earlier agent."""
     against = np.concatenate([chosen, loose])
     apart: FloatArray = np.linalg.norm(boxes.center[loose][:, None] - boxes.center[against][None], axis=-1)
-    same = (apart < SAME_PLACE) & (boxes.category[loose][:, None] == boxes.category[against])
+    same = (apart < SAME_ACTOR_DISTANCE) & (boxes.category[loose][:, None] == boxes.category[against])
     earlier = np.tril(agent[loose][:, None] != agent[loose], k=-1)
     same[:, len(chosen) :] &= earlier
     result: BoolArray = same.any(axis=1)

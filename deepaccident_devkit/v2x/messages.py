@@ -32,12 +32,12 @@ _BEV_SHAPE: Final = (64, 200, 200)
 Payload = Literal["images", "cloud", "boxes", "bev"]
 """The kinds of data that a message can have; `MessageSize` describes them."""
 _NORMAL: Final = NormalDist()
+# Bytes that can be asked for.
 _MOST: Final = 2**50
-"""Bytes that can be asked for."""
+# Seconds: no scenario is longer, so a longer latency is in milliseconds.
 _LONGEST: Final = 20.0
-"""Seconds: no scenario is longer, so a longer latency is in milliseconds."""
+# The largest distance of a latency from a whole number of frames, in frames.
 _FRAME_TOLERANCE: Final = 1e-6
-"""The largest distance of a latency from a whole number of frames, in frames."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -32,22 +32,22 @@ from deepaccident_devkit.validation.subject import Subject, actors_text, frames_
 POSITION = 0.05
 """Metres between two agents' views of an actor."""
 HEADING = np.radians(5.0)
-SIZE = 0.02
-"""Metres between two agents' sizes of an actor."""
+# Metres between two agents' sizes of an actor.
+_SIZE_TOLERANCE = 0.02
 OWN_APART = 0.6
 """Metres between an agent's own row and where others see it; the real ones reach 0.3."""
+# Metres around an agent's origin in which others see the agent itself.
 _ITSELF = 3.0
-"""Metres around an agent's origin in which others see the agent itself."""
 SAME_PLACE = 0.1
 """Metres within which boxes of two agents are the same thing; different ids then contradict."""
+# Metres between the centres of two whose boxes can overlap.
 _NEAR = 10.0
-"""Metres between the centres of two whose boxes can overlap."""
+# Metres that a mover goes in a frame, at least.
 _STEP = 0.05
-"""Metres that a mover goes in a frame, at least."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Views:
+class _ActorViews:
     """Every actor at every moment (K of them), as each agent (A) annotated it from outside; NaN and −1 where not.
 
     Attributes:
@@ -78,14 +78,14 @@ def check_agreement(subject: Subject) -> Iterator[Finding]:
     yield from _overlaps(subject, views)
 
 
-def _views(subject: Subject) -> Views:
+def _views(subject: Subject) -> _ActorViews:
     boxes, rows = subject.boxes, np.flatnonzero(subject.seen)
     moments, moment = np.unique(
         np.column_stack([boxes.actor[rows], boxes.frame[rows]]).reshape(-1, 2), axis=0, return_inverse=True
     )
     place = (moment.reshape(-1), boxes.agent[rows])
     shape = (len(moments), len(subject.agents))
-    views = Views(
+    views = _ActorViews(
         actor=moments[:, 0],
         frame=moments[:, 1],
         center=np.full((*shape, 3), np.nan),
@@ -100,7 +100,7 @@ def _views(subject: Subject) -> Views:
     return views
 
 
-def _compare(subject: Subject, views: Views, first: int, second: int) -> Iterator[Finding]:
+def _compare(subject: Subject, views: _ActorViews, first: int, second: int) -> Iterator[Finding]:
     where = f"{subject.token}: {subject.agents[first]} and {subject.agents[second]}"
     apart = np.linalg.norm(views.center[:, first] - views.center[:, second], axis=1)
     turned = np.abs(_wrapped(views.yaw[:, first] - views.yaw[:, second]))
@@ -109,7 +109,7 @@ def _compare(subject: Subject, views: Views, first: int, second: int) -> Iterato
     for code, values, limit, unit in (
         ("positions-differ", apart, POSITION, "{:.2f} m apart"),
         ("headings-differ", np.degrees(turned), np.degrees(HEADING), "turned by {:.0f}°"),
-        ("sizes-differ", grown, SIZE, "sizes {:.2f} m apart"),
+        ("sizes-differ", grown, _SIZE_TOLERANCE, "sizes {:.2f} m apart"),
     ):
         bad = both & (values > limit)
         if bad.any():
@@ -120,7 +120,7 @@ def _compare(subject: Subject, views: Views, first: int, second: int) -> Iterato
         yield subject.finding("classes-differ", where, what)
 
 
-def _worst(views: Views, bad: BoolArray, values: FloatArray, both: BoolArray, unit: str) -> str:
+def _worst(views: _ActorViews, bad: BoolArray, values: FloatArray, both: BoolArray, unit: str) -> str:
     worst = int(np.argmax(np.where(bad, values, -1)))
     share = bad.sum() / both.sum()
     return (
@@ -129,7 +129,7 @@ def _worst(views: Views, bad: BoolArray, values: FloatArray, both: BoolArray, un
     )
 
 
-def _own_rows(subject: Subject, views: Views) -> Iterator[Finding]:
+def _own_rows(subject: Subject, views: _ActorViews) -> Iterator[Finding]:
     """Each agent's own row against what the others see of the actor that meta says it is."""
     key = {moment: index for index, moment in enumerate(zip(views.actor.tolist(), views.frame.tolist(), strict=True))}
     rows = np.flatnonzero(subject.own & (subject.boxes.actor != UNTRACKED_ID))
@@ -142,7 +142,7 @@ def _own_rows(subject: Subject, views: Views) -> Iterator[Finding]:
     far = np.nanmin(apart, axis=1)
     bad = subject.mask(own[far > OWN_APART])
     seen_size = np.nanmedian(views.size[seen], axis=1)
-    other_size = np.abs(subject.boxes.labels.size[own] - seen_size).max(axis=1) > SIZE
+    other_size = np.abs(subject.boxes.labels.size[own] - seen_size).max(axis=1) > _SIZE_TOLERANCE
     for agent, picked in subject.rows_by_agent(subject.mask(own[other_size])):
         what = f"the own row has another size than others see, {frames_text(subject.boxes.frame[picked])}"
         yield subject.finding("sizes-differ", subject.label_where(agent), what)
@@ -154,7 +154,7 @@ def _own_rows(subject: Subject, views: Views) -> Iterator[Finding]:
         yield subject.finding("own-box-apart", subject.label_where(agent), what)
 
 
-def _missing_actors(subject: Subject, views: Views) -> Iterator[Finding]:
+def _missing_actors(subject: Subject, views: _ActorViews) -> Iterator[Finding]:
     """Near actors that others annotate and one agent lacks, although its labels are complete (`Subject.reach`)."""
     there = np.isfinite(views.center[..., 0])
     place = np.nanmean(views.center, axis=1)
@@ -192,7 +192,7 @@ def _ids(subject: Subject) -> Iterator[Finding]:
         yield subject.finding("ids-differ", where, what)
 
 
-def _overlaps(subject: Subject, views: Views) -> Iterator[Finding]:
+def _overlaps(subject: Subject, views: _ActorViews) -> Iterator[Finding]:
     """A mover's box in another's, as others see the two, where meta names no collision; parked rows overlap anyway."""
     if subject.files.meta is None or subject.files.meta.collision is not None:
         return

@@ -28,8 +28,8 @@ class Code:
 
 
 _DATA = json.loads(Path(__file__).with_suffix(".json").read_bytes())
+# Name of a remedy that several kinds share → its text; other kinds have a text of their own.
 _REMEDIES = {**_DATA["remedies"], "update the index": INDEX_REMEDY}
-"""Name of a remedy that several kinds share → its text; other kinds have a text of their own."""
 CODES: dict[str, Code] = {
     name: Code(**{**fields, "remedy": _REMEDIES.get(fields["remedy"], fields["remedy"])})
     for name, fields in _DATA["codes"].items()

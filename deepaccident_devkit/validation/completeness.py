@@ -9,15 +9,15 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
 from deepaccident_devkit.errors import ReleaseError, TokenError
-from deepaccident_devkit.parallel import Places, run_batch
 from deepaccident_devkit.release import ReleaseLayout, ScenarioFolder, find_release
 from deepaccident_devkit.release.layout import frame_sizes
 from deepaccident_devkit.release.store import Dataroot, open_dataroot, places_of, refused_archives
-from deepaccident_devkit.reports import Report
 from deepaccident_devkit.support.arrays import ShortRepr
+from deepaccident_devkit.support.parallel import Places, run_batch
+from deepaccident_devkit.support.reports import Report
 from deepaccident_devkit.support.text import columns_text, counted, members_of, size_text
 from deepaccident_devkit.tables.indexing import assign_splits
-from deepaccident_devkit.tables.scan import ENDINGS
+from deepaccident_devkit.tables.scan import SMALL_FILE_ENDINGS
 from deepaccident_devkit.taxonomy import (
     AGENTS,
     BEV_CAMERA,
@@ -32,14 +32,15 @@ from deepaccident_devkit.taxonomy import (
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
-    from deepaccident_devkit.parallel import Engine
+    from deepaccident_devkit.support.parallel import Engine
 
 _META: Final = "meta"
+# Kinds that the test split ships without.
 _NOT_IN_TEST: Final = ("label", BEV_CAMERA, _META)
-"""Kinds that the test split ships without."""
 _UNKNOWN_SPLIT: Final = "unknown"
+# Scenarios that the text lists at most.
 _LISTED: Final = 10
-"""Scenarios that the text lists at most."""
+# Of the text's tables: heading → kinds of files.
 _COLUMNS: Final = {
     "calib": ("calib",),
     "label": ("label",),
@@ -47,7 +48,6 @@ _COLUMNS: Final = {
     LIDAR: (LIDAR,),
     BEV_CAMERA: (BEV_CAMERA,),
 }
-"""Of the text's tables: heading → kinds of files."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -197,11 +197,13 @@ def files_of(scenario: ScenarioFolder) -> tuple[FileCount, ...]:
     """The files of a scenario, agent by agent, then `meta`; none if neither calib nor labels number a frame."""
     found: dict[tuple[str, str], Mapping[int, int]] = {}
     for agent in AGENTS:
-        for kind, ending in {**ENDINGS, **CHANNEL_FORMAT}.items():
+        for kind, ending in {**SMALL_FILE_ENDINGS, **CHANNEL_FORMAT}.items():
             found[agent, kind] = {}
             with suppress(ReleaseError):  # a finding of its own
                 found[agent, kind] = frame_sizes(scenario.kind_folder(agent, kind), ending)
-    frames = max((frame for (_, kind), sizes in found.items() if kind in ENDINGS for frame in sizes), default=0)
+    frames = max(
+        (frame for (_, kind), sizes in found.items() if kind in SMALL_FILE_ENDINGS for frame in sizes), default=0
+    )
     if not frames:
         return ()
     counts = []
@@ -235,14 +237,14 @@ def completeness(
         version=layout.version,
         scenarios=len(every),
         whole=len(every) - len(lacking),
-        total=summed((count for counts in every.values() for count in counts), "all"),
+        total=_summed((count for counts in every.values() for count in counts), "all"),
         splits={split: _split_files(by_split.get(split, {}), lacking, expected.get(split)) for split in splits},
         lacking=dict(sorted(lacking.items())),
         unreadable_archives=refused_archives(layout.root),
     )
 
 
-def summed(counts: Iterable[FileCount], channel: str, agent: str | None = None) -> FileCount:
+def _summed(counts: Iterable[FileCount], channel: str, agent: str | None = None) -> FileCount:
     """The sum of some counts, under a name."""
     counts = list(counts)
     return FileCount(
@@ -276,7 +278,7 @@ def _split_files(
         scenarios=len(scenarios),
         whole=len(scenarios.keys() - set(lacking)),
         expected=expected,
-        files=[summed(of_part, of_part[0].channel, of_part[0].agent) for of_part in of_parts],
+        files=[_summed(of_part, of_part[0].channel, of_part[0].agent) for of_part in of_parts],
     )
 
 
@@ -293,5 +295,5 @@ def _split_text(name: str, split: SplitFiles) -> str:
 def _missing_texts(files: Sequence[FileCount], agent: str) -> Iterator[str]:
     """How many files of the kinds of each of `_COLUMNS` an agent lacks; - for none, `all` for as many as expected."""
     for kinds in _COLUMNS.values():
-        count = summed((each for each in files if each.agent == agent and each.channel in kinds), "")
+        count = _summed((each for each in files if each.agent == agent and each.channel in kinds), "")
         yield "-" if not count.missing else "all" if count.missing == count.expected else f"{count.missing:,}"

@@ -5,44 +5,27 @@ Croissant 1.0, with the fields of its extension for responsible AI, RAI 1.0. Pat
 
 from __future__ import annotations
 
+import json
 from collections import Counter
 from collections.abc import Iterable, Mapping
+from pathlib import Path
 from typing import Any, Final
 
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import ChoiceError, NotAvailableError
-from deepaccident_devkit.overview import Overview, overview
-from deepaccident_devkit.release.labels import FIELDS
+from deepaccident_devkit.release.labels import LABEL_FIELDS
 from deepaccident_devkit.release.store.members import SPLIT_FILE_FOLDER, SPLIT_FILES
 from deepaccident_devkit.statistics import FACTS, GROUPS, DatasetStatistics, dataset_statistics
-from deepaccident_devkit.statistics.results import TOTAL, UNKNOWN
+from deepaccident_devkit.statistics.overview import Overview, overview
+from deepaccident_devkit.statistics.results import TOTAL, UNKNOWN_SPLIT
 from deepaccident_devkit.taxonomy import AGENTS, BEV_CAMERA, CAMERAS, CATEGORIES, LIDAR, SPLITS
 from deepaccident_devkit.validation.codes import CODES
 
-Json = dict[str, Any]
+JsonLd = dict[str, Any]
 
-# the standard's own, which readers expect as a whole
-_CONTEXT: Final[Json] = {
-    "@language": "en",
-    "@vocab": "https://schema.org/",
-    "sc": "https://schema.org/",
-    "cr": "http://mlcommons.org/croissant/",
-    "rai": "http://mlcommons.org/croissant/RAI/",
-    "dct": "http://purl.org/dc/terms/",
-    "conformsTo": "dct:conformsTo",
-    "data": {"@id": "cr:data", "@type": "@json"},
-    "dataType": {"@id": "cr:dataType", "@type": "@vocab"},
-    "examples": {"@id": "cr:examples", "@type": "@json"},
-    **{
-        term: f"cr:{term}"
-        for term in (
-            *("citeAs", "column", "equivalentProperty", "extract", "field", "fileObject", "fileProperty", "fileSet"),
-            *("format", "includes", "isLiveDataset", "jsonPath", "key", "md5", "parentField", "path", "recordSet"),
-            *("references", "regex", "repeated", "replace", "samplingRate", "separator", "source", "subField"),
-            "transform",
-        )
-    },
-}
+_CONTEXT: Final = Path(__file__).with_name(
+    "croissant_context.json"
+)  # the standard's own, which readers expect as a whole
 _CITATION: Final = """\
 @inproceedings{wang2024deepaccident,
   title = {DeepAccident: A Motion and Accident Prediction Benchmark for V2X Autonomous Driving},
@@ -87,7 +70,7 @@ can learn either, and know nothing of accidents. Cut normal clips to the length 
 scores` finds detectors of short clips.
 
 Frames and agents of a scenario, and twins (an accident and the normal scenario of its name), are much alike: keep them
-on one side of a split; `deepaccident audit splits` finds those that are not. The mini release has names of the whole
+on one side of a split; `deepaccident check splits` finds those that are not. The mini release has names of the whole
 one, with other recordings.
 
 Measured on the real release, in brackets on what and on how many cases:
@@ -166,7 +149,7 @@ _OF_LINE: Final = (
 )
 
 
-def data_card(dataset: Dataset, *, licence: str | None = None) -> Json:
+def data_card(dataset: Dataset, *, licence: str | None = None) -> JsonLd:
     """The data card of a release as Croissant metadata; the same files give the same card, wherever they lie.
 
     Args:
@@ -198,7 +181,7 @@ def data_card(dataset: Dataset, *, licence: str | None = None) -> Json:
         + ("" if licence else " The licence is not stated here; ask the dataset's authors for it.")
     )
     return {
-        "@context": _CONTEXT,
+        "@context": json.loads(_CONTEXT.read_bytes()),
         "@type": "sc:Dataset",
         "name": "DeepAccident" + dataset.version.removeprefix("v1"),
         "description": text,
@@ -218,7 +201,7 @@ def data_card(dataset: Dataset, *, licence: str | None = None) -> Json:
     }
 
 
-def _distribution(dataset: Dataset, seen: Overview) -> list[Json]:
+def _distribution(dataset: Dataset, seen: Overview) -> list[JsonLd]:
     """A file set for each kind of file that is here."""
     folders = sorted({f"{each['folder']}/".lstrip("/") for each in dataset.scenario[:]})
     here = {name: f" {number:,} of {seen.samples:,} are here." for name, number in seen.files.items()}
@@ -237,20 +220,20 @@ def _distribution(dataset: Dataset, seen: Overview) -> list[Json]:
     return sets
 
 
-def _splits(found: DatasetStatistics) -> Json:
+def _splits(found: DatasetStatistics) -> JsonLd:
     boxes = {group: found.counts["annotations"].total(group) for group in GROUPS}
     urls = {"train": "cr:TrainingSplit", "val": "cr:ValidationSplit", "test": "cr:TestSplit"}
     rows = [
         (split, urls.get(split), *(each[split] for each in (found.scenarios, found.frames, found.samples, boxes)))
-        for split in (*SPLITS, UNKNOWN)
+        for split in (*SPLITS, UNKNOWN_SPLIT)
         if split in SPLITS or found.scenarios[split]
     ]
     made = _records("splits", "The official splits, and how much of each is here.", _OF_SPLIT, rows)
     return {**made, "dataType": "cr:Split", "key": {"@id": "splits/name"}}
 
 
-def _counts(dataset: Dataset, found: DatasetStatistics) -> Json:
-    splits = {each["token"]: each["split"] or UNKNOWN for each in dataset.scenario[:]}
+def _counts(dataset: Dataset, found: DatasetStatistics) -> JsonLd:
+    splits = {each["token"]: each["split"] or UNKNOWN_SPLIT for each in dataset.scenario[:]}
     recorded = Counter(
         (each["name"], of) for each in dataset.agent[:] for of in (TOTAL, splits[each["scenario_token"]])
     )
@@ -267,14 +250,14 @@ def _counts(dataset: Dataset, found: DatasetStatistics) -> Json:
     return _records("counts", "What is here, by split; `deepaccident info --statistics` has more.", _OF_COUNT, rows)
 
 
-def _of_labels(dataset: Dataset) -> list[Json]:
+def _of_labels(dataset: Dataset) -> list[JsonLd]:
     """Samples by the paths of their label files, and annotations by the lines of these."""
     of_path = dict(_OF_PATH)
     if all(each["folder"] in SPLITS for each in dataset.scenario[:]):
         of_path["split"] = ("sc:Text", "By the folder.", "fullpath", f"({'|'.join(SPLITS)})/")
     of_line = {
-        name: (*how, "lines", rf"(?:\S+ ){{{place}}}(\S+)(?: \S+){{{len(FIELDS) - place - 1}}}$")
-        for place, (name, how) in enumerate(zip(FIELDS, _OF_LINE, strict=True))
+        name: (*how, "lines", rf"(?:\S+ ){{{place}}}(\S+)(?: \S+){{{len(LABEL_FIELDS) - place - 1}}}$")
+        for place, (name, how) in enumerate(zip(LABEL_FIELDS, _OF_LINE, strict=True))
     }
     return [
         _records(
@@ -296,7 +279,7 @@ def _of_labels(dataset: Dataset) -> list[Json]:
 
 def _records(
     name: str, text: str, fields: Mapping[str, tuple[str, ...]], rows: Iterable[tuple[Any, ...]] = (), files: str = ""
-) -> Json:
+) -> JsonLd:
     """A record set that holds rows of its fields, or whose fields are read in files."""
     made = [
         _node("Field", f"{name}/{field}", meaning, dataType=kind)
@@ -311,5 +294,5 @@ def _records(
     return _node("RecordSet", name, text, field=made, **({"data": data} if data else {}))
 
 
-def _node(kind: str, name: str, text: str, **more: Any) -> Json:
+def _node(kind: str, name: str, text: str, **more: Any) -> JsonLd:
     return {"@type": f"cr:{kind}", "@id": name, "name": name.rpartition("/")[2], "description": text, **more}

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from itertools import permutations
 
-from deepaccident_devkit.accidents.twins import torn_twins
+from deepaccident_devkit.collisions.twins import torn_twins
 from deepaccident_devkit.errors import ReleaseError, shortened
 from deepaccident_devkit.release import ReleaseLayout, ScenarioFolder, read_split_file, store
 from deepaccident_devkit.release.layout import frame_numbers
@@ -17,22 +17,22 @@ from deepaccident_devkit.tables.scan import ScenarioScan, finding_of, frame_rang
 from deepaccident_devkit.taxonomy import AGENTS, CHANNEL_FORMAT, CHANNELS
 from deepaccident_devkit.validation.subject import frames_text, make_finding
 
+# Frames that are listed if a folder has no more.
 _FEW = 10
-"""Frames that are listed if a folder has no more."""
-Recording = tuple[str, str]
-"""Agent and kind of file: `label`, `calib` or a channel."""
+# Agent and kind of file: `label`, `calib` or a channel.
+_Recording = tuple[str, str]
 
 
-Inventory = Mapping[Recording, list[int]]
+Inventory = Mapping[_Recording, list[int]]
 """Frame numbers of the sensor folders of a scenario that have any."""
+# Repeated lines that a finding names at most.
 _NAMED = 3
-"""Repeated lines that a finding names at most."""
 
 
 def take_inventory(scenario: ScenarioFolder, scan: ScenarioScan) -> tuple[Inventory, list[Finding]]:
     """List a scenario's sensor folders; a channel that is wholly absent was not downloaded, and is no finding."""
     findings: list[Finding] = []
-    frames: dict[Recording, list[int]] = {}
+    frames: dict[_Recording, list[int]] = {}
     for agent in scan.agents:
         for channel in CHANNELS:
             folder = scenario.kind_folder(agent, channel)
@@ -87,7 +87,7 @@ def _frame_findings(
     if extra:
         what = f"has frames {frame_ranges(extra)} beyond {scan.num_frames}"
         yield make_finding("sensor-frames-extra", scenario.token, str(folder), what)
-    for entry in sorted(store.listed(folder), key=lambda entry: entry.name):
+    for entry in sorted(store.folder_entries(folder), key=lambda entry: entry.name):
         path = folder / entry.name
         try:
             status = entry.stat()
@@ -100,7 +100,7 @@ def _frame_findings(
             yield make_finding("sensor-irregular", scenario.token, str(path), irregular)
 
 
-def check_splits(layout: ReleaseLayout) -> tuple[ReleaseLayout, list[Finding]]:
+def check_split_files(layout: ReleaseLayout) -> tuple[ReleaseLayout, list[Finding]]:
     """The release with those split files that can be read, and what is wrong with all of them."""
     found: list[Finding] = []
     readable: dict[str, ReleasePath] = {}

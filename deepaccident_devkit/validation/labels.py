@@ -31,8 +31,8 @@ OWN_TURN = np.radians(15.0)
 """Heading of the own row's box against the agent's."""
 OWN_VELOCITY = 0.05
 """m/s between the own row and the first line, which print the same number with other digits."""
-SAME_PLACE = 0.05
-"""Metres within which two boxes of a class stand in the same place."""
+# Metres within which two boxes of a class stand in the same place.
+_SAME_PLACE = 0.05
 SIZE_CHANGE = 0.02
 WALKER_SIZE_CHANGE = 1.0
 """Metres by which a pedestrian's box may change from frame to frame: real ones stretch by 0.62."""
@@ -88,7 +88,7 @@ def _ids(subject: Subject) -> Iterator[Finding]:
 
 def _same_places(subject: Subject) -> Iterator[Finding]:
     labels, sample = subject.boxes.labels, subject.boxes.sample
-    pairs, doubled = near_pairs(labels.center, sample * len(CATEGORIES) + labels.category, SAME_PLACE)
+    pairs, doubled = near_pairs(labels.center, sample * len(CATEGORIES) + labels.category, _SAME_PLACE)
     doubled[pairs.ravel()] = True
     yield from subject.label_findings("duplicate-box", doubled, "two boxes stand in the same place")
 

@@ -25,27 +25,27 @@ CAMERA_FIELD = {**dict.fromkeys(CAMERAS, 70.0), "Camera_Back": 110.0}
 """Horizontal field of view, degrees."""
 _YAW_TOLERANCE = 5.0
 _FIELD_TOLERANCE = 0.02
+# Metres from the LiDAR: a truck's front is up to 4.8 m from its middle, the release's poles have theirs at 5.1 m.
 _FURTHEST_CAMERA = 5.5
-"""Metres from the LiDAR: a truck's front is up to 4.8 m from its middle, the release's poles have theirs at 5.1 m."""
 _TILT = np.sin(np.radians(10.0))
+# Metres between a camera's height and that of the others.
 _CAMERA_HEIGHTS = 0.4
-"""Metres between a camera's height and that of the others."""
 _LIDAR_HEIGHTS = (0.8, 4.5)
 _POLE_MOUNT = 0.01
 _POLE_CHANGE = 0.02
+# Metres off the middle of the frames around.
 _JUMP = 0.75
-"""Metres off the middle of the frames around."""
+# The blow can be up to three frames before the last; what follows it fits no displacement. Of fewer than eight frames
+# the first half is judged all the same.
 _LAST_FRAMES = 4
-"""The blow can be up to three frames before the last; what follows it fits no displacement. Of fewer than eight frames
-the first half is judged all the same."""
+# m/s, and as a share of the speed, between a label's first line and the displacement around it.
 _SPEED_DIFFERENCE = (1.0, 0.2)
-"""m/s, and as a share of the speed, between a label's first line and the displacement around it."""
+# How many boxes of an actor, and which share of them, must not fit for a finding.
 _ACTOR_OFF = (3, 0.8)
-"""How many boxes of an actor, and which share of them, must not fit for a finding."""
-NEAR = 15.0
-"""Metres within which a vehicle that the agent saw is not too far away to be tracked."""
+# Metres within which a vehicle that the agent saw is not too far away to be tracked.
+_TRACKING_RADIUS = 15.0
+# The number of boxes that must show it: the tracking of a single one comes and goes.
 _LEAST_BOXES = 2
-"""The number of boxes that must show it: the tracking of a single one comes and goes."""
 _VEHICLES = tuple(CATEGORIES.index(name) for name in ("car", "truck", "van"))
 
 
@@ -222,7 +222,7 @@ def _trackable(subject: Subject, rows: IntArray) -> BoolArray:
     """Which untracked boxes (M,) of what their agent saw are near vehicles, or tracked by an agent no nearer."""
     labels, boxes = subject.boxes.labels, subject.boxes
     distance = np.linalg.norm(labels.center[:, :2], axis=1)
-    found: BoolArray = np.isin(labels.category[rows], _VEHICLES) & (distance[rows] < NEAR)
+    found: BoolArray = np.isin(labels.category[rows], _VEHICLES) & (distance[rows] < _TRACKING_RADIUS)
     others = np.flatnonzero(subject.seen)
     if len(rows) and len(others):
         both = np.concatenate([rows, others])

@@ -28,16 +28,16 @@ from deepaccident_devkit.validation.subject import MOST_BOXES, Subject, frames_t
 
 ZEROS: Final = 64
 """Zero bytes in a row from which on they are a fault."""
+# Markers of a scan's head and of the picture's end; coded data hold neither.
 _SCAN, _END = b"\xff\xda", b"\xff\xd9"
-"""Markers of a scan's head and of the picture's end; coded data hold neither."""
+# In a JPEG's head: how many codes of each length grey's AC coefficients have; nearly all encoders write just these.
 _USUAL_CODES: Final = bytes.fromhex("100002010303020403050504040000017d")
-"""In a JPEG's head: how many codes of each length grey's AC coefficients have; nearly all encoders write just these."""
+# The brightness that decoders give to blocks whose data are missing: 128, and what rounding does to it.
 _GREY = (126.0, 130.0)
-"""The brightness that decoders give to blocks whose data are missing: 128, and what rounding does to it."""
+# Of red, green and blue in the brightness.
 _SHARES = (0.299, 0.587, 0.114)
-"""Of red, green and blue in the brightness."""
+# Data that a decoder of a whole picture does not look at.
 _MORE = bytes(range(1, 251)) * 40
-"""Data that a decoder of a whole picture does not look at."""
 _KINDS: dict[str, FileKind] = {LIDAR: "lidar", BEV_CAMERA: "bev"}
 LIDAR_RANGE = 75.0
 """Metres; the real LiDAR ends at 70."""
@@ -46,25 +46,25 @@ POINT_COUNT = (5, 0.25)
 cars are off by up to 12 points, or 24 % of a few."""
 WALKER_POINT_COUNT = (30, 0.25)
 """The same for pedestrians, whose real boxes change their size between the count and the label."""
+# Points by which one box alone may be off, and a pedestrian's: the release has 77 for 55, and 486 for 260.
 _LARGE_COUNT = (25, 300)
-"""Points by which one box alone may be off, and a pedestrian's: the release has 77 for 55, and 486 for 260."""
+# Boxes of one label, and their share of those with points, that are off if the cloud is not the label's.
 _FRAME_OFF = (2, 0.25)
-"""Boxes of one label, and their share of those with points, that are off if the cloud is not the label's."""
+# The same for all labels of an agent, of whose boxes up to 7.5 % are off in the release.
 _AGENT_OFF = (3, 0.15)
-"""The same for all labels of an agent, of whose boxes up to 7.5 % are off in the release."""
 _BEV_HALF = 55.0
 _VEHICLES = tuple(CATEGORIES.index(name) for name in ("car", "truck", "van"))
 _BEV_LEAST_SHARE = 0.5
 _THUMBNAIL = (32, 18)
+# The largest ratio of an image's distance from its neighbours in time to their distance from each other.
 _OUT_OF_SEQUENCE = 3.0
-"""The largest ratio of an image's distance from its neighbours in time to their distance from each other."""
+# Grey levels; below it images are the same to the eye.
 _LEAST_DIFFERENCE = 6.0
-"""Grey levels; below it images are the same to the eye."""
+# Grey levels between the darkest and the lightest spot of a picture that shows something.
 _BLANK = 40.0
-"""Grey levels between the darkest and the lightest spot of a picture that shows something."""
+# Metres an agent may move while its pictures stay the same.
 _STILL = 0.02
-"""Metres an agent may move while its pictures stay the same."""
-ORIENTATIONS: dict[str, str] = {
+PICTURE_ORIENTATIONS: dict[str, str] = {
     "forward-up": "as the format says",
     "mirrored": "left and right exchanged",
     "backward-up": "turned by half",
@@ -127,7 +127,7 @@ class _BevHits:
     """Vehicles whose centre has the vehicle's tag, for one recording: under each orientation, and frame by frame."""
 
     boxes: int = 0
-    hits: dict[str, int] = field(default_factory=lambda: dict.fromkeys(ORIENTATIONS, 0))
+    hits: dict[str, int] = field(default_factory=lambda: dict.fromkeys(PICTURE_ORIENTATIONS, 0))
     poor_frames: list[int] = field(default_factory=list)
 
 
@@ -310,7 +310,7 @@ def _bevs(subject: Subject, agent: int, paths: Mapping[int, ReleasePath], tellin
         places = _vehicle_places(subject, agent, frame)
         if not len(places):
             continue
-        hits = {name: _hits(semantic, _turned(places, name)) for name in ORIENTATIONS}
+        hits = {name: _hits(semantic, _turned(places, name)) for name in PICTURE_ORIENTATIONS}
         total.boxes += len(places)
         for name, hit in hits.items():
             total.hits[name] += int(hit.sum())
@@ -320,7 +320,7 @@ def _bevs(subject: Subject, agent: int, paths: Mapping[int, ReleasePath], tellin
     best = max(total.hits, key=lambda name: total.hits[name])
     if total.hits[best] > total.hits["forward-up"] + max(2, 0.25 * total.boxes) and total.boxes:
         shown = f"{total.hits[best]} of {total.boxes} vehicles are where the labels have them if it is '{best}'"
-        what = f"{shown} ({ORIENTATIONS[best]}), {total.hits['forward-up']} if forward is up"
+        what = f"{shown} ({PICTURE_ORIENTATIONS[best]}), {total.hits['forward-up']} if forward is up"
         yield subject.finding("bev-orientation", folder, what)
     elif total.poor_frames:
         what = f"fewer than half of the labels' vehicles are in the picture, {frames_text(total.poor_frames)}"

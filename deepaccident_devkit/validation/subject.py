@@ -18,16 +18,16 @@ from deepaccident_devkit.tables.scan import ScenarioFiles, frame_ranges
 from deepaccident_devkit.taxonomy import INFRASTRUCTURE, OWN_ACTOR_ID, UNTRACKED_ID, AgentName
 from deepaccident_devkit.validation.codes import CODES
 
+# Metres at the most within which a label is taken to be complete.
 _SURE_REACH = 35.0
-"""Metres at the most within which a label is taken to be complete."""
 _SHARE_OF_FURTHEST = 0.8
 _FURTHEST = 1e7
 MOST_BOXES = 500
 """Boxes in a label, of which real ones have less than a hundred."""
+# Boxes at one place and moment that are compared pair by pair.
 _MOST_TOGETHER = 32
-"""Boxes at one place and moment that are compared pair by pair."""
+# Metres between an untracked row and where the actor should be.
 _UNTRACKED_PLACE = 2.0
-"""Metres between an untracked row and where the actor should be."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

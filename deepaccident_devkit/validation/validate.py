@@ -15,10 +15,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from deepaccident_devkit._version import __version__
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ConfigError, IndexStoreError, ReleaseError
-from deepaccident_devkit.parallel import Places, Store, run_batch
 from deepaccident_devkit.release import ReleaseLayout, ScenarioFolder
 from deepaccident_devkit.release.layout import left_aside, names_without_calib
 from deepaccident_devkit.release.store import (
@@ -27,14 +25,16 @@ from deepaccident_devkit.release.store import (
     checksums_compared,
     places_of,
 )
-from deepaccident_devkit.reports import CheckReport, Report
 from deepaccident_devkit.support.files import writable_folder
 from deepaccident_devkit.support.json_text import as_record
+from deepaccident_devkit.support.parallel import Places, Store, run_batch
 from deepaccident_devkit.support.reading import LIMITS_VARIABLE
+from deepaccident_devkit.support.reports import CheckReport, Report
 from deepaccident_devkit.support.text import counted
+from deepaccident_devkit.support.version import __version__
 from deepaccident_devkit.tables import SEVERITIES, Finding, Tables, current_index
 from deepaccident_devkit.tables.boxes import VelocityFit, fit_velocities, total_fit
-from deepaccident_devkit.tables.scan import ENDINGS, finding_of, read_scenario, scan_scenario, times_digest
+from deepaccident_devkit.tables.scan import SMALL_FILE_ENDINGS, finding_of, read_scenario, scan_scenario, times_digest
 from deepaccident_devkit.tables.tables import token_of
 from deepaccident_devkit.taxonomy import CHANNELS, VELOCITY_FRAMES
 from deepaccident_devkit.validation.agreement import check_agreement, check_story
@@ -46,7 +46,7 @@ from deepaccident_devkit.validation.completeness import (
     files_of,
     readable_release,
 )
-from deepaccident_devkit.validation.inventory import absences, check_splits, take_inventory
+from deepaccident_devkit.validation.inventory import absences, check_split_files, take_inventory
 from deepaccident_devkit.validation.labels import check_labels
 from deepaccident_devkit.validation.poses import check_poses, check_untracked, check_velocities
 from deepaccident_devkit.validation.sensors import check_sensors
@@ -55,15 +55,15 @@ from deepaccident_devkit.validation.subject import make_finding, subject_of
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
-    from deepaccident_devkit.parallel import Engine
+    from deepaccident_devkit.support.parallel import Engine
 
 NO_FIT = total_fit([])
 _LINES_A_SCENARIO = 8
 _ALL_LISTED = "(--all lists all)"
+# Names while a download is running: with `.part`, `.partial`, `.download` or `.crdownload` at their end.
 _UNFINISHED = "*.zip.[cdp]*[dlt]"
-"""Names while a download is running: with `.part`, `.partial`, `.download` or `.crdownload` at their end."""
+# Kinds of files that are always read.
 _READ = ("calib", "label", "meta")
-"""Kinds of files that are always read."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -99,7 +99,7 @@ class ScenarioCheck:
 def check_key(scenario: ScenarioFolder, *, deep: bool) -> str:
     """A digest of all that decides a scenario's check: the devkit, settings, names, sizes and times of its files."""
     settings = (__version__, deep, str(scenario.root), scenario.folder, os.environ.get(LIMITS_VARIABLE))
-    times = times_digest(scenario, (*ENDINGS, *CHANNELS), ctime=False)
+    times = times_digest(scenario, (*SMALL_FILE_ENDINGS, *CHANNELS), ctime=False)
     return hashlib.blake2b(f"{settings} {times}".encode(), digest_size=8).hexdigest()
 
 
@@ -305,7 +305,7 @@ def _report(
     deep: bool,
 ) -> ValidationReport:
     """What was found in scenarios, and in the release as a whole."""
-    readable, of_release = check_splits(layout)
+    readable, of_release = check_split_files(layout)
     tokens = {check.token for check in checks}
     of_release = [finding for finding in of_release if finding.scenario is None or finding.scenario in tokens]
     of_release += _strays(layout) if scenarios is None else ()

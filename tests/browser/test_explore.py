@@ -17,12 +17,12 @@ from replay_page import accident
 from selenium.webdriver.common.keys import Keys
 
 from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.collisions import twin_of
 from deepaccident_devkit.evaluation.runs import save_run
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
-from deepaccident_devkit.explore import Explorer, export_pages, make_app
-from deepaccident_devkit.explore.serving import Served, serving
+from deepaccident_devkit.plugins.explore import Explorer, export_pages, make_app
+from deepaccident_devkit.plugins.explore.serving import Served, serving
 from deepaccident_devkit.render.captions import scenario_words
-from deepaccident_devkit.safety import twin_of
 
 pytestmark = pytest.mark.slow
 

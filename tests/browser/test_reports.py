@@ -8,10 +8,10 @@ from evaluation_runs import PARTIAL, evaluation_run
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
-from deepaccident_devkit.motion import samples
+from deepaccident_devkit.plugins.safety import safety_report
+from deepaccident_devkit.plugins.safety.page import save_safety_report
 from deepaccident_devkit.render.evaluation import save_report
-from deepaccident_devkit.safety import safety_report
-from deepaccident_devkit.safety.page import save_safety_report
+from deepaccident_devkit.selection.samples import samples
 
 pytestmark = pytest.mark.slow
 

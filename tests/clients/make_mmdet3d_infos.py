@@ -20,8 +20,8 @@ from deepaccident_devkit.export.frames import keyframes
 from deepaccident_devkit.export.mmdet3d import Mmdet3d
 from deepaccident_devkit.export.nuscenes import NuScenes
 from deepaccident_devkit.geometry import SE3
+from deepaccident_devkit.plugins.synth import SynthConfig, make_release
 from deepaccident_devkit.release import read_calib, write_calib
-from deepaccident_devkit.synth import SynthConfig, make_release
 from deepaccident_devkit.taxonomy import OWN_ACTOR_ID
 
 AGENTS = ("ego_vehicle", "infrastructure")

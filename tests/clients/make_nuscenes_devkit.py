@@ -16,7 +16,7 @@ from deepaccident_devkit.export.bulk import export_release
 from deepaccident_devkit.export.frames import keyframes
 from deepaccident_devkit.export.nuscenes import NuScenes
 from deepaccident_devkit.export.nuscenes.scenes import CHANNEL_NAMES
-from deepaccident_devkit.synth import SynthConfig, make_release
+from deepaccident_devkit.plugins.synth import SynthConfig, make_release
 from deepaccident_devkit.taxonomy import OWN_ACTOR_ID
 
 AGENTS = ("ego_vehicle", "infrastructure")

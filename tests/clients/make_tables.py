@@ -18,7 +18,7 @@ from deepaccident_devkit.export.bulk import export_release
 from deepaccident_devkit.export.format import SPLIT_NAMES
 from deepaccident_devkit.export.parquet import Parquet
 from deepaccident_devkit.export.webdataset import WebDataset
-from deepaccident_devkit.synth import SynthConfig, make_release
+from deepaccident_devkit.plugins.synth import SynthConfig, make_release
 
 
 def main(folder: Path) -> None:

@@ -52,7 +52,7 @@ def test_workers_read_too(remote: DeepAccident, da: DeepAccident, method: str) -
 @pytest.mark.filterwarnings("ignore:This process .* is multi-threaded:DeprecationWarning")
 def test_a_loader_of_two_workers(remote: DeepAccident, da: DeepAccident, method: str) -> None:
     torch = pytest.importorskip("torch")
-    from deepaccident_devkit.export.torch import ImageConfig, V2XConfig, V2XDataset, collate
+    from deepaccident_devkit.training.torch import ImageConfig, V2XConfig, V2XDataset, collate
 
     tokens = [da.sample[number]["token"] for number in (1, 4, 8)]
     config = V2XConfig(agents="+infrastructure", images=ImageConfig(resize=(18, 32)))

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from engines.products import COMMANDS, Cluster, Local, command, contents, done, words
 
-from deepaccident_devkit.synth import SynthConfig, make_release
+from deepaccident_devkit.plugins.synth import SynthConfig, make_release
 
 
 @pytest.fixture(scope="session")

@@ -56,7 +56,7 @@ def test_a_killed_scheduler_costs_what_is_at_hand(local: Local, tmp_path: Path) 
 
 
 WITHOUT = "import sys; sys.modules['deepaccident_devkit'] = None"
-OTHER = "import deepaccident_devkit._version as here; here.__version__ = '0.0.1'"
+OTHER = "import deepaccident_devkit.support.version as here; here.__version__ = '0.0.1'"
 WORKER = "from distributed.cli.dask_worker import main; main()"
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from deepaccident_devkit.release import ScenarioFolder
 from deepaccident_devkit.support.files import write_bytes
 from deepaccident_devkit.taxonomy import OWN_ACTOR_ID, VEHICLE_AGENTS
-from deepaccident_devkit.testing.breakages.breakage import ENDINGS, FIELD, Rows, ScenarioEditor
+from deepaccident_devkit.testing.breakages.breakage import FIELD, FILE_ENDINGS, LabelRows, ScenarioEditor
 
 Candidate = TypeVar("Candidate")
 Sightings = Mapping[str, Mapping[int, Mapping[int, np.ndarray]]]
@@ -58,7 +58,7 @@ class Place(ScenarioEditor):
         }
 
     def take_next(self, agent: str, kind: str, frame: int) -> None:
-        """Replace an agent's file of a kind (`ENDINGS`) by the next frame's."""
+        """Replace an agent's file of a kind (`FILE_ENDINGS`) by the next frame's."""
         self.take(agent, kind, frame, agent, frame + 1)
 
     def take(self, agent: str, kind: str, frame: int, other: str, other_frame: int) -> None:
@@ -193,7 +193,7 @@ class Place(ScenarioEditor):
         ]
         agent, actor = one_of(pairs, rng)
         for other in self.agents:
-            for kind in ENDINGS if other != agent else ():
+            for kind in FILE_ENDINGS if other != agent else ():
                 self.remove_folder(self.folder(other, kind))
         return agent, actor
 
@@ -216,10 +216,10 @@ class Place(ScenarioEditor):
         line = next(line for line in self.meta_lines() if "agents id:" in line)
         return [int(word) for word in line.split(":")[1].split()]
 
-    def row_of(self, rows: Rows, actor: int) -> list[str]:
+    def row_of(self, rows: LabelRows, actor: int) -> list[str]:
         return next(row for row in rows[1:] if int(row[FIELD["id"]]) == actor)
 
-    def any_row(self, rng: np.random.Generator, rows: Rows) -> list[str]:
+    def any_row(self, rng: np.random.Generator, rows: LabelRows) -> list[str]:
         """A box line that is not the agent's own."""
         others = [row for row in rows[1:] if int(row[FIELD["id"]]) != OWN_ACTOR_ID]
         return others[rng.integers(len(others))]

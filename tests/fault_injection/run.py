@@ -9,8 +9,8 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
+from deepaccident_devkit.plugins.synth import SynthConfig, make_release
 from deepaccident_devkit.release import find_release
-from deepaccident_devkit.synth import SynthConfig, make_release
 from fault_injection.mutations import BEYOND, MUTATIONS, seeded
 from fault_injection.mutations.calib import marker
 from fault_injection.place import NoVictimError, Place

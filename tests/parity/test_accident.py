@@ -26,9 +26,9 @@ from deepaccident_devkit.evaluation.accident.released import (
     paths_of_heads,
 )
 from deepaccident_devkit.evaluation.predictions import MotionOutput, first_frames
-from deepaccident_devkit.exact.outlines import pair_gaps
 from deepaccident_devkit.geometry.bev_grid import cells_in, to_orientation
 from deepaccident_devkit.motion import POST_PROCESSING, MotionHeads, MotionLabelConfig, MotionLabels, predict_instances
+from deepaccident_devkit.motion.reference_arithmetic.outlines import pair_gaps
 
 ACCIDENT, RULES = POST_PROCESSING["accident"], ReleasedAccidents()
 COUNTS = ("tp", "fp", "fn", "id", "position", "time")

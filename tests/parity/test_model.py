@@ -19,10 +19,12 @@ from golden_model import GoldenModel, check_close
 
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.geometry.conventions import flip_pose
-from deepaccident_devkit.model import warps
-from deepaccident_devkit.model.bev import BevEncode, BevEncodeConfig, crop
-from deepaccident_devkit.model.checkpoint import Weights, load_weights
-from deepaccident_devkit.model.detection import (
+from deepaccident_devkit.motion import Augmentation, MotionLabelConfig, MotionLabels
+from deepaccident_devkit.motion.warping import WarpMode
+from deepaccident_devkit.plugins.model import warps
+from deepaccident_devkit.plugins.model.bev import BevEncode, BevEncodeConfig, crop
+from deepaccident_devkit.plugins.model.checkpoint import Weights, load_weights
+from deepaccident_devkit.plugins.model.detection import (
     RELEASED_CLASS_SLOTS,
     RELEASED_NMS,
     CenterHead,
@@ -37,8 +39,8 @@ from deepaccident_devkit.model.detection import (
     detection_targets,
     suppress,
 )
-from deepaccident_devkit.model.detection.targets import peak_radius
-from deepaccident_devkit.model.fusion import (
+from deepaccident_devkit.plugins.model.detection.targets import peak_radius
+from deepaccident_devkit.plugins.model.fusion import (
     Agent3D,
     Agent3DConfig,
     CobevtConfig,
@@ -47,11 +49,11 @@ from deepaccident_devkit.model.fusion import (
     V2XViTConfig,
     fusion,
 )
-from deepaccident_devkit.model.fusion.transformers import sinusoid
-from deepaccident_devkit.model.images import Swin, SwinConfig, from_official, image_encoder
-from deepaccident_devkit.model.inputs import ModelInputs
-from deepaccident_devkit.model.lift import CameraGeometry, LiftConfig, LiftSplat
-from deepaccident_devkit.model.motion import (
+from deepaccident_devkit.plugins.model.fusion.transformers import sinusoid
+from deepaccident_devkit.plugins.model.images import Swin, SwinConfig, from_official, image_encoder
+from deepaccident_devkit.plugins.model.inputs import ModelInputs
+from deepaccident_devkit.plugins.model.lift import CameraGeometry, LiftConfig, LiftSplat
+from deepaccident_devkit.plugins.model.motion import (
     LatentDistribution,
     MotionHead,
     MotionHeadConfig,
@@ -60,14 +62,13 @@ from deepaccident_devkit.model.motion import (
     frame_mask,
     motion_losses,
 )
-from deepaccident_devkit.model.motion.decoders import FlowGru, SpatialDistribution, warp_with_flow
-from deepaccident_devkit.model.motion.head import center_loss, latent_loss, segmentation_loss, vector_loss
-from deepaccident_devkit.model.network import ModelConfig, V2XFormer
-from deepaccident_devkit.model.presets import released
-from deepaccident_devkit.model.temporal import TemporalConfig, temporal_model
-from deepaccident_devkit.model.training_step import Targets, TrainingStep
-from deepaccident_devkit.model.warps import matrices_from_six
-from deepaccident_devkit.motion import Augmentation, MotionLabelConfig, MotionLabels
+from deepaccident_devkit.plugins.model.motion.decoders import FlowGru, SpatialDistribution, warp_with_flow
+from deepaccident_devkit.plugins.model.motion.head import center_loss, latent_loss, segmentation_loss, vector_loss
+from deepaccident_devkit.plugins.model.network import ModelConfig, V2XFormer
+from deepaccident_devkit.plugins.model.presets import released
+from deepaccident_devkit.plugins.model.temporal import TemporalConfig, temporal_model
+from deepaccident_devkit.plugins.model.training_step import Targets, TrainingStep
+from deepaccident_devkit.plugins.model.warps import matrices_from_six
 
 
 @pytest.fixture
@@ -198,12 +199,12 @@ def check_sampled(ours: torch.Tensor, golden: torch.Tensor, mode: str) -> None:
 
 @pytest.mark.parametrize("mode", ["bilinear", "nearest"])
 @pytest.mark.parametrize("augmented", [False, True])
-def test_chains_of_warps_equal_the_released_warper(golden_model: Golden, augmented: bool, mode: warps.WarpMode) -> None:
+def test_chains_of_warps_equal_the_released_warper(golden_model: Golden, augmented: bool, mode: WarpMode) -> None:
     """FeatureWarper's cumulative warp; nearest: all but 0.5 % of the cells."""
     golden = golden_model("warps")
     given = golden.inputs()
     matrix = given["aug"] if augmented else None
-    chain = warps.present_from_past(given["egomotion"][:, :2], chain="released", bev_transform=matrix)
+    chain = warps.present_from_past_batch(given["egomotion"][:, :2], chain="released", bev_transform=matrix)
     ours = given["x"].clone()
     ours[:, :2] = warps.warp_features(
         given["x"][:, :2].flatten(0, 1), chain.flatten(0, 1), bounds(golden), warp="stretched", mode=mode
@@ -217,12 +218,12 @@ def test_partners_are_placed_as_by_the_released_warper(golden_model: Golden) -> 
     given, expected, grid = golden.inputs(), golden.outputs(), bounds(golden)
     ego_from_agent = warps.matrices_from_six(given["relative_pose"])
     check_close(ego_from_agent, expected["pose_mats"], 1e-6)
-    check_close(warps.agents_to_ego(given["xv"], ego_from_agent, grid, warp="stretched"), expected["v2x"])
+    check_close(warps.features_to_ego(given["xv"], ego_from_agent, grid, warp="stretched"), expected["v2x"])
     own = given["aug_v"]
     as_released = warps.between_augmented(ego_from_agent, own, own)
-    check_close(warps.agents_to_ego(given["xv"], as_released, grid, warp="stretched"), expected["v2x_aug_released"])
+    check_close(warps.features_to_ego(given["xv"], as_released, grid, warp="stretched"), expected["v2x_aug_released"])
     right = warps.between_augmented(ego_from_agent, own[:, :1], own)
-    check_close(warps.agents_to_ego(given["xv"], right, grid, warp="stretched"), expected["v2x_aug_right"])
+    check_close(warps.features_to_ego(given["xv"], right, grid, warp="stretched"), expected["v2x_aug_right"])
 
 
 @pytest.mark.parametrize(("name", "pose"), [("identity_full", [0.0] * 6), ("move_full", [7.3, -3.1, 0, 0, 0, 0.6])])
@@ -262,7 +263,7 @@ def test_released_fusion_equals_the_released_one(golden_model: Golden) -> None:
     given, expected = golden.inputs(), golden.outputs()
     x = given["x"].requires_grad_()
     ego_from_agent = warps.matrices_from_six(given["relative_pose"])
-    placed = warps.agents_to_ego(x, ego_from_agent, bounds(golden), warp="stretched")
+    placed = warps.features_to_ego(x, ego_from_agent, bounds(golden), warp="stretched")
     check_close(placed, expected["warped"])
     config = ReleasedFusionConfig(
         channels=x.shape[2],

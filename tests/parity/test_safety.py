@@ -15,22 +15,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from deepaccident_devkit import safety
-from deepaccident_devkit.accidents.contact import Pair, contact_made, contact_times, impacts, pair_of
-from deepaccident_devkit.accidents.outcomes import delta_v_of
-from deepaccident_devkit.accidents.replay import braking_plans, replay
+from deepaccident_devkit import interactions
+from deepaccident_devkit.collisions import OUTCOMES, Accident, Braking, outcomes_of
+from deepaccident_devkit.collisions.contact import Pair, contact_made, contact_times, impacts, pair_of
+from deepaccident_devkit.collisions.outcomes import delta_v_of
+from deepaccident_devkit.collisions.replay import braking_plans, replay
+from deepaccident_devkit.descriptions import coalition_leads, shapley_values
+from deepaccident_devkit.descriptions.avoidability import last_moments
 from deepaccident_devkit.evaluation.warning.recordings import AlarmRuns
-from deepaccident_devkit.safety import (
-    COALITIONS,
-    OUTCOMES,
-    PARTNERS,
-    Accident,
-    Braking,
-    coalition_leads,
-    outcomes_of,
-    shapley_values,
-)
-from deepaccident_devkit.safety.avoidability import last_moments
+from deepaccident_devkit.plugins.safety import COALITIONS, PARTNERS
 from deepaccident_devkit.taxonomy import AGENTS
 
 HORIZON, WINDOW = 20.0, 10.0
@@ -82,30 +75,30 @@ def within_horizon(seconds: np.ndarray) -> np.ndarray:
 
 
 MEASURES: dict[str, Callable[[Side, Side], np.ndarray]] = {
-    "ttc_2d": lambda i, j: within_horizon(safety.time_to_collision(i.box, j.box, i.velocity, j.velocity)),
+    "ttc_2d": lambda i, j: within_horizon(interactions.time_to_collision(i.box, j.box, i.velocity, j.velocity)),
     "mttc_2d": lambda i, j: within_horizon(
-        safety.modified_ttc(i.box, j.box, i.speed, j.speed, i.acceleration, j.acceleration)
+        interactions.modified_ttc(i.box, j.box, i.speed, j.speed, i.acceleration, j.acceleration)
     ),
-    "ttc_1d": lambda i, j: safety.time_to_collision_1d(i.box, j.box, i.velocity, j.velocity),
-    "drac_1d": lambda i, j: safety.drac_1d(i.box, j.box, i.velocity, j.velocity),
-    "mttc_1d": lambda i, j: safety.modified_ttc_1d(
+    "ttc_1d": lambda i, j: interactions.time_to_collision_1d(i.box, j.box, i.velocity, j.velocity),
+    "drac_1d": lambda i, j: interactions.drac_1d(i.box, j.box, i.velocity, j.velocity),
+    "mttc_1d": lambda i, j: interactions.modified_ttc_1d(
         i.box, j.box, i.velocity, j.velocity, i.acceleration, j.acceleration
     ),
-    "drac_2d": lambda i, j: safety.drac_of(
-        within_horizon(safety.time_to_collision(i.box, j.box, i.velocity, j.velocity)),
-        safety.relative_speed(i.velocity, j.velocity),
+    "drac_2d": lambda i, j: interactions.drac_of(
+        within_horizon(interactions.time_to_collision(i.box, j.box, i.velocity, j.velocity)),
+        interactions.relative_speed(i.velocity, j.velocity),
     ),
-    "distance": lambda i, j: safety.gaps_of_pairs(i.box, j.box),
-    "min_distance_20s": lambda i, j: safety.nearest_approach(i.box, j.box, i.velocity, j.velocity, HORIZON)[0],
-    "closing_speed": lambda i, j: safety.closing_speed(i.box, j.box, i.velocity, j.velocity),
-    "closing_speed_boxes": lambda i, j: safety.closing_speed_of_boxes(i.box, j.box, i.velocity, j.velocity),
-    "relative_speed": lambda i, j: safety.relative_speed(i.velocity, j.velocity),
-    "delta_v_i": lambda i, j: safety.delta_v(i.velocity, j.velocity, i.mass, j.mass)[:, 0],
-    "delta_v_j": lambda i, j: safety.delta_v(i.velocity, j.velocity, i.mass, j.mass)[:, 1],
-    "impact_heading": lambda i, j: safety.impact_heading(i.box, j.box),
-    "impact_direction_i": lambda i, j: safety.impact_direction(i.box, i.velocity, j.velocity),
-    "pet": lambda i, j: np.abs(safety.post_encroachment_time(i.box, j.box, i.velocity, j.velocity, WINDOW)),
-    "pet_area": lambda i, j: safety.conflict_area_pet(i.box, j.box, i.velocity, j.velocity, WINDOW),
+    "distance": lambda i, j: interactions.gaps_of_pairs(i.box, j.box),
+    "min_distance_20s": lambda i, j: interactions.nearest_approach(i.box, j.box, i.velocity, j.velocity, HORIZON)[0],
+    "closing_speed": lambda i, j: interactions.closing_speed(i.box, j.box, i.velocity, j.velocity),
+    "closing_speed_boxes": lambda i, j: interactions.closing_speed_of_boxes(i.box, j.box, i.velocity, j.velocity),
+    "relative_speed": lambda i, j: interactions.relative_speed(i.velocity, j.velocity),
+    "delta_v_i": lambda i, j: interactions.delta_v(i.velocity, j.velocity, i.mass, j.mass)[:, 0],
+    "delta_v_j": lambda i, j: interactions.delta_v(i.velocity, j.velocity, i.mass, j.mass)[:, 1],
+    "impact_heading": lambda i, j: interactions.impact_heading(i.box, j.box),
+    "impact_direction_i": lambda i, j: interactions.impact_direction(i.box, i.velocity, j.velocity),
+    "pet": lambda i, j: np.abs(interactions.post_encroachment_time(i.box, j.box, i.velocity, j.velocity, WINDOW)),
+    "pet_area": lambda i, j: interactions.conflict_area_pet(i.box, j.box, i.velocity, j.velocity, WINDOW),
 }
 ABSOLUTE = {
     "ttc_2d": 1e-6,
@@ -142,16 +135,16 @@ def test_the_time_of_the_least_distance_where_there_is_one(surrogates: Mapping[s
     """Where a side passes along the other's corner, the gap stays the least for a while: any of these times will do."""
     i, j = side_of(surrogates, "i"), side_of(surrogates, "j")
     expected, least = (numbers(surrogates["expected"][name]) for name in ("t_min_distance", "min_distance_20s"))
-    found = safety.nearest_approach(i.box, j.box, i.velocity, j.velocity, HORIZON)[1]
+    found = interactions.nearest_approach(i.box, j.box, i.velocity, j.velocity, HORIZON)[1]
     for times in (found, expected):
         moved = [np.column_stack([one.box[:, :2] + times[:, None] * one.velocity, one.box[:, 2:]]) for one in (i, j)]
-        np.testing.assert_allclose(safety.gaps_of_pairs(moved[0], moved[1]), least, atol=1e-9)
+        np.testing.assert_allclose(interactions.gaps_of_pairs(moved[0], moved[1]), least, atol=1e-9)
     assert (np.abs(found - expected) > 1e-3).mean() < 0.02
 
 
 def test_who_is_first(surrogates: Mapping[str, Any]) -> None:
     i, j = side_of(surrogates, "i"), side_of(surrogates, "j")
-    times = safety.post_encroachment_time(i.box, j.box, i.velocity, j.velocity, WINDOW)
+    times = interactions.post_encroachment_time(i.box, j.box, i.velocity, j.velocity, WINDOW)
     known = ~np.isnan(numbers(surrogates["expected"]["pet"]))
     words = np.where(np.isfinite(times) & (times != 0), np.where(times > 0, "i", "j"), "")
     np.testing.assert_array_equal(words[known], np.array(surrogates["expected"]["pet_first"])[known])
@@ -161,8 +154,8 @@ def test_who_is_first(surrogates: Mapping[str, Any]) -> None:
 def test_as_the_library_has_it_below_20_s(surrogates: Mapping[str, Any], measure: str, name: str) -> None:
     expected = numbers(surrogates["library"][name])
     i, j = side_of(surrogates, "i"), side_of(surrogates, "j")
-    times = safety.time_to_collision(i.box, j.box, i.velocity, j.velocity)
-    found = times if measure == "ttc_2d" else safety.drac(i.box, j.box, i.velocity, j.velocity)
+    times = interactions.time_to_collision(i.box, j.box, i.velocity, j.velocity)
+    found = times if measure == "ttc_2d" else interactions.drac(i.box, j.box, i.velocity, j.velocity)
     overlapping = times == 0  # where the library goes on calculating with −1
     assert (numbers(surrogates["library"]["lib_ttc"])[overlapping] == -1).all()
     near = ~overlapping & (times < HORIZON)
@@ -174,7 +167,7 @@ def test_exposed_and_integrated_times(surrogates: Mapping[str, Any]) -> None:
     assert surrogates["tet_tit"]
     for series in surrogates["tet_tit"]:
         times = numbers(series["ttc"])
-        for function, name in ((safety.time_exposed, "TET"), (safety.time_integrated, "TIT")):
+        for function, name in ((interactions.time_exposed, "TET"), (interactions.time_integrated, "TIT")):
             assert function(times, series["tau"], series["dt"]) == pytest.approx(series[name], abs=1e-9), name
 
 

@@ -13,7 +13,6 @@ from shapely import MultiPoint, get_coordinates
 
 from deepaccident_devkit.evaluation.accident import AccidentEvaluator
 from deepaccident_devkit.evaluation.accident.paper import PaperAccidents
-from deepaccident_devkit.evaluation.accident_truth import AccidentContext
 from deepaccident_devkit.evaluation.map_accidents import (
     AccidentReading,
     InstanceTracks,
@@ -23,6 +22,7 @@ from deepaccident_devkit.evaluation.map_accidents import (
     match_tracks,
 )
 from deepaccident_devkit.evaluation.predictions import MotionOutput
+from deepaccident_devkit.evaluation.truth import AccidentContext
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.geometry.bev_grid import ORIENTATIONS
 from deepaccident_devkit.motion import LABEL_PROTOCOLS

@@ -7,11 +7,11 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from numpy.testing import assert_array_equal
 
-from deepaccident_devkit.exact.peaks import find_peaks, nearest_peaks
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.geometry.bev_grid import ORIENTATIONS, to_orientation
 from deepaccident_devkit.motion.grouping import MotionHeads
 from deepaccident_devkit.motion.instances import POST_PROCESSING, PostProcessing, predict_instances, trajectories
+from deepaccident_devkit.motion.reference_arithmetic.peaks import find_peaks, nearest_peaks
 
 QUARTERS = st.integers(-24, 24).map(lambda quarters: quarters / 4)
 """Cells; a quarter is what leaves sums and squares exact, so that ties are ties."""

@@ -17,8 +17,9 @@ from numpy.testing import assert_allclose
 from wording import lacking
 
 from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.descriptions import avoidability
+from deepaccident_devkit.plugins.safety import avoidability_report, lead_time_ledger
 from deepaccident_devkit.render import render_accident
-from deepaccident_devkit.safety import avoidability, avoidability_report, lead_time_ledger
 from deepaccident_devkit.validation import validate_release
 
 Agents = dict[str, tuple[int, str, tuple[float, float, float], np.ndarray]]

@@ -14,8 +14,8 @@ import pytest
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.export.bulk import export_release
 from deepaccident_devkit.export.nuscenes import NuScenes
-from deepaccident_devkit.nuscenes import NuScenesRelease, open_nuscenes
-from deepaccident_devkit.synth import SynthConfig, make_release
+from deepaccident_devkit.plugins.nuscenes import NuScenesRelease, open_nuscenes
+from deepaccident_devkit.plugins.synth import SynthConfig, make_release
 
 _NEEDED = ("nuscenes", "torch")
 

@@ -9,8 +9,8 @@ from nuscenes_mistakes import MISTAKES, copied
 
 from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.errors import SourceError
-from deepaccident_devkit.nuscenes import open_nuscenes
-from deepaccident_devkit.nuscenes.check import check_source, look_at
+from deepaccident_devkit.plugins.nuscenes import open_nuscenes
+from deepaccident_devkit.plugins.nuscenes.check import check_source, look_at
 
 
 def test_a_good_source_passes(pair) -> None:

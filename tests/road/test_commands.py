@@ -12,7 +12,7 @@ from nuscenes.eval.detection.evaluate import DetectionEval
 
 from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.evaluation import DetectedBoxes, ResultsWriter
-from deepaccident_devkit.nuscenes.results import NAME, write_detections
+from deepaccident_devkit.plugins.nuscenes.results import NUSCENES_RESULTS_FILE, write_detections
 from deepaccident_devkit.taxonomy import OWN_ACTOR_ID
 
 PAGE = Path(__file__).parents[2] / "docs" / "nuscenes.md"
@@ -52,7 +52,7 @@ def test_the_road_is_predicted_and_evaluated_by_its_rules(pair, trained: Path, t
     out = tmp_path / "results"
     told = run("predict", trained / "road", pair.folder, "--agents", "single", "--samples", "all", "--split", "val",
                "--out", out)  # fmt: skip
-    assert str(out / NAME) in told
+    assert str(out / NUSCENES_RESULTS_FILE) in told
     fiery = ["--split", "val", "--samples", "all", "--switch", "labels=fiery"]
     assert "vpq 100x100" in run("evaluate", "motion", pair.folder, "--results", out / "motion", *fiery)
     ours = run("evaluate", "detection", pair.folder, "--results", out / "detection.json", *fiery[:4])
@@ -64,7 +64,7 @@ def test_the_road_is_predicted_and_evaluated_by_its_rules(pair, trained: Path, t
     both = run("evaluate", "compare", tmp_path / "of_road", tmp_path / "of_ours")
     assert f"{pair.folder}, v1.0-deepaccident" in both
     assert "no sample in common" in both
-    document = json.loads((out / NAME).read_text())
+    document = json.loads((out / NUSCENES_RESULTS_FILE).read_text())
     assert len(document["results"]) == 7 * len(pair.road.split_scenarios("val"))
 
 
@@ -89,7 +89,9 @@ def test_what_is_true_has_ap_1_by_nuscenes_own_evaluation(pair, tmp_path: Path) 
 
 
 def test_rigs_say_what_is_odd(pair, tmp_path: Path) -> None:
-    told = json.loads(run("rigs", pair.release.dataroot, pair.folder, "--json", "--out", tmp_path / "rigs.png"))
+    told = json.loads(
+        run("sensor-setups", pair.release.dataroot, pair.folder, "--json", "--out", tmp_path / "rigs.png")
+    )
     ours, road = told["sources"]
     assert ours["cameras"] == road["cameras"]
     assert (ours["labels_a_second"], road["labels_a_second"]) == (10.0, 2.0)

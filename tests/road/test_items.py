@@ -6,10 +6,10 @@ import torch
 from nuscenes import NuScenes
 from torch.utils.data import DataLoader
 
-from deepaccident_devkit.export.torch import ImageConfig, V2XConfig, V2XDataset, collate
 from deepaccident_devkit.motion import motion_labels
-from deepaccident_devkit.nuscenes.items import NuScenesDataset
+from deepaccident_devkit.plugins.nuscenes.items import NuScenesDataset
 from deepaccident_devkit.taxonomy import CAMERAS, CATEGORIES, LIDAR, OWN_ACTOR_ID, UNTRACKED_ID
+from deepaccident_devkit.training.torch import ImageConfig, V2XConfig, V2XDataset, collate
 
 CONFIG = V2XConfig(past=2, images=ImageConfig(dtype="uint8"), labels="fiery", visible=None)
 VAN, CAR = CATEGORIES.index("van"), CATEGORIES.index("car")

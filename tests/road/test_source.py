@@ -21,9 +21,9 @@ from deepaccident_devkit.errors import (
     SensorFileError,
     VersionError,
 )
-from deepaccident_devkit.export.torch import V2XConfig, V2XDataset
-from deepaccident_devkit.nuscenes import CLASSES, open_nuscenes, release_of
+from deepaccident_devkit.plugins.nuscenes import CLASSES, open_nuscenes, release_of
 from deepaccident_devkit.taxonomy import IGNORED_ID
+from deepaccident_devkit.training.torch import V2XConfig, V2XDataset
 
 
 def test_tables_are_kept_and_need_no_nuscenes_devkit(pair, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,8 +9,8 @@ from studies import written
 
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.evaluation.breakdowns import cluster_of
-from deepaccident_devkit.study import read_recipe, run_study
-from deepaccident_devkit.study.overlap import known_scenarios
+from deepaccident_devkit.plugins.study import read_recipe, run_study
+from deepaccident_devkit.plugins.study.overlap import known_scenarios
 
 SMALL = {"scenarios": 4, "frames": 16, "image_size": [64, 36], "sensor_step": 5}
 ROAD = {**SMALL, "rig": "road", "nuscenes": True}

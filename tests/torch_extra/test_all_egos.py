@@ -11,7 +11,8 @@ from torch_extra.compared import same
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ConfigError, MissingFileError, NotAvailableError
-from deepaccident_devkit.export.torch import (
+from deepaccident_devkit.taxonomy import AGENTS
+from deepaccident_devkit.training.torch import (
     AllEgosDataset,
     ImageConfig,
     RandomAugmentation,
@@ -19,7 +20,6 @@ from deepaccident_devkit.export.torch import (
     V2XDataset,
     collate_all_egos,
 )
-from deepaccident_devkit.taxonomy import AGENTS
 from deepaccident_devkit.v2x import Link
 
 CONFIG = {"past": 2, "step": 1, "images": ImageConfig(dtype="uint8"), "labels": "deepaccident"}

@@ -15,11 +15,11 @@ from torch_extra.compared import same
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.export.torch import ImageConfig, RandomAugmentation, V2XConfig, V2XDataset
-from deepaccident_devkit.export.torch.config import augmented_boxes, augmented_pose, augmented_six_vectors
 from deepaccident_devkit.geometry import BevGrid, Boxes, conventions
 from deepaccident_devkit.motion import Augmentation, MotionLabelConfig, bev_segmentation
 from deepaccident_devkit.motion.sample_labels import motion_labels
+from deepaccident_devkit.training.torch import ImageConfig, RandomAugmentation, V2XConfig, V2XDataset
+from deepaccident_devkit.training.torch.config import augmented_boxes, augmented_pose, augmented_six_vectors
 
 AUGMENTED = pytest.mark.parametrize(
     "augmentation",

@@ -22,7 +22,9 @@ from torch_extra.compared import same
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.errors import ConfigError, MissingFileError
-from deepaccident_devkit.export.torch import (
+from deepaccident_devkit.geometry import BevGrid
+from deepaccident_devkit.motion import MotionLabelConfig
+from deepaccident_devkit.training.torch import (
     ImageConfig,
     RandomAugmentation,
     V2XConfig,
@@ -30,8 +32,6 @@ from deepaccident_devkit.export.torch import (
     collate,
     collate_fusion,
 )
-from deepaccident_devkit.geometry import BevGrid
-from deepaccident_devkit.motion import MotionLabelConfig
 from deepaccident_devkit.v2x import Link
 
 EVERYTHING = V2XConfig(

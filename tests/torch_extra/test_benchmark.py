@@ -3,7 +3,7 @@
 import pytest
 from scripts import of_checkout
 
-from deepaccident_devkit.synth import SynthConfig
+from deepaccident_devkit.plugins.synth import SynthConfig
 
 
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")

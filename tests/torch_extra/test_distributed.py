@@ -15,7 +15,7 @@ from torch_extra.compared import same
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import EvaluationError
 from deepaccident_devkit.evaluation import MotionEvaluator
-from deepaccident_devkit.export.torch import RandomAugmentation, V2XConfig, V2XDataset, merged_evaluator
+from deepaccident_devkit.training.torch import RandomAugmentation, V2XConfig, V2XDataset, merged_evaluator
 
 Outcome = Callable[[str], list[Any]]
 

@@ -15,8 +15,8 @@ from torch_extra.compared import same
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ConfigError, MissingFileError
 from deepaccident_devkit.export.bulk import export_release
-from deepaccident_devkit.export.image_cache import CachedImages
-from deepaccident_devkit.export.torch import ImageConfig, V2XConfig, V2XDataset, collate_fusion
+from deepaccident_devkit.training.image_cache import CachedImages
+from deepaccident_devkit.training.torch import ImageConfig, V2XConfig, V2XDataset, collate_fusion
 
 IMAGES = ImageConfig(resize=(18, 30), crop=(2, 3, 12, 25), mean=(0.5, 0.4, 0.3), std=(0.2, 0.3, 0.4))
 CONFIG = V2XConfig(agents="all", past=2, step=2, points=False, boxes=None, images=IMAGES)

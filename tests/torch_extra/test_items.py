@@ -20,11 +20,11 @@ from deepaccident_devkit.errors import (
     SensorFileError,
     TokenError,
 )
-from deepaccident_devkit.export.torch import AllEgosDataset, ImageConfig, V2XConfig, V2XDataset
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.motion import Augmentation, MotionLabelConfig, bev_segmentation
 from deepaccident_devkit.motion.sample_labels import motion_labels
 from deepaccident_devkit.taxonomy import AGENTS, CAMERAS
+from deepaccident_devkit.training.torch import AllEgosDataset, ImageConfig, V2XConfig, V2XDataset
 from deepaccident_devkit.v2x import AGENT_CONFIGS, cooperating_agents
 
 LABELS = MotionLabelConfig(receptive_field=2, future_frames=3, step=1)

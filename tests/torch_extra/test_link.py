@@ -8,8 +8,8 @@ from torch_extra.compared import same
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.export.torch import ImageConfig, RandomAugmentation, V2XConfig, V2XDataset, collate_fusion
 from deepaccident_devkit.motion import MotionLabelConfig
+from deepaccident_devkit.training.torch import ImageConfig, RandomAugmentation, V2XConfig, V2XDataset, collate_fusion
 from deepaccident_devkit.v2x import Link
 
 LABELS = MotionLabelConfig(receptive_field=2, future_frames=2, step=1)

@@ -8,7 +8,7 @@ from torch.utils.data import DataLoader
 from torch_extra.compared import same
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.export.torch import ImageConfig, V2XConfig, V2XDataset, collate
+from deepaccident_devkit.training.torch import ImageConfig, V2XConfig, V2XDataset, collate
 
 
 @pytest.mark.slow

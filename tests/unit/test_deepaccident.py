@@ -7,11 +7,12 @@ from typing import Any
 
 import pytest
 
-from deepaccident_devkit import DeepAccident, maps, motion, render, safety, validation
+from deepaccident_devkit import DeepAccident, descriptions, interactions, maps, motion, render, selection, validation
+from deepaccident_devkit.selection.samples import samples
 
 LATE = {
     name: getattr(package, name)
-    for package in (maps, motion, render, safety, validation)
+    for package in (descriptions, interactions, maps, motion, render, selection, validation)
     for name in package.__all__
     if hasattr(DeepAccident, name)
 }
@@ -21,13 +22,13 @@ def run(code: str) -> str:
     return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300, check=True).stdout
 
 
-PARTS = ("motion", "render", "safety", "interactions", "maps", "validation", "evaluation", "synth")
+PARTS = ("motion", "render", "descriptions", "interactions", "maps", "validation", "evaluation", "plugins")
 HEAVY = [*(f"deepaccident_devkit.{name}" for name in PARTS), "cv2", "matplotlib", "scipy", "shapely"]
 
 
 @pytest.mark.parametrize(
     ("used", "imported"),
-    [("find", set()), ("transform", set()), ("samples", {"deepaccident_devkit.motion"})],
+    [("find", set()), ("transform", set()), ("motion_labels", {"deepaccident_devkit.motion"})],
 )
 def test_what_is_asked_for_brings_its_own_package_alone(used: str, imported: set[str]) -> None:
     code = f"import sys; from deepaccident_devkit import DeepAccident; DeepAccident.{used}; print(*sys.modules)"
@@ -63,4 +64,4 @@ def test_a_subclass_keeps_what_it_has_instead() -> None:
             return super().samples
 
     mine = object.__new__(Mine)
-    assert [mine.samples().__func__ for _ in range(2)] == [motion.samples] * 2
+    assert [mine.samples().__func__ for _ in range(2)] == [samples] * 2

@@ -11,9 +11,9 @@ from deepaccident_devkit.errors import ConfigError, DatarootError, DeepAccidentE
 from deepaccident_devkit.evaluation.results import ResultsWriter, read_results
 from deepaccident_devkit.evaluation.runs import read_bundle
 from deepaccident_devkit.motion import write_label_files
+from deepaccident_devkit.plugins.synth import make_release
 from deepaccident_devkit.support.files import writable_folder
 from deepaccident_devkit.support.text import path_of
-from deepaccident_devkit.synth import make_release
 from deepaccident_devkit.validation import validate_release
 
 

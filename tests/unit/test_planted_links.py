@@ -15,16 +15,16 @@ from refusals import assert_refused
 from tiny_format import TinyFormat
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit._version import __version__
 from deepaccident_devkit.errors import DeepAccidentError, OutputFolderError
-from deepaccident_devkit.explore.explorer import KeptFiles
 from deepaccident_devkit.export.bulk import export_release
 from deepaccident_devkit.motion import MotionLabelConfig, write_label_files
+from deepaccident_devkit.plugins.explore.explorer import KeptFiles
+from deepaccident_devkit.plugins.synth import SynthConfig, generate, make_release
+from deepaccident_devkit.plugins.synth.demo import demo
+from deepaccident_devkit.plugins.synth.scenario import RecordingJob
 from deepaccident_devkit.release.store.store import FileCache
 from deepaccident_devkit.support.files import place_in, remove_in, temporary_path, write_bytes
-from deepaccident_devkit.synth import SynthConfig, generate, make_release
-from deepaccident_devkit.synth.demo import demo
-from deepaccident_devkit.synth.scenario import RecordingJob
+from deepaccident_devkit.support.version import __version__
 from deepaccident_devkit.testing import SmallRelease, write_small_release
 
 PRECIOUS = b"precious\0"

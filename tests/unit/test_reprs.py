@@ -36,6 +36,7 @@ from deepaccident_devkit.geometry import SE3, BevGrid, Boxes, LidarPointCloud
 from deepaccident_devkit.interactions import InteractionConfig, Interactions
 from deepaccident_devkit.interactions.scenario import interactions_of_tracks
 from deepaccident_devkit.motion import LABEL_PROTOCOLS, MotionHeads, MotionLabelConfig, MotionLabels
+from deepaccident_devkit.plugins import PROTOCOL_VERSION, Plugin
 from deepaccident_devkit.support.arrays import ShortRepr
 from deepaccident_devkit.v2x import Contact
 
@@ -96,6 +97,7 @@ def interactions() -> Interactions:
 
 
 OWN = {
+    "Plugin": lambda: Plugin(name="mine", protocol_version=PROTOCOL_VERSION),
     "Boxes": boxes,
     "Interactions": interactions,
     "AccidentResult": lambda: AccidentEvaluator().compute(),

@@ -28,15 +28,15 @@ from deepaccident_devkit.evaluation.results import ResultsWriter
 from deepaccident_devkit.evaluation.runs import SampleSelection, evaluate_results, save_run
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 from deepaccident_devkit.export.bulk import export_release
-from deepaccident_devkit.export.image_cache import CachedImages
 from deepaccident_devkit.export.images import ImageConfig
 from deepaccident_devkit.export.opencood import OpenCood
 from deepaccident_devkit.export.questions import Questions, WindowRules
 from deepaccident_devkit.motion import MotionLabelConfig, write_label_files
-from deepaccident_devkit.study.recipe import SHIPPED
-from deepaccident_devkit.synth.spec import design_text
+from deepaccident_devkit.plugins.study.recipe import SHIPPED_RECIPES
+from deepaccident_devkit.plugins.synth.spec import design_text
 from deepaccident_devkit.taxonomy import CAMERAS, AgentName
 from deepaccident_devkit.testing import SmallRelease, write_small_release
+from deepaccident_devkit.training.image_cache import CachedImages
 
 AGENTS: tuple[AgentName, ...] = ("ego_vehicle", "infrastructure")
 CHANNELS = ("Camera_Front", "lidar01", "BEV_instance_camera")
@@ -125,7 +125,7 @@ def make_healthy(folder: Path) -> Path:
     (folder / "specs" / "crossing.yaml").write_text(design_text(1), encoding="utf-8")
     (folder / "recipes").mkdir()
     for name in ("agents", "road"):
-        shutil.copy(SHIPPED / f"{name}.yaml", folder / "recipes")
+        shutil.copy(SHIPPED_RECIPES / f"{name}.yaml", folder / "recipes")
     (folder / "recipes" / "every_key.yaml").write_text(yaml.safe_dump(RECIPE, sort_keys=False), encoding="utf-8")
     _write_exports(dataset, sensors, folder)
     for method in ("stored", "deflated"):

@@ -6,9 +6,9 @@ import torch
 from torch_extra.model.small_model import RUN, small, trained
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.model.checkpoint import write_weights
-from deepaccident_devkit.model.network import V2XFormer
-from deepaccident_devkit.model.training_run import TrainConfig
+from deepaccident_devkit.plugins.model.checkpoint import write_weights
+from deepaccident_devkit.plugins.model.network import V2XFormer
+from deepaccident_devkit.plugins.model.training_run import TrainConfig
 
 TRAINING = TrainConfig(
     steps=1, egos=1, samples="every", agents="available", validation=None, save_every=1, seed=RUN.seed

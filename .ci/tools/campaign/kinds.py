@@ -15,15 +15,16 @@ from campaign import other_kinds, plain, road_kinds, weights_kinds
 from campaign.healthy import SETUPS, opened, selection
 from campaign.kind import Action, Kind, Room, dataset_of
 from campaign.mutations import HTML
+from campaign.tables_of_releases import judge_tables, tables
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.evaluation.results import read_results
 from deepaccident_devkit.evaluation.runs import compare_bundles, evaluate_results, verify_bundle
 from deepaccident_devkit.motion import LabelFiles
+from deepaccident_devkit.plugins.synth.spec import draw, read_spec
+from deepaccident_devkit.plugins.synth.spec.model import AllOf, Part
 from deepaccident_devkit.release import find_release, read_calib
 from deepaccident_devkit.render.evaluation.report import report_html
 from deepaccident_devkit.support.reading import file_checksum
-from deepaccident_devkit.synth.spec import draw, read_spec
-from deepaccident_devkit.synth.spec.model import Items, Part
 from deepaccident_devkit.tables import Index
 from deepaccident_devkit.tables.index import MANIFEST_FILE
 from deepaccident_devkit.validation import validate_release
@@ -33,67 +34,6 @@ from deepaccident_devkit.validation import validate_release
 
 def _opened(room: Room, on_error: Any) -> DeepAccident:
     return DeepAccident("v1", room.tree, index_dir=room.scratch / "index", workers=1, verbose=False, on_error=on_error)
-
-
-def tables(dataset: DeepAccident) -> dict[str, Any]:
-    """All that the tables say of small files, by the token of the sample or scenario."""
-    read: dict[str, Any] = {
-        each["token"]: (each["velocity"], dataset.boxes(each["token"], frame="lidar", velocity="label"), pose)
-        for each, pose in zip(dataset.sample, dataset.columns("ego_pose")["matrix"], strict=True)
-    }
-    return read | {each["token"]: each for each in dataset.scenario}
-
-
-def judge_tables(room: Room, read: Mapping[str, Any]) -> str | None:
-    """Compare the scenarios that were read with their files."""
-    for token, value in read.items():
-        scenario_type, name, *sample = token.split("/")
-        folder = room.tree / scenario_type
-        if not sample:
-            meta = folder / "meta" / f"{name}.txt"
-            fault = _meta_fault(value, plain.meta(meta)) if meta.is_file() else _known(value["weather"])
-        else:
-            stem = f"{name}/{name}_{sample[1]}"
-            velocity, boxes, pose = value
-            label = folder / sample[0] / "label" / f"{stem}.txt"
-            fault = _label_fault(velocity, boxes, *plain.label(label)) if label.is_file() else _known(velocity)
-            calib = plain.calib(folder / sample[0] / "calib" / f"{stem}.pkl")
-            flipped = plain.LEFT_TO_RIGHT @ calib["ego_to_world"] @ plain.LEFT_TO_RIGHT
-            fault = fault or (None if np.array_equal(pose, flipped.ravel()) else "ego_to_world")
-        if fault:
-            return f"{token}: {fault}"
-    return None
-
-
-def _known(value: Any) -> str | None:
-    """A fault if something is known of a file that is not there."""
-    return None if value is None else f"{value}, though the file is not there"
-
-
-def _label_fault(velocity: Any, boxes: Any, speed: tuple[float, ...], rows: list[tuple[Any, ...]]) -> str | None:
-    if not np.array_equal(velocity, [speed[0], -speed[1]], equal_nan=True):
-        return f"speed {velocity} and not {speed}"
-    if len(boxes) != len(rows):
-        return f"{len(boxes)} boxes and not {len(rows)}"
-    for box, row in zip(boxes, rows, strict=True):
-        same = np.array_equal([*box.center, *box.size], [row[1], -row[2], *row[3:7]])
-        turn = abs(np.exp(1j * box.yaw) - np.exp(-1j * row[7]))
-        facts = (box.category, box.actor_id, box.num_lidar_pts, box.camera_visible)
-        if not same or turn > 1e-6 or facts != (row[0], *row[10:]):
-            return f"{box!r} and not {row}"
-    return None
-
-
-def _meta_fault(scenario: Mapping[str, Any], said: Mapping[str, Any]) -> str | None:
-    first, collision = said["first"], scenario["collision"]
-    expected = None if "-1" in (first[1], first[3]) else ([int(first[1]), int(first[3])], float(first[5]))
-    found = None if collision is None else (collision["ids"], collision["impact"])
-    if expected != found:
-        return f"collision {found} and not {expected}"
-    if f"{scenario['weather']}{scenario['time_of_day'] or ''}" != first[0]:
-        return f"weather {scenario['weather']} and not {first[0]}"
-    road = (scenario["road_type"] or "", said.get("road_type", ""))
-    return None if road[0] == road[1] else f"road type {road[0]} and not {road[1]}"
 
 
 def _validate(room: Room, *, deep: bool = False) -> Any:
@@ -351,7 +291,7 @@ def _part_fault(part: Part, said: Any, path: str) -> str | None:
         value = next(said[key] for key in (name, name.removesuffix("_arm"), name.replace("_", "-")) if key in said)
         if isinstance(choice, Part):
             faults: Iterator[str | None] = iter([_part_fault(choice, value, f"{path}.{name}")])
-        elif isinstance(choice, Items):
+        elif isinstance(choice, AllOf):
             pairs = zip(choice.items, value, strict=True)
             faults = (_part_fault(item, each, name) if isinstance(item, Part) else None for item, each in pairs)
         else:
@@ -403,7 +343,7 @@ _INDEX = (
     Action(_index, _judge_opened),
     Action(
         lambda room: _index(room, check=True),
-        lambda room, read: None if _same_tables(room, read) else "other values after --check",
+        lambda room, read: None if _same_tables(room, read) else "other values after a check",
     ),
 )
 

@@ -13,13 +13,14 @@ import numpy as np
 from campaign import other_mutations, plain
 from campaign.healthy import AGENTS, CHANNELS, EXPORT, SCHEDULER, opened
 from campaign.kind import Action, Kind, Room, dataset_of
+from campaign.tables_of_releases import judge_tables, tables
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import WorkerError
 from deepaccident_devkit.export.bulk import export_release
-from deepaccident_devkit.export.image_cache import ImageCache
 from deepaccident_devkit.export.questions import read_answers, results_of_answers
-from deepaccident_devkit.parallel import cluster_executor, executors
-from deepaccident_devkit.study import Recipe, read_recipe
+from deepaccident_devkit.plugins.study import Recipe, read_recipe
+from deepaccident_devkit.support.parallel import cluster_executor, executors
+from deepaccident_devkit.training.image_cache import ImageCache
 from deepaccident_devkit.validation import validate_release
 
 assert other_mutations  # made for these
@@ -108,7 +109,7 @@ def _judge_cached(room: Room, read: Mapping[str, Any]) -> str | None:
 def _scheduled(room: Room) -> str:
     """Nobody listens at the healthy address, and it is right to say so."""
     try:
-        with patch.object(executors, "SECONDS", 0.2), cluster_executor(scheduler_file=room.victim):
+        with patch.object(executors, "ADDRESS_WAIT", 0.2), cluster_executor(scheduler_file=room.victim):
             return "a scheduler"
     except WorkerError:
         same = room.victim.is_file() and room.victim.stat().st_size == room.healthy.stat().st_size
@@ -125,8 +126,6 @@ def _judge_scheduled(room: Room, read: str) -> str | None:
 
 
 def _from_zip(room: Room) -> dict[str, Any]:
-    from campaign.kinds import tables
-
     index = room.scratch / "index"
     return tables(DeepAccident("v1", room.victim, index_dir=index, workers=1, verbose=False))
 
@@ -134,8 +133,6 @@ def _from_zip(room: Room) -> dict[str, Any]:
 def _judge_zip(room: Room, read: Mapping[str, Any]) -> str | None:
     """Unpacked without a look at checksums, the release says the same."""
     unpacked = plain.unpacked(room.victim, room.scratch / "unpacked")
-    from campaign.kinds import judge_tables
-
     return judge_tables(Room(room.home, unpacked, room.victim, room.scratch, room.outside, room.healthy), read)
 
 

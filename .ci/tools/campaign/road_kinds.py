@@ -9,7 +9,7 @@ import numpy as np
 
 from campaign import road_mutations
 from campaign.kind import Action, Kind, Room
-from deepaccident_devkit.nuscenes import open_nuscenes
+from deepaccident_devkit.plugins.nuscenes import open_nuscenes
 
 assert road_mutations  # made for these
 

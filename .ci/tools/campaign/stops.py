@@ -39,7 +39,7 @@ _RELEASE = "{home}/release --index-dir {home}/index --workers 1"
 _SENSORS = f"{{home}}/sensors {SCENARIO} --index-dir {{home}}/index_of_sensors --workers 1"
 _EVALUATE = f"{_RELEASE} --split train --samples all"
 VERBS = (
-    Verb("index", "index {home}/release --index-dir {out} --workers 1 --check"),
+    Verb("check index", "check index {home}/release --index-dir {out} --workers 1"),
     Verb("labels", f"labels {_RELEASE} --split train --out {{out}}/labels", progress="labels/manifest.json"),
     Verb("synth", "synth {out}/made --scenarios 2 --frames 3 --sensors none --seed 1 --workers 1"),
     Verb("split", f"split {_RELEASE} --out {{out}} --overwrite"),

@@ -22,7 +22,7 @@ def _network() -> Any:
 
 
 def _read(room: Room) -> dict[str, Any]:
-    from deepaccident_devkit.model.checkpoint import read_weights
+    from deepaccident_devkit.plugins.model.checkpoint import read_weights
 
     return dict(read_weights(room.victim).tensors)
 
@@ -31,7 +31,7 @@ def _loaded(room: Room) -> dict[str, Any]:
     """Put into a network, as `predict` does it; it has the healthy ones before."""
     import torch
 
-    from deepaccident_devkit.model.checkpoint import load_weights, read_weights
+    from deepaccident_devkit.plugins.model.checkpoint import load_weights, read_weights
 
     torch.manual_seed(0)
     network = _network()

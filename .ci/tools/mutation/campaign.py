@@ -25,19 +25,19 @@ from mutation.sample import PACKAGE, ROOT, fingerprint
 
 TESTS = {
     "geometry": "unit/geometry property/test_geometry property/test_se3 property/test_handedness parity/test_poses",
+    "motion/reference_arithmetic": "unit/motion property/test_postprocessing property/test_warps "
+    "parity/test_accident parity/test_labels parity/test_postprocess parity/test_warps",
     "motion": "unit/motion property/test_motion_labels property/test_postprocessing property/test_warps "
     "parity/test_fiery parity/test_labels parity/test_postprocess parity/test_trajectories parity/test_visibility "
     "parity/test_warps",
-    "exact": "unit/exact unit/motion property/test_postprocessing property/test_warps parity/test_accident "
-    "parity/test_labels parity/test_postprocess parity/test_warps",
     "evaluation/results": "unit/evaluation/results",
     "evaluation/runs": "unit/evaluation/runs test_cli_evaluate",
     "evaluation/__init__": "unit/evaluation/runs",
     "evaluation": "unit/evaluation property/test_accident property/test_detection property/test_motion_metrics "
     "parity/test_accident parity/test_anticipation parity/test_attributes parity/test_detection parity/test_motion "
     "parity/test_trajectories",
-    "v2x": "unit/v2x unit/baselines/test_outlook property/test_v2x parity/test_poses parity/test_visibility",
-    "splits": "unit/test_splits",
+    "v2x": "unit/v2x unit/plugins/baselines/test_outlook property/test_v2x parity/test_poses parity/test_visibility",
+    "selection/splits": "unit/selection/test_splits",
 }
 """The tests of each room, by how their paths begin; besides them its examples in docstrings."""
 _LONGEST = 10.0

@@ -10,7 +10,7 @@ from mutation.mutants import Mutant, changes
 
 ROOT = Path(__file__).parents[3]
 PACKAGE = ROOT / "deepaccident_devkit"
-AREAS = ("geometry", "exact", "motion", "evaluation", "v2x", "splits.py")
+AREAS = ("geometry", "motion", "evaluation", "v2x", "selection/splits.py")
 
 
 def drawn(count: int, seed: int) -> list[Mutant]:

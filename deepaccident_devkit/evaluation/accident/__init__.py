@@ -17,18 +17,18 @@ from deepaccident_devkit.evaluation.accident.scoring import (
     AccidentsWithin,
     ComparedAccidents,
 )
-from deepaccident_devkit.evaluation.accident_truth import (
+from deepaccident_devkit.evaluation.alarms import foreseen_accident
+from deepaccident_devkit.evaluation.evaluator import Counts, Evaluator
+from deepaccident_devkit.evaluation.map_accidents import AccidentReading
+from deepaccident_devkit.evaluation.predictions import Prediction, checked_prediction
+from deepaccident_devkit.evaluation.truth import (
     AccidentContext,
     BoxTruth,
     accident_context,
     box_truth,
     checked_facts,
     compared_facts,
-    foreseen_accident,
 )
-from deepaccident_devkit.evaluation.evaluator import Counts, Evaluator
-from deepaccident_devkit.evaluation.map_accidents import AccidentReading
-from deepaccident_devkit.evaluation.predictions import Prediction, checked_prediction
 from deepaccident_devkit.motion import MotionLabels
 
 __all__ = [

@@ -27,23 +27,15 @@ from deepaccident_devkit.evaluation.accident.scoring import (
     tally_result,
     united,
 )
-from deepaccident_devkit.evaluation.accident_truth import (
-    SLACK,
-    AccidentContext,
-    BoxTruth,
-    Pair,
-    named_alarms,
-    not_counted_notes,
-    position_difference,
-    within_horizon,
-)
+from deepaccident_devkit.evaluation.alarms import Pair, named_alarms, position_difference, within_horizon
 from deepaccident_devkit.evaluation.evaluator import Counts
 from deepaccident_devkit.evaluation.map_accidents import AccidentReading
 from deepaccident_devkit.evaluation.predictions import Accident, MotionOutput, Prediction, checked_prediction
+from deepaccident_devkit.evaluation.truth import SLACK, AccidentContext, BoxTruth, not_counted_notes
 from deepaccident_devkit.motion import MotionLabels
 
+# Why nothing else of a sample counts.
 _ASIDE = ("at_impact", "unplaced")
-"""Why nothing else of a sample counts."""
 _LEFT_OUT = ("unjudged", "beyond", *_ASIDE)
 
 

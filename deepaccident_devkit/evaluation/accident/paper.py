@@ -22,13 +22,7 @@ from deepaccident_devkit.evaluation.accident.scoring import (
     tally_result,
     united,
 )
-from deepaccident_devkit.evaluation.accident_truth import (
-    MATCH_DISTANCE,
-    AccidentContext,
-    by_sureness,
-    nearest_two,
-    position_difference,
-)
+from deepaccident_devkit.evaluation.alarms import MATCH_DISTANCE, by_sureness, nearest_two, position_difference
 from deepaccident_devkit.evaluation.evaluator import Counts
 from deepaccident_devkit.evaluation.map_accidents import (
     AccidentReading,
@@ -48,6 +42,7 @@ from deepaccident_devkit.evaluation.predictions import (
     frames_there,
     labels_at_present,
 )
+from deepaccident_devkit.evaluation.truth import AccidentContext
 from deepaccident_devkit.motion import MotionHeads, MotionLabels
 from deepaccident_devkit.support.arrays import AnyArray
 from deepaccident_devkit.support.text import settle_choices
@@ -55,8 +50,8 @@ from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
 SampleChoice = Literal["best", "mean_first"]
 _NO_LABEL: Final = "label: the accident protocol 'paper' needs the sample's motion labels"
+# Forms of a prediction that are not heads, as counts and as notes have them.
 _FORMS: Final[Mapping[str, str]] = {"instance_maps": "instance maps", "explicit": "explicit accidents"}
-"""Forms of a prediction that are not heads, as counts and as notes have them."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

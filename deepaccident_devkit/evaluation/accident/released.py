@@ -26,7 +26,7 @@ from deepaccident_devkit.evaluation.accident.scoring import (
     tally_result,
     united,
 )
-from deepaccident_devkit.evaluation.accident_truth import AccidentContext, position_difference
+from deepaccident_devkit.evaluation.alarms import position_difference
 from deepaccident_devkit.evaluation.evaluator import Counts
 from deepaccident_devkit.evaluation.instances import Paths, instance_paths, longest, match_trajectories, padded
 from deepaccident_devkit.evaluation.predictions import (
@@ -38,17 +38,18 @@ from deepaccident_devkit.evaluation.predictions import (
     frames_there,
     labels_at_present,
 )
-from deepaccident_devkit.exact.contours import first_hulls, redrawn_cells
-from deepaccident_devkit.exact.outlines import pair_gaps
+from deepaccident_devkit.evaluation.truth import AccidentContext
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.geometry.bev_grid import to_orientation
 from deepaccident_devkit.motion import MotionHeads, MotionLabels, predict_instances, trajectories
+from deepaccident_devkit.motion.reference_arithmetic.contours import first_hulls, redrawn_cells
+from deepaccident_devkit.motion.reference_arithmetic.outlines import pair_gaps
 from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
-Pair = tuple[int, int]
+_Pair = tuple[int, int]
+# The released code's errors where nothing is foreseen: a share, metres, seconds.
 _NOTHING_FOUND: Final = {"id": 1.0, "position": 20.0, "time": 1.0}
-"""The released code's errors where nothing is foreseen: a share, metres, seconds."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -163,8 +164,8 @@ def padded_paths(given: DrawnPaths, length: int) -> DrawnPaths:
 
 
 def accident_counts(
-    predictions: Sequence[DrawnPaths], truth: DrawnPaths, matches: Sequence[Collection[Pair]]
-) -> tuple[dict[str, Any], Pair | None]:
+    predictions: Sequence[DrawnPaths], truth: DrawnPaths, matches: Sequence[Collection[_Pair]]
+) -> tuple[dict[str, Any], _Pair | None]:
     """What one sample adds, of paths that are padded.
 
     Args:
@@ -204,7 +205,7 @@ def accident_counts(
     return counts, true
 
 
-def collision(given: DrawnPaths, frame: int, gap: float) -> Pair | None:
+def collision(given: DrawnPaths, frame: int, gap: float) -> _Pair | None:
     """The two instances of the smallest distance below `gap` cells at a frame; of equal ones the first ids."""
     pairs, gaps = pair_gaps(given.drawn[frame], np.array([*given.paths], dtype=np.int64), below=gap)
     if not len(gaps) or gaps.min() >= gap:
@@ -213,7 +214,7 @@ def collision(given: DrawnPaths, frame: int, gap: float) -> Pair | None:
     return first, second
 
 
-def _apart(alarm: tuple[DrawnPaths, Pair], true: tuple[DrawnPaths, Pair], frame: int) -> float:
+def _apart(alarm: tuple[DrawnPaths, _Pair], true: tuple[DrawnPaths, _Pair], frame: int) -> float:
     """Metres: the sum of the distances of the predicted from the true two, in the order with the smaller sum."""
     here, there = (np.array([each.paths[name][frame] for name in pair]) for each, pair in (alarm, true))
     return position_difference(here, there)

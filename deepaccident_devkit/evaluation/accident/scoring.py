@@ -10,20 +10,19 @@ from typing import Any, ClassVar, Final
 
 import numpy as np
 
-from deepaccident_devkit.evaluation.accident_truth import AccidentContext
 from deepaccident_devkit.evaluation.evaluator import Counts, ratio
 from deepaccident_devkit.evaluation.map_accidents import TIE, even
 from deepaccident_devkit.evaluation.predictions import Accident
 from deepaccident_devkit.evaluation.task import Row, TaskResult
+from deepaccident_devkit.evaluation.truth import AccidentContext
 from deepaccident_devkit.motion import OWN_BOX_ID, MotionLabels
 from deepaccident_devkit.support.arrays import BoolArray, ShortRepr
 
 DISTANCES: Final = (5.0, 10.0, 15.0)
 """The largest position differences of a predicted accident, metres."""
+# The actors that the truth of a sample names: the pair of the meta file, another pair, nobody; or the pair is
+# unknown.
 NAMED: Final = ("meta", "another", "none", "unknown")
-"""The actors that the truth of a sample names: the pair of the meta file, another pair, nobody; or the pair is
-unknown.
-"""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -111,18 +110,17 @@ class ComparedAccidents(ShortRepr):
 
 ERRORS: Final = ("id", "position", "time")
 _CASES: Final = ("tp", "fp", "fn")
-Tally = Mapping[str, Any]
-"""`numbers`: how many samples and positives there are, how many by `NAMED`, and for each of `DISTANCES` how many are
-true positive, false positive and missed, and how many of each of `ERRORS` are known; `errors`: for each distance and of
-`ERRORS` floats whose exact sum is theirs. Flat, since breakdowns add up thousands; as JSON can hold it.
-"""
-_NOTHING: Final[Tally] = {
+# `numbers`: how many samples and positives there are, how many by `NAMED`, and for each of `DISTANCES` how many are
+# true positive, false positive and missed, and how many of each of `ERRORS` are known; `errors`: for each distance and
+# of `ERRORS` floats whose exact sum is theirs. Flat, since breakdowns add up thousands; as JSON can hold it.
+_Tally = Mapping[str, Any]
+_NOTHING: Final[_Tally] = {
     "numbers": [0] * (2 + len(NAMED) + len(DISTANCES) * (len(_CASES) + len(ERRORS))),
     "errors": [[]] * (len(DISTANCES) * len(ERRORS)),
 }
 
 
-def sample_tally(sample: Counts, within: Sequence[Mapping[str, Any]]) -> Tally:
+def sample_tally(sample: Counts, within: Sequence[Mapping[str, Any]]) -> _Tally:
     """Of one sample.
 
     Args:
@@ -137,7 +135,7 @@ def sample_tally(sample: Counts, within: Sequence[Mapping[str, Any]]) -> Tally:
     }
 
 
-def united(tallies: Iterable[Tally]) -> Tally:
+def united(tallies: Iterable[_Tally]) -> _Tally:
     """The tally of several together."""
     given = [_NOTHING, *tallies]
     return {
@@ -157,7 +155,7 @@ def exact_parts(numbers: Iterable[Iterable[float]]) -> list[float]:
     return parts
 
 
-def tally_result(tally: Tally, errors_at: float) -> AccidentResult:
+def tally_result(tally: _Tally, errors_at: float) -> AccidentResult:
     """The metrics of what `united` gives.
 
     Args:
@@ -203,14 +201,13 @@ def _within(distance: float, numbers: Sequence[int], errors: Sequence[Sequence[f
     )
 
 
+# An accident that is foreseen, as counts hold it: `position` (metres), `time` (seconds, later than the truth is
+# positive) and `id` (0 the same two, 1 others) differences from the truth; None where there is none or it is not known.
 Alarm = Mapping[str, Any]
-"""An accident that is foreseen, as counts hold it: `position` (metres), `time` (seconds, later than the truth is
-positive) and `id` (0 the same two, 1 others) differences from the truth; None where there is none or it is not known.
-"""
 
 
+# Metres: of `paper` and `boxes` the errors are means over the true positives within this distance.
 ERRORS_AT: Final = 10.0
-"""Metres: of `paper` and `boxes` the errors are means over the true positives within this distance."""
 
 
 def hit_of(alarms: Sequence[Alarm], distance: float) -> Alarm | None:
@@ -241,7 +238,7 @@ def named(pair: Iterable[int | None] | None, context: AccidentContext) -> str:
     return "meta" if context.pair is not None and actors == set(context.pair) else "another"
 
 
-def alarms_tally(sample: Counts, alarms: Sequence[Alarm]) -> Tally:
+def alarms_tally(sample: Counts, alarms: Sequence[Alarm]) -> _Tally:
     """What one sample adds; an accident foreseen elsewhere is a false positive and leaves the true one missed.
 
     Args:

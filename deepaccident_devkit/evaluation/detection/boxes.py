@@ -40,8 +40,8 @@ _CHOICES: Final = {
     "curve": get_args(Curve),
     "area_of": ("center", "footprint"),
 }
+# Of all curves together.
 _MOST_POINTS: Final = 10_000_000
-"""Of all curves together."""
 
 
 def _check_classes(classes: tuple[tuple[str, tuple[str, ...]], ...]) -> None:

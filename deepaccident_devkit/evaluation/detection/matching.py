@@ -20,8 +20,8 @@ from deepaccident_devkit.geometry.box_arrays import intersection_areas
 from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray, IntArray, as_floats, readonly
 from deepaccident_devkit.taxonomy import CATEGORIES
 
+# Candidate → (true box, rank) of the pairs that are near enough.
 Reach = Mapping[int, Sequence[tuple[int, int]]]
-"""Candidate → (true box, rank) of the pairs that are near enough."""
 _NOBODY: Final = -1
 
 
@@ -121,10 +121,10 @@ def nearest_by_score(reach: Reach) -> dict[int, int]:
     return result
 
 
+# Errors of translation (m), scale (1 − overlap), orientation (rad) and velocity (m/s), in the order of columns.
 ERRORS: Final = ("ATE", "ASE", "AOE", "AVE")
-"""Errors of translation (m), scale (1 − overlap), orientation (rad) and velocity (m/s), in the order of columns."""
+# The released code's full turn, radians.
 RELEASED_TURN: Final = 2 * 3.1415926
-"""The released code's full turn, radians."""
 
 
 def costs(detections: BoxColumns, truth: BoxColumns, protocol: DetectionProtocol) -> AnyArray:
@@ -224,8 +224,8 @@ _MEASURES: Final[Mapping[str, Callable[[BoxColumns, BoxColumns, DetectionProtoco
 }
 
 
+# Names of the columns of `frame_counts` that name detections by their rows → how many they are together.
 COLUMNS: Final = {"detections": 2, "tp": 2, "spent": 2, "excused": 3, "matches": 2, "errors": 6}
-"""Names of the columns of `frame_counts` that name detections by their rows → how many they are together."""
 _CORNERS: Final = np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, -1.0], [-1.0, 1.0]]) / 2
 
 

@@ -17,8 +17,8 @@ from deepaccident_devkit.evaluation.evaluator import Counts
 from deepaccident_devkit.evaluation.task import FrozenMappings, Row, TaskResult, plain
 from deepaccident_devkit.support.arrays import AnyArray, FloatArray, FrozenArrays, IntArray
 
+# Of one array over rows and draws: how many draws are made together.
 _MOST_VALUES: Final = 2**20
-"""Of one array over rows and draws: how many draws are made together."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

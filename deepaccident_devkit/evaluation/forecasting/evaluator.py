@@ -39,8 +39,8 @@ from deepaccident_devkit.evaluation.task import Row
 from deepaccident_devkit.support.arrays import FloatArray, check_least
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
+# The row of all actors of a sample together: means over samples.
 TOGETHER: Final = "together"
-"""The row of all actors of a sample together: means over samples."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

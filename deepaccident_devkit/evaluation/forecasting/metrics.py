@@ -16,12 +16,12 @@ from deepaccident_devkit.evaluation.instances import distances
 from deepaccident_devkit.evaluation.predictions import ascending_times
 from deepaccident_devkit.support.arrays import BoolArray, FloatArray, FrozenArrays, checked, checked_whole
 
+# Metres; a larger error at the end is a miss.
 MISS_DISTANCE: Final = 2.0
-"""Metres; a larger error at the end is a miss."""
+# Metres; centres that come nearer to each other collide.
 COLLISION_DISTANCE: Final = 1.0
-"""Metres; centres that come nearer to each other collide."""
+# Seconds by which a moment may miss the step that it is meant for, as sums of float32 do.
 SAME_TIME: Final = 1e-3
-"""Seconds by which a moment may miss the step that it is meant for, as sums of float32 do."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from deepaccident_devkit.evaluation.accident_truth import LABEL_STEP, MATCH_DISTANCE
+from deepaccident_devkit.evaluation.alarms import LABEL_STEP, MATCH_DISTANCE
 from deepaccident_devkit.evaluation.forecasting.metrics import Forecast
 from deepaccident_devkit.evaluation.map_accidents import InstanceTracks, match_tracks, predicted_tracks
 from deepaccident_devkit.evaluation.predictions import MotionOutput

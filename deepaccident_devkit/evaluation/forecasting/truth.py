@@ -9,16 +9,16 @@ from typing import Final
 import numpy as np
 
 from deepaccident_devkit.dataset import Dataset, RowArgument
-from deepaccident_devkit.evaluation.accident_truth import labelled_sample
+from deepaccident_devkit.evaluation.truth import labelled_sample
 from deepaccident_devkit.support.arrays import BoolArray, FloatArray, FrozenArrays, IntArray
 from deepaccident_devkit.taxonomy import AGENTS, CATEGORIES, FRAME_PERIOD, OWN_ACTOR_ID
 from deepaccident_devkit.v2x.cooperation import seen_actors
 from deepaccident_devkit.v2x.tracks import ScenarioTracks, scenario_tracks
 
+# Seconds that the truth goes on.
 LONGEST: Final = 5.0
-"""Seconds that the truth goes on."""
+# m/s at the present; slower actors stand.
 MOVING_SPEED: Final = 0.5
-"""m/s at the present; slower actors stand."""
 _LAST_SECONDS: Final = 5
 EVERYBODY: Final = "all"
 CLASSES: Final = tuple(f"class {name}" for name in CATEGORIES)

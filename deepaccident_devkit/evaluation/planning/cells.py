@@ -17,14 +17,14 @@ import numpy as np
 from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray, IntArray, ShortRepr
 
 STEPS: Final = 6
+# Seconds.
 STEP: Final = 0.5
-"""Seconds."""
+# Seconds; each is two steps more.
 HORIZONS: Final = (1, 2, 3)
-"""Seconds; each is two steps more."""
+# Metres from the ego to the edges of the grid.
 HALF: Final = 50.0
-"""Metres from the ego to the edges of the grid."""
+# Metres from nuScenes' ego origin to its LiDAR.
 LIDAR_AHEAD: Final = 0.985793
-"""Metres from nuScenes' ego origin to its LiDAR."""
 Over = Literal["step", "mean", "any"]
 
 
@@ -161,8 +161,8 @@ def _box(path: FloatArray, ego: tuple[float, float], rules: CellRules) -> IntArr
     return np.clip(np.trunc(np.stack([rows, columns])), 0, rules.size - 1).astype(np.int64)
 
 
+# Metres.
 _LEAST_STEP: Final = 1.0
-"""Metres."""
 
 
 def _point(path: FloatArray, rules: CellRules) -> IntArray:

@@ -9,9 +9,9 @@ from typing import Final
 
 import numpy as np
 
-from deepaccident_devkit.accidents.contact import TOUCHING
-from deepaccident_devkit.accidents.outcomes import MOST_MARGIN
-from deepaccident_devkit.accidents.replay import HORIZON
+from deepaccident_devkit.collisions.contact import TOUCHING
+from deepaccident_devkit.collisions.outcomes import MOST_MARGIN
+from deepaccident_devkit.collisions.replay import HORIZON
 from deepaccident_devkit.evaluation.means import Sums
 from deepaccident_devkit.evaluation.planning.cells import HORIZONS, STEP
 from deepaccident_devkit.evaluation.planning.contacts import Contacts, first_contacts, without_gaps
@@ -20,12 +20,12 @@ from deepaccident_devkit.geometry.box_arrays import gaps_of_pairs
 from deepaccident_devkit.support.arrays import FloatArray
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
+# Seconds and metres: times are decimal numbers, and a path projected on itself loses digits.
 _SLACK: Final = 1e-6
-"""Seconds and metres: times are decimal numbers, and a path projected on itself loses digits."""
+# Seconds from a sample to the lead that it counts for: lists of samples count back from each recording's own end.
 _NEAREST: Final = 0.2
-"""Seconds from a sample to the lead that it counts for: lists of samples count back from each recording's own end."""
+# Metres of a recorded way from which the share of it that is lost says something.
 _FAR: Final = 1.0
-"""Metres of a recorded way from which the share of it that is lost says something."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -8,13 +8,13 @@ from typing import Final
 
 import numpy as np
 
-from deepaccident_devkit.accidents.contact import contact_times, impacts, pair_of
+from deepaccident_devkit.collisions.contact import contact_times, impacts, pair_of
 from deepaccident_devkit.geometry.box_arrays import gaps_of_pairs
 from deepaccident_devkit.support.arrays import BoolArray, FloatArray, FrozenArrays
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
+# m/s up to which the ego stands.
 _STANDS: Final = 0.05
-"""m/s up to which the ego stands."""
 _NO_BRAKING: Final = [[np.inf, np.inf]]
 
 

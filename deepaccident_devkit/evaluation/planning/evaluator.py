@@ -35,8 +35,8 @@ from deepaccident_devkit.geometry.box_arrays import corner_offsets
 from deepaccident_devkit.support.arrays import BoolArray
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
-Protocol = CleanPlanning | CellRules
-PLANNING_PROTOCOLS: Final[Mapping[str, Protocol]] = MappingProxyType({"clean": CleanPlanning(), **CELL_PROTOCOLS})
+_Protocol = CleanPlanning | CellRules
+PLANNING_PROTOCOLS: Final[Mapping[str, _Protocol]] = MappingProxyType({"clean": CleanPlanning(), **CELL_PROTOCOLS})
 GIVEN: Final = "given"
 TRIVIAL: Final = ("recorded", "standing", "constant velocity", "full braking")
 _MEAN: Final = "mean"
@@ -107,7 +107,7 @@ class PlanningEvaluator(MeansEvaluator[PlanningResult]):
     vehicles_only = True
     has_horizon = False
 
-    protocol: Protocol
+    protocol: _Protocol
     order: ClassVar[Sequence[str]] = (
         *(f"{role}{lead}{end}" for role in ("", "bystander, ") for end in ("", " to contact") for lead in BY_LEAD),
         *_BY_HORIZON,

@@ -9,13 +9,13 @@ from typing import Final
 
 import numpy as np
 
-from deepaccident_devkit.accidents.recorded import Accident, accident_of, tried
-from deepaccident_devkit.accidents.replay import braking_plans, motion_of, replay
-from deepaccident_devkit.accidents.twins import twin_of
+from deepaccident_devkit.collisions.recorded import Accident, accident_of, tried
+from deepaccident_devkit.collisions.replay import braking_plans, motion_of, replay
+from deepaccident_devkit.collisions.twins import twin_of
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import EvaluationError, GeometryError
-from deepaccident_devkit.evaluation.accident_truth import box_truth, labelled_sample
 from deepaccident_devkit.evaluation.predictions import ascending_times
+from deepaccident_devkit.evaluation.truth import box_truth, labelled_sample
 from deepaccident_devkit.geometry.conventions import inverses, stored_transforms
 from deepaccident_devkit.support.arrays import (
     BoolArray,
@@ -82,10 +82,10 @@ class Plan(FrozenArrays):
         return np.column_stack([np.interp(times, moments, each) for each in values.T])
 
 
+# Seconds for which paths go straight on.
 _ONWARD: Final = 1000.0
-"""Seconds for which paths go straight on."""
+# Metres: a shorter step keeps the heading.
 _TURNS: Final = 0.1
-"""Metres: a shorter step keeps the heading."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -201,10 +201,10 @@ def _ego_poses(dataset: Dataset, token: str, present: int, last: int) -> FloatAr
     return np.vstack([2 * poses[0] - poses[min(1, len(poses) - 1)], poses])
 
 
+# m/s² of full braking.
 BRAKING: Final = 8.0
-"""m/s² of full braking."""
+# Seconds that these plans look ahead, at least.
 _REACH: Final = 3.0
-"""Seconds that these plans look ahead, at least."""
 
 
 def trivial_plans(scene: PlanningScene) -> Mapping[str, Plan]:
@@ -229,8 +229,8 @@ def steps_of(step: float, until: float) -> FloatArray:
     return np.asarray(np.arange(1, math.floor(until / step + _SAME_TIME) + 1, dtype=np.float64) * step)
 
 
+# Share of a step by which a time that is meant to be a step's may miss it.
 _SAME_TIME: Final = 1e-6
-"""Share of a step by which a time that is meant to be a step's may miss it."""
 
 
 def recorded_poses(scene: PlanningScene, times: FloatArray, braking_from: float = np.inf) -> FloatArray:

@@ -34,8 +34,8 @@ from deepaccident_devkit.evaluation.results.records import (
 )
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.motion import LABEL_PROTOCOLS
-from deepaccident_devkit.parallel import Places, run_batch
 from deepaccident_devkit.support.arrays import AnyArray, checked_number
+from deepaccident_devkit.support.parallel import Places, run_batch
 from deepaccident_devkit.support.reading import (
     DAMAGED_ARCHIVE,
     array_of,
@@ -48,21 +48,20 @@ from deepaccident_devkit.support.reading import (
 from deepaccident_devkit.support.text import settle_choices
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
+# Name of a sample's array in the archive, of its token and the array's name.
 MEMBER: Final = "{}/{}.npy"
-"""Name of a sample's array in the archive, of its token and the array's name."""
+# Map → its channels.
 HEADS: Final[Mapping[str, int]] = {"segmentation": 2, "centerness": 1, "offset": 2, "flow": 2}
-"""Map → its channels."""
+# Arrays that earlier files have beside their maps, which say the same.
 NOT_READ: Final = ("trajectory_id", "trajectory")
-"""Arrays that earlier files have beside their maps, which say the same."""
+# Cells over all frames and predictions of a sample, twenty times as many as ten released predictions have. A small
+# archive can hold more, but memory cannot.
 _MOST_VALUES: Final = 2**26
-"""Cells over all frames and predictions of a sample, twenty times as many as ten released predictions have. A small
-archive can hold more, but memory cannot.
-"""
+# Bytes of a number.
 _WIDEST: Final = 8
-"""Bytes of a number."""
 _LONGEST_HEADER: Final = 1 << 16
+# How an array's member begins.
 _NPY: Final = b"\x93NUMPY\x01\x00"
-"""How an array's member begins."""
 _KINDS: Final = {"u": "unsigned whole numbers", "i": "whole numbers", "f": "floats"}
 _HIGHEST_ID: Final = 2**31 - 1
 _OPEN_FILES: Final = 8

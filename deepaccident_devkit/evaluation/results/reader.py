@@ -51,12 +51,12 @@ from deepaccident_devkit.taxonomy import CATEGORIES, UNTRACKED_ID
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
-    from deepaccident_devkit.parallel import Engine
+    from deepaccident_devkit.support.parallel import Engine
 
 Prediction = MotionOutput | list[Accident] | DetectedBoxes | list[Plan] | list[Forecast]
 Columns = dict[str, AnyArray]
+# How far from 1 a quaternion's norm may be; `Boxes` brings it there.
 _UNIT_TOLERANCE: Final = 1e-3
-"""How far from 1 a quaternion's norm may be; `Boxes` brings it there."""
 _UNKNOWN: Final = (math.nan, math.nan)
 _MOST_KEPT: Final = 4
 
@@ -194,10 +194,10 @@ class EntryContents:
     form: MotionForm | None = None
 
 
+# The content of a file; callers ask only for tokens that it has.
 Contents = EntryContents | MotionContents
-"""The content of a file; callers ask only for tokens that it has."""
+# Path and fingerprint → contents of the files that this process parsed last.
 kept: Final[dict[tuple[Path, str], Contents]] = {}
-"""Path and fingerprint → contents of the files that this process parsed last."""
 
 
 def contents_of(path: Path, fingerprint: str = "") -> tuple[Contents, str]:
@@ -410,10 +410,10 @@ def objects_at(entries: Entries, token: str) -> list[Any]:
 
 
 _OBJECT: Final = "object"
+# Task → what makes the columns of its records by token, and of the columns a sample's prediction.
 ENTRIES: Final[Mapping[str, tuple[Callable[..., Columns], Callable[[Entries, str], Any]]]] = {
     "accident": (accident_columns, accidents_at),
     "detection": (detection_columns, boxes_at),
     "planning": (plan_columns, objects_at),
     "forecasting": (forecast_columns, objects_at),
 }
-"""Task → what makes the columns of its records by token, and of the columns a sample's prediction."""

@@ -26,45 +26,45 @@ from deepaccident_devkit.taxonomy import CATEGORIES
 
 ResultsTask = Literal["motion", "accident", "detection", "planning", "forecasting"]
 Stored = Literal["instances", "heads"]
-Format = Literal["DeepAccident results"]
+_Format = Literal["DeepAccident results"]
+# Counted up with what files hold.
 Version = Literal[1]
-"""Counted up with what files hold."""
-FORMAT: Final = get_args(Format)[0]
+FORMAT: Final = get_args(_Format)[0]
 FORMAT_VERSION: Final = get_args(Version)[0]
 RESULTS_NAMES: Final[Mapping[ResultsTask, str]] = MappingProxyType(
     {name: name if name == "motion" else f"{name}.json" for name in get_args(ResultsTask)}
 )
 """Task → the name of its file, of motion a folder, where results of all tasks are written into one folder."""
+# The manifest of motion results, in their folder; results of the other tasks in a folder are called so too.
 RESULTS_FILE: Final = "results.json"
-"""The manifest of motion results, in their folder; results of the other tasks in a folder are called so too."""
+# A regular expression of tokens: words with `/` between.
 WORDS: Final = r"^[^/\\]+(/[^/\\]+)*$"
-"""A regular expression of tokens: words with `/` between."""
+# Metres, seconds, metres a second: larger numbers are mistakes, and squares of the largest floats overflow.
 LARGEST: Final = 1e6
-"""Metres, seconds, metres a second: larger numbers are mistakes, and squares of the largest floats overflow."""
-Measure = Annotated[float, Meta(ge=-LARGEST, le=LARGEST)]
+_Measure = Annotated[float, Meta(ge=-LARGEST, le=LARGEST)]
 FromZero = Annotated[float, Meta(ge=0, le=LARGEST)]
 Count = Annotated[int, Meta(ge=1)]
 ActorId = Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
 Token = Annotated[str, Meta(extra_json_schema={"pattern": WORDS})]
+# A further field of the nuScenes devkit; this dataset has no attributes.
 Ignored = Annotated[msgspec.Raw | UnsetType, Meta(description="Ignored.")]
-"""A further field of the nuScenes devkit; this dataset has no attributes."""
 Kind = TypeVar("Kind")
 Entry = TypeVar("Entry", bound=msgspec.Struct)
+# From nuScenes' width, length, height to our length, width, height, and back.
 LENGTH_FIRST: Final = [1, 0, 2]
-"""From nuScenes' width, length, height to our length, width, height, and back."""
+# Characters of a wrong value that an error shows.
 _SHOWN: Final = 80
-"""Characters of a wrong value that an error shows."""
+# The largest depth of nested objects and lists in `meta`, which people and reports read.
 _MOST_LEVELS: Final = 30
-"""The largest depth of nested objects and lists in `meta`, which people and reports read."""
+# Characters.
 _LONGEST_TOKEN: Final = 1000
-"""Characters."""
 
 
 class AccidentEntry(msgspec.Struct, forbid_unknown_fields=True, gc=False):
     """An accident that is foreseen."""
 
     positions: Annotated[
-        tuple[tuple[Measure, Measure], tuple[Measure, Measure]],
+        tuple[tuple[_Measure, _Measure], tuple[_Measure, _Measure]],
         Meta(
             description="Of the two that collide: x forward, y left, metres, in the present ego frame of the sample's "
             "agent."
@@ -83,7 +83,7 @@ class BoxEntry(msgspec.Struct, forbid_unknown_fields=True, gc=False):
 
     sample_token: Annotated[Token, Meta(description="The sample's token, under which the box stands.")]
     translation: Annotated[
-        tuple[Measure, Measure, Measure], Meta(description="Centre x, y, z in the world, right-handed, metres.")
+        tuple[_Measure, _Measure, _Measure], Meta(description="Centre x, y, z in the world, right-handed, metres.")
     ]
     size: Annotated[
         tuple[FromZero, FromZero, FromZero], Meta(description="WIDTH, LENGTH, HEIGHT, metres: nuScenes' order.")
@@ -95,7 +95,7 @@ class BoxEntry(msgspec.Struct, forbid_unknown_fields=True, gc=False):
     detection_name: Annotated[Literal[CATEGORIES], Meta(description="Category.")]  # type: ignore[valid-type]
     detection_score: Annotated[float, Meta(description="How sure the model is, the more the higher.")]
     velocity: Annotated[
-        tuple[Measure, Measure] | UnsetType | None,
+        tuple[_Measure, _Measure] | UnsetType | None,
         Meta(description="x and y in the world over the ground, m/s; null if not known."),
     ] = UNSET
     attribute_name: Ignored = UNSET
@@ -103,7 +103,7 @@ class BoxEntry(msgspec.Struct, forbid_unknown_fields=True, gc=False):
     num_pts: Ignored = UNSET
 
 
-Place = tuple[Measure, Measure]
+Place = tuple[_Measure, _Measure]
 Times = Annotated[list[FromZero], Meta(min_length=1, description="Seconds after the present, ascending.")]
 
 
@@ -120,7 +120,7 @@ class PlanEntry(msgspec.Struct, forbid_unknown_fields=True, gc=False):
     ]
     score: Annotated[float, Meta(description="How good the plan is; the one with the highest is evaluated.")]
     yaw: Annotated[
-        list[Measure] | UnsetType | None,
+        list[_Measure] | UnsetType | None,
         Meta(description="Its headings at these times, radians, counter-clockwise; null for those of the steps."),
     ] = UNSET
 
@@ -143,13 +143,13 @@ class ForecastEntry(msgspec.Struct, forbid_unknown_fields=True, gc=False):
     ]
 
 
+# Task → record of an entry.
 ENTRY_RECORDS: Final[Mapping[str, type[msgspec.Struct]]] = {
     "accident": AccidentEntry,
     "detection": BoxEntry,
     "planning": PlanEntry,
     "forecasting": ForecastEntry,
 }
-"""Task → record of an entry."""
 
 
 class FormRecord(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
@@ -180,7 +180,7 @@ class Shard(msgspec.Struct, forbid_unknown_fields=True, kw_only=True, frozen=Tru
 
 
 class _File(msgspec.Struct, forbid_unknown_fields=True, kw_only=True, tag_field="task"):
-    format: Format
+    format: _Format
     version: Version
     meta: Annotated[
         msgspec.Raw,

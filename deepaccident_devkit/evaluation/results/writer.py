@@ -47,8 +47,8 @@ from deepaccident_devkit.support.reading import file_checksum, open_file, read_b
 from deepaccident_devkit.support.text import choice, counted, differing_text, path_of
 from deepaccident_devkit.taxonomy import CATEGORIES
 
+# What is before and after the entries in a file; no line ends in the notes.
 _BODY, _END = ',\n"results": {', "\n}\n}\n"
-"""What is before and after the entries in a file; no line ends in the notes."""
 _FIRST_DATE: Final = (1980, 1, 1, 0, 0, 0)
 _MOST_SAMPLES: Final = 64
 MOST_BYTES: Final = 32 * 2**20
@@ -147,7 +147,7 @@ class ResultsWriter:
         """Write the prediction of a sample.
 
         Args:
-            token: of the sample; each one once. Whether the release has it is not known here: `evaluate check
+            token: of the sample; each one once. Whether the release has it is not known here: `check results
                 --dataroot` tells.
             prediction: of motion a MotionOutput, all of one grid and number of frames; of accidents those that are
                 foreseen, [] for none; of detection the boxes, in the world frame; of planning one or more Plans; of
@@ -349,13 +349,13 @@ def _all_of(kind: type[Kind], prediction: object) -> list[Kind]:
     return [each for each in given if isinstance(each, kind)]
 
 
+# Task → the entries of a sample as a file has them, of its token and prediction.
 _ENTRIES: Final[Mapping[str, Callable[[str, object], list[dict[str, Any]]]]] = {
     "accident": _accidents,
     "detection": _boxes,
     "planning": _plans,
     "forecasting": _forecasts,
 }
-"""Task → the entries of a sample as a file has them, of its token and prediction."""
 
 
 class ShardWriter:

@@ -28,7 +28,6 @@ from deepaccident_devkit.evaluation.runs.side_by_side import SideBySide, side_by
 from deepaccident_devkit.evaluation.runs.text import results_text, summary_text
 from deepaccident_devkit.evaluation.runs.verification import Difference, Verification, verify_bundle
 from deepaccident_devkit.release.fingerprints import ScenarioHashes, scenario_hashes
-from deepaccident_devkit.rooms import names_of
 
 __all__ = [
     "BREAKDOWNS",
@@ -55,7 +54,6 @@ __all__ = [
     "evaluate_results",
     "evaluation_store",
     "over_bytes",
-    "prevented_accidents",
     "read_bundle",
     "read_rows",
     "results_text",
@@ -65,7 +63,4 @@ __all__ = [
     "side_by_side",
     "summary_text",
     "verify_bundle",
-    "with_prevented",
 ]
-
-__getattr__, __dir__ = names_of(__name__, __all__)  # what the room `safety` adds

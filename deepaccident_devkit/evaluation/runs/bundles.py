@@ -7,7 +7,8 @@ import math
 import os
 import shutil
 import stat
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
@@ -20,7 +21,13 @@ from deepaccident_devkit.evaluation.evaluator import Evaluator
 from deepaccident_devkit.evaluation.results.records import check_token
 from deepaccident_devkit.evaluation.runs.evaluation_run import SUMMARY_FORMAT, SUMMARY_VERSION, EvaluationRun
 from deepaccident_devkit.evaluation.runs.rows import Row, read_rows, sample_rows, write_rows
-from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup, SampleSelection, remove_checkpoints, scenario_of
+from deepaccident_devkit.evaluation.runs.setups import (
+    EvaluationSetup,
+    SampleSelection,
+    is_task,
+    remove_checkpoints,
+    scenario_of,
+)
 from deepaccident_devkit.evaluation.warning.recordings import GROUPS
 from deepaccident_devkit.release.fingerprints import ScenarioHashes
 from deepaccident_devkit.support.arrays import ShortRepr
@@ -38,6 +45,7 @@ FILES_FILE: Final = "files.json"
 RESULTS_FOLDER: Final = "results"
 SCENARIOS_FORMAT: Final = "DeepAccident scenario hashes"
 FILES_FORMAT: Final = "DeepAccident evaluation bundle"
+# A name, a path, a checksum: what shows in a terminal, in a line.
 Line = Annotated[
     str,
     msgspec.Meta(
@@ -45,10 +53,10 @@ Line = Annotated[
         pattern=r"^[^\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ufeff]*\Z",
     ),
 ]
-"""A name, a path, a checksum: what shows in a terminal, in a line."""
+# Which threshold of an evaluation is taken: of the best F1; of at most one second a minute in false alarm; or of at
+# most one second a minute of braking for false alarms, which the evaluation of prevented accidents finds.
 Chooser = Literal["best_f1", "quiet", "braking"]
-"""Which threshold of an evaluation is taken: of the best F1; of at most one second a minute in false alarm; or of at
-most one second a minute of braking for false alarms, which the evaluation of prevented accidents finds."""
+_UNCLEAR: Final = "does not say what was evaluated: "
 _REMEDY: Final = "give a folder that `deepaccident evaluate … --out` wrote, or evaluate again"
 
 
@@ -112,14 +120,17 @@ class Bundle(ShortRepr):
     Attributes:
         folder: where.
         summary: of `metrics_summary.json`.
-        setup: task and rules.
         selection: which samples.
     """
 
     folder: Path
     summary: Mapping[str, Any]
-    setup: EvaluationSetup
     selection: SampleSelection
+
+    @property
+    def setup(self) -> EvaluationSetup:
+        """Return the task and its rules; raises ResultsError if the plug-in that has the task is not installed."""
+        return _stated_setup(self.folder / SUMMARY_FILE, self.summary)
 
     @property
     def dataroot(self) -> str:
@@ -211,23 +222,39 @@ class Bundle(ShortRepr):
 
 
 def read_bundle(folder: Path) -> Bundle:
-    """Open a bundle; raises ResultsError if there is none that this devkit can read."""
+    """Open a bundle; raises ResultsError if there is none that this devkit can read.
+
+    A bundle whose task is one of a plug-in that is not installed opens, too: `summary["task"]` names it.
+    """
     folder = path_of(folder)
     if not folder.is_dir():
         raise ResultsError(f"{folder}: no such folder; {_REMEDY}")
     path = folder / SUMMARY_FILE
     summary = read_json(path, SUMMARY_FORMAT)
-    unclear = "does not say what was evaluated: "
-    _record(path, summary, _Summary, unclear)
-    try:
-        setup = EvaluationSetup(**{name: summary[name] for name in ("task", "protocol", "switches", "horizon")})
+    _record(path, summary, _Summary, _UNCLEAR)
+    if is_task(summary["task"]):
+        _stated_setup(path, summary)
+    with _stating(path):
         selection = SampleSelection(
             agents=None if summary["agents"] is None else tuple(summary["agents"]),
             **{name: summary[name] for name in ("split", "samples", "scope", "horizon")},
         )
+    return Bundle(folder=folder, summary=summary, selection=selection)
+
+
+def _stated_setup(path: Path, summary: Mapping[str, Any]) -> EvaluationSetup:
+    """Return the setup that a summary states; raises ResultsError."""
+    with _stating(path):
+        return EvaluationSetup(**{name: summary[name] for name in ("task", "protocol", "switches", "horizon")})
+
+
+@contextmanager
+def _stating(path: Path) -> Iterator[None]:
+    """Turn errors of impossible values into a ResultsError that names the summary."""
+    try:
+        yield
     except (ArithmeticError, LookupError, TypeError, ValueError) as error:  # whatever a switch's value can cause
-        raise ResultsError(f"{path}: {unclear}{shortened(str(error), MOST_TOLD)}; {_REMEDY}") from error
-    return Bundle(folder=folder, summary=summary, setup=setup, selection=selection)
+        raise ResultsError(f"{path}: {_UNCLEAR}{shortened(str(error), MOST_TOLD)}; {_REMEDY}") from error
 
 
 def chosen_threshold(folder: Path, by: Chooser, tokens: Iterable[str]) -> float:

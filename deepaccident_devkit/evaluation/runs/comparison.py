@@ -32,21 +32,21 @@ from deepaccident_devkit.evaluation.runs.bundles import Bundle, read_bundle
 from deepaccident_devkit.evaluation.runs.setups import scenario_of
 from deepaccident_devkit.evaluation.runs.verification import differing
 from deepaccident_devkit.evaluation.task import Headline, headlines, plain
-from deepaccident_devkit.reports import Report, Row, record_rows
 from deepaccident_devkit.support.arrays import BoolArray, FloatArray, ShortRepr, known
+from deepaccident_devkit.support.reports import Report, Row, record_rows
 from deepaccident_devkit.support.text import columns_text, counted, path_of
 
+# What a number is tested with: by itself, with all other headlines, or not at all.
 Family = Literal["main", "headlines", "other"]
-"""What a number is tested with: by itself, with all other headlines, or not at all."""
 _SETUP: Final = ("task", "protocol", "switches", "horizon", "settings")
 _SHOWN: Final = 3
+# Differences that differ by at most this share of them count as equal.
 _ROUNDING: Final = 1e-9
-"""Differences that differ by at most this share of them count as equal."""
 _IMPOSSIBLE: Final = "no decision is possible with"
+# What a table says instead of that, and explains below.
 _TOO_FEW: Final = "too few"
-"""What a table says instead of that, and explains below."""
+# The chance that the stated number of scenarios decides a difference.
 _POWER: Final = 0.8
-"""The chance that the stated number of scenarios decides a difference."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

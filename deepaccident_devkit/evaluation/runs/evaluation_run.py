@@ -12,7 +12,6 @@ from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from deepaccident_devkit._version import __version__
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import EvaluationError, ResultsError
 from deepaccident_devkit.evaluation.breakdowns import (
@@ -29,7 +28,6 @@ from deepaccident_devkit.evaluation.evaluator import Evaluator
 from deepaccident_devkit.evaluation.intervals import Resampling
 from deepaccident_devkit.evaluation.results import Results, read_results
 from deepaccident_devkit.evaluation.runs.setups import (
-    TASKS,
     Coverage,
     EvaluationSetup,
     SampleLoader,
@@ -38,19 +36,21 @@ from deepaccident_devkit.evaluation.runs.setups import (
     checkpoint_path,
     coverage,
     default_selection,
+    evaluator_class,
     scenario_of,
 )
 from deepaccident_devkit.evaluation.task import headlines, plain
-from deepaccident_devkit.parallel import run_batch, workers_kept
 from deepaccident_devkit.release.fingerprints import ScenarioHashes, fingerprint, scenario_hashes
 from deepaccident_devkit.support.arrays import ShortRepr
+from deepaccident_devkit.support.parallel import run_batch, workers_kept
 from deepaccident_devkit.support.text import counted
+from deepaccident_devkit.support.version import __version__
 from deepaccident_devkit.taxonomy import SPLITS
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
-    from deepaccident_devkit.parallel import Engine
+    from deepaccident_devkit.support.parallel import Engine
 
 
 SUMMARY_FORMAT: Final = "DeepAccident metrics summary"
@@ -73,12 +73,12 @@ BREAKDOWNS: Final = (
 
 def breakdowns_of(task: str) -> tuple[str, ...]:
     """What a task's results are broken down by if nothing else is asked for: warnings by whole recordings alone."""
-    whole = TASKS[task].needs_whole_recordings
+    whole = evaluator_class(task).needs_whole_recordings
     return tuple(name for name in BREAKDOWNS if not (whole and name in WITHIN_RECORDINGS))
 
 
+# Whose versions stand in a summary: arithmetic is theirs.
 _LIBRARIES: Final = ("numpy", "scipy")
-"""Whose versions stand in a summary: arithmetic is theirs."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -353,7 +353,7 @@ def evaluate_results(
     check_recordings(loader.results, dataset)
     covered = coverage(dataset, loader.results.tokens, chosen, explain=not allow_partial)
     tokens = _covered_tokens(dataset, loader.results, chosen, covered, allow_partial=allow_partial)
-    if TASKS[setup.task].needs_meta:
+    if evaluator_class(setup.task).needs_meta:
         check_metas(dataset, tokens, chosen.split)
     how = {"workers": None, **how}
     loader.results.check(**how)

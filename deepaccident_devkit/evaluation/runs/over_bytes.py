@@ -19,7 +19,7 @@ from deepaccident_devkit.evaluation.runs.bundles import read_bundle
 from deepaccident_devkit.evaluation.runs.comparison import comparable
 from deepaccident_devkit.evaluation.runs.setups import scenario_of
 from deepaccident_devkit.evaluation.task import Unit, headlines, value_text
-from deepaccident_devkit.reports import Report, Row, record_rows
+from deepaccident_devkit.support.reports import Report, Row, record_rows
 from deepaccident_devkit.support.text import columns_text, counted, path_of
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 

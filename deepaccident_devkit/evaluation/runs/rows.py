@@ -46,10 +46,10 @@ def _which(run: EvaluationRun, token: str) -> Row:
     }
 
 
+# Of the metadata: one JSON object.
 STAMP_KEY: Final = b"deepaccident"
-"""Of the metadata: one JSON object."""
+# Of a number as Python holds it.
 _VALUE_BYTES: Final = 32
-"""Of a number as Python holds it."""
 
 
 def write_rows(path: Path, rows: Sequence[Mapping[str, Any]], stamp: Mapping[str, Any]) -> None:

@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import EvaluationError
 from deepaccident_devkit.evaluation.accident import AccidentContext, BoxAccidents
-from deepaccident_devkit.evaluation.accident_truth import LABEL_STEP, by_sureness, position_difference
+from deepaccident_devkit.evaluation.alarms import LABEL_STEP, by_sureness, position_difference
 from deepaccident_devkit.evaluation.detection.boxes import columns_of
 from deepaccident_devkit.evaluation.forecasting import Forecast, ForecastingTruth
 from deepaccident_devkit.evaluation.forecasting.metrics import SAME_TIME
@@ -33,18 +33,20 @@ from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup, SampleLo
 from deepaccident_devkit.evaluation.task import FrozenMappings
 from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.motion import MotionLabels
-from deepaccident_devkit.parallel import run_batch
 from deepaccident_devkit.support.arrays import AnyArray, FloatArray, IntArray
+from deepaccident_devkit.support.parallel import run_batch
 from deepaccident_devkit.support.text import counted
 from deepaccident_devkit.taxonomy import CATEGORIES, FRAME_PERIOD, OWN_ACTOR_ID
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
-    from deepaccident_devkit.parallel import Engine
+    from deepaccident_devkit.support.parallel import Engine
 
 __all__ = ["SanityReport", "check_sanity"]
 
+# Name → the signs of x and y once it is undone, and −1 if the two are swapped before. x right, y forward is turned
+# left. If two explain the same, as on a straight way, the first is told.
 _AXES: Final = {
     "x mirrored": (-1, 1, 1),
     "y mirrored": (1, -1, 1),
@@ -54,44 +56,43 @@ _AXES: Final = {
     "x and y swapped": (1, 1, -1),
     "x and y swapped and mirrored": (-1, -1, -1),
 }
-"""Name → the signs of x and y once it is undone, and −1 if the two are swapped before. x right, y forward is turned
-left. If two explain the same, as on a straight way, the first is told."""
 SAMPLES: Final = 20
+# Samples that are looked at, and of accident lists and plans, which are short.
 LISTS: Final = 60
-"""Samples that are looked at, and of accident lists and plans, which are short."""
+# How many times as large the share has to be once a mistake is undone.
 _MARGIN: Final = 2.0
-"""How many times as large the share has to be once a mistake is undone."""
+# The share that it has to reach, if not one half; in time, slow predictions reach a part, too.
 _LEAST: Final[Mapping[str, float]] = {"place": 0.2, "time": 0.4}
-"""The share that it has to reach, if not one half; in time, slow predictions reach a part, too."""
+# Cells, accidents, boxes, or places of paths that have to be hit.
 _EVIDENCE: Final = {"motion": 100, "accident": 4, "detection": 10, "planning": 10, "forecasting": 10}
-"""Cells, accidents, boxes, or places of paths that have to be hit."""
 _THINGS: Final = dict(zip(_EVIDENCE, ("cells", "accidents", "true boxes", "places", "places"), strict=True))
+# Metres: as near on the ground, a box is found, and both places of an accident are hit on average.
 _NEAR: Final = 2.0
-"""Metres: as near on the ground, a box is found, and both places of an accident are hit on average."""
+# Nearer in height, 0.7 m, since LiDAR and ego frame differ by the LiDAR's height alone, some 2 m.
 _SCALE: Final = np.array([1, 1, _NEAR / 0.7])
-"""Nearer in height, 0.7 m, since LiDAR and ego frame differ by the LiDAR's height alone, some 2 m."""
+# Seconds, of accidents.
 NEAR_IN_TIME: Final = 0.15
-"""Seconds, of accidents."""
+# Metres, or a tenth of the way if that is more.
 _NEAR_ON_PATH: Final = 1.0
-"""Metres, or a tenth of the way if that is more."""
+# Share of a box's size, of its height over the ground or of its velocity that may be wrong.
 _ALIKE: Final = 0.2
-"""Share of a box's size, of its height over the ground or of its velocity that may be wrong."""
+# Boxes of a class from which on its name tells.
 _FEWEST: Final = 5
-"""Boxes of a class from which on its name tells."""
+# m/s: within a step, slower actors do not move enough.
 MOVING: Final = 4.0
-"""m/s: within a step, slower actors do not move enough."""
+# A heading that is nearer to one of the true box's four directions is right; at random, a third of them are.
 STRAIGHT: Final = np.deg2rad(15)
-"""A heading that is nearer to one of the true box's four directions is right; at random, a third of them are."""
+# Name → the order of the given sizes, and by what they are multiplied to undo it.
 _SIZES: Final = {
     f"sizes in the order {', '.join(('length', 'width', 'height')[axis] for axis in order)}": (order, 1.0)
     for order in permutations(range(3))
     if order != (0, 1, 2)
 } | {"half sizes": ((0, 1, 2), 2.0), "double sizes": ((0, 1, 2), 0.5)}
-"""Name → the order of the given sizes, and by what they are multiplied to undo it."""
+# Name → how much of the box's height is added to undo it.
 _HEIGHTS: Final = {"z of the lower face": 0.5, "z of the upper face": -0.5}
-"""Name → how much of the box's height is added to undo it."""
 _VELOCITIES: Final = {"velocities per frame": 1 / FRAME_PERIOD, "velocities per step": 1 / LABEL_STEP}
 _DEGREES: Final = "yaw in degrees"
+# Name → what headings are multiplied by, and what is added to them, to undo it.
 _YAWS: Final = {
     "yaw clockwise": (-1.0, 0.0),
     "yaw from y": (1.0, np.pi / 2),
@@ -99,17 +100,17 @@ _YAWS: Final = {
     "yaw clockwise from y": (-1.0, np.pi / 2),
     "yaw backwards": (1.0, np.pi),
 }
-"""Name → what headings are multiplied by, and what is added to them, to undo it."""
+# Above this a heading may be in degrees; a small one would be near 0, as most are, whatever was wrong with it.
 _LARGE_YAW: Final = 4.0
-"""Above this a heading may be in degrees; a small one would be near 0, as most are, whatever was wrong with it."""
 _CLASSES: Final = "classes swapped"
+# Seconds at which paths are compared.
 _STEPS: Final = np.arange(1, 7) * LABEL_STEP
-"""Seconds at which paths are compared."""
+# The same in frames from the present on.
 _FRAMES: Final = slice(5, 31, 5)
-"""The same in frames from the present on."""
+# In so few frames, slow predictions look late.
 FEWEST_FRAMES: Final = 3
-"""In so few frames, slow predictions look late."""
 _SECONDS: Final = "times are in seconds after the present"
+# Group → mistakes that are undone on trial → what is right.
 _SAYS: Final[Mapping[str, Mapping[str, str]]] = {
     "place": {
         **dict.fromkeys(_AXES, "x is forward and y to the left; of maps, state the orientation that they have"),
@@ -139,14 +140,13 @@ _SAYS: Final[Mapping[str, Mapping[str, str]]] = {
     "velocity": dict.fromkeys(_VELOCITIES, "velocities are in m/s"),
     "class": {_CLASSES: f"the classes are, counted from 0, {', '.join(CATEGORIES)}"},
 }
-"""Group → mistakes that are undone on trial → what is right."""
+# Group → what is said if most of what is found in its place is wrong, and no mistake explains it.
 _UNFIT: Final[Mapping[str, str]] = {
     "height": "heights do not fit: {} of {} are right; z is that of the middle of the box, in the world frame",
     "size": "sizes do not fit: {} of {} are right; sizes are whole lengths, widths and heights in metres",
     "heading": "headings look random: {} of {} are right, of boxes apart from quarters of a turn; are they degrees "
     "instead of radians, or not predicted? They are counted counter-clockwise from x, of boxes from that of the world",
 }
-"""Group → what is said if most of what is found in its place is wrong, and no mistake explains it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -538,6 +538,7 @@ def _places_at(times: FloatArray, path: FloatArray, present: FloatArray) -> Floa
     return np.column_stack([np.interp(_STEPS, times, values) for values in path.T])
 
 
+# Kind of results → what looks at a sample, by its token, prediction and truth.
 _LOOKS: Final[Mapping[str, Callable[..., Seen]]] = {
     "motion": _motion_seen,
     "accident": _accidents_seen,
@@ -545,4 +546,3 @@ _LOOKS: Final[Mapping[str, Callable[..., Seen]]] = {
     "planning": _plan_seen,
     "forecasting": _forecasts_seen,
 }
-"""Kind of results → what looks at a sample, by its token, prediction and truth."""

@@ -10,7 +10,6 @@ from itertools import product
 from pathlib import Path
 from typing import Any, Final, Literal, get_args
 
-from deepaccident_devkit._version import __version__
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import (
     ConfigError,
@@ -29,23 +28,25 @@ from deepaccident_devkit.evaluation.predictions import compared_labels
 from deepaccident_devkit.evaluation.results import Results
 from deepaccident_devkit.evaluation.task import FrozenDict, switched
 from deepaccident_devkit.evaluation.warning import WarningEvaluator
-from deepaccident_devkit.motion import LABEL_PROTOCOLS, MotionLabels, samples
-from deepaccident_devkit.motion.sample_labels import no_samples_text
-from deepaccident_devkit.parallel import Places, Store, unfinished_folder
+from deepaccident_devkit.motion import LABEL_PROTOCOLS, MotionLabels
 from deepaccident_devkit.release.fingerprints import INDEX_REMEDY, digest_of
+from deepaccident_devkit.selection.samples import no_samples_text, samples
 from deepaccident_devkit.support.arrays import ShortRepr
 from deepaccident_devkit.support.files import remove_in
-from deepaccident_devkit.support.text import choice, choices, counted, path_of, settle_choices, spelled
+from deepaccident_devkit.support.parallel import Places, Store, unfinished_folder
+from deepaccident_devkit.support.plugins import offers
+from deepaccident_devkit.support.text import choice, choices, counted, meant_text, path_of, settle_choices, spelled
+from deepaccident_devkit.support.version import __version__
 from deepaccident_devkit.taxonomy import AGENTS, FRAME_PERIOD, SPLIT_CHOICES, SPLITS, VEHICLE_AGENTS
 
-__all__ = ["TASKS", "EvaluationSetup", "SampleLoader"]
+__all__ = ["TASKS", "EvaluationSetup", "SampleLoader", "evaluator_class", "is_task"]
 
 SampleList = Literal["evaluate", "all"]
 ScopeName = Literal["accident", "all"]
+# Samples that a message names.
 _SHOWN: Final = 3
-"""Samples that a message names."""
+# Seconds from one sample of a list to the next.
 LIST_STEP: Final = 0.5
-"""Seconds from one sample of a list to the next."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -296,9 +297,35 @@ TASKS: Final[dict[str, type[Evaluator[Any]]]] = {
         ForecastingEvaluator,
     )
 }
-"""All tasks by name; a new one has a line here."""
+"""The devkit's own tasks by name; a new one has a line here. Plug-ins add theirs: ask `evaluator_class`."""
+
+
+def is_task(name: str) -> bool:
+    """Return whether the devkit or a plug-in has a task."""
+    return name in TASKS or name in offers(lambda plugin: plugin.tasks, TASKS).by_name
+
+
+def evaluator_class(task: str) -> type[Evaluator[Any]]:
+    """Return the evaluator of a task, of the devkit or of a plug-in.
+
+    Raises:
+        ChoiceError: no such task; if it is one of a plug-in that is not installed, or left out, the message says so.
+    """
+    name = spelled(task, TASKS)
+    if name in TASKS:
+        return TASKS[name]
+    found = offers(lambda plugin: plugin.tasks, TASKS)
+    names = (*TASKS, *found.by_name)
+    remedy = f"; if a plug-in has this task, install it. {found.refusals_text()}".rstrip()
+    hint = meant_text(str(task), names) or remedy
+    evaluator = found.by_name[choice("task", task, names, elsewhere={str(task).lower(): hint})].load()
+    if not evaluator.protocols:
+        raise ConfigError(f"{evaluator.__name__}: has no protocols; give it one, such as an empty frozen dataclass")
+    return evaluator
+
+
+# Seconds; recordings are shorter.
 _LONGEST_HORIZON: Final = 100
-"""Seconds; recordings are shorter."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -306,7 +333,7 @@ class EvaluationSetup:
     """What is evaluated, and by which rules; two of equal ones give comparable numbers.
 
     Attributes:
-        task: Name of a task, of `TASKS`.
+        task: Name of a task, of the devkit or of a plug-in.
         protocol: Name of one of the task's `protocols`.
         switches: choices of the protocol that are changed, by name (`task.switch_names`).
         horizon: seconds that the predictions look ahead; detection has none.
@@ -319,8 +346,9 @@ class EvaluationSetup:
 
     def __post_init__(self) -> None:
         """Check; raises ChoiceError or ConfigError."""
-        settle_choices(self, {"task": tuple(TASKS)})
-        protocols = TASKS[self.task].protocols
+        task = evaluator_class(self.task)
+        object.__setattr__(self, "task", task.task)
+        protocols = task.protocols
         protocol = choice(f"protocol of {self.task}", self.protocol, protocols, elsewhere=label_rules(self.task))
         object.__setattr__(self, "protocol", protocol)
         if not 0 < self.horizon <= _LONGEST_HORIZON:
@@ -331,11 +359,11 @@ class EvaluationSetup:
     @property
     def rules(self) -> Any:
         """The protocol itself, with the switches."""
-        return switched(TASKS[self.task].protocols[self.protocol], self.switches)
+        return switched(evaluator_class(self.task).protocols[self.protocol], self.switches)
 
     def evaluator(self) -> Evaluator[Any]:
         """A new evaluator of these rules."""
-        return TASKS[self.task](self.rules)
+        return evaluator_class(self.task)(self.rules)
 
     def as_dict(self) -> dict[str, Any]:
         """All of it, as JSON holds it, with the evaluator's own `settings`: every choice."""
@@ -362,9 +390,9 @@ def default_selection(
     Raises:
         ChoiceError: no such list, scope or agent.
     """
-    if agents is None and TASKS[setup.task].vehicles_only:
+    if agents is None and evaluator_class(setup.task).vehicles_only:
         agents = VEHICLE_AGENTS
-    listed: SampleList = samples or ("all" if TASKS[setup.task].needs_whole_recordings else "evaluate")
+    listed: SampleList = samples or ("all" if evaluator_class(setup.task).needs_whole_recordings else "evaluate")
     return SampleSelection(
         split=os.fspath(split),
         samples=listed,
@@ -390,7 +418,7 @@ class SampleLoader:
 
     def __post_init__(self) -> None:
         """Check that the results are of a kind that the rules take, and look far enough; raises EvaluationError."""
-        kinds = TASKS[self.setup.task].result_kinds
+        kinds = evaluator_class(self.setup.task).result_kinds
         if self.results.task not in kinds:
             raise EvaluationError(
                 f"{self.results.path}: holds {self.results.task} results; {self.setup.task} is evaluated from "

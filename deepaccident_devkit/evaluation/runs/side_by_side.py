@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from deepaccident_devkit.evaluation.runs.bundles import Bundle
-from deepaccident_devkit.reports import Report, Row
+from deepaccident_devkit.support.reports import Report, Row
 from deepaccident_devkit.support.text import columns_text
 
 

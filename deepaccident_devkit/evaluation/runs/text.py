@@ -13,28 +13,29 @@ from typing import Any, Final
 
 from deepaccident_devkit.errors import shortened
 from deepaccident_devkit.evaluation.results import Results
-from deepaccident_devkit.evaluation.runs.further import further_results
+from deepaccident_devkit.evaluation.runs.further import Json, further_results
 from deepaccident_devkit.evaluation.runs.over_bytes import sent_bytes
-from deepaccident_devkit.evaluation.runs.setups import TASKS, agent_of, scenario_of
+from deepaccident_devkit.evaluation.runs.setups import agent_of, evaluator_class, scenario_of
 from deepaccident_devkit.evaluation.warning.recordings import GIVEN
-from deepaccident_devkit.reports import Table
+from deepaccident_devkit.support.reports import Table
 from deepaccident_devkit.support.text import columns_text, counted
 
 SHOWN_BREAKDOWNS: Final = ("time_to_impact", "accident_visibility")
+# Headlines that a breakdown shows.
 _COLUMNS: Final = 5
-"""Headlines that a breakdown shows."""
+# Parts of the metrics that hold no counts of the samples.
 _NOT_COUNTED: Final = ("beside", "notes", "curve", "references", "counted")
-"""Parts of the metrics that hold no counts of the samples."""
 _PUBLISHED_CELLS: Final = [-50.0, 50.0, 0.5]
 _PUBLISHED_PREDICTIONS: Final = 6
+# Share of true paths with a match below which errors of paths say little of the others.
 _FEW_PATHS: Final = 0.9
-"""Share of true paths with a match below which errors of paths say little of the others."""
+# Percent of plans from which on something is probably wrong with them.
 _MOST_INFEASIBLE: Final = 90
-"""Percent of plans from which on something is probably wrong with them."""
+# Letters of the notes in results that are shown; they may hold a hash a scenario.
 _META: Final = 1000
-"""Letters of the notes in results that are shown; they may hold a hash a scenario."""
+# Thresholds that are told for another split.
 _TOLD: Final = ("best_f1", "quiet")
-"""Thresholds that are told for another split."""
+# Of the protocol `clean`. Recall and seconds never stand without precision and the time in alarm.
 _CLEAN_COLUMNS: Final[Mapping[str, str]] = {
     "auc_ahead": "auc_ahead",
     "twin_wins": "twin_wins",
@@ -48,7 +49,6 @@ _CLEAN_COLUMNS: Final[Mapping[str, str]] = {
     "tta0": "operating/tta0",
     "tta_hit": "operating/tta_hit",
 }
-"""Of the protocol `clean`. Recall and seconds never stand without precision and the time in alarm."""
 _PRINTED: Final = {"AP": "average_precision", "mTTA": "mean_time", "TTA@R80": "time_at_r80"}
 _AT_HALF: Final = {"P@0.5": "precision_at_half", "R@0.5": "recall_at_half", "TTA@0.5": "time_at_half"}
 _FIELD_COLUMNS: Final[Mapping[str, Mapping[str, str]]] = {
@@ -57,7 +57,6 @@ _FIELD_COLUMNS: Final[Mapping[str, Mapping[str, str]]] = {
     "drive": _PRINTED | _AT_HALF,
     "dad": _PRINTED,
 }
-Json = Mapping[str, Any]
 
 
 def summary_text(summary: Json, by: Sequence[str] = SHOWN_BREAKDOWNS) -> str:
@@ -208,7 +207,7 @@ def means_tables(summary: Json) -> dict[str, Table]:
     Numbers are the columns, or where they are more than the rows, these.
     """
     tables, metrics = {}, summary["metrics"]
-    units = {row.path.rpartition("/")[2]: row.unit for row in TASKS[summary["task"]].result_class.rows}
+    units = {row.path.rpartition("/")[2]: row.unit for row in evaluator_class(summary["task"]).result_class.rows}
     for name, means in (metrics.get("means") or {}).items():
         counted = metrics["counted"][name]
         columns = dict.fromkeys(column for row in means.values() for column in row)
@@ -223,8 +222,8 @@ def means_tables(summary: Json) -> dict[str, Table]:
     return tables
 
 
+# More columns than rows from which a table is turned.
 _WIDER: Final = 4
-"""More columns than rows from which a table is turned."""
 
 
 def _mean(value: float | None, count: int, most: int) -> str:

@@ -29,20 +29,20 @@ from deepaccident_devkit.evaluation.runs.evaluation_run import EvaluationRun, ev
 from deepaccident_devkit.evaluation.runs.further import further_names, with_further
 from deepaccident_devkit.evaluation.runs.rows import rows_table, sample_rows
 from deepaccident_devkit.release.fingerprints import ScenarioHashes, fingerprint
-from deepaccident_devkit.reports import Report, Row, record_rows
 from deepaccident_devkit.support.arrays import ShortRepr
+from deepaccident_devkit.support.reports import Report, Row, record_rows
 from deepaccident_devkit.support.text import counted, path_of
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
-    from deepaccident_devkit.parallel import Engine
+    from deepaccident_devkit.support.parallel import Engine
 
 
+# Stands for a missing value.
 ABSENT: Final = "absent"
-"""Stands for a missing value."""
+# Characters of a value that a line shows.
 _LONGEST: Final = 60
-"""Characters of a value that a line shows."""
 _LONGEST_PLACE: Final = 300
 
 
@@ -92,10 +92,10 @@ def _short(value: Any) -> str:
     return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 1]}…"
 
 
+# Differences that the text lists.
 _SHOWN: Final = 20
-"""Differences that the text lists."""
+# Of a summary: what is told in notes, or says where things were.
 _NOT_COMPARED: Final = ("environment", "sanity", "release/dataroot", "results/path")
-"""Of a summary: what is told in notes, or says where things were."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -201,7 +201,7 @@ def check_repeated(bundle: Bundle, given: Mapping[str, object]) -> None:
         options = " ".join(f"--{name} {shlex.quote(path)}" for name, path in outside.items())
         raise ResultsError(
             f"{bundle.folder}: names paths outside of it, which are opened only if you give them: deepaccident "
-            f"evaluate verify {shlex.quote(os.fspath(bundle.folder))} {options}"
+            f"check bundle {shlex.quote(os.fspath(bundle.folder))} {options}"
         )
 
 

@@ -11,11 +11,9 @@ from deepaccident_devkit.evaluation.warning.field import (
     printed_figures,
 )
 from deepaccident_devkit.evaluation.warning.recordings import ScoreSeries
-from deepaccident_devkit.rooms import names_of
 
 __all__ = [
     "WARNING_PROTOCOLS",
-    "AccidentOutcomes",
     "AnticipationFigures",
     "AnticipationResult",
     "CleanScores",
@@ -24,15 +22,8 @@ __all__ = [
     "FieldResult",
     "FieldWarnings",
     "OperatingPoint",
-    "OutcomeTable",
-    "PreventedEvaluator",
-    "PreventedResult",
-    "PreventionCurve",
-    "PreventionFigures",
     "ScoreSeries",
     "WarningEvaluator",
     "field_figures",
     "printed_figures",
 ]
-
-__getattr__, __dir__ = names_of(__name__, __all__)  # what the room `safety` adds

@@ -33,8 +33,8 @@ from deepaccident_devkit.support.arrays import FloatArray, IntArray
 from deepaccident_devkit.support.text import settle_choices
 
 RANDOM_DRAWS: Final = 20
+# Seconds that a warning may need from an agent that sees the danger to the two that collide.
 LATENCIES: Final = (0.0, 0.1, 0.3)
-"""Seconds that a warning may need from an agent that sees the danger to the two that collide."""
 _ANY: Final = float(np.nextafter(0.0, 1.0))
 _FIXED: Final[Mapping[str, float]] = {"always": 1.0, "never": 1.0, "random per frame": 0.5, "random per recording": 0.5}
 

@@ -16,13 +16,13 @@ from deepaccident_devkit.evaluation.evaluator import ratio
 from deepaccident_devkit.evaluation.warning.recordings import MINUTE, ScoreSeries, shares
 from deepaccident_devkit.support.arrays import BoolArray, FloatArray, IntArray, ShortRepr
 
+# Seconds before the impact in which the headline compares scores.
 WINDOW: Final = 3.0
-"""Seconds before the impact in which the headline compares scores."""
+# R80 and P80: recall and precision that operating points are asked for.
 SAME_RECALL: Final = 0.8
-"""R80 and P80: recall and precision that operating points are asked for."""
+# Seconds before the impact from which on an alarm counts as one of this accident; before, it is neither right nor
+# wrong.
 EARLY: Final = 5.0
-"""Seconds before the impact from which on an alarm counts as one of this accident; before, it is neither right nor
-wrong."""
 _SLACK: Final = 1e-9
 
 

@@ -7,9 +7,9 @@ from types import MappingProxyType
 from typing import Any, ClassVar, Final
 
 from deepaccident_devkit.dataset import Dataset
-from deepaccident_devkit.evaluation.accident_truth import AccidentContext, checked_facts, compared_facts
 from deepaccident_devkit.evaluation.evaluator import Counts, Evaluator
 from deepaccident_devkit.evaluation.predictions import Prediction
+from deepaccident_devkit.evaluation.truth import AccidentContext, checked_facts, compared_facts
 from deepaccident_devkit.evaluation.warning.anticipation import AnticipationResult, CleanWarnings
 from deepaccident_devkit.evaluation.warning.field import FieldResult, FieldWarnings
 from deepaccident_devkit.evaluation.warning.recordings import PART, parts_of, sample_counts
@@ -17,9 +17,9 @@ from deepaccident_devkit.evaluation.warning.result import WarningResult
 from deepaccident_devkit.motion import MotionLabels
 from deepaccident_devkit.support.arrays import IntArray
 
-Protocol = CleanWarnings | FieldWarnings
-Result = AnticipationResult | FieldResult
-WARNING_PROTOCOLS: Final[Mapping[str, Protocol]] = MappingProxyType(
+_Protocol = CleanWarnings | FieldWarnings
+_Result = AnticipationResult | FieldResult
+WARNING_PROTOCOLS: Final[Mapping[str, _Protocol]] = MappingProxyType(
     {"clean": CleanWarnings(), "field": FieldWarnings()}
 )
 """`clean` ranks predictors, recording by recording; `field` is what published codes print. Both compare with labels as
@@ -47,7 +47,7 @@ class WarningEvaluator(Evaluator[Any]):
     needs_whole_recordings = True
     needs_meta = True
 
-    protocol: Protocol
+    protocol: _Protocol
 
     def truth(
         self, dataset: Dataset, token: str, form: Any, horizon: float, /
@@ -79,15 +79,15 @@ class WarningEvaluator(Evaluator[Any]):
         checked_facts(label, context)
         self.add(token, sample_counts(token, prediction, label, context or AccidentContext()))
 
-    def result_of(self, counts: Collection[Counts]) -> Result:
+    def result_of(self, counts: Collection[Counts]) -> _Result:
         """The metrics of some samples' counts, in any order; of what `pooled` gives, too."""
         return self.protocol.result(counts)
 
-    def compute(self, tokens: Iterable[str] | None = None) -> Result:
+    def compute(self, tokens: Iterable[str] | None = None) -> _Result:
         """The metrics of all samples, beside those of the reference predictors; or of some, without."""
         if tokens is None:
             return self.protocol.result(list(self._counts.values()), references=True)
-        result: Result = super().compute(tokens)
+        result: _Result = super().compute(tokens)
         return result
 
     def sample_row(self, token: str) -> dict[str, Any]:

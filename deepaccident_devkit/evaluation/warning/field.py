@@ -33,8 +33,8 @@ from deepaccident_devkit.support.text import choice
 FieldCode = Literal["ustring", "dsta", "drive", "dad"]
 FIELD_CODES: Final[tuple[FieldCode, ...]] = get_args(FieldCode)
 _DAD_SECONDS: Final = 5.0
+# DRIVE moves its thresholds 0 and 1 inwards by this.
 _NUDGE: Final = 1e-6
-"""DRIVE moves its thresholds 0 and 1 inwards by this."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -16,28 +16,25 @@ from typing import Final, Literal, get_args
 import numpy as np
 
 from deepaccident_devkit.errors import EvaluationError
-from deepaccident_devkit.evaluation.accident_truth import (
+from deepaccident_devkit.evaluation.alarms import Pair, named_alarms, position_difference, within_horizon
+from deepaccident_devkit.evaluation.breakdowns import cluster_of
+from deepaccident_devkit.evaluation.evaluator import Counts
+from deepaccident_devkit.evaluation.map_accidents import TIE, AccidentReading
+from deepaccident_devkit.evaluation.predictions import Accident, Prediction, checked_prediction
+from deepaccident_devkit.evaluation.truth import (
     REFERENCES,
     SLACK,
     AccidentContext,
     BoxTruth,
     Involvement,
-    Pair,
-    named_alarms,
     not_counted_notes,
-    position_difference,
-    within_horizon,
 )
-from deepaccident_devkit.evaluation.breakdowns import cluster_of
-from deepaccident_devkit.evaluation.evaluator import Counts
-from deepaccident_devkit.evaluation.map_accidents import TIE, AccidentReading
-from deepaccident_devkit.evaluation.predictions import Accident, Prediction, checked_prediction
 from deepaccident_devkit.motion import MotionLabels
 from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray, FrozenArrays, IntArray
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
+# Columns: times are decimal numbers, which binary numbers only approximate.
 _SLACK: Final = 1e-6
-"""Columns: times are decimal numbers, which binary numbers only approximate."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -136,14 +133,14 @@ class AlarmRuns(FrozenArrays):
         return first
 
 
-Kind = Literal["accident", "twins", "others"]
-"""Of a recording: somebody collides; nobody does, but in the scenario's twin; nobody does, and none there is known."""
+# Of a recording: somebody collides; nobody does, but in the scenario's twin; nobody does, and none there is known.
+_Kind = Literal["accident", "twins", "others"]
+# Metres: an alarm is right whose positions differ by less in sum from where the pair meets, as errors of `paper`.
 _NEAR: Final = 10.0
-"""Metres: an alarm is right whose positions differ by less in sum from where the pair meets, as errors of `paper`."""
-KINDS: Final[tuple[Kind, ...]] = get_args(Kind)
+KINDS: Final[tuple[_Kind, ...]] = get_args(_Kind)
+# In place of the kind: somebody collides, but no label shows with whom (`BoxTruth.unplaced`); such samples are counted
+# and left out, since no alarm in them can be called right or false.
 UNPLACED: Final = "unplaced"
-"""In place of the kind: somebody collides, but no label shows with whom (`BoxTruth.unplaced`); such samples are counted
-and left out, since no alarm in them can be called right or false."""
 
 
 def sample_counts(
@@ -217,7 +214,7 @@ def _place(token: object) -> tuple[str, int]:
     return recording, int(frame)
 
 
-def _kind(context: AccidentContext) -> Kind:
+def _kind(context: AccidentContext) -> _Kind:
     if context.time_to_impact is not None:
         return "accident"
     return "twins" if context.twin else "others"
@@ -232,16 +229,16 @@ def _is_right(accident: Accident, ids: Pair | None, truth: BoxTruth, context: Ac
     return truth.impact is not None and position_difference(accident.positions, truth.impact.positions) < _NEAR - TIE
 
 
+# What a sample's score in an accident recording is: that of its surest right alarm, or of its surest alarm.
 ScoresOf = Literal["pair", "recording"]
-"""What a sample's score in an accident recording is: that of its surest right alarm, or of its surest alarm."""
 GIVEN: Final = "given"
 TRIVIAL: Final = ("always", "never", "random per frame", "random per recording")
+# Rows of every table: the predictions, four predictors that know nothing, and two that know the present.
 PREDICTORS: Final = (GIVEN, *TRIVIAL, *REFERENCES)
-"""Rows of every table: the predictions, four predictors that know nothing, and two that know the present."""
 GROUPS: Final = (*get_args(Involvement), "unknown")
 """Of recordings, never pooled: by `Involvement`; `unknown` where no context says it."""
+# Of a recording; the longest have some hundred.
 _MOST_FRAMES: Final = 10_000
-"""Of a recording; the longest have some hundred."""
 _PLACE: Final = itemgetter("recording", "frame")
 _COLUMN: Final[Mapping[ScoresOf, int]] = {name: column for column, name in enumerate(get_args(ScoresOf))}
 
@@ -265,15 +262,15 @@ class Recording(FrozenArrays):
     name: str
     story: str
     group: str
-    kind: Kind
+    kind: _Kind
     part: int
     frame: IntArray
     end: int
     scores: Mapping[str, FloatArray]
 
 
+# Under this name counts hold those of several samples, whose recordings are never put together with others'.
 PART: Final = "part"
-"""Under this name counts hold those of several samples, whose recordings are never put together with others'."""
 
 
 def parts_of(counts: Collection[Counts]) -> list[Sequence[Counts]]:
@@ -341,7 +338,7 @@ def _recording(name: str, samples: Sequence[Counts], part: int) -> Recording:
     frame = np.array([each["frame"] for each in samples], dtype=np.int64)
     if not (frame.min() >= 0 and frame.max() <= _MOST_FRAMES):  # a column each: else one could ask for gigabytes
         raise EvaluationError(f"{name}: expected frames up to {_MOST_FRAMES:,}, found {frame.min()} to {frame.max()}")
-    kind: Kind = first["kind"]
+    kind: _Kind = first["kind"]
     ends = [each["frame"] + each["to_end"] for each in samples if each["to_end"] is not None]
     given = [[*each["alarms"], *([score, 0] for score in each["unjudged"])] for each in samples]
     return Recording(

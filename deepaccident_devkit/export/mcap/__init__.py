@@ -22,7 +22,7 @@ from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ChoiceError, MissingExtraError
 from deepaccident_devkit.evaluation.results import Prediction, Results
 from deepaccident_devkit.motion import MotionLabelConfig
-from deepaccident_devkit.motion.config import label_config
+from deepaccident_devkit.motion.config import resolved_label_config
 from deepaccident_devkit.support.arrays import checked_whole
 from deepaccident_devkit.support.text import choices, path_of, possible_text
 from deepaccident_devkit.taxonomy import CAMERAS, LIDAR
@@ -110,7 +110,7 @@ class McapConfig:
         if checked_whole("points", self.points, "n for every n-th point", ChoiceError) < 1:
             raise ChoiceError(f"points: expected a number from 1, for every n-th point, found {self.points!r}")
         if self.motion_labels is not None:
-            object.__setattr__(self, "motion_labels", label_config(self.motion_labels))
+            object.__setattr__(self, "motion_labels", resolved_label_config(self.motion_labels))
 
     @classmethod
     def of(cls, **choices: Any) -> McapConfig:

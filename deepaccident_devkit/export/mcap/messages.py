@@ -1,6 +1,6 @@
 """An MCAP file being written on the timeline of a scenario, and Foxglove's messages from the devkit's own types.
 
-`Recording` writes messages frame by frame; a `Moment` is a frame of the agents that are exported. Boxes are scene
+`McapRecording` writes messages frame by frame; a `Moment` is a frame of the agents that are exported. Boxes are scene
 entities (cubes and lines), and coloured points for viewers without these: rerun shows point clouds but no SceneUpdate,
 so every rendering is there again as points, on a topic that ends in `/points`.
 """
@@ -34,12 +34,12 @@ from google.protobuf.timestamp_pb2 import Timestamp
 from mcap.writer import CompressionType, Writer
 from mcap_protobuf.schema import build_file_descriptor_set
 
-from deepaccident_devkit._version import __version__
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.export.mcap import EPOCH
 from deepaccident_devkit.geometry import SE3, Boxes, quaternions
 from deepaccident_devkit.render.boxes import EDGES, recorders_of
 from deepaccident_devkit.support.arrays import AnyArray, ByteArray, FloatArray
+from deepaccident_devkit.support.version import __version__
 from deepaccident_devkit.tables.tokens import sample_token
 from deepaccident_devkit.taxonomy import AGENTS, FRAME_PERIOD, LIDAR
 from deepaccident_devkit.v2x.agents import Agents, agents_of, cooperating_agents
@@ -59,8 +59,8 @@ _NO_TURN: Final = np.array([1.0, 0.0, 0.0, 0.0])
 _FACE_ALPHA: Final = 0.4
 _LINE_PIXELS: Final = 2.0
 _TEXT_PIXELS: Final = 14.0
+# Metres from a box's top to its text.
 _TEXT_ABOVE: Final = 0.6
-"""Metres from a box's top to its text."""
 POINT_SPACING: Final = 0.25
 """Metres between the points of a rendered line."""
 
@@ -70,13 +70,13 @@ def frame_nanoseconds(index: int) -> int:
     return EPOCH * _SECOND_NANOSECONDS + (index - 1) * _FRAME_NANOSECONDS
 
 
-def frame_timestamp(index: int) -> Any:
+def protobuf_timestamp(index: int) -> Any:
     """The same as a protobuf Timestamp."""
     seconds, nanos = divmod(frame_nanoseconds(index), _SECOND_NANOSECONDS)
     return Timestamp(seconds=seconds, nanos=nanos)
 
 
-class Recording:
+class McapRecording:
     """Writes messages frame by frame; a topic and its schema are added with the first message of the topic.
 
     Chunks are compressed (zstd), and chunks, messages and metadata are indexed, so that viewers can seek.
@@ -90,7 +90,7 @@ class Recording:
         self._topics: dict[str, int] = {}
         self._sequence: dict[str, Iterator[int]] = defaultdict(count)
 
-    def __enter__(self) -> Recording:
+    def __enter__(self) -> McapRecording:
         return self
 
     def __exit__(
@@ -192,7 +192,7 @@ def frame_id(agent: str, frame: str) -> str:
 def transform_message(parent: str, child: str, parent_from_child: SE3, index: int) -> Any:
     """A FrameTransform: the pose of one coordinate frame in another."""
     return FrameTransform(
-        timestamp=frame_timestamp(index),
+        timestamp=protobuf_timestamp(index),
         parent_frame_id=parent,
         child_frame_id=child,
         translation=vector(parent_from_child.translation),
@@ -237,7 +237,7 @@ def cloud_message(points: AnyArray, frame: str, index: int) -> Any:
     """A PointCloud of a structured array (N,), with a message field for each of its fields (x, y, z and others)."""
     columns: Mapping[str, Any] = points.dtype.fields or {}
     return PointCloud(
-        timestamp=frame_timestamp(index),
+        timestamp=protobuf_timestamp(index),
         frame_id=frame,
         pose=pose(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])),
         point_stride=points.dtype.itemsize,
@@ -251,7 +251,7 @@ def cloud_message(points: AnyArray, frame: str, index: int) -> Any:
 
 def scene_update(entities: Sequence[Any], index: int) -> Any:
     """A SceneUpdate that shows these entities and removes all others of its topic."""
-    everything = SceneEntityDeletion(timestamp=frame_timestamp(index), type=SceneEntityDeletion.ALL)
+    everything = SceneEntityDeletion(timestamp=protobuf_timestamp(index), type=SceneEntityDeletion.ALL)
     return SceneUpdate(deletions=[everything], entities=entities)
 
 
@@ -259,7 +259,7 @@ def entity(name: str, frame: str, index: int, facts: Mapping[str, str], **primit
     """A SceneEntity in a coordinate frame: its primitives, and facts that the viewer shows after a click on it."""
     seconds = (index - 1) * FRAME_PERIOD
     return SceneEntity(
-        timestamp=frame_timestamp(index),
+        timestamp=protobuf_timestamp(index),
         frame_id=frame,
         id=name,
         frame_locked=False,

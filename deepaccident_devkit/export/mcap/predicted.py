@@ -16,8 +16,8 @@ from deepaccident_devkit.evaluation.results import Results
 from deepaccident_devkit.export.mcap import Predictions
 from deepaccident_devkit.export.mcap.messages import (
     COLORED_POINT,
+    McapRecording,
     Moment,
-    Recording,
     Roles,
     box_segments,
     cloud_message,
@@ -47,14 +47,14 @@ CELL_POINT: Final = np.dtype(
 """A point of a map: `instance` is the map's id, `frame` counts from 0, the present."""
 FRAME_HEIGHT: Final = 0.2
 """Metres from each future frame up to the next one, so that no frame hides another."""
+# The share of its opacity that an instance has lost at the last frame.
 _FADING: Final = 0.6
-"""The share of its opacity that an instance has lost at the last frame."""
+# Diameter of the spheres where an accident is predicted, metres.
 _MARK: Final = 1.0
-"""Diameter of the spheres where an accident is predicted, metres."""
 _MARK_HEIGHT: Final = 1.0
 
 
-class MotionMaps:
+class MotionMapMessages:
     """Renders the motion labels of moments in the agents' ego frames."""
 
     def __init__(self, dataset: Dataset, scenario: str, config: MotionLabelConfig) -> None:
@@ -62,7 +62,7 @@ class MotionMaps:
         self._dataset, self._config = dataset, config
         self._roles = Roles(dataset, scenario)
 
-    def write(self, moment: Moment, recording: Recording) -> None:
+    def write(self, moment: Moment, recording: McapRecording) -> None:
         """Write the motion labels of the samples of a moment that have labels."""
         records = {agent: self._dataset.get("sample", sample) for agent, sample in moment.samples.items()}
         labelled = {agent: record for agent, record in records.items() if record["labelled"]}
@@ -130,7 +130,7 @@ class PredictedScenes:
         """Whether a sample has a prediction."""
         return sample in self._prediction
 
-    def write(self, moment: Moment, recording: Recording) -> None:
+    def write(self, moment: Moment, recording: McapRecording) -> None:
         """Write the predictions of a moment's samples; raises ConfigError or ResultsError."""
         for agent, sample in moment.samples.items():
             if self.has(sample):
@@ -139,7 +139,7 @@ class PredictedScenes:
                 _write(agent, found, moment.index, recording)
 
 
-def _write(agent: str, prediction: object, index: int, recording: Recording) -> None:
+def _write(agent: str, prediction: object, index: int, recording: McapRecording) -> None:
     topic = f"/{agent}/prediction"
     if isinstance(prediction, MotionOutput):
         points = cell_points(_instances(prediction), prediction.grid)
@@ -162,7 +162,7 @@ def _instances(output: MotionOutput) -> Any:
     return np.asarray(output.instances)[-1]
 
 
-def _write_boxes(agent: str, detected: DetectedBoxes, topic: str, index: int, recording: Recording) -> None:
+def _write_boxes(agent: str, detected: DetectedBoxes, topic: str, index: int, recording: McapRecording) -> None:
     boxes, frame = detected.boxes, frame_id(agent, detected.boxes.frame)
     segments = box_segments(boxes)
     entities = [
@@ -181,7 +181,9 @@ def _write_boxes(agent: str, detected: DetectedBoxes, topic: str, index: int, re
     recording.write(f"{topic}/points", cloud_message(points, frame, index), index)
 
 
-def _write_accidents(agent: str, accidents: Sequence[Accident], topic: str, index: int, recording: Recording) -> None:
+def _write_accidents(
+    agent: str, accidents: Sequence[Accident], topic: str, index: int, recording: McapRecording
+) -> None:
     frame, entities, points = frame_id(agent, "ego"), [], []
     for number, accident in enumerate(accidents):
         places = np.column_stack([accident.positions, np.full(2, _MARK_HEIGHT)])

@@ -17,14 +17,13 @@ from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 from google.protobuf.wrappers_pb2 import DoubleValue
 from tqdm import tqdm
 
-from deepaccident_devkit._version import __version__
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import NotAvailableError
 from deepaccident_devkit.export.mcap import EXPORTED_CHANNELS, McapConfig, Predictions
 from deepaccident_devkit.export.mcap.layouts import write_layouts
 from deepaccident_devkit.export.mcap.messages import (
+    McapRecording,
     Moment,
-    Recording,
     Roles,
     above,
     box_segments,
@@ -34,20 +33,20 @@ from deepaccident_devkit.export.mcap.messages import (
     entity,
     exported_agents,
     frame_id,
-    frame_timestamp,
     joined,
     label,
     lines,
     moment_of,
+    protobuf_timestamp,
     scene_update,
     segment_points,
     strip,
     strip_points,
     transform_message,
 )
-from deepaccident_devkit.export.mcap.predicted import MotionMaps, PredictedScenes
+from deepaccident_devkit.export.mcap.predicted import MotionMapMessages, PredictedScenes
 from deepaccident_devkit.geometry import Boxes
-from deepaccident_devkit.motion.config import label_config
+from deepaccident_devkit.motion.config import resolved_label_config
 from deepaccident_devkit.release.fingerprints import fingerprint, scenario_hashes
 from deepaccident_devkit.release.images import read_jpeg
 from deepaccident_devkit.release.layout import MissingFiles
@@ -57,6 +56,7 @@ from deepaccident_devkit.render.boxes import role_colors
 from deepaccident_devkit.render.styles import AGENT_COLORS, MAP_COLORS
 from deepaccident_devkit.support.arrays import FloatArray, IntArray
 from deepaccident_devkit.support.files import replacing
+from deepaccident_devkit.support.version import __version__
 from deepaccident_devkit.tables.tokens import frame_token
 from deepaccident_devkit.taxonomy import (
     AGENTS,
@@ -72,20 +72,20 @@ from deepaccident_devkit.v2x.cooperation import visible_actors
 from deepaccident_devkit.v2x.tracks import scenario_tracks
 
 METADATA: Final = "deepaccident_devkit"
+# Frames (0.1 s) between two lines of the countdown.
 _LOG_EVERY: Final = 5
-"""Frames (0.1 s) between two lines of the countdown."""
 _SHOWN: Final = ("town", "weather", "time_of_day", "road_type", "split", "accident_type")
 LIDAR_POINT: Final = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4")])
+# Into how many steps LiDAR coordinates are rounded in a metre, and intensities from 0 to 1.
 _LIDAR_STEPS, _INTENSITIES = 32, 32
-"""Into how many steps LiDAR coordinates are rounded in a metre, and intensities from 0 to 1."""
+# Cells of a BEV camera from one point of the road to the next.
 _ROAD_STEP: Final = 5
-"""Cells of a BEV camera from one point of the road to the next."""
 TRAIL_FRAMES: Final = 20
 """How many frames (2 s) an actor's trail goes back, and its path goes ahead."""
 _PATH_ALPHA: Final = 0.5
 
 
-def write_poses(dataset: Dataset, moment: Moment, recording: Recording) -> None:
+def write_poses(dataset: Dataset, moment: Moment, recording: McapRecording) -> None:
     """Write world → agent → sensors in one message, and each agent's pose in a message of its own."""
     transforms, poses = [], []
     for agent, sample in moment.samples.items():
@@ -99,13 +99,13 @@ def write_poses(dataset: Dataset, moment: Moment, recording: Recording) -> None:
         poses.append((agent, there))
     recording.write("/tf", FrameTransforms(transforms=transforms), moment.index)
     for agent, there in poses:
-        message = PoseInFrame(timestamp=frame_timestamp(moment.index), frame_id="world")
+        message = PoseInFrame(timestamp=protobuf_timestamp(moment.index), frame_id="world")
         message.pose.position.CopyFrom(there.translation)
         message.pose.orientation.CopyFrom(there.rotation)
         recording.write(f"/{agent}/pose", message, moment.index)
 
 
-def write_road(dataset: Dataset, moment: Moment, recording: Recording) -> None:
+def write_road(dataset: Dataset, moment: Moment, recording: McapRecording) -> None:
     """Write what the agents' BEV cameras see of the ground at this moment as points in world, every 0.5 m."""
     parts = []
     for agent, sample in moment.samples.items():
@@ -135,14 +135,19 @@ def write_scenario(
     token = record["token"]
     agents = exported_agents(dataset, token, config.agents)
     moments = [moment_of(token, index, agents) for index in config.frame_numbers(record["num_frames"])]
-    sensors = Sensors(dataset, config)
-    parts: list[Callable[[Moment, Recording], None]]
-    parts = [Story(dataset, token).write, partial(write_poses, dataset), sensors.write, Actors(dataset, token).write]
+    sensors = _SensorMessages(dataset, config)
+    parts: list[Callable[[Moment, McapRecording], None]]
+    parts = [
+        _StoryMessages(dataset, token).write,
+        partial(write_poses, dataset),
+        sensors.write,
+        _ActorMessages(dataset, token).write,
+    ]
     if config.motion_labels is not None:
-        parts.append(MotionMaps(dataset, token, label_config(config.motion_labels)).write)
+        parts.append(MotionMapMessages(dataset, token, resolved_label_config(config.motion_labels)).write)
     if prediction is not None:
         parts.append(_predicted(prediction, moments, token).write)
-    with replacing(path) as temporary, temporary.open("wb") as stream, Recording(stream) as recording:
+    with replacing(path) as temporary, temporary.open("wb") as stream, McapRecording(stream) as recording:
         recording.add_metadata(METADATA, scenario_metadata(dataset, token))
         write_road(dataset, moments[0], recording)
         for moment in tqdm(moments, desc=path.name, disable=not progress, unit="frame"):
@@ -175,7 +180,7 @@ def scenario_metadata(dataset: Dataset, scenario: str) -> dict[str, str]:
     }
 
 
-class Story:
+class _StoryMessages:
     """Writes into a log what happens, and, if there is an impact, a countdown to it."""
 
     def __init__(self, dataset: Dataset, scenario: str) -> None:
@@ -184,7 +189,7 @@ class Story:
         self._record: Any = dataset.get("scenario", scenario)
         self._told = False
 
-    def write(self, moment: Moment, recording: Recording) -> None:
+    def write(self, moment: Moment, recording: McapRecording) -> None:
         """Write the countdown of a moment; at the first moment, the scenario's facts before it."""
         if not self._told:
             self._told = True
@@ -210,11 +215,11 @@ class Story:
         )
 
 
-def _log(text: str, index: int, recording: Recording, level: int = Log.INFO) -> None:
-    recording.write("/log", Log(timestamp=frame_timestamp(index), level=level, message=text, name=METADATA), index)
+def _log(text: str, index: int, recording: McapRecording, level: int = Log.INFO) -> None:
+    recording.write("/log", Log(timestamp=protobuf_timestamp(index), level=level, message=text, name=METADATA), index)
 
 
-class Sensors:
+class _SensorMessages:
     """Writes the sensor files of moments, and counts the missing ones."""
 
     def __init__(self, dataset: Dataset, config: McapConfig) -> None:
@@ -224,7 +229,7 @@ class Sensors:
         self._step = config.points
         self._files = MissingFiles(dataset.dataroot, "skip")
 
-    def write(self, moment: Moment, recording: Recording) -> None:
+    def write(self, moment: Moment, recording: McapRecording) -> None:
         """Write the files of a moment, agent by agent; raises SensorFileError."""
         for agent, sample in moment.samples.items():
             for channel in self._channels:
@@ -240,14 +245,14 @@ class Sensors:
         """Log how many files were left out, if any."""
         self._files.tell()
 
-    def _write_image(self, agent: str, token: str, path: ReleasePath, index: int, recording: Recording) -> None:
+    def _write_image(self, agent: str, token: str, path: ReleasePath, index: int, recording: McapRecording) -> None:
         (content, size), channel = read_jpeg(path), token.rsplit("/", 1)[1]
         frame = frame_id(agent, channel)
-        image = CompressedImage(timestamp=frame_timestamp(index), frame_id=frame, data=content, format="jpeg")
+        image = CompressedImage(timestamp=protobuf_timestamp(index), frame_id=frame, data=content, format="jpeg")
         recording.write(f"/{frame}/calibration", _calibration(self._dataset, token, size, frame, index), index)
         recording.write(f"/{frame}/image", image, index)
 
-    def _write_cloud(self, agent: str, sample: str, index: int, recording: Recording) -> None:
+    def _write_cloud(self, agent: str, sample: str, index: int, recording: McapRecording) -> None:
         cloud = self._dataset.load_point_cloud(sample, "lidar")
         rows = slice(None, None, self._step)
         points = np.zeros(len(cloud.xyz[rows]), dtype=LIDAR_POINT)
@@ -262,7 +267,7 @@ def _calibration(dataset: Dataset, token: str, size: tuple[int, int], frame: str
     """A CameraCalibration for an image of `size` (width, height), which may be smaller than calib says."""
     lens = dataset.camera(token).resized(*size)
     return CameraCalibration(
-        timestamp=frame_timestamp(index),
+        timestamp=protobuf_timestamp(index),
         frame_id=frame,
         width=lens.width,
         height=lens.height,
@@ -274,7 +279,7 @@ def _calibration(dataset: Dataset, token: str, size: tuple[int, int], frame: str
     )
 
 
-class Actors:
+class _ActorMessages:
     """Renders the boxes of moments."""
 
     def __init__(self, dataset: Dataset, scenario: str) -> None:
@@ -288,14 +293,14 @@ class Actors:
             for rows in [np.flatnonzero(tracks.actor_id == actor)]
         }
 
-    def write(self, moment: Moment, recording: Recording) -> None:
+    def write(self, moment: Moment, recording: McapRecording) -> None:
         """Write all actors of a moment in world, and the annotations of each agent in its LiDAR frame."""
         self._write_actors(moment, recording)
         for agent, sample in moment.samples.items():
             if self._dataset.get("sample", sample)["labelled"]:
                 self._write_annotations(agent, sample, moment.index, recording)
 
-    def _write_actors(self, moment: Moment, recording: Recording) -> None:
+    def _write_actors(self, moment: Moment, recording: McapRecording) -> None:
         view = cooperative_view(self._dataset, moment.first_sample, agents=tuple(moment.samples))
         boxes, segments = view.boxes, box_segments(view.boxes)
         colors = role_colors(self._dataset, moment.first_sample, boxes)
@@ -342,7 +347,7 @@ class Actors:
         recording.write("/actors", scene_update(entities, moment.index), moment.index)
         recording.write("/actors/points", cloud_message(joined(points), "world", moment.index), moment.index)
 
-    def _write_annotations(self, agent: str, sample: str, index: int, recording: Recording) -> None:
+    def _write_annotations(self, agent: str, sample: str, index: int, recording: McapRecording) -> None:
         boxes, actors = self._dataset.boxes(sample, "lidar"), self._dataset.actor_ids(sample).tolist()
         segments, color = box_segments(boxes), AGENT_COLORS[agent]
         entities = []

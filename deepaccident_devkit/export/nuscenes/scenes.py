@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from deepaccident_devkit.export.bulk import Output
     from deepaccident_devkit.geometry import PinholeCamera
 
-VERSION: Final = "v1.0-deepaccident"
+NUSCENES_VERSION: Final = "v1.0-deepaccident"
 LIDAR_CHANNEL: Final = "LIDAR_TOP"
 CAMERA_CHANNELS: Final = MappingProxyType(
     dict(
@@ -41,15 +41,15 @@ CAMERA_CHANNELS: Final = MappingProxyType(
 )
 """Our camera → nuScenes' channel."""
 CHANNEL_NAMES: Final = MappingProxyType({**CAMERA_CHANNELS, LIDAR: LIDAR_CHANNEL})
-ENDINGS: Final = MappingProxyType({**dict.fromkeys(CAMERAS, "jpg"), LIDAR: "pcd.bin"})
+_ENDINGS: Final = MappingProxyType({**dict.fromkeys(CAMERAS, "jpg"), LIDAR: "pcd.bin"})
 _EPOCH: Final = 1_600_000_000_000_000
 _HOUR: Final = 3_600_000_000
 _PERIOD: Final = 100_000
-Row = dict[str, Any]
-Rows = Mapping[str, Sequence[Row]]
-"""Table → rows in their order."""
+NuScenesRow = dict[str, Any]
+# Table → rows in their order.
+_RowsByTable = Mapping[str, Sequence[NuScenesRow]]
 Van = Literal["car", "truck"]
-CATEGORIES: Final = MappingProxyType(
+NUSCENES_CATEGORIES: Final = MappingProxyType(
     {
         "car": "vehicle.car",
         "truck": "vehicle.truck",
@@ -59,12 +59,12 @@ CATEGORIES: Final = MappingProxyType(
     }
 )
 """Our class → nuScenes' category; vans are said to be one of the first two."""
+# Whether a camera of the agent sees a box → nuScenes' visibility; the levels between cannot be known.
 _SEEN: Final = MappingProxyType({True: "4", False: "1"})
-"""Whether a camera of the agent sees a box → nuScenes' visibility; the levels between cannot be known."""
+# m/s, above which an actor moves.
 _MOVING: Final = 0.2
-"""m/s, above which an actor moves."""
 LidarAxes = Literal["ego", "nuscenes"]
-TURNS: Final = {
+AXES_ROTATIONS: Final = {
     "ego": np.eye(3),
     "nuscenes": np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]),
 }
@@ -79,11 +79,11 @@ def token(kind: str, *parts: object) -> str:
 def sensor_path(scene: str, channel: str, stamp: int, *, key: bool) -> str:
     """The path of a sensor file below the folder; `channel` is ours."""
     name = CHANNEL_NAMES[channel]
-    return f"{'samples' if key else 'sweeps'}/{name}/{scene}__{name}__{stamp}.{ENDINGS[channel]}"
+    return f"{'samples' if key else 'sweeps'}/{name}/{scene}__{name}__{stamp}.{_ENDINGS[channel]}"
 
 
 @dataclass(frozen=True)
-class Scene:
+class AgentScene:
     """One agent's recording of a scenario.
 
     Attributes:
@@ -146,7 +146,7 @@ class Scene:
         hours = self.dataset.getind("scenario", self.scenario) + 1
         return _EPOCH + hours * _HOUR + number * _PERIOD + AGENTS.index(self.agent)
 
-    def rows(self) -> Rows:
+    def rows(self) -> _RowsByTable:
         """The rows of `scene`, `log`, `sample` and `ego_pose`."""
         about = self.dataset.scenario.get(self.scenario)
         scene, log = (token(table, agent_token(self.scenario, self.agent)) for table in ("scene", "log"))
@@ -173,7 +173,7 @@ class Scene:
         poses = [self._pose_row(number) for number in self.frames]
         return {"scene": [scene_row], "log": [log_row], "sample": samples, "ego_pose": poses}
 
-    def _sample_row(self, number: int, scene: str) -> Row:
+    def _sample_row(self, number: int, scene: str) -> NuScenesRow:
         sample = self.sample(number)
         return {
             "token": token("sample", sample),
@@ -184,7 +184,7 @@ class Scene:
             "deepaccident_token": sample,
         }
 
-    def _pose_row(self, number: int) -> Row:
+    def _pose_row(self, number: int) -> NuScenesRow:
         pose = self.dataset.ego_pose.get(self.sample(number))
         return {
             "token": token("ego_pose", self.sample(number)),
@@ -194,12 +194,12 @@ class Scene:
         }
 
 
-def scenes_of(dataset: Dataset, scenario: str, agents: Sequence[str], *, sweeps: bool) -> Iterator[Scene]:
+def scenes_of(dataset: Dataset, scenario: str, agents: Sequence[str], *, sweeps: bool) -> Iterator[AgentScene]:
     """The scenes of those of the agents that recorded a scenario."""
-    return (Scene(dataset, scenario, agent, sweeps) for agent in agents_of(dataset, scenario) if agent in agents)
+    return (AgentScene(dataset, scenario, agent, sweeps) for agent in agents_of(dataset, scenario) if agent in agents)
 
 
-def linked(rows: list[Row]) -> list[Row]:
+def linked(rows: list[NuScenesRow]) -> list[NuScenesRow]:
     """The same rows, each with the tokens of the one before and after it as `prev` and `next`; "" at the ends."""
     tokens = ["", *(row["token"] for row in rows), ""]
     for row, before, after in zip(rows, tokens, tokens[2:], strict=False):
@@ -207,14 +207,14 @@ def linked(rows: list[Row]) -> list[Row]:
     return rows
 
 
-def box_rows(scene: Scene, van: Van, output: Output) -> Rows:
+def box_rows(scene: AgentScene, van: Van, output: Output) -> _RowsByTable:
     """The rows of `instance` and `sample_annotation`: an actor has an instance of its own in each scene.
 
     The agent's own row is left out, as nuScenes does not annotate the ego. An untracked row is an instance by itself,
     and so is one whose id stands in its label already.
     """
-    rows: list[Row] = []
-    tracks: dict[str, list[Row]] = {}
+    rows: list[NuScenesRow] = []
+    tracks: dict[str, list[NuScenesRow]] = {}
     for number in range(1, scene.last + 1):
         sample = scene.dataset.sample.get(scene.sample(number))
         if not scene.is_key(number):
@@ -229,7 +229,7 @@ def box_rows(scene: Scene, van: Van, output: Output) -> Rows:
     return {"instance": [_instance(track, van) for track in tracks.values()], "sample_annotation": rows}
 
 
-def _annotations(scene: Scene, number: int, output: Output) -> Iterator[Row]:
+def _annotations(scene: AgentScene, number: int, output: Output) -> Iterator[NuScenesRow]:
     """The row of each box of a keyframe, without the boxes before and after it."""
     sample = scene.sample(number)
     boxes = scene.dataset.boxes(sample)
@@ -275,12 +275,12 @@ def _attributes(category: str, actor: int, speed: float) -> list[str]:
     return ["vehicle.moving" if speed > _MOVING else "vehicle.stopped"]
 
 
-def _instance(rows: list[Row], van: Van) -> Row:
+def _instance(rows: list[NuScenesRow], van: Van) -> NuScenesRow:
     """The row of an actor in a scene; its class is that of its first box."""
     category = rows[0]["category_deepaccident"]
     return {
         "token": rows[0]["instance_token"],
-        "category_token": token("category", CATEGORIES[van if category == "van" else category]),
+        "category_token": token("category", NUSCENES_CATEGORIES[van if category == "van" else category]),
         "nbr_annotations": len(rows),
         "first_annotation_token": rows[0]["token"],
         "last_annotation_token": rows[-1]["token"],
@@ -289,14 +289,14 @@ def _instance(rows: list[Row], van: Van) -> Row:
     }
 
 
-def write_sensors(scene: Scene, axes: LidarAxes, output: Output) -> Rows:
+def write_sensors(scene: AgentScene, axes: LidarAxes, output: Output) -> _RowsByTable:
     """Write the clouds of a scene, link its images, and return the rows of `sample_data` and `calibrated_sensor`.
 
     Files that are missing in a partial release have rows too, as those of a partial nuScenes download: evaluations look
     up every keyframe's `LIDAR_TOP`, but open no cloud. A missing image has the size of the camera's first one.
     """
-    data: list[Row] = []
-    calibrated: dict[str, Row] = {}
+    data: list[NuScenesRow] = []
+    calibrated: dict[str, NuScenesRow] = {}
     for channel, files in scene.files.items():
         rows, any_file = [], next(iter(files.values()), None)
         for number in scene.frames:
@@ -324,7 +324,9 @@ def write_sensors(scene: Scene, axes: LidarAxes, output: Output) -> Rows:
     return {"sample_data": data, "calibrated_sensor": list(calibrated.values())}
 
 
-def _data_row(scene: Scene, number: int, channel: str, sensor: str, path: str, lens: PinholeCamera | None) -> Row:
+def _data_row(
+    scene: AgentScene, number: int, channel: str, sensor: str, path: str, lens: PinholeCamera | None
+) -> NuScenesRow:
     sample = scene.sample(number)
     return {
         "token": token("sample_data", sample, channel),
@@ -332,7 +334,7 @@ def _data_row(scene: Scene, number: int, channel: str, sensor: str, path: str, l
         "ego_pose_token": token("ego_pose", sample),
         "calibrated_sensor_token": token("calibrated_sensor", sensor),
         "timestamp": scene.stamp(number),
-        "fileformat": ENDINGS[channel].removesuffix(".bin"),
+        "fileformat": _ENDINGS[channel].removesuffix(".bin"),
         "is_key_frame": scene.is_key(number),
         "height": 0 if lens is None else lens.height,
         "width": 0 if lens is None else lens.width,
@@ -340,12 +342,14 @@ def _data_row(scene: Scene, number: int, channel: str, sensor: str, path: str, l
     }
 
 
-def _calibrated_row(scene: Scene, source: str, name: str, lens: PinholeCamera | None, axes: LidarAxes) -> Row:
+def _calibrated_row(
+    scene: AgentScene, source: str, name: str, lens: PinholeCamera | None, axes: LidarAxes
+) -> NuScenesRow:
     """The row of our calibrated sensor `source`, whose token is made of `name`; a camera has the K of its images."""
     record = scene.dataset.calibrated_sensor.get(source)
     rotation, intrinsic = record["rotation"], []
     if lens is None:
-        rotation = quaternions.from_matrix(quaternions.to_matrix(rotation) @ TURNS[axes].T).tolist()
+        rotation = quaternions.from_matrix(quaternions.to_matrix(rotation) @ AXES_ROTATIONS[axes].T).tolist()
     else:
         intrinsic = lens.intrinsic.tolist()
     return {
@@ -361,6 +365,6 @@ def _cloud(path: ReleasePath, axes: LidarAxes) -> bytes:
     """The content of a `.pcd.bin`: x, y, z, intensity, ring (0), in the LiDAR's frame with these axes."""
     cloud = read_lidar(path)
     points = np.zeros((len(cloud), 5), dtype="<f4")
-    points[:, :3] = cloud.xyz @ TURNS[axes].T
+    points[:, :3] = cloud.xyz @ AXES_ROTATIONS[axes].T
     points[:, 3] = cloud.intensity
     return points.tobytes()

@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, ClassVar, Final, get_args
 
 from deepaccident_devkit.export.bulk import Format, Output, Unit
 from deepaccident_devkit.export.nuscenes.scenes import (
-    CATEGORIES,
     CHANNEL_NAMES,
     LIDAR_CHANNEL,
-    VERSION,
+    NUSCENES_CATEGORIES,
+    NUSCENES_VERSION,
+    AgentScene,
     LidarAxes,
-    Row,
-    Scene,
+    NuScenesRow,
     Van,
     box_rows,
     scenes_of,
@@ -106,9 +106,9 @@ class NuScenes(Format):
         splits: dict[str, list[str]] = {f"deepaccident_{split}": [] for split in SPLITS}
         for row in scenes:
             splits.setdefault(f"deepaccident_{row['split'] or 'unknown'}", []).append(row["name"])
-        output.write(f"{VERSION}/splits.json", json.dumps(splits, indent=1).encode())
+        output.write(f"{NUSCENES_VERSION}/splits.json", json.dumps(splits, indent=1).encode())
 
-    def scenes(self, dataset: Dataset, unit: Unit) -> list[Scene]:
+    def scenes(self, dataset: Dataset, unit: Unit) -> list[AgentScene]:
         """The scenes of a unit."""
         return [
             scene for token in unit.scenarios for scene in scenes_of(dataset, token, self.agents, sweeps=self.sweeps)
@@ -121,7 +121,7 @@ def _lines(folder: Path, table: str) -> list[str]:
 
 def _write_table(table: str, rows: Iterable[str], output: Output) -> None:
     """Write a table of rows that are JSON, as they come."""
-    with output.file(f"{VERSION}/{table}.json") as path, path.open("w", encoding="utf-8") as file:
+    with output.file(f"{NUSCENES_VERSION}/{table}.json") as path, path.open("w", encoding="utf-8") as file:
         separator = "[\n"
         for row in rows:
             file.write(f"{separator}{row}")
@@ -129,24 +129,24 @@ def _write_table(table: str, rows: Iterable[str], output: Output) -> None:
         file.write("\n]" if separator == ",\n" else "[]")
 
 
-def _fixed_tables() -> dict[str, list[Row]]:
+def _fixed_tables() -> dict[str, list[NuScenesRow]]:
     """The tables that are the same in every export."""
     sensors = {name: "lidar" if name == LIDAR_CHANNEL else "camera" for name in CHANNEL_NAMES.values()}
     return {
         "sensor": [
             {"token": token("sensor", name), "channel": name, "modality": kind} for name, kind in sensors.items()
         ],
-        "category": [_word("category", name) for name in CATEGORIES.values()],
+        "category": [_word("category", name) for name in NUSCENES_CATEGORIES.values()],
         "attribute": [_word("attribute", name) for name in _ATTRIBUTES],
         "visibility": [{"token": key, "level": level, "description": ""} for key, level in _VISIBILITIES.items()],
     }
 
 
-def _word(table: str, name: str) -> Row:
+def _word(table: str, name: str) -> NuScenesRow:
     return {"token": token(table, name), "name": name, "description": ""}
 
 
-def _maps(logs: Sequence[Row]) -> list[Row]:
+def _maps(logs: Sequence[NuScenesRow]) -> list[NuScenesRow]:
     """A map for each town, with all logs of the town: a reader stops at a log that is in no map."""
     towns: dict[str, list[str]] = {}
     for log in logs:

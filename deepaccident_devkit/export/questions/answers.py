@@ -12,7 +12,6 @@ from typing import Annotated, Any, Final
 import msgspec
 import numpy as np
 
-from deepaccident_devkit._version import __version__
 from deepaccident_devkit.errors import ConfigError, ResultsError, shortened
 from deepaccident_devkit.evaluation import Accident
 from deepaccident_devkit.evaluation.results import ResultsWriter
@@ -20,6 +19,7 @@ from deepaccident_devkit.support.arrays import FloatArray, ShortRepr, checked_nu
 from deepaccident_devkit.support.json_text import Record, parsed_record
 from deepaccident_devkit.support.reading import fault_text, read_bytes
 from deepaccident_devkit.support.text import path_of
+from deepaccident_devkit.support.version import __version__
 from deepaccident_devkit.tables.tokens import sample_token
 
 _README: Final = """\
@@ -74,12 +74,12 @@ _RULES: Final = {
 _IMAGES: Final = "| `images` | pictures, with their time, observer, camera and path |\n"
 _REMEDY: Final = "mend that line; README.md beside the questions says what an answer is"
 _SURE: Final = 0.5
+# Larger numbers are mistakes, as with seconds.
 _Metres = Annotated[float, msgspec.Meta(ge=-1e6, le=1e6)]
-"""Larger numbers are mistakes, as with seconds."""
 _TWO: Final = msgspec.Meta(min_length=2, max_length=2)
 
 
-def readme(*, seconds: int, observe: float, seen: str, pictures: bool) -> bytes:
+def questions_readme(*, seconds: int, observe: float, seen: str, pictures: bool) -> bytes:
     """The README.md for those who answer: seconds that are asked about, of a window, what counts as seen, pictures."""
     sure = 2 if seconds > 1 else 1
     example = {

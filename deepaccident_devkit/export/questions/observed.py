@@ -33,23 +33,23 @@ from deepaccident_devkit.v2x.cooperation import cooperative_view
 if TYPE_CHECKING:
     from deepaccident_devkit.dataset import Dataset, Visible
 
+# Seconds from one moment of a window to the next.
 _STEP = KEY_STEP * FRAME_PERIOD
-"""Seconds from one moment of a window to the next."""
 RATE: Final = round(1 / _STEP)
 """Moments a second."""
 _SAME = 1e-6
-Seen = Literal["released", "camera", "annotated"]
-_VISIBLE: Final[dict[Seen, Visible | None]] = {"released": "released", "camera": "camera", "annotated": None}
-EGO: Final = "ego"
+SeenRule = Literal["released", "camera", "annotated"]
+_VISIBLE: Final[dict[SeenRule, Visible | None]] = {"released": "released", "camera": "camera", "annotated": None}
+_EGO: Final = "ego"
 _PLACES: Final = 2
+# Decimals of metres and metres a second, and of radians.
 _ANGLES: Final = 3
-"""Decimals of metres and metres a second, and of radians."""
 CONDITIONS: Final = ("weather", "time_of_day", "road_type")
 """Facts of the meta file that stand in a question: the others say, or hint at, how the recording ends."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Window:
+class QuestionWindow:
     """The moments of one question, as numbers of recorded frames.
 
     Attributes:
@@ -97,11 +97,11 @@ class WindowRules:
         if checked_whole("ahead", self.ahead, "a whole number from 1", ConfigError) < 1:
             raise ConfigError(f"ahead: expected a whole number from 1, found {self.ahead!r}")
 
-    def windows(self, last: int) -> list[Window]:
+    def windows(self, last: int) -> list[QuestionWindow]:
         """The windows of a recording of frames 1 to `last`, in the order of time."""
         stride, past = round(self.stride / FRAME_PERIOD), round(self.observe / FRAME_PERIOD)
         presents = sorted(range(last - stride, past, -stride))
-        return [Window(frames=tuple(range(present - past, present + 1, KEY_STEP))) for present in presents]
+        return [QuestionWindow(frames=tuple(range(present - past, present + 1, KEY_STEP))) for present in presents]
 
 
 def digest(seed: str, *words: str) -> str:
@@ -163,7 +163,7 @@ class Observations:
         own_ids: agent → its actor id; None for the infrastructure.
     """
 
-    def __init__(self, dataset: Dataset, scenario: str, agents: tuple[AgentName, ...], seen: Seen) -> None:
+    def __init__(self, dataset: Dataset, scenario: str, agents: tuple[AgentName, ...], seen: SeenRule) -> None:
         """Look at nothing yet."""
         self.dataset, self.scenario, self.agents, self._seen = dataset, scenario, agents, seen
         self.own_ids: dict[AgentName, int | None] = {
@@ -171,12 +171,12 @@ class Observations:
         }
         self._moments: dict[int, tuple[Boxes, FloatArray, AnyArray]] = {}
 
-    def is_labelled(self, window: Window) -> bool:
+    def is_labelled(self, window: QuestionWindow) -> bool:
         """Whether each agent of the set has a label at each moment: without one it is not known what it saw."""
         labelled = self.dataset.columns("sample")["labelled"]
         return all(labelled[self._row(agent, frame)] for agent in self.agents for frame in window.frames)
 
-    def seen(self, window: Window) -> SeenRows:
+    def seen(self, window: QuestionWindow) -> SeenRows:
         """The actors that at least one agent sees, by moment, in the ego frame of the window's present.
 
         The agents of the set are not among them: `paths` has these.
@@ -190,11 +190,11 @@ class Observations:
             moment=np.repeat(np.arange(len(moments)), [len(each[0]) for each in moments]),
         )
 
-    def paths(self, window: Window) -> list[AgentPath]:
+    def paths(self, window: QuestionWindow) -> list[AgentPath]:
         """Where the agents of the set were, the ego first."""
         return [self._path(agent, window) for agent in self.agents]
 
-    def _path(self, agent: AgentName, window: Window) -> AgentPath:
+    def _path(self, agent: AgentName, window: QuestionWindow) -> AgentPath:
         ego_from_world, rows = self._ego_from_world(window), [self._row(agent, frame) for frame in window.frames]
         poses = [ego_from_world @ self._world_from_agent(agent, frame) for frame in window.frames]
         labelled = self.dataset.boxes(sample_token(self.scenario, agent, window.present), "lidar")
@@ -227,7 +227,7 @@ class Observations:
         speed: FloatArray = np.linalg.norm(said[first[source] + row], axis=1)
         return speed
 
-    def _ego_from_world(self, window: Window) -> SE3:
+    def _ego_from_world(self, window: QuestionWindow) -> SE3:
         return self._world_from_agent(self.agents[0], window.present).inverse()
 
     def _world_from_agent(self, agent: AgentName, frame: int) -> SE3:
@@ -269,7 +269,7 @@ def names_of(
         (path for path in paths[1:] if path.agent != INFRASTRUCTURE),
         key=lambda path: (float(np.linalg.norm(path.pose[-1, :2])), *path.pose[-1].tolist()),
     )
-    observers: dict[str, AgentName] = {EGO: paths[0].agent}
+    observers: dict[str, AgentName] = {_EGO: paths[0].agent}
     observers |= {f"partner_{number}": path.agent for number, path in enumerate(partners, start=1)}
     if any(path.agent == INFRASTRUCTURE for path in paths[1:]):
         observers[INFRASTRUCTURE] = INFRASTRUCTURE
@@ -286,7 +286,7 @@ def names_of(
 
 
 def question_facts(
-    seen: SeenRows, paths: Sequence[AgentPath], names: Names, window: Window, scenario: Mapping[str, Any]
+    seen: SeenRows, paths: Sequence[AgentPath], names: Names, window: QuestionWindow, scenario: Mapping[str, Any]
 ) -> dict[str, Any]:
     """What a question says, but its id, what it asks, and pictures; of a scenario only `CONDITIONS` are taken."""
     of_agent = {path.agent: path for path in paths}

@@ -16,12 +16,12 @@ from deepaccident_devkit.errors import ChoiceError, ConfigError, NotAvailableErr
 from deepaccident_devkit.evaluation.accident import box_truth
 from deepaccident_devkit.export.bulk import Format, Output, Unit
 from deepaccident_devkit.export.frames import sensor_files
-from deepaccident_devkit.export.questions.answers import answer_schema, readme
+from deepaccident_devkit.export.questions.answers import answer_schema, questions_readme
 from deepaccident_devkit.export.questions.observed import (
     RATE,
     Observations,
-    Seen,
-    Window,
+    QuestionWindow,
+    SeenRule,
     WindowRules,
     digest,
     names_of,
@@ -30,7 +30,7 @@ from deepaccident_devkit.export.questions.observed import (
 from deepaccident_devkit.support.arrays import ShortRepr
 from deepaccident_devkit.support.files import write_bytes
 from deepaccident_devkit.support.reading import read_bytes
-from deepaccident_devkit.support.text import Word, choice, choices, settle_choices, spelled
+from deepaccident_devkit.support.text import AnyText, choice, choices, settle_choices, spelled
 from deepaccident_devkit.tables.tokens import sample_token
 from deepaccident_devkit.taxonomy import AGENTS, CAMERAS, FRAME_PERIOD, VEHICLE_AGENTS, AgentName
 from deepaccident_devkit.v2x.agents import AGENT_SETS, agents_of, cooperating_agents
@@ -45,17 +45,17 @@ if TYPE_CHECKING:
 
 QUESTIONS: Final = "questions.jsonl"
 TRUTH: Final = "truth.jsonl"
+# Where the id stands in a line.
 _ID: Final = slice(len('{"id": "'), len('{"id": "') + 16)
-"""Where the id stands in a line."""
 _ABSENT: Final = "agents of scenarios that are not in this release"
 _ALONE: Final = "recordings whose observers are not all in this release"
 _SHORT: Final = "recordings that are too short for a window"
 _UNLABELLED: Final = "windows with a moment at which an observer has no label"
-FOLDER: Final = "questions"
-"""Of what may be handed out, in the export's folder."""
+# Of what may be handed out, in the export's folder.
+_FOLDER: Final = "questions"
 _MISSING: Final = "pictures that are not in this release"
-Pair: TypeAlias = tuple[dict[str, Any], dict[str, Any]]
-"""A question and its truth."""
+# A question and its truth.
+_QuestionPair: TypeAlias = tuple[dict[str, Any], dict[str, Any]]
 _SECOND: Final = round(1 / FRAME_PERIOD)
 _DESIGN: Final = ("accident_type", "signalized", "spawn_side", "ego_direction", "other_direction")
 _CONTACT: Final = ("sides", "speeds", "closing_speed", "impact_angle", "gap")
@@ -91,7 +91,7 @@ class Questions(ShortRepr, Format):
 
     agents: tuple[str, ...] = VEHICLE_AGENTS[:1]
     observers: str | tuple[str, ...] = "single"
-    seen: Seen = "released"
+    seen: SeenRule = "released"
     window: WindowRules = field(default_factory=WindowRules)
     cameras: tuple[str, ...] = ()
     seed: str = "0"
@@ -106,7 +106,7 @@ class Questions(ShortRepr, Format):
         """Check the choices too."""
         super().__post_init__()
         object.__setattr__(self, "observers", _observers(self.observers))
-        settle_choices(self, {"seen": get_args(Seen)})
+        settle_choices(self, {"seen": get_args(SeenRule)})
         object.__setattr__(self, "cameras", _names("cameras", self.cameras, CAMERAS))
         if not isinstance(self.window, WindowRules):
             raise ConfigError(f"window: expected WindowRules, found {type(self.window).__name__}")
@@ -146,14 +146,14 @@ class Questions(ShortRepr, Format):
     def finish(self, dataset: Dataset, units: Sequence[Unit], output: Output, parts: Callable[[Unit], Path]) -> None:  # noqa: ARG002 - others need the release
         """Join the questions of all scenarios, and their truth, in the order of the ids, which were drawn."""
         folders, rules = [parts(unit) for unit in units], self.window
-        for name, path in ((QUESTIONS, f"{FOLDER}/{QUESTIONS}"), (TRUTH, TRUTH)):
+        for name, path in ((QUESTIONS, f"{_FOLDER}/{QUESTIONS}"), (TRUTH, TRUTH)):
             lines = _by_id([folder / name for folder in folders])
             with output.file(path) as temporary, temporary.open("wb") as file:
                 file.writelines(lines)
-        text = readme(seconds=rules.ahead, observe=rules.observe, seen=self.seen, pictures=bool(self.cameras))
-        output.write(f"{FOLDER}/README.md", text)
+        text = questions_readme(seconds=rules.ahead, observe=rules.observe, seen=self.seen, pictures=bool(self.cameras))
+        output.write(f"{_FOLDER}/README.md", text)
         schema = json.dumps(answer_schema(rules.ahead), indent=1)
-        output.write(f"{FOLDER}/answer.schema.json", f"{schema}\n".encode())
+        output.write(f"{_FOLDER}/answer.schema.json", f"{schema}\n".encode())
 
 
 def _by_id(paths: Sequence[Path]) -> Iterator[bytes]:
@@ -177,13 +177,13 @@ def _observers(given: str | Sequence[str]) -> str | tuple[str, ...]:
     return _names("observers", given, AGENTS)
 
 
-def _names(argument: str, given: str | Sequence[str], words: Sequence[Word]) -> tuple[Word, ...]:
+def _names(argument: str, given: str | Sequence[str], words: Sequence[AnyText]) -> tuple[AnyText, ...]:
     """A name or several, each once, in their usual order; raises ChoiceError."""
     named = choices(argument, given, words, empty=True)
     return tuple(name for name in words if name in named)
 
 
-def questions_of(dataset: Dataset, scenario: str, form: Questions, output: Output) -> list[Pair]:
+def questions_of(dataset: Dataset, scenario: str, form: Questions, output: Output) -> list[_QuestionPair]:
     """The questions of a scenario, given by its token; puts the pictures there, and counts what is left out."""
     record = dataset.scenario.get(scenario)
     if reason := unanswerable(dataset, record):
@@ -203,8 +203,12 @@ def questions_of(dataset: Dataset, scenario: str, form: Questions, output: Outpu
 
 
 def _pairs(
-    observed: Observations, windows: Sequence[Window], form: Questions, why: Mapping[str, Any] | None, output: Output
-) -> Iterator[Pair]:
+    observed: Observations,
+    windows: Sequence[QuestionWindow],
+    form: Questions,
+    why: Mapping[str, Any] | None,
+    output: Output,
+) -> Iterator[_QuestionPair]:
     """Question and truth of each window of a recording that is asked about."""
     scenario, ahead, rules = observed.dataset.scenario.get(observed.scenario), form.window.ahead, form.window
     files: dict[tuple[str, str], dict[int, tuple[ReleasePath, int]]] = {
@@ -232,7 +236,7 @@ def _pairs(
 def _pictures(
     files: Mapping[tuple[str, str], Mapping[int, tuple[ReleasePath, int]]],
     cameras: Sequence[str],
-    window: Window,
+    window: QuestionWindow,
     names: Names,
     question: str,
     output: Output,
@@ -249,7 +253,7 @@ def _pictures(
             output.leave_out(_MISSING)
             continue
         path = f"images/{question}/{number:02d}_{name}_{camera}.jpg"
-        output.link(found[0], f"{FOLDER}/{path}", symbolic=False)
+        output.link(found[0], f"{_FOLDER}/{path}", symbolic=False)
         listed.append({"time": time, "observer": name, "camera": camera, "path": path})
     return listed
 

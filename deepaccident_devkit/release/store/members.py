@@ -29,11 +29,12 @@ SPLIT_FOLDERS: Final = SPLITS
 SPLIT_FILE_FOLDER: Final = "split_txt_files"
 SCENARIO_TYPE: Final = re.compile(r"type\d+_subtype\d+_(?:accident|normal)")
 SPLIT_FILES: Final = tuple(f"{split}.txt" for split in (*SPLITS, *MINI_SPLITS))
+# The folder that macOS adds to its archives.
 _FROM_MACOS: Final = "__MACOSX"
-"""The folder that macOS adds to its archives."""
+# Counts up whenever the file's form or its meaning changes.
 FORM: Final = 3
-"""Counts up whenever the file's form or its meaning changes."""
 _HEAD: Final = b"deepaccident_members"
+# How a `Member` is stored.
 _NUMBERS: Final = np.dtype(
     [
         ("archive", "<i4"),
@@ -44,9 +45,8 @@ _NUMBERS: Final = np.dtype(
         ("deflated", "u1"),
     ]
 )
-"""How a `Member` is stored."""
+# Where the name of a frame's file has its number.
 _FRAME: Final = slice(-7, -4)
-"""Where the name of a frame's file has its number."""
 _REMEDY: Final = "remove it with: deepaccident index DATAROOT --clear"
 
 

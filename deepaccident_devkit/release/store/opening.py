@@ -30,7 +30,7 @@ from deepaccident_devkit.release.store.members import (
     release_folder,
     write_members,
 )
-from deepaccident_devkit.release.store.paths import Dataroot, ReleasePath, StorePath, is_folder, listed
+from deepaccident_devkit.release.store.paths import Dataroot, ReleasePath, StorePath, folder_entries, is_folder
 from deepaccident_devkit.release.store.sources import UrlSource, asked, list_zip
 from deepaccident_devkit.release.store.store import opened_store
 from deepaccident_devkit.support.files import is_writable_folder
@@ -41,16 +41,16 @@ from deepaccident_devkit.taxonomy import OnError
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
-    from deepaccident_devkit.parallel import Engine, Failure
+    from deepaccident_devkit.support.parallel import Engine, Failure
 
+# File → its bytes, and a text that changes with it.
 _States: TypeAlias = Mapping[str, tuple[int, str]]
-"""File → its bytes, and a text that changes with it."""
 INDEX_FOLDER: Final = ".deepaccident"
 _ENDING: Final = ".zip"
+# Folders below a dataroot in which archives are looked for.
 _DEEPEST: Final = 3
-"""Folders below a dataroot in which archives are looked for."""
+# How the name of a list of a store's files begins.
 _LIST: Final = "files-"
-"""How the name of a list of a store's files begins."""
 _WITHOUT_THEM: Final = (
     "\nThe others can be read without them: move them out of the folder, or pass on_error='skip' (--on-error skip)."
 )
@@ -150,7 +150,7 @@ def _archives(path: Path) -> list[Path]:
     while folders:
         folder, depth = folders.pop()
         with suppress(OSError):
-            for entry in listed(folder):
+            for entry in folder_entries(folder):
                 inside = folder / entry.name
                 if is_folder(entry) and depth < _DEEPEST and not entry.name.startswith("."):
                     folders.append((inside, depth + 1))
@@ -161,7 +161,7 @@ def _archives(path: Path) -> list[Path]:
 
 def _has_scenarios(folder: Path) -> bool:
     with suppress(OSError):
-        return any(SCENARIO_TYPE.fullmatch(entry.name) and is_folder(entry) for entry in listed(folder))
+        return any(SCENARIO_TYPE.fullmatch(entry.name) and is_folder(entry) for entry in folder_entries(folder))
     return False
 
 
@@ -210,7 +210,7 @@ def _listings(
     base: str, archives: Iterable[str], places: tuple[Path, ...] = (), **how: Unpack[Engine]
 ) -> list[Listing | Failure]:
     """List archives by their paths from the base, a folder or a URL; a Failure says why one cannot be listed."""
-    from deepaccident_devkit.parallel import Places, Tried, run_batch  # here: few dataroots are archives
+    from deepaccident_devkit.support.parallel import Places, Tried, run_batch  # here: few dataroots are archives
 
     work = Tried(partial(_listing_of, base))
     return run_batch(work, list(archives), label="listing archives", places=Places(reads=places), **how)

@@ -12,7 +12,7 @@ from pathlib import Path, PurePath, PurePosixPath
 from typing import Final, TypeAlias
 
 from deepaccident_devkit.errors import DatarootError, MissingFileError, NotAvailableError, ReleaseError
-from deepaccident_devkit.release.store.store import COMPARES, READ_BEFORE, Store
+from deepaccident_devkit.release.store.store import COMPARES, READ_BEFORE, ReleaseStore
 from deepaccident_devkit.support.reading import FileKind, fault_text, read_bytes
 
 REMEDY: Final = "restore the file from its archive"
@@ -38,7 +38,7 @@ class StorePath:
         inside: the path in the release, with `/` between names; empty for the release's folder.
     """
 
-    store: Store
+    store: ReleaseStore
     inside: str = ""
 
     def __truediv__(self, below: str | PurePath) -> StorePath:
@@ -104,7 +104,7 @@ class StorePath:
         raise FileNotFoundError(str(self))
 
     def local_path(self) -> Path:
-        """A real path with its content; raises as `Store.local_path` does."""
+        """A real path with its content; raises as `ReleaseStore.local_path` does."""
         return self.store.local_path(self.inside)
 
     def content(self, kind: FileKind) -> bytes:
@@ -112,8 +112,8 @@ class StorePath:
         return self.store.read(self.inside, kind)
 
 
+# Where something of a release lies: a real path, or one in a store.
 ReleasePath: TypeAlias = Path | StorePath
-"""Where something of a release lies: a real path, or one in a store."""
 
 
 def places_of(root: ReleasePath) -> tuple[Path, ...]:
@@ -171,12 +171,12 @@ class StoreEntry:
         return self.status
 
 
+# How a caller names a release: its folder, an archive, a folder of archives, a URL.
 Dataroot: TypeAlias = str | os.PathLike[str] | ReleasePath
-"""How a caller names a release: its folder, an archive, a folder of archives, a URL."""
-Entry: TypeAlias = os.DirEntry[str] | StoreEntry
+FolderEntry: TypeAlias = os.DirEntry[str] | StoreEntry
 
 
-def listed(folder: ReleasePath) -> list[Entry]:
+def folder_entries(folder: ReleasePath) -> list[FolderEntry]:
     """What lies in a folder, in no order; raises OSError, FileNotFoundError and NotADirectoryError among them."""
     if isinstance(folder, Path):
         with os.scandir(folder) as entries:
@@ -194,7 +194,7 @@ def listed(folder: ReleasePath) -> list[Entry]:
     return [*folders, *files]
 
 
-def is_folder(entry: Entry, *, loops: bool = False) -> bool:
+def is_folder(entry: FolderEntry, *, loops: bool = False) -> bool:
     """Whether an entry is a folder, or a link whose end cannot be looked at; listing that one tells why.
 
     Links that lead back (`leads_back`) are none, unless `loops`.
@@ -205,7 +205,7 @@ def is_folder(entry: Entry, *, loops: bool = False) -> bool:
         return True
 
 
-def leads_back(entry: Entry) -> bool:
+def leads_back(entry: FolderEntry) -> bool:
     """Whether an entry is a link that leads nowhere: its end is not there, is itself, or a folder that it lies in."""
     if isinstance(entry, StoreEntry) or not entry.is_symlink():
         return False

@@ -24,26 +24,26 @@ from deepaccident_devkit.support.reading import (
     DAMAGED_ARCHIVE,
     LIMITS_VARIABLE,
     RefusedFileError,
+    byte_limit,
     check_end,
     fault_text,
-    limit_of,
     open_file,
 )
 
-Result = TypeVar("Result")
+_Result = TypeVar("_Result")
+# Parts of a URL in a library's message that may be secret: what is asked for, and who asks.
 _SECRETS: Final = re.compile(r"\?\S*|(?<=://)[^/@\s]+@")
-"""Parts of a URL in a library's message that may be secret: what is asked for, and who asks."""
 _LARGEST_GAP: Final = 1 << 16
+# Bytes between two members that are fetched with them, and that are fetched at once.
 _LARGEST_RANGE: Final = 64 << 20
-"""Bytes between two members that are fetched with them, and that are fetched at once."""
+# Archives that are open at once in a process; a system allows some 1,000 files.
 MOST_OPEN: Final = 256
-"""Archives that are open at once in a process; a system allows some 1,000 files."""
-Range = tuple[str, int, int]
-"""An archive, and the first byte and the one after the last."""
+# An archive, and the first byte and the one after the last.
+ByteRange = tuple[str, int, int]
+# Bytes of a member's head before its name.
 HEAD_LENGTH: Final = 30
-"""Bytes of a member's head before its name."""
+# Bytes that are read at once in place of a head's true length: a name, and more fields than any program adds.
 LONGEST_HEAD: Final = HEAD_LENGTH + 512
-"""Bytes that are read at once in place of a head's true length: a name, and more fields than any program adds."""
 _HEAD: Final = struct.Struct("<4s22xHH")
 _SIGNATURE: Final = b"PK\x03\x04"
 _ENCRYPTED: Final = 1
@@ -58,7 +58,7 @@ class Source(ABC):
     def read(self, archive: str, start: int, stop: int) -> bytes:
         """Bytes of an archive, as many as are there; raises OSError, of a file that is gone FileNotFoundError."""
 
-    def read_all(self, ranges: Sequence[Range]) -> list[bytes]:
+    def read_all(self, ranges: Sequence[ByteRange]) -> list[bytes]:
         """Several parts; raises OSError."""
         return [self.read(*each) for each in ranges]
 
@@ -118,7 +118,7 @@ class UrlSource(Source):
         files, root = self._files()
         return cast("bytes", asked(lambda: files.cat_file(f"{root}/{archive}", start=start, end=stop)))
 
-    def read_all(self, ranges: Sequence[Range]) -> list[bytes]:
+    def read_all(self, ranges: Sequence[ByteRange]) -> list[bytes]:
         """Several parts, together: what lies close together comes as one."""
         from fsspec.utils import merge_offset_ranges
 
@@ -185,7 +185,7 @@ def _fsspec(url: str) -> Any:
     return fsspec
 
 
-def asked(call: Callable[[], Result]) -> Result:
+def asked(call: Callable[[], _Result]) -> _Result:
     """What a call of fsspec returns; whatever a library below raises becomes an OSError whose words hold no secret."""
     try:
         return call()
@@ -220,7 +220,7 @@ def list_zip(file: BinaryIO, archive: str, shown: str) -> Listing:
     """
     size = file.seek(0, os.SEEK_END)
     try:
-        check_end(file, limit_of("archive"))
+        check_end(file, byte_limit("archive"))
         with zipfile.ZipFile(file) as opened:
             entries = opened.infolist()
     except RefusedFileError as error:  # by the gate, or by a URL
@@ -257,23 +257,23 @@ def member_bytes(content: bytes, member: Member) -> bytes:
         try:
             content = decoder.decompress(content, member.size + 1)
         except zlib.error as error:
-            raise damaged(f"cannot be decompressed ({error})") from error
+            raise damaged_member_error(f"cannot be decompressed ({error})") from error
     if len(content) != member.size:
-        raise damaged(f"{len(content):,} bytes in place of {member.size:,}")
+        raise damaged_member_error(f"{len(content):,} bytes in place of {member.size:,}")
     return content
 
 
 def head_length(head: bytes) -> int:
     """Bytes before a member's content, by the beginning of its head; raises RefusedFileError if there is no head."""
     if len(head) < HEAD_LENGTH:
-        raise damaged("the archive ends before it")
+        raise damaged_member_error("the archive ends before it")
     signature, name, extra = _HEAD.unpack_from(head)
     if signature != _SIGNATURE:
-        raise damaged("no head at its place")
+        raise damaged_member_error("no head at its place")
     return HEAD_LENGTH + int(name) + int(extra)
 
 
-def damaged(what: str) -> RefusedFileError:
+def damaged_member_error(what: str) -> RefusedFileError:
     """The error of a member that cannot be read, whose clause says why."""
     return RefusedFileError(errno.EIO, f"damaged in its archive ({what})")
 

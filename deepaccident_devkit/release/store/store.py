@@ -1,4 +1,4 @@
-"""`Store`: the files of a release in archives or at a URL, read by their path in it; `FileCache`: copies of such files.
+"""`ReleaseStore` reads the files of a release in archives or at a URL by their path; `FileCache` keeps copies of them.
 
 The cache is a folder of bounded size; who was not used the longest goes first. Several processes use it at once: each
 file appears whole, and one that is removed while it is read stays readable.
@@ -21,9 +21,9 @@ from deepaccident_devkit.release.store.members import Member, Members
 from deepaccident_devkit.release.store.sources import (
     HEAD_LENGTH,
     LONGEST_HEAD,
-    Range,
+    ByteRange,
     Source,
-    damaged,
+    damaged_member_error,
     head_length,
     member_bytes,
     source_of,
@@ -34,15 +34,15 @@ from deepaccident_devkit.support.reading import FileKind, RefusedFileError, byte
 FOLDER_VARIABLE: Final = "DEEPACCIDENT_CACHE"
 SIZE_VARIABLE: Final = "DEEPACCIDENT_CACHE_SIZE"
 _DEFAULT_SIZE: Final = "20G"
+# Part of the size that a process may add before it looks at the whole folder again.
 _LOOKED_AFTER: Final = 0.05
-"""Part of the size that a process may add before it looks at the whole folder again."""
+# Part of the size that is left when something had to go.
 _KEPT: Final = 0.9
-"""Part of the size that is left when something had to go."""
 _SENSOR_KINDS: Final[tuple[FileKind, ...]] = ("image", "lidar", "bev")
+# Whether the bytes of archives' members are compared with their checksums; `paths.checksums_compared` sets it.
 COMPARES: ContextVar[bool] = ContextVar("compares", default=False)
-"""Whether the bytes of archives' members are compared with their checksums; `paths.checksums_compared` sets it."""
+# Files by name that were read together; `paths.fetched` sets it.
 READ_BEFORE: ContextVar[dict[str, bytes] | None] = ContextVar("fetched", default=None)
-"""Files by name that were read together; `paths.fetched` sets it."""
 
 
 class FileCache:
@@ -120,7 +120,7 @@ class FileCache:
         return found
 
 
-class Store:
+class ReleaseStore:
     """The files of one release that have no paths of their own. Cheap to pickle; safe in forks and threads.
 
     Attributes:
@@ -139,7 +139,7 @@ class Store:
         return opened_store, (self.place, self.base, self.list_file)
 
     def __repr__(self) -> str:
-        return f"Store({self.place!r})"
+        return f"ReleaseStore({self.place!r})"
 
     @property
     def is_remote(self) -> bool:
@@ -214,7 +214,7 @@ class Store:
             self._cache.put(path, self._bytes(name, member))
         return path
 
-    def _range(self, name: str, member: Member) -> Range:
+    def _range(self, name: str, member: Member) -> ByteRange:
         archive = self.members.archives[member.archive]
         if member.offset < 0:
             return f"{archive}/{name.rpartition('/')[2]}".lstrip("/"), 0, member.size
@@ -238,14 +238,14 @@ def _cut_out(content: bytes, member: Member) -> bytes:
 
 def _decoded(content: bytes, member: Member) -> bytes:
     if len(content) < member.stored:
-        raise damaged("the archive ends before it")
+        raise damaged_member_error("the archive ends before it")
     content = member_bytes(content, member)
     if COMPARES.get() and zlib.crc32(content) != member.version:
-        raise damaged("its bytes do not agree with its checksum")
+        raise damaged_member_error("its bytes do not agree with its checksum")
     return content
 
 
 @lru_cache(maxsize=4)
-def opened_store(place: str, base: str, list_file: Path) -> Store:
+def opened_store(place: str, base: str, list_file: Path) -> ReleaseStore:
     """The store of a list of files, opened once a process."""
-    return Store(place, base, list_file)
+    return ReleaseStore(place, base, list_file)

@@ -13,7 +13,6 @@ from deepaccident_devkit.render.evaluation.tasks import (
     render_predictors,
     render_quality_by_time,
 )
-from deepaccident_devkit.rooms import names_of
 
 __all__ = [
     "draw_motion_outcome",
@@ -26,9 +25,6 @@ __all__ = [
     "render_plans",
     "render_precision_recall",
     "render_predictors",
-    "render_prevention",
     "render_quality_by_time",
     "save_report",
 ]
-
-__getattr__, __dir__ = names_of(__name__, __all__)  # what the room `safety` adds

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from deepaccident_devkit._version import __version__
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.evaluation.accident import AccidentEvaluator, compared_accidents
 from deepaccident_devkit.evaluation.breakdowns import EVERYTHING, WITHIN_RECORDINGS, Breakdown
@@ -21,6 +20,7 @@ from deepaccident_devkit.evaluation.planning.evaluator import BY_LEAD
 from deepaccident_devkit.evaluation.predictions import MotionOutput, frames_there, labels_at_present
 from deepaccident_devkit.evaluation.results import Results
 from deepaccident_devkit.evaluation.runs import EvaluationRun
+from deepaccident_devkit.evaluation.runs.further import extra_result
 from deepaccident_devkit.evaluation.runs.setups import SampleLoader
 from deepaccident_devkit.evaluation.task import Headline, headlines
 from deepaccident_devkit.evaluation.warning import AnticipationResult
@@ -31,8 +31,8 @@ from deepaccident_devkit.render.evaluation.panels import PANEL, UNKNOWN, render_
 from deepaccident_devkit.render.figures import axes_or_new, report_figure, titled_from_above, write_report_figure
 from deepaccident_devkit.render.outcomes import draw_accident_outcome, draw_detection_outcome
 from deepaccident_devkit.render.styles import MUTED_COLOR, OUTCOME_COLORS, WARNING_COLOR, current_style, in_own_settings
-from deepaccident_devkit.rooms import added
 from deepaccident_devkit.support.arrays import BoolArray
+from deepaccident_devkit.support.version import __version__
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
 if TYPE_CHECKING:
@@ -40,17 +40,17 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _DPI: Final = 160
+# The least height of a bar in inches.
 _ROW: Final = 0.38
-"""The least height of a bar in inches."""
+# Inches of a title, ticks and labels.
 _AROUND_BARS: Final = 1.1
-"""Inches of a title, ticks and labels."""
+# Marks what a figure is made of: words to be copied, not to be read, may be small.
 _GID: Final = "token"
-"""Marks what a figure is made of: words to be copied, not to be read, may be small."""
 _BY_TIME: Final = "time_to_impact"
+# How many of the worst, and of the best, samples are shown.
 _EACH: Final = 3
-"""How many of the worst, and of the best, samples are shown."""
+# Inches of a view from above with its title.
 _HEIGHT: Final = 5.6
-"""Inches of a view from above with its title."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -102,7 +102,7 @@ def run_figures(run: EvaluationRun) -> tuple[RunFigure, ...]:
     """All figures of a run: of its task, of further results, and of breakdowns with several groups and a number."""
     own = [*_FIGURES[run.setup.task](run)] if run.setup.task in _FIGURES else []
     for name, told in run.further.items():
-        own += added("figures", name)(told.groups[0].result)
+        own += extra_result(name).figures(told.groups[0].result)
     left_out = (EVERYTHING, *(WITHIN_RECORDINGS if run.evaluator.needs_whole_recordings else ()))
     broken = {each.by: each for each in run.breakdowns if each.by not in left_out and len(each.groups) > 1}
     numbers = [path for path in run.evaluator.main_numbers if _headline(run.result, path) is not None]

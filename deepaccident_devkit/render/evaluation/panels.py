@@ -26,14 +26,14 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+# Width and height of one panel in inches: a page of a printed report has two rows of two.
 PANEL: Final = (5.2, 3.0)
-"""Width and height of one panel in inches: a page of a printed report has two rows of two."""
+# The axis' length in lengths of the longest bar, so that the words beside the bars have room.
 _BESIDE: Final = 1.3
-"""The axis' length in lengths of the longest bar, so that the words beside the bars have room."""
 UNKNOWN: Final = "not known"
 _WIDTH, _ROW, _TITLE = 7.2, 0.42, 0.9  # inches
+# Inches of the ticks and the label of a panel.
 _AXIS: Final = 0.6
-"""Inches of the ticks and the label of a panel."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -28,6 +28,7 @@ from deepaccident_devkit.support.pages import document, result_text, scalar
 from deepaccident_devkit.support.reading import read_bytes
 
 _BETTER: Final = {True: "higher", False: "lower", None: ""}
+# Field of a result → heading of its table.
 _PARTS: Final = {
     "truths": "Actors in the samples' true accidents",
     "within": "By the allowed distance (m)",
@@ -35,11 +36,10 @@ _PARTS: Final = {
     "classes": "By class",
     "beside": "With other choices, always reported as well",
 }
-"""Field of a result → heading of its table."""
+# What is known of a class without true boxes.
 _COUNTED: Final = ("thresholds", "truths", "detections")
-"""What is known of a class without true boxes."""
+# Fields that results give about themselves and that are shown at the top, if there are any.
 _SHOWN_META: Final = ("method", "name", "authors", "url", "date")
-"""Fields that results give about themselves and that are shown at the top, if there are any."""
 REPORT_FILE: Final = "report.html"
 FIGURES_FOLDER: Final = "figures"
 

@@ -40,12 +40,12 @@ from deepaccident_devkit.support.text import choice
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+# Metres: where the axis of the allowed distance ends.
 _FARTHEST: Final = 20.0
-"""Metres: where the axis of the allowed distance ends."""
+# Seconds: each bin has half a second, and the middle bin is around no error.
 _TIME_EDGES: Final = np.arange(-2.25, 2.3, 0.5)
-"""Seconds: each bin has half a second, and the middle bin is around no error."""
+# Styles that distinguish lines even in print without colours.
 _DASHES: Final = ("-", "--", "-.", ":")
-"""Styles that distinguish lines even in print without colours."""
 
 
 @in_own_settings

@@ -10,7 +10,7 @@ import numpy as np
 
 from deepaccident_devkit.evaluation.accident import AccidentResult, BoxTruth, ComparedAccidents
 from deepaccident_devkit.evaluation.accident.scoring import AccidentsWithin
-from deepaccident_devkit.evaluation.accident_truth import position_difference
+from deepaccident_devkit.evaluation.alarms import position_difference
 from deepaccident_devkit.evaluation.detection import (
     DetectedBoxes,
     DetectionMatches,
@@ -43,23 +43,23 @@ if TYPE_CHECKING:
 
 ACCIDENT_LAYERS: Final[tuple[Layer, ...]] = ("boxes", "trajectories", "ids", "grid")
 _LEAST: Final = 15.0
+# Metres to each side that are shown, at least and at most.
 _MOST: Final = 60.0
-"""Metres to each side that are shown, at least and at most."""
+# Metres that are shown around the places of accidents and the actors.
 _AROUND: Final = 8.0
-"""Metres that are shown around the places of accidents and the actors."""
+# Points around circles, crosses and the lines between them that no words cover: left, low, right and high.
 _MARK: Final = (-7.0, -7.0, 7.0, 7.0)
-"""Points around circles, crosses and the lines between them that no words cover: left, low, right and high."""
+# Whether it is right is what the picture shows.
 FORESEEN_COLOR: Final = "black"
-"""Whether it is right is what the picture shows."""
 DETECTION_LAYERS: Final[tuple[Layer, ...]] = ("boxes", "ids", "grid")
-WINDOW: Final = 50.0
-"""Metres around the agent that are shown."""
+# Metres around the agent that are shown.
+VIEW_RANGE: Final = 50.0
+# The lines around true boxes and instances that are missed.
 DASHED: Final = (0, (2, 1))
-"""The lines around true boxes and instances that are missed."""
-Side = Literal["true", "predicted"]
+_Side = Literal["true", "predicted"]
 MOTION_LAYERS: Final[tuple[Layer, ...]] = ("labels", "trajectories", "ids", "grid")
 _RIGHT, _WRONG, _UNCOUNTED = 1, 2, 3
-_WORDS: Final[dict[Side, tuple[str, str]]] = {"true": ("found", "missed"), "predicted": ("right", "false")}
+_WORDS: Final[dict[_Side, tuple[str, str]]] = {"true": ("found", "missed"), "predicted": ("right", "false")}
 
 
 def layers_but_ids(given: Iterable[Layer] | None, possible: Sequence[Layer]) -> frozenset[Layer]:
@@ -275,7 +275,7 @@ def draw_detection_outcome(
     if "ids" in shown:
         true = truth.select(np.concatenate([matches.truth, matches.missed]))
         draw_ids_from_above(true, ax, ["black"] * len(true))
-    ax.set(xlim=(-WINDOW, WINDOW), ylim=(-WINDOW, WINDOW))
+    ax.set(xlim=(-VIEW_RANGE, VIEW_RANGE), ylim=(-VIEW_RANGE, VIEW_RANGE))
     names = {"right": "detected", "false": "false", "missed": "missed"}
     draw_legend_of_fills(ax, {words: OUTCOME_COLORS[kind] for kind, words in names.items()})
     return titled_from_above(ax, detection_words(prediction, truth, matches, protocol), grid="grid" in shown)
@@ -330,7 +330,7 @@ class MotionOutcome(ShortRepr):
     matches: IntArray
     extent: float
 
-    def outcomes(self, side: Side) -> AnyArray:
+    def outcomes(self, side: _Side) -> AnyArray:
         """(T, H, W) 1 for instances matched in that frame, 2 for unmatched ones, 3 beyond the range, 0 elsewhere."""
         maps = self.true if side == "true" else self.predicted
         result = np.zeros(maps.instance.shape, dtype=np.int64)
@@ -342,7 +342,7 @@ class MotionOutcome(ShortRepr):
             result[frame][np.isin(instance, found)] = _RIGHT
         return result
 
-    def judged(self, side: Side, frame: int) -> dict[str, IntArray]:
+    def judged(self, side: _Side, frame: int) -> dict[str, IntArray]:
         """A frame's ids by the kinds of `OUTCOME_COLORS`: `right`, and `false` or (true ones) `missed`; none beyond."""
         maps, kinds = (self.true if side == "true" else self.predicted).instance[frame], self.outcomes(side)[frame]
         named = {"right": _RIGHT, "missed" if side == "true" else "false": _WRONG}
@@ -363,7 +363,7 @@ def motion_outcome(prediction: MotionOutput, label: MotionLabels) -> MotionOutco
 
 @in_own_settings
 def draw_motion_side(
-    outcome: MotionOutcome, side: Side, *, layers: Iterable[Layer] | None = None, ax: Axes | None = None
+    outcome: MotionOutcome, side: _Side, *, layers: Iterable[Layer] | None = None, ax: Axes | None = None
 ) -> Axes:
     """Render `true` instances as found or missed, or `predicted` ones as right or false; later frames are paler.
 

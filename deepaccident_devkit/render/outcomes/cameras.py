@@ -42,24 +42,24 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+# Metres: the height of the posts at places, since rings far away are flat.
 _POST: Final = 1.5
-"""Metres: the height of the posts at places, since rings far away are flat."""
+# Points around a post that no words cover: left, low, right and high.
 _MARK: Final = (-6.0, -6.0, 6.0, 6.0)
-"""Points around a post that no words cover: left, low, right and high."""
+# Points by which the casing of a line is wider.
 _CASING: Final = 1.4
-"""Points by which the casing of a line is wider."""
+# Edges around lines that are pale; others have white edges.
 CASINGS: Final = {OUTCOME_COLORS["missed"]: "black"}
-"""Edges around lines that are pale; others have white edges."""
+# Inches.
 _SIZE: Final = (14.7, 7.1125)
-"""Inches."""
 _TURN: Final = np.linspace(0, 2 * np.pi, 33)
 _RING: Final = [np.column_stack([np.cos(_TURN), np.sin(_TURN)])]
+# The ring around a true place and the cross at a foreseen one, of a radius of 1 m.
 _CROSS: Final = [np.sqrt(0.5) * np.array(arm) for arm in ([[-1, -1], [1, 1]], [[-1, 1], [1, -1]])]
-"""The ring around a true place and the cross at a foreseen one, of a radius of 1 m."""
+# Points around the middle of a panel's upper edge, where words about a missing image are: left, low, right, high.
 _MISSING: Final = (-58.0, -48.0, 58.0, 0.0)
-"""Points around the middle of a panel's upper edge, where words about a missing image are: left, low, right, high."""
+# How opaque the ground of instances is.
 _FILL: Final = 0.3
-"""How opaque the ground of instances is."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

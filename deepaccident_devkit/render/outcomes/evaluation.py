@@ -22,7 +22,7 @@ from deepaccident_devkit.render.outcomes.above import (
     ACCIDENT_LAYERS,
     DETECTION_LAYERS,
     MOTION_LAYERS,
-    WINDOW,
+    VIEW_RANGE,
     draw_accidents,
     draw_detection_outcome,
     draw_motion_side,
@@ -51,10 +51,10 @@ _POSSIBLE: Final[Mapping[str, tuple[Layer, ...]]] = {
     "accident": ("image", "bev", *ACCIDENT_LAYERS),
     "detection": DETECTION_LAYERS,
 }
-SIZES: Final = {"motion": (12.4, 6.9), "accident": (12.4, 5.9), "detection": (12.4, 6.9)}
-"""Inches."""
+# Inches.
+FIGURE_SIZES: Final = {"motion": (12.4, 6.9), "accident": (12.4, 5.9), "detection": (12.4, 6.9)}
+# How wide a camera and what is beside it are.
 _CAMERA_BESIDE: Final = (1.4, 1.0)
-"""How wide a camera and what is beside it are."""
 
 
 @in_own_settings
@@ -101,7 +101,7 @@ def render_evaluation(
     given, chosen = judged_as(prediction, task)
     shown = layers_but_ids(layers, _POSSIBLE[chosen])
     verdict = sample_verdict(dataset, sample, given, task=chosen, protocol=protocol, label=label)
-    fig = figure_or_new(fig, SIZES[chosen])
+    fig = figure_or_new(fig, FIGURE_SIZES[chosen])
     left, right = fig.subplots(1, 2, width_ratios=_CAMERA_BESIDE if chosen == "accident" else None)
     if isinstance(verdict, DetectionVerdict):
         _draw_detection(verdict, collider_ids(dataset, verdict.sample), shown, left, right)
@@ -158,7 +158,7 @@ def _draw_detection(
         pair = truth.select(np.isin(truth.actor_id, [*pair_ids]))
         for ax in (left, right):
             draw_boxes_from_above(pair, ax, [COLLIDER_COLOR] * len(pair), fill=0, linewidths=1.6)
-    left.set(xlim=(-WINDOW, WINDOW), ylim=(-WINDOW, WINDOW))
+    left.set(xlim=(-VIEW_RANGE, VIEW_RANGE), ylim=(-VIEW_RANGE, VIEW_RANGE))
     titled_from_above(
         left, f"true boxes: {len(matches.truth)} found, {len(matches.missed)} missed (dashed)", grid="grid" in shown
     )

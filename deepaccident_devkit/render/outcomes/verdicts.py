@@ -35,8 +35,8 @@ from deepaccident_devkit.taxonomy import FRAME_PERIOD
 from deepaccident_devkit.v2x import cooperative_boxes
 
 Judged: TypeAlias = MotionOutput | list[Accident] | DetectedBoxes
+# Half a second from frame to frame, two seconds ahead.
 _RELEASED: Final = MotionLabelConfig()
-"""Half a second from frame to frame, two seconds ahead."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -15,10 +15,11 @@ from deepaccident_devkit.errors import NotAvailableError
 from deepaccident_devkit.evaluation import Accident, AccidentContext, BoxAccidents, MotionOutput, accident_context
 from deepaccident_devkit.evaluation.accident import Prediction
 from deepaccident_devkit.evaluation.accident.scoring import ERRORS_AT, hit_of
-from deepaccident_devkit.evaluation.accident_truth import RELEASED_HORIZON, Pair, named_alarms
+from deepaccident_devkit.evaluation.alarms import Pair, named_alarms
 from deepaccident_devkit.evaluation.predictions import checked_prediction
 from deepaccident_devkit.evaluation.results import Results
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup, SampleLoader
+from deepaccident_devkit.evaluation.truth import RELEASED_HORIZON
 from deepaccident_devkit.geometry import SE3, quaternions, time_to_collision
 from deepaccident_devkit.geometry.box_arrays import gaps_of_pairs
 from deepaccident_devkit.motion import MotionLabels
@@ -37,15 +38,15 @@ from deepaccident_devkit.v2x.tracks import ScenarioTracks, scenario_tracks
 if TYPE_CHECKING:
     from deepaccident_devkit.tables.records import ScenarioRecord
 
+# A results file of motion or accidents, or predictions by sample token.
 Foreseen = Results | Mapping[str, MotionOutput | Iterable[Accident]]
-"""A results file of motion or accidents, or predictions by sample token."""
 _RULES: Final = BoxAccidents()
+# The most alarms of a sample that are shown: right alarms first, then the surest ones.
 _SHOWN: Final = 3
-"""The most alarms of a sample that are shown: right alarms first, then the surest ones."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Recording(FrozenArrays):
+class ReplayRecording(FrozenArrays):
     """A scenario and the agents whose view is shown.
 
     Attributes:
@@ -94,7 +95,7 @@ class Recording(FrozenArrays):
         return list(np.rint((as_floats(xy) - self.origin) * 100).astype(np.int64).tolist())
 
 
-def recording_of(dataset: Dataset, scenario: RowArgument | None, agents: Agents) -> Recording:
+def recording_of(dataset: Dataset, scenario: RowArgument | None, agents: Agents) -> ReplayRecording:
     """A scenario of a release: by default the first that ends in an accident or, without any, the first one.
 
     Agents are as `cooperating_agents` takes them, seen from the first that is there; its errors are raised, and
@@ -107,7 +108,7 @@ def recording_of(dataset: Dataset, scenario: RowArgument | None, agents: Agents)
         contact = collision(dataset, record)
     except NotAvailableError as error:
         unknown = str(error)
-    return Recording(
+    return ReplayRecording(
         dataset=dataset,
         scenario=record,
         agents=tuple(agent for agent in AGENTS if agent in chosen),
@@ -125,7 +126,7 @@ def _origin(dataset: Dataset, record: ScenarioRecord, contact: Contact | None) -
     return as_floats(np.round(np.mean(poses, axis=0)[:2]))
 
 
-def agent_entries(recording: Recording) -> list[dict[str, Any]]:
+def agent_entries(recording: ReplayRecording) -> list[dict[str, Any]]:
     """The agents as the page has them: names, colour, actor id, and one pose for each frame (cm, cm, mrad)."""
     described = []
     for agent in recording.agents:
@@ -145,7 +146,7 @@ def agent_entries(recording: Recording) -> list[dict[str, Any]]:
     return described
 
 
-def actor_entries(recording: Recording) -> list[dict[str, Any]]:
+def actor_entries(recording: ReplayRecording) -> list[dict[str, Any]]:
     """The actors as the page has them: the colliding pair, the agents, then the others by id.
 
     Each has its name, role and colour, the letters of the agent that it is, length, width and height (cm), one state
@@ -163,7 +164,7 @@ def actor_entries(recording: Recording) -> list[dict[str, Any]]:
     return [_actor(recording, tracks, int(ids[row]), recorders, seen[row]) for row in order]
 
 
-def pair_entries(recording: Recording) -> dict[str, list[int | None]] | None:
+def pair_entries(recording: ReplayRecording) -> dict[str, list[int | None]] | None:
     """How near the colliding pair is at each frame: its gap (cm), and its time to collision if both go on (ds).
 
     As `interactions` has them, seen from above; null where one of the two is not annotated or has no known velocity,
@@ -185,7 +186,7 @@ def pair_entries(recording: Recording) -> dict[str, list[int | None]] | None:
     }
 
 
-def camera_entries(recording: Recording) -> list[list[dict[str, Any]]]:
+def camera_entries(recording: ReplayRecording) -> list[list[dict[str, Any]]]:
     """For each agent its cameras as the page has them, so that the page can project boxes into their pictures.
 
     A camera has its title, its lens (width and height of the image, fx, fy, cx, cy; pixels), and for each frame the
@@ -195,7 +196,7 @@ def camera_entries(recording: Recording) -> list[list[dict[str, Any]]]:
     return [[_camera(recording, agent, channel) for channel in CAMERAS] for agent in recording.agents]
 
 
-def _camera(recording: Recording, agent: str, channel: str) -> dict[str, Any]:
+def _camera(recording: ReplayRecording, agent: str, channel: str) -> dict[str, Any]:
     samples = [recording.sample(agent, frame) for frame in recording.frames]
     lens = recording.dataset.camera(samples[0], channel)
     poses = [recording.dataset.world_from(sample, channel) for sample in samples]
@@ -211,7 +212,7 @@ def _camera(recording: Recording, agent: str, channel: str) -> dict[str, Any]:
 
 
 def _actor(
-    recording: Recording, tracks: ScenarioTracks, actor: int, recorders: Mapping[int, str], seen: AnyArray
+    recording: ReplayRecording, tracks: ScenarioTracks, actor: int, recorders: Mapping[int, str], seen: AnyArray
 ) -> dict[str, Any]:
     rows = np.flatnonzero(tracks.actor_id == actor)
     boxes, agent = tracks.boxes.select(rows), recorders.get(actor)
@@ -246,7 +247,7 @@ def _actor(
     }
 
 
-def _seen(recording: Recording, ids: IntArray) -> AnyArray:
+def _seen(recording: ReplayRecording, ids: IntArray) -> AnyArray:
     """(actors, frames) uint8: bit masks over the recording's agents."""
     seen = np.zeros((len(ids), len(recording.frames)), dtype=np.uint8)
     for bit, agent in enumerate(recording.agents):
@@ -260,7 +261,7 @@ def _milliradians(angle: float) -> int:
     return round(angle * 1000)
 
 
-def foreseen_entries(recording: Recording, prediction: Foreseen) -> dict[str, Any]:
+def foreseen_entries(recording: ReplayRecording, prediction: Foreseen) -> dict[str, Any]:
     """The foreseen accidents as the page has them: the rule in words, and each sample of the agents with a prediction.
 
     Instance maps given by token have the orientation of the released labels. Raises NotAvailableError if no prediction
@@ -290,7 +291,7 @@ def _horizon(prediction: Foreseen) -> float:
     return RELEASED_HORIZON if form is None else min(RELEASED_HORIZON, (form.frames - 1) * form.step)
 
 
-def _sample(recording: Recording, prediction: Foreseen, agent: str, frame: int, horizon: float) -> dict[str, Any]:
+def _sample(recording: ReplayRecording, prediction: Foreseen, agent: str, frame: int, horizon: float) -> dict[str, Any]:
     token = recording.sample(agent, frame)
     given, label, context = _loaded(recording, prediction, token, horizon)
     truth = context.truth
@@ -312,7 +313,7 @@ def _sample(recording: Recording, prediction: Foreseen, agent: str, frame: int, 
 
 
 def _loaded(
-    recording: Recording, prediction: Foreseen, token: str, horizon: float
+    recording: ReplayRecording, prediction: Foreseen, token: str, horizon: float
 ) -> tuple[MotionOutput | list[Accident], MotionLabels | None, AccidentContext]:
     if isinstance(prediction, Results):
         setup = EvaluationSetup(task="accident", protocol="boxes", horizon=horizon)
@@ -330,7 +331,7 @@ def _verdict(given: Prediction, label: MotionLabels | None, context: AccidentCon
 
 
 def _alarm(
-    recording: Recording, accident: Accident, ids: Pair | None, context: AccidentContext, world_from_ego: SE3
+    recording: ReplayRecording, accident: Accident, ids: Pair | None, context: AccidentContext, world_from_ego: SE3
 ) -> dict[str, Any]:
     counts = _RULES.counts([accident], None, context)
     off = counts["alarms"][0] if counts["alarms"] else None

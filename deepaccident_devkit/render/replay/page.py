@@ -18,7 +18,7 @@ from deepaccident_devkit.render.boxes import camera_name
 from deepaccident_devkit.render.captions import scenario_words
 from deepaccident_devkit.render.replay.entries import (
     Foreseen,
-    Recording,
+    ReplayRecording,
     actor_entries,
     agent_entries,
     camera_entries,
@@ -56,8 +56,8 @@ from deepaccident_devkit.taxonomy import AGENTS, CAMERAS, FRAME_PERIOD, LIDAR, s
 from deepaccident_devkit.v2x import Agents
 from deepaccident_devkit.v2x.collisions import contact_words
 
+# The most bytes of a page, so that it can be sent by mail.
 SIZE_LIMIT: Final = 15_000_000
-"""The most bytes of a page, so that it can be sent by mail."""
 _SCRIPTS: Final = (
     "sources",
     "pointers",
@@ -72,8 +72,8 @@ _SCRIPTS: Final = (
     "replay",
 )
 _BASE64: Final = 4 / 3
+# Bytes of a picture in JSON in addition to its base64: quotes, a comma and padding.
 _BESIDE: Final = 8
-"""Bytes of a picture in JSON in addition to its base64: quotes, a comma and padding."""
 
 
 def render_replay(
@@ -164,14 +164,14 @@ def served_replay(
     }
 
 
-def lidar_files(recording: Recording) -> list[list[bool]]:
+def lidar_files(recording: ReplayRecording) -> list[list[bool]]:
     """For each agent and frame whether the LiDAR file is there."""
     there = recording.dataset.sensor_frames(recording.scenario["token"])
     return [[frame in there[agent, LIDAR] for frame in recording.frames] for agent in recording.agents]
 
 
 def _data(
-    recording: Recording, prediction: Foreseen | None, files: CameraFiles, clouds: list[list[bool]]
+    recording: ReplayRecording, prediction: Foreseen | None, files: CameraFiles, clouds: list[list[bool]]
 ) -> tuple[dict[str, Any], Followed]:
     """The page's data, except pictures and points, and the cameras that follow the pair.
 
@@ -216,7 +216,7 @@ def _data(
 
 
 def _with_pictures(
-    recording: Recording, cameras: list[list[dict[str, Any]]], jpegs: Jpegs
+    recording: ReplayRecording, cameras: list[list[dict[str, Any]]], jpegs: Jpegs
 ) -> list[list[dict[str, Any]]]:
     """For each agent its cameras that have pictures, with one for each frame in base64; null where there is none."""
     shown = []
@@ -262,13 +262,17 @@ def replay_script() -> str:
     return "".join(part(f"replay/{name}.js") for name in _SCRIPTS)
 
 
-def facts(recording: Recording) -> list[list[str]]:
+def facts(recording: ReplayRecording) -> list[list[str]]:
     """Names and values of the facts about a scenario and its end; unknown values are left out."""
     return [[name, value] for name, value in (*_setting(recording), *_ending(recording)) if value]
 
 
 def notes(
-    recording: Recording, files: CameraFiles, settings: PictureSettings | None, clouds: list[list[bool]], most: int
+    recording: ReplayRecording,
+    files: CameraFiles,
+    settings: PictureSettings | None,
+    clouds: list[list[bool]],
+    most: int,
 ) -> list[str]:
     """Sentences on what is missing in the release or was left out.
 
@@ -277,12 +281,12 @@ def notes(
     return [*_labels(recording), *_missing_pictures(files), *_pictures(files, settings), *_clouds(clouds, most)]
 
 
-def served_notes(recording: Recording, files: CameraFiles, clouds: list[list[bool]]) -> list[str]:
+def served_notes(recording: ReplayRecording, files: CameraFiles, clouds: list[list[bool]]) -> list[str]:
     """Sentences on what is missing in the release, for a page that has no pictures itself."""
     return [*_labels(recording), *_missing_pictures(files), *_clouds(clouds, served_points(recording))]
 
 
-def _setting(recording: Recording) -> Iterator[tuple[str, str]]:
+def _setting(recording: ReplayRecording) -> Iterator[tuple[str, str]]:
     scenario = recording.scenario
     lights = "with traffic lights" if scenario["signalized"] else "without traffic lights"
     yield "Town", scenario["town"]
@@ -296,7 +300,7 @@ def _setting(recording: Recording) -> Iterator[tuple[str, str]]:
     yield "Split", scenario["split"] or ""
 
 
-def _ending(recording: Recording) -> Iterator[tuple[str, str]]:
+def _ending(recording: ReplayRecording) -> Iterator[tuple[str, str]]:
     told, contact = recording.scenario["collision"], recording.contact
     if told is None:
         yield "Ends", "without a collision" if recording.scenario["weather"] else ""
@@ -319,7 +323,7 @@ def _speed(speed: float) -> str:
     return "unknown" if math.isnan(speed) else f"{speed:.1f} m/s ({speed * 3.6:.0f} km/h)"
 
 
-def _labels(recording: Recording) -> Iterator[str]:
+def _labels(recording: ReplayRecording) -> Iterator[str]:
     absent = [short_name(agent) for agent in AGENTS if agent not in recording.agents]
     if absent:
         yield f"Agents not shown: {', '.join(absent)}."

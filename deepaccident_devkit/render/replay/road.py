@@ -13,24 +13,23 @@ from deepaccident_devkit.release import BevImage
 from deepaccident_devkit.release.images import picture_bytes
 from deepaccident_devkit.release.npz import TAGS
 from deepaccident_devkit.render.captions import is_there
-from deepaccident_devkit.render.ground import map_beneath
-from deepaccident_devkit.render.replay.entries import Recording
+from deepaccident_devkit.render.replay.entries import ReplayRecording
 from deepaccident_devkit.render.styles import BEV_COLORS
-from deepaccident_devkit.rooms import added
+from deepaccident_devkit.render.town_map import ground_at, map_beneath
 from deepaccident_devkit.support.arrays import ByteArray, FloatArray
 from deepaccident_devkit.taxonomy import BEV_CAMERA, BEV_RESOLUTION, BEV_SHAPE
 
+# What is drawn. Vehicles and pedestrians move: another moment shows what is beneath them.
 _GROUND: Final = ("sidewalk", "road", "road_line")
-"""What is drawn. Vehicles and pedestrians move: another moment shows what is beneath them."""
+# The number of moments whose pictures are merged.
 _MOMENTS: Final = 4
-"""The number of moments whose pictures are merged."""
+# Metres: side of a pixel. The first is taken whose picture is small enough.
 _CELLS: Final = (0.2, 0.3, 0.5, 0.8)
-"""Metres: side of a pixel. The first is taken whose picture is small enough."""
+# Bytes of the picture; in base64 it has a third more.
 _MOST: Final = 200_000
-"""Bytes of the picture; in base64 it has a third more."""
 
 
-def road_picture(recording: Recording) -> dict[str, Any] | None:
+def road_picture(recording: ReplayRecording) -> dict[str, Any] | None:
     """The road as the page has it: a PNG in base64, and its left, top, width and height (cm, y up).
 
     Transparent is nothing, or not seen. If the release has no BEV camera file of these moments, as of the test split,
@@ -57,13 +56,13 @@ def road_picture(recording: Recording) -> dict[str, Any] | None:
     return {"png": base64.b64encode(png).decode("ascii"), "left": left, "top": top, "width": width, "height": height}
 
 
-def _samples(recording: Recording) -> list[str]:
+def _samples(recording: ReplayRecording) -> list[str]:
     """The samples (tokens) of the agents at a few moments."""
     frames = np.linspace(recording.frames[0], recording.frames[-1], _MOMENTS).round().astype(int)
     return [recording.sample(agent, frame) for agent in recording.agents for frame in np.unique(frames).tolist()]
 
 
-def _seen(recording: Recording, samples: Sequence[str]) -> list[tuple[BevImage, SE3]]:
+def _seen(recording: ReplayRecording, samples: Sequence[str]) -> list[tuple[BevImage, SE3]]:
     """The pictures of samples whose files are there, and where the agents are in world."""
     dataset = recording.dataset
     there = [sample for sample in samples if is_there(dataset, f"{sample}/{BEV_CAMERA}")]
@@ -102,8 +101,7 @@ def _merged(seen: Sequence[tuple[BevImage, SE3]], low: FloatArray, high: FloatAr
 def _mapped(town: Any, low: FloatArray, high: FloatArray, cell: float) -> ByteArray:
     """(H, W) uint8: the ground by a town's map, as `_merged` gives it."""
     across, down = np.meshgrid(*_middles(low, high, cell))
-    ground: ByteArray = added("picture", "ground_at")(town, np.column_stack([across.ravel(), down.ravel()]), _GROUND)
-    return ground.reshape(across.shape)
+    return ground_at(town, np.column_stack([across.ravel(), down.ravel()]), _GROUND).reshape(across.shape)
 
 
 def _middles(low: FloatArray, high: FloatArray, cell: float) -> tuple[FloatArray, FloatArray]:

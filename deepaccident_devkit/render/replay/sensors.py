@@ -13,58 +13,58 @@ import numpy as np
 from deepaccident_devkit.errors import MissingFileError
 from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.geometry.camera import IN_FRONT_DEPTH
-from deepaccident_devkit.parallel import own_threads, run_batch
 from deepaccident_devkit.release import read_image
 from deepaccident_devkit.release.images import picture_bytes
 from deepaccident_devkit.release.store import ReleasePath
-from deepaccident_devkit.render.replay.entries import Recording
+from deepaccident_devkit.render.replay.entries import ReplayRecording
 from deepaccident_devkit.support.arrays import AnyArray, ByteArray, FloatArray, IntArray, as_floats
+from deepaccident_devkit.support.parallel import own_threads, run_batch
 from deepaccident_devkit.taxonomy import CAMERAS, AgentName
 from deepaccident_devkit.v2x.tracks import scenario_tracks
 
+# What a change of the camera costs: as much as the pair's whole loss from a picture for about ten frames.
 _SWITCH: Final = 1.0
-"""What a change of the camera costs: as much as the pair's whole loss from a picture for about ten frames."""
+# How many moments the last one counts for: it is the impact.
 _END: Final = 5.0
-"""How many moments the last one counts for: it is the impact."""
+# What an actor counts for that the agent does not see: something stands before it.
 _HIDDEN: Final = 0.2
-"""What an actor counts for that the agent does not see: something stands before it."""
+# Share of the image's width from which on the size of an actor matters less.
 _LARGE: Final = 0.1
-"""Share of the image's width from which on the size of an actor matters less."""
+# Sizes of the nested boxes at whose corners an actor is looked for; 1 is the actor's own.
 _LAYERS: Final = as_floats([1, 2, 3]) / 3
-"""Sizes of the nested boxes at whose corners an actor is looked for; 1 is the actor's own."""
 FRONT: Final = CAMERAS[0]
+# Width in pixels and JPEG quality; the first pair that fits is taken.
 LADDER: Final = ((960, 80), (800, 75), (640, 75), (640, 65), (560, 60), (480, 60), (480, 50), (400, 50), (320, 45))
-"""Width in pixels and JPEG quality; the first pair that fits is taken."""
+# For each step of the ladder, one of how many frames has a picture of the other cameras; the last is for the rest.
 OTHERS: Final = (1, 2, 2, 2, 4)
-"""For each step of the ladder, one of how many frames has a picture of the other cameras; the last is for the rest."""
+# Pixels: the other cameras' pictures are half as wide as the others, but not smaller than this.
 LEAST_OTHER: Final = 256
-"""Pixels: the other cameras' pictures are half as wide as the others, but not smaller than this."""
+# The number of pictures from which the size of all is estimated.
 _PROBED: Final = 12
-"""The number of pictures from which the size of all is estimated."""
+# Metres: side of a cube; of the points in it one is kept.
 _CELL: Final = 0.3
-"""Metres: side of a cube; of the points in it one is kept."""
 _NUMBERED: Final = as_floats([73_856_093, 19_349_669, 83_492_791])
 _MIXED: Final = 0x9E3779B1
+# A cube's number is the sum of its places times `_NUMBERED`, mixed: quicker than sorting, and neighbours lie apart.
 _SLOTS: Final = 1 << 16
-"""A cube's number is the sum of its places times `_NUMBERED`, mixed: quicker than sorting, and neighbours lie apart."""
+# Points of a cloud.
 _MOST: Final = 4000
-"""Points of a cloud."""
-POINT_BYTES: Final = 8
-"""Of a point in base64: three int16."""
+# Of a point in base64: three int16.
+_POINT_BYTES: Final = 8
+# Bytes of all clouds of a page that has its pictures too.
 PAGE_POINTS: Final = 3_000_000
-"""Bytes of all clouds of a page that has its pictures too."""
+# Bytes of all clouds of a scenario that a server gives, so that with data and scripts it keeps to 15 MB.
 SERVED_POINTS: Final = 13_000_000
-"""Bytes of all clouds of a scenario that a server gives, so that with data and scripts it keeps to 15 MB."""
+# Metres above the ground: lower points are on the road.
 _LEAST_HEIGHT: Final = 0.3
-"""Metres above the ground: lower points are on the road."""
+# Of so many points the height of one is looked at for the ground's.
 _SOME: Final = 8
-"""Of so many points the height of one is looked at for the ground's."""
+# Percentile of the points' heights that counts as the ground: the infrastructure's ego frame is not on the ground.
 _GROUND: Final = 5.0
-"""Percentile of the points' heights that counts as the ground: the infrastructure's ego frame is not on the ground."""
+# Agent and camera → one file for each frame; None where there is none.
 CameraFiles = Mapping[tuple[str, str], Sequence[ReleasePath | None]]
-"""Agent and camera → one file for each frame; None where there is none."""
+# Agent → camera → one picture for each frame; None where there is none. Cameras without any are left out.
 Jpegs = dict[str, dict[str, tuple[bytes | None, ...]]]
-"""Agent → camera → one picture for each frame; None where there is none. Cameras without any are left out."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -81,7 +81,7 @@ class Followed:
 
 
 def follow_pair(
-    recording: Recording, seen: Mapping[int, Sequence[int]], there: Mapping[tuple[str, str], Sequence[bool]]
+    recording: ReplayRecording, seen: Mapping[int, Sequence[int]], there: Mapping[tuple[str, str], Sequence[bool]]
 ) -> Followed:
     """Choose cameras so that most of the pair is in the picture, large and not hidden, and changes are few.
 
@@ -98,7 +98,10 @@ def follow_pair(
 
 
 def _scores(
-    recording: Recording, bit: int, seen: Mapping[int, Sequence[int]], there: Mapping[tuple[str, str], Sequence[bool]]
+    recording: ReplayRecording,
+    bit: int,
+    seen: Mapping[int, Sequence[int]],
+    there: Mapping[tuple[str, str], Sequence[bool]],
 ) -> FloatArray:
     """(frames, cameras) how well an agent's cameras show the pair, without itself; −1 where there is no picture."""
     agent = recording.agents[bit]
@@ -116,7 +119,7 @@ def _scores(
     return scores
 
 
-def _shown(recording: Recording, agent: str, channel: str, boxes: Boxes, row: IntArray) -> FloatArray:
+def _shown(recording: ReplayRecording, agent: str, channel: str, boxes: Boxes, row: IntArray) -> FloatArray:
     """(N,) from 0 to 1: the share of boxes, in world, that a camera's picture has, less if they are small.
 
     `row` (N,) says at which frame, from 0, each box is. The lens is that of the first frame.
@@ -181,7 +184,7 @@ class _Image:
 _Images = dict[tuple[str, str], list[_Image | None]]
 
 
-def camera_files(recording: Recording) -> CameraFiles:
+def camera_files(recording: ReplayRecording) -> CameraFiles:
     """The image files of all cameras of the agents."""
     there = recording.dataset.sensor_frames(recording.scenario["token"])
     return {
@@ -216,7 +219,7 @@ def camera_pictures(
     return _fitting(images, limit, _ladder(max(map(len, files.values()))), progress=progress)
 
 
-def _paths(recording: Recording, agent: str, channel: str) -> Iterator[ReleasePath]:
+def _paths(recording: ReplayRecording, agent: str, channel: str) -> Iterator[ReleasePath]:
     samples = (recording.sample(agent, frame) for frame in recording.frames)
     return (recording.dataset.sensor_path(f"{sample}/{channel}") for sample in samples)
 
@@ -297,10 +300,10 @@ def _jpeg(image: ByteArray, settings: PictureSettings, *, large: bool) -> bytes:
 
 def most_points(clouds: int, limit: float) -> int:
     """How many points each of so many clouds may have so that all keep a limit of bytes."""
-    return min(_MOST, int(limit / (POINT_BYTES * max(1, clouds))))
+    return min(_MOST, int(limit / (_POINT_BYTES * max(1, clouds))))
 
 
-def lidar_points(recording: Recording, most: int) -> list[list[str | None] | None] | None:
+def lidar_points(recording: ReplayRecording, most: int) -> list[list[str | None] | None] | None:
     """For each agent a cloud for each frame, as `cloud_text` has it, of at most so many points.
 
     None stands for a missing file; an agent of which all are missing has no list, and without any there is none.
@@ -311,12 +314,12 @@ def lidar_points(recording: Recording, most: int) -> list[list[str | None] | Non
     return shown if any(shown) else None
 
 
-def served_points(recording: Recording) -> int:
+def served_points(recording: ReplayRecording) -> int:
     """How many points a cloud may have that a server gives, if all files are there."""
     return most_points(len(recording.agents) * len(recording.frames), SERVED_POINTS)
 
 
-def cloud_text(recording: Recording, agent: str, frame: int, most: int | None = None) -> str | None:
+def cloud_text(recording: ReplayRecording, agent: str, frame: int, most: int | None = None) -> str | None:
     """A cloud above the road: int16 x, y, z, x, y, z, …, little-endian, decimetres from the origin, as base64.
 
     z is that of world. At most so many points, by default `served_points`, spread evenly over the

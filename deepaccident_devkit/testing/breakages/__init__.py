@@ -24,7 +24,7 @@ _GROUPS = (
     files.SENSOR_MEANING,
     folders.BROKEN,
     folders.ODD,
-    folders.SPLIT_FILES,
+    folders.SPLIT_FILE,
     folders.LEGAL,
 )
 BREAKAGES: Mapping[str, Breakage] = {breakage.name: breakage for group in _GROUPS for breakage in group.breakages}

@@ -11,7 +11,7 @@ import numpy as np
 
 from deepaccident_devkit.errors import ReleaseError
 from deepaccident_devkit.release import ScenarioFolder, read_calib, write_raw_calib
-from deepaccident_devkit.release.labels import FIELDS
+from deepaccident_devkit.release.labels import LABEL_FIELDS
 from deepaccident_devkit.release.layout import frame_numbers
 from deepaccident_devkit.release.npz import KEY, read_npz
 from deepaccident_devkit.release.store import real_path
@@ -19,11 +19,11 @@ from deepaccident_devkit.support.arrays import AnyArray, ShortRepr
 from deepaccident_devkit.support.files import write_bytes
 from deepaccident_devkit.taxonomy import CHANNEL_FORMAT, INFRASTRUCTURE, AgentName
 
-Rows = list[list[str]]
+LabelRows = list[list[str]]
 """The words of a label file's lines; the first line is the header."""
-ENDINGS: Mapping[str, str] = {"label": "txt", "calib": "pkl", **CHANNEL_FORMAT}
+FILE_ENDINGS: Mapping[str, str] = {"label": "txt", "calib": "pkl", **CHANNEL_FORMAT}
 """Kind of file → its ending."""
-FIELD: Mapping[str, int] = {name: place for place, name in enumerate(FIELDS)}
+FIELD: Mapping[str, int] = {name: place for place, name in enumerate(LABEL_FIELDS)}
 """Field of a label line → its place in the line."""
 Apply = Callable[["Victim"], Path]
 
@@ -104,7 +104,7 @@ class ScenarioEditor:
 
     def file(self, agent: str, kind: str, frame: int) -> Path:
         """A file of a kind: `label`, `calib` or a channel."""
-        return real_path(self.scenario.file(agent, kind, frame, ENDINGS[kind]))
+        return real_path(self.scenario.file(agent, kind, frame, FILE_ENDINGS[kind]))
 
     def folder(self, agent: str, kind: str) -> Path:
         """The folder of the files of a kind."""
@@ -141,11 +141,11 @@ class ScenarioEditor:
         self.write(one, other_content)
         self.write(other, content)
 
-    def rows(self, agent: str, frame: int) -> Rows:
+    def rows(self, agent: str, frame: int) -> LabelRows:
         """The words of a label file's lines."""
         return [line.split() for line in self.file(agent, "label", frame).read_text("ascii").splitlines()]
 
-    def write_rows(self, agent: str, frame: int, rows: Rows) -> Path:
+    def write_rows(self, agent: str, frame: int, rows: LabelRows) -> Path:
         """Replace a label."""
         return self.write(self.file(agent, "label", frame), "\n".join(" ".join(row) for row in rows).encode("ascii"))
 
@@ -238,7 +238,7 @@ class Victim:
 
 
 @dataclass(slots=True)
-class Group:
+class BreakageGroup:
     """Collects the breakages of a module: a function's name is that of the breakage, its docstring the description."""
 
     name: str

@@ -15,10 +15,10 @@ from deepaccident_devkit.errors import (
 from deepaccident_devkit.release import read_image, write_image
 from deepaccident_devkit.release.store import real_path
 from deepaccident_devkit.taxonomy import BEV_CAMERA, LIDAR, OWN_ACTOR_ID
-from deepaccident_devkit.testing.breakages.breakage import FIELD, Group, Victim
+from deepaccident_devkit.testing.breakages.breakage import FIELD, BreakageGroup, Victim
 
-LABEL_FORM = Group("label", opening=BrokenReleaseError, reading=LabelError)
-LABEL_MEANING = Group("label")
+LABEL_FORM = BreakageGroup("label", opening=BrokenReleaseError, reading=LabelError)
+LABEL_MEANING = BreakageGroup("label")
 
 
 def _set_field(victim: Victim, name: str, word: str) -> Path:
@@ -118,8 +118,8 @@ def labels_of_two_agents_swapped(victim: Victim) -> Path:
     return victim.editor.folder(victim.agent, "label")
 
 
-CALIB_FORM = Group("calib", opening=BrokenReleaseError, reading=CalibError)
-CALIB_MEANING = Group("calib")
+CALIB_FORM = BreakageGroup("calib", opening=BrokenReleaseError, reading=CalibError)
+CALIB_MEANING = BreakageGroup("calib")
 
 
 @CALIB_FORM.enter("calib-unreadable")
@@ -198,8 +198,8 @@ def calib_cameras_swapped(victim: Victim) -> Path:
     return victim.editor.folder(victim.agent, "calib")
 
 
-META_FORM = Group("meta", opening=BrokenReleaseError, reading=MetaError)
-META_MEANING = Group("meta")
+META_FORM = BreakageGroup("meta", opening=BrokenReleaseError, reading=MetaError)
+META_MEANING = BreakageGroup("meta")
 
 
 def _edit_first_line(victim: Victim, word: int, new: str) -> Path:
@@ -245,9 +245,9 @@ def meta_pair_wrong(victim: Victim) -> Path:
     return _edit_first_line(victim, 1, "7777")
 
 
-SENSOR_FORM = Group("sensor", reading=SensorFileError, deep=True)
-SENSOR_MEANING = Group("sensor", deep=True)
-SENSOR_MISSING = Group("sensor", reading=MissingFileError)
+SENSOR_FORM = BreakageGroup("sensor", reading=SensorFileError, deep=True)
+SENSOR_MEANING = BreakageGroup("sensor", deep=True)
+SENSOR_MISSING = BreakageGroup("sensor", reading=MissingFileError)
 CAMERA = "Camera_Front"
 
 

@@ -16,11 +16,11 @@ from deepaccident_devkit.taxonomy import (
     SPLITS,
     UNTRACKED_ID,
 )
-from deepaccident_devkit.testing.breakages.breakage import ENDINGS, FIELD, Group, Victim
+from deepaccident_devkit.testing.breakages.breakage import FIELD, FILE_ENDINGS, BreakageGroup, Victim
 
-BROKEN = Group("release", opening=BrokenReleaseError)
-ODD = Group("release")
-SPLIT_FILES = Group("release", opening=SplitFileError, reading=SplitFileError)
+BROKEN = BreakageGroup("release", opening=BrokenReleaseError)
+ODD = BreakageGroup("release")
+SPLIT_FILE = BreakageGroup("release", opening=SplitFileError, reading=SplitFileError)
 
 
 @BROKEN.enter("frames-missing")
@@ -38,7 +38,7 @@ def calib_missing(victim: Victim) -> Path:
 @BROKEN.enter("frames-missing", "sensor-frames-missing")
 def frame_lost(victim: Victim) -> Path:
     """An agent lacks all files of a frame."""
-    for kind in ENDINGS:
+    for kind in FILE_ENDINGS:
         if victim.file(kind).exists():
             victim.editor.remove(victim.file(kind))
     return victim.file("calib")
@@ -87,7 +87,7 @@ def agent_unlabelled(victim: Victim) -> Path:
 @ODD.enter("ids-differ", "meta-pair", "own-box-apart", "sizes-differ")
 def agents_swapped(victim: Victim) -> Path:
     """All folders of two vehicles are swapped."""
-    for kind in ENDINGS:
+    for kind in FILE_ENDINGS:
         for frame in victim.editor.frames:
             files = [victim.editor.file(agent, kind, frame) for agent in (victim.agent, victim.other)]
             if all(path.exists() for path in files):
@@ -103,7 +103,7 @@ def frames_swapped(victim: Victim) -> Path:
     return victim.editor.folder(victim.agent, "label")
 
 
-@SPLIT_FILES.enter("split-file-unreadable")
+@SPLIT_FILE.enter("split-file-unreadable")
 def split_file_garbled(victim: Victim) -> Path:
     """A split file has a line of one word."""
     path = victim.editor.root / "val.txt"
@@ -118,7 +118,7 @@ def split_line_twice(victim: Victim) -> Path:
     return victim.editor.write(path, path.read_bytes() * 2)
 
 
-LEGAL = Group("legal")
+LEGAL = BreakageGroup("legal")
 
 
 @LEGAL.enter()
@@ -168,7 +168,7 @@ def meta_no_collision(victim: Victim) -> Path:
 @LEGAL.enter("agent-missing")
 def infrastructure_absent(victim: Victim) -> Path:
     """A scenario has no infrastructure agent, like those of one mirror of the release."""
-    for kind in ENDINGS:
+    for kind in FILE_ENDINGS:
         victim.editor.remove_folder(victim.editor.folder(INFRASTRUCTURE, kind))
     return victim.editor.folder(INFRASTRUCTURE, "calib")
 

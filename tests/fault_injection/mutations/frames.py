@@ -6,14 +6,14 @@ import numpy as np
 
 from deepaccident_devkit.taxonomy import CHANNELS
 from fault_injection.kinds import Group
-from fault_injection.place import ENDINGS, Place
+from fault_injection.place import FILE_ENDINGS, Place
 
 GROUP = Group("frames")
 
 
 def _remove_frame(place: Place, agents: Sequence[str], frame: int) -> None:
     for agent in agents:
-        for kind in ENDINGS:
+        for kind in FILE_ENDINGS:
             place.remove(place.file(agent, kind, frame))
 
 
@@ -37,7 +37,7 @@ def _repeat_last(place: Place, agents: Sequence[str], *kinds: str, later: int = 
 
 
 def _under_another_name(place: Place, rng: np.random.Generator, old: str, new: str, *, copied: bool) -> None:
-    agent, kind, frame = place.any_agent(rng), str(rng.choice(list(ENDINGS))), place.any_frame(rng)
+    agent, kind, frame = place.any_agent(rng), str(rng.choice(list(FILE_ENDINGS))), place.any_frame(rng)
     path = place.file(agent, kind, frame)
     place.write(path.with_name(path.name.replace(old.format(frame), new.format(frame))), path.read_bytes())
     if not copied:
@@ -89,11 +89,11 @@ GROUP.add(
         "file_for_folder": ("A file is where an agent's folder of labels must be.", _file_for_folder),
         "extra_frame": (
             "An agent has a copy of its last frame as one more frame.",
-            lambda place, rng: _repeat_last(place, [place.any_agent(rng)], *ENDINGS),
+            lambda place, rng: _repeat_last(place, [place.any_agent(rng)], *FILE_ENDINGS),
         ),
         "extra_frame_of_all": (
             "All agents have a copy of their last frame as one more frame.",
-            lambda place, _: _repeat_last(place, place.agents, *ENDINGS),
+            lambda place, _: _repeat_last(place, place.agents, *FILE_ENDINGS),
         ),
         "extra_label": (
             "An agent has a label file of a frame that no agent recorded.",

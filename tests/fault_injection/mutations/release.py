@@ -12,7 +12,7 @@ from deepaccident_devkit.tables import open_index
 from deepaccident_devkit.tables.scan import folder_digest
 from deepaccident_devkit.taxonomy import BEV_CAMERA, CHANNELS
 from fault_injection.kinds import Group
-from fault_injection.place import ENDINGS, Place
+from fault_injection.place import FILE_ENDINGS, Place
 
 GROUP = Group("release")
 PARTIAL = "a partial download: users unpack some sensors only (docs/format.md, Tree)"
@@ -61,7 +61,7 @@ def _unpack_beside(place: Place, rng: np.random.Generator) -> None:
 
 def _exchange_agents(place: Place, rng: np.random.Generator) -> None:
     one, other = (str(agent) for agent in rng.choice(place.agents[:4], size=2, replace=False))
-    for kind in ENDINGS:
+    for kind in FILE_ENDINGS:
         place.exchange_agents((one, other), kind, place.frames)
 
 
@@ -156,7 +156,7 @@ GROUP.add(
     {
         "agent_removed": (
             "All files of an agent are absent.",
-            lambda place, rng: _remove_folders(place, [place.any_agent(rng)], list(ENDINGS)),
+            lambda place, rng: _remove_folders(place, [place.any_agent(rng)], list(FILE_ENDINGS)),
         ),
     },
     harmless="a partial download: a scenario without one of the agents is valid (docs/format.md, Tree)",

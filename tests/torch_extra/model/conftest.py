@@ -16,9 +16,9 @@ if importlib.util.find_spec("torch") is not None:
 
     torch.set_num_threads(1)  # several tests run side by side
 
-    from deepaccident_devkit.export.torch import V2XConfig, V2XDataset, collate
-    from deepaccident_devkit.model.inputs import Handedness, ModelInputs, model_inputs
-    from deepaccident_devkit.model.network import ModelConfig, V2XFormer
+    from deepaccident_devkit.plugins.model.inputs import Handedness, ModelInputs, model_inputs
+    from deepaccident_devkit.plugins.model.network import ModelConfig, V2XFormer
+    from deepaccident_devkit.training.torch import V2XConfig, V2XDataset, collate
 
 
 @pytest.fixture(scope="session")

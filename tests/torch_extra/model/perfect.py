@@ -2,7 +2,7 @@
 
 import torch
 
-from deepaccident_devkit.model.detection import TaskMaps, TaskTargets
+from deepaccident_devkit.plugins.model.detection import TaskMaps, TaskTargets
 
 
 def perfect_maps(targets: list[TaskTargets]) -> list[TaskMaps]:

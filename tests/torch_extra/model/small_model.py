@@ -13,13 +13,13 @@ import torch
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.export.images import ImageConfig
 from deepaccident_devkit.geometry import BevGrid
-from deepaccident_devkit.model import presets
-from deepaccident_devkit.model import training_loop as training
-from deepaccident_devkit.model.bev import BevEncodeConfig, BevUNetConfig
-from deepaccident_devkit.model.images import SmallConvConfig, SwinConfig
-from deepaccident_devkit.model.network import CameraConfig, ModelConfig
-from deepaccident_devkit.model.pillars import PillarConfig
-from deepaccident_devkit.model.training_run import TrainConfig
+from deepaccident_devkit.plugins.model import presets
+from deepaccident_devkit.plugins.model import training_loop as training
+from deepaccident_devkit.plugins.model.bev import BevEncodeConfig, BevUNetConfig
+from deepaccident_devkit.plugins.model.images import SmallConvConfig, SwinConfig
+from deepaccident_devkit.plugins.model.network import CameraConfig, ModelConfig
+from deepaccident_devkit.plugins.model.pillars import PillarConfig
+from deepaccident_devkit.plugins.model.training_run import TrainConfig
 
 ALONG = (-50.0, 50.0, 2.5)
 """40 cells: 20 after the encoder, 5 of the latent."""
@@ -114,7 +114,7 @@ def trained(
     """A run with `small` in the place of `tiny`, on one thread; curves, which take seconds, are left out."""
     torch.set_num_threads(1)
     drawn = training.save_training if curves else lambda *_: None
-    with patch.object(presets, "PRESETS", {"tiny": small}), patch.object(training, "save_training", drawn):
+    with patch.object(presets, "MODEL_PRESETS", {"tiny": small}), patch.object(training, "save_training", drawn):
         return training.train(dataset, folder, presets.ModelChoice(), config, device="cpu", **options)
 
 

@@ -10,7 +10,7 @@ from refusals import assert_refused
 from deepaccident_devkit.errors import ConfigError, GeometryError
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.geometry.bev_grid import ORIENTATIONS
-from deepaccident_devkit.model.bev import BevEncode, BevEncodeConfig, BevUNet, BevUNetConfig, crop
+from deepaccident_devkit.plugins.model.bev import BevEncode, BevEncodeConfig, BevUNet, BevUNetConfig, crop
 
 SOURCE = BevGrid((-8.0, 10.0, 1.0), (-9.0, 6.0, 0.5))
 ENCODERS = [

@@ -15,10 +15,10 @@ from torch_extra.compared import same
 from torch_extra.model.small_model import small, small_released
 
 from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.model.checkpoint import BEST, FINAL, load_weights, read_weights, write_weights
-from deepaccident_devkit.model.fusion import CobevtConfig
-from deepaccident_devkit.model.images import SwinConfig
-from deepaccident_devkit.model.network import V2XFormer
+from deepaccident_devkit.plugins.model.checkpoint import BEST, FINAL, load_weights, read_weights, write_weights
+from deepaccident_devkit.plugins.model.fusion import CobevtConfig
+from deepaccident_devkit.plugins.model.images import SwinConfig
+from deepaccident_devkit.plugins.model.network import V2XFormer
 
 META = {"preset": "tiny", "fusion": None, "horizon": 2.0, "note": 'a "quoted" ä'}
 

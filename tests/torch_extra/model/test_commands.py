@@ -12,7 +12,7 @@ from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.errors import ConfigError, DeepAccidentError, NotAvailableError
 from deepaccident_devkit.evaluation import read_results
-from deepaccident_devkit.model import load_model
+from deepaccident_devkit.plugins.model import load_model
 
 QUICK = ("--validation", "none", "--device", "cpu")
 PAGE = Path(__file__).parents[3] / "docs" / "training.md"

@@ -18,7 +18,7 @@ from torch_extra.model.perfect import perfect_maps
 
 from deepaccident_devkit.errors import DeepAccidentError, GeometryError
 from deepaccident_devkit.geometry import SE3
-from deepaccident_devkit.model.detection import (
+from deepaccident_devkit.plugins.model.detection import (
     ONE_TASK,
     RELEASED_CLASS_SLOTS,
     RELEASED_NMS,

@@ -11,12 +11,12 @@ from torch.testing import assert_close
 from torch_extra.compared import same
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.export.torch import AllEgosDataset, V2XConfig, V2XDataset, collate, collate_all_egos
 from deepaccident_devkit.geometry.conventions import flip_points, flip_pose, flip_six_vector, flip_vectors2, flip_yaw
-from deepaccident_devkit.model.inputs import ModelInputs, mirrored_boxes, model_inputs
-from deepaccident_devkit.model.network import ModelConfig
-from deepaccident_devkit.model.warps import matrices_from_six
 from deepaccident_devkit.motion import Augmentation
+from deepaccident_devkit.plugins.model.inputs import ModelInputs, mirrored_boxes, model_inputs
+from deepaccident_devkit.plugins.model.network import ModelConfig
+from deepaccident_devkit.plugins.model.warps import matrices_from_six
+from deepaccident_devkit.training.torch import AllEgosDataset, V2XConfig, V2XDataset, collate, collate_all_egos
 
 PAST = 3
 TURNED = Augmentation(rotation=0.3, scale=1.04, flip=True)

@@ -18,8 +18,8 @@ import torch
 from refusals import assert_refused
 
 from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.model import load_model
-from deepaccident_devkit.model.checkpoint import read_weights, write_weights
+from deepaccident_devkit.plugins.model import load_model
+from deepaccident_devkit.plugins.model.checkpoint import read_weights, write_weights
 
 NAME = "img_neck.weight"
 SHORT = r"\A.{,600}\Z"
@@ -225,7 +225,7 @@ HOSTILE: dict[str, bytes] = {
 CODE = """
 import json, resource, sys, time
 from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.model.checkpoint import read_weights
+from deepaccident_devkit.plugins.model.checkpoint import read_weights
 def peak(): return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024
 limit = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize() + (2 << 30)
 resource.setrlimit(resource.RLIMIT_AS, (limit, limit))

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from refusals import assert_refused
 
 from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.model.fusion import (
+from deepaccident_devkit.plugins.model.fusion import (
     Agent3D,
     Agent3DConfig,
     CobevtConfig,
@@ -21,7 +21,7 @@ from deepaccident_devkit.model.fusion import (
     V2XViTConfig,
     fusion,
 )
-from deepaccident_devkit.model.fusion.attention import Windows
+from deepaccident_devkit.plugins.model.fusion.attention import Windows
 
 C = 8
 MEAN = PoolFusionConfig()

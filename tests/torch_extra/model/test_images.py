@@ -6,8 +6,15 @@ from refusals import assert_refused
 from torch import nn
 
 from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.model.images import SmallConvConfig, Swin, SwinConfig, from_official, image_encoder, normalised
-from deepaccident_devkit.model.images.swin import PatchMerging
+from deepaccident_devkit.plugins.model.images import (
+    SmallConvConfig,
+    Swin,
+    SwinConfig,
+    from_official,
+    image_encoder,
+    normalised,
+)
+from deepaccident_devkit.plugins.model.images.swin import PatchMerging
 
 SMALL_SWIN = {"embed_dims": 8, "depths": (2, 2, 2, 2), "num_heads": (1, 2, 2, 4), "neck_channels": 16}
 ENCODERS = [

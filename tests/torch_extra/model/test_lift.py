@@ -13,7 +13,7 @@ from strategies import ANGLES, arrays, rotation_matrix
 
 from deepaccident_devkit.errors import ConfigError, GeometryError
 from deepaccident_devkit.geometry import SE3, BevGrid, PinholeCamera
-from deepaccident_devkit.model.lift import CameraGeometry, LiftConfig, LiftSplat
+from deepaccident_devkit.plugins.model.lift import CameraGeometry, LiftConfig, LiftSplat
 
 CONFIG = LiftConfig(
     in_channels=5,

@@ -12,7 +12,7 @@ import torch
 from refusals import assert_refused
 
 from deepaccident_devkit.errors import SensorFileError, WorkerError
-from deepaccident_devkit.model.loading import read_batches, worker_faults_named
+from deepaccident_devkit.plugins.model.loading import read_batches, worker_faults_named
 
 REMEDY = ("shared memory", "fewer workers", "without --workers")
 

@@ -9,19 +9,19 @@ from torch import Tensor, nn
 from torch_extra.compared import same
 
 from deepaccident_devkit.errors import ConfigError, GeometryError, NotAvailableError
-from deepaccident_devkit.model.motion import (
+from deepaccident_devkit.plugins.model.motion import (
     LatentDistribution,
     MotionHead,
     MotionHeadConfig,
     MotionLossConfig,
-    MotionMaps,
     MotionOutputs,
     MotionTargets,
+    PredictedMotionMaps,
     frame_mask,
     motion_losses,
 )
-from deepaccident_devkit.model.motion.decoders import FlowGru, ShuffledDecoder, warp_with_flow
-from deepaccident_devkit.model.motion.head import center_loss, vector_loss
+from deepaccident_devkit.plugins.model.motion.decoders import FlowGru, ShuffledDecoder, warp_with_flow
+from deepaccident_devkit.plugins.model.motion.head import center_loss, vector_loss
 
 # eight channels: a bottleneck of one channel of 3 × 3 cells can pass back a gradient of exactly 0
 SEPARATE = MotionHeadConfig(in_channels=8, latent=2, future_frames=2, samples=3)
@@ -161,7 +161,7 @@ def test_frames_that_do_not_count_change_no_loss() -> None:
     targets.frame_mask[0, 2] = targets.frame_mask[1] = False
     outputs = head(features, targets)
     ignored = ~targets.frame_mask[:, :, None, None, None]
-    changed = MotionMaps(*(torch.where(ignored, 7, maps) for maps in outputs.maps))
+    changed = PredictedMotionMaps(*(torch.where(ignored, 7, maps) for maps in outputs.maps))
     present = LatentDistribution(*(torch.cat([each[:1], each[1:] + 3]) for each in outputs.present))
     before = motion_losses(outputs, targets, LOSSES)
     assert all(loss.item() > 0 for loss in before.values())

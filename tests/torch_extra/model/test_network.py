@@ -10,12 +10,12 @@ from torch.testing import assert_close
 from torch_extra.model.small_model import small, small_both, small_lidar, small_released
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.export.torch import AllEgosDataset, RandomAugmentation, V2XDataset, collate, collate_all_egos
-from deepaccident_devkit.model.fusion import ReleasedFusionConfig
-from deepaccident_devkit.model.inputs import model_inputs
-from deepaccident_devkit.model.network import ModelConfig, V2XFormer
-from deepaccident_devkit.model.presets import fusion_config
+from deepaccident_devkit.plugins.model.fusion import ReleasedFusionConfig
+from deepaccident_devkit.plugins.model.inputs import model_inputs
+from deepaccident_devkit.plugins.model.network import ModelConfig, V2XFormer
+from deepaccident_devkit.plugins.model.presets import fusion_config
 from deepaccident_devkit.taxonomy import ModelFusion
+from deepaccident_devkit.training.torch import AllEgosDataset, RandomAugmentation, V2XDataset, collate, collate_all_egos
 
 Seeded = Callable[..., V2XFormer]
 Predicted = Callable[..., list[torch.Tensor]]

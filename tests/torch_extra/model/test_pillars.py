@@ -11,14 +11,14 @@ from torch_extra.model.small_model import small_both, small_lidar
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.export.torch import AllEgosDataset, V2XDataset, collate, collate_all_egos
 from deepaccident_devkit.geometry import BevGrid
-from deepaccident_devkit.model.inputs import model_inputs
-from deepaccident_devkit.model.network import ModelConfig, V2XFormer
-from deepaccident_devkit.model.pillars import PillarConfig, PillarEncoder
-from deepaccident_devkit.model.training_run import TrainConfig
-from deepaccident_devkit.model.training_step import TrainingStep, training_batch
+from deepaccident_devkit.plugins.model.inputs import model_inputs
+from deepaccident_devkit.plugins.model.network import ModelConfig, V2XFormer
+from deepaccident_devkit.plugins.model.pillars import PillarConfig, PillarEncoder
+from deepaccident_devkit.plugins.model.training_run import TrainConfig
+from deepaccident_devkit.plugins.model.training_step import TrainingStep, training_batch
 from deepaccident_devkit.taxonomy import POLE_HEIGHT
+from deepaccident_devkit.training.torch import AllEgosDataset, V2XDataset, collate, collate_all_egos
 from deepaccident_devkit.v2x import Link
 
 GRID = BevGrid(x=(-10.0, 10.0, 1.0), y=(-5.0, 5.0, 1.0))

@@ -29,20 +29,20 @@ from deepaccident_devkit.evaluation import (
 )
 from deepaccident_devkit.evaluation.forecasting import forecasting_truth
 from deepaccident_devkit.evaluation.motion import MOTION_PROTOCOLS
-from deepaccident_devkit.export.torch import V2XConfig, V2XDataset
-from deepaccident_devkit.model.detection import detection_targets
-from deepaccident_devkit.model.inputs import mirrored_boxes
-from deepaccident_devkit.model.motion import MotionMaps
-from deepaccident_devkit.model.network import V2XFormer
-from deepaccident_devkit.model.results import (
+from deepaccident_devkit.motion import MotionHeads, motion_labels
+from deepaccident_devkit.plugins.model.detection import detection_targets
+from deepaccident_devkit.plugins.model.inputs import mirrored_boxes
+from deepaccident_devkit.plugins.model.motion import PredictedMotionMaps
+from deepaccident_devkit.plugins.model.network import V2XFormer
+from deepaccident_devkit.plugins.model.results import (
     PredictConfig,
     SamplePrediction,
     motion_output,
     predict_results,
     predictions,
 )
-from deepaccident_devkit.motion import MotionHeads, motion_labels
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
+from deepaccident_devkit.training.torch import V2XConfig, V2XDataset
 from deepaccident_devkit.v2x import Link
 
 Seeded = Callable[..., V2XFormer]
@@ -275,7 +275,7 @@ class TestPerfectMaps:
         heads = MotionHeads.from_labels(label)
         centerness = logit(heads.centerness.clip(1e-6, 1 - 1e-6))
         fields = (heads.segmentation, centerness, heads.offset, heads.flow)
-        maps = MotionMaps(*[torch.as_tensor(np.array(each))[None, None].float() for each in fields])
+        maps = PredictedMotionMaps(*[torch.as_tensor(np.array(each))[None, None].float() for each in fields])
         motion = told(lambda found: found._replace(motion=found.motion._replace(maps=maps)))
         monkeypatch.setattr(V2XFormer, "forward", motion)
         evaluator.update(token, predict(perfect, da, [token])[0].motion, label)
@@ -303,7 +303,7 @@ def told(change: Callable[[Any], Any]) -> Callable[..., Any]:
 
 def test_centres_become_probabilities(model: V2XFormer) -> None:
     zeros = torch.zeros(2, 3, 2, 40, 40)
-    output = motion_output(MotionMaps(zeros, torch.full((2, 3, 1, 40, 40), 2.0), zeros, zeros), model)
+    output = motion_output(PredictedMotionMaps(zeros, torch.full((2, 3, 1, 40, 40), 2.0), zeros, zeros), model)
     assert (output.grid, len(output.heads or ())) == (model.config.labels.grid, 2)
     np.testing.assert_allclose(output.heads[0].centerness, 1 / (1 + np.exp(-2.0)), rtol=1e-6)
 

@@ -15,14 +15,14 @@ from torch_extra.model.small_model import small
 from deepaccident_devkit.errors import ChoiceError, ConfigError
 from deepaccident_devkit.export.images import ImageConfig
 from deepaccident_devkit.geometry import BevGrid
-from deepaccident_devkit.model import presets
-from deepaccident_devkit.model.bev import BevUNetConfig
-from deepaccident_devkit.model.checkpoint import FINAL, write_weights
-from deepaccident_devkit.model.fusion import CobevtConfig, DiscoNetConfig, PoolFusionConfig, V2XViTConfig
-from deepaccident_devkit.model.network import CameraConfig, ModelConfig, V2XFormer
-from deepaccident_devkit.model.pillars import PillarConfig
-from deepaccident_devkit.model.presets import (
-    PRESETS,
+from deepaccident_devkit.plugins.model import presets
+from deepaccident_devkit.plugins.model.bev import BevUNetConfig
+from deepaccident_devkit.plugins.model.checkpoint import FINAL, write_weights
+from deepaccident_devkit.plugins.model.fusion import CobevtConfig, DiscoNetConfig, PoolFusionConfig, V2XViTConfig
+from deepaccident_devkit.plugins.model.network import CameraConfig, ModelConfig, V2XFormer
+from deepaccident_devkit.plugins.model.pillars import PillarConfig
+from deepaccident_devkit.plugins.model.presets import (
+    MODEL_PRESETS,
     ModelChoice,
     load_model,
     released,
@@ -64,11 +64,11 @@ def test_released_has_the_quirks_of_the_release() -> None:
     ("fusion", "kind"),
     [("mean", PoolFusionConfig), ("disconet", DiscoNetConfig), ("cobevt", CobevtConfig), ("v2xvit", V2XViTConfig)],
 )
-@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("preset", MODEL_PRESETS)
 def test_a_fusion_fits_its_preset(fusion: ModelFusion, kind: type, preset: Any) -> None:
     config = ModelChoice(preset=preset, fusion=fusion).config
     assert isinstance(config.fusion, kind)
-    assert config == replace(PRESETS[preset](), fusion=config.fusion)
+    assert config == replace(MODEL_PRESETS[preset](), fusion=config.fusion)
     with torch.device("meta"):
         V2XFormer(config)
 
@@ -110,7 +110,7 @@ def test_a_choice_can_be_noted_and_made_again() -> None:
 
 
 def test_a_model_is_loaded_by_its_notes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(presets, "PRESETS", {"tiny": small})
+    monkeypatch.setattr(presets, "MODEL_PRESETS", {"tiny": small})
     choice = ModelChoice(fusion="cobevt")
     model, notes = V2XFormer(choice.config), {**choice.as_dict(), "step": 7}
 

@@ -12,10 +12,10 @@ from click.testing import CliRunner
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.errors import MissingExtraError
-from deepaccident_devkit.model import read_weights
-from deepaccident_devkit.model.checkpoint import SHIPPED, write_weights
+from deepaccident_devkit.plugins.model import read_weights
+from deepaccident_devkit.plugins.model.checkpoint import SHIPPED, write_weights
 
-demo: Any = importlib.import_module("deepaccident_devkit.synth.demo")
+demo: Any = importlib.import_module("deepaccident_devkit.plugins.synth.demo")
 
 
 @pytest.mark.parametrize("name", SHIPPED)
@@ -69,6 +69,6 @@ def test_the_demo_shows_their_prediction(da: DeepAccident, tmp_path: Path, monke
     page, without = (demo.demo_page([["agents"]], [], model=there) for there in (True, False))
     assert page.index("motion_labels_1s_before.png") < page.index(name)
     assert name not in without
-    monkeypatch.setattr("deepaccident_devkit.model.load_model", Mock(side_effect=MissingExtraError("no torch")))
+    monkeypatch.setattr("deepaccident_devkit.plugins.model.load_model", Mock(side_effect=MissingExtraError("no torch")))
     assert not demo.draw_model(da, tmp_path)
     assert not (tmp_path / name).exists()

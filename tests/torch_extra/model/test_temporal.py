@@ -6,8 +6,8 @@ from refusals import assert_refused
 
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.geometry import BevGrid
-from deepaccident_devkit.model.temporal import Temporal3D, TemporalConcat, TemporalConfig, temporal_model
-from deepaccident_devkit.model.warps import between_augmented, matrices_from_six, six_from_matrices
+from deepaccident_devkit.plugins.model.temporal import Temporal3D, TemporalConcat, TemporalConfig, temporal_model
+from deepaccident_devkit.plugins.model.warps import between_augmented, matrices_from_six, six_from_matrices
 
 GRID = BevGrid(x=(-6, 6, 1), y=(-4, 4, 1))
 KINDS = ["blocks", "concat"]

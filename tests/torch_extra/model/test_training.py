@@ -30,12 +30,11 @@ from torch_extra.model.small_model import RUN, small, small_released, trained
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, ConfigError, DeepAccidentError, NotAvailableError
-from deepaccident_devkit.export.torch import AllEgosDataset, V2XDataset, collate, collate_all_egos
-from deepaccident_devkit.model import training_loop as training
-from deepaccident_devkit.model.checkpoint import BEST, FINAL, LAST, load_weights, read_weights, write_weights
-from deepaccident_devkit.model.inputs import ModelInputs, mirrored_boxes, model_inputs
-from deepaccident_devkit.model.network import ModelConfig, V2XFormer
-from deepaccident_devkit.model.training_run import (
+from deepaccident_devkit.plugins.model import training_loop as training
+from deepaccident_devkit.plugins.model.checkpoint import BEST, FINAL, LAST, load_weights, read_weights, write_weights
+from deepaccident_devkit.plugins.model.inputs import ModelInputs, mirrored_boxes, model_inputs
+from deepaccident_devkit.plugins.model.network import ModelConfig, V2XFormer
+from deepaccident_devkit.plugins.model.training_run import (
     TrainConfig,
     add_to_log,
     checked_device,
@@ -44,7 +43,7 @@ from deepaccident_devkit.model.training_run import (
     processes,
     read_log,
 )
-from deepaccident_devkit.model.training_step import (
+from deepaccident_devkit.plugins.model.training_step import (
     MixedMoments,
     Moments,
     TrainingStep,
@@ -57,6 +56,7 @@ from deepaccident_devkit.model.training_step import (
     training_batch,
     with_dropped_partners,
 )
+from deepaccident_devkit.training.torch import AllEgosDataset, V2XDataset, collate, collate_all_egos
 
 SHORT = replace(RUN, steps=2, validation=None, save_every=1)
 TESTS = Path(__file__).parents[2]

@@ -7,13 +7,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from deepaccident_devkit.geometry import BevGrid, conventions
-from deepaccident_devkit.model.warps import (
+from deepaccident_devkit.plugins.model.warps import (
     agents_mask,
-    agents_to_ego,
     between_augmented,
+    features_to_ego,
     inside_mask,
     matrices_from_six,
-    present_from_past,
+    present_from_past_batch,
     six_from_matrices,
     warp_features,
 )
@@ -52,14 +52,14 @@ def test_exact_chains_lead_from_each_frame_to_the_present(vectors: list[torch.Te
     next_from_this = torch.linalg.inv(world_from_frame[1:]) @ world_from_frame[:-1]
     motion = six_from_matrices(next_from_this)[None]
     expected = torch.linalg.inv(world_from_frame[-1]) @ world_from_frame[:-1]
-    torch.testing.assert_close(present_from_past(motion)[0], expected, atol=1e-6, rtol=0)
+    torch.testing.assert_close(present_from_past_batch(motion)[0], expected, atol=1e-6, rtol=0)
 
 
 def test_the_released_chain_is_another_one_before_the_last_step_only() -> None:
     motion = torch.stack([turned(4, 0, 0, 0, 0, 0.5), turned(3, 1, 0, 0, 0, -0.2)], 1)
     first, second = matrices_from_six(motion[0])
     for chain, joined in (("exact", second @ first), ("released", first @ second)):
-        torch.testing.assert_close(present_from_past(motion, chain=chain)[0], torch.stack([joined, second]))
+        torch.testing.assert_close(present_from_past_batch(motion, chain=chain)[0], torch.stack([joined, second]))
 
 
 def test_augmented_transforms_lead_between_augmented_points() -> None:
@@ -115,7 +115,7 @@ def test_height_and_tilt_count_only_in_the_inverse_s_plane() -> None:
 def test_the_ego_is_neither_warped_nor_hidden_and_missing_agents_are() -> None:
     features = torch.rand(2, 3, 4, 24, 20, requires_grad=True)
     pose = matrices_from_six(turned(2, 1, 0, 0, 0, 0.4)).expand(2, 3, 4, 4)
-    placed = agents_to_ego(features, pose, GRID)
+    placed = features_to_ego(features, pose, GRID)
     assert torch.equal(placed[:, 0], features[:, 0])
     torch.testing.assert_close(placed[:, 2], warp_features(features[:, 2], pose[:, 2], GRID))
     inside = inside_mask(pose[0], GRID)[0]
@@ -129,7 +129,7 @@ def test_the_ego_is_neither_warped_nor_hidden_and_missing_agents_are() -> None:
 
 def test_a_batch_without_partners_has_an_ego_map_alone() -> None:
     features, pose = torch.rand(2, 1, 4, 24, 20), torch.eye(4).expand(2, 1, 4, 4)
-    assert torch.equal(agents_to_ego(features, pose, GRID), features)
+    assert torch.equal(features_to_ego(features, pose, GRID), features)
     assert agents_mask(torch.ones(2, 1, dtype=torch.bool), pose, GRID).all()
 
 
@@ -138,7 +138,7 @@ def test_autocast_does_not_round_poses() -> None:
     motion = torch.stack([turned(37.3, 0, 0, 0, 0, 0.4)] * 2, 1)
     features, far = torch.rand(1, 1, 24, 20), matrices_from_six(turned(0.3, 0.2, 0, 0, 0, 0.1))
     with torch.autocast("cpu", dtype=torch.bfloat16):
-        chain = present_from_past(motion, bev_transform=MIRRORED)
+        chain = present_from_past_batch(motion, bev_transform=MIRRORED)
         rounded = warp_features(features.bfloat16(), far, GRID)
-    assert torch.equal(chain, present_from_past(motion, bev_transform=MIRRORED))
+    assert torch.equal(chain, present_from_past_batch(motion, bev_transform=MIRRORED))
     torch.testing.assert_close(rounded, warp_features(features, far, GRID).bfloat16(), atol=1e-2, rtol=0)

@@ -11,16 +11,16 @@ import torch
 from studies import BASELINES, killed, written
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.baselines import detected_accidents
 from deepaccident_devkit.errors import ConfigError, SomeFailedError
-from deepaccident_devkit.export.torch import V2XDataset
-from deepaccident_devkit.model import PredictConfig, load_model, predictions, read_weights
-from deepaccident_devkit.model.presets import tiny
 from deepaccident_devkit.motion import MotionLabelConfig
-from deepaccident_devkit.study import read_recipe, run_study
-from deepaccident_devkit.study.predict import blanked, predictions_of, strangers_of, with_strangers
-from deepaccident_devkit.study.recipe import Row
-from deepaccident_devkit.study.summary import ALL
+from deepaccident_devkit.plugins.baselines import detected_accidents
+from deepaccident_devkit.plugins.model import PredictConfig, load_model, predictions, read_weights
+from deepaccident_devkit.plugins.model.presets import tiny
+from deepaccident_devkit.plugins.study import read_recipe, run_study
+from deepaccident_devkit.plugins.study.predict import blanked, predictions_of, strangers_of, with_strangers
+from deepaccident_devkit.plugins.study.recipe import StudyRow
+from deepaccident_devkit.plugins.study.summary import ALL
+from deepaccident_devkit.training.torch import V2XDataset
 
 SMALL = {"scenarios": 2, "frames": 8, "image_size": [64, 36], "sensors": "cameras", "view": "hidden", "designs": [1]}
 TRAINED = {"release": "training", "save_every": 1, "egos": 1}
@@ -48,7 +48,7 @@ MODELS: dict[str, Any] = {
     "groups": {},
     "compare": [["all", "sees all"]],
 }
-MODULE = "deepaccident_devkit.model.training_loop"
+MODULE = "deepaccident_devkit.plugins.model.training_loop"
 
 
 @pytest.fixture(scope="module")
@@ -99,8 +99,8 @@ def test_a_run_that_was_killed_ends_as_one_that_was_not(out: Path, tmp_path: Pat
     killed(path, again, MODULE, "add_to_log", 4)
     steps = sorted(len((each / "log.jsonl").read_text().splitlines()) for each in (again / "weights").iterdir())
     assert steps == [1, 3]  # of two seeds; those that begin from nothing come first
-    killed(path, again, "deepaccident_devkit.model.results", "prediction_of", 2)
-    killed(path, again, "deepaccident_devkit.study.predict", "blanked", 1)
+    killed(path, again, "deepaccident_devkit.plugins.model.results", "prediction_of", 2)
+    killed(path, again, "deepaccident_devkit.plugins.study.predict", "blanked", 1)
     run_study(read_recipe(str(path)), again, device="cpu", workers=2)
     for name in ("counts.json.gz", "tables/rows.csv", "tables/comparisons.csv"):
         assert (again / "mine" / name).read_bytes() == (out / "mine" / name).read_bytes()
@@ -237,7 +237,7 @@ def test_a_row_predicts_as_the_model_does(da: DeepAccident) -> None:
     tokens = [f"{da.scenario[0]['token']}/ego_vehicle/004"]
     shipped = read_weights("tiny").path
     [(token, (motion, accidents, boxes))] = predictions_of(
-        Row(name="all", weights="a"), shipped, "cpu", da, tokens, tiny().labels
+        StudyRow(name="all", weights="a"), shipped, "cpu", da, tokens, tiny().labels
     )
     [expected] = predictions(load_model("tiny"), da, tokens, PredictConfig())
     assert token == expected.token
@@ -247,7 +247,7 @@ def test_a_row_predicts_as_the_model_does(da: DeepAccident) -> None:
     assert expected.motion.heads is not None
     assert (motion.heads[-1].centerness == expected.motion.heads[-1].centerness).all()
     with pytest.raises(ConfigError, match="was trained with the labels clean; give `labels: clean` in"):
-        [*predictions_of(Row(name="all", weights="a"), shipped, "cpu", da, tokens, MotionLabelConfig())]
+        [*predictions_of(StudyRow(name="all", weights="a"), shipped, "cpu", da, tokens, MotionLabelConfig())]
 
 
 @pytest.mark.slow
@@ -262,9 +262,11 @@ def test_a_row_of_weights_and_a_baseline_has_alarms_from_the_boxes(
     da: DeepAccident, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     torch.set_num_threads(1)
-    monkeypatch.setattr("deepaccident_devkit.baselines.predict._LIKELY", 0.0)  # the weights are sure of little here
+    monkeypatch.setattr(
+        "deepaccident_devkit.plugins.baselines.predict._LIKELY", 0.0
+    )  # the weights are sure of little here
     tokens, shipped = [f"{each['token']}/ego_vehicle/004" for each in da.scenario], read_weights("tiny_lidar").path
-    rows = (Row(name="boxes", weights="a", baseline="constant_velocity"), Row(name="maps", weights="a"))
+    rows = (StudyRow(name="boxes", weights="a", baseline="constant_velocity"), StudyRow(name="maps", weights="a"))
     told = [dict(predictions_of(row, shipped, "cpu", da, tokens, tiny().labels)) for row in rows]
     for token, (_, accidents, boxes) in told[0].items():
         expected = detected_accidents(da, token, boxes)

@@ -31,7 +31,7 @@ from deepaccident_devkit.evaluation.intervals import (
 from deepaccident_devkit.evaluation.motion import MotionEvaluator
 from deepaccident_devkit.evaluation.runs.setups import TASKS, EvaluationSetup
 from deepaccident_devkit.evaluation.task import Row
-from deepaccident_devkit.safety.prevention_result import PreventedResult
+from deepaccident_devkit.plugins.safety.prevention_result import PreventedResult
 
 
 def made(

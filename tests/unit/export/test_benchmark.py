@@ -10,7 +10,7 @@ from scripts import of_checkout
 
 import deepaccident_devkit.export
 from deepaccident_devkit.export.bulk import Format
-from deepaccident_devkit.synth import SynthConfig
+from deepaccident_devkit.plugins.synth import SynthConfig
 
 benchmark = of_checkout("benchmarks.export")
 

@@ -29,7 +29,6 @@ from refusals import assert_refused
 from tiny_format import KilledFormat, TinyFormat
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit._version import __version__
 from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.errors import (
     ChoiceError,
@@ -44,8 +43,7 @@ from deepaccident_devkit.errors import (
     WorkerError,
 )
 from deepaccident_devkit.export import bulk
-from deepaccident_devkit.export.bulk import Export, Exported, Format, Link, Manifest, Output, Tally, export_release
-from deepaccident_devkit.export.image_cache import CachedImages
+from deepaccident_devkit.export.bulk import Export, Exported, Format, LinkKind, Manifest, Output, Tally, export_release
 from deepaccident_devkit.export.images import ImageConfig
 from deepaccident_devkit.export.nuscenes import NuScenes
 from deepaccident_devkit.export.opencood import OpenCood
@@ -53,12 +51,14 @@ from deepaccident_devkit.export.parquet import Parquet
 from deepaccident_devkit.export.questions import Questions
 from deepaccident_devkit.export.released_infos import ReleasedInfos
 from deepaccident_devkit.export.webdataset import WebDataset
-from deepaccident_devkit.parallel import Store
 from deepaccident_devkit.release import find_release
 from deepaccident_devkit.release.fingerprints import fingerprint, scenario_hashes
 from deepaccident_devkit.support.files import temporary_of, temporary_path
+from deepaccident_devkit.support.parallel import Store
+from deepaccident_devkit.support.version import __version__
 from deepaccident_devkit.tables import current_index
 from deepaccident_devkit.taxonomy import AGENTS
+from deepaccident_devkit.training.image_cache import CachedImages
 
 SCENARIOS, PICTURES = 3, 18
 MANIFEST, ARCHIVE = "tiny.manifest.json", ".deepaccident-tiny.zip"
@@ -333,7 +333,7 @@ class TestRelease:
         token = dataset.scenario[1]["token"]
         label = next(changing.glob(f"{token.replace('/', '/ego_vehicle/label/')}/*_002.txt"))
         label.write_text(label.read_text() + "\n")
-        named = ("the index is out of date", token, "deepaccident index DATAROOT --check")
+        named = ("the index is out of date", token, "deepaccident check index DATAROOT")
         assert_refused((lambda: written(dataset, tmp_path / "out"), IndexStoreError, named))
         assert not (tmp_path / "out").exists()
 
@@ -634,7 +634,7 @@ def source(tmp_path: Path) -> Path:
     return path
 
 
-def output_of(tmp_path: Path, link: Link = "hard", note: Callable[[str], object] = lambda _: None) -> Output:
+def output_of(tmp_path: Path, link: LinkKind = "hard", note: Callable[[str], object] = lambda _: None) -> Output:
     return Output(tmp_path / "out", tmp_path / "parts", link, note=note)
 
 
@@ -710,7 +710,7 @@ def test_leaving_out_counts(tmp_path: Path) -> None:
 class TestLinks:
     @pytest.mark.parametrize("link", ["hard", "symbolic", "copy"])
     @pytest.mark.parametrize("by_link", [False, True])
-    def test_each_way(self, tmp_path: Path, source: Path, link: Link, by_link: bool) -> None:
+    def test_each_way(self, tmp_path: Path, source: Path, link: LinkKind, by_link: bool) -> None:
         given = source
         if by_link:  # a release may be a tree of links
             given = tmp_path / "given.jpg"
@@ -753,7 +753,7 @@ class TestLinks:
 
     @pytest.mark.parametrize("link", ["hard", "symbolic"])
     def test_a_full_disk_is_no_reason_for_another_way(
-        self, tmp_path: Path, source: Path, monkeypatch: pytest.MonkeyPatch, link: Link
+        self, tmp_path: Path, source: Path, monkeypatch: pytest.MonkeyPatch, link: LinkKind
     ) -> None:
         monkeypatch.setattr(os, "link", refusing(errno.ENOSPC))
         monkeypatch.setattr(Path, "symlink_to", refusing(errno.ENOSPC))
@@ -772,7 +772,7 @@ class TestLinks:
         ],
         ids=["missing", "pipe", "folder", "link to nothing", "link to itself"],
     )
-    def test_what_is_no_file(self, tmp_path: Path, make: Callable[[Path], None], words: str, link: Link) -> None:
+    def test_what_is_no_file(self, tmp_path: Path, make: Callable[[Path], None], words: str, link: LinkKind) -> None:
         path = tmp_path / "odd.jpg"
         make(path)
         assert_refused(

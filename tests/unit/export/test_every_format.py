@@ -1,4 +1,4 @@
-"""Images that are stored in another size than calib says: each export has the K of the very file that it has."""
+"""All formats of `deepaccident export`: each is opened here, and has the K of the very images that it holds."""
 
 import json
 import pickle
@@ -7,12 +7,16 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import click
 import numpy as np
 import pytest
+from mcap_reading import read_mcap
 from nuscenes_reader import tables_of
 from opencood_reader import facts_of
+from verbs import called
 
 from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.cli.export import export
 from deepaccident_devkit.export.bulk import export_release
 from deepaccident_devkit.export.mmdet3d import Mmdet3d
 from deepaccident_devkit.export.nuscenes import NuScenes
@@ -94,3 +98,43 @@ def test_k_is_of_the_file_that_is_there(
         np.testing.assert_allclose(k, np.diag([width / lens.width, height / lens.height, 1]) @ lens.intrinsic)
         assert told in (None, (width, height))
         assert (lens.width, lens.height) != SIZE
+
+
+def first_line(out: Path) -> Any:
+    return json.loads(next(out.rglob("truth.jsonl")).read_text(encoding="utf-8").splitlines()[0])
+
+
+def tar_names(out: Path) -> list[str]:
+    with tarfile.open(next(out.glob("*.tar"))) as archive:
+        return archive.getnames()
+
+
+def parquet_tokens(out: Path) -> list[str]:
+    from pyarrow.parquet import read_table
+
+    return read_table(next(out.glob("sample/*.parquet")))["token"].to_pylist()
+
+
+OPENERS: dict[str, Callable[[Path], Any]] = {
+    "mcap": lambda out: read_mcap(next(out.glob("*.mcap"))),
+    "mmdet3d": lambda out: pickle.loads(next(out.glob("*_val.pkl")).read_bytes())["data_list"],
+    "nuscenes": lambda out: tables_of(out / "v1.0-deepaccident")["sample"],
+    "opencood": lambda out: sorted(out.rglob("*.yaml")),
+    "parquet": parquet_tokens,
+    "questions": first_line,
+    "town-maps": lambda out: json.loads(next(out.glob("*.geojson")).read_text(encoding="utf-8"))["features"],
+    "webdataset": tar_names,
+}
+"""Format → function that opens what `deepaccident export FORMAT` wrote and returns some of it."""
+
+
+@pytest.mark.parametrize("name", export.list_commands(click.Context(export)))
+def test_every_format_of_the_command_line_can_be_opened(
+    name: str, request: pytest.FixtureRequest, tmp_path: Path
+) -> None:
+    assert name in OPENERS, f"add a function that opens the format {name} to OPENERS"
+    out = tmp_path / ("scene.mcap" if name == "mcap" else "out")
+    dataset = request.getfixturevalue("da_motion" if name == "questions" else "da")  # questions need longer recordings
+    options = ("--observe", "1", "--ahead", "1") if name == "questions" else ()
+    called("export", name, dataset.dataroot, "--out", out, *options)
+    assert OPENERS[name](tmp_path if name == "mcap" else out)

@@ -12,7 +12,6 @@ from tiny_format import TinyFormat
 
 from deepaccident_devkit.errors import ChoiceError, ConfigError
 from deepaccident_devkit.export.bulk import Format, flat_name
-from deepaccident_devkit.export.image_cache import CachedImages
 from deepaccident_devkit.export.images import ImageConfig
 from deepaccident_devkit.export.nuscenes import NuScenes
 from deepaccident_devkit.export.opencood import OpenCood
@@ -20,6 +19,7 @@ from deepaccident_devkit.export.parquet import Parquet
 from deepaccident_devkit.export.questions import Questions, WindowRules
 from deepaccident_devkit.export.released_infos import ReleasedInfos
 from deepaccident_devkit.export.webdataset import WebDataset
+from deepaccident_devkit.training.image_cache import CachedImages
 
 TYPE = "type1_subtype1_accident"
 TOKENS = st.text(st.characters(exclude_categories=("Cs",), exclude_characters="/\0"), min_size=1, max_size=250)

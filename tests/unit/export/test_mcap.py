@@ -20,7 +20,6 @@ from PIL import Image
 from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit._version import __version__
 from deepaccident_devkit.cli.export import export
 from deepaccident_devkit.errors import (
     ChoiceError,
@@ -38,6 +37,7 @@ from deepaccident_devkit.export.mcap.layouts import write_layouts
 from deepaccident_devkit.motion import MotionHeads, motion_labels
 from deepaccident_devkit.release.npz import TAGS
 from deepaccident_devkit.render.styles import AGENT_COLORS, COLLIDER_COLOR, MAP_COLORS
+from deepaccident_devkit.support.version import __version__
 from deepaccident_devkit.taxonomy import AGENTS, CAMERAS, INFRASTRUCTURE, LIDAR, OWN_ACTOR_ID
 from deepaccident_devkit.v2x import cooperative_boxes, visible_instances
 

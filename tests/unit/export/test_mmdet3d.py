@@ -15,7 +15,7 @@ from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.cli.export import export
 from deepaccident_devkit.errors import ConfigError, ExportError
 from deepaccident_devkit.export.bulk import Exported, export_release
-from deepaccident_devkit.export.mmdet3d import CLASSES, Mmdet3d
+from deepaccident_devkit.export.mmdet3d import NUSCENES_CLASSES, Mmdet3d
 from deepaccident_devkit.export.nuscenes import NuScenes
 from deepaccident_devkit.taxonomy import AGENTS, OWN_ACTOR_ID
 
@@ -104,7 +104,9 @@ def test_labels_are_nuscenes_own(da: DeepAccident, exported: Exported, tmp_path:
     for folder, van in ((exported.folder, "car"), (trucks.folder, "truck")):
         instances = [each for split in ("train", "val") for info in infos(folder, split) for each in info["instances"]]
         named = {
-            (each["category"], CLASSES[each[key]]) for each in instances for key in ("bbox_label_3d", "bbox_label")
+            (each["category"], NUSCENES_CLASSES[each[key]])
+            for each in instances
+            for key in ("bbox_label_3d", "bbox_label")
         }
         ours = {category for category, _ in named}
         assert named == {(each, {"van": van, "cyclist": "bicycle"}.get(each, each)) for each in ours} > {("van", van)}

@@ -66,7 +66,7 @@ def test_rows_are_the_records_in_shards_of_any_size(
 
 
 def test_groups_of_rows_bound_the_memory(da: DeepAccident, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(parquet, "ROWS", 100)
+    monkeypatch.setattr(parquet, "ROW_GROUP_SIZE", 100)
     folder = export(da, tmp_path / "out").folder
     assert_all_rows(da, folder)
     footers = [pq.read_metadata(path) for path in (folder / "annotation").iterdir()]

@@ -8,7 +8,7 @@ from refusals import assert_refused
 
 from deepaccident_devkit.errors import GeometryError
 from deepaccident_devkit.geometry import SE3, Box, Boxes, box_arrays
-from deepaccident_devkit.geometry.box_arrays import COLUMNS
+from deepaccident_devkit.geometry.box_arrays import BOX_COLUMNS
 from deepaccident_devkit.geometry.boxes import concatenate, trusted_boxes
 
 
@@ -93,7 +93,7 @@ def test_an_index_says_what_it_cannot_pick(two: Boxes) -> None:
 
 
 def test_tokens_follow_the_sample(two: Boxes) -> None:
-    columns = {name: getattr(two, name) for name in COLUMNS}
+    columns = {name: getattr(two, name) for name in BOX_COLUMNS}
     known = Boxes(frame="lidar", sample="type/name/ego_vehicle/003", **columns)
     tokens = ["type/name/ego_vehicle/003/0", "type/name/ego_vehicle/003/1"]
     moved = known.transform(SE3.identity(), "ego")
@@ -139,7 +139,7 @@ def test_the_callers_arrays_are_copied_and_stay_writable() -> None:
     made = Boxes.from_arrays(center, np.ones((1, 3)), [0.0])
     center[0] = 5
     assert_array_equal(made.center, [[0, 0, 0]])
-    assert [getattr(made, name).flags.writeable for name in COLUMNS] == [False] * len(COLUMNS)
+    assert [getattr(made, name).flags.writeable for name in BOX_COLUMNS] == [False] * len(BOX_COLUMNS)
 
 
 @pytest.mark.parametrize(
@@ -206,7 +206,7 @@ def test_boxes_without_area_overlap_nothing(square: Boxes) -> None:
 
 @pytest.mark.parametrize("column", ["center", "size", "rotation"])
 def test_boxes_that_are_nowhere_have_no_gap_and_hold_nothing(square: Boxes, column: str) -> None:
-    columns = {name: getattr(square, name).copy() for name in COLUMNS}
+    columns = {name: getattr(square, name).copy() for name in BOX_COLUMNS}
     columns[column][0, 0] = np.nan
     nowhere = trusted_boxes("lidar", columns)  # the constructor takes none
     assert_array_equal(nowhere.distance_bev(square), [[np.nan]])
@@ -278,14 +278,14 @@ def test_many_pairs_are_worked_off_in_pieces(monkeypatch: pytest.MonkeyPatch) ->
     ],
 )
 def test_numbers_that_are_no_boxes_are_refused(two: Boxes, columns: dict[str, object], message: str) -> None:
-    good = {name: getattr(two, name) for name in ("frame", *COLUMNS)}
+    good = {name: getattr(two, name) for name in ("frame", *BOX_COLUMNS)}
     assert_refused(
         (lambda: Boxes(**{**good, **columns}), GeometryError, message),
     )
 
 
 def test_names_and_nearly_unit_quaternions_are_taken(two: Boxes) -> None:
-    good = {name: getattr(two, name) for name in ("frame", *COLUMNS)}
+    good = {name: getattr(two, name) for name in ("frame", *BOX_COLUMNS)}
     made = Boxes(**{**good, "category": ["van", "car"], "rotation": two.rotation * 1.0005})
     assert_array_equal(made.category, [2, 0])
     assert_allclose(made.rotation, two.rotation, atol=1e-15)

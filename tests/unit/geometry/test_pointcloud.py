@@ -8,7 +8,7 @@ from refusals import assert_refused
 
 from deepaccident_devkit.errors import GeometryError
 from deepaccident_devkit.geometry import SE3, BevGrid, LidarPointCloud
-from deepaccident_devkit.geometry.pointcloud import concatenate
+from deepaccident_devkit.geometry.pointcloud import concatenate_clouds
 
 
 def test_points_move_and_intensity_stays() -> None:
@@ -73,8 +73,12 @@ def test_select_picks_points(cloud: LidarPointCloud) -> None:
 
 
 def test_clouds_of_one_frame_join(cloud: LidarPointCloud) -> None:
-    joined = concatenate([cloud, cloud.crop(z=(1, 5))], "lidar")
-    assert (rows(joined), joined.intensity.dtype, len(concatenate([], "ego"))) == ([0, 1, 2, 3, 4, 3, 4], np.float32, 0)
+    joined = concatenate_clouds([cloud, cloud.crop(z=(1, 5))], "lidar")
+    assert (rows(joined), joined.intensity.dtype, len(concatenate_clouds([], "ego"))) == (
+        [0, 1, 2, 3, 4, 3, 4],
+        np.float32,
+        0,
+    )
 
 
 def test_points_keep_their_sources(cloud: LidarPointCloud) -> None:
@@ -82,11 +86,11 @@ def test_points_keep_their_sources(cloud: LidarPointCloud) -> None:
     assert (of_two.agent.dtype, of_two.time_lag.dtype) == (np.int8, np.float32)
     part = of_two.transform(SE3.identity(), "ego").crop(x=(1, 11)).select([0, 2])
     assert rows(part) == [1, 4]
-    for each in (part, concatenate([part], "ego")):
+    for each in (part, concatenate_clouds([part], "ego")):
         assert_array_equal(each.agent, [0, 4])
         assert_array_equal(each.time_lag, np.float32([0, 0.2]))
     assert not part.time_lag.flags.writeable
-    joined = concatenate([of_two, replace(of_two, agent=None)], "lidar")
+    joined = concatenate_clouds([of_two, replace(of_two, agent=None)], "lidar")
     assert (joined.agent, len(joined.time_lag)) == (None, 10)
 
 
@@ -102,7 +106,7 @@ def test_misuse_of_clouds_says_what_to_give(cloud: LidarPointCloud) -> None:
         (lambda: cloud.crop(y=(1, 0)), GeometryError, ("y: expected a start and an end not before it", "(1, 0)")),
         (lambda: cloud.crop(z=(1, 2, 3)), GeometryError, ("z: expected shape (2)",)),
         (lambda: cloud.select([5]), GeometryError, ("does not pick from 5 points",)),
-        (lambda: concatenate([cloud], "ego"), GeometryError, ("'lidar'", "'ego'", "transform them first")),
+        (lambda: concatenate_clouds([cloud], "ego"), GeometryError, ("'lidar'", "'ego'", "transform them first")),
         *[
             (
                 partial(LidarPointCloud, np.zeros((1, 3)), [0], wrong),

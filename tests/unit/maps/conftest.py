@@ -10,11 +10,11 @@ import pytest
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.maps import TownMap, town_map
+from deepaccident_devkit.plugins.synth import SynthConfig
+from deepaccident_devkit.plugins.synth.plan import plan_scenarios
+from deepaccident_devkit.plugins.synth.scenario import build_scenario
+from deepaccident_devkit.plugins.synth.world import World
 from deepaccident_devkit.support.arrays import FloatArray
-from deepaccident_devkit.synth import SynthConfig
-from deepaccident_devkit.synth.plan import plan_scenarios
-from deepaccident_devkit.synth.scenario import build_scenario
-from deepaccident_devkit.synth.world import World
 from deepaccident_devkit.taxonomy import CAMERAS, LIDAR
 
 

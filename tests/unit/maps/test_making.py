@@ -14,8 +14,8 @@ from refusals import assert_refused
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, NotAvailableError, TokenError
 from deepaccident_devkit.maps import TownMap, TownMapConfig, kept_town_map, making, town_map, towns_of
+from deepaccident_devkit.plugins.synth.roads import ROAD_CODES, SIDEWALK
 from deepaccident_devkit.support.arrays import BoolArray, FloatArray
-from deepaccident_devkit.synth.roads import ROAD_CODES, SIDEWALK
 from deepaccident_devkit.tables import clear_index
 from deepaccident_devkit.taxonomy import AGENTS, BEV_CAMERA
 
@@ -189,6 +189,6 @@ def test_a_damaged_kept_map_is_made_again(own_bev_release: DeepAccident, town: s
 def test_where_nothing_can_be_written_a_map_is_made_and_not_kept(
     own_bev_release: DeepAccident, town: str, mapped: TownMap, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("deepaccident_devkit.parallel.store.write_bytes", Mock(side_effect=PermissionError))
+    monkeypatch.setattr("deepaccident_devkit.support.parallel.store.write_own", Mock(side_effect=PermissionError))
     assert same(town_map(own_bev_release, town, workers=1), mapped)
     assert kept_town_map(own_bev_release, town) is None

@@ -15,7 +15,7 @@ from refusals import assert_refused
 from deepaccident_devkit.errors import ChoiceError, GeometryError
 from deepaccident_devkit.geometry.cell_outlines import outlines
 from deepaccident_devkit.maps import TownMap
-from deepaccident_devkit.maps.town_map import classes_of, geojson_of, simplified
+from deepaccident_devkit.maps.town_map import classes_of, geojson_of, simplified_polygons
 
 
 def tiny() -> TownMap:
@@ -102,8 +102,8 @@ def test_an_outline_holds_its_cells_and_no_others(mask: np.ndarray) -> None:
     rows, columns = np.indices(mask.shape)
     x, y = ORIGIN[0] + (columns + 0.5) * 0.25, ORIGIN[1] + (rows + 0.5) * 0.25
     np.testing.assert_array_equal(shapely.contains_xy(polygons, x, y), mask)
-    assert simplified(polygons, 0, 0).equals_exact(polygons, 0)
-    for each in (polygons, simplified(polygons, 0.25, 0.0625)):
+    assert simplified_polygons(polygons, 0, 0).equals_exact(polygons, 0)
+    for each in (polygons, simplified_polygons(polygons, 0.25, 0.0625)):
         assert each.is_valid
         rings = [(part.exterior.is_ccw, any(ring.is_ccw for ring in part.interiors)) for part in each.geoms]
         assert rings == [(True, False)] * len(rings)
@@ -113,7 +113,7 @@ def test_small_islands_and_holes_go() -> None:
     mask = np.zeros((40, 40), np.bool_)
     mask[2:30, 2:30] = mask[35:37, 35:37] = True
     mask[5:7, 5:7] = mask[10:16, 10:16] = False  # 0.25 m² and 2.25 m²
-    kept, everything = (simplified(outlines(mask, ORIGIN, 0.25), 0, least) for least in (1.0, 0.25))
+    kept, everything = (simplified_polygons(outlines(mask, ORIGIN, 0.25), 0, least) for least in (1.0, 0.25))
     (part,) = kept.geoms
     assert [shapely.Polygon(ring).area for ring in part.interiors] == [2.25]
     assert (len(everything.geoms), len(everything.geoms[0].interiors)) == (2, 2)
@@ -122,14 +122,14 @@ def test_small_islands_and_holes_go() -> None:
 def test_steps_of_a_slanting_edge_become_a_line() -> None:
     rows, columns = np.indices((80, 80))
     exact = outlines((np.abs(columns - rows) < 20) & (rows > 2) & (rows < 77), ORIGIN, 0.25)
-    straight = simplified(exact, 0.25, 1.0)
+    straight = simplified_polygons(exact, 0.25, 1.0)
     assert len(straight.geoms[0].exterior.coords) < 12 < len(exact.geoms[0].exterior.coords)
     assert straight.hausdorff_distance(exact) <= 0.25
 
 
 def test_nothing_has_no_polygon() -> None:
     empty = outlines(np.zeros((3, 3), np.bool_), ORIGIN, 0.25)
-    assert len(empty.geoms) == len(simplified(empty, 0.25, 1.0).geoms) == 0
+    assert len(empty.geoms) == len(simplified_polygons(empty, 0.25, 1.0).geoms) == 0
     assert json.loads(geojson_of("Town01", {"drivable": empty}))["features"] == []
 
 

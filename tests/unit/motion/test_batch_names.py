@@ -7,7 +7,7 @@ from deepaccident_devkit.errors import ChoiceError, ConfigError, FieldError, Geo
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.geometry.conventions import flip_six_vector
 from deepaccident_devkit.motion import FrameBoxes, MotionLabelConfig, MotionLabels, motion_labels_from_boxes
-from deepaccident_devkit.motion.batch_names import HEADS, MAPS, config_from_names
+from deepaccident_devkit.motion.batch_names import HEAD_NAMES, MAPS, config_from_names
 
 NAMES = ("fiery", "beverse", "deepaccident")
 
@@ -98,7 +98,7 @@ def test_beverses_and_deepaccidents_batches() -> None:
 
 def test_labels_answer_to_the_names_of_the_heads() -> None:
     labels = made()
-    for ours, head in HEADS.items():
+    for ours, head in HEAD_NAMES.items():
         assert getattr(labels, head) is getattr(labels, ours)
 
 

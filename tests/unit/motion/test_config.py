@@ -10,7 +10,7 @@ from refusals import assert_refused
 from deepaccident_devkit.errors import ChoiceError, ConfigError
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.motion import LABEL_PROTOCOLS, PRESETS, Augmentation, MotionLabelConfig
-from deepaccident_devkit.motion.config import label_config, slip_names
+from deepaccident_devkit.motion.config import resolved_label_config, slip_names
 from deepaccident_devkit.v2x import AgentConfig
 
 
@@ -166,10 +166,14 @@ def test_presets_and_protocols_cannot_be_changed() -> None:
 
 
 def test_a_configuration_may_be_named() -> None:
-    assert (label_config("fiery"), label_config(None)) == (PRESETS["fiery"], MotionLabelConfig())
-    assert label_config(PRESETS["beverse"]) is PRESETS["beverse"]
+    assert (resolved_label_config("fiery"), resolved_label_config(None)) == (PRESETS["fiery"], MotionLabelConfig())
+    assert resolved_label_config(PRESETS["beverse"]) is PRESETS["beverse"]
     assert_refused(
-        (lambda: label_config(3), ConfigError, "config: expected a MotionLabelConfig or the name of a preset, found 3"),
+        (
+            lambda: resolved_label_config(3),
+            ConfigError,
+            "config: expected a MotionLabelConfig or the name of a preset, found 3",
+        ),
     )
 
 

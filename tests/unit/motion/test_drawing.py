@@ -12,7 +12,6 @@ from numpy.testing import assert_allclose, assert_array_equal
 from refusals import assert_refused
 
 from deepaccident_devkit.errors import ConfigError, GeometryError
-from deepaccident_devkit.exact.polygon_fill import topmost
 from deepaccident_devkit.geometry import SE3, BevGrid, conventions
 from deepaccident_devkit.geometry.bev_grid import axes_of, to_orientation
 from deepaccident_devkit.motion import (
@@ -26,6 +25,7 @@ from deepaccident_devkit.motion import (
 )
 from deepaccident_devkit.motion.box_polygons import Footprints, box_polygons
 from deepaccident_devkit.motion.drawing import following_centers
+from deepaccident_devkit.motion.reference_arithmetic.polygon_fill import topmost
 from deepaccident_devkit.motion.warping import sampling_matrix
 
 STILL = np.zeros((7, 6))

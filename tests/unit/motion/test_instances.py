@@ -8,7 +8,6 @@ from numpy.testing import assert_allclose, assert_array_equal
 from refusals import assert_refused
 
 from deepaccident_devkit.errors import ChoiceError, ConfigError, GeometryError
-from deepaccident_devkit.exact.contours import redrawn_cells
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.motion.config import MotionLabelConfig
 from deepaccident_devkit.motion.grouping import LABEL_LOGIT, MotionHeads
@@ -21,6 +20,7 @@ from deepaccident_devkit.motion.instances import (
     trajectories,
 )
 from deepaccident_devkit.motion.labels import MotionLabels
+from deepaccident_devkit.motion.reference_arithmetic.contours import redrawn_cells
 
 SHAPE = (30, 40)
 

@@ -50,11 +50,11 @@ from deepaccident_devkit.motion import (
 )
 from deepaccident_devkit.motion.batch_names import BatchNames
 from deepaccident_devkit.motion.label_folder import (
-    FORMAT_VERSION,
+    LABEL_FORMAT_VERSION,
     MANIFEST,
     NOBODY,
     NOWHERE,
-    Manifest,
+    LabelManifest,
     StoredLabels,
     label_store,
     write_array,
@@ -265,7 +265,7 @@ def test_the_page_names_every_member_and_key(da_motion: DeepAccident, tmp_path: 
             assert f"| `{name.replace(frame, '<NNN>').removesuffix('.npy')}` |" in page
     for key in json.loads((tmp_path / MANIFEST).read_text()):
         assert f"| `{key}` |" in page
-    assert f"| `version` | {FORMAT_VERSION};" in page
+    assert f"| `version` | {LABEL_FORMAT_VERSION};" in page
     assert {str(NOWHERE).replace("-", "−"), "−2⁶³"} <= set(re.split(r"[ ;:,]", page))
     assert NOBODY == -(2**63)
 
@@ -728,7 +728,7 @@ class TestDamage:
         restate(folder, config={**MotionLabelConfig().as_dict(), "draw_ego": False})
         assert_refused((lambda: LabelFiles(folder), LabelFilesError, "its digest is not that of its configuration"))
 
-    @pytest.mark.parametrize(("version", "kind"), [(FORMAT_VERSION + 1, "newer"), (0, "older")])
+    @pytest.mark.parametrize(("version", "kind"), [(LABEL_FORMAT_VERSION + 1, "newer"), (0, "older")])
     def test_another_devkits_labels_are_refused_and_kept(
         self, small: DeepAccident, folder: Path, version: int, kind: str
     ) -> None:
@@ -736,7 +736,7 @@ class TestDamage:
         path.write_text(json.dumps({**json.loads(path.read_text()), "version": version, "new": 1}))
         before = contents(folder)
         sentence = (
-            rf"{kind} devkit's labels \(format version {version}, this devkit's is {FORMAT_VERSION}\); .* or make"
+            rf"{kind} devkit's labels \(format version {version}, this devkit's is {LABEL_FORMAT_VERSION}\); .* or make"
         )
         assert_refused(
             *[
@@ -934,7 +934,7 @@ def test_nothing_is_listed_before_all_is_there(da_b: DeepAccident, out: Path, wh
     """And what a killed process has begun is removed, unless others are at work."""
     store = label_store(out, "")
     with store.shared():
-        Manifest(MotionLabelConfig(), {}).write(out)
+        LabelManifest(MotionLabelConfig(), {}).write(out)
         assert_refused(
             (lambda: LabelFiles(out), LabelFilesError, "its labels are not complete"),
         )

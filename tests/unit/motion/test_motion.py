@@ -4,14 +4,13 @@ import numpy as np
 from refusals import assert_refused
 from written_out import written_out
 
-from deepaccident_devkit.errors import ChoiceError, LabelFilesError
+from deepaccident_devkit.errors import LabelFilesError
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.motion import (
     LabelFiles,
     MotionHeads,
     motion_labels_from_boxes,
     predict_instances,
-    samples,
     segmentation_of,
 )
 from deepaccident_devkit.release import BevImage
@@ -21,7 +20,7 @@ WRITTEN = {
     "augmentation.Augmentation": "rotation=0.0, scale=1.0, flip=False",
     "batch_names.MAPS": "('segmentation', 'instance', 'centerness', 'offset', 'flow')",
     "batch_names.VECTOR_MAPS": "('offset', 'flow')",
-    "batch_names.HEADS": (
+    "batch_names.HEAD_NAMES": (
         "mappingproxy({'segmentation': 'segmentation', 'centerness': 'instance_center', "
         "'offset': 'instance_offset', 'flow': 'instance_flow'})"
     ),
@@ -54,18 +53,15 @@ WRITTEN = {
     "label_files.LabelFiles": "config=None",
     "label_folder.NOWHERE": "-32768",
     "label_folder.NOBODY": "-9223372036854775808",
-    "label_folder.FORMAT": "'DeepAccident motion labels'",
-    "label_folder.FORMAT_VERSION": "1",
+    "label_folder.LABEL_FORMAT": "'DeepAccident motion labels'",
+    "label_folder.LABEL_FORMAT_VERSION": "1",
     "label_folder.MANIFEST": "'manifest.json'",
-    "label_folder.Manifest": "names=None",
-    "label_folder.Manifest.of": "names=None",
-    "label_folder.Manifest.check": "names=None",
+    "label_folder.LabelManifest": "names=None",
+    "label_folder.LabelManifest.of": "names=None",
+    "label_folder.LabelManifest.check": "names=None",
     "labels.MotionLabels": "at_present=False",
     "labels.MotionLabels.to_present": "centerness='nearest'",
     "labels.MotionLabels.from_batch": "at_present=False",
-    "sample_labels.samples": "protocol='released', horizon=2.0, scope='accident', sensors=()",
-    "sample_labels.training_samples": "sensors=()",
-    "sample_labels.evaluation_samples": "protocol='released', horizon=2.0, scope='accident'",
     "sample_labels.motion_labels": "config=None, id_map=None",
     "sample_labels.motion_labels_of": "config=None",
     "warping.present_from_frames": "augmentation=None",
@@ -89,5 +85,4 @@ def test_every_default_and_constant_written_out() -> None:
     assert not segmentation_of(image, BevGrid((-1, 1, 1), (-1, 1, 1))).masks.any()
     assert_refused(
         (lambda: LabelFiles("nowhere"), LabelFilesError, ("nowhere",)),
-        (lambda: samples(None, "train", "nothing"), ChoiceError, ("'nothing'",)),  # type: ignore[arg-type]
     )

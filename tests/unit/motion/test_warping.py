@@ -9,11 +9,11 @@ from numpy.testing import assert_array_equal
 from refusals import assert_refused
 
 from deepaccident_devkit.errors import ChoiceError, GeometryError, NotAvailableError
-from deepaccident_devkit.exact import single_precision
 from deepaccident_devkit.geometry import BevGrid, conventions
 from deepaccident_devkit.motion.augmentation import Augmentation
 from deepaccident_devkit.motion.config import LABEL_PROTOCOLS, LabelProtocol, MotionLabelConfig
 from deepaccident_devkit.motion.labels import MotionLabels
+from deepaccident_devkit.motion.reference_arithmetic import single_precision
 from deepaccident_devkit.motion.warping import (
     agents_to_ego,
     nearest_indices,

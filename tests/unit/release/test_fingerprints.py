@@ -50,7 +50,7 @@ def test_one_file_changes_one_hash_and_the_index_is_refused(
     path.write_bytes(path.read_bytes()[:-1] + b" ")
     changed = folder_hashes(folder_of(own_release, scenario)).as_dict()
     assert [name for name, value in before.as_dict().items() if changed[name] != value] == [kind]
-    named = (str(own_release), "the index is out of date", scenario, "deepaccident index DATAROOT --check")
+    named = (str(own_release), "the index is out of date", scenario, "deepaccident check index DATAROOT")
     assert_refused((lambda: scenario_hashes(opened, [scenario]), IndexStoreError, named))
     others = opened.split_scenarios("val")
     assert list(scenario_hashes(opened, others)) == sorted(others)

@@ -4,8 +4,8 @@ import pytest
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.motion import MotionLabels
+from deepaccident_devkit.plugins.synth import SynthConfig, make_release
 from deepaccident_devkit.statistics import DatasetStatistics, dataset_statistics
-from deepaccident_devkit.synth import SynthConfig, make_release
 
 
 @pytest.fixture(scope="session")

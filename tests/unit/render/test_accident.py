@@ -17,7 +17,7 @@ from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import NotAvailableError
 from deepaccident_devkit.geometry import SE3, Boxes
 from deepaccident_devkit.render import detached_figure
-from deepaccident_devkit.render.accident import Pair, accident_words, draw_countdown, render_accident
+from deepaccident_devkit.render.accident import CollidingPair, accident_words, draw_countdown, render_accident
 from deepaccident_devkit.render.boxes import camera_name
 from deepaccident_devkit.render.camera import best_view
 from deepaccident_devkit.render.styles import COLLIDER_COLOR
@@ -171,7 +171,7 @@ def red_size(ax: Any) -> Any:
 
 def assert_pair_is_seen(da: DeepAccident, scenario: Any, seconds: Sequence[float], width: float = 3.3) -> None:
     """At every moment: in the cameras of three agents or more, and from above with both tags; no tag is left out."""
-    tags = {*Pair.of(da, da.collision(scenario)).tags.values()}
+    tags = {*CollidingPair.of(da, da.collision(scenario)).tags.values()}
     figure = detached_figure((width * len(seconds), 4.2 * width))
     render_accident(da, scenario, seconds=seconds, agents=AGENTS, fig=figure)
     figure.draw_without_rendering()
@@ -197,15 +197,19 @@ def test_the_pair_of_each_design_is_seen_up_to_the_impact(da_designs: DeepAccide
 
 
 def test_a_camera_that_saw_the_pair_is_kept(da: DeepAccident, accident: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    pair, at, below = Pair.of(da, da.collision(accident)), Pair.at, SE3.from_rotation(np.eye(3), [0.0, 0.0, -500.0])
+    pair, at, below = (
+        CollidingPair.of(da, da.collision(accident)),
+        CollidingPair.at,
+        SE3.from_rotation(np.eye(3), [0.0, 0.0, -500.0]),
+    )
     channel, view, last = pair.view("ego_vehicle_behind", 5)
     assert (view is not None, last) == (True, 5)
 
-    def gone_at_the_impact(self: Pair, index: int, seen_by: str | None = None) -> Boxes:
+    def gone_at_the_impact(self: CollidingPair, index: int, seen_by: str | None = None) -> Boxes:
         boxes = at(self, index, seen_by)
         return boxes.transform(below, "world") if index == 6 else boxes
 
-    monkeypatch.setattr(Pair, "at", gone_at_the_impact)
+    monkeypatch.setattr(CollidingPair, "at", gone_at_the_impact)
     assert pair.view("ego_vehicle_behind", 6) == (channel, None, 5)
     figure = drawn(da, accident, seconds=[0.0], agents=["ego_vehicle_behind"])
     assert "seen 0.1 s ago" in texts(figure.axes[0])[0]
@@ -221,7 +225,7 @@ def test_rows_are_columns_in_a_wide_figure(da: DeepAccident, accident: str) -> N
 def test_where_there_is_little_room_the_agents_that_see_the_pair_best_are_shown(
     da: DeepAccident, accident: str
 ) -> None:
-    pair, seconds = Pair.of(da, da.collision(accident)), (0.3, 0.2, 0.1, 0.0)
+    pair, seconds = CollidingPair.of(da, da.collision(accident)), (0.3, 0.2, 0.1, 0.0)
     few, asked = (
         render_accident(da, accident, seconds=seconds, agents=agents, fig=detached_figure((8.0, 4.5)))
         for agents in (None, AGENTS)

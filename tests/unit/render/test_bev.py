@@ -13,6 +13,7 @@ from matplotlib.quiver import Quiver
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.geometry import SE3
+from deepaccident_devkit.plugins.synth import SynthConfig, make_release
 from deepaccident_devkit.release import BevImage
 from deepaccident_devkit.release.npz import TAGS
 from deepaccident_devkit.render.bev import BevView, draw_bev, render_bev
@@ -26,7 +27,6 @@ from deepaccident_devkit.render.styles import (
     OWN_COLOR,
     POINT_COLOR,
 )
-from deepaccident_devkit.synth import SynthConfig, make_release
 from deepaccident_devkit.taxonomy import AGENTS, OWN_ACTOR_ID, short_name
 from deepaccident_devkit.v2x import Link, PoseNoise, cooperative_boxes
 

@@ -18,15 +18,15 @@ from scripts import loaded_script
 
 import deepaccident_devkit
 from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.plugins.safety import lead_time_ledger
+from deepaccident_devkit.plugins.safety.figures import render_lead_times
 from deepaccident_devkit.render import detached_figure, style, styles
 from deepaccident_devkit.render.figures import save_picture
 from deepaccident_devkit.render.motion_maps import direction_colors
 from deepaccident_devkit.render.notebook import png_of
 from deepaccident_devkit.render.statistics import render_statistics
 from deepaccident_devkit.render.training import render_curve
-from deepaccident_devkit.render.video import Scene, views_of
-from deepaccident_devkit.safety import lead_time_ledger
-from deepaccident_devkit.safety.figures import render_lead_times
+from deepaccident_devkit.render.video import VideoScene, views_of
 from deepaccident_devkit.statistics import dataset_statistics
 
 HOSTILE: dict[str, Any] = {
@@ -140,7 +140,7 @@ def test_a_video_and_what_a_notebook_shows_know_no_setting(da_motion: DeepAccide
     sample, made = da_motion.sample[40], []
     for settings in ({}, HOSTILE):
         with mpl.rc_context(settings):
-            scene = Scene(dataset=da_motion, views=views_of("bev", None), agents=None, width=160, height=160)
+            scene = VideoScene(dataset=da_motion, views=views_of("bev", None), agents=None, width=160, height=160)
             made.append((scene.picture(sample["frame_token"]).tobytes(), png_of(da_motion.boxes(sample))))
     assert made[0] == made[1]
 

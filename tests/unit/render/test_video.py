@@ -18,7 +18,7 @@ from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, MissingExtraError
 from deepaccident_devkit.render.camera import CAMERA_DEFAULT, draw_camera
 from deepaccident_devkit.render.styles import AGENT_COLORS, COLLIDER_COLOR
-from deepaccident_devkit.render.video import VIEWS, Scene, names_at, render_scenario_video, views_of, write_video
+from deepaccident_devkit.render.video import VIEWS, VideoScene, names_at, render_scenario_video, views_of, write_video
 from deepaccident_devkit.tables.tokens import frame_token
 from deepaccident_devkit.taxonomy import AGENTS, CAMERAS
 
@@ -44,7 +44,7 @@ def test_a_video_has_all_frames_in_order_at_its_size(video: Callable[..., Path],
 @pytest.mark.slow
 def test_the_same_pictures_are_the_same_bytes(da: DeepAccident, accident: str, tmp_path: Path) -> None:
     """Whatever the memory held that the encoder gets; rare, hence many times."""
-    scene = Scene(dataset=da, views=views_of([grey, "bev"], None), agents=None, width=SIZE[0], height=SIZE[1])
+    scene = VideoScene(dataset=da, views=views_of([grey, "bev"], None), agents=None, width=SIZE[0], height=SIZE[1])
     pictures = [scene.picture(frame_token(accident, number)) for number in (1, 2, 3)]
     rng = np.random.default_rng(0)
     for number in range(400):
@@ -121,7 +121,7 @@ def video(da: DeepAccident, accident: str, tmp_path: Path) -> Callable[..., Path
 
 def picture_of(da: DeepAccident, frame: str, what: Any, size: tuple[int, int], agents: Any = None) -> Any:
     """A frame of a video."""
-    scene = Scene(dataset=da, views=views_of(what, None), agents=agents, width=size[0], height=size[1])
+    scene = VideoScene(dataset=da, views=views_of(what, None), agents=agents, width=size[0], height=size[1])
     return scene.picture(frame)
 
 

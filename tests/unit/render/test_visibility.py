@@ -9,10 +9,10 @@ from matplotlib.colors import to_hex, to_rgba
 from wording import lacking
 
 from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.plugins.synth import SynthConfig, make_release
 from deepaccident_devkit.render import detached_figure
 from deepaccident_devkit.render.styles import AGENT_COLORS, COLLIDER_COLOR
 from deepaccident_devkit.render.visibility import render_visibility, render_visibility_matrix, visibility_of
-from deepaccident_devkit.synth import SynthConfig, make_release
 from deepaccident_devkit.taxonomy import AGENTS
 
 

@@ -17,7 +17,7 @@ from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.geometry import quaternions
 from deepaccident_devkit.geometry.box_arrays import gaps_of_pairs
 from deepaccident_devkit.statistics import FACTS, Fact, ReleaseFacts, release_facts
-from deepaccident_devkit.statistics.scenario_facts import scenario_facts
+from deepaccident_devkit.statistics.scenario_facts import counted_scenario_facts
 
 QUIET = "ClearNoon -1 -1 -1 -1 -1 -1 -1 18\n" + "\n".join(META.splitlines()[1:]).replace("ego other", "none none")
 UNKNOWN = META.replace("1212 car", "0 car").replace("ego other", "ego none")
@@ -31,7 +31,7 @@ def named(number: int) -> str:
 def values_of(root: Path, key: str) -> list[float] | list[list[float]]:
     """The values of a fact, of all scenarios of a release."""
     da = DeepAccident(dataroot=root, verbose=False)
-    found = [scenario_facts(da, record).values.get(key) for record in da.scenario[:]]
+    found = [counted_scenario_facts(da, record).values.get(key) for record in da.scenario[:]]
     return [value for each in found if each is not None for value in each.tolist()]
 
 
@@ -121,7 +121,7 @@ def test_the_least_gaps_and_errors_are_those_of_plain_loops(da_motion: DeepAccid
         velocity = (place - before["translation"][:2]) * 2 if before else np.array(row["velocity"][:2])
         return np.array([*(place + velocity * seconds), *row["size"][:2], quaternions.yaw_of(row["rotation"])])
 
-    found = scenario_facts(da_motion, record).values
+    found = counted_scenario_facts(da_motion, record).values
     for frame, second, hit in ((11, 1, 0), (11, 2, 0), (11, 3, 1), (21, 1, 0), (21, 2, 1), (31, 1, 1)):
         times = np.arange(10 * second - 9, 10 * second + 1) / 10
         ahead = {actor: np.array([box(actor, frame, time) for time in times]) for actor, when in at if when == frame}

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from deepaccident_devkit.parallel import batches, own_threads
 from deepaccident_devkit.support.cores import quota_below, usable_cores
+from deepaccident_devkit.support.parallel import batches, own_threads
 
 VERSION_1 = {"cpu.cfs_quota_us": "{0}\n", "cpu.cfs_period_us": "{1}\n"}
 VERSION_2 = {"cpu.max": "{} {}\n"}
@@ -62,7 +62,7 @@ def test_a_system_without_control_groups_has_no_quota(tmp_path: Path) -> None:
 def test_a_job_on_one_core_of_a_large_node() -> None:
     code = (
         "import os; os.cpu_count = lambda: 128; os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})\n"
-        "from deepaccident_devkit.parallel.batches import _worker_count\n"
+        "from deepaccident_devkit.support.parallel.batches import _worker_count\n"
         "print(_worker_count(None, 10_000))"
     )
     command = [sys.executable, "-c", code]

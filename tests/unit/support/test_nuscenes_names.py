@@ -46,7 +46,7 @@ def test_none_of_the_names_is_here(kind: type, names: Mapping[str, str]) -> None
 
 @pytest.mark.parametrize(
     "names",
-    [*(names for _, names in CLASSES), nuscenes_names.KEYWORDS, nuscenes_names.FIELDS],
+    [*(names for _, names in CLASSES), nuscenes_names.KEYWORDS, nuscenes_names.FIELD_HINTS],
     ids=["dataset", "box", "cloud", "keywords", "fields"],
 )
 def test_each_counterpart_is_here(names: Mapping[str, str]) -> None:
@@ -151,12 +151,12 @@ def test_a_misspelt_argument_is_named(da: DeepAccident, call, argument: str, mea
 def test_a_field_of_nuscenes_names_the_counterpart(da: DeepAccident, table: str) -> None:
     record = getattr(da, table)[0]
     ours = {"agent": {"first_sample_token", "last_sample_token"}}.get(table, set())
-    assert {field for field in nuscenes_names.FIELDS if field in record} <= ours
+    assert {field for field in nuscenes_names.FIELD_HINTS if field in record} <= ours
     no = "the record has no field '{}'"
     assert_refused(
         *(
             (lambda field=field: record[field], FieldError, (f"{no.format(field)}: {counterpart} ",))
-            for field, counterpart in nuscenes_names.FIELDS.items()
+            for field, counterpart in nuscenes_names.FIELD_HINTS.items()
             if field not in record
         ),
         (lambda: record["tokn"], KeyError, (f"{no.format('tokn')}; it has token, ", "; did you mean 'token'?")),
@@ -184,5 +184,5 @@ def test_the_page_has_every_name() -> None:
     page = (Path(__file__).parents[3] / "docs" / "reading.md").read_text(encoding="utf-8")
     left = " ".join(re.findall(r"^\| (.*) \| .* \|$", page, re.MULTILINE))
     every = {name for _, names in CLASSES for name in names} | set(nuscenes_names.TABLES)
-    every |= nuscenes_names.KEYWORDS.keys() | nuscenes_names.FIELDS.keys()
+    every |= nuscenes_names.KEYWORDS.keys() | nuscenes_names.FIELD_HINTS.keys()
     assert sorted(name for name in every if not re.search(rf"\b{name}\b", left)) == []

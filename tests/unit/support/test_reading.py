@@ -20,13 +20,13 @@ from refusals import assert_refused
 import deepaccident_devkit
 from deepaccident_devkit.errors import shortened
 from deepaccident_devkit.support.reading import (
+    BYTE_LIMITS,
     DAMAGED_ARCHIVE,
-    LIMITS,
     LIMITS_VARIABLE,
     array_of,
+    byte_limit,
     check_size,
     file_checksum,
-    limit_of,
     mapped_file,
     open_file,
     open_zip,
@@ -99,33 +99,33 @@ def test_what_can_be_no_name_is_said_in_our_words(tmp_path: Path, name: str, rea
     )
 
 
-@pytest.mark.parametrize("kind", LIMITS)
+@pytest.mark.parametrize("kind", BYTE_LIMITS)
 def test_a_file_above_its_limit_is_refused_before_it_is_read(path: Path, kind) -> None:
     with path.open("wb") as file:
-        file.truncate(LIMITS[kind] + 1)  # a sparse file takes no room
+        file.truncate(BYTE_LIMITS[kind] + 1)  # a sparse file takes no room
     assert_refused(
         (
             lambda: read_bytes(path, kind),
             OSError,
-            rf"{LIMITS[kind] + 1:,} bytes, more than .* set {LIMITS_VARIABLE}={kind}=\d+M",
+            rf"{BYTE_LIMITS[kind] + 1:,} bytes, more than .* set {LIMITS_VARIABLE}={kind}=\d+M",
         )
     )
 
 
 def test_a_remedy_that_is_followed_helps(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with path.open("wb") as file:
-        file.truncate(LIMITS["meta"] + 1)
+        file.truncate(BYTE_LIMITS["meta"] + 1)
     with pytest.raises(OSError, match="limit for meta") as raised:
         read_bytes(path, "meta")
     monkeypatch.setenv(*raised.value.strerror.rsplit(" ", 1)[1].split("=", 1))
-    assert len(read_bytes(path, "meta")) == LIMITS["meta"] + 1
+    assert len(read_bytes(path, "meta")) == BYTE_LIMITS["meta"] + 1
 
 
 def test_the_limits_of_the_environment_reach_spawned_workers(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(LIMITS_VARIABLE, "label=2K, lidar=3M bev=7")
-    assert [limit_of(kind) for kind in ("label", "lidar", "bev", "meta")] == [2048, 3 << 20, 7, LIMITS["meta"]]
+    assert [byte_limit(kind) for kind in ("label", "lidar", "bev", "meta")] == [2048, 3 << 20, 7, BYTE_LIMITS["meta"]]
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
-        assert pool.submit(limit_of, "label").result() == 2048
+        assert pool.submit(byte_limit, "label").result() == 2048
 
 
 @pytest.mark.parametrize("text", ["label", "label=", "label=0", "labels=3M", "label=3X", "label=-1", "x" * 10_000])
@@ -149,25 +149,26 @@ OTHER_WAYS_TO_READ = re.compile(
 NOT_OF_STRANGERS = {
     "support/reading.py": "the gate",
     "support/files.py": "the system's processes",
-    "audit/reader.py": "labels that were written a line before",
+    "plugins/audit/reader.py": "labels that were written a line before",
     "cli/process.py": "nothing: the null device",
-    "synth/demo.py": "the mark of the demo's own folder",
+    "plugins/synth/demo.py": "the mark of the demo's own folder",
     "evaluation/runs/bundles.py": "counts that were written a line before",
-    "explore/pages/release.py": "the split file that was written a line before",
-    "explore/pages/responses.py": "the package's own styles and scripts",
-    "explore/serving.py": "a browser",
+    "plugins/explore/pages/release.py": "the split file that was written a line before",
+    "plugins/explore/pages/responses.py": "the package's own styles and scripts",
+    "plugins/explore/serving.py": "a browser",
     "export/questions/questions.py": "the parts that the export wrote",
     "statistics/real_facts.py": "the package's own facts",
     "support/cores.py": "the system's limits",
     "support/nuscenes_names.py": "the package's own hints",
     "support/pages.py": "the package's own templates",
-    "parallel/store.py": "locks, of which nothing is believed",
+    "support/parallel/store.py": "locks, of which nothing is believed",
     "validation/codes.py": "the package's own kinds of findings",
+    "validation/croissant.py": "the package's own copy of a context",
     "release/images.py": "the head of an image that the gate opened",
     "release/store/store.py": "the cache's own copies",
     "release/store/sources.py": "fsspec, and the directory of an archive that the gate or fsspec opened",
-    "synth/benchmark.py": "the package's own benchmarks",
-    "synth/spec/catalogue.py": "the package's own designs",
+    "plugins/synth/benchmark.py": "the package's own benchmarks",
+    "plugins/synth/spec/catalogue.py": "the package's own designs",
 }
 
 

@@ -11,7 +11,6 @@ from refusals import assert_refused
 from verbs import commands
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.baselines import Baseline
 from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.cli.agents import agent_names, names_or_configuration
 from deepaccident_devkit.cli.verbs import WordChoice
@@ -22,10 +21,11 @@ from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 from deepaccident_devkit.export.mcap import McapConfig
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.motion import MotionLabelConfig, agents_to_ego, config_from_names
+from deepaccident_devkit.plugins.baselines import Baseline
+from deepaccident_devkit.plugins.synth import SynthConfig
 from deepaccident_devkit.release import find_release
 from deepaccident_devkit.render.figures import layers_of
 from deepaccident_devkit.support.text import choice, differing_text, meant_text
-from deepaccident_devkit.synth import SynthConfig
 from deepaccident_devkit.testing import SmallRelease
 from deepaccident_devkit.v2x import AgentConfig, cooperating_agents
 

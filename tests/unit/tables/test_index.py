@@ -30,9 +30,9 @@ from deepaccident_devkit.errors import (
     NotAvailableError,
     VersionError,
 )
-from deepaccident_devkit.overview import overview
 from deepaccident_devkit.release import find_release
 from deepaccident_devkit.release.fingerprints import folder_hashes
+from deepaccident_devkit.statistics.overview import overview
 from deepaccident_devkit.support import files
 from deepaccident_devkit.tables import clear_index, indexing
 from deepaccident_devkit.tables import index as index_module
@@ -230,7 +230,7 @@ def test_opening_again_reads_no_label(root: Path, monkeypatch: pytest.MonkeyPatc
 
 
 def test_a_check_says_what_it_compared(root: Path) -> None:
-    whole = CliRunner().invoke(deepaccident, ["index", str(root), "--check"])
+    whole = CliRunner().invoke(deepaccident, ["check", "index", str(root)])
     assert (whole.exit_code, "label, calib and meta files of 2 scenarios\n" in whole.stdout) == (0, True)
 
 
@@ -241,9 +241,9 @@ def test_a_refresh_reads_just_what_was_edited_added_or_removed(root: Path, monke
         indexing, "read_scenario", lambda scenario, scan: (read.append(scenario.name), original(scenario, scan))[1]
     )
 
-    def refreshed(*options: str) -> tuple[int, list[str]]:
+    def refreshed(*verbs: str) -> tuple[int, list[str]]:
         read.clear()
-        assert CliRunner().invoke(deepaccident, ["index", str(root), *options]).exit_code == 0
+        assert CliRunner().invoke(deepaccident, [*(verbs or ("index",)), str(root)]).exit_code == 0
         names = sorted(read)
         shutil.rmtree(root.parent / "fresh", ignore_errors=True)
         count = len(opened(root, root.parent / "fresh").annotation)
@@ -252,9 +252,9 @@ def test_a_refresh_reads_just_what_was_edited_added_or_removed(root: Path, monke
 
     before, names = refreshed()
     assert names == [tiny.NAME, OTHER]
-    assert refreshed("--check") == (before, [])
+    assert refreshed("check", "index") == (before, [])
     edit(root, OTHER)
-    assert refreshed("--check") == (before - 1, [OTHER])
+    assert refreshed("check", "index") == (before - 1, [OTHER])
     tiny.write_tiny_release(root, scenario_type="type1_subtype2_accident", name=THIRD)
     assert refreshed()[1] == [THIRD]
     shutil.rmtree(root / "type1_subtype2_accident")
@@ -430,7 +430,7 @@ def index_in_the_cache(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         opened(root)
 
 
-@pytest.mark.parametrize("arguments", ["index", "index a b", "index a --clear --check"])
+@pytest.mark.parametrize("arguments", ["index", "index a b", "check index", "index a --clear --workers 2"])
 def test_wrong_usage_is_status_2(arguments: str) -> None:
     result = CliRunner().invoke(deepaccident, arguments.split())
     assert (result.exit_code, "Usage: " in result.output) == (2, True)

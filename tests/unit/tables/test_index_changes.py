@@ -135,7 +135,7 @@ def test_what_was_written_in_place_is_seen_by_index_and_told_by_validate(root: P
         assert opened(root).tables_folder == before.tables_folder
         (finding,) = [each for each in validate_release(root, workers=1).findings if each.code == "index-outdated"]
         assert (finding.severity, finding.scenario) == ("warning", tiny.TOKEN)
-        assert "deepaccident index DATAROOT" in finding.remedy
+        assert "deepaccident check index DATAROOT" in finding.remedy
     called("index", root)
     assert is_right(opened(root), root)
     assert "index-outdated" not in {finding.code for finding in validate_release(root, workers=1).findings}
@@ -182,7 +182,7 @@ def test_a_damaged_list_of_hashes_is_refused_and_validate_goes_on(root: Path) ->
     table.unlink()
     table.write_bytes(content.replace(b'{"label"', b'["label"'))
     assert validate_release(root, workers=1).scenarios == 1
-    with pytest.raises(index_module.IndexStoreError, match=r"hashes of its files are damaged; .* --check"):
+    with pytest.raises(index_module.IndexStoreError, match=r"hashes of its files are damaged; .* check index"):
         opened(root).indexed_hashes(tiny.TOKEN)
 
 

@@ -102,7 +102,7 @@ def test_killed_around_every_renaming(root: Path, tmp_path: Path, job: Job, afte
         if index is not None:
             assert len(Tables(index.tables_folder).table("annotation")) in (before, before - 1)
         assert len(opened(root, index_dir).annotation) in (before, before - 1)
-        assert CliRunner().invoke(deepaccident, ["index", str(root), "--index-dir", str(index_dir), "--check"]).output
+        assert CliRunner().invoke(deepaccident, ["check", "index", str(root), "--index-dir", str(index_dir)]).output
         assert contents(index_dir) == fresh, step
         step += 1
     kept, tables, old = (1, 3, 1) if refresh else (2, 3, 0)  # a table, the tables' folder, and the manifest
@@ -128,7 +128,7 @@ def test_a_full_disk_while_indexing(own_release: Path, tmp_path: Path, job: Job,
     assert contents(index_dir) == contents(tmp_path / "fresh")
 
 
-@pytest.mark.parametrize("step", ["indexing.join_tables", "index.write_bytes"])
+@pytest.mark.parametrize("step", ["indexing.join_tables", "index.write_own"])
 def test_a_disk_that_is_full_at_the_end(root: Path, monkeypatch: pytest.MonkeyPatch, step: str) -> None:
     opened(root)
     before = index_alone(root / INDEX.parent)

@@ -145,7 +145,7 @@ def test_a_folder_that_holds_something_is_left_alone(tmp_path: Path) -> None:
 
 def test_it_needs_neither_the_generator_nor_what_tests_need(tmp_path: Path) -> None:
     """As where only the core is installed: no embreex, hypothesis, pytest."""
-    absent = ["embreex", "hypothesis", "pytest", "deepaccident_devkit.synth"]
+    absent = ["embreex", "hypothesis", "pytest", "deepaccident_devkit.plugins.synth"]
     code = (
         f"import sys; sys.modules.update(dict.fromkeys({absent}));"
         "from pathlib import Path; from deepaccident_devkit.testing import SmallRelease, broken_release;"

@@ -13,8 +13,7 @@ from numpy.testing import assert_array_equal
 from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.accidents.recorded import accidents_of
-from deepaccident_devkit.baselines import Baseline
+from deepaccident_devkit.collisions.recorded import accidents_of
 from deepaccident_devkit.errors import ChoiceError, GeometryError, NotAvailableError, TokenError
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup, SampleSelection, default_selection
 from deepaccident_devkit.export.images import ImageConfig
@@ -22,6 +21,7 @@ from deepaccident_devkit.export.mcap import McapConfig
 from deepaccident_devkit.export.opencood import OpenCood
 from deepaccident_devkit.maps.making import towns_of
 from deepaccident_devkit.motion import MotionLabelConfig
+from deepaccident_devkit.plugins.baselines import Baseline
 from deepaccident_devkit.render.video import names_at
 from deepaccident_devkit.taxonomy import AGENTS
 from deepaccident_devkit.testing import SmallRelease

@@ -11,12 +11,12 @@ import pytest
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.geometry import SE3
-from deepaccident_devkit.synth import SynthConfig
-from deepaccident_devkit.synth.plan import plan_scenarios
-from deepaccident_devkit.synth.scenario import RecordingJob, Scenario, build_scenario, record_scenario
-from deepaccident_devkit.synth.sensors.agents import Agent, Camera, make_agents
-from deepaccident_devkit.synth.sensors.render import ray_directions, slopes
-from deepaccident_devkit.synth.sensors.scene import Scene, Setting, make_scene
+from deepaccident_devkit.plugins.synth import SynthConfig
+from deepaccident_devkit.plugins.synth.plan import plan_scenarios
+from deepaccident_devkit.plugins.synth.scenario import RecordingJob, Scenario, build_scenario, record_scenario
+from deepaccident_devkit.plugins.synth.sensors.agents import Agent, Camera, make_agents
+from deepaccident_devkit.plugins.synth.sensors.render import ray_directions, slopes
+from deepaccident_devkit.plugins.synth.sensors.scene import Scene, Setting, make_scene
 from deepaccident_devkit.taxonomy import frame_timestamp
 
 CONFIG = SynthConfig(scenarios=1, frames=2, image_size=(320, 180), seed=11, designed=True)

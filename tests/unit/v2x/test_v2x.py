@@ -25,7 +25,7 @@ WRITTEN = {
     "clouds.aggregate_point_cloud": "agents=None, sweeps=1, frame='world', compensate=False, "
     "link=None, on_missing='raise'",
     "collisions.CONTACT_GAP": "1.5",
-    "cooperation.SAME_PLACE": "0.5",
+    "cooperation.SAME_ACTOR_DISTANCE": "0.5",
     "cooperation.visible_instances": "agents=None, link=None",
     "cooperation.visible_actors": "agents=None, link=None",
     "cooperation.cooperative_boxes": "agents=None, frame='world', visible=None, link=None",

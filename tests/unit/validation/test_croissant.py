@@ -16,7 +16,7 @@ from verbs import called, ran
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, NotAvailableError
 from deepaccident_devkit.release import read_label
-from deepaccident_devkit.release.labels import FIELDS
+from deepaccident_devkit.release.labels import LABEL_FIELDS
 from deepaccident_devkit.taxonomy import AGENTS, CATEGORIES, CHANNELS, SPLITS
 from deepaccident_devkit.validation import CODES, data_card
 
@@ -128,8 +128,8 @@ def test_lines_say_what_a_box_is(da: DeepAccident) -> None:
     head, *lines = path.read_text().splitlines()
     raw = read_label(path, raw=True)
     assert len(lines) == len(raw) > 0
-    of_lines = {name: fields[name] for name in FIELDS}
-    assert {name: found_by(field, head) for name, field in of_lines.items()} == dict.fromkeys(FIELDS)
+    of_lines = {name: fields[name] for name in LABEL_FIELDS}
+    assert {name: found_by(field, head) for name, field in of_lines.items()} == dict.fromkeys(LABEL_FIELDS)
     for line, box in zip(lines, raw.center.tolist(), strict=True):
         told = {name: found_by(field, line) for name, field in of_lines.items()}
         assert list(told.values()) == line.split()

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import tiny
 
-from deepaccident_devkit.synth import SynthConfig, make_release
+from deepaccident_devkit.plugins.synth import SynthConfig, make_release
 from deepaccident_devkit.validation import validate_release
 
 

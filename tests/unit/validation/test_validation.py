@@ -19,12 +19,12 @@ from verbs import called
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import LabelError, TokenError
-from deepaccident_devkit.overview import overview
 from deepaccident_devkit.release import read_labels
 from deepaccident_devkit.release.npz import read_npz
+from deepaccident_devkit.statistics.overview import overview
 from deepaccident_devkit.tables import scan
 from deepaccident_devkit.validation import Finding, ValidationReport, validate_release
-from deepaccident_devkit.validation.sensors import ORIENTATIONS, out_of_sequence
+from deepaccident_devkit.validation.sensors import PICTURE_ORIENTATIONS, out_of_sequence
 
 SKIPPED = ("label-line-skipped", "note")
 
@@ -272,7 +272,7 @@ TURNS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("orientation", [name for name in ORIENTATIONS if name != "forward-up"])
+@pytest.mark.parametrize("orientation", [name for name in PICTURE_ORIENTATIONS if name != "forward-up"])
 def test_a_turned_bev_camera_is_recognised(release_root: Path, tmp_path: Path, orientation: str) -> None:
     agent = next(release_root.glob("*_accident")) / "ego_vehicle"
     for kind in ("calib", "label", "BEV_instance_camera"):

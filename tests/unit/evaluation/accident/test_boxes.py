@@ -16,9 +16,9 @@ from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import EvaluationError
 from deepaccident_devkit.evaluation.accident import AccidentEvaluator, BoxTruth, accident_context
 from deepaccident_devkit.evaluation.accident.boxes import BoxAccidents
-from deepaccident_devkit.evaluation.accident_truth import UNPLACED_NOTE, AccidentContext
 from deepaccident_devkit.evaluation.map_accidents import AccidentReading
 from deepaccident_devkit.evaluation.predictions import Accident
+from deepaccident_devkit.evaluation.truth import UNPLACED_NOTE, AccidentContext
 from deepaccident_devkit.motion import OWN_BOX_ID
 from deepaccident_devkit.taxonomy import AGENTS
 

@@ -13,9 +13,9 @@ from refusals import assert_refused
 
 from deepaccident_devkit.errors import ChoiceError, ConfigError, EvaluationError
 from deepaccident_devkit.evaluation.accident.paper import PaperAccidents
-from deepaccident_devkit.evaluation.accident_truth import AccidentContext
 from deepaccident_devkit.evaluation.map_accidents import AccidentReading, accident_of
 from deepaccident_devkit.evaluation.predictions import Accident, MotionOutput
+from deepaccident_devkit.evaluation.truth import AccidentContext
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.geometry.bev_grid import ORIENTATIONS
 

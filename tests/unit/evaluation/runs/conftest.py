@@ -11,7 +11,7 @@ from deepaccident_devkit.evaluation import Accident, accident_context, instances
 from deepaccident_devkit.evaluation.results import Results, ResultsWriter, read_results
 from deepaccident_devkit.evaluation.runs import EvaluationRun, SampleSelection, evaluate_results
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
-from deepaccident_devkit.synth import SynthConfig, make_release
+from deepaccident_devkit.plugins.synth import SynthConfig, make_release
 
 WriteAccidents = Callable[..., Results]
 WriteMotion = Callable[..., Results]

@@ -36,7 +36,7 @@ from deepaccident_devkit.evaluation.runs.setups import (
     remove_checkpoints,
     scenario_of,
 )
-from deepaccident_devkit.splits import save_selection
+from deepaccident_devkit.selection.splits import save_selection
 
 SETUP = EvaluationSetup(task="accident", protocol="boxes")
 Write = Callable[..., Results]

@@ -14,13 +14,6 @@ from planning_scenes import scene
 from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.baselines import (
-    predict_accidents,
-    predict_detections,
-    predict_forecasts,
-    predict_motion,
-    predict_plan,
-)
 from deepaccident_devkit.errors import EvaluationError
 from deepaccident_devkit.evaluation.accident import accident_context
 from deepaccident_devkit.evaluation.detection import DetectedBoxes
@@ -43,6 +36,13 @@ from deepaccident_devkit.evaluation.runs.sanity import (
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 from deepaccident_devkit.geometry import SE3, BevGrid, Boxes
 from deepaccident_devkit.motion import MotionHeads
+from deepaccident_devkit.plugins.baselines import (
+    predict_accidents,
+    predict_detections,
+    predict_forecasts,
+    predict_motion,
+    predict_plan,
+)
 
 Change = Callable[[DeepAccident, str, Any], Any]
 """A release, a sample's token and its prediction → the prediction with a mistake."""

@@ -39,7 +39,7 @@ from deepaccident_devkit.evaluation.runs.setups import (
 from deepaccident_devkit.evaluation.warning import WarningEvaluator
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.motion import MotionLabels
-from deepaccident_devkit.synth import SynthConfig, make_release
+from deepaccident_devkit.plugins.synth import SynthConfig, make_release
 
 ALL = [(task, protocol) for task, evaluator_class in TASKS.items() for protocol in evaluator_class.protocols]
 
@@ -374,7 +374,7 @@ def test_other_recordings_of_the_same_names_are_refused(da_b: DeepAccident, own_
         (
             lambda: check_recordings(results, other),
             ResultsError,
-            (str(results.path), "1 of 6", first, "index DATAROOT --check"),
+            (str(results.path), "1 of 6", first, "check index DATAROOT"),
         )
     )
     check_recordings(results_of(da_b, tmp_path / "second.json", release_note(da_b, [second])), other)

@@ -10,21 +10,22 @@ from asgi import get
 from memory_results import MemoryResults
 
 from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.descriptions import describe
 from deepaccident_devkit.evaluation import instances_of
-from deepaccident_devkit.evaluation.accident_truth import UNPLACED_NOTE
 from deepaccident_devkit.evaluation.predictions import Accident
 from deepaccident_devkit.evaluation.results import ResultsWriter
 from deepaccident_devkit.evaluation.runs import EvaluationRun, default_selection, evaluate_results
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup, SampleLoader
-from deepaccident_devkit.explore import Explorer, make_app
-from deepaccident_devkit.explore.pages.scenario import PARTS
+from deepaccident_devkit.evaluation.truth import UNPLACED_NOTE
 from deepaccident_devkit.motion import MotionLabelConfig
+from deepaccident_devkit.plugins.explore import Explorer, make_app
+from deepaccident_devkit.plugins.explore.pages.scenario import PARTS
+from deepaccident_devkit.plugins.safety import avoidability_report, lead_time_ledger
+from deepaccident_devkit.plugins.safety.prevention import prevention_evaluator
+from deepaccident_devkit.plugins.synth import SynthConfig, make_release
 from deepaccident_devkit.render.outcomes.above import difference_words
 from deepaccident_devkit.render.outcomes.verdicts import sample_verdict
-from deepaccident_devkit.safety import avoidability_report, describe, lead_time_ledger
-from deepaccident_devkit.safety.prevention import prevention_evaluator
 from deepaccident_devkit.statistics import dataset_statistics
-from deepaccident_devkit.synth import SynthConfig, make_release
 from deepaccident_devkit.v2x.collisions import default_scenario
 
 pytestmark = pytest.mark.slow

@@ -388,7 +388,7 @@ def test_a_pipe_in_the_place_of_a_file(bundle: Path, da_b: DeepAccident, name: s
 def test_paths_that_lead_out_are_opened_only_if_they_are_given(
     bundle: Path, da_b: DeepAccident, results: Results, tmp_path: Path
 ) -> None:
-    command = f"evaluate verify {bundle} --dataroot {da_b.dataroot} --results {results.path}"
+    command = f"check bundle {bundle} --dataroot {da_b.dataroot} --results {results.path}"
     assert_refused(
         (
             lambda: verify(bundle, da_b, results=None),

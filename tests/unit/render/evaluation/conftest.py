@@ -7,7 +7,7 @@ import pytest
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.evaluation.detection.result import DetectionResult
-from deepaccident_devkit.motion import samples
+from deepaccident_devkit.selection.samples import samples
 
 
 @pytest.fixture(scope="session")

@@ -70,7 +70,7 @@ def test_a_report_holds_all_and_asks_for_nothing(
     assert sum(map(warning_pixels, figures)) == 0
     numbers = [words for each in headlines(run.result) for words in (each.name, each.text())]
     switches = re.findall(r"'(\w+)':", str(run.setup.as_dict()["settings"]))
-    told = (run.release.fingerprint, run.results.fingerprint, setup.protocol, "deepaccident evaluate verify")
+    told = (run.release.fingerprint, run.results.fingerprint, setup.protocol, "deepaccident check bundle")
     clusters = "no intervals: of 1 cluster (an accident and its twin are one); at least 6 are needed"
     assert not lacking(page.text, clusters, *told, *numbers, *switches)
     clean = ["TTC < 3 s, seen"] if setup.task == "warning" else []

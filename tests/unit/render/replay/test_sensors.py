@@ -20,7 +20,7 @@ from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.geometry.camera import IN_FRONT_DEPTH
 from deepaccident_devkit.render.boxes import camera_name
 from deepaccident_devkit.render.replay import render_replay, sensors
-from deepaccident_devkit.render.replay.entries import Recording, actor_entries, recording_of
+from deepaccident_devkit.render.replay.entries import ReplayRecording, actor_entries, recording_of
 from deepaccident_devkit.render.replay.sensors import (
     PAGE_POINTS,
     Followed,
@@ -130,11 +130,11 @@ def test_a_missing_picture_leaves_a_hole(da: DeepAccident, tmp_path: Path) -> No
 
 
 @pytest.fixture(scope="module")
-def recording(da_motion: DeepAccident) -> Recording:
+def recording(da_motion: DeepAccident) -> ReplayRecording:
     return recording_of(da_motion, accident(da_motion), None)
 
 
-def followed(recording: Recording, missing: tuple[str, str] = ("", "")) -> Followed:
+def followed(recording: ReplayRecording, missing: tuple[str, str] = ("", "")) -> Followed:
     seen = {actor["id"]: actor["seen"] for actor in actor_entries(recording)}
     keys = itertools.product(recording.agents, CAMERAS)
     return follow_pair(recording, seen, {key: [key != missing] * len(recording.frames) for key in keys})
@@ -144,7 +144,7 @@ def changes(names: tuple[str, ...]) -> int:
     return sum(one != other for one, other in itertools.pairwise(names))
 
 
-def test_the_pair_is_in_the_picture_at_the_impact(da_motion: DeepAccident, recording: Recording) -> None:
+def test_the_pair_is_in_the_picture_at_the_impact(da_motion: DeepAccident, recording: ReplayRecording) -> None:
     found = followed(recording)
     assert {agent: len(channels) for agent, channels in found.channels.items()} == dict.fromkeys(AGENTS, 35)
     assert max(map(changes, [*found.channels.values(), found.agents])) <= 3  # in 3.5 s: it does not flicker
@@ -157,7 +157,7 @@ def test_the_pair_is_in_the_picture_at_the_impact(da_motion: DeepAccident, recor
         assert lens.in_image(*lens.project(centers), min_depth=IN_FRONT_DEPTH).any(), (frame, agent, channel)
 
 
-def test_a_camera_without_pictures_is_not_chosen(recording: Recording) -> None:
+def test_a_camera_without_pictures_is_not_chosen(recording: ReplayRecording) -> None:
     before = followed(recording)
     agent, channel = before.agents[-1], before.channels[before.agents[-1]][-1]
     after = followed(recording, missing=(agent, channel))

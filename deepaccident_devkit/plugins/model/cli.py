@@ -1,0 +1,130 @@
+"""`deepaccident train`: train the model on a release."""
+
+from pathlib import Path
+from typing import Any, get_args
+
+import click
+
+from deepaccident_devkit.cli.agents import cooperating_parameter, names_or_configuration
+from deepaccident_devkit.cli.options import (
+    PATH,
+    figure_style_parameter,
+    model_parameters,
+    open_release,
+    reader_parameters,
+    refuse_unused,
+    release_of,
+    use_threads_sparingly,
+)
+from deepaccident_devkit.cli.verbs import WordChoice, advanced, verb
+from deepaccident_devkit.taxonomy import ModelFusion, ModelPreset
+
+_CHOICE = ("preset", "fusion", "horizon", "focal", "labels")
+_TRAINING = ("steps", "moments", "egos", "split", "validation", "samples", "seed", "bf16")
+_EXAMPLES = """\b
+Examples:
+  deepaccident train DATAROOT --preset tiny --agents all --out runs/all
+  deepaccident train DATAROOT --from runs/single --agents all --freeze img_backbone. --out runs/warm
+  torchrun --nproc-per-node 4 -m deepaccident_devkit.cli train DATAROOT --preset released --bf16 --out runs/big"""
+
+
+@verb(epilog=_EXAMPLES)
+@reader_parameters
+@click.option(
+    "--preset",
+    type=WordChoice(get_args(ModelPreset)),
+    default="tiny",
+    show_default=True,
+    help="The model: the released one, or one that a laptop trains.",
+)
+@click.option(
+    "--fusion", type=WordChoice(get_args(ModelFusion)), help="How the agents' maps are joined.  [default: the preset's]"
+)
+@click.option("--horizon", type=float, help="How many seconds to predict, in steps of 0.5.  [default: 2]")
+@advanced(
+    "--focal",
+    type=float,
+    help="Focal length in pixels of the virtual camera that all images look as if taken by.  [default: their own]",
+)
+@advanced(
+    "--labels",
+    type=WordChoice(["fiery"]),
+    help="Motion labels by FIERY's rules, as nuScenes is evaluated with.  [default: the preset's]",
+)
+@cooperating_parameter("Agents that cooperate with each ego", "all")
+@click.option("--split", default="train", show_default=True, help="Name of a split, or a split file (.txt).")
+@click.option(
+    "--validation", default="val", show_default=True, help="Split whose score chooses the best weights; none for none."
+)
+@click.option(
+    "--samples",
+    type=WordChoice(["train", "all", "every"]),
+    default="all",
+    show_default=True,
+    help="train: one a second, as released. all: two a second. every: ten a second.",
+)
+@click.option("--steps", type=click.IntRange(min=1), default=1500, show_default=True, help="Steps of the optimizer.")
+@advanced(
+    "--moments", type=click.IntRange(min=1), default=1, show_default=True, help="Moments a step, each with all agents."
+)
+@advanced("--egos", type=click.IntRange(min=1), help="Agents of a moment that are the ego in turn.  [default: all]")
+@advanced("--learning-rate", type=float, default=2e-3, show_default=True, help="The highest learning rate.")
+@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Seed of all that is drawn.")
+@click.option(
+    "--from",
+    "weights",
+    type=PATH,
+    help="Run or file of weights to begin from, `tiny`, `tiny_lidar`, or a checkpoint of the release, BEVerse or Swin.",
+)
+@click.option("--also", type=PATH, metavar="DATAROOT", help="Another release, or nuScenes, to learn from too.")
+@click.option("--mix", type=float, default=0.5, show_default=True, help="Share of the moments that are from --also.")
+@advanced(
+    "--freeze", multiple=True, metavar="NAME", help="Do not train parameters whose names begin so; you can repeat this."
+)
+@model_parameters
+@advanced("--bf16", is_flag=True, help="Compute in bfloat16, on GPUs.")
+@figure_style_parameter
+@click.option("--out", required=True, type=PATH, metavar="RUN", help="Folder of weights, log and curves.")
+def train(weights: Path | None, also: Path | None, mix: float, **options: Any) -> None:
+    """Train the model on the release in DATAROOT, or on nuScenes.
+
+    If the command is interrupted or killed, the same command goes on from the last checkpoint.
+    """
+    if also is None:
+        refuse_unused("without --also", "mix")
+    use_threads_sparingly()
+    from deepaccident_devkit.plugins.model import ModelChoice, SecondSource, TrainConfig
+    from deepaccident_devkit.plugins.model import train as train_model
+
+    validation = options["validation"]
+    config = TrainConfig(
+        agents=names_or_configuration(options["agents"]) or "all",
+        learning_rate=options["learning_rate"],
+        freeze=options["freeze"],
+        **{**{name: options[name] for name in _TRAINING}, "validation": None if validation == "none" else validation},
+    )
+    choice = ModelChoice(**{name: options[name] for name in _CHOICE})
+    dataset = open_release(**release_of(options))
+    second = None if also is None else SecondSource(dataset=open_release(also, version="v1"), mix=mix)
+    for source in (dataset, *([] if second is None else [second.dataset])):
+        if source.layout == "nuScenes":
+            from deepaccident_devkit.plugins.nuscenes.check import check_source  # opened it
+
+            check_source(source)
+    best = train_model(
+        dataset,
+        options["out"],
+        choice,
+        config,
+        weights=weights,
+        device=options["device"],
+        workers=options["workers"] or 0,
+        images_cache=options["images_cache"],
+        also=second,
+        say=click.echo,
+    )
+    click.echo(f"weights: {best}")
+    click.echo(
+        f"next: deepaccident predict {options['out']} {options['dataroot']} --split val --out results\n"
+        "Numbers on the split that chose the weights (--validation, by default val) flatter them."
+    )

@@ -1,0 +1,191 @@
+"""The detection head: maps of box centres and box codes from features seen from above (CenterPoint)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, NamedTuple, get_args
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from deepaccident_devkit.errors import ConfigError
+from deepaccident_devkit.geometry import BevGrid
+from deepaccident_devkit.geometry.bev_grid import Axis
+from deepaccident_devkit.support.arrays import check_least
+from deepaccident_devkit.support.text import settle_choices
+from deepaccident_devkit.taxonomy import CATEGORIES
+
+ClassSlots = tuple[tuple[int | None, ...], ...]
+Branches = Literal["separate", "joint"]
+
+# Channels of a task's maps beside the heatmap, in the order of the box code.
+CODE_CHANNELS = {"reg": 2, "height": 1, "dim": 3, "rot": 2, "vel": 2}
+CODE_SIZE = sum(CODE_CHANNELS.values())
+# Our tasks: cars; trucks and vans; cyclists and motorcycles; pedestrians.
+CLASS_SLOTS: ClassSlots = ((0,), (1, 2), (3, 4), (5,))
+RELEASED_CLASS_SLOTS: ClassSlots = (*CLASS_SLOTS, (None, None), (None, None))
+"""The release's six tasks with ten slots, by what they train on.
+
+The release names them (car) (truck, van) (invalid1, invalid2) (invalid3) (motorcycle, cyclist) (pedestrian, invalid4),
+but compares dataset indices with slot numbers, so that its last two tasks never see a box.
+"""
+# All classes in one task, as in the small model.
+ONE_TASK: ClassSlots = (tuple(range(len(CATEGORIES))),)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DetectionConfig:
+    """Sizes, cells and classes of a `CenterHead`.
+
+    Attributes:
+        in_channels: of the features.
+        shared_channels: of the convolution that all tasks share, and of the branches.
+        class_slots: for each task, which category each heatmap channel stands for: an index into
+            `taxonomy.CATEGORIES`, or None for a channel that no box trains. Boxes of a category without a slot are
+            background.
+        x: start, end and cell size of the output's columns, metres, ego frame.
+        y: the same of its rows.
+        branches: `separate` for the released two convolutions a quantity, `joint` for one 1×1 convolution a task.
+        upsample: how many times more rows and columns the output has than the features.
+        heatmap_bias: initial bias of the heatmap channels; −2.19 makes every cell a centre with probability 0.1.
+    """
+
+    in_channels: int = 256
+    shared_channels: int = 64
+    class_slots: ClassSlots = CLASS_SLOTS
+    x: Axis = (-51.2, 51.2, 0.8)
+    y: Axis = (-51.2, 51.2, 0.8)
+    branches: Branches = "separate"
+    upsample: int = 1
+    heatmap_bias: float = -2.19
+
+    def __post_init__(self) -> None:
+        """Check; raises ConfigError or ChoiceError."""
+        settle_choices(self, {"branches": get_args(Branches)})
+        BevGrid(x=self.x, y=self.y)  # checks both axes
+        check_least(self, in_channels=1, shared_channels=1, upsample=1)
+        _check_slots(self.class_slots)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows (y) and columns (x) of the output."""
+        return BevGrid(x=self.x, y=self.y).shape
+
+
+class TaskMaps(NamedTuple):
+    """What the head says for one task, for each of H × W cells (row = y, column = x, both rising).
+
+    Attributes:
+        reg: (B, 2, H, W) centre from the cell's lower corner: x, y, in cells.
+        height: (B, 1, H, W) z of the centre, metres.
+        dim: (B, 3, H, W) logarithms of length, width, height in metres.
+        rot: (B, 2, H, W) sine and cosine of the yaw, of any common scale.
+        vel: (B, 2, H, W) vx, vy, m/s.
+        heatmap: (B, slots, H, W) logits: is a box of this slot centred here?
+    """
+
+    reg: Tensor
+    height: Tensor
+    dim: Tensor
+    rot: Tensor
+    vel: Tensor
+    heatmap: Tensor
+
+    @property
+    def code(self) -> Tensor:
+        """The box code, (B, 10, H, W): all maps but the heatmap."""
+        return torch.cat(self[:-1], dim=1)
+
+
+class ConvBlock(nn.Module):
+    """Convolution 3×3 without bias, batch normalisation, ReLU; same height and width."""
+
+    def __init__(self, in_channels: int, out_channels: int) -> None:
+        super().__init__()
+        self.conv = nn.Conv2d(in_channels, out_channels, 3, padding=1, bias=False)
+        self.bn = nn.BatchNorm2d(out_channels)
+
+    def forward(self, features: Tensor) -> Tensor:
+        """(B, in, H, W) → (B, out, H, W)."""
+        return functional.relu(self.bn(self.conv(features)))
+
+
+class SeparateHead(nn.Module):
+    """One task's released branches: for each quantity a `ConvBlock` and a convolution 3×3."""
+
+    def __init__(self, channels: int, slots: int, heatmap_bias: float) -> None:
+        super().__init__()
+        for name, count in {**CODE_CHANNELS, "heatmap": slots}.items():
+            last = nn.Conv2d(channels, count, 3, padding=1)
+            if name == "heatmap":
+                nn.init.constant_(last.bias, heatmap_bias)  # type: ignore[arg-type]  # it has one
+            self.add_module(name, nn.Sequential(ConvBlock(channels, channels), last))
+
+    def forward(self, features: Tensor) -> TaskMaps:
+        """(B, channels, H, W) → maps of the same cells."""
+        return TaskMaps(*(self.get_submodule(name)(features) for name in TaskMaps._fields))
+
+
+class JointHead(nn.Module):
+    """One task's maps from one 1×1 convolution."""
+
+    def __init__(self, channels: int, slots: int, heatmap_bias: float) -> None:
+        super().__init__()
+        self._sizes = [*CODE_CHANNELS.values(), slots]
+        self.maps = nn.Conv2d(channels, sum(self._sizes), 1)
+        with torch.no_grad():
+            self.maps.bias[CODE_SIZE:] = heatmap_bias  # type: ignore[index]  # it has one
+
+    def forward(self, features: Tensor) -> TaskMaps:
+        """(B, channels, H, W) → maps of the same cells."""
+        return TaskMaps(*self.maps(features).split(self._sizes, dim=1))
+
+
+class CenterHead(nn.Module):
+    """Boxes as points on the ground: a shared convolution, then maps for each task.
+
+    With `branches="separate"` and no upsampling it is the released CenterHeadv1, with the same keys.
+    """
+
+    def __init__(self, config: DetectionConfig) -> None:
+        """Build the head of a configuration."""
+        super().__init__()
+        self.config = config
+        self.shared_conv = ConvBlock(config.in_channels, config.shared_channels)
+        kind = SeparateHead if config.branches == "separate" else JointHead
+        self.task_heads = nn.ModuleList(
+            kind(config.shared_channels, len(slots), config.heatmap_bias) for slots in config.class_slots
+        )
+
+    def forward(self, features: Tensor) -> list[TaskMaps]:
+        """The maps of each task.
+
+        Args:
+            features: (B, in_channels, rows, columns) of the configured grid, divided by `upsample`.
+
+        Raises:
+            ConfigError: features of another height or width.
+        """
+        rows, columns = self.config.shape
+        given = tuple(size * self.config.upsample for size in features.shape[-2:])
+        if given != (rows, columns):
+            raise ConfigError(
+                f"features: {given[0]} × {given[1]} cells after upsampling by {self.config.upsample}, expected "
+                f"{rows} × {columns} of x={self.config.x}, y={self.config.y}; change x and y, or upsample"
+            )
+        shared = self.shared_conv(features)
+        if self.config.upsample > 1:
+            shared = functional.interpolate(shared, size=(rows, columns), mode="bilinear", align_corners=False)
+        return [head(shared) for head in self.task_heads]
+
+
+def _check_slots(class_slots: ClassSlots) -> None:
+    found = [category for slots in class_slots for category in slots if category is not None]
+    if not class_slots or not all(class_slots):
+        raise ConfigError(f"class_slots: expected tasks of one slot or more, found {class_slots!r}")
+    if len(set(found)) < len(found) or not set(found) <= set(range(len(CATEGORIES))):
+        raise ConfigError(
+            f"class_slots: expected each category 0 to {len(CATEGORIES) - 1} at most once, and None for slots that "
+            f"nothing trains; found {class_slots!r}"
+        )

@@ -1,0 +1,59 @@
+"""Fusion of several agents' BEV maps: `fusion` makes the module of a config; all have the interface `Fusion`.
+
+`PoolFusion` is a mean or maximum, `ReleasedFusion` what the released code does; `DiscoNetFusion`, `CobevtFusion` and
+`V2XViTFusion` are written after their own papers, since the released code has none of them.
+"""
+
+from collections.abc import Callable, Mapping
+from typing import Any, Final, TypeAlias
+
+from deepaccident_devkit.errors import ConfigError
+from deepaccident_devkit.plugins.model.fusion.simple import (
+    RELEASED_EGO_CHANNELS,
+    Agent3D,
+    Agent3DConfig,
+    DiscoNetConfig,
+    DiscoNetFusion,
+    Fusion,
+    PoolFusion,
+    PoolFusionConfig,
+    ReleasedFusion,
+    ReleasedFusionConfig,
+)
+from deepaccident_devkit.plugins.model.fusion.transformers import CobevtConfig, CobevtFusion, V2XViTConfig, V2XViTFusion
+
+FusionConfig: TypeAlias = PoolFusionConfig | ReleasedFusionConfig | DiscoNetConfig | CobevtConfig | V2XViTConfig
+_MODULES: Final[Mapping[type, Callable[[Any], Fusion]]] = {
+    PoolFusionConfig: PoolFusion,
+    ReleasedFusionConfig: ReleasedFusion,
+    DiscoNetConfig: DiscoNetFusion,
+    CobevtConfig: CobevtFusion,
+    V2XViTConfig: V2XViTFusion,
+}
+
+
+def fusion(config: FusionConfig) -> Fusion:
+    """The fusion module that a config describes, with fresh weights. Raises ConfigError: another object."""
+    if type(config) not in _MODULES:
+        raise ConfigError(f"fusion: expected the config of a fusion module, found {config!r}")
+    return _MODULES[type(config)](config)
+
+
+__all__ = [
+    "RELEASED_EGO_CHANNELS",
+    "Agent3D",
+    "Agent3DConfig",
+    "CobevtConfig",
+    "CobevtFusion",
+    "DiscoNetConfig",
+    "DiscoNetFusion",
+    "Fusion",
+    "FusionConfig",
+    "PoolFusion",
+    "PoolFusionConfig",
+    "ReleasedFusion",
+    "ReleasedFusionConfig",
+    "V2XViTConfig",
+    "V2XViTFusion",
+    "fusion",
+]

@@ -1,0 +1,61 @@
+"""Batches that worker processes read; a worker that fails ends the run with an error instead of leaving it waiting."""
+
+from __future__ import annotations
+
+import multiprocessing
+import re
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from multiprocessing.queues import Queue
+from typing import Any, Final
+
+from torch._utils import ExceptionWrapper
+from torch.utils.data import DataLoader
+
+from deepaccident_devkit.errors import DeepAccidentError, WorkerError, shortened
+from deepaccident_devkit.support.parallel import FEWER_WORKERS, starting_workers
+
+# What torch says in this process if a worker failed, or if what it sent cannot be opened here.
+_WORKERS_FAULT: Final = re.compile(r"DataLoader worker|</torch_|ancdata")
+
+
+def read_batches(data: Any, collate: Callable[..., Any], workers: int, **options: Any) -> Iterator[dict[str, Any]]:
+    """Start to read batches by worker processes, or by this one (0).
+
+    Args:
+        data: A map-style dataset of torch.
+        collate: Makes a batch of items.
+        workers: Number of processes that read.
+        **options: Further options of `DataLoader`.
+
+    Raises:
+        WorkerError: The processes cannot be started.
+    """
+    with starting_workers():
+        if workers:
+            multiprocessing.Queue()  # torch would print tracebacks
+        return iter(DataLoader(data, collate_fn=collate, num_workers=workers, worker_init_fn=_send_faults, **options))
+
+
+@contextmanager
+def worker_faults_named() -> Iterator[None]:
+    """Raise WorkerError where a worker of `read_batches` was killed or failed otherwise; the devkit's errors pass.
+
+    Torch may raise such an error at any time while the workers run, so the block is all that uses the batches.
+    """
+    try:
+        yield
+    except Exception as error:
+        if isinstance(error, DeepAccidentError) or not _WORKERS_FAULT.search(str(error)):
+            raise
+        *_, cause = str(error).strip().splitlines()
+        raise WorkerError(f"a worker that reads samples failed ({shortened(cause)}); {FEWER_WORKERS}") from error
+
+
+def _send_faults(_: int) -> None:
+    """Let this worker send the reason if it cannot send a batch: otherwise it prints that, and its reader waits."""
+    Queue._on_queue_feeder_error = _send_reason  # type: ignore[attr-defined] # noqa: SLF001 - multiprocessing's own hook
+
+
+def _send_reason(queue: Any, _: Exception, unsent: tuple[int, Any]) -> None:
+    queue.put((unsent[0], ExceptionWrapper(where="in DataLoader worker process")))

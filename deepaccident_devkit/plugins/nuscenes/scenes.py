@@ -1,0 +1,259 @@
+"""One scene of nuScenes as the rows of our tables: frames at 10 Hz, of which its keyframes are every fifth one."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from itertools import chain
+from typing import Any, Final
+
+import numpy as np
+
+from deepaccident_devkit.errors import shortened
+from deepaccident_devkit.export.frames import KEY_STEP
+from deepaccident_devkit.export.nuscenes.scenes import CAMERA_CHANNELS, CHANNEL_NAMES, LIDAR_CHANNEL
+from deepaccident_devkit.geometry import quaternions
+from deepaccident_devkit.geometry.conventions import inverses
+from deepaccident_devkit.plugins.nuscenes.classes import CLASSES, category_of
+from deepaccident_devkit.plugins.nuscenes.tables import NuScenesTables
+from deepaccident_devkit.release import Labels, ScenarioFolder
+from deepaccident_devkit.release.calib import Calibs
+from deepaccident_devkit.release.labels import label_from_world_velocity
+from deepaccident_devkit.support.arrays import FloatArray, IntArray
+from deepaccident_devkit.tables.arrow_files import ColumnArrays
+from deepaccident_devkit.tables.build import scenario_rows
+from deepaccident_devkit.tables.scan import ScenarioFiles, ScenarioScan
+from deepaccident_devkit.taxonomy import AGENTS, CHANNELS, IGNORED_ID
+
+# Whose recording a scene is.
+AGENT: Final = AGENTS[0]
+# Of the x and y of a quaternion: below, it is a turn about z alone.
+_LEAN: Final = 1e-6
+# nuScenes' visibility of a box of which the cameras see less than 40 %; FIERY takes it for unseen.
+_UNSEEN: Final = "1"
+# Seconds from a keyframe to the next one.
+_MIN_GAP_S: Final = 1e-3
+# Seconds from a box to the next one of its object, beyond which nuScenes knows no velocity.
+_MAX_GAP_S: Final = 1.5
+_MIN_FOCAL_PX: Final = 0.5
+# How far from 1 the length of a quaternion may be.
+_UNIT_TOLERANCE: Final = 0.01
+
+
+class NuScenesScene:
+    """A scene, read and checked.
+
+    Attributes:
+        frames: number of frames.
+    """
+
+    def __init__(self, source: NuScenesTables, row: Any) -> None:
+        """Read the scene of a row; raises DatarootError for a damaged row that it leads to."""
+        self._source, self._row = source, row
+        self._samples = self._chain()
+        self.frames = KEY_STEP * (len(self._samples) - 1) + 1
+        boxes = [source.rows_of("sample_annotation", sample) for sample in self._samples]
+        self._boxes = list(chain(*boxes))
+        self._keyframes = np.repeat(np.arange(len(boxes)), [len(of_sample) for of_sample in boxes])
+        self._rotations = self._quaternions(self._boxes)
+        self._files = [self._channels(sample) for sample in self._samples]
+        self._world_from_ego, self._ego_from_sensor = self._poses(LIDAR_CHANNEL)
+        self._ego_from_lidar = self._turned(upright=bool((np.abs(self._rotations[:, 1:3]) < _LEAN).all()))
+        self._calibs = self._all_calibs()
+        self._columns = self._box_columns()
+
+    def _chain(self) -> list[Any]:
+        """Return the samples in the order of their times, in which each must lead to the next one."""
+        source, scene = self._source, self._row
+        samples = sorted(source.rows_of("sample", scene), key=lambda sample: sample.timestamp)
+        tokens = [*(sample.token for sample in samples), ""]
+        links = [scene.first_sample_token, *(sample.next for sample in samples)]
+        for row, link, token in zip([scene, *samples], links, tokens, strict=True):
+            if link != token or not samples:
+                raise source.error(row, f"next sample: expected {token!r} by its time, found {shortened(link)!r}")
+        self._stamps = 1e-6 * np.array([sample.timestamp for sample in samples])
+        gaps = np.diff(self._stamps, append=np.inf)
+        if gaps.min() < _MIN_GAP_S:
+            raise source.error(samples[gaps.argmin()], "timestamp: expected the next sample to be later")
+        return samples
+
+    def _channels(self, sample: Any) -> dict[str, Any]:
+        """Return the rows of the files at a keyframe by their channels."""
+        follow = self._source.follow
+        files = {
+            follow(follow(file, "calibrated_sensor_token"), "sensor_token").channel: file
+            for file in self._source.rows_of("sample_data", sample)
+            if file.is_key_frame
+        }
+        if lacking := CHANNEL_NAMES.values() - files.keys():
+            raise self._source.error(sample, f"token: sample_data.json has no {', '.join(sorted(lacking))} for it")
+        return files
+
+    def _poses(self, channel: str) -> list[FloatArray]:
+        """Return `world_from_ego` and `ego_from_sensor` (K, 4, 4) of a sensor at its keyframes."""
+        files = [of_sample[channel] for of_sample in self._files]
+        return [
+            self._matrices([self._source.follow(file, field) for file in files])
+            for field in ("ego_pose_token", "calibrated_sensor_token")
+        ]
+
+    def _matrices(self, rows: Sequence[Any]) -> FloatArray:
+        """Return the transforms (N, 4, 4) of rows with translation and rotation."""
+        result = np.tile(np.eye(4), (len(rows), 1, 1))
+        result[:, :3, :3] = quaternions.to_matrix(self._quaternions(rows))
+        result[:, :3, 3] = [row.translation for row in rows]
+        return result
+
+    def _quaternions(self, rows: Sequence[Any]) -> FloatArray:
+        """Return the rotations (N, 4) of rows; raises DatarootError for one that is none."""
+        rotations = np.reshape([row.rotation for row in rows], (-1, 4))
+        errors = np.abs(np.linalg.norm(rotations, axis=1) - 1)
+        if errors.max(initial=0) > _UNIT_TOLERANCE:
+            row = rows[errors.argmax()]
+            raise self._source.error(row, f"rotation: expected a unit quaternion, found {row.rotation}")
+        return rotations
+
+    def _turned(self, *, upright: bool) -> FloatArray:
+        """Return `ego_from_lidar` (K, 4, 4): x forward, and upright in the world if all boxes are."""
+        result = self._ego_from_sensor.copy()
+        turn = result[:, :3, :3]
+        if upright:
+            world = self._world_from_ego[:, :3, :3]
+            turn[:] = np.swapaxes(world, 1, 2) @ _about_z(_heading(world))
+        else:
+            turn[:] = turn @ _about_z(-_heading(turn))
+        return result
+
+    def files(self, first: int) -> Iterator[tuple[int, str, str, list[float]]]:
+        """Yield row of `sample_data`, file, nuScenes' token of the sample, and its `lidar_from_sensor`.
+
+        `first` is the row of the scene's first sample.
+        """
+        matrices = (inverses(self._ego_from_lidar) @ self._ego_from_sensor).reshape(-1, 16).tolist()
+        for number, (sample, files, matrix) in enumerate(zip(self._samples, self._files, matrices, strict=True)):
+            for channel, name in CHANNEL_NAMES.items():
+                row = (first + KEY_STEP * number) * len(CHANNELS) + CHANNELS.index(channel)
+                yield row, files[name].filename, sample.token, matrix
+
+    def rows(self, *, every_class: bool) -> dict[str, ColumnArrays]:
+        """Return the rows of all tables, with boxes of all classes or of ours only."""
+        place = ScenarioFolder(self._source.folder.parent, "", "nuscenes", self._row.name, (AGENT,))
+        scan = ScenarioScan(
+            agents=(AGENT,), has_meta=False, labelled=(AGENT,), num_frames=self.frames, problems=(), notices=()
+        )
+        is_key = np.arange(self.frames) % KEY_STEP == 0
+        times = np.interp(np.arange(self.frames), np.flatnonzero(is_key), self._stamps - self._stamps[0]).round(6)
+        chosen = (self._columns["actor_id"] < IGNORED_ID) | every_class
+        moved = np.diff(self._calibs.world_from_ego[:, :2, 3], axis=0, append=np.nan)
+        labels = Labels(
+            raw=False,
+            num_boxes=np.bincount(KEY_STEP * self._keyframes[chosen], minlength=self.frames),
+            agent_velocity=moved / np.diff(times, append=np.nan)[:, None],
+            **{name: column[chosen] for name, column in self._columns.items()},
+        )
+        rows = scenario_rows(ScenarioFiles(scenario=place, scan=scan, meta=None, calibs=self._calibs, labels=labels))
+        images = [self._files[0][channel] for channel in CAMERA_CHANNELS.values()]
+        sizes = {}
+        for side in ("width", "height"):  # K says only where their middle may be
+            others = rows["sample_data"][side][len(images) : len(CHANNELS)]
+            sizes[side] = np.tile([*(getattr(image, side) for image in images), *others], self.frames)
+        own_columns: dict[str, ColumnArrays] = {
+            "scenario": {"town": [self._source.follow(self._row, "log_token").location]},
+            "frame": {"timestamp": times},
+            "sample": {
+                "timestamp": times,
+                "time_to_end": times[-1] - times,
+                "labelled": is_key & bool(self._boxes),
+            },
+            "sample_data": sizes,
+            "ego_pose": {"timestamp": times},
+        }
+        return {table: {**columns, **own_columns.get(table, {})} for table, columns in rows.items()}
+
+    def _all_calibs(self) -> Calibs:
+        """Return those of all frames: poses between keyframes are interpolated, sensors stay as at the one before."""
+        from scipy.spatial.transform import Rotation
+
+        world = self._world_from_ego
+        before, step = np.divmod(np.arange(self.frames), KEY_STEP)
+        after, share = before + (step > 0), step[:, None] / KEY_STEP
+        turns = Rotation.from_matrix(world[:, :3, :3])
+        turn = (turns[before].inv() * turns[after]).as_rotvec()
+        moved = world[before]
+        moved[:, :3, 3] += share * (world[after] - moved)[:, :3, 3]
+        moved[:, :3, :3] = (turns[before] * Rotation.from_rotvec(share * turn)).as_matrix()
+        moved[step == 0] = world
+        cameras, intrinsics = [], []
+        for channel in CAMERA_CHANNELS.values():
+            then, ego_from_camera = self._poses(channel)
+            ego_then = inverses(then @ ego_from_camera) @ world  # the camera's ego is where it was at its own time
+            cameras.append(ego_then @ self._ego_from_lidar)
+            intrinsics.append(np.stack([self._intrinsic(files[channel]) for files in self._files]))
+        return Calibs(
+            ego_from_lidar=self._ego_from_lidar[before],
+            world_from_ego=moved,
+            camera_from_lidar=np.stack(cameras, axis=1)[before],
+            intrinsic=np.stack(intrinsics, axis=1)[before],
+        )
+
+    def _intrinsic(self, image: Any) -> FloatArray:
+        """Return the intrinsic matrix (3, 3) of an image; raises DatarootError if it or its size is none."""
+        mount = self._source.follow(image, "calibrated_sensor_token")
+        matrix = np.array(mount.camera_intrinsic)
+        if matrix.shape != (3, 3) or matrix.diagonal().min() < _MIN_FOCAL_PX:
+            raise self._source.error(mount, "camera_intrinsic: expected 3 x 3 numbers with focal lengths in pixels")
+        if min(image.width, image.height) < 1:
+            raise self._source.error(image, "width, height: expected the pixels of an image, found 0")
+        return matrix
+
+    def _box_columns(self) -> dict[str, Any]:
+        """Return the columns of `Labels` of all boxes."""
+        boxes, follow, calibs = self._boxes, self._source.follow, self._calibs
+        names = [follow(follow(box, "instance_token"), "category_token").name for box in boxes]
+        world_from_lidar = calibs.world_from_ego @ calibs.ego_from_lidar
+        lidar_from_world = inverses(world_from_lidar)[KEY_STEP * self._keyframes]
+        turn = lidar_from_world[:, :3, :3]
+        yaw = _heading(turn @ quaternions.to_matrix(self._rotations))
+        center = np.reshape([box.translation for box in boxes], (-1, 3))
+        ids, velocity = self._tracks(center[:, :2])
+        ids += np.array([name not in CLASSES for name in names], dtype=bool) * IGNORED_ID
+        return {
+            "category": np.array([category_of(name) for name in names], dtype=np.int8),
+            "center": (turn @ center[:, :, None])[..., 0] + lidar_from_world[:, :3, 3],
+            "size": np.reshape([box.size for box in boxes], (-1, 3))[:, [1, 0, 2]],
+            "yaw": yaw,
+            "velocity": label_from_world_velocity(velocity, yaw),
+            "actor_id": ids,
+            "num_lidar_pts": np.array([box.num_lidar_pts for box in boxes], dtype=np.int64),
+            "camera_visible": np.array([box.visibility_token != _UNSEEN for box in boxes], dtype=bool),
+        }
+
+    def _tracks(self, places: FloatArray) -> tuple[IntArray, FloatArray]:
+        """Return numbers (N,) of actors as they appear, and velocities (N, 2) in the world, m/s.
+
+        As in nuScenes, a velocity is that from the actor's box before to its box after, NaN where these are too far
+        apart in time. Raises DatarootError if an actor has two boxes at a keyframe.
+        """
+        times, tracks = self._stamps[self._keyframes], defaultdict(list)
+        ids, velocity = np.zeros(len(times), dtype=np.int64), np.full((len(times), 2), np.nan)
+        for row, box in enumerate(self._boxes):
+            tracks[box.instance_token].append(row)
+        for number, rows in enumerate(tracks.values(), start=1):
+            ids[rows] = number
+            for before, row, after in zip([rows[0], *rows[:-1]], rows, [*rows[1:], rows[-1]], strict=True):
+                if before < row and times[before] == times[row]:
+                    raise self._source.error(self._boxes[row], "instance_token: two boxes of its sample have it")
+                seconds = times[after] - times[before]
+                if 0 < seconds <= _MAX_GAP_S * ((before < row) + (row < after)):
+                    velocity[row] = (places[after] - places[before]) / seconds
+        return ids, velocity
+
+
+def _heading(turn: FloatArray) -> FloatArray:
+    """Where x points, about z (N,), of rotations (N, 3, 3)."""
+    return np.asarray(np.arctan2(turn[:, 1, 0], turn[:, 0, 0]))
+
+
+def _about_z(angle: FloatArray) -> FloatArray:
+    """Rotations (N, 3, 3) about z."""
+    return quaternions.to_matrix(quaternions.from_yaw(angle))

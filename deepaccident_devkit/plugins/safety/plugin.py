@@ -1,0 +1,34 @@
+"""What the plug-in `safety` offers."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+from deepaccident_devkit.support.plugins import PROTOCOL_VERSION, LazyVerb, Plugin
+
+if TYPE_CHECKING:
+    import click
+
+    from deepaccident_devkit.evaluation.runs.further import ExtraResult
+
+
+def _safety() -> click.Command:
+    from deepaccident_devkit.plugins.safety.cli import safety
+
+    return safety
+
+
+def _prevented() -> ExtraResult:
+    from deepaccident_devkit.plugins.safety.prevention import PREVENTED
+
+    return PREVENTED
+
+
+PLUGIN: Final = Plugin(
+    name="safety",
+    protocol_version=PROTOCOL_VERSION,
+    verbs={
+        "safety": LazyVerb("Look into accidents: who saw it first, when it was too late.", _safety),
+    },
+    extra_results={"prevented": _prevented},
+)

@@ -1,0 +1,33 @@
+"""What the plug-in `synth` offers."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+from deepaccident_devkit.support.plugins import PROTOCOL_VERSION, LazyVerb, Plugin, need_plugin
+
+if TYPE_CHECKING:
+    import click
+
+
+def _demo() -> click.Command:
+    need_plugin("baselines", "demo")
+    from deepaccident_devkit.plugins.synth.demo import demo
+
+    return demo
+
+
+def _synth() -> click.Command:
+    from deepaccident_devkit.plugins.synth.cli import synth
+
+    return synth
+
+
+PLUGIN: Final = Plugin(
+    name="synth",
+    protocol_version=PROTOCOL_VERSION,
+    verbs={
+        "demo": LazyVerb("Make a small synthetic release, and a page on it.", _demo),
+        "synth": LazyVerb("Make a synthetic release.", _synth),
+    },
+)

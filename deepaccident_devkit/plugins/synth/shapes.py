@@ -1,0 +1,419 @@
+"""The shapes of each category: solids inside its label box, x forward, origin on the road below the box's centre."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from deepaccident_devkit.plugins.synth import solids
+from deepaccident_devkit.plugins.synth.solids import FRONT, LEFT, REAR, RIGHT, Block, Color, Solids
+
+# Metres from the road to the bottom of every label box, so that no point of the ground lies in a box.
+BOX_CLEARANCE = 0.02
+# Metres between a label box and what it holds, so that rounding moves no point out of its box.
+INSET = 0.01
+
+TIRE: Color = (34, 34, 36)
+RIM: Color = (150, 152, 156)
+# The colour of headlamps.
+LAMP: Color = (250, 246, 215)
+# The colour of tail lamps.
+TAIL: Color = (190, 24, 24)
+SKIN: Color = (214, 168, 138)
+DARK: Color = (48, 50, 56)
+PLATE: Color = (232, 232, 224)
+
+
+@dataclass(frozen=True, slots=True)
+class _ShapeFrame:
+    """The space that a shape may fill, and its two colours.
+
+    Attributes:
+        x: half the length, metres.
+        y: half the width, metres.
+        top: the height above the road, metres.
+        color: the colour of paint or clothes.
+        accent: the second colour.
+    """
+
+    x: float
+    y: float
+    top: float
+    color: Color
+    accent: Color
+
+
+def wheels(axles: tuple[float, ...], y: float, radius: float, width: float = 0.22) -> list[Block]:
+    """Wheels on both sides, whose outer faces are `y` metres from the middle."""
+    sides = ((y - width, y), (-y, -y + width))
+    return [block for axle in axles for side in sides for block in wheel(axle, side, radius, main=False)]
+
+
+def wheel(axle: float, across: tuple[float, float], radius: float, *, main: bool) -> tuple[Block, Block, Block]:
+    """A wheel of three blocks: two that give the tyre six corners, seen from the side, and a rim."""
+    middle, cut, rim = 0.03 + radius, 0.5 * radius, 0.52 * radius
+    upper = Block(
+        (axle - radius, axle + radius), across, (middle, middle + radius), TIRE, inset=(cut, cut, 0.0), main=main
+    )
+    lower = Block((axle - cut, axle + cut), across, (middle - radius, middle), TIRE, inset=(-cut, -cut, 0.0), main=main)
+    beyond = (across[0] - 0.008, across[1] + 0.008)
+    hub = Block((axle - rim, axle + rim), beyond, (middle - rim, middle + rim), RIM, main=False)
+    return upper, lower, hub
+
+
+def lamps(x: float, side: float, height: float, depth: float = 0.3) -> list[Block]:
+    """Two headlamps and two tail lamps, whose faces are `x` metres ahead of and behind the middle."""
+    z = (height, height + 0.13)
+    across = ((side - 0.45, side - 0.08), (-side + 0.08, -side + 0.45))
+    front = [Block((x - depth, x), y, z, LAMP, main=False) for y in across]
+    rear = [Block((-x, -x + depth), y, z, TAIL, main=False) for y in across]
+    return front + rear
+
+
+def plates(x: float, height: float) -> list[Block]:
+    """A number plate in front and one behind."""
+    z = (height, height + 0.11)
+    return [
+        Block((x - 0.1, x), (-0.26, 0.26), z, PLATE, main=False),
+        Block((-x, -x + 0.1), (-0.26, 0.26), z, PLATE, main=False),
+    ]
+
+
+def mirrors(x: float, body: float, y: float, height: float, color: Color) -> list[Block]:
+    """Mirrors between the body's side and `y` metres from the middle."""
+    z = (height, height + 0.14)
+    sides = ((body - 0.02, y), (-y, -body + 0.02))
+    return [Block((x - 0.06, x + 0.1), side, z, color, inset=(0.04, 0.0, 0.0), main=False) for side in sides]
+
+
+# Half the thickness of arms and legs, metres.
+_LIMB = 0.045
+
+
+def motorcycle(frame: _ShapeFrame) -> list[Block]:
+    """A motorcycle and its rider, who sits upright."""
+    x = frame.x
+    return [
+        *_two_wheels(x, 0.32, 0.07),
+        Block((-0.5 * x, 0.42 * x), (-0.15, 0.15), (0.34, 0.7), frame.color, inset=(0.12, 0.05, 0.03)),
+        Block((-0.05 * x, 0.36 * x), (-0.16, 0.16), (0.7, 0.92), frame.color, inset=(0.1, 0.12, 0.05)),
+        Block((-0.78 * x, -0.1 * x), (-0.12, 0.12), (0.7, 0.8), DARK, inset=(0.0, 0.06, 0.02)),
+        _fork(0.72 * x, 0.3, 0.98),
+        _handlebar(0.38 * x, frame.y, 0.98),
+        Block((0.44 * x, 0.54 * x), (-0.09, 0.09), (0.8, 0.94), LAMP, main=False),
+        Block((-0.82 * x, -0.76 * x), (-0.06, 0.06), (0.72, 0.8), TAIL, main=False),
+        *_rider(frame, seat=-0.2 * x, low=0.8, reach=0.5 * x, helmet=DARK),
+    ]
+
+
+def scooter(frame: _ShapeFrame) -> list[Block]:
+    """A scooter with a shield before its rider's knees."""
+    x = frame.x
+    return [
+        *_two_wheels(x, 0.26, 0.06),
+        Block((-0.85 * x, -0.1 * x), (-0.17, 0.17), (0.38, 0.76), frame.color, inset=(0.1, 0.06, 0.04)),
+        Block((-0.12 * x, 0.5 * x), (-0.15, 0.15), (0.26, 0.36), frame.color),
+        Block((0.46 * x, 0.54 * x), (-0.22, 0.22), (0.32, 0.95), frame.color, inset=(0.1, -0.1, 0.05)),
+        Block((-0.7 * x, -0.1 * x), (-0.13, 0.13), (0.76, 0.82), DARK),
+        _handlebar(0.4 * x, frame.y, 0.98),
+        Block((0.44 * x, 0.52 * x), (-0.08, 0.08), (0.82, 0.94), LAMP, main=False),
+        Block((-0.87 * x, -0.8 * x), (-0.08, 0.08), (0.6, 0.7), TAIL, main=False),
+        *_rider(frame, seat=-0.3 * x, low=0.82, reach=0.45 * x, helmet=(220, 220, 216)),
+    ]
+
+
+def cyclist(frame: _ShapeFrame) -> list[Block]:
+    """A bicycle and its rider, who leans forward."""
+    x = frame.x
+    return [
+        *_two_wheels(x, 0.33, 0.025),
+        Block((-0.1 * x, 0.42 * x), (-0.025, 0.025), (0.44, 0.5), frame.color, inset=(-0.1, -0.02, 0.0), main=False),
+        Block((-0.2 * x, 0.5 * x), (-0.025, 0.025), (0.74, 0.8), frame.color, main=False),
+        Block((-0.22 * x, -0.16 * x), (-0.03, 0.03), (0.36, 0.92), DARK, inset=(0.1, -0.1, 0.0), main=False),
+        _fork(0.62 * x, 0.3, 1.0),
+        _handlebar(0.46 * x, frame.y, 1.0),
+        *_rider(frame, seat=-0.28 * x, low=0.9, reach=0.5 * x, helmet=(226, 228, 230)),
+    ]
+
+
+def walker(frame: _ShapeFrame) -> list[Block]:
+    """A person in the middle of a long step, with swinging arms."""
+    return _person(frame, stride=frame.x - _LIMB)
+
+
+def stroller(frame: _ShapeFrame) -> list[Block]:
+    """A person with a short step and a bag on the back."""
+    y, top = frame.y, frame.top
+    bag = Block((-frame.x, -0.4 * frame.x), (-0.6 * y, 0.6 * y), (0.56 * top, 0.78 * top), DARK, inset=(0, 0.02, 0.02))
+    return [*_person(frame, stride=0.5 * frame.x), bag]
+
+
+def _person(frame: _ShapeFrame, stride: float) -> list[Block]:
+    y, top, color = frame.y, frame.top, frame.color
+    hip, neck = 0.48 * top, 0.85 * top
+    reach = min(0.62 * frame.x, 0.12)
+    return [
+        _limb(stride, (0.015, 0.14), (0.03, hip), frame.accent),
+        _limb(-stride, (-0.14, -0.015), (0.03, hip), frame.accent),
+        Block((-reach, reach), (-0.72 * y, 0.72 * y), (hip, neck), color, inset=(0.02, 0.02, -0.02)),
+        _limb(-0.6 * stride, (0.76 * y, y), (0.46 * top, 0.82 * top), color),
+        _limb(0.6 * stride, (-y, -0.76 * y), (0.46 * top, 0.82 * top), color),
+        Block((-0.05, 0.05), (-0.05, 0.05), (neck, neck + 0.04), SKIN, main=False),
+        Block((-0.08, 0.1), (-0.075, 0.075), (neck + 0.03, top - 0.06), SKIN, inset=(0.01, -0.01, -0.01)),
+        Block((-0.1, 0.08), (-0.085, 0.085), (top - 0.1, top), DARK, inset=(0.03, 0.03, 0.03)),
+    ]
+
+
+def _rider(frame: _ShapeFrame, seat: float, low: float, reach: float, helmet: Color) -> list[Block]:
+    """A rider at `seat`, `low` metres above the road, with hands `reach` metres ahead of the middle."""
+    top, side = frame.top, min(frame.y - 0.02, 0.24)
+    neck, lean = top - 0.27, min(0.22, 0.4 * (reach - seat))
+    shoulder = seat + lean
+    arms = ((side - 0.08, side), (-side, -side + 0.08))
+    hand = 1.0 if neck > 1.1 else 0.9 * neck
+    return [
+        Block(
+            (seat - 0.14, seat + 0.12), (-side + 0.05, side - 0.05), (low, neck), frame.accent, inset=(-lean, lean, 0.0)
+        ),
+        *(
+            Block((seat, seat + 0.15), across, (0.36, low + 0.08), DARK, inset=(-0.06, -0.02, 0.0))
+            for across in ((0.05, min(side, 0.16)), (-min(side, 0.16), -0.05))
+        ),
+        *(
+            Block(
+                (reach - 0.1, reach),
+                across,
+                (hand - 0.04, neck - 0.04),
+                frame.accent,
+                inset=(reach - shoulder - 0.1, shoulder - reach + 0.1, 0.0),
+                main=False,
+            )
+            for across in arms
+        ),
+        Block((shoulder - 0.08, shoulder + 0.14), (-0.1, 0.1), (neck, top - 0.14), SKIN, main=False),
+        Block((shoulder - 0.12, shoulder + 0.14), (-0.12, 0.12), (top - 0.18, top), helmet, inset=(0.05, 0.05, 0.04)),
+    ]
+
+
+def _limb(end: float, y: tuple[float, float], z: tuple[float, float], color: Color) -> Block:
+    """An arm or a leg from the body's middle down to `end` metres ahead of it."""
+    return Block((end - _LIMB, end + _LIMB), y, z, color, inset=(end, -end, 0.0))
+
+
+def _two_wheels(x: float, radius: float, half_width: float) -> list[Block]:
+    across = (-half_width, half_width)
+    return [block for axle in (x - radius, radius - x) for block in wheel(axle, across, radius, main=True)]
+
+
+def _fork(x: float, low: float, high: float) -> Block:
+    return Block((x - 0.03, x + 0.03), (-0.05, 0.05), (low, high), DARK, inset=(0.16, -0.16, 0.0), main=False)
+
+
+def _handlebar(x: float, y: float, height: float) -> Block:
+    return Block((x - 0.03, x + 0.03), (-y, y), (height - 0.03, height + 0.03), DARK, main=False)
+
+
+_ALL_AROUND = (FRONT, REAR, LEFT, RIGHT)
+# The share of the label box's half width that the body has; mirrors have the rest.
+_BODY = 0.94
+
+
+@dataclass(frozen=True, slots=True)
+class _Line:
+    """The side view of a car, in shares of its half length and of its height.
+
+    Attributes:
+        waist: height of the windows' lower edge.
+        cabin: where the windows' lower edge begins and ends.
+        roof: where the roof begins and ends.
+        boot: where the boot's lid behind the cabin begins and ends; None if the cabin is the rear end of the car.
+        wheel: radius of the wheels, metres.
+        sill: height of the body's lower edge, metres.
+    """
+
+    waist: float
+    cabin: tuple[float, float]
+    roof: tuple[float, float]
+    boot: tuple[float, float] | None
+    wheel: float
+    sill: float
+
+
+_SALOON = _Line(0.6, (-0.84, 0.45), (-0.6, 0.16), (-0.98, -0.76), 0.32, 0.2)
+_HATCHBACK = _Line(0.6, (-0.94, 0.5), (-0.74, 0.1), None, 0.31, 0.2)
+_OFF_ROADER = _Line(0.58, (-0.96, 0.44), (-0.86, 0.16), None, 0.36, 0.27)
+
+
+def saloon(frame: _ShapeFrame) -> list[Block]:
+    """A car of three boxes: bonnet, cabin, boot."""
+    return _car(frame, _SALOON)
+
+
+def hatchback(frame: _ShapeFrame) -> list[Block]:
+    """A car of two boxes: bonnet, cabin."""
+    return _car(frame, _HATCHBACK)
+
+
+def off_roader(frame: _ShapeFrame) -> list[Block]:
+    """A steep car of two boxes on large wheels, with rails on the roof."""
+    x, top = frame.x, frame.top
+    rails = [Block((-0.7 * x, 0.05 * x), y, (top - 0.05, top), DARK, main=False) for y in ((0.5, 0.56), (-0.56, -0.5))]
+    return [*_car(frame, _OFF_ROADER), *rails]
+
+
+def _car(frame: _ShapeFrame, line: _Line) -> list[Block]:
+    x, body, top, color = frame.x, _BODY * frame.y, frame.top, frame.color
+    waist, roof = line.waist * top, top - 0.05
+    between = waist + 0.6 * (roof - waist)
+    (rear, front), (roof_rear, roof_front) = ((share * x for share in span) for span in (line.cabin, line.roof))
+    upper = 0.6
+    blocks = [
+        Block(
+            (-x + 0.06, x - 0.06), (-body + 0.05, body - 0.05), (line.sill, 0.42), color, inset=(-0.05, -0.05, -0.05)
+        ),
+        Block((-x + 0.01, x - 0.01), (-body, body), (0.42, waist), color, inset=(0.16, 0.07, 0.05)),
+        Block(
+            (rear, front),
+            (-body + 0.08, body - 0.08),
+            (waist, between),
+            color,
+            glass=_ALL_AROUND,
+            inset=(upper * (front - roof_front), upper * (roof_rear - rear), 0.09),
+        ),
+        Block(
+            (rear + upper * (roof_rear - rear), front - upper * (front - roof_front)),
+            (-body + 0.17, body - 0.17),
+            (between, roof),
+            color,
+            glass=_ALL_AROUND,
+            inset=((1 - upper) * (front - roof_front), (1 - upper) * (roof_rear - rear), 0.1),
+        ),
+        Block((roof_rear, roof_front), (-body + 0.26, body - 0.26), (roof, top), color, inset=(0.12, 0.12, 0.1)),
+        Block((0.9 * front, x - 0.2), (-body + 0.12, body - 0.12), (waist, waist + 0.05), color, inset=(0.25, 0, 0.1)),
+        Block((x - 0.1, x - 0.01), (-0.5 * body, 0.5 * body), (0.27, 0.39), DARK, main=False),
+        *_pillars(0.5 * (roof_rear + roof_front), body - 0.09, waist, roof, frame),
+        *mirrors(0.72 * front, body - 0.06, frame.y, waist + 0.02, color),
+        *wheels((0.62 * x, -0.6 * x), body, line.wheel),
+        *lamps(x - 0.02, body, 0.72 * waist),
+        *plates(x, 0.45),
+    ]
+    if line.boot:
+        lid = (line.boot[0] * x, line.boot[1] * x)
+        blocks.append(Block(lid, (-body + 0.1, body - 0.1), (waist, waist + 0.06), color, inset=(0, 0.08, 0.08)))
+    return blocks
+
+
+def _pillars(x: float, side: float, waist: float, roof: float, frame: _ShapeFrame) -> list[Block]:
+    """An upright post between the side windows, left and right."""
+    outer = ((side - 0.04, side + 0.005), (-side - 0.005, -side + 0.04))
+    return [Block((x - 0.05, x + 0.05), across, (waist, roof), frame.color, main=False) for across in outer]
+
+
+# The same share for vans and trucks.
+_VAN_BODY = 0.95
+
+
+def delivery_van(frame: _ShapeFrame) -> list[Block]:
+    """A van with windows only in front."""
+    return _van(frame, panes=((0.14, 0.4),))
+
+
+def minibus(frame: _ShapeFrame) -> list[Block]:
+    """A van with windows along its whole length."""
+    return _van(frame, panes=((0.14, 0.4), (-0.4, 0.06), (-0.88, -0.48)))
+
+
+def box_truck(frame: _ShapeFrame) -> list[Block]:
+    """A cab and a large box."""
+    x, y, top = frame.x, _VAN_BODY * frame.y, frame.top
+    box = Block((-x, 0.52 * x), (-y, y), (0.95, top), frame.accent, inset=(0.02, 0.02, 0.02))
+    return [*_chassis(frame, 0.76 * top), box]
+
+
+def tank_truck(frame: _ShapeFrame) -> list[Block]:
+    """A cab and a tank with eight sides."""
+    x, y, top = frame.x, _VAN_BODY * frame.y, 0.82 * frame.top
+    low, high = 0.95 + 0.28 * (top - 0.95), top - 0.28 * (top - 0.95)
+    along, narrow = (-x, 0.5 * x), 0.4 * y
+    return [
+        *_chassis(frame, 0.74 * frame.top),
+        Block(along, (-y + narrow, y - narrow), (0.95, low), frame.accent, inset=(0.0, 0.0, -narrow)),
+        Block(along, (-y, y), (low, high), frame.accent),
+        Block(along, (-y, y), (high, top), frame.accent, inset=(0.0, 0.0, narrow)),
+        Block((-0.3 * x, 0.0), (-0.3, 0.3), (top, frame.top), DARK),
+    ]
+
+
+def _van(frame: _ShapeFrame, panes: tuple[tuple[float, float], ...]) -> list[Block]:
+    x, y, top, color = frame.x, _VAN_BODY * frame.y, frame.top, frame.color
+    waist = 0.52 * top
+    sides = ((y - 0.12, y - 0.045), (0.045 - y, 0.12 - y))
+    return [
+        Block((-x + 0.04, x - 0.06), (-y + 0.05, y - 0.05), (0.22, 0.44), color, inset=(-0.04, -0.02, -0.05)),
+        Block((-x + 0.01, x - 0.01), (-y, y), (0.44, waist), color, inset=(0.2, 0.0, 0.03)),
+        Block(
+            (-x + 0.02, 0.8 * x),
+            (-y + 0.03, y - 0.03),
+            (waist, top - 0.08),
+            color,
+            glass=(FRONT,),
+            inset=(0.62, 0.05, 0.05),
+        ),
+        Block((-x + 0.09, 0.78 * x - 0.62), (-y + 0.1, y - 0.1), (top - 0.08, top), color, inset=(0.12, 0.1, 0.12)),
+        Block((-x + 0.01, -x + 0.1), (-0.7 * y, 0.7 * y), (waist + 0.1, top - 0.35), solids.GLASS, main=False),
+        *(
+            Block((span[0] * x, span[1] * x), side, (waist + 0.06, top - 0.34), solids.GLASS, main=False)
+            for span in panes
+            for side in sides
+        ),
+        *mirrors(0.5 * x, y - 0.03, frame.y, waist + 0.06, DARK),
+        *wheels((0.64 * x, -0.62 * x), y, 0.35),
+        *lamps(x - 0.02, y, 0.72 * waist),
+        *plates(x, 0.46),
+    ]
+
+
+def _chassis(frame: _ShapeFrame, cab_top: float) -> list[Block]:
+    """Frame, wheels and cab of a truck."""
+    x, y = frame.x, _VAN_BODY * frame.y
+    middle = 0.45 * cab_top + 0.35
+    cab = (0.56 * x, x - 0.02)
+    return [
+        Block((-x + 0.05, 0.9 * x), (-0.8 * y, 0.8 * y), (0.55, 0.95), DARK, main=False),
+        Block(cab, (-y + 0.04, y - 0.04), (0.45, middle), frame.color, inset=(0.04, 0.0, 0.0)),
+        Block(
+            (cab[0], cab[1] - 0.04),
+            (-y + 0.04, y - 0.04),
+            (middle, cab_top - 0.15),
+            frame.color,
+            glass=(FRONT, LEFT, RIGHT),
+            inset=(0.16, 0.0, 0.05),
+        ),
+        Block(
+            (cab[0], cab[1] - 0.2), (-y + 0.09, y - 0.09), (cab_top - 0.15, cab_top), frame.color, inset=(0.2, 0, 0.1)
+        ),
+        Block((x - 0.1, x), (-0.6 * y, 0.6 * y), (0.6, 0.95), DARK, glass=(REAR,), main=False),
+        *mirrors(cab[1] - 0.3, y - 0.06, frame.y, middle + 0.15, DARK),
+        *wheels((0.76 * x, -0.45 * x, -0.75 * x), y, 0.48, 0.3),
+        *lamps(x, y - 0.1, 0.66),
+    ]
+
+
+# Category → the functions that build its models.
+MODELS: dict[str, tuple[Callable[[_ShapeFrame], list[Block]], ...]] = {
+    "car": (saloon, hatchback, off_roader),
+    "van": (delivery_van, minibus),
+    "truck": (box_truck, tank_truck),
+    "motorcycle": (motorcycle, scooter),
+    "cyclist": (cyclist,),
+    "pedestrian": (walker, stroller),
+}
+
+
+def shape_of(category: str, size: tuple[float, float, float], color: Color, accent: Color, model: int = 0) -> Solids:
+    """The solids of a road user with a label box of length, width and height, metres, and two colours.
+
+    The model is one of the category's `MODELS`; after the last one, the first follows.
+    """
+    length, width, height = size
+    frame = _ShapeFrame(length / 2 - INSET, width / 2 - INSET, BOX_CLEARANCE + height - INSET, color, accent)
+    models = MODELS[category]
+    return solids.build(models[model % len(models)](frame))

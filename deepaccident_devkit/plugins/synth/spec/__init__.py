@@ -1,0 +1,32 @@
+"""Scenario files: what they can say, how they are read, and the paper's twelve designs as such files.
+
+A file is read into a `SpecTemplate`, whose ranges and choices are still open; `draw` makes a `ScenarioSpec` from it.
+The parts, lowest layer first: `model` (the fields and their open choices), `reading` (YAML and types), `checks` (the
+rest), `catalogue` (templates and the designs).
+"""
+
+from deepaccident_devkit.plugins.synth.spec.catalogue import (
+    DESIGN_NUMBERS,
+    SpecTemplate,
+    design_text,
+    draw,
+    parse_spec,
+    read_design,
+    read_spec,
+)
+from deepaccident_devkit.plugins.synth.spec.model import ActorSpec, BackgroundSpec, MeetSpec, ScenarioSpec, View
+
+__all__ = [
+    "DESIGN_NUMBERS",
+    "ActorSpec",
+    "BackgroundSpec",
+    "MeetSpec",
+    "ScenarioSpec",
+    "SpecTemplate",
+    "View",
+    "design_text",
+    "draw",
+    "parse_spec",
+    "read_design",
+    "read_spec",
+]

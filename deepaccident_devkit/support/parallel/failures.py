@@ -1,0 +1,55 @@
+"""Items of bulk work that fail: the others are done, and what failed is listed at the end."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Generic, TypeVar
+
+from deepaccident_devkit.errors import DeepAccidentError, MissingExtraError, ReleaseError, SomeFailedError, WorkerError
+
+_Item = TypeVar("_Item")
+_Result = TypeVar("_Result")
+
+
+@dataclass(frozen=True, slots=True)
+class Failure:
+    """What an item gives in place of a result.
+
+    Attributes:
+        message: of its error.
+    """
+
+    message: str
+
+
+@dataclass(frozen=True, slots=True)
+class Tried(Generic[_Item, _Result]):
+    """Work that gives a Failure for an item with a fault of its own; a full disk or a lost worker still ends it all.
+
+    Attributes:
+        work: what is tried.
+    """
+
+    work: Callable[[_Item], _Result]
+
+    def __call__(self, item: _Item) -> _Result | Failure:
+        """Do the work."""
+        try:
+            return self.work(item)
+        except ReleaseError as error:  # a missing file is an OSError too
+            return Failure(str(error))
+        except (OSError, MissingExtraError, WorkerError):
+            raise
+        except DeepAccidentError as error:
+            return Failure(str(error))
+
+
+def check_failures(results: Iterable[tuple[str, object]], where: str) -> None:
+    """Raise SomeFailedError if there is a Failure among named results; the message lists them all."""
+    everything = list(results)
+    failed = [f"  {name}: {result.message}" for name, result in everything if isinstance(result, Failure)]
+    if failed:
+        lines = [f"{where}: {len(failed)} of {len(everything)} failed:", *failed]
+        lines.append("The others are done; mend these, and run the same again: it does what is left.")
+        raise SomeFailedError("\n".join(lines))

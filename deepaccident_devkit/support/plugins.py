@@ -1,0 +1,220 @@
+"""Plug-ins: products that stand on the core and add verbs, formats, tasks and more to it (docs/plugins.md).
+
+Our own are the folders of `deepaccident_devkit/plugins` that have a `plugin.py`. Other people's are installed packages
+with an entry point in the group `deepaccident_devkit.plugins`. Either offers one object, a `Plugin`. What it offers is
+imported when it is used.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+from collections.abc import Callable, Collection, Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, Generic, NamedTuple, TypeVar
+
+from deepaccident_devkit.errors import MissingPluginError
+
+if TYPE_CHECKING:
+    import click
+
+    from deepaccident_devkit.deepaccident import DeepAccident
+    from deepaccident_devkit.evaluation.evaluator import Evaluator
+    from deepaccident_devkit.evaluation.runs.further import ExtraResult
+    from deepaccident_devkit.export.format import Format
+
+PROTOCOL_VERSION: Final = 1
+"""Version of `Plugin`; a plug-in written for another version is left out."""
+ENTRY_POINT_GROUP: Final = "deepaccident_devkit.plugins"
+# Environment variable; `off` leaves other people's plug-ins out.
+OFF_SWITCH: Final = "DEEPACCIDENT_PLUGINS"
+_FOLDER: Final = Path(__file__).parents[1] / "plugins"
+_PACKAGE: Final = f"{__package__.partition('.')[0]}.plugins"
+
+
+class LazyVerb(NamedTuple):
+    """A verb of the command line: one line for the list of verbs, and a function that imports the verb."""
+
+    summary: str
+    load: Callable[[], click.Command]
+
+
+class LazyFormat(NamedTuple):
+    """A format of `deepaccident export`: one line for the list of formats, and a function that imports it."""
+
+    summary: str
+    load: Callable[[], type[Format]]
+
+
+class LazyTask(NamedTuple):
+    """A task of `deepaccident evaluate`: one line for the list of tasks, and a function that imports its evaluator."""
+
+    summary: str
+    load: Callable[[], type[Evaluator[Any]]]
+
+
+class Opener(NamedTuple):
+    """A function that opens dataroots of another dataset, and one that recognizes them.
+
+    Attributes:
+        recognizes: folder → whether it is such a dataroot.
+        open_release: folder, folder for the index or None → the release.
+    """
+
+    recognizes: Callable[[Path], bool]
+    open_release: Callable[[Path, Path | None], DeepAccident]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Plugin:
+    """What a plug-in offers, by name; it is imported when it is used.
+
+    Attributes:
+        name: Name that messages use.
+        protocol_version: `PROTOCOL_VERSION` of the devkit that the plug-in was written for.
+        verbs: Verbs of the command line; `check NAME` is a verb of the group `check`.
+        openers: Openers of other datasets, by the dataset's name.
+        export_formats: Formats of `deepaccident export`.
+        tasks: Tasks of `deepaccident evaluate`.
+        extra_results: Functions that import extra results of evaluations.
+    """
+
+    name: str
+    protocol_version: int
+    verbs: Mapping[str, LazyVerb] = field(default_factory=dict)
+    openers: Mapping[str, Opener] = field(default_factory=dict)
+    export_formats: Mapping[str, LazyFormat] = field(default_factory=dict)
+    tasks: Mapping[str, LazyTask] = field(default_factory=dict)
+    extra_results: Mapping[str, Callable[[], ExtraResult]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Check the kinds of what is offered; raises TypeError."""
+        kinds = {"verbs": LazyVerb, "openers": Opener, "export_formats": LazyFormat, "tasks": LazyTask}
+        for name, kind in kinds.items():
+            for value in getattr(self, name).values():
+                if not isinstance(value, kind):
+                    raise TypeError(f"{name}: expected objects of the class {kind.__name__}, found {value!r}")
+
+    def __repr__(self) -> str:
+        """Return its kind and name."""
+        return f"Plugin({str(self.name)[:50]!r})"
+
+
+Offered = TypeVar("Offered")
+
+
+@dataclass(frozen=True, slots=True)
+class Offers(Generic[Offered]):
+    """What plug-ins offer of one kind.
+
+    Attributes:
+        by_name: Name → what is offered.
+        refused: Plug-in → why it, or one of its names, is left out.
+    """
+
+    by_name: Mapping[str, Offered]
+    refused: Mapping[str, str]
+
+    def refusals_text(self) -> str:
+        """Return a line for each plug-in that is left out; empty if there is none."""
+        return "\n".join(f"The plug-in {name} is left out: {reason}." for name, reason in self.refused.items())
+
+
+def offers(
+    read: Callable[[Plugin], Mapping[str, Offered]], core: Collection[str] = (), *, own: bool = False
+) -> Offers[Offered]:
+    """Collect what plug-ins offer of one kind.
+
+    Args:
+        read: Takes it out of a plug-in.
+        core: Names that the core has; a plug-in cannot offer them.
+        own: Whether to ask the devkit's own plug-ins only, which reads no entry points.
+
+    Returns:
+        The names that one plug-in offers. Of several with one name the devkit's own has it, or nobody.
+    """
+    found = own_plugins() if own else all_plugins()
+    refused = dict(found.refused)
+    owners: dict[str, list[tuple[str, Offered]]] = {}
+    for plugin in found.plugins:
+        for name, value in read(plugin).items():
+            owners.setdefault(name, []).append((plugin.name, value))
+    by_name = {}
+    own_names = {plugin.name for plugin in own_plugins().plugins}
+    for name, owned in owners.items():
+        names = [owner for owner, _ in owned]
+        if name in core:
+            refused |= dict.fromkeys(names, f"it offers {name!r}, which the devkit itself has")
+        elif len(owned) == 1:
+            by_name[name] = owned[0][1]
+        elif names[0] in own_names:  # they come first
+            by_name[name] = owned[0][1]
+            refused |= dict.fromkeys(names[1:], f"it offers {name!r}, which {names[0]} offers, too")
+        else:
+            refused |= {owner: f"{' and '.join(names)} both offer {name!r}; uninstall one of them" for owner in names}
+    return Offers(by_name, refused)
+
+
+class Installed(NamedTuple):
+    """The plug-ins that were loaded, and for each that was not, why."""
+
+    plugins: tuple[Plugin, ...]
+    refused: Mapping[str, str]
+
+
+@cache
+def own_plugins() -> Installed:
+    """Load the objects of the devkit's own plug-ins, without the packages that they describe."""
+    return _loaded((path.parent.name, _from_file, path) for path in sorted(_FOLDER.glob("*/plugin.py")))
+
+
+@cache
+def all_plugins() -> Installed:
+    """Load the devkit's own plug-ins and, unless they are switched off, those of other installed packages."""
+    from importlib.metadata import entry_points  # reading them takes milliseconds
+
+    own = own_plugins()
+    if os.environ.get(OFF_SWITCH, "").lower() == "off":
+        return own
+    points = sorted(entry_points(group=ENTRY_POINT_GROUP), key=lambda point: point.name)
+    others = _loaded((point.name, lambda point: point.load(), point) for point in points)
+    return Installed((*own.plugins, *others.plugins), {**own.refused, **others.refused})
+
+
+def need_plugin(name: str, purpose: str) -> None:
+    """Raise MissingPluginError, which says what for, if one of the devkit's own plug-ins is not installed."""
+    if not (_FOLDER / name / "plugin.py").is_file():
+        raise MissingPluginError(
+            f"{purpose}: needs the plug-in {name}, which this installation lacks; install the whole devkit"
+        )
+
+
+def _loaded(sources: Iterator[tuple[str, Callable[[Any], Any], Any]]) -> Installed:
+    plugins: list[Plugin] = []
+    refused: dict[str, str] = {}
+    for name, load, source in sources:
+        try:
+            plugin = load(source)
+        except Exception as error:  # noqa: BLE001 - whatever somebody else's code raises
+            refused[name] = f"{type(error).__name__}: {error}"
+            continue
+        if not isinstance(plugin, Plugin):
+            refused[name] = f"expected an object of the class Plugin, found {type(plugin).__name__}"
+        elif plugin.protocol_version != PROTOCOL_VERSION:
+            version = plugin.protocol_version
+            refused[name] = f"it is for version {version} of the plug-in protocol, this devkit has {PROTOCOL_VERSION}"
+        else:
+            plugins.append(plugin)
+    return Installed(tuple(plugins), refused)
+
+
+def _from_file(path: Path) -> Any:
+    """Return the plug-in object of a `plugin.py`; its package, which may be slow to import, is not imported."""
+    spec = importlib.util.spec_from_file_location(f"{_PACKAGE}.{path.parent.name}.plugin", path)
+    if spec is None or spec.loader is None:
+        raise ImportError(f"{path}: cannot be imported")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module.PLUGIN

@@ -1,0 +1,130 @@
+"""The safety report: its numbers are those of its parts, each accident is replayed once, and nothing is lost."""
+
+import csv
+import importlib
+import json
+from pathlib import Path
+from unittest.mock import Mock
+
+import numpy as np
+import pytest
+from damaged_releases import damaged_release
+from wording import lacking
+
+import deepaccident_devkit.plugins.safety.report as report_module
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.collisions import Skipped
+from deepaccident_devkit.descriptions import describe, stories
+from deepaccident_devkit.interactions import interactions
+from deepaccident_devkit.plugins.safety import (
+    SafetyReport,
+    avoidability_report,
+    lead_time_ledger,
+    safety_report,
+    twin_report,
+)
+from deepaccident_devkit.plugins.safety.avoidability_report import Dropped
+
+
+@pytest.fixture(scope="module")
+def report(da_motion: DeepAccident) -> SafetyReport:
+    return safety_report(da_motion, workers=1)
+
+
+def test_its_parts_are_those_of_the_functions(da_motion: DeepAccident, report: SafetyReport) -> None:
+    for part, function in (
+        (report.avoidability, avoidability_report),
+        (report.ledger, lead_time_ledger),
+        (report.twins, twin_report),
+    ):
+        assert part.to_dict() == function(da_motion, workers=1).to_dict()
+    assert [row.story for row in report.rows] + list(report.normal) == list(stories(da_motion, workers=1))
+    assert (report.scenarios, len(report.rows), report.left_out) == (2, 1, [])
+
+
+def test_a_row_has_the_numbers_of_its_accident(da_motion: DeepAccident, report: SafetyReport) -> None:
+    (row,) = report.rows
+    (replayed,), (times,), (twin,) = report.avoidability.accidents, report.ledger.accidents, report.twins.diffs
+    story, told = describe(da_motion, row.scenario).facts["accident"], row.to_dict()
+    slack = replayed.slack[replayed.accident.agents.index("ego_vehicle")]
+    assert (row.brakes, told["last_moments"]["6"]) == (["ego_vehicle"], story["braking"]["slack"])
+    assert row.last_moments == pytest.approx(dict(zip((4.0, 6.0, 8.0), slack, strict=True)), abs=0.005)
+    known = {**story["seen"], "ego_vehicle": times.alone, "all": times.together}
+    assert row.leads == pytest.approx(known, abs=1e-6)
+    assert (row.parts, row.severity) == (
+        pytest.approx(twin.to_dict()["time_to_impact"]),
+        max(each["delta_v"] for each in story["pair"]),
+    )
+    pairs = interactions(da_motion, row.scenario).pairs
+    at = pairs.position(*times.actor_ids)
+    measures = told["time_exposed"], np.inf if told["pet"] is None else told["pet"]
+    assert measures == pytest.approx((pairs.tet[at, 0], abs(pairs.pet[at])), abs=0.005)
+
+
+def test_each_accident_is_replayed_once(da_motion: DeepAccident, monkeypatch: pytest.MonkeyPatch) -> None:
+    looked = Mock(side_effect=report_module.looked_into)
+    never = Mock(side_effect=AssertionError("the story replays the accident itself"))
+    monkeypatch.setattr(report_module, "looked_into", looked)
+    monkeypatch.setattr(importlib.import_module("deepaccident_devkit.descriptions.stories"), "avoidability", never)
+    (row,) = safety_report(da_motion, da_motion.find(collision=True), workers=1).rows
+    assert [call.args[1]["token"] for call in looked.call_args_list] == [row.scenario]
+    assert row.story.facts["accident"]["braking"] is not None
+
+
+def test_an_accident_that_cannot_be_replayed_keeps_its_row(
+    da_motion: DeepAccident, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (accident,) = da_motion.find(collision=True)
+    dropped = Dropped(Skipped(scenario=accident["token"], reason="2.00 m apart"), 2.0)
+    monkeypatch.setattr(report_module, "looked_into", lambda *_: dropped)
+    report = safety_report(da_motion, [accident], workers=1)
+    (row,) = report.rows
+    assert (row.replayed, row.last_moments, row.brakes, row.severity) == (None, {}, [], -1.0)
+    assert row.leads["all"] is not None
+    assert report.left_out == [(row.scenario, "braking: dropped", "2.00 m apart")]
+    assert report.to_dict()["margins"] == {row.scenario: 2.0}
+    assert report.avoidability.margin_counts["1 m or more"] == 1
+
+
+def test_what_is_left_out_is_named(own_release: Path) -> None:
+    damaged = damaged_release(own_release)
+    report = safety_report(damaged.dataset, workers=1)
+    shown = [row.scenario for row in report.rows] + [each.facts["scenario"] for each in report.normal]
+    assert sorted(shown) == sorted(damaged.whole)
+    told = {scenario: f"{part}: {reason}" for scenario, part, reason in report.left_out}
+    for scenario, *words in (
+        (damaged.without_meta, "braking: skipped, lead times", "no meta file"),
+        (damaged.without_labels, "braking: skipped, lead times", "no labels"),
+        (damaged.broken, "everything", "on_error='skip'"),
+    ):
+        assert not lacking(told[scenario], *words)
+
+
+def test_normal_scenarios_come_by_their_least_time_to_collision(da_b: DeepAccident) -> None:
+    normal = safety_report(da_b, workers=1).normal
+    times = [np.inf if (each := story.facts["nearest"]) is None else each["min_ttc"] for story in normal]
+    assert times == sorted(times)
+    assert len(normal) == sum(each["collision"] is None for each in da_b.scenario)
+
+
+def test_tables(report: SafetyReport, tmp_path: Path) -> None:
+    accidents, left_out = report.to_csv(tmp_path)
+    heading, line = csv.reader(accidents.read_text(encoding="utf-8").splitlines())
+    cells, (row,) = dict(zip(heading, line, strict=True)), report.rows
+    expected = {
+        "scenario": row.scenario,
+        "story": row.story.text,
+        "pet": "" if row.measures.pet is None else str(row.measures.pet),
+    }
+    numbers = {
+        "closing_speed": row.story.facts["accident"]["closing_speed"],
+        "lead_infrastructure": row.leads["infrastructure"],
+        "last_moment_8": row.last_moments[8.0],
+        "second_delta_v": row.colliders[1]["delta_v"],
+        "twin_parts": row.parts,
+    }
+    assert len(cells) == len(heading)
+    assert {name: cells[name] for name in expected} == expected
+    assert {name: float(cells[name]) for name in numbers} == numbers
+    assert left_out.read_text() == "scenario,part,reason\n"
+    assert json.loads(report.to_json())["accidents"][0] == json.loads(json.dumps(row.to_dict()))

@@ -1,0 +1,201 @@
+"""Recipes: what a file can say, and what is said of faults."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from deepaccident_devkit.errors import ConfigError
+from deepaccident_devkit.plugins.study import read_recipe
+from deepaccident_devkit.plugins.study.recipe import MOST_ROWS, SHIPPED_RECIPES, StudyRow
+
+PLAIN: dict[str, Any] = {
+    "title": "A study",
+    "question": "Does it help?",
+    "releases": {"test": {"seed": 3, "scenarios": 4}},
+    "test": {"release": "test"},
+    "rows": [{"name": "one", "baseline": "standing"}, {"name": "two", "trivial": "nothing"}],
+}
+MODEL = {"weights": {"trunk": {"release": "test"}}, "rows": [{"name": "one", "weights": "trunk"}]}
+
+
+def written(folder: Path, recipe: dict[str, Any]) -> str:
+    path = folder / "mine.yaml"
+    path.write_text(json.dumps(recipe), encoding="utf-8")  # JSON is YAML
+    return str(path)
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({"titel": "A study"}, "unknown field `titel`"),
+        ({"title": 3}, r"expected `str`, got `int` - at `\$.title`"),
+        ({"rows": None}, r"expected `array`, got `null` - at `\$.rows`"),
+        ({"rows": [{"name": "one"}]}, "expected one of weights, baseline and trivial, or .*, found none"),
+        (
+            {"rows": [{"name": "one", "weights": "w", "baseline": "standing"}], "weights": {"w": {"file": "tiny"}}},
+            "or weights and the baseline constant_velocity, found weights and baseline",
+        ),
+        (
+            {"rows": [{"name": "one", "baseline": "flying"}]},
+            r"invalid enum value 'flying' - at `\$.rows\[0\].baseline`",
+        ),
+        ({"rows": [{"name": "one", "weights": "trunk"}]}, "rows: one: weights: expected one of .*found 'trunk'"),
+        ({"rows": [{"name": "one", "trivial": "nothing"}] * 2}, "rows: one: name: is there twice; name the keys"),
+        ({"rows": [{"name": "one", "baseline": "standing", "control": "blank"}]}, "control: spoils what a model sees"),
+        ({"rows": [{"name": "one", "baseline": "standing", "agents": "+front"}]}, "agents: expected one of .*'.front'"),
+        ({"rows": [{"name": "one", "baseline": "standing", "latency": 0.15}]}, "rows: one: latency: .*0.15"),
+        ({"rows": [{"name": "one", "baseline": "standing", "horizon": 0.7}]}, "rows: one: .*0.7.*0.5"),
+        ({"rows": [{"name": "a{latency}", "trivial": "nothing", "latencies": [1]}]}, "unknown field `latencies`"),
+        ({**MODEL, "rows": [{"name": "one", "weights": "trunk", "horizon": 3.0}]}, "horizon: is what the weights were"),
+        ({**MODEL, "weights": {"trunk": {"release": "tset"}}}, "weights.trunk: release: .*did you mean 'test'"),
+        ({**MODEL, "weights": {"trunk": {"release": "test", "from": "trunk"}}}, "from, which stands above: expected"),
+        (
+            {**MODEL, "weights": {"trunk": {"file": "tiny", "steps": 3}}},
+            "file: these weights are there; leave the other",
+        ),
+        ({"releases": {"test": {"sede": 3}}}, "releases.test: key: expected one of .*did you mean 'seed'"),
+        ({"releases": {"test": {"frames": 0}}}, "releases.test: .*frames: 0 is not possible; choose a number from 1"),
+        ({"test": {"release": "training"}}, "test: release: expected .*'training'"),
+        ({"test": {"release": "test", "where": ["town"]}}, r"test.where, groups: expected field=value"),
+        ({"test": {"release": "test", "labels": "cleam"}}, "test: .*did you mean 'clean'"),
+        ({"test": {"release": "TEST"}}, "test: release: found 'TEST'; write it with the same capital letters"),
+        ({"headline": {"row": "one", "less": "two", "number": "APA"}}, "headline: number: found 'APA'"),
+        ({"rows": []}, "rows: expected 1 to 1,000, found 0"),
+        ({"rows": [{"name": "one", "trivial": "nothing", "agents": []}]}, "rows: expected 1 to 1,000, found 0"),
+        ({"rows": [{"name": "one", "baseline": "standing", "horizon": 1e9}]}, "rows: one: horizon: 1000000000.0 s"),
+        ({"test": {"release": "test", "horizon": 1e12}}, "test: horizon: 1000000000000.0 s .* up to 100"),
+        ({"releases": {"test": {"spec": 3}}}, r"expected `str`, got `int` - at `\$.releases\[...\].spec`"),
+        ({"releases": {"test": {"dataroot": [1]}}}, r"expected `str`, got `array` - at `\$.releases\[...\].dataroot`"),
+        *(
+            ({**MODEL, "weights": {"trunk": {"release": "test", key: value}}}, f"weights.trunk: .*{key}")
+            for key, value in {"mix": "abc", "also": 3, "also_split": [1], "split": None, "from": ["a"]}.items()
+        ),
+        ({**MODEL, "weights": {"trunk": {"release": "test", "mix": 1.5}}}, "mix: expected a share .*found 1.5"),
+        ({"seeds": [-1]}, r"expected `int` >= 0 - at `\$.seeds\[0\]`"),
+        ({"seeds": list(range(101))}, r"length <= 100 - at `\$.seeds`"),
+        ({"by": ["town_hall"]}, "by: by: expected one of .*'town_hall'"),
+        ({"compare": [["one", "three"]]}, "compare, headline: row: expected one of one, two, found 'three'"),
+        ({"headline": {"row": "one", "less": "two", "number": "apaa"}}, "headline: number: .*did you mean 'apa'"),
+        ({"headline": {"row": "one", "less": "two", "where": "hidden"}}, "headline: where: .*'hidden'"),
+    ],
+)
+def test_a_fault_is_named_with_its_file_its_key_and_a_remedy(
+    changes: dict[str, Any], told: str, tmp_path: Path
+) -> None:
+    path = written(tmp_path, {**PLAIN, **changes})
+    with pytest.raises(ConfigError, match=told) as raised:
+        read_recipe(path)
+    assert str(raised.value).startswith(f"{path}: ")
+
+
+@pytest.mark.parametrize("rows", [5, [5], {"a": 1}, None])
+def test_rows_of_the_smoke_part_are_rows(rows: Any, tmp_path: Path) -> None:
+    path = written(tmp_path, {**PLAIN, "smoke": {"rows": rows}})
+    with pytest.raises(ConfigError, match=r"mine.yaml: the recipe: expected .* got .* - at `\$.rows"):
+        read_recipe(path, smoke=True)
+
+
+def test_lists_in_many_keys_are_counted_before_they_are_multiplied_out(tmp_path: Path) -> None:
+    numbers = {key: [float(each) for each in range(100)] for key in ("horizon", "latency", "pose_noise", "packet_loss")}
+    row = {"name": "a", "baseline": "standing", **numbers, "agents": ["all"] * 100, "budget": list(range(1, 101))}
+    with pytest.raises(ConfigError, match=r"rows: expected 1 to 1,000, found 1,000,000,000,000: a list makes a row"):
+        read_recipe(written(tmp_path, {**PLAIN, "rows": [row]}))
+    many = [{"name": f"{{agents}} {each}", "trivial": "nothing", "agents": ["all", "single"]} for each in range(500)]
+    assert len(read_recipe(written(tmp_path, {**PLAIN, "rows": many})).rows) == MOST_ROWS
+    with pytest.raises(ConfigError, match="found 1,001"):
+        read_recipe(written(tmp_path, {**PLAIN, "rows": [*many, {"name": "one", "trivial": "nothing"}]}))
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"rows": [{"name": f"n{each}", "trivial": "nothing"} for each in range(28_000)]},
+        {"weights": {f"w{each}": {"release": "test"} for each in range(40_000)}},
+    ],
+)
+def test_a_recipe_of_too_many_characters_is_not_parsed(changes: dict[str, Any], tmp_path: Path) -> None:
+    path = written(tmp_path, {**PLAIN, **changes})
+    with pytest.raises(
+        ConfigError, match=r"has [\d,]+ characters, more than 100,000; split the study|more than"
+    ) as told:
+        read_recipe(path)
+    assert path in str(told.value)
+
+
+def test_files_that_are_no_recipes(tmp_path: Path) -> None:
+    with pytest.raises(
+        ConfigError, match=r"RECIPE, which is no file \.yaml: expected one of agents, .*did you mean 'links'"
+    ):
+        read_recipe("link")
+    with pytest.raises(ConfigError, match=r"no.yaml: cannot be read .*; give a file of YAML"):
+        read_recipe(str(tmp_path / "no.yaml"))
+    (tmp_path / "no.yaml").write_text("a: &b {}\nc: *b\n")
+    with pytest.raises(ConfigError, match=r"no.yaml:2: c: aliases \(\*name\) are not read here"):
+        read_recipe(str(tmp_path / "no.yaml"))
+    (tmp_path / "no.yaml").write_text("\n")
+    with pytest.raises(ConfigError, match="the recipe: object missing required field `rows`"):
+        read_recipe(str(tmp_path / "no.yaml"))
+    (tmp_path / "no.yaml").write_text("- a\n")
+    with pytest.raises(ConfigError, match="the recipe: expected `object`, got `array`"):
+        read_recipe(str(tmp_path / "no.yaml"))
+    with pytest.raises(ConfigError, match="smoke: is missing; write this part, or leave out --smoke"):
+        read_recipe(written(tmp_path, PLAIN), smoke=True)
+
+
+def test_a_list_makes_a_row_each(tmp_path: Path) -> None:
+    rows = [
+        {"name": "{agents}, {latency} s", "baseline": "standing", "agents": ["single", "all"], "latency": [0.0, 0.5]},
+        {"name": "{agents.__class__} {weights}", "trivial": "nothing", "agents": ["all"]},
+    ]
+    found = read_recipe(written(tmp_path, {**PLAIN, "rows": rows})).rows
+    expected = [
+        StudyRow(
+            name=f"{agents}, {late} s",
+            baseline="standing",
+            agents=agents,
+            latency=late,
+            over=("latency", late, f"{agents}, … s"),
+        )
+        for agents in ("single", "all")
+        for late in (0.0, 0.5)
+    ]
+    assert list(found) == [*expected, StudyRow(name="{agents.__class__} {weights}", trivial="nothing")]
+    assert (found[0].link, found[1].link and found[1].link.latency_frames) == (None, 5)
+    assert StudyRow(name="a", agents="ego_vehicle,other_vehicle").cooperating == ["ego_vehicle", "other_vehicle"]
+
+
+def test_the_smoke_part_replaces_what_it_names(tmp_path: Path) -> None:
+    small = {"releases": {"test": {"scenarios": 2}}, "rows": PLAIN["rows"][:1], "title": "Small"}
+    path = written(tmp_path, {**PLAIN, "smoke": small})
+    whole, smoke = read_recipe(path), read_recipe(path, smoke=True)
+    assert (whole.name, smoke.name, whole.title, smoke.title) == ("mine", "mine-smoke", "A study", "Small")
+    assert (len(whole.rows), len(smoke.rows)) == (2, 1)
+    assert (whole.releases["test"], smoke.releases["test"]) == (
+        {"seed": 3, "scenarios": 4},
+        {"seed": 3, "scenarios": 2},
+    )
+    assert whole.test == smoke.test
+
+
+def test_the_recipes_that_ship_share_releases_and_the_trunk() -> None:
+    names = sorted(each.stem for each in SHIPPED_RECIPES.glob("*.yaml"))
+    assert " ".join(names) == "agents boxes fusions horizons inputs links overfit road v2x visibility"
+    found = [read_recipe(name) for name in names]
+    assert all(read_recipe(name, smoke=True).rows for name in names)
+    assert [each.name for each in found if not each.weights] == ["v2x"]
+    trained = [each for each in found if "trunk" in each.weights]
+    own = [each.name for each in found if each.weights and each not in trained]
+    assert own == ["horizons", "inputs", "overfit", "road"]
+    assert len({str((each.releases["training"], each.weights["trunk"])) for each in trained}) == 1
+    assert all(set(each.seeds) <= set(trained[0].seeds) for each in trained)
+    others = [each.name for each in trained if each.releases["test"] != trained[0].releases["test"]]
+    assert others == ["boxes", "links"]
+    rows = {row.name for row in trained[0].rows}
+    assert {"black", "strangers", "nothing", "everything", "labels, all", "constant velocity, single"} < rows
+
+
+def test_a_scenario_file_lies_beside_the_recipe(tmp_path: Path) -> None:
+    recipe = written(tmp_path, {**PLAIN, "releases": {"test": {"seed": 3, "spec": "scenes/mine.yaml"}}})
+    assert read_recipe(recipe).releases["test"]["spec"] == str(tmp_path / "scenes" / "mine.yaml")

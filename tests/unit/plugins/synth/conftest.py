@@ -1,0 +1,40 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from deepaccident_devkit.plugins.synth import SynthConfig, make_release
+from deepaccident_devkit.release import ScenarioFolder, find_release
+
+CONFIG = SynthConfig(scenarios=2, frames=3, image_size=(192, 108), seed=5, designed=True)
+
+
+@pytest.fixture(scope="session")
+def config() -> SynthConfig:
+    return CONFIG
+
+
+@pytest.fixture(scope="session")
+def release_root(tmp_path_factory) -> Path:
+    """An accident and its twin, three frames, with all sensors."""
+    return make_release(tmp_path_factory.mktemp("synth") / "a release", CONFIG, workers=1)
+
+
+@pytest.fixture(scope="session")
+def scenarios(release_root) -> tuple[ScenarioFolder, ...]:
+    return find_release(release_root).scenarios
+
+
+@pytest.fixture(scope="session")
+def digests():
+    """Relative path → content of every file below a folder."""
+
+    def read(root: Path) -> dict[str, bytes]:
+        return {p.relative_to(root).as_posix(): p.read_bytes() for p in sorted(root.rglob("*")) if p.is_file()}
+
+    return read
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    return np.random.default_rng(0)

@@ -1,0 +1,73 @@
+"""What a junction can be like."""
+
+import numpy as np
+import pytest
+from refusals import assert_refused
+
+from deepaccident_devkit.errors import ConfigError
+from deepaccident_devkit.plugins.synth.roads import ROAD_CODES, Hump, Junction, RoadSpec
+from deepaccident_devkit.plugins.synth.roads.layout import SLOT_LENGTH
+
+
+@pytest.mark.parametrize(
+    ("fields", "sentence"),
+    [
+        ({"kind": "five-way"}, "road.kind: expected one of four-way, three-way, found 'five-way'"),
+        ({"lanes": 3}, "road.lanes: expected 1 or 2 in each direction, found 3"),
+        (
+            {"kind": "three-way", "hump": Hump(arm="north")},
+            "road.hump.arm: a three-way junction has no north arm; choose one of west, south, east",
+        ),
+        (
+            {"hump": Hump(distance=36.0)},
+            r"road.hump.distance: 36 m puts the foot of the hump into the junction; choose 48.0 m or more",
+        ),
+    ],
+)
+def test_impossible_junctions_are_refused(fields, sentence):
+    assert_refused((lambda: RoadSpec(**fields), ConfigError, sentence))
+
+
+@pytest.mark.parametrize("lanes", [1, 2])
+def test_everything_lies_outward_in_order(lanes):
+    spec = RoadSpec(lanes=lanes)
+    assert spec.lanes_edge < spec.road_edge < spec.sidewalk_edge
+    assert spec.road_edge < spec.mouth < spec.crosswalk[1] < spec.stop_line[0] < spec.stop_line[1]
+
+
+def test_lane_0_is_the_rightmost():
+    assert [RoadSpec(lanes=2).lane_center(lane) for lane in (0, 1)] == [5.25, 1.75]
+
+
+@pytest.mark.parametrize(
+    ("fields", "arms"),
+    [({}, ()), ({"signalized": False}, ("south", "north")), ({"kind": "three-way", "signalized": False}, ("south",))],
+)
+def test_who_has_a_yield_line(fields, arms):
+    assert RoadSpec(**fields).yielding_arms == arms
+
+
+def corners(places, length, width):
+    signs = np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]]) * [length / 2, width / 2]
+    cos, sin = np.cos(places[:, 2, None]), np.sin(places[:, 2, None])
+    x = places[:, 0, None] + cos * signs[:, 0] - sin * signs[:, 1]
+    y = places[:, 1, None] + sin * signs[:, 0] + cos * signs[:, 1]
+    return np.stack([x, y], axis=-1)
+
+
+def test_a_parked_van_stands_on_its_strip(junction):
+    vans, spec = corners(junction.parking_places(), 5.0, 2.1), junction.spec
+    assert np.isin(junction.ground_map().at(vans.reshape(-1, 2)), ROAD_CODES).all()
+    beside = np.abs(vans).min(axis=2)
+    assert spec.lanes_edge < beside.min() < beside.max() < spec.road_edge
+    assert np.abs(vans).max(axis=2).min() > spec.stop_line[1] + 5
+
+
+def test_slots_do_not_overlap_and_face_with_the_traffic():
+    places = Junction(RoadSpec()).parking_places()
+    distance = np.hypot(*(places[:, None, :2] - places[None, :, :2]).T)
+    np.fill_diagonal(distance, np.inf)
+    np.testing.assert_allclose(distance.min(axis=1), SLOT_LENGTH)
+    heading = np.column_stack([np.cos(places[:, 2]), np.sin(places[:, 2])])
+    right = np.column_stack([heading[:, 1], -heading[:, 0]])
+    assert ((places[:, :2] * right).sum(axis=1) > 4).all()  # keeps right: the middle line is to the left

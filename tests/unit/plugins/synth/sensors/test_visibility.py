@@ -1,0 +1,90 @@
+"""Who is seen: truths that one can work out by hand, and the pictures themselves."""
+
+import itertools
+
+import numpy as np
+import pytest
+
+from deepaccident_devkit.geometry import Boxes
+from deepaccident_devkit.plugins.synth.sensors.annotate import CLOSE, CameraViews, camera_visible, rectangles
+from deepaccident_devkit.plugins.synth.sensors.render import look
+from deepaccident_devkit.plugins.synth.solids import Block
+
+SIZE, SLOPE = (400, 200), np.array([0.004, 0.004])
+SHARES = np.array(list(itertools.product(np.linspace(-0.5, 0.5, 41), repeat=3)))
+WALL = (120, 120, 120)
+
+
+def ego_sees(rig, actor_id, agent=0):
+    scene = rig.scene(0.0)
+    rows = np.array([scene.actors.row_of(actor_id)])
+    return bool(camera_visible(scene, rig.agents[agent], rig.agents[agent].ground_from_lidar(scene), rows)[0])
+
+
+@pytest.mark.parametrize("place", [(0.3, -0.2, 12.0), (1.2, 0.4, 0.8), (-1.4, 0.0, 0.2), (0.4, 0.2, -0.5)])
+def test_a_rectangle_is_as_large_as_what_is_ahead_of_the_camera(place):
+    """Of a box ahead of it, and of boxes that are partly behind it."""
+    size, axis = np.array([1.5, 1.5, 3.0]), np.array([np.cos(0.3), np.sin(0.3), 0])
+    points = np.array(place) + SHARES @ (np.array([axis, [-axis[1], axis[0], 0], [0, 0, 1]]) * size[:, None])
+    ahead = points[points[:, 2] >= CLOSE]
+    pixels = ahead[:, :2] / ahead[:, 2:] / SLOPE + np.array(SIZE) / 2
+    (low,), (high,) = rectangles(Boxes.from_arrays([place], [size], [0.3]).corners(), SLOPE, SIZE)
+    for edge, farthest in ((low, pixels.min(axis=0)), (high, pixels.max(axis=0))):
+        np.testing.assert_allclose(edge.clip(0, SIZE), farthest.clip(0, SIZE), atol=4)
+    assert ((low <= pixels.min(axis=0) + 1e-6) & (high >= pixels.max(axis=0) - 1e-6)).all()
+
+
+def test_who_is_behind_the_camera_has_no_rectangle():
+    low, high = rectangles(Boxes.from_arrays([[0.0, 0.0, -3.0]], [[1.0, 1.0, 1.0]], [0.0]).corners(), SLOPE, SIZE)
+    np.testing.assert_array_equal(low, high)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("upper_edge", "width", "seen"),
+    [(4.0, 6.0, False), (4.0, 1.9, True), (1.0, 6.0, True)],
+    ids=["a wall before all of it", "a wall before half of it", "a low wall"],
+)
+def test_a_wall_hides_what_is_behind_it(world, bare, actor, rig_of, upper_edge, width, seen):
+    """The wall ends `width` to the left of the car's right side, seen from the ego at (-30, -1.75)."""
+    wall = Block((-16.2, -16.0), (-5.0, -5.0 + width), (-0.1, upper_edge), WALL)
+    car = actor(9, "car", -8.0, -1.75)
+    assert ego_sees(rig_of(bare(world, [wall]), [car]), 1009) == seen
+    assert ego_sees(rig_of(bare(world), [car]), 1009)
+
+
+@pytest.mark.parametrize("hidden", [False, True])
+def test_a_truck_hides_the_car_before_it(world, bare, actor, rig_of, hidden):
+    truck = [actor(10, "truck", -8.0, -1.75)] if hidden else []
+    assert ego_sees(rig_of(bare(world), [actor(9, "car", 6.0, -1.75), *truck]), 1009) != hidden
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("x", "seen"), [(-30.0, False), (-56.0, True)])
+def test_a_rise_hides_a_pedestrian_behind_it(hilly_world, bare, actor, rig_of, x, seen):
+    """The crest lies 55 m from the middle; the ego waits 30 m from it or on it, the pedestrian stands far behind."""
+    places = {"ego_vehicle": (x, -1.75, np.pi), "ego_vehicle_behind": (20.0, -1.75, 0.0)}
+    assert ego_sees(rig_of(bare(hilly_world), [actor(9, "pedestrian", -86.0, -1.75)], places=places), 1009) == seen
+
+
+def test_nobody_sees_itself_and_all_around_is_seen(world, bare, actor, rig_of):
+    turns = np.deg2rad([0, 50, -50, 95, -95, 140, -140, 180])
+    places = zip(-30 + 9 * np.cos(turns), -1.75 + 9 * np.sin(turns), strict=True)
+    rig = rig_of(bare(world), [actor(10 + k, "pedestrian", *place) for k, place in enumerate(places)])
+    assert [actor_id for actor_id in (1000, *range(1010, 1018)) if not ego_sees(rig, actor_id)] == [1000]
+
+
+def test_pixels_are_about_those_of_the_picture(world, actor, rig_of):
+    """The counts of a 400 × 225 picture, against all pixels of a picture of that size; by everything in sight."""
+    others = [actor(10 + k, "car", 5.0 + 9 * k, 1.75, np.pi) for k in range(4)]
+    others += [actor(20 + k, "pedestrian", -14.0 + 4 * k, 5.0) for k in range(4)]
+    rig = rig_of(world, others, image_size=(400, 225))
+    scene, agent = rig.scene(0.0), rig.agents[1]
+    rows = np.arange(len(scene.actors))
+    for camera in agent.cameras:
+        pose = agent.ground_from_lidar(scene) @ camera.camera_from_lidar.inverse()
+        owner = scene.face_owner[look(scene, camera, pose).all.face]
+        shown = np.bincount(owner[owner >= 0], minlength=len(rows))
+        counted = CameraViews(scene, [camera], [pose], rows).pixels()[0]
+        np.testing.assert_allclose(counted, shown, rtol=0.35, atol=12)
+        assert not (counted[shown > 12] == 0).any()

@@ -1,0 +1,36 @@
+import numpy as np
+import pytest
+
+from deepaccident_devkit.plugins.synth.traffic.driving import MAX_STEER, MAX_STEER_RATE, PERIOD
+from deepaccident_devkit.plugins.synth.traffic.simulate import simulate
+
+
+@pytest.fixture(scope="module", params=["car", "truck", "motorcycle", "cyclist"])
+def turning(request, driver):
+    """Left and right turns of a category."""
+    ways = (("west", "left"), ("east", "right"))
+    users = [driver(*way, category=request.param, max_speed=6.0) for way in ways]
+    return users, simulate(users, begin=0.0, end=12.0)
+
+
+def test_turns_are_driven_along_the_path_to_its_end(turning):
+    users, run = turning
+    for row, user in enumerate(users):
+        along, left = user.path.project(run.poses[:, row, :2])
+        assert along[-1] > user.route.exit_s
+        assert (np.abs(left).max() < 0.85, abs(left[-1]) < 0.1) == (True, True)
+
+
+def test_the_wheels_are_turned_no_farther_nor_faster_than_they_can_be(turning):
+    _, run = turning
+    steer = run.states[..., 4]
+    assert 0.05 < np.abs(steer).max() <= MAX_STEER + 1e-12
+    assert np.abs(np.diff(steer, axis=0)).max() <= MAX_STEER_RATE * PERIOD + 1e-12
+
+
+def test_one_on_foot_is_on_its_path_and_stops_at_its_end(walker):
+    user = walker()
+    along, left = user.path.project(simulate([user], begin=0.0, end=16.0).poses[:, 0, :2])
+    np.testing.assert_allclose(left, 0.0, atol=1e-9)
+    assert (np.diff(along) >= 0).all()
+    assert along[-1] == pytest.approx(user.path.length, abs=0.5)
