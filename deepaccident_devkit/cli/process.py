@@ -22,7 +22,7 @@ _ENDING: Final = (signal.SIGINT, signal.SIGTERM)
 _LINE: Final = b"interrupted; no file is half-written, and the same command can be run again\n"
 # Time for the verb to remove its temporary files; then the process ends as it is.
 _TIDYING_SECONDS: Final = 1.5
-# Seconds after which a signal is sent once more whose exception Python ignored.
+# Seconds after which a signal whose exception Python ignored is sent again.
 _AGAIN_AFTER: Final = 0.02
 # Seconds: some programs send a signal to a process and then to its group.
 _SAME_SIGNAL: Final = 0.2
@@ -41,6 +41,7 @@ class _Signals:
         self.first: int | None = None
         self._since = 0.0
         self._verb_ended = False
+        self._raising_again = False
         self._told_before = sys.unraisablehook
 
     def install(self) -> None:
@@ -59,7 +60,7 @@ class _Signals:
         self._verb_ended = True
 
     def _handle(self, number: int, _frame: Any) -> None:
-        if self._verb_ended:
+        if self._verb_ended or self._raising_again:
             return
         if self.first is None:
             self.first, self._since = number, time.monotonic()
@@ -73,7 +74,15 @@ class _Signals:
             self._told_before(ignored)
         elif self.first is not None and not self._verb_ended:
             number, self.first = self.first, None
-            threading.Timer(_AGAIN_AFTER, os.kill, (os.getpid(), number)).start()
+            self._raising_again = True  # what is raised before this returns is lost, too
+            threading.Thread(target=self._send_again, args=(number,), name="signal again", daemon=True).start()
+            self._raising_again = False
+
+    def _send_again(self, number: int) -> None:
+        """Send a signal until the handler has raised for it."""
+        while self.first is None and not self._verb_ended:
+            time.sleep(_AGAIN_AFTER)
+            os.kill(os.getpid(), number)
 
     def _watch(self, reading: int) -> None:
         number = 0
