@@ -57,7 +57,7 @@ WAIT = 60.0
 """Seconds for a page to be as it should."""
 LOADED = "[...document.images].every((each) => each.complete)"
 COMPUTED = "![...document.querySelectorAll('.waits')].length"
-AT = "go(29);"
+AT = "document.dispatchEvent(new CustomEvent('go', { detail: 29 }));"
 
 
 @click.command(help=__doc__)

@@ -58,6 +58,10 @@ class Browser:
         """The frame that a replay shows, from 0 on."""
         return int(self.value("document.getElementById('scrubber').value"))
 
+    def go_to(self, frame: int, document: str = "document") -> None:
+        """Let a replay show a frame, from 0 on; `document` is the expression of its document."""
+        self.script(f"{document}.dispatchEvent(new CustomEvent('go', {{ detail: {frame} }}))")
+
     def faults(self) -> dict[str, Any]:
         """What no page may have, by kind: what overflows, what the console says, pictures that are not loaded."""
         pictures = "[...document.images].filter((each) => each.src && !each.naturalWidth).map((each) => each.outerHTML)"

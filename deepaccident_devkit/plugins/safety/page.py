@@ -31,6 +31,7 @@ from deepaccident_devkit.support.files import place_in, plain_names, writable_fo
 from deepaccident_devkit.support.pages import document, part
 from deepaccident_devkit.support.parallel import Engine, Places, run_batch
 from deepaccident_devkit.support.reading import read_bytes
+from deepaccident_devkit.support.scripts import bundled
 from deepaccident_devkit.support.text import number_text
 from deepaccident_devkit.support.version import __version__
 from deepaccident_devkit.taxonomy import AGENTS, short_name
@@ -136,7 +137,7 @@ def safety_report_html(
     return document(
         "safety_report.html",
         style=page_style(),
-        script=part("sorting.js"),
+        script=bundled(part, "sorting"),
         report=report,
         header=_header(report),
         shares=list(_shares(report)),

@@ -51,6 +51,7 @@ from deepaccident_devkit.render.styles import (
 )
 from deepaccident_devkit.support.files import write_bytes
 from deepaccident_devkit.support.pages import document, part, source_hash
+from deepaccident_devkit.support.scripts import bundled
 from deepaccident_devkit.support.text import path_of
 from deepaccident_devkit.taxonomy import AGENTS, CAMERAS, FRAME_PERIOD, LIDAR, short_name
 from deepaccident_devkit.v2x import Agents
@@ -58,19 +59,6 @@ from deepaccident_devkit.v2x.collisions import contact_words
 
 # The most bytes of a page, so that it can be sent by mail.
 SIZE_LIMIT: Final = 15_000_000
-_SCRIPTS: Final = (
-    "sources",
-    "pointers",
-    "ground",
-    "panels",
-    "lit",
-    "cameras",
-    "gpu",
-    "orbit",
-    "space",
-    "strip",
-    "replay",
-)
 _BASE64: Final = 4 / 3
 # Bytes of a picture in JSON in addition to its base64: quotes, a comma and padding.
 _BESIDE: Final = 8
@@ -258,8 +246,8 @@ def replay_style() -> str:
 
 
 def replay_script() -> str:
-    """The scripts of a replay; each uses the ones before it."""
-    return "".join(part(f"replay/{name}.js") for name in _SCRIPTS)
+    """Return the modules of a replay as one script."""
+    return bundled(lambda name: part(f"replay/{name}"), "replay")
 
 
 def facts(recording: ReplayRecording) -> list[list[str]]:

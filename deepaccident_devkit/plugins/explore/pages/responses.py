@@ -25,11 +25,14 @@ from deepaccident_devkit.render.replay import replay_script, replay_style
 from deepaccident_devkit.render.styles import page_style
 from deepaccident_devkit.support.pages import part, path_in_address
 from deepaccident_devkit.support.pages import rendered as filled
+from deepaccident_devkit.support.scripts import bundled
 
 # A browser may keep pictures for some minutes: files of a release seldom change.
 KEPT: Final = "private, max-age=600"
 _FOREVER: Final = "private, max-age=31536000, immutable"
 _LAST_PAGE: Final = 1_000_000
+# Those that pages load; they import the other ones beside them.
+_SCRIPTS: Final = ("copy", "keys", "list", "moment", "parts", "twins", "waiting")
 _KINDS: Final = {"css": "text/css", "js": "text/javascript"}
 
 
@@ -100,12 +103,17 @@ def asset(root: str, name: str) -> str:
 def assets() -> dict[str, str]:
     """Name → text."""
     folder = files("deepaccident_devkit.plugins.explore") / "static"
+
+    def read(name: str) -> str:
+        return (folder / name).read_text(encoding="utf-8")
+
     return {
-        **{each.name: each.read_text(encoding="utf-8") for each in folder.iterdir() if each.name[0] != "_"},
+        **{f"{name}.js": bundled(read, name) for name in _SCRIPTS},
+        "explore.css": read("explore.css"),
         "pages.css": page_style(),
         "replay.css": replay_style(),
         "replay-player.js": replay_script(),
-        "sorting.js": part("sorting.js"),
+        "sorting.js": bundled(part, "sorting"),
     }
 
 

@@ -1,13 +1,17 @@
 // Buttons that copy code.
 
-for (const button of document.querySelectorAll(".copy")) {
+/** @type {NodeListOf<HTMLElement>} */
+const buttons = document.querySelectorAll(".copy");
+for (const button of buttons) {
   button.addEventListener("click", async () => {
-    const said = document.getElementById("copied");
+    const text = button.dataset.text ?? "";
+    const answer = document.getElementById("copied");
+    if (!answer) return;
     try {
-      await navigator.clipboard.writeText(button.dataset.text);
-      said.textContent = "copied";
+      await navigator.clipboard.writeText(text);
+      answer.textContent = "copied";
     } catch {
-      said.textContent = button.dataset.text; // no clipboard here: the reader copies it himself
+      answer.textContent = text; // there is no clipboard: readers copy the text themselves
     }
   });
 }

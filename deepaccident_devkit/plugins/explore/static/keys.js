@@ -1,28 +1,31 @@
-// Keys of all pages: "/" goes to the query, "n" and "p" to the next and previous page or sample, j and k along entries.
+// Keys of all pages: "/" goes to the query, n and p to the next and previous page or sample, j and k along the entries.
 
-const links = () => [...document.querySelectorAll("a.entry")];
+import { nextEntry } from "./entries.js";
 
-function along(step) {
-  const all = links();
-  const at = all.indexOf(document.activeElement);
-  const next = all[at < 0 ? (step > 0 ? 0 : all.length - 1) : Math.min(all.length - 1, Math.max(0, at + step))];
-  if (next) next.focus();
+/** @param {1 | -1} step */
+function goAlong(step) {
+  /** @type {HTMLAnchorElement[]} */
+  const entries = [...document.querySelectorAll("a.entry")].filter((each) => each instanceof HTMLAnchorElement);
+  const at = entries.findIndex((each) => each === document.activeElement);
+  entries[nextEntry(at, step, entries.length)]?.focus();
 }
 
+/** @param {"next" | "prev"} relation */
 function follow(relation) {
   const link = document.querySelector(`a[rel="${relation}"]`);
-  if (link) link.click();
+  if (link instanceof HTMLAnchorElement) link.click();
 }
 
+/** @type {Record<string, () => void>} */
 const keys = {
   "/": () => document.getElementById("query")?.focus(),
   n: () => follow("next"),
   p: () => follow("prev"),
-  j: () => along(1),
-  k: () => along(-1),
+  j: () => goAlong(1),
+  k: () => goAlong(-1),
 };
 document.addEventListener("keydown", (event) => {
-  if (event.target.closest("input, select, textarea")) return;
+  if (event.target instanceof Element && event.target.closest("input, select, textarea")) return;
   if (event.ctrlKey || event.metaKey || event.altKey || !keys[event.key]) return;
   event.preventDefault();
   keys[event.key]();

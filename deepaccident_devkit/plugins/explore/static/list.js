@@ -1,39 +1,62 @@
 // The list of scenarios: what is chosen is shown at once.
 
-const form = document.getElementById("filters");
+import { queryOf } from "./filters.js";
+
 const FOCUS = "explore-focus";
 
-// Only what is not as usual is part of the address.
-function send() {
-  const given = new URLSearchParams();
-  for (const [name, value] of new FormData(form)) {
-    const usual = { q: "", sort: "name", order: "up", view: "grid" };
-    if (usual[name] !== value) given.append(name, value);
-  }
-  const focused = document.activeElement;
-  const place = focused && focused.name ? [focused.name, focused.type === "checkbox" ? focused.value : null] : null;
-  sessionStorage.setItem(FOCUS, JSON.stringify({ place, scroll: form.querySelector("aside").scrollTop, y: scrollY }));
-  location.assign(`${form.getAttribute("action")}?${given}`);
+/**
+ * What has the focus before the list is loaded again, and how far it is scrolled. `value` tells checkboxes apart.
+ * @typedef {{ focus: { name: string, value: string | null } | null, scroll: number }} Position
+ */
+
+/** @param {HTMLFormElement} form */
+function send(form) {
+  /** @type {[string, string][]} */
+  const choices = [...new FormData(form)].map(([name, value]) => [name, String(value)]);
+  /** @type {Position} */
+  const position = { focus: focusIn(document.activeElement), scroll: scrollY };
+  sessionStorage.setItem(FOCUS, JSON.stringify(position));
+  location.assign(`${form.getAttribute("action")}?${queryOf(choices)}`);
 }
 
-form.addEventListener("change", (event) => {
-  if (event.target.id !== "query") send();
-});
-form.addEventListener("submit", (event) => {
-  event.preventDefault();
-  send();
-});
-
-// A reader who uses the keyboard goes on where he was.
-const kept = JSON.parse(sessionStorage.getItem(FOCUS) || "null");
-sessionStorage.removeItem(FOCUS);
-if (kept) {
-  const [name, value] = kept.place || [];
-  const found = [...form.elements].find((each) => each.name === name && (value === null || each.value === value));
-  if (found) {
-    const facet = found.closest("details");
-    if (facet) facet.open = true;
-    found.focus({ preventScroll: true });
+/** @param {Element | null} element */
+function focusIn(element) {
+  if (element instanceof HTMLInputElement && element.type === "checkbox") {
+    return { name: element.name, value: element.value };
   }
-  scrollTo(0, kept.y);
+  const hasName = element instanceof HTMLInputElement || element instanceof HTMLSelectElement;
+  return hasName && element.name ? { name: element.name, value: null } : null;
+}
+
+/**
+ * Go on where a reader who uses the keyboard was.
+ * @param {HTMLFormElement} form
+ */
+function restore(form) {
+  /** @type {Position | null} */
+  const position = JSON.parse(sessionStorage.getItem(FOCUS) ?? "null");
+  sessionStorage.removeItem(FOCUS);
+  if (!position) return;
+  const { focus } = position;
+  for (const element of form.elements) {
+    if (!focus || !(element instanceof HTMLInputElement || element instanceof HTMLSelectElement)) continue;
+    if (element.name !== focus.name || (focus.value !== null && element.value !== focus.value)) continue;
+    const facet = element.closest("details");
+    if (facet) facet.open = true;
+    element.focus({ preventScroll: true });
+    break;
+  }
+  scrollTo(0, position.scroll);
+}
+
+const filters = document.getElementById("filters");
+if (filters instanceof HTMLFormElement) {
+  filters.addEventListener("change", (event) => {
+    if (event.target instanceof Element && event.target.id !== "query") send(filters);
+  });
+  filters.addEventListener("submit", (event) => {
+    event.preventDefault();
+    send(filters);
+  });
+  restore(filters);
 }

@@ -1,76 +1,133 @@
-// What the reader looks at in the address, and the other way round, so that a colleague opens the same view. After the
-// scripts of the replay, whose names it uses.
+// Keeps what the reader looks at in the address, and shows what the address says, so that a colleague sees the same. It
+// stands after the script of the replay, and reads and sets the replay's own controls.
+
+import { changedQuery, frameOfAddress, picturesOfAddress, viewOfAddress, viewText } from "./addresses.js";
+
+/** @import { ReplayData } from "../../../support/templates/replay/types.js" */
+
+const DELAY = 200; // milliseconds: browsers refuse many changes of the address in a second
 
 const given = new URLSearchParams(location.search);
-const momentLink = document.getElementById("moment");
-const ticks = [...document.querySelectorAll('[id^="layer-"], [id^="cloud-"], #boxes')];
-const selects = ["follow", "sight", "scene", "points-by"].map(byId);
-const usual = new Map([...ticks.map((box) => [box.id, box.checked]), ...selects.map((each) => [each.id, each.value])]);
-const viewOf = () => [ground.x, ground.y, ground.scale].map((each) => each.toFixed(2)).join(",");
-const usualView = viewOf();
+/** @type {ReplayData} */
+const data = JSON.parse(document.getElementById("data")?.textContent ?? "");
+const large = selectOf("large");
+const selects = ["follow", "sight", "scene", "points-by"].map(selectOf);
+/** @type {HTMLInputElement[]} */
+const checkboxes = [...document.querySelectorAll('[id^="layer-"], [id^="cloud-"], #boxes')].filter(
+  (each) => each instanceof HTMLInputElement,
+);
+/** @type {HTMLElement[]} the pictures of the agents */
+const figures = [...document.querySelectorAll("#cards figure")].filter((each) => each instanceof HTMLElement);
+const allCameras = /** @type {HTMLDetailsElement} */ (document.getElementById("every"));
+const usualChecks = new Map(checkboxes.map((box) => [box.id, box.checked]));
+const usualValues = new Map(selects.map((select) => [select.id, select.value]));
+const usualView = viewText(mapView());
 
-function set(control, value) {
-  control.value = value;
-  if (control.value !== value) control.value = usual.get(control.id) || ""; // there is no such choice here
-  control.dispatchEvent(new Event("change"));
+/** @param {string} id */
+function selectOf(id) {
+  return /** @type {HTMLSelectElement} */ (document.getElementById(id));
+}
+
+/** Return the frame that is shown. */
+function shownFrame() {
+  return Number(/** @type {HTMLInputElement} */ (document.getElementById("scrubber")).value);
+}
+
+/** Return the numbers of the map's view. */
+function mapView() {
+  return (document.getElementById("ground")?.dataset.view ?? "").split(" ").map(Number);
+}
+
+/** @param {number} frame */
+function go(frame) {
+  document.dispatchEvent(new CustomEvent("go", { detail: frame }));
+}
+
+/**
+ * Choose an option as a reader does; what is usual if there is no such option.
+ * @param {HTMLSelectElement} select
+ * @param {string} value
+ */
+function choose(select, value) {
+  select.value = value;
+  if (select.value !== value) select.value = usualValues.get(select.id) ?? "";
+  select.dispatchEvent(new Event("change"));
 }
 
 // from the address
 
-const frameGiven = Number(given.get("frame"));
-const pictured = data.countdown.map((_, frame) => data.cameras.flat().filter((each) => each.pictures[frame] !== null).length);
-if (Number.isInteger(frameGiven) && frameGiven > 0) go(frameGiven - 1);
-else if (!pictured[0]) go(pictured.indexOf(Math.max(...pictured))); // of a partial download where most pictures are
-const large = data.agents.findIndex((agent) => agent.name === given.get("large"));
-if (large >= 0) enlarge(String(large));
-for (const select of selects) if (given.has(select.id)) set(select, given.get(select.id));
-const changed = (given.get("changed") || "").split(",");
-for (const box of ticks.filter((each) => changed.includes(each.id))) if (box.checked === usual.get(box.id)) box.click();
-for (const each of (given.get("pictures") || "").split(",")) {
-  const [agent, title] = each.split(":");
-  const card = cards.find((one) => one.agent.name === agent);
-  if (card && card.available.some((camera) => camera.title === title)) set(card.select, title);
+const frame = frameOfAddress(given.get("frame"), data.cameras.flat(), data.countdown.length);
+if (frame) go(frame);
+const largeAgent = data.agents.findIndex((agent) => agent.name === given.get("large"));
+if (largeAgent >= 0) choose(large, String(largeAgent));
+for (const select of selects) {
+  const value = given.get(select.id);
+  if (value !== null) choose(select, value);
 }
-const place = (given.get("view") || "").split(",").map(Number);
-if (place.length === 3 && place.every(Number.isFinite) && place[2] > 0 && state.follow === "") {
-  [ground.x, ground.y, ground.scale] = place;
-  ground.draw();
+const changed = (given.get("changed") ?? "").split(",");
+for (const box of checkboxes) {
+  if (changed.includes(box.id) && box.checked === usualChecks.get(box.id)) box.click();
 }
-if (given.get("cameras") === "all") document.getElementById("every").open = true;
+for (const { agent, title } of picturesOfAddress(given.get("pictures"))) {
+  const select = figures.find((figure) => figure.dataset.agent === agent)?.querySelector("select");
+  if (select && [...select.options].some((option) => option.value === title)) choose(select, title);
+}
+const view = viewOfAddress(given.get("view"));
+if (view && selectOf("follow").value === "") {
+  document.dispatchEvent(new CustomEvent("look", { detail: { id: "ground", view } }));
+}
+if (given.get("cameras") === "all") allCameras.open = true;
 
 // to the address
 
+/** @param {string} number of an agent */
+function nameOf(number) {
+  return data.agents[Number(number)].name;
+}
+
+/** Return the cameras that the reader has chosen, as the address has them. */
+function chosenCameras() {
+  return figures.flatMap((figure) => {
+    const title = figure.querySelector("select")?.value;
+    return title ? [`${figure.dataset.agent}:${title}`] : [];
+  });
+}
+
 function remember() {
-  const now = new URLSearchParams(location.search);
-  const write = (name, value) => (value ? now.set(name, value) : now.delete(name));
-  const agentOf = (number) => (number === "" ? "" : data.agents[Number(number)].name);
-  write("frame", state.frame ? String(state.frame + 1) : "");
-  write("large", agentOf(state.large));
-  for (const select of selects) {
-    if (select.value === usual.get(select.id)) now.delete(select.id);
-    else now.set(select.id, select.value); // empty is a choice, too
-  }
-  write("changed", ticks.filter((box) => box.checked !== usual.get(box.id)).map((box) => box.id).join(","));
-  const chosen = cards.filter((card) => card.chosen).map((card) => `${card.agent.name}:${card.chosen}`);
-  write("pictures", chosen.join(","));
-  write("view", state.follow === "" && viewOf() !== usualView ? viewOf() : "");
-  write("cameras", document.getElementById("every").open ? "all" : "");
-  const query = now.toString();
+  const now = shownFrame();
+  const shown = viewText(mapView());
+  const isMoved = selectOf("follow").value === "" && shown !== usualView;
+  const switched = checkboxes.filter((box) => box.checked !== usualChecks.get(box.id));
+  /** @type {Record<string, string | null>} */
+  const values = {
+    frame: now ? String(now + 1) : null,
+    large: large.value === "" ? null : nameOf(large.value),
+    changed: switched.map((box) => box.id).join(",") || null,
+    pictures: chosenCameras().join(",") || null,
+    view: isMoved ? shown : null,
+    cameras: allCameras.open ? "all" : null,
+  };
+  for (const { id, value } of selects) values[id] = value === usualValues.get(id) ? null : value; // may be empty
+  const query = changedQuery(location.search, values);
   history.replaceState(null, "", query ? `?${query}` : location.pathname);
-  momentLink.href = `moment/${agentOf(state.large || data.automatic.agents[state.frame])}/${state.frame + 1}`;
+  const agent = nameOf(large.value || String(data.automatic.agents[now]));
+  document.getElementById("moment")?.setAttribute("href", `moment/${agent}/${now + 1}`);
 }
+
 remember();
-// While it plays the address stays: browsers refuse many changes a second.
-let later = null;
+/** @type {number | undefined} */
+let timer;
+
 function rememberSoon() {
-  clearTimeout(later);
-  later = setTimeout(remember, 200);
+  clearTimeout(timer);
+  timer = setTimeout(remember, DELAY);
 }
+
 document.addEventListener("moment", rememberSoon);
 for (const kind of ["pointerup", "wheel", "keyup", "click"]) document.addEventListener(kind, rememberSoon);
 document.addEventListener("click", (event) => {
-  const button = event.target.closest("[data-frame]");
-  if (!button || button.tagName !== "BUTTON") return;
+  const button = event.target instanceof Element && event.target.closest("[data-frame]");
+  if (!(button instanceof HTMLButtonElement)) return;
   go(Number(button.dataset.frame) - 1);
-  document.querySelector(".stage").scrollIntoView();
+  document.querySelector(".stage")?.scrollIntoView();
 });

@@ -1,10 +1,14 @@
-// WebGL 2: points, thick lines, triangles and one picture on the ground, each kind with a shader and a buffer.
+// WebGL 2: points, thick lines, triangles and one picture on the ground; each kind has a shader and a buffer.
 //
 // Written here because the packages that PyPI has do not fit: standalone.js of k3d 3.2 (2.6 MB) and plotly.min.js of
 // plotly 7.1 (4.8 MB) add style elements, which the page's policy refuses, compile code from text, which would need
 // `unsafe-eval`, and would be a new dependency.
 
 const SHARED = "#version 300 es\nprecision highp float;\nuniform mat4 view;\nuniform vec2 size;\n";
+/** @typedef {"points" | "lines" | "faces" | "picture"} Kind */
+/** @typedef {{ buffer: WebGLBuffer, room: number, array: WebGLVertexArrayObject, count: number }} KindBuffer */
+
+/** @type {Record<Kind, { vertex: string, fragment: string }>} */
 const SHADERS = {
   points: {
     vertex: `in vec3 place; in vec4 color; out vec4 tint; uniform float near;
@@ -12,7 +16,7 @@ const SHADERS = {
         gl_PointSize = clamp(near / gl_Position.w, 1.3, 3.2) * size.y; }`,
     fragment: "in vec4 tint; out vec4 shown; void main() { shown = vec4(tint.rgb * tint.a, tint.a); }",
   },
-  // one line is four corners; what lies behind the reader's eye is cut off
+  // a line is four corners; what lies behind the eye is cut off
   lines: {
     vertex: `in vec2 corner; in vec3 from; in vec3 to; in vec4 color; in float width; out vec4 tint;
       uniform vec2 pixels;
@@ -46,7 +50,8 @@ const SHADERS = {
       }`,
   },
 };
-const LAYOUTS = { // attributes and how many numbers each has
+/** @type {Record<Kind, Record<string, number>>} attributes, and how many numbers each has */
+const LAYOUTS = {
   points: { place: 3, color: 4 },
   lines: { from: 3, to: 3, color: 4, width: 1 },
   faces: { place: 3, color: 4 },
@@ -54,74 +59,115 @@ const LAYOUTS = { // attributes and how many numbers each has
 };
 const CORNERS = new Float32Array([0, -1, 0, 1, 1, -1, 1, 1]);
 
-/** What a graphics processor holds for one canvas: as much after an hour as at the beginning. */
-class Gpu {
+/** @type {Kind[]} */
+const KINDS = ["points", "lines", "faces", "picture"];
+
+/**
+ * What a graphics processor holds for one canvas: as much after an hour as at the beginning.
+ */
+export class Gpu {
   /** @param {WebGL2RenderingContext} gl */
   constructor(gl) {
     this.gl = gl;
-    this.programs = {};
-    this.buffers = {};
-    for (const kind of Object.keys(SHADERS)) {
-      this.programs[kind] = this.program(SHADERS[kind]);
-      this.buffers[kind] = { buffer: gl.createBuffer(), room: 0, array: gl.createVertexArray() };
-      this.describe(kind);
-    }
+    this.view = new Float32Array(16);
+    /** @type {[width: number, height: number]} */
+    this.pixels = [1, 1];
+    this.ratio = 1;
+    this.corners = gl.createBuffer(); // those of a line
+    /** @type {Record<Kind, WebGLProgram>} */
+    this.programs = {
+      points: this.program(SHADERS.points),
+      lines: this.program(SHADERS.lines),
+      faces: this.program(SHADERS.faces),
+      picture: this.program(SHADERS.picture),
+    };
+    /** @type {Record<Kind, KindBuffer>} */
+    this.buffers = { points: this.buffer(), lines: this.buffer(), faces: this.buffer(), picture: this.buffer() };
+    for (const kind of KINDS) this.describe(kind);
+    /** @type {WebGLTexture | null} */
     this.texture = null;
   }
 
+  /** @returns {KindBuffer} */
+  buffer() {
+    return { buffer: this.gl.createBuffer(), room: 0, array: this.gl.createVertexArray(), count: 0 };
+  }
+
+  /** @param {{ vertex: string, fragment: string }} texts */
   program({ vertex, fragment }) {
     const gl = this.gl;
     const program = gl.createProgram();
-    for (const [kind, text] of [[gl.VERTEX_SHADER, SHARED + vertex], [gl.FRAGMENT_SHADER, SHARED + fragment]]) {
-      const shader = gl.createShader(kind);
-      gl.shaderSource(shader, text);
-      gl.compileShader(shader);
-      gl.attachShader(program, shader);
-      gl.deleteShader(shader); // it goes with its program
-    }
+    this.attach(program, gl.VERTEX_SHADER, SHARED + vertex);
+    this.attach(program, gl.FRAGMENT_SHADER, SHARED + fragment);
     gl.linkProgram(program);
     return program;
   }
 
-  // Where a kind's attributes lie in its buffer. Of lines, each has the corners again.
+  /**
+   * @param {WebGLProgram} program
+   * @param {number} type
+   * @param {string} text
+   */
+  attach(program, type, text) {
+    const gl = this.gl;
+    const shader = gl.createShader(type);
+    if (shader === null) return; // the context is lost
+    gl.shaderSource(shader, text);
+    gl.compileShader(shader);
+    gl.attachShader(program, shader);
+    gl.deleteShader(shader); // it goes with its program
+  }
+
+  /**
+   * Say where a kind's attributes lie in its buffer. Each line has the corners again.
+   * @param {Kind} kind
+   */
   describe(kind) {
     const gl = this.gl;
     const { buffer, array } = this.buffers[kind];
-    const stride = 4 * Object.values(LAYOUTS[kind]).reduce((sum, each) => sum + each, 0);
     gl.bindVertexArray(array);
     if (kind === "lines") {
-      this.corners = gl.createBuffer();
       gl.bindBuffer(gl.ARRAY_BUFFER, this.corners);
       gl.bufferData(gl.ARRAY_BUFFER, CORNERS, gl.STATIC_DRAW);
-      this.attribute(kind, "corner", 2, 8, 0, 0);
+      this.attribute(kind, "corner", { count: 2, stride: 8, offset: 0, divisor: 0 });
     }
     gl.bindBuffer(gl.ARRAY_BUFFER, buffer);
+    const stride = 4 * numbersOf(kind);
     let offset = 0;
     for (const [name, count] of Object.entries(LAYOUTS[kind])) {
-      this.attribute(kind, name, count, stride, offset, kind === "lines" ? 1 : 0);
+      this.attribute(kind, name, { count, stride, offset, divisor: kind === "lines" ? 1 : 0 });
       offset += 4 * count;
     }
     gl.bindVertexArray(null);
   }
 
-  attribute(kind, name, count, stride, offset, divisor) {
+  /**
+   * @param {Kind} kind
+   * @param {string} name
+   * @param {{ count: number, stride: number, offset: number, divisor: number }} layout
+   */
+  attribute(kind, name, { count, stride, offset, divisor }) {
     const gl = this.gl;
-    const place = gl.getAttribLocation(this.programs[kind], name);
-    gl.enableVertexAttribArray(place);
-    gl.vertexAttribPointer(place, count, gl.FLOAT, false, stride, offset);
-    gl.vertexAttribDivisor(place, divisor);
+    const location = gl.getAttribLocation(this.programs[kind], name);
+    gl.enableVertexAttribArray(location);
+    gl.vertexAttribPointer(location, count, gl.FLOAT, false, stride, offset);
+    gl.vertexAttribDivisor(location, divisor);
   }
 
-  /** Give a kind new numbers, in the room that it has if they fit. */
-  fill(kind, numbers, count) {
+  /**
+   * Give a kind new numbers, in the memory that it has if they fit.
+   * @param {Kind} kind
+   * @param {Numbers} numbers
+   */
+  fill(kind, { array, count }) {
     const gl = this.gl;
     const own = this.buffers[kind];
     gl.bindBuffer(gl.ARRAY_BUFFER, own.buffer);
     if (count > own.room) {
       own.room = count;
-      gl.bufferData(gl.ARRAY_BUFFER, numbers.subarray(0, count), gl.DYNAMIC_DRAW);
-    } else gl.bufferSubData(gl.ARRAY_BUFFER, 0, numbers.subarray(0, count));
-    own.count = count / Object.values(LAYOUTS[kind]).reduce((sum, each) => sum + each, 0);
+      gl.bufferData(gl.ARRAY_BUFFER, array.subarray(0, count), gl.DYNAMIC_DRAW);
+    } else gl.bufferSubData(gl.ARRAY_BUFFER, 0, array.subarray(0, count));
+    own.count = count / numbersOf(kind);
   }
 
   /** @param {HTMLImageElement} image the picture on the ground */
@@ -135,11 +181,18 @@ class Gpu {
     for (const side of [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T]) gl.texParameteri(gl.TEXTURE_2D, side, gl.CLAMP_TO_EDGE);
   }
 
-  /** Begin a picture: `ratio` is that of the screen's pixels to the page's. */
-  begin(view, width, height, ratio) {
+  /**
+   * Begin a picture.
+   * @param {Float32Array<ArrayBuffer>} view the matrix from the world to the picture
+   * @param {[width: number, height: number]} pixels of the screen
+   * @param {number} ratio the screen's pixels by the page's
+   */
+  begin(view, pixels, ratio) {
     const gl = this.gl;
-    Object.assign(this, { view, pixels: [width, height], ratio });
-    gl.viewport(0, 0, width, height);
+    this.view = view;
+    this.pixels = pixels;
+    this.ratio = ratio;
+    gl.viewport(0, 0, ...pixels);
     gl.clearColor(0, 0, 0, 0);
     gl.depthMask(true);
     gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
@@ -149,8 +202,12 @@ class Gpu {
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
   }
 
-  /** Draw all of a kind, with values of its uniforms. */
-  draw(kind, values = {}) {
+  /**
+   * Draw all of a kind.
+   * @param {Kind} kind
+   * @param {Record<string, number>} uniforms
+   */
+  draw(kind, uniforms = {}) {
     const gl = this.gl;
     const { array, count } = this.buffers[kind];
     if (!count || (kind === "picture" && !this.texture)) return;
@@ -159,7 +216,7 @@ class Gpu {
     gl.uniformMatrix4fv(gl.getUniformLocation(program, "view"), false, this.view);
     gl.uniform2f(gl.getUniformLocation(program, "size"), 1, this.ratio);
     if (kind === "lines") gl.uniform2f(gl.getUniformLocation(program, "pixels"), ...this.pixels);
-    for (const [name, value] of Object.entries(values)) gl.uniform1f(gl.getUniformLocation(program, name), value);
+    for (const [name, value] of Object.entries(uniforms)) gl.uniform1f(gl.getUniformLocation(program, name), value);
     gl.depthMask(kind !== "faces"); // what is behind a glass face is seen
     gl.bindVertexArray(array);
     if (kind === "lines") gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, count);
@@ -167,7 +224,7 @@ class Gpu {
     gl.bindVertexArray(null);
   }
 
-  /** Give all back. */
+  /** Give all memory back. */
   free() {
     const gl = this.gl;
     for (const { buffer, array } of Object.values(this.buffers)) {
@@ -180,13 +237,22 @@ class Gpu {
   }
 }
 
+/**
+ * Return how many numbers one thing of a kind has.
+ * @param {Kind} kind
+ */
+function numbersOf(kind) {
+  return Object.values(LAYOUTS[kind]).reduce((sum, count) => sum + count, 0);
+}
+
 /** Numbers that are added one after the other; the array grows and is used again. */
-class Numbers {
+export class Numbers {
   constructor() {
     this.array = new Float32Array(1 << 12);
     this.count = 0;
   }
 
+  /** @param {number[]} values */
   add(...values) {
     if (this.count + values.length > this.array.length) {
       const larger = new Float32Array(2 * this.array.length);
@@ -197,6 +263,3 @@ class Numbers {
     this.count += values.length;
   }
 }
-
-/** @returns {number[]} red, green, blue from 0 to 1, of `#rrggbb` */
-const channelsOf = (color) => [1, 3, 5].map((at) => parseInt(color.slice(at, at + 2), 16) / 255);

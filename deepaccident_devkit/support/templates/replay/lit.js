@@ -1,80 +1,81 @@
-// The actor that the reader points at or has chosen, in any view: all views name it and light it up.
+// The actor that the reader points at or has chosen, in any view: all views name and highlight it.
+
+import { nextActor } from "./actors.js";
+import { data } from "./data.js";
+import { actorInPicture } from "./picking.js";
+import { refresh } from "./refresh.js";
+import { state } from "./state.js";
+
+/** @import { PicturedBox } from "./picking.js" */
+/** @import { Actor } from "./types.js" */
 
 function light() {
-  const wanted = state.pointed === null ? state.chosen : state.pointed;
-  if (wanted === state.lit) return;
-  state.lit = wanted;
-  showCameras();
-  showEvery();
-  showLit();
-  ground.draw();
-  space.draw();
+  const lit = state.pointed ?? state.chosen;
+  if (lit === state.lit) return;
+  state.lit = lit;
+  refresh("actor");
 }
 
-const numberOf = (actor) => (actor ? actor.id : null);
-
-function point(actor) {
-  state.pointed = numberOf(actor);
+/** @param {Actor | null} actor */
+export function point(actor) {
+  state.pointed = actor?.id ?? null;
   light();
 }
 
-/** Choose an actor; the same one again, or none, ends it. */
-function choose(actor) {
-  state.chosen = numberOf(actor) === state.chosen ? null : numberOf(actor);
+/**
+ * Choose an actor; the same one again, or none, ends the choice.
+ * @param {Actor | null} actor
+ */
+export function choose(actor) {
+  const id = actor?.id ?? null;
+  state.chosen = id === state.chosen ? null : id;
   state.pointed = null;
   light();
 }
 
-/** The next actor that is there, by the order of the table. */
-function chooseNext(step) {
-  const there = data.actors.filter((actor) => actor.states[state.frame] !== null);
-  const at = there.findIndex((actor) => actor.id === state.chosen);
-  if (there.length) choose(there[(at + step + there.length + (at < 0 && step < 0 ? 1 : 0)) % there.length]);
+/**
+ * Choose the next or previous actor, in the order of the table.
+ * @param {1 | -1} step
+ */
+export function chooseNext(step) {
+  const actor = nextActor(data.actors, state.frame, state.chosen, step);
+  if (actor) choose(actor);
 }
 
-function seenBy(actor) {
-  const names = data.agents.filter((_, bit) => actor.seen[state.frame] & (1 << bit)).map((agent) => agent.title);
-  return `seen by ${names.join(", ") || "nobody else"}`;
-}
+/**
+ * A picture with boxes over it.
+ * @typedef {object} Picture
+ * @property {HTMLElement} figure
+ * @property {SVGSVGElement} boxes
+ * @property {[width: number, height: number]} size of the image
+ * @property {PicturedBox[]} places
+ */
 
-const speedOf = (now) => (now[3] === null ? "speed unknown" : `${(now[3] / 10).toFixed(1)} m/s`);
-
-function showLit() {
-  const actor = data.actors.find((each) => each.id === state.lit);
-  const now = actor && actor.states[state.frame];
-  byId("lit").classList.toggle("nobody", !actor);
-  for (const { actor: own, row } of rows) row.classList.toggle("lit", own.id === state.lit);
-  if (!actor) byId("lit").textContent = "Point at an actor in any view: all views show it.";
-  else if (!now) byId("lit").textContent = `${actor.title}: not annotated at this moment.`;
-  else byId("lit").textContent = `${actor.title}: ${speedOf(now)}, ${seenBy(actor)}.`;
-}
-
-// in a camera's picture
-
-/** The nearest actor whose box a pointer is on, in the picture of a card. */
-function actorIn(card, event) {
-  const box = card.boxes.getBoundingClientRect();
-  const [width, height] = card.size || [0, 0];
+/**
+ * Return the actor under a pointer.
+ * @param {Picture} picture
+ * @param {MouseEvent} event
+ */
+function actorUnder(picture, event) {
+  const box = picture.boxes.getBoundingClientRect();
+  const [width, height] = picture.size;
   const x = ((event.clientX - box.left) / box.width) * width;
   const y = ((event.clientY - box.top) / box.height) * height;
-  const within = ({ place }) => place[0] <= x && x <= place[2] && place[1] <= y && y <= place[3];
-  const hit = (card.places || []).filter(within);
-  return hit.length ? hit.reduce((best, each) => (each.away < best.away ? each : best)).actor : null;
+  return actorInPicture(picture.places, x, y);
 }
 
-/** Point and choose in the picture of a card; what else a click does, `otherwise` does. */
-function lightIn(card, element, otherwise) {
-  element.addEventListener("pointermove", (event) => point(actorIn(card, event)));
+/**
+ * Let the reader point at and choose actors in a picture.
+ * @param {Picture} picture
+ * @param {HTMLElement} element around the picture
+ * @param {() => void} onClick a click beside all actors, and any click on a picture that is not the large one
+ */
+export function lightIn(picture, element, onClick) {
+  element.addEventListener("pointermove", (event) => point(actorUnder(picture, event)));
   element.addEventListener("pointerleave", () => point(null));
   element.addEventListener("click", (event) => {
-    const actor = event.detail ? actorIn(card, event) : null; // of a key, it has no place
+    const actor = event.detail ? actorUnder(picture, event) : null; // a click by a key has no place
     if (actor) choose(actor);
-    if (!actor || !card.figure.classList.contains("large")) otherwise();
+    if (!actor || !picture.figure.classList.contains("large")) onClick();
   });
-}
-
-for (const { actor, row } of rows) {
-  row.addEventListener("pointerenter", () => point(actor));
-  row.addEventListener("pointerleave", () => point(null));
-  row.addEventListener("click", () => choose(actor));
 }

@@ -1,61 +1,93 @@
-"use strict";
+// Where pictures and LiDAR points come from: the page itself, or the server that gives the page (`data.served`).
 
-// Where pictures and LiDAR points are: in the page itself or, of a page that a server gives (`data.served`), there.
+/** @import { Agent, Camera, ReplayData } from "./types.js" */
 
 const KEPT_CLOUDS = 400;
-const WIDE = { large: 960, small: 320 }; // pixels of the pictures that a server is asked for
+const WIDTHS = { large: 960, small: 320 }; // of the pictures that a server is asked for, pixels
 
-class Sources {
-  constructor(data, arrived) {
+export class Sources {
+  /**
+   * @param {ReplayData} data
+   * @param {() => void} onCloud called when points of a server have arrived
+   */
+  constructor(data, onCloud) {
     this.data = data;
-    this.served = data.served || null;
-    this.arrived = arrived;
+    this.served = data.served ?? null;
+    this.onCloud = onCloud;
+    /** @type {Map<string, Int16Array | null | undefined>} */
     this.clouds = new Map();
   }
 
-  // The address of a camera's picture of a frame that has one.
-  picture(agent, camera, frame, large) {
+  /**
+   * Return the address of a camera's picture of a frame that has one.
+   * @param {Agent} agent
+   * @param {Camera} camera
+   * @param {number} frame
+   * @param {boolean} isLarge
+   */
+  picture(agent, camera, frame, isLarge) {
     if (!this.served) return `data:image/jpeg;base64,${camera.pictures[frame]}`;
-    const width = large ? WIDE.large : WIDE.small;
+    const width = isLarge ? WIDTHS.large : WIDTHS.small;
     return `${this.served.folder}images/${agent.name}/${camera.channel}/${frame + 1}?width=${width}`;
   }
 
-  // The agents, by number, that have points at any frame.
+  /** The numbers of the agents that have points at any frame. */
   get withPoints() {
     const clouds = this.served ? this.served.points : this.data.points || [];
-    return this.data.agents.map((_, bit) => bit).filter((bit) => clouds[bit]);
+    return this.data.agents.map((_, agent) => agent).filter((agent) => clouds[agent]);
   }
 
-  // Points of an agent, x, y, z, x, y, z, … in decimetres; null where there are none, undefined as long as they are on
-  // their way.
-  points(bit, frame) {
-    const key = `${bit}/${frame}`;
-    if (!this.clouds.has(key)) this.get(key, bit, frame);
+  /**
+   * Return an agent's points, x, y, z, x, y, z, … in decimetres; null where there are none, undefined while they are
+   * loaded.
+   * @param {number} agent its number
+   * @param {number} frame
+   */
+  points(agent, frame) {
+    const key = `${agent}/${frame}`;
+    if (!this.clouds.has(key)) this.load(key, agent, frame);
     return this.clouds.get(key);
   }
 
-  get(key, bit, frame) {
-    const there = (this.served ? this.served : this.data).points[bit][frame];
-    if (there === true) this.ask(key, bit, frame);
-    else this.clouds.set(key, typeof there === "string" ? decodedCloud(there) : null);
+  /**
+   * @param {string} key
+   * @param {number} agent
+   * @param {number} frame
+   */
+  load(key, agent, frame) {
+    if (!this.served) {
+      const cloud = this.data.points?.[agent]?.[frame];
+      this.clouds.set(key, cloud ? decodedCloud(cloud) : null);
+    } else if (this.served.points[agent]?.[frame]) {
+      this.ask(key, `${this.served.folder}points/${this.data.agents[agent].name}/${frame + 1}`);
+    } else this.clouds.set(key, null);
   }
 
-  ask(key, bit, frame) {
+  /**
+   * Ask the server for a cloud; the one that was asked for first is forgotten if there are many.
+   * @param {string} key
+   * @param {string} address
+   */
+  async ask(key, address) {
     this.clouds.set(key, undefined);
-    if (this.clouds.size > KEPT_CLOUDS) this.clouds.delete(this.clouds.keys().next().value);
-    fetch(`${this.served.folder}points/${this.data.agents[bit].name}/${frame + 1}`)
-      .then((answer) => (answer.ok ? answer.text() : ""))
-      .then((coded) => {
-        this.clouds.set(key, decodedCloud(coded));
-        this.arrived();
-      })
-      .catch(() => this.clouds.delete(key)); // the server has ended; another look asks again
+    const [first] = this.clouds.keys();
+    if (this.clouds.size > KEPT_CLOUDS) this.clouds.delete(first);
+    try {
+      const answer = await fetch(address);
+      this.clouds.set(key, decodedCloud(answer.ok ? await answer.text() : ""));
+      this.onCloud();
+    } catch {
+      this.clouds.delete(key); // the server has ended; the next look asks again
+    }
   }
 }
 
-// Little-endian int16 from base64: x, y, z, x, y, z, …, decimetres.
-function decodedCloud(coded) {
-  const text = atob(coded);
-  const view = new DataView(Uint8Array.from(text, (character) => character.charCodeAt(0)).buffer);
+/**
+ * Return the numbers of a cloud: little-endian int16 in base64.
+ * @param {string} text
+ */
+export function decodedCloud(text) {
+  const characters = atob(text);
+  const view = new DataView(Uint8Array.from(characters, (character) => character.charCodeAt(0)).buffer);
   return Int16Array.from({ length: view.byteLength / 2 }, (_, index) => view.getInt16(2 * index, true));
 }

@@ -1,140 +1,208 @@
-// The strip below the slider, on its scale: the pair's speeds, gap and time to collision, who sees it, verdicts; and
-// which frames have files. A click goes there.
+// The strip below the slider, on its scale: the pair's speeds, gap and time to collision, who sees it, and verdicts.
+// Below the slider itself: which frames have files. A click on the strip goes to a frame.
 
-const ROW = 20; // pixels of a curve's height
+import { isSeen, seersOf, verdictColor } from "./actors.js";
+import { frameAtShare, shareOf } from "./clock.js";
+import { barExtent, curvePath, known, runs } from "./curves.js";
+import { data, last, pair } from "./data.js";
+import { byId, drawn, made } from "./elements.js";
+import { step } from "./playback.js";
+import { state } from "./state.js";
+
+/** @import { Actor, Sample } from "./types.js" */
+
+const CURVE = 20; // pixels of a curve's height
 const BAND = 3; // pixels of an agent's line
-const LONGEST = 6; // seconds: the curve has no longer time to collision
+const LONGEST_GAP = 900; // metres
+const LONGEST_TIME = 6; // seconds: the curve has no longer time to collision
+
 const strip = byId("strip");
 
-const known = (values) => values.filter((each) => each !== null);
-const svg = (height, ...children) => {
-  const looks = { viewBox: `0 0 ${Math.max(last, 1)} ${height}`, height, preserveAspectRatio: "none" };
-  return drawn("svg", { ...looks, "aria-hidden": "true" }, ...children);
-};
+/**
+ * @param {number} height
+ * @param {SVGElement[]} children
+ */
+function plot(height, ...children) {
+  const box = { viewBox: `0 0 ${Math.max(last, 1)} ${height}`, height, preserveAspectRatio: "none" };
+  return drawn("svg", { ...box, "aria-hidden": "true" }, ...children);
+}
 
-/** A curve of values, one a frame, between 0 and `most`; it has gaps where they are not known. */
-function curve(values, most, color, dashed) {
-  let path = "";
-  values.forEach((value, frame) => {
-    if (value === null) return;
-    const isFirst = frame === 0 || values[frame - 1] === null;
-    path += `${isFirst ? "M" : "L"}${frame} ${(ROW - 1.5 - (Math.min(value, most) / most) * (ROW - 3)).toFixed(1)}`;
+/**
+ * @param {(number | null)[]} values
+ * @param {number} most
+ * @param {string} color
+ * @param {boolean} isDashed
+ */
+function curve(values, most, color, isDashed) {
+  return drawn("path", {
+    d: curvePath(values, most, CURVE),
+    fill: "none",
+    stroke: color,
+    "stroke-width": 2,
+    "vector-effect": "non-scaling-stroke",
+    "stroke-dasharray": isDashed ? "5 3" : "none",
   });
-  const line = { d: path, fill: "none", stroke: color, "stroke-width": 2, "vector-effect": "non-scaling-stroke" };
-  return drawn("path", { ...line, "stroke-dasharray": dashed ? "5 3" : "none" });
 }
 
-/** A bar from frame to frame, half a frame beyond both where the strip goes on. */
-function bar(from, to, y, height, color) {
-  const [left, right] = [Math.max(0, from - 0.5), Math.min(Math.max(last, 1), to + 0.5)];
-  return drawn("rect", { x: left, y, width: right - left, height, fill: color });
+/**
+ * Draw a bar from frame to frame.
+ * @param {[from: number, to: number]} frames
+ * @param {number} y
+ * @param {number} height
+ * @param {string} color
+ */
+function bar([from, to], y, height, color) {
+  return drawn("rect", { ...barExtent(from, to, last), y, height, fill: color });
 }
 
-/** Bars where a condition holds. */
+/**
+ * Draw bars at the frames where a condition holds.
+ * @param {(frame: number) => boolean} holds
+ * @param {number} y
+ * @param {number} height
+ * @param {string} color
+ */
 function bars(holds, y, height, color) {
-  const found = [];
-  for (let frame = 0; frame <= last; frame += 1) {
-    if (!holds(frame)) continue;
-    const from = frame;
-    while (frame < last && holds(frame + 1)) frame += 1;
-    found.push(bar(from, frame, y, height, color));
-  }
-  return found;
+  return runs(last, holds).map((frames) => bar(frames, y, height, color));
 }
 
-/** A row: its name, its picture, and what it says of a frame. */
-function stripRow(name, picture, words) {
-  const told = made("span", { className: "told" });
-  const plot = made("div", { className: "plot" }, picture);
-  strip.append(made("span", { className: "row", textContent: name }), plot, told);
-  return { plot, told, words };
+/**
+ * A row of the strip: where it says something, and what it says of a frame.
+ * @typedef {{ text: HTMLElement, textOf: (frame: number) => string }} Row
+ */
+
+/**
+ * Add a row.
+ * @param {string} name
+ * @param {SVGElement} picture
+ * @param {(frame: number) => string} textOf
+ * @returns {Row}
+ */
+function addRow(name, picture, textOf) {
+  const text = made("span", { className: "told" });
+  strip.append(
+    made("span", { className: "row", textContent: name }),
+    made("div", { className: "plot" }, picture),
+    text,
+  );
+  return { text, textOf };
 }
 
-// The pair's own hues: red would be both.
-const hueOf = (actor) => (data.agents.find((agent) => agent.actor === actor.id) || { color: "currentColor" }).color;
+/**
+ * Return the colour of the agent that an actor is: red would be both of the pair.
+ * @param {Actor} actor
+ */
+function colorOf(actor) {
+  return data.agents.find((agent) => agent.actor === actor.id)?.color ?? "currentColor";
+}
 
-function speedRow() {
+function addSpeeds() {
   const speeds = pair.map((actor) => actor.states.map((now) => now && now[3]));
   const most = Math.max(1, ...speeds.flatMap(known));
-  const lines = speeds.map((values, number) => curve(values, most, hueOf(pair[number]), number === 1));
-  const told = (value) => (value === null ? "–" : (value / 10).toFixed(1));
-  const words = (frame) => `${speeds.map((each) => told(each[frame])).join(" and ")} m/s`;
-  return stripRow("speeds", svg(ROW, ...lines), words);
-}
-
-function measureRow(name, values, unit, scale, limit) {
-  const most = Math.min(limit * scale, Math.max(1, ...known(values)));
-  const told = (frame) => (values[frame] === null ? "–" : `${(values[frame] / scale).toFixed(1)} ${unit}`);
-  const shown = values.map((each) => (each !== null && each > limit * scale ? null : each));
-  return stripRow(name, svg(ROW, curve(shown, most, "currentColor", false)), told);
-}
-
-function sightRow(actor) {
-  const lines = data.agents.flatMap((agent, bit) => {
-    const own = agent.actor === actor.id;
-    return own ? [] : bars((frame) => actor.seen[frame] & (1 << bit), bit * BAND, BAND - 0.8, agent.color);
+  const lines = speeds.map((values, number) => curve(values, most, colorOf(pair[number]), number === 1));
+  const valueText = (/** @type {number | null} */ value) => (value === null ? "–" : (value / 10).toFixed(1));
+  return addRow("speeds", plot(CURVE, ...lines), (frame) => {
+    return `${speeds.map((values) => valueText(values[frame])).join(" and ")} m/s`;
   });
-  const seeing = (frame) => data.agents.filter((_, bit) => actor.seen[frame] & (1 << bit));
-  const told = (frame) => seeing(frame).map((agent) => agent.short).join(" ") || "nobody";
-  return stripRow(`${actor.tag || actor.id} seen by`, svg(BAND * data.agents.length, ...lines), told);
 }
 
-function verdictRow() {
-  const lines = data.prediction.samples.map((sample) =>
-    bar(sample.frame, sample.frame, sample.agent * BAND, BAND - 0.8, verdictColor(sample.verdict)),
+/**
+ * @param {string} name
+ * @param {(number | null)[]} values
+ * @param {string} unit
+ * @param {number} scale values of a unit
+ * @param {number} limit the largest value that the curve has
+ */
+function addMeasure(name, values, unit, scale, limit) {
+  const most = Math.min(limit * scale, Math.max(1, ...known(values)));
+  const shown = values.map((value) => (value !== null && value > limit * scale ? null : value));
+  return addRow(name, plot(CURVE, curve(shown, most, "currentColor", false)), (frame) => {
+    const value = values[frame];
+    return value === null ? "–" : `${(value / scale).toFixed(1)} ${unit}`;
+  });
+}
+
+/** @param {Actor} actor */
+function addSight(actor) {
+  const lines = data.agents.flatMap((agent, number) => {
+    if (agent.actor === actor.id) return [];
+    return bars((frame) => isSeen(actor, frame, number), number * BAND, BAND - 0.8, agent.color);
+  });
+  const name = `${actor.tag || actor.id} seen by`;
+  return addRow(name, plot(BAND * data.agents.length, ...lines), (frame) => {
+    return seersOf(actor, frame, data.agents).map((agent) => agent.short).join(" ") || "nobody";
+  });
+}
+
+/** @param {Sample[]} samples */
+function addVerdicts(samples) {
+  const lines = samples.map(({ frame, agent, verdict }) =>
+    bar([frame, frame], agent * BAND, BAND - 0.8, verdictColor(verdict, data.colors)),
   );
-  const told = () => {
+  return addRow("verdicts", plot(BAND * data.agents.length, ...lines), () => {
     const words = state.foreseen.map((sample) => `${data.agents[sample.agent].short} ${sample.verdict}`);
     return words.join(", ") || "none yet";
-  };
-  return stripRow("verdicts", svg(BAND * data.agents.length, ...lines), told);
+  });
 }
 
-const stripRows = [
-  ...(pair.length ? [speedRow()] : []),
-  ...(data.pair ? [measureRow("gap", data.pair.gap, "m", 100, FARTHEST)] : []),
-  ...(data.pair ? [measureRow("time to collision", data.pair.ttc, "s", 10, LONGEST)] : []),
-  ...pair.map(sightRow),
-  ...(data.prediction ? [verdictRow()] : []),
-];
+/** @type {Row[]} */
+const rows = [];
+if (pair.length) rows.push(addSpeeds());
+if (data.pair) {
+  rows.push(addMeasure("gap", data.pair.gap, "m", 100, LONGEST_GAP));
+  rows.push(addMeasure("time to collision", data.pair.ttc, "s", 10, LONGEST_TIME));
+}
+for (const actor of pair) rows.push(addSight(actor));
+if (data.prediction) rows.push(addVerdicts(data.prediction.samples));
 
-function showStrip() {
-  strip.style.setProperty("--now", String(state.frame / Math.max(last, 1)));
-  for (const { told, words } of stripRows) told.textContent = words(state.frame);
+/** Show what the strip says of the frame. */
+export function showStrip() {
+  strip.style.setProperty("--now", String(shareOf(state.frame, last)));
+  for (const { text, textOf } of rows) text.textContent = textOf(state.frame);
 }
 
 let isHeld = false;
+
+/** @param {PointerEvent} event */
 function goIn(event) {
-  const plot = event.target.closest(".plot");
-  if (!plot) return;
-  const box = plot.getBoundingClientRect();
-  step(Math.round(((event.clientX - box.left) / box.width) * last) - state.frame);
+  const target = event.target instanceof Element && event.target.closest(".plot");
+  if (!target) return;
+  const box = target.getBoundingClientRect();
+  step(frameAtShare((event.clientX - box.left) / box.width, last) - state.frame);
 }
+
 strip.addEventListener("pointerdown", (event) => {
   isHeld = true;
   goIn(event);
 });
-strip.addEventListener("pointermove", (event) => isHeld && goIn(event));
+strip.addEventListener("pointermove", (event) => {
+  if (isHeld) goIn(event);
+});
 addEventListener("pointerup", () => {
   isHeld = false;
 });
 
 const more = byId("more");
-function openStrip(isOpen) {
+
+/** @param {boolean} isOpen */
+function open(isOpen) {
   strip.hidden = !isOpen;
   more.setAttribute("aria-expanded", String(isOpen));
 }
-more.hidden = !stripRows.length;
-more.addEventListener("click", () => openStrip(strip.hidden));
-openStrip(stripRows.length > 0 && innerWidth >= 840 && innerHeight >= 700);
 
-// Below the slider: the frames whose sensor files are there, paler where some of them are missing.
-if (data.files.some((each) => each < data.sensors)) {
+more.hidden = !rows.length;
+more.addEventListener("click", () => open(Boolean(strip.hidden)));
+open(rows.length > 0 && innerWidth >= 840 && innerHeight >= 700);
+
+// the frames whose sensor files are there, paler where some of them are missing
+
+if (data.files.some((count) => count < data.sensors)) {
   const height = 4;
-  const there = bars((frame) => data.files[frame] === data.sensors, 0, height, "currentColor");
-  const some = bars((frame) => data.files[frame] > 0 && data.files[frame] < data.sensors, 0, height, "currentColor");
+  const all = bars((frame) => data.files[frame] === data.sensors, 0, height, "currentColor");
+  const isPart = (/** @type {number} */ count) => count > 0 && count < data.sensors;
+  const some = bars((frame) => isPart(data.files[frame]), 0, height, "currentColor");
   for (const each of some) each.setAttribute("fill-opacity", "0.5");
-  byId("files").append(svg(height, ...there, ...some));
+  byId("files").append(plot(height, ...all, ...some));
   byId("files").hidden = false;
   byId("files-key").hidden = false;
 }

@@ -1,0 +1,49 @@
+"""JavaScript modules bundled into one script, for pages that are a single file or are opened without a server.
+
+Browsers load no modules from a disk, and the policy of a single page allows only one script.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from typing import Final
+
+_IMPORT: Final = re.compile(r'^import \{(\s*\w+(?:,\s*\w+)*,?\s*)\} from "\./(\w+)\.js";$', re.MULTILINE)
+_EXPORT: Final = re.compile(r"^export (?=(?:async function|function|class|const) (\w+))", re.MULTILINE)
+# A comment of types, which browsers do not need.
+_TYPES: Final = re.compile(r"^ */\*\*(?:(?!\*/).)*\*/\n", re.MULTILINE | re.DOTALL)
+_UNKNOWN: Final = re.compile(r"^(?:import|export)\b.*", re.MULTILINE)
+
+
+def bundled(read: Callable[[str], str], name: str) -> str:
+    """Return a module and all that it imports as one script, which makes no global names and has no comments of types.
+
+    Args:
+        read: Function that returns the text of a module in the same folder, such as `clock.js`.
+        name: Name of the module without its suffix.
+
+    Raises:
+        ValueError: Modules import each other, or one has an import or export of another form than
+            `import { a, b } from "./name.js";` and `export` before a function, a class or a constant.
+        OSError: `read` does not find a module.
+    """
+    modules: dict[str, str] = {}
+    _add(read, name, (), modules)
+    return f'(() => {{\n"use strict";\n{"".join(modules.values())}}})();\n'
+
+
+def _add(read: Callable[[str], str], name: str, importers: tuple[str, ...], modules: dict[str, str]) -> None:
+    """Add a module after those that it imports."""
+    if name in importers:
+        raise ValueError(f"modules import each other: {' imports '.join((*importers, name))}")
+    if name in modules:
+        return
+    text = _TYPES.sub("", read(f"{name}.js"))
+    for imported in _IMPORT.finditer(text):
+        _add(read, imported[2], (*importers, name), modules)
+    exports = ", ".join(_EXPORT.findall(text))
+    body = _EXPORT.sub("", _IMPORT.sub(r"const {\1} = module_\2;", text))
+    if unknown := _UNKNOWN.search(body):
+        raise ValueError(f"{name}.js: the bundler does not know this form: {unknown[0]}")
+    modules[name] = f"const module_{name} = (() => {{\n{body}return {{ {exports} }};\n}})();\n"

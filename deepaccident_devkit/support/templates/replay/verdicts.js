@@ -1,0 +1,60 @@
+// What a model predicts, and what its predictions count as.
+
+import { lastBefore, samplesByFrame, verdictColor } from "./actors.js";
+import { data } from "./data.js";
+import { badge, byId, made, smallText } from "./elements.js";
+import { go } from "./playback.js";
+import { agentHeadings } from "./seen.js";
+import { state } from "./state.js";
+
+/** @import { Sample } from "./types.js" */
+
+/** The samples of each evaluated frame. */
+export const samplesAt = samplesByFrame(data.prediction?.samples ?? []);
+
+/** @param {Sample} sample */
+export function verdictBadge(sample) {
+  return badge(sample.verdict, verdictColor(sample.verdict, data.colors));
+}
+
+/**
+ * Make the row of a frame in the table of all verdicts.
+ * @param {number} frame
+ * @param {Sample[]} samples
+ */
+function verdictRow(frame, samples) {
+  const number = String(frame + 1);
+  const jump = made("button", { type: "button", textContent: number, ariaLabel: `Go to frame ${number}` });
+  jump.addEventListener("click", () => go(frame));
+  const cells = data.agents.map((_, agent) => {
+    const sample = samples.find((each) => each.agent === agent);
+    return made("td", {}, sample ? verdictBadge(sample) : "");
+  });
+  const row = made("tr", {}, made("th", { scope: "row" }, jump), ...cells);
+  row.dataset.frame = String(frame);
+  return row;
+}
+
+if (data.prediction) {
+  byId("verdict").hidden = false;
+  byId("rule").textContent = data.prediction.rule;
+  const heading = made("tr", {}, made("th", { scope: "col", textContent: "frame" }), ...agentHeadings());
+  const body = [...samplesAt].map(([frame, samples]) => verdictRow(frame, samples));
+  byId("samples").append(made("table", {}, made("thead", {}, heading), made("tbody", {}, ...body)));
+}
+
+/** Show what was predicted at the last evaluated frame. */
+export function showForeseen() {
+  if (!data.prediction) return;
+  const frame = lastBefore(samplesAt.keys(), state.frame);
+  state.foreseen = frame === null ? [] : samplesAt.get(frame) ?? [];
+  const lines = state.foreseen.flatMap((sample) => [
+    made("p", {}, verdictBadge(sample), sample.text),
+    ...sample.alarms.map((alarm) => smallText(alarm.text, alarm.right ? "right" : "")),
+    ...(sample.more ? [smallText(`and ${sample.more} more, less sure`)] : []),
+  ]);
+  byId("foreseen").replaceChildren(...(lines.length ? lines : [smallText("Nothing was evaluated yet.")]));
+  for (const row of byId("samples").querySelectorAll("tr")) {
+    if (row.dataset.frame) row.className = row.dataset.frame === String(frame) ? "now" : "";
+  }
+}
