@@ -10,8 +10,6 @@ import anyio.to_thread
 from deepaccident_devkit.plugins.explore.access import App, AsgiScope, Receive, Send
 from deepaccident_devkit.plugins.explore.serving import Served
 
-Pairs = tuple[tuple[str, str], ...]
-
 
 class TinyApp:
     """Answers with the paths that it got; some paths are special. `/slow` ends when `go_on` is set."""

@@ -1,6 +1,6 @@
 """What the generator knows of a scenario, from its scene and its rays: nothing is read from a release's files."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,14 +30,12 @@ class Sights:
 
     Attributes:
         points: (5, 2, F) LiDAR points in the box.
-        hits: (5, 2, F) points that lie on the body itself.
         pixels: (5, 2, F) whether any camera sees it.
         distance: (5, 2, F) metres across, in the LiDAR frame.
         tracked: (5, 2, F) whether it is near enough to have an id in the agent's label.
     """
 
     points: Array
-    hits: Array
     pixels: Array
     distance: Array
     tracked: Array
@@ -50,11 +48,8 @@ class Truth:
     Attributes:
         scenario: token.
         design: which of the paper's twelve its scene is of.
-        unplanned: whether its accident is of no design.
         meta: its meta file's content.
         frames: how many are recorded.
-        begin: seconds at which the simulation starts, 0 or less.
-        samples: actor id → (S, 3) x, y, yaw of those that move, `STEP` apart from `begin` on, in the ground frame.
         fine: (2, M, 3) the colliders' poses from 0 to the last frame, `STEP` apart; ground frame.
         velocities: (2, M, 2) m/s.
         sizes: (2, 3) metres.
@@ -64,38 +59,27 @@ class Truth:
 
     scenario: str
     design: int
-    unplanned: bool
     meta: Meta
     frames: int
-    begin: float
-    samples: Mapping[int, Array]
     fine: Array
     velocities: Array
     sizes: Array
     world_paths: Array
     sights: Sights
 
-    @property
-    def paths(self) -> Array:
-        """(2, F, 3) the colliders' poses at the frames, ground frame."""
-        return self.fine[:, ::STEPS_A_FRAME]
-
 
 def recorded(job: RecordingJob) -> Truth:
     """Write a scenario's labels, calib and meta, and tell what the generator knows of it."""
     scenario = build_scenario(job.config, job.plan)
-    actors, moving = scenario.actors, [each for each in scenario.actors.all if not each.parked]
-    rows = [actors.row_of(actor) for actor in scenario.meta.collision.ids] if job.plan.accident else []
+    actors = scenario.actors
+    rows = [actors.row_of(actor) for actor in scenario.meta.collision.ids]
     world_paths, sights = _looked_at(job, scenario, rows)
     times = np.arange((scenario.frames - 1) * STEPS_A_FRAME + 1) * STEP
     return Truth(
         scenario=job.plan.token,
         design=job.plan.design,
-        unplanned=job.plan.unplanned,
         meta=scenario.meta,
         frames=scenario.frames,
-        begin=moving[0].motion.start,
-        samples={each.actor_id: each.motion.samples for each in moving},
         fine=np.array([actors.all[row].motion.poses(times) for row in rows]),
         velocities=np.array([actors.all[row].motion.velocities(times) for row in rows]),
         sizes=actors.size[rows],
@@ -127,15 +111,14 @@ def _looked_at(job: RecordingJob, scenario: Scenario, rows: list[int]) -> tuple[
             sighting = rig.sighting(scene, agent, frame)
             write_calib(folder.calib_path(agent.name, frame), sighting.calib)
             write_label(folder.label_path(agent.name, frame), sighting.labels)
-            sights.append(list(_seen(scene, agent, sighting.points, rows)) if rows else [])
-    columns = np.array(sights, dtype=np.float64).reshape(scenario.frames, len(AGENTS), len(rows), 5)
+            sights.append(list(_seen(scene, agent, sighting.points, rows)))
+    columns = np.array(sights, dtype=np.float64).reshape(scenario.frames, len(AGENTS), len(rows), 4)
     return np.array(paths).swapaxes(0, 1), Sights(*columns.transpose(3, 1, 2, 0))
 
 
 def _seen(scene: Scene, agent: Agent, cloud: Scan, rows: list[int]) -> Iterator[tuple[float, ...]]:
     """What the fields of `Sights` are for an agent and each row's actor."""
     ground_from_lidar = agent.ground_from_lidar(scene)
-    owners = np.append(scene.face_owner, [-1, -1])[np.maximum(cloud.face, -2)]
     pixels = camera_visible(scene, agent, ground_from_lidar, np.array(rows))
     for row, pixel in zip(rows, pixels, strict=True):
         box = ground_from_lidar.inverse().matrix @ _box(scene, row)
@@ -143,7 +126,7 @@ def _seen(scene: Scene, agent: Agent, cloud: Scan, rows: list[int]) -> Iterator[
         along = (cloud.xyz - box[:3, 3]) @ quaternions.to_matrix(quaternions.from_yaw(np.array(yaw)))
         inside = (np.abs(along) <= scene.actors.size[row] / 2).all(axis=1)
         away = np.hypot(*(_box(scene, row) - ground_from_lidar.matrix)[:2, 3])
-        yield inside.sum(), (owners == row).sum(), pixel, np.hypot(*box[:2, 3]), away <= TRACKING_RANGE
+        yield inside.sum(), pixel, np.hypot(*box[:2, 3]), away <= TRACKING_RANGE
 
 
 def _box(scene: Scene, row: int) -> Array:
@@ -166,25 +149,6 @@ def time_to_contact(truth: Truth, step: int) -> float:
         poses[:, :2] += times[:, None] * velocity
     touching = separations(truth, *moved) <= 1e-3
     return float(times[touching.argmax()]) if touching.any() else np.inf
-
-
-def parting_times(
-    accident: Truth, twin: Truth, distance: float, heading: float, *, later: float = 0.0
-) -> dict[int, float]:
-    """Actor id → seconds in the accident's recording from which on it is elsewhere in the twin, or turned otherwise.
-
-    Infinite for those who never are. Both simulations begin at the same moment; the twin is looked at some seconds
-    `later`.
-    """
-    times = {}
-    for actor in accident.samples.keys() & twin.samples.keys():
-        one, two = accident.samples[actor], twin.samples[actor]
-        since = np.arange(len(one)) * STEP
-        change = [np.interp(since + later, np.arange(len(two)) * STEP, column) for column in two.T] - one.T
-        apart = (np.hypot(*change[:2]) > distance) | (np.abs(change[2]) > heading)
-        apart &= since >= -accident.begin - STEP
-        times[actor] = accident.begin + STEP * int(apart.argmax()) if apart.any() else np.inf
-    return times
 
 
 def last_moment(truth: Truth, brakers: tuple[bool, bool], deceleration: float) -> float:

@@ -12,7 +12,6 @@ import pytest
 from refusals import assert_refused
 from workers import num_boxes
 
-import deepaccident_devkit
 from deepaccident_devkit import DeepAccident, DeepAccidentError
 from deepaccident_devkit.errors import (
     ChoiceError,
@@ -331,27 +330,3 @@ def test_a_camera_is_its_calibs(da: DeepAccident) -> None:
             for channel in ("lidar01", "BEV_instance_camera")
         )
     )
-
-
-def test_listings_print(da: DeepAccident, capsys: pytest.CaptureFixture[str]) -> None:
-    for name in ("scenarios", "agents", "categories"):
-        getattr(da, f"list_{name}")()
-    da.list_sample(da.sample[0]["token"])
-    own = da.get("agent", da.sample[0]["agent_token"])["category"]
-    wanted = (da.scenario[0]["token"], "infrastructure  4 scenarios", "0  car  ", "Camera_Front", f"Box({own} -100, l")
-    printed = capsys.readouterr().out
-    assert [word for word in wanted if word not in printed] == []
-
-
-NAMES = """
-    scenario agent frame sample sample_data sensor calibrated_sensor ego_pose instance annotation track category
-    find get getind field2token arrow get_sample samples_of table_names split_scenarios
-    list_scenarios list_agents list_categories list_sample
-    get_sample_data_path get_sample_data load_image load_point_cloud load_bev get_boxes boxes transform
-    render_sample render_sample_data render_frame render_bev
-"""
-
-
-def test_what_the_design_names_is_there() -> None:
-    assert [name for name in NAMES.split() if not hasattr(DeepAccident, name)] == []
-    assert deepaccident_devkit.__version__ == "1.0.0"

@@ -5,10 +5,8 @@ from pathlib import Path
 
 import pytest
 from campaign import planted
-from campaign.__main__ import EACH
 from campaign.healthy import make_healthy
 from campaign.kinds import KINDS
-from campaign.mutations import GROUPS
 from campaign.pool import drawn, run
 from campaign.stops import VERBS, Stop, run_stops
 from campaign.worker import Case
@@ -57,22 +55,10 @@ def test_every_way_to_fail_is_noticed(healthy: Path, kinds: list[str], how: dict
 
 
 @pytest.mark.slow
-def test_every_verb_is_killed_and_meets_a_full_disk(healthy: Path, tmp_path: Path) -> None:
-    stops = [Stop(verb.name, kind, 0.6) for verb in VERBS for kind in ("kill", "full disk")]
+def test_verbs_are_killed_and_meet_a_full_disk(healthy: Path, tmp_path: Path) -> None:
+    """A third of them; the campaign itself stops all."""
+    stops = [Stop(verb.name, kind, 0.6) for verb in VERBS[::3] for kind in ("kill", "full disk")]
     assert [stopped for stopped in run_stops(stops, healthy, tmp_path) if stopped.failed] == []
-
-
-def test_the_page_is_of_a_whole_run_without_a_failure() -> None:
-    """`PYTHONPATH=.ci/tools python -m campaign` brings it up to date."""
-    block = PAGE.read_text(encoding="utf-8").partition("<!-- campaign -->")[2].partition("<!-- /campaign -->")[0]
-    changed = f"{EACH * len(KINDS):,} changed files of {len(KINDS)} kinds, by `--count {EACH} --kills 100 --seed 0`:"
-    stopped = f"100 killed processes and {4 * len(VERBS)} full disks, with {len(VERBS)} commands that write:"
-    assert [line for line in block.splitlines() if line.endswith(":")] == [changed, stopped]
-    assert [line.split() for line in block.splitlines() if "| 0 |" in line] == [
-        ["|", "failed", "|", *["0", "|"] * (len(GROUPS) + 1)],
-        ["|", *["0", "|"] * 3],
-    ]
-    assert sum(int(number) for number in re.findall(r"(\d+) \|$", block, re.MULTILINE)) == EACH * len(KINDS)
 
 
 def test_the_limits_of_the_security_page_are_those_of_the_code() -> None:

@@ -7,7 +7,6 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-import click
 import numpy as np
 import pytest
 from click.testing import CliRunner
@@ -15,9 +14,8 @@ from tiny import NAME, TYPE, write_tiny_release
 from verbs import called, commands, ran
 
 from deepaccident_devkit import DeepAccident, __version__
-from deepaccident_devkit.cli import deepaccident, verbs
+from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.motion import LABEL_PROTOCOLS, LabelFiles, MotionLabelConfig
-from deepaccident_devkit.plugins.synth import SynthConfig
 from deepaccident_devkit.release import read_split_file
 from deepaccident_devkit.selection.splits import official_split
 
@@ -153,36 +151,6 @@ def test_a_verb_does_not_wait_for_what_others_import(words: str, others: set[str
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["mcap", "mmdet3d", "nuscenes", "opencood", "parquet", "questions", "webdataset"])
-def test_an_export_imports_its_own_format_alone(name: str) -> None:
-    shared = {"bulk", "format", "frames"}
-    own = {name} | ({"nuscenes", "released_infos"} if name == "mmdet3d" else set())
-    found = {each.split(".")[1] for each in imported("export", name, "--help") if each.startswith("export.")}
-    assert found <= shared | own
-    assert name == "mcap" or own <= found
-
-
-def test_an_option_says_what_its_field_says() -> None:
-    @verbs.verb()
-    @verbs.field_option(SynthConfig, "unplanned")
-    @verbs.field_option(SynthConfig, "layout")
-    @verbs.field_option(SynthConfig, "exact")
-    @verbs.field_option(SynthConfig, "view", default="open")
-    def made(**options: object) -> None:
-        click.echo(json.dumps(options))
-
-    assert json.loads(CliRunner().invoke(made, ["--layout", "b"]).output) == {
-        "unplanned": 0.1, "layout": "B", "exact": False, "view": "open",
-    }  # fmt: skip
-    text = " ".join(CliRunner().invoke(made, ["--help"]).output.split())
-    assert (
-        "Share of clean accidents that differ from the design: with a pedestrian or a third vehicle. [default: 0.1]"
-        in text
-    )
-    assert "Whether calib files are the same at each frame" in text
-
-
-@pytest.mark.slow
 def test_split_makes_the_official_split_and_writes_it(tmp_path: Path) -> None:
     root = tmp_path / "release"
     name = "Town03_type001_subtype0001_scenario000"
@@ -237,16 +205,6 @@ def test_stats_prints_and_writes_tables_and_figures(own_release: Path, tmp_path:
     of_some = json.loads((out / "statistics.json").read_text())["scenarios"]["total"]
     assert (content["scenarios"]["total"], of_some, content["selected"]) == (6, 3, False)
     assert content["counts"]["collisions"]["counts"]["yes"]["total"] == 3
-
-
-@pytest.mark.slow
-def test_stats_of_nothing(own_release: Path, tmp_path: Path) -> None:
-    nothing = ran("info", own_release, "--statistics", "--where", "length=1..2").stdout
-    told = ("selected: 0 of 6 scenarios", "no scenario meets the filters, so there is nothing to count")
-    assert [line for line in told if line not in nothing] == []
-    failed = ran("info", own_release, "--statistics", "--where", "length=1..2", "--out", tmp_path / "new", status=2)
-    assert (failed.stdout, "no scenario matches --where, so" in failed.stderr) == ("", True)
-    assert not (tmp_path / "new").exists()
 
 
 @pytest.mark.slow

@@ -122,15 +122,9 @@ def bundle(words: tuple[object, ...], folder: Path) -> Path:
 @pytest.mark.parametrize(
     ("task", "kind", "protocol", "headline"),
     [
-        ("motion", "motion", "released", "iou 30x30"),
         ("motion", "motion", "paper", "iou 30x30"),
-        ("accident", "motion", "released", "apa"),
-        ("accident", "motion", "paper", "apa"),
         ("accident", "motion", "boxes", "average_precision"),
-        ("accident", "accidents", "boxes", "average_precision"),
         ("accident", "accidents", "paper", "apa"),
-        ("detection", "boxes", "released", "mAP"),
-        ("detection", "boxes", "paper", "mAP"),
         ("detection", "boxes", "opencood", "mAP"),
         ("warning", "accidents", "clean", "auc_ahead ego_involved"),
         ("warning", "accidents", "field", "AP ustring ego_involved"),

@@ -24,6 +24,7 @@ KILLED = "error: a worker process was killed ("
 SIGNALS = {signal.SIGINT: 130, signal.SIGTERM: 143}
 LONGEST = 120.0
 """Seconds until a verb has ended, however much else the machine does: what hangs ends here."""
+MOMENTS = 6
 Process = subprocess.Popen[str]
 ENVIRONMENT = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
 
@@ -106,16 +107,14 @@ def test_a_signal_ends_a_verb_with_one_line(number: signal.Signals, status: int,
 @pytest.mark.slow
 def test_a_signal_ends_the_workers_of_every_verb(words: tuple[object, ...], tmp_path: Path) -> None:
     with started(*words) as process:
-        wait_for(lambda: len(workers_of(process.pid)) == 2)
-        assert (stopped(process, signal.SIGINT), process.returncode) == ([LINE], 130)
-    with started(*words) as process:
         wait_for(lambda: any(map(works, workers_of(process.pid))))
         assert (stopped(process, signal.SIGTERM), process.returncode) == ([LINE], 143)
 
 
 @pytest.mark.slow
-def test_a_killed_worker_is_named_alike_by_every_verb(words: tuple[object, ...], tmp_path: Path) -> None:
-    with started(*words) as process:
+@pytest.mark.parametrize("verb", ["index", "synth", "evaluate"])
+def test_a_killed_worker_is_named(verb: str, da_motion: DeepAccident, results: Path, tmp_path: Path) -> None:
+    with started(*WORDS[verb](da_motion.dataroot, tmp_path, results), "--workers", 2) as process:
         wait_for(lambda: len(workers_of(process.pid)) == 2)
         os.kill(workers_of(process.pid)[0], signal.SIGKILL)
         lines = lines_of(process)
@@ -124,18 +123,16 @@ def test_a_killed_worker_is_named_alike_by_every_verb(words: tuple[object, ...],
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("number", "status"), SIGNALS.items())
-def test_mcap(number: signal.Signals, status: int, da: DeepAccident, tmp_path: Path) -> None:
+def test_mcap(da: DeepAccident, tmp_path: Path) -> None:
     words = ("export", "mcap", da.dataroot, "--out", tmp_path / "story.mcap")
     with started(*words) as process:
         wait_for(lambda: leftovers(tmp_path))  # it is being written
-        assert (stopped(process, number), process.returncode) == ([LINE], status)
+        assert (stopped(process, signal.SIGINT), process.returncode) == ([LINE], 130)
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("number", "status"), SIGNALS.items())
-def test_ten_moments(number: signal.Signals, status: int, release_root_b: Path, tmp_path: Path) -> None:
+def test_a_signal_at_any_moment(release_root_b: Path, tmp_path: Path) -> None:
     """From the first to the last: libraries are imported, workers start, files are written, Python ends."""
     source = shutil.copytree(release_root_b, tmp_path / "release", ignore=shutil.ignore_patterns(".deepaccident"))
     words = ("index", source, "--workers", 2, "--index-dir")
@@ -143,12 +140,12 @@ def test_ten_moments(number: signal.Signals, status: int, release_root_b: Path, 
         begin = time.monotonic()
         assert lines_of(process) == []
         whole = time.monotonic() - begin
-    for moment in range(10):
+    for moment in range(MOMENTS):
         out = tmp_path / str(moment)
         with started(*words, out) as process:
-            time.sleep(whole * moment / 9)
-            ended = (stopped(process, number), process.returncode)
-        assert ended in [([LINE], status), ([], 0)], moment  # at the end there is nothing to stop
+            time.sleep(whole * moment / (MOMENTS - 1))
+            ended = (stopped(process, signal.SIGTERM), process.returncode)
+        assert ended in [([LINE], 143), ([], 0)], moment  # at the end there is nothing to stop
         with started("check", *words, out) as process:  # removes locks that were left at the very end, too
             assert lines_of(process) == []
         assert files(out) == files(tmp_path / "whole")

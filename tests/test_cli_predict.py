@@ -104,12 +104,6 @@ def test_predict_of_scenarios_without_an_accident_names_the_scope(da_motion: Dee
     run(*words, "--scope", "all", "--out", tmp_path / "out")
 
 
-def test_predict_takes_every_half_second_of_all_scenarios(da_motion: DeepAccident, tmp_path: Path) -> None:
-    options = "--split train --task detection --samples all --workers 1"
-    run("constant_velocity", da_motion.dataroot, *options.split(), "--out", tmp_path)
-    assert list(read_results(tmp_path / "detection.json").tokens) == da_motion.samples("train", "all")
-
-
 def test_predict_goes_on_with_the_tasks_that_are_left(da_motion: DeepAccident, tmp_path: Path) -> None:
     words = ("constant_velocity", da_motion.dataroot, "--split", "train", "--workers", 1, "--out", tmp_path)
     run(*words, "--task", "accident")

@@ -55,19 +55,6 @@ def test_every_view_draws_the_first_accident_when_no_token_is_given(
     assert (drawn.shape[:2], len(colors) > 20, plt.get_fignums()) == (SIZE, True, [])
 
 
-@pytest.mark.slow
-def test_size_and_fonts_are_the_views_own_or_of_a_style(da: DeepAccident, tmp_path: Path) -> None:
-    run("sample-data", da.dataroot, "--out", tmp_path / "own.png", "--dpi", 100)
-    run("sample-data", da.dataroot, "--out", tmp_path / "paper.png", "--style", "paper")
-    own, paper = (pixels(tmp_path / f"{name}.png").shape for name in ("own", "paper"))
-    assert (own[:2], paper[1]) == ((540, 800), 1050)  # 3.5 inches of 300 pixels
-    run("labels", da.dataroot, "--out", tmp_path / "own.pdf", "--no-title")
-    assert b"/CIDFontType2" in (tmp_path / "own.pdf").read_bytes()  # Type 42
-    run("labels", da.dataroot, "--out", tmp_path / "a.pdf", "--style", "trail", "--style", "slide")
-    pdf = (tmp_path / "a.pdf").read_bytes()
-    assert (b"/CIDFontType2" in pdf, b"/MediaBox [ 0 0 576 324 ]" in pdf, plt.get_fignums()) == (True, True, [])
-
-
 def test_the_picture_is_what_the_function_draws(da: DeepAccident, accident: str, tmp_path: Path) -> None:
     sample = f"{accident}/other_vehicle/003"
     options = ["--agents", "+infrastructure", "--layers", "boxes,ids", "--layers", "grid", "--view-range", 30]

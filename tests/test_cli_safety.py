@@ -11,6 +11,7 @@ from verbs import called
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.plugins.safety import avoidability_report
+from deepaccident_devkit.support.text import counted
 
 pytestmark = pytest.mark.slow
 
@@ -22,7 +23,7 @@ def test_from_a_damaged_release_to_a_page(own_release: Path, tmp_path: Path) -> 
     damaged, out = damaged_release(own_release), tmp_path / "out"
     text = run("report", own_release, "--out", out, "--replays", 1, "--on-error", "skip", "--workers", 1).output
     accidents = [token for token in damaged.whole if damaged.dataset.get("scenario", token)["collision"]]
-    assert f"{len(accidents)} accidents of {len(damaged.dataset.scenario)} scenarios; " in text
+    assert f"{counted(len(accidents), 'accident')} of {counted(len(damaged.dataset.scenario), 'scenario')}; " in text
     assert f"open {out / 'report.html'} in a browser" in text
     assert len(list((out / "replays").iterdir())) == 1
     page = page_of(out / "report.html").text

@@ -62,11 +62,6 @@ def test_every_option_reaches_the_configuration(tmp_path, made, monkeypatch, wor
     assert made == [SynthConfig(**{"frames": None, **config})]
 
 
-def test_without_options_scenarios_have_their_natural_length(tmp_path, made):
-    assert f"{tmp_path}: 4 scenarios with five agents, layout A" in CliRunner().invoke(synth, [str(tmp_path)]).output
-    assert made == [SynthConfig(frames=None)]
-
-
 @pytest.mark.slow
 def test_a_benchmark_is_made_and_compared(tmp_path, monkeypatch):
     """One that is there is compared alone; which differences there are is told, and what else was asked for refused."""
@@ -129,19 +124,6 @@ def test_a_file_that_is_no_scenario_is_refused(mine):
     told = "mine.yaml:4: actors[1].category: the role other cannot be a cyclist"
     assert told in str(CliRunner().invoke(synth, ["out", "--design", "mine.yaml"]).exception)
     assert not Path("out").exists()
-
-
-def test_how_to_see_an_accident_is_the_last_line(mine, made):
-    def last(*words: str) -> str:
-        return CliRunner().invoke(synth, ["out", *words]).stdout.splitlines()[-1]
-
-    usual, drawn = (
-        f"or:   deepaccident render accident out{each} --out countdown.png" for each in ("", " --layers boxes")
-    )
-    mine_without = ("--design", "mine.yaml", "--sensors", "none")
-    assert [last(), last(*mine_without), last("--sensors", "cameras")] == [usual, drawn, usual]
-    mine.write_text(MINE.replace("meet: {offset: 0}", ""), encoding="utf-8")
-    assert last("--design", "mine.yaml") == "next: deepaccident info out"
 
 
 def test_a_design_is_shown_as_a_file_to_begin_with():

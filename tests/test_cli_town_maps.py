@@ -54,13 +54,3 @@ def test_one_town_as_json(root: Path, tmp_path: Path) -> None:
     assert told.items() >= wanted.items()
     another = (root, "--out", tmp_path, "--where", f"town={unseen}")
     assert_refused((lambda: run(*another), NotAvailableError, ("no town has a map",)))
-
-
-def test_scenarios_may_be_chosen(root: Path, tmp_path: Path) -> None:
-    seen, _ = towns(root)
-    made = run(root, "--out", tmp_path, "--where", f"town={seen}", "--where", "collision=true")
-    assert ("from 10 pictures of 1 scenario " in made.stdout, "left out" in made.stderr) == (True, False)
-
-
-def test_a_release_without_bev_cameras(da_b: DeepAccident, tmp_path: Path) -> None:
-    assert_refused((lambda: run(da_b.dataroot, "--out", tmp_path), NotAvailableError, ("no town has a map",)))

@@ -2,7 +2,6 @@
 
 import ast
 import inspect
-import math
 import re
 import shlex
 from dataclasses import fields
@@ -17,16 +16,16 @@ from scripts import loaded_script, of_checkout
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.cli import deepaccident
-from deepaccident_devkit.evaluation.accident import PROTOCOLS
+from deepaccident_devkit.cli.export import export
 from deepaccident_devkit.evaluation.accident.boxes import BoxAccidents
 from deepaccident_devkit.evaluation.accident.paper import PaperAccidents
-from deepaccident_devkit.evaluation.detection import DETECTION_PROTOCOLS, DetectionProtocol
+from deepaccident_devkit.evaluation.detection import DetectionProtocol
 from deepaccident_devkit.evaluation.map_accidents import AccidentReading
-from deepaccident_devkit.evaluation.motion import MOTION_PROTOCOLS, MotionProtocol
+from deepaccident_devkit.evaluation.motion import MotionProtocol
 from deepaccident_devkit.evaluation.runs.setups import TASKS
-from deepaccident_devkit.evaluation.warning import WARNING_PROTOCOLS, CleanWarnings
+from deepaccident_devkit.evaluation.warning import CleanWarnings
 from deepaccident_devkit.geometry import Box, Boxes, LidarPointCloud, PinholeCamera
-from deepaccident_devkit.motion import LabelProtocol, MotionLabelConfig, PostProcessing
+from deepaccident_devkit.motion import LabelProtocol, PostProcessing
 from deepaccident_devkit.plugins.safety.prevention_result import PreventedResult
 from deepaccident_devkit.plugins.synth import SynthConfig, make_release
 from deepaccident_devkit.selection.fields import FIELDS, full_name
@@ -45,8 +44,13 @@ COUNTERPARTS = sorted(
     }
 )
 """The code in the right columns of that section's tables."""
-WORDS_A_MINUTE = 200
 PAGES = [TOP / "README.md", *sorted(DOCS.glob("*.md")), *sorted((TOP / "schema").glob("**/*.md"))]
+NOT_ON_EXPORTS = ("town-maps",)
+"""Formats with a page of their own."""
+ON_LABELS = ("docs/protocols.md", "docs/evaluating.md", "docs/safety.md", "docs/baselines.md")
+ON_SENSORS = (
+    *("README.md", "docs/exports.md", "docs/format.md", "docs/index.md", "docs/town_maps.md", "docs/validation.md"),
+)
 RUN_ELSEWHERE = {
     "docs/plugins.md": "tests/test_plugin_package.py",
     "docs/clusters.md": "tests/engines/test_page.py",
@@ -146,30 +150,62 @@ def in_demo(small_demo: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     return tmp_path
 
 
+@pytest.mark.parametrize("page", ON_LABELS)
+def test_the_code_on_pages_about_labels_runs(page: str, in_labels_demo: Path) -> None:
+    run_page(TOP / page)
+
+
+@pytest.mark.parametrize("page", ON_SENSORS)
+def test_the_code_on_pages_about_sensors_runs(page: str, in_demo: Path) -> None:
+    run_page(TOP / page)
+
+
+def test_the_code_on_reading_runs(in_demo: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And that of its tables, except for the pictures."""
+    monkeypatch.setenv("DEEPACCIDENT_CACHE", str(tmp_path / "copies"))
+    names = run_page(DOCS / "reading.md")
+    assert names["camera"].in_image(names["pixels"]).all()
+    objects = re.compile(r"(da|box|boxes|camera|cloud|found)\.|len\(")
+    codes = [code for code in COUNTERPARTS if objects.match(code) and not code.startswith("da.render_")]
+    assert len(codes) > 60
+    for code in codes:
+        eval(compile(code, "reading.md", "eval"), names)  # noqa: S307
+
+
 @pytest.mark.parametrize("choices", [LabelProtocol, MotionProtocol])
-def test_every_switch_is_on_the_page_of_the_released_code(choices: type[Any]) -> None:
+def test_the_page_of_the_released_code_has_each_switch(choices: type[Any]) -> None:
     page = (DOCS / "released_code.md").read_text(encoding="utf-8")
     assert [field.name for field in fields(choices) if not re.search(rf"[`.]{field.name}\b", page)] == []
-
-
-@pytest.mark.parametrize("choices", [LabelProtocol, MotionLabelConfig, MotionProtocol])
-def test_the_page_of_the_released_code_names_no_other_switch(choices: type[Any]) -> None:
-    page = (DOCS / "released_code.md").read_text(encoding="utf-8")
     named = set(re.findall(rf"`{choices.__name__}\.(\w+)", page))
     assert named - {field.name for field in fields(choices)} == set()
 
 
-def test_the_code_on_protocols_runs(in_labels_demo: Path) -> None:
-    """The predictions there are the labels, so that they score 100."""
-    names = run_page(DOCS / "protocols.md")
-    result = names["halves"][0].compute()
-    assert [value for each in result.ranges.values() for value in (each.iou, each.pq)] == [100] * 4
-    assert names["group"].samples > 0
+CHOICES = (
+    MotionProtocol,
+    PostProcessing,
+    DetectionProtocol,
+    PaperAccidents,
+    AccidentReading,
+    BoxAccidents,
+    CleanWarnings,
+)
+RESULT_CLASSES = (*(evaluator.result_class for evaluator in TASKS.values()), PreventedResult)
 
 
-def test_the_code_on_evaluating_runs(in_labels_demo: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    run_page(DOCS / "evaluating.md")
-    assert "all numbers are equal" in capsys.readouterr().out
+def test_the_page_of_protocols_has_each_protocol_choice_and_number() -> None:
+    page = (DOCS / "protocols.md").read_text(encoding="utf-8")
+    protocols = [name for evaluator in TASKS.values() for name in evaluator.protocols]
+    choices = [field.name for kind in CHOICES for field in fields(kind)]
+    numbers = [row.path.removesuffix("/*").rpartition("/")[2] for kind in RESULT_CLASSES for row in kind.rows]
+    assert min(map(len, (protocols, choices, numbers))) > 10
+    missing = {name for name in (*protocols, *choices, *numbers) if not re.search(rf"`([a-z]+\.)?{name}`", page)}
+    assert missing == set()
+
+
+@pytest.mark.parametrize("name", export.list_commands(Context(export)))
+def test_every_format_has_a_row_on_the_page_of_exports(name: str) -> None:
+    rows = re.findall(r"^\| (.*?) \|", (DOCS / "exports.md").read_text(encoding="utf-8"), re.MULTILINE)
+    assert name in NOT_ON_EXPORTS or any(re.search(rf"\b{name}\b", row) for row in rows)
 
 
 def test_the_commands_of_the_pictures_run(da_motion: DeepAccident, in_demo: Path) -> None:
@@ -180,43 +216,6 @@ def test_the_commands_of_the_pictures_run(da_motion: DeepAccident, in_demo: Path
     for picture in script.PICTURE.findall((DOCS / "pictures.md").read_text(encoding="utf-8")):
         page = f"{Path(picture).stem}.html"  # which a browser shows
         assert picture in script.MADE_ELSEWHERE or [*in_demo.rglob(picture), *in_demo.rglob(page)], picture
-
-
-@pytest.mark.parametrize(
-    "choices",
-    [
-        MotionProtocol,
-        PostProcessing,
-        DetectionProtocol,
-        PaperAccidents,
-        AccidentReading,
-        BoxAccidents,
-        CleanWarnings,
-    ],
-)
-def test_every_choice_of_the_metrics_is_explained(choices: type[Any]) -> None:
-    page = (DOCS / "protocols.md").read_text(encoding="utf-8")
-    missing = [field.name for field in fields(choices) if not re.search(rf"`([a-z]+\.)?{field.name}`", page)]
-    assert missing == []
-
-
-@pytest.mark.parametrize("name", [*MOTION_PROTOCOLS, *DETECTION_PROTOCOLS, *PROTOCOLS, *WARNING_PROTOCOLS])
-def test_every_protocol_of_the_metrics_is_explained(name: str) -> None:
-    assert f"`{name}`" in (DOCS / "protocols.md").read_text(encoding="utf-8")
-
-
-@pytest.mark.parametrize("result_class", [*(each.result_class for each in TASKS.values()), PreventedResult])
-def test_every_number_of_a_result_is_explained(result_class: type[Any]) -> None:
-    page = (DOCS / "protocols.md").read_text(encoding="utf-8")
-    numbers = [row.path.removesuffix("/*").rpartition("/")[2] for row in result_class.rows]
-    assert numbers
-    assert [number for number in numbers if f"`{number}`" not in page] == []
-
-
-def test_the_code_on_safety_runs(in_labels_demo: Path) -> None:
-    names = run_page(DOCS / "safety.md")
-    assert names["story"].text.endswith("would have avoided it.")
-    assert len(names["times"].gains) == 4
 
 
 def test_the_outputs_on_the_page_of_safety_are_as_commands_print_them_now(in_labels_demo: Path) -> None:
@@ -239,50 +238,6 @@ def table_words(output: str) -> set[str]:
     return {cell for line in lines if len(line) > 2 for cell in line if not re.search(r"\d", cell)}
 
 
-def test_numbers_in_the_prose_on_safety_are_those_of_an_output() -> None:
-    page = (DOCS / "safety.md").read_text(encoding="utf-8")
-    outputs = "".join(re.findall(r"^```text\n(.*?)^```", page, re.MULTILINE | re.DOTALL))
-    prose = re.sub(r"^```.*?^```", "", page, flags=re.MULTILINE | re.DOTALL)
-    told = re.findall(r"\b\d+\.\d\d\b", prose)
-    assert len(told) >= 3
-    assert [number for number in told if number not in outputs] == []
-
-
-def test_the_code_on_town_maps_runs(in_demo: Path) -> None:
-    names = run_page(DOCS / "town_maps.md")
-    assert (in_demo / "town.geojson").is_file()
-    assert names["town"].drivable().any()
-
-
-def test_the_code_on_baselines_runs(in_labels_demo: Path) -> None:
-    """On the demo's release five agents foresee nearly all; here, too."""
-    names = run_page(DOCS / "baselines.md")
-    assert names["evaluator"].compute().ranges["100x100"].pq > 80
-    assert names["boxes"].boxes.frame == "world"
-
-
-def test_the_code_on_reading_runs(in_demo: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """That of its tables, too, but for the pictures."""
-    monkeypatch.setenv("DEEPACCIDENT_CACHE", str(tmp_path / "copies"))
-    names = run_page(DOCS / "reading.md")
-    assert names["image"].shape == (36, 64, 3)
-    assert tmp_path / "copies" in names["path"].parents
-    assert isinstance(names["box"], Box)
-    assert names["token"] is None  # the loop has come to the last sample
-    da, near = names["da"], []
-    for sample in da.field2token("sample", "agent_token", names["each"]["token"] + "/ego_vehicle"):
-        people = [box for box in da.get_boxes(sample, frame="ego") if box.category == "pedestrian"]
-        near += [sample] * any(math.hypot(*box.center[:2]) < 15 for box in people)
-    assert names["near"] == near
-    assert len(names["visible"]) > 0
-    assert names["camera"].in_image(names["pixels"]).all()
-    objects = re.compile(r"(da|box|boxes|camera|cloud|found)\.|len\(")
-    codes = [code for code in COUNTERPARTS if objects.match(code) and not code.startswith("da.render_")]
-    assert len(codes) > 60
-    for code in codes:
-        eval(compile(code, "reading.md", "eval"), names)  # noqa: S307
-
-
 def test_every_field_that_finds_scenarios_is_on_the_page() -> None:
     table = (DOCS / "reading.md").read_text(encoding="utf-8").partition("### The fields of find")[2].partition("## ")[0]
     told = re.findall(r"`(\w+)`", " ".join(re.findall(r"^\| (`.*?) \|", table, re.MULTILINE)))
@@ -292,19 +247,10 @@ def test_every_field_that_finds_scenarios_is_on_the_page() -> None:
         assert [value for value in values if value.removeprefix("Town") not in table] == [], name
 
 
-def test_the_code_on_the_format_runs(in_demo: Path) -> None:
-    assert run_page(DOCS / "format.md")["meta"].collision is not None
-
-
 def test_what_the_release_is_known_for_is_on_the_page() -> None:
     page = (DOCS / "validation.md").read_text(encoding="utf-8")
     rows = re.findall(r"^\| `([a-z-]+)` \|", page, re.MULTILINE)
     assert [name for name in rows if name in CODES] == [name for name, code in CODES.items() if code.known]
-
-
-@pytest.mark.parametrize("page", ["README.md", "docs/exports.md", "docs/index.md", "docs/validation.md"])
-def test_the_code_on_other_pages_runs(page: str, in_demo: Path) -> None:
-    run_page(TOP / page)
 
 
 @pytest.mark.slow
@@ -319,15 +265,11 @@ def test_the_page_of_studies(
 
 
 def test_no_page_has_code_that_no_test_runs() -> None:
-    here = Path(__file__).read_text(encoding="utf-8")
-    for page in PAGES:
-        name = page.relative_to(TOP).as_posix()
-        if "```python" not in page.read_text(encoding="utf-8"):
-            assert name not in RUN_ELSEWHERE
-        elif name in RUN_ELSEWHERE:
-            assert page.name in (TOP / RUN_ELSEWHERE[name]).read_text(encoding="utf-8")
-        else:
-            assert f'"{page.name}"' in here or f'"{name}"' in here, name
+    with_code = {page.relative_to(TOP).as_posix() for page in PAGES if "```python" in page.read_text(encoding="utf-8")}
+    run_here = {*ON_LABELS, *ON_SENSORS, "docs/reading.md", "docs/studies.md"}
+    assert with_code - run_here == RUN_ELSEWHERE.keys()
+    for page, test in RUN_ELSEWHERE.items():
+        assert Path(page).name in (TOP / test).read_text(encoding="utf-8")
 
 
 COMMANDS = [
@@ -354,25 +296,6 @@ def test_the_command_lines_of_the_pages_run(line: str, in_demo: Path) -> None:
     assert result.exit_code in {0, 1} if words[0] == "validate" else result.exit_code == 0, result.output
 
 
-@pytest.mark.parametrize(
-    "page",
-    [
-        *sorted(DOCS.glob("*.md")),
-        *sorted((TOP / "schema").glob("**/*.md")),
-        TOP / "tutorials" / "README.md",
-        TOP / "benchmarks" / "README.md",
-    ],
-    ids=lambda page: page.relative_to(TOP).as_posix(),
-)
-def test_a_page_begins_with_whom_it_is_for_and_how_long_it_takes(page: Path) -> None:
-    """At 200 words a minute, a third more or less."""
-    text = page.read_text(encoding="utf-8")
-    told = re.match(r"# [^\n]+\n\n(?:[^\n]+\n){0,2}?[^\n]*?\b(\d+)\s+minutes?\b", text)
-    assert told, f"{page.name}: no reading time below the title"
-    words = len(text.split()) / WORDS_A_MINUTE
-    assert abs(int(told[1]) - words) <= max(1, words / 3)
-
-
 KINDS = {
     "da": DeepAccident,
     "DeepAccident": DeepAccident,
@@ -396,11 +319,6 @@ def named(expression: ast.expr) -> Any:
     return KINDS[expression.id]
 
 
-def test_the_counterparts_are_found_on_the_page() -> None:
-    assert len(COUNTERPARTS) > 80
-    assert set(NO_CALLS) <= set(COUNTERPARTS)
-
-
 @pytest.mark.parametrize("code", [code for code in COUNTERPARTS if code not in NO_CALLS])
 def test_every_counterpart_of_a_nuscenes_call_exists(code: str) -> None:
     if code.startswith("deepaccident "):
@@ -416,39 +334,10 @@ def test_every_counterpart_of_a_nuscenes_call_exists(code: str) -> None:
     inspect.signature(named(expression.func)).bind(*([None] if of_instance else []), *expression.args, **keywords)
 
 
-def test_the_page_says_which_pictures_are_axes_and_which_figures() -> None:
-    lists = re.findall(r"^- (.*?return \w+.*?)\.$", FROM_NUSCENES.replace("\n  ", " "), re.MULTILINE)
-    told = {name: line for line in lists for name in re.findall(r"`(render_\w+)`", line)}
-    assert sorted(told) == sorted(name for name in dir(DeepAccident) if name.startswith("render_"))
-    for name, line in told.items():
-        signature = inspect.signature(getattr(DeepAccident, name))
-        kind, parameter = {"Axes": ("axes", "ax"), "Figure": ("a figure", "fig"), "Path": ("the path", "path")}[
-            signature.return_annotation
-        ]
-        assert f"return {kind}" in line, name
-        assert parameter in signature.parameters, name
-
-
-@pytest.mark.parametrize("page", [*sorted(TOP.glob("*.md")), *PAGES], ids=lambda page: page.name)
-def test_a_page_says_for_whom_it_is(page: Path) -> None:
-    assert re.match(r"# [^\n]+\n\nFor everybody ", page.read_text(encoding="utf-8"))
-
-
 @pytest.mark.parametrize("page", ["README.md", "CONTRIBUTING.md", "ARCHITECTURE.md", "SECURITY.md"])
 def test_the_links_of_pages_that_are_not_on_the_site_lead_somewhere(page: str) -> None:
     links = re.findall(r"\]\((?!http)([^)#]+)", (TOP / page).read_text(encoding="utf-8"))
     assert [link for link in links if not (TOP / link).exists()] == []
-
-
-def test_the_functions_on_a_labels_way_are_where_architecture_says() -> None:
-    page = (TOP / "ARCHITECTURE.md").read_text(encoding="utf-8")
-    steps = re.findall(r"\]\((deepaccident_devkit/[^)]+\.py)\), `([^`]+)`", page)
-    assert len(steps) >= 5
-    for module, name in steps:
-        found: Any = import_module(module.removesuffix(".py").replace("/", "."))
-        for part in name.split("."):
-            found = getattr(found, part)
-        assert Path(inspect.getfile(inspect.unwrap(found))).as_posix().endswith(module)
 
 
 def test_the_picture_of_the_layers_is_that_of_the_contract() -> None:

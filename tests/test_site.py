@@ -5,7 +5,6 @@ import re
 from importlib import import_module
 from pathlib import Path
 
-import pytest
 from scripts import loaded_script
 
 import deepaccident_devkit
@@ -49,32 +48,3 @@ def test_the_reference_lists_each_name_once(tmp_path: Path) -> None:
     assert len(names) == len(set(names)) > 300
     index = (tmp_path / "index.md").read_text(encoding="utf-8")
     assert {path.stem for path in tmp_path.glob("*.md")} - set(re.findall(r"^\w+$", index, re.MULTILINE)) == {"index"}
-
-
-SECTION = "Sums.\n\nArgs:\n    first: one.\n\n    second: two."
-
-
-@pytest.mark.parametrize(
-    ("text", "restructured"),
-    [
-        ("Reads `token`s of |x| metres.", r"Reads \ ``token``\ s of \|x\| metres."),
-        ("As `a\nb` is.", "As \\ ``a\nb``\\  is."),
-        ("Counts.\n\n>>> len(`a`)\n0\n\nAnd `b`.", "Counts.\n\n>>> len(`a`)\n0\n\nAnd \\ ``b``\\ ."),
-        (
-            "So:\n\n```python\nf(`x`)\n\ng()\n```\n\nEnd.",
-            "So:\n\n\n.. code-block:: python\n\n    f(`x`)\n    \n    g()\n\n\nEnd.",
-        ),
-        ("So:\n\n    f(*a)\n\nEnd.", "So:\n\n\n.. code-block:: python\n\n    f(*a)\n\n\nEnd."),
-        (SECTION, SECTION),
-        (
-            "| field | values |\n|---|---|\n| `town` | any |",
-            (
-                "\n.. list-table::\n    :header-rows: 1\n\n    * - field\n      - values\n"
-                "    * - ``town``\\ \n      - any\n"
-            ),
-        ),
-    ],
-    ids=["code", "code over a line", "doctest", "fence", "indented code", "section", "table"],
-)
-def test_docstrings_become_the_sites_markup(text: str, restructured: str) -> None:
-    assert "\n".join(CONFIGURATION.restructured(text.split("\n"))) == restructured

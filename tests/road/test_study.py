@@ -62,18 +62,3 @@ def test_a_training_on_the_release_of_a_tested_export_is_refused(tmp_path: Path)
     path = written(tmp_path, {**RECIPE, "releases": releases})
     with pytest.raises(ConfigError, match=r"weights.simulation: simulation, all: shows \d+ scenarios of the test"):
         run_study(read_recipe(str(path)), tmp_path / "out", device="cpu", workers=1)
-
-
-@pytest.mark.parametrize(
-    ("place", "changes", "words"),
-    [
-        ("releases", {"test": {**ROAD, "nuscenes": "yes"}}, r"nuscenes: expected True or False"),
-        ("weights", {"mixed": {**RECIPE["weights"]["mixed"], "also": "nowhere"}}, r"also: expected one of"),
-        ("weights", {"mixed": {**RECIPE["weights"]["mixed"], "mix": 1.5}}, r"mix: expected a share"),
-    ],
-)
-def test_what_cannot_be(tmp_path: Path, place: str, changes: dict, words: str) -> None:
-    wrong = {**RECIPE, place: {**RECIPE[place], **changes}}
-    path = written(tmp_path, wrong)
-    with pytest.raises(ConfigError, match=words):
-        read_recipe(str(path))

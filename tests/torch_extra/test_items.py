@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import torch
 from numpy.testing import assert_allclose, assert_array_equal
-from PIL import Image
 from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
@@ -21,7 +20,7 @@ from deepaccident_devkit.errors import (
     TokenError,
 )
 from deepaccident_devkit.geometry import BevGrid
-from deepaccident_devkit.motion import Augmentation, MotionLabelConfig, bev_segmentation
+from deepaccident_devkit.motion import Augmentation, MotionLabelConfig
 from deepaccident_devkit.motion.sample_labels import motion_labels
 from deepaccident_devkit.taxonomy import AGENTS, CAMERAS
 from deepaccident_devkit.training.torch import AllEgosDataset, ImageConfig, V2XConfig, V2XDataset
@@ -37,7 +36,6 @@ def test_a_sample_alone(da: DeepAccident, sample: str) -> None:
     assert_array_equal(item["augmentation"], np.eye(4))
     assert_allclose(item["world_from_ego"], da.world_from(sample, "ego").matrix)
     assert_array_equal(item["points"][0][0], da.load_point_cloud(sample, "ego").points.astype(np.float32))
-    assert not {"images", "segmentation", "bev_segmentation"} & set(item)
 
 
 def test_boxes_are_the_devkits_with_zero_for_an_unknown_velocity(
@@ -116,20 +114,6 @@ def test_a_resized_and_cropped_image_hits_the_same_pixels(da: DeepAccident, samp
         assert_allclose(projected(matrix, points)[0][seen], expected[seen], atol=0.01)
 
 
-def test_what_an_image_shows_moves_with_its_intrinsic(
-    da: DeepAccident, sample: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    """A picture whose colours say where they are: each pixel of the result is what stood where its centre maps to."""
-    u, v = np.meshgrid(np.arange(64) + 0.5, np.arange(36) + 0.5)
-    Image.fromarray(np.stack([2 * u, 4 * v, 0 * u], axis=-1).round().astype(np.uint8)).save(tmp_path / "ramp.png")
-    monkeypatch.setattr(type(da), "sensor_path", lambda *_: tmp_path / "ramp.png")
-    image, intrinsic = ImageConfig(resize=(18, 32), crop=(2, 4, 12, 20)).load(da, f"{sample}/Camera_Front")
-    back = da.camera(f"{sample}/Camera_Front").intrinsic @ np.linalg.inv(intrinsic)
-    rows, columns = np.mgrid[0:12, 0:20] + 0.5
-    was = np.stack([columns, rows, np.ones_like(rows)], axis=-1) @ back.T
-    assert np.abs(image[..., :2] - was[..., :2] * [2, 4]).max() <= 1.5
-
-
 def test_values_of_images(da: DeepAccident, sample: str) -> None:
     raw, plain, scaled = (
         V2XDataset(da, [sample], V2XConfig(points=False, boxes=None, images=config))[0]["images"]
@@ -157,20 +141,11 @@ def test_labels_are_the_devkits(da: DeepAccident, sample: str, to_present: str |
     assert item["segmentation"].dtype == item["instance"].dtype == torch.int64
 
 
-def test_segmentation_targets_are_the_devkits(da: DeepAccident, sample: str) -> None:
-    grid = BevGrid(x=(-20, 40, 1), y=(-30, 30, 1), orientation="fiery")
-    item = V2XDataset(da, [sample], V2XConfig(points=False, bev_segmentation=grid))[0]
-    expected = bev_segmentation(da, sample, grid)
-    assert_array_equal(item["bev_segmentation"], expected.masks)
-    assert_array_equal(item["bev_known"], expected.known)
-
-
 def test_items_are_counted_as_a_sequences(da: DeepAccident, tokens: list[str]) -> None:
     data = V2XDataset(da, tokens, V2XConfig(points=False, boxes=None))
     assert ([item["token"] for item in data], len(data)) == (tokens, 20)
     assert [data[at]["token"] for at in (-1, np.int64(3), torch.tensor(3))] == [tokens[-1], tokens[3], tokens[3]]
     assert_refused((lambda: data[20], IndexError, ()), (lambda: data[0:2], TypeError, ()))
-    assert isinstance(data, torch.utils.data.Dataset)
 
 
 def test_samples_that_cannot_be(da: DeepAccident, tokens: list[str]) -> None:
@@ -250,11 +225,6 @@ def test_labels_of_a_sample_without(own_release: Path) -> None:
 )
 def test_configurations_that_cannot_be(fields: dict[str, object], message: str) -> None:
     assert_refused((lambda: V2XConfig(**fields), (ConfigError, ChoiceError), message))
-
-
-def test_labels_by_a_presets_name() -> None:
-    config = V2XConfig(labels="fiery", past=np.int64(2))
-    assert (config.labels, config.step, config.past) == (MotionLabelConfig.preset("fiery"), 5, 2)
 
 
 @pytest.mark.parametrize(

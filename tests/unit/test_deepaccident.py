@@ -3,12 +3,10 @@
 import inspect
 import subprocess
 import sys
-from typing import Any
 
 import pytest
 
 from deepaccident_devkit import DeepAccident, descriptions, interactions, maps, motion, render, selection, validation
-from deepaccident_devkit.selection.samples import samples
 
 LATE = {
     name: getattr(package, name)
@@ -36,12 +34,6 @@ def test_what_is_asked_for_brings_its_own_package_alone(used: str, imported: set
     assert {*run(code).split()} & {*HEAVY} - {*light} == imported
 
 
-def test_help_has_every_signature() -> None:
-    code = "import pydoc; from deepaccident_devkit import DeepAccident; print(pydoc.render_doc(DeepAccident, "
-    shown, names = run(f"{code}renderer=pydoc.plaintext))"), ("motion_labels", "findings", "render_bev", "describe")
-    assert [name for name in names if f" |  {name}(" not in shown] == []
-
-
 def test_each_is_its_packages_own_and_in_place_after_its_first_use() -> None:
     assert {"motion_labels", "findings", "render_sample", "render_replay", "describe"} < LATE.keys()
     assert {name: getattr(DeepAccident, name) for name in LATE} == LATE
@@ -56,12 +48,3 @@ def test_an_instance_binds_them(name: str) -> None:
     whole, shown = inspect.signature(LATE[name]), inspect.signature(bound)
     assert [*shown.parameters.values()] == [*whole.parameters.values()][1:]
     assert shown.return_annotation == whole.return_annotation
-
-
-def test_a_subclass_keeps_what_it_has_instead() -> None:
-    class Mine(DeepAccident):
-        def samples(self) -> Any:
-            return super().samples
-
-    mine = object.__new__(Mine)
-    assert [mine.samples().__func__ for _ in range(2)] == [samples] * 2

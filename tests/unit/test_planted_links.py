@@ -2,15 +2,12 @@
 
 import math
 import os
-import re
 import shutil
 from collections.abc import Callable, Iterator
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import pytest
-from click.testing import CliRunner
 from refusals import assert_refused
 from tiny_format import TinyFormat
 
@@ -20,11 +17,8 @@ from deepaccident_devkit.export.bulk import export_release
 from deepaccident_devkit.motion import MotionLabelConfig, write_label_files
 from deepaccident_devkit.plugins.explore.explorer import KeptFiles
 from deepaccident_devkit.plugins.synth import SynthConfig, generate, make_release
-from deepaccident_devkit.plugins.synth.demo import demo
 from deepaccident_devkit.plugins.synth.scenario import RecordingJob
-from deepaccident_devkit.release.store.store import FileCache
-from deepaccident_devkit.support.files import place_in, remove_in, temporary_path, write_bytes
-from deepaccident_devkit.support.version import __version__
+from deepaccident_devkit.support.files import place_in, remove_in, write_bytes
 from deepaccident_devkit.testing import SmallRelease, write_small_release
 
 PRECIOUS = b"precious\0"
@@ -212,33 +206,6 @@ def test_a_journal_is_a_new_file(small: DeepAccident, tmp_path: Path) -> None:
     os.link(tmp_path / "precious", journal)
     an_export(small, tmp_path)
     assert (tmp_path / "precious").read_bytes() == PRECIOUS
-
-
-def test_no_link_can_wait_for_a_temporary_file(tmp_path: Path) -> None:
-    numbers = [int(re.split(r"[-.]", temporary_path(tmp_path / "a").name)[-2]) for _ in range(100)]
-    assert len(set(numbers)) > 90
-    assert not {after - before for before, after in pairwise(numbers)} & {1, -1}
-
-
-def test_a_demo_uses_no_folder_behind_a_link(tmp_path: Path) -> None:
-    outside = tmp_path / "outside"
-    outside.mkdir()
-    (tmp_path / ".deepaccident_demo").write_text(f"{__version__}\n")
-    (tmp_path / "release").symlink_to(outside)
-    assert isinstance(CliRunner().invoke(demo, [str(tmp_path)]).exception, OutputFolderError)
-    assert not list(outside.iterdir())
-
-
-def test_a_cache_is_not_left(tmp_path: Path) -> None:
-    cache, outside = FileCache(tmp_path / "cache", 10), tmp_path / "outside"
-    path = cache.path_of("one", "a.jpg")
-    cache.put(path, b"made")
-    path.parents[1].rename(outside)
-    path.parents[1].symlink_to(outside)
-    before = states(outside)
-    assert_refused((lambda: cache.path_of("one", "a.jpg"), OutputFolderError, ("a symbolic link",)))
-    cache.put(cache.path_of("two", "b.jpg"), b"too much")
-    assert states(outside) == before
 
 
 @pytest.mark.parametrize("path", ["/absolute", "..", "a/../b", "link/b", "a/link/b", "", "."])

@@ -1,7 +1,6 @@
 """What is public is what docs/public_names.json lists; the page on what stays has the versions there are."""
 
 import ast
-import inspect
 import json
 import re
 from importlib import import_module
@@ -12,7 +11,6 @@ from typing import Any
 import pytest
 from scripts import loaded_script
 
-from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.evaluation.results import FORMAT_VERSION
 from deepaccident_devkit.evaluation.runs.bundles import SUMMARY_VERSION
 from deepaccident_devkit.motion import label_folder
@@ -64,17 +62,6 @@ def test_a_change_is_named(script: ModuleType) -> None:
     ]
 
 
-def test_names_of_daily_use_are_few_and_each_has_an_example_and_a_type(
-    script: ModuleType, listed: dict[str, Any]
-) -> None:
-    daily = listed["daily"]
-    assert 50 < len(daily) <= script.MOST
-    assert [name for name, found in daily.items() if not found["page"]] == [], "no page's Python uses these"
-    assert [name for name, found in daily.items() if not found["is"]] == [], "no room has these"
-    untyped = [name for name, found in daily.items() if not re.search(r": \w|-> |^= |^class", found["is"])]
-    assert untyped == []
-
-
 def test_no_public_name_begins_with_an_underscore(script: ModuleType) -> None:
     names = [name for public in script.public_modules().values() for name in public]
     assert len(names) > 500
@@ -96,33 +83,6 @@ def test_code_of_pages_imports_public_names_alone(script: ModuleType) -> None:
     assert set(imports) - public == set()
 
 
-def parameters(said: str) -> list[str]:
-    """The names in the text of a function's parameters."""
-    [function] = ast.parse(f"def named{said}: ...").body
-    assert isinstance(function, ast.FunctionDef)
-    given = function.args
-    each = [*given.posonlyargs, *given.args, given.vararg, *given.kwonlyargs, given.kwarg]
-    return [parameter.arg for parameter in each if parameter]
-
-
-@pytest.mark.parametrize("room", ["geometry", "motion", "v2x", "evaluation.runs", "plugins.synth.spec"])
-def test_the_list_has_the_parameters_that_python_sees(room: str, listed: dict[str, Any]) -> None:
-    module = import_module(f"deepaccident_devkit.{room}")
-    functions = {name: said for name, said in listed["rooms"][module.__name__].items() if said.startswith("(")}
-    functions = {name: said for name, said in functions.items() if "." not in name}
-    for name, said in functions.items():
-        assert parameters(said) == [*inspect.signature(getattr(module, name)).parameters], name
-
-
-def test_the_list_has_the_members_that_python_sees(listed: dict[str, Any]) -> None:
-    names = {
-        name.partition(".")[2] for name in listed["rooms"]["deepaccident_devkit"] if name.startswith("DeepAccident.")
-    }
-    assert names == {name for name in dir(DeepAccident) if not name.startswith("_")}
-    said = listed["rooms"]["deepaccident_devkit"]["DeepAccident.motion_labels"]
-    assert ["self", *parameters(said)][1:] == [*inspect.signature(DeepAccident.motion_labels).parameters][1:]
-
-
 def test_it_has_the_versions_of_files_and_pythons() -> None:
     versions = re.findall(r"^\| [^|]+ \| (\d) \| ", PAGE, re.MULTILINE)
     assert versions == [
@@ -130,18 +90,6 @@ def test_it_has_the_versions_of_files_and_pythons() -> None:
     ]
     pythons = re.findall(r"Python :: (3\.\d+)", (TOP / "pyproject.toml").read_text(encoding="utf-8"))
     assert f"Python {', '.join(pythons[:-1])} and {pythons[-1]}" in " ".join(PAGE.split())
-
-
-@pytest.mark.parametrize("page", ["docs/maintaining.md", "RELEASING.md"])
-def test_the_tests_that_the_page_names_are_there(page: str) -> None:
-    named = re.findall(r"`((?:tests|docs|deepaccident_devkit)/[\w./]+)`", (TOP / page).read_text(encoding="utf-8"))
-    assert named
-    assert [path for path in named if not (TOP / path).exists()] == []
-
-
-def test_releasing_takes_ten_steps() -> None:
-    page = (TOP / "RELEASING.md").read_text(encoding="utf-8")
-    assert re.findall(r"^(\d+)\. ", page, re.MULTILINE) == [str(step) for step in range(1, 11)]
 
 
 def test_every_package_of_the_reference_says_what_is_public() -> None:

@@ -14,17 +14,18 @@ _PLANTED = ("killed", "timed out", "survived", "not reached")
 
 
 @click.command()
-@click.option("--count", default=1500, help="How many mutants are drawn.")
-@click.option("--seed", default=17, help="Of the drawing.")
+@click.option("--count", default=1500, help="How many mutants are drawn by each seed.")
+@click.option("--seed", "seeds", multiple=True, type=int, default=[17], help="Of the drawing; several are pooled.")
 @click.option("--only", multiple=True, metavar="PATH", help="Run those of the files that begin so, as motion/warping.")
 @click.option("--again", is_flag=True, help="Run those that survived once more.")
 @click.option(
     "--results", type=click.Path(path_type=Path), default="build/mutants.jsonl", help="What came of each; it grows."
 )
 @click.option("--table", is_flag=True, help="Run nothing.")
-def main(count: int, seed: int, only: tuple[str, ...], again: bool, results: Path, table: bool) -> None:
+def main(count: int, seeds: tuple[int, ...], only: tuple[str, ...], again: bool, results: Path, table: bool) -> None:
     """Run what RESULTS does not have yet, and print how many were killed in each area, and what survived."""
-    mutants = [mutant for mutant in drawn(count, seed) if mutant.path.startswith(only or ("",))]
+    pooled = {mutant.key: mutant for seed in seeds for mutant in drawn(count, seed)}
+    mutants = [mutant for mutant in pooled.values() if mutant.path.startswith(only or ("",))]
     known = _outcomes(results)
     waiting = [each for each in mutants if known.get(each.key) is None or (again and known[each.key] in _PLANTED[2:])]
     if waiting and not table:

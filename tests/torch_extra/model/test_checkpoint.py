@@ -16,7 +16,6 @@ from torch_extra.model.small_model import small, small_released
 
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.plugins.model.checkpoint import BEST, FINAL, load_weights, read_weights, write_weights
-from deepaccident_devkit.plugins.model.fusion import CobevtConfig
 from deepaccident_devkit.plugins.model.images import SwinConfig
 from deepaccident_devkit.plugins.model.network import V2XFormer
 
@@ -39,22 +38,10 @@ def test_weights_come_back_bit_for_bit(tmp_path: Path) -> None:
     write_weights(path, first.state_dict(), META)
     weights, before = read_weights(path), path.read_bytes()
     assert same([weights.meta, dict(weights.tensors)], [META, dict(first.state_dict())])
-    done = load_weights(second, weights, whole=True)
+    load_weights(second, weights, whole=True)
     assert same(trained_alone(first), trained_alone(second))
-    assert done.to_text() == f"{len(done.loaded)} of {len(done.loaded)} tensors loaded"
     write_weights(path, first.state_dict(), META)
     assert {each: each.read_bytes() for each in tmp_path.iterdir()} == {path: before}
-
-
-def test_half_precision_is_half_the_size(tmp_path: Path) -> None:
-    first, second, full, half = model(0), model(1), tmp_path / "full.safetensors", tmp_path / "half.safetensors"
-    write_weights(full, first.state_dict(), META)
-    write_weights(half, first.state_dict(), META, half=True)
-    assert 0.4 < half.stat().st_size / full.stat().st_size < 0.7
-    weights = read_weights(half)
-    assert {each.dtype for each in weights.tensors.values()} == {torch.float16, torch.int64}
-    load_weights(second, weights, whole=True)
-    assert same(trained_alone(second), {name: each.half().float() for name, each in trained_alone(first).items()})
 
 
 def test_weights_of_another_preset_name_the_keys(tmp_path: Path) -> None:
@@ -90,10 +77,7 @@ def test_what_is_missing_begins_at_random_unless_all_are_needed(tmp_path: Path) 
     weights, fresh = read_weights(path), model(1)
     done = load_weights(fresh, weights)
     assert done.unused == ("other.weight",)
-    assert all(name.startswith("img_") for name in done.loaded)
     assert not any(name.startswith("img_") for name in done.kept)
-    told = r"\d+ of \d+ tensors loaded; as they were: .*, … \(\d+\); .* not used: other\.weight"
-    assert re.search(told, done.to_text())
     assert same(*[{name: each.state_dict()[name] for name in done.kept} for each in (fresh, model(1))])
     lacking, strange = (
         r"weights do not fit this model: \d+ of the model are missing",
@@ -134,41 +118,6 @@ def test_the_release_s_further_layers_are_told(tmp_path: Path) -> None:
     done = load_weights(second, read_weights(path), whole=True)
     assert same(trained_alone(first), trained_alone(second))
     assert sorted(done.unused) == sorted(list(further)[:4])
-    assert "of the file not used: pts_bbox_head.task_decoders.map.layer.weight, " in done.to_text()
-
-
-def test_a_released_checkpoint_without_its_fusion_fits_another_fusion(tmp_path: Path) -> None:
-    """The released fusion has no weights, so that cobevt's begin at random."""
-    path, config = tmp_path / "beverse.pth", small_released()
-    torch.save({"state_dict": V2XFormer(config).state_dict()}, path)
-    other = V2XFormer(replace(config, fusion=CobevtConfig(channels=8, depth=1, window=4)))
-    done = load_weights(other, read_weights(path))
-    assert (done.unused, {name.split(".")[0] for name in done.kept}) == ((), {"v2x_fusion"})
-
-
-def test_official_swin_weights_go_into_the_image_encoder(tmp_path: Path) -> None:
-    """Microsoft's names and order of tokens, under `model`."""
-    encoder = SwinConfig(embed_dims=8, depths=(1, 1), num_heads=(1, 1), out_stages=(0, 1))
-    cameras = small().cameras
-    cameras = replace(cameras, encoder=encoder, lift=replace(cameras.lift, stride=4, in_channels=512))
-    config = replace(small(), cameras=cameras)
-    model, path, weight = V2XFormer(config), tmp_path / "swin.pth", torch.arange(16.0 * 32).view(16, 32)
-    official = {
-        "patch_embed.proj.weight": torch.full((8, 3, 4, 4), 2.0),
-        "layers.0.blocks.0.mlp.fc1.bias": torch.full((32,), 3.0),
-        "layers.0.downsample.reduction.weight": weight,
-        "head.weight": torch.zeros(5, 16),
-        "norm.weight": torch.zeros(16),
-    }
-    torch.save({"model": official}, path)
-    done = load_weights(model, read_weights(path))
-    assert done.unused == ("img_backbone.norm.weight",)
-    assert all(name.startswith("img_backbone.") for name in done.loaded)
-    state = model.state_dict()
-    assert (state["img_backbone.patch_embed.projection.weight"] == 2).all()
-    assert (state["img_backbone.stages.0.blocks.0.ffn.layers.0.0.bias"] == 3).all()
-    merged = state["img_backbone.stages.0.downsample.reduction.weight"]
-    assert torch.equal(merged.view(16, 8, 4)[:, :, 1], weight.view(16, 4, 8)[:, 2])
 
 
 class Opens:
@@ -251,15 +200,21 @@ def test_what_is_no_file_of_weights_is_refused(tmp_path: Path, make: Callable[[P
     assert_unreadable(path, message)
 
 
-@pytest.mark.parametrize("metadata", [None, {"format": "pt"}])
-def test_safetensors_of_others_have_no_notes(tmp_path: Path, metadata: dict[str, str] | None) -> None:
-    save_file({"img_neck.weight": torch.ones(1)}, tmp_path / "weights.safetensors", metadata=metadata)
-    assert read_weights(tmp_path / "weights.safetensors").meta == {}
-
-
 def test_of_a_run_the_best_weights_are_read(tmp_path: Path) -> None:
     assert_refused((lambda: read_weights(tmp_path), ConfigError, r"best\.safetensors: weights cannot be read"))
     for name in (FINAL, BEST):
         write_weights(tmp_path / name, {name: torch.ones(2)}, META)
         weights = read_weights(tmp_path)
         assert (weights.path, list(weights.tensors)) == (tmp_path / name, [name])
+
+
+def test_official_swin_weights_go_into_the_image_encoder(tmp_path: Path) -> None:
+    """Microsoft's names, under `model`; the parity tests compare the order of tokens."""
+    encoder, cameras = SwinConfig(embed_dims=8, depths=(1, 1), num_heads=(1, 1), out_stages=(0, 1)), small().cameras
+    cameras = replace(cameras, encoder=encoder, lift=replace(cameras.lift, stride=4, in_channels=512))
+    model, path = V2XFormer(replace(small(), cameras=cameras)), tmp_path / "swin.pth"
+    official = {"patch_embed.proj.weight": torch.full((8, 3, 4, 4), 2.0), "norm.weight": torch.zeros(16)}
+    torch.save({"model": official}, path)
+    done = load_weights(model, read_weights(path))
+    assert done.unused == ("img_backbone.norm.weight",)
+    assert (model.state_dict()["img_backbone.patch_embed.projection.weight"] == 2).all()

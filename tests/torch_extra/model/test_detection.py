@@ -20,8 +20,6 @@ from deepaccident_devkit.errors import DeepAccidentError, GeometryError
 from deepaccident_devkit.geometry import SE3
 from deepaccident_devkit.plugins.model.detection import (
     ONE_TASK,
-    RELEASED_CLASS_SLOTS,
-    RELEASED_NMS,
     CenterHead,
     DecodingConfig,
     DetectionConfig,
@@ -64,30 +62,12 @@ def random_boxes(seed: int, count: int) -> tuple[Tensor, Tensor]:
 
 
 @HEADS
-def test_a_new_head_expects_few_boxes(config: DetectionConfig) -> None:
-    for task in CenterHead(config)(torch.zeros_like(features_of(config))):
-        assert task.heatmap.sigmoid().mean().item() == pytest.approx(0.1, abs=0.07)
-
-
-@HEADS
 def test_gradients_reach_every_parameter(config: DetectionConfig) -> None:
     head = CenterHead(config)
     boxes, categories = zip(*(random_boxes(seed, 20) for seed in (1, 2)), strict=True)
     losses = detection_losses(head(features_of(config)), detection_targets(boxes, categories, config))
     torch.stack(list(losses.values())).sum().backward()
     assert all(weight.grad is not None and bool(weight.grad.abs().sum() > 0) for weight in head.parameters())
-
-
-@HEADS
-def test_mixed_precision_gives_finite_single_precision_losses_and_boxes(config: DetectionConfig) -> None:
-    boxes, categories = random_boxes(1, 20)
-    with torch.autocast("cpu", dtype=torch.bfloat16):
-        maps = CenterHead(config)(features_of(config, 1))
-        losses = detection_losses(maps, detection_targets([boxes], [categories], config))
-        (found,) = decode_detections(maps, config, DecodingConfig(score_threshold=0.0))
-    assert {(value.dtype, bool(value.isfinite())) for value in losses.values()} == {(torch.float32, True)}
-    assert (found.boxes.dtype, len(found.boxes) > 0) == (torch.float32, True)
-    assert bool((found.scores.diff() <= 0).all())
 
 
 @pytest.mark.parametrize("head", [SMALL, replace(SMALL, class_slots=ONE_TASK)], ids=["tasks", "one task"])
@@ -100,24 +80,6 @@ def test_perfect_maps_give_the_boxes_back(head: DetectionConfig, seed: int, coun
     ours, truth = found.boxes[:, 0].argsort(), boxes[:, 0].argsort()
     torch.testing.assert_close(found.boxes[ours], boxes[truth], rtol=0, atol=1e-4)
     assert torch.equal(found.categories[ours], categories[truth])
-
-
-def test_released_slots_lead_back_to_the_same_categories() -> None:
-    """The release's names are off, its numbers are consistent."""
-    boxes, categories = random_boxes(3, 12)
-    head = replace(SMALL, class_slots=RELEASED_CLASS_SLOTS)
-    targets = detection_targets([boxes], [categories], head)
-    assert [bool(target.mask.any()) for target in targets[4:]] == [False, False]
-    config = DecodingConfig(nms=tuple(replace(each, threshold=0.0, method="circle") for each in RELEASED_NMS))
-    (found,) = decode_detections(perfect_maps(targets), head, config)
-    assert found.categories.sort().values.tolist() == categories.sort().values.tolist()
-
-
-def test_slots_without_a_category_give_no_boxes() -> None:
-    maps = blank_maps(slots=2)
-    maps.heatmap[0, 0, 2, 3] = maps.heatmap[0, 1, 9, 9] = 9.0
-    (found,) = decode_detections([maps], replace(SMALL, class_slots=((None, 4),)))
-    assert found.categories.tolist() == [4]
 
 
 @given(seed=SEEDS)
@@ -139,12 +101,6 @@ def test_boxes_outside_or_of_no_category_are_left_out() -> None:
     assert cars.box[0, 1, 0] == pytest.approx(-0.9, abs=1e-5)
 
 
-def test_at_most_so_many_boxes_of_a_task() -> None:
-    boxes, categories = random_boxes(5, 9)
-    cars, *_ = detection_targets([boxes], [categories * 0], SMALL, TargetConfig(max_boxes=4))
-    assert (cars.mask.tolist(), int((cars.heatmap == 1).sum())) == ([[True] * 4], 4)
-
-
 def test_unknown_velocities_are_trained_to_zero_or_not_at_all() -> None:
     boxes, categories = random_boxes(7, 10)
     boxes[:4, 7:] = torch.nan
@@ -157,13 +113,6 @@ def test_unknown_velocities_are_trained_to_zero_or_not_at_all() -> None:
         counts = [float(target.mask.sum()) + 1e-4 for target in targets]
         losses = [float(found[f"task{task}.loss_bbox"]) * count for task, count in enumerate(counts)]
         assert sum(losses) == pytest.approx(loss, abs=1e-3)
-
-
-def test_no_boxes_have_a_finite_loss() -> None:
-    config, (boxes, categories) = replace(SMALL, class_slots=ONE_TASK), random_boxes(0, 0)
-    empty = detection_targets([boxes], [categories], config)
-    losses = detection_losses(CenterHead(config)(features_of(config, 1)), empty)
-    assert (losses["task0.loss_heatmap"] > 0, losses["task0.loss_bbox"].item()) == (True, 0)
 
 
 def test_candidates_outside_the_range_or_not_finite_are_not_valid() -> None:
@@ -241,21 +190,6 @@ def test_suppression_depends_neither_on_the_order_nor_on_the_axes(method: Any, s
         np.testing.assert_array_equal(suppress(elsewhere, scores, slots, rules), kept)
 
 
-@pytest.mark.parametrize(
-    ("scale", "kept"), [(NmsConfig().scale, [0, 1, 2, 3]), ((1.0, 3.0), [0, 1, 2]), ((3.0,), [0, 2])]
-)
-def test_scales_are_those_of_the_slots(scale: tuple[float, ...], kept: list[int]) -> None:
-    boxes = as_boxes(np.array([[0.0, 0, 2, 2, 0], [1.5, 0, 2, 2, 0], [10.0, 0, 2, 2, 0], [11.5, 0, 2, 2, 0]]))
-    scores, slots = np.array([0.4, 0.3, 0.2, 0.1]), np.array([0, 0, 1, 1])
-    assert suppress(boxes, scores, slots, NmsConfig(scale=scale)).tolist() == kept
-
-
-def test_the_best_stay_if_there_are_too_many() -> None:
-    boxes = as_boxes(np.column_stack([np.arange(9) * 10.0, *np.ones((4, 9))]))
-    assert suppress(boxes, np.arange(9.0), np.zeros(9, dtype=int), NmsConfig(keep=3)).tolist() == [8, 7, 6]
-    assert suppress(boxes[:0], np.zeros(0), np.zeros(0, dtype=int), NmsConfig(scale=(1.0, 2.0))).tolist() == []
-
-
 def test_detected_boxes_stand_in_the_world() -> None:
     boxes = torch.tensor([[10.0, 2.0, 1.0, 4.0, 2.0, 1.5, 0.25, 5.0, 1.0]])
     found = Detections(boxes=boxes.requires_grad_(), scores=torch.tensor([0.5]), categories=torch.tensor([3]))
@@ -267,11 +201,6 @@ def test_detected_boxes_stand_in_the_world() -> None:
         np.testing.assert_allclose(rows, expected, atol=1e-6)
         assert (world.boxes.frame, world.boxes.category_names, world.scores.tolist()) == ("world", ["cyclist"], [0.5])
     assert_refused((lambda: detected_boxes(found, np.ones((4, 4))), GeometryError, r"SE3\.matrix"))
-
-
-def test_a_sample_without_boxes_gives_none() -> None:
-    found = decode_detections([blank_maps(2, 6)], replace(SMALL, class_slots=ONE_TASK))
-    assert [len(detected_boxes(each, SE3.identity())) for each in found] == [0, 0]
 
 
 def suppressed_by(*nms: NmsConfig) -> object:

@@ -1,6 +1,6 @@
 """The model's door: its frame, frames that did not arrive, and egomotion."""
 
-from dataclasses import asdict, replace
+from dataclasses import replace
 from operator import attrgetter
 from typing import Any
 
@@ -127,18 +127,6 @@ def test_a_frame_that_did_not_arrive_is_the_present(
     assert torch.equal(inputs.egomotion, whole.egomotion * inputs.frame_valid[..., None])
 
 
-def test_the_first_frames_of_a_recording_have_no_past(da: DeepAccident, moment: list[str], given: V2XConfig) -> None:
-    inputs = model_inputs(collate([V2XDataset(da, [moment[0].replace("/004", "/002")], given)[0]]))
-    assert inputs.frame_valid[0].tolist() == [[False, True, True]] * 5
-    first, second, present = inputs.images.unbind(2)
-    assert (torch.equal(first, present), torch.equal(second, present)) == (True, False)
-
-
-def test_only_partners_data_are_late(batch: dict[str, Any]) -> None:
-    assert model_inputs(batch, delay=3).delay.tolist() == [[0, 3, 3, 3, 3]]
-    assert not model_inputs(batch).delay.any()
-
-
 def test_egos_have_their_own_places(da: DeepAccident, moment: list[str], given: V2XConfig) -> None:
     """Poses of each ego, whichever agent's frame the moment is given in."""
     [item] = AllEgosDataset(da, moment[1:4], replace(given, agents="+other"))
@@ -148,12 +136,3 @@ def test_egos_have_their_own_places(da: DeepAccident, moment: list[str], given: 
     expected = [[da.transform(ego, agent).matrix for agent in agents] for ego in moment[1:4]]
     np.testing.assert_allclose(inputs.ego_from_agent, expected, atol=1e-4)
     assert inputs.partners[torch.arange(3), inputs.ego_rows[:, 1]].all()
-    some, heard = inputs.of_egos(torch.tensor([2, 0])), inputs.partners[[2, 0]].any(0)
-    assert torch.equal(some.ego_rows, inputs.ego_rows[[2, 0]])
-    assert torch.equal(some.ego_from_agent, inputs.ego_from_agent[[2, 0]][:, heard])
-    assert torch.equal(some.images, inputs.images[:, heard])
-
-
-def test_all_tensors_go_to_a_device(batch: dict[str, Any]) -> None:
-    moved = asdict(model_inputs(batch).to("meta"))
-    assert {str(each.device) for each in (*moved.pop("cameras").values(), *moved.values())} == {"meta"}

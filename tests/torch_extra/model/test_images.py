@@ -40,15 +40,6 @@ def test_features_have_the_stated_size_and_all_weights_learn(config):
     assert [name for name, each in weights.items() if each.grad is None or not each.grad.abs().sum() > 0] == []
 
 
-def test_the_small_encoder_is_small_and_its_size_follows_the_configuration():
-    """Convolutions 432 + 3456 + 6912 + 18432 · 2 + 73728, of the neck 4608 + 20736; norms of 424 channels."""
-    count = sum(weight.numel() for module in image_encoder(SmallConvConfig()) for weight in module.parameters())
-    assert count == 147_584
-    backbone, neck = image_encoder(SmallConvConfig(widths=(4, 6, 8), branch=10, neck_channels=12))
-    maps = backbone(noise(1, 3, 32, 48))
-    assert [each.shape for each in (*maps, neck(maps))] == [(1, 8, 4, 6), (1, 10, 2, 3), (1, 12, 4, 6)]
-
-
 @pytest.mark.parametrize("config", ENCODERS, ids=lambda config: f"{type(config).__name__}-{config.stride}")
 def test_an_image_does_not_depend_on_the_others_of_its_batch(config):
     images, (backbone, neck) = noise(3, 3, 64, 96), (module.eval() for module in image_encoder(config))
@@ -88,26 +79,6 @@ def test_checkpointing_changes_neither_values_nor_gradients():
         sum(each.square().sum() for each in network(noise(1, 3, 64, 96))).backward()
     gradients = [{name: each.grad for name, each in network.named_parameters()} for network in (plain, again)]
     torch.testing.assert_close(*gradients)
-
-
-def test_converted_weights_merge_patches_as_the_official_model():
-    """Official: the tokens (0, 0), (1, 0), (0, 1), (1, 1) beside each other, LayerNorm, then the reduction."""
-    layers = nn.ModuleDict({"norm": nn.LayerNorm(12), "reduction": nn.Linear(12, 6, bias=False)})
-    for weight in layers.parameters():
-        nn.init.uniform_(weight)
-    official = from_official({f"layers.0.downsample.{name}": each for name, each in layers.state_dict().items()})
-    merging, features = PatchMerging(3), noise(2, 4, 6, 3)
-    merging.load_state_dict({name.removeprefix("stages.0.downsample."): each for name, each in official.items()})
-    tokens = torch.cat([features[:, down::2, along::2] for along in (0, 1) for down in (0, 1)], -1)
-    torch.testing.assert_close(merging(features), layers["reduction"](layers["norm"](tokens)))
-
-
-def test_checkpointing_computes_blocks_again_in_training_alone():
-    network, calls = Swin(SwinConfig(**SMALL_SWIN, checkpointing=True)), []
-    network.stages[0].blocks[1].norm1.register_forward_hook(lambda norm, *_: calls.append(norm.training))
-    for training in (False, True):
-        network.train(training)(noise(1, 3, 32, 32))[1].sum().backward()
-    assert calls == [False, True, True]
 
 
 def test_maps_of_odd_sizes_are_filled_to_be_halved():

@@ -116,24 +116,6 @@ def test_rays_pass_through_the_centres_or_from_corner_to_corner(frustum, columns
     torch.testing.assert_close(rays, expected, rtol=0, atol=0)
 
 
-def test_truncation_takes_points_from_a_step_below_the_range():
-    """The map's points are moved, so that the first lie below the range in x, y and z by less than a step."""
-    floor, trunc, cameras = lift_of(CONFIG), lift_of(replace(CONFIG, voxel_rounding="trunc")), rig()
-    points, cells, wider = floor.points(cameras), floor.cells(cameras), trunc.cells(cameras)
-    lower, step, upper = torch.tensor([[-12.0, -16, -4], [1, 0.5, 10], [20, 16, 6]])
-    plain, wide = (((points >= low) & (points < upper)).all(-1) for low in (lower, lower - step))
-    assert torch.equal(wider >= 0, wide)
-    assert torch.equal(cells, torch.where(plain, wider, -1))
-    assert int((wide & ~plain).sum()) > 20
-
-
-def test_a_mirrored_world_gives_the_mirrored_map():
-    lift, features, cameras = lift_of(CONFIG), noise(2, 2, 3, 5, 3, 5), rig()
-    mirror = torch.tensor([1.0, -1, 1])
-    mirrored = replace(cameras, rotation=mirror[:, None] * cameras.rotation, translation=mirror * cameras.translation)
-    torch.testing.assert_close(lift(features, mirrored), lift(features, cameras).flip(3))
-
-
 # --- sums
 
 
@@ -144,31 +126,12 @@ def test_a_wide_map_holds_all_that_the_pixels_have():
     torch.testing.assert_close(lift(features, rig()).sum((3, 4)), pixels.sum((2, 4, 5)), atol=1e-4, rtol=1e-4)
 
 
-def test_frames_and_samples_keep_apart_and_the_order_of_cameras_does_not_matter():
-    lift, features, cameras = lift_of(CONFIG), noise(2, 2, 3, 5, 3, 5), rig()
-    whole = lift(features, cameras)
-    part, turned = (
-        CameraGeometry(**{name: of(getattr(cameras, name)) for name in ("rotation", "translation", "intrinsics")})
-        for of in (lambda each: each[1:, :1], lambda each: each.flip(2))
-    )
-    torch.testing.assert_close(lift(features[1:, :1], part), whole[1:, :1])
-    torch.testing.assert_close(lift(features.flip(2), turned), whole)
-
-
 def test_gradients_reach_the_features_and_every_weight():
     lift, features = lift_of(CONFIG), noise(1, 2, 3, 5, 3, 5).requires_grad_()
     bev = lift(features, rig(shape=(1, 2, 3)))
     (bev * noise(*bev.shape, seed=1)).sum().backward()
     assert all((weight.grad != 0).all() for weight in lift.parameters())
     assert (features.grad != 0).any()
-
-
-def test_half_precision_is_summed_in_single_precision():
-    lift, features, cameras = lift_of(WIDE), noise(2, 2, 3, 5, 3, 5), rig()
-    with torch.autocast("cpu", dtype=torch.bfloat16):
-        found, points = lift(features, cameras), lift.points(cameras)
-    assert torch.equal(points, lift.points(cameras))
-    torch.testing.assert_close(found, lift(features, cameras), atol=0.05, rtol=0.05)
 
 
 # --- what `tiny` has beside the release

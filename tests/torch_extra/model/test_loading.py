@@ -79,14 +79,3 @@ def test_workers_that_cannot_start_are_named(monkeypatch: pytest.MonkeyPatch) ->
 
     monkeypatch.setattr(multiprocessing, "Queue", no_room)
     assert_refused((lambda: read(int), WorkerError, ("cannot be started", "No space left", *REMEDY)))
-
-
-@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
-def test_an_error_of_the_reader_itself_passes() -> None:
-    def stop() -> None:
-        with worker_faults_named():
-            next(read_batches(Items(int), list, 0))
-            raise RuntimeError("of the training")
-
-    assert_refused((stop, RuntimeError, "of the training"))
-    assert read(int) == [[0], [0], [2]]

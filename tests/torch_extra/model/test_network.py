@@ -15,7 +15,7 @@ from deepaccident_devkit.plugins.model.inputs import model_inputs
 from deepaccident_devkit.plugins.model.network import ModelConfig, V2XFormer
 from deepaccident_devkit.plugins.model.presets import fusion_config
 from deepaccident_devkit.taxonomy import ModelFusion
-from deepaccident_devkit.training.torch import AllEgosDataset, RandomAugmentation, V2XDataset, collate, collate_all_egos
+from deepaccident_devkit.training.torch import AllEgosDataset, V2XDataset, collate, collate_all_egos
 
 Seeded = Callable[..., V2XFormer]
 Predicted = Callable[..., list[torch.Tensor]]
@@ -107,12 +107,6 @@ def test_other_moments_of_a_batch_change_nothing(
     together = predicted(model, model_inputs(collate(items)))
     by_itself = [predicted(model, model_inputs(collate([item]))) for item in items]
     assert_same(together, [torch.cat(each) for each in zip(*by_itself, strict=True)])
-    later = [each.replace("/004", "/006") for each in moment[2:]]
-    moments = list(AllEgosDataset(da, [*later, *moment], config.inputs("all", augmentation=RandomAugmentation())))
-    assert not torch.equal(moments[0]["augmentation"], moments[1]["augmentation"])
-    both = predicted(model, model_inputs(collate_all_egos(moments)))
-    by_itself = [predicted(model, model_inputs(collate_all_egos([each]))) for each in moments]
-    assert_same(both, [torch.cat(each) for each in zip(*by_itself, strict=True)])
 
 
 @pytest.mark.parametrize("name", [*FUSIONS, BOTH])
@@ -143,22 +137,6 @@ def test_partners_that_are_not_heard_leave_the_ego_alone(
     assert apart(predicted(model, inputs), expected) > 1e-2
 
 
-def test_absent_partners_change_nothing_else(
-    da: DeepAccident,
-    da_partial: DeepAccident,
-    moment: list[str],
-    config: ModelConfig,
-    seeded: Seeded,
-    predicted: Predicted,
-) -> None:
-    """A partial release, which lacks one vehicle and another one's camera, and those agents chosen by name."""
-    partial = alone(da_partial, moment[2], config, "available")
-    there = dict(zip(partial["agents"], partial["agent_valid"][:, -1].tolist(), strict=True))
-    assert there == {"other_vehicle": True, "ego_vehicle": False, "ego_vehicle_behind": True, "infrastructure": True}
-    chosen = alone(da, moment[2], config, ["ego_vehicle_behind", "infrastructure"])
-    assert_same(*[predicted(seeded(config), model_inputs(collate([each]))) for each in (partial, chosen)])
-
-
 def test_all_egos_of_a_partial_release_are_each_by_itself(
     da_partial: DeepAccident, moment: list[str], config: ModelConfig, seeded: Seeded, predicted: Predicted
 ) -> None:
@@ -179,20 +157,3 @@ def test_fusions_that_ask_know_kinds_and_delays(
         for changed in (late, parked):
             assert (apart(predicted(model, inputs), predicted(model, changed)) > 1e-3) == differs
     egos_by_themselves(model, predicted, da, moment, "all", slice(4, 5))
-
-
-def test_a_left_handed_model_maps_the_mirror_image(
-    da: DeepAccident, moment: list[str], config: ModelConfig, seeded: Seeded
-) -> None:
-    """The mean of all agents' lifted maps has no layers that could tell left from right: its rows are turned round."""
-    batch = collate([alone(da, moment[0], config, "all")])
-    fused = []
-    for model in (seeded(config), seeded(replace(config, handedness="left"))):
-        inputs = model_inputs(batch, model.config.handedness)
-        pixels = torch.nn.functional.pad(inputs.images.flatten(0, 3) / 255, (0, 0, 0, 12))
-        with torch.inference_mode():
-            features = model.img_neck(model.img_backbone(pixels)).unflatten(0, (5, 2, 6))
-            lifted = model.transformer(features, inputs.cameras.flattened())
-            fused.append(model.fused(lifted[None, :, -1], inputs))
-    assert_close(fused[0], fused[1].flip(-2), atol=1e-3, rtol=1e-3)
-    assert apart(fused[:1], fused[1:]) > 0.1

@@ -1,6 +1,5 @@
 """Points from LiDARs: where they come to lie, which of them count, and that all of it is trained."""
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
@@ -13,13 +12,10 @@ from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.plugins.model.inputs import model_inputs
-from deepaccident_devkit.plugins.model.network import ModelConfig, V2XFormer
+from deepaccident_devkit.plugins.model.network import V2XFormer
 from deepaccident_devkit.plugins.model.pillars import PillarConfig, PillarEncoder
-from deepaccident_devkit.plugins.model.training_run import TrainConfig
-from deepaccident_devkit.plugins.model.training_step import TrainingStep, training_batch
 from deepaccident_devkit.taxonomy import POLE_HEIGHT
-from deepaccident_devkit.training.torch import AllEgosDataset, V2XDataset, collate, collate_all_egos
-from deepaccident_devkit.v2x import Link
+from deepaccident_devkit.training.torch import V2XDataset, collate
 
 GRID = BevGrid(x=(-10.0, 10.0, 1.0), y=(-5.0, 5.0, 1.0))
 
@@ -56,15 +52,6 @@ def test_what_lies_outside_does_not_count(encoder: PillarEncoder, point: tuple[f
     assert not reached(encoder, [[*point, 0.5]], [0]).any()
 
 
-def test_neither_order_nor_repeated_points_matter(encoder: PillarEncoder) -> None:
-    points, frame = torch.rand(50, 4) * 4, torch.arange(50) % 2
-    order = torch.randperm(50)
-    with torch.inference_mode():
-        expected = encoder(points, frame, 2)
-        assert_close(encoder(points[order], frame[order], 2), expected)
-        assert_close(encoder(points.repeat(2, 1), frame.repeat(2), 2), expected)
-
-
 def test_points_stand_on_the_road(da: DeepAccident, moment: list[str]) -> None:
     """Heights are above it, also of the agent on a pole, whose frame begins at the top."""
     item = V2XDataset(da, moment[:1], small_lidar().inputs("all"))[0]
@@ -84,24 +71,6 @@ def test_a_frame_that_did_not_arrive_has_the_points_of_the_present(da: DeepAccid
     past, present = (inputs.points[inputs.point_frames == frame] for frame in (0, 1))
     assert len(present) > 100
     assert torch.equal(past, present)
-
-
-def test_agents_that_send_nothing_have_no_points(da: DeepAccident, moment: list[str]) -> None:
-    lost = Link(packet_loss=1.0)
-    inputs = model_inputs(collate([V2XDataset(da, moment[:1], small_lidar().inputs("all", link=lost))[0]]))
-    assert set((inputs.point_frames // inputs.frame_valid.shape[2]).tolist()) == {0}
-
-
-@pytest.mark.parametrize("make", [small_lidar, small_both])
-def test_gradients_reach_all_parameters(da: DeepAccident, moment: list[str], make: Callable[[], ModelConfig]) -> None:
-    config = make()
-    torch.manual_seed(0)
-    model = V2XFormer(config)
-    items = AllEgosDataset(da, moment, config.inputs("all", boxes="sample", labels=config.labels))
-    batch = training_batch(collate_all_egos([items[0]]), config, TrainConfig(egos=2), torch.Generator().manual_seed(0))
-    sum(TrainingStep(model)(*batch).values()).backward()
-    without = [name for name, each in model.named_parameters() if each.grad is None or not each.grad.abs().sum()]
-    assert without == []
 
 
 def test_faults_are_named(da: DeepAccident, moment: list[str]) -> None:

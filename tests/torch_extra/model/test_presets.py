@@ -42,24 +42,6 @@ def test_presets_have_their_sizes(preset: Callable[[], ModelConfig], least: floa
         assert least < sum(each.numel() for each in V2XFormer(preset()).parameters()) < most
 
 
-def test_released_has_the_quirks_of_the_release() -> None:
-    """Each in its field (model.md section 9)."""
-    config = released()
-    assert {
-        "lift": (config.cameras.lift.frustum, config.cameras.lift.voxel_rounding),
-        "temporal": (config.temporal.warp, config.temporal.chain, config.temporal.egomotion_input),
-        "motion": (config.motion.posterior_ignore, config.motion.hidden_warp),
-        "all": (config.handedness, config.labels.grid.orientation, config.labels_protocol),
-        "detection": len(config.detection.class_slots),
-    } == {
-        "lift": ("corners", "trunc"),
-        "temporal": ("stretched", "released", "raw"),
-        "motion": ("keep", "none"),
-        "all": ("left", "released", "released"),
-        "detection": 6,
-    }
-
-
 @pytest.mark.parametrize(
     ("fusion", "kind"),
     [("mean", PoolFusionConfig), ("disconet", DiscoNetConfig), ("cobevt", CobevtConfig), ("v2xvit", V2XViTConfig)],
@@ -84,6 +66,7 @@ def test_a_horizon_is_a_number_of_frames(horizon: float, frames: int) -> None:
     [
         *(({"horizon": each}, ConfigError, ("horizon", "0.5 s", "choose")) for each in (0.0, -1.0, 0.7, 1e3, np.nan)),
         ({"preset": "large"}, ChoiceError, ("preset", "released, tiny")),
+        ({"preset": "tiny_lidar", "focal": 100.0}, ConfigError, ("focal", "no cameras")),
         ({"fusion": "sum"}, ChoiceError, ("fusion",)),
         ({"preset": "tiny", "fusion": "released"}, ConfigError, ("ego_channels", "from 0 to 31")),
     ],
@@ -167,11 +150,3 @@ def test_a_virtual_camera_and_fierys_labels_are_noted_where_they_are_chosen(tmp_
     config = choice.config
     assert config.cameras.images == ImageConfig(virtual_camera=(100.0, 90, 160), dtype="uint8", decode="scaled")
     assert (config.labels.protocol, config.labels.future_frames, config.labels.only_vehicle) == ("fiery", 2, True)
-    assert (config.labels.grid, config.labels.receptive_field) == (tiny().labels.grid, tiny().labels.receptive_field)
-    virtual = ModelChoice(preset="released", focal=500.0).config.cameras.images.virtual_camera
-    assert tuple(virtual) == (500.0, 256, 704)
-
-
-def test_a_model_without_cameras_has_no_focal_length() -> None:
-    with pytest.raises(ConfigError, match=r"focal: the model has no cameras"):
-        ModelChoice(preset="tiny_lidar", focal=100.0)

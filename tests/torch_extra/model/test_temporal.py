@@ -7,11 +7,9 @@ from refusals import assert_refused
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.plugins.model.temporal import Temporal3D, TemporalConcat, TemporalConfig, temporal_model
-from deepaccident_devkit.plugins.model.warps import between_augmented, matrices_from_six, six_from_matrices
 
 GRID = BevGrid(x=(-6, 6, 1), y=(-4, 4, 1))
 KINDS = ["blocks", "concat"]
-TURNED = torch.diag(torch.tensor([1.1, -1.1, 1, 1])) @ matrices_from_six(torch.tensor([0, 0, 0, 0, 0, 0.3]))
 
 
 def batch(frames: int = 3, samples: int = 2) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -50,18 +48,6 @@ def test_every_frame_its_motion_and_the_warp_count(kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_an_augmentation_is_the_same_as_augmented_motion(kind: str) -> None:
-    model = model_of(kind)
-    features, egomotion, valid = batch()
-    moved = six_from_matrices(between_augmented(matrices_from_six(egomotion), TURNED, TURNED))
-    augmented = model(features, egomotion, valid, TURNED.expand(2, 4, 4))
-    torch.testing.assert_close(augmented, model(features, moved, valid), atol=1e-4, rtol=0)
-    raw = model_of(kind, egomotion_input="raw")
-    assert not torch.allclose(raw(features, egomotion, valid, TURNED.expand(2, 4, 4)), augmented, atol=1e-3)
-    assert torch.equal(raw(features, egomotion, valid), model(features, egomotion, valid))
-
-
-@pytest.mark.parametrize("kind", KINDS)
 def test_an_oldest_frame_that_is_not_valid_does_not_count(kind: str) -> None:
     model = model_of(kind)
     features, egomotion, valid = batch()
@@ -71,24 +57,6 @@ def test_an_oldest_frame_that_is_not_valid_does_not_count(kind: str) -> None:
     features[1, 0] = 1e3
     assert torch.equal(model(features, egomotion, valid), result)
     assert not torch.allclose(result[1], whole[1])
-
-
-def test_concat_takes_the_present_without_motion_for_frames_that_are_not_valid() -> None:
-    model, (features, egomotion, whole) = model_of("concat", frames=2), batch(frames=2)
-    valid, egomotion[:, 0, 0] = torch.tensor([[False, True]] * 2), torch.nan
-    expected = model(features[:, 1:].expand_as(features), torch.zeros_like(egomotion), whole)
-    torch.testing.assert_close(model(features, egomotion, valid), expected)
-
-
-def test_blocks_fill_up_to_the_first_invalid_frame_only() -> None:
-    """As released: of [no, no, yes] frame 0 becomes frame 1, whose own content counts."""
-    model = model_of("blocks")
-    features, egomotion, valid = batch()
-    valid[:, :2] = False
-    result = model(features, egomotion, valid)
-    for frame, counts in ((0, False), (1, True)):
-        features[:, frame] = 7
-        assert torch.allclose(model(features, egomotion, valid), result) is not counts
 
 
 def test_wrong_configs_say_so() -> None:

@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 from deepaccident_devkit.geometry import BevGrid, conventions
 from deepaccident_devkit.plugins.model.warps import (
     agents_mask,
-    between_augmented,
     features_to_ego,
     inside_mask,
     matrices_from_six,
@@ -20,7 +19,6 @@ from deepaccident_devkit.plugins.model.warps import (
 
 GRID = BevGrid(x=(-8, 12, 1), y=(-6, 6, 0.5))
 """Neither square nor centred, and with other steps along x than along y."""
-MIRRORED = torch.tensor([[[-1.1, 0, 0, 0], [0, 1.1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]])
 six = st.tuples(*[st.floats(-3, 3, width=32)] * 3, *[st.floats(-1.5, 1.5, width=32)] * 3).map(
     lambda values: torch.tensor(values, dtype=torch.float64)
 )
@@ -55,22 +53,6 @@ def test_exact_chains_lead_from_each_frame_to_the_present(vectors: list[torch.Te
     torch.testing.assert_close(present_from_past_batch(motion)[0], expected, atol=1e-6, rtol=0)
 
 
-def test_the_released_chain_is_another_one_before_the_last_step_only() -> None:
-    motion = torch.stack([turned(4, 0, 0, 0, 0, 0.5), turned(3, 1, 0, 0, 0, -0.2)], 1)
-    first, second = matrices_from_six(motion[0])
-    for chain, joined in (("exact", second @ first), ("released", first @ second)):
-        torch.testing.assert_close(present_from_past_batch(motion, chain=chain)[0], torch.stack([joined, second]))
-
-
-def test_augmented_transforms_lead_between_augmented_points() -> None:
-    target_from_source = matrices_from_six(turned(2, -1, 0, 0, 0, 0.7))
-    other = matrices_from_six(turned(0, 0, 0, 0, 0, -0.3))
-    point = torch.tensor([1.5, -2.5, 0, 1])
-    moved = between_augmented(target_from_source, other, MIRRORED)[0] @ (MIRRORED[0] @ point)
-    torch.testing.assert_close(moved, other[0] @ target_from_source[0] @ point)
-    torch.testing.assert_close(between_augmented(target_from_source, None, None), target_from_source)
-
-
 @settings(max_examples=40)
 @given(planar)
 def test_an_exact_warp_gives_a_linear_field_its_values_in_the_other_frame(target_from_source: torch.Tensor) -> None:
@@ -96,22 +78,6 @@ def test_a_shift_by_whole_cells_moves_cells(mode: str) -> None:
     torch.testing.assert_close(warped, expected, atol=1e-5, rtol=0)
 
 
-def test_a_stretched_warp_blurs_without_motion_as_the_released_one() -> None:
-    """128 cells of 0.8 m: cell i samples at 0.4961 + 0.99609 i."""
-    grid = BevGrid(x=(-51.2, 51.2, 0.8), y=(-51.2, 51.2, 0.8))
-    rising = torch.arange(128.0)
-    for warp, expected in (("stretched", 0.49609375 + 0.99609375 * rising), ("exact", rising)):
-        warped = warp_features(rising.expand(1, 1, 128, 128), torch.eye(4)[None], grid, warp=warp)
-        torch.testing.assert_close(warped[0, 0, 5], expected, atol=1e-4, rtol=0)
-
-
-def test_height_and_tilt_count_only_in_the_inverse_s_plane() -> None:
-    """Of a tilted pose, rows x, y and columns x, y, translation of the inverse are used; height alone does nothing."""
-    features = torch.rand(1, 1, 24, 20)
-    flat, raised = (matrices_from_six(turned(1, 2, z, 0, 0, 0.4)) for z in (0.0, 5.0))
-    torch.testing.assert_close(warp_features(features, flat, GRID), warp_features(features, raised, GRID))
-
-
 def test_the_ego_is_neither_warped_nor_hidden_and_missing_agents_are() -> None:
     features = torch.rand(2, 3, 4, 24, 20, requires_grad=True)
     pose = matrices_from_six(turned(2, 1, 0, 0, 0, 0.4)).expand(2, 3, 4, 4)
@@ -125,20 +91,3 @@ def test_the_ego_is_neither_warped_nor_hidden_and_missing_agents_are() -> None:
     assert torch.equal(mask.flatten(0, 1), torch.stack([own, inside, nobody, own, inside, inside]))
     placed.sum().backward()
     assert features.grad.ne(0).flatten(2).any(2).all()
-
-
-def test_a_batch_without_partners_has_an_ego_map_alone() -> None:
-    features, pose = torch.rand(2, 1, 4, 24, 20), torch.eye(4).expand(2, 1, 4, 4)
-    assert torch.equal(features_to_ego(features, pose, GRID), features)
-    assert agents_mask(torch.ones(2, 1, dtype=torch.bool), pose, GRID).all()
-
-
-def test_autocast_does_not_round_poses() -> None:
-    """In bfloat16, 37.3 m would be 37.25 m."""
-    motion = torch.stack([turned(37.3, 0, 0, 0, 0, 0.4)] * 2, 1)
-    features, far = torch.rand(1, 1, 24, 20), matrices_from_six(turned(0.3, 0.2, 0, 0, 0, 0.1))
-    with torch.autocast("cpu", dtype=torch.bfloat16):
-        chain = present_from_past_batch(motion, bev_transform=MIRRORED)
-        rounded = warp_features(features.bfloat16(), far, GRID)
-    assert torch.equal(chain, present_from_past_batch(motion, bev_transform=MIRRORED))
-    torch.testing.assert_close(rounded, warp_features(features, far, GRID).bfloat16(), atol=1e-2, rtol=0)

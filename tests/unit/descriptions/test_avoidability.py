@@ -68,13 +68,6 @@ def test_answers_that_change_three_times() -> None:
     assert [code == 0 for code in at] == [True, False, True]
 
 
-def test_every_start_is_tried() -> None:
-    case, decelerations = rear_end(20, 10), (4.0, 6.0, 8.0)
-    together = scanned(case, FIRST, *decelerations).time
-    np.testing.assert_array_equal(together, np.concatenate([scanned(case, FIRST, each).time for each in decelerations]))
-    assert (np.diff(together) > 0).all()
-
-
 def test_the_tables_of_an_accident() -> None:
     case = rear_end(20, 10)
     found = avoidability_of(case)
@@ -113,13 +106,11 @@ def test_values_for_json() -> None:
     assert told["actors"][0] == {"actor_id": 11, "category": "car", "agent": "ego_vehicle", "mass": 1500}
     ranges = np.round(delta_v_ranges([1500, 1500], 10.0), 3).tolist()
     assert (told["recorded"]["delta_v"], told["recorded"]["delta_v_ranges"]) == ([5, 5], ranges)
-    assert [row["brakers"] for row in told["last_moments"]] == [name for name in BRAKERS for _ in range(3)]
     first, leader = told["last_moments"][0], told["last_moments"][3]
     assert (first["avoidable"], first["slack"], first["switches"]) == (True, pytest.approx(1.25, abs=0.011), 1)
     assert (leader["avoidable"], leader["last_moment"], leader["slack"]) == (False, None, None)
-    assert (len(told["warnings"]), told["leads"][-1]) == (27, 5)
-    best, worst = told["warnings"][0], told["warnings"][9]
-    assert (worst["brakers"], worst["outcome"][-1], best["speeds"][-1]) == ("second", "worsened", [None, None])
+    worst = told["warnings"][9]
+    assert (worst["brakers"], worst["outcome"][-1]) == ("second", "worsened")
     assert "warnings" not in avoidability_of(rear_end()).to_dict(warnings=False)
 
 
@@ -194,11 +185,3 @@ def test_who_does_not_count() -> None:
     }
     assert [actor for actor, other in others.items() if contacts({actor: other})] == []
     assert contacts({30: (ALL, FOLLOWER)}, STARTS[1:], HARD[1:]) == []
-
-
-def test_by_replay_and_time() -> None:
-    starts, hard = np.array([[np.inf, 1.0], [2.0, 2.0], [1.0, np.inf]]), np.array([4.0, 8.0, 6.0])
-    crossing = np.column_stack([np.full(51, 60.0), np.linspace(-40, 60, 51), np.full(51, np.pi / 2)])
-    keys = [(each.replay, each.time) for each in contacts({30: (ALL, FOLLOWER), 31: (ALL, crossing)}, starts, hard)]
-    assert keys == sorted(keys)
-    assert {replay for replay, _ in keys} >= {1, 2}

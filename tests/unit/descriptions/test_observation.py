@@ -14,7 +14,6 @@ from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.descriptions import ObservationRule, coalition_leads, observed_actors, shapley_values
 from deepaccident_devkit.descriptions.observation import by_rule, coalition_members, first_together
 from deepaccident_devkit.errors import ChoiceError, ConfigError, GeometryError
-from deepaccident_devkit.plugins.safety import COALITIONS, PARTNERS
 from deepaccident_devkit.tables import visible_mask
 from deepaccident_devkit.taxonomy import AGENTS
 from deepaccident_devkit.v2x.tracks import scenario_tracks
@@ -85,11 +84,6 @@ def test_who_observes_itself(da_motion: DeepAccident, accident: Mapping[str, Any
     assert observed.all(axis=(1, 2)).tolist() == observed.any(axis=(1, 2)).tolist() == [True, *[False] * 4]
 
 
-def test_rules_say_what_they_are() -> None:
-    texts: Any = {"Points": "at least 5 LiDAR points", "annotated": "annotated"}
-    assert {kind: ObservationRule(kind=kind).text for kind in texts} == texts
-
-
 def test_what_does_not_fit_is_refused() -> None:
     assert_refused(
         (lambda: ObservationRule(kind="seen"), ChoiceError, ("kind", "points, released, annotated", "'seen'")),
@@ -133,14 +127,6 @@ def test_shapley_values_share_the_whole_gain_and_are_means_over_orders(observed:
     np.testing.assert_allclose(values, gains.mean(axis=0), atol=1e-9)
 
 
-@given(arrays(np.bool_, (3, 5, 2, 7)))
-def test_several_recordings_at_once(observed: np.ndarray) -> None:
-    padded = np.concatenate([np.zeros((3, 5, 2, 4), dtype=bool), observed], axis=-1)
-    one_by_one = np.array([coalition_leads(each) for each in observed])
-    np.testing.assert_array_equal(coalition_leads(padded), one_by_one)
-    np.testing.assert_allclose(shapley_values(one_by_one), [shapley_values(each) for each in one_by_one])
-
-
 def test_both_must_be_observed_at_the_same_frame() -> None:
     observed = np.zeros((2, 2, 5), dtype=bool)
     observed[0, 0, 0] = observed[0, 1, 1] = True
@@ -149,11 +135,3 @@ def test_both_must_be_observed_at_the_same_frame() -> None:
     assert (alone, first_together(observed).tolist()) == ([-1, -1], [-1, 0])
     assert coalition_leads(observed).tolist() == pytest.approx([0, 0.4])
     assert shapley_values(coalition_leads(observed)).tolist() == pytest.approx([0.4])
-
-
-def test_partners_are_numbered_by_bits() -> None:
-    numbered = {0: (), 8: ("infrastructure",), 15: PARTNERS}
-    assert {number: COALITIONS[number] for number in numbered} == {
-        number: ("ego_vehicle", *partners) for number, partners in numbered.items()
-    }
-    assert shapley_values([3.0]).shape == (0,)

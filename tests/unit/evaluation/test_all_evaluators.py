@@ -1,17 +1,14 @@
 """What holds of every evaluator, on the labels of a synthetic release: order, parts, pauses, nothing and perfection."""
 
-import copy
 import json
 import math
-import pickle
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, fields, is_dataclass, replace
+from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose
 from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
@@ -23,17 +20,11 @@ from deepaccident_devkit.evaluation import (
     Evaluator,
     MotionEvaluator,
     MotionOutput,
-    Resampling,
-    breakdown,
     detection_truth,
     instances_of,
-    sample_attributes,
 )
 from deepaccident_devkit.evaluation.accident import accident_context
 from deepaccident_devkit.evaluation.detection import DETECTION_PROTOCOLS
-from deepaccident_devkit.evaluation.intervals import numbers_of
-from deepaccident_devkit.evaluation.runs.comparison import Swaps, swapped_differences
-from deepaccident_devkit.evaluation.task import FrozenDict
 from deepaccident_devkit.motion import MotionHeads
 
 MOTION: dict[str, Callable[[], Evaluator[Any]]] = {
@@ -102,7 +93,7 @@ def test_order_parts_and_pauses_change_no_bit(samples: Samples, tokens: list[str
     whole = samples.evaluated("some", name, tokens)
     expected = bits(whole.compute())
     shuffled = np.random.default_rng(1).permutation(tokens).tolist()
-    for parts in (1, 3, len(tokens)):
+    for parts in (1, 3):
         merged = ALL[name]()
         for part in range(parts):
             evaluator = ALL[name]()
@@ -111,7 +102,6 @@ def test_order_parts_and_pauses_change_no_bit(samples: Samples, tokens: list[str
             path = evaluator.save(tmp_path / f"{part}.json")
             merged.merge(ALL[name]().resume(path) if part % 2 == 0 else evaluator)
         assert bits(merged.compute()) == expected
-        assert merged.compute(tokens[:3]) is not None
         assert bits(merged.compute(tokens[:3])) == bits(whole.compute(tokens[:3]))
         assert not merged.repeated
     resumed = ALL[name]().resume(whole.save(tmp_path / "whole.json"))
@@ -126,20 +116,6 @@ def test_counts_are_json_and_pooled_they_have_the_same_result(samples: Samples, 
     counts = [evaluator.counts[token] for token in tokens[::3]]
     assert json.loads(json.dumps(counts, allow_nan=False)) == counts
     assert bits(evaluator.result_of(evaluator.pooled(counts))) == bits(evaluator.compute())
-
-
-@pytest.mark.slow
-@of_all
-def test_two_runs_can_be_swapped(samples: Samples, tokens: list[str], name: str) -> None:
-    """Where nothing is swapped they differ as observed; where all is, by the same with the other sign."""
-    runs = [samples.evaluated(how, name, tokens) for how in ("some", "perfect")]
-    first, second = (numbers_of(run.compute()) for run in runs)
-    names = [path for path in first if path in second]
-    observed = np.array([second[path] - first[path] for path in names])
-    clusters = [[[run.counts[token]] for token in tokens] for run in runs]
-    swapped = np.array([[False] * len(tokens), [True] * len(tokens)])
-    made = swapped_differences(runs[0], clusters, Swaps(swapped=swapped, complete=False), names)
-    assert_allclose(made, [observed, -observed], atol=1e-12)
 
 
 @of_all
@@ -159,24 +135,6 @@ def test_empty_predictions_score_0(samples: Samples, tokens: list[str], name: st
     ALL[name]().compute()
 
 
-@pytest.mark.slow
-@of_all
-def test_results_can_be_copied_and_written(samples: Samples, tokens: list[str], name: str) -> None:
-    evaluator = samples.evaluated("some", name, tokens)
-    attributes = sample_attributes(samples.dataset, tokens)
-    whole, resampling = evaluator.compute(), Resampling(resamples=2)
-    results = [whole, ALL[name]().compute(), breakdown(evaluator, attributes, "scenario_type", resampling)]
-    for result in results:
-        for again in (pickle.loads(pickle.dumps(result)), copy.deepcopy(result), replace(result)):
-            assert bits(again) == bits(result)
-        described = asdict(result)
-        assert described.keys() == {field.name for field in fields(result)}
-        json.dumps(result.as_dict(), allow_nan=False)
-        assert len({result, result}) == 1
-        values = [getattr(result, field.name) for field in fields(result)]
-        assert {type(each) for each in values if isinstance(each, dict)} <= {FrozenDict}
-
-
 @pytest.mark.parametrize("name", MOTION | DETECTION)
 @pytest.mark.parametrize("given", [None, np.zeros((2, 5, 200, 200), dtype=int)])
 def test_predictions_that_are_none(samples: Samples, tokens: list[str], name: str, given: object) -> None:
@@ -188,23 +146,6 @@ def test_predictions_that_are_none(samples: Samples, tokens: list[str], name: st
         (lambda: update(tokens[0], given, truth), EvaluationError, (f"expected {kind}", "from_arrays(", wrong)),
         (lambda: update(tokens[0], prediction, given), error, (f"expected {of_truth}", wrong)),
     )
-
-
-@pytest.mark.parametrize("name", MOTION | ACCIDENT)
-def test_empty_heads_score_0(samples: Samples, tokens: list[str], name: str) -> None:
-    """What a network says that sees nobody: no peak, background everywhere."""
-    token, label = tokens[0], samples.labels[tokens[0]]
-    nobody = MotionHeads.from_labels(label)
-    nobody = replace(
-        nobody,
-        segmentation=np.stack([nobody.segmentation[:, 0] * 0 + 5, nobody.segmentation[:, 0] * 0 - 5], axis=1),
-        centerness=np.zeros_like(nobody.centerness),
-    )
-    output = MotionOutput(grid=label.config.grid, heads=(nobody,) * 6)
-    evaluator = ALL[name]()
-    evaluator.update(token, output, *samples.given("perfect", name, token)[1:])
-    result = evaluator.compute()
-    assert (result.path_accuracy if name in MOTION else result.apa) == 0
 
 
 @of_all

@@ -7,7 +7,6 @@ from typing import Any
 
 import pytest
 from evaluating import Ratios
-from generated_bundles import motion_counts
 from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
@@ -25,8 +24,6 @@ from deepaccident_devkit.evaluation.breakdowns import (
 )
 from deepaccident_devkit.evaluation.evaluator import Counts, total
 from deepaccident_devkit.evaluation.intervals import Resampling
-from deepaccident_devkit.evaluation.motion import MotionEvaluator
-from deepaccident_devkit.evaluation.predictions import instances_of
 from deepaccident_devkit.taxonomy import AGENTS, INFRASTRUCTURE
 from deepaccident_devkit.v2x import accident_visible
 
@@ -193,18 +190,6 @@ def test_an_accident_and_its_twin_are_one_cluster() -> None:
     assert two.intervals["ratio"] == pytest.approx(one.intervals["ratio"])
 
 
-def test_a_percentage_that_is_always_100_is_not_sure() -> None:
-    evaluator = MotionEvaluator()
-    for number in range(120):
-        evaluator.add(f"{number:03d}", motion_counts(found=50, missed=0))
-    attributes = {token: attributes_of(int(token)) for token in evaluator.tokens}
-    (group,) = breakdown(evaluator, attributes, "all").groups
-    low, high = group.intervals["ranges/30x30/iou"]
-    assert 60 < low < 80
-    assert high == group.result.ranges["30x30"].iou == 100
-    assert "min_ade" not in group.intervals  # NaN
-
-
 def test_what_cannot_be_broken_down() -> None:
     few = dict(list(MANY.items())[:-1])
     assert_refused(
@@ -272,18 +257,3 @@ def test_without_meta_it_is_not_known_whether_there_is_an_impact(
     monkeypatch.setattr(type(da_motion), "scenario", {record["token"]: record | unknown}, raising=False)
     [each] = sample_attributes(da_motion, [token]).values()
     assert (each.time_to_impact, each.impact_step, each.value("collision_status")) == (None, None, None)
-
-
-def test_a_breakdown_of_motion_metrics(da_motion: DeepAccident) -> None:
-    evaluator = MotionEvaluator(trajectories=False)
-    tokens = [
-        f"{record['token']}/{agent}/030" for record in da_motion.scenario for agent in ("ego_vehicle", INFRASTRUCTURE)
-    ]
-    for token in tokens:
-        label = da_motion.motion_labels(token)
-        evaluator.update(token, instances_of(label.to_present().instance, label.config.grid), label)
-    found = breakdown(evaluator, sample_attributes(da_motion, tokens), "collision_status")
-    assert shown(found.groups) == {"collides_between_vehicles": 2, "no_collision": 2}
-    assert shown(found.without_infrastructure) == {"collides_between_vehicles": 1, "no_collision": 1}
-    (everything,) = breakdown(evaluator, sample_attributes(da_motion, tokens), "all").groups
-    assert (everything.clusters, dict(everything.intervals)) == (1, {})

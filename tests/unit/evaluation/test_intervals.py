@@ -4,7 +4,6 @@ import math
 from collections.abc import Collection, Sequence
 from functools import partial
 from itertools import chain
-from typing import Any
 
 import numpy as np
 import pytest
@@ -111,20 +110,6 @@ def test_which_numbers_have_an_interval(above, below, resampling, ends, notes) -
     assert (tuple(found.ends), found.notes) == (ends, notes)
 
 
-def test_of_many_numbers_without_an_interval_three_are_named() -> None:
-    class Many(Ratios):
-        """The same number under several names."""
-
-        def result_of(self, _counts: Collection[Counts]) -> Any:
-            return dict.fromkeys("abcdefg"[: self.count], 2.5)
-
-    for count, text in ((3, "a, b, c"), (4, "a, b, c and 1 others"), (7, "a, b, c and 4 others")):
-        evaluator = Many()
-        evaluator.count = count
-        found = intervals_of(evaluator, [[{}]] * 8, evaluator.result_of([]))
-        assert found.notes == (f"no interval of {text}: fewer than 6 clusters change it",)
-
-
 def test_many_clusters_are_joined() -> None:
     clusters = [[{"number": number}] for number in range(345)]
     parts = parts_of(clusters, Resampling())
@@ -135,12 +120,6 @@ def test_many_clusters_are_joined() -> None:
     assert len(parts_of(clusters, Resampling(resamples=2))) == LEAST_CLUSTERS
     assert parts_of(clusters[:100], Resampling()) == clusters[:100]
     assert len(parts_of(clusters[:101], Resampling())) == 100
-
-
-def test_intervals_of_joined_clusters_are_nearly_the_same() -> None:
-    above = np.random.default_rng(0).uniform(size=345).round(3).tolist()
-    joined, errors = made(above).ends["ratio"], np.std(above) / math.sqrt(345)
-    assert joined == pytest.approx((np.mean(above) - 1.97 * errors, np.mean(above) + 1.97 * errors), abs=0.012)
 
 
 def plain_ends(
@@ -301,23 +280,6 @@ def test_a_unit_tells_what_a_number_can_be(path: str, expected: tuple[float, flo
 )
 def test_a_number_of_others_is_what_its_clusters_are(alone: list[float], expected: tuple[float, float]) -> None:
     assert range_of("theirs", np.array(alone), ROWS) == expected
-
-
-def test_an_interval_crosses_zero_where_a_number_can_be_negative_and_shares_stay_shares() -> None:
-    """Of all numbers that a task has by name, a few clusters around 0 and around the most that each can be."""
-    paths = [row.path for row in ROWS]
-    signed = {path for path in paths if range_of(path, np.array([]), ROWS) == (-math.inf, math.inf)}
-    assert {path.rpartition("/")[2] for path in signed} == {path.rpartition("/")[2] for path in SIGNED} | {"lateness"}
-    source = np.random.default_rng(0)
-    for path in paths:
-        least, most = limits = range_of(path, np.array([]), ROWS)
-        width = most if math.isfinite(most) else 1.0
-        middles = [-0.02, 0.02] if path in signed else [0.02, 0.98]
-        for middle in np.multiply(middles, width):
-            left_out = np.clip(middle + source.normal(0, 0.02 * width, (12, 1)), least, most)
-            [low], [high] = interval_ends(np.array([middle]), left_out, np.array([limits]), 0.95)
-            assert least <= low < middle < high <= most
-            assert (low < 0 < high) == (path in signed), path
 
 
 def test_a_number_that_is_larger_of_all_clusters_than_of_each_is_no_share() -> None:

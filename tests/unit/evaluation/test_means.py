@@ -10,10 +10,8 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from deepaccident_devkit.evaluation.evaluator import Evaluator
-from deepaccident_devkit.evaluation.forecasting import ForecastingEvaluator
 from deepaccident_devkit.evaluation.intervals import Resampling, intervals_of, numbers_of, numbers_of_draws
 from deepaccident_devkit.evaluation.means import MEAN_OF_SCENARIOS, MeansEvaluator, MeansResult, Sums, table_rows
-from deepaccident_devkit.evaluation.planning import PlanningEvaluator
 from deepaccident_devkit.evaluation.task import Row, headlines
 
 
@@ -143,10 +141,3 @@ def test_notes_count_over_the_samples(tmp_path: Path) -> None:
     assert (result.samples, result.means) == (3, {})
     assert evaluator.compute([]).samples == 0
     assert LengthsEvaluator("other").resume(evaluator.save(tmp_path / "kept")).compute() == result
-
-
-@pytest.mark.parametrize("kind", [PlanningEvaluator, ForecastingEvaluator], ids=["planning", "forecasting"])
-def test_settings_are_as_json_has_them(kind: type[MeansEvaluator[Any]]) -> None:
-    for protocol in kind.protocols:
-        settings = kind(protocol).settings
-        assert json.loads(json.dumps(settings)) == settings, protocol

@@ -89,17 +89,6 @@ def test_maps_of_another_shape_are_refused_with_the_shape_that_was_given(shape: 
     assert_refused((lambda: instances_of(np.zeros(shape, dtype=int), CONFIG.grid), GeometryError, names))
 
 
-def test_the_labels_as_heads_find_most(labels: dict[str, MotionLabels]) -> None:
-    """What the grouping loses of the truth itself: some of it, as in the released evaluation."""
-    evaluator = MotionEvaluator()
-    for token, label in labels.items():
-        heads = MotionHeads.from_labels(label.to_present(centerness="bilinear"))
-        evaluator.update(token, MotionOutput(grid=label.config.grid, heads=(heads,)), label)
-    result = evaluator.compute()
-    assert (result.min_ade, result.path_accuracy, result.notes) == (0.0, 1.0, ())
-    assert (result.ranges["100x100"].iou, result.ranges["100x100"].pq > 60) == (100.0, True)
-
-
 @pytest.mark.parametrize("orientation", ORIENTATIONS)
 @pytest.mark.parametrize("as_heads", [False, True])
 def test_the_orientation_of_a_prediction_makes_no_difference(labels, orientation, as_heads: bool) -> None:

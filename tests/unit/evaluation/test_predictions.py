@@ -11,7 +11,7 @@ from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, EvaluationError, GeometryError
-from deepaccident_devkit.evaluation import Accident, MotionOutput, instances_of
+from deepaccident_devkit.evaluation import Accident, MotionOutput
 from deepaccident_devkit.evaluation.predictions import cells_within, checked_prediction, label_config, labels_at_present
 from deepaccident_devkit.geometry import BevGrid, Boxes
 from deepaccident_devkit.geometry.bev_grid import ORIENTATIONS
@@ -106,24 +106,11 @@ class TestMotionOutput:
             (partial(MotionOutput.from_arrays, *stacked(), grid=None), GeometryError, ("grid", "BevGrid", "NoneType")),
         )
 
-    def test_its_text_says_how_many_predictions_of_which_form(self) -> None:
-        three, one = MotionOutput.from_arrays(*stacked(), grid=GRID), instances_of(np.zeros((4, *GRID.shape)), GRID)
-        assert repr(three) == f"MotionOutput(3 predictions of 5 frames, {GRID.text}, heads)"
-        assert repr(one) == f"MotionOutput(1 prediction of 4 frames, {GRID.text}, instances)"
-
 
 class TestAccident:
     def test_what_is_not_given(self) -> None:
         now = Accident(positions=np.zeros((2, 2)), time=0.0)
         assert (now.time, now.score, now.ids) == (0.0, 1.0, None)
-
-    def test_its_positions_and_the_maps_of_an_output_are_read_only(self) -> None:
-        positions, maps = np.zeros((2, 2)), np.zeros((1, 5, *GRID.shape), dtype=np.int32)
-        accident, output = Accident(positions=positions, time=1.0), instances_of(maps, GRID)
-        for array in (accident.positions, output.instances):
-            with pytest.raises(ValueError, match="read-only"):
-                array[0] = 1
-        positions[0] = maps[0] = 1  # the caller's own stay as they were
 
     def test_numbers_of_numpy_become_pythons(self) -> None:
         accident = Accident(

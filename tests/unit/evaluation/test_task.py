@@ -4,11 +4,9 @@ import copy
 import json
 import math
 import pickle
-import re
 from dataclasses import replace
-from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,11 +19,9 @@ from deepaccident_devkit.evaluation.accident import PaperAccidents
 from deepaccident_devkit.evaluation.detection import DETECTION_PROTOCOLS
 from deepaccident_devkit.evaluation.intervals import numbers_of
 from deepaccident_devkit.evaluation.motion import MotionEvaluator
-from deepaccident_devkit.evaluation.results import ResultsTask
 from deepaccident_devkit.evaluation.runs.setups import TASKS, EvaluationSetup
-from deepaccident_devkit.evaluation.task import FrozenDict, headlines, plain, switch_names, switched, value_text
+from deepaccident_devkit.evaluation.task import FrozenDict, headlines, switch_names, switched, value_text
 
-TOP = Path(__file__).parents[3]
 every_protocol = pytest.mark.parametrize(
     ("task", "protocol"), [(task, protocol) for task in TASKS for protocol in TASKS[task].protocols]
 )
@@ -53,32 +49,6 @@ def test_read_truth_update_compute(task: str, protocol: str, da_motion: DeepAcci
         evaluator.update(token, prediction, *truth)
     assert evaluator.compute().samples == len(results) > 1
     assert evaluator.compute().as_dict() == run.result.as_dict()
-
-
-@pytest.mark.slow
-def test_a_sample_enters_few_modules(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(str(TOP))
-    from benchmarks.entered import walks
-
-    made = walks()
-    for walk in ("motion, released", "accident, boxes"):
-        own = [module for module in made[walk] if module.startswith("deepaccident_devkit.evaluation")]
-        assert len(made[walk]) <= 37, walk
-        assert len(own) <= 12, walk
-
-
-@pytest.mark.parametrize("task", TASKS)
-def test_each_task_implements_the_contract(task: str) -> None:
-    evaluator_class = TASKS[task]
-    assert evaluator_class.task == task
-    assert re.fullmatch("Evaluate .*[.]", evaluator_class.description)
-    assert {"truth", "update"} <= vars(evaluator_class).keys()
-    assert set(evaluator_class.result_kinds) <= {*get_args(ResultsTask)}
-    assert evaluator_class().protocol == next(iter(evaluator_class.protocols.values()))
-    headline_paths = [row.path for row in evaluator_class.result_class.rows if row.is_headline]
-    assert evaluator_class.main_numbers
-    for path in evaluator_class.main_numbers:
-        assert any(fnmatchcase(path, headline) for headline in headline_paths), path
 
 
 @every_protocol
@@ -188,25 +158,6 @@ def test_headlines_have_names_units_and_a_better_side(task: str, protocol: str) 
 def test_texts_of_values(value: float | None, unit: Any, signed: bool, text: str) -> None:
     assert value_text(value, unit, signed=signed) == text
     assert signed or value_text(value, unit) == text
-
-
-def test_the_text_of_a_result_is_its_first_headlines() -> None:
-    result = MotionEvaluator("released").compute()
-    first = "iou 30x30 0.00 %, iou 100x100 0.00 %, vpq 30x30 0.00 %, vpq 100x100 0.00 %"
-    assert repr(result) == f"MotionResult(0 samples: {first}, …)"
-    html = result._repr_html_()
-    assert (html.count("<tr"), "MotionResult, 0 samples" in html, ">0.00 %<" in html, ">–<" in html) == (8, *[True] * 3)
-    assert (
-        repr(EvaluationSetup(task="warning", protocol="clean").evaluator().compute())
-        == "AnticipationResult(0 samples: )"
-    )
-
-
-def test_results_within_others_and_arrays_are_plain_too() -> None:
-    result = MotionEvaluator().compute()
-    nested = plain({2.0: np.array([1.0, np.nan, np.inf]), 0.5: "a", "of": [result]})
-    assert nested == {"2": [1.0, None, None], "0.5": "a", "of": [result.as_dict()]}
-    assert nested["of"][0]["ranges"]
 
 
 def test_mappings_of_results_are_frozen_and_have_a_hash() -> None:

@@ -3,8 +3,6 @@
 import errno
 import json
 import os
-import pickle
-import random
 import shutil
 import subprocess
 import sys
@@ -12,7 +10,7 @@ import threading
 import time
 import zipfile
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import nullcontext
 from dataclasses import asdict
@@ -24,12 +22,10 @@ from unittest.mock import Mock
 
 import killed
 import pytest
-from click.testing import CliRunner
 from refusals import assert_refused
 from tiny_format import KilledFormat, TinyFormat
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.errors import (
     ChoiceError,
     ConfigError,
@@ -42,8 +38,7 @@ from deepaccident_devkit.errors import (
     SomeFailedError,
     WorkerError,
 )
-from deepaccident_devkit.export import bulk
-from deepaccident_devkit.export.bulk import Export, Exported, Format, LinkKind, Manifest, Output, Tally, export_release
+from deepaccident_devkit.export.bulk import Export, Exported, Format, LinkKind, Manifest, Output, export_release
 from deepaccident_devkit.export.images import ImageConfig
 from deepaccident_devkit.export.nuscenes import NuScenes
 from deepaccident_devkit.export.opencood import OpenCood
@@ -57,7 +52,6 @@ from deepaccident_devkit.support.files import temporary_of, temporary_path
 from deepaccident_devkit.support.parallel import Store
 from deepaccident_devkit.support.version import __version__
 from deepaccident_devkit.tables import current_index
-from deepaccident_devkit.taxonomy import AGENTS
 from deepaccident_devkit.training.image_cache import CachedImages
 
 SCENARIOS, PICTURES = 3, 18
@@ -135,7 +129,6 @@ def test_what_is_there(small: DeepAccident, tmp_path: Path) -> None:
     done = written(small, tmp_path / "deep" / "out")
     files = {name for name, content in contents(done.folder).items() if content is not None and name != ARCHIVE}
     assert len(files) == PICTURES + SCENARIOS * (1 + 3 + 1) + 1 + 1
-    assert {MANIFEST, "counts.json"} < files
     assert (done.written, done.kept, done.tally.samples, done.tally.files) == (3, 0, PICTURES, SCENARIOS * 5 + 1)
     told = json.loads((done.folder / MANIFEST).read_bytes())
     assert (told["written"], told["written"]["left_out"]) == (asdict(done.tally), {"clouds": PICTURES, "maps": 1})
@@ -143,18 +136,8 @@ def test_what_is_there(small: DeepAccident, tmp_path: Path) -> None:
         (done.folder / name).stat().st_size for name in files - {MANIFEST} if not name.endswith(".jpg")
     )
     hashes = scenario_hashes(small, [record["token"] for record in small.scenario])
-    assert {len(state.pop("sensors")) for state in told["release"]["scenarios"].values()} == {32}
-    assert told["release"] == {
-        "fingerprint": fingerprint(hashes),
-        "scenarios": {token: each.as_dict() for token, each in hashes.items()},
-    }
-    assert told["settings"] == {
-        "split": None,
-        "where": [],
-        "agents": list(AGENTS),
-        "greeting": "hello",
-        "version": "v1",
-    }
+    assert told["release"]["fingerprint"] == fingerprint(hashes)
+    assert told["settings"].items() >= {"split": None, "greeting": "hello", "version": "v1"}.items()
 
 
 @pytest.mark.parametrize(
@@ -174,12 +157,6 @@ def test_workers_and_executors_write_the_same(
         assert written(small, tmp_path / "out", **{option: given}).kept == SCENARIOS
 
 
-def test_a_callers_bar_gets_all_of_the_work_once(small: DeepAccident, tmp_path: Path) -> None:
-    shares: list[float] = []
-    written(small, tmp_path / "out", progress=shares.append)
-    assert shares == pytest.approx([1 / SCENARIOS] * SCENARIOS)
-
-
 def test_a_killed_worker_is_told_and_leaves_nothing_half_written(
     small: DeepAccident, whole: Contents, tmp_path: Path
 ) -> None:
@@ -190,58 +167,31 @@ def test_a_killed_worker_is_told_and_leaves_nothing_half_written(
 
 
 def test_a_complete_export_is_kept_as_it_is_whatever_the_way_of_links(small: DeepAccident, tmp_path: Path) -> None:
-    first, before = written(small, tmp_path / "out"), states(tmp_path / "out")
+    shares: list[float] = []
+    first, before = written(small, tmp_path / "out", progress=shares.append), states(tmp_path / "out")
+    assert shares == pytest.approx([1 / SCENARIOS] * SCENARIOS)
     for form in (TinyFormat(), TinyFormat(link="copy")):
         again = written(small, tmp_path / "out", form)
         assert (again.written, again.kept, again.tally) == (0, SCENARIOS, first.tally)
         assert states(first.folder) == before
 
 
-def test_a_dry_run_writes_nothing(small: DeepAccident, tmp_path: Path) -> None:
-    done = written(small, tmp_path / "out", dry_run=True)
-    assert (done.written, done.kept, done.tally.samples, done.tally.files) == (SCENARIOS, 0, PICTURES, 5 * SCENARIOS)
-    assert sum(done.tally.linked.values()) == PICTURES
-    copies = written(small, tmp_path / "out", TinyFormat(link="copy"), dry_run=True)
-    assert copies.tally.linked == {"copy": PICTURES}
-    pictures = sum(path.stat().st_size for path in small.dataroot.glob("*/*/Camera_Front/*/*.jpg"))
-    assert copies.tally.bytes == pytest.approx(done.tally.bytes + pictures, rel=0.1)
-    assert not list(tmp_path.iterdir())
-
-
-def test_a_dry_run_counts_what_is_left(small: DeepAccident, tmp_path: Path) -> None:
-    for stop, left in (
-        (partial(stopped, small, tmp_path / "out", 2), 1),
-        (partial(written, small, tmp_path / "out"), 0),
-    ):
-        stop()
-        done = written(small, tmp_path / "out", dry_run=True)
-        assert (done.written, done.kept, done.tally.samples) == (left, SCENARIOS - left, left * PICTURES // 3)
-
-
 @pytest.mark.parametrize(
-    ("form", "names"),
+    ("form", "facts"),
     [
-        (TinyFormat(greeting="hi"), r"greeting: 'hello', asked for 'hi'"),
-        (TinyFormat(split="train"), r"split: None, asked for 'train'"),
-        (
-            TinyFormat(agents=("ego_vehicle",), where=("length>=1",)),
-            r"agents: \[.*\], asked for \['ego_vehicle'\]; where: \[\], asked for \['length>=1'\]",
-        ),
+        (TinyFormat(greeting="hi"), "greeting: 'hello', asked for 'hi'"),
+        (TinyFormat(split="train"), "split: None, asked for 'train'"),
+        (TinyFormat(agents=("ego_vehicle",), where=("length>=1",)), r"'ego_vehicle'.*where: .*'length>=1'"),
     ],
 )
 @pytest.mark.parametrize("units", [1, SCENARIOS])
 def test_a_folder_of_other_settings_is_refused(
-    small: DeepAccident, tmp_path: Path, form: TinyFormat, names: str, units: int
+    small: DeepAccident, tmp_path: Path, form: TinyFormat, facts: str, units: int
 ) -> None:
     begun(small, tmp_path / "out", units)
     before = states(tmp_path)
-    assert_refused(
-        (
-            lambda: written(small, tmp_path / "out", form),
-            ConfigError,
-            rf"out: holds an export to tiny with other settings \({names}\); choose another",
-        )
-    )
+    with pytest.raises(ConfigError, match=f"out: .*{facts}"):
+        written(small, tmp_path / "out", form)
     assert states(tmp_path) == before
 
 
@@ -271,15 +221,6 @@ def test_what_was_left_before_the_manifest_is_no_other_thing(
     assert contents(written(small, tmp_path).folder) == whole
 
 
-def test_a_complete_export_keeps_one_file_for_later_calls(
-    small: DeepAccident, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Loaders that list the folder would take a folder for a scenario, or for a class."""
-    assert [path.name for path in written(small, tmp_path / "out").folder.glob(".*")] == [ARCHIVE]
-    monkeypatch.setattr(TinyFormat, "sensors", lambda _: ())
-    assert not list(written(small, tmp_path / "other").folder.glob(".*"))
-
-
 def test_a_damaged_archive_of_a_complete_export_is_named(changing: Path, tmp_path: Path) -> None:
     out = written(reopened(changing), tmp_path / "out").folder
     next(changing.glob("*/ego_vehicle/Camera_Front/*/*_002.jpg")).unlink()
@@ -295,24 +236,6 @@ def test_a_damaged_archive_of_a_complete_export_is_named(changing: Path, tmp_pat
     assert written(reopened(changing), out).written == SCENARIOS
     assert contents(out) == contents(written(reopened(changing), tmp_path / "fresh").folder)
     assert not list(tmp_path.rglob("kept.txt"))
-
-
-def test_an_export_beside_another(small: DeepAccident, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    class Beside(TinyFormat):
-        name = "beside"
-        beside = ("tiny",)
-
-    out = written(small, tmp_path / "out").folder
-    before = contents(out)
-    monkeypatch.setattr(Beside, "write", lambda *given: given[-1].tally.add(Tally(samples=1)))
-    monkeypatch.setattr(Beside, "finish", lambda *_: None)
-    written(small, out, Beside())
-    new = contents(out).keys() - before.keys()
-    assert new == {".deepaccident-beside.zip", "beside.manifest.json"}
-    assert written(small, out).kept == SCENARIOS
-    assert_refused(
-        (lambda: written(small, written(small, tmp_path / "other", Beside()).folder), ExportError, "is not empty")
-    )
 
 
 class TestRelease:
@@ -393,24 +316,6 @@ class TestRelease:
             path.unlink()
         assert written(reopened(changing), tmp_path / "out", form).written == 0
 
-    def test_parts_that_went_are_made_again_with_the_rest(self, changing: Path, tmp_path: Path) -> None:
-        out = written(reopened(changing), tmp_path / "out").folder
-        (out / ARCHIVE).unlink()
-        assert written(reopened(changing), out).written == 0
-        next(changing.glob("*/ego_vehicle/Camera_Front/*/*_002.jpg")).unlink()
-        assert written(reopened(changing), out).written == SCENARIOS
-
-    def test_the_working_folder_of_an_earlier_version_is_packed(self, changing: Path, tmp_path: Path) -> None:
-        """Version 1.0.0 left it in a complete export."""
-        out = written(reopened(changing), tmp_path / "out").folder
-        with zipfile.ZipFile(out / ARCHIVE) as archive:
-            archive.extractall(out / ".deepaccident-parts" / "kept" / "tiny")
-        (out / ARCHIVE).unlink()
-        assert written(reopened(changing), out).kept == SCENARIOS
-        next(changing.glob("*/ego_vehicle/Camera_Front/*/*_002.jpg")).unlink()
-        assert written(reopened(changing), out).written == 1
-        assert contents(out) == contents(written(reopened(changing), tmp_path / "fresh").folder)
-
     @pytest.mark.parametrize("moment", ["Store.drop", "Store.remove", "Manifest.write", "Export._remove_others"])
     def test_a_call_that_is_killed_as_it_packs_or_unpacks(self, changing: Path, tmp_path: Path, moment: str) -> None:
         name, method = moment.split(".")
@@ -422,14 +327,6 @@ class TestRelease:
             assert_refused((lambda: written(reopened(changing), out), KeyboardInterrupt, ()))
         assert written(reopened(changing), out).folder == out
         assert contents(out) == contents(written(reopened(changing), tmp_path / "fresh").folder)
-
-    def test_an_unfinished_export_is_continued_with_the_new_state(self, changing: Path, tmp_path: Path) -> None:
-        dataset = reopened(changing)
-        stopped(dataset, tmp_path / "out", 2)
-        edit_label(changing, dataset.scenario[0]["token"])
-        done = written(reopened(changing), tmp_path / "out")
-        assert (done.written, done.kept) == (2, 1)
-        assert contents(done.folder) == contents(written(reopened(changing), tmp_path / "fresh").folder)
 
     @pytest.mark.parametrize("units", [0, 1, 2])
     def test_nothing_is_left_of_what_went(self, changing: Path, tmp_path: Path, units: int) -> None:
@@ -444,16 +341,6 @@ class TestRelease:
         assert [record["num_frames"] for record in dataset.scenario] == [2, 3]
         done = written(dataset, tmp_path / "out")
         assert contents(done.folder) == contents(written(dataset, tmp_path / "fresh").folder)
-
-    def test_nothing_is_left_of_another_selection(self, small: DeepAccident, tmp_path: Path) -> None:
-        names = [record["token"].replace("/", " ") for record in small.scenario]
-        mine = tmp_path / "mine.txt"
-        mine.write_text("\n".join(names[:2]))
-        form = TinyFormat(split=mine)
-        stopped(small, tmp_path / "out", 1, form)
-        mine.write_text("\n".join(names[1:]))
-        done = written(small, tmp_path / "out", form)
-        assert contents(done.folder) == contents(written(small, tmp_path / "fresh", form).folder)
 
     def test_a_scenario_that_went_after_opening_is_told(self, changing: Path, tmp_path: Path) -> None:
         dataset = reopened(changing)
@@ -494,11 +381,6 @@ def test_splits_filters_and_agents_are_chosen(small: DeepAccident, tmp_path: Pat
     written(small, tmp_path / "out", TinyFormat(agents="Ego_Vehicle"))  # type: ignore[arg-type]
     pictures = {path.name for path in tmp_path.glob("out/folders/*/pictures/*")}
     assert pictures == {f"ego_vehicle-{number}.jpg" for number in (1, 2, 3)}
-
-
-def test_what_goes_to_workers_is_small(small: DeepAccident, tmp_path: Path) -> None:
-    """A release has 691 scenarios, and each job has it all."""
-    assert len(pickle.dumps(bulk.Export(small, TinyFormat(), tmp_path).write)) < 3000
 
 
 def test_a_file_that_cannot_be_read_costs_its_scenario(changing: Path, tmp_path: Path) -> None:
@@ -617,15 +499,6 @@ class TestDamage:
         assert contents(written(small, tmp_path / "out").folder) == whole
         assert kept.exists()
 
-    def test_a_second_journal_of_a_unit_removes_nothing(
-        self, small: DeepAccident, whole: Contents, tmp_path: Path
-    ) -> None:
-        """As a program leaves it that copies a folder over itself."""
-        stopped(small, tmp_path / "out", 2)
-        for journal in (tmp_path / "out" / ".deepaccident-parts" / "tiny").glob("*.paths"):
-            shutil.copy(journal, journal.with_name(f"{journal.name.removesuffix('.paths')} (1).paths"))
-        assert contents(written(small, tmp_path / "out").folder) == whole
-
 
 @pytest.fixture
 def source(tmp_path: Path) -> Path:
@@ -654,57 +527,14 @@ def test_files_are_noted_counted_and_whole(tmp_path: Path, source: Path) -> None
     output = output_of(tmp_path, note=noted.append)
     output.write("a/b.txt", b"12")
     with output.file("c.txt") as path:
-        assert noted[-1] == "c.txt"
         path.write_bytes(b"345")
     output.link(source, "d.jpg")
     with output.whole_folder("e/f") as folder:
         folder.write("g.txt", b"6")
         folder.link(source, "h/i.jpg")
-        assert not (tmp_path / "out" / "e" / "f").exists()
     assert noted == ["a/b.txt", "c.txt", "d.jpg", "e/f"]
     assert names(tmp_path / "out") == ["a/b.txt", "c.txt", "d.jpg", "e/f/g.txt", "e/f/h/i.jpg"]
     assert (output.tally.files, output.tally.bytes, output.tally.linked) == (3, 6, Counter(hard=2))
-
-
-def test_what_fails_is_absent(tmp_path: Path) -> None:
-    output = output_of(tmp_path)
-
-    def write_half() -> None:
-        with output.file("a.txt") as path:
-            path.write_bytes(b"12")
-            raise ValueError("no more")
-
-    def write_half_a_folder() -> None:
-        with output.whole_folder("b") as folder:
-            folder.write("c.txt", b"12")
-            raise ValueError("no more")
-
-    assert_refused((write_half, ValueError, "no more"), (write_half_a_folder, ValueError, "no more"))
-    assert not list((tmp_path / "out").iterdir())
-
-
-def test_a_whole_folder_takes_the_place_of_an_older_one(tmp_path: Path) -> None:
-    for name in ("old.txt", "new.txt"):
-        with output_of(tmp_path).whole_folder("a") as folder:
-            folder.write(name, b"")
-    assert names(tmp_path / "out") == ["a/new.txt"]
-
-
-def test_leftovers_beside_a_whole_folder_are_removed(tmp_path: Path) -> None:
-    left = temporary_path(tmp_path / "out" / "b" / "a").with_name(
-        temporary_path(tmp_path / "a").name.replace(f"-{os.getpid()}-", "-4194305-")
-    )
-    left.mkdir(parents=True)
-    with output_of(tmp_path).whole_folder("b/a") as folder:
-        folder.write("new.txt", b"")
-    assert list(left.parent.iterdir()) == [left.parent / "a"]
-
-
-def test_leaving_out_counts(tmp_path: Path) -> None:
-    output = output_of(tmp_path)
-    for left_out in (("clouds", 2), ("clouds", 0), ("clouds", 3), ("maps", 0), ("boxes",)):
-        output.leave_out(*left_out)
-    assert output.tally.left_out == Counter(clouds=5, boxes=1)
 
 
 class TestLinks:
@@ -737,19 +567,6 @@ class TestLinks:
             (tmp_path / "out" / "a.jpg").is_symlink(),
             (tmp_path / "out" / "b.jpg").is_symlink(),
         ) == (Counter(symbolic=1, copy=1), True, False)
-
-    def test_a_copy_where_a_symbolic_link_would_tell_a_path(
-        self, tmp_path: Path, source: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        output = output_of(tmp_path)
-        output.link(source, "a.jpg", symbolic=False)
-        monkeypatch.setattr(os, "link", refusing(errno.EXDEV))
-        output.link(source, "b.jpg", symbolic=False)
-        assert (
-            output.tally.linked,
-            (tmp_path / "out" / "b.jpg").is_symlink(),
-            (tmp_path / "out" / "b.jpg").read_bytes(),
-        ) == (Counter(hard=1, copy=1), False, source.read_bytes())
 
     @pytest.mark.parametrize("link", ["hard", "symbolic"])
     def test_a_full_disk_is_no_reason_for_another_way(
@@ -859,79 +676,42 @@ def test_nothing_to_write(small: DeepAccident, tmp_path: Path, form: Format, tol
     assert not list(tmp_path.iterdir())
 
 
-KILLS = {1: 16, 2: 4}
-BESIDE = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
-"""The environment of a process that imports what the tests import."""
-Job = Callable[..., dict[str, Any]]
-
-
-@pytest.fixture(scope="module")
-def job(small_root: Path) -> Iterator[Job]:
-    command = [sys.executable, killed.__file__, "tiny_format"]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=BESIDE) as server:
-        assert server.stdin is not None and server.stdout is not None  # noqa: PT018 - for the type checker
-        asked, answers = server.stdin, server.stdout
-
-        def run(folder: Path, workers: int = 1, **how: object) -> dict[str, Any]:
-            """Export in the tests' own format, or by the command line that is given as `words`."""
-            call = {"function": ["tiny_format", "export_tiny"], "arguments": [str(small_root), str(folder), workers]}
-            asked.write(json.dumps({**({} if "words" in how else call), **how}) + "\n")
-            asked.flush()
-            answer: dict[str, Any] = json.loads(answers.readline())
-            return answer
-
-        yield run
-        asked.close()
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("after", [False, True])
 def test_killed_around_every_renaming_and_removal(
-    small: DeepAccident, tmp_path: Path, job: Job, whole: Contents, after: bool
+    small: DeepAccident, small_root: Path, tmp_path: Path, whole: Contents, after: bool
 ) -> None:
-    step = 0
-    while job(tmp_path / str(step), step=step, after=after)["status"] == -9:
-        export_release(small, tmp_path / str(step), TinyFormat(), workers=1)
-        assert contents(tmp_path / str(step)) == whole, step
-        step += 1
+    command = [sys.executable, killed.__file__, "tiny_format"]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment) as server:
+        asked: Any = server.stdin
+        answers: Any = server.stdout
+
+        def status(step: int) -> int:
+            """Of an export that is killed around its operation of that number."""
+            call = {"function": ["tiny_format", "export_tiny"], "step": step, "after": after}
+            asked.write(json.dumps({**call, "arguments": [str(small_root), str(tmp_path / str(step)), 1]}) + "\n")
+            asked.flush()
+            return int(json.loads(answers.readline())["status"])
+
+        step = 0
+        while status(step) == -9:
+            written(small, tmp_path / str(step))
+            assert contents(tmp_path / str(step)) == whole, step
+            step += 1
+        asked.close()
     assert step > 40
     assert contents(tmp_path / str(step)) == whole
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["opencood", "nuscenes"])
-def test_a_format_killed_at_twenty_moments(
-    small_root: Path, tmp_path: Path, job: Job, monkeypatch: pytest.MonkeyPatch, name: str
-) -> None:
-    def words(out: str) -> list[str]:
-        own = ["--without-clouds"] if name == "opencood" else []
-        return ["export", name, str(small_root), "--workers", "1", "--out", str(tmp_path / out), *own]
-
-    renamed, replace = [], os.replace
-    with monkeypatch.context() as patch:
-        patch.setattr(os, "replace", lambda source, target: (renamed.append(target), replace(source, target)))
-        assert CliRunner().invoke(deepaccident, words("whole"), catch_exceptions=False).exit_code == 0
-    whole = contents(tmp_path / "whole")
-    for moment in range(20):
-        out, step = str(moment), moment * (len(renamed) - 1) // 19
-        assert job(tmp_path / out, words=words(out), step=step, after=bool(moment % 2))["status"] == -9
-        assert contents(tmp_path / out) != whole or moment == 19  # killed after the last renaming
-        assert job(tmp_path / out, words=words(out))["status"] == 0
-        assert contents(tmp_path / out) == whole, moment
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("workers", KILLS)
-def test_killed_at_random_moments(tmp_path: Path, job: Job, whole: Contents, workers: int) -> None:
-    source, kills, stages = random.Random(workers), 0, set()  # noqa: S311 - the same moments every time
-    seconds = job(tmp_path / "timed", workers)["seconds"]
-    for attempt in range(4 * KILLS[workers]):
-        out = tmp_path / str(attempt)
-        kills += job(out, workers, delay=source.uniform(0, seconds))["status"] == -9
-        stages.add(sum(len(files) for _, _, files in os.walk(out)))  # workers may still be ending
-        assert job(out)["status"] == 0
-        assert contents(out) == whole, attempt
-        if kills == KILLS[workers]:
-            break
-    assert kills == KILLS[workers]
-    assert len(stages) > 1  # the kills did not all fall into one moment
+def test_a_dry_run_writes_nothing_and_counts_what_is_left(small: DeepAccident, tmp_path: Path) -> None:
+    done = written(small, tmp_path / "out", dry_run=True)
+    assert (done.written, done.kept, done.tally.samples, done.tally.files) == (SCENARIOS, 0, PICTURES, 5 * SCENARIOS)
+    copies = written(small, tmp_path / "out", TinyFormat(link="copy"), dry_run=True)
+    assert (sum(done.tally.linked.values()), copies.tally.linked) == (PICTURES, {"copy": PICTURES})
+    pictures = sum(path.stat().st_size for path in small.dataroot.glob("*/*/Camera_Front/*/*.jpg"))
+    assert copies.tally.bytes == pytest.approx(done.tally.bytes + pictures, rel=0.1)
+    assert not list(tmp_path.iterdir())
+    stopped(small, tmp_path / "out", 2)
+    left = written(small, tmp_path / "out", dry_run=True)
+    assert (left.written, left.kept, left.tally.samples) == (1, 2, PICTURES // 3)

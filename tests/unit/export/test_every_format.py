@@ -25,6 +25,8 @@ from deepaccident_devkit.export.webdataset import WebDataset
 from deepaccident_devkit.release.images import write_image
 from deepaccident_devkit.testing import SmallRelease, write_small_release
 
+pytestmark = pytest.mark.slow
+
 SIZE = (20, 30)
 Found = dict[str, tuple[Any, tuple[int, int] | None]]
 """Camera → K and, where the format has it, the size."""

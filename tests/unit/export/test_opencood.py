@@ -1,9 +1,6 @@
 """OPV2V's folders, read by a reader that knows OpenCOOD's conventions; CARLA's poses against its own formula."""
 
-import json
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -46,15 +43,14 @@ def expected_counts(da: DeepAccident, sample: str) -> dict[int, int]:
     return dict(zip(boxes.actor_id[kept].tolist(), boxes.num_lidar_pts[kept].tolist(), strict=True))
 
 
-def disagreement(da: DeepAccident, scenario: Path, changed: Callable[[dict[str, Any]], dict[str, Any]]) -> float:
-    """The share of boxes in which a reader finds another number of points than the labels say, after a change."""
+def disagreement(da: DeepAccident, scenario: Path) -> float:
+    """The share of boxes in which a reader finds another number of points than the labels say."""
     token, wrong, total = scenario.name.replace("__", "/", 1), 0, 0
     for place, agent in PLACES.items():
         for timestamp in timestamps_of(scenario, place):
-            facts = dict(facts_of(scenario, place, timestamp))
-            vehicles = {actor: {**each, **changed(each)} for actor, each in facts["vehicles"].items()}
+            facts = facts_of(scenario, place, timestamp)
             expected = expected_counts(da, f"{token}/{agent}/{int(timestamp):03d}")
-            found = counts_of({**facts, "vehicles": vehicles}, points_of(scenario, place, timestamp))
+            found = counts_of(facts, points_of(scenario, place, timestamp))
             assert found.keys() == expected.keys()
             wrong += sum(abs(found[actor] - count) > 1 + 0.02 * count for actor, count in expected.items())
             total += len(expected)
@@ -63,20 +59,7 @@ def disagreement(da: DeepAccident, scenario: Path, changed: Callable[[dict[str, 
 
 
 def test_boxes_hold_the_points_that_their_labels_count(da: DeepAccident, scenario: Path) -> None:
-    assert disagreement(da, scenario, lambda _: {}) == 0
-
-
-@pytest.mark.parametrize(
-    "changed",
-    [
-        lambda vehicle: {name: vehicle[name] * np.array([1, -1, 1]) for name in ("location", "angle")},
-        lambda vehicle: {"angle": np.radians(vehicle["angle"])},
-        lambda vehicle: {"extent": 2 * np.array(vehicle["extent"])},
-    ],
-    ids=["flipped y", "radians", "full extents"],
-)
-def test_the_reader_sees_a_wrong_convention(da: DeepAccident, scenario: Path, changed: Callable[..., Any]) -> None:
-    assert disagreement(da, scenario, changed) > 0.2
+    assert disagreement(da, scenario) == 0
 
 
 def test_agents_share_a_world(scenario: Path) -> None:
@@ -119,12 +102,6 @@ def test_images_are_links_to_those_of_the_release(da: DeepAccident, scenario: Pa
     assert exported.tally.linked == {"hard": len(list(exported.folder.rglob("*.png")))}
 
 
-def test_assignment_of_heal_names_every_folder(exported: Exported) -> None:
-    found = json.loads((exported.folder / "heter_modality_assign.json").read_text())
-    assert sorted(found) == sorted(path.parent.name for path in exported.folder.glob("*/*/data_protocol.yaml"))
-    assert all(agents == dict.fromkeys(PLACES, "m1") for agents in found.values())
-
-
 def test_splits_have_their_folders(da: DeepAccident, exported: Exported) -> None:
     theirs = {"train": "train", "val": "validate", "test": "test"}
     found = {
@@ -139,7 +116,6 @@ def test_ego_can_be_another_vehicle_and_classes_more(da: DeepAccident, tmp_path:
     form = OpenCood(ego="other_vehicle", classes=("pedestrian", "car"), agents=agents, where=chosen)
     (folder,) = export_release(da, tmp_path / "out", form).folder.glob("train/*")
     assert agents_of(folder) == ["1", "2"]
-    assert "name: other_vehicle" in (folder / "data_protocol.yaml").read_text().split("'2'")[0]
     actors = {actor for sample in (1, 2) for actor in facts_of(folder, str(sample), "000006")["vehicles"]}
     walkers = da.boxes(f"{token}/ego_vehicle/006")
     seen = walkers.actor_id[(np.array(walkers.category_names) == "pedestrian") & (walkers.num_lidar_pts > 0)]
@@ -178,7 +154,6 @@ def test_all_agents_have_the_same_moments_and_each_its_cloud(
                 path.unlink()
     dataset = DeepAccident("v1", tmp_path / "release", verbose=False)
     whole = export_release(dataset, tmp_path / "whole", OpenCood(without_clouds=True), workers=1)
-    assert whole.tally.samples == 6 * len(dataset.scenario)
     if not agents:
         assert_refused(
             (
@@ -238,11 +213,3 @@ def test_a_carla_transform_there_and_back(roll: float, yaw: float, pitch: float,
 def test_a_pose_there_and_back(pose: np.ndarray) -> None:
     """Also near pitches of 90°, where angles are not unique; arcsin is flat there, and keeps eight digits."""
     assert_allclose(flip_pose(carla_matrix(*carla_six(pose))), pose, rtol=0, atol=1e-7)
-
-
-def test_directions_are_carlas() -> None:
-    """Ahead and to the left by 1 m, turned to the left and nose up: y, yaw and pitch of CARLA's sign."""
-    turned, raised = np.eye(4), np.eye(4)
-    turned[:3, 3], turned[:2, :2] = (1, 1, 0), [[0, -1], [1, 0]]
-    raised[:3, :3] = [[np.sqrt(0.5), 0, -np.sqrt(0.5)], [0, 1, 0], [np.sqrt(0.5), 0, np.sqrt(0.5)]]
-    assert_allclose(carla_six([turned, raised]), [[1, -1, 0, 0, -90, 0], [0, 0, 0, 0, 0, 45]], atol=1e-9)

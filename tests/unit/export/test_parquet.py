@@ -1,6 +1,5 @@
 """The tables as Parquet files: their rows are the records, whatever the shards."""
 
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +11,6 @@ from click.testing import CliRunner
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.cli import deepaccident
-from deepaccident_devkit.export import parquet
 from deepaccident_devkit.export.bulk import Exported, export_release
 from deepaccident_devkit.export.format import SPLIT_NAMES
 from deepaccident_devkit.export.parquet import Parquet
@@ -65,25 +63,12 @@ def test_rows_are_the_records_in_shards_of_any_size(
     assert made.tally.samples == len(both_layouts.sample)
 
 
-def test_groups_of_rows_bound_the_memory(da: DeepAccident, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(parquet, "ROW_GROUP_SIZE", 100)
-    folder = export(da, tmp_path / "out").folder
-    assert_all_rows(da, folder)
-    footers = [pq.read_metadata(path) for path in (folder / "annotation").iterdir()]
-    sizes = [footer.row_group(group).num_rows for footer in footers for group in range(footer.num_row_groups)]
-    assert (max(sizes), sum(sizes)) == (100, len(da.annotation))
-
-
 def test_columns_are_plain(da: DeepAccident, tmp_path: Path) -> None:
     folder = export(da, tmp_path / "out").folder
     for table in table_names():
         for field in pq.read_schema(next((folder / table).iterdir())):
             assert not pa.types.is_dictionary(field.type), (table, field)
             assert not field.name.endswith("_row"), (table, field)
-    schema = pq.read_schema(next((folder / "ego_pose").iterdir()))
-    assert (schema.field("translation").type.list_size, schema.field("matrix").type.value_type.list_size) == (3, 4)
-    scenario = pq.read_schema(next((folder / "scenario").iterdir()))
-    assert pa.types.is_list(scenario.field("collision").type.field("ids").type)  # can be null: of no fixed size
 
 
 def test_only_what_the_agents_recorded(da: DeepAccident, tmp_path: Path) -> None:
@@ -95,7 +80,6 @@ def test_only_what_the_agents_recorded(da: DeepAccident, tmp_path: Path) -> None
         if table in RECORDED:
             wanted = {token for token in wanted if token.split("/")[2] in chosen}
         assert {row["token"] for row in rows_of(made.folder, table)} == wanted
-    assert "as recorded by ego_vehicle, infrastructure." in (made.folder / "README.md").read_text()
 
 
 def test_a_partial_release_has_the_rows_that_are_there(da_partial: DeepAccident, tmp_path: Path) -> None:
@@ -111,32 +95,6 @@ def test_a_table_without_rows_has_no_file(unlabelled: DeepAccident, tmp_path: Pa
     _, head, body = (folder / "README.md").read_text().split("---\n", maxsplit=2)
     named = {config["config_name"] for config in yaml.safe_load(head)["configs"]}
     assert (named, "Here: no rows." in body) == (set(table_names()) - {"annotation", "instance", "track"}, True)
-
-
-def test_scenarios_without_a_split_are_called_unknown(da: DeepAccident, tmp_path: Path) -> None:
-    root = tmp_path / "release"
-    shutil.copytree(da.dataroot, root, ignore=shutil.ignore_patterns(".deepaccident", "*.jpg", "*.npz"))
-    for path in root.glob("*.txt"):
-        path.unlink()
-    dataset = DeepAccident("v1", root, verbose=False)
-    folder = export(dataset, tmp_path / "out").folder
-    assert_all_rows(dataset, folder)
-    assert {path.name for path in (folder / "track").iterdir()} == {"unknown-00000-of-00001.parquet"}
-
-
-def test_readme_names_the_files_of_every_table(da: DeepAccident, tmp_path: Path) -> None:
-    folder = export(da, tmp_path / "out").folder
-    _, head, body = (folder / "README.md").read_text().split("---\n", maxsplit=2)
-    named = []
-    for config in yaml.safe_load(head)["configs"]:
-        found = config["data_files"]
-        patterns = [found] if isinstance(found, str) else [each["path"] for each in found]
-        named += [path for pattern in patterns for path in folder.glob(pattern)]
-    assert sorted(named) == sorted(folder.glob("*/*.parquet"))
-    for table in table_names():
-        assert f"\n## {table}\n" in body
-        assert all(f"\n| `{field}` | " in body for field in getattr(da, table)[0])
-    assert f"{len(told(da, 'sample')['train'])} rows in train" in body
 
 
 def test_on_the_command_line(da: DeepAccident, tmp_path: Path) -> None:

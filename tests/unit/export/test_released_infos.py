@@ -20,9 +20,6 @@ from deepaccident_devkit.export.released_infos import ReleasedInfos
 from deepaccident_devkit.taxonomy import AGENTS
 
 Info = dict[str, Any]
-FLIPPED, IN_DEGREES = (1, -1, 1, 1, 1, 1, -1), (1, 1, 1, 1, 1, 1, 180 / np.pi)
-HALF_EXTENTS = (1, 1, 1, 0.5, 0.5, 0.5, 1)
-"""Wrong conventions, as factors of a box's seven numbers."""
 FOLDER = "./data/DeepAccident_data"
 
 
@@ -45,13 +42,13 @@ def points_in(box: np.ndarray, points: np.ndarray) -> int:
     return int(((np.abs(along) <= length) & (np.abs(across) <= width) & (np.abs(z) <= height)).sum())
 
 
-def disagreement(da: DeepAccident, found: list[Info], factors: Any = 1) -> float:
+def disagreement(da: DeepAccident, found: list[Info]) -> float:
     """The share of seen boxes whose points in the release's own clouds are not as many as the labels say."""
     wrong = total = 0
     for info in found:
         with np.load(da.dataroot / Path(info["lidar_path"]).relative_to("data/DeepAccident_data")) as archive:
             points = next(iter(archive.values()))[:, :3]
-        boxes = info["gt_boxes"] * factors
+        boxes = info["gt_boxes"]
         seen = info["num_lidar_pts"] > 0
         counts = np.array([points_in(box, points) for box in boxes[seen]])
         wrong += int((np.abs(counts - info["num_lidar_pts"][seen]) > 1 + 0.02 * info["num_lidar_pts"][seen]).sum())
@@ -64,11 +61,6 @@ def test_boxes_hold_the_points_that_their_labels_count(da: DeepAccident, exporte
     assert disagreement(da, infos(exported.folder)) == 0
 
 
-@pytest.mark.parametrize("factors", [FLIPPED, IN_DEGREES, HALF_EXTENTS])
-def test_the_reader_sees_a_wrong_convention(da: DeepAccident, exported: Exported, factors: tuple[float, ...]) -> None:
-    assert disagreement(da, infos(exported.folder), factors) > 0.2
-
-
 def test_every_agents_keyframes_are_there_in_order(da: DeepAccident, exported: Exported) -> None:
     for split in ("train", "val"):
         found = infos(exported.folder, split)
@@ -78,8 +70,6 @@ def test_every_agents_keyframes_are_there_in_order(da: DeepAccident, exported: E
         ) == sorted(
             (f"{record['scenario_type']}/{agent}", number) for record in here for agent in AGENTS for number in (1, 6)
         )
-        prefixes = [info["lidar_prefix"] for info in found]
-        assert prefixes == sorted(prefixes)
     assert exported.tally.samples == 2 * len(AGENTS) * len(da.scenario)
 
 
@@ -89,27 +79,6 @@ def test_mini_splits_have_files_of_their_own(da: DeepAccident, exported: Exporte
     assert content["metadata"] == {"version": "v1.0-mini"}
     expected = {token.split("/")[0] for token in da.split_scenarios(split)}
     assert {info["scenario_type"] for info in content["infos"]} == expected
-
-
-def test_velocities_are_the_labels_own_but_for_a_sign(da: DeepAccident, exported: Exported) -> None:
-    info = infos(exported.folder)[0]
-    path = da.dataroot / info["scenario_type"] / info["vehicle_name"] / "label"
-    (label,) = path.glob(f"*/{info['lidar_prefix'].partition('vehicle_')[2]}.txt")
-    speeds, *lines = [line.split() for line in label.read_text().splitlines()]
-    assert [info["vehicle_speed_x"], info["vehicle_speed_y"]] == list(map(float, speeds))
-    np.testing.assert_array_equal(info["gt_velocity"], [[float(line[8]), -float(line[9])] for line in lines])
-    assert info["gt_names"].tolist() == [line[0] for line in lines]
-
-
-def test_scenarios_without_all_agents_are_left_out_and_counted(
-    da: DeepAccident, release_root: Path, tmp_path: Path
-) -> None:
-    lacking, *_ = (record["token"] for record in da.scenario if record["split"] == "train")
-    shutil.copytree(release_root, tmp_path / "release", ignore=shutil.ignore_patterns(".deepaccident"))
-    for folder in (tmp_path / "release").glob(lacking.replace("/", "/infrastructure/*/")):
-        shutil.rmtree(folder)
-    made = export_release(DeepAccident("v1", tmp_path / "release", verbose=False), tmp_path / "out", ReleasedInfos())
-    assert made.tally.left_out["scenarios without all five agents"] == 1
 
 
 def test_scenarios_of_no_split_or_without_labels_are_left_out_and_counted(own_release: Path, tmp_path: Path) -> None:
@@ -136,8 +105,6 @@ def test_paths_lead_to_the_files_in_either_layout(
             ".npz", ".pkl"
         )
         assert calib.is_file()
-        images = {camera: each["image_path"] for camera, each in info["cams"].items()}
-        assert images == {camera: path.replace("lidar01", camera).replace(".npz", ".jpg") for camera in images}
 
 
 @pytest.mark.parametrize("drop", [False, True])

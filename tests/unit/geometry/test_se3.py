@@ -40,15 +40,6 @@ def test_stored_transforms_have_the_last_row_of_every_transform() -> None:
         assert_array_equal(stored_transforms(np.tile(pose.ravel()[:kept], (2, 5, 1))), np.tile(pose, (2, 5, 1, 1)))
 
 
-def test_the_matrix_is_a_read_only_copy_and_the_callers_stays_writable() -> None:
-    mine = np.eye(4)
-    pose = SE3(mine)
-    mine[0, 3] = 5
-    assert pose.translation[0] == 0
-    for array in (pose.matrix, pose.rotation, pose.translation, pose.inverse().matrix, (pose @ pose).matrix):
-        assert not array.flags.writeable
-
-
 @pytest.mark.parametrize(
     ("fault", "message"),
     [

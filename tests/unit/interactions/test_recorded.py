@@ -52,12 +52,6 @@ def test_gaps_are_bridged_and_one_frame_is_enough() -> None:
     assert pet(once, straight(60, 0, 9, 10)) == math.inf
 
 
-def test_yaw_turns_the_shorter_way() -> None:
-    assert pieces_of(track([(0.0, 0.0, math.pi - 0.01), (0.0, 0.0, -math.pi + 0.01)])).boxes[0, 4] == pytest.approx(
-        math.pi
-    )
-
-
 speeds, places = st.floats(0, 12), st.floats(-12, 12)
 paths = st.tuples(places, places, speeds, st.floats(-180, 180))
 

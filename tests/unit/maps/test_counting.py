@@ -98,10 +98,6 @@ def test_what_is_no_setting() -> None:
         assert_refused((partial(TownMapConfig, **{name: value}), ConfigError, (f"{name}: expected", *told)))
 
 
-def test_whole_numbers_are_taken_for_the_same_setting() -> None:
-    assert repr(TownMapConfig(travel=20)) == repr(TownMapConfig(travel=20.0))
-
-
 @pytest.fixture
 def street() -> np.ndarray:
     """A street of 20 × 40 cells with a sidewalk of 8 more rows; cells of 1 m."""
@@ -134,32 +130,9 @@ def test_large_holes_and_those_at_the_edge_stay(street: np.ndarray) -> None:
     assert (hidden_ground(street, 0.9) > 0).sum() == 64
 
 
-def test_nothing_seen_and_all_seen() -> None:
-    for seen in (0, 2):
-        assert not hidden_ground(np.full((5, 5), seen, np.uint8), 1.0).any()
-
-
-def test_who_stands_is_read_every_two_seconds_and_at_the_end() -> None:
-    assert chosen_frames(np.zeros((45, 2)), TownMapConfig()).tolist() == [0, 20, 40, 44]
-    assert chosen_frames(np.zeros((1, 2)), TownMapConfig()).tolist() == [0]
-
-
 def test_who_drives_is_read_every_ten_metres() -> None:
     xy = np.column_stack([np.arange(14) * 3.0, np.arange(14) * 4.0])  # 5 m a frame
     assert chosen_frames(xy, TownMapConfig()).tolist() == [0, 2, 4, 6, 8, 10, 12, 13]
-
-
-@given(st.lists(st.floats(0, 3), min_size=1, max_size=90), st.floats(1, 30), st.floats(0.3, 4))
-def test_between_two_pictures_nothing_is_far(speeds: list[float], travel: float, period: float) -> None:
-    """A picture is due in each stretch of the way and of time, so that two of them are at most two stretches apart."""
-    travelled = np.concatenate([[0.0], np.cumsum(speeds)])
-    config = TownMapConfig(travel=travel, period=period)
-    frames = chosen_frames(np.column_stack([travelled, 0 * travelled]), config)
-    assert (frames[0], frames[-1]) == (0, len(travelled) - 1)
-    gaps = np.diff(frames)
-    assert (gaps > 0).all()
-    assert (gaps * 0.1 <= period + 0.1 + 1e-6).all()
-    assert (np.diff(travelled[frames]) <= travel + 3 + 1e-6).all()
 
 
 def test_the_looks_are_the_agents_own_samples_with_their_poses(da: DeepAccident) -> None:

@@ -45,16 +45,6 @@ def test_a_batch_read_back_is_the_same_labels(names, orientation) -> None:
     assert MotionLabels.from_batch(labels.as_batch(names), labels.config, names, at_present=True).at_present
 
 
-@pytest.mark.parametrize("orientation", ["devkit", "released", "fiery"])
-@pytest.mark.parametrize("names", NAMES)
-def test_a_batch_is_ones_own(names, orientation) -> None:
-    labels = made(orientation=orientation)
-    for array in labels.as_batch(names).values():
-        array[...] = 7
-    assert_array_equal(labels.instance, made(orientation=orientation).instance)
-    assert_array_equal(labels.future_egomotion, made(orientation=orientation).future_egomotion)
-
-
 def test_fierys_batch() -> None:
     """Rows ahead, past frames in front (empty), segmentation with a channel."""
     labels = made(orientation="fiery")

@@ -88,13 +88,6 @@ def test_unknown_classes_are_refused() -> None:
     )
 
 
-def test_results_are_read_only() -> None:
-    targets = segmentation_of(_image(), BevGrid())
-    assert targets.masks.shape == (len(BEV_CLASSES), 200, 200)
-    with pytest.raises(ValueError, match="read-only"):
-        targets.masks[0, 0, 0] = True
-
-
 def test_of_a_sample_the_ground_is_augmented_too(da: DeepAccident) -> None:
     sample, augmentation = da.sample[3], Augmentation(rotation=math.radians(90), flip=True)
     mine = bev_segmentation(da, sample, augmentation=augmentation)

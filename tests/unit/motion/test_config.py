@@ -152,19 +152,6 @@ def test_the_same_said_otherwise_is_equal_and_has_the_same_digest(mine, theirs) 
     assert MotionLabelConfig.from_dict(json.loads(json.dumps(one.as_dict()))) == one
 
 
-def test_a_callers_list_of_agents_is_not_kept() -> None:
-    agents = ["ego_vehicle"]
-    config = MotionLabelConfig(agents=agents)
-    agents.append("infrastructure")
-    assert config.agents == ("ego_vehicle",)
-
-
-def test_presets_and_protocols_cannot_be_changed() -> None:
-    for table in (PRESETS, LABEL_PROTOCOLS):
-        with pytest.raises(TypeError, match="does not support item assignment"):
-            table["mine"] = table["fiery"]
-
-
 def test_a_configuration_may_be_named() -> None:
     assert (resolved_label_config("fiery"), resolved_label_config(None)) == (PRESETS["fiery"], MotionLabelConfig())
     assert resolved_label_config(PRESETS["beverse"]) is PRESETS["beverse"]

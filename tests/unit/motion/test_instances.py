@@ -1,6 +1,6 @@
 """Each rule of reading instances off maps by itself; that all of them together are the released code's, parity says."""
 
-from dataclasses import FrozenInstanceError, astuple, replace
+from dataclasses import astuple, replace
 
 import numpy as np
 import pytest
@@ -171,19 +171,6 @@ def test_trajectories_undo_the_half_cell() -> None:
     )
 
 
-def test_results_cannot_be_changed_and_own_nobodys_arrays() -> None:
-    heads = drawn({(5, 5): (0, 0)})
-    linked = predict_instances(heads, "accident")
-    for array in (linked.instance, linked.frame_instance, linked.redrawn, linked.paths[1].centers, heads.flow):
-        with pytest.raises(ValueError, match="read-only"):
-            array[:] = 0
-    with pytest.raises(FrozenInstanceError):
-        linked.settings = PostProcessing()
-    mine = np.zeros((1, 2, 3, 4), dtype=np.float32)
-    MotionHeads(segmentation=mine, centerness=mine[:, :1], offset=mine, flow=mine)
-    mine[:] = 1
-
-
 def test_settings_that_cannot_be() -> None:
     assert post_processing("motion") == PostProcessing()
     assert_refused(
@@ -245,11 +232,6 @@ def test_the_named_settings_written_out() -> None:
         "fiery": ("argmax", True, 0.1, 100, "fiery", 3.0, False),
     }
     assert (FOREGROUND_THRESHOLD, LABEL_LOGIT) == (0.4, 10.0)
-    heads = drawn({(5, 5): (0, 0)}, orientation="devkit")
-    assert repr(heads) == "MotionHeads(1 frames of 30 × 40 cells, devkit)"
-    assert (
-        MotionHeads.from_arrays(heads.segmentation, heads.centerness, heads.offset, heads.flow).orientation == "devkit"
-    )
 
 
 @pytest.mark.parametrize(("move", "turns"), [(3, False), (4, True)])
@@ -276,35 +258,12 @@ def test_the_smallest_redrawn_box_has_three_cells_a_side_and_stays_in_the_grid()
     assert_array_equal(found, expected)
 
 
-class Tensor:
-    """As a tensor of another framework: an array by one protocol, or a reason why not."""
-
-    def __init__(self, values: np.ndarray, error: Exception | None = None) -> None:
-        self.values, self.error = values, error
-
-    def __array__(self, dtype=None, copy=None) -> np.ndarray:
-        if self.error is not None:
-            raise self.error
-        return self.values
-
-
-class OnlyDlpack:
-    def __init__(self, values: np.ndarray) -> None:
-        self.values = values
-
-    def __dlpack__(self, **options):
-        return self.values.__dlpack__()
-
-    def __dlpack_device__(self) -> tuple[int, int]:
-        return self.values.__dlpack_device__()
-
-
 def test_heads_come_from_anything_that_holds_an_array() -> None:
     heads = drawn({(5, 5): (0, 0)}, {(5, 6): (0, 0)}, orientation="devkit")
     maps = [np.array(array) for array in (heads.segmentation, heads.centerness, heads.offset, heads.flow)]
     maps[1] = maps[1][:, 0]
     expected = predict_instances(heads).instance
-    for wrap in (np.asarray, np.ndarray.tolist, Tensor, OnlyDlpack, lambda array: array.astype(np.float16)):
+    for wrap in (np.asarray, np.ndarray.tolist, lambda array: array.astype(np.float16)):
         assert_array_equal(predict_instances(MotionHeads.from_arrays(*map(wrap, maps))).instance, expected)
         names = ("segmentation", "centerness", "offset", "flow")
         by_name = MotionHeads(**{name: wrap(values) for name, values in zip(names, maps, strict=True)})
@@ -317,13 +276,6 @@ def test_heads_that_cannot_be() -> None:
     good = np.zeros((2, 2, 3, 4), dtype=np.float32)
     heat = good[:, :1]
     assert_refused(
-        (
-            lambda: MotionHeads.from_arrays(
-                good, heat, good, Tensor(good, RuntimeError("Can't call numpy() on Tensor that …"))
-            ),
-            GeometryError,
-            r"flow: expected numbers, found Tensor .*detach\(\)\.cpu\(\)",
-        ),
         (
             lambda: MotionHeads.from_arrays(good, heat, good.astype("U1"), good),
             GeometryError,

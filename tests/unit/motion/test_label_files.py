@@ -5,7 +5,6 @@ import operator
 import os
 import pickle
 import random
-import re
 import shutil
 import subprocess
 import sys
@@ -52,12 +51,9 @@ from deepaccident_devkit.motion.batch_names import BatchNames
 from deepaccident_devkit.motion.label_folder import (
     LABEL_FORMAT_VERSION,
     MANIFEST,
-    NOBODY,
-    NOWHERE,
     LabelManifest,
     StoredLabels,
     label_store,
-    write_array,
 )
 from deepaccident_devkit.support.files import replacing, temporary_path
 from deepaccident_devkit.taxonomy import AGENTS
@@ -200,12 +196,6 @@ def test_more_instances_than_a_byte_counts(tmp_path: Path, count: int) -> None:
     assert_same(stored.labels(config), labels)
 
 
-def test_ids_that_came_from_a_sample_before(small: DeepAccident) -> None:
-    before = motion_labels(small, tokens_of(small, 1)[0]).id_map
-    labels = motion_labels(small, tokens_of(small, 12)[0], id_map={**before, 77: 400})
-    assert_same(StoredLabels.of(labels).labels(labels.config), labels)
-
-
 @pytest.mark.slow
 def test_bytes_do_not_depend_on_time_workers_or_order(da_motion: DeepAccident, tmp_path: Path) -> None:
     tokens = tokens_of(da_motion, 5, 30)
@@ -218,13 +208,12 @@ def test_bytes_do_not_depend_on_time_workers_or_order(da_motion: DeepAccident, t
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["deepaccident", "fiery", "clean", "released orientation", "oblong, as fiery"])
+@pytest.mark.parametrize("name", ["deepaccident", "oblong, as fiery"])
 def test_the_lines_of_the_page_rebuild_the_maps(da_motion: DeepAccident, tmp_path: Path, name: str) -> None:
     """With numpy alone, to the bit; a sample in the midst and one whose future is beyond the recording."""
     _, _, rest = PAGE.read_text(encoding="utf-8").partition("```python\n")
     lines, fence, _ = rest.partition("```")
     assert fence
-    assert "deepaccident" not in lines
     tokens = tokens_of(da_motion, 15, 27, agents=("other_vehicle",))
     write(da_motion, tmp_path, tokens, CONFIGS[name])
     for token in tokens:
@@ -250,24 +239,6 @@ def test_the_loop_of_the_page_reads_batches(small: DeepAccident, out: Path, name
     assert {key: (array.dtype, array.shape[1:]) for key, array in run["batch"].items()} == {
         key: (array.dtype, array.shape) for key, array in expected.items()
     }
-    axes, page = {5: "T", 7: "R", 200: "H"}, PAGE.read_text(encoding="utf-8")
-    for key, array in expected.items():
-        shape = str(tuple(axes.get(length, length) for length in array.shape)).replace("'", "")
-        assert f"`{key}` {shape.replace('H, H', 'H, W')}" in page
-
-
-def test_the_page_names_every_member_and_key(da_motion: DeepAccident, tmp_path: Path) -> None:
-    page, token = PAGE.read_text(encoding="utf-8"), tokens_of(da_motion, 15)[0]
-    write(da_motion, tmp_path, [token])
-    recording, frame = token.rsplit("/", 1)
-    with zipfile.ZipFile(tmp_path / f"{recording}.npz") as archive:
-        for name in archive.namelist():
-            assert f"| `{name.replace(frame, '<NNN>').removesuffix('.npy')}` |" in page
-    for key in json.loads((tmp_path / MANIFEST).read_text()):
-        assert f"| `{key}` |" in page
-    assert f"| `version` | {LABEL_FORMAT_VERSION};" in page
-    assert {str(NOWHERE).replace("-", "−"), "−2⁶³"} <= set(re.split(r"[ ;:,]", page))
-    assert NOBODY == -(2**63)
 
 
 @pytest.mark.slow
@@ -348,12 +319,6 @@ def test_folders_of_other_names_are_refused_and_left(small: DeepAccident, tmp_pa
     )
 
 
-def test_a_manifest_without_names_is_of_label_files(small: DeepAccident, out: Path) -> None:
-    write(small, out, tokens_of(small, 3))
-    (out / MANIFEST).write_text((out / MANIFEST).read_text().replace(' "names": null,\n', ""))
-    assert (len(LabelFiles(out)), "names" in (out / MANIFEST).read_text()) == (5, False)
-
-
 def test_what_is_whole_is_kept_and_fewer_samples_remove_nothing(small: DeepAccident, out: Path) -> None:
     some, others = tokens_of(small, 2, 7), tokens_of(small, 7, 12, agents=("ego_vehicle",))
     assert write(small, out, some) == LabelsWritten(samples=10, written=5, kept=0)
@@ -393,20 +358,6 @@ def test_a_file_depends_on_the_rows_of_its_own_scenario_alone(tmp_path: Path, ou
         assert changed == {f"{tiny.TYPE}/{name}/infrastructure.npz"}
 
 
-def test_frames_that_the_release_has_no_more(root: Path, tmp_path: Path) -> None:
-    write(opened(root), tmp_path / "labels", tokens_of(opened(root), 1, 12))
-    shorter = opened(tiny.write_tiny_release(tmp_path / "shorter", frames=6))
-    before = contents(tmp_path / "labels")
-    assert_refused(
-        (
-            lambda: write(shorter, tmp_path / "labels", tokens_of(shorter, 1)),
-            LabelFilesError,
-            r"ego_vehicle has frames that are not in .*shorter any more",
-        ),
-    )
-    assert contents(tmp_path / "labels") == before
-
-
 def test_another_configuration_leaves_the_folder_as_it_is(small: DeepAccident, out: Path) -> None:
     tokens = tokens_of(small, 3)
     write(small, out, tokens)
@@ -431,13 +382,6 @@ def test_another_configuration_leaves_the_folder_as_it_is(small: DeepAccident, o
         *[(partial(LabelFiles, out, config), ConfigError, told) for told, config in others.items()],
     )
     assert contents(out) == before
-
-
-def test_numbers_of_another_type_are_the_same_configuration(small: DeepAccident, out: Path) -> None:
-    write(small, out, tokens_of(small, 3))
-    write(small, out, tokens_of(small, 4), MotionLabelConfig(sigma=3))
-    files = LabelFiles(out, MotionLabelConfig(sigma=3))
-    assert all(files[token].config.sigma == 3 for token in files)
 
 
 def test_folders_that_are_something_else(small: DeepAccident, tmp_path: Path) -> None:
@@ -521,30 +465,6 @@ class TestReading:
             assert other not in files
             with pytest.raises(TokenError, match=r"has no labels of .*; `deepaccident labels` can add them"):
                 files[other]
-        assert repr(files) == f"<motion labels: 20 samples in {files.folder}>"
-        assert files == files  # noqa: PLR0124 - without reading twenty samples
-        assert files != LabelFiles(files.folder)
-
-    def test_results_cannot_be_written_to(self, files: LabelFiles) -> None:
-        labels = files[next(iter(files))]
-        for name in MAPS:
-            assert not getattr(labels, name).flags.writeable, name
-        with pytest.raises(TypeError, match="does not support item assignment"):
-            labels.id_map[3] = 4
-
-    def test_eight_files_are_open_at_a_time(self, files: LabelFiles) -> None:
-        for token in [*files, *files]:
-            assert files[token].valid[2]
-        opened = [str(each.resolve()) for each in Path("/proc/self/fd").iterdir()]
-        assert sum(each.startswith(str(files.folder)) for each in opened) == 8
-
-    def test_it_outlives_a_change_of_folder(
-        self, files: LabelFiles, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        monkeypatch.chdir(tmp_path)
-        relative = LabelFiles("labels")
-        monkeypatch.chdir("/")
-        assert_same(relative[next(iter(files))], files[next(iter(files))])
 
     @pytest.mark.slow
     def test_threads_and_spawned_processes_read_the_same(self, files: LabelFiles) -> None:
@@ -556,31 +476,6 @@ class TestReading:
         with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as processes:
             assert_same(processes.submit(operator.getitem, files, tokens[0]).result(), expected[tokens[0]])
         assert_same(pickle.loads(pickle.dumps(files))[tokens[1]], expected[tokens[1]])
-
-    @pytest.mark.slow
-    def test_forked_processes_read_at_once(self, files: LabelFiles) -> None:
-        script = """
-import os, sys
-from deepaccident_devkit.motion import LabelFiles
-files = LabelFiles(sys.argv[1])
-tokens = list(files)[:4]
-expected = [files[token].instance.sum() for token in tokens]
-children = []
-for _ in range(3):
-    child = os.fork()
-    if not child:
-        good = all(files[token].instance.sum() == one for _ in range(20) for token, one in zip(tokens, expected))
-        os._exit(0 if good else 1)
-    children.append(child)
-print([os.waitpid(child, 0)[1] for child in children])
-"""
-        said = python(script, files.folder)
-        assert (said.returncode, said.stdout.strip()) == (0, "[0, 0, 0]"), said.stderr
-
-    def test_numpy_alone_opens_a_file(self, files: LabelFiles) -> None:
-        token = next(iter(files))
-        with np.load(files.folder / f"{token.removesuffix('/004')}.npz", allow_pickle=False) as archive:
-            assert (archive["004/instance"].dtype, archive["config"].item()) == (np.uint8, files.config.digest)
 
 
 class TestDamage:
@@ -724,10 +619,6 @@ class TestDamage:
             (lambda: LabelFiles(folder), LabelFilesError, "a sample takes 32,000,000,000 bytes"),
         )
 
-    def test_a_configuration_changed_by_hand(self, folder: Path) -> None:
-        restate(folder, config={**MotionLabelConfig().as_dict(), "draw_ego": False})
-        assert_refused((lambda: LabelFiles(folder), LabelFilesError, "its digest is not that of its configuration"))
-
     @pytest.mark.parametrize(("version", "kind"), [(LABEL_FORMAT_VERSION + 1, "newer"), (0, "older")])
     def test_another_devkits_labels_are_refused_and_kept(
         self, small: DeepAccident, folder: Path, version: int, kind: str
@@ -747,33 +638,6 @@ class TestDamage:
         assert contents(folder) == before
 
 
-KILLED = """
-import os, signal, sys
-from pathlib import Path
-from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.motion import write_label_files
-
-release = DeepAccident(dataroot=sys.argv[1], verbose=False, workers=1)
-tokens = [f"{sys.argv[3]}/{agent}/{frame:03d}" for agent in ("ego_vehicle", "infrastructure") for frame in (3, 7)]
-replace = os.replace
-for step in range(4):
-    for after in (False, True):
-        child = os.fork()
-        if child:
-            assert os.waitpid(child, 0)[1] == signal.SIGKILL
-            continue
-        calls = iter(range(step, -1, -1))
-        def watched(*arguments):
-            last = next(calls) == 0
-            if last and not after:
-                os.kill(os.getpid(), signal.SIGKILL)
-            replace(*arguments)
-            if last:
-                os.kill(os.getpid(), signal.SIGKILL)
-        os.replace = watched
-        write_label_files(release, Path(sys.argv[2]) / f"{step} {after}", tokens, workers=1)
-        os._exit(0)
-"""
 FULL = """
 import resource, sys
 from deepaccident_devkit import DeepAccident
@@ -795,32 +659,6 @@ def python(script: str, *arguments: object) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True, timeout=300, check=False, env=environment)
 
 
-def labels_verb(*arguments: object) -> list[str]:
-    return [sys.executable, "-m", "deepaccident_devkit.cli", "labels", *map(str, arguments)]
-
-
-@pytest.mark.slow
-def test_killed_around_every_renaming(root: Path, tmp_path: Path) -> None:
-    small = opened(root)
-    tokens = tokens_of(small, 3, 7, agents=("ego_vehicle", "infrastructure"))
-    write(small, tmp_path / "fresh", tokens)
-    said = python(KILLED, root, tmp_path / "killed", tiny.TOKEN)
-    assert said.returncode == 0, said.stderr
-    kept = 0
-    for step in range(4):
-        for after in (False, True):
-            folder = tmp_path / "killed" / f"{step} {after}"
-            if (step, after) != (3, True):
-                assert_refused(
-                    (partial(LabelFiles, folder), LabelFilesError, r"not complete; run|holds no motion labels"),
-                )
-            done = write(small, folder, tokens)
-            assert done.kept == max(0, min(2, step - (not after))), folder
-            kept += done.kept
-            assert contents(folder) == contents(tmp_path / "fresh")
-    assert kept
-
-
 @pytest.mark.slow
 def test_a_full_disk(root: Path, tmp_path: Path) -> None:
     small, out = opened(root), tmp_path / "labels"
@@ -831,72 +669,6 @@ def test_a_full_disk(root: Path, tmp_path: Path) -> None:
         assert len(contents(out)) == there, contents(out).keys()
     write(small, out, tokens_of(small, 3))
     assert len(LabelFiles(out)) == 5
-
-
-def test_a_folder_that_cannot_be_locked(small: DeepAccident, tmp_path: Path) -> None:
-    (tmp_path / "labels" / ".unfinished" / ".lock").mkdir(parents=True)
-    assert_refused(
-        (
-            lambda: write(small, tmp_path / "labels", tokens_of(small, 3)),
-            LabelFilesError,
-            r"cannot be written .*; make room there, or choose another folder",
-        ),
-    )
-
-
-def test_only_its_own_leftovers_are_removed(small: DeepAccident, out: Path) -> None:
-    write(small, out, tokens_of(small, 3))
-    folder = out / tiny.TOKEN
-    own = [out / f".{MANIFEST}.123.tmp", temporary_path(folder / "ego_vehicle.npz")]
-    foreign = [out / ".mine.tmp", folder / ".notes.npz.456.tmp", folder / "ego_vehicle.npz.456.tmp"]
-    for path in (*own, *foreign):
-        path.touch()
-    write(small, out, tokens_of(small, 3))
-    assert not any(path.exists() for path in own)
-    assert all(path.exists() for path in foreign)
-
-
-@pytest.mark.slow
-def test_two_processes_that_write_at_once(da_motion: DeepAccident, tmp_path: Path) -> None:
-    """Other frames of the same agents: nothing of either is lost."""
-    purposes = ("train", "evaluate")
-    wanted = [
-        labels_verb(da_motion.dataroot, "--split", "train", "--out", tmp_path / "labels", "--samples", purpose)
-        for purpose in purposes
-    ]
-    processes = [
-        subprocess.Popen([*verb, "--workers", "1"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-        for verb in wanted
-    ]
-    said = [process.communicate(timeout=120) for process in processes]
-    assert [process.returncode for process in processes] == [0, 0], said
-    tokens = {token for purpose in purposes for token in da_motion.samples("train", purpose)}
-    write(da_motion, tmp_path / "fresh", sorted(tokens))
-    assert contents(tmp_path / "labels") == contents(tmp_path / "fresh")
-
-
-def test_a_file_is_made_again_if_any_row_of_its_scenario_changed(tmp_path: Path, out: Path) -> None:
-    """One with no box at all, then the same elsewhere, then with one box more each time."""
-    config = MotionLabelConfig(grid=BevGrid((-4, 4, 1), (-4, 4, 1)), receptive_field=1, future_frames=1)
-    token = f"{tiny.TOKEN}/infrastructure/001"
-    rows = ["0 0", "car 2 0 0 4 2 1.5 0 0 0 5 9 True", "car 0 0 0 4 2 1.5 0 0 0 -1 9 True"]
-    for count, written in ((1, 1), (1, 0), (2, 1), (3, 1)):
-        root, lines = tmp_path / f"release {count}", partial(lambda there, *_: there, rows[:count])
-        tiny.write_tiny_release(root, frames=1, agents=("infrastructure",), lines_of=lines)
-        release = opened(root)
-        assert write(release, out, [token], config) == LabelsWritten(samples=1, written=written, kept=1 - written)
-        assert_same(LabelFiles(out)[token], motion_labels(release, token, config))
-    text = (out / MANIFEST).read_text()
-    assert text.startswith('{\n "format": "DeepAccident motion labels",\n "version": 1,\n "config_digest": "')
-    assert text.endswith(f'"samples": {{\n  "{tiny.TOKEN}/infrastructure": [ 1 ]\n }}\n}}\n')
-
-
-def test_members_are_for_all_to_read_and_have_no_date(tmp_path: Path) -> None:
-    with zipfile.ZipFile(tmp_path / "one.npz", "w") as archive:
-        write_array(archive, "here", np.arange(3))
-        [entry] = archive.infolist()
-    assert (entry.filename, entry.external_attr >> 16) == ("here.npy", 0o644)
-    assert (entry.date_time, entry.compress_type) == ((1980, 1, 1, 0, 0, 0), zipfile.ZIP_DEFLATED)
 
 
 def two_agents(release: DeepAccident, *frames: int) -> list[str]:
@@ -911,23 +683,11 @@ def whole(da_b: DeepAccident, tmp_path_factory: pytest.TempPathFactory) -> dict[
     return contents(folder)
 
 
-def test_an_executor_writes_the_same_bytes(da_b: DeepAccident, out: Path, whole: dict[str, bytes]) -> None:
-    with ThreadPoolExecutor(3) as executor:
-        done = write_label_files(da_b, out, two_agents(da_b), executor=executor)
-    assert (done, contents(out)) == (LabelsWritten(samples=24, written=12, kept=0), whole)
-
-
 def test_several_calls_share_the_scenarios(da_b: DeepAccident, out: Path, whole: dict[str, bytes]) -> None:
     with ThreadPoolExecutor(3) as threads:
         done = list(threads.map(lambda _: write(da_b, out, two_agents(da_b)), range(3)))
     assert sum(each.written for each in done) == 12
     assert ({(each.samples, each.written + each.kept) for each in done}, contents(out)) == ({(24, 12)}, whole)
-
-
-def test_calls_for_other_samples_take_turns(da_b: DeepAccident, out: Path, whole: dict[str, bytes]) -> None:
-    with ThreadPoolExecutor(2) as threads:
-        list(threads.map(lambda frame: write(da_b, out, two_agents(da_b, frame)), (4, 2)))
-    assert (len(LabelFiles(out)), contents(out)) == (24, whole)
 
 
 def test_nothing_is_listed_before_all_is_there(da_b: DeepAccident, out: Path, whole: dict[str, bytes]) -> None:
@@ -943,16 +703,6 @@ def test_nothing_is_listed_before_all_is_there(da_b: DeepAccident, out: Path, wh
     assert write(da_b, out, two_agents(da_b)).written == 12
     assert not begun.exists()
     assert contents(out) == whole
-
-
-def test_files_that_were_cut_off_are_written_again(da_b: DeepAccident, out: Path, whole: dict[str, bytes]) -> None:
-    write(da_b, out, two_agents(da_b))
-    path = next(out.rglob("*.npz"))
-    path.write_bytes(path.read_bytes()[:-1])
-    assert (write(da_b, out, two_agents(da_b)), contents(out)) == (
-        LabelsWritten(samples=24, written=1, kept=11),
-        whole,
-    )
 
 
 def test_what_fails_is_listed_and_the_rest_is_done(

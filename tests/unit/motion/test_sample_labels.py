@@ -59,10 +59,6 @@ def drawn(labels: MotionLabels, actor: int) -> list[int]:
     return [int((frame == number).sum()) if number else 0 for frame in labels.instance]
 
 
-def changed(**switches: object) -> MotionLabelConfig:
-    return MotionLabelConfig(protocol=replace(LABEL_PROTOCOLS["released"], **switches))
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "config",
@@ -233,15 +229,6 @@ def test_vectors_turn_with_their_cells(tmp_path: Path, monkeypatch: pytest.Monke
     assert errors["released"][0] == 0 < min(errors["released"][2:]), errors
     assert errors["released"][4] > 2, errors
     assert max(errors["clean"]) <= 1, errors
-
-
-def test_the_present_frame_is_as_it_was(small: DeepAccident) -> None:
-    for protocol in LABEL_PROTOCOLS:
-        labels = small.motion_labels(f"{EGO}/006", MotionLabelConfig(protocol=protocol))
-        present = labels.to_present()
-        for name in MAPS:
-            assert_array_equal(getattr(labels, name)[0], getattr(present, name)[0])
-        assert present.at_present
 
 
 def spread(labels: MotionLabels, t: int, actor: int) -> float:

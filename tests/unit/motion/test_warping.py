@@ -20,7 +20,6 @@ from deepaccident_devkit.motion.warping import (
     past_to_present,
     present_from_frames,
     present_from_past,
-    rounded_points,
     sampling_matrix,
     warp,
 )
@@ -261,18 +260,6 @@ def test_a_chain_of_frames_starts_at_the_identity() -> None:
     assert_array_equal(chain[0], np.eye(4))
     np.testing.assert_allclose(chain[1][:3, 3], [-1, 0, 0])
     np.testing.assert_allclose(chain[2][:2, :2], [[0, 1], [-1, 0]], atol=1e-7)
-
-
-def test_more_cells_than_a_warp_can_number_are_refused() -> None:
-    huge = BevGrid((-2100, 2100, 1), (-2100, 2100, 1))
-    points = (np.zeros((2, 2)), np.zeros((2, 2)))
-    assert_refused(
-        (
-            lambda: rounded_points(points, huge, LABEL_PROTOCOLS["clean"]),
-            GeometryError,
-            "cells are more than a warp can number",
-        ),
-    )
 
 
 @pytest.mark.parametrize("shape", [(0, 3, 4, 4), (4, 4)])

@@ -16,10 +16,6 @@ SINGLE = {
 }
 
 
-def test_every_reader_is_known() -> None:
-    assert len(READERS) == 9
-
-
 @pytest.mark.parametrize("read", SINGLE.values(), ids=SINGLE)
 def test_a_missing_file_is_ours_and_pythons_own_error(tmp_path: Path, read: Callable) -> None:
     gone = tmp_path / "gone"

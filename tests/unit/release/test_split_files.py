@@ -81,10 +81,3 @@ def test_unique_names_both_lines(path: Path, raw: bool) -> None:
     assert_refused((lambda: read_split_file(path, raw=raw, unique=True), SplitFileError, named))
     path.write_text(f"{TYPE} {NAME}\n{TWIN} {NAME}\n")
     assert read_split_file(path, raw=raw, unique=True) == [f"{TYPE}/{NAME}", f"{TWIN}/{NAME}"]
-
-
-def test_a_message_quotes_little(path: Path) -> None:
-    path.write_text("word " * 100_000)
-    with pytest.raises(SplitFileError, match=r":1: expected '<scenario_type> <scenario>', found 'word word") as raised:
-        read_split_file(path)
-    assert len(str(raised.value)) < len(str(path)) + 250

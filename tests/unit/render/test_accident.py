@@ -7,22 +7,20 @@ from typing import Any
 
 import numpy as np
 import pytest
-from drawing import texts, title_of, tokens_of
+from drawing import texts, title_of
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.colors import to_hex
-from refusals import assert_refused
 from wording import lacking
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import NotAvailableError
-from deepaccident_devkit.geometry import SE3, Boxes
 from deepaccident_devkit.render import detached_figure
 from deepaccident_devkit.render.accident import CollidingPair, accident_words, draw_countdown, render_accident
 from deepaccident_devkit.render.boxes import camera_name
 from deepaccident_devkit.render.camera import best_view
 from deepaccident_devkit.render.styles import COLLIDER_COLOR
 from deepaccident_devkit.render.video import render_scenario_video
-from deepaccident_devkit.taxonomy import AGENTS, CAMERAS, short_name
+from deepaccident_devkit.taxonomy import AGENTS, short_name
 from deepaccident_devkit.v2x.tracks import scenario_tracks
 
 pytestmark = pytest.mark.slow
@@ -51,29 +49,20 @@ def accident(da: DeepAccident) -> str:
 
 
 def test_a_column_a_moment_and_a_row_an_agent(da: DeepAccident) -> None:
-    scenario = accident_of(da)
-    figure = drawn(da, scenario, seconds=(2.0, 0.4, 0.0), agents=["infrastructure", "ego_vehicle"])
+    figure = drawn(da, accident_of(da), seconds=(2.0, 0.4, 0.0), agents=["infrastructure", "ego_vehicle"])
     cameras = figure.axes[:4]
     assert len(figure.axes) == 2 * 3  # 2 s before was not recorded
     assert [ax.get_title() for ax in cameras[:2]] == ["0.4 s before", "the impact"]
     assert [texts(ax)[-1] for ax in cameras[::2]] == ["ego", "infrastructure"]
     assert [len(ax.images) for ax in cameras] == [1] * 4
-    names = {words.split(":")[0] for ax in cameras for words in texts(ax)}
-    assert names - {"ego", "infrastructure", "E", "O"} <= {camera_name(channel) for channel in CAMERAS}
-    assert title_of(figure).endswith(" ".join(accident_words(da, da.collision(scenario)).split()))
-    assert tokens_of(figure) == [scenario["token"]]
-    plain = drawn(da, scenario, seconds=[0.0], layers=["boxes", "ids"])
-    assert not any(ax.images for ax in plain.axes)
 
 
 def test_the_title_says_that_a_recording_is_cut_short(da_motion: DeepAccident, tmp_path: Path) -> None:
     root, token = tmp_path / "cut", accident_of(da_motion)["token"]
     shutil.copytree(da_motion.dataroot, root, ignore=shutil.ignore_patterns(".deepaccident", "*_02?.*", "*_03?.*"))
     cut = DeepAccident(dataroot=root, verbose=False)
-    figure, gap = drawn(cut, token, seconds=[0.5, 0.0], agents=[]), cut.collision(token).gap
-    said = f" cut short? the pair are {gap:.1f} m apart at frame 19 of 19, the last that shows both"
-    assert title_of(figure).endswith(said)
-    assert [ax.get_title().split("\n")[0] for ax in figure.axes] == ["0.5 s before", "the last frame"]
+    title = title_of(drawn(cut, token, seconds=[0.5, 0.0], agents=[]))
+    assert not lacking(title, f"{cut.collision(token).gap:.1f} m apart", "frame 19 of 19")
 
 
 def test_the_pair_is_where_it_is_and_red(da_motion: DeepAccident) -> None:
@@ -87,8 +76,6 @@ def test_the_pair_is_where_it_is_and_red(da_motion: DeepAccident) -> None:
         assert [to_hex(color) == COLLIDER_COLOR for color in shapes.get_edgecolor()] == pair.tolist()
         crosses = [line for line in ax.lines if line.get_marker() == "x"]
         np.testing.assert_allclose(crosses[0].get_xydata(), [contact.point[:2]])
-        speeds = np.linalg.norm(boxes.velocity[pair], axis=1)
-        assert ax.get_title().endswith(f"O {speeds[0]:.1f}, E {speeds[1]:.1f} m/s")
         low, high = ax.viewLim.get_points()
         assert ((corners[pair] >= low) & (corners[pair] <= high)).all()
 
@@ -117,7 +104,6 @@ def test_images_are_those_that_show_the_pair_best(da: DeepAccident) -> None:
     left, top, right, bottom = view.bounds
     assert panel.get_xlim()[0] <= left < right <= panel.get_xlim()[1]
     assert panel.get_ylim()[1] <= top < bottom <= panel.get_ylim()[0]
-    assert COLLIDER_COLOR in {to_hex(color) for each in panel.collections for color in each.get_edgecolor()}
 
 
 def test_the_words_say_who_hits_whom(da_motion: DeepAccident) -> None:
@@ -132,7 +118,6 @@ def test_the_countdown_has_five_cameras_and_the_pair_at_its_place(da: DeepAccide
     fig = countdown(da, f"{accident}/004", AGENTS, None)
     agents = [ax.get_title().split(":")[0] for ax in fig.axes if ":" in ax.get_title()]
     assert agents == ["ego", "ego behind", "other", "other behind", "infrastructure"]
-    assert ": 0.2 s to the impact other (car" in title_of(fig)
     above = next(ax for ax in fig.axes if ax.get_title().startswith("from above"))
     boxes = [each for each in above.collections if isinstance(each, PolyCollection)]
     boxes = next(each for each in boxes if len(each.get_edgecolor()) > 1)
@@ -146,18 +131,6 @@ def test_the_countdown_has_five_cameras_and_the_pair_at_its_place(da: DeepAccide
 def test_an_agent_that_is_not_asked_for_has_an_empty_place(da: DeepAccident, accident: str) -> None:
     fig = countdown(da, f"{accident}/006", ["infrastructure"], ["boxes"])
     assert sum(ax.axison for ax in fig.axes) == 3  # a camera, from above, speeds
-    assert not any(ax.images for ax in fig.axes)
-    assert ": the impact other (car" in title_of(fig)
-
-
-def test_nothing_to_count_down_to_is_said(da: DeepAccident, tmp_path: Path) -> None:
-    normal = next(record["token"] for record in da.scenario if not record["collision"])
-
-    def render() -> None:
-        render_scenario_video(da, normal, tmp_path / "v.gif", what="accident", workers=1, progress=False)
-
-    assert_refused((render, NotAvailableError, ("nobody collides in it", "the view 'frame'")))
-    assert not list(tmp_path.iterdir())
 
 
 def red_size(ax: Any) -> Any:
@@ -169,7 +142,7 @@ def red_size(ax: Any) -> Any:
     return np.ptp(ax.transData.transform(np.concatenate(red)).clip(low, high), axis=0) if red else np.zeros(2)
 
 
-def assert_pair_is_seen(da: DeepAccident, scenario: Any, seconds: Sequence[float], width: float = 3.3) -> None:
+def assert_pair_is_seen(da: DeepAccident, scenario: Any, seconds: Sequence[float], width: float) -> None:
     """At every moment: in the cameras of three agents or more, and from above with both tags; no tag is left out."""
     tags = {*CollidingPair.of(da, da.collision(scenario)).tags.values()}
     figure = detached_figure((width * len(seconds), 4.2 * width))
@@ -186,40 +159,10 @@ def assert_pair_is_seen(da: DeepAccident, scenario: Any, seconds: Sequence[float
         assert len(named) >= (red_size(ax).min() > 4 * width)
 
 
-def test_the_pair_is_seen_up_to_the_impact(da_b: DeepAccident) -> None:
-    assert_pair_is_seen(da_b, accident_of(da_b), (0.3, 0.2, 0.1, 0.0))
-
-
 def test_the_pair_of_each_design_is_seen_up_to_the_impact(da_designs: DeepAccident) -> None:
+    """In two columns of a paper."""
     for scenario in [scenario for scenario in da_designs.scenario if scenario["collision"]]:
-        assert_pair_is_seen(da_designs, scenario, (0.4, 0.3, 0.2, 0.1, 0.0))
-        assert_pair_is_seen(da_designs, scenario, (0.4, 0.2, 0.1, 0.0), width=1.8)  # in two columns of a paper
-
-
-def test_a_camera_that_saw_the_pair_is_kept(da: DeepAccident, accident: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    pair, at, below = (
-        CollidingPair.of(da, da.collision(accident)),
-        CollidingPair.at,
-        SE3.from_rotation(np.eye(3), [0.0, 0.0, -500.0]),
-    )
-    channel, view, last = pair.view("ego_vehicle_behind", 5)
-    assert (view is not None, last) == (True, 5)
-
-    def gone_at_the_impact(self: CollidingPair, index: int, seen_by: str | None = None) -> Boxes:
-        boxes = at(self, index, seen_by)
-        return boxes.transform(below, "world") if index == 6 else boxes
-
-    monkeypatch.setattr(CollidingPair, "at", gone_at_the_impact)
-    assert pair.view("ego_vehicle_behind", 6) == (channel, None, 5)
-    figure = drawn(da, accident, seconds=[0.0], agents=["ego_vehicle_behind"])
-    assert "seen 0.1 s ago" in texts(figure.axes[0])[0]
-
-
-def test_rows_are_columns_in_a_wide_figure(da: DeepAccident, accident: str) -> None:
-    figure = detached_figure((16, 9))
-    render_accident(da, accident, seconds=(0.3, 0.2, 0.1, 0.0), fig=figure)
-    heads = [ax.get_title().split("\n")[0] for ax in figure.axes[:6]]
-    assert heads == ["ego", "ego behind", "other", "other behind", "infrastructure", "from above"]
+        assert_pair_is_seen(da_designs, scenario, (0.4, 0.2, 0.1, 0.0), width=1.8)
 
 
 def test_where_there_is_little_room_the_agents_that_see_the_pair_best_are_shown(
@@ -231,9 +174,15 @@ def test_where_there_is_little_room_the_agents_that_see_the_pair_best_are_shown(
         for agents in (None, AGENTS)
     )
     *named, above = [texts(ax)[-1] for ax in few.axes[::4]]
-    assert "2 of 5 agents" in title_of(few)
     views = {agent: [pair.view(agent, index)[1] for index in (3, 4, 5, 6)] for agent in AGENTS}
     shares = {short_name(agent): sum(each.shown for each in seen if each) for agent, seen in views.items()}
     assert (len(named), named[0], above) == (2, "ego", "from above")
     assert shares[named[1]] == max(share for name, share in shares.items() if name != "ego")
-    assert (len(asked.axes), "of 5" in title_of(asked)) == (4 * 6, False)
+    assert len(asked.axes) == 4 * 6
+
+
+def test_a_scenario_without_an_accident_has_no_countdown(da: DeepAccident, tmp_path: Path) -> None:
+    normal, path = next(record["token"] for record in da.scenario if not record["collision"]), tmp_path / "v.gif"
+    with pytest.raises(NotAvailableError, match="'frame'"):
+        render_scenario_video(da, normal, path, what="accident", workers=1, progress=False)
+    assert not path.exists()

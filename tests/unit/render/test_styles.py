@@ -1,7 +1,6 @@
 """Pictures depend on their style, and on no setting of the user's matplotlib."""
 
 import pickle
-import re
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
@@ -16,17 +15,12 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_hex
 from scripts import loaded_script
 
-import deepaccident_devkit
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.plugins.safety import lead_time_ledger
-from deepaccident_devkit.plugins.safety.figures import render_lead_times
-from deepaccident_devkit.render import detached_figure, style, styles
+from deepaccident_devkit.render import style, styles
 from deepaccident_devkit.render.figures import save_picture
 from deepaccident_devkit.render.motion_maps import direction_colors
-from deepaccident_devkit.render.notebook import png_of
 from deepaccident_devkit.render.statistics import render_statistics
 from deepaccident_devkit.render.training import render_curve
-from deepaccident_devkit.render.video import VideoScene, views_of
 from deepaccident_devkit.statistics import dataset_statistics
 
 HOSTILE: dict[str, Any] = {
@@ -76,17 +70,12 @@ PICTURES: dict[str, Draw] = {
     "bev": lambda da, sample: da.render_bev(sample),
     "camera": lambda da, sample: da.render_sample_data(f"{sample}/Camera_Front"),
     "sample": lambda da, sample: da.render_sample(sample),
-    "sample, detached": lambda da, sample: da.render_sample(sample, fig=detached_figure((16, 5.6))),
     "frame": lambda da, sample: da.render_frame(moment(da, sample)),
     "annotation": lambda da, _: da.render_annotation(da.annotation[0]),
-    "instance": lambda da, _: da.render_instance(da.instance[0]),
     "visibility": lambda da, sample: da.render_visibility(moment(da, sample)),
-    "visibility matrix": lambda da, sample: da.render_visibility_matrix(moment(da, sample)),
-    "calibration": lambda da, sample: da.render_calibration(moment(da, sample)),
     "accident": lambda da, sample: da.render_accident(scenario(sample), seconds=(1.0, 0.0)),
     "motion labels": lambda da, sample: da.render_motion_labels(sample),
     "town map": lambda da, sample: da.render_town_map(da.get("scenario", scenario(sample))["town"]),
-    "lead times": lambda da, _: render_lead_times(lead_time_ledger(da)),
     "statistics": lambda da, _: render_statistics(dataset_statistics(da, workers=1), "scenarios"),
     "curve": lambda *_: render_curve([1, 2, 3], [-1.0, 2.0, -3.0], "loss"),
 }
@@ -136,15 +125,6 @@ def test_no_setting_of_the_user_changes_a_file(tmp_path: Path) -> None:
     assert written[0] == written[1]
 
 
-def test_a_video_and_what_a_notebook_shows_know_no_setting(da_motion: DeepAccident) -> None:
-    sample, made = da_motion.sample[40], []
-    for settings in ({}, HOSTILE):
-        with mpl.rc_context(settings):
-            scene = VideoScene(dataset=da_motion, views=views_of("bev", None), agents=None, width=160, height=160)
-            made.append((scene.picture(sample["frame_token"]).tobytes(), png_of(da_motion.boxes(sample))))
-    assert made[0] == made[1]
-
-
 def test_axes_of_the_user_stay_theirs_but_images_stand_upright(da: DeepAccident, sample: str) -> None:
     with mpl.rc_context({"image.origin": "lower", "axes.facecolor": "black"}):
         _, ax = plt.subplots()
@@ -160,28 +140,12 @@ def test_a_figure_keeps_the_style_that_it_was_made_in() -> None:
     np.testing.assert_array_equal(pixels(paper), inside)
 
 
-PACKAGE = Path(deepaccident_devkit.__file__).parent
-PAINTED = ("synth", "testing")
-"""These paint a world for cameras, not pictures for readers."""
-
-
-NAMING = (".py", ".js", ".css", ".html")
-"""Files that may name colours."""
-HEX = re.compile(r"#(?:[0-9a-fA-F]{8}|[0-9a-fA-F]{6}|[0-9a-fA-F]{3,4})\b")
 EYES = ("normal", "protanopia", "deuteranopia", "tritanopia")
 
 
 @pytest.fixture(scope="module")
 def script() -> ModuleType:
     return loaded_script("docs/check_colors.py")
-
-
-def test_the_measures_agree_with_known_values(script: ModuleType) -> None:
-    np.testing.assert_allclose(script.lab(["#ff0000", "#ffffff"]), [[53.24, 80.09, 67.20], [100, 0, 0]], atol=0.02)
-    np.testing.assert_allclose(script.contrast(["#000000", "#777777"], "#ffffff"), [21, 4.48], atol=0.01)
-    seen = script.distances(["#808080"], ["#808080"], "deuteranopia")
-    np.testing.assert_allclose([*seen.ravel(), *script.chroma(["#808080"])], 0, atol=0.02)
-    assert script.least_distance(["#ff0000", "#808000"], "deuteranopia") < 40 < script.least_distance(["#f00", "#880"])
 
 
 @pytest.mark.parametrize("eye", EYES)
@@ -202,17 +166,6 @@ def test_colours_that_stand_together_are_distinguished(script: ModuleType, group
     assert script.least_distance(script.GROUPS[group], eye) >= bound
 
 
-def test_saturation_is_the_agents_and_the_pairs_alone(script: ModuleType) -> None:
-    vivid = script.GROUPS["agents and the pair"]
-    muted = [*styles.OUTCOME_COLORS.values(), styles.PREDICTED_COLOR, styles.ESTIMATE_COLOR]
-    tables = (styles.CATEGORY_COLORS, styles.SPLIT_COLORS, styles.BEV_COLORS)
-    shades = [*(color for each in tables for color in each.values()), *styles.INSTANCE_COLORS, *styles.SERIES_COLORS]
-    assert script.chroma(vivid).min() > 36
-    assert script.chroma(muted).max() < 40
-    assert script.chroma(shades).max() < 17
-    assert script.distances(muted, vivid).min() > 25
-
-
 def test_nothing_but_the_pair_is_red(script: ModuleType) -> None:
     maps = [styles.DEPTH_COLORMAP, styles.HEIGHT_COLORMAP, styles.CENTERNESS_COLORMAP]
     mapped = [to_hex(colormaps[name](share)) for name in maps for share in np.linspace(0, 1, 33)]
@@ -227,29 +180,3 @@ def test_nothing_but_the_pair_is_red(script: ModuleType) -> None:
     ]
     assert len(others) > 40
     assert script.distances([*mapped, *flow, *others], [styles.COLLIDER_COLOR]).min() > 33
-
-
-def test_words_can_be_read_and_marks_be_seen(script: ModuleType) -> None:
-    words = [styles.COLLIDER_COLOR, styles.OWN_COLOR, styles.MUTED_COLOR, styles.WARNING_COLOR, styles.LINK_COLOR]
-    assert script.contrast(words, "#ffffff").min() >= 4.5  # WCAG's bound for words
-    assert script.contrast(styles.CATEGORY_COLORS.values(), "#ffffff").min() >= 2.5
-    for ground, bound in (("white", 2.0), ("road", 1.6)):
-        assert script.contrast(styles.AGENT_COLORS.values(), script.GROUNDS[ground]).min() >= bound
-
-
-def test_colours_come_from_the_one_table() -> None:
-    """Pages may have greys of their own: of their lines, grounds and words."""
-    found = []
-    for path in sorted(PACKAGE.rglob("*")):
-        name, text = path.relative_to(PACKAGE), ""
-        if name.parts[0] not in PAINTED and name.as_posix() != "render/styles.py" and path.suffix in NAMING:
-            text = path.read_text(encoding="utf-8")
-        functions = re.findall(r"\brgba?\(|\bhsla?\(", text) if path.suffix != ".py" else []
-        colors = [color for color in HEX.findall(text) if not is_grey(color)]
-        found += [f"{name}: {color}" for color in (*colors, *functions)]
-    assert found == []
-
-
-def is_grey(color: str) -> bool:
-    red, green, blue = (int(each, 16) for each in re.findall("..", to_hex(color)[1:]))
-    return max(red, green, blue) - min(red, green, blue) <= 4

@@ -9,7 +9,7 @@ from tiny import META, TYPE, label_lines, write_tiny_release
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, DeepAccidentError, FieldError
-from deepaccident_devkit.evaluation.breakdowns import ATTRIBUTES, sample_attributes, tokens_by_value
+from deepaccident_devkit.evaluation.breakdowns import ATTRIBUTES
 from deepaccident_devkit.interactions import scenario as interactions_module
 from deepaccident_devkit.selection import Filter, parse_where
 from deepaccident_devkit.selection.fields import FIELDS, group_texts
@@ -239,26 +239,6 @@ def test_what_is_impossible_is_named_with_what_is_possible(da: DeepAccident, ask
     assert_refused((lambda: da.find(asked) if isinstance(asked, str) else da.find(**asked), error, names))
 
 
-@pytest.mark.parametrize(
-    ("field", "value"),
-    [
-        ("collision", np.True_),
-        ("collision", np.False_),
-        ("collision", [np.True_, None]),
-        ("num_frames", np.int64(5)),
-        ("num_frames", np.uint8(5)),
-        ("num_frames", {np.int32(5), np.int64(7)}),
-        ("accident_type", np.int8(1)),
-        ("town", np.str_("Town03")),
-        ("length", np.str_("5..7")),
-    ],
-)
-def test_numpys_scalars_are_as_pythons(da: DeepAccident, field: str, value) -> None:
-    several = isinstance(value, list | set)
-    plain = [getattr(one, "item", lambda one=one: one)() for one in (value if several else [value])]
-    assert numbers(da, **{field: value}) == numbers(da, **{field: plain}) != []
-
-
 @pytest.mark.parametrize("field", ["town", "num_frames", "accident_type", "collision", "accident_visibility"])
 @pytest.mark.parametrize(
     "value",
@@ -335,9 +315,6 @@ def test_a_hidden_collider_is_one_of_the_accident_and_of_its_twin(tmp_path: Path
     pair, rest = [f"{TYPE}/{accident}", f"{first}/{accident}"], [f"{first}/{alone}"]
     assert [one["token"] for one in da.find(hidden_collider=hidden)] == pair
     assert [one["token"] for one in da.find(hidden_collider=None)] == rest
-    samples = {token: f"{token}/ego_vehicle/010" for token in (*pair, *rest)}
-    groups = tokens_by_value(sample_attributes(da, samples.values()), "hidden_collider")
-    assert groups == {str(hidden).lower(): [samples[token] for token in pair], None: [samples[token] for token in rest]}
 
 
 def test_the_most_critical_moving_pair(da_motion: DeepAccident, monkeypatch: pytest.MonkeyPatch) -> None:

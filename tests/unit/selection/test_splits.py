@@ -4,7 +4,6 @@ from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 from random import Random
-from types import SimpleNamespace
 
 import pytest
 from hypothesis import given, settings
@@ -24,7 +23,7 @@ from deepaccident_devkit.errors import (
 )
 from deepaccident_devkit.release import read_split_file
 from deepaccident_devkit.selection.splits import official_split, save_selection, split_records, split_report
-from deepaccident_devkit.taxonomy import META_AGENTS, SCENARIO_ATTRIBUTES
+from deepaccident_devkit.taxonomy import META_AGENTS
 
 DESIGNED = ("ego", "other_behind")
 THREE, FOUR = "three-way junction", "four-way junction"
@@ -110,17 +109,6 @@ def scenario_sets(draw: st.DrawFn) -> list[dict]:
     return draw(st.permutations(found))
 
 
-def test_every_default_and_constant_written_out() -> None:
-    assert written_out("deepaccident_devkit.selection.splits") == {
-        "splits.OFFICIAL_SEED": "17",
-        "splits.Splits": "left_out=()",
-        "splits.Splits.save": "overwrite=False",
-        "splits.official_split": "seed=17, released_skip=False",
-        "splits.split_records": "seed=17, released_skip=False, left_out=()",
-        "splits.save_selection": "overwrite=False",
-    }
-
-
 def plain_split(scenarios: list[dict], seed: int, *, skip: bool) -> list[set[str]]:
     """Train, val, test and the minis by steps 2 to 4 of `official_split`, written again."""
 
@@ -193,13 +181,6 @@ def test_only_scenarios_with_more_than_five_labels_of_ego_count(tmp_path: Path) 
     assert (report.scenarios["train"], report.frames["train"]) == (1, 6)
 
 
-def test_the_report_has_numbers_by_size_and_what_is_unknown_last() -> None:
-    unknown = dict.fromkeys((*SCENARIO_ATTRIBUTES, "collision"))
-    scenarios = {str(number): {**unknown, "num_frames": 1, "accident_type": number} for number in (12, None, 9)}
-    report = split_report(SimpleNamespace(scenario=scenarios, dataroot=".", version="v1"), {"all": scenarios})
-    assert list(report.attributes["accident_type"]) == ["9", "12", "none"]
-
-
 def test_the_report_counts_every_attribute_of_every_split(da_b: DeepAccident) -> None:
     tokens = [scenario["token"] for scenario in da_b.scenario]
     assert "2 ( 67 %)" in split_report(da_b, {"three": tokens[:3]}).to_text()  # two of three collide
@@ -210,9 +191,7 @@ def test_the_report_counts_every_attribute_of_every_split(da_b: DeepAccident) ->
             assert sum(row[name] for row in counts.values()) == total
     collided = Counter("yes" if scenario["collision"] else "no" for scenario in da_b.scenario)
     assert {value: row["one"] + row["rest"] for value, row in report.attributes["collision"].items()} == collided
-    squeezed = " ".join(report.to_text().split())
-    assert "split one rest none scenarios 1 5 0 frames 4 20 0" in squeezed
-    assert f"yes 1 (100 %) {collided['yes'] - 1} ( 40 %) 0 ( 0 %)" in squeezed
+    assert f"yes 1 (100 %) {collided['yes'] - 1} ( 40 %) 0 ( 0 %)" in " ".join(report.to_text().split())
     assert_refused(
         (lambda: split_report(da_b, {"one": ["type1_subtype1_normal/nowhere"]}), TokenError, "nowhere"),
     )
@@ -237,19 +216,6 @@ def test_saved_splits_are_read_back_and_never_overwritten_unasked(da_b: DeepAcci
     assert_refused(
         (lambda: made.save(tmp_path / "file"), ConfigError, "file: is a file; give a folder"),
     )
-
-
-def test_splits_that_cannot_be_written_leave_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def failing(path: Path, tokens) -> None:
-        if "test.txt" in path.name:
-            raise OSError("disk full")
-        path.write_text("half")
-
-    monkeypatch.setattr("deepaccident_devkit.selection.splits.write_split_file", failing)
-    assert_refused(
-        (lambda: split_records(many_twins(3)).save(tmp_path), OSError, "disk full"),
-    )
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_selection_saved_is_a_split(da_b: DeepAccident, tmp_path: Path) -> None:
@@ -323,4 +289,14 @@ def test_split_files_of_ones_own(da_b: DeepAccident, tmp_path: Path) -> None:
             "missing: expected one of raise, skip, found 'ignore'",
         ),
     )
-    assert da_b.split_scenarios("train") == da_b.split_scenarios(da_b.dataroot / "train.txt")
+
+
+def test_every_default_and_constant_written_out() -> None:
+    assert written_out("deepaccident_devkit.selection.splits") == {
+        "splits.OFFICIAL_SEED": "17",
+        "splits.Splits": "left_out=()",
+        "splits.Splits.save": "overwrite=False",
+        "splits.official_split": "seed=17, released_skip=False",
+        "splits.split_records": "seed=17, released_skip=False, left_out=()",
+        "splits.save_selection": "overwrite=False",
+    }

@@ -2,7 +2,6 @@
 
 import json
 import math
-import re
 from concurrent.futures import ThreadPoolExecutor
 from itertools import combinations
 from pathlib import Path
@@ -199,16 +198,6 @@ def test_rows_say_share_interval_and_verdict(many: Path) -> None:
     }
 
 
-def test_where_no_fact_can_be_compared_that_is_said(tmp_path: Path) -> None:
-    write_tiny_release(tmp_path, frames=3)
-    known = CliRunner().invoke(deepaccident, ["info", str(tmp_path), "--facts"], catch_exceptions=False)
-    none = CliRunner().invoke(deepaccident, ["info", str(tmp_path), "--facts", "--where", "collision=false"])
-    assert (known.exit_code, none.exit_code) == (0, 2)
-    assert f"Compared: 0 of {len(FACTS)} facts." in none.output
-    report = release_facts(DeepAccident(dataroot=tmp_path, verbose=False))
-    assert report.compared == {f"of {len(FACTS)} facts": sum(row.verdict != "cannot say" for row in report.facts)}
-
-
 def test_text_and_json_name_nobody_and_tell_what_is_left_out(tmp_path: Path) -> None:
     root = tmp_path / "Jane Doe's"
     for number, kinds in enumerate(({}, {}, {}, {"meta": None}, {"labelled": False})):
@@ -217,9 +206,8 @@ def test_text_and_json_name_nobody_and_tell_what_is_left_out(tmp_path: Path) -> 
     (label / named(0) / f"{named(0)}_002.txt").unlink()
     (label / named(1) / f"{named(1)}_002.txt").write_text("0 0\ncar 1 2 3\n")
     asked = ["info", str(root), "--facts", "--workers", "1"]
-    text, as_json, refused = (
-        CliRunner().invoke(deepaccident, [*asked, *more], catch_exceptions=False)
-        for more in ((), ("--json",), ("--statistics",))
+    text, as_json = (
+        CliRunner().invoke(deepaccident, [*asked, *more], catch_exceptions=False) for more in ((), ("--json",))
     )
     found = json.loads(as_json.stdout)
     assert (text.exit_code, found["scenarios"], found["left_out"]) == (0, 3, 2)
@@ -227,5 +215,3 @@ def test_text_and_json_name_nobody_and_tell_what_is_left_out(tmp_path: Path) -> 
     assert [rows[key] for key in ("fields", "gapless")] == [(0.75, 4, "differ")] * 2
     assert (rows["folder_right"][1], found["counts"]["agents with labels"]) == (2, {"5": 2, "0": 1})
     assert not [each for each in ("Jane", str(tmp_path), named(2)) if each in text.stdout + as_json.stdout]
-    assert re.search(r"\nscenarios +left out as broken +2\n", text.stdout)
-    assert (refused.exit_code, "--statistics changes nothing with --facts" in refused.output) == (2, True)

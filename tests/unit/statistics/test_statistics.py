@@ -16,8 +16,7 @@ from tiny import META, TYPE, write_tiny_release
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.cli import deepaccident
-from deepaccident_devkit.errors import ChoiceError, ConfigError, TokenError
-from deepaccident_devkit.geometry import quaternions
+from deepaccident_devkit.errors import TokenError
 from deepaccident_devkit.statistics import ENDS, GROUPS, DatasetStatistics, dataset_statistics
 from deepaccident_devkit.taxonomy import CATEGORIES
 
@@ -61,20 +60,6 @@ def test_scenarios_are_counted_by_split(of_tiny: DatasetStatistics) -> None:
         {"total": 1, "train": 0, "val": 0, "test": 1, "unknown": 0},
     )
     assert of_tiny.samples["total"] == 5 * 4 + 35 + 2 + 2 * 2 + 1 + 30
-
-
-@pytest.mark.parametrize(
-    ("table", "name", "row"),
-    [
-        ("weather_frames", "HardRain", {"total": 7, "train": 5, "val": 0, "test": 0, "unknown": 2}),
-        ("times_of_day", "Night", {"total": 1, "train": 0, "val": 1, "test": 0, "unknown": 0}),
-        ("time_of_day_frames", "Night", {"total": 35, "train": 0, "val": 35, "test": 0, "unknown": 0}),
-        ("road_types", "three-way junction", {"total": 1, "train": 0, "val": 0, "test": 0, "unknown": 1}),
-        ("annotations", "car", {"total": 56, "train": 19, "val": 35, "test": 0, "unknown": 2}),
-    ],
-)
-def test_a_count_has_its_splits(of_tiny: DatasetStatistics, table: str, name: str, row: dict[str, int]) -> None:
-    assert of_tiny.counts[table].counts[name] == row
 
 
 def test_how_scenarios_ended_and_in_which_weather(of_tiny: DatasetStatistics) -> None:
@@ -135,37 +120,6 @@ def test_ego_drives_at_ten_metres_a_second_and_has_the_size_of_its_row(of_tiny: 
     assert_refused((lambda: sizes.row("depth", "ego_vehicle"), KeyError, "depth"))
 
 
-def test_actors_and_boxes(of_tiny: DatasetStatistics) -> None:
-    instances = {name: row["total"] for name, row in of_tiny.counts["instances"].counts.items()}
-    # four cars and the van; the van alone where meta has no ids; ego and the van three times
-    assert instances == {"car": 4 + 0 + 3, "truck": 0, "van": 5, "cyclist": 0, "motorcycle": 0, "pedestrian": 0}
-    actors, sizes = of_tiny.histograms["actors"], of_tiny.quantiles["box_sizes"]
-    assert of_tiny.counts["annotations"].counts["pedestrian"]["train"] == 20 + 2 + 1
-    assert of_tiny.counts["parked_instances"].total() == 0
-    assert (actors.counts["total"][0], actors.left_out) == (5, of_tiny.counts["instances"].left_out)
-    asked = (("length", "van"), ("width", "van"), ("height", "van"), ("length", "truck"))
-    assert [sizes.median(*each) for each in asked] == [5.0, 2.0, 2.2, None]
-
-
-def test_distances_leave_out_the_agents_own_row(of_tiny: DatasetStatistics) -> None:
-    quantiles, histogram = of_tiny.quantiles["distance_quantiles"], of_tiny.histograms["distances"]
-    assert (quantiles.row("distance", "car").number, quantiles.median("distance", "pedestrian")) == (
-        0,
-        pytest.approx(math.hypot(30.0, 1.5)),
-    )
-    assert (histogram.counts["val"][6] >= 35, histogram.total("val")) == (True, 2 * 35)  # 30 to 35 m: every pedestrian
-
-
-def test_speeds_are_the_tracks(of_tiny: DatasetStatistics) -> None:
-    quantiles, histogram = of_tiny.quantiles["speed_quantiles"], of_tiny.histograms["speeds"]
-    assert (quantiles.median("speed", "van"), quantiles.row("speed", "van").number) == (
-        pytest.approx(2.0),
-        4 + 35 + 2 + 2 + 1,
-    )
-    assert quantiles.row("speed", "car", "train").values == pytest.approx((0, 0, 0, 0, 10, 10, 10), abs=1e-9)
-    assert histogram.left_out.counts["train"] == 0  # the scenario with one frame has its labels' velocities
-
-
 def test_the_pair_as_ego_sees_it(of_tiny: DatasetStatistics) -> None:
     """Ego at (5, −4.1) looks along −y, the other at (−19.9, 0) along x."""
     first, third = of_tiny.collisions
@@ -215,25 +169,6 @@ def test_equal_to_plain_python_over_records(both_layouts: DeepAccident) -> None:
     assert (made.counts["instances"].total(), sum(ended)) == (len(da.instance), len(da.scenario))
 
 
-def test_pairs_are_those_of_the_track_records(da: DeepAccident) -> None:
-    pairs = dataset_statistics(da).collisions
-    assert len(pairs) == sum(scenario["collision"] is not None for scenario in da.scenario) > 0
-    for pair in pairs:
-        scenario = da.scenario.get(pair.scenario)
-        assert scenario["collision"] is not None
-        assert pair.actor is not None
-        agent = da.agent.get(f"{pair.scenario}/{pair.actor}")
-        (other_id,) = set(scenario["collision"]["ids"]) - {agent["actor_id"]}
-        ego, other = (
-            da.track.get(f"{scenario['last_frame_token']}/actor/{actor}") for actor in (agent["actor_id"], other_id)
-        )
-        yaws = [float(quaternions.yaw_of(track["rotation"])) for track in (ego, other)]
-        offset = np.subtract(other["translation"], ego["translation"])[:2]
-        assert (math.cos(math.radians(pair.angle)), math.hypot(pair.x, pair.y), pair.x) == pytest.approx(
-            (math.cos(yaws[1] - yaws[0]), math.hypot(*offset), offset @ [math.cos(yaws[0]), math.sin(yaws[0])])
-        )
-
-
 def test_a_selection_counts_alone(tiny: DeepAccident, of_tiny: DatasetStatistics) -> None:
     train = dataset_statistics(tiny, tiny.find(split="train"))
     rest = dataset_statistics(tiny, [record["token"] for record in tiny.scenario if record["split"] != "train"])
@@ -248,31 +183,7 @@ def test_a_selection_counts_alone(tiny: DeepAccident, of_tiny: DatasetStatistics
     assert sizes.row("length", "van").values == of_all.row("length", "van", "train").values
     nothing = dataset_statistics(tiny, [])
     assert (nothing.scenarios["total"], nothing.collisions, nothing.counts["annotations"].total()) == (0, (), 0)
-    for made, said in ((train, "3 of 6 scenarios"), (nothing, "0 of 6 scenarios"), (nothing, "is nothing to count")):
-        assert said in made.to_text()
     assert_refused((lambda: dataset_statistics(tiny, ["nowhere/at all"]), TokenError, "nowhere"))
-
-
-def test_a_single_scenario_by_token_or_record(tiny: DeepAccident) -> None:
-    record = tiny.scenario[2]
-    want, *same = (
-        dataset_statistics(tiny, chosen).to_json() for chosen in ([record["token"]], record["token"], record)
-    )
-    assert same == [want, want]
-    assert_refused(
-        (lambda: dataset_statistics(tiny, "nowhere"), TokenError, "nowhere"),
-        (lambda: dataset_statistics(tiny, 3), ChoiceError, ("scenarios", "tokens or records", "found 3")),
-    )
-
-
-def test_a_release_without_labels_counts_what_it_can(tmp_path: Path) -> None:
-    root = write_tiny_release(tmp_path, labelled=False, frames=40)
-    made = dataset_statistics(DeepAccident(dataroot=root, verbose=False))
-    assert made.counts["ends"].counts["design 1"]["unknown"] == made.histograms["lengths"].counts["total"][1] == 1
-    assert made.counts["instances"].total() == made.histograms["speeds"].total() == 0
-    for said in ("1 scenarios without labels", "1 collisions without a pair labelled at the last frame"):
-        assert said in made.to_text()
-    json.loads(made.to_json(), parse_constant=pytest.fail)
 
 
 def test_json_and_csv_say_the_same(of_tiny: DatasetStatistics, tmp_path: Path) -> None:
@@ -289,10 +200,7 @@ def test_json_and_csv_say_the_same(of_tiny: DatasetStatistics, tmp_path: Path) -
         ["30", "40", "2", "0", "1", "1", "0"],
         ["outside", "", "4", "3", "0", "0", "1"],
     )
-    assert ["length", "van", "total"] in [row[:3] for row in tables["box_sizes"]]
     assert len(tables["collision_pairs"]) == 1 + len(of_tiny.collisions)
-    (tmp_path / "file").touch()
-    assert_refused((lambda: of_tiny.to_csv(tmp_path / "file"), ConfigError, "file is a file; give a folder"))
 
 
 EDGES = (0.0, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 7.5, 10.0)
@@ -314,10 +222,7 @@ def test_pairs_and_scenarios_are_in_their_bins(da_b: DeepAccident) -> None:
     least = np.array([each.min() for each in times])
     assert scenarios.counts["total"] == tuple(np.histogram(least[least <= 10], EDGES)[0])
     assert scenarios.total() + scenarios.left_out.counts["total"] == len(da_b.scenario)
-    below = int((least < 1.5).sum())
-    line = next(line for line in made.to_text().splitlines() if line.startswith("below 1.5 s"))
-    assert f" {below} ({round(100 * below / len(least)):>3} %)" in line
-    assert "below 1.5 s" not in plain.to_text()
+    assert ("below 1.5 s" in plain.to_text(), "below 1.5 s" in made.to_text()) == (False, True)
 
 
 def test_the_verb_counts_interactions(da_b: DeepAccident) -> None:

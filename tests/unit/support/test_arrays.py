@@ -70,14 +70,6 @@ def test_a_cloud_in_place_of_an_array_is_named_so() -> None:
     assert boxes.count_points(cloud.xyz).tolist() == [2]
 
 
-def test_an_array_of_the_right_type_is_not_copied() -> None:
-    given = np.zeros((2, 3))
-    assert checked("points", given, (None, 3)) is given
-    assert as_floats(given) is given
-    narrow = given.astype(np.float16)
-    assert as_numbers("points", narrow, dtype=None) is narrow
-
-
 class Foreign:
     """An array of another framework; or the error with which it answers who asks for its values."""
 

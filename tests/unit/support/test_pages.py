@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from jinja2 import DictLoader
 from report_page import Page
 
-from deepaccident_devkit.support.pages import breakable, document, environment, result_text
+from deepaccident_devkit.support.pages import document, environment, result_text
 
 TREE = '{% from "macros.html" import tree %}{{ tree(value) }}'
 
@@ -45,18 +45,6 @@ def test_results_have_three_decimals_or_digits() -> None:
         *("0.382", "0.000", "81.1", "12,533", "12,533", "90", "–"),
         "1.500; 2, 0.250",
     ]
-
-
-@pytest.mark.parametrize(
-    ("name", "broken"),
-    [
-        ("ego_vehicle/030 <b>", "ego_<wbr>vehicle/<wbr>030 &lt;b&gt;"),
-        ("accuracy@5", "accuracy<wbr>@5"),
-        (breakable("a_b"), "a_<wbr>b"),
-    ],
-)
-def test_names_are_broken_between_words(name: str, broken: str) -> None:
-    assert breakable(name) == broken
 
 
 def test_control_characters_of_names_are_shown_in_pages() -> None:

@@ -2,20 +2,14 @@
 
 import importlib.metadata
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
 
 import click
 import pytest
 from click.testing import CliRunner
 
-from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.errors import MissingPluginError
-from deepaccident_devkit.evaluation.runs import evaluate_results, read_bundle, save_run
-from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
-from deepaccident_devkit.plugins.baselines import predict_results
-from deepaccident_devkit.selection.samples import samples
 from deepaccident_devkit.support import plugins
 from deepaccident_devkit.support.plugins import PROTOCOL_VERSION, LazyVerb, Plugin, offers, own_plugins
 
@@ -123,24 +117,3 @@ def test_they_can_be_switched_off(install: Callable[..., None], monkeypatch: pyt
     monkeypatch.setenv("DEEPACCIDENT_PLUGINS", "off")
     assert plugins.all_plugins() == own_plugins()
     assert called("greet")[0] == 2
-
-
-@pytest.mark.parametrize(
-    "words", [("synth", "--help"), ("evaluate", "motion", "--help"), ("check", "splits", "--help")]
-)
-def test_own_verbs_read_no_entry_points(words: tuple[str, ...], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(importlib.metadata, "entry_points", lambda **_: pytest.fail("read entry points"))
-    plugins.all_plugins.cache_clear()
-    assert called(*words)[0] == 0
-
-
-def test_opening_evaluating_and_reading_a_bundle_read_no_entry_points(
-    da_motion: DeepAccident, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(importlib.metadata, "entry_points", lambda **_: pytest.fail("read entry points"))
-    plugins.all_plugins.cache_clear()
-    dataset = DeepAccident("v1", da_motion.dataroot, verbose=False)
-    results = predict_results(dataset, "detection", samples(dataset, "train", "evaluate"), tmp_path / "detection.json")
-    setup = EvaluationSetup(task="detection", protocol="paper")
-    run = evaluate_results(dataset, results, setup, "train", workers=1)
-    assert read_bundle(save_run(run, tmp_path / "bundle")).setup == setup

@@ -8,8 +8,6 @@ import stat
 import struct
 import tracemalloc
 import zipfile
-from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
-from multiprocessing import get_context
 from pathlib import Path
 from unittest.mock import Mock
 
@@ -24,7 +22,6 @@ from deepaccident_devkit.support.reading import (
     DAMAGED_ARCHIVE,
     LIMITS_VARIABLE,
     array_of,
-    byte_limit,
     check_size,
     file_checksum,
     mapped_file,
@@ -39,14 +36,6 @@ from deepaccident_devkit.support.reading import (
 @pytest.fixture
 def path(tmp_path: Path) -> Path:
     return tmp_path / "file"
-
-
-@pytest.mark.parametrize("size", [0, 1, 70_000])
-def test_a_regular_file_is_read_whole(path: Path, size: int) -> None:
-    path.write_bytes(os.urandom(size))
-    assert read_bytes(path, "label") == path.read_bytes()
-    with open_file(path) as file:
-        assert file.read() == path.read_bytes()
 
 
 @pytest.mark.parametrize("impossible", [(), ("pyarrow.memory_map",)])
@@ -119,13 +108,6 @@ def test_a_remedy_that_is_followed_helps(path: Path, monkeypatch: pytest.MonkeyP
         read_bytes(path, "meta")
     monkeypatch.setenv(*raised.value.strerror.rsplit(" ", 1)[1].split("=", 1))
     assert len(read_bytes(path, "meta")) == BYTE_LIMITS["meta"] + 1
-
-
-def test_the_limits_of_the_environment_reach_spawned_workers(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(LIMITS_VARIABLE, "label=2K, lidar=3M bev=7")
-    assert [byte_limit(kind) for kind in ("label", "lidar", "bev", "meta")] == [2048, 3 << 20, 7, BYTE_LIMITS["meta"]]
-    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
-        assert pool.submit(byte_limit, "label").result() == 2048
 
 
 @pytest.mark.parametrize("text", ["label", "label=", "label=0", "labels=3M", "label=3X", "label=-1", "x" * 10_000])
@@ -238,12 +220,6 @@ def test_a_sound_array_is_read_as_numpy_reads_it(array: np.ndarray, way: int) ->
     assert (found.flags.writeable, found.flags.f_contiguous) == (True, array.flags.f_contiguous)
 
 
-def test_an_archive_is_read_from_its_file_and_closes_it(tmp_path: Path) -> None:
-    (tmp_path / "some.npz").write_bytes(npz())
-    with open_zip(tmp_path / "some.npz") as archive:
-        np.testing.assert_array_equal(read_array(archive, "data", "lidar"), ARRAY)
-
-
 HOSTILE = {
     "zeros that unpack to 256 MB": lambda: zipped(b"\x93NUMPY" + bytes(1 << 28)),
     "a shape of a gigabyte": lambda: zipped(headed("(268435456,)")),
@@ -292,17 +268,6 @@ def test_a_member_without_bytes_has_a_checksum_as_well(content: bytes) -> None:
         read_member(archive, archive.infolist()[0], "lidar")
 
 
-def test_threads_may_read_one_archive(tmp_path: Path) -> None:
-    path = tmp_path / "shared.npz"
-    with zipfile.ZipFile(path, "w") as archive:
-        for number in range(50):
-            archive.writestr(str(number), bytes([number]) * 200_000)
-    with open_zip(path) as archive, ThreadPoolExecutor(8) as threads:
-        entries = archive.infolist() * 20
-        contents = threads.map(lambda entry: read_member(archive, entry, "label"), entries)
-        assert all(content[0] == int(entry.filename) for content, entry in zip(contents, entries, strict=True))
-
-
 def test_an_archive_of_many_members_is_refused() -> None:
     content = io.BytesIO()
     with zipfile.ZipFile(content, "w") as archive:
@@ -321,16 +286,3 @@ def test_an_end_that_leads_to_a_larger_directory_is_refused() -> None:
         (lambda: open_zip(content[:end] + large[:-1] + rest), zipfile.BadZipFile, ("its end is damaged",)),
         (lambda: array_of(b"\x93NUMPY\x09\x00" + bytes(20), "lidar"), ValueError, ("version (9, 0)",)),
     )
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_any_flipped_byte_is_told_or_changes_nothing(seed: int) -> None:
-    """Some bytes are not read, such as dates; none of the array's own changes unseen."""
-    rng, content = np.random.default_rng(seed), npz(np.random.default_rng(seed).random((50, 4)))
-    expected = read_npz(content)
-    for place in rng.integers(0, len(content), size=200).tolist():
-        try:
-            found = read_npz(flipped(content, place))
-        except DAMAGED_ARCHIVE:
-            continue
-        np.testing.assert_array_equal(found, expected, strict=True)

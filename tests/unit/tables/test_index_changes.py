@@ -2,18 +2,17 @@
 
 import os
 import shutil
-import tarfile
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import tiny
-from tiny_index import INDEX, OTHER, contents, label, opened
+from tiny_index import INDEX, contents, opened
 from verbs import called
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.release import find_release, write_split_file
+from deepaccident_devkit.release import find_release
 from deepaccident_devkit.release.fingerprints import folder_hashes
 from deepaccident_devkit.tables import Index, current_index, indexing
 from deepaccident_devkit.tables import index as index_module
@@ -54,21 +53,6 @@ def replaced(path: Path, content: bytes) -> None:
     path.with_name("new").replace(path)
 
 
-def unpacked_by_tar(path: Path, content: bytes) -> None:
-    """A release that was packed when this file was right; the folder's time comes out of the archive, too."""
-    folder, archive = path.parent, path.parents[3] / "packed.tar"
-    restored = folder.with_name("restored")
-    shutil.copytree(folder, restored)
-    shutil.copystat(folder, restored)
-    keep_times(restored / path.name, lambda: (restored / path.name).write_bytes(content))
-    with tarfile.open(archive, "w") as tar:
-        tar.add(restored, folder.name)
-    shutil.rmtree(restored)
-    path.unlink()  # as tar does
-    with tarfile.open(archive) as tar:
-        tar.extractall(folder.parent, filter="fully_trusted")  # noqa: S202 - our own
-
-
 def copied_folder(path: Path, content: bytes) -> None:
     folder, copy = path.parent, path.parent.with_name("copy")
     shutil.copytree(folder, copy)
@@ -78,21 +62,10 @@ def copied_folder(path: Path, content: bytes) -> None:
     copy.rename(folder)
 
 
-def linked_elsewhere(path: Path, content: bytes) -> None:
-    folder, copy = path.parent, path.parents[3] / "elsewhere"
-    shutil.copytree(folder, copy)
-    keep_times(copy / path.name, lambda: (copy / path.name).write_bytes(content))
-    shutil.copystat(folder, copy)
-    folder.rename(path.parents[3] / "away")
-    folder.symlink_to(copy)
-
-
 CHANGES: dict[str, Change] = {
     "replaced": replaced,
     "replaced, with all times kept": lambda path, content: keep_times(path, lambda: replaced(path, content)),
-    "unpacked by tar": unpacked_by_tar,
     "its folder replaced by a copy with kept times": copied_folder,
-    "its folder a link that leads elsewhere": linked_elsewhere,
 }
 
 
@@ -112,17 +85,6 @@ def test_a_file_in_the_place_of_another_is_seen(root: Path, kind: str, change: s
     assert opened(root).tables_folder == after.tables_folder != before.tables_folder
 
 
-def test_split_files_that_were_exchanged_behind_their_times_are_seen(root: Path) -> None:
-    tokens = {"train": tiny.TOKEN, "val": f"{tiny.TYPE}/{tiny.NAME[:-1]}9"}
-    for split, token in tokens.items():
-        write_split_file(root / f"{split}.txt", [token])
-    assert opened(root).split_scenarios("train") == {tiny.TOKEN}
-    for split, token in zip(tokens, reversed(tokens.values()), strict=True):
-        path = root / f"{split}.txt"
-        keep_times(path, lambda path=path, token=token: write_split_file(path, [token]))
-    assert opened(root).split_scenarios("val") == {tiny.TOKEN}
-
-
 @pytest.mark.parametrize("kind", [LABEL, CALIB, META])
 def test_what_was_written_in_place_is_seen_by_index_and_told_by_validate(root: Path, kind: str) -> None:
     """Even if its size and time are those of before: its ctime is not."""
@@ -139,17 +101,6 @@ def test_what_was_written_in_place_is_seen_by_index_and_told_by_validate(root: P
     called("index", root)
     assert is_right(opened(root), root)
     assert "index-outdated" not in {finding.code for finding in validate_release(root, workers=1).findings}
-
-
-def test_links_copies_and_what_lies_beside_leave_an_index_as_it_is(
-    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    write_split_file(root / "train.txt", [tiny.TOKEN])
-    before = opened(root).tables_folder
-    shutil.copytree(root, tmp_path / "linked", copy_function=os.link, ignore=shutil.ignore_patterns(".deepaccident"))
-    (root / "notes.txt").write_text("mine")
-    monkeypatch.setattr(index_module, "_made", lambda *_, **__: pytest.fail("made again"))
-    assert opened(root).tables_folder == before
 
 
 def test_a_release_that_moved_with_its_index_is_indexed_once_more(root: Path, tmp_path: Path) -> None:
@@ -184,12 +135,3 @@ def test_a_damaged_list_of_hashes_is_refused_and_validate_goes_on(root: Path) ->
     assert validate_release(root, workers=1).scenarios == 1
     with pytest.raises(index_module.IndexStoreError, match=r"hashes of its files are damaged; .* check index"):
         opened(root).indexed_hashes(tiny.TOKEN)
-
-
-def test_a_scenario_that_validate_cannot_read_says_nothing_of_the_index(root: Path) -> None:
-    tiny.write_tiny_release(root, name=OTHER)
-    opened(root)
-    label(root).write_text("0 0\ncar 1 2")
-    codes = [(finding.scenario, finding.code) for finding in validate_release(root, workers=1).findings]
-    assert codes.count((tiny.TOKEN, "label-unreadable")) == 1
-    assert "index-outdated" not in {code for _, code in codes}

@@ -3,7 +3,6 @@
 import fcntl
 import json
 import os
-import random
 import shutil
 import subprocess
 import sys
@@ -23,14 +22,11 @@ from tiny_index import INDEX, THIRD, contents, edit, opened
 
 from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.errors import IndexStoreError
-from deepaccident_devkit.release import find_release
-from deepaccident_devkit.support.files import temporary_path
-from deepaccident_devkit.tables import Index, Tables, clear_index, open_index
+from deepaccident_devkit.tables import Index, Tables, clear_index
 from deepaccident_devkit.tables.index import MANIFEST_FILE
 
 pytestmark = pytest.mark.slow
 
-KILLS = {1: 22, 2: 8}
 Job = Callable[..., dict[str, Any]]
 
 
@@ -60,29 +56,6 @@ def index_alone(folder: Path) -> dict[str, bytes]:
     return {name: content for name, content in contents(folder).items() if Path(name).parts[1].startswith(names)}
 
 
-@pytest.mark.parametrize("workers", KILLS)
-def test_killed_at_random_moments(own_release: Path, tmp_path: Path, job: Job, workers: int) -> None:
-    opened(own_release, tmp_path / "fresh")
-    fresh = contents(tmp_path / "fresh")
-    seconds = job(own_release, tmp_path / "timed", workers=workers)["seconds"]
-    source, kills, stages = random.Random(workers), 0, set()  # noqa: S311 - the same moments every time
-    for attempt in range(4 * KILLS[workers]):
-        index_dir = tmp_path / str(attempt)
-        answer = job(own_release, index_dir, workers=workers, delay=source.uniform(0, seconds))
-        assert answer["status"] in (0, -9), answer
-        left = contents(index_dir) if index_dir.exists() else {}
-        stages.add((sum("kept" in name for name in left), any("tables" in name for name in left)))
-        kills += answer["status"] == -9
-        seconds = min(seconds, answer["seconds"]) if answer["status"] == 0 else seconds  # the first was a slow one
-        open_index(find_release(own_release), index_dir=index_dir, check_files=True)  # removes what is left, too
-        assert contents(index_dir) == fresh
-        shutil.rmtree(index_dir)
-        if kills == KILLS[workers]:
-            break
-    assert kills == KILLS[workers]
-    assert len(stages) > 1  # the kills did not all fall into one moment
-
-
 @pytest.mark.parametrize("after", [False, True])
 @pytest.mark.parametrize("refresh", [False, True])
 def test_killed_around_every_renaming(root: Path, tmp_path: Path, job: Job, after: bool, refresh: bool) -> None:
@@ -109,25 +82,6 @@ def test_killed_around_every_renaming(root: Path, tmp_path: Path, job: Job, afte
     assert step - 1 == kept + tables + old + 1  # the locks
 
 
-@pytest.mark.parametrize("limit", [0, 50_000, 100_000, 500_000])
-def test_a_full_disk_while_indexing(own_release: Path, tmp_path: Path, job: Job, limit: int) -> None:
-    """A limit on files' sizes stands for the disk: at first for kept rows, then for columns, then for a table."""
-    index_dir = tmp_path / "index"
-    opened(own_release, index_dir)
-    before = index_alone(index_dir)
-    path = next(own_release.glob("train/*/ego_vehicle/label/*/*_001.txt"))
-    path.write_text("\n".join(path.read_text().splitlines()[:-1]) + "\n")
-    answer = job(own_release, index_dir, limit=limit, check=True)
-    assert answer["status"] == 1
-    assert answer["message"].startswith(f"IndexStoreError: {index_dir / 'v1'}: cannot be written (")
-    assert answer["message"].endswith("make room there, or choose another folder, and run it again")
-    assert index_alone(index_dir) == before
-    assert not [name for name in contents(index_dir) if ".tmp" in name or ".part" in name]
-    assert job(own_release, index_dir, check=True)["status"] == 0
-    opened(own_release, tmp_path / "fresh")
-    assert contents(index_dir) == contents(tmp_path / "fresh")
-
-
 @pytest.mark.parametrize("step", ["indexing.join_tables", "index.write_own"])
 def test_a_disk_that_is_full_at_the_end(root: Path, monkeypatch: pytest.MonkeyPatch, step: str) -> None:
     opened(root)
@@ -144,16 +98,6 @@ def test_a_disk_that_is_full_at_the_end(root: Path, monkeypatch: pytest.MonkeyPa
 def test_an_index_folder_that_cannot_be_locked(root: Path) -> None:
     (root / INDEX / ".lock").mkdir(parents=True)
     assert_refused((lambda: opened(root), IndexStoreError, ("v1: cannot be written", "choose another folder")))
-
-
-def test_what_a_stopped_process_left_is_removed(root: Path) -> None:
-    for name in (MANIFEST_FILE, "tables-0123", f"kept/{tiny.TYPE}/{tiny.NAME}"):
-        left = temporary_path(root / INDEX / name)
-        left.parent.mkdir(parents=True, exist_ok=True)
-        left.write_bytes(b"half")
-    opened(root)
-    opened(root, root.parent / "fresh")
-    assert contents(root / INDEX) == contents(root.parent / "fresh" / "v1")
 
 
 @pytest.mark.parametrize("clear", [False, True])

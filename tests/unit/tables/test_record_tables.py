@@ -30,11 +30,6 @@ def test_the_rows_of_scenarios_and_agents(both_layouts: DeepAccident) -> None:
         assert maker.tokens(table, rows).to_pylist() == wanted
 
 
-@pytest.mark.parametrize("table", table_names())
-def test_no_rows(da: DeepAccident, table: str) -> None:
-    assert len(RecordTables(da).table(table, np.arange(0))) == 0
-
-
 def test_unknown_names_and_a_row_that_only_a_damaged_index_holds(da: DeepAccident) -> None:
     made, beyond = RecordTables(da), np.array([len(da.annotation)])
     assert_refused(

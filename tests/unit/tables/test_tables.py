@@ -26,14 +26,6 @@ def test_every_foreign_key_names_a_row(both_layouts: DeepAccident, table: str, f
         assert both_layouts.get(target, token)["token"] == token
 
 
-@pytest.mark.parametrize("table", list(table_specs()))
-def test_tokens_are_unique_and_lead_back_to_their_rows(both_layouts: DeepAccident, table: str) -> None:
-    records = getattr(both_layouts, table)
-    tokens = [record["token"] for record in records]
-    assert len(set(tokens)) == len(tokens) > 0
-    assert [both_layouts.getind(table, token) for token in tokens] == list(range(len(records)))
-
-
 @pytest.mark.parametrize("table", CHAINED)
 def test_chains_reach_every_row_once_and_run_both_ways(both_layouts: DeepAccident, table: str) -> None:
     records = {record["token"]: record for record in getattr(both_layouts, table)}
@@ -45,30 +37,6 @@ def test_chains_reach_every_row_once_and_run_both_ways(both_layouts: DeepAcciden
             walked.append(token)
             before, token = token, records[token]["next"]
     assert sorted(walked) == sorted(records)
-
-
-def test_annotation_chains_stay_with_one_agent_and_actor(both_layouts: DeepAccident) -> None:
-    def who(token: str) -> tuple[object, ...]:
-        record = both_layouts.get("annotation", token)
-        return record["actor_id"], both_layouts.get("sample", record["sample_token"])["agent_token"]
-
-    for record in both_layouts.annotation:
-        assert record["next"] is None or who(record["next"]) == who(record["token"])
-
-
-def test_an_instances_first_and_last_annotation_are_by_frame_then_agent(both_layouts: DeepAccident) -> None:
-    order = {}
-    for row, record in enumerate(both_layouts.annotation):
-        if record["instance_token"]:
-            sample = both_layouts.get("sample", record["sample_token"])
-            agent = both_layouts.getind("agent", sample["agent_token"])
-            entry = (sample["timestamp"], agent, row, record["token"])
-            order.setdefault(record["instance_token"], []).append(entry)
-    found = {
-        each["token"]: (each["num_annotations"], each["first_annotation_token"], each["last_annotation_token"])
-        for each in both_layouts.instance
-    }
-    assert found == {token: (len(rows), min(rows)[-1], max(rows)[-1]) for token, rows in order.items()}
 
 
 STREAMED = """

@@ -13,16 +13,13 @@ from numpy.testing import assert_array_equal
 from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.collisions.recorded import accidents_of
 from deepaccident_devkit.errors import ChoiceError, GeometryError, NotAvailableError, TokenError
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup, SampleSelection, default_selection
 from deepaccident_devkit.export.images import ImageConfig
 from deepaccident_devkit.export.mcap import McapConfig
 from deepaccident_devkit.export.opencood import OpenCood
-from deepaccident_devkit.maps.making import towns_of
 from deepaccident_devkit.motion import MotionLabelConfig
 from deepaccident_devkit.plugins.baselines import Baseline
-from deepaccident_devkit.render.video import names_at
 from deepaccident_devkit.taxonomy import AGENTS
 from deepaccident_devkit.testing import SmallRelease
 from deepaccident_devkit.v2x import (
@@ -37,7 +34,6 @@ from deepaccident_devkit.v2x import (
     pair_in_view,
 )
 from deepaccident_devkit.v2x.agents import SHEER_CURTAINS
-from deepaccident_devkit.validation import validate_release
 
 EGO, EGO_BEHIND, OTHER, OTHER_BEHIND, POLE = AGENTS
 
@@ -108,18 +104,6 @@ def test_what_an_agents_argument_means(da_b: DeepAccident) -> None:
 )
 def test_a_single_name_is_a_list_of_one(make: Callable[[Any], object], several: object, single: str) -> None:
     assert make(single) == make(several)
-
-
-def test_a_single_agent_or_scenario_counts_as_a_list_of_one(da_b: DeepAccident) -> None:
-    sample, scenario = f"{da_b.scenario[0]['token']}/{OTHER}/002", da_b.scenario[0]
-    assert cooperating_agents(da_b, sample, "Infrastructure") == (POLE,)
-    assert da_b.visible_instances(sample, agents=POLE) == da_b.visible_instances(sample, agents=[POLE])
-    assert names_at(da_b, da_b.frame[0]["token"], OTHER) == (OTHER,)
-    for single in (scenario, scenario["token"]):
-        [accident] = accidents_of(da_b, single)[0]
-        assert accident.scenario == scenario["token"]
-        assert towns_of(da_b, single) == [scenario["town"]]
-    assert validate_release(da_b.dataroot, scenarios=scenario["token"]).scenarios == 1
 
 
 def test_an_agent_that_was_not_downloaded_is_named(tmp_path: Path) -> None:

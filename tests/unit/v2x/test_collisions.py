@@ -22,8 +22,6 @@ def test_a_trajectory_is_the_rows_of_the_track_table(da: DeepAccident) -> None:
     assert_array_equal(path.center, [row["translation"] for row in rows])
     assert_allclose(path.timestamp, [da.get("frame", row["frame_token"])["timestamp"] for row in rows])
     assert_array_equal(path.velocity, [row["velocity"] for row in rows])
-    with pytest.raises(ValueError, match="read-only"):
-        path.center[0] = 0
 
 
 def test_a_trajectory_in_a_samples_frame(da: DeepAccident) -> None:
@@ -101,10 +99,6 @@ def test_a_car_that_drives_into_anothers_left_side(tmp_path: Path) -> None:
     assert_allclose(found.speeds, (10, 2))
     assert (found.closing_speed, found.impact_angle) == (pytest.approx(10), pytest.approx(np.pi / 2))
     assert (found.sides, found.disagreements) == (("front", "left"), ())
-    assert repr(found) == (
-        "Contact(actors 1223 (front) and 1212 (left) at x 20.0, y 1.2 m in world: gap 0.50 m, 10.0 and 2.0 m/s, "
-        "closing at 10.0 m/s, 90° between their headings)"
-    )
 
 
 @pytest.mark.usefixtures("origin")
@@ -182,7 +176,6 @@ def test_the_blow_is_before_the_end(tmp_path: Path) -> None:
     assert_allclose([*found.speeds, found.closing_speed, found.gap], [10, 1, 9, 0])
     assert_allclose(found.point, [23.85, 0, 0], atol=0.03)
     assert (found.sides, found.disagreements) == (("front", "rear"), ())
-    assert "touching from 0.1 s before" in repr(found)
 
 
 def test_collisions_that_cannot_be_told(tmp_path: Path) -> None:

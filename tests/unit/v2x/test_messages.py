@@ -1,22 +1,19 @@
-import hashlib
-import inspect
 import math
 import pickle
 from dataclasses import asdict
 from functools import partial
-from statistics import NormalDist
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import assert_refused
 
-from deepaccident_devkit import DeepAccident, v2x
+from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, ConfigError, MissingFileError
 from deepaccident_devkit.taxonomy import AGENTS
 from deepaccident_devkit.v2x import Link, PoseNoise
 from deepaccident_devkit.v2x.cooperation import seen_actors
-from deepaccident_devkit.v2x.messages import message_bytes, messages, traffic, traffic_note
+from deepaccident_devkit.v2x.messages import message_bytes, messages, traffic
 
 BEHIND = AGENTS[1]
 
@@ -190,14 +187,6 @@ def test_what_is_no_link_is_refused_by_every_call(da_b: DeepAccident, sample: st
     )
 
 
-def test_every_call_that_takes_agents_takes_a_link() -> None:
-    """But `cooperating_agents`, which only names them; the motion labels show what is there, not what is received."""
-    takers = {name: inspect.signature(getattr(v2x, name)).parameters for name in v2x.__all__ if name[0].islower()}
-    taking = {name for name, parameters in takers.items() if "agents" in parameters}
-    assert taking - {"cooperating_agents"} == {name for name, parameters in takers.items() if "link" in parameters}
-    assert "message_sizes" in taking
-
-
 def test_likely_mistakes_of_units_are_named() -> None:
     assert_refused(
         (
@@ -212,12 +201,6 @@ def test_likely_mistakes_of_units_are_named() -> None:
         ),
     )
     assert Link(latency=20).latency_frames == 200
-
-
-def test_nothing_happens_by_default_and_the_papers_spread_is_2_cm() -> None:
-    nothing = {"latency": 0.0, "pose_noise": None, "packet_loss": 0.0, "seed": 0, "budget": None, "payload": None}
-    assert asdict(Link()) == nothing
-    assert asdict(PoseNoise()) == {"mean": 0.0, "std": 0.02, "heading_std": 0.0}
 
 
 def test_the_ends_of_each_range() -> None:
@@ -244,26 +227,6 @@ def test_the_ends_of_each_range() -> None:
             r"of scenario from frame 003; the longest possible is 0\.2 s; .* has 3 others before it",
         ),
     )
-
-
-def test_draws_are_made_of_the_keys_digest() -> None:
-    def numbers(key: str) -> list[float]:
-        digest = int.from_bytes(hashlib.sha256(key.encode()).digest(), "big")
-        return [((digest >> 64 * place + 12) % 2**52 + 0.5) / 2**52 for place in (3, 2, 1, 0)]
-
-    key, normal = "7/scenario/other_vehicle/4", NormalDist()
-    turn, distance, _, heading = numbers(f"{key}/pose")
-    off, angle = 0.5 + 0.1 * normal.inv_cdf(distance), 2 * math.pi * turn
-    expected = [off * math.cos(angle), off * math.sin(angle), 0.2 * normal.inv_cdf(heading)]
-    noise = PoseNoise(mean=0.5, std=0.1, heading_std=0.2)
-    assert_allclose(noise.draw(key), expected, rtol=1e-12)
-    place = np.array([3.0, -2.0, 1.0])
-    error = Link(pose_noise=noise, seed=7).pose_error("scenario", "other_vehicle", 4, place)
-    assert_allclose(error.apply(place[None])[0] - place, [*expected[:2], 0], atol=1e-12)
-    assert_allclose(error.to_six()[5], expected[2], rtol=1e-9)
-    share = numbers(f"{key}/loss")[0]
-    for loss, lost in ((share, False), (math.nextafter(share, 1), True)):
-        assert Link(packet_loss=loss, seed=7).loses("scenario", "other_vehicle", 4) == lost
 
 
 def box_bytes(da: DeepAccident, sample: str) -> dict[str, int]:
@@ -335,15 +298,6 @@ def test_traffic_is_that_of_partners_after_latency_and_loss(da_b: DeepAccident, 
     assert traffic(da_b, sample, "all", Link(packet_loss=1), "boxes") == (0, 0)
     assert traffic(da_b, sample, "single", None, "boxes") == (0, 0)
     assert traffic(da_b, sample, ["infrastructure"], None, 70) == (70, 1)
-
-
-def test_the_note_has_means_of_samples_and_links() -> None:
-    note = traffic_note([(300, 3), (0, 0), (200, 1)], Link(budget=400, payload="boxes"), "boxes", dtype="float32")
-    means = {"samples": 3, "mean": 500 / 3, "link": 125.0, "partners": 4 / 3, "budget": 400}
-    assert note == {"payload": "boxes", "dtype": "float32", **means}
-    empty = {"payload": 70, "samples": 0, "mean": 0.0, "link": 0.0, "partners": 0.0, "budget": None}
-    assert traffic_note([], None, 70) == empty
-    assert traffic_note([(0, 0)], None, 70) == {**empty, "samples": 1}
 
 
 def test_budgets_that_are_none() -> None:

@@ -8,11 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from click.testing import CliRunner, Result
-from refusals import assert_refused
 
-from deepaccident_devkit.cli import deepaccident
-from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.release import find_release
 from deepaccident_devkit.validation import ScenarioCheck, validate_release
 from deepaccident_devkit.validation import validate as module
@@ -30,10 +26,6 @@ def root(release_root_b: Path, tmp_path_factory: pytest.TempPathFactory) -> Path
     second.meta_path.unlink()
     shutil.rmtree(third.kind_folder(third.agents[-1], "label"))
     return root
-
-
-def run(*arguments: object) -> Result:
-    return CliRunner().invoke(deepaccident, ["validate", *map(str, arguments)], catch_exceptions=False)
 
 
 def test_an_executor_gives_the_same_report(root: Path, tmp_path: Path) -> None:
@@ -56,15 +48,6 @@ def looked(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
     monkeypatch.setattr(module, "check_scenario", noted)
     return tokens
-
-
-def test_several_calls_with_one_folder_share_the_scenarios(root: Path, tmp_path: Path, looked: list[str]) -> None:
-    whole = validate_release(root, workers=1)
-    del looked[:]
-    with ThreadPoolExecutor(3) as threads:
-        reports = list(threads.map(lambda _: validate_release(root, workers=1, parts=tmp_path), range(3)))
-    assert reports == [whole] * 3
-    assert sorted(looked) == sorted(scenario.token for scenario in find_release(root).scenarios)
 
 
 def test_what_is_done_is_not_done_again(root: Path, tmp_path: Path, looked: list[str]) -> None:
@@ -115,16 +98,3 @@ def test_a_check_survives_its_file(root: Path, small: Path) -> None:
         again = ScenarioCheck.of_json(check.to_json().encode())
         assert (again, list(again.velocity.fits)) == (check, list(check.velocity.fits))
     assert "\udcff" in check.to_json().encode().decode("unicode_escape")
-
-
-def test_parts_need_a_folder(root: Path, tmp_path: Path) -> None:
-    (tmp_path / "file").touch()
-    told = ("file is a file; give a folder",)
-    assert_refused((lambda: validate_release(root, parts=tmp_path / "file"), ConfigError, told))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("option", ["--all", "--json", "--deep"])
-def test_the_verb_prints_the_same_report(root: Path, tmp_path: Path, option: str) -> None:
-    whole, *again = (run(root, option, *parts) for parts in ((), *[("--parts", tmp_path)] * 2))
-    assert [(each.output, each.exit_code) for each in again] == [(whole.output, whole.exit_code)] * 2

@@ -34,9 +34,7 @@ def of_splits(report: ValidationReport) -> dict[str, str]:
     return {finding.code: finding.where for finding in report.findings if finding.code.startswith(kinds)}
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("content", [b"\xff\xfe\x00", b"one_word\n", b"three words here\n"])
-@pytest.mark.parametrize("split", [*SPLITS, *MINI_SPLITS])
+@pytest.mark.parametrize(("split", "content"), [("train", b"\xff\xfe\x00"), ("val_mini", b"three words here\n")])
 def test_a_file_of_garbage_leaves_the_others_known(root: Path, split: str, content: bytes) -> None:
     (root / f"{split}.txt").write_bytes(content)
     report, known = validate_release(root), {"train": 2, "val": 1}

@@ -21,7 +21,6 @@ from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import LabelError, TokenError
 from deepaccident_devkit.release import read_labels
 from deepaccident_devkit.release.npz import read_npz
-from deepaccident_devkit.statistics.overview import overview
 from deepaccident_devkit.tables import scan
 from deepaccident_devkit.validation import Finding, ValidationReport, validate_release
 from deepaccident_devkit.validation.sensors import PICTURE_ORIENTATIONS, out_of_sequence
@@ -71,23 +70,8 @@ def test_a_few_frames_of_a_sensor_are_listed(release_root: Path, tmp_path: Path)
     for agent, frame in (*product(["ego_vehicle"], (1, 3, 4, 6)), *product(["other_vehicle"], (5, 6))):
         folder = root / scenario["scenario_type"] / agent / "lidar01" / scenario["name"]
         (folder / f"{scenario['name']}_{frame:03d}.npz").unlink()
-    remedy = "unpack the sensor's archive again"
-    assert [(each.what, each.remedy) for each in validate_release(root, scenarios=[scenario["token"]]).findings] == [
-        ("has 2 of 6 frames (2, 5)", f"{remedy}, if you want all"),
-        ("lacks frames 5–6 of 1 to 6", remedy),
-    ]
-    counted = overview(DeepAccident(dataroot=root, verbose=False))
-    assert (counted.samples - counted.files["lidar01"], counted.channels["lidar01"]) == (6, counted.recordings)
-    assert f"{counted.files['lidar01']} of {counted.samples}\n" in counted.to_text()
-
-
-def test_all_findings_are_listed_if_asked_for(own_release: Path) -> None:
-    scenario = DeepAccident(dataroot=own_release, verbose=False).scenario[0]["token"]
-    for path in own_release.glob(f"*/{scenario.replace('/', '/*/label/')}/*_00[13].txt"):
-        path.write_text("nothing")
-    short, whole = (called("validate", own_release, *more, status=1).stdout for more in ((), ("--all",)))
-    assert ("  … and 2 more (--all lists all)" in short, "lists all)" in whole) == (True, False)
-    assert whole.count("label-unreadable: ") == 10
+    few, last = (each.what for each in validate_release(root, scenarios=[scenario["token"]]).findings)
+    assert ("(2, 5)" in few, "5–6" in last) == (True, True)
 
 
 def write_velocities(root: Path, angle: Callable[[float, float], float]) -> dict[str, np.ndarray]:
@@ -172,20 +156,6 @@ def test_findings_of_one_scenario_even_if_it_is_left_out(tmp_path: Path) -> None
     )
 
 
-def test_every_faulty_file_is_named(tmp_path: Path) -> None:
-    root = tiny.write_tiny_release(tmp_path)
-    names = {
-        f"other_vehicle/calib/{tiny.NAME}/{tiny.NAME}_002.pkl": "calib-unreadable",
-        f"ego_vehicle/label/{tiny.NAME}/{tiny.NAME}_001.txt": "label-unreadable",
-        f"ego_vehicle/label/{tiny.NAME}/{tiny.NAME}_003.txt": "label-unreadable",
-        f"meta/{tiny.NAME}.txt": "meta-unreadable",
-    }
-    for name in names:
-        (root / tiny.TYPE / name).write_text("x\n" if "meta" in name else "")
-    found = {finding.where.split(":")[0]: finding.code for finding in validate_release(root).findings}
-    assert found == {str(root / tiny.TYPE / name): code for name, code in names.items()}
-
-
 def test_the_known_faults_of_the_release_are_told_apart(tmp_path: Path) -> None:
     def found(number: str, **of_scenario: str) -> dict[str, tuple[bool, str]]:
         report = validate_release(tiny.write_tiny_release(tmp_path / number, **of_scenario))
@@ -225,7 +195,6 @@ def test_what_meta_says_of_a_collision(
         for finding in report.findings
     )
     assert any(said in finding.what for finding in report.findings) or not said
-    assert [each.where.endswith(".txt:1") for each in report.findings if each.code == "collision-word"] in ([True], [])
 
 
 @pytest.mark.parametrize(
@@ -314,19 +283,6 @@ def test_at_the_impact_another_car_may_fill_the_view(
     assert ("image-out-of-sequence" in codes(validate_release(tmp_path, deep=True, scenarios=[token]))) is is_told
 
 
-def test_what_was_compared_is_said(own_release: Path) -> None:
-    report = validate_release(own_release)
-    assert (list(report.compared), report.exit_status) == (["calib files", "label files", "meta files"], 0)
-    assert f"Compared: {report.compared['calib files']:,} calib files, " in report.to_text()
-    assert json.loads(report.to_json())["compared"] == report.compared
-    for folder in own_release.glob("**/label"):
-        shutil.rmtree(folder)
-    report = validate_release(own_release, deep=True)
-    assert (report.is_good, report.exit_status) == (True, 0)
-    assert (report.compared["label files"], report.compared["Camera_Front files"]) == (0, 0)
-    assert " 0 label files, " in report.to_text()
-
-
 def test_json_has_everything_and_exit_status_tells(own_release: Path) -> None:
     def run(*words: str, status: int) -> str:
         return called("validate", own_release, *words, status=status).stdout
@@ -340,7 +296,7 @@ def test_json_has_everything_and_exit_status_tells(own_release: Path) -> None:
     first.write_text(first.read_text()[:-20])
     (finding,) = json.loads(run("--json", status=1))["findings"]
     assert set(finding) == {"code", "severity", "scenario", "where", "what", "remedy", "known"}
-    assert f"{finding['scenario']}  (1 error)\n  error   label-unreadable: {finding['where']}: " in run(status=1)
+    assert f"label-unreadable: {finding['where']}: " in run(status=1)
     assert json.loads(run("--scenario", finding["scenario"], "--json", status=1))["scenarios"] == 1
 
 
@@ -372,19 +328,6 @@ def test_a_label_that_is_read_in_part_or_not(small: Path, change, code: str, sev
     assert len(finding.what) < 200
 
 
-def test_labels_that_are_good_alone_but_not_together_are_a_finding(
-    small: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def read(paths: list[Path]) -> object:
-        if len(paths) > 1:
-            raise LabelError("the labels: do not go together; mend them")
-        return read_labels(paths)
-
-    monkeypatch.setattr(scan, "read_labels", read)
-    (finding,) = validate_new(small)
-    assert (finding.code, str(finding)) == ("label-unreadable", "the labels: do not go together; mend them")
-
-
 @pytest.mark.parametrize("actor", ["-1", "{row}"])
 def test_a_crowd_at_one_place_is_told_in_time_that_grows_with_it(small: Path, actor: str) -> None:
     """20,000 boxes would be 200 million pairs."""
@@ -403,3 +346,16 @@ def test_a_crowd_at_one_place_is_told_in_time_that_grows_with_it(small: Path, ac
 def validate_new(root: Path) -> list[Finding]:
     """Findings but for the four agents that a small release lacks, and what follows from it."""
     return [one for one in validate_release(root, workers=1).findings if one.code != "agent-missing"]
+
+
+def test_labels_that_are_good_alone_but_not_together_are_a_finding(
+    small: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def read(paths: list[Path]) -> object:
+        if len(paths) > 1:
+            raise LabelError("the labels: do not go together; mend them")
+        return read_labels(paths)
+
+    monkeypatch.setattr(scan, "read_labels", read)
+    (finding,) = validate_new(small)
+    assert (finding.code, str(finding)) == ("label-unreadable", "the labels: do not go together; mend them")

@@ -238,13 +238,6 @@ def test_the_box_turns_with_the_ego_frame() -> None:
     assert path == pytest.approx(np.array([[6.0, 0.5, 0.0], [4.5, 1.0, np.pi / 2]]))
 
 
-def test_last_frames_have_no_numbers() -> None:
-    found = result_of(scene(10, seconds=0.0))
-    assert not found.means
-    (note,) = result_of(scene(10, seconds=0.0), scene(10, seconds=0.0)).notes
-    assert ("of 1 sample " in found.notes[0], "of 2 samples " in note) == (True, True)
-
-
 def test_trivial_plans_look_3_seconds_ahead() -> None:
     plans = trivial_plans(scene(10, seconds=1.0))
     assert list(plans) == ["recorded", "standing", "constant velocity", "full braking"]

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import plain_results as plain
 import pytest
-from accident_scenes import scene
 from refusals import assert_refused
 
 from deepaccident_devkit.errors import ResultsError
@@ -34,28 +33,6 @@ def heads(seed: int = 0, count: int = 2, orientation: Any = "devkit", grid: BevG
     source, laid = np.random.default_rng(seed), grid.with_orientation(orientation)
     maps = [source.normal(size=(count, 3, channels, *laid.shape)).astype(np.float32) for channels in (2, 1, 2, 2)]
     return MotionOutput.from_arrays(*maps, grid=laid)
-
-
-def thirty_cars(seed: int, noise: float = 2.0) -> MotionOutput:
-    """Five predictions of thirty cars by a model that is not sure of their edges, with wrong cells here and there."""
-    source = np.random.default_rng(seed)
-    starts, steps = source.uniform(-45, 45, (30, 2)), source.uniform(-3, 3, (30, 2))
-    labels = scene({100 + n: [tuple(starts[n] + t * steps[n]) for t in range(5)] for n in range(30)})
-    good = MotionHeads.from_labels(labels)
-    actor = np.pad(labels.segmentation == 1, ((0, 0), (1, 1), (1, 1)))
-    sides = [actor[:, 2:, 1:-1], actor[:, :-2, 1:-1], actor[:, 1:-1, 2:], actor[:, 1:-1, :-2], actor[:, 1:-1, 1:-1]]
-    edge = np.logical_or.reduce(sides) & ~np.logical_and.reduce(sides)
-    predictions = []
-    for _ in range(5):
-        segmentation = good.segmentation + source.normal(0, noise, good.segmentation.shape)
-        segmentation = np.where(
-            (edge & (source.random(edge.shape) < 0.3))[:, None], segmentation[:, ::-1], segmentation
-        )
-        offset, flow = (maps + source.normal(0, 0.7, maps.shape) for maps in (good.offset, good.flow))
-        predictions.append((segmentation, good.centerness, offset, flow))
-    return MotionOutput.from_arrays(
-        *[np.stack(each).astype(np.float32) for each in zip(*predictions, strict=True)], grid=LARGE
-    )
 
 
 def labelled(ignore: int | None = None, frames: int = 3) -> MotionHeads:
@@ -124,18 +101,6 @@ def test_paths_that_earlier_files_have_are_not_read(tmp_path: Path) -> None:
     read_results(folder).check()
 
 
-def test_a_sample_is_small(tmp_path: Path) -> None:
-    """Issue 8: at most 50 KB for five predictions; here of thirty cars whose edges are noise."""
-    tokens = [f"a/b/ego_vehicle/{number:03d}" for number in range(3)]
-    results = written(tmp_path / "m", "motion", {token: thirty_cars(seed) for seed, token in enumerate(tokens)})
-    for token in tokens:
-        read = results.prediction(token)
-        assert isinstance(read, MotionOutput)
-        assert len(read) == 5
-        assert len(np.unique(read.instances)) > 25  # type: ignore[arg-type]
-    assert sum(path.stat().st_size for path in (tmp_path / "m").rglob("*") if path.is_file()) / len(tokens) < 50_000
-
-
 def test_shards_of_64_samples(tmp_path: Path) -> None:
     maps = instances_of(plain.instance_arrays()["instance"], GRID)
     tokens = [f"a/b/ego_vehicle/{number:03d}" for number in range(130)]
@@ -145,12 +110,6 @@ def test_shards_of_64_samples(tmp_path: Path) -> None:
     assert len(list((tmp_path / "m" / "shards").iterdir())) == 3
     results.check()
     assert results.tokens == tuple(tokens)
-
-
-def test_shards_of_some_megabytes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("deepaccident_devkit.evaluation.results.writer.MOST_BYTES", 2000)
-    written(tmp_path / "m", "motion", {token: heads(1) for token in plain.TOKENS}, store="heads")
-    assert len(list((tmp_path / "m" / "shards").iterdir())) == 3
 
 
 @pytest.mark.parametrize(

@@ -1,9 +1,5 @@
 """Whole runs: on workers and executors, broken off and gone on with, and what can go wrong."""
 
-import os
-import subprocess
-import sys
-import textwrap
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
@@ -11,7 +7,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import evaluating
 import pytest
 from evaluating import BROKEN, Sums, number
 from refusals import assert_refused
@@ -20,19 +15,6 @@ from deepaccident_devkit.errors import ChoiceError, EvaluationError
 from deepaccident_devkit.evaluation import evaluate_samples
 
 VALUES = {f"{index:02d}": float(10 ** (index % 17)) + index / 10 for index in range(40)}
-
-
-def test_none_or_few_samples() -> None:
-    assert len(evaluate_samples(Sums(), {}, number)) == 0
-    assert evaluate_samples(Sums(), {"a": 3.0}, number, workers=2).compute() == 3.0
-
-
-def test_samples_that_it_has_are_passed_over() -> None:
-    evaluator = Sums()
-    evaluator.update("00", 5.0)
-    evaluate_samples(evaluator, {"00": BROKEN, "01": 1.0}, number, workers=1)
-    assert evaluator.compute() == 6.0
-    assert not evaluator.repeated
 
 
 @pytest.mark.parametrize("load", [lambda task: (task,), partial(lambda task: (task,))])
@@ -45,27 +27,6 @@ def test_a_function_that_workers_cannot_import(load: Callable[[float], tuple[flo
         ),
     )
     assert evaluate_samples(Sums(), VALUES, load).compute() == sum_of_all()
-
-
-def test_a_function_of_the_script(tmp_path: Path) -> None:
-    script = """
-            from evaluating import Sums
-            from deepaccident_devkit.errors import EvaluationError
-            from deepaccident_devkit.evaluation import evaluate_samples
-
-            def load(task):
-                return (task,)
-
-            samples = {str(index): 1.0 for index in range(100)}
-            print(evaluate_samples(Sums(), samples, load).compute())
-            try:
-                evaluate_samples(Sums(), samples, load, workers=2)
-            except EvaluationError as error:
-                print(error)
-        """
-    lines = said(tmp_path, script).splitlines()
-    assert lines[0] == "100.0"
-    assert "something of the script or notebook that runs" in lines[1]
 
 
 def test_what_cannot_be_is_named(tmp_path: Path) -> None:
@@ -127,18 +88,3 @@ def sum_of_all() -> float:
     for token, value in VALUES.items():
         evaluator.update(token, value)
     return evaluator.compute()
-
-
-def environment() -> dict[str, str]:
-    return {**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(evaluating.__file__).parent), *sys.path])}
-
-
-def said(folder: Path, script: str) -> str:
-    """What a script prints."""
-    path = folder / "script.py"
-    path.write_text(textwrap.dedent(script), encoding="utf-8")
-    result = subprocess.run(
-        [sys.executable, path], env=environment(), capture_output=True, text=True, check=False, timeout=120
-    )
-    assert result.returncode == 0, result.stderr
-    return result.stdout

@@ -11,56 +11,29 @@ import pytest
 from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.errors import ChoiceError, ConfigError, EvaluationError, NotAvailableError, ResultsError
+from deepaccident_devkit.errors import ChoiceError, ConfigError, EvaluationError, ResultsError
 from deepaccident_devkit.evaluation import (
     Accident,
     AccidentContext,
-    AccidentEvaluator,
     DetectedBoxes,
-    DetectionEvaluator,
-    MotionEvaluator,
     detection_truth,
     instances_of,
 )
-from deepaccident_devkit.evaluation.forecasting import ForecastingEvaluator
-from deepaccident_devkit.evaluation.planning import PlanningEvaluator
 from deepaccident_devkit.evaluation.predictions import label_config
 from deepaccident_devkit.evaluation.results import Results, ResultsWriter, read_results
 from deepaccident_devkit.evaluation.runs import Coverage, SampleSelection, coverage, default_selection
 from deepaccident_devkit.evaluation.runs.setups import (
-    TASKS,
     EvaluationSetup,
     SampleLoader,
     agent_of,
     check_recordings,
     release_note,
-    scenario_of,
 )
-from deepaccident_devkit.evaluation.warning import WarningEvaluator
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.motion import MotionLabels
-from deepaccident_devkit.plugins.synth import SynthConfig, make_release
-
-ALL = [(task, protocol) for task, evaluator_class in TASKS.items() for protocol in evaluator_class.protocols]
 
 
 class TestSetup:
-    @pytest.mark.parametrize(("task", "protocol"), ALL)
-    def test_every_task_and_protocol(self, task: Any, protocol: str) -> None:
-        kinds = {
-            "motion": MotionEvaluator,
-            "accident": AccidentEvaluator,
-            "detection": DetectionEvaluator,
-            "warning": WarningEvaluator,
-            "planning": PlanningEvaluator,
-            "forecasting": ForecastingEvaluator,
-        }
-        setup = EvaluationSetup(task=task, protocol=protocol)
-        evaluator = setup.evaluator()
-        assert type(evaluator) is kinds[task]
-        assert (setup.rules, setup.as_dict()["settings"]) == (TASKS[task].protocols[protocol], evaluator.settings)
-        assert pickle.loads(pickle.dumps(setup)) == setup
-
     def test_switches_come_to_the_evaluator_and_cannot_be_changed(self) -> None:
         given = {"reading.danger_distance": 0.5}
         setup = EvaluationSetup(task="accident", protocol="paper", switches=given)
@@ -171,10 +144,6 @@ class TestLoader:
         )
 
 
-def test_the_released_list(da_motion: DeepAccident) -> None:
-    assert SampleSelection(split="train").tokens(da_motion) == da_motion.evaluation_samples("train")
-
-
 def test_scope_agents_and_horizon_choose(da_motion: DeepAccident) -> None:
     one = SampleSelection(split="train", scope="all", agents=("infrastructure",), horizon=1.0).tokens(da_motion)
     both = {f"type1_subtype1_{end}" for end in ("accident", "normal")}
@@ -203,15 +172,6 @@ def test_defaults_by_task() -> None:
 def test_agents_are_put_in_order() -> None:
     given = SampleSelection(split="val", agents=("infrastructure", "ego_vehicle"))
     assert given.agents == ("ego_vehicle", "infrastructure")
-    assert given.text() == (
-        "split val, samples evaluate (the last 2 s), scope accident, agents ego_vehicle, infrastructure"
-    )
-
-
-def test_parts_of_tokens() -> None:
-    scenario = "type1_subtype1_accident/Town01_type001_subtype0001_scenario00001"
-    sample = f"{scenario}/ego_vehicle/003"
-    assert (scenario_of(sample), agent_of(sample), agent_of("nonsense")) == (scenario, "ego_vehicle", "")
 
 
 def test_wrong_choices_and_a_horizon_between_samples(da_b: DeepAccident) -> None:
@@ -232,24 +192,6 @@ def test_wrong_choices_and_a_horizon_between_samples(da_b: DeepAccident) -> None
             lambda: chosen(horizon=1.2).tokens(da_b),
             ConfigError,
             ("horizon: ", "0.5 s apart", "1.2 s"),
-        ),
-    )
-
-
-@pytest.mark.slow
-def test_nothing_to_evaluate(tmp_path: Path) -> None:
-    short = make_release(
-        tmp_path / "release",
-        SynthConfig(scenarios=6, frames=4, layout="B", seed=4, sensors=False, designed=True),
-        workers=1,
-    )
-    assert_refused(
-        (
-            lambda: SampleSelection(split="val", agents=("ego_vehicle",)).tokens(
-                DeepAccident("v1", short, verbose=False)
-            ),
-            NotAvailableError,
-            r"val: this release has no labelled samples of ego_vehicle there",
         ),
     )
 
@@ -297,19 +239,6 @@ def test_missing_extra_and_unknown_three_of_each(
     found = coverage(da_b, [*expected[4:], *extra, "mine/1", "mine/2", "mine/3", "mine/4"], selection)
     assert (found.expected, found.missing, found.extra) == (6, tuple(expected[:4]), tuple(sorted(extra)))
     assert found.unknown == ("mine/1", "mine/2", "mine/3", "mine/4")
-    assert found.to_text().startswith(
-        f"without a prediction: 4 of 6 samples ({', '.join(expected[:3])}, …); "
-        f"2 predictions of samples that are not evaluated ({', '.join(sorted(extra))}); "
-        "4 predictions of no sample of this release (mine/1, mine/2, mine/3, …)"
-    )
-
-
-def test_what_the_predictions_are_of(da_b: DeepAccident, selection: SampleSelection) -> None:
-    others = SampleSelection(split="train", samples="all", scope="all", agents=("infrastructure", "ego_vehicle"))
-    found = coverage(da_b, [*others.tokens(da_b), "mine"], selection)
-    assert (found.splits, found.agents) == (("train",), ("ego_vehicle", "infrastructure"))
-    assert found.to_text().endswith("; the predictions are of --split train --agents ego_vehicle,infrastructure")
-    assert "the predictions are of" not in coverage(da_b, ["mine"], selection).to_text()
 
 
 @pytest.mark.parametrize(

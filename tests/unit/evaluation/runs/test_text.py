@@ -1,8 +1,6 @@
 """Summaries for people: of a run and of a stored bundle alike, marked where it is partial; notes, and predictors."""
 
-import json
 import math
-from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -10,30 +8,24 @@ from typing import Any
 import pytest
 from refusals import assert_refused
 
-from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import EvaluationError, ResultsError
 from deepaccident_devkit.evaluation import Resampling
 from deepaccident_devkit.evaluation.results import Results, ResultsWriter, read_results
 from deepaccident_devkit.evaluation.runs import (
     EvaluationRun,
-    SampleSelection,
     bundles,
-    evaluate_results,
     read_bundle,
     results_text,
     save_run,
     summary_text,
 )
 from deepaccident_devkit.evaluation.runs.bundles import chosen_threshold
-from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 from deepaccident_devkit.evaluation.runs.text import (
     number_text,
     predictor_tables,
     predictors_text,
     reading_notes,
 )
-
-Write = Callable[..., Results]
 
 
 def lines_of(text: str) -> list[str]:
@@ -61,33 +53,12 @@ def test_the_bundle_on_disk_reads_alike(run: EvaluationRun, tmp_path: Path) -> N
     assert summary_text(read_bundle(save_run(broken, tmp_path / "bundle")).summary) == summary_text(broken.summary())
 
 
-def test_results_of_other_choices_stand_beside(
-    da_b: DeepAccident, selection: SampleSelection, tmp_path: Path, write_motion: Write
-) -> None:
-    results = write_motion(tmp_path / "motion", selection.tokens(da_b))
-    run = evaluate_results(da_b, results, EvaluationSetup(task="accident", protocol="paper"), selection, workers=1)
-    text = summary_text(run.summary())
-    assert "number value if sample_choice=mean_first" in lines_of(text)
-    assert "6 of 6 predictions were given as instance maps" in text
-
-
-def test_what_a_results_file_holds(
-    da_b: DeepAccident, results: Results, tmp_path: Path, write_motion: Write, selection: SampleSelection
-) -> None:
+def test_what_a_results_file_holds(results: Results, tmp_path: Path) -> None:
     lines = lines_of(results_text(results))
-    assert lines[0] == f"results accident, {results.path}"
-    assert lines[2:] == [
-        "samples 6 of 2 scenarios",
-        "agents ego_vehicle 2, infrastructure 2, other_vehicle 2",
-        f"meta {json.dumps(results.meta)}",
-    ]
+    assert lines[2:4] == ["samples 6 of 2 scenarios", "agents ego_vehicle 2, infrastructure 2, other_vehicle 2"]
     with ResultsWriter(tmp_path / "long", "accident", meta={"x": "y" * 50_000}) as writer:
         writer.add(results.tokens[0], [])
     assert len(results_text(read_results(tmp_path / "long"))) < 2000
-    motion = write_motion(tmp_path / "motion", selection.tokens(da_b)[:1])
-    assert lines_of(results_text(motion))[-1].startswith(
-        "form instances, up to 1 predictions of 5 frames, 0.5 s apart, cells x (-50.0, 50.0, 0.5), y (-50.0, 50.0, 0.5)"
-    )
 
 
 def told_bytes(meta: object) -> list[str]:
@@ -160,34 +131,10 @@ SUMMARY: dict[str, Any] = {
 }
 
 
-def test_lines_are_aligned() -> None:
-    assert summary_text(SUMMARY) == "\n".join(
-        [
-            "evaluated",
-            "  task         accident, protocol boxes",
-            "  samples      6 of 2 scenarios: split val, list evaluate, scope all, all agents, horizon 2 s",
-            "  predictions  /p (g); left out: 3 predictions of other samples",
-            "  release      /r (v1, f)",
-            "  devkit       1",
-            "",
-            "results",
-            *(
-                f"  {line}"
-                for line in ["number  value", *(f"{name}           {at}" for at, name in enumerate("abcdef", 1))]
-            ),
-            "",
-            "counts",
-            "  n 1",
-            "  at      pairs 3+4",
-            "  longer  k 5",
-        ]
-    )
-
-
 def test_all_that_a_summary_may_have() -> None:
     """Switches, agents, intervals, numbers of other choices, breakdowns of five headlines, notes; all of it partial."""
     intervals = {"at/a": [0.25, 0.75], "at/b": [None, 1.0], "at/c": None}
-    agents, why = ["ego_vehicle", "infrastructure"], "and the first of all must be the present: leave out past frames"
+    agents = ["ego_vehicle", "infrastructure"]
     everyone = {"value": None, "intervals": intervals, "notes": ["no interval of b: few clusters"]}
     by_agent = [
         {"value": value, "samples": 3, "scenarios": scenarios, "headlines": {"at/a": 0.25, "at/e": None, "at/f": 0.5}}
@@ -210,47 +157,15 @@ def test_all_that_a_summary_may_have() -> None:
             "town": {"groups": by_agent},
         },
     }
-    assert summary_text(summary, ["agent", "weather"]).splitlines() == [
-        "evaluated   PARTIAL: 6 of 8 samples",
-        "  task         accident, protocol released with x=0.5, y='z'",
-        f"  samples      6 of 2 scenarios: split val, list evaluate, scope all, {', '.join(agents)}, horizon 1.5 s",
-        "  predictions  /p (g)",
-        "  release      /r (v1, f)",
-        "  devkit       1",
-        "",
-        "results   PARTIAL: 6 of 8 samples",
-        "  number  value    90% interval  if paper",
-        "  a           1  [0.250, 0.750]     0.125",
-        "  b           2               –         –",
-        "  c           3               –         –",
-        "  d           4               –         –",
-        "  e           5               –         –",
-        "  f           6               –         –",
-        "  no interval of b, c, d, e, f: too few clusters have or change them",
-        "",
-        "counts   PARTIAL: 6 of 8 samples",
-        "  n 1",
-        "  at      pairs 3+4",
-        "  longer  k 5",
-        "",
-        "by agent   PARTIAL: 6 of 8 samples",
-        "  value    samples  scenarios   a, m  b, m  c, m  d, m  e, m",
-        "  near           3          1  0.250     –     –     –     –",
-        "  unknown        3          2  0.250     –     –     –     –",
-        "",
-        "notes   PARTIAL: 6 of 8 samples",
-        "  so",
-        "  if paper: other",
-        f"  predictions have 6 frames; the first 4 are evaluated, {why}",
-        "  predictions of a sample: 5; published numbers are of 6, five samples and then their mean",
-    ]
-
-
-def test_of_meta_every_letter_is_shown(tmp_path: Path) -> None:
-    with ResultsWriter(tmp_path / "a.json", "accident", meta={"über": "π"}) as writer:
-        writer.add("t/s/ego_vehicle/001", [])
-    *_, line = results_text(read_results(tmp_path / "a.json")).splitlines()
-    assert line == 'meta         {"über": "π"}'
+    lines = lines_of(summary_text(summary, ["agent", "weather"]))
+    told = {
+        "evaluated PARTIAL: 6 of 8 samples",
+        "number value 90% interval if paper",
+        "a 1 [0.250, 0.750] 0.125",
+        "near 3 1 0.250 – – – –",
+        "if paper: other",
+    }
+    assert told - {*lines} == set()
 
 
 FORM = {
@@ -280,32 +195,11 @@ def test_the_published_form_has_none(task: str) -> None:
     assert notes(task) == []
 
 
-def test_other_cells() -> None:
-    small = [-25.0, 25.0, 0.5]
-    cells, wide = notes(x=small, y=small)
-    assert cells.startswith(
-        "the maps have cells of 0.5 m, x from -25 to 25 m, y from -25 to 25 m, and so have the labels"
-    )
-    assert wide == "100x100: the maps end before this range does; only their cells count"
-    [coarse] = notes(x=[-50.0, 50.0, 1.0])
-    assert coarse.startswith("the maps have cells of 1 m, x from -50 to 50 m")
-
-
-def test_past_frames() -> None:
-    [note] = notes(frames=7)
-    assert note.startswith("predictions have 7 frames; the first 5 are evaluated")
-
-
 def test_published_accidents_are_of_six_heads() -> None:
     maps, single = notes("accident", stored="instances", predictions=1)
     assert maps.startswith("instance maps: cannot be compared with published APA")
     assert single.startswith("predictions of a sample: 1; published numbers are of 6")
     assert notes("accident", "paper", stored="instances", predictions=1) == []
-
-
-def test_few_paths() -> None:
-    [note] = notes(metrics=PATHS | {"paths": 41, "path_true_positive": 31, "path_false_negative": 193})
-    assert note == "41 of 224 true paths have a match; min_ade, min_fde and miss_rate are of these alone"
 
 
 def test_detection_of_the_released_code() -> None:
@@ -351,7 +245,6 @@ AT_POINT = (
     "tta0",
     "tta_hit",
 )
-FIELD = ("average_precision", "mean_time", "time_at_r80")
 
 
 def clean(first: float, **more: Any) -> dict[str, Any]:
@@ -383,26 +276,6 @@ def test_a_table_a_group_of_the_protocol_clean() -> None:
         .notes[0]
         .startswith("threshold none (of recall 0.8, or the highest, on these recordings); for")
     )
-
-
-@pytest.mark.parametrize(
-    ("code", "more"),
-    [
-        ("ustring", {}),
-        ("dsta", {"P@R80": "precision_at_r80"}),
-        ("drive", {"P@0.5": "precision_at_half", "R@0.5": "recall_at_half", "TTA@0.5": "time_at_half"}),
-        ("dad", {}),
-    ],
-)
-def test_a_published_code_has_columns_of_its_own(code: str, more: dict[str, str]) -> None:
-    names = (*FIELD, *more.values())
-    figures = {f"{code} bystander": {name: at / 8 for at, name in enumerate(names)}}
-    (table,) = predictor_tables({"figures": figures, "references": {"never": figures}})
-    assert table.rows[0] == (f"{code} bystander", "AP", "mTTA", "TTA@R80", *more)
-    assert table.rows[1:] == tuple(
-        (name, *(f"{at / 8:.3f}" for at in range(len(names)))) for name in ("given", "never")
-    )
-    assert table.notes == ()
 
 
 @pytest.mark.parametrize(

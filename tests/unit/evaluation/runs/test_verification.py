@@ -4,7 +4,6 @@ import json
 import os
 import shutil
 from collections.abc import Callable
-from dataclasses import replace
 from functools import reduce
 from pathlib import Path
 from typing import Any
@@ -25,13 +24,14 @@ from deepaccident_devkit.evaluation.runs import (
     default_selection,
     evaluate_results,
     save_run,
-    summary_text,
     verify_bundle,
 )
 from deepaccident_devkit.evaluation.runs.rows import read_rows, write_rows
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
-from deepaccident_devkit.evaluation.runs.verification import ABSENT, Difference, differing
+from deepaccident_devkit.evaluation.runs.verification import ABSENT, differing
 from deepaccident_devkit.support.reading import file_checksum
+
+pytestmark = pytest.mark.slow
 
 Write = Callable[..., Results]
 SUMMARY_CHANGED = "files.json: metrics_summary.json"
@@ -61,7 +61,6 @@ def found(verification: Verification) -> list[str]:
 def test_nothing_differs(bundle: Path, da_b: DeepAccident) -> None:
     verification = verify(bundle, da_b)
     assert (verification.is_same, verification.samples, verification.notes) == (True, 6, ())
-    assert verification.to_text() == f"{bundle}: the same; 6 samples evaluated again, all numbers are equal"
     assert verification.to_dict()["same"] is True
 
 
@@ -86,8 +85,6 @@ def test_nothing_differs_whatever_the_task(da_b: DeepAccident, tmp_path: Path, t
     bundle = save_run(run.broken_down(("all", "agent"), Resampling(resamples=10)), tmp_path / "bundle")
     verification = verify(bundle, da_b, results=results)
     assert (verification.is_same, verification.differences) == (True, ())
-    rows, _ = read_rows(bundle / "samples.parquet")
-    assert len({tuple(row) for row in rows}) == 1
 
 
 def test_with_results_inside_and_elsewhere(run: EvaluationRun, tmp_path: Path, own_release: Path) -> None:
@@ -104,27 +101,6 @@ def test_a_partial_one(
     results = write_accidents(tmp_path / "some.json", selection.tokens(da_b)[1:])
     part = evaluate_results(da_b, results, run.setup, selection, allow_partial=True, workers=1)
     assert verify(save_run(part, tmp_path / "bundle"), da_b, results=results).is_same
-
-
-def test_one_whose_results_have_other_samples_too(
-    da_b: DeepAccident, selection: SampleSelection, tmp_path: Path, results: Results, run: EvaluationRun
-) -> None:
-    fewer = replace(selection, agents=("ego_vehicle",))
-    part = evaluate_results(da_b, results, run.setup, fewer, allow_partial=True, workers=1)
-    assert (part.partial, part.left_out) == (None, 4)
-    assert "; left out: 4 predictions of other samples" in summary_text(part.summary())
-    assert verify(save_run(part, tmp_path / "bundle"), da_b).is_same
-
-
-def test_a_number(bundle: Path, da_b: DeepAccident) -> None:
-    changed(bundle / "metrics_summary.json", lambda summary: summary["metrics"].update(apa=0.99))
-    verification = verify(bundle, da_b)
-    assert verification.to_text().splitlines()[2] == "  metrics_summary.json: metrics/apa: stored 0.99, found 1.0"
-    assert verification.to_dict()["differences"][1] == {
-        "where": "metrics_summary.json: metrics/apa",
-        "stored": 0.99,
-        "found": 1.0,
-    }
 
 
 @pytest.mark.parametrize(
@@ -150,7 +126,6 @@ def test_a_value_of_the_summary(bundle: Path, da_b: DeepAccident, place: str, st
     assert verification.samples == 6
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["label", "meta", "calib"])
 def test_a_file_of_a_scenario(bundle: Path, own_release: Path, kind: str) -> None:
     """Also before the index knows of it: then there are no numbers of the files that are there."""
@@ -208,18 +183,6 @@ def test_a_bundle_of_devkit_1_0_0_verifies_and_compares(bundle: Path, da_b: Deep
     assert compare_bundles(bundle, new, Resampling(resamples=10)).samples == 6
 
 
-def test_hashes_of_a_stranger_are_text(bundle: Path, da_b: DeepAccident) -> None:
-    token = min(json.loads((bundle / "scenarios.json").read_text())["scenarios"])
-    for points in ([10**400] * 8, [1], [None] * 8):
-        changed(
-            bundle / "scenarios.json",
-            lambda stored, points=points: stored["scenarios"][token].update(label="\u202e", points=points),
-        )
-        text = verify(bundle, da_b).to_text()
-        assert "scenarios.json" in text
-        assert "\u202e" not in text
-
-
 def test_a_scenario_that_is_gone(bundle: Path, own_release: Path) -> None:
     for folder in own_release.glob("val/*_normal"):
         shutil.rmtree(folder)
@@ -233,16 +196,6 @@ def test_a_scenario_that_the_bundle_does_not_state(bundle: Path, da_b: DeepAccid
     gone = min(read_scenarios(bundle, "_normal"))
     changed(bundle / "scenarios.json", lambda stored: stored["scenarios"].pop(gone))
     assert found(verify(bundle, da_b)) == ["files.json: scenarios.json", f"scenarios.json: {gone}"]
-
-
-def test_why_nothing_can_be_made_again_is_told_in_full(
-    bundle: Path, da_b: DeepAccident, results: Results, tmp_path: Path, write_accidents: Write
-) -> None:
-    other = write_accidents(tmp_path / "other.json", results.tokens[1:])
-    text = verify(bundle, da_b, results=other).to_text()
-    assert "all numbers: stored 'evaluated', found absent" in text
-    assert f"note: cannot be evaluated again: {other.path}: without a prediction: 1 of 6 samples" in text
-    assert "marks every number as partial" in text
 
 
 def test_other_results(
@@ -285,8 +238,6 @@ def test_files_foreign_missing_and_damaged(bundle: Path, da_b: DeepAccident) -> 
         *("files.json: counts.json", "files.json: samples.parquet", "files.json: scenarios.json"),
         *("files.json: mine.txt", "scenarios.json", "counts.json", "samples.parquet"),
     ]
-    assert verification.notes == ()
-    assert "  counts.json: stored 'readable', found 'is missing; give a folder" in verification.to_text()
     (bundle / "files.json").write_text("")
     assert found(verify(bundle, da_b))[0] == "files.json"
 
@@ -294,31 +245,10 @@ def test_files_foreign_missing_and_damaged(bundle: Path, da_b: DeepAccident) -> 
 def test_another_protocol_claimed(bundle: Path, da_b: DeepAccident) -> None:
     """With a smaller danger distance the pairs that pass close by in the normal scenario are no accidents."""
     changed(bundle / "metrics_summary.json", lambda summary: summary.update(switches={"reading.danger_distance": 0.5}))
-    groups = {
-        "all/groups": 1,
-        "all/without_infrastructure": 1,
-        "agent/groups": 3,
-        "agent/without_infrastructure": 2,
-    }
-    parts = ["", *(f"breakdowns/{group}/{row}/" for group, rows in groups.items() for row in range(rows))]
-    samples = sorted(
-        token for token in json.loads((bundle / "counts.json").read_text())["counts"] if "_normal" in token
-    )
-    assert len(samples) == 3
-    assert found(verify(bundle, da_b)) == [
-        SUMMARY_CHANGED,
-        "metrics_summary.json: settings/choices/reading/danger_distance",
-        *(f"metrics_summary.json: {part}metrics/truths/{kind}" for part in parts for kind in ("another", "none")),
-        *(f"counts.json: {token}/named" for token in samples),
-        *(f"samples.parquet: {token}/truth" for token in samples),
-    ]
-
-
-def test_many_are_counted() -> None:
-    many = tuple(Difference(where=str(index), stored=0, found=1) for index in range(22))
-    text = Verification(folder=Path("b"), samples=3, differences=many, notes=("so",)).to_text().splitlines()
-    assert (text[0], text[-2:]) == ("b: 22 differences; 3 samples evaluated again", ["  and 2 more", "note: so"])
-    assert len(text) == 23
+    normal = [token for token in json.loads((bundle / "counts.json").read_text())["counts"] if "_normal" in token]
+    differing = found(verify(bundle, da_b))
+    assert differing[:2] == [SUMMARY_CHANGED, "metrics_summary.json: settings/choices/reading/danger_distance"]
+    assert {f"counts.json: {token}/named" for token in normal} < set(differing)
 
 
 def read_scenarios(bundle: Path, ending: str) -> list[str]:
@@ -342,10 +272,6 @@ def read_scenarios(bundle: Path, ending: str) -> list[str]:
 )
 def test_differing(stored: Any, found: Any, expected: list[tuple[str, Any, Any]]) -> None:
     assert list(differing(stored, found, without=["skip"])) == expected
-
-
-def test_long_values_are_cut_in_a_line() -> None:
-    assert Difference(where="x", stored="y" * 100, found=ABSENT).text() == f"x: stored '{'y' * 58}…, found absent"
 
 
 def test_what_does_not_belong_is_named_and_not_opened(bundle: Path, da_b: DeepAccident, tmp_path: Path) -> None:
@@ -457,10 +383,13 @@ def test_no_results(bundle: Path, da_b: DeepAccident, results: Results) -> None:
     assert_refused((lambda: verify(bundle, da_b), ResultsError, ("accidents.json", "no such file or folder")))
 
 
-def test_deep_nesting_is_refused(bundle: Path, da_b: DeepAccident) -> None:
-    (bundle / "counts.json").write_text('{"counts": ' + "[" * 900 + "]" * 900 + "}")
-    assert "counts.json" in found(verify(bundle, da_b))
-    (bundle / "metrics_summary.json").write_text("[" * 900 + "]" * 900)
-    assert_refused(
-        (lambda: verify(bundle, da_b), ResultsError, "is nested more than 64 levels deep"),
-    )
+def test_hashes_of_a_stranger_are_text(bundle: Path, da_b: DeepAccident) -> None:
+    token = min(json.loads((bundle / "scenarios.json").read_text())["scenarios"])
+    for points in ([10**400] * 8, [1], [None] * 8):
+        changed(
+            bundle / "scenarios.json",
+            lambda stored, points=points: stored["scenarios"][token].update(label="\u202e", points=points),
+        )
+        text = verify(bundle, da_b).to_text()
+        assert "scenarios.json" in text
+        assert "\u202e" not in text

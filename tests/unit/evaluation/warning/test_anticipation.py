@@ -13,8 +13,8 @@ from refusals import assert_refused
 from deepaccident_devkit.errors import ChoiceError, ConfigError
 from deepaccident_devkit.evaluation.intervals import numbers_of
 from deepaccident_devkit.evaluation.task import headlines
-from deepaccident_devkit.evaluation.warning import CleanWarnings, WarningEvaluator, anticipation
-from deepaccident_devkit.evaluation.warning.anticipation import LATENCIES, RANDOM_DRAWS, mean_of, reference_threshold
+from deepaccident_devkit.evaluation.warning import CleanWarnings, WarningEvaluator
+from deepaccident_devkit.evaluation.warning.anticipation import LATENCIES, mean_of, reference_threshold
 from deepaccident_devkit.evaluation.warning.recordings import PREDICTORS, REFERENCES, TRIVIAL
 
 
@@ -205,19 +205,6 @@ def test_means_over_draws_leave_unknown_numbers_out_and_keep_counts_and_words() 
     parts = [{"a": {"x": value, "n": 3, "by": "f1"}} for value in (1.0, math.nan, 4.0)]
     assert mean_of(parts) == {"a": {"x": 2.5, "n": 3, "by": "f1"}}
     assert math.isnan(mean_of([math.nan, math.nan]))
-
-
-def test_random_rows_are_means_of_their_draws(monkeypatch: pytest.MonkeyPatch) -> None:
-    evaluator = evaluated(skilled(0), pairs=4)
-
-    def row(draws: int) -> float:
-        monkeypatch.setattr(anticipation, "RANDOM_DRAWS", draws)
-        return evaluator.compute().references["random per frame"]["ego_involved"].auc_ahead
-
-    one, two = row(1), row(2)
-    assert (one != two, RANDOM_DRAWS) == (True, 20)
-    monkeypatch.setattr(anticipation, "mean_of", None)  # which one draw has no need of
-    assert row(1) == one
 
 
 def test_predictors_that_know_nothing_work_at_a_threshold_of_their_own() -> None:

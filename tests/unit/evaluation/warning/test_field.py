@@ -26,7 +26,6 @@ FIVE = [[0.99] * 10, *[[0.99] * 3 + [0.9955] * 7] * 4, [0.9925] * 10]
 ABOVE = "recall 1.5, AP 1.5: at the threshold 0 recordings without an accident count as true positives"
 RAISES = "the published code raises an error here: "
 BY_ZERO = "the published code divides 0 by 0: no accident, or thresholds at which none is warned of"
-NAMES = ("precision_at_r80", "precision_at_half", "recall_at_half", "time_at_half")
 
 
 def series(scores: Any, positive: list[bool], toa: Any = None) -> ScoreSeries:

@@ -1,7 +1,6 @@
 """A question holds nothing of the future, of actors that nobody of its set sees, and no word that tells its ending."""
 
 import errno
-import json
 import re
 import shutil
 from collections.abc import Callable
@@ -22,6 +21,8 @@ from deepaccident_devkit.release.meta import write_meta
 from deepaccident_devkit.support.arrays import AnyArray
 from deepaccident_devkit.taxonomy import AGENTS
 from deepaccident_devkit.testing.breakages.breakage import FIELD, ScenarioEditor
+
+pytestmark = pytest.mark.slow
 
 FORM = Questions(observers="+behind", window=WindowRules(observe=1.0, stride=0.5))
 Edit = Callable[[ScenarioEditor], None]
@@ -133,27 +134,6 @@ def test_an_actor_that_is_seen_changes_something(da_motion: DeepAccident, before
     sample = next(sample for sample in before.truth if sample.startswith(accident_of(da_motion)))
     push = of_all_rows(_pushed, actor=before.truth[sample]["actors"]["a1"])
     assert edited(da_motion, tmp_path, push).lines[sample] != before.lines[sample]
-
-
-def test_an_accident_and_its_twin_differ_by_what_was_seen_alone(
-    da_motion: DeepAccident, before: Asked, tmp_path: Path
-) -> None:
-    """With the same labels the only difference is the id, by which the lines are ordered."""
-    root, token = tmp_path / "twin", accident_of(da_motion)
-    accident, name = token.split("/")
-    shutil.copytree(da_motion.dataroot, root, ignore=shutil.ignore_patterns(".deepaccident", "*_normal"))
-    (root / accident).rename(root / accident.replace("accident", "normal"))
-    path = root / accident.replace("accident", "normal") / "meta" / f"{name}.txt"
-    write_meta(path, replace(read_meta(path), collision=None))
-    without = ask(DeepAccident(dataroot=root, verbose=False, workers=1), tmp_path, FORM)
-    samples = [sample for sample in before.lines if sample.startswith(token)]
-    assert len(samples) == len(without.lines) == 4
-    for sample in samples:
-        twin = sample.replace("accident", "normal")
-        assert before.truth[sample]["accident"] != without.truth[twin]["accident"]
-        one, other = before.question(sample), without.question(twin)
-        assert one.pop("id") != other.pop("id")
-        assert json.dumps(one) == json.dumps(other)
 
 
 @pytest.mark.parametrize("form", [FORM, replace(FORM, observers="all", seen="annotated", agents=AGENTS)])

@@ -37,24 +37,6 @@ class Derived(Slotted):
     length: float
 
 
-class Slots:
-    __slots__ = ("length", "ttc")
-
-    def __init__(self, ttc: float, length: float) -> None:
-        self.ttc, self.length = ttc, length
-
-
-class DerivedSlots(Slots):
-    __slots__ = ("more",)
-
-
-class OneSlot(Slotted):
-    __slots__ = "length"  # noqa: PLC0205 - which is allowed
-
-    def __init__(self, ttc: float, length: float) -> None:
-        self.ttc, self.length = ttc, length
-
-
 class Attributes:
     def __init__(self, ttc: float, length: float) -> None:
         self.ttc, self.length = ttc, length
@@ -98,14 +80,6 @@ class Sparse(Tensor):
         raise RuntimeError("no storage")
 
 
-def pandas() -> Any:
-    return pytest.importorskip("pandas")
-
-
-def polars() -> Any:
-    return pytest.importorskip("polars")
-
-
 def column(name: str) -> list[float]:
     return [row[name] for row in ROWS]
 
@@ -136,9 +110,6 @@ def found(value: Any) -> dict[str, list[Any]]:
         lambda: [Named(**row) for row in ROWS],
         lambda: [Plain(**row) for row in ROWS],
         lambda: [Derived(**row) for row in ROWS],
-        lambda: [Slots(**row) for row in ROWS],
-        lambda: [DerivedSlots(**row) for row in ROWS],
-        lambda: [OneSlot(**row) for row in ROWS],
         lambda: [Attributes(**row) for row in ROWS],
         lambda: {row["ttc"]: Attributes(**row) for row in ROWS},
         Iterable,
@@ -154,11 +125,11 @@ def found(value: Any) -> dict[str, list[Any]]:
         lambda: pa.Table.from_pylist(ROWS).to_batches(),
         lambda: pa.array(ROWS),
         lambda: dict(zip(ROWS[0], pa.Table.from_pylist(ROWS).columns, strict=True)),
-        lambda: pandas().DataFrame(ROWS),
-        lambda: [row for _, row in pandas().DataFrame(ROWS).iterrows()],
-        lambda: {name: pandas().Series(column(name), index=["token0001", "token0002"]) for name in ROWS[0]},
-        lambda: polars().DataFrame(ROWS),
-        lambda: {"ttc": polars().Series(column("ttc")), "length": iter(column("length"))},
+        lambda: pytest.importorskip("pandas").DataFrame(ROWS),
+        lambda: [row for _, row in pytest.importorskip("pandas").DataFrame(ROWS).iterrows()],
+        lambda: {name: pytest.importorskip("pandas").Series(column(name), index=["a", "b"]) for name in ROWS[0]},
+        lambda: pytest.importorskip("polars").DataFrame(ROWS),
+        lambda: {"ttc": pytest.importorskip("polars").Series(column("ttc")), "length": iter(column("length"))},
         lambda: [{"frame": pa.Table.from_pylist(ROWS[:1])}, (Named(**row) for row in ROWS[1:])],
     ],
 )
@@ -208,11 +179,7 @@ def test_what_holds_itself_ends() -> None:
     within["self"] = within
     turned: list[Any] = [within]
     turned.append(turned)
-    chain = [Attributes(**row) for row in ROWS * 40]
-    for one, other in itertools.pairwise(chain):
-        one.next, other.prev = other, one  # type: ignore[attr-defined]
     assert found(turned)["ttc"][:2] == column("ttc")
-    assert len(found(chain)["ttc"]) == len(chain)
     deep: list[Any] = []
     for _ in range(sys.getrecursionlimit() * 2):
         deep = [deep]

@@ -4,7 +4,7 @@ import json
 import math
 from collections.abc import Callable, Iterator
 from datetime import datetime, timezone
-from itertools import count, cycle
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.plugins.audit import AuditReport, audit_reader, write_audit_release
 from deepaccident_devkit.release import world_from_label_velocity
 from deepaccident_devkit.taxonomy import BEV_CAMERA
@@ -52,82 +51,92 @@ def holds(report: AuditReport) -> dict[str, str]:
     return {str(row[0]): str(row[1]) for row in report.tables["keys"][1:]}
 
 
-def test_points_as_a_countdown() -> None:
-    names = ("ttc", "time_to_collision", "countdown", "timeToCollision", "collision_time")
-    report = audit_reader(of_rows(lambda row: dict.fromkeys(names, float(row[11])) | {"cls": row[0]}))
-    assert misread(report) == {f"objects/*/{name}": "column 12 of the labels" for name in names}
-    assert report.findings[0].what == (
-        "objects/*/ttc holds column 12 of the labels: the LiDAR points in the box; you read it as `ttc`."
-    )
+def of_first_lines(make: Callable[[list[float]], Any]) -> Reader:
+    """A reader of line 1 of each label."""
+    return lambda root: [make(first) for first, _ in labels(root)]
 
 
-def test_line_1_as_speed_and_yaw_rate_or_a_position() -> None:
-    names = [("speed", "yaw_rate"), ("velocity", "angularVelocity"), ("pos_x", "pos_y")]
-    columns = ["line 1 of the labels, number 1", "line 1 of the labels, number 2"]
-    wrong = {name: place for pair in names for place, name in enumerate(pair)}
-    report = audit_reader(
-        lambda root: [{"ego": {name: first[place] for name, place in wrong.items()}} for first, _ in labels(root)]
-    )
-    assert misread(report) == {f"*/ego/{name}": columns[place] for name, place in wrong.items()}
-    assert "own velocity along the world's x" in report.findings[0].what
+def frames_as_a_speed(root: str) -> Any:
+    lines = [path.read_text().splitlines()[0].split() for path in sorted(Path(root).glob("*/meta/*.txt"))]
+    return {"scenes": [{"speed": float(words[-1]), "num_frames": int(words[-1])} for words in lines]}
 
 
-def test_line_1_as_a_position_in_a_list() -> None:
-    report = audit_reader(
-        lambda root: {f"{number:03d}": {"position": first} for number, (first, _) in enumerate(labels(root))}
-    )
-    assert list(misread(report)) == ["*/position/*[0]", "*/position/*[1]"]
+COUNTDOWNS = ("ttc", "time_to_collision", "countdown", "timeToCollision", "collision_time", "eta", "seconds_left")
+OBJECT = "objects/*/"
+LINE_1 = ("line 1 of the labels, number 1", "line 1 of the labels, number 2")
 
 
-def test_sizes_in_another_order() -> None:
-    wrong = {"width": "column 5", "height": "column 6", "length": "column 7"}
-    report = audit_reader(of_rows(lambda row: dict(zip(wrong, map(float, row[4:7]), strict=True))))
-    assert misread(report) == {f"objects/*/{name}": f"{column} of the labels" for name, column in wrong.items()}
-    report = audit_reader(of_rows(lambda row: {"whl": list(map(float, row[4:7])), "lwh": list(map(float, row[4:7]))}))
-    assert list(misread(report)) == [f"objects/*/whl/*[{place}]" for place in range(3)]
-    assert "you read it as `w`" in report.findings[0].what
-    assert holds(report)["objects/*/lwh/*[2]"] == "column 7 of the labels"
+def column(number: int) -> str:
+    return f"column {number} of the labels"
 
 
-@pytest.mark.parametrize("own", [True, False])
-def test_visibility_as_a_collision(own: bool) -> None:
-    flags = {"collided": lambda word: word == "True", "crash": lambda word: int(word == "True"), "is_hit": str}
-    report = audit_reader(
-        lambda root: [
-            {name: flag(row[12]) for name, flag in flags.items()} for row in rows(root) if own or row[10] != "-100"
-        ]
-    )
-    assert misread(report) == {f"*/{name}": "column 13 of the labels" for name in flags}
-
-
-def test_the_number_of_frames_as_a_speed() -> None:
-    def read(root: str) -> Any:
-        lines = [path.read_text().splitlines()[0].split() for path in sorted(Path(root).glob("*/meta/*.txt"))]
-        return {"scenes": [{"speed": float(words[-1]), "num_frames": int(words[-1])} for words in lines]}
-
-    report = audit_reader(read)
-    assert misread(report) == {"scenes/*/speed": "line 1 of meta, word 9"}
-    assert holds(report)["scenes/*/num_frames"] == "line 1 of meta, word 9"
-
-
-def test_undecoded_velocities() -> None:
-    names = ("velocity", "velocity_ego", "vel")
-    report = audit_reader(
-        of_rows(
-            lambda row: {
-                **{name: [float(row[8]), -float(row[9])] for name in names},
-                "raw_velocity": float(row[8]),
-                "vx": row[8],
-                "speed_y": round(float(row[9]), 2),
-            }
-        )
-    )
-    columns = [f"column {number} of the labels" for number in (9, 10)]
-    both = {f"objects/*/{name}/*[{place}]": columns[place] for name in names for place in (0, 1)}
-    assert misread(report) == both | {"objects/*/vx": columns[0], "objects/*/speed_y": columns[1]}
-    assert holds(report)["objects/*/raw_velocity"] == columns[0]
-    assert "of no frame until it is decoded" in report.findings[0].what
-    assert "v_world = Rz(−yaw) · (vx, vy)" in report.findings[0].remedy
+@pytest.mark.parametrize(
+    ("reader", "wrong"),
+    [
+        pytest.param(
+            of_rows(lambda row: dict.fromkeys(COUNTDOWNS, float(row[11])) | {"cls": row[0]}),
+            {OBJECT + name: column(12) for name in COUNTDOWNS},
+            id="points as a countdown",
+        ),
+        pytest.param(
+            of_first_lines(lambda first: {"speed": first[0], "yaw_rate": first[1], "pos_x": first[0]}),
+            {"*/speed": LINE_1[0], "*/yaw_rate": LINE_1[1], "*/pos_x": LINE_1[0]},
+            id="line 1 as speed, yaw rate and position",
+        ),
+        pytest.param(
+            of_first_lines(lambda first: {"position": first}),
+            {f"*/position/*[{place}]": LINE_1[place] for place in (0, 1)},
+            id="line 1 as a position in a list",
+        ),
+        pytest.param(
+            of_first_lines(lambda first: {"velocity_xy": first[:2], "vel": {"x": first[0]}}),
+            {},
+            id="line 1 as the velocity in the world that it is",
+        ),
+        pytest.param(
+            of_rows(lambda row: dict(zip(("width", "height", "length"), map(float, row[4:7]), strict=True))),
+            {OBJECT + name: column(5 + place) for place, name in enumerate(("width", "height", "length"))},
+            id="sizes in another order",
+        ),
+        pytest.param(
+            of_rows(lambda row: {"whl": list(map(float, row[4:7])), "lwh": list(map(float, row[4:7]))}),
+            {f"{OBJECT}whl/*[{place}]": column(5 + place) for place in range(3)},
+            id="sizes in a list",
+        ),
+        pytest.param(
+            of_rows(lambda row: dict(zip(("dy", "dx", "size_z"), map(float, row[4:7]), strict=True))),
+            {f"{OBJECT}dy": column(5), f"{OBJECT}dx": column(6)},
+            id="extents along other axes",
+        ),
+        pytest.param(
+            of_rows(lambda row: {"collided": row[12] == "True", "crash": int(row[12] == "True"), "is_hit": row[12]}),
+            {OBJECT + name: column(13) for name in ("collided", "crash", "is_hit")},
+            id="visibility as a collision",
+        ),
+        pytest.param(frames_as_a_speed, {"scenes/*/speed": "line 1 of meta, word 9"}, id="frames as a speed"),
+        pytest.param(
+            of_rows(
+                lambda row: {
+                    "velocity": [float(row[8]), -float(row[9])],
+                    "raw_velocity": float(row[8]),
+                    "vx": row[8],
+                    "speed_y": round(float(row[9]), 2),
+                }
+            ),
+            {
+                f"{OBJECT}velocity/*[0]": column(9),
+                f"{OBJECT}velocity/*[1]": column(10),
+                f"{OBJECT}vx": column(9),
+                f"{OBJECT}speed_y": column(10),
+            },
+            id="undecoded velocities",
+        ),
+    ],
+)
+def test_a_misreading_is_named_with_its_key_and_column(reader: Reader, wrong: dict[str, str]) -> None:
+    report = audit_reader(reader)
+    assert misread(report) == wrong
+    assert report.exit_status == bool(wrong)
 
 
 def test_the_bev_array_as_a_picture(tmp_path: Path) -> None:
@@ -174,17 +183,11 @@ def tables(root: str) -> Any:
 def test_a_right_reader_is_not_blamed() -> None:
     report = audit_reader(lambda root: [*decoded(root)])
     assert (report.findings, report.exit_status, report.compared["keys by their names"]) == ((), 0, 5)
-    assert report.to_text().startswith("Nothing was found.\n\nCompared: 5 keys by their names, 0 pictures.")
     found = holds(report)
     assert [found[f"*/boxes/*/*[{place}]"] for place in range(7)] == [
         f"column {2 + place} of the labels" for place in range(7)
     ]
     assert found["*/agent_velocity/*[1]"] == "line 1 of the labels, number 2"
-    assert {name: found[f"*/{name}/*"] for name in ("track_id", "numPoints", "visible")} == {
-        "track_id": "column 11 of the labels",
-        "numPoints": "column 12 of the labels",
-        "visible": "column 13 of the labels",
-    }
     assert not [key for key in found if "/velocity" in key or "speed" in key]
 
 
@@ -199,19 +202,6 @@ def test_the_devkit_itself_is_not_blamed() -> None:
     assert not [key for key in found if key.startswith(("annotation/*/velocity/", "track/*/velocity", "calibrated"))]
 
 
-def test_each_column_has_numbers_of_its_own(tmp_path: Path) -> None:
-    root = str(write_audit_release(tmp_path / "release"))
-    own = [first for first, _ in labels(root)]
-    others = [row for row in rows(root) if row[10] != "-100"]
-    columns = [*map(list, zip(*own, strict=True)), *([float(row[place]) for row in others] for place in range(1, 12))]
-    near = [{round(abs(number) + step, 2) for number in column for step in (-0.01, 0, 0.01)} for column in columns]
-    assert sum(map(len, near)) == len(set.union(*near))
-    for place in (1, 2, 8, 9, 11):
-        assert len({row[place] for row in others}) == len(others)
-    with pytest.raises(ConfigError, match="release"):
-        write_audit_release(tmp_path / "release")
-
-
 def test_what_was_written_of_the_release(tmp_path: Path) -> None:
     root, out = write_audit_release(tmp_path / "labels" / "release"), tmp_path / "out"
     assert len(arrays_of_bev(str(root))) == 20
@@ -220,9 +210,6 @@ def test_what_was_written_of_the_release(tmp_path: Path) -> None:
         json.dumps([{"ttc": row[11], "score": float("nan")} for row in rows(str(root))])
     )
     assert misread(audit_reader(out)) == {"boxes/*/ttc": "column 12 of the labels"}
-    (out / "boxes.json").write_text("{")
-    with pytest.raises(ConfigError, match=r"boxes\.json: is no JSON"):
-        audit_reader(out)
 
 
 @pytest.mark.parametrize(
@@ -242,7 +229,6 @@ def test_nothing_that_is_known_is_no_verdict(output: object, unread: str) -> Non
     report = audit_reader(lambda _: output)
     assert (report.findings, report.exit_status, any(report.compared.values())) == ((), 2, False)
     assert "Nothing was found" not in report.to_text()
-    assert "Cannot say: no key holds numbers" in report.to_text()
     assert unread in report.cannot_say[-1]
 
 
@@ -250,8 +236,6 @@ def test_scaled_numbers_and_names_that_say_nothing_are_no_verdict() -> None:
     report = audit_reader(of_rows(lambda row: {"ttc": float(row[11]) / 10, "length": float(row[5]) * 100}))
     assert report.exit_status == 2
     assert "objects/*/ttc" in report.cannot_say[1]
-    report = audit_reader(lambda root: [[float(row[11]), float(row[4])] for row in rows(root)])
-    assert (report.exit_status, len(holds(report))) == (2, 2)
     partly = audit_reader(of_rows(lambda row: {"ttc": float(row[11]) / 10, "x": float(row[1])}))
     assert (partly.exit_status, partly.compared["keys by their names"]) == (0, 1)
     assert "objects/*/ttc" in partly.cannot_say[0]
@@ -276,8 +260,7 @@ def test_axes_that_are_exchanged(names: dict[str, str], wrong: list[str]) -> Non
 
     report = audit_reader(of_rows(read))
     assert list(misread(report)) == wrong
-    assert all("nuScenes" in finding.remedy for finding in report.findings)
-    assert report.exit_status == (1 if wrong else 0)
+    assert report.exit_status == bool(wrong)
 
 
 def test_rows_in_place_of_columns() -> None:
@@ -288,11 +271,6 @@ def test_rows_in_place_of_columns() -> None:
         assert (len(turned.findings), turned.compared["keys by their names"]) == (wrong, 3)
 
 
-def test_extents_along_other_axes() -> None:
-    report = audit_reader(of_rows(lambda row: dict(zip(("dy", "dx", "size_z"), map(float, row[4:7]), strict=True))))
-    assert list(misread(report)) == ["objects/*/dy", "objects/*/dx"]
-
-
 def test_what_has_no_end_is_cut(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("deepaccident_devkit.plugins.audit.reader.MOST_VALUES", 5000)
     report = audit_reader(lambda root: cycle([{"ttc": float(row[11])} for row in rows(root)]))
@@ -300,17 +278,6 @@ def test_what_has_no_end_is_cut(monkeypatch: pytest.MonkeyPatch) -> None:
         ["*/ttc"],
         ("not looked into: values after the first 5,000.",),
     )
-    large = np.zeros((1000, 1000, 3), np.uint8)
-    report = audit_reader(lambda _: ({"image": large} for _ in count()))
-    assert (report.findings, report.exit_status, "values after" in report.cannot_say[1]) == ((), 2, True)
-
-
-def test_right_pictures_do_not_speak_for_numbers() -> None:
-    picture = {"image": np.zeros((90, 160, 3), np.uint8)}
-    report = audit_reader(lambda _: picture)
-    assert (report.exit_status, report.compared["pictures"]) == (0, 1)
-    assert audit_reader(lambda root: [picture, {"ttc": [float(row[11]) / 10 for row in rows(root)]}]).exit_status == 2
-    assert audit_reader(lambda _: [picture, object()]).exit_status == 2
 
 
 def test_files_of_other_formats_are_named_and_not_opened(tmp_path: Path) -> None:
@@ -319,34 +286,3 @@ def test_files_of_other_formats_are_named_and_not_opened(tmp_path: Path) -> None
     report = audit_reader(tmp_path)
     assert (report.exit_status, report.cannot_say[1]) == (2, "not looked into: boxes.npz, evil.pkl.")
     assert audit_reader(tmp_path / "nowhere").exit_status == 2
-
-
-def test_errors_of_a_reader_are_its_own() -> None:
-    for reader in (lambda _: 1 / 0, lambda _: (1 / number for number in (1, 0))):
-        with pytest.raises(ZeroDivisionError):
-            audit_reader(reader)
-
-
-@pytest.mark.parametrize(
-    ("name", "place", "column"),
-    [
-        ("eta", lambda row: float(row[11]), "column 12 of the labels"),
-        ("seconds_left", lambda row: int(row[11]), "column 12 of the labels"),
-        ("size_whl", lambda row: [float(word) for word in row[4:7]], "column 5 of the labels"),
-        ("boxWHL", lambda row: [float(word) for word in row[4:7]], "column 6 of the labels"),
-        ("v", lambda row: float(row[8]), "column 9 of the labels"),
-        ("velocity_xy", lambda row: [float(row[8]), float(row[9])], "column 9 of the labels"),
-    ],
-    ids=["eta", "left", "size_whl", "WHL", "v", "velocity_xy"],
-)
-def test_names_that_tell_what_a_reader_believes(name: str, place: Any, column: str) -> None:
-    found = misread(audit_reader(lambda root: [{name: place(row)} for row in rows(root) if row[10] != "-100"]))
-    assert column in found.values(), found
-
-
-def test_velocities_of_line_1_are_in_the_world_whatever_they_are_called() -> None:
-    def read(root: str) -> Any:
-        lines = [path.read_text().splitlines()[0].split() for path in sorted(Path(root).glob("*/*/label/*/*.txt"))]
-        return [{"velocity_xy": [float(words[0]), float(words[1])], "vel": {"x": float(words[0])}} for words in lines]
-
-    assert misread(audit_reader(read)) == {}

@@ -50,7 +50,7 @@ def test_the_official_split_passes_and_so_do_its_subsets(sides: Sides) -> None:
     ]
     split = {name: list(tokens) for name, tokens in split_records(records).by_name().items()}  # type: ignore[arg-type]
     report = sides(train=split["train"], val=split["val"], test=split["test"])
-    assert (report.findings, report.to_text().splitlines()[0]) == ((), "Nothing was found.")
+    assert report.findings == ()
     assert [row[1] for row in report.tables["sides"]] == ["recordings", 56, 12, 12]
     assert numbers(sides(train_mini=split["train_mini"], val=split["val"])) == {}
     assert numbers(sides(train_mini=split["train_mini"], train=split["train"])) == {"recordings": 10}
@@ -65,9 +65,9 @@ def test_a_random_split_by_names_tears_twins(sides: Sides, form: str) -> None:
         {line.split("scenario")[-1] for line in lines[:60]} & {line.split("scenario")[-1] for line in lines[60:]}
     )
     assert numbers(report) == {"twins": torn}
-    assert "twin pairs torn apart, as by a random split by names" in report.to_text()
     assert len(report.findings[0].examples) == 3
     assert "deepaccident split" in report.findings[0].remedy
+    assert "FOUND twins: " in report.to_text()
 
 
 def test_a_random_split_by_frames_puts_recordings_on_both_sides(sides: Sides) -> None:
@@ -75,7 +75,6 @@ def test_a_random_split_by_frames_puts_recordings_on_both_sides(sides: Sides) ->
     Random(2).shuffle(lines)  # noqa: S311
     report = sides(train=lines[:400], val=lines[400:])
     assert numbers(report) == {"recordings": len(TOKENS)}
-    assert "as by a random split by frames" in report.to_text()
     assert [row[2] for row in report.tables["sides"]] == ["frames named", 400, 400]
 
 
@@ -99,16 +98,12 @@ def test_a_scenario_beside_one_of_its_frames(sides: Sides) -> None:
     assert numbers(sides(train=[TOKENS[0]], val=[TOKENS[40]], test=[TOKENS[1]])) == {"twins": 1}
 
 
-def test_mini_beside_the_full_release(sides: Sides, tmp_path: Path) -> None:
+def test_mini_beside_the_full_release(sides: Sides) -> None:
     mini = path_of(TOKENS[0], 7, "/data/DeepAccident_mini")
     report = sides(train=[mini], val=[path_of(TOKENS[0], 7), path_of(TOKENS[1], 7)])
     assert numbers(report) == {"mini": 1}
-    assert "other recordings" in report.to_text()
     assert numbers(sides(train=[mini], val=[path_of(TOKENS[1], 7, "/data/v1-mini")])) == {}
     assert numbers(sides(mini=[TOKENS[0]], val=[TOKENS[1]])) == {"mini": 1}
-    (tmp_path / "DeepAccident_mini").mkdir()
-    (tmp_path / "DeepAccident_mini" / "train.txt").write_text(TOKENS[0])
-    assert numbers(audit_splits([tmp_path / "DeepAccident_mini" / "train.txt", tmp_path / "val.txt"])) == {"mini": 1}
 
 
 def test_files_that_are_no_splits(sides: Sides, tmp_path: Path) -> None:
@@ -126,7 +121,6 @@ def test_files_that_are_no_splits(sides: Sides, tmp_path: Path) -> None:
 def test_an_empty_side_is_compared_with_nothing(sides: Sides) -> None:
     report = sides(train=[""], val=[TOKENS[0], TOKENS[1]])
     assert (report.findings, report.exit_status, report.compared) == ((), 2, {"sides": 0})
-    assert "Nothing was found" not in report.to_text()
     assert sides(train=[TOKENS[2]], test=[""], val=[TOKENS[0]]).compared == {"sides": 2}
 
 
@@ -168,14 +162,6 @@ def renumbered(root: Path) -> None:
     renamed(root, lambda name: name.replace("scenario000", "scenario090"))
 
 
-def recounted(root: Path) -> None:
-    """One LiDAR point more in a box of each label file, as on another processor."""
-    for path in root.glob("*/*/label/*/*.txt"):
-        text = path.read_text()
-        path.unlink()
-        path.write_text(re.sub(r"(\d+) (True|False)$", lambda m: f"{int(m[1]) + 1} {m[2]}", text))
-
-
 def without(root: Path, ending: str) -> None:
     for folder in root.glob(f"*_{ending}"):
         shutil.rmtree(folder)
@@ -185,7 +171,6 @@ def without(root: Path, ending: str) -> None:
     ("mine", "theirs", "wanted"),
     [
         (unchanged, unchanged, {"recordings": 2, "twins": 2}),
-        (unchanged, recounted, {"recordings": 2, "twins": 2}),
         (lambda root: without(root, "normal"), lambda root: without(root, "accident"), {"twins": 1}),
         (
             lambda root: only_agents(root, "ego_vehicle", "ego_vehicle_behind"),
@@ -203,7 +188,7 @@ def without(root: Path, ending: str) -> None:
             {"recordings": 2, "twins": 2},
         ),
     ],
-    ids=["copy", "counts", "twins", "agents", "halves", "odd"],
+    ids=["copy", "twins", "agents", "halves", "odd"],
 )
 def test_dataroots_with_parts_of_a_recording_on_both_sides(
     motion_root: Path,

@@ -18,7 +18,7 @@ from deepaccident_devkit.plugins.baselines import (
     seen_actors,
     turn_rates,
 )
-from deepaccident_devkit.taxonomy import AGENTS, OWN_ACTOR_ID, UNTRACKED_ID
+from deepaccident_devkit.taxonomy import AGENTS, OWN_ACTOR_ID
 from deepaccident_devkit.v2x import Link
 from deepaccident_devkit.v2x.cooperation import visible_actors
 
@@ -35,11 +35,8 @@ def test_it_knows_whom_the_released_rule_calls_seen_and_the_ego(da_hidden: DeepA
     seen = seen_actors(da_hidden, token, agents=agents)
     own = da_hidden.agent.get(token.rsplit("/", 1)[0])["actor_id"]
     assert seen.own_actor_id == own
-    ids = seen.boxes.actor_id.tolist()
-    assert ids[0] == OWN_ACTOR_ID
-    assert seen.has_own
-    assert ids[1:] == sorted(set(visible_actors(da_hidden, token, agents=agents).tolist()) - {own})
-    assert UNTRACKED_ID not in ids
+    others = sorted(set(visible_actors(da_hidden, token, agents=agents).tolist()) - {own})
+    assert seen.boxes.actor_id.tolist() == [OWN_ACTOR_ID, *others]
 
 
 def test_the_ego_is_where_its_own_label_has_it_whoever_else_sees_it(da_hidden: DeepAccident) -> None:
@@ -78,12 +75,9 @@ def test_late_boxes_lag_behind_by_the_way_made_since(da_hidden: DeepAccident) ->
 
 
 def test_who_drives_straight_on_does_not_turn(da_hidden: DeepAccident) -> None:
-    scenario, present = da_hidden.scenario[0], seen_actors(da_hidden, sample(da_hidden), agents="all")
+    present = seen_actors(da_hidden, sample(da_hidden), agents="all")
     rates = turn_rates(da_hidden, sample(da_hidden), agents="all")
-    assert rates.shape == present.boxes.actor_id.shape
-    assert (scenario["ego_direction"], scenario["other_direction"]) == ("straight", "straight")
-    other = da_hidden.agent.get(f"{scenario['token']}/other_vehicle")["actor_id"]
-    assert other is not None
+    other = da_hidden.agent.get(f"{da_hidden.scenario[0]['token']}/other_vehicle")["actor_id"]
     two = np.isin(present.boxes.actor_id, [OWN_ACTOR_ID, other])
     assert two.sum() == 2
     np.testing.assert_allclose(rates[two], 0, atol=1e-2)  # poses in files are rounded
@@ -139,16 +133,10 @@ numbers = st.floats(-20, 20, allow_nan=False)
 
 
 def test_constant_velocity_goes_straight_on_and_keeps_the_heading() -> None:
-    poses = constant_velocity(POSE, np.array([[2.0, -1.0], [0.0, 3.0]]), np.array([0.0, 0.5, 2.0]))
-    assert poses.shape == (3, 2, 3)
+    poses = constant_velocity(POSE, np.array([[2.0, -1.0], [np.nan, np.nan]]), np.array([0.0, 0.5, 2.0]))
     np.testing.assert_array_equal(poses[0], POSE)
-    np.testing.assert_allclose(poses[1], [[2.0, 1.5, 0.5], [0.0, 1.5, -3.0]])
-    np.testing.assert_allclose(poses[2], [[5.0, 0.0, 0.5], [0.0, 6.0, -3.0]])
-
-
-def test_who_has_no_velocity_stands() -> None:
-    poses = constant_velocity(POSE, np.array([[np.nan, np.nan], [1.0, 0.0]]), np.array([3.0]))
-    np.testing.assert_allclose(poses[0], [POSE[0], [3.0, 0.0, -3.0]])
+    np.testing.assert_allclose(poses[1:, 0], [[2.0, 1.5, 0.5], [5.0, 0.0, 0.5]])
+    np.testing.assert_array_equal(poses[1:, 1], [POSE[1], POSE[1]])  # who has no velocity stands
 
 
 def test_a_full_turn_ends_where_it_began_and_half_of_it_across() -> None:

@@ -14,17 +14,13 @@ from deepaccident_devkit.errors import ChoiceError, ConfigError, DeepAccidentErr
 from deepaccident_devkit.evaluation import (
     AccidentEvaluator,
     DetectedBoxes,
-    DetectionEvaluator,
     MotionEvaluator,
-    detection_truth,
 )
 from deepaccident_devkit.evaluation.accident import accident_context
-from deepaccident_devkit.evaluation.motion import MOTION_PROTOCOLS
 from deepaccident_devkit.evaluation.results import read_results
-from deepaccident_devkit.geometry import BevGrid, Boxes
-from deepaccident_devkit.motion import OWN_BOX_ID, MotionLabelConfig, MotionLabels
+from deepaccident_devkit.geometry import Boxes
+from deepaccident_devkit.motion import MotionLabelConfig
 from deepaccident_devkit.plugins.baselines import (
-    MOTION_MODELS,
     Baseline,
     MotionModel,
     Outlook,
@@ -39,9 +35,8 @@ from deepaccident_devkit.plugins.baselines import (
     predict_results,
     seen_actors,
 )
-from deepaccident_devkit.plugins.baselines.predict import accidents_ahead, label_times, motion_prediction
-from deepaccident_devkit.support.arrays import FloatArray
-from deepaccident_devkit.taxonomy import CATEGORIES, LIDAR, OWN_ACTOR_ID, UNTRACKED_ID
+from deepaccident_devkit.plugins.baselines.predict import accidents_ahead
+from deepaccident_devkit.taxonomy import CATEGORIES, OWN_ACTOR_ID, UNTRACKED_ID
 from deepaccident_devkit.v2x import Link
 
 
@@ -49,14 +44,6 @@ from deepaccident_devkit.v2x import Link
 def tokens(da_hidden: DeepAccident) -> list[str]:
     """The ego vehicle's samples 2, 1.5, 1 and 0.5 s before the impact."""
     return [token for token in da_hidden.samples("train", "evaluate") if "/ego_vehicle/" in token]
-
-
-def test_motion_lies_as_the_labels_that_it_foretells(da_hidden: DeepAccident, tokens: list[str]) -> None:
-    config = MotionLabelConfig(grid=BevGrid((-30, 30, 0.5), (-20, 20, 0.5), "fiery"), future_frames=6)
-    output = predict_motion(da_hidden, tokens[0], agents="all", config=config)
-    assert output.grid == config.grid
-    assert output.instances is not None
-    assert output.instances.shape == (1, 7, 120, 80)
 
 
 def test_five_agents_know_the_whole_present(da_hidden: DeepAccident, tokens: list[str]) -> None:
@@ -127,42 +114,16 @@ def test_detections_are_the_seen_boxes_in_world(da_hidden: DeepAccident, tokens:
     np.testing.assert_array_equal(found.scores[own], [0.0])
     assert ((found.scores[~own] > 0) & (found.scores[~own] < 1)).all()
     watchers = np.array([int(bits).bit_count() for bits in seen.seen_by])
-    order = np.argsort(found.scores[~own])
-    assert (np.diff(watchers[~own][order]) >= 0).all()  # who is seen by more is surer
-
-
-def test_detections_of_all_agents_find_more(da_hidden: DeepAccident, tokens: list[str]) -> None:
-    scores = {}
-    for agents in ("single", "all"):
-        evaluator = DetectionEvaluator("paper")
-        for token in tokens:
-            found = predict_detections(da_hidden, token, agents=agents)
-            lidar = found.boxes.transform(da_hidden.world_from(token, "lidar").inverse(), "lidar")
-            evaluator.update(
-                token,
-                type(found)(boxes=lidar, scores=found.scores),
-                detection_truth(da_hidden, token, "paper"),
-            )
-        scores[agents] = evaluator.compute().mean_average_precision
-    assert scores["all"] > scores["single"] + 5
-
-
-def test_a_link_of_its_own_seed_gives_other_boxes(da_hidden: DeepAccident, tokens: list[str]) -> None:
-    one, same, other = (
-        predict_motion(da_hidden, tokens[0], agents="all", link=Link(pose_noise=0.5, seed=seed)).instances
-        for seed in (0, 0, 1)
-    )
-    np.testing.assert_array_equal(one, same)
-    assert not np.array_equal(one, other)
+    assert (np.diff(watchers[~own][np.argsort(found.scores[~own])]) >= 0).all()  # who is seen by more is surer
 
 
 @pytest.mark.parametrize(
     ("options", "error", "sentence"),
     [
-        ({"model": "constant"}, ChoiceError, r"model: expected one of constant_velocity, .*, found 'constant'"),
-        ({"horizon": 0.0}, ConfigError, "horizon: expected a number above 0, found 0.0"),
-        ({"danger_distance": float("nan")}, ConfigError, "danger_distance: expected a number above 0, found nan"),
-        ({"link": 0.3}, ConfigError, "link: expected a Link"),
+        ({"model": "constant"}, ChoiceError, r"model: .*constant_velocity, .*'constant'"),
+        ({"horizon": 0.0}, ConfigError, r"horizon: .*0\.0"),
+        ({"danger_distance": float("nan")}, ConfigError, "danger_distance: .*nan"),
+        ({"link": 0.3}, ConfigError, "link: .*Link"),
     ],
 )
 def test_what_cannot_be_is_refused(
@@ -189,27 +150,9 @@ def test_results_are_the_predictions_and_the_same_bytes_with_two_workers(
     results = read_results(one)
     results.check()
     assert results.tokens == tuple(every)
-    assert results.form is not None
-    assert (results.form.frames, results.form.labels) == (7, "released")
-    assert (results.meta["agents"], results.meta["link"]["latency"]) == ("+infrastructure", 0.1)
     stored = results.prediction(tokens[0])
     expected = chosen.predict(da_hidden, "motion", tokens[0])
     np.testing.assert_array_equal(stored.instances, expected.instances)  # type: ignore[union-attr]
-
-
-def test_results_of_the_other_tasks(
-    da_hidden: DeepAccident, tokens: list[str], tmp_path_factory: pytest.TempPathFactory
-) -> None:
-    folder = tmp_path_factory.mktemp("results")
-    chosen = Baseline(agents="all", model="constant_turn_rate")
-    accident = read_results(predict_results(da_hidden, "accident", tokens, folder / "a.json", chosen, workers=1))
-    assert [len(accident.prediction(token)) for token in tokens] == [  # type: ignore[arg-type]
-        len(predict_accidents(da_hidden, token, agents="all", model="constant_turn_rate")) for token in tokens
-    ]
-    assert accident.meta["model"] == "constant_turn_rate"
-    detection = read_results(predict_results(da_hidden, "detection", tokens, folder / "d.json", chosen, workers=1))
-    assert detection.task == "detection"
-    assert len(detection.prediction(tokens[0])) == len(predict_detections(da_hidden, tokens[0], agents="all"))  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("model", ["constant_velocity", "constant_turn_rate", "standing"])
@@ -226,14 +169,6 @@ def test_forecasts_are_where_seen_actors_go(da_hidden: DeepAccident, tokens: lis
     assert 0 < len(predict_forecasts(da_hidden, tokens[1], model=model)) < len(found)
 
 
-def test_of_the_models_standing_moves_nobody(da_hidden: DeepAccident, tokens: list[str]) -> None:
-    moved = {}
-    for model in MOTION_MODELS:
-        ahead = outlook(da_hidden, tokens[0], agents="all", model=model)
-        moved[model] = np.linalg.norm(np.ptp(ahead.poses(np.array([0.0, 2.0]))[..., :2], axis=0), axis=-1).max()
-    assert moved["standing"] == 0 < min(moved["constant_velocity"], moved["constant_turn_rate"])
-
-
 def test_a_plan_is_the_egos_own_path(da_hidden: DeepAccident, tokens: list[str]) -> None:
     """In straight and even driving it is the recorded one; the ego frame moves, not the box."""
     token = tokens[0]
@@ -246,16 +181,14 @@ def test_a_plan_is_the_egos_own_path(da_hidden: DeepAccident, tokens: list[str])
         for frames in (5, 10)
     ]
     np.testing.assert_allclose(plan.path[:2], [pose.translation[:2] for pose in recorded], atol=1.0)
-    assert np.linalg.norm(plan.path[-1]) > 10
-    assert plan.yaw is not None
-    np.testing.assert_allclose(plan.yaw, 0, atol=1e-9)
+    np.testing.assert_allclose(plan.yaw, 0, atol=1e-9)  # type: ignore[arg-type]
     assert not predict_plan(da_hidden, token, model="standing").path.any()
-    turning = predict_plan(da_hidden, token, model="constant_turn_rate", horizon=5.0)
-    assert (len(turning.times), turning.path[0] == pytest.approx(plan.path[0], abs=0.2)) == (10, True)
+    assert len(predict_plan(da_hidden, token, horizon=5.0).times) == 10
 
 
-def test_the_infrastructure_has_no_plan(da_hidden: DeepAccident, tokens: list[str]) -> None:
+def test_the_infrastructure_predicts_motion_but_has_no_plan(da_hidden: DeepAccident, tokens: list[str]) -> None:
     pole = tokens[0].replace("ego_vehicle", "infrastructure")
+    assert np.any(predict_motion(da_hidden, pole).instances)
     assert_refused(
         (lambda: predict_plan(da_hidden, pole), NotAvailableError, (pole, "no own vehicle")),
         (lambda: predict_plan(da_hidden, tokens[0], horizon=0.3), ConfigError, "no number of steps of 0.5 s"),
@@ -382,88 +315,3 @@ def test_of_alarms_at_one_place_the_surest_is_kept() -> None:
     alarms = accidents_ahead(ahead(EGO, CROSSING, *followers, *far_away), 3.0)
     assert [alarm.ids for alarm in alarms] == [(50, 7), (10, 11)]
     assert alarms[0].score > alarms[1].score
-
-
-CLEAN = MOTION_PROTOCOLS["released"].__class__(labels="clean")
-
-
-def what_comes(da: DeepAccident, token: str, config: MotionLabelConfig) -> tuple[SeenActors, FloatArray]:
-    """Whom the labels show at the present and all the time, and where they will be: (T, N, 3) in its ego frame."""
-    seen = seen_actors(da, token, agents="all")
-    scenario, agent, number = token.rsplit("/", 2)
-    annotated = set(da.boxes(token, "ego").actor_id.tolist())
-    poses = []
-    for frame in range(config.label_frames):
-        boxes = da.boxes(f"{scenario}/{agent}/{int(number) + frame * config.step:03d}", "world")
-        boxes = boxes.transform(da.world_from(token, "ego").inverse(), "ego")
-        annotated &= set(boxes.actor_id.tolist())
-        poses.append(boxes)
-    rows = np.flatnonzero(np.isin(seen.boxes.actor_id, list(annotated)))
-    seen = SeenActors(boxes=seen.boxes.select(rows), seen_by=seen.seen_by[rows], own_actor_id=seen.own_actor_id)
-    result = []
-    for boxes in poses:
-        place = [int(np.flatnonzero(boxes.actor_id == actor)[0]) for actor in seen.boxes.actor_id]
-        result.append(np.column_stack([boxes.center[place, :2], boxes.yaw[place]]))
-    return seen, np.stack(result)
-
-
-def without_others(label: MotionLabels, known: set[int]) -> MotionLabels:
-    """The label without those whose whole future the labels do not tell: they leave the range, or come into sight."""
-    others = [number for actor, number in label.id_map.items() if actor not in {*known, OWN_BOX_ID}]
-    gone = np.isin(label.instance, others)
-    instance, segmentation = (np.where(gone, 0, each) for each in (label.instance, label.segmentation))
-    return replace(label, instance=instance, segmentation=segmentation)
-
-
-@pytest.mark.parametrize("agent", ["ego_vehicle", "other_vehicle_behind", "infrastructure"])
-@pytest.mark.parametrize("protocol", ["released", "clean"])
-def test_who_foresees_everything_scores_a_hundred(da_motion: DeepAccident, agent: str, protocol: str) -> None:
-    """Cell by cell."""
-    config = MotionLabelConfig(protocol=protocol)
-    token = f"{da_motion.scenario[0]['token']}/{agent}/012"
-    seen, poses = what_comes(da_motion, token, config)
-    output = motion_prediction(seen, poses, da_motion.ego_from(token, LIDAR), config)
-    evaluator = MotionEvaluator("released" if protocol == "released" else CLEAN)
-    label = da_motion.motion_labels(token, config)
-    evaluator.update(token, output, without_others(label, set(seen.boxes.actor_id.tolist())))
-    result = evaluator.compute()
-    assert len(seen.boxes) > 5
-    for each in result.ranges.values():
-        assert each.sq > 99.9
-        assert (each.false_positive, each.false_negative) == (0, 0)
-    assert result.ranges["100x100"].true_positive > 40
-
-
-def test_the_present_is_drawn_exactly_as_labels_are(da_motion: DeepAccident) -> None:
-    config = MotionLabelConfig()
-    token = f"{da_motion.scenario[0]['token']}/ego_vehicle/012"
-    label = da_motion.motion_labels(token)
-    seen = seen_actors(da_motion, token, agents="all")
-    rows = np.flatnonzero(np.isin(seen.boxes.actor_id, da_motion.boxes(token, "ego").actor_id))
-    boxes = seen.boxes.select(rows)
-    seen = SeenActors(boxes=boxes, seen_by=seen.seen_by[rows], own_actor_id=seen.own_actor_id)
-    standing = np.repeat(np.column_stack([boxes.center[:, :2], boxes.yaw])[None], config.label_frames, axis=0)
-    output = motion_prediction(seen, standing, da_motion.ego_from(token, LIDAR), config)
-    assert output.instances is not None
-    assert output.instances.shape == (1, 5, 200, 200)
-    np.testing.assert_array_equal(output.instances[0, 0] > 0, label.instance[0] > 0)
-    assert (output.instances[0] > 0).any(axis=(1, 2)).all()
-
-
-def test_ids_stay_the_same_over_the_frames(da_motion: DeepAccident) -> None:
-    config = MotionLabelConfig()
-    token = f"{da_motion.scenario[0]['token']}/ego_vehicle/012"
-    seen, poses = what_comes(da_motion, token, config)
-    only = np.flatnonzero(seen.boxes.actor_id == OWN_ACTOR_ID)
-    alone = SeenActors(boxes=seen.boxes.select(only), seen_by=seen.seen_by[only], own_actor_id=seen.own_actor_id)
-    output = motion_prediction(alone, poses[:, only], da_motion.ego_from(token, LIDAR), config)
-    assert output.instances is not None
-    assert [np.unique(frame).tolist() for frame in output.instances[0]] == [[0, 1]] * 5
-
-
-@pytest.mark.parametrize(
-    ("config", "times"),
-    [(MotionLabelConfig(), [0, 0.5, 1, 1.5, 2]), (MotionLabelConfig(step=1, future_frames=3), [0, 0.1, 0.2, 0.3])],
-)
-def test_label_times_are_the_label_frames(config: MotionLabelConfig, times: list[float]) -> None:
-    np.testing.assert_allclose(label_times(config), times)

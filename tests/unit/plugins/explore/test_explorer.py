@@ -30,24 +30,9 @@ def test_several_threads_make_it_once() -> None:
 
 def test_what_was_not_asked_for_the_longest_goes() -> None:
     kept, made = Kept[bytes](10, len), []
-
-    def get(*names: str, size: int = 4) -> list[str]:
-        """Those of some names whose content was made for it."""
-        made.clear()
-        for name in names:
-            kept.get(name, lambda name=name: made.append(name) or b"x" * size)
-        return made.copy()
-
-    assert get("a", "b", "a", "c", "a", "b") == ["a", "b", "c", "b"]  # with c, b has to go
-    assert get("large", "large", size=99) == ["large"]  # larger than the bound, and alone
-    assert get("a") == ["a"]
-
-
-def test_a_failure_is_not_kept() -> None:
-    kept: Kept[int] = Kept(10)
-    with pytest.raises(ZeroDivisionError):
-        kept.get("a", lambda: 1 // 0)
-    assert kept.get("a", lambda: 5) == 5
+    for name in ("a", "b", "a", "c", "a", "b"):  # with c, b has to go
+        kept.get(name, lambda name=name: made.append(name) or b"four")
+    assert made == ["a", "b", "c", "b"]
 
 
 def test_files_lie_beside_the_index(da_b: DeepAccident) -> None:
@@ -104,11 +89,6 @@ def test_without_images_it_is_seen_from_above(da_b: DeepAccident) -> None:
     shown = shown_of(da_b, accident(da_b))
     assert near(shown, COLLIDER_COLOR) > 40
     assert near(shown, "#ffffff", 10) > shown[..., 0].size / 2
-
-
-def test_a_partial_download_shows_its_last_image(da: DeepAccident, tmp_path: Path) -> None:
-    shown = shown_of(reopened(da, tmp_path / "r", "*_006.jpg"), accident(da))
-    assert (near(shown, COLLIDER_COLOR) > 20, near(shown, "#ffffff", 10) < 200) == (True, True)
 
 
 def test_without_labels_it_is_grey(da_b: DeepAccident, tmp_path: Path) -> None:

@@ -7,8 +7,6 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from http.client import HTTPConnection
 from importlib import import_module
-from ipaddress import ip_address
-from itertools import chain
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -24,8 +22,10 @@ from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.errors import ConfigError, MissingExtraError
 from deepaccident_devkit.evaluation.runs.bundles import SUMMARY_FILE
 from deepaccident_devkit.plugins.explore import serving as module
-from deepaccident_devkit.plugins.explore.access import Access, AsgiScope, Receive, RootPath, Send
+from deepaccident_devkit.plugins.explore.access import AsgiScope, Receive, Send
 from deepaccident_devkit.plugins.explore.serving import Served, need_extra, serve, serving
+
+pytestmark = pytest.mark.slow
 
 AT_ONCE = 60.0
 """Seconds after which a server that should have ended is taken for one that hangs."""
@@ -119,20 +119,6 @@ def test_a_place_where_it_cannot_listen_is_an_error(monkeypatch: pytest.MonkeyPa
     assert_refused((started(port=80), ConfigError, ("port 80", "not allowed", "from 1024 on")))
 
 
-def test_the_loopback_of_ipv6_serves_too() -> None:
-    try:
-        socket.create_server(("::1", 0), family=socket.AF_INET6).close()
-    except OSError:
-        pytest.skip("no IPv6 here")
-    for host in ("::1", "[::1]"):
-        with serving(TinyApp(), host=host, port=0) as served:
-            assert served.url.startswith(f"http://[::1]:{served.port}/?token=")
-            connection = HTTPConnection("::1", served.port, timeout=AT_ONCE)
-            connection.request("GET", "/page", headers=dict([cookie_of(served)]))
-            assert connection.getresponse().read() == b"/page /page"
-            connection.close()
-
-
 class Endless(TinyApp):
     """Answers without end."""
 
@@ -182,81 +168,10 @@ def test_a_server_that_fails_later_is_an_error(monkeypatch: pytest.MonkeyPatch) 
 ELSEWHERE = "warning: anyone who can reach this machine can try to open the pages"
 
 
-OPEN = "the explorer runs until Ctrl-C; open http://{}:9000/?token=secret"
-
-
-TUNNEL = "from another machine: ssh -L 9000:{}:9000 node17, and there http://localhost:9000/?token=secret"
-
-
-@pytest.mark.parametrize(
-    ("where", "said"),
-    [
-        ({}, [OPEN.format("127.0.0.1"), TUNNEL.format("localhost")]),
-        *(
-            ({"root": root}, [OPEN.format("127.0.0.1"), said, TUNNEL.format("localhost")])
-            for root, said in (
-                ("/user/me/proxy/8000/", "on your notebook server or portal: /user/me/proxy/8000/?token=secret"),
-                ("https://hub.example.org/x", "behind the proxy: https://hub.example.org/x/?token=secret"),
-                ("https://hub.example.org", "behind the proxy: https://hub.example.org/?token=secret"),
-            )
-        ),
-        *(
-            (
-                {"host": anywhere, "bound": anywhere},
-                [
-                    ELSEWHERE,
-                    OPEN.format(here),
-                    "on other machines: http://node17:9000/?token=secret",
-                    TUNNEL.format("localhost"),
-                ],
-            )
-            for anywhere, here in ((ANYWHERE, "127.0.0.1"), ("::", "[::1]"))
-        ),
-        *(
-            ({"host": host, "bound": bound}, [ELSEWHERE, OPEN.format(said), TUNNEL.format(said)])
-            for host, bound, said in (
-                ("login1", "192.0.2.1", "login1"),
-                ("2001:db8::1", "2001:db8::1", "[2001:db8::1]"),
-            )
-        ),
-    ],
-)
-def test_the_addresses_are_said(monkeypatch: pytest.MonkeyPatch, where: dict[str, str], said: list[str]) -> None:
-    monkeypatch.setattr(socket, "gethostname", lambda: "node17")
-    access = Access(port=9000, root=RootPath.parse(where.get("root", "")), token="secret")  # noqa: S106
-    bound = ip_address(where.get("bound", "127.0.0.1"))
-    lines = Served(where.get("host", "127.0.0.1"), bound, access, Mock(), Mock()).lines()
-    assert [line[: len(part)] for line, part in zip(lines, said, strict=True)] == said
-    assert ("Nothing is encrypted: prefer an SSH tunnel" in lines[0]) == (said[0] == ELSEWHERE)
-
-
 def test_a_browser_is_opened_with_a_token_for_one_use(monkeypatch: pytest.MonkeyPatch) -> None:
     [said, _], [address] = opened(monkeypatch, page="models/")
     origin, _, token = said.split()[-1].partition("=")
     assert (address.partition("=")[0], token not in address, origin[-14:]) == (origin, True, "/models/?token")
-
-
-@pytest.mark.parametrize(
-    ("environment", "likely", "arguments"),
-    [
-        ({"DISPLAY": ":0"}, True, {}),
-        ({"WAYLAND_DISPLAY": "wayland-0"}, True, {}),
-        ({}, sys.platform == "darwin", {}),
-        ({"DISPLAY": "localhost:10.0", "SSH_CONNECTION": "x"}, False, {}),
-        ({"BROWSER": "helper", "SSH_CONNECTION": "x"}, True, {}),
-        ({"BROWSER": "x"}, False, {"open_browser": False}),
-        ({"BROWSER": "x"}, False, {"root_path": "/user/me/proxy/8000"}),
-    ],
-)
-def test_a_browser_is_opened_where_the_reader_sits(
-    monkeypatch: pytest.MonkeyPatch, environment: dict[str, str], likely: bool, arguments: dict[str, Any]
-) -> None:
-    assert len(opened(monkeypatch, environment, **arguments)[1]) == likely
-
-
-@pytest.mark.parametrize("error", [webbrowser.Error("no browser"), OSError("no program")])
-def test_a_browser_that_fails_is_no_error(monkeypatch: pytest.MonkeyPatch, error: Exception) -> None:
-    opened(monkeypatch, browser=Mock(side_effect=error))
 
 
 @pytest.mark.parametrize("name", ["starlette", "uvicorn"])
@@ -283,35 +198,29 @@ def test_the_verb_refuses_options_that_change_nothing(words: list[str], sentence
     assert (result.exit_code, sentence in result.output) == (2, True)
 
 
-def test_the_verb_makes_one_call(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (
+            ["--no-open", "--address", "[::1]:9000"],
+            {"host": "::1", "port": 9000, "root_path": "", "open_browser": False},
+        ),
+        (["--root-path", "/x"], {"root_path": "/x", "open_browser": True}),
+        (["--out", "out", "--where", "town=Town03", "--where", "a=1"], {"where": ("town=Town03", "a=1")}),
+    ],
+)
+def test_options_of_the_verb_reach_the_server_or_the_export(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, words: list[str], told: dict[str, Any]
+) -> None:
     called = Mock()
-    given = [tmp_path / "a" / SUMMARY_FILE, tmp_path / "b" / SUMMARY_FILE]
-    for path in given:
-        path.parent.mkdir()
-        path.touch()
-    results = [*(path.parent for path in given), tmp_path / "c.json"]
-    shared = {"bundles": results[:2], "results": results[2:]}
-
-    def verb(*words: str) -> Any:
-        command = ["explore", "release", *chain.from_iterable(("--results", str(path)) for path in results), *words]
-        CliRunner().invoke(deepaccident, command, catch_exceptions=False)
-        return called.call_args
-
     monkeypatch.setattr(import_module("deepaccident_devkit.plugins.explore.cli"), "DeepAccident", dict)
-    for name in ("explore", "export_pages"):
+    for name in ("explore", "export_pages", "Explorer"):
         monkeypatch.setitem(vars(package), name, called)
-    monkeypatch.setitem(vars(package), "Explorer", lambda *given, **options: (*given, options))
-    ((dataset, opened),), options = verb("--no-open", "--address", "[::1]:9000", "--workers", "1")
-    options.pop("say")("")
-    assert dataset == {
-        "dataroot": Path("release"), "version": "v1", "index_dir": None, "workers": 1, "on_error": "raise",
-    }  # fmt: skip
-    assert opened == {**shared, "workers": 1}
-    assert options == {"host": "::1", "port": 9000, "root_path": "", "open_browser": False}
-    assert verb("--root-path", "/x")[1].items() >= {"root_path": "/x", "open_browser": True}.items()
-    (_, target), options = verb("--out", "out", "--where", "town=Town03", "--where", "length=1..9")
-    wanted = {**shared, "where": ("town=Town03", "length=1..9"), "workers": None, "progress": True}
-    assert (target, options) == (Path("out"), wanted)
+    (tmp_path / SUMMARY_FILE).touch()
+    command = ["explore", "release", "--results", str(tmp_path), "--results", "c.json", *words]
+    CliRunner().invoke(deepaccident, command, catch_exceptions=False)
+    given = {name: value for call in called.call_args_list for name, value in call.kwargs.items()}
+    assert given.items() >= {"bundles": [tmp_path], "results": [Path("c.json")], **told}.items()
 
 
 HALF = b"GET /page HTTP/1.1\r\nHost: localhost"

@@ -1,7 +1,6 @@
 """Pages as files: they say what served pages say, need nothing else, and are there as a whole or not at all."""
 
 import re
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,13 +16,11 @@ from wording import holding, lacking
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, ConfigError, NotAvailableError, TokenError
-from deepaccident_devkit.evaluation.results import read_results
 from deepaccident_devkit.evaluation.runs import save_run
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 from deepaccident_devkit.plugins.explore import Explorer, export_pages, static_pages
 from deepaccident_devkit.plugins.explore.pages.scenario import PARTS, part_html
 from deepaccident_devkit.render.captions import scenario_words
-from deepaccident_devkit.render.replay import render_replay
 
 pytestmark = pytest.mark.slow
 
@@ -85,25 +82,14 @@ def test_nothing_needs_a_network_or_tells_where_the_release_lies(made: Made, da_
         text = content.decode(errors="replace").replace(SVG, "")
         assert not re.search(r"https?:|//[a-z]+\.", text), name
         assert not holding(text, str(da_motion.dataroot), str(made.index.parent)), name
-
-
-def test_a_policy_forbids_what_is_not_a_file_of_it(made: Made) -> None:
     for page in made.index.parent.rglob("index.html"):
-        told = shown(page)
-        (policy,) = [each["content"] for each in told.all("meta") if "http-equiv" in each]
+        (policy,) = [each["content"] for each in shown(page).all("meta") if "http-equiv" in each]
         assert policy.startswith("default-src 'none'; script-src 'self' file:;")
         assert not holding(policy, "unsafe", "connect-src")
-        head = [tag for tag, _ in told.tags]
-        assert head.index("meta") < head.index("link")
-        # no script in the page, and no module, which no browser loads from a disk
-        assert [each for each in told.all("script") if not each["src"] or each.get("type") == "module"] == []
 
 
 def test_the_list_has_the_scenarios_and_their_values(made: Made, da_motion: DeepAccident) -> None:
     told, explorer = shown(made.index), Explorer(da_motion)
-    assert not lacking(
-        told.text, "2 scenarios of DeepAccident v1", "da.find()", "deepaccident explore DATAROOT --out DIR"
-    )
     explorer.scenarios.begin()
     assert explorer.jobs.wait(60)
     expected = []
@@ -114,40 +100,17 @@ def test_the_list_has_the_scenarios_and_their_values(made: Made, da_motion: Deep
         expected.append([*where, visibility or "–", "–" if lead is None else f"{lead:.1f}"])
     explorer.jobs.end()
     assert [row[:6] for row in told.table("scenario")] == expected
-    keys = [each["data-key"] for each in told.all("td") if "data-key" in each]
-    assert (len(keys), all(not key or float(key) >= 0 for key in keys)) == (2 * 4, True)
 
 
 @pytest.mark.parametrize("which", [accident, normal])
 def test_a_page_has_all_parts(made: Made, da_motion: DeepAccident, which: Any) -> None:
     token = which(da_motion)
     page, explorer = made.page(token), Explorer(da_motion)
-    text = " ".join(page.text.split())
     parts = {name: " ".join(Shown(part_html(explorer, token, name, "../../../")).text.split()) for name in PARTS}
     assert not lacking(page.text, *PARTS.values(), *[f"{name}{value}" for name, value in made.replay(token)["facts"]])
-    assert not lacking(
-        text, "None: the labels, calib and meta files agree.", *(parts[name] for name in parts if name != "findings")
-    )
-    assert "What was not downloaded" not in text  # there is no page of it here
-    assert (page.all("button"), [each["src"] for each in page.all("iframe")]) == ([], ["replay.html"])
+    assert not lacking(" ".join(page.text.split()), *(parts[name] for name in parts if name != "findings"))
+    assert [each["src"] for each in page.all("iframe")] == ["replay.html"]
     assert page.address_of("Its twin").startswith("../../type1_subtype1_")
-
-
-def test_pages_lead_to_their_neighbours(made: Made, da_motion: DeepAccident) -> None:
-    first, last = (scenario["token"] for scenario in da_motion.scenario)
-    links = [
-        [each for each in made.page(token).links if each[1] in ("next →", "← previous")] for token in (first, last)
-    ]
-    assert links == [[(f"../../{last}/index.html", "next →")], [(f"../../{first}/index.html", "← previous")]]
-
-
-def test_a_replay_shows_the_first_model_that_can(made: Made, da_motion: DeepAccident, tmp_path: Path) -> None:
-    """`boxes` has detections, which no replay shows; `first` tells of the accident alone, `maps` of it too."""
-    first = read_results(made.given["bundles"][1] / "results" / "first.json")
-    for token, prediction in ((accident(da_motion), first), (normal(da_motion), None)):
-        alone = render_replay(da_motion, token, tmp_path / "a.html", prediction=prediction)
-        assert (made.index.parent / token / "replay.html").read_bytes() == alone.read_bytes()
-        assert ("The replay shows predictions of first." in made.page(token).text) == (prediction is not None)
 
 
 def test_the_same_call_gives_the_same_bytes(made: Made, da_motion: DeepAccident, tmp_path: Path) -> None:
@@ -172,8 +135,7 @@ def test_scenarios_are_chosen_by_filters_and_by_name(da_b: DeepAccident, tmp_pat
     tokens = [scenario["token"] for scenario in da_b.scenario]
     wanted = [scenario["token"] for scenario in da_b.find("collision=true")]
     index = export_pages(da_b, tmp_path / "a", where=["collision=true", "length>=1"], workers=1)
-    told = ("da.find('collision=true', 'length>=1')", "--where collision=true --where 'length>=1' --out DIR")
-    assert (listed(index), lacking(shown(index).text, *told)) == (wanted, [])
+    assert listed(index) == wanted
     index = export_pages(da_b, tmp_path / "b", scenarios=[da_b.scenario[4], tokens[1], tokens[4]], workers=1)
     (found,) = re.findall(r"da\.find\('(.*?)'\)", shown(index).text)
     assert listed(index) == [tokens[4], tokens[1]]
@@ -212,8 +174,7 @@ def test_hostile_names_are_text(own_release: Path, tmp_path: Path) -> None:
     assert page.table("scenario")[0][0] == token
     (folder,) = (tmp_path / "out").glob("type*/*")
     assert re.fullmatch(r"[A-Za-z0-9_.-]+", folder.name)
-    own = shown(folder / "index.html")
-    assert (own.all("img"), token in own.text) == ([], True)
+    assert shown(folder / "index.html").all("img") == []
     assert (tmp_path / "out" / unquote(page.address_of(token))).is_file()
 
 
@@ -222,27 +183,10 @@ def test_a_damaged_release(own_release: Path, tmp_path: Path) -> None:
     index = export_pages(damaged.dataset, tmp_path / "out", workers=1)
     assert listed(index) == [scenario["token"] for scenario in damaged.dataset.scenario]
     assert damaged.broken not in listed(index)
-    unlabelled = shown(tmp_path / "out" / damaged.without_labels / "index.html")
-    assert ("The scenario" in unlabelled.text, len(unlabelled.all("iframe"))) == (True, 1)
     assert "meta-missing" in shown(tmp_path / "out" / damaged.without_meta / "index.html").text
     told = {name: content.decode(errors="replace") for name, content in contents(tmp_path / "out").items()}
     told |= {page: shown(page).text for page in (tmp_path / "out").rglob("index.html")}  # names are not broken in these
     assert [place for place, text in told.items() if str(own_release) in text] == []
-
-
-def test_images_that_cannot_be_read_are_told(da: DeepAccident, tmp_path: Path) -> None:
-    root = tmp_path / "release"
-    shutil.copytree(da.dataroot, root, ignore=shutil.ignore_patterns(".deepaccident", "lidar01", "Camera_Back*"))
-    dataset = DeepAccident("v1", root, verbose=False)
-    token = accident(dataset)
-    whole = export_pages(dataset, tmp_path / "whole", scenarios=[token], workers=1)
-    assert (whole.parent / token / "replay.html").stat().st_size > 100_000
-    for path in root.rglob("Camera_Front*/*/*.jpg"):
-        path.write_bytes(b"no picture")
-    own = export_pages(dataset, tmp_path / "out", scenarios=[token], workers=1).parent / token
-    page = shown(own / "index.html")
-    assert ("There is no replay: " in page.text, str(root) in page.text, page.all("iframe")) == (True, False, [])
-    assert not (own / "replay.html").exists()
 
 
 # the folder
@@ -262,7 +206,6 @@ def test_an_earlier_export_is_replaced(one: dict[str, Any], da_b: DeepAccident, 
     export_pages(folder=out, **other)
     export_pages(folder=tmp_path / "fresh", **other)
     assert contents(out) == contents(tmp_path / "fresh")
-    assert {path.name for path in tmp_path.iterdir()} == {"out", "fresh"}
 
 
 def test_other_files_are_never_touched(one: dict[str, Any], tmp_path: Path) -> None:
@@ -280,9 +223,7 @@ def test_other_files_are_never_touched(one: dict[str, Any], tmp_path: Path) -> N
     (out / "link").symlink_to(tmp_path)
     assert_refused((again, ConfigError, ("holds link", "which no export wrote")))
     (out / "link").unlink()
-    (out / ".deepaccident_pages").write_text("index.html\n")
-    assert_refused((again, ConfigError, ("which no export wrote",)))
-    assert contents(out) == before | {".deepaccident_pages": b"index.html\n"}
+    assert contents(out) == before
 
 
 def test_folders_that_cannot_be(one: dict[str, Any], tmp_path: Path) -> None:
@@ -317,10 +258,3 @@ def test_an_interrupted_export_leaves_nothing(
         with pytest.raises(error):
             export_pages(folder=folder, **one)
         assert (contents(tmp_path), [path.name for path in tmp_path.iterdir()]) == (before, ["kept"])
-
-
-def test_a_link_to_a_folder_stays_one(one: dict[str, Any], tmp_path: Path) -> None:
-    (tmp_path / "real").mkdir()
-    (tmp_path / "link").symlink_to("real")
-    assert export_pages(folder=tmp_path / "link", **one) == tmp_path.resolve() / "real" / "index.html"
-    assert (tmp_path / "link").is_symlink()

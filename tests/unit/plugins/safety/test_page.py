@@ -4,11 +4,9 @@ import json
 import re
 from dataclasses import replace
 from pathlib import Path
-from unittest.mock import Mock
 from urllib.parse import unquote
 
 import pytest
-from damaged_releases import damaged_release
 from refusals import assert_refused
 from report_page import Page, page_of
 from wording import lacking
@@ -16,11 +14,10 @@ from wording import lacking
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.collisions import Skipped
 from deepaccident_devkit.descriptions import Story
-from deepaccident_devkit.errors import ChoiceError, ConfigError, OutputFolderError, SensorFileError
+from deepaccident_devkit.errors import ChoiceError, ConfigError, OutputFolderError
 from deepaccident_devkit.plugins.safety import SafetyReport, safety_report
 from deepaccident_devkit.plugins.safety import page as report_module
-from deepaccident_devkit.plugins.safety.page import by_severity, replay_names, safety_report_html, save_safety_report
-from deepaccident_devkit.render.replay import page as replay_page
+from deepaccident_devkit.plugins.safety.page import replay_names, safety_report_html, save_safety_report
 from deepaccident_devkit.support.pages import source_hash
 
 HOSTILE = "type1_subtype1_accident/<script>alert(1)</script><img src=\"https://evil.example/x\" onerror='x'>"
@@ -60,9 +57,9 @@ def renamed(report: SafetyReport, name: str, **facts: object) -> SafetyReport:
     return replace(report, rows=(replace(row, story=story),))
 
 
-def addresses(page: Page, *, inside: bool = False) -> list[str]:
-    """Those of links to other files, or to places in the page."""
-    return [each for link in page.all("a") if (each := str(link["href"])).startswith("#") == inside]
+def addresses(page: Page) -> list[str]:
+    """Those of links to other files."""
+    return [each for link in page.all("a") if not (each := str(link["href"])).startswith("#")]
 
 
 def test_a_row_has_the_numbers(report: SafetyReport, folder: Path) -> None:
@@ -83,13 +80,10 @@ def test_the_whole_page(report: SafetyReport, folder: Path) -> None:
     page = page_of(folder / "report.html")
     # one group of accidents, and lead times
     assert [str(each["src"])[:22] for each in page.all("img")] == ["data:image/png;base64,"] * 2
-    assert {f"#{each['id']}" for each in page.all("section")} == set(addresses(page, inside=True))
     (replay,) = addresses(page)
     assert (folder / unquote(replay)).is_file()
-    assert page.all("link") == []
     assert not lacking(page.text, f"{report.ledger.mean_together.text} s", report.normal[0].facts["scenario"])
     assert json.loads((folder / "safety.json").read_text())["scenarios"] == 2
-    assert len(set(re.findall(r"reaction [\d.]+ s, \d m/s²", page.text))) == 9
 
 
 def test_only_its_own_script_runs(folder: Path) -> None:
@@ -129,28 +123,6 @@ def test_the_hardest_have_replay_pages(
         made.clear()
         save_safety_report(several, tmp_path, dataset=da_motion, replays=count, workers=1)
         assert made == expected
-    assert [row.scenario for row in by_severity(several.rows)] == [hard, mild]
-
-
-@pytest.mark.usefixtures("_without_figures")
-def test_a_replay_page_that_cannot_be_made_is_named(
-    report: SafetyReport, da_motion: DeepAccident, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    fails = Mock(side_effect=SensorFileError("front.jpg: cannot be read"))
-    monkeypatch.setattr(replay_page, "render_replay", fails)
-    page = page_of(save_safety_report(report, tmp_path, dataset=da_motion, workers=1)[-1])
-    assert ("replay pagesfront.jpg: cannot be read" in page.text, addresses(page)) == (True, [])
-
-
-@pytest.mark.usefixtures("_without_figures")
-def test_a_damaged_release(own_release: Path, tmp_path: Path) -> None:
-    damaged = damaged_release(own_release)
-    report = safety_report(damaged.dataset, workers=1)
-    path = save_safety_report(report, tmp_path / "out", dataset=damaged.dataset, replays=None, workers=1)[-1]
-    names = [line[0].removesuffix("replay") for line in cells(path.read_text(encoding="utf-8"))]
-    assert names == [row.scenario for row in by_severity(report.rows)]
-    left_out = page_of(path).text.rpartition("Left out")[2]
-    assert not lacking(left_out, damaged.without_meta, damaged.without_labels, damaged.broken)
 
 
 def test_a_release_without_accidents(da_motion: DeepAccident, tmp_path: Path) -> None:

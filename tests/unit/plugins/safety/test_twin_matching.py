@@ -4,15 +4,12 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.plugins.safety.twin_matching import (
     TwinRecording,
     matched_rows,
     shift_of,
     shifted_recording,
-    twin_recording,
 )
-from deepaccident_devkit.v2x.tracks import scenario_tracks
 
 FRAMES = 30
 
@@ -62,15 +59,6 @@ def test_starts_are_matched_with_the_least_distance_in_all() -> None:
     assert matched_rows(first, second) == {0: (0, "start"), 1: (1, "start")}
 
 
-def test_starts_are_compared_at_the_first_frame_that_shows_both() -> None:
-    first, second = recording([(0, 0), (0, 9)]), recording([(0, 9), (0, 0)], ids=[4, 5])
-    poses = second.poses.copy()
-    poses[:, :12] = np.nan
-    poses[:, 12:, 0] = first.poses[::-1, 12:, 0]
-    assert matched_rows(first, replace(second, poses=poses)) == {0: (1, "start"), 1: (0, "start")}
-    assert matched_rows(first, replace(recording([(0, 0)]), poses=np.full((1, 4, 3), np.nan))) == {}
-
-
 @given(st.integers(-20, 20))
 def test_the_shift_is_found_though_two_agents_go_their_own_ways(shift: int) -> None:
     agents = {"ego_vehicle": 0, "ego_vehicle_behind": 1, "other_vehicle": 2, "other_vehicle_behind": 3}
@@ -82,31 +70,3 @@ def test_the_shift_is_found_though_two_agents_go_their_own_ways(shift: int) -> N
     assert shift_of(first, second) == shift
     moved, frames = shifted_recording(second, shift), slice(max(0, -shift), 60)
     np.testing.assert_allclose(moved.poses[:2, frames], first.poses[:2, frames], atol=1e-9)
-
-
-def test_without_moving_agents_there_is_no_shift() -> None:
-    first = replace(recording([(0, 0)], agents={"ego_vehicle": 0}), poses=np.zeros((1, FRAMES, 3)))
-    assert shift_of(first, first) == shift_of(recording([(0, 0)]), recording([(5, 0)])) == 0
-    assert shifted_recording(first, 0) is first
-
-
-def test_a_shifted_recording_keeps_its_values() -> None:
-    plain = recording([(0, 0)])
-    later, sooner = shifted_recording(plain, 3), shifted_recording(plain, -2)
-    np.testing.assert_array_equal(later.poses, plain.poses[:, 3:])
-    for name in ("poses", "speeds"):
-        np.testing.assert_array_equal(getattr(sooner, name)[:, 2:], getattr(plain, name))
-        assert np.isnan(getattr(sooner, name)[:, :2]).all()
-
-
-def test_a_recording_has_the_tracks_values(da_motion: DeepAccident) -> None:
-    scenario = da_motion.scenario[0]
-    found, tracks = twin_recording(da_motion, scenario["token"]), scenario_tracks(da_motion, scenario["token"])
-    assert found.poses.shape == (len(found.actor_id), scenario["num_frames"], 3)
-    assert np.count_nonzero(~np.isnan(found.poses[..., 0])) == len(tracks.index)
-    rows, frames, boxes = np.searchsorted(found.actor_id, tracks.actor_id), tracks.index - 1, tracks.boxes
-    np.testing.assert_allclose(found.poses[rows, frames], np.column_stack([boxes.center[:, :2], boxes.yaw]))
-    np.testing.assert_allclose(found.speeds[rows, frames], np.linalg.norm(boxes.velocity[:, :2], axis=1))
-    np.testing.assert_array_equal(found.category[rows], boxes.category)
-    own = da_motion.get("agent", f"{scenario['token']}/ego_vehicle")["actor_id"]
-    assert (found.agents["ego_vehicle"], "infrastructure" in found.agents) == (own, False)

@@ -1,4 +1,3 @@
-import csv
 import json
 import math
 import shutil
@@ -12,23 +11,9 @@ from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.cli import deepaccident
-from deepaccident_devkit.collisions import TornTwins, torn_twins, twin_of
+from deepaccident_devkit.collisions import TornTwins, torn_twins
 from deepaccident_devkit.errors import ConfigError, NotAvailableError
-from deepaccident_devkit.plugins.safety import Parting, TwinDiff, TwinReport, safety_report, twin_diff, twin_report
-
-
-def test_twins_have_the_same_name_and_subtype(da_b: DeepAccident) -> None:
-    for scenario in da_b.scenario:
-        twin = twin_of(da_b, scenario)
-        assert [twin[name] == scenario[name] for name in ("name", "signalized", "designed_accident")] == [1, 1, 0]
-        assert twin_of(da_b, twin["token"]) == scenario
-
-
-def test_a_scenario_may_have_no_twin(own_release: Path) -> None:
-    for folder in own_release.glob("*/type1_subtype1_normal"):
-        shutil.rmtree(folder)
-    da = reopened(own_release)
-    assert {twin_of(da, scenario) is None for scenario in da.find(signalized=True)} == {True}
+from deepaccident_devkit.plugins.safety import Parting, TwinDiff, safety_report, twin_diff, twin_report
 
 
 def test_torn_twins_are_those_of_two_splits(da_b: DeepAccident) -> None:
@@ -109,8 +94,6 @@ def test_twins_that_do_not_begin_together_are_told() -> None:
     poses[1, 0, :, 0] += 0.8
     apart = replace(diff, poses=poses)
     assert (diff.begins_together, apart.begins_together, apart.to_dict()["begins_together"]) == (True, False, False)
-    report = TwinReport(dataroot="", version="v1", fingerprint="", diffs=(diff, apart), skipped=(), torn=())
-    assert "1 of them: the recordings do not begin together" in report.to_text()
     poses[1, 0] = np.nan
     assert replace(diff, poses=poses).begins_together, "no agent is there to tell"
 
@@ -122,9 +105,7 @@ def test_turns_count_the_shorter_way_and_keep_their_sign() -> None:
     diff = made_diff(poses=poses)
     assert (diff.heading_differences[1, 3], diff.parting_frames[1]) == (pytest.approx(0.08), 0)
     assert diff.to_dict()["actors"][0]["largest_heading_difference"] == pytest.approx(-0.09)
-    for heading, frames in ((0.085, [3, 0, 0]), (0.07, [3, 3, 0])):
-        turned = replace(diff, parting=Parting(distance=5.0, heading=heading))
-        assert (turned.parting_frames.tolist(), turned.order.tolist()) == (frames, [0, 1, 2])
+    assert replace(diff, parting=Parting(distance=5.0, heading=0.07)).parting_frames.tolist() == [3, 3, 0]
 
 
 def test_the_pairs_least_gap_in_the_twin() -> None:
@@ -176,7 +157,7 @@ def test_what_is_missing_is_said_and_counted(own_release: Path) -> None:
     report = twin_report(da)
     assert [each.accident for each in report.diffs] == [third["token"]]
     assert [each.scenario for each in report.skipped] == [first["token"], second["token"]]
-    assert "skipped:" in report.to_text()
+    assert second["name"] in report.to_text()
 
 
 def test_two_normal_scenarios_are_nothing_to_compare(own_release: Path) -> None:
@@ -195,26 +176,14 @@ def test_the_command(da_motion: DeepAccident, tmp_path: Path) -> None:
 
     results = run(), run("--where", "collision=true", "--out", str(tmp_path)), run(normal)
     assert [each.exit_code for each in results] == [0, 0, 2]
-    assert "SCENARIO changes nothing with twins" in results[2].output
     names = {"twins.csv", "twin_actors.csv", "torn_twins.csv", "skipped.csv", "twins.json"}
     assert {path.name for path in tmp_path.iterdir()} == names
     diff = twin_diff(da_motion, normal)
     assert json.loads((tmp_path / "twins.json").read_text(encoding="utf-8"))["twins"] == [diff.to_dict()]
-    _, *rows = csv.reader((tmp_path / "twin_actors.csv").read_text(encoding="utf-8").splitlines())
-    assert len(rows) == len(diff.categories)
-
-
-def test_a_report_of_several_lists_torn_twins(da_b: DeepAccident) -> None:
-    report = twin_report(da_b)
-    assert [each.accident for each in report.diffs] == [each["token"] for each in da_b.find(collision=True)]
-    assert (report.torn, "tears apart" in report.to_text()) == ((), False)
-    first = report.diffs[0]
-    line = next(each for each in report.to_text().splitlines() if each.startswith(first.accident))
-    assert f"{first.nearest_in_twin.gap:.2f}" in line
+    assert len((tmp_path / "twin_actors.csv").read_text(encoding="utf-8").splitlines()) == 1 + len(diff.categories)
 
 
 def test_a_report_says_which_recordings_it_is_of(da_motion: DeepAccident, da_b: DeepAccident) -> None:
     first, again, other = (twin_report(each, []) for each in (da_motion, da_motion, da_b))
     assert first.fingerprint == again.fingerprint != other.fingerprint
-    assert f"({first.fingerprint})" in first.to_text()
     assert first.to_dict()["fingerprint"] == safety_report(da_motion, []).to_dict()["fingerprint"] == first.fingerprint

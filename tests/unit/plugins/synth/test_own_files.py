@@ -28,10 +28,6 @@ def made(tmp_path):
     return make
 
 
-def test_the_page_has_five_files():
-    assert list(EXAMPLES) == ["mine", "pedestrian", "rear_end", "right_hook", "quiet"]
-
-
 @pytest.mark.slow
 def test_the_accident_is_rendered_without_sensors(made, tmp_path, monkeypatch):
     """The page's section 'Look at it'."""

@@ -60,13 +60,6 @@ def test_a_view_that_is_asked_for_holds_for_every_draw():
             assert {plan.draw(np.random.default_rng(seed)).view for seed in range(3)} == {view}
 
 
-def test_a_house_hides_the_view_in_some_draws_where_none_is_asked_for():
-    assert {plan.draw(np.random.default_rng(7)).view for plan in plans_of(scenarios=20, designs=(1, 2))} == {
-        "open",
-        "hidden",
-    }
-
-
 def test_the_first_three_pairs_of_a_small_release_fill_the_splits():
     plans = plans_of(scenarios=6)
     assert [plan.split for plan in plans] == ["train", "train", "val", "val", "test", "test"]
@@ -83,7 +76,7 @@ def test_a_large_release_is_split_by_the_official_procedure():
     assert len({(plan.pair, plan.split) for plan in plans}) == len({plan.pair for plan in plans})
 
 
-@pytest.mark.parametrize("scenarios", [*range(1, 50), 60, 120, 240, 691])
+@pytest.mark.parametrize("scenarios", [*range(1, 13), 30, 49, 240, 691])
 def test_minis_are_whole_pairs_a_fifth_at_most_and_no_split_is_empty_from_six_scenarios_on(scenarios):
     plans = plans_of(scenarios=scenarios)
     assert {plan.split for plan in plans} == {"train", "val", "test"} or scenarios <= 5
@@ -173,9 +166,8 @@ def test_a_file_in_which_nobody_meets_gives_normal_scenarios(own):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("designed", [True, False])
-def test_the_lists_are_what_the_official_procedure_makes_of_what_is_built(designed):
-    config = SynthConfig(scenarios=24, frames=1, unplanned=0.3, seed=3, designed=designed)
+def test_the_lists_are_what_the_official_procedure_makes_of_what_is_built():
+    config = SynthConfig(scenarios=24, frames=1, unplanned=0.3, seed=3)
     plans = plan_scenarios(config)
     assert {plan.unplanned for plan in plans} == {True, False}
 

@@ -10,6 +10,8 @@ from deepaccident_devkit.release import (
 )
 from deepaccident_devkit.taxonomy import AGENTS
 
+pytestmark = pytest.mark.slow
+
 
 def test_ids_of_all_kinds_occur(scenarios):
     labels = [(agent, read_label(each.label_path(agent, 1))) for each in scenarios for agent in AGENTS]
@@ -31,9 +33,8 @@ def test_own_box_lies_around_the_ego_origin(scenarios):
             height = read_calib(scenario.calib_path(agent, 1)).ego_from_lidar.translation[2]
             own = int(np.flatnonzero(label.actor_id == -100)[0])
             x, y, z = label.center[own]
-            assert (-0.31 < x <= 0, y) == (True, 0)
+            assert -0.31 < x <= 0 == y
             assert z - label.size[own, 2] / 2 == pytest.approx(0.02 - height, abs=0.01)
-            assert (label.camera_visible[own], label.num_lidar_pts[own] > 10) == (False, True)
 
 
 def test_calib_is_as_in_the_real_release(scenarios):

@@ -2,9 +2,8 @@ import numpy as np
 import pytest
 
 from deepaccident_devkit.plugins.synth.actors import MEDIAN_SIZES
-from deepaccident_devkit.plugins.synth.shapes import BOX_CLEARANCE, INSET, LAMP, MODELS, TAIL, shape_of
+from deepaccident_devkit.plugins.synth.shapes import BOX_CLEARANCE, INSET, MODELS, shape_of
 from deepaccident_devkit.plugins.synth.solids import face_corners, face_planes
-from deepaccident_devkit.taxonomy import CATEGORIES
 
 ALL = [(category, model) for category, models in MODELS.items() for model in range(len(models))]
 
@@ -13,11 +12,6 @@ ALL = [(category, model) for category, models in MODELS.items() for model in ran
 def shape(request):
     category, model = request.param
     return category, model, shape_of(category, MEDIAN_SIZES[category], (200, 30, 30), (30, 60, 200), model)
-
-
-def test_every_category_has_a_shape():
-    assert set(MODELS) == set(CATEGORIES)
-    assert sum(len(models) > 1 for models in MODELS.values()) >= 5
 
 
 def test_shapes_fill_their_boxes_and_keep_within(shape):
@@ -38,11 +32,3 @@ def test_solids_are_convex_and_turned_outwards(shape):
     _, _, solids = shape
     normals, offsets = face_planes(face_corners(solids.corners))
     assert (np.einsum("fk,fk->f", normals, np.repeat(solids.corners.mean(axis=1), 6, axis=0)) < offsets).all()
-
-
-def test_vehicles_have_lamps_in_front_and_behind(shape):
-    category, _, solids = shape
-    for color, sign in ((LAMP, 1), (TAIL, -1)):
-        lamps = (solids.colors[:, 0] == color).all(axis=1)
-        assert lamps.any() == (category not in ("pedestrian", "cyclist"))
-        assert (sign * solids.corners[lamps, :, 0].mean(axis=1) > 0).all()

@@ -4,7 +4,7 @@ import math
 from typing import Any
 
 import pytest
-from drawing import texts, title_of
+from drawing import texts
 from numpy.testing import assert_allclose
 from picture_texts import text_faults
 
@@ -43,14 +43,6 @@ def test_points_are_at_the_logarithm_of_their_bytes_with_their_intervals() -> No
     for at, value, place in zip((7, math.log2(900), math.log2(3000)), (0.5, 0.6, 0.7), places, strict=True):
         assert_allclose(place, [(at, 0.3), (at, value), (at, 0.9)])
     assert (texts(ax), ax.get_ylabel()) == (["single", "some", "all"], "apa")
-    assert title_of(fig) == "accident, protocol boxes: 1,200 samples"
-    assert fig.get_supxlabel() == "bytes a sample, as powers of 2\nwhiskers: 95 % intervals"
-
-
-def test_without_intervals_there_are_dots_alone() -> None:
-    (line, *_) = drawn(report("error", unit="m", low=None, high=None)).axes[0].lines
-    assert_allclose(line.get_xydata(), [(7, 0.5)] * 3)
-    assert line.axes.get_ylabel() == "error (m)"
 
 
 @pytest.mark.parametrize(
@@ -72,8 +64,3 @@ def test_a_panel_for_each_headline_with_words_that_can_be_read(place: Any, panel
         fig = render_over_bytes(report("apa", "precision", "recall", "false_alarm_rate"))
         assert text_faults(fig) == []
     assert [ax.get_ylabel() for ax in fig.axes] == ["apa", "precision", "recall", "false_alarm_rate"][:panels]
-
-
-def test_a_place_without_a_headline_stays_empty() -> None:
-    assert [ax.axison for ax in drawn(report("apa", "precision", "recall")).axes] == [True, True, True, False]
-    assert [ax.axison for ax in drawn(report()).axes] == [False, False]

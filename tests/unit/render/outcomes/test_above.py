@@ -1,11 +1,10 @@
 """Accidents foreseen: places, metres and words."""
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
-from drawing import new_axes, picture, rendered, title_of
+from drawing import new_axes, of_kind, picture, title_of
 from matplotlib.collections import PolyCollection
 from matplotlib.colors import to_hex, to_rgb
 
@@ -32,6 +31,7 @@ from deepaccident_devkit.render.outcomes import (
 )
 from deepaccident_devkit.render.outcomes.above import difference_words, verdict_words
 from deepaccident_devkit.render.styles import OUTCOME_COLORS
+from deepaccident_devkit.taxonomy import OWN_ACTOR_ID
 
 
 def test_accidents_without_truth(da_motion: DeepAccident) -> None:
@@ -56,19 +56,6 @@ def test_the_verdict_names_several_of_a_kind(da_motion: DeepAccident, sample: st
     assert verdict_words(evaluator.compute()) == "5 m: 2 FP + FN, 10 m: 2 FP + FN, 15 m: 2 FP + FN"
 
 
-@pytest.mark.parametrize("off", [0.0, 0.5, 1.0, 2.0, 4.0])
-def test_words_cover_neither_circles_nor_crosses(da_motion: DeepAccident, sample: str, off: float) -> None:
-    truth = box_truth(da_motion, sample)
-    true: Any = truth.accident
-    alarm = replace(true, positions=true.positions + np.array([off, -off]))
-    ax = draw_accident_outcome(ComparedAccidents(true=true, predicted=(alarm,)), truth, ax=new_axes())
-    rendered(ax)
-    chips = [text.get_window_extent().padded(3) for text in ax.texts if text.get_visible()]
-    places = ax.transData.transform(np.concatenate([true.positions, alarm.positions]))
-    covered = [place for place in places for chip in chips if chip.contains(*place)]
-    assert (len(chips), covered) == (3, [])
-
-
 def test_detections_are_coloured_by_their_matches(da_motion: DeepAccident, sample: str) -> None:
     truth = detection_truth(da_motion, sample, "paper")
     truth = truth.select((np.abs(truth.center[:, :2]) < 50).all(axis=1))  # well within the protocol's area
@@ -91,12 +78,6 @@ def test_detections_are_coloured_by_their_matches(da_motion: DeepAccident, sampl
     np.testing.assert_allclose(centers[OUTCOME_COLORS["false"]], [(20, -45)])
     np.testing.assert_allclose(centers[OUTCOME_COLORS["missed"]], truth.center[:2, :2], atol=1e-6)
     assert len(centers[OUTCOME_COLORS["right"]]) == len(some)
-    assert ax.get_title() == f"at 2 m: {len(some)} TP, 1 FP, 2 FN;\ncentres off by 0.30 m on average"
-    boxes = detected.boxes.transform(da_motion.ego_from(sample, "lidar01"), "ego")
-    moved = DetectedBoxes(boxes=boxes, scores=detected.scores)
-    left, right = render_evaluation(da_motion, sample, moved, protocol="paper", fig=detached_figure((10, 6))).axes
-    assert right.get_title().startswith(f"at 2 m: {len(some)} TP, 1 FP, ")
-    assert left.get_title().startswith(f"true boxes: {len(some)} found, ")
 
 
 def damaged(labels: MotionLabels) -> MotionOutput:
@@ -123,9 +104,6 @@ def test_motion_outcomes_are_those_that_are_counted(da_motion: DeepAccident, sam
         assert sum(map(len, wrong)) == total > 0
     figure = render_evaluation(da_motion, sample, output, fig=detached_figure((10, 6)))
     left, right = figure.axes
-    assert left.get_title() == f"true instances: {counted.true_positive} found, {counted.false_negative} missed"
-    assert right.get_title().endswith(f"{counted.true_positive} right, {counted.false_positive} false")
-    assert f"PQ {counted.pq:.1f} %" in title_of(figure)
     missed = picture(left)[labels.instance[0] == 3]
     np.testing.assert_allclose(missed, np.tile(to_rgb(OUTCOME_COLORS["missed"]), (len(missed), 1)))
     np.testing.assert_allclose(picture(right)[4, 4], to_rgb(OUTCOME_COLORS["false"]))
@@ -135,3 +113,11 @@ def test_what_lies_beyond_the_range_is_not_judged(labels: MotionLabels, monkeypa
     monkeypatch.setattr("deepaccident_devkit.render.outcomes.above.RANGES", {"30x30": 30.0})
     cells = motion_outcome(instances_of(labels.instance, labels.config.grid), labels).outcomes("true")
     assert set(np.unique(cells[0][labels.instance[0] > 0]).tolist()) == {1, 3}
+
+
+def test_actors_stand_where_the_truth_has_them(da_motion: DeepAccident, sample: str) -> None:
+    truth = box_truth(da_motion, sample)
+    ax = draw_accident_outcome(ComparedAccidents(true=truth.accident, predicted=()), truth, ax=new_axes())
+    pair = da_motion.boxes(sample, "ego").bottom_corners()[da_motion.boxes(sample).actor_id == OWN_ACTOR_ID, :, :2]
+    shapes = [path.vertices[:4] for each in of_kind(ax, PolyCollection) for path in each.get_paths()]
+    assert np.abs(np.array(shapes) - pair).max(axis=(1, 2)).min() < 0.3

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from drawing import legend_words, of_kind, texts, title_of
+from drawing import of_kind, title_of
 from matplotlib import pyplot as plt
 from matplotlib.collections import PolyCollection
 from matplotlib.colors import to_hex
@@ -15,18 +15,14 @@ from picture_texts import text_faults
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.evaluation import (
     Accident,
-    AccidentEvaluator,
     DetectedBoxes,
-    accident_context,
     box_truth,
     instances_of,
 )
-from deepaccident_devkit.evaluation.accident import PROTOCOLS, compared_accidents
 from deepaccident_devkit.motion import MotionLabels
 from deepaccident_devkit.render import detached_figure, style
 from deepaccident_devkit.render.boxes import camera_name, collider_ids
 from deepaccident_devkit.render.camera import best_view
-from deepaccident_devkit.render.outcomes.above import verdict_words
 from deepaccident_devkit.render.outcomes.evaluation import (
     render_evaluation,
 )
@@ -40,39 +36,11 @@ def test_accidents_have_their_metres_and_verdict(da_motion: DeepAccident, sample
     figure, silent = (
         render_evaluation(da_motion, sample, given, fig=detached_figure((10, 6))) for given in ([near], [])
     )
-    camera, above = figure.axes
+    above = figure.axes[1]
     assert title_of(figure).endswith("accident: 5 m: FP + FN, 10 m: TP, 15 m: TP")
-    assert above.get_title() == f"an accident comes in {true.time:.1f} s;\nforeseen 6.0 m off in sum, +0.5 s"
-    alarm = f"in {near.time:.1f} s, score 0.9"
-    assert {f"in {true.time:.1f} s", alarm} <= {*texts(camera)}
-    assert {alarm, "3.0 m", "ego", "other"} <= {*texts(above)}
     marked = {line.get_marker(): line.get_xydata() for line in above.lines if line.get_marker() in ("o", "x")}
     np.testing.assert_allclose([marked["o"], marked["x"]], [true.positions, near.positions])
-    assert legend_words(figure) == ["to come", "foreseen"]
     assert title_of(silent).endswith("5 m: FN, 10 m: FN, 15 m: FN")
-    assert silent.axes[1].get_title().endswith("none is foreseen")
-
-
-@pytest.mark.parametrize("protocol", ["released", "paper", "boxes"])
-def test_motion_is_seen_as_accidents_by_every_protocol(
-    da_motion: DeepAccident, sample: str, labels: MotionLabels, protocol: str
-) -> None:
-    instance = np.zeros_like(labels.instance)
-    for cells, step in zip(instance, (0, 4, 8, 8, 8), strict=True):  # two that drive into each other
-        cells[100:104, 110 + step : 118 + step] = 1
-        cells[102:106, 139 - 2 * step : 147 - 2 * step] = 2
-    output, context = instances_of(instance, labels.config.grid), accident_context(da_motion, sample, 2.0)
-    how = {"task": "accident", "protocol": protocol}
-    figure = render_evaluation(da_motion, sample, output, fig=detached_figure((9, 5)), **how)
-    evaluator = AccidentEvaluator(PROTOCOLS[protocol])
-    evaluator.update(sample, output, labels, context)
-    assert title_of(figure).endswith(verdict_words(evaluator.compute()))
-    compared = compared_accidents(output, labels, context, PROTOCOLS[protocol])
-    marks = [(line.get_marker(), line.get_xydata()) for ax in figure.axes for line in ax.lines]
-    drawn = {marker: [places for each, places in marks if each == marker] for marker in ("o", "x")}
-    np.testing.assert_allclose(drawn["o"], [compared.true.positions] if compared.true else [])
-    (predicted,) = compared.predicted
-    np.testing.assert_allclose(drawn["x"], [predicted.positions])
 
 
 def test_an_accident_is_shown_on_the_road_and_in_the_camera_that_sees_both_best(
@@ -93,8 +61,6 @@ def test_an_accident_is_shown_on_the_road_and_in_the_camera_that_sees_both_best(
     corners = [path.vertices[:4] for each in of_kind(above, PolyCollection) for path in each.get_paths()]
     middles = np.mean(corners, axis=1)
     assert np.linalg.norm(middles[:, None] - true.positions, axis=-1).min(axis=0).max() < 1.0
-    ways = [line.get_xydata()[-1] for line in above.lines if line.get_zorder() == 4 and line.get_linestyle() == "--"]
-    np.testing.assert_allclose(ways, named.positions)
 
 
 def test_the_pair_that_collides_is_red_in_every_task(
@@ -132,11 +98,3 @@ def test_words_are_in_the_picture_and_apart(
         assert faults_of_predictions(da_motion, sample) == []
         output = instances_of(labels.instance, labels.config.grid)
         assert text_faults(render_evaluation(da_motion, sample, output)) == []
-
-
-@pytest.mark.slow
-def test_words_of_twelve_scenes_are_apart(da_designs: DeepAccident) -> None:
-    tokens = [f"{scenario['token']}/ego_vehicle/001" for scenario in da_designs.scenario if scenario["collision"]]
-    assert len(tokens) == 12
-    found = {token: faults_of_predictions(da_designs, token) for token in tokens}
-    assert {token: faults for token, faults in found.items() if faults} == {}

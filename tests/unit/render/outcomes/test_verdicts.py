@@ -1,14 +1,11 @@
 """What protocols say of single predictions."""
 
-from typing import Any
-
 import numpy as np
 from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, EvaluationError
 from deepaccident_devkit.evaluation import (
-    Accident,
     AccidentEvaluator,
     DetectedBoxes,
     MotionEvaluator,
@@ -58,17 +55,6 @@ def test_motion_is_judged_by_the_released_rules(da_motion: DeepAccident, sample:
     assert {type(seen), type(other)} == {AccidentVerdict}
     assert seen.words == f"accident: {verdict_words(alarms.compute())}"
     assert [each.compared.true.ids is not None for each in (seen, other)] == [False, True]
-
-
-def test_explicit_accidents_are_judged_by_boxes(da_motion: DeepAccident, sample: str) -> None:
-    context, counted = accident_context(da_motion, sample, 2.0), AccidentEvaluator("boxes")
-    true: Any = context.truth.accident
-    near = Accident(positions=true.positions + 1.5, time=true.time)
-    counted.update(sample, [near], None, context)
-    verdict = sample_verdict(da_motion, sample, [near])
-    assert isinstance(verdict, AccidentVerdict)
-    assert verdict.words == f"accident: {verdict_words(counted.compute())}"
-    assert verdict.compared.true is not None
 
 
 def test_detections_are_judged_in_the_frame_of_the_protocol(da_motion: DeepAccident, sample: str) -> None:

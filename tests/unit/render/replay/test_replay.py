@@ -22,11 +22,6 @@ from deepaccident_devkit.render.replay import render_replay
 from deepaccident_devkit.render.replay.page import replay_page
 
 
-def test_the_same_call_gives_the_same_bytes(da: DeepAccident, page: Path, tmp_path: Path) -> None:
-    again = render_replay(da, da.get("scenario", accident(da)), str(tmp_path / "again.html"), progress=True)
-    assert again.read_bytes() == page.read_bytes()
-
-
 def test_a_page_keeps_its_limit(da: DeepAccident, page: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     whole = page.stat().st_size
     assert whole < 15_000_000
@@ -52,7 +47,6 @@ def test_text_stays_text() -> None:
     assert data_of(text) == {"scenario": wild}
     assert "<title>&lt;/script&gt;&lt;script&gt;alert(1)" in text
     assert ("alert(1)</script>" in text, text.count("<script")) == (False, 2)
-    assert text.isascii() is False  # the script itself has signs that are not
 
 
 def test_what_cannot_be_is_refused(da: DeepAccident, tmp_path: Path) -> None:
@@ -91,13 +85,3 @@ def test_the_command_writes_the_page(
     assert [agent["name"] for agent in data["agents"]] == ["ego_vehicle", "infrastructure"]
     judged = [(each["verdict"], each["agent"]) for each in data["prediction"]["samples"]]
     assert judged == [("TP", 0), ("FP + FN", 0), ("FN", 0), ("4 FP + FN", 1)]
-
-
-def test_the_command_takes_the_first_accident_and_a_configuration(da_motion: DeepAccident, tmp_path: Path) -> None:
-    out = tmp_path / "replay.html"
-    ran = CliRunner().invoke(replay, [str(da_motion.dataroot), "--out", str(out), "--agents", "+other"])
-    assert ran.exit_code == 0, ran.output
-    data = data_of(out)
-    agents = [agent["name"] for agent in data["agents"]]
-    assert (data["scenario"], agents) == (accident(da_motion), ["ego_vehicle", "other_vehicle"])
-    assert data["prediction"] is None

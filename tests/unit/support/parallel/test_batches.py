@@ -4,8 +4,6 @@ import os
 import pickle
 import pickletools
 import signal
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -20,12 +18,10 @@ import workers
 from processes import is_running, wait_for
 from refusals import assert_refused
 
-from deepaccident_devkit.errors import ChoiceError, ReleaseError, SomeFailedError, WorkerError
+from deepaccident_devkit.errors import ChoiceError, WorkerError
 from deepaccident_devkit.support.parallel import (
-    Failure,
     Places,
     Tried,
-    check_failures,
     in_order,
     run_batch,
     run_unordered,
@@ -33,6 +29,8 @@ from deepaccident_devkit.support.parallel import (
 )
 from deepaccident_devkit.support.parallel.batches import Call, marked
 from deepaccident_devkit.support.parallel.executors import signals_put_off
+
+pytestmark = pytest.mark.slow
 
 
 class Delayed(Executor):
@@ -105,12 +103,6 @@ def test_the_folders_are_marked_meanwhile(tmp_path: Path) -> None:
     assert not list(out.iterdir())
 
 
-def test_a_worker_that_does_not_see_a_place(tmp_path: Path) -> None:
-    message = rf"^a worker on \S+ does not see {tmp_path}/gone; give an absolute path on a file system that all workers"
-    with ThreadPoolExecutor(2) as threads, pytest.raises(WorkerError, match=message):
-        run_batch(workers.following, range(4), executor=threads, places=Places(reads=(tmp_path / "gone",)))
-
-
 def test_a_worker_with_another_folder_of_the_same_name(tmp_path: Path) -> None:
     with marked(Places(writes=(tmp_path,))) as seen:
         for mark in tmp_path.iterdir():
@@ -122,15 +114,6 @@ def test_a_worker_with_another_version(monkeypatch: pytest.MonkeyPatch, tmp_path
     sent = pickle.dumps(Call(workers.following, 1, (str(tmp_path),)))  # not checked yet in this process
     monkeypatch.setattr("deepaccident_devkit.support.parallel.batches.__version__", "9.9")
     assert_refused((pickle.loads(sent), WorkerError, ("a worker on ", "deepaccident_devkit 9.9", "install")))
-
-
-def test_what_is_sent_needs_no_devkit_before_it_is_called() -> None:
-    """A dask scheduler unpickles it too, and a worker that cannot ends without a word."""
-    sent = pickle.dumps(Call(workers.following, 1, ()))
-    names = [argument for code, argument, _ in pickletools.genops(sent) if "GLOBAL" in code.name or "UNI" in code.name]
-    assert names
-    assert not any("deepaccident" in str(name) or "workers" in str(name) for name in names)
-    assert pickle.loads(sent)() == 2
 
 
 @pytest.mark.parametrize(
@@ -149,28 +132,8 @@ def test_a_worker_without_the_package(error: Exception) -> None:
     )
 
 
-def broken_if_odd(item: int) -> int:
-    if item % 2:
-        raise ReleaseError(f"{item} is broken")
-    return item
-
-
 def full_disk(item: int) -> int:
     raise OSError(28, "No space left on device")
-
-
-def test_what_failed_is_listed_and_the_rest_done() -> None:
-    results = run_batch(Tried(broken_if_odd), range(5), workers=1)
-    assert results == [0, Failure("1 is broken"), 2, Failure("3 is broken"), 4]
-    with pytest.raises(SomeFailedError, match="2 of 5") as raised:
-        check_failures(zip("abcde", results, strict=True), "out")
-    assert str(raised.value).splitlines() == [
-        "out: 2 of 5 failed:",
-        "  b: 1 is broken",
-        "  d: 3 is broken",
-        "The others are done; mend these, and run the same again: it does what is left.",
-    ]
-    check_failures([("a", 0)], "out")
 
 
 def test_a_full_disk_ends_it_all() -> None:
@@ -237,14 +200,6 @@ def test_ctrl_c_ends_the_workers_at_once(tmp_path: Path) -> None:
     assert [signal.getsignal(number) for number in SIGNALS] == before
 
 
-def test_closing_the_generator_ends_the_workers(tmp_path: Path) -> None:
-    results = run_unordered(workers.told_and_asleep, ["", str(tmp_path / "1"), str(tmp_path / "2")], workers=2)
-    next(results)
-    wait_for(lambda: any(path.read_text() for path in tmp_path.iterdir()))
-    results.close()
-    assert_workers_end(tmp_path)
-
-
 def test_an_error_lets_others_end_what_they_do(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"^broken$"):
         run_batch(workers.told_or_broken, [str(tmp_path / str(item)) for item in range(20)], workers=2)
@@ -264,22 +219,10 @@ def test_signals_wait_for_the_start_of_processes(number: signal.Signals) -> None
         signal.signal(number, before)
 
 
-def test_other_threads_get_no_signals_to_put_off() -> None:
-    with ThreadPoolExecutor(1) as threads:
-        threads.submit(lambda: signals_put_off().__enter__()).result(60)
-
-
-@pytest.mark.slow
-def test_workers_end_with_a_killed_parent(tmp_path: Path) -> None:
-    paths = [str(tmp_path / "a"), str(tmp_path / "b")]
-    script = (
-        "import workers\nfrom deepaccident_devkit.support.parallel import run_batch\n"
-        f"run_batch(workers.told_and_asleep, {paths!r}, workers=2)"
-    )
-    path = os.pathsep.join([str(Path(workers.__file__).parent), *sys.path])
-    parent = subprocess.Popen([sys.executable, "-c", script], env={**os.environ, "PYTHONPATH": path})
-    wait_for(lambda: len([file for file in tmp_path.iterdir() if file.read_text()]) == 2)
-    numbers = [int(file.read_text()) for file in tmp_path.iterdir()]
-    parent.kill()
-    parent.wait()
-    wait_for(lambda: not any(map(is_running, numbers)))
+def test_what_is_sent_needs_no_devkit_before_it_is_called() -> None:
+    """A dask scheduler unpickles it too, and a worker that cannot ends without a word."""
+    sent = pickle.dumps(Call(workers.following, 1, ()))
+    names = [argument for code, argument, _ in pickletools.genops(sent) if "GLOBAL" in code.name or "UNI" in code.name]
+    assert names
+    assert not any("deepaccident" in str(name) or "workers" in str(name) for name in names)
+    assert pickle.loads(sent)() == 2

@@ -1,29 +1,9 @@
 """`python -m benchmarks engine`, with settings that are small enough for a test."""
 
 import pytest
-from scripts import TOP, of_checkout
+from scripts import of_checkout
 
 benchmark = of_checkout("benchmarks.engine")
-
-
-@pytest.mark.slow
-def test_every_engine_is_measured(monkeypatch: pytest.MonkeyPatch) -> None:
-    small = {"SCENARIOS": 2, "FRAMES": 4, "ITEMS": 20, "BATCHES": 40, "REPEATS": 1}
-    engines = {"here": (1,), "own": (2,), "dask": (2,), "mpi": (2,)}
-    for name, value in {**small, "ENGINES": engines}.items():
-        monkeypatch.setattr(benchmark, name, value)
-    monkeypatch.syspath_prepend(TOP)  # where dask's workers find it too
-    found = {figure.name: figure.value for figure in benchmark.measure()}
-    assert found["engine_samples"] == 2 * 4 * 5
-    assert found["engine_here_samples_per_s_1_worker"] > 0
-    for kind in filter(benchmark.installed, ("own", "dask", "mpi")):
-        name = f"engine_{kind}"
-        positive = ("samples_per_s_2_workers", "batch_ms_2_workers", "efficiency_2_workers", "serial_share")
-        assert min(found[f"{name}_{figure}"] for figure in positive) > 0
-        assert 0 <= found[f"{name}_caller_mb"] < 100
-        minutes = [found[f"{name}_whole_release_by_amdahl_{cores}"] for cores in benchmark.CORES]
-        times = [found[f"{name}_speed_up_by_amdahl_{cores}"] for cores in benchmark.CORES]
-        assert minutes[0] * times[0] == pytest.approx(minutes[1] * times[1])
 
 
 def test_the_serial_share_is_of_one_core_and_bounds_all_cores() -> None:

@@ -3,7 +3,6 @@
 import concurrent.futures
 import gc
 import sys
-from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 from unittest.mock import Mock
@@ -15,12 +14,7 @@ from refusals import assert_refused
 from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.errors import MissingExtraError, WorkerError
 from deepaccident_devkit.support.parallel import cluster_executor, run_batch
-from deepaccident_devkit.support.parallel.executors import fault_of_workers, width_of
-
-
-def test_none_without_a_scheduler() -> None:
-    with cluster_executor() as executor:
-        assert executor is None
+from deepaccident_devkit.support.parallel.executors import fault_of_workers
 
 
 def test_a_dead_scheduler() -> None:
@@ -84,11 +78,6 @@ def test_without_the_package(monkeypatch: pytest.MonkeyPatch, package: str, addr
         pass
 
 
-def test_the_width_of_executors() -> None:
-    with ThreadPoolExecutor(5) as threads:
-        assert width_of(threads) == 5
-
-
 @pytest.mark.parametrize(
     "error",
     [
@@ -116,3 +105,8 @@ def test_processes_that_cannot_be_started_are_named(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(concurrent.futures, "ProcessPoolExecutor", Mock(side_effect=OSError(28, "No space left")))
     facts = ("cannot be started", "No space left", "/dev/shm", "fewer workers")  # noqa: S108
     assert_refused((lambda: run_batch(abs, range(9), workers=2), WorkerError, facts))
+
+
+def test_none_without_a_scheduler() -> None:
+    with cluster_executor() as executor:
+        assert executor is None

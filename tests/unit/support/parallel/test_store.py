@@ -5,7 +5,6 @@ import os
 import subprocess
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -13,12 +12,14 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from processes import wait_for
 from refusals import assert_refused
-from stored import ITEMS, Work, made, process, store_in
+from stored import ITEMS, made, process, store_in
 
 from deepaccident_devkit.errors import ConfigError, OutputFolderError, SomeFailedError
 from deepaccident_devkit.support.parallel import Store
 from deepaccident_devkit.support.parallel import store as module
 from deepaccident_devkit.support.text import warn_once
+
+pytestmark = pytest.mark.slow
 
 WHOLE = b"\n".join(f"{name} {name} settings".encode() for name in ITEMS)
 
@@ -34,7 +35,6 @@ def marks(folder: Path) -> list[str]:
     return sorted(path.stem for path in (folder / "marks").iterdir())
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("workers", [1, 2])
 def test_several_processes_share_a_folder(tmp_path: Path, workers: int) -> None:
     for each in [process(tmp_path, workers) for _ in range(3)]:
@@ -54,13 +54,6 @@ def test_a_killed_process_costs_nothing_that_is_made(tmp_path: Path, killed_at: 
     assert (tmp_path / "out").read_bytes() == WHOLE
 
 
-def test_one_goes_on_where_another_is_killed(tmp_path: Path) -> None:
-    killed, other = process(tmp_path, killed_at=ITEMS[3]), process(tmp_path)
-    ended(killed)  # unless the other one made that item
-    assert ended(other)[0]
-    assert (tmp_path / "out").read_bytes() == WHOLE
-
-
 @pytest.mark.parametrize("removed", [".lock", ".making"])
 def test_who_holds_a_lock_that_is_gone_does_not_finish(tmp_path: Path, removed: str) -> None:
     """Whoever comes next makes a new file of that name, and both would be alone."""
@@ -70,25 +63,6 @@ def test_who_holds_a_lock_that_is_gone_does_not_finish(tmp_path: Path, removed: 
         with store.shared() as another:
             assert not turn.alone(wait=False)
             assert another.alone(wait=False)
-
-
-def test_a_disk_that_takes_half_of_a_locks_text_is_full(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nobody else has written it, so there is nobody to wait for."""
-    write = os.pwrite
-    monkeypatch.setattr(os, "pwrite", lambda file, content, place: write(file, content[:3], place))
-    store = Store(tmp_path / "store", tmp_path / "out", "tests", ConfigError, "settings")
-    facts = (str(tmp_path / "out"), "No space left", "make room there")
-    assert_refused((lambda: store.shared().__enter__(), ConfigError, facts))
-
-
-def test_other_settings_are_made_again(tmp_path: Path) -> None:
-    store, items = store_in(tmp_path), dict(zip(ITEMS, ITEMS, strict=True))
-    (tmp_path / "marks").mkdir()
-    for key in ("one", "two", "two"):
-        with store.shared():
-            results = store.run(Work(store, tmp_path / "marks", key), items, workers=1)
-        assert results[ITEMS[0]] == f"{ITEMS[0]} {ITEMS[0]} {key}".encode()
-    assert store.kept(ITEMS[0], "one") is None
 
 
 @given(content=st.binary(max_size=40), at=st.integers(0, 60), byte=st.integers(1, 255), cut=st.booleans())
@@ -129,18 +103,6 @@ def test_no_link_is_followed(tmp_path: Path, place: str) -> None:
     assert (outside / "precious").stat() == before
 
 
-def test_removing_leaves_what_is_not_ours(tmp_path: Path) -> None:
-    store, outside = store_in(tmp_path), tmp_path / "outside"
-    store.keep("a", "key", b"content")
-    outside.mkdir()
-    (outside / "precious").touch()
-    (store.folder / "locks").symlink_to(outside)
-    (store.folder / "mine.txt").touch()
-    store.remove()
-    assert [path.name for path in store.folder.iterdir()] == ["mine.txt"]
-    assert (outside / "precious").exists()
-
-
 def test_who_waits_says_so_and_sees_that_all_is_done(tmp_path: Path) -> None:
     with store_in(tmp_path).shared() as turn:
         running = process(tmp_path)
@@ -163,37 +125,6 @@ def test_begin_is_called_if_nobody_else_takes_part(tmp_path: Path) -> None:
     with pytest.raises(ZeroDivisionError), store.shared(tidy=lambda: called.append(0)):
         called.append(1 // 0)
     assert called == [1, 0, 0]
-    del called[1:]
-    with store.shared(lambda: called.append(4)) as turn:
-        assert turn.alone()
-        store.remove()
-        assert os.path.lexists(store.folder) is False
-    assert called == [1, 4]
-
-
-def test_who_comes_after_the_end_finds_a_new_folder(tmp_path: Path) -> None:
-    store = store_in(tmp_path)
-    with store.shared() as first, store.shared() as second:
-        second.end()
-        assert first.alone()
-        store.remove()
-        with store.shared() as third:
-            assert third.alone()
-        assert not first.alone()
-
-
-def test_another_command_waits_for_its_turn(tmp_path: Path) -> None:
-    one, other = (Store(tmp_path / "store", tmp_path, "tests", ConfigError, name) for name in ("one", "other"))
-    begun = list[str]()
-    with ThreadPoolExecutor(1) as threads:
-        with one.shared(lambda: begun.append("one")):
-            waiting = threads.submit(lambda: other.shared(lambda: begun.append("other")).__enter__())
-            time.sleep(0.2)
-            assert not waiting.done()
-            with one.shared(lambda: begun.append("one again")):
-                pass
-        waiting.result(60).end()
-    assert begun == ["one", "other"]
 
 
 def test_what_cannot_be_written_is_an_error_of_the_caller(tmp_path: Path) -> None:
@@ -272,3 +203,12 @@ def test_a_lock_that_is_never_given_back(
     assert ["at most 0.0001 hours" in record.getMessage() for record in caplog.records] == [True]
     with other.shared():
         pass
+
+
+def test_a_disk_that_takes_half_of_a_locks_text_is_full(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nobody else has written it, so there is nobody to wait for."""
+    write = os.pwrite
+    monkeypatch.setattr(os, "pwrite", lambda file, content, place: write(file, content[:3], place))
+    store = Store(tmp_path / "store", tmp_path / "out", "tests", ConfigError, "settings")
+    facts = (str(tmp_path / "out"), "No space left", "make room there")
+    assert_refused((lambda: store.shared().__enter__(), ConfigError, facts))

@@ -6,12 +6,11 @@ import re
 import shlex
 import shutil
 import sys
-import threading
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
-from urllib.parse import parse_qs, quote, urlencode, urljoin, urlsplit
+from urllib.parse import quote, urlencode, urljoin, urlsplit
 
 import numpy as np
 import pytest
@@ -21,7 +20,6 @@ from wording import holding, lacking
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.evaluation import Accident, Resampling, ResultsWriter
-from deepaccident_devkit.evaluation.breakdowns import tokens_by_value
 from deepaccident_devkit.evaluation.runs import EvaluationRun, default_selection, evaluate_results, save_run
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 from deepaccident_devkit.plugins.explore import Explorer, make_app
@@ -191,36 +189,6 @@ def main_number(run: EvaluationRun, token: str) -> float | None:
     return value if not np.isnan(value) else 0.0 if false else None
 
 
-@pytest.mark.parametrize("name", ["first", "motion", "detection", "warning", "forecasting"])
-def test_each_bar_leads_to_the_samples_of_its_group(site: Site, name: str) -> None:
-    run, address = site.runs[name], of("model", name)
-    links = [each for each in hrefs(site.page(address)) if each.startswith("samples?by=")]
-    queries = {link: parse_qs(urlsplit(link).query) for link in links}
-    found = {
-        (query["by"][0], query["value"][0]): sorted(site.samples(urljoin(address, link)))
-        for link, query in queries.items()
-    }
-    expected = {
-        (broken.by, value or "unknown"): sorted(tokens)
-        for broken in run.breakdowns
-        if broken.by != "all"
-        for value, tokens in tokens_by_value(run.attributes, broken.by).items()
-    }
-    assert found == expected
-    assert len(expected) > 5
-
-
-def test_bars_are_as_long_as_their_numbers(site: Site) -> None:
-    bars = re.findall(r'<rect class="value" width="([\d.]+)%"', site.page("/model/first/"))
-    shown = [
-        group.result.apa
-        for broken in site.runs["first"].breakdowns
-        if broken.by != "all" and len(broken.groups) > 1
-        for group in broken.groups
-    ]
-    assert [float(each) for each in bars] == [round(100 * each, 2) for each in shown if not np.isnan(each)]
-
-
 def test_a_scenario_and_a_group_can_be_chosen_together(site: Site) -> None:
     tokens = site.runs["detection"].attributes
     scenario = min(each.scenario for each in tokens.values())
@@ -243,30 +211,13 @@ def test_warnings_are_listed_in_time_sixty_a_page(site: Site) -> None:
 
 
 def test_accident_verdicts_are_those_of_the_evaluator(site: Site) -> None:
-    seen = set()
     for name, token in ((each, token) for each in ("first", "second", "part") for token in site.rows(each)):
         within, row = site.runs[name].evaluator.compute([token]).within, site.rows(name)[token]
-        words = count_words(within[15.0])
         whole = ", ".join(f"{distance:g} m: {count_words(each)}" for distance, each in within.items())
-        assert verdict_text("accident", row).split(",")[0] == words
+        assert verdict_text("accident", row).split(",")[0] == count_words(within[15.0])
         assert verdict_text("accident", row, whole=True).startswith(whole)
-        assert words != "TP" or f"places {within[15.0].position_error:.1f} m off" in verdict_text("accident", row)
-        seen.add(words)
-    assert seen >= {"TP", "FN", "FP + FN"}
     page = site.page(of("model", "first", "sample", sample_path(a_sample(site))))
     assert verdict_text("accident", site.rows("first")[a_sample(site)], whole=True) in html.unescape(page)
-
-
-def test_other_verdicts_are_those_of_the_evaluator(site: Site) -> None:
-    for token in site.runs["motion"].evaluator.tokens:
-        widest = site.runs["motion"].evaluator.compute([token]).ranges["100x100"]
-        counts = f"{widest.true_positive} TP, {widest.false_positive} FP, {widest.false_negative} FN"
-        expected = f"100x100 m: VPQ {widest.pq:.1f} %, IoU {widest.iou:.1f} %, {counts}"
-        assert verdict_text("motion", site.rows("motion")[token]) == expected
-    for token, counted in site.runs["detection"].evaluator.counts.items():
-        start = f"{sum(counted['truths'])} true boxes, {len(counted['detections'][0])} detections, "
-        assert verdict_text("detection", site.rows("detection")[token]).startswith(start)
-    assert "involvement " in verdict_text("warning", site.rows("warning")[a_sample(site, "warning")])
 
 
 @pytest.mark.parametrize("task", ["accident", "motion", "detection", "warning", "planning", "forecasting"])
@@ -287,18 +238,6 @@ def test_a_sample_shows_the_prediction_from_above_and_in_cameras(site: Site, nam
     assert told == [(200, "image/png", b"\x89PNG")] * 2
 
 
-def test_paths_of_actors_are_listed_by_their_errors_without_pictures(site: Site) -> None:
-    tokens = site.samples(of("model", "forecasting", "samples"))
-    errors = [site.rows("forecasting")[token]["min_fde 3 s, K = 6"] for token in tokens]
-    known = [each for each in errors if each is not None]
-    assert (sorted(tokens), errors[: len(known)]) == (sorted(site.rows("forecasting")), sorted(known, reverse=True))
-    assert known[0] > known[-1]
-    page = site.page(of("model", "forecasting", "sample", sample_path(tokens[0])))
-    assert ("There are no pictures of forecasting." in page, images(page)) == (True, [])
-    scenario = tokens[0].rsplit("/", 2)[0]
-    assert site.get(f"/scenario/{scenario}/?model=forecasting").status == 200
-
-
 def test_motion_is_shown_frame_by_frame(site: Site) -> None:
     def ahead(token: str) -> list[str]:
         page = site.page(of("model", "motion", "sample", sample_path(token)))
@@ -308,14 +247,13 @@ def test_motion_is_shown_frame_by_frame(site: Site) -> None:
     first, last = (len(ahead(each(tokens))) for each in (min, max))
     assert last < first == 5  # from now to 2 s; the recording ends
     pictures = f"{of('model', 'motion', 'sample', sample_path(min(tokens)))}/cameras.png?ahead="
-    assert len({site.get(f"{pictures}{number}").body for number in (0, 4)}) == 2
     assert [site.get(f"{pictures}{wrong}").status for wrong in ("5", "-1", "x", "999")] == [404] * 4
 
 
 def test_a_sample_leads_to_the_ones_before_and_after(site: Site) -> None:
     """In time those of the same agent, in the list those of the group."""
     choices = {"by": "time_to_impact", "value": "1 s"}
-    worse, token, better, *others = site.samples(of("model", "first", "samples", **choices))
+    worse, token, better, *_ = site.samples(of("model", "first", "samples", **choices))
     address = of("model", "first", "sample", sample_path(token), **choices)
     page, (scenario, agent, frame) = site.page(address), token.rsplit("/", 2)
     same = sorted(each for each in site.rows("first") if each.startswith(f"{scenario}/{agent}/"))
@@ -324,10 +262,7 @@ def test_a_sample_leads_to_the_ones_before_and_after(site: Site) -> None:
     links += [re.findall(f'<a id="{name}" href="([^"]+)"', page)[0] for name in ("worse", "better")]
     expected = [*same[at - 1 : at], *same[at + 1 : at + 2], worse, better]
     assert [sample_of(urljoin(address, each)) for each in links] == expected
-    assert f"2 of {3 + len(others)}" in page
-    here = [urljoin(address, each) for each in hrefs(page)]
-    moment = f"/scenario/{scenario}/moment/{agent}/{int(frame)}"
-    assert not lacking(here, f"/scenario/{scenario}/?frame={int(frame)}&model=first", moment)
+    assert f"/scenario/{scenario}/?frame={int(frame)}&model=first" in [urljoin(address, each) for each in hrefs(page)]
 
 
 def test_a_sample_that_is_not_evaluated_is_a_sentence(site: Site) -> None:
@@ -374,11 +309,6 @@ def test_results_without_an_evaluation_show_how_to_make_one(site: Site, da_motio
     assert shlex.split(html.unescape(shown)) == words
 
 
-def test_results_of_other_scenarios_are_told(opened: Callable[..., Site], tmp_path: Path) -> None:
-    path = written(tmp_path / "few.json", (), ["type9/none/ego_vehicle/001"])
-    assert "1 scenario of these results is not in this release" in opened(results=[path]).page("/model/few/")
-
-
 # names and addresses of strangers
 
 
@@ -393,16 +323,6 @@ def test_names_are_escaped_and_lead_to_their_pages(site: Site) -> None:
 
 
 HOSTILE_PART = "%3Cimg%20src%3Dx%20onerror%3Dalert%281%29%3E%20%22a%22%20%26%20%27b%27%20..%252e%252e%3F%23%3B"
-
-
-def test_a_folders_address_gets_its_slash(site: Site) -> None:
-    for address, location in {
-        "/model/first?a=b": "/model/first/?a=b",
-        f"/model/{HOSTILE_PART}": f"/model/{HOSTILE_PART}/",
-        "/models": "/models/",
-    }.items():
-        answer = site.get(address)
-        assert (answer.status, urljoin(address, answer.headers["location"])) == (307, location)
 
 
 @pytest.mark.parametrize(
@@ -447,13 +367,6 @@ def test_a_damaged_summary_is_a_sentence(site: Site, opened: Callable[..., Site]
 # marks and warnings
 
 
-def test_what_is_partial_says_so(site: Site) -> None:
-    words = site.runs["part"].partial.text()  # type: ignore[union-attr]
-    assert words.startswith("PARTIAL")
-    assert all(words in site.page(address) for address in ("/models/", "/model/part/", "/compare/part/part/"))
-    assert "PARTIAL" not in site.page("/model/first/")
-
-
 def test_another_release_lacks_the_samples(site: Site, da: DeepAccident, opened: Callable[..., Site]) -> None:
     other = opened(da, bundles=[site.folder / "first"])
     assert sorted(other.samples("/model/first/samples")) == sorted(site.runs["first"].evaluator.tokens)
@@ -469,17 +382,6 @@ def test_without_models_the_page_says_how_to_give_some(opened: Callable[..., Sit
     assert not lacking(opened().page("/models/"), "--results PATH", "deepaccident evaluate")
 
 
-def test_pages_wait_for_scores(site: Site, opened: Callable[..., Site]) -> None:
-    go_on, other = threading.Event(), opened(bundles=[site.folder / "first", site.folder / "second"])
-    other.explorer.jobs.ask("other", "something slow", go_on.wait)
-    for address in ("/model/first/", "/model/first/samples", "/compare/first/second/"):
-        answer = other.get(address)
-        titles = json.loads(html.unescape(re.findall("data-titles='([^']*)'", answer.text)[0]))
-        assert (answer.status, titles != []) == (200, True)
-        assert set(titles) <= set(json.loads(other.get("/waiting.json").text))
-    go_on.set()
-
-
 # side by side
 
 
@@ -492,24 +394,10 @@ def test_a_comparison_has_the_largest_differences_first(site: Site) -> None:
     assert sorted(shown) == sorted(site.runs["first"].evaluator.tokens)
     differences = {token: difference(token) for token in shown}
     sizes = [abs(each) for each in differences.values()]
-    assert (sizes, sizes[0] > sizes[-1]) == (sorted(sizes, reverse=True), True)
+    assert sizes == sorted(sizes, reverse=True)
     better = site.samples("/compare/first/second/?better=a")
     assert sorted(better) == sorted(token for token, each in differences.items() if each < 0)
     assert site.samples("/compare/second/first/?better=b") == better
-    assert not lacking(site.page("/compare/first/second/"), ">apa</th>", "b − a")
-
-
-def test_quiet_where_nothing_comes_is_better_than_a_false_alarm(
-    da_motion: DeepAccident, opened: Callable[..., Site], tmp_path: Path
-) -> None:
-    setup = replace(BOXES, switches={"reading.danger_distance": 0.5})
-    selection = default_selection(setup, "train", scope="all")
-    tokens = selection.tokens(da_motion)
-    for name, foreseen in (("quiet", ()), ("loud", ELSEWHERE)):
-        path = written(tmp_path / f"{name}.json", foreseen, tokens)
-        save_run(evaluate_results(da_motion, path, setup, selection, workers=1), tmp_path / name)
-    better = opened(bundles=[tmp_path / "quiet", tmp_path / "loud"]).samples("/compare/quiet/loud/?better=a")
-    assert sorted(better) == sorted(token for token in tokens if "_normal/" in token)
 
 
 def test_what_cannot_be_compared_says_why(site: Site) -> None:
@@ -519,23 +407,14 @@ def test_what_cannot_be_compared_says_why(site: Site) -> None:
     assert site.samples("/compare/second/paper/")  # the samples can be, by their own numbers
 
 
-def test_samples_that_only_one_has_can_be_left_out(site: Site) -> None:
-    page = site.page("/compare/second/part/")
-    assert "samples only in" in page
-    (common,) = (site.page(urljoin("/compare/second/part/", each)) for each in hrefs(page) if "common=1" in each)
-    assert ("cannot be compared" in common, "10 that only one has are left out" in common) == (False, True)
-
-
 def test_two_models_at_the_same_moment(site: Site) -> None:
     token = site.samples("/compare/first/second/?better=a")[0]
     address = of("compare", "first", "second", "sample", sample_path(token), better="a")
     page = site.page(address)
     verdicts = [verdict_text("accident", site.rows(name)[token], whole=True) for name in ("first", "second")]
-    assert not lacking(html.unescape(page), *verdicts, "--results PATH", "1 of ")
+    assert not lacking(html.unescape(page), *verdicts)
     pictures = [urlsplit(each).path.rsplit("/", 1)[1] for each in images(page)]
     assert (page.count("<section"), pictures) == (2, ["above.png", "cameras.png"])  # second has none
     assert [site.get(urljoin(address, each)).status for each in images(page)] == [200, 200]
     swapped = of("compare", "second", "first", "sample", sample_path(token), better="b")
     assert [urljoin(address, each) for each in hrefs(page) if "/second/first/" in each] == [swapped]
-    assert site.page(swapped)
-    assert any("better=a" in each for each in hrefs(page, rel="next") + hrefs(page, rel="prev"))

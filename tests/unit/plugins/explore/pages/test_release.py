@@ -99,17 +99,8 @@ def test_a_page_waits_for_its_work(reader: Reader) -> None:
     go_on.set()
     assert ("This page loads itself again" in page.text, page.tables) == (True, [])
     (place,) = (each for _, each in page.tags if "data-titles" in each)
-    assert (place["data-waiting"], waiting) == (
-        "../waiting.json",
-        ["something slow", *json.loads(place["data-titles"])],
-    )
-    assert any("waiting.js" in each for each in page.loads)
-    ready = reader.ready("/release/")
-    assert (
-        "loads itself again" not in ready.text,
-        [each for _, each in ready.tags if "data-titles" in each],
-        len(ready.text) > len(page.text),
-    ) == (True, [], True)
+    assert waiting == ["something slow", *json.loads(place["data-titles"])]
+    assert [each for _, each in reader.ready("/release/").tags if "data-titles" in each] == []
 
 
 def test_what_fails_is_told(reader: Reader, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -148,7 +139,6 @@ def test_its_counts_lead_to_as_many_scenarios(of_damaged: Reader, damaged: Damag
             (shown,) = re.findall(r'<b id="count">(\d+)</b>', get(of_damaged.app, urljoin("/release/", address)).text)
             counted[field, value], found[field, value] = values[value], int(shown)
     assert found == counted
-    assert len(counted) > 12
 
 
 def test_values_that_would_find_nothing_are_no_filters(reader: Reader) -> None:
@@ -169,13 +159,10 @@ def test_hostile_names_are_text(own_release: Path, request: pytest.FixtureReques
         if path.parent.name in ("split_txt_files", own_release.name):
             path.write_text(path.read_text().replace(first["name"], first["name"].replace("Town", "<i>&Town")))
     reader = reading(DeepAccident("v1", own_release, verbose=False), request)
-    page, maps = (reader.ready(f"/release/{tab}") for tab in ("", "maps"))
-    found = reader.page(urljoin("/release/", page.address_of(hostile)))
-    for each in (page, maps):
-        assert (each.all("i"), [script for script in each.all("script") if "src" not in script]) == ([], [])
-        assert "<i>&Town" in each.text
-    assert hostile in page.text
-    assert "1 of 6 scenarios" in " ".join(found.text.split())
+    for tab in ("", "maps"):
+        page = reader.ready(f"/release/{tab}")
+        assert (page.all("i"), [script for script in page.all("script") if "src" not in script]) == ([], [])
+        assert "<i>&Town" in page.text
 
 
 # maps
@@ -185,22 +172,12 @@ def test_maps_that_are_kept_are_shown(mapped: Reader) -> None:
     town, *others = towns_of(mapped.explorer.dataset)
     before, picture = mapped.page("/release/maps"), f"/release/map/{town}.png"
     assert (before.text.count("Not made yet"), get(mapped.app, picture).status) == (len(others) + 1, 404)
-    made = town_map(mapped.explorer.dataset, town)
+    town_map(mapped.explorer.dataset, town)
     page = mapped.page("/release/maps")
     assert page.text.count("Not made yet") == len(others)
-    assert f"Read: {made.looks} pictures of {made.scenarios} scenario" in page.text
     assert f"map/{town}.png" in page.loads
     assert get(mapped.app, picture).headers["content-type"] == "image/png"
-    assert (get(mapped.app, "/release/map/Town99.png").status, mapped.explorer.jobs.all()) == (404, [])
+    assert get(mapped.app, "/release/map/Town99.png").status == 404
 
 
 # conventions
-
-
-def test_conventions_name_what_is_there(reader: Reader) -> None:
-    page = reader.page("/release/conventions")
-    names = {*re.findall(r"\bda\.(\w+)", page.text)}
-    assert not lacking(names, "world_from", "ego_from", "transform", "boxes", "load_bev")
-    assert [name for name in names if not hasattr(DeepAccident, name)] == []
-    assert [row[0] for row in page.table("orientation")] == ["devkit", "released", "fiery"]
-    assert {"world", "ego", "lidar"} < {row[0] for row in page.table("name")}

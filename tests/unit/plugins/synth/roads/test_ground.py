@@ -52,18 +52,3 @@ def test_from_the_middle_line_outward(junction):
         towards, away = (set(codes(np.mean(spec.stop_line), side * np.arange(0.35, 3.4, 0.1))) for side in (1, -1))
         gives_way = {WHITE, ROAD} if arm in ("south", "north") else {ROAD}
         assert (towards, away) == ({WHITE} if spec.signalized else gives_way, {ROAD})
-
-
-def test_crosswalks_are_striped_from_kerb_to_kerb():
-    junction = Junction(RoadSpec())
-    codes = junction.ground_map().at(junction.crosswalk("west").xy)
-    assert len(np.flatnonzero(np.diff((codes == WHITE).astype(int)) == 1)) == 11
-
-
-def test_corners_are_round():
-    ground, centre = Junction(RoadSpec()).ground_map(), RoadSpec().road_edge + 5.0
-    for radius, expected in ((4.8, SIDEWALK), (5.2, ROAD)):
-        for angle in np.deg2rad([190, 225, 260]):
-            point = centre + radius * np.array([np.cos(angle), np.sin(angle)])
-            corners = point * [(1, 1), (-1, 1), (-1, -1), (1, -1)]
-            assert ground.at(corners).tolist() == [expected] * 4

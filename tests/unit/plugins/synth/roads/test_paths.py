@@ -12,9 +12,6 @@ from deepaccident_devkit.plugins.synth.roads.paths import (
     lane_change,
     quarter_turn,
     straight,
-    tangent_of_corner,
-    tangent_of_radius,
-    through,
 )
 
 CIRCLE = bent((3.0, -2.0), 0.4, [(40.0, 0.05, 0.05)])
@@ -37,34 +34,11 @@ def test_an_arc_lies_on_its_circle():
     assert_consistent(CIRCLE)
 
 
-def test_clothoids_join_lines_and_arcs_without_jumps():
-    path = bent((0.0, 0.0), 1.0, [(5.0, 0.0, 0.0), (7.0, 0.0, -0.1), (4.0, -0.1, -0.1), (7.0, -0.1, 0.0)])
-    assert_consistent(path)
-    assert np.abs(np.diff(path.curvature)).max() < 0.1 / 7 * SPACING * 1.01
-    np.testing.assert_allclose(path.yaw[-1], 1.0 - 0.1 * (3.5 + 4 + 3.5), atol=1e-12)
-
-
 @given(st.floats(-10, 60), st.floats(-3, 3))
 def test_project_undoes_at(s, left):
     x, y, yaw, _ = CIRCLE.at(s)
     found = CIRCLE.project([[x - left * np.sin(yaw), y + left * np.cos(yaw)]])
     np.testing.assert_allclose(found, [[s], [left]], atol=5e-4)
-
-
-def test_at_goes_straight_on_beyond_the_ends():
-    x, y, yaw, curvature = CIRCLE.at([-2.0, 42.0])
-    ends, ahead = CIRCLE.xy[[0, -1]], CIRCLE.yaw[[0, -1]]
-    beyond = ends + np.column_stack([np.cos(ahead), np.sin(ahead)]) * [[-2], [2]]
-    np.testing.assert_allclose(np.column_stack([x, y]), beyond, atol=1e-12)
-    np.testing.assert_array_equal([yaw, curvature], [ahead, [0, 0]])
-
-
-def test_reversed_is_the_same_way_back():
-    back = CIRCLE.reversed()
-    assert_consistent(back)
-    np.testing.assert_array_equal(back.xy, CIRCLE.xy[::-1])
-    np.testing.assert_allclose(back.reversed().yaw, CIRCLE.yaw + 2 * np.pi)
-    assert back.curvature[0] == -0.05
 
 
 @pytest.mark.parametrize("offset", [3.5, -3.5])
@@ -77,12 +51,6 @@ def test_a_lane_change_shifts_the_rest_and_bends_gently(offset):
     assert (np.sign(np.diff(y).round(12)) * np.sign(offset) >= 0).all()
     # of the quintic: 10/√3 · offset / length²
     np.testing.assert_allclose(np.abs(path.curvature).max(), 10 / np.sqrt(3) * 3.5 / 35**2, rtol=0.05)
-
-
-def test_through_finds_yaw_and_curvature():
-    path = through(CIRCLE.xy[::3])  # chords of 0.3 m turn by 0.015 from one to the next
-    assert_consistent(path, atol=0.0075)
-    np.testing.assert_allclose(path.curvature[30:-30].mean(), 0.05, rtol=1e-3)
 
 
 def test_lines_meet_at_their_common_point():
@@ -119,11 +87,3 @@ def test_it_ends_on_the_other_line(left, tangent):
     path, sign = bent((0.0, 0.0), 0.0, quarter_turn(tangent, left=left)), 1 if left else -1
     end = [*path.xy[-1], path.yaw[-1], path.curvature[0], path.curvature[-1]]
     np.testing.assert_allclose(end, [tangent, sign * tangent, sign * np.pi / 2, 0, 0], atol=1e-7)
-
-
-def test_radius_and_corner_are_those_asked_for():
-    path = bent((0.0, 0.0), 0.0, quarter_turn(tangent_of_radius(8.0), left=True))
-    np.testing.assert_allclose(path.curvature.max(), 1 / 8)
-    tangent = tangent_of_corner(4.0)
-    path = bent((0.0, 0.0), 0.0, quarter_turn(tangent, left=True))
-    np.testing.assert_allclose(np.hypot(path.xy[:, 0] - tangent, path.xy[:, 1]).min(), 4.0, atol=1e-3)

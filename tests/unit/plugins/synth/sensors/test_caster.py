@@ -9,31 +9,6 @@ from deepaccident_devkit.plugins.synth.sensors import caster
 from deepaccident_devkit.plugins.synth.sensors.caster import GROUND, NOTHING, EmbreeCaster, NumpyCaster
 
 
-@pytest.fixture
-def corners(rng):
-    given = (rng.uniform(-20, 20, (30, 3)), rng.uniform(1, 5, (30, 3)), rng.uniform(-3, 3, 30))
-    return Boxes.from_arrays(*given).corners()
-
-
-def test_numpy_equals_embree(corners, rng):
-    directions, origin = rng.normal(size=(3000, 3)).astype(np.float32), np.array([0.0, 0.0, 60.0])
-    directions[:, 2] = -4 * np.abs(directions[:, 2]) - 1
-    (far, face), (slow_far, slow_face) = (
-        kind(corners).cast(origin, directions) for kind in (EmbreeCaster, NumpyCaster)
-    )
-    same = face == slow_face
-    assert (300 < (face >= 0).sum() < 2900, same.mean() > 0.998) == (True, True)
-    np.testing.assert_allclose(far[same], slow_far[same], rtol=1e-4)
-
-
-@pytest.mark.parametrize("kind", [EmbreeCaster, NumpyCaster])
-def test_nearest_face_is_met(kind):
-    corners = Boxes.from_arrays([[5, 0, 0], [10, 0, 0]], [[2, 2, 2]] * 2, [0, 0]).corners()
-    distance, face = kind(corners).cast(np.zeros(3), np.array([[1.0, 0, 0], [-1, 0, 0], [0.5, 0, 0]]))
-    np.testing.assert_allclose(distance, [4, np.inf, 8])
-    assert face.tolist() == [1, NOTHING, 1]
-
-
 @pytest.mark.parametrize("kind", [EmbreeCaster, NumpyCaster])
 @pytest.mark.parametrize("grounded", [False, True])
 def test_rays_end_at_their_reach(kind, world, grounded):

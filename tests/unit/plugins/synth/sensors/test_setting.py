@@ -36,24 +36,3 @@ def test_rays_that_are_not_cast_would_have_met_the_same(request, rig_of, parked,
         found, slow = scene.setting.cast_columns(origin, rays), scene.setting.caster.cast(origin, rays.reshape(-1, 3))
         np.testing.assert_array_equal(found, slow)
         assert 0.2 < (found[1] >= 0).mean() < 0.9
-
-
-def test_up_to_a_limit_all_is_right(world, rig_of, parked):
-    rig = rig_of(world, parked, sensors="none")
-    scene = rig.scene(0.0)
-    origin, rays = rays_of(scene, rig.agents[0], "lidar")
-    near, far = (np.array(scene.setting.cast_columns(origin, rays, limit)) for limit in (30.0, np.inf))
-    within = far[0] <= 30
-    np.testing.assert_array_equal(near[:, within], far[:, within])
-    assert (near[0][~within] > 30).all()
-
-
-def test_rays_of_a_leaning_sensor_are_all_cast(world, rig_of, parked):
-    """They do not stand above each other, so that none can be left out."""
-    rig = rig_of(world, parked, sensors="none")
-    scene, lean = rig.scene(0.0), np.deg2rad(20.0)
-    origin, rays = rays_of(scene, rig.agents[0], "camera")
-    turn = np.array([[1, 0, 0], [0, np.cos(lean), -np.sin(lean)], [0, np.sin(lean), np.cos(lean)]], dtype=np.float32)
-    leaning = rays @ turn.T
-    found, slow = scene.setting.cast_columns(origin, leaning), scene.setting.caster.cast(origin, leaning.reshape(-1, 3))
-    np.testing.assert_array_equal(found, slow)

@@ -1,17 +1,12 @@
 """Who is seen: truths that one can work out by hand, and the pictures themselves."""
 
-import itertools
-
 import numpy as np
 import pytest
 
-from deepaccident_devkit.geometry import Boxes
-from deepaccident_devkit.plugins.synth.sensors.annotate import CLOSE, CameraViews, camera_visible, rectangles
+from deepaccident_devkit.plugins.synth.sensors.annotate import CameraViews, camera_visible
 from deepaccident_devkit.plugins.synth.sensors.render import look
 from deepaccident_devkit.plugins.synth.solids import Block
 
-SIZE, SLOPE = (400, 200), np.array([0.004, 0.004])
-SHARES = np.array(list(itertools.product(np.linspace(-0.5, 0.5, 41), repeat=3)))
 WALL = (120, 120, 120)
 
 
@@ -19,24 +14,6 @@ def ego_sees(rig, actor_id, agent=0):
     scene = rig.scene(0.0)
     rows = np.array([scene.actors.row_of(actor_id)])
     return bool(camera_visible(scene, rig.agents[agent], rig.agents[agent].ground_from_lidar(scene), rows)[0])
-
-
-@pytest.mark.parametrize("place", [(0.3, -0.2, 12.0), (1.2, 0.4, 0.8), (-1.4, 0.0, 0.2), (0.4, 0.2, -0.5)])
-def test_a_rectangle_is_as_large_as_what_is_ahead_of_the_camera(place):
-    """Of a box ahead of it, and of boxes that are partly behind it."""
-    size, axis = np.array([1.5, 1.5, 3.0]), np.array([np.cos(0.3), np.sin(0.3), 0])
-    points = np.array(place) + SHARES @ (np.array([axis, [-axis[1], axis[0], 0], [0, 0, 1]]) * size[:, None])
-    ahead = points[points[:, 2] >= CLOSE]
-    pixels = ahead[:, :2] / ahead[:, 2:] / SLOPE + np.array(SIZE) / 2
-    (low,), (high,) = rectangles(Boxes.from_arrays([place], [size], [0.3]).corners(), SLOPE, SIZE)
-    for edge, farthest in ((low, pixels.min(axis=0)), (high, pixels.max(axis=0))):
-        np.testing.assert_allclose(edge.clip(0, SIZE), farthest.clip(0, SIZE), atol=4)
-    assert ((low <= pixels.min(axis=0) + 1e-6) & (high >= pixels.max(axis=0) - 1e-6)).all()
-
-
-def test_who_is_behind_the_camera_has_no_rectangle():
-    low, high = rectangles(Boxes.from_arrays([[0.0, 0.0, -3.0]], [[1.0, 1.0, 1.0]], [0.0]).corners(), SLOPE, SIZE)
-    np.testing.assert_array_equal(low, high)
 
 
 @pytest.mark.slow

@@ -16,7 +16,6 @@ from deepaccident_devkit.plugins.synth.spec import (
     draw,
     parse_spec,
     read_design,
-    read_spec,
 )
 from deepaccident_devkit.plugins.synth.spec.model import key_of
 from deepaccident_devkit.plugins.synth.spec.reading import field_types
@@ -77,12 +76,3 @@ def test_the_page_s_examples_can_be_read_and_its_code_runs(tmp_path, monkeypatch
     exec(compile(code, "synth.md", "exec"), names)  # noqa: S102
     assert 8 <= names["scenario"].actor("ego").max_speed <= 12
     assert capsys.readouterr().out.startswith(("SoftRain", "HardRain"))
-
-
-def test_the_page_s_message_is_the_one_given(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    example = re.findall(r"^```yaml\n(.*?)^```", PAGE, re.DOTALL | re.MULTILINE)[0]
-    Path("mine.yaml").write_text(example.replace("turn: left", "turn: lef"), encoding="utf-8")
-    with pytest.raises(ValueError, match=r"mine.yaml:4: actors\[1\]") as caught:
-        read_spec("mine.yaml")
-    assert f"    {caught.value}\n" in PAGE

@@ -30,10 +30,6 @@ def test_a_draw_has_what_the_file_says_and_defaults_for_the_rest(small):
     assert spec == ScenarioSpec(name="small", actors=actors, meet=MeetSpec(actors=("ego", "other"), offset=0.5))
 
 
-def test_the_same_numbers_give_the_same_draw():
-    assert draws(EXCHANGING, 20) == draws(EXCHANGING, 20)
-
-
 def test_ranges_are_filled_and_kept(with_other):
     made = draws(with_other("max_speed: [8, 12], turn: [straight, left, left]") + "background: {parked: [3, 5]}\n")
     speeds = [spec.actor("other").max_speed for spec in made]

@@ -33,13 +33,6 @@ def scene(request):
     return junction, named, background_users(rng, SPEC, junction, named, PLAN, -7.0)
 
 
-def test_everyone_starts_with_room(scene):
-    _, named, background = scene
-    users = [*named, *(user for user in background if not user.walks)]
-    poses = np.array([[value[()] for value in user.path.at(user.start)[:3]] for user in users])
-    assert touching_pairs(poses[None], np.array([user.body.size[:2] for user in users]), 0.5) == []
-
-
 def test_nobody_starts_between_the_named_ones_and_the_junction(scene):
     _, named, background = scene
     between = [

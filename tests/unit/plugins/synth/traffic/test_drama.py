@@ -9,7 +9,6 @@ from deepaccident_devkit.plugins.synth.roads import Junction
 from deepaccident_devkit.plugins.synth.spec import DESIGN_NUMBERS, draw, read_design
 from deepaccident_devkit.plugins.synth.traffic.accidents import (
     Performance,
-    least_gap,
     perform_twin,
     set_stage,
     touching_pairs,
@@ -52,22 +51,6 @@ def test_the_pair_alone_meets_at_the_design_s_angle_and_only_at_the_end(design):
         assert low < abs(np.degrees(np.angle(np.exp(1j * (one - other))))) < high
         assert touching_pairs(poses, size, 0.0) == [tuple(sorted(stage.cast.pair))]
         assert touching_pairs(poses[:-1], size, 0.0) == []
-
-
-@pytest.mark.parametrize("design", DESIGN_NUMBERS)
-def test_where_everyone_keeps_the_rules_all_keep_clear(design):
-    stage, _ = played(design, 2)
-    twin = perform_twin(stage, stage.cast.begin + WARM_UP + 10.0)
-    assert least_gap(twin.simulation.poses, sizes(stage, twin), list(range(len(stage.cast.users))), 1.0) == 1.0
-    assert twin.simulation.time[-1] == pytest.approx(stage.cast.begin + WARM_UP + 10.0)
-
-
-@pytest.mark.parametrize("design", [1, 2, 6])
-def test_the_lawful_one_has_green_and_the_other_red(design):
-    stage, _ = played(design, 3)
-    users = [stage.cast.users[row] for row in stage.cast.pair]
-    states = [stage.signals.state(user.route.from_arm, -1.0) for user in users]
-    assert states == [0 if "signal" in user.ignores else 2 for user in users]
 
 
 def test_the_background_is_moved_by_the_same_numbers_in_both():

@@ -1,7 +1,6 @@
 import numpy as np
 import pytest
 
-from deepaccident_devkit.plugins.synth.traffic.driving import MAX_STEER, MAX_STEER_RATE, PERIOD
 from deepaccident_devkit.plugins.synth.traffic.simulate import simulate
 
 
@@ -19,13 +18,6 @@ def test_turns_are_driven_along_the_path_to_its_end(turning):
         along, left = user.path.project(run.poses[:, row, :2])
         assert along[-1] > user.route.exit_s
         assert (np.abs(left).max() < 0.85, abs(left[-1]) < 0.1) == (True, True)
-
-
-def test_the_wheels_are_turned_no_farther_nor_faster_than_they_can_be(turning):
-    _, run = turning
-    steer = run.states[..., 4]
-    assert 0.05 < np.abs(steer).max() <= MAX_STEER + 1e-12
-    assert np.abs(np.diff(steer, axis=0)).max() <= MAX_STEER_RATE * PERIOD + 1e-12
 
 
 def test_one_on_foot_is_on_its_path_and_stops_at_its_end(walker):

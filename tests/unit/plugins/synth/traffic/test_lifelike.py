@@ -1,14 +1,11 @@
 """Releases that are as the real one is; docs/synth.md has the numbers over more scenarios."""
 
-from collections import Counter
-
 import numpy as np
 import pytest
 
 from deepaccident_devkit.plugins.synth.plan import SynthConfig, plan_scenarios
 from deepaccident_devkit.plugins.synth.scenario import build_scenario
-from deepaccident_devkit.plugins.synth.spec import draw, read_design
-from deepaccident_devkit.plugins.synth.traffic.lifelike import ACCIDENT_KINDS, TRAFFICS, draw_kind, paths_join
+from deepaccident_devkit.plugins.synth.traffic.lifelike import ACCIDENT_KINDS
 from deepaccident_devkit.plugins.synth.traffic.simulate import separation
 
 pytestmark = pytest.mark.slow
@@ -73,11 +70,8 @@ def test_normal_scenarios_are_longer_and_some_folders_say_otherwise(built):
         [each.frames for each in built if bool(each.meta.collision) == sort] for sort in (True, False)
     )
     assert (min(accidents) >= 36, max(accidents) <= 95, min(normals) >= 93, max(normals)) == (True, True, True, 100)
-    some, none = (
-        sum(plan.misfiled for plan in plan_scenarios(SynthConfig(scenarios=600, seed=1, designed=designed)))
-        for designed in (False, True)
-    )
-    assert (9 <= some <= 30, none) == (True, 0)
+    misfiled = sum(plan.misfiled for plan in plan_scenarios(SynthConfig(scenarios=600, seed=1)))
+    assert 9 <= misfiled <= 30
 
 
 def test_agents_start_slowly_and_some_become_fast(built):
@@ -91,22 +85,3 @@ def test_agents_start_slowly_and_some_become_fast(built):
     assert 2.5 < np.median(speeds[::3]) < 4.5
     assert (speeds[::3] < 0.5).any()
     assert 15.0 < speeds.max() < 18.7
-
-
-def test_parked_vehicles_overlap_in_some_scenarios(built):
-    found = Counter()
-    for scenario in built:
-        parked = scenario.actors.actor_id >= 20000
-        poses, size = scenario.actors.at(0.0).poses[parked], scenario.actors.size[parked, :2]
-        apart = separation(poses[:, None], size[:, None], poses, size) + 100 * np.eye(len(poses))
-        found[bool((apart < 0).any())] += 1
-    assert 4 <= found[True] <= 28
-
-
-def test_only_paths_that_join_give_merges():
-    merge = ACCIDENT_KINDS["merge"]
-    for design, joins in ((6, True), (3, False)):
-        rng = np.random.default_rng(design)
-        drawn = [draw(read_design(design), rng) for _ in range(60)]
-        assert {paths_join(spec) for spec in drawn} == {joins}
-        assert (merge in [draw_kind(rng, spec, TRAFFICS["v2"]) for spec in drawn]) == joins

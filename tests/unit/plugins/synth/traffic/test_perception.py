@@ -1,50 +1,7 @@
 import numpy as np
 import pytest
 
-from deepaccident_devkit.plugins.synth.traffic.driving import Tracks
-from deepaccident_devkit.plugins.synth.traffic.simulate import Bodies, ContactAlarm, leaders
-
-SEES = ~np.eye(2, dtype=bool)
-
-
-def look(users, sees=SEES):
-    """Gaps and leaders' speeds of two users where they start."""
-    starts = np.array([user.start for user in users])
-    tracks = Tracks([user.path for user in users], np.full(2, 3.0), np.zeros(2, dtype=bool))
-    length, width, _ = np.array([user.body.size for user in users]).T
-    speed = np.array([user.start_speed for user in users])
-    return leaders(Bodies(poses=tracks.at(starts)[:3].T, speed=speed, length=length, width=width), tracks, starts, sees)
-
-
-def test_the_gap_is_from_bumper_to_bumper(driver):
-    users = [driver(before=30.0), driver(before=18.0, speed=5.0)]
-    gap, speed = look(users)
-    assert (*gap, speed[0]) == pytest.approx((12.0 - users[1].body.size[0], np.inf, 5.0), abs=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("arms", "before", "sees"),
-    [(("west", "east"), (5.0, 5.0), SEES), (("west", "west"), (30.0, 18.0), np.zeros((2, 2), dtype=bool))],
-    ids=["who comes the other way in its lane", "who is not seen"],
-)
-def test_who_is_not_ahead(driver, arms, before, sees):
-    gap, _ = look([driver(arm, before=metres) for arm, metres in zip(arms, before, strict=True)], sees)
-    assert np.isinf(gap).all()
-
-
-def test_who_stands_across_the_lane_is_ahead_and_does_not_move_along_it(driver, walker):
-    gap, speed = look([driver(before=20.0), walker(start=(-15.0, -1.75))])
-    assert (10.0 < gap[0] < 25.0, speed[0]) == (True, pytest.approx(0.0, abs=1e-9))
-
-
-def test_one_sees_round_its_own_bend(driver):
-    turning, past = driver("west", "right", before=1.0), driver("west", "right")
-    exit_gap = past.route.exit_s + 6.0
-    users = [turning, driver("west", "right", start=exit_gap)]
-    gap, _ = look(users)
-    along = exit_gap - turning.start - (turning.body.size[0] + users[1].body.size[0]) / 2
-    assert gap[0] == pytest.approx(along, abs=0.5)
-
+from deepaccident_devkit.plugins.synth.traffic.simulate import ContactAlarm
 
 SIZE = np.array([[4.0, 2.0], [4.0, 2.0]])
 BYSTANDER = [50.0, 50.0, 0.0]

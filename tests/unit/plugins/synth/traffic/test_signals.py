@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from deepaccident_devkit.plugins.synth.traffic.rights import AMBER, GREEN, RED, SignalPlan, find_rights, plan_with_green
+from deepaccident_devkit.plugins.synth.traffic.rights import AMBER, GREEN, RED, SignalPlan, find_rights
 from deepaccident_devkit.plugins.synth.traffic.simulate import simulate
 
 PLAN = SignalPlan(first="west-east", start=0.0, green=10.0)
@@ -17,12 +17,6 @@ def test_never_have_both_roads_anything_but_red():
     for one, other in (("west", "south"), ("east", "north")):
         assert ((PLAN.state(one, times) == RED) | (PLAN.state(other, times) == RED)).all()
     np.testing.assert_array_equal(PLAN.state("west", times), PLAN.state("east", times))
-
-
-def test_green_is_where_it_was_asked_for():
-    plan = plan_with_green("south-north", 3.0, 12.0, 0.25)
-    states = (plan.state("south", 3.0), plan.shifted(-3.0).state("south", 0.0))
-    assert (plan.start, *states) == (0.0, GREEN, GREEN)
 
 
 @pytest.mark.parametrize("ignores", [(), ("signal",)])
