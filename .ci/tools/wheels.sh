@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # The wheel and the sdist, each installed away from the checkout on every Python of pyproject.toml, with the oldest
-# libraries that it allows and with the newest: the demo, README.md's Python, and the version. `.ci/run` does two of
-# these (its steps "a wheel and an sdist" and "the core tests"). Some 25 minutes on two cores:
+# libraries that it allows and with the newest: the demo, README.md's Python, and the version. `.ci/run` does some
+# of these (its steps `package`, `oldest` and `newest`). Some 25 minutes on two cores:
 #
 #     .ci/tools/wheels.sh            # all
 #     .ci/tools/wheels.sh 3.12       # one Python

@@ -1,0 +1,11 @@
+# linters, types, layers, and the tests of the core that take seconds
+source .ci/tools/step.sh
+need environment environment core "$PYTHON" '.[test,lint]'
+PATH="$CI_ENVIRONMENTS/core/bin:$PATH"
+check types mypy --strict deepaccident_devkit &
+check lint ruff check .
+check format ruff format --check .
+check layers lint-imports
+check tests pytest -q -n auto -p no:cacheprovider tests/property tests/unit/geometry tests/unit/release \
+  tests/unit/tables tests/unit/selection tests/unit/v2x tests/unit/motion tests/unit/evaluation tests/test_api.py
+finish

@@ -1,0 +1,91 @@
+# What the steps share. .ci/tools/run_steps.py sets CI_*, starts each step in a copy of the tree, and reports its checks.
+set -euo pipefail
+export PIP_DISABLE_PIP_VERSION_CHECK=1 MPLBACKEND=Agg PYTEST_XDIST_AUTO_NUM_WORKERS="$CI_WORKERS"
+# A CPU build; `torch` alone would download gigabytes of CUDA. Where PyPI has only that:
+# TORCH='torch --index-url https://download.pytorch.org/whl/cpu' .ci/run
+TORCH="${TORCH:-torch==2.13.0}"
+OLDEST="${OLDEST:-3.10}" NEWEST="${NEWEST:-3.13}" # Pythons
+source .ci/tools/python_of.sh
+
+# check NAME COMMAND...: runs a command. Its failure is reported, and the step goes on.
+check() {
+  local name="$1" began=$SECONDS log status
+  shift
+  log="$CI_LOGS/${name//[^a-zA-Z0-9.]/_}.log"
+  set +e
+  (
+    set -e
+    "$@"
+  ) >"$log" 2>&1 </dev/null
+  status=$?
+  set -e
+  if [ $status = 0 ]; then result=passed; else result=failed; fi
+  printf '%s\t%s\t%s\t%s\n' "$name" $result $((SECONDS - began)) "$log" >>"$CI_LOGS/checks.tsv"
+}
+
+# need NAME COMMAND...: like check, but the step ends where it fails.
+need() {
+  check "$@"
+  if [ $result = failed ]; then exit 1; fi
+}
+
+# finish: the last line of a step.
+finish() {
+  wait
+  if grep -q $'\tfailed\t' "$CI_LOGS/checks.tsv"; then exit 1; fi
+}
+
+# environment NAME PYTHON REQUIREMENTS...: a virtual environment at $CI_ENVIRONMENTS/NAME, which several steps may use.
+# Each argument is what one pip installs, in this order. One that is there for the same requirements is taken again,
+# with the package of this tree.
+environment() {
+  local home="$CI_ENVIRONMENTS/$1" python="$2" requirements words made_for
+  shift 2
+  made_for="$("$python" --version) $(printf '%s\n' "$@" | cat - pyproject.toml | sha256sum)"
+  exec 9>"$home.lock"
+  flock 9
+  if [ "$(cat "$home/made_for" 2>/dev/null)" != "$made_for" ]; then
+    rm -rf "$home"
+    "$python" -m venv "$home"
+    for requirements in "$@"; do
+      read -ra words <<<"$requirements"
+      "$home/bin/pip" install --quiet "${words[@]}"
+    done
+  elif [[ " $*" == *' .'* && "$(cat "$home/holds")" != "$CI_SOURCE_HASH" ]]; then
+    "$home/bin/pip" install --quiet --no-deps --force-reinstall .
+  fi
+  printf '%s' "$made_for" >"$home/made_for"
+  printf '%s' "$CI_SOURCE_HASH" >"$home/holds"
+  exec 9>&-
+}
+
+# system COMMAND PACKAGE...: Debian's packages, where the command that they bring is missing.
+system() {
+  command -v "$1" >/dev/null && return
+  shift
+  (
+    flock 9
+    apt-get -qq update && apt-get -qq install -y "$@"
+  ) 9>"$CI_ENVIRONMENTS/system.lock"
+}
+
+# The command of README.md that installs this extra and then runs something.
+readme_command() {
+  local found
+  found="$(sed -n "s/^    \(pip install '\.\[$1\]'.*\)$/\1/p" README.md)"
+  [ -n "$found" ] || { echo "README.md has no command line with .[$1]" >&2; return 1; }
+  printf '%s\n' "$found"
+}
+
+# client NAME: another reader, in its own environment without this package, opens the folder that is made for it.
+client() {
+  mkdir "$CI_LOGS/$1"
+  "$CI_ENVIRONMENTS/core/bin/python" -m "tests.clients.make_$1" "$CI_LOGS/$1"
+  "$CI_ENVIRONMENTS/$1/bin/python" "tests/clients/$1.py" "$CI_LOGS/$1"
+}
+
+# The real scenario that tests/real read, where it lies beside the checkout.
+if [ -d "$CI_TOP/../shared/real" ]; then
+  DEEPACCIDENT_REAL="$(realpath "$CI_TOP/../shared/real")"
+  export DEEPACCIDENT_REAL
+fi
