@@ -34,7 +34,7 @@ def test_a_failure_is_reported_by_name_and_the_other_steps_run(tmp_path: Path) -
     for name, checks in STEPS.items():
         script = repository / ".ci" / "steps" / f"{name}.sh"
         script.parent.mkdir(exist_ok=True)
-        script.write_text(BEGIN + checks.replace("FILE", str(output)) + "finish\n")
+        script.write_text(BEGIN + checks.replace("FILE", str(output)) + "wait\n")
     done = subprocess.run([repository / ".ci" / "run", *STEPS], capture_output=True, text=True, check=False)
     assert done.returncode == 1
     table, _, rest = done.stdout.partition("\nstep ")[2].partition("====")

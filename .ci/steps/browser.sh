@@ -13,4 +13,3 @@ need Chromium system chromedriver chromium chromium-driver
 PATH="$CI_ENVIRONMENTS/core/bin:$PATH"
 export DEEPACCIDENT_REQUIRE_BROWSER=1
 check pages pytest -q -m "" -n auto -p no:cacheprovider tests/browser
-finish

@@ -4,4 +4,3 @@ need environment environment core "$PYTHON" '.[test,lint]'
 check 'environment mmdet3d_infos' environment mmdet3d_infos "$PYTHON" "$TORCH" \
   'numpy<2 mmcv-lite==2.1.0 mmengine==0.10.7 mmdet==3.3.0 mmdet3d==1.4.0'
 check 'mmdet3d reads the infos' client mmdet3d_infos
-finish

@@ -2,17 +2,16 @@
 source .ci/tools/step.sh
 need environment environment core "$PYTHON" '.[test,lint]'
 
+nuscenes_devkit=('nuscenes-devkit==1.2.0 motmetrics==1.4.0 pandas<3 numpy<2' "$TORCH numpy<2")
 # first without this package, as other people have it
-check 'environment nuscenes_devkit' environment nuscenes_devkit "$PYTHON" \
-  'nuscenes-devkit==1.2.0 motmetrics==1.4.0 pandas<3 numpy<2' "$TORCH numpy<2"
+check 'environment nuscenes_devkit' environment nuscenes_devkit "$PYTHON" "${nuscenes_devkit[@]}"
 check 'nuscenes-devkit reads the export' client nuscenes_devkit
 check 'environment tables' environment tables "$PYTHON" \
   'datasets==5.2.0 webdataset==1.0.2 duckdb==2.0.0 polars==2.1.0 pandas==3.1.1 pyarrow==26.0.1 pillow==13.0.0'
 check 'datasets, DuckDB and Polars read the export' client tables
 
-check 'environment nuscenes' environment nuscenes "$PYTHON" \
-  'nuscenes-devkit==1.2.0 motmetrics==1.4.0 pandas<3 numpy<2' "$TORCH numpy<2" '.[nuscenes,torch,test] numpy<2' \
-  'mlcroissant==1.1.1 numpy<2'
+check 'environment nuscenes' environment nuscenes "$PYTHON" "${nuscenes_devkit[@]}" \
+  '.[nuscenes,torch,test] numpy<2' 'mlcroissant==1.1.1 numpy<2'
 nuscenes="$CI_ENVIRONMENTS/nuscenes/bin"
 export DEEPACCIDENT_REQUIRE_NUSCENES=1 DEEPACCIDENT_REQUIRE_CROISSANT=1
 check 'nuScenes as a source' "$nuscenes/pytest" -q -n auto -p no:cacheprovider tests/road
@@ -28,4 +27,3 @@ same_botocore() {
 check 'a server of S3' same_botocore
 export DEEPACCIDENT_REQUIRE_CLOUD=1
 check 'dataroots on S3' "$CI_ENVIRONMENTS/cloud/bin/pytest" -q -p no:cacheprovider tests/cloud
-finish

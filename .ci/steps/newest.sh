@@ -4,4 +4,3 @@ python="$(python_of "$NEWEST")"
 "$python" -m venv "$CI_LOGS/venv"
 PATH="$CI_LOGS/venv/bin:$PATH"
 check tests bash -c "$(readme_command test)"
-finish

@@ -21,4 +21,3 @@ installed() {
 }
 check 'the wheel installs' installed "$CI_LOGS"/dist/*.whl
 check 'the source archive installs' installed --force-reinstall --no-deps "$CI_LOGS"/dist/*.tar.gz
-finish

@@ -8,4 +8,4 @@ check format ruff format --check .
 check layers lint-imports
 check tests pytest -q -n auto -p no:cacheprovider tests/property tests/unit/geometry tests/unit/release \
   tests/unit/tables tests/unit/selection tests/unit/v2x tests/unit/motion tests/unit/evaluation tests/test_api.py
-finish
+wait

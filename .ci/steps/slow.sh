@@ -6,4 +6,3 @@ PATH="$CI_ENVIRONMENTS/core/bin:$PATH"
 need mpi4py flock "$CI_ENVIRONMENTS/core.lock" pip install --quiet mpi4py
 export DEEPACCIDENT_REQUIRE_MPI=1
 check tests pytest -q -n auto -m slow -p no:cacheprovider --ignore tests/browser
-finish

@@ -11,4 +11,4 @@ campaign_of_weights() {
   PYTHONPATH=.ci/tools python -m campaign --count 12 --kinds 'weights,weights of PyTorch,weights of old PyTorch,training state'
 }
 check 'damaged weights' campaign_of_weights
-finish
+wait

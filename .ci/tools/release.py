@@ -27,13 +27,16 @@ PLACES = {
 
 def main(arguments: list[str], top: Path) -> int:
     """Do what the command line asks for; return its exit status."""
-    commands: dict[str, Callable[..., int]] = {"set": set_version, "check": check, "notes": print_notes}
-    try:
-        command, *values = arguments
-        return commands[command](top, *values)
-    except (ValueError, KeyError, TypeError):
+    commands: dict[str, tuple[Callable[..., int], tuple[int, ...]]] = {
+        "set": (set_version, (1,)),
+        "check": (check, (0, 1)),
+        "notes": (print_notes, (0,)),
+    }
+    run, counts_of_values = commands.get(arguments[0] if arguments else "", (None, ()))
+    if run is None or len(arguments) - 1 not in counts_of_values:
         print(__doc__, file=sys.stderr)
         return 2
+    return run(top, *arguments[1:])
 
 
 def set_version(top: Path, version: str) -> int:

@@ -110,13 +110,13 @@ def _run_all(names: Sequence[str], work: Path, environments: Path) -> list[Run]:
     """Run steps in this order, `AT_A_TIME` of them at any moment; they share the machine's cores."""
     environments.mkdir(parents=True, exist_ok=True)
     source = work / "source"
-    files = _copy_tree(source)
+    _copy_tree(source)
     at_once = min(AT_A_TIME, len(names))
     variables = {
         **{name: value for name, value in os.environ.items() if name != "PYTHONPATH"},
         "CI_TOP": str(TOP),
         "CI_ENVIRONMENTS": str(environments),
-        "CI_SOURCE_HASH": _hash_of(files),
+        "CI_SOURCE_HASH": _hash_of(source),
         "CI_WORKERS": str(max(1, len(os.sched_getaffinity(0)) // at_once)),
         "PYTHON": sys.executable,
     }
@@ -142,24 +142,22 @@ def _run_all(names: Sequence[str], work: Path, environments: Path) -> list[Run]:
     return ended
 
 
-def _copy_tree(target: Path) -> list[Path]:
-    """Copy what git tracks or would track, and return the copies."""
+def _copy_tree(target: Path) -> None:
+    """Copy what git tracks or would track."""
     command = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
     listed = subprocess.run(command, cwd=TOP, check=True, capture_output=True).stdout.decode()
-    copies = []
-    for name in sorted({*listed.split("\0")} - {""}):
+    for name in {*listed.split("\0")} - {""}:
         if (TOP / name).is_file():
             copy = target / name
             copy.parent.mkdir(parents=True, exist_ok=True)
             shutil.copy2(TOP / name, copy, follow_symlinks=False)
-            copies.append(copy)
-    return copies
 
 
-def _hash_of(files: Sequence[Path]) -> str:
+def _hash_of(folder: Path) -> str:
+    """A hash of the names and contents of all files in a folder."""
     content = hashlib.sha256()
-    for path in files:
-        content.update(path.name.encode() + b"\0" + path.read_bytes())
+    for path in sorted(path for path in folder.rglob("*") if path.is_file()):
+        content.update(f"{path.relative_to(folder)}\0".encode() + path.read_bytes())
     return content.hexdigest()
 
 
@@ -203,7 +201,8 @@ def _failures(run: Run) -> Iterator[tuple[str, str]]:
         if not check.passed:
             yield check.name, _excerpt(check.log)
     if not run.passed and all(check.passed for check in run.checks):
-        yield f"the script ended with {run.process.returncode}", _excerpt(run.folder / "script.log")
+        reason = f"the script ended with {run.process.returncode}" if run.checks else "the script made no check"
+        yield reason, _excerpt(run.folder / "script.log")
 
 
 def _excerpt(log: Path) -> str:

@@ -7,7 +7,8 @@ TORCH="${TORCH:-torch==2.13.0}"
 OLDEST="${OLDEST:-3.10}" NEWEST="${NEWEST:-3.13}" # Pythons
 source .ci/tools/python_of.sh
 
-# check NAME COMMAND...: runs a command. Its failure is reported, and the step goes on.
+# check NAME COMMAND...: runs a command. Its failure is reported, and the step goes on. A step with checks in the
+# background ends with `wait`.
 check() {
   local name="$1" began=$SECONDS log status
   shift
@@ -27,12 +28,6 @@ check() {
 need() {
   check "$@"
   if [ $result = failed ]; then exit 1; fi
-}
-
-# finish: the last line of a step.
-finish() {
-  wait
-  if grep -q $'\tfailed\t' "$CI_LOGS/checks.tsv"; then exit 1; fi
 }
 
 # environment NAME PYTHON REQUIREMENTS...: a virtual environment at $CI_ENVIRONMENTS/NAME, which several steps may use.

@@ -38,7 +38,7 @@ export function axesOf(state) {
  * @param {ActorState} state
  * @returns {Vector} the centre, centimetres
  */
-export function centreOf(state) {
+function centreOf(state) {
   return [state[0], state[1], state[4]];
 }
 
