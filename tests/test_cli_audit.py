@@ -4,11 +4,9 @@ import json
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner
 from verbs import called
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.errors import ConfigError, ResultsError
 from deepaccident_devkit.selection.splits import official_split
 
@@ -31,6 +29,7 @@ def forgets(dataroot):
 """
 
 
+@pytest.mark.slow
 def test_splits(da: DeepAccident, tmp_path: Path) -> None:
     files = sorted(official_split(da).save(tmp_path))
     sides = [path for path in files if "mini" not in path.name]
@@ -43,6 +42,7 @@ def test_splits(da: DeepAccident, tmp_path: Path) -> None:
     assert [each["kind"] for each in json.loads(found.stdout)["findings"]] == ["recordings", "twins"]
 
 
+@pytest.mark.slow
 def test_scores(da_b: DeepAccident, tmp_path: Path) -> None:
     """Of six clips, fewer clusters than an interval needs, nothing can be said."""
     path = tmp_path / "scores.csv"
@@ -59,6 +59,7 @@ def test_scores(da_b: DeepAccident, tmp_path: Path) -> None:
             called("check", "scores", da_b.dataroot, path)
 
 
+@pytest.mark.slow
 def test_a_function(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(tmp_path))
     monkeypatch.chdir(tmp_path)
@@ -72,18 +73,14 @@ def test_a_function(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     nothing = called("check", "reader", "audited_reader:forgets", status=2).output
     assert nothing.startswith("Compared: 0 keys")
     assert "not looked into: NoneType" in nothing
-    assert not any(
-        json.loads(called("check", "reader", "audited_reader:forgets", "--json", status=2).stdout)["compared"].values()
-    )
     for target in ("audited_reader:no", "no_such_module:read", "nowhere"):
-        refused = CliRunner().invoke(deepaccident, ["check", "reader", target])
-        assert (refused.exit_code, "module:function or file.py:function" in refused.output) == (2, True)
+        assert "file.py:function" in called("check", "reader", target, status=2).output
 
 
+@pytest.mark.slow
 def test_a_folder_that_was_written(tmp_path: Path) -> None:
     release, out = tmp_path / "release", tmp_path / "out"
     assert f"written: {release}" in called("check", "reader", release, "--write-release").output
-    assert DeepAccident(dataroot=release, verbose=False).scenario[0]["num_frames"] == 2
     space: dict[str, object] = {}
     exec(READER, space)  # noqa: S102
     out.mkdir()

@@ -21,6 +21,8 @@ from deepaccident_devkit.render import detached_figure, render_bev, render_sampl
 from deepaccident_devkit.render.figures import figure_of_pixels, save_picture
 from deepaccident_devkit.taxonomy import AGENTS, CAMERAS, LIDAR, OWN_ACTOR_ID
 
+pytestmark = pytest.mark.slow
+
 SIZE = (480, 480)
 VIEWS = sorted(set(render.commands) - {"evaluation", "video", "replay"})
 
@@ -39,7 +41,6 @@ def accident(da: DeepAccident) -> str:
     return next(record["token"] for record in da.scenario if record["collision"])
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "verb", [*VIEWS, "sample-data --color-by depth", "visibility --style table", "bev --color-by class"]
 )
@@ -82,7 +83,6 @@ def test_several_rows_go_into_a_folder(da: DeepAccident, accident: str, tmp_path
     }
 
 
-@pytest.mark.slow
 def test_a_range_of_frames_of_a_scenario(da: DeepAccident, accident: str, tmp_path: Path) -> None:
     run("sample", da.dataroot, accident, "--frame-range", "2..3", "--out", tmp_path, "--size", "640x240", "--dpi", 40)
     assert [path.name[-15:] for path in sorted(tmp_path.iterdir())] == ["vehicle_002.png", "vehicle_003.png"]
@@ -178,7 +178,6 @@ def test_video_takes_the_first_accident(da: DeepAccident, tmp_path: Path) -> Non
     assert (tmp_path / "v.webp").is_file()
 
 
-@pytest.mark.slow
 def test_a_release_without_an_accident_shows_its_first_scenario(da: DeepAccident, tmp_path: Path) -> None:
     root = tmp_path / "normal"
     shutil.copytree(da.dataroot, root, ignore=shutil.ignore_patterns(".deepaccident", "*_accident"))

@@ -189,6 +189,7 @@ Section = Callable[[DeepAccident, DeepAccident, Path], Pins]
 SECTIONS: list[Section] = [tables, pairs, labels, evaluations, study, nuscenes]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("section", SECTIONS, ids=lambda section: section.__name__)
 def test_numbers_are_what_they_were(
     section: Callable[..., Pins], da: DeepAccident, da_motion: DeepAccident, tmp_path: Path, pytestconfig: pytest.Config

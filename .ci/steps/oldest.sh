@@ -11,3 +11,5 @@ check tests "$CI_ENVIRONMENTS/oldest/bin/pytest" -q -n auto -p no:cacheprovider 
   --ignore tests/test_docs.py --ignore tests/test_site.py --ignore tests/browser --ignore-glob 'tests/test_cli*' \
   --ignore tests/unit/render --ignore tests/unit/testing --ignore tests/fault_injection \
   --ignore tests/unit/plugins --ignore tests/test_words.py
+check 'tests of files for others' "$CI_ENVIRONMENTS/oldest/bin/pytest" -q -n auto -m slow -p no:cacheprovider \
+  tests/unit/export tests/unit/motion

@@ -54,6 +54,8 @@ from deepaccident_devkit.support.version import __version__
 from deepaccident_devkit.tables import current_index
 from deepaccident_devkit.training.image_cache import CachedImages
 
+pytestmark = pytest.mark.slow
+
 SCENARIOS, PICTURES = 3, 18
 MANIFEST, ARCHIVE = "tiny.manifest.json", ".deepaccident-tiny.zip"
 
@@ -146,7 +148,7 @@ def test_what_is_there(small: DeepAccident, tmp_path: Path) -> None:
         ("workers", lambda: nullcontext(2)),
         ("workers", nullcontext),
         ("executor", ThreadPoolExecutor),
-        pytest.param("executor", lambda: ProcessPoolExecutor(2, get_context("spawn")), marks=pytest.mark.slow),
+        pytest.param("executor", lambda: ProcessPoolExecutor(2, get_context("spawn"))),
     ],
 )
 def test_workers_and_executors_write_the_same(
@@ -676,7 +678,6 @@ def test_nothing_to_write(small: DeepAccident, tmp_path: Path, form: Format, tol
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("after", [False, True])
 def test_killed_around_every_renaming_and_removal(
     small: DeepAccident, small_root: Path, tmp_path: Path, whole: Contents, after: bool

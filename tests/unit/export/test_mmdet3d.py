@@ -19,6 +19,8 @@ from deepaccident_devkit.export.mmdet3d import NUSCENES_CLASSES, Mmdet3d
 from deepaccident_devkit.export.nuscenes import NuScenes
 from deepaccident_devkit.taxonomy import AGENTS, OWN_ACTOR_ID
 
+pytestmark = pytest.mark.slow
+
 Info = dict[str, Any]
 
 

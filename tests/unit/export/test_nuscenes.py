@@ -19,6 +19,8 @@ from deepaccident_devkit.export.nuscenes import NuScenes
 from deepaccident_devkit.export.nuscenes.scenes import CHANNEL_NAMES
 from deepaccident_devkit.taxonomy import AGENTS, OWN_ACTOR_ID, UNTRACKED_ID
 
+pytestmark = pytest.mark.slow
+
 VERSION = "v1.0-deepaccident"
 KEYS, FRAMES = (1, 6), 6
 

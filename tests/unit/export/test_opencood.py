@@ -19,6 +19,8 @@ from deepaccident_devkit.geometry.conventions import flip_pose
 from deepaccident_devkit.taxonomy import AGENTS, OWN_ACTOR_ID, UNTRACKED_ID
 from deepaccident_devkit.testing import SmallRelease, write_small_release
 
+pytestmark = pytest.mark.slow
+
 PLACES = dict(zip(("1", "2", "3", "4", "-1"), AGENTS, strict=True))
 
 

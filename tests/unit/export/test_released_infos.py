@@ -19,6 +19,8 @@ from deepaccident_devkit.export.bulk import Exported, export_release
 from deepaccident_devkit.export.released_infos import ReleasedInfos
 from deepaccident_devkit.taxonomy import AGENTS
 
+pytestmark = pytest.mark.slow
+
 Info = dict[str, Any]
 FOLDER = "./data/DeepAccident_data"
 

@@ -58,6 +58,8 @@ from deepaccident_devkit.motion.label_folder import (
 from deepaccident_devkit.support.files import replacing, temporary_path
 from deepaccident_devkit.taxonomy import AGENTS
 
+pytestmark = pytest.mark.slow
+
 PAGE = Path(__file__).parents[3] / "schema" / "motion_labels.md"
 MAPS = ("segmentation", "instance", "centerness", "offset", "flow", "future_egomotion", "valid")
 OBLONG = BevGrid((-20.0, 60.0, 0.5), (-30.0, 10.0, 0.25))
@@ -150,7 +152,6 @@ def lift(release: Path, agent: str, name: str = tiny.NAME, frame: int = 6) -> No
     os.utime(calib.parent)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", CONFIGS)
 def test_labels_of_every_configuration_come_back(da_motion: DeepAccident, tmp_path: Path, name: str) -> None:
     tokens = tokens_of(da_motion, 1, 27, agents=("ego_vehicle", "infrastructure"))
@@ -160,7 +161,6 @@ def test_labels_of_every_configuration_come_back(da_motion: DeepAccident, tmp_pa
         assert_same(files[token], motion_labels(da_motion, token, CONFIGS[name]))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", ["clean, everybody, untracked too", "everybody", "quirks of one's own"])
 def test_untracked_actors(small: DeepAccident, tmp_path: Path, name: str) -> None:
     """Each row is an instance without an actor, or all are actor −1."""
@@ -196,7 +196,6 @@ def test_more_instances_than_a_byte_counts(tmp_path: Path, count: int) -> None:
     assert_same(stored.labels(config), labels)
 
 
-@pytest.mark.slow
 def test_bytes_do_not_depend_on_time_workers_or_order(da_motion: DeepAccident, tmp_path: Path) -> None:
     tokens = tokens_of(da_motion, 5, 30)
     write(da_motion, tmp_path / "one", tokens)
@@ -207,7 +206,6 @@ def test_bytes_do_not_depend_on_time_workers_or_order(da_motion: DeepAccident, t
     assert contents(tmp_path / "one") == contents(tmp_path / "two") == contents(tmp_path / "three")
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", ["deepaccident", "oblong, as fiery"])
 def test_the_lines_of_the_page_rebuild_the_maps(da_motion: DeepAccident, tmp_path: Path, name: str) -> None:
     """With numpy alone, to the bit; a sample in the midst and one whose future is beyond the recording."""
@@ -241,7 +239,6 @@ def test_the_loop_of_the_page_reads_batches(small: DeepAccident, out: Path, name
     }
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", get_args(BatchNames))
 @pytest.mark.parametrize("config", ["deepaccident", "fiery", "clean", "oblong"])
 def test_batches_of_every_code_and_sample(small: DeepAccident, out: Path, name: BatchNames, config: str) -> None:
@@ -466,7 +463,6 @@ class TestReading:
             with pytest.raises(TokenError, match=r"has no labels of .*; `deepaccident labels` can add them"):
                 files[other]
 
-    @pytest.mark.slow
     def test_threads_and_spawned_processes_read_the_same(self, files: LabelFiles) -> None:
         tokens = random.Random(1).choices(list(files), k=60)  # noqa: S311
         expected = {token: files[token] for token in files}
@@ -488,7 +484,6 @@ class TestDamage:
     def path(self, folder: Path) -> Path:
         return folder / f"{tiny.TOKEN}" / "ego_vehicle.npz"
 
-    @pytest.mark.slow
     def test_any_byte_of_a_file(self, small: DeepAccident, folder: Path, path: Path) -> None:
         """The labels or our error, whatever byte is another."""
         whole, token = path.read_bytes(), tokens_of(small, 3)[0]
@@ -506,7 +501,6 @@ class TestDamage:
         assert told.endswith("; remove it and run `deepaccident labels` again")
         assert refused > 20
 
-    @pytest.mark.slow
     @pytest.mark.parametrize("keep", [0, 1, 500, -1, None])
     def test_a_file_cut_short_or_gone_is_made_again(
         self, small: DeepAccident, folder: Path, path: Path, keep: int | None
@@ -534,7 +528,6 @@ class TestDamage:
         assert write(small, folder, [token]).written == 1
         assert_same(LabelFiles(folder)[token], motion_labels(small, token))
 
-    @pytest.mark.slow
     @pytest.mark.parametrize("member", ["instance", "center", "flow", "actor", "future_egomotion", "valid"])
     def test_arrays_that_cannot_be_the_samples(
         self, small: DeepAccident, path: Path, folder: Path, member: str
@@ -556,7 +549,6 @@ class TestDamage:
             ),
         )
 
-    @pytest.mark.slow
     @pytest.mark.parametrize(
         "text",
         ["", "{", "[]", "null", "3", "\0", "[" * 100_000, "\xff", '{"format": "DeepAccident motion labels"}'],
@@ -572,7 +564,6 @@ class TestDamage:
         )
         assert contents(folder) == before
 
-    @pytest.mark.slow
     @pytest.mark.parametrize(
         "change",
         [
@@ -659,7 +650,6 @@ def python(script: str, *arguments: object) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True, timeout=300, check=False, env=environment)
 
 
-@pytest.mark.slow
 def test_a_full_disk(root: Path, tmp_path: Path) -> None:
     small, out = opened(root), tmp_path / "labels"
     for limit, there in ((100, 0), (12_000, 1)):

@@ -18,6 +18,8 @@ from deepaccident_devkit.geometry.box_arrays import gaps_of_pairs
 from deepaccident_devkit.statistics import FACTS, Fact, ReleaseFacts, release_facts
 from deepaccident_devkit.statistics.scenario_facts import counted_scenario_facts
 
+pytestmark = pytest.mark.slow
+
 QUIET = "ClearNoon -1 -1 -1 -1 -1 -1 -1 18\n" + "\n".join(META.splitlines()[1:]).replace("ego other", "none none")
 UNKNOWN = META.replace("1212 car", "0 car").replace("ego other", "ego none")
 NORMAL = TYPE.replace("accident", "normal")

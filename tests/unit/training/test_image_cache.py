@@ -21,6 +21,8 @@ from deepaccident_devkit.export.images import ImageConfig
 from deepaccident_devkit.taxonomy import CAMERAS
 from deepaccident_devkit.training.image_cache import CachedImages, ImageCache
 
+pytestmark = pytest.mark.slow
+
 IMAGES = ImageConfig(resize=(18, 30), crop=(2, 3, 12, 25))
 ALL = ("length>=1",)
 FEW = ("ego_vehicle", "infrastructure")

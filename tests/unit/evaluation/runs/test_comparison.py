@@ -42,6 +42,8 @@ from deepaccident_devkit.evaluation.runs.comparison import (
 )
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 
+pytestmark = pytest.mark.slow
+
 Write = Callable[..., Results]
 Save = Callable[..., Path]
 FEW = Resampling(resamples=40)
@@ -258,7 +260,6 @@ def test_other_labels_and_another_devkit(saved: Save, results: Results) -> None:
     )
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("clusters", "pairs"), [(12, 200)])
 def test_equally_good_runs_are_rarely_called_really_different(tmp_path: Path, clusters: int, pairs: int) -> None:
     """Of two runs of the same law, with clusters that are hard for both, at most 5 % but for chance."""

@@ -44,6 +44,8 @@ from deepaccident_devkit.plugins.baselines import (
     predict_plan,
 )
 
+pytestmark = pytest.mark.slow
+
 Change = Callable[[DeepAccident, str, Any], Any]
 """A release, a sample's token and its prediction → the prediction with a mistake."""
 AXES = {

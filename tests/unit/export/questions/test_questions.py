@@ -26,6 +26,8 @@ from deepaccident_devkit.release.meta import write_meta
 from deepaccident_devkit.taxonomy import AGENTS
 from deepaccident_devkit.v2x.cooperation import visible_instances
 
+pytestmark = pytest.mark.slow
+
 WINDOW = WindowRules(observe=1.0, stride=0.5)
 SET = ("ego_vehicle", "other_vehicle", "infrastructure")
 FORM = Questions(observers=SET, window=WINDOW, agents=("ego_vehicle", "infrastructure"))

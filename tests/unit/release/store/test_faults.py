@@ -33,6 +33,8 @@ from deepaccident_devkit.release.store.store import opened_store
 from deepaccident_devkit.support.reading import open_file
 from deepaccident_devkit.validation import validate_release
 
+pytestmark = pytest.mark.slow
+
 _NAME = "type1_subtype1_accident/ego_vehicle/calib/a/a_001.pkl"
 
 
