@@ -30,7 +30,9 @@ NAMES = (
 
 @click.command()
 @click.argument("names", nargs=-1, type=click.Choice(NAMES), metavar="[NAME…]")
-@click.option("--json", "as_json", is_flag=True, help="One flat JSON object (name: number) and nothing else.")
+@click.option(
+    "--json", "as_json", is_flag=True, help="One flat JSON object (name: number) and nothing else."
+)
 def main(names: tuple[str, ...], as_json: bool) -> None:  # noqa: FBT001 - click's flag
     """Measure the devkit; NAME is one of parsing, indexing, scale, validation, geometry, labels, evaluation,
     coverage, safety, render, synth, export, loader, engine, stores, explore, beside.

@@ -40,7 +40,9 @@ Work = Callable[[], object]
 ROUNDS, LEAST_SECONDS = 15, 0.02
 """Turns of each way, and how long one lasts: a way that takes less is run several times in a turn."""
 OWN_ENVIRONMENT = ("nuscenes-devkit==1.2.0", "pandas<3", "numpy<2")
-RELEASE = SynthConfig(scenarios=2, frames=60, image_size=(320, 180), seed=3, unplanned=0, designed=True)
+RELEASE = SynthConfig(
+    scenarios=2, frames=60, image_size=(320, 180), seed=3, unplanned=0, designed=True
+)
 TURNS = 3
 """Of whole programs."""
 
@@ -61,7 +63,9 @@ def measure() -> list[Figure]:
 def compared(work: str, ours: Work, others: Mapping[str, Work]) -> list[Figure]:
     """A figure for each other way."""
     ways = {"ours": ours, **others}
-    repeats = {name: max(1, round(LEAST_SECONDS / max(seconds(way), 1e-6))) for name, way in ways.items()}
+    repeats = {
+        name: max(1, round(LEAST_SECONDS / max(seconds(way), 1e-6))) for name, way in ways.items()
+    }
     taken: dict[str, list[float]] = {name: [] for name in ways}
     for _ in range(ROUNDS):
         for name, way in ways.items():
@@ -93,7 +97,10 @@ def in_process() -> dict[str, tuple[Work, dict[str, Work]]]:
     ids = np.unique(instance)[1:].astype(np.int64)
     found: dict[str, tuple[Work, dict[str, Work]]] = {
         "warp_bilinear": (lambda: labels.to_present("bilinear"), {}),
-        "iou_of_rotated_boxes": (lambda: first.iou_bev(second), {"shapely": lambda: shapely_iou(first, second)}),
+        "iou_of_rotated_boxes": (
+            lambda: first.iou_bev(second),
+            {"shapely": lambda: shapely_iou(first, second)},
+        ),
         "gaps_of_instances": (lambda: pair_gaps(instance, ids), {}),
     }
     if find_spec("torch"):
@@ -112,7 +119,10 @@ def gaps_by_skimage(instance: Any, ids: Any) -> object:
     import shapely
     from skimage.measure import approximate_polygon, find_contours
 
-    outlines = [approximate_polygon(find_contours(instance == name, 0.5)[0], tolerance=TOLERANCE) for name in ids]
+    outlines = [
+        approximate_polygon(find_contours(instance == name, 0.5)[0], tolerance=TOLERANCE)
+        for name in ids
+    ]
     shapes = np.array([shapely.Polygon(outline) for outline in outlines])
     first, second = np.triu_indices(len(ids), 1)
     return shapely.distance(shapes[first], shapes[second])
@@ -149,7 +159,9 @@ def beside_nuscenes_devkit() -> list[Figure]:
         python = os.environ.get("NUSCENES_PYTHON") or own_environment(root / "environment")
         if python is None:
             return []
-        dataset = DeepAccident(dataroot=make_release(root / "release", RELEASE, workers=2), verbose=False)
+        dataset = DeepAccident(
+            dataroot=make_release(root / "release", RELEASE, workers=2), verbose=False
+        )
         export_release(dataset, root / "export", NuScenes(), workers=2)
         script = Path(__file__).with_name("beside_nuscenes.py")
         commands = {
@@ -159,9 +171,14 @@ def beside_nuscenes_devkit() -> list[Figure]:
         found: dict[str, list[dict[str, float]]] = {name: [] for name in commands}
         for _ in range(TURNS):
             for name, command in commands.items():  # the other first: it writes the detections
-                said = subprocess.run(command, check=True, capture_output=True, text=True, env=one_thread()).stdout
+                said = subprocess.run(
+                    command, check=True, capture_output=True, text=True, env=one_thread()
+                ).stdout
                 found[name].append(json.loads(said.splitlines()[-1]))
-    medians = {name: {key: median(run[key] for run in runs) for key in runs[0]} for name, runs in found.items()}
+    medians = {
+        name: {key: median(run[key] for run in runs) for key in runs[0]}
+        for name, runs in found.items()
+    }
     return [
         figure(f"{key}_nuscenes_devkit", value, medians["other"][key], unit)
         for key, value in medians["ours"].items()
@@ -181,6 +198,9 @@ def own_environment(folder: Path) -> str | None:
         subprocess.run([sys.executable, "-m", "venv", str(folder)], check=True, capture_output=True)
         subprocess.run(install, check=True, capture_output=True)
     except subprocess.CalledProcessError as error:
-        click.echo(f"beside: nuscenes-devkit is not measured; its environment could not be made ({error})", err=True)
+        click.echo(
+            f"beside: nuscenes-devkit is not measured; its environment could not be made ({error})",
+            err=True,
+        )
         return None
     return python

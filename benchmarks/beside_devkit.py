@@ -22,7 +22,11 @@ def main(folder: Path) -> dict[str, float]:
     before, start = resident(), time.process_time()
     da = DeepAccident(dataroot=folder / "release", verbose=False)
     keys = {scenario["token"]: set(keyframes(scenario["num_frames"])) for scenario in da.scenario}
-    tokens = [each["token"] for each in da.sample if int(each["token"][-3:]) in keys[each["scenario_token"]]]
+    tokens = [
+        each["token"]
+        for each in da.sample
+        if int(each["token"][-3:]) in keys[each["scenario_token"]]
+    ]
     for token in tokens:
         da.get_boxes(token, "lidar")
     tables, memory = time.process_time() - start, resident() - before
@@ -33,7 +37,13 @@ def main(folder: Path) -> dict[str, float]:
     points = (time.process_time() - start) / CLOUDS
     results = folder / "results.json"
     if not results.exists():
-        made = ["results", str(folder / "detections.json"), str(folder / "release"), "--out", str(results)]
+        made = [
+            "results",
+            str(folder / "detections.json"),
+            str(folder / "release"),
+            "--out",
+            str(results),
+        ]
         deepaccident.main(made, standalone_mode=False)
     setup = EvaluationSetup(task="detection", protocol="paper", switches={"thresholds": THRESHOLDS})
     selection = SampleSelection(split="train", samples="all", scope="all")

@@ -37,7 +37,8 @@ def compared(items: dict[str, Any], workers: int) -> Iterator[Figure]:
     from torch.utils.data import DataLoader
 
     loaders = {
-        way: DataLoader(each, num_workers=workers, persistent_workers=workers > 0) for way, each in items.items()
+        way: DataLoader(each, num_workers=workers, persistent_workers=workers > 0)
+        for way, each in items.items()
     }
     taken: dict[str, list[float]] = {way: [] for way in loaders}
     for epoch in range(EPOCHS + 1):

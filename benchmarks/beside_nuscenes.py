@@ -20,7 +20,10 @@ from nuscenes.utils.geometry_utils import points_in_box
 
 VERSION, SPLIT = "v1.0-deepaccident", "deepaccident_train"
 CLOUDS = 10
-META = {name: name == "use_lidar" for name in ("use_camera", "use_lidar", "use_radar", "use_map", "use_external")}
+META = {
+    name: name == "use_lidar"
+    for name in ("use_camera", "use_lidar", "use_radar", "use_map", "use_external")
+}
 
 
 def main(folder: Path) -> dict[str, float]:
@@ -32,7 +35,10 @@ def main(folder: Path) -> dict[str, float]:
     write_detections(nusc, folder / "detections.json")
     clouds = [sample["data"]["LIDAR_TOP"] for sample in nusc.sample[:CLOUDS]]
     read = [
-        (nusc.get_sample_data(token)[1], LidarPointCloud.from_file(nusc.get_sample_data_path(token)))
+        (
+            nusc.get_sample_data(token)[1],
+            LidarPointCloud.from_file(nusc.get_sample_data_path(token)),
+        )
         for token in clouds
     ]
     start = time.process_time()
@@ -42,7 +48,9 @@ def main(folder: Path) -> dict[str, float]:
     points = (time.process_time() - start) / CLOUDS
     start = time.process_time()
     config = config_factory("detection_cvpr_2019")
-    DetectionEval(nusc, config, str(folder / "detections.json"), SPLIT, str(folder / "out"), verbose=False).evaluate()
+    DetectionEval(
+        nusc, config, str(folder / "detections.json"), SPLIT, str(folder / "out"), verbose=False
+    ).evaluate()
     evaluation = time.process_time() - start
     return {
         "tables_and_boxes": 1e3 * tables,
@@ -71,7 +79,9 @@ def write_detections(nusc: NuScenes, path: Path) -> None:
             boxes.append(
                 {
                     "sample_token": sample["token"],
-                    "translation": (np.array(record["translation"]) + source.normal(0, 0.6, 3)).tolist(),
+                    "translation": (
+                        np.array(record["translation"]) + source.normal(0, 0.6, 3)
+                    ).tolist(),
                     "size": record["size"],
                     "rotation": record["rotation"],
                     "velocity": np.nan_to_num(nusc.box_velocity(record["token"])[:2]).tolist(),

@@ -22,7 +22,12 @@ from benchmarks.labels_postprocess import clear_heads
 from benchmarks.labels_warp import make_labels
 from deepaccident_devkit.evaluation.motion import motion_counts
 from deepaccident_devkit.evaluation.predictions import instances_of
-from deepaccident_devkit.motion import MotionHeads, MotionLabelConfig, motion_labels_from_boxes, predict_instances
+from deepaccident_devkit.motion import (
+    MotionHeads,
+    MotionLabelConfig,
+    motion_labels_from_boxes,
+    predict_instances,
+)
 
 FOLDER: Final = "DEEPACCIDENT_RELEASED"
 ELSEWHERE: Final = {
@@ -77,7 +82,9 @@ class Released:
         package.__path__ = [str(folder / _PLUGIN / "datasets/utils")]
         sys.modules[package.__name__] = package
         self._instance = importlib.import_module(f"{package.__name__}.instance")
-        self._warper = importlib.import_module(f"{package.__name__}.warper").FeatureWarper(grid_conf=_GRID)
+        self._warper = importlib.import_module(f"{package.__name__}.warper").FeatureWarper(
+            grid_conf=_GRID
+        )
         metrics = folder / _PLUGIN / "metrics/metrics.py"
         self._metric = _definition(metrics, "PanopticMetric_separate")
 
@@ -102,7 +109,9 @@ class Released:
         }
         motion = torch.from_numpy(np.array(labels.label_egomotion)[None])
         return [
-            self._warper.cumulative_warp_features_reverse(torch.from_numpy(each[None].astype(np.float32)), motion, mode)
+            self._warper.cumulative_warp_features_reverse(
+                torch.from_numpy(each[None].astype(np.float32)), motion, mode
+            )
             for each, mode in maps.values()
         ]
 
@@ -115,7 +124,9 @@ class Released:
             "instance_offset": heads.offset,
             "instance_flow": heads.flow,
         }
-        output = {name: torch.from_numpy(np.array(each))[None] for name, each in names.items()}  # it writes into them
+        output = {
+            name: torch.from_numpy(np.array(each))[None] for name, each in names.items()
+        }  # it writes into them
         read = getattr(self._instance, f"predict_instance_segmentation_and_trajectories{variant}")
         return read(output, compute_matched_centers=True)
 
@@ -125,7 +136,10 @@ class Released:
         metric = self._metric(n_classes=2)
         for part in _RANGES:
             metric.update(
-                *(torch.from_numpy(each[None, :, part, part].astype(np.int64)) for each in (prediction, truth))
+                *(
+                    torch.from_numpy(each[None, :, part, part].astype(np.int64))
+                    for each in (prediction, truth)
+                )
             )
         return metric
 

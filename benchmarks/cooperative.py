@@ -15,16 +15,25 @@ BOUND_MS = 2.0
 
 def measure() -> list[Figure]:
     with tempfile.TemporaryDirectory() as folder, one_core():
-        da = DeepAccident(dataroot=labels_only_release(Path(folder), scenarios=1, frames=6), verbose=False)
+        da = DeepAccident(
+            dataroot=labels_only_release(Path(folder), scenarios=1, frames=6), verbose=False
+        )
         sample = da.get_sample(da.scenario[0], "ego_vehicle", 5)["token"]
         link = Link(latency=0.2, pose_noise=0.3, packet_loss=0.1)
         works = {
             "cooperative_boxes_ms": lambda: da.cooperative_boxes(sample, frame="ego"),
-            "cooperative_boxes_released_ms": lambda: da.cooperative_boxes(sample, frame="ego", visible="released"),
-            "cooperative_boxes_link_ms": lambda: da.cooperative_boxes(sample, frame="ego", link=link),
+            "cooperative_boxes_released_ms": lambda: da.cooperative_boxes(
+                sample, frame="ego", visible="released"
+            ),
+            "cooperative_boxes_link_ms": lambda: da.cooperative_boxes(
+                sample, frame="ego", link=link
+            ),
             "visible_instances_ms": lambda: da.visible_instances(sample),
         }
-        return [Figure(name=name, value=_milliseconds(work), unit="ms", bound=BOUND_MS) for name, work in works.items()]
+        return [
+            Figure(name=name, value=_milliseconds(work), unit="ms", bound=BOUND_MS)
+            for name, work in works.items()
+        ]
 
 
 def _milliseconds(work: Callable[[], object]) -> float:

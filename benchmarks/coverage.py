@@ -8,7 +8,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from benchmarks.coverage_data import Sums, differences, means, middle, old_interval, ratios, shares, two_runs
+from benchmarks.coverage_data import (
+    Sums,
+    differences,
+    means,
+    middle,
+    old_interval,
+    ratios,
+    shares,
+    two_runs,
+)
 from benchmarks.measure import Figure
 from deepaccident_devkit.evaluation.intervals import Resampling, interval_ends
 from deepaccident_devkit.evaluation.runs.comparison import p_values, swaps_of
@@ -77,21 +86,40 @@ def measure(draws: int = DRAWS) -> list[Figure]:
             figures += [
                 Figure(name=f"{name}_mean", value=mean([each.new for each in cells])),
                 Figure(
-                    name=f"{name}_lowest", value=min(each.new for each in cells), bound=least, higher_is_better=True
+                    name=f"{name}_lowest",
+                    value=min(each.new for each in cells),
+                    bound=least,
+                    higher_is_better=True,
                 ),
             ]
     tested = [each for each in power(draws) if not each.effect]
-    return [*figures, Figure(name="compare_false_real_most", value=max(each.new for each in tested), bound=0.05)]
+    return [
+        *figures,
+        Figure(name="compare_false_real_most", value=max(each.new for each in tested), bound=0.05),
+    ]
 
 
 def coverage_table(draws: int = DRAWS) -> str:
     """Of each kind and number of clusters: mean and lowest coverage, and what was before."""
-    head = ("numbers", "clusters", "settings", "mean", "at the ends", "lowest", "which", "mean before", "lowest before")
+    head = (
+        "numbers",
+        "clusters",
+        "settings",
+        "mean",
+        "at the ends",
+        "lowest",
+        "which",
+        "mean before",
+        "lowest before",
+    )
     rows = [f"| {' | '.join(head)} |", "|---|---:|---:|---:|---:|---:|---|---:|---:|"]
     for kind in KINDS:
         for clusters in SHOWN:
             cells = list(coverage(kind, clusters, draws))
-            low, ends = min(cells, key=lambda cell: cell.new), [cell.new for cell in cells if cell.ends]
+            low, ends = (
+                min(cells, key=lambda cell: cell.new),
+                [cell.new for cell in cells if cell.ends],
+            )
             inner, old = [cell.new for cell in cells if not cell.ends], [cell.old for cell in cells]
             words = (
                 kind,
@@ -110,8 +138,13 @@ def coverage_table(draws: int = DRAWS) -> str:
 
 def power_table(draws: int = DRAWS) -> str:
     """How often differences are called real, now and before."""
-    shown = [f"{effect:+.2f} | before" if effect else "0 (falsely real) | before" for effect in EFFECTS]
-    rows = [f"| clusters | correlation | {' | '.join(shown)} |", f"|---:|---:|{'---:|---:|' * len(EFFECTS)}"]
+    shown = [
+        f"{effect:+.2f} | before" if effect else "0 (falsely real) | before" for effect in EFFECTS
+    ]
+    rows = [
+        f"| clusters | correlation | {' | '.join(shown)} |",
+        f"|---:|---:|{'---:|---:|' * len(EFFECTS)}",
+    ]
     made = list(power(draws))
     for at in range(0, len(made), len(EFFECTS)):
         first, *others = made[at : at + len(EFFECTS)]
@@ -179,7 +212,9 @@ def power(draws: int = DRAWS, seed: int = 0) -> Iterator[Tested]:
         for correlation in CORRELATIONS:
             for effect in EFFECTS:
                 runs = two_runs("5 to 20", correlation, SHARE, effect, (clusters, draws), source)
-                batches = [[each[:, at : at + _BATCH] for each in runs] for at in range(0, draws, _BATCH)]
+                batches = [
+                    [each[:, at : at + _BATCH] for each in runs] for at in range(0, draws, _BATCH)
+                ]
                 new = [real(*batch, seed=number) for number, batch in enumerate(batches)]
                 old = [old_real(*batch, source) for batch in batches]
                 yield Tested(
@@ -191,7 +226,9 @@ def power(draws: int = DRAWS, seed: int = 0) -> Iterator[Tested]:
                 )
 
 
-def real(first: FloatArray, second: FloatArray, samples: FloatArray, *, seed: int = 0) -> np.ndarray:
+def real(
+    first: FloatArray, second: FloatArray, samples: FloatArray, *, seed: int = 0
+) -> np.ndarray:
     """(D,) whether the library's test calls the difference of each draw real."""
     swaps = swaps_of(len(first), Resampling(seed=seed))
     signs = 1.0 - 2.0 * swaps.swapped
@@ -199,7 +236,9 @@ def real(first: FloatArray, second: FloatArray, samples: FloatArray, *, seed: in
     return p_values(apart.sum(axis=0) / below, signs @ apart / below, swaps) <= 1 - CONFIDENCE
 
 
-def old_real(first: FloatArray, second: FloatArray, samples: FloatArray, source: np.random.Generator) -> np.ndarray:
+def old_real(
+    first: FloatArray, second: FloatArray, samples: FloatArray, source: np.random.Generator
+) -> np.ndarray:
     """(D,) whether the middle 95 % of 1,000 paired resamples lie on one side of 0."""
     count = len(first)
     times = source.multinomial(count, np.full(count, 1 / count), 1000).astype(float)

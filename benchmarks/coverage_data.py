@@ -51,7 +51,11 @@ def sizes(kind: str, shape: tuple[int, int], source: np.random.Generator) -> Flo
 
 
 def hits(
-    share: float, correlation: float, hard: FloatArray, samples: FloatArray, source: np.random.Generator
+    share: float,
+    correlation: float,
+    hard: FloatArray,
+    samples: FloatArray,
+    source: np.random.Generator,
 ) -> FloatArray:
     """How many samples of each cluster are hits; `hard` is the cluster's own variable."""
     chance = ndtr((ndtri(share) - np.sqrt(correlation) * hard) / np.sqrt(1 - correlation))
@@ -64,9 +68,14 @@ def shares(clusters: int, draws: int, source: np.random.Generator) -> Iterator[S
         for correlation in CORRELATIONS:
             for share in SHARES:
                 samples = sizes(kind, (clusters, draws), source)
-                found = hits(share, correlation, source.standard_normal(samples.shape), samples, source)
+                found = hits(
+                    share, correlation, source.standard_normal(samples.shape), samples, source
+                )
                 yield Sums(
-                    name=f"{kind}, correlation {correlation}, share {share}", truth=share, above=found, below=samples
+                    name=f"{kind}, correlation {correlation}, share {share}",
+                    truth=share,
+                    above=found,
+                    below=samples,
                 )
 
 
@@ -81,7 +90,10 @@ def ratios(clusters: int, draws: int, source: np.random.Generator) -> Iterator[S
             ratio = _logistic(level + spread * source.standard_normal(samples.shape))
             truth = float(_logistic(level + spread * points) @ weights / weights.sum())
             yield Sums(
-                name=f"{kind}, ratio {truth:.2f}, spread {spread}", truth=truth, above=union * ratio, below=union
+                name=f"{kind}, ratio {truth:.2f}, spread {spread}",
+                truth=truth,
+                above=union * ratio,
+                below=union,
             )
 
 
@@ -102,19 +114,39 @@ def differences(clusters: int, draws: int, source: np.random.Generator) -> Itera
     for kind in SIZES:
         for correlation in CORRELATIONS:
             for share, more in ((0.1, 0.05), (0.5, 0.0), (0.6, 0.1), (0.9, 0.05)):
-                first, second, samples = two_runs(kind, correlation, share, more, (clusters, draws), source)
+                first, second, samples = two_runs(
+                    kind, correlation, share, more, (clusters, draws), source
+                )
                 name = f"{kind}, correlation {correlation}, share {share} + {more}"
-                yield Sums(name=name, truth=more, above=second - first, below=samples, limit=np.inf, least=-np.inf)
+                yield Sums(
+                    name=name,
+                    truth=more,
+                    above=second - first,
+                    below=samples,
+                    limit=np.inf,
+                    least=-np.inf,
+                )
 
 
 def two_runs(
-    kind: str, correlation: float, share: float, more: float, shape: tuple[int, int], source: np.random.Generator
+    kind: str,
+    correlation: float,
+    share: float,
+    more: float,
+    shape: tuple[int, int],
+    source: np.random.Generator,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Hits of two runs, the second of which has a share that is so much more, and the samples; each (C, D)."""
     common, *own = source.standard_normal((3, *shape))
     samples = sizes(kind, shape, source)
     first, second = (
-        hits(each, correlation, np.sqrt(PAIRED) * common + np.sqrt(1 - PAIRED) * hard, samples, source)
+        hits(
+            each,
+            correlation,
+            np.sqrt(PAIRED) * common + np.sqrt(1 - PAIRED) * hard,
+            samples,
+            source,
+        )
         for each, hard in zip((share, share + more), own, strict=True)
     )
     return first, second, samples
@@ -133,7 +165,9 @@ def middle(times: FloatArray, sums: Sums) -> tuple[FloatArray, FloatArray]:
         values = np.sort((times @ sums.above) / (times @ sums.below), axis=0)
     known = np.isfinite(values).sum(axis=0)
     beside, draws = (known * 0.025).astype(int), np.arange(values.shape[1])
-    return values[np.minimum(beside, known - 1), draws], values[np.maximum(known - 1 - beside, 0), draws]
+    return values[np.minimum(beside, known - 1), draws], values[
+        np.maximum(known - 1 - beside, 0), draws
+    ]
 
 
 def _logistic(values: FloatArray) -> FloatArray:

@@ -54,11 +54,18 @@ def measure() -> list[Figure]:
     with tempfile.TemporaryDirectory(prefix="deepaccident_engine_") as folder:
         root = labels_only_release(Path(folder), scenarios=SCENARIOS, frames=FRAMES)
         DeepAccident(dataroot=root, verbose=False)
-        found = {kind: {workers: probe(root, kind, workers) for workers in counts} for kind, counts in kinds.items()}
+        found = {
+            kind: {workers: probe(root, kind, workers) for workers in counts}
+            for kind, counts in kinds.items()
+        }
     here = found["here"][1]
     figures = [Figure(name="engine_samples", value=here.samples)]
     for kind, runs in found.items():
-        figures += [figure for workers, seen in runs.items() for figure in of_run(f"engine_{kind}", workers, seen)]
+        figures += [
+            figure
+            for workers, seen in runs.items()
+            for figure in of_run(f"engine_{kind}", workers, seen)
+        ]
         if kind != "here":
             figures += of_engine(f"engine_{kind}", here, runs.get(1, here), runs[2])
     return figures
@@ -80,7 +87,14 @@ def probe(root: Path, kind: str, workers: int) -> Seen:
     """Measure an engine from a new process."""
     with cluster(kind, workers) as address:
         batches = BATCHES if workers == 2 else ITEMS
-        task = Task(dataroot=str(root), workers=workers, address=address, items=ITEMS, batches=batches, repeats=REPEATS)
+        task = Task(
+            dataroot=str(root),
+            workers=workers,
+            address=address,
+            items=ITEMS,
+            batches=batches,
+            repeats=REPEATS,
+        )
         ranks = ["mpiexec", "-n", str(workers + 1), sys.executable, "-m", "mpi4py.futures"]
         line = ranks if kind == "mpi" else [sys.executable]
         done = subprocess.run(
@@ -109,7 +123,11 @@ def cluster(kind: str, workers: int) -> Iterator[str | None]:
 def of_run(name: str, workers: int, seen: Seen) -> list[Figure]:
     ending = f"{workers}_worker{'s' * (workers > 1)}"
     return [
-        Figure(name=f"{name}_samples_per_s_{ending}", value=seen.samples / seen.export_s, unit="samples/s"),
+        Figure(
+            name=f"{name}_samples_per_s_{ending}",
+            value=seen.samples / seen.export_s,
+            unit="samples/s",
+        ),
         Figure(name=f"{name}_overhead_ms_{ending}", value=1e3 * seen.item_s, unit="ms a scenario"),
         Figure(name=f"{name}_batch_ms_{ending}", value=1e3 * seen.batch_s, unit="ms a batch"),
     ]
@@ -122,14 +140,22 @@ def of_engine(name: str, here: Seen, one: Seen, two: Seen) -> list[Figure]:
     minutes = WHOLE_SAMPLES / here.samples * here.export_s / 60
     return [
         Figure(name=f"{name}_efficiency_2_workers", value=one.export_s / two.export_s / 2),
-        Figure(name=f"{name}_caller_mb", value=two.growth_mb, unit=f"MB more for {BATCHES:,} batches"),
+        Figure(
+            name=f"{name}_caller_mb", value=two.growth_mb, unit=f"MB more for {BATCHES:,} batches"
+        ),
         Figure(name=f"{name}_serial_share", value=share),
         *(
-            Figure(name=f"{name}_speed_up_by_amdahl_{cores}", value=speed_up, unit="times (computed)")
+            Figure(
+                name=f"{name}_speed_up_by_amdahl_{cores}", value=speed_up, unit="times (computed)"
+            )
             for cores, speed_up in speed_ups.items()
         ),
         *(
-            Figure(name=f"{name}_whole_release_by_amdahl_{cores}", value=minutes / speed_up, unit="minutes (computed)")
+            Figure(
+                name=f"{name}_whole_release_by_amdahl_{cores}",
+                value=minutes / speed_up,
+                unit="minutes (computed)",
+            )
             for cores, speed_up in speed_ups.items()
         ),
     ]

@@ -81,7 +81,11 @@ def main() -> None:
 @contextmanager
 def engine(task: Task) -> Iterator[Executor | None]:
     alone = task.address is None and task.workers == 1
-    with own_workers(task.workers) if task.address is None else cluster_executor(task.address) as executor:
+    with (
+        own_workers(task.workers)
+        if task.address is None
+        else cluster_executor(task.address) as executor
+    ):
         yield None if alone else executor
 
 
@@ -119,9 +123,15 @@ def exported(dataset: DeepAccident, executor: Executor | None) -> tuple[float, f
         return results[0]
 
     form = OpenCood(without_clouds=True)  # the release has labels alone
-    with TemporaryDirectory(dir=dataset.dataroot.parent) as folder, mock.patch.object(store, "run_batch", timed):
+    with (
+        TemporaryDirectory(dir=dataset.dataroot.parent) as folder,
+        mock.patch.object(store, "run_batch", timed),
+    ):
         seconds = best_of(
-            1, lambda: bulk.export_release(dataset, Path(folder) / "out", form, workers=1, executor=executor)
+            1,
+            lambda: bulk.export_release(
+                dataset, Path(folder) / "out", form, workers=1, executor=executor
+            ),
         )
     inside, handed = map(sum, zip(*batches, strict=True))
     return seconds, seconds - inside, handed
@@ -130,7 +140,9 @@ def exported(dataset: DeepAccident, executor: Executor | None) -> tuple[float, f
 def busy_seconds(executor: Executor | None) -> float:
     """Processor time of this process so far, and of the scheduler's if there is one."""
     client = getattr(executor, "_client", None)  # of a dask executor
-    return time.process_time() + (client.run_on_scheduler(time.process_time) if client is not None else 0.0)
+    return time.process_time() + (
+        client.run_on_scheduler(time.process_time) if client is not None else 0.0
+    )
 
 
 def highest_mb() -> float:

@@ -65,7 +65,9 @@ def walks() -> dict[str, dict[str, list[str]]]:
             setup = EvaluationSetup(task=task, protocol=protocol)
             selection = default_selection(setup, split, **listed)
             results = root / f"{kind}_{task}{'' if kind == 'motion' else '.json'}"
-            predict_results(dataset, kind, selection.tokens(dataset)[:1], results, workers=1, progress=False)
+            predict_results(
+                dataset, kind, selection.tokens(dataset)[:1], results, workers=1, progress=False
+            )
             how = {"workers": 1, "progress": False, "allow_partial": True}
 
             def evaluate(setup=setup, selection=selection, results=results, how=how):
@@ -77,10 +79,17 @@ def walks() -> dict[str, dict[str, list[str]]]:
 
 
 @click.command()
-@click.option("--list", "listed", is_flag=True, help="Name modules and functions, in the order of their first calls.")
+@click.option(
+    "--list",
+    "listed",
+    is_flag=True,
+    help="Name modules and functions, in the order of their first calls.",
+)
 def main(listed: bool) -> None:  # noqa: FBT001 - click's flag
     """Print how many modules and functions of the package one sample enters, for each task."""
-    click.echo(f"{'task, protocol':<22}{'modules':>9}{'of evaluation':>15}{'functions':>11}{'of evaluation':>15}")
+    click.echo(
+        f"{'task, protocol':<22}{'modules':>9}{'of evaluation':>15}{'functions':>11}{'of evaluation':>15}"
+    )
     for walk, modules in walks().items():
         own = {name: each for name, each in modules.items() if name.startswith(EVALUATION)}
         counts = [sum(map(len, each.values())) for each in (modules, own)]

@@ -5,4 +5,8 @@ from benchmarks.measure import Figure
 
 
 def measure() -> list[Figure]:
-    return [*evaluation_motion.measure(), *evaluation_accident.measure(), *evaluation_detection.measure()]
+    return [
+        *evaluation_motion.measure(),
+        *evaluation_accident.measure(),
+        *evaluation_detection.measure(),
+    ]

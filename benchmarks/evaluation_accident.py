@@ -13,7 +13,9 @@ PREDICTIONS, REPEATS = 6, 20
 
 
 def measure() -> list[Figure]:
-    label = motion_labels_from_boxes(make_frames(np.random.default_rng(0)), make_motion(), MotionLabelConfig())
+    label = motion_labels_from_boxes(
+        make_frames(np.random.default_rng(0)), make_motion(), MotionLabelConfig()
+    )
     label = label.to_present(centerness="bilinear")
     output = predicted(label, np.random.default_rng(1))
     with one_core():
@@ -26,7 +28,10 @@ def measure() -> list[Figure]:
                 reference=9600,
             ),
             Figure(
-                name="accident_paper_ms", value=milliseconds(PROTOCOLS["paper"], output, label), unit="ms", bound=80.0
+                name="accident_paper_ms",
+                value=milliseconds(PROTOCOLS["paper"], output, label),
+                unit="ms",
+                bound=80.0,
             ),
         ]
 
@@ -39,11 +44,15 @@ def milliseconds(protocol: AccidentProtocol, output: MotionOutput, label: Motion
 def predicted(label: MotionLabels, source: np.random.Generator) -> MotionOutput:
     """What a good model says: the labels, their outlines and vectors a little off, each time in another way."""
     truth = MotionHeads.from_labels(label)
-    return MotionOutput(grid=label.config.grid, heads=tuple(noisy(truth, source) for _ in range(PREDICTIONS)))
+    return MotionOutput(
+        grid=label.config.grid, heads=tuple(noisy(truth, source) for _ in range(PREDICTIONS))
+    )
 
 
 def noisy(truth: MotionHeads, source: np.random.Generator) -> MotionHeads:
-    logit = np.where(truth.segmentation[:, 1] > 0, 3.0, -3.0) + source.normal(0, 0.8, truth.segmentation[:, 1].shape)
+    logit = np.where(truth.segmentation[:, 1] > 0, 3.0, -3.0) + source.normal(
+        0, 0.8, truth.segmentation[:, 1].shape
+    )
     vectors = [
         np.where(values == truth.ignore_index, 0, values) + source.normal(0, 0.3, values.shape)
         for values in (truth.offset, truth.flow)

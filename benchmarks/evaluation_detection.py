@@ -11,7 +11,9 @@ REFERENCE_MS = 7.7
 
 
 def measure() -> list[Figure]:
-    some, many = ([frame(seed, false_alarms) for seed in range(FRAMES)] for false_alarms in (10, 270))
+    some, many = (
+        [frame(seed, false_alarms) for seed in range(FRAMES)] for false_alarms in (10, 270)
+    )
     with one_core():
         return [
             figure("detection_frame_ms", "released", some, bound=1.0, reference=REFERENCE_MS),
@@ -35,7 +37,11 @@ def figure(
         evaluator.compute()
 
     return Figure(
-        name=name, value=1e3 / len(frames) * best_of(REPEATS, evaluate), unit="ms", bound=bound, reference=reference
+        name=name,
+        value=1e3 / len(frames) * best_of(REPEATS, evaluate),
+        unit="ms",
+        bound=bound,
+        reference=reference,
     )
 
 
@@ -47,10 +53,17 @@ def frame(seed: int, false_alarms: int) -> tuple[DetectedBoxes, Boxes]:
     size = source.uniform((3, 1.5, 1.4), (6, 2.5, 2.5), (count, 3))
     yaw, category = source.uniform(-np.pi, np.pi, count), source.integers(0, 6, count)
     velocity = np.column_stack([source.normal(0, 5, (count, 2)), np.zeros(count)])
-    truth = Boxes.from_arrays(center, size, yaw, frame="lidar", category=category, velocity=velocity)
+    truth = Boxes.from_arrays(
+        center, size, yaw, frame="lidar", category=category, velocity=velocity
+    )
     off = center + source.normal(0, 0.6, center.shape)
     found = Boxes.from_arrays(
-        off, size * 1.05, yaw + source.normal(0, 0.2, count), frame="lidar", category=category, velocity=velocity
+        off,
+        size * 1.05,
+        yaw + source.normal(0, 0.2, count),
+        frame="lidar",
+        category=category,
+        velocity=velocity,
     )
     scores = np.concatenate([source.beta(4, 2, OBJECTS), source.beta(1, 4, false_alarms)])
     return DetectedBoxes(boxes=found, scores=scores), truth.select(np.arange(OBJECTS))

@@ -6,7 +6,12 @@ from benchmarks.labels_postprocess import FRAMES, clear_heads
 from benchmarks.measure import Figure, best_of, one_core
 from deepaccident_devkit.evaluation.motion import motion_counts
 from deepaccident_devkit.evaluation.predictions import MotionOutput, instances_of
-from deepaccident_devkit.motion import MotionHeads, MotionLabelConfig, MotionLabels, predict_instances
+from deepaccident_devkit.motion import (
+    MotionHeads,
+    MotionLabelConfig,
+    MotionLabels,
+    predict_instances,
+)
 
 PREDICTIONS = 6
 REPEATS, SLOW_REPEATS = 60, 5
@@ -22,7 +27,8 @@ def measure() -> list[Figure]:
         return [
             Figure(
                 name="motion_update_ms",
-                value=1e3 * best_of(REPEATS, lambda: motion_counts(maps, label, trajectories=False)),
+                value=1e3
+                * best_of(REPEATS, lambda: motion_counts(maps, label, trajectories=False)),
                 unit="ms",
                 bound=1.0,
                 reference=14.7,

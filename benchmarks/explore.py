@@ -34,7 +34,9 @@ LISTS = (
     "/?sort=accident_visibility&page=12",
 )
 READERS, SECONDS, REPEATS = 20, 30.0, 15
-RELEASE = SynthConfig(scenarios=1, frames=2, image_size=(1600, 900), seed=7, unplanned=0, designed=True)
+RELEASE = SynthConfig(
+    scenarios=1, frames=2, image_size=(1600, 900), seed=7, unplanned=0, designed=True
+)
 WORKED = 240.0
 """Seconds to wait for the work in the background."""
 
@@ -67,7 +69,11 @@ class Reader:
     def get(self, address: str) -> tuple[int, dict[str, str], bytes]:
         self._connection.request("GET", address, headers=self._headers)
         answer = self._connection.getresponse()
-        return answer.status, {name.lower(): value for name, value in answer.getheaders()}, answer.read()
+        return (
+            answer.status,
+            {name.lower(): value for name, value in answer.getheaders()},
+            answer.read(),
+        )
 
     def seconds(self, address: str) -> float:
         start = time.perf_counter()
@@ -79,7 +85,10 @@ class Reader:
 
 def measure() -> list[Figure]:
     with tempfile.TemporaryDirectory(prefix="deepaccident_explore_") as folder:
-        return [*_of_lists(write_whole_release(Path(folder))), *_of_pictures(Path(folder) / "pictures")]
+        return [
+            *_of_lists(write_whole_release(Path(folder))),
+            *_of_pictures(Path(folder) / "pictures"),
+        ]
 
 
 def _of_lists(root: Path) -> Iterator[Figure]:
@@ -96,8 +105,15 @@ def _of_lists(root: Path) -> Iterator[Figure]:
         before = running.memory_mb
         times, errors = _crowd(running, SECONDS)
         yield Figure(name="explore_readers_errors", value=errors, bound=None)
-        yield Figure(name="explore_readers_p95_ms", value=float(np.quantile(times, 0.95)) * 1e3, unit="ms", bound=300)
-        yield Figure(name="explore_readers_median_ms", value=float(np.median(times)) * 1e3, unit="ms")
+        yield Figure(
+            name="explore_readers_p95_ms",
+            value=float(np.quantile(times, 0.95)) * 1e3,
+            unit="ms",
+            bound=300,
+        )
+        yield Figure(
+            name="explore_readers_median_ms", value=float(np.median(times)) * 1e3, unit="ms"
+        )
         yield Figure(name="explore_readers_pages_per_s", value=len(times) / SECONDS, unit="/s")
         yield Figure(name="explore_memory_mb", value=running.memory_mb, unit="MB")
         yield Figure(name="explore_memory_growth_mb", value=running.memory_mb - before, unit="MB")
@@ -107,7 +123,9 @@ def _slowest(reader: Reader) -> float:
     """Of the lists' medians, the largest, seconds."""
     for address in LISTS:
         reader.seconds(address)
-    return max(float(np.median([reader.seconds(address) for _ in range(REPEATS)])) for address in LISTS)
+    return max(
+        float(np.median([reader.seconds(address) for _ in range(REPEATS)])) for address in LISTS
+    )
 
 
 def _wait_for_work(reader: Reader) -> float:
@@ -153,9 +171,15 @@ def _of_pictures(root: Path) -> Iterator[Figure]:
             cameras = ("Front", "FrontLeft", "FrontRight", "Back", "BackLeft", "BackRight")
             took = [reader.seconds(image.format(camera)) * 1e3 for camera in cameras]
             yield Figure(name=f"explore_image_{width}_ms", value=float(np.median(took)), unit="ms")
-        yield Figure(name="explore_image_kept_ms", value=_again(reader, image.format("Front")), unit="ms")
-        yield Figure(name="explore_scenario_ms", value=reader.seconds(f"/{scenario}/") * 1e3, unit="ms")
-        yield Figure(name="explore_scenario_kept_ms", value=_again(reader, f"/{scenario}/"), unit="ms")
+        yield Figure(
+            name="explore_image_kept_ms", value=_again(reader, image.format("Front")), unit="ms"
+        )
+        yield Figure(
+            name="explore_scenario_ms", value=reader.seconds(f"/{scenario}/") * 1e3, unit="ms"
+        )
+        yield Figure(
+            name="explore_scenario_kept_ms", value=_again(reader, f"/{scenario}/"), unit="ms"
+        )
 
 
 def _again(reader: Reader, address: str) -> float:
@@ -165,8 +189,18 @@ def _again(reader: Reader, address: str) -> float:
 @contextmanager
 def served(root: Path, *more: Any) -> Iterator[Served]:
     """The command on a release, until the end of the block."""
-    words = [sys.executable, "-m", "deepaccident_devkit.cli", "explore", str(root), "--no-open", *map(str, more)]
-    environment = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
+    words = [
+        sys.executable,
+        "-m",
+        "deepaccident_devkit.cli",
+        "explore",
+        str(root),
+        "--no-open",
+        *map(str, more),
+    ]
+    environment = {
+        name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"
+    }
     with subprocess.Popen(
         words, stdout=subprocess.PIPE, text=True, env={**environment, "PYTHONUNBUFFERED": "1"}
     ) as ran:

@@ -26,7 +26,9 @@ from deepaccident_devkit.plugins.synth import SynthConfig, make_release
 from deepaccident_devkit.release import find_release
 from deepaccident_devkit.training.image_cache import CachedImages
 
-CACHE = CachedImages(images=ImageConfig(resize=(396, 704), crop=(140, 0, 256, 704)), where=("length>=1",))
+CACHE = CachedImages(
+    images=ImageConfig(resize=(396, 704), crop=(140, 0, 256, 704)), where=("length>=1",)
+)
 QUESTIONS = Questions(window=WindowRules(observe=0.0, stride=0.5))
 FORMATS: tuple[Format, ...] = (
     *(OpenCood(), NuScenes(), Mmdet3d(), ReleasedInfos(), Parquet(), WebDataset()),
@@ -45,7 +47,12 @@ def measure() -> list[Figure]:
         lines = [scenario.token.replace("/", " ") for scenario in find_release(root).scenarios]
         (root / "train.txt").write_text("\n".join(lines))
         dataset = DeepAccident(dataroot=root, verbose=False)
-        return [figure for form in FORMATS for each in ways(dataset, form) for figure in exported(dataset, each)]
+        return [
+            figure
+            for form in FORMATS
+            for each in ways(dataset, form)
+            for figure in exported(dataset, each)
+        ]
 
 
 def ways(dataset: DeepAccident, form: Format) -> list[Format]:

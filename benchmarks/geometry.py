@@ -48,8 +48,13 @@ def make_boxes(source: np.random.Generator, count: int) -> Boxes:
 
 def make_points(source: np.random.Generator) -> np.ndarray:
     """A cloud that thins out with the distance, as a LiDAR's does."""
-    bearing, distance = source.uniform(-np.pi, np.pi, POINTS), 2 + np.abs(source.normal(0, 25, POINTS))
-    return np.column_stack([distance * np.cos(bearing), distance * np.sin(bearing), source.uniform(-2, 3, POINTS)])
+    bearing, distance = (
+        source.uniform(-np.pi, np.pi, POINTS),
+        2 + np.abs(source.normal(0, 25, POINTS)),
+    )
+    return np.column_stack(
+        [distance * np.cos(bearing), distance * np.sin(bearing), source.uniform(-2, 3, POINTS)]
+    )
 
 
 def plainly_contains(boxes: Boxes, points: np.ndarray) -> np.ndarray:

@@ -33,7 +33,12 @@ SCENARIOS, FRAMES = 8, 40
 
 
 def measure() -> list[Figure]:
-    return [*labels_ms(), *labels_warp.measure(), *labels_postprocess.measure(), *split_samples_per_s()]
+    return [
+        *labels_ms(),
+        *labels_warp.measure(),
+        *labels_postprocess.measure(),
+        *split_samples_per_s(),
+    ]
 
 
 def labels_ms() -> list[Figure]:
@@ -42,18 +47,30 @@ def labels_ms() -> list[Figure]:
     configs = {name: MotionLabelConfig(protocol=name) for name in LABEL_PROTOCOLS}
     with one_core():
         milliseconds = {
-            name: 1e3 * best_of(REPEATS, lambda config=config: motion_labels_from_boxes(frames, motion, config))
+            name: 1e3
+            * best_of(
+                REPEATS, lambda config=config: motion_labels_from_boxes(frames, motion, config)
+            )
             for name, config in configs.items()
         }
         filling = 1e3 * best_of(REPEATS, lambda: filled_cells(quads, (200, 200), image, 5))
         floor = 1e3 * best_of(REPEATS, lambda: LabelMaps.empty(configs["released"]))
     released = milliseconds.pop("released")
     return [
-        Figure(name="labels_ms", value=released, unit="ms", bound=RELEASED_MS / 45, reference=RELEASED_MS),
+        Figure(
+            name="labels_ms",
+            value=released,
+            unit="ms",
+            bound=RELEASED_MS / 45,
+            reference=RELEASED_MS,
+        ),
         Figure(name="labels_floor_ms", value=floor, unit="ms"),  # the maps' bytes, written once
         Figure(name="labels_floors", value=released / floor, unit="floors"),
         Figure(name="labels_fill_150_quads_ms", value=filling, unit="ms", bound=0.6),
-        *(Figure(name=f"labels_{name}_ms", value=value, unit="ms") for name, value in milliseconds.items()),
+        *(
+            Figure(name=f"labels_{name}_ms", value=value, unit="ms")
+            for name, value in milliseconds.items()
+        ),
     ]
 
 
@@ -65,7 +82,9 @@ def split_samples_per_s() -> list[Figure]:
         tokens = [sample["token"] for sample in dataset.sample]
         rates = {}
         for workers in (1, 2):
-            work = functools.partial(write_label_files, dataset, Path(folder) / f"{workers}", tokens, workers=workers)
+            work = functools.partial(
+                write_label_files, dataset, Path(folder) / f"{workers}", tokens, workers=workers
+            )
             rates[workers] = len(tokens) / best_of(1, work)
         files, sample = LabelFiles(Path(folder) / "1"), dataset.sample[len(tokens) // 2]
         five = [each["token"] for each in dataset.samples_of(sample["frame_token"])]
@@ -80,13 +99,23 @@ def split_samples_per_s() -> list[Figure]:
             )
     return [
         Figure(
-            name="labels_from_tables_ms", value=from_tables, unit="ms", bound=RELEASED_MS / 40, reference=RELEASED_MS
+            name="labels_from_tables_ms",
+            value=from_tables,
+            unit="ms",
+            bound=RELEASED_MS / 40,
+            reference=RELEASED_MS,
         ),
-        Figure(name="labels_from_tables_five_ms", value=together / len(five), unit="ms", bound=1.32),
+        Figure(
+            name="labels_from_tables_five_ms", value=together / len(five), unit="ms", bound=1.32
+        ),
         Figure(name="labels_from_files_ms", value=from_files, unit="ms"),
         Figure(name="split_samples_per_s_1_worker", value=rates[1], unit="samples/s"),
         Figure(
-            name="split_samples_per_s_2_workers", value=rates[2], unit="samples/s", bound=400, higher_is_better=True
+            name="split_samples_per_s_2_workers",
+            value=rates[2],
+            unit="samples/s",
+            bound=400,
+            higher_is_better=True,
         ),
     ]
 
@@ -101,7 +130,9 @@ def make_frames(source: np.random.Generator) -> list[FrameBoxes]:
     seen = np.append(False, source.random(OBJECTS) < 0.9)
     return [
         FrameBoxes(
-            center=np.column_stack([start + STEP * t * speed[:, None] * heading(yaw), np.zeros(count)]),
+            center=np.column_stack(
+                [start + STEP * t * speed[:, None] * heading(yaw), np.zeros(count)]
+            ),
             size=size,
             yaw=yaw,
             actor_id=np.append(-100, np.arange(OBJECTS) + 200),

@@ -23,7 +23,12 @@ def measure() -> list[Figure]:
 
 
 def figure(
-    name: str, heads: MotionHeads, settings: str, repeats: int, bound: float, reference: float | None = None
+    name: str,
+    heads: MotionHeads,
+    settings: str,
+    repeats: int,
+    bound: float,
+    reference: float | None = None,
 ) -> Figure:
     seconds = best_of(repeats, lambda: predict_instances(heads, settings))
     return Figure(name=name, value=1e3 * seconds, unit="ms", bound=bound, reference=reference)
@@ -33,7 +38,10 @@ def clear_heads(seed: int = 0) -> MotionHeads:
     """What a good model says: cars that drive on, their outlines and vectors a little off."""
     source = np.random.default_rng(seed)
     row, column = np.indices((CELLS, CELLS), dtype=np.float32)
-    start, heading = source.uniform(10, CELLS - 10, (OBJECTS, 2)), source.uniform(-np.pi, np.pi, OBJECTS)
+    start, heading = (
+        source.uniform(10, CELLS - 10, (OBJECTS, 2)),
+        source.uniform(-np.pi, np.pi, OBJECTS),
+    )
     along = np.stack([np.sin(heading), np.cos(heading)], axis=1)
     half = np.stack([source.uniform(3, 6, OBJECTS), source.uniform(1.5, 2.5, OBJECTS)], axis=1)
     step = along * source.uniform(0, 8, (OBJECTS, 1))
@@ -46,7 +54,10 @@ def clear_heads(seed: int = 0) -> MotionHeads:
             peak = np.exp(-((row - center[0]) ** 2 + (column - center[1]) ** 2) / 9)
             np.maximum(centerness[frame], peak, out=centerness[frame])
             across = np.array([axis[1], -axis[0]])
-            corners = [center + a * long * axis + b * wide * across for a, b in ((1, 1), (1, -1), (-1, -1), (-1, 1))]
+            corners = [
+                center + a * long * axis + b * wide * across
+                for a, b in ((1, 1), (1, -1), (-1, -1), (-1, 1))
+            ]
             cells, _ = filled_cells(np.rint([corners])[..., ::-1], (CELLS, CELLS))
             at = np.unravel_index(cells, (CELLS, CELLS))
             logit[frame][at] = 3
@@ -55,7 +66,10 @@ def clear_heads(seed: int = 0) -> MotionHeads:
     vectors += source.normal(0, 0.3, vectors.shape).astype(np.float32)
     logit += source.normal(0, 0.8, logit.shape).astype(np.float32)
     return MotionHeads(
-        segmentation=np.stack([-logit, logit], axis=1), centerness=centerness, offset=vectors[0], flow=vectors[1]
+        segmentation=np.stack([-logit, logit], axis=1),
+        centerness=centerness,
+        offset=vectors[0],
+        flow=vectors[1],
     )
 
 

@@ -23,7 +23,9 @@ from deepaccident_devkit.plugins.synth import SynthConfig, make_release
 from deepaccident_devkit.taxonomy import AGENTS
 from deepaccident_devkit.training.image_cache import CachedImages
 
-RELEASE = SynthConfig(scenarios=1, frames=2, image_size=(1600, 900), seed=7, unplanned=0, designed=True)
+RELEASE = SynthConfig(
+    scenarios=1, frames=2, image_size=(1600, 900), seed=7, unplanned=0, designed=True
+)
 SCENARIOS = 4
 IMAGES = ImageConfig(resize=SIZE, crop=CROP, dtype="uint8")
 SCALED = replace(IMAGES, decode="scaled")
@@ -58,7 +60,9 @@ def measure() -> list[Figure]:
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder)
         made = make_release(root / "made", RELEASE, workers=2)
-        dataset = DeepAccident(dataroot=copied_release(made, root / "release", scenarios=SCENARIOS), verbose=False)
+        dataset = DeepAccident(
+            dataroot=copied_release(made, root / "release", scenarios=SCENARIOS), verbose=False
+        )
         for codec in CODECS:
             form = CachedImages(images=SCALED, codec=codec, where=("length>=1",))  # type: ignore[arg-type]
             export_release(dataset, root / codec, form, workers=2)
@@ -78,11 +82,20 @@ def ways(dataset: DeepAccident, caches: Path | None, agents: tuple[str, ...]) ->
     configs = {
         "full": replace(base, images=IMAGES),
         "scaled": base,
-        **({} if caches is None else {f"cached_{each}": replace(base, images_cache=caches / each) for each in CODECS}),
+        **(
+            {}
+            if caches is None
+            else {f"cached_{each}": replace(base, images_cache=caches / each) for each in CODECS}
+        ),
     }
-    found: dict[str, Any] = {way: V2XDataset(dataset, tokens, config) for way, config in configs.items()}
+    found: dict[str, Any] = {
+        way: V2XDataset(dataset, tokens, config) for way, config in configs.items()
+    }
     if len(agents) == 1:
-        paths = [[dataset.get_sample_data_path(token, camera) for camera in IMAGES.cameras] for token in tokens]
+        paths = [
+            [dataset.get_sample_data_path(token, camera) for camera in IMAGES.cameras]
+            for token in tokens
+        ]
         for way, images in (("full", IMAGES), ("scaled", SCALED)):
             config = replace(base, images=replace(images, **NORMALISED))
             found[f"{way}_normalised"] = V2XDataset(dataset, tokens, config)
@@ -96,11 +109,17 @@ def speeds(way: str, team: str, items: Any) -> list[Figure]:
     """The processor time of an item, and items a second of a loader with no worker, one and two."""
     name, count = f"loader_{way}_{team}", len(items)
     with one_core():
-        seconds = min(processor_seconds(items, index % count) for index in range(max(count, REPEATS)))
-    figures = [Figure(name=f"{name}_ms", value=seconds * 1e3, unit="ms", bound=BOUNDS.get((way, team)))]
+        seconds = min(
+            processor_seconds(items, index % count) for index in range(max(count, REPEATS))
+        )
+    figures = [
+        Figure(name=f"{name}_ms", value=seconds * 1e3, unit="ms", bound=BOUNDS.get((way, team)))
+    ]
     for workers in (0, 1, 2):
         value = count / loading_seconds(items, workers)
-        figures.append(Figure(name=f"{name}_items_per_s_{workers}_workers", value=value, unit="items/s"))
+        figures.append(
+            Figure(name=f"{name}_items_per_s_{workers}_workers", value=value, unit="items/s")
+        )
     return figures
 
 
@@ -123,16 +142,24 @@ def loading_seconds(items: Any, workers: int) -> float:
 
 def differences(dataset: DeepAccident) -> list[Figure]:
     """How far `scaled` and JPEG of quality 95 are from `full`, in steps of 255."""
-    frames = [f"{record['token']}/{camera}" for record in dataset.sample[:10] for camera in IMAGES.cameras]
+    frames = [
+        f"{record['token']}/{camera}" for record in dataset.sample[:10] for camera in IMAGES.cameras
+    ]
     found = np.concatenate(
         [
-            np.abs(SCALED.load(dataset, each)[0].astype(np.int16) - IMAGES.load(dataset, each)[0]).ravel()
+            np.abs(
+                SCALED.load(dataset, each)[0].astype(np.int16) - IMAGES.load(dataset, each)[0]
+            ).ravel()
             for each in frames
         ]
     )
     return [
         Figure(name="loader_scaled_difference_mean", value=float(found.mean()), unit="of 255"),
-        Figure(name="loader_scaled_difference_99_percent", value=float(np.percentile(found, 99)), unit="of 255"),
+        Figure(
+            name="loader_scaled_difference_99_percent",
+            value=float(np.percentile(found, 99)),
+            unit="of 255",
+        ),
         Figure(name="loader_scaled_difference_max", value=float(found.max()), unit="of 255"),
     ]
 

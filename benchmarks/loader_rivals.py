@@ -47,15 +47,22 @@ class Rival:
             return _stacked_tensors(images, normalised=normalised)
         if not normalised:
             return np.stack([image.transpose(2, 0, 1) for image in images])
-        mean, std = np.float32(255) * np.float32(MEAN), np.float32(1) / (np.float32(255) * np.float32(STD))
-        return np.stack([((image.astype(np.float32) - mean) * std).transpose(2, 0, 1) for image in images])
+        mean, std = (
+            np.float32(255) * np.float32(MEAN),
+            np.float32(1) / (np.float32(255) * np.float32(STD)),
+        )
+        return np.stack(
+            [((image.astype(np.float32) - mean) * std).transpose(2, 0, 1) for image in images]
+        )
 
 
 def rivals() -> dict[str, Rival]:
     """Name → those whose libraries are here, and run: torchvision needs the very torch that it was made for."""
     modules = {"pillow": "PIL", "opencv-python-headless": "cv2"}
     return {
-        name: rival for name, rival in _RIVALS.items() if all(_runs(modules.get(need, need)) for need in rival.needs)
+        name: rival
+        for name, rival in _RIVALS.items()
+        if all(_runs(modules.get(need, need)) for need in rival.needs)
     }
 
 
@@ -97,7 +104,9 @@ def _torchvision(path: Path) -> Any:
     from torchvision.io import decode_jpeg, read_file
     from torchvision.transforms.v2 import functional
 
-    return functional.resize(decode_jpeg(read_file(str(path))), list(SIZE), antialias=True)[:, _ROWS]
+    return functional.resize(decode_jpeg(read_file(str(path))), list(SIZE), antialias=True)[
+        :, _ROWS
+    ]
 
 
 def _stacked_tensors(images: Sequence[Any], *, normalised: bool) -> Any:
@@ -107,7 +116,9 @@ def _stacked_tensors(images: Sequence[Any], *, normalised: bool) -> Any:
     stacked = torch.stack(list(images))
     if not normalised:
         return stacked
-    return functional.normalize(functional.to_dtype(stacked, torch.float32, scale=True), list(MEAN), list(STD))
+    return functional.normalize(
+        functional.to_dtype(stacked, torch.float32, scale=True), list(MEAN), list(STD)
+    )
 
 
 _CV2, _SIMPLEJPEG = ("opencv-python-headless",), ("simplejpeg", "opencv-python-headless")
@@ -115,13 +126,21 @@ _RIVALS = {
     "pillow": Rival(_pillow, ("pillow",), smooth=True),
     "torchvision": Rival(_torchvision, ("torch", "torchvision"), smooth=True),
     "cv2_area": Rival(lambda path: _cv2(path, "INTER_AREA"), _CV2, smooth=True),
-    "simplejpeg_area": Rival(lambda path: _simplejpeg(path, "INTER_AREA"), _SIMPLEJPEG, smooth=True),
+    "simplejpeg_area": Rival(
+        lambda path: _simplejpeg(path, "INTER_AREA"), _SIMPLEJPEG, smooth=True
+    ),
     "cv2": Rival(lambda path: _cv2(path, "INTER_LINEAR"), _CV2, smooth=False),
     "simplejpeg": Rival(lambda path: _simplejpeg(path, "INTER_LINEAR"), _SIMPLEJPEG, smooth=False),
     "simplejpeg_scaled_area": Rival(
-        lambda path: _simplejpeg(path, "INTER_AREA", scaled=True), _SIMPLEJPEG, smooth=True, scaled=True
+        lambda path: _simplejpeg(path, "INTER_AREA", scaled=True),
+        _SIMPLEJPEG,
+        smooth=True,
+        scaled=True,
     ),
     "simplejpeg_scaled": Rival(
-        lambda path: _simplejpeg(path, "INTER_LINEAR", scaled=True), _SIMPLEJPEG, smooth=False, scaled=True
+        lambda path: _simplejpeg(path, "INTER_LINEAR", scaled=True),
+        _SIMPLEJPEG,
+        smooth=False,
+        scaled=True,
     ),
 }

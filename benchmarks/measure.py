@@ -76,7 +76,10 @@ def table(figures: Sequence[Figure]) -> str:
         if figure.bound is not None:
             row[2:4] = f"{_number(figure.bound)} {figure.unit}", f"{figure.ratio:.2f}"
         if figure.reference is not None:
-            row[4:6] = f"{_number(figure.reference)} {figure.unit}", f"{figure.reference / figure.value:.3g}"
+            row[4:6] = (
+                f"{_number(figure.reference)} {figure.unit}",
+                f"{figure.reference / figure.value:.3g}",
+            )
         rows.append(row)
     columns = [column for column in zip(*rows, strict=True) if any(column[1:])]
     widths = [max(map(len, column)) for column in columns]

@@ -17,15 +17,35 @@ def measure() -> list[Figure]:
         with one_core():
             alone = FILES / best_of(7, lambda: read_labels(paths))
         plain = FILES / best_of(3, lambda: [read_plainly(path) for path in paths])
-        expected = [value for path in paths[:50] for row in read_plainly(path)[1] for value in row[1:4]]
+        expected = [
+            value for path in paths[:50] for row in read_plainly(path)[1] for value in row[1:4]
+        ]
         read = read_labels(paths[:50], raw=True).center.reshape(-1).tolist()
         if read != expected:
             raise AssertionError("the two readers disagree")
     return [
-        Figure(name="parsing_files_per_s", value=ours, unit="files/s", bound=30_000, higher_is_better=True),
-        Figure(name="parsing_files_per_s_one_core", value=alone, unit="files/s", bound=30_000, higher_is_better=True),
+        Figure(
+            name="parsing_files_per_s",
+            value=ours,
+            unit="files/s",
+            bound=30_000,
+            higher_is_better=True,
+        ),
+        Figure(
+            name="parsing_files_per_s_one_core",
+            value=alone,
+            unit="files/s",
+            bound=30_000,
+            higher_is_better=True,
+        ),
         Figure(name="parsing_plain_files_per_s", value=plain, unit="files/s"),
-        Figure(name="parsing_ratio", value=ours / plain, unit="times plain", bound=5, higher_is_better=True),
+        Figure(
+            name="parsing_ratio",
+            value=ours / plain,
+            unit="times plain",
+            bound=5,
+            higher_is_better=True,
+        ),
     ]
 
 
@@ -58,5 +78,7 @@ def read_plainly(path: Path) -> tuple[tuple[float, ...], list[tuple[object, ...]
             words = line.split()
             if len(words) > 1:
                 numbers = map(float, words[1:10])
-                rows.append((words[0], *numbers, int(words[10]), int(words[11]), words[12] == "True"))
+                rows.append(
+                    (words[0], *numbers, int(words[10]), int(words[11]), words[12] == "True")
+                )
     return speed, rows

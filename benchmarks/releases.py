@@ -18,7 +18,11 @@ def index_share_of_raw(index_bytes: float, samples: int) -> float:
 
 def labels_only_release(root: Path, *, scenarios: int, frames: int) -> Path:
     """A release without sensor files: one accident and its twin, copied under other names."""
-    made = make_release(root / "made", SynthConfig(scenarios=2, frames=frames, sensors=False, designed=True), workers=2)
+    made = make_release(
+        root / "made",
+        SynthConfig(scenarios=2, frames=frames, sensors=False, designed=True),
+        workers=2,
+    )
     return copied_release(made, root / "release", scenarios=scenarios)
 
 

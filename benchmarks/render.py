@@ -17,7 +17,9 @@ PICTURES = ("frame", "sample", "accident", "bev", "visibility")
 
 def measure() -> list[Figure]:
     with tempfile.TemporaryDirectory() as folder:
-        dataset = DeepAccident(dataroot=make_release(Path(folder) / "release", RELEASE, workers=2), verbose=False)
+        dataset = DeepAccident(
+            dataroot=make_release(Path(folder) / "release", RELEASE, workers=2), verbose=False
+        )
         return [*pictures_s(dataset), *video_s(dataset, Path(folder))]
 
 
@@ -26,7 +28,13 @@ def pictures_s(dataset: DeepAccident) -> list[Figure]:
     figures = []
     with one_core():
         for name in PICTURES:
-            scene = VideoScene(dataset=dataset, views=views_of(name, None), agents=None, width=SIZE[0], height=SIZE[1])
+            scene = VideoScene(
+                dataset=dataset,
+                views=views_of(name, None),
+                agents=None,
+                width=SIZE[0],
+                height=SIZE[1],
+            )
             seconds = best_of(REPEATS, partial(scene.picture, token))
             bound = 1.0 if name == "frame" else None
             figures.append(Figure(name=f"render_{name}_s", value=seconds, unit="s", bound=bound))
@@ -46,5 +54,7 @@ def video_s(dataset: DeepAccident, folder: Path) -> list[Figure]:
             workers=2,
             progress=False,
         )
-        figures.append(Figure(name=f"render_video_{name}_s", value=best_of(1, write), unit="s", bound=bound))
+        figures.append(
+            Figure(name=f"render_video_{name}_s", value=best_of(1, write), unit="s", bound=bound)
+        )
     return figures

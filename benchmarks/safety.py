@@ -61,7 +61,11 @@ def measure() -> list[Figure]:
     }
     with one_core():
         figures = [
-            Figure(name=f"safety_{name}_pairs_per_s", value=PAIRS / best_of(REPEATS, each), unit="pairs/s")
+            Figure(
+                name=f"safety_{name}_pairs_per_s",
+                value=PAIRS / best_of(REPEATS, each),
+                unit="pairs/s",
+            )
             for name, each in work.items()
         ]
         figures += of_library(boxes, velocities)
@@ -73,25 +77,51 @@ def of_tables() -> list[Figure]:
     with tempfile.TemporaryDirectory(prefix="deepaccident_safety_") as name:
         folder = Path(name)
         config = SynthConfig(scenarios=MADE, frames=FRAMES, sensors=False, designed=True)
-        root = copied_release(make_release(folder / "made", config, workers=2), folder / "release", scenarios=SCENARIOS)
+        root = copied_release(
+            make_release(folder / "made", config, workers=2),
+            folder / "release",
+            scenarios=SCENARIOS,
+        )
         dataset = DeepAccident(dataroot=root, verbose=False)
         seconds = best_of(1, lambda: [len(each) for each in interactions_of(dataset, workers=2)])
         core = core_seconds(dataset)
-        again = best_of(REPEATS, lambda: [len(each) for each in interactions_of(dataset, workers=1)])
+        again = best_of(
+            REPEATS, lambda: [len(each) for each in interactions_of(dataset, workers=1)]
+        )
         found = list(interactions_of(dataset, workers=1))
-        size = sum(path.stat().st_size for path in (dataset.tables_folder / FOLDER).rglob("*.arrow"))
+        size = sum(
+            path.stat().st_size for path in (dataset.tables_folder / FOLDER).rglob("*.arrow")
+        )
     share = WHOLE_SAMPLES / AGENTS / (SCENARIOS * FRAMES)
     return [
         Figure(name="safety_table_scenarios", value=SCENARIOS),
-        Figure(name="safety_table_rows_per_frame", value=sum(map(len, found)) / (SCENARIOS * FRAMES)),
-        Figure(name="safety_table_scenarios_per_s_2_workers", value=SCENARIOS / seconds, unit="scenarios/s"),
-        Figure(name="safety_table_kept_scenarios_per_s", value=SCENARIOS / again, unit="scenarios/s"),
-        Figure(name="safety_table_core_ms_per_frame", value=core * 1e3 / (SCENARIOS * FRAMES), unit="ms"),
         Figure(
-            name="safety_table_whole_release_s_2_cores", value=core * share / 2, unit="s (extrapolated)", bound=BOUND_S
+            name="safety_table_rows_per_frame", value=sum(map(len, found)) / (SCENARIOS * FRAMES)
         ),
         Figure(
-            name="safety_table_whole_release_mb", value=size / 1e6 * share, unit="MB (extrapolated)", bound=BOUND_MB
+            name="safety_table_scenarios_per_s_2_workers",
+            value=SCENARIOS / seconds,
+            unit="scenarios/s",
+        ),
+        Figure(
+            name="safety_table_kept_scenarios_per_s", value=SCENARIOS / again, unit="scenarios/s"
+        ),
+        Figure(
+            name="safety_table_core_ms_per_frame",
+            value=core * 1e3 / (SCENARIOS * FRAMES),
+            unit="ms",
+        ),
+        Figure(
+            name="safety_table_whole_release_s_2_cores",
+            value=core * share / 2,
+            unit="s (extrapolated)",
+            bound=BOUND_S,
+        ),
+        Figure(
+            name="safety_table_whole_release_mb",
+            value=size / 1e6 * share,
+            unit="MB (extrapolated)",
+            bound=BOUND_MB,
         ),
     ]
 
@@ -111,7 +141,9 @@ def of_library(boxes: list[np.ndarray], velocities: list[np.ndarray]) -> list[Fi
     if not checkout:
         return []
     if importlib.util.find_spec("pandas") is None:
-        raise SystemExit(f"{CHECKOUT}: SSMsOnPlane needs pandas; install it, or leave the variable out")
+        raise SystemExit(
+            f"{CHECKOUT}: SSMsOnPlane needs pandas; install it, or leave the variable out"
+        )
     longitudinal, frame = library_of(Path(checkout)), library_frame(boxes, velocities)
     theirs = np.asarray(longitudinal.TTC(frame.copy(), toreturn="values"))
     ours = time_to_collision(*boxes, *velocities)
@@ -121,7 +153,10 @@ def of_library(boxes: list[np.ndarray], velocities: list[np.ndarray]) -> list[Fi
     return [
         Figure(
             name=f"safety_ssms_on_plane_{name.lower()}_pairs_per_s",
-            value=PAIRS / best_of(REPEATS, lambda name=name: getattr(longitudinal, name)(frame, toreturn="values")),
+            value=PAIRS
+            / best_of(
+                REPEATS, lambda name=name: getattr(longitudinal, name)(frame, toreturn="values")
+            ),
             unit="pairs/s",
         )
         for name in ("TTC", "DRAC")
@@ -131,7 +166,9 @@ def of_library(boxes: list[np.ndarray], velocities: list[np.ndarray]) -> list[Fi
 def library_of(checkout: Path) -> Any:
     """The module `src.longitudinal_ssms` of a clone."""
     if not (checkout / "src" / "longitudinal_ssms.py").is_file():
-        raise SystemExit(f"{CHECKOUT}: {checkout} has no src/longitudinal_ssms.py; name a clone of SSMsOnPlane")
+        raise SystemExit(
+            f"{CHECKOUT}: {checkout} has no src/longitudinal_ssms.py; name a clone of SSMsOnPlane"
+        )
     sys.path.insert(0, str(checkout))
     try:
         return importlib.import_module("src.longitudinal_ssms")
@@ -158,7 +195,10 @@ def make_pairs(source: np.random.Generator) -> tuple[list[np.ndarray], ...]:
     for _ in range(2):
         yaw, speed = source.uniform(-np.pi, np.pi, PAIRS), source.uniform(0, 15, PAIRS)
         heading = np.column_stack([np.cos(yaw), np.sin(yaw)])
-        place = source.normal(0, 4, (PAIRS, 2)) - heading * (speed * source.uniform(1, 5, PAIRS))[:, None]
+        place = (
+            source.normal(0, 4, (PAIRS, 2))
+            - heading * (speed * source.uniform(1, 5, PAIRS))[:, None]
+        )
         size = source.uniform([3.5, 1.6], [9.0, 2.8], (PAIRS, 2))
         boxes.append(np.column_stack([place, size, yaw]))
         velocities.append(heading * speed[:, None])

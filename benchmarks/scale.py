@@ -16,7 +16,15 @@ import numpy as np
 from benchmarks.measure import Figure
 from benchmarks.releases import index_share_of_raw
 from deepaccident_devkit.geometry.se3 import SE3
-from deepaccident_devkit.release import Calibs, Collision, Labels, Meta, ScenarioFolder, find_release, write_meta
+from deepaccident_devkit.release import (
+    Calibs,
+    Collision,
+    Labels,
+    Meta,
+    ScenarioFolder,
+    find_release,
+    write_meta,
+)
 from deepaccident_devkit.release.store import INDEX_FOLDER
 from deepaccident_devkit.tables import Index
 from deepaccident_devkit.tables.build import scenario_rows
@@ -94,12 +102,21 @@ def measure() -> list[Figure]:
             sum(path.stat().st_size for path in root.glob(f"{INDEX_FOLDER}/v1/{files}"))
             for files in ("tables-*/*", "kept/*")
         )
-        runs = [probe(root) for _ in range(PROCESSES + 1)][1:]  # the first compiles and fills the file cache
+        runs = [probe(root) for _ in range(PROCESSES + 1)][
+            1:
+        ]  # the first compiles and fills the file cache
     best = {name: min(run[name] for run in runs) for name in runs[0]}
     bounds = {"open_s": 0.2, "rss_mb": 100, "get_us": 20, "boxes_us": 20}
-    units = {"open_s": "s", "rss_mb": "MB", "get_us": "µs", "boxes_us": "µs", "boxes_world_us": "µs"}
+    units = {
+        "open_s": "s",
+        "rss_mb": "MB",
+        "get_us": "µs",
+        "boxes_us": "µs",
+        "boxes_world_us": "µs",
+    }
     figures = [
-        Figure(name=name, value=value, unit=units.get(name, ""), bound=bounds.get(name)) for name, value in best.items()
+        Figure(name=name, value=value, unit=units.get(name, ""), bound=bounds.get(name))
+        for name, value in best.items()
     ]
     share = index_share_of_raw(tables + kept, int(best["samples"]))
     return [
@@ -112,9 +129,15 @@ def measure() -> list[Figure]:
 
 def probe(root: Path) -> dict[str, float]:
     """Open the release in a new process, as a user does whose installation is compiled."""
-    environment = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
+    environment = {
+        name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"
+    }
     done = subprocess.run(
-        [sys.executable, "-c", _PROBE, str(root)], capture_output=True, text=True, check=True, env=environment
+        [sys.executable, "-c", _PROBE, str(root)],
+        capture_output=True,
+        text=True,
+        check=True,
+        env=environment,
     )
     figures: dict[str, float] = json.loads(done.stdout)
     return figures
@@ -140,10 +163,16 @@ def write_whole_release(root: Path) -> Path:
         (kept / f"{number:03d}").write_bytes(rows_to_keep({**tables, "scenario": story}, ""))
     folder = index / "tables-scale"
     folder.mkdir()
-    join_tables(folder, sorted(kept.iterdir()), [SPLITS[number % len(SPLITS)] for number in range(SCENARIOS)])
+    join_tables(
+        folder,
+        sorted(kept.iterdir()),
+        [SPLITS[number % len(SPLITS)] for number in range(SCENARIOS)],
+    )
     layout = find_release(root)
     fingerprint = folder_digest(layout.scenarios, layout.split_files.values())
-    Index(folder=index, fingerprint=fingerprint, tables=folder.name, table_files=table_files(folder)).write()
+    Index(
+        folder=index, fingerprint=fingerprint, tables=folder.name, table_files=table_files(folder)
+    ).write()
     return root
 
 
@@ -160,7 +189,8 @@ def told(number: int) -> dict[str, list[object]]:
         "accident_type": range(1, 13),
     }
     return {
-        name: [possible[number // (place + 1) % len(possible)]] for place, (name, possible) in enumerate(values.items())
+        name: [possible[number // (place + 1) % len(possible)]]
+        for place, (name, possible) in enumerate(values.items())
     }
 
 
@@ -169,7 +199,10 @@ def one_scenario() -> ScenarioFiles:
     source = np.random.default_rng(0)
     samples = len(AGENTS) * FRAMES
     poses = [SE3.from_yaw(0.01 * n, (n, 2.0, 0.0)) for n in range(FRAMES)]
-    start, speed = source.normal(size=(BOXES, 3)) * (40, 40, 0.1), source.normal(size=(BOXES, 3)) * (5, 5, 0)
+    start, speed = (
+        source.normal(size=(BOXES, 3)) * (40, 40, 0.1),
+        source.normal(size=(BOXES, 3)) * (5, 5, 0),
+    )
     driven = [pose.inverse().apply(start + speed * frame / 10) for frame, pose in enumerate(poses)]
     count = samples * BOXES
     agent_of_box = np.repeat(np.arange(len(AGENTS)), FRAMES * BOXES)
@@ -194,6 +227,8 @@ def one_scenario() -> ScenarioFiles:
         camera_from_lidar=np.tile(np.eye(4), (samples, len(CAMERAS), 1, 1)),
         intrinsic=np.tile(intrinsic, (samples, len(CAMERAS), 1, 1)),
     )
-    scan = ScenarioScan(agents=AGENTS, has_meta=True, labelled=AGENTS, num_frames=FRAMES, problems=(), notices=())
+    scan = ScenarioScan(
+        agents=AGENTS, has_meta=True, labelled=AGENTS, num_frames=FRAMES, problems=(), notices=()
+    )
     scenario = ScenarioFolder(Path(), "", "type1_subtype1_accident", "Town03", AGENTS)
     return ScenarioFiles(scenario=scenario, scan=scan, meta=META, calibs=calibs, labels=labels)

@@ -47,7 +47,9 @@ def main(study: Path, name: str, seed: str) -> None:
     cells = {(each["kind"], each["name"]): each for each in told["cells"]}
     key = cells["weights", f"{name}, seed {seed}"]["key"]
     given = read_weights(study.parent / "weights" / key)
-    tensors = {each: tensor for each, tensor in given.tensors.items() if not each.endswith(_NOT_SHIPPED)}
+    tensors = {
+        each: tensor for each, tensor in given.tensors.items() if not each.endswith(_NOT_SHIPPED)
+    }
     preset, release = given.meta["preset"], told["recipe"]["weights"][name]["release"]
     made = {
         "study": f"deepaccident study {told['recipe']['name']}",
@@ -70,8 +72,13 @@ def main(study: Path, name: str, seed: str) -> None:
 def scores(path: Path, scored: Mapping[str, Any]) -> dict[str, float]:
     """What weights score with some agents on a release, as `SCORED` says both."""
     with one_thread(), tempfile.TemporaryDirectory() as folder:
-        synth = {name: tuple(each) if isinstance(each, list) else each for name, each in scored["synth"].items()}
-        release = DeepAccident("v1", make_release(Path(folder) / "release", SynthConfig(**synth)), verbose=False)
+        synth = {
+            name: tuple(each) if isinstance(each, list) else each
+            for name, each in scored["synth"].items()
+        }
+        release = DeepAccident(
+            "v1", make_release(Path(folder) / "release", SynthConfig(**synth)), verbose=False
+        )
         split = Path(folder) / "all.txt"
         write_split_file(split, [record["token"] for record in release.scenario])
         config = PredictConfig(agents=scored["agents"])

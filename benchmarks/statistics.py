@@ -40,6 +40,8 @@ def measure() -> list[Figure]:
 
 def probe(root: Path) -> dict[str, float]:
     """Compute the statistics in a new process: files cached, nothing else."""
-    done = subprocess.run([sys.executable, "-c", _PROBE, str(root)], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", _PROBE, str(root)], capture_output=True, text=True, check=True
+    )
     figures: dict[str, float] = json.loads(done.stdout)
     return figures

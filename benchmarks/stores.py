@@ -52,21 +52,36 @@ def _reading(folder: Path) -> list[Figure]:
         for name, root in roots.items():
             paths = [root / each for each in order]
             # a label's kind is not kept in the cache of a URL's files, so that the store itself is timed
-            raw[name] = 1e6 / IMAGES * best_of(15, _all(lambda path: read_bytes(path, "label"), paths))
+            raw[name] = (
+                1e6 / IMAGES * best_of(15, _all(lambda path: read_bytes(path, "label"), paths))
+            )
             decoded[name] = 1e3 / 8 * best_of(5, _all(read_image, paths[:8]))
-    contents = {name: [read_bytes(root / each, "label") for each in names] for name, root in roots.items()}
+    contents = {
+        name: [read_bytes(root / each, "label") for each in names] for name, root in roots.items()
+    }
     if any(content != contents["file"] for content in contents.values()):
         raise AssertionError("the stores disagree")
     memory.rm("/benchmark", recursive=True)
     size = IMAGE_BYTES / 1000
-    figures = [Figure(name=f"stores_{name}_us", value=raw[name], unit=f"µs for {size:.0f} kB") for name in raw]
-    figures += [Figure(name=f"stores_{name}_image_ms", value=decoded[name], unit="ms") for name in decoded]
+    figures = [
+        Figure(name=f"stores_{name}_us", value=raw[name], unit=f"µs for {size:.0f} kB")
+        for name in raw
+    ]
+    figures += [
+        Figure(name=f"stores_{name}_image_ms", value=decoded[name], unit="ms") for name in decoded
+    ]
     ratios = (
         ("stores_zip_stored_ratio", raw["zip_stored"] / raw["file"], 1.15),
         ("stores_zip_stored_image_ratio", decoded["zip_stored"] / decoded["file"], 1.15),
         ("stores_zip_deflated_image_ratio", decoded["zip_deflated"] / decoded["file"], 1.10),
     )
-    return [*figures, *(Figure(name=name, value=value, unit="of a file", bound=most) for name, value, most in ratios)]
+    return [
+        *figures,
+        *(
+            Figure(name=name, value=value, unit="of a file", bound=most)
+            for name, value, most in ratios
+        ),
+    ]
 
 
 def _write_images(root: Path) -> list[str]:
@@ -80,7 +95,9 @@ def _write_images(root: Path) -> list[str]:
     (root / FOLDER).mkdir(parents=True)
     for number in range(1, IMAGES + 1):
         noisy = np.clip(picture + random.normal(0, 5, picture.shape), 0, 255).astype(np.uint8)
-        quality = next(each for each in range(90, 0, -5) if len(_jpeg(noisy, each)) < 1.3 * IMAGE_BYTES)
+        quality = next(
+            each for each in range(90, 0, -5) if len(_jpeg(noisy, each)) < 1.3 * IMAGE_BYTES
+        )
         names.append(f"{FOLDER}/Town01_type001_subtype0001_scenario00001_{number:03d}.jpg")
         (root / names[-1]).write_bytes(_jpeg(noisy, quality))
     return names
@@ -107,7 +124,11 @@ def _opening(folder: Path) -> list[Figure]:
         folders, names = [], []
         for scenario in scenarios:
             stem = f"Town{scenario % 10:02d}_type001_subtype0001_scenario{scenario:05d}"
-            folders += [f"type1_subtype1_accident/{agent}/{kind}/{stem}" for agent in AGENTS for kind in kinds]
+            folders += [
+                f"type1_subtype1_accident/{agent}/{kind}/{stem}"
+                for agent in AGENTS
+                for kind in kinds
+            ]
             files = [f"{stem}_{frame:03d}.jpg" for frame in range(1, FRAMES + 1)]
             names += files * (len(AGENTS) * len(kinds))
         places = np.arange(len(names))
@@ -119,7 +140,15 @@ def _opening(folder: Path) -> list[Figure]:
             "deflated": places * 0,
         }
         of_folder = np.repeat(np.arange(len(folders)), FRAMES)
-        listings.append(Listing(archive=archive.name, folders=folders, folder=of_folder, names=names, numbers=numbers))
+        listings.append(
+            Listing(
+                archive=archive.name,
+                folders=folders,
+                folder=of_folder,
+                names=names,
+                numbers=numbers,
+            )
+        )
     place.mkdir()
     write_members(place / list_name(sorted(states.items())), listings, {})
     count = sum(len(listing.names) for listing in listings)

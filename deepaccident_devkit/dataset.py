@@ -10,7 +10,13 @@ from typing import TYPE_CHECKING, Any, Final, Literal, get_args
 
 import numpy as np
 
-from deepaccident_devkit.errors import ChoiceError, MissingFileError, NotAvailableError, ReleaseError, TokenError
+from deepaccident_devkit.errors import (
+    ChoiceError,
+    MissingFileError,
+    NotAvailableError,
+    ReleaseError,
+    TokenError,
+)
 from deepaccident_devkit.geometry import SE3, Box, Boxes, LidarPointCloud, PinholeCamera
 from deepaccident_devkit.geometry.boxes import trusted_boxes
 from deepaccident_devkit.geometry.conventions import stored_transforms
@@ -22,7 +28,13 @@ from deepaccident_devkit.release.store import ReleasePath, StorePath
 from deepaccident_devkit.support import nuscenes_names
 from deepaccident_devkit.support.arrays import AnyArray, BoolArray, ByteArray, FloatArray, IntArray
 from deepaccident_devkit.support.text import choice, spelled
-from deepaccident_devkit.tables import OpenTables, RowArgument, displacement_velocities, visible_ids, visible_mask
+from deepaccident_devkit.tables import (
+    OpenTables,
+    RowArgument,
+    displacement_velocities,
+    visible_ids,
+    visible_mask,
+)
 from deepaccident_devkit.tables.arrow_files import damaged_value
 from deepaccident_devkit.tables.tables import token_of
 from deepaccident_devkit.taxonomy import (
@@ -43,7 +55,9 @@ __all__ = ["VISIBLE", "Dataset", "RowArgument", "VelocitySource", "Visible"]
 Visible = Literal["camera", "released"]
 VelocitySource = Literal["decoded", "derived", "label"]
 # What a caller can call a frame → its one name.
-_FRAMES: Final[Mapping[str, str]] = {name: name for name in (*get_args(Frame), *CHANNELS)} | {LIDAR: "lidar"}
+_FRAMES: Final[Mapping[str, str]] = {name: name for name in (*get_args(Frame), *CHANNELS)} | {
+    LIDAR: "lidar"
+}
 VISIBLE: Final = (None, *get_args(Visible))
 """What `visible=` can be."""
 
@@ -125,7 +139,9 @@ class Dataset(OpenTables):
         """
         token, frame = token_of(sample), self.frame_name(frame)
         row = self._tables.resolver.row("sample", token)
-        lidar_boxes = self._lidar_boxes(row, choice("velocity", velocity, get_args(VelocitySource)), token)
+        lidar_boxes = self._lidar_boxes(
+            row, choice("velocity", velocity, get_args(VelocitySource)), token
+        )
         seen_by = choice("visible", visible, VISIBLE)
         if seen_by is not None:
             lidar_boxes = lidar_boxes.select(self._visible(row, lidar_boxes, seen_by))
@@ -150,7 +166,9 @@ class Dataset(OpenTables):
         """
         row = self._sample_row(sample)
         boxes = self.boxes(sample, frame, visible, velocity)
-        instances = self._tables.views["annotation"]["instance_row"][self._annotation_slice(row)][boxes.row].tolist()
+        instances = self._tables.views["annotation"]["instance_row"][self._annotation_slice(row)][
+            boxes.row
+        ].tolist()
         token_of_instance = self._tables.resolver.token_makers["instance"]
         result = list(boxes)
         for box, instance in zip(result, instances, strict=True):
@@ -166,7 +184,9 @@ class Dataset(OpenTables):
         Raises:
             TokenError: no such sample.
         """
-        instances = self._tables.views["annotation"]["instance_row"][self._annotation_slice(self._sample_row(sample))]
+        instances = self._tables.views["annotation"]["instance_row"][
+            self._annotation_slice(self._sample_row(sample))
+        ]
         actors = self._tables.views["instance"]["actor_id"]
         known = instances >= 0
         result = np.full(len(instances), UNTRACKED_ID, dtype=np.int64)
@@ -206,7 +226,9 @@ class Dataset(OpenTables):
         path = self.sensor_path(sample_data, channel)
         if isinstance(path, Path):
             return path
-        raise NotAvailableError(f"{path}: lies in an archive or at a URL; da.local_path(token) gives a real path")
+        raise NotAvailableError(
+            f"{path}: lies in an archive or at a URL; da.local_path(token) gives a real path"
+        )
 
     def local_path(self, sample_data: RowArgument, channel: str | None = None) -> Path:
         """A real path with the content of a sensor file, for other programs; arguments as of `get_sample_data`.
@@ -245,13 +267,17 @@ class Dataset(OpenTables):
         """
         row = self.getind("scenario", scenario)
         record = self.scenario[row]
-        folder = ScenarioFolder(self.dataroot, record["folder"], record["scenario_type"], record["name"], AGENTS)
+        folder = ScenarioFolder(
+            self.dataroot, record["folder"], record["scenario_type"], record["name"], AGENTS
+        )
         found: dict[tuple[str, str], tuple[int, ...]] = {}
         for agent, channel in product(self._tables.resolver.agents_of(row), CHANNELS):
             found[agent, channel] = ()
             with suppress(ReleaseError):
                 here, _ = frame_numbers(folder.kind_folder(agent, channel), CHANNEL_FORMAT[channel])
-                found[agent, channel] = tuple(frame for frame in here if frame <= record["num_frames"])
+                found[agent, channel] = tuple(
+                    frame for frame in here if frame <= record["num_frames"]
+                )
         return found
 
     @nuscenes_names.with_keywords_named
@@ -293,7 +319,9 @@ class Dataset(OpenTables):
         if name not in CAMERAS:
             raise ChoiceError(f"camera: expected one of {', '.join(CAMERAS)}, found {name}")
         view = self._tables.views["sample_data"]
-        return PinholeCamera(self._intrinsic(row), view["width"].item(row), view["height"].item(row))
+        return PinholeCamera(
+            self._intrinsic(row), view["width"].item(row), view["height"].item(row)
+        )
 
     def load_image(
         self,
@@ -333,11 +361,16 @@ class Dataset(OpenTables):
             MissingFileError: the file was not downloaded.
             SensorFileError: it cannot be read.
         """
-        row, name = self._sample_row(sample), choice("frame", self.frame_name(frame), get_args(Frame))
+        row, name = (
+            self._sample_row(sample),
+            choice("frame", self.frame_name(frame), get_args(Frame)),
+        )
         cloud = self._lidar_cloud(row)
         if name == "lidar":
             return cloud
-        return cloud.transform(self._world_from(row, name).inverse() @ self._world_from(row, "lidar"), name)
+        return cloud.transform(
+            self._world_from(row, name).inverse() @ self._world_from(row, "lidar"), name
+        )
 
     def _lidar_cloud(self, row: int) -> LidarPointCloud:
         """Read the points of a row of `sample` in its LiDAR frame."""
@@ -361,7 +394,9 @@ class Dataset(OpenTables):
     def _sensor(self, sample_data: RowArgument, channel: str | None) -> tuple[int, str]:
         """The row and the channel of a sensor file; arguments as of `get_sample_data`. Raises TokenError."""
         token = token_of(sample_data)
-        row = self.sample_data.row(token if channel is None else f"{token}/{spelled(channel, CHANNELS)}")
+        row = self.sample_data.row(
+            token if channel is None else f"{token}/{spelled(channel, CHANNELS)}"
+        )
         return row, CHANNELS[row % len(CHANNELS)]
 
     def _path(self, sample_data_row: int) -> ReleasePath:
@@ -369,8 +404,12 @@ class Dataset(OpenTables):
 
     def _intrinsic(self, sample_data_row: int) -> FloatArray:
         """K (3, 3) of a camera, the caller's own."""
-        calibrated = self._tables.views["sample_data"]["calibrated_sensor_row"].item(sample_data_row)
-        intrinsic: FloatArray = self._tables.views["calibrated_sensor"]["camera_intrinsic"][calibrated]
+        calibrated = self._tables.views["sample_data"]["calibrated_sensor_row"].item(
+            sample_data_row
+        )
+        intrinsic: FloatArray = self._tables.views["calibrated_sensor"]["camera_intrinsic"][
+            calibrated
+        ]
         return intrinsic.reshape(3, 3).copy()
 
     def _channel_path(self, sample_row: int, channel: str) -> ReleasePath:
@@ -378,13 +417,18 @@ class Dataset(OpenTables):
 
     def _annotation_slice(self, sample_row: int) -> slice:
         view = self._tables.views["sample"]
-        first, count = view["first_annotation_row"].item(sample_row), view["num_annotations"].item(sample_row)
+        first, count = (
+            view["first_annotation_row"].item(sample_row),
+            view["num_annotations"].item(sample_row),
+        )
         rows = slice(max(first, 0), max(first, 0) + count)
         if not rows.start <= rows.stop <= len(self._tables.views["annotation"]["sample_row"]):
             raise damaged_value("sample")
         return rows
 
-    def _lidar_boxes(self, sample_row: int, velocity: VelocitySource, token: str | None = None) -> Boxes:
+    def _lidar_boxes(
+        self, sample_row: int, velocity: VelocitySource, token: str | None = None
+    ) -> Boxes:
         view, rows = self._tables.views["annotation"], self._annotation_slice(sample_row)
         columns: dict[str, AnyArray] = {
             "center": view["translation"][rows],
@@ -398,7 +442,9 @@ class Dataset(OpenTables):
             "row": np.arange(rows.stop - rows.start),
         }
         if velocity == "label":
-            columns["velocity"] = self._label_velocity(sample_row, columns["actor_id"], view["velocity_label"][rows])
+            columns["velocity"] = self._label_velocity(
+                sample_row, columns["actor_id"], view["velocity_label"][rows]
+            )
         elif velocity == "derived":
             columns["velocity"] = self._derived_velocity(sample_row)
         return trusted_boxes("lidar", columns, token)
@@ -406,8 +452,16 @@ class Dataset(OpenTables):
     def _derived_velocity(self, sample_row: int) -> FloatArray:
         """(N, 3) in the sample's LiDAR frame, by the samples around it."""
         samples, boxes = self._tables.views["sample"], self._tables.views["annotation"]
-        around = (samples["prev_row"].item(sample_row), sample_row, samples["next_row"].item(sample_row))
-        parts = [(row, self._annotation_slice(row), self._world_from(row, "lidar")) for row in around if row >= 0]
+        around = (
+            samples["prev_row"].item(sample_row),
+            sample_row,
+            samples["next_row"].item(sample_row),
+        )
+        parts = [
+            (row, self._annotation_slice(row), self._world_from(row, "lidar"))
+            for row in around
+            if row >= 0
+        ]
         frame = np.concatenate([np.full(rows.stop - rows.start, row) for row, rows, _ in parts])
         velocity = displacement_velocities(
             np.concatenate([world.apply(boxes["translation"][rows]) for _, rows, world in parts]),
@@ -417,7 +471,9 @@ class Dataset(OpenTables):
         )
         return self._world_from(sample_row, "lidar").inverse().rotate(velocity[frame == sample_row])
 
-    def _label_velocity(self, sample_row: int, actor_id: IntArray, velocity_label: FloatArray) -> FloatArray:
+    def _label_velocity(
+        self, sample_row: int, actor_id: IntArray, velocity_label: FloatArray
+    ) -> FloatArray:
         velocity = np.column_stack([velocity_label, np.zeros(len(velocity_label))])
         own = actor_id == OWN_ACTOR_ID
         velocity[own] = self._world_from(sample_row, "lidar").inverse().rotate(velocity[own])
@@ -432,7 +488,11 @@ class Dataset(OpenTables):
             pole = AGENTS[self._tables.views["sample"]["agent"].item(other)] == INFRASTRUCTURE
             masks.append(
                 visible_mask(
-                    seen.center[:, :2], seen.category, seen.num_lidar_pts, seen.camera_visible, infrastructure=pole
+                    seen.center[:, :2],
+                    seen.category,
+                    seen.num_lidar_pts,
+                    seen.camera_visible,
+                    infrastructure=pole,
                 )
             )
             ids.append(seen.actor_id)
@@ -454,4 +514,6 @@ class Dataset(OpenTables):
             return trusted_se3(pose)
         channel = LIDAR if frame == "lidar" else frame
         sample_data_row = sample_row * len(CHANNELS) + CHANNELS.index(channel)
-        return trusted_se3(pose @ stored_transforms(views["sample_data"]["matrix"][sample_data_row]))
+        return trusted_se3(
+            pose @ stored_transforms(views["sample_data"]["matrix"][sample_data_row])
+        )

@@ -112,7 +112,11 @@ class DeepAccident(Dataset):
             MissingExtraError: the dataroot is a URL, and the extra `cloud` is not installed.
         """
         how: dict[str, Any] = {"workers": workers, "executor": executor, "progress": verbose}
-        place = None if index_dir is None else Path(os.path.abspath(path_of(index_dir, "index_dir: expected a path")))  # noqa: PTH100
+        place = (
+            None
+            if index_dir is None
+            else Path(os.path.abspath(path_of(index_dir, "index_dir: expected a path")))  # noqa: PTH100
+        )
         layout = find_release(open_dataroot(dataroot, place, on_error=on_error, **how), version)
         for last_attempt in (False, True):
             index = open_index(layout, index_dir=place, on_error=on_error, **how)

@@ -38,7 +38,9 @@ def escaped(text: str) -> str:
 class DeepAccidentError(Exception):
     """Base of all errors raised on purpose by the devkit."""
 
-    _is_list: ClassVar[bool] = False  # if it is, each line may be as long as another error's message
+    _is_list: ClassVar[bool] = (
+        False  # if it is, each line may be as long as another error's message
+    )
 
     def __init__(self, *message: object) -> None:
         """Take the sentence. Its middle is left out if it is too long, and its control characters are shown."""

@@ -5,7 +5,9 @@ See docs/format.md, and docs/released_code.md, Conventions and samples.
 
 from typing import Final, Literal
 
-AgentName = Literal["ego_vehicle", "ego_vehicle_behind", "other_vehicle", "other_vehicle_behind", "infrastructure"]
+AgentName = Literal[
+    "ego_vehicle", "ego_vehicle_behind", "other_vehicle", "other_vehicle_behind", "infrastructure"
+]
 Frame = Literal["world", "ego", "lidar"]
 OnError = Literal["raise", "skip"]
 Layout = Literal["A", "B"]
@@ -54,7 +56,11 @@ CHANNEL_MODALITY: Final[dict[str, str]] = {
     BEV_CAMERA: "bev",
 }
 FILE_FORMATS: Final = ("jpg", "npz")
-CHANNEL_FORMAT: Final[dict[str, str]] = {**dict.fromkeys(CAMERAS, "jpg"), LIDAR: "npz", BEV_CAMERA: "npz"}
+CHANNEL_FORMAT: Final[dict[str, str]] = {
+    **dict.fromkeys(CAMERAS, "jpg"),
+    LIDAR: "npz",
+    BEV_CAMERA: "npz",
+}
 """Channel → ending of its files."""
 
 CATEGORIES: Final = ("car", "truck", "van", "cyclist", "motorcycle", "pedestrian")
@@ -116,7 +122,14 @@ SPAWN_RELATIONS: Final = ("same", "opposite")
 CONTACT_SIDES: Final = ("front", "front_side", "rear", "rear_side")
 """The words that the whole release is known to use; a release may hold others, so no reader insists on them."""
 
-SCENARIO_ATTRIBUTES: Final = ("scenario_type", "town", "weather", "time_of_day", "road_type", "accident_type")
+SCENARIO_ATTRIBUTES: Final = (
+    "scenario_type",
+    "town",
+    "weather",
+    "time_of_day",
+    "road_type",
+    "accident_type",
+)
 """The scenario fields by which overviews and split reports count."""
 
 

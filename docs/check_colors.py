@@ -15,18 +15,34 @@ from deepaccident_devkit.render import styles
 EYES = {
     "normal": np.eye(3),
     "protanopia": np.array(
-        [[0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216], [-0.003882, -0.048116, 1.051998]]
+        [
+            [0.152286, 1.052583, -0.204868],
+            [0.114503, 0.786281, 0.099216],
+            [-0.003882, -0.048116, 1.051998],
+        ]
     ),
     "deuteranopia": np.array(
-        [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413], [-0.011820, 0.042940, 0.968881]]
+        [
+            [0.367322, 0.860646, -0.227968],
+            [0.280085, 0.672501, 0.047413],
+            [-0.011820, 0.042940, 0.968881],
+        ]
     ),
     "tritanopia": np.array(
-        [[1.255528, -0.076749, -0.178779], [-0.078411, 0.930809, 0.147602], [0.004733, 0.691367, 0.303900]]
+        [
+            [1.255528, -0.076749, -0.178779],
+            [-0.078411, 0.930809, 0.147602],
+            [0.004733, 0.691367, 0.303900],
+        ]
     ),
 }
 """What each kind of eye makes of linear RGB."""
 XYZ_FROM_RGB = np.array(
-    [[0.4124564, 0.3575761, 0.1804375], [0.2126729, 0.7151522, 0.0721750], [0.0193339, 0.1191920, 0.9503041]]
+    [
+        [0.4124564, 0.3575761, 0.1804375],
+        [0.2126729, 0.7151522, 0.0721750],
+        [0.0193339, 0.1191920, 0.9503041],
+    ]
 )
 GROUPS = {
     "agents and the pair": (*styles.AGENT_COLORS.values(), styles.COLLIDER_COLOR),
@@ -61,7 +77,9 @@ def chroma(names: Iterable[str]) -> NDArray[np.float64]:
     return np.hypot(*lab(names)[:, 1:].T)
 
 
-def distances(first: Iterable[str], second: Iterable[str], eye: str = "normal") -> NDArray[np.float64]:
+def distances(
+    first: Iterable[str], second: Iterable[str], eye: str = "normal"
+) -> NDArray[np.float64]:
     """(N, M) ΔE between the colours of two groups."""
     return np.linalg.norm(lab(first, eye)[:, None] - lab(second, eye), axis=-1)
 
@@ -84,7 +102,9 @@ def main() -> None:
         print(f"{name:22}", *(f"{least_distance(group, eye):13.1f}" for eye in EYES))
     print(f"\n{'smallest contrast':22}", *(f"{ground:>15}" for ground in GROUNDS))
     for name, group in GROUPS.items():
-        print(f"{name:22}", *(f"{contrast(group, ground).min():15.2f}" for ground in GROUNDS.values()))
+        print(
+            f"{name:22}", *(f"{contrast(group, ground).min():15.2f}" for ground in GROUNDS.values())
+        )
 
 
 if __name__ == "__main__":

@@ -45,7 +45,10 @@ myst_heading_anchors = 3
 
 autodoc_member_order = "bysource"
 autodoc_typehints_format = "short"
-autodoc_mock_imports = ["torch", "safetensors"]  # the adapter and the model are described without them
+autodoc_mock_imports = [
+    "torch",
+    "safetensors",
+]  # the adapter and the model are described without them
 napoleon_numpy_docstring = False
 napoleon_attr_annotations = False  # signatures have the types
 napoleon_use_ivar = True  # attributes are a list below their class, not an entry each
@@ -133,7 +136,9 @@ def write_reference(folder: Path) -> None:
     names = []
     for title, listed in REFERENCE.items():
         names.append(re.sub(r"\W+", "_", title.lower()))
-        sections = "\n".join(f"## `{each}`\n\n```{{eval-rst}}\n{_directive(each, seen)}\n```\n" for each in listed)
+        sections = "\n".join(
+            f"## `{each}`\n\n```{{eval-rst}}\n{_directive(each, seen)}\n```\n" for each in listed
+        )
         (folder / f"{names[-1]}.md").write_text(f"# {title}\n\n{sections}", encoding="utf-8")
     tree = "\n".join(["```{toctree}", ":maxdepth: 2", "", *names, "```", ""])
     (folder / "index.md").write_text(f"{INTRODUCTION}\n{tree}", encoding="utf-8")
@@ -159,8 +164,15 @@ def _directive(name: str, seen: set[str]) -> str:
 
 
 _CODE_SPAN = re.compile(r"(?<![`\\])`([^`]+)`(?!`)")
-_ARRAY = re.compile(r"~?(numpy\.)?ndarray\[tuple\[[^\]]*\], ~?(numpy\.)?dtype\[~?(numpy\.|typing\.)*(?P<dtype>\w+)\]\]")
-_ARRAY_NAMES = {"float64": "FloatArray", "int64": "IntArray", "bool": "BoolArray", "uint8": "ByteArray"}
+_ARRAY = re.compile(
+    r"~?(numpy\.)?ndarray\[tuple\[[^\]]*\], ~?(numpy\.)?dtype\[~?(numpy\.|typing\.)*(?P<dtype>\w+)\]\]"
+)
+_ARRAY_NAMES = {
+    "float64": "FloatArray",
+    "int64": "IntArray",
+    "bool": "BoolArray",
+    "uint8": "ByteArray",
+}
 """As `deepaccident_devkit.support.arrays` calls them."""
 _WITHOUT_TYPE = ("attribute", "data", "property")
 """What napoleon takes `type: text` off, if there is a colon in the first line."""
@@ -231,10 +243,18 @@ def _table(lines: list[str]) -> list[str]:
     return [*result, ""]
 
 
-_RESTRUCTURED = {"text": _text, "fence": _fence, "example": _example, "table": _table, "doctest": list}
+_RESTRUCTURED = {
+    "text": _text,
+    "fence": _fence,
+    "example": _example,
+    "table": _table,
+    "doctest": list,
+}
 
 
-def _process(_app: Any, what: str, _name: str, _obj: object, _options: Any, lines: list[str]) -> None:
+def _process(
+    _app: Any, what: str, _name: str, _obj: object, _options: Any, lines: list[str]
+) -> None:
     if what == "method":  # functions that the facade binds: it is `self`
         lines[:] = [line for line in lines if line.strip() != "dataset: the release."]
     lines[:] = restructured(lines)
@@ -243,7 +263,13 @@ def _process(_app: Any, what: str, _name: str, _obj: object, _options: Any, line
 
 
 def _name_arrays(
-    _app: Any, _what: str, _name: str, _obj: object, _options: Any, signature: str | None, result: str | None
+    _app: Any,
+    _what: str,
+    _name: str,
+    _obj: object,
+    _options: Any,
+    signature: str | None,
+    result: str | None,
 ) -> tuple[str | None, ...]:
     return tuple(text and _ARRAY.sub(_array_name, text) for text in (signature, result))
 

@@ -53,7 +53,9 @@ SEEDS = {1: 1, 2: 7, 3: 7, 4: 5, 5: 3, 6: 4, 7: 6, 8: 11, 9: 12, 10: 3, 11: 7, 1
 """Of a draw of each design in the daytime."""
 DESIGN_FRAMES = 25
 RIGS: tuple[RigName, ...] = ("released", "road")
-BOTH = SynthConfig(scenarios=2, frames=31, image_size=(480, 270), sensor_step=5, seed=4, designed=True)
+BOTH = SynthConfig(
+    scenarios=2, frames=31, image_size=(480, 270), sensor_step=5, seed=4, designed=True
+)
 """Shown as it is, and as nuScenes: from its first frame to its last, each fifth one has images."""
 FRAMES_BEFORE = 7
 """Of the impact, when the pictures are taken."""
@@ -76,10 +78,14 @@ def render_all(images: Path) -> None:
     save_picture(draw_sketch(), images / "scenario_sketch.png", dpi=100)
     save_picture(draw_designs(), images / "designs.jpg", dpi=100)
     with tempfile.TemporaryDirectory() as folder:
-        release = DeepAccident(dataroot=make_release(Path(folder) / "release", RELEASE), verbose=False)
+        release = DeepAccident(
+            dataroot=make_release(Path(folder) / "release", RELEASE), verbose=False
+        )
         draw_labels(release, images / "motion_labels.png")
         draw_rigs(Path(folder), images / "rigs.webp")
-        if find_spec("nuscenes") is not None:  # which has an environment of its own (docs/nuscenes.md)
+        if (
+            find_spec("nuscenes") is not None
+        ):  # which has an environment of its own (docs/nuscenes.md)
             draw_both_sources(Path(folder), images / "road.webp")
     draw_turn("instance", range(5), images / "labels_released_clean.png")
     draw_turn("flow", range(4), images / "labels_released_clean_flow.png")
@@ -88,27 +94,47 @@ def render_all(images: Path) -> None:
 
 def draw_key(fig: Figure) -> Figure:
     """A row for each rule of the grammar, and the colour maps to their right."""
-    parts = fig.subplot_mosaic([["rows", "depth"], ["rows", "height"], ["rows", "flow"]], width_ratios=(5.2, 1))
+    parts = fig.subplot_mosaic(
+        [["rows", "depth"], ["rows", "height"], ["rows", "flow"]], width_ratios=(5.2, 1)
+    )
     rows = parts["rows"]
     rows.set(xlim=(-22, 6 * KEY_STEP - 4), ylim=(-4.3 * KEY_ROW, 0.6 * KEY_ROW), aspect="equal")
     rows.set_axis_off()
     vehicles = [agent for agent in AGENTS if agent != "infrastructure"]
     hues = [styles.AGENT_COLORS[agent] for agent in vehicles]
-    draw_row(rows, 0, "agents", [(short_name(agent), "car", hue) for agent, hue in zip(vehicles, hues, strict=True)])
+    draw_row(
+        rows,
+        0,
+        "agents",
+        [(short_name(agent), "car", hue) for agent, hue in zip(vehicles, hues, strict=True)],
+    )
     place = (len(vehicles) * KEY_STEP, 0.0)
     rows.plot(*place, "o", color=styles.AGENT_COLORS["infrastructure"], markersize=9)
     write(rows, "infrastructure", *place)
     red = styles.COLLIDER_COLOR
-    draw_row(rows, 1, "colliding pair", [("a car", "car", red), ("a pedestrian", "pedestrian", red)])
-    draw_row(rows, 2, "other actors", [(name, name, styles.CATEGORY_COLORS[name]) for name in SIZES])
-    draw_patches(rows, 3, "predictions", {**styles.OUTCOME_COLORS, "no verdict": styles.PREDICTED_COLOR})
+    draw_row(
+        rows, 1, "colliding pair", [("a car", "car", red), ("a pedestrian", "pedestrian", red)]
+    )
+    draw_row(
+        rows, 2, "other actors", [(name, name, styles.CATEGORY_COLORS[name]) for name in SIZES]
+    )
     draw_patches(
-        rows, 4, "charts", dict(zip(("first", "second", "third", "fourth"), styles.SERIES_COLORS, strict=True))
+        rows, 3, "predictions", {**styles.OUTCOME_COLORS, "no verdict": styles.PREDICTED_COLOR}
+    )
+    draw_patches(
+        rows,
+        4,
+        "charts",
+        dict(zip(("first", "second", "third", "fourth"), styles.SERIES_COLORS, strict=True)),
     )
     for name, colormap in (("depth", styles.DEPTH_COLORMAP), ("height", styles.HEIGHT_COLORMAP)):
-        parts[name].imshow(np.linspace(0, 1, 256)[None], cmap=colormap, aspect="auto", extent=(0, 1, 0, 1))
+        parts[name].imshow(
+            np.linspace(0, 1, 256)[None], cmap=colormap, aspect="auto", extent=(0, 1, 0, 1)
+        )
         parts[name].set(xticks=(0, 1), yticks=(), box_aspect=0.16)
-        parts[name].set_xticks((0, 1), ("near", "far") if name == "depth" else ("low", "high"), fontsize=8)
+        parts[name].set_xticks(
+            (0, 1), ("near", "far") if name == "depth" else ("low", "high"), fontsize=8
+        )
         parts[name].set_title(f"points by {name}", fontsize=8)
     draw_wheel(parts["flow"])
     return fig
@@ -120,7 +146,11 @@ def draw_row(ax: Axes, row: int, title: str, entries: list[tuple[str, str, str]]
     names = [name for _, name, _ in entries]
     center = [(number * KEY_STEP, -row * KEY_ROW, 0.0) for number in range(len(entries))]
     boxes = Boxes.from_arrays(
-        center, [(*SIZES[name], 1.5) for name in names], [0.0] * len(names), frame="ego", category=names
+        center,
+        [(*SIZES[name], 1.5) for name in names],
+        [0.0] * len(names),
+        frame="ego",
+        category=names,
     )
     draw_boxes_from_above(boxes, ax, [color for _, _, color in entries])
     for (words, _, _), (x, y, _) in zip(entries, center, strict=True):
@@ -137,14 +167,20 @@ def draw_patches(ax: Axes, row: int, title: str, meanings: dict[str, str]) -> No
 
 
 def write(ax: Axes, words: str, x: float, y: float) -> None:
-    ax.annotate(words, (x, y), (0, -10), textcoords="offset points", ha="center", va="top", fontsize=8)
+    ax.annotate(
+        words, (x, y), (0, -10), textcoords="offset points", ha="center", va="top", fontsize=8
+    )
 
 
 def draw_wheel(ax: Axes) -> None:
     """The colours of directions."""
     left, along = np.mgrid[-1:1:101j, -1:1:101j]
     inside = (np.hypot(left, along) <= 1)[..., None]
-    ax.imshow(np.where(inside, direction_colors(left, along, longest=1.0), 1.0), origin="lower", extent=(-1, 1, -1, 1))
+    ax.imshow(
+        np.where(inside, direction_colors(left, along, longest=1.0), 1.0),
+        origin="lower",
+        extent=(-1, 1, -1, 1),
+    )
     ax.set_axis_off()
     ax.set_title("flow: forward to the right", fontsize=8)
 
@@ -192,10 +228,14 @@ def draw_design(release: DeepAccident, above: Axes, image: Axes) -> None:
         raise SystemExit(f"{token}: nobody collides in it; choose another seed")
     frame = release.field2token("frame", "scenario_token", token)[-1 - FRAMES_BEFORE]
     samples = [sample["token"] for sample in release.samples_of(frame)]
-    release.render_bev(samples[0], agents="all", view_range=AROUND_EGO, layers=("bev", "boxes"), ax=above)
+    release.render_bev(
+        samples[0], agents="all", view_range=AROUND_EGO, layers=("bev", "boxes"), ax=above
+    )
     draw_meeting(release, samples[0], contact, above)
     boxes = release.cooperative_boxes(samples[0], agents="all", frame="world")
-    witnesses = [sample for sample in samples if "behind" not in sample]  # followers see one of the two hide the other
+    witnesses = [
+        sample for sample in samples if "behind" not in sample
+    ]  # followers see one of the two hide the other
     view = best_view(release, witnesses, boxes.select(np.isin(boxes.actor_id, contact.actor_ids)))
     camera = f"{samples[0]}/Camera_Front" if view is None else view.camera
     release.render_sample_data(camera, layers=("image",), ax=image)
@@ -243,7 +283,14 @@ def render_roads(ax: Axes) -> None:
             ends = np.stack([near * out + across * left, AROUND * out + across * left])
             ax.plot(*ends.T, style, color=LINE, linewidth=2)
         ax.plot(*np.stack([near * out, near * out + edge * left]).T, color=LINE, linewidth=5)
-        ax.text(*(46 * out - 13 * np.abs(left)), arm, fontsize=15, fontweight="bold", ha="center", va="center")
+        ax.text(
+            *(46 * out - 13 * np.abs(left)),
+            arm,
+            fontsize=15,
+            fontweight="bold",
+            ha="center",
+            va="center",
+        )
     ax.plot(0, 0, "+", color="black", markersize=14)
     ax.text(1, 1, "middle", fontsize=10)
 
@@ -256,7 +303,12 @@ def render_lanes(ax: Axes) -> None:
             route = junction.route(arm, "straight", lane)
             x, y, yaw, _ = (float(value) for value in route.path.at(route.stop_s - 4.0))
             ahead = 3.5 * np.array([np.cos(yaw), np.sin(yaw)])
-            ax.annotate("", (x + ahead[0], y + ahead[1]), (x, y), arrowprops={"arrowstyle": "-|>", "color": "0.3"})
+            ax.annotate(
+                "",
+                (x + ahead[0], y + ahead[1]),
+                (x, y),
+                arrowprops={"arrowstyle": "-|>", "color": "0.3"},
+            )
             ax.text(*((x, y) - ahead / 3), str(lane), fontsize=12, ha="center", va="center")
 
 
@@ -285,10 +337,18 @@ def render_sides(ax: Axes) -> None:
             ax.text(middle + 3, -PARKED, label, color="C2", fontsize=10, va="center")
         else:
             ax.text(
-                middle - 2, -PARKED + 4, f"the same,\nside: {side}", color="C2", fontsize=10, va="center", ha="right"
+                middle - 2,
+                -PARKED + 4,
+                f"the same,\nside: {side}",
+                color="C2",
+                fontsize=10,
+                va="center",
+                ha="right",
             )
     path = road_crossing(SPEC, "south", STEP_OUT, "right").xy
-    ax.annotate("", path[-1], path[0], arrowprops={"arrowstyle": "-|>", "color": "C3", "linewidth": 2})
+    ax.annotate(
+        "", path[-1], path[0], arrowprops={"arrowstyle": "-|>", "color": "C3", "linewidth": 2}
+    )
     label = f"pedestrian: from: south,\nside: right,\nstart_distance: {STEP_OUT:g}"
     ax.text(path[0, 0] + 1, path[0, 1] + 1, label, color="C3", fontsize=10)
 
@@ -305,7 +365,9 @@ def draw_labels(release: DeepAccident, path: Path) -> None:
 def draw_rigs(folder: Path, path: Path) -> None:
     """The two rigs of the generator."""
     made = [
-        make_release(folder / name, SynthConfig(rig=name, frames=3, image_size=(64, 36), designed=True))
+        make_release(
+            folder / name, SynthConfig(rig=name, frames=3, image_size=(64, 36), designed=True)
+        )
         for name in RIGS
     ]
     report = sensor_setup_report(*(DeepAccident(dataroot=each, verbose=False) for each in made))
@@ -324,9 +386,9 @@ def draw_both_sources(folder: Path, path: Path) -> None:
     pictures = []
     for scenario, source in sources.items():
         content = BytesIO()
-        source.render_sample(source.get_sample(scenario, "ego_vehicle", frame=BOTH.frames - 10)).savefig(
-            content, dpi=60
-        )
+        source.render_sample(
+            source.get_sample(scenario, "ego_vehicle", frame=BOTH.frames - 10)
+        ).savefig(content, dpi=60)
         pictures.append(np.asarray(Image.open(content).convert("RGB")))
     Image.fromarray(np.concatenate(pictures)).save(path, quality=85)
 
@@ -369,6 +431,10 @@ def _draw_outlines(frame: int, ax: Any) -> None:
     """What is really there, in the present ego frame."""
     for actor in ACTORS:
         length, width, _ = actor.size
-        corners = np.array([[-1, -1, 0], [-1, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]]) * (length, width, 0) / 2
+        corners = (
+            np.array([[-1, -1, 0], [-1, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]])
+            * (length, width, 0)
+            / 2
+        )
         x, y, _ = (actor.pose(frame) @ corners).T
         ax.plot(x, y, color="#f5a000", linewidth=1.2, zorder=2)

@@ -35,7 +35,9 @@ def layers() -> list[list[str]]:
     """The contract's layers, from top to bottom, each with its modules."""
     content = tomllib.loads((TOP / "pyproject.toml").read_text(encoding="utf-8"))
     contract = next(
-        contract for contract in content["tool"]["importlinter"]["contracts"] if contract["type"] == "layers"
+        contract
+        for contract in content["tool"]["importlinter"]["contracts"]
+        if contract["type"] == "layers"
     )
     return [[name.strip(" ()") for name in re.split("[|:]", layer)] for layer in contract["layers"]]
 
@@ -53,14 +55,25 @@ def picture() -> str:
     rows, parts, top = layers(), [], MARGIN
     for number, modules in enumerate(rows):
         width = (WIDTH - 2 * MARGIN - GAP * (len(modules) - 1)) / len(modules)
-        texts = [wrap(purpose(module), int((width - 16) / LETTER), max_lines=3, placeholder=" …") for module in modules]
+        texts = [
+            wrap(purpose(module), int((width - 16) / LETTER), max_lines=3, placeholder=" …")
+            for module in modules
+        ]
         height = TOP_OF_TEXT + 10 + LINE * max(map(len, texts))
         for place, (module, lines) in enumerate(zip(modules, texts, strict=True)):
             left = MARGIN + place * (width + GAP)
             parts.append(_rectangle(left, top, width, height, _kind(rows, number)))
-            parts.append(_text(left + 8, top + TOP_OF_TEXT, escape(module), 'font-size="14" font-weight="bold"'))
+            parts.append(
+                _text(
+                    left + 8, top + TOP_OF_TEXT, escape(module), 'font-size="14" font-weight="bold"'
+                )
+            )
             for line, words in enumerate(lines, start=1):
-                parts.append(_text(left + 8, top + TOP_OF_TEXT + LINE * line, escape(words), 'font-size="11.5"'))
+                parts.append(
+                    _text(
+                        left + 8, top + TOP_OF_TEXT + LINE * line, escape(words), 'font-size="11.5"'
+                    )
+                )
         top += height + GAP
     height = top + 12 + MARGIN
     head = [
@@ -81,7 +94,10 @@ def _kind(rows: list[list[str]], number: int) -> str:
 def _key(top: int) -> list[str]:
     parts, left = [], MARGIN
     for kind, words in _KINDS.items():
-        parts += [_rectangle(left, top - 10, 12, 12, kind), _text(left + 18, top, words, 'font-size="12"')]
+        parts += [
+            _rectangle(left, top - 10, 12, 12, kind),
+            _text(left + 18, top, words, 'font-size="12"'),
+        ]
         left += 200
     rule = "imports go downwards, never up"
     return [*parts, _text(left, top, rule, 'font-size="12"')]

@@ -108,7 +108,11 @@ def _alike(group: click.Group) -> dict[str, click.Command]:
     """The commands of a group that have the options of a release, except for those that differ from the others."""
     context = click.Context(group)
     commands = {name: group.get_command(context, name) for name in group.list_commands(context)}
-    return {name: each for name, each in commands.items() if each and _on_release(each) and name not in _UNLIKE}
+    return {
+        name: each
+        for name, each in commands.items()
+        if each and _on_release(each) and name not in _UNLIKE
+    }
 
 
 def _common(group: click.Group) -> list[click.Option]:
@@ -116,7 +120,11 @@ def _common(group: click.Group) -> list[click.Option]:
     alike = [_options(command) for command in _alike(group).values()]
     if len(alike) < _ALIKE:
         return []
-    return [each for each in _without(alike[0], _options(_release)) if all(_is_in(each, options) for options in alike)]
+    return [
+        each
+        for each in _without(alike[0], _options(_release))
+        if all(_is_in(each, options) for options in alike)
+    ]
 
 
 def _is_in(option: click.Option, options: list[click.Option]) -> bool:
@@ -143,10 +151,16 @@ def _section(command: click.Command, path: tuple[str, ...], parent: click.Group 
     lines += [_plain(command.help), ""]
     if isinstance(command, click.Group):
         context = click.Context(command)
-        names = [f"[`{name}`](#{'-'.join((*path, name))})" for name in command.list_commands(context)]
+        names = [
+            f"[`{name}`](#{'-'.join((*path, name))})" for name in command.list_commands(context)
+        ]
         lines += [f"Commands below it: {', '.join(names)}.", ""]
         if common := _common(command):
-            lines += [f"{_with_release(command)} have these options in common:", "", *_tables(common)]
+            lines += [
+                f"{_with_release(command)} have these options in common:",
+                "",
+                *_tables(common),
+            ]
     if only_group:
         return "\n".join(lines)
     options = _options(command)
@@ -188,7 +202,9 @@ def _name(option: click.Option) -> str:
     names = ", ".join(f"`{name}`" for name in (*option.opts, *option.secondary_opts))
     if option.is_flag or isinstance(option.type, click.Choice):
         return names
-    return f"{names} `{option.metavar or option.type.name.upper().removesuffix(' RANGE')}`".replace("|", "\\|")
+    return f"{names} `{option.metavar or option.type.name.upper().removesuffix(' RANGE')}`".replace(
+        "|", "\\|"
+    )
 
 
 def _meaning(option: click.Option) -> str:
@@ -210,7 +226,9 @@ def _meaning(option: click.Option) -> str:
 def _plain(text: str | None) -> str:
     """A help text; what click does not wrap is a block."""
     parts = inspect.cleandoc(text or "").split("\n\n")
-    return "\n\n".join(indent(each[2:], "    ") if each.startswith("\b\n") else each for each in parts)
+    return "\n\n".join(
+        indent(each[2:], "    ") if each.startswith("\b\n") else each for each in parts
+    )
 
 
 if __name__ == "__main__":

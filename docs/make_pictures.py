@@ -103,7 +103,9 @@ def make_demo(folder: Path) -> None:
 
 def keep(picture: str, folder: Path) -> None:
     """Copy a picture into docs/images; where no command made it, it is that of the web page of its name."""
-    made = next(folder.rglob(picture), None) or page_picture(next(folder.rglob(f"{Path(picture).stem}.html")))
+    made = next(folder.rglob(picture), None) or page_picture(
+        next(folder.rglob(f"{Path(picture).stem}.html"))
+    )
     shutil.copy(made, IMAGES / picture)
     print(f"{picture}: {made.stat().st_size / 1000:.0f} kB")
 
@@ -111,7 +113,12 @@ def keep(picture: str, folder: Path) -> None:
 def page_picture(page: Path, anchor: str = "") -> Path:
     """What a browser's window shows of a web page, from an anchor on; a replay half a second before its end."""
     options = webdriver.ChromeOptions()
-    for option in ("--headless=new", "--no-sandbox", "--hide-scrollbars", f"--window-size={WINDOW}"):
+    for option in (
+        "--headless=new",
+        "--no-sandbox",
+        "--hide-scrollbars",
+        f"--window-size={WINDOW}",
+    ):
         options.add_argument(option)
     shot = page.with_suffix(".png")
     with webdriver.Chrome(options) as browser:
@@ -128,8 +135,12 @@ def keep_explorer(given: Path | None) -> None:
     """Make a release, two models' bundles, and a picture of each page of the explorer."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        dataset = DeepAccident("v1", given or make_release(folder / "release", RELEASE, progress=True))
-        explorer = Explorer(dataset, bundles=[bundle(dataset, folder, agents) for agents in ("single", "all")])
+        dataset = DeepAccident(
+            "v1", given or make_release(folder / "release", RELEASE, progress=True)
+        )
+        explorer = Explorer(
+            dataset, bundles=[bundle(dataset, folder, agents) for agents in ("single", "all")]
+        )
         explorer.begin()
         explorer.jobs.wait()
         with serving(make_app(explorer)) as served:
@@ -141,9 +152,13 @@ def bundle(dataset: DeepAccident, folder: Path, agents: str) -> Path:
     name = {"single": "ego_alone", "all": "five_agents"}[agents]
     tokens = SELECTION.tokens(dataset)
     results = read_results(
-        predict_results(dataset, "accident", tokens, folder / f"{name}.json", Baseline(agents=agents))
+        predict_results(
+            dataset, "accident", tokens, folder / f"{name}.json", Baseline(agents=agents)
+        )
     )
-    run = evaluate_results(dataset, results, EvaluationSetup(task="accident", protocol="boxes"), SELECTION)
+    run = evaluate_results(
+        dataset, results, EvaluationSetup(task="accident", protocol="boxes"), SELECTION
+    )
     return save_run(run.broken_down(), folder / name, include_results=True)
 
 
@@ -158,8 +173,16 @@ def keep_all(served: Served, explorer: Explorer) -> None:
         "scenarios": ("?sort=min_ttc", "", LOADED),
         "table": ("?view=table&sort=lead&order=down&q=length%3E%3D40%3B+min_ttc%3C2", "", COMPUTED),
         "scenario": (f"{here}/", AT, LOADED),
-        "cameras": (f"{here}/?cameras=all", f"{AT} document.getElementById('every').scrollIntoView()", LOADED),
-        "twin": (f"{here}/twin", "", "[...document.querySelectorAll('iframe')].every((each) => each.contentWindow.go)"),
+        "cameras": (
+            f"{here}/?cameras=all",
+            f"{AT} document.getElementById('every').scrollIntoView()",
+            LOADED,
+        ),
+        "twin": (
+            f"{here}/twin",
+            "",
+            "[...document.querySelectorAll('iframe')].every((each) => each.contentWindow.go)",
+        ),
         "moment": (f"{here}/moment/ego_vehicle/30", "", "document.images[0].naturalWidth"),
         "model": ("model/ego_alone/", "", COMPUTED),
         "sample": (f"model/ego_alone/sample/{worst}", "", LOADED),
@@ -181,14 +204,18 @@ def keep_all(served: Served, explorer: Explorer) -> None:
             time.sleep(2)  # pictures that the script asked for, and twins in step
             until(browser, ready)
             picture = IMAGES / f"explore_{name}.webp"
-            Image.open(BytesIO(browser.get_screenshot_as_png())).convert("RGB").save(picture, quality=QUALITY)
+            Image.open(BytesIO(browser.get_screenshot_as_png())).convert("RGB").save(
+                picture, quality=QUALITY
+            )
             print(f"{picture.name}: {picture.stat().st_size / 1000:.0f} kB")
 
 
 def until(browser: Any, ready: str) -> None:
     """Wait until an expression holds; a page that loads itself again meanwhile is waited for too."""
     end = time.monotonic() + WAIT
-    while not browser.execute_script(f"return document.readyState === 'complete' && Boolean({ready})"):
+    while not browser.execute_script(
+        f"return document.readyState === 'complete' && Boolean({ready})"
+    ):
         assert time.monotonic() < end, f"{browser.current_url}: waited in vain for {ready}"
         time.sleep(0.2)
 

@@ -83,15 +83,24 @@ def differences(old: dict[str, Any], new: dict[str, Any]) -> list[str]:
     return [
         *(f"removed: {name}" for name in sorted(before.keys() - after.keys())),
         *(f"added: {name}" for name in sorted(after.keys() - before.keys())),
-        *(f"changed: {name}\n    was {before[name]}\n    is  {after[name]}" for name in sorted(changed)),
+        *(
+            f"changed: {name}\n    was {before[name]}\n    is  {after[name]}"
+            for name in sorted(changed)
+        ),
     ]
 
 
 def _lines(names: dict[str, Any]) -> dict[str, str]:
     return {
-        **{f"{room}: {name}": said for room, each in names["rooms"].items() for name, said in each.items()},
+        **{
+            f"{room}: {name}": said
+            for room, each in names["rooms"].items()
+            for name, said in each.items()
+        },
         **names["commands"],
-        **{f"{name}, of daily use": f"in {found['page']}" for name, found in names["daily"].items()},
+        **{
+            f"{name}, of daily use": f"in {found['page']}" for name, found in names["daily"].items()
+        },
     }
 
 
@@ -104,8 +113,12 @@ def daily(rooms: dict[str, dict[str, str]]) -> dict[str, dict[str, str | None]]:
     found: dict[str, dict[str, str | None]] = {}
     for group, names in DAILY.items():
         for name in names.split():
-            page = next((page for page, used in uses.items() if name.rpartition(".")[2] in used), None)
-            room, whole = (PACKAGE, f"{group}.{name}") if group == "DeepAccident" else (_dotted(group), name)
+            page = next(
+                (page for page, used in uses.items() if name.rpartition(".")[2] in used), None
+            )
+            room, whole = (
+                (PACKAGE, f"{group}.{name}") if group == "DeepAccident" else (_dotted(group), name)
+            )
             while (said := rooms[room].get(whole, "")).startswith(f"= {PACKAGE}."):
                 room = said.removeprefix("= ").removesuffix(f".{whole}")
             found[f"{group}.{name}".lstrip(".")] = {"page": page, "is": said or None}
@@ -121,7 +134,9 @@ def pages() -> list[str]:
 
 def code_of(page: Path) -> Iterator[ast.AST]:
     """The nodes of a page's Python blocks."""
-    for block in re.findall(r"^```python\n(.*?)^```", page.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL):
+    for block in re.findall(
+        r"^```python\n(.*?)^```", page.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL
+    ):
         yield from ast.walk(ast.parse(block))
 
 
@@ -148,7 +163,9 @@ def public_modules() -> dict[str, tuple[str, ...]]:
         for name in listed:
             room, _, last = name.rpartition(".")
             if not last[0].isupper():
-                result[_dotted(name)] = tuple(each for each in _all_of(_dotted(name)) if each not in internal)
+                result[_dotted(name)] = tuple(
+                    each for each in _all_of(_dotted(name)) if each not in internal
+                )
             elif room:
                 result[_dotted(room)] = (*result.get(_dotted(room), ()), last)
     return result
@@ -161,7 +178,11 @@ def _dotted(room: str) -> str:
 def _all_of(module: str) -> tuple[str, ...]:
     if "__all__" in (constants := _constants(_path(module))):
         return tuple(ast.literal_eval(constants["__all__"]))
-    return tuple(name for name, (home, _) in _names(module).items() if home == module and not name.startswith("_"))
+    return tuple(
+        name
+        for name, (home, _) in _names(module).items()
+        if home == module and not name.startswith("_")
+    )
 
 
 def names_of(room: str) -> dict[str, str]:
@@ -183,7 +204,11 @@ def names_of(room: str) -> dict[str, str]:
 @cache
 def _describing(home: str, name: str) -> str:
     """Of the rooms that have a name, the one that describes it: the nearest above its module, or the first."""
-    rooms = [room for room, names in public_modules().items() if name in names and _found(room, name)[0] == home]
+    rooms = [
+        room
+        for room, names in public_modules().items()
+        if name in names and _found(room, name)[0] == home
+    ]
     near = [room for room in rooms if f"{home}.".startswith(f"{room}.") and room != PACKAGE]
     return max(near, key=len, default=rooms[0])
 
@@ -203,7 +228,11 @@ def _tree(path: Path) -> ast.Module:
 
 
 def _constants(path: Path) -> dict[str, ast.expr]:
-    return {ast.unparse(node.targets[0]): node.value for node in _tree(path).body if isinstance(node, ast.Assign)}
+    return {
+        ast.unparse(node.targets[0]): node.value
+        for node in _tree(path).body
+        if isinstance(node, ast.Assign)
+    }
 
 
 def _statements(body: Iterable[ast.stmt]) -> Iterator[ast.stmt]:
@@ -224,7 +253,9 @@ def _names(module: str) -> dict[str, tuple[str, ast.stmt | str]]:
             found[node.name] = (module, node)
         elif isinstance(node, ast.Assign | ast.AnnAssign):
             for target in node.targets if isinstance(node, ast.Assign) else [node.target]:
-                found.setdefault(ast.unparse(target), (module, node))  # a function that is wrapped stays itself
+                found.setdefault(
+                    ast.unparse(target), (module, node)
+                )  # a function that is wrapped stays itself
         elif isinstance(node, ast.ImportFrom) and node.module:
             found |= {alias.asname or alias.name: (node.module, alias.name) for alias in node.names}
     return found
@@ -303,7 +334,9 @@ class _Short(ast.NodeTransformer):
     """Leaves out what computes a value, which not every Python writes alike."""
 
     def visit(self, node: ast.AST) -> ast.AST:
-        computes = isinstance(node, ast.Lambda | ast.GeneratorExp | ast.ListComp | ast.SetComp | ast.DictComp)
+        computes = isinstance(
+            node, ast.Lambda | ast.GeneratorExp | ast.ListComp | ast.SetComp | ast.DictComp
+        )
         return ast.Name("…") if computes else self.generic_visit(node)
 
 
@@ -319,7 +352,8 @@ def _constructor(module: str, node: ast.ClassDef) -> str:
     """Its parameters: those of `__init__`, or the fields of a record."""
     bases = [*_bases(module, node)][::-1]
     record = any(
-        "dataclass" in _decorators(each) or RECORDS.intersection(map(ast.unparse, each.bases)) for _, each in bases
+        "dataclass" in _decorators(each) or RECORDS.intersection(map(ast.unparse, each.bases))
+        for _, each in bases
     )
     fields: dict[str, str] = {}
     for home, each in bases:
@@ -345,7 +379,9 @@ def _members(module: str, node: ast.ClassDef) -> dict[str, str]:
     for statement in _statements(node.body):
         if isinstance(statement, ast.FunctionDef) and not statement.name.startswith("_"):
             result[statement.name] = _member(module, statement)
-        elif isinstance(statement, ast.Assign) and not (name := ast.unparse(statement.targets[0])).startswith("_"):
+        elif isinstance(statement, ast.Assign) and not (
+            name := ast.unparse(statement.targets[0])
+        ).startswith("_"):
             result[name] = _attribute(module, statement)
     return result
 

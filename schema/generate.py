@@ -53,12 +53,17 @@ def generated_results_files() -> dict[str, str]:
 
 def json_schemas(derived: Mapping[str, TableSpec] | None = None) -> dict[str, dict[str, Any]]:
     """Table name → JSON Schema (draft 2020-12) of one of its records; of the index's tables and of derived ones."""
-    return {name: _record_schema(spec) for name, spec in {**table_specs(), **(derived or {})}.items()}
+    return {
+        name: _record_schema(spec) for name, spec in {**table_specs(), **(derived or {})}.items()
+    }
 
 
 def columns_markdown(derived: Mapping[str, TableSpec] | None = None) -> str:
     """A Markdown section a table: what a row is, its token, and its columns; derived tables last, without tokens."""
-    return "\n\n".join(_table_markdown(spec) for spec in {**table_specs(), **(derived or {})}.values()) + "\n"
+    return (
+        "\n\n".join(_table_markdown(spec) for spec in {**table_specs(), **(derived or {})}.values())
+        + "\n"
+    )
 
 
 def _record_schema(spec: TableSpec) -> dict[str, Any]:
@@ -104,7 +109,11 @@ def _kind_schema(kind: ColumnKind) -> dict[str, Any]:  # noqa: PLR0911 - one a k
         case Choice(values=values):
             return {"type": "string", "enum": list(values)}
         case Subset(values=values):
-            return {"type": "array", "items": {"type": "string", "enum": list(values)}, "uniqueItems": True}
+            return {
+                "type": "array",
+                "items": {"type": "string", "enum": list(values)},
+                "uniqueItems": True,
+            }
         case Struct(record=record):
             return _object_schema(record_columns(record))
 
@@ -112,7 +121,12 @@ def _kind_schema(kind: ColumnKind) -> dict[str, Any]:  # noqa: PLR0911 - one a k
 def _nested_array(shape: tuple[int, ...]) -> dict[str, Any]:
     if not shape:
         return {"type": "number"}
-    return {"type": "array", "items": _nested_array(shape[1:]), "minItems": shape[0], "maxItems": shape[0]}
+    return {
+        "type": "array",
+        "items": _nested_array(shape[1:]),
+        "minItems": shape[0],
+        "maxItems": shape[0],
+    }
 
 
 def _table_markdown(spec: TableSpec) -> str:
@@ -131,7 +145,9 @@ def _column_markdown(column: Column) -> str:
     kind = column.kind
     meaning = f"→ `{kind.table}`. {kind.doc}" if isinstance(kind, Key) else kind.doc
     unit = getattr(kind, "unit", "")
-    stored = f"`{column.stored}`: {_type_text(kind)}" if column.stored else "made from the rows' order"
+    stored = (
+        f"`{column.stored}`: {_type_text(kind)}" if column.stored else "made from the rows' order"
+    )
     null = ", nullable" if column.nullable else ""
     return f"| `{column.field}` | {stored}{null} | {meaning}{f' [{unit}]' if unit else ''} |"
 

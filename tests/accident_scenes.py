@@ -29,7 +29,9 @@ def scene(cars: Mapping[int, Path], frames: int = FRAMES, **config) -> MotionLab
     The released rounding puts corners on half metres exactly where they are, so that cells span 4 m × 2 m, centre to
     centre.
     """
-    there = [_frame({actor: path[t] for actor, path in cars.items() if path[t]}) for t in range(frames)]
+    there = [
+        _frame({actor: path[t] for actor, path in cars.items() if path[t]}) for t in range(frames)
+    ]
     settings = MotionLabelConfig(**{"draw_ego": False, **config})
     shown = [*there, *[None] * (settings.label_frames - frames)]
     valid = np.append(np.ones(2, dtype=bool), [frame is not None for frame in shown])
@@ -38,12 +40,16 @@ def scene(cars: Mapping[int, Path], frames: int = FRAMES, **config) -> MotionLab
 
 def as_maps(*labels: MotionLabels) -> MotionOutput:
     """The labels as predictions, given as instance maps."""
-    return MotionOutput(grid=labels[0].config.grid, instances=np.stack([each.instance for each in labels]))
+    return MotionOutput(
+        grid=labels[0].config.grid, instances=np.stack([each.instance for each in labels])
+    )
 
 
 def as_heads(*labels: MotionLabels) -> MotionOutput:
     """The labels as predictions, given as heads."""
-    return MotionOutput(grid=labels[0].config.grid, heads=tuple(MotionHeads.from_labels(each) for each in labels))
+    return MotionOutput(
+        grid=labels[0].config.grid, heads=tuple(MotionHeads.from_labels(each) for each in labels)
+    )
 
 
 def _frame(cars: Mapping[int, tuple[float, float]]) -> FrameBoxes:

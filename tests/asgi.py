@@ -38,7 +38,10 @@ def get(app: Any, address: str, headers: dict[str, str] | None = None) -> Answer
         "raw_path": path.encode(),
         "root_path": "",
         "query_string": query.encode(),
-        "headers": [(b"host", b"localhost"), *((k.encode(), v.encode()) for k, v in (headers or {}).items())],
+        "headers": [
+            (b"host", b"localhost"),
+            *((k.encode(), v.encode()) for k, v in (headers or {}).items()),
+        ],
         "client": ("127.0.0.1", 1),
         "server": ("127.0.0.1", 80),
         "state": {},

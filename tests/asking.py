@@ -32,11 +32,19 @@ class TinyApp:
             await anyio.to_thread.run_sync(self.go_on.wait)
         if path == "/own":
             headers = [(b"Cache-Control", b"max-age=60"), (b"X-Frame-Options", b"DENY")]
-        await send({"type": "http.response.start", "status": 404 if path == "/missing" else 200, "headers": headers})
+        await send(
+            {
+                "type": "http.response.start",
+                "status": 404 if path == "/missing" else 200,
+                "headers": headers,
+            }
+        )
         if path == "/half":
             raise LookupError("no other half")
         body = f"{path} {scope['raw_path'].decode()}".encode()
-        await send({"type": "http.response.body", "body": b"" if scope["method"] == "HEAD" else body})
+        await send(
+            {"type": "http.response.body", "body": b"" if scope["method"] == "HEAD" else body}
+        )
 
     @staticmethod
     async def _lifespan(receive: Receive, send: Send) -> None:
@@ -63,7 +71,11 @@ class Answer:
 
 
 def ask(
-    port: int, target: str = "/", *headers: tuple[str, str], method: str = "GET", host: str | None = "localhost"
+    port: int,
+    target: str = "/",
+    *headers: tuple[str, str],
+    method: str = "GET",
+    host: str | None = "localhost",
 ) -> Answer:
     """Send one request with these headers and no others, and `Host` unless it is None."""
     connection = HTTPConnection("127.0.0.1", port, timeout=10)

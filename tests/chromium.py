@@ -42,9 +42,15 @@ class Browser:
 
         Not data that stand in the page, nor the browser's own start page, which may still be on its way.
         """
-        events = [json.loads(entry["message"])["message"] for entry in self.driver.get_log("performance")]
+        events = [
+            json.loads(entry["message"])["message"] for entry in self.driver.get_log("performance")
+        ]
         asked = [each["params"] for each in events if each["method"] == "Network.requestWillBeSent"]
-        return [each["request"]["url"] for each in asked if not each["request"]["url"].startswith(("data:", "chrome:"))]
+        return [
+            each["request"]["url"]
+            for each in asked
+            if not each["request"]["url"].startswith(("data:", "chrome:"))
+        ]
 
     def script(self, code: str) -> Any:
         """What JavaScript returns."""

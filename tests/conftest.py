@@ -41,7 +41,11 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         default=os.environ.get("DEEPACCIDENT_REAL") or None,
         help="folder with a real scenario, for tests/real, which are skipped without [DEEPACCIDENT_REAL]",
     )
-    parser.addoption("--pin", action="store_true", help="write tests/data/pinned.json anew (tests/test_pinned.py)")
+    parser.addoption(
+        "--pin",
+        action="store_true",
+        help="write tests/data/pinned.json anew (tests/test_pinned.py)",
+    )
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -53,7 +57,9 @@ def pytest_configure(config: pytest.Config) -> None:
         config.option.maxworkerrestart = "0"
     manager = config.pluginmanager
     if not manager.has_plugin("deepaccident") and not manager.is_blocked("deepaccident"):
-        manager.register(importlib.import_module("deepaccident_devkit.testing.plugin"), "deepaccident")
+        manager.register(
+            importlib.import_module("deepaccident_devkit.testing.plugin"), "deepaccident"
+        )
 
 
 def pytest_collection_finish() -> None:
@@ -85,7 +91,11 @@ def made(name: str, factory: pytest.TempPathFactory, **config: Any) -> Path:
     root.parent.mkdir(exist_ok=True)
     with root.with_name(f"{name}.lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
-        return root if root.exists() else make_release(root, SynthConfig(designed=True, **config), workers=1)
+        return (
+            root
+            if root.exists()
+            else make_release(root, SynthConfig(designed=True, **config), workers=1)
+        )
 
 
 @pytest.fixture(scope="session")
@@ -95,7 +105,9 @@ def release_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     In its accidents ego and other collide, as designed. Its labels count the very points of its clouds.
     """
     size = {"scenarios": 4, "frames": 6, "image_size": (64, 36)}
-    return made("deep accident", tmp_path_factory, **size, layout="A", seed=3, unplanned=0, exact=True)
+    return made(
+        "deep accident", tmp_path_factory, **size, layout="A", seed=3, unplanned=0, exact=True
+    )
 
 
 @pytest.fixture(scope="session")
@@ -113,7 +125,9 @@ def made_demo(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
 @pytest.fixture(scope="session")
 def release_root_b(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A synthetic release in layout B, labels only; read-only by agreement."""
-    return made("layout_b", tmp_path_factory, scenarios=6, frames=4, layout="B", seed=4, sensors=False)
+    return made(
+        "layout_b", tmp_path_factory, scenarios=6, frames=4, layout="B", seed=4, sensors=False
+    )
 
 
 @pytest.fixture(scope="session")
@@ -126,8 +140,13 @@ def da(release_root: Path) -> DeepAccident:
 def da_partial(release_root: Path, tmp_path_factory: pytest.TempPathFactory) -> DeepAccident:
     """`da` as a partial download: no front camera of the ego, no LiDAR of the pole, no other_vehicle_behind."""
     root = tmp_path_factory.mktemp("synthetic") / "partial"
-    shutil.copytree(release_root, root, ignore=shutil.ignore_patterns(".deepaccident", "other_vehicle_behind"))
-    for folder in (*root.glob("*/ego_vehicle/Camera_Front"), *root.glob("*/infrastructure/lidar01")):
+    shutil.copytree(
+        release_root, root, ignore=shutil.ignore_patterns(".deepaccident", "other_vehicle_behind")
+    )
+    for folder in (
+        *root.glob("*/ego_vehicle/Camera_Front"),
+        *root.glob("*/infrastructure/lidar01"),
+    ):
         shutil.rmtree(folder)
     return DeepAccident("v1", root, verbose=False)
 
@@ -141,7 +160,9 @@ def da_b(release_root_b: Path) -> DeepAccident:
 @pytest.fixture(scope="session")
 def motion_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An accident of ego and other and its normal twin of 3.5 s, labels only: with pasts, futures and ends."""
-    return made("motion", tmp_path_factory, scenarios=2, frames=35, seed=5, sensors=False, unplanned=0)
+    return made(
+        "motion", tmp_path_factory, scenarios=2, frames=35, seed=5, sensors=False, unplanned=0
+    )
 
 
 @pytest.fixture(scope="session")

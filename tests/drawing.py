@@ -31,7 +31,9 @@ def on_canvas(ax: Axes, places: Any) -> Any:
     return np.column_stack([u, ax.figure.bbox.height - v])
 
 
-def has_color(picture: Any, place: Any, color: str, *, within: float = 2.0, tolerance: float = 60.0) -> bool:
+def has_color(
+    picture: Any, place: Any, color: str, *, within: float = 2.0, tolerance: float = 60.0
+) -> bool:
     """Whether a pixel whose centre is within some pixels of a place of the canvas has a colour, nearly."""
     height, width = picture.shape[:2]
     rows, columns = np.mgrid[:height, :width]
@@ -48,7 +50,9 @@ def title_of(drawn: Axes | Figure) -> str:
 
 def tokens_of(figure: Any) -> list[str]:
     """The tokens beneath the titles of a figure."""
-    return [each.get_text().replace("\n", "") for each in figure.artists if each.get_gid() == "token"]
+    return [
+        each.get_text().replace("\n", "") for each in figure.artists if each.get_gid() == "token"
+    ]
 
 
 def words(ax: Axes) -> str:

@@ -46,7 +46,9 @@ def labels_as_maps(dataset: DeepAccident, token: str) -> Sequence[Any]:
 @dataclass(frozen=True)
 class Ratio:
     ratio: float
-    nothing: float = field(default=math.nan, compare=False)  # from Python 3.13 on, equal fields only make equal records
+    nothing: float = field(
+        default=math.nan, compare=False
+    )  # from Python 3.13 on, equal fields only make equal records
     median_of_all: float = 0.5
 
 

@@ -24,10 +24,14 @@ def evaluated(
 ) -> WarningEvaluator:
     """Accident recordings of 6 s and twins of 9 s, two samples a second; alarms are right before accidents, or not."""
     evaluator, endings = WarningEvaluator(protocol), (("accident", 61), ("normal", 91))
-    for number, (ending, last), (agent, involvement) in itertools.product(range(pairs), endings, agents):
+    for number, (ending, last), (agent, involvement) in itertools.product(
+        range(pairs), endings, agents
+    ):
         crash, frames = ending == "accident", np.arange(1, last + 1, 5)
         recording = f"type1_subtype1_{ending}/s{number}/{agent}"
-        for frame, score in zip(frames.tolist(), scores(crash, (last - frames) / 10).tolist(), strict=True):
+        for frame, score in zip(
+            frames.tolist(), scores(crash, (last - frames) / 10).tolist(), strict=True
+        ):
             counts: dict[str, Any] = {
                 "recording": recording,
                 "frame": frame,

@@ -9,7 +9,13 @@ from typing import Any
 import numpy as np
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.evaluation import DetectedBoxes, Resampling, breakdown, detection_truth, instances_of
+from deepaccident_devkit.evaluation import (
+    DetectedBoxes,
+    Resampling,
+    breakdown,
+    detection_truth,
+    instances_of,
+)
 from deepaccident_devkit.evaluation.accident import BoxTruth, accident_context
 from deepaccident_devkit.evaluation.breakdowns import sample_attributes
 from deepaccident_devkit.evaluation.predictions import Accident
@@ -48,7 +54,10 @@ def evaluation_run(
     for number, token in enumerate(tokens):
         evaluator.update(token, *_arguments(dataset, setup, token, np.random.default_rng(number)))
     attributes = sample_attributes(dataset, tokens)
-    hashes = {each.scenario: ScenarioHashes(label="1a", meta="2b", calib="3c") for each in attributes.values()}
+    hashes = {
+        each.scenario: ScenarioHashes(label="1a", meta="2b", calib="3c")
+        for each in attributes.values()
+    }
     return EvaluationRun(
         setup=setup,
         selection=SampleSelection(split="train", horizon=setup.horizon),
@@ -57,9 +66,13 @@ def evaluation_run(
         partial=partial,
         attributes=attributes,
         times_to_impact={token: dataset.get("sample", token)["time_to_impact"] for token in tokens},
-        breakdowns=tuple(breakdown(evaluator, attributes, by, Resampling(resamples=20)) for by in BREAKDOWNS),
+        breakdowns=tuple(
+            breakdown(evaluator, attributes, by, Resampling(resamples=20)) for by in BREAKDOWNS
+        ),
         release=ReleaseInfo(dataroot="/data/DeepAccident", version="v1", scenarios=hashes),
-        results=ResultsInfo(path="results", task=setup.task, fingerprint="5e5e", meta=meta, form=None),
+        results=ResultsInfo(
+            path="results", task=setup.task, fingerprint="5e5e", meta=meta, form=None
+        ),
         **more,
     )
 
@@ -80,12 +93,18 @@ def _arguments(
         truth = detection_truth(dataset, token, setup.rules)
         keep = source.uniform(size=len(truth)) < 0.8
         boxes = truth.select(keep)
-        boxes = replace(boxes, center=boxes.center + source.normal(0, 0.6, (len(boxes), 3)) * (1, 1, 0))
-        return DetectedBoxes(boxes=boxes, scores=np.round(source.uniform(size=len(boxes)), 2)), truth
+        boxes = replace(
+            boxes, center=boxes.center + source.normal(0, 0.6, (len(boxes), 3)) * (1, 1, 0)
+        )
+        return DetectedBoxes(
+            boxes=boxes, scores=np.round(source.uniform(size=len(boxes)), 2)
+        ), truth
     context = accident_context(dataset, token, setup.horizon, references=setup.task == "warning")
     if setup.protocol == "boxes" or setup.task == "warning":
         return _alarms(context.truth, source), None, context
-    label = dataset.motion_labels(token, MotionLabelConfig(protocol=setup.rules.labels)).to_present("bilinear")
+    label = dataset.motion_labels(token, MotionLabelConfig(protocol=setup.rules.labels)).to_present(
+        "bilinear"
+    )
     maps = np.roll(label.instance, source.integers(-2, 3, 2), (1, 2))
     lost = source.integers(1, 8)
     output = instances_of(np.where(maps == lost, 0, maps), label.config.grid)
@@ -95,7 +114,11 @@ def _arguments(
 def _alarms(truth: BoxTruth | None, source: np.random.Generator) -> list[Accident]:
     """Mostly one, somewhat off; sometimes one where nothing comes."""
     if truth is None or truth.accident is None:
-        return [Accident(positions=np.ones((2, 2)), time=0.5, score=0.3)] if source.uniform() < 0.3 else []
+        return (
+            [Accident(positions=np.ones((2, 2)), time=0.5, score=0.3)]
+            if source.uniform() < 0.3
+            else []
+        )
     off = source.normal(0, 2.5, (2, 2))
     late = float(np.clip(truth.accident.time + source.choice((-0.5, 0, 0, 0.5)), 0, None))
     score = round(float(source.uniform(0.3, 1)), 2)
@@ -104,7 +127,10 @@ def _alarms(truth: BoxTruth | None, source: np.random.Generator) -> list[Acciden
 
 
 def stored_run(
-    dataset: DeepAccident, setup: EvaluationSetup, path: Path, selection: SampleSelection | None = None
+    dataset: DeepAccident,
+    setup: EvaluationSetup,
+    path: Path,
+    selection: SampleSelection | None = None,
 ) -> tuple[EvaluationRun, Results]:
     """The same predictions, written as results and evaluated from there; by default of the split train."""
     selection = selection or default_selection(setup, "train")

@@ -47,7 +47,9 @@ def _read(path: Path, writing: int) -> None:
             read_calib(path)
         except CalibError as error:
             message = str(error)
-        os.write(writing, json.dumps({"message": message[:10_000], "peak": _peak() - before}).encode())
+        os.write(
+            writing, json.dumps({"message": message[:10_000], "peak": _peak() - before}).encode()
+        )
         status = 0
     finally:
         os._exit(status)

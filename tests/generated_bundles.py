@@ -5,7 +5,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from deepaccident_devkit.evaluation.runs.bundles import COUNTS_FILE, SCENARIOS_FILE, SCENARIOS_FORMAT, SUMMARY_FILE
+from deepaccident_devkit.evaluation.runs.bundles import (
+    COUNTS_FILE,
+    SCENARIOS_FILE,
+    SCENARIOS_FORMAT,
+    SUMMARY_FILE,
+)
 from deepaccident_devkit.evaluation.runs.evaluation_run import SUMMARY_FORMAT, SUMMARY_VERSION
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 
@@ -27,7 +32,11 @@ def motion_counts(found: int, missed: int) -> dict[str, Any]:
 
 
 def write_bundle(
-    folder: Path, cells: Sequence[tuple[int, int]], *, twins: bool = False, sent: Mapping[str, Any] | None = None
+    folder: Path,
+    cells: Sequence[tuple[int, int]],
+    *,
+    twins: bool = False,
+    sent: Mapping[str, Any] | None = None,
 ) -> Path:
     """A bundle of a sample a cluster, or of two that are equal: of an accident and of its twin.
 
@@ -58,12 +67,18 @@ def write_bundle(
         "agents": None,
         "counts": {"left_out": 0},
         "release": {"version": "v1", "dataroot": "data"},
-        "results": {"path": "results", "form": None, "meta": {} if sent is None else {"bytes": sent}},
+        "results": {
+            "path": "results",
+            "form": None,
+            "meta": {} if sent is None else {"bytes": sent},
+        },
         "breakdowns": {},
         "environment": {},
     }
     (folder / SUMMARY_FILE).write_text(json.dumps(summary))
-    scenarios = {token.rsplit("/", 2)[0]: {"label": None, "meta": None, "calib": None} for token in counts}
+    scenarios = {
+        token.rsplit("/", 2)[0]: {"label": None, "meta": None, "calib": None} for token in counts
+    }
     stated = {"format": SCENARIOS_FORMAT, "version": SUMMARY_VERSION, "scenarios": scenarios}
     (folder / SCENARIOS_FILE).write_text(json.dumps(stated))
     return folder

@@ -123,7 +123,9 @@ def _seen(scene: Scene, agent: Agent, cloud: Scan, rows: list[int]) -> Iterator[
     for row, pixel in zip(rows, pixels, strict=True):
         box = ground_from_lidar.inverse().matrix @ _box(scene, row)
         yaw = 0.0 if row == agent.row else np.arctan2(box[1, 0], box[0, 0])
-        along = (cloud.xyz - box[:3, 3]) @ quaternions.to_matrix(quaternions.from_yaw(np.array(yaw)))
+        along = (cloud.xyz - box[:3, 3]) @ quaternions.to_matrix(
+            quaternions.from_yaw(np.array(yaw))
+        )
         inside = (np.abs(along) <= scene.actors.size[row] / 2).all(axis=1)
         away = np.hypot(*(_box(scene, row) - ground_from_lidar.matrix)[:2, 3])
         yield inside.sum(), pixel, np.hypot(*box[:2, 3]), away <= TRACKING_RANGE
@@ -159,7 +161,9 @@ def last_moment(truth: Truth, brakers: tuple[bool, bool], deceleration: float) -
     after = np.arange(1, round(HORIZON / STEP) + 1) * STEP
     placed = []
     for path, velocity, brakes in zip(truth.fine, truth.velocities[:, -1], brakers, strict=True):
-        beyond = np.column_stack([path[-1, :2] + after[:, None] * velocity, np.full(len(after), path[-1, 2])])
+        beyond = np.column_stack(
+            [path[-1, :2] + after[:, None] * velocity, np.full(len(after), path[-1, 2])]
+        )
         poses = np.concatenate([path, beyond])
         arcs = np.append(0, np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T)))
         times = np.arange(len(poses)) * STEP
@@ -180,7 +184,9 @@ def last_moment(truth: Truth, brakers: tuple[bool, bool], deceleration: float) -
 def facing(truth: Truth) -> Array:
     """(2,) unit vector from the first collider to the second at the end, across the widest gap along any side."""
     poses, sizes = truth.fine[:, -1], truth.sizes[:, :2]
-    axes = np.concatenate([[[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]] for yaw in poses[:, 2]])
+    axes = np.concatenate(
+        [[[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]] for yaw in poses[:, 2]]
+    )
     reach = np.abs((axes @ axes.T).reshape(4, 2, 2) * sizes / 2).sum(axis=(1, 2))
     apart = axes @ (poses[1, :2] - poses[0, :2])
     best = np.argmax(np.abs(apart) - reach)

@@ -20,7 +20,9 @@ class GoldenModel:
         if not path.is_file():
             pytest.fail(f"{path}: is not there; see pytest --golden DIR")
         self._arrays = _arrays(path)
-        self.config: dict[str, Any] = json.loads(str(self._arrays["cfg"])) if "cfg" in self._arrays else {}
+        self.config: dict[str, Any] = (
+            json.loads(str(self._arrays["cfg"])) if "cfg" in self._arrays else {}
+        )
 
     def inputs(self) -> dict[str, Any]:
         return self._tensors("in.")

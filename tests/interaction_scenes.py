@@ -22,7 +22,9 @@ def straight(frames: int, x: float, y: float, speed: float, degrees: float = 0.0
 
 
 def tracks_of(
-    paths: Mapping[int, Path], sizes: Mapping[int, tuple] = MappingProxyType({}), unknown: tuple[int, ...] = ()
+    paths: Mapping[int, Path],
+    sizes: Mapping[int, tuple] = MappingProxyType({}),
+    unknown: tuple[int, ...] = (),
 ) -> ScenarioTracks:
     """Tracks of actors by id, cars unless `sizes` says otherwise, at the velocities of their ways.
 
@@ -58,4 +60,6 @@ def tracks_of(
         camera_visible=np.zeros(count, dtype=bool),
         row=np.arange(count),
     )
-    return ScenarioTracks(boxes=boxes, index=table[:, 0].astype(np.int64), agents=np.ones(count, dtype=np.uint8))
+    return ScenarioTracks(
+        boxes=boxes, index=table[:, 0].astype(np.int64), agents=np.ones(count, dtype=np.uint8)
+    )

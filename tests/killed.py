@@ -110,7 +110,8 @@ def _kill_at(step: int, *, after: bool) -> None:
         return call
 
     os.replace = watched(
-        os.replace, lambda _, path: not path.parent.name.startswith(".tables-") or path.name == "track.arrow"
+        os.replace,
+        lambda _, path: not path.parent.name.startswith(".tables-") or path.name == "track.arrow",
     )
     shutil.rmtree = watched(shutil.rmtree, lambda path, *_: Path(path).exists())
 

@@ -45,7 +45,9 @@ def cloud_of(message: Any) -> np.ndarray:
     """The points of a PointCloud, by its own fields."""
     kinds = [(field.name, _NUMPY_TYPES[field.type], field.offset) for field in message.fields]
     names, formats, offsets = zip(*kinds, strict=True)
-    dtype = np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": message.point_stride})
+    dtype = np.dtype(
+        {"names": names, "formats": formats, "offsets": offsets, "itemsize": message.point_stride}
+    )
     return np.frombuffer(message.data, dtype=dtype)
 
 

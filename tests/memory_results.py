@@ -38,7 +38,9 @@ class MemoryResults:
         frames = len(one.heads[0].segmentation) if maps is None else maps.shape[1]
         if maps is None:
             stored = "heads"
-        return MotionForm(stored=stored, grid=one.grid, predictions=len(one), frames=frames, labels=self.labels)
+        return MotionForm(
+            stored=stored, grid=one.grid, predictions=len(one), frames=frames, labels=self.labels
+        )
 
     def prediction(self, token: str) -> Any:
         """As it was given."""

@@ -83,9 +83,13 @@ def write_dataroot(
         made.add("category", name, name=name)
     made.add("attribute", "moving", name="vehicle.moving")
     made.add("visibility", "1", level="v0-40")
-    road_map = made.add("map", "map", category="semantic_prior", log_tokens=[], filename="maps/road.png")
+    road_map = made.add(
+        "map", "map", category="semantic_prior", log_tokens=[], filename="maps/road.png"
+    )
     for name in SENSORS:
-        made.add("sensor", name, channel=name, modality="lidar" if name == "LIDAR_TOP" else "camera")
+        made.add(
+            "sensor", name, channel=name, modality="lidar" if name == "LIDAR_TOP" else "camera"
+        )
     scenes: dict[str, list[str]] = {}
     for number, split in enumerate(splits):
         name = f"scene-{number:04d}"
@@ -99,7 +103,9 @@ def write_dataroot(
     return made
 
 
-def _write_scene(made: Dataroot, name: str, keyframes: int, boxes: int, images: Images, *, points: bool) -> None:
+def _write_scene(
+    made: Dataroot, name: str, keyframes: int, boxes: int, images: Images, *, points: bool
+) -> None:
     rng = made.rng
     gaps = np.append(0, rng.integers(420_000, 600_000, keyframes - 1))
     times = (1_500_000_000_000_000 + np.cumsum(gaps)).tolist()
@@ -116,7 +122,9 @@ def _write_scene(made: Dataroot, name: str, keyframes: int, boxes: int, images: 
     )
     for number, token in enumerate(samples):
         before, after = samples[number - 1] if number else "", (*samples, "")[number + 1]
-        made.add("sample", token, timestamp=times[number], scene_token=name, prev=before, next=after)
+        made.add(
+            "sample", token, timestamp=times[number], scene_token=name, prev=before, next=after
+        )
     start, speed, turn = rng.uniform(300, 900, 2), rng.uniform(4, 9), rng.uniform(-0.1, 0.1)
     heading = rng.uniform(-3, 3)
 
@@ -127,7 +135,9 @@ def _write_scene(made: Dataroot, name: str, keyframes: int, boxes: int, images: 
         return place, Quaternion(axis=[0, 0, 1], radians=heading + turn * seconds)
 
     annotated = [
-        row for number in range(boxes) for row in _write_track(made, f"{name}-actor{number}", samples, times, start)
+        row
+        for number in range(boxes)
+        for row in _write_track(made, f"{name}-actor{number}", samples, times, start)
     ]
     for sensor in SENSORS:
         _write_mount(made, f"{name}-{sensor}", sensor)
@@ -136,7 +146,9 @@ def _write_scene(made: Dataroot, name: str, keyframes: int, boxes: int, images: 
             for stamp in stamps:
                 place, rotation = ego(stamp)
                 own = f"{token}-{sensor}-{stamp}"
-                made.add("ego_pose", own, translation=place.tolist(), rotation=rotation.elements.tolist())
+                made.add(
+                    "ego_pose", own, translation=place.tolist(), rotation=rotation.elements.tolist()
+                )
                 file = f"{'samples' if stamp == times[number] else 'sweeps'}/{sensor}/{own}"
                 made.add(
                     "sample_data",
@@ -152,7 +164,9 @@ def _write_scene(made: Dataroot, name: str, keyframes: int, boxes: int, images: 
                 )
             if sensor == "LIDAR_TOP" and points:
                 here = [row for row in annotated if row["sample_token"] == token]
-                _write_cloud(made, made.tables["sample_data"][-len(stamps)], here, ego(times[number]))
+                _write_cloud(
+                    made, made.tables["sample_data"][-len(stamps)], here, ego(times[number])
+                )
             elif sensor != "LIDAR_TOP" and images != "none":
                 path = made.folder / made.tables["sample_data"][-len(stamps)]["filename"]
                 path.parent.mkdir(parents=True, exist_ok=True)
@@ -164,7 +178,10 @@ def _write_mount(made: Dataroot, token: str, sensor: str) -> None:
         rotation, place, intrinsic = Quaternion(axis=[0, 0, 1], degrees=-90), [0.9, 0.0, 1.84], []
     else:
         rotation = Quaternion(axis=[0, 0, 1], degrees=LOOKS[sensor]) * OPTICAL
-        place, intrinsic = [1.0, 0.0, 1.5], [[126.0, 0.0, 80.0], [0.0, 126.0, 45.0], [0.0, 0.0, 1.0]]
+        place, intrinsic = (
+            [1.0, 0.0, 1.5],
+            [[126.0, 0.0, 80.0], [0.0, 126.0, 45.0], [0.0, 0.0, 1.0]],
+        )
     made.add(
         "calibrated_sensor",
         token,
@@ -175,7 +192,9 @@ def _write_mount(made: Dataroot, token: str, sensor: str) -> None:
     )
 
 
-def _write_track(made: Dataroot, name: str, samples: list[str], times: list[int], start: np.ndarray) -> list[Row]:
+def _write_track(
+    made: Dataroot, name: str, samples: list[str], times: list[int], start: np.ndarray
+) -> list[Row]:
     """An actor that drives straight on, at some of the keyframes."""
     rng = made.rng
     category = CLASSES[int(name.rpartition("actor")[2]) % len(CLASSES)]
@@ -208,14 +227,26 @@ def _write_track(made: Dataroot, name: str, samples: list[str], times: list[int]
     return rows
 
 
-def _write_cloud(made: Dataroot, row: Row, boxes: list[Row], ego: tuple[np.ndarray, Quaternion]) -> None:
+def _write_cloud(
+    made: Dataroot, row: Row, boxes: list[Row], ego: tuple[np.ndarray, Quaternion]
+) -> None:
     """A flat road, and points in boxes."""
     rng, (place, rotation) = made.rng, ego
-    parts = [np.column_stack([rng.uniform(-20, 20, (2000, 2)), np.zeros(2000)]) @ rotation.rotation_matrix.T + place]
+    parts = [
+        np.column_stack([rng.uniform(-20, 20, (2000, 2)), np.zeros(2000)])
+        @ rotation.rotation_matrix.T
+        + place
+    ]
     for box in boxes:
-        inside = rng.uniform(-0.45, 0.45, (box["num_lidar_pts"], 3)) * np.take(box["size"], [1, 0, 2])
+        inside = rng.uniform(-0.45, 0.45, (box["num_lidar_pts"], 3)) * np.take(
+            box["size"], [1, 0, 2]
+        )
         parts.append(inside @ Quaternion(box["rotation"]).rotation_matrix.T + box["translation"])
-    mount = next(each for each in made.tables["calibrated_sensor"] if each["token"] == row["calibrated_sensor_token"])
+    mount = next(
+        each
+        for each in made.tables["calibrated_sensor"]
+        if each["token"] == row["calibrated_sensor_token"]
+    )
     in_ego = (np.concatenate(parts) - place) @ rotation.rotation_matrix
     in_lidar = (in_ego - mount["translation"]) @ Quaternion(mount["rotation"]).rotation_matrix
     path = made.folder / row["filename"]

@@ -71,7 +71,10 @@ def lidar_for_ego(folder: Path) -> None:
     lidar_of, _ = _lidars(folder)
     some = next(iter(lidar_of.values()))
     with rows_of(folder, "sample_data") as files:
-        moved = {row["calibrated_sensor_token"]: lidar_of.get(row["ego_pose_token"], some) for row in files}
+        moved = {
+            row["calibrated_sensor_token"]: lidar_of.get(row["ego_pose_token"], some)
+            for row in files
+        }
     with rows_of(folder, "ego_pose") as poses:
         for row in poses:
             put(row, matrix_of(row) @ lidar_of.get(row["token"], some))
@@ -118,8 +121,14 @@ def boxes_sunk(folder: Path) -> None:
 MISTAKES: dict[str, tuple[Callable[[Path], None], str]] = {
     "mirrored": (mirror_y, r"y is mirrored"),
     "LiDAR for ego": (lidar_for_ego, r"the LiDAR's frame stands for the ego's"),
-    "images in another order": (other_order, r"cameras are in another order: .*Camera_FrontLeft shows"),
-    "names in another order": (other_names, r"cameras are in another order: .*Camera_FrontLeft looks where"),
+    "images in another order": (
+        other_order,
+        r"cameras are in another order: .*Camera_FrontLeft shows",
+    ),
+    "names in another order": (
+        other_names,
+        r"cameras are in another order: .*Camera_FrontLeft looks where",
+    ),
     "sunk": (sunk, r"sunk by 1\.[89] m"),
     "boxes sunk": (boxes_sunk, r"sunk by 1\.9 m"),
 }

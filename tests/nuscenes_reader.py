@@ -10,7 +10,17 @@ import numpy as np
 from pyquaternion import Quaternion
 
 TABLES = (
-    *("category", "attribute", "visibility", "instance", "sensor", "calibrated_sensor", "ego_pose", "log", "scene"),
+    *(
+        "category",
+        "attribute",
+        "visibility",
+        "instance",
+        "sensor",
+        "calibrated_sensor",
+        "ego_pose",
+        "log",
+        "scene",
+    ),
     *("sample", "sample_data", "sample_annotation", "map"),
 )
 Tables = dict[str, dict[str, dict[str, Any]]]
@@ -40,20 +50,35 @@ def faults_of(tables: Tables) -> Iterator[str]:
             for field, value in row.items():
                 target = field.removesuffix("_token").removeprefix("first_").removeprefix("last_")
                 target = {"annotation": "sample_annotation"}.get(target, target)
-                if field.endswith("_token") and field != "deepaccident_token" and value not in tables[target]:
+                if (
+                    field.endswith("_token")
+                    and field != "deepaccident_token"
+                    and value not in tables[target]
+                ):
                     yield f"{name}.{field} of {row['token']} leads nowhere"
             if any(word not in tables["attribute"] for word in row.get("attribute_tokens", ())):
                 yield f"{name}: no such attribute"
-    for name, group in (("sample", "scene_token"), ("sample_annotation", "instance_token"), ("sample_data", None)):
+    for name, group in (
+        ("sample", "scene_token"),
+        ("sample_annotation", "instance_token"),
+        ("sample_data", None),
+    ):
         yield from _chain_faults(tables, name, group)
     mapped = {token for row in tables["map"].values() for token in row["log_tokens"]}
     yield from (f"log {token} is in no map" for token in tables["log"].keys() - mapped)
-    first = Counter(tables["sample"][row["first_sample_token"]]["timestamp"] for row in tables["scene"].values())
+    first = Counter(
+        tables["sample"][row["first_sample_token"]]["timestamp"] for row in tables["scene"].values()
+    )
     yield from (f"{count} scenes begin at {moment}" for moment, count in first.items() if count > 1)
     for scene in tables["scene"].values():
         own = [row for row in tables["sample"].values() if row["scene_token"] == scene["token"]]
-        ends = [row["token"] for row in own if not row["prev"]] + [row["token"] for row in own if not row["next"]]
-        if (len(own), ends) != (scene["nbr_samples"], [scene["first_sample_token"], scene["last_sample_token"]]):
+        ends = [row["token"] for row in own if not row["prev"]] + [
+            row["token"] for row in own if not row["next"]
+        ]
+        if (len(own), ends) != (
+            scene["nbr_samples"],
+            [scene["first_sample_token"], scene["last_sample_token"]],
+        ):
             yield f"scene {scene['name']} says other samples than it has"
 
 
@@ -79,7 +104,9 @@ def _chain_faults(tables: Tables, name: str, group: str | None) -> Iterator[str]
                 yield f"{name}.{way} of {row['token']} leaves its chain"
 
 
-def boxes_in(tables: Tables, data: dict[str, Any]) -> Iterator[tuple[dict[str, Any], np.ndarray, Quaternion]]:
+def boxes_in(
+    tables: Tables, data: dict[str, Any]
+) -> Iterator[tuple[dict[str, Any], np.ndarray, Quaternion]]:
     """The annotations of a keyframe's sensor file, with centre and rotation in the sensor's frame."""
     calibrated = tables["calibrated_sensor"][data["calibrated_sensor_token"]]
     pose = tables["ego_pose"][data["ego_pose_token"]]
@@ -97,7 +124,9 @@ def points_of(path: Path) -> np.ndarray:
     return np.fromfile(path, dtype="<f4").reshape(-1, 5)
 
 
-def count_points(points: np.ndarray, size: list[float], center: np.ndarray, rotation: Quaternion) -> int:
+def count_points(
+    points: np.ndarray, size: list[float], center: np.ndarray, rotation: Quaternion
+) -> int:
     """How many points lie in a box; size is width, length, height."""
     local = (points[:, :3] - center) @ rotation.rotation_matrix
     return int((np.abs(local) <= np.array(size)[[1, 0, 2]] / 2).all(axis=1).sum())

@@ -22,7 +22,9 @@ def agents_of(scenario: Path) -> list[str]:
 
 
 def timestamps_of(scenario: Path, agent: str) -> list[str]:
-    return sorted(each.stem for each in (scenario / agent).glob("*.yaml") if "additional" not in each.name)
+    return sorted(
+        each.stem for each in (scenario / agent).glob("*.yaml") if "additional" not in each.name
+    )
 
 
 def facts_of(scenario: Path, agent: str, timestamp: str, suffix: str = "yaml") -> Facts:
@@ -35,7 +37,9 @@ def points_of(scenario: Path, agent: str, timestamp: str) -> np.ndarray:
     """(N, 4) x, y, z and intensity: the share of red, as Open3D gives colours."""
     content = (scenario / agent / f"{timestamp}.pcd").read_bytes()
     header, _, body = content.partition(b"DATA binary\n")
-    told = dict(line.split(" ", 1) for line in header.decode().splitlines() if not line.startswith("#"))
+    told = dict(
+        line.split(" ", 1) for line in header.decode().splitlines() if not line.startswith("#")
+    )
     assert (told["FIELDS"], told["TYPE"], told["SIZE"]) == ("x y z rgb", "F F F U", "4 4 4 4")
     rows = np.frombuffer(body, dtype=[("xyz", "<f4", 3), ("rgb", "<u4")])
     assert len(rows) == int(told["POINTS"])
@@ -45,7 +49,14 @@ def points_of(scenario: Path, agent: str, timestamp: str) -> np.ndarray:
 def world_from(six: Any) -> np.ndarray:
     """(4, 4) of x, y, z, roll, yaw, pitch in degrees, as CARLA turns: left-handed, roll and pitch against the screw."""
     roll, yaw, pitch = np.radians(six[3:])
-    cr, sr, cy, sy, cp, sp = np.cos(roll), np.sin(roll), np.cos(yaw), np.sin(yaw), np.cos(pitch), np.sin(pitch)
+    cr, sr, cy, sy, cp, sp = (
+        np.cos(roll),
+        np.sin(roll),
+        np.cos(yaw),
+        np.sin(yaw),
+        np.cos(pitch),
+        np.sin(pitch),
+    )
     matrix = np.eye(4)
     matrix[:3, 3] = six[:3]
     matrix[:3, :3] = [

@@ -12,7 +12,11 @@ _METHODS = {"stored": zipfile.ZIP_STORED, "deflated": zipfile.ZIP_DEFLATED}
 
 def files_of(root: Path) -> list[Path]:
     """A release's own files, in order."""
-    return [path for path in sorted(root.rglob("*")) if path.is_file() and ".deepaccident" not in path.parts]
+    return [
+        path
+        for path in sorted(root.rglob("*"))
+        if path.is_file() and ".deepaccident" not in path.parts
+    ]
 
 
 def packed(
@@ -29,7 +33,9 @@ def packed(
         for path in files_of(root):
             below = path.relative_to(root)
             if chosen(below):
-                opened.writestr(written(above + below.as_posix()), path.read_bytes(), _METHODS[method])
+                opened.writestr(
+                    written(above + below.as_posix()), path.read_bytes(), _METHODS[method]
+                )
     return archive
 
 
@@ -37,7 +43,13 @@ def packed_by_agent(root: Path, folder: Path, names: Iterable[str]) -> Path:
     """A folder with a zip for each agent and one of the meta files, below odd folders; split files lie beside them."""
     for number, name in enumerate(names):
         method, above = KINDS[number % 2], ("", "DeepAccident/", "./data/x/")[number % 3]
-        packed(root, folder / ("", "more")[number % 2] / f"{name}.zip", method, above, lambda path: name in path.parts)  # noqa: B023
+        packed(
+            root,
+            folder / ("", "more")[number % 2] / f"{name}.zip",
+            method,
+            above,
+            lambda path: name in path.parts,  # noqa: B023
+        )
     for path in root.glob("*.txt"):
         (folder / path.name).write_bytes(path.read_bytes())
     return folder

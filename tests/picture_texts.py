@@ -22,7 +22,11 @@ def text_faults(figure: Any) -> list[str]:
         FigureCanvasAgg(figure).draw()  # as it is saved
     texts = [text for text in _drawn(figure) if text.get_visible() and text.get_text().strip()]
     page = figure.bbox.padded(TOUCHING)
-    boxes = [(text, text.get_window_extent().padded(-TOUCHING)) for text in texts if text.get_gid() != "token"]
+    boxes = [
+        (text, text.get_window_extent().padded(-TOUCHING))
+        for text in texts
+        if text.get_gid() != "token"
+    ]
     faults = [
         f"{text.get_text()!r}: outside"
         for text, box in boxes
@@ -34,14 +38,20 @@ def text_faults(figure: Any) -> list[str]:
         if text.get_fontsize() < text_size() - 1e-6
     ]
     pairs = combinations(boxes, 2)
-    faults += [f"{a.get_text()!r} over {b.get_text()!r}" for (a, one), (b, other) in pairs if one.fully_overlaps(other)]
+    faults += [
+        f"{a.get_text()!r} over {b.get_text()!r}"
+        for (a, one), (b, other) in pairs
+        if one.fully_overlaps(other)
+    ]
     return faults
 
 
 def panels_share(figure: Any) -> float:
     """Which share of a figure's canvas its panels are: axes that are switched off only hold words."""
     areas = [ax.get_window_extent() for ax in figure.axes if ax.axison]
-    return float(sum(area.width * area.height for area in areas) / (figure.bbox.width * figure.bbox.height))
+    return float(
+        sum(area.width * area.height for area in areas) / (figure.bbox.width * figure.bbox.height)
+    )
 
 
 def _drawn(figure: Any) -> list[Any]:
@@ -50,7 +60,11 @@ def _drawn(figure: Any) -> list[Any]:
     for axes in figure.axes:
         for axis in (axes.xaxis, axes.yaxis):
             ticks = axis._update_ticks()
-            shown = {axis.label, axis.offsetText, *(each for tick in ticks for each in (tick.label1, tick.label2))}
+            shown = {
+                axis.label,
+                axis.offsetText,
+                *(each for tick in ticks for each in (tick.label1, tick.label2)),
+            }
             off = not (axes.axison and axis.get_visible())
             hidden.update(each for each in axis.findobj(Text) if off or each not in shown)
         clipped = [text for text in axes.texts if text.get_clip_on()]

@@ -60,16 +60,22 @@ def linked(raw: np.ndarray, flow: np.ndarray, distance: float) -> np.ndarray:
         moved = grid + flow[t]
         before = [mean(moved, result[-1] == name) for name in known]
         after = [mean(grid, following == name) for name in range(1, int(following.max()) + 1)]
-        costs = np.array([[np.sqrt((a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2) for a in after] for b in before])
+        costs = np.array(
+            [[np.sqrt((a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2) for a in after] for b in before]
+        )
         names = {
-            int(j) + 1: known[i] for i, j in zip(*linear_sum_assignment(costs), strict=True) if costs[i, j] < distance
+            int(j) + 1: known[i]
+            for i, j in zip(*linear_sum_assignment(costs), strict=True)
+            if costs[i, j] < distance
         }
         unmatched = set(np.unique(following)).difference(set(names))
         unmatched.remove(0)
         for name in unmatched:
             newest += 1
             names[int(name)] = newest
-        result.append(np.vectorize(lambda name, names=names: names.get(name, 0), otypes=[np.int64])(following))
+        result.append(
+            np.vectorize(lambda name, names=names: names.get(name, 0), otypes=[np.int64])(following)
+        )
     return np.stack(result)
 
 

@@ -18,11 +18,23 @@ PREDICTIONS = 2
 
 
 def document(task: str, **body: Any) -> dict[str, Any]:
-    return {"format": "DeepAccident results", "version": 1, "task": task, "meta": {"method": "plain"}, **body}
+    return {
+        "format": "DeepAccident results",
+        "version": 1,
+        "task": task,
+        "meta": {"method": "plain"},
+        **body,
+    }
 
 
 def accident(**changes: Any) -> dict[str, Any]:
-    return {"positions": [[12.5, 0.5], [13.0, -2.0]], "time": 1.5, "score": 0.75, "ids": [1236, 1240], **changes}
+    return {
+        "positions": [[12.5, 0.5], [13.0, -2.0]],
+        "time": 1.5,
+        "score": 0.75,
+        "ids": [1236, 1240],
+        **changes,
+    }
 
 
 def box(token: str, **changes: Any) -> dict[str, Any]:
@@ -47,17 +59,33 @@ def accidents() -> dict[str, Any]:
 def detections() -> dict[str, Any]:
     """Two boxes, one and none."""
     first, second, third = TOKENS
-    lists = [[box(first), box(first, velocity=None, attribute_name="")], [box(second, detection_name="pedestrian")], []]
+    lists = [
+        [box(first), box(first, velocity=None, attribute_name="")],
+        [box(second, detection_name="pedestrian")],
+        [],
+    ]
     return document("detection", results=dict(zip((first, second, third), lists, strict=True)))
 
 
 def plan(**changes: Any) -> dict[str, Any]:
-    return {"times": [0.5, 1.0], "path": [[4.0, 0.0], [8.0, 0.5]], "score": 0.75, "yaw": [0.0, 0.1], **changes}
+    return {
+        "times": [0.5, 1.0],
+        "path": [[4.0, 0.0], [8.0, 0.5]],
+        "score": 0.75,
+        "yaw": [0.0, 0.1],
+        **changes,
+    }
 
 
 def forecast(**changes: Any) -> dict[str, Any]:
     paths = [[[12.0, 3.5], [10.0, 3.5]], [[12.0, 3.5], [11.0, 4.0]]]
-    return {"id": 1236, "times": [0.5, 1.0], "paths": paths, "probabilities": [0.75, 0.25], **changes}
+    return {
+        "id": 1236,
+        "times": [0.5, 1.0],
+        "paths": paths,
+        "probabilities": [0.75, 0.25],
+        **changes,
+    }
 
 
 def plans() -> dict[str, Any]:
@@ -104,7 +132,8 @@ def listed(folder: Path, file: str, tokens: Sequence[str]) -> dict[str, Any]:
 def write_shard(path: Path, samples: Mapping[str, Mapping[str, np.ndarray]]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     np.savez_compressed(
-        path, **{f"{token}/{name}": a for token, arrays in samples.items() for name, a in arrays.items()}
+        path,
+        **{f"{token}/{name}": a for token, arrays in samples.items() for name, a in arrays.items()},
     )
 
 

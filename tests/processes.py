@@ -17,7 +17,10 @@ def is_running(process: int) -> bool:
 def workers_of(process: int) -> list[int]:
     """The pool's processes that a process has started."""
     try:
-        found = [int(child) for child in Path(f"/proc/{process}/task/{process}/children").read_text().split()]
+        found = [
+            int(child)
+            for child in Path(f"/proc/{process}/task/{process}/children").read_text().split()
+        ]
     except OSError:
         return []
     return [child for child in found if is_running(child) and b"spawn_main" in _command(child)]

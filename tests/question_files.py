@@ -32,7 +32,11 @@ def read_back(done: Exported) -> Asked:
     lines = (done.folder / "questions" / "questions.jsonl").read_bytes().splitlines()
     by_id = {json.loads(line)["id"]: line for line in lines}
     assert [each["id"] for each in truth] == list(by_id) == sorted(by_id)
-    return Asked(done, {each["sample"]: by_id[each["id"]] for each in truth}, {each["sample"]: each for each in truth})
+    return Asked(
+        done,
+        {each["sample"]: by_id[each["id"]] for each in truth},
+        {each["sample"]: each for each in truth},
+    )
 
 
 def ask(dataset: DeepAccident, folder: Path, form: Questions) -> Asked:

@@ -13,10 +13,21 @@ from torch.utils.data import DataLoader, DistributedSampler
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import EvaluationError
-from deepaccident_devkit.evaluation import AccidentEvaluator, DetectionEvaluator, MotionEvaluator, detection_truth
+from deepaccident_devkit.evaluation import (
+    AccidentEvaluator,
+    DetectionEvaluator,
+    MotionEvaluator,
+    detection_truth,
+)
 from deepaccident_devkit.evaluation.detection import DetectedBoxes
 from deepaccident_devkit.evaluation.evaluator import Evaluator
-from deepaccident_devkit.training.torch import RandomAugmentation, V2XConfig, V2XDataset, collate, merged_evaluator
+from deepaccident_devkit.training.torch import (
+    RandomAugmentation,
+    V2XConfig,
+    V2XDataset,
+    collate,
+    merged_evaluator,
+)
 
 RANKS = 2
 
@@ -37,10 +48,14 @@ def _rank(rank: int, work: Callable[..., None], folder: Path, *arguments: Any) -
         distributed.destroy_process_group()
 
 
-def everything(rank: int, folder: Path, dataset: DeepAccident, tokens: list[str], root: Path) -> None:
+def everything(
+    rank: int, folder: Path, dataset: DeepAccident, tokens: list[str], root: Path
+) -> None:
     """Leaves `<what>_<rank>.json` of all that the tests look at."""
     write(folder, "opened", rank, tables_of(root))
-    data = V2XDataset(dataset, tokens, V2XConfig(points=False, boxes=None, augmentation=RandomAugmentation()))
+    data = V2XDataset(
+        dataset, tokens, V2XConfig(points=False, boxes=None, augmentation=RandomAugmentation())
+    )
     seen = tokens[rank::RANKS]
     for evaluator in counted(dataset, seen):
         merged_evaluator(evaluator).save(folder / f"{type(evaluator).__name__}_{rank}.json")
@@ -58,7 +73,11 @@ def tables_of(root: Path) -> str:
 
 
 def counted(dataset: DeepAccident, tokens: list[str]) -> list[Evaluator[Any]]:
-    motion, accident, detection = MotionEvaluator(), AccidentEvaluator("paper"), DetectionEvaluator()
+    motion, accident, detection = (
+        MotionEvaluator(),
+        AccidentEvaluator("paper"),
+        DetectionEvaluator(),
+    )
     for token in tokens:
         prediction, label = labels_as_maps(dataset, token)
         motion.update(token, prediction, label)
@@ -72,7 +91,9 @@ def counted(dataset: DeepAccident, tokens: list[str]) -> list[Evaluator[Any]]:
 def trained(data: V2XDataset) -> list[dict[str, Any]]:
     """Token → augmentation matrix of this rank's items, for two epochs of a worker that stays."""
     sampler = DistributedSampler(data)
-    loader = DataLoader(data, sampler=sampler, num_workers=1, persistent_workers=True, collate_fn=collate)
+    loader = DataLoader(
+        data, sampler=sampler, num_workers=1, persistent_workers=True, collate_fn=collate
+    )
     epochs = []
     for epoch in range(2):
         data.set_epoch(epoch)

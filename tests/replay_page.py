@@ -22,7 +22,9 @@ def normal(dataset: DeepAccident) -> str:
 
 def data_of(page: Path | str) -> dict[str, Any]:
     text = page if isinstance(page, str) else page.read_text(encoding="utf-8")
-    (found,) = re.findall(r'<script type="application/json" id="data">(.*?)</script>', text, re.DOTALL)
+    (found,) = re.findall(
+        r'<script type="application/json" id="data">(.*?)</script>', text, re.DOTALL
+    )
     data: dict[str, Any] = json.loads(found)
     return data
 

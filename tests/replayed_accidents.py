@@ -14,7 +14,9 @@ STEP = 0.1
 def straight(start: tuple[float, float], yaw: float, speed: float, frames: int) -> np.ndarray:
     """(F, 3) constant speed along the heading."""
     way = np.arange(frames) * STEP * speed
-    return np.column_stack([start[0] + way * np.cos(yaw), start[1] + way * np.sin(yaw), np.full(frames, yaw)])
+    return np.column_stack(
+        [start[0] + way * np.cos(yaw), start[1] + way * np.sin(yaw), np.full(frames, yaw)]
+    )
 
 
 def accident(
@@ -69,7 +71,9 @@ def wild_paths(draw: Callable[..., float], frames: int = 21) -> np.ndarray:
     """(F, 3) of a path with turns, standing still and jumps of speed, whose last frame is near the origin."""
     seed = draw(st.integers(0, 10_000))
     rng = np.random.default_rng(seed)
-    speeds = np.repeat(rng.choice([0.0, 2.0, 8.0, 15.0, 25.0], 7), 3)[: frames - 1] + rng.normal(0, 0.3, frames - 1)
+    speeds = np.repeat(rng.choice([0.0, 2.0, 8.0, 15.0, 25.0], 7), 3)[: frames - 1] + rng.normal(
+        0, 0.3, frames - 1
+    )
     speeds = np.maximum(speeds, 0) * (speeds > 0.5)
     yaws = np.cumsum(rng.normal(0, 0.08, frames)) + rng.uniform(-np.pi, np.pi)
     steps = np.column_stack([np.cos(yaws[1:]), np.sin(yaws[1:])]) * speeds[:, None] * STEP

@@ -65,4 +65,6 @@ def process(folder: Path, workers: int = 1, killed_at: str = "") -> "subprocess.
     """Another process that makes all, and imports this module by its name as its workers do."""
     code = f"from pathlib import Path; import stored; stored.made(Path({str(folder)!r}), {workers}, {killed_at=!r})"
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parent)}
-    return subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.PIPE, text=True, env=environment)
+    return subprocess.Popen(
+        [sys.executable, "-c", code], stderr=subprocess.PIPE, text=True, env=environment
+    )

@@ -9,7 +9,12 @@ from typing import Any
 BASELINES: dict[str, Any] = {
     "title": "A small <study>",
     "question": "Does it run?",
-    "headline": {"row": "sees all", "less": "sees single", "number": "iou_100", "where": "accidents"},
+    "headline": {
+        "row": "sees all",
+        "less": "sees single",
+        "number": "iou_100",
+        "where": "accidents",
+    },
     "releases": {
         "test": {
             "seed": 203,

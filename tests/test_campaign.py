@@ -44,12 +44,19 @@ def test_changed_files_are_read_or_refused(healthy: Path) -> None:
     ("kinds", "how"),
     [
         ([kind for kind in planted.KINDS if kind != "hang"], {}),
-        (["hang"], {"seconds": 1.0, "workers": 1}),  # of work: only what never ends has more on any machine
+        (
+            ["hang"],
+            {"seconds": 1.0, "workers": 1},
+        ),  # of work: only what never ends has more on any machine
     ],
 )
-def test_every_way_to_fail_is_noticed(healthy: Path, kinds: list[str], how: dict[str, float]) -> None:
+def test_every_way_to_fail_is_noticed(
+    healthy: Path, kinds: list[str], how: dict[str, float]
+) -> None:
     """Bad readers, by turns with good ones: what fails does not touch the next case."""
-    cases = [case for kind in kinds for case in (Case(kind, "emptied", 0), Case("read", "emptied", 0))]
+    cases = [
+        case for kind in kinds for case in (Case(kind, "emptied", 0), Case("read", "emptied", 0))
+    ]
     verdicts = [outcome.verdict for outcome in run(cases, healthy, kinds="campaign.planted", **how)]
     assert verdicts == [verdict for kind in kinds for verdict in (kind.split(",")[0], "read")]
 
@@ -64,6 +71,7 @@ def test_verbs_are_killed_and_meet_a_full_disk(healthy: Path, tmp_path: Path) ->
 def test_the_limits_of_the_security_page_are_those_of_the_code() -> None:
     text = (TOP / "SECURITY.md").read_text(encoding="utf-8")
     stated = {
-        kind: int(size) << 20 for kind, size in re.findall(r"^\| `(\w+)` \|[^|]*\| (\d+) MiB \|$", text, re.MULTILINE)
+        kind: int(size) << 20
+        for kind, size in re.findall(r"^\| `(\w+)` \|[^|]*\| (\d+) MiB \|$", text, re.MULTILINE)
     }
     assert stated == BYTE_LIMITS

@@ -28,14 +28,18 @@ FAILED tests/test_one.py::test_two - assert 1 == 2
 
 def test_a_failure_is_reported_by_name_and_the_other_steps_run(tmp_path: Path) -> None:
     repository, output = tmp_path / "repository", tmp_path / "output.txt"
-    shutil.copytree(TOP / ".ci", repository / ".ci", ignore=shutil.ignore_patterns("steps", "node_modules"))
+    shutil.copytree(
+        TOP / ".ci", repository / ".ci", ignore=shutil.ignore_patterns("steps", "node_modules")
+    )
     subprocess.run(["git", "init", "--quiet", repository], check=True)
     output.write_text(FAILURES)
     for name, checks in STEPS.items():
         script = repository / ".ci" / "steps" / f"{name}.sh"
         script.parent.mkdir(exist_ok=True)
         script.write_text(BEGIN + checks.replace("FILE", str(output)) + "wait\n")
-    done = subprocess.run([repository / ".ci" / "run", *STEPS], capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [repository / ".ci" / "run", *STEPS], capture_output=True, text=True, check=False
+    )
     assert done.returncode == 1
     table, _, rest = done.stdout.partition("\nstep ")[2].partition("====")
     results = dict(re.findall(r"^(\w+) +(passed|FAILED) +\d+$", table, re.MULTILINE))
@@ -46,11 +50,15 @@ def test_a_failure_is_reported_by_name_and_the_other_steps_run(tmp_path: Path) -
     assert "E  assert 1 == 2" in failures
     assert "no_such_command" in failures
     assert "FAILED tests/test_one.py::test_two - assert 1 == 2" in summary
-    assert summary.index("good, tests: 5 passed") < summary.index("tests, tests: 1 failed, 4 passed")
+    assert summary.index("good, tests: 5 passed") < summary.index(
+        "tests, tests: 1 failed, 4 passed"
+    )
 
 
 def test_an_unknown_step_is_refused() -> None:
-    done = subprocess.run([TOP / ".ci" / "run", "quik"], capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [TOP / ".ci" / "run", "quik"], capture_output=True, text=True, check=False
+    )
     assert (done.returncode, "quik" in done.stderr) == (2, True)
 
 
@@ -62,7 +70,12 @@ def release() -> ModuleType:
 @pytest.fixture
 def copy(release: ModuleType, tmp_path: Path) -> Path:
     """The files that state the version or an address."""
-    for name in (*release.PLACES, "pyproject.toml", "RELEASING.md", ".github/ISSUE_TEMPLATE/config.yml"):
+    for name in (
+        *release.PLACES,
+        "pyproject.toml",
+        "RELEASING.md",
+        ".github/ISSUE_TEMPLATE/config.yml",
+    ):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(TOP / name, tmp_path / name)
     return tmp_path
@@ -79,7 +92,10 @@ def test_a_version_is_set_everywhere(release: ModuleType, copy: Path) -> None:
     assert list(release.disagreements(copy, "v1.2.0")) == []
     assert release.STABLE in (copy / "pyproject.toml").read_text()
     assert release.notes_of(copy) != notes
-    once = {name: (copy / name).read_text() for name in ("pyproject.toml", "CITATION.cff", "CHANGELOG.md")}
+    once = {
+        name: (copy / name).read_text()
+        for name in ("pyproject.toml", "CITATION.cff", "CHANGELOG.md")
+    }
     assert all("github.com/someone/" in once[name] for name in ("pyproject.toml", "CITATION.cff"))
     release.main(["set", "1.2.0"], copy)
     assert once == {name: (copy / name).read_text() for name in once}
@@ -95,7 +111,12 @@ def test_a_version_is_set_everywhere(release: ModuleType, copy: Path) -> None:
     ],
 )
 def test_a_release_is_refused_where_a_file_disagrees(
-    release: ModuleType, copy: Path, capsys: pytest.CaptureFixture[str], file: str, old: str, new: str
+    release: ModuleType,
+    copy: Path,
+    capsys: pytest.CaptureFixture[str],
+    file: str,
+    old: str,
+    new: str,
 ) -> None:
     (copy / "RELEASING.md").write_text("    owner = someone\n")
     release.main(["set", "1.2.0rc1"], copy)

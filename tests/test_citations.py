@@ -23,9 +23,23 @@ _SECTION = re.compile(r"\b(docs/\w+\.md),[\s#]+([A-Z][\w'-]*)")
 def repository_files() -> list[str]:
     """Without git, since a copy of the checkout has none."""
     found = [path for path in TOP.iterdir() if path.is_file()]
-    for folder in ("deepaccident_devkit", "docs", "schema", "tests", "tutorials", "benchmarks", ".ci"):
-        found += [path for path in (TOP / folder).rglob("*") if path.is_file() and "__pycache__" not in path.parts]
-    return [path.relative_to(TOP).as_posix() for path in found if path.parent != TOP / "docs" / "api"]
+    for folder in (
+        "deepaccident_devkit",
+        "docs",
+        "schema",
+        "tests",
+        "tutorials",
+        "benchmarks",
+        ".ci",
+    ):
+        found += [
+            path
+            for path in (TOP / folder).rglob("*")
+            if path.is_file() and "__pycache__" not in path.parts
+        ]
+    return [
+        path.relative_to(TOP).as_posix() for path in found if path.parent != TOP / "docs" / "api"
+    ]
 
 
 def texts(files: list[str]) -> Iterator[tuple[str, str]]:
@@ -73,7 +87,11 @@ def test_every_page_that_is_cited_ships(files: list[str], citing: dict[str, str]
 
 def test_every_section_that_is_cited_is_a_heading(citing: dict[str, str]) -> None:
     headings = {
-        name: {word for line in re.findall(r"^#+ (.*)$", text, re.MULTILINE) for word in line.split()[:1]}
+        name: {
+            word
+            for line in re.findall(r"^#+ (.*)$", text, re.MULTILINE)
+            for word in line.split()[:1]
+        }
         for name, text in citing.items()
         if name.endswith(".md")
     }

@@ -23,7 +23,20 @@ from deepaccident_devkit.selection.splits import official_split
 @pytest.mark.slow
 def test_synth_index_info_end_to_end(tmp_path: Path) -> None:
     out = tmp_path / "my release"
-    made = ran("synth", out, "--scenarios", 2, "--frames", 3, "--size", "64x36", "--layout", "B", "--seed", 7)
+    made = ran(
+        "synth",
+        out,
+        "--scenarios",
+        2,
+        "--frames",
+        3,
+        "--size",
+        "64x36",
+        "--layout",
+        "B",
+        "--seed",
+        7,
+    )
     assert "deepaccident info" in made.stdout
     assert "2 scenarios, 30 samples" in ran("index", out).stdout
     text = " ".join(ran("info", out).stdout.split())
@@ -44,7 +57,9 @@ def test_synth_index_info_end_to_end(tmp_path: Path) -> None:
 
 def test_errors_are_one_message_and_status_2(tmp_path: Path) -> None:
     failed = ran("info", tmp_path / "nowhere", status=2)
-    assert failed.stderr.startswith(f"error: {tmp_path / 'nowhere'}: does not exist; give the folder")
+    assert failed.stderr.startswith(
+        f"error: {tmp_path / 'nowhere'}: does not exist; give the folder"
+    )
     assert failed.stdout == ""
 
 
@@ -65,9 +80,13 @@ cli.main()
 
 
 def test_of_an_error_in_a_loaders_worker_the_message_is_told_alone() -> None:
-    failed = subprocess.run([sys.executable, "-c", FAILING], check=False, capture_output=True, text=True)
+    failed = subprocess.run(
+        [sys.executable, "-c", FAILING], check=False, capture_output=True, text=True
+    )
     assert (failed.returncode, failed.stderr) == (2, "error: a.jpg: no such file\n")
-    failed = subprocess.run([sys.executable, "-c", FAILING, "memory"], check=False, capture_output=True, text=True)
+    failed = subprocess.run(
+        [sys.executable, "-c", FAILING, "memory"], check=False, capture_output=True, text=True
+    )
     assert (failed.returncode, failed.stderr[:24]) == (2, "error: memory ran out; u")
 
 
@@ -79,7 +98,10 @@ def test_a_broken_release_is_listed_and_may_be_skipped(own_release: Path) -> Non
     assert "1 of 6 scenarios are broken" in told
     assert f"{broken}:2: expected 13 fields, found 5" in told
     skipped = ran("info", own_release, "--on-error", "skip")
-    assert ("left out as broken:" in skipped.stdout, "WARNING: left out" in skipped.stderr) == (True, True)
+    assert ("left out as broken:" in skipped.stdout, "WARNING: left out" in skipped.stderr) == (
+        True,
+        True,
+    )
 
 
 OF_FILES = ("--version", "--workers", "--scheduler")
@@ -118,7 +140,10 @@ def test_index_check_sees_an_edit_that_folder_times_hide(own_release: Path) -> N
     ran("index", own_release)
     label = next(own_release.glob("train/*/ego_vehicle/label/*/*_001.txt"))
     label.write_text("\n".join(label.read_text().splitlines()[:-1]) + "\n")
-    before, after = (json.loads(ran("info", own_release, "--json").stdout)["tables"]["annotation"] for _ in range(2))
+    before, after = (
+        json.loads(ran("info", own_release, "--json").stdout)["tables"]["annotation"]
+        for _ in range(2)
+    )
     ran("check", "index", own_release)
     checked = json.loads(ran("info", own_release, "--json").stdout)["tables"]["annotation"]
     assert (after, checked) == (before, before - 1)
@@ -131,11 +156,15 @@ def imported(*words: str) -> set[str]:
         from deepaccident_devkit.cli import deepaccident
         deepaccident({words!r}, standalone_mode=False)
         print("IMPORTED", *sys.modules)"""
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300, check=True)
-    names = done.stdout.rpartition("IMPORTED")[2].split()
-    return {name.removeprefix("deepaccident_devkit.") for name in names if name.startswith("deepaccident_devkit.")} | (
-        {"numpy"} & set(names)
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=300, check=True
     )
+    names = done.stdout.rpartition("IMPORTED")[2].split()
+    return {
+        name.removeprefix("deepaccident_devkit.")
+        for name in names
+        if name.startswith("deepaccident_devkit.")
+    } | ({"numpy"} & set(names))
 
 
 @pytest.mark.parametrize(
@@ -157,10 +186,18 @@ def test_split_makes_the_official_split_and_writes_it(tmp_path: Path) -> None:
     for number in range(14):
         write_tiny_release(root, frames=6, agents=("ego_vehicle",), name=f"{name}{number:02d}")
     made = ran("split", root, "--out", tmp_path / "new", "--json")
-    assert json.loads(made.stdout)["scenarios"] == {"train": 10, "val": 2, "test": 2, "train_mini": 2, "val_mini": 0}
+    assert json.loads(made.stdout)["scenarios"] == {
+        "train": 10,
+        "val": 2,
+        "test": 2,
+        "train_mini": 2,
+        "val_mini": 0,
+    }
     assert f"written: {tmp_path / 'new' / 'val_mini.txt'}" in made.stderr
     by_library = official_split(DeepAccident(dataroot=root)).by_name()
-    assert {path.stem: tuple(read_split_file(path)) for path in (tmp_path / "new").iterdir()} == by_library
+    assert {
+        path.stem: tuple(read_split_file(path)) for path in (tmp_path / "new").iterdir()
+    } == by_library
     again = ("split", root, "--out", tmp_path / "new", "--seed", 1)
     assert "train.txt: is there already" in ran(*again, status=2).stderr
     ran(*again, "--overwrite")
@@ -171,7 +208,10 @@ def test_split_makes_the_official_split_and_writes_it(tmp_path: Path) -> None:
 def test_split_saves_a_selection(own_release: Path, tmp_path: Path) -> None:
     some = ("--where", "collision=true", "--where", "split=train")
     saved = ran("split", own_release, *some, "--out", tmp_path / "a.txt")
-    found = [scenario["token"] for scenario in DeepAccident(dataroot=own_release).find(collision=True, split="train")]
+    found = [
+        scenario["token"]
+        for scenario in DeepAccident(dataroot=own_release).find(collision=True, split="train")
+    ]
     assert read_split_file(tmp_path / "a.txt") == found
     assert f"scenarios {len(found)}" in " ".join(saved.stdout.split())
     ran("split", own_release, "--out", tmp_path / "b.txt")
@@ -190,15 +230,26 @@ def test_info_lists_the_scenarios_of_where(own_release: Path) -> None:
         [each["token"] for each in some],
     )
     none = ran("info", own_release, "--where", "length=1..2").stdout
-    assert none == "no scenario matches length=1..2; deepaccident info --fields lists what can be asked for\n"
+    assert (
+        none
+        == "no scenario matches length=1..2; deepaccident info --fields lists what can be asked for\n"
+    )
 
 
 @pytest.mark.slow
 def test_stats_prints_and_writes_tables_and_figures(own_release: Path, tmp_path: Path) -> None:
     out = tmp_path / "new" / "stats"
-    made = ran("info", own_release, "--statistics", "--where", "designed_accident=true", "--out", out)
+    made = ran(
+        "info", own_release, "--statistics", "--where", "designed_accident=true", "--out", out
+    )
     names = {path.name for path in out.iterdir()}
-    assert {"statistics.json", "ends.csv", "collision_pairs.csv", "scenarios.png", "collisions.png"} <= names
+    assert {
+        "statistics.json",
+        "ends.csv",
+        "collision_pairs.csv",
+        "scenarios.png",
+        "collisions.png",
+    } <= names
     told = ("selected: 3 of 6 scenarios", f"written: {len(names)} files in {out}")
     assert ([each for each in told if each not in made.stdout], [*out.glob("*.tmp")]) == ([], [])
     content = json.loads(ran("info", own_release, "--statistics", "--json").stdout)
@@ -208,7 +259,9 @@ def test_stats_prints_and_writes_tables_and_figures(own_release: Path, tmp_path:
 
 
 @pytest.mark.slow
-def test_labels_writes_a_split_and_goes_on_where_it_stopped(own_release: Path, tmp_path: Path) -> None:
+def test_labels_writes_a_split_and_goes_on_where_it_stopped(
+    own_release: Path, tmp_path: Path
+) -> None:
     out, agents = tmp_path / "new" / "labels", ("ego_vehicle", "infrastructure")
     verb = ("labels", own_release, "--split", "train", "--out", out, "--workers", 2)
     switches = ("--switch", "half_cell_shift=no", "--switch", "own_box_default=no")
@@ -218,7 +271,9 @@ def test_labels_writes_a_split_and_goes_on_where_it_stopped(own_release: Path, t
     assert (made.stdout, "motion labels: 100%" in made.stderr) == (whole, True)
     rules = replace(LABEL_PROTOCOLS["released"], half_cell_shift=False, own_box_default=False)
     files = LabelFiles(out, MotionLabelConfig(protocol=rules))
-    assert {token.rsplit("/", 1)[0] for token in files} == {f"{one}/{agent}" for one in scenarios for agent in agents}
+    assert {token.rsplit("/", 1)[0] for token in files} == {
+        f"{one}/{agent}" for one in scenarios for agent in agents
+    }
     kept = ran(*verb, "--agents", "infrastructure", *switches)
     assert f"0 files written, {len(scenarios)} were there already" in kept.stdout
     before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
@@ -232,7 +287,16 @@ def test_labels_writes_a_split_and_goes_on_where_it_stopped(own_release: Path, t
 
 @pytest.mark.slow
 def test_labels_writes_batches_by_their_names(own_release: Path, tmp_path: Path) -> None:
-    verb = ("labels", own_release, "--split", "train", "--out", tmp_path / "batches", "--names", "fiery")
+    verb = (
+        "labels",
+        own_release,
+        "--split",
+        "train",
+        "--out",
+        tmp_path / "batches",
+        "--names",
+        "fiery",
+    )
     ran(*verb, "--preset", "fiery", "--samples", "all", "--agents", "infrastructure")
     release = DeepAccident(dataroot=own_release)
     token = release.samples("train", "all")[-1]
@@ -257,7 +321,11 @@ def test_labels_of_what_has_none(tmp_path: Path) -> None:
     options = ("--split", tmp_path / "mine.txt", "--out", tmp_path / "labels")
     for root, more, told in (
         ("test", (), "none of its samples here has labels"),
-        ("partial", ("--agents", "infrastructure"), "has no labelled samples of infrastructure for --samples"),
+        (
+            "partial",
+            ("--agents", "infrastructure"),
+            "has no labelled samples of infrastructure for --samples",
+        ),
         ("partial", ("--seen-by", "+other"), "agents: other_vehicle is not in this release"),
     ):
         assert told in ran("labels", tmp_path / root, *options, *more, status=2).stderr

@@ -34,12 +34,21 @@ def test_splits(da: DeepAccident, tmp_path: Path) -> None:
     files = sorted(official_split(da).save(tmp_path))
     sides = [path for path in files if "mini" not in path.name]
     assert len("".join(path.read_text() for path in sides).splitlines()) == len(da.scenario)
-    assert called("check", "splits", *sides, status=2).output.startswith("Compared: 0 sides")  # all are of train
-    (tmp_path / "other.txt").write_text("type1_subtype1_normal/Town09_type001_subtype0001_scenario00001\n")
-    assert called("check", "splits", *sides, tmp_path / "other.txt").output.startswith("Nothing was found.")
+    assert called("check", "splits", *sides, status=2).output.startswith(
+        "Compared: 0 sides"
+    )  # all are of train
+    (tmp_path / "other.txt").write_text(
+        "type1_subtype1_normal/Town09_type001_subtype0001_scenario00001\n"
+    )
+    assert called("check", "splits", *sides, tmp_path / "other.txt").output.startswith(
+        "Nothing was found."
+    )
     (tmp_path / "random.txt").write_text(f"{da.scenario[0]['token']}/ego_vehicle/001\n")
     found = called("check", "splits", *sides, tmp_path / "random.txt", "--json", status=1)
-    assert [each["kind"] for each in json.loads(found.stdout)["findings"]] == ["recordings", "twins"]
+    assert [each["kind"] for each in json.loads(found.stdout)["findings"]] == [
+        "recordings",
+        "twins",
+    ]
 
 
 @pytest.mark.slow
@@ -51,7 +60,9 @@ def test_scores(da_b: DeepAccident, tmp_path: Path) -> None:
     told = called("check", "scores", da_b.dataroot, path, status=2).output
     assert "6 scenarios with meta and a score" in told
     assert "the scores 1.0" in " ".join(told.split())
-    train = called("check", "scores", da_b.dataroot, path, "--split", "train", "--json", status=2).stdout
+    train = called(
+        "check", "scores", da_b.dataroot, path, "--split", "train", "--json", status=2
+    ).stdout
     assert json.loads(train)["tables"]["scores"][0][:2] == ["attribute", "AUC"]
     for token in ("a/b", "a/b/ego_vehicle/001"):
         path.write_text(f"{token},0.5")
@@ -66,8 +77,14 @@ def test_a_function(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "audited_reader.py").write_text(READER)
     for target in ("audited_reader:read", tmp_path / "audited_reader.py:read"):
         found = called("check", "reader", target, status=1)
-        assert "FOUND misread: */ttc holds column 12 of the labels: the LiDAR points in the box" in found.output
-    for name, told in (("wrong", "TypeError"), ("leaves", "SystemExit")):  # which exit status 1 or 0 would hide
+        assert (
+            "FOUND misread: */ttc holds column 12 of the labels: the LiDAR points in the box"
+            in found.output
+        )
+    for name, told in (
+        ("wrong", "TypeError"),
+        ("leaves", "SystemExit"),
+    ):  # which exit status 1 or 0 would hide
         with pytest.raises(ConfigError, match=f"audited_reader:{name}: ended with {told}"):
             called("check", "reader", f"audited_reader:{name}")
     nothing = called("check", "reader", "audited_reader:forgets", status=2).output

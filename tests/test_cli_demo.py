@@ -36,22 +36,31 @@ def times(folder: Path) -> dict[Path, int]:
 def test_the_page_shows_all_that_was_made(made_demo: tuple[Path, str]) -> None:
     out, _ = made_demo
     page = page_of(out / "index.html")
-    pictures, links = ([str(each[key]) for each in page.all(tag)] for tag, key in (("img", "src"), ("a", "href")))
+    pictures, links = (
+        [str(each[key]) for each in page.all(tag)] for tag, key in (("img", "src"), ("a", "href"))
+    )
     assert sorted(pictures) == sorted(path.name for path in out.glob("*.png"))
     assert len(pictures) == 4 + (find_spec("torch") is not None)
     assert [name for name in pictures if (out / name).stat().st_size <= 20_000] == []
     assert [each["src"] for each in page.all("iframe")] == ["replay.html", "evaluation/report.html"]
     assert [link for link in links if not link.startswith("#") and not (out / link).is_file()] == []
-    assert {link[1:] for link in links if link.startswith("#")} == {each.get("id") for each in page.all("section")}
-    ((single, five),) = re.findall(r"single vehiclefive agents\s*IoU \(%\)(\d+\.\d)(\d+\.\d)", page.text)
+    assert {link[1:] for link in links if link.startswith("#")} == {
+        each.get("id") for each in page.all("section")
+    }
+    ((single, five),) = re.findall(
+        r"single vehiclefive agents\s*IoU \(%\)(\d+\.\d)(\d+\.\d)", page.text
+    )
     assert float(five) > float(single)
 
 
 @pytest.mark.slow
-def test_the_next_steps_run_as_they_are_printed(made_demo: tuple[Path, str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_next_steps_run_as_they_are_printed(
+    made_demo: tuple[Path, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     served: list[object] = []
     monkeypatch.setattr(
-        "deepaccident_devkit.plugins.explore.serving.serve", lambda _, **how: served.append(how["page"])
+        "deepaccident_devkit.plugins.explore.serving.serve",
+        lambda _, **how: served.append(how["page"]),
     )
     out, printed = made_demo
     assert printed.rstrip().endswith(str(out / "index.html"))
@@ -93,7 +102,11 @@ def test_a_folder_of_somebody_else_is_refused(name: str, tmp_path: Path) -> None
     another = ("was not made by the demo of version ", " deepaccident demo OTHER_FOLDER")
     assert_refused(
         (lambda: run("demo", str(tmp_path)), ConfigError, another),
-        (lambda: run("demo", str(tmp_path / name)), ConfigError, (f"{name}: exists, and was not made",)),
+        (
+            lambda: run("demo", str(tmp_path / name)),
+            ConfigError,
+            (f"{name}: exists, and was not made",),
+        ),
     )
     assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [(name, "0.0.1\n")]
 
@@ -111,13 +124,18 @@ def test_ego_sees_the_crash_coming_and_five_agents_see_it_earlier(tmp_path: Path
         boxes = da.boxes(da.get_sample(accident, "ego_vehicle", frame=40 - tenths), "ego")
         (other,) = boxes.select(boxes.actor_id == collider)
         # of 35 degrees to each side
-        return bool(other.camera_visible) and abs(np.degrees(np.arctan2(other.center[1], other.center[0]))) < 30
+        return (
+            bool(other.camera_visible)
+            and abs(np.degrees(np.arctan2(other.center[1], other.center[0]))) < 30
+        )
 
     assert all(map(in_view, range(1, 21)))
     assert not any(map(in_view, range(27, 36)))
     heading, *lines = demo.demo_table(da)
     single, five = (dict(zip(heading[1:], map(float, line[1:]), strict=True)) for line in lines)
-    assert 0.5 < single["recall"] < five["recall"] == 1  # what alone is seen late is missed in the first samples
+    assert (
+        0.5 < single["recall"] < five["recall"] == 1
+    )  # what alone is seen late is missed in the first samples
     assert five["IoU (%)"] > single["IoU (%)"] + 10
     assert [name for name in ("VPQ (%)", "APA", "mAP (%)") if five[name] <= single[name]] == []
     assert single["precision"] == five["precision"] == 1

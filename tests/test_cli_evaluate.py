@@ -22,7 +22,12 @@ from deepaccident_devkit import DeepAccident, taxonomy
 from deepaccident_devkit.errors import ChoiceError, EvaluationError, ResultsError
 from deepaccident_devkit.evaluation import Accident, DetectedBoxes, accident_context, instances_of
 from deepaccident_devkit.evaluation.results import ResultsWriter
-from deepaccident_devkit.evaluation.runs import SampleSelection, evaluate_results, read_bundle, save_run
+from deepaccident_devkit.evaluation.runs import (
+    SampleSelection,
+    evaluate_results,
+    read_bundle,
+    save_run,
+)
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 
 pytestmark = pytest.mark.slow
@@ -43,7 +48,9 @@ def summary_of(result: Result) -> Any:
 def renamed(bundle: Path) -> Path:
     """An evaluation, as if it were of other recordings than those it is of."""
     stored = json.loads((bundle / "scenarios.json").read_text())
-    others = {name.replace("_type001_", "_type009_"): each for name, each in stored["scenarios"].items()}
+    others = {
+        name.replace("_type001_", "_type009_"): each for name, each in stored["scenarios"].items()
+    }
     (bundle / "scenarios.json").write_text(json.dumps(stored | {"scenarios": others}))
     return bundle
 
@@ -67,15 +74,23 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def tokens(da_motion: DeepAccident) -> list[str]:
-    return [token for token in da_motion.evaluation_samples("train") if token.split("/")[2] in AGENTS]
+    return [
+        token for token in da_motion.evaluation_samples("train") if token.split("/")[2] in AGENTS
+    ]
 
 
-def write_accidents(dataset: DeepAccident, path: Path, tokens: Iterable[str], moved: float = 0.1) -> Path:
+def write_accidents(
+    dataset: DeepAccident, path: Path, tokens: Iterable[str], moved: float = 0.1
+) -> Path:
     with ResultsWriter(path, "accident") as writer:
         for token in tokens:
             truth = accident_context(dataset, token, 2.0).truth
             true = None if truth is None else truth.accident
-            alarms = [] if true is None else [Accident(positions=true.positions + moved, time=true.time, ids=true.ids)]
+            alarms = (
+                []
+                if true is None
+                else [Accident(positions=true.positions + moved, time=true.time, ids=true.ids)]
+            )
             writer.add(token, alarms)
     return path
 
@@ -84,7 +99,9 @@ def write_motion(dataset: DeepAccident, path: Path, tokens: Iterable[str], moved
     with ResultsWriter(path, "motion", meta={"method": "<b>moved</b>"}) as writer:
         for token in tokens:
             label = dataset.motion_labels(token).to_present("bilinear")
-            writer.add(token, instances_of(np.roll(label.instance, moved, axis=2), label.config.grid))
+            writer.add(
+                token, instances_of(np.roll(label.instance, moved, axis=2), label.config.grid)
+            )
     return path
 
 
@@ -109,7 +126,15 @@ def results(da_motion: DeepAccident, folder: Path, tokens: list[str]) -> dict[st
 @pytest.fixture(scope="module")
 def words(da_motion: DeepAccident, results: dict[str, Path]) -> tuple[object, ...]:
     """Those of an evaluation of the accidents."""
-    return ("accident", da_motion.dataroot, "--results", results["accidents"], *LIST, "--protocol", "boxes")
+    return (
+        "accident",
+        da_motion.dataroot,
+        "--results",
+        results["accidents"],
+        *LIST,
+        "--protocol",
+        "boxes",
+    )
 
 
 @pytest.fixture(scope="module")
@@ -131,47 +156,82 @@ def bundle(words: tuple[object, ...], folder: Path) -> Path:
     ],
 )
 def test_every_task_and_protocol(
-    da_motion: DeepAccident, results: dict[str, Path], task: str, kind: str, protocol: str, headline: str
+    da_motion: DeepAccident,
+    results: dict[str, Path],
+    task: str,
+    kind: str,
+    protocol: str,
+    headline: str,
 ) -> None:
     words = (task, da_motion.dataroot, "--results", results[kind], *LIST, "--protocol", protocol)
     text = evaluate(*words, "--samples", "evaluate", "--scope", "accident").output
-    told = (f"{task}, protocol {protocol}", "samples      8 of 1 scenarios: split train", f"\n  {headline} ")
+    told = (
+        f"{task}, protocol {protocol}",
+        "samples      8 of 1 scenarios: split train",
+        f"\n  {headline} ",
+    )
     assert [each for each in told if each not in text] == []
     assert "PARTIAL" not in text
 
 
-def test_a_bundle_with_all_there_is(bundle: Path, results: dict[str, Path], da_motion: DeepAccident) -> None:
+def test_a_bundle_with_all_there_is(
+    bundle: Path, results: dict[str, Path], da_motion: DeepAccident
+) -> None:
     assert {path.name for path in bundle.iterdir()} == {
         *("metrics_summary.json", "counts.json", "samples.parquet", "scenarios.json", "files.json"),
         *("report.html", "figures", "results"),
     }
     summary = read_bundle(bundle).summary
-    assert (summary["sanity"]["samples"], summary["release"]["dataroot"]) == (8, str(da_motion.dataroot))
+    assert (summary["sanity"]["samples"], summary["release"]["dataroot"]) == (
+        8,
+        str(da_motion.dataroot),
+    )
     assert (bundle / "results" / "accidents.json").read_bytes() == results["accidents"].read_bytes()
     assert not bundle.with_name("bundle.unfinished").exists()
 
 
-def test_several_processes_write_one_evaluation(words: tuple[object, ...], bundle: Path, tmp_path: Path) -> None:
+def test_several_processes_write_one_evaluation(
+    words: tuple[object, ...], bundle: Path, tmp_path: Path
+) -> None:
     more = ("--sanity", "--include-results", "--out", tmp_path / "out")
     line = [sys.executable, "-m", "deepaccident_devkit.cli", "evaluate", *map(str, (*words, *more))]
-    running = [subprocess.Popen(line, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) for _ in range(2)]
+    running = [
+        subprocess.Popen(line, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        for _ in range(2)
+    ]
     told = [process.communicate(timeout=300) for process in running]
     if all(process.returncode == 0 for process in running):  # else one began when all was done
         assert all("samples      8 of 1 scenarios: split train" in printed for printed, _ in told)
     else:
         assert any("holds an evaluation; pass overwrite=True" in errors for _, errors in told), told
     names = [path.relative_to(bundle) for path in bundle.rglob("*") if path.is_file()]
-    assert [name for name in names if (tmp_path / "out" / name).read_bytes() != (bundle / name).read_bytes()] == []
+    assert [
+        name
+        for name in names
+        if (tmp_path / "out" / name).read_bytes() != (bundle / name).read_bytes()
+    ] == []
     assert [each.name for each in tmp_path.iterdir()] == ["out"]
 
 
 def test_json_is_the_summary(words: tuple[object, ...], tmp_path: Path) -> None:
-    options = ("--by", "town", "--switch", "reading.danger_distance=0.5", "--json", "--out", tmp_path / "b")
+    options = (
+        "--by",
+        "town",
+        "--switch",
+        "reading.danger_distance=0.5",
+        "--json",
+        "--out",
+        tmp_path / "b",
+    )
     done = evaluate(*words, *options)
     summary = json.loads(done.stdout)
     assert summary == read_bundle(tmp_path / "b").summary
     told = (["all", "town"], {"reading.danger_distance": 0.5}, True)
-    assert ([*summary["breakdowns"]], summary["switches"], f"written: {tmp_path / 'b'}" in done.stderr) == told
+    assert (
+        [*summary["breakdowns"]],
+        summary["switches"],
+        f"written: {tmp_path / 'b'}" in done.stderr,
+    ) == told
 
 
 @pytest.mark.parametrize(
@@ -184,13 +244,29 @@ def test_json_is_the_summary(words: tuple[object, ...], tmp_path: Path) -> None:
     ],
 )
 def test_a_partial_download_is_evaluated_and_its_report_has_pictures(
-    da_partial: DeepAccident, tmp_path: Path, task: str, protocol: str, write: Callable[..., Path], line: str
+    da_partial: DeepAccident,
+    tmp_path: Path,
+    task: str,
+    protocol: str,
+    write: Callable[..., Path],
+    line: str,
 ) -> None:
     """The truth of the agents that are there is a perfect prediction (the released AP is 97.22 %, then)."""
     tokens = da_partial.evaluation_samples("val", "paper", scope="all")
-    assert {token.split("/")[2] for token in tokens} == set(taxonomy.AGENTS) - {"other_vehicle_behind"}
+    assert {token.split("/")[2] for token in tokens} == set(taxonomy.AGENTS) - {
+        "other_vehicle_behind"
+    }
     results = write(da_partial, tmp_path / "results", tokens)
-    words = (task, da_partial.dataroot, "--results", results, "--split", "val", "--protocol", protocol)
+    words = (
+        task,
+        da_partial.dataroot,
+        "--results",
+        results,
+        "--split",
+        "val",
+        "--protocol",
+        protocol,
+    )
     text = evaluate(*words, *LISTED, "--sanity", "--out", tmp_path / "bundle").stdout
     assert "samples      8 of 2 scenarios: split val" in text
     assert f" {line} " in " ".join(text.split())
@@ -211,15 +287,21 @@ def test_a_part_is_refused_unless_allowed_and_marked_everywhere(
     titles = [block.splitlines()[0] for block in text.split("\n\n")]
     assert [title for title in titles if "PARTIAL: 5 of 8 samples" not in title] == []
     assert len(titles) > 4
-    assert "PARTIAL: 5 of 8 samples" in (tmp_path / "bundle" / "report.html").read_text(encoding="utf-8")
+    assert "PARTIAL: 5 of 8 samples" in (tmp_path / "bundle" / "report.html").read_text(
+        encoding="utf-8"
+    )
 
 
 class TestVerify:
     def test_the_same(self, bundle: Path, da_motion: DeepAccident) -> None:
-        done = ran("check", "bundle", bundle, "--dataroot", da_motion.dataroot, "--on-error", "skip")
+        done = ran(
+            "check", "bundle", bundle, "--dataroot", da_motion.dataroot, "--on-error", "skip"
+        )
         assert "the same; 8 samples evaluated again" in done.stdout
 
-    def test_paths_in_a_bundle_are_to_be_repeated(self, bundle: Path, da_motion: DeepAccident) -> None:
+    def test_paths_in_a_bundle_are_to_be_repeated(
+        self, bundle: Path, da_motion: DeepAccident
+    ) -> None:
         told = ran("check", "bundle", bundle, status=2).stderr
         command = f"deepaccident check bundle {shlex.quote(str(bundle))} --dataroot {da_motion.dataroot}\n"
         assert (told.count("\n"), told.endswith(command)) == (1, True)
@@ -247,8 +329,14 @@ def two(da_motion: DeepAccident, folder: Path) -> list[Path]:
     made, selection = [], SampleSelection(split="train", scope="all", agents=AGENTS)
     setup = EvaluationSetup(task="accident", protocol="boxes")
     for name, moved in (("a", 0.1), ("b", 1.0)):
-        results = write_accidents(da_motion, folder / f"{name}.json", selection.tokens(da_motion), moved)
-        made.append(save_run(evaluate_results(da_motion, results, setup, selection, workers=1), folder / name))
+        results = write_accidents(
+            da_motion, folder / f"{name}.json", selection.tokens(da_motion), moved
+        )
+        made.append(
+            save_run(
+                evaluate_results(da_motion, results, setup, selection, workers=1), folder / name
+            )
+        )
     return made
 
 
@@ -258,7 +346,9 @@ class TestCompare:
         words = ("compare", *two, "--resamples", 20)
         text = evaluate(*words, *(word for path in files for word in ("--out", path))).output
         # one cluster says nothing of others
-        error = next(line.split() for line in text.splitlines() if line.startswith("position_error"))
+        error = next(
+            line.split() for line in text.splitlines() if line.startswith("position_error")
+        )
         assert (error[2:5], error[-2:]) == (["0.283", "2.828", "+2.546"], ["too", "few"])
         assert "\n".join(f"written: {path}" for path in files) in text
         stated = json.loads(files[1].read_text())
@@ -275,9 +365,20 @@ class TestCheck:
             )
 
     def test_against_a_release(self, da_motion: DeepAccident, results: dict[str, Path]) -> None:
-        words = ("check", "results", results["motion"], "--dataroot", da_motion.dataroot, "--split", "train")
+        words = (
+            "check",
+            "results",
+            results["motion"],
+            "--dataroot",
+            da_motion.dataroot,
+            "--split",
+            "train",
+        )
         good = called(*words, "--agents", ",".join(AGENTS)).stdout
-        assert "all 8 samples have a prediction, and nothing else has\nSanity check of 8 samples: " in good
+        assert (
+            "all 8 samples have a prediction, and nothing else has\nSanity check of 8 samples: "
+            in good
+        )
         assert "None of these mistakes was found: x mirrored, " in good
         assert "the predictions are of the samples of --agents " in called(*words, status=1).stdout
 
@@ -303,13 +404,26 @@ class TestCheck:
         with ResultsWriter(tmp_path / "empty.json", "accident") as writer:
             for token in tokens:
                 writer.add(token, [])
-        words = (da_motion.dataroot, "--results", tmp_path / "empty.json", *LIST, "--protocol", "boxes", "--sanity")
+        words = (
+            da_motion.dataroot,
+            "--results",
+            tmp_path / "empty.json",
+            *LIST,
+            "--protocol",
+            "boxes",
+            "--sanity",
+        )
         told = evaluate("accident", *words, status=2).stdout.splitlines()[-3:]
         assert told[0].startswith("Sanity check of 8 samples: 0 of 0 accidents")
         assert "predictions looked at are empty" in told[1]
         assert told[2].startswith("Cannot say whether a mistake was made")
         release = ("--dataroot", da_motion.dataroot, *LIST[:-2])
-        assert called("check", "results", tmp_path / "empty.json", *release, status=2).stdout.splitlines()[-3:] == told
+        assert (
+            called(
+                "check", "results", tmp_path / "empty.json", *release, status=2
+            ).stdout.splitlines()[-3:]
+            == told
+        )
 
 
 @pytest.mark.parametrize(
@@ -322,15 +436,27 @@ class TestCheck:
             ("danger_distance", "a number, such as 1.0, found 'high'"),
         ),
         ("--split nowhere", ChoiceError, ("split: expected one of train, val",)),
-        ("--agents ego", ChoiceError, ("--agents: expected one of ego_vehicle", "did you mean 'ego_vehicle'")),
-        ("--switch reading.danger_distance", None, ("--switch: expected NAME=VALUE, found 'reading.danger_distance'",)),
+        (
+            "--agents ego",
+            ChoiceError,
+            ("--agents: expected one of ego_vehicle", "did you mean 'ego_vehicle'"),
+        ),
+        (
+            "--switch reading.danger_distance",
+            None,
+            ("--switch: expected NAME=VALUE, found 'reading.danger_distance'",),
+        ),
         ("--by wether", None, ("Invalid value for '--by'",)),
         ("--protocol boxy", None, ("Invalid value for '--protocol'",)),
         ("--out {}", ResultsError, ("is not empty and holds no evaluation",)),
     ],
 )
 def test_options_that_are_refused(
-    words: tuple[object, ...], tmp_path: Path, options: str, error: type[Exception] | None, names: tuple[str, ...]
+    words: tuple[object, ...],
+    tmp_path: Path,
+    options: str,
+    error: type[Exception] | None,
+    names: tuple[str, ...],
 ) -> None:
     (tmp_path / "thesis.tex").touch()
     given = (*words, *options.format(tmp_path).split())
@@ -354,7 +480,9 @@ def test_an_operating_point_from_another_split(
         (lambda: evaluate(*words, "--threshold-from", bundle), EvaluationError, another),
     )
     summary = summary_of(evaluate(*words, "--threshold-from", renamed(out), "--json"))
-    stored = json.loads((out / "metrics_summary.json").read_text())["metrics"]["groups"]["ego_involved"]
+    stored = json.loads((out / "metrics_summary.json").read_text())["metrics"]["groups"][
+        "ego_involved"
+    ]
     assert summary["switches"] == {"threshold": stored["best_f1"]}
     assert summary["metrics"]["operating_by"] == "given"
 
@@ -364,14 +492,24 @@ def prevention(da_motion: DeepAccident, folder: Path) -> Path:
     """An evaluation of the true accidents over whole recordings, with the accidents that they would have prevented."""
     tokens = [token for token in da_motion.samples("train", "all") if token.split("/")[2] in AGENTS]
     results = write_accidents(da_motion, folder / "whole.json", tokens)
-    words = ("warning", da_motion.dataroot, "--results", results, *LIST, "--prevented", "--include-results")
+    words = (
+        "warning",
+        da_motion.dataroot,
+        "--results",
+        results,
+        *LIST,
+        "--prevented",
+        "--include-results",
+    )
     text = evaluate(*words, "--out", folder / "prevention").output
     assert "\nprevented accidents\n  ego_involved, 1 s, 6 m/s²" in text
     assert "for another split: braking " in text
     return folder / "prevention"
 
 
-def test_prevented_accidents_are_stored_shown_and_verified(prevention: Path, da_motion: DeepAccident) -> None:
+def test_prevented_accidents_are_stored_shown_and_verified(
+    prevention: Path, da_motion: DeepAccident
+) -> None:
     prevented = read_bundle(prevention).summary["prevented"]
     assert list(prevented["groups"]) == ["ego_involved", "infrastructure"]
     siren = prevented["references"]["always"]["ego_involved"]["right"]["0"]["1 s, 6 m/s²"]
@@ -381,11 +519,14 @@ def test_prevented_accidents_are_stored_shown_and_verified(prevention: Path, da_
     report = page_of(prevention / "report.html").text
     assert ("Prevented accidents" in report, "random per frame, quiet" in report) == (True, True)
     assert (prevention / "figures" / "prevention_ego_involved.png").is_file()
-    words, path = ("check", "bundle", prevention, "--dataroot", da_motion.dataroot), prevention / "metrics_summary.json"
+    words, path = (
+        ("check", "bundle", prevention, "--dataroot", da_motion.dataroot),
+        prevention / "metrics_summary.json",
+    )
     assert "the same; " in called(*words).output
     for told, change in {
-        "prevented/groups/ego_involved/quiet_braking: stored 0.5, found 1.0": lambda text: text.replace(
-            '"quiet_braking": 1.0', '"quiet_braking": 0.5'
+        "prevented/groups/ego_involved/quiet_braking: stored 0.5, found 1.0": lambda text: (
+            text.replace('"quiet_braking": 1.0', '"quiet_braking": 0.5')
         ),
         "does not say how intervals were made": lambda text: json.dumps(
             json.loads(text) | {"prevented": {"groups": {}}}
@@ -400,10 +541,21 @@ def test_a_threshold_of_little_braking_from_another_split(
     prevention: Path, da_motion: DeepAccident, folder: Path, tmp_path: Path
 ) -> None:
     other = renamed(shutil.copytree(prevention, tmp_path / "other"))
-    words = ("warning", da_motion.dataroot, "--results", folder / "whole.json", *LIST, "--threshold-from", other)
+    words = (
+        "warning",
+        da_motion.dataroot,
+        "--results",
+        folder / "whole.json",
+        *LIST,
+        "--threshold-from",
+        other,
+    )
     words = (*words, "--threshold-by", "braking", "--prevented", "--json")
     summary = summary_of(evaluate(*words))
-    assert (summary["switches"], summary["prevented"]["operating_by"]) == ({"threshold": 1.0}, "given")
+    assert (summary["switches"], summary["prevented"]["operating_by"]) == (
+        {"threshold": 1.0},
+        "given",
+    )
     assert not any("on these very recordings" in note for note in summary["prevented"]["notes"])
     stored = json.loads((other / "metrics_summary.json").read_text())
     del stored["prevented"]

@@ -24,7 +24,15 @@ pytestmark = pytest.mark.slow
 @contextmanager
 def running(root: Path, *words: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
     """The command, and the address that it prints."""
-    command = [sys.executable, "-m", "deepaccident_devkit.cli", "explore", str(root), "--no-open", *words]
+    command = [
+        sys.executable,
+        "-m",
+        "deepaccident_devkit.cli",
+        "explore",
+        str(root),
+        "--no-open",
+        *words,
+    ]
     with subprocess.Popen(
         command,
         stdout=subprocess.PIPE,
@@ -35,7 +43,10 @@ def running(root: Path, *words: str) -> Iterator[tuple[subprocess.Popen[str], st
         try:
             assert process.stdout is not None
             lines = iter(process.stdout.readline, "")
-            yield process, next(found[0] for line in lines if (found := re.findall(r"open (http\S+)", line)))
+            yield (
+                process,
+                next(found[0] for line in lines if (found := re.findall(r"open (http\S+)", line))),
+            )
         finally:
             process.kill()
 
@@ -49,7 +60,11 @@ def test_the_printed_address_opens_the_pages_until_ctrl_c(da: DeepAccident) -> N
         cookie = ("Cookie", first.cookie)
         assert accident(da) in ask(port, "/", cookie).body
         assert ask(port, f"/scenario/{accident(da)}/", cookie).status == 200
-        for target in ("/../../../etc/passwd", "/static/0/..%2f..%2fexplorer.py", "/scenario/..%2f..%2fetc/passwd/"):
+        for target in (
+            "/../../../etc/passwd",
+            "/static/0/..%2f..%2fexplorer.py",
+            "/scenario/..%2f..%2fetc/passwd/",
+        ):
             found = ask(port, target, cookie)
             assert (found.status, "root:" in found.body) == (404, False)
         assert ask(port, "/", cookie, host="evil.example").status == 400

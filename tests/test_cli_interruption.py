@@ -33,9 +33,17 @@ ENVIRONMENT = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
 def started(*words: object) -> Iterator[Process]:
     """A verb in a process group of its own, as a shell makes it, with its handlers in place."""
     command = [sys.executable, "-m", "deepaccident_devkit.cli", *map(str, words)]
-    how: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "env": ENVIRONMENT}
+    how: dict[str, Any] = {
+        "stdout": subprocess.PIPE,
+        "stderr": subprocess.PIPE,
+        "text": True,
+        "env": ENVIRONMENT,
+    }
     # as in a terminal: a runner in the background ignores Ctrl-C, and so would its children
-    how |= {"start_new_session": True, "preexec_fn": lambda: signal.signal(signal.SIGINT, signal.default_int_handler)}
+    how |= {
+        "start_new_session": True,
+        "preexec_fn": lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    }
     with subprocess.Popen(command, **how) as process:
         wait_for(lambda: process.poll() is not None or catches(process.pid, signal.SIGTERM))
         try:
@@ -48,7 +56,9 @@ def started(*words: object) -> Iterator[Process]:
 def lines_of(process: Process) -> list[str]:
     """What a verb says on stderr until it ends, without the states of progress bars."""
     _, said = process.communicate(timeout=LONGEST)
-    return [line for line in said.replace("\r", "\n").splitlines() if line.strip() and "%|" not in line]
+    return [
+        line for line in said.replace("\r", "\n").splitlines() if line.strip() and "%|" not in line
+    ]
 
 
 def stopped(process: Process, number: signal.Signals) -> list[str]:
@@ -61,14 +71,27 @@ def stopped(process: Process, number: signal.Signals) -> list[str]:
 
 
 def leftovers(folder: Path) -> list[str]:
-    return [path.name for path in folder.rglob(".*") if temporary_of(path.name) or path.name.endswith(".unfinished")]
+    return [
+        path.name
+        for path in folder.rglob(".*")
+        if temporary_of(path.name) or path.name.endswith(".unfinished")
+    ]
 
 
 @pytest.fixture(scope="module")
 def results(da_motion: DeepAccident, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The accidents that the baseline foresees in `da_motion`."""
     out = tmp_path_factory.mktemp("results")
-    words = ("predict", "constant_velocity", da_motion.dataroot, "--task", "accident", *IN_TRAIN, "--out", out)
+    words = (
+        "predict",
+        "constant_velocity",
+        da_motion.dataroot,
+        "--task",
+        "accident",
+        *IN_TRAIN,
+        "--out",
+        out,
+    )
     called(*words, "--workers", 1)
     return out / "accident.json"
 
@@ -77,28 +100,84 @@ IN_TRAIN = ("--split", "train", "--scope", "all")
 WORDS: dict[str, Callable[[Path, Path, Path], tuple[object, ...]]] = {
     "index": lambda root, out, _: ("index", root, "--index-dir", out),
     "info": lambda root, out, _: ("info", root, "--index-dir", out),
-    "stats": lambda root, out, _: ("info", root, "--statistics", "--index-dir", out, "--out", out / "statistics"),
+    "stats": lambda root, out, _: (
+        "info",
+        root,
+        "--statistics",
+        "--index-dir",
+        out,
+        "--out",
+        out / "statistics",
+    ),
     "validate": lambda root, *_: ("validate", root, "--deep"),
-    "labels": lambda root, out, _: ("labels", root, "--split", "train", "--samples", "all", "--out", out),
-    "synth": lambda _, out, __: ("synth", out / "made", "--scenarios", 2, "--frames", 8, "--size", "64x36"),
+    "labels": lambda root, out, _: (
+        "labels",
+        root,
+        "--split",
+        "train",
+        "--samples",
+        "all",
+        "--out",
+        out,
+    ),
+    "synth": lambda _, out, __: (
+        "synth",
+        out / "made",
+        "--scenarios",
+        2,
+        "--frames",
+        8,
+        "--size",
+        "64x36",
+    ),
     "demo": lambda _, out, __: ("demo", out / "demo"),
     "predict": lambda root, out, _: ("predict", "constant_velocity", root, *IN_TRAIN, "--out", out),
     "evaluate": lambda root, out, results: (
-        *("evaluate", "accident", root, *IN_TRAIN, "--results", results, "--protocol", "boxes", "--out", out / "run"),
+        *(
+            "evaluate",
+            "accident",
+            root,
+            *IN_TRAIN,
+            "--results",
+            results,
+            "--protocol",
+            "boxes",
+            "--out",
+            out / "run",
+        ),
     ),
-    "export": lambda root, out, _: ("export", "opencood", root, "--without-clouds", "--out", out / "export"),
-    "video": lambda root, out, _: ("render", "video", root, "--what", "bev", "--out", out / "video.gif"),
+    "export": lambda root, out, _: (
+        "export",
+        "opencood",
+        root,
+        "--without-clouds",
+        "--out",
+        out / "export",
+    ),
+    "video": lambda root, out, _: (
+        "render",
+        "video",
+        root,
+        "--what",
+        "bev",
+        "--out",
+        out / "video.gif",
+    ),
 }
 """Verb with workers → its words, for a release, a folder to write into and a results file."""
 
 
 @pytest.fixture(params=WORDS)
-def words(request: pytest.FixtureRequest, da_motion: DeepAccident, results: Path, tmp_path: Path) -> tuple[object, ...]:
+def words(
+    request: pytest.FixtureRequest, da_motion: DeepAccident, results: Path, tmp_path: Path
+) -> tuple[object, ...]:
     return (*WORDS[request.param](da_motion.dataroot, tmp_path, results), "--workers", 2)
 
 
 @pytest.mark.parametrize(("number", "status"), SIGNALS.items())
-def test_a_signal_ends_a_verb_with_one_line(number: signal.Signals, status: int, tmp_path: Path) -> None:
+def test_a_signal_ends_a_verb_with_one_line(
+    number: signal.Signals, status: int, tmp_path: Path
+) -> None:
     with started("synth", tmp_path / "out", "--sensors", "none") as process:
         assert (stopped(process, number), process.returncode) == ([LINE], status)
     assert not leftovers(tmp_path)
@@ -113,7 +192,9 @@ def test_a_signal_ends_the_workers_of_every_verb(words: tuple[object, ...], tmp_
 
 @pytest.mark.slow
 @pytest.mark.parametrize("verb", ["index", "synth", "evaluate"])
-def test_a_killed_worker_is_named(verb: str, da_motion: DeepAccident, results: Path, tmp_path: Path) -> None:
+def test_a_killed_worker_is_named(
+    verb: str, da_motion: DeepAccident, results: Path, tmp_path: Path
+) -> None:
     with started(*WORDS[verb](da_motion.dataroot, tmp_path, results), "--workers", 2) as process:
         wait_for(lambda: len(workers_of(process.pid)) == 2)
         os.kill(workers_of(process.pid)[0], signal.SIGKILL)
@@ -134,7 +215,9 @@ def test_mcap(da: DeepAccident, tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_a_signal_at_any_moment(release_root_b: Path, tmp_path: Path) -> None:
     """From the first to the last: libraries are imported, workers start, files are written, Python ends."""
-    source = shutil.copytree(release_root_b, tmp_path / "release", ignore=shutil.ignore_patterns(".deepaccident"))
+    source = shutil.copytree(
+        release_root_b, tmp_path / "release", ignore=shutil.ignore_patterns(".deepaccident")
+    )
     words = ("index", source, "--workers", 2, "--index-dir")
     with started(*words, tmp_path / "whole") as process:
         begin = time.monotonic()
@@ -146,13 +229,19 @@ def test_a_signal_at_any_moment(release_root_b: Path, tmp_path: Path) -> None:
             time.sleep(whole * moment / (MOMENTS - 1))
             ended = (stopped(process, signal.SIGTERM), process.returncode)
         assert ended in [([LINE], 143), ([], 0)], moment  # at the end there is nothing to stop
-        with started("check", *words, out) as process:  # removes locks that were left at the very end, too
+        with started(
+            "check", *words, out
+        ) as process:  # removes locks that were left at the very end, too
             assert lines_of(process) == []
         assert files(out) == files(tmp_path / "whole")
 
 
 def files(folder: Path) -> dict[str, bytes]:
-    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    return {
+        path.relative_to(folder).as_posix(): path.read_bytes()
+        for path in folder.rglob("*")
+        if path.is_file()
+    }
 
 
 IN_A_LIBRARY = """
@@ -173,7 +262,9 @@ IN_A_LIBRARY = """
 def scripted(script: str) -> Process:
     """A process that runs a script."""
     command = [sys.executable, "-c", textwrap.dedent(script)]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=ENVIRONMENT)
+    return subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=ENVIRONMENT
+    )
 
 
 @pytest.mark.slow
@@ -190,7 +281,9 @@ def test_a_library_that_takes_the_exception(then: str) -> None:
 @pytest.mark.slow
 def test_a_second_signal_ends_at_once() -> None:
     """Not only when the first one's time is over."""
-    with scripted(IN_A_LIBRARY.format(then="print('tidying', flush=True); time.sleep(600)")) as process:
+    with scripted(
+        IN_A_LIBRARY.format(then="print('tidying', flush=True); time.sleep(600)")
+    ) as process:
         assert process.stdout is not None
         for _ in range(2):
             process.stdout.readline()
@@ -242,9 +335,16 @@ ENDS = {
 
 
 @pytest.mark.parametrize(("number", "status"), SIGNALS.items())
-@pytest.mark.parametrize(("script", "ends"), ENDS.items(), ids=["another signal", "Python's end", "in between"])
-def test_a_signal_amid(number: signal.Signals, status: int, script: str, ends: tuple[Any, ...]) -> None:
+@pytest.mark.parametrize(
+    ("script", "ends"), ENDS.items(), ids=["another signal", "Python's end", "in between"]
+)
+def test_a_signal_amid(
+    number: signal.Signals, status: int, script: str, ends: tuple[Any, ...]
+) -> None:
     with scripted(script.format(number=int(number))) as process:
         printed, said = process.communicate(timeout=LONGEST)
     *told, usual = ends
-    assert (printed, said.splitlines(), process.returncode) == (*told, status if usual is None else usual)
+    assert (printed, said.splitlines(), process.returncode) == (
+        *told,
+        status if usual is None else usual,
+    )

@@ -15,4 +15,6 @@ def script() -> ModuleType:
 
 
 def test_the_page_is_up_to_date(script: ModuleType) -> None:
-    assert script.PAGE.read_text(encoding="utf-8") == script.page(), "run: python docs/make_cli_page.py"
+    assert script.PAGE.read_text(encoding="utf-8") == script.page(), (
+        "run: python docs/make_cli_page.py"
+    )

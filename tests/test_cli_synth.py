@@ -51,7 +51,10 @@ def test_verb_writes_a_release_and_names_the_next_step(tmp_path):
         ("--sensors Cameras", {"sensors": "cameras"}),
         ("--sensors none", {"sensors": False}),
         ("--for-released-code", {"for_released_code": True}),
-        ("--for-released-code --size 1600x900 --layout A", {"for_released_code": True, "image_size": (1600, 900)}),
+        (
+            "--for-released-code --size 1600x900 --layout A",
+            {"for_released_code": True, "image_size": (1600, 900)},
+        ),
     ],
 )
 def test_every_option_reaches_the_configuration(tmp_path, made, monkeypatch, words, config):
@@ -73,9 +76,13 @@ def test_a_benchmark_is_made_and_compared(tmp_path, monkeypatch):
     monkeypatch.setattr(module, "published", lambda name: {"v1": wanted}[name])
 
     def run(*words: str):
-        return CliRunner().invoke(synth, [str(tmp_path / "out"), "--benchmark", "v1", "--workers", "1", *words])
+        return CliRunner().invoke(
+            synth, [str(tmp_path / "out"), "--benchmark", "v1", "--workers", "1", *words]
+        )
 
-    assert "--seed changes nothing with --benchmark, which says all of it" in run("--seed", "6").stderr
+    assert (
+        "--seed changes nothing with --benchmark, which says all of it" in run("--seed", "6").stderr
+    )
     first = run("--sensors", "clouds")
     assert (first.exit_code, first.stdout.splitlines()[0]) == (
         0,
@@ -96,7 +103,9 @@ def test_a_benchmark_is_made_and_compared(tmp_path, monkeypatch):
 def test_labels_without_embree_are_said_to_take_long(tmp_path, made, monkeypatch):
     monkeypatch.setattr(sys.modules[synth.callback.__module__], "has_embree", lambda: False)
     result = CliRunner().invoke(synth, [str(tmp_path), "--sensors", "none"])
-    assert "slow without the package embreex; in a checkout: pip install '.[synth]'" in result.stderr
+    assert (
+        "slow without the package embreex; in a checkout: pip install '.[synth]'" in result.stderr
+    )
     assert made == [SynthConfig(frames=None, sensors=False)]
 
 

@@ -17,15 +17,23 @@ def benchmark() -> ModuleType:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["shares", "ratios of areas", "means", "differences of two runs' shares"])
+@pytest.mark.parametrize(
+    "kind", ["shares", "ratios of areas", "means", "differences of two runs' shares"]
+)
 @pytest.mark.parametrize(("clusters", "least"), [(8, 0.86), (52, 0.9)])
-def test_intervals_hold_the_truth(benchmark: ModuleType, kind: str, clusters: int, least: float) -> None:
+def test_intervals_hold_the_truth(
+    benchmark: ModuleType, kind: str, clusters: int, least: float
+) -> None:
     """An interval of 90 % called one of 95 %, or the percentile bootstrap of before, fails."""
     cells = list(benchmark.coverage(kind, clusters, DRAWS))
     inner = [cell.new for cell in cells if not cell.ends]
     assert 0.93 <= benchmark.mean(inner) <= 0.975
     assert min(cell.new for cell in cells) >= least
-    narrow = [cell.new for cell in benchmark.coverage(kind, clusters, DRAWS, confidence=0.9) if not cell.ends]
+    narrow = [
+        cell.new
+        for cell in benchmark.coverage(kind, clusters, DRAWS, confidence=0.9)
+        if not cell.ends
+    ]
     assert benchmark.mean(narrow) < 0.93 + 0.005 * (clusters < 52)
     assert benchmark.mean([cell.old for cell in cells]) < 0.93
 

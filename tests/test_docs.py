@@ -35,7 +35,9 @@ pytestmark = pytest.mark.slow
 
 TOP = Path(__file__).parents[1]
 DOCS = TOP / "docs"
-FROM_NUSCENES = (DOCS / "reading.md").read_text(encoding="utf-8").partition("## From the nuScenes devkit")[2]
+FROM_NUSCENES = (
+    (DOCS / "reading.md").read_text(encoding="utf-8").partition("## From the nuScenes devkit")[2]
+)
 COUNTERPARTS = sorted(
     {
         span
@@ -49,7 +51,14 @@ NOT_ON_EXPORTS = ("town-maps",)
 """Formats with a page of their own."""
 ON_LABELS = ("docs/protocols.md", "docs/evaluating.md", "docs/safety.md", "docs/baselines.md")
 ON_SENSORS = (
-    *("README.md", "docs/exports.md", "docs/format.md", "docs/index.md", "docs/town_maps.md", "docs/validation.md"),
+    *(
+        "README.md",
+        "docs/exports.md",
+        "docs/format.md",
+        "docs/index.md",
+        "docs/town_maps.md",
+        "docs/validation.md",
+    ),
 )
 RUN_ELSEWHERE = {
     "docs/plugins.md": "tests/test_plugin_package.py",
@@ -107,7 +116,9 @@ NO_CALLS = (
 def run_page(page: Path, languages: str = "python|bash") -> dict[str, Any]:
     """Run the page's Python and shell blocks, as they stand and in their order, in the working folder."""
     names: dict[str, Any] = {}
-    blocks = re.findall(rf"^```({languages})\n(.*?)^```", page.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE)
+    blocks = re.findall(
+        rf"^```({languages})\n(.*?)^```", page.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE
+    )
     assert blocks, f"{page}: no code"
     for language, code in blocks:
         if language == "python":
@@ -129,7 +140,9 @@ def folder_of_demo(root: Path, folder: Path) -> Path:
 
 
 @pytest.fixture
-def in_labels_demo(da_motion: DeepAccident, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def in_labels_demo(
+    da_motion: DeepAccident, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Path:
     """A working folder in which `deepaccident_demo/release` is a small release, with labels alone."""
     monkeypatch.chdir(folder_of_demo(da_motion.dataroot, tmp_path))
     return tmp_path
@@ -160,13 +173,17 @@ def test_the_code_on_pages_about_sensors_runs(page: str, in_demo: Path) -> None:
     run_page(TOP / page)
 
 
-def test_the_code_on_reading_runs(in_demo: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_code_on_reading_runs(
+    in_demo: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """And that of its tables, except for the pictures."""
     monkeypatch.setenv("DEEPACCIDENT_CACHE", str(tmp_path / "copies"))
     names = run_page(DOCS / "reading.md")
     assert names["camera"].in_image(names["pixels"]).all()
     objects = re.compile(r"(da|box|boxes|camera|cloud|found)\.|len\(")
-    codes = [code for code in COUNTERPARTS if objects.match(code) and not code.startswith("da.render_")]
+    codes = [
+        code for code in COUNTERPARTS if objects.match(code) and not code.startswith("da.render_")
+    ]
     assert len(codes) > 60
     for code in codes:
         eval(compile(code, "reading.md", "eval"), names)  # noqa: S307
@@ -175,7 +192,9 @@ def test_the_code_on_reading_runs(in_demo: Path, tmp_path: Path, monkeypatch: py
 @pytest.mark.parametrize("choices", [LabelProtocol, MotionProtocol])
 def test_the_page_of_the_released_code_has_each_switch(choices: type[Any]) -> None:
     page = (DOCS / "released_code.md").read_text(encoding="utf-8")
-    assert [field.name for field in fields(choices) if not re.search(rf"[`.]{field.name}\b", page)] == []
+    assert [
+        field.name for field in fields(choices) if not re.search(rf"[`.]{field.name}\b", page)
+    ] == []
     named = set(re.findall(rf"`{choices.__name__}\.(\w+)", page))
     assert named - {field.name for field in fields(choices)} == set()
 
@@ -196,15 +215,25 @@ def test_the_page_of_protocols_has_each_protocol_choice_and_number() -> None:
     page = (DOCS / "protocols.md").read_text(encoding="utf-8")
     protocols = [name for evaluator in TASKS.values() for name in evaluator.protocols]
     choices = [field.name for kind in CHOICES for field in fields(kind)]
-    numbers = [row.path.removesuffix("/*").rpartition("/")[2] for kind in RESULT_CLASSES for row in kind.rows]
+    numbers = [
+        row.path.removesuffix("/*").rpartition("/")[2]
+        for kind in RESULT_CLASSES
+        for row in kind.rows
+    ]
     assert min(map(len, (protocols, choices, numbers))) > 10
-    missing = {name for name in (*protocols, *choices, *numbers) if not re.search(rf"`([a-z]+\.)?{name}`", page)}
+    missing = {
+        name
+        for name in (*protocols, *choices, *numbers)
+        if not re.search(rf"`([a-z]+\.)?{name}`", page)
+    }
     assert missing == set()
 
 
 @pytest.mark.parametrize("name", export.list_commands(Context(export)))
 def test_every_format_has_a_row_on_the_page_of_exports(name: str) -> None:
-    rows = re.findall(r"^\| (.*?) \|", (DOCS / "exports.md").read_text(encoding="utf-8"), re.MULTILINE)
+    rows = re.findall(
+        r"^\| (.*?) \|", (DOCS / "exports.md").read_text(encoding="utf-8"), re.MULTILINE
+    )
     assert name in NOT_ON_EXPORTS or any(re.search(rf"\b{name}\b", row) for row in rows)
 
 
@@ -215,42 +244,65 @@ def test_the_commands_of_the_pictures_run(da_motion: DeepAccident, in_demo: Path
     script = loaded_script("docs/make_pictures.py")
     for picture in script.PICTURE.findall((DOCS / "pictures.md").read_text(encoding="utf-8")):
         page = f"{Path(picture).stem}.html"  # which a browser shows
-        assert picture in script.MADE_ELSEWHERE or [*in_demo.rglob(picture), *in_demo.rglob(page)], picture
+        assert picture in script.MADE_ELSEWHERE or [
+            *in_demo.rglob(picture),
+            *in_demo.rglob(page),
+        ], picture
 
 
-def test_the_outputs_on_the_page_of_safety_are_as_commands_print_them_now(in_labels_demo: Path) -> None:
+def test_the_outputs_on_the_page_of_safety_are_as_commands_print_them_now(
+    in_labels_demo: Path,
+) -> None:
     """Their headings and rows' names are compared: `python docs/make_tables.py safety` measures on a larger release."""
     script = of_checkout("benchmarks.pages.safety")
     (in_labels_demo / script.RELEASE).symlink_to(in_labels_demo / "deepaccident_demo" / "release")
     there = (DOCS / "safety.md").read_text(encoding="utf-8")
     page = re.sub(r"^    deepaccident (synth|predict|evaluate) .*$", "", there, flags=re.MULTILINE)
     now = script.with_outputs(page)
-    outputs = [re.findall(r"^<!-- output -->\n(.*?)^<!-- end", text, re.MULTILINE | re.DOTALL) for text in (there, now)]
+    outputs = [
+        re.findall(r"^<!-- output -->\n(.*?)^<!-- end", text, re.MULTILINE | re.DOTALL)
+        for text in (there, now)
+    ]
     assert len(outputs[0]) == 6
     for old, new in zip(*outputs, strict=True):
-        if not re.search("^(prevented accidents|Twins)", old, re.MULTILINE):  # one accident has no such tables
+        if not re.search(
+            "^(prevented accidents|Twins)", old, re.MULTILINE
+        ):  # one accident has no such tables
             assert table_words(old) <= table_words(new) | {"val", "test", "…"}
 
 
 def table_words(output: str) -> set[str]:
     """The names of columns and rows: what has no number, of lines that have several columns."""
-    lines = [re.split(r"\s{2,}", line.strip()) for line in output.splitlines() if not line.startswith("type")]
+    lines = [
+        re.split(r"\s{2,}", line.strip())
+        for line in output.splitlines()
+        if not line.startswith("type")
+    ]
     return {cell for line in lines if len(line) > 2 for cell in line if not re.search(r"\d", cell)}
 
 
 def test_every_field_that_finds_scenarios_is_on_the_page() -> None:
-    table = (DOCS / "reading.md").read_text(encoding="utf-8").partition("### The fields of find")[2].partition("## ")[0]
+    table = (
+        (DOCS / "reading.md")
+        .read_text(encoding="utf-8")
+        .partition("### The fields of find")[2]
+        .partition("## ")[0]
+    )
     told = re.findall(r"`(\w+)`", " ".join(re.findall(r"^\| (`.*?) \|", table, re.MULTILINE)))
     assert sorted(told) == sorted([*FIELDS, "length", "type"])
     for name in told:
-        values = [str(value) for value in FIELDS[full_name(name)].known if not isinstance(value, int)]
+        values = [
+            str(value) for value in FIELDS[full_name(name)].known if not isinstance(value, int)
+        ]
         assert [value for value in values if value.removeprefix("Town") not in table] == [], name
 
 
 def test_what_the_release_is_known_for_is_on_the_page() -> None:
     page = (DOCS / "validation.md").read_text(encoding="utf-8")
     rows = re.findall(r"^\| `([a-z-]+)` \|", page, re.MULTILINE)
-    assert [name for name in rows if name in CODES] == [name for name, code in CODES.items() if code.known]
+    assert [name for name in rows if name in CODES] == [
+        name for name, code in CODES.items() if code.known
+    ]
 
 
 @pytest.mark.slow
@@ -265,7 +317,11 @@ def test_the_page_of_studies(
 
 
 def test_no_page_has_code_that_no_test_runs() -> None:
-    with_code = {page.relative_to(TOP).as_posix() for page in PAGES if "```python" in page.read_text(encoding="utf-8")}
+    with_code = {
+        page.relative_to(TOP).as_posix()
+        for page in PAGES
+        if "```python" in page.read_text(encoding="utf-8")
+    }
     run_here = {*ON_LABELS, *ON_SENSORS, "docs/reading.md", "docs/studies.md"}
     assert with_code - run_here == RUN_ELSEWHERE.keys()
     for page, test in RUN_ELSEWHERE.items():
@@ -276,7 +332,9 @@ COMMANDS = [
     pytest.param(line, id=f"{page.stem}: {line[12:]}")
     for page in PAGES
     if page.name != "cli.md"  # which is made from the commands themselves
-    for line in re.findall(r"^    (deepaccident \S[^#\n]*[^#\s])", page.read_text(encoding="utf-8"), re.MULTILINE)
+    for line in re.findall(
+        r"^    (deepaccident \S[^#\n]*[^#\s])", page.read_text(encoding="utf-8"), re.MULTILINE
+    )
 ]
 """The command lines of the pages' indented blocks."""
 
@@ -293,7 +351,9 @@ def test_the_command_lines_of_the_pages_run(line: str, in_demo: Path) -> None:
         command.make_parser(context).parse_args(words)  # raises where there is no such option
         return
     result = CliRunner().invoke(deepaccident, words, catch_exceptions=False)
-    assert result.exit_code in {0, 1} if words[0] == "validate" else result.exit_code == 0, result.output
+    assert result.exit_code in {0, 1} if words[0] == "validate" else result.exit_code == 0, (
+        result.output
+    )
 
 
 KINDS = {
@@ -313,7 +373,9 @@ def named(expression: ast.expr) -> Any:
         return named(expression.value).__getitem__
     if isinstance(expression, ast.Attribute):
         if isinstance(expression.value, ast.Name) and expression.value.id not in KINDS:
-            return getattr(import_module(f"deepaccident_devkit.{expression.value.id}"), expression.attr)
+            return getattr(
+                import_module(f"deepaccident_devkit.{expression.value.id}"), expression.attr
+            )
         return getattr(named(expression.value), expression.attr)
     assert isinstance(expression, ast.Name)
     return KINDS[expression.id]
@@ -329,9 +391,13 @@ def test_every_counterpart_of_a_nuscenes_call_exists(code: str) -> None:
         named(expression)
         return
     keywords = {keyword.arg: keyword.value for keyword in expression.keywords if keyword.arg}
-    owner = getattr(expression.func, "value", None)  # of a method its object, or its class: `geometry.Box.from_wlh`
+    owner = getattr(
+        expression.func, "value", None
+    )  # of a method its object, or its class: `geometry.Box.from_wlh`
     of_instance = owner is not None and not getattr(owner, "attr", "").istitle()
-    inspect.signature(named(expression.func)).bind(*([None] if of_instance else []), *expression.args, **keywords)
+    inspect.signature(named(expression.func)).bind(
+        *([None] if of_instance else []), *expression.args, **keywords
+    )
 
 
 @pytest.mark.parametrize("page", ["README.md", "CONTRIBUTING.md", "ARCHITECTURE.md", "SECURITY.md"])
@@ -342,4 +408,6 @@ def test_the_links_of_pages_that_are_not_on_the_site_lead_somewhere(page: str) -
 
 def test_the_picture_of_the_layers_is_that_of_the_contract() -> None:
     script = loaded_script("docs/make_architecture.py")
-    assert script.PICTURE.read_text(encoding="utf-8") == script.picture(), "run: python docs/make_architecture.py"
+    assert script.PICTURE.read_text(encoding="utf-8") == script.picture(), (
+        "run: python docs/make_architecture.py"
+    )

@@ -60,7 +60,9 @@ def test_mutants_of_a_source() -> None:
         ("int = 3", "int = 1", (False, 2, 4, 5, (1,))),
     ],
 )
-def test_a_mutant_is_planted_wherever_it_is_held(tmp_path: Path, monkeypatch, before, after, found) -> None:
+def test_a_mutant_is_planted_wherever_it_is_held(
+    tmp_path: Path, monkeypatch, before, after, found
+) -> None:
     path = tmp_path / "planted_here.py"
     path.write_text(SOURCE)
     spec = importlib.util.spec_from_file_location("planted_here", path)
@@ -72,4 +74,7 @@ def test_a_mutant_is_planted_wherever_it_is_held(tmp_path: Path, monkeypatch, be
         (SOURCE, False, (False, 2, 4, 5, (3,))),
         (SOURCE.replace(before, after), True, found),
     ):
-        assert (plant(module, ast.parse(source)), near.__wrapped__(2), *limits()) == (planted, *held)
+        assert (plant(module, ast.parse(source)), near.__wrapped__(2), *limits()) == (
+            planted,
+            *held,
+        )

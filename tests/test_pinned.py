@@ -44,7 +44,9 @@ COLLIDING_AGENTS = ("ego_vehicle_behind", "other_vehicle")
 """Agents whose predicted plans lead to collisions; other plans hardly show a fault."""
 STUDY: dict[str, Any] = {
     **BASELINES,
-    "rows": [{"name": "sees {agents}", "baseline": "constant_velocity", "agents": ["single", "all"]}],
+    "rows": [
+        {"name": "sees {agents}", "baseline": "constant_velocity", "agents": ["single", "all"]}
+    ],
     "groups": {"accidents": ["collision=true"]},
     "compare": [],
 }
@@ -62,7 +64,12 @@ def pin(value: Any) -> list[Any]:
         floats.append(leaf[finite].astype(float))
         rest.update(repr(leaf[~finite].tolist()).encode())
     numbers = np.concatenate(floats)
-    return [count, rest.hexdigest()[:12], float(numbers.sum()), float(numbers @ np.linspace(1.0, 2.0, len(numbers)))]
+    return [
+        count,
+        rest.hexdigest()[:12],
+        float(numbers.sum()),
+        float(numbers @ np.linspace(1.0, 2.0, len(numbers))),
+    ]
 
 
 def leaves(value: Any) -> Iterator[Any]:
@@ -85,7 +92,9 @@ def same(found: Any, expected: Any) -> bool:
     if isinstance(found, list):
         return len(found) == len(expected) and all(map(same, found, expected))
     if isinstance(found, float) and isinstance(expected, float):
-        return math.isclose(found, expected, rel_tol=1e-6, abs_tol=1e-9) or (math.isnan(found) and math.isnan(expected))
+        return math.isclose(found, expected, rel_tol=1e-6, abs_tol=1e-9) or (
+            math.isnan(found) and math.isnan(expected)
+        )
     return bool(found == expected)
 
 
@@ -114,8 +123,14 @@ def pairs(_: DeepAccident, da: DeepAccident, __: Path) -> Pins:
     made = {record["token"]: interactions(da, record["token"]) for record in da.scenario}
     found = {}
     for token, each in made.items():
-        for name, table in (("interaction", each.to_arrow()), ("interaction_pair", each.pairs.to_arrow())):
-            found |= {f"{token} {name}.{column}": pin(table[column].to_pylist()) for column in table.column_names}
+        for name, table in (
+            ("interaction", each.to_arrow()),
+            ("interaction_pair", each.pairs.to_arrow()),
+        ):
+            found |= {
+                f"{token} {name}.{column}": pin(table[column].to_pylist())
+                for column in table.column_names
+            }
     return found
 
 
@@ -125,7 +140,11 @@ def labels(_: DeepAccident, da: DeepAccident, __: Path) -> Pins:
     configs = {name: MotionLabelConfig.preset(name) for name in PRESETS}
     configs |= {f"protocol {name}": MotionLabelConfig(protocol=name) for name in LABEL_PROTOCOLS}
     made = {name: motion_labels(da, token, config) for name, config in configs.items()}
-    return {f"{name}.{field}": pin(getattr(each, field)) for name, each in made.items() for field in LABEL_FIELDS}
+    return {
+        f"{name}.{field}": pin(getattr(each, field))
+        for name, each in made.items()
+        for field in LABEL_FIELDS
+    }
 
 
 def evaluations(_: DeepAccident, da: DeepAccident, folder: Path) -> Pins:
@@ -136,12 +155,19 @@ def evaluations(_: DeepAccident, da: DeepAccident, folder: Path) -> Pins:
         agents = COLLIDING_AGENTS if kind == "planning" else ("ego_vehicle",)
         mine = {"samples": "all", "scope": "all", "agents": agents}
         tokens = SampleSelection(split=str(split), **mine).tokens(da)
-        path = predict_results(da, kind, tokens, folder / (kind if kind == "motion" else f"{kind}.json"))
-        for task, protocol in [(task, protocol) for task, protocols in tasks.items() for protocol in protocols]:
+        path = predict_results(
+            da, kind, tokens, folder / (kind if kind == "motion" else f"{kind}.json")
+        )
+        for task, protocol in [
+            (task, protocol) for task, protocols in tasks.items() for protocol in protocols
+        ]:
             setup = EvaluationSetup(task=task, protocol=protocol)
             run = evaluate_results(da, path, setup, default_selection(setup, split, **mine))
             name, summary = f"{kind} {task} {protocol}", run.summary()
-            found |= {f"{name} counts": pin(run.evaluator.counts), f"{name} numbers": pin(summary["metrics"])}
+            found |= {
+                f"{name} counts": pin(run.evaluator.counts),
+                f"{name} numbers": pin(summary["metrics"]),
+            }
             found[f"{name} headlines"] = [each["value"] for each in summary["headlines"]]
     return found
 
@@ -192,18 +218,25 @@ SECTIONS: list[Section] = [tables, pairs, labels, evaluations, study, nuscenes]
 @pytest.mark.slow
 @pytest.mark.parametrize("section", SECTIONS, ids=lambda section: section.__name__)
 def test_numbers_are_what_they_were(
-    section: Callable[..., Pins], da: DeepAccident, da_motion: DeepAccident, tmp_path: Path, pytestconfig: pytest.Config
+    section: Callable[..., Pins],
+    da: DeepAccident,
+    da_motion: DeepAccident,
+    tmp_path: Path,
+    pytestconfig: pytest.Config,
 ) -> None:
     found = json.loads(json.dumps(section(da, da_motion, tmp_path)))
     kept = json.loads(FILE.read_text(encoding="utf-8")) if FILE.exists() else {}
     if pytestconfig.getoption("--pin"):
         before = kept.get(section.__name__, {})
-        kept[section.__name__] = {  # what is the same stays as it is written, in spite of other last digits
+        kept[
+            section.__name__
+        ] = {  # what is the same stays as it is written, in spite of other last digits
             name: before[name] if name in before and same(value, before[name]) else value
             for name, value in found.items()
         }
         rows = (
-            f'"{name}": {{\n' + ",\n".join(f" {json.dumps(key)}: {json.dumps(each)}" for key, each in of.items())
+            f'"{name}": {{\n'
+            + ",\n".join(f" {json.dumps(key)}: {json.dumps(each)}" for key, each in of.items())
             for name, of in kept.items()
         )
         FILE.write_text("{" + "\n},\n".join(rows) + "\n}}\n", encoding="utf-8")

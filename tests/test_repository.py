@@ -18,7 +18,15 @@ from deepaccident_devkit.cli import deepaccident
 
 TEMPLATES = sorted((TOP / ".github" / "ISSUE_TEMPLATE").glob("*.yml"))
 BUILT = (
-    *("pyproject.toml", "setup.py", "MANIFEST.in", "README.md", "LICENSE", "CHANGELOG.md", "CITATION.cff"),
+    *(
+        "pyproject.toml",
+        "setup.py",
+        "MANIFEST.in",
+        "README.md",
+        "LICENSE",
+        "CHANGELOG.md",
+        "CITATION.cff",
+    ),
     "SECURITY.md",
 )
 
@@ -36,7 +44,8 @@ def test_the_templates_ask_for_commands_that_exist(path: Path) -> None:
         result = CliRunner().invoke(deepaccident, words)
         assert result.exit_code == 0
         assert (
-            verb.startswith("-") or [word for word in options if word[:2] == "--" and word not in result.output] == []
+            verb.startswith("-")
+            or [word for word in options if word[:2] == "--" and word not in result.output] == []
         )
 
 
@@ -52,7 +61,9 @@ def distributions(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (source / "tests").mkdir()
     shutil.copy(__file__, source / "tests")
     code = "from setuptools import build_meta as b; b.build_wheel('dist'); b.build_sdist('dist')"
-    subprocess.run([sys.executable, "-W", "ignore", "-c", code], cwd=source, check=True, capture_output=True)
+    subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", code], cwd=source, check=True, capture_output=True
+    )
     return source / "dist"
 
 
@@ -81,7 +92,9 @@ def test_an_sdist_holds_the_package_and_what_builds_it(distributions: Path) -> N
     with tarfile.open(sdist) as archive:
         names = {each.name.partition("/")[2] for each in archive.getmembers() if each.isfile()}
     made = {"PKG-INFO", "setup.cfg"}
-    assert {name for name in names if ".egg-info/" not in name} == package_files() | set(BUILT) | made
+    assert {name for name in names if ".egg-info/" not in name} == package_files() | set(
+        BUILT
+    ) | made
 
 
 STRANGER = """
@@ -102,12 +115,24 @@ def test_a_strangers_type_checker_reads_the_types(distributions: Path, tmp_path:
     pytest.importorskip("mypy")
     environment = tmp_path / "environment"
     subprocess.run([sys.executable, "-m", "venv", "--without-pip", environment], check=True)
-    [installed], [wheel] = environment.glob("lib/python*/site-packages"), distributions.glob("*.whl")
+    [installed], [wheel] = (
+        environment.glob("lib/python*/site-packages"),
+        distributions.glob("*.whl"),
+    )
     shutil.unpack_archive(wheel, installed, "zip")
     (installed / "libraries.pth").write_text(sysconfig.get_path("purelib"), encoding="utf-8")
     (tmp_path / "stranger.py").write_text(STRANGER, encoding="utf-8")
-    command = [sys.executable, "-m", "mypy", "--strict", "--python-executable", environment / "bin" / "python"]
-    found = subprocess.run([*command, "stranger.py"], cwd=tmp_path, capture_output=True, text=True, check=False).stdout
+    command = [
+        sys.executable,
+        "-m",
+        "mypy",
+        "--strict",
+        "--python-executable",
+        environment / "bin" / "python",
+    ]
+    found = subprocess.run(
+        [*command, "stranger.py"], cwd=tmp_path, capture_output=True, text=True, check=False
+    ).stdout
     assert re.search(r'Revealed type is "numpy\.ndarray\[', found), found
     assert ("def (" in found, '"Boxes" has no attribute "no_such_field"' in found) == (True, True)
     assert found.rstrip().endswith("Found 1 error in 1 file (checked 1 source file)")

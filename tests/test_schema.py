@@ -18,12 +18,20 @@ SCHEMA = Path(__file__).parents[1] / "schema"
 
 def test_the_files_are_not_stale(schema_generator: ModuleType) -> None:
     for name, content in schema_generator.generated_files().items():
-        assert (SCHEMA / name).read_text(encoding="utf-8") == content, f"run python schema/generate.py: {name}"
+        assert (SCHEMA / name).read_text(encoding="utf-8") == content, (
+            f"run python schema/generate.py: {name}"
+        )
 
 
 def test_no_file_is_left_over(schema_generator: ModuleType) -> None:
-    by_hand = {"generate.py", "motion_labels.md"}  # tests/unit/motion/test_label_files.py runs what the page says
-    assert {path.name for path in SCHEMA.iterdir() if path.is_file()} == {*schema_generator.generated_files(), *by_hand}
+    by_hand = {
+        "generate.py",
+        "motion_labels.md",
+    }  # tests/unit/motion/test_label_files.py runs what the page says
+    assert {path.name for path in SCHEMA.iterdir() if path.is_file()} == {
+        *schema_generator.generated_files(),
+        *by_hand,
+    }
 
 
 @pytest.mark.parametrize("table", list(table_specs()))

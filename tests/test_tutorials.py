@@ -34,7 +34,9 @@ def test_every_notebook_is_run_and_listed() -> None:
 
 
 @pytest.mark.parametrize("name", LAST_WORDS)
-def test_notebook_is_stored_without_outputs_and_begins_with_what_installs_the_devkit(name: str) -> None:
+def test_notebook_is_stored_without_outputs_and_begins_with_what_installs_the_devkit(
+    name: str,
+) -> None:
     code = [cell for cell in read(name).cells if cell.cell_type == "code"]
     assert [cell.id for cell in code if cell.outputs or cell.execution_count is not None] == []
     wanted = ("except ModuleNotFoundError:", "\n    %pip install --quiet '..[synth]'")
@@ -44,13 +46,22 @@ def test_notebook_is_stored_without_outputs_and_begins_with_what_installs_the_de
 @pytest.mark.parametrize("name", LAST_WORDS)
 @pytest.mark.filterwarnings("ignore::DeprecationWarning:jupyter_client|zmq|nbclient|asyncio")
 def test_notebook_runs(
-    name: str, release_root: Path, da_motion: DeepAccident, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    name: str,
+    release_root: Path,
+    da_motion: DeepAccident,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setenv("DEEPACCIDENT", str(release_root if name in NEEDS_SENSORS else da_motion.dataroot))
+    monkeypatch.setenv(
+        "DEEPACCIDENT", str(release_root if name in NEEDS_SENSORS else da_motion.dataroot)
+    )
     monkeypatch.setenv("TMPDIR", str(tmp_path))
     notebook = read(name)
     NotebookClient(
-        notebook, timeout=SECONDS, kernel_name="python3", resources={"metadata": {"path": str(TUTORIALS)}}
+        notebook,
+        timeout=SECONDS,
+        kernel_name="python3",
+        resources={"metadata": {"path": str(TUTORIALS)}},
     ).execute()
     last = next(cell for cell in reversed(notebook.cells) if cell.cell_type == "code")
     assert LAST_WORDS[name] in last.outputs[0].text

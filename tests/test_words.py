@@ -34,11 +34,20 @@ def prose(path: Path) -> str:
     text = path.read_text(encoding="utf-8")
     if path.suffix == ".ipynb":
         cells = json.loads(text)["cells"]
-        text = "\n\n".join("".join(cell["source"]) for cell in cells if cell["cell_type"] == "markdown")
+        text = "\n\n".join(
+            "".join(cell["source"]) for cell in cells if cell["cell_type"] == "markdown"
+        )
     if path.suffix == ".py":
         nodes = [node.value for node in ast.walk(ast.parse(text)) if isinstance(node, ast.Expr)]
-        texts = [node.value for node in nodes if isinstance(node, ast.Constant) and isinstance(node.value, str)]
-        return CODE.sub(" • ", re.sub(r"^ +", " ", EXAMPLE_OR_NAME.sub("", "\n".join(texts)), flags=re.MULTILINE))
+        texts = [
+            node.value
+            for node in nodes
+            if isinstance(node, ast.Constant) and isinstance(node.value, str)
+        ]
+        return CODE.sub(
+            " • ",
+            re.sub(r"^ +", " ", EXAMPLE_OR_NAME.sub("", "\n".join(texts)), flags=re.MULTILINE),
+        )
     return CODE.sub(" • ", text)
 
 

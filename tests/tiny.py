@@ -10,8 +10,21 @@ import numpy as np
 TYPE = "type1_subtype1_accident"
 NAME = "Town03_type001_subtype0001_scenario00024"
 TOKEN = f"{TYPE}/{NAME}"
-AGENTS = ("ego_vehicle", "ego_vehicle_behind", "other_vehicle", "other_vehicle_behind", "infrastructure")
-CAMERA_YAW = {"Front": 0, "FrontLeft": -55, "FrontRight": 55, "Back": 180, "BackLeft": -110, "BackRight": 110}
+AGENTS = (
+    "ego_vehicle",
+    "ego_vehicle_behind",
+    "other_vehicle",
+    "other_vehicle_behind",
+    "infrastructure",
+)
+CAMERA_YAW = {
+    "Front": 0,
+    "FrontLeft": -55,
+    "FrontRight": 55,
+    "Back": 180,
+    "BackLeft": -110,
+    "BackRight": 110,
+}
 META = """HardRainNoon 1223 car 1212 car 6790.168605131015 same front_side 14
  colliding agents: ego other
  agents id: 1223 1236 1212 1237
@@ -31,10 +44,14 @@ def pose(yaw: float = 0.0, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> np
 def calib(ego_to_world: np.ndarray, *, height: float) -> dict[str, np.ndarray]:
     arrays = {"lidar_to_ego": pose(z=height), "ego_to_world": ego_to_world}
     for name, yaw in CAMERA_YAW.items():
-        camera_to_lidar = pose(yaw, x=2.0 * np.cos(np.radians(yaw)), y=2.0 * np.sin(np.radians(yaw)), z=-0.3)
+        camera_to_lidar = pose(
+            yaw, x=2.0 * np.cos(np.radians(yaw)), y=2.0 * np.sin(np.radians(yaw)), z=-0.3
+        )
         focal = 560.166 if name == "Back" else 1142.5184
         arrays[f"lidar_to_Camera_{name}"] = np.linalg.inv(camera_to_lidar)
-        arrays[f"intrinsic_Camera_{name}"] = np.array([[800, focal, 0], [450, 0, -focal], [1, 0, 0]], dtype=float)
+        arrays[f"intrinsic_Camera_{name}"] = np.array(
+            [[800, focal, 0], [450, 0, -focal], [1, 0, 0]], dtype=float
+        )
     return arrays
 
 
@@ -88,13 +105,18 @@ def write_tiny_release(
                 old_pickle(calib(ego_to_world(agent, frame), height=lidar_height(agent))),
             )
             if labelled:
-                _write(base / agent / "label" / f"{stem}.txt", ("\n".join(lines_of(agent, frame)) + "\n").encode())
+                _write(
+                    base / agent / "label" / f"{stem}.txt",
+                    ("\n".join(lines_of(agent, frame)) + "\n").encode(),
+                )
     return root
 
 
 def old_pickle(content: Any) -> bytes:
     """A pickle that names numpy 1's modules."""
-    return pickle.dumps(content, protocol=2).replace(b"numpy._core.multiarray", b"numpy.core.multiarray")
+    return pickle.dumps(content, protocol=2).replace(
+        b"numpy._core.multiarray", b"numpy.core.multiarray"
+    )
 
 
 def _write(path: Path, content: bytes) -> None:

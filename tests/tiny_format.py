@@ -40,7 +40,13 @@ class TinyFormat(Format):
         output.leave_out("clouds", len(pictures))
         write_bytes(output.parts / "count.txt", str(len(pictures)).encode())
 
-    def finish(self, dataset: Dataset, units: Sequence[Unit], output: Output, parts: Callable[[Unit], Path]) -> None:  # noqa: ARG002
+    def finish(
+        self,
+        dataset: Dataset,  # noqa: ARG002
+        units: Sequence[Unit],
+        output: Output,
+        parts: Callable[[Unit], Path],
+    ) -> None:
         counts = {unit.name: int((parts(unit) / "count.txt").read_text()) for unit in units}
         output.write("counts.json", json.dumps(counts).encode())
         output.leave_out("maps")
@@ -67,4 +73,6 @@ class KilledFormat(TinyFormat):
 
 def export_tiny(dataroot: str, folder: str, workers: int) -> None:
     """Export a release whole."""
-    export_release(DeepAccident(dataroot=dataroot, verbose=False), folder, TinyFormat(), workers=workers)
+    export_release(
+        DeepAccident(dataroot=dataroot, verbose=False), folder, TinyFormat(), workers=workers
+    )

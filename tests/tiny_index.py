@@ -12,12 +12,18 @@ THIRD = "Town01_type001_subtype0001_scenario00001"
 INDEX = Path(".deepaccident") / "v1"
 
 
-def opened(root: Path | str, index_dir: Path | str | None = None, **arguments: object) -> DeepAccident:
+def opened(
+    root: Path | str, index_dir: Path | str | None = None, **arguments: object
+) -> DeepAccident:
     return DeepAccident(dataroot=root, index_dir=index_dir, verbose=False, **arguments)  # type: ignore[arg-type]
 
 
 def contents(folder: Path) -> dict[str, bytes]:
-    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
 
 
 def label(root: Path, agent: str = "ego_vehicle", frame: int = 2, name: str = tiny.NAME) -> Path:

@@ -25,7 +25,9 @@ def ran(*words: object, status: int = 0) -> subprocess.CompletedProcess[str]:
     return done
 
 
-def commands(command: click.Command, *words: str) -> Iterator[tuple[tuple[str, ...], click.Command]]:
+def commands(
+    command: click.Command, *words: str
+) -> Iterator[tuple[tuple[str, ...], click.Command]]:
     """A command by its words, and all commands below it."""
     yield words, command
     context = click.Context(command)

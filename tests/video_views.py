@@ -29,9 +29,14 @@ def decoded(path: Path) -> list[Any]:
     if path.suffix == ".mp4":
         av = pytest.importorskip("av")
         with av.open(str(path)) as container:
-            return [frame.to_ndarray(format="rgb24").astype(float) for frame in container.decode(video=0)]
+            return [
+                frame.to_ndarray(format="rgb24").astype(float)
+                for frame in container.decode(video=0)
+            ]
     with Image.open(path) as image:
-        return [np.asarray(each.convert("RGB"), dtype=float) for each in ImageSequence.Iterator(image)]
+        return [
+            np.asarray(each.convert("RGB"), dtype=float) for each in ImageSequence.Iterator(image)
+        ]
 
 
 def greys(path: Path) -> list[int]:

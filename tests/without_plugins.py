@@ -41,7 +41,11 @@ def pytest_make_collect_report(collector: pytest.Collector) -> Iterator[Any]:
     report: Any = yield
     call = getattr(report, "call", None)
     if report.failed and call is not None and needed_by_the_test(call.excinfo.value):
-        report.outcome, report.longrepr, report.result = "skipped", (str(collector.path), 0, "needs a plug-in"), []
+        report.outcome, report.longrepr, report.result = (
+            "skipped",
+            (str(collector.path), 0, "needs a plug-in"),
+            [],
+        )
     return report
 
 

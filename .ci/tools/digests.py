@@ -36,19 +36,37 @@ RELEASES = {
     "sensors": ["--scenarios", "2", "--frames", "11", "--size", "32x18", "--seed", "978"],
 }
 """Name → how `synth` makes it: one with pasts and futures, and a small one with all sensors."""
-GENERATED = ["--scenarios", "2", "--frames", "2", "--size", "48x27", "--seed", "979", "--layout", "B", "--designed"]
+GENERATED = [
+    "--scenarios",
+    "2",
+    "--frames",
+    "2",
+    "--size",
+    "48x27",
+    "--seed",
+    "979",
+    "--layout",
+    "B",
+    "--designed",
+]
 """How each checkout makes a release of its own, all of whose files are compared."""
 EXPORTS = {
     "cache": ("sensors", ["cache", "--size", "16x9", "--where", "length=1..1000"]),
     "labels": ("labelled", ["labels", "--samples", "all", "--split"]),
-    "labels of beverse": ("labelled", ["labels", "--samples", "evaluate", "--names", "beverse", "--split"]),
+    "labels of beverse": (
+        "labelled",
+        ["labels", "--samples", "evaluate", "--names", "beverse", "--split"],
+    ),
     "mcap": ("sensors", ["export", "mcap", "--motion-labels", "deepaccident"]),
     "mmdet3d": ("sensors", ["export", "mmdet3d"]),
     "mmdet3d released": ("sensors", ["export", "mmdet3d", "--style", "released"]),
     "nuscenes": ("sensors", ["export", "nuscenes"]),
     "opencood": ("sensors", ["export", "opencood"]),
     "parquet": ("labelled", ["export", "parquet"]),
-    "questions": ("labelled", ["export", "questions", "--observe", "1", "--ahead", "1", "--stride", "0.5"]),
+    "questions": (
+        "labelled",
+        ["export", "questions", "--observe", "1", "--ahead", "1", "--stride", "0.5"],
+    ),
     "town-maps": ("sensors", ["export", "town-maps"]),
     "webdataset": ("sensors", ["export", "webdataset"]),
 }
@@ -258,7 +276,12 @@ def _as_before(arguments: Sequence[str]) -> list[str]:
     if words != list(arguments):
         return words  # of a day on which the other spellings were there
     size = {"synth": "--image-size", "cache": "--resize"}.get(words[0], "--size")
-    return "\0".join(words).replace("--sensors\0none", "--no-sensors").replace("--size", size).split("\0")
+    return (
+        "\0".join(words)
+        .replace("--sensors\0none", "--no-sensors")
+        .replace("--size", size)
+        .split("\0")
+    )
 
 
 def digests_of_files(folder: Path, left_out: Iterable[str] = FILES_LEFT_OUT) -> Digests:
@@ -276,7 +299,10 @@ def digests_of_tables(dataset: Any, table: str) -> Digests:
     arrow, records = dataset.arrow(table), list(getattr(dataset, table))
     fields = [field for field in (records[0] if records else ()) if field not in arrow.column_names]
     return {
-        **{name: digest([str(arrow.schema.field(name).type), arrow[name].to_pylist()]) for name in arrow.column_names},
+        **{
+            name: digest([str(arrow.schema.field(name).type), arrow[name].to_pylist()])
+            for name in arrow.column_names
+        },
         **{name: digest([record[name] for record in records]) for name in fields},
     }
 
@@ -288,13 +314,21 @@ def add_tables(found: Found, name: str, dataset: Any) -> None:
     for frame in ("world", "ego", "lidar"):
         found.add(f"tables/{name}/box/{frame}", digests_of_boxes, dataset, frame)
     for record in dataset.scenario:
-        found.add(f"tables/{name}/interaction/{record['token']}", digests_of_pairs, dataset, record["token"])
+        found.add(
+            f"tables/{name}/interaction/{record['token']}",
+            digests_of_pairs,
+            dataset,
+            record["token"],
+        )
 
 
 def digests_of_boxes(dataset: Any, frame: str) -> Digests:
     """Each field of the boxes of some samples."""
     boxes = [dataset.boxes(token, frame) for token in some_samples(dataset, 40)]
-    return {each.name: digest([getattr(one, each.name) for one in boxes]) for each in dataclasses.fields(boxes[0])}
+    return {
+        each.name: digest([getattr(one, each.name) for one in boxes])
+        for each in dataclasses.fields(boxes[0])
+    }
 
 
 def digests_of_pairs(dataset: Any, scenario: str) -> Digests:
@@ -304,7 +338,9 @@ def digests_of_pairs(dataset: Any, scenario: str) -> Digests:
     made = interactions(dataset, scenario)
     tables = {"interaction": made.to_arrow(), "interaction_pair": made.pairs.to_arrow()}
     return {
-        f"{name}/{column}": digest(of[column].to_pylist()) for name, of in tables.items() for column in of.column_names
+        f"{name}/{column}": digest(of[column].to_pylist())
+        for name, of in tables.items()
+        for column in of.column_names
     }
 
 
@@ -313,7 +349,9 @@ def add_labels(found: Found, name: str, dataset: Any) -> None:
     from deepaccident_devkit.motion import LABEL_PROTOCOLS, PRESETS, MotionLabelConfig
 
     configs = {preset: MotionLabelConfig.preset(preset) for preset in PRESETS}
-    configs |= {f"protocol {protocol}": MotionLabelConfig(protocol=protocol) for protocol in LABEL_PROTOCOLS}
+    configs |= {
+        f"protocol {protocol}": MotionLabelConfig(protocol=protocol) for protocol in LABEL_PROTOCOLS
+    }
     configs |= {
         "agents single": MotionLabelConfig(agents="single"),
         "vehicles": MotionLabelConfig(only_vehicle=True),
@@ -335,7 +373,16 @@ def digests_of_labels(dataset: Any, config: Any) -> Digests:
     from deepaccident_devkit.motion import motion_labels
 
     made = [motion_labels(dataset, token, config) for token in some_samples(dataset, 12)]
-    fields = ("segmentation", "instance", "centerness", "offset", "flow", "future_egomotion", "valid", "id_map")
+    fields = (
+        "segmentation",
+        "instance",
+        "centerness",
+        "offset",
+        "flow",
+        "future_egomotion",
+        "valid",
+        "id_map",
+    )
     return {field: digest([getattr(each, field) for each in made]) for field in fields}
 
 
@@ -377,7 +424,9 @@ def baselines() -> dict[str, Any]:
     noisy = Link(latency=0.2, pose_noise=0.4, packet_loss=0.1, seed=977)
     return {
         "constant velocity": baseline(),
-        "turn rate of all, noisy": baseline(agents="all", model="constant_turn_rate", link=noisy, horizon=3.0),
+        "turn rate of all, noisy": baseline(
+            agents="all", model="constant_turn_rate", link=noisy, horizon=3.0
+        ),
     }
 
 
@@ -482,7 +531,8 @@ def digests_of_study(name: str, folder: Path) -> Digests:
     report = study.run_study(study.read_recipe(str(recipe)), folder / "out", workers=1)
     summary = {k: value for k, value in report.to_dict().items() if k not in STUDY_KEYS_LEFT_OUT}
     summary["cells"] = [
-        {key: value for key, value in cell.items() if key not in CELL_KEYS_LEFT_OUT} for cell in summary["cells"]
+        {key: value for key, value in cell.items() if key not in CELL_KEYS_LEFT_OUT}
+        for cell in summary["cells"]
     ]
     files = digests_of_files(folder / "out" / name, STUDY_FILES_LEFT_OUT)
     return {**dict(leaves(summary, depth=5)), **files}
@@ -604,7 +654,9 @@ def work(out: Path) -> None:
 
     print(f"  {deepaccident_devkit.__file__}", flush=True)
     here, found = Path.cwd(), Found()
-    dataset, sensors = (DeepAccident("v1", here / "releases" / name, verbose=False) for name in RELEASES)
+    dataset, sensors = (
+        DeepAccident("v1", here / "releases" / name, verbose=False) for name in RELEASES
+    )
     write_split(here / SPLIT, dataset)
 
     def labels() -> None:
@@ -644,7 +696,12 @@ def work(out: Path) -> None:
 
 def run_in(checkout: Path, python: str, *arguments: str, folder: Path) -> None:
     """Run Python with a checkout's package in a folder; raises CalledProcessError."""
-    environment = {**os.environ, "PYTHONPATH": str(checkout), "MPLBACKEND": "Agg", "PYTHONHASHSEED": "0"}
+    environment = {
+        **os.environ,
+        "PYTHONPATH": str(checkout),
+        "MPLBACKEND": "Agg",
+        "PYTHONHASHSEED": "0",
+    }
     subprocess.run([python, *arguments], cwd=folder, env=environment, check=True, stderr=None)
 
 
@@ -652,7 +709,9 @@ def digests_in(checkout: Path, python: str, releases: Path, folder: Path) -> Dig
     """What a worker in a checkout finds; the folder is made anew."""
     shutil.rmtree(folder, ignore_errors=True)
     without_index = shutil.ignore_patterns(".deepaccident")
-    shutil.copytree(releases, folder / "releases", ignore=without_index, copy_function=shutil.copyfile)
+    shutil.copytree(
+        releases, folder / "releases", ignore=without_index, copy_function=shutil.copyfile
+    )
     out = folder / "digests.json"
     run_in(checkout, python, __file__, "--worker", str(out), folder=folder)
     found: Digests = json.loads(out.read_text())
@@ -705,11 +764,19 @@ def report(found: Mapping[str, str], title: str) -> None:
 def parsed() -> argparse.Namespace:
     """The arguments."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n\n")[0])
-    parser.add_argument("checkouts", nargs="*", type=Path, metavar="CHECKOUT", help="two folders: BEFORE and AFTER")
-    parser.add_argument("--release", type=Path, help="folder of releases that a run with --keep made")
-    parser.add_argument("--expect", action="append", default=[], metavar="PATTERN", help="names that may differ")
+    parser.add_argument(
+        "checkouts", nargs="*", type=Path, metavar="CHECKOUT", help="two folders: BEFORE and AFTER"
+    )
+    parser.add_argument(
+        "--release", type=Path, help="folder of releases that a run with --keep made"
+    )
+    parser.add_argument(
+        "--expect", action="append", default=[], metavar="PATTERN", help="names that may differ"
+    )
     parser.add_argument("--python", default=sys.executable, help="interpreter of both workers")
-    parser.add_argument("--keep", type=Path, help="folder for releases and digests, in place of a temporary one")
+    parser.add_argument(
+        "--keep", type=Path, help="folder for releases and digests, in place of a temporary one"
+    )
     parser.add_argument("--worker", type=Path, help=argparse.SUPPRESS)
     given = parser.parse_args()
     if given.worker is None and len(given.checkouts) != 2:
@@ -734,11 +801,19 @@ def main() -> int:
         for name, checkout in (("before", before), ("after", after)):
             print(f"{name}: {checkout}", flush=True)
             found.append(digests_in(checkout, given.python, releases, folder / "run"))
-            (folder / f"{name}.json").write_text(json.dumps(found[-1], indent=1, sort_keys=True, ensure_ascii=False))
+            (folder / f"{name}.json").write_text(
+                json.dumps(found[-1], indent=1, sort_keys=True, ensure_ascii=False)
+            )
         different = differences(*found)
-    expected = {n: how for n, how in different.items() if any(fnmatchcase(n, pattern) for pattern in given.expect)}
+    expected = {
+        n: how
+        for n, how in different.items()
+        if any(fnmatchcase(n, pattern) for pattern in given.expect)
+    }
     unexpected = {name: how for name, how in different.items() if name not in expected}
-    print(f"{sum(name in found[1] for name in found[0]) - sum('changed' in how for how in different.values()):,} equal")
+    print(
+        f"{sum(name in found[1] for name in found[0]) - sum('changed' in how for how in different.values()):,} equal"
+    )
     report(expected, "as expected")
     report(unexpected, "unexpected")
     return int(bool(unexpected))

@@ -19,9 +19,18 @@ with (Path(__file__).parents[2] / "pyproject.toml").open("rb") as file:
     project = tomllib.load(file)["project"]
 extras = project["optional-dependencies"]
 extra = extras[sys.argv[1] if len(sys.argv) > 1 else "test"]
-others = [name for each in extra if each.startswith("deepaccident_devkit[") for name in re.findall(r"\w+", each)[1:]]
+others = [
+    name
+    for each in extra
+    if each.startswith("deepaccident_devkit[")
+    for name in re.findall(r"\w+", each)[1:]
+]
 bounds: dict[str, tuple[int, ...]] = {}
-for requirement in [*project["dependencies"], *extra, *(each for name in others for each in extras[name])]:
+for requirement in [
+    *project["dependencies"],
+    *extra,
+    *(each for name in others for each in extras[name]),
+]:
     found = re.match(r"([\w-]+)>=([\d.]+)", requirement)
     if found:
         bound = tuple(map(int, found[2].split(".")))

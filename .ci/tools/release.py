@@ -45,12 +45,18 @@ def set_version(top: Path, version: str) -> int:
         print(f"{version} is no version such as 1.1.0 or 1.1.0rc1", file=sys.stderr)
         return 2
     today = datetime.now(timezone.utc).date().isoformat()
-    replace(top / "deepaccident_devkit/support/version.py", PLACES["deepaccident_devkit/support/version.py"], version)
+    replace(
+        top / "deepaccident_devkit/support/version.py",
+        PLACES["deepaccident_devkit/support/version.py"],
+        version,
+    )
     replace(top / "CITATION.cff", PLACES["CITATION.cff"], version)
     changelog = (top / "CHANGELOG.md").read_text(encoding="utf-8")
     if f"## [{version}]" not in changelog:
         heading = f"## [Unreleased]\n\n## [{version}] - {today}"
-        (top / "CHANGELOG.md").write_text(changelog.replace("## [Unreleased]", heading, 1), encoding="utf-8")
+        (top / "CHANGELOG.md").write_text(
+            changelog.replace("## [Unreleased]", heading, 1), encoding="utf-8"
+        )
     replace(top / "pyproject.toml", r'"(Development Status :: .*)"', status_of(version))
     if owner := owner_of(top):
         write_addresses(top, f"https://github.com/{owner}/deepaccident_devkit")
@@ -93,12 +99,16 @@ def version_of(top: Path) -> str:
 
 def owner_of(top: Path) -> str:
     """The owner of the repository on GitHub; empty where none is set."""
-    return re.findall(r"(?m)^    owner = *(\S*)$", (top / "RELEASING.md").read_text(encoding="utf-8"))[0]
+    return re.findall(
+        r"(?m)^    owner = *(\S*)$", (top / "RELEASING.md").read_text(encoding="utf-8")
+    )[0]
 
 
 def notes_of(top: Path) -> str:
     """The section of the changelog on this version, without its heading."""
-    sections = re.split(r"(?m)^## \[(.*?)\].*\n", (top / "CHANGELOG.md").read_text(encoding="utf-8"))
+    sections = re.split(
+        r"(?m)^## \[(.*?)\].*\n", (top / "CHANGELOG.md").read_text(encoding="utf-8")
+    )
     return dict(zip(sections[1::2], sections[2::2], strict=True))[version_of(top)].strip()
 
 
@@ -116,7 +126,12 @@ def write_addresses(top: Path, repository: str) -> None:
         f"    url: {advisories}\n    about: Reported in private, as SECURITY.md asks\n"
     )
     code = f"repository-code: {repository}\n"
-    write_section(top / "pyproject.toml", r"(?s)\[project\.urls\]\n.*?\n\n", urls, before="[project.scripts]\n")
+    write_section(
+        top / "pyproject.toml",
+        r"(?s)\[project\.urls\]\n.*?\n\n",
+        urls,
+        before="[project.scripts]\n",
+    )
     write_section(top / "CITATION.cff", r"(?m)^repository-code: .*\n", code, before="authors:\n")
     (top / ".github/ISSUE_TEMPLATE/config.yml").write_text(links, encoding="utf-8")
 
@@ -131,7 +146,9 @@ def replace(path: Path, pattern: str, value: str) -> None:
 def write_section(path: Path, pattern: str, section: str, *, before: str) -> None:
     """Replace a section, or insert it above the line that reads `before`."""
     text, count = re.subn(pattern, section, path.read_text(encoding="utf-8"))
-    path.write_text(text if count else text.replace(f"\n{before}", f"\n{section}{before}", 1), encoding="utf-8")
+    path.write_text(
+        text if count else text.replace(f"\n{before}", f"\n{section}{before}", 1), encoding="utf-8"
+    )
 
 
 if __name__ == "__main__":

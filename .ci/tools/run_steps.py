@@ -53,14 +53,21 @@ class Run:
     @property
     def passed(self) -> bool:
         """Whether the script and all of its checks passed; a script without any check did not."""
-        return self.process.returncode == 0 and bool(self.checks) and all(check.passed for check in self.checks)
+        return (
+            self.process.returncode == 0
+            and bool(self.checks)
+            and all(check.passed for check in self.checks)
+        )
 
     def new_checks(self) -> list[Check]:
         """The checks that ended since the last call."""
         path = self.folder / "checks.tsv"
         lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
         rows = [line.split("\t") for line in lines[len(self.checks) :]]
-        ended = [Check(name, result == "passed", int(seconds), Path(log)) for name, result, seconds, log in rows]
+        ended = [
+            Check(name, result == "passed", int(seconds), Path(log))
+            for name, result, seconds, log in rows
+        ]
         self.checks += ended
         return ended
 
@@ -89,8 +96,12 @@ def main() -> int:
 
 
 def _options() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(prog=".ci/run", description=(__doc__ or "").partition("\n\n")[2])
-    parser.add_argument("steps", nargs="*", metavar="STEP", help="names of steps; default: all but those by hand")
+    parser = argparse.ArgumentParser(
+        prog=".ci/run", description=(__doc__ or "").partition("\n\n")[2]
+    )
+    parser.add_argument(
+        "steps", nargs="*", metavar="STEP", help="names of steps; default: all but those by hand"
+    )
     parser.add_argument("--list", action="store_true", help="list the steps, and run none")
     parser.add_argument(
         "--environments",
@@ -129,7 +140,10 @@ def _run_all(names: Sequence[str], work: Path, environments: Path) -> list[Run]:
             for run in list(running):
                 is_over = run.process.poll() is not None
                 for check in run.new_checks():
-                    print(f"{run.name}: {check.name} {_result(check.passed)} ({check.seconds} s)", flush=True)
+                    print(
+                        f"{run.name}: {check.name} {_result(check.passed)} ({check.seconds} s)",
+                        flush=True,
+                    )
                 if is_over:
                     run.seconds = time.monotonic() - run.began
                     print(f"== {run.name} {_result(run.passed)} ({run.seconds:.0f} s)", flush=True)
@@ -201,7 +215,11 @@ def _failures(run: Run) -> Iterator[tuple[str, str]]:
         if not check.passed:
             yield check.name, _excerpt(check.log)
     if not run.passed and all(check.passed for check in run.checks):
-        reason = f"the script ended with {run.process.returncode}" if run.checks else "the script made no check"
+        reason = (
+            f"the script ended with {run.process.returncode}"
+            if run.checks
+            else "the script made no check"
+        )
         yield reason, _excerpt(run.folder / "script.log")
 
 
@@ -218,7 +236,11 @@ def _test_summary(run: Run) -> Iterator[str]:
     for check in run.checks:
         lines = check.log.read_text(encoding="utf-8", errors="replace").splitlines()
         yield from (line for line in lines if re.match(r"(FAILED|ERROR) \S+", line))
-        totals = [line.strip("= ") for line in lines if re.search(r"\d (passed|failed|error)\b.* in [\d.]+s", line)]
+        totals = [
+            line.strip("= ")
+            for line in lines
+            if re.search(r"\d (passed|failed|error)\b.* in [\d.]+s", line)
+        ]
         yield from (f"{run.name}, {check.name}: {total}" for total in totals[-1:])
 
 

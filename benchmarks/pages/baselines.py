@@ -9,7 +9,12 @@ from benchmarks.pages.marks import put, table
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.evaluation.breakdowns import Group
 from deepaccident_devkit.evaluation.intervals import numbers_of
-from deepaccident_devkit.evaluation.runs import SampleSelection, compare_bundles, evaluate_results, save_run
+from deepaccident_devkit.evaluation.runs import (
+    SampleSelection,
+    compare_bundles,
+    evaluate_results,
+    save_run,
+)
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 from deepaccident_devkit.plugins.baselines import Baseline, predict_results
 from deepaccident_devkit.plugins.synth import SynthConfig, make_release
@@ -67,7 +72,10 @@ def main(_release: Path | None = None) -> None:
         views = {name: evaluated_view(folder / name, config) for name, config in RELEASES.items()}
         put("size", size_text(views))
         put("configurations", numbers_table(views, SHOWN, list(AGENT_CONFIGS)))
-        put("decided", decided_table(views, {name: "single" for name in AGENT_CONFIGS if name != "single"}))
+        put(
+            "decided",
+            decided_table(views, {name: "single" for name in AGENT_CONFIGS if name != "single"}),
+        )
 
 
 def evaluated_view(folder: Path, config: SynthConfig) -> dict[str, Evaluated]:
@@ -77,7 +85,9 @@ def evaluated_view(folder: Path, config: SynthConfig) -> dict[str, Evaluated]:
         make_release(root, config)
     dataset = DeepAccident("v1", root, verbose=False)
     baselines = {name: Baseline(agents=name) for name in AGENT_CONFIGS}
-    return {name: evaluated(dataset, baseline, folder / name) for name, baseline in baselines.items()}
+    return {
+        name: evaluated(dataset, baseline, folder / name) for name, baseline in baselines.items()
+    }
 
 
 def evaluated(dataset: DeepAccident, baseline: Baseline, folder: Path) -> Evaluated:
@@ -85,7 +95,9 @@ def evaluated(dataset: DeepAccident, baseline: Baseline, folder: Path) -> Evalua
     folder.mkdir(parents=True, exist_ok=True)
     groups = {}
     for name, (task, setup) in EVALUATIONS.items():
-        path = predict_results(dataset, task, SELECTION.tokens(dataset), folder / f"{task}_results", baseline)
+        path = predict_results(
+            dataset, task, SELECTION.tokens(dataset), folder / f"{task}_results", baseline
+        )
         run = evaluate_results(dataset, path, setup, SELECTION).broken_down(("all",))
         save_run(run, folder / name)
         groups[name] = run.breakdowns[0].groups[0]
@@ -118,8 +130,13 @@ def decided_table(views: Views, bases: Mapping[str, str]) -> str:
             sides: dict[str, list[str]] = {"more": [], "less": [], "not decided": []}
             for row, ends in differences.items():
                 low, high = ends[name]
-                sides["more" if low > 0 else "less" if high < 0 else "not decided"].append(f"`{row}`")
-            words = ["every one" if len(each) == len(bases) else ", ".join(each) or "–" for each in sides.values()]
+                sides["more" if low > 0 else "less" if high < 0 else "not decided"].append(
+                    f"`{row}`"
+                )
+            words = [
+                "every one" if len(each) == len(bases) else ", ".join(each) or "–"
+                for each in sides.values()
+            ]
             lines.append([name, view, *words])
     return table(["number", "view", "more", "less", "not decided"], lines)
 
@@ -127,7 +144,10 @@ def decided_table(views: Views, bases: Mapping[str, str]) -> str:
 def compared(base: Evaluated, other: Evaluated) -> dict[str, tuple[float, float]]:
     """The intervals of the differences of all numbers; (0, 0) for none."""
     numbers = {
-        name: {each.number: each for each in compare_bundles(base.folder / name, other.folder / name).numbers}
+        name: {
+            each.number: each
+            for each in compare_bundles(base.folder / name, other.folder / name).numbers
+        }
         for name in EVALUATIONS
     }
     found = {name: numbers[evaluation][path] for name, (evaluation, path) in NUMBERS.items()}

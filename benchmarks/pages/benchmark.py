@@ -54,10 +54,27 @@ def keep(release: Path, name: str) -> None:
     model, agents = ROWS[name]
     with tempfile.TemporaryDirectory() as folder:
         made = Path(folder) / name
-        run("predict", model, str(release), "--agents", agents, "--split", "test", "--out", str(made / "results"))
+        run(
+            "predict",
+            model,
+            str(release),
+            "--agents",
+            agents,
+            "--split",
+            "test",
+            "--out",
+            str(made / "results"),
+        )
         round_numbers(made / "results" / TASKS["detection"])
         for task, results in TASKS.items():
-            given = ("--results", str(made / "results" / results), "--split", "test", "--out", str(made / task))
+            given = (
+                "--results",
+                str(made / "results" / results),
+                "--split",
+                "test",
+                "--out",
+                str(made / task),
+            )
             run("evaluate", task, str(release), "--protocol", "paper", *given)
             slim(made / task)
         shutil.make_archive(str(made / "results"), "xztar", made, "results")
@@ -69,7 +86,9 @@ def keep(release: Path, name: str) -> None:
 
 def round_numbers(path: Path) -> None:
     """Write a JSON file anew with four decimals, which is half as much to keep."""
-    told = json.loads(path.read_text(encoding="utf-8"), parse_float=lambda word: round(float(word), 4))
+    told = json.loads(
+        path.read_text(encoding="utf-8"), parse_float=lambda word: round(float(word), 4)
+    )
     path.write_text(json.dumps(told, ensure_ascii=False, separators=(",", ":")), encoding="utf-8")
 
 
@@ -79,7 +98,9 @@ def slim(bundle: Path) -> None:
     (bundle / "report.html").unlink(missing_ok=True)
     told = json.loads((bundle / SUMMARY_FILE).read_text(encoding="utf-8"))
     told["release"]["dataroot"], told["results"]["path"] = "v1", "results"
-    (bundle / SUMMARY_FILE).write_text(json.dumps(told, indent=1, ensure_ascii=False), encoding="utf-8")
+    (bundle / SUMMARY_FILE).write_text(
+        json.dumps(told, indent=1, ensure_ascii=False), encoding="utf-8"
+    )
     listed = json.loads((bundle / FILES_FILE).read_text(encoding="utf-8"))
     listed["files"] = checksums_of(bundle)
     (bundle / FILES_FILE).write_text(json.dumps(listed, indent=1), encoding="utf-8")
@@ -96,17 +117,29 @@ def text(name: str, column: str) -> str:
 
 def main(_release: Path | None = None) -> None:
     """Write the page's table."""
-    rows = [(f"`{name}`", *(text(name, column) for column in NUMBERS)) for name in ROWS if (KEPT / name).is_dir()]
+    rows = [
+        (f"`{name}`", *(text(name, column) for column in NUMBERS))
+        for name in ROWS
+        if (KEPT / name).is_dir()
+    ]
     put("benchmark", table(("row", *NUMBERS), rows))
 
 
 if __name__ == "__main__":
     what, *rest = sys.argv[1:]
     if what == "--lock":
-        lines = sorted(f"{each.name}=={each.version}" for each in distributions() if each.name != "deepaccident_devkit")
-        (KEPT / "lock.txt").write_text("\n".join([f"# Python {sys.version.split()[0]}", *lines, ""]), encoding="utf-8")
+        lines = sorted(
+            f"{each.name}=={each.version}"
+            for each in distributions()
+            if each.name != "deepaccident_devkit"
+        )
+        (KEPT / "lock.txt").write_text(
+            "\n".join([f"# Python {sys.version.split()[0]}", *lines, ""]), encoding="utf-8"
+        )
     elif what == "--published":
-        told = json.dumps(described_release(Path(rest[0]), progress=True), separators=(",", ":"), sort_keys=True)
+        told = json.dumps(
+            described_release(Path(rest[0]), progress=True), separators=(",", ":"), sort_keys=True
+        )
         PUBLISHED.write_bytes(lzma.compress(told.encode(), preset=9))
     else:
         for name in rest or ROWS:

@@ -15,7 +15,9 @@ def main(release: Path | None) -> None:
     """Measure, and write the table into docs/synth.md; without a release, some ten minutes."""
     with tempfile.TemporaryDirectory() as folder:
         root = release or make_release(Path(folder) / "release", RELEASE, workers=2)
-        report = release_facts(DeepAccident(dataroot=root, index_dir=Path(folder) / "index", verbose=False))
+        report = release_facts(
+            DeepAccident(dataroot=root, index_dir=Path(folder) / "index", verbose=False)
+        )
     put("facts", page_text(report))
 
 

@@ -49,7 +49,8 @@ class Actor:
         """Where it is at a label frame."""
         way = self.speed * STEP * frame
         return SE3.from_yaw(
-            self.heading, (self.x + way * np.cos(self.heading), self.y + way * np.sin(self.heading), 0.0)
+            self.heading,
+            (self.x + way * np.cos(self.heading), self.y + way * np.sin(self.heading), 0.0),
         )
 
 
@@ -60,17 +61,38 @@ class TurningEgo(Actor):
         turned = max(0.0, 0.5 * STEP * frame)
         radius = self.speed / 0.5
         straight = min(0, frame) * self.speed * STEP
-        return SE3.from_yaw(turned, (straight + radius * np.sin(turned), radius * (1 - np.cos(turned)), 0.0))
+        return SE3.from_yaw(
+            turned, (straight + radius * np.sin(turned), radius * (1 - np.cos(turned)), 0.0)
+        )
 
 
-EGO = TurningEgo(actor_id=-100, category="car", x=0, y=0, speed=4.0, size=(4.9, 2.1, 1.5), seen_from=None)
+EGO = TurningEgo(
+    actor_id=-100, category="car", x=0, y=0, speed=4.0, size=(4.9, 2.1, 1.5), seen_from=None
+)
 ACTORS = (
     EGO,
     Actor(actor_id=21, category="car", x=38.6, y=3.5, heading=np.pi, speed=8.0),
     Actor(actor_id=22, category="car", x=20.3, y=-13.5, heading=np.pi / 2, speed=7.0),
-    Actor(actor_id=40, category="van", x=38.0, y=-8.0, heading=np.pi, speed=5.0, size=(5.9, 2.2, 2.6), seen_from=2),
+    Actor(
+        actor_id=40,
+        category="van",
+        x=38.0,
+        y=-8.0,
+        heading=np.pi,
+        speed=5.0,
+        size=(5.9, 2.2, 2.6),
+        seen_from=2,
+    ),
     Actor(actor_id=20001, category="car", x=9.3, y=-6.2, heading=0.25),
-    Actor(actor_id=31, category="pedestrian", x=4.0, y=9.0, heading=-0.4, speed=1.6, size=(0.8, 0.8, 1.8)),
+    Actor(
+        actor_id=31,
+        category="pedestrian",
+        x=4.0,
+        y=9.0,
+        heading=-0.4,
+        speed=1.6,
+        size=(0.8, 0.8, 1.8),
+    ),
     Actor(actor_id=-1, category="truck", x=-20.0, y=12.0, size=(8.5, 2.6, 3.4), seen_from=None),
     Actor(actor_id=-1, category="car", x=-28.0, y=-9.0, seen_from=None),
 )
@@ -97,11 +119,15 @@ def turn(
     mount = ego_from_lidar or SE3.identity()
     actors = [actor for actor in ACTORS if own_row or actor is not EGO]
     recorded = config.label_frames if frames is None else frames
-    moments = [_boxes(actors, frame, mount) if frame < recorded else None for frame in range(config.label_frames)]
+    moments = [
+        _boxes(actors, frame, mount) if frame < recorded else None
+        for frame in range(config.label_frames)
+    ]
     past = config.receptive_field - 1
     numbers = range(-past, config.label_frames + 1)
     motion = future_egomotion(
-        np.stack([EGO.pose(number).matrix for number in numbers]), [number < recorded for number in numbers]
+        np.stack([EGO.pose(number).matrix for number in numbers]),
+        [number < recorded for number in numbers],
     )
     kept = dict(zip(reversed(COLLIDING), (1, 2), strict=True)) if earlier_ids else None
     id_map = kept if config.rules.ids_kept_between_samples else None
@@ -117,7 +143,9 @@ def _boxes(actors: list[Actor], frame: int, ego_from_lidar: SE3) -> FrameBoxes:
         yaw=np.array([pose.yaw for pose in poses]),
         actor_id=np.array([actor.actor_id for actor in actors]),
         category=np.array([CATEGORIES.index(actor.category) for actor in actors]),
-        visible=np.array([actor.seen_from is not None and frame >= actor.seen_from for actor in actors]),
+        visible=np.array(
+            [actor.seen_from is not None and frame >= actor.seen_from for actor in actors]
+        ),
         ego_from_lidar=ego_from_lidar.matrix,
     )
 
@@ -141,9 +169,12 @@ CIRCUMSTANCES = {
         "an augmentation: turned by 0.3 rad", config={"augmentation": Augmentation(rotation=0.3)}
     ),
     "untracked_share_an_id": Circumstance(
-        "`filter_invisible=False`, so that untracked actors are rasterised", config={"filter_invisible": False}
+        "`filter_invisible=False`, so that untracked actors are rasterised",
+        config={"filter_invisible": False},
     ),
-    "missing_frames_are_empty": Circumstance("the recording ends 1 s after the present", moment={"frames": 3}),
+    "missing_frames_are_empty": Circumstance(
+        "the recording ends 1 s after the present", moment={"frames": 3}
+    ),
     "ids_kept_between_samples": Circumstance(
         "an earlier sample's `id_map` with the colliding pair", moment={"earlier_ids": True}
     ),
@@ -158,7 +189,9 @@ CIRCUMSTANCES = {
 def main(_release: Path | None = None) -> None:
     """Write the tables."""
     with tempfile.TemporaryDirectory() as folder:
-        release = DeepAccident(dataroot=make_release(Path(folder) / "release", RELEASE), verbose=False)
+        release = DeepAccident(
+            dataroot=make_release(Path(folder) / "release", RELEASE), verbose=False
+        )
         put("label-cells", f"\n{table_of_the_turn()}\n{table_of_the_release(release)}\n")
 
 
@@ -172,7 +205,13 @@ def table_of_the_turn() -> str:
             *(turn(one, **how.moment) for one in (kept, replace(kept, protocol=without(switch))))
         )
         rows.append([f"`{switch}`", how.words, *(f"{count:,}" for count in counts)])
-    rows.append(["all: `clean`", "as it is", *(f"{n:,}" for n in cells_that_differ(turn(RELEASED), turn(CLEAN)))])
+    rows.append(
+        [
+            "all: `clean`",
+            "as it is",
+            *(f"{n:,}" for n in cells_that_differ(turn(RELEASED), turn(CLEAN))),
+        ]
+    )
     return _table(["the left turn: switch", "what is so", *MAPS], rows)
 
 
@@ -185,19 +224,28 @@ def table_of_the_release(release: DeepAccident) -> str:
         kept = release.motion_labels(token)
         for name, config in [*changed.items(), ("all: `clean`", CLEAN)]:
             sums[name] += cells_that_differ(kept, release.motion_labels(token, config))
-    rows = [[name, *(f"{count / len(tokens):,.1f}" for count in counts)] for name, counts in sums.items()]
+    rows = [
+        [name, *(f"{count / len(tokens):,.1f}" for count in counts)]
+        for name, counts in sums.items()
+    ]
     return _table([f"a synthetic release, mean of {len(tokens)} samples: switch", *MAPS], rows)
 
 
 def switches() -> list[str]:
     """The names of the switches in which the two protocols differ."""
     one, other = LABEL_PROTOCOLS["released"], LABEL_PROTOCOLS["clean"]
-    return [item.name for item in fields(LabelProtocol) if getattr(one, item.name) != getattr(other, item.name)]
+    return [
+        item.name
+        for item in fields(LabelProtocol)
+        if getattr(one, item.name) != getattr(other, item.name)
+    ]
 
 
 def without(switch: str) -> LabelProtocol:
     """The released protocol with one switch as the clean one has it."""
-    return replace(LABEL_PROTOCOLS["released"], **{switch: getattr(LABEL_PROTOCOLS["clean"], switch)})
+    return replace(
+        LABEL_PROTOCOLS["released"], **{switch: getattr(LABEL_PROTOCOLS["clean"], switch)}
+    )
 
 
 def cells_that_differ(one: MotionLabels, other: MotionLabels) -> list[int]:

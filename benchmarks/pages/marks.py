@@ -20,14 +20,18 @@ def page_of(name: str) -> Path:
     """The page that has the marks; raises SystemExit if not just one has them."""
     found = [page for page in PAGES if f"<!-- {name} -->" in page.read_text(encoding="utf-8")]
     if len(found) != 1:
-        raise SystemExit(f"<!-- {name} -->: expected on one page, found on {[page.name for page in found]}")
+        raise SystemExit(
+            f"<!-- {name} -->: expected on one page, found on {[page.name for page in found]}"
+        )
     return found[0]
 
 
 def replaced(page: str, name: str, text: str) -> str:
     """A page with another text between the marks of a name."""
     begin, end = f"<!-- {name} -->", f"<!-- end of {name} -->"
-    changed, count = re.subn(f"{begin}.*?{end}", lambda _: f"{begin}\n{text}\n{end}", page, flags=re.DOTALL)
+    changed, count = re.subn(
+        f"{begin}.*?{end}", lambda _: f"{begin}\n{text}\n{end}", page, flags=re.DOTALL
+    )
     if count != 1:
         raise SystemExit(f"{begin} … {end}: expected once, found {count} times")
     return changed

@@ -15,11 +15,26 @@ from textwrap import fill
 from typing import Any, Final
 
 from benchmarks.pages.marks import TOP, put, table
-from deepaccident_devkit.plugins.study.numbers import NUMBERS, Evaluators, EvaluatorsBySeed, evaluators_of, verdict
+from deepaccident_devkit.plugins.study.numbers import (
+    NUMBERS,
+    Evaluators,
+    EvaluatorsBySeed,
+    evaluators_of,
+    verdict,
+)
 from deepaccident_devkit.plugins.study.summary import ALL, difference_text, number_with_interval
 
 KEPT: Final = TOP / "benchmarks" / "studies"
-ORDER: Final = ("agents", "boxes", "visibility", "fusions", "horizons", "links", "inputs", "overfit")
+ORDER: Final = (
+    "agents",
+    "boxes",
+    "visibility",
+    "fusions",
+    "horizons",
+    "links",
+    "inputs",
+    "overfit",
+)
 ROAD: Final = "road"
 """The recipe whose numbers are on the page of nuScenes."""
 SHOWN: Final = ("apa", "iou_100", "vpq_100", "map", "hidden_foreground", "false_foreground")
@@ -48,7 +63,9 @@ def keep(folder: Path) -> Path:
             source["spec"] = Path(source["spec"]).name
     told = json.loads(gzip.decompress((folder / "counts.json.gz").read_bytes()))
     accidents = {
-        row: {seed: counts.get("accident", {}) for seed, counts in seeds.items()}  # nuScenes has none
+        row: {
+            seed: counts.get("accident", {}) for seed, counts in seeds.items()
+        }  # nuScenes has none
         for row, seeds in told["rows"].items()
     }
     path = KEPT / f"{summary['recipe']['name']}.json.xz"
@@ -80,10 +97,18 @@ def accident_rows(study: Mapping[str, Any]) -> dict[str, EvaluatorsBySeed]:
     return dict(rows)
 
 
-def rows_table(summary: Summary, columns: Mapping[str, tuple[str, str]], names: Iterable[str] = ()) -> str:
+def rows_table(
+    summary: Summary, columns: Mapping[str, tuple[str, str]], names: Iterable[str] = ()
+) -> str:
     """Some rows, or all: what stands above a column → the group and the number of its cells."""
     rows = [
-        (f"`{name}`", *(number_with_interval(groups[group][number], number) for group, number in columns.values()))
+        (
+            f"`{name}`",
+            *(
+                number_with_interval(groups[group][number], number)
+                for group, number in columns.values()
+            ),
+        )
         for name in names or summary["rows"]
         for groups in [summary["rows"][name]["groups"]]
     ]
@@ -103,10 +128,15 @@ def answer_table(summary: Summary) -> str:
 def made_text(summary: Summary) -> str:
     """How a study was made."""
     tested, cells = summary["groups"][ALL], summary["cells"]
-    hours = {kind: sum(each["seconds"] for each in cells if each["kind"] == kind) / 3600 for kind in CELLS}
+    hours = {
+        kind: sum(each["seconds"] for each in cells if each["kind"] == kind) / 3600
+        for kind in CELLS
+    }
     spent = ", ".join(f"{CELLS[kind]} {each:.1f}" for kind, each in hours.items() if each)
     rows = [each["groups"][ALL] for each in summary["rows"].values()]
-    seeds = sorted({seed for numbers in rows for each in numbers.values() for seed in each["seeds"]})
+    seeds = sorted(
+        {seed for numbers in rows for each in numbers.values() for seed in each["seeds"]}
+    )
     told = f"seeds {', '.join(seeds)}; " if seeds else ""
     return (
         f"{tested['samples']:,} samples of {tested['pairs']:,} pairs of an accident and its twin; {told}hours of one "
@@ -126,7 +156,9 @@ def study_text(name: str, summary: Summary) -> str:
     told = [made, f"**{summary['headline']['text']}**"] if summary["headline"] else [made]
     rows = [row for row in summary["rows"] if name == TRIVIAL_OF or row not in TRIVIAL]
     columns = groups if name == "visibility" else numbers_in(ALL, SHOWN) | groups
-    return "\n\n".join([f"## {summary['title']}", *map(wrapped, told), rows_table(summary, columns, rows)])
+    return "\n\n".join(
+        [f"## {summary['title']}", *map(wrapped, told), rows_table(summary, columns, rows)]
+    )
 
 
 def findings_table(found: Mapping[str, Summary]) -> str:
@@ -147,7 +179,13 @@ def findings_table(found: Mapping[str, Summary]) -> str:
                     of_seeds(everywhere["iou_100"], "iou_100"),
                 )
             )
-    heads = ("APA, hidden collider", "of each seed", "verdict", "APA, all samples", "IoU 100x100 (%), all")
+    heads = (
+        "APA, hidden collider",
+        "of each seed",
+        "verdict",
+        "APA, all samples",
+        "IoU 100x100 (%), all",
+    )
     return table(("recipe", "difference", *heads, "of each seed"), rows)
 
 
@@ -174,7 +212,9 @@ def road_text(summary: Summary) -> str:
 
 def of_seeds(found: Mapping[str, Any], number: str) -> str:
     """A difference's value for each seed."""
-    return ", ".join(difference_text({"value": one, "low": None}, number) for one in found["seeds"].values())
+    return ", ".join(
+        difference_text({"value": one, "low": None}, number) for one in found["seeds"].values()
+    )
 
 
 def weights_table() -> str:
@@ -188,7 +228,9 @@ def weights_table() -> str:
         scores = (f"{100 * scored[each]:.1f}" for each in ("iou", "vpq", "map"))
         by = f"`{made['study']}`: `{made['weights']}`, seed {made['seed']}"
         rows.append((f"`{name}`", by, f"{path.stat().st_size / 1e6:.1f}", *scores))
-    return table(("weights", "made by", "MB", "IoU 100x100 (%)", "VPQ 100x100 (%)", "mAP (%)"), rows)
+    return table(
+        ("weights", "made by", "MB", "IoU 100x100 (%)", "VPQ 100x100 (%)", "mAP (%)"), rows
+    )
 
 
 def wrapped(text: str) -> str:

@@ -8,7 +8,11 @@ import numpy as np
 from benchmarks.pages.marks import put
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.release import find_release
-from deepaccident_devkit.tables.boxes import decoded_velocities, displacement_velocities, world_centers
+from deepaccident_devkit.tables.boxes import (
+    decoded_velocities,
+    displacement_velocities,
+    world_centers,
+)
 from deepaccident_devkit.tables.build import scenario_boxes
 from deepaccident_devkit.tables.scan import read_scenario, scan_scenario
 from deepaccident_devkit.taxonomy import CAMERAS, CATEGORIES, CHANNELS, VELOCITY_FRAMES
@@ -63,7 +67,9 @@ def calibration_table(dataset: DeepAccident) -> str:
         own = matrices[number * frames : (number + 1) * frames, : len(CAMERAS) + 1]
         turn = own[..., :3]
         rigid = np.abs(turn @ np.swapaxes(turn, -1, -2) - np.eye(3)).max()
-        distinct = sum(len(np.unique(own[:, k].reshape(frames, -1), axis=0)) for k in range(own.shape[1]))
+        distinct = sum(
+            len(np.unique(own[:, k].reshape(frames, -1), axis=0)) for k in range(own.shape[1])
+        )
         rows = sum(row["agent_token"] == agent["token"] for row in dataset.calibrated_sensor)
         moved, turned_by = np.ptp(own[..., 3], axis=0).max(), np.ptp(turn, axis=0).max()
         lines.append(
@@ -79,8 +85,13 @@ def index_table(dataset: DeepAccident) -> str:
     size = {path: path.stat().st_size / samples for path in index.rglob("*") if path.is_file()}
     of_boxes = sum(value for path, value in size.items() if path.stem in ("annotation", "track"))
     kept = sum(value for path, value in size.items() if "kept" in path.parts)
-    whole = sum(size.values()) + (of_boxes + kept) * (BOXES_A_SAMPLE / boxes - 1)  # all that is kept, so too much
-    lines = ["| index of a real scenario | bytes a sample | share of the raw data |", "| --- | ---: | ---: |"]
+    whole = sum(size.values()) + (of_boxes + kept) * (
+        BOXES_A_SAMPLE / boxes - 1
+    )  # all that is kept, so too much
+    lines = [
+        "| index of a real scenario | bytes a sample | share of the raw data |",
+        "| --- | ---: | ---: |",
+    ]
     for words, value in (
         (f"measured, {boxes:.0f} boxes a sample", sum(size.values())),
         (f"with {BOXES_A_SAMPLE:.0f} boxes a sample, as the whole release has (at most)", whole),

@@ -20,7 +20,8 @@ IMAGES = PAGE.parent / "images"
 RELEASE, OUT = "accidents", "out"
 """What DATAROOT and OUT on the page are here."""
 PIECE = re.compile(
-    r"^ {4}deepaccident (?P<command>\S[^\n]*)$|^<!-- output -->$.*?^<!-- end of output -->$", re.MULTILINE | re.DOTALL
+    r"^ {4}deepaccident (?P<command>\S[^\n]*)$|^<!-- output -->$.*?^<!-- end of output -->$",
+    re.MULTILINE | re.DOTALL,
 )
 PICTURES = {
     "safety_lead_times.webp": "lead_times.png",
@@ -70,7 +71,9 @@ def output(command: str) -> str:
     result = CliRunner().invoke(deepaccident, words, catch_exceptions=False)
     if result.exit_code:
         raise SystemExit(f"{command}: {result.output}")
-    text = result.stdout.replace(f"{Path.cwd()}/", "").replace(f"{Path(RELEASE).resolve()}", RELEASE)
+    text = result.stdout.replace(f"{Path.cwd()}/", "").replace(
+        f"{Path(RELEASE).resolve()}", RELEASE
+    )
     cut = next((each for name, each in CUTS.items() if f" {name} " in f" {command} "), str)
     return cut(text).rstrip()
 
@@ -92,7 +95,9 @@ def one_story(text: str) -> str:
     """The first scenario and its story."""
     scenario, story = text.splitlines()[:2]
     indent = story[: len(story) - len(story.lstrip())]
-    return "\n".join([scenario, fill(story.strip(), LINE, initial_indent=indent, subsequent_indent=indent), "…"])
+    return "\n".join(
+        [scenario, fill(story.strip(), LINE, initial_indent=indent, subsequent_indent=indent), "…"]
+    )
 
 
 def paragraph(begin: str) -> Callable[[str], str]:

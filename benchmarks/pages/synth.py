@@ -71,7 +71,9 @@ _WATCHING = (VEHICLE_AGENTS[1], VEHICLE_AGENTS[3], INFRASTRUCTURE)
 
 def config(pairs: int) -> SynthConfig:
     """The release that is measured: only designed accidents, with all their frames."""
-    return SynthConfig(scenarios=2 * pairs, frames=None, unplanned=0.0, sensors=False, designed=True)
+    return SynthConfig(
+        scenarios=2 * pairs, frames=None, unplanned=0.0, sensors=False, designed=True
+    )
 
 
 def measure(number: int, *, views: bool = True) -> Pair:
@@ -94,7 +96,10 @@ def measure(number: int, *, views: bool = True) -> Pair:
         twin_frames=twin.frames,
         twin_gap=round(twin_gap, 2),
         twin_touches=twin_touches,
-        sees_both={agent: _in_view(accident, [of_agent[-2]], [agent], agent) for agent, of_agent in labels.items()},
+        sees_both={
+            agent: _in_view(accident, [of_agent[-2]], [agent], agent)
+            for agent, of_agent in labels.items()
+        },
         views={agent: _letters(accident, labels, agent) for agent in labels},
     )
 
@@ -102,12 +107,16 @@ def measure(number: int, *, views: bool = True) -> Pair:
 def _nearest(scenario: Scenario) -> tuple[float, bool]:
     """How near two of the vehicle agents come to each other, metres, and whether any two road users ever touch."""
     actors, size = scenario.actors, scenario.actors.size[:, :2]
-    poses = np.stack([actors.at(frame_timestamp(frame)).poses for frame in range(1, scenario.frames + 1)])
+    poses = np.stack(
+        [actors.at(frame_timestamp(frame)).poses for frame in range(1, scenario.frames + 1)]
+    )
     first, second = np.triu_indices(len(size), 1)
     touching = (separation(poses[:, first], size[first], poses[:, second], size[second]) <= 0).any()
     agents = np.array([actors.row_of(actor) for actor in scenario.agents.values()])
     first, second = (agents[rows] for rows in np.triu_indices(len(agents), 1))
-    return float(gap(poses[:, first], size[first], poses[:, second], size[second]).min()), bool(touching)
+    return float(gap(poses[:, first], size[first], poses[:, second], size[second]).min()), bool(
+        touching
+    )
 
 
 def _labels(scenario: Scenario, seed: int) -> dict[str, list[Labels]]:
@@ -115,7 +124,13 @@ def _labels(scenario: Scenario, seed: int) -> dict[str, list[Labels]]:
     sky = (scenario.spec.weather, scenario.spec.time_of_day)
     noise = (seed, scenario.plan.pair, int(scenario.plan.accident))
     rig = make_rig(
-        scenario.world, scenario.actors, scenario.agents, sky=sky, image_size=(480, 270), seed=noise, images=False
+        scenario.world,
+        scenario.actors,
+        scenario.agents,
+        sky=sky,
+        image_size=(480, 270),
+        seed=noise,
+        images=False,
     )
     labels: dict[str, list[Labels]] = {agent: [] for agent in AGENTS}
     for back in range(EVALUATED + OBSERVED - 1, 0, -1):
@@ -173,7 +188,9 @@ def designs_table(pairs: Sequence[Pair]) -> str:
             _range([pair["angle"] for pair in of_design]),
             f"{speeds[0]:.1f}, {speeds[1]:.1f}",
             _range([pair["frames"] for pair in of_design]),
-            ", ".join(_share(pair["sees_both"][agent] for pair in of_design) for agent in _WATCHING),
+            ", ".join(
+                _share(pair["sees_both"][agent] for pair in of_design) for agent in _WATCHING
+            ),
             _share(not pair["twin_touches"] for pair in of_design),
             f"{min(pair['twin_gap'] for pair in of_design):.1f}",
         )
@@ -188,7 +205,10 @@ def views_table(pairs: Sequence[Pair]) -> str:
     for name, agents in {**{f"`{agent}`": (agent,) for agent in AGENTS}, "all": AGENTS}.items():
         letters = "".join(pair["views"][agent] for pair in pairs for agent in agents)
         unseen, together = len(letters) - letters.count("v"), letters.count("c")
-        shares = f"{100 * unseen / len(letters):.1f} %", f"{100 * together / unseen:.1f} %" if unseen else "–"
+        shares = (
+            f"{100 * unseen / len(letters):.1f} %",
+            f"{100 * together / unseen:.1f} %" if unseen else "–",
+        )
         lines.append(f"| {name} | {len(letters):,} | {shares[0]} | {shares[1]} |")
     return "\n".join(lines)
 
@@ -197,13 +217,19 @@ def lengths_table(pairs: Sequence[Pair]) -> str:
     """Numbers of frames of scenarios, in the release and here."""
     accidents, twins = [pair["frames"] for pair in pairs], [pair["twin_frames"] for pair in pairs]
     rows = {
-        "the release": (RELEASED_SCENARIOS, f"{RELEASED_FRAMES / RELEASED_SCENARIOS:.0f}", "40–100"),
+        "the release": (
+            RELEASED_SCENARIOS,
+            f"{RELEASED_FRAMES / RELEASED_SCENARIOS:.0f}",
+            "40–100",
+        ),
         "here": (2 * len(pairs), f"{np.mean(accidents + twins):.0f}", _ends(accidents + twins)),
         "here, accidents": (len(pairs), f"{np.mean(accidents):.0f}", _ends(accidents)),
         "here, normal twins": (len(pairs), f"{np.mean(twins):.0f}", _ends(twins)),
     }
     lines = ["| | scenarios | frames of a scenario, mean | least–most |", "|---" * 4 + "|"]
-    return "\n".join(lines + [f"| {name} | {' | '.join(map(str, cells))} |" for name, cells in rows.items()])
+    return "\n".join(
+        lines + [f"| {name} | {' | '.join(map(str, cells))} |" for name, cells in rows.items()]
+    )
 
 
 def tables(measured: Measured) -> dict[str, str]:
@@ -227,7 +253,9 @@ def save(content: Measured) -> None:
     """Save the measured values, one pair on each line."""
     beside = [f'"{key}": {json.dumps(content[key], indent=1)}' for key in ("real", "generated")]
     pairs = ",\n".join(json.dumps(pair) for pair in content["pairs"])
-    MEASURED.write_text("{\n" + ",\n".join([*beside, f'"pairs": [\n{pairs}\n]']) + "\n}\n", encoding="utf-8")
+    MEASURED.write_text(
+        "{\n" + ",\n".join([*beside, f'"pairs": [\n{pairs}\n]']) + "\n}\n", encoding="utf-8"
+    )
 
 
 def _share(holds: Iterable[bool]) -> str:
@@ -249,7 +277,9 @@ def main(release: Path | None = None) -> None:
         content["real"] = synth_beside.measure_real(release)
     content["generated"] = synth_beside.measure_generated()
     with ProcessPoolExecutor(WORKERS) as executor:
-        content["pairs"] = list(executor.map(measure, range(SEEDS * len(DESIGN_NUMBERS)), chunksize=4))
+        content["pairs"] = list(
+            executor.map(measure, range(SEEDS * len(DESIGN_NUMBERS)), chunksize=4)
+        )
     save(content)
     for name, text in tables(content).items():
         put(name, f"\n{text}\n")

@@ -10,7 +10,11 @@ import yaml
 
 from deepaccident_devkit.plugins.synth import SynthConfig, make_release
 from deepaccident_devkit.plugins.synth.plan import plan_scenarios
-from deepaccident_devkit.plugins.synth.scenario import RecordingJob, forget_scenario, record_scenario
+from deepaccident_devkit.plugins.synth.scenario import (
+    RecordingJob,
+    forget_scenario,
+    record_scenario,
+)
 from deepaccident_devkit.plugins.synth.spec import design_text
 from deepaccident_devkit.release import (
     Labels,
@@ -24,7 +28,14 @@ from deepaccident_devkit.release import (
     read_meta,
 )
 from deepaccident_devkit.support.arrays import BoolArray, FloatArray
-from deepaccident_devkit.taxonomy import AGENTS, CATEGORIES, INFRASTRUCTURE, LIDAR, OWN_ACTOR_ID, STATIC_ACTOR_ID
+from deepaccident_devkit.taxonomy import (
+    AGENTS,
+    CATEGORIES,
+    INFRASTRUCTURE,
+    LIDAR,
+    OWN_ACTOR_ID,
+    STATIC_ACTOR_ID,
+)
 
 Numbers = dict[str, float]
 
@@ -56,15 +67,21 @@ def measure_generated() -> Numbers:
         folder = Path(name)
         spec = folder / "like_the_real_one.yaml"
         spec.write_text(_like_the_real_one(), encoding="utf-8")
-        config = SynthConfig(scenarios=2 * PAIRS, frames=None, unplanned=0.0, sensors=False, spec=spec)
+        config = SynthConfig(
+            scenarios=2 * PAIRS, frames=None, unplanned=0.0, sensors=False, spec=spec
+        )
         root = make_release(folder / "release", config)
-        pictured = SynthConfig(scenarios=2 * PAIRS, frames=None, unplanned=0.0, spec=spec, image_size=(1600, 900))
+        pictured = SynthConfig(
+            scenarios=2 * PAIRS, frames=None, unplanned=0.0, spec=spec, image_size=(1600, 900)
+        )
         normal = [plan for plan in plan_scenarios(pictured) if not plan.accident]
         for plan in normal:
             record_scenario(RecordingJob(root, pictured, plan, 1, SENSOR_STEP))
         forget_scenario()
         tokens = {plan.token for plan in normal}
-        return measure([scenario for scenario in find_release(root).scenarios if scenario.token in tokens])
+        return measure(
+            [scenario for scenario in find_release(root).scenarios if scenario.token in tokens]
+        )
 
 
 def _like_the_real_one() -> str:
@@ -72,8 +89,15 @@ def _like_the_real_one() -> str:
     spec = yaml.safe_load(design_text(6))
     spec["road"] = {"kind": "three-way", "signalized": True, "lanes": 1}
     ego, other = spec["actors"][0], spec["actors"][2]
-    ego["from"], ego["turn"], other["from"], other["turn"] = other["from"], other["turn"], ego["from"], ego["turn"]
-    return yaml.safe_dump({**spec, "view": "open", "exchange": False, "weather": "Clear", "time_of_day": "Noon"})
+    ego["from"], ego["turn"], other["from"], other["turn"] = (
+        other["from"],
+        other["turn"],
+        ego["from"],
+        ego["turn"],
+    )
+    return yaml.safe_dump(
+        {**spec, "view": "open", "exchange": False, "weather": "Clear", "time_of_day": "Noon"}
+    )
 
 
 def measure(scenarios: Sequence[ScenarioFolder]) -> Numbers:
@@ -93,7 +117,9 @@ def _frames(scenario: ScenarioFolder) -> int:
 
 
 def _labels(scenario: ScenarioFolder, agent: str) -> Labels:
-    return read_labels([scenario.label_path(agent, frame) for frame in range(1, _frames(scenario) + 1)])
+    return read_labels(
+        [scenario.label_path(agent, frame) for frame in range(1, _frames(scenario) + 1)]
+    )
 
 
 def _actors(scenario: ScenarioFolder) -> Numbers:
@@ -104,16 +130,23 @@ def _actors(scenario: ScenarioFolder) -> Numbers:
     for agent in AGENTS:
         labels = _labels(scenario, agent)
         ids = np.where(labels.actor_id == OWN_ACTOR_ID, own_ids.get(agent, 0), labels.actor_id)
-        for actor, code, speed in zip(ids.tolist(), labels.category.tolist(), _speed(labels).tolist(), strict=True):
+        for actor, code, speed in zip(
+            ids.tolist(), labels.category.tolist(), _speed(labels).tolist(), strict=True
+        ):
             if actor > 0:
                 fastest[actor], category[actor] = max(fastest.get(actor, 0.0), speed), code
-    driven = {actor: code for actor, code in category.items() if actor < STATIC_ACTOR_ID and code != _PEDESTRIAN}
+    driven = {
+        actor: code
+        for actor, code in category.items()
+        if actor < STATIC_ACTOR_ID and code != _PEDESTRIAN
+    }
     return {
         "four-wheelers that drive": sum(
             code not in _TWO_WHEELERS and fastest[actor] > _MOVING for actor, code in driven.items()
         ),
         "four-wheelers that wait": sum(
-            code not in _TWO_WHEELERS and fastest[actor] <= _MOVING for actor, code in driven.items()
+            code not in _TWO_WHEELERS and fastest[actor] <= _MOVING
+            for actor, code in driven.items()
         ),
         "two-wheelers": sum(code in _TWO_WHEELERS for code in driven.values()),
         "pedestrians": sum(code == _PEDESTRIAN for code in category.values()),
@@ -140,19 +173,25 @@ def _boxes(labels: Sequence[Labels]) -> Numbers:
         "boxes, most": float(counts.max()),
         "speed, median": _percentile(joined["speed"][driving], 50),
         "speed, 95 %": _percentile(joined["speed"][driving], 95),
-        "walking, median": _percentile(joined["speed"][(codes == _PEDESTRIAN) & (joined["speed"] > _MOVING)], 50),
+        "walking, median": _percentile(
+            joined["speed"][(codes == _PEDESTRIAN) & (joined["speed"] > _MOVING)], 50
+        ),
         "untracked": float((ids == -1).mean()),
         "points on itself": _percentile(points[own], 50),
         "without points": float((points[other] == 0).mean()),
         "visible": float(visible[other].mean()),
     }
-    numbers |= {f"distance, {share} %": _percentile(distance[other], share) for share in (10, 50, 90, 100)}
+    numbers |= {
+        f"distance, {share} %": _percentile(distance[other], share) for share in (10, 50, 90, 100)
+    }
     for name, (low, high) in _BINS.items():
         rows: BoolArray = other & (distance >= low) & (distance < high)
         numbers[f"boxes {name}"] = float(rows[other].mean())
         numbers[f"without points {name}"] = float((points[rows] == 0).mean())
         numbers[f"visible {name}"] = float(visible[rows].mean())
-        numbers[f"points on a car {name}"] = _percentile(points[rows & (codes == _CAR) & (points > 0)], 50)
+        numbers[f"points on a car {name}"] = _percentile(
+            points[rows & (codes == _CAR) & (points > 0)], 50
+        )
     return numbers
 
 
@@ -175,7 +214,10 @@ def _clouds(scenarios: Sequence[ScenarioFolder]) -> Numbers:
         "counts that differ": float(off[with_points].mean()),
         "counts, by": _percentile(np.abs(stored - recount)[off] / np.maximum(stored, 1)[off], 50),
     }
-    for pole, name in ((False, "points of a vehicle's cloud"), (True, "points of the pole's cloud")):
+    for pole, name in (
+        (False, "points of a vehicle's cloud"),
+        (True, "points of the pole's cloud"),
+    ):
         numbers |= {f"{name}, {key}": float(of(sizes[pole])) for key, of in _ENDS.items()}
     return numbers
 
@@ -217,16 +259,26 @@ def _calibs(scenarios: Sequence[ScenarioFolder]) -> Numbers:
 
 def _sizes(scenarios: Sequence[ScenarioFolder]) -> Numbers:
     """Mean sizes of files, kB; of images only those of the pole, at the frames whose clouds are measured."""
-    frames = [(s, agent, frame) for s in scenarios for agent in AGENTS for frame in range(1, _frames(s) + 1)]
+    frames = [
+        (s, agent, frame)
+        for s in scenarios
+        for agent in AGENTS
+        for frame in range(1, _frames(s) + 1)
+    ]
     paths = {
         "label": [s.label_path(agent, frame) for s, agent, frame in frames],
         "calib": [s.calib_path(agent, frame) for s, agent, frame in frames],
         "LiDAR": [s.channel_path(agent, LIDAR, frame) for s, agent, frame in _clouded(scenarios)],
         "image": [
-            path for s in scenarios for path in sorted(s.kind_folder(INFRASTRUCTURE, "Camera_Front").rglob("*.jpg"))
+            path
+            for s in scenarios
+            for path in sorted(s.kind_folder(INFRASTRUCTURE, "Camera_Front").rglob("*.jpg"))
         ],
     }
-    return {f"kB, {kind}": mean(path.stat().st_size for path in each) / 1000 for kind, each in paths.items()}
+    return {
+        f"kB, {kind}": mean(path.stat().st_size for path in each) / 1000
+        for kind, each in paths.items()
+    }
 
 
 def _speed(labels: Labels) -> FloatArray:
@@ -243,9 +295,17 @@ _ROWS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
     ("motorcycles and cyclists", "{:.1f}", ("two-wheelers",)),
     ("pedestrians", "{:.1f}", ("pedestrians",)),
     ("parked vehicles", "{:.1f}", ("parked",)),
-    ("speed of moving vehicles: median, 95 % (m/s)", "{:.1f}, {:.1f}", ("speed, median", "speed, 95 %")),
+    (
+        "speed of moving vehicles: median, 95 % (m/s)",
+        "{:.1f}, {:.1f}",
+        ("speed, median", "speed, 95 %"),
+    ),
     ("speed of moving pedestrians: median (m/s)", "{:.1f}", ("walking, median",)),
-    ("boxes in a label: mean (least–most)", "{:.0f} ({:.0f}–{:.0f})", ("boxes, mean", "boxes, least", "boxes, most")),
+    (
+        "boxes in a label: mean (least–most)",
+        "{:.0f} ({:.0f}–{:.0f})",
+        ("boxes, mean", "boxes, least", "boxes, most"),
+    ),
     (
         "distance of boxes: 10, 50, 90, 100 % (m)",
         "{:.0f}, {:.0f}, {:.0f}, {:.0f}",
@@ -265,12 +325,20 @@ _ROWS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
         ("counts that differ", "counts, by"),
     ),
     *(
-        (f"{name}: mean (least–most)", "{:,.0f} ({:,.0f}–{:,.0f})", tuple(f"{name}, {key}" for key in _ENDS))
+        (
+            f"{name}: mean (least–most)",
+            "{:,.0f} ({:,.0f}–{:,.0f})",
+            tuple(f"{name}, {key}" for key in _ENDS),
+        )
         for name in ("points of a vehicle's cloud", "points of the pole's cloud")
     ),
     ("LiDAR above its vehicle's box height (m)", "{:.2f}", ("LiDAR above its vehicle",)),
     ("calib, from frame to frame: greatest shift (mm)", "{:.2f}", ("calib, shift",)),
-    ("calib, from frame to frame: greatest change of an element of a rotation", "{:.0e}", ("calib, turn",)),
+    (
+        "calib, from frame to frame: greatest change of an element of a rotation",
+        "{:.0e}",
+        ("calib, turn",),
+    ),
     ("label file (kB)", "{:.1f}", ("kB, label",)),
     ("calib file (kB)", "{:.1f}", ("kB, calib",)),
     ("LiDAR file (kB)", "{:.0f}", ("kB, LiDAR",)),

@@ -29,7 +29,9 @@ def main(release: Path | None = None) -> None:
         put("warning-clean", measured(root, PREDICTORS))
         easier = make_release(Path(folder) / "designed", DESIGNED)
         rows = measured(easier, BASELINES).strip().splitlines()
-        put("warning-designed", "\n".join(rows[: 2 + len(BASELINES)]))  # without the rows of references
+        put(
+            "warning-designed", "\n".join(rows[: 2 + len(BASELINES)])
+        )  # without the rows of references
 
 
 def measured(root: Path, predictors: Mapping[str, Predictor]) -> str:
@@ -62,7 +64,9 @@ def perfect(_dataset: DeepAccident, _token: str, context: AccidentContext) -> li
 
 
 def _baseline(agents: str) -> Predictor:
-    return lambda dataset, token, _context: accidents_ahead(outlook(dataset, token, agents=agents), HORIZON)
+    return lambda dataset, token, _context: accidents_ahead(
+        outlook(dataset, token, agents=agents), HORIZON
+    )
 
 
 BASELINES: Mapping[str, Predictor] = {

@@ -53,7 +53,9 @@ def _plugin_verbs(plugin: Plugin) -> dict[str, LazyVerb]:
     return {name: verb for name, verb in plugin.verbs.items() if " " not in name}
 
 
-_VERBS: Final = {name: LazyVerb(summary, partial(_core_verb, name)) for name, summary in _SUMMARIES.items()}
+_VERBS: Final = {
+    name: LazyVerb(summary, partial(_core_verb, name)) for name, summary in _SUMMARIES.items()
+}
 
 
 @click.group(
@@ -65,7 +67,12 @@ _VERBS: Final = {name: LazyVerb(summary, partial(_core_verb, name)) for name, su
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
 )
 @click.option("--version", is_flag=True, help="Show the version and exit.")
-@click.option("--all", "every", is_flag=True, help="With --version: also the versions of Python and all libraries.")
+@click.option(
+    "--all",
+    "every",
+    is_flag=True,
+    help="With --version: also the versions of Python and all libraries.",
+)
 @click.pass_context
 def deepaccident(context: click.Context, version: bool, every: bool) -> None:
     """Tools for the DeepAccident V2X accident dataset."""
@@ -78,7 +85,11 @@ def deepaccident(context: click.Context, version: bool, every: bool) -> None:
 
 def _versions() -> str:
     """What a report of a bug needs: the versions of the devkit, Python, the system and each library of any extra."""
-    from importlib.metadata import PackageNotFoundError, requires, version  # here: it takes longer than all the rest
+    from importlib.metadata import (
+        PackageNotFoundError,
+        requires,
+        version,
+    )  # here: it takes longer than all the rest
 
     from deepaccident_devkit.support.text import columns_text
 
@@ -89,8 +100,14 @@ def _versions() -> str:
             return "not installed"
 
     users = [each for each in requires("deepaccident_devkit") or () if not _DEVELOPERS.search(each)]
-    names = sorted({match.group().lower() for each in users if (match := re.match(r"[\w.-]+", each))})
-    rows = [("deepaccident", __version__), ("Python", platform.python_version()), ("system", platform.platform())]
+    names = sorted(
+        {match.group().lower() for each in users if (match := re.match(r"[\w.-]+", each))}
+    )
+    rows = [
+        ("deepaccident", __version__),
+        ("Python", platform.python_version()),
+        ("system", platform.platform()),
+    ]
     return columns_text([*rows, *((name, installed(name)) for name in names)])
 
 
@@ -104,12 +121,22 @@ def main() -> None:
 
 def _run() -> None:
     shown = logging.StreamHandler()
-    shown.addFilter(lambda record: record.name.partition(".")[0] not in _OF_DASK)  # its errors come as exceptions too
-    logging.basicConfig(level=logging.WARNING, format="%(levelname)s: %(message)s", handlers=[shown])
+    shown.addFilter(
+        lambda record: record.name.partition(".")[0] not in _OF_DASK
+    )  # its errors come as exceptions too
+    logging.basicConfig(
+        level=logging.WARNING, format="%(levelname)s: %(message)s", handlers=[shown]
+    )
     try:
         run_interruptibly(deepaccident)
-    except (DeepAccidentError, OSError, MemoryError) as error:  # OSErrors: a full disk, a folder without permission
-        *_, told = str(error).rpartition(f".{type(error).__name__}: ")  # a loader's worker puts its traceback before it
+    except (
+        DeepAccidentError,
+        OSError,
+        MemoryError,
+    ) as error:  # OSErrors: a full disk, a folder without permission
+        *_, told = str(error).rpartition(
+            f".{type(error).__name__}: "
+        )  # a loader's worker puts its traceback before it
         if isinstance(error, MemoryError):
             told = "memory ran out; use fewer workers (--workers), or a machine with more memory"
         click.echo(f"error: {told}", err=True)

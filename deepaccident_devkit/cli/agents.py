@@ -47,7 +47,9 @@ def names_or_configuration(given: Sequence[str]) -> str | list[str] | None:
     return names if alone in AGENTS else alone
 
 
-def link_parameters(latency: float = 0.0, pose_noise: float = 0.0) -> Callable[[Function], Function]:
+def link_parameters(
+    latency: float = 0.0, pose_noise: float = 0.0
+) -> Callable[[Function], Function]:
     """Options for what happens to partners' data, with these defaults."""
     return together(
         field_option(Link, "latency", default=latency),

@@ -13,14 +13,18 @@ from deepaccident_devkit.taxonomy import CAMERAS
 from deepaccident_devkit.training.image_cache import CachedImages
 
 
-def _part(context: click.Context, parameter: click.Parameter, value: str | None) -> tuple[int, int, int, int] | None:
+def _part(
+    context: click.Context, parameter: click.Parameter, value: str | None
+) -> tuple[int, int, int, int] | None:
     """Parse `LEFT,TOP,WIDTH,HEIGHT` to (top, left, height, width); None stays."""
     if value is None:
         return None
     match = re.fullmatch(r"(\d+),(\d+),(\d+),(\d+)", value.replace(" ", ""))
     if match is None:
         raise click.BadParameter(
-            f"expected left, top, width and height such as 0,140,704,256, found {value!r}", context, parameter
+            f"expected left, top, width and height such as 0,140,704,256, found {value!r}",
+            context,
+            parameter,
         )
     left, top, width, height = map(int, match.groups())
     return top, left, height, width
@@ -37,7 +41,10 @@ def _part(context: click.Context, parameter: click.Parameter, value: str | None)
     help="Size of a whole image, such as 704x396.",
 )
 @click.option(
-    "--crop", callback=_part, metavar="LEFT,TOP,WIDTH,HEIGHT", help="Part of the resized image to keep.  [default: all]"
+    "--crop",
+    callback=_part,
+    metavar="LEFT,TOP,WIDTH,HEIGHT",
+    help="Part of the resized image to keep.  [default: all]",
 )
 @channels_parameter
 @field_option(ImageConfig, "decode", option=advanced)
@@ -55,5 +62,7 @@ def cache(
     Give --split or --where: all images at 704x256 take 0.9 TB as raw pixels. --dry-run says how much yours take. If a
     run is interrupted, the same command continues it.
     """
-    images = ImageConfig(resize=resize[::-1], crop=crop, cameras=tuple(words_of(channels)) or CAMERAS, decode=decode)
+    images = ImageConfig(
+        resize=resize[::-1], crop=crop, cameras=tuple(words_of(channels)) or CAMERAS, decode=decode
+    )
     run_export(CachedImages, {"images": images, "codec": codec}, **options)

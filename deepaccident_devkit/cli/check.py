@@ -36,13 +36,19 @@ def _bundle() -> click.Command:
 
 def _check_verbs(plugin: Plugin) -> dict[str, LazyVerb]:
     """Return the verbs that a plug-in offers under names such as `check splits`."""
-    return {name.removeprefix(_PREFIX): verb for name, verb in plugin.verbs.items() if name.startswith(_PREFIX)}
+    return {
+        name.removeprefix(_PREFIX): verb
+        for name, verb in plugin.verbs.items()
+        if name.startswith(_PREFIX)
+    }
 
 
 _VERBS: Final = {
     "bundle": LazyVerb("Repeat an evaluation and list all differences.", _bundle),
     "index": LazyVerb("Compare an index with the files of its release, and mend it.", _index),
-    "release": LazyVerb("Print what is wrong, unusual or missing in a release; the same as validate.", _release),
+    "release": LazyVerb(
+        "Print what is wrong, unusual or missing in a release; the same as validate.", _release
+    ),
     "results": LazyVerb("Check every entry of a results file.", _results),
 }
 

@@ -27,7 +27,14 @@ from deepaccident_devkit.cli.options import (
     switches_of,
     version_parameter,
 )
-from deepaccident_devkit.cli.verbs import LazyVerbs, WordChoice, advanced, field_option, together, verb
+from deepaccident_devkit.cli.verbs import (
+    LazyVerbs,
+    WordChoice,
+    advanced,
+    field_option,
+    together,
+    verb,
+)
 from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.evaluation import Resampling
@@ -91,7 +98,12 @@ _selection_parameters = together(
         help="Accident scenarios only, or all scenarios.  [default: accident; with --samples all: all]",
     ),
     agents_parameter,
-    click.option("--horizon", default=2.0, show_default=True, help="How many seconds the predictions look ahead."),
+    click.option(
+        "--horizon",
+        default=2.0,
+        show_default=True,
+        help="How many seconds the predictions look ahead.",
+    ),
 )
 
 
@@ -119,7 +131,9 @@ _WARNING = together(
 )
 
 
-def _attributes(context: click.Context, parameter: click.Parameter, names: tuple[str, ...]) -> tuple[str, ...]:
+def _attributes(
+    context: click.Context, parameter: click.Parameter, names: tuple[str, ...]
+) -> tuple[str, ...]:
     """The attributes that repeated --by names."""
     try:
         return tuple(map(attribute_name, names))
@@ -135,7 +149,9 @@ def _task_verb(task: str) -> click.Command:
 
     @verb(task, help=text)
     @release_parameters
-    @click.option("--results", required=True, type=PATH, help="Results file or folder with the predictions.")
+    @click.option(
+        "--results", required=True, type=PATH, help="Results file or folder with the predictions."
+    )
     @_selection_parameters
     @click.option(
         "--protocol",
@@ -173,10 +189,18 @@ def _task_verb(task: str) -> click.Command:
         help="Look for classic mistakes, such as mirrored axes or another frame. Exit status 2: there is nothing to "
         "compare.",
     )
-    @click.option("--out", type=PATH, help="Folder to write all numbers, figures and a report into.")
-    @click.option("--overwrite", is_flag=True, help="Replace an evaluation that is already in --out.")
+    @click.option(
+        "--out", type=PATH, help="Folder to write all numbers, figures and a report into."
+    )
+    @click.option(
+        "--overwrite", is_flag=True, help="Replace an evaluation that is already in --out."
+    )
     @figure_style_parameter
-    @advanced("--include-results", is_flag=True, help="Copy the results into --out, so that others can verify them.")
+    @advanced(
+        "--include-results",
+        is_flag=True,
+        help="Copy the results into --out, so that others can verify them.",
+    )
     @json_parameter
     def evaluated(results: Path, protocol: str, switches: tuple[str, ...], **options: Any) -> None:
         setup = EvaluationSetup(
@@ -188,7 +212,9 @@ def _task_verb(task: str) -> click.Command:
 
 
 @workers_kept()
-def _evaluate(setup: EvaluationSetup, results: Path, *, by: tuple[str, ...], as_json: bool, **options: Any) -> None:
+def _evaluate(
+    setup: EvaluationSetup, results: Path, *, by: tuple[str, ...], as_json: bool, **options: Any
+) -> None:
     out: Path | None = options["out"]
     _refuse_unused(setup, options)
     selection = _selection_of(setup, options)
@@ -200,17 +226,32 @@ def _evaluate(setup: EvaluationSetup, results: Path, *, by: tuple[str, ...], as_
         "results": str(opened.path),
     }
     if out is not None:
-        checked_target(out, overwrite=options["overwrite"], asked=stated)  # before the release is indexed
+        checked_target(
+            out, overwrite=options["overwrite"], asked=stated
+        )  # before the release is indexed
     dataset = open_release(**release_of(options), **engine_of(options))
     if options.get("threshold_from") is not None:
-        threshold = chosen_threshold(options["threshold_from"], options["threshold_by"], selection.tokens(dataset))
+        threshold = chosen_threshold(
+            options["threshold_from"], options["threshold_by"], selection.tokens(dataset)
+        )
         setup = replace(setup, switches={**setup.switches, "threshold": threshold})
-    asked = {name: str(each) for name, each in options.items() if name not in ("workers", "executor")}
-    command = digest_of({"setup": setup.as_dict(), "results": opened.fingerprint, "by": by, "options": asked})
+    asked = {
+        name: str(each) for name, each in options.items() if name not in ("workers", "executor")
+    }
+    command = digest_of(
+        {"setup": setup.as_dict(), "results": opened.fingerprint, "by": by, "options": asked}
+    )
     with nullcontext() if out is None else evaluation_store(out, command).shared() as turn:
         if out is not None:
-            checked_target(out, overwrite=options["overwrite"])  # of another process, which has just ended
-        how = {**engine_of(options), "allow_partial": options["allow_partial"], "out": out, "progress": True}
+            checked_target(
+                out, overwrite=options["overwrite"]
+            )  # of another process, which has just ended
+        how = {
+            **engine_of(options),
+            "allow_partial": options["allow_partial"],
+            "out": out,
+            "progress": True,
+        }
         run = evaluate_results(dataset, opened, setup, selection, **how)
         if turn is None or out is None or turn.alone():
             summary, text = _written(run, dataset, opened, by, options)
@@ -225,12 +266,18 @@ def _evaluate(setup: EvaluationSetup, results: Path, *, by: tuple[str, ...], as_
 
 
 def _written(
-    run: EvaluationRun, dataset: DeepAccident, results: Results, by: tuple[str, ...], options: dict[str, Any]
+    run: EvaluationRun,
+    dataset: DeepAccident,
+    results: Results,
+    by: tuple[str, ...],
+    options: dict[str, Any],
 ) -> tuple[Mapping[str, Any], str]:
     """Complete a run, and save it where that is asked for; its summary, and the text of the sanity check."""
     engine = engine_of(options)
     resampling = Resampling(resamples=options["resamples"])
-    run = run.broken_down((EVERYTHING, *(by or breakdowns_of(run.setup.task))), resampling, **engine)
+    run = run.broken_down(
+        (EVERYTHING, *(by or breakdowns_of(run.setup.task))), resampling, **engine
+    )
     if options.get("prevented"):
         run = with_further(run, "prevented", dataset, resampling, progress=True, **engine)
     text = ""
@@ -254,7 +301,9 @@ def _refuse_unused(setup: EvaluationSetup, options: dict[str, Any]) -> None:
     if options.get("threshold_from") is None:
         refuse_unused("without --threshold-from", "threshold_by")
     elif "threshold" in setup.switches:
-        raise click.UsageError("--threshold-from sets the threshold that --switch threshold=… sets; give one of them")
+        raise click.UsageError(
+            "--threshold-from sets the threshold that --switch threshold=… sets; give one of them"
+        )
     if options.get("prevented") and not isinstance(setup.rules, CleanWarnings):
         raise click.UsageError(
             f"--prevented needs the scores of whole recordings, which --protocol {setup.protocol} does not have; give "
@@ -264,8 +313,15 @@ def _refuse_unused(setup: EvaluationSetup, options: dict[str, Any]) -> None:
         extra_result("prevented")  # before long work, as its plug-in may be missing
     if isinstance(setup.rules, FieldWarnings) and options["resamples"]:
         refuse_unused("with --protocol field, which has no intervals", "resamples")
-    if not evaluator_class(setup.task).has_horizon and _selection_of(setup, options).samples == "all":
-        why = "detections are of the present" if setup.task == "detection" else "the protocol has its own"
+    if (
+        not evaluator_class(setup.task).has_horizon
+        and _selection_of(setup, options).samples == "all"
+    ):
+        why = (
+            "detections are of the present"
+            if setup.task == "detection"
+            else "the protocol has its own"
+        )
         refuse_unused(f"with --samples all: {why}", "horizon")
 
 
@@ -283,7 +339,9 @@ def _selection_of(setup: EvaluationSetup, options: Mapping[str, Any]) -> SampleS
 
 @verb("results")
 @click.argument("results", type=PATH)
-@click.option("--dataroot", type=DATAROOT, help="Also compare the samples with those of this release.")
+@click.option(
+    "--dataroot", type=DATAROOT, help="Also compare the samples with those of this release."
+)
 @version_parameter
 @_selection_parameters
 @engine_parameters
@@ -304,7 +362,9 @@ def check_results(results: Path, dataroot: Dataroot | None, version: str, **opti
         return
     dataset = open_release(dataroot, version=version, on_error=options["on_error"], **engine)
     first = next(iter(evaluator_class(opened.task).protocols))
-    protocol = "boxes" if opened.task == "accident" else first  # the one that takes explicit accidents
+    protocol = (
+        "boxes" if opened.task == "accident" else first
+    )  # the one that takes explicit accidents
     setup = EvaluationSetup(task=opened.task, protocol=protocol, horizon=options["horizon"])
     selection = _selection_of(setup, options)
     check_recordings(opened, dataset)
@@ -320,14 +380,19 @@ def check_results(results: Path, dataroot: Dataroot | None, version: str, **opti
 
 
 def _compare() -> click.Command:
-    from deepaccident_devkit.cli.evaluate_bundles import compare  # it renders, and so imports matplotlib
+    from deepaccident_devkit.cli.evaluate_bundles import (
+        compare,
+    )  # it renders, and so imports matplotlib
 
     return compare
 
 
 def _task_verbs(plugin: Plugin) -> dict[str, LazyVerb]:
     """Return the verbs of a plug-in's tasks."""
-    return {name: LazyVerb(task.summary, partial(_task_verb, name)) for name, task in plugin.tasks.items()}
+    return {
+        name: LazyVerb(task.summary, partial(_task_verb, name))
+        for name, task in plugin.tasks.items()
+    }
 
 
 _VERBS: Final = {

@@ -47,8 +47,12 @@ _DPI = 130
 
 @verb("bundle")
 @click.argument("folder", metavar="DIR", type=PATH)
-@click.option("--dataroot", type=DATAROOT, help="Folder of the release; without it, nothing is done.")
-@click.option("--results", type=PATH, help="Results file or folder.  [default: the copy in DIR, if any]")
+@click.option(
+    "--dataroot", type=DATAROOT, help="Folder of the release; without it, nothing is done."
+)
+@click.option(
+    "--results", type=PATH, help="Results file or folder.  [default: the copy in DIR, if any]"
+)
 @click.option("--split", help="Split file, if the evaluation in DIR is of one.")
 @index_dir_parameter
 @engine_parameters
@@ -74,11 +78,14 @@ def verify(
     bundle = read_bundle(folder)
     check_repeated(bundle, {"dataroot": dataroot, "results": results, "split": split})
     layout = find_release(
-        open_dataroot(dataroot or bundle.dataroot, index_dir, outside=True, on_error=on_error), bundle.release_version
+        open_dataroot(dataroot or bundle.dataroot, index_dir, outside=True, on_error=on_error),
+        bundle.release_version,
     )
     place = index_dir or place_outside(layout)
     dataset = DeepAccident(layout.version, layout.root, place, on_error=on_error, **engine)
-    verification = verify_bundle(folder, dataset, results=results, split=split, progress=True, **engine)
+    verification = verify_bundle(
+        folder, dataset, results=results, split=split, progress=True, **engine
+    )
     click.echo(verification.to_json() if as_json else verification.to_text())
     if not verification.is_same:
         sys.exit(_FINDINGS_STATUS)
@@ -115,13 +122,17 @@ def compare(
     """
     for path in out:
         if path.suffix.lower() not in _KINDS:
-            raise click.BadParameter(f"--out: expected a file that ends in {', '.join(_KINDS)}, found {str(path)!r}")
+            raise click.BadParameter(
+                f"--out: expected a file that ends in {', '.join(_KINDS)}, found {str(path)!r}"
+            )
     comparison: SideBySide | OverBytes | Comparison
     bundles = [read_bundle(each) for each in (a, b, *more)]
     if not common and not set.intersection(*(set(each.scenarios()) for each in bundles)):
         comparison = side_by_side(bundles)
         if any(path.suffix.lower() in PICTURE_SUFFIXES for path in out):
-            raise click.BadParameter("--out: these evaluations have no sample in common; give a file .csv or .json")
+            raise click.BadParameter(
+                "--out: these evaluations have no sample in common; give a file .csv or .json"
+            )
     elif more:
         comparison = over_bytes([a, b, *more], Resampling(resamples=resamples), common=common)
     else:
@@ -133,7 +144,9 @@ def compare(
         elif path.suffix.lower() == ".json":
             write_bytes(path, as_text.encode())
         else:
-            drawn: Any = render_over_bytes if isinstance(comparison, OverBytes) else render_comparison
+            drawn: Any = (
+                render_over_bytes if isinstance(comparison, OverBytes) else render_comparison
+            )
             save_picture(drawn(comparison), path, dpi=None if current_style().few else _DPI)
     click.echo(as_text if as_json else comparison.to_text())
     for path in out:

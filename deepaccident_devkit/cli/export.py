@@ -8,7 +8,12 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from deepaccident_devkit.cli.agents import agent_names, agents_parameter, cooperating_parameter, names_or_configuration
+from deepaccident_devkit.cli.agents import (
+    agent_names,
+    agents_parameter,
+    cooperating_parameter,
+    names_or_configuration,
+)
 from deepaccident_devkit.cli.options import (
     PATH,
     channels_parameter,
@@ -19,7 +24,14 @@ from deepaccident_devkit.cli.options import (
     where_parameter,
     words_of,
 )
-from deepaccident_devkit.cli.verbs import LazyVerbs, WordChoice, advanced, field_option, together, verb
+from deepaccident_devkit.cli.verbs import (
+    LazyVerbs,
+    WordChoice,
+    advanced,
+    field_option,
+    together,
+    verb,
+)
 from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.errors import ExportError
 from deepaccident_devkit.motion import PRESETS
@@ -49,8 +61,13 @@ def bulk_parameters(agents: Callable[[Any], Any] = agents_parameter) -> Callable
     """
     return together(
         release_parameters,
-        click.option("--out", required=True, type=PATH, metavar="FOLDER", help="Folder to write into."),
-        click.option("--split", help="Only this split: train, val, test, …, or a split file (.txt).  [default: all]"),
+        click.option(
+            "--out", required=True, type=PATH, metavar="FOLDER", help="Folder to write into."
+        ),
+        click.option(
+            "--split",
+            help="Only this split: train, val, test, …, or a split file (.txt).  [default: all]",
+        ),
         where_parameter,
         agents,
         click.option("--dry-run", is_flag=True, help="Only say how much would be written."),
@@ -72,21 +89,31 @@ def run_export(
     """Export in a format with its `own` settings; says how much it will be, then what was written and left out."""
     from deepaccident_devkit.export.bulk import export_release
 
-    form = kind(split=split, where=where, agents=agent_names(agents), link=link, **own)  # before the release is indexed
+    form = kind(
+        split=split, where=where, agents=agent_names(agents), link=link, **own
+    )  # before the release is indexed
     dataset = DeepAccident(**release)
     left = export_release(dataset, out, form, dry_run=True)
     if left.written:
-        free = shutil.disk_usage(next(each for each in (left.folder, *left.folder.parents) if each.exists())).free
-        linked = sum(left.tally.linked.values())  # a temporary folder may take other links than this one
+        free = shutil.disk_usage(
+            next(each for each in (left.folder, *left.folder.parents) if each.exists())
+        ).free
+        linked = sum(
+            left.tally.linked.values()
+        )  # a temporary folder may take other links than this one
         told = f"{_counts(left.tally, 'to write')}{f', {linked:,} files to link' if linked else ''}"
         click.echo(f"about {left.tally.samples:,} samples: {told}; {size_text(free)} free")
         if left.tally.bytes > free:
-            raise ExportError(f"{out}: there is too little room; choose another disk, or fewer scenarios or agents")
+            raise ExportError(
+                f"{out}: there is too little room; choose another disk, or fewer scenarios or agents"
+            )
     if dry_run:
         return
     done = export_release(dataset, out, form, **engine_of(release), progress=True)
     tally = done.tally
-    linked_text = "".join(f", {count:,} files as {_WAYS[way]}" for way, count in sorted(tally.linked.items()))
+    linked_text = "".join(
+        f", {count:,} files as {_WAYS[way]}" for way, count in sorted(tally.linked.items())
+    )
     units = f"{counted(done.written, form.unit_word)} written now, {done.kept:,} were there already"
     click.echo(f"{done.folder}: {_counts(tally, 'written')}{linked_text}; {units}")
     for what, count in sorted(tally.left_out.items()):
@@ -94,10 +121,14 @@ def run_export(
 
 
 def _counts(tally: "Tally", done: str) -> str:
-    return f"{f'{tally.files:,}' if tally.files else 'a few'} files {done} ({size_text(tally.bytes)})"
+    return (
+        f"{f'{tally.files:,}' if tally.files else 'a few'} files {done} ({size_text(tally.bytes)})"
+    )
 
 
-def _of_format(kind: type[Any], *options: Callable[[Any], Any], summary: str = "", text: str = "") -> click.Command:
+def _of_format(
+    kind: type[Any], *options: Callable[[Any], Any], summary: str = "", text: str = ""
+) -> click.Command:
     """Return the verb of a format, whose own options set fields of the format.
 
     Args:
@@ -128,7 +159,9 @@ def _own(kind: type[Any], chosen: dict[str, Any]) -> dict[str, Any]:
 def _nuscenes_options() -> tuple[Callable[[Any], Any], ...]:
     from deepaccident_devkit.export.nuscenes import NuScenes
 
-    return link_parameter, *(field_option(NuScenes, each, option=advanced) for each in ("van", "lidar_axes", "sweeps"))
+    return link_parameter, *(
+        field_option(NuScenes, each, option=advanced) for each in ("van", "lidar_axes", "sweeps")
+    )
 
 
 def _nuscenes() -> click.Command:
@@ -149,7 +182,10 @@ def _mmdet3d() -> click.Command:
     from deepaccident_devkit.export.nuscenes import NuScenes
     from deepaccident_devkit.export.released_infos import ReleasedInfos
 
-    released = [field_option(ReleasedInfos, field, option=advanced) for field in ("root_prefix", "drop_empty")]
+    released = [
+        field_option(ReleasedInfos, field, option=advanced)
+        for field in ("root_prefix", "drop_empty")
+    ]
 
     @verb(short_help=_VERBS["mmdet3d"].summary)
     @bulk_parameters()
@@ -282,7 +318,9 @@ def _questions() -> click.Command:
             refuse_unused("without --images", "channels")
         own = {
             "observers": names_or_configuration(agents) or "single",
-            "window": WindowRules(**{name: options.pop(name) for name in ("observe", "ahead", "stride")}),
+            "window": WindowRules(
+                **{name: options.pop(name) for name in ("observe", "ahead", "stride")}
+            ),
             "cameras": () if images == "none" else _camera_names(channels),
             **{name: options.pop(name) for name in ("seen", "seed")},
         }
@@ -305,7 +343,9 @@ def _camera_names(given: tuple[str, ...]) -> tuple[str, ...]:
 @verb("mcap", short_help="Write a scenario as an interactive 3D scene (MCAP).")
 @release_parameters
 @click.argument("scenario", required=False)
-@click.option("--out", required=True, type=PATH, metavar="FILE", help="File to write, such as accident.mcap.")
+@click.option(
+    "--out", required=True, type=PATH, metavar="FILE", help="File to write, such as accident.mcap."
+)
 @agents_parameter
 @channels_parameter
 @frame_range_parameter
@@ -317,8 +357,12 @@ def _camera_names(given: tuple[str, ...]) -> tuple[str, ...]:
     show_default=True,
     help="Only every N-th point of a cloud.",
 )
-@click.option("--motion-labels", type=WordChoice(PRESETS), help="Also write motion labels by this preset.")
-@click.option("--results", type=PATH, metavar="FILE", help="Also write the predictions of this results file.")
+@click.option(
+    "--motion-labels", type=WordChoice(PRESETS), help="Also write motion labels by this preset."
+)
+@click.option(
+    "--results", type=PATH, metavar="FILE", help="Also write the predictions of this results file."
+)
 def _mcap(
     scenario: str | None,
     out: Path,
@@ -361,11 +405,17 @@ _VERBS: Final = {
     "mcap": LazyVerb("Write a scenario as an interactive 3D scene (MCAP).", lambda: _mcap),
     "mmdet3d": LazyVerb("Write infos for mmdet3d, or for the released code.", _mmdet3d),
     "nuscenes": LazyVerb("Write nuScenes tables and their sensor files.", _nuscenes),
-    "opencood": LazyVerb("Write OPV2V's folders, for OpenCOOD, V2X-ViT, CoAlign and HEAL.", _opencood),
-    "parquet": LazyVerb("Write all tables as Parquet files, for datasets, DuckDB, Polars and pandas.", _parquet),
+    "opencood": LazyVerb(
+        "Write OPV2V's folders, for OpenCOOD, V2X-ViT, CoAlign and HEAL.", _opencood
+    ),
+    "parquet": LazyVerb(
+        "Write all tables as Parquet files, for datasets, DuckDB, Polars and pandas.", _parquet
+    ),
     "questions": LazyVerb("Write questions on what happens next, for language models.", _questions),
     "town-maps": LazyVerb("Write the roads and sidewalks of each town as GeoJSON.", _town_maps),
-    "webdataset": LazyVerb("Write samples with images, LiDAR and boxes as tar files, for webdataset.", _webdataset),
+    "webdataset": LazyVerb(
+        "Write samples with images, LiDAR and boxes as tar files, for webdataset.", _webdataset
+    ),
 }
 
 

@@ -25,7 +25,10 @@ def index(dataroot: Dataroot, version: str, on_error: OnError, clear: bool, **op
     if clear:
         refuse_unused("with --clear, which makes no index", "workers", "on_error")
         cleared = clear_index(dataroot, version=version, index_dir=options["index_dir"])
-        click.echo("\n".join(f"removed {folder}" for folder in cleared) or f"{dataroot}: no index to remove")
+        click.echo(
+            "\n".join(f"removed {folder}" for folder in cleared)
+            or f"{dataroot}: no index to remove"
+        )
         return
     _update(dataroot, version, on_error, check_files=False, **options)
 
@@ -42,10 +45,17 @@ def check_index(dataroot: Dataroot, version: str, on_error: OnError, **options: 
     click.echo(f"compared: the tables, and the label, calib and meta files of {scenarios}")
 
 
-def _update(dataroot: Dataroot, version: str, on_error: OnError, *, check_files: bool, **options: Any) -> Tables:
+def _update(
+    dataroot: Dataroot, version: str, on_error: OnError, *, check_files: bool, **options: Any
+) -> Tables:
     """Make or update an index, print where it is, and return its tables."""
     root = open_dataroot(
-        dataroot, options["index_dir"], refresh=True, on_error=on_error, progress=True, **engine_of(options)
+        dataroot,
+        options["index_dir"],
+        refresh=True,
+        on_error=on_error,
+        progress=True,
+        **engine_of(options),
     )
     made = open_index(
         find_release(root, version),
@@ -56,6 +66,8 @@ def _update(dataroot: Dataroot, version: str, on_error: OnError, *, check_files:
         **options,
     )
     tables = Tables(made.tables_folder)
-    counts = ", ".join(f"{len(tables.table(name)):,} {name}s" for name in ("scenario", "sample", "annotation"))
+    counts = ", ".join(
+        f"{len(tables.table(name)):,} {name}s" for name in ("scenario", "sample", "annotation")
+    )
     click.echo(f"{made.tables_folder}: {counts}")
     return tables

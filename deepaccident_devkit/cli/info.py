@@ -42,7 +42,11 @@ def _list_fields(context: click.Context, _parameter: click.Parameter, wanted: bo
     help="List what --where takes: fields, their values and what they mean; without DATAROOT.",
 )
 @click.option("--statistics", is_flag=True, help="Print the paper's statistics by split instead.")
-@click.option("--interactions", is_flag=True, help="With --statistics: also count how soon moving pairs would collide.")
+@click.option(
+    "--interactions",
+    is_flag=True,
+    help="With --statistics: also count how soon moving pairs would collide.",
+)
 @click.option(
     "--out",
     type=click.Path(),
@@ -61,7 +65,9 @@ def _list_fields(context: click.Context, _parameter: click.Parameter, wanted: bo
     help="Print the release's data card instead: Croissant metadata, as JSON-LD (docs/format.md).",
 )
 @click.option(
-    "--licence", metavar="TEXT", help="With --croissant: the licence that you have the data under, or its URL."
+    "--licence",
+    metavar="TEXT",
+    help="With --croissant: the licence that you have the data under, or its URL.",
 )
 @json_parameter
 def info(
@@ -82,7 +88,9 @@ def info(
     if croissant:
         from deepaccident_devkit.validation import data_card
 
-        refuse_unused("with --croissant", "where", "statistics", "interactions", "out", "facts", "as_json")
+        refuse_unused(
+            "with --croissant", "where", "statistics", "interactions", "out", "facts", "as_json"
+        )
         card = data_card(open_release(**release), licence=licence)
         click.echo(json.dumps(card, indent=2, ensure_ascii=False))
         return
@@ -103,9 +111,13 @@ def info(
         say_report(report, [], None, as_json=as_json)
         sys.exit(report.exit_status)
     if chosen == [] and out is not None:
-        raise click.UsageError("no scenario matches --where, so there is nothing to write; change it or omit --out")
+        raise click.UsageError(
+            "no scenario matches --where, so there is nothing to write; change it or omit --out"
+        )
     if statistics:
-        _statistics(dataset, chosen, out, interactions=interactions, as_json=as_json, **engine_of(release))
+        _statistics(
+            dataset, chosen, out, interactions=interactions, as_json=as_json, **engine_of(release)
+        )
         return
     if chosen is None:
         summary = overview(dataset)
@@ -113,12 +125,17 @@ def info(
     elif as_json:
         click.echo(json.dumps(chosen, indent=2, ensure_ascii=False))
     else:
-        found = [f"{len(chosen)} of {len(dataset.scenario)} scenarios match", *scenario_lines(chosen)]
+        found = [
+            f"{len(chosen)} of {len(dataset.scenario)} scenarios match",
+            *scenario_lines(chosen),
+        ]
         none = f"no scenario matches {' and '.join(where)}; deepaccident info --fields lists what can be asked for"
         click.echo("\n".join(found) if chosen else none)
 
 
-def _statistics(dataset: DeepAccident, chosen: list[Any] | None, out: str | None, *, as_json: bool, **how: Any) -> None:
+def _statistics(
+    dataset: DeepAccident, chosen: list[Any] | None, out: str | None, *, as_json: bool, **how: Any
+) -> None:
     from deepaccident_devkit.render.statistics import save_statistics  # it imports matplotlib
     from deepaccident_devkit.statistics import dataset_statistics
     from deepaccident_devkit.support.files import writable_folder

@@ -9,7 +9,13 @@ from deepaccident_devkit.cli.agents import agent_names, agents_parameter
 from deepaccident_devkit.cli.options import engine_of, open_release, release_parameters, switches_of
 from deepaccident_devkit.cli.verbs import WordChoice, advanced, field_option, verb
 from deepaccident_devkit.errors import NotAvailableError
-from deepaccident_devkit.motion import LABEL_PROTOCOLS, PRESETS, LabelProtocol, MotionLabelConfig, write_label_files
+from deepaccident_devkit.motion import (
+    LABEL_PROTOCOLS,
+    PRESETS,
+    LabelProtocol,
+    MotionLabelConfig,
+    write_label_files,
+)
 from deepaccident_devkit.motion.batch_names import BatchNames
 from deepaccident_devkit.motion.config import NO_PRESETS, slip_names
 from deepaccident_devkit.motion.label_folder import LabelManifest, folder_path
@@ -22,7 +28,9 @@ _CONFIG_OPTIONS = ("preset", "protocol", "switches", "seen_by", "only_vehicle")
 
 @verb()
 @release_parameters
-@click.option("--split", required=True, help="train, val, train_mini, val_mini, all, or a split file (.txt).")
+@click.option(
+    "--split", required=True, help="train, val, train_mini, val_mini, all, or a split file (.txt)."
+)
 @click.option(
     "--out",
     required=True,
@@ -46,9 +54,17 @@ _CONFIG_OPTIONS = ("preset", "protocol", "switches", "seen_by", "only_vehicle")
     show_default=True,
     help="Grid, orientation and protocol of the labels.",
 )
-@click.option("--protocol", type=WordChoice(LABEL_PROTOCOLS), help="Rules of the labels.  [default: of the preset]")
+@click.option(
+    "--protocol",
+    type=WordChoice(LABEL_PROTOCOLS),
+    help="Rules of the labels.  [default: of the preset]",
+)
 @advanced(
-    "--switch", "switches", multiple=True, metavar="NAME=yes|no", help="Switch one quirk of the protocol on or off."
+    "--switch",
+    "switches",
+    multiple=True,
+    metavar="NAME=yes|no",
+    help="Switch one quirk of the protocol on or off.",
 )
 @click.option(
     "--seen-by",
@@ -64,7 +80,12 @@ _CONFIG_OPTIONS = ("preset", "protocol", "switches", "seen_by", "only_vehicle")
     "[default: label files]",
 )
 def labels(
-    split: str, out: str, agents: tuple[str, ...], purpose: Purpose, names: BatchNames | None, **options: Any
+    split: str,
+    out: str,
+    agents: tuple[str, ...],
+    purpose: Purpose,
+    names: BatchNames | None,
+    **options: Any,
 ) -> None:
     """Write the motion labels of one split of the release in DATAROOT.
 
@@ -74,9 +95,13 @@ def labels(
     chosen = agent_names(agents)
     LabelManifest.of(folder_path(out), config, names)  # before the release is indexed
     dataset = open_release(**options)
-    tokens = [token for token in dataset.samples(split, purpose) if token.rsplit("/", 2)[1] in chosen]
+    tokens = [
+        token for token in dataset.samples(split, purpose) if token.rsplit("/", 2)[1] in chosen
+    ]
     if not tokens:
-        raise NotAvailableError(f"{split}: has no labelled samples of {', '.join(chosen)} for --samples {purpose}")
+        raise NotAvailableError(
+            f"{split}: has no labelled samples of {', '.join(chosen)} for --samples {purpose}"
+        )
     done = write_label_files(
         dataset,
         out,
@@ -87,12 +112,16 @@ def labels(
         progress=True,
     )
     written = counted(done.written, "file")
-    click.echo(f"{counted(done.samples, 'sample')} in {out}: {written} written, {done.kept} were there already")
+    click.echo(
+        f"{counted(done.samples, 'sample')} in {out}: {written} written, {done.kept} were there already"
+    )
 
 
 def _config(options: dict[str, Any]) -> MotionLabelConfig:
     """Take the options that say what labels show out of the verb's."""
-    preset, protocol, switches, seen_by, only_vehicle = (options.pop(name) for name in _CONFIG_OPTIONS)
+    preset, protocol, switches, seen_by, only_vehicle = (
+        options.pop(name) for name in _CONFIG_OPTIONS
+    )
     named = {"protocol": protocol, "agents": seen_by, "only_vehicle": only_vehicle or None}
     changes: dict[str, Any] = {name: value for name, value in named.items() if value is not None}
     config = MotionLabelConfig.preset(preset, **changes)
@@ -104,5 +133,7 @@ def _switched(rules: LabelProtocol, texts: tuple[str, ...]) -> LabelProtocol:
     for name, value in switches.items():
         if name not in slip_names() or not isinstance(value, bool):
             names = ", ".join(slip_names())
-            raise click.BadParameter(f"--switch: expected yes or no for one of {names}; found {', '.join(texts)}")
+            raise click.BadParameter(
+                f"--switch: expected yes or no for one of {names}; found {', '.join(texts)}"
+            )
     return replace(rules, **switches)

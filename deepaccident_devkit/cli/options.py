@@ -26,10 +26,17 @@ class DatarootParameter(click.Path):
     """A release on the command line: a path, or a URL, which stays a text."""
 
     def convert(
-        self, value: str | os.PathLike[str], param: click.Parameter | None, ctx: click.Context | None
+        self,
+        value: str | os.PathLike[str],
+        param: click.Parameter | None,
+        ctx: click.Context | None,
     ) -> str | bytes | os.PathLike[str]:
         """The path, or the URL as it is."""
-        return value if isinstance(value, str) and "://" in value else super().convert(value, param, ctx)
+        return (
+            value
+            if isinstance(value, str) and "://" in value
+            else super().convert(value, param, ctx)
+        )
 
 
 DATAROOT = DatarootParameter(path_type=Path)
@@ -43,9 +50,15 @@ _SCHEDULER = advanced(
     "(docs/clusters.md).",
 )
 version_parameter = click.option(
-    "--version", type=WordChoice(VERSIONS), default="v1", show_default=True, help="Version of the release."
+    "--version",
+    type=WordChoice(VERSIONS),
+    default="v1",
+    show_default=True,
+    help="Version of the release.",
 )
-workers_parameter = click.option("--workers", type=click.IntRange(min=1), help="Number of processes to use.")
+workers_parameter = click.option(
+    "--workers", type=click.IntRange(min=1), help="Number of processes to use."
+)
 index_dir_parameter = advanced("--index-dir", type=PATH, help="Folder of the index.")
 on_error_parameter = advanced(
     "--on-error",
@@ -90,11 +103,18 @@ channels_parameter = click.option(
 )
 model_parameters = together(
     click.option(
-        "--device", default="auto", show_default=True, help="cpu, cuda, …; auto takes a GPU where there is one."
+        "--device",
+        default="auto",
+        show_default=True,
+        help="cpu, cuda, …; auto takes a GPU where there is one.",
     ),
-    click.option("--images-cache", type=PATH, help="Folder of `deepaccident cache` with the images."),
+    click.option(
+        "--images-cache", type=PATH, help="Folder of `deepaccident cache` with the images."
+    ),
 )
-json_parameter = click.option("--json", "as_json", is_flag=True, help="Print one JSON object, for programs.")
+json_parameter = click.option(
+    "--json", "as_json", is_flag=True, help="Print one JSON object, for programs."
+)
 
 
 def engine_parameters(run_verb: Function) -> Function:
@@ -104,11 +124,16 @@ def engine_parameters(run_verb: Function) -> Function:
     def run(*arguments: Any, scheduler: str | None, **options: Any) -> Any:
         if scheduler is None:
             return run_verb(*arguments, executor=None, **options)
-        from deepaccident_devkit.support.parallel import cluster_executor  # here: most verbs start without it
+        from deepaccident_devkit.support.parallel import (
+            cluster_executor,
+        )  # here: most verbs start without it
 
         refuse_unused("with a scheduler, which has workers of its own", "workers")
         # workers have working folders of their own
-        options = {name: each.absolute() if isinstance(each, Path) else each for name, each in options.items()}
+        options = {
+            name: each.absolute() if isinstance(each, Path) else each
+            for name, each in options.items()
+        }
         file = Path(scheduler) if scheduler.endswith(".json") else None
         with cluster_executor(None if file else scheduler, file) as executor:
             return run_verb(*arguments, executor=executor, **options)
@@ -116,7 +141,9 @@ def engine_parameters(run_verb: Function) -> Function:
     return cast("Function", workers_parameter(_SCHEDULER(run)))
 
 
-release_options = together(version_parameter, engine_parameters, index_dir_parameter, on_error_parameter)
+release_options = together(
+    version_parameter, engine_parameters, index_dir_parameter, on_error_parameter
+)
 """--version, --index-dir, --on-error and what `engine_parameters` gives."""
 release_parameters = together(dataroot_argument, release_options)
 """For a verb on a release: DATAROOT and its options."""
@@ -188,7 +215,9 @@ def words_of(given: Sequence[str]) -> list[str]:
     return [word for text in given for word in text.split(",")]
 
 
-seed_parameter = click.option("--seed", default=0, show_default=True, help="Seed of all that is drawn.")
+seed_parameter = click.option(
+    "--seed", default=0, show_default=True, help="Seed of all that is drawn."
+)
 
 
 def use_threads_sparingly() -> None:
@@ -201,7 +230,9 @@ def use_threads_sparingly() -> None:
 
 def was_given(parameter: str) -> bool:
     """Whether the call of the verb that runs has this option, be it with its default."""
-    return click.get_current_context().get_parameter_source(parameter) is not ParameterSource.DEFAULT
+    return (
+        click.get_current_context().get_parameter_source(parameter) is not ParameterSource.DEFAULT
+    )
 
 
 def refuse_unused(why: str, *parameters: str) -> None:
@@ -209,27 +240,37 @@ def refuse_unused(why: str, *parameters: str) -> None:
     context = click.get_current_context()
     for option in context.command.params:
         if option.name in parameters and was_given(option.name):
-            name = option.opts[0] if isinstance(option, click.Option) else option.human_readable_name
+            name = (
+                option.opts[0] if isinstance(option, click.Option) else option.human_readable_name
+            )
             raise click.UsageError(f"{name} changes nothing {why}; leave it out", context)
 
 
-def pixel_size(context: click.Context, parameter: click.Parameter, value: str | None) -> tuple[int, int] | None:
+def pixel_size(
+    context: click.Context, parameter: click.Parameter, value: str | None
+) -> tuple[int, int] | None:
     """Parse `WxH` to (width, height); None stays."""
     if value is None:
         return None
     match = re.fullmatch(r"(\d+)x(\d+)", value.strip(), re.IGNORECASE)
     if match is None:
-        raise click.BadParameter(f"expected width x height such as 480x270, found {value!r}", context, parameter)
+        raise click.BadParameter(
+            f"expected width x height such as 480x270, found {value!r}", context, parameter
+        )
     return int(match[1]), int(match[2])
 
 
-def _frame_range(context: click.Context, parameter: click.Parameter, value: str | None) -> range | None:
+def _frame_range(
+    context: click.Context, parameter: click.Parameter, value: str | None
+) -> range | None:
     """Parse `FIRST..LAST`, or one number; None stays."""
     if value is None:
         return None
     match = re.fullmatch(r"(\d+)(?:\.\.(\d+))?", value.strip())
     if match is None or int(match[1]) > int(match[2] or match[1]):
-        raise click.BadParameter(f"expected frame numbers such as 20..40, found {value!r}", context, parameter)
+        raise click.BadParameter(
+            f"expected frame numbers such as 20..40, found {value!r}", context, parameter
+        )
     return range(int(match[1]), int(match[2] or match[1]) + 1)
 
 

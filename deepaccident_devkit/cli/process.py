@@ -53,7 +53,9 @@ class _Signals:
         for number in _ENDING:
             signal.signal(number, self._handle)
         sys.unraisablehook = self._raise_again
-        atexit.register(_ignore)  # amid its own ending Python would let a signal kill a verb that has done its work
+        atexit.register(
+            _ignore
+        )  # amid its own ending Python would let a signal kill a verb that has done its work
 
     def verb_ended(self) -> None:
         """Raise no more: Python's own ending would print a traceback."""
@@ -75,7 +77,9 @@ class _Signals:
         elif self.first is not None and not self._verb_ended:
             number, self.first = self.first, None
             self._raising_again = True  # what is raised before this returns is lost, too
-            threading.Thread(target=self._send_again, args=(number,), name="signal again", daemon=True).start()
+            threading.Thread(
+                target=self._send_again, args=(number,), name="signal again", daemon=True
+            ).start()
             self._raising_again = False
 
     def _send_again(self, number: int) -> None:

@@ -8,7 +8,11 @@ from typing import Any, cast, get_args
 
 import click
 
-from deepaccident_devkit.cli.agents import cooperating_parameter, link_parameters, names_or_configuration
+from deepaccident_devkit.cli.agents import (
+    cooperating_parameter,
+    link_parameters,
+    names_or_configuration,
+)
 from deepaccident_devkit.cli.options import (
     PATH,
     frame_range_parameter,
@@ -26,9 +30,19 @@ from deepaccident_devkit.evaluation.results import read_results
 from deepaccident_devkit.render.accident import COUNTDOWN, render_accident
 from deepaccident_devkit.render.actors import render_annotation, render_instance
 from deepaccident_devkit.render.bev import render_bev
-from deepaccident_devkit.render.camera import ColorBy, render_pointcloud_in_image, render_sample_data
+from deepaccident_devkit.render.camera import (
+    ColorBy,
+    render_pointcloud_in_image,
+    render_sample_data,
+)
 from deepaccident_devkit.render.captions import missing_words
-from deepaccident_devkit.render.figures import LAYERS, PICTURE_SUFFIXES, Layer, figure_of_pixels, save_picture
+from deepaccident_devkit.render.figures import (
+    LAYERS,
+    PICTURE_SUFFIXES,
+    Layer,
+    figure_of_pixels,
+    save_picture,
+)
 from deepaccident_devkit.render.link import render_link
 from deepaccident_devkit.render.motion import MotionStyle, render_motion_labels
 from deepaccident_devkit.render.outcomes import render_evaluation
@@ -51,7 +65,15 @@ _OUT = f"File to write ({', '.join(PICTURE_SUFFIXES)}), or a folder for several 
 def _linked(draw: Callable[..., Any]) -> Callable[..., Any]:
     """Turn a function that takes `link` into one that takes --latency, --pose-noise and --seed."""
 
-    def drawn(dataset: Dataset, token: str, *, latency: float, pose_noise: float, seed: int, **choices: Any) -> Any:
+    def drawn(
+        dataset: Dataset,
+        token: str,
+        *,
+        latency: float,
+        pose_noise: float,
+        seed: int,
+        **choices: Any,
+    ) -> Any:
         # noise with a mean of 0 m would still have a spread
         link = Link(latency=latency, pose_noise=pose_noise or None, seed=seed)
         return draw(dataset, token, link=link, **choices)
@@ -64,7 +86,9 @@ def _evaluated(dataset: Dataset, token: str, *, results: Path, **choices: Any) -
     return render_evaluation(dataset, token, prediction, **choices)
 
 
-def _sensor_file(dataset: Dataset, token: str, *, color_by: ColorBy | None = None, **choices: Any) -> Any:
+def _sensor_file(
+    dataset: Dataset, token: str, *, color_by: ColorBy | None = None, **choices: Any
+) -> Any:
     """What a sensor recorded, or with `color_by` the LiDAR points on its image."""
     if color_by is None:
         return render_sample_data(dataset, token, **choices)
@@ -72,7 +96,9 @@ def _sensor_file(dataset: Dataset, token: str, *, color_by: ColorBy | None = Non
     return render_pointcloud_in_image(dataset, token, color_by=color_by, **choices)
 
 
-def _visibility(dataset: Dataset, token: str, *, style: str = _VISIBILITY_STYLES[0], **choices: Any) -> Any:
+def _visibility(
+    dataset: Dataset, token: str, *, style: str = _VISIBILITY_STYLES[0], **choices: Any
+) -> Any:
     """Who sees whom, from above or as a table."""
     if style == _VISIBILITY_STYLES[0]:
         return render_visibility(dataset, token, **choices)
@@ -80,21 +106,31 @@ def _visibility(dataset: Dataset, token: str, *, style: str = _VISIBILITY_STYLES
     return render_visibility_matrix(dataset, token, **choices)
 
 
-def _seconds(context: click.Context, parameter: click.Parameter, value: str | None) -> list[float] | None:
+def _seconds(
+    context: click.Context, parameter: click.Parameter, value: str | None
+) -> list[float] | None:
     if value is None:
         return None
     try:
         return [float(word) for word in value.split(",")]
     except ValueError:
-        raise click.BadParameter(f"expected seconds such as 2,1,0, found {value!r}", context, parameter) from None
+        raise click.BadParameter(
+            f"expected seconds such as 2,1,0, found {value!r}", context, parameter
+        ) from None
 
 
 _AGENTS = cooperating_parameter("Agents to show", "chosen by the view")
-_VIEW_RANGE = click.option("--view-range", type=float, metavar="M", help="Metres to show on each side.")
-_COORDINATES = advanced(
-    "--frame", type=WordChoice(get_args(Frame)), help="Coordinate frame of the axes.  [default: ego]"
+_VIEW_RANGE = click.option(
+    "--view-range", type=float, metavar="M", help="Metres to show on each side."
 )
-_BY_CLASS = click.option("--color-by", type=WordChoice(("class",)), help="Give boxes a hue for each class.")
+_COORDINATES = advanced(
+    "--frame",
+    type=WordChoice(get_args(Frame)),
+    help="Coordinate frame of the axes.  [default: ego]",
+)
+_BY_CLASS = click.option(
+    "--color-by", type=WordChoice(("class",)), help="Give boxes a hue for each class."
+)
 _LAYERS = click.option(
     "--layers",
     multiple=True,
@@ -128,7 +164,12 @@ class _Picture:
     channels: tuple[str, ...] = (*CAMERAS, LIDAR)
 
     def drawn(
-        self, dataset: Dataset, row: str, size: tuple[int, int] | None, dpi: float, choices: dict[str, Any]
+        self,
+        dataset: Dataset,
+        row: str,
+        size: tuple[int, int] | None,
+        dpi: float,
+        choices: dict[str, Any],
     ) -> Any:
         """Render a row into a figure of the given size in pixels, or of the view's own size."""
         canvas = {}
@@ -187,7 +228,11 @@ _PICTURES = {
             _AGENTS,
             _VIEW_RANGE,
             _COORDINATES,
-            advanced("--sweeps", type=click.IntRange(min=1), help="Number of frames of LiDAR points.  [default: 1]"),
+            advanced(
+                "--sweeps",
+                type=click.IntRange(min=1),
+                help="Number of frames of LiDAR points.  [default: 1]",
+            ),
             link_parameters(),
             seed_parameter,
             _BY_CLASS,
@@ -236,10 +281,13 @@ _PICTURES = {
         options=(
             click.option("--results", type=PATH, required=True, help="Results file of a model."),
             click.option(
-                "--task", type=WordChoice(["motion", "accident"]), help="Verdict on motion, or on the accident in it."
+                "--task",
+                type=WordChoice(["motion", "accident"]),
+                help="Verdict on motion, or on the accident in it.",
             ),
             click.option(
-                "--protocol", help="Name of the protocol.  [default: released; for explicit accidents: boxes]"
+                "--protocol",
+                help="Name of the protocol.  [default: released; for explicit accidents: boxes]",
             ),
             _LAYERS,
         ),
@@ -271,16 +319,25 @@ def render() -> None:
 def _verb(name: str, picture: _Picture) -> click.Command:
     text = f"{picture.help}\n\nTOKEN is a row of the table {picture.of}."
     if picture.of not in ("scenario", "instance"):
-        most = ", or of a partial download the nearest one with most files" if picture.channels else ""
+        most = (
+            ", or of a partial download the nearest one with most files" if picture.channels else ""
+        )
         text += f" A scenario's token stands for the moment one second before its end{most}."
-    own = f"{' or '.join(picture.styles)}  [default: {picture.styles[0]}]; " if picture.styles else ""
+    own = (
+        f"{' or '.join(picture.styles)}  [default: {picture.styles[0]}]; " if picture.styles else ""
+    )
     text += f" Without TOKEN the command renders {picture.default}."
 
     @verb(name, help=text, short_help=picture.help)
     @release_parameters
     @click.argument("tokens", nargs=-1, metavar="[TOKEN…]")
     @click.option("--out", type=PATH, required=True, metavar="FILE|FOLDER", help=_OUT)
-    @click.option("--size", callback=pixel_size, metavar="WxH", help="Size in pixels.  [default: chosen by the view]")
+    @click.option(
+        "--size",
+        callback=pixel_size,
+        metavar="WxH",
+        help="Size in pixels.  [default: chosen by the view]",
+    )
     @advanced(
         "--dpi",
         type=click.FloatRange(min=1),
@@ -310,7 +367,12 @@ def _verb(name: str, picture: _Picture) -> click.Command:
         release = {option: options.pop(option) for option in _RELEASE}
         options["agents"] = names_or_configuration(options.pop("agents", ()))
         if name == "bev" and options["agents"] in (None, "single"):
-            refuse_unused("without --agents: it is about the data of partners", "latency", "pose_noise", "seed")
+            refuse_unused(
+                "without --agents: it is about the data of partners",
+                "latency",
+                "pose_noise",
+                "seed",
+            )
         if not options.get("pose_noise"):
             refuse_unused("without --pose-noise", "seed")
         options["layers"] = words_of(options.pop("layers", ())) or None
@@ -318,7 +380,14 @@ def _verb(name: str, picture: _Picture) -> click.Command:
         if not tokens and "results" in choices:
             tokens = read_results(choices["results"]).tokens[:1]
         dataset = open_release(**release)
-        rows = rows_to_draw(dataset, picture.of, tokens, frames, picture.channels, latency=choices.get("latency", 0.0))
+        rows = rows_to_draw(
+            dataset,
+            picture.of,
+            tokens,
+            frames,
+            picture.channels,
+            latency=choices.get("latency", 0.0),
+        )
         looks = [word for word in styles if word in picture.styles]
         if looks:
             choices["style"] = looks[-1]
@@ -360,9 +429,16 @@ for _name, _picture in _PICTURES.items():
 @_LAYERS
 @frame_range_parameter
 @click.option(
-    "--size", callback=pixel_size, metavar="WxH", default="1280x720", show_default=True, help="Size in pixels."
+    "--size",
+    callback=pixel_size,
+    metavar="WxH",
+    default="1280x720",
+    show_default=True,
+    help="Size in pixels.",
 )
-@click.option("--fps", default=10.0, show_default=True, help="Frames per second; the recordings have 10.")
+@click.option(
+    "--fps", default=10.0, show_default=True, help="Frames per second; the recordings have 10."
+)
 def video(
     scenario: str | None,
     out: Path,
@@ -396,10 +472,22 @@ def video(
 @render.command(cls=Verb, short_help="Write a scenario as one HTML file that plays.")
 @release_parameters
 @click.argument("scenario", required=False)
-@click.option("--out", required=True, type=click.Path(), metavar="FILE", help="File to write, such as replay.html.")
-@click.option("--results", type=click.Path(), help="Results file of motion or accidents, shown with its verdicts.")
+@click.option(
+    "--out",
+    required=True,
+    type=click.Path(),
+    metavar="FILE",
+    help="File to write, such as replay.html.",
+)
+@click.option(
+    "--results",
+    type=click.Path(),
+    help="Results file of motion or accidents, shown with its verdicts.",
+)
 @cooperating_parameter("Agents to show", "available")
-def replay(scenario: str | None, out: str, results: str | None, agents: tuple[str, ...], **release: Any) -> None:
+def replay(
+    scenario: str | None, out: str, results: str | None, agents: tuple[str, ...], **release: Any
+) -> None:
     """Write one scenario of the release in DATAROOT as one HTML file that plays in any browser, without a network.
 
     Without SCENARIO the command takes the first accident, or if there is none, the first scenario. The file has at most
@@ -407,5 +495,7 @@ def replay(scenario: str | None, out: str, results: str | None, agents: tuple[st
     """
     prediction = None if results is None else read_results(results)  # before the release is indexed
     dataset, chosen = open_release(**release), names_or_configuration(agents)
-    path = render_replay(dataset, scenario, out, prediction=prediction, agents=chosen, progress=True)
+    path = render_replay(
+        dataset, scenario, out, prediction=prediction, agents=chosen, progress=True
+    )
     click.echo(f"written: {path}, {path.stat().st_size / 1e6:.1f} MB; open it in a browser")

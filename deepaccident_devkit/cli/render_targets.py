@@ -12,7 +12,12 @@ from deepaccident_devkit.render.boxes import collider_ids
 from deepaccident_devkit.render.camera import best_view
 from deepaccident_devkit.render.figures import PICTURE_SUFFIXES
 from deepaccident_devkit.support.arrays import IntArray, as_floats
-from deepaccident_devkit.tables.tokens import annotation_token, frame_token, instance_token, sample_token
+from deepaccident_devkit.tables.tokens import (
+    annotation_token,
+    frame_token,
+    instance_token,
+    sample_token,
+)
 from deepaccident_devkit.taxonomy import CAMERAS, CHANNELS, FRAME_PERIOD, OWN_ACTOR_ID
 from deepaccident_devkit.v2x.agents import agents_of
 from deepaccident_devkit.v2x.collisions import default_scenario, first_accident
@@ -38,27 +43,39 @@ def rows_to_draw(
     except where a whole scenario is rendered.
     """
     if frames is not None and table in ("scenario", "instance"):
-        raise click.UsageError(f"--frame-range is for moments; a whole {table} is rendered, leave it out")
+        raise click.UsageError(
+            f"--frame-range is for moments; a whole {table} is rendered, leave it out"
+        )
     rows: list[str] = []
-    first = first_accident if table == "scenario" else default_scenario  # a whole scenario is counted down
+    first = (
+        first_accident if table == "scenario" else default_scenario
+    )  # a whole scenario is counted down
     for token in tokens or [first(dataset)]:
         if token.count("/") == 1:
-            rows += _of_scenario(dataset, table, token, frames, _files(dataset, token, channels, latency))
+            rows += _of_scenario(
+                dataset, table, token, frames, _files(dataset, token, channels, latency)
+            )
         elif frames is not None:
-            raise click.UsageError(f"--frame-range is for scenarios; {token} is a {table}, name its scenario instead")
+            raise click.UsageError(
+                f"--frame-range is for scenarios; {token} is a {table}, name its scenario instead"
+            )
         else:
             rows.append(token)
     return rows
 
 
-def _of_scenario(dataset: Dataset, table: str, token: str, frames: range | None, files: IntArray) -> list[str]:
+def _of_scenario(
+    dataset: Dataset, table: str, token: str, frames: range | None, files: IntArray
+) -> list[str]:
     record = dataset.get("scenario", token)
     if table == "scenario":
         return [token]
     if table == "instance":
         return [_instance(dataset, token)]
     if frames is not None and frames[-1] > record["num_frames"]:
-        raise ChoiceError(f"--frame-range: expected frames from 1 to {record['num_frames']}, found {frames[-1]}")
+        raise ChoiceError(
+            f"--frame-range: expected frames from 1 to {record['num_frames']}, found {frames[-1]}"
+        )
     if frames is None:
         usual = max(1, record["num_frames"] - round(_SECONDS_BEFORE / FRAME_PERIOD))
         of_agents = files.sum(axis=1)
@@ -74,13 +91,18 @@ def _of_scenario(dataset: Dataset, table: str, token: str, frames: range | None,
     if table == "sample_data":
         camera = CAMERAS[of_frames[agent, : len(CAMERAS)].argmax()]
         return [f"{sample}/{camera}" for sample in samples]
-    return [_annotation(dataset, sample) for sample in samples] if table == "annotation" else samples
+    return (
+        [_annotation(dataset, sample) for sample in samples] if table == "annotation" else samples
+    )
 
 
 def _files(dataset: Dataset, scenario: str, channels: Sequence[str], latency: float) -> IntArray:
     """How many files are here, (agents of the scenario, channels, frames), of each moment and of `latency` before."""
     agents, late = agents_of(dataset, scenario), round(latency / FRAME_PERIOD)
-    files = np.zeros((len(agents), len(channels), dataset.get("scenario", scenario)["num_frames"]), dtype=np.int64)
+    files = np.zeros(
+        (len(agents), len(channels), dataset.get("scenario", scenario)["num_frames"]),
+        dtype=np.int64,
+    )
     for (agent, channel), frames in dataset.sensor_frames(scenario).items():
         if channel in channels:
             files[agents.index(agent), channels.index(channel), np.array(frames, dtype=int) - 1] = 1
@@ -106,9 +128,14 @@ def _annotation(dataset: Dataset, sample: str) -> str:
         raise NotAvailableError(f"{sample}: has no boxes of other actors; name an annotation")
     collides = np.isin(boxes.actor_id, list(collider_ids(dataset, sample)))
     in_image = as_floats(
-        [best_view(dataset, [sample], boxes.select(boxes.row == row)) is not None for row in boxes.row]
+        [
+            best_view(dataset, [sample], boxes.select(boxes.row == row)) is not None
+            for row in boxes.row
+        ]
     )
-    return annotation_token(sample, int(boxes.row[np.lexsort((boxes.num_lidar_pts, in_image, collides))[-1]]))
+    return annotation_token(
+        sample, int(boxes.row[np.lexsort((boxes.num_lidar_pts, in_image, collides))[-1]])
+    )
 
 
 def picture_paths(out: Path, view: str, rows: Sequence[str]) -> list[Path]:
@@ -116,7 +143,9 @@ def picture_paths(out: Path, view: str, rows: Sequence[str]) -> list[Path]:
     if out.suffix.lower() not in PICTURE_SUFFIXES:
         if out.suffix and not out.is_dir():
             kinds = ", ".join(PICTURE_SUFFIXES)
-            raise click.UsageError(f"--out: expected a folder, or a file that ends in {kinds}; found {out}")
+            raise click.UsageError(
+                f"--out: expected a folder, or a file that ends in {kinds}; found {out}"
+            )
         return [out / f"{view}_{row.replace('/', '_')}.png" for row in rows]
     if len(rows) > 1:
         raise click.UsageError(f"--out: {len(rows)} pictures need a folder, found the file {out}")

@@ -15,7 +15,9 @@ _FILE = click.Path(path_type=Path, exists=True, dir_okay=False)
 @verb()
 @click.argument("file", type=_FILE)
 @click.argument("dataroot", type=DATAROOT, required=False)
-@click.option("--truth", type=_FILE, metavar="FILE", help="truth.jsonl of the export of the questions.")
+@click.option(
+    "--truth", type=_FILE, metavar="FILE", help="truth.jsonl of the export of the questions."
+)
 @release_options
 @click.option(
     "--threshold",
@@ -24,9 +26,15 @@ _FILE = click.Path(path_type=Path, exists=True, dir_okay=False)
     show_default=True,
     help="With --truth: probability from which a second is an alarm; 0 keeps all alarms, for curves.",
 )
-@click.option("--method", metavar="TEXT", help="With --truth: name of the model, which the file and reports show.")
+@click.option(
+    "--method",
+    metavar="TEXT",
+    help="With --truth: name of the model, which the file and reports show.",
+)
 @click.option("--out", required=True, type=PATH, metavar="FILE", help="Results file to write.")
-def results(file: Path, truth: Path | None, out: Path, threshold: float, method: str | None, **release: Any) -> None:
+def results(
+    file: Path, truth: Path | None, out: Path, threshold: float, method: str | None, **release: Any
+) -> None:
     """Make a results file of what a model of another framework predicts.
 
     With DATAROOT, FILE has detections of a nuScenes export of that release: the JSON of a detector, as the nuScenes
@@ -38,7 +46,9 @@ def results(file: Path, truth: Path | None, out: Path, threshold: float, method:
     `deepaccident evaluate warning` take what this writes.
     """
     if (truth is None) == (release["dataroot"] is None):
-        raise click.UsageError("give DATAROOT for detections of a nuScenes export, or --truth for answers to questions")
+        raise click.UsageError(
+            "give DATAROOT for detections of a nuScenes export, or --truth for answers to questions"
+        )
     if truth is None:
         refuse_unused("without --truth", "threshold", "method")
         _of_detections(file, out, release)
@@ -57,9 +67,13 @@ def _of_detections(file: Path, out: Path, release: dict[str, Any]) -> None:
     with ResultsWriter(out, "detection", meta=found.meta) as writer:
         for token, boxes in found.boxes.items():
             writer.add(token, boxes)
-    click.echo(f"{out}: {sum(map(len, found.boxes.values())):,} boxes of {counted(len(found.boxes), 'sample')}")
+    click.echo(
+        f"{out}: {sum(map(len, found.boxes.values())):,} boxes of {counted(len(found.boxes), 'sample')}"
+    )
     for name, count in found.left_out.items():
-        click.echo(f"left out: {count:,} boxes of the class {name}, which DeepAccident does not have")
+        click.echo(
+            f"left out: {count:,} boxes of the class {name}, which DeepAccident does not have"
+        )
 
 
 def _of_answers(file: Path, truth: Path, out: Path, threshold: float, meta: dict[str, str]) -> None:

@@ -5,15 +5,28 @@ from typing import Any
 
 import click
 
-from deepaccident_devkit.cli.options import PATH, json_parameter, refuse_unused, release_parameters, where_parameter
+from deepaccident_devkit.cli.options import (
+    PATH,
+    json_parameter,
+    refuse_unused,
+    release_parameters,
+    where_parameter,
+)
 from deepaccident_devkit.cli.verbs import verb
 from deepaccident_devkit.deepaccident import DeepAccident
-from deepaccident_devkit.selection.splits import OFFICIAL_SEED, official_split, save_selection, split_report
+from deepaccident_devkit.selection.splits import (
+    OFFICIAL_SEED,
+    official_split,
+    save_selection,
+    split_report,
+)
 
 
 @verb()
 @release_parameters
-@click.option("--seed", default=OFFICIAL_SEED, show_default=True, help="Seed of the official procedure.")
+@click.option(
+    "--seed", default=OFFICIAL_SEED, show_default=True, help="Seed of the official procedure."
+)
 @click.option(
     "--out",
     type=PATH,
@@ -37,7 +50,9 @@ def split(
     """
     save = out if out is not None and out.suffix == ".txt" else None
     if where and out and not save:
-        raise click.UsageError(f"--where chooses scenarios for a split file; give --out FILE.txt, found {out}")
+        raise click.UsageError(
+            f"--where chooses scenarios for a split file; give --out FILE.txt, found {out}"
+        )
     if where or save:
         refuse_unused("with --where or a split file: it is for the official split", "seed")
     if not out:

@@ -5,7 +5,12 @@ from typing import Any
 
 import click
 
-from deepaccident_devkit.cli.options import engine_of, json_parameter, release_parameters, where_parameter
+from deepaccident_devkit.cli.options import (
+    engine_of,
+    json_parameter,
+    release_parameters,
+    where_parameter,
+)
 from deepaccident_devkit.cli.verbs import verb
 from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.errors import NotAvailableError
@@ -17,7 +22,9 @@ from deepaccident_devkit.support.text import counted
 @verb("town-maps", short_help="Write the roads and sidewalks of each town as GeoJSON.")
 @release_parameters
 @where_parameter
-@click.option("--out", required=True, type=click.Path(), metavar="FOLDER", help="Folder to write into.")
+@click.option(
+    "--out", required=True, type=click.Path(), metavar="FOLDER", help="Folder to write into."
+)
 @json_parameter
 def town_maps(where: tuple[str, ...], out: str, as_json: bool, **release: Any) -> None:
     """Write a file FOLDER/TOWN.geojson for each town of the release in DATAROOT.
@@ -28,7 +35,9 @@ def town_maps(where: tuple[str, ...], out: str, as_json: bool, **release: Any) -
     folder, dataset = writable_folder(out), DeepAccident(**release)
     chosen = dataset.find(*where) if where else None
     if chosen == []:
-        raise click.UsageError("no scenario matches --where, so there is no map; change it or omit it")
+        raise click.UsageError(
+            "no scenario matches --where, so there is no map; change it or omit it"
+        )
     written: dict[str, dict[str, Any]] = {}
     for town in towns_of(dataset, chosen):
         try:
@@ -37,12 +46,16 @@ def town_maps(where: tuple[str, ...], out: str, as_json: bool, **release: Any) -
             click.echo(f"left out: {error}", err=True)
             continue
         path = made.to_geojson(folder / f"{made.town}.geojson")
-        counts = {name: getattr(made, name) for name in ("scenarios", "looks", "missing", "damaged")}
+        counts = {
+            name: getattr(made, name) for name in ("scenarios", "looks", "missing", "damaged")
+        }
         area = round(float(made.drivable().sum()) * made.resolution**2, 1)
         written[made.town] = {"path": str(path), **counts, "drivable_square_metres": area}
     if not written:
         raise NotAvailableError("no town has a map: there is no readable file of a BEV camera")
-    click.echo(json.dumps(written, indent=2) if as_json else "\n".join(map(_town_line, written.values())))
+    click.echo(
+        json.dumps(written, indent=2) if as_json else "\n".join(map(_town_line, written.values()))
+    )
 
 
 def _town_line(told: dict[str, Any]) -> str:

@@ -34,9 +34,17 @@ from deepaccident_devkit.validation import release_completeness, validate_releas
     help="Only list folders: how many scenarios are whole, and how many files of each split, agent and sensor are "
     "missing.",
 )
-@click.option("--deep", is_flag=True, help="Also decode each image and array, and compare them with the labels.")
 @click.option(
-    "--scenario", "scenarios", multiple=True, metavar="TOKEN", help="Only this scenario; you can repeat this option."
+    "--deep",
+    is_flag=True,
+    help="Also decode each image and array, and compare them with the labels.",
+)
+@click.option(
+    "--scenario",
+    "scenarios",
+    multiple=True,
+    metavar="TOKEN",
+    help="Only this scenario; you can repeat this option.",
 )
 @click.option(
     "--all",
@@ -46,7 +54,12 @@ from deepaccident_devkit.validation import release_completeness, validate_releas
 )
 @json_parameter
 def validate(
-    dataroot: Dataroot, scenarios: tuple[str, ...], files: bool, whole: bool, as_json: bool, **how: Any
+    dataroot: Dataroot,
+    scenarios: tuple[str, ...],
+    files: bool,
+    whole: bool,
+    as_json: bool,
+    **how: Any,
 ) -> None:
     """Print what is wrong, unusual or missing in the release in DATAROOT, worst scenario first.
 

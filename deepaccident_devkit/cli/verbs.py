@@ -68,12 +68,16 @@ class LazyVerbs(click.Group):
         try:
             return found.load()
         except Exception as error:
-            raise MissingPluginError(f"{cmd_name}: its plug-in fails with {type(error).__name__}: {error}") from error
+            raise MissingPluginError(
+                f"{cmd_name}: its plug-in fails with {type(error).__name__}: {error}"
+            ) from error
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:  # noqa: ARG002 - click's signature
         """Write the list of verbs, and which plug-ins were left out."""
         with formatter.section("Commands"):
-            formatter.write_dl([(name, verb.summary) for name, verb in sorted(self._all_verbs().items())])
+            formatter.write_dl(
+                [(name, verb.summary) for name, verb in sorted(self._all_verbs().items())]
+            )
         if refusals := self._offers().refusals_text():
             formatter.write_paragraph()
             formatter.write_text(refusals)
@@ -107,7 +111,9 @@ class Verb(click.Command):
         """Write the options, and then the advanced ones."""
         options = [each for each in self.get_params(ctx) if isinstance(each, click.Option)]
         for heading, kind in (("Options", False), ("Advanced", True)):
-            records = (each.get_help_record(ctx) for each in options if isinstance(each, Advanced) is kind)
+            records = (
+                each.get_help_record(ctx) for each in options if isinstance(each, Advanced) is kind
+            )
             if rows := [record for record in records if record is not None]:
                 with formatter.section(heading):
                     formatter.write_dl(rows)
@@ -136,7 +142,9 @@ def together(*parameters: Callable[[Any], Any]) -> Callable[[Function], Function
 class WordChoice(_Choice):
     """One of some words in any case of letters; the error of another one names the word that was probably meant."""
 
-    def __init__(self, words: Iterable[str], elsewhere: Mapping[str, str] = MappingProxyType({})) -> None:
+    def __init__(
+        self, words: Iterable[str], elsewhere: Mapping[str, str] = MappingProxyType({})
+    ) -> None:
         """Take the words, and what to say of words that mean something in another place."""
         super().__init__(tuple(words), case_sensitive=False)
         self.elsewhere = elsewhere
@@ -151,7 +159,11 @@ class WordChoice(_Choice):
 
 
 def field_option(
-    config: type[Any], field: str, *names: str, option: Callable[..., Any] = click.option, **changes: Any
+    config: type[Any],
+    field: str,
+    *names: str,
+    option: Callable[..., Any] = click.option,
+    **changes: Any,
 ) -> Callable[[Function], Function]:
     """An option for a field of a dataclass, so that nothing is said twice.
 
@@ -161,7 +173,11 @@ def field_option(
     default = changes.get("default", config.__dataclass_fields__[field].default)
     hint = get_type_hints(config)[field]
     hints = [each for each in get_args(hint) or (hint,) if each is not NoneType]
-    words = hint if get_origin(hint) is Literal else next((each for each in hints if get_origin(each) is Literal), None)
+    words = (
+        hint
+        if get_origin(hint) is Literal
+        else next((each for each in hints if get_origin(each) is Literal), None)
+    )
     name = field.replace("_", "-")
     settings: dict[str, Any] = {"default": default, "help": field_text(config, field)}
     if words is not None:

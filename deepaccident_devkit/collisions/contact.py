@@ -15,9 +15,22 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from deepaccident_devkit.collisions.replay import BrakingPlans, Motion, ReplayStates, braking_plans, motion_of, replay
+from deepaccident_devkit.collisions.replay import (
+    BrakingPlans,
+    Motion,
+    ReplayStates,
+    braking_plans,
+    motion_of,
+    replay,
+)
 from deepaccident_devkit.geometry.box_arrays import gaps_of_pairs
-from deepaccident_devkit.support.arrays import BoolArray, FloatArray, FrozenArrays, IntArray, checked
+from deepaccident_devkit.support.arrays import (
+    BoolArray,
+    FloatArray,
+    FrozenArrays,
+    IntArray,
+    checked,
+)
 
 # Seconds of the longest intervals.
 _COARSE: Final = 0.32
@@ -71,13 +84,20 @@ def pair_of(paths: ArrayLike, sizes: ArrayLike, *, margin: float | None = None) 
     flat = checked("sizes", np.asarray(sizes)[:, :2], (2, 2))
     first, second = (motion_of(path) for path in both)
     if margin is None:
-        last = [np.concatenate([path[-1, :2], size, path[-1, 2:]]) for path, size in zip(both, flat, strict=True)]
+        last = [
+            np.concatenate([path[-1, :2], size, path[-1, 2:]])
+            for path, size in zip(both, flat, strict=True)
+        ]
         margin = float(gaps_of_pairs(last[0], last[1])) + TOUCHING
     return Pair(motions=(first, second), sizes=flat, margin=margin)
 
 
 def contact_times(
-    pair: Pair, starts: ArrayLike, decelerations: ArrayLike, *, window: tuple[float, float] | None = None
+    pair: Pair,
+    starts: ArrayLike,
+    decelerations: ArrayLike,
+    *,
+    window: tuple[float, float] | None = None,
 ) -> FloatArray:
     """(N,) seconds at which replays of a pair first touch; inf for those that never do.
 
@@ -89,10 +109,16 @@ def contact_times(
 
 
 def contact_made(
-    pair: Pair, starts: ArrayLike, decelerations: ArrayLike, *, window: tuple[float, float] | None = None
+    pair: Pair,
+    starts: ArrayLike,
+    decelerations: ArrayLike,
+    *,
+    window: tuple[float, float] | None = None,
 ) -> BoolArray:
     """(N,) whether replays of a pair touch at all: faster than `contact_times`, whose arguments and errors it has."""
-    found = _search(pair, _plans(pair, starts, decelerations), window or _whole(pair), earliest=False)
+    found = _search(
+        pair, _plans(pair, starts, decelerations), window or _whole(pair), earliest=False
+    )
     return np.isfinite(found)
 
 
@@ -112,9 +138,14 @@ def _whole(pair: Pair) -> tuple[float, float]:
     return 0.0, float(pair.motions[0].times[-1])
 
 
-def _plans(pair: Pair, starts: ArrayLike, decelerations: ArrayLike) -> tuple[BrakingPlans, BrakingPlans]:
+def _plans(
+    pair: Pair, starts: ArrayLike, decelerations: ArrayLike
+) -> tuple[BrakingPlans, BrakingPlans]:
     begun = checked("starts", starts, (None, 2))
-    first, second = (braking_plans(motion, begun[:, each], decelerations) for each, motion in enumerate(pair.motions))
+    first, second = (
+        braking_plans(motion, begun[:, each], decelerations)
+        for each, motion in enumerate(pair.motions)
+    )
     return first, second
 
 
@@ -150,7 +181,8 @@ class _Gaps:
     def at(self, rows: IntArray, times: FloatArray, step: float) -> FloatArray:
         """(8, N) marks; the gap is a lower bound where the two are farther apart than they drive in a step."""
         one, two = (
-            replay(motion, plan, rows, times) for motion, plan in zip(self._pair.motions, self._plans, strict=True)
+            replay(motion, plan, rows, times)
+            for motion, plan in zip(self._pair.motions, self._plans, strict=True)
         )
         turn = self._reaches[0] * one.turned + self._reaches[1] * two.turned
         x, y = (one.poses - two.poses)[:, :2].T
@@ -160,7 +192,9 @@ class _Gaps:
         gap[near] = gaps_of_pairs(*outlines)
         stretch = one.stretches * len(self._pair.motions[1].times) + two.stretches
         way = one.arcs + two.arcs + turn
-        return np.stack([times, gap - self._pair.margin, way, turn, x, y, one.speeds + two.speeds, stretch])
+        return np.stack(
+            [times, gap - self._pair.margin, way, turn, x, y, one.speeds + two.speeds, stretch]
+        )
 
     def _outlines(self, states: ReplayStates, which: int, rows: IntArray) -> FloatArray:
         poses = states.poses[rows]
@@ -169,7 +203,11 @@ class _Gaps:
 
 
 def _search(
-    pair: Pair, plans: tuple[BrakingPlans, BrakingPlans], window: tuple[float, float], *, earliest: bool
+    pair: Pair,
+    plans: tuple[BrakingPlans, BrakingPlans],
+    window: tuple[float, float],
+    *,
+    earliest: bool,
 ) -> FloatArray:
     """(N,) times of contact, inf for none: the first ones, or any (`earliest` false).
 
@@ -217,7 +255,9 @@ def _contact_possible(ends: FloatArray) -> BoolArray:
     change = np.abs(end - begin)
     apart = np.hypot(change[_Mark.X], change[_Mark.Y])
     relative = apart + change[_Mark.TURN] + change[_Mark.SPEED] * change[_Mark.TIME] / 2
-    most = np.where(change[_Mark.STRETCH] == 0, np.minimum(relative, change[_Mark.WAY]), change[_Mark.WAY])
+    most = np.where(
+        change[_Mark.STRETCH] == 0, np.minimum(relative, change[_Mark.WAY]), change[_Mark.WAY]
+    )
     return np.asarray(begin[_Mark.GAP] + end[_Mark.GAP] <= most)
 
 
@@ -226,12 +266,15 @@ def _nodes(pair: Pair, window: tuple[float, float]) -> FloatArray:
     since, until = window
     bounds = [since, *([pair.duration] if since < pair.duration < until else []), until]
     parts = [
-        np.linspace(start, end, max(1, int(np.ceil((end - start) / _COARSE))) + 1) for start, end in pairwise(bounds)
+        np.linspace(start, end, max(1, int(np.ceil((end - start) / _COARSE))) + 1)
+        for start, end in pairwise(bounds)
     ]
     return np.unique(np.concatenate(parts))
 
 
-def _first_intervals(gaps: _Gaps, nodes: FloatArray, begun: FloatArray) -> tuple[IntArray, FloatArray]:
+def _first_intervals(
+    gaps: _Gaps, nodes: FloatArray, begun: FloatArray
+) -> tuple[IntArray, FloatArray]:
     """The intervals between nodes that end after `begun`: replays (M,), and marks (2, 8, M) at both ends."""
     marks = np.full((len(_Mark), len(begun), len(nodes)), np.nan)
     rows, numbers = np.nonzero(np.append(nodes[1:], np.inf) > begun[:, None])

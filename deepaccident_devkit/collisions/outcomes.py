@@ -13,7 +13,13 @@ from numpy.typing import ArrayLike
 from deepaccident_devkit.collisions.contact import Pair, contact_times, impacts, pair_of
 from deepaccident_devkit.collisions.recorded import MASS_UNCERTAINTY, Accident
 from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.support.arrays import BoolArray, FloatArray, FrozenArrays, IntArray, checked
+from deepaccident_devkit.support.arrays import (
+    BoolArray,
+    FloatArray,
+    FrozenArrays,
+    IntArray,
+    checked,
+)
 
 OUTCOMES: Final = ("avoided", "stopped", "mitigated", "unchanged", "worsened")
 """What can become of an accident; their positions are the codes of `Outcomes.outcome`."""
@@ -113,8 +119,12 @@ def delta_v_ranges(masses: ArrayLike, relative_speeds: ArrayLike) -> FloatArray:
     both = checked("masses", masses, (2,))
     ends = []
     for sign in (1, -1):  # a heavier actor changes its speed less
-        first = delta_v_of(both * [1 + sign * MASS_UNCERTAINTY, 1 - sign * MASS_UNCERTAINTY], relative_speeds)
-        second = delta_v_of(both * [1 - sign * MASS_UNCERTAINTY, 1 + sign * MASS_UNCERTAINTY], relative_speeds)
+        first = delta_v_of(
+            both * [1 + sign * MASS_UNCERTAINTY, 1 - sign * MASS_UNCERTAINTY], relative_speeds
+        )
+        second = delta_v_of(
+            both * [1 - sign * MASS_UNCERTAINTY, 1 + sign * MASS_UNCERTAINTY], relative_speeds
+        )
         ends.append(np.stack([first[..., 0], second[..., 1]], axis=-1))
     return np.stack(ends, axis=-1)
 
@@ -161,7 +171,9 @@ def outcomes_of(
         GeometryError: the warning times have another shape.
     """
     pair = pair_of(accident.paths, accident.sizes)
-    starts, hard = _brakings_begun(pair, checked("warning_times", warning_times, (None,)) + latency, brakings)
+    starts, hard = _brakings_begun(
+        pair, checked("warning_times", warning_times, (None,)) + latency, brakings
+    )
     distinct, places = _distinct(starts, hard)
     begun = np.where(brakers, distinct[:, :1], np.inf)
     times = contact_times(pair, begun, distinct[:, 1])
@@ -193,7 +205,9 @@ def _distinct(starts: FloatArray, decelerations: FloatArray) -> tuple[FloatArray
     """(N, 2) different starts and decelerations, the last one without braking; where those of W × K are among them."""
     hard = np.where(np.isinf(starts), 1.0, decelerations)
     asked = np.stack([starts.ravel(), hard.ravel()], axis=1)
-    distinct, places = np.unique(np.concatenate([asked, [[np.inf, 1.0]]]), axis=0, return_inverse=True)
+    distinct, places = np.unique(
+        np.concatenate([asked, [[np.inf, 1.0]]]), axis=0, return_inverse=True
+    )
     return distinct, places.ravel()[:-1].reshape(starts.shape)
 
 

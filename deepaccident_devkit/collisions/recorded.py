@@ -14,7 +14,13 @@ from numpy.typing import ArrayLike
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ConfigError, NotAvailableError
 from deepaccident_devkit.geometry.box_arrays import signed_gaps
-from deepaccident_devkit.support.arrays import FloatArray, FrozenArrays, IntArray, ShortRepr, checked
+from deepaccident_devkit.support.arrays import (
+    FloatArray,
+    FrozenArrays,
+    IntArray,
+    ShortRepr,
+    checked,
+)
 from deepaccident_devkit.support.parallel import Places, in_order, run_unordered
 from deepaccident_devkit.support.reports import Row
 from deepaccident_devkit.tables.tables import rows_of_scenarios
@@ -30,7 +36,14 @@ if TYPE_CHECKING:
     from deepaccident_devkit.tables.records import ScenarioRecord
 
 CLASS_MASSES: Final[Mapping[str, float]] = MappingProxyType(
-    {"car": 1500.0, "truck": 9000.0, "van": 2400.0, "cyclist": 95.0, "motorcycle": 280.0, "pedestrian": 75.0}
+    {
+        "car": 1500.0,
+        "truck": 9000.0,
+        "van": 2400.0,
+        "cyclist": 95.0,
+        "motorcycle": 280.0,
+        "pedestrian": 75.0,
+    }
 )
 """Kilograms of a road user of its class's median size, with load or rider: an assumption of this devkit."""
 MASS_UNCERTAINTY: Final = 0.3
@@ -50,7 +63,9 @@ _FEWEST: Final = 2
 _LEAST, _MOST = 0.5, 2.0
 
 
-def masses_of(categories: ArrayLike, sizes: ArrayLike, class_masses: Mapping[str, float] = CLASS_MASSES) -> FloatArray:
+def masses_of(
+    categories: ArrayLike, sizes: ArrayLike, class_masses: Mapping[str, float] = CLASS_MASSES
+) -> FloatArray:
     """The assumed masses (N,) of road users in kilograms: their class's, times their volume over the class's median.
 
     The factor is kept between 0.5 and 2.
@@ -74,7 +89,9 @@ def masses_of(categories: ArrayLike, sizes: ArrayLike, class_masses: Mapping[str
 def _masses_in_order(class_masses: Mapping[str, float]) -> Sequence[float]:
     missing = [name for name in CATEGORIES if not class_masses.get(name, 0) > 0]
     if missing:
-        raise ConfigError(f"class_masses: expected kilograms above 0 for each class; {', '.join(missing)} has none")
+        raise ConfigError(
+            f"class_masses: expected kilograms above 0 for each class; {', '.join(missing)} has none"
+        )
     return [float(class_masses[name]) for name in CATEGORIES]
 
 
@@ -123,7 +140,9 @@ class Accident(FrozenArrays):
     def touching(self) -> float | None:
         """Seconds from the frame at which the outlines begin to touch (as `Contact.contact_frame`) to the last one."""
         flat = np.broadcast_to(self.sizes[:, None, :2], (*self.paths.shape[:2], 2))
-        begin = contact_begin(signed_gaps(*np.concatenate([self.paths[..., :2], flat, self.paths[..., 2:]], axis=2)))
+        begin = contact_begin(
+            signed_gaps(*np.concatenate([self.paths[..., :2], flat, self.paths[..., 2:]], axis=2))
+        )
         return None if begin is None else round((self.paths.shape[1] - 1 - begin) * FRAME_PERIOD, 1)
 
 
@@ -132,9 +151,7 @@ def counted_text(touching: Sequence[float | None]) -> str:
     early = [seconds for seconds in touching if seconds]
     text = "seconds count to the last frame; the impact is at most 0.1 s after it"
     if early:
-        text += (
-            f", or before it where outlines touch: {len(early)} of {len(touching)} accidents, up to {max(early):.1f} s"
-        )
+        text += f", or before it where outlines touch: {len(early)} of {len(touching)} accidents, up to {max(early):.1f} s"
     return text
 
 
@@ -174,7 +191,9 @@ def accident_of(
     first, second = named
     tracks = scenario_tracks(dataset, token)
     if not len(tracks.index):
-        raise NotAvailableError(f"{token} has no labels (the test split ships without), which say where actors are")
+        raise NotAvailableError(
+            f"{token} has no labels (the test split ships without), which say where actors are"
+        )
     rows = [np.flatnonzero(tracks.actor_id == actor) for actor in (first, second)]
     common, _ = labelled_together(tracks, token, named)
     if len(common) < _FEWEST:
@@ -210,7 +229,10 @@ def accidents_of(
     Raises:
         TokenError: no such scenario.
     """
-    found = [tried(accident_of, dataset, dataset.scenario[row]) for row in rows_of_scenarios(dataset, scenarios)]
+    found = [
+        tried(accident_of, dataset, dataset.scenario[row])
+        for row in rows_of_scenarios(dataset, scenarios)
+    ]
     return [*those_of(Accident, found)], [*those_of(Skipped, found)]
 
 
@@ -270,7 +292,9 @@ def each_scenario(
     rows = sorted(set(rows_of_scenarios(dataset, scenarios)))
     runs = [rows[first : first + at_once] for first in range(0, len(rows), at_once)]
     sizes, places = [len(run) for run in runs], Places(reads=dataset.places)
-    parts = run_unordered(partial(_run, work, dataset), runs, sizes=sizes, places=places, label=label, **how)
+    parts = run_unordered(
+        partial(_run, work, dataset), runs, sizes=sizes, places=places, label=label, **how
+    )
     return [each for part in in_order(parts) for each in part]
 
 

@@ -14,7 +14,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from deepaccident_devkit.errors import GeometryError
-from deepaccident_devkit.support.arrays import BoolArray, FloatArray, FrozenArrays, IntArray, checked
+from deepaccident_devkit.support.arrays import (
+    BoolArray,
+    FloatArray,
+    FrozenArrays,
+    IntArray,
+    checked,
+)
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
 HORIZON: Final = 3.0
@@ -160,7 +166,9 @@ def braking_plans(motion: Motion, starts: ArrayLike, decelerations: ArrayLike) -
     return BrakingPlans(
         starts=np.where(brakes, at, np.inf),
         decelerations=hard,
-        arcs=np.where(brakes, motion.arcs[stretches] + speeds * (at - motion.times[stretches]), np.inf),
+        arcs=np.where(
+            brakes, motion.arcs[stretches] + speeds * (at - motion.times[stretches]), np.inf
+        ),
         speeds=np.where(brakes, speeds, 0.0),
     )
 
@@ -183,7 +191,9 @@ def replay(motion: Motion, plans: BrakingPlans, rows: IntArray, times: FloatArra
     return ReplayStates(poses=poses, speeds=speeds, arcs=arcs, turned=turned, stretches=stretches)
 
 
-def _braked(plans: BrakingPlans, times: FloatArray, arcs: FloatArray) -> tuple[BoolArray, FloatArray, FloatArray]:
+def _braked(
+    plans: BrakingPlans, times: FloatArray, arcs: FloatArray
+) -> tuple[BoolArray, FloatArray, FloatArray]:
     """Which replays are behind the recording's arc lengths; of these, the arc lengths and speeds."""
     braking = np.minimum(times - plans.starts, plans.speeds / plans.decelerations)
     lost = plans.decelerations * braking
@@ -199,5 +209,7 @@ def _places(motion: Motion, arcs: FloatArray) -> tuple[IntArray, FloatArray]:
     """
     numbers = np.searchsorted(motion.arcs, arcs, side="right") - 1
     lengths = motion.lengths[numbers]
-    shares = np.divide(arcs - motion.arcs[numbers], lengths, out=np.zeros_like(arcs), where=lengths > 0)
+    shares = np.divide(
+        arcs - motion.arcs[numbers], lengths, out=np.zeros_like(arcs), where=lengths > 0
+    )
     return numbers, shares

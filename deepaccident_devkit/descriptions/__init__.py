@@ -1,13 +1,23 @@
 """What happens in a scenario, in words: facts, sentences, who observed whom, and when it was too late to brake."""
 
-from deepaccident_devkit.descriptions.avoidability import Avoidability, avoidability, avoidability_of
+from deepaccident_devkit.descriptions.avoidability import (
+    Avoidability,
+    avoidability,
+    avoidability_of,
+)
 from deepaccident_devkit.descriptions.observation import (
     ObservationRule,
     coalition_leads,
     observed_actors,
     shapley_values,
 )
-from deepaccident_devkit.descriptions.stories import Story, describe, scenario_facts, stories, story_text
+from deepaccident_devkit.descriptions.stories import (
+    Story,
+    describe,
+    scenario_facts,
+    stories,
+    story_text,
+)
 
 __all__ = [
     "Avoidability",

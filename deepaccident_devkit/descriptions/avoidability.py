@@ -27,7 +27,15 @@ from deepaccident_devkit.collisions.recorded import Accident, accident_of, recor
 from deepaccident_devkit.collisions.replay import HORIZON
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import NotAvailableError
-from deepaccident_devkit.support.arrays import BoolArray, FloatArray, FrozenArrays, IntArray, as_floats, checked, known
+from deepaccident_devkit.support.arrays import (
+    BoolArray,
+    FloatArray,
+    FrozenArrays,
+    IntArray,
+    as_floats,
+    checked,
+    known,
+)
 from deepaccident_devkit.taxonomy import CATEGORIES, FRAME_PERIOD
 from deepaccident_devkit.v2x.tracks import ScenarioTracks, scenario_tracks
 
@@ -132,10 +140,19 @@ class Avoidability(FrozenArrays):
             warnings: whether to give what each warning changes, some thousand values.
         """
         accident = self.accident
-        actors = zip(accident.actor_ids, accident.categories, accident.agents, accident.masses.tolist(), strict=True)
+        actors = zip(
+            accident.actor_ids,
+            accident.categories,
+            accident.agents,
+            accident.masses.tolist(),
+            strict=True,
+        )
         result: dict[str, Any] = {
             "scenario": accident.scenario,
-            "actors": [dict(zip(("actor_id", "category", "agent", "mass"), each, strict=True)) for each in actors],
+            "actors": [
+                dict(zip(("actor_id", "category", "agent", "mass"), each, strict=True))
+                for each in actors
+            ],
             "duration": round(accident.duration, 1),
             "head_on": self.head_on,
             "pedestrian": self.pedestrian,
@@ -150,7 +167,9 @@ class Avoidability(FrozenArrays):
     def last_moment_rows(self) -> Iterator[dict[str, Any]]:
         """For each of `BRAKERS` and each deceleration the last moment to brake, and what comes with it."""
         moments = self.last_moments
-        for row, (brakers, deceleration) in enumerate(product(BRAKERS, self.decelerations.tolist())):
+        for row, (brakers, deceleration) in enumerate(
+            product(BRAKERS, self.decelerations.tolist())
+        ):
             yield {
                 "brakers": brakers,
                 "deceleration": deceleration,
@@ -234,7 +253,10 @@ def unusable(accident: Accident, check: ReplayCheck) -> str:
 
 
 def avoidability_of(
-    accident: Accident, tracks: ScenarioTracks | None = None, *, brakings: Sequence[Braking] = BRAKINGS
+    accident: Accident,
+    tracks: ScenarioTracks | None = None,
+    *,
+    brakings: Sequence[Braking] = BRAKINGS,
 ) -> Avoidability:
     """When an accident could have been avoided by braking.
 
@@ -254,11 +276,15 @@ def avoidability_of(
     decelerations = np.unique([each.deceleration for each in brakings])
     scans = [last_moments(pair, brakers, decelerations) for brakers in MASKS]
     moments = LastMoments(
-        **{name: np.concatenate([getattr(each, name) for each in scans]) for name in LastMoments.__slots__}
+        **{
+            name: np.concatenate([getattr(each, name) for each in scans])
+            for name in LastMoments.__slots__
+        }
     )
     leads = as_floats(np.arange(accident.paths.shape[1]) * FRAME_PERIOD)
     first, second, both = (
-        outcomes_of(accident, brakers, accident.duration - leads, brakings=brakings) for brakers in MASKS
+        outcomes_of(accident, brakers, accident.duration - leads, brakings=brakings)
+        for brakers in MASKS
     )
     return Avoidability(
         accident=accident,
@@ -288,7 +314,9 @@ def avoidability(
     """
     accident = accident_of(dataset, scenario)
     return (
-        None if accident is None else avoidability_of(accident, scenario_tracks(dataset, scenario), brakings=brakings)
+        None
+        if accident is None
+        else avoidability_of(accident, scenario_tracks(dataset, scenario), brakings=brakings)
     )
 
 
@@ -385,5 +413,7 @@ def _may_meet(path: FloatArray, size: FloatArray, other: _Other) -> bool:
 
 def _positions(path: FloatArray) -> FloatArray:
     """Positions at each frame of the recording and of its continuation."""
-    onward = np.arange(1, round(HORIZON / FRAME_PERIOD) + 1)[:, None] * (path[-1, :2] - path[-2, :2])
+    onward = np.arange(1, round(HORIZON / FRAME_PERIOD) + 1)[:, None] * (
+        path[-1, :2] - path[-2, :2]
+    )
     return np.concatenate([path[:, :2], path[-1, :2] + onward])

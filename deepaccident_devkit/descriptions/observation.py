@@ -17,7 +17,13 @@ from numpy.typing import ArrayLike
 
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ConfigError, GeometryError
-from deepaccident_devkit.support.arrays import BoolArray, FloatArray, IntArray, as_numbers, checked_whole
+from deepaccident_devkit.support.arrays import (
+    BoolArray,
+    FloatArray,
+    IntArray,
+    as_numbers,
+    checked_whole,
+)
 from deepaccident_devkit.support.text import settle_choices
 from deepaccident_devkit.tables import visible_mask
 from deepaccident_devkit.taxonomy import AGENTS, FRAME_PERIOD, INFRASTRUCTURE, AgentName
@@ -57,7 +63,10 @@ class ObservationRule:
 
 
 def observed_actors(
-    dataset: Dataset, scenario: RowArgument, actor_ids: Sequence[int], rule: ObservationRule | None = None
+    dataset: Dataset,
+    scenario: RowArgument,
+    actor_ids: Sequence[int],
+    rule: ObservationRule | None = None,
 ) -> tuple[tuple[AgentName, ...], BoolArray]:
     """Whether each agent observes some actors at each frame of a scenario.
 
@@ -85,7 +94,9 @@ def observed_actors(
     which, position = _boxes_of(dataset, boxes, actor_ids)
     at = annotations["sample_row"][boxes][which] - of_scenario.start
     seen = by_rule(dataset, boxes, which, codes[at] == AGENTS.index(INFRASTRUCTURE), rule)
-    frame = (samples["frame_row"][of_scenario] - dataset.columns("scenario")["first_frame_row"][row])[at]
+    frame = (
+        samples["frame_row"][of_scenario] - dataset.columns("scenario")["first_frame_row"][row]
+    )[at]
     observed[there.searchsorted(codes[at[seen]]), position[seen], frame[seen]] = True
     observed[_themselves(dataset, row, there, actor_ids)] = True
     return tuple(AGENTS[code] for code in there.tolist()), observed
@@ -153,11 +164,16 @@ def shapley_values(leads: ArrayLike) -> FloatArray:
     count = values.shape[-1] if values.ndim else 0
     partners = count.bit_length() - 1
     if count != 1 << max(partners, 0):
-        raise GeometryError(f"leads: expected one for each of 2^n coalitions, found shape {values.shape}")
+        raise GeometryError(
+            f"leads: expected one for each of 2^n coalitions, found shape {values.shape}"
+        )
     members = coalition_members(partners)
     sizes = members.sum(axis=1)
     weights = np.array(
-        [factorial(size) * factorial(partners - size - 1) / factorial(partners) for size in range(partners)]
+        [
+            factorial(size) * factorial(partners - size - 1) / factorial(partners)
+            for size in range(partners)
+        ]
     )
     result = np.zeros((*values.shape[:-1], partners))
     for partner in range(partners):
@@ -173,7 +189,9 @@ def _rows_of(keys: IntArray, first: int, end: int) -> slice:
     return slice(*np.searchsorted(keys, ends).tolist())
 
 
-def _boxes_of(dataset: Dataset, boxes: slice, actor_ids: Sequence[int]) -> tuple[IntArray, IntArray]:
+def _boxes_of(
+    dataset: Dataset, boxes: slice, actor_ids: Sequence[int]
+) -> tuple[IntArray, IntArray]:
     """Which of a scenario's annotations are of some actors, and each one's position among the actors."""
     instance = dataset.columns("annotation")["instance_row"][boxes]
     tracked = np.flatnonzero(instance >= 0)
@@ -182,7 +200,9 @@ def _boxes_of(dataset: Dataset, boxes: slice, actor_ids: Sequence[int]) -> tuple
     return tracked[found], position
 
 
-def by_rule(dataset: Dataset, boxes: slice, which: IntArray, by_pole: BoolArray, rule: ObservationRule) -> BoolArray:
+def by_rule(
+    dataset: Dataset, boxes: slice, which: IntArray, by_pole: BoolArray, rule: ObservationRule
+) -> BoolArray:
     """Which of some of a scenario's annotations show an actor that their agent observes."""
     if rule.kind == "annotated":
         return np.ones(len(which), dtype=bool)
@@ -190,12 +210,19 @@ def by_rule(dataset: Dataset, boxes: slice, which: IntArray, by_pole: BoolArray,
     points = columns["num_lidar_pts"][boxes][which]
     if rule.kind == "points":
         return np.asarray(points >= rule.least_points)
-    xy, category, camera = (columns[name][boxes][which] for name in ("translation", "category", "camera_visible"))
-    masks = [visible_mask(xy[:, :2], category, points, camera, infrastructure=pole) for pole in (False, True)]
+    xy, category, camera = (
+        columns[name][boxes][which] for name in ("translation", "category", "camera_visible")
+    )
+    masks = [
+        visible_mask(xy[:, :2], category, points, camera, infrastructure=pole)
+        for pole in (False, True)
+    ]
     return np.where(by_pole, masks[1], masks[0])
 
 
-def _themselves(dataset: Dataset, scenario_row: int, agents: IntArray, actor_ids: Sequence[int]) -> BoolArray:
+def _themselves(
+    dataset: Dataset, scenario_row: int, agents: IntArray, actor_ids: Sequence[int]
+) -> BoolArray:
     """(A, N) which of the actors each agent is; `agents` by their positions in `taxonomy.AGENTS`."""
     columns = dataset.columns("agent")
     rows = _rows_of(columns["scenario_row"], scenario_row, scenario_row + 1)

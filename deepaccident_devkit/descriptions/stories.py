@@ -46,7 +46,11 @@ _AGENTS: Final = {
     "other_vehicle_behind": "the vehicle behind the other one",
     "infrastructure": "the infrastructure",
 }
-_TURN_WORDS: Final = {"straight": "going straight", "left": "turning left", "right": "turning right"}
+_TURN_WORDS: Final = {
+    "straight": "going straight",
+    "left": "turning left",
+    "right": "turning right",
+}
 _SIDES: Final = {
     "front": "at its front",
     "rear": "from behind",
@@ -88,14 +92,14 @@ def _collision(facts: Mapping[str, Any], accident: Mapping[str, Any]) -> str:
     if accident["touching"] != 0 and accident["gap"] is not None:
         details.append(contact_words(accident["touching"], accident["gap"]))
     if accident["apart"]:
-        sentence = (
-            f"meta lets {actors[0]} collide with {actors[1]}, but they are {accident['gap']:.1f} m apart at the end"
-        )
+        sentence = f"meta lets {actors[0]} collide with {actors[1]}, but they are {accident['gap']:.1f} m apart at the end"
         details = details[2:] if accident["touching"] else []
     elif mine == others == "front":
         sentence = f"{actors[0]} collides head-on with {actors[1]}"
     elif others == "front":
-        sentence = " ".join(part for part in (actors[0], "is hit", _SIDES.get(mine), "by", actors[1]) if part)
+        sentence = " ".join(
+            part for part in (actors[0], "is hit", _SIDES.get(mine), "by", actors[1]) if part
+        )
     else:
         sentence = f"{actors[0]} collides with {actors[1]}"
         details.insert(0, f"{mine} side to {others} side" if mine and others else None)
@@ -104,7 +108,9 @@ def _collision(facts: Mapping[str, Any], accident: Mapping[str, Any]) -> str:
 
 def _delta_v(first: Mapping[str, Any], second: Mapping[str, Any]) -> str | None:
     values = [f"{each:.1f}" for each in (first["delta_v"], second["delta_v"]) if each is not None]
-    return f"with a delta-v of {' and '.join(values)} m/s if masses are as assumed" if values else None
+    return (
+        f"with a delta-v of {' and '.join(values)} m/s if masses are as assumed" if values else None
+    )
 
 
 def _with_motion(actor: Mapping[str, Any], *, closes: bool = False) -> str:
@@ -112,7 +118,9 @@ def _with_motion(actor: Mapping[str, Any], *, closes: bool = False) -> str:
     words = actor_words(actor)
     kind = f"a {actor['category']}" if actor["agent"] and actor["category"] else None
     motion = " ".join(
-        part for part in (_TURN_WORDS.get(actor["turn"] or ""), _number(actor["speed"], "at {:.1f} m/s")) if part
+        part
+        for part in (_TURN_WORDS.get(actor["turn"] or ""), _number(actor["speed"], "at {:.1f} m/s"))
+        if part
     )
     more = " ".join(part for part in (kind, motion) if part)
     if not more:
@@ -121,7 +129,9 @@ def _with_motion(actor: Mapping[str, Any], *, closes: bool = False) -> str:
 
 
 def _place(facts: Mapping[str, Any]) -> str | None:
-    lights = {True: "with traffic lights", False: "without traffic lights", None: None}[facts["signalized"]]
+    lights = {True: "with traffic lights", False: "without traffic lights", None: None}[
+        facts["signalized"]
+    ]
     road = facts["road_type"] or ("junction" if lights else None)
     town = f"in {facts['town']}" if facts["town"] else None
     sky = _listed([facts["weather"], facts["time_of_day"]])
@@ -153,7 +163,11 @@ def _avoidance(accident: Mapping[str, Any]) -> str | None:
     how = f"braking at {braking['deceleration']:g} m/s² by {who}"
     if not braking["avoidable"]:
         return f"{how} would not have avoided it at any time"
-    return None if braking["slack"] is None else f"{how} until {braking['slack']:.1f} s before would have avoided it"
+    return (
+        None
+        if braking["slack"] is None
+        else f"{how} until {braking['slack']:.1f} s before would have avoided it"
+    )
 
 
 def _no_accident(facts: Mapping[str, Any]) -> str:
@@ -161,15 +175,27 @@ def _no_accident(facts: Mapping[str, Any]) -> str:
     what, more = {
         None: ("it is not known whether anybody collides", ""),
         False: ("meta names no collision" if overlap else "nobody collides", ""),
-        True: (f"{_partners_text(facts.get('partners')) or 'two'} collide", ", but the labels do not show how"),
+        True: (
+            f"{_partners_text(facts.get('partners')) or 'two'} collide",
+            ", but the labels do not show how",
+        ),
     }[facts["collision"]]
-    return " ".join(part for part in (_place(facts), what, _number(facts["duration"], "in {:.1f} s")) if part) + more
+    return (
+        " ".join(
+            part
+            for part in (_place(facts), what, _number(facts["duration"], "in {:.1f} s"))
+            if part
+        )
+        + more
+    )
 
 
 def _partners_text(partners: Iterable[Mapping[str, Any]] | None) -> str | None:
     """The two that meta names; of one that no label shows, that it is so."""
     unseen = {True: "", False: " that no label shows"}
-    return _listed([actor_words(each) + unseen[each["labelled"]] for each in partners or ()], " and ")
+    return _listed(
+        [actor_words(each) + unseen[each["labelled"]] for each in partners or ()], " and "
+    )
 
 
 def _nearest_text(nearest: Mapping[str, Any] | None) -> str | None:
@@ -253,7 +279,9 @@ def stories(
     Raises:
         TokenError: no such scenario.
     """
-    return those_of(Story, each_scenario(describe, dataset, scenarios, label="stories", at_once=1, **how))
+    return those_of(
+        Story, each_scenario(describe, dataset, scenarios, label="stories", at_once=1, **how)
+    )
 
 
 def scenario_facts(
@@ -270,11 +298,16 @@ def scenario_facts(
     unknown: list[str] = []
     collides = None if record["weather"] is None else record["collision"] is not None
     if collides is None:
-        unknown.append(f"{record['token']} has no meta file, which says whether two collide; unpack meta")
+        unknown.append(
+            f"{record['token']} has no meta file, which says whether two collide; unpack meta"
+        )
     accident = _accident(dataset, record, unknown, replayed) if collides else None
     return {
         "scenario": record["token"],
-        **{name: record[name] for name in ("town", "road_type", "signalized", "weather", "time_of_day")},
+        **{
+            name: record[name]
+            for name in ("town", "road_type", "signalized", "weather", "time_of_day")
+        },
         "duration": round((record["num_frames"] - 1) * FRAME_PERIOD, 1),
         "collision": collides,
         "accident": accident,
@@ -285,7 +318,10 @@ def scenario_facts(
 
 
 def _accident(
-    dataset: Dataset, record: ScenarioRecord, unknown: list[str], replayed: Avoidability | Skipped | None
+    dataset: Dataset,
+    record: ScenarioRecord,
+    unknown: list[str],
+    replayed: Avoidability | Skipped | None,
 ) -> dict[str, Any] | None:
     """Who collides, how, who saw it, and what would have avoided it."""
     try:
@@ -330,7 +366,11 @@ def _partners(dataset: Dataset, record: ScenarioRecord) -> list[dict[str, Any]] 
 
 
 def _collider(
-    record: ScenarioRecord, accident: Accident, contact: Contact, braked: Avoidability | None, which: int
+    record: ScenarioRecord,
+    accident: Accident,
+    contact: Contact,
+    braked: Avoidability | None,
+    which: int,
 ) -> dict[str, Any]:
     agent = accident.agents[which]
     turn = _TURNS.get(agent or "")
@@ -349,7 +389,9 @@ def _seen(dataset: Dataset, accident: Accident) -> dict[str, float]:
     """Agent → seconds before the impact at which it alone first observes both; 0 if it never does."""
     there, observed = observed_actors(dataset, accident.scenario, accident.actor_ids)
     return {
-        agent: round((both.size - 1 - int(np.argmax(both))) * FRAME_PERIOD, 1) if both.any() else 0.0
+        agent: round((both.size - 1 - int(np.argmax(both))) * FRAME_PERIOD, 1)
+        if both.any()
+        else 0.0
         for agent, both in zip(there, observed[:, 0] & observed[:, 1], strict=True)
     }
 
@@ -374,12 +416,17 @@ def _nearest(dataset: Dataset, record: ScenarioRecord, unknown: list[str]) -> di
     overlap = pairs.min_gap == 0
     rows = np.flatnonzero(overlap if overlap.any() else pairs.moving & np.isfinite(pairs.min_ttc))
     if not len(rows):
-        if not any(dataset.get_sample(record["token"], agent, 1)["labelled"] for agent in agents_of(dataset, record)):
+        if not any(
+            dataset.get_sample(record["token"], agent, 1)["labelled"]
+            for agent in agents_of(dataset, record)
+        ):
             unknown.append(f"{record['token']} has no labels, which say where actors are")
         return None
     row = rows[np.argmin(pairs.min_ttc[rows])]
     return {
-        "pair": [_actor(dataset, record["token"], actor) for actor in pairs.actor_ids[row].tolist()],
+        "pair": [
+            _actor(dataset, record["token"], actor) for actor in pairs.actor_ids[row].tolist()
+        ],
         "min_ttc": known(pairs.min_ttc[row], 2),
         "min_gap": known(pairs.min_gap[row], 2),
     }
@@ -387,4 +434,8 @@ def _nearest(dataset: Dataset, record: ScenarioRecord, unknown: list[str]) -> di
 
 def _actor(dataset: Dataset, scenario: str, actor_id: int) -> dict[str, Any]:
     category = dataset.get("instance", f"{scenario}/actor/{actor_id}")["category"]
-    return {"actor_id": actor_id, "category": category, "agent": agents_by_actor(dataset, scenario).get(actor_id)}
+    return {
+        "actor_id": actor_id,
+        "category": category,
+        "agent": agents_by_actor(dataset, scenario).get(actor_id),
+    }

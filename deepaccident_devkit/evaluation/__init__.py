@@ -16,11 +16,25 @@ from deepaccident_devkit.evaluation.accident import (
     box_truth,
     foreseen_accident,
 )
-from deepaccident_devkit.evaluation.breakdowns import Breakdown, SampleAttributes, breakdown, sample_attributes
+from deepaccident_devkit.evaluation.breakdowns import (
+    Breakdown,
+    SampleAttributes,
+    breakdown,
+    sample_attributes,
+)
 from deepaccident_devkit.evaluation.counting import evaluate_samples
-from deepaccident_devkit.evaluation.detection import DetectedBoxes, DetectionEvaluator, DetectionResult, detection_truth
+from deepaccident_devkit.evaluation.detection import (
+    DetectedBoxes,
+    DetectionEvaluator,
+    DetectionResult,
+    detection_truth,
+)
 from deepaccident_devkit.evaluation.evaluator import Evaluator
-from deepaccident_devkit.evaluation.forecasting import Forecast, ForecastingEvaluator, ForecastingResult
+from deepaccident_devkit.evaluation.forecasting import (
+    Forecast,
+    ForecastingEvaluator,
+    ForecastingResult,
+)
 from deepaccident_devkit.evaluation.instances import match_trajectories, vpq_counts
 from deepaccident_devkit.evaluation.intervals import Resampling
 from deepaccident_devkit.evaluation.motion import MotionEvaluator, MotionResult, motion_counts

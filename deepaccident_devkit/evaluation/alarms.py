@@ -35,7 +35,10 @@ _RELEASED_LABELS: Final = MotionLabelConfig()
 
 
 def named_alarms(
-    prediction: MotionOutput | list[Accident], label: MotionLabels | None, truth: BoxTruth, reading: AccidentReading
+    prediction: MotionOutput | list[Accident],
+    label: MotionLabels | None,
+    truth: BoxTruth,
+    reading: AccidentReading,
 ) -> list[NamedAlarm]:
     """The alarms of one sample, the surest first, of equally sure ones the earliest.
 
@@ -51,10 +54,15 @@ def named_alarms(
         reading: how an accident is read off maps.
     """
     if isinstance(prediction, MotionOutput):
-        found = _alarms_of_maps(prediction, label.config if label else _RELEASED_LABELS, truth, reading)
+        found = _alarms_of_maps(
+            prediction, label.config if label else _RELEASED_LABELS, truth, reading
+        )
     else:
         found = [(alarm, _named(alarm, truth)) for alarm in prediction]
-    return sorted((each for each in found if each[0].score >= LEAST_SCORE), key=lambda each: by_sureness(each[0]))
+    return sorted(
+        (each for each in found if each[0].score >= LEAST_SCORE),
+        key=lambda each: by_sureness(each[0]),
+    )
 
 
 def within_horizon(alarms: list[NamedAlarm], truth: BoxTruth) -> list[NamedAlarm]:
@@ -91,7 +99,9 @@ def _named(alarm: Accident, truth: BoxTruth) -> Pair:
     if alarm.ids is not None:
         return alarm.ids
     frame = min(round(alarm.time / FRAME_PERIOD), len(truth.time) - 1)
-    return nearest_two(alarm.positions, truth.actor_id, truth.footprint[frame, :, :2], MATCH_DISTANCE)
+    return nearest_two(
+        alarm.positions, truth.actor_id, truth.footprint[frame, :, :2], MATCH_DISTANCE
+    )
 
 
 def foreseen_accident(
@@ -115,7 +125,9 @@ def foreseen_accident(
         ChoiceError: no such labels.
     """
     labels = choice("labels", labels, (None, *LABEL_PROTOCOLS))
-    read = predicted_accidents(output, None if labels is None else LABEL_PROTOCOLS[labels], AccidentReading())
+    read = predicted_accidents(
+        output, None if labels is None else LABEL_PROTOCOLS[labels], AccidentReading()
+    )
     there = _surest_first(read)
     return _joint(there, len(read), step) if there else None
 
@@ -125,9 +137,13 @@ def _surest_first(read: list[InstanceAccident]) -> list[tuple[InstanceAccident, 
     return [(each, each.contact) for each in (*read[-1:], *read[:-1]) if each.contact is not None]
 
 
-def _joint(there: list[tuple[InstanceAccident, Contact]], predictions: int, step: float) -> Accident:
+def _joint(
+    there: list[tuple[InstanceAccident, Contact]], predictions: int, step: float
+) -> Accident:
     found, contact = there[0]
-    return Accident(positions=found.positions, time=contact.frame * step, score=len(there) / predictions)
+    return Accident(
+        positions=found.positions, time=contact.frame * step, score=len(there) / predictions
+    )
 
 
 def _alarms_of_maps(
@@ -140,5 +156,9 @@ def _alarms_of_maps(
     if not there:
         return []
     found, contact = there[0]
-    match = match_tracks(found.tracks, truth.tracks(seconds, len(found.tracks.center)), MATCH_DISTANCE)
-    return [(_joint(there, len(read), seconds), (match.get(contact.ids[0]), match.get(contact.ids[1])))]
+    match = match_tracks(
+        found.tracks, truth.tracks(seconds, len(found.tracks.center)), MATCH_DISTANCE
+    )
+    return [
+        (_joint(there, len(read), seconds), (match.get(contact.ids[0]), match.get(contact.ids[1])))
+    ]

@@ -33,7 +33,9 @@ WITHIN_RECORDINGS: Final = ("time_to_impact", "impact_step", "time_to_end", "acc
 
 
 # The token of a scene of our export to nuScenes, which stands for one agent's recording of a scenario.
-_NUSCENES_SCENE: Final = re.compile(rf"^nuscenes/(\w+_(?:accident|normal))-(.+?)(?:-(?:{'|'.join(AGENTS)}))?$")
+_NUSCENES_SCENE: Final = re.compile(
+    rf"^nuscenes/(\w+_(?:accident|normal))-(.+?)(?:-(?:{'|'.join(AGENTS)}))?$"
+)
 
 
 def cluster_of(scenario: str) -> str:
@@ -87,9 +89,19 @@ class SampleAttributes(ShortRepr):
 
 
 EVERYTHING: Final = "all"
-_OF_SAMPLES: Final = ("agent", "accident_visibility", "time_to_impact", "impact_step", "time_to_end")
+_OF_SAMPLES: Final = (
+    "agent",
+    "accident_visibility",
+    "time_to_impact",
+    "impact_step",
+    "time_to_end",
+)
 # What results can be broken down by; `all` is not to break them down.
-ATTRIBUTES: Final = (EVERYTHING, *(name for name, field in FIELDS.items() if field.groups), *_OF_SAMPLES)
+ATTRIBUTES: Final = (
+    EVERYTHING,
+    *(name for name, field in FIELDS.items() if field.groups),
+    *_OF_SAMPLES,
+)
 
 
 def attribute_name(name: str) -> str:
@@ -110,11 +122,15 @@ def sample_attributes(dataset: Dataset, tokens: Iterable[str]) -> dict[str, Samp
         scenario = sample["scenario_token"]
         if scenario not in stories:
             stories[scenario] = group_texts(dataset, dataset.scenario.get(scenario))
-        result[token] = _attributes(sample, stories[scenario], visible=accident_visible(dataset, token))
+        result[token] = _attributes(
+            sample, stories[scenario], visible=accident_visible(dataset, token)
+        )
     return result
 
 
-def tokens_by_value(attributes: Mapping[str, SampleAttributes], name: str) -> dict[str | None, list[str]]:
+def tokens_by_value(
+    attributes: Mapping[str, SampleAttributes], name: str
+) -> dict[str | None, list[str]]:
     """The samples that have each value of an attribute; values in the order met. Raises ChoiceError."""
     name = attribute_name(name)
     result: dict[str | None, list[str]] = {}
@@ -128,7 +144,9 @@ def time_bin(frames: int, width: int) -> str:
     return f"{-(-frames // width) * width / _FRAMES_PER_SECOND:g} s"
 
 
-def _attributes(sample: SampleRecord, story: Mapping[str, str | None], *, visible: bool | None) -> SampleAttributes:
+def _attributes(
+    sample: SampleRecord, story: Mapping[str, str | None], *, visible: bool | None
+) -> SampleAttributes:
     ahead, left = sample["time_to_impact"], sample["time_to_end"]
     frames = None if ahead is None else round(ahead * _FRAMES_PER_SECOND)
     without = None if story["collision_status"] is None else NO_IMPACT
@@ -223,13 +241,18 @@ def breakdown(
 
 
 def _groups(
-    evaluator: Evaluator[_Result], attributes: Mapping[str, SampleAttributes], by: str, resampling: Resampling
+    evaluator: Evaluator[_Result],
+    attributes: Mapping[str, SampleAttributes],
+    by: str,
+    resampling: Resampling,
 ) -> tuple[Group[_Result], ...]:
     by_value = tokens_by_value(attributes, by)
     ordered: list[str | None] = sorted(by_value, key=natural_order)
     if by == "agent":
         ordered.sort(key=AGENTS.index)
-    return tuple(_group(evaluator, value, by_value[value], attributes, resampling) for value in ordered)
+    return tuple(
+        _group(evaluator, value, by_value[value], attributes, resampling) for value in ordered
+    )
 
 
 def _group(

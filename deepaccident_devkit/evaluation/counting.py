@@ -102,7 +102,9 @@ class _Batch(Generic[Task]):
 _Counted: TypeAlias = tuple[Any, dict[str, EvaluationError]]
 
 
-def _done(batches: Sequence[_Batch[Any]], store: Store | None, how: dict[str, Any]) -> Sequence[_Counted]:
+def _done(
+    batches: Sequence[_Batch[Any]], store: Store | None, how: dict[str, Any]
+) -> Sequence[_Counted]:
     """What each batch gives."""
     if store is None:
         return run_batch(_evaluated, batches, **how)
@@ -123,7 +125,9 @@ def _evaluated(batch: _Batch[Any]) -> _Counted:
             evaluator.update(token, *batch.load(task))
         except Exception as error:  # noqa: BLE001, PERF203 - whatever a caller's own function raises
             text = str(error).removeprefix(f"{token}: ")
-            faults[token] = EvaluationError(f"{token}: cannot be evaluated: {type(error).__name__}: {text}")
+            faults[token] = EvaluationError(
+                f"{token}: cannot be evaluated: {type(error).__name__}: {text}"
+            )
             faults[token].__cause__ = error
     if store is not None and not faults:
         store.keep(batch.name, batch.key, json.dumps(dict(evaluator.counts)).encode())
@@ -134,7 +138,10 @@ def _fault_of_all(failed: Sequence[EvaluationError], samples: int) -> Evaluation
     """The error of the only one that has failed, or of a list of all."""
     if len(failed) == 1:
         return failed[0]
-    lines = [f"{len(failed)} of {samples} samples cannot be evaluated:", *(f"  {each}" for each in failed)]
+    lines = [
+        f"{len(failed)} of {samples} samples cannot be evaluated:",
+        *(f"  {each}" for each in failed),
+    ]
     fault = EvaluationError("\n".join(lines))
     fault.__cause__ = next((each.__cause__ for each in failed if each.__cause__ is not None), None)
     return fault
@@ -146,7 +153,11 @@ def _workers_that_can(batch: _Batch[Any], workers: int | None) -> int | None:
 
     try:
         sent = bytes(ForkingPickler.dumps((batch.evaluator, batch.load, batch.samples[0][1])))
-        reason = "it is, or needs, something of the script or notebook that runs" if b"__main__" in sent else None
+        reason = (
+            "it is, or needs, something of the script or notebook that runs"
+            if b"__main__" in sent
+            else None
+        )
     except Exception as error:  # noqa: BLE001 - whatever an object's own way of being sent raises
         reason = str(error)
     if reason is None:

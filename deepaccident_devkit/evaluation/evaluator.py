@@ -127,14 +127,18 @@ class Evaluator(SampleCounts, Generic[_Result]):
         if tokens is None:
             return self.result_of(list(self._counts.values()))
         if isinstance(tokens, str) or not isinstance(tokens, Iterable):
-            raise EvaluationError(f"tokens: expected several of them, found {tokens!r}; give [token] for one")
+            raise EvaluationError(
+                f"tokens: expected several of them, found {tokens!r}; give [token] for one"
+            )
         selected: list[Any] = list(tokens)
         for token in selected:
             if not isinstance(token, str):
                 raise EvaluationError(f"tokens: expected texts, found {token!r} among them")
         missing = sorted(set(selected) - self._counts.keys())
         if missing:
-            raise EvaluationError(f"{len(missing)} samples have no prediction, such as {missing[0]}")
+            raise EvaluationError(
+                f"{len(missing)} samples have no prediction, such as {missing[0]}"
+            )
         return self.result_of([self._counts[token] for token in set(selected)])
 
     # How intervals and tests draw samples again and again
@@ -160,7 +164,9 @@ class Evaluator(SampleCounts, Generic[_Result]):
         """
         pooled = [self.pooled(part) for part in parts]
         for draw in times.tolist():
-            repeated = [part for part, count in zip(pooled, draw, strict=True) for _ in range(count)]
+            repeated = [
+                part for part, count in zip(pooled, draw, strict=True) for _ in range(count)
+            ]
             yield self.result_of([counts for part in repeated for counts in part])
 
     def drawn_numbers(

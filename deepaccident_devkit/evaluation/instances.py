@@ -33,7 +33,14 @@ import numpy as np
 from deepaccident_devkit.errors import GeometryError
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.geometry.bev_grid import cells_in
-from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray, FrozenArrays, IntArray, as_numbers
+from deepaccident_devkit.support.arrays import (
+    AnyArray,
+    BoolArray,
+    FloatArray,
+    FrozenArrays,
+    IntArray,
+    as_numbers,
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -109,7 +116,9 @@ class PanopticQuality:
     denominator: float
 
 
-def vpq_counts(prediction: AnyArray, label: AnyArray, *, temporally_consistent: bool = True) -> VpqCounts:
+def vpq_counts(
+    prediction: AnyArray, label: AnyArray, *, temporally_consistent: bool = True
+) -> VpqCounts:
     """Compare the instances of one sample.
 
     Args:
@@ -124,14 +133,18 @@ def vpq_counts(prediction: AnyArray, label: AnyArray, *, temporally_consistent: 
     predicted, true = _checked_maps(prediction, label)
     shared = _shared_cells(predicted, true)
     true_size, predicted_size = shared.sum(axis=2), shared.sum(axis=1)
-    frame, true_id, predicted_id = _matches(shared, true_size, predicted_size, consistent=temporally_consistent)
+    frame, true_id, predicted_id = _matches(
+        shared, true_size, predicted_size, consistent=temporally_consistent
+    )
     inside = shared[frame, true_id, predicted_id]
     overlap = inside / (true_size[frame, true_id] + predicted_size[frame, predicted_id] - inside)
     found = np.bincount(frame, minlength=len(true))
     alarms = np.count_nonzero(predicted_size[:, 1:], axis=1) - found
     missed = np.count_nonzero(true_size[:, 1:], axis=1) - found
     covered = np.array([math.fsum(overlap[frame == index].tolist()) for index in range(len(true))])
-    same = shared[:, 0, 0]  # cells of the background in both, which counts where they are more than half of the union
+    same = shared[
+        :, 0, 0
+    ]  # cells of the background in both, which counts where they are more than half of the union
     union = np.maximum(true_size[:, 0] + predicted_size[:, 0] - same, 1)
     beside = np.where(2 * same > union, same / union, 0.0)
     return VpqCounts(
@@ -155,11 +168,15 @@ def vpq_matches(prediction: AnyArray, label: AnyArray) -> IntArray:
         names.append(ids.astype(np.int64))
         ranks.append(rank.reshape(-1)[:-1].reshape(maps.shape))
     shared = _shared_cells(ranks[0], ranks[1])
-    frame, true_id, predicted_id = _matches(shared, shared.sum(axis=2), shared.sum(axis=1), consistent=True)
+    frame, true_id, predicted_id = _matches(
+        shared, shared.sum(axis=2), shared.sum(axis=1), consistent=True
+    )
     return np.stack([frame, names[0][predicted_id], names[1][true_id]], axis=1)
 
 
-def panoptic_quality(iou: float, true_positive: float, false_positive: float, false_negative: float) -> PanopticQuality:
+def panoptic_quality(
+    iou: float, true_positive: float, false_positive: float, false_negative: float
+) -> PanopticQuality:
     """The quality of sums over frames; 0 where there is nothing to count."""
     denominator = max(true_positive + false_positive / 2 + false_negative / 2, 1)
     return PanopticQuality(
@@ -172,9 +189,14 @@ def panoptic_quality(iou: float, true_positive: float, false_positive: float, fa
 
 def _checked_maps(prediction: AnyArray, label: AnyArray) -> tuple[AnyArray, AnyArray]:
     """Two sets of instance maps (T, H, W); raises GeometryError."""
-    predicted, true = as_numbers("prediction", prediction, dtype=None), as_numbers("label", label, dtype=None)
+    predicted, true = (
+        as_numbers("prediction", prediction, dtype=None),
+        as_numbers("label", label, dtype=None),
+    )
     if predicted.shape != true.shape or true.ndim != 3:
-        raise GeometryError(f"prediction: expected (T, H, W) as the label's {true.shape}, found {predicted.shape}")
+        raise GeometryError(
+            f"prediction: expected (T, H, W) as the label's {true.shape}, found {predicted.shape}"
+        )
     return predicted, true
 
 
@@ -182,7 +204,9 @@ def _shared_cells(predicted: AnyArray, true: AnyArray) -> IntArray:
     """(T, G + 1, P + 1) cells by true and predicted id, 0 the background; ids are renumbered if they are large."""
     frames, cells = len(true), true[0].size if len(true) else 0
     here = np.flatnonzero((predicted > 0) | (true > 0))
-    true_id, predicted_id = (np.maximum(maps.reshape(-1)[here], 0).astype(np.int64) for maps in (true, predicted))
+    true_id, predicted_id = (
+        np.maximum(maps.reshape(-1)[here], 0).astype(np.int64) for maps in (true, predicted)
+    )
     if math.prod(_pairs_shape(frames, true_id, predicted_id)) > _MOST_PAIRS:
         true_id, predicted_id = (_renumbered(ids) for ids in (true_id, predicted_id))
     shape = _pairs_shape(frames, true_id, predicted_id)
@@ -210,7 +234,9 @@ def _matches(
     frame, true_id, predicted_id = np.nonzero(shared[:, 1:, 1:])
     true_id, predicted_id = true_id + 1, predicted_id + 1
     inside = shared[frame, true_id, predicted_id]
-    match = np.flatnonzero(3 * inside > true_size[frame, true_id] + predicted_size[frame, predicted_id])
+    match = np.flatnonzero(
+        3 * inside > true_size[frame, true_id] + predicted_size[frame, predicted_id]
+    )
     if consistent:
         order = np.argsort(true_id[match], kind="stable")  # of each true id by time
         other = (np.diff(true_id[match][order]) == 0) & (np.diff(predicted_id[match][order]) != 0)
@@ -306,19 +332,24 @@ def _continued(path: FloatArray, length: int) -> FloatArray:
     if missing <= 0:
         return path
     step = path[-1] - path[-2] if len(path) > 1 else np.zeros(2)
-    added: FloatArray = np.cumsum([path[-1], *(np.arange(1.0, missing + 1)[:, None] * step)], axis=0)[1:]
+    added: FloatArray = np.cumsum(
+        [path[-1], *(np.arange(1.0, missing + 1)[:, None] * step)], axis=0
+    )[1:]
     return np.concatenate([path, added])
 
 
 def _costs(prediction: Paths, truth: Paths) -> FloatArray:
     """(P, G) the sums of the distances over the frames, from the first frame on."""
     length = longest(truth)
-    if any(len(path) != length for path in truth.values()) or any(len(path) < length for path in prediction.values()):
+    if any(len(path) != length for path in truth.values()) or any(
+        len(path) < length for path in prediction.values()
+    ):
         raise GeometryError(f"trajectories: expected {length} points each; see `padded`")
     result = np.zeros((len(prediction), len(truth)))
     if result.size:
         predicted, true = (
-            np.stack([path[:length] for path in paths.values()], axis=1) for paths in (prediction, truth)
+            np.stack([path[:length] for path in paths.values()], axis=1)
+            for paths in (prediction, truth)
         )
         for here, there in zip(predicted, true, strict=True):
             result += distances(here[:, None], there[None])
@@ -347,7 +378,10 @@ def instance_paths(instance: AnyArray, grid: BevGrid) -> dict[int, FloatArray]:
     y, x = cells_in(cell[0], cell[1], shape, grid.orientation, "devkit")
     count = np.bincount(key, minlength=length)
     mean = [np.bincount(key, along, length) / np.maximum(count, 1) for along in (x, y)]
-    metres = [low + (along + 0.5) * size for along, (low, _, size) in zip(mean, (grid.x, grid.y), strict=True)]
+    metres = [
+        low + (along + 0.5) * size
+        for along, (low, _, size) in zip(mean, (grid.x, grid.y), strict=True)
+    ]
     paths = np.stack(metres, axis=-1).reshape(len(ids), len(instance), 2)
     there = count.reshape(len(ids), len(instance)) > 0
     return {name: path[here] for name, path, here in zip(ids.tolist(), paths, there, strict=True)}

@@ -54,11 +54,17 @@ class Resampling:
         """Check the values; raises ConfigError."""
         if type(self.resamples) is not int or not 0 <= self.resamples <= MOST_RESAMPLES:
             expected = f"a whole number from 0 to {MOST_RESAMPLES:,}"
-            raise ConfigError(f"resamples: expected {expected}, found {shortened(repr(self.resamples))}")
+            raise ConfigError(
+                f"resamples: expected {expected}, found {shortened(repr(self.resamples))}"
+            )
         if type(self.seed) is not int or self.seed < 0:
-            raise ConfigError(f"seed: expected a whole number from 0, found {shortened(repr(self.seed))}")
+            raise ConfigError(
+                f"seed: expected a whole number from 0, found {shortened(repr(self.seed))}"
+            )
         if not 0 < self.confidence < 1:
-            raise ConfigError(f"confidence: expected a share between 0 and 1, such as 0.95, found {self.confidence!r}")
+            raise ConfigError(
+                f"confidence: expected a share between 0 and 1, such as 0.95, found {self.confidence!r}"
+            )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -75,7 +81,10 @@ class Intervals:
 
 
 def intervals_of(
-    evaluator: Evaluator[Any], clusters: Clusters, result: object, resampling: Resampling | None = None
+    evaluator: Evaluator[Any],
+    clusters: Clusters,
+    result: object,
+    resampling: Resampling | None = None,
 ) -> Intervals:
     """Intervals of the numbers of a result.
 
@@ -92,10 +101,16 @@ def intervals_of(
         return Intervals(ends={}, notes=("no intervals: this protocol has none",))
     if len(clusters) < LEAST_CLUSTERS:
         return Intervals(ends={}, notes=(f"no intervals: {few_clusters(len(clusters))}",))
-    numbers = {name: each for name, each in numbers_of(result).items() if math.isfinite(each) and has_interval(name)}
+    numbers = {
+        name: each
+        for name, each in numbers_of(result).items()
+        if math.isfinite(each) and has_interval(name)
+    }
     names, values = list(numbers), np.array(list(numbers.values()))
     drawn = draws_of_parts(evaluator, clusters, names, chosen)
-    low, high, having = ends_of_draws(names, values, drawn, chosen.confidence, evaluator.result_class.rows)
+    low, high, having = ends_of_draws(
+        names, values, drawn, chosen.confidence, evaluator.result_class.rows
+    )
     found = np.isfinite(low)
     ends = {name: (float(low[at]), float(high[at])) for at, name in enumerate(names) if found[at]}
     without = {name: int(having[at]) for at, name in enumerate(names) if not found[at]}
@@ -176,7 +191,9 @@ def parts_of(clusters: Clusters, resampling: Resampling) -> Clusters:
     if len(clusters) <= most:
         return clusters
     order = np.random.default_rng(resampling.seed).permutation(len(clusters)).tolist()
-    return [[counts for at in order[first::most] for counts in clusters[at]] for first in range(most)]
+    return [
+        [counts for at in order[first::most] for counts in clusters[at]] for first in range(most)
+    ]
 
 
 def leaving_out(count: int) -> IntArray:
@@ -184,7 +201,9 @@ def leaving_out(count: int) -> IntArray:
     return 1 - np.eye(count, dtype=np.int64)
 
 
-def numbers_of_draws(evaluator: Evaluator[Any], parts: Clusters, times: IntArray, names: Iterable[str]) -> FloatArray:
+def numbers_of_draws(
+    evaluator: Evaluator[Any], parts: Clusters, times: IntArray, names: Iterable[str]
+) -> FloatArray:
     """(D, M) the numbers of these M names in each of D draws, as `Evaluator.resampled` makes them; NaN for none."""
     listed = list(names)
     at_once = evaluator.drawn_numbers(parts, times, listed)
@@ -216,7 +235,11 @@ def standard_errors(values: FloatArray, left_out: FloatArray) -> tuple[FloatArra
 
 
 def interval_ends(
-    values: FloatArray, left_out: FloatArray, ranges: FloatArray, confidence: float, having: IntArray | None = None
+    values: FloatArray,
+    left_out: FloatArray,
+    ranges: FloatArray,
+    confidence: float,
+    having: IntArray | None = None,
 ) -> tuple[FloatArray, FloatArray]:
     """Intervals by Student's t: of shares as Wilson's, of numbers from 0 on of their logarithms, of others as they are.
 
@@ -239,11 +262,18 @@ def interval_ends(
     errors, freedom = standard_errors(values, left_out)
     same, share = errors <= _ROUNDING * width, np.isfinite(most)
     known = np.where(
-        same, share & (having >= LEAST_CLUSTERS), np.count_nonzero(left_out - values, axis=0) >= LEAST_CLUSTERS
+        same,
+        share & (having >= LEAST_CLUSTERS),
+        np.count_nonzero(left_out - values, axis=0) >= LEAST_CLUSTERS,
     )
-    t, plain_t = (as_floats(stdtrit(each, (1 + confidence) / 2)) for each in (freedom, np.maximum(having - 1, 1)))
+    t, plain_t = (
+        as_floats(stdtrit(each, (1 + confidence) / 2))
+        for each in (freedom, np.maximum(having - 1, 1))
+    )
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        shares = _wilson((values - least) / width, np.where(same, math.nan, errors / width), having, t, plain_t)
+        shares = _wilson(
+            (values - least) / width, np.where(same, math.nan, errors / width), having, t, plain_t
+        )
         factors = np.exp(t * errors / values)
         kinds = [share, least == 0]
         low = np.select(kinds, [least + width * shares[0], values / factors], values - t * errors)
@@ -265,7 +295,9 @@ def _wilson(
     unsure = np.where(np.isnan(errors), plain_t**2 / having, bounded)
     half = np.sqrt(unsure * inside * (1 - inside) + unsure**2 / 4)
     # the high end is 1 less the low one of what is missing: of a share of 1 it is 1, however numbers are rounded
-    low, missing = (np.maximum((each + unsure / 2 - half) / (1 + unsure), 0) for each in (inside, 1 - inside))
+    low, missing = (
+        np.maximum((each + unsure / 2 - half) / (1 + unsure), 0) for each in (inside, 1 - inside)
+    )
     return low, 1 - missing
 
 
@@ -325,7 +357,9 @@ def range_of(path: str, values: FloatArray, rows: Sequence[Row]) -> tuple[float,
 
 def _is_one_of(path: str, patterns: Iterable[str]) -> bool:
     """Whether a pattern fits the path, or its end, as of the results `beside` others."""
-    return any(fnmatchcase(path, pattern) or fnmatchcase(path, f"*/{pattern}") for pattern in patterns)
+    return any(
+        fnmatchcase(path, pattern) or fnmatchcase(path, f"*/{pattern}") for pattern in patterns
+    )
 
 
 def _numbers(value: object, path: str) -> Iterator[tuple[str, float]]:

@@ -17,7 +17,13 @@ from deepaccident_devkit.evaluation.predictions import Accident, MotionOutput, f
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.geometry.bev_grid import Orientation, cells_in
 from deepaccident_devkit.motion import LabelProtocol, MotionHeads, predict_instances
-from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray, FrozenArrays, IntArray
+from deepaccident_devkit.support.arrays import (
+    AnyArray,
+    BoolArray,
+    FloatArray,
+    FrozenArrays,
+    IntArray,
+)
 
 # The number of pairs of corner and side in one batch: bounds the memory.
 _PAIRS_AT_ONCE = 1 << 18
@@ -122,7 +128,9 @@ def _to_sides(points: FloatArray, hull: FloatArray) -> tuple[FloatArray, FloatAr
     across = side[:, None, :, 0] * apart[..., 1] - side[:, None, :, 1] * apart[..., 0]
     beside = (along > 0) & (along < length)
     # beyond a side's ends the way to the end itself is the nearest; each end is some side's start
-    squared = np.where(beside, across * across / np.where(beside, length, 1.0), (apart * apart).sum(axis=-1))
+    squared = np.where(
+        beside, across * across / np.where(beside, length, 1.0), (apart * apart).sum(axis=-1)
+    )
     pair = np.arange(len(points))
     flat = squared.reshape(len(points), -1)
     best = np.argmin(flat, axis=1)
@@ -164,7 +172,9 @@ class AccidentReading:
     def __post_init__(self) -> None:
         """Check the value; raises ConfigError."""
         if not 0 < self.danger_distance < np.inf:
-            raise ConfigError(f"danger_distance: expected metres above 0, found {self.danger_distance!r}")
+            raise ConfigError(
+                f"danger_distance: expected metres above 0, found {self.danger_distance!r}"
+            )
 
 
 def instances_of_heads(heads: MotionHeads) -> AnyArray:
@@ -219,11 +229,19 @@ class InstanceAccident:
     @property
     def positions(self) -> FloatArray:
         """(2, 2) x forward, y left of the two that collide, at that moment; of those with a contact."""
-        return np.full((2, 2), np.nan) if self.contact is None else self.tracks.at(self.contact.frame, self.contact.ids)
+        return (
+            np.full((2, 2), np.nan)
+            if self.contact is None
+            else self.tracks.at(self.contact.frame, self.contact.ids)
+        )
 
     def explicit(self, seconds: float) -> Accident | None:
         """It as an explicit accident without ids, `seconds` from frame to frame; None without a contact."""
-        return None if self.contact is None else Accident(positions=self.positions, time=self.contact.frame * seconds)
+        return (
+            None
+            if self.contact is None
+            else Accident(positions=self.positions, time=self.contact.frame * seconds)
+        )
 
 
 def even(length: FloatArray) -> FloatArray:
@@ -249,11 +267,14 @@ def accident_of(
     shapes = _shapes(instance, grid.orientation)
     size = np.array([grid.x[2], grid.y[2]])
     return InstanceAccident(
-        tracks=_tracks(shapes, len(instance), grid, rules), contact=_contact(shapes, size, reading.danger_distance)
+        tracks=_tracks(shapes, len(instance), grid, rules),
+        contact=_contact(shapes, size, reading.danger_distance),
     )
 
 
-def _tracks(shapes: _Shapes, frames: int, grid: BevGrid, rules: LabelProtocol | None) -> InstanceTracks:
+def _tracks(
+    shapes: _Shapes, frames: int, grid: BevGrid, rules: LabelProtocol | None
+) -> InstanceTracks:
     identity, which = np.unique(shapes.identity, return_inverse=True)
     center = np.full((frames, len(identity), 2), np.nan)
     place = shapes.center + (0.5 if rules is None else rules.place_in_cell)
@@ -263,16 +284,28 @@ def _tracks(shapes: _Shapes, frames: int, grid: BevGrid, rules: LabelProtocol | 
 
 def predicted_tracks(output: MotionOutput, rules: LabelProtocol | None) -> list[InstanceTracks]:
     """Where the instances of each of the K predictions go; arguments as of `accident_of`."""
-    maps = map(instances_of_heads, output.heads or ()) if output.instances is None else output.instances
-    return [_tracks(_shapes(each, output.grid.orientation), len(each), output.grid, rules) for each in maps]
+    maps = (
+        map(instances_of_heads, output.heads or ())
+        if output.instances is None
+        else output.instances
+    )
+    return [
+        _tracks(_shapes(each, output.grid.orientation), len(each), output.grid, rules)
+        for each in maps
+    ]
 
 
 def predicted_accidents(
-    output: MotionOutput, rules: LabelProtocol | None, reading: AccidentReading, frames: int | None = None
+    output: MotionOutput,
+    rules: LabelProtocol | None,
+    reading: AccidentReading,
+    frames: int | None = None,
 ) -> list[InstanceAccident]:
     """What `accident_of` reads off each of the K predictions, cut to so many frames; None for all."""
     heads = [each if frames is None else first_frames(each, frames) for each in output.heads or ()]
-    maps = map(instances_of_heads, heads) if output.instances is None else output.instances[:, :frames]
+    maps = (
+        map(instances_of_heads, heads) if output.instances is None else output.instances[:, :frames]
+    )
     return [accident_of(each, output.grid, rules, reading) for each in maps]
 
 
@@ -346,7 +379,10 @@ def _shapes(instance: AnyArray, orientation: Orientation) -> _Shapes:
     order = np.argsort(group, kind="stable")
     begin = np.cumsum(count) - count
     cells = np.stack([x, y], axis=1)
-    center = np.stack([np.bincount(group, along, len(key)) for along in cells.T], axis=1) / count[:, None]
+    center = (
+        np.stack([np.bincount(group, along, len(key)) for along in cells.T], axis=1)
+        / count[:, None]
+    )
     of_each = cells[order]
     return _Shapes(
         frame=frame[order][begin],
@@ -373,7 +409,9 @@ def _contact(shapes: _Shapes, size: FloatArray, danger_distance: float) -> Conta
     first, second, distance = first[near], second[near], distance[near]
     between = even(np.linalg.norm((shapes.center[first] - shapes.center[second]) * size, axis=1))
     frame = shapes.frame[first]
-    best = np.lexsort((shapes.identity[second], shapes.identity[first], between, frame, distance))[0]
+    best = np.lexsort((shapes.identity[second], shapes.identity[first], between, frame, distance))[
+        0
+    ]
     return Contact(
         frame=int(frame[best]),
         ids=(int(shapes.identity[first[best]]), int(shapes.identity[second[best]])),
@@ -381,7 +419,9 @@ def _contact(shapes: _Shapes, size: FloatArray, danger_distance: float) -> Conta
     )
 
 
-def _candidates(shapes: _Shapes, size: FloatArray, danger_distance: float) -> tuple[IntArray, IntArray]:
+def _candidates(
+    shapes: _Shapes, size: FloatArray, danger_distance: float
+) -> tuple[IntArray, IntArray]:
     """Pairs of rows of one frame whose bounding boxes are nearer than the danger distance."""
     firsts, seconds = [np.zeros(0, dtype=np.int64)], [np.zeros(0, dtype=np.int64)]
     starts = np.append(np.flatnonzero(np.diff(shapes.frame, prepend=-1)), len(shapes.frame))

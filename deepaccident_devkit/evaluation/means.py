@@ -28,7 +28,9 @@ _PARTS: Final = 2.0**30
 _ANY_CELL: Final = "means/*/*/"
 
 
-def table_rows(columns: Sequence[Row], main_tables: Sequence[str], main_row: str) -> tuple[Row, ...]:
+def table_rows(
+    columns: Sequence[Row], main_tables: Sequence[str], main_row: str
+) -> tuple[Row, ...]:
     """Return the rows of a result's tables: first the headlines by column, then one row for each column.
 
     Args:
@@ -36,10 +38,14 @@ def table_rows(columns: Sequence[Row], main_tables: Sequence[str], main_row: str
         main_tables: Tables whose numbers in `main_row` are headlines, unless their column says otherwise.
         main_row: Row of the tables.
     """
-    numbers = [replace(column, path=_ANY_CELL + column.path, is_headline=False) for column in columns]
+    numbers = [
+        replace(column, path=_ANY_CELL + column.path, is_headline=False) for column in columns
+    ]
     headline_columns = [column for column in columns if column.is_headline]
     headline_rows = [
-        replace(column, path=f"means/{table}/{main_row}/{column.path}", name=f"{column.path} {table}")
+        replace(
+            column, path=f"means/{table}/{main_row}/{column.path}", name=f"{column.path} {table}"
+        )
         for column in headline_columns
         for table in main_tables
     ]
@@ -81,11 +87,18 @@ class Sums:
         """Add one value; NaN is not counted."""
         self.add_rows(table, {row: np.ones(1, dtype=bool)}, {column: np.array([value])})
 
-    def add_rows(self, table: str, rows: Mapping[str, BoolArray], columns: Mapping[str, FloatArray]) -> None:
+    def add_rows(
+        self, table: str, rows: Mapping[str, BoolArray], columns: Mapping[str, FloatArray]
+    ) -> None:
         """Add values (N,) of columns to each row, of which its mask (N,) has them; NaN are not counted."""
-        values, masks = np.stack([*columns.values()], axis=1), np.stack([*rows.values()]).astype(np.float64)
+        values, masks = (
+            np.stack([*columns.values()], axis=1),
+            np.stack([*rows.values()]).astype(np.float64),
+        )
         there = np.isfinite(values)
-        numbers = np.stack([masks @ np.where(there, _rounded(values), 0.0), masks @ there], axis=-1).reshape(-1, 2)
+        numbers = np.stack(
+            [masks @ np.where(there, _rounded(values), 0.0), masks @ there], axis=-1
+        ).reshape(-1, 2)
         for name, number in zip(product(rows, columns), numbers, strict=True):
             path = "/".join((table, *name))
             self._numbers[path] = self._numbers.get(path, 0.0) + number
@@ -97,7 +110,9 @@ class Sums:
 
     def counts(self, scenario: str | None = None) -> Counts:
         """As an evaluator keeps them; with a scenario's token, the row `MEAN_OF_SCENARIOS` has means of its means."""
-        return _counts(self._numbers, self._notes) | ({} if scenario is None else {"scenario": scenario})
+        return _counts(self._numbers, self._notes) | (
+            {} if scenario is None else {"scenario": scenario}
+        )
 
 
 class MeansEvaluator(Evaluator[_Result], Generic[_Result]):
@@ -112,7 +127,9 @@ class MeansEvaluator(Evaluator[_Result], Generic[_Result]):
         """Take a sample's counts (`Evaluator.add`); of samples with the same names these are kept once."""
         names = counts.get("names")
         if not (isinstance(names, str) and names.replace("\n", "").isprintable()):
-            raise EvaluationError(f"{token}: expected counts with the names of their numbers; evaluate again")
+            raise EvaluationError(
+                f"{token}: expected counts with the names of their numbers; evaluate again"
+            )
         super().add(token, {**counts, "names": sys.intern(names)})
 
     def pooled(self, counts: Collection[Counts]) -> Sequence[Counts]:
@@ -120,7 +137,10 @@ class MeansEvaluator(Evaluator[_Result], Generic[_Result]):
         by_scenario: dict[str | None, list[Counts]] = {}
         for each in counts:
             by_scenario.setdefault(each.get("scenario"), []).append(each)
-        parts = [_pooled(those) if name is None else self._of_scenario(those) for name, those in by_scenario.items()]
+        parts = [
+            _pooled(those) if name is None else self._of_scenario(those)
+            for name, those in by_scenario.items()
+        ]
         return [_pooled(parts)]
 
     def _of_scenario(self, counts: Collection[Counts]) -> Counts:
@@ -128,17 +148,28 @@ class MeansEvaluator(Evaluator[_Result], Generic[_Result]):
         whole, main = _pooled(counts), f"/{self.main_row}/"
         numbers = _by_path(whole)
         means = {
-            path.replace(main, f"/{MEAN_OF_SCENARIOS}/"): np.array([_rounded(value / max(count, 1.0)), min(count, 1.0)])
+            path.replace(main, f"/{MEAN_OF_SCENARIOS}/"): np.array(
+                [_rounded(value / max(count, 1.0)), min(count, 1.0)]
+            )
             for path, (value, count) in numbers.items()
             if main in path
         }
         return {**whole, **_counts(numbers | means, whole["notes"])}
 
-    def drawn_numbers(self, parts: Sequence[Sequence[Counts]], times: IntArray, names: Sequence[str]) -> FloatArray:
+    def drawn_numbers(
+        self, parts: Sequence[Sequence[Counts]], times: IntArray, names: Sequence[str]
+    ) -> FloatArray:
         """The numbers of each draw (`Evaluator.drawn_numbers`): all sums are drawn at once."""
         pooled = [_by_path(self.pooled(part)[0]) for part in parts]
-        given = np.array([[each.get(name.removeprefix("means/"), np.zeros(2)) for name in names] for each in pooled])
-        sums, counts = (times @ each for each in np.moveaxis(given.reshape(len(parts), len(names), 2), -1, 0))
+        given = np.array(
+            [
+                [each.get(name.removeprefix("means/"), np.zeros(2)) for name in names]
+                for each in pooled
+            ]
+        )
+        sums, counts = (
+            times @ each for each in np.moveaxis(given.reshape(len(parts), len(names), 2), -1, 0)
+        )
         return np.where(counts > 0, sums / np.maximum(counts, 1), np.nan)
 
     def result_of(self, counts: Collection[Counts]) -> _Result:
@@ -146,19 +177,31 @@ class MeansEvaluator(Evaluator[_Result], Generic[_Result]):
         (pooled,) = self.pooled(counts)
         means: dict[str, dict[str, dict[str, float]]] = {}
         counted: dict[str, dict[str, dict[str, int]]] = {}
-        columns = [row.path.removeprefix(_ANY_CELL) for row in self.result_class.rows if row.path.startswith(_ANY_CELL)]
-        for path, (value, count) in sorted(_by_path(pooled).items(), key=lambda item: self._place(item[0], columns)):
+        columns = [
+            row.path.removeprefix(_ANY_CELL)
+            for row in self.result_class.rows
+            if row.path.startswith(_ANY_CELL)
+        ]
+        for path, (value, count) in sorted(
+            _by_path(pooled).items(), key=lambda item: self._place(item[0], columns)
+        ):
             table, row, column = path.split("/")
-            means.setdefault(table, {}).setdefault(row, {})[column] = ratio(float(value), float(count))
+            means.setdefault(table, {}).setdefault(row, {})[column] = ratio(
+                float(value), float(count)
+            )
             counted.setdefault(table, {}).setdefault(row, {})[column] = int(count)
         notes = tuple(_note_text(text, count) for text, count in sorted(pooled["notes"].items()))
-        result: _Result = self.result_class(samples=pooled["samples"], means=means, counted=counted, notes=notes)
+        result: _Result = self.result_class(
+            samples=pooled["samples"], means=means, counted=counted, notes=notes
+        )
         return result
 
     def _place(self, path: str, columns: Sequence[str]) -> tuple[Any, ...]:
         """Return the sort key of a number: `order` for tables and rows, `columns` for columns; raises ValueError."""
         *names, column = path.split("/")
-        places = [self.order.index(name) if name in self.order else len(self.order) for name in names]
+        places = [
+            self.order.index(name) if name in self.order else len(self.order) for name in names
+        ]
         keys = [(place, natural_order(name)) for place, name in zip(places, names, strict=True)]
         return *keys, columns.index(column)
 
@@ -174,11 +217,17 @@ def _rounded(values: FloatArray | float) -> FloatArray:
 
 def _counts(numbers: Mapping[str, FloatArray], notes: Mapping[str, int]) -> dict[str, Any]:
     """Paths `table/row/column` with the sum and of how many (2,), as JSON holds them."""
-    return {"names": "\n".join(numbers), "numbers": [each.tolist() for each in numbers.values()], "notes": dict(notes)}
+    return {
+        "names": "\n".join(numbers),
+        "numbers": [each.tolist() for each in numbers.values()],
+        "notes": dict(notes),
+    }
 
 
 def _by_path(counts: Counts) -> dict[str, FloatArray]:
-    return dict(zip(filter(None, counts["names"].split("\n")), np.array(counts["numbers"]), strict=True))
+    return dict(
+        zip(filter(None, counts["names"].split("\n")), np.array(counts["numbers"]), strict=True)
+    )
 
 
 def _pooled(counts: Collection[Counts]) -> Counts:

@@ -176,7 +176,9 @@ class MotionEvaluator(Evaluator[MotionResult]):
     result_class = MotionResult
     main_numbers: ClassVar[tuple[str, ...]] = ("ranges/100x100/pq", "ranges/100x100/iou")
 
-    def __init__(self, protocol: str | MotionProtocol = "released", *, trajectories: bool = True) -> None:
+    def __init__(
+        self, protocol: str | MotionProtocol = "released", *, trajectories: bool = True
+    ) -> None:
         """Start without samples.
 
         Args:
@@ -195,7 +197,9 @@ class MotionEvaluator(Evaluator[MotionResult]):
         """The protocol's choices, and whether paths are compared."""
         return {"protocol": asdict(self.protocol), "trajectories": self.trajectories}
 
-    def truth(self, dataset: Dataset, token: str, form: Any, horizon: float, /) -> tuple[MotionLabels | None]:
+    def truth(
+        self, dataset: Dataset, token: str, form: Any, horizon: float, /
+    ) -> tuple[MotionLabels | None]:
         """Return the sample's motion labels, on the grid of the results."""
         return (compared_labels(dataset, token, self.protocol, form, horizon),)
 
@@ -211,7 +215,9 @@ class MotionEvaluator(Evaluator[MotionResult]):
             EvaluationError: there is no prediction or label, the labels are of another protocol, the prediction has
                 another grid or too few frames, or the sample came before with another outcome.
         """
-        self.add(token, motion_counts(prediction, label, self.protocol, trajectories=self.trajectories))
+        self.add(
+            token, motion_counts(prediction, label, self.protocol, trajectories=self.trajectories)
+        )
 
     def result_of(self, counts: Collection[Counts]) -> MotionResult:
         """The metrics of some samples' counts, in any order."""
@@ -221,16 +227,23 @@ class MotionEvaluator(Evaluator[MotionResult]):
         """Return IoU and PQ (percent), instances and cells by range, then the paths and their errors (m)."""
         result = self.compute([token])
         row: dict[str, Any] = {"frames": result.frames}
-        for (name, part), cells in zip(result.ranges.items(), self._counts[token]["cells"], strict=True):
+        for (name, part), cells in zip(
+            result.ranges.items(), self._counts[token]["cells"], strict=True
+        ):
             row |= {f"iou_{name}": part.iou, f"pq_{name}": part.pq}
             row |= {
                 f"tp_{name}": part.true_positive,
                 f"fp_{name}": part.false_positive,
                 f"fn_{name}": part.false_negative,
             }
-            row |= {f"cells_{case}_{name}": count for case, count in zip(("tp", "fp", "fn"), cells, strict=True)}
+            row |= {
+                f"cells_{case}_{name}": count
+                for case, count in zip(("tp", "fp", "fn"), cells, strict=True)
+            }
         paths = ("paths", "path_true_positive", "path_false_positive", "path_false_negative")
-        return row | {name: getattr(result, name) for name in (*paths, "min_ade", "min_fde", "miss_rate")}
+        return row | {
+            name: getattr(result, name) for name in (*paths, "min_ade", "min_fde", "miss_rate")
+        }
 
     def pooled(self, counts: Collection[Counts]) -> list[Counts]:
         """The samples' counts as those of one sample of one frame, which have the same result."""
@@ -282,7 +295,9 @@ def motion_counts(
     prediction, label = checked_pair(prediction, label)
     frames = compared_frames(prediction, label, rules.labels)
     truth, grid = labels_at_present(label), label.config.grid
-    actors, instance = (prediction.grid.reorient(each, grid.orientation) for each in _last_maps(prediction, frames))
+    actors, instance = (
+        prediction.grid.reorient(each, grid.orientation) for each in _last_maps(prediction, frames)
+    )
     true_actors, true_instance = truth.segmentation[:frames] == 1, truth.instance[:frames]
     cells, vpq = [], []
     for extent in RANGES.values():
@@ -290,7 +305,12 @@ def motion_counts(
         counted = mask_counts(actors[within], true_actors[within])
         cells.append([counted.true_positive, counted.false_positive, counted.false_negative])
         quality = vpq_counts(instance[within], true_instance[within])
-        by_name = (quality.iou, quality.true_positive, quality.false_positive, quality.false_negative)
+        by_name = (
+            quality.iou,
+            quality.true_positive,
+            quality.false_positive,
+            quality.false_negative,
+        )
         vpq.append([values[:, 1].tolist() for values in by_name])
     return {
         "samples": 1,
@@ -307,7 +327,9 @@ def _last_maps(prediction: MotionOutput, frames: int) -> tuple[AnyArray, AnyArra
     actors = actor_cells(prediction)[:frames]
     if prediction.instances is not None:
         return actors, prediction.instances[-1, :frames]
-    return actors, predict_instances(first_frames((prediction.heads or ())[-1], frames), "motion").instance
+    return actors, predict_instances(
+        first_frames((prediction.heads or ())[-1], frames), "motion"
+    ).instance
 
 
 def actor_cells(prediction: MotionOutput) -> AnyArray:
@@ -347,13 +369,19 @@ def _sums(counts: Collection[Counts]) -> dict[str, Any]:
     """The samples' counts as those of one sample of one frame."""
     ranges, kinds = range(len(RANGES)), range(4)
     vpq = [
-        [[math.fsum(chain.from_iterable(each["vpq"][index][kind] for each in counts))] for kind in kinds]
+        [
+            [math.fsum(chain.from_iterable(each["vpq"][index][kind] for each in counts))]
+            for kind in kinds
+        ]
         for index in ranges
     ]
     columns = [[*zip(*(each["cells"][index] for each in counts), strict=True)] for index in ranges]
     paths = [each["paths"] for each in counts if each["paths"]]
     return {
-        **{name: sum(each[name] for each in counts) for name in ("samples", "frames", "instance_maps")},
+        **{
+            name: sum(each[name] for each in counts)
+            for name in ("samples", "frames", "instance_maps")
+        },
         "cells": [[*map(sum, those or [()] * 3)] for those in columns],
         "vpq": vpq,
         "paths": {name: total(paths, name) for name in _PATHS},
@@ -364,7 +392,9 @@ def motion_result(counts: Collection[Counts], protocol: MotionProtocol) -> Motio
     """The metrics of some samples' counts, in any order."""
     sums = _sums(counts)
     paths, samples, number = (sums[name] for name in ("paths", "samples", "instance_maps"))
-    ranges = [_range_result(*each, protocol) for each in zip(sums["cells"], sums["vpq"], strict=True)]
+    ranges = [
+        _range_result(*each, protocol) for each in zip(sums["cells"], sums["vpq"], strict=True)
+    ]
     found, alarms, lost = (int(paths[name]) for name in _PATH_COUNTS)
     return MotionResult(
         ranges=dict(zip(RANGES, ranges, strict=True)),
@@ -378,11 +408,15 @@ def motion_result(counts: Collection[Counts], protocol: MotionProtocol) -> Motio
         path_false_negative=lost,
         samples=samples,
         frames=sums["frames"],
-        notes=(f"{number} of {counted(samples, 'prediction')}: {_INSTANCE_MAPS}",) if number else (),
+        notes=(f"{number} of {counted(samples, 'prediction')}: {_INSTANCE_MAPS}",)
+        if number
+        else (),
     )
 
 
-def _range_result(cells: Sequence[int], vpq: Sequence[Sequence[float]], protocol: MotionProtocol) -> RangeResult:
+def _range_result(
+    cells: Sequence[int], vpq: Sequence[Sequence[float]], protocol: MotionProtocol
+) -> RangeResult:
     """Of the sums of [tp, fp, fn] cells, and of overlaps, found, false and missed instances."""
     (overlap,), *numbers = vpq
     found, alarms, missed = (int(number) for (number,) in numbers)

@@ -14,7 +14,13 @@ from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import EvaluationError, GeometryError
 from deepaccident_devkit.geometry import BevGrid, Boxes
 from deepaccident_devkit.geometry.bev_grid import Orientation
-from deepaccident_devkit.motion import LABEL_PROTOCOLS, MotionHeads, MotionLabelConfig, MotionLabels, motion_labels
+from deepaccident_devkit.motion import (
+    LABEL_PROTOCOLS,
+    MotionHeads,
+    MotionLabelConfig,
+    MotionLabels,
+    motion_labels,
+)
 from deepaccident_devkit.support.arrays import (
     AnyArray,
     FloatArray,
@@ -100,7 +106,12 @@ class MotionOutput(FrozenArrays):
             ChoiceError: no such orientation.
         """
         laid = _checked_grid(grid, orientation)
-        given = {"segmentation": segmentation, "centerness": centerness, "offset": offset, "flow": flow}
+        given = {
+            "segmentation": segmentation,
+            "centerness": centerness,
+            "offset": offset,
+            "flow": flow,
+        }
         maps = {name: as_numbers(name, values, dtype=np.float32) for name, values in given.items()}
         if maps["segmentation"].ndim == 4:
             maps = {name: values[None] for name, values in maps.items()}
@@ -108,20 +119,31 @@ class MotionOutput(FrozenArrays):
         for name, values in maps.items():
             if count is None or values.ndim not in _AXES[name] or len(values) != count:
                 shapes = ", ".join(f"{each} {np.shape(array)}" for each, array in maps.items())
-                raise GeometryError(f"{name}: expected (K, T, channels, H, W), or (T, channels, H, W), found {shapes}")
+                raise GeometryError(
+                    f"{name}: expected (K, T, channels, H, W), or (T, channels, H, W), found {shapes}"
+                )
         heads = (
-            MotionHeads(**{name: values[index] for name, values in maps.items()}, orientation=laid.orientation)
+            MotionHeads(
+                **{name: values[index] for name, values in maps.items()},
+                orientation=laid.orientation,
+            )
             for index in range(count or 0)
         )
         return cls(grid=laid, heads=tuple(heads))
 
     def __len__(self) -> int:
         """Number of predictions, K."""
-        return len(self.heads) if self.heads is not None else len(self.instances if self.instances is not None else ())
+        return (
+            len(self.heads)
+            if self.heads is not None
+            else len(self.instances if self.instances is not None else ())
+        )
 
     def __repr__(self) -> str:
         """Predictions, frames, cells, and which of the two forms."""
-        maps = self.instances[0] if self.instances is not None else (self.heads or ())[0].segmentation
+        maps = (
+            self.instances[0] if self.instances is not None else (self.heads or ())[0].segmentation
+        )
         form = "heads" if self.instances is None else "instances"
         plural = "s" * (len(self) != 1)
         return f"MotionOutput({len(self)} prediction{plural} of {len(maps)} frames, {self.grid.text}, {form})"
@@ -147,13 +169,17 @@ class Accident(FrozenArrays):
         """Check and freeze; raises GeometryError."""
         positions = checked("accident positions", self.positions, (2, 2)).copy()
         if not np.isfinite(positions).all():
-            raise GeometryError("accident positions: not all numbers are finite; leave out what is not predicted")
+            raise GeometryError(
+                "accident positions: not all numbers are finite; leave out what is not predicted"
+            )
         time = checked_number("accident time", self.time, "seconds after the present")
         score = checked_number("accident score", self.score)
         if not (math.isfinite(time) and math.isfinite(score)):
             raise GeometryError(f"accident: time {time} and score {score} must be finite")
         if time < 0:
-            raise GeometryError(f"accident time: expected seconds after the present, found {time}; leave out the past")
+            raise GeometryError(
+                f"accident time: expected seconds after the present, found {time}; leave out the past"
+            )
         for name, value in {
             "positions": positions,
             "time": time,
@@ -185,7 +211,11 @@ def checked_prediction(prediction: object) -> MotionOutput | list[Accident]:
         return prediction
     alarms: list[Accident] = []
     # empty Boxes are no alarm only by mistake
-    for each in prediction if isinstance(prediction, Iterable) and not isinstance(prediction, Boxes) else [prediction]:
+    for each in (
+        prediction
+        if isinstance(prediction, Iterable) and not isinstance(prediction, Boxes)
+        else [prediction]
+    ):
         if each is prediction or not isinstance(each, Accident):
             raise EvaluationError(
                 f"prediction: expected a MotionOutput or a list of Accidents, found {type(prediction).__name__} with "
@@ -198,7 +228,9 @@ def checked_prediction(prediction: object) -> MotionOutput | list[Accident]:
 
 def _checked_grid(grid: object, orientation: Orientation | None) -> BevGrid:
     if not isinstance(grid, BevGrid):
-        raise GeometryError(f"grid: expected a BevGrid, such as label.config.grid, found {type(grid).__name__}")
+        raise GeometryError(
+            f"grid: expected a BevGrid, such as label.config.grid, found {type(grid).__name__}"
+        )
     return grid if orientation is None else grid.with_orientation(orientation)
 
 
@@ -206,7 +238,9 @@ def _checked_heads(heads: object, grid: BevGrid) -> tuple[MotionHeads, ...]:
     given = (heads,) if isinstance(heads, MotionHeads) else heads
     if not isinstance(given, Sequence) or not all(isinstance(each, MotionHeads) for each in given):
         kinds = (
-            sorted({type(each).__name__ for each in given}) if isinstance(given, Sequence) else [type(given).__name__]
+            sorted({type(each).__name__ for each in given})
+            if isinstance(given, Sequence)
+            else [type(given).__name__]
         )
         raise GeometryError(
             f"heads: expected MotionHeads, found {', '.join(kinds)}; of arrays, make the output with "
@@ -226,14 +260,20 @@ def _checked_heads(heads: object, grid: BevGrid) -> tuple[MotionHeads, ...]:
 def ascending_times(values: ArrayLike) -> FloatArray:
     """(T,) seconds after the present of a predicted path, a copy; raises GeometryError if they are not ascending."""
     times = checked("times", values, (None,)).copy()
-    if not (len(times) and np.isfinite(times).all() and times[0] >= 0 and (np.diff(times) > 0).all()):
-        raise GeometryError(f"times: expected ascending seconds after the present, found {times.tolist()}")
+    if not (
+        len(times) and np.isfinite(times).all() and times[0] >= 0 and (np.diff(times) > 0).all()
+    ):
+        raise GeometryError(
+            f"times: expected ascending seconds after the present, found {times.tolist()}"
+        )
     return times
 
 
 # Seconds: the times of a path that is longer are probably no seconds.
 LONGEST_PATH: Final = 10.0
-LONG_PATHS: Final = "suspicious: {path} longer than 10 s; times are in seconds, not in frames or milliseconds"
+LONG_PATHS: Final = (
+    "suspicious: {path} longer than 10 s; times are in seconds, not in frames or milliseconds"
+)
 
 
 def _checked_ids(ids: object) -> tuple[int, int] | None:
@@ -241,9 +281,12 @@ def _checked_ids(ids: object) -> tuple[int, int] | None:
         return None
     pair = ids.tolist() if isinstance(ids, np.ndarray) else ids
     if not isinstance(pair, Sequence) or isinstance(pair, str) or len(pair) != 2:
-        raise GeometryError(f"accident ids: expected two actor ids, or None for unknown ones, found {ids!r}")
+        raise GeometryError(
+            f"accident ids: expected two actor ids, or None for unknown ones, found {ids!r}"
+        )
     first, second = (
-        checked_whole("accident ids", each, "two whole numbers, or None for unknown ones") for each in pair
+        checked_whole("accident ids", each, "two whole numbers, or None for unknown ones")
+        for each in pair
     )
     return first, second
 
@@ -252,7 +295,9 @@ def _checked_ids(ids: object) -> tuple[int, int] | None:
 _TINY: Final = 1e-6
 
 
-def compared_labels(dataset: Dataset, token: str, rules: Any, form: Any, horizon: float) -> MotionLabels | None:
+def compared_labels(
+    dataset: Dataset, token: str, rules: Any, form: Any, horizon: float
+) -> MotionLabels | None:
     """The sample's motion labels as `label_config` says; None where there is none to compare with."""
     config = label_config(rules, form, horizon)
     return None if config is None else motion_labels(dataset, token, config)
@@ -287,7 +332,9 @@ def frames_there(label: MotionLabels) -> int:
     valid = label.label_valid
     count = len(valid) if valid.all() else int(np.argmin(valid))
     if not count:
-        raise EvaluationError("labels: the present frame is not in the recording; choose another sample")
+        raise EvaluationError(
+            "labels: the present frame is not in the recording; choose another sample"
+        )
     return count
 
 
@@ -306,7 +353,9 @@ def checked_pair(prediction: object, label: object) -> tuple[MotionOutput, Motio
     return prediction, label
 
 
-def compared_frames(prediction: MotionOutput | list[Accident], label: MotionLabels, protocol: str | None) -> int:
+def compared_frames(
+    prediction: MotionOutput | list[Accident], label: MotionLabels, protocol: str | None
+) -> int:
     """How many frames of a prediction are compared with labels; explicit accidents fit all labels.
 
     Raises:
@@ -329,7 +378,9 @@ def compared_frames(prediction: MotionOutput | list[Accident], label: MotionLabe
     maps = () if prediction.instances is None else prediction.instances
     predicted = min([*(len(each.segmentation) for each in prediction.heads or ()), *map(len, maps)])
     if predicted < frames:
-        raise EvaluationError(f"prediction: expected at least {frames} frames from the present on, found {predicted}")
+        raise EvaluationError(
+            f"prediction: expected at least {frames} frames from the present on, found {predicted}"
+        )
     return frames
 
 
@@ -343,8 +394,13 @@ def first_frames(heads: MotionHeads, frames: int) -> MotionHeads:
 def cells_within(grid: BevGrid, extent: float) -> tuple[slice, slice]:
     """Rows and columns of the cells whose centres are in a square of `extent` metres around the ego."""
     spans = [
-        [min(max(math.ceil((edge - low) / size - 0.5 - _TINY), 0), round((high - low) / size)) for edge in edges]
-        for (low, high, size), edges in ((axis, (-extent / 2, extent / 2)) for axis in (grid.x, grid.y))
+        [
+            min(max(math.ceil((edge - low) / size - 0.5 - _TINY), 0), round((high - low) / size))
+            for edge in edges
+        ]
+        for (low, high, size), edges in (
+            (axis, (-extent / 2, extent / 2)) for axis in (grid.x, grid.y)
+        )
     ]
     along_x, along_y = (slice(first, stop) for first, stop in spans)
     if grid.orientation == "fiery":

@@ -37,7 +37,9 @@ class SampleCounts(ABC):
 
     def __repr__(self) -> str:
         """Return the class and the number of samples."""
-        return f"{type(self).__name__}({len(self._counts):,} sample{'s' * (len(self._counts) != 1)})"
+        return (
+            f"{type(self).__name__}({len(self._counts):,} sample{'s' * (len(self._counts) != 1)})"
+        )
 
     @property
     @abstractmethod
@@ -63,7 +65,9 @@ class SampleCounts(ABC):
         elif self._counts[token] == counts:
             self.repeated.add(token)
         else:
-            raise EvaluationError(f"{token}: evaluated twice, with different results; give each sample one prediction")
+            raise EvaluationError(
+                f"{token}: evaluated twice, with different results; give each sample one prediction"
+            )
 
     def merge(self: CountsT, other: CountsT) -> CountsT:
         """Take all samples of another evaluator; returns this one.
@@ -125,7 +129,9 @@ class SampleCounts(ABC):
             write_bytes(target, json.dumps(state).encode())
         except OSError as error:
             remedy = "make room there, or choose another file"
-            raise EvaluationError(f"{target}: the evaluation cannot be saved ({error}); {remedy}") from error
+            raise EvaluationError(
+                f"{target}: the evaluation cannot be saved ({error}); {remedy}"
+            ) from error
         return target
 
     def resume(self: CountsT, path: str | os.PathLike[str]) -> CountsT:
@@ -141,11 +147,17 @@ class SampleCounts(ABC):
             maker, settings, repeated = state["made_by"], state["settings"], set(state["repeated"])
             counts = {token: dict(each) for token, each in state["counts"].items()}
         except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-            raise EvaluationError(f"{source}: no saved evaluation ({fault_text(error)}); begin again") from error
+            raise EvaluationError(
+                f"{source}: no saved evaluation ({fault_text(error)}); begin again"
+            ) from error
         if maker != self.maker:
-            raise EvaluationError(f"{source}: was saved by {maker}, this is {self.maker}; begin again")
+            raise EvaluationError(
+                f"{source}: was saved by {maker}, this is {self.maker}; begin again"
+            )
         if settings != self.settings:
-            raise EvaluationError(f"{source}: was saved with other settings ({settings}); begin again, or use those")
+            raise EvaluationError(
+                f"{source}: was saved with other settings ({settings}); begin again, or use those"
+            )
         try:
             for token, each in counts.items():
                 self.add(token, each)

@@ -20,9 +20,19 @@ if TYPE_CHECKING:
 
 _Kind = TypeVar("_Kind")
 Rules = TypeVar("Rules", bound="DataclassInstance")
-_WORDS: Final[Mapping[type | None, str]] = {bool: "true or false", float: "a number", str: "a word", tuple: "a list"}
+_WORDS: Final[Mapping[type | None, str]] = {
+    bool: "true or false",
+    float: "a number",
+    str: "a word",
+    tuple: "a list",
+}
 # A kind of value → the types that are of it; a bool is an int to Python, so that it comes first.
-_LIKE: Final[Mapping[type, tuple[type, ...]]] = {bool: (bool,), float: (float, int), str: (str,), tuple: (tuple,)}
+_LIKE: Final[Mapping[type, tuple[type, ...]]] = {
+    bool: (bool,),
+    float: (float, int),
+    str: (str,),
+    tuple: (tuple,),
+}
 
 
 def switch_names(rules: DataclassInstance) -> list[str]:
@@ -56,7 +66,9 @@ def switched(rules: Rules, switches: Mapping[str, Any]) -> Rules:
     for name, value in switches.items():
         if name not in names:
             there = f"there are {possible_text(name, names)}" if names else "it has none"
-            raise ChoiceError(f"these rules have no switch {name!r}{meant_text(name, names)}; {there}")
+            raise ChoiceError(
+                f"these rules have no switch {name!r}{meant_text(name, names)}; {there}"
+            )
         head, _, rest = name.partition(".")
         if rest:
             parts.setdefault(head, {})[rest] = value
@@ -69,11 +81,17 @@ def switched(rules: Rules, switches: Mapping[str, Any]) -> Rules:
 def _of_kind(name: str, rules: DataclassInstance, field: str, value: Any) -> Any:
     """A value of the kind of a field's own; raises ChoiceError. A field whose value is None takes any."""
     before = getattr(rules, field)
-    kind = next((kind for kind in (bool, float, str, tuple) if isinstance(before, _LIKE[kind])), None)
-    fits = kind is None or (isinstance(value, _LIKE[kind]) and (kind is bool or not isinstance(value, bool)))
+    kind = next(
+        (kind for kind in (bool, float, str, tuple) if isinstance(before, _LIKE[kind])), None
+    )
+    fits = kind is None or (
+        isinstance(value, _LIKE[kind]) and (kind is bool or not isinstance(value, bool))
+    )
     takes_none = any("None" in str(each.type) for each in fields(rules) if each.name == field)
     if not (takes_none if value is None else fits):
-        raise ChoiceError(f"switch {name}: expected {_WORDS[kind]}, such as {before!r}, found {value!r}")
+        raise ChoiceError(
+            f"switch {name}: expected {_WORDS[kind]}, such as {before!r}, found {value!r}"
+        )
     return value
 
 
@@ -137,7 +155,10 @@ def plain(value: Any) -> Any:
     if is_dataclass(value):
         return {each.name: plain(getattr(value, each.name)) for each in fields(value)}
     if isinstance(value, Mapping):
-        return {f"{key:g}" if isinstance(key, float) else str(key): plain(each) for key, each in value.items()}
+        return {
+            f"{key:g}" if isinstance(key, float) else str(key): plain(each)
+            for key, each in value.items()
+        }
     if isinstance(value, np.ndarray):
         return plain(value.tolist())
     if isinstance(value, (list, tuple)):
@@ -153,7 +174,9 @@ def _frozen(value: Any) -> Any:
 
 Unit = Literal["%", "share", "m", "s", "rad", "m/s", "1 - overlap", "1/min"]
 # The most that a number of a unit can be; others have no limit.
-LIMITS: Final[Mapping[Unit, float]] = MappingProxyType({"%": 100.0, "share": 1.0, "1 - overlap": 1.0})
+LIMITS: Final[Mapping[Unit, float]] = MappingProxyType(
+    {"%": 100.0, "share": 1.0, "1 - overlap": 1.0}
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -227,7 +250,10 @@ class TaskResult(FrozenMappings):
 
     def _repr_html_(self) -> str:
         rows = [(number.name, number.text()) for number in headlines(self)]
-        return table_html([("number", "value"), *rows], f"{type(self).__name__}, {counted(self.samples, 'sample')}")
+        return table_html(
+            [("number", "value"), *rows],
+            f"{type(self).__name__}, {counted(self.samples, 'sample')}",
+        )
 
 
 def headlines(result: TaskResult) -> tuple[Headline, ...]:
@@ -257,7 +283,11 @@ def value_text(value: float | None, unit: Unit, *, signed: bool = False) -> str:
     if value is None:
         return "–"
     number = f"{value:{'+' if signed else ''}.{2 if unit == '%' else 3}f}"
-    return number if unit in ("share", "1 - overlap") or (signed and unit == "%") else f"{number} {unit}"
+    return (
+        number
+        if unit in ("share", "1 - overlap") or (signed and unit == "%")
+        else f"{number} {unit}"
+    )
 
 
 def _found(result: object, path: str) -> Iterator[tuple[str, Any]]:
@@ -267,7 +297,9 @@ def _found(result: object, path: str) -> Iterator[tuple[str, Any]]:
         for name, each in result.items():
             text = f"{name:g}" if isinstance(name, float) else str(name)
             if head in ("*", text):
-                yield from ((text, value) for _, value in (_found(each, rest) if rest else [("", each)]))
+                yield from (
+                    (text, value) for _, value in (_found(each, rest) if rest else [("", each)])
+                )
     elif hasattr(result, head):
         value = getattr(result, head)
         yield from _found(value, rest) if rest else [("", value)]

@@ -33,9 +33,7 @@ from deepaccident_devkit.v2x.tracks import ScenarioTracks, scenario_tracks
 RELEASED_HORIZON: Final = 2.0
 # Seconds: half a recorded frame, so that decimal moments compare as they are meant.
 SLACK: Final = FRAME_PERIOD / 2
-UNPLACED_NOTE: Final = (
-    "left out: {} of accidents of which no label shows both actors (meta names one without a label, or one twice)"
-)
+UNPLACED_NOTE: Final = "left out: {} of accidents of which no label shows both actors (meta names one without a label, or one twice)"
 _BEYOND_NOTE: Final = "not counted: {} for later than the horizon"
 # Metres that an actor must cover in the window to count as moving.
 _MOVES: Final = 0.5
@@ -104,7 +102,10 @@ class BoxTruth(FrozenArrays):
             first, second = (here[side] for side in np.nonzero(near))
             if len(first):
                 gap = gaps(rows[np.unique(first)], rows[np.unique(second)])
-                gap = gap[np.unique(first, return_inverse=True)[1], np.unique(second, return_inverse=True)[1]]
+                gap = gap[
+                    np.unique(first, return_inverse=True)[1],
+                    np.unique(second, return_inverse=True)[1],
+                ]
                 best = int(np.argmin(gap))
                 found.append((float(gap[best]), frame, int(first[best]), int(second[best])))
         if not found or min(found)[0] >= danger_distance:
@@ -178,14 +179,20 @@ def accident_context(
         pair=None if collision is None else (collision["ids"][0], collision["ids"][1]),
         known=scenario["weather"] is not None,
         own_actor_id=own_actor_id,
-        truth=None if horizon is None or tracks is None else _box_truth(dataset, there, scenario, tracks, horizon),
+        truth=None
+        if horizon is None or tracks is None
+        else _box_truth(dataset, there, scenario, tracks, horizon),
         time_to_impact=there["time_to_impact"],
         time_to_end=there["time_to_end"],
         twin=twin,
-        time_to_twin_impact=(other["num_frames"] - present) * FRAME_PERIOD if twin and other is not None else None,
+        time_to_twin_impact=(other["num_frames"] - present) * FRAME_PERIOD
+        if twin and other is not None
+        else None,
         involvement=involvement,
         references=(
-            {} if not references or tracks is None else _references(dataset, there, tracks, own_actor_id, involvement)
+            {}
+            if not references or tracks is None
+            else _references(dataset, there, tracks, own_actor_id, involvement)
         ),
     )
 
@@ -219,11 +226,17 @@ def box_truth(dataset: Dataset, sample: RowArgument, horizon: float = RELEASED_H
 
 
 def _box_truth(
-    dataset: Dataset, there: Mapping[str, Any], scenario: Mapping[str, Any], tracks: ScenarioTracks, horizon: float
+    dataset: Dataset,
+    there: Mapping[str, Any],
+    scenario: Mapping[str, Any],
+    tracks: ScenarioTracks,
+    horizon: float,
 ) -> BoxTruth:
     """`box_truth` of a sample whose scenario's tracks are read."""
     if scenario["weather"] is None:
-        raise NotAvailableError(f"{scenario['token']} has no meta file, which names the colliding pair; unpack meta")
+        raise NotAvailableError(
+            f"{scenario['token']} has no meta file, which names the colliding pair; unpack meta"
+        )
     present = int(there["token"].rsplit("/", 1)[1])
     boxes = tracks.boxes.transform(dataset.world_from(there["token"], "ego").inverse(), "ego")
     footprints = np.column_stack([boxes.center[:, :2], boxes.size[:, :2], boxes.yaw])
@@ -232,7 +245,11 @@ def _box_truth(
     actors, which = np.unique(tracks.actor_id[inside], return_inverse=True)
     footprint = np.full((last - present + 1, len(actors), 5), np.nan)
     footprint[tracks.index[inside] - present, which] = footprints[inside]
-    ahead, pair, impact = there["time_to_impact"], labelled_pair(scenario["collision"], tracks.actor_id), None
+    ahead, pair, impact = (
+        there["time_to_impact"],
+        labelled_pair(scenario["collision"], tracks.actor_id),
+        None,
+    )
     if ahead is not None and pair is not None:
         rows = [np.flatnonzero(tracks.actor_id == actor)[-1] for actor in pair]
         impact = Accident(positions=footprints[rows, :2], time=ahead, ids=pair)
@@ -249,7 +266,10 @@ def _box_truth(
 
 def checked_facts(label: object, context: object) -> None:
     """Whether a sample's truth is given as labels and context, either of which may be None; raises EvaluationError."""
-    for name, given, kind in (("label", label, MotionLabels), ("context", context, AccidentContext)):
+    for name, given, kind in (
+        ("label", label, MotionLabels),
+        ("context", context, AccidentContext),
+    ):
         if given is not None and not isinstance(given, kind):
             raise EvaluationError(
                 f"{name}: expected {kind.__name__} or None, found {type(given).__name__}; give what "
@@ -286,7 +306,10 @@ def _collides(scenario: Mapping[str, Any] | None) -> bool:
 
 
 def _involvement(
-    agent: str, own_actor_id: int | None, collision: Mapping[str, Any] | None, twin: Mapping[str, Any] | None
+    agent: str,
+    own_actor_id: int | None,
+    collision: Mapping[str, Any] | None,
+    twin: Mapping[str, Any] | None,
 ) -> Involvement:
     if agent == INFRASTRUCTURE:
         return "infrastructure"
@@ -323,7 +346,9 @@ ALARM_TIME: Final = 3.0
 _MOVING: Final = 0.1
 
 
-def constant_velocity_alarms(boxes: Boxes, names: Mapping[int, int | None], own: int | None) -> tuple[Accident, ...]:
+def constant_velocity_alarms(
+    boxes: Boxes, names: Mapping[int, int | None], own: int | None
+) -> tuple[Accident, ...]:
     """The pairs of actors whose time to collision is below 3 s, the soonest first.
 
     Args:
@@ -343,9 +368,13 @@ def constant_velocity_alarms(boxes: Boxes, names: Mapping[int, int | None], own:
         near &= mine[first] | mine[second]
     first, second = first[near], second[near]
     footprint = np.column_stack([boxes.center[:, :2], boxes.size[:, :2], boxes.yaw])
-    seconds = time_to_collision(footprint[first], footprint[second], velocity[first], velocity[second])
+    seconds = time_to_collision(
+        footprint[first], footprint[second], velocity[first], velocity[second]
+    )
     alarms = []
-    for row in np.flatnonzero(seconds < ALARM_TIME)[np.argsort(seconds[seconds < ALARM_TIME], kind="stable")]:
+    for row in np.flatnonzero(seconds < ALARM_TIME)[
+        np.argsort(seconds[seconds < ALARM_TIME], kind="stable")
+    ]:
         pair = [int(first[row]), int(second[row])]
         one, other = (ids[each] for each in pair)
         alarms.append(

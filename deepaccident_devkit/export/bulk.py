@@ -29,7 +29,12 @@ from deepaccident_devkit.errors import (
     shortened,
 )
 from deepaccident_devkit.export.format import Format, LinkKind, Output, Tally, Unit, flat_name
-from deepaccident_devkit.release.fingerprints import checked_hashes, digest_of, scenario_folders, sensor_digest
+from deepaccident_devkit.release.fingerprints import (
+    checked_hashes,
+    digest_of,
+    scenario_folders,
+    sensor_digest,
+)
 from deepaccident_devkit.release.layout import ScenarioFolder
 from deepaccident_devkit.selection import find
 from deepaccident_devkit.support.files import (
@@ -41,8 +46,22 @@ from deepaccident_devkit.support.files import (
     write_bytes,
 )
 from deepaccident_devkit.support.json_text import parsed_record
-from deepaccident_devkit.support.parallel import Engine, Failure, Places, Store, Tried, check_failures, run_batch
-from deepaccident_devkit.support.reading import DAMAGED_ARCHIVE, fault_text, open_zip, read_bytes, read_member
+from deepaccident_devkit.support.parallel import (
+    Engine,
+    Failure,
+    Places,
+    Store,
+    Tried,
+    check_failures,
+    run_batch,
+)
+from deepaccident_devkit.support.reading import (
+    DAMAGED_ARCHIVE,
+    fault_text,
+    open_zip,
+    read_bytes,
+    read_member,
+)
 from deepaccident_devkit.support.text import differing_text, path_of
 from deepaccident_devkit.support.version import __version__
 
@@ -51,14 +70,26 @@ if TYPE_CHECKING:
 
     from deepaccident_devkit.dataset import Dataset
 
-__all__ = ["Exported", "Format", "LinkKind", "Manifest", "Output", "Tally", "Unit", "export_release", "flat_name"]
+__all__ = [
+    "Exported",
+    "Format",
+    "LinkKind",
+    "Manifest",
+    "Output",
+    "Tally",
+    "Unit",
+    "export_release",
+    "flat_name",
+]
 
 _FOLDER: Final = ".deepaccident-parts"
 _ENDING: Final = ".manifest.json"
 _DONE: Final = "done"
 _PATHS: Final = ".paths"
 # Paths that no export notes: out of its folder, or to what it keeps there itself. Somebody else wrote those.
-_REFUSED: Final = re.compile(r"(.*/)?(\.{0,2}|\.deepaccident[^/]*|[^/]*\.manifest\.json)(/.*)?", re.DOTALL)
+_REFUSED: Final = re.compile(
+    r"(.*/)?(\.{0,2}|\.deepaccident[^/]*|[^/]*\.manifest\.json)(/.*)?", re.DOTALL
+)
 # Characters of a path; no system opens a longer one.
 _LONGEST: Final = 4096
 # Counts up when the content of a done-record changes.
@@ -143,13 +174,19 @@ class Manifest:
         except NotADirectoryError as error:
             raise ExportError(f"{folder}: is a file; give a folder") from error
         except OSError as error:
-            raise ExportError(f"{folder}: cannot be read ({error}); choose another folder") from error
+            raise ExportError(
+                f"{folder}: cannot be read ({error}); choose another folder"
+            ) from error
         if is_begun:
             found = cls.read(folder, form.name)
             found.check(folder, settings)
             return found
         # a killed export may have left what it keeps alone
-        strange = [each for each in others if not each.startswith(".deepaccident-") and temporary_of(each) is None]
+        strange = [
+            each
+            for each in others
+            if not each.startswith(".deepaccident-") and temporary_of(each) is None
+        ]
         if strange and not any(f"{each}{_ENDING}" in others for each in form.beside):
             raise ExportError(
                 f"{folder}: is not empty ({shortened(strange[0])}) and holds no {form.name} export; choose a new folder"
@@ -165,13 +202,19 @@ class Manifest:
             if found.format != name:
                 raise ValueError("another format's")
         except (OSError, ValueError) as error:
-            fault = fault_text(error) if isinstance(error, OSError) else f"is no manifest of a {name} export ({error})"
+            fault = (
+                fault_text(error)
+                if isinstance(error, OSError)
+                else f"is no manifest of a {name} export ({error})"
+            )
             raise ExportError(f"{path}: {fault}; export again into an empty folder") from error
         return found
 
     def write(self, folder: Path) -> None:
         """Write it into its folder."""
-        write_bytes(folder / f"{self.format}{_ENDING}", f"{json.dumps(asdict(self), indent=1)}\n".encode())
+        write_bytes(
+            folder / f"{self.format}{_ENDING}", f"{json.dumps(asdict(self), indent=1)}\n".encode()
+        )
 
     def check(self, folder: Path, settings: Mapping[str, Any]) -> None:
         """Refuse other settings; raises ConfigError that names what differs."""
@@ -182,7 +225,12 @@ class Manifest:
 
 
 def export_release(
-    dataset: Dataset, folder: str | os.PathLike[str], form: Format, *, dry_run: bool = False, **how: Unpack[Engine]
+    dataset: Dataset,
+    folder: str | os.PathLike[str],
+    form: Format,
+    *,
+    dry_run: bool = False,
+    **how: Unpack[Engine],
 ) -> Exported:
     """Write scenarios of a release in another format. If a call is interrupted, the same call continues it.
 
@@ -224,12 +272,21 @@ def export_release(
     form.check(dataset, root)
     folders = scenario_folders(dataset, scenarios)
     if absent := [token for token in scenarios if token not in folders]:
-        raise MissingFileError(f"{dataset.dataroot}: scenario {absent[0]} is gone; open the release again")
+        raise MissingFileError(
+            f"{dataset.dataroot}: scenario {absent[0]} is gone; open the release again"
+        )
     groups = [[folders[token] for token in unit.scenarios] for unit in units]
-    comparing: Engine = {**how, "progress": how.get("progress") is True}  # a caller's bar is for what is written
+    comparing: Engine = {
+        **how,
+        "progress": how.get("progress") is True,
+    }  # a caller's bar is for what is written
     # also if nothing is there yet: workers that cannot do the work say so before a folder is made
     states = run_batch(
-        Tried(export.states), groups, label="comparing", places=Places(reads=dataset.places), **comparing
+        Tried(export.states),
+        groups,
+        label="comparing",
+        places=Places(reads=dataset.places),
+        **comparing,
     )
     jobs = {unit.name: (unit, found) for unit, found in zip(units, states, strict=True)}
     if manifest.release:
@@ -261,7 +318,11 @@ class Export:
     def store(self) -> Store:
         """What says which units are done, and keeps others from writing the same."""
         return Store(
-            place_in(self.root, _FOLDER, opened=True), self.root, "writes an export", ExportError, self.command
+            place_in(self.root, _FOLDER, opened=True),
+            self.root,
+            "writes an export",
+            ExportError,
+            self.command,
         )
 
     @property
@@ -291,11 +352,16 @@ class Export:
                 failed = True
                 continue
             except OSError as error:
-                raise ExportError(f"a scenario cannot be tried ({error}); make room there") from error
+                raise ExportError(
+                    f"a scenario cannot be tried ({error}); make room there"
+                ) from error
             if tally.samples:
                 count = len(scenarios)
                 linked = {way: number * count for way, number in tally.linked.items()}
-                files, size = tally.files * len(units), tally.bytes * count  # a unit of many has one file for all
+                files, size = (
+                    tally.files * len(units),
+                    tally.bytes * count,
+                )  # a unit of many has one file for all
                 return Tally(samples=tally.samples * count, files=files, bytes=size, linked=linked)
         if alone and not failed:
             raise NotAvailableError(self.form.nothing)
@@ -310,7 +376,9 @@ class Export:
                 output.tally.bytes, measured = 0, Path(folder)
             else:
                 measured = output.parts
-            output.tally.bytes += sum(each.stat().st_size for each in measured.rglob("*") if each.is_file())
+            output.tally.bytes += sum(
+                each.stat().st_size for each in measured.rglob("*") if each.is_file()
+            )
         return output.tally
 
     def states(self, folders: Sequence[ScenarioFolder]) -> States:
@@ -322,7 +390,9 @@ class Export:
             for folder in folders
         }
 
-    def completed(self, before: Manifest, jobs: Mapping[str, _Job], how: Engine) -> tuple[Manifest, int]:
+    def completed(
+        self, before: Manifest, jobs: Mapping[str, _Job], how: Engine
+    ) -> tuple[Manifest, int]:
         """Write what is left, beside others that write it; the manifest, and how many units are new."""
         store = self.store
 
@@ -365,7 +435,9 @@ class Export:
         self.store.keep(name, key, json.dumps(asdict(output.tally)).encode())
         return _Done(output.tally, new=True)
 
-    def _finished(self, jobs: Mapping[str, _Job], done: Sequence[_Done], settings: dict[str, Any]) -> Manifest:
+    def _finished(
+        self, jobs: Mapping[str, _Job], done: Sequence[_Done], settings: dict[str, Any]
+    ) -> Manifest:
         """Write what spans units; the manifest of the complete export. If there is no sample, nothing is left."""
         if not any(each.tally.samples for each in done):
             self._remove_others(())
@@ -379,8 +451,12 @@ class Export:
         for each in done:
             output.tally.add(each.tally)
         scenarios = _all_states(jobs)
-        made_from = MadeFrom(fingerprint=digest_of(_truth(scenarios)), scenarios=dict(sorted(scenarios.items())))
-        return Manifest(format=self.form.name, settings=settings, release=made_from, written=output.tally)
+        made_from = MadeFrom(
+            fingerprint=digest_of(_truth(scenarios)), scenarios=dict(sorted(scenarios.items()))
+        )
+        return Manifest(
+            format=self.form.name, settings=settings, release=made_from, written=output.tally
+        )
 
     @contextmanager
     def _output(self, unit: Unit | None = None) -> Iterator[Output]:
@@ -396,7 +472,9 @@ class Export:
         earlier, now = _noted(journal), set[str]()
         for folder in {place_in(self.root, path).parent for path in earlier}:
             remove_leftovers(folder, [PurePosixPath(path).name for path in earlier])
-        write_bytes(journal, "".join(f"{path}\0" for path in sorted(earlier)).encode())  # a new file, and no link
+        write_bytes(
+            journal, "".join(f"{path}\0" for path in sorted(earlier)).encode()
+        )  # a new file, and no link
         with journal.open("ab", buffering=0) as file:
 
             def note(path: str) -> None:
@@ -412,7 +490,10 @@ class Export:
 
         A program that copies a folder may leave a second journal of a unit, with another name.
         """
-        journals = {path.name.removesuffix(_PATHS): path for path in sorted(self.kept.glob(f"[!.]*{_PATHS}"))}
+        journals = {
+            path.name.removesuffix(_PATHS): path
+            for path in sorted(self.kept.glob(f"[!.]*{_PATHS}"))
+        }
         others = journals.keys() - names
         if not others:  # then no journal need be read
             return
@@ -436,7 +517,9 @@ class Export:
         The caller has the folder alone.
         """
         begun = {temporary_of(each.name) or "" for each in self.root.iterdir()}
-        remove_leftovers(self.root, [each for each in begun if each.endswith(_ENDING)])  # who has it alone writes those
+        remove_leftovers(
+            self.root, [each for each in begun if each.endswith(_ENDING)]
+        )  # who has it alone writes those
         for each, _, _ in os.walk(self.root):
             remove_leftovers(Path(each))
 
@@ -444,11 +527,17 @@ class Export:
         """Remove the store; sensor files may change later, so what a later call needs then is packed into one file."""
         if pack and self.form.sensors():
             with replacing(self._archive) as temporary, zipfile.ZipFile(temporary, "w") as archive:
-                for path in sorted(path for path in self.kept.rglob("*") if path.is_file() and not path.is_symlink()):
+                for path in sorted(
+                    path
+                    for path in self.kept.rglob("*")
+                    if path.is_file() and not path.is_symlink()
+                ):
                     name = path.relative_to(self.kept).as_posix()
                     if not name.isprintable():
                         continue  # a stranger's, and zip has no such names
-                    archive.writestr(zipfile.ZipInfo(name), read_bytes(path, "archive"))  # without a date
+                    archive.writestr(
+                        zipfile.ZipInfo(name), read_bytes(path, "archive")
+                    )  # without a date
         self.store.drop(self.form.name)
         self.store.remove(keep=any(self.store.folder.glob("kept/*")))  # another format's
 
@@ -463,7 +552,9 @@ class Export:
         try:
             with open_zip(self._archive) as archive:
                 for entry in archive.infolist():
-                    write_bytes(place_in(self.kept, entry.filename), read_member(archive, entry, "archive"))
+                    write_bytes(
+                        place_in(self.kept, entry.filename), read_member(archive, entry, "archive")
+                    )
         except OSError:
             raise
         except DAMAGED_ARCHIVE as error:
@@ -478,7 +569,9 @@ def _chosen(dataset: Dataset, form: Format) -> list[str]:
     found = [record["token"] for record in find(dataset, *form.where)]
     chosen = [token for token in found if of_split is None or token in of_split]
     if not chosen:
-        raise NotAvailableError("no scenario of this release is in that split and matches the filters; change them")
+        raise NotAvailableError(
+            "no scenario of this release is in that split and matches the filters; change them"
+        )
     return chosen
 
 
@@ -494,7 +587,10 @@ def _all_states(jobs: Mapping[str, _Job]) -> dict[str, dict[str, str | None]]:
 
 def _truth(states: States) -> dict[str, dict[str, Any]]:
     """States of scenarios without their sensor files."""
-    return {token: {name: each for name, each in state.items() if name != _SENSORS} for token, state in states.items()}
+    return {
+        token: {name: each for name, each in state.items() if name != _SENSORS}
+        for token, state in states.items()
+    }
 
 
 def _is_current(root: Path, before: States, now: States) -> bool:

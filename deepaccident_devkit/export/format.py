@@ -29,12 +29,24 @@ from deepaccident_devkit.taxonomy import AGENTS, CHANNELS
 
 LinkKind = Literal["hard", "symbolic", "copy"]
 # What a file system answers that cannot make a link; a full disk is another matter.
-_NO_LINKS: Final = (errno.EXDEV, errno.EPERM, errno.EACCES, errno.EMLINK, errno.ENOTSUP, errno.ENOSYS)
+_NO_LINKS: Final = (
+    errno.EXDEV,
+    errno.EPERM,
+    errno.EACCES,
+    errno.EMLINK,
+    errno.ENOTSUP,
+    errno.ENOSYS,
+)
 _DIGEST: Final = re.compile(r"-[0-9a-f]{16}\Z")
 # Of a name made from a token; the devkit's and the formats' endings come to it, and systems allow 255.
 _MOST_CHARACTERS: Final = 150
 README: Final = "README.md"
-SPLIT_NAMES: Final[Mapping[str | None, str]] = {"train": "train", "val": "validation", "test": "test", None: "unknown"}
+SPLIT_NAMES: Final[Mapping[str | None, str]] = {
+    "train": "train",
+    "val": "validation",
+    "test": "test",
+    None: "unknown",
+}
 """A scenario's split → what files are called by it; `datasets` expects these words."""
 _TEXT: Final = """\
 ---
@@ -150,11 +162,15 @@ class Output:
                 content, real = b"", Path(os.path.realpath(source))
                 open_file(real).close()
         except OSError as error:
-            raise SensorFileError(f"{source}: {fault_text(error)}; restore it from its archive") from error
+            raise SensorFileError(
+                f"{source}: {fault_text(error)}; restore it from its archive"
+            ) from error
         with replacing(self._place(path)) as temporary:
             if real is None:
                 temporary.write_bytes(content)
-            way = "copy" if real is None else _linked(real, temporary, self._link, symbolic=symbolic)
+            way = (
+                "copy" if real is None else _linked(real, temporary, self._link, symbolic=symbolic)
+            )
         self.tally.linked[way] = self.tally.linked.get(way, 0) + 1
 
     def leave_out(self, what: str, count: int = 1) -> None:
@@ -225,7 +241,9 @@ class Format(ABC):
     """What a unit is, for people."""
     channels: ClassVar[tuple[str, ...]] = CHANNELS
     """Sensors whose files decide what is written; tables and infos name files, there or not."""
-    nothing: ClassVar[str] = "no chosen agent recorded one of these scenarios; choose other agents or scenarios"
+    nothing: ClassVar[str] = (
+        "no chosen agent recorded one of these scenarios; choose other agents or scenarios"
+    )
     """Why there may be no sample to write, and the remedy."""
     beside: ClassVar[tuple[str, ...]] = ()
     """Formats whose exports may lie in the same folder already."""
@@ -286,7 +304,9 @@ def flat_name(token: str) -> str:
     return f"{name}-{hashlib.blake2b(token.encode(), digest_size=8).hexdigest()}"
 
 
-def shards(dataset: Dataset, sizes: Mapping[str, int], limit: int) -> dict[str, list[tuple[str, ...]]]:
+def shards(
+    dataset: Dataset, sizes: Mapping[str, int], limit: int
+) -> dict[str, list[tuple[str, ...]]]:
     """Name of a split → its shards: consecutive scenarios, sizes up to the limit, but at least one scenario."""
     found: dict[str, list[tuple[str, ...]]] = {name: [] for name in SPLIT_NAMES.values()}
     room = dict.fromkeys(found, 0)

@@ -26,7 +26,9 @@ def keyframe_after(number: int, last: int) -> int:
     return number + (last - number) % KEY_STEP
 
 
-def sensor_files(dataset: Dataset, scenario: str, agent: str, channel: str) -> dict[int, tuple[ReleasePath, int]]:
+def sensor_files(
+    dataset: Dataset, scenario: str, agent: str, channel: str
+) -> dict[int, tuple[ReleasePath, int]]:
     """Frame number → path and bytes of a channel's files that are there; raises TokenError and DatarootError."""
     count = dataset.scenario[dataset.getind("scenario", scenario)]["num_frames"]
     folder = dataset.sensor_path(f"{sample_token(scenario, agent, 1)}/{channel}").parent
@@ -38,7 +40,9 @@ def sensor_files(dataset: Dataset, scenario: str, agent: str, channel: str) -> d
     }
 
 
-def stored_camera(dataset: Dataset, camera: str, file: tuple[ReleasePath, int] | None) -> PinholeCamera:
+def stored_camera(
+    dataset: Dataset, camera: str, file: tuple[ReleasePath, int] | None
+) -> PinholeCamera:
     """A camera, by its image's token, with K and size of its file of `sensor_files`; without a file, those of calib.
 
     Raises TokenError, and SensorFileError if the file is no image.

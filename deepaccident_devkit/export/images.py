@@ -44,12 +44,16 @@ class VirtualCamera(NamedTuple):
     height: int
     width: int
 
-    def taken(self, image: ByteArray, lens: PinholeCamera, decode: Decoding) -> tuple[ByteArray, FloatArray]:
+    def taken(
+        self, image: ByteArray, lens: PinholeCamera, decode: Decoding
+    ) -> tuple[ByteArray, FloatArray]:
         """The image (height, width, 3) of a camera's whole one, and its K."""
         height = max(round(lens.height * self.focal / lens.intrinsic[1, 1]), 1)
         width = max(round(lens.width * self.focal / lens.intrinsic[0, 0]), 1)
         intrinsic = lens.resized(width, height).intrinsic.copy()
-        left, top = np.rint(intrinsic[:2, 2] - (self.width / 2, self.height / 2)).astype(int).tolist()
+        left, top = (
+            np.rint(intrinsic[:2, 2] - (self.width / 2, self.height / 2)).astype(int).tolist()
+        )
         intrinsic[:2, 2] -= (left, top)
         result = np.zeros((3, self.height, self.width), dtype=np.uint8).transpose(1, 2, 0)
         rows, columns = (
@@ -59,7 +63,9 @@ class VirtualCamera(NamedTuple):
         if rows.start < rows.stop and columns.start < columns.stop:
             part = (rows.start, columns.start, rows.stop - rows.start, columns.stop - columns.start)
             seen = resized_part(image, (height, width), part, decode)
-            result[rows.start - top : rows.stop - top, columns.start - left : columns.stop - left] = seen
+            result[
+                rows.start - top : rows.stop - top, columns.start - left : columns.stop - left
+            ] = seen
         return result, intrinsic
 
 
@@ -96,23 +102,31 @@ class ImageConfig:
         if self.resize is not None:
             self._set("resize", _pixels("resize", self.resize, "height and width", (1, 1)))
         if self.crop is not None:
-            self._set("crop", _pixels("crop", self.crop, "top, left, height and width", (0, 0, 1, 1)))
+            self._set(
+                "crop", _pixels("crop", self.crop, "top, left, height and width", (0, 0, 1, 1))
+            )
             if self.resize is not None:
                 _check_crop(self.crop, self.resize)
-        settle_choices(self, {"dtype": get_args(ImageDtype), "decode": get_args(Decoding)}, error=ConfigError)
+        settle_choices(
+            self, {"dtype": get_args(ImageDtype), "decode": get_args(Decoding)}, error=ConfigError
+        )
         for name in ("mean", "std"):
             self._set(name, _channels(name, getattr(self, name)))
         if min(self.std) <= 0:
             raise ConfigError(f"std: expected numbers above 0, found {self.std}")
         if self.dtype == "uint8" and (self.mean, self.std) != (_NO_MEAN, _NO_STD):
-            raise ConfigError("mean and std: uint8 images are not scaled; choose dtype='float32', or leave them out")
+            raise ConfigError(
+                "mean and std: uint8 images are not scaled; choose dtype='float32', or leave them out"
+            )
         self._set("cameras", _cameras(self.cameras))
         if self.virtual_camera is not None:
             focal, *size = self.virtual_camera
             height, width = _pixels("virtual_camera", size, "height and width", (1, 1))
             self._set("virtual_camera", VirtualCamera(focal, height, width))
             if not 0 < focal < math.inf or (self.resize, self.crop) != (None, None):
-                raise ConfigError("virtual_camera: expected a focal length above 0, and no resize or crop beside it")
+                raise ConfigError(
+                    "virtual_camera: expected a focal length above 0, and no resize or crop beside it"
+                )
 
     def _set(self, name: str, value: object) -> None:
         object.__setattr__(self, name, value)
@@ -132,10 +146,16 @@ class ImageConfig:
         lens = dataset.camera(camera)
         if self.virtual_camera is not None:
             image = dataset.load_image(camera)
-            return self.virtual_camera.taken(image, lens.resized(image.shape[1], image.shape[0]), self.decode)
+            return self.virtual_camera.taken(
+                image, lens.resized(image.shape[1], image.shape[0]), self.decode
+            )
         if self.resize is not None:
-            image = dataset.load_image(camera, least=self.resize if self.decode == "scaled" else None)
-            return resized_part(image, self.resize, self.crop, self.decode), self.intrinsic(lens, self.resize)
+            image = dataset.load_image(
+                camera, least=self.resize if self.decode == "scaled" else None
+            )
+            return resized_part(image, self.resize, self.crop, self.decode), self.intrinsic(
+                lens, self.resize
+            )
         image = dataset.load_image(camera)
         height, width = image.shape[:2]
         return self.cropped(image), self.intrinsic(lens, (height, width))
@@ -162,10 +182,14 @@ class ImageConfig:
         if self.dtype == "uint8":
             return images
         result = (np.empty if known.all() else np.zeros)(images.shape, dtype=np.float32)
-        mean, std = (np.array(three, dtype=np.float32)[:, None, None] for three in (self.mean, self.std))
+        mean, std = (
+            np.array(three, dtype=np.float32)[:, None, None] for three in (self.mean, self.std)
+        )
         scale, shift = np.float32(1) / (np.float32(255) * std), mean / std
         for a, p in np.argwhere(known).tolist():
-            for image, out in zip(images[a, p], result[a, p], strict=True):  # one fits into the processor's cache
+            for image, out in zip(
+                images[a, p], result[a, p], strict=True
+            ):  # one fits into the processor's cache
                 np.copyto(out, image)
                 np.multiply(out, scale, out=out)
                 np.subtract(out, shift, out=out)
@@ -173,7 +197,10 @@ class ImageConfig:
 
 
 def resized_part(
-    image: ByteArray, size: tuple[int, int], crop: tuple[int, int, int, int] | None, decode: Decoding
+    image: ByteArray,
+    size: tuple[int, int],
+    crop: tuple[int, int, int, int] | None,
+    decode: Decoding,
 ) -> ByteArray:
     """A part (top, left, height, width) of an image (H, W, 3) resized to `size`; None is all of it.
 
@@ -193,8 +220,12 @@ def resized_part(
     top, left, height, width = crop or (0, 0, *size)
     rows = _resampled(image.reshape(len(image), -1), size[0], range(top, top + height), decode)
     turned: Any = cv2.transpose(rows.reshape(height, -1, 3)).reshape(-1, 3 * height)
-    columns = _resampled(turned, size[1], range(left, left + width), decode).reshape(width, height, 3)
-    return np.stack([cv2.transpose(each) for each in cv2.split(columns)], dtype=np.uint8).transpose(1, 2, 0)
+    columns = _resampled(turned, size[1], range(left, left + width), decode).reshape(
+        width, height, 3
+    )
+    return np.stack([cv2.transpose(each) for each in cv2.split(columns)], dtype=np.uint8).transpose(
+        1, 2, 0
+    )
 
 
 def _resampled(rows: ByteArray, new: int, part: range, decode: Decoding) -> ByteArray:
@@ -220,7 +251,9 @@ def _resampled(rows: ByteArray, new: int, part: range, decode: Decoding) -> Byte
 
 
 @lru_cache
-def _groups(old: int, new: int, part: range, decode: Decoding) -> list[tuple[range, list[tuple[slice, float]]]]:
+def _groups(
+    old: int, new: int, part: range, decode: Decoding
+) -> list[tuple[range, list[tuple[slice, float]]]]:
     """Which of `new` rows are the same means of the `old` rows near them, and of which.
 
     Returns:
@@ -233,11 +266,18 @@ def _groups(old: int, new: int, part: range, decode: Decoding) -> list[tuple[ran
     edge = -((old - reach) // (2 * old))  # so many rows at both ends reach beyond the old ones
     inner = range(max(part.start, edge), min(part.stop, new - edge))
     groups = []
-    for made in [range(i, i + 1) for i in part if i not in inner] + [inner[i::step] for i in range(step) if inner[i:]]:
+    for made in [range(i, i + 1) for i in part if i not in inner] + [
+        inner[i::step] for i in range(step) if inner[i:]
+    ]:
         centre = (2 * made[0] + 1) * old
-        rows = range(max((centre - reach) // (2 * new), 0), min(-((-centre - reach) // (2 * new)), old))
+        rows = range(
+            max((centre - reach) // (2 * new), 0), min(-((-centre - reach) // (2 * new)), old)
+        )
         near = [reach - abs((2 * row + 1) * new - centre) for row in rows]
-        weights = [max(each, 0) if decode == "full" else min(each + new, 2 * min(old, new)) for each in near]
+        weights = [
+            max(each, 0) if decode == "full" else min(each + new, 2 * min(old, new))
+            for each in near
+        ]
         shares = [
             (slice(row, row + stride * (len(made) - 1) + 1, stride), weight / total)
             for row, weight, total in zip(rows, weights, accumulate(weights), strict=True)
@@ -247,12 +287,16 @@ def _groups(old: int, new: int, part: range, decode: Decoding) -> list[tuple[ran
     return groups
 
 
-def _pixels(name: str, given: Iterable[SupportsIndex], meaning: str, least: Sequence[int]) -> tuple[int, ...]:
+def _pixels(
+    name: str, given: Iterable[SupportsIndex], meaning: str, least: Sequence[int]
+) -> tuple[int, ...]:
     try:
         numbers = tuple(operator.index(number) for number in given)
     except TypeError:
         numbers = ()
-    if len(numbers) != len(least) or any(number < low for number, low in zip(numbers, least, strict=True)):
+    if len(numbers) != len(least) or any(
+        number < low for number, low in zip(numbers, least, strict=True)
+    ):
         raise ConfigError(f"{name}: expected {meaning} in pixels, found {given!r}")
     return numbers
 

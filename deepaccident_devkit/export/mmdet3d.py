@@ -46,11 +46,22 @@ if TYPE_CHECKING:
     from deepaccident_devkit.export.nuscenes.scenes import AgentScene, Van
 
 NUSCENES_CLASSES: Final = (
-    *("car", "truck", "trailer", "bus", "construction_vehicle", "bicycle", "motorcycle", "pedestrian"),
+    *(
+        "car",
+        "truck",
+        "trailer",
+        "bus",
+        "construction_vehicle",
+        "bicycle",
+        "motorcycle",
+        "pedestrian",
+    ),
     *("traffic_cone", "barrier"),
 )
 """NuScenes' ten classes, in the order of the client's labels."""
-LABELS: Final = MappingProxyType({"car": 0, "truck": 1, "cyclist": 5, "motorcycle": 6, "pedestrian": 7})
+LABELS: Final = MappingProxyType(
+    {"car": 0, "truck": 1, "cyclist": 5, "motorcycle": 6, "pedestrian": 7}
+)
 """Our class → its label; vans are said to be cars or trucks."""
 # How many clouds before a keyframe an info names at most: one second.
 _SWEEPS: Final = 10
@@ -71,7 +82,10 @@ class Mmdet3d(NuScenes):
             ExportError: there is none.
             ConfigError: its settings differ.
         """
-        if Manifest.of(folder, NuScenes, {**self.settings(), "version": dataset.version}).release is None:
+        if (
+            Manifest.of(folder, NuScenes, {**self.settings(), "version": dataset.version}).release
+            is None
+        ):
             raise ExportError(
                 f"{folder}: holds no complete nuscenes export, whose files the infos name; write it there first, with "
                 "the same settings"
@@ -79,11 +93,17 @@ class Mmdet3d(NuScenes):
 
     def write(self, dataset: Dataset, unit: Unit, output: Output) -> None:
         """Keep the infos of a scenario, a line each."""
-        infos = [info for scene in self.scenes(dataset, unit) for info in _infos(scene, self, output)]
+        infos = [
+            info for scene in self.scenes(dataset, unit) for info in _infos(scene, self, output)
+        ]
         output.tally.samples += len(infos)
-        write_bytes(output.parts / _PART, "".join(f"{json.dumps(info)}\n" for info in infos).encode())
+        write_bytes(
+            output.parts / _PART, "".join(f"{json.dumps(info)}\n" for info in infos).encode()
+        )
 
-    def finish(self, dataset: Dataset, units: Sequence[Unit], output: Output, parts: Callable[[Unit], Path]) -> None:
+    def finish(
+        self, dataset: Dataset, units: Sequence[Unit], output: Output, parts: Callable[[Unit], Path]
+    ) -> None:
         """Join the infos of each split that has some; `sample_idx` is an info's place in its file."""
         folders: dict[str, list[Path]] = {}
         for unit in units:
@@ -97,13 +117,20 @@ class Mmdet3d(NuScenes):
         }
         for split, places in sorted(folders.items()):
             pieces = (pickled_items([info]) for info in _placed(places))
-            with output.file(f"deepaccident_infos_{split}.pkl") as temporary, temporary.open("wb") as file:
+            with (
+                output.file(f"deepaccident_infos_{split}.pkl") as temporary,
+                temporary.open("wb") as file,
+            ):
                 write_joined(file, "data_list", pieces, {"metainfo": about})
 
 
 def _placed(folders: Iterable[Path]) -> Iterator[dict[str, Any]]:
     """The infos that units left in these folders, with their places."""
-    lines = (line for folder in folders for line in read_bytes(folder / _PART, "bundle").decode().splitlines())
+    lines = (
+        line
+        for folder in folders
+        for line in read_bytes(folder / _PART, "bundle").decode().splitlines()
+    )
     return ({"sample_idx": place, **json.loads(line)} for place, line in enumerate(lines))
 
 
@@ -123,7 +150,9 @@ def _infos(scene: AgentScene, form: NuScenes, output: Output) -> Iterator[dict[s
             ego_from_camera = scene.dataset.ego_from(sample, camera)
             images[channel] = {
                 "img_path": _file(scene, camera, number).name,
-                "cam2img": stored_camera(scene.dataset, f"{sample}/{camera}", file).intrinsic.tolist(),
+                "cam2img": stored_camera(
+                    scene.dataset, f"{sample}/{camera}", file
+                ).intrinsic.tolist(),
                 "lidar2cam": (ego_from_camera.inverse() @ ego_from_lidar).matrix.tolist(),
                 "cam2ego": ego_from_camera.matrix.tolist(),
                 "sample_data_token": token("sample_data", sample, camera),
@@ -131,7 +160,11 @@ def _infos(scene: AgentScene, form: NuScenes, output: Output) -> Iterator[dict[s
             }
         if number not in scene.files[LIDAR]:
             output.leave_out("point clouds that are not in this release (the infos name them)")
-        before = [each for each in range(number - 1, max(number - 1 - _SWEEPS, 0), -1) if each in scene.files[LIDAR]]
+        before = [
+            each
+            for each in range(number - 1, max(number - 1 - _SWEEPS, 0), -1)
+            if each in scene.files[LIDAR]
+        ]
         yield {
             "token": token("sample", sample),
             "timestamp": scene.stamp(number) / 1e6,
@@ -142,26 +175,39 @@ def _infos(scene: AgentScene, form: NuScenes, output: Output) -> Iterator[dict[s
                 "lidar2ego": ego_from_lidar.matrix.tolist(),
             },
             "images": images,
-            "lidar_sweeps": [_sweep(scene, each, lidar_from_world, ours_from_theirs) for each in before],
-            "instances": list(_instances(scene, sample, form.van, ours_from_theirs.inverse(), output)),
+            "lidar_sweeps": [
+                _sweep(scene, each, lidar_from_world, ours_from_theirs) for each in before
+            ],
+            "instances": list(
+                _instances(scene, sample, form.van, ours_from_theirs.inverse(), output)
+            ),
             "cam_instances": {},
             "deepaccident": {"scenario": scene.scenario, "agent": scene.agent, "frame": number},
         }
 
 
-def _sweep(scene: AgentScene, number: int, lidar_from_world: SE3, ours_from_theirs: SE3) -> dict[str, Any]:
+def _sweep(
+    scene: AgentScene, number: int, lidar_from_world: SE3, ours_from_theirs: SE3
+) -> dict[str, Any]:
     """A cloud before a keyframe, whose LiDAR frame is given.
 
     The client turns points by the transpose of `lidar2sensor` and subtracts its fourth column unturned. So that column
     is the way of the sensor, and not what the inverse would have.
     """
     sample = scene.sample(number)
-    lidar_from_sensor = lidar_from_world @ scene.dataset.world_from(sample, "lidar") @ ours_from_theirs
+    lidar_from_sensor = (
+        lidar_from_world @ scene.dataset.world_from(sample, "lidar") @ ours_from_theirs
+    )
     lidar_to_sensor = np.eye(4)
-    lidar_to_sensor[:3, :3], lidar_to_sensor[:3, 3] = lidar_from_sensor.rotation.T, -lidar_from_sensor.translation
+    lidar_to_sensor[:3, :3], lidar_to_sensor[:3, 3] = (
+        lidar_from_sensor.rotation.T,
+        -lidar_from_sensor.translation,
+    )
     return {
         "lidar_points": {
-            "lidar_path": str(_file(scene, LIDAR, number)),  # with its folder, by which the client knows keyframes
+            "lidar_path": str(
+                _file(scene, LIDAR, number)
+            ),  # with its folder, by which the client knows keyframes
             "lidar2ego": (scene.dataset.ego_from(sample, LIDAR) @ ours_from_theirs).matrix.tolist(),
             "lidar2sensor": lidar_to_sensor.tolist(),
         },
@@ -196,4 +242,6 @@ def _instances(
 
 def _file(scene: AgentScene, channel: str, number: int) -> PurePosixPath:
     """The path of a sensor file in the folder of the nuScenes export."""
-    return PurePosixPath(sensor_path(scene.name, channel, scene.stamp(number), key=scene.is_key(number)))
+    return PurePosixPath(
+        sensor_path(scene.name, channel, scene.stamp(number), key=scene.is_key(number))
+    )

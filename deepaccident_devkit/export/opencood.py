@@ -26,7 +26,12 @@ from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.export.format import Format, Output, Unit, some_of
 from deepaccident_devkit.export.frames import sensor_files, stored_camera
 from deepaccident_devkit.geometry import Boxes
-from deepaccident_devkit.geometry.conventions import camera_from_lidar_to_raw, flip_pose, inverses, stored_transforms
+from deepaccident_devkit.geometry.conventions import (
+    camera_from_lidar_to_raw,
+    flip_pose,
+    inverses,
+    stored_transforms,
+)
 from deepaccident_devkit.geometry.quaternions import to_matrix
 from deepaccident_devkit.release import read_lidar
 from deepaccident_devkit.release.store import ReleasePath
@@ -56,7 +61,12 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 # Our split → their folder.
-_SPLITS: Final[Mapping[str | None, str]] = {"train": "train", "val": "validate", "test": "test", None: "unknown"}
+_SPLITS: Final[Mapping[str | None, str]] = {
+    "train": "train",
+    "val": "validate",
+    "test": "test",
+    None: "unknown",
+}
 _AGENTS: Final = "agents.json"
 # Our camera → theirs. OPV2V has four: front, right rear, left rear, back; loaders leave out the other two.
 _CAMERA_NAMES: Final[Mapping[str, str]] = {
@@ -99,24 +109,42 @@ class OpenCood(Format):
 
     def write(self, dataset: Dataset, unit: Unit, output: Output) -> None:
         """Write a scenario's folder, which appears when it is whole."""
-        recording = _Recording(dataset, unit.scenarios[0], self.agents, self.ego, self.without_clouds)
+        recording = _Recording(
+            dataset, unit.scenarios[0], self.agents, self.ego, self.without_clouds
+        )
         recording.count(output)
         if recording.frames:  # loaders stop at a scenario without agents
             with output.whole_folder(f"{_SPLITS[recording.record['split']]}/{unit.name}") as folder:
                 folder.write("data_protocol.yaml", _yaml(recording.protocol()))
                 for agent in recording.agents:
                     self._write_agent(recording, agent, folder)
-        folders = [recording.folders[agent] for agent in recording.agents] if recording.frames else []
+        folders = (
+            [recording.folders[agent] for agent in recording.agents] if recording.frames else []
+        )
         facts = {"folders": folders, "written": recording.written, "samples": recording.samples}
         write_bytes(output.parts / _AGENTS, json.dumps(facts).encode())
 
-    def finish(self, dataset: Dataset, units: Sequence[Unit], output: Output, parts: Callable[[Unit], Path]) -> None:  # noqa: ARG002 - others need the release
+    def finish(
+        self,
+        dataset: Dataset,  # noqa: ARG002
+        units: Sequence[Unit],
+        output: Output,
+        parts: Callable[[Unit], Path],
+    ) -> None:
         """Write HEAL's assignment, by which all agents have the same sensors."""
-        facts = {unit.name: parsed_json(read_bytes(parts(unit) / _AGENTS, "bundle")) for unit in units}
-        found = {name: dict.fromkeys(each["folders"], "m1") for name, each in facts.items() if each["folders"]}
+        facts = {
+            unit.name: parsed_json(read_bytes(parts(unit) / _AGENTS, "bundle")) for unit in units
+        }
+        found = {
+            name: dict.fromkeys(each["folders"], "m1")
+            for name, each in facts.items()
+            if each["folders"]
+        }
         output.write("heter_modality_assign.json", f"{json.dumps(found, indent=1)}\n".encode())
 
-        written, samples = (sum(each[name] for each in facts.values()) for name in ("written", "samples"))
+        written, samples = (
+            sum(each[name] for each in facts.values()) for name in ("written", "samples")
+        )
         if 2 * written < samples:
             logger.warning(
                 "%d of %d samples, most of the export, are left out for lack of point clouds; unpack the archives of "
@@ -132,9 +160,13 @@ class OpenCood(Format):
         for number in recording.frames:
             stem, facts = f"{recording.folders[agent]}/{number:06d}", moments.facts(number, output)
             output.write(f"{stem}.yaml", _yaml(facts))
-            output.write(f"{stem}.json", json.dumps(facts).encode())  # CoAlign and HEAL read it in place of the yaml
+            output.write(
+                f"{stem}.json", json.dumps(facts).encode()
+            )  # CoAlign and HEAL read it in place of the yaml
             if number in files[LIDAR]:
-                output.write(f"{stem}.pcd", pcd_bytes(read_lidar(files[LIDAR][number][0], raw=True)))
+                output.write(
+                    f"{stem}.pcd", pcd_bytes(read_lidar(files[LIDAR][number][0], raw=True))
+                )
             for camera, name in _CAMERA_NAMES.items():
                 if number in files[camera]:
                     output.link(files[camera][number][0], f"{stem}_{name}.png")
@@ -163,7 +195,14 @@ class _Recording:
         written: how many of them are written: not all if clouds are missing.
     """
 
-    def __init__(self, dataset: Dataset, token: str, agents: Sequence[str], ego: str, without_clouds: bool) -> None:  # noqa: FBT001
+    def __init__(
+        self,
+        dataset: Dataset,
+        token: str,
+        agents: Sequence[str],
+        ego: str,
+        without_clouds: bool,  # noqa: FBT001
+    ) -> None:
         """Look which files of these agents are there, and choose what is written. Raises TokenError."""
         self.dataset, self.token = dataset, token
         self.record: ScenarioRecord = dataset.scenario[dataset.getind("scenario", token)]
@@ -174,7 +213,10 @@ class _Recording:
             if agent in agents
         }
         self._absent, self.samples = len(agents) - len(self._there), len(self._there) * len(numbers)
-        moments = {agent: set(numbers if without_clouds else files[LIDAR]) for agent, files in self._there.items()}
+        moments = {
+            agent: set(numbers if without_clouds else files[LIDAR])
+            for agent, files in self._there.items()
+        }
         self.agents = [agent for agent in self._there if moments[agent]]
         common = set(numbers).intersection(*(moments[agent] for agent in self.agents))
         self.frames = sorted(common) if self.agents else []
@@ -194,11 +236,17 @@ class _Recording:
 
     def protocol(self) -> dict[str, Any]:
         """Where the scenario comes from; no loader reads it."""
-        actors = {agent: self.dataset.get("agent", f"{self.token}/{agent}")["actor_id"] for agent in self.agents}
+        actors = {
+            agent: self.dataset.get("agent", f"{self.token}/{agent}")["actor_id"]
+            for agent in self.agents
+        }
         return {
             "source": "DeepAccident",
             "scenario": self.token,
-            "agents": {self.folders[agent]: {"name": agent, "actor_id": actor} for agent, actor in actors.items()},
+            "agents": {
+                self.folders[agent]: {"name": agent, "actor_id": actor}
+                for agent, actor in actors.items()
+            },
         }
 
     def count(self, output: Output) -> None:
@@ -206,9 +254,15 @@ class _Recording:
         output.tally.samples += self.written
         images = sum(map(self._count, CAMERAS))
         output.leave_out("agents of scenarios that are not in this release", self._absent)
-        output.leave_out("images that are not in this release", len(CAMERAS) * self.samples - images)
-        output.leave_out("point clouds that are not in this release", self.samples - self._count(LIDAR))
-        output.leave_out("samples of agents or moments without point clouds", self.samples - self.written)
+        output.leave_out(
+            "images that are not in this release", len(CAMERAS) * self.samples - images
+        )
+        output.leave_out(
+            "point clouds that are not in this release", self.samples - self._count(LIDAR)
+        )
+        output.leave_out(
+            "samples of agents or moments without point clouds", self.samples - self.written
+        )
         output.leave_out("files of the BEV camera", self._count(BEV_CAMERA))
 
     def _count(self, channel: str) -> int:
@@ -233,14 +287,20 @@ class _Moments:
             "boxes without LiDAR points": lambda boxes: boxes.num_lidar_pts > 0,
         }
         count = recording.record["num_frames"]
-        self.samples = [sample_token(recording.token, agent, number) for number in range(1, count + 1)]
+        self.samples = [
+            sample_token(recording.token, agent, number) for number in range(1, count + 1)
+        ]
         first = dataset.getind("sample", self.samples[0])
-        self._world_from_ego = stored_transforms(dataset.columns("ego_pose")["matrix"][first : first + count])
+        self._world_from_ego = stored_transforms(
+            dataset.columns("ego_pose")["matrix"][first : first + count]
+        )
         rows = slice(first * len(CHANNELS), (first + count) * len(CHANNELS))
         sensors = stored_transforms(dataset.columns("sample_data")["matrix"][rows])
         self._ego_from = sensors.reshape(count, len(CHANNELS), 4, 4)
         samples = dataset.columns("sample")
-        self._velocity, self._labelled = (samples[name][first : first + count] for name in ("velocity", "labelled"))
+        self._velocity, self._labelled = (
+            samples[name][first : first + count] for name in ("velocity", "labelled")
+        )
         self._extrinsic = {name: self._camera_from_lidar(name) for name in _CAMERA_NAMES}
 
     def facts(self, number: int, output: Output) -> dict[str, Any]:
@@ -249,7 +309,10 @@ class _Moments:
         ego = carla_six(self._world_from_ego[at]).tolist()
         world_from_lidar = self._world_from_ego[at] @ self._ego_from[at, CHANNELS.index(LIDAR)]
         return {
-            **{theirs: self._camera(ours, at, flip_pose(world_from_lidar)) for ours, theirs in _CAMERA_NAMES.items()},
+            **{
+                theirs: self._camera(ours, at, flip_pose(world_from_lidar))
+                for ours, theirs in _CAMERA_NAMES.items()
+            },
             "ego_speed": self._speed(at),
             "lidar_pose": carla_six(world_from_lidar).tolist(),
             "plan_trajectory": [  # where it went; a recording has no planned speed
@@ -277,7 +340,13 @@ class _Moments:
         center = np.column_stack([np.zeros((len(boxes), 2)), half[:, 2]])
         speed = np.linalg.norm(np.nan_to_num(boxes.velocity), axis=1) * _KMH
         return {
-            actor: {"angle": angle, "center": middle, "extent": extent, "location": location, "speed": kmh}
+            actor: {
+                "angle": angle,
+                "center": middle,
+                "extent": extent,
+                "location": location,
+                "speed": kmh,
+            }
             for actor, angle, middle, extent, location, kmh in zip(
                 boxes.actor_id.tolist(),
                 six[:, 3:].tolist(),
@@ -291,9 +360,13 @@ class _Moments:
 
     def _camera(self, name: str, at: int, raw_world_from_lidar: FloatArray) -> dict[str, Any]:
         lidar_to_camera = self._extrinsic[name][at]
-        lens = stored_camera(self._dataset, f"{self.samples[at]}/{name}", self._files[name].get(at + 1))
+        lens = stored_camera(
+            self._dataset, f"{self.samples[at]}/{name}", self._files[name].get(at + 1)
+        )
         return {
-            "cords": carla_six(flip_pose(raw_world_from_lidar @ inverses(lidar_to_camera))).tolist(),
+            "cords": carla_six(
+                flip_pose(raw_world_from_lidar @ inverses(lidar_to_camera))
+            ).tolist(),
             "extrinsic": lidar_to_camera.tolist(),
             "intrinsic": lens.intrinsic.tolist(),
         }
@@ -301,7 +374,9 @@ class _Moments:
     def _camera_from_lidar(self, name: str) -> FloatArray:
         """(N, 4, 4) LiDAR → camera in CARLA's axes, as calib files have it."""
         ego_from_camera = self._ego_from[:, CHANNELS.index(name)]
-        return camera_from_lidar_to_raw(inverses(ego_from_camera) @ self._ego_from[:, CHANNELS.index(LIDAR)])
+        return camera_from_lidar_to_raw(
+            inverses(ego_from_camera) @ self._ego_from[:, CHANNELS.index(LIDAR)]
+        )
 
     def _speed(self, at: int) -> float:
         """The agent's, in km/h: the label's; without a label by its positions."""

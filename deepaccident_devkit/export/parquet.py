@@ -58,13 +58,17 @@ class Parquet(Format):
         """Check the size of shards too."""
         super().__post_init__()
         if self.shard_scenarios < 1:
-            raise ConfigError(f"shard_scenarios: expected a number from 1, found {self.shard_scenarios}")
+            raise ConfigError(
+                f"shard_scenarios: expected a number from 1, found {self.shard_scenarios}"
+            )
 
     def units(self, dataset: Dataset, scenarios: Sequence[str]) -> list[Unit]:
         """A shard each."""
         return [
             Unit(name=f"{split}-{number:05d}-of-{len(groups):05d}", scenarios=group)
-            for split, groups in shards(dataset, dict.fromkeys(scenarios, 1), self.shard_scenarios).items()
+            for split, groups in shards(
+                dataset, dict.fromkeys(scenarios, 1), self.shard_scenarios
+            ).items()
             for number, group in enumerate(groups)
         ]
 
@@ -78,7 +82,10 @@ class Parquet(Format):
         output.tally.samples += len(rows["sample"])
         absent = len(unit.scenarios) * len(self.agents) - len(rows["agent"])
         output.leave_out("agents of scenarios that are not in this release", absent)
-        output.leave_out("samples of other agents", len(maker.rows(unit.scenarios)["sample"]) - len(rows["sample"]))
+        output.leave_out(
+            "samples of other agents",
+            len(maker.rows(unit.scenarios)["sample"]) - len(rows["sample"]),
+        )
 
     def finish(
         self,
@@ -90,10 +97,16 @@ class Parquet(Format):
         """Write the tables that all splits share, and the README.md."""
         maker = RecordTables(dataset)
         for table in _ONCE:
-            _write(output, f"{table}/{_ONLY_FILE}", iter([maker.table(table, np.arange(len(dataset.arrow(table))))]))
+            _write(
+                output,
+                f"{table}/{_ONLY_FILE}",
+                iter([maker.table(table, np.arange(len(dataset.arrow(table))))]),
+            )
         rows = {table: _rows_by_split(output.folder / table) for table in dataset.table_names}
         configs = [
-            {"config_name": table, "data_files": _data_files(table, found)} for table, found in rows.items() if found
+            {"config_name": table, "data_files": _data_files(table, found)}
+            for table, found in rows.items()
+            if found
         ]
         title = f"DeepAccident {dataset.version}: tables"
         output.write(README, readme(self, dataset, title, {"configs": configs}, _body(rows)))
@@ -115,7 +128,10 @@ def _write(output: Output, path: str, pieces: Iterator[Any]) -> None:
     from pyarrow.parquet import ParquetWriter
 
     first = next(pieces)
-    with output.file(path) as temporary, ParquetWriter(temporary, first.schema, compression="zstd") as writer:
+    with (
+        output.file(path) as temporary,
+        ParquetWriter(temporary, first.schema, compression="zstd") as writer,
+    ):
         for piece in chain([first], pieces):
             writer.write_table(piece)
 
@@ -142,8 +158,18 @@ def _body(rows: Mapping[str, Mapping[str, int]]) -> str:
     """What each table is, how many rows of it there are, and its columns."""
     lines = [_NOTES]
     for table, spec in table_specs().items():
-        counts = ", ".join(f"{count:,} rows in {split}" for split, count in rows[table].items()) or "no rows"
-        lines += [f"## {table}", "", f"{spec.doc} Here: {counts}.", "", "| column | what |", "|---|---|"]
+        counts = (
+            ", ".join(f"{count:,} rows in {split}" for split, count in rows[table].items())
+            or "no rows"
+        )
+        lines += [
+            f"## {table}",
+            "",
+            f"{spec.doc} Here: {counts}.",
+            "",
+            "| column | what |",
+            "|---|---|",
+        ]
         lines += [f"| `{column.field}` | {_meaning(column.kind)} |" for column in spec.columns]
         lines.append("")
     return "\n".join(lines)

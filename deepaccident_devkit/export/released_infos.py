@@ -29,7 +29,15 @@ from deepaccident_devkit.release.pickles import pickled_items, write_joined
 from deepaccident_devkit.support.files import write_bytes
 from deepaccident_devkit.support.reading import read_bytes
 from deepaccident_devkit.tables.tokens import frame_token
-from deepaccident_devkit.taxonomy import AGENTS, BEV_CAMERA, CAMERAS, CATEGORIES, CHANNEL_FORMAT, CHANNELS, LIDAR
+from deepaccident_devkit.taxonomy import (
+    AGENTS,
+    BEV_CAMERA,
+    CAMERAS,
+    CATEGORIES,
+    CHANNEL_FORMAT,
+    CHANNELS,
+    LIDAR,
+)
 from deepaccident_devkit.v2x.agents import agents_of
 
 logger = logging.getLogger(__name__)
@@ -103,7 +111,9 @@ class ReleasedInfos(Format):
             output.leave_out(fault)
             return
         record = dataset.get("scenario", token)
-        folder = ScenarioFolder(dataset.dataroot, record["folder"], record["scenario_type"], record["name"], AGENTS)
+        folder = ScenarioFolder(
+            dataset.dataroot, record["folder"], record["scenario_type"], record["name"], AGENTS
+        )
         empty: list[str] = []
         for agent in AGENTS:
             infos = list(_infos(folder, agent, _keyframes(dataset, token), self.root_prefix))
@@ -118,7 +128,9 @@ class ReleasedInfos(Format):
             write_bytes(output.parts / name, pickled_items(infos))
         write_bytes(output.parts / _EMPTY, "".join(f"{prefix}\n" for prefix in empty).encode())
 
-    def finish(self, dataset: Dataset, units: Sequence[Unit], output: Output, parts: Callable[[Unit], Path]) -> None:
+    def finish(
+        self, dataset: Dataset, units: Sequence[Unit], output: Output, parts: Callable[[Unit], Path]
+    ) -> None:
         """Join the parts of each split, in the order of `lidar_prefix`."""
         for split, version in _SPLITS.items():
             try:
@@ -127,10 +139,14 @@ class ReleasedInfos(Format):
                 continue
             folders = [parts(unit) for unit in units if unit.scenarios[0] in scenarios]
             paths = sorted(
-                (path for folder in folders for path in folder.glob(f"*{_ENDING}")), key=lambda path: path.name
+                (path for folder in folders for path in folder.glob(f"*{_ENDING}")),
+                key=lambda path: path.name,
             )
             if paths:
-                with output.file(f"carla_infos_{split}.pkl") as temporary, temporary.open("wb") as file:
+                with (
+                    output.file(f"carla_infos_{split}.pkl") as temporary,
+                    temporary.open("wb") as file,
+                ):
                     write_joined(
                         file,
                         "infos",
@@ -138,7 +154,9 @@ class ReleasedInfos(Format):
                         {"metadata": {"version": version}},
                     )
         empty = b"".join(
-            read_bytes(parts(unit) / _EMPTY, "bundle") for unit in units if (parts(unit) / _EMPTY).exists()
+            read_bytes(parts(unit) / _EMPTY, "bundle")
+            for unit in units
+            if (parts(unit) / _EMPTY).exists()
         )
         if empty:
             output.write(f"carla_infos_{_EMPTY}", empty)
@@ -160,18 +178,31 @@ def _fault(dataset: Dataset, scenario: str) -> str | None:
         return "scenarios that are neither in train nor in val"
     if agents_of(dataset, scenario) != AGENTS:
         return "scenarios without all five agents"
-    samples = [dataset.samples_of(frame_token(scenario, number)) for number in _keyframes(dataset, scenario)]
-    return None if all(sample["labelled"] for moment in samples for sample in moment) else "scenarios without labels"
+    samples = [
+        dataset.samples_of(frame_token(scenario, number))
+        for number in _keyframes(dataset, scenario)
+    ]
+    return (
+        None
+        if all(sample["labelled"] for moment in samples for sample in moment)
+        else "scenarios without labels"
+    )
 
 
-def _infos(folder: ScenarioFolder, agent: str, numbers: range, root_prefix: str) -> Iterator[dict[str, Any]]:
+def _infos(
+    folder: ScenarioFolder, agent: str, numbers: range, root_prefix: str
+) -> Iterator[dict[str, Any]]:
     """The infos of an agent's keyframes, with the converter's own keys."""
     calibs = [read_calib(folder.calib_path(agent, number), raw=True) for number in numbers]
-    name, place = folder.name.split("_"), "/".join(filter(None, (root_prefix, folder.folder, folder.scenario_type)))
+    name, place = (
+        folder.name.split("_"),
+        "/".join(filter(None, (root_prefix, folder.folder, folder.scenario_type))),
+    )
     for number, calib in zip(numbers, calibs, strict=True):
         stem = f"{folder.name}_{number:03d}"
         paths = {
-            channel: f"{place}/{agent}/{channel}/{folder.name}/{stem}.{CHANNEL_FORMAT[channel]}" for channel in CHANNELS
+            channel: f"{place}/{agent}/{channel}/{folder.name}/{stem}.{CHANNEL_FORMAT[channel]}"
+            for channel in CHANNELS
         }
         yield {
             "scenario_type": folder.scenario_type,

@@ -119,11 +119,15 @@ def sample_json(dataset: Dataset, sample: str, sizes: Mapping[str, tuple[int, in
         "agent": record["agent"],
         "frame": dataset.frame.get(record["frame_token"])["index"],
         "split": dataset.scenario.get(record["scenario_token"])["split"],
-        **{name: record[name] for name in ("timestamp", "time_to_end", "time_to_impact", "velocity")},
+        **{
+            name: record[name]
+            for name in ("timestamp", "time_to_end", "time_to_impact", "velocity")
+        },
         "world_from_ego": dataset.world_from(sample, "ego").matrix.tolist(),
         "ego_from_lidar": dataset.ego_from(sample, LIDAR).matrix.tolist(),
         "cameras": {
-            name: _camera(dataset, sample, camera, sizes.get(camera)) for camera, name in _CAMERA_NAMES.items()
+            name: _camera(dataset, sample, camera, sizes.get(camera))
+            for camera, name in _CAMERA_NAMES.items()
         },
         "labelled": record["labelled"],
         "boxes": _boxes(dataset, sample),
@@ -131,7 +135,9 @@ def sample_json(dataset: Dataset, sample: str, sizes: Mapping[str, tuple[int, in
     return json.dumps(facts, allow_nan=False).encode()
 
 
-def _camera(dataset: Dataset, sample: str, channel: str, size: tuple[int, int] | None) -> dict[str, Any]:
+def _camera(
+    dataset: Dataset, sample: str, channel: str, size: tuple[int, int] | None
+) -> dict[str, Any]:
     calibrated = dataset.camera(sample, channel)
     camera = calibrated if size is None else calibrated.resized(*size)
     return {
@@ -184,11 +190,15 @@ class WebDataset(Format):
         super().__post_init__()
         settle_choices(self, {"frames": get_args(FrameChoice)})
         if self.shard_size < 1:
-            raise ConfigError(f"shard_size: expected a number of bytes from 1, found {self.shard_size}")
+            raise ConfigError(
+                f"shard_size: expected a number of bytes from 1, found {self.shard_size}"
+            )
 
     def units(self, dataset: Dataset, scenarios: Sequence[str]) -> list[Unit]:
         """A shard each, by the sizes of the first files: all would take minutes."""
-        sizes = {scenario: _Recording(dataset, scenario, self).quick_size() for scenario in scenarios}
+        sizes = {
+            scenario: _Recording(dataset, scenario, self).quick_size() for scenario in scenarios
+        }
         return [
             Unit(name=f"{split}-{number:06d}", scenarios=group)
             for split, groups in shards(dataset, sizes, self.shard_size).items()
@@ -220,7 +230,9 @@ class WebDataset(Format):
             "configs": [{"config_name": "default", "data_files": files}],
             "dataset_info": {"features": _features(_TYPES)},
         }
-        text = readme(self, dataset, f"DeepAccident {dataset.version}: samples", head, _BODY + JSON_FIELDS)
+        text = readme(
+            self, dataset, f"DeepAccident {dataset.version}: samples", head, _BODY + JSON_FIELDS
+        )
         output.write(README, text)
 
 
@@ -235,7 +247,9 @@ class _Recording:
         """Look which agents are there."""
         self._dataset, self._scenario, self._wanted = dataset, scenario, form.agents
         self._last = dataset.scenario.get(scenario)["num_frames"]
-        self._numbers = keyframes(self._last) if form.frames == "keyframes" else range(1, self._last + 1)
+        self._numbers = (
+            keyframes(self._last) if form.frames == "keyframes" else range(1, self._last + 1)
+        )
         self._here = agents_of(dataset, scenario)
         self._agents: list[str] = [agent for agent in self._here if agent in form.agents]
         self.samples = len(self._agents) * len(self._numbers)
@@ -246,14 +260,18 @@ class _Recording:
         found = {}
         for agent, channel in product(self._agents, CHANNELS):
             files = sensor_files(self._dataset, self._scenario, agent, channel)
-            found[agent, channel] = {number: files[number] for number in self._numbers if number in files}
+            found[agent, channel] = {
+                number: files[number] for number in self._numbers if number in files
+            }
         return found
 
     def quick_size(self) -> int:
         """Bytes, as if all files were as large as the first ones."""
         size = self.samples * _FACTS_BYTES
         for agent, channel in product(self._agents, _IN_SHARDS):
-            path = self._dataset.sensor_path(sample_token(self._scenario, agent, self._numbers[0]), channel)
+            path = self._dataset.sensor_path(
+                sample_token(self._scenario, agent, self._numbers[0]), channel
+            )
             size += path.stat().st_size * len(self._numbers) if path.is_file() else 0
         return size
 
@@ -261,12 +279,21 @@ class _Recording:
         """Count the samples, and what is not written."""
         output.tally.samples += self.samples
         absent = [agent for agent in self._wanted if agent not in self._here]
-        counts = {channel: sum(len(self._files[agent, channel]) for agent in self._agents) for channel in CHANNELS}
+        counts = {
+            channel: sum(len(self._files[agent, channel]) for agent in self._agents)
+            for channel in CHANNELS
+        }
         images = sum(counts[camera] for camera in CAMERAS)
         output.leave_out("agents of scenarios that are not in this release", len(absent))
-        output.leave_out("samples of other agents", (len(self._here) - len(self._agents)) * len(self._numbers))
-        output.leave_out("samples between keyframes", (self._last - len(self._numbers)) * len(self._agents))
-        output.leave_out("images that are not in this release", len(CAMERAS) * self.samples - images)
+        output.leave_out(
+            "samples of other agents", (len(self._here) - len(self._agents)) * len(self._numbers)
+        )
+        output.leave_out(
+            "samples between keyframes", (self._last - len(self._numbers)) * len(self._agents)
+        )
+        output.leave_out(
+            "images that are not in this release", len(CAMERAS) * self.samples - images
+        )
         output.leave_out("point clouds that are not in this release", self.samples - counts[LIDAR])
         output.leave_out("files of the BEV camera", counts[BEV_CAMERA])
 
@@ -274,7 +301,9 @@ class _Recording:
         """Add the samples, those of a moment together."""
         for number, agent in product(self._numbers, self._agents):
             token = sample_token(self._scenario, agent, number)
-            key = token.replace("%", "%25").replace(".", "%2E")  # readers cut a name at its first dot
+            key = token.replace("%", "%25").replace(
+                ".", "%2E"
+            )  # readers cut a name at its first dot
             sizes = {}
             for camera, name in _CAMERA_NAMES.items():
                 if number in self._files[agent, camera]:

@@ -97,13 +97,17 @@ class BevGrid:
         if given.ndim != 2 or given.shape[1] not in (2, 3):
             raise GeometryError(f"points: expected shape (N, 2) or (N, 3), found {given.shape}")
         steps, inside = [], np.ones(len(given), dtype=bool)
-        for values, (low, high, size), count in zip(given.T, (self.x, self.y), self._counts, strict=False):
+        for values, (low, high, size), count in zip(
+            given.T, (self.x, self.y), self._counts, strict=False
+        ):
             within = (values >= low) & (values < high)
             cell = np.floor((np.where(within, values, low) - low) / size).astype(np.int64)
             steps.append(np.minimum(cell, count - 1))
             inside &= within
         along_x, along_y = steps
-        index = np.stack(cells_in(along_y, along_x, self._counts[::-1], "devkit", self.orientation), axis=1)
+        index = np.stack(
+            cells_in(along_y, along_x, self._counts[::-1], "devkit", self.orientation), axis=1
+        )
         index[~inside] = -1
         return index, inside
 
@@ -128,7 +132,9 @@ class BevGrid:
         target = self.with_orientation(orientation)
         array = as_numbers("raster", raster, dtype=None)
         if array.shape[-2:] != self.shape:
-            raise GeometryError(f"raster: expected shape (…, {self.shape[0]}, {self.shape[1]}), found {array.shape}")
+            raise GeometryError(
+                f"raster: expected shape (…, {self.shape[0]}, {self.shape[1]}), found {array.shape}"
+            )
         return _turned(_turned(array, self.orientation), target.orientation)
 
     def _laid_out(self, devkit: FloatArray) -> FloatArray:
@@ -146,7 +152,11 @@ def _turned(raster: AnyArray, orientation: Orientation) -> AnyArray:
 
 
 def cells_in(
-    row: AnyArray, column: AnyArray, shape: tuple[int, int], source: Orientation, target: Orientation
+    row: AnyArray,
+    column: AnyArray,
+    shape: tuple[int, int],
+    source: Orientation,
+    target: Orientation,
 ) -> tuple[AnyArray, AnyArray]:
     """Row and column in another orientation, of cells of one orientation with `shape` (rows, columns)."""
     rows, columns = shape
@@ -167,9 +177,13 @@ def _axis(name: str, given: Axis) -> Axis:
     try:
         low, high, size = (float(number) for number in given)
     except (TypeError, ValueError, OverflowError) as error:
-        raise ConfigError(f"{name}: expected start, end and cell size in metres, found {given!r}") from error
+        raise ConfigError(
+            f"{name}: expected start, end and cell size in metres, found {given!r}"
+        ) from error
     if not (low < high and 0 < size < math.inf and math.isfinite((high - low) / size)):
-        raise ConfigError(f"{name}: expected start < end and a cell size above 0 in metres, found {given!r}")
+        raise ConfigError(
+            f"{name}: expected start < end and a cell size above 0 in metres, found {given!r}"
+        )
     return low, high, size
 
 
@@ -180,7 +194,11 @@ def _cell_count(name: str, axis: Axis) -> int:
     if count > 0 and abs(cells - count) <= _WHOLE:
         return count
     shorter, longer = math.floor(cells), math.floor(cells) + 1
-    ends = [f"({low:g}, {low + number * size:g}, {size:g})" for number in (shorter, longer) if number > 0]
+    ends = [
+        f"({low:g}, {low + number * size:g}, {size:g})"
+        for number in (shorter, longer)
+        if number > 0
+    ]
     raise ConfigError(
         f"{name}: {low:g} to {high:g} m is not a whole number of cells of {size:g} m ({cells:.6g}); "
         f"{'the nearest that are' if len(ends) > 1 else 'the nearest that is'}: {' and '.join(ends)}"
@@ -188,7 +206,12 @@ def _cell_count(name: str, axis: Axis) -> int:
 
 
 def to_orientation(
-    array: AnyArray, *, vectors: bool, source: Orientation, target: Orientation, ignore: float | None = None
+    array: AnyArray,
+    *,
+    vectors: bool,
+    source: Orientation,
+    target: Orientation,
+    ignore: float | None = None,
 ) -> AnyArray:
     """Maps (…, H, W) of the orientation `source` in the orientation `target`; a view if no value changes.
 
@@ -210,7 +233,9 @@ def to_orientation(
     return _turned(result, target)
 
 
-def vectors_in(down: AnyArray, along: AnyArray, source: Orientation, target: Orientation) -> tuple[AnyArray, AnyArray]:
+def vectors_in(
+    down: AnyArray, along: AnyArray, source: Orientation, target: Orientation
+) -> tuple[AnyArray, AnyArray]:
     """The components down the rows and along the columns of one orientation, as those of another."""
     if source == "fiery":
         down, along = along, down

@@ -104,7 +104,9 @@ def gaps(first: FloatArray, second: FloatArray) -> FloatArray:
     result = np.zeros((len(first), len(second)))
     step = max(1, PAIRS_AT_ONCE // max(1, len(second)))
     for start in range(0, len(first), step):
-        result[start : start + step] = gaps_of_pairs(first[start : start + step, None], second[None])
+        result[start : start + step] = gaps_of_pairs(
+            first[start : start + step, None], second[None]
+        )
     return result
 
 
@@ -142,7 +144,10 @@ def _reaching(first: FloatArray, second: FloatArray) -> FloatArray:
     """The way (…, 2) to the first's nearest corner from the nearest place of the second."""
     x, y = _corners_in(first, second)
     half = second[..., 2:4, None] / 2
-    x, y = (values - np.clip(values, -half[..., axis, :], half[..., axis, :]) for axis, values in enumerate((x, y)))
+    x, y = (
+        values - np.clip(values, -half[..., axis, :], half[..., axis, :])
+        for axis, values in enumerate((x, y))
+    )
     nearest = (x**2 + y**2).argmin(axis=-1)[..., None]
     x, y = (np.take_along_axis(values, nearest, axis=-1)[..., 0] for values in (x, y))
     cosine, sine = np.cos(second[..., 4]), np.sin(second[..., 4])
@@ -168,7 +173,9 @@ def _areas_of_pairs(first: FloatArray, second: FloatArray) -> FloatArray:
     return result
 
 
-def _stretch_within(start: FloatArray, change: FloatArray, limit: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _stretch_within(
+    start: FloatArray, change: FloatArray, limit: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     """The part [t0, t1] of [0, 1] where |start + t·change| ≤ limit; if it is empty, t0 = t1."""
     divisor = np.where(change == 0, 1.0, change)  # with 0 the caller multiplies by 0 later
     with np.errstate(over="ignore"):
@@ -183,7 +190,8 @@ def _mean_of_clamped(start: FloatArray, change: FloatArray, limit: FloatArray) -
     at = [np.clip(start + t * change, -limit, limit) for t in (0.0, enters, leaves, 1.0)]
     steps = (enters, leaves - enters, 1 - leaves)
     total: FloatArray = sum(
-        (step * (a + b) / 2 for step, a, b in zip(steps, at, at[1:], strict=False)), start=np.zeros_like(start)
+        (step * (a + b) / 2 for step, a, b in zip(steps, at, at[1:], strict=False)),
+        start=np.zeros_like(start),
     )
     return total
 
@@ -275,13 +283,17 @@ def normals(yaw: FloatArray) -> FloatArray:
 
 def along(directions: FloatArray, vectors: FloatArray) -> FloatArray:
     """How far vectors (…, 2) go along each of their N directions (…, N, 2): (…, N)."""
-    result: FloatArray = directions[..., 0] * vectors[..., 0, None] + directions[..., 1] * vectors[..., 1, None]
+    result: FloatArray = (
+        directions[..., 0] * vectors[..., 0, None] + directions[..., 1] * vectors[..., 1, None]
+    )
     return result
 
 
 def half_extents(boxes: FloatArray, directions: FloatArray) -> FloatArray:
     """Half of the extents of boxes (…, 5) along each of their N unit directions (…, N, 2): (…, N) metres."""
-    lengthwise, across = (np.abs(along(directions, normals(yaw))) for yaw in np.moveaxis(side_yaws(boxes), -1, 0))
+    lengthwise, across = (
+        np.abs(along(directions, normals(yaw))) for yaw in np.moveaxis(side_yaws(boxes), -1, 0)
+    )
     result: FloatArray = lengthwise * boxes[..., 2, None] / 2 + across * boxes[..., 3, None] / 2
     return result
 
@@ -309,7 +321,9 @@ def points_in_boxes(
     return boxes[inside], near[rows[inside]]
 
 
-def _in_windows(x: FloatArray, y: FloatArray, low: FloatArray, high: FloatArray) -> tuple[IntArray, IntArray]:
+def _in_windows(
+    x: FloatArray, y: FloatArray, low: FloatArray, high: FloatArray
+) -> tuple[IntArray, IntArray]:
     """Every pair of a window (N,) and a point (P,) in it, seen from above."""
     step = max(1, _WINDOWS_AT_ONCE // max(1, len(x)))
     windows, rows = [np.zeros(0, dtype=np.int64)], [np.zeros(0, dtype=np.int64)]
@@ -330,7 +344,9 @@ def _near_any(points: FloatArray, low: FloatArray, high: FloatArray) -> IntArray
         return np.zeros(0, dtype=np.int64)
     low, high = low[windows, :2], high[windows, :2]
     origin, end = low.min(axis=0), high.max(axis=0)
-    scale = (_CELLS - 1) / np.maximum(end - origin, 1e-6)  # the width can be 0 after rounding of very large numbers
+    scale = (_CELLS - 1) / np.maximum(
+        end - origin, 1e-6
+    )  # the width can be 0 after rounding of very large numbers
     touched = np.zeros((_CELLS, _CELLS), dtype=bool)
     # points and windows go through the same rising function, so a point in a window is in a cell of the window
     first, last = ((low - origin) * scale).astype(int), ((high - origin) * scale).astype(int)

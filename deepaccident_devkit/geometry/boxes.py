@@ -26,7 +26,12 @@ from deepaccident_devkit.support.arrays import (
     checked,
     readonly,
 )
-from deepaccident_devkit.support.nuscenes_names import BOX, BOX_MADE, with_keywords_named, without_names
+from deepaccident_devkit.support.nuscenes_names import (
+    BOX,
+    BOX_MADE,
+    with_keywords_named,
+    without_names,
+)
 from deepaccident_devkit.support.text import Pictured
 from deepaccident_devkit.taxonomy import CAMERAS, CATEGORIES
 
@@ -34,7 +39,16 @@ if TYPE_CHECKING:
     from pyquaternion import Quaternion
 
 CORNER_SIGNS = np.array(
-    [[1, 1, 1], [1, -1, 1], [1, -1, -1], [1, 1, -1], [-1, 1, 1], [-1, -1, 1], [-1, -1, -1], [-1, 1, -1]],
+    [
+        [1, 1, 1],
+        [1, -1, 1],
+        [1, -1, -1],
+        [1, 1, -1],
+        [-1, 1, 1],
+        [-1, -1, 1],
+        [-1, -1, -1],
+        [-1, 1, -1],
+    ],
     dtype=np.float64,
 )
 """Signs of (length, width, height) of the eight corners: four in front, then four behind, each four clockwise from the
@@ -80,7 +94,11 @@ class Boxes(FrozenArrays, Pictured):
         count = len(checked("Boxes.center", self.center, (None, 3)))
         columns: dict[str, AnyArray] = {}
         for name, (shape, dtype) in BOX_COLUMNS.items():
-            given = box_arrays.category_codes(self.category) if name == "category" else getattr(self, name)
+            given = (
+                box_arrays.category_codes(self.category)
+                if name == "category"
+                else getattr(self, name)
+            )
             columns[name] = checked(f"Boxes.{name}", given, (count, *shape[1:]), dtype).copy()
         box_arrays.check_numbers(columns)
         columns["rotation"] = box_arrays.unit_quaternions(columns["rotation"])
@@ -116,7 +134,9 @@ class Boxes(FrozenArrays, Pictured):
         }
         unknown = set(given) - set(BOX_COLUMNS)
         if unknown:
-            raise GeometryError(f"Boxes has no column {sorted(unknown)}; it has {list(BOX_COLUMNS)}")
+            raise GeometryError(
+                f"Boxes has no column {sorted(unknown)}; it has {list(BOX_COLUMNS)}"
+            )
         return cls(
             frame=frame,
             center=center,  # type: ignore[arg-type]  # checked in __post_init__
@@ -164,13 +184,17 @@ class Boxes(FrozenArrays, Pictured):
 
     def __repr__(self) -> str:
         """Their number, frame and categories."""
-        counts = ", ".join(f"{count} {name}" for name, count in Counter(self.category_names).most_common())
+        counts = ", ".join(
+            f"{count} {name}" for name, count in Counter(self.category_names).most_common()
+        )
         return f"Boxes({len(self)} in {self.frame}{': ' if counts else ''}{counts})"
 
     @property
     def token(self) -> list[str] | None:
         """The tokens of the N annotations; None if the boxes are of several samples, or not of a release."""
-        return None if self.sample is None else [f"{self.sample}/{row}" for row in self.row.tolist()]
+        return (
+            None if self.sample is None else [f"{self.sample}/{row}" for row in self.row.tolist()]
+        )
 
     @property
     def yaw(self) -> FloatArray:
@@ -190,11 +214,15 @@ class Boxes(FrozenArrays, Pictured):
         """
         picked = np.asarray(which)
         if picked.ndim != 1:
-            raise GeometryError(f"expected a mask ({len(self)},) or an array of rows, found {which!r}")
+            raise GeometryError(
+                f"expected a mask ({len(self)},) or an array of rows, found {which!r}"
+            )
         try:
             return self._picked(picked if picked.size else np.zeros(0, dtype=np.int64))
         except IndexError as error:
-            raise GeometryError(f"{which!r} does not pick from {len(self)} boxes: {error}") from error
+            raise GeometryError(
+                f"{which!r} does not pick from {len(self)} boxes: {error}"
+            ) from error
 
     def transform(self, target_from_source: SE3, frame: str) -> Boxes:
         """The same boxes in another coordinate frame, with the same sizes. Raises GeometryError."""
@@ -279,11 +307,15 @@ class Boxes(FrozenArrays, Pictured):
 
     def _picked(self, which: slice | AnyArray) -> Boxes:
         """The boxes of a slice, a mask or an array of rows; raises numpy's IndexError."""
-        return trusted_boxes(self.frame, {name: getattr(self, name)[which] for name in BOX_COLUMNS}, self.sample)
+        return trusted_boxes(
+            self.frame, {name: getattr(self, name)[which] for name in BOX_COLUMNS}, self.sample
+        )
 
     def _points_within(self, points: FloatArray) -> tuple[IntArray, IntArray]:
         """Rows of boxes and rows of points (P, 3), one pair for each point in a box."""
-        return box_arrays.points_in_boxes(points, self.center, self.size / 2, quaternions.to_matrix(self.rotation))
+        return box_arrays.points_in_boxes(
+            points, self.center, self.size / 2, quaternions.to_matrix(self.rotation)
+        )
 
     def _footprints(self) -> FloatArray:
         return np.column_stack([self.center[:, :2], self.size[:, :2], self.yaw])
@@ -323,7 +355,9 @@ def concatenate(parts: list[Boxes], frame: str) -> Boxes:
     """All boxes of `parts`, in order; every part must be in `frame`."""
     for part in parts:
         if part.frame != frame:
-            raise GeometryError(f"boxes of frame {part.frame!r} cannot join those of {frame!r}; transform them first")
+            raise GeometryError(
+                f"boxes of frame {part.frame!r} cannot join those of {frame!r}; transform them first"
+            )
     samples = {part.sample for part in parts}
     return trusted_boxes(
         frame,
@@ -335,7 +369,9 @@ def concatenate(parts: list[Boxes], frame: str) -> Boxes:
 def _over_union(common: FloatArray, mine: FloatArray, theirs: FloatArray) -> FloatArray:
     """The shares (N, M) that common parts have of the unions of two sets of sizes, (N, axes) and (M, axes)."""
     union = mine.prod(axis=1)[:, None] + theirs.prod(axis=1) - common
-    return as_floats(np.divide(common, union, out=np.zeros_like(common), where=union > 0).clip(0, 1))
+    return as_floats(
+        np.divide(common, union, out=np.zeros_like(common), where=union > 0).clip(0, 1)
+    )
 
 
 def checked_boxes(name: str, boxes: object) -> Boxes:
@@ -359,13 +395,21 @@ class Box:
     __slots__ = ("_boxes", "instance_token", "token")
 
     def __init__(
-        self, boxes: Boxes, token: str | None = None, instance_token: str | None = None, **others: NoReturn
+        self,
+        boxes: Boxes,
+        token: str | None = None,
+        instance_token: str | None = None,
+        **others: NoReturn,
     ) -> None:
         """Wrap the only row of `boxes`; raises GeometryError if there are none or several, or these are no `Boxes`."""
         if others or not isinstance(boxes, Boxes):
-            raise GeometryError(f"a Box is one row of Boxes, found {type(boxes).__name__}; {BOX_MADE}")
+            raise GeometryError(
+                f"a Box is one row of Boxes, found {type(boxes).__name__}; {BOX_MADE}"
+            )
         if len(boxes) != 1:
-            raise GeometryError(f"a Box is one row of Boxes, found {len(boxes)}; pick one with boxes[i]")
+            raise GeometryError(
+                f"a Box is one row of Boxes, found {len(boxes)}; pick one with boxes[i]"
+            )
         self._boxes = boxes
         self.token = token
         self.instance_token = instance_token
@@ -489,7 +533,9 @@ class Box:
 
     def transform(self, target_from_source: SE3, frame: str) -> Box:
         """The same box in another frame. Raises GeometryError."""
-        return Box(self._boxes.transform(target_from_source, frame), self.token, self.instance_token)
+        return Box(
+            self._boxes.transform(target_from_source, frame), self.token, self.instance_token
+        )
 
     def __repr__(self) -> str:
         """Category, id, frame and pose on one line."""

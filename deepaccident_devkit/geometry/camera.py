@@ -64,7 +64,9 @@ class PinholeCamera(FrozenArrays):
         """Check the numbers; raises GeometryError."""
         intrinsic = checked("PinholeCamera.intrinsic", self.intrinsic, (3, 3)).copy()
         if not np.isfinite(intrinsic).all():
-            raise GeometryError(f"PinholeCamera.intrinsic: expected finite numbers, found {intrinsic.tolist()}")
+            raise GeometryError(
+                f"PinholeCamera.intrinsic: expected finite numbers, found {intrinsic.tolist()}"
+            )
         object.__setattr__(self, "intrinsic", readonly(intrinsic))
         for name in ("width", "height"):
             object.__setattr__(self, name, _pixels(f"PinholeCamera.{name}", getattr(self, name)))
@@ -79,9 +81,13 @@ class PinholeCamera(FrozenArrays):
         width, height = _pixels("width", width), _pixels("height", height)
         angle = checked_number("horizontal", horizontal, "a field of view in radians")
         if not 0 < angle < np.pi:
-            raise GeometryError(f"horizontal: expected a field of view between 0 and π radians, found {horizontal}")
+            raise GeometryError(
+                f"horizontal: expected a field of view between 0 and π radians, found {horizontal}"
+            )
         focal = width / 2 / np.tan(angle / 2)
-        return cls(np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]), width, height)
+        return cls(
+            np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]), width, height
+        )
 
     def resized(self, width: int, height: int) -> PinholeCamera:
         """The camera of the same picture at another size, pixels; raises GeometryError if that has no pixels."""
@@ -101,7 +107,12 @@ class PinholeCamera(FrozenArrays):
         return pixels, depth
 
     def in_image(
-        self, pixels: ArrayLike, depth: ArrayLike | None = None, *, min_depth: float = 0.0, margin: float = 0.0
+        self,
+        pixels: ArrayLike,
+        depth: ArrayLike | None = None,
+        *,
+        min_depth: float = 0.0,
+        margin: float = 0.0,
     ) -> BoolArray:
         """Which pixels (N, 2) lie in the image, 0 ≤ u < width and 0 ≤ v < height; NaN does not.
 
@@ -113,7 +124,9 @@ class PinholeCamera(FrozenArrays):
         """
         uv = checked("pixels", pixels, (None, 2))
         u, v = uv[:, 0], uv[:, 1]
-        inside: BoolArray = (u >= margin) & (u < self.width - margin) & (v >= margin) & (v < self.height - margin)
+        inside: BoolArray = (
+            (u >= margin) & (u < self.width - margin) & (v >= margin) & (v < self.height - margin)
+        )
         if depth is not None:
             inside &= checked("depth", depth, (len(uv),)) > min_depth
         return inside
@@ -139,7 +152,9 @@ class PinholeCamera(FrozenArrays):
         seen = self.in_image(pixels, depth, min_depth=VISIBLE_DEPTH).reshape(-1, 8)
         in_front = (depth > IN_FRONT_DEPTH).reshape(-1, 8).all(axis=1)
         levels = [in_front & seen.all(axis=1), in_front & seen.any(axis=1)]
-        return np.select(levels, [BoxVisibility.ALL, BoxVisibility.ANY], BoxVisibility.NONE).astype(np.int8)
+        return np.select(levels, [BoxVisibility.ALL, BoxVisibility.ANY], BoxVisibility.NONE).astype(
+            np.int8
+        )
 
     def boxes_in_image(self, boxes: Boxes, level: BoxVisibility = BoxVisibility.ANY) -> BoolArray:
         """Which of N boxes of this camera's optical frame meet `level`: (N,) bool.

@@ -23,7 +23,9 @@ def outlines(cells: BoolArray, origin: FloatArray, resolution: float) -> MultiPo
     import shapely
 
     column0, column1, row0, row1 = _rectangles(cells).T
-    joined = shapely.union_all(shapely.box(column0, row0, column1, row1))  # in whole numbers, so that all edges meet
+    joined = shapely.union_all(
+        shapely.box(column0, row0, column1, row1)
+    )  # in whole numbers, so that all edges meet
     placed = shapely.transform(joined, lambda corners: origin + corners * resolution)
     return multi_polygon(list(shapely.get_parts(placed)))
 

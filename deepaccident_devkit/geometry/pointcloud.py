@@ -94,7 +94,9 @@ class LidarPointCloud(FrozenArrays, Pictured):
         try:
             return replace(self, **{name: column[rows] for name, column in self._columns().items()})
         except IndexError as error:
-            raise GeometryError(f"{which!r} does not pick from {len(self)} points: {error}") from error
+            raise GeometryError(
+                f"{which!r} does not pick from {len(self)} points: {error}"
+            ) from error
 
     def crop(
         self,
@@ -114,7 +116,9 @@ class LidarPointCloud(FrozenArrays, Pictured):
             z: see `x`.
         """
         if grid is not None and not isinstance(grid, BevGrid):
-            raise GeometryError(f"grid: expected a BevGrid, found {grid!r}; ranges go by name, x=(start, end)")
+            raise GeometryError(
+                f"grid: expected a BevGrid, found {grid!r}; ranges go by name, x=(start, end)"
+            )
         keep = np.ones(len(self), dtype=bool) if grid is None else grid.index_of(self.xyz)[1]
         for name, values, limits in zip("xyz", self.xyz.T, (x, y, z), strict=True):
             if limits is not None:
@@ -157,11 +161,15 @@ def concatenate_clouds(parts: Sequence[LidarPointCloud], frame: str) -> LidarPoi
     """
     for part in parts:
         if part.frame != frame:
-            raise GeometryError(f"points of frame {part.frame!r} cannot join those of {frame!r}; transform them first")
+            raise GeometryError(
+                f"points of frame {part.frame!r} cannot join those of {frame!r}; transform them first"
+            )
     nothing = LidarPointCloud(np.zeros((0, 3)), np.zeros(0), frame, np.zeros(0), np.zeros(0))
     columns = [part._columns() for part in (nothing, *parts)]  # noqa: SLF001 - its own kind
     shared = [name for name in columns[0] if all(name in each for each in columns)]
-    return LidarPointCloud(**{name: np.concatenate([each[name] for each in columns]) for name in shared}, frame=frame)
+    return LidarPointCloud(
+        **{name: np.concatenate([each[name] for each in columns]) for name in shared}, frame=frame
+    )
 
 
 def _within(name: str, values: FloatArray, limits: CoordinateRange) -> BoolArray:

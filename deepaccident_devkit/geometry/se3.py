@@ -12,7 +12,14 @@ from numpy.typing import ArrayLike
 from deepaccident_devkit.errors import GeometryError
 from deepaccident_devkit.geometry import conventions, quaternions
 from deepaccident_devkit.geometry.conventions import LAST_ROW, inverses
-from deepaccident_devkit.support.arrays import FloatArray, FrozenArrays, as_numbers, checked, checked_number, readonly
+from deepaccident_devkit.support.arrays import (
+    FloatArray,
+    FrozenArrays,
+    as_numbers,
+    checked,
+    checked_number,
+    readonly,
+)
 
 if TYPE_CHECKING:
     from pyquaternion import Quaternion
@@ -74,12 +81,16 @@ class SE3(FrozenArrays):
         return cls(matrix)
 
     @classmethod
-    def from_quaternion(cls, quaternion: Quaternion, translation: ArrayLike = (0.0, 0.0, 0.0)) -> SE3:
+    def from_quaternion(
+        cls, quaternion: Quaternion, translation: ArrayLike = (0.0, 0.0, 0.0)
+    ) -> SE3:
         """From a unit quaternion (pyquaternion's, or four numbers w, x, y, z) and a translation (3,), metres."""
         wxyz = checked("quaternion", getattr(quaternion, "elements", quaternion), (4,))
         norm = float(np.linalg.norm(wxyz))
         if not np.isfinite(norm) or norm < RIGID_TOLERANCE:
-            raise GeometryError(f"quaternion: {wxyz.tolist()} has no direction; give a unit quaternion w, x, y, z")
+            raise GeometryError(
+                f"quaternion: {wxyz.tolist()} has no direction; give a unit quaternion w, x, y, z"
+            )
         return cls.from_rotation(quaternions.to_matrix(wxyz / norm), translation)
 
     @classmethod
@@ -158,8 +169,12 @@ class SE3(FrozenArrays):
         if not isinstance(points, np.ndarray) and isinstance(points, Movable):
             return points.transform(self, points.frame if frame is None else frame)
         if frame is not None:
-            raise GeometryError(f"frame: points of an array carry no name of a frame, found {frame!r}; leave it out")
-        given = as_numbers("points", points, "points of shape (N, 3) or (3,), boxes or a point cloud")
+            raise GeometryError(
+                f"frame: points of an array carry no name of a frame, found {frame!r}; leave it out"
+            )
+        given = as_numbers(
+            "points", points, "points of shape (N, 3) or (3,), boxes or a point cloud"
+        )
         if given.ndim == 0 or given.ndim > 2 or given.shape[-1] != 3:
             hint = "; of a matrix (4, 4) make SE3(matrix)" if given.shape == (4, 4) else ""
             hint = "; transpose it (.T)" if given.ndim == 2 and given.shape[0] == 3 else hint
@@ -183,7 +198,9 @@ class SE3(FrozenArrays):
     def __matmul__(self, other: ArrayLike) -> FloatArray: ...
     def __matmul__(self, other: Any) -> Any:
         """Compose: `a_from_b @ b_from_c` is `a_from_c`; with points (N, 3), boxes or a point cloud, `apply`."""
-        return trusted_se3(self.matrix @ other.matrix) if isinstance(other, SE3) else self.apply(other)
+        return (
+            trusted_se3(self.matrix @ other.matrix) if isinstance(other, SE3) else self.apply(other)
+        )
 
     def __repr__(self) -> str:
         """Translation and yaw."""

@@ -23,7 +23,13 @@ from deepaccident_devkit.interactions.measures import (
     time_to_collision_1d,
 )
 from deepaccident_devkit.interactions.table import InteractionConfig
-from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray, FrozenArrays, IntArray
+from deepaccident_devkit.support.arrays import (
+    AnyArray,
+    BoolArray,
+    FloatArray,
+    FrozenArrays,
+    IntArray,
+)
 from deepaccident_devkit.tables import displacement_velocities
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 from deepaccident_devkit.v2x.tracks import ScenarioTracks
@@ -73,7 +79,9 @@ def actor_motion(tracks: ScenarioTracks, num_frames: int, config: InteractionCon
         moves: BoolArray = np.hypot(velocity[..., 0], velocity[..., 1]) > config.standing_speed
     return ActorMotion(
         ids=ids,
-        masses=masses_of(boxes.category[rows], _median_sizes(boxes.size, actor, len(ids)), config.class_masses),
+        masses=masses_of(
+            boxes.category[rows], _median_sizes(boxes.size, actor, len(ids)), config.class_masses
+        ),
         boxes=dense,
         velocity=velocity,
         speed=speed,
@@ -95,7 +103,9 @@ def _velocities(tracks: ScenarioTracks) -> FloatArray:
 
 def _median_sizes(sizes: FloatArray, actor: IntArray, count: int) -> FloatArray:
     """(A, 3) medians: a pedestrian's box changes its size with the steps."""
-    return np.array([np.median(sizes[actor == each], axis=0) for each in range(count)]).reshape(-1, 3)
+    return np.array([np.median(sizes[actor == each], axis=0) for each in range(count)]).reshape(
+        -1, 3
+    )
 
 
 def _accelerations(speed: FloatArray) -> FloatArray:
@@ -155,7 +165,9 @@ def measured_pairs(motion: ActorMotion, config: InteractionConfig) -> Measured:
     )
 
 
-def pair_summaries(motion: ActorMotion, measured: Measured, config: InteractionConfig) -> dict[str, AnyArray]:
+def pair_summaries(
+    motion: ActorMotion, measured: Measured, config: InteractionConfig
+) -> dict[str, AnyArray]:
     """The columns of `InteractionPairRecord` by name: least and most over frames; frames as positions, −1 for none."""
     values = measured.values
     ttc, gap = _filled(values["ttc"], np.inf), _filled(values["gap"], np.inf)
@@ -217,13 +229,17 @@ def _may_be_under(motion: ActorMotion, pairs: IntArray, config: InteractionConfi
         return counts & (distance <= config.radius) & near
 
 
-def _under(motion: ActorMotion, sides: list[tuple[IntArray, IntArray]], config: InteractionConfig) -> BoolArray:
+def _under(
+    motion: ActorMotion, sides: list[tuple[IntArray, IntArray]], config: InteractionConfig
+) -> BoolArray:
     """Whether pairs, given by (actors, frames) of each side, are under a threshold."""
     boxes, velocity = ([array[side] for side in sides] for array in (motion.boxes, motion.velocity))
     return _within(boxes, gaps_of_pairs(*boxes), time_to_collision(*boxes, *velocity), config)
 
 
-def _within(boxes: list[FloatArray], gap: FloatArray, ttc: FloatArray, config: InteractionConfig) -> BoolArray:
+def _within(
+    boxes: list[FloatArray], gap: FloatArray, ttc: FloatArray, config: InteractionConfig
+) -> BoolArray:
     apart = boxes[1][:, :2] - boxes[0][:, :2]
     within: BoolArray = np.hypot(apart[:, 0], apart[:, 1]) <= config.radius
     return within & ((ttc <= config.max_ttc) | (gap <= config.max_gap))
@@ -234,10 +250,15 @@ def _values(
 ) -> tuple[dict[str, FloatArray], BoolArray]:
     """The measures of pairs at frames, given by (actors, frames) of each side; and which are under a threshold."""
     boxes, velocity = ([array[side] for side in sides] for array in (motion.boxes, motion.velocity))
-    speed, acceleration = ([array[side] for side in sides] for array in (motion.speed, motion.acceleration))
+    speed, acceleration = (
+        [array[side] for side in sides] for array in (motion.speed, motion.acceleration)
+    )
     gap = gaps_of_pairs(*boxes)
     ttc = _until(time_to_collision(*boxes, *velocity), config)
-    one_way = [time_to_collision_1d(*boxes, *velocity), time_to_collision_1d(*boxes[::-1], *velocity[::-1])]
+    one_way = [
+        time_to_collision_1d(*boxes, *velocity),
+        time_to_collision_1d(*boxes[::-1], *velocity[::-1]),
+    ]
     values = {
         "gap": gap,
         "closing_speed": closing_speed_of_boxes(*boxes, *velocity),
@@ -255,7 +276,9 @@ def _until(times: FloatArray, config: InteractionConfig) -> FloatArray:
     return np.where(times > config.horizon, np.inf, times)
 
 
-def _moves_as_one(motion: ActorMotion, pairs: IntArray, gap: FloatArray, config: InteractionConfig) -> BoolArray:
+def _moves_as_one(
+    motion: ActorMotion, pairs: IntArray, gap: FloatArray, config: InteractionConfig
+) -> BoolArray:
     """(L,) whether two touch at all frames that count, and are never faster relative to each other than who stands."""
     speed = relative_speed(motion.velocity[pairs[:, 0]], motion.velocity[pairs[:, 1]])
     with np.errstate(invalid="ignore"):
@@ -274,4 +297,6 @@ def _least(values: FloatArray) -> FloatArray:
 
 def _first_least(values: FloatArray) -> IntArray:
     """(L,) positions of the first least of (L, F)."""
-    return np.asarray(values.argmin(axis=1)) if values.size else np.zeros(len(values), dtype=np.int64)
+    return (
+        np.asarray(values.argmin(axis=1)) if values.size else np.zeros(len(values), dtype=np.int64)
+    )

@@ -11,7 +11,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from deepaccident_devkit.geometry.box_arrays import along, half_extents, normals, side_gaps, side_yaws
+from deepaccident_devkit.geometry.box_arrays import (
+    along,
+    half_extents,
+    normals,
+    side_gaps,
+    side_yaws,
+)
 from deepaccident_devkit.support.arrays import BoolArray, FloatArray, FrozenArrays, IntArray
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
@@ -134,10 +140,14 @@ def _swept(
     return begin + way / 2, np.abs(way) / 2 + half_extents(box, normal)
 
 
-def _extents(normal: FloatArray, middle: FloatArray, half: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _extents(
+    normal: FloatArray, middle: FloatArray, half: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     """The area within N strips (…, N): its least and most (…, N) along the normal (…, N, 2) of each."""
     across = np.stack([-normal[..., 1], normal[..., 0]], axis=-1)
-    along_each, across_each = (np.einsum("...nk,...mk->...mn", normal, other) for other in (normal, across))
+    along_each, across_each = (
+        np.einsum("...nk,...mk->...mn", normal, other) for other in (normal, across)
+    )
     return _range_of(-middle[..., None, :], across_each, along_each, half[..., None, :])
 
 
@@ -150,7 +160,11 @@ def _times_inside(
 ) -> tuple[FloatArray, FloatArray]:
     """When a moving box first and last touches an area, given by directions and its least and most along them."""
     normal, least, most = area
-    start, speed, half = along(normal, box[..., :2] - origin), along(normal, velocity), half_extents(box, normal)
+    start, speed, half = (
+        along(normal, box[..., :2] - origin),
+        along(normal, velocity),
+        half_extents(box, normal),
+    )
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         ends = np.stack([(least - half - start) / speed, (most + half - start) / speed])
     still = np.abs(speed) < _PARALLEL
@@ -159,7 +173,9 @@ def _times_inside(
     return np.clip(begin, 0, window), np.clip(end, 0, window)
 
 
-def _range_of(g: FloatArray, a: FloatArray, b: FloatArray, r: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _range_of(
+    g: FloatArray, a: FloatArray, b: FloatArray, r: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     """The least and most d (…) for which some t lies in all N strips |g + a·t + b·d| ≤ r, given by (…, N) each.
 
     Each strip bounds a·t from below and above; each lower bound must be within each upper one.
@@ -234,7 +250,9 @@ def recorded_pet(first: Pieces, second: Pieces) -> float:
     """
     one, other = np.nonzero(_near(first, second))
     one, other = _crossing(first, second, one, other)
-    apart = np.maximum(second.spans[other, 0] - first.spans[one, 1], first.spans[one, 0] - second.spans[other, 1])
+    apart = np.maximum(
+        second.spans[other, 0] - first.spans[one, 1], first.spans[one, 0] - second.spans[other, 1]
+    )
     order = np.argsort(apart, kind="stable")
     best = np.inf
     for start in range(0, len(order), _ROUND):
@@ -261,7 +279,9 @@ def _near(first: Pieces, second: Pieces) -> BoolArray:
     return np.asarray((apart**2).sum(axis=-1) <= reach**2)
 
 
-def _crossing(first: Pieces, second: Pieces, one: IntArray, other: IntArray) -> tuple[IntArray, IntArray]:
+def _crossing(
+    first: Pieces, second: Pieces, one: IntArray, other: IntArray
+) -> tuple[IntArray, IntArray]:
     """Those pairs of pieces that no direction of a side parts at all times."""
     normal, gap, reach = side_gaps(first.boxes[one], second.boxes[other])
     ways = [

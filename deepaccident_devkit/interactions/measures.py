@@ -58,7 +58,9 @@ def drac_1d(
     return _known(np.where(meets, rates, 0.0), closing)
 
 
-def drac(first: FloatArray, second: FloatArray, first_velocity: FloatArray, second_velocity: FloatArray) -> FloatArray:
+def drac(
+    first: FloatArray, second: FloatArray, first_velocity: FloatArray, second_velocity: FloatArray
+) -> FloatArray:
     """Deceleration rate to avoid a crash in the plane, m/s²: the relative speed over twice the time to collision.
 
     Returns:
@@ -122,7 +124,10 @@ def closing_speed_of_boxes(
 
 
 def delta_v(
-    first_velocity: FloatArray, second_velocity: FloatArray, first_mass: FloatArray, second_mass: FloatArray
+    first_velocity: FloatArray,
+    second_velocity: FloatArray,
+    first_mass: FloatArray,
+    second_mass: FloatArray,
 ) -> FloatArray:
     """How much the velocity of the first and of the second would change if they collided now: (…, 2) m/s.
 
@@ -137,7 +142,9 @@ def impact_heading(first: FloatArray, second: FloatArray) -> FloatArray:
     return wrapped(second[..., 4] - first[..., 4])
 
 
-def impact_direction(first: FloatArray, first_velocity: FloatArray, second_velocity: FloatArray) -> FloatArray:
+def impact_direction(
+    first: FloatArray, first_velocity: FloatArray, second_velocity: FloatArray
+) -> FloatArray:
     """The direction (…,) in which the first moves relative to the second, as the first sees it, in (−π, π].
 
     0 is straight ahead. NaN where there is no relative motion.
@@ -155,7 +162,9 @@ def time_exposed(times: FloatArray, threshold: float, step: float) -> FloatArray
 def time_integrated(times: FloatArray, threshold: float, step: float) -> FloatArray:
     """Time integrated TIT (…,), s²: sum of (threshold − time) · step over moments (…, T) within a threshold."""
     below = np.asarray(times) <= threshold
-    return np.asarray(np.where(below, threshold - np.where(below, times, 0.0), 0.0).sum(axis=-1) * step)
+    return np.asarray(
+        np.where(below, threshold - np.where(below, times, 0.0), 0.0).sum(axis=-1) * step
+    )
 
 
 def nearest_approach(
@@ -183,9 +192,9 @@ def nearest_approach(
     first, second = np.broadcast_arrays(first, second)
     motion = np.broadcast_to(second_velocity - first_velocity, (*first.shape[:-1], 2))
     touch = time_to_collision(first, second, first_velocity, second_velocity)
-    ways = (corner_offsets(second)[..., :, None, :] - corner_offsets(first)[..., None, :, :]).reshape(
-        *first.shape[:-1], 16, 2
-    ) + (second[..., :2] - first[..., :2])[..., None, :]
+    ways = (
+        corner_offsets(second)[..., :, None, :] - corner_offsets(first)[..., None, :, :]
+    ).reshape(*first.shape[:-1], 16, 2) + (second[..., :2] - first[..., :2])[..., None, :]
     speed = (motion**2).sum(axis=-1)[..., None]
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         passing = np.where(speed > 0, -along(ways, motion) / speed, 0.0).clip(0, horizon)
@@ -231,7 +240,9 @@ def modified_ttc(
     given = (first_speed, second_speed, first_acceleration, second_acceleration)
     shape = np.broadcast_shapes(first.shape[:-1], second.shape[:-1], *map(np.shape, given))
     motion = np.stack([np.broadcast_to(each, shape).ravel() for each in given], axis=-1)
-    first, second = (np.broadcast_to(boxes, (*shape, 5)).reshape(-1, 5) for boxes in (first, second))
+    first, second = (
+        np.broadcast_to(boxes, (*shape, 5)).reshape(-1, 5) for boxes in (first, second)
+    )
     parts = [slice(start, start + _PAIRS_AT_ONCE) for start in range(0, len(first), _PAIRS_AT_ONCE)]
     times = [_accelerated(first[part], second[part], motion[part]) for part in parts]
     return np.concatenate([np.zeros(0), *times]).reshape(shape)
@@ -289,7 +300,8 @@ def _accelerated(first: FloatArray, second: FloatArray, motion: FloatArray) -> F
     speeds, rates = motion[:, :2], motion[:, 2:]
     stops = _stops(speeds, rates)
     shares = [  # of the way of each, along a side
-        sign * along(normal, normals(box[:, 4]))[:, :, None] for sign, box in ((-1.0, first), (1.0, second))
+        sign * along(normal, normals(box[:, 4]))[:, :, None]
+        for sign, box in ((-1.0, first), (1.0, second))
     ]
     edges = np.concatenate([np.zeros((len(first), 1)), np.sort(stops, axis=1)], axis=1)
     candidates = [np.zeros((len(first), 1))]
@@ -304,7 +316,9 @@ def _accelerated(first: FloatArray, second: FloatArray, motion: FloatArray) -> F
         offsets = np.concatenate([constant - reach, constant + reach], axis=1)
         times = begin + np.hstack([*_roots(np.tile(square, 2), np.tile(linear, 2), offsets)])
         candidates.append(np.where(times >= 0, times, np.inf))
-    return np.where(np.isnan(motion).any(axis=1), np.nan, _first_touch(candidates, (gap, reach), shares, motion))
+    return np.where(
+        np.isnan(motion).any(axis=1), np.nan, _first_touch(candidates, (gap, reach), shares, motion)
+    )
 
 
 def _first_touch(
@@ -319,7 +333,10 @@ def _first_touch(
     stops = _stops(speeds, rates)
     times = np.concatenate(candidates, axis=1)
     touch = np.isfinite(times)
-    ways = [_travelled(times, *(each[:, which, None] for each in (speeds, rates, stops))) for which in (0, 1)]
+    ways = [
+        _travelled(times, *(each[:, which, None] for each in (speeds, rates, stops)))
+        for which in (0, 1)
+    ]
     for side in range(4):
         distance = shares[0][:, side] * ways[0] + shares[1][:, side] * ways[1] + gap[:, side, None]
         with np.errstate(invalid="ignore"):
@@ -339,7 +356,9 @@ def _stops(speeds: FloatArray, rates: FloatArray) -> FloatArray:
     return np.where((speeds == 0) & (rates <= 0), 0.0, braking)
 
 
-def _travelled(times: FloatArray, speeds: FloatArray, rates: FloatArray, stops: FloatArray) -> FloatArray:
+def _travelled(
+    times: FloatArray, speeds: FloatArray, rates: FloatArray, stops: FloatArray
+) -> FloatArray:
     """Way along the heading at times, which stays where it stops; of infinite times those of 0."""
     until = np.minimum(np.where(np.isfinite(times), times, 0.0), stops)
     return np.asarray(speeds * until + rates * until**2 / 2)

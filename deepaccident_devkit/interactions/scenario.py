@@ -68,7 +68,9 @@ def keep(dataset: Dataset, found: Interactions) -> bool:
     """Write the file of a scenario's interactions; whether that could be done."""
     if not dataset.tables_folder.is_dir():  # made again meanwhile
         return False
-    content = streams(list(zip(interaction_specs().values(), _to_columns(dataset, found), strict=True)))
+    content = streams(
+        list(zip(interaction_specs().values(), _to_columns(dataset, found), strict=True))
+    )
     try:
         _store(dataset).keep(found.scenario, _key(found.config), content)
     except OSError as error:
@@ -149,10 +151,16 @@ def _keys(dataset: Dataset, scenario: str) -> tuple[int, Any, int]:
     row = dataset.getind("scenario", scenario)
     instances = dataset.columns("instance")
     first, last = instances["scenario_row"].searchsorted((row, row + 1))
-    return dataset.columns("scenario")["first_frame_row"].item(row), instances["actor_id"][first:last], int(first)
+    return (
+        dataset.columns("scenario")["first_frame_row"].item(row),
+        instances["actor_id"][first:last],
+        int(first),
+    )
 
 
-def interactions(dataset: Dataset, scenario: RowArgument, config: InteractionConfig | None = None) -> Interactions:
+def interactions(
+    dataset: Dataset, scenario: RowArgument, config: InteractionConfig | None = None
+) -> Interactions:
     """The pairs of a scenario's road users that come near each other: how near, how fast, how soon they would touch.
 
     Seen from above, from the labels of all agents (`track`). With the default config they are computed once and kept
@@ -216,7 +224,10 @@ def interactions_of(
 
 
 def _in_turn(
-    dataset: Dataset, tokens: Sequence[str], absent: Collection[str], made: Generator[Interactions, None, None]
+    dataset: Dataset,
+    tokens: Sequence[str],
+    absent: Collection[str],
+    made: Generator[Interactions, None, None],
 ) -> Iterator[Interactions]:
     """Those that were absent as they are made, the others as they are kept."""
     with closing(made):
@@ -240,18 +251,27 @@ _MEASURES: Final[Mapping[str, Callable[[InteractionPairs, BoolArray], float]]] =
 def measures_of_moving_pairs(found: Interactions) -> dict[str, float | None]:
     """These measures of a scenario's interactions; None without labels."""
     moving = found.pairs.moving
-    return {name: measure(found.pairs, moving) if found.labelled else None for name, measure in _MEASURES.items()}
+    return {
+        name: measure(found.pairs, moving) if found.labelled else None
+        for name, measure in _MEASURES.items()
+    }
 
 
-def each_of_moving_pairs(name: str, dataset: Dataset, scenarios: Sequence[RowArgument]) -> Iterator[float | None]:
+def each_of_moving_pairs(
+    name: str, dataset: Dataset, scenarios: Sequence[RowArgument]
+) -> Iterator[float | None]:
     """One of these measures of each scenario, in their order."""
     for found in interactions_of(dataset, scenarios, progress=len(scenarios) >= _WORTH_A_BAR):
         yield measures_of_moving_pairs(found)[name]
 
 
-def least_times(dataset: Dataset, scenarios: Sequence[RowArgument], **how: Unpack[Engine]) -> list[FloatArray]:
+def least_times(
+    dataset: Dataset, scenarios: Sequence[RowArgument], **how: Unpack[Engine]
+) -> list[FloatArray]:
     """The least times to collision (L,) of each scenario's moving pairs, seconds; `how` as of `interactions_of`."""
-    return [each.pairs.min_ttc[each.pairs.moving] for each in interactions_of(dataset, scenarios, **how)]
+    return [
+        each.pairs.min_ttc[each.pairs.moving] for each in interactions_of(dataset, scenarios, **how)
+    ]
 
 
 def interactions_of_tracks(

@@ -16,7 +16,14 @@ import numpy as np
 
 from deepaccident_devkit.collisions.recorded import CLASS_MASSES
 from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray, FrozenArrays, IntArray, checked_number
+from deepaccident_devkit.support.arrays import (
+    AnyArray,
+    BoolArray,
+    FloatArray,
+    FrozenArrays,
+    IntArray,
+    checked_number,
+)
 from deepaccident_devkit.tables.columns import Key, Number, TableSpec, Vector
 from deepaccident_devkit.tables.records import spec_of
 from deepaccident_devkit.tables.tokens import frame_token, instance_token
@@ -55,7 +62,9 @@ class InteractionConfig:
         if len(taus) != 2:
             raise ConfigError(f"taus: expected two thresholds in seconds, found {len(taus)}")
         if self.horizon < self.max_ttc:
-            raise ConfigError(f"horizon: expected at least max_ttc, {self.max_ttc} s, found {self.horizon} s")
+            raise ConfigError(
+                f"horizon: expected at least max_ttc, {self.max_ttc} s, found {self.horizon} s"
+            )
         object.__setattr__(self, "taus", taus)
         object.__setattr__(self, "class_masses", MappingProxyType(dict(self.class_masses)))
 
@@ -88,21 +97,33 @@ class InteractionRecord(TypedDict):
     second_token: Annotated[str, Key(table="instance", doc="The other.")]
     gap: Annotated[float, _number("Between the boxes; 0 where they touch.", "m")]
     closing_speed: Annotated[
-        float | None, _number("With which the gap shrinks, negative where it grows; null where the boxes touch.", "m/s")
+        float | None,
+        _number(
+            "With which the gap shrinks, negative where it grows; null where the boxes touch.",
+            "m/s",
+        ),
     ]
     ttc: Annotated[
         float | None,
-        _number("Time to collision of the boxes at steady velocities; infinite if never, or after the horizon.", "s"),
+        _number(
+            "Time to collision of the boxes at steady velocities; infinite if never, or after the horizon.",
+            "s",
+        ),
     ]
     ttc_1d: Annotated[
-        float | None, _number("Time to collision along the heading of the one behind, the less of both.", "s")
+        float | None,
+        _number("Time to collision along the heading of the one behind, the less of both.", "s"),
     ]
     drac: Annotated[
-        float | None, _number("Deceleration rate to avoid a crash: relative speed over twice the `ttc`.", "m/s²")
+        float | None,
+        _number("Deceleration rate to avoid a crash: relative speed over twice the `ttc`.", "m/s²"),
     ]
     mttc: Annotated[
         float | None,
-        _number("As `ttc`, each with its acceleration along its heading, until it stops or the horizon.", "s"),
+        _number(
+            "As `ttc`, each with its acceleration along its heading, until it stops or the horizon.",
+            "s",
+        ),
     ]
     delta_v: Annotated[
         list[float] | None,
@@ -113,7 +134,10 @@ class InteractionRecord(TypedDict):
         ),
     ]
     impact_angle: Annotated[
-        float, _number("The second's heading as the first sees it, in (−π, π]: 0 the same, ±π head-on.", "rad")
+        float,
+        _number(
+            "The second's heading as the first sees it, in (−π, π]: 0 the same, ±π head-on.", "rad"
+        ),
     ]
 
 
@@ -127,13 +151,23 @@ class InteractionPairRecord(TypedDict):
     scenario_token: Annotated[str, Key(table="scenario", doc="Its scenario.")]
     first_token: Annotated[str, Key(table="instance", doc="The one with the smaller actor id.")]
     second_token: Annotated[str, Key(table="instance", doc="The other.")]
-    num_frames: Annotated[int, Number(dtype="int64", doc="Frames that the least and most are over.")]
-    moving: Annotated[bool, Number(dtype="bool", doc="Whether each of the two moves at some frame.")]
+    num_frames: Annotated[
+        int, Number(dtype="int64", doc="Frames that the least and most are over.")
+    ]
+    moving: Annotated[
+        bool, Number(dtype="bool", doc="Whether each of the two moves at some frame.")
+    ]
     min_ttc: Annotated[float, _number("Least time to collision; infinite if there is none.", "s")]
-    min_ttc_frame_token: Annotated[str | None, Key(table="frame", doc="The first moment of the least `ttc`.")]
+    min_ttc_frame_token: Annotated[
+        str | None, Key(table="frame", doc="The first moment of the least `ttc`.")
+    ]
     min_gap: Annotated[float, _number("Least gap.", "m")]
-    min_gap_frame_token: Annotated[str, Key(table="frame", doc="The first moment of the least gap.")]
-    max_drac: Annotated[float, _number("Most deceleration needed; infinite where the boxes touch.", "m/s²")]
+    min_gap_frame_token: Annotated[
+        str, Key(table="frame", doc="The first moment of the least gap.")
+    ]
+    max_drac: Annotated[
+        float, _number("Most deceleration needed; infinite where the boxes touch.", "m/s²")
+    ]
     min_mttc: Annotated[float, _number("Least time to collision with accelerations.", "s")]
     pet: Annotated[
         float,
@@ -144,10 +178,16 @@ class InteractionPairRecord(TypedDict):
         ),
     ]
     tet: Annotated[
-        list[float], Vector(shape=(2,), doc="Time exposed: with a `ttc` of at most 1.5 s, and of 3 s.", unit="s")
+        list[float],
+        Vector(
+            shape=(2,), doc="Time exposed: with a `ttc` of at most 1.5 s, and of 3 s.", unit="s"
+        ),
     ]
     tit: Annotated[
-        list[float], Vector(shape=(2,), doc="Time integrated: sum of threshold − `ttc` over that time.", unit="s²")
+        list[float],
+        Vector(
+            shape=(2,), doc="Time integrated: sum of threshold − `ttc` over that time.", unit="s²"
+        ),
     ]
 
 
@@ -211,7 +251,10 @@ class InteractionPairs(FrozenArrays):
         columns = {
             "scenario_token": [self.scenario] * len(self),
             **_actor_tokens(self.scenario, self.actor_ids),
-            **{f"{name}_token": _frame_tokens(self.scenario, getattr(self, name)) for name in _FRAMES},
+            **{
+                f"{name}_token": _frame_tokens(self.scenario, getattr(self, name))
+                for name in _FRAMES
+            },
         }
         return _arrow_table(PAIRS, self, columns)
 
@@ -264,9 +307,7 @@ class Interactions(FrozenArrays):
         if not self.labelled:
             return f"Interactions({self.scenario}: no labels)"
         count = len(self.pairs)
-        text = (
-            f"Interactions({self.scenario}: {count} pair{'s' * (count != 1)}, {len(self)} row{'s' * (len(self) != 1)}"
-        )
+        text = f"Interactions({self.scenario}: {count} pair{'s' * (count != 1)}, {len(self)} row{'s' * (len(self) != 1)}"
         times = np.where(self.pairs.moving, self.pairs.min_ttc, np.inf)
         if not np.isfinite(times).any():
             return f"{text})"
@@ -305,7 +346,10 @@ def _arrow_table(name: str, arrays: Any, given: Mapping[str, Any]) -> Any:
         values: AnyArray = getattr(arrays, column.field)
         unknown: BoolArray = np.isnan(values.sum(axis=tuple(range(1, values.ndim))))
         if isinstance(column.kind, Vector):
-            rows = [None if null else each for null, each in zip(unknown.tolist(), values.tolist(), strict=True)]
+            rows = [
+                None if null else each
+                for null, each in zip(unknown.tolist(), values.tolist(), strict=True)
+            ]
             columns[column.field] = pa.array(rows, type=pa.list_(pa.float64(), column.kind.length))
         else:
             columns[column.field] = pa.array(values, mask=unknown)

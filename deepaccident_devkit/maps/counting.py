@@ -21,7 +21,14 @@ from deepaccident_devkit.geometry.conventions import stored_transforms
 from deepaccident_devkit.release import read_bev
 from deepaccident_devkit.release.npz import TAGS
 from deepaccident_devkit.release.store import ReleasePath
-from deepaccident_devkit.support.arrays import BoolArray, ByteArray, FloatArray, FrozenArrays, IntArray, checked_number
+from deepaccident_devkit.support.arrays import (
+    BoolArray,
+    ByteArray,
+    FloatArray,
+    FrozenArrays,
+    IntArray,
+    checked_number,
+)
 from deepaccident_devkit.taxonomy import BEV_CAMERA, BEV_RESOLUTION, BEV_SHAPE, FRAME_PERIOD
 
 logger = logging.getLogger(__name__)
@@ -83,7 +90,8 @@ class Looks(FrozenArrays):
     def files(self, dataset: Dataset) -> Iterator[ReleasePath]:
         """Where the pictures lie; they need not be there."""
         return (
-            dataset.sensor_path(f"{dataset.sample[row]['token']}/{BEV_CAMERA}") for row in self.sample_rows.tolist()
+            dataset.sensor_path(f"{dataset.sample[row]['token']}/{BEV_CAMERA}")
+            for row in self.sample_rows.tolist()
         )
 
 
@@ -106,7 +114,9 @@ def chosen_frames(xy: FloatArray, config: TownMapConfig) -> IntArray:
     steps = np.hypot(*np.diff(xy, axis=0).T)
     travelled = np.concatenate([[0.0], np.cumsum(steps)])
     seconds = np.arange(len(xy)) * FRAME_PERIOD
-    stretches = np.column_stack([travelled / config.travel, seconds / config.period + 1e-9]).astype(np.int64)
+    stretches = np.column_stack([travelled / config.travel, seconds / config.period + 1e-9]).astype(
+        np.int64
+    )
     begins = np.flatnonzero((np.diff(stretches, axis=0) > 0).any(axis=1)) + 1
     return np.unique(np.concatenate([[0], begins, [len(xy) - 1]]))
 
@@ -151,7 +161,12 @@ def count_scenario(dataset: Dataset, config: TownMapConfig, scenario_row: int) -
 
 
 def _add_looks(
-    dataset: Dataset, recording: Looks, resolution: float, low: IntArray, counts: PixelCounts, seen: BoolArray
+    dataset: Dataset,
+    recording: Looks,
+    resolution: float,
+    low: IntArray,
+    counts: PixelCounts,
+    seen: BoolArray,
 ) -> list[str]:
     """Add one agent's pictures to `counts`, and the cells that it saw to `seen`; says what became of each picture."""
     outcomes = []
@@ -175,7 +190,9 @@ def _add_looks(
     return outcomes
 
 
-def codes_in_world(tags: ByteArray, world_from_ego: FloatArray, resolution: float) -> tuple[IntArray, ByteArray]:
+def codes_in_world(
+    tags: ByteArray, world_from_ego: FloatArray, resolution: float
+) -> tuple[IntArray, ByteArray]:
     """A picture's ground in the cells of the world: what its pixel nearest to each cell's middle shows.
 
     The road is taken for a plane through the agent's origin, which tilts as the agent does; `tags` (1200, 1200) are
@@ -184,7 +201,8 @@ def codes_in_world(tags: ByteArray, world_from_ego: FloatArray, resolution: floa
     """
     low, high = cells_around(world_from_ego[None], resolution)
     y, x = (
-        (np.arange(first, last) + 0.5) * resolution for first, last in zip(low.tolist(), high.tolist(), strict=True)
+        (np.arange(first, last) + 0.5) * resolution
+        for first, last in zip(low.tolist(), high.tolist(), strict=True)
     )
     x, y = x - world_from_ego[0, 3], y - world_from_ego[1, 3]
     (a, b), (c, d) = np.linalg.inv(world_from_ego[:2, :2]) / BEV_RESOLUTION
@@ -233,7 +251,9 @@ def hidden_ground(classes: ByteArray, resolution: float) -> ByteArray:
     return filled
 
 
-def _classes_around(classes: ByteArray, rows: IntArray, columns: IntArray, holes: IntArray, count: int) -> ByteArray:
+def _classes_around(
+    classes: ByteArray, rows: IntArray, columns: IntArray, holes: IntArray, count: int
+) -> ByteArray:
     """The most frequent class (1 + count,) beside the cells (N,) of each hole, by the hole's number."""
     kinds = int(classes.max(initial=0)) + 1
     votes = np.zeros((count + 1, max(kinds, 3)), dtype=np.int64)

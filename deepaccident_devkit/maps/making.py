@@ -77,7 +77,9 @@ def town_map(
     """
     town, rows = _scenarios_in(dataset, town, scenarios)
     found = _read(dataset, town, rows, config)
-    if found is not None and (not found.missing or found.missing == _missing(dataset, rows, config)):
+    if found is not None and (
+        not found.missing or found.missing == _missing(dataset, rows, config)
+    ):
         return found
     work, places = partial(count_scenario, dataset, config), Places(reads=dataset.places)
     windows = run_unordered(work, rows, label=f"mapping {town}", places=places, **how)
@@ -86,7 +88,9 @@ def town_map(
     return made
 
 
-def kept_town_map(dataset: Dataset, town: str, *, config: TownMapConfig = _DEFAULT) -> TownMap | None:
+def kept_town_map(
+    dataset: Dataset, town: str, *, config: TownMapConfig = _DEFAULT
+) -> TownMap | None:
     """The map of a town from all its scenarios, as an earlier `town_map` has kept it; nothing is made.
 
     Raises:
@@ -107,22 +111,33 @@ def towns_of(dataset: Dataset, scenarios: Iterable[RowArgument] | None = None) -
     return sorted({dataset.scenario[row]["town"] for row in rows_of_scenarios(dataset, scenarios)})
 
 
-def _scenarios_in(dataset: Dataset, town: str, scenarios: Iterable[RowArgument] | None) -> tuple[str, Sequence[int]]:
+def _scenarios_in(
+    dataset: Dataset, town: str, scenarios: Iterable[RowArgument] | None
+) -> tuple[str, Sequence[int]]:
     """The town's name, and the rows of its scenarios, ascending."""
     town = choice("town", town, towns_of(dataset))
-    rows = [dataset.getind("scenario", token) for token in dataset.field2token("scenario", "town", town)]
+    rows = [
+        dataset.getind("scenario", token) for token in dataset.field2token("scenario", "town", town)
+    ]
     if scenarios is None:
         return town, rows
     wanted = set(rows_of_scenarios(dataset, scenarios))
     chosen = [row for row in rows if row in wanted]
     if not chosen:
-        raise NotAvailableError(f"none of the {len(wanted)} scenarios given is in {town}; leave scenarios= out for all")
+        raise NotAvailableError(
+            f"none of the {len(wanted)} scenarios given is in {town}; leave scenarios= out for all"
+        )
     return town, chosen
 
 
 def _missing(dataset: Dataset, rows: Sequence[int], config: TownMapConfig) -> int:
     """How many of the pictures that a map is made from are not there."""
-    files = (path for row in rows for recording in looks_of(dataset, row, config) for path in recording.files(dataset))
+    files = (
+        path
+        for row in rows
+        for recording in looks_of(dataset, row, config)
+        for path in recording.files(dataset)
+    )
     return sum(not path.exists() for path in files)
 
 
@@ -138,31 +153,42 @@ def _store(dataset: Dataset) -> Store:
     return Store(folder, folder, "keeps town maps", IndexStoreError)
 
 
-def _read(dataset: Dataset, town: str, rows: Sequence[int], config: TownMapConfig) -> TownMap | None:
+def _read(
+    dataset: Dataset, town: str, rows: Sequence[int], config: TownMapConfig
+) -> TownMap | None:
     """The map that is kept; None if there is none, or if its file is damaged."""
     store, key = _store(dataset), _key(dataset, town, rows, config)
     try:
         state = store.path(key).stat()
     except OSError:
         return None
-    return _unpacked(store, key, town, config.resolution, (state.st_mtime_ns, state.st_size, state.st_ino))
+    return _unpacked(
+        store, key, town, config.resolution, (state.st_mtime_ns, state.st_size, state.st_ino)
+    )
 
 
 @lru_cache(maxsize=1)  # every picture of a video asks for the same one
-def _unpacked(store: Store, key: str, town: str, resolution: float, _state: tuple[int, ...]) -> TownMap | None:
+def _unpacked(
+    store: Store, key: str, town: str, resolution: float, _state: tuple[int, ...]
+) -> TownMap | None:
     """The map in a file; its state tells it from another that takes its place."""
     content = store.kept(key, key, "index")
     if content is None:
         return None
     with open_zip(content) as archive:
-        arrays: dict[str, Any] = {name: read_array(archive, name, "index") for name in (*_ARRAYS, "numbers")}
+        arrays: dict[str, Any] = {
+            name: read_array(archive, name, "index") for name in (*_ARRAYS, "numbers")
+        }
     numbers = dict(zip(_NUMBERS, arrays.pop("numbers").tolist(), strict=True))
     return TownMap(town=town, resolution=resolution, **arrays, **numbers)
 
 
 def _keep(dataset: Dataset, key: str, made: TownMap) -> None:
     """Keep a map, if its file can be written and would be read again; the same map gives the same bytes."""
-    content, numbers = io.BytesIO(), np.array([getattr(made, name) for name in _NUMBERS], dtype=np.int64)
+    content, numbers = (
+        io.BytesIO(),
+        np.array([getattr(made, name) for name in _NUMBERS], dtype=np.int64),
+    )
     np.savez_compressed(content, **{name: getattr(made, name) for name in _ARRAYS}, numbers=numbers)
     if made.counts.nbytes <= byte_limit("index") and dataset.tables_folder.is_dir():
         with suppress(OSError):  # a folder that may not be written to
@@ -170,10 +196,16 @@ def _keep(dataset: Dataset, key: str, made: TownMap) -> None:
 
 
 def _joined(
-    dataset: Dataset, town: str, rows: Sequence[int], config: TownMapConfig, windows: Iterable[Window]
+    dataset: Dataset,
+    town: str,
+    rows: Sequence[int],
+    config: TownMapConfig,
+    windows: Iterable[Window],
 ) -> TownMap:
     """The map that the windows of all scenarios add up to, in any order, cut to what was seen."""
-    poses = np.concatenate([recording.poses for row in rows for recording in looks_of(dataset, row, config)])
+    poses = np.concatenate(
+        [recording.poses for row in rows for recording in looks_of(dataset, row, config)]
+    )
     low, high = cells_around(poses, config.resolution)
     shape = tuple((high - low).tolist())
     counts = np.zeros((len(GROUND_CLASSES), *shape), dtype=np.uint16)

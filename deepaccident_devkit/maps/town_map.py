@@ -14,7 +14,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from deepaccident_devkit.geometry.cell_outlines import multi_polygon, outlines
 from deepaccident_devkit.maps.counting import GROUND_CLASSES
-from deepaccident_devkit.support.arrays import BoolArray, ByteArray, FloatArray, FrozenArrays, as_floats, checked
+from deepaccident_devkit.support.arrays import (
+    BoolArray,
+    ByteArray,
+    FloatArray,
+    FrozenArrays,
+    as_floats,
+    checked,
+)
 from deepaccident_devkit.support.files import write_bytes
 from deepaccident_devkit.support.text import choice, path_of
 
@@ -72,7 +79,10 @@ class TownMap(FrozenArrays):
     @property
     def extent(self) -> tuple[float, float, float, float]:
         """Least and greatest x, least and greatest y, metres: what matplotlib's `imshow(origin="lower")` takes."""
-        low, high = self.origin.tolist(), (self.origin + np.array(self.shape[::-1]) * self.resolution).tolist()
+        low, high = (
+            self.origin.tolist(),
+            (self.origin + np.array(self.shape[::-1]) * self.resolution).tolist(),
+        )
         return low[0], high[0], low[1], high[1]
 
     def seen(self) -> BoolArray:
@@ -103,7 +113,9 @@ class TownMap(FrozenArrays):
         inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
         result = np.zeros(len(xy), dtype=np.uint8)
         cells = row[inside].astype(np.int64), column[inside].astype(np.int64)
-        result[inside] = np.maximum(classes_of(self.counts[(slice(None), *cells)]), self.hidden[cells])
+        result[inside] = np.maximum(
+            classes_of(self.counts[(slice(None), *cells)]), self.hidden[cells]
+        )
         return result
 
     def around(self, center: ArrayLike, reach: float) -> TownMap:
@@ -137,7 +149,11 @@ class TownMap(FrozenArrays):
             ChoiceError: no such area.
         """
         of = choice("of", of, AREAS)
-        return self.drivable() if of == "drivable" else np.asarray(self.classes() == 1 + GROUND_CLASSES.index(of))
+        return (
+            self.drivable()
+            if of == "drivable"
+            else np.asarray(self.classes() == 1 + GROUND_CLASSES.index(of))
+        )
 
     def polygons(
         self, of: Area = "drivable", *, tolerance: float | None = None, least_area: float = 1.0
@@ -154,7 +170,9 @@ class TownMap(FrozenArrays):
             ChoiceError: no such area.
         """
         exact = outlines(self.area(of), self.origin, self.resolution)
-        return simplified_polygons(exact, self.resolution if tolerance is None else tolerance, least_area)
+        return simplified_polygons(
+            exact, self.resolution if tolerance is None else tolerance, least_area
+        )
 
     def to_geojson(self, path: str | os.PathLike[str]) -> Path:
         """Write the drivable area and the sidewalks as GeoJSON, a feature for each polygon; returns the path.
@@ -164,7 +182,10 @@ class TownMap(FrozenArrays):
         The same map gives the same bytes.
         """
         target = path_of(path)
-        write_bytes(target, geojson_of(self.town, {area: self.polygons(area) for area in ("drivable", "sidewalk")}))
+        write_bytes(
+            target,
+            geojson_of(self.town, {area: self.polygons(area) for area in ("drivable", "sidewalk")}),
+        )
         return target
 
 
@@ -186,7 +207,9 @@ def _surface_and_all(counts: NDArray[np.uint16]) -> tuple[NDArray[np.uint32], ND
     return counts[:_ROAD_LINE].sum(axis=0, dtype=np.uint32), counts.sum(axis=0, dtype=np.uint32)
 
 
-def simplified_polygons(polygons: MultiPolygon, tolerance: float, least_area: float) -> MultiPolygon:
+def simplified_polygons(
+    polygons: MultiPolygon, tolerance: float, least_area: float
+) -> MultiPolygon:
     """Polygons whose outlines may move by `tolerance` metres, without smaller islands and holes, square metres."""
     import shapely
 
@@ -195,7 +218,9 @@ def simplified_polygons(polygons: MultiPolygon, tolerance: float, least_area: fl
     if not tolerance:
         return multi_polygon(kept)
     whole = shapely.simplify(shapely.MultiPolygon(kept), tolerance)
-    parts = shapely.get_parts(shapely.get_parts(shapely.make_valid(whole)))  # twice, as collections may hold several
+    parts = shapely.get_parts(
+        shapely.get_parts(shapely.make_valid(whole))
+    )  # twice, as collections may hold several
     return multi_polygon([part for part in parts if part.geom_type == "Polygon"])
 
 
@@ -226,4 +251,7 @@ def _without_holes(polygon: Polygon, least_area: float) -> Polygon:
 
 
 def _rings(polygon: Polygon) -> list[list[list[float]]]:
-    return [np.round(np.asarray(ring.coords), _DECIMALS).tolist() for ring in (polygon.exterior, *polygon.interiors)]
+    return [
+        np.round(np.asarray(ring.coords), _DECIMALS).tolist()
+        for ring in (polygon.exterior, *polygon.interiors)
+    ]

@@ -20,9 +20,19 @@ as labels are warped.
 
 from deepaccident_devkit.motion.augmentation import Augmentation
 from deepaccident_devkit.motion.batch_names import config_from_names
-from deepaccident_devkit.motion.bev_segmentation import BEV_CLASSES, BevSegmentation, bev_segmentation, segmentation_of
+from deepaccident_devkit.motion.bev_segmentation import (
+    BEV_CLASSES,
+    BevSegmentation,
+    bev_segmentation,
+    segmentation_of,
+)
 from deepaccident_devkit.motion.box_polygons import OWN_BOX_ID, FrameBoxes, FramePolygons
-from deepaccident_devkit.motion.config import LABEL_PROTOCOLS, PRESETS, LabelProtocol, MotionLabelConfig
+from deepaccident_devkit.motion.config import (
+    LABEL_PROTOCOLS,
+    PRESETS,
+    LabelProtocol,
+    MotionLabelConfig,
+)
 from deepaccident_devkit.motion.drawing import labels_from_polygons, motion_labels_from_boxes
 from deepaccident_devkit.motion.grouping import MotionHeads
 from deepaccident_devkit.motion.instances import (

@@ -33,7 +33,9 @@ class Augmentation:
         rotation = checked_setting("augmentation: rotation", self.rotation, "finite radians")
         scale = checked_setting("augmentation: scale", self.scale, "a factor above 0, 1 for none")
         if scale <= 0:
-            raise ConfigError(f"augmentation: scale: expected a factor above 0, 1 for none, found {self.scale!r}")
+            raise ConfigError(
+                f"augmentation: scale: expected a factor above 0, 1 for none, found {self.scale!r}"
+            )
         object.__setattr__(self, "rotation", rotation)
         object.__setattr__(self, "scale", scale)
         object.__setattr__(self, "flip", checked_flag("augmentation: flip", self.flip))

@@ -79,7 +79,9 @@ _BATCHES: Final[Mapping[str, _Batch]] = {
 }
 
 
-def to_batch(labels: Mapping[str, AnyArray], config: MotionLabelConfig, names: BatchNames) -> dict[str, AnyArray]:
+def to_batch(
+    labels: Mapping[str, AnyArray], config: MotionLabelConfig, names: BatchNames
+) -> dict[str, AnyArray]:
     """Our maps, `future_egomotion` and `valid` under a code's names, in new, writable arrays; raises ChoiceError."""
     batch = _batch(names)
     result = {}
@@ -93,11 +95,15 @@ def to_batch(labels: Mapping[str, AnyArray], config: MotionLabelConfig, names: B
         )
         if batch.past_frames:
             empty = config.ignore_index if ours in VECTOR_MAPS else 0
-            past = np.full((config.receptive_field - 1, *values.shape[1:]), empty, dtype=values.dtype)
+            past = np.full(
+                (config.receptive_field - 1, *values.shape[1:]), empty, dtype=values.dtype
+            )
             values = np.concatenate([past, values])
             if ours == "segmentation":
                 values = values[:, None]
-        result[batch.names[ours]] = np.array(values, dtype=np.int64 if values.dtype.kind in "iu" else None, order="C")
+        result[batch.names[ours]] = np.array(
+            values, dtype=np.int64 if values.dtype.kind in "iu" else None, order="C"
+        )
     motion = labels["future_egomotion"]
     result[batch.names["future_egomotion"]] = np.array(
         flip_six_vector(motion) if batch.left_handed else motion, dtype=np.float32
@@ -108,7 +114,9 @@ def to_batch(labels: Mapping[str, AnyArray], config: MotionLabelConfig, names: B
     return result
 
 
-def from_batch(batch: Mapping[str, Any], config: MotionLabelConfig, names: BatchNames) -> dict[str, AnyArray]:
+def from_batch(
+    batch: Mapping[str, Any], config: MotionLabelConfig, names: BatchNames
+) -> dict[str, AnyArray]:
     """Our maps, `future_egomotion` and `valid` from one sample of another code: the reverse of `to_batch`.
 
     `batch` has no batch axis, and any framework's arrays. Raises FieldError where one is missing, ChoiceError,
@@ -117,17 +125,23 @@ def from_batch(batch: Mapping[str, Any], config: MotionLabelConfig, names: Batch
     code = _batch(names)
     missing = sorted(set(code.names.values()) - set(batch))
     if missing:
-        raise FieldError(f"batch: {names} labels have {missing[0]!r}; there are {', '.join(sorted(batch))}")
+        raise FieldError(
+            f"batch: {names} labels have {missing[0]!r}; there are {', '.join(sorted(batch))}"
+        )
     shape = config.grid.with_orientation(code.orientation).shape
     past = config.receptive_field - 1 if code.past_frames else 0
     result = {}
     for ours in MAPS:
         theirs = code.names[ours]
-        channels = {"segmentation": (1,) if code.past_frames else (), "instance": (), "centerness": (1,)}.get(
-            ours, (2,)
-        )
+        channels = {
+            "segmentation": (1,) if code.past_frames else (),
+            "instance": (),
+            "centerness": (1,),
+        }.get(ours, (2,))
         dtype = {"segmentation": np.uint8, "instance": np.int32}.get(ours, np.float32)
-        values = checked(theirs, batch[theirs], (past + config.label_frames, *channels, *shape), dtype)[past:]
+        values = checked(
+            theirs, batch[theirs], (past + config.label_frames, *channels, *shape), dtype
+        )[past:]
         if ours == "segmentation" and channels:
             values = values[:, 0]
         result[ours] = to_orientation(
@@ -139,7 +153,9 @@ def from_batch(batch: Mapping[str, Any], config: MotionLabelConfig, names: Batch
         )
     theirs = code.names["future_egomotion"]
     motion = checked(theirs, batch[theirs], (config.frames, 6), np.float32)
-    result["future_egomotion"] = flip_six_vector(motion).astype(np.float32) if code.left_handed else motion
+    result["future_egomotion"] = (
+        flip_six_vector(motion).astype(np.float32) if code.left_handed else motion
+    )
     known = batch["img_is_valid"] if "img_is_valid" in batch else np.ones(config.frames, dtype=bool)
     result["valid"] = checked("img_is_valid", known, (config.frames,), np.bool_)
     return result
@@ -208,7 +224,9 @@ def _bound(given: Any) -> tuple[float, float, float]:
     try:
         low, high, size = (float(number) for number in given)
     except (TypeError, ValueError) as error:
-        raise ConfigError(f"ybound: expected start, end and cell size in metres, found {given!r}") from error
+        raise ConfigError(
+            f"ybound: expected start, end and cell size in metres, found {given!r}"
+        ) from error
     return low, high, size
 
 

@@ -21,7 +21,9 @@ from deepaccident_devkit.taxonomy import BEV_RESOLUTION, BEV_SHAPE
 
 BEV_CLASSES: Final = ("road", "lane_line", "sidewalk", "vehicle", "pedestrian")
 """The classes of the targets, in their order."""
-_TAGS: Final = tuple(TAGS[tag] for tag in ("road", "road_line", "sidewalk", "vehicle", "pedestrian"))
+_TAGS: Final = tuple(
+    TAGS[tag] for tag in ("road", "road_line", "sidewalk", "vehicle", "pedestrian")
+)
 COVERAGE: Final[Mapping[str, float]] = {
     "road": 0.5,
     "lane_line": 0.0,
@@ -90,8 +92,13 @@ def segmentation_of(
     index = _pixels_of_cells(grid, augmentation)
     tags = np.append(image.semantic.reshape(-1), np.uint8(0))[index]
     needed = [max(1, math.ceil(COVERAGE[name] * index.shape[-1])) for name in BEV_CLASSES]
-    layers = [np.count_nonzero(tags == tag, axis=-1) >= pixels for tag, pixels in zip(_TAGS, needed, strict=True)]
-    return BevSegmentation(grid=grid, masks=np.stack(layers), known=np.all(index < image.semantic.size, axis=-1))
+    layers = [
+        np.count_nonzero(tags == tag, axis=-1) >= pixels
+        for tag, pixels in zip(_TAGS, needed, strict=True)
+    ]
+    return BevSegmentation(
+        grid=grid, masks=np.stack(layers), known=np.all(index < image.semantic.size, axis=-1)
+    )
 
 
 @functools.lru_cache(maxsize=4)
@@ -105,6 +112,10 @@ def _pixels_of_cells(grid: BevGrid, augmentation: Augmentation | None) -> IntArr
     if augmentation is not None:
         points = points @ np.linalg.inv(augmentation.matrix)[:2, :2].T
     # from the middle of the image to a pixel's centre there are whole pixels and a half
-    row, column = (np.rint(BEV_SHAPE[axis] / 2 - 0.5 - points[..., axis] / BEV_RESOLUTION) for axis in (0, 1))
+    row, column = (
+        np.rint(BEV_SHAPE[axis] / 2 - 0.5 - points[..., axis] / BEV_RESOLUTION) for axis in (0, 1)
+    )
     inside = (row >= 0) & (row < BEV_SHAPE[0]) & (column >= 0) & (column < BEV_SHAPE[1])
-    return readonly(np.where(inside, row * BEV_SHAPE[1] + column, BEV_SHAPE[0] * BEV_SHAPE[1]).astype(np.int64))
+    return readonly(
+        np.where(inside, row * BEV_SHAPE[1] + column, BEV_SHAPE[0] * BEV_SHAPE[1]).astype(np.int64)
+    )

@@ -87,7 +87,11 @@ class FrameBoxes(ShortRepr):
             array = checked(f"FrameBoxes.{name}", getattr(self, name), shape, dtype)
             if dtype is np.float64 and not np.isfinite(array).all():
                 row = int(np.argwhere(~np.isfinite(array))[0, 0])
-                remedy = "give None for a frame without a pose" if name == "ego_from_lidar" else "leave out such rows"
+                remedy = (
+                    "give None for a frame without a pose"
+                    if name == "ego_from_lidar"
+                    else "leave out such rows"
+                )
                 raise GeometryError(f"FrameBoxes.{name}: row {row} is not finite; {remedy}")
             object.__setattr__(self, name, readonly(array))
 
@@ -108,9 +112,16 @@ class FramePolygons(ShortRepr):
     def __post_init__(self) -> None:
         """Check and freeze; raises GeometryError."""
         double = getattr(self.corners, "dtype", None) == np.float64
-        corners = checked("FramePolygons.corners", self.corners, (None, 4, 2), np.float64 if double else np.float32)
+        corners = checked(
+            "FramePolygons.corners",
+            self.corners,
+            (None, 4, 2),
+            np.float64 if double else np.float32,
+        )
         object.__setattr__(self, "corners", readonly(corners))
-        object.__setattr__(self, "key", readonly(checked("FramePolygons.key", self.key, (len(corners),), np.int64)))
+        object.__setattr__(
+            self, "key", readonly(checked("FramePolygons.key", self.key, (len(corners),), np.int64))
+        )
 
 
 class Polygons(NamedTuple):
@@ -131,8 +142,12 @@ class Polygons(NamedTuple):
         """Those of all frames, one after another."""
         there = [(number, frame) for number, frame in enumerate(frames) if frame is not None]
         return cls(
-            np.concatenate([np.zeros((0, 4, 2), dtype=np.float32), *[frame.corners for _, frame in there]]),
-            np.repeat([number for number, _ in there], [len(frame.key) for _, frame in there]).astype(np.int64),
+            np.concatenate(
+                [np.zeros((0, 4, 2), dtype=np.float32), *[frame.corners for _, frame in there]]
+            ),
+            np.repeat(
+                [number for number, _ in there], [len(frame.key) for _, frame in there]
+            ).astype(np.int64),
             np.concatenate([np.zeros(0, dtype=np.int64), *[frame.key for _, frame in there]]),
         )
 
@@ -173,7 +188,9 @@ def box_polygons(
     polygons = polygons_of(BoxRows.of(frames, is_vehicle=is_vehicle), config)
     ends = polygons.frame.searchsorted(np.arange(len(frames)), side="right").tolist()
     return [
-        None if frame is None else FramePolygons(corners=polygons.corners[start:end], key=polygons.key[start:end])
+        None
+        if frame is None
+        else FramePolygons(corners=polygons.corners[start:end], key=polygons.key[start:end])
         for frame, start, end in zip(frames, [0, *ends], ends, strict=False)
     ]
 
@@ -197,10 +214,16 @@ def polygons_of(boxes: BoxRows, config: MotionLabelConfig) -> Polygons:
     return Polygons(np.concatenate([_corners(own), others])[order], frame[order], key[order])
 
 
-def footprints_of(polygons: Polygons, ids: IntArray, frames: int, config: MotionLabelConfig) -> Footprints:
+def footprints_of(
+    polygons: Polygons, ids: IntArray, frames: int, config: MotionLabelConfig
+) -> Footprints:
     """The polygons of frames with these ids, rasterised in native orientation; later polygons lie on top."""
     native = config.grid.with_orientation(config.rules.native)
-    given = polygons.corners if config.rules.pose == "yaw" else polygons.corners.astype(np.float32, copy=False)
+    given = (
+        polygons.corners
+        if config.rules.pose == "yaw"
+        else polygons.corners.astype(np.float32, copy=False)
+    )
     x, y = given[..., 0], given[..., 1] if config.rules.right_handed else -given[..., 1]
     place = np.stack((y, x) if native.orientation == "fiery" else (x, y), axis=-1)
     low, _, size = np.array(axes_of(native)[::-1]).T
@@ -210,7 +233,9 @@ def footprints_of(polygons: Polygons, ids: IntArray, frames: int, config: Motion
     else:
         cells = np.floor((place.astype(np.float64) - low) / size)
     vertices = np.clip(cells, -_FAR, _FAR).astype(np.int64)
-    return Footprints(vertices, polygons.frame, ids, topmost(vertices, native.shape, polygons.frame, frames))
+    return Footprints(
+        vertices, polygons.frame, ids, topmost(vertices, native.shape, polygons.frame, frames)
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -246,10 +271,13 @@ class BoxRows:
         """Those of one sample; raises GeometryError."""
         for given in frames:
             if not isinstance(given, FrameBoxes | None):
-                raise GeometryError(f"frames: expected FrameBoxes, or None beyond the recording, found {given!r}")
+                raise GeometryError(
+                    f"frames: expected FrameBoxes, or None beyond the recording, found {given!r}"
+                )
         known = [_NO_BOXES if frame is None else frame for frame in frames]
         center, size, yaw, actor_id, category, visible = (
-            np.concatenate(columns) for columns in zip(*map(_COLUMNS, [_NO_BOXES, *known]), strict=True)
+            np.concatenate(columns)
+            for columns in zip(*map(_COLUMNS, [_NO_BOXES, *known]), strict=True)
         )
         return cls(
             frame=np.repeat(np.arange(len(frames)), [len(frame.actor_id) for frame in known]),
@@ -369,4 +397,7 @@ def _leaning_corners(boxes: BoxRows, augmentation: Augmentation | None) -> Float
         .bottom_corners()[..., :2]
         for pose, start, end in zip(boxes.ego_from_lidar, [0, *ends], ends, strict=False)
     ]
-    return np.concatenate(corners) @ (np.eye(4) if augmentation is None else augmentation.matrix)[:2, :2].T
+    return (
+        np.concatenate(corners)
+        @ (np.eye(4) if augmentation is None else augmentation.matrix)[:2, :2].T
+    )

@@ -108,10 +108,14 @@ class LabelProtocol:
             name, value = f"label protocol: {one.name}", getattr(self, one.name)
             allowed = _CHOICES.get(one.name)
             object.__setattr__(
-                self, one.name, checked_flag(name, value) if allowed is None else choice(name, value, allowed)
+                self,
+                one.name,
+                checked_flag(name, value) if allowed is None else choice(name, value, allowed),
             )
         if self.warp == "fiery" and self.native != "fiery":
-            raise ConfigError(f"label protocol: warp 'fiery' needs native 'fiery', found {self.native!r}")
+            raise ConfigError(
+                f"label protocol: warp 'fiery' needs native 'fiery', found {self.native!r}"
+            )
 
     @property
     def right_handed(self) -> bool:
@@ -183,7 +187,10 @@ LABEL_PROTOCOLS: Final[Mapping[str, LabelProtocol]] = MappingProxyType(
 )
 """By name: the released code, the same without its quirks, and the two codes that it is based on."""
 NO_PRESETS: Final[Mapping[str, str]] = MappingProxyType(
-    {name: f"; {name!r} is a protocol of labels: give protocol={name!r}" for name in LABEL_PROTOCOLS}
+    {
+        name: f"; {name!r} is a protocol of labels: give protocol={name!r}"
+        for name in LABEL_PROTOCOLS
+    }
 )
 """What to say of a protocol's name that is given as a preset's."""
 _NAMES: Final = {rules: name for name, rules in LABEL_PROTOCOLS.items()}
@@ -243,23 +250,36 @@ class MotionLabelConfig:
     def __post_init__(self) -> None:
         """Check and complete; raises ConfigError or ChoiceError, each with the remedy."""
         if not isinstance(self.grid, BevGrid):
-            raise ConfigError(f"grid: expected a BevGrid, found {self.grid!r}; BevGrid(x=(-50, 50, 0.5)) makes one")
-        grid = self.grid if self.orientation is None else self.grid.with_orientation(self.orientation)
+            raise ConfigError(
+                f"grid: expected a BevGrid, found {self.grid!r}; BevGrid(x=(-50, 50, 0.5)) makes one"
+            )
+        grid = (
+            self.grid if self.orientation is None else self.grid.with_orientation(self.orientation)
+        )
         values: dict[str, object] = {
             "grid": grid,
             "orientation": None,
             "ignore_index": _checked_mark(self.ignore_index, grid),
-            "sigma": checked_setting("sigma", self.sigma, "cells from 0.01 to 10,000, such as 3", *_SIGMAS),
-            "agents": None if is_available(self.agents) else checked_agents(self.agents),  # one digest for both
+            "sigma": checked_setting(
+                "sigma", self.sigma, "cells from 0.01 to 10,000, such as 3", *_SIGMAS
+            ),
+            "agents": None
+            if is_available(self.agents)
+            else checked_agents(self.agents),  # one digest for both
             "protocol": _NAMES.get(label_protocol(self.protocol), self.protocol),
-            **{name: checked_count(name, getattr(self, name), what, _MOST_FRAMES) for name, what in _COUNTS.items()},
+            **{
+                name: checked_count(name, getattr(self, name), what, _MOST_FRAMES)
+                for name, what in _COUNTS.items()
+            },
             **{
                 name: checked_flag(name, getattr(self, name))
                 for name in ("only_vehicle", "filter_invisible", "draw_ego")
             },
         }
         if not isinstance(self.augmentation, Augmentation | None):
-            raise ConfigError(f"augmentation: expected an Augmentation or None, found {self.augmentation!r}")
+            raise ConfigError(
+                f"augmentation: expected an Augmentation or None, found {self.augmentation!r}"
+            )
         for name, value in values.items():
             object.__setattr__(self, name, value)
 
@@ -280,7 +300,11 @@ class MotionLabelConfig:
                 f"preset: there is no field {unknown[0]!r}; there are {', '.join(cls.__dataclass_fields__)}"
             )
         given = changes.get("grid")
-        if isinstance(given, BevGrid) and given.orientation == "devkit" and changes.get("orientation") is None:
+        if (
+            isinstance(given, BevGrid)
+            and given.orientation == "devkit"
+            and changes.get("orientation") is None
+        ):
             changes["orientation"] = preset.grid.orientation
         return replace(preset, **changes)
 
@@ -302,7 +326,9 @@ class MotionLabelConfig:
     @property
     def offsets(self) -> range:
         """Recorded frames from the present to each of `frames`, the past negative."""
-        return range(-(self.receptive_field - 1) * self.step, self.future_frames * self.step + 1, self.step)
+        return range(
+            -(self.receptive_field - 1) * self.step, self.future_frames * self.step + 1, self.step
+        )
 
     def as_dict(self) -> dict[str, Any]:
         """All that affects the labels' values, in types that JSON has; the protocol as its switches.
@@ -339,7 +365,9 @@ class MotionLabelConfig:
                 grid=BevGrid(tuple(grid["x"]), tuple(grid["y"])),
                 protocol=protocol,
                 augmentation=None if augmentation is None else Augmentation(**augmentation),
-                agents=AgentConfig(agents["name"], tuple(agents["partners"])) if isinstance(agents, dict) else agents,
+                agents=AgentConfig(agents["name"], tuple(agents["partners"]))
+                if isinstance(agents, dict)
+                else agents,
                 **values,
             )
         except (KeyError, TypeError, AttributeError) as error:
@@ -362,7 +390,9 @@ def resolved_label_config(config: MotionLabelConfig | str | None) -> MotionLabel
     if config is None or isinstance(config, str):
         return MotionLabelConfig() if config is None else MotionLabelConfig.preset(config)
     if not isinstance(config, MotionLabelConfig):
-        raise ConfigError(f"config: expected a MotionLabelConfig or the name of a preset, found {config!r}")
+        raise ConfigError(
+            f"config: expected a MotionLabelConfig or the name of a preset, found {config!r}"
+        )
     return config
 
 
@@ -373,7 +403,9 @@ def _checked_mark(ignore_index: object, grid: BevGrid) -> int:
     grids with a side of more than 255 cells only 255 is possible. There the vector (255, 255) is 360 cells long,
     farther than an actor reaches from its centre or moves in a step.
     """
-    mark = checked_count("ignore_index", ignore_index, "a value that no vector has, such as 255", _BYTE)
+    mark = checked_count(
+        "ignore_index", ignore_index, "a value that no vector has, such as 255", _BYTE
+    )
     least = min(max(grid.shape), _BYTE)
     if mark < least:
         raise ConfigError(
@@ -388,7 +420,9 @@ PRESETS: Final[Mapping[str, MotionLabelConfig]] = MappingProxyType(
     {
         "deepaccident": _DEEPACCIDENT,
         **{
-            f"deepaccident-{seconds}s": replace(_DEEPACCIDENT, future_frames=seconds * _STEPS_PER_SECOND)
+            f"deepaccident-{seconds}s": replace(
+                _DEEPACCIDENT, future_frames=seconds * _STEPS_PER_SECOND
+            )
             for seconds in (3, 4, 5)
         },
         "beverse": _BEVERSE,

@@ -22,10 +22,19 @@ from deepaccident_devkit.motion.box_polygons import (
     box_polygons,
     footprints_of,
 )
-from deepaccident_devkit.motion.config import LabelProtocol, MotionLabelConfig, resolved_label_config
+from deepaccident_devkit.motion.config import (
+    LabelProtocol,
+    MotionLabelConfig,
+    resolved_label_config,
+)
 from deepaccident_devkit.motion.labels import MotionLabels
 from deepaccident_devkit.motion.reference_arithmetic.single_precision import SamplingLine
-from deepaccident_devkit.motion.warping import frames_from_next, nearest_indices, sampling_lines, sampling_matrix
+from deepaccident_devkit.motion.warping import (
+    frames_from_next,
+    nearest_indices,
+    sampling_lines,
+    sampling_matrix,
+)
 from deepaccident_devkit.support.arrays import (
     AnyArray,
     BoolArray,
@@ -98,7 +107,9 @@ def labels_from_polygons(
         )
     motion = checked("egomotion", egomotion, (config.frames, 6), np.float32)
     if not np.isfinite(motion).all():
-        raise GeometryError("egomotion: not all numbers are finite; set rows without a motion to zero")
+        raise GeometryError(
+            "egomotion: not all numbers are finite; set rows without a motion to zero"
+        )
     past = config.receptive_field - 1
     there = np.array([True] * past + [frame is not None for frame in polygons])
     known = there if valid is None else there & checked("valid", valid, (config.frames,), np.bool_)
@@ -117,18 +128,26 @@ def labels_of(
     `egomotion` (S, R, 6) is finite, `valid` (S, R); each sample's ids continue `id_map`. Raises ConfigError.
     """
     past, frames = config.receptive_field - 1, config.label_frames
-    ids, continued = _numbered(polygons, len(valid), config, {} if id_map is None else _checked_ids(id_map, config))
+    ids, continued = _numbered(
+        polygons, len(valid), config, {} if id_map is None else _checked_ids(id_map, config)
+    )
     footprints = footprints_of(polygons, ids, len(valid) * frames, config)
     covered = _covered(footprints, config)
     centers = covered.centers()
-    this_from_next = frames_from_next(egomotion[:, past:].reshape(-1, 6)[:-1], config.rules, config.augmentation)
-    following = following_centers(footprints, sampling_matrix(this_from_next, config.rules), config, covered.ids)
+    this_from_next = frames_from_next(
+        egomotion[:, past:].reshape(-1, 6)[:-1], config.rules, config.augmentation
+    )
+    following = following_centers(
+        footprints, sampling_matrix(this_from_next, config.rules), config, covered.ids
+    )
     following[np.isnan(centers)] = np.nan
     del footprints  # else its cells stay until the last sample
     for sample, own_ids in enumerate(continued):
         first, last = sample * frames, (sample + 1) * frames
         shown = covered.between(first, last)
-        maps = label_maps(shown, centers[first:last], following[first:last], ~valid[sample, past:], config)
+        maps = label_maps(
+            shown, centers[first:last], following[first:last], ~valid[sample, past:], config
+        )
         yield maps.labels(config, egomotion[sample], valid[sample], own_ids)
 
 
@@ -260,13 +279,19 @@ class LabelMaps:
         return cls(
             offset=memory[: 8 * count].view(np.float32).reshape(two),
             flow=memory[8 * count : 16 * count].view(np.float32).reshape(two),
-            centerness=memory[16 * count : 20 * count].view(np.float32).reshape(frames, 1, height, width),
+            centerness=memory[16 * count : 20 * count]
+            .view(np.float32)
+            .reshape(frames, 1, height, width),
             instance=memory[20 * count : 24 * count].view(np.int32).reshape(one),
             segmentation=memory[24 * count :].reshape(one),
         )
 
     def labels(
-        self, config: MotionLabelConfig, egomotion: Float32Array, valid: BoolArray, id_map: dict[int, int]
+        self,
+        config: MotionLabelConfig,
+        egomotion: Float32Array,
+        valid: BoolArray,
+        id_map: dict[int, int],
     ) -> MotionLabels:
         """The labels with these maps."""
         return MotionLabels(
@@ -283,7 +308,11 @@ class LabelMaps:
 
 
 def label_maps(
-    covered: CoveredCells, centers: Float32Array, following: Float32Array, missing: BoolArray, config: MotionLabelConfig
+    covered: CoveredCells,
+    centers: Float32Array,
+    following: Float32Array,
+    missing: BoolArray,
+    config: MotionLabelConfig,
 ) -> LabelMaps:
     """The maps of instances, from native cells and centres (T, 1 + ids, 2) here and at the next frame, or NaN.
 
@@ -299,7 +328,9 @@ def label_maps(
     maps.segmentation.reshape(-1)[cell] = 1
     maps.instance.reshape(-1)[cell] = covered.identity
     slot = covered.slot
-    (down, along), (next_down, next_along) = np.array([centers, following]).reshape(2, -1, 2).swapaxes(1, 2).copy()
+    (down, along), (next_down, next_along) = (
+        np.array([centers, following]).reshape(2, -1, 2).swapaxes(1, 2).copy()
+    )
     from_row = down.take(slot) - covered.row.astype(np.float32)
     from_column = along.take(slot) - covered.column.astype(np.float32)
     offset = vectors_in(from_row, from_column, source, target)
@@ -329,9 +360,13 @@ def _draw_peaks(centerness: AnyArray, frame: IntArray, center: IntArray, sigma: 
     reach = len(peak) // 2
     first, last = np.maximum(center - reach, 0), np.minimum(center + reach + 1, shape)
     bounds = np.hstack([first, last, first - center + reach, last - center + reach]).tolist()
-    for number, (top, left, bottom, right, above, before, below, behind) in zip(frame.tolist(), bounds, strict=True):
+    for number, (top, left, bottom, right, above, before, below, behind) in zip(
+        frame.tolist(), bounds, strict=True
+    ):
         part = centerness[number, 0, top:bottom, left:right]
-        cv2.max(part, peak[above:below, before:behind], part)  # half of numpy's time: it goes from row to row faster
+        cv2.max(
+            part, peak[above:below, before:behind], part
+        )  # half of numpy's time: it goes from row to row faster
 
 
 @functools.lru_cache(maxsize=8)
@@ -420,13 +455,17 @@ def _seen_near(
     source = ((runs.frame + 1) * grid.cells).take(run)
     source += down * np.int32(columns)
     source += along
-    inside &= footprints.top.take(source, mode="clip") == (runs.polygon + 1).astype(np.int32).take(run)
+    inside &= footprints.top.take(source, mode="clip") == (runs.polygon + 1).astype(np.int32).take(
+        run
+    )
     seen = np.flatnonzero(inside)
     of_run = run[seen]
     return runs.polygon[of_run], runs.row[of_run], column[seen] - runs.frame[of_run] * columns
 
 
-def runs_near(footprints: Footprints, origin: FloatArray, inverse: FloatArray, grid: BevGrid) -> _Runs | None:
+def runs_near(
+    footprints: Footprints, origin: FloatArray, inverse: FloatArray, grid: BevGrid
+) -> _Runs | None:
     """The cells around the footprints of all frames but the first; None if these are more than a few frames' cells."""
     polygon = np.flatnonzero(footprints.frame > 0)
     corners, frame = footprints.corners[polygon, :, ::-1], footprints.frame[polygon] - 1
@@ -449,7 +488,9 @@ def runs_near(footprints: Footprints, origin: FloatArray, inverse: FloatArray, g
     )
 
 
-def even_spread(lines: tuple[SamplingLine, SamplingLine], grid: BevGrid) -> tuple[FloatArray, FloatArray] | None:
+def even_spread(
+    lines: tuple[SamplingLine, SamplingLine], grid: BevGrid
+) -> tuple[FloatArray, FloatArray] | None:
     """The first cells' sample points (N, 2), and (N, 2, 2) how far target cells lie apart for each cell of the source.
 
     None where the points are too far away, or too near to each other or too far apart, for what is done with it.
@@ -459,7 +500,9 @@ def even_spread(lines: tuple[SamplingLine, SamplingLine], grid: BevGrid) -> tupl
         return None
     points = np.array(
         [
-            line.finish(line.of_row[:, [0, -1, 0]] + line.of_column[:, [0, 0, -1]] + line.shift[:, None])
+            line.finish(
+                line.of_row[:, [0, -1, 0]] + line.of_column[:, [0, 0, -1]] + line.shift[:, None]
+            )
             for line in lines
         ],
         dtype=np.float64,
@@ -467,7 +510,10 @@ def even_spread(lines: tuple[SamplingLine, SamplingLine], grid: BevGrid) -> tupl
     steps = (points[..., 1:] - points[..., :1]) / (rows - 1, columns - 1)
     (down, along), (down_column, along_column) = steps.transpose(0, 2, 1)
     scale = down * along_column - along * down_column
-    if not (np.abs(points) < _FARTHEST).all() or not ((np.abs(scale) > 0.25) & (np.abs(scale) < 4)).all():
+    if (
+        not (np.abs(points) < _FARTHEST).all()
+        or not ((np.abs(scale) > 0.25) & (np.abs(scale) < 4)).all()
+    ):
         return None
     inverse = np.array([[along_column, -along], [-down_column, down]]) / scale
     return points[..., 0].T, inverse.transpose(2, 0, 1)

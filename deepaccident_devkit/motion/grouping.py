@@ -19,7 +19,15 @@ from deepaccident_devkit.errors import GeometryError
 from deepaccident_devkit.geometry.bev_grid import ORIENTATIONS, Orientation, to_orientation
 from deepaccident_devkit.motion.labels import MotionLabels
 from deepaccident_devkit.motion.reference_arithmetic.peaks import nearest_peaks
-from deepaccident_devkit.support.arrays import AnyArray, FloatArray, IntArray, ShortRepr, as_numbers, checked, readonly
+from deepaccident_devkit.support.arrays import (
+    AnyArray,
+    FloatArray,
+    IntArray,
+    ShortRepr,
+    as_numbers,
+    checked,
+    readonly,
+)
 from deepaccident_devkit.support.text import settle_choices
 
 LABEL_LOGIT: Final = 10.0
@@ -56,7 +64,9 @@ class MotionHeads(ShortRepr):
         segmentation = checked("segmentation", self.segmentation, (None, 2, None, None), np.float32)
         frames, _, height, width = segmentation.shape
         if segmentation.size == 0:
-            raise GeometryError(f"segmentation: expected at least one frame of one cell, found {segmentation.shape}")
+            raise GeometryError(
+                f"segmentation: expected at least one frame of one cell, found {segmentation.shape}"
+            )
         centerness = as_numbers("centerness", self.centerness, dtype=np.float32)
         if centerness.ndim == 3:
             centerness = centerness[:, None]
@@ -69,7 +79,9 @@ class MotionHeads(ShortRepr):
             "flow": checked("flow", self.flow, shape, np.float32),
         }
         for name, values in maps.items():
-            _check_values(name, values, np.inf if name in {"segmentation", "centerness"} else _LARGEST)
+            _check_values(
+                name, values, np.inf if name in {"segmentation", "centerness"} else _LARGEST
+            )
             object.__setattr__(self, name, readonly(values))
 
     def __repr__(self) -> str:
@@ -128,7 +140,11 @@ class MotionHeads(ShortRepr):
 
         def turned(values: AnyArray, *, vectors: bool) -> AnyArray:
             return to_orientation(
-                values, vectors=vectors, source=self.orientation, target=orientation, ignore=self.ignore_index
+                values,
+                vectors=vectors,
+                source=self.orientation,
+                target=orientation,
+                ignore=self.ignore_index,
             )
 
         return MotionHeads(
@@ -248,7 +264,9 @@ def _distances(first: AnyArray, second: AnyArray) -> AnyArray:
     return np.asarray(np.sqrt(apart[..., 0] * apart[..., 0] + apart[..., 1] * apart[..., 1]))
 
 
-def _linked(known: IntArray, distances: AnyArray, limit: float, newest: int) -> tuple[IntArray, int]:
+def _linked(
+    known: IntArray, distances: AnyArray, limit: float, newest: int
+) -> tuple[IntArray, int]:
     """The next frame's ids (M + 1,), and the highest id given so far."""
     from scipy.optimize import linear_sum_assignment
 

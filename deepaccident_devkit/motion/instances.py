@@ -12,9 +12,21 @@ import numpy as np
 
 from deepaccident_devkit.errors import ConfigError, GeometryError
 from deepaccident_devkit.geometry import BevGrid
-from deepaccident_devkit.geometry.bev_grid import ORIENTATIONS, Orientation, cells_in, to_orientation
+from deepaccident_devkit.geometry.bev_grid import (
+    ORIENTATIONS,
+    Orientation,
+    cells_in,
+    to_orientation,
+)
 from deepaccident_devkit.motion.config import LabelProtocol, label_protocol
-from deepaccident_devkit.motion.grouping import LABEL_LOGIT, FrameGroups, MotionHeads, group_cells, link_frames, sums_by
+from deepaccident_devkit.motion.grouping import (
+    LABEL_LOGIT,
+    FrameGroups,
+    MotionHeads,
+    group_cells,
+    link_frames,
+    sums_by,
+)
 from deepaccident_devkit.motion.reference_arithmetic.contours import first_hulls, redrawn_cells
 from deepaccident_devkit.motion.reference_arithmetic.peaks import find_peaks
 from deepaccident_devkit.support.arrays import (
@@ -70,11 +82,19 @@ class PostProcessing:
         """Check the values; raises ChoiceError or ConfigError."""
         values = {
             "foreground": choice("foreground", self.foreground, get_args(Foreground)),
-            "labels_bypass_sigmoid": checked_flag("labels_bypass_sigmoid", self.labels_bypass_sigmoid),
-            "center_threshold": checked_setting("center_threshold", self.center_threshold, "a number from 0", 0.0),
-            "max_centers": checked_count("max_centers", self.max_centers, "centres of a frame", _MOST_CENTERS),
+            "labels_bypass_sigmoid": checked_flag(
+                "labels_bypass_sigmoid", self.labels_bypass_sigmoid
+            ),
+            "center_threshold": checked_setting(
+                "center_threshold", self.center_threshold, "a number from 0", 0.0
+            ),
+            "max_centers": checked_count(
+                "max_centers", self.max_centers, "centres of a frame", _MOST_CENTERS
+            ),
             "scan": choice("scan", self.scan, ORIENTATIONS),
-            "link_distance": checked_setting("link_distance", self.link_distance, "a number of cells from 0", 0.0),
+            "link_distance": checked_setting(
+                "link_distance", self.link_distance, "a number of cells from 0", 0.0
+            ),
             "redraw": checked_flag("redraw", self.redraw),
         }
         for name, value in values.items():
@@ -138,8 +158,12 @@ class LinkedInstances(ShortRepr):
         """Freeze arrays and maps."""
         object.__setattr__(self, "instance", readonly(self.instance))
         object.__setattr__(self, "frame_instance", readonly(self.frame_instance))
-        object.__setattr__(self, "redrawn", None if self.redrawn is None else readonly(self.redrawn))
-        object.__setattr__(self, "frame_centers", tuple(readonly(centers) for centers in self.frame_centers))
+        object.__setattr__(
+            self, "redrawn", None if self.redrawn is None else readonly(self.redrawn)
+        )
+        object.__setattr__(
+            self, "frame_centers", tuple(readonly(centers) for centers in self.frame_centers)
+        )
         object.__setattr__(self, "paths", MappingProxyType(dict(self.paths)))
 
     @property
@@ -148,7 +172,9 @@ class LinkedInstances(ShortRepr):
         return {identity: path.centers for identity, path in self.paths.items()}
 
 
-def predict_instances(heads: MotionHeads, settings: PostProcessing | str = "motion") -> LinkedInstances:
+def predict_instances(
+    heads: MotionHeads, settings: PostProcessing | str = "motion"
+) -> LinkedInstances:
     """Instances with the same id in all frames, as the released code finds them.
 
     See docs/released_code.md, Post-processing and FIERY's own labels.
@@ -171,7 +197,10 @@ def predict_instances(heads: MotionHeads, settings: PostProcessing | str = "moti
     centerness = turn.maps(heads.centerness[:, 0])
     peaks = [find_peaks(frame, rules.center_threshold, rules.max_centers) for frame in centerness]
     foreground = turn.maps(foreground_cells(heads.segmentation, rules))
-    positions = [np.stack(np.nonzero(here & (len(found) > 0))) for here, found in zip(foreground, peaks, strict=True)]
+    positions = [
+        np.stack(np.nonzero(here & (len(found) > 0)))
+        for here, found in zip(foreground, peaks, strict=True)
+    ]
     groups = [
         group_cells(
             found,
@@ -180,7 +209,9 @@ def predict_instances(heads: MotionHeads, settings: PostProcessing | str = "moti
             turn.vectors_at(position, flow, heads.ignore_index),
             all_cells=position.shape[1] == offset[0].size,
         )
-        for found, position, offset, flow in zip(peaks, positions, heads.offset, heads.flow, strict=True)
+        for found, position, offset, flow in zip(
+            peaks, positions, heads.offset, heads.flow, strict=True
+        )
     ]
     names = link_frames(groups, rules.link_distance)
     centers, counts = _paths(groups, names)
@@ -191,13 +222,19 @@ def predict_instances(heads: MotionHeads, settings: PostProcessing | str = "moti
     return LinkedInstances(
         settings=rules,
         orientation=heads.orientation,
-        instance=turn.raster(positions, [name[group.ids] for name, group in zip(names, groups, strict=True)]),
+        instance=turn.raster(
+            positions, [name[group.ids] for name, group in zip(names, groups, strict=True)]
+        ),
         frame_instance=turn.raster(positions, [group.ids for group in groups]),
         redrawn=redrawn,
         frame_centers=[turn.points(frame) for frame in peaks],
         paths={
-            identity: InstancePath(frames=np.flatnonzero(cells), centers=points[cells > 0], cell_counts=cells)
-            for identity, (points, cells) in enumerate(zip(turn.points(centers), counts, strict=True), start=1)
+            identity: InstancePath(
+                frames=np.flatnonzero(cells), centers=points[cells > 0], cell_counts=cells
+            )
+            for identity, (points, cells) in enumerate(
+                zip(turn.points(centers), counts, strict=True), start=1
+            )
         },
     )
 
@@ -208,7 +245,11 @@ def foreground_cells(segmentation: AnyArray, rules: PostProcessing) -> BoolArray
     if rules.foreground == "argmax":
         return np.asarray(actor > background)
     threshold = np.float32(FOREGROUND_THRESHOLD)
-    if rules.labels_bypass_sigmoid and segmentation.max() == LABEL_LOGIT and segmentation.min() == 0:
+    if (
+        rules.labels_bypass_sigmoid
+        and segmentation.max() == LABEL_LOGIT
+        and segmentation.min() == 0
+    ):
         return np.asarray(actor > threshold)
     # A float32 sigmoid exceeds the threshold from half-way to the next float32 on. That point's own logit is compared
     # with instead, which needs no exponential of every cell.
@@ -221,7 +262,9 @@ def post_processing(settings: PostProcessing | str) -> PostProcessing:
     if isinstance(settings, PostProcessing):
         return settings
     if not isinstance(settings, str):
-        raise ConfigError(f"post-processing: expected PostProcessing or the name of one, found {settings!r}")
+        raise ConfigError(
+            f"post-processing: expected PostProcessing or the name of one, found {settings!r}"
+        )
     return POST_PROCESSING[choice("post-processing", settings, POST_PROCESSING)]
 
 
@@ -250,14 +293,17 @@ def trajectories(
     """
     shape = grid.with_orientation(linked.orientation).shape
     if linked.instance.shape[1:] != shape:
-        raise GeometryError(f"grid: has {shape} cells, but the instances have {linked.instance.shape[1:]}")
+        raise GeometryError(
+            f"grid: has {shape} cells, but the instances have {linked.instance.shape[1:]}"
+        )
     rules = label_protocol(protocol)
     if half_cell_shift is not None:
         rules = replace(rules, half_cell_shift=half_cell_shift)
     within = np.array(rules.place_in_cell)
     low, size = np.array([(low, size) for low, _, size in (grid.x, grid.y)]).T
     return {
-        name: low + (_points_in(points, shape, linked.orientation, "devkit")[:, ::-1] + within) * size
+        name: low
+        + (_points_in(points, shape, linked.orientation, "devkit")[:, ::-1] + within) * size
         for name, points in linked.centers.items()
     }
 
@@ -267,7 +313,9 @@ def _paths(groups: Sequence[FrameGroups], names: Sequence[IntArray]) -> tuple[Fl
     length = groups[0].instances + 1
     pairs = list(zip(groups, names, strict=True))
     counts = np.stack([sums_by(name, group.count, length) for group, name in pairs])
-    sums = np.stack([[sums_by(name, along, length) for along in group.position_sum] for group, name in pairs])
+    sums = np.stack(
+        [[sums_by(name, along, length) for along in group.position_sum] for group, name in pairs]
+    )
     centers = (sums / np.maximum(counts, 1)[:, None]).astype(np.float32).astype(np.float64)
     return centers.transpose(2, 0, 1)[1:], counts.T[1:].astype(np.int64)
 
@@ -293,7 +341,9 @@ class _Turn:
         """The heads' vectors (2, H, W) at scanned rows and columns (2, P), as (2, P) scanned ones."""
         taken = np.take(vectors.reshape(2, -1), self._flat(position), axis=1)
         rasters = taken.T[..., None, None]  # of one cell each: no cell moves, only the vectors turn
-        turned = to_orientation(rasters, vectors=True, source=self.heads, target=self.scan, ignore=ignore)
+        turned = to_orientation(
+            rasters, vectors=True, source=self.heads, target=self.scan, ignore=ignore
+        )
         return turned[..., 0, 0].T
 
     def raster(self, positions: Sequence[IntArray], ids: Sequence[IntArray]) -> AnyArray:
@@ -312,6 +362,8 @@ class _Turn:
         return np.asarray(row * self.shape[1] + column)
 
 
-def _points_in(points: AnyArray, shape: tuple[int, int], source: Orientation, target: Orientation) -> AnyArray:
+def _points_in(
+    points: AnyArray, shape: tuple[int, int], source: Orientation, target: Orientation
+) -> AnyArray:
     """Rows and columns (…, 2) of one orientation, `shape` its cells, in another."""
     return np.stack(cells_in(points[..., 0], points[..., 1], shape, source, target), axis=-1)

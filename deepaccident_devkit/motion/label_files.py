@@ -109,13 +109,16 @@ def write_label_files(
     wanted = _by_recording(dataset, tokens)
     _check_agents(dataset, wanted, chosen)
     LabelManifest.of(root, chosen, names)
-    store = label_store(root, digest_of({"config": chosen.digest, "names": names, "samples": wanted}))
+    store = label_store(
+        root, digest_of({"config": chosen.digest, "names": names, "samples": wanted})
+    )
     with store.shared(tidy=partial(remove_half_written, root)) as turn:
         manifest = LabelManifest.of(root, chosen, names)
         if not (root / MANIFEST).exists():
             manifest.write(root)
         files = {
-            recording: _with_kept(dataset, root, recording, frames, manifest) for recording, frames in wanted.items()
+            recording: _with_kept(dataset, root, recording, frames, manifest)
+            for recording, frames in wanted.items()
         }
         made = store.run(
             _Work(dataset, root, manifest.config, names).write,
@@ -126,11 +129,15 @@ def write_label_files(
         )
         if turn.alone():
             manifest = LabelManifest.of(root, chosen, names)
-            manifest.samples.update({recording: list(frames) for recording, frames in files.items()})
+            manifest.samples.update(
+                {recording: list(frames) for recording, frames in files.items()}
+            )
             manifest.write(root)
             store.remove()
     each = [new for files_made in made.values() for new in files_made]
-    return LabelsWritten(samples=sum(map(len, wanted.values())), written=sum(each), kept=len(each) - sum(each))
+    return LabelsWritten(
+        samples=sum(map(len, wanted.values())), written=sum(each), kept=len(each) - sum(each)
+    )
 
 
 class LabelFiles(Mapping[str, MotionLabels]):
@@ -140,7 +147,9 @@ class LabelFiles(Mapping[str, MotionLabels]):
     is added to the folder later is seen when it is opened again.
     """
 
-    def __init__(self, folder: str | os.PathLike[str], config: MotionLabelConfig | str | None = None) -> None:
+    def __init__(
+        self, folder: str | os.PathLike[str], config: MotionLabelConfig | str | None = None
+    ) -> None:
         """Open a folder that `write_label_files` or `deepaccident labels` made.
 
         Args:
@@ -162,11 +171,14 @@ class LabelFiles(Mapping[str, MotionLabels]):
         if config is not None:
             manifest.check(self.folder, resolved_label_config(config))
         if not manifest.samples:
-            raise LabelFilesError(f"{self.folder}: its labels are not complete; run `deepaccident labels` on it again")
+            raise LabelFilesError(
+                f"{self.folder}: its labels are not complete; run `deepaccident labels` on it again"
+            )
         self.config = manifest.config
         self._digest = manifest.config.digest
         self._frames = {
-            recording: frozenset(manifest.samples[recording]) for recording in sorted(manifest.samples, key=_order)
+            recording: frozenset(manifest.samples[recording])
+            for recording in sorted(manifest.samples, key=_order)
         }
         self._open: OrderedDict[str, zipfile.ZipFile] = OrderedDict()
         self._process = os.getpid()
@@ -202,14 +214,18 @@ class LabelFiles(Mapping[str, MotionLabels]):
             LabelFilesError: its file is missing, damaged or of another configuration.
         """
         if token not in self:
-            raise TokenError(f"{self.folder}: has no labels of {token!r}; `deepaccident labels` can add them")
+            raise TokenError(
+                f"{self.folder}: has no labels of {token!r}; `deepaccident labels` can add them"
+            )
         recording, number = _parts(token)
         try:
             return StoredLabels.read(self._archive(recording), f"{number:03d}").labels(self.config)
         except DAMAGED_ARCHIVE as error:
             self._open.pop(recording, None)
             path = label_path(self.folder, recording)
-            raise LabelFilesError(f"{path}: {error}; remove it and run `deepaccident labels` again") from error
+            raise LabelFilesError(
+                f"{path}: {error}; remove it and run `deepaccident labels` again"
+            ) from error
 
     def _archive(self, recording: str) -> zipfile.ZipFile:
         """The open file of a scenario and agent; threads may share it, so the garbage collector closes dropped ones."""
@@ -253,7 +269,9 @@ class _Work:
             self._write_file(path, each, source, labels)
         return [path in new for path in paths]
 
-    def _write_file(self, path: Path, frames: tuple[int, ...], source: str, of_frames: Iterator[MotionLabels]) -> None:
+    def _write_file(
+        self, path: Path, frames: tuple[int, ...], source: str, of_frames: Iterator[MotionLabels]
+    ) -> None:
         """Write one file of the next labels; a batch has its code's arrays alone, its source is the zip's comment."""
         place = place_in(self.root, path.relative_to(self.root))
         with replacing(place) as temporary, zipfile.ZipFile(temporary, "w") as archive:
@@ -262,7 +280,9 @@ class _Work:
                 write_array(archive, "source", np.array(source))
             else:
                 archive.comment = source.encode()
-            for frame, labels in zip(frames, of_frames, strict=False):  # the others are of the files after it
+            for frame, labels in zip(
+                frames, of_frames, strict=False
+            ):  # the others are of the files after it
                 if self.names is None:
                     StoredLabels.of(labels).write(archive, f"{frame:03d}")
                 else:
@@ -272,7 +292,9 @@ class _Work:
     def _source(self, recording: str, frames: tuple[int, ...]) -> str:
         """A digest of all that files are made from: configuration, samples or names, and the scenario's rows."""
         digest = hashlib.blake2b(digest_size=16)
-        what = frames if self.names is None else self.names  # a batch does not depend on the samples beside it
+        what = (
+            frames if self.names is None else self.names
+        )  # a batch does not depend on the samples beside it
         digest.update(f"{LABEL_FORMAT_VERSION} {self.config.digest} {recording} {what}".encode())
         for array in _scenario_arrays(self.dataset, recording.rsplit("/", 1)[0]):
             digest.update(np.ascontiguousarray(array).tobytes())
@@ -285,14 +307,24 @@ def _scenario_arrays(dataset: Dataset, scenario: str) -> Iterator[AnyArray]:
     row, samples = dataset.getind("scenario", scenario), dataset.columns("sample")
     first, last = samples["scenario_row"].searchsorted((row, row + 1))
     yield dataset.columns("ego_pose")["matrix"][first:last]
-    lidars = slice(first * len(CHANNELS) + CHANNELS.index(LIDAR), last * len(CHANNELS), len(CHANNELS))
+    lidars = slice(
+        first * len(CHANNELS) + CHANNELS.index(LIDAR), last * len(CHANNELS), len(CHANNELS)
+    )
     yield dataset.columns("sample_data")["matrix"][lidars]
     yield samples["agent"][first:last]
     counts = samples["num_annotations"][first:last]
     yield counts
     if counts.any():
         start = int(samples["first_annotation_row"][first:last][counts > 0].min())
-        for name in ("translation", "size", "yaw", "actor_id", "category", "num_lidar_pts", "camera_visible"):
+        for name in (
+            "translation",
+            "size",
+            "yaw",
+            "actor_id",
+            "category",
+            "num_lidar_pts",
+            "camera_visible",
+        ):
             yield dataset.columns("annotation")[name][start : start + int(counts.sum())]
 
 
@@ -310,7 +342,9 @@ def _source_of(path: Path, names: BatchNames | None) -> str | None:
 def _by_recording(dataset: Dataset, tokens: Iterable[RowArgument]) -> dict[str, list[int]]:
     """Scenario and agent → frame numbers, each once, ascending."""
     if isinstance(tokens, str | Mapping):
-        raise ChoiceError(f"tokens: expected samples' tokens or records, found {tokens!r}; put it into a list")
+        raise ChoiceError(
+            f"tokens: expected samples' tokens or records, found {tokens!r}; put it into a list"
+        )
     found: dict[str, set[int]] = {}
     labelled = dataset.columns("sample")["labelled"]
     for given in tokens:
@@ -325,7 +359,9 @@ def _by_recording(dataset: Dataset, tokens: Iterable[RowArgument]) -> dict[str, 
     return {recording: sorted(found[recording]) for recording in sorted(found, key=_order)}
 
 
-def _check_agents(dataset: Dataset, wanted: Mapping[str, list[int]], config: MotionLabelConfig) -> None:
+def _check_agents(
+    dataset: Dataset, wanted: Mapping[str, list[int]], config: MotionLabelConfig
+) -> None:
     """Raise NotAvailableError or ChoiceError now, and not later in a worker."""
     if config.filter_invisible and config.agents is not None:
         for recording, frames in wanted.items():

@@ -74,7 +74,9 @@ class StoredLabels(ShortRepr):
         row, column = np.divmod(cell, instance.shape[2])
         center = np.full((len(instance), 1 + highest, 2), NOWHERE, dtype=np.int16)
         flow = center.copy()
-        center.reshape(-1, 2)[shown] = np.stack([row, column], axis=1) + labels.offset[frame, :, row, column]
+        center.reshape(-1, 2)[shown] = (
+            np.stack([row, column], axis=1) + labels.offset[frame, :, row, column]
+        )
         vectors = labels.flow[frame, :, row, column]
         known = (vectors != labels.config.ignore_index).any(axis=1)
         flow.reshape(-1, 2)[shown[known]] = vectors[known]
@@ -99,7 +101,12 @@ class StoredLabels(ShortRepr):
         row, column = cells_in(cell // shape[1], cell % shape[1], shape, given, native)
         identity: IntArray = self.instance.reshape(-1)[flat].astype(np.int64)
         covered = CoveredCells(
-            frame=frame, row=row, column=column, identity=identity, frames=len(self.instance), ids=len(self.actor) - 1
+            frame=frame,
+            row=row,
+            column=column,
+            identity=identity,
+            frames=len(self.instance),
+            ids=len(self.actor) - 1,
         )
         center, flow = (
             np.where(table == NOWHERE, np.float32(np.nan), table.astype(np.float32))
@@ -131,7 +138,12 @@ class StoredLabels(ShortRepr):
     @classmethod
     def read(cls, archive: zipfile.ZipFile, folder: str) -> StoredLabels:
         """The arrays of a folder of an archive; raises what zipfile and numpy raise for damaged ones."""
-        return cls(**{each.name: read_array(archive, f"{folder}/{each.name}", "motion_labels") for each in fields(cls)})
+        return cls(
+            **{
+                each.name: read_array(archive, f"{folder}/{each.name}", "motion_labels")
+                for each in fields(cls)
+            }
+        )
 
 
 def write_array(archive: zipfile.ZipFile, name: str, array: AnyArray) -> None:
@@ -151,7 +163,9 @@ MANIFEST: Final = "manifest.json"
 _CELL_BYTES: Final = 16
 _UNFINISHED: Final = ".unfinished"
 _WRITTEN: Final = re.compile(rf"{re.escape(MANIFEST)}|({'|'.join(AGENTS)}|\d{{3}})\.npz")
-_RECORDING: Final = re.compile(rf"(?!\.)[^/\\\0]{{1,255}}/(?!\.)[^/\\\0]{{1,255}}/({'|'.join(AGENTS)})")
+_RECORDING: Final = re.compile(
+    rf"(?!\.)[^/\\\0]{{1,255}}/(?!\.)[^/\\\0]{{1,255}}/({'|'.join(AGENTS)})"
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,7 +184,9 @@ class LabelManifest:
     names: BatchNames | None = None
 
     @classmethod
-    def of(cls, root: Path, config: MotionLabelConfig, names: BatchNames | None = None) -> LabelManifest:
+    def of(
+        cls, root: Path, config: MotionLabelConfig, names: BatchNames | None = None
+    ) -> LabelManifest:
         """The manifest of a folder into which labels of a configuration will be written; changes nothing.
 
         Raises:
@@ -187,11 +203,15 @@ class LabelManifest:
                 manifest.check(root, config, names)
                 return manifest
             if not all(map(_is_own, there)):
-                raise LabelFilesError(f"{root}: is not empty and holds no motion labels; choose a new folder")
+                raise LabelFilesError(
+                    f"{root}: is not empty and holds no motion labels; choose a new folder"
+                )
         except OSError as error:
             if isinstance(error, LabelFilesError):
                 raise
-            raise LabelFilesError(f"{root}: cannot be read ({error}); choose another folder") from error
+            raise LabelFilesError(
+                f"{root}: cannot be read ({error}); choose another folder"
+            ) from error
         return cls(config, {}, names)
 
     @classmethod
@@ -208,26 +228,41 @@ class LabelManifest:
             config, samples = MotionLabelConfig.from_dict(told["config"]), _samples(told["samples"])
             names = told.get("names")  # absent in folders of 0.1
             if names not in (None, *get_args(BatchNames)):
-                raise ValueError(f"names: expected one of {', '.join(get_args(BatchNames))}, or null, found {names!r}")
+                raise ValueError(
+                    f"names: expected one of {', '.join(get_args(BatchNames))}, or null, found {names!r}"
+                )
             if config.digest != told["config_digest"]:
                 raise ValueError("its digest is not that of its configuration")
-            check_size(config.grid.cells * config.label_frames * _CELL_BYTES, "motion_labels", "a sample")
+            check_size(
+                config.grid.cells * config.label_frames * _CELL_BYTES, "motion_labels", "a sample"
+            )
         except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
             if isinstance(error, LabelFilesError):
                 raise
-            told = fault_text(error) if isinstance(error, OSError) else f"cannot be read ({shortened(str(error), 600)})"
-            raise LabelFilesError(f"{path}: {told}; make the labels again in an empty folder") from error
+            told = (
+                fault_text(error)
+                if isinstance(error, OSError)
+                else f"cannot be read ({shortened(str(error), 600)})"
+            )
+            raise LabelFilesError(
+                f"{path}: {told}; make the labels again in an empty folder"
+            ) from error
         return cls(config, samples, names)
 
     def check(self, root: Path, config: MotionLabelConfig, names: BatchNames | None = None) -> None:
         """Refuse another configuration or other names; raises ConfigError that says what differs."""
         mine, others = (
-            _flat({**one.as_dict(), "names": own}) for one, own in ((self.config, self.names), (config, names))
+            _flat({**one.as_dict(), "names": own})
+            for one, own in ((self.config, self.names), (config, names))
         )
         changed = sorted(name for name in {*mine, *others} if mine.get(name) != others.get(name))
         if changed:
-            text = "; ".join(f"{name}: {mine.get(name)!r}, asked for {others.get(name)!r}" for name in changed)
-            raise ConfigError(f"{root}: holds labels of another configuration ({text}); choose another folder")
+            text = "; ".join(
+                f"{name}: {mine.get(name)!r}, asked for {others.get(name)!r}" for name in changed
+            )
+            raise ConfigError(
+                f"{root}: holds labels of another configuration ({text}); choose another folder"
+            )
 
     def write(self, root: Path) -> None:
         """Write the manifest into its folder."""
@@ -248,7 +283,9 @@ class LabelManifest:
 
 def label_store(root: Path, command: str) -> Store:
     """What keeps others from writing the same labels into a folder; `command` says which labels are written."""
-    return Store(place_in(root, _UNFINISHED, opened=True), root, "writes labels", LabelFilesError, command)
+    return Store(
+        place_in(root, _UNFINISHED, opened=True), root, "writes labels", LabelFilesError, command
+    )
 
 
 def folder_path(folder: str | os.PathLike[str]) -> Path:
@@ -288,7 +325,9 @@ def _is_half_written(name: str) -> bool:
 
 def _check_version(path: Path, form: object, version: object) -> None:
     if form != LABEL_FORMAT or not isinstance(version, int):
-        raise ValueError(f"expected a manifest of {LABEL_FORMAT}, found one of {form!r}, version {version!r}")
+        raise ValueError(
+            f"expected a manifest of {LABEL_FORMAT}, found one of {form!r}, version {version!r}"
+        )
     if version != LABEL_FORMAT_VERSION:
         kind, remedy = (
             ("a newer", "update the devkit, or")
@@ -306,7 +345,9 @@ def _samples(read: Mapping[str, Any]) -> dict[str, list[int]]:
     for recording, frames in read.items():
         good = _RECORDING.fullmatch(recording) and isinstance(frames, list)
         if not good or not all(type(frame) is int and frame > 0 for frame in frames):
-            raise ValueError(f"samples of {shortened(recording)!r}: expected a scenario, agent and frame numbers")
+            raise ValueError(
+                f"samples of {shortened(recording)!r}: expected a scenario, agent and frame numbers"
+            )
     return {recording: list(frames) for recording, frames in read.items()}
 
 

@@ -115,9 +115,13 @@ class MotionLabels(FrozenArrays, Pictured):
             ChoiceError: no such mode.
         """
         if self.at_present:
-            raise NotAvailableError("labels: they are in the present frame already; warp the labels of `motion_labels`")
+            raise NotAvailableError(
+                "labels: they are in the present frame already; warp the labels of `motion_labels`"
+            )
         maps = {name: getattr(self, name) for name in MAPS}
-        warped: dict[str, Any] = maps_to_present(maps, self.label_egomotion, ~self.label_valid, self.config, centerness)
+        warped: dict[str, Any] = maps_to_present(
+            maps, self.label_egomotion, ~self.label_valid, self.config, centerness
+        )
         return replace(self, **warped, at_present=True)
 
     @property
@@ -145,7 +149,12 @@ class MotionLabels(FrozenArrays, Pictured):
 
     @classmethod
     def from_batch(
-        cls, batch: Mapping[str, Any], config: MotionLabelConfig | str, names: BatchNames, *, at_present: bool = False
+        cls,
+        batch: Mapping[str, Any],
+        config: MotionLabelConfig | str,
+        names: BatchNames,
+        *,
+        at_present: bool = False,
     ) -> MotionLabels:
         """Labels from a sample of another code's loader, the reverse of `as_batch`; the ids' actors are not known.
 
@@ -198,10 +207,14 @@ def maps_to_present(
         turn = None if rules.vectors_not_rotated else _vector_turn(transforms[frame], config)
         _warp_instances(source, target, indices, turn, config)
         if centerness == "nearest":
-            target["centerness"].reshape(-1)[:] = take_cells(source["centerness"].reshape(-1), indices)
+            target["centerness"].reshape(-1)[:] = take_cells(
+                source["centerness"].reshape(-1), indices
+            )
         else:
             native = config.grid.reorient(source["centerness"], rules.native)
-            config.grid.reorient(target["centerness"], rules.native)[...] = blend_cells(native, points)
+            config.grid.reorient(target["centerness"], rules.native)[...] = blend_cells(
+                native, points
+            )
     return warped
 
 
@@ -212,7 +225,9 @@ def _empty_like(maps: Mapping[str, AnyArray]) -> dict[str, AnyArray]:
     """
     block = np.empty(sum(given.nbytes for given in maps.values()), dtype=np.uint8)
     result, start = {}, 0
-    for name, given in reversed(list(maps.items())):  # segmentation's bytes last, so that all are aligned
+    for name, given in reversed(
+        list(maps.items())
+    ):  # segmentation's bytes last, so that all are aligned
         end = start + given.nbytes
         result[name] = block[start:end].view(given.dtype).reshape(given.shape)
         start = end
@@ -232,13 +247,18 @@ def _warp_instances(
     instances are fetched. Offset and flow, where they are known, turn by `turn`.
     """
     target["instance"].reshape(-1)[:] = take_cells(source["instance"].reshape(-1), indices)
-    on_instance = np.flatnonzero(target["instance"] != 0)  # seven times as fast on a mask as on integers
+    on_instance = np.flatnonzero(
+        target["instance"] != 0
+    )  # seven times as fast on a mask as on integers
     fetched = indices[on_instance]
     background = np.full(indices.size, config.ignore_index, dtype=target["offset"].dtype)
     if config.rules.outside_is_zero:
         background *= indices != OUTSIDE
     for name, beside in (("segmentation", 0), ("offset", background), ("flow", background)):
-        cells, filled = source[name].reshape(-1, indices.size), target[name].reshape(-1, indices.size)
+        cells, filled = (
+            source[name].reshape(-1, indices.size),
+            target[name].reshape(-1, indices.size),
+        )
         filled[...] = beside
         values = cells.take(fetched, axis=1)
         if turn is not None and name != "segmentation":

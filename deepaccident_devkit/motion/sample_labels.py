@@ -83,34 +83,48 @@ def motion_labels_of(
         DeepAccidentError: as of `motion_labels`, when the labels are asked for.
     """
     if isinstance(samples, str | Mapping):
-        raise ChoiceError(f"samples: expected tokens or records of samples, found {samples!r}; put it into a list")
+        raise ChoiceError(
+            f"samples: expected tokens or records of samples, found {samples!r}; put it into a list"
+        )
     chosen, left = resolved_label_config(config), iter(samples)
     groups = iter(lambda: list(islice(left, _AT_ONCE)), [])
     return (labels for group in groups for labels in _labels(dataset, group, chosen, None))
 
 
 def _labels(
-    dataset: Dataset, group: Sequence[RowArgument], config: MotionLabelConfig, id_map: Mapping[int, int] | None
+    dataset: Dataset,
+    group: Sequence[RowArgument],
+    config: MotionLabelConfig,
+    id_map: Mapping[int, int] | None,
 ) -> Iterator[MotionLabels]:
     """The labels of S samples; the ids of each continue the map."""
     if config.rules.sight == "camera":
         dataset = dataset.with_ignored
-    row, columns = np.array([dataset.getind("sample", sample) for sample in group]), dataset.columns("sample")
+    row, columns = (
+        np.array([dataset.getind("sample", sample) for sample in group]),
+        dataset.columns("sample"),
+    )
     bare = row[~columns["labelled"][row]]
     if len(bare):
-        raise NotAvailableError(f"{dataset.sample[bare.item(0)]['token']} has no label (the test split has none)")
+        raise NotAvailableError(
+            f"{dataset.sample[bare.item(0)]['token']} has no label (the test split has none)"
+        )
     length = dataset.columns("scenario")["num_frames"][columns["scenario_row"][row]]
     first_row = dataset.columns("agent")["first_sample_row"][columns["agent_row"][row]]
     offsets = np.array([*config.offsets, config.offsets[-1] + config.step])
     index: IntArray = (row - first_row)[:, None] + offsets
     there = (index >= 0) & (index < length[:, None])
     world_from_ego = np.tile(np.eye(4), (*index.shape, 1, 1))
-    world_from_ego[there] = stored_transforms(dataset.columns("ego_pose")["matrix"][(row[:, None] + offsets)[there]])
+    world_from_ego[there] = stored_transforms(
+        dataset.columns("ego_pose")["matrix"][(row[:, None] + offsets)[there]]
+    )
     # the rows from the last moment of a sample to the first of the next are left out
     motion = egomotion(world_from_ego.reshape(-1, 4, 4), there.reshape(-1), config.rules)
     motion = motion[np.arange(index.size).reshape(index.shape)[:, :-1]]
     shown = slice(config.receptive_field - 1, -1)
-    boxes = _box_rows(dataset, group, columns["agent_row"][row], index[:, shown], there[:, shown], config)
+    boxes = _box_rows(
+        dataset, group, columns["agent_row"][row], index[:, shown], there[:, shown], config
+    )
     return labels_of(polygons_of(boxes, config), motion, there[:, :-1], config, id_map)
 
 
@@ -148,12 +162,16 @@ def _box_rows(
 
 def _ego_from_lidar(dataset: Dataset, rows: IntArray, config: MotionLabelConfig) -> FloatArray:
     """(K, 4, 4) of samples, as `FrameBoxes` has it."""
-    ego_from_lidar = stored_transforms(dataset.columns("sample_data")["matrix"][rows * len(CHANNELS) + _LIDAR])
+    ego_from_lidar = stored_transforms(
+        dataset.columns("sample_data")["matrix"][rows * len(CHANNELS) + _LIDAR]
+    )
     if config.rules.pose != "yaw":
         return ego_from_lidar
     world_from_ego = stored_transforms(dataset.columns("ego_pose")["matrix"][rows])
     world_from_level = conventions.six_vectors_of(world_from_ego) * (1, 1, 1, 0, 0, 1)
-    return np.asarray(inverses(conventions.matrices_of_six(world_from_level)) @ world_from_ego @ ego_from_lidar)
+    return np.asarray(
+        inverses(conventions.matrices_of_six(world_from_level)) @ world_from_ego @ ego_from_lidar
+    )
 
 
 def _seen(
@@ -172,9 +190,14 @@ def _seen(
     one_each = dict(zip(agent.tolist(), group, strict=True))
     of_agent = {row: _observers(dataset, sample, config) for row, sample in one_each.items()}
     observers = [of_agent[row] for row in agent.tolist()]
-    observer, sample = np.concatenate(observers), np.repeat(np.arange(len(agent)), [len(one) for one in observers])
+    observer, sample = (
+        np.concatenate(observers),
+        np.repeat(np.arange(len(agent)), [len(one) for one in observers]),
+    )
     known = there[sample]
-    row, count = _annotations(dataset, (agents["first_sample_row"][observer][:, None] + index[sample])[known])
+    row, count = _annotations(
+        dataset, (agents["first_sample_row"][observer][:, None] + index[sample])[known]
+    )
     frame = np.repeat(np.arange(there.size).reshape(there.shape)[sample][known], count)
     actor, mask = boxes["actor_id"][row], boxes["camera_visible"][row]
     if config.rules.sight != "camera":
@@ -211,4 +234,6 @@ def _pairs(actor: AnyArray, row: IntArray, frame: IntArray, frames: int) -> IntA
 
     An untracked row is an actor of its own.
     """
-    return np.asarray(np.where(actor == UNTRACKED_ID, OWN_ACTOR_ID - 1 - row, actor) * frames + frame)
+    return np.asarray(
+        np.where(actor == UNTRACKED_ID, OWN_ACTOR_ID - 1 - row, actor) * frames + frame
+    )

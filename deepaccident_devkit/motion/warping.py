@@ -66,10 +66,17 @@ class _Arithmetic(NamedTuple):
 
 
 _SINGLE = _Arithmetic(
-    single_precision.pose_matrices, single_precision.rigid_inverse, single_precision.inverse, single_precision.product
+    single_precision.pose_matrices,
+    single_precision.rigid_inverse,
+    single_precision.inverse,
+    single_precision.product,
 )
 _DOUBLE = _Arithmetic(conventions.matrices_of_six, np.linalg.inv, np.linalg.inv, np.matmul)
-_ARITHMETIC: Final[Mapping[str, _Arithmetic]] = {"stretched": _SINGLE, "fiery": _SINGLE, "exact": _DOUBLE}
+_ARITHMETIC: Final[Mapping[str, _Arithmetic]] = {
+    "stretched": _SINGLE,
+    "fiery": _SINGLE,
+    "exact": _DOUBLE,
+}
 
 
 def egomotion(world_from_ego: ArrayLike, valid: ArrayLike, rules: LabelProtocol) -> AnyArray:
@@ -102,11 +109,15 @@ def present_from_frames(
     """
     arithmetic = _ARITHMETIC[rules.warp]
     this_from_next = arithmetic.rigid_inverse(_native_matrices(egomotion, rules)[:-1])
-    chain = accumulate(this_from_next, arithmetic.product, initial=np.eye(4, dtype=this_from_next.dtype))
+    chain = accumulate(
+        this_from_next, arithmetic.product, initial=np.eye(4, dtype=this_from_next.dtype)
+    )
     return _augmented(np.stack(list(chain)), rules, augmentation)
 
 
-def frames_from_next(egomotion: ArrayLike, rules: LabelProtocol, augmentation: Augmentation | None = None) -> AnyArray:
+def frames_from_next(
+    egomotion: ArrayLike, rules: LabelProtocol, augmentation: Augmentation | None = None
+) -> AnyArray:
     """Transforms (T, 4, 4) from each frame's next frame to that frame, of `next_from_this` (T, 6).
 
     The released code has a special way to invert these.
@@ -115,7 +126,9 @@ def frames_from_next(egomotion: ArrayLike, rules: LabelProtocol, augmentation: A
     return _augmented(inverse, rules, augmentation)
 
 
-def present_from_past(egomotion: ArrayLike, rules: LabelProtocol, augmentation: Augmentation | None = None) -> AnyArray:
+def present_from_past(
+    egomotion: ArrayLike, rules: LabelProtocol, augmentation: Augmentation | None = None
+) -> AnyArray:
     """Transforms (P, 4, 4) of past moments to the present, of their `next_from_this` (P, 6), the oldest first.
 
     The released code and FIERY multiply the motions in the order of time, E_0 E_1, and so are wrong from the second
@@ -136,10 +149,14 @@ def ego_from_agents(
 
 def _native_matrices(six: ArrayLike, rules: LabelProtocol) -> AnyArray:
     vectors = checked("egomotion", six, (None, 6))
-    return _ARITHMETIC[rules.warp].matrices(vectors if rules.right_handed else flip_six_vector(vectors))
+    return _ARITHMETIC[rules.warp].matrices(
+        vectors if rules.right_handed else flip_six_vector(vectors)
+    )
 
 
-def _augmented(transforms: AnyArray, rules: LabelProtocol, augmentation: Augmentation | None) -> AnyArray:
+def _augmented(
+    transforms: AnyArray, rules: LabelProtocol, augmentation: Augmentation | None
+) -> AnyArray:
     """A · transforms · A⁻¹."""
     if augmentation is None or not len(transforms):
         return transforms
@@ -152,12 +169,20 @@ def _augmented(transforms: AnyArray, rules: LabelProtocol, augmentation: Augment
 def sampling_matrix(target_from_source: ArrayLike, rules: LabelProtocol) -> AnyArray:
     """`source_from_target` of transforms (N, 4, 4), as the protocol computes it: in float32 or float64."""
     if rules.warp == "stretched":
-        return single_precision.inverse(checked("target_from_source", target_from_source, (None, 4, 4), np.float32))
-    return np.asarray(np.linalg.inv(checked("target_from_source", target_from_source, (None, 4, 4))))
+        return single_precision.inverse(
+            checked("target_from_source", target_from_source, (None, 4, 4), np.float32)
+        )
+    return np.asarray(
+        np.linalg.inv(checked("target_from_source", target_from_source, (None, 4, 4)))
+    )
 
 
 def nearest_indices(
-    source_from_target: ArrayLike, grid: BevGrid, rules: LabelProtocol, *, orientation: Orientation | None = None
+    source_from_target: ArrayLike,
+    grid: BevGrid,
+    rules: LabelProtocol,
+    *,
+    orientation: Orientation | None = None,
 ) -> CellIndices:
     """The source cell (H · W,) of each target cell: row · W + column, `OUTSIDE` where the sample point is off the grid.
 
@@ -168,11 +193,16 @@ def nearest_indices(
 
 
 def rounded_points(
-    points: tuple[AnyArray, AnyArray], grid: BevGrid, rules: LabelProtocol, orientation: Orientation | None = None
+    points: tuple[AnyArray, AnyArray],
+    grid: BevGrid,
+    rules: LabelProtocol,
+    orientation: Orientation | None = None,
 ) -> CellIndices:
     """`nearest_indices` from the sample points."""
     if grid.cells > _COUNTABLE:
-        raise GeometryError(f"grid: {grid.cells} cells are more than a warp can number; choose at most {_COUNTABLE}")
+        raise GeometryError(
+            f"grid: {grid.cells} cells are more than a warp can number; choose at most {_COUNTABLE}"
+        )
     row, column = np.rint(points[0]), np.rint(points[1])
     rows, columns = row.shape
     beside = (row < 0) | (row >= rows)
@@ -211,7 +241,9 @@ def warp(
     by_native_rows = lying.reorient(source, native)  # a view; refuses other shapes
     if checked_mode(mode) == "nearest":
         indices = nearest_indices(source_from_target, grid, rules, orientation=orientation)
-        return take_cells(source.reshape(*source.shape[:-2], -1), indices, fill).reshape(source.shape)
+        return take_cells(source.reshape(*source.shape[:-2], -1), indices, fill).reshape(
+            source.shape
+        )
     result = np.empty(source.shape, dtype=np.float32)
     points = sample_points(source_from_target, grid, rules)
     lying.reorient(result, native)[...] = blend_cells(by_native_rows, points, fill)
@@ -223,7 +255,9 @@ def checked_mode(mode: WarpMode) -> WarpMode:
     return choice("mode", mode, get_args(WarpMode))
 
 
-def sample_points(source_from_target: ArrayLike, grid: BevGrid, rules: LabelProtocol) -> tuple[AnyArray, AnyArray]:
+def sample_points(
+    source_from_target: ArrayLike, grid: BevGrid, rules: LabelProtocol
+) -> tuple[AnyArray, AnyArray]:
     """Where in the source each target cell samples: rows and columns (H, W), in cells, 0 the first cell's centre.
 
     Native orientation; float32, but float64 if `exact`. Raises GeometryError.
@@ -233,15 +267,21 @@ def sample_points(source_from_target: ArrayLike, grid: BevGrid, rules: LabelProt
     return rows.points(0), columns.points(0)
 
 
-def sampling_lines(matrices: AnyArray, grid: BevGrid, rules: LabelProtocol) -> tuple[SamplingLine, SamplingLine]:
+def sampling_lines(
+    matrices: AnyArray, grid: BevGrid, rules: LabelProtocol
+) -> tuple[SamplingLine, SamplingLine]:
     """What `sample_points` computes its rows and columns from, for matrices (N, 4, 4): to sample only some cells.
 
     Raises GeometryError.
     """
     if not np.isfinite(matrices).all():
-        raise GeometryError("source_from_target: not all numbers are finite; leave out frames without a pose")
+        raise GeometryError(
+            "source_from_target: not all numbers are finite; leave out frames without a pose"
+        )
     if rules.warp == "fiery":
-        numbers = conventions.six_vectors_of(np.linalg.inv(matrices)).astype(np.float32).T[..., None]
+        numbers = (
+            conventions.six_vectors_of(np.linalg.inv(matrices)).astype(np.float32).T[..., None]
+        )
         return fiery_lines(numbers[0], numbers[1], numbers[5], grid.x, grid.y)
     native = grid.with_orientation(rules.native)
     order = [0, 1] if native.orientation == "fiery" else [1, 0]
@@ -255,7 +295,9 @@ def sampling_lines(matrices: AnyArray, grid: BevGrid, rules: LabelProtocol) -> t
 def _numbering(grid: BevGrid, native: Orientation) -> tuple[int, int, int]:
     """How `grid`'s orientation numbers the cells of the native one: the first, the step of a row, of a column."""
     numbers = grid.reorient(np.arange(grid.cells).reshape(grid.shape), native)
-    first, below, beside = (int(corner) for corner in (numbers[0, 0], numbers[-1, 0], numbers[0, -1]))
+    first, below, beside = (
+        int(corner) for corner in (numbers[0, 0], numbers[-1, 0], numbers[0, -1])
+    )
     rows, columns = (max(count - 1, 1) for count in numbers.shape)
     return first, (below - first) // rows, (beside - first) // columns
 
@@ -290,7 +332,9 @@ def past_to_present(
     maps = _maps(features)
     motion = checked("egomotion", egomotion, (None, 6))
     if len(maps) > len(motion) + 1:
-        raise GeometryError(f"egomotion: expected at least {len(maps) - 1} rows for {len(maps)} maps")
+        raise GeometryError(
+            f"egomotion: expected at least {len(maps) - 1} rows for {len(maps)} maps"
+        )
     rules = label_protocol(protocol)
     transforms = present_from_past(motion[: len(maps) - 1], rules, augmentation)
     return _warped(maps, list(range(len(maps) - 1)), transforms, rules, grid, mode)
@@ -318,13 +362,22 @@ def agents_to_ego(
     maps = _maps(features)
     poses = checked("relative_pose", relative_pose, (len(maps), 6))
     rules = label_protocol(protocol)
-    return _warped(maps, list(range(1, len(maps))), ego_from_agents(poses[1:], rules, augmentation), rules, grid, mode)
+    return _warped(
+        maps,
+        list(range(1, len(maps))),
+        ego_from_agents(poses[1:], rules, augmentation),
+        rules,
+        grid,
+        mode,
+    )
 
 
 def _maps(features: ArrayLike) -> AnyArray:
     maps = as_numbers("features", features, "maps (K, …, H, W)", dtype=None)
     if maps.ndim < 3 or not len(maps):
-        raise GeometryError(f"features: expected at least one map of shape (K, …, H, W), found {maps.shape}")
+        raise GeometryError(
+            f"features: expected at least one map of shape (K, …, H, W), found {maps.shape}"
+        )
     return maps
 
 

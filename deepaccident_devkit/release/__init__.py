@@ -3,7 +3,14 @@
 Readers convert CARLA's left-handed values to the devkit's right-handed ones unless called with `raw=True`.
 """
 
-from deepaccident_devkit.release.calib import Calib, Calibs, read_calib, read_calibs, write_calib, write_raw_calib
+from deepaccident_devkit.release.calib import (
+    Calib,
+    Calibs,
+    read_calib,
+    read_calibs,
+    write_calib,
+    write_raw_calib,
+)
 from deepaccident_devkit.release.images import read_image, write_image
 from deepaccident_devkit.release.labels import (
     Labels,

@@ -136,7 +136,9 @@ class Machine:
 
     def known(self, name: str) -> object:
         if name not in self._names:
-            self.refuse(f"the pickle asks for {shortened(name.replace(' ', '.'))}, which is not allowed")
+            self.refuse(
+                f"the pickle asks for {shortened(name.replace(' ', '.'))}, which is not allowed"
+            )
         return self._names[name]
 
     def referred(self) -> object:
@@ -164,7 +166,9 @@ def dict_of(pairs: Iterable[tuple[Any, Any]]) -> dict[Any, Any]:
     """A dict by texts and whole numbers: a tuple's hash can take all time, and many long numbers can have the same."""
     items = list(pairs)
     if not all(type(key) is str or (type(key) is int and abs(key) < 1 << 63) for key, _ in items):
-        raise pickle.UnpicklingError("a key that is no text and no whole number of 64 bits is not allowed")
+        raise pickle.UnpicklingError(
+            "a key that is no text and no whole number of 64 bits is not allowed"
+        )
     return dict(items)
 
 
@@ -224,7 +228,9 @@ _PUSHED: Final[Mapping[bytes, _Step]] = {
     pickle.EMPTY_LIST: lambda _: [],
     pickle.LIST: Machine.items,
     pickle.EMPTY_DICT: lambda _: {},
-    pickle.GLOBAL: lambda machine: machine.known(f"{machine.line().decode()} {machine.line().decode()}"),
+    pickle.GLOBAL: lambda machine: machine.known(
+        f"{machine.line().decode()} {machine.line().decode()}"
+    ),
     pickle.STACK_GLOBAL: lambda machine: machine.known(" ".join(machine.items(2))),
     pickle.BINPERSID: Machine.referred,
     pickle.REDUCE: Machine.called,

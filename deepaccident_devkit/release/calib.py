@@ -103,7 +103,9 @@ def read_calib(path: ReleasePath, *, raw: bool = False) -> Calib | dict[str, Any
     return Calib(
         ego_from_lidar=SE3(calibs.ego_from_lidar[0]),
         world_from_ego=SE3(calibs.world_from_ego[0]),
-        camera_from_lidar={name: SE3(calibs.camera_from_lidar[0, k]) for k, name in enumerate(CAMERAS)},
+        camera_from_lidar={
+            name: SE3(calibs.camera_from_lidar[0, k]) for k, name in enumerate(CAMERAS)
+        },
         intrinsic={name: readonly(calibs.intrinsic[0, k]) for k, name in enumerate(CAMERAS)},
     )
 
@@ -114,7 +116,9 @@ def read_calibs(paths: Sequence[ReleasePath]) -> Calibs:
     files = [_loaded(path, content) for path, content in zip(paths[:1], contents[:1], strict=True)]
     arrays = load_stacked(contents)  # of the first one's layout, whose keys and shapes are checked
     if arrays is None:
-        files += [_loaded(path, content) for path, content in zip(paths[1:], contents[1:], strict=True)]
+        files += [
+            _loaded(path, content) for path, content in zip(paths[1:], contents[1:], strict=True)
+        ]
         arrays = _stacked(files)
     return _converted(paths, arrays)
 
@@ -126,7 +130,9 @@ def write_calib(path: Path, calib: Calib) -> None:
         "ego_to_world": conventions.flip_pose(calib.world_from_ego.matrix),
     }
     for camera in CAMERAS:
-        raw[f"lidar_to_{camera}"] = conventions.camera_from_lidar_to_raw(calib.camera_from_lidar[camera].matrix)
+        raw[f"lidar_to_{camera}"] = conventions.camera_from_lidar_to_raw(
+            calib.camera_from_lidar[camera].matrix
+        )
         raw[f"intrinsic_{camera}"] = conventions.intrinsic_to_raw(calib.intrinsic[camera])
     write_raw_calib(path, raw)
 
@@ -136,7 +142,9 @@ def write_raw_calib(path: Path, raw: Mapping[str, AnyArray]) -> None:
 
     Old numpy versions can read it too.
     """
-    arrays = {key: np.ascontiguousarray(array) + 0.0 for key, array in raw.items()}  # + 0.0: no negative zeros
+    arrays = {
+        key: np.ascontiguousarray(array) + 0.0 for key, array in raw.items()
+    }  # + 0.0: no negative zeros
     write_bytes(path, pickled(arrays))
 
 
@@ -159,26 +167,42 @@ def _loaded(path: ReleasePath, content: bytes) -> dict[str, AnyArray]:
 
 def _checked_raw(path: ReleasePath, loaded: Any) -> dict[str, AnyArray]:
     if not isinstance(loaded, dict):
-        raise CalibError(f"{path}: expected a dict of arrays, found {type(loaded).__name__}; {REMEDY}")
+        raise CalibError(
+            f"{path}: expected a dict of arrays, found {type(loaded).__name__}; {REMEDY}"
+        )
     missing = [key for key in KEYS if key not in loaded]
     if missing:
         raise CalibError(f"{path}: lacks {', '.join(missing)}; {REMEDY}")
     for key, shape in KEYS.items():
         array = loaded[key]
-        if not isinstance(array, np.ndarray) or array.shape != shape or array.dtype.kind not in "fiu":
-            found = f"{array.shape} of {array.dtype}" if isinstance(array, np.ndarray) else type(array).__name__
-            raise CalibError(f"{path}: {key}: expected numbers of shape {shape}, found {found}; {REMEDY}")
+        if (
+            not isinstance(array, np.ndarray)
+            or array.shape != shape
+            or array.dtype.kind not in "fiu"
+        ):
+            found = (
+                f"{array.shape} of {array.dtype}"
+                if isinstance(array, np.ndarray)
+                else type(array).__name__
+            )
+            raise CalibError(
+                f"{path}: {key}: expected numbers of shape {shape}, found {found}; {REMEDY}"
+            )
     return loaded
 
 
 def _stacked(files: Sequence[Mapping[str, AnyArray]]) -> dict[str, AnyArray]:
-    return {key: np.array([file[key] for file in files]).reshape(-1, *shape) for key, shape in KEYS.items()}
+    return {
+        key: np.array([file[key] for file in files]).reshape(-1, *shape)
+        for key, shape in KEYS.items()
+    }
 
 
 def _converted(paths: Sequence[ReleasePath], arrays: Mapping[str, AnyArray]) -> Calibs:
     """Check the numbers of all files (N, …) at once and turn them right-handed."""
     poses, intrinsics = (
-        np.stack([arrays[key] for key in keys], axis=1).astype(np.float64) for keys in (_POSE_KEYS, _INTRINSIC_KEYS)
+        np.stack([arrays[key] for key in keys], axis=1).astype(np.float64)
+        for keys in (_POSE_KEYS, _INTRINSIC_KEYS)
     )
     rigid = _surely_rigid(poses).all(axis=1)
     finite = in_range(intrinsics).all(axis=(1, 2, 3))
@@ -201,11 +225,17 @@ def _surely_rigid(poses: FloatArray) -> BoolArray:
     with np.errstate(invalid="ignore", over="ignore"):
         off = np.abs(turns @ np.swapaxes(turns, -1, -2) - np.eye(3)).max(axis=(-1, -2))
         proper = (off < RIGID_TOLERANCE / 2) & (np.linalg.det(turns) > 0)
-    return np.asarray(proper & in_range(poses).all(axis=(-1, -2)) & (poses[..., 3, :] == _LAST_ROW).all(axis=-1))
+    return np.asarray(
+        proper & in_range(poses).all(axis=(-1, -2)) & (poses[..., 3, :] == _LAST_ROW).all(axis=-1)
+    )
 
 
 def _first_value_fault(poses: FloatArray, intrinsics: FloatArray) -> str | None:
-    faults = [f"{key}: {fault}" for key, pose in zip(_POSE_KEYS, poses, strict=True) if (fault := rigid_fault(pose))]
+    faults = [
+        f"{key}: {fault}"
+        for key, pose in zip(_POSE_KEYS, poses, strict=True)
+        if (fault := rigid_fault(pose))
+    ]
     faults += [
         f"{key}: holds NaN or infinity, or a number beyond {LARGEST_NUMBER:.0e}"
         for key, matrix in zip((*_POSE_KEYS, *_INTRINSIC_KEYS), (*poses, *intrinsics), strict=True)

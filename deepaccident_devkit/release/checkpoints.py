@@ -17,7 +17,14 @@ from deepaccident_devkit.release._unpickle import Machine, dict_of
 from deepaccident_devkit.support.reading import DAMAGED_ARCHIVE, open_zip, read_member
 
 # What a file that is no checkpoint, a damaged or a hostile one can raise; a Warning where warnings are errors.
-FAULTS: Final = (pickle.UnpicklingError, TypeError, AttributeError, IndexError, Warning, *DAMAGED_ARCHIVE)
+FAULTS: Final = (
+    pickle.UnpicklingError,
+    TypeError,
+    AttributeError,
+    IndexError,
+    Warning,
+    *DAMAGED_ARCHIVE,
+)
 # Kind of numbers, as PyTorch calls it → bytes of one.
 NUMBER_BYTES: Final[Mapping[str, int]] = {
     **dict.fromkeys(("float64", "int64"), 8),
@@ -107,7 +114,12 @@ def _read(content: bytes, kinds: dict[str, str], start: int = 0) -> Machine:
     def storage(notes: Any) -> StoredTensor:
         what, kind, name, _device, _count, *view = notes
         # first of all types: the hash of a tuple can take all time
-        if {type(kind), type(name)} != {str} or what != "storage" or kind not in NUMBER_BYTES or any(view):
+        if (
+            {type(kind), type(name)} != {str}
+            or what != "storage"
+            or kind not in NUMBER_BYTES
+            or any(view)
+        ):
             raise ValueError("a storage of another form is not allowed")
         kinds[name] = kind
         return StoredTensor(name, kind, 0, (), ())
@@ -123,7 +135,9 @@ def _ordered(items: list[Any] | None = None) -> dict[Any, Any]:
     return made
 
 
-def _tensor(storage: StoredTensor, offset: Any, shape: Any, strides: Any, *_further: object) -> StoredTensor:
+def _tensor(
+    storage: StoredTensor, offset: Any, shape: Any, strides: Any, *_further: object
+) -> StoredTensor:
     if not len(shape) == len(strides) <= _MOST_DIMENSIONS:
         raise ValueError(f"a tensor of more than {_MOST_DIMENSIONS} dimensions is not allowed")
     if not all(type(each) is int and each >= 0 for each in (offset, *shape, *strides)):
@@ -136,13 +150,27 @@ _NAMES: Final[Mapping[str, object]] = {
     "collections OrderedDict": _ordered,
     **{f"torch._utils _rebuild_{name}": _tensor for name in ("tensor", "tensor_v2")},
     **dict.fromkeys(
-        ("torch Size", "torch._utils _rebuild_parameter", "torch._utils _rebuild_parameter_with_state"),
+        (
+            "torch Size",
+            "torch._utils _rebuild_parameter",
+            "torch._utils _rebuild_parameter_with_state",
+        ),
         lambda value, *_: value,
     ),
     **dict.fromkeys(
         (
-            *("numpy dtype", "numpy ndarray", "_codecs encode", "torch device", "pathlib PosixPath"),
-            *(f"numpy.{core}.multiarray {name}" for core in ("core", "_core") for name in ("scalar", "_reconstruct")),
+            *(
+                "numpy dtype",
+                "numpy ndarray",
+                "_codecs encode",
+                "torch device",
+                "pathlib PosixPath",
+            ),
+            *(
+                f"numpy.{core}.multiarray {name}"
+                for core in ("core", "_core")
+                for name in ("scalar", "_reconstruct")
+            ),
             *(f"torch {kind}" for kind in NUMBER_BYTES),
         ),
         lambda *_: None,

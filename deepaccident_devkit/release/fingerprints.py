@@ -15,7 +15,12 @@ from typing import TYPE_CHECKING, Any, Final, Protocol, TypeAlias, runtime_check
 import numpy as np
 
 from deepaccident_devkit.errors import IndexStoreError, ReleaseError
-from deepaccident_devkit.release.layout import ScenarioFolder, find_release, frame_numbers, frame_sizes
+from deepaccident_devkit.release.layout import (
+    ScenarioFolder,
+    find_release,
+    frame_numbers,
+    frame_sizes,
+)
 from deepaccident_devkit.release.store import ReleasePath, places_of, read_content
 from deepaccident_devkit.support.reading import FileKind
 from deepaccident_devkit.support.sketches import Sketch, distance, sketch
@@ -66,7 +71,10 @@ class ScenarioHashes:
         """Return whether the files are the same, but for a few LiDAR points more or less in some boxes."""
         if other is None or None in (self.boxes, other.boxes):
             return self == other
-        return _UNCOUNTED(self) == _UNCOUNTED(other) and distance(self.points, other.points) <= POINTS_TOLERANCE
+        return (
+            _UNCOUNTED(self) == _UNCOUNTED(other)
+            and distance(self.points, other.points) <= POINTS_TOLERANCE
+        )
 
 
 class Located(Protocol):
@@ -92,7 +100,9 @@ class HasTruth(Protocol):
         """The hashes of a scenario's truth; raises TokenError."""
 
 
-def scenario_hashes(dataset: Located, scenarios: Collection[str], **how: Unpack[Engine]) -> dict[str, ScenarioHashes]:
+def scenario_hashes(
+    dataset: Located, scenarios: Collection[str], **how: Unpack[Engine]
+) -> dict[str, ScenarioHashes]:
     """Return the hashes of some scenarios' files by token, in order; scenarios that the release lacks are left out.
 
     Reads the files, and compares them with those that the index was made from: it does not notice a file that was
@@ -110,11 +120,16 @@ def scenario_hashes(dataset: Located, scenarios: Collection[str], **how: Unpack[
     """
     if isinstance(dataset, HasTruth):
         return {token: dataset.truth_hashes(token) for token in sorted(set(scenarios))}
-    from deepaccident_devkit.support.parallel import Places, run_batch  # here: opening a release waits for this module
+    from deepaccident_devkit.support.parallel import (
+        Places,
+        run_batch,
+    )  # here: opening a release waits for this module
 
     folders = scenario_folders(dataset, scenarios)
     work, places = partial(checked_hashes, dataset), Places(reads=places_of(dataset.dataroot))
-    return dict(zip(folders, run_batch(work, list(folders.values()), places=places, **how), strict=True))
+    return dict(
+        zip(folders, run_batch(work, list(folders.values()), places=places, **how), strict=True)
+    )
 
 
 def checked_hashes(dataset: Located, scenario: ScenarioFolder) -> ScenarioHashes:
@@ -130,7 +145,10 @@ def checked_hashes(dataset: Located, scenario: ScenarioFolder) -> ScenarioHashes
 
 def scenario_folders(dataset: Located, scenarios: Collection[str]) -> dict[str, ScenarioFolder]:
     """Where some scenarios' files lie, by token in order, if they are in the release; raises DatarootError."""
-    folders = {each.token: each for each in reversed(find_release(dataset.dataroot, dataset.version).scenarios)}
+    folders = {
+        each.token: each
+        for each in reversed(find_release(dataset.dataroot, dataset.version).scenarios)
+    }
     return {token: folders[token] for token in sorted(set(scenarios)) if token in folders}
 
 
@@ -173,7 +191,13 @@ def folder_hashes(scenario: ScenarioFolder, read: _Reader = _read) -> ScenarioHa
 def sensor_digest(scenario: ScenarioFolder, sensors: Iterable[tuple[str, str]]) -> str:
     """A hash of frames and sizes of sensor files of a scenario's agents and channels; folders are only listed."""
     sizes = [
-        (agent, channel, list(frame_sizes(scenario.kind_folder(agent, channel), CHANNEL_FORMAT[channel]).items()))
+        (
+            agent,
+            channel,
+            list(
+                frame_sizes(scenario.kind_folder(agent, channel), CHANNEL_FORMAT[channel]).items()
+            ),
+        )
         for agent, channel in sensors
     ]
     return digest_of(sizes)

@@ -19,7 +19,16 @@ from deepaccident_devkit.support.reading import check_size, fault_text, open_fil
 
 JPEG_QUALITY = 90
 # What decoding a damaged image can raise.
-_DAMAGED = (OSError, SyntaxError, ValueError, struct.error, EOFError, MemoryError, OverflowError, zlib.error)
+_DAMAGED = (
+    OSError,
+    SyntaxError,
+    ValueError,
+    struct.error,
+    EOFError,
+    MemoryError,
+    OverflowError,
+    zlib.error,
+)
 # Others have decoders that start programs.
 _FORMATS = ("JPEG", "PNG")
 _BYTES_A_PIXEL = 3
@@ -92,7 +101,11 @@ def _decoded_jpeg(content: bytes, scale: int) -> ByteArray:
     import cv2
 
     rgb = getattr(cv2, "IMREAD_COLOR_RGB", 0)  # since OpenCV 4.11
-    flags = cv2.IMREAD_IGNORE_ORIENTATION | (rgb or cv2.IMREAD_COLOR) | scale // 2 * cv2.IMREAD_REDUCED_GRAYSCALE_2
+    flags = (
+        cv2.IMREAD_IGNORE_ORIENTATION
+        | (rgb or cv2.IMREAD_COLOR)
+        | scale // 2 * cv2.IMREAD_REDUCED_GRAYSCALE_2
+    )
     pixels: Any = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), flags)
     if pixels is None:
         raise ValueError("its picture cannot be decoded")
@@ -130,8 +143,12 @@ def encode_jpeg(path: ReleasePath, image: ByteArray, quality: int = JPEG_QUALITY
     import cv2
 
     if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or not image.size:
-        raise SensorFileError(f"{path}: expected shape (H, W, 3) of uint8, found {image.shape} of {image.dtype}")
-    done, encoded = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, quality])
+        raise SensorFileError(
+            f"{path}: expected shape (H, W, 3) of uint8, found {image.shape} of {image.dtype}"
+        )
+    done, encoded = cv2.imencode(
+        ".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, quality]
+    )
     if not done:
         raise SensorFileError(f"{path}: an image of shape {image.shape} cannot be encoded as JPEG")
     return bytes(encoded.tobytes())
@@ -158,4 +175,6 @@ def _opened(path: ReleasePath, content: bytes | None, formats: tuple[str, ...]) 
     except (*_DAMAGED, *bombs) as error:
         known = not isinstance(error, UnidentifiedImageError)
         detail = fault_text(error) if known else f"expected {' or '.join(formats)}"
-        raise SensorFileError(f"{path}: not a readable image ({shortened(detail, MOST_TOLD)}); {REMEDY}") from error
+        raise SensorFileError(
+            f"{path}: not a readable image ({shortened(detail, MOST_TOLD)}); {REMEDY}"
+        ) from error

@@ -59,7 +59,21 @@ def turned_vectors(vectors: FloatArray, angle: FloatArray) -> FloatArray:
 
 
 # The 13 fields of a box line, in order.
-LABEL_FIELDS = ("class", "x", "y", "z", "l", "w", "h", "yaw", "vx", "vy", "id", "num_lidar_pts", "camera_visible")
+LABEL_FIELDS = (
+    "class",
+    "x",
+    "y",
+    "z",
+    "l",
+    "w",
+    "h",
+    "yaw",
+    "vx",
+    "vy",
+    "id",
+    "num_lidar_pts",
+    "camera_visible",
+)
 _FINITE_FIELDS = LABEL_FIELDS[1:8]
 _FLOAT_FIELDS = LABEL_FIELDS[1:10]
 _INTEGER_FIELDS = ("id", "num_lidar_pts")
@@ -159,7 +173,9 @@ def read_labels(paths: Sequence[ReleasePath], *, raw: bool = False) -> Labels:
             belongs, an unknown class, NaN, infinity or more than 1e9 in a position, size or yaw; the message names file
             and line.
     """
-    batches = [paths[start : start + _FILES_A_CALL] for start in range(0, len(paths), _FILES_A_CALL)]
+    batches = [
+        paths[start : start + _FILES_A_CALL] for start in range(0, len(paths), _FILES_A_CALL)
+    ]
     parts = _parse_batches(batches or [[]])
     columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     if not raw:
@@ -193,7 +209,9 @@ def write_label(path: Path, labels: Labels) -> None:
         raise LabelError(f"{path}: expected the labels of one file, found {len(labels.num_boxes)}")
     flip = 1.0 if labels.raw else -1.0
     signs = np.array([1, flip, 1, 1, 1, 1, flip, 1, flip])
-    numbers = np.column_stack([labels.center, labels.size, labels.yaw, labels.velocity]) * signs + 0.0
+    numbers = (
+        np.column_stack([labels.center, labels.size, labels.yaw, labels.velocity]) * signs + 0.0
+    )
     speed = labels.agent_velocity[0] * (1.0, flip) + 0.0  # + 0.0: no negative zeros
     lines = [_words(speed.tolist())]
     rows = zip(
@@ -204,7 +222,10 @@ def write_label(path: Path, labels: Labels) -> None:
         labels.camera_visible.tolist(),
         strict=True,
     )
-    lines += [f"{CATEGORIES[code]} {_words(row)} {actor} {points} {seen}" for code, row, actor, points, seen in rows]
+    lines += [
+        f"{CATEGORIES[code]} {_words(row)} {actor} {points} {seen}"
+        for code, row, actor, points, seen in rows
+    ]
     write_bytes(path, "\n".join(lines).encode("ascii"))
 
 
@@ -221,7 +242,10 @@ def _parse_batches(batches: Sequence[Sequence[ReleasePath]]) -> list[dict[str, A
     import pyarrow as pa  # noqa: F401 - here: pyarrow 25.0.0 crashes after the thread has ended that imports it
 
     with ThreadPoolExecutor(min(_MOST_THREADS, usable_cores())) as pool:
-        parts = [pool.submit(_parse_files, batch, [_content(path) for path in batch]) for batch in batches]
+        parts = [
+            pool.submit(_parse_files, batch, [_content(path) for path in batch])
+            for batch in batches
+        ]
         return [part.result() for part in parts]
 
 
@@ -249,8 +273,12 @@ def _parse_joined(contents: Sequence[bytes]) -> dict[str, AnyArray] | None:
     import pyarrow as pa
 
     body_starts = [content.index(b"\n") + 1 for content in contents]
-    header = b"".join([content[:start] for content, start in zip(contents, body_starts, strict=True)])
-    body = b"".join([memoryview(content)[start:] for content, start in zip(contents, body_starts, strict=True)])
+    header = b"".join(
+        [content[:start] for content, start in zip(contents, body_starts, strict=True)]
+    )
+    body = b"".join(
+        [memoryview(content)[start:] for content, start in zip(contents, body_starts, strict=True)]
+    )
     if b"x" in body or b"X" in body:  # Arrow reads hexadecimal integers
         return None
     try:
@@ -283,7 +311,9 @@ def _columns(content: bytes, names: Sequence[str]) -> dict[str, Any] | None:
     return {name: words.take(pa.array(numbers[at :: len(names)])) for at, name in enumerate(names)}
 
 
-def _parse_columns(words: dict[str, Any], header: dict[str, Any], num_boxes: IntArray) -> dict[str, AnyArray]:
+def _parse_columns(
+    words: dict[str, Any], header: dict[str, Any], num_boxes: IntArray
+) -> dict[str, AnyArray]:
     """Raises pyarrow.ArrowInvalid for what is none of its kind; an unknown class is −1."""
     import pyarrow as pa
     import pyarrow.compute as pc
@@ -338,8 +368,14 @@ def _first_fault(paths: Sequence[ReleasePath], contents: Sequence[bytes]) -> Lab
         if (fault := _faulty_line(content)) is not None:
             number, what = fault
             return LabelError(f"{path}:{number}: {what}; {_REMEDY}")
-    odd = [path for path, content in zip(paths, contents, strict=True) if _parse_joined([_tidied(content)]) is None]
-    return LabelError(f"{(odd or paths)[0]}: cannot be parsed, though each line looks right; {_REMEDY}")
+    odd = [
+        path
+        for path, content in zip(paths, contents, strict=True)
+        if _parse_joined([_tidied(content)]) is None
+    ]
+    return LabelError(
+        f"{(odd or paths)[0]}: cannot be parsed, though each line looks right; {_REMEDY}"
+    )
 
 
 def _faulty_line(content: bytes) -> tuple[int, str] | None:
@@ -363,7 +399,9 @@ def _suspicious_lines(lines: Sequence[bytes]) -> Iterator[tuple[int, bytes]]:
     for start in range(0, len(lines), _LINES_A_STEP):
         stretch = lines[start : start + _LINES_A_STEP]
         joined = b"\n".join(stretch)
-        parsed = _parse_joined([b"0 0\n" + _tidied(joined)]) if start and b"\0" not in joined else None
+        parsed = (
+            _parse_joined([b"0 0\n" + _tidied(joined)]) if start and b"\0" not in joined else None
+        )
         if parsed is None or _has_fault(parsed):
             yield from enumerate(stretch, start=start + 1)
 
@@ -371,7 +409,9 @@ def _suspicious_lines(lines: Sequence[bytes]) -> Iterator[tuple[int, bytes]]:
 def _header_fault(words: Sequence[str]) -> str | None:
     if len(words) != len(_HEADER):
         return f"expected '<speed_x> <speed_y>', found {_counted(words)} fields: {_quoted(words)}"
-    return next((f"{shortened(word)!r} is no number" for word in words if number_of(word) is None), None)
+    return next(
+        (f"{shortened(word)!r} is no number" for word in words if number_of(word) is None), None
+    )
 
 
 def _line_fault(words: Sequence[str]) -> str | None:
@@ -380,7 +420,9 @@ def _line_fault(words: Sequence[str]) -> str | None:
     return next(
         (
             fault
-            for fault in (_field_fault(name, word) for name, word in zip(LABEL_FIELDS, words, strict=True))
+            for fault in (
+                _field_fault(name, word) for name, word in zip(LABEL_FIELDS, words, strict=True)
+            )
             if fault
         ),
         None,

@@ -14,7 +14,13 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Final, get_args
 
-from deepaccident_devkit.errors import DatarootError, MissingFileError, SplitFileError, VersionError, shortened
+from deepaccident_devkit.errors import (
+    DatarootError,
+    MissingFileError,
+    SplitFileError,
+    VersionError,
+    shortened,
+)
 from deepaccident_devkit.release.store import (
     FolderEntry,
     ReleasePath,
@@ -130,21 +136,33 @@ def find_release(root: ReleasePath, version: str = "v1") -> ReleaseLayout:
     """
     version = spelled(version, VERSIONS)
     if version not in VERSIONS:
-        raise VersionError(f"unknown version {version!r}; known are {', '.join(VERSIONS)}{_version_remedy(version)}")
+        raise VersionError(
+            f"unknown version {version!r}; known are {', '.join(VERSIONS)}{_version_remedy(version)}"
+        )
     try:
         str(root).encode()
     except UnicodeEncodeError:
-        raise DatarootError(f"{str(root)!r}: is not UTF-8, which Arrow needs a path to be; rename the folder") from None
+        raise DatarootError(
+            f"{str(root)!r}: is not UTF-8, which Arrow needs a path to be; rename the folder"
+        ) from None
     if not root.is_dir():
         missing = "is a link that leads nowhere" if os.path.islink(str(root)) else "does not exist"  # noqa: PTH114
         state = "is a file" if root.is_file() else missing
-        raise DatarootError(f"{root}: {state}; give the folder that the release was unpacked into as dataroot")
+        raise DatarootError(
+            f"{root}: {state}; give the folder that the release was unpacked into as dataroot"
+        )
     folders = _folders_of(root, version)
     scenarios = [scenario for folder in folders for scenario in _scenarios_in(root, folder)]
     if not scenarios:
         if isinstance(root, Path) and nuscenes_tables(root):
-            raise DatarootError(f"{root}: is a dataroot of nuScenes; open it with nuscenes.open_nuscenes")
-        aside = f"; it is of one scenario type: give {root.parent}" if SCENARIO_TYPE.fullmatch(root.name) else ""
+            raise DatarootError(
+                f"{root}: is a dataroot of nuScenes; open it with nuscenes.open_nuscenes"
+            )
+        aside = (
+            f"; it is of one scenario type: give {root.parent}"
+            if SCENARIO_TYPE.fullmatch(root.name)
+            else ""
+        )
         aside += "".join(
             f"; {path} {f'looks like {meant}: rename it' if meant else 'is a link that leads nowhere'}"
             for path, meant in islice(left_aside(root), _MOST_ASIDE)
@@ -173,7 +191,9 @@ def nuscenes_tables(dataroot: str | os.PathLike[str]) -> Path | None:
     tables = (given / NUSCENES_TABLE, *given.glob(f"v1.0*/{NUSCENES_TABLE}"))
     found = sorted(table.parent for table in tables if table.is_file())
     if len(found) > 1:
-        raise VersionError(f"{given}: has several versions of nuScenes; give the folder of one, such as {found[0]}")
+        raise VersionError(
+            f"{given}: has several versions of nuScenes; give the folder of one, such as {found[0]}"
+        )
     return found[0].absolute() if found else None
 
 
@@ -235,11 +255,17 @@ def names_without_calib(layout: ReleaseLayout) -> Iterator[tuple[ReleasePath, st
     """
     known: dict[ReleasePath, set[str]] = {}
     for scenario in layout.scenarios:
-        known.setdefault(scenario.root / scenario.folder / scenario.scenario_type, set()).add(scenario.name)
+        known.setdefault(scenario.root / scenario.folder / scenario.scenario_type, set()).add(
+            scenario.name
+        )
     for folder, names in known.items():
         found: set[str] = set()
         with suppress(DatarootError):
-            found = {entry.name[:-4] for entry in _entries(folder / "meta") if entry.name.endswith(".txt")}
+            found = {
+                entry.name[:-4]
+                for entry in _entries(folder / "meta")
+                if entry.name.endswith(".txt")
+            }
         for agent in AGENTS:
             for kind in ("label", *CHANNEL_FORMAT):
                 with suppress(DatarootError):
@@ -258,7 +284,9 @@ def left_aside(root: ReleasePath) -> Iterator[tuple[ReleasePath, str | None]]:
     yield from _aside_in(root, (SCENARIO_TYPE.pattern, *_ABOVE_TYPES))
     for folder in splits:
         yield from _aside_in(folder, (SCENARIO_TYPE.pattern,))
-    for of_type in (folder / name for folder in (root, *splits) for name in _scenario_types(folder)):
+    for of_type in (
+        folder / name for folder in (root, *splits) for name in _scenario_types(folder)
+    ):
         yield from _aside_in(of_type, _IN_TYPE)
         for agent in (of_type / name for name in _subfolders(of_type) if name in AGENTS):
             yield from _aside_in(agent, _KINDS)
@@ -266,7 +294,9 @@ def left_aside(root: ReleasePath) -> Iterator[tuple[ReleasePath, str | None]]:
                 yield from _aside_in(agent / kind, ())
 
 
-def _aside_in(folder: ReleasePath, known: Sequence[str]) -> Iterator[tuple[ReleasePath, str | None]]:
+def _aside_in(
+    folder: ReleasePath, known: Sequence[str]
+) -> Iterator[tuple[ReleasePath, str | None]]:
     """What `left_aside` tells of one folder, in which these names (patterns) are read; of others only links."""
     entries: list[FolderEntry] = []
     with suppress(DatarootError):  # told where its scenarios are read
@@ -275,7 +305,12 @@ def _aside_in(folder: ReleasePath, known: Sequence[str]) -> Iterator[tuple[Relea
         path, found = folder / entry.name, re.fullmatch(_COPY.format("|".join(known)), entry.name)
         if leads_back(entry):
             yield path, None
-        elif not known or entry.name.startswith(".") or not is_folder(entry) or (found and found[1] == entry.name):
+        elif (
+            not known
+            or entry.name.startswith(".")
+            or not is_folder(entry)
+            or (found and found[1] == entry.name)
+        ):
             continue
         elif found and (found[1] not in _ABOVE_TYPES or _holds_types(path)):
             yield path, found[1]
@@ -285,13 +320,19 @@ def _aside_in(folder: ReleasePath, known: Sequence[str]) -> Iterator[tuple[Relea
 
 def _holds_types(folder: ReleasePath) -> bool:
     """Whether scenario types lie in a folder, or in a split folder in it."""
-    return any(SCENARIO_TYPE.match(name) for below in ("", *_ABOVE_TYPES) for name in _subfolders(folder / below))
+    return any(
+        SCENARIO_TYPE.match(name)
+        for below in ("", *_ABOVE_TYPES)
+        for name in _subfolders(folder / below)
+    )
 
 
 def _folders_of(root: ReleasePath, version: str) -> list[str]:
     """The folders below the root, `""` for the root itself, that hold scenario types of this version."""
     flat = [""] if _scenario_types(root) else []
-    split = [name for name in _subfolders(root) if name in _ABOVE_TYPES and _scenario_types(root / name)]
+    split = [
+        name for name in _subfolders(root) if name in _ABOVE_TYPES and _scenario_types(root / name)
+    ]
     mini = [split.pop(split.index(MINI_FOLDER))] if MINI_FOLDER in split else []
     root_is_mini = root.resolve().name == MINI_FOLDER
     if version == "v1":
@@ -299,7 +340,9 @@ def _folders_of(root: ReleasePath, version: str) -> list[str]:
     if root_is_mini and flat:
         return flat
     if not mini and (flat or split):
-        raise VersionError(f"{root}: holds no mini release (folder {MINI_FOLDER}); open it with version='v1'")
+        raise VersionError(
+            f"{root}: holds no mini release (folder {MINI_FOLDER}); open it with version='v1'"
+        )
     return mini
 
 
@@ -309,7 +352,9 @@ def _scenario_types(folder: ReleasePath) -> list[str]:
 
 def _scenarios_in(root: ReleasePath, folder: str) -> Iterator[ScenarioFolder]:
     for scenario_type in _scenario_types(root / folder):
-        _entries(root / folder / scenario_type)  # one that cannot be listed would hide its scenarios
+        _entries(
+            root / folder / scenario_type
+        )  # one that cannot be listed would hide its scenarios
         agents_of: dict[str, list[AgentName]] = {}
         closed: DatarootError | None = None
         for agent in AGENTS:
@@ -331,7 +376,11 @@ def _subfolders(folder: ReleasePath, *, loops: bool = False) -> list[str]:
     With `loops`, so are links to themselves, which `frame_numbers` reports, too.
     """
     entries = _entries(folder, files=True)
-    return [entry.name for entry in entries if not entry.name.startswith(".") and is_folder(entry, loops=loops)]
+    return [
+        entry.name
+        for entry in entries
+        if not entry.name.startswith(".") and is_folder(entry, loops=loops)
+    ]
 
 
 def _entries(folder: ReleasePath, *, files: bool = False) -> list[FolderEntry]:
@@ -339,9 +388,13 @@ def _entries(folder: ReleasePath, *, files: bool = False) -> list[FolderEntry]:
     try:
         return folder_entries(folder)
     except OSError as error:
-        if isinstance(error, FileNotFoundError) or (files and isinstance(error, NotADirectoryError)):
+        if isinstance(error, FileNotFoundError) or (
+            files and isinstance(error, NotADirectoryError)
+        ):
             return []
-        raise DatarootError(f"{folder}: cannot be listed ({error.strerror}); {_UNLISTABLE_REMEDY}") from error
+        raise DatarootError(
+            f"{folder}: cannot be listed ({error.strerror}); {_UNLISTABLE_REMEDY}"
+        ) from error
 
 
 def read_split_file(path: ReleasePath, *, raw: bool = False, unique: bool = False) -> list[str]:
@@ -362,7 +415,11 @@ def read_split_file(path: ReleasePath, *, raw: bool = False, unique: bool = Fals
     lines = read_lines(path, "split", SplitFileError, remedy, errors="surrogateescape")
     if any("\0" in line for line in lines):
         raise SplitFileError(f"{path}: not a text file; {remedy}")
-    words = [(number, tuple(line.split(maxsplit=2))) for number, line in enumerate(lines, start=1) if line.strip()]
+    words = [
+        (number, tuple(line.split(maxsplit=2)))
+        for number, line in enumerate(lines, start=1)
+        if line.strip()
+    ]
     for number, line_words in words:
         if len(line_words) != 2:
             raise SplitFileError(
@@ -383,7 +440,10 @@ def read_split_file(path: ReleasePath, *, raw: bool = False, unique: bool = Fals
 
 def write_split_file(path: Path, scenario_tokens: Sequence[str]) -> None:
     """Write scenario tokens, one line each."""
-    lines = [f"{scenario_type} {name}\n" for scenario_type, name in (token.split("/") for token in scenario_tokens)]
+    lines = [
+        f"{scenario_type} {name}\n"
+        for scenario_type, name in (token.split("/") for token in scenario_tokens)
+    ]
     write_bytes(path, "".join(lines).encode())
 
 
@@ -413,7 +473,9 @@ class MissingFiles:
     def tell(self) -> None:
         """Log one warning with the number of files that were left out, if any."""
         if self._missing:
-            counts = ", ".join(f"{self._missing[name]} of {self._asked[name]} of {name}" for name in self._missing)
+            counts = ", ".join(
+                f"{self._missing[name]} of {self._asked[name]} of {name}" for name in self._missing
+            )
             _logger.warning("left out files that are not in %s: %s", self._root, counts)
 
 

@@ -9,9 +9,17 @@ from deepaccident_devkit.release.store import REMEDY, ReleasePath, read_lines
 from deepaccident_devkit.support.arrays import LARGEST_NUMBER, ShortRepr, in_range
 from deepaccident_devkit.support.files import write_bytes
 from deepaccident_devkit.support.text import integer_of, number_of
-from deepaccident_devkit.taxonomy import META_AGENTS, TIMES_OF_DAY, UNTRACKED_ID, WARM_UP_FRAMES, AgentName
+from deepaccident_devkit.taxonomy import (
+    META_AGENTS,
+    TIMES_OF_DAY,
+    UNTRACKED_ID,
+    WARM_UP_FRAMES,
+    AgentName,
+)
 
-_FIRST_LINE = "<weather+time> <id1> <class1> <id2> <class2> <impact> <spawn relation> <contact side> <frames>"
+_FIRST_LINE = (
+    "<weather+time> <id1> <class1> <id2> <class2> <impact> <spawn relation> <contact side> <frames>"
+)
 _SHORT_NAMES = {name: short for short, name in META_AGENTS.items()}
 
 
@@ -94,7 +102,15 @@ def write_meta(path: Path, meta: Meta) -> None:
         words += [UNTRACKED_ID] * 7
     else:
         (id1, id2), (class1, class2) = collision.ids, collision.classes
-        words += [id1, class1, id2, class2, collision.impact, collision.spawn_relation, collision.contact_side]
+        words += [
+            id1,
+            class1,
+            id2,
+            class2,
+            collision.impact,
+            collision.spawn_relation,
+            collision.contact_side,
+        ]
     lines = [" ".join(map(str, [*words, meta.simulated_frames]))]
     agents = collision.agents if collision else meta.planned_agents or (None, None)
     entries = {
@@ -115,7 +131,9 @@ def _entries(path: ReleasePath, lines: Sequence[tuple[int, str]]) -> dict[str, t
     for number, line in lines:
         key, colon, value = line.partition(":")
         if not colon:
-            raise MetaError(f"{path}:{number}: expected '<key>: <value>', found {shortened(line)!r}; {REMEDY}")
+            raise MetaError(
+                f"{path}:{number}: expected '<key>: <value>', found {shortened(line)!r}; {REMEDY}"
+            )
         entries[key.strip()] = (number, value.strip())
     return entries
 
@@ -177,17 +195,23 @@ def _colliding_agents(
     names = value.split()
     if len(names) != 2 or not set(names) <= set(META_AGENTS):
         known = ", ".join(META_AGENTS)
-        raise MetaError(f"{path}:{number}: expected two of {known}, found {shortened(value)!r}; {REMEDY}")
+        raise MetaError(
+            f"{path}:{number}: expected two of {known}, found {shortened(value)!r}; {REMEDY}"
+        )
     return META_AGENTS[names[0]], META_AGENTS[names[1]]
 
 
-def _agent_ids(path: ReleasePath, entries: dict[str, tuple[int, str]]) -> tuple[int, int, int, int] | None:
+def _agent_ids(
+    path: ReleasePath, entries: dict[str, tuple[int, str]]
+) -> tuple[int, int, int, int] | None:
     if "agents id" not in entries:
         return None
     number, value = entries["agents id"]
     ids = [_integer(f"{path}:{number}", "agent's id", word) for word in value.split()]
     if len(ids) != 4:
-        raise MetaError(f"{path}:{number}: expected four agents' ids, found {shortened(value)!r}; {REMEDY}")
+        raise MetaError(
+            f"{path}:{number}: expected four agents' ids, found {shortened(value)!r}; {REMEDY}"
+        )
     return ids[0], ids[1], ids[2], ids[3]
 
 
@@ -199,7 +223,9 @@ def _text(entries: dict[str, tuple[int, str]], key: str) -> str | None:
 def _integer(where: str, what: str, word: str) -> int:
     value = integer_of(word)
     if value is None:
-        raise MetaError(f"{where}: {what}: expected an integer, found {shortened(word)!r}; {REMEDY}")
+        raise MetaError(
+            f"{where}: {what}: expected an integer, found {shortened(word)!r}; {REMEDY}"
+        )
     return value
 
 

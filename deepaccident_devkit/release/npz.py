@@ -13,9 +13,23 @@ from deepaccident_devkit.errors import MOST_TOLD, SensorFileError, shortened
 from deepaccident_devkit.geometry import LidarPointCloud
 from deepaccident_devkit.geometry.conventions import flip_points
 from deepaccident_devkit.release.store import REMEDY, ReleasePath, read_content
-from deepaccident_devkit.support.arrays import AnyArray, ByteArray, ShortRepr, checked, in_range, readonly
+from deepaccident_devkit.support.arrays import (
+    AnyArray,
+    ByteArray,
+    ShortRepr,
+    checked,
+    in_range,
+    readonly,
+)
 from deepaccident_devkit.support.files import write_bytes
-from deepaccident_devkit.support.reading import DAMAGED_ARCHIVE, FileKind, array_of, fault_text, open_zip, read_member
+from deepaccident_devkit.support.reading import (
+    DAMAGED_ARCHIVE,
+    FileKind,
+    array_of,
+    fault_text,
+    open_zip,
+    read_member,
+)
 from deepaccident_devkit.taxonomy import BEV_RESOLUTION, BEV_SHAPE
 
 KEY = "data"
@@ -40,7 +54,9 @@ def read_npz(path: ReleasePath, kind: FileKind) -> AnyArray:
     except DAMAGED_ARCHIVE as error:
         if isinstance(error, SensorFileError):
             raise
-        detail = "expected an npz archive, found a bare array" if content.startswith(_BARE_ARRAY) else ""
+        detail = (
+            "expected an npz archive, found a bare array" if content.startswith(_BARE_ARRAY) else ""
+        )
         detail = detail or f"not a readable npz archive ({shortened(fault_text(error), MOST_TOLD)})"
         raise SensorFileError(f"{path}: {detail}; {REMEDY}") from error
 
@@ -51,7 +67,9 @@ def write_npz(path: Path, array: AnyArray, *, level: int = _FAST) -> None:
     np.lib.format.write_array(member, np.ascontiguousarray(array), allow_pickle=False)
     archive = io.BytesIO()
     with zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED, compresslevel=level) as file:
-        file.writestr(zipfile.ZipInfo(f"{KEY}{_ENDING}"), member.getvalue(), zipfile.ZIP_DEFLATED, level)
+        file.writestr(
+            zipfile.ZipInfo(f"{KEY}{_ENDING}"), member.getvalue(), zipfile.ZIP_DEFLATED, level
+        )
     write_bytes(path, archive.getvalue())
 
 
@@ -60,7 +78,9 @@ def _array_member(path: ReleasePath, archive: zipfile.ZipFile) -> zipfile.ZipInf
     named = [entry for entry in entries if entry.filename == f"{KEY}{_ENDING}"] or entries
     if len(named) != 1:
         found = ", ".join(entry.filename.removesuffix(_ENDING) for entry in entries) or "no array"
-        raise SensorFileError(f"{path}: expected an array named '{KEY}', found {shortened(found)}; {REMEDY}")
+        raise SensorFileError(
+            f"{path}: expected an array named '{KEY}', found {shortened(found)}; {REMEDY}"
+        )
     return named[0]
 
 
@@ -149,7 +169,9 @@ def read_bev(path: ReleasePath, *, raw: bool = False) -> BevImage | ByteArray:
     return BevImage(data[..., 2].copy(), instance)
 
 
-def write_bev(path: Path, semantic: ByteArray, instance: NDArray[np.uint16], *, level: int = _FAST) -> None:
+def write_bev(
+    path: Path, semantic: ByteArray, instance: NDArray[np.uint16], *, level: int = _FAST
+) -> None:
     """Write tags and object ids, both (1200, 1200), forward up; `level` is that of `write_npz`."""
     import cv2
 

@@ -64,10 +64,15 @@ def load_arrays(content: bytes) -> Any:
         machine = Machine(content, _NAMES, MOST_OPCODES)
         value = _Values(content).made(machine.value)
     except _FAULTS as error:
-        said = shortened(fault_text(error), _LONGEST_SENTENCE)  # a pickle's own text may be no text for a screen
+        said = shortened(
+            fault_text(error), _LONGEST_SENTENCE
+        )  # a pickle's own text may be no text for a screen
         raise pickle.UnpicklingError(said if said.isprintable() else ascii(said)[1:-1]) from error
     if machine.slices:
-        starts, ends = [0, *(each.stop for each in machine.slices)], [*(each.start for each in machine.slices), None]
+        starts, ends = (
+            [0, *(each.stop for each in machine.slices)],
+            [*(each.start for each in machine.slices), None],
+        )
         parts = [(start, content[start:end]) for start, end in zip(starts, ends, strict=True)]
         layouts[:] = [_Layout(len(content), parts, machine.value), *layouts[: _MOST_LAYOUTS - 1]]
     return value
@@ -98,7 +103,9 @@ def pickled_items(items: Iterable[object]) -> bytes:
     return stream.getvalue()
 
 
-def write_joined(file: BinaryIO, name: str, pieces: Iterable[bytes], beside: Mapping[str, object]) -> None:
+def write_joined(
+    file: BinaryIO, name: str, pieces: Iterable[bytes], beside: Mapping[str, object]
+) -> None:
     """Write the pickle of `{name: [items of all pieces], **beside}`; one piece at a time is in memory."""
     file.write(_BEGIN + pickle.EMPTY_DICT + pickle.MARK + _opcodes(name) + pickle.EMPTY_LIST)
     file.writelines(pickle.MARK + piece + pickle.APPENDS for piece in pieces)
@@ -117,7 +124,9 @@ class _Pickler(pickle.Pickler):
         """How an array or a dtype is written; anything else as usual."""
         if isinstance(obj, np.ndarray):
             array: AnyArray = np.ascontiguousarray(obj)
-            make, arguments, (version, _, *rest) = cast("tuple[Any, Any, tuple[Any, ...]]", array.__reduce__())
+            make, arguments, (version, _, *rest) = cast(
+                "tuple[Any, Any, tuple[Any, ...]]", array.__reduce__()
+            )
             return make, arguments, (version, obj.shape, *rest)
         if isinstance(obj, np.dtype):
             return np.dtype, (obj.str,)
@@ -149,7 +158,9 @@ class _Layout(NamedTuple):
     value: Any
 
     def fits(self, content: bytes) -> bool:
-        return len(content) == self.size and all(content.startswith(part, start) for start, part in self.parts)
+        return len(content) == self.size and all(
+            content.startswith(part, start) for start, part in self.parts
+        )
 
     def stacked(self, contents: Sequence[bytes]) -> dict[str, AnyArray] | None:
         """The arrays of all contents if they fit, and the value is a dict of arrays with bytes of their own."""
@@ -165,7 +176,8 @@ class _Layout(NamedTuple):
             if (rows[:, start : start + len(part)] != np.frombuffer(part, np.uint8)).any():
                 return None
         return {
-            key: rows[:, each.content].copy().view(each.dtype).reshape(-1, *each.shape) for key, each in arrays.items()
+            key: rows[:, each.content].copy().view(each.dtype).reshape(-1, *each.shape)
+            for key, each in arrays.items()
         }
 
 
@@ -187,7 +199,9 @@ class _Kind:
     def __setstate__(self, state: Any) -> None:
         """Take the byte order from the state that numpy writes."""
         if state[1] not in ("<", ">", "=", "|") or state != (3, state[1], *_NUMBER_STATE):
-            raise pickle.UnpicklingError("an array of numbers with parts, or in no known byte order, is not allowed")
+            raise pickle.UnpicklingError(
+                "an array of numbers with parts, or in no known byte order, is not allowed"
+            )
         self.dtype = self.dtype.newbyteorder(state[1])
 
 
@@ -246,13 +260,17 @@ class _Values:
     def made(self, value: Any, depth: int = 0) -> Any:
         self._take(_A_VALUE)
         if depth > _DEEPEST:
-            raise pickle.UnpicklingError(f"more than {_DEEPEST} containers within each other are not allowed")
+            raise pickle.UnpicklingError(
+                f"more than {_DEEPEST} containers within each other are not allowed"
+            )
         kind = type(value)
         if kind is _Array:
             return self._array(value)
         if kind is dict:
             if not all(type(key) is str and key.isprintable() for key in value):
-                raise pickle.UnpicklingError("a key that is no text, or cannot be printed, is not allowed")
+                raise pickle.UnpicklingError(
+                    "a key that is no text, or cannot be printed, is not allowed"
+                )
             self._take(sum(map(len, value)))
             return {key: self.made(item, depth + 1) for key, item in value.items()}
         if kind is list or kind is tuple:
@@ -269,7 +287,9 @@ class _Values:
         flat: AnyArray = np.frombuffer(self._bytes(notes.content), dtype=notes.dtype)
         array = flat.reshape(notes.shape, order=notes.order)
         if array.shape != notes.shape:  # reshape itself would fill in a negative length
-            raise pickle.UnpicklingError("an array whose shape is not what its bytes have is not allowed")
+            raise pickle.UnpicklingError(
+                "an array whose shape is not what its bytes have is not allowed"
+            )
         return array.astype(notes.dtype.newbyteorder("="))
 
     def _bytes(self, noted: object) -> bytes | memoryview:
@@ -288,4 +308,6 @@ class _Values:
     def _take(self, size: int) -> None:
         self._room -= size
         if self._room < 0:
-            raise pickle.UnpicklingError("values that are far larger than their pickle are not allowed")
+            raise pickle.UnpicklingError(
+                "values that are far larger than their pickle are not allowed"
+            )

@@ -21,10 +21,22 @@ from deepaccident_devkit.render.boxes import (
     in_drawing_order,
     role_colors,
 )
-from deepaccident_devkit.render.camera import CAMERA_LAYERS, BestView, best_view, crop_about, draw_camera
+from deepaccident_devkit.render.camera import (
+    CAMERA_LAYERS,
+    BestView,
+    best_view,
+    crop_about,
+    draw_camera,
+)
 from deepaccident_devkit.render.captions import is_there, set_scene_title
 from deepaccident_devkit.render.chips import keep_free, place_chips
-from deepaccident_devkit.render.figures import Layer, figure_or_new, layers_of, settled, with_light_grid
+from deepaccident_devkit.render.figures import (
+    Layer,
+    figure_or_new,
+    layers_of,
+    settled,
+    with_light_grid,
+)
 from deepaccident_devkit.render.ground import draw_underlay
 from deepaccident_devkit.render.styles import (
     AGENT_COLORS,
@@ -135,7 +147,9 @@ def render_accident(
     moments = _moments(seconds or usual, record["num_frames"])
     first = sample_token(record["token"], agents_of(dataset, scenario)[0], record["num_frames"])
     names = in_drawing_order([] if agents == [] else cooperating_agents(dataset, first, agents))
-    fig = figure_or_new(fig, (_WIDTH * len(moments) + 0.8, 1.95 * len(names) + _WIDTH + 1.1), column=1.45)
+    fig = figure_or_new(
+        fig, (_WIDTH * len(moments) + 0.8, 1.95 * len(names) + _WIDTH + 1.1), column=1.45
+    )
     pair, best = CollidingPair.of(dataset, contact), ""
     room = _agents_with_room(fig, len(names), len(moments)) if agents is None else len(names)
     if room < len(names):
@@ -147,11 +161,16 @@ def render_accident(
             _write_name(draw_pair_in_camera(pair, agent, index, shown, ax), ax)
         draw_pair_from_above(pair, index, shown, axes[-1, column])
         end = "the last frame" if cut or contact.touching else "the impact"
-        _write_head(end if left == 0 else f"{left:g} s before", "black", axes[0, column], above=not across)
+        _write_head(
+            end if left == 0 else f"{left:g} s before", "black", axes[0, column], above=not across
+        )
     for agent, ax in zip(names, axes[:, 0], strict=False):
         _write_head(short_name(agent), AGENT_COLORS[agent], ax, above=across)
     _write_head(
-        "from above,\nspeeds in m/s" if current_style().few else "from above", "black", axes[-1, 0], above=across
+        "from above,\nspeeds in m/s" if current_style().few else "from above",
+        "black",
+        axes[-1, 0],
+        above=across,
     )
     words = "\n".join(filter(None, [accident_words(dataset, contact), cut]))
     set_scene_title(fig, dataset, record["token"], best, below=words)
@@ -159,7 +178,12 @@ def render_accident(
 
 
 def draw_countdown(
-    dataset: Dataset, frame: str, *, agents: Sequence[str], layers: Collection[Layer] | None, fig: Figure
+    dataset: Dataset,
+    frame: str,
+    *,
+    agents: Sequence[str],
+    layers: Collection[Layer] | None,
+    fig: Figure,
 ) -> None:
     """Render a moment of an accident on an empty figure of about 16 to 9: five cameras, the contact, the pair's speeds.
 
@@ -176,11 +200,15 @@ def draw_countdown(
             axes[agent].set_axis_off()
             continue
         words = draw_pair_in_camera(pair, agent, index, shown, axes[agent]).replace("\n", " ")
-        axes[agent].set_title(f"{short_name(agent)}: {words}", fontsize="medium", color=AGENT_COLORS[agent])
+        axes[agent].set_title(
+            f"{short_name(agent)}: {words}", fontsize="medium", color=AGENT_COLORS[agent]
+        )
     draw_pair_from_above(pair, index, shown, axes["above"])
     axes["above"].set_title(f"from above, {axes['above'].get_title()}", fontsize="medium")
     _draw_speeds(pair, index, axes["speeds"])
-    set_scene_title(fig, dataset, frame, below=accident_words(dataset, contact).replace("\n", "; "), fontsize=12)
+    set_scene_title(
+        fig, dataset, frame, below=accident_words(dataset, contact).replace("\n", "; "), fontsize=12
+    )
 
 
 def accident_words(dataset: Dataset, contact: Contact) -> str:
@@ -193,7 +221,9 @@ def accident_words(dataset: Dataset, contact: Contact) -> str:
     names = []
     for instance, actor in zip(contact.instances, contact.actor_ids, strict=True):
         category = dataset.instance.get(instance)["category"]
-        names.append(f"{owners[actor]} ({category} {actor})" if actor in owners else f"{category} {actor}")
+        names.append(
+            f"{owners[actor]} ({category} {actor})" if actor in owners else f"{category} {actor}"
+        )
     order = (1, 0) if contact.sides[1] == "front" and contact.sides[0] != "front" else (0, 1)
     hitting, hit = (names[each] for each in order)
     verb = "and" if contact.apart else "hits" if contact.sides[order[0]] == "front" else "touches"
@@ -222,14 +252,24 @@ class CollidingPair:
         scenario = contact.frame.rsplit("/", 1)[0]
         tracks = scenario_tracks(dataset, scenario)
         return cls(
-            dataset=dataset, scenario=scenario, contact=contact, tracks=tracks, tags=actor_tags(dataset, contact)
+            dataset=dataset,
+            scenario=scenario,
+            contact=contact,
+            tracks=tracks,
+            tags=actor_tags(dataset, contact),
         )
 
     def at(self, index: int, seen_by: str | None = None) -> Boxes:
         """Their boxes in world in a frame (number from 1), as far as they exist; without the agent that sees them."""
         there = self.tracks.at(index)
-        own = None if seen_by is None else self.dataset.agent.get(f"{self.scenario}/{seen_by}")["actor_id"]
-        return there.select(np.isin(there.actor_id, [actor for actor in self.contact.actor_ids if actor != own]))
+        own = (
+            None
+            if seen_by is None
+            else self.dataset.agent.get(f"{self.scenario}/{seen_by}")["actor_id"]
+        )
+        return there.select(
+            np.isin(there.actor_id, [actor for actor in self.contact.actor_ids if actor != own])
+        )
 
     def view(self, agent: str, index: int) -> tuple[str, BestView | None, int | None]:
         """The camera of an agent that shows the pair best in a frame, its view, and when it last had the pair.
@@ -238,7 +278,9 @@ class CollidingPair:
         without such a one the front camera; then there is no view.
         """
         sample = sample_token(self.scenario, agent, index)
-        there = [channel for channel in CAMERAS if is_there(self.dataset, f"{sample}/{channel}")] or CAMERAS
+        there = [
+            channel for channel in CAMERAS if is_there(self.dataset, f"{sample}/{channel}")
+        ] or CAMERAS
         for earlier in range(index, max(0, index - _REMEMBERED), -1):
             then = sample_token(self.scenario, agent, earlier)
             view = best_view(self.dataset, [then], self.at(earlier, agent), there)
@@ -247,7 +289,9 @@ class CollidingPair:
         return there[0], None, None
 
 
-def draw_pair_in_camera(pair: CollidingPair, agent: str, index: int, layers: Collection[Layer], ax: Axes) -> str:
+def draw_pair_in_camera(
+    pair: CollidingPair, agent: str, index: int, layers: Collection[Layer], ax: Axes
+) -> str:
     """Render the part of an agent's image that has the pair, with tags; dashed if no camera of the agent sees them.
 
     The frame is a number from 1. Returns the camera's short name, and how long ago it saw the pair if it does not now.
@@ -261,7 +305,9 @@ def draw_pair_in_camera(pair: CollidingPair, agent: str, index: int, layers: Col
     if view is None:
         return name if last is None else f"{name}:\nseen {(index - last) * FRAME_PERIOD:.1f} s ago"
     lens = camera_of(dataset, camera)
-    left, top, right, bottom = crop_about(view.bounds, width=lens.width, height=lens.height, share=_LEAST_CROP)
+    left, top, right, bottom = crop_about(
+        view.bounds, width=lens.width, height=lens.height, share=_LEAST_CROP
+    )
     ax.set(xlim=(left, right), ylim=(bottom, top))
     if "boxes" not in layers:
         return name
@@ -272,14 +318,18 @@ def draw_pair_in_camera(pair: CollidingPair, agent: str, index: int, layers: Col
     return name
 
 
-def draw_pair_from_above(pair: CollidingPair, index: int, layers: Collection[Layer], ax: Axes) -> None:
+def draw_pair_from_above(
+    pair: CollidingPair, index: int, layers: Collection[Layer], ax: Axes
+) -> None:
     """Render a frame (number from 1) around the place of contact, in world, as near as the pair allows.
 
     The layers are `bev` (the road), `boxes`, `velocities`, `ids`, `trajectories` (of the pair, up to the contact) and
     `grid`; the title is the pair's speeds.
     """
     dataset, contact = pair.dataset, pair.contact
-    sample = dataset.get("sample", sample_token(pair.scenario, agents_of(dataset, pair.scenario)[0], index))
+    sample = dataset.get(
+        "sample", sample_token(pair.scenario, agents_of(dataset, pair.scenario)[0], index)
+    )
     boxes, both = pair.tracks.at(index), pair.at(index)
     place = contact.point[:2]
     reach = _MARGIN + float(np.abs(both.bottom_corners()[..., :2] - place).max(initial=0.0))
@@ -290,7 +340,9 @@ def draw_pair_from_above(pair: CollidingPair, index: int, layers: Collection[Lay
         _draw_road(pair, index, reach, ax)
     if "trajectories" in layers:
         seconds, red = (_PAST, sample["time_to_impact"] or 0.0), [COLLIDER_COLOR] * len(both)
-        draw_trails(dataset, sample, both, red, target_from_world=SE3.identity(), seconds=seconds, ax=ax)
+        draw_trails(
+            dataset, sample, both, red, target_from_world=SE3.identity(), seconds=seconds, ax=ax
+        )
     _write_tags_from_above(pair, both, ax)  # before the ids, which have what room is left
     draw_actors_from_above(boxes, ax, role_colors(dataset, sample, boxes), layers)
     ax.plot(x, y, "x", color="black", markersize=_CROSS, markeredgewidth=1.8, zorder=5)
@@ -301,7 +353,10 @@ def draw_pair_from_above(pair: CollidingPair, index: int, layers: Collection[Lay
         for actor, velocity in zip(both.actor_id.tolist(), both.velocity, strict=True)
     ]
     words = ", ".join(speeds) + ("" if current_style().few else " m/s")
-    ax.set_title("\n".join(speeds) if current_style().few and len(words) > _SHORT else words, fontsize=text_size())
+    ax.set_title(
+        "\n".join(speeds) if current_style().few and len(words) > _SHORT else words,
+        fontsize=text_size(),
+    )
 
 
 def number_words(value: float) -> str:
@@ -312,7 +367,9 @@ def number_words(value: float) -> str:
 def _draw_road(pair: CollidingPair, index: int, reach: float, ax: Axes) -> None:
     """Render the ground from the BEV camera that is nearest to the contact; nothing if there is no file."""
     dataset, place = pair.dataset, pair.contact.point[:2]
-    samples = [sample_token(pair.scenario, agent, index) for agent in agents_of(dataset, pair.scenario)]
+    samples = [
+        sample_token(pair.scenario, agent, index) for agent in agents_of(dataset, pair.scenario)
+    ]
     there = [sample for sample in samples if is_there(dataset, f"{sample}/{BEV_CAMERA}")]
     poses = [dataset.world_from(sample, "ego") for sample in there]
     away = [float(np.abs(pose.translation[:2] - place).max()) for pose in poses]
@@ -336,11 +393,21 @@ def _draw_scale(reach: float, ax: Axes, *, grid: bool) -> None:
     left, low = (each + 0.1 * reach for each in ax.viewLim.min)
     ax.plot([left, left + metres], [low, low], color="black", linewidth=2)
     paper = {"facecolor": CASING_COLOR, "edgecolor": "none", "alpha": 0.7, "pad": 0.5}
-    ax.text(left, low + 0.06 * reach, f"{metres:.0f} m", fontsize=text_size(), va="bottom", zorder=6, bbox=paper)
+    ax.text(
+        left,
+        low + 0.06 * reach,
+        f"{metres:.0f} m",
+        fontsize=text_size(),
+        va="bottom",
+        zorder=6,
+        bbox=paper,
+    )
     keep_free(ax, [[(left, low), (left + metres, low)]], margin=(-2, -2, 2, 2 * text_size()))
 
 
-def _write_tags_in_image(pair: CollidingPair, actors: list[int], bounds: FloatArray, ax: Axes) -> None:
+def _write_tags_in_image(
+    pair: CollidingPair, actors: list[int], bounds: FloatArray, ax: Axes
+) -> None:
     """Write tags above what the panel shows of boxes with bounds (N, 4), pixels; of two, at their outer sides."""
     (left, right), (bottom, top) = ax.get_xlim(), ax.get_ylim()
     cars = bounds.reshape(-1, 2, 2).clip((left, top), (right, bottom))
@@ -418,8 +485,12 @@ def _width(fig: Figure, agents: int, moments: int) -> tuple[float, bool]:
 def _panels(fig: Figure, agents: int, moments: int) -> tuple[Any, bool]:
     """Axes (agents + 1, moments), and whether rows are columns."""
     if _width(fig, agents, moments)[1]:
-        return fig.subplots(moments, agents + 1, squeeze=False, width_ratios=(*[16 / 9] * agents, 1)).T, True
-    return fig.subplots(agents + 1, moments, squeeze=False, height_ratios=(*[9 / 16] * agents, 1)), False
+        return fig.subplots(
+            moments, agents + 1, squeeze=False, width_ratios=(*[16 / 9] * agents, 1)
+        ).T, True
+    return fig.subplots(
+        agents + 1, moments, squeeze=False, height_ratios=(*[9 / 16] * agents, 1)
+    ), False
 
 
 def _agents_with_room(fig: Figure, agents: int, moments: int) -> int:
@@ -432,13 +503,21 @@ def _agents_with_room(fig: Figure, agents: int, moments: int) -> int:
         if width >= least
     }
     enough = _ENOUGH * fig.bbox.width * fig.bbox.height / fig.dpi**2 if current_style().few else 0.0
-    return max((number for number, area in areas.items() if area > enough), default=max(areas, key=areas.__getitem__))
+    return max(
+        (number for number, area in areas.items() if area > enough),
+        default=max(areas, key=areas.__getitem__),
+    )
 
 
-def _best_agents(pair: CollidingPair, agents: Sequence[str], frames: Sequence[int], number: int) -> list[str]:
+def _best_agents(
+    pair: CollidingPair, agents: Sequence[str], frames: Sequence[int], number: int
+) -> list[str]:
     """So many of the agents: the ego, and those in whose images most, and of equals the largest, of the pair is."""
     views = {agent: [pair.view(agent, index)[1] for index in frames] for agent in agents}
-    seen = {agent: [(view.shown, view.area) for view in views[agent] if view is not None] for agent in agents}
+    seen = {
+        agent: [(view.shown, view.area) for view in views[agent] if view is not None]
+        for agent in agents
+    }
     best = {agent: np.sum([(0, 0), *seen[agent]], axis=0).tolist() for agent in agents}
     ranked = sorted(agents, key=lambda agent: (agent == AGENTS[0], best[agent]), reverse=True)
     return in_drawing_order(ranked[:number])
@@ -447,7 +526,9 @@ def _best_agents(pair: CollidingPair, agents: Sequence[str], frames: Sequence[in
 def _write_head(words: str, color: str, ax: Axes, *, above: bool) -> None:
     """Write the head of a column above its first panel, or that of a row beside it."""
     if above:
-        ax.set_title("\n".join(filter(None, [words, ax.get_title()])), color=color, fontsize="medium")
+        ax.set_title(
+            "\n".join(filter(None, [words, ax.get_title()])), color=color, fontsize="medium"
+        )
         return
     style: dict[str, Any] = {"rotation": 90, "ha": "right", "va": "center", "fontweight": "bold"}
     ax.text(-0.02, 0.5, words, color=color, transform=ax.transAxes, **style)
@@ -483,7 +564,10 @@ def _draw_speeds(pair: CollidingPair, index: int, ax: Axes) -> None:
     ax.axvline((index - impact) * FRAME_PERIOD, color="black", linewidth=1.2)
     ax.axvline(0, color=COLLIDER_COLOR, linewidth=1.2, linestyle=":")
     ax.set(
-        xlabel="time to the impact (s)", ylabel="speed (m/s)", xlim=(-(impact - 1) * FRAME_PERIOD, 0.1), ylim=(0, None)
+        xlabel="time to the impact (s)",
+        ylabel="speed (m/s)",
+        xlim=(-(impact - 1) * FRAME_PERIOD, 0.1),
+        ylim=(0, None),
     )
     ax.legend(loc="lower left", fontsize=text_size(), ncols=2, framealpha=0.7)
     with_light_grid(ax, "both")

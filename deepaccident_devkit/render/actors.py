@@ -25,7 +25,14 @@ from deepaccident_devkit.render.boxes import (
 )
 from deepaccident_devkit.render.camera import BestView, best_view, crop_about, draw_image
 from deepaccident_devkit.render.captions import set_scene_title, set_title
-from deepaccident_devkit.render.figures import LAYERS, Layer, axis_words, figure_or_new, layers_of, with_light_grid
+from deepaccident_devkit.render.figures import (
+    LAYERS,
+    Layer,
+    axis_words,
+    figure_or_new,
+    layers_of,
+    with_light_grid,
+)
 from deepaccident_devkit.render.ground import draw_underlay
 from deepaccident_devkit.render.styles import (
     AGENT_COLORS,
@@ -35,9 +42,22 @@ from deepaccident_devkit.render.styles import (
     in_own_settings,
     text_size,
 )
-from deepaccident_devkit.support.arrays import BoolArray, FloatArray, FrozenArrays, IntArray, as_floats
+from deepaccident_devkit.support.arrays import (
+    BoolArray,
+    FloatArray,
+    FrozenArrays,
+    IntArray,
+    as_floats,
+)
 from deepaccident_devkit.tables.tokens import instance_token, sample_token
-from deepaccident_devkit.taxonomy import BEV_CAMERA, CAMERAS, FRAME_PERIOD, OWN_ACTOR_ID, frame_timestamp, short_name
+from deepaccident_devkit.taxonomy import (
+    BEV_CAMERA,
+    CAMERAS,
+    FRAME_PERIOD,
+    OWN_ACTOR_ID,
+    frame_timestamp,
+    short_name,
+)
 from deepaccident_devkit.v2x import Agents, cooperating_agents
 from deepaccident_devkit.v2x.cooperation import visible_actors
 from deepaccident_devkit.v2x.poses import camera_of
@@ -57,12 +77,19 @@ _BESIDE: Final[list[Any]] = [["path", "first", "second"], ["path", "speed", "see
 # The panels of an actor over time, by what there is room for.
 _MOSAICS: Final[Mapping[str, dict[str, Any]]] = {
     "all": {
-        "mosaic": [["path", "first", "second"], ["path", "third", "fourth"], ["speed", "points", "seen"]],
+        "mosaic": [
+            ["path", "first", "second"],
+            ["path", "third", "fourth"],
+            ["speed", "points", "seen"],
+        ],
         "height_ratios": (1, 1, 1.1),
     },
     "page": {"mosaic": _BESIDE, "width_ratios": (1.6, 1, 1)},
     "slide": {"mosaic": _BESIDE, "width_ratios": (1.9, 1, 1)},
-    "column": {"mosaic": [["path"] * 2, ["first", "second"], ["seen"] * 2], "height_ratios": (2.0, 0.6, 0.8)},
+    "column": {
+        "mosaic": [["path"] * 2, ["first", "second"], ["seen"] * 2],
+        "height_ratios": (2.0, 0.6, 0.8),
+    },
 }
 # The panels of one box.
 _BOX_MOSAICS: Final[Mapping[str, dict[str, Any]]] = {
@@ -117,11 +144,24 @@ def render_annotation(
     color = role_colors(dataset, sample, box)
     fig = figure_or_new(fig, (10, 4.9), page=0.43, column=1.6)
     axes = fig.subplot_mosaic(**_BOX_MOSAICS.get(current_style().room, _BOX_MOSAICS["all"]))
-    _draw_in_camera(dataset, best_view(dataset, [sample], box), box, color, axes["camera"], image="image" in chosen)
+    _draw_in_camera(
+        dataset,
+        best_view(dataset, [sample], box),
+        box,
+        color,
+        axes["camera"],
+        image="image" in chosen,
+    )
 
     own = box.transform(dataset.world_from(sample, "ego").inverse(), "ego")
     x, y = own.center[0, :2].tolist()
-    draw_bev(dataset, sample, BevView(view_range=margin, center=(x, y)), chosen - {"image"}, axes["above"])
+    draw_bev(
+        dataset,
+        sample,
+        BevView(view_range=margin, center=(x, y)),
+        chosen - {"image"},
+        axes["above"],
+    )
     draw_boxes_from_above(own, axes["above"], color, fill=0.5, linewidths=2.5)
     axes["above"].set_title("ego frame of the agent", fontsize="medium")
 
@@ -147,13 +187,26 @@ def _draw_in_camera(
 ) -> None:
     if view is None:
         ax.set_axis_off()
-        ax.text(0.5, 0.5, "in no image of its agent's cameras", ha="center", va="center", transform=ax.transAxes)
+        ax.text(
+            0.5,
+            0.5,
+            "in no image of its agent's cameras",
+            ha="center",
+            va="center",
+            transform=ax.transAxes,
+        )
         return
     draw_view(dataset, view, box, color, ax, image=image)
 
 
 def draw_view(
-    dataset: Dataset, view: BestView, boxes: Boxes, colors: list[str], ax: Axes, *, image: bool = True
+    dataset: Dataset,
+    view: BestView,
+    boxes: Boxes,
+    colors: list[str],
+    ax: Axes,
+    *,
+    image: bool = True,
 ) -> None:
     """Render the part of a best view's image around boxes, in world, and their edges; the title is the camera."""
     camera = dataset.get("sample_data", view.camera)
@@ -169,7 +222,9 @@ def _facts(dataset: Dataset, record: dict[str, Any], own: Boxes) -> list[list[st
     """The facts about a box, in columns of lines; `own` has only this box, in the ego frame."""
     length, width, height = record["size"]
     speed = float(np.linalg.norm(record["velocity"]))
-    countdown = "none" if record["time_to_impact"] is None else f"in {record['time_to_impact']:.1f} s"
+    countdown = (
+        "none" if record["time_to_impact"] is None else f"in {record['time_to_impact']:.1f} s"
+    )
     agents = []
     if record["instance_token"] is not None:
         scenario, _, number, _ = record["token"].rsplit("/", 3)
@@ -226,7 +281,9 @@ def render_instance(
     """
     chosen = layers_of(layers, _LAYERS, _LAYERS)
     actor = _actor(dataset, instance)
-    names = in_drawing_order(cooperating_agents(dataset, sample_token(actor.scenario, actor.recorder, 1), agents))
+    names = in_drawing_order(
+        cooperating_agents(dataset, sample_token(actor.scenario, actor.recorder, 1), agents)
+    )
     known = [sightings(dataset, actor.scenario, agent, actor.actor_id) for agent in names]
     fig = figure_or_new(fig, (14, 8.5), page=0.42, column=1.65)
     axes = fig.subplot_mosaic(**_MOSAICS[current_style().room])
@@ -298,17 +355,25 @@ def _draw_path(dataset: Dataset, actor: _Actor, layers: frozenset[Layer], ax: Ax
     path = actor.boxes.center[:, :2]
     center = (path.min(axis=0) + path.max(axis=0)) / 2
     reach = float(np.ptp(path, axis=0).max()) / 2 + _AROUND
-    ax.set(xlim=(center[0] - reach, center[0] + reach), ylim=(center[1] - reach, center[1] + reach), aspect="equal")
+    ax.set(
+        xlim=(center[0] - reach, center[0] + reach),
+        ylim=(center[1] - reach, center[1] + reach),
+        aspect="equal",
+    )
     middle = sample_token(actor.scenario, actor.recorder, int(actor.index[len(actor.index) // 2]))
     if "bev" in layers and dataset.sensor_path(f"{middle}/{BEV_CAMERA}").is_file():
         world_from_ego = dataset.world_from(middle, "ego")
         away = float(np.abs(center - world_from_ego.translation[:2]).max())
-        draw_underlay(dataset.load_bev(middle), ax, target_from_ego=world_from_ego, view_range=reach + away)
+        draw_underlay(
+            dataset.load_bev(middle), ax, target_from_ego=world_from_ego, view_range=reach + away
+        )
     if "trajectories" in layers:
         draw_trail(path[::-1], ax, actor.color, linewidths=2.5)
     seconds = np.flatnonzero((actor.index - 1) % _FRAMES_A_SECOND == 0)
     if "boxes" in layers:
-        draw_boxes_from_above(actor.boxes.select(seconds), ax, [actor.color] * len(seconds), fill=0.1)
+        draw_boxes_from_above(
+            actor.boxes.select(seconds), ax, [actor.color] * len(seconds), fill=0.1
+        )
     last = -np.inf
     for row in seconds.tolist():
         travelled = float(np.linalg.norm(path[row] - path[0]))
@@ -317,7 +382,15 @@ def _draw_path(dataset: Dataset, actor: _Actor, layers: frozenset[Layer], ax: Ax
             write_beside(ax, words, (float(path[row, 0]), float(path[row, 1])), "black")
             last = travelled
     if actor.impact is not None and actor.color == COLLIDER_COLOR:
-        ax.scatter(path[-1:, 0], path[-1:, 1], s=130, c=actor.color, marker="*", edgecolors="white", zorder=7)
+        ax.scatter(
+            path[-1:, 0],
+            path[-1:, 1],
+            s=130,
+            c=actor.color,
+            marker="*",
+            edgecolors="white",
+            zorder=7,
+        )
         write_beside(ax, "impact", (float(path[-1, 0]), float(path[-1, 1])), actor.color)
     ax.locator_params(nbins=5)
     x_words, y_words = axis_words("world")
@@ -327,27 +400,41 @@ def _draw_path(dataset: Dataset, actor: _Actor, layers: frozenset[Layer], ax: Ax
 
 
 def _draw_crops(
-    dataset: Dataset, actor: _Actor, known: Sequence[Sightings], layers: frozenset[Layer], axes: Sequence[Axes]
+    dataset: Dataset,
+    actor: _Actor,
+    known: Sequence[Sightings],
+    layers: frozenset[Layer],
+    axes: Sequence[Axes],
 ) -> None:
     """The largest views at several of the moments at which some camera sees the actor, preferably with its image."""
     seen, files = [one.index[one.camera] for one in known], dataset.sensor_frames(actor.scenario)
     images = [[frame for camera in CAMERAS for frame in files[one.agent, camera]] for one in known]
     shown = [index[np.isin(index, there)] for index, there in zip(seen, images, strict=True)]
     moments = np.unique(np.concatenate(shown if any(map(len, shown)) else seen))
-    picked = moments[np.unique(np.linspace(0, len(moments) - 1, len(axes)).round().astype(int))] if len(moments) else []
+    picked = (
+        moments[np.unique(np.linspace(0, len(moments) - 1, len(axes)).round().astype(int))]
+        if len(moments)
+        else []
+    )
     for ax in axes[len(picked) :]:
         ax.set_axis_off()
     if not len(picked):
-        axes[0].text(0.5, 0.5, "no camera sees it", ha="center", va="center", transform=axes[0].transAxes)
+        axes[0].text(
+            0.5, 0.5, "no camera sees it", ha="center", va="center", transform=axes[0].transAxes
+        )
     for index, ax in zip(picked, axes, strict=False):
         box = actor.boxes.select(actor.index == index)
         there = [one.agent for one in known if index in one.index[one.camera]]
-        view = best_view(dataset, [sample_token(actor.scenario, agent, int(index)) for agent in there], box)
+        view = best_view(
+            dataset, [sample_token(actor.scenario, agent, int(index)) for agent in there], box
+        )
         if view is None:
             ax.set_axis_off()
             continue
         colors = [actor.color] if "boxes" in layers else []
-        draw_view(dataset, view, box.select(np.arange(len(colors))), colors, ax, image="image" in layers)
+        draw_view(
+            dataset, view, box.select(np.arange(len(colors))), colors, ax, image="image" in layers
+        )
         agent, _, channel = view.camera.rsplit("/", 3)[1:]
         words = f"{frame_timestamp(int(index)):.1f} s, {short_name(agent)}, {camera_name(channel)}"
         set_title(ax, words, fontsize=text_size())
@@ -362,7 +449,13 @@ def _draw_speed(actor: _Actor, ax: Axes) -> None:
 
 def _draw_points(known: Sequence[Sightings], ax: Axes) -> None:
     for one in known:
-        ax.plot(one.timestamp, one.points, color=AGENT_COLORS[one.agent], linewidth=1.3, label=short_name(one.agent))
+        ax.plot(
+            one.timestamp,
+            one.points,
+            color=AGENT_COLORS[one.agent],
+            linewidth=1.3,
+            label=short_name(one.agent),
+        )
     ax.set_yscale("symlog", linthresh=10)
     ax.set_ylim(bottom=0)
     ax.set_title("LiDAR points in its box", fontsize="medium")
@@ -372,10 +465,25 @@ def _draw_seen(actor: _Actor, known: Sequence[Sightings], ax: Axes) -> None:
     """One bar for each agent, from the top: full where it sees the actor, pale where it only annotated it."""
     for row, one in enumerate(known):
         for which, opacity in ((one.seen, 1.0), (~one.seen, 0.25)):
-            spans = [(time - FRAME_PERIOD / 2, FRAME_PERIOD) for time in one.timestamp[which].tolist()]
-            ax.broken_barh(spans, (row - 0.35, 0.7), facecolors=AGENT_COLORS[one.agent], alpha=opacity, linewidth=0)
+            spans = [
+                (time - FRAME_PERIOD / 2, FRAME_PERIOD) for time in one.timestamp[which].tolist()
+            ]
+            ax.broken_barh(
+                spans,
+                (row - 0.35, 0.7),
+                facecolors=AGENT_COLORS[one.agent],
+                alpha=opacity,
+                linewidth=0,
+            )
         if one.agent == actor.own_agent:
-            ax.text(actor.duration / 2, row, "is the actor itself", ha="center", va="center", fontsize=text_size())
+            ax.text(
+                actor.duration / 2,
+                row,
+                "is the actor itself",
+                ha="center",
+                va="center",
+                fontsize=text_size(),
+            )
     ax.set_yticks(range(len(known)), [short_name(one.agent) for one in known])
     ax.set_ylim(len(known) - 0.5, -0.5)
     set_title(ax, "who sees it, pale: only annotated", fontsize="medium")
@@ -420,11 +528,15 @@ def sightings(dataset: Dataset, scenario: str, agent: str, actor_id: int) -> Sig
     for index in range(1, dataset.get("scenario", scenario)["num_frames"] + 1):
         sample = sample_token(scenario, agent, index)
         boxes = dataset.boxes(sample, "lidar")
-        found = np.flatnonzero((dataset.actor_ids(sample) == actor_id) & (boxes.actor_id != OWN_ACTOR_ID))
+        found = np.flatnonzero(
+            (dataset.actor_ids(sample) == actor_id) & (boxes.actor_id != OWN_ACTOR_ID)
+        )
         if len(found):
             row = int(found[0])
             seen = actor_id in visible_actors(dataset, sample, agents=[agent])
-            rows.append((index, int(boxes.num_lidar_pts[row]), bool(boxes.camera_visible[row]), seen))
+            rows.append(
+                (index, int(boxes.num_lidar_pts[row]), bool(boxes.camera_visible[row]), seen)
+            )
     table = np.array(rows, dtype=np.int64).reshape(-1, 4)
     return Sightings(
         agent=agent,

@@ -32,7 +32,14 @@ from deepaccident_devkit.render.captions import (
     write_missing,
 )
 from deepaccident_devkit.render.chips import keep_free
-from deepaccident_devkit.render.figures import Layer, axes_or_new, axis_words, check_view_range, layers_of, widening
+from deepaccident_devkit.render.figures import (
+    Layer,
+    axes_or_new,
+    axis_words,
+    check_view_range,
+    layers_of,
+    widening,
+)
 from deepaccident_devkit.render.ground import draw_underlay
 from deepaccident_devkit.render.styles import (
     AGENT_COLORS,
@@ -191,7 +198,9 @@ def render_bev(  # noqa: PLR0913 - each is a choice that stands on its own in a 
     return ax
 
 
-def draw_bev(dataset: Dataset, sample: RowArgument, view: BevView, layers: frozenset[Layer], ax: Axes) -> _ViewContent:
+def draw_bev(
+    dataset: Dataset, sample: RowArgument, view: BevView, layers: frozenset[Layer], ax: Axes
+) -> _ViewContent:
     """Render a panel of `render_bev`, with its arguments and errors; returns what a legend explains."""
     record = dataset.sample[dataset.getind("sample", sample)]
     names = cooperating_agents(dataset, record, view.agents)
@@ -209,18 +218,28 @@ def draw_bev(dataset: Dataset, sample: RowArgument, view: BevView, layers: froze
         draw_town_map(town, ax, target_from_world=target_from_world)
     if has_ground:
         image = dataset.load_bev(record)
-        reach = float(view.half.max()) + float(np.abs(center - target_from_ego.translation[:2]).max())
+        reach = float(view.half.max()) + float(
+            np.abs(center - target_from_ego.translation[:2]).max()
+        )
         draw_underlay(image, ax, target_from_ego=target_from_ego, view_range=reach)
     clouds = _draw_clouds(dataset, record, view, names, center, ax) if "points" in layers else {}
     absent = [missing_clouds_text([agent for agent, cloud in clouds.items() if cloud is None])]
     colored: frozenset[str] = frozenset()
     if not layers.isdisjoint(_OF_BOXES):
         boxes = _boxes(dataset, record, view, names)
-        boxes = boxes.select((np.abs(boxes.center[:, :2] - center) < view.half + _BEYOND).all(axis=1))
+        boxes = boxes.select(
+            (np.abs(boxes.center[:, :2] - center) < view.half + _BEYOND).all(axis=1)
+        )
         colors = role_colors(dataset, record, boxes)
         if "trajectories" in layers:
             draw_trails(
-                dataset, record, boxes, colors, target_from_world=target_from_world, seconds=view.seconds, ax=ax
+                dataset,
+                record,
+                boxes,
+                colors,
+                target_from_world=target_from_world,
+                seconds=view.seconds,
+                ax=ax,
             )
         draw_actors_from_above(boxes, ax, colors, layers)
         if "boxes" in layers:
@@ -239,7 +258,9 @@ def draw_bev(dataset: Dataset, sample: RowArgument, view: BevView, layers: froze
     return colored, shown if len(names) > 1 else ()
 
 
-def _absent_ground(dataset: Dataset, ground: str, layers: frozenset[Layer], *, seen: bool, other: bool) -> list[str]:
+def _absent_ground(
+    dataset: Dataset, ground: str, layers: frozenset[Layer], *, seen: bool, other: bool
+) -> list[str]:
     """What a corner says of the ground: that of the BEV camera only if nothing `other` shows the surroundings."""
     if seen or layers.isdisjoint(("map", "bev")):
         return []
@@ -248,7 +269,9 @@ def _absent_ground(dataset: Dataset, ground: str, layers: frozenset[Layer], *, s
     return [] if other else [f"{BEV_CAMERA}: {absence_text(dataset, ground)}"]
 
 
-def _boxes(dataset: Dataset, record: SampleRecord, view: BevView, names: Sequence[AgentName]) -> Boxes:
+def _boxes(
+    dataset: Dataset, record: SampleRecord, view: BevView, names: Sequence[AgentName]
+) -> Boxes:
     """The sample's own boxes with their label ids, or several agents' with CARLA's.
 
     The receiver knows its own place: no message moves its box.
@@ -260,7 +283,9 @@ def _boxes(dataset: Dataset, record: SampleRecord, view: BevView, names: Sequenc
     if view.link is None or own is None:
         return boxes
     true = cooperative_boxes(dataset, record, agents=names, frame=view.frame)
-    return concatenate([true.select(true.actor_id == own), boxes.select(boxes.actor_id != own)], view.frame)
+    return concatenate(
+        [true.select(true.actor_id == own), boxes.select(boxes.actor_id != own)], view.frame
+    )
 
 
 def _draw_clouds(
@@ -281,17 +306,30 @@ def _draw_clouds(
     return clouds
 
 
-def _cloud(dataset: Dataset, record: SampleRecord, view: BevView, agent: AgentName) -> LidarPointCloud | None:
+def _cloud(
+    dataset: Dataset, record: SampleRecord, view: BevView, agent: AgentName
+) -> LidarPointCloud | None:
     """What arrives of an agent's points; None if it would arrive, and none of the files is there."""
-    sent = [message.sample for message in messages(dataset, record, [agent], view.link, sweeps=view.sweeps)]
+    sent = [
+        message.sample
+        for message in messages(dataset, record, [agent], view.link, sweeps=view.sweeps)
+    ]
     if sent and not any(has_cloud(dataset, sample) for sample in sent):
         return None
     return aggregate_point_cloud(
-        dataset, record, agents=[agent], sweeps=view.sweeps, frame=view.frame, link=view.link, on_missing="skip"
+        dataset,
+        record,
+        agents=[agent],
+        sweeps=view.sweeps,
+        frame=view.frame,
+        link=view.link,
+        on_missing="skip",
     )
 
 
-def _draw_marks(dataset: Dataset, record: SampleRecord, frame: str, names: Sequence[AgentName], ax: Axes) -> None:
+def _draw_marks(
+    dataset: Dataset, record: SampleRecord, frame: str, names: Sequence[AgentName], ax: Axes
+) -> None:
     """An arrow head at the true pose of each agent; with names if there are several agents."""
     from matplotlib.collections import PolyCollection
 
@@ -304,18 +342,27 @@ def _draw_marks(dataset: Dataset, record: SampleRecord, frame: str, names: Seque
             x, y = axes_from_ego.translation[:2].tolist()
             write_beside(ax, short_name(agent), (x, y), colors[-1])
     edges = [OWN_COLOR if agent == record["agent"] else CASING_COLOR for agent in names]
-    ax.add_collection(PolyCollection(heads, facecolors=colors, edgecolors=edges, linewidths=0.8, zorder=5))
+    ax.add_collection(
+        PolyCollection(heads, facecolors=colors, edgecolors=edges, linewidths=0.8, zorder=5)
+    )
     keep_free(ax, heads)
 
 
-def _name_pair(dataset: Dataset, record: SampleRecord, boxes: Boxes, ax: Axes, *, named: Collection[AgentName]) -> None:
+def _name_pair(
+    dataset: Dataset, record: SampleRecord, boxes: Boxes, ax: Axes, *, named: Collection[AgentName]
+) -> None:
     """Write who collides: the agents that are not yet `named`, others by their category."""
     agents, colliders = recorder_ids(dataset, record), collider_ids(dataset, record)
     for row, actor in enumerate(label_ids(dataset, record, boxes)):
         agent = agents.get(actor)
         if actor in colliders and agent not in named:
             x, y = boxes.center[row, :2].tolist()
-            write_beside(ax, boxes.category_names[row] if agent is None else short_name(agent), (x, y), COLLIDER_COLOR)
+            write_beside(
+                ax,
+                boxes.category_names[row] if agent is None else short_name(agent),
+                (x, y),
+                COLLIDER_COLOR,
+            )
 
 
 def link_words(link: Link) -> str:

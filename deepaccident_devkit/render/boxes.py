@@ -26,7 +26,14 @@ from deepaccident_devkit.render.styles import (
 )
 from deepaccident_devkit.support.arrays import BoolArray, FloatArray, IntArray
 from deepaccident_devkit.tables.tokens import sample_token
-from deepaccident_devkit.taxonomy import AGENTS, FRAME_PERIOD, OWN_ACTOR_ID, UNTRACKED_ID, AgentName, short_name
+from deepaccident_devkit.taxonomy import (
+    AGENTS,
+    FRAME_PERIOD,
+    OWN_ACTOR_ID,
+    UNTRACKED_ID,
+    AgentName,
+    short_name,
+)
 from deepaccident_devkit.v2x import Contact
 from deepaccident_devkit.v2x.agents import agents_of
 from deepaccident_devkit.v2x.tracks import ScenarioTracks, scenario_tracks
@@ -37,7 +44,20 @@ if TYPE_CHECKING:
     from matplotlib.patches import PathPatch
 
 # The twelve edges of a box between its corners, in `Box.corners` order; the first four are its front.
-EDGES = ((0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7))
+EDGES = (
+    (0, 1),
+    (1, 2),
+    (2, 3),
+    (3, 0),
+    (4, 5),
+    (5, 6),
+    (6, 7),
+    (7, 4),
+    (0, 4),
+    (1, 5),
+    (2, 6),
+    (3, 7),
+)
 # Metres from the middle of the mark of a small actor, from above, to its rim: about a car's width in all.
 _MARK_RADIUS: Final = 1.0
 # Points: it is at least as large, so that it is found in a view of a whole town.
@@ -68,11 +88,15 @@ def draw_box(box: Box, ax: Axes, color: str | None = None) -> Axes:
             f"box: expected a Box, found {type(box).__name__}; the box is first, then the axes: draw_box(box, ax)"
         )
     chosen = color or category_colors()[box.category]
-    _draw_footprints(box.center[None, :2], box.bottom_corners().T[None, :, :2], ax, [chosen], 0.25, {})
+    _draw_footprints(
+        box.center[None, :2], box.bottom_corners().T[None, :, :2], ax, [chosen], 0.25, {}
+    )
     return ax
 
 
-def draw_boxes_from_above(boxes: Boxes, ax: Axes, colors: Sequence[str], *, fill: float = 0.25, **how: Any) -> None:
+def draw_boxes_from_above(
+    boxes: Boxes, ax: Axes, colors: Sequence[str], *, fill: float = 0.25, **how: Any
+) -> None:
     """Render boxes in x and y of their (level) frame, metres, each with a line towards its front, as opaque as `fill`.
 
     Pedestrians, cyclists and motorcycles also have their class's mark, as large as a car is wide. `how` is
@@ -97,11 +121,21 @@ def draw_velocities_from_above(boxes: Boxes, ax: Axes, colors: Sequence[str]) ->
         how: Any = {"angles": "xy", "scale_units": "xy", "scale": 1, "width": 0.004, "zorder": 4}
         arrows = ax.quiver(*start, *step, color=chosen, **how)
         words = f"{_KEY_SPEED} m/s"
-        key = ax.quiverkey(arrows, 0.85, 0.03, _KEY_SPEED, words, color=OWN_COLOR, fontproperties={"size": text_size()})
+        key = ax.quiverkey(
+            arrows,
+            0.85,
+            0.03,
+            _KEY_SPEED,
+            words,
+            color=OWN_COLOR,
+            fontproperties={"size": text_size()},
+        )
         key.text.set_bbox({"facecolor": CASING_COLOR, "edgecolor": "none", "pad": 1.5})
 
 
-def draw_actors_from_above(boxes: Boxes, ax: Axes, colors: Sequence[str], layers: Collection[Layer]) -> None:
+def draw_actors_from_above(
+    boxes: Boxes, ax: Axes, colors: Sequence[str], layers: Collection[Layer]
+) -> None:
     """Render the requested ones of the layers `boxes`, `velocities` and `ids`, as the functions above do."""
     if "boxes" in layers:
         draw_boxes_from_above(boxes, ax, colors)
@@ -111,7 +145,9 @@ def draw_actors_from_above(boxes: Boxes, ax: Axes, colors: Sequence[str], layers
         draw_ids_from_above(boxes, ax, colors)
 
 
-def draw_boxes_in_image(boxes: Boxes, camera: PinholeCamera, ax: Axes, colors: Sequence[str], **how: Any) -> BoolArray:
+def draw_boxes_in_image(
+    boxes: Boxes, camera: PinholeCamera, ax: Axes, colors: Sequence[str], **how: Any
+) -> BoolArray:
     """Render the edges of boxes (N) of the camera's optical frame, with a white casing, and fill their fronts.
 
     What is not in front of the camera is cut off. `how` is matplotlib's for the edges, such as `linestyle`. Returns
@@ -131,7 +167,9 @@ def draw_boxes_in_image(boxes: Boxes, camera: PinholeCamera, ax: Axes, colors: S
         front = edge < 4
         rows, starts = np.unique(row[front], return_index=True)
         fronts = np.split(pixels[front].reshape(-1, 2), 2 * starts[1:])
-        filled = PolyCollection(fronts if len(rows) else [], facecolors=faces[rows], edgecolors="none")
+        filled = PolyCollection(
+            fronts if len(rows) else [], facecolors=faces[rows], edgecolors="none"
+        )
         ax.add_collection(filled, autolim=False)
     bounds = _bounds(pixels, row, len(boxes), camera)
     return np.asarray((bounds[:, 2:] > bounds[:, :2]).all(axis=1))
@@ -174,19 +212,30 @@ def draw_ids_in_image(boxes: Boxes, camera: PinholeCamera, ax: Axes, colors: Seq
     """Write the ids of tracked boxes of the camera's optical frame above them, if their top is in the image."""
     pixels, depth = camera.project(boxes.corners()[:, (0, 1, 4, 5)].mean(axis=1))
     seen = camera.in_image(pixels, depth, min_depth=NEAREST_DRAWN)
-    _write_ids(pixels[seen], boxes.actor_id[seen], ax, [colors[row] for row in np.flatnonzero(seen).tolist()])
+    _write_ids(
+        pixels[seen],
+        boxes.actor_id[seen],
+        ax,
+        [colors[row] for row in np.flatnonzero(seen).tolist()],
+    )
 
 
-def draw_velocities_in_image(boxes: Boxes, camera: PinholeCamera, ax: Axes, colors: Sequence[str]) -> None:
+def draw_velocities_in_image(
+    boxes: Boxes, camera: PinholeCamera, ax: Axes, colors: Sequence[str]
+) -> None:
     """Render a line to where the centre of each moving box of the camera's optical frame would be in a second."""
     from matplotlib.collections import LineCollection
     from matplotlib.colors import to_rgba_array
 
     moving = _moving(boxes)
     center = boxes.center[moving]
-    pixels, drawn = segments_in_image(np.stack([center, center + boxes.velocity[moving]], axis=1), camera)
+    pixels, drawn = segments_in_image(
+        np.stack([center, center + boxes.velocity[moving]], axis=1), camera
+    )
     chosen = to_rgba_array(list(colors))[moving][drawn]
-    ax.add_collection(LineCollection(list(pixels), colors=chosen, linewidths=2, linestyles=(0, (2, 1))))
+    ax.add_collection(
+        LineCollection(list(pixels), colors=chosen, linewidths=2, linestyles=(0, (2, 1)))
+    )
 
 
 def segments_in_image(segments: FloatArray, camera: PinholeCamera) -> tuple[FloatArray, BoolArray]:
@@ -204,7 +253,12 @@ def segments_in_image(segments: FloatArray, camera: PinholeCamera) -> tuple[Floa
 
 
 def _draw_footprints(
-    centers: FloatArray, corners: FloatArray, ax: Axes, colors: Sequence[str], fill: float, how: Mapping[str, Any]
+    centers: FloatArray,
+    corners: FloatArray,
+    ax: Axes,
+    colors: Sequence[str],
+    fill: float,
+    how: Mapping[str, Any],
 ) -> None:
     """Outlines (N, 4, 2), the front corners first, and lines from the centres (N, 2) to the fronts."""
     from matplotlib.collections import LineCollection, PolyCollection
@@ -213,7 +267,9 @@ def _draw_footprints(
     faces = to_rgba_array(list(colors))
     faces[:, 3] *= fill
     style = {"linewidths": 1.2, "zorder": 3, **how}
-    ax.add_collection(PolyCollection(list(corners), facecolors=faces, edgecolors=list(colors), **style))
+    ax.add_collection(
+        PolyCollection(list(corners), facecolors=faces, edgecolors=list(colors), **style)
+    )
     keep_free(ax, corners)
     headings = np.stack([centers, corners[:, :2].mean(axis=1)], axis=1)
     ax.add_collection(LineCollection(list(headings), colors=list(colors), **style))
@@ -236,7 +292,9 @@ def _draw_small(boxes: Boxes, ax: Axes, colors: Sequence[str], *, filled: bool) 
     ]
     own = [colors[row] for row, _ in small]
     inside, edges = (own, CASING_COLOR) if filled else ("none", own)
-    ax.add_collection(PolyCollection(marks, facecolors=inside, edgecolors=edges, linewidths=0.7, zorder=3.5))
+    ax.add_collection(
+        PolyCollection(marks, facecolors=inside, edgecolors=edges, linewidths=0.7, zorder=3.5)
+    )
 
 
 def _moving(boxes: Boxes) -> BoolArray:
@@ -246,7 +304,9 @@ def _moving(boxes: Boxes) -> BoolArray:
 def _write_ids(places: FloatArray, actor_ids: IntArray, ax: Axes, colors: Sequence[str]) -> None:
     """Write the ids of tracked actors at places (N, 2): first those of hues, which are the accident's actors."""
     shades = set(category_colors().values())
-    order = sorted(np.flatnonzero(actor_ids != UNTRACKED_ID).tolist(), key=lambda row: colors[row] in shades)
+    order = sorted(
+        np.flatnonzero(actor_ids != UNTRACKED_ID).tolist(), key=lambda row: colors[row] in shades
+    )
     words = ["own" if actor_ids[row] == OWN_ACTOR_ID else str(actor_ids[row]) for row in order]
     place_chips(ax, zip(words, places[order], strict=True), colors=[colors[row] for row in order])
 
@@ -292,10 +352,14 @@ def draw_trails(
 
 def _rows(tracks: ScenarioTracks, actor: int | None, first: int, last: int) -> IntArray:
     """The rows of an actor from frame `first` to `last`, both included, in the order of time."""
-    return np.flatnonzero((tracks.actor_id == actor) & (tracks.index >= first) & (tracks.index <= last))
+    return np.flatnonzero(
+        (tracks.actor_id == actor) & (tracks.index >= first) & (tracks.index <= last)
+    )
 
 
-def _draw_trails(paths: Sequence[FloatArray], ax: Axes, colors: Sequence[str], how: dict[str, Any]) -> LineCollection:
+def _draw_trails(
+    paths: Sequence[FloatArray], ax: Axes, colors: Sequence[str], how: dict[str, Any]
+) -> LineCollection:
     """Paths (T, 2) as one collection of short lines, each fainter than the one before it."""
     from matplotlib.collections import LineCollection
     from matplotlib.colors import to_rgb
@@ -326,12 +390,18 @@ def recorder_ids(dataset: Dataset, sample: RowArgument) -> dict[int, AgentName]:
     """The label ids, in this sample, of the recording vehicles → their agents: −100 is the sample's own."""
     record = dataset.get("sample", sample)
     recorders = recorders_of(dataset, record["scenario_token"])
-    return {OWN_ACTOR_ID if agent == record["agent"] else actor: agent for actor, agent in recorders.items()}
+    return {
+        OWN_ACTOR_ID if agent == record["agent"] else actor: agent
+        for actor, agent in recorders.items()
+    }
 
 
 def recorders_of(dataset: Dataset, scenario: str) -> dict[int, AgentName]:
     """The actor ids of a scenario's (a token's) recording vehicles, as far as meta names them → their agents."""
-    actors = {agent: dataset.agent.get(f"{scenario}/{agent}")["actor_id"] for agent in agents_of(dataset, scenario)}
+    actors = {
+        agent: dataset.agent.get(f"{scenario}/{agent}")["actor_id"]
+        for agent in agents_of(dataset, scenario)
+    }
     return {actor: agent for agent, actor in actors.items() if actor is not None}
 
 
@@ -347,7 +417,11 @@ def actor_color(category: str, agent: str | None = None, *, collides: bool = Fal
     """
     if collides:
         return COLLIDER_COLOR
-    return category_colors()[category] if agent is None or current_style().by_class else AGENT_COLORS[agent]
+    return (
+        category_colors()[category]
+        if agent is None or current_style().by_class
+        else AGENT_COLORS[agent]
+    )
 
 
 def role_colors(dataset: Dataset, sample: RowArgument, boxes: Boxes) -> list[str]:
@@ -356,7 +430,9 @@ def role_colors(dataset: Dataset, sample: RowArgument, boxes: Boxes) -> list[str
     colliders, recorders = collider_ids(dataset, record), recorder_ids(dataset, record)
     return [
         actor_color(category, recorders.get(actor), collides=actor in colliders)
-        for actor, category in zip(label_ids(dataset, record, boxes), boxes.category_names, strict=True)
+        for actor, category in zip(
+            label_ids(dataset, record, boxes), boxes.category_names, strict=True
+        )
     ]
 
 
@@ -370,7 +446,9 @@ def actor_tags(dataset: Dataset, contact: Contact) -> dict[int, str]:
     """Short names of the two that collide: the initials of agents, such as `E` and `OB`, else the category."""
     agents = recorders_of(dataset, contact.frame.rsplit("/", 1)[0])
     return {
-        actor: agent_letters(agents[actor]) if actor in agents else dataset.instance.get(instance)["category"]
+        actor: agent_letters(agents[actor])
+        if actor in agents
+        else dataset.instance.get(instance)["category"]
         for actor, instance in zip(contact.actor_ids, contact.instances, strict=True)
     }
 

@@ -37,7 +37,12 @@ from deepaccident_devkit.render.captions import (
 )
 from deepaccident_devkit.render.figures import Layer, axes_or_new, layers_of, widening
 from deepaccident_devkit.render.hidden import hiding
-from deepaccident_devkit.render.styles import AGENT_COLORS, DEPTH_COLORMAP, HEIGHT_COLORMAP, in_own_settings
+from deepaccident_devkit.render.styles import (
+    AGENT_COLORS,
+    DEPTH_COLORMAP,
+    HEIGHT_COLORMAP,
+    in_own_settings,
+)
 from deepaccident_devkit.support.arrays import FloatArray, as_floats
 from deepaccident_devkit.support.text import choice
 from deepaccident_devkit.taxonomy import CAMERAS, LIDAR, OWN_ACTOR_ID
@@ -65,7 +70,11 @@ _HEIGHTS: Final = (-1.0, 6.0)
 
 @in_own_settings
 def render_sample_data(
-    dataset: Dataset, sample_data: RowArgument, *, layers: Iterable[Layer] | None = None, ax: Axes | None = None
+    dataset: Dataset,
+    sample_data: RowArgument,
+    *,
+    layers: Iterable[Layer] | None = None,
+    ax: Axes | None = None,
 ) -> Axes:
     """Render what a sensor recorded: a camera's image, or the LiDAR or the BEV camera from above.
 
@@ -92,7 +101,10 @@ def render_sample_data(
     record = dataset.get("sample_data", sample_data)
     if record["modality"] == "camera":
         chosen = layers_of(layers, CAMERA_DEFAULT, CAMERA_LAYERS)
-        there = {"image": is_there(dataset, record["token"]), "points": has_cloud(dataset, record["sample_token"])}
+        there = {
+            "image": is_there(dataset, record["token"]),
+            "points": has_cloud(dataset, record["sample_token"]),
+        }
         if chosen and not any(there.get(layer, True) for layer in chosen):
             raise MissingFileError(
                 f"{dataset.sensor_path(record)}: no such file, and nothing else to render; unpack the archive "
@@ -114,7 +126,9 @@ def render_sample_data(
     return ax
 
 
-def draw_camera(dataset: Dataset, record: Any, layers: Collection[Layer], ax: Axes) -> frozenset[str]:
+def draw_camera(
+    dataset: Dataset, record: Any, layers: Collection[Layer], ax: Axes
+) -> frozenset[str]:
     """Render a camera's panel of `render_sample_data`; returns the colours of the boxes in its image."""
     sample = record["sample_token"]
     draw_image(dataset, record, ax, image="image" in layers)
@@ -124,7 +138,9 @@ def draw_camera(dataset: Dataset, record: Any, layers: Collection[Layer], ax: Ax
     elif "points" in layers:
         write_missing(ax, missing_clouds_text([sample.rsplit("/", 2)[1]]))
     boxes = dataset.boxes(sample, frame=record["channel"], visible="camera")
-    return draw_camera_boxes(dataset, record, boxes.select(boxes.actor_id != OWN_ACTOR_ID), layers, ax)
+    return draw_camera_boxes(
+        dataset, record, boxes.select(boxes.actor_id != OWN_ACTOR_ID), layers, ax
+    )
 
 
 def draw_image(dataset: Dataset, camera: Any, ax: Axes, *, image: bool = True) -> None:
@@ -138,13 +154,19 @@ def draw_image(dataset: Dataset, camera: Any, ax: Axes, *, image: bool = True) -
     elif image:
         ax.imshow(dataset.load_image(camera), extent=(0, lens.width, lens.height, 0))
     ax.set(
-        xlim=(0, lens.width), ylim=(lens.height, 0), aspect="equal", anchor="N", title=camera_name(camera["channel"])
+        xlim=(0, lens.width),
+        ylim=(lens.height, 0),
+        aspect="equal",
+        anchor="N",
+        title=camera_name(camera["channel"]),
     )
     for scale in (ax.xaxis, ax.yaxis, *ax.spines.values()):
         scale.set_visible(False)
 
 
-def draw_points_in_image(pixels: FloatArray, ax: Axes, *, size: float = 2.0, **colors: Any) -> PathCollection:
+def draw_points_in_image(
+    pixels: FloatArray, ax: Axes, *, size: float = 2.0, **colors: Any
+) -> PathCollection:
     """Render points at pixels (P, 2), (u, v), of a size in points²: of one `color`, or by numbers `c` and a `cmap`."""
     return ax.scatter(pixels[:, 0], pixels[:, 1], s=size, linewidths=0, rasterized=True, **colors)
 
@@ -224,11 +246,15 @@ def render_pointcloud_in_image(
         draw_legend(ax, handles, loc="upper center", bbox_to_anchor=(0.5, 0))
     elif sources:
         _draw_metres(dataset, sources[0], record, seen, color_by, ax)
-    set_scene_title(ax, dataset, record["token"], camera_name(record["channel"]), below=f"LiDAR: {whose}")
+    set_scene_title(
+        ax, dataset, record["token"], camera_name(record["channel"]), below=f"LiDAR: {whose}"
+    )
     return ax
 
 
-def _draw_agent(dataset: Dataset, source: SampleRecord, camera: RowArgument, seen: _Seen, ax: Axes) -> None:
+def _draw_agent(
+    dataset: Dataset, source: SampleRecord, camera: RowArgument, seen: _Seen, ax: Axes
+) -> None:
     cloud = dataset.load_point_cloud(source, "lidar")
     points = seen(project_to_image(dataset, cloud, source, camera, colors=False))
     draw_points_in_image(points.pixels[points.mask], ax, color=AGENT_COLORS[source["agent"]])
@@ -247,7 +273,9 @@ def _draw_metres(
     points = seen(project_to_image(dataset, cloud, source, camera, colors=False))
     values, limits, colormap = points.depth, _DEPTHS, DEPTH_COLORMAP
     if color_by == "height":
-        ego_from_world = dataset.world_from(dataset.get("sample_data", camera)["sample_token"], "ego").inverse()
+        ego_from_world = dataset.world_from(
+            dataset.get("sample_data", camera)["sample_token"], "ego"
+        ).inverse()
         values, limits, colormap = ego_from_world.apply(cloud.xyz)[:, 2], _HEIGHTS, HEIGHT_COLORMAP
     drawn = _draw_numbers(points, values, limits, colormap, ax)
     ax.figure.colorbar(drawn, ax=ax, label=f"{color_by} (m)", fraction=0.03, pad=0.01)
@@ -260,7 +288,9 @@ def _draw_numbers(
     shown = np.flatnonzero(points.mask)
     shown = shown[np.argsort(-points.depth[shown])]
     low, high = limits
-    return draw_points_in_image(points.pixels[shown], ax, c=values[shown], cmap=colormap, vmin=low, vmax=high)
+    return draw_points_in_image(
+        points.pixels[shown], ax, c=values[shown], cmap=colormap, vmin=low, vmax=high
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -288,9 +318,15 @@ def best_view(
     The samples, by token, are those of the boxes' moment. A view whose image was not downloaded only counts if there
     is no other. None if no camera has any part of a box in its image.
     """
-    views = [_view(dataset, f"{sample}/{channel}", boxes) for sample in samples for channel in channels]
+    views = [
+        _view(dataset, f"{sample}/{channel}", boxes) for sample in samples for channel in channels
+    ]
     there = [view for view in views if view is not None]
-    return max(there, key=lambda view: (is_there(dataset, view.camera), view.shown, view.area), default=None)
+    return max(
+        there,
+        key=lambda view: (is_there(dataset, view.camera), view.shown, view.area),
+        default=None,
+    )
 
 
 def _view(dataset: Dataset, camera: str, boxes: Boxes) -> BestView | None:
@@ -302,7 +338,10 @@ def _view(dataset: Dataset, camera: str, boxes: Boxes) -> BestView | None:
     if not seen.any():
         return None
     bounds = bounds_in_image(optical.select(seen), lens)
-    (left, top), (right, bottom) = bounds[:, :2].min(axis=0).tolist(), bounds[:, 2:].max(axis=0).tolist()
+    (left, top), (right, bottom) = (
+        bounds[:, :2].min(axis=0).tolist(),
+        bounds[:, 2:].max(axis=0).tolist(),
+    )
     return BestView(
         camera=camera,
         shown=round(float(shown.sum()), 2),

@@ -59,7 +59,9 @@ _NO_CLOUD: Final = "no LiDAR file of "
 def scene_words(record: Mapping[str, Any]) -> str:
     """Where and when a scenario takes place, as far as meta says it: `Town10HD, wet night`."""
     weather = _CAPITALS.sub(" ", record["weather"] or "").lower()
-    when = (" at " if weather.endswith("rain") else " ").join(filter(None, [weather, record["time_of_day"]]))
+    when = (" at " if weather.endswith("rain") else " ").join(
+        filter(None, [weather, record["time_of_day"]])
+    )
     return ", ".join(filter(None, [record["town"], when.lower()]))
 
 
@@ -83,7 +85,13 @@ def moment_words(dataset: Dataset, token: str) -> str:
 
 
 def set_scene_title(
-    where: Axes | Figure, dataset: Dataset, token: str, words: str = "", *, below: str = "", **style: Any
+    where: Axes | Figure,
+    dataset: Dataset,
+    token: str,
+    words: str = "",
+    *,
+    below: str = "",
+    **style: Any,
 ) -> None:
     """Title axes or a figure `Town10HD, wet night: 1.0 s to the impact, ego`, and a token small beneath.
 
@@ -112,7 +120,12 @@ def set_scene_title(
 
 
 def set_title(
-    where: Axes | Figure, words: str, *, token: str = "", fontsize: float | str | None = None, **style: Any
+    where: Axes | Figure,
+    words: str,
+    *,
+    token: str = "",
+    fontsize: float | str | None = None,
+    **style: Any,
 ) -> None:
     """Give axes or a figure a title that its figure's width does not cut off, and a token beneath if its style has any.
 
@@ -124,7 +137,9 @@ def set_title(
     from matplotlib.font_manager import FontProperties
 
     panel, drawn = isinstance(where, Axes), cast("Any", where)
-    font = FontProperties(size=fontsize or rcParams["axes.titlesize" if panel else "figure.titlesize"])
+    font = FontProperties(
+        size=fontsize or rcParams["axes.titlesize" if panel else "figure.titlesize"]
+    )
     room = 72 * room_of(where)
     text, size = _fitted(words, font, room, text_size())
     small, small_size = _fitted(
@@ -134,8 +149,14 @@ def set_title(
     blank = math.ceil(small_size * (small.count("\n") + 1) / size) if small else 0
     text += "\n " * blank
     if panel:
-        style.setdefault("y", 1.0)  # matplotlib measures all ticks, again and again, to find a title's height
-    title = drawn.set_title(text, fontsize=size, **style) if panel else drawn.suptitle(text, fontsize=size, **style)
+        style.setdefault(
+            "y", 1.0
+        )  # matplotlib measures all ticks, again and again, to find a title's height
+    title = (
+        drawn.set_title(text, fontsize=size, **style)
+        if panel
+        else drawn.suptitle(text, fontsize=size, **style)
+    )
     _write_token(where, small, small_size, title)
 
 
@@ -144,13 +165,21 @@ def _write_token(where: Any, token: str, size: float, title: Any) -> None:
     from matplotlib.text import Annotation
 
     figure = where.figure
-    for older in [each for each in figure.artists if each.get_gid() == _BENEATH and each.xycoords is title]:
+    for older in [
+        each for each in figure.artists if each.get_gid() == _BENEATH and each.xycoords is title
+    ]:
         older.remove()
     if token:
-        how: dict[str, Any] = {"ha": "center", "va": "bottom", "fontsize": size, "color": MUTED_COLOR, "gid": _BENEATH}
-        figure.add_artist(Annotation(token, (0.5, 0), xycoords=title, annotation_clip=False, **how)).set_in_layout(
-            False
-        )
+        how: dict[str, Any] = {
+            "ha": "center",
+            "va": "bottom",
+            "fontsize": size,
+            "color": MUTED_COLOR,
+            "gid": _BENEATH,
+        }
+        figure.add_artist(
+            Annotation(token, (0.5, 0), xycoords=title, annotation_clip=False, **how)
+        ).set_in_layout(False)
 
 
 def room_of(where: Axes | Figure, panel_share: float = _PANEL_SHARE) -> float:
@@ -206,7 +235,11 @@ def _width_in(file: str, text: str, size: float) -> float:
     from matplotlib.textpath import text_to_path
 
     font = FontProperties(fname=file, size=size)
-    return float(text_to_path.get_text_width_height_descent(text, font, ismath=False)[0]) if text else 0.0
+    return (
+        float(text_to_path.get_text_width_height_descent(text, font, ismath=False)[0])
+        if text
+        else 0.0
+    )
 
 
 def box_handles(colors: Collection[str]) -> list[Artist]:
@@ -227,13 +260,18 @@ def box_handles(colors: Collection[str]) -> list[Artist]:
 
 def agent_handles(agents: Collection[str]) -> list[Artist]:
     """A dot for each agent, in the order of all pictures."""
-    return [_mark(short_name(agent), "o", AGENT_COLORS[agent]) for agent in in_drawing_order(agents)]
+    return [
+        _mark(short_name(agent), "o", AGENT_COLORS[agent]) for agent in in_drawing_order(agents)
+    ]
 
 
 def handles_from_above(colors: Collection[str], clouds: Collection[str]) -> list[Artist]:
     """What the colours of boxes and of agents' clouds mean, each once; in a small picture names stand at the clouds."""
     known = {AGENT_COLORS[agent] for agent in clouds}
-    return [*box_handles(set(colors) - known), *agent_handles(() if current_style().few else clouds)]
+    return [
+        *box_handles(set(colors) - known),
+        *agent_handles(() if current_style().few else clouds),
+    ]
 
 
 def _mark(label: str, marker: str, color: str) -> Artist:
@@ -242,15 +280,26 @@ def _mark(label: str, marker: str, color: str) -> Artist:
     return Line2D([], [], linestyle="none", marker=marker, color=color, label=label)
 
 
-def draw_legend(where: Any, handles: Sequence[Artist], *, columns: int | None = None, **how: Any) -> None:
+def draw_legend(
+    where: Any, handles: Sequence[Artist], *, columns: int | None = None, **how: Any
+) -> None:
     """Render a legend, by default below all panels of a figure, with as many columns as have room; none if empty."""
     from matplotlib.font_manager import FontProperties
 
     if handles:
         font = FontProperties(size=text_size())
-        widths = [text_width(str(handle.get_label()), font) / 72 + _HANDLE * text_size() for handle in handles]
+        widths = [
+            text_width(str(handle.get_label()), font) / 72 + _HANDLE * text_size()
+            for handle in handles
+        ]
         columns = _columns_with_room(widths, columns or len(handles), room_of(where, _LEGEND_SHARE))
-        style = {"loc": "outside lower center", "fontsize": text_size(), "frameon": False, **_SPACING, **how}
+        style = {
+            "loc": "outside lower center",
+            "fontsize": text_size(),
+            "frameon": False,
+            **_SPACING,
+            **how,
+        }
         where.legend(handles=list(handles), ncols=columns, **style)
 
 
@@ -262,9 +311,15 @@ def _columns_with_room(widths: Sequence[float], most: int, room: float) -> int:
     return 1
 
 
-def draw_legend_outside(ax: Axes, handles: Sequence[Artist], *, columns: int | None = None, **how: Any) -> None:
+def draw_legend_outside(
+    ax: Axes, handles: Sequence[Artist], *, columns: int | None = None, **how: Any
+) -> None:
     """Render a legend below axes, or on a slide, which is wide, to their right."""
-    place: dict[str, Any] = {"loc": "upper center", "bbox_to_anchor": (0.5, 0), "borderaxespad": 4.5}
+    place: dict[str, Any] = {
+        "loc": "upper center",
+        "bbox_to_anchor": (0.5, 0),
+        "borderaxespad": 4.5,
+    }
     if current_style().room == "slide":
         columns, place = 1, {"loc": "upper left", "bbox_to_anchor": (1, 1), "borderaxespad": 0.5}
     draw_legend(ax, handles, columns=columns, **{**place, **how})
@@ -274,7 +329,9 @@ def draw_legend_of_fills(ax: Axes, colors: Mapping[str, str]) -> None:
     """Put a legend of filled shapes into the axes."""
     from matplotlib.patches import Patch
 
-    handles = [Patch(label=name, facecolor=(color, 0.4), edgecolor=color) for name, color in colors.items()]
+    handles = [
+        Patch(label=name, facecolor=(color, 0.4), edgecolor=color) for name, color in colors.items()
+    ]
     draw_legend(ax, handles, columns=1, **INSIDE)
 
 
@@ -293,15 +350,25 @@ def draw_missing_image(dataset: Dataset, sample_data: str, ax: Axes) -> None:
     agent, _, channel = sample_data.rsplit("/", 3)[1:]
     ax.set_facecolor(MISSING_COLOR)
     words = absence_text(dataset, sample_data)
-    how: dict[str, Any] = {"ha": "center", "va": "top", "clip_on": True, "in_layout": False, "gid": _MISSING}
+    how: dict[str, Any] = {
+        "ha": "center",
+        "va": "top",
+        "clip_on": True,
+        "in_layout": False,
+        "gid": _MISSING,
+    }
     told = f"_{agent} {channel}: {words}"
-    ax.text(0.5, 0.97, words, label=told, fontsize=text_size(), transform=ax.transAxes, zorder=0, **how)
+    ax.text(
+        0.5, 0.97, words, label=told, fontsize=text_size(), transform=ax.transAxes, zorder=0, **how
+    )
 
 
 def absence_text(dataset: Dataset, sample_data: str) -> str:
     """Why a sensor's file, by its token, is not there: the folder has files of other frames, or none at all."""
     folder = dataset.sensor_path(sample_data).parent
-    return "no file of this frame" if folder.is_dir() and folder_entries(folder) else "not downloaded"
+    return (
+        "no file of this frame" if folder.is_dir() and folder_entries(folder) else "not downloaded"
+    )
 
 
 def write_missing(ax: Axes, words: str) -> None:
@@ -326,7 +393,12 @@ def _parts(texts: Iterable[Any]) -> list[str]:
 
     Their labels say it, after a `_`, with which no legend has them.
     """
-    parts = list(dict.fromkeys(part for text in texts for part in text.get_label()[1:].split("; ") if part))
+    parts = list(
+        dict.fromkeys(part for text in texts for part in text.get_label()[1:].split("; ") if part)
+    )
     clouds = [part.removeprefix(_NO_CLOUD) for part in parts if part.startswith(_NO_CLOUD)]
     others = [part for part in parts if not part.startswith(_NO_CLOUD)]
-    return [*others, *filter(None, [missing_clouds_text({*filter(None, ", ".join(clouds).split(", "))})])]
+    return [
+        *others,
+        *filter(None, [missing_clouds_text({*filter(None, ", ".join(clouds).split(", "))})]),
+    ]

@@ -10,7 +10,13 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from deepaccident_devkit.render.styles import CASING_COLOR, GRID_COLOR, MUTED_COLOR, OWN_COLOR, text_size
+from deepaccident_devkit.render.styles import (
+    CASING_COLOR,
+    GRID_COLOR,
+    MUTED_COLOR,
+    OWN_COLOR,
+    text_size,
+)
 from deepaccident_devkit.support.arrays import FloatArray
 
 if TYPE_CHECKING:
@@ -71,7 +77,9 @@ def place_chips(
         )
 
 
-def keep_free(ax: Axes, shapes: ArrayLike, *, margin: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)) -> None:
+def keep_free(
+    ax: Axes, shapes: ArrayLike, *, margin: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+) -> None:
     """Let no chip cover shapes (N, corners, 2) in data coordinates, and a margin around them.
 
     The margin is points added to a shape's left, low, right and high side: to the left and down they are negative.
@@ -106,7 +114,9 @@ class _Placer:
                 continue
             bounds = chip.get_window_extent(renderer)
             half = np.array([bounds.width, bounds.height]) / 2 + (_PAD + 0.5) * point
-            middle = anchor + (_RINGS[:, None, None] * point * _WAYS + np.sign(_WAYS.round(6)) * half).reshape(-1, 2)
+            middle = anchor + (
+                _RINGS[:, None, None] * point * _WAYS + np.sign(_WAYS.round(6)) * half
+            ).reshape(-1, 2)
             found = np.column_stack([middle - half, middle + half])
             inside = (found[:, :2] >= area[:2]).all(axis=1) & (found[:, 2:] <= area[2:]).all(axis=1)
             free = np.flatnonzero(inside & ~_overlap(found, taken))
@@ -124,14 +134,21 @@ class _Placer:
         """(N, 4) the pixels of the shapes, at so many pixels a point."""
         if not self.shapes:
             return np.zeros((0, 4))
-        ends = self.ax.transData.transform(np.concatenate(self.shapes).reshape(-1, 2)).reshape(-1, 2, 2)
-        return np.column_stack([ends.min(axis=1), ends.max(axis=1)]) + np.concatenate(self.margins) * point
+        ends = self.ax.transData.transform(np.concatenate(self.shapes).reshape(-1, 2)).reshape(
+            -1, 2, 2
+        )
+        return (
+            np.column_stack([ends.min(axis=1), ends.max(axis=1)])
+            + np.concatenate(self.margins) * point
+        )
 
     def _draw_leaders(self, leaders: list[list[FloatArray]], renderer: Any) -> None:
         from matplotlib.collections import LineCollection
         from matplotlib.transforms import IdentityTransform
 
-        lines = LineCollection(leaders, colors=MUTED_COLOR, linewidths=0.6, transform=IdentityTransform())
+        lines = LineCollection(
+            leaders, colors=MUTED_COLOR, linewidths=0.6, transform=IdentityTransform()
+        )
         lines.set_figure(self.ax.figure)
         lines.draw(renderer)
 

@@ -22,12 +22,25 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Layer = Literal[
-    "image", "map", "bev", "points", "boxes", "ids", "velocities", "trajectories", "labels", "visibility", "grid"
+    "image",
+    "map",
+    "bev",
+    "points",
+    "boxes",
+    "ids",
+    "velocities",
+    "trajectories",
+    "labels",
+    "visibility",
+    "grid",
 ]
 """`image` is the camera's picture, `map` the town's ground by all its recordings, `bev` the simulator's camera from
 above, `labels` what the motion labels say."""
 LAYERS: tuple[Layer, ...] = get_args(Layer)
-_UNDATED: Final[Mapping[str, dict[str, Any]]] = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}
+_UNDATED: Final[Mapping[str, dict[str, Any]]] = {
+    "pdf": {"CreationDate": None},
+    "svg": {"Date": None},
+}
 # Width by height of a view from above on a slide.
 _WIDE: Final = 1.6
 # How often a figure is laid out at most; of its width or height, how far a panel that does not move may move.
@@ -40,7 +53,10 @@ def layers_of(
 ) -> frozenset[Layer]:
     """The layers to render of the possible ones: None is the default, an empty list none. Raises ChoiceError."""
     words = default if given is None else given
-    return frozenset(choice("layers", layer, possible) for layer in ((words,) if isinstance(words, str) else words))
+    return frozenset(
+        choice("layers", layer, possible)
+        for layer in ((words,) if isinstance(words, str) else words)
+    )
 
 
 def axes_or_new(ax: Axes | None, size: tuple[float, float] = (8, 8)) -> Axes:
@@ -51,11 +67,17 @@ def axes_or_new(ax: Axes | None, size: tuple[float, float] = (8, 8)) -> Axes:
 
     from deepaccident_devkit.render.own_figure import OwnFigure
 
-    return plt.subplots(figsize=size_in_style(size, panels="one"), layout="constrained", FigureClass=OwnFigure)[1]
+    return plt.subplots(
+        figsize=size_in_style(size, panels="one"), layout="constrained", FigureClass=OwnFigure
+    )[1]
 
 
 def figure_or_new(
-    fig: Figure | None, size: tuple[float, float], *, panels: Literal["one", "several"] = "several", **heights: float
+    fig: Figure | None,
+    size: tuple[float, float],
+    *,
+    panels: Literal["one", "several"] = "several",
+    **heights: float,
 ) -> Figure:
     """The figure given, or a new pyplot one, which notebooks display, of a size in inches or its style's.
 
@@ -115,7 +137,9 @@ def settled(fig: Figure) -> Figure:
     matplotlib measures the room for titles and legends before it makes the panels' scales equal, so the room is too
     small. When it lays the figure out again at rendering, it starts from panels that are nearly right.
     """
-    engine = fig.get_layout_engine() if fig.figure is fig else None  # a part of a figure is laid out with it
+    engine = (
+        fig.get_layout_engine() if fig.figure is fig else None
+    )  # a part of a figure is laid out with it
     if engine is not None:
         with getattr(fig, "settings", nullcontext)():
             engine.execute(fig)
@@ -128,8 +152,13 @@ def laid_out(fig: Figure, dpi: float) -> Iterator[None]:
     engine, usual, places = fig.get_layout_engine(), fig.dpi, np.zeros(0)
     fig.set_dpi(dpi)  # letters are measured in pixels
     for number in range(_PASSES):
-        before, places = places, np.array([ax.get_position(original=False).bounds for ax in settled(fig).axes])
-        if number > 1 and np.abs(places - before).max(initial=0) < _STILL:  # the first two may be equal by chance
+        before, places = (
+            places,
+            np.array([ax.get_position(original=False).bounds for ax in settled(fig).axes]),
+        )
+        if (
+            number > 1 and np.abs(places - before).max(initial=0) < _STILL
+        ):  # the first two may be equal by chance
             break
     fig.set_layout_engine(None)
     try:
@@ -143,7 +172,9 @@ def check_picture_path(path: str | os.PathLike[str]) -> Path:
     """The path, if it has the suffix of a picture; raises ChoiceError."""
     path = path_of(path)
     if path.suffix.lower() not in PICTURE_SUFFIXES:
-        raise ChoiceError(f"path: expected a file that ends in {', '.join(PICTURE_SUFFIXES)}, found {str(path)!r}")
+        raise ChoiceError(
+            f"path: expected a file that ends in {', '.join(PICTURE_SUFFIXES)}, found {str(path)!r}"
+        )
     return path
 
 
@@ -155,7 +186,9 @@ def figure_of_pixels(width: int, height: int, *, dpi: float) -> Figure:
     return figure
 
 
-def save_picture(drawn: Axes | Figure, path: str | os.PathLike[str], *, dpi: float | None = None) -> Path:
+def save_picture(
+    drawn: Axes | Figure, path: str | os.PathLike[str], *, dpi: float | None = None
+) -> Path:
     """Write a `render_…` result's figure atomically into a file of one of `PICTURE_SUFFIXES`, and close it in pyplot.
 
     `dpi` is pixels an inch; None for those of the style, in a notebook's 100. Raises ChoiceError for another suffix.
@@ -170,7 +203,9 @@ def save_picture(drawn: Axes | Figure, path: str | os.PathLike[str], *, dpi: flo
         plt.close(figure)
 
 
-def write_figure(figure: Figure, path: Path, *, dpi: float, words: dict[str, Any] | None = None) -> Path:
+def write_figure(
+    figure: Figure, path: Path, *, dpi: float, words: dict[str, Any] | None = None
+) -> Path:
     """Write a figure as the path's suffix says, atomically and without a date: the same picture makes the same bytes.
 
     `words` are the text entries of a PNG file. The figure is one from `detached_figure`; others stay open in pyplot.
@@ -188,7 +223,9 @@ def report_figure(
     return detached_figure(size_in_style(size, panels=panels, heights=heights))
 
 
-def write_report_figure(figure: Figure, path: Path, *, dpi: float = 150, words: dict[str, Any] | None = None) -> Path:
+def write_report_figure(
+    figure: Figure, path: Path, *, dpi: float = 150, words: dict[str, Any] | None = None
+) -> Path:
     """Write a figure of a report into a PNG file, and for a paper or a slide also into a PDF file beside it."""
     style = current_style()
     if style.few:

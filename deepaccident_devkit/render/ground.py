@@ -30,13 +30,23 @@ def draw_underlay(image: BevImage, ax: Axes, *, target_from_ego: SE3, view_range
         view_range: metres around the agent; of a turned picture a larger square is taken, so that it fills the corners.
     """
     yaw, size = _yaw(target_from_ego), len(image.semantic)
-    half = min(size // 2, int(np.ceil(view_range * (abs(np.cos(yaw)) + abs(np.sin(yaw))) / image.resolution)))
+    half = min(
+        size // 2,
+        int(np.ceil(view_range * (abs(np.cos(yaw)) + abs(np.sin(yaw))) / image.resolution)),
+    )
     shown = slice(size // 2 - half, size // 2 + half)
     tags = image.semantic[::-1, ::-1].T[shown, shown]
     step = max(1, len(tags) // _MOST_PIXELS)
     reach = half * image.resolution
     extent = (-reach, reach, -reach, reach)
-    draw_ground(tags[step // 2 :: step, step // 2 :: step], TAGS, ax, extent=extent, placed=target_from_ego, zorder=0)
+    draw_ground(
+        tags[step // 2 :: step, step // 2 :: step],
+        TAGS,
+        ax,
+        extent=extent,
+        placed=target_from_ego,
+        zorder=0,
+    )
 
 
 def draw_ground(

@@ -86,7 +86,9 @@ class SharedBoxes:
     @property
     def shifts(self) -> tuple[FloatArray, FloatArray]:
         """(M, 2) true and (M, 2) received centres, x and y, of the actors that are in both."""
-        _, first, second = np.intersect1d(self.true.actor_id, self.received.actor_id, return_indices=True)
+        _, first, second = np.intersect1d(
+            self.true.actor_id, self.received.actor_id, return_indices=True
+        )
         return self.true.center[first, :2], self.received.center[second, :2]
 
 
@@ -132,20 +134,34 @@ def render_link(
         check_view_range(view_range)
     shared = shared_boxes(dataset, record, link, agents)
     reach = view_range or _reach(dataset, record, shared)
-    clouds = {"without the link": None, "with the link": link} if "points" in shown and room != "column" else {}
+    clouds = (
+        {"without the link": None, "with the link": link}
+        if "points" in shown and room != "column"
+        else {}
+    )
     if current_style().few:
         clouds.pop("without the link", None)
     wide = 1.0 if clouds else widening(None) ** 1.5  # the legend is below
     size = 5.0 * (1 + len(clouds)) + 0.4, 6.4
-    fig = figure_or_new(fig, size, panels="several" if clouds else "one", page=0.6 if clouds else 1.28, column=1.28)
+    fig = figure_or_new(
+        fig, size, panels="several" if clouds else "one", page=0.6 if clouds else 1.28, column=1.28
+    )
     first, *others = fig.subplots(1, 1 + len(clouds), squeeze=False)[0]
     first.set(xlim=(-wide * reach, wide * reach), ylim=(-reach, reach), aspect="equal")
     x_words, y_words = axis_words("ego")
     first.set(xlabel=x_words, ylabel=y_words, title=_error_words(shared))
     _draw_shared(shared, shown, first)
-    write_beside(first, f"{short_name(record['agent'])} receives", (0.0, 0.0), AGENT_COLORS[record["agent"]])
+    write_beside(
+        first, f"{short_name(record['agent'])} receives", (0.0, 0.0), AGENT_COLORS[record["agent"]]
+    )
     for ax, (words, there) in zip(others, clouds.items(), strict=True):
-        draw_bev(dataset, record, BevView(view_range=reach, agents=agents, link=there), shown - {"boxes", "ids"}, ax)
+        draw_bev(
+            dataset,
+            record,
+            BevView(view_range=reach, agents=agents, link=there),
+            shown - {"boxes", "ids"},
+            ax,
+        )
         ax.set(title=f"clouds {words}", anchor="C")
         if "boxes" in shown:
             truth = cooperative_boxes(dataset, record, agents=agents, frame="ego")
@@ -157,19 +173,33 @@ def render_link(
 
 def _reach(dataset: Dataset, record: SampleRecord, shared: Sequence[SharedBoxes]) -> float:
     """Metres to each side of the ego up to the agents and the colliding pair, within bounds."""
-    places = [transform(dataset, record, at_once(record, each.agent), "ego", "ego").translation[:2] for each in shared]
-    pair = [each.true.select(np.isin(each.true.actor_id, [*collider_ids(dataset, record)])) for each in shared]
+    places = [
+        transform(dataset, record, at_once(record, each.agent), "ego", "ego").translation[:2]
+        for each in shared
+    ]
+    pair = [
+        each.true.select(np.isin(each.true.actor_id, [*collider_ids(dataset, record)]))
+        for each in shared
+    ]
     far = np.concatenate([np.array(places), *(boxes.center[:, :2] for boxes in pair)])
     return float(np.clip(np.abs(far).max() + _AROUND, *_REACHES))
 
 
-def shared_boxes(dataset: Dataset, sample: RowArgument, link: Link, agents: Agents = None) -> list[SharedBoxes]:
+def shared_boxes(
+    dataset: Dataset, sample: RowArgument, link: Link, agents: Agents = None
+) -> list[SharedBoxes]:
     """Each partner's tracked boxes as they arrive; arguments and errors as in `render_link`."""
     record = dataset.get("sample", sample)
-    partners = [agent for agent in cooperating_agents(dataset, sample, agents) if agent != record["agent"]]
+    partners = [
+        agent for agent in cooperating_agents(dataset, sample, agents) if agent != record["agent"]
+    ]
     if not partners:
-        raise ChoiceError(f"agents: expected a partner of {record['agent']}, found none; a link needs two agents")
-    arriving = {message.agent for message in messages(dataset, sample, agents, link)}  # together they may not fit
+        raise ChoiceError(
+            f"agents: expected a partner of {record['agent']}, found none; a link needs two agents"
+        )
+    arriving = {
+        message.agent for message in messages(dataset, sample, agents, link)
+    }  # together they may not fit
     return [
         SharedBoxes(
             agent=agent,
@@ -207,7 +237,13 @@ def _draw_shared(shared: Sequence[SharedBoxes], shown: frozenset[Layer], ax: Axe
             draw_boxes_from_above(each.received, ax, colors, fill=0.25, linewidths=1)
         start, end = each.shifts
         if len(start):
-            how: dict[str, Any] = {"angles": "xy", "scale_units": "xy", "scale": 1, "width": 0.004, "zorder": 4}
+            how: dict[str, Any] = {
+                "angles": "xy",
+                "scale_units": "xy",
+                "scale": 1,
+                "width": 0.004,
+                "zorder": 4,
+            }
             ax.quiver(*start.T, *(end - start).T, color=OWN_COLOR, **how)
     if "ids" in shown:
         draw_ids_from_above(true, ax, hues)
@@ -230,7 +266,15 @@ def _handles() -> list[Artist]:
 
     return [
         Patch(facecolor="none", edgecolor=TRUE_PLACE_COLOR, linestyle="--", label="true places"),
-        Line2D([], [], linestyle="none", marker="$\\rightarrow$", color=OWN_COLOR, markersize=12, label="the error"),
+        Line2D(
+            [],
+            [],
+            linestyle="none",
+            marker="$\\rightarrow$",
+            color=OWN_COLOR,
+            markersize=12,
+            label="the error",
+        ),
     ]
 
 

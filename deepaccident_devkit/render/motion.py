@@ -10,7 +10,12 @@ import numpy as np
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.evaluation.predictions import MotionOutput
-from deepaccident_devkit.motion import MotionLabelConfig, MotionLabels, PostProcessing, motion_labels
+from deepaccident_devkit.motion import (
+    MotionLabelConfig,
+    MotionLabels,
+    PostProcessing,
+    motion_labels,
+)
 from deepaccident_devkit.render.boxes import collider_ids, recorder_ids
 from deepaccident_devkit.render.captions import draw_legend, set_scene_title
 from deepaccident_devkit.render.figures import Layer, axes_or_new, figure_or_new, layers_of, settled
@@ -40,7 +45,10 @@ _SHOWN: Final[dict[MotionStyle, tuple[Layer, ...]]] = {
     "maps": ("labels", "velocities"),
     "trail": ("labels", "trajectories"),
 }
-_POSSIBLE: Final[dict[MotionStyle, tuple[Layer, ...]]] = {"maps": _MAP_LAYERS, "trail": TRAIL_LAYERS}
+_POSSIBLE: Final[dict[MotionStyle, tuple[Layer, ...]]] = {
+    "maps": _MAP_LAYERS,
+    "trail": TRAIL_LAYERS,
+}
 _FEW_MAPS: Final = ("instance", "flow")
 # How many frames maps show in a small picture.
 _FEW_FRAMES: Final = {"column": 1, "page": 3, "slide": 3}
@@ -87,7 +95,9 @@ def render_motion_labels(
     if at_present:
         labels = labels.to_present()
     pair, agents = collider_ids(dataset, sample), recorder_ids(dataset, sample)
-    fig = draw_motion_labels(labels, marked=pair, agents=agents, style=style, layers=layers, fig=fig)
+    fig = draw_motion_labels(
+        labels, marked=pair, agents=agents, style=style, layers=layers, fig=fig
+    )
     set_scene_title(fig, dataset, dataset.get("sample", sample)["token"], "motion labels")
     return settled(fig) if style == "trail" else fig
 
@@ -151,7 +161,9 @@ def draw_motion_output(
     Raises:
         ChoiceError: no such prediction, post-processing, style or layer.
     """
-    maps = maps_of_output(output, number=number, step=step, marked=marked, post_processing=post_processing)
+    maps = maps_of_output(
+        output, number=number, step=step, marked=marked, post_processing=post_processing
+    )
     return _draw(maps, style, layers, fig)
 
 
@@ -219,16 +231,24 @@ def draw_motion_trail(
 
 
 def _maps(given: MotionLabels | MotionOutput, marked: Collection[int]) -> MotionMaps:
-    return maps_of_output(given, marked=marked) if isinstance(given, MotionOutput) else maps_of_labels(given, marked)
+    return (
+        maps_of_output(given, marked=marked)
+        if isinstance(given, MotionOutput)
+        else maps_of_labels(given, marked)
+    )
 
 
 def _at_present(maps: MotionMaps) -> MotionMaps:
     if not maps.at_present:
-        raise ChoiceError("trail: each frame is in its own ego frame; warp the labels with to_present() first")
+        raise ChoiceError(
+            "trail: each frame is in its own ego frame; warp the labels with to_present() first"
+        )
     return maps
 
 
-def _draw(maps: MotionMaps, style: MotionStyle, layers: Iterable[Layer] | None, fig: Figure | None) -> Figure:
+def _draw(
+    maps: MotionMaps, style: MotionStyle, layers: Iterable[Layer] | None, fig: Figure | None
+) -> Figure:
     style = choice("style", style, get_args(MotionStyle))
     shown = layers_of(layers, _SHOWN[style], _POSSIBLE[style])
     if style == "maps":
@@ -250,9 +270,14 @@ def _draw_maps(maps: MotionMaps, shown: frozenset[Layer], fig: Figure | None) ->
         frames = np.unique(there[np.linspace(0, len(there) - 1, most).round().astype(int)]).tolist()
     columns, rows = len(frames), len(names)
     fig = figure_or_new(
-        fig, (2.8 * (columns + _KEY_WIDTH) + 0.6, 2.8 * rows + 1.3), page=0.3 * rows + 0.06, column=0.57 * rows + 0.1
+        fig,
+        (2.8 * (columns + _KEY_WIDTH) + 0.6, 2.8 * rows + 1.3),
+        page=0.3 * rows + 0.06,
+        column=0.57 * rows + 0.1,
     )
-    axes = fig.subplots(rows, columns + 1, squeeze=False, width_ratios=(*[1.0] * columns, _KEY_WIDTH))
+    axes = fig.subplots(
+        rows, columns + 1, squeeze=False, width_ratios=(*[1.0] * columns, _KEY_WIDTH)
+    )
     panels = axes[:, :columns]
     for row, name in enumerate(names):
         for ax, frame in zip(panels[row], frames, strict=True):

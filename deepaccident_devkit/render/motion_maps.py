@@ -13,7 +13,13 @@ from deepaccident_devkit.evaluation.instances import instance_paths
 from deepaccident_devkit.evaluation.predictions import MotionOutput
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.geometry.bev_grid import to_orientation
-from deepaccident_devkit.motion import OWN_BOX_ID, MotionHeads, MotionLabels, PostProcessing, predict_instances
+from deepaccident_devkit.motion import (
+    OWN_BOX_ID,
+    MotionHeads,
+    MotionLabels,
+    PostProcessing,
+    predict_instances,
+)
 from deepaccident_devkit.render.chips import place_chips
 from deepaccident_devkit.render.figures import Layer, with_light_grid
 from deepaccident_devkit.render.styles import (
@@ -79,7 +85,9 @@ class MotionMaps(FrozenArrays):
         """`offset` or `flow`, (T, 2, H, W); raises ChoiceError if it is not there."""
         maps = getattr(self, name)
         if maps is None:
-            raise ChoiceError(f"map: this prediction has only {', '.join(self.names)}, not {name}; give heads for it")
+            raise ChoiceError(
+                f"map: this prediction has only {', '.join(self.names)}, not {name}; give heads for it"
+            )
         return np.asarray(maps)
 
     def longest(self, name: DrawnMap) -> float:
@@ -102,7 +110,9 @@ def maps_of_labels(
     valid = labels.label_valid
 
     def lying(name: str, *, vectors: bool = False) -> AnyArray:
-        return to_orientation(getattr(labels, name), vectors=vectors, source=source, target="devkit", ignore=ignore)
+        return to_orientation(
+            getattr(labels, name), vectors=vectors, source=source, target="devkit", ignore=ignore
+        )
 
     instance = np.where(valid[:, None, None], lying("instance"), 0)
     known = instance[:, None] > 0
@@ -134,8 +144,13 @@ def maps_of_output(
 ) -> MotionMaps:
     """One prediction of an output, by default the last, with `step` seconds from frame to frame. Raises ChoiceError."""
     if number not in range(-len(output), len(output)):
-        raise ChoiceError(f"prediction: expected a number from 0 to {len(output) - 1}, or from the end, found {number}")
-    grid, heads = output.grid.with_orientation("devkit"), None if output.heads is None else output.heads[number]
+        raise ChoiceError(
+            f"prediction: expected a number from 0 to {len(output) - 1}, or from the end, found {number}"
+        )
+    grid, heads = (
+        output.grid.with_orientation("devkit"),
+        None if output.heads is None else output.heads[number],
+    )
     instance = _found(output, heads, number, post_processing)
     instance = np.maximum(output.grid.reorient(instance, "devkit"), 0)
     more = {} if heads is None else _head_maps(heads, instance)
@@ -153,7 +168,10 @@ def maps_of_output(
 
 
 def _found(
-    output: MotionOutput, heads: MotionHeads | None, number: int, post_processing: PostProcessing | str
+    output: MotionOutput,
+    heads: MotionHeads | None,
+    number: int,
+    post_processing: PostProcessing | str,
 ) -> AnyArray:
     """(T, H, W) the instances of one prediction, in its own orientation."""
     if output.instances is not None:
@@ -181,9 +199,14 @@ def _label_colors(
     from matplotlib.colors import to_rgb
 
     highest = max([int(instance.max(initial=0)), *labels.id_map.values()])
-    named = {OWN_ACTOR_ID if actor == OWN_BOX_ID else actor: identity for actor, identity in labels.id_map.items()}
+    named = {
+        OWN_ACTOR_ID if actor == OWN_BOX_ID else actor: identity
+        for actor, identity in labels.id_map.items()
+    }
     colors = _palette(highest, [identity for actor, identity in named.items() if actor in marked])
-    hues = {OWN_ACTOR_ID: OWN_COLOR} | {actor: AGENT_COLORS[agent] for actor, agent in agents.items()}
+    hues = {OWN_ACTOR_ID: OWN_COLOR} | {
+        actor: AGENT_COLORS[agent] for actor, agent in agents.items()
+    }
     for actor in hues.keys() & named.keys() - {*marked}:
         colors[named[actor]] = to_rgb(hues[actor])
     return colors
@@ -202,7 +225,9 @@ def _palette(highest: int, marked: Collection[int]) -> FloatArray:
     return colors
 
 
-def draw_map_of(maps: MotionMaps, name: DrawnMap, frame: int, shown: frozenset[Layer], ax: Axes) -> Axes:
+def draw_map_of(
+    maps: MotionMaps, name: DrawnMap, frame: int, shown: frozenset[Layer], ax: Axes
+) -> Axes:
     """Render one map of one frame as `draw_motion_map` says; `shown` are its layers."""
     ax.set(xlim=maps.grid.x[:2], ylim=maps.grid.y[:2], aspect="equal")
     if not maps.valid[frame]:
@@ -213,14 +238,24 @@ def draw_map_of(maps: MotionMaps, name: DrawnMap, frame: int, shown: frozenset[L
         _draw_picture(maps, name, frame, ax)
     if name == "flow" and "velocities" in shown:
         _draw_arrows(maps, frame, ax)
-    if name == "flow" and maps.instance[frame].any() and np.isnan(maps.vectors("flow")[frame]).all():
+    if (
+        name == "flow"
+        and maps.instance[frame].any()
+        and np.isnan(maps.vectors("flow")[frame]).all()
+    ):
         ax.text(0.5, 0.5, "no next frame", ha="center", va="center", transform=ax.transAxes)
     return _with_ids_and_grid(maps, frame, shown, ax)
 
 
 def draw_trail_of(maps: MotionMaps, shown: frozenset[Layer], ax: Axes) -> Axes:
     """Render all frames as `draw_motion_trail` says; `shown` are its layers."""
-    ax.set(xlim=maps.grid.x[:2], ylim=maps.grid.y[:2], aspect="equal", xlabel="x forward (m)", ylabel="y left (m)")
+    ax.set(
+        xlim=maps.grid.x[:2],
+        ylim=maps.grid.y[:2],
+        aspect="equal",
+        xlabel="x forward (m)",
+        ylabel="y left (m)",
+    )
     if "labels" in shown:
         _draw_cells(ax, trail_picture(maps), maps)
         draw_edge(maps, maps.own, ax, OWN_COLOR)
@@ -246,18 +281,23 @@ def draw_key(maps: MotionMaps, name: DrawnMap, ax: Axes) -> None:
     ax.axis("off")
     if name == "instance":
         if handles := instance_handles(maps):
-            ax.legend(handles=handles, loc="center left", frameon=False, borderpad=0, handlelength=1)
+            ax.legend(
+                handles=handles, loc="center left", frameon=False, borderpad=0, handlelength=1
+            )
     elif name == "centerness":
         from matplotlib.cm import ScalarMappable
         from matplotlib.colors import Normalize
 
         ax.figure.colorbar(
-            ScalarMappable(Normalize(0, 1), CENTERNESS_COLORMAP), cax=ax.inset_axes((0.1, 0.15, 0.15, 0.7))
+            ScalarMappable(Normalize(0, 1), CENTERNESS_COLORMAP),
+            cax=ax.inset_axes((0.1, 0.15, 0.15, 0.7)),
         )
     else:
         side = np.linspace(-1, 1, 101)
         along, left = np.meshgrid(side, side)
-        wheel = np.where((np.hypot(left, along) <= 1)[..., None], direction_colors(left, along, longest=1.0), 1.0)
+        wheel = np.where(
+            (np.hypot(left, along) <= 1)[..., None], direction_colors(left, along, longest=1.0), 1.0
+        )
         ax.imshow(wheel, origin="lower", extent=(-1, 1, -1, 1))
         ax.text(0, -1.2, f"rim: {maps.longest(name):.0f} cells", ha="center", va="top")
         ax.text(0, 1.1, "left", ha="center", va="bottom")
@@ -306,10 +346,21 @@ def _draw_arrows(maps: MotionMaps, frame: int, ax: Axes) -> None:
     _, member, count = np.unique(instance[known], return_inverse=True, return_counts=True)
     left, along = flow[:, known]
     start_x, start_y, step_y, step_x = (
-        np.bincount(member.ravel(), weights=values) / count for values in (x[column], y[row], left, along)
+        np.bincount(member.ravel(), weights=values) / count
+        for values in (x[column], y[row], left, along)
     )
     steps = step_x * maps.grid.x[2], step_y * maps.grid.y[2]
-    ax.quiver(start_x, start_y, *steps, angles="xy", scale_units="xy", scale=1, width=0.007, headlength=4, zorder=3)
+    ax.quiver(
+        start_x,
+        start_y,
+        *steps,
+        angles="xy",
+        scale_units="xy",
+        scale=1,
+        width=0.007,
+        headlength=4,
+        zorder=3,
+    )
 
 
 def _draw_paths(maps: MotionMaps, ax: Axes) -> None:
@@ -317,7 +368,9 @@ def _draw_paths(maps: MotionMaps, ax: Axes) -> None:
     from matplotlib.collections import LineCollection
 
     paths = {identity: path for identity, path in maps.paths().items() if len(path) > 1}
-    colors = [maps.colors[identity] * 0.6 for identity in paths]  # darker than the cells that they lie on
+    colors = [
+        maps.colors[identity] * 0.6 for identity in paths
+    ]  # darker than the cells that they lie on
     ax.add_collection(LineCollection(list(paths.values()), colors=colors, linewidths=1.3, zorder=4))
     if paths:
         later = [path[1:] for path in paths.values()]
@@ -332,12 +385,20 @@ def _with_ids_and_grid(maps: MotionMaps, frame: int, shown: frozenset[Layer], ax
         for identity in np.unique(maps.instance[frame][maps.instance[frame] > 0]).tolist():
             row, column = np.nonzero(maps.instance[frame] == identity)
             low, high = (x[column.min()], y[row.min()]), (x[column.max()], y[row.max()])
-            place_chips(ax, [(str(identity), (x[column].mean(), y[row].mean()))], avoid=[[low, high]])
+            place_chips(
+                ax, [(str(identity), (x[column].mean(), y[row].mean()))], avoid=[[low, high]]
+            )
     return with_light_grid(ax, "both") if "grid" in shown else ax
 
 
 def _draw_cells(ax: Axes, picture: AnyArray, maps: MotionMaps, **how: Any) -> None:
-    ax.imshow(picture, origin="lower", extent=(*maps.grid.x[:2], *maps.grid.y[:2]), interpolation="nearest", **how)
+    ax.imshow(
+        picture,
+        origin="lower",
+        extent=(*maps.grid.x[:2], *maps.grid.y[:2]),
+        interpolation="nearest",
+        **how,
+    )
 
 
 def instance_handles(maps: MotionMaps) -> list[Artist]:
@@ -346,10 +407,16 @@ def instance_handles(maps: MotionMaps) -> list[Artist]:
     from matplotlib.patches import Patch
 
     drawn = {to_hex(color) for color in maps.colors}
-    meanings = {"colliding pair": COLLIDER_COLOR} | {short_name(name): hue for name, hue in AGENT_COLORS.items()}
-    handles: list[Artist] = [Patch(label=name, facecolor=color) for name, color in meanings.items() if color in drawn]
+    meanings = {"colliding pair": COLLIDER_COLOR} | {
+        short_name(name): hue for name, hue in AGENT_COLORS.items()
+    }
+    handles: list[Artist] = [
+        Patch(label=name, facecolor=color) for name, color in meanings.items() if color in drawn
+    ]
     if maps.own > 0:
-        handles.append(Patch(label="own box", facecolor="none", edgecolor=OWN_COLOR, linewidth=_OWN_EDGE))
+        handles.append(
+            Patch(label="own box", facecolor="none", edgecolor=OWN_COLOR, linewidth=_OWN_EDGE)
+        )
     return handles
 
 

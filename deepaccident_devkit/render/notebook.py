@@ -49,7 +49,9 @@ def _draw(thing: object, ax: Axes) -> None:
     elif isinstance(thing, MotionLabels):
         draw_motion_trail(thing if thing.at_present else thing.to_present(), ax=ax)
     else:
-        raise ChoiceError(f"there is nothing to render in {thing!r}; expected boxes, points or MotionLabels")
+        raise ChoiceError(
+            f"there is nothing to render in {thing!r}; expected boxes, points or MotionLabels"
+        )
 
 
 def _draw_boxes(boxes: Boxes, ax: Axes) -> None:
@@ -57,7 +59,9 @@ def _draw_boxes(boxes: Boxes, ax: Axes) -> None:
     shown = boxes[:: -(-len(boxes) // _MOST_BOXES)]
     if boxes.frame in CAMERAS:
         shown = shown.transform(_LEVEL_FROM_OPTICAL, "ego")
-    draw_boxes_from_above(shown, ax, [CATEGORY_COLORS[name] for name in shown.category_names], linewidths=0.8)
+    draw_boxes_from_above(
+        shown, ax, [CATEGORY_COLORS[name] for name in shown.category_names], linewidths=0.8
+    )
     ax.autoscale_view()
 
 

@@ -31,9 +31,20 @@ from deepaccident_devkit.render.captions import (
 )
 from deepaccident_devkit.render.figures import LAYERS, Layer, figure_or_new, layers_of
 from deepaccident_devkit.render.hidden import hiding
-from deepaccident_devkit.render.styles import AGENT_COLORS, current_style, in_own_settings, text_size
+from deepaccident_devkit.render.styles import (
+    AGENT_COLORS,
+    current_style,
+    in_own_settings,
+    text_size,
+)
 from deepaccident_devkit.taxonomy import CAMERAS, short_name
-from deepaccident_devkit.v2x import Agents, Link, cooperating_agents, cooperative_boxes, project_to_image
+from deepaccident_devkit.v2x import (
+    Agents,
+    Link,
+    cooperating_agents,
+    cooperative_boxes,
+    project_to_image,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -107,10 +118,17 @@ def render_sample(
         mosaic: list[Any] = [*map(list, CAMERA_GRID), ["bev"] * 3]
         axes = fig.subplot_mosaic(mosaic, height_ratios=(1, 1, 16 / 3))
     else:
-        grid, ratios = (CAMERA_GRID, (4, 4, 4, 4.5)) if width > _WIDE * height else (_TALL_GRID, (4, 4, 8))
+        grid, ratios = (
+            (CAMERA_GRID, (4, 4, 4, 4.5)) if width > _WIDE * height else (_TALL_GRID, (4, 4, 8))
+        )
         axes = fig.subplot_mosaic([[*row, "bev"] for row in grid], width_ratios=ratios)
     for channel in CAMERAS:
-        draw_camera(dataset, dataset.get("sample_data", f"{record['token']}/{channel}"), in_cameras, axes[channel])
+        draw_camera(
+            dataset,
+            dataset.get("sample_data", f"{record['token']}/{channel}"),
+            in_cameras,
+            axes[channel],
+        )
     shown = draw_bev(dataset, record, BevView(agents=names, link=link), from_above, axes["bev"])
     draw_legend(fig, handles_from_above(*shown))
     set_scene_title(fig, dataset, record["token"])
@@ -156,7 +174,12 @@ def render_frame(
 
 
 def draw_shared_moment(
-    dataset: Dataset, frame: RowArgument, *, agents: Sequence[str], layers: Iterable[Layer] | None, fig: Figure
+    dataset: Dataset,
+    frame: RowArgument,
+    *,
+    agents: Sequence[str],
+    layers: Iterable[Layer] | None,
+    fig: Figure,
 ) -> None:
     """Render the front views of agents beside one view from above that they share, in world, as wide as they need.
 
@@ -200,21 +223,35 @@ def _moment_panels(fig: Figure, agents: int) -> tuple[Axes, float, list[Axes]]:
         columns = agents if width > height else min(_COLUMNS, agents)
         rows = -(-agents // columns)
         room -= rows * (width / columns * 9 / 16 + _TITLE * text_size())
-        tall = fig.add_gridspec(rows + 1, columns, height_ratios=(*[width / columns * 9 / 16] * rows, room))
-        cameras, above, broad = _filled(fig, tall, agents, first=0), fig.add_subplot(tall[rows, :]), width
+        tall = fig.add_gridspec(
+            rows + 1, columns, height_ratios=(*[width / columns * 9 / 16] * rows, room)
+        )
+        cameras, above, broad = (
+            _filled(fig, tall, agents, first=0),
+            fig.add_subplot(tall[rows, :]),
+            width,
+        )
     else:
         rows = min(2 if width > _WIDE * height else 3, agents)
         columns = -(-agents // rows)
         share = min(columns * room / rows * 16 / 9, _MOST_CAMERAS * width)
-        grid = fig.add_gridspec(rows, columns + 1, width_ratios=(width - share, *[share / columns] * columns))
-        cameras, above, broad = _filled(fig, grid, agents, first=1), fig.add_subplot(grid[:, 0]), width - share
+        grid = fig.add_gridspec(
+            rows, columns + 1, width_ratios=(width - share, *[share / columns] * columns)
+        )
+        cameras, above, broad = (
+            _filled(fig, grid, agents, first=1),
+            fig.add_subplot(grid[:, 0]),
+            width - share,
+        )
     return above, min(max(1.0, (broad - _BESIDE * text_size()) / room), _WIDEST), cameras
 
 
 def _filled(fig: Figure, grid: Any, number: int, *, first: int) -> list[Axes]:
     """So many axes in a grid, from a first column on, row by row."""
     columns = grid.ncols - first
-    return [fig.add_subplot(grid[each // columns, first + each % columns]) for each in range(number)]
+    return [
+        fig.add_subplot(grid[each // columns, first + each % columns]) for each in range(number)
+    ]
 
 
 @in_own_settings
@@ -265,7 +302,9 @@ def render_calibration(
     boxes = cooperative_boxes(dataset, sample, agents=names)
     columns = 2 if current_style().room == "column" else _COLUMNS
     rows = -(-len(cameras) // columns)
-    fig = figure_or_new(fig, (15, 3.1 * rows + 0.8), page=0.2 * rows + 0.06, column=0.33 * rows + 0.12)
+    fig = figure_or_new(
+        fig, (15, 3.1 * rows + 0.8), page=0.2 * rows + 0.06, column=0.33 * rows + 0.12
+    )
     axes = fig.subplots(rows, min(columns, len(cameras)), squeeze=False)
     for ax in axes.flat[len(cameras) :]:
         ax.set_axis_off()
@@ -277,9 +316,13 @@ def render_calibration(
         draw_legend(axes.flat[-1], agent_handles(clouds), columns=1, loc="center")
     else:
         draw_legend(fig, agent_handles(clouds))
-    write_missing(axes[0, 0], missing_clouds_text([agent for agent in lookers if agent not in clouds]))
+    write_missing(
+        axes[0, 0], missing_clouds_text([agent for agent in lookers if agent not in clouds])
+    )
     whose = "each agent" if len(names) > 1 else short_name(names[0])
-    set_scene_title(fig, dataset, record["frame_token"] if is_frame else record["token"], f"LiDAR of {whose}")
+    set_scene_title(
+        fig, dataset, record["frame_token"] if is_frame else record["token"], f"LiDAR of {whose}"
+    )
     return fig
 
 
@@ -307,6 +350,8 @@ def _draw_panel(
         points = seen(project_to_image(dataset, cloud, sample, record, colors=False))
         draw_points_in_image(points.pixels[points.mask], ax, size=1.2, color=AGENT_COLORS[agent])
     own = dataset.get("agent", sample["agent_token"])["actor_id"]
-    optical = boxes.transform(dataset.world_from(sample, record["channel"]).inverse(), record["channel"])
+    optical = boxes.transform(
+        dataset.world_from(sample, record["channel"]).inverse(), record["channel"]
+    )
     near = np.linalg.norm(optical.center, axis=1) < _FARTHEST
     draw_camera_boxes(dataset, record, optical.select(near & (optical.actor_id != own)), layers, ax)

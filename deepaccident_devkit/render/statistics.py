@@ -11,7 +11,12 @@ from typing import TYPE_CHECKING, Any, Final
 
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.render.captions import draw_legend
-from deepaccident_devkit.render.figures import detached_figure, figure_or_new, with_light_grid, write_figure
+from deepaccident_devkit.render.figures import (
+    detached_figure,
+    figure_or_new,
+    with_light_grid,
+    write_figure,
+)
 from deepaccident_devkit.render.styles import (
     CATEGORY_COLORS,
     CATEGORY_MARKERS,
@@ -55,7 +60,14 @@ def draw_counts(table: CountTable, ax: Axes) -> Axes:
     for group in GROUPS[1:]:
         widths = [table.counts[value][group] for value in values]
         if any(widths):
-            ax.barh(range(len(values)), widths, left=starts, color=SPLIT_COLORS[group], label=group, height=0.72)
+            ax.barh(
+                range(len(values)),
+                widths,
+                left=starts,
+                color=SPLIT_COLORS[group],
+                label=group,
+                height=0.72,
+            )
         starts = [start + width for start, width in zip(starts, widths, strict=True)]
     for position, total in enumerate(starts):
         share = f" ({100 * total / whole:.0f} %)" if whole else ""
@@ -82,9 +94,15 @@ def draw_histogram(histogram: Histogram, ax: Axes) -> Axes:
 
 def draw_quantiles(table: QuantileTable, field: str, ax: Axes) -> Axes:
     """Render a field's quantiles by category: box from 25 to 75 %, line at the median, whiskers at 5 and 95 %."""
-    rows = [row for row in table.quantiles if row.field == field and row.group == GROUPS[0] and row.values]
+    rows = [
+        row
+        for row in table.quantiles
+        if row.field == field and row.group == GROUPS[0] and row.values
+    ]
     draw_quantile_boxes({row.category: row for row in rows}, ax)
-    ax.set(ylabel=f"{field} ({table.unit})", title=f"{field.capitalize()} by category", ylim=(0, None))
+    ax.set(
+        ylabel=f"{field} ({table.unit})", title=f"{field.capitalize()} by category", ylim=(0, None)
+    )
     ax.tick_params(axis="x", labelsize=text_size())
     return ax
 
@@ -94,7 +112,9 @@ def draw_angles(histogram: Histogram, ax: Axes) -> Axes:
     from matplotlib.projections.polar import PolarAxes
 
     if not isinstance(ax, PolarAxes):
-        raise ChoiceError(f"ax: expected polar axes (projection='polar'), found {type(ax).__name__}")
+        raise ChoiceError(
+            f"ax: expected polar axes (projection='polar'), found {type(ax).__name__}"
+        )
     ax.set_theta_zero_location("N")
     edges = histogram.edges
     middles = [radians((low + high) / 2) for low, high in pairwise(edges)]
@@ -124,7 +144,9 @@ def draw_relative_positions(pairs: Sequence[CollisionPair], ax: Axes) -> Axes:
             color, marker = CATEGORY_COLORS[category], CATEGORY_MARKERS.get(category, "s")
             how: Any = {"s": 30, "marker": marker, "alpha": 0.75, "linewidths": 0}
             ax.scatter(*positions, color=color, label=category, zorder=3, **how)
-    ax.add_patch(Rectangle((-0.97, -2.3), 1.94, 4.6, fill=False, edgecolor=COLLIDER_COLOR, linewidth=1.2))
+    ax.add_patch(
+        Rectangle((-0.97, -2.3), 1.94, 4.6, fill=False, edgecolor=COLLIDER_COLOR, linewidth=1.2)
+    )
     ax.annotate("", (0, 2.3), (0, 0.4), arrowprops={"arrowstyle": "->", "color": COLLIDER_COLOR})
     reach = max([6.0, *(1.1 * max(abs(pair.x), abs(pair.y)) for pair in pairs)])
     ax.set(xlim=(reach, -reach), ylim=(-reach, reach), aspect="equal")
@@ -132,7 +154,9 @@ def draw_relative_positions(pairs: Sequence[CollisionPair], ax: Axes) -> Axes:
     ax.set_title("Centre of the other actor\n(red: the first, as a median car)", fontsize=10)
     if pairs:
         handles, _ = ax.get_legend_handles_labels()
-        draw_legend(ax, handles, columns=3, loc="upper center", bbox_to_anchor=(0.5, -0.22))  # below the axis' label
+        draw_legend(
+            ax, handles, columns=3, loc="upper center", bbox_to_anchor=(0.5, -0.22)
+        )  # below the axis' label
     return with_light_grid(ax, "both")
 
 
@@ -144,9 +168,13 @@ def draw_quantile_boxes(rows: Mapping[str, QuantileRow], ax: Axes) -> None:
         if (q := row.values)
     ]
     if boxes:
-        parts = ax.bxp(boxes, showfliers=False, patch_artist=True, widths=0.45, medianprops={"color": "black"})
+        parts = ax.bxp(
+            boxes, showfliers=False, patch_artist=True, widths=0.45, medianprops={"color": "black"}
+        )
         for patch, row in zip(parts["boxes"], rows.values(), strict=True):
-            patch.set(facecolor=CATEGORY_COLORS.get(row.category, SPLIT_COLORS["unknown"]), alpha=0.75)
+            patch.set(
+                facecolor=CATEGORY_COLORS.get(row.category, SPLIT_COLORS["unknown"]), alpha=0.75
+            )
         medians = [row.values[PROBABILITIES.index(0.5)] for row in rows.values() if row.values]
         for position, median in enumerate(medians, 1):
             text = f"{median:.{1 if median >= 10 else 2}f}"
@@ -157,7 +185,11 @@ def draw_quantile_boxes(rows: Mapping[str, QuantileRow], ax: Axes) -> None:
 
 
 def _draw_stacked(
-    histogram: Histogram, ax: Axes, places: Sequence[float], width: float | Sequence[float], **how: Any
+    histogram: Histogram,
+    ax: Axes,
+    places: Sequence[float],
+    width: float | Sequence[float],
+    **how: Any,
 ) -> None:
     """Bars at some places, the splits on top of each other; splits with only zeros have no bars."""
     base, style = [0] * len(places), {"edgecolor": "white", "linewidth": 0.5, **how}
@@ -174,7 +206,9 @@ def _title(histogram: Histogram) -> str:
         return histogram.title
     share = 100 * outside / histogram.total()
     words = f"{share:.1f}" if share >= _LEAST_SHARE else f"less than {_LEAST_SHARE}"
-    return f"{histogram.title}\n({words} % outside of {histogram.edges[0]:g}–{histogram.edges[-1]:g})"
+    return (
+        f"{histogram.title}\n({words} % outside of {histogram.edges[0]:g}–{histogram.edges[-1]:g})"
+    )
 
 
 def _counting(axis: Axis) -> None:
@@ -240,7 +274,9 @@ def _collisions(statistics: DatasetStatistics, fig: Figure) -> None:
     draw_angles(statistics.histograms["collision_bearings"], ax=bearings)
     headings = "collisions by the other's heading: 0° the same,\n90° to the left, 180° head-on, 270° to the right"
     angles.set_xlabel(headings, fontsize=text_size())
-    bearings.set_xlabel("collisions by where the other is:\n0° ahead, 90° left, 270° right", fontsize=text_size())
+    bearings.set_xlabel(
+        "collisions by where the other is:\n0° ahead, 90° left, 270° right", fontsize=text_size()
+    )
     draw_relative_positions(statistics.collisions, ax=fig.add_subplot(1, 3, 3))
 
 
@@ -254,11 +290,15 @@ _FIGURES: Mapping[str, tuple[tuple[float, float], _Draw]] = {
     "collisions": ((_WIDTH, 5.2), _collisions),
 }
 # The groups that `render_statistics` renders → width and height of their figures in inches.
-STATISTICS_FIGURES: Final[Mapping[str, tuple[float, float]]] = {group: size for group, (size, _) in _FIGURES.items()}
+STATISTICS_FIGURES: Final[Mapping[str, tuple[float, float]]] = {
+    group: size for group, (size, _) in _FIGURES.items()
+}
 
 
 @in_own_settings
-def render_statistics(statistics: DatasetStatistics, group: str, *, fig: Figure | None = None) -> Figure:
+def render_statistics(
+    statistics: DatasetStatistics, group: str, *, fig: Figure | None = None
+) -> Figure:
     """Render one group of `STATISTICS_FIGURES`, coloured by split. Raises ChoiceError: no such group."""
     from matplotlib.layout_engine import ConstrainedLayoutEngine
 
@@ -270,11 +310,20 @@ def render_statistics(statistics: DatasetStatistics, group: str, *, fig: Figure 
     draw(statistics, fig)
     handles = {}
     for ax in fig.axes:
-        handles.update({label: handle for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)})
+        handles.update(
+            {label: handle for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)}
+        )
     shown = [name for name in SPLIT_COLORS if name in handles]
     if shown:
         chosen = [handles[name] for name in shown]
-        fig.legend(chosen, shown, loc="outside lower center", ncols=len(shown), title="split", fontsize=text_size())
+        fig.legend(
+            chosen,
+            shown,
+            loc="outside lower center",
+            ncols=len(shown),
+            title="split",
+            fontsize=text_size(),
+        )
     return fig
 
 
@@ -286,5 +335,7 @@ def save_statistics(statistics: DatasetStatistics, folder: str | os.PathLike[str
     folder, paths = writable_folder(folder), []
     for group, (size, _) in _FIGURES.items():
         figure = render_statistics(statistics, group, fig=detached_figure(size))
-        paths += [write_figure(figure, folder / f"{group}.{kind}", dpi=_DPI) for kind in ("png", "pdf")]
+        paths += [
+            write_figure(figure, folder / f"{group}.{kind}", dpi=_DPI) for kind in ("png", "pdf")
+        ]
     return paths

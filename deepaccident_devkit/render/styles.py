@@ -70,7 +70,12 @@ BEV_COLORS: Mapping[str, str] = {
     "pedestrian": "#d3d9e0",
 }
 # The ground of a town's map that is alone in its picture.
-MAP_COLORS: Mapping[str, str] = {"road": "#868f98", "road_line": "#ffffff", "sidewalk": "#d8c8a0", "other": "#dde4e0"}
+MAP_COLORS: Mapping[str, str] = {
+    "road": "#868f98",
+    "road_line": "#ffffff",
+    "sidewalk": "#d8c8a0",
+    "other": "#dde4e0",
+}
 GRID_COLOR = "#d0d0d0"
 # The place of an image that is not there.
 MISSING_COLOR = "#dddddd"
@@ -156,14 +161,27 @@ class _Style:
 
 def _small(letters: float, **how: Any) -> _Style:
     """A style of small pictures with letters of so many points."""
-    sizes = {"font.size": letters, "axes.titlesize": letters, "figure.titlesize": letters + 1, "axes.linewidth": 0.6}
-    ticks = {f"{axis}tick.{name}": size for axis in "xy" for name, size in (("major.size", 2.5), ("major.pad", 2.0))}
-    return _Style(letters=letters, tokens=False, rc={**_FONTS, **sizes, **ticks, "axes.labelpad": 2.0}, **how)
+    sizes = {
+        "font.size": letters,
+        "axes.titlesize": letters,
+        "figure.titlesize": letters + 1,
+        "axes.linewidth": 0.6,
+    }
+    ticks = {
+        f"{axis}tick.{name}": size
+        for axis in "xy"
+        for name, size in (("major.size", 2.5), ("major.pad", 2.0))
+    }
+    return _Style(
+        letters=letters, tokens=False, rc={**_FONTS, **sizes, **ticks, "axes.labelpad": 2.0}, **how
+    )
 
 
 def _printed(panel: float, figure: float) -> _Style:
     """A style of a paper; letters of 7 points in DejaVu Sans are as tall as 9 points of Times."""
-    return _small(7, dpi=300, panel=panel, figure=figure, room="column" if figure < _COLUMN else "page")
+    return _small(
+        7, dpi=300, panel=panel, figure=figure, room="column" if figure < _COLUMN else "page"
+    )
 
 
 # Inches: a narrower picture is a column of a paper.
@@ -214,7 +232,10 @@ def in_own_settings(function: Drawing) -> Drawing:
 
 @contextmanager
 def style(
-    name: StyleName | None = None, *, title: bool = True, color_by: Literal["role", "class"] = "role"
+    name: StyleName | None = None,
+    *,
+    title: bool = True,
+    color_by: Literal["role", "class"] = "role",
 ) -> Iterator[None]:
     """In a `with` statement: new pictures have the size, panels and letters that a paper or a slide needs.
 
@@ -233,7 +254,9 @@ def style(
     from matplotlib import rc_context
 
     if name is not None and name not in _STYLES:
-        raise ChoiceError(f"style: expected one of {', '.join(get_args(StyleName))}, found {name!r}")
+        raise ChoiceError(
+            f"style: expected one of {', '.join(get_args(StyleName))}, found {name!r}"
+        )
     by_class = choice("color_by", color_by, ("role", "class")) == "class"
     chosen = replace(_NOTEBOOK if name is None else _STYLES[name], titled=title, by_class=by_class)
     token = _current.set(chosen)
@@ -260,7 +283,10 @@ def text_size() -> float:
 
 
 def size_in_style(
-    size: tuple[float, float], *, panels: Literal["one", "several"], heights: Mapping[str, float] = MappingProxyType({})
+    size: tuple[float, float],
+    *,
+    panels: Literal["one", "several"],
+    heights: Mapping[str, float] = MappingProxyType({}),
 ) -> tuple[float, float]:
     """Inches in the current style of a picture that would have this size in a notebook.
 

@@ -60,7 +60,9 @@ def draw_whole_map(drawn: TownMap, ax: Axes) -> Axes:
         for name, color in MAP_COLORS.items()
     ]
     draw_legend(ax, handles, loc="upper center", bbox_to_anchor=(0.5, 0), borderaxespad=4.5)
-    ax.set_title(f"{drawn.town}: {drawn.looks:,} pictures of {counted(drawn.scenarios, 'scenario')}")
+    ax.set_title(
+        f"{drawn.town}: {drawn.looks:,} pictures of {counted(drawn.scenarios, 'scenario')}"
+    )
     return ax
 
 
@@ -79,7 +81,9 @@ def map_beneath(dataset: Dataset, scenario: str, *, make: bool) -> TownMap | Non
         return None
 
 
-def draw_town_map(drawn: TownMap, ax: Axes, *, target_from_world: SE3, colors: Mapping[str, str] = BEV_COLORS) -> None:
+def draw_town_map(
+    drawn: TownMap, ax: Axes, *, target_from_world: SE3, colors: Mapping[str, str] = BEV_COLORS
+) -> None:
     """Render the part of a map that axes show, whose limits stay; what has no colour, or was not seen, is white."""
     part = _shown(drawn, (ax.get_xlim(), ax.get_ylim()), target_from_world)
     if not part.agents.size:
@@ -90,18 +94,26 @@ def draw_town_map(drawn: TownMap, ax: Axes, *, target_from_world: SE3, colors: M
     (left, bottom), reach = part.origin.tolist(), part.resolution
     extent = (left, left + columns * reach, bottom, bottom + rows * reach)
     numbers = {name: number for number, name in enumerate(GROUND_CLASSES, 1)}
-    draw_ground(cells, numbers, ax, extent=extent, placed=target_from_world, zorder=-1, colors=colors)
+    draw_ground(
+        cells, numbers, ax, extent=extent, placed=target_from_world, zorder=-1, colors=colors
+    )
 
 
 def ground_at(drawn: TownMap, points: FloatArray, names: Sequence[str]) -> ByteArray:
     """(N,) uint8: 1 + the position in names of what lies at points (N, 2), x and y in world; 0 for anything else."""
-    numbers = np.array([0, *(1 + names.index(name) if name in names else 0 for name in GROUND_CLASSES)])
+    numbers = np.array(
+        [0, *(1 + names.index(name) if name in names else 0 for name in GROUND_CLASSES)]
+    )
     return numbers.astype(np.uint8)[drawn.classes_at(points)]
 
 
-def _shown(drawn: TownMap, limits: tuple[tuple[float, float], ...], target_from_world: SE3) -> TownMap:
+def _shown(
+    drawn: TownMap, limits: tuple[tuple[float, float], ...], target_from_world: SE3
+) -> TownMap:
     """The part of a map around what the limits of axes show, however they are turned."""
     middle = np.array([np.mean(each) for each in limits])
     reach = float(np.hypot(*(np.diff(each)[0] for each in limits)) / 2)
-    center = target_from_world.inverse().apply(np.array([[*middle, target_from_world.translation[2]]]))[0, :2]
+    center = target_from_world.inverse().apply(
+        np.array([[*middle, target_from_world.translation[2]]])
+    )[0, :2]
     return drawn.around(center, reach)

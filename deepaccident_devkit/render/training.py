@@ -17,7 +17,13 @@ from deepaccident_devkit.render.figures import (
     with_light_grid,
     write_report_figure,
 )
-from deepaccident_devkit.render.styles import MUTED_COLOR, OWN_COLOR, PREDICTED_COLOR, in_own_settings, text_size
+from deepaccident_devkit.render.styles import (
+    MUTED_COLOR,
+    OWN_COLOR,
+    PREDICTED_COLOR,
+    in_own_settings,
+    text_size,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -31,12 +37,23 @@ _MEANS: Final = 60
 
 
 @in_own_settings
-def render_curve(steps: Sequence[int], values: Sequence[float], title: str, *, ax: Axes | None = None) -> Axes:
+def render_curve(
+    steps: Sequence[int], values: Sequence[float], title: str, *, ax: Axes | None = None
+) -> Axes:
     """Render one number by the optimizer's step: each value as a dot, and means of groups of steps as a line."""
     ax = axes_or_new(ax, _PANEL)
     crowded = len(values) > _MEANS
-    ax.plot(steps, values, ".", color=MUTED_COLOR if crowded else PREDICTED_COLOR, markersize=2 if crowded else 6)
-    groups = [np.array_split(np.asarray(each, dtype=float), min(_MEANS, len(values)) or 1) for each in (steps, values)]
+    ax.plot(
+        steps,
+        values,
+        ".",
+        color=MUTED_COLOR if crowded else PREDICTED_COLOR,
+        markersize=2 if crowded else 6,
+    )
+    groups = [
+        np.array_split(np.asarray(each, dtype=float), min(_MEANS, len(values)) or 1)
+        for each in (steps, values)
+    ]
     with catch_warnings():
         simplefilter("ignore", RuntimeWarning)  # a group of gaps alone is a gap
         means = [[np.nanmean(group) for group in each] for each in groups]
@@ -47,7 +64,9 @@ def render_curve(steps: Sequence[int], values: Sequence[float], title: str, *, a
 
 
 @in_own_settings
-def render_training(rows: Sequence[Mapping[str, Any]], title: str, *, fig: Figure | None = None) -> Figure:
+def render_training(
+    rows: Sequence[Mapping[str, Any]], title: str, *, fig: Figure | None = None
+) -> Figure:
     """Render the curves of a run by the rows of its log: a `step`, and numbers by name, also below `validation`."""
     curves = _curves(rows)
     fig = figure_or_new(fig, _size(len(curves)))
@@ -64,7 +83,9 @@ def render_training(rows: Sequence[Mapping[str, Any]], title: str, *, fig: Figur
 
 def save_training(rows: Sequence[Mapping[str, Any]], title: str, path: Path) -> None:
     """Write `render_training` into a PNG file, as `write_report_figure` does. Raises OSError."""
-    write_report_figure(render_training(rows, title, fig=report_figure(_size(len(_curves(rows))))), path, dpi=_DPI)
+    write_report_figure(
+        render_training(rows, title, fig=report_figure(_size(len(_curves(rows))))), path, dpi=_DPI
+    )
 
 
 def _curves(rows: Sequence[Mapping[str, Any]]) -> dict[str, list[tuple[int, float]]]:

@@ -28,7 +28,11 @@ from deepaccident_devkit.render.samples import (
     render_sample,
 )
 from deepaccident_devkit.render.styles import in_own_settings
-from deepaccident_devkit.render.visibility import VISIBILITY_LAYERS, render_visibility, render_visibility_matrix
+from deepaccident_devkit.render.visibility import (
+    VISIBILITY_LAYERS,
+    render_visibility,
+    render_visibility_matrix,
+)
 from deepaccident_devkit.support.arrays import ByteArray
 from deepaccident_devkit.support.files import replacing
 from deepaccident_devkit.support.parallel import Engine, Places, in_order, run_unordered
@@ -65,7 +69,9 @@ _DPI_AT: Final = 1280 * 720
 def check_target(path: Path, *, size: tuple[int, int], fps: float) -> None:
     """Check before anything is rendered that the file can be written; raises ChoiceError and MissingExtraError."""
     if path.suffix.lower() not in SUFFIXES:
-        raise ChoiceError(f"path: expected a file that ends in {', '.join(SUFFIXES)}, found {str(path)!r}")
+        raise ChoiceError(
+            f"path: expected a file that ends in {', '.join(SUFFIXES)}, found {str(path)!r}"
+        )
     if path.is_dir():
         raise ChoiceError(f"path: expected a file, found the folder {path}")
     folder = next(each for each in path.absolute().parents if each.exists())
@@ -78,7 +84,9 @@ def check_target(path: Path, *, size: tuple[int, int], fps: float) -> None:
     if path.suffix.lower() == ".mp4":
         if any(side % 2 for side in size):
             even = tuple(side - side % 2 for side in size)
-            raise ChoiceError(f"size: expected an even width and height, which MP4 needs, found {size}; give {even}")
+            raise ChoiceError(
+                f"size: expected an even width and height, which MP4 needs, found {size}; give {even}"
+            )
         try:
             import av  # noqa: F401 - whether it is installed
         except ImportError:
@@ -100,7 +108,9 @@ def _write_mp4(path: Path, pictures: Iterable[ByteArray], fps: float) -> None:
     """H.264 in yuv420p with its index in front: browsers play it, and begin before it is complete."""
     import av
 
-    with av.open(os.fspath(path), "w", format="mp4", options={"movflags": "+faststart"}) as container:
+    with av.open(
+        os.fspath(path), "w", format="mp4", options={"movflags": "+faststart"}
+    ) as container:
         stream = None
         for picture in pictures:
             if stream is None:
@@ -175,7 +185,12 @@ class _View:
     own: bool = False
 
     def on(
-        self, fig: Figure, dataset: Dataset, frame: str, agents: Sequence[str], layers: tuple[Layer, ...] | None
+        self,
+        fig: Figure,
+        dataset: Dataset,
+        frame: str,
+        agents: Sequence[str],
+        layers: tuple[Layer, ...] | None,
     ) -> None:
         """Render a moment, by its frame's token, on an empty figure.
 
@@ -193,10 +208,14 @@ class _View:
         token = frame if self.of == "frame" else sample_token(scenario, agents[0], int(number))
         chosen = {"agents": agents, "layers": layers}
         canvas = fig if self.canvas == "fig" else fig.add_subplot()
-        self.draw(dataset, token, **{self.canvas: canvas}, **{name: chosen[name] for name in self.takes})
+        self.draw(
+            dataset, token, **{self.canvas: canvas}, **{name: chosen[name] for name in self.takes}
+        )
 
 
-def _draw_channel(channel: str, dataset: Dataset, sample: str, *, layers: tuple[Layer, ...] | None, ax: Axes) -> None:
+def _draw_channel(
+    channel: str, dataset: Dataset, sample: str, *, layers: tuple[Layer, ...] | None, ax: Axes
+) -> None:
     shown = CAMERA_DEFAULT if layers is None else layers
     draw_camera(dataset, dataset.get("sample_data", f"{sample}/{channel}"), shown, ax)
 
@@ -208,13 +227,25 @@ VIEWS: Final[Mapping[str, _View]] = {
     "accident": _View(draw=draw_countdown, of="frame", layers=PAIR_LAYERS, share=2, inches=12.8),
     "bev": _View(draw=render_bev, canvas="ax", layers=BEV_LAYERS, inches=4.6),
     "visibility": _View(draw=render_visibility, canvas="ax", layers=VISIBILITY_LAYERS),
-    "visibility_matrix": _View(draw=render_visibility_matrix, canvas="ax", takes=("agents",), layers=()),
-    "calibration": _View(draw=render_calibration, of="frame", layers=CALIBRATION_LAYERS, share=2, inches=12.0),
+    "visibility_matrix": _View(
+        draw=render_visibility_matrix, canvas="ax", takes=("agents",), layers=()
+    ),
+    "calibration": _View(
+        draw=render_calibration, of="frame", layers=CALIBRATION_LAYERS, share=2, inches=12.0
+    ),
     "labels": _View(
-        draw=partial(render_motion_labels, style="trail"), takes=("layers",), layers=TRAIL_LAYERS, inches=5.5
+        draw=partial(render_motion_labels, style="trail"),
+        takes=("layers",),
+        layers=TRAIL_LAYERS,
+        inches=5.5,
     ),
     **{
-        channel: _View(draw=partial(_draw_channel, channel), canvas="ax", takes=("layers",), layers=CAMERA_LAYERS)
+        channel: _View(
+            draw=partial(_draw_channel, channel),
+            canvas="ax",
+            takes=("layers",),
+            layers=CAMERA_LAYERS,
+        )
         for channel in CAMERAS
     },
 }
@@ -251,7 +282,12 @@ class VideoScene:
 
     @in_own_settings
     def _drawn(
-        self, view: _View, width: int, frame: str, agents: Sequence[str], layers: tuple[Layer, ...] | None
+        self,
+        view: _View,
+        width: int,
+        frame: str,
+        agents: Sequence[str],
+        layers: tuple[Layer, ...] | None,
     ) -> ByteArray:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
 
@@ -288,7 +324,11 @@ def views_of(
 
 
 def _view(given: object) -> _View:
-    return _View(draw=given, layers=(), own=True) if callable(given) else VIEWS[choice("what", given, VIEWS)]
+    return (
+        _View(draw=given, layers=(), own=True)
+        if callable(given)
+        else VIEWS[choice("what", given, VIEWS)]
+    )
 
 
 def render_scenario_video(  # noqa: PLR0913 - each is a choice that stands on its own in a notebook
@@ -341,12 +381,16 @@ def render_scenario_video(  # noqa: PLR0913 - each is a choice that stands on it
     check_target(target, size=(width, height), fps=fps)
     views = views_of(what, layers)
     record = dataset.get("scenario", scenario)
-    tokens = [frame_token(record["token"], number) for number in _numbers(frames, record["num_frames"])]
+    tokens = [
+        frame_token(record["token"], number) for number in _numbers(frames, record["num_frames"])
+    ]
     names_at(dataset, tokens[0], agents)  # before any worker starts
     own = [view.draw for view, _ in views if view.own]
     scene = VideoScene(dataset=dataset, views=views, agents=agents, width=width, height=height)
     engine: Engine = {"progress": True, **how, "workers": _workers(own, how.get("workers"))}
-    drawn = run_unordered(scene.picture, tokens, label="frames", places=Places(reads=dataset.places), **engine)
+    drawn = run_unordered(
+        scene.picture, tokens, label="frames", places=Places(reads=dataset.places), **engine
+    )
     with closing(in_order(drawn)) as pictures:
         write_video(target, pictures, fps=fps)
     return target
@@ -361,7 +405,9 @@ def _numbers(frames: Collection[int] | slice | None, last: int) -> list[int]:
         numbers = list(frames)
     wrong = [number for number in numbers if number not in recorded]
     if wrong or not numbers:
-        raise ChoiceError(f"frames: expected numbers from 1 to {last}, found {wrong[0] if wrong else 'none'}")
+        raise ChoiceError(
+            f"frames: expected numbers from 1 to {last}, found {wrong[0] if wrong else 'none'}"
+        )
     return numbers
 
 

@@ -51,7 +51,12 @@ from deepaccident_devkit.support.arrays import BoolArray, FloatArray, FrozenArra
 from deepaccident_devkit.support.text import choice
 from deepaccident_devkit.tables.tokens import sample_token
 from deepaccident_devkit.taxonomy import OWN_ACTOR_ID, UNTRACKED_ID, Frame, short_name
-from deepaccident_devkit.v2x import Agents, aggregate_point_cloud, cooperating_agents, cooperative_boxes
+from deepaccident_devkit.v2x import (
+    Agents,
+    aggregate_point_cloud,
+    cooperating_agents,
+    cooperative_boxes,
+)
 from deepaccident_devkit.v2x.cooperation import visible_actors
 
 if TYPE_CHECKING:
@@ -59,7 +64,14 @@ if TYPE_CHECKING:
 
 # The slashes of a frame's token, `<scenario_type>/<name>/<NNN>`; a sample's token has one more, for the agent.
 _FRAME_SLASHES: Final = 2
-VISIBILITY_LAYERS: Final[tuple[Layer, ...]] = ("points", "boxes", "ids", "velocities", "visibility", "grid")
+VISIBILITY_LAYERS: Final[tuple[Layer, ...]] = (
+    "points",
+    "boxes",
+    "ids",
+    "velocities",
+    "visibility",
+    "grid",
+)
 _SHOWN: Final[tuple[Layer, ...]] = ("boxes", "visibility", "grid")
 # Metres that are shown around the agents and the colliding pair.
 _MARGIN: Final = 10.0
@@ -135,10 +147,14 @@ class Visibility(FrozenArrays):
         if agent not in self.agents or not self.pair:
             return np.zeros(len(self.boxes), dtype=bool)
         column = self.agents.index(agent)
-        return np.asarray((self.collides | self.records) & ~self.seen[:, column] & ~self.own[:, column])
+        return np.asarray(
+            (self.collides | self.records) & ~self.seen[:, column] & ~self.own[:, column]
+        )
 
 
-def visibility_of(dataset: Dataset, moment: RowArgument, agents: Agents = None, frame: str = "ego") -> Visibility:
+def visibility_of(
+    dataset: Dataset, moment: RowArgument, agents: Agents = None, frame: str = "ego"
+) -> Visibility:
     """Which of some agents see which of the actors that any agent annotated, in a coordinate frame of the sample.
 
     The moment is a sample, or a frame: then its first agent's sample is taken. Agents are as `visible_instances` takes
@@ -168,7 +184,9 @@ def visibility_of(dataset: Dataset, moment: RowArgument, agents: Agents = None, 
         agents=tuple(looking),
         boxes=boxes,
         place=place,
-        actor=np.array([UNTRACKED_ID if actor is None else actor for actor in actors], dtype=np.int64),
+        actor=np.array(
+            [UNTRACKED_ID if actor is None else actor for actor in actors], dtype=np.int64
+        ),
         seen=seen,
         annotated=annotated,
         points=points,
@@ -180,7 +198,9 @@ def sample_at(dataset: Dataset, moment: RowArgument) -> str:
     """Token of a sample, or of a frame's first sample; raises TokenError if `moment` is neither."""
     token = str(moment["token"]) if isinstance(moment, Mapping) else moment
     is_frame = token.count("/") == _FRAME_SLASHES
-    return str((dataset.samples_of(token)[0] if is_frame else dataset.get("sample", token))["token"])
+    return str(
+        (dataset.samples_of(token)[0] if is_frame else dataset.get("sample", token))["token"]
+    )
 
 
 @in_own_settings
@@ -232,13 +252,17 @@ def render_visibility(
     ax.locator_params(nbins=6)  # each tick costs time
     if "points" in shown:
         _draw_points(dataset, known, frame, ax)
-    set_scene_title(ax, dataset, dataset.get("sample", known.sample)["frame_token"], "who sees whom")
+    set_scene_title(
+        ax, dataset, dataset.get("sample", known.sample)["frame_token"], "who sees whom"
+    )
     colors = role_colors(dataset, known.sample, known.boxes)
     hidden = known.hidden_from(known.ego)
     if "boxes" in shown:
         draw_boxes_from_above(known.boxes.select(~hidden), ax, _chosen(colors, ~hidden))
         unseen = known.boxes.select(hidden)
-        draw_boxes_from_above(unseen, ax, _chosen(colors, hidden), fill=0.0, linestyle=(0, (2, 1)), linewidths=2.0)
+        draw_boxes_from_above(
+            unseen, ax, _chosen(colors, hidden), fill=0.0, linestyle=(0, (2, 1)), linewidths=2.0
+        )
     if "velocities" in shown:
         draw_velocities_from_above(known.boxes, ax, colors)
     if "visibility" in shown:
@@ -281,7 +305,9 @@ def render_visibility_matrix(
         NotAvailableError: an agent is not in this (partial) release.
     """
     known = visibility_of(dataset, moment, agents)
-    rows = np.lexsort((known.boxes.actor_id, -known.seen.sum(axis=1), ~known.records, ~known.collides))
+    rows = np.lexsort(
+        (known.boxes.actor_id, -known.seen.sum(axis=1), ~known.records, ~known.collides)
+    )
     shown = rows[: _ROWS_OF_A_SLIDE if current_style().room == "slide" else _MOST_ROWS]
     columns = in_drawing_order(known.agents)
     ax = axes_or_new(ax, (1.4 + 0.75 * len(columns), 1.2 + 0.29 * max(len(shown), 4)))
@@ -294,7 +320,10 @@ def render_visibility_matrix(
         label.set_color(COLLIDER_COLOR if known.collides[row] else OWN_COLOR)
     heads = [short_name(agent) for agent in columns]
     ax.set_xticks(
-        range(len(columns)), heads, fontsize=text_size(), rotation=0 if current_style().room == "slide" else 90
+        range(len(columns)),
+        heads,
+        fontsize=text_size(),
+        rotation=0 if current_style().room == "slide" else 90,
     )
     ax.xaxis.tick_top()
     ax.set(xlim=(-0.5, len(columns) - 0.5), ylim=(max(len(shown), 1) - 0.5, -0.5))
@@ -302,20 +331,32 @@ def render_visibility_matrix(
     ax.spines[:].set_visible(False)
     more = len(rows) - len(shown)
     key = ["filled: seen; number: LiDAR points;", "–: not in the agent's label"]
-    ax.set_xlabel("\n".join([*key, *([f"{more} more actors"] if more else [])]), fontsize=text_size())
+    ax.set_xlabel(
+        "\n".join([*key, *([f"{more} more actors"] if more else [])]), fontsize=text_size()
+    )
     above: dict[str, Any] = {"x": _MIDDLE, "y": None}  # above the heads of the columns
-    set_scene_title(ax, dataset, dataset.get("sample", known.sample)["frame_token"], below="who sees whom", **above)
+    set_scene_title(
+        ax,
+        dataset,
+        dataset.get("sample", known.sample)["frame_token"],
+        below="who sees whom",
+        **above,
+    )
     return ax
 
 
-def _view(known: Visibility, view_range: float | None, wide: float) -> tuple[FloatArray, FloatArray]:
+def _view(
+    known: Visibility, view_range: float | None, wide: float
+) -> tuple[FloatArray, FloatArray]:
     """The lower left and the upper right corner, (2,) each, of the square that is shown, or of a wider one."""
     if view_range is not None:
         column = known.agents.index(known.ego) if known.ego in known.agents else 0
         middle, half = known.place[column], view_range
     else:
         corners = known.boxes.bottom_corners()[..., :2]
-        middle, half = _square_about(np.concatenate([known.place, *corners[known.collides | known.records]]), _MARGIN)
+        middle, half = _square_about(
+            np.concatenate([known.place, *corners[known.collides | known.records]]), _MARGIN
+        )
         among = (np.abs(corners - middle) < half).all(axis=-1).any(axis=-1)  # none of them is cut
         whole = np.concatenate([[middle - half, middle + half], *corners[among]])
         middle, half = _square_about(whole, _EDGE * half * (np.abs(whole - middle).max() > half))
@@ -331,9 +372,14 @@ def _square_about(places: FloatArray, margin: float) -> tuple[FloatArray, float]
 
 def _draw_points(dataset: Dataset, known: Visibility, frame: str, ax: Axes) -> None:
     (left, right), (low, high) = ax.get_xlim(), ax.get_ylim()
-    middle, half = np.array([left + right, low + high]) / 2, np.array([right - left, high - low]) / 2
+    middle, half = (
+        np.array([left + right, low + high]) / 2,
+        np.array([right - left, high - low]) / 2,
+    )
     scenario, _, number = known.sample.rsplit("/", 2)
-    absent = [agent for agent in known.agents if not has_cloud(dataset, f"{scenario}/{agent}/{number}")]
+    absent = [
+        agent for agent in known.agents if not has_cloud(dataset, f"{scenario}/{agent}/{number}")
+    ]
     write_missing(ax, missing_clouds_text(absent))
     for agent in known.agents:
         if agent in absent:
@@ -348,10 +394,14 @@ def _draw_sight_lines(known: Visibility, ax: Axes) -> None:
     row, column = np.nonzero(known.seen & known.collides[:, None])
     lines = np.stack([known.place[column], known.boxes.center[row, :2]], axis=1)
     way = lines[:, 1] - lines[:, 0]
-    right = np.column_stack([way[:, 1], -way[:, 0]]) / np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-9)
+    right = np.column_stack([way[:, 1], -way[:, 0]]) / np.maximum(
+        np.linalg.norm(way, axis=1, keepdims=True), 1e-9
+    )
     lines += (right * _ASIDE * np.ptp(ax.get_xlim()))[:, None]
     colors = [AGENT_COLORS[known.agents[each]] for each in column.tolist()]
-    ax.add_collection(LineCollection(list(lines), colors=colors, linewidths=1.2, alpha=0.8, zorder=2))
+    ax.add_collection(
+        LineCollection(list(lines), colors=colors, linewidths=1.2, alpha=0.8, zorder=2)
+    )
 
 
 def _draw_dots(known: Visibility, ax: Axes) -> None:
@@ -359,12 +409,16 @@ def _draw_dots(known: Visibility, ax: Axes) -> None:
 
     order, scale = in_drawing_order(known.agents), text_size() / SMALLEST_TEXT
     inches, slot_width, above = ax.figure.dpi_scale_trans, _SLOT * scale, _ABOVE * scale
-    tops = np.column_stack([known.boxes.center[:, 0], known.boxes.bottom_corners()[..., 1].max(axis=1)])
+    tops = np.column_stack(
+        [known.boxes.center[:, 0], known.boxes.bottom_corners()[..., 1].max(axis=1)]
+    )
     side = len(order) / 2 * slot_width
     keep_free(ax, tops[known.seen.any(axis=1), None], margin=(-side, 0.0, side, 2 * above))
     for slot, agent in enumerate(order):
         x, y = tops[known.seen[:, known.agents.index(agent)]].T
-        beside = ScaledTranslation((slot - (len(order) - 1) / 2) * slot_width / 72, above / 72, inches)
+        beside = ScaledTranslation(
+            (slot - (len(order) - 1) / 2) * slot_width / 72, above / 72, inches
+        )
         ax.scatter(
             x,
             y,
@@ -389,13 +443,32 @@ def _write_hidden(known: Visibility, hidden: BoolArray, ax: Axes) -> None:
 def _draw_agents(known: Visibility, ax: Axes) -> None:
     scale = text_size() / SMALLEST_TEXT
     if current_style().few:
-        names = [(short_name(agent), place) for agent, place in zip(known.agents, known.place.tolist(), strict=True)]
+        names = [
+            (short_name(agent), place)
+            for agent, place in zip(known.agents, known.place.tolist(), strict=True)
+        ]
         place_chips(ax, names, colors=[AGENT_COLORS[agent] for agent in known.agents])
     for agent, (x, y) in zip(known.agents, known.place.tolist(), strict=True):
-        ax.plot(x, y, "*", color=AGENT_COLORS[agent], markeredgecolor="white", markersize=10 * scale, zorder=5)
+        ax.plot(
+            x,
+            y,
+            "*",
+            color=AGENT_COLORS[agent],
+            markeredgecolor="white",
+            markersize=10 * scale,
+            zorder=5,
+        )
     if known.ego in known.agents:
         x, y = known.place[known.agents.index(known.ego)].tolist()
-        ax.plot(x, y, "o", markersize=12 * scale, fillstyle="none", color=AGENT_COLORS[known.ego], zorder=5)
+        ax.plot(
+            x,
+            y,
+            "o",
+            markersize=12 * scale,
+            fillstyle="none",
+            color=AGENT_COLORS[known.ego],
+            zorder=5,
+        )
 
 
 def _draw_legend(known: Visibility, hidden: BoolArray, shown: Collection[Layer], ax: Axes) -> None:
@@ -408,12 +481,28 @@ def _draw_legend(known: Visibility, hidden: BoolArray, shown: Collection[Layer],
     mark: dict[str, Any] = {"linestyle": "none", "color": MUTED_COLOR}
     handles.append(Line2D([], [], marker="*", markersize=8, label="an agent", **mark))
     if known.ego in known.agents:
-        handles.append(Line2D([], [], marker="o", markersize=9, fillstyle="none", label=f"whose view: {ego}", **mark))
+        handles.append(
+            Line2D(
+                [],
+                [],
+                marker="o",
+                markersize=9,
+                fillstyle="none",
+                label=f"whose view: {ego}",
+                **mark,
+            )
+        )
     if "visibility" in shown and known.pair:
-        handles.append(Line2D([], [], color=MUTED_COLOR, linewidth=1.2, label="sees one of the pair"))
+        handles.append(
+            Line2D([], [], color=MUTED_COLOR, linewidth=1.2, label="sees one of the pair")
+        )
     if hidden.any():
-        handles.append(Patch(facecolor="none", edgecolor=OWN_COLOR, linestyle="--", label=f"{ego} cannot see"))
-    draw_legend_outside(ax, handles, columns=4, title="dots above: who sees it", title_fontsize=text_size())
+        handles.append(
+            Patch(facecolor="none", edgecolor=OWN_COLOR, linestyle="--", label=f"{ego} cannot see")
+        )
+    draw_legend_outside(
+        ax, handles, columns=4, title="dots above: who sees it", title_fontsize=text_size()
+    )
 
 
 def _draw_column(known: Visibility, rows: IntArray, agent: str, column: int, ax: Axes) -> None:
@@ -434,10 +523,18 @@ def _draw_column(known: Visibility, rows: IntArray, agent: str, column: int, ax:
             )
             continue
         face, edge = (AGENT_COLORS[agent],) * 2 if seen else ("none", GRID_COLOR)
-        ax.add_patch(Rectangle((column - 0.3, place - 0.4), 0.6, 0.8, facecolor=face, edgecolor=edge))
+        ax.add_patch(
+            Rectangle((column - 0.3, place - 0.4), 0.6, 0.8, facecolor=face, edgecolor=edge)
+        )
         ink = _legible_on(AGENT_COLORS[agent]) if seen else MUTED_COLOR
         ax.text(
-            column, place, f"{known.points[row, source]}", ha="center", va="center", fontsize=text_size(), color=ink
+            column,
+            place,
+            f"{known.points[row, source]}",
+            ha="center",
+            va="center",
+            fontsize=text_size(),
+            color=ink,
         )
 
 

@@ -65,7 +65,10 @@ class Condition:
     def holds(self, value: FieldValue | tuple[FieldValue, ...]) -> bool:
         """Whether a scenario with this value of the field, or with these, is wanted."""
         several = value if isinstance(value, tuple) else (value,)
-        met = (each in self.values or any(_within(each, *bounds) for bounds in self.ranges) for each in several)
+        met = (
+            each in self.values or any(_within(each, *bounds) for bounds in self.ranges)
+            for each in several
+        )
         return any(met) != self.negated
 
 
@@ -105,7 +108,9 @@ def keyword_filter(name: str, value: FilterValue) -> Filter:
 
 def condition_of(wanted: Filter, field: Field, here: Iterable[FieldValue]) -> Condition:
     """Check a filter against its field, whose values in this release are always possible; raises ChoiceError."""
-    possible = list(dict.fromkeys([*field.known, *sorted({str(value) for value in here if value is not None})]))
+    possible = list(
+        dict.fromkeys([*field.known, *sorted({str(value) for value in here if value is not None})])
+    )
     singles: set[FieldValue] = set()
     ranges = []
     for given in wanted.values:
@@ -168,7 +173,9 @@ def _number(field: Field, value: object) -> float:
             f"{field.name}: expected a number, a range such as 40..60 or a bound such as >=50, found {_shown(value)}"
         )
     if field.known and number not in field.known:
-        raise ChoiceError(f"{field.name}: found {_shown(number)}; possible are {', '.join(map(str, field.known))}")
+        raise ChoiceError(
+            f"{field.name}: found {_shown(number)}; possible are {', '.join(map(str, field.known))}"
+        )
     return number
 
 
@@ -214,7 +221,11 @@ def _ends(sign: str, number: float) -> tuple[float | None, float | None]:
     """The lowest and highest number, both allowed, that a bound stands for."""
     if sign in {">", "<"}:
         aside = math.inf if sign == ">" else -math.inf
-        number = number + int(math.copysign(1, aside)) if isinstance(number, int) else math.nextafter(number, aside)
+        number = (
+            number + int(math.copysign(1, aside))
+            if isinstance(number, int)
+            else math.nextafter(number, aside)
+        )
     return (number, None) if sign.startswith(">") else (None, number)
 
 

@@ -76,7 +76,9 @@ class Field:
     def shown(self) -> str:
         """The values that it can have, as a filter has them."""
         if self.kind != "word" or not self.known:
-            return {"flag": "true, false", "number": "numbers", "measure": "numbers"}.get(self.kind, "words")
+            return {"flag": "true, false", "number": "numbers", "measure": "numbers"}.get(
+                self.kind, "words"
+            )
         return ", ".join(map(str, self.known))
 
     def values(
@@ -114,7 +116,9 @@ def fields_text() -> str:
 
 def group_texts(dataset: Dataset, scenario: ScenarioRecord) -> dict[str, str | None]:
     """The values of a scenario for all fields that results can be grouped by, as texts; None unknown."""
-    return {name: _text(field.read(dataset, scenario)) for name, field in FIELDS.items() if field.groups}
+    return {
+        name: _text(field.read(dataset, scenario)) for name, field in FIELDS.items() if field.groups
+    }
 
 
 def _text(value: Any) -> str | None:
@@ -132,7 +136,12 @@ def _column(column: Column) -> Field:
         return scenario[column.field]  # type: ignore[literal-required]
 
     return Field(
-        column.field, kind, column.kind.doc, read, known, groups=column.field in _FEW or bool(known) or kind == "flag"
+        column.field,
+        kind,
+        column.kind.doc,
+        read,
+        known,
+        groups=column.field in _FEW or bool(known) or kind == "flag",
     )
 
 
@@ -148,19 +157,27 @@ def _of_collision(name: str) -> _Read:
 
 
 def _ended_in_collision(_: Dataset, scenario: ScenarioRecord) -> bool | None:
-    return None if scenario["weather"] is None else scenario["collision"] is not None  # no weather: no meta
+    return (
+        None if scenario["weather"] is None else scenario["collision"] is not None
+    )  # no weather: no meta
 
 
 def _collision_status(_: Dataset, scenario: ScenarioRecord) -> str | None:
     told = scenario["collision"]
     if told is None:
         return None if scenario["weather"] is None else "no_collision"
-    return "collides_with_pedestrian" if "pedestrian" in told["classes"] else "collides_between_vehicles"
+    return (
+        "collides_with_pedestrian"
+        if "pedestrian" in told["classes"]
+        else "collides_between_vehicles"
+    )
 
 
 def _weather_group(_: Dataset, scenario: ScenarioRecord) -> str | None:
     weather = scenario["weather"]
-    return weather and next((name for word, name in _WEATHER_GROUPS.items() if word in weather), weather)
+    return weather and next(
+        (name for word, name in _WEATHER_GROUPS.items() if word in weather), weather
+    )
 
 
 def _time_of_day_group(_: Dataset, scenario: ScenarioRecord) -> str | None:
@@ -169,10 +186,15 @@ def _time_of_day_group(_: Dataset, scenario: ScenarioRecord) -> str | None:
 
 
 def _trajectory_type(_: Dataset, scenario: ScenarioRecord) -> str | None:
-    road, directions = scenario["road_type"], (scenario["ego_direction"], scenario["other_direction"])
+    road, directions = (
+        scenario["road_type"],
+        (scenario["ego_direction"], scenario["other_direction"]),
+    )
     if road is None or None in directions:
         return None
-    return _STRAIGHT if road.startswith("four") and directions == ("straight", "straight") else TURNING
+    return (
+        _STRAIGHT if road.startswith("four") and directions == ("straight", "straight") else TURNING
+    )
 
 
 def _closing_speed(dataset: Dataset, scenario: ScenarioRecord) -> float | None:
@@ -194,7 +216,9 @@ def _of_moving_pairs(name: str) -> Field:
     """One of the fields that are measures of a scenario's interactions."""
 
     def read_all(dataset: Dataset, scenarios: Sequence[ScenarioRecord]) -> Iterable[float | None]:
-        from deepaccident_devkit.interactions.scenario import each_of_moving_pairs  # other fields do without it
+        from deepaccident_devkit.interactions.scenario import (
+            each_of_moving_pairs,
+        )  # other fields do without it
 
         return each_of_moving_pairs(name, dataset, scenarios)
 
@@ -230,7 +254,11 @@ _DERIVED = (
         groups=True,
     ),
     Field(
-        "collision", "flag", "Whether meta names a collision; unknown without meta.", _ended_in_collision, groups=True
+        "collision",
+        "flag",
+        "Whether meta names a collision; unknown without meta.",
+        _ended_in_collision,
+        groups=True,
     ),
     Field(
         "collision_status",
@@ -240,7 +268,12 @@ _DERIVED = (
         ("no_collision", "collides_with_pedestrian", "collides_between_vehicles"),
         groups=True,
     ),
-    Field("collision_ids", "number", "Actors of the colliding pair, one of which must match.", _of_collision("ids")),
+    Field(
+        "collision_ids",
+        "number",
+        "Actors of the colliding pair, one of which must match.",
+        _of_collision("ids"),
+    ),
     Field(
         "collision_classes",
         "word",
@@ -255,9 +288,16 @@ _DERIVED = (
         _of_collision("agents"),
         taxonomy.VEHICLE_AGENTS,
     ),
-    Field("spawn_relation", "word", "As meta names it.", _of_collision("spawn_relation"), groups=True),
     Field(
-        "contact_side", "word", "As meta names it.", _of_collision("contact_side"), taxonomy.CONTACT_SIDES, groups=True
+        "spawn_relation", "word", "As meta names it.", _of_collision("spawn_relation"), groups=True
+    ),
+    Field(
+        "contact_side",
+        "word",
+        "As meta names it.",
+        _of_collision("contact_side"),
+        taxonomy.CONTACT_SIDES,
+        groups=True,
     ),
     Field("impact", "measure", "As meta has it.", _of_collision("impact")),
     Field(
@@ -288,7 +328,11 @@ _DERIVED = (
 FIELDS: Final = {
     field.name: field
     for field in (
-        *(_column(column) for column in table_spec("scenario").columns if not isinstance(column.kind, Struct)),
+        *(
+            _column(column)
+            for column in table_spec("scenario").columns
+            if not isinstance(column.kind, Struct)
+        ),
         *_DERIVED,
     )
 }

@@ -43,15 +43,26 @@ def find(dataset: Dataset, *where: str, **filters: FilterValue) -> list[Scenario
 
     Examples:
         >>> da.find(town=["Town03", "Town05"], collision=True, length="50..")  # doctest: +SKIP
-        >>> da.find("closing_speed>=10", time_of_day="Night", accident_visibility="invisible")  # doctest: +SKIP
+        >>> da.find(
+        ...     "closing_speed>=10", time_of_day="Night", accident_visibility="invisible"
+        ... )  # doctest: +SKIP
         >>> da.find(min_ttc="..1.5", collision=False)  # doctest: +SKIP
     """
     scenarios = dataset.scenario[:]
-    wanted = [*map(parse_where, where), *(keyword_filter(name, value) for name, value in filters.items())]
+    wanted = [
+        *map(parse_where, where),
+        *(keyword_filter(name, value) for name, value in filters.items()),
+    ]
     conditions = [_condition(dataset, scenarios, each) for each in wanted]
-    for condition in sorted(conditions, key=lambda each: each.field.costly):  # those last, on the few that are left
+    for condition in sorted(
+        conditions, key=lambda each: each.field.costly
+    ):  # those last, on the few that are left
         values = condition.field.values(dataset, scenarios)
-        scenarios = [scenario for scenario, value in zip(scenarios, values, strict=True) if condition.holds(value)]
+        scenarios = [
+            scenario
+            for scenario, value in zip(scenarios, values, strict=True)
+            if condition.holds(value)
+        ]
     return scenarios
 
 

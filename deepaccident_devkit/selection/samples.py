@@ -21,7 +21,13 @@ SampleProtocol = Literal["released", "paper"]
 Scope = Literal["accident", "all"]
 # Recorded frames from one key frame to the next, counted back from a scenario's last frame.
 _KEY_STEP: Final = 5
-_STEPS: Final = {"train": 10, "evaluate": _KEY_STEP, "all": _KEY_STEP, "keyframes": _KEY_STEP, "every": 1}
+_STEPS: Final = {
+    "train": 10,
+    "evaluate": _KEY_STEP,
+    "all": _KEY_STEP,
+    "keyframes": _KEY_STEP,
+    "every": 1,
+}
 _RELEASED_HORIZON: Final = 2.0
 
 
@@ -75,7 +81,9 @@ def samples(
     if not (1 <= steps < float("inf") and abs(steps - round(steps)) < 1e-6):
         raise ConfigError(f"horizon: {horizon} s is no multiple of 0.5 s; choose 0.5, 1, 1.5, …")
     if protocol == "released" and (seconds != _RELEASED_HORIZON or scope != "accident"):
-        raise ConfigError("the released protocol looks 2 s ahead in accident scenarios; choose protocol='paper'")
+        raise ConfigError(
+            "the released protocol looks 2 s ahead in accident scenarios; choose protocol='paper'"
+        )
 
     scenario_tokens = dataset.split_scenarios(split)
     if not scenario_tokens:
@@ -83,19 +91,28 @@ def samples(
             f"{split}: no scenario of this split is in {dataset.dataroot}; unpack that part of the release, or choose "
             f"another split: it has {_splits_text(dataset)}"
         )
-    wanted = np.isin(np.arange(len(dataset.scenario)), [dataset.getind("scenario", one) for one in scenario_tokens])
+    wanted = np.isin(
+        np.arange(len(dataset.scenario)),
+        [dataset.getind("scenario", one) for one in scenario_tokens],
+    )
     columns, scenarios = dataset.columns("sample"), dataset.columns("scenario")
     row = columns["scenario_row"]
     in_split = wanted[row] & columns["labelled"][:]
     if not in_split.any():
-        raise NotAvailableError(f"{split}: none of its samples here has labels (the test split has none)")
-    to_end = scenarios["num_frames"][row] - (columns["frame_row"] - scenarios["first_frame_row"][row] + 1)
+        raise NotAvailableError(
+            f"{split}: none of its samples here has labels (the test split has none)"
+        )
+    to_end = scenarios["num_frames"][row] - (
+        columns["frame_row"] - scenarios["first_frame_row"][row] + 1
+    )
     chosen = to_end % _STEPS[listed] == 0
     if listed == "evaluate":
         chosen &= (to_end > 0) & (to_end <= round(seconds / FRAME_PERIOD))
         if scope == "accident":
             chosen &= scenarios["designed_accident"][:][row]
-    tokens = [dataset.sample[index]["token"] for index in np.flatnonzero(in_split & chosen).tolist()]
+    tokens = [
+        dataset.sample[index]["token"] for index in np.flatnonzero(in_split & chosen).tolist()
+    ]
     return _with_files(dataset, tokens, channels) if channels else tokens
 
 
@@ -130,10 +147,14 @@ def no_samples_text(dataset: Dataset, split: str | os.PathLike[str], scope: Scop
 def _splits_text(dataset: Dataset) -> str:
     """`train: 2 scenarios, split unknown: 1 scenario`."""
     counts = Counter(scenario["split"] or "split unknown" for scenario in dataset.scenario)
-    return ", ".join(f"{name}: {count} scenario{'s' * (count != 1)}" for name, count in counts.items())
+    return ", ".join(
+        f"{name}: {count} scenario{'s' * (count != 1)}" for name, count in counts.items()
+    )
 
 
-def training_samples(dataset: Dataset, split: str | os.PathLike[str], *, sensors: Iterable[str] = ()) -> list[str]:
+def training_samples(
+    dataset: Dataset, split: str | os.PathLike[str], *, sensors: Iterable[str] = ()
+) -> list[str]:
     """The samples that a model is trained on, one a second: `samples` for the purpose `train`; see there."""
     return samples(dataset, split, "train", sensors=sensors)
 

@@ -16,7 +16,14 @@ from deepaccident_devkit.errors import ConfigError, TokenError
 from deepaccident_devkit.release import write_split_file
 from deepaccident_devkit.support.files import replacing
 from deepaccident_devkit.support.reports import Report
-from deepaccident_devkit.support.text import columns_text, counted, members_of, natural_order, path_of, share_text
+from deepaccident_devkit.support.text import (
+    columns_text,
+    counted,
+    members_of,
+    natural_order,
+    path_of,
+    share_text,
+)
 from deepaccident_devkit.taxonomy import MINI_SPLITS, SCENARIO_ATTRIBUTES, SPLITS, VEHICLE_AGENTS
 
 if TYPE_CHECKING:
@@ -75,11 +82,14 @@ class Splits:
             TokenError: a scenario's name has blanks, which a split file cannot hold.
         """
         return _write_all(
-            {path_of(folder) / f"{name}.txt": tokens for name, tokens in self.by_name().items()}, overwrite
+            {path_of(folder) / f"{name}.txt": tokens for name, tokens in self.by_name().items()},
+            overwrite,
         )
 
 
-def official_split(dataset: Dataset, seed: int = OFFICIAL_SEED, *, released_skip: bool = False) -> Splits:
+def official_split(
+    dataset: Dataset, seed: int = OFFICIAL_SEED, *, released_skip: bool = False
+) -> Splits:
     """Split a release as the official procedure does, but reproducibly.
 
     The official lists ship with the release and cannot be made again: their procedure starts from the order in which
@@ -104,9 +114,13 @@ def official_split(dataset: Dataset, seed: int = OFFICIAL_SEED, *, released_skip
             So it skips the pair after it, which then counts as not designed.
     """
     scenarios = dataset.scenario[:]
-    counted = [scenario for scenario in scenarios if _ego_labels(dataset, scenario) >= _FEWEST_LABELS]
+    counted = [
+        scenario for scenario in scenarios if _ego_labels(dataset, scenario) >= _FEWEST_LABELS
+    ]
     tokens = {scenario["token"] for scenario in counted}
-    left_out = tuple(sorted(scenario["token"] for scenario in scenarios if scenario["token"] not in tokens))
+    left_out = tuple(
+        sorted(scenario["token"] for scenario in scenarios if scenario["token"] not in tokens)
+    )
     return split_records(counted, seed, released_skip=released_skip, left_out=left_out)
 
 
@@ -127,10 +141,14 @@ def split_records(
         strata = _strata([of_token[token] for token in split], released_skip=released_skip)
         shares = (_DESIGNED_SHARE, _MINI_SHARE)
         minis.append(_dealt(strata, shares, round(_MINI_SHARE * len(split)), parts=1, seed=seed)[0])
-    return Splits(train=train, val=val, test=test, train_mini=minis[0], val_mini=minis[1], left_out=left_out)
+    return Splits(
+        train=train, val=val, test=test, train_mini=minis[0], val_mini=minis[1], left_out=left_out
+    )
 
 
-def save_selection(scenarios: Iterable[RowArgument], path: str | os.PathLike[str], *, overwrite: bool = False) -> Path:
+def save_selection(
+    scenarios: Iterable[RowArgument], path: str | os.PathLike[str], *, overwrite: bool = False
+) -> Path:
     """Write scenarios, such as `find` gives, as a split file that `split_scenarios(path)` reads.
 
     Args:
@@ -181,7 +199,10 @@ class SplitReport(Report):
         totals = {"scenarios": self.scenarios, "frames": self.frames}
         blocks = [
             f"DeepAccident {self.version} at {self.dataroot}",
-            columns_text([("split", *names)] + [(word, *map(str, row.values())) for word, row in totals.items()]),
+            columns_text(
+                [("split", *names)]
+                + [(word, *map(str, row.values())) for word, row in totals.items()]
+            ),
         ]
         for field, counts in self.attributes.items():
             rows = [
@@ -206,13 +227,20 @@ def split_report(dataset: Dataset, splits: Splits | Mapping[str, Collection[str]
         TokenError: a token is no scenario of the release.
     """
     by_name = splits.by_name() if isinstance(splits, Splits) else splits
-    records = {name: [dataset.scenario.get(token) for token in tokens] for name, tokens in by_name.items()}
+    records = {
+        name: [dataset.scenario.get(token) for token in tokens] for name, tokens in by_name.items()
+    }
     return SplitReport(
         dataroot=str(dataset.dataroot),
         version=dataset.version,
         scenarios={name: len(scenarios) for name, scenarios in records.items()},
-        frames={name: sum(scenario["num_frames"] for scenario in scenarios) for name, scenarios in records.items()},
-        attributes={field: _distribution(records, field) for field in (*SCENARIO_ATTRIBUTES, "collision")},
+        frames={
+            name: sum(scenario["num_frames"] for scenario in scenarios)
+            for name, scenarios in records.items()
+        },
+        attributes={
+            field: _distribution(records, field) for field in (*SCENARIO_ATTRIBUTES, "collision")
+        },
         left_out=splits.left_out if isinstance(splits, Splits) else (),
     )
 
@@ -244,7 +272,10 @@ def _strata(scenarios: Iterable[ScenarioRecord], *, released_skip: bool) -> _Str
     single_types: dict[str, list[_Unit]] = {}
     for token in singles:
         single_types.setdefault(of_token[token]["scenario_type"], []).append((token,))
-    return _by_junction(of_token, designed), [*_by_junction(of_token, others), *single_types.values()]
+    return _by_junction(of_token, designed), [
+        *_by_junction(of_token, others),
+        *single_types.values(),
+    ]
 
 
 def _order(scenario: ScenarioRecord) -> tuple[str, bool, str]:
@@ -279,7 +310,9 @@ def _is_designed(normal: ScenarioRecord, accident: ScenarioRecord) -> bool:
     return (first in _EGOS and second in _OTHERS) or (first in _OTHERS and second in _EGOS)
 
 
-def _by_junction(of_token: Mapping[str, ScenarioRecord], twins: Sequence[_Unit]) -> list[list[_Unit]]:
+def _by_junction(
+    of_token: Mapping[str, ScenarioRecord], twins: Sequence[_Unit]
+) -> list[list[_Unit]]:
     """Twins by the accident's meta: three-way; four-way from opposite; the rest."""
     strata: list[list[_Unit]] = [[], [], []]
     for twin in twins:
@@ -324,7 +357,9 @@ def _write_all(files: Mapping[Path, Sequence[str]], overwrite: bool) -> list[Pat
         for token in tokens:
             _check_line(path, token)
         if path.exists() and not overwrite:
-            raise ConfigError(f"{path}: is there already; choose another place, or ask to overwrite it")
+            raise ConfigError(
+                f"{path}: is there already; choose another place, or ask to overwrite it"
+            )
         if path.is_dir():
             raise ConfigError(f"{path}: is a folder; choose another place")
         if path.parent.exists() and not path.parent.is_dir():
@@ -351,8 +386,13 @@ def _check_line(path: Path, token: str) -> None:
         )
 
 
-def _distribution(records: Mapping[str, Sequence[ScenarioRecord]], field: str) -> dict[str, dict[str, int]]:
-    counts = {name: Counter(_shown(scenario, field) for scenario in scenarios) for name, scenarios in records.items()}
+def _distribution(
+    records: Mapping[str, Sequence[ScenarioRecord]], field: str
+) -> dict[str, dict[str, int]]:
+    counts = {
+        name: Counter(_shown(scenario, field) for scenario in scenarios)
+        for name, scenarios in records.items()
+    }
     values = sorted({value for counter in counts.values() for value in counter}, key=natural_order)
     return {value: {name: counter[value] for name, counter in counts.items()} for value in values}
 

@@ -90,7 +90,14 @@ def dataset_statistics(
     chosen = _Chosen(dataset, sorted(set(rows_of_scenarios(dataset, scenarios))))
     pairs, pair_histograms = _collisions(chosen)
     (distances, distance_quantiles), (speeds, speed_quantiles) = _distances(chosen), _speeds(chosen)
-    histograms = [_lengths(chosen), _ego_speeds(chosen), _actors(chosen), distances, speeds, *pair_histograms]
+    histograms = [
+        _lengths(chosen),
+        _ego_speeds(chosen),
+        _actors(chosen),
+        distances,
+        speeds,
+        *pair_histograms,
+    ]
     if interactions:
         histograms += _interactions(chosen, **how)
     quantiles = (_ego_sizes(chosen), _box_sizes(chosen), distance_quantiles, speed_quantiles)
@@ -129,10 +136,12 @@ class _Chosen:
         labelled[self.column("sample", "scenario_row")[self.column("sample", "labelled")]] = True
         self.labelled_group = np.where(labelled, self.scenario_group, np.int8(-1))
         self.unlabelled = LeftOut(
-            what="scenarios without labels", counts=_by_group(np.where(labelled, np.int8(-1), self.scenario_group))
+            what="scenarios without labels",
+            counts=_by_group(np.where(labelled, np.int8(-1), self.scenario_group)),
         )
         self.ends = {
-            each["token"]: scenario_end(each, self.agents.get(each["token"], [])) for each in self.scenarios.values()
+            each["token"]: scenario_end(each, self.agents.get(each["token"], []))
+            for each in self.scenarios.values()
         }
 
     def column(self, table: str, name: str) -> Any:
@@ -143,7 +152,9 @@ class _Chosen:
         """(N,) int8 group code of every row of a table."""
         if table not in self._groups:
             of, name = (
-                (self.group("sample"), "sample_row") if table == "annotation" else (self.scenario_group, "scenario_row")
+                (self.group("sample"), "sample_row")
+                if table == "annotation"
+                else (self.scenario_group, "scenario_row")
             )
             self._groups[table] = of[self.column(table, name)]
         return self._groups[table]
@@ -186,7 +197,9 @@ def _histogram(
     bins = np.searchsorted(bounds, values, side="right").astype(np.int8)  # 0 below, B + 1 above
     bins[values == bounds[-1]] = len(bounds) - 1
     bins[np.isnan(values)] = -1
-    below, *rows, above = _by_code([str(place) for place in range(len(edges) + 1)], bins, groups).values()
+    below, *rows, above = _by_code(
+        [str(place) for place in range(len(edges) + 1)], bins, groups
+    ).values()
     name, title, field, unit = names
     return Histogram(
         name=name,
@@ -201,7 +214,9 @@ def _histogram(
     )
 
 
-def _quantile_rows(field: str, category: str, values: FloatArray, groups: AnyArray) -> list[QuantileRow]:
+def _quantile_rows(
+    field: str, category: str, values: FloatArray, groups: AnyArray
+) -> list[QuantileRow]:
     """The quantiles of values (N,) without NaN in every group."""
     chosen = [values[groups == code] for code in range(len(_PARTS))]
     everything = np.concatenate(chosen)
@@ -224,14 +239,16 @@ def _scenario_counts(chosen: _Chosen) -> list[CountTable]:
     frames = np.array([scenario["num_frames"] for scenario in records], dtype=np.int64)
     for name, (title, field, known, counted) in _OF_SCENARIOS.items():
         words = [
-            (chosen.ends[scenario["token"]] if field == "end" else word_of(scenario, field)) or UNKNOWN_SPLIT
+            (chosen.ends[scenario["token"]] if field == "end" else word_of(scenario, field))
+            or UNKNOWN_SPLIT
             for scenario in records
         ]
         others = sorted(set(words) - {*known, UNKNOWN_SPLIT})
         listed = [*known, *others, *({UNKNOWN_SPLIT} & set(words))]
         rows = {word: [row for row, each in enumerate(words) if each == word] for word in listed}
         counts = {
-            word: _by_group(groups[here], frames[here] if counted == "frames" else None) for word, here in rows.items()
+            word: _by_group(groups[here], frames[here] if counted == "frames" else None)
+            for word, here in rows.items()
         }
         made.append(CountTable(name=name, title=title, field=field, counted=counted, counts=counts))
     return made
@@ -264,7 +281,9 @@ def _actor_counts(chosen: _Chosen) -> list[CountTable]:
 
 def _lengths(chosen: _Chosen) -> Histogram:
     """Recorded frames of scenarios; meta's simulated ones are ten more."""
-    lengths = np.array([scenario["num_frames"] for scenario in chosen.scenarios.values()], dtype=np.float64)
+    lengths = np.array(
+        [scenario["num_frames"] for scenario in chosen.scenarios.values()], dtype=np.float64
+    )
     groups = chosen.scenario_group[list(chosen.scenarios)]
     names = ("lengths", "Lengths of scenarios", "length", "frames")
     return _histogram(names, "scenarios", lengths, groups, range(30, 101, 10))
@@ -273,17 +292,26 @@ def _lengths(chosen: _Chosen) -> Histogram:
 def _ego_speeds(chosen: _Chosen) -> Histogram:
     """Speeds of `ego_vehicle` at its samples, by the first line of their labels."""
     ego = chosen.column("sample", "agent") == AGENTS.index(_EGO)
-    speeds, groups = np.linalg.norm(chosen.column("sample", "velocity")[ego], axis=1), chosen.group("sample")[ego]
-    without = LeftOut(what="ego samples without a label", counts=_by_group(groups[~np.isfinite(speeds)]))
+    speeds, groups = (
+        np.linalg.norm(chosen.column("sample", "velocity")[ego], axis=1),
+        chosen.group("sample")[ego],
+    )
+    without = LeftOut(
+        what="ego samples without a label", counts=_by_group(groups[~np.isfinite(speeds)])
+    )
     names = ("ego_speeds", "Speed of the ego vehicle", "speed", "m/s")
     return _histogram(names, "ego samples", speeds, groups, tuple(range(21)), without)
 
 
 def _actors(chosen: _Chosen) -> Histogram:
     """Actors (instances) of each labelled scenario."""
-    numbers = np.bincount(chosen.column("instance", "scenario_row"), minlength=len(chosen.scenario_group)).astype(float)
+    numbers = np.bincount(
+        chosen.column("instance", "scenario_row"), minlength=len(chosen.scenario_group)
+    ).astype(float)
     names = ("actors", "Actors a scenario", "actors", "actors")
-    return _histogram(names, "scenarios", numbers, chosen.labelled_group, range(0, 201, 10), chosen.unlabelled)
+    return _histogram(
+        names, "scenarios", numbers, chosen.labelled_group, range(0, 201, 10), chosen.unlabelled
+    )
 
 
 def _ego_sizes(chosen: _Chosen) -> QuantileTable:
@@ -302,7 +330,9 @@ def _ego_sizes(chosen: _Chosen) -> QuantileTable:
         unit="m",
         counted="scenarios",
         quantiles=tuple(rows),
-        left_out=LeftOut(what="scenarios whose ego has no label row of its own", counts=_by_group(groups[~known])),
+        left_out=LeftOut(
+            what="scenarios whose ego has no label row of its own", counts=_by_group(groups[~known])
+        ),
     )
 
 
@@ -331,7 +361,9 @@ def _distances(chosen: _Chosen) -> tuple[Histogram, QuantileTable]:
     groups = np.where(of_others, chosen.group("annotation"), np.int8(-1))
     names = ("distances", "Distance from the agent", "distance", "m")
     what = ("annotations of others", tuple(range(0, 101, 5)), chosen.unlabelled)
-    return _distribution(names, what, np.hypot(x, y), chosen.column("annotation", "category"), groups)
+    return _distribution(
+        names, what, np.hypot(x, y), chosen.column("annotation", "category"), groups
+    )
 
 
 def _speeds(chosen: _Chosen) -> tuple[Histogram, QuantileTable]:
@@ -339,7 +371,9 @@ def _speeds(chosen: _Chosen) -> tuple[Histogram, QuantileTable]:
     parked = chosen.column("instance", "actor_id") >= STATIC_ACTOR_ID
     x, y = chosen.column("track", "velocity")[:, :2].T
     speeds = np.hypot(x, y)
-    groups = np.where(parked[chosen.column("track", "instance_row")], np.int8(-1), chosen.group("track"))
+    groups = np.where(
+        parked[chosen.column("track", "instance_row")], np.int8(-1), chosen.group("track")
+    )
     why = "moments of actors whose label has no velocity, and that no agent saw in the frame before or after"
     left_out = LeftOut(what=why, counts=_by_group(groups[~np.isfinite(speeds)]))
     names = ("speeds", "Speed of actors that are not parked", "speed", "m/s")
@@ -409,15 +443,20 @@ def _collisions(chosen: _Chosen) -> tuple[tuple[CollisionPair, ...], list[Histog
     for row, scenario in chosen.scenarios.items():
         if scenario["collision"] is None:
             continue
-        names = {each["actor_id"]: each["name"] for each in chosen.agents.get(scenario["token"], [])}
+        names = {
+            each["actor_id"]: each["name"] for each in chosen.agents.get(scenario["token"], [])
+        }
         ids = _in_agents_order(scenario["collision"]["ids"], names)
         here = tracks.get(row, {})
         if len(set(ids)) == len(ids) and set(ids) <= set(here):
-            pairs.append(_pair(chosen, scenario, [here[actor] for actor in ids], list(map(names.get, ids))))
+            pairs.append(
+                _pair(chosen, scenario, [here[actor] for actor in ids], list(map(names.get, ids)))
+            )
         else:
             without.append(chosen.scenario_group[row])
     left_out = LeftOut(
-        what="collisions without a pair labelled at the last frame", counts=_by_group(np.array(without, dtype=np.int8))
+        what="collisions without a pair labelled at the last frame",
+        counts=_by_group(np.array(without, dtype=np.int8)),
     )
     groups = np.array([_PARTS.index(pair.split) for pair in pairs], dtype=np.int8)
     values = {
@@ -443,7 +482,9 @@ def _tracks_at_the_end(chosen: _Chosen) -> dict[int, dict[int, int]]:
     actors = chosen.column("instance", "actor_id")[chosen.column("track", "instance_row")[rows]]
     scenarios = chosen.column("track", "scenario_row")[rows]
     tracks: dict[int, dict[int, int]] = {}
-    for scenario, actor, row in zip(scenarios.tolist(), actors.tolist(), rows.tolist(), strict=True):
+    for scenario, actor, row in zip(
+        scenarios.tolist(), actors.tolist(), rows.tolist(), strict=True
+    ):
         tracks.setdefault(scenario, {})[actor] = row
     return tracks
 

@@ -78,7 +78,9 @@ class Overview(Report):
             splits += [(name, f"{scenarios} of {count}") for name, count in self.expected.items()]
         blocks = [
             head,
-            table_text("table", "rows", [(name, f"{rows:,}") for name, rows in self.tables.items()]),
+            table_text(
+                "table", "rows", [(name, f"{rows:,}") for name, rows in self.tables.items()]
+            ),
             table_text("split", "scenarios", splits),
             table_text(
                 "agent",
@@ -95,19 +97,25 @@ class Overview(Report):
                 ]
             ),
             *(
-                table_text(field, "scenarios", [(value, str(count)) for value, count in counts.items()])
+                table_text(
+                    field, "scenarios", [(value, str(count)) for value, count in counts.items()]
+                )
                 for field, counts in self.attributes.items()
             ),
         ]
         if self.left_out:
-            blocks.append("left out as broken:\n" + "\n".join(f"  {token}" for token in self.left_out))
+            blocks.append(
+                "left out as broken:\n" + "\n".join(f"  {token}" for token in self.left_out)
+            )
         return "\n\n".join(blocks)
 
 
 def overview(dataset: Dataset) -> Overview:
     """Count what a release holds."""
     scenarios, agents = dataset.scenario[:], dataset.agent[:]
-    samples = {agent["token"]: dataset.get("sample", agent["first_sample_token"]) for agent in agents}
+    samples = {
+        agent["token"]: dataset.get("sample", agent["first_sample_token"]) for agent in agents
+    }
     split_counts = Counter(scenario["split"] or _UNKNOWN for scenario in scenarios)
     expected = {"v1": EXPECTED_SCENARIOS, "v1-mini": {"v1-mini": EXPECTED_MINI_SCENARIOS}}
     files = _channel_files(dataset, scenarios)
@@ -117,11 +125,17 @@ def overview(dataset: Dataset) -> Overview:
         layout=dataset.layout,
         index=str(dataset.tables_folder),
         tables={name: len(dataset.arrow(name)) for name in dataset.table_names},
-        splits={name: split_counts[name] for name in (*SPLITS, _UNKNOWN) if split_counts[name] or name in SPLITS},
+        splits={
+            name: split_counts[name]
+            for name in (*SPLITS, _UNKNOWN)
+            if split_counts[name] or name in SPLITS
+        },
         expected=expected.get(dataset.version, {}),
         agents={name: sum(agent["name"] == name for agent in agents) for name in AGENTS},
         labelled={
-            name: sum(agent["name"] == name and samples[agent["token"]]["labelled"] for agent in agents)
+            name: sum(
+                agent["name"] == name and samples[agent["token"]]["labelled"] for agent in agents
+            )
             for name in AGENTS
         },
         channels={channel: sum(count > 0 for count in counts) for channel, counts in files.items()},
@@ -130,7 +144,10 @@ def overview(dataset: Dataset) -> Overview:
         samples=len(dataset.sample),
         attributes={
             "collision": _counts(map(_collides, scenarios)),
-            **{field: _counts(scenario[field] for scenario in scenarios) for field in SCENARIO_ATTRIBUTES},
+            **{
+                field: _counts(scenario[field] for scenario in scenarios)
+                for field in SCENARIO_ATTRIBUTES
+            },
         },
         left_out=[problem.scenario for problem in dataset.problems],
     )
@@ -143,7 +160,9 @@ def scenario_lines(scenarios: Iterable[ScenarioRecord]) -> list[str]:
         end = _ENDS[_collides(scenario)]
         weather = f"{scenario['weather'] or _UNKNOWN} {scenario['time_of_day'] or ''}".strip()
         split = scenario["split"] or "split unknown"
-        lines.append(f"{scenario['token']}  {scenario['num_frames']} frames  {split}  {weather}  {end}")
+        lines.append(
+            f"{scenario['token']}  {scenario['num_frames']} frames  {split}  {weather}  {end}"
+        )
     return lines
 
 

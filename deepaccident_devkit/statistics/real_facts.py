@@ -15,7 +15,9 @@ from deepaccident_devkit.support.arrays import ShortRepr
 from deepaccident_devkit.support.json_text import as_record
 
 FactVerdict = Literal["agree", "differ", "cannot say"]
-FactKind = Literal["all", "some", "share", "mean", "median", "few", "most", "least", "area", "range"]
+FactKind = Literal[
+    "all", "some", "share", "mean", "median", "few", "most", "least", "area", "range"
+]
 """What is compared: a share (that must be all, or some, or is a number), a mean, a median, percentiles where there are
 few real cases, the most, the least, an AUC, or a median that lies in a range."""
 
@@ -60,11 +62,26 @@ class Fact(ShortRepr):
     def texts(self) -> tuple[str, ...]:
         """A table's cells: fact, confidence, others, here, cases, verdict."""
         words = {"all": "always", "some": "occurs", "range": _text(self.limits, self.unit, " to ")}
-        of = f" ({self.source}{f', {self.real_cases:,}' if self.real_cases else ''})" if self.source else ""
+        of = (
+            f" ({self.source}{f', {self.real_cases:,}' if self.real_cases else ''})"
+            if self.source
+            else ""
+        )
         others = words.get(self.kind) or _text(self.real, self.unit)
         here = "–" if self.here is None else _text([self.here], self.unit)
-        within = f" [{_text(self.ends or (), self.unit, ' … ')}]" if len({self.here, *(self.ends or ())}) > 1 else ""
-        return self.name, self.confidence, others + of, here + within, f"{self.cases:,}", self.verdict
+        within = (
+            f" [{_text(self.ends or (), self.unit, ' … ')}]"
+            if len({self.here, *(self.ends or ())}) > 1
+            else ""
+        )
+        return (
+            self.name,
+            self.confidence,
+            others + of,
+            here + within,
+            f"{self.cases:,}",
+            self.verdict,
+        )
 
 
 def _text(values: Sequence[float], unit: str, between: str = ", ") -> str:

@@ -61,10 +61,17 @@ class ReleaseFacts(CheckReport):
             **self.counts,
         }
         return {
-            "facts": [("fact", "conf.", "others", "here", "cases", "verdict"), *(fact.texts() for fact in self.facts)],
+            "facts": [
+                ("fact", "conf.", "others", "here", "cases", "verdict"),
+                *(fact.texts() for fact in self.facts),
+            ],
             "counts": [
                 ("of", "what", "number"),
-                *((name, word, f"{number:,}") for name, words in counts.items() for word, number in words.items()),
+                *(
+                    (name, word, f"{number:,}")
+                    for name, words in counts.items()
+                    for word, number in words.items()
+                ),
             ],
         }
 
@@ -87,9 +94,15 @@ def release_facts(
         ChoiceError: `workers` is less than 1.
         WorkerError: a worker was killed, or cannot do the work.
     """
-    found = those_of(ScenarioFacts, each_scenario(counted_scenario_facts, dataset, scenarios, label="facts", **how))
+    found = those_of(
+        ScenarioFacts,
+        each_scenario(counted_scenario_facts, dataset, scenarios, label="facts", **how),
+    )
     broken = [" ".join(problem.messages) for problem in dataset.problems]
-    parts = {fact.key: [each.values[fact.key] for each in found if fact.key in each.values] for fact in FACTS}
+    parts = {
+        fact.key: [each.values[fact.key] for each in found if fact.key in each.values]
+        for fact in FACTS
+    }
     for key, phrase in _BROKEN.items():
         parts[key] = [np.ones(1)] * len(found) + [np.zeros(1) for text in broken if phrase in text]
     counts = {
@@ -115,17 +128,23 @@ def _compared(fact: Fact, parts: Sequence[FloatArray]) -> Fact:
     return found if here is None else replace(found, verdict=_verdict(found, here))
 
 
-def _measured(fact: Fact, parts: Sequence[FloatArray]) -> tuple[float | None, tuple[float, float] | None]:
+def _measured(
+    fact: Fact, parts: Sequence[FloatArray]
+) -> tuple[float | None, tuple[float, float] | None]:
     """A release's number, and its ends; the scenarios, not their cases, are what is independent."""
     values, number = np.concatenate(parts), len(parts)
     if fact.kind == "area":
         hit = values[:, 1] > 0
-        smaller = np.sign(np.subtract.outer(values[~hit, 0], values[hit, 0])) / 2 + 0.5  # ties count half
+        smaller = (
+            np.sign(np.subtract.outer(values[~hit, 0], values[hit, 0])) / 2 + 0.5
+        )  # ties count half
         return (float(smaller.mean()) if smaller.size else None), None
     if fact.kind in ("few", "median", "range", "most", "least"):
         half = min(_Z / 2 / math.sqrt(number), 0.5)
         levels = {"few": (0.05, 0.5, 0.95), "most": (1, 1, 1), "least": (0, 0, 0)}
-        low, here, high = np.quantile(values, levels.get(fact.kind, (0.5 - half, 0.5, 0.5 + half))).tolist()
+        low, here, high = np.quantile(
+            values, levels.get(fact.kind, (0.5 - half, 0.5, 0.5 + half))
+        ).tolist()
         return here, (low, high)
     mean = float(values.mean())
     off = np.array([(each - mean).sum() for each in parts]) / len(values)
@@ -139,7 +158,9 @@ def _measured(fact: Fact, parts: Sequence[FloatArray]) -> tuple[float | None, tu
 def _wilson(share: float, number: float) -> tuple[float, float]:
     """The ends of Wilson's 95 % interval of a share of so many cases."""
     half = _Z * math.sqrt(share * (1 - share) / number + (_Z / 2 / number) ** 2)
-    low, high = ((share + _Z**2 / 2 / number + each) / (1 + _Z**2 / number) for each in (-half, half))
+    low, high = (
+        (share + _Z**2 / 2 / number + each) / (1 + _Z**2 / number) for each in (-half, half)
+    )
     return max(low, 0.0), min(high + 1e-12, 1.0)  # which rounding would keep from 1
 
 
@@ -150,7 +171,13 @@ def _verdict(fact: Fact, here: float) -> FactVerdict:
     if fact.kind == "few":
         agrees = low <= min(fact.real) and max(fact.real) <= high
     if fact.kind in ("share", "mean", "median"):
-        known = _wilson(fact.real[0], fact.real_cases) if fact.kind == "share" and fact.real_cases < MANY else fact.real
+        known = (
+            _wilson(fact.real[0], fact.real_cases)
+            if fact.kind == "share" and fact.real_cases < MANY
+            else fact.real
+        )
         agrees = 2 * low - here <= known[-1] and known[0] <= 2 * high - here
     certain = fact.kind == "all" or (agrees and fact.kind in ("some", "most", "least"))
-    return "cannot say" if fact.scenarios < FEWEST and not certain else "agree" if agrees else "differ"
+    return (
+        "cannot say" if fact.scenarios < FEWEST and not certain else "agree" if agrees else "differ"
+    )

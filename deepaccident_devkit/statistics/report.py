@@ -91,9 +91,16 @@ class DatasetStatistics(Report):
         sums = {"scenarios": self.scenarios, "frames": self.frames, "samples": self.samples}
         blocks = [
             head,
-            columns_text([("", *self.groups)] + [(word, *self._cells(counts)) for word, counts in sums.items()]),
+            columns_text(
+                [("", *self.groups)]
+                + [(word, *self._cells(counts)) for word, counts in sums.items()]
+            ),
         ]
-        blocks += [self._shares_text(table) for table in self.counts.values() if table.counted == "scenarios"]
+        blocks += [
+            self._shares_text(table)
+            for table in self.counts.values()
+            if table.counted == "scenarios"
+        ]
         blocks += [self._lengths_text(), self._categories_text()]
         if CRITICAL in self.histograms:
             blocks.append(self._critical_text())
@@ -103,7 +110,9 @@ class DatasetStatistics(Report):
             if table.left_out and table.left_out.counts[TOTAL]
         }
         if left_out:
-            blocks.append("\n".join(["left out where a value is needed that they lack:", *sorted(left_out)]))
+            blocks.append(
+                "\n".join(["left out where a value is needed that they lack:", *sorted(left_out)])
+            )
         return "\n\n".join(blocks)
 
     def _cells(self, counts: Mapping[str, int]) -> list[str]:
@@ -124,7 +133,9 @@ class DatasetStatistics(Report):
             (label, *(str(lengths.counts[group][index]) for group in self.groups))
             for index, label in enumerate(lengths.bin_labels())
         ]
-        return columns_text([("length in frames", *self.groups), *rows, ("other", *self._cells(lengths.outside))])
+        return columns_text(
+            [("length in frames", *self.groups), *rows, ("other", *self._cells(lengths.outside))]
+        )
 
     def _critical_text(self) -> str:
         """Scenarios in which a moving pair comes below some times to collision, of those with labels."""
@@ -133,7 +144,10 @@ class DatasetStatistics(Report):
         rows = [
             (
                 f"below {limit:g} s",
-                *(share_text(sum(times.counts[each][: times.edges.index(limit)]), labelled[each]) for each in labelled),
+                *(
+                    share_text(sum(times.counts[each][: times.edges.index(limit)]), labelled[each])
+                    for each in labelled
+                ),
             )
             for limit in _LIMITS
         ]
@@ -144,16 +158,28 @@ class DatasetStatistics(Report):
         sizes = self.quantiles["box_sizes"]
         rows = []
         for category in CATEGORIES:
-            size = [number_text(sizes.median(field, category), 2) for field in ("length", "width", "height")]
+            size = [
+                number_text(sizes.median(field, category), 2)
+                for field in ("length", "width", "height")
+            ]
             rows.append(
                 (
                     category,
                     f"{self.counts['instances'].counts[category][TOTAL]:,}",
                     f"{self.counts['annotations'].counts[category][TOTAL]:,}",
                     " × ".join(size) if size[0] != "–" else "–",
-                    number_text(self.quantiles["distance_quantiles"].median("distance", category), 1),
+                    number_text(
+                        self.quantiles["distance_quantiles"].median("distance", category), 1
+                    ),
                     number_text(self.quantiles["speed_quantiles"].median("speed", category), 1),
                 )
             )
-        heading = ("category, medians", "instances", "annotations", "l × w × h (m)", "distance (m)", "speed (m/s)")
+        heading = (
+            "category, medians",
+            "instances",
+            "annotations",
+            "l × w × h (m)",
+            "distance (m)",
+            "speed (m/s)",
+        )
         return columns_text([heading, *rows])

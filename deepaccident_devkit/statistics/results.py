@@ -182,7 +182,10 @@ class QuantileTable(ShortRepr):
         absent = (None,) * len(PROBABILITIES)
         return [
             ("field", "category", "group", "number", *names),
-            *((row.field, row.category, row.group, row.number, *(row.values or absent)) for row in self.quantiles),
+            *(
+                (row.field, row.category, row.group, row.number, *(row.values or absent))
+                for row in self.quantiles
+            ),
         ]
 
 
@@ -220,7 +223,10 @@ class CollisionPair(ShortRepr):
 
 def collision_rows(pairs: tuple[CollisionPair, ...]) -> list[StatisticsRow]:
     """A heading, then a row a pair."""
-    return [tuple(field.name for field in fields(CollisionPair)), *(astuple(pair) for pair in pairs)]
+    return [
+        tuple(field.name for field in fields(CollisionPair)),
+        *(astuple(pair) for pair in pairs),
+    ]
 
 
 StatisticsTable = CountTable | Histogram | QuantileTable
@@ -240,14 +246,21 @@ def scenario_end(scenario: ScenarioRecord, agents: Sequence[AgentRecord]) -> str
     return _undesigned_end(scenario, collision, agents)
 
 
-def _undesigned_end(scenario: ScenarioRecord, collision: CollisionRecord, agents: Sequence[AgentRecord]) -> str | None:
+def _undesigned_end(
+    scenario: ScenarioRecord, collision: CollisionRecord, agents: Sequence[AgentRecord]
+) -> str | None:
     """Of a collision that realises no design: whether its pair are agents; None where meta is silent."""
     here = {agent["name"]: agent["actor_id"] for agent in agents if not agent["is_infrastructure"]}
     names = collision["agents"] or (None, None)
-    missing = set(VEHICLE_AGENTS) - set(here)  # of a partial download: meta's names stand for their ids
+    missing = set(VEHICLE_AGENTS) - set(
+        here
+    )  # of a partial download: meta's names stand for their ids
     if None in here.values() or (missing and collision["agents"] is None):
         return None
-    if not all(actor in here.values() or name in missing for actor, name in zip(collision["ids"], names, strict=True)):
+    if not all(
+        actor in here.values() or name in missing
+        for actor, name in zip(collision["ids"], names, strict=True)
+    ):
         return WITH_OTHER
     story = ("road_type", "spawn_side", "ego_direction", "other_direction")
     return None if None in [scenario[word] for word in story] else NO_DESIGN  # type: ignore[literal-required]

@@ -71,7 +71,9 @@ class ScenarioFacts:
 
 def counted_scenario_facts(dataset: Dataset, record: ScenarioRecord) -> ScenarioFacts:
     """The facts of one scenario; raises MetaError where its meta file has become unreadable."""
-    folder = ScenarioFolder(dataset.dataroot, record["folder"], record["scenario_type"], record["name"], AGENTS)
+    folder = ScenarioFolder(
+        dataset.dataroot, record["folder"], record["scenario_type"], record["name"], AGENTS
+    )
     seen, frame, collision = _Seen(dataset, record), record["velocity_frame"], record["collision"]
     labelled = len(np.unique(seen.column("sample", "agent")[seen.labelled]))
     values: dict[str, ArrayLike] = {
@@ -88,11 +90,18 @@ def counted_scenario_facts(dataset: Dataset, record: ScenarioRecord) -> Scenario
         "agents with labels": str(labelled),
         "velocity frame": frame,
         **{name: dict(record)[name] for name in _WORDS},
-        **({"token 7": collision["spawn_relation"], "token 8": collision["contact_side"]} if collision else {}),
+        **(
+            {"token 7": collision["spawn_relation"], "token 8": collision["contact_side"]}
+            if collision
+            else {}
+        ),
     }
     ids = seen.column("annotation", "actor_id")
     arrays = {key: as_floats(each) for key, each in values.items() if np.size(each)}
-    known = {key: each[np.isfinite(each.reshape(len(each), -1)).all(axis=1)] for key, each in arrays.items()}
+    known = {
+        key: each[np.isfinite(each.reshape(len(each), -1)).all(axis=1)]
+        for key, each in arrays.items()
+    }
     return ScenarioFacts(
         values={key: each for key, each in known.items() if len(each)},
         counts={
@@ -118,20 +127,34 @@ class _Seen:
     """
 
     def __init__(self, dataset: Dataset, record: ScenarioRecord) -> None:
-        self.dataset, self.frames, row = dataset, record["num_frames"], dataset.getind("scenario", record["token"])
+        self.dataset, self.frames, row = (
+            dataset,
+            record["num_frames"],
+            dataset.getind("scenario", record["token"]),
+        )
         tracks = scenario_tracks(dataset, record["token"])
         self.ids, first, actor = np.unique(tracks.actor_id, return_index=True, return_inverse=True)
         boxes, dense = tracks.boxes, np.full((len(self.ids), self.frames, 8), np.nan)
         dense[actor.reshape(-1), tracks.index - 1] = np.column_stack(
-            [boxes.center[:, :2], boxes.size[:, :2], boxes.yaw, boxes.velocity[:, :2], tracks.agents & 1]
+            [
+                boxes.center[:, :2],
+                boxes.size[:, :2],
+                boxes.yaw,
+                boxes.velocity[:, :2],
+                tracks.agents & 1,
+            ]
         )
         self.boxes, self.velocity, self.by_ego = dense[..., :5], dense[..., 5:7], dense[..., 7] == 1
-        before = np.pad(dense[..., :2], ((0, 0), (_HALF, 0), (0, 0)), constant_values=np.nan)[:, :-_HALF]
+        before = np.pad(dense[..., :2], ((0, 0), (_HALF, 0), (0, 0)), constant_values=np.nan)[
+            :, :-_HALF
+        ]
         moved = (dense[..., :2] - before) * (_SECOND / _HALF)
         self.recent = np.where(np.isnan(moved), self.velocity, moved)
         self.vehicle: BoolArray = boxes.category[first] != _PEDESTRIAN
         of_samples = dataset.columns("sample")["scenario_row"]
-        self.samples = slice(*of_samples.searchsorted(np.array([row, row + 1], dtype=of_samples.dtype)).tolist())
+        self.samples = slice(
+            *of_samples.searchsorted(np.array([row, row + 1], dtype=of_samples.dtype)).tolist()
+        )
         self.drives: BoolArray = self.column("sample", "agent") != AGENTS.index(INFRASTRUCTURE)
         self.labelled: BoolArray = self.column("sample", "labelled")
 
@@ -139,20 +162,29 @@ class _Seen:
         """What a column of samples, poses, label rows or sensor files has of this scenario."""
         columns, rows = self.dataset.columns(table), self.samples
         if (keys := columns.get("sample_row")) is not None:
-            ends = np.array([rows.start, rows.stop], dtype=keys.dtype)  # of another type, all rows would be copied
+            ends = np.array(
+                [rows.start, rows.stop], dtype=keys.dtype
+            )  # of another type, all rows would be copied
             rows = slice(*keys.searchsorted(ends).tolist())
         return np.asarray(columns[name][rows])
 
 
 def _of_meta(seen: _Seen, record: ScenarioRecord, meta: Meta) -> dict[str, ArrayLike]:
     """What follows from the meta file and the folder's name; and what is foreseen of the collision."""
-    accident, frames, collision, ids = record["designed_accident"], record["num_frames"], meta.collision, meta.agent_ids
+    accident, frames, collision, ids = (
+        record["designed_accident"],
+        record["num_frames"],
+        meta.collision,
+        meta.agent_ids,
+    )
     values: dict[str, ArrayLike] = {
         "accident_without" if accident else "normal_with": [accident == (collision is None)],
         "folder_right": [accident == (collision is not None)],
         "accident_frames" if accident else "normal_frames": [frames],
         "length": [(frames, collision is not None)],
-        "known_words": [(getattr(meta, name) or known[0]) in known for name, known in _WORDS.items()],
+        "known_words": [
+            (getattr(meta, name) or known[0]) in known for name, known in _WORDS.items()
+        ],
         "ids_ascend": [ids[2] < ids[0] < ids[1] < ids[3]] if ids else [],
         "none_none": [meta.planned_agents is None] if ids and collision is None else [],
         **_foreseen(seen, collided=collision is not None),
@@ -161,7 +193,11 @@ def _of_meta(seen: _Seen, record: ScenarioRecord, meta: Meta) -> dict[str, Array
         return values
     names = dict(zip(ids or (), VEHICLE_AGENTS, strict=False))
     pair, unknown = {names.get(each) for each in collision.ids}, 0 in collision.ids
-    pairs = {"designed": VEHICLE_AGENTS[::2], "behind": VEHICLE_AGENTS[1::2], "follower": VEHICLE_AGENTS[1:3]}
+    pairs = {
+        "designed": VEHICLE_AGENTS[::2],
+        "behind": VEHICLE_AGENTS[1::2],
+        "follower": VEHICLE_AGENTS[1:3],
+    }
     return values | {
         "frames_by_meta": [frames == meta.recorded_frames],
         "short": [frames - 1 < _SECONDS_AHEAD[-1] * _SECOND],
@@ -184,7 +220,10 @@ def _of_contact(seen: _Seen, pair: tuple[int, int]) -> dict[str, ArrayLike]:
         return {}
     first, other = seen.boxes[rows][:, known]
     apart = signed_gaps(first, other)
-    touching, last_second = np.flatnonzero(apart <= 0), _SECOND * (np.ceil((seen.frames - 1) / _SECOND) - 1)
+    touching, last_second = (
+        np.flatnonzero(apart <= 0),
+        _SECOND * (np.ceil((seen.frames - 1) / _SECOND) - 1),
+    )
     before = max(int([*touching, len(known) - 1][0]) - 1, 0)
     turn, velocity = first[before, 4] - other[before, 4], seen.velocity[rows, known[before]]
     return {
@@ -204,7 +243,10 @@ def _of_agents(seen: _Seen) -> dict[str, ArrayLike]:
     speed, cars = np.hypot(*seen.column("sample", "velocity")[seen.drives].T), poses[seen.drives]
     known, poles = speed[np.isfinite(speed)], poses[~seen.drives][: len(cars)]
     below = [cars[np.hypot(*(cars - pole)[:, :2, 3].T).argmin(), 2, 3] for pole in poles[:1]]
-    places, of = seen.dataset.columns("calibrated_sensor"), seen.column("sample_data", "calibrated_sensor_row")
+    places, of = (
+        seen.dataset.columns("calibrated_sensor"),
+        seen.column("sample_data", "calibrated_sensor_row"),
+    )
     moved = seen.column("sample_data", "matrix")[:, 3::4] - places["matrix"][of][:, 3:12:4]
     return {
         "pitch": np.degrees(np.arcsin(np.abs(cars[:, 2, 0]).clip(max=1))),
@@ -223,15 +265,26 @@ def _of_labels(seen: _Seen) -> dict[str, ArrayLike]:
 
     Untracked ones are left out; ego itself counts among those that overlap and come near.
     """
-    ids, sample = seen.column("annotation", "actor_id"), seen.column("annotation", "sample_row") - seen.samples.start
+    ids, sample = (
+        seen.column("annotation", "actor_id"),
+        seen.column("annotation", "sample_row") - seen.samples.start,
+    )
     vehicle = (ids > 0) & (seen.column("annotation", "category") != _PEDESTRIAN)
-    own, vehicles = (np.bincount(sample[rows], minlength=len(seen.drives)) for rows in (ids == OWN_ACTOR_ID, vehicle))
+    own, vehicles = (
+        np.bincount(sample[rows], minlength=len(seen.drives))
+        for rows in (ids == OWN_ACTOR_ID, vehicle)
+    )
     boxes = np.where(seen.by_ego[..., None], seen.boxes, np.nan)[seen.vehicle]
     pairs = np.stack(np.triu_indices(len(boxes), 1))
-    gaps, moves = gaps_of_pairs(*boxes[pairs]), (np.hypot(*seen.velocity[seen.vehicle].T) > _MOVING_SPEED).T[pairs]
+    gaps, moves = (
+        gaps_of_pairs(*boxes[pairs]),
+        (np.hypot(*seen.velocity[seen.vehicle].T) > _MOVING_SPEED).T[pairs],
+    )
     here, movers = np.isfinite(gaps) & moves.any(axis=0), moves.sum(axis=0)[gaps == 0]
     least = [
-        np.fmin.reduce(gaps[here[:, now], now + 1 : now + 2 * _SECOND + 1], axis=None, initial=np.inf)
+        np.fmin.reduce(
+            gaps[here[:, now], now + 1 : now + 2 * _SECOND + 1], axis=None, initial=np.inf
+        )
         for now in range(0, seen.frames - 1, _SECOND)
     ]
     nearest = np.array(least)[np.isfinite(least)]
@@ -240,7 +293,10 @@ def _of_labels(seen: _Seen) -> dict[str, ArrayLike]:
         "own_row": (own == seen.drives)[seen.labelled],
         "vehicles": vehicles[seen.labelled & (seen.column("sample", "agent") == 0)],
         "overlap_samples": (gaps == 0).any(axis=0)[seen.by_ego.any(axis=0)],
-        **{f"overlap_{name}": movers == count for count, name in enumerate(("stand", "mixed", "move"))},
+        **{
+            f"overlap_{name}": movers == count
+            for count, name in enumerate(("stand", "mixed", "move"))
+        },
         "next_touch": nearest < 0.01,
         "next_near": nearest < 2.5,
         "next_gap": nearest,
@@ -274,7 +330,9 @@ def _least_gaps(boxes: FloatArray, first: IntArray, second: IntArray) -> FloatAr
     """(T,) the least gap of pairs of actors whose outlines are (A, T, 5), NaN left out; inf without a pair."""
     apart = np.hypot(*np.moveaxis(boxes[first] - boxes[second], -1, 0)[:2])
     longest, shortest = np.hypot(boxes[..., 2], boxes[..., 3]) / 2, boxes[..., 2:4].min(axis=-1) / 2
-    most = np.fmin.reduce(np.maximum(apart - shortest[first] - shortest[second], 0), axis=0, initial=np.inf)
+    most = np.fmin.reduce(
+        np.maximum(apart - shortest[first] - shortest[second], 0), axis=0, initial=np.inf
+    )
     pair, time = np.nonzero(apart - longest[first] - longest[second] <= most)
     least = np.full(boxes.shape[1], np.inf)
     np.minimum.at(least, time, gaps_of_pairs(boxes[first[pair], time], boxes[second[pair], time]))
@@ -284,7 +342,11 @@ def _least_gaps(boxes: FloatArray, first: IntArray, second: IntArray) -> FloatAr
 def _extrapolated(seen: _Seen) -> dict[str, ArrayLike]:
     """How far actors are from where constant velocity puts them: every half second, at 1 to 5 s, as long as seen."""
     now, seconds = np.arange(_HALF, seen.frames, _HALF), np.array(_SECONDS_AHEAD)
-    places = np.pad(seen.boxes[..., :2], ((0, 0), (0, _SECOND * _SECONDS_AHEAD[-1]), (0, 0)), constant_values=np.nan)
+    places = np.pad(
+        seen.boxes[..., :2],
+        ((0, 0), (0, _SECOND * _SECONDS_AHEAD[-1]), (0, 0)),
+        constant_values=np.nan,
+    )
     expected = places[:, now, None] + seen.recent[:, now, None] * seconds[:, None]
     error = np.linalg.norm(places[:, now[:, None] + _SECOND * seconds] - expected, axis=-1).reshape(
         -1, len(_SECONDS_AHEAD)

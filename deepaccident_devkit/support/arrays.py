@@ -83,7 +83,10 @@ class FrozenArrays(ShortRepr):
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Copies go without `__init__`, since what they hold was checked."""
-        return _restored, (type(self), {name: getattr(self, name) for name in _field_names(type(self))})
+        return _restored, (
+            type(self),
+            {name: getattr(self, name) for name in _field_names(type(self))},
+        )
 
 
 class BitView(Sequence[bool]):
@@ -127,8 +130,12 @@ def checked(
         return values if values.dtype == dtype else as_numbers(name, values, dtype=dtype)
     array = as_numbers(name, values, f"an array of shape {_shape_text(shape)}", dtype)
     if not _fits(array.shape, shape):
-        remedy = "; transpose it (.T)" if array.ndim == 2 and _fits(array.shape[::-1], shape) else ""
-        raise GeometryError(f"{name}: expected shape {_shape_text(shape)}, found {array.shape}{remedy}")
+        remedy = (
+            "; transpose it (.T)" if array.ndim == 2 and _fits(array.shape[::-1], shape) else ""
+        )
+        raise GeometryError(
+            f"{name}: expected shape {_shape_text(shape)}, found {array.shape}{remedy}"
+        )
     return array
 
 
@@ -157,15 +164,24 @@ def as_numbers(
         if not np.array_equal(array, given):
             other = given[array != given].flat[0]
             raise GeometryError(f"{name}: expected whole numbers of {wanted}, found {other}")
-    elif wanted.kind == "f" and wanted.itemsize < given.dtype.itemsize and not np.isfinite(array).all():
+    elif (
+        wanted.kind == "f"
+        and wanted.itemsize < given.dtype.itemsize
+        and not np.isfinite(array).all()
+    ):
         lost = np.isinf(array) & np.isfinite(given)
         if lost.any():
-            raise GeometryError(f"{name}: expected numbers within {wanted}'s range, found {given[lost][0]}")
+            raise GeometryError(
+                f"{name}: expected numbers within {wanted}'s range, found {given[lost][0]}"
+            )
     return array
 
 
 def checked_number(
-    name: str, value: object, expected: str = "a number", error: type[DeepAccidentError] = GeometryError
+    name: str,
+    value: object,
+    expected: str = "a number",
+    error: type[DeepAccidentError] = GeometryError,
 ) -> float:
     """A single number, numpy's scalars among them, as Python's float; or raise `error`, which says what is expected."""
     if isinstance(value, np.ndarray) and value.ndim == 0:
@@ -179,7 +195,10 @@ def checked_number(
 
 
 def checked_whole(
-    name: str, value: object, expected: str = "a whole number", error: type[DeepAccidentError] = GeometryError
+    name: str,
+    value: object,
+    expected: str = "a whole number",
+    error: type[DeepAccidentError] = GeometryError,
 ) -> int:
     """A single whole number, numpy's integers among them, as Python's int; or raise `error`."""
     try:
@@ -198,15 +217,25 @@ def checked_flag(name: str, value: object) -> bool:
 def checked_count(name: str, value: object, what: str, most: int) -> int:
     """A whole number from 1 to `most`, or ConfigError, which says what it counts."""
     expected = f"a whole number from 1 to {most:,} ({what})"
-    found = 0 if isinstance(value, bool | np.bool_) else checked_whole(name, value, expected, ConfigError)
+    found = (
+        0
+        if isinstance(value, bool | np.bool_)
+        else checked_whole(name, value, expected, ConfigError)
+    )
     if not 1 <= found <= most:
         raise ConfigError(f"{name}: expected {expected}, found {value!r}")
     return found
 
 
-def checked_setting(name: str, value: object, expected: str, least: float = -math.inf, most: float = math.inf) -> float:
+def checked_setting(
+    name: str, value: object, expected: str, least: float = -math.inf, most: float = math.inf
+) -> float:
     """A finite number from `least` to `most`, or ConfigError."""
-    found = math.nan if isinstance(value, bool | np.bool_) else checked_number(name, value, expected, ConfigError)
+    found = (
+        math.nan
+        if isinstance(value, bool | np.bool_)
+        else checked_number(name, value, expected, ConfigError)
+    )
     if not (math.isfinite(found) and least <= found <= most):
         raise ConfigError(f"{name}: expected {expected}, found {value!r}")
     return found
@@ -286,7 +315,9 @@ def _remedy(values: object) -> str:
         return "; give its array, .xyz"
     if hasattr(values, "corners"):  # boxes, whose own error has the remedy
         return ""
-    if isinstance(values, np.ndarray) or not (hasattr(values, "__array__") or hasattr(values, "__dlpack__")):
+    if isinstance(values, np.ndarray) or not (
+        hasattr(values, "__array__") or hasattr(values, "__dlpack__")
+    ):
         return ""
     return "; pass a torch tensor as tensor.detach().cpu().float(), another framework's as a float32 numpy array"
 
@@ -295,7 +326,9 @@ def _restored(kind: type[FrozenArrays], values: Mapping[str, Any]) -> FrozenArra
     """Undo `FrozenArrays.__reduce__`."""
     result = object.__new__(kind)
     for name, value in values.items():
-        object.__setattr__(result, name, readonly(value) if isinstance(value, np.ndarray) else value)
+        object.__setattr__(
+            result, name, readonly(value) if isinstance(value, np.ndarray) else value
+        )
     return result
 
 
@@ -306,7 +339,9 @@ def _value_text(value: object) -> str:
     if isinstance(value, float):
         return f"{value:.6g}"
     if isinstance(value, Mapping | list | tuple) and (len(value) > _FEW or _holds_arrays(value)):
-        return f"<{len(value)} in a {'dict' if isinstance(value, Mapping) else type(value).__name__}>"
+        return (
+            f"<{len(value)} in a {'dict' if isinstance(value, Mapping) else type(value).__name__}>"
+        )
     text = repr(value)
     return text if len(text) <= _LONGEST_VALUE else f"{type(value).__name__}(…)"
 

@@ -77,12 +77,16 @@ def replacing_folder(path: Path) -> Iterator[Path]:
 def check_free(out: Path) -> None:
     """Raise ConfigError unless a folder can be made there: nothing is, or an empty folder."""
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise ConfigError(f"{out}: exists and is not an empty folder; choose another folder, or remove this one")
+        raise ConfigError(
+            f"{out}: exists and is not an empty folder; choose another folder, or remove this one"
+        )
 
 
 def temporary_path(path: Path) -> Path:
     """A path beside `path` that no other thread, process or host uses."""
-    return path.with_name(f".{path.name[:_NAME_LENGTH]}.{_writer(os.getpid())}-{secrets.randbits(32)}.tmp")
+    return path.with_name(
+        f".{path.name[:_NAME_LENGTH]}.{_writer(os.getpid())}-{secrets.randbits(32)}.tmp"
+    )
 
 
 def temporary_of(name: str) -> str | None:
@@ -121,7 +125,9 @@ def _check_replaceable(path: Path) -> None:
     elif os.path.exists(path):  # noqa: PTH110 - Path.exists raises for a name that is too long
         fault = irregular_text(path.stat().st_mode)
     if fault:
-        raise OutputFolderError(f"{path}: {fault}, so it is not replaced; give the path of a new file")
+        raise OutputFolderError(
+            f"{path}: {fault}, so it is not replaced; give the path of a new file"
+        )
 
 
 def _begun(path: Path) -> Path:
@@ -178,8 +184,12 @@ def _start(process: int) -> str | None:
         status = Path(f"/proc/{process}/stat").read_text(encoding="utf-8", errors="replace")
     except OSError:
         return None
-    state, *facts = status.rpartition(")")[2].split()  # after its name, which may have brackets itself
-    return "" if state in "ZX" else facts[18]  # a killed process whose parent does not ask for it is there still
+    state, *facts = status.rpartition(")")[
+        2
+    ].split()  # after its name, which may have brackets itself
+    return (
+        "" if state in "ZX" else facts[18]
+    )  # a killed process whose parent does not ask for it is there still
 
 
 def write_bytes(path: Path, content: bytes) -> None:
@@ -264,5 +274,7 @@ def writable_folder(folder: str | os.PathLike[str]) -> Path:
         return path
     for part in (path, *path.parents):
         if os.path.isfile(part):  # noqa: PTH113 - Path.is_file raises where it may not look
-            raise ConfigError(f"{path}: no file can be written there, {part} is a file; give a folder")
+            raise ConfigError(
+                f"{path}: no file can be written there, {part} is a file; give a folder"
+            )
     raise ConfigError(f"{path}: no file can be written there; give a folder that you may write to")

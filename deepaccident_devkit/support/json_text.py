@@ -58,7 +58,9 @@ def parsed_json(content: bytes, *, constants: bool = False, levels: int = MOST_L
         return noted(f"{shortened(name)}: stands there twice")
 
     def refused(word: str) -> object:
-        found = f"found {word.removeprefix('-')}; write null for an optional value that is not known"
+        found = (
+            f"found {word.removeprefix('-')}; write null for an optional value that is not known"
+        )
         return noted(f"expected a finite number, {found}")
 
     if content.startswith(_GZIP):
@@ -70,7 +72,9 @@ def parsed_json(content: bytes, *, constants: bool = False, levels: int = MOST_L
     _check_levels(content, levels)
     try:
         text = content.decode("utf-8")
-        value = json.loads(text, object_pairs_hook=made, parse_constant=None if constants else refused)
+        value = json.loads(
+            text, object_pairs_hook=made, parse_constant=None if constants else refused
+        )
     except ValueError as error:  # the words of Python's own errors change with its version
         where = (
             f"line {error.lineno}, column {error.colno}"
@@ -111,7 +115,9 @@ def _check_levels(content: bytes, most: int) -> None:
         content = content.replace(b"\\\\", b"").replace(b'\\"', b"")
     level, inside = 0, False
     for first in range(0, len(content), _BLOCK):
-        marks = np.frombuffer(content[first : first + _BLOCK].translate(None, _OTHERS), dtype=np.uint8)
+        marks = np.frombuffer(
+            content[first : first + _BLOCK].translate(None, _OTHERS), dtype=np.uint8
+        )
         in_text = np.logical_xor.accumulate(np.concatenate([[inside], marks == _QUOTE]))
         levels = level + np.cumsum(_STEPS[marks] * ~in_text[1:])
         if levels.max(initial=0) > most:

@@ -86,7 +86,9 @@ def with_keywords_named(function: Callable[P, _T], module: str | None = None) ->
     def checked(*arguments: P.args, **named: P.kwargs) -> _T:
         for name in sorted(named.keys() - known.keys()) if named else ():
             if name in KEYWORDS:
-                raise KeywordError(f"{called} has no argument {name!r}: {KEYWORDS[name]} (see {_PAGE})")
+                raise KeywordError(
+                    f"{called} has no argument {name!r}: {KEYWORDS[name]} (see {_PAGE})"
+                )
             if not takes_any:
                 raise KeywordError(f"{called} has no argument {name!r}{meant_text(name, known)}")
         return function(*arguments, **named)

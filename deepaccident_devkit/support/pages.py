@@ -62,7 +62,9 @@ def rendered(template: str, **context: Any) -> str:
     return escaped(environment().get_template(template).render(**context))
 
 
-def document(template: str, *, style: str, policy: str = _POLICY, script: str = "", **context: Any) -> str:
+def document(
+    template: str, *, style: str, policy: str = _POLICY, script: str = "", **context: Any
+) -> str:
     """A page that is one file, by a template that extends `document.html`, and the context that it shows.
 
     `policy` is the Content-Security-Policy: what a browser may load and run. `script` is the only one that runs, after
@@ -123,7 +125,13 @@ def result_text(value: Any) -> str:
         return scalar(value)
     if value == round(value):
         return f"{value:,.0f}"
-    return f"{value:.3f}" if abs(value) < 10 else f"{value:.3g}" if abs(value) < 1000 else f"{value:,.0f}"
+    return (
+        f"{value:.3f}"
+        if abs(value) < 10
+        else f"{value:.3g}"
+        if abs(value) < 1000
+        else f"{value:,.0f}"
+    )
 
 
 def _listed(values: Sequence[Any], text: Callable[[Any], str]) -> str:

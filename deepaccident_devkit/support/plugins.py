@@ -91,11 +91,18 @@ class Plugin:
 
     def __post_init__(self) -> None:
         """Check the kinds of what is offered; raises TypeError."""
-        kinds = {"verbs": LazyVerb, "openers": Opener, "export_formats": LazyFormat, "tasks": LazyTask}
+        kinds = {
+            "verbs": LazyVerb,
+            "openers": Opener,
+            "export_formats": LazyFormat,
+            "tasks": LazyTask,
+        }
         for name, kind in kinds.items():
             for value in getattr(self, name).values():
                 if not isinstance(value, kind):
-                    raise TypeError(f"{name}: expected objects of the class {kind.__name__}, found {value!r}")
+                    raise TypeError(
+                        f"{name}: expected objects of the class {kind.__name__}, found {value!r}"
+                    )
 
     def __repr__(self) -> str:
         """Return its kind and name."""
@@ -119,11 +126,16 @@ class Offers(Generic[Offered]):
 
     def refusals_text(self) -> str:
         """Return a line for each plug-in that is left out; empty if there is none."""
-        return "\n".join(f"The plug-in {name} is left out: {reason}." for name, reason in self.refused.items())
+        return "\n".join(
+            f"The plug-in {name} is left out: {reason}." for name, reason in self.refused.items()
+        )
 
 
 def offers(
-    read: Callable[[Plugin], Mapping[str, Offered]], core: Collection[str] = (), *, own: bool = False
+    read: Callable[[Plugin], Mapping[str, Offered]],
+    core: Collection[str] = (),
+    *,
+    own: bool = False,
 ) -> Offers[Offered]:
     """Collect what plug-ins offer of one kind.
 
@@ -153,7 +165,10 @@ def offers(
             by_name[name] = owned[0][1]
             refused |= dict.fromkeys(names[1:], f"it offers {name!r}, which {names[0]} offers, too")
         else:
-            refused |= {owner: f"{' and '.join(names)} both offer {name!r}; uninstall one of them" for owner in names}
+            refused |= {
+                owner: f"{' and '.join(names)} both offer {name!r}; uninstall one of them"
+                for owner in names
+            }
     return Offers(by_name, refused)
 
 
@@ -167,7 +182,9 @@ class Installed(NamedTuple):
 @cache
 def own_plugins() -> Installed:
     """Load the objects of the devkit's own plug-ins, without the packages that they describe."""
-    return _loaded((path.parent.name, _from_file, path) for path in sorted(_FOLDER.glob("*/plugin.py")))
+    return _loaded(
+        (path.parent.name, _from_file, path) for path in sorted(_FOLDER.glob("*/plugin.py"))
+    )
 
 
 @cache
@@ -204,7 +221,9 @@ def _loaded(sources: Iterator[tuple[str, Callable[[Any], Any], Any]]) -> Install
             refused[name] = f"expected an object of the class Plugin, found {type(plugin).__name__}"
         elif plugin.protocol_version != PROTOCOL_VERSION:
             version = plugin.protocol_version
-            refused[name] = f"it is for version {version} of the plug-in protocol, this devkit has {PROTOCOL_VERSION}"
+            refused[name] = (
+                f"it is for version {version} of the plug-in protocol, this devkit has {PROTOCOL_VERSION}"
+            )
         else:
             plugins.append(plugin)
     return Installed(tuple(plugins), refused)

@@ -78,7 +78,9 @@ LIMITS_VARIABLE: Final = "DEEPACCIDENT_LIMITS"
 _LIMIT: Final = re.compile(r"([a-z_]+)=(\w+)", re.ASCII)
 _SIZE: Final = re.compile(r"([1-9][0-9]{0,11})([KMGT]?)")
 _FACTORS: Final = {"": 1, "K": 1 << 10, "M": 1 << 20, "G": 1 << 30, "T": 1 << 40}
-_FLAGS: Final = os.O_RDONLY | getattr(os, "O_BINARY", 0) | getattr(os, "O_NONBLOCK", 0)  # no waiting for a pipe
+_FLAGS: Final = (
+    os.O_RDONLY | getattr(os, "O_BINARY", 0) | getattr(os, "O_NONBLOCK", 0)
+)  # no waiting for a pipe
 # How a member of an archive, the end of an archive, the end of a large one, and what leads to that, begin.
 _MEMBER, _END, _LARGE_END, _LOCATOR = b"PK\x03\x04", b"PK\x05\x06", b"PK\x06\x06", b"PK\x06\x07"
 # Bytes by which a web page can be told.
@@ -115,7 +117,9 @@ class StoredFile(Protocol):
         """Its bytes; raises OSError as `read_bytes` does."""
 
 
-_observer: ContextVar[Callable[[Path | StoredFile, bytes], None] | None] = ContextVar("observer", default=None)
+_observer: ContextVar[Callable[[Path | StoredFile, bytes], None] | None] = ContextVar(
+    "observer", default=None
+)
 
 
 class RefusedFileError(OSError):
@@ -125,7 +129,9 @@ class RefusedFileError(OSError):
 def byte_limit(kind: FileKind) -> int:
     """Bytes that a file of a kind, or what is decoded from it, may have; or RefusedFileError."""
     changed = os.environ.get(LIMITS_VARIABLE)
-    return BYTE_LIMITS[kind] if not changed else _changed_limits(changed).get(kind, BYTE_LIMITS[kind])
+    return (
+        BYTE_LIMITS[kind] if not changed else _changed_limits(changed).get(kind, BYTE_LIMITS[kind])
+    )
 
 
 def bytes_of(text: str) -> int | None:
@@ -150,7 +156,9 @@ def _read(path: Path, kind: FileKind) -> bytes:
     try:
         check_size(size, kind)
         content = os.read(descriptor, size)
-        if len(content) < size or os.read(descriptor, 1):  # a file that grows, or does not know its size
+        if len(content) < size or os.read(
+            descriptor, 1
+        ):  # a file that grows, or does not know its size
             with os.fdopen(os.dup(descriptor), "rb") as file:
                 file.seek(0)
                 content = file.read(byte_limit(kind) + 1)
@@ -223,7 +231,9 @@ def irregular_text(mode: int) -> str | None:
     """
     if stat.S_ISREG(mode):
         return None
-    kind = {stat.S_IFDIR: "a folder", stat.S_IFIFO: "a named pipe", stat.S_IFSOCK: "a socket"}.get(stat.S_IFMT(mode))
+    kind = {stat.S_IFDIR: "a folder", stat.S_IFIFO: "a named pipe", stat.S_IFSOCK: "a socket"}.get(
+        stat.S_IFMT(mode)
+    )
     return f"not a regular file ({kind or 'a device'})"
 
 
@@ -293,7 +303,9 @@ def read_member(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, kind: FileKind
     except EOFError:
         raise zipfile.BadZipFile("a member ends early") from None
     if len(content) != entry.file_size:
-        raise zipfile.BadZipFile(f"a member has {len(content):,} bytes, its stored size is {entry.file_size:,}")
+        raise zipfile.BadZipFile(
+            f"a member has {len(content):,} bytes, its stored size is {entry.file_size:,}"
+        )
     return content
 
 
@@ -313,11 +325,15 @@ def array_of(content: bytes, kind: FileKind) -> AnyArray:
         raise ValueError(f"version {version} of its array is unknown")
     shape, fortran, dtype = getattr(np.lib.format, _HEADER_READERS[version])(file)
     if dtype.kind not in "biufcU" or min(shape, default=0) < 0:
-        raise ValueError(f"expected numbers or text, found shape {shape} of {shortened(str(dtype))}")
+        raise ValueError(
+            f"expected numbers or text, found shape {shape} of {shortened(str(dtype))}"
+        )
     size, there = math.prod(shape) * dtype.itemsize, len(content) - file.tell()
     check_size(size, kind, "its array")
     if size != there:
-        raise ValueError(f"its array has {there:,} bytes, but its shape {shape} of {dtype} needs {size:,}")
+        raise ValueError(
+            f"its array has {there:,} bytes, but its shape {shape} of {dtype} needs {size:,}"
+        )
     flat: AnyArray = np.frombuffer(content, dtype, offset=file.tell()).copy()
     return flat.reshape(shape[::-1]).T if fortran else flat.reshape(shape)
 
@@ -339,11 +355,16 @@ def check_end(file: BinaryIO, most: int) -> None:
     directory, large = _number(tail, end + 12, 4), end - _LOCATOR_LENGTH
     if large >= 0 and tail.startswith(_LOCATOR, large):
         record = large - _LARGE_END_LENGTH
-        if not tail.startswith(_LARGE_END, max(0, record)) or _number(tail, large + 8, 8) != start + record:
+        if (
+            not tail.startswith(_LARGE_END, max(0, record))
+            or _number(tail, large + 8, 8) != start + record
+        ):
             raise zipfile.BadZipFile("its end is damaged")
         directory = _number(tail, record + 40, 8)
     if directory > most:
-        raise RefusedFileError(errno.EFBIG, f"the archive's directory has {directory:,} bytes, more than {most:,}")
+        raise RefusedFileError(
+            errno.EFBIG, f"the archive's directory has {directory:,} bytes, more than {most:,}"
+        )
 
 
 def _no_end_text(beginning: bytes) -> str:

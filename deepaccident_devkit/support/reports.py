@@ -55,7 +55,9 @@ class Report(ShortRepr):
 
     def to_text(self) -> str:
         """The tables, for a terminal."""
-        return "\n\n".join(f"{name}\n{columns_text(_texts(rows))}" for name, rows in self.named_tables().items())
+        return "\n\n".join(
+            f"{name}\n{columns_text(_texts(rows))}" for name, rows in self.named_tables().items()
+        )
 
     def to_html(self) -> str:
         """The tables, for a notebook or a page; all texts are escaped."""
@@ -71,7 +73,9 @@ class Report(ShortRepr):
             ConfigError: `folder` cannot be written to, or is not one.
         """
         folder = writable_folder(folder)
-        return [write_csv(folder / f"{name}.csv", rows) for name, rows in self.named_tables().items()]
+        return [
+            write_csv(folder / f"{name}.csv", rows) for name, rows in self.named_tables().items()
+        ]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -9,8 +9,12 @@ import re
 from collections.abc import Callable
 from typing import Final
 
-_IMPORT: Final = re.compile(r'^import \{(\s*\w+(?:,\s*\w+)*,?\s*)\} from "\./(\w+)\.js";$', re.MULTILINE)
-_EXPORT: Final = re.compile(r"^export (?=(?:async function|function|class|const) (\w+))", re.MULTILINE)
+_IMPORT: Final = re.compile(
+    r'^import \{(\s*\w+(?:,\s*\w+)*,?\s*)\} from "\./(\w+)\.js";$', re.MULTILINE
+)
+_EXPORT: Final = re.compile(
+    r"^export (?=(?:async function|function|class|const) (\w+))", re.MULTILINE
+)
 # A comment of types, which browsers do not need.
 _TYPES: Final = re.compile(r"^ */\*\*(?:(?!\*/).)*\*/\n", re.MULTILINE | re.DOTALL)
 _UNKNOWN: Final = re.compile(r"^(?:import|export)\b.*", re.MULTILINE)
@@ -33,7 +37,9 @@ def bundled(read: Callable[[str], str], name: str) -> str:
     return f'(() => {{\n"use strict";\n{"".join(modules.values())}}})();\n'
 
 
-def _add(read: Callable[[str], str], name: str, importers: tuple[str, ...], modules: dict[str, str]) -> None:
+def _add(
+    read: Callable[[str], str], name: str, importers: tuple[str, ...], modules: dict[str, str]
+) -> None:
     """Add a module after those that it imports."""
     if name in importers:
         raise ValueError(f"modules import each other: {' imports '.join((*importers, name))}")

@@ -25,7 +25,9 @@ _LISTED = 20
 _STEM = 3
 # Differing values that a message shows at most.
 _DIFFERING = 3
-_NUMBER: Final = re.compile(r"[+-]?((\d+\.?\d*|\.\d+)(e[+-]?\d+)?|nan|inf|infinity)", re.ASCII | re.IGNORECASE)
+_NUMBER: Final = re.compile(
+    r"[+-]?((\d+\.?\d*|\.\d+)(e[+-]?\d+)?|nan|inf|infinity)", re.ASCII | re.IGNORECASE
+)
 _INTEGER: Final = re.compile(r"(-?)0*(\d{1,19})", re.ASCII)
 
 
@@ -136,7 +138,9 @@ def meant_text(wrong: object, possible: Iterable[object]) -> str:
     if not isinstance(wrong, str) or not wrong:
         return ""
     start = wrong.lower()
-    close = get_close_matches(start, lowered, n=1) or [word for word in lowered if word.startswith(start)]
+    close = get_close_matches(start, lowered, n=1) or [
+        word for word in lowered if word.startswith(start)
+    ]
     close = close or [word for word in lowered if len(word) >= _STEM and start.startswith(word)]
     return f"; did you mean {lowered[close[0]]!r}?" if close else ""
 
@@ -149,7 +153,10 @@ def spelled(value: Any, words: Iterable[str]) -> Any:
 
 def differing_text(there: Mapping[str, Any], asked: Mapping[str, Any]) -> str:
     """`training/steps: 2, asked for 3; …`: which values differ from those asked for, the first ones; empty if none."""
-    has, wanted = dict(_leaves(there)), dict(_leaves(json.loads(json.dumps(asked))))  # tuples are lists in a file
+    has, wanted = (
+        dict(_leaves(there)),
+        dict(_leaves(json.loads(json.dumps(asked)))),
+    )  # tuples are lists in a file
     changed = sorted(name for name in {*has, *wanted} if has.get(name) != wanted.get(name))
     differences = [
         f"{name}: {shortened(repr(has.get(name)))}, asked for {shortened(repr(wanted.get(name)))}"
@@ -188,7 +195,9 @@ def choice(
         return chosen
     none = ", or None" if len(expected) < len(words) else ""
     meant = elsewhere.get(str(value).lower()) or meant_text(value, expected)
-    raise error(f"{name}: expected one of {', '.join(expected)}{none}{also}, found {value!r}{meant}")
+    raise error(
+        f"{name}: expected one of {', '.join(expected)}{none}{also}, found {value!r}{meant}"
+    )
 
 
 def members_of(
@@ -227,14 +236,22 @@ def choices(
 
 
 def settle_choices(
-    record: object, words: Mapping[str, Collection[str | None]], *, error: type[DeepAccidentError] = ChoiceError
+    record: object,
+    words: Mapping[str, Collection[str | None]],
+    *,
+    error: type[DeepAccidentError] = ChoiceError,
 ) -> None:
     """Give fields of a frozen dataclass, while it is made, the spelling of their words; the errors are `choice`'s."""
     for name, possible in words.items():
         object.__setattr__(record, name, choice(name, getattr(record, name), possible, error=error))
 
 
-def path_text(given: object, expected: str = "expected a path", *, error: type[DeepAccidentError] = ConfigError) -> str:
+def path_text(
+    given: object,
+    expected: str = "expected a path",
+    *,
+    error: type[DeepAccidentError] = ConfigError,
+) -> str:
     """The text of what a caller gives as a path: a text, or a path object of one; else ConfigError, or another kind.
 
     `expected` is how the message begins, such as `out: expected a folder`. An empty one is refused, and what no file
@@ -248,6 +265,11 @@ def path_text(given: object, expected: str = "expected a path", *, error: type[D
     raise error(f"{expected}, found {found}")
 
 
-def path_of(given: object, expected: str = "expected a path", *, error: type[DeepAccidentError] = ConfigError) -> Path:
+def path_of(
+    given: object,
+    expected: str = "expected a path",
+    *,
+    error: type[DeepAccidentError] = ConfigError,
+) -> Path:
     """What a caller gives as a path, with `~` for the home folder; takes and raises what `path_text` does."""
     return Path(path_text(given, expected, error=error)).expanduser()

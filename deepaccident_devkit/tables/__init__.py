@@ -1,7 +1,14 @@
 """The release as relational tables: their columns, the index they are made into, and the opened store."""
 
 from deepaccident_devkit.tables.boxes import displacement_velocities, visible_ids, visible_mask
-from deepaccident_devkit.tables.index import Index, Problem, clear_index, current_index, open_index, place_outside
+from deepaccident_devkit.tables.index import (
+    Index,
+    Problem,
+    clear_index,
+    current_index,
+    open_index,
+    place_outside,
+)
 from deepaccident_devkit.tables.scan import SEVERITIES, Finding, Severity
 from deepaccident_devkit.tables.tables import OpenTables, RowArgument, Table, Tables, table_names
 

@@ -67,7 +67,9 @@ class TableWriter(ExitStack):
         super().__init__()
         self._folder, self._spec, self.num_rows = folder, spec, 0
         self._columns: dict[str | None, Any] = {
-            column.stored: self.enter_context(TemporaryFile(dir=folder)) if is_streamable(spec) else []  # noqa: SIM115
+            column.stored: self.enter_context(TemporaryFile(dir=folder))  # noqa: SIM115
+            if is_streamable(spec)
+            else []
             for column in spec.stored_columns
         }
 
@@ -85,7 +87,9 @@ class TableWriter(ExitStack):
         """Write the table's file, with words about the table as a whole."""
         import pyarrow as pa
 
-        columns = {column.stored or "": self._collected(column) for column in self._spec.stored_columns}
+        columns = {
+            column.stored or "": self._collected(column) for column in self._spec.stored_columns
+        }
         with (
             replacing(table_path(self._folder, self._spec.name)) as temporary,
             pa.OSFile(str(temporary), "wb") as sink,
@@ -137,7 +141,9 @@ class StoredTable:
             self.views = views(spec, batch)
             self.words = _words(batch.schema)
         except FileNotFoundError:
-            raise IndexStoreError(f"{path}: no such file: the index was made again; open the release again") from None
+            raise IndexStoreError(
+                f"{path}: no such file: the index was made again; open the release again"
+            ) from None
         except (OSError, pa.ArrowException, IndexError, ValueError) as error:
             raise IndexStoreError(
                 f"{path}: cannot be read ({shortened(str(error))}); {DAMAGED_INDEX_REMEDY}"
@@ -154,18 +160,24 @@ class StoredTable:
 
         table = pa.Table.from_batches([self._batch])
         if fault := value_fault_of(self.spec, table):
-            raise IndexStoreError(f"{self._path}: damaged ({shortened(fault)}); {DAMAGED_INDEX_REMEDY}")
+            raise IndexStoreError(
+                f"{self._path}: damaged ({shortened(fault)}); {DAMAGED_INDEX_REMEDY}"
+            )
         return table
 
 
-def streams(tables: Sequence[tuple[TableSpec, ColumnArrays]], metadata: Mapping[str, str] | None = None) -> bytes:
+def streams(
+    tables: Sequence[tuple[TableSpec, ColumnArrays]], metadata: Mapping[str, str] | None = None
+) -> bytes:
     """The rows of each table, with or without words, as compressed Arrow streams one after the other."""
     import pyarrow as pa
 
     options = pa.ipc.IpcWriteOptions(compression="zstd", use_threads=False)
     sink = pa.BufferOutputStream()
     for spec, columns in tables:
-        with pa.ipc.new_stream(sink, arrow_schema(spec).with_metadata(dict(metadata or {})), options=options) as writer:
+        with pa.ipc.new_stream(
+            sink, arrow_schema(spec).with_metadata(dict(metadata or {})), options=options
+        ) as writer:
             writer.write_batch(record_batch(spec, columns))
     content: bytes = sink.getvalue().to_pybytes()
     return content
@@ -189,7 +201,9 @@ def read_streams(source: Any, specs: Sequence[TableSpec]) -> list[dict[str, Any]
     options = pa.ipc.IpcReadOptions(use_threads=False)
     tables = []
     for spec in specs:
-        batches = list(pa.ipc.open_stream(source, options=options))  # to the stream's end, where the next one starts
+        batches = list(
+            pa.ipc.open_stream(source, options=options)
+        )  # to the stream's end, where the next one starts
         if len(batches) != 1 or _batch_fault(spec, batches[0]):
             return None
         tables.append({name: unpacked(view) for name, view in views(spec, batches[0]).items()})
@@ -239,7 +253,9 @@ def arrow_schema(spec: TableSpec) -> Any:
 
     return pa.schema(
         [
-            pa.field(column.stored, arrow_type(column.kind), column.nullable, {"doc": column.kind.doc})
+            pa.field(
+                column.stored, arrow_type(column.kind), column.nullable, {"doc": column.kind.doc}
+            )
             for column in spec.stored_columns
         ]
     )
@@ -354,9 +370,9 @@ def _view(kind: ColumnKind, array: Any) -> Any:
         array = array.indices
     length = len(array)
     if isinstance(kind, Vector):
-        return _buffer(array.values.buffers()[1], np.dtype(np.float64), length * kind.length).reshape(
-            length, kind.length
-        )
+        return _buffer(
+            array.values.buffers()[1], np.dtype(np.float64), length * kind.length
+        ).reshape(length, kind.length)
     content = array.buffers()[1]
     if isinstance(kind, Number) and kind.dtype == "bool":
         return BitView(_buffer(content, np.dtype(np.uint8), (length + 7) // 8), length)

@@ -14,7 +14,14 @@ from numpy.typing import ArrayLike
 from deepaccident_devkit.geometry import quaternions
 from deepaccident_devkit.release import Labels
 from deepaccident_devkit.release.labels import turned_vectors
-from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray, IntArray, ShortRepr, as_floats
+from deepaccident_devkit.support.arrays import (
+    AnyArray,
+    BoolArray,
+    FloatArray,
+    IntArray,
+    ShortRepr,
+    as_floats,
+)
 from deepaccident_devkit.tables.columns import NULL_INTEGER
 from deepaccident_devkit.taxonomy import (
     CATEGORIES,
@@ -87,14 +94,18 @@ def world_rotations(boxes: ScenarioBoxes) -> FloatArray:
 
 def to_lidar(boxes: ScenarioBoxes, world_vectors: FloatArray) -> FloatArray:
     """(N, 3) world vectors along the axes of each box's LiDAR frame."""
-    return as_floats(np.einsum("nji,nj->ni", boxes.world_from_lidar[boxes.sample, :3, :3], world_vectors))
+    return as_floats(
+        np.einsum("nji,nj->ni", boxes.world_from_lidar[boxes.sample, :3, :3], world_vectors)
+    )
 
 
 def chains(boxes: ScenarioBoxes) -> tuple[AnyArray, AnyArray]:
     """(N,) row of the same agent's previous and next box of the same label id; −1 at the ends and for id −1."""
     label_id = boxes.labels.actor_id
     order = np.lexsort((np.arange(len(boxes)), boxes.frame, label_id, boxes.agent))
-    same = (boxes.agent[order][1:] == boxes.agent[order][:-1]) & (label_id[order][1:] == label_id[order][:-1])
+    same = (boxes.agent[order][1:] == boxes.agent[order][:-1]) & (
+        label_id[order][1:] == label_id[order][:-1]
+    )
     same &= label_id[order][1:] != UNTRACKED_ID
     previous = np.full(len(boxes), NULL_INTEGER, dtype=np.int32)
     following = previous.copy()
@@ -106,7 +117,9 @@ def chains(boxes: ScenarioBoxes) -> tuple[AnyArray, AnyArray]:
 def instances(boxes: ScenarioBoxes) -> tuple[Mapping[str, AnyArray], AnyArray]:
     """The columns of the scenario's instances, by ascending actor id, and the instance row (N,) of each box."""
     known = np.flatnonzero(boxes.actor != UNTRACKED_ID)
-    order = known[np.lexsort((known, boxes.agent_order[known], boxes.frame[known], boxes.actor[known]))]
+    order = known[
+        np.lexsort((known, boxes.agent_order[known], boxes.frame[known], boxes.actor[known]))
+    ]
     actors, first, count = np.unique(boxes.actor[order], return_index=True, return_counts=True)
     instance_row = np.full(len(boxes), NULL_INTEGER, dtype=np.int32)
     instance_row[order] = np.repeat(np.arange(len(actors)), count)
@@ -129,7 +142,9 @@ def tracks(boxes: ScenarioBoxes, instance_row: AnyArray) -> tuple[AnyArray, AnyA
     """
     known = np.flatnonzero(instance_row != NULL_INTEGER)
     own = boxes.labels.actor_id[known] == OWN_ACTOR_ID
-    order = known[np.lexsort((known, boxes.agent_order[known], own, instance_row[known], boxes.frame[known]))]
+    order = known[
+        np.lexsort((known, boxes.agent_order[known], own, instance_row[known], boxes.frame[known]))
+    ]
     if not len(order):
         return order, np.zeros(0, dtype=np.uint8)
     starts = _group_starts(boxes.frame[order], instance_row[order])
@@ -167,12 +182,17 @@ def visible_mask(
         (N,) bool.
     """
     position, points = as_floats(xy).reshape(-1, 2), np.asarray(num_lidar_pts)
-    camera, small = np.asarray(camera_visible, dtype=bool), _SMALL[np.asarray(category, dtype=np.intp)]
+    camera, small = (
+        np.asarray(camera_visible, dtype=bool),
+        _SMALL[np.asarray(category, dtype=np.intp)],
+    )
     # squares and root, not hypot: boxes on the very edge are decided by the last bit
     distance = np.sqrt(position[:, 0] * position[:, 0] + position[:, 1] * position[:, 1])
     far_seen = camera & (points >= np.where(small, 1, 2))
     near = distance < np.where(infrastructure, NEAR_INFRASTRUCTURE, NEAR_VEHICLE)
-    return np.where(near, camera | (points >= np.where(infrastructure, 1, np.where(small, 2, 5))), far_seen)
+    return np.where(
+        near, camera | (points >= np.where(infrastructure, 1, np.where(small, 2, 5))), far_seen
+    )
 
 
 def visible_ids(masks: Sequence[ArrayLike], actor_ids: Sequence[ArrayLike]) -> IntArray:
@@ -184,7 +204,10 @@ def visible_ids(masks: Sequence[ArrayLike], actor_ids: Sequence[ArrayLike]) -> I
         masks: `visible_mask` of each agent.
         actor_ids: the label ids (N,) of each agent's boxes.
     """
-    seen = [np.asarray(ids)[np.asarray(mask, dtype=bool)] for mask, ids in zip(masks, actor_ids, strict=True)]
+    seen = [
+        np.asarray(ids)[np.asarray(mask, dtype=bool)]
+        for mask, ids in zip(masks, actor_ids, strict=True)
+    ]
     union = np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *seen]).astype(np.int64))
     return np.setdiff1d(union, (OWN_ACTOR_ID, UNTRACKED_ID))
 
@@ -210,7 +233,11 @@ class VelocityFit(ShortRepr):
         name = max(self.fits, key=lambda frame: self.fits[frame])
         if self.fits[RELEASED_VELOCITY_FRAME] >= _AS_GOOD * self.fits[name]:
             name = RELEASED_VELOCITY_FRAME
-        return name if self.boxes >= LEAST_BOXES and self.fits[name] >= _LEAST_SHARE * self.boxes else None
+        return (
+            name
+            if self.boxes >= LEAST_BOXES and self.fits[name] >= _LEAST_SHARE * self.boxes
+            else None
+        )
 
 
 def total_fit(fits: list[VelocityFit]) -> VelocityFit:
@@ -221,7 +248,9 @@ def total_fit(fits: list[VelocityFit]) -> VelocityFit:
     )
 
 
-def displacement_velocities(centers: FloatArray, agent: IntArray, label_id: IntArray, frame: IntArray) -> FloatArray:
+def displacement_velocities(
+    centers: FloatArray, agent: IntArray, label_id: IntArray, frame: IntArray
+) -> FloatArray:
     """(N, 3) m/s in world from displacements at 10 Hz, NaN where unknown.
 
     A track is one agent's rows of one label id (−100 is its own track): central differences where the frames before
@@ -255,7 +284,9 @@ def fit_velocities(boxes: ScenarioBoxes, displacement: FloatArray) -> VelocityFi
     return VelocityFit(boxes=len(rows), fits={name: int(fit.sum()) for name, fit in fits.items()})
 
 
-def velocities_that_fit(boxes: ScenarioBoxes, displacement: FloatArray) -> tuple[IntArray, dict[str, BoolArray]]:
+def velocities_that_fit(
+    boxes: ScenarioBoxes, displacement: FloatArray
+) -> tuple[IntArray, dict[str, BoolArray]]:
     """The rows (M,) of boxes that are used, and which of them fit each frame."""
     label_id, said = boxes.labels.actor_id, boxes.labels.velocity
     speed = np.linalg.norm(displacement[:, :2], axis=1)
@@ -263,18 +294,25 @@ def velocities_that_fit(boxes: ScenarioBoxes, displacement: FloatArray) -> tuple
     rows = np.flatnonzero(telling & (speed > _LEAST_SPEED) & np.isfinite(said).all(axis=1))
     limit = _FITS[0] + _FITS[1] * speed[rows]
     return rows, {
-        name: np.linalg.norm(turned_vectors(said[rows], angle[rows]) - displacement[rows, :2], axis=1) < limit
+        name: np.linalg.norm(
+            turned_vectors(said[rows], angle[rows]) - displacement[rows, :2], axis=1
+        )
+        < limit
         for name, angle in _angles(boxes).items()
     }
 
 
-def decoded_velocities(boxes: ScenarioBoxes, displacement: FloatArray, frame: str | None) -> FloatArray:
+def decoded_velocities(
+    boxes: ScenarioBoxes, displacement: FloatArray, frame: str | None
+) -> FloatArray:
     """(N, 3) m/s in world: the labels' own, which are in `frame`, where they have any; else the displacements (N, 3).
 
     A label has no vertical velocity: it is taken from the displacement, and is 0 without one. None for the frame is the
     release's own way.
     """
-    over_ground = turned_vectors(boxes.labels.velocity, _angles(boxes)[frame or RELEASED_VELOCITY_FRAME])
+    over_ground = turned_vectors(
+        boxes.labels.velocity, _angles(boxes)[frame or RELEASED_VELOCITY_FRAME]
+    )
     own = boxes.labels.actor_id == OWN_ACTOR_ID
     over_ground[own] = boxes.labels.velocity[own]  # in world, whatever the others' are in
     velocity = np.column_stack([over_ground, np.nan_to_num(displacement[:, 2])])

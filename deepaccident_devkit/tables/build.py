@@ -11,7 +11,12 @@ from deepaccident_devkit.release import Calibs, Meta
 from deepaccident_devkit.support.arrays import AnyArray, FloatArray, IntArray
 from deepaccident_devkit.tables import boxes as box_rules
 from deepaccident_devkit.tables.arrow_files import ColumnArrays
-from deepaccident_devkit.tables.boxes import ScenarioBoxes, decoded_velocities, displacement_velocities, fit_velocities
+from deepaccident_devkit.tables.boxes import (
+    ScenarioBoxes,
+    decoded_velocities,
+    displacement_velocities,
+    fit_velocities,
+)
 from deepaccident_devkit.tables.columns import NULL_INTEGER
 from deepaccident_devkit.tables.scan import ScenarioFiles
 from deepaccident_devkit.taxonomy import (
@@ -67,7 +72,9 @@ def scenario_boxes(files: ScenarioFiles) -> ScenarioBoxes:
     """A scenario's boxes, and where each was recorded."""
     sample = np.repeat(np.flatnonzero(_sample_labelled(files)), files.labels.num_boxes)
     agent, frame = np.divmod(sample, files.scan.num_frames)
-    actor_of_agent = np.array([_actor_id(files, name) for name in files.scan.agents], dtype=np.int64)
+    actor_of_agent = np.array(
+        [_actor_id(files, name) for name in files.scan.agents], dtype=np.int64
+    )
     label_id = files.labels.actor_id
     return ScenarioBoxes(
         labels=files.labels,
@@ -94,14 +101,20 @@ def _scenario_row(files: ScenarioFiles, velocity_frame: str | None) -> ColumnArr
         "designed_accident": [scenario.scenario_type.endswith("_accident")],
         "town": [scenario.name.split("_")[0]],
         **{name: [getattr(meta, name, None)] for name in from_meta},
-        "time_of_day": [TIMES_OF_DAY.index(meta.time_of_day) if meta and meta.time_of_day else NULL_INTEGER],
+        "time_of_day": [
+            TIMES_OF_DAY.index(meta.time_of_day) if meta and meta.time_of_day else NULL_INTEGER
+        ],
         "collision": [collision],
         "accident_type": [NULL_INTEGER if design is None else design],
-        "velocity_frame": [NULL_INTEGER if velocity_frame is None else [*VELOCITY_FRAMES].index(velocity_frame)],
+        "velocity_frame": [
+            NULL_INTEGER if velocity_frame is None else [*VELOCITY_FRAMES].index(velocity_frame)
+        ],
         "num_frames": [files.scan.num_frames],
         "first_frame_row": [0],
         "last_frame_row": [files.scan.num_frames - 1],
-        "split": [NULL_INTEGER],  # split files may change without the scenario's: filled in when tables are joined
+        "split": [
+            NULL_INTEGER
+        ],  # split files may change without the scenario's: filled in when tables are joined
     }
 
 
@@ -109,7 +122,9 @@ def _agent_rows(files: ScenarioFiles, boxes: ScenarioBoxes) -> ColumnArrays:
     count = len(files.scan.agents)
     category = np.full(count, NULL_INTEGER)
     size = np.full((count, 3), np.nan)
-    own = np.flatnonzero(files.labels.actor_id == OWN_ACTOR_ID)[::-1]  # the first own row is written last, and stays
+    own = np.flatnonzero(files.labels.actor_id == OWN_ACTOR_ID)[
+        ::-1
+    ]  # the first own row is written last, and stays
     category[boxes.agent[own]] = files.labels.category[own]
     size[boxes.agent[own]] = files.labels.size[own]
     return {
@@ -163,7 +178,10 @@ def _sample_rows(files: ScenarioFiles) -> ColumnArrays:
 
 
 def _annotation_rows(
-    files: ScenarioFiles, boxes: ScenarioBoxes, instance_of_box: AnyArray, world_velocities: FloatArray
+    files: ScenarioFiles,
+    boxes: ScenarioBoxes,
+    instance_of_box: AnyArray,
+    world_velocities: FloatArray,
 ) -> ColumnArrays:
     labels = files.labels
     previous, following = box_rules.chains(boxes)
@@ -207,7 +225,9 @@ def _track_rows(
 
 
 def _sample_labelled(files: ScenarioFiles) -> AnyArray:
-    return np.repeat([agent in files.scan.labelled for agent in files.scan.agents], files.scan.num_frames)
+    return np.repeat(
+        [agent in files.scan.labelled for agent in files.scan.agents], files.scan.num_frames
+    )
 
 
 def _agent_codes(files: ScenarioFiles) -> IntArray:
@@ -294,11 +314,17 @@ def timestamps(frames: int) -> FloatArray:
     return np.array([frame_timestamp(index) for index in range(1, frames + 1)])
 
 
-def _sample_data_rows(calibs: Calibs, calibrated_sensor_of: IntArray, agents: int, frames: int) -> ColumnArrays:
+def _sample_data_rows(
+    calibs: Calibs, calibrated_sensor_of: IntArray, agents: int, frames: int
+) -> ColumnArrays:
     """Columns in the order sample, channel."""
     samples, channels = len(calibs), len(CHANNELS)
     previous, following = (
-        np.where(neighbour[:, None] < 0, NULL_INTEGER, neighbour[:, None] * channels + np.arange(channels))
+        np.where(
+            neighbour[:, None] < 0,
+            NULL_INTEGER,
+            neighbour[:, None] * channels + np.arange(channels),
+        )
         for neighbour in neighbour_rows(frames, agents)
     )
     size = np.full((samples, channels, 2), NULL_INTEGER, dtype=np.int64)
@@ -311,7 +337,9 @@ def _sample_data_rows(calibs: Calibs, calibrated_sensor_of: IntArray, agents: in
         "ego_pose_row": np.repeat(np.arange(samples), channels),
         "channel": np.tile(np.arange(channels), samples),
         "modality": np.tile(_channel_modalities(), samples),
-        "fileformat": np.tile([FILE_FORMATS.index(CHANNEL_FORMAT[channel]) for channel in CHANNELS], samples),
+        "fileformat": np.tile(
+            [FILE_FORMATS.index(CHANNEL_FORMAT[channel]) for channel in CHANNELS], samples
+        ),
         "width": size[..., 0].reshape(-1),
         "height": size[..., 1].reshape(-1),
         "prev_row": previous.reshape(-1),
@@ -319,7 +347,9 @@ def _sample_data_rows(calibs: Calibs, calibrated_sensor_of: IntArray, agents: in
     }
 
 
-def _calibrated_sensor_rows(values: FloatArray, agents: int, frames: int) -> tuple[ColumnArrays, IntArray]:
+def _calibrated_sensor_rows(
+    values: FloatArray, agents: int, frames: int
+) -> tuple[ColumnArrays, IntArray]:
     """The distinct values of each agent's sensors by first occurrence; (samples, channels) which of them each is."""
     row_of = np.zeros(values.shape[:2], dtype=np.int64)
     chosen: list[FloatArray] = []
@@ -348,11 +378,15 @@ def _sensor_values(calibs: Calibs) -> FloatArray:
     """(samples, channels, 25): `ego_from_sensor` and K (NaN where there is none) of every file."""
     samples, channels = len(calibs), len(CHANNELS)
     matrix = np.tile(np.eye(4), (samples, channels, 1, 1))
-    matrix[:, : len(CAMERAS)] = calibs.ego_from_lidar[:, None] @ np.linalg.inv(calibs.camera_from_lidar)
+    matrix[:, : len(CAMERAS)] = calibs.ego_from_lidar[:, None] @ np.linalg.inv(
+        calibs.camera_from_lidar
+    )
     matrix[:, CHANNELS.index(LIDAR)] = calibs.ego_from_lidar
     intrinsic = np.full((samples, channels, 3, 3), np.nan)
     intrinsic[:, : len(CAMERAS)] = calibs.intrinsic
-    return np.concatenate([matrix.reshape(samples, channels, 16), intrinsic.reshape(samples, channels, 9)], axis=-1)
+    return np.concatenate(
+        [matrix.reshape(samples, channels, 16), intrinsic.reshape(samples, channels, 9)], axis=-1
+    )
 
 
 def _ego_pose_rows(calibs: Calibs, agents: int, frames: int) -> ColumnArrays:

@@ -24,7 +24,13 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
-from deepaccident_devkit.errors import BrokenReleaseError, DatarootError, IndexStoreError, VersionError, escaped
+from deepaccident_devkit.errors import (
+    BrokenReleaseError,
+    DatarootError,
+    IndexStoreError,
+    VersionError,
+    escaped,
+)
 from deepaccident_devkit.release import ReleaseLayout
 from deepaccident_devkit.release.store import Dataroot, index_places, list_files_in, places_of
 from deepaccident_devkit.support.arrays import ShortRepr
@@ -36,7 +42,13 @@ from deepaccident_devkit.support.files import (
     temporary_of,
     write_own,
 )
-from deepaccident_devkit.support.reading import RefusedFileError, byte_limit, fault_text, file_checksum, read_bytes
+from deepaccident_devkit.support.reading import (
+    RefusedFileError,
+    byte_limit,
+    fault_text,
+    file_checksum,
+    read_bytes,
+)
 from deepaccident_devkit.support.text import choice
 from deepaccident_devkit.tables.arrow_files import table_path
 from deepaccident_devkit.tables.records import SCHEMA_VERSION, table_specs
@@ -109,14 +121,35 @@ class Index(ShortRepr):
         """The index in a folder, up to date or not; None if there is none that today's code can use."""
         content = _manifest(folder)
         try:
-            if content.pop("checksum") != _checksum(content) or content.pop("schema_version") != SCHEMA_VERSION:
+            if (
+                content.pop("checksum") != _checksum(content)
+                or content.pop("schema_version") != SCHEMA_VERSION
+            ):
                 return None
-            problems = [Problem(**{**each, "messages": tuple(each["messages"])}) for each in content.pop("problems")]
-            files = {name: (int(size), str(digest)) for name, (size, digest) in content.pop("table_files").items()}
+            problems = [
+                Problem(**{**each, "messages": tuple(each["messages"])})
+                for each in content.pop("problems")
+            ]
+            files = {
+                name: (int(size), str(digest))
+                for name, (size, digest) in content.pop("table_files").items()
+            }
             notices = tuple(content.pop("notices"))
-            index = cls(folder=folder, table_files=files, problems=tuple(problems), notices=notices, **content)
-            names = {table_path(Path(), table).name for table in table_specs()} if index.tables else set()
-            whole = set(files) == names and re.fullmatch(rf"({_TABLES}\w+)?", index.tables, re.ASCII)
+            index = cls(
+                folder=folder,
+                table_files=files,
+                problems=tuple(problems),
+                notices=notices,
+                **content,
+            )
+            names = (
+                {table_path(Path(), table).name for table in table_specs()}
+                if index.tables
+                else set()
+            )
+            whole = set(files) == names and re.fullmatch(
+                rf"({_TABLES}\w+)?", index.tables, re.ASCII
+            )
         except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError):
             return None
         return index if whole else None
@@ -136,8 +169,14 @@ class Index(ShortRepr):
         """
         if self.fingerprint != fingerprint or not self._has_sizes():
             return False
-        broken = {problem.scenario: problem.contents for problem in self.problems if problem.contents}
-        return all(content_hashes(each) == broken[each.token] for each in layout.scenarios if each.token in broken)
+        broken = {
+            problem.scenario: problem.contents for problem in self.problems if problem.contents
+        }
+        return all(
+            content_hashes(each) == broken[each.token]
+            for each in layout.scenarios
+            if each.token in broken
+        )
 
     def is_whole(self) -> bool:
         """Whether the content of all tables is what was written; by size first, for a hole has gigabytes to read."""
@@ -184,7 +223,9 @@ def open_index(
     index = None if check_times or check_files else current_index(layout, index_dir)
     while index is None:
         folder = _writable_folder(layout, index_dir)
-        index = _made(layout, folder, check_files=check_files, **how) or current_index(layout, index_dir)
+        index = _made(layout, folder, check_files=check_files, **how) or current_index(
+            layout, index_dir
+        )
     _accept(layout, index, on_error)
     return index
 
@@ -226,11 +267,15 @@ def _writable_folder(layout: ReleaseLayout, index_dir: Path | None) -> Path:
     folder = next(filter(is_writable_folder, folders), None)
     if folder is None:
         places = " or ".join(map(str, folders))
-        raise IndexStoreError(f"{places}: no place to write the index; give a writable folder with index_dir=")
+        raise IndexStoreError(
+            f"{places}: no place to write the index; give a writable folder with index_dir="
+        )
     return folder
 
 
-def _made(layout: ReleaseLayout, folder: Path, *, check_files: bool, **how: Unpack[Engine]) -> Index | None:
+def _made(
+    layout: ReleaseLayout, folder: Path, *, check_files: bool, **how: Unpack[Engine]
+) -> Index | None:
     """Bring the index in `folder` up to date; None if another process, with which it shared the work, has done that.
 
     Broken scenarios do not stop it: they are listed in the manifest. Damaged rows and tables are made again.
@@ -243,7 +288,9 @@ def _made(layout: ReleaseLayout, folder: Path, *, check_files: bool, **how: Unpa
     _refuse_newer(folder)
     fingerprint, splits = _fingerprint(layout), assign_splits(layout)
     store = _store(folder, f"{SCHEMA_VERSION} {fingerprint} {check_files}")
-    candidates = {each.token: each for each in layout.scenarios if each.token not in splits.problems}
+    candidates = {
+        each.token: each for each in layout.scenarios if each.token not in splits.problems
+    }
     with store.shared(tidy=partial(_tidy, folder)) as turn:
         outcomes = store.run(
             partial(index_scenario, store, check_files=check_files),
@@ -254,20 +301,28 @@ def _made(layout: ReleaseLayout, folder: Path, *, check_files: bool, **how: Unpa
         )
         if not turn.alone():
             return None
-        tables, files = _written_tables(store, [outcome for outcome in outcomes.values() if outcome.indexed], splits)
+        tables, files = _written_tables(
+            store, [outcome for outcome in outcomes.values() if outcome.indexed], splits
+        )
         broken = [
             Problem(scenario=token, messages=outcome.messages, contents=outcome.contents)
             for token, outcome in outcomes.items()
             if outcome.messages
         ]
-        misplaced = [Problem(scenario=token, messages=messages) for token, messages in splits.problems.items()]
+        misplaced = [
+            Problem(scenario=token, messages=messages)
+            for token, messages in splits.problems.items()
+        ]
         index = Index(
             folder=folder,
             fingerprint=fingerprint,
             tables=tables,
             table_files=files,
             problems=tuple(sorted(broken + misplaced, key=lambda problem: problem.scenario)),
-            notices=(*splits.notices, *(notice for each in outcomes.values() for notice in each.notices)),
+            notices=(
+                *splits.notices,
+                *(notice for each in outcomes.values() for notice in each.notices),
+            ),
         )
         index.write()
         kept = {f"kept/{token}" for token, outcome in outcomes.items() if outcome.indexed}
@@ -305,16 +360,27 @@ def _written_tables(
     if not outcomes:
         return "", {}
     assigned = [splits.split_of.get(outcome.scenario.token) for outcome in outcomes]
-    hashes = json.dumps({outcome.scenario.token: json.loads(outcome.contents) for outcome in outcomes})
-    made_from = (SCHEMA_VERSION, hashes, [outcome.scenario.folder for outcome in outcomes], assigned)
+    hashes = json.dumps(
+        {outcome.scenario.token: json.loads(outcome.contents) for outcome in outcomes}
+    )
+    made_from = (
+        SCHEMA_VERSION,
+        hashes,
+        [outcome.scenario.folder for outcome in outcomes],
+        assigned,
+    )
     name = _TABLES + hashlib.blake2b(repr(made_from).encode(), digest_size=8).hexdigest()
     folder, before = place_in(store.folder, name, opened=True), Index.read(store.folder)
     if before is not None and before.tables == name and before.is_whole():
         files = dict(before.table_files)
     else:
-        remove_in(store.folder, name)  # damaged, or of a process that was stopped before its manifest
+        remove_in(
+            store.folder, name
+        )  # damaged, or of a process that was stopped before its manifest
         with replacing_folder(folder) as temporary:
-            join_tables(temporary, [store.path(each.scenario.token) for each in outcomes], assigned, hashes)
+            join_tables(
+                temporary, [store.path(each.scenario.token) for each in outcomes], assigned, hashes
+            )
             files = table_files(temporary)
     return name, files
 
@@ -349,7 +415,9 @@ def _unnamed(folder: Path, tables: str = "") -> list[str]:
 def _manifest(folder: Path) -> dict[str, Any]:
     """The manifest's JSON object, empty if there is none."""
     try:
-        content = json.loads(read_bytes(folder / MANIFEST_FILE, "index"))  # names of files may have half characters
+        content = json.loads(
+            read_bytes(folder / MANIFEST_FILE, "index")
+        )  # names of files may have half characters
     except (OSError, ValueError, RecursionError, MemoryError):
         return {}
     return content if isinstance(content, dict) else {}
@@ -370,9 +438,13 @@ def _accept(layout: ReleaseLayout, index: Index, on_error: OnError) -> None:
     if index.problems and (on_error == "raise" or not index.tables):
         raise BrokenReleaseError(_problems_text(layout, index.problems))
     if not index.tables:
-        raise DatarootError(f"{layout.root}: its scenarios hold no calib files; unpack the calib archives")
+        raise DatarootError(
+            f"{layout.root}: its scenarios hold no calib files; unpack the calib archives"
+        )
     for problem in index.problems:
-        logger.warning("left out %s", escaped(f"{problem.scenario}: {' | '.join(problem.messages)}"))
+        logger.warning(
+            "left out %s", escaped(f"{problem.scenario}: {' | '.join(problem.messages)}")
+        )
     places: dict[str, list[str]] = {}
     for notice in index.notices:
         place, _, words = notice.partition(": ")
@@ -397,7 +469,9 @@ def _first_lines(messages: Sequence[str]) -> list[str]:
     return [*(f"    {message}" for message in messages[:_NAMED]), *more]
 
 
-def clear_index(dataroot: Dataroot, *, version: str = "v1", index_dir: Path | None = None) -> list[Path]:
+def clear_index(
+    dataroot: Dataroot, *, version: str = "v1", index_dir: Path | None = None
+) -> list[Path]:
     """Remove the indexes of a release, in its own folder and in the user's cache, with what stopped processes left.
 
     Waits for a process that makes one. The release itself is not needed, nor touched.
@@ -442,11 +516,15 @@ def _refuse_foreign(folder: Path) -> None:
     """Raise IndexStoreError if there is anything in the folder that no devkit puts there."""
     paths = {path.relative_to(folder).as_posix(): path for path in sorted(folder.rglob("*"))}
     foreign = [
-        name for name, path in paths.items() if path.is_symlink() or not (path.is_dir() or _FILE.fullmatch(name))
+        name
+        for name, path in paths.items()
+        if path.is_symlink() or not (path.is_dir() or _FILE.fullmatch(name))
     ]
     if foreign:
         names = ", ".join(foreign[:_NAMED])
-        raise IndexStoreError(f"{folder}: not removed: it holds what is no part of an index: {names}; look at it")
+        raise IndexStoreError(
+            f"{folder}: not removed: it holds what is no part of an index: {names}; look at it"
+        )
 
 
 def _remove(store: Store) -> None:

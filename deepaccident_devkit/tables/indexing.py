@@ -75,16 +75,24 @@ def assign_splits(layout: ReleaseLayout) -> SplitAssignment:
         for first, second in combinations([split for split in group if split in listed], 2):
             for token in sorted(listed[first] & listed[second] & tokens):
                 files = f"{layout.split_files[first]} and {layout.split_files[second]}"
-                problems.setdefault(token, []).append(f"stands in two splits: {files}; remove it from one")
+                problems.setdefault(token, []).append(
+                    f"stands in two splits: {files}; remove it from one"
+                )
     for token, folders in _folders_of(layout).items():
         if len(folders) > 1:
             places = " and ".join(str(layout.root / folder) for folder in folders)
             problems.setdefault(token, []).append(f"stands in two folders: {places}; remove one")
-    in_folder = {scenario.token: scenario.folder for scenario in layout.scenarios if scenario.folder in SPLITS}
+    in_folder = {
+        scenario.token: scenario.folder
+        for scenario in layout.scenarios
+        if scenario.folder in SPLITS
+    }
     in_files = {token: split for split in SPLITS for token in listed.get(split, ())}
     missing = {split: len(set(listed.get(split, ())) - tokens) for split in SPLITS}
     return SplitAssignment(
-        split_of={token: split for token, split in {**in_folder, **in_files}.items() if token in tokens},
+        split_of={
+            token: split for token, split in {**in_folder, **in_files}.items() if token in tokens
+        },
         problems={token: tuple(messages) for token, messages in problems.items()},
         unlisted=tuple(sorted(tokens - set(in_files))) if set(SPLITS) <= set(listed) else (),
         contradictions=_contradictions(listed, in_folder),
@@ -96,7 +104,9 @@ def assign_splits(layout: ReleaseLayout) -> SplitAssignment:
     )
 
 
-def _contradictions(listed: Mapping[str, set[str]], in_folder: Mapping[str, str]) -> dict[str, tuple[str, ...]]:
+def _contradictions(
+    listed: Mapping[str, set[str]], in_folder: Mapping[str, str]
+) -> dict[str, tuple[str, ...]]:
     messages: dict[str, list[str]] = {}
     for token, folder in in_folder.items():
         for split in SPLITS:
@@ -145,7 +155,8 @@ def index_scenario(store: Store, scenario: ScenarioFolder, *, check_files: bool 
     token, scan = scenario.token, scan_scenario(scenario)
     if not scan.agents and not scan.problems:
         return Outcome(
-            scenario=scenario, notices=(*scan.notices, f"{token}: its calib folders hold no files; left out")
+            scenario=scenario,
+            notices=(*scan.notices, f"{token}: its calib folders hold no files; left out"),
         )
     faults: Sequence[Finding] = scan.problems
     content = None if faults else store.kept(token, key, "index")
@@ -156,7 +167,9 @@ def index_scenario(store: Store, scenario: ScenarioFolder, *, check_files: bool 
         if files is not None:
             store.keep(token, key, rows_to_keep(scenario_rows(files), contents))
     notices = scan.notices if faults else (*scan.notices, *_end_notices(scenario, scan))
-    return Outcome(scenario=scenario, contents=contents, messages=tuple(map(str, faults)), notices=notices)
+    return Outcome(
+        scenario=scenario, contents=contents, messages=tuple(map(str, faults)), notices=notices
+    )
 
 
 def _end_notices(scenario: ScenarioFolder, scan: ScenarioScan) -> Iterator[str]:
@@ -174,7 +187,9 @@ def rows_to_keep(tables: Mapping[str, ColumnArrays], contents: str) -> bytes:
     return streams([(spec, tables[spec.name]) for spec in _kept_specs()], {HASHES: contents})
 
 
-def join_tables(folder: Path, scenarios: Sequence[Path], splits: Sequence[str | None], hashes: str = "{}") -> None:
+def join_tables(
+    folder: Path, scenarios: Sequence[Path], splits: Sequence[str | None], hashes: str = "{}"
+) -> None:
     """Write every table to a folder: row keys count on, scenario after scenario, whose kept rows and splits are given.
 
     The table of scenarios carries the hashes of their files, by token, as JSON. Raises OSError, and IndexStoreError if
@@ -182,7 +197,10 @@ def join_tables(folder: Path, scenarios: Sequence[Path], splits: Sequence[str | 
     """
     specs = table_specs()
     with ExitStack() as stack:
-        writers = {spec.name: stack.enter_context(TableWriter(folder, specs[spec.name])) for spec in _kept_specs()}
+        writers = {
+            spec.name: stack.enter_context(TableWriter(folder, specs[spec.name]))
+            for spec in _kept_specs()
+        }
         for path, split in zip(scenarios, splits, strict=True):
             tables = _kept_rows(path)
             tables["scenario"]["split"] = [NULL_INTEGER if split is None else SPLITS.index(split)]
@@ -201,7 +219,10 @@ def _kept_specs() -> list[TableSpec]:
     """The tables of which a scenario has rows, with the columns that are kept."""
     return [
         replace(
-            spec, columns=tuple(column for column in spec.columns if column.stored not in _FROM_OTHERS.get(name, ()))
+            spec,
+            columns=tuple(
+                column for column in spec.columns if column.stored not in _FROM_OTHERS.get(name, ())
+            ),
         )
         for name, spec in table_specs().items()
         if name not in _SHARED_TABLES
@@ -225,11 +246,19 @@ def _kept_rows(path: Path) -> dict[str, dict[str, Any]]:
     }
 
 
-def _counted_on(spec: TableSpec, rows: Mapping[str, Any], first_rows: Mapping[str, int]) -> dict[str, Any]:
+def _counted_on(
+    spec: TableSpec, rows: Mapping[str, Any], first_rows: Mapping[str, int]
+) -> dict[str, Any]:
     """The same rows with keys that count from the joined tables' start; nulls and shared tables' keys stay."""
     result = dict(rows)
     for column in spec.stored_columns:
-        if isinstance(column.kind, Key) and column.stored and column.kind.table not in _SHARED_TABLES:
+        if (
+            isinstance(column.kind, Key)
+            and column.stored
+            and column.kind.table not in _SHARED_TABLES
+        ):
             local = np.asarray(rows[column.stored], dtype=np.int64)
-            result[column.stored] = np.where(local == NULL_INTEGER, local, local + first_rows[column.kind.table])
+            result[column.stored] = np.where(
+                local == NULL_INTEGER, local, local + first_rows[column.kind.table]
+            )
     return result

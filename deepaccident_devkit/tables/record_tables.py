@@ -53,12 +53,16 @@ class RecordTables:
 
         Rows of what an agent recorded are only those of `agents`; tracks and instances are merged from all agents'.
         """
-        chosen = np.array([self._tables.getind("scenario", token) for token in scenarios], dtype=np.int64)
+        chosen = np.array(
+            [self._tables.getind("scenario", token) for token in scenarios], dtype=np.int64
+        )
         agent, sample = self._tables.columns("agent"), self._tables.columns("sample")
         codes = [AGENTS.index(name) for name in AGENTS if name in agents]
         recorders = self._rows_with("agent", "scenario_row", chosen)
         recorders = recorders[np.isin(agent["name"][recorders], codes)]
-        num_frames = self._tables.columns("scenario")["num_frames"][agent["scenario_row"][recorders]]
+        num_frames = self._tables.columns("scenario")["num_frames"][
+            agent["scenario_row"][recorders]
+        ]
         samples = _spans(agent["first_sample_row"][recorders], num_frames)
         return {
             "scenario": chosen,
@@ -69,7 +73,9 @@ class RecordTables:
             "calibrated_sensor": self._rows_with("calibrated_sensor", "agent_row", recorders),
             "ego_pose": samples,
             "instance": self._rows_with("instance", "scenario_row", chosen),
-            "annotation": _spans(sample["first_annotation_row"][samples], sample["num_annotations"][samples]),
+            "annotation": _spans(
+                sample["first_annotation_row"][samples], sample["num_annotations"][samples]
+            ),
             "track": self._rows_with("track", "scenario_row", chosen),
         }
 
@@ -94,13 +100,18 @@ class RecordTables:
     def _rows_with(self, table: str, key: str, targets: IntArray) -> IntArray:
         """The rows of a table whose `key`, which is sorted, is one of the rows `targets` of another table."""
         column = self._tables.columns(table)[key]
-        first, last = (np.searchsorted(column, (targets + each).astype(column.dtype)) for each in (0, 1))
+        first, last = (
+            np.searchsorted(column, (targets + each).astype(column.dtype)) for each in (0, 1)
+        )
         return _spans(first, last - first)
 
     def _values(self, table: str, column: Column, rows: IntArray) -> Any:  # noqa: PLR0911 - one a kind
         if column.stored is None:
             return self._filenames(rows) if column.field == "filename" else self.tokens(table, rows)
-        stored, view = self._tables.arrow(table)[column.stored], self._tables.columns(table)[column.stored]
+        stored, view = (
+            self._tables.arrow(table)[column.stored],
+            self._tables.columns(table)[column.stored],
+        )
         match column.kind:
             case Key(table=target):
                 return self._keys(target, view[rows])
@@ -122,11 +133,16 @@ class RecordTables:
 
     def _agent_tokens(self, rows: IntArray) -> Any:
         agent = self._tables.columns("agent")
-        return _joined(self._scenarios.take(agent["scenario_row"][rows]), _words(AGENTS, agent["name"][rows]))
+        return _joined(
+            self._scenarios.take(agent["scenario_row"][rows]), _words(AGENTS, agent["name"][rows])
+        )
 
     def _frame_tokens(self, rows: IntArray) -> Any:
         frame = self._tables.columns("frame")
-        return _joined(self._scenarios.take(frame["scenario_row"][rows]), self._numbers.take(frame["index"][rows]))
+        return _joined(
+            self._scenarios.take(frame["scenario_row"][rows]),
+            self._numbers.take(frame["index"][rows]),
+        )
 
     def _sample_tokens(self, rows: IntArray) -> Any:
         agent = self._tables.columns("sample")["agent_row"][rows]
@@ -134,7 +150,9 @@ class RecordTables:
 
     def _number_words(self, samples: IntArray, agents: IntArray) -> Any:
         """The frame numbers `NNN` of samples of agents, both by row."""
-        return self._numbers.take(samples - self._tables.columns("agent")["first_sample_row"][agents] + 1)
+        return self._numbers.take(
+            samples - self._tables.columns("agent")["first_sample_row"][agents] + 1
+        )
 
     def _sample_data_tokens(self, rows: IntArray) -> Any:
         sample, channel = np.divmod(rows, len(CHANNELS))
@@ -144,11 +162,17 @@ class RecordTables:
         import pyarrow.compute as pc
 
         view = self._tables.columns("calibrated_sensor")
-        first = _joined(self._agent_tokens(view["agent_row"][rows]), _words(CHANNELS, view["sensor_row"][rows]))
-        return pc.if_else(view["number"][rows] == 1, first, _joined(first, _digits(view["number"][rows])))
+        first = _joined(
+            self._agent_tokens(view["agent_row"][rows]), _words(CHANNELS, view["sensor_row"][rows])
+        )
+        return pc.if_else(
+            view["number"][rows] == 1, first, _joined(first, _digits(view["number"][rows]))
+        )
 
     def _instance_tokens(self, rows: IntArray) -> Any:
-        return self._actor_tokens("scenario", self._tables.columns("instance")["scenario_row"][rows], rows)
+        return self._actor_tokens(
+            "scenario", self._tables.columns("instance")["scenario_row"][rows], rows
+        )
 
     def _track_tokens(self, rows: IntArray) -> Any:
         track = self._tables.columns("track")
@@ -173,10 +197,17 @@ class RecordTables:
         scenario = self._tables.columns("agent")["scenario_row"][agent]
         words = self._tables.columns("scenario")
         name = words["name"].take(scenario)
-        folder, agents = words["folder"].take(scenario), _words(AGENTS, self._tables.columns("agent")["name"][agent])
+        folder, agents = (
+            words["folder"].take(scenario),
+            _words(AGENTS, self._tables.columns("agent")["name"][agent]),
+        )
         file = _joined(name, self._number_words(sample, agent), separator="_")
-        file = _joined(file, _words([CHANNEL_FORMAT[each] for each in CHANNELS], channel), separator=".")
-        path = _joined(words["scenario_type"].take(scenario), agents, _words(CHANNELS, channel), name, file)
+        file = _joined(
+            file, _words([CHANNEL_FORMAT[each] for each in CHANNELS], channel), separator="."
+        )
+        path = _joined(
+            words["scenario_type"].take(scenario), agents, _words(CHANNELS, channel), name, file
+        )
         return pc.if_else(pc.equal(folder, ""), path, _joined(folder, path))
 
 
@@ -210,7 +241,10 @@ def _subsets(values: Sequence[str], masks: IntArray) -> Any:
     """The lists of words that bit masks stand for."""
     import pyarrow as pa
 
-    lists = [[word for bit, word in enumerate(values) if mask >> bit & 1] for mask in range(1 << len(values))]
+    lists = [
+        [word for bit, word in enumerate(values) if mask >> bit & 1]
+        for mask in range(1 << len(values))
+    ]
     return pa.array(lists).take(pa.array(masks))
 
 
@@ -230,7 +264,9 @@ def _nullable_lists(data: FloatArray, shape: Sequence[int]) -> Any:
     known = ~np.isnan(data[:, 0])
     array = pa.array(data[known].reshape(-1))
     for length in reversed(shape):
-        array = pa.ListArray.from_arrays(np.arange(0, len(array) + 1, length, dtype=np.int32), array)
+        array = pa.ListArray.from_arrays(
+            np.arange(0, len(array) + 1, length, dtype=np.int32), array
+        )
     return _spread(array, known)
 
 
@@ -239,7 +275,10 @@ def _of_open_lists(structs: Any) -> Any:
     import pyarrow as pa
 
     fields = [(field.name, field.type) for field in structs.type]
-    opened = {name: pa.list_(kind.value_type) if pa.types.is_fixed_size_list(kind) else kind for name, kind in fields}
+    opened = {
+        name: pa.list_(kind.value_type) if pa.types.is_fixed_size_list(kind) else kind
+        for name, kind in fields
+    }
     return pa.array(structs.to_pylist(), type=pa.struct(list(opened.items())))
 
 

@@ -46,8 +46,12 @@ class CollisionRecord(TypedDict):
     ids: Annotated[list[int], Items(type="integer", doc="Actor ids of the pair.")]
     classes: Annotated[list[str], Items(type="string", doc="Category names of the pair.")]
     impact: Annotated[float, Number(dtype="float64", doc="The simulator's impulse of the contact.")]
-    spawn_relation: Annotated[str, Word(doc="Meta's word for where the pair was spawned, such as `same`.")]
-    contact_side: Annotated[str, Word(doc="Meta's word for where the contact was, such as `front_side`.")]
+    spawn_relation: Annotated[
+        str, Word(doc="Meta's word for where the pair was spawned, such as `same`.")
+    ]
+    contact_side: Annotated[
+        str, Word(doc="Meta's word for where the contact was, such as `front_side`.")
+    ]
     agents: Annotated[
         list[str | None] | None,
         Items(
@@ -61,11 +65,17 @@ class CollisionRecord(TypedDict):
 class ScenarioRecord(TypedDict):
     """One recording of 36 to 100 frames at an intersection, seen by up to five agents."""
 
-    token: Annotated[str, Derived(doc="`<scenario_type>/<name>`; a name alone occurs under several types.")]
+    token: Annotated[
+        str, Derived(doc="`<scenario_type>/<name>`; a name alone occurs under several types.")
+    ]
     name: Annotated[str, Word(doc="Folder name, `<Town>_type001_subtype000<k>_scenario000<nn>`.")]
     scenario_type: Annotated[str, Word(doc="Such as `type1_subtype1_accident`.")]
-    folder: Annotated[str, Word(doc="Folder of layout B below the dataroot (`train`, …), empty in layout A.")]
-    signalized: Annotated[bool, Number(dtype="bool", doc="Whether the intersection has traffic lights (subtype1).")]
+    folder: Annotated[
+        str, Word(doc="Folder of layout B below the dataroot (`train`, …), empty in layout A.")
+    ]
+    signalized: Annotated[
+        bool, Number(dtype="bool", doc="Whether the intersection has traffic lights (subtype1).")
+    ]
     designed_accident: Annotated[
         bool,
         Number(
@@ -77,16 +87,24 @@ class ScenarioRecord(TypedDict):
     town: Annotated[str, Word(doc="CARLA town, first part of the name.")]
     weather: Annotated[str | None, Word(doc="Clear, Cloudy, HardRain, …; null without meta.")]
     time_of_day: Annotated[str | None, Choice(values=TIMES_OF_DAY, doc="Null without meta.")]
-    road_type: Annotated[str | None, Word(doc="`four-way junction` or `three-way junction`; null where unsaid.")]
-    spawn_side: Annotated[str | None, Word(doc="Where the other vehicle comes from: left, right, opposite….")]
+    road_type: Annotated[
+        str | None, Word(doc="`four-way junction` or `three-way junction`; null where unsaid.")
+    ]
+    spawn_side: Annotated[
+        str | None, Word(doc="Where the other vehicle comes from: left, right, opposite….")
+    ]
     ego_direction: Annotated[str | None, Word(doc="straight, left or right.")]
     other_direction: Annotated[str | None, Word(doc="straight, left or right.")]
     collision: Annotated[
-        CollisionRecord | None, Struct(record=CollisionRecord, doc="Null if meta names no collision, or is missing.")
+        CollisionRecord | None,
+        Struct(record=CollisionRecord, doc="Null if meta names no collision, or is missing."),
     ]
     accident_type: Annotated[
         int | None,
-        Number(dtype="int8", doc="The paper's design 1 to 12 that the accident realises; null for any other end."),
+        Number(
+            dtype="int8",
+            doc="The paper's design 1 to 12 that the accident realises; null for any other end.",
+        ),
     ]
     velocity_frame: Annotated[
         str | None,
@@ -97,12 +115,19 @@ class ScenarioRecord(TypedDict):
             "`released` where it is null.",
         ),
     ]
-    num_frames: Annotated[int, Number(dtype="int32", doc="Recorded frames, numbered from 1, at 10 Hz.")]
+    num_frames: Annotated[
+        int, Number(dtype="int32", doc="Recorded frames, numbered from 1, at 10 Hz.")
+    ]
     first_frame_token: Annotated[str, Key(table="frame", doc="The first moment.")]
-    last_frame_token: Annotated[str, Key(table="frame", doc="The last moment: of an accident, the impact.")]
+    last_frame_token: Annotated[
+        str, Key(table="frame", doc="The last moment: of an accident, the impact.")
+    ]
     split: Annotated[
         str | None,
-        Choice(values=SPLITS, doc="From the split files, else the folder of layout B, else null (unknown)."),
+        Choice(
+            values=SPLITS,
+            doc="From the split files, else the folder of layout B, else null (unknown).",
+        ),
     ]
 
 
@@ -112,11 +137,20 @@ class AgentRecord(TypedDict):
     token: Annotated[str, Derived(doc="`<scenario>/<agent>`.")]
     scenario_token: Annotated[str, Key(table="scenario", doc="Its scenario.")]
     name: Annotated[str, Choice(values=AGENTS, doc="The release's folder name.")]
-    actor_id: Annotated[int | None, Number(dtype="int64", doc="CARLA id by meta; null for infrastructure.")]
-    category: Annotated[str | None, Choice(values=CATEGORIES, doc="Of its own label row; null without one.")]
-    size: Annotated[list[float] | None, Vector(shape=(3,), doc="Length, width, height of its own label row.", unit="m")]
+    actor_id: Annotated[
+        int | None, Number(dtype="int64", doc="CARLA id by meta; null for infrastructure.")
+    ]
+    category: Annotated[
+        str | None, Choice(values=CATEGORIES, doc="Of its own label row; null without one.")
+    ]
+    size: Annotated[
+        list[float] | None,
+        Vector(shape=(3,), doc="Length, width, height of its own label row.", unit="m"),
+    ]
     is_infrastructure: Annotated[bool, Number(dtype="bool", doc="Whether it is the roadside pole.")]
-    first_sample_token: Annotated[str, Key(table="sample", doc="Its first sample; the rest follow.")]
+    first_sample_token: Annotated[
+        str, Key(table="sample", doc="Its first sample; the rest follow.")
+    ]
 
 
 class FrameRecord(TypedDict):
@@ -125,10 +159,16 @@ class FrameRecord(TypedDict):
     token: Annotated[str, Derived(doc="`<scenario>/<NNN>`.")]
     scenario_token: Annotated[str, Key(table="scenario", doc="Its scenario.")]
     index: Annotated[int, Number(dtype="int32", doc="The frame's number NNN, from 1.")]
-    timestamp: Annotated[float, Number(dtype="float64", doc="Since the first frame: (NNN − 1) · 0.1.", unit="s")]
+    timestamp: Annotated[
+        float, Number(dtype="float64", doc="Since the first frame: (NNN − 1) · 0.1.", unit="s")
+    ]
     time_to_impact: Annotated[
         float | None,
-        Number(dtype="float64", doc="Until the recorded impact (the paper's TTC); null without one.", unit="s"),
+        Number(
+            dtype="float64",
+            doc="Until the recorded impact (the paper's TTC); null without one.",
+            unit="s",
+        ),
     ]
     prev: Annotated[str | None, Key(table="frame", doc="The moment before.")]
     next: Annotated[str | None, Key(table="frame", doc="The moment after.")]
@@ -145,16 +185,26 @@ class SampleRecord(TypedDict):
     timestamp: Annotated[float, Number(dtype="float64", doc="Since the first frame.", unit="s")]
     velocity: Annotated[
         list[float] | None,
-        Vector(shape=(2,), doc="The agent's, in world: the label's first line as (vx, −vy).", unit="m/s"),
+        Vector(
+            shape=(2,),
+            doc="The agent's, in world: the label's first line as (vx, −vy).",
+            unit="m/s",
+        ),
     ]
-    time_to_end: Annotated[float, Number(dtype="float64", doc="Until the scenario's last frame.", unit="s")]
+    time_to_end: Annotated[
+        float, Number(dtype="float64", doc="Until the scenario's last frame.", unit="s")
+    ]
     time_to_impact: Annotated[
-        float | None, Number(dtype="float64", doc="Until the recorded impact; null without one.", unit="s")
+        float | None,
+        Number(dtype="float64", doc="Until the recorded impact; null without one.", unit="s"),
     ]
     labelled: Annotated[bool, Number(dtype="bool", doc="Whether there is a label file.")]
-    num_annotations: Annotated[int, Number(dtype="int32", doc="Boxes annotated by this agent at this moment.")]
+    num_annotations: Annotated[
+        int, Number(dtype="int32", doc="Boxes annotated by this agent at this moment.")
+    ]
     first_annotation_token: Annotated[
-        str | None, Key(table="annotation", doc="Its first box; the others are the rows that follow.")
+        str | None,
+        Key(table="annotation", doc="Its first box; the others are the rows that follow."),
     ]
     prev: Annotated[str | None, Key(table="sample", doc="The same agent's moment before.")]
     next: Annotated[str | None, Key(table="sample", doc="The same agent's moment after.")]
@@ -167,15 +217,24 @@ class SampleDataRecord(TypedDict):
     sample_token: Annotated[str, Key(table="sample", doc="Its sample.")]
     sensor_token: Annotated[str, Key(table="sensor", doc="Its sensor.")]
     calibrated_sensor_token: Annotated[
-        str, Key(table="calibrated_sensor", doc="Where the sensor sits on the agent, and its intrinsics.")
+        str,
+        Key(
+            table="calibrated_sensor", doc="Where the sensor sits on the agent, and its intrinsics."
+        ),
     ]
     ego_pose_token: Annotated[str, Key(table="ego_pose", doc="Where the agent was.")]
     channel: Annotated[str, Choice(values=CHANNELS, doc="The release's folder name.")]
     modality: Annotated[str, Choice(values=MODALITIES, doc="Of the sensor.")]
     filename: Annotated[str, Derived(doc="Path below the dataroot, with forward slashes.")]
     fileformat: Annotated[str, Choice(values=FILE_FORMATS, doc="Ending of the file.")]
-    width: Annotated[int | None, Number(dtype="int32", doc="Image width by calib (2·cx); null for lidar.", unit="px")]
-    height: Annotated[int | None, Number(dtype="int32", doc="Image height by calib (2·cy); null for lidar.", unit="px")]
+    width: Annotated[
+        int | None,
+        Number(dtype="int32", doc="Image width by calib (2·cx); null for lidar.", unit="px"),
+    ]
+    height: Annotated[
+        int | None,
+        Number(dtype="int32", doc="Image height by calib (2·cy); null for lidar.", unit="px"),
+    ]
     matrix: Annotated[
         list[list[float]],
         Vector(
@@ -203,17 +262,26 @@ class CalibratedSensorRecord(TypedDict):
     1 mm in the translation and 1e-5 in the rotation is one row, with the numbers of its first frame.
     """
 
-    token: Annotated[str, Derived(doc="`<scenario>/<agent>/<channel>`, then `/2`, `/3`, … for further values.")]
+    token: Annotated[
+        str, Derived(doc="`<scenario>/<agent>/<channel>`, then `/2`, `/3`, … for further values.")
+    ]
     sensor_token: Annotated[str, Key(table="sensor", doc="Its sensor.")]
     agent_token: Annotated[str, Key(table="agent", doc="Its agent.")]
     number: Annotated[int, Number(dtype="int32", doc="Counts the rows of this sensor from 1.")]
     translation: Annotated[
         list[float],
-        Vector(shape=(3,), doc="Of the sensor in the agent's ego frame; 0 for the BEV camera.", unit="m"),
+        Vector(
+            shape=(3,),
+            doc="Of the sensor in the agent's ego frame; 0 for the BEV camera.",
+            unit="m",
+        ),
     ]
     rotation: Annotated[
         list[float],
-        Vector(shape=(4,), doc="Quaternion w, x, y, z; cameras with optical axes (x right, y down, z forward)."),
+        Vector(
+            shape=(4,),
+            doc="Quaternion w, x, y, z; cameras with optical axes (x right, y down, z forward).",
+        ),
     ]
     camera_intrinsic: Annotated[
         list[list[float]] | None, Vector(shape=(3, 3), doc="K of a camera, else null.", unit="px")
@@ -228,12 +296,17 @@ class EgoPoseRecord(TypedDict):
     """Where an agent was at a moment: `world_from_ego`; one row a sample."""
 
     token: Annotated[str, Derived(doc="The sample's token.")]
-    translation: Annotated[list[float], Vector(shape=(3,), doc="Of the ego frame's origin in world.", unit="m")]
+    translation: Annotated[
+        list[float], Vector(shape=(3,), doc="Of the ego frame's origin in world.", unit="m")
+    ]
     rotation: Annotated[list[float], Vector(shape=(4,), doc="Quaternion w, x, y, z.")]
     timestamp: Annotated[float, Number(dtype="float64", doc="Since the first frame.", unit="s")]
     matrix: Annotated[
         list[list[float]],
-        Vector(shape=(4, 4), doc="`world_from_ego` as the calib file gives it, right-handed, bit for bit."),
+        Vector(
+            shape=(4, 4),
+            doc="`world_from_ego` as the calib file gives it, right-handed, bit for bit.",
+        ),
     ]
 
 
@@ -245,14 +318,18 @@ class InstanceRecord(TypedDict):
     actor_id: Annotated[int, Number(dtype="int64", doc="CARLA id; from 20000 on parked.")]
     category: Annotated[str, Choice(values=CATEGORIES, doc="By its first annotation.")]
     num_annotations: Annotated[int, Number(dtype="int32", doc="Over all frames and agents.")]
-    first_annotation_token: Annotated[str, Key(table="annotation", doc="First by frame, then agent.")]
+    first_annotation_token: Annotated[
+        str, Key(table="annotation", doc="First by frame, then agent.")
+    ]
     last_annotation_token: Annotated[str, Key(table="annotation", doc="Last by frame, then agent.")]
 
 
 class AnnotationRecord(TypedDict):
     """One box: an actor as one agent annotated it at one moment, in that sample's LiDAR frame."""
 
-    token: Annotated[str, Derived(doc="`<sample>/<row>`, row counted from 0 among the boxes of the label.")]
+    token: Annotated[
+        str, Derived(doc="`<sample>/<row>`, row counted from 0 among the boxes of the label.")
+    ]
     sample_token: Annotated[str, Key(table="sample", doc="Its sample.")]
     instance_token: Annotated[
         str | None,
@@ -262,7 +339,9 @@ class AnnotationRecord(TypedDict):
         ),
     ]
     category: Annotated[str, Choice(values=CATEGORIES, doc="The label's class.")]
-    translation: Annotated[list[float], Vector(shape=(3,), doc="Box centre, LiDAR frame.", unit="m")]
+    translation: Annotated[
+        list[float], Vector(shape=(3,), doc="Box centre, LiDAR frame.", unit="m")
+    ]
     size: Annotated[list[float], Vector(shape=(3,), doc="Full length, width, height.", unit="m")]
     rotation: Annotated[list[float], Vector(shape=(4,), doc="Quaternion w, x, y, z, LiDAR frame.")]
     velocity: Annotated[
@@ -274,12 +353,22 @@ class AnnotationRecord(TypedDict):
             unit="m/s",
         ),
     ]
-    yaw: Annotated[float, Number(dtype="float64", doc="About z, counter-clockwise, LiDAR frame.", unit="rad")]
-    actor_id: Annotated[
-        int, Number(dtype="int64", doc="As in the file: −100 the agent itself, −1 untracked, ≥ 20000 parked.")
+    yaw: Annotated[
+        float, Number(dtype="float64", doc="About z, counter-clockwise, LiDAR frame.", unit="rad")
     ]
-    num_lidar_pts: Annotated[int, Number(dtype="int64", doc="Points of this agent's LiDAR in the box.")]
-    camera_visible: Annotated[bool, Number(dtype="bool", doc="Whether any of this agent's cameras sees it.")]
+    actor_id: Annotated[
+        int,
+        Number(
+            dtype="int64",
+            doc="As in the file: −100 the agent itself, −1 untracked, ≥ 20000 parked.",
+        ),
+    ]
+    num_lidar_pts: Annotated[
+        int, Number(dtype="int64", doc="Points of this agent's LiDAR in the box.")
+    ]
+    camera_visible: Annotated[
+        bool, Number(dtype="bool", doc="Whether any of this agent's cameras sees it.")
+    ]
     velocity_label: Annotated[
         list[float],
         Vector(
@@ -289,12 +378,19 @@ class AnnotationRecord(TypedDict):
             unit="m/s",
         ),
     ]
-    is_collider: Annotated[bool, Number(dtype="bool", doc="Whether meta names this actor as one of the pair.")]
-    time_to_impact: Annotated[
-        float | None, Number(dtype="float64", doc="Until the recorded impact; null without one.", unit="s")
+    is_collider: Annotated[
+        bool, Number(dtype="bool", doc="Whether meta names this actor as one of the pair.")
     ]
-    prev: Annotated[str | None, Key(table="annotation", doc="The same agent's box of this actor before.")]
-    next: Annotated[str | None, Key(table="annotation", doc="The same agent's box of this actor after.")]
+    time_to_impact: Annotated[
+        float | None,
+        Number(dtype="float64", doc="Until the recorded impact; null without one.", unit="s"),
+    ]
+    prev: Annotated[
+        str | None, Key(table="annotation", doc="The same agent's box of this actor before.")
+    ]
+    next: Annotated[
+        str | None, Key(table="annotation", doc="The same agent's box of this actor after.")
+    ]
 
 
 class TrackRecord(TypedDict):
@@ -311,9 +407,13 @@ class TrackRecord(TypedDict):
     translation: Annotated[list[float], Vector(shape=(3,), doc="Box centre, world.", unit="m")]
     rotation: Annotated[list[float], Vector(shape=(4,), doc="Quaternion w, x, y, z, world.")]
     size: Annotated[list[float], Vector(shape=(3,), doc="Full length, width, height.", unit="m")]
-    velocity: Annotated[list[float], Vector(shape=(3,), doc="World; NaN where unknown.", unit="m/s")]
+    velocity: Annotated[
+        list[float], Vector(shape=(3,), doc="World; NaN where unknown.", unit="m/s")
+    ]
     category: Annotated[str, Choice(values=CATEGORIES, doc="The label's class.")]
-    is_collider: Annotated[bool, Number(dtype="bool", doc="Whether meta names this actor as one of the pair.")]
+    is_collider: Annotated[
+        bool, Number(dtype="bool", doc="Whether meta names this actor as one of the pair.")
+    ]
     agents: Annotated[list[str], Subset(values=AGENTS, doc="The agents that annotated it.")]
 
 
@@ -360,12 +460,16 @@ def table_spec(name: str) -> TableSpec:
 
 def record_columns(record: type) -> tuple[Column, ...]:
     """The columns that a TypedDict of annotated fields declares."""
-    return tuple(_column(field, hint) for field, hint in get_type_hints(record, include_extras=True).items())
+    return tuple(
+        _column(field, hint) for field, hint in get_type_hints(record, include_extras=True).items()
+    )
 
 
 def spec_of(name: str, record: type) -> TableSpec:
     """The specification of a table whose records a TypedDict of annotated fields declares."""
-    return TableSpec(name=name, doc=" ".join((record.__doc__ or "").split()), columns=record_columns(record))
+    return TableSpec(
+        name=name, doc=" ".join((record.__doc__ or "").split()), columns=record_columns(record)
+    )
 
 
 def _column(field: str, hint: Any) -> Column:

@@ -11,10 +11,24 @@ from operator import attrgetter
 from typing import Any, Literal
 
 from deepaccident_devkit.errors import ReleaseError
-from deepaccident_devkit.release import Calibs, Labels, Meta, ScenarioFolder, read_calibs, read_labels, read_meta
+from deepaccident_devkit.release import (
+    Calibs,
+    Labels,
+    Meta,
+    ScenarioFolder,
+    read_calibs,
+    read_labels,
+    read_meta,
+)
 from deepaccident_devkit.release.fingerprints import folder_hashes
 from deepaccident_devkit.release.layout import frame_numbers
-from deepaccident_devkit.release.store import FolderEntry, ReleasePath, StorePath, fetched, folder_entries
+from deepaccident_devkit.release.store import (
+    FolderEntry,
+    ReleasePath,
+    StorePath,
+    fetched,
+    folder_entries,
+)
 from deepaccident_devkit.support.arrays import ShortRepr
 from deepaccident_devkit.support.reading import FileKind, fault_text, observed, read_bytes
 from deepaccident_devkit.taxonomy import AGENTS, AgentName
@@ -59,7 +73,9 @@ def finding_of(error: ReleaseError, code: str, scenario: str | None) -> Finding:
     """The finding that a reader's error tells of; its text is the error's."""
     where, _, rest = str(error).partition(": ")
     what, _, remedy = rest.rpartition("; ")
-    return Finding(code=code, severity="error", scenario=scenario, where=where, what=what, remedy=remedy)
+    return Finding(
+        code=code, severity="error", scenario=scenario, where=where, what=what, remedy=remedy
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -107,13 +123,19 @@ def scan_scenario(scenario: ScenarioFolder) -> ScenarioScan:
             f"{scenario.meta_path}: missing or not readable: weather and collision of this scenario are unknown, "
             "and find(collision=…) leaves it out; find(designed_accident=True) goes by its folder"
         )
-    num_frames = max((found[-1] for (agent, _), found in frames.items() if found and agent in agents), default=0)
+    num_frames = max(
+        (found[-1] for (agent, _), found in frames.items() if found and agent in agents), default=0
+    )
     for agent in agents:
         for kind in ("calib", "label") if agent in labelled else ("calib",):
             missing = sorted(set(range(1, num_frames + 1)) - set(frames[agent, kind]))
             if missing:
                 what = f"lacks frames {frame_ranges(missing)} of 1 to {num_frames}"
-                problems.append(_broken(scenario, "frames-missing", scenario.kind_folder(agent, kind), what, _REMEDY))
+                problems.append(
+                    _broken(
+                        scenario, "frames-missing", scenario.kind_folder(agent, kind), what, _REMEDY
+                    )
+                )
     return ScenarioScan(
         agents=agents,
         has_meta=has_meta,
@@ -124,7 +146,9 @@ def scan_scenario(scenario: ScenarioFolder) -> ScenarioScan:
     )
 
 
-def _frames(scenario: ScenarioFolder, agent: AgentName, kind: str, ending: str, problems: list[Finding]) -> list[int]:
+def _frames(
+    scenario: ScenarioFolder, agent: AgentName, kind: str, ending: str, problems: list[Finding]
+) -> list[int]:
     """The frame numbers of an agent's files of a kind; what is wrong with the folder goes to `problems`."""
     folder = scenario.kind_folder(agent, kind)
     try:
@@ -137,8 +161,17 @@ def _frames(scenario: ScenarioFolder, agent: AgentName, kind: str, ending: str, 
     return frames
 
 
-def _broken(scenario: ScenarioFolder, code: str, where: ReleasePath, what: str, remedy: str) -> Finding:
-    return Finding(code=code, severity="error", scenario=scenario.token, where=str(where), what=what, remedy=remedy)
+def _broken(
+    scenario: ScenarioFolder, code: str, where: ReleasePath, what: str, remedy: str
+) -> Finding:
+    return Finding(
+        code=code,
+        severity="error",
+        scenario=scenario.token,
+        where=str(where),
+        what=what,
+        remedy=remedy,
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -167,7 +200,9 @@ class ScenarioFiles:
         return len(self.scan.agents) * self.scan.num_frames
 
 
-def read_scenario(scenario: ScenarioFolder, scan: ScenarioScan) -> tuple[ScenarioFiles | None, list[Finding]]:
+def read_scenario(
+    scenario: ScenarioFolder, scan: ScenarioScan
+) -> tuple[ScenarioFiles | None, list[Finding]]:
     """A scenario's meta, calib and label files, None if there is a fault; and the faults, the first of every file."""
     faults: list[Finding] = []
 
@@ -199,7 +234,9 @@ def read_scenario(scenario: ScenarioFolder, scan: ScenarioScan) -> tuple[Scenari
         return None, faults
     meta = metas[0] if metas else None
     hashes = content_hashes(scenario, contents)
-    return ScenarioFiles(scenario=scenario, scan=scan, meta=meta, calibs=calibs, labels=labels, hashes=hashes), []
+    return ScenarioFiles(
+        scenario=scenario, scan=scan, meta=meta, calibs=calibs, labels=labels, hashes=hashes
+    ), []
 
 
 def _read_metas(paths: Sequence[ReleasePath]) -> list[Meta]:
@@ -216,23 +253,34 @@ def folder_digest(scenarios: Iterable[ScenarioFolder], split_files: Iterable[Rel
     digest = hashlib.blake2b(digest_size=16)
     for scenario in scenarios:
         if isinstance(scenario.root, StorePath):
-            digest.update(os.fsencode(f"{scenario.root.store.state} {scenario.folder}/{scenario.token}\n"))
+            digest.update(
+                os.fsencode(f"{scenario.root.store.state} {scenario.folder}/{scenario.token}\n")
+            )
             continue
         root = os.fspath(scenario.root)
         base = os.path.join(root, scenario.folder, scenario.scenario_type)  # noqa: PTH118 - 7,000 of them at start
         digest.update(os.fsencode(f"{scenario.folder}/{scenario.token}\n"))
-        folders = [f"{base}/{agent}/{kind}/{scenario.name}" for agent in AGENTS for kind in SMALL_FILE_ENDINGS]
+        folders = [
+            f"{base}/{agent}/{kind}/{scenario.name}"
+            for agent in AGENTS
+            for kind in SMALL_FILE_ENDINGS
+        ]
         for path in [*folders, f"{base}/meta"]:
             digest.update(_stat_words(path, ctime=True))
         digest.update(_stat_words(f"{base}/meta/{scenario.name}.txt"))
     for file in split_files:
         digest.update(os.fsencode(file.name))
-        digest.update(_stat_words(file) if isinstance(file, StorePath) else _content_or_fault(file, "split"))
+        digest.update(
+            _stat_words(file) if isinstance(file, StorePath) else _content_or_fault(file, "split")
+        )
     return digest.hexdigest()
 
 
 def times_digest(
-    scenario: ScenarioFolder, kinds: Iterable[str] = tuple(SMALL_FILE_ENDINGS), *, ctime: bool = True
+    scenario: ScenarioFolder,
+    kinds: Iterable[str] = tuple(SMALL_FILE_ENDINGS),
+    *,
+    ctime: bool = True,
 ) -> str:
     """Return a digest of the names, sizes and times of a scenario's files of some kinds, and of meta; opens none.
 
@@ -241,8 +289,12 @@ def times_digest(
     digest = hashlib.blake2b(os.fsencode(f"{scenario.folder}/{scenario.token}"), digest_size=16)
     for agent, kind in product(AGENTS, kinds):
         with suppress(OSError):  # no such folder
-            for entry in sorted(folder_entries(scenario.kind_folder(agent, kind)), key=attrgetter("name")):
-                digest.update(os.fsencode(f"{agent}/{kind}/{entry.name}") + _stat_words(entry, ctime=ctime))
+            for entry in sorted(
+                folder_entries(scenario.kind_folder(agent, kind)), key=attrgetter("name")
+            ):
+                digest.update(
+                    os.fsencode(f"{agent}/{kind}/{entry.name}") + _stat_words(entry, ctime=ctime)
+                )
     digest.update(_stat_words(scenario.meta_path, ctime=ctime))
     return digest.hexdigest()
 
@@ -298,5 +350,7 @@ def frame_ranges(numbers: Sequence[int]) -> str:
             runs[-1][1] = number
         else:
             runs.append([number, number])
-    words = [f"{first}" if first == last else f"{first}–{last}" for first, last in runs[:_FRAMES_NAMED]]
+    words = [
+        f"{first}" if first == last else f"{first}–{last}" for first, last in runs[:_FRAMES_NAMED]
+    ]
     return ", ".join(words) + (" …" if len(runs) > _FRAMES_NAMED else "")

@@ -26,8 +26,21 @@ from deepaccident_devkit.support.arrays import checked_number
 from deepaccident_devkit.support.json_text import as_record, parsed_json
 from deepaccident_devkit.support.nuscenes_names import field_remedy, with_keywords_named
 from deepaccident_devkit.support.text import choice, meant_text, members_of, path_of, spelled
-from deepaccident_devkit.tables.arrow_files import DAMAGED_INDEX_REMEDY, HASHES, StoredTable, damaged_value
-from deepaccident_devkit.tables.columns import NULL_INTEGER, Choice, Column, Key, Number, Subset, Vector
+from deepaccident_devkit.tables.arrow_files import (
+    DAMAGED_INDEX_REMEDY,
+    HASHES,
+    StoredTable,
+    damaged_value,
+)
+from deepaccident_devkit.tables.columns import (
+    NULL_INTEGER,
+    Choice,
+    Column,
+    Key,
+    Number,
+    Subset,
+    Vector,
+)
 from deepaccident_devkit.tables.index import Problem
 from deepaccident_devkit.tables.records import table_spec, table_specs
 from deepaccident_devkit.tables.tokens import ColumnViews, Resolver
@@ -207,7 +220,12 @@ class OpenTables:
         return self._tables.views[self._tables.table(table).name]
 
     def get_sample(
-        self, scenario: RowArgument, agent: str, frame: int | None = None, *, time_to_impact: float | None = None
+        self,
+        scenario: RowArgument,
+        agent: str,
+        frame: int | None = None,
+        *,
+        time_to_impact: float | None = None,
     ) -> records.SampleRecord:
         """Return the sample of an agent at a moment of a scenario.
 
@@ -224,27 +242,39 @@ class OpenTables:
         if time_to_impact is not None and frame is None:
             frame = self._frame_before_impact(scenario, time_to_impact)
         elif time_to_impact is not None or not isinstance(frame, int | np.integer):
-            raise TokenError(f"frame: expected a number from 1, found {frame!r}; or give time_to_impact= instead")
+            raise TokenError(
+                f"frame: expected a number from 1, found {frame!r}; or give time_to_impact= instead"
+            )
         return self.sample.get(f"{token_of(scenario)}/{spelled(agent, AGENTS)}/{frame:03d}")
 
     def _frame_before_impact(self, scenario: RowArgument, seconds: float) -> int:
         record = self.scenario.get(token_of(scenario))
         if record["collision"] is None:
-            raise NotAvailableError(f"{record['token']}: has no collision by its meta file; give frame= instead")
+            raise NotAvailableError(
+                f"{record['token']}: has no collision by its meta file; give frame= instead"
+            )
         steps = checked_number("time_to_impact", seconds, "seconds", TokenError) / FRAME_PERIOD
         frames = round(steps) if np.isfinite(steps) else -1
         if not 0 <= frames < record["num_frames"] or abs(steps - frames) > _SAME_FRAME:
             longest = (record["num_frames"] - 1) / 10
-            raise TokenError(f"time_to_impact: expected 0, 0.1, 0.2, … up to {longest} s, found {seconds}")
+            raise TokenError(
+                f"time_to_impact: expected 0, 0.1, 0.2, … up to {longest} s, found {seconds}"
+            )
         return record["num_frames"] - frames
 
     def samples_of(self, frame: RowArgument) -> list[records.SampleRecord]:
         """The samples of one moment, one for each agent that is there, in the order of `taxonomy.AGENTS`."""
         record = self.frame[self.frame.row(token_of(frame))]
-        agents = self._tables.resolver.agents_of(self.scenario.row(record["scenario_token"])).values()
-        return [self.sample[self._tables.resolver.sample_at(agent, record["index"])] for agent in agents]
+        agents = self._tables.resolver.agents_of(
+            self.scenario.row(record["scenario_token"])
+        ).values()
+        return [
+            self.sample[self._tables.resolver.sample_at(agent, record["index"])] for agent in agents
+        ]
 
-    def split_scenarios(self, split: str | os.PathLike[str], *, missing: OnError = "raise") -> set[str]:
+    def split_scenarios(
+        self, split: str | os.PathLike[str], *, missing: OnError = "raise"
+    ) -> set[str]:
         """The tokens of this release's scenarios that belong to a split.
 
         Args:
@@ -262,7 +292,9 @@ class OpenTables:
         """
         missing = choice("missing", missing, get_args(OnError))
         if not isinstance(split, str | os.PathLike):
-            raise ChoiceError(f"split: expected the name of one, or the path of a split file, found {split!r}")
+            raise ChoiceError(
+                f"split: expected the name of one, or the path of a split file, found {split!r}"
+            )
         here = set(self._tables.resolver.scenario_tokens)
         if not isinstance(split, str) or split.endswith(".txt"):
             path = path_of(split)
@@ -274,7 +306,9 @@ class OpenTables:
                     f"{', '.join(absent[:3])}{', …' if len(absent) > 3 else ''}; pass missing='skip' to go without them"
                 )
             return here.intersection(listed)
-        unsplit = f"; for scenarios whose split is unknown {self._own_split_text().removeprefix('or ')}"
+        unsplit = (
+            f"; for scenarios whose split is unknown {self._own_split_text().removeprefix('or ')}"
+        )
         split = split_choice(split, elsewhere={"unknown": unsplit})
         if split == "all":
             return here
@@ -300,7 +334,9 @@ class OpenTables:
 class Tables:
     """All tables of an index, memory-mapped: they stay readable when another process remakes the index."""
 
-    def __init__(self, folder: Path, resolver: Callable[[ColumnViews], Resolver] = Resolver) -> None:
+    def __init__(
+        self, folder: Path, resolver: Callable[[ColumnViews], Resolver] = Resolver
+    ) -> None:
         """Open the tables in `folder`; raises IndexStoreError if they cannot be read.
 
         Args:
@@ -376,7 +412,9 @@ class Table(Sequence[_Record], Generic[_Record]):
         if isinstance(row, slice):
             return [self._record(position) for position in range(*row.indices(len(self)))]
         if not isinstance(row, int | np.integer):
-            raise TableError(f"table '{self.name}' counts its rows: expected a number, found {row!r}; use get(token)")
+            raise TableError(
+                f"table '{self.name}' counts its rows: expected a number, found {row!r}; use get(token)"
+            )
         position = row + len(self) if row < 0 else row
         if not 0 <= position < len(self):
             raise IndexError(f"table '{self.name}' has {len(self)} rows, asked for row {row}")
@@ -400,13 +438,17 @@ class Table(Sequence[_Record], Generic[_Record]):
     def tokens_where(self, field: str, value: Any) -> list[str]:
         """The tokens of the rows whose field equals `value`, in order; raises FieldError."""
         try:
-            return [self._resolver.token(self.name, int(row)) for row in self._rows_where(field, value)]
+            return [
+                self._resolver.token(self.name, int(row)) for row in self._rows_where(field, value)
+            ]
         except IndexError as error:
             raise damaged_value(self.name) from error
 
     def _record(self, row: int) -> _Record:
         try:
-            return cast(_Record, RecordDict({field: getter(row) for field, getter in self._getters}))
+            return cast(
+                _Record, RecordDict({field: getter(row) for field, getter in self._getters})
+            )
         except IndexError as error:
             raise damaged_value(self.name) from error
 
@@ -415,7 +457,9 @@ class Table(Sequence[_Record], Generic[_Record]):
         if column is None:
             fields = [name for name, _ in self._getters]
             meant = meant_text(field, fields)
-            raise FieldError(f"table '{self.name}' has no field '{field}'; it has {', '.join(fields)}{meant}")
+            raise FieldError(
+                f"table '{self.name}' has no field '{field}'; it has {', '.join(fields)}{meant}"
+            )
         stored_value = self._stored_value(column, value)
         view = self._stored.views.get(column.stored or "")
         if stored_value is not None and isinstance(view, np.ndarray):
@@ -435,21 +479,33 @@ class Table(Sequence[_Record], Generic[_Record]):
             known = spelled(value, kind.values)
             return kind.values.index(known) if known in kind.values else NULL_INTEGER - 1
         plain_number = isinstance(value, int | float) and not isinstance(value, bool)
-        if isinstance(kind, Number) and plain_number and not (column.nullable and value == NULL_INTEGER):
+        if (
+            isinstance(kind, Number)
+            and plain_number
+            and not (column.nullable and value == NULL_INTEGER)
+        ):
             return value
         return None
 
     def _getter(self, column: Column) -> _Getter:  # noqa: PLR0911 - one a kind
         if column.stored is None:
-            return self._resolver.filename if column.field == "filename" else self._resolver.token_makers[self.name]
+            return (
+                self._resolver.filename
+                if column.field == "filename"
+                else self._resolver.token_makers[self.name]
+            )
         view: Any = self._stored.views[column.stored]
         match column.kind:
             case Key(table=table):
-                return _key_getter(view, self._resolver.token_makers[table], nullable=column.nullable)
+                return _key_getter(
+                    view, self._resolver.token_makers[table], nullable=column.nullable
+                )
             case Choice(values=values):
                 return _choice_getter(view, values)
             case Subset(values=values):
-                return lambda row: [value for bit, value in enumerate(values) if view.item(row) >> bit & 1]
+                return lambda row: [
+                    value for bit, value in enumerate(values) if view.item(row) >> bit & 1
+                ]
             case Vector(shape=shape):
                 return _vector_getter(view, shape, nullable=column.nullable)
             case Number(dtype=dtype):
@@ -478,7 +534,9 @@ def table_names() -> list[str]:
 
 def split_choice(split: str, **remedies: Any) -> str:
     """Return the name of a split in its own spelling; raises ChoiceError. `remedies` are arguments of `choice`."""
-    return choice("split", split, SPLIT_CHOICES, also=", or a split file (its name ends in .txt)", **remedies)
+    return choice(
+        "split", split, SPLIT_CHOICES, also=", or a split file (its name ends in .txt)", **remedies
+    )
 
 
 def token_of(row: RowArgument) -> str:
@@ -489,7 +547,9 @@ def token_of(row: RowArgument) -> str:
     return token
 
 
-def rows_of_scenarios(tables: OpenTables, scenarios: RowArgument | Iterable[RowArgument] | None) -> Sequence[int]:
+def rows_of_scenarios(
+    tables: OpenTables, scenarios: RowArgument | Iterable[RowArgument] | None
+) -> Sequence[int]:
     """Return the rows of scenarios in the order given, those of all for None; raises TokenError or ChoiceError."""
     if scenarios is None:
         return range(len(tables.scenario))

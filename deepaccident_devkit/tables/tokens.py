@@ -33,7 +33,8 @@ FORMS = {
 ColumnViews = Mapping[str, Mapping[str, Any]]
 """Table → stored column → view of it."""
 _NUM_WORDS = {
-    table: form.replace("<scenario>", "<scenario_type>/<name>").count("/") + 1 for table, form in FORMS.items()
+    table: form.replace("<scenario>", "<scenario_type>/<name>").count("/") + 1
+    for table, form in FORMS.items()
 }
 
 
@@ -83,7 +84,9 @@ class Resolver:
         """Note where each scenario's and agent's rows begin; `views` may open tables when asked for them."""
         self._views = views
         scenario, agent = views["scenario"], views["agent"]
-        names = zip(scenario["scenario_type"].to_pylist(), scenario["name"].to_pylist(), strict=True)
+        names = zip(
+            scenario["scenario_type"].to_pylist(), scenario["name"].to_pylist(), strict=True
+        )
         self.scenario_tokens = ["/".join(words) for words in names]
         self._scenario_rows = {token: row for row, token in enumerate(self.scenario_tokens)}
         self._num_frames: list[int] = scenario["num_frames"].tolist()
@@ -92,7 +95,9 @@ class Resolver:
         self._agents: list[dict[str, int]] = [{} for _ in self.scenario_tokens]
         self._agent_scenario: list[int] = agent["scenario_row"].tolist()
         self._agent_names = [AGENTS[code] for code in agent["name"].tolist()]
-        for row, (scenario_row, name) in enumerate(zip(self._agent_scenario, self._agent_names, strict=True)):
+        for row, (scenario_row, name) in enumerate(
+            zip(self._agent_scenario, self._agent_names, strict=True)
+        ):
             self._agents[scenario_row][name] = row
         self._row_finders: dict[str, Callable[..., int]] = {
             "scenario": self._scenario_row,
@@ -149,7 +154,9 @@ class Resolver:
         """The path of a sensor file below the dataroot, with forward slashes."""
         sample, code = divmod(sample_data_row, len(CHANNELS))
         scenario_type, name, agent, number = self._sample_token(sample).split("/")
-        folder = self._views["scenario"]["folder"][self._views["sample"]["scenario_row"].item(sample)].as_py()
+        folder = self._views["scenario"]["folder"][
+            self._views["sample"]["scenario_row"].item(sample)
+        ].as_py()
         channel = CHANNELS[code]
         path = f"{scenario_type}/{agent}/{channel}/{name}/{name}_{number}.{CHANNEL_FORMAT[channel]}"
         return f"{folder}/{path}" if folder else path
@@ -177,7 +184,9 @@ class Resolver:
 
     def _instance_token(self, row: int) -> str:
         view = self._views["instance"]
-        return instance_token(self.scenario_tokens[view["scenario_row"].item(row)], view["actor_id"].item(row))
+        return instance_token(
+            self.scenario_tokens[view["scenario_row"].item(row)], view["actor_id"].item(row)
+        )
 
     def _annotation_token(self, row: int) -> str:
         sample = self._views["annotation"]["sample_row"].item(row)
@@ -191,10 +200,16 @@ class Resolver:
     def _lacks_its_type(self, token: str) -> str:
         """What to write where a token begins with the name of a scenario; empty for all others."""
         name, slash, rest = token.partition("/")
-        here = [f"'{scenario}{slash}{rest}'" for scenario in self.scenario_tokens if scenario.split("/")[1] == name]
+        here = [
+            f"'{scenario}{slash}{rest}'"
+            for scenario in self.scenario_tokens
+            if scenario.split("/")[1] == name
+        ]
         if not here:
             return ""
-        shown = " or ".join(here[:3]) + (f" or one of {len(here) - 3} more" if len(here) > 3 else "")
+        shown = " or ".join(here[:3]) + (
+            f" or one of {len(here) - 3} more" if len(here) > 3 else ""
+        )
         return f"a scenario's name is not unique, its token begins with its type; write {shown}"
 
     def _scenario_row(self, scenario: str) -> int:
@@ -219,17 +234,27 @@ class Resolver:
         return self._first_frame[self._scenario_row(scenario)] + self._index(scenario, number) - 1
 
     def _sample_row(self, scenario: str, agent: str, number: str) -> int:
-        return self._first_sample[self._agent_row(scenario, agent)] + self._index(scenario, number) - 1
+        return (
+            self._first_sample[self._agent_row(scenario, agent)] + self._index(scenario, number) - 1
+        )
 
     def _sample_data_row(self, scenario: str, agent: str, number: str, channel: str) -> int:
         return self._sample_row(scenario, agent, number) * len(CHANNELS) + _channel_code(channel)
 
-    def _calibrated_sensor_row(self, scenario: str, agent: str, channel: str, number: str = "") -> int:
+    def _calibrated_sensor_row(
+        self, scenario: str, agent: str, channel: str, number: str = ""
+    ) -> int:
         agent_row = self._agent_row(scenario, agent)
         wanted = _channel_code(channel), parse_number(number) if number else 1
         view = self._views["calibrated_sensor"]
         first, last = np.searchsorted(view["agent_row"], (agent_row, agent_row + 1))
-        found = list(zip(view["sensor_row"][first:last].tolist(), view["number"][first:last].tolist(), strict=True))
+        found = list(
+            zip(
+                view["sensor_row"][first:last].tolist(),
+                view["number"][first:last].tolist(),
+                strict=True,
+            )
+        )
         if wanted not in found or number == "1":  # the first value's token has no number
             raise _UnknownError("this sensor has fewer distinct values")
         return int(first) + found.index(wanted)
@@ -240,7 +265,9 @@ class Resolver:
             raise _UnknownError
         view = self._views["instance"]
         first, last = np.searchsorted(view["scenario_row"], (scenario_row, scenario_row + 1))
-        return int(first) + _place(view["actor_id"][first:last], actor_id, f"the scenario has no actor {actor_id}")
+        return int(first) + _place(
+            view["actor_id"][first:last], actor_id, f"the scenario has no actor {actor_id}"
+        )
 
     def _annotation_row(self, scenario: str, agent: str, number: str, place: str) -> int:
         sample, row = self._sample_row(scenario, agent, number), parse_number(place)
@@ -252,7 +279,10 @@ class Resolver:
         return first + row
 
     def _track_row(self, scenario: str, number: str, word: str, actor: str) -> int:
-        frame, instance = self._frame_row(scenario, number), self._instance_row(scenario, word, actor)
+        frame, instance = (
+            self._frame_row(scenario, number),
+            self._instance_row(scenario, word, actor),
+        )
         view = self._views["track"]
         first, last = np.searchsorted(view["frame_row"], (frame, frame + 1))
         return int(first) + _place(

@@ -8,12 +8,20 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from deepaccident_devkit.testing.breakages import BREAKAGES, Breakage, BrokenRelease, break_release, broken_release
+    from deepaccident_devkit.testing.breakages import (
+        BREAKAGES,
+        Breakage,
+        BrokenRelease,
+        break_release,
+        broken_release,
+    )
     from deepaccident_devkit.testing.releases import SmallRelease, write_small_release
 
 # Public name → its module.
 _HOMES = {
-    **dict.fromkeys(("BREAKAGES", "Breakage", "BrokenRelease", "break_release", "broken_release"), "breakages"),
+    **dict.fromkeys(
+        ("BREAKAGES", "Breakage", "BrokenRelease", "break_release", "broken_release"), "breakages"
+    ),
     **dict.fromkeys(("SmallRelease", "write_small_release"), "releases"),
 }
 

@@ -54,32 +54,42 @@ def make_deepaccident_release(tmp_path_factory: pytest.TempPathFactory) -> MakeR
     def make(config: SmallRelease | None = None, **options: Any) -> Path:
         wanted = replace(config or SmallRelease(), **options)
         if wanted not in made:
-            made[wanted] = write_small_release(tmp_path_factory.mktemp("deepaccident") / "release", wanted)
+            made[wanted] = write_small_release(
+                tmp_path_factory.mktemp("deepaccident") / "release", wanted
+            )
         return made[wanted]
 
     return make
 
 
 @pytest.fixture(scope="session")
-def deepaccident_release(deepaccident_config: SmallRelease, make_deepaccident_release: MakeRelease) -> Path:
+def deepaccident_release(
+    deepaccident_config: SmallRelease, make_deepaccident_release: MakeRelease
+) -> Path:
     """The folder of a healthy release, one for each session and layout; tests must not change it."""
     return make_deepaccident_release(deepaccident_config)
 
 
 @pytest.fixture
-def deepaccident_release_copy(deepaccident_release: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def deepaccident_release_copy(
+    deepaccident_release: Path, tmp_path_factory: pytest.TempPathFactory
+) -> Path:
     """A copy of `deepaccident_release`, without an index, that the test may change."""
     return _copied(deepaccident_release, tmp_path_factory.mktemp("deepaccident") / "copy")
 
 
 @pytest.fixture
-def deepaccident_broken(deepaccident_release: Path, tmp_path_factory: pytest.TempPathFactory) -> BreakRelease:
+def deepaccident_broken(
+    deepaccident_release: Path, tmp_path_factory: pytest.TempPathFactory
+) -> BreakRelease:
     """A factory: a name of `BREAKAGES` → a copy of `deepaccident_release` with this breakage."""
     from deepaccident_devkit.testing.breakages import break_release, checked_breakage
 
     def broken(name: str) -> BrokenRelease:
         checked_breakage(name)
-        return break_release(_copied(deepaccident_release, tmp_path_factory.mktemp("deepaccident") / "broken"), name)
+        return break_release(
+            _copied(deepaccident_release, tmp_path_factory.mktemp("deepaccident") / "broken"), name
+        )
 
     return broken
 

@@ -9,7 +9,13 @@ from typing import get_args
 import numpy as np
 
 from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.release import Collision, Meta, ScenarioFolder, write_meta, write_split_file
+from deepaccident_devkit.release import (
+    Collision,
+    Meta,
+    ScenarioFolder,
+    write_meta,
+    write_split_file,
+)
 from deepaccident_devkit.release.store import real_path
 from deepaccident_devkit.support.files import check_free, replacing_folder
 from deepaccident_devkit.support.text import choices, settle_choices
@@ -59,7 +65,9 @@ class SmallRelease:
         object.__setattr__(self, "image_size", _as_tuple("image_size", self.image_size))
         settle_choices(self, {"layout": get_args(Layout)}, error=ConfigError)
         for name, known in (("splits", SPLITS), ("agents", AGENTS), ("channels", CHANNELS)):
-            named = choices(name, getattr(self, name), known, empty=name == "channels", error=ConfigError)
+            named = choices(
+                name, getattr(self, name), known, empty=name == "channels", error=ConfigError
+            )
             object.__setattr__(self, name, named)
         if not 1 <= self.frames <= _MOST_FRAMES:
             raise ConfigError(f"frames: expected 1 to {_MOST_FRAMES}, found {self.frames}")
@@ -69,7 +77,9 @@ class SmallRelease:
             raise ConfigError(f"image_size: expected (width, height), found {self.image_size}")
         (width, height), low, high = self.image_size, _LEAST_IMAGE, _MOST_IMAGE
         if not (low[0] <= width <= high[0] and low[1] <= height <= high[1]):
-            raise ConfigError(f"image_size: expected width and height from {low} to {high}, found {self.image_size}")
+            raise ConfigError(
+                f"image_size: expected width and height from {low} to {high}, found {self.image_size}"
+            )
 
 
 def _as_tuple(name: str, value: object) -> tuple[object, ...]:
@@ -106,10 +116,26 @@ class _Story:
 
 
 _STORIES = (
-    _Story(split="train", scenario_type="type1_subtype1_accident", name="Town03_type001_subtype0001_scenario00001"),
-    _Story(split="train", scenario_type="type1_subtype1_normal", name="Town03_type001_subtype0001_scenario00001"),
-    _Story(split="val", scenario_type="type1_subtype2_accident", name="Town05_type001_subtype0002_scenario00002"),
-    _Story(split="test", scenario_type="type1_subtype2_normal", name="Town10HD_type001_subtype0002_scenario00003"),
+    _Story(
+        split="train",
+        scenario_type="type1_subtype1_accident",
+        name="Town03_type001_subtype0001_scenario00001",
+    ),
+    _Story(
+        split="train",
+        scenario_type="type1_subtype1_normal",
+        name="Town03_type001_subtype0001_scenario00001",
+    ),
+    _Story(
+        split="val",
+        scenario_type="type1_subtype2_accident",
+        name="Town05_type001_subtype0002_scenario00002",
+    ),
+    _Story(
+        split="test",
+        scenario_type="type1_subtype2_normal",
+        name="Town10HD_type001_subtype0002_scenario00003",
+    ),
 )
 
 
@@ -156,7 +182,11 @@ def _write_scenario(root: Path, story: _Story, config: SmallRelease) -> None:
 
 
 def _meta(rng: np.random.Generator, scene: SmallScene, *, accident: bool) -> Meta:
-    weather, time_of_day, impact = rng.choice(WEATHERS), rng.choice(TIMES_OF_DAY), rng.uniform(2000.0, 9000.0)
+    weather, time_of_day, impact = (
+        rng.choice(WEATHERS),
+        rng.choice(TIMES_OF_DAY),
+        rng.uniform(2000.0, 9000.0),
+    )
     users = {user.actor_id: user for user in scene.users}
     ids = (AGENT_IDS[AGENTS.index(PAIR[0])], AGENT_IDS[AGENTS.index(PAIR[1])])
     collision = Collision(

@@ -39,7 +39,9 @@ from deepaccident_devkit.taxonomy import (
 )
 
 _LIDAR_HEIGHT = 1.94
-_CAMERA_YAW = dict(zip(CAMERAS, np.deg2rad([0.0, 55.0, -55.0, 180.0, 110.0, -110.0]).tolist(), strict=True))
+_CAMERA_YAW = dict(
+    zip(CAMERAS, np.deg2rad([0.0, 55.0, -55.0, 180.0, 110.0, -110.0]).tolist(), strict=True)
+)
 # Metres from the LiDAR's axis to a camera, and from the LiDAR down to it.
 _CAMERA_RADIUS, _CAMERA_DROP = 1.0, 0.3
 _OPTICAL_FROM_FORWARD = SE3.from_rotation([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
@@ -47,16 +49,25 @@ _OPTICAL_FROM_FORWARD = SE3.from_rotation([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [
 
 def _cameras(image_size: tuple[int, int]) -> dict[str, PinholeCamera]:
     """Channel → camera for images of `image_size` (width, height): the back camera has 110°, the others 70°."""
-    fields = {channel: np.deg2rad(110.0 if channel == "Camera_Back" else 70.0) for channel in CAMERAS}
-    return {channel: PinholeCamera.from_field_of_view(*image_size, field) for channel, field in fields.items()}
+    fields = {
+        channel: np.deg2rad(110.0 if channel == "Camera_Back" else 70.0) for channel in CAMERAS
+    }
+    return {
+        channel: PinholeCamera.from_field_of_view(*image_size, field)
+        for channel, field in fields.items()
+    }
 
 
 def calib_of(agent: AgentName, world_from_ego: SE3, image_size: tuple[int, int]) -> Calib:
     """An agent's calib of one frame."""
     return Calib(
-        ego_from_lidar=SE3.from_yaw(0.0, (0.0, 0.0, 0.0 if agent == INFRASTRUCTURE else _LIDAR_HEIGHT)),
+        ego_from_lidar=SE3.from_yaw(
+            0.0, (0.0, 0.0, 0.0 if agent == INFRASTRUCTURE else _LIDAR_HEIGHT)
+        ),
         world_from_ego=world_from_ego,
-        camera_from_lidar={channel: _camera_from_lidar(yaw) for channel, yaw in _CAMERA_YAW.items()},
+        camera_from_lidar={
+            channel: _camera_from_lidar(yaw) for channel, yaw in _CAMERA_YAW.items()
+        },
         intrinsic={channel: camera.intrinsic for channel, camera in _cameras(image_size).items()},
     )
 
@@ -103,18 +114,55 @@ _CAR, _VAN = (4.6, 1.9, 1.5), (4.5, 2.0, 2.0)
 _AGENTS = (
     _MovingBox(actor_id=1223, category="car", size=_CAR, end=(-1.4, -1.75), yaw=0.0, speed=9.0),
     _MovingBox(actor_id=1236, category="van", size=_VAN, end=(-11.4, -1.75), yaw=0.0, speed=9.0),
-    _MovingBox(actor_id=1212, category="car", size=_CAR, end=(1.75, -1.75), yaw=_SOUTH_TO_NORTH, speed=7.0),
-    _MovingBox(actor_id=1237, category="car", size=_CAR, end=(1.75, -12.0), yaw=_SOUTH_TO_NORTH, speed=7.0),
+    _MovingBox(
+        actor_id=1212, category="car", size=_CAR, end=(1.75, -1.75), yaw=_SOUTH_TO_NORTH, speed=7.0
+    ),
+    _MovingBox(
+        actor_id=1237, category="car", size=_CAR, end=(1.75, -12.0), yaw=_SOUTH_TO_NORTH, speed=7.0
+    ),
 )
 _TRAFFIC = (
-    _MovingBox(actor_id=1301, category="truck", size=(8.4, 2.6, 3.6), end=(18.0, 1.75), yaw=_EAST_TO_WEST, speed=6.0),
-    _MovingBox(actor_id=1302, category="cyclist", size=(1.64, 0.5, 1.77), end=(5.5, 12.0), yaw=np.pi / 2, speed=4.0),
     _MovingBox(
-        actor_id=1303, category="motorcycle", size=(2.2, 0.86, 1.5), end=(-1.75, 20.0), yaw=-np.pi / 2, speed=7.0
+        actor_id=1301,
+        category="truck",
+        size=(8.4, 2.6, 3.6),
+        end=(18.0, 1.75),
+        yaw=_EAST_TO_WEST,
+        speed=6.0,
     ),
-    _MovingBox(actor_id=1304, category="pedestrian", size=(0.4, 0.4, 1.86), end=(-8.0, 6.0), yaw=0.0, speed=1.2),
+    _MovingBox(
+        actor_id=1302,
+        category="cyclist",
+        size=(1.64, 0.5, 1.77),
+        end=(5.5, 12.0),
+        yaw=np.pi / 2,
+        speed=4.0,
+    ),
+    _MovingBox(
+        actor_id=1303,
+        category="motorcycle",
+        size=(2.2, 0.86, 1.5),
+        end=(-1.75, 20.0),
+        yaw=-np.pi / 2,
+        speed=7.0,
+    ),
+    _MovingBox(
+        actor_id=1304,
+        category="pedestrian",
+        size=(0.4, 0.4, 1.86),
+        end=(-8.0, 6.0),
+        yaw=0.0,
+        speed=1.2,
+    ),
     _MovingBox(actor_id=20001, category="car", size=_CAR, end=(-24.0, -5.5), yaw=0.0, speed=0.0),
-    _MovingBox(actor_id=FAR_ACTOR_ID, category="pedestrian", size=(0.4, 0.4, 1.86), end=(70, 8), yaw=2.2, speed=0.0),
+    _MovingBox(
+        actor_id=FAR_ACTOR_ID,
+        category="pedestrian",
+        size=(0.4, 0.4, 1.86),
+        end=(70, 8),
+        yaw=2.2,
+        speed=0.0,
+    ),
 )
 _POLE = (8.0, 8.0, POLE_HEIGHT)
 
@@ -156,7 +204,9 @@ class SmallScene:
         if agent not in VEHICLE_AGENTS:
             return self.world_from_ground @ SE3.from_yaw(0.0, _POLE)
         boxes, row = self.boxes(frame), VEHICLE_AGENTS.index(agent)
-        return SE3.from_yaw(float(boxes.yaw[row]), boxes.center[row] - (0.0, 0.0, boxes.size[row, 2] / 2))
+        return SE3.from_yaw(
+            float(boxes.yaw[row]), boxes.center[row] - (0.0, 0.0, boxes.size[row, 2] / 2)
+        )
 
 
 def small_scene(rng: np.random.Generator, *, frames: int, accident: bool) -> SmallScene:
@@ -164,10 +214,15 @@ def small_scene(rng: np.random.Generator, *, frames: int, accident: bool) -> Sma
     x, y, yaw = rng.uniform(-200.0, 200.0), rng.uniform(-200.0, 200.0), rng.uniform(-np.pi, np.pi)
     ego_speed, other_speed = rng.uniform(0.8, 1.2, 2).tolist()
     factors = (ego_speed, ego_speed, other_speed, other_speed)
-    agents = [replace(user, speed=user.speed * factor) for user, factor in zip(_AGENTS, factors, strict=True)]
+    agents = [
+        replace(user, speed=user.speed * factor)
+        for user, factor in zip(_AGENTS, factors, strict=True)
+    ]
     if not accident:
         agents[2:] = [replace(user, end=(user.end[0], user.end[1] - _DELAY)) for user in agents[2:]]
-    return SmallScene(world_from_ground=SE3.from_yaw(yaw, (x, y, 0.3)), users=(*agents, *_TRAFFIC), frames=frames)
+    return SmallScene(
+        world_from_ground=SE3.from_yaw(yaw, (x, y, 0.3)), users=(*agents, *_TRAFFIC), frames=frames
+    )
 
 
 # The most points on a box, and the number of points on a box 1 m away; it becomes smaller with the distance.
@@ -176,7 +231,9 @@ _GROUND_RADII, _GROUND_POINTS = (6.0, 12.0, 24.0), 12
 _LIDAR_RANGE = 65.0
 _LEAST_DEPTH = 0.5
 # RGB of each of `taxonomy.CATEGORIES`.
-_COLORS = np.array([(200, 40, 40), (40, 80, 200), (40, 160, 60), (220, 180, 40), (160, 60, 180), (240, 120, 40)])
+_COLORS = np.array(
+    [(200, 40, 40), (40, 80, 200), (40, 160, 60), (220, 180, 40), (160, 60, 180), (240, 120, 40)]
+)
 _MIDDLE = (BEV_SHAPE[0] - 1) / 2
 
 
@@ -184,8 +241,12 @@ def cloud_of(boxes: Boxes, lidar_height: float) -> FloatArray:
     """Points (N, 3) in the LiDAR frame, metres, in its boxes and on the ground, rounded to the file's float32."""
     parts = [_ground(lidar_height)]
     distance = np.linalg.norm(boxes.center[:, :2], axis=1)
-    counts = np.clip(_POINT_METRES / np.maximum(distance, 1.0), 1, _MOST_POINTS).astype(int) * (distance < _LIDAR_RANGE)
-    for center, size, yaw, count in zip(boxes.center, boxes.size, boxes.yaw, counts.tolist(), strict=True):
+    counts = np.clip(_POINT_METRES / np.maximum(distance, 1.0), 1, _MOST_POINTS).astype(int) * (
+        distance < _LIDAR_RANGE
+    )
+    for center, size, yaw, count in zip(
+        boxes.center, boxes.size, boxes.yaw, counts.tolist(), strict=True
+    ):
         inside = _spread(count) * size
         turn = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])
         parts.append(center + inside @ turn.T)
@@ -213,7 +274,9 @@ def _picture_of(
     return picture
 
 
-def top_view_of(boxes: Boxes, object_ids: NDArray[np.uint16]) -> tuple[ByteArray, NDArray[np.uint16]]:
+def top_view_of(
+    boxes: Boxes, object_ids: NDArray[np.uint16]
+) -> tuple[ByteArray, NDArray[np.uint16]]:
     """Tags (1200, 1200) uint8 and the simulator's ids (1200, 1200) uint16 around an agent: forward is up, left left."""
     import cv2
 
@@ -223,7 +286,9 @@ def top_view_of(boxes: Boxes, object_ids: NDArray[np.uint16]) -> tuple[ByteArray
     for corners, code, number in rows:
         places = corners[:, :2]
         if np.abs(places).max() * 2 < BEV_RESOLUTION * BEV_SHAPE[0]:
-            outline = np.rint(_MIDDLE - places[:, ::-1] / BEV_RESOLUTION).astype(np.int32)  # OpenCV: column, row
+            outline = np.rint(_MIDDLE - places[:, ::-1] / BEV_RESOLUTION).astype(
+                np.int32
+            )  # OpenCV: column, row
             tag = TAGS["pedestrian" if CATEGORIES[code] == "pedestrian" else "vehicle"]
             cv2.fillConvexPoly(semantic, outline, tag)
             cv2.fillConvexPoly(instance, outline, number)
@@ -238,7 +303,10 @@ def _spread(count: int) -> FloatArray:
 
 def _ground(lidar_height: float) -> FloatArray:
     angle = np.linspace(0.0, 2 * np.pi, _GROUND_POINTS, endpoint=False)
-    rings = [np.column_stack([radius * np.cos(angle), radius * np.sin(angle)]) for radius in _GROUND_RADII]
+    rings = [
+        np.column_stack([radius * np.cos(angle), radius * np.sin(angle)])
+        for radius in _GROUND_RADII
+    ]
     places = np.concatenate(rings)
     return np.column_stack([places, np.full(len(places), -lidar_height)])
 
@@ -251,18 +319,27 @@ class Recorder:
     """Writes what an agent recorded at a frame (counted from 1), file by file; images have width and height, pixels."""
 
     def __init__(
-        self, folder: ScenarioFolder, scene: SmallScene, agent: AgentName, frame: int, image_size: tuple[int, int]
+        self,
+        folder: ScenarioFolder,
+        scene: SmallScene,
+        agent: AgentName,
+        frame: int,
+        image_size: tuple[int, int],
     ) -> None:
         self._folder, self._agent, self._frame = folder, agent, frame
         self._cameras = _cameras(image_size)
         self._calib = calib_of(agent, scene.world_from_ego(agent, frame), image_size)
         world = scene.boxes(frame)
-        self._own = np.arange(len(world)) < (agent in VEHICLE_AGENTS)  # the own row, if any, comes first
+        self._own = np.arange(len(world)) < (
+            agent in VEHICLE_AGENTS
+        )  # the own row, if any, comes first
         if agent in VEHICLE_AGENTS:
             own = VEHICLE_AGENTS.index(agent)
             world = world.select([own, *(row for row in range(len(world)) if row != own)])
         self._velocity = world.velocity[:, :2]
-        self._boxes = world.transform((self._calib.world_from_ego @ self._calib.ego_from_lidar).inverse(), "lidar")
+        self._boxes = world.transform(
+            (self._calib.world_from_ego @ self._calib.ego_from_lidar).inverse(), "lidar"
+        )
         height = self._calib.ego_from_lidar.translation[2] if self._own.any() else POLE_HEIGHT
         self._cloud = cloud_of(self._boxes.select(~self._own), float(height))
 
@@ -274,7 +351,10 @@ class Recorder:
         """The boxes: the own row is first; the pedestrian who is far away is not tracked."""
         labels = self._labels()
         points = labels.boxes().count_points(self._cloud)
-        write_label(real_path(self._folder.label_path(self._agent, self._frame)), replace(labels, num_lidar_pts=points))
+        write_label(
+            real_path(self._folder.label_path(self._agent, self._frame)),
+            replace(labels, num_lidar_pts=points),
+        )
 
     def write_channel(self, channel: str) -> None:
         """The file of one sensor."""
@@ -288,7 +368,9 @@ class Recorder:
             write_image(path, self._picture(channel))
 
     def _picture(self, channel: str) -> ByteArray:
-        boxes = self._boxes.select(~self._own).transform(self._calib.camera_from_lidar[channel], channel)
+        boxes = self._boxes.select(~self._own).transform(
+            self._calib.camera_from_lidar[channel], channel
+        )
         sky = (120 + 12 * AGENTS.index(self._agent), 130 + 12 * CAMERAS.index(channel), 200)
         road = (40 + self._frame, 40 + self._frame, 45 + self._frame)
         return _picture_of(boxes, self._cameras[channel], sky=sky, road=road)
@@ -307,7 +389,9 @@ class Recorder:
             yaw=yaw,
             velocity=label_from_world_velocity(self._velocity, yaw),
             actor_id=np.select(
-                [self._own, boxes.actor_id == FAR_ACTOR_ID], [OWN_ACTOR_ID, UNTRACKED_ID], boxes.actor_id
+                [self._own, boxes.actor_id == FAR_ACTOR_ID],
+                [OWN_ACTOR_ID, UNTRACKED_ID],
+                boxes.actor_id,
             ),
             num_lidar_pts=np.zeros(len(boxes), dtype=np.int64),
             camera_visible=self._visible(),

@@ -33,7 +33,9 @@ try:
     from hypothesis import strategies as st
     from hypothesis.extra import numpy as hnp
 except ModuleNotFoundError as error:
-    raise MissingExtraError("the strategies need hypothesis: in a checkout, pip install '.[testing]'") from error
+    raise MissingExtraError(
+        "the strategies need hypothesis: in a checkout, pip install '.[testing]'"
+    ) from error
 
 _T = TypeVar("_T")
 
@@ -101,7 +103,9 @@ def boxes(draw: st.DrawFn, max_count: int = 5, frame: str = "lidar") -> Boxes:
 
 
 @st.composite
-def upright_boxes(draw: st.DrawFn, max_count: int = 4, reach: float = 10.0, frame: str = "lidar") -> Boxes:
+def upright_boxes(
+    draw: st.DrawFn, max_count: int = 4, reach: float = 10.0, frame: str = "lidar"
+) -> Boxes:
     """Boxes that stand on the ground, so near to each other that many overlap; some are parallel to the axes."""
     count = draw(st.integers(0, max_count))
     yaws = ANGLES | st.sampled_from([0.0, np.pi / 2, -np.pi / 2, np.pi])
@@ -117,7 +121,11 @@ def cameras() -> st.SearchStrategy[PinholeCamera]:
     """Pinhole cameras of all focal lengths and centres that a picture can have."""
     focal, centre = st.floats(50, 5000), st.floats(0, 2000)
     matrix = st.builds(
-        lambda fx, fy, cx, cy: np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), focal, focal, centre, centre
+        lambda fx, fy, cx, cy: np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]),
+        focal,
+        focal,
+        centre,
+        centre,
     )
     return st.builds(PinholeCamera, matrix, st.integers(1, 2000), st.integers(1, 2000))
 
@@ -151,11 +159,15 @@ def label_lines(draw: st.DrawFn) -> str:
     size = st.floats(0.3, 10.0)
     floats = [draw(number) for _ in range(3)] + [draw(size) for _ in range(3)] + [draw(ANGLES)]
     actor_id = draw(
-        st.just(UNTRACKED_ID) | st.integers(1, 10_000) | st.integers(STATIC_ACTOR_ID, STATIC_ACTOR_ID + 500)
+        st.just(UNTRACKED_ID)
+        | st.integers(1, 10_000)
+        | st.integers(STATIC_ACTOR_ID, STATIC_ACTOR_ID + 500)
     )
     speeds = [draw(number), draw(number)] if 0 < actor_id < STATIC_ACTOR_ID else [0.0, 0.0]
     words = [draw(st.sampled_from(CATEGORIES)), *map(repr, floats + speeds)]
-    return " ".join([*words, str(actor_id), str(draw(st.integers(0, 2000))), str(draw(st.booleans()))])
+    return " ".join(
+        [*words, str(actor_id), str(draw(st.integers(0, 2000))), str(draw(st.booleans()))]
+    )
 
 
 @st.composite
@@ -209,7 +221,9 @@ def calibs(draw: st.DrawFn) -> Calib:
         world_from_ego=draw(poses()),
         camera_from_lidar={camera: draw(poses(5.0)) for camera in CAMERAS},
         intrinsic={
-            camera: np.array([[draw(focal), 0, draw(focal)], [0, draw(focal), draw(focal)], [0, 0, 1]])
+            camera: np.array(
+                [[draw(focal), 0, draw(focal)], [0, draw(focal), draw(focal)], [0, 0, 1]]
+            )
             for camera in CAMERAS
         },
     )
@@ -218,7 +232,11 @@ def calibs(draw: st.DrawFn) -> Calib:
 @st.composite
 def clouds(draw: st.DrawFn) -> LidarPointCloud:
     """Point clouds of single-precision numbers, as in the files."""
-    values = draw(hnp.arrays(np.float32, (draw(st.integers(0, 20)), 4), elements=st.floats(-100, 100, width=32)))
+    values = draw(
+        hnp.arrays(
+            np.float32, (draw(st.integers(0, 20)), 4), elements=st.floats(-100, 100, width=32)
+        )
+    )
     return LidarPointCloud(values[:, :3].astype(np.float64), values[:, 3])
 
 

@@ -65,14 +65,18 @@ class CachedImages(Format):
     codec: Codec = "raw"
 
     name: ClassVar[str] = "cache"
-    nothing: ClassVar[str] = "none of these images is in this release; unpack the archives that hold them"
+    nothing: ClassVar[str] = (
+        "none of these images is in this release; unpack the archives that hold them"
+    )
 
     def __post_init__(self) -> None:
         """Check the choices too."""
         super().__post_init__()
         settle_choices(self, {"codec": get_args(Codec)})
         if self.images.resize is None:
-            raise ConfigError("images: a cache holds images of one size; give ImageConfig(resize=(height, width))")
+            raise ConfigError(
+                "images: a cache holds images of one size; give ImageConfig(resize=(height, width))"
+            )
 
     def settings(self) -> dict[str, Any]:
         """Everything that decides what is written."""
@@ -99,19 +103,31 @@ class CachedImages(Format):
         there = self._there(dataset, scenario)
 
         def contents() -> Iterator[bytes | None]:
-            for agent, number, camera in product(self.agents, range(1, frames + 1), self.images.cameras):
+            for agent, number, camera in product(
+                self.agents, range(1, frames + 1), self.images.cameras
+            ):
                 has = number in there.get((agent, camera), ())
-                yield self._content(dataset, _camera_token(scenario, agent, number, camera)) if has else None
+                yield (
+                    self._content(dataset, _camera_token(scenario, agent, number, camera))
+                    if has
+                    else None
+                )
 
         with output.file(_images_path(scenario)) as path:
             _write_images(path, len(self.agents) * frames, len(self.images.cameras), contents())
-        output.tally.samples += len({(agent, number) for (agent, _), numbers in there.items() for number in numbers})
+        output.tally.samples += len(
+            {(agent, number) for (agent, _), numbers in there.items() for number in numbers}
+        )
         absent = [agent for agent in self.agents if (agent, self.images.cameras[0]) not in there]
         wanted = (len(self.agents) - len(absent)) * frames * len(self.images.cameras)
         output.leave_out("agents of scenarios that are not in this release", len(absent))
-        output.leave_out("images that are not in this release", wanted - sum(map(len, there.values())))
+        output.leave_out(
+            "images that are not in this release", wanted - sum(map(len, there.values()))
+        )
 
-    def finish(self, dataset: Dataset, units: Sequence[Unit], output: Output, parts: Callable[[Unit], Path]) -> None:
+    def finish(
+        self, dataset: Dataset, units: Sequence[Unit], output: Output, parts: Callable[[Unit], Path]
+    ) -> None:
         """Nothing spans scenarios."""
 
     def _there(self, dataset: Dataset, scenario: str) -> dict[tuple[str, str], set[int]]:
@@ -175,7 +191,9 @@ class ImageCache:
         return type(self), (self.folder,)
 
     def __repr__(self) -> str:
-        return f"ImageCache({self.folder}, {counted(len(self._scenarios), 'scenario')}, {self.codec})"
+        return (
+            f"ImageCache({self.folder}, {counted(len(self._scenarios), 'scenario')}, {self.codec})"
+        )
 
     def check(self, config: ImageConfig) -> None:
         """Refuse images that it cannot give. It can crop those that it has whole, and leave out cameras.
@@ -222,7 +240,9 @@ class ImageCache:
         file, row, column = self._located(camera)
         return file.has(row, column)
 
-    def load(self, config: ImageConfig, dataset: Dataset, camera: str) -> tuple[ByteArray, FloatArray]:
+    def load(
+        self, config: ImageConfig, dataset: Dataset, camera: str
+    ) -> tuple[ByteArray, FloatArray]:
         """An image (h, w, 3) uint8 RGB, perhaps read-only, and its intrinsic (3, 3): as `ImageConfig.load` gives them.
 
         Raises:
@@ -250,7 +270,9 @@ class ImageCache:
         if self.codec == "jpeg":
             image = decode_image(path, bytes(content))
         elif len(content) == height * width * 3:
-            image = np.frombuffer(content, dtype=np.uint8).reshape(3, height, width).transpose(1, 2, 0)
+            image = (
+                np.frombuffer(content, dtype=np.uint8).reshape(3, height, width).transpose(1, 2, 0)
+            )
         else:
             image = np.zeros((0, 0, 3), dtype=np.uint8)
         if image.shape != (height, width, 3):
@@ -332,7 +354,9 @@ class _ImagesFile:
         """The table; raises ValueError or OSError."""
         if len(self._bytes) < _HEAD or self._bytes[: len(_MAGIC)] != _MAGIC:
             raise ValueError("is no file of cached images")
-        rows, cameras = np.frombuffer(self._bytes, dtype=_NUMBER, offset=len(_MAGIC), count=2).tolist()
+        rows, cameras = np.frombuffer(
+            self._bytes, dtype=_NUMBER, offset=len(_MAGIC), count=2
+        ).tolist()
         if cameras != wanted:
             raise ValueError(f"has {cameras} cameras, and its cache {wanted}")
         end = _HEAD + rows * cameras * 2 * _NUMBER.itemsize
@@ -342,7 +366,9 @@ class _ImagesFile:
         table = np.frombuffer(self._bytes, dtype=_NUMBER, offset=_HEAD, count=rows * cameras * 2)
         table = table.reshape(rows, cameras, 2)
         if table.size and (
-            table.min() < 0 or table.max() > len(self._bytes) or table.sum(axis=2).max() > len(self._bytes)
+            table.min() < 0
+            or table.max() > len(self._bytes)
+            or table.sum(axis=2).max() > len(self._bytes)
         ):
             raise ValueError("is cut off")
         check_size(int(table[..., 1].max(initial=0)), "image", "an image")

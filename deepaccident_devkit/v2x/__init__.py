@@ -15,7 +15,12 @@ from deepaccident_devkit.v2x.agents import (
 )
 from deepaccident_devkit.v2x.clouds import aggregate_point_cloud
 from deepaccident_devkit.v2x.collisions import Contact, collision
-from deepaccident_devkit.v2x.cooperation import CooperativeView, cooperative_boxes, cooperative_view, visible_instances
+from deepaccident_devkit.v2x.cooperation import (
+    CooperativeView,
+    cooperative_boxes,
+    cooperative_view,
+    visible_instances,
+)
 from deepaccident_devkit.v2x.messages import Link, MessageSize, PoseNoise, message_sizes
 from deepaccident_devkit.v2x.poses import (
     ImagePoints,

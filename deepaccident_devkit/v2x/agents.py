@@ -82,7 +82,9 @@ class AgentConfig:
 
     def __post_init__(self) -> None:
         """Check the roles; raises ChoiceError."""
-        object.__setattr__(self, "partners", choices("partners", self.partners, get_args(PartnerRole), empty=True))
+        object.__setattr__(
+            self, "partners", choices("partners", self.partners, get_args(PartnerRole), empty=True)
+        )
 
     def agents_for(self, ego: str, *, side: VehicleSide = "ego_vehicle") -> tuple[AgentName, ...]:
         """The agents of this configuration by their own names, the ego first.
@@ -152,7 +154,9 @@ def agents_note(agents: Agents) -> str | list[str] | None:
     return list(checked) if isinstance(checked, tuple) else checked
 
 
-def cooperating_agents(dataset: Dataset, sample: RowArgument, agents: Agents = None) -> tuple[AgentName, ...]:
+def cooperating_agents(
+    dataset: Dataset, sample: RowArgument, agents: Agents = None
+) -> tuple[AgentName, ...]:
     """The agents that an `agents=` argument means at a sample, each once; the sample's own first if it is among them.
 
     Args:
@@ -267,7 +271,9 @@ def accident_visible(dataset: Dataset, sample: RowArgument) -> bool | None:
     return _accident_visible(dataset, scenario, dataset.agent.get(record["agent_token"]), index)
 
 
-def accident_visible_mask(in_view: ArrayLike, *, collision: ArrayLike = True, exempt: ArrayLike = False) -> BoolArray:
+def accident_visible_mask(
+    in_view: ArrayLike, *, collision: ArrayLike = True, exempt: ArrayLike = False
+) -> BoolArray:
     """The released rule by itself: which samples count as seeing the accident.
 
     See docs/released_code.md, Visibility and attributes. A sample does not if its agent does not have the accident in
@@ -293,7 +299,9 @@ def accident_visible_mask(in_view: ArrayLike, *, collision: ArrayLike = True, ex
     return np.asarray(~(unseen & counts))
 
 
-def pair_in_view(mask: ArrayLike, actor_ids: ArrayLike, pair: Collection[int], own_id: int | None = None) -> bool:
+def pair_in_view(
+    mask: ArrayLike, actor_ids: ArrayLike, pair: Collection[int], own_id: int | None = None
+) -> bool:
     """Whether an agent sees the others of a colliding pair at one moment.
 
     See docs/released_code.md, Visibility and attributes.
@@ -316,23 +324,36 @@ def _ego_of(dataset: Dataset, scenario: ScenarioRecord) -> AgentRecord | None:
         return None
 
 
-def _accident_visible(dataset: Dataset, scenario: ScenarioRecord, agent: AgentRecord, index: int) -> bool | None:
+def _accident_visible(
+    dataset: Dataset, scenario: ScenarioRecord, agent: AgentRecord, index: int
+) -> bool | None:
     if scenario["weather"] is None:  # there is no meta
         return None
     collision, exempt = scenario["collision"], scenario["name"] in SHEER_CURTAINS
     if collision is None or exempt:  # whatever is in view
-        return bool(accident_visible_mask([False] * _OBSERVED, collision=collision is not None, exempt=exempt))
+        return bool(
+            accident_visible_mask(
+                [False] * _OBSERVED, collision=collision is not None, exempt=exempt
+            )
+        )
     if agent["actor_id"] is None and agent["name"] != INFRASTRUCTURE:
         return None
     moments = [index - _STEP * back for back in reversed(range(_OBSERVED))]
-    views = [_has_in_view(dataset, agent, [moment], collision["ids"]) if moment > 0 else False for moment in moments]
+    views = [
+        _has_in_view(dataset, agent, [moment], collision["ids"]) if moment > 0 else False
+        for moment in moments
+    ]
     seen = [view for view in views if view is not None]
     return bool(accident_visible_mask(seen)) if len(seen) == _OBSERVED else None
 
 
-def _has_in_view(dataset: Dataset, agent: AgentRecord, indices: Iterable[int], pair: Collection[int]) -> bool | None:
+def _has_in_view(
+    dataset: Dataset, agent: AgentRecord, indices: Iterable[int], pair: Collection[int]
+) -> bool | None:
     """Whether an agent itself sees each of the others of a pair at one of some frames; None if one has no label."""
-    samples = [dataset.get_sample(agent["scenario_token"], agent["name"], index) for index in indices]
+    samples = [
+        dataset.get_sample(agent["scenario_token"], agent["name"], index) for index in indices
+    ]
     if not all(sample["labelled"] for sample in samples):
         return None
     boxes = concatenate([dataset.boxes(sample, "lidar") for sample in samples], "lidar")

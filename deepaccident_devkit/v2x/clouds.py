@@ -71,11 +71,15 @@ def aggregate_point_cloud(
             continue
         cloud = dataset.load_point_cloud(message.sample, "lidar")
         if tracks is not None:
-            cloud = _compensated(cloud, dataset.world_from(message.sample, "lidar"), tracks, message, int(present))
+            cloud = _compensated(
+                cloud, dataset.world_from(message.sample, "lidar"), tracks, message, int(present)
+            )
         cloud = cloud.transform(message.target_from(dataset, "lidar", target_from_world), frame)
         lag = record["timestamp"] - dataset.get("sample", message.sample)["timestamp"]
         agent = np.full(len(cloud), AGENTS.index(message.agent), dtype=np.int8)
-        parts.append(replace(cloud, agent=agent, time_lag=np.full(len(cloud), lag, dtype=np.float32)))
+        parts.append(
+            replace(cloud, agent=agent, time_lag=np.full(len(cloud), lag, dtype=np.float32))
+        )
     files.tell()
     return concatenate_clouds(parts, frame)
 
@@ -88,10 +92,15 @@ def moved_points(points: FloatArray, then: Boxes, now: Boxes) -> FloatArray:
     """
     both, row_then, row_now = np.intersect1d(then.actor_id, now.actor_id, return_indices=True)
     before, after = then.select(row_then), now.select(row_now)
-    moves = (before.center != after.center).any(axis=1) | (before.rotation != after.rotation).any(axis=1)
+    moves = (before.center != after.center).any(axis=1) | (before.rotation != after.rotation).any(
+        axis=1
+    )
     before, after = before.select(moves), after.select(moves)
     result = np.array(points)
-    turns_then, turns_now = quaternions.to_matrix(before.rotation), quaternions.to_matrix(after.rotation)
+    turns_then, turns_now = (
+        quaternions.to_matrix(before.rotation),
+        quaternions.to_matrix(after.rotation),
+    )
     for box, inside in enumerate(before.contains(points) if len(both) else ()):
         local = (points[inside] - before.center[box]) @ turns_then[box]
         result[inside] = local @ turns_now[box].T + after.center[box]
@@ -99,7 +108,11 @@ def moved_points(points: FloatArray, then: Boxes, now: Boxes) -> FloatArray:
 
 
 def _compensated(
-    cloud: LidarPointCloud, world_from_lidar: SE3, tracks: ScenarioTracks, message: Message, present: int
+    cloud: LidarPointCloud,
+    world_from_lidar: SE3,
+    tracks: ScenarioTracks,
+    message: Message,
+    present: int,
 ) -> LidarPointCloud:
     """A cloud in its LiDAR frame with moving actors where they are at frame `present`."""
     taken = int(message.sample.rsplit("/", 1)[1])

@@ -86,10 +86,14 @@ class Contact(FrozenArrays):
 
     def __repr__(self) -> str:
         """Who, where, how fast: in one line."""
-        who = " and ".join(f"{actor} ({side})" for actor, side in zip(self.actor_ids, self.sides, strict=True))
+        who = " and ".join(
+            f"{actor} ({side})" for actor, side in zip(self.actor_ids, self.sides, strict=True)
+        )
         speeds = " and ".join(f"{speed:.1f}" for speed in self.speeds)
         x, y = self.point[:2].tolist()
-        when = "" if self.touching is None else f" touching from {self.touching:.1f} s before the end,"
+        when = (
+            "" if self.touching is None else f" touching from {self.touching:.1f} s before the end,"
+        )
         return (
             f"Contact(actors {who} at x {x:.1f}, y {y:.1f} m in world:{when} gap {self.gap:.2f} m, {speeds} m/s, "
             f"closing at {self.closing_speed:.1f} m/s, {math.degrees(self.impact_angle):.0f}° between their headings)"
@@ -108,7 +112,10 @@ def first_accident(dataset: Dataset) -> str:
     """The first scenario that ends in an accident, preferably with labels of both; or NotAvailableError."""
     accidents = [record for record in dataset.scenario if record["collision"] is not None]
     for record in accidents:
-        if labelled_pair(record["collision"], scenario_tracks(dataset, record["token"]).actor_id) is not None:
+        if (
+            labelled_pair(record["collision"], scenario_tracks(dataset, record["token"]).actor_id)
+            is not None
+        ):
             return record["token"]
     if accidents:
         return accidents[0]["token"]
@@ -154,7 +161,9 @@ def collision(dataset: Dataset, scenario: RowArgument) -> Contact | None:
     tracks = scenario_tracks(dataset, record["token"])
     frames, rows = labelled_together(tracks, record["token"], named)
     outlines = (tracks.boxes.select(each) for each in rows)
-    gaps = signed_gaps(*(np.column_stack([each.center[:, :2], each.size[:, :2], each.yaw]) for each in outlines))
+    gaps = signed_gaps(
+        *(np.column_stack([each.center[:, :2], each.size[:, :2], each.yaw]) for each in outlines)
+    )
     begin, last = contact_begin(gaps), len(frames) - 1
     moment = last if begin is None else begin
     pair, met = (tracks.boxes.select(rows[:, at]) for at in (last, moment))
@@ -190,7 +199,9 @@ def colliding_pair(record: ScenarioRecord) -> tuple[int, int] | None:
         NotAvailableError: the scenario has no meta file, or the file names one actor twice.
     """
     if record["weather"] is None:
-        raise NotAvailableError(f"{record['token']} has no meta file, which names the colliding pair; unpack meta")
+        raise NotAvailableError(
+            f"{record['token']} has no meta file, which names the colliding pair; unpack meta"
+        )
     if record["collision"] is None:
         return None
     first, second = record["collision"]["ids"]
@@ -207,7 +218,9 @@ def labelled_pair(collision: CollisionRecord | None, actor_ids: IntArray) -> tup
     Meta may name one actor twice, or one that no label has: id 0, or of an agent that is not here.
     """
     first, second = (0, 0) if collision is None else collision["ids"]
-    return (first, second) if first != second and np.isin((first, second), actor_ids).all() else None
+    return (
+        (first, second) if first != second and np.isin((first, second), actor_ids).all() else None
+    )
 
 
 def _velocities_into(dataset: Dataset, frame: str, pair: Boxes) -> FloatArray:
@@ -226,7 +239,9 @@ def _velocities_into(dataset: Dataset, frame: str, pair: Boxes) -> FloatArray:
     return np.where(np.isnan(velocity), pair.velocity, velocity)
 
 
-def labelled_together(tracks: ScenarioTracks, scenario: str, pair: tuple[int, int]) -> tuple[IntArray, IntArray]:
+def labelled_together(
+    tracks: ScenarioTracks, scenario: str, pair: tuple[int, int]
+) -> tuple[IntArray, IntArray]:
     """The frame numbers (F,), ascending, at which labels show both of a pair, and the rows (2, F) of tracks there.
 
     Raises NotAvailableError if there are none: `counterpart not recorded` if labels show one of the two alone.
@@ -286,7 +301,9 @@ def _facing(pair: Boxes) -> tuple[FloatArray, tuple[ContactSide, ContactSide]]:
     """The normal (2,) along which the gap is widest, first to second, and the sides that face each other."""
     axes = quaternions.to_matrix(pair.rotation)[:, :2, :2]  # box, xy, along or across
     normals = np.concatenate([axes[0].T, axes[1].T])
-    reach = np.einsum("nbk,bk->n", np.abs(np.einsum("na,bak->nbk", normals, axes)), pair.size[:, :2] / 2)
+    reach = np.einsum(
+        "nbk,bk->n", np.abs(np.einsum("na,bak->nbk", normals, axes)), pair.size[:, :2] / 2
+    )
     apart = normals @ (pair.center[1] - pair.center[0])[:2]
     best = int(np.argmax(np.abs(apart) - reach))
     toward_second = normals[best] * (1.0 if apart[best] >= 0 else -1.0)
@@ -319,7 +336,9 @@ def _disagreements(
         found.append(f"the pair is {gap:.2f} m apart")
     if pair.category_names != told["classes"]:
         found.append(f"the classes are {pair.category_names}, meta says {told['classes']}")
-    found += _other_agents(_agent_ids(dataset, record["token"]), pair.actor_id.tolist(), told["agents"])
+    found += _other_agents(
+        _agent_ids(dataset, record["token"]), pair.actor_id.tolist(), told["agents"]
+    )
     word, _, aside = told["contact_side"].partition("_")
     fitting = {word, "left", "right"} if aside else {word}
     if word in ("front", "rear", "left", "right") and not fitting & {*sides}:
@@ -333,7 +352,9 @@ def _agent_ids(dataset: Dataset, scenario: str) -> dict[str, int | None]:
     return {agent["name"]: agent["actor_id"] for agent in agents if not agent["is_infrastructure"]}
 
 
-def _other_agents(ids: Mapping[str, int | None], pair: Sequence[int], told: Sequence[str | None] | None) -> list[str]:
+def _other_agents(
+    ids: Mapping[str, int | None], pair: Sequence[int], told: Sequence[str | None] | None
+) -> list[str]:
     """How the colliding agents in the meta file differ from those that have the pair's ids, in words.
 
     `ids` are the vehicles that are agents here → actor ids; `told` the meta file's names, None for no agent.

@@ -15,11 +15,23 @@ from deepaccident_devkit.dataset import VISIBLE, Dataset, RowArgument, Visible
 from deepaccident_devkit.errors import NotAvailableError
 from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.geometry.boxes import concatenate, trusted_boxes
-from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray, FrozenArrays, IntArray
+from deepaccident_devkit.support.arrays import (
+    AnyArray,
+    BoolArray,
+    FloatArray,
+    FrozenArrays,
+    IntArray,
+)
 from deepaccident_devkit.support.text import choice
 from deepaccident_devkit.tables import visible_ids, visible_mask
 from deepaccident_devkit.tables.tokens import instance_token
-from deepaccident_devkit.taxonomy import AGENTS, INFRASTRUCTURE, OWN_ACTOR_ID, UNTRACKED_ID, AgentName
+from deepaccident_devkit.taxonomy import (
+    AGENTS,
+    INFRASTRUCTURE,
+    OWN_ACTOR_ID,
+    UNTRACKED_ID,
+    AgentName,
+)
 from deepaccident_devkit.v2x.agents import Agents
 from deepaccident_devkit.v2x.messages import Link, Message, messages
 
@@ -141,7 +153,9 @@ def cooperative_boxes(
         NotAvailableError: an agent is not in this (partial) release.
         ConfigError: `link` is no Link, or its latency is longer than the scenario's past.
     """
-    return cooperative_view(dataset, sample, agents=agents, frame=frame, visible=visible, link=link).boxes
+    return cooperative_view(
+        dataset, sample, agents=agents, frame=frame, visible=visible, link=link
+    ).boxes
 
 
 def cooperative_view(
@@ -162,13 +176,19 @@ def cooperative_view(
         if visible is not None:
             seen = _visible_mask(message, boxes, visible)
             boxes, ids = boxes.select(seen), ids[seen]
-        parts.append(boxes.transform(message.target_from(dataset, "lidar", target_from_world), frame))
+        parts.append(
+            boxes.transform(message.target_from(dataset, "lidar", target_from_world), frame)
+        )
         actors.append(ids)
         agent_codes.append(np.full(len(ids), AGENTS.index(message.agent), dtype=np.int8))
     if not parts:
         empty = Boxes.from_arrays(np.zeros((0, 3)), np.zeros((0, 3)), [], frame=frame)
-        return CooperativeView(boxes=empty, source=np.zeros(0, dtype=np.int8), seen_by=np.zeros(0, dtype=np.uint8))
-    return _one_an_actor(concatenate(parts, frame), np.concatenate(actors), np.concatenate(agent_codes))
+        return CooperativeView(
+            boxes=empty, source=np.zeros(0, dtype=np.int8), seen_by=np.zeros(0, dtype=np.uint8)
+        )
+    return _one_an_actor(
+        concatenate(parts, frame), np.concatenate(actors), np.concatenate(agent_codes)
+    )
 
 
 def seen_actors(
@@ -204,7 +224,9 @@ def seen_actors(
             f"{record['token']}: has no label (the test split ships without), so that an oracle knows nothing; choose "
             "a labelled sample"
         )
-    view = cooperative_view(dataset, sample, agents=agents, frame=frame, visible="released", link=link)
+    view = cooperative_view(
+        dataset, sample, agents=agents, frame=frame, visible="released", link=link
+    )
     own_actor_id = dataset.get("agent", record["agent_token"])["actor_id"]
     others = view.boxes.actor_id != (OWN_ACTOR_ID if own_actor_id is None else own_actor_id)
     labelled = dataset.boxes(sample, frame)
@@ -228,7 +250,9 @@ def _one_an_actor(boxes: Boxes, actor: IntArray, agent: AnyArray) -> Cooperative
     chosen = order[first]
     from_outside = ~own[order]
     count = len(ids)
-    points = np.bincount(group, np.where(from_outside, boxes.num_lidar_pts[order], 0), count).astype(np.int64)
+    points = np.bincount(
+        group, np.where(from_outside, boxes.num_lidar_pts[order], 0), count
+    ).astype(np.int64)
     camera = np.bincount(group, boxes.camera_visible[order] & from_outside, count) > 0
     seen_by = np.zeros(count, dtype=np.uint8)
     bits = np.left_shift(1, agent, dtype=np.uint8, casting="unsafe")
@@ -238,7 +262,10 @@ def _one_an_actor(boxes: Boxes, actor: IntArray, agent: AnyArray) -> Cooperative
     loose = loose[~_repeated(boxes, agent, loose, chosen)]
     picked = np.concatenate([chosen, loose])
     result = boxes.select(picked)
-    columns = {name: getattr(result, name) for name in ("center", "size", "rotation", "velocity", "category", "row")}
+    columns = {
+        name: getattr(result, name)
+        for name in ("center", "size", "rotation", "velocity", "category", "row")
+    }
     merged = trusted_boxes(
         boxes.frame,
         {
@@ -248,7 +275,9 @@ def _one_an_actor(boxes: Boxes, actor: IntArray, agent: AnyArray) -> Cooperative
             "camera_visible": np.concatenate([camera, boxes.camera_visible[loose]]),
         },
     )
-    return CooperativeView(boxes=merged, source=agent[picked], seen_by=np.concatenate([seen_by, bits[loose]]))
+    return CooperativeView(
+        boxes=merged, source=agent[picked], seen_by=np.concatenate([seen_by, bits[loose]])
+    )
 
 
 def _first_of_each(actor: IntArray, agent: AnyArray) -> IntArray:
@@ -261,8 +290,12 @@ def _first_of_each(actor: IntArray, agent: AnyArray) -> IntArray:
 def _repeated(boxes: Boxes, agent: AnyArray, loose: IntArray, chosen: IntArray) -> BoolArray:
     """Which untracked rows are at the place of a tracked actor, or of an untracked row of an earlier agent."""
     against = np.concatenate([chosen, loose])
-    apart: FloatArray = np.linalg.norm(boxes.center[loose][:, None] - boxes.center[against][None], axis=-1)
-    same = (apart < SAME_ACTOR_DISTANCE) & (boxes.category[loose][:, None] == boxes.category[against])
+    apart: FloatArray = np.linalg.norm(
+        boxes.center[loose][:, None] - boxes.center[against][None], axis=-1
+    )
+    same = (apart < SAME_ACTOR_DISTANCE) & (
+        boxes.category[loose][:, None] == boxes.category[against]
+    )
     earlier = np.tril(agent[loose][:, None] != agent[loose], k=-1)
     same[:, len(chosen) :] &= earlier
     result: BoolArray = same.any(axis=1)

@@ -16,7 +16,12 @@ from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ChoiceError, ConfigError
 from deepaccident_devkit.geometry import SE3
 from deepaccident_devkit.release.layout import MissingFiles
-from deepaccident_devkit.support.arrays import FloatArray, checked_count, checked_number, checked_whole
+from deepaccident_devkit.support.arrays import (
+    FloatArray,
+    checked_count,
+    checked_number,
+    checked_whole,
+)
 from deepaccident_devkit.support.text import choice
 from deepaccident_devkit.tables.tokens import sample_token
 from deepaccident_devkit.taxonomy import CAMERAS, FRAME_PERIOD, LIDAR, AgentName, OnError
@@ -60,9 +65,13 @@ class PoseNoise:
     def __post_init__(self) -> None:
         """Check the numbers; raises ConfigError."""
         for name in ("mean", "std", "heading_std"):
-            value = checked_number(f"pose noise: {name}", getattr(self, name), "a number from 0", ConfigError)
+            value = checked_number(
+                f"pose noise: {name}", getattr(self, name), "a number from 0", ConfigError
+            )
             if not 0 <= value < math.inf:
-                raise ConfigError(f"pose noise: {name} is {value:g}; choose a finite number of at least 0")
+                raise ConfigError(
+                    f"pose noise: {name} is {value:g}; choose a finite number of at least 0"
+                )
             object.__setattr__(self, name, value)
         if self.heading_std > math.pi:
             radians = math.radians(self.heading_std)
@@ -75,7 +84,11 @@ class PoseNoise:
         """The error of one partner at one frame: x and y in world, metres, and heading, radians; `key` decides it."""
         turn, distance, _, heading = uniforms(f"{key}/pose")
         off, direction = self.mean + self.std * _NORMAL.inv_cdf(distance), 2 * math.pi * turn
-        return off * math.cos(direction), off * math.sin(direction), self.heading_std * _NORMAL.inv_cdf(heading)
+        return (
+            off * math.cos(direction),
+            off * math.sin(direction),
+            self.heading_std * _NORMAL.inv_cdf(heading),
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -107,15 +120,21 @@ class Link:
 
     def __post_init__(self) -> None:
         """Check the numbers and convert them to Python's types; raises ConfigError, or ChoiceError of the payload."""
-        loss = checked_number("packet_loss", self.packet_loss, "a probability from 0 to 1", ConfigError)
+        loss = checked_number(
+            "packet_loss", self.packet_loss, "a probability from 0 to 1", ConfigError
+        )
         if not 0 <= loss <= 1:
-            raise ConfigError(f"packet_loss: {loss:g} is no probability; choose a number from 0 to 1")
+            raise ConfigError(
+                f"packet_loss: {loss:g} is no probability; choose a number from 0 to 1"
+            )
         checked = {
             "latency": _whole_frames(self.latency),
             "pose_noise": _noise(self.pose_noise),
             "packet_loss": loss,
             "seed": checked_whole("seed", self.seed, "a whole number", ConfigError),
-            "budget": None if self.budget is None else checked_count("budget", self.budget, "bytes a frame", _MOST),
+            "budget": None
+            if self.budget is None
+            else checked_count("budget", self.budget, "bytes a frame", _MOST),
             "payload": (
                 choice("payload", self.payload, (None, *get_args(Payload)))
                 if self.payload is None or isinstance(self.payload, str)
@@ -152,9 +171,14 @@ class Link:
 
     def loses(self, scenario: str, partner: str, index: int) -> bool:
         """Whether a partner's data do not arrive at frame number `index`."""
-        return self.packet_loss > 0 and uniforms(f"{self._key(scenario, partner, index)}/loss")[0] < self.packet_loss
+        return (
+            self.packet_loss > 0
+            and uniforms(f"{self._key(scenario, partner, index)}/loss")[0] < self.packet_loss
+        )
 
-    def pose_error(self, scenario: str, partner: str, index: int, position: FloatArray) -> SE3 | None:
+    def pose_error(
+        self, scenario: str, partner: str, index: int, position: FloatArray
+    ) -> SE3 | None:
         """From true places to those where the ego puts the partner's data: `claimed_from_world`; None without noise.
 
         Args:
@@ -167,7 +191,9 @@ class Link:
             return None
         x, y, heading = self.pose_noise.draw(self._key(scenario, partner, index))
         turn = SE3.from_yaw(heading)
-        return SE3.from_rotation(turn.rotation, position + np.array([x, y, 0.0]) - turn.rotate(position))
+        return SE3.from_rotation(
+            turn.rotation, position + np.array([x, y, 0.0]) - turn.rotate(position)
+        )
 
     def _key(self, scenario: str, partner: str, index: int) -> str:
         return f"{self.seed}/{scenario}/{partner}/{index}"
@@ -177,14 +203,18 @@ def checked_link(link: object) -> Link | None:
     """The `link=` of a call, checked; raises ConfigError."""
     if link is None or isinstance(link, Link):
         return link
-    raise ConfigError(f"link: expected a Link, such as Link(latency=0.2, pose_noise=0.3), or None, found {link!r}")
+    raise ConfigError(
+        f"link: expected a Link, such as Link(latency=0.2, pose_noise=0.3), or None, found {link!r}"
+    )
 
 
 def _whole_frames(latency: object) -> float:
     """The latency in seconds, as exactly a whole number of frames."""
     seconds = checked_number("latency", latency, "seconds from 0", ConfigError)
     if not 0 <= seconds < math.inf:
-        raise ConfigError(f"latency: {seconds} is not possible; choose a finite number of seconds from 0")
+        raise ConfigError(
+            f"latency: {seconds} is not possible; choose a finite number of seconds from 0"
+        )
     if seconds > _LONGEST:
         raise ConfigError(
             f"latency: {seconds:g} s is longer than any scenario; if these are milliseconds, give {seconds / 1000:g}"
@@ -302,7 +332,9 @@ def message_bytes(dataset: Dataset, sample: str, payload: Payload | int | None) 
     if payload == "cloud":
         return POSE_BYTES + POINT_BYTES * len(dataset.load_point_cloud(sample, "lidar"))
     boxes = dataset.columns("sample")["num_annotations"].item(dataset.getind("sample", sample))
-    return POSE_BYTES + (BOX_BYTES * int(boxes) if payload == "boxes" else _bev_bytes(_BEV_SHAPE, np.float32))
+    return POSE_BYTES + (
+        BOX_BYTES * int(boxes) if payload == "boxes" else _bev_bytes(_BEV_SHAPE, np.float32)
+    )
 
 
 def traffic(
@@ -313,7 +345,9 @@ def traffic(
     Raises what `messages` and `message_bytes` do.
     """
     own = dataset.get("sample", sample)["token"]
-    exact = None if link is None else replace(link, pose_noise=None)  # which changes no size, and takes time
+    exact = (
+        None if link is None else replace(link, pose_noise=None)
+    )  # which changes no size, and takes time
     sent = [
         message_bytes(dataset, message.sample, payload)
         for message in messages(dataset, own, agents, exact)
@@ -348,7 +382,9 @@ def _bev_bytes(shape: Sequence[int], dtype: DTypeLike) -> int:
     try:
         return math.prod(lengths) * np.dtype(dtype).itemsize
     except TypeError as error:
-        raise ChoiceError(f"bev_dtype: expected a type such as 'float32', found {dtype!r} ({error})") from error
+        raise ChoiceError(
+            f"bev_dtype: expected a type such as 'float32', found {dtype!r} ({error})"
+        ) from error
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -374,7 +410,12 @@ class Message:
 
 
 def messages(
-    dataset: Dataset, sample: RowArgument, agents: Agents = None, link: Link | None = None, *, sweeps: int = 1
+    dataset: Dataset,
+    sample: RowArgument,
+    agents: Agents = None,
+    link: Link | None = None,
+    *,
+    sweeps: int = 1,
 ) -> Iterator[Message]:
     """What the agents contribute at a sample and at the `sweeps` − 1 frames before it; nothing for a lost message.
 
@@ -390,7 +431,9 @@ def messages(
         left = math.inf if link is None or link.budget is None else link.budget
         for agent in names:
             if link is None or agent == ego:
-                yield Message(agent=agent, sample=sample_token(scenario, agent, index), pose_error=None)
+                yield Message(
+                    agent=agent, sample=sample_token(scenario, agent, index), pose_error=None
+                )
             elif index == int(number) or index > link.latency_frames:
                 message = _received(dataset, scenario, agent, index, link)
                 size = (
@@ -403,7 +446,9 @@ def messages(
                     yield message
 
 
-def _received(dataset: Dataset, scenario: str, agent: AgentName, index: int, link: Link) -> Message | None:
+def _received(
+    dataset: Dataset, scenario: str, agent: AgentName, index: int, link: Link
+) -> Message | None:
     sent = sample_token(scenario, agent, link.frame_sent(scenario, index))
     if link.loses(scenario, agent, index):
         return None

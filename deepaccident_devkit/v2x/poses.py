@@ -18,7 +18,13 @@ from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ChoiceError, GeometryError
 from deepaccident_devkit.geometry import SE3, LidarPointCloud, PinholeCamera, conventions
 from deepaccident_devkit.geometry.conventions import inverses
-from deepaccident_devkit.support.arrays import BoolArray, ByteArray, FloatArray, FrozenArrays, checked
+from deepaccident_devkit.support.arrays import (
+    BoolArray,
+    ByteArray,
+    FloatArray,
+    FrozenArrays,
+    checked,
+)
 from deepaccident_devkit.support.nuscenes_names import with_keywords_named
 
 Poses = Sequence[SE3] | ArrayLike
@@ -45,7 +51,9 @@ def transform(
         TokenError: no such sample.
         ChoiceError: no such frame, or the samples are of two scenarios, whose worlds have nothing in common.
     """
-    scenarios = [dataset.get("sample", sample)["scenario_token"] for sample in (target_sample, source_sample)]
+    scenarios = [
+        dataset.get("sample", sample)["scenario_token"] for sample in (target_sample, source_sample)
+    ]
     if scenarios[0] != scenarios[1]:
         raise ChoiceError(
             f"transform: expected two samples of one scenario, found {scenarios[0]} and {scenarios[1]}; "
@@ -69,7 +77,9 @@ def relative_pose_to_ego(world_from_agent: Poses) -> FloatArray:
     """
     poses = _stacked("world_from_agent", world_from_agent)
     if not len(poses):
-        raise GeometryError("world_from_agent: expected the ego's pose and its partners', found none")
+        raise GeometryError(
+            "world_from_agent: expected the ego's pose and its partners', found none"
+        )
     return conventions.six_vectors_of(inverses(poses[:1]) @ poses)
 
 
@@ -94,7 +104,9 @@ def future_egomotion(world_from_ego: Poses, valid: ArrayLike | None = None) -> F
     poses = _stacked("world_from_ego", world_from_ego)
     if not len(poses):
         raise GeometryError("world_from_ego: expected at least one pose, found none")
-    known: BoolArray = checked("valid", np.ones(len(poses)) if valid is None else valid, (len(poses),), np.bool_)
+    known: BoolArray = checked(
+        "valid", np.ones(len(poses)) if valid is None else valid, (len(poses),), np.bool_
+    )
     both = known[:-1] & known[1:]
     motion = np.zeros((len(poses) - 1, 6))
     motion[both] = conventions.six_vectors_of(inverses(poses[1:][both]) @ poses[:-1][both])
@@ -161,7 +173,9 @@ def project_to_image(
         xyz, source = checked("points", points, (None, 3)), frame or "world"
     record = dataset.get("sample_data", camera)
     lens = camera_of(dataset, record)
-    optical_from_source = transform(dataset, record["sample_token"], sample, record["channel"], source)
+    optical_from_source = transform(
+        dataset, record["sample_token"], sample, record["channel"], source
+    )
     pixels, depth = lens.project(optical_from_source.apply(xyz))
     mask = lens.in_image(pixels)
     color = colors_at(dataset.load_image(record), lens, pixels, mask) if colors else None
@@ -191,7 +205,9 @@ def map_pointcloud_to_image(
     """
     record = dataset.get("sample_data", camera)
     source = record["sample_token"] if sample is None else sample
-    return project_to_image(dataset, dataset.load_point_cloud(source, "lidar"), source, record, colors=colors)
+    return project_to_image(
+        dataset, dataset.load_point_cloud(source, "lidar"), source, record, colors=colors
+    )
 
 
 def camera_of(dataset: Dataset, camera: RowArgument) -> PinholeCamera:
@@ -199,7 +215,9 @@ def camera_of(dataset: Dataset, camera: RowArgument) -> PinholeCamera:
     return dataset.camera(camera)
 
 
-def colors_at(image: ByteArray, lens: PinholeCamera, pixels: FloatArray, mask: BoolArray) -> ByteArray:
+def colors_at(
+    image: ByteArray, lens: PinholeCamera, pixels: FloatArray, mask: BoolArray
+) -> ByteArray:
     """Colours (N, 3) uint8; pixels are scaled if the image was stored smaller than its calib says."""
     height, width = image.shape[:2]
     columns = (pixels[mask, 0] * (width / lens.width)).astype(np.intp)

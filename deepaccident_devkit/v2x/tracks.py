@@ -128,9 +128,14 @@ def scenario_tracks(dataset: Dataset, scenario: RowArgument) -> ScenarioTracks:
     """A scenario's rows of the track table as arrays; raises TokenError."""
     columns, scenario_row = dataset.columns("track"), dataset.getind("scenario", scenario)
     scenarios = dataset.columns("scenario")
-    first_frame, frames = scenarios["first_frame_row"].item(scenario_row), scenarios["num_frames"].item(scenario_row)
+    first_frame, frames = (
+        scenarios["first_frame_row"].item(scenario_row),
+        scenarios["num_frames"].item(scenario_row),
+    )
     ends = np.array([first_frame, first_frame + frames], dtype=columns["frame_row"].dtype)
-    rows = slice(*columns["frame_row"].searchsorted(ends).tolist())  # of another type, all rows would be copied
+    rows = slice(
+        *columns["frame_row"].searchsorted(ends).tolist()
+    )  # of another type, all rows would be copied
     count = rows.stop - rows.start
     boxes = trusted_boxes(
         "world",

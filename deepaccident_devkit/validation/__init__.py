@@ -3,9 +3,19 @@
 from deepaccident_devkit.tables import Finding
 from deepaccident_devkit.tables.boxes import VelocityFit
 from deepaccident_devkit.validation.codes import CODES
-from deepaccident_devkit.validation.completeness import Completeness, FileCount, SplitFiles, release_completeness
+from deepaccident_devkit.validation.completeness import (
+    Completeness,
+    FileCount,
+    SplitFiles,
+    release_completeness,
+)
 from deepaccident_devkit.validation.croissant import data_card
-from deepaccident_devkit.validation.validate import ScenarioCheck, ValidationReport, findings, validate_release
+from deepaccident_devkit.validation.validate import (
+    ScenarioCheck,
+    ValidationReport,
+    findings,
+    validate_release,
+)
 
 __all__ = [
     "CODES",

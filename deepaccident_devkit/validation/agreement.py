@@ -81,7 +81,9 @@ def check_agreement(subject: Subject) -> Iterator[Finding]:
 def _views(subject: Subject) -> _ActorViews:
     boxes, rows = subject.boxes, np.flatnonzero(subject.seen)
     moments, moment = np.unique(
-        np.column_stack([boxes.actor[rows], boxes.frame[rows]]).reshape(-1, 2), axis=0, return_inverse=True
+        np.column_stack([boxes.actor[rows], boxes.frame[rows]]).reshape(-1, 2),
+        axis=0,
+        return_inverse=True,
     )
     place = (moment.reshape(-1), boxes.agent[rows])
     shape = (len(moments), len(subject.agents))
@@ -120,7 +122,9 @@ def _compare(subject: Subject, views: _ActorViews, first: int, second: int) -> I
         yield subject.finding("classes-differ", where, what)
 
 
-def _worst(views: _ActorViews, bad: BoolArray, values: FloatArray, both: BoolArray, unit: str) -> str:
+def _worst(
+    views: _ActorViews, bad: BoolArray, values: FloatArray, both: BoolArray, unit: str
+) -> str:
     worst = int(np.argmax(np.where(bad, values, -1)))
     share = bad.sum() / both.sum()
     return (
@@ -131,10 +135,19 @@ def _worst(views: _ActorViews, bad: BoolArray, values: FloatArray, both: BoolArr
 
 def _own_rows(subject: Subject, views: _ActorViews) -> Iterator[Finding]:
     """Each agent's own row against what the others see of the actor that meta says it is."""
-    key = {moment: index for index, moment in enumerate(zip(views.actor.tolist(), views.frame.tolist(), strict=True))}
+    key = {
+        moment: index
+        for index, moment in enumerate(zip(views.actor.tolist(), views.frame.tolist(), strict=True))
+    }
     rows = np.flatnonzero(subject.own & (subject.boxes.actor != UNTRACKED_ID))
-    moments = zip(subject.boxes.actor[rows].tolist(), subject.boxes.frame[rows].tolist(), strict=True)
-    pairs = [(row, key[moment]) for row, moment in zip(rows.tolist(), moments, strict=True) if moment in key]
+    moments = zip(
+        subject.boxes.actor[rows].tolist(), subject.boxes.frame[rows].tolist(), strict=True
+    )
+    pairs = [
+        (row, key[moment])
+        for row, moment in zip(rows.tolist(), moments, strict=True)
+        if moment in key
+    ]
     if not pairs:
         return
     own, seen = np.array(pairs).T
@@ -161,14 +174,18 @@ def _missing_actors(subject: Subject, views: _ActorViews) -> Iterator[Finding]:
     for agent, reach in enumerate(subject.reach.tolist()):
         if subject.agents[agent] not in subject.files.scan.labelled:
             continue
-        distance = np.linalg.norm(place[:, :2] - subject.positions[agent][views.frame - 1, :2], axis=1)
+        distance = np.linalg.norm(
+            place[:, :2] - subject.positions[agent][views.frame - 1, :2], axis=1
+        )
         expected = (distance < reach) & (distance > _ITSELF)
         missing = np.flatnonzero(expected & ~there[:, agent])
         missing = missing[~subject.has_untracked(agent, views.frame[missing], place[missing])]
         if len(missing):
             what = f"others see {actors_text(views.actor[missing])} within {reach:.0f} m"
             where = subject.label_where(agent)
-            yield subject.finding("actor-missing", where, f"{what}, {frames_text(views.frame[missing])}")
+            yield subject.finding(
+                "actor-missing", where, f"{what}, {frames_text(views.frame[missing])}"
+            )
 
 
 def _ids(subject: Subject) -> Iterator[Finding]:
@@ -177,7 +194,9 @@ def _ids(subject: Subject) -> Iterator[Finding]:
     rows = np.flatnonzero(subject.seen | (subject.own & (boxes.actor != UNTRACKED_ID)))
     near_ones, _ = near_pairs(subject.centers[rows], boxes.frame[rows], OWN_APART)
     first, second = rows[near_ones].T
-    differ = (boxes.actor[first] != boxes.actor[second]) & (boxes.agent[first] != boxes.agent[second])
+    differ = (boxes.actor[first] != boxes.actor[second]) & (
+        boxes.agent[first] != boxes.agent[second]
+    )
     first, second = first[differ], second[differ]
     near = np.linalg.norm(subject.centers[first] - subject.centers[second], axis=1) < SAME_PLACE
     alike = boxes.labels.category[first] == boxes.labels.category[second]
@@ -199,14 +218,21 @@ def _overlaps(subject: Subject, views: _ActorViews) -> Iterator[Finding]:
     seen = (np.arange(len(views.actor)), np.isfinite(views.center[..., 0]).argmax(axis=1))
     center, size = views.center[seen], views.size[seen]
     moves = np.zeros(len(center), dtype=bool)
-    moves[1:] = (np.diff(views.actor) == 0) & (np.linalg.norm(np.diff(center, axis=0), axis=1) > _STEP)
+    moves[1:] = (np.diff(views.actor) == 0) & (
+        np.linalg.norm(np.diff(center, axis=0), axis=1) > _STEP
+    )
     pairs, _ = near_pairs(center, views.frame, _NEAR)
     pairs = pairs[moves[pairs].any(axis=1)]
     first, second = np.column_stack([center[:, :2], size[:, :2], views.yaw[seen]])[pairs.T]
     depth = -signed_gaps(first, second)
-    over = (depth > POSITION) & (np.abs(np.diff(center[pairs, 2])[:, 0]) < size[pairs, 2].mean(axis=1))
+    over = (depth > POSITION) & (
+        np.abs(np.diff(center[pairs, 2])[:, 0]) < size[pairs, 2].mean(axis=1)
+    )
     if over.any():
-        who, when = actors_text(views.actor[pairs[over]].ravel()), frames_text(views.frame[pairs[over, 0]])
+        who, when = (
+            actors_text(views.actor[pairs[over]].ravel()),
+            frames_text(views.frame[pairs[over, 0]]),
+        )
         what = f"{who} overlap by up to {depth[over].max():.2f} m, {when}"
         yield subject.finding("overlap-unnamed", subject.token, what)
 
@@ -219,7 +245,9 @@ def _wrapped(angle: FloatArray) -> FloatArray:
 def check_story(subject: Subject) -> Iterator[Finding]:
     """All that meta says, compared with the format and the recordings."""
     if subject.files.scenario.name in SHEER_CURTAINS:
-        yield subject.finding("sheer-curtain", subject.token, "vehicles behind sheer curtains are marked invisible")
+        yield subject.finding(
+            "sheer-curtain", subject.token, "vehicles behind sheer curtains are marked invisible"
+        )
     yield from _name(subject)
     if subject.files.meta is not None:
         for check in _CHECKS:
@@ -231,7 +259,11 @@ def _name(subject: Subject) -> Iterator[Finding]:
     scenario = subject.files.scenario
     folder = re.match(r"type(\d+)_subtype(\d+)_", scenario.scenario_type)
     name = re.search(r"_type(\d+)_subtype(\d+)_", scenario.name)
-    if folder and name and [int(word) for word in folder.groups()] != [int(word) for word in name.groups()]:
+    if (
+        folder
+        and name
+        and [int(word) for word in folder.groups()] != [int(word) for word in name.groups()]
+    ):
         what = f"its name says type {int(name[1])}, subtype {int(name[2])}, its folder {scenario.scenario_type}"
         yield subject.finding("name-and-folder", subject.token, what)
 
@@ -247,7 +279,11 @@ def _words(subject: Subject, meta: Meta) -> Iterator[Finding]:
     }
     for name, (word, known) in said.items():
         if word is not None and word not in known:
-            yield _at_meta(subject, "meta-word", f"{name} is {shortened(word)!r}, expected one of {', '.join(known)}")
+            yield _at_meta(
+                subject,
+                "meta-word",
+                f"{name} is {shortened(word)!r}, expected one of {', '.join(known)}",
+            )
     told = (
         {}
         if meta.collision is None
@@ -261,7 +297,9 @@ def _words(subject: Subject, meta: Meta) -> Iterator[Finding]:
             what = f"{name} is {shortened(word)!r}, the release is known to have {', '.join(known)}"
             yield subject.finding("collision-word", f"{subject.files.scenario.meta_path}:1", what)
     if meta.time_of_day is None:
-        yield _at_meta(subject, "meta-word", f"{shortened(meta.weather)!r} does not end in a time of day")
+        yield _at_meta(
+            subject, "meta-word", f"{shortened(meta.weather)!r} does not end in a time of day"
+        )
     absent = [name for name, (word, _) in said.items() if word is None]
     absent += ["agents id"] if meta.agent_ids is None else []
     if absent:
@@ -292,14 +330,20 @@ def _agents(subject: Subject, meta: Meta) -> Iterator[Finding]:
     if collision is None or collision.agents is None or meta.agent_ids is None:
         return
     if set(collision.agents) == {None}:
-        yield _at_meta(subject, "nobody-named", f"the colliding agents are 'none none', the pair {collision.ids}")
+        yield _at_meta(
+            subject,
+            "nobody-named",
+            f"the colliding agents are 'none none', the pair {collision.ids}",
+        )
         return
     id_of = dict(zip(VEHICLE_AGENTS, meta.agent_ids, strict=True))
     short = {name: word for word, name in META_AGENTS.items()}
     expected = {id_of[agent] for agent in collision.agents if agent is not None}
     if not expected <= set(collision.ids) and UNKNOWN_ID not in collision.ids:
         names = " ".join(short[agent] for agent in collision.agents)
-        yield _at_meta(subject, "meta-pair", f"the colliding agents '{names}' are not the pair {collision.ids}")
+        yield _at_meta(
+            subject, "meta-pair", f"the colliding agents '{names}' are not the pair {collision.ids}"
+        )
     named = {agent for agent, actor in id_of.items() if actor in collision.ids}
     if not named <= set(collision.agents):
         what = f"the pair {collision.ids} has an agent that 'colliding agents' does not name"
@@ -350,11 +394,20 @@ def pair_gap(subject: Subject, collision: Collision) -> float | None:
 
 def _footprints(subject: Subject, rows: IntArray) -> FloatArray:
     """(M, 5) boxes in world from above: x, y, length, width, yaw."""
-    return np.column_stack([subject.centers[rows, :2], subject.boxes.labels.size[rows, :2], subject.yaw[rows]])
+    return np.column_stack(
+        [subject.centers[rows, :2], subject.boxes.labels.size[rows, :2], subject.yaw[rows]]
+    )
 
 
 def _at_meta(subject: Subject, code: str, what: str) -> Finding:
     return subject.finding(code, str(subject.files.scenario.meta_path), what)
 
 
-_CHECKS: tuple[Callable[[Subject, Meta], Iterator[Finding]], ...] = (_words, _counts, _folder, _agents, _pair, _impact)
+_CHECKS: tuple[Callable[[Subject, Meta], Iterator[Finding]], ...] = (
+    _words,
+    _counts,
+    _folder,
+    _agents,
+    _pair,
+    _impact,
+)

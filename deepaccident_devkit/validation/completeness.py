@@ -114,7 +114,9 @@ class Completeness(Report):
     def to_text(self) -> str:
         """Blocks for a terminal: unreadable archives, each split, then the first scenarios that lack something."""
         refused = [f"cannot be read: {sentence}" for sentence in self.unreadable_archives]
-        return "\n".join([f"DeepAccident {self.version} at {self.dataroot}", *refused, self.section()])
+        return "\n".join(
+            [f"DeepAccident {self.version} at {self.dataroot}", *refused, self.section()]
+        )
 
     def section(self) -> str:
         """The same without the release's name, as a part of another report."""
@@ -126,7 +128,11 @@ class Completeness(Report):
         blocks = [head, *(_split_text(name, split) for name, split in self.splits.items())]
         if self.lacking:
             lines = [f"  {token}: {sum(kinds.values()):,}" for token, kinds in self.lacking.items()]
-            more = [f"  … and {len(lines) - _LISTED:,} more (--json lists all)"] if len(lines) > _LISTED else []
+            more = (
+                [f"  … and {len(lines) - _LISTED:,} more (--json lists all)"]
+                if len(lines) > _LISTED
+                else []
+            )
             heading = f"scenarios that lack files, and how many ({len(lines):,}):"
             blocks.append("\n".join([heading, *lines[:_LISTED], *more]))
         return "\n\n".join(blocks)
@@ -159,9 +165,13 @@ def release_completeness(
     """
     layout = readable_release(root, version)
     folders = chosen_scenarios(layout, scenarios)
-    files = run_batch(files_of, folders, label="listing files", places=Places(reads=places_of(layout.root)), **how)
+    files = run_batch(
+        files_of, folders, label="listing files", places=Places(reads=places_of(layout.root)), **how
+    )
     tokens = [folder.token for folder in folders]
-    return completeness(layout, zip(tokens, files, strict=True), str(root), selected=scenarios is not None)
+    return completeness(
+        layout, zip(tokens, files, strict=True), str(root), selected=scenarios is not None
+    )
 
 
 def readable_release(root: Dataroot, version: str) -> ReleaseLayout:
@@ -179,7 +189,9 @@ def readable_release(root: Dataroot, version: str) -> ReleaseLayout:
         return ReleaseLayout(root=place, version=version, layout="A", scenarios=())
 
 
-def chosen_scenarios(layout: ReleaseLayout, scenarios: Collection[str] | None) -> list[ScenarioFolder]:
+def chosen_scenarios(
+    layout: ReleaseLayout, scenarios: Collection[str] | None
+) -> list[ScenarioFolder]:
     """The scenarios of some tokens, None for all; raises TokenError."""
     if scenarios is None:
         return list(layout.scenarios)
@@ -202,7 +214,13 @@ def files_of(scenario: ScenarioFolder) -> tuple[FileCount, ...]:
             with suppress(ReleaseError):  # a finding of its own
                 found[agent, kind] = frame_sizes(scenario.kind_folder(agent, kind), ending)
     frames = max(
-        (frame for (_, kind), sizes in found.items() if kind in SMALL_FILE_ENDINGS for frame in sizes), default=0
+        (
+            frame
+            for (_, kind), sizes in found.items()
+            if kind in SMALL_FILE_ENDINGS
+            for frame in sizes
+        ),
+        default=0,
     )
     if not frames:
         return ()
@@ -210,35 +228,58 @@ def files_of(scenario: ScenarioFolder) -> tuple[FileCount, ...]:
     for (name, kind), of_frames in found.items():
         sizes = [size for frame, size in of_frames.items() if size and frame <= frames]
         missing = frames - len(sizes)
-        counts.append(FileCount(agent=name, channel=kind, expected=frames, missing=missing, bytes=sum(sizes)))
+        counts.append(
+            FileCount(agent=name, channel=kind, expected=frames, missing=missing, bytes=sum(sizes))
+        )
     meta = 0
     with suppress(OSError):
         meta = scenario.meta_path.stat().st_size
-    return *counts, FileCount(agent=None, channel=_META, expected=1, missing=int(not meta), bytes=meta)
+    return *counts, FileCount(
+        agent=None, channel=_META, expected=1, missing=int(not meta), bytes=meta
+    )
 
 
 def completeness(
-    layout: ReleaseLayout, found: Iterable[tuple[str, Sequence[FileCount]]], dataroot: str, *, selected: bool
+    layout: ReleaseLayout,
+    found: Iterable[tuple[str, Sequence[FileCount]]],
+    dataroot: str,
+    *,
+    selected: bool,
 ) -> Completeness:
     """The sum of the files of scenarios, of which `files_of` told; `selected` if these are not all of the release."""
     split_of = assign_splits(layout).split_of
     by_split: dict[str, dict[str, list[FileCount]]] = {}
     for token, counts in found:
-        split = layout.version if layout.version == "v1-mini" else split_of.get(token, _UNKNOWN_SPLIT)
+        split = (
+            layout.version if layout.version == "v1-mini" else split_of.get(token, _UNKNOWN_SPLIT)
+        )
         if counts:
             by_split.setdefault(split, {})[token] = [_expected_in(split, count) for count in counts]
-    every = {token: counts for scenarios in by_split.values() for token, counts in scenarios.items()}
+    every = {
+        token: counts for scenarios in by_split.values() for token, counts in scenarios.items()
+    }
     lacking = {token: kinds for token, counts in every.items() if (kinds := _missing_kinds(counts))}
-    of_release = {layout.version: EXPECTED_MINI_SCENARIOS} if layout.version == "v1-mini" else EXPECTED_SCENARIOS
+    of_release = (
+        {layout.version: EXPECTED_MINI_SCENARIOS}
+        if layout.version == "v1-mini"
+        else EXPECTED_SCENARIOS
+    )
     expected = {} if selected else of_release
-    splits = (split for split in (*SPLITS, layout.version, _UNKNOWN_SPLIT) if split in by_split or split in expected)
+    splits = (
+        split
+        for split in (*SPLITS, layout.version, _UNKNOWN_SPLIT)
+        if split in by_split or split in expected
+    )
     return Completeness(
         dataroot=dataroot,
         version=layout.version,
         scenarios=len(every),
         whole=len(every) - len(lacking),
         total=_summed((count for counts in every.values() for count in counts), "all"),
-        splits={split: _split_files(by_split.get(split, {}), lacking, expected.get(split)) for split in splits},
+        splits={
+            split: _split_files(by_split.get(split, {}), lacking, expected.get(split))
+            for split in splits
+        },
         lacking=dict(sorted(lacking.items())),
         unreadable_archives=refused_archives(layout.root),
     )
@@ -287,13 +328,30 @@ def _split_text(name: str, split: SplitFiles) -> str:
     head = f"split {name}: {counted(split.scenarios, 'scenario')}{of_release} here, {split.whole:,} whole"
     if split.whole == split.scenarios:
         return head
-    rows = [("missing files", *_COLUMNS), *((agent, *_missing_texts(split.files, agent)) for agent in AGENTS)]
+    rows = [
+        ("missing files", *_COLUMNS),
+        *((agent, *_missing_texts(split.files, agent)) for agent in AGENTS),
+    ]
     without_meta = next(count.missing for count in split.files if count.channel == _META)
-    return "\n".join([head, columns_text(rows), *([f"meta is missing of {without_meta:,}"] if without_meta else [])])
+    return "\n".join(
+        [
+            head,
+            columns_text(rows),
+            *([f"meta is missing of {without_meta:,}"] if without_meta else []),
+        ]
+    )
 
 
 def _missing_texts(files: Sequence[FileCount], agent: str) -> Iterator[str]:
     """How many files of the kinds of each of `_COLUMNS` an agent lacks; - for none, `all` for as many as expected."""
     for kinds in _COLUMNS.values():
-        count = _summed((each for each in files if each.agent == agent and each.channel in kinds), "")
-        yield "-" if not count.missing else "all" if count.missing == count.expected else f"{count.missing:,}"
+        count = _summed(
+            (each for each in files if each.agent == agent and each.channel in kinds), ""
+        )
+        yield (
+            "-"
+            if not count.missing
+            else "all"
+            if count.missing == count.expected
+            else f"{count.missing:,}"
+        )

@@ -35,7 +35,13 @@ Li, Zhenguo and Luo, Ping},
   year = {2024},
   url = {https://arxiv.org/abs/2304.01168}
 }"""
-_SHORTCUTS: Final = {"length", "folder_right", "accident_frames", "normal_frames", "short"}  # keys of FACTS
+_SHORTCUTS: Final = {
+    "length",
+    "folder_right",
+    "accident_frames",
+    "normal_frames",
+    "short",
+}  # keys of FACTS
 # property → its paragraphs
 _RAI: Final = {
     "rai:dataCollection": """
@@ -104,7 +110,10 @@ _FILES: Final[Mapping[str, tuple[str, str, str]]] = {
         "Where an agent and its sensors are: a pickle, which can run any code.",
     ),
     "meta": ("type*/meta/*.txt", _TEXT, "How a scenario was set up, and how it ended."),
-    **{name: (f"type*/*/{name}/*/*.jpg", "image/jpeg", "Images of this camera.") for name in CAMERAS},
+    **{
+        name: (f"type*/*/{name}/*/*.jpg", "image/jpeg", "Images of this camera.")
+        for name in CAMERAS
+    },
     LIDAR: (
         f"type*/*/{LIDAR}/*/*.npz",
         _BINARY,
@@ -120,7 +129,10 @@ _FILES: Final[Mapping[str, tuple[str, str, str]]] = {
 _OF_SPLIT: Final = {
     "name": ("sc:Text", "Of the split; unknown where neither lists nor folders say it."),
     "url": ("sc:URL", "Croissant's name of it."),
-    **{name: ("sc:Integer", f"{name} of it here.") for name in ("scenarios", "frames", "samples", "annotations")},
+    **{
+        name: ("sc:Integer", f"{name} of it here.")
+        for name in ("scenarios", "frames", "samples", "annotations")
+    },
 }
 _OF_COUNT: Final = {
     "table": ("sc:Text", "What the value is of."),
@@ -129,11 +141,36 @@ _OF_COUNT: Final = {
     **{group: ("sc:Integer", f"How many: {group}.") for group in GROUPS},
 }
 _OF_PATH: Final = {
-    "scenario_type": ("sc:Text", "Such as type1_subtype1_accident.", "fullpath", r"(?:.*/)?([^/]+)/[^/]+/label/"),
-    "scenario": ("sc:Text", "Its name, which occurs under several types.", "fullpath", r".*/label/([^/]+)/"),
-    "agent": ("sc:Text", f"Who recorded: {', '.join(AGENTS)}.", "fullpath", r"(?:.*/)?([^/]+)/label/"),
-    "frame": ("sc:Integer", "From 1, at 10 Hz: 0.1 s · (frame − 1) since the first.", "fullpath", r".*_(\d+)\.txt"),
-    "accident": ("sc:Text", "What was designed: accident or normal.", "fullpath", r".*_(accident|normal)/"),
+    "scenario_type": (
+        "sc:Text",
+        "Such as type1_subtype1_accident.",
+        "fullpath",
+        r"(?:.*/)?([^/]+)/[^/]+/label/",
+    ),
+    "scenario": (
+        "sc:Text",
+        "Its name, which occurs under several types.",
+        "fullpath",
+        r".*/label/([^/]+)/",
+    ),
+    "agent": (
+        "sc:Text",
+        f"Who recorded: {', '.join(AGENTS)}.",
+        "fullpath",
+        r"(?:.*/)?([^/]+)/label/",
+    ),
+    "frame": (
+        "sc:Integer",
+        "From 1, at 10 Hz: 0.1 s · (frame − 1) since the first.",
+        "fullpath",
+        r".*_(\d+)\.txt",
+    ),
+    "accident": (
+        "sc:Text",
+        "What was designed: accident or normal.",
+        "fullpath",
+        r".*_(accident|normal)/",
+    ),
 }
 _OF_LINE: Final = (
     ("sc:Text", f"Class: {', '.join(CATEGORIES)}."),
@@ -142,8 +179,14 @@ _OF_LINE: Final = (
     ("sc:Float", "Centre of the box (not its bottom), up from the LiDAR. m, LiDAR frame."),
     *(("sc:Float", f"Full {size} of the box. m.") for size in ("length", "width", "height")),
     ("sc:Float", "Heading about z, clockwise seen from above. rad, LiDAR frame."),
-    *(("sc:Float", f"Velocity in {axis}: the world's, turned once more by yaw. m/s; may be NaN.") for axis in "xy"),
-    ("sc:Integer", "Actor, the same for all agents and frames; −100 the agent, −1 untracked, from 20000 on parked."),
+    *(
+        ("sc:Float", f"Velocity in {axis}: the world's, turned once more by yaw. m/s; may be NaN.")
+        for axis in "xy"
+    ),
+    (
+        "sc:Integer",
+        "Actor, the same for all agents and frames; −100 the agent, −1 untracked, from 20000 on parked.",
+    ),
     ("sc:Integer", "Points of this agent's LiDAR in the box."),
     ("sc:Boolean", "Whether any of this agent's six cameras sees it."),
 )
@@ -166,13 +209,21 @@ def data_card(dataset: Dataset, *, licence: str | None = None) -> JsonLd:
         ChoiceError: `licence` is blank.
     """
     if dataset.layout not in ("A", "B", "A+B"):
-        raise NotAvailableError(f"{dataset.dataroot}: is no release of DeepAccident; only such have a data card here")
+        raise NotAvailableError(
+            f"{dataset.dataroot}: is no release of DeepAccident; only such have a data card here"
+        )
     if licence is not None and not licence.strip():
         raise ChoiceError(f"licence: expected a text such as a URL, found {licence!r}")
     seen, found = overview(dataset), dataset_statistics(dataset)
-    told = {name: [" ".join(each.split()) for each in text.split("\n\n")] for name, text in _RAI.items()}
-    told["rai:dataLimitations"] += [f"{code.meaning[:-1]}: {code.known}." for code in CODES.values() if code.known]
-    told["rai:dataBiases"] += [f"{each.name}: {each.texts()[2]}" for each in FACTS if each.key in _SHORTCUTS]
+    told = {
+        name: [" ".join(each.split()) for each in text.split("\n\n")] for name, text in _RAI.items()
+    }
+    told["rai:dataLimitations"] += [
+        f"{code.meaning[:-1]}: {code.known}." for code in CODES.values() if code.known
+    ]
+    told["rai:dataBiases"] += [
+        f"{each.name}: {each.texts()[2]}" for each in FACTS if each.key in _SHORTCUTS
+    ]
     text = (
         "Accidents and normal traffic at junctions in the simulator CARLA, seen by up to five agents that can "
         f"cooperate. Here are {found.scenarios[TOTAL]} scenarios, of which "
@@ -185,11 +236,20 @@ def data_card(dataset: Dataset, *, licence: str | None = None) -> JsonLd:
         "@type": "sc:Dataset",
         "name": "DeepAccident" + dataset.version.removeprefix("v1"),
         "description": text,
-        "conformsTo": ["http://mlcommons.org/croissant/1.0", "http://mlcommons.org/croissant/RAI/1.0"],
+        "conformsTo": [
+            "http://mlcommons.org/croissant/1.0",
+            "http://mlcommons.org/croissant/RAI/1.0",
+        ],
         **({"license": licence} if licence else {}),
         "citeAs": _CITATION,
         "datePublished": "2024",
-        "keywords": ["autonomous driving", "V2X", "accident prediction", "motion prediction", "CARLA"],
+        "keywords": [
+            "autonomous driving",
+            "V2X",
+            "accident prediction",
+            "motion prediction",
+            "CARLA",
+        ],
         "url": "https://deepaccident.github.io/",
         "version": dataset.version.replace("v1", "1.0.0"),
         **{name: texts if len(texts) > 1 else texts[0] for name, texts in told.items()},
@@ -204,10 +264,16 @@ def data_card(dataset: Dataset, *, licence: str | None = None) -> JsonLd:
 def _distribution(dataset: Dataset, seen: Overview) -> list[JsonLd]:
     """A file set for each kind of file that is here."""
     folders = sorted({f"{each['folder']}/".lstrip("/") for each in dataset.scenario[:]})
-    here = {name: f" {number:,} of {seen.samples:,} are here." for name, number in seen.files.items()}
+    here = {
+        name: f" {number:,} of {seen.samples:,} are here." for name, number in seen.files.items()
+    }
     sets = [
         _node(
-            "FileSet", name, text + here.get(name, ""), encodingFormat=form, includes=[each + place for each in folders]
+            "FileSet",
+            name,
+            text + here.get(name, ""),
+            encodingFormat=form,
+            includes=[each + place for each in folders],
         )
         for name, (place, form, text) in _FILES.items()
         if seen.files.get(name, 1)
@@ -224,7 +290,11 @@ def _splits(found: DatasetStatistics) -> JsonLd:
     boxes = {group: found.counts["annotations"].total(group) for group in GROUPS}
     urls = {"train": "cr:TrainingSplit", "val": "cr:ValidationSplit", "test": "cr:TestSplit"}
     rows = [
-        (split, urls.get(split), *(each[split] for each in (found.scenarios, found.frames, found.samples, boxes)))
+        (
+            split,
+            urls.get(split),
+            *(each[split] for each in (found.scenarios, found.frames, found.samples, boxes)),
+        )
         for split in (*SPLITS, UNKNOWN_SPLIT)
         if split in SPLITS or found.scenarios[split]
     ]
@@ -235,10 +305,15 @@ def _splits(found: DatasetStatistics) -> JsonLd:
 def _counts(dataset: Dataset, found: DatasetStatistics) -> JsonLd:
     splits = {each["token"]: each["split"] or UNKNOWN_SPLIT for each in dataset.scenario[:]}
     recorded = Counter(
-        (each["name"], of) for each in dataset.agent[:] for of in (TOTAL, splits[each["scenario_token"]])
+        (each["name"], of)
+        for each in dataset.agent[:]
+        for of in (TOTAL, splits[each["scenario_token"]])
     )
     tables: dict[str, tuple[str, Mapping[str, Mapping[str, int]]]] = {
-        "agents": ("scenarios", {name: {group: recorded[name, group] for group in GROUPS} for name in AGENTS}),
+        "agents": (
+            "scenarios",
+            {name: {group: recorded[name, group] for group in GROUPS} for name in AGENTS},
+        ),
         **{each.name: (each.counted, each.counts) for each in found.counts.values()},
     }
     rows = [
@@ -247,7 +322,12 @@ def _counts(dataset: Dataset, found: DatasetStatistics) -> JsonLd:
         for value, numbers in counts.items()
         if numbers[TOTAL]
     ]
-    return _records("counts", "What is here, by split; `deepaccident info --statistics` has more.", _OF_COUNT, rows)
+    return _records(
+        "counts",
+        "What is here, by split; `deepaccident info --statistics` has more.",
+        _OF_COUNT,
+        rows,
+    )
 
 
 def _of_labels(dataset: Dataset) -> list[JsonLd]:
@@ -256,7 +336,11 @@ def _of_labels(dataset: Dataset) -> list[JsonLd]:
     if all(each["folder"] in SPLITS for each in dataset.scenario[:]):
         of_path["split"] = ("sc:Text", "By the folder.", "fullpath", f"({'|'.join(SPLITS)})/")
     of_line = {
-        name: (*how, "lines", rf"(?:\S+ ){{{place}}}(\S+)(?: \S+){{{len(LABEL_FIELDS) - place - 1}}}$")
+        name: (
+            *how,
+            "lines",
+            rf"(?:\S+ ){{{place}}}(\S+)(?: \S+){{{len(LABEL_FIELDS) - place - 1}}}$",
+        )
         for place, (name, how) in enumerate(zip(LABEL_FIELDS, _OF_LINE, strict=True))
     }
     return [
@@ -278,13 +362,23 @@ def _of_labels(dataset: Dataset) -> list[JsonLd]:
 
 
 def _records(
-    name: str, text: str, fields: Mapping[str, tuple[str, ...]], rows: Iterable[tuple[Any, ...]] = (), files: str = ""
+    name: str,
+    text: str,
+    fields: Mapping[str, tuple[str, ...]],
+    rows: Iterable[tuple[Any, ...]] = (),
+    files: str = "",
 ) -> JsonLd:
     """A record set that holds rows of its fields, or whose fields are read in files."""
     made = [
         _node("Field", f"{name}/{field}", meaning, dataType=kind)
         | (
-            {"source": {"fileSet": {"@id": files}, "extract": {"fileProperty": how[0]}, "transform": {"regex": how[1]}}}
+            {
+                "source": {
+                    "fileSet": {"@id": files},
+                    "extract": {"fileProperty": how[0]},
+                    "transform": {"regex": how[1]},
+                }
+            }
             if how
             else {}
         )
@@ -295,4 +389,10 @@ def _records(
 
 
 def _node(kind: str, name: str, text: str, **more: Any) -> JsonLd:
-    return {"@type": f"cr:{kind}", "@id": name, "name": name.rpartition("/")[2], "description": text, **more}
+    return {
+        "@type": f"cr:{kind}",
+        "@id": name,
+        "name": name.rpartition("/")[2],
+        "description": text,
+        **more,
+    }

@@ -43,7 +43,11 @@ def take_inventory(scenario: ScenarioFolder, scan: ScenarioScan) -> tuple[Invent
                 continue
             if odd:
                 names = ", ".join(odd[:3])
-                findings.append(make_finding("sensor-odd-name", scenario.token, str(folder), f"{len(odd)}: {names}"))
+                findings.append(
+                    make_finding(
+                        "sensor-odd-name", scenario.token, str(folder), f"{len(odd)}: {names}"
+                    )
+                )
             if found:
                 frames[agent, channel] = found
                 findings += _frame_findings(scenario, scan, agent, channel, found)
@@ -57,7 +61,9 @@ def absences(scenario: ScenarioFolder, scan: ScenarioScan) -> Iterator[Finding]:
     with_labels = [agent for agent in missing if scenario.kind_folder(agent, "label").is_dir()]
     for agent in with_labels:
         where = str(scenario.kind_folder(agent, "calib"))
-        yield make_finding("labels-without-calib", token, where, f"{agent} has labels, but no calib files")
+        yield make_finding(
+            "labels-without-calib", token, where, f"{agent} has labels, but no calib files"
+        )
     missing = [agent for agent in missing if agent not in with_labels]
     if missing:
         yield make_finding("agent-missing", token, token, f"has no {', '.join(missing)}")
@@ -66,7 +72,9 @@ def absences(scenario: ScenarioFolder, scan: ScenarioScan) -> Iterator[Finding]:
         code = "agent-unlabelled" if scan.labelled else "unlabelled"
         yield make_finding(code, token, token, f"no labels of {', '.join(unlabelled)}")
     if scan.labelled and not scan.has_meta:
-        yield make_finding("meta-missing", token, str(scenario.meta_path), "missing or not readable")
+        yield make_finding(
+            "meta-missing", token, str(scenario.meta_path), "missing or not readable"
+        )
 
 
 def _frame_findings(
@@ -119,7 +127,11 @@ def check_split_files(layout: ReleaseLayout) -> tuple[ReleaseLayout, list[Findin
 
 def _repeated(path: ReleasePath, tokens: list[str]) -> Iterator[Finding]:
     """Scenarios that a file lists more than once; reading takes them once."""
-    repeated = [shortened(token.replace("/", " ", 1)) for token, count in Counter(tokens).items() if count > 1]
+    repeated = [
+        shortened(token.replace("/", " ", 1))
+        for token, count in Counter(tokens).items()
+        if count > 1
+    ]
     if repeated:
         more = f" and {len(repeated) - _NAMED} more" if len(repeated) > _NAMED else ""
         what = f"lists more than once: {', '.join(repeated[:_NAMED])}{more}"
@@ -148,5 +160,9 @@ def _twins(splits: SplitAssignment) -> Iterator[Finding]:
         if token not in splits.problems and token not in splits.contradictions
     }
     for twins in torn_twins(known):
-        for (token, mine), (other, theirs) in permutations(zip(twins.scenarios, twins.splits, strict=True)):
-            yield make_finding("twins-apart", token, token, f"is of {mine}, its twin {other} of {theirs}")
+        for (token, mine), (other, theirs) in permutations(
+            zip(twins.scenarios, twins.splits, strict=True)
+        ):
+            yield make_finding(
+                "twins-apart", token, token, f"is of {mine}, its twin {other} of {theirs}"
+            )

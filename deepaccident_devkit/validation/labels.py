@@ -61,7 +61,9 @@ def _lone_words(subject: Subject) -> Iterator[Finding]:
                 continue
             _, word, ends = skipped[-1]
             if ends and any(name.startswith(word) for name in CATEGORIES):
-                yield subject.finding("label-cut", str(path), f"its last line is cut off after '{word}'")
+                yield subject.finding(
+                    "label-cut", str(path), f"its last line is cut off after '{word}'"
+                )
                 skipped.pop()
             if skipped:
                 number, word, _ = skipped[0]
@@ -82,26 +84,42 @@ def _ids(subject: Subject) -> Iterator[Finding]:
     label_id = subject.label_id
     odd = (label_id < UNTRACKED_ID) & (label_id != OWN_ACTOR_ID) | (label_id >= MOST_ACTOR_ID)
     yield from subject.label_findings("odd-id", odd, "ids that the format does not know")
-    repeated = _repeated(np.column_stack([subject.boxes.sample, label_id])) & (label_id != UNTRACKED_ID)
-    yield from subject.label_findings("duplicate-id", repeated & ~subject.own, "an id occurs twice in one label")
+    repeated = _repeated(np.column_stack([subject.boxes.sample, label_id])) & (
+        label_id != UNTRACKED_ID
+    )
+    yield from subject.label_findings(
+        "duplicate-id", repeated & ~subject.own, "an id occurs twice in one label"
+    )
 
 
 def _same_places(subject: Subject) -> Iterator[Finding]:
     labels, sample = subject.boxes.labels, subject.boxes.sample
-    pairs, doubled = near_pairs(labels.center, sample * len(CATEGORIES) + labels.category, _SAME_PLACE)
+    pairs, doubled = near_pairs(
+        labels.center, sample * len(CATEGORIES) + labels.category, _SAME_PLACE
+    )
     doubled[pairs.ravel()] = True
     yield from subject.label_findings("duplicate-box", doubled, "two boxes stand in the same place")
 
 
 def _sizes_and_points(subject: Subject) -> Iterator[Finding]:
     size = subject.boxes.labels.size
-    shortest, longest = np.array([LENGTHS[name] for name in CATEGORIES])[subject.boxes.labels.category].T
+    shortest, longest = np.array([LENGTHS[name] for name in CATEGORIES])[
+        subject.boxes.labels.category
+    ].T
     odd: BoolArray = np.any(size <= 0, axis=1) | np.any(size[:, 1:] > LARGEST_SIZE, axis=1)
-    unlike = (size[:, 0] < shortest) | (size[:, 0] > longest) | (_is_car(subject) & (size[:, 0] < size[:, 1]))
-    odd |= unlike & (subject.label_id != UNTRACKED_ID)  # real untracked rows have sizes of another class
+    unlike = (
+        (size[:, 0] < shortest)
+        | (size[:, 0] > longest)
+        | (_is_car(subject) & (size[:, 0] < size[:, 1]))
+    )
+    odd |= unlike & (
+        subject.label_id != UNTRACKED_ID
+    )  # real untracked rows have sizes of another class
     odd |= size[:, 0] > max(most for _, most in LENGTHS.values())
     yield from subject.label_findings("odd-size", odd, "sizes that their classes do not have")
-    yield from subject.label_findings("odd-points", subject.boxes.labels.num_lidar_pts < 0, "less than 0 LiDAR points")
+    yield from subject.label_findings(
+        "odd-points", subject.boxes.labels.num_lidar_pts < 0, "less than 0 LiDAR points"
+    )
     far: BoolArray = np.any(np.abs(subject.boxes.labels.center) > FURTHEST, axis=1)
     yield from subject.label_findings("odd-position", far, f"over {FURTHEST:.0f} m from the LiDAR")
     unknown: BoolArray = np.any(np.isnan(subject.boxes.labels.velocity), axis=1)
@@ -127,7 +145,9 @@ def _own_rows(subject: Subject) -> Iterator[Finding]:
 def _own_boxes(subject: Subject) -> Iterator[Finding]:
     rows = np.flatnonzero(subject.own)
     pose = subject.files.calibs.world_from_ego[subject.boxes.sample[rows]]
-    standing = pose[:, :3, 3] + pose[:, :3, 2] * subject.boxes.labels.size[rows, 2:] / 2  # on the road, upright
+    standing = (
+        pose[:, :3, 3] + pose[:, :3, 2] * subject.boxes.labels.size[rows, 2:] / 2
+    )  # on the road, upright
     turn = subject.yaw[rows] - np.arctan2(pose[:, 1, 0], pose[:, 0, 0])
     far = np.zeros(len(subject.own), dtype=bool)
     far[rows] = np.linalg.norm(subject.centers[rows] - standing, axis=1) > OWN_OFFSET
@@ -135,12 +155,18 @@ def _own_boxes(subject: Subject) -> Iterator[Finding]:
     what = f"the own box is turned, or over {OWN_OFFSET} m off standing on the agent's origin"
     yield from subject.label_findings("own-box-off", far, what)
     first_line = np.full((subject.files.num_samples, 2), np.nan)
-    labelled = np.repeat([agent in subject.files.scan.labelled for agent in subject.agents], subject.num_frames)
+    labelled = np.repeat(
+        [agent in subject.files.scan.labelled for agent in subject.agents], subject.num_frames
+    )
     first_line[labelled] = subject.files.labels.agent_velocity
     differs = np.zeros(len(subject.own), dtype=bool)
-    difference = np.abs(subject.boxes.labels.velocity[rows] - first_line[subject.boxes.sample[rows]]).max(axis=1)
+    difference = np.abs(
+        subject.boxes.labels.velocity[rows] - first_line[subject.boxes.sample[rows]]
+    ).max(axis=1)
     differs[rows] = difference > OWN_VELOCITY
-    yield from subject.label_findings("own-velocity", differs, "the agent's own velocity differs from the first line")
+    yield from subject.label_findings(
+        "own-velocity", differs, "the agent's own velocity differs from the first line"
+    )
 
 
 def _tracks(subject: Subject) -> Iterator[Finding]:
@@ -152,24 +178,35 @@ def _tracks(subject: Subject) -> Iterator[Finding]:
     same = (subject.label_id[rows][1:] == subject.label_id[rows][:-1]) & (
         boxes.agent[rows][1:] == boxes.agent[rows][:-1]
     )
-    allowed = np.where(boxes.labels.category == CATEGORIES.index("pedestrian"), WALKER_SIZE_CHANGE, SIZE_CHANGE)
+    allowed = np.where(
+        boxes.labels.category == CATEGORIES.index("pedestrian"), WALKER_SIZE_CHANGE, SIZE_CHANGE
+    )
     for code, changed in (
         ("class-changes", boxes.labels.category[rows][1:] != boxes.labels.category[rows][:-1]),
-        ("size-changes", np.abs(np.diff(boxes.labels.size[rows], axis=0)).max(axis=1) > allowed[rows[1:]]),
+        (
+            "size-changes",
+            np.abs(np.diff(boxes.labels.size[rows], axis=0)).max(axis=1) > allowed[rows[1:]],
+        ),
     ):
-        yield from subject.label_findings(code, subject.mask(rows[1:][same & changed]), "changes along the track")
+        yield from subject.label_findings(
+            code, subject.mask(rows[1:][same & changed]), "changes along the track"
+        )
     step = np.diff(frame)
     three = same[1:] & same[:-1] & (step[1:] == 1) & (step[:-1] == 1)
     bend = np.linalg.norm(_second_difference(subject.centers[rows]), axis=1) / 2
     free = ~(subject.in_collision[rows[1:-1]] & (frame[2:] > subject.num_frames - LAST_FRAMES))
     jumps = three & (bend > JUMP) & free
     yield from subject.label_findings(
-        "track-jump", subject.mask(rows[1:-1][jumps]), f"over {JUMP} m off the middle of the frames around"
+        "track-jump",
+        subject.mask(rows[1:-1][jumps]),
+        f"over {JUMP} m off the middle of the frames around",
     )
     yaw = subject.yaw[rows]
     steps = np.abs(np.arctan2(np.sin(np.diff(yaw)), np.cos(np.diff(yaw))))
     turns = three & free & _is_car(subject)[rows[1:-1]] & (steps[1:] > TURN) & (steps[:-1] > TURN)
-    yield from subject.label_findings("track-turn", subject.mask(rows[1:-1][turns]), "turned to and fro")
+    yield from subject.label_findings(
+        "track-turn", subject.mask(rows[1:-1][turns]), "turned to and fro"
+    )
     near = np.linalg.norm(boxes.labels.center[rows, :2], axis=1) < subject.reach[boxes.agent[rows]]
     gap = np.flatnonzero(same & (step > 1) & near[1:] & near[:-1])
     before, after = rows[gap], rows[gap + 1]
@@ -189,7 +226,11 @@ def _is_car(subject: Subject) -> BoolArray:
 
 
 def _second_difference(values: FloatArray) -> FloatArray:
-    return values[2:] - 2 * values[1:-1] + values[:-2] if len(values) > 2 else np.zeros((0, values.shape[1]))
+    return (
+        values[2:] - 2 * values[1:-1] + values[:-2]
+        if len(values) > 2
+        else np.zeros((0, values.shape[1]))
+    )
 
 
 def _repeated(keys: AnyArray) -> BoolArray:

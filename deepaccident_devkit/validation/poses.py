@@ -67,10 +67,17 @@ def _intrinsics(subject: Subject, agent: int) -> Iterator[Finding]:
     pinhole: BoolArray = np.asarray((focal > 0).all(axis=-1) & (rest < 1e-6).all(axis=-1))
     ratio = focal[..., 0] / np.where(intrinsic[..., 0, 2] > 0, intrinsic[..., 0, 2], np.nan)
     expected = 1 / np.tan(np.radians([CAMERA_FIELD[camera] for camera in CAMERAS]) / 2)
-    square = np.abs(focal[..., 1] / np.where(focal[..., 0] > 0, focal[..., 0], np.nan) - 1) < _FIELD_TOLERANCE
+    square = (
+        np.abs(focal[..., 1] / np.where(focal[..., 0] > 0, focal[..., 0], np.nan) - 1)
+        < _FIELD_TOLERANCE
+    )
     odd = pinhole & ~((np.abs(ratio / expected - 1) < _FIELD_TOLERANCE) & square)
-    yield from _camera_findings(subject, agent, "intrinsic-form", ~pinhole, "is no pinhole camera's K")
-    yield from _camera_findings(subject, agent, "intrinsic-odd", odd, "its f does not fit its field of view")
+    yield from _camera_findings(
+        subject, agent, "intrinsic-form", ~pinhole, "is no pinhole camera's K"
+    )
+    yield from _camera_findings(
+        subject, agent, "intrinsic-odd", odd, "its f does not fit its field of view"
+    )
 
 
 def _cameras(subject: Subject, agent: int) -> Iterator[Finding]:
@@ -82,13 +89,19 @@ def _cameras(subject: Subject, agent: int) -> Iterator[Finding]:
     height = position[..., 2]
     far = np.linalg.norm(position, axis=-1) > _FURTHEST_CAMERA
     if not subject.is_pole(agent):  # a pole's may look down
-        far |= (np.abs(pose[..., 0, 2]) > _TILT) | (np.abs(forward[..., 2]) > _TILT)  # rolled or pitched
+        far |= (np.abs(pose[..., 0, 2]) > _TILT) | (
+            np.abs(forward[..., 2]) > _TILT
+        )  # rolled or pitched
     far |= np.abs(height - np.median(height, axis=-1, keepdims=True)) > _CAMERA_HEIGHTS
     bad: BoolArray = (off > _YAW_TOLERANCE) | far
-    yield from _camera_findings(subject, agent, "camera-misplaced", bad, "looks another way, or is far from the LiDAR")
+    yield from _camera_findings(
+        subject, agent, "camera-misplaced", bad, "looks another way, or is far from the LiDAR"
+    )
 
 
-def _camera_findings(subject: Subject, agent: int, code: str, bad: BoolArray, what: str) -> Iterator[Finding]:
+def _camera_findings(
+    subject: Subject, agent: int, code: str, bad: BoolArray, what: str
+) -> Iterator[Finding]:
     """A finding a camera for a mask (F, 6)."""
     for camera, frames in zip(CAMERAS, bad.T, strict=True):
         if frames.any():
@@ -108,9 +121,14 @@ def _mounts(subject: Subject, agent: int) -> Iterator[Finding]:
         expected = "expected {} to {} m above the road".format(*_LIDAR_HEIGHTS)
     if odd.any():
         yield subject.finding(
-            "lidar-height", subject.calib_where(agent), f"{expected}, {frames_text(np.flatnonzero(odd) + 1)}"
+            "lidar-height",
+            subject.calib_where(agent),
+            f"{expected}, {frames_text(np.flatnonzero(odd) + 1)}",
         )
-    for name, pose in {"lidar_to_ego": lidar, "lidar_to_Camera": calibs.camera_from_lidar[frames]}.items():
+    for name, pose in {
+        "lidar_to_ego": lidar,
+        "lidar_to_Camera": calibs.camera_from_lidar[frames],
+    }.items():
         change = np.abs(pose - np.median(pose, axis=0))
         moved = change[..., :3, 3].reshape(len(pose), -1).max(axis=1)
         turned = change[..., :3, :3].reshape(len(pose), -1).max(axis=1)
@@ -118,7 +136,9 @@ def _mounts(subject: Subject, agent: int) -> Iterator[Finding]:
         if off.any():
             what = f"{name} changes by up to {1000 * moved.max():.0f} mm and {turned.max():.2g} in its rotation"
             yield subject.finding(
-                "calib-changes", subject.calib_where(agent), f"{what}, {frames_text(np.flatnonzero(off) + 1)}"
+                "calib-changes",
+                subject.calib_where(agent),
+                f"{what}, {frames_text(np.flatnonzero(off) + 1)}",
             )
     intrinsic = calibs.intrinsic[frames]
     if (np.abs(intrinsic - intrinsic[0]) > 1.0).any():
@@ -142,7 +162,9 @@ def _path(subject: Subject, agent: int) -> Iterator[Finding]:
     jumps = np.flatnonzero(bend > _JUMP) + 2
     jumps = jumps[jumps <= subject.num_frames - 1 - _LAST_FRAMES]
     if len(jumps):
-        yield subject.finding("pose-jump", where, f"over {_JUMP} m off the frames around at {frames_text(jumps)}")
+        yield subject.finding(
+            "pose-jump", where, f"over {_JUMP} m off the frames around at {frames_text(jumps)}"
+        )
 
 
 def _speed(subject: Subject, agent: int) -> Iterator[Finding]:
@@ -154,7 +176,9 @@ def _speed(subject: Subject, agent: int) -> Iterator[Finding]:
     said = subject.files.labels.agent_velocity[start : start + subject.num_frames]
     moved = _central(subject.positions[agent, :, :2])
     least, share = _SPEED_DIFFERENCE
-    off = ~(np.linalg.norm(said - moved, axis=1) <= least + share * np.linalg.norm(moved, axis=1))  # NaN is off too
+    off = ~(
+        np.linalg.norm(said - moved, axis=1) <= least + share * np.linalg.norm(moved, axis=1)
+    )  # NaN is off too
     off[max(subject.num_frames // 2, subject.num_frames - _LAST_FRAMES) :] = False
     if off.any():
         what = f"the first line is over {least:.0f} m/s off the displacement, {frames_text(np.flatnonzero(off) + 1)}"
@@ -168,7 +192,13 @@ def _central(position: FloatArray) -> FloatArray:
     return np.asarray(np.gradient(position, FRAME_PERIOD, axis=0))
 
 
-_CHECKS: tuple[Callable[[Subject, int], Iterator[Finding]], ...] = (_intrinsics, _cameras, _mounts, _path, _speed)
+_CHECKS: tuple[Callable[[Subject, int], Iterator[Finding]], ...] = (
+    _intrinsics,
+    _cameras,
+    _mounts,
+    _path,
+    _speed,
+)
 
 
 def check_velocities(subject: Subject, fit: VelocityFit) -> Iterator[Finding]:
@@ -189,7 +219,9 @@ def _actors_off(subject: Subject, frame: str) -> Iterator[Finding]:
     """The tracks most of whose velocities do not fit the frame that fits the rest."""
     rows, fits = velocities_that_fit(subject.boxes, subject.velocity)
     tracks, track = np.unique(
-        np.column_stack([subject.boxes.agent[rows], subject.label_id[rows]]), axis=0, return_inverse=True
+        np.column_stack([subject.boxes.agent[rows], subject.label_id[rows]]),
+        axis=0,
+        return_inverse=True,
     )
     track = track.reshape(-1)
     count = np.bincount(track, minlength=len(tracks))
@@ -197,17 +229,23 @@ def _actors_off(subject: Subject, frame: str) -> Iterator[Finding]:
     least, share = _ACTOR_OFF
     off = (wrong >= least) & (wrong >= share * count)
     wrong_rows = subject.mask(rows[off[track] & ~fits[frame]])
-    yield from subject.label_findings("velocity-off", wrong_rows, "velocities do not fit the displacement")
+    yield from subject.label_findings(
+        "velocity-off", wrong_rows, "velocities do not fit the displacement"
+    )
 
 
 def check_untracked(subject: Subject) -> Iterator[Finding]:
     """Say which labels, or all labels of which agents, lost their ids."""
     agents, frames = len(subject.agents), subject.num_frames
     untracked = subject.label_id == UNTRACKED_ID
-    tracked = np.bincount(subject.boxes.sample[subject.seen], minlength=agents * frames).reshape(agents, frames)
+    tracked = np.bincount(subject.boxes.sample[subject.seen], minlength=agents * frames).reshape(
+        agents, frames
+    )
     rows = np.flatnonzero(untracked & (tracked == 0)[subject.boxes.agent, subject.boxes.frame - 1])
     rows = rows[_trackable(subject, rows)]
-    shown = np.bincount(subject.boxes.sample[rows], minlength=agents * frames).reshape(agents, frames)
+    shown = np.bincount(subject.boxes.sample[rows], minlength=agents * frames).reshape(
+        agents, frames
+    )
     for agent in range(agents):
         lost = np.flatnonzero(shown[agent] >= _LEAST_BOXES) + 1
         if not tracked[agent].any() and shown[agent].sum() >= _LEAST_BOXES:
@@ -222,7 +260,9 @@ def _trackable(subject: Subject, rows: IntArray) -> BoolArray:
     """Which untracked boxes (M,) of what their agent saw are near vehicles, or tracked by an agent no nearer."""
     labels, boxes = subject.boxes.labels, subject.boxes
     distance = np.linalg.norm(labels.center[:, :2], axis=1)
-    found: BoolArray = np.isin(labels.category[rows], _VEHICLES) & (distance[rows] < _TRACKING_RADIUS)
+    found: BoolArray = np.isin(labels.category[rows], _VEHICLES) & (
+        distance[rows] < _TRACKING_RADIUS
+    )
     others = np.flatnonzero(subject.seen)
     if len(rows) and len(others):
         both = np.concatenate([rows, others])

@@ -22,7 +22,15 @@ from deepaccident_devkit.support.arrays import AnyArray, BoolArray, ByteArray, F
 from deepaccident_devkit.support.reading import FileKind, read_bytes
 from deepaccident_devkit.tables import Finding
 from deepaccident_devkit.tables.scan import finding_of
-from deepaccident_devkit.taxonomy import BEV_CAMERA, BEV_RESOLUTION, BEV_SHAPE, CAMERAS, CATEGORIES, LIDAR, OWN_ACTOR_ID
+from deepaccident_devkit.taxonomy import (
+    BEV_CAMERA,
+    BEV_RESOLUTION,
+    BEV_SHAPE,
+    CAMERAS,
+    CATEGORIES,
+    LIDAR,
+    OWN_ACTOR_ID,
+)
 from deepaccident_devkit.validation.inventory import Inventory
 from deepaccident_devkit.validation.subject import MOST_BOXES, Subject, frames_text
 
@@ -85,7 +93,10 @@ def zero_stretch(content: bytes) -> tuple[int, int] | None:
     nothing is said.
     """
     start, stop = _last_scan(content)
-    if content.find(_USUAL_CODES, 0, start) < 0 or (zeros := content.find(bytes(ZEROS), start, stop)) < 0:
+    if (
+        content.find(_USUAL_CODES, 0, start) < 0
+        or (zeros := content.find(bytes(ZEROS), start, stop)) < 0
+    ):
         return None
     data = content[zeros:stop]
     return zeros, len(data) - len(data.lstrip(b"\0"))
@@ -100,7 +111,9 @@ def ends_early(content: bytes, image: ByteArray) -> bool:
     if not least < image[-1, -1] @ _SHARES < most:
         return False
     start, stop = _last_scan(content)
-    longer = content[:stop].rstrip(b"\xff") + _MORE + content[stop:]  # a last 0xff would make a marker of what follows
+    longer = (
+        content[:stop].rstrip(b"\xff") + _MORE + content[stop:]
+    )  # a last 0xff would make a marker of what follows
     return start > 0 and not np.array_equal(_decoded(longer), image)
 
 
@@ -136,7 +149,9 @@ def check_sensors(subject: Subject, inventory: Inventory) -> Iterator[Finding]:
     checksums: dict[str, list[tuple[str, str, int]]] = defaultdict(list)
     for (agent, channel), frames in inventory.items():
         usable = [frame for frame in frames if frame <= subject.num_frames]
-        paths = {frame: subject.files.scenario.channel_path(agent, channel, frame) for frame in usable}
+        paths = {
+            frame: subject.files.scenario.channel_path(agent, channel, frame) for frame in usable
+        }
         row = subject.agents.index(agent)
         telling: list[int] = []
         if channel in CAMERAS:
@@ -147,7 +162,9 @@ def check_sensors(subject: Subject, inventory: Inventory) -> Iterator[Finding]:
             yield from _bevs(subject, row, paths, telling)
         for frame in telling:
             content = read_bytes(paths[frame], _KINDS.get(channel, "image"))
-            checksums[hashlib.blake2b(content, digest_size=16).hexdigest()].append((agent, channel, frame))
+            checksums[hashlib.blake2b(content, digest_size=16).hexdigest()].append(
+                (agent, channel, frame)
+            )
     yield from _repeated(subject, checksums)
 
 
@@ -170,9 +187,15 @@ def _images(
             yield subject.finding("sensor-unreadable", str(path), what)
             continue
         sizes[frame] = (image.shape[1], image.shape[0])
-        thumbnails[frame] = cv2.resize(image, _THUMBNAIL, interpolation=cv2.INTER_AREA).astype(np.float64)
+        thumbnails[frame] = cv2.resize(image, _THUMBNAIL, interpolation=cv2.INTER_AREA).astype(
+            np.float64
+        )
     yield from _image_sizes(subject, agent, channel, sizes)
-    telling += [frame for frame, picture in thumbnails.items() if np.ptp(picture, axis=(0, 1)).max() >= _BLANK]
+    telling += [
+        frame
+        for frame, picture in thumbnails.items()
+        if np.ptp(picture, axis=(0, 1)).max() >= _BLANK
+    ]
     odd = out_of_sequence(thumbnails)
     if subject.num_frames in odd and _collides(subject, agent):
         odd.remove(subject.num_frames)  # at the impact another car may fill the view at once
@@ -186,7 +209,11 @@ def _lost_part(content: bytes, image: ByteArray) -> str | None:
     """What shows that a part of a picture is lost, though it can be decoded."""
     if (zeros := zero_stretch(content)) is not None:
         return f"holds {zeros[1]} zero bytes in a row from byte {zeros[0]} on: part of the picture is lost"
-    return "its data end early: the rest of the picture is lost" if ends_early(content, image) else None
+    return (
+        "its data end early: the rest of the picture is lost"
+        if ends_early(content, image)
+        else None
+    )
 
 
 def _collides(subject: Subject, agent: int) -> bool:
@@ -195,7 +222,9 @@ def _collides(subject: Subject, agent: int) -> bool:
     return bool(subject.in_collision[own].any())
 
 
-def _image_sizes(subject: Subject, agent: int, channel: str, sizes: Mapping[int, tuple[int, int]]) -> Iterator[Finding]:
+def _image_sizes(
+    subject: Subject, agent: int, channel: str, sizes: Mapping[int, tuple[int, int]]
+) -> Iterator[Finding]:
     """Every image must be as large as its K says: twice the principal point."""
     camera = CAMERAS.index(channel)
     for frame, (width, height) in sizes.items():
@@ -240,7 +269,9 @@ def _distance(first: FloatArray, second: FloatArray) -> FloatArray:
     return np.asarray(np.abs(first - second).mean(axis=(1, 2, 3)))
 
 
-def _clouds(subject: Subject, agent: int, paths: Mapping[int, ReleasePath], telling: list[int]) -> Iterator[Finding]:
+def _clouds(
+    subject: Subject, agent: int, paths: Mapping[int, ReleasePath], telling: list[int]
+) -> Iterator[Finding]:
     """Decode an agent's point clouds; the frames that could be read go to `telling`."""
     odd, off = [], np.zeros((subject.num_frames + 1, 3), dtype=np.int64)
     for frame, path in paths.items():
@@ -294,10 +325,14 @@ def _many_off(off: IntArray, limit: tuple[int, float]) -> BoolArray:
 
 def _sample_boxes(subject: Subject, agent: int, frame: int) -> Boxes:
     """The boxes of one label in its LiDAR frame."""
-    return subject.lidar_boxes.select(np.flatnonzero(subject.boxes.sample == agent * subject.num_frames + frame - 1))
+    return subject.lidar_boxes.select(
+        np.flatnonzero(subject.boxes.sample == agent * subject.num_frames + frame - 1)
+    )
 
 
-def _bevs(subject: Subject, agent: int, paths: Mapping[int, ReleasePath], telling: list[int]) -> Iterator[Finding]:
+def _bevs(
+    subject: Subject, agent: int, paths: Mapping[int, ReleasePath], telling: list[int]
+) -> Iterator[Finding]:
     """Decode an agent's BEV arrays; the frames that could be read go to `telling`."""
     total = _BevHits()
     for frame, path in paths.items():
@@ -320,7 +355,9 @@ def _bevs(subject: Subject, agent: int, paths: Mapping[int, ReleasePath], tellin
     best = max(total.hits, key=lambda name: total.hits[name])
     if total.hits[best] > total.hits["forward-up"] + max(2, 0.25 * total.boxes) and total.boxes:
         shown = f"{total.hits[best]} of {total.boxes} vehicles are where the labels have them if it is '{best}'"
-        what = f"{shown} ({PICTURE_ORIENTATIONS[best]}), {total.hits['forward-up']} if forward is up"
+        what = (
+            f"{shown} ({PICTURE_ORIENTATIONS[best]}), {total.hits['forward-up']} if forward is up"
+        )
         yield subject.finding("bev-orientation", folder, what)
     elif total.poor_frames:
         what = f"fewer than half of the labels' vehicles are in the picture, {frames_text(total.poor_frames)}"
@@ -359,14 +396,18 @@ def _hits(semantic: ByteArray, places: FloatArray) -> BoolArray:
     return np.asarray(semantic[pixels[:, 0], pixels[:, 1]] == TAGS["vehicle"])
 
 
-def _repeated(subject: Subject, checksums: Mapping[str, Sequence[tuple[str, str, int]]]) -> Iterator[Finding]:
+def _repeated(
+    subject: Subject, checksums: Mapping[str, Sequence[tuple[str, str, int]]]
+) -> Iterator[Finding]:
     """Files with the same bytes; an agent that stands still may see the same again and again."""
     for places in checksums.values():
         if len(places) < 2 or _stood_still(subject, places):
             continue
         names = [f"{agent}/{channel}/{frame:03d}" for agent, channel, frame in places]
         more = f" and {len(names) - 4} more" if len(names) > 4 else ""
-        yield subject.finding("file-repeated", subject.token, f"the same bytes: {', '.join(names[:4])}{more}")
+        yield subject.finding(
+            "file-repeated", subject.token, f"the same bytes: {', '.join(names[:4])}{more}"
+        )
 
 
 def _stood_still(subject: Subject, places: Sequence[tuple[str, str, int]]) -> bool:

@@ -96,7 +96,12 @@ class Subject:
         """
         labels, agent = self.boxes.labels, self.boxes.agent
         distance = np.linalg.norm(labels.center[:, :2], axis=1)
-        hidden = self.seen & (labels.num_lidar_pts == 0) & ~labels.camera_visible & (distance < _SURE_REACH)
+        hidden = (
+            self.seen
+            & (labels.num_lidar_pts == 0)
+            & ~labels.camera_visible
+            & (distance < _SURE_REACH)
+        )
         furthest = np.zeros(len(self.agents))
         np.maximum.at(furthest, agent, distance)
         return np.asarray(np.minimum(_SURE_REACH, _SHARE_OF_FURTHEST * furthest) * hidden.any())
@@ -108,8 +113,14 @@ class Subject:
             return np.zeros(len(frames), dtype=bool)
         from scipy.spatial import cKDTree
 
-        tree = cKDTree(np.unique(tree_points(self.centers[rows], self.boxes.frame[rows], _UNTRACKED_PLACE), axis=0))
-        distance, _ = tree.query(tree_points(places, frames, _UNTRACKED_PLACE), distance_upper_bound=_UNTRACKED_PLACE)
+        tree = cKDTree(
+            np.unique(
+                tree_points(self.centers[rows], self.boxes.frame[rows], _UNTRACKED_PLACE), axis=0
+            )
+        )
+        distance, _ = tree.query(
+            tree_points(places, frames, _UNTRACKED_PLACE), distance_upper_bound=_UNTRACKED_PLACE
+        )
         return np.asarray(np.isfinite(distance))
 
     @cached_property
@@ -120,12 +131,16 @@ class Subject:
     @cached_property
     def velocity(self) -> FloatArray:
         """(N, 3) m/s from displacements, NaN where unknown."""
-        return displacement_velocities(self.centers, self.boxes.agent, self.label_id, self.boxes.frame)
+        return displacement_velocities(
+            self.centers, self.boxes.agent, self.label_id, self.boxes.frame
+        )
 
     @cached_property
     def positions(self) -> FloatArray:
         """(A, F, 3) of the agents, metres."""
-        return self.files.calibs.world_from_ego[:, :3, 3].reshape(len(self.agents), self.num_frames, 3)
+        return self.files.calibs.world_from_ego[:, :3, 3].reshape(
+            len(self.agents), self.num_frames, 3
+        )
 
     def is_pole(self, agent: int) -> bool:
         """Whether the agent of this row stands at the roadside."""
@@ -178,10 +193,14 @@ def near_pairs(places: FloatArray, moments: AnyArray, radius: float) -> tuple[In
     from scipy.spatial import cKDTree
 
     points = tree_points(places, moments, radius)
-    _, cell, count = np.unique(np.floor(points / radius), axis=0, return_inverse=True, return_counts=True)
+    _, cell, count = np.unique(
+        np.floor(points / radius), axis=0, return_inverse=True, return_counts=True
+    )
     crowded: BoolArray = count[cell.reshape(-1)] > _MOST_TOGETHER
     rows = np.flatnonzero(~crowded)
-    pairs: IntArray = rows[cKDTree(points[rows]).query_pairs(radius, output_type="ndarray")].reshape(-1, 2)
+    pairs: IntArray = rows[
+        cKDTree(points[rows]).query_pairs(radius, output_type="ndarray")
+    ].reshape(-1, 2)
     return pairs, crowded
 
 

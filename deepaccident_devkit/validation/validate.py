@@ -34,7 +34,13 @@ from deepaccident_devkit.support.text import counted
 from deepaccident_devkit.support.version import __version__
 from deepaccident_devkit.tables import SEVERITIES, Finding, Tables, current_index
 from deepaccident_devkit.tables.boxes import VelocityFit, fit_velocities, total_fit
-from deepaccident_devkit.tables.scan import SMALL_FILE_ENDINGS, finding_of, read_scenario, scan_scenario, times_digest
+from deepaccident_devkit.tables.scan import (
+    SMALL_FILE_ENDINGS,
+    finding_of,
+    read_scenario,
+    scan_scenario,
+    times_digest,
+)
 from deepaccident_devkit.tables.tables import token_of
 from deepaccident_devkit.taxonomy import CHANNELS, VELOCITY_FRAMES
 from deepaccident_devkit.validation.agreement import check_agreement, check_story
@@ -98,7 +104,13 @@ class ScenarioCheck:
 
 def check_key(scenario: ScenarioFolder, *, deep: bool) -> str:
     """A digest of all that decides a scenario's check: the devkit, settings, names, sizes and times of its files."""
-    settings = (__version__, deep, str(scenario.root), scenario.folder, os.environ.get(LIMITS_VARIABLE))
+    settings = (
+        __version__,
+        deep,
+        str(scenario.root),
+        scenario.folder,
+        os.environ.get(LIMITS_VARIABLE),
+    )
     times = times_digest(scenario, (*SMALL_FILE_ENDINGS, *CHANNELS), ctime=False)
     return hashlib.blake2b(f"{settings} {times}".encode(), digest_size=8).hexdigest()
 
@@ -155,10 +167,16 @@ class ValidationReport(CheckReport):
             whole: whether to list all that was found of a scenario.
         """
         most = sys.maxsize if whole else _LINES_A_SCENARIO
-        return "\n\n".join([self._head(), *self._scenario_blocks(most, notes=notes), *self._closing(notes=notes)])
+        return "\n\n".join(
+            [self._head(), *self._scenario_blocks(most, notes=notes), *self._closing(notes=notes)]
+        )
 
     def _head(self) -> str:
-        depth = "every file decoded" if self.deep else "labels, calib, meta and file names (--deep decodes the rest)"
+        depth = (
+            "every file decoded"
+            if self.deep
+            else "labels, calib, meta and file names (--deep decodes the rest)"
+        )
         return (
             f"DeepAccident {self.version} at {self.dataroot}\n"
             f"{counted(self.scenarios, 'scenario')}, {counted(self.samples, 'sample')}: {depth}"
@@ -171,7 +189,9 @@ class ValidationReport(CheckReport):
                 by_scenario.setdefault(finding.scenario, []).append(finding)
         for scenario, findings in by_scenario.items():
             counts = Counter(finding.severity for finding in findings)
-            head = ", ".join(counted(counts[severity], severity) for severity in SEVERITIES if counts[severity])
+            head = ", ".join(
+                counted(counts[severity], severity) for severity in SEVERITIES if counts[severity]
+            )
             lines = [f"{scenario or 'the release'}  ({head})"]
             lines += [_line(finding) for finding in findings[:most]]
             if len(findings) > most:
@@ -179,22 +199,33 @@ class ValidationReport(CheckReport):
             yield "\n".join(lines)
 
     def _closing(self, *, notes: bool) -> Iterator[str]:
-        by_code = Counter((finding.severity, finding.code, finding.known) for finding in self.findings)
+        by_code = Counter(
+            (finding.severity, finding.code, finding.known) for finding in self.findings
+        )
         if by_code:
             lines = (
                 f"{code:<24} {severity:<8} {count:>8}{'  known of the release' if known else ''}"
                 for severity in SEVERITIES
-                for (grade, code, known), count in sorted(by_code.items(), key=lambda item: (-item[1], item[0][1]))
+                for (grade, code, known), count in sorted(
+                    by_code.items(), key=lambda item: (-item[1], item[0][1])
+                )
                 if grade == severity
             )
             yield "\n".join([f"{'kind':<24} {'how bad':<8} {'findings':>8}", *lines])
         if self.velocity.boxes:
             shares = ", ".join(
-                f"{name} {count / self.velocity.boxes:.0%}" for name, count in self.velocity.fits.items()
+                f"{name} {count / self.velocity.boxes:.0%}"
+                for name, count in self.velocity.fits.items()
             )
-            best = VELOCITY_FRAMES[self.velocity.best] if self.velocity.best else "in none of the known frames"
+            best = (
+                VELOCITY_FRAMES[self.velocity.best]
+                if self.velocity.best
+                else "in none of the known frames"
+            )
             found = Counter(self.velocity_frames.values())
-            scenarios = ", ".join(f"{name or 'unknown'} in {count}" for name, count in found.most_common())
+            scenarios = ", ".join(
+                f"{name or 'unknown'} in {count}" for name, count in found.most_common()
+            )
             yield (
                 f"label velocities: {best}\n"
                 f"  scenarios: {scenarios}; of {self.velocity.boxes:,} moving boxes fit: {shares}"
@@ -273,7 +304,9 @@ class _Work:
         """Look at one scenario, unless that was done."""
         if self.store is None:
             return check_scenario(scenario, deep=self.deep)
-        key = check_key(scenario, deep=self.deep)  # before anything is read: a later edit is noticed
+        key = check_key(
+            scenario, deep=self.deep
+        )  # before anything is read: a later edit is noticed
         kept = self.store.kept(_name(scenario), key)
         if kept is not None:
             return ScenarioCheck.of_json(kept)
@@ -281,14 +314,19 @@ class _Work:
         self.store.keep(_name(scenario), key, check.to_json().encode())
         return check
 
-    def run(self, scenarios: Sequence[ScenarioFolder], **how: Unpack[Engine]) -> list[ScenarioCheck]:
+    def run(
+        self, scenarios: Sequence[ScenarioFolder], **how: Unpack[Engine]
+    ) -> list[ScenarioCheck]:
         """Look at all of them."""
         reads = tuple({place for scenario in scenarios for place in places_of(scenario.root)})
         label = "validating scenarios"
         if self.store is None:
             return run_batch(self, scenarios, label=label, places=Places(reads=reads), **how)
         with self.store.shared():
-            places, items = Places(reads=reads, writes=(self.store.folder,)), {_name(each): each for each in scenarios}
+            places, items = (
+                Places(reads=reads, writes=(self.store.folder,)),
+                {_name(each): each for each in scenarios},
+            )
             return list(self.store.run(self, items, label=label, places=places, **how).values())
 
 
@@ -307,7 +345,9 @@ def _report(
     """What was found in scenarios, and in the release as a whole."""
     readable, of_release = check_split_files(layout)
     tokens = {check.token for check in checks}
-    of_release = [finding for finding in of_release if finding.scenario is None or finding.scenario in tokens]
+    of_release = [
+        finding for finding in of_release if finding.scenario is None or finding.scenario in tokens
+    ]
     of_release += _strays(layout) if scenarios is None else ()
     of_release += _outdated(layout, checks)
     counts = ((check.token, check.files) for check in checks)
@@ -324,7 +364,9 @@ def _report(
         deep=deep,
         scenarios=len(checks),
         samples=sum(check.samples for check in checks),
-        findings=worst_first([*of_release, *(finding for check in checks for finding in check.findings)]),
+        findings=worst_first(
+            [*of_release, *(finding for check in checks for finding in check.findings)]
+        ),
         files=files,
         velocity=total_fit([check.velocity for check in checks]),
         velocity_frames={check.token: check.velocity.best for check in checks},
@@ -343,7 +385,9 @@ def findings(dataset: Dataset, scenario: RowArgument, *, deep: bool = False) -> 
         TokenError: the release has no such scenario.
     """
     token = token_of(scenario)
-    report = validate_release(dataset.dataroot, dataset.version, deep=deep, workers=1, scenarios=[token])
+    report = validate_release(
+        dataset.dataroot, dataset.version, deep=deep, workers=1, scenarios=[token]
+    )
     return [finding for finding in report.findings if finding.scenario == token]
 
 
@@ -357,7 +401,9 @@ def check_scenario(scenario: ScenarioFolder, *, deep: bool = False) -> ScenarioC
     scan = scan_scenario(scenario)
     inventory, of_files = take_inventory(scenario, scan)
     found = [*scan.problems, *absences(scenario, scan), *of_files]
-    files, faults = (None, []) if scan.problems or not scan.agents else read_scenario(scenario, scan)
+    files, faults = (
+        (None, []) if scan.problems or not scan.agents else read_scenario(scenario, scan)
+    )
     found += faults
     velocity = NO_FIT
     if files is not None:
@@ -403,8 +449,21 @@ def _strays(layout: ReleaseLayout) -> Iterator[Finding]:
         yield make_finding("calib-missing", None, str(folder / "*" / "calib" / name), what)
     for path, meant in left_aside(layout.root):
         if meant is None:
-            yield make_finding("link-leads-nowhere", None, str(path), "its end is not there, or is a folder above it")
+            yield make_finding(
+                "link-leads-nowhere",
+                None,
+                str(path),
+                "its end is not there, or is a folder above it",
+            )
         else:
-            yield make_finding("folder-left-aside", None, str(path), f"is not read; it looks like {meant}")
-    for path in Path(layout.root.store.place).rglob(_UNFINISHED) if isinstance(layout.root, StorePath) else ():
-        yield make_finding("archive-unfinished", None, str(path), "is not read; it looks like half a download")
+            yield make_finding(
+                "folder-left-aside", None, str(path), f"is not read; it looks like {meant}"
+            )
+    for path in (
+        Path(layout.root.store.place).rglob(_UNFINISHED)
+        if isinstance(layout.root, StorePath)
+        else ()
+    ):
+        yield make_finding(
+            "archive-unfinished", None, str(path), "is not read; it looks like half a download"
+        )

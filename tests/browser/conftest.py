@@ -15,7 +15,9 @@ if importlib.util.find_spec("selenium") is None:
     MISSING.append("selenium")
 if MISSING:
     if os.environ.get("DEEPACCIDENT_REQUIRE_BROWSER"):
-        raise pytest.UsageError(f"DEEPACCIDENT_REQUIRE_BROWSER is set, but there is no {', '.join(MISSING)}")
+        raise pytest.UsageError(
+            f"DEEPACCIDENT_REQUIRE_BROWSER is set, but there is no {', '.join(MISSING)}"
+        )
     collect_ignore_glob = ["test_*.py"]
 
 

@@ -50,7 +50,9 @@ class Pages(Browser):
 
     def shown(self) -> list[str]:
         """The tokens of the scenarios in the list."""
-        names = self.value("[...document.querySelectorAll('a.entry')].map((each) => decodeURIComponent(each.pathname))")
+        names = self.value(
+            "[...document.querySelectorAll('a.entry')].map((each) => decodeURIComponent(each.pathname))"
+        )
         return [name.strip("/").removeprefix("scenario/") for name in names]
 
     def tick(self, name: str, value: str) -> None:
@@ -84,7 +86,10 @@ def root(release_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     next(broken.iterdir()).write_bytes(b"no label\n")
     for folder in copy.glob("*/other_vehicle_behind/Camera_*"):
         shutil.rmtree(folder)
-    for path in (*kind.glob("*/Camera_*/*img*/*_00[12].jpg"), *kind.glob("*/Camera_*/*img*/*_00[45].jpg")):
+    for path in (
+        *kind.glob("*/Camera_*/*img*/*_00[12].jpg"),
+        *kind.glob("*/Camera_*/*img*/*_00[45].jpg"),
+    ):
         path.unlink()
     return copy
 
@@ -129,7 +134,10 @@ def test_the_token_leaves_the_address(browser: Browser, served: Served) -> None:
     browser.open(f"{served.origin}/", 1280)
     assert "printed" in browser.value("document.body.innerText")
     browser.open(served.url, 1280)
-    assert (browser.driver.current_url, "Scenarios" in browser.driver.title) == (f"{served.origin}/", True)
+    assert (browser.driver.current_url, "Scenarios" in browser.driver.title) == (
+        f"{served.origin}/",
+        True,
+    )
     assert served.token not in json.dumps(browser.driver.get_cookies())
 
 
@@ -144,7 +152,9 @@ def test_filters_and_the_back_button(pages: Pages, dataset: DeepAccident) -> Non
     pages.driver.back()
     pages.wait("location.search === '?collision=true'")
     wait_for(lambda: pages.shown() == collided)
-    pages.wait("[...document.images].length && [...document.images].every((each) => each.naturalWidth === 320)")
+    pages.wait(
+        "[...document.images].length && [...document.images].every((each) => each.naturalWidth === 320)"
+    )
 
 
 def test_a_query_tells_its_errors_in_place(pages: Pages, dataset: DeepAccident) -> None:
@@ -180,7 +190,9 @@ def test_the_keyboard_is_enough(pages: Pages, dataset: DeepAccident) -> None:
     assert pages.frame() == last - 1
 
 
-PARTS_THERE = "[...document.querySelectorAll('[data-part]')].every((each) => !each.querySelector('.waits'))"
+PARTS_THERE = (
+    "[...document.querySelectorAll('[data-part]')].every((each) => !each.querySelector('.waits'))"
+)
 
 
 def test_a_scenario_shows_all(pages: Pages, dataset: DeepAccident) -> None:
@@ -191,13 +203,19 @@ def test_a_scenario_shows_all(pages: Pages, dataset: DeepAccident) -> None:
     loaded = "[...document.querySelectorAll('#every img')].filter((each) => !each.hidden)"
     pages.wait(f"{loaded}.every((each) => each.complete && each.naturalWidth === 64)")
     grey = "[...document.querySelectorAll('#every .none')].filter((each) => !each.hidden).length"
-    assert (pages.value(f"{loaded}.length"), pages.value(grey)) == (24, 6)  # an agent's images were not downloaded
+    assert (pages.value(f"{loaded}.length"), pages.value(grey)) == (
+        24,
+        6,
+    )  # an agent's images were not downloaded
     drawn = "document.getElementById('ground').toDataURL()"
     before = pages.value(drawn)
     pages.click("#layer-points")
     pages.wait(f"{drawn} !== {json.dumps(before)}")
     pages.wait(PARTS_THERE)
-    assert pages.value("document.querySelector('[data-part$=story]').innerText") == dataset.describe(token).text
+    assert (
+        pages.value("document.querySelector('[data-part$=story]').innerText")
+        == dataset.describe(token).text
+    )
     pages.click("[data-part$=pairs] button")
     number = pages.value("document.querySelector('[data-part$=pairs] button').dataset.frame")
     assert pages.frame() == int(number) - 1
@@ -229,11 +247,18 @@ def test_an_address_says_what_is_looked_at(pages: Pages, dataset: DeepAccident) 
     pages.go_to(2)
     for button in ("#layer-trails", "#cloud-infrastructure", "#closer"):
         pages.click(button)
-    values = (("#large", "2"), ("#cards select", "back"), ("#scene", "space"), ("#points-by", "height"))
+    values = (
+        ("#large", "2"),
+        ("#cards select", "back"),
+        ("#scene", "space"),
+        ("#points-by", "height"),
+    )
     for select, value in values:
         control = f"document.querySelector('{select}')"
         pages.script(f"{control}.value = '{value}'; {control}.dispatchEvent(new Event('change'))")
-    pages.wait("['changed=', 'pictures=', 'view=', 'points-by='].every((each) => location.search.includes(each))")
+    pages.wait(
+        "['changed=', 'pictures=', 'view=', 'points-by='].every((each) => location.search.includes(each))"
+    )
     looks = """[...['scrubber', 'large', 'follow', 'scene', 'points-by'].map((id) => document.getElementById(id).value),
         [...document.querySelectorAll('#clouds input')].map((each) => each.checked),
         [...document.querySelectorAll('#layers input')].map((each) => each.checked),
@@ -249,12 +274,17 @@ def test_an_address_says_what_is_looked_at(pages: Pages, dataset: DeepAccident) 
 
 def test_a_twin_goes_in_step(pages: Pages, dataset: DeepAccident, explorer: Explorer) -> None:
     record, twin = next(
-        (each, twin_of(dataset, each)) for each in dataset.find(collision=True) if twin_of(dataset, each)
+        (each, twin_of(dataset, each))
+        for each in dataset.find(collision=True)
+        if twin_of(dataset, each)
     )
     pages.go(scenario_page(record["token"], "twin"))
     replays = "[...document.querySelectorAll('iframe')].map((each) => each.contentDocument)"
     pages.wait(f"{replays}.every((each) => each.querySelector('canvas[data-view]'))")
-    shift, last = int(pages.value("document.getElementById('twins').dataset.shift")), record["num_frames"] - 1
+    shift, last = (
+        int(pages.value("document.getElementById('twins').dataset.shift")),
+        record["num_frames"] - 1,
+    )
 
     def led(leader: int, frame: int) -> int:
         """The frame of the other replay after one has gone to a frame."""
@@ -278,7 +308,9 @@ def test_a_twin_goes_in_step(pages: Pages, dataset: DeepAccident, explorer: Expl
     for replay in (1, 0):
         before = views()
         np.testing.assert_allclose(before[0], before[1])
-        pages.script(f"document.querySelectorAll('iframe')[{replay}].contentDocument.getElementById('closer').click()")
+        pages.script(
+            f"document.querySelectorAll('iframe')[{replay}].contentDocument.getElementById('closer').click()"
+        )
         wait_for(lambda old=before: (views()[:, 2] > old[:, 2]).all())
     _, stays = of_both("Number(document.getElementById('scrubber').value)")
     pages.click("#step")
@@ -293,14 +325,21 @@ def test_hostile_names_are_text(pages: Pages, dataset: DeepAccident) -> None:
     pages.wait(PARTS_THERE)
     assert token in pages.value("document.body.innerText")
     pages.go(f"?q={quote('name=' + HOSTILE)}&view=table")
-    assert pages.value("[window.hit === undefined, document.querySelectorAll('img').length]") == [True, 0]
+    assert pages.value("[window.hit === undefined, document.querySelectorAll('img').length]") == [
+        True,
+        0,
+    ]
 
 
-def test_nothing_reaches_beyond_the_window(pages: Pages, dataset: DeepAccident, scheme: str) -> None:
+def test_nothing_reaches_beyond_the_window(
+    pages: Pages, dataset: DeepAccident, scheme: str
+) -> None:
     own = [scenario_page(accident(dataset), more) for more in ("", "twin", "moment/ego_vehicle/2")]
     for size, address in product(WIDTHS, ("", "?view=table", *own, "models/", "release/")):
         pages.go(address, size)
-        assert (pages.overflowing(), pages.complaints(), pages.scheme()) == ([], [], scheme), address
+        assert (pages.overflowing(), pages.complaints(), pages.scheme()) == ([], [], scheme), (
+            address
+        )
 
 
 @pytest.fixture(scope="module")
@@ -313,7 +352,9 @@ def judged(da_motion: DeepAccident, tmp_path_factory: pytest.TempPathFactory) ->
     save_run(run, folder / "second")
     stored_run(da_motion, EvaluationSetup(task="motion"), folder / "maps")
     explorer = Explorer(
-        da_motion, bundles=[folder / "first", folder / "second"], results=[folder / "maps" / "results.json"]
+        da_motion,
+        bundles=[folder / "first", folder / "second"],
+        results=[folder / "maps" / "results.json"],
     )
     explorer.begin()
     assert explorer.jobs.wait(120)
@@ -328,7 +369,9 @@ def test_a_models_samples_and_two_side_by_side(browser: Browser, judged: Served)
     pages.wait("document.querySelector('a.entry')")
     pages.go("model/first/samples")
     pages.click("a.entry")
-    pages.wait("document.images.length >= 1 && [...document.images].every((each) => each.naturalWidth > 300)")
+    pages.wait(
+        "document.images.length >= 1 && [...document.images].every((each) => each.naturalWidth > 300)"
+    )
     pages.go("compare/first/second/")
     pages.wait("document.querySelector('a.entry')")
     pages.click("a.entry")
@@ -361,10 +404,16 @@ def asked_for(browser: Browser) -> set[Path]:
 def wait_for_replay(browser: Browser) -> None:
     """Go into the frame, when its scripts have run."""
     browser.driver.switch_to.frame(browser.driver.find_element("css selector", "iframe"))
-    wait_for(lambda: browser.script("return document.getElementById('time').textContent.includes('frame 1')"))
+    wait_for(
+        lambda: browser.script(
+            "return document.getElementById('time').textContent.includes('frame 1')"
+        )
+    )
 
 
-def test_it_opens_and_plays_without_a_complaint(index: Path, da: DeepAccident, browser: Browser, scheme: str) -> None:
+def test_it_opens_and_plays_without_a_complaint(
+    index: Path, da: DeepAccident, browser: Browser, scheme: str
+) -> None:
     for page in (index, own_page(index, da)):
         browser.open(page, 400)
         assert (browser.faults(), browser.scheme()) == ({}, scheme)
@@ -374,18 +423,29 @@ def test_it_opens_and_plays_without_a_complaint(index: Path, da: DeepAccident, b
             wait_for(lambda: browser.frame() > 0)
             browser.driver.switch_to.default_content()
         asked = asked_for(browser)
-        assert {path for path in asked if not path.is_relative_to(index.parent) or not path.is_file()} == set()
+        assert {
+            path for path in asked if not path.is_relative_to(index.parent) or not path.is_file()
+        } == set()
         assert browser.complaints() == []
 
 
 def test_a_click_sorts(index: Path, browser: Browser) -> None:
     browser.open(index, 1280)
     names = browser.script(COLUMN % "scenario")
-    for heading, key in (("least TTC (s)", float), ("lead, all (s)", float), ("visibility", lambda _: 0)):
+    for heading, key in (
+        ("least TTC (s)", float),
+        ("lead, all (s)", float),
+        ("visibility", lambda _: 0),
+    ):
         browser.script(CLICK % heading)
         column = browser.script(COLUMN % heading)
         known = [value for value in column if value != "–"]
-        assert column == sorted(known, key=key) + ["–"] * (len(column) - len(known))  # unknown ones are last
+        assert column == sorted(known, key=key) + ["–"] * (
+            len(column) - len(known)
+        )  # unknown ones are last
     for _ in range(2):
         browser.script(CLICK % "scenario")
-    assert (browser.script(COLUMN % "scenario"), browser.complaints()) == (sorted(names, reverse=True), [])
+    assert (browser.script(COLUMN % "scenario"), browser.complaints()) == (
+        sorted(names, reverse=True),
+        [],
+    )

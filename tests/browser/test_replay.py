@@ -65,7 +65,10 @@ def text(browser: Browser, name: str) -> str:
 
 def view(browser: Browser) -> list[float]:
     """The middle of the scene, metres, and how many pixels a metre has."""
-    return [float(each) for each in browser.value("document.getElementById('ground').dataset.view").split()]
+    return [
+        float(each)
+        for each in browser.value("document.getElementById('ground').dataset.view").split()
+    ]
 
 
 def scrub(browser: Browser, to: int) -> None:
@@ -84,7 +87,10 @@ def drawn(browser: Browser) -> str:
 def pixels_at(browser: Browser, world: Any, origin: Any) -> list[list[int]]:
     """The colours of the canvas at places (N, 2) in world, metres, by the view that it says it has."""
     *middle, scale = view(browser)
-    size = [browser.value(f"document.getElementById('ground').client{side}") for side in ("Width", "Height")]
+    size = [
+        browser.value(f"document.getElementById('ground').client{side}")
+        for side in ("Width", "Height")
+    ]
     places = np.array(size) / 2 + (np.asarray(world) - origin - middle) * [scale, -scale]
     colors: list[list[int]] = browser.driver.execute_script(PIXELS, places.tolist())
     return colors
@@ -97,7 +103,11 @@ def mixed(color: str, share: float) -> list[float]:
 
 
 def test_it_plays_to_the_impact(opened: Browser) -> None:
-    assert (opened.frame(), text(opened, "play"), text(opened, "countdown")) == (0, "Play", "3.4 s to impact")
+    assert (opened.frame(), text(opened, "play"), text(opened, "countdown")) == (
+        0,
+        "Play",
+        "3.4 s to impact",
+    )
     choose(opened, "#speed", "0.25")
     click(opened, "play")
     wait_for(lambda: opened.frame() >= 2)
@@ -111,13 +121,23 @@ def test_it_plays_to_the_impact(opened: Browser) -> None:
 
 
 @pytest.mark.parametrize("at", [0, 20])
-def test_boxes_are_drawn_where_the_labels_say(at: int, opened: Browser, da_motion: DeepAccident, scenario: str) -> None:
+def test_boxes_are_drawn_where_the_labels_say(
+    at: int, opened: Browser, da_motion: DeepAccident, scenario: str
+) -> None:
     """Points of each box near its corners are of its colour, a metre beyond its sides nothing is."""
     scrub(opened, at)
     behind = ("ego_vehicle_behind", "other_vehicle_behind")
-    colors_of = {da_motion.get("agent", f"{scenario}/{each}")["actor_id"]: AGENT_COLORS[each] for each in behind}
-    colors_of |= dict.fromkeys(da_motion.get("scenario", scenario)["collision"]["ids"], COLLIDER_COLOR)
-    boxes, origin = scenario_tracks(da_motion, scenario).at(at + 1), recording_of(da_motion, scenario, None).origin
+    colors_of = {
+        da_motion.get("agent", f"{scenario}/{each}")["actor_id"]: AGENT_COLORS[each]
+        for each in behind
+    }
+    colors_of |= dict.fromkeys(
+        da_motion.get("scenario", scenario)["collision"]["ids"], COLLIDER_COLOR
+    )
+    boxes, origin = (
+        scenario_tracks(da_motion, scenario).at(at + 1),
+        recording_of(da_motion, scenario, None).origin,
+    )
     for actor, color in colors_of.items():
         row = int(boxes.actor_id.searchsorted(actor))
         sine, cosine = np.sin(boxes.yaw[row]), np.cos(boxes.yaw[row])
@@ -130,11 +150,15 @@ def test_boxes_are_drawn_where_the_labels_say(at: int, opened: Browser, da_motio
         assert (off[:4].max() < 12, off[4:].min() > 60) == (True, True), (actor, colors)
 
 
-def test_the_impact_is_marked_where_the_pair_meets(opened: Browser, da_motion: DeepAccident, scenario: str) -> None:
+def test_the_impact_is_marked_where_the_pair_meets(
+    opened: Browser, da_motion: DeepAccident, scenario: str
+) -> None:
     contact, origin = da_motion.collision(scenario), recording_of(da_motion, scenario, None).origin
     between_rays = (np.arange(8) + 0.5) * np.pi / 4
     ring = np.column_stack([np.cos(between_rays), np.sin(between_rays)])
-    around = np.concatenate([contact.point[:2] + radius * ring for radius in (0.75, 1.25, 1.75, 2.5)])
+    around = np.concatenate(
+        [contact.point[:2] + radius * ring for radius in (0.75, 1.25, 1.75, 2.5)]
+    )
 
     def marked() -> tuple[int, bool]:
         colors = np.array(pixels_at(opened, around, origin))[:, :3]
@@ -171,7 +195,9 @@ def test_a_control_with_the_focus_keeps_its_keys(opened: Browser) -> None:
     assert (opened.frame(), text(opened, "play")) == (1, "Play")
 
 
-def test_the_ground_is_dragged_zoomed_and_followed(opened: Browser, da_motion: DeepAccident, scenario: str) -> None:
+def test_the_ground_is_dragged_zoomed_and_followed(
+    opened: Browser, da_motion: DeepAccident, scenario: str
+) -> None:
     x, y, scale = view(opened)
     canvas = opened.driver.find_element("id", "ground")
     ActionChains(opened.driver).drag_and_drop_by_offset(canvas, 60, 30).perform()
@@ -181,12 +207,18 @@ def test_the_ground_is_dragged_zoomed_and_followed(opened: Browser, da_motion: D
     choose(opened, "#follow", "2")
     scrub(opened, 12)
     there = da_motion.world_from(f"{scenario}/other_vehicle/013", "ego").translation[:2]
-    assert view(opened)[:2] == pytest.approx(there - recording_of(da_motion, scenario, None).origin, abs=0.0051)
+    assert view(opened)[:2] == pytest.approx(
+        there - recording_of(da_motion, scenario, None).origin, abs=0.0051
+    )
 
 
-def test_who_sees_whom_is_listed_and_drawn(opened: Browser, da_motion: DeepAccident, scenario: str) -> None:
+def test_who_sees_whom_is_listed_and_drawn(
+    opened: Browser, da_motion: DeepAccident, scenario: str
+) -> None:
     scrub(opened, 20)
-    listed = opened.value("[...document.querySelectorAll('#seen tbody tr')].map((row) => row.innerText)")
+    listed = opened.value(
+        "[...document.querySelectorAll('#seen tbody tr')].map((row) => row.innerText)"
+    )
     rows = [row.split("\t") for row in listed]
     for column, agent in enumerate(("ego_vehicle", "ego_vehicle_behind", "other_vehicle"), 1):
         visible = da_motion.visible_instances(f"{scenario}/{agent}/021", agents=[agent])
@@ -206,7 +238,9 @@ def recorded(da: DeepAccident, tmp_path_factory: pytest.TempPathFactory) -> Path
 def test_every_camera_is_chosen(browser: Browser, recorded: Path) -> None:
     data = data_of(recorded)
     browser.open(recorded, 1280)
-    browser.wait("document.images.length === 5 && [...document.images].every((each) => each.naturalWidth === 64)")
+    browser.wait(
+        "document.images.length === 5 && [...document.images].every((each) => each.naturalWidth === 64)"
+    )
     scrub(browser, 4)
     for agent, cameras in zip(data["agents"], data["cameras"], strict=True):
         image = f"document.querySelector('figure[data-agent={agent['name']}] img')"
@@ -216,13 +250,17 @@ def test_every_camera_is_chosen(browser: Browser, recorded: Path) -> None:
     assert (browser.complaints(), len(browser.requests())) == ([], 1)
 
 
-STILL = "const done = arguments[0]; requestAnimationFrame(() => requestAnimationFrame(() => done()))"
+STILL = (
+    "const done = arguments[0]; requestAnimationFrame(() => requestAnimationFrame(() => done()))"
+)
 
 
 def photo(browser: Browser) -> Image.Image:
     """The scene in three dimensions as the reader sees it."""
     browser.driver.execute_async_script(STILL)
-    return Image.open(io.BytesIO(browser.driver.find_element("id", "space").screenshot_as_png)).convert("RGB")
+    return Image.open(
+        io.BytesIO(browser.driver.find_element("id", "space").screenshot_as_png)
+    ).convert("RGB")
 
 
 def test_the_scene_is_turned(browser: Browser, recorded: Path) -> None:
@@ -273,7 +311,9 @@ def pixel_of(browser: Browser, canvas: str, place: Any) -> Any:
     right = np.array([-np.sin(turn), np.cos(turn), 0.0])
     away = place - (numbers[:3] - distance * ahead)
     across = np.array([right @ away, -np.cross(right, ahead) @ away])
-    return size / 2 + across / (ahead @ away) * size[1] / 2 / np.tan(0.45)  # half of the field of view
+    return size / 2 + across / (ahead @ away) * size[1] / 2 / np.tan(
+        0.45
+    )  # half of the field of view
 
 
 LIT = """
@@ -285,20 +325,28 @@ return [[...document.querySelectorAll('.large g.lit')].map((each) => Number(each
 
 
 @pytest.mark.parametrize("view", ["space", "ground", "camera", "seen"])
-def test_an_actor_that_is_chosen_lights_up_in_all_views(view: str, browser: Browser, recorded: Path) -> None:
+def test_an_actor_that_is_chosen_lights_up_in_all_views(
+    view: str, browser: Browser, recorded: Path
+) -> None:
     data = data_of(recorded)
     browser.open(recorded, 1280)
     scrub(browser, 2)
     own = data["agents"][data["automatic"]["agents"][2]]["actor"]
     actor = next(each for each in data["actors"] if each["role"] == "pair" and each["id"] != own)
-    names = ", ".join(agent["title"] for bit, agent in enumerate(data["agents"]) if actor["seen"][2] >> bit & 1)
+    names = ", ".join(
+        agent["title"] for bit, agent in enumerate(data["agents"]) if actor["seen"][2] >> bit & 1
+    )
     words = f"{actor['title']}: {actor['states'][2][3] / 10:.1f} m/s, seen by {names}."
     dark = {photo(browser).tobytes(), drawn(browser)}
     for is_chosen in (False, True):  # else pointed at
         mouse = ActionBuilder(browser.driver)
-        at = np.array(browser.driver.execute_script(PLACE, actor["id"], data["actors"].index(actor), view))
+        at = np.array(
+            browser.driver.execute_script(PLACE, actor["id"], data["actors"].index(actor), view)
+        )
         if view in ("space", "ground"):
-            at += pixel_of(browser, view, np.array(actor["states"][2])[[0, 1, 4]].astype(float) / 100)
+            at += pixel_of(
+                browser, view, np.array(actor["states"][2])[[0, 1, 4]].astype(float) / 100
+            )
         mouse.pointer_action.move_to_location(*at.round().astype(int).tolist())
         if is_chosen:
             mouse.pointer_action.click().move_to_location(2, 2)
@@ -320,7 +368,9 @@ def test_the_strip_tells_of_the_pair_and_leads_there(browser: Browser, judged: P
         ActionChains(browser.driver).move_to_element_with_offset(plot, across, 0).click().perform()
         assert browser.frame() == 20
     gap, ttc = (data["pair"][name][20] for name in ("gap", "ttc"))
-    assert not lacking(browser.value(TEXTS.format(".told")), f"{gap / 100:.1f} m", f"{ttc / 10:.1f} s", "E TP")
+    assert not lacking(
+        browser.value(TEXTS.format(".told")), f"{gap / 100:.1f} m", f"{ttc / 10:.1f} s", "E TP"
+    )
 
 
 WITHOUT = """
@@ -330,7 +380,9 @@ HTMLCanvasElement.prototype.getContext = function (kind) { return kind === '2d' 
 
 
 def test_without_webgl_there_is_the_map(browser: Browser, recorded: Path) -> None:
-    added = browser.driver.execute_cdp_cmd("Page.addScriptToEvaluateOnNewDocument", {"source": WITHOUT})
+    added = browser.driver.execute_cdp_cmd(
+        "Page.addScriptToEvaluateOnNewDocument", {"source": WITHOUT}
+    )
     browser.open(recorded, 1280)
     browser.driver.execute_cdp_cmd("Page.removeScriptToEvaluateOnNewDocument", added)
     click(browser, "closer", "whole", "layer-points")
@@ -344,7 +396,9 @@ CHANNELS = {camera_name(channel): channel for channel in CAMERAS}
 LARGE = "return document.querySelector('.agent.large').dataset.agent"
 
 
-def test_one_picture_is_large_and_by_default_it_follows_the_pair(browser: Browser, recorded: Path) -> None:
+def test_one_picture_is_large_and_by_default_it_follows_the_pair(
+    browser: Browser, recorded: Path
+) -> None:
     data = data_of(recorded)
     browser.open(recorded, 1280)
     for frame in (0, 5):  # the last is the impact
@@ -362,7 +416,9 @@ def test_one_picture_is_large_and_by_default_it_follows_the_pair(browser: Browse
         assert browser.script(LARGE) == large
 
 
-def test_boxes_are_where_the_camera_has_them(browser: Browser, da: DeepAccident, recorded: Path) -> None:
+def test_boxes_are_where_the_camera_has_them(
+    browser: Browser, da: DeepAccident, recorded: Path
+) -> None:
     """At the impact, of all agents, cut off at the near plane: as Python draws them, to a hundredth."""
     scenario = data_of(recorded)["scenario"]
     browser.open(recorded, 1280)
@@ -380,9 +436,13 @@ def test_boxes_are_where_the_camera_has_them(browser: Browser, da: DeepAccident,
             (corners,) = optical.select(optical.actor_id == actor).corners()
             wanted, there = segments_in_image(corners[np.array(EDGES)], da.camera(sample, channel))
             cut += int((corners[:, 2] < NEAREST_DRAWN).any())
-            found = np.array([float(each) for each in re.findall(r"-?[\d.]+", path)]).reshape(-1, 2, 2)
+            found = np.array([float(each) for each in re.findall(r"-?[\d.]+", path)]).reshape(
+                -1, 2, 2
+            )
             assert len(found) == int(there.sum())
-            away = (corners[np.array(EDGES), 2] > 1.0).all(axis=1)[there]  # nearer, half a centimetre is many pixels
+            away = (corners[np.array(EDGES), 2] > 1.0).all(axis=1)[
+                there
+            ]  # nearer, half a centimetre is many pixels
             np.testing.assert_allclose(found[away], wanted[away], rtol=0.01, atol=0.3)
     assert cut > 0
     click(browser, "boxes")
@@ -390,12 +450,21 @@ def test_boxes_are_where_the_camera_has_them(browser: Browser, da: DeepAccident,
 
 
 @pytest.fixture(scope="module")
-def judged(da_motion: DeepAccident, scenario: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def judged(
+    da_motion: DeepAccident, scenario: str, tmp_path_factory: pytest.TempPathFactory
+) -> Path:
     """A page on which the ego foresees the accident at frame 20, and elsewhere at frame 30."""
     given = {}
-    for token, away in ((f"{scenario}/ego_vehicle/020", 0.0), (f"{scenario}/ego_vehicle/030", 20.0)):
+    for token, away in (
+        (f"{scenario}/ego_vehicle/020", 0.0),
+        (f"{scenario}/ego_vehicle/030", 20.0),
+    ):
         truth = box_truth(da_motion, token).accident
-        given[token] = [Accident(positions=truth.positions + np.array([away, 0.0]), time=truth.time, ids=truth.ids)]
+        given[token] = [
+            Accident(
+                positions=truth.positions + np.array([away, 0.0]), time=truth.time, ids=truth.ids
+            )
+        ]
     path = tmp_path_factory.mktemp("judged") / "replay.html"
     return render_replay(da_motion, scenario, path, prediction=given)
 
@@ -403,7 +472,11 @@ def judged(da_motion: DeepAccident, scenario: str, tmp_path_factory: pytest.Temp
 def test_the_verdict_stands_beside(browser: Browser, judged: Path) -> None:
     browser.open(judged, 1280)
     of_20 = "TPego at frame 20: an accident comes in 1.5 s"
-    for at, told in ((0, "Nothing was evaluated yet."), (28, of_20), (19, of_20)):  # the last one that was evaluated
+    for at, told in (
+        (0, "Nothing was evaluated yet."),
+        (28, of_20),
+        (19, of_20),
+    ):  # the last one that was evaluated
         scrub(browser, at)
         assert text(browser, "foreseen").startswith(told)
     browser.script("document.querySelectorAll('#samples button')[1].click()")
@@ -445,10 +518,15 @@ def test_it_fits_its_window_and_asks_for_nothing(
     for page_, at in ((recorded, 0), (recorded, 5), (judged, 0), (judged, 34)):
         browser.open(page_, width)
         scrub(browser, at)
-        browser.script("if (document.getElementById('strip').hidden) document.getElementById('more').click()")
+        browser.script(
+            "if (document.getElementById('strip').hidden) document.getElementById('more').click()"
+        )
         assert (browser.faults(), browser.requests()) == ({}, [page_.resolve().as_uri()])
         assert [browser.script(each) for each in (CUT, CHOSEN_CUT, SMALL, NAMELESS)] == [[]] * 4
-    assert (browser.scheme(), sum(photo(browser).getpixel((8, 8))) > 384) == (scheme, scheme == "light")  # the sky
+    assert (browser.scheme(), sum(photo(browser).getpixel((8, 8))) > 384) == (
+        scheme,
+        scheme == "light",
+    )  # the sky
 
 
 INTRUDERS = """
@@ -461,5 +539,10 @@ def test_nobody_can_make_it_load_or_run_anything(browser: Browser, page: Path) -
     browser.open(page, 1280)
     browser.script(INTRUDERS)
     told: list[str] = []
-    wait_for(lambda: told.extend(browser.complaints()) or holding("\n".join(told), "img-src", "script-src")[1:])
+    wait_for(
+        lambda: (
+            told.extend(browser.complaints())
+            or holding("\n".join(told), "img-src", "script-src")[1:]
+        )
+    )
     assert browser.value("window.ran === undefined") is True

@@ -16,7 +16,9 @@ from deepaccident_devkit.selection.samples import samples
 pytestmark = pytest.mark.slow
 
 
-def test_the_page_shows_pictures_replay_and_report(made_demo: tuple[Path, str], browser: Browser) -> None:
+def test_the_page_shows_pictures_replay_and_report(
+    made_demo: tuple[Path, str], browser: Browser
+) -> None:
     out, _ = made_demo
     browser.open(out / "index.html", 700)
     pictures = 4 + (out / "model_1s_before.png").is_file()  # where PyTorch is
@@ -24,7 +26,9 @@ def test_the_page_shows_pictures_replay_and_report(made_demo: tuple[Path, str], 
     assert browser.faults() == {}
     titles = []
     for frame in browser.driver.find_elements("tag name", "iframe"):
-        browser.driver.execute_script("arguments[0].scrollIntoView()", frame)  # the browser loads it when it is near
+        browser.driver.execute_script(
+            "arguments[0].scrollIntoView()", frame
+        )  # the browser loads it when it is near
         browser.driver.switch_to.frame(frame)
         titles.append(browser.value("document.title").split(":")[0])
         assert browser.value("document.documentElement.scrollWidth <= innerWidth")
@@ -49,14 +53,26 @@ SETUPS = (
 @pytest.fixture(scope="module")
 def tokens(da_motion: DeepAccident) -> list[str]:
     listed = samples(da_motion, "train", "evaluate", "paper", scope="all")
-    return [token for token in listed if token.split("/")[-2] in ("ego_vehicle", "infrastructure")][::2]
+    return [token for token in listed if token.split("/")[-2] in ("ego_vehicle", "infrastructure")][
+        ::2
+    ]
 
 
 @pytest.mark.parametrize("setup", SETUPS, ids=lambda setup: setup.task)
 def test_a_report_opens_without_a_complaint(
-    setup: EvaluationSetup, da_motion: DeepAccident, tokens: list[str], browser: Browser, tmp_path: Path
+    setup: EvaluationSetup,
+    da_motion: DeepAccident,
+    tokens: list[str],
+    browser: Browser,
+    tmp_path: Path,
 ) -> None:
-    run = evaluation_run(da_motion, setup, tokens, partial=PARTIAL, meta={"method": LONG, "paper": {LONG: [LONG, 1.5]}})
+    run = evaluation_run(
+        da_motion,
+        setup,
+        tokens,
+        partial=PARTIAL,
+        meta={"method": LONG, "paper": {LONG: [LONG, 1.5]}},
+    )
     page = save_report(run, tmp_path)
     for width in (1200, 400):
         browser.open(page, width)
@@ -68,14 +84,20 @@ def test_a_report_opens_without_a_complaint(
 @pytest.fixture(scope="module")
 def page(da_b: DeepAccident, tmp_path_factory: pytest.TempPathFactory) -> Path:
     report = safety_report(da_b, workers=1)
-    return save_safety_report(report, tmp_path_factory.mktemp("safety"), dataset=da_b, replays=1, workers=1)[-1]
+    return save_safety_report(
+        report, tmp_path_factory.mktemp("safety"), dataset=da_b, replays=1, workers=1
+    )[-1]
 
 
 def test_it_opens_without_a_complaint(page: Path, browser: Browser, scheme: str) -> None:
     for width in (1280, 400):
         browser.open(page, width)
         browser.script(OPEN_DETAILS)
-        assert (browser.faults(), browser.requests(), browser.scheme()) == ({}, [page.as_uri()], scheme)
+        assert (browser.faults(), browser.requests(), browser.scheme()) == (
+            {},
+            [page.as_uri()],
+            scheme,
+        )
 
 
 def test_a_link_leads_to_a_replay(page: Path, browser: Browser) -> None:

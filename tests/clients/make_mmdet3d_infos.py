@@ -30,7 +30,15 @@ PAGE = Path(__file__).parents[2] / "docs" / "exports.md"
 
 
 def main(folder: Path) -> None:
-    config = SynthConfig(scenarios=2, frames=17, image_size=(320, 180), seed=3, unplanned=0, exact=True, designed=True)
+    config = SynthConfig(
+        scenarios=2,
+        frames=17,
+        image_size=(320, 180),
+        seed=3,
+        unplanned=0,
+        exact=True,
+        designed=True,
+    )
     turn_the_ego(make_release(folder / "release", config))
     dataset = DeepAccident("v1", folder / "release", verbose=False)
     expected = {}
@@ -38,12 +46,16 @@ def main(folder: Path) -> None:
         for kind in (NuScenes, Mmdet3d):
             export_release(dataset, folder / axes, kind(agents=AGENTS, lidar_axes=axes))
         expected[axes] = {
-            f"{record['token']}/{agent}/{number:03d}": moment_of(dataset, record["token"], agent, number, TURNS[axes])
+            f"{record['token']}/{agent}/{number:03d}": moment_of(
+                dataset, record["token"], agent, number, TURNS[axes]
+            )
             for record in dataset.scenario
             for agent in AGENTS
             for number in keyframes(record["num_frames"])
         }
-    (code,) = re.findall(r"^    from mmdet3d.*?(?=^\S)", PAGE.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE)
+    (code,) = re.findall(
+        r"^    from mmdet3d.*?(?=^\S)", PAGE.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE
+    )
     assert any("van" in moment["classes"] for moment in expected["ego"].values())
     (folder / "expected.json").write_text(json.dumps({"exports": expected, "class": dedent(code)}))
 
@@ -56,7 +68,9 @@ def turn_the_ego(release: Path) -> None:
         write_calib(path, replace(calib, world_from_ego=turned))
 
 
-def moment_of(dataset: DeepAccident, scenario: str, agent: str, number: int, turn: np.ndarray) -> dict[str, Any]:
+def moment_of(
+    dataset: DeepAccident, scenario: str, agent: str, number: int, turn: np.ndarray
+) -> dict[str, Any]:
     """What the client must find, in the LiDAR's frame with its axes turned; distances in metres."""
     sample = f"{scenario}/{agent}/{number:03d}"
     boxes = dataset.boxes(sample, "lidar", velocity="derived")
@@ -64,17 +78,25 @@ def moment_of(dataset: DeepAccident, scenario: str, agent: str, number: int, tur
     velocity = np.nan_to_num(boxes.velocity) @ turn.T
     yaw = boxes.yaw + np.arctan2(turn[1, 0], turn[0, 0])
     lidar = dataset.world_from(sample, "lidar").inverse()
-    ahead = dataset.world_from(sample, "Camera_BackLeft").apply([[1.0, 0.5, 10.0]])  # right, down, forward
+    ahead = dataset.world_from(sample, "Camera_BackLeft").apply(
+        [[1.0, 0.5, 10.0]]
+    )  # right, down, forward
     return {
-        "boxes": np.column_stack([boxes.center @ turn.T, boxes.size, yaw, velocity[:, :2]]).tolist(),
+        "boxes": np.column_stack(
+            [boxes.center @ turn.T, boxes.size, yaw, velocity[:, :2]]
+        ).tolist(),
         "classes": boxes.category_names,
         "points": boxes.num_lidar_pts.tolist(),
         "clouds": {
-            f"{(number - each) / 10:.1f}": cloud_of(dataset, f"{sample[:-3]}{each:03d}", sample, turn)
+            f"{(number - each) / 10:.1f}": cloud_of(
+                dataset, f"{sample[:-3]}{each:03d}", sample, turn
+            )
             for each in range(number, max(number - 11, 0), -1)
         },
         "ahead": (lidar.apply(ahead)[0] @ turn.T).tolist(),
-        "pixel": dataset.camera(sample, "Camera_BackLeft").project([[1.0, 0.5, 10.0]])[0][0].tolist(),
+        "pixel": dataset.camera(sample, "Camera_BackLeft")
+        .project([[1.0, 0.5, 10.0]])[0][0]
+        .tolist(),
     }
 
 

@@ -23,11 +23,15 @@ AGENTS = ("ego_vehicle", "infrastructure")
 
 
 def main(folder: Path) -> None:
-    config = SynthConfig(scenarios=2, frames=32, image_size=(320, 180), seed=3, unplanned=0, designed=True)
+    config = SynthConfig(
+        scenarios=2, frames=32, image_size=(320, 180), seed=3, unplanned=0, designed=True
+    )
     dataset = DeepAccident("v1", make_release(folder / "release", config), verbose=False)
     export_release(dataset, folder / "export", NuScenes(agents=AGENTS))
     content = {
-        record["token"]: boxes_of(dataset, record["token"]) for record in dataset.sample if record["agent"] in AGENTS
+        record["token"]: boxes_of(dataset, record["token"])
+        for record in dataset.sample
+        if record["agent"] in AGENTS
     }
     (folder / "expected.json").write_text(json.dumps(content))
 

@@ -31,14 +31,28 @@ def main(folder: Path) -> None:
 
 def release(root: Path) -> DeepAccident:
     config = SynthConfig(
-        scenarios=8, frames=4, image_size=(64, 36), unlabelled_test=True, unplanned=0, seed=3, designed=True
+        scenarios=8,
+        frames=4,
+        image_size=(64, 36),
+        unlabelled_test=True,
+        unplanned=0,
+        seed=3,
+        designed=True,
     )
     make_release(root, config)
     dataset = DeepAccident("v1", root, verbose=False)
     first, *_, last = (record for record in dataset.scenario if record["split"] != "test")
-    shutil.rmtree(dataset.get_sample_data_path(f"{first['token']}/ego_vehicle/001/Camera_Front").parent)
+    shutil.rmtree(
+        dataset.get_sample_data_path(f"{first['token']}/ego_vehicle/001/Camera_Front").parent
+    )
     for path in root.glob("*.txt"):
-        path.write_text("".join(line for line in path.open() if line.split() != [last["scenario_type"], last["name"]]))
+        path.write_text(
+            "".join(
+                line
+                for line in path.open()
+                if line.split() != [last["scenario_type"], last["name"]]
+            )
+        )
     return DeepAccident("v1", root, verbose=False)
 
 
@@ -56,7 +70,10 @@ def tables(dataset: DeepAccident) -> dict[str, Any]:
             split = "train" if name in ("sensor", "category") else split_of(dataset, record)
             by_split.setdefault(split, []).append(dict(record))
         found[name] = {
-            split: {"rows": len(rows), "some": {at: plain(rows[at]) for at in (0, len(rows) // 2, len(rows) - 1)}}
+            split: {
+                "rows": len(rows),
+                "some": {at: plain(rows[at]) for at in (0, len(rows) // 2, len(rows) - 1)},
+            }
             for split, rows in by_split.items()
         }
     return found
@@ -66,7 +83,10 @@ def queries(dataset: DeepAccident) -> dict[str, Any]:
     """What the code in docs/exports.md must find."""
     boxes: Counter[tuple[str, str]] = Counter()
     for record in dataset.annotation:
-        boxes[dataset.scenario.get("/".join(record["token"].split("/")[:2]))["town"], record["category"]] += 1
+        boxes[
+            dataset.scenario.get("/".join(record["token"].split("/")[:2]))["town"],
+            record["category"],
+        ] += 1
     impacts = [record["token"] for record in dataset.sample if record["time_to_impact"] == 0]
     seen = {agent: set() for agent in ("infrastructure", "ego_vehicle")}
     for record in dataset.annotation:
@@ -86,7 +106,9 @@ def shards(dataset: DeepAccident) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for record in dataset.sample:
         points = dataset.load_point_cloud(record, "lidar").points.astype(np.float32)
-        front, back = (dataset.get_sample_data_path(record, f"Camera_{side}") for side in ("Front", "BackLeft"))
+        front, back = (
+            dataset.get_sample_data_path(record, f"Camera_{side}") for side in ("Front", "BackLeft")
+        )
         found.setdefault(split_of(dataset, record), {})[record["token"]] = {
             "front": digest(front.read_bytes()) if front.exists() else None,
             "back": digest(back.read_bytes()),

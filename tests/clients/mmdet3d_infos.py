@@ -18,7 +18,14 @@ from typing import Any
 
 import numpy as np
 
-CAMERAS = ("CAM_FRONT", "CAM_FRONT_LEFT", "CAM_FRONT_RIGHT", "CAM_BACK", "CAM_BACK_LEFT", "CAM_BACK_RIGHT")
+CAMERAS = (
+    "CAM_FRONT",
+    "CAM_FRONT_LEFT",
+    "CAM_FRONT_RIGHT",
+    "CAM_BACK",
+    "CAM_BACK_LEFT",
+    "CAM_BACK_RIGHT",
+)
 THEIRS = {"car": "car", "van": "car", "truck": "truck", "cyclist": "bicycle"}
 """Our class → nuScenes', where they differ."""
 
@@ -38,7 +45,11 @@ class Finder(MetaPathFinder, Loader):
     """Finds the compiled parts of mmcv."""
 
     def find_spec(self, name: str, *_: object) -> ModuleSpec | None:
-        return ModuleSpec(name, self, is_package=True) if name.startswith(("mmcv.ops", "mmcv._ext")) else None
+        return (
+            ModuleSpec(name, self, is_package=True)
+            if name.startswith(("mmcv.ops", "mmcv._ext"))
+            else None
+        )
 
     def create_module(self, spec: ModuleSpec) -> ModuleType:
         return Names(spec.name)
@@ -106,7 +117,13 @@ def opened(kind: Any, file: Path) -> Any:
         modality={"use_lidar": True, "use_camera": True},
         pipeline=[
             {"type": "LoadPointsFromFile", "coord_type": "LIDAR", "load_dim": 5, "use_dim": 5},
-            {"type": "LoadPointsFromMultiSweeps", "sweeps_num": 10, "load_dim": 5, "use_dim": 5, "test_mode": True},
+            {
+                "type": "LoadPointsFromMultiSweeps",
+                "sweeps_num": 10,
+                "load_dim": 5,
+                "use_dim": 5,
+                "test_mode": True,
+            },
         ],
         filter_empty_gt=False,
     )
@@ -122,13 +139,21 @@ def check_metric(kind: Any, root: Path, expected: dict[str, Any]) -> None:
 
     (file,) = root.glob("deepaccident_infos_*.pkl")
     dataset, made = opened(kind, file), root / "results"
-    metric = NuScenesMetric(data_root=str(root), ann_file=str(file), format_only=True, jsonfile_prefix=str(made))
+    metric = NuScenesMetric(
+        data_root=str(root), ann_file=str(file), format_only=True, jsonfile_prefix=str(made)
+    )
     metric.dataset_meta = dataset.metainfo
     for index in range(len(dataset)):
         truth = dataset.get_data_info(index)["ann_info"]
         labels = torch.tensor(truth["gt_labels_3d"])
-        boxes = {"bboxes_3d": truth["gt_bboxes_3d"], "labels_3d": labels, "scores_3d": torch.ones(len(labels))}
-        metric.process({}, [{"pred_instances_3d": boxes, "pred_instances": {}, "sample_idx": index}])
+        boxes = {
+            "bboxes_3d": truth["gt_bboxes_3d"],
+            "labels_3d": labels,
+            "scores_3d": torch.ones(len(labels)),
+        }
+        metric.process(
+            {}, [{"pred_instances_3d": boxes, "pred_instances": {}, "sample_idx": index}]
+        )
     metric.compute_metrics(metric.results)
     evaluation = DetectionEval(
         NuScenes("v1.0-deepaccident", str(root), verbose=False),
@@ -147,9 +172,12 @@ def check_metric(kind: Any, root: Path, expected: dict[str, Any]) -> None:
 def check_boxes(info: dict[str, Any], truth: dict[str, Any], classes: Sequence[str]) -> None:
     boxes, labels = info["gt_bboxes_3d"], [classes[label] for label in info["gt_labels_3d"]]
     assert labels == [
-        name if name in classes and "van" in classes else THEIRS.get(name, name) for name in truth["classes"]
+        name if name in classes and "van" in classes else THEIRS.get(name, name)
+        for name in truth["classes"]
     ]
-    theirs = np.column_stack([boxes.gravity_center.numpy(), boxes.dims.numpy(), boxes.yaw.numpy(), boxes.tensor[:, 7:]])
+    theirs = np.column_stack(
+        [boxes.gravity_center.numpy(), boxes.dims.numpy(), boxes.yaw.numpy(), boxes.tensor[:, 7:]]
+    )
     off = theirs - np.array(truth["boxes"]).reshape(-1, 9)
     off[:, 6] = np.arctan2(np.sin(off[:, 6]), np.cos(off[:, 6]))
     assert np.abs(off).max(initial=0) < 1e-3, off
@@ -162,7 +190,11 @@ def check_points(points: np.ndarray, truth: dict[str, Any]) -> int:
         x, y, z = (points[:, :3] - box[:3]).T
         cos, sin = np.cos(box[6]), np.sin(box[6])
         length, width, height = np.array(box[3:6]) / 2 + 1e-4
-        within = (np.abs(x * cos + y * sin) < length) & (np.abs(y * cos - x * sin) < width) & (np.abs(z) < height)
+        within = (
+            (np.abs(x * cos + y * sin) < length)
+            & (np.abs(y * cos - x * sin) < width)
+            & (np.abs(z) < height)
+        )
         assert abs(within.sum() - count) <= 1 + 0.02 * count, (box, within.sum(), count)
         total += count
     return total
@@ -181,7 +213,9 @@ def check_clouds(points: np.ndarray, truth: dict[str, Any]) -> int:
 def check_camera(camera: dict[str, Any], truth: dict[str, Any]) -> None:
     """Its image is there, and a point before it is seen where it should be."""
     assert Path(camera["img_path"]).is_file()
-    u, v, depth = np.array(camera["cam2img"]) @ (np.array(camera["lidar2cam"]) @ [*truth["ahead"], 1])[:3]
+    u, v, depth = (
+        np.array(camera["cam2img"]) @ (np.array(camera["lidar2cam"]) @ [*truth["ahead"], 1])[:3]
+    )
     assert np.abs(np.array([u, v]) / depth - truth["pixel"]).max() < 1e-3
 
 

@@ -27,7 +27,10 @@ from nuscenes.utils.geometry_utils import BoxVisibility, points_in_box
 from pyquaternion import Quaternion
 
 VERSION, SPLIT = "v1.0-deepaccident", "deepaccident_train"
-META = {name: name == "use_lidar" for name in ("use_camera", "use_lidar", "use_radar", "use_map", "use_external")}
+META = {
+    name: name == "use_lidar"
+    for name in ("use_camera", "use_lidar", "use_radar", "use_map", "use_external")
+}
 
 
 def main(folder: Path) -> None:
@@ -92,7 +95,11 @@ def check_sweeps(nusc: NuScenes, expected: dict) -> float:
         steps = (sample["timestamp"] - row["timestamp"]) // 100_000
         assert 1 <= steps <= 4
         name, number = sample["deepaccident_token"].rsplit("/", 1)
-        ours = {box[0]: box[1:4] for box in expected[f"{name}/{int(number) - steps:03d}"]["world"] if box[0] != -1}
+        ours = {
+            box[0]: box[1:4]
+            for box in expected[f"{name}/{int(number) - steps:03d}"]["world"]
+            if box[0] != -1
+        }
         for box in nusc.get_boxes(row["token"]):
             record = nusc.get("sample_annotation", box.token)
             if record["prev"] and record["actor_id"] in ours:
@@ -115,7 +122,9 @@ def check_points(nusc: NuScenes) -> None:
     assert total > 100
     assert wrong < 0.02 * total, (wrong, total)
     last = nusc.get("sample", nusc.scene[0]["last_sample_token"])
-    cloud, times = LidarPointCloud.from_file_multisweep(nusc, last, "LIDAR_TOP", "LIDAR_TOP", nsweeps=6)
+    cloud, times = LidarPointCloud.from_file_multisweep(
+        nusc, last, "LIDAR_TOP", "LIDAR_TOP", nsweeps=6
+    )
     assert np.allclose(np.unique(times), np.arange(6) / 10, atol=1e-6)
     assert cloud.points.shape == (4, times.shape[1])
 
@@ -143,13 +152,17 @@ def check_futures(nusc: NuScenes) -> None:
             while record["next"] and len(path) < 4:
                 record = nusc.get("sample_annotation", record["next"])
                 path.append(record["translation"][:2])
-            found = helper.get_future_for_agent(first["instance_token"], sample["token"], 2, in_agent_frame=False)
+            found = helper.get_future_for_agent(
+                first["instance_token"], sample["token"], 2, in_agent_frame=False
+            )
             assert np.allclose(found.reshape(-1, 2), np.reshape(path, (-1, 2)))
             seen += len(path) == 4
     assert seen > 100
 
 
-def write_results(nusc: NuScenes, path: Path, kind: str, name_of: Callable[[str], str | None]) -> None:
+def write_results(
+    nusc: NuScenes, path: Path, kind: str, name_of: Callable[[str], str | None]
+) -> None:
     """Write the true boxes of the split that have points as `detection` or `tracking` results."""
     scenes = set(json.loads((Path(nusc.table_root) / "splits.json").read_text())[SPLIT])
     results = {}
@@ -176,9 +189,15 @@ def detect(nusc: NuScenes, folder: Path) -> str:
     """Perfect detections have AP 1.0 in every class, and no error of any kind."""
     path, config = folder / "detections.json", config_factory("detection_cvpr_2019")
     write_results(nusc, path, "detection", category_to_detection_name)
-    evaluation = DetectionEval(nusc, config, str(path), SPLIT, str(folder / "detection"), verbose=False)
+    evaluation = DetectionEval(
+        nusc, config, str(path), SPLIT, str(folder / "detection"), verbose=False
+    )
     metrics, _ = evaluation.evaluate()
-    near = {box.detection_name for token in evaluation.sample_tokens for box in evaluation.gt_boxes[token]}
+    near = {
+        box.detection_name
+        for token in evaluation.sample_tokens
+        for box in evaluation.gt_boxes[token]
+    }
     assert {"car", "pedestrian"} <= near
     for name in near:
         assert metrics.mean_dist_aps[name] > 1 - 1e-9, (name, metrics.mean_dist_aps[name])
@@ -192,10 +211,18 @@ def track(nusc: NuScenes, folder: Path) -> str:
     path, config = folder / "tracks.json", config_factory("tracking_nips_2019")
     write_results(nusc, path, "tracking", category_to_tracking_name)
     evaluation = TrackingEval(
-        config, str(path), SPLIT, str(folder / "tracking"), VERSION, str(folder / "export"), verbose=False
+        config,
+        str(path),
+        SPLIT,
+        str(folder / "tracking"),
+        VERSION,
+        str(folder / "export"),
+        verbose=False,
     )
     metrics, _ = evaluation.evaluate()
-    found = {name: value for name, value in metrics.label_metrics["mota"].items() if not np.isnan(value)}
+    found = {
+        name: value for name, value in metrics.label_metrics["mota"].items() if not np.isnan(value)
+    }
     assert {"car", "pedestrian"} <= found.keys()
     assert all(value > 1 - 1e-9 for value in found.values()), found
     return ", ".join(sorted(found))

@@ -48,7 +48,9 @@ def by_polars(table: str, split: str) -> Rows:
 
 def by_duckdb(table: str, split: str) -> Rows:
     found = duckdb.read_parquet(files(table, split))
-    return len(found), lambda row: dict(zip(found.columns, found.limit(1, row).fetchall()[0], strict=True))
+    return len(found), lambda row: dict(
+        zip(found.columns, found.limit(1, row).fetchall()[0], strict=True)
+    )
 
 
 def by_pandas(table: str, split: str) -> Rows:
@@ -80,7 +82,9 @@ def check_tables(tables: dict[str, Any]) -> int:
 
 def check_queries(told: dict[str, Any]) -> int:
     """Run the page's code; some of its blocks leave what it must find under these names."""
-    blocks = re.findall(rf"^```python ({'|'.join(CLIENTS)})\n(.*?)^```", PAGE.read_text(), re.DOTALL | re.MULTILINE)
+    blocks = re.findall(
+        rf"^```python ({'|'.join(CLIENTS)})\n(.*?)^```", PAGE.read_text(), re.DOTALL | re.MULTILINE
+    )
     assert {client for client, _ in blocks} == set(CLIENTS)
     names: dict[str, Any] = {}
     for client, code in blocks:
@@ -96,13 +100,17 @@ def check_sample(sample: dict[str, Any], told: dict[str, Any], images: tuple[Any
     points, facts = np.array(sample["lidar.npy"], dtype=np.float32), sample["json"]
     assert points.shape == (told["count"], 4)
     assert digest(points.tobytes()) == told["points"]
-    assert [None if image is None else digest(image) for image in images] == [told["front"], told["back"]]
+    assert [None if image is None else digest(image) for image in images] == [
+        told["front"],
+        told["back"],
+    ]
     world_from_lidar = np.array(facts["world_from_ego"]) @ facts["ego_from_lidar"]
     assert np.allclose(world_from_lidar, told["world_from_lidar"], atol=1e-9)
     boxes = facts["boxes"]
     centers = np.array(boxes["center"]).reshape(-1, 3)
     assert np.allclose(
-        centers @ world_from_lidar[:3, :3].T + world_from_lidar[:3, 3], np.reshape(told["centers"], (-1, 3))
+        centers @ world_from_lidar[:3, :3].T + world_from_lidar[:3, 3],
+        np.reshape(told["centers"], (-1, 3)),
     )
     assert same(boxes["velocity"], told["velocities"])
     assert len({len(column) for column in boxes.values()}) == 1

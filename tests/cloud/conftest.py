@@ -19,7 +19,9 @@ _NEEDED = ("s3fs", "moto")
 
 if missing := [name for name in _NEEDED if importlib.util.find_spec(name) is None]:
     if os.environ.get("DEEPACCIDENT_REQUIRE_CLOUD"):
-        raise pytest.UsageError(f"DEEPACCIDENT_REQUIRE_CLOUD is set, but {', '.join(missing)} is not installed")
+        raise pytest.UsageError(
+            f"DEEPACCIDENT_REQUIRE_CLOUD is set, but {', '.join(missing)} is not installed"
+        )
     collect_ignore_glob = ["test_*.py"]
 
 
@@ -46,8 +48,13 @@ def bucket(release_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Iter
             wait_for(lambda: _answers(port))
             files = s3fs.S3FileSystem()
             files.mkdir("bucket")
-            below = {path: path.relative_to(release_root).as_posix() for path in files_of(release_root)}
-            files.put([str(path) for path in below], [f"bucket/data/DeepAccident/{name}" for name in below.values()])
+            below = {
+                path: path.relative_to(release_root).as_posix() for path in files_of(release_root)
+            }
+            files.put(
+                [str(path) for path in below],
+                [f"bucket/data/DeepAccident/{name}" for name in below.values()],
+            )
             archive = packed(release_root, tmp_path_factory.mktemp("bucket") / "all.zip")
             files.put(str(archive), "bucket/zips/all.zip")
             yield "s3://bucket"

@@ -22,13 +22,19 @@ def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture(scope="module", params=PLACES)
-def remote(request: pytest.FixtureRequest, bucket: str, tmp_path_factory: pytest.TempPathFactory) -> DeepAccident:
+def remote(
+    request: pytest.FixtureRequest, bucket: str, tmp_path_factory: pytest.TempPathFactory
+) -> DeepAccident:
     index = tmp_path_factory.mktemp("index")
-    return DeepAccident(dataroot=f"{bucket}/{request.param}", index_dir=index, workers=1, verbose=False)
+    return DeepAccident(
+        dataroot=f"{bucket}/{request.param}", index_dir=index, workers=1, verbose=False
+    )
 
 
 def test_tables_and_files_have_the_same_bytes(remote: DeepAccident, da: DeepAccident) -> None:
-    for path in filter(Path.is_file, da.tables_folder.iterdir()):  # another test may have kept more beside them
+    for path in filter(
+        Path.is_file, da.tables_folder.iterdir()
+    ):  # another test may have kept more beside them
         assert (remote.tables_folder / path.name).read_bytes() == path.read_bytes()
     for sample in (da.sample[0]["token"], da.sample[40]["token"]):
         for channel in ("Camera_Back", "lidar01", "BEV_instance_camera"):
@@ -43,7 +49,9 @@ def test_tables_and_files_have_the_same_bytes(remote: DeepAccident, da: DeepAcci
 def test_workers_read_too(remote: DeepAccident, da: DeepAccident, method: str) -> None:
     samples = [da.sample[number]["token"] for number in (0, 3, 9, 30)]
     expected = [image_sum(da, sample) for sample in samples]
-    assert [image_sum(pickle.loads(pickle.dumps(remote)), sample) for sample in samples[:1]] == expected[:1]
+    assert [
+        image_sum(pickle.loads(pickle.dumps(remote)), sample) for sample in samples[:1]
+    ] == expected[:1]
     with ProcessPoolExecutor(2, mp_context=get_context(method)) as pool:
         assert list(pool.map(image_sum, [remote] * 4, samples)) == expected
 
@@ -89,7 +97,9 @@ def test_without_credentials(bucket: str, tmp_path: Path, monkeypatch: pytest.Mo
         monkeypatch.delenv(name)
     monkeypatch.setenv("AWS_SHARED_CREDENTIALS_FILE", os.devnull)
     s3fs.S3FileSystem.clear_instance_cache()
-    with pytest.raises(DatarootError, match=r"s3://bucket/zips: cannot be read \(.*credentials.*\); check the URL"):
+    with pytest.raises(
+        DatarootError, match=r"s3://bucket/zips: cannot be read \(.*credentials.*\); check the URL"
+    ):
         DeepAccident(dataroot=f"{bucket}/zips", index_dir=tmp_path)
     assert list(tmp_path.glob("*")) == []
     s3fs.S3FileSystem.clear_instance_cache()
@@ -97,11 +107,15 @@ def test_without_credentials(bucket: str, tmp_path: Path, monkeypatch: pytest.Mo
 
 @pytest.mark.parametrize("place", ["nothing/here", "zips/none.zip"])
 def test_a_wrong_url(bucket: str, place: str, tmp_path: Path) -> None:
-    with pytest.raises(DatarootError, match=rf"{bucket}/{place}: (no file of a release found|does not exist)"):
+    with pytest.raises(
+        DatarootError, match=rf"{bucket}/{place}: (no file of a release found|does not exist)"
+    ):
         DeepAccident(dataroot=f"{bucket}/{place}", index_dir=tmp_path)
 
 
-def test_a_server_that_is_gone(bucket: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_server_that_is_gone(
+    bucket: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     import s3fs
 
     dataset = DeepAccident(dataroot=f"{bucket}/zips", index_dir=tmp_path, workers=1, verbose=False)

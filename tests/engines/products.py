@@ -49,7 +49,12 @@ def command(arguments: Sequence[str]) -> list[str]:
 def done(line: Sequence[str], **environment: str) -> str:
     """Run a command to its end; what it printed."""
     ended = subprocess.run(
-        line, capture_output=True, text=True, timeout=300, check=False, env={**os.environ, **environment}
+        line,
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+        env={**os.environ, **environment},
     )
     assert ended.returncode in (0, 1), ended.stderr  # 1: what `validate` finds
     return ended.stdout

@@ -19,11 +19,15 @@ BEGUN = {"opencood": "opencood/*/*", "synth": ".made.unfinished/parts/*"}
 """Commands whose worker is killed, and what they make first."""
 
 
-def test_all_is_the_same_with_a_worker_killed_half_way(local: Local, cluster: Cluster, tmp_path: Path) -> None:
+def test_all_is_the_same_with_a_worker_killed_half_way(
+    local: Local, cluster: Cluster, tmp_path: Path
+) -> None:
     left = list(cluster.workers)
     for name in COMMANDS:
         line = [*words(name, {**local.places, "out": tmp_path}), "--scheduler", cluster.address]
-        with subprocess.Popen(command(line), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as running:
+        with subprocess.Popen(
+            command(line), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        ) as running:
             if name in BEGUN:  # dask begins another worker
                 wait_for(lambda pattern=BEGUN[name]: any(tmp_path.glob(pattern)))
                 os.kill(left.pop(), signal.SIGKILL)
@@ -38,7 +42,9 @@ def test_a_killed_scheduler_costs_what_is_at_hand(local: Local, tmp_path: Path) 
     scheduler, address = started_scheduler(tmp_path)
     workers = [started_worker(address) for _ in range(2)]
     line = words("opencood", {**local.places, "out": tmp_path})
-    with subprocess.Popen([*command(line), "--scheduler", address], stderr=subprocess.PIPE, text=True) as running:
+    with subprocess.Popen(
+        [*command(line), "--scheduler", address], stderr=subprocess.PIPE, text=True
+    ) as running:
         wait_for(lambda: list(tmp_path.glob("opencood/.deepaccident-parts/kept/opencood/*/done")))
         scheduler.kill()
         _, errors = running.communicate(timeout=120)
@@ -49,8 +55,12 @@ def test_a_killed_scheduler_costs_what_is_at_hand(local: Local, tmp_path: Path) 
     assert errors.splitlines()[-1].startswith("error: the scheduler has ended")
     again = subprocess.run(command(line), capture_output=True, text=True, timeout=300, check=True)
     assert " 0 were there already" not in again.stdout
-    expected = {path: content for path, content in local.files.items() if path.startswith("opencood/")}
-    assert {f"opencood/{path}": content for path, content in contents(tmp_path / "opencood").items()} == expected
+    expected = {
+        path: content for path, content in local.files.items() if path.startswith("opencood/")
+    }
+    assert {
+        f"opencood/{path}": content for path, content in contents(tmp_path / "opencood").items()
+    } == expected
 
 
 WITHOUT = "import sys; sys.modules['deepaccident_devkit'] = None"
@@ -79,7 +89,9 @@ def test_a_worker_without_the_package_or_with_another_version(
     line = [*words("opencood", {**local.places, "out": tmp_path}), "--scheduler", scheduler]
     worker = started_worker(scheduler, setup)
     wait_for_worker(scheduler)
-    ended = subprocess.run(command(line), stderr=subprocess.PIPE, text=True, timeout=120, check=False)
+    ended = subprocess.run(
+        command(line), stderr=subprocess.PIPE, text=True, timeout=120, check=False
+    )
     worker.kill()
     worker.wait()
     assert ended.returncode == 2
@@ -88,12 +100,17 @@ def test_a_worker_without_the_package_or_with_another_version(
 
 
 @pytest.mark.parametrize("unseen", ["release", "opencood"])
-def test_a_folder_that_workers_cannot_see(local: Local, scheduler: str, tmp_path: Path, unseen: str) -> None:
+def test_a_folder_that_workers_cannot_see(
+    local: Local, scheduler: str, tmp_path: Path, unseen: str
+) -> None:
     """On the worker's side another, empty file system lies over it."""
     out = tmp_path / "opencood"
     out.mkdir()
     place = {"release": local.places["release"], "opencood": out}[unseen]
-    if shutil.which("unshare") is None or subprocess.run(["unshare", "-m", "true"], check=False).returncode:
+    if (
+        shutil.which("unshare") is None
+        or subprocess.run(["unshare", "-m", "true"], check=False).returncode
+    ):
         pytest.skip("no right to mount")
     hidden = ["unshare", "-m", "sh", "-c", f'mount -t tmpfs none "{place}" && exec "$@"', "sh"]
     worker = started_worker(scheduler, before=hidden)
@@ -110,15 +127,40 @@ def test_a_folder_that_workers_cannot_see(local: Local, scheduler: str, tmp_path
 
 def started_scheduler(folder: Path) -> tuple[subprocess.Popen[str], str]:
     file = folder / "scheduler.json"
-    options = ["--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--no-show", "--scheduler-file", str(file)]
-    line = [sys.executable, "-c", f"{WITHOUT}; from distributed.cli.dask_scheduler import main; main()", *options]
+    options = [
+        "--host",
+        "127.0.0.1",
+        "--port",
+        "0",
+        "--no-dashboard",
+        "--no-show",
+        "--scheduler-file",
+        str(file),
+    ]
+    line = [
+        sys.executable,
+        "-c",
+        f"{WITHOUT}; from distributed.cli.dask_scheduler import main; main()",
+        *options,
+    ]
     process = subprocess.Popen(line, stderr=subprocess.DEVNULL, text=True)  # it needs no devkit
     wait_for(lambda: file.exists() and '"address"' in file.read_text())
     return process, json.loads(file.read_text())["address"]
 
 
-def started_worker(address: str, setup: str = "", before: list[str] | None = None) -> subprocess.Popen[str]:
-    line = [sys.executable, "-c", f"{setup}\n{WORKER}", address, "--no-nanny", "--nthreads", "1", "--no-dashboard"]
+def started_worker(
+    address: str, setup: str = "", before: list[str] | None = None
+) -> subprocess.Popen[str]:
+    line = [
+        sys.executable,
+        "-c",
+        f"{setup}\n{WORKER}",
+        address,
+        "--no-nanny",
+        "--nthreads",
+        "1",
+        "--no-dashboard",
+    ]
     return subprocess.Popen([*(before or []), *line], stderr=subprocess.DEVNULL, text=True)
 
 

@@ -54,6 +54,10 @@ def test_the_page(local: Local, place: Path, number: int) -> None:
     run = ["bash", "-eu", "script"] if language == "bash" else [sys.executable, "script"]
     ended = subprocess.run(run, cwd=place, capture_output=True, text=True, timeout=300, check=False)
     assert ended.returncode == 0, ended.stderr
-    exported = {path: content for path, content in local.files.items() if path.startswith("opencood/")}
+    exported = {
+        path: content for path, content in local.files.items() if path.startswith("opencood/")
+    }
     for folder in (place / "out").glob("[!l]*"):
-        assert {f"opencood/{path}": content for path, content in contents(folder).items()} == exported
+        assert {
+            f"opencood/{path}": content for path, content in contents(folder).items()
+        } == exported

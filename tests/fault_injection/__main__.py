@@ -17,7 +17,9 @@ def main() -> None:
     print(to_markdown(outcomes))
     page = PAGE.read_text(encoding="utf-8")
     block = re.compile("(<!-- faults -->\n).*?(<!-- /faults -->)", re.DOTALL)
-    PAGE.write_text(block.sub(lambda marks: marks[1] + summary(outcomes) + marks[2], page), encoding="utf-8")
+    PAGE.write_text(
+        block.sub(lambda marks: marks[1] + summary(outcomes) + marks[2], page), encoding="utf-8"
+    )
 
 
 if __name__ == "__main__":  # processes that plant faults import this again

@@ -52,7 +52,13 @@ class Group:
         for name, (says, apply) in rows.items():
             title = " ".join(says.split()).rstrip(".")
             self.mutations.append(
-                Mutation(name=name, group=self.name, title=title, apply=apply, **{"deep": self.deep, **how})
+                Mutation(
+                    name=name,
+                    group=self.name,
+                    title=title,
+                    apply=apply,
+                    **{"deep": self.deep, **how},
+                )
             )
 
 
@@ -68,13 +74,22 @@ def in_file(kind: str, change: Callable[[bytes, np.random.Generator], bytes]) ->
 
 
 def in_calib(
-    key: str, edit: Matrix | None = None, *, drawn: Callable[[np.random.Generator], Matrix] | None = None, always: bool
+    key: str,
+    edit: Matrix | None = None,
+    *,
+    drawn: Callable[[np.random.Generator], Matrix] | None = None,
+    always: bool,
 ) -> Apply:
     """Edit a matrix of an agent's calib at a frame or always: as it is said or `drawn`; `{}` stands for a camera."""
 
     def apply(place: Place, rng: np.random.Generator) -> None:
         agent, frames = place.any_agent(rng), place.frames if always else [place.any_frame(rng)]
-        place.edit_calib(agent, frames, key.format(rng.choice(CAMERAS)) if "{}" in key else key, edit or drawn(rng))
+        place.edit_calib(
+            agent,
+            frames,
+            key.format(rng.choice(CAMERAS)) if "{}" in key else key,
+            edit or drawn(rng),
+        )
 
     return apply
 

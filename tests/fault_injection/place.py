@@ -10,7 +10,12 @@ import numpy as np
 from deepaccident_devkit.release import ScenarioFolder
 from deepaccident_devkit.support.files import write_bytes
 from deepaccident_devkit.taxonomy import OWN_ACTOR_ID, VEHICLE_AGENTS
-from deepaccident_devkit.testing.breakages.breakage import FIELD, FILE_ENDINGS, LabelRows, ScenarioEditor
+from deepaccident_devkit.testing.breakages.breakage import (
+    FIELD,
+    FILE_ENDINGS,
+    LabelRows,
+    ScenarioEditor,
+)
 
 Candidate = TypeVar("Candidate")
 Sightings = Mapping[str, Mapping[int, Mapping[int, np.ndarray]]]
@@ -141,7 +146,9 @@ class Place(ScenarioEditor):
             for row in self.rows(agent, frame)[1:]:
                 actor = int(row[FIELD["id"]])
                 if actor > 0:
-                    seen.setdefault(actor, {})[frame] = (world_from_lidar @ [*map(float, row[1:4]), 1.0])[:3]
+                    seen.setdefault(actor, {})[frame] = (
+                        world_from_lidar @ [*map(float, row[1:4]), 1.0]
+                    )[:3]
         return seen
 
     def steady(self, agent: str, *, moving: bool = False) -> set[int]:
@@ -153,7 +160,9 @@ class Place(ScenarioEditor):
         }
 
     def _moves(self, places: Mapping[int, np.ndarray]) -> bool:
-        return way_length(places[self.frames[-1]] - places[self.frames[0]]) > LEAST_MOVE * (len(self.frames) - 1)
+        return way_length(places[self.frames[-1]] - places[self.frames[0]]) > LEAST_MOVE * (
+            len(self.frames) - 1
+        )
 
     def shared_actor(
         self, rng: np.random.Generator, *, moving: bool = False, within: float = np.inf
@@ -169,10 +178,16 @@ class Place(ScenarioEditor):
         ]
         return one_of(pairs, rng)
 
-    def steady_ones(self, rng: np.random.Generator, count: int, *, moving: bool = False) -> tuple[str, list[int]]:
+    def steady_ones(
+        self, rng: np.random.Generator, count: int, *, moving: bool = False
+    ) -> tuple[str, list[int]]:
         """An agent and so many of the actors that it sees in every frame."""
-        agent = one_of([agent for agent in self.agents if len(self.steady(agent, moving=moving)) >= count], rng)
-        return agent, rng.choice(sorted(self.steady(agent, moving=moving)), size=count, replace=False).tolist()
+        agent = one_of(
+            [agent for agent in self.agents if len(self.steady(agent, moving=moving)) >= count], rng
+        )
+        return agent, rng.choice(
+            sorted(self.steady(agent, moving=moving)), size=count, replace=False
+        ).tolist()
 
     def lone_actor(self, rng: np.random.Generator, *, vehicle: bool = False) -> tuple[str, int]:
         """An agent, alone from now on (the others' files are gone), and a near moving actor that it sees always.
@@ -180,7 +195,9 @@ class Place(ScenarioEditor):
         The agent's labels leave nobody out for being hidden: of others nobody can say whether an actor is missing.
         """
         classes = {
-            int(row[FIELD["id"]]): row[0] for agent in self.agents for row in self.rows(agent, self.frames[0])[1:]
+            int(row[FIELD["id"]]): row[0]
+            for agent in self.agents
+            for row in self.rows(agent, self.frames[0])[1:]
         }
         pairs = [
             (agent, actor)
@@ -209,7 +226,10 @@ class Place(ScenarioEditor):
 
     def _is_near(self, agent: str, actor: int, within: float) -> bool:
         places = self.sightings[agent][actor]
-        return all(way_length(place - self.position(agent, frame)) <= within for frame, place in places.items())
+        return all(
+            way_length(place - self.position(agent, frame)) <= within
+            for frame, place in places.items()
+        )
 
     def agent_ids(self) -> list[int]:
         """Actor ids of the vehicle agents, as meta says."""

@@ -15,7 +15,9 @@ from fault_injection.mutations import BEYOND, MUTATIONS, seeded
 from fault_injection.mutations.calib import marker
 from fault_injection.place import NoVictimError, Place
 
-RELEASE = SynthConfig(scenarios=2, frames=7, image_size=(96, 54), seed=8, unplanned=0, designed=True)
+RELEASE = SynthConfig(
+    scenarios=2, frames=7, image_size=(96, 54), seed=8, unplanned=0, designed=True
+)
 NUM_MUTATIONS = 200
 SEEDS_BEYOND = 2
 WORKERS = 2
@@ -75,7 +77,11 @@ def places(root: Path) -> dict[str, Place]:
 def mutate(job: Job, of: dict[str, Place]) -> Place:
     """Apply a mutation to the first scenario with a victim for it, in an order that its seed chooses."""
     mutation, rng = MUTATIONS[job.name], seeded(job.name, job.seed)
-    fitting = sorted(token for token in of if mutation.only is None or token.split("/")[0].endswith(mutation.only))
+    fitting = sorted(
+        token
+        for token in of
+        if mutation.only is None or token.split("/")[0].endswith(mutation.only)
+    )
     for token in rng.permutation(fitting):
         place = of[str(token)]
         assert set(place.sightings) == set(place.agents)  # looked at while all is well
@@ -85,7 +91,9 @@ def mutate(job: Job, of: dict[str, Place]) -> Place:
             assert not place.changes()
         else:
             return place
-    raise NoVictimError(f"{job.name}: nobody in {', '.join(fitting)} is what it needs; try another seed of RELEASE")
+    raise NoVictimError(
+        f"{job.name}: nobody in {', '.join(fitting)} is what it needs; try another seed of RELEASE"
+    )
 
 
 def run(root: Path, wanted: Sequence[Job]) -> list[Outcome]:

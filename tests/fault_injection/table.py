@@ -41,7 +41,9 @@ class Row:
 
     def cells(self) -> list[str]:
         """The cells of its row of the table."""
-        codes = sorted({code for outcome in self.outcomes for code in (*outcome.errors, *outcome.warnings)})
+        codes = sorted(
+            {code for outcome in self.outcomes for code in (*outcome.errors, *outcome.warnings)}
+        )
         told = ", ".join(f"`{code}`" for code in codes)
         why = self.mutation.harmless or self.mutation.beyond
         return [
@@ -69,7 +71,9 @@ def to_markdown(outcomes: Sequence[Outcome]) -> str:
     parts = [_HEAD + summary(outcomes)]
     for group in dict.fromkeys(row.mutation.group for row in rows):
         lines = [_line(row.cells()) for row in rows if row.mutation.group == group]
-        parts.append("\n".join([f"## {group[0].upper()}{group[1:]}", "", *_header(_COLUMNS), *lines, ""]))
+        parts.append(
+            "\n".join([f"## {group[0].upper()}{group[1:]}", "", *_header(_COLUMNS), *lines, ""])
+        )
     return "\n".join(parts)
 
 
@@ -78,7 +82,12 @@ def summary(outcomes: Sequence[Outcome]) -> str:
     rows = rows_of(outcomes)
     must = [row for row in rows if row.mutation.beyond is None]
     told = dict(zip(("found", "harmless", "missed"), _tally(must), strict=True))
-    counts = {**told, "count": sum(told.values()), "kinds": len(must), "beyond": len(rows) - len(must)}
+    counts = {
+        **told,
+        "count": sum(told.values()),
+        "kinds": len(must),
+        "beyond": len(rows) - len(must),
+    }
     return _SUMMARY.format(**counts) + _groups(must)
 
 

@@ -27,11 +27,17 @@ def test_200_mutations_of_every_kind_are_tried():
 
 
 def test_every_fault_is_found(outcomes):
-    assert [outcome for outcome in outcomes if not outcome.found and outcome.job.name not in {*HARMLESS, *BEYOND}] == []
+    assert [
+        outcome
+        for outcome in outcomes
+        if not outcome.found and outcome.job.name not in {*HARMLESS, *BEYOND}
+    ] == []
 
 
 def test_what_does_no_harm_is_no_error(outcomes):
-    assert [outcome for outcome in outcomes if outcome.errors and outcome.job.name in HARMLESS] == []
+    assert [
+        outcome for outcome in outcomes if outcome.errors and outcome.job.name in HARMLESS
+    ] == []
 
 
 def test_no_pickle_ever_runs(outcomes):

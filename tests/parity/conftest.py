@@ -32,7 +32,9 @@ class GoldenCase:
 
     def _checked_index(self) -> int:
         if self.index is None:
-            pytest.fail(f"{self.folder / self.part}.json: no case in its list '{self.key}'; see pytest --golden DIR")
+            pytest.fail(
+                f"{self.folder / self.part}.json: no case in its list '{self.key}'; see pytest --golden DIR"
+            )
         return self.index
 
     @property
@@ -67,7 +69,9 @@ class GoldenRow:
 
     def __getitem__(self, name: str) -> np.ndarray:
         if self.index is None:
-            pytest.fail(f"{self.folder / self.part}.npz: no row in its array '{self.key}'; see pytest --golden DIR")
+            pytest.fail(
+                f"{self.folder / self.part}.npz: no row in its array '{self.key}'; see pytest --golden DIR"
+            )
         return _arrays(self.folder / f"{self.part}.npz")[name][self.index]
 
 
@@ -85,8 +89,12 @@ def _arrays(path: Path) -> dict[str, np.ndarray]:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    config.addinivalue_line("markers", "golden_cases(part, list): one test an entry of that list in the part's JSON")
-    config.addinivalue_line("markers", "golden_rows(part, array): one test a row of that array in the part's npz")
+    config.addinivalue_line(
+        "markers", "golden_cases(part, list): one test an entry of that list in the part's JSON"
+    )
+    config.addinivalue_line(
+        "markers", "golden_rows(part, array): one test a row of that array in the part's npz"
+    )
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
@@ -95,15 +103,25 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     if by_case is not None:
         part, key = by_case.args
         count = len(_json(folder / f"{part}.json").get(key, []))
-        _parametrize(metafunc, "golden", [GoldenCase(folder, part, key, index) for index in range(count) or [None]])
+        _parametrize(
+            metafunc,
+            "golden",
+            [GoldenCase(folder, part, key, index) for index in range(count) or [None]],
+        )
     by_row = metafunc.definition.get_closest_marker("golden_rows")
     if by_row is not None:
         part, key = by_row.args
         count = len(_arrays(folder / f"{part}.npz").get(key, []))
-        _parametrize(metafunc, "golden_row", [GoldenRow(folder, part, key, index) for index in range(count) or [None]])
+        _parametrize(
+            metafunc,
+            "golden_row",
+            [GoldenRow(folder, part, key, index) for index in range(count) or [None]],
+        )
 
 
-def _parametrize(metafunc: pytest.Metafunc, name: str, cases: Sequence[GoldenCase | GoldenRow]) -> None:
+def _parametrize(
+    metafunc: pytest.Metafunc, name: str, cases: Sequence[GoldenCase | GoldenRow]
+) -> None:
     metafunc.parametrize(name, cases, ids=lambda case: f"{case.part}-{case.index}")
 
 

@@ -27,7 +27,13 @@ from deepaccident_devkit.evaluation.accident.released import (
 )
 from deepaccident_devkit.evaluation.predictions import MotionOutput, first_frames
 from deepaccident_devkit.geometry.bev_grid import cells_in, to_orientation
-from deepaccident_devkit.motion import POST_PROCESSING, MotionHeads, MotionLabelConfig, MotionLabels, predict_instances
+from deepaccident_devkit.motion import (
+    POST_PROCESSING,
+    MotionHeads,
+    MotionLabelConfig,
+    MotionLabels,
+    predict_instances,
+)
 from deepaccident_devkit.motion.reference_arithmetic.outlines import pair_gaps
 
 ACCIDENT, RULES = POST_PROCESSING["accident"], ReleasedAccidents()
@@ -62,7 +68,11 @@ def label_of(golden: GoldenCase, orientation: str) -> MotionLabels:
     }
     turned = {
         name: to_orientation(
-            values, vectors=name in {"offset", "flow"}, source="released", target=orientation, ignore=255
+            values,
+            vectors=name in {"offset", "flow"},
+            source="released",
+            target=orientation,
+            ignore=255,
         )
         for name, values in maps.items()
     }
@@ -106,7 +116,9 @@ def evaluator_of(folder: Path, index: int, predictions: str, orientation: str) -
     evaluator = AccidentEvaluator(protocol="released")
     heads = heads_of(golden, orientation)[PREDICTIONS[predictions]]
     output = MotionOutput(grid=config(orientation).grid, heads=heads)
-    evaluator.update(golden.entry["sample_idx"] + f" {golden.index}", output, label_of(golden, orientation))
+    evaluator.update(
+        golden.entry["sample_idx"] + f" {golden.index}", output, label_of(golden, orientation)
+    )
     return evaluator
 
 
@@ -120,7 +132,9 @@ def evaluator_of_all(folder: Path, predictions: str) -> AccidentEvaluator:
 
 def whole(folder: Path) -> dict:
     found = GoldenCase(folder, "d_accident", "samples", None).whole
-    assert found.get("samples"), f"{folder / 'd_accident'}.json: no samples; see pytest --golden DIR"
+    assert found.get("samples"), (
+        f"{folder / 'd_accident'}.json: no samples; see pytest --golden DIR"
+    )
     return found
 
 
@@ -128,7 +142,9 @@ def released_centers(linked) -> dict[str, list]:
     """Points column before row, as the released code counts them."""
     shape = linked.instance.shape[1:]
     return {
-        str(name): np.stack(cells_in(*points.T, shape, linked.orientation, "released")[::-1], axis=-1).tolist()
+        str(name): np.stack(
+            cells_in(*points.T, shape, linked.orientation, "released")[::-1], axis=-1
+        ).tolist()
         for name, points in linked.centers.items()
     }
 
@@ -153,9 +169,13 @@ def test_instances_of_the_predictions(golden, orientation: str) -> None:
     heads = heads_of(golden, orientation)
     assert len(heads) == len(drawn)
     differing = []
-    for each, expected_drawn, centers in zip(heads, drawn, golden.entry["out"]["matched_centers_pred"], strict=True):
+    for each, expected_drawn, centers in zip(
+        heads, drawn, golden.entry["out"]["matched_centers_pred"], strict=True
+    ):
         linked = predict_instances(each, ACCIDENT)
-        redrawn = to_orientation(linked.redrawn, vectors=False, source=orientation, target="released")
+        redrawn = to_orientation(
+            linked.redrawn, vectors=False, source=orientation, target="released"
+        )
         differing.append(int((redrawn != expected_drawn).sum()))
         assert released_centers(linked) == centers
     assert differing == [0] * len(heads)
@@ -164,7 +184,10 @@ def test_instances_of_the_predictions(golden, orientation: str) -> None:
 @samples
 @pytest.mark.parametrize(
     ("predictions", "orientation"),
-    [*(("six_stable_sort", orientation) for orientation in ORIENTATIONS), ("one_stable_sort", "released")],
+    [
+        *(("six_stable_sort", orientation) for orientation in ORIENTATIONS),
+        ("one_stable_sort", "released"),
+    ],
 )
 def test_counts_of_each_sample(golden, predictions: str, orientation: str) -> None:
     [counts] = evaluator_of(golden.folder, golden.index, predictions, orientation).counts.values()
@@ -178,15 +201,21 @@ def test_counts_and_rates_of_all_samples(request: pytest.FixtureRequest, predict
     folder = request.config.getoption("golden")
     expected = whole(folder)["counters"][predictions]
     result = evaluator_of_all(folder, predictions).compute()
-    assert [f"{distance:g}" for distance in result.within] == [name for name in expected if name != "APA"]
+    assert [f"{distance:g}" for distance in result.within] == [
+        name for name in expected if name != "APA"
+    ]
     for distance, each in result.within.items():
         there = expected[f"{distance:g}"]
         assert [each.tp, each.fp, each.fn] == [there["tp"], there["fp"], there["fn"]]
         errors = [each.id_error, each.position_error, each.time_error] if each.tp else NOTHING_FOUND
         found = [each.accuracy, *errors]
-        assert_allclose(found, [there[name] for name in ("acc", "id", "pos", "time")], rtol=0, atol=1e-6)
+        assert_allclose(
+            found, [there[name] for name in ("acc", "id", "pos", "time")], rtol=0, atol=1e-6
+        )
     assert result.apa == pytest.approx(expected["APA"], abs=1e-6)
-    assert (result.samples, result.positives + result.negatives) == (len(whole(folder)["samples"]),) * 2
+    assert (result.samples, result.positives + result.negatives) == (
+        len(whole(folder)["samples"]),
+    ) * 2
 
 
 def test_samples_foreseen_within_15_metres(request: pytest.FixtureRequest) -> None:
@@ -194,11 +223,15 @@ def test_samples_foreseen_within_15_metres(request: pytest.FixtureRequest) -> No
     lines = whole(folder)["tp_list"]
     assert lines[-1] == ""
     counts = evaluator_of_all(folder, "six_stable_sort").counts.values()
-    assert [index for index, each in enumerate(counts) if each["tp"][-1]] == [int(line[:4]) - 1 for line in lines[:-1]]
+    assert [index for index, each in enumerate(counts) if each["tp"][-1]] == [
+        int(line[:4]) - 1 for line in lines[:-1]
+    ]
 
 
 def paths_of(entry: dict, drawn: np.ndarray) -> DrawnPaths:
-    return DrawnPaths(paths={int(name): np.array(points) * CELL for name, points in entry.items()}, drawn=drawn)
+    return DrawnPaths(
+        paths={int(name): np.array(points) * CELL for name, points in entry.items()}, drawn=drawn
+    )
 
 
 @pytest.mark.golden_cases("d2_eval_accidents", "cases")
@@ -230,7 +263,10 @@ def distances_of_samples(folder: Path) -> list[tuple[float, float]]:
         truth, _ = paths_of_heads(truth_heads(golden, "released"), config("released").grid)
         pairs, gaps = pair_gaps(truth.drawn[-1], np.array([*truth.paths], dtype=np.int64))
         found = dict(zip(map(tuple, pairs.tolist()), gaps.tolist(), strict=True))
-        listed = {(first, second): gap for first, second, gap in golden.entry["out"]["gt_pair_distances_last"]}
+        listed = {
+            (first, second): gap
+            for first, second, gap in golden.entry["out"]["gt_pair_distances_last"]
+        }
         assert {pair for pair, gap in found.items() if gap < 30 - MOVED_BY} <= set(listed)
         result += [(found[pair], gap) for pair, gap in listed.items()]
     return result
@@ -246,11 +282,15 @@ def distances_of_cases(folder: Path) -> list[tuple[float, float]]:
         frames = [(frame, entry["gt_traj"], image) for frame, image in enumerate(golden["gt"])]
         if entry["pred_traj"][0]:
             last = [maps[-1] for maps in golden["pred"]]
-            frames += [(entry["S"] - 1, *each) for each in zip(entry["pred_traj"], last, strict=True)]
+            frames += [
+                (entry["S"] - 1, *each) for each in zip(entry["pred_traj"], last, strict=True)
+            ]
         log = []
         for frame, paths, image in frames:
             pairs, gaps = pair_gaps(image, np.array([int(name) for name in paths], dtype=np.int64))
-            log += [(frame, *pair, gap) for pair, gap in zip(pairs.tolist(), gaps.tolist(), strict=True)]
+            log += [
+                (frame, *pair, gap) for pair, gap in zip(pairs.tolist(), gaps.tolist(), strict=True)
+            ]
         assert [row[:3] for row in log] == [tuple(row[:3]) for row in entry["distances"]]
         result += [(our[3], their[3]) for our, their in zip(log, entry["distances"], strict=True)]
     return result

@@ -51,14 +51,21 @@ def _cases(folder: Path) -> Mapping[str, Any]:
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     cases = _cases(metafunc.config.getoption("golden"))
     if "code" in metafunc.fixturenames:
-        pairs = [(name, code) for name, case in cases.items() for code in case if code.endswith("_stable")]
+        pairs = [
+            (name, code)
+            for name, case in cases.items()
+            for code in case
+            if code.endswith("_stable")
+        ]
         metafunc.parametrize(("case", "code"), pairs or [(None, None)])
     else:
         metafunc.parametrize("case", list(cases) or [None])
 
 
 @pytest.fixture
-def golden(case: str | None, pytestconfig: pytest.Config) -> tuple[Mapping[str, Any], dict[str, np.ndarray]]:
+def golden(
+    case: str | None, pytestconfig: pytest.Config
+) -> tuple[Mapping[str, Any], dict[str, np.ndarray]]:
     folder = pytestconfig.getoption("golden")
     if case is None:
         pytest.fail(f"{folder / 'safety' / 'anticipation.json'}: no case; see pytest --golden DIR")
@@ -67,12 +74,17 @@ def golden(case: str | None, pytestconfig: pytest.Config) -> tuple[Mapping[str, 
     return _cases(folder)[case], arrays
 
 
-def series_of(entry: Mapping[str, Any], arrays: Mapping[str, np.ndarray], *, cut: bool) -> ScoreSeries:
+def series_of(
+    entry: Mapping[str, Any], arrays: Mapping[str, np.ndarray], *, cut: bool
+) -> ScoreSeries:
     positive = arrays["labels"] > 0
     columns = arrays["scores"].shape[1]
     toa = np.where(positive, arrays["toa"], arrays["length"] if cut else columns)
     return ScoreSeries(
-        scores=arrays["scores"].astype(np.float64), positive=positive, toa=toa.astype(np.int64), fps=entry["fps"]
+        scores=arrays["scores"].astype(np.float64),
+        positive=positive,
+        toa=toa.astype(np.int64),
+        fps=entry["fps"],
     )
 
 

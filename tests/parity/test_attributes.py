@@ -37,7 +37,9 @@ def record_of(golden) -> dict[str, Any]:
     time = next(time for time in _TIMES if word.endswith(time))
     return {
         "scenario_type": golden.entry["sample_idx"].split("_accident_")[0] + "_accident",
-        "town": next(part for part in golden.entry["sample_idx"].split("_") if part.startswith("Town")),
+        "town": next(
+            part for part in golden.entry["sample_idx"].split("_") if part.startswith("Town")
+        ),
         "weather": word.removesuffix(time),
         "time_of_day": time,
         "collision": None if class1 == class2 == "-1" else {"classes": [class1, class2]},
@@ -70,9 +72,14 @@ def attributes_of(entry: dict[str, Any]) -> SampleAttributes:
 @pytest.mark.golden_cases("d_accident", "attributes_counter")
 def test_who_has_which_value(golden) -> None:
     name = list(golden.whole["attributes_counter"])[golden.index]
-    attributes = {str(index): attributes_of(entry) for index, entry in enumerate(golden.whole["samples"])}
+    attributes = {
+        str(index): attributes_of(entry) for index, entry in enumerate(golden.whole["samples"])
+    }
     found = tokens_by_value(attributes, _NAMES[name])
     expected = golden.whole["attributes_counter"][name]
-    as_ours = {_VISIBILITY.get(value, value): [str(index) for index in each] for value, each in expected.items()}
+    as_ours = {
+        _VISIBILITY.get(value, value): [str(index) for index in each]
+        for value, each in expected.items()
+    }
     assert found == as_ours
     assert list(found) == list(as_ours)

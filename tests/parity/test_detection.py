@@ -60,7 +60,9 @@ def columns(boxes: np.ndarray, category: np.ndarray, score: np.ndarray | None = 
 def frames(folder: Path) -> list[tuple[BoxColumns, BoxColumns]]:
     """Detections and true boxes of each frame."""
     with np.load(folder / "e_detection.npz") as archive:
-        numbers = sorted(name.removeprefix("gt_boxes_") for name in archive.files if name.startswith("gt_boxes_"))
+        numbers = sorted(
+            name.removeprefix("gt_boxes_") for name in archive.files if name.startswith("gt_boxes_")
+        )
         assert numbers
         return [
             (
@@ -75,7 +77,8 @@ def frames(folder: Path) -> list[tuple[BoxColumns, BoxColumns]]:
 def result(folder: Path, mode: str) -> DetectionResult:
     protocol = DETECTION_PROTOCOLS[mode]
     counts = [
-        {"token": f"{position:06d}", **frame_counts(*frame, protocol)} for position, frame in enumerate(frames(folder))
+        {"token": f"{position:06d}", **frame_counts(*frame, protocol)}
+        for position, frame in enumerate(frames(folder))
     ]
     return detection_result(json.loads(json.dumps(counts))[::-1], protocol)
 
@@ -99,7 +102,12 @@ def test_points_of_the_curves(golden, mode: str, prefix: str) -> None:
 @every_class
 def test_average_precisions_and_errors(golden) -> None:
     ours = result(golden.folder, "released")
-    assert differing(ours.average_precision[golden.index, 0], golden.whole["ap_per_threshold"][golden.index]) == 0
+    assert (
+        differing(
+            ours.average_precision[golden.index, 0], golden.whole["ap_per_threshold"][golden.index]
+        )
+        == 0
+    )
     assert list(RELEASED.thresholds) == golden.whole["distance_thresholds"]
     ate, ase, aoe, ave = ours.errors[golden.index]
     expected = [golden.whole[name][golden.index] for name in ("mATE", "mASE", "mAOE", "mAVE")]
@@ -116,13 +124,18 @@ def test_what_evaluate_returned(golden, mode: str, prefix: str) -> None:
     told = {"Overall_3D_mAP" if kind else "Overall_3D": ours.mean_average_precision}
     if kind:
         told |= {f"{name}_3D_{kind}": ours.class_average_precision[name]}
-        told |= {f"{name}_m{error}": value for error, value in zip(ERRORS, ours.errors[golden.index], strict=True)}
+        told |= {
+            f"{name}_m{error}": value
+            for error, value in zip(ERRORS, ours.errors[golden.index], strict=True)
+        }
     else:
         told |= {f"Overall_3D_{name}": ours.class_average_precision[name]}
         for ring, difficulty in enumerate(("easy", "moderate", "hard")):
             told[f"Overall_3D_{difficulty}"] = mean_of(ours.average_precision[:, ring])
             for level, strictness in enumerate(("strict", "loose")):
-                told[f"{name}_3D_{difficulty}_{strictness}"] = ours.average_precision[golden.index, ring, level]
+                told[f"{name}_3D_{difficulty}_{strictness}"] = ours.average_precision[
+                    golden.index, ring, level
+                ]
     for key, value in told.items():
         tolerance = SCALE_TOLERANCE if key.endswith("mASE") else TOLERANCE
         assert abs(value - expected[f"CARLA/{key}"]) <= tolerance, key
@@ -136,7 +149,9 @@ def test_one_frame_and_class(golden) -> None:
     wanted = expected["cls"]
     ring = ring_of(detections, truth, RELEASED, 0)
     ignored = np.where(ring.truth_counts, 0, 1)
-    assert_array_equal(np.where(class_codes(truth, RELEASED) == wanted, ignored, -1), expected["ignored_gt"])
+    assert_array_equal(
+        np.where(class_codes(truth, RELEASED) == wanted, ignored, -1), expected["ignored_gt"]
+    )
     of_class = np.where(class_codes(detections, RELEASED) == wanted, 0, -1)
     beyond = ~ring.counts
     assert_array_equal(np.where(beyond, 1, of_class), expected["ignored_dt"])
@@ -148,7 +163,8 @@ def test_one_frame_and_class(golden) -> None:
     reach = {
         candidate: pairs
         for candidate, pairs in ring.reach(SHOWN_THRESHOLD).items()
-        if candidate % classes == wanted and (not passes or detections.score[candidate // classes] >= SHOWN_SCORE)
+        if candidate % classes == wanted
+        and (not passes or detections.score[candidate // classes] >= SHOWN_SCORE)
     }
     counts = {candidate: bool(ring.counts[candidate // classes]) for candidate in reach}
     steps = nearest_by_truth(reach, counts, ring.truth_counts.tolist())
@@ -181,7 +197,9 @@ def test_the_evaluator_says_the_same(golden) -> None:
             )
             for boxes in (detections, truth)
         )
-        evaluator.update(f"{position:06d}", DetectedBoxes(boxes=predicted, scores=detections.score), true)
+        evaluator.update(
+            f"{position:06d}", DetectedBoxes(boxes=predicted, scores=detections.score), true
+        )
     ours, of_columns = evaluator.compute(), result(golden.folder, "released")
     assert_array_equal(ours.average_precision, of_columns.average_precision)
     assert_allclose(ours.errors, of_columns.errors, rtol=0, atol=1e-6)

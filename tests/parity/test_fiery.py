@@ -8,7 +8,12 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from deepaccident_devkit.motion import FramePolygons, MotionLabelConfig, MotionLabels, labels_from_polygons
+from deepaccident_devkit.motion import (
+    FramePolygons,
+    MotionLabelConfig,
+    MotionLabels,
+    labels_from_polygons,
+)
 
 FLIPS = 1
 
@@ -23,13 +28,18 @@ def fiery_labels(case) -> MotionLabels:
     ]
     past = np.zeros((config.receptive_field - 1, 6))
     id_map = {int(key): int(key) + 1 for key in number}
-    return labels_from_polygons(polygons, np.concatenate([past, case["egomotion"]]), config, id_map=id_map)
+    return labels_from_polygons(
+        polygons, np.concatenate([past, case["egomotion"]]), config, id_map=id_map
+    )
 
 
 @pytest.mark.golden_cases("h_fiery", "cases")
 def test_labels_equal_fierys(golden) -> None:
     labels = fiery_labels(golden)
-    differing = {name: int((getattr(labels, name) != golden[name]).sum()) for name in ("instance", "offset", "flow")}
+    differing = {
+        name: int((getattr(labels, name) != golden[name]).sum())
+        for name in ("instance", "offset", "flow")
+    }
     assert differing == {"instance": 0, "offset": 0, "flow": 0}
     assert_array_equal(labels.segmentation, golden["instance"] > 0)
     assert (labels.centerness.astype(np.float16) != golden["centerness"]).sum() <= FLIPS

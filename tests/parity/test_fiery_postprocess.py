@@ -30,7 +30,9 @@ def test_linked_instances_equal_fierys(golden, orientation: str) -> None:
     assert found.shape == expected.shape
     assert int((found != expected).sum()) == 0
     centers = {
-        str(name): np.stack(cells_in(*points.T, shape, orientation, "fiery"), axis=-1)[:, ::-1].tolist()
+        str(name): np.stack(cells_in(*points.T, shape, orientation, "fiery"), axis=-1)[
+            :, ::-1
+        ].tolist()
         for name, points in linked.centers.items()
     }
     assert centers == golden.entry["matched_centers"]

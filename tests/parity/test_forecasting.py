@@ -75,7 +75,9 @@ def test_errors_by_mode_equal_av2s(given: Mapping[str, np.ndarray], name: str) -
 
 @pytest.mark.parametrize("most", [1, 6])
 @pytest.mark.parametrize("name", BY_ACTOR)
-def test_errors_by_actor_equal_the_rules_on_av2s(given: Mapping[str, np.ndarray], name: str, most: int) -> None:
+def test_errors_by_actor_equal_the_rules_on_av2s(
+    given: Mapping[str, np.ndarray], name: str, most: int
+) -> None:
     paths, chances, truth, valid = modes_of(given)
     found = actor_errors(paths, truth, valid, chances, most)[name]
     assert_allclose(found, given[f"k{most}_{name}"].astype(float), rtol=0, atol=TOLERANCE)
@@ -84,7 +86,9 @@ def test_errors_by_actor_equal_the_rules_on_av2s(given: Mapping[str, np.ndarray]
 
 @pytest.mark.parametrize("world", WORLDS)
 def test_worlds_equal_av2s(given: Mapping[str, np.ndarray], world: int) -> None:
-    paths, truth, chances = (given[f"world_{name}_{world}"] for name in ("forecasts", "gt", "probability"))
+    paths, truth, chances = (
+        given[f"world_{name}_{world}"] for name in ("forecasts", "gt", "probability")
+    )
     ade, fde, missed = world_errors(paths, truth)
     assert_allclose(ade, given[f"world_ade_{world}"], rtol=0, atol=TOLERANCE)
     assert_allclose(fde, given[f"world_fde_{world}"], rtol=0, atol=TOLERANCE)
@@ -93,12 +97,28 @@ def test_worlds_equal_av2s(given: Mapping[str, np.ndarray], world: int) -> None:
     assert_array_equal(collisions(paths), given[f"world_collisions_{world}"])
 
 
-def test_every_golden_array_is_compared(given: Mapping[str, np.ndarray], pytestconfig: pytest.Config) -> None:
+def test_every_golden_array_is_compared(
+    given: Mapping[str, np.ndarray], pytestconfig: pytest.Config
+) -> None:
     inputs = {"forecasts", "gt", "valid", "probability", "n_modes"}
-    inputs |= {f"world_{name}_{world}" for name in ("forecasts", "gt", "probability") for world in WORLDS}
-    outputs = {*BY_MODE, *(f"k{most}_{kind}{name}" for most in (1, 6) for kind in ("", "mean_") for name in BY_ACTOR)}
+    inputs |= {
+        f"world_{name}_{world}" for name in ("forecasts", "gt", "probability") for world in WORLDS
+    }
+    outputs = {
+        *BY_MODE,
+        *(
+            f"k{most}_{kind}{name}"
+            for most in (1, 6)
+            for kind in ("", "mean_")
+            for name in BY_ACTOR
+        ),
+    }
     worlds = ("ade", "fde", "brier_fde", "misses", "collisions")
     outputs |= {f"world_{name}_{world}" for name in worlds for world in WORLDS}
     assert set(given) == inputs | outputs
-    cases = json.loads((pytestconfig.getoption("golden") / "forecasting" / "cases.json").read_text(encoding="utf-8"))
+    cases = json.loads(
+        (pytestconfig.getoption("golden") / "forecasting" / "cases.json").read_text(
+            encoding="utf-8"
+        )
+    )
     assert len(cases["cases"]) == len(given["forecasts"])

@@ -99,13 +99,17 @@ def augmentation_of(scene) -> Augmentation | None:
 
 
 def config_of(scene, **changes) -> MotionLabelConfig:
-    return MotionLabelConfig(**{"orientation": "released", "augmentation": augmentation_of(scene), **changes})
+    return MotionLabelConfig(
+        **{"orientation": "released", "augmentation": augmentation_of(scene), **changes}
+    )
 
 
 def labels_of(scene, **changes) -> MotionLabels:
     motion = flip_six_vector(scene["future_egomotions"])
     is_vehicle = scene.entry["agent"] != INFRASTRUCTURE
-    return motion_labels_from_boxes(frames_of(scene), motion, config_of(scene, **changes), is_vehicle=is_vehicle)
+    return motion_labels_from_boxes(
+        frames_of(scene), motion, config_of(scene, **changes), is_vehicle=is_vehicle
+    )
 
 
 def test_who_is_seen_equals_the_released_codes(golden) -> None:
@@ -118,7 +122,9 @@ def test_who_is_seen_equals_the_released_codes(golden) -> None:
 def test_corners_of_boxes_equal_the_released_codes(golden) -> None:
     scene = Scene(golden)
     frames = frames_of(scene)
-    drawn = box_polygons(frames, config_of(scene), is_vehicle=scene.entry["agent"] != INFRASTRUCTURE)
+    drawn = box_polygons(
+        frames, config_of(scene), is_vehicle=scene.entry["agent"] != INFRASTRUCTURE
+    )
     every = box_polygons(frames, config_of(scene, filter_invisible=False), is_vehicle=False)
     for t, frame in enumerate(frames):
         if frame is None:
@@ -132,7 +138,9 @@ def test_corners_of_boxes_equal_the_released_codes(golden) -> None:
         kept = np.isin(scene["ids", t], seen_first)
         assert_array_equal(drawn[t].key[~is_own], scene["ids", t][kept])
         assert_allclose(drawn[t].corners[~is_own], others[kept], rtol=0, atol=BOX_TOLERANCE)
-        assert_allclose(every[t].corners, others[scene["ids", t] != -100], rtol=0, atol=BOX_TOLERANCE)
+        assert_allclose(
+            every[t].corners, others[scene["ids", t] != -100], rtol=0, atol=BOX_TOLERANCE
+        )
 
 
 def flip(corners: np.ndarray) -> np.ndarray:

@@ -27,16 +27,21 @@ def test_labels_read_from_a_release_equal_the_released_codes(golden, tmp_path: P
     release = DeepAccident(dataroot=tmp_path, verbose=False, workers=1)
     own = release.motion_labels(token, config_of(scene))
     differing = {
-        name: int((getattr(own, name) != scene[name]).sum()) for name in ("segmentation", "instance", "offset", "flow")
+        name: int((getattr(own, name) != scene[name]).sum())
+        for name in ("segmentation", "instance", "offset", "flow")
     }
     present = own.to_present()
     for name in ("segmentation", "instance", "offset", "flow"):
         differing[f"w_{name}"] = int((getattr(present, name) != scene[f"w_{name}"]).sum())
-    assert differing == dict.fromkeys(differing, 0), f"scene {golden.index}: differing cells {differing}"
+    assert differing == dict.fromkeys(differing, 0), (
+        f"scene {golden.index}: differing cells {differing}"
+    )
     known = own.valid[:-1] & own.valid[1:]
     given = flip_six_vector(scene["future_egomotions"])[:-1][known]
     np.testing.assert_allclose(own.future_egomotion[:-1][known], given, rtol=0, atol=1e-6)
-    assert {str(actor): identity for actor, identity in own.id_map.items()} == scene.entry["instance_map"]
+    assert {str(actor): identity for actor, identity in own.id_map.items()} == scene.entry[
+        "instance_map"
+    ]
     assert own.label_valid.tolist() == scene["frame_valid"].astype(bool).tolist()
 
 
@@ -48,7 +53,9 @@ def write_release(scene: Scene, root: Path) -> str:
     (top / "meta").mkdir(parents=True)
     ids = " ".join(str(scene.entry["agent_ids"][agent]) for agent in AGENTS[:4])
     weather = f"ClearNoon -1 -1 -1 -1 -1 -1 -1 {length + 10}"
-    (top / "meta" / f"{name}.txt").write_text(f"{weather}\n colliding agents: none none\n agents id: {ids}\n")
+    (top / "meta" / f"{name}.txt").write_text(
+        f"{weather}\n colliding agents: none none\n agents id: {ids}\n"
+    )
     for a, agent in enumerate(AGENTS):
         for kind in ("label", "calib"):
             (top / agent / kind / name).mkdir(parents=True)
@@ -56,17 +63,27 @@ def write_release(scene: Scene, root: Path) -> str:
             k = min(max(round((number - present) / STEP) + PRESENT, 0), 6)
             calib = calib_of(scene, k)
             stem = f"{name}_{number:03d}"
-            (top / agent / "calib" / name / f"{stem}.pkl").write_bytes(pickle.dumps(calib, protocol=2))
+            (top / agent / "calib" / name / f"{stem}.pkl").write_bytes(
+                pickle.dumps(calib, protocol=2)
+            )
             t, between = divmod(number - present, STEP)
             rows = (
-                [] if between or not 0 <= t < LABEL_FRAMES else rows_of(scene, t, a, own=agent == scene.entry["agent"])
+                []
+                if between or not 0 <= t < LABEL_FRAMES
+                else rows_of(scene, t, a, own=agent == scene.entry["agent"])
             )
-            (top / agent / "label" / name / f"{stem}.txt").write_text("\n".join(["0.0 0.0", *rows, ""]))
+            (top / agent / "label" / name / f"{stem}.txt").write_text(
+                "\n".join(["0.0 0.0", *rows, ""])
+            )
     return f"type1_subtype1_accident/{name}/{scene.entry['agent']}/{present:03d}"
 
 
 def calib_of(scene: Scene, k: int) -> dict[str, np.ndarray]:
-    there = next(index for index in sorted(range(7), key=lambda index: abs(index - k)) if scene.has("e2w", index))
+    there = next(
+        index
+        for index in sorted(range(7), key=lambda index: abs(index - k))
+        if scene.has("e2w", index)
+    )
     lens = np.array([[800.0, 1142.5, 0], [450.0, 0, -1142.5], [1.0, 0, 0]])
     return {
         "lidar_to_ego": scene["l2e", there],
@@ -90,5 +107,7 @@ def rows_of(scene: Scene, t: int, a: int, *, own: bool) -> list[str]:
     classes = [CATEGORIES[code] for code in scene["vis_cls", t, a]]
     return [
         f"{name} {box} {number} {count} {bool(camera)}".replace("np.float64(", "").replace(")", "")
-        for name, box, number, count, camera in zip(classes, boxes, ids.tolist(), points.tolist(), seen, strict=True)
+        for name, box, number, count, camera in zip(
+            classes, boxes, ids.tolist(), points.tolist(), seen, strict=True
+        )
     ]

@@ -62,8 +62,17 @@ from deepaccident_devkit.plugins.model.motion import (
     frame_mask,
     motion_losses,
 )
-from deepaccident_devkit.plugins.model.motion.decoders import FlowGru, SpatialDistribution, warp_with_flow
-from deepaccident_devkit.plugins.model.motion.head import center_loss, latent_loss, segmentation_loss, vector_loss
+from deepaccident_devkit.plugins.model.motion.decoders import (
+    FlowGru,
+    SpatialDistribution,
+    warp_with_flow,
+)
+from deepaccident_devkit.plugins.model.motion.head import (
+    center_loss,
+    latent_loss,
+    segmentation_loss,
+    vector_loss,
+)
 from deepaccident_devkit.plugins.model.network import ModelConfig, V2XFormer
 from deepaccident_devkit.plugins.model.presets import released
 from deepaccident_devkit.plugins.model.temporal import TemporalConfig, temporal_model
@@ -105,7 +114,11 @@ def test_swin_and_its_neck_equal_the_released_ones(swin_neck):
 def test_the_index_of_relative_positions_is_the_released_one(swin_neck):
     golden, backbone, _ = swin_neck
     fresh = Swin(backbone.config).state_dict()
-    indices = {name: each for name, each in golden.state("img_backbone.").items() if name.endswith("_index")}
+    indices = {
+        name: each
+        for name, each in golden.state("img_backbone.").items()
+        if name.endswith("_index")
+    }
     assert len(indices) == sum(backbone.config.depths)
     for name, each in indices.items():
         assert torch.equal(fresh[name], each)
@@ -199,15 +212,23 @@ def check_sampled(ours: torch.Tensor, golden: torch.Tensor, mode: str) -> None:
 
 @pytest.mark.parametrize("mode", ["bilinear", "nearest"])
 @pytest.mark.parametrize("augmented", [False, True])
-def test_chains_of_warps_equal_the_released_warper(golden_model: Golden, augmented: bool, mode: WarpMode) -> None:
+def test_chains_of_warps_equal_the_released_warper(
+    golden_model: Golden, augmented: bool, mode: WarpMode
+) -> None:
     """FeatureWarper's cumulative warp; nearest: all but 0.5 % of the cells."""
     golden = golden_model("warps")
     given = golden.inputs()
     matrix = given["aug"] if augmented else None
-    chain = warps.present_from_past_batch(given["egomotion"][:, :2], chain="released", bev_transform=matrix)
+    chain = warps.present_from_past_batch(
+        given["egomotion"][:, :2], chain="released", bev_transform=matrix
+    )
     ours = given["x"].clone()
     ours[:, :2] = warps.warp_features(
-        given["x"][:, :2].flatten(0, 1), chain.flatten(0, 1), bounds(golden), warp="stretched", mode=mode
+        given["x"][:, :2].flatten(0, 1),
+        chain.flatten(0, 1),
+        bounds(golden),
+        warp="stretched",
+        mode=mode,
     ).unflatten(0, chain.shape[:2])
     check_sampled(ours, golden.outputs()[f"temporal{'_aug' if augmented else ''}_{mode}"], mode)
 
@@ -218,21 +239,34 @@ def test_partners_are_placed_as_by_the_released_warper(golden_model: Golden) -> 
     given, expected, grid = golden.inputs(), golden.outputs(), bounds(golden)
     ego_from_agent = warps.matrices_from_six(given["relative_pose"])
     check_close(ego_from_agent, expected["pose_mats"], 1e-6)
-    check_close(warps.features_to_ego(given["xv"], ego_from_agent, grid, warp="stretched"), expected["v2x"])
+    check_close(
+        warps.features_to_ego(given["xv"], ego_from_agent, grid, warp="stretched"), expected["v2x"]
+    )
     own = given["aug_v"]
     as_released = warps.between_augmented(ego_from_agent, own, own)
-    check_close(warps.features_to_ego(given["xv"], as_released, grid, warp="stretched"), expected["v2x_aug_released"])
+    check_close(
+        warps.features_to_ego(given["xv"], as_released, grid, warp="stretched"),
+        expected["v2x_aug_released"],
+    )
     right = warps.between_augmented(ego_from_agent, own[:, :1], own)
-    check_close(warps.features_to_ego(given["xv"], right, grid, warp="stretched"), expected["v2x_aug_right"])
+    check_close(
+        warps.features_to_ego(given["xv"], right, grid, warp="stretched"), expected["v2x_aug_right"]
+    )
 
 
-@pytest.mark.parametrize(("name", "pose"), [("identity_full", [0.0] * 6), ("move_full", [7.3, -3.1, 0, 0, 0, 0.6])])
-def test_a_full_map_is_warped_as_by_the_released_warper(golden_model: Golden, name: str, pose: list[float]) -> None:
+@pytest.mark.parametrize(
+    ("name", "pose"), [("identity_full", [0.0] * 6), ("move_full", [7.3, -3.1, 0, 0, 0, 0.6])]
+)
+def test_a_full_map_is_warped_as_by_the_released_warper(
+    golden_model: Golden, name: str, pose: list[float]
+) -> None:
     """128 × 128 cells of 0.8 m."""
     golden = golden_model("warps")
     target_from_source = warps.matrices_from_six(torch.tensor([pose]))
     features = golden.inputs()["xf"][:, 0]
-    ours = warps.warp_features(features[:, None], target_from_source, bounds(golden, "full"), warp="stretched")
+    ours = warps.warp_features(
+        features[:, None], target_from_source, bounds(golden, "full"), warp="stretched"
+    )
     check_close(ours, golden.outputs()[name])
 
 
@@ -253,7 +287,9 @@ def test_temporal_model_equals_the_released_one(golden_model: Golden, case: str)
     model.load_state_dict(golden.state("temporal_model."))
     model.train(case.startswith("train"))
     matrix = given["aug"] if case.endswith("aug") else None
-    ours = model(given["x"], given["egomotion"][:, :frames], given["img_is_valid"][:, :frames], matrix)
+    ours = model(
+        given["x"], given["egomotion"][:, :frames], given["img_is_valid"][:, :frames], matrix
+    )
     check_close(ours, golden.outputs()[case])
 
 
@@ -282,7 +318,9 @@ def test_the_released_fusion_s_unreached_layers_equal_its_own(golden_model: Gold
     """The layers behind the early return, called in the order of the lines that are never reached."""
     golden = golden_model("fusion_agent3d_dead")
     given, expected = golden.inputs(), golden.outputs()
-    model = Agent3D(Agent3DConfig(channels=golden.config["in_channels"], agents=golden.config["num_agents"])).eval()
+    model = Agent3D(
+        Agent3DConfig(channels=golden.config["in_channels"], agents=golden.config["num_agents"])
+    ).eval()
     model.load_state_dict(golden.state("v2x_fusion."))
     check_close(model.over_agents(given["warped"], given["relative_pose"]), expected["after_model"])
     check_close(model(given["warped"], given["relative_pose"]), expected["compressed"])
@@ -292,10 +330,16 @@ def test_disconet_equals_the_original(golden_model: Golden) -> None:
     """PixelWeightedFusionSoftmax and Linear, of CoBEVT's code."""
     golden = golden_model("ref_disconet")
     given, expected = golden.inputs(), golden.outputs()
-    model = fusion(DiscoNetConfig(channels=golden.config["channels"], last_relu=golden.config["final_relu"])).eval()
-    model.load_state_dict({**disconet_scores(golden), **renamed(golden.state("mlp."), [(r"^", "out.")])})
+    model = fusion(
+        DiscoNetConfig(channels=golden.config["channels"], last_relu=golden.config["final_relu"])
+    ).eval()
+    model.load_state_dict(
+        {**disconet_scores(golden), **renamed(golden.state("mlp."), [(r"^", "out.")])}
+    )
     check_close(model.weights(given["x"], given["mask"]), expected["weights"][:, :, 0])
-    check_close(model(given["x"], given["mask"], *vehicles_without_delay(given["mask"])), expected["y"])
+    check_close(
+        model(given["x"], given["mask"], *vehicles_without_delay(given["mask"])), expected["y"]
+    )
 
 
 def disconet_scores(golden: GoldenModel) -> dict[str, torch.Tensor]:
@@ -332,7 +376,9 @@ def test_cobevt_equals_the_original(golden_model: Golden) -> None:
     model.load_state_dict(renamed(state, table))
     first = model.layers[0](given["x"].movedim(2, -1), given["mask"]).movedim(-1, 2)
     check_close(first, expected["after_block0"])
-    check_close(model(given["x"], given["mask"], *vehicles_without_delay(given["mask"])), expected["y"])
+    check_close(
+        model(given["x"], given["mask"], *vehicles_without_delay(given["mask"])), expected["y"]
+    )
 
 
 def test_v2xvit_equals_the_original(golden_model: Golden) -> None:
@@ -357,7 +403,9 @@ def test_v2xvit_equals_the_original(golden_model: Golden) -> None:
     check_close(tokens, expected["after_rte"])
     for number, block in enumerate(model.blocks):
         if number == 0:
-            check_close(block.agents.layer(block.agents.norm(tokens), mask, infra), expected["hmsa0"])
+            check_close(
+                block.agents.layer(block.agents.norm(tokens), mask, infra), expected["hmsa0"]
+            )
         tokens = block(tokens, mask, infra)
         layer = expected[f"after_layer{number}"]
         check_close(tokens, layer, 2e-3 if layer.dtype == torch.float16 else 1e-4)
@@ -393,7 +441,9 @@ def v2xvit_state(state: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
     return ours
 
 
-def renamed(state: dict[str, torch.Tensor], table: list[tuple[str, str]]) -> dict[str, torch.Tensor]:
+def renamed(
+    state: dict[str, torch.Tensor], table: list[tuple[str, str]]
+) -> dict[str, torch.Tensor]:
     for pattern, replacement in table:
         state = {re.sub(pattern, replacement, key): value for key, value in state.items()}
     return state
@@ -420,7 +470,8 @@ BATCH = (
 def test_the_crop_is_the_released_one(golden_model) -> None:
     golden = golden_model("crop")
     source, target = (
-        BevGrid(golden.config[name]["xbound"], golden.config[name]["ybound"]) for name in ("grid", "motion")
+        BevGrid(golden.config[name]["xbound"], golden.config[name]["ybound"])
+        for name in ("grid", "motion")
     )
     check_close(crop(golden.inputs()["x"], source, target), golden.outputs()["y"], 1e-5)
 
@@ -429,7 +480,11 @@ def test_the_encoder_is_the_released_one(golden_model) -> None:
     golden = golden_model("bev_encoder")
     inputs = golden.config["numC_input"]
     widths = (2 * inputs, 4 * inputs, 8 * inputs)
-    encoder = BevEncode(BevEncodeConfig(in_channels=inputs, out_channels=golden.config["numC_output"], widths=widths))
+    encoder = BevEncode(
+        BevEncodeConfig(
+            in_channels=inputs, out_channels=golden.config["numC_output"], widths=widths
+        )
+    )
     encoder.load_state_dict(golden.state("taskfeat_encoders.motion."))
     check_close(encoder.eval()(golden.inputs()["x"]), golden.outputs()["y"])
 
@@ -447,7 +502,9 @@ def test_future_states_are_the_released_ones(golden_model) -> None:
 
 def test_the_distribution_is_the_released_one(golden_model) -> None:
     golden = golden_model("future_prediction")
-    inputs, latent, limits = (golden.config[name] for name in ("in_channels", "latent_dim", "log_sigma"))
+    inputs, latent, limits = (
+        golden.config[name] for name in ("in_channels", "latent_dim", "log_sigma")
+    )
     distribution = SpatialDistribution(inputs, inputs // 2, latent, tuple(limits))
     distribution.load_state_dict(golden.state("present_distribution."))
     found = distribution.eval()(golden.inputs()["dist_x"][:, 0])
@@ -457,7 +514,9 @@ def test_the_distribution_is_the_released_one(golden_model) -> None:
 
 def test_training_outputs_are_the_released_ones(golden_model) -> None:
     golden = golden_model("motion_head")
-    outputs = head_of(golden).train()(golden.inputs()["x"], warped_targets(golden), noise=golden.inputs()["noise"])
+    outputs = head_of(golden).train()(
+        golden.inputs()["x"], warped_targets(golden), noise=golden.inputs()["noise"]
+    )
     expected = golden.outputs()
     for name, maps in outputs.maps._asdict().items():
         check_close(maps, expected[f"train.{name}"])
@@ -468,8 +527,14 @@ def test_training_outputs_are_the_released_ones(golden_model) -> None:
 
 def test_losses_and_gradients_of_the_head_are_the_released_ones(golden_model) -> None:
     golden = golden_model("motion_head")
-    head, features, targets = head_of(golden), golden.inputs()["x"].requires_grad_(), warped_targets(golden)
-    losses = motion_losses(head.train()(features, targets, noise=golden.inputs()["noise"]), targets, MotionLossConfig())
+    head, features, targets = (
+        head_of(golden),
+        golden.inputs()["x"].requires_grad_(),
+        warped_targets(golden),
+    )
+    losses = motion_losses(
+        head.train()(features, targets, noise=golden.inputs()["noise"]), targets, MotionLossConfig()
+    )
     expected = golden.outputs()
     for name, loss in losses.items():
         check_close(loss, expected[f"loss.loss_{name}"])
@@ -484,11 +549,17 @@ def test_predictions_are_the_released_ones(golden_model) -> None:
     """Draws 1 to 4 are stored in float16."""
     golden = golden_model("motion_head")
     with torch.no_grad():
-        maps = head_of(golden).eval()(golden.inputs()["x"], noise=golden.inputs()["eval_noise"]).maps
+        maps = (
+            head_of(golden).eval()(golden.inputs()["x"], noise=golden.inputs()["eval_noise"]).maps
+        )
     for name, values in golden.outputs().items():
         if name.startswith("eval."):
             _, draw, part = name.split(".")
-            check_close(getattr(maps, part)[int(draw)], values, 1e-4 if values.dtype == torch.float32 else 2e-3)
+            check_close(
+                getattr(maps, part)[int(draw)],
+                values,
+                1e-4 if values.dtype == torch.float32 else 2e-3,
+            )
 
 
 def test_the_devkit_warps_labels_as_the_released_head(golden_model) -> None:
@@ -499,7 +570,10 @@ def test_the_devkit_warps_labels_as_the_released_head(golden_model) -> None:
         labels = released_labels(golden, sample).to_present("nearest")
         here = labels.label_valid
         for name in ("segmentation", "centerness", "offset", "flow"):
-            found, warped = getattr(labels, name)[here], getattr(expected, name)[sample].numpy()[here]
+            found, warped = (
+                getattr(labels, name)[here],
+                getattr(expected, name)[sample].numpy()[here],
+            )
             np.testing.assert_array_equal(found, warped, err_msg=name)
 
 
@@ -524,7 +598,11 @@ def test_each_loss_is_the_released_one(golden_model, name, target, loss, config)
         "offset": given["label.instance_offset"],
         "flow": given["label.instance_flow"],
     }[target]
-    head = {"ignored": "segmentation", "segmentation": "segmentation", "centerness": "instance_center"}
+    head = {
+        "ignored": "segmentation",
+        "segmentation": "segmentation",
+        "centerness": "instance_center",
+    }
     predicted = given[f"pred.{head.get(target, f'instance_{target}')}"].requires_grad_()
     found = loss(predicted, label, given["frame_mask"], MotionLossConfig(**config))
     check_close(found, expected[name])
@@ -537,7 +615,8 @@ def test_the_divergence_is_the_released_one(golden_model, name, first) -> None:
     golden = golden_model("motion_losses")
     given = golden.inputs()
     present, future = (
-        LatentDistribution(given[f"{when}_mu"], given[f"{when}_log_sigma"]) for when in ("present", "future")
+        LatentDistribution(given[f"{when}_mu"], given[f"{when}_log_sigma"])
+        for when in ("present", "future")
     )
     mask = torch.zeros(len(present.mu), dtype=torch.bool)
     mask[:first] = True
@@ -550,7 +629,9 @@ def test_nothing_to_learn_from_gives_no_loss(golden_model) -> None:
     nothing = torch.zeros_like(given["frame_mask"])
     config = MotionLossConfig()
     check_close(
-        segmentation_loss(given["pred.segmentation"], given["label.motion_segmentation"], nothing, config),
+        segmentation_loss(
+            given["pred.segmentation"], given["label.motion_segmentation"], nothing, config
+        ),
         expected["seg_no_frame"],
     )
     check_close(
@@ -564,7 +645,8 @@ def test_from_fused_features_on_it_predicts_as_the_released_model(golden_model) 
     golden = golden_model("end_to_end")
     heads, given = golden.config["pts_bbox_head"], golden.inputs()
     source, target = (
-        BevGrid(grid["xbound"], grid["ybound"]) for grid in (heads["grid_conf"], heads["motion_grid_conf"])
+        BevGrid(grid["xbound"], grid["ybound"])
+        for grid in (heads["grid_conf"], heads["motion_grid_conf"])
     )
     small = config(golden)
     encoder = BevEncode(small.bev)
@@ -581,11 +663,17 @@ def test_from_fused_features_on_it_predicts_as_the_released_model(golden_model) 
 
 def floats(state: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
     """Weights stored in half precision, as they are used."""
-    return {name: values.float() if values.is_floating_point() else values for name, values in state.items()}
+    return {
+        name: values.float() if values.is_floating_point() else values
+        for name, values in state.items()
+    }
 
 
 def head_of(golden: GoldenModel) -> MotionHead:
-    sizes = {"in_channels": golden.config["in_channels"], "latent": golden.config["prob_latent_dim"]}
+    sizes = {
+        "in_channels": golden.config["in_channels"],
+        "latent": golden.config["prob_latent_dim"],
+    }
     head = MotionHead(MotionHeadConfig(**sizes, **RELEASED))
     head.load_state_dict(golden.state("task_decoders.motion."))
     return head
@@ -606,14 +694,18 @@ def warped_targets(golden: GoldenModel) -> MotionTargets:
 
 def released_labels(golden: GoldenModel, sample: int) -> MotionLabels:
     """One sample's labels, each frame in its own frame, as the released loader gives them."""
-    given = {name: values[sample].numpy() for name, values in golden.inputs().items() if name in BATCH}
+    given = {
+        name: values[sample].numpy() for name, values in golden.inputs().items() if name in BATCH
+    }
     bounds = golden.config["grid_conf"]
     config = MotionLabelConfig(
         grid=BevGrid(bounds["xbound"], bounds["ybound"]),
         orientation="released",
         augmentation=augmentation_of(golden.inputs()["aug_transform"][sample].numpy()),
     )
-    return MotionLabels.from_batch(given | {"future_egomotions": given["future_egomotion"]}, config, "deepaccident")
+    return MotionLabels.from_batch(
+        given | {"future_egomotions": given["future_egomotion"]}, config, "deepaccident"
+    )
 
 
 def augmentation_of(matrix: np.ndarray) -> Augmentation:
@@ -659,7 +751,9 @@ def head_config(det: GoldenModel) -> DetectionConfig:
 
 def golden_maps(det: GoldenModel) -> list[TaskMaps]:
     outputs = det.outputs()
-    return [TaskMaps(*(outputs[f"pred.{task}.{name}"] for name in TaskMaps._fields)) for task in TASKS]
+    return [
+        TaskMaps(*(outputs[f"pred.{task}.{name}"] for name in TaskMaps._fields)) for task in TASKS
+    ]
 
 
 def our_targets(det: GoldenModel) -> list[TaskTargets]:
@@ -694,7 +788,11 @@ def test_losses_and_gradient_of_the_released_head(det: GoldenModel, head: Center
     x = det.inputs()["x"].requires_grad_()
     maps = head.train()(x)
     losses = detection_losses(maps, our_targets(det), DetectionLossConfig(weight=1.0))
-    golden = {key.removeprefix("loss."): value for key, value in det.outputs().items() if key.startswith("loss.")}
+    golden = {
+        key.removeprefix("loss."): value
+        for key, value in det.outputs().items()
+        if key.startswith("loss.")
+    }
     assert losses.keys() == golden.keys()
     for name, value in losses.items():
         check_close(value, golden[name])
@@ -706,10 +804,18 @@ def test_losses_and_gradient_of_the_released_head(det: GoldenModel, head: Center
 @pytest.mark.parametrize("task", TASKS)
 def test_decoded_boxes_of_the_released_coder(det: GoldenModel, task: int) -> None:
     coder = det.config["bbox_coder"]
-    config = DecodingConfig(candidates=coder["max_num"], center_range=tuple(coder["post_center_range"]))
-    found, outputs = decode_candidates(golden_maps(det)[task], head_config(det), config), det.outputs()
+    config = DecodingConfig(
+        candidates=coder["max_num"], center_range=tuple(coder["post_center_range"])
+    )
+    found, outputs = (
+        decode_candidates(golden_maps(det)[task], head_config(det), config),
+        det.outputs(),
+    )
     for sample in range(len(det.inputs()["boxes"])):
-        golden = {name: outputs[f"decode.{task}.{sample}.{name}"] for name in ("boxes", "scores", "labels")}
+        golden = {
+            name: outputs[f"decode.{task}.{sample}.{name}"]
+            for name in ("boxes", "scores", "labels")
+        }
         valid = found.valid[sample]
         check_close(found.scores[sample, valid], golden["scores"])
         check_close(found.boxes[sample, valid], golden["boxes"])
@@ -722,7 +828,10 @@ def test_circle_suppression_of_the_released_code(det: GoldenModel) -> None:
     assert suppressed
     for name, kept in suppressed.items():
         _, task, sample = name.split(".")
-        found = (outputs[f"decode.{task}.{sample}.{each}"].numpy() for each in ("boxes", "scores", "labels"))
+        found = (
+            outputs[f"decode.{task}.{sample}.{each}"].numpy()
+            for each in ("boxes", "scores", "labels")
+        )
         boxes, scores, labels = found
         ours = suppress(boxes, scores, labels.astype(np.int64), RELEASED_NMS[int(task)])
         np.testing.assert_array_equal(ours, kept.numpy())
@@ -757,16 +866,22 @@ def config(golden: GoldenModel) -> ModelConfig:
         ),
         temporal=replace(whole.temporal, grid=BevGrid(**along)),
         bev=BevEncodeConfig(
-            in_channels=heads["in_channels"], out_channels=heads["out_channels"], widths=tuple(heads["num_channels"])
+            in_channels=heads["in_channels"],
+            out_channels=heads["out_channels"],
+            widths=tuple(heads["num_channels"]),
         ),
-        motion=replace(whole.motion, in_channels=motion["in_channels"], latent=motion["prob_latent_dim"]),
+        motion=replace(
+            whole.motion, in_channels=motion["in_channels"], latent=motion["prob_latent_dim"]
+        ),
         detection=replace(
             whole.detection,
             in_channels=detection["in_channels"],
             shared_channels=detection["share_conv_channel"],
             **along,
         ),
-        targets=TargetConfig(unknown_velocity="zero", max_boxes=small["train_cfg"]["pts"]["max_objs"]),
+        targets=TargetConfig(
+            unknown_velocity="zero", max_boxes=small["train_cfg"]["pts"]["max_objs"]
+        ),
         decoding=DecodingConfig(),
         labels=replace(whole.labels, grid=BevGrid(**own, orientation="released")),
     )
@@ -799,7 +914,9 @@ def inputs_of(given: dict[str, Any]) -> ModelInputs:
 
 def model_of(golden: Any) -> V2XFormer:
     model = V2XFormer(config(golden))
-    done = load_weights(model, Weights(tensors=golden.state(), meta={}, path=Path("end_to_end.npz")), whole=True)
+    done = load_weights(
+        model, Weights(tensors=golden.state(), meta={}, path=Path("end_to_end.npz")), whole=True
+    )
     assert not done.kept
     assert not done.unused
     return model
@@ -811,7 +928,9 @@ def test_each_part_of_a_prediction_is_the_released_one(golden_model) -> None:
     inputs = inputs_of(given)
     with torch.no_grad():
         neck = model.img_neck(model.img_backbone(inputs.images.flatten(0, 3)))
-        lifted = model.transformer(neck.unflatten(0, inputs.images.shape[1:4]), inputs.cameras.flattened())
+        lifted = model.transformer(
+            neck.unflatten(0, inputs.images.shape[1:4]), inputs.cameras.flattened()
+        )
         maps = model.encoded(inputs)
         fused = model.fused(maps, inputs)
         # of the five draws only the first one's noise is stored; the last prediction is the mean's
@@ -835,12 +954,23 @@ def test_each_part_of_a_prediction_is_the_released_one(golden_model) -> None:
 def test_losses_and_gradients_of_a_step_are_the_released_ones(golden_model) -> None:
     golden = golden_model("end_to_end")
     given, expected, model = golden.inputs(), golden.outputs(), model_of(golden).train()
-    names = ("motion_segmentation", "motion_instance", "instance_centerness", "instance_offset", "instance_flow")
+    names = (
+        "motion_segmentation",
+        "motion_instance",
+        "instance_centerness",
+        "instance_offset",
+        "instance_flow",
+    )
     batch = {name: given[name][0].numpy() for name in names}
     batch |= {"future_egomotions": given["agent0.egomotion"][0].numpy()}
     batch |= {"img_is_valid": given["agent0.img_is_valid"][0].numpy()}
-    labels = MotionLabels.from_batch(batch, config(golden).labels, "deepaccident").to_present("nearest")
-    maps = [torch.tensor(getattr(labels, name))[None] for name in ("segmentation", "centerness", "offset", "flow")]
+    labels = MotionLabels.from_batch(batch, config(golden).labels, "deepaccident").to_present(
+        "nearest"
+    )
+    maps = [
+        torch.tensor(getattr(labels, name))[None]
+        for name in ("segmentation", "centerness", "offset", "flow")
+    ]
     valid = torch.tensor(labels.valid)[None]
     motion = MotionTargets(maps[0].long(), *maps[1:], frame_mask(valid[:, PAST:], valid[:, :PAST]))
     boxes = given["boxes"].clone()
@@ -865,7 +995,8 @@ def test_losses_and_gradients_of_a_step_are_the_released_ones(golden_model) -> N
 
 
 @pytest.mark.parametrize(
-    ("name", "unused"), [("DeepAccident_tiny", None), ("DeepAccident_tiny_v2x", Agent3DConfig(channels=64))]
+    ("name", "unused"),
+    [("DeepAccident_tiny", None), ("DeepAccident_tiny_v2x", Agent3DConfig(channels=64))],
 )
 def test_names_and_shapes_are_those_of_the_released_configs(
     request: pytest.FixtureRequest, name: str, unused: Agent3DConfig | None
@@ -876,5 +1007,8 @@ def test_names_and_shapes_are_those_of_the_released_configs(
         whole = released()
         model = V2XFormer(replace(whole, fusion=replace(whole.fusion, agent3d=unused)))
     state = model.state_dict()
-    found = [f"{key} {tuple(each.shape)} {str(each.dtype).removeprefix('torch.')}" for key, each in state.items()]
+    found = [
+        f"{key} {tuple(each.shape)} {str(each.dtype).removeprefix('torch.')}"
+        for key, each in state.items()
+    ]
     assert sorted(found) == sorted(path.read_text(encoding="utf-8").splitlines())

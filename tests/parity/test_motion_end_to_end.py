@@ -46,7 +46,10 @@ class Sample:
 
     @property
     def label(self) -> MotionLabels:
-        inputs, valid = self._inputs, np.arange(RELEASED.frames) < RELEASED.receptive_field - 1 + self.frames
+        inputs, valid = (
+            self._inputs,
+            np.arange(RELEASED.frames) < RELEASED.receptive_field - 1 + self.frames,
+        )
         return MotionLabels(
             config=RELEASED,
             segmentation=inputs["gt_seg"].astype(np.uint8),
@@ -64,7 +67,9 @@ class Sample:
     def prediction(self) -> MotionOutput:
         names = ("pred_seg_q", "pred_center_q", "pred_off_q", "pred_flow_q")
         heads = []
-        for logit, center, offset, flow in zip(*(self._inputs[name] for name in names), strict=True):
+        for logit, center, offset, flow in zip(
+            *(self._inputs[name] for name in names), strict=True
+        ):
             quantised = logit.astype(np.float32) / 16
             heads.append(
                 MotionHeads(
@@ -108,11 +113,15 @@ def assert_as_printed(result: MotionResult, text: str) -> None:
         each = result.ranges[name]
         denominator = each.true_positive + each.false_positive / 2 + each.false_negative / 2
         found = [each.iou, each.pq, each.sq, each.rq, 100 * max(denominator, 1)]
-        np.testing.assert_allclose(found, [float(number) for number in numbers], rtol=0, atol=5.1e-4, err_msg=name)
+        np.testing.assert_allclose(
+            found, [float(number) for number in numbers], rtol=0, atol=5.1e-4, err_msg=name
+        )
     for name, pattern in _PATHS.items():
         match = re.search(pattern, text)
         assert match, f"{pattern} is not in the block"
-        np.testing.assert_allclose(getattr(result, name), float(match[1]), rtol=0, atol=5.1e-5, err_msg=name)
+        np.testing.assert_allclose(
+            getattr(result, name), float(match[1]), rtol=0, atol=5.1e-5, err_msg=name
+        )
 
 
 @pytest.mark.golden_cases("d_accident", "samples")
@@ -121,7 +130,9 @@ def test_paths_of_a_sample(golden) -> None:
     out, counts = golden.entry["out"], evaluator.counts[str(golden.index)]["paths"]
     expected = out["eval_metrics"]
     found = [counts["ade"], counts["fde"], counts["missed"], counts["count"]]
-    np.testing.assert_allclose(found, [expected[0], expected[3], expected[6], expected[8]], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(
+        found, [expected[0], expected[3], expected[6], expected[8]], rtol=0, atol=1e-9
+    )
     pairs, _, alarms, lost = out["traj_mapping_stable_sort"][-1]
     numbers = [counts[name] for name in ("true_positive", "false_positive", "false_negative")]
     assert numbers == [len(pairs), len(alarms), len(lost)]
@@ -129,7 +140,10 @@ def test_paths_of_a_sample(golden) -> None:
 
 @pytest.mark.golden_cases("d_accident", "attributes_counter")
 def test_what_was_printed_by_attribute(golden) -> None:
-    name, (evaluator, order) = list(golden.whole["attributes_counter"])[golden.index], everything(golden)
+    name, (evaluator, order) = (
+        list(golden.whole["attributes_counter"])[golden.index],
+        everything(golden),
+    )
     values = golden.whole["attributes_counter"][name]
     texts = {value: text for attribute, value, text in blocks(golden.folder) if attribute == name}
     assert list(texts) == list(values)
@@ -141,7 +155,10 @@ def test_what_was_printed_by_attribute(golden) -> None:
 @pytest.mark.golden_cases("d_accident", "attributes_counter")
 def test_the_correct_breakdown_adds_up_to_what_was_printed_of_everything(golden) -> None:
     """Each sample has one value, so that the values' instances are all of them: as released they are not."""
-    name, (evaluator, _) = list(golden.whole["attributes_counter"])[golden.index], everything(golden)
+    name, (evaluator, _) = (
+        list(golden.whole["attributes_counter"])[golden.index],
+        everything(golden),
+    )
     (text,) = [text for attribute, _, text in blocks(golden.folder) if attribute == ALL]
     result = evaluator.compute()
     assert_as_printed(result, text)
@@ -151,4 +168,6 @@ def test_the_correct_breakdown_adds_up_to_what_was_printed_of_everything(golden)
     ]
     for extent, each in result.ranges.items():
         for count in ("true_positive", "false_positive", "false_negative"):
-            assert sum(getattr(group.ranges[extent], count) for group in groups) == getattr(each, count)
+            assert sum(getattr(group.ranges[extent], count) for group in groups) == getattr(
+                each, count
+            )

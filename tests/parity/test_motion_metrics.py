@@ -51,7 +51,9 @@ def vpq(counts: Sequence[VpqCounts]) -> list[PanopticQuality]:
 
 def assert_quality(found: Sequence[PanopticQuality], expected: dict) -> None:
     for key in ("pq", "sq", "rq", "denominator"):
-        assert_allclose([getattr(each, key) for each in found], expected[key], rtol=0, atol=TOLERANCE)
+        assert_allclose(
+            [getattr(each, key) for each in found], expected[key], rtol=0, atol=TOLERANCE
+        )
 
 
 @by_range
@@ -61,7 +63,9 @@ def test_vpq_of_a_sequence(golden, name: str) -> None:
     assert len(found.iou) == golden.entry["S"]
     for key in ("true_positive", "false_positive", "false_negative"):
         assert_array_equal(getattr(found, key), [frame[key] for frame in expected["per_frame"]])
-    assert_allclose(found.iou, [frame["iou"] for frame in expected["per_frame"]], rtol=TOLERANCE, atol=TOLERANCE)
+    assert_allclose(
+        found.iou, [frame["iou"] for frame in expected["per_frame"]], rtol=TOLERANCE, atol=TOLERANCE
+    )
     assert_quality(vpq([found]), expected)
 
 
@@ -88,20 +92,35 @@ def test_all_sequences(golden) -> None:
     """Sums over everything, and over the sequences `selected_index`, as a breakdown takes them; and the mistake."""
     name = list(golden.whole["aggregate"])[golden.index]
     expected, selected = golden.whole["aggregate"][name], golden.whole["selected_index"]
-    cases = [replace(golden, key="sequences", index=number) for number in range(len(golden.whole["sequences"]))]
+    cases = [
+        replace(golden, key="sequences", index=number)
+        for number in range(len(golden.whole["sequences"]))
+    ]
     counts = [vpq_counts(*instances(case, name)) for case in cases]
     cells = [segmentations(case, name) for case in cases]
 
     assert_quality(vpq(counts), expected["separate"])
     assert_quality(vpq(counts), expected["plain"])
-    frames = [[getattr(each, part)[frame] for part in PARTS] for each in counts for frame in range(len(each.iou))]
+    frames = [
+        [getattr(each, part)[frame] for part in PARTS]
+        for each in counts
+        for frame in range(len(each.iou))
+    ]
     wrong = np.sum([frames[number] for number in selected], axis=0)
-    assert_quality([panoptic_quality(*sums) for sums in wrong.T], expected["separate_selected_as_released"])
+    assert_quality(
+        [panoptic_quality(*sums) for sums in wrong.T], expected["separate_selected_as_released"]
+    )
     for key in ("iou_separate", "iou_plain"):
         assert_allclose(
-            [iou([each[index] for each in cells]) for index in (0, 1)], expected[key], rtol=0, atol=TOLERANCE
+            [iou([each[index] for each in cells]) for index in (0, 1)],
+            expected[key],
+            rtol=0,
+            atol=TOLERANCE,
         )
     chosen = [cells[number] for number in selected]
     assert_allclose(
-        [iou([each[index] for each in chosen]) for index in (0, 1)], expected["iou_selected"], rtol=0, atol=TOLERANCE
+        [iou([each[index] for each in chosen]) for index in (0, 1)],
+        expected["iou_selected"],
+        rtol=0,
+        atol=TOLERANCE,
     )

@@ -39,7 +39,10 @@ def folder(golden: Path, expected: Tables, tmp_path_factory: pytest.TempPathFact
     shutil.copytree(golden / "release", root / "release")
     dataset = DeepAccident("v1", root / "release", index_dir=root / "index", verbose=False)
     agents = tuple(dict.fromkeys(row["vehicle"] for row in expected["log"].values()))
-    return export_release(dataset, root / "out", NuScenes(agents=agents), workers=1).folder / "v1.0-deepaccident"
+    return (
+        export_release(dataset, root / "out", NuScenes(agents=agents), workers=1).folder
+        / "v1.0-deepaccident"
+    )
 
 
 @pytest.fixture(scope="module")
@@ -53,10 +56,14 @@ class Scenes:
     def __init__(self, tables: Tables) -> None:
         self.tables = tables
         first = {
-            token: tables["sample"][row["first_sample_token"]]["timestamp"] for token, row in tables["scene"].items()
+            token: tables["sample"][row["first_sample_token"]]["timestamp"]
+            for token, row in tables["scene"].items()
         }
         self.moments = {
-            token: (tables["scene"][row["scene_token"]]["name"], row["timestamp"] - first[row["scene_token"]])
+            token: (
+                tables["scene"][row["scene_token"]]["name"],
+                row["timestamp"] - first[row["scene_token"]],
+            )
             for token, row in tables["sample"].items()
         }
         self.start = {tables["scene"][token]["name"]: moment for token, moment in first.items()}
@@ -66,7 +73,11 @@ class Scenes:
         result, places = {}, {"": None}
         for token, row in self.tables["sample_data"].items():
             scene = self.moments[row["sample_token"]][0]
-            places[token] = (scene, row["timestamp"] - self.start[scene], channel_of(self.tables, row))
+            places[token] = (
+                scene,
+                row["timestamp"] - self.start[scene],
+                channel_of(self.tables, row),
+            )
         for token, row in self.tables["sample_data"].items():
             pose = self.tables["ego_pose"][row["ego_pose_token"]]
             calibrated = self.tables["calibrated_sensor"][row["calibrated_sensor_token"]]
@@ -87,7 +98,10 @@ class Scenes:
         """(Scene, moment, place to the centimetre) → what is said of the box."""
         tables, result, places = self.tables, {}, {"": None}
         for token, row in tables["sample_annotation"].items():
-            places[token] = (*self.moments[row["sample_token"]], *np.round(row["translation"], 2).tolist())
+            places[token] = (
+                *self.moments[row["sample_token"]],
+                *np.round(row["translation"], 2).tolist(),
+            )
         for token, row in tables["sample_annotation"].items():
             instance = tables["instance"][row["instance_token"]]
             result[places[token]] = {
@@ -98,7 +112,9 @@ class Scenes:
                     places[instance["last_annotation_token"]],
                 ),
                 "category": tables["category"][instance["category_token"]]["name"],
-                "attributes": [tables["attribute"][each]["name"] for each in row["attribute_tokens"]],
+                "attributes": [
+                    tables["attribute"][each]["name"] for each in row["attribute_tokens"]
+                ],
                 "visibility": tables["visibility"][row["visibility_token"]]["level"],
                 "points": (row["num_lidar_pts"], row["num_radar_pts"]),
                 "pose": matrix_of(row),
@@ -118,7 +134,9 @@ class Scenes:
                 "samples": row["nbr_samples"],
                 "ends": [self.moments[row[f"{end}_sample_token"]] for end in ("first", "last")],
                 "log": [logs[row["log_token"]][name] for name in ("vehicle", "location")],
-                "chains": {place: chain for place, chain in chains.items() if place[0] == row["name"]},
+                "chains": {
+                    place: chain for place, chain in chains.items() if place[0] == row["name"]
+                },
             }
             for row in self.tables["scene"].values()
         }
@@ -134,7 +152,9 @@ def assert_same(found: dict[Any, dict[str, Any]], expected: dict[Any, dict[str, 
     for place, facts in expected.items():
         for name, value in facts.items():
             if isinstance(value, np.ndarray):
-                np.testing.assert_allclose(found[place][name], value, rtol=0, atol=1e-6, err_msg=f"{place} {name}")
+                np.testing.assert_allclose(
+                    found[place][name], value, rtol=0, atol=1e-6, err_msg=f"{place} {name}"
+                )
             else:
                 assert found[place][name] == value, (place, name)
 
@@ -154,7 +174,10 @@ def test_scenes(found: Tables, expected: Tables) -> None:
 @pytest.mark.parametrize("name", ["sensor", "category", "attribute", "visibility"])
 def test_words(found: Tables, expected: Tables, name: str) -> None:
     words = [
-        sorted(tuple((key, value) for key, value in row.items() if key != "token") for row in each[name].values())
+        sorted(
+            tuple((key, value) for key, value in row.items() if key != "token")
+            for row in each[name].values()
+        )
         for each in (found, expected)
     ]
     assert words[0] == words[1]
@@ -166,7 +189,11 @@ def test_neither_has_faults(found: Tables, expected: Tables) -> None:
 
 def test_scenes_are_in_the_golden_split(golden: Path, folder: Path, expected: Tables) -> None:
     """The golden release may be a part of the one that the splits are of: then some scenes have no tables."""
-    ours, theirs = (json.loads((each / "splits.json").read_text()) for each in (folder, golden / "nuscenes"))
+    ours, theirs = (
+        json.loads((each / "splits.json").read_text()) for each in (folder, golden / "nuscenes")
+    )
     there = {row["name"] for row in expected["scene"].values()}
-    assert ours == {split: [name for name in theirs.get(split, []) if name in there] for split in ours}
+    assert ours == {
+        split: [name for name in theirs.get(split, []) if name in there] for split in ours
+    }
     assert {name for names in ours.values() for name in names} == there

@@ -34,11 +34,18 @@ def test_every_value_is_equal(golden: Path, made: Path) -> None:
     ours = {path.name: path for path in made.glob("*/*")}
     for path in sorted(golden.glob("opencood/*/*/*.yaml")):
         scenario, agent, name = path.parts[-3:]
-        expected, found = (yaml.safe_load(each.read_text()) for each in (path, ours[scenario] / agent / name))
+        expected, found = (
+            yaml.safe_load(each.read_text()) for each in (path, ours[scenario] / agent / name)
+        )
         for where, theirs, mine in differences(expected, found):
             tolerance = 1e-9 if "angle" in where or "cords" in where or "pos" in where else 1e-6
             assert isinstance(theirs, float), (path, where, theirs, mine)
-            assert math.isclose(theirs, mine, rel_tol=0, abs_tol=tolerance), (path, where, theirs, mine)
+            assert math.isclose(theirs, mine, rel_tol=0, abs_tol=tolerance), (
+                path,
+                where,
+                theirs,
+                mine,
+            )
 
 
 def test_point_clouds_are_the_same_bytes(golden: Path, made: Path) -> None:
@@ -50,7 +57,9 @@ def test_point_clouds_are_the_same_bytes(golden: Path, made: Path) -> None:
         assert (ours[scenario] / agent / name).read_bytes() == path.read_bytes()
 
 
-def differences(expected: Any, found: Any, where: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any, Any]]:
+def differences(
+    expected: Any, found: Any, where: tuple[str, ...] = ()
+) -> Iterator[tuple[tuple[str, ...], Any, Any]]:
     """Where two loaded files differ, and by what."""
     if isinstance(expected, dict) and isinstance(found, dict) and expected.keys() == found.keys():
         for name, value in expected.items():

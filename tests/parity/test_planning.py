@@ -49,7 +49,11 @@ def drawn(objects: np.ndarray, step: int, protocol: str) -> np.ndarray:
     kind, wanted = objects[:, 3], CELL_PROTOCOLS[protocol].objects
     present = (objects[:, 1] == 0) & (kind < 2)
     known = present & (objects[:, 4] > 1) if wanted == "seen" else present
-    shown = kind == 0 if wanted == "vehicles" else (kind < 2) & np.isin(objects[:, 2], objects[known, 2])
+    shown = (
+        kind == 0
+        if wanted == "vehicles"
+        else (kind < 2) & np.isin(objects[:, 2], objects[known, 2])
+    )
     rows = objects[shown & (objects[:, 1] == step)]
     footprints = rows[:, [5, 6, 8, 9, 7]]
     return corner_offsets(footprints) + footprints[:, None, :2]
@@ -69,12 +73,20 @@ def test_the_rasters_are_those_of_the_code(folder: Path, protocol: str) -> None:
             corners = drawn(objects, step + 1, protocol)
             half_way = protocol == FLOATS and (np.abs(corners / rules.cell % 1 - 0.5) < 1e-5).any()
             off = occupied(corners, rules) != cells[step]
-            assert off.sum() <= (25 if half_way or OLD_FILL else 0), f"sample {sample}, step {step + 1}"
+            assert off.sum() <= (25 if half_way or OLD_FILL else 0), (
+                f"sample {sample}, step {step + 1}"
+            )
 
 
-def numbers_of(folder: Path, protocol: str) -> tuple[list[np.ndarray], list[np.ndarray], list[dict[str, np.ndarray]]]:
+def numbers_of(
+    folder: Path, protocol: str
+) -> tuple[list[np.ndarray], list[np.ndarray], list[dict[str, np.ndarray]]]:
     """What plan and recorded path touch in each sample of the stored rasters, and the numbers."""
-    inputs, cells, rules = arrays(folder / "inputs.npz"), rasters(folder, protocol), CELL_PROTOCOLS[protocol]
+    inputs, cells, rules = (
+        arrays(folder / "inputs.npz"),
+        rasters(folder, protocol),
+        CELL_PROTOCOLS[protocol],
+    )
     if protocol == "uniad":
         cells = cells | ~inputs["valid"][:, :, None, None]
     plans, trues, numbers = [], [], []
@@ -102,18 +114,31 @@ def test_the_numbers_are_those_of_the_code(folder: Path, protocol: str) -> None:
         elif protocol == "uniad":
             total, by_sample = told[f"uniad_total_{name}"][1::2], told[f"uniad_{name}"][:, 1::2]
         else:
-            total, by_sample = told[f"{protocol}_total_{prefix}{name}"], told[f"{protocol}_{prefix}{name}"]
+            total, by_sample = (
+                told[f"{protocol}_total_{prefix}{name}"],
+                told[f"{protocol}_{prefix}{name}"],
+            )
         assert_allclose(np.nanmean(found, axis=0), total, rtol=1e-6, atol=1e-6)
         if by_sample is not None:
             assert_allclose(found, by_sample, rtol=1e-6, atol=1e-6)
     if protocol == "bev_planner":
-        assert_allclose(np.nanmean([each["l2"] for each in numbers]), told["bev_planner_avg_L2"], rtol=1e-6)
-        assert_allclose(np.nanmean([each["collision"] for each in numbers]), told["bev_planner_avg_col"], rtol=1e-6)
+        assert_allclose(
+            np.nanmean([each["l2"] for each in numbers]), told["bev_planner_avg_L2"], rtol=1e-6
+        )
+        assert_allclose(
+            np.nanmean([each["collision"] for each in numbers]),
+            told["bev_planner_avg_col"],
+            rtol=1e-6,
+        )
 
 
 @pytest.mark.parametrize("protocol", PUBLIC)
 def test_a_plan_equal_to_the_recorded_path_never_collides(folder: Path, protocol: str) -> None:
-    inputs, cells, rules = arrays(folder / "inputs.npz"), rasters(folder, protocol), CELL_PROTOCOLS[protocol]
+    inputs, cells, rules = (
+        arrays(folder / "inputs.npz"),
+        rasters(folder, protocol),
+        CELL_PROTOCOLS[protocol],
+    )
     touched = 0
     for sample, path in enumerate(inputs["gt_xy"].astype(np.float64)):
         found = touching(path, cells[sample], BOX, rules)
@@ -131,7 +156,9 @@ def test_contacts_are_those_of_closed_forms(golden) -> None:
     poses = np.array(case["plan"])
     plan = Plan(times=np.arange(len(poses)) * case["plan_dt"], path=poses[:, :2], yaw=poses[:, 2])
     assert {each["dt"] for each in case["others"]} == {FRAME_PERIOD}
-    frames = 1 + round(max([plan.times[-1] / FRAME_PERIOD, *(len(each["poses"]) - 1 for each in case["others"])]))
+    frames = 1 + round(
+        max([plan.times[-1] / FRAME_PERIOD, *(len(each["poses"]) - 1 for each in case["others"])])
+    )
     others = np.full((frames, len(case["others"]), 5), np.nan)
     for number, each in enumerate(case["others"]):
         there = np.array(each["poses"])
@@ -139,9 +166,13 @@ def test_contacts_are_those_of_closed_forms(golden) -> None:
         others[: len(there), number] = np.column_stack([there[:, :2], size, there[:, 2]])
     until = np.full(others.shape[1], (frames - 1) * FRAME_PERIOD)
     path = plan.poses(np.arange(frames) * FRAME_PERIOD)
-    found = first_contacts(path, np.array(case["ego_box"]), others, np.zeros(others.shape[1]), until)
+    found = first_contacts(
+        path, np.array(case["ego_box"]), others, np.zeros(others.shape[1]), until
+    )
     told, ids = case["expected"], [each["id"] for each in case["others"]]
-    assert [ids[at] for at in np.flatnonzero(found.overlapping)] == told.get("overlap_at_present", [])
+    assert [ids[at] for at in np.flatnonzero(found.overlapping)] == told.get(
+        "overlap_at_present", []
+    )
     times = np.where(found.overlapping, np.inf, found.time)
     first = int(np.argmin(times))
     if told["contact"] is None:
@@ -149,7 +180,9 @@ def test_contacts_are_those_of_closed_forms(golden) -> None:
         return
     assert ids[first] == told["contact"]
     numbers = [times[first], found.speed[first], found.relative_speed[first]]
-    assert_allclose(numbers, [told[name] for name in ("t", "ego_speed", "relative_speed")], atol=1e-6)
+    assert_allclose(
+        numbers, [told[name] for name in ("t", "ego_speed", "relative_speed")], atol=1e-6
+    )
 
 
 def test_the_definitions_disagree_as_the_page_says() -> None:
@@ -158,7 +191,12 @@ def test_the_definitions_disagree_as_the_page_says() -> None:
     found = {protocol: numbers_of(folder, protocol)[2][35] for protocol in PUBLIC}
     collisions = {protocol: (100 * each["collision"]).tolist() for protocol, each in found.items()}
     sixth = pytest.approx(100 / 6)
-    assert collisions == {"uniad": [0] * 3, "stp3": [0, 0, sixth], "vad": [0, 0, sixth], "bev_planner": [0, 0, 100]}
+    assert collisions == {
+        "uniad": [0] * 3,
+        "stp3": [0, 0, sixth],
+        "vad": [0, 0, sixth],
+        "bev_planner": [0, 0, 100],
+    }
     assert_allclose(found["uniad"]["l2"], [0.78, 2.28, 5.16], atol=0.005)
     for protocol in PUBLIC[1:]:
         assert_allclose(found[protocol]["l2"], [0.55, 1.15, 2.23], atol=0.005)

@@ -25,7 +25,9 @@ def test_relative_poses_equal_the_released_codes(golden_row) -> None:
     relative = relative_pose_to_ego(raw)
     assert_allclose(relative, golden_row["relative_pose_to_ego"], rtol=0, atol=TOLERANCE)
     assert_allclose(relative[0], 0, atol=1e-9)
-    assert_allclose(flip_six_vector(relative_pose_to_ego(flip_pose(raw))), relative, rtol=0, atol=1e-9)
+    assert_allclose(
+        flip_six_vector(relative_pose_to_ego(flip_pose(raw))), relative, rtol=0, atol=1e-9
+    )
 
 
 @pytest.mark.golden_rows("g_poses", "pose_vec2mat")

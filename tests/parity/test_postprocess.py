@@ -42,14 +42,21 @@ def differing_cells(maps: np.ndarray, orientation: str, expected: np.ndarray) ->
 def released_points(points: np.ndarray, linked: LinkedInstances) -> np.ndarray:
     """Rows and columns (n, 2) as the released code counts them."""
     shape = linked.instance.shape[1:]
-    return np.stack(cells_in(points[:, 0], points[:, 1], shape, linked.orientation, "released"), axis=-1)
+    return np.stack(
+        cells_in(points[:, 0], points[:, 1], shape, linked.orientation, "released"), axis=-1
+    )
 
 
 def assert_paths_equal(linked: LinkedInstances, expected: dict) -> None:
     """Points column before row, one for each frame that the instance is in; cells of each frame."""
-    centers = {str(name): released_points(points, linked)[:, ::-1].tolist() for name, points in linked.centers.items()}
+    centers = {
+        str(name): released_points(points, linked)[:, ::-1].tolist()
+        for name, points in linked.centers.items()
+    }
     assert centers == expected["matched_centers"]
-    assert {str(name): path.cell_counts.tolist() for name, path in linked.paths.items()} == expected["pixel_counts"]
+    assert {
+        str(name): path.cell_counts.tolist() for name, path in linked.paths.items()
+    } == expected["pixel_counts"]
     for path in linked.paths.values():
         assert_array_equal(path.frames, np.flatnonzero(path.cell_counts))
 

@@ -38,7 +38,9 @@ def test_boxes_drawn_from_labels_equal_the_released_codes(golden, orientation: s
     assert int((drawn != expected).sum()) == 0
     shape = drawn.shape[1:]
     centers = {
-        str(name): np.stack(cells_in(*points.T, shape, orientation, "released")[::-1], axis=-1).tolist()
+        str(name): np.stack(
+            cells_in(*points.T, shape, orientation, "released")[::-1], axis=-1
+        ).tolist()
         for name, points in linked.centers.items()
     }
     assert centers == golden.entry["e2e_matched_centers"]

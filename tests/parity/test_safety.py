@@ -17,7 +17,13 @@ import pytest
 
 from deepaccident_devkit import interactions
 from deepaccident_devkit.collisions import OUTCOMES, Accident, Braking, outcomes_of
-from deepaccident_devkit.collisions.contact import Pair, contact_made, contact_times, impacts, pair_of
+from deepaccident_devkit.collisions.contact import (
+    Pair,
+    contact_made,
+    contact_times,
+    impacts,
+    pair_of,
+)
 from deepaccident_devkit.collisions.outcomes import delta_v_of
 from deepaccident_devkit.collisions.replay import braking_plans, replay
 from deepaccident_devkit.descriptions import coalition_leads, shapley_values
@@ -59,10 +65,14 @@ class Side:
 
 
 def side_of(surrogates: Mapping[str, Any], side: str) -> Side:
-    given = {name: np.array(values) for name, values in surrogates["inputs"].items() if name != "kind"}
+    given = {
+        name: np.array(values) for name, values in surrogates["inputs"].items() if name != "kind"
+    }
     yaw, speed = given[f"yaw_{side}"], given[f"speed_{side}"]
     return Side(
-        box=np.stack([given[f"{part}_{side}"] for part in ("x", "y", "length", "width", "yaw")], axis=1),
+        box=np.stack(
+            [given[f"{part}_{side}"] for part in ("x", "y", "length", "width", "yaw")], axis=1
+        ),
         velocity=speed[:, None] * np.stack([np.cos(yaw), np.sin(yaw)], axis=1),
         speed=speed,
         acceleration=given[f"acc_{side}"],
@@ -75,7 +85,9 @@ def within_horizon(seconds: np.ndarray) -> np.ndarray:
 
 
 MEASURES: dict[str, Callable[[Side, Side], np.ndarray]] = {
-    "ttc_2d": lambda i, j: within_horizon(interactions.time_to_collision(i.box, j.box, i.velocity, j.velocity)),
+    "ttc_2d": lambda i, j: within_horizon(
+        interactions.time_to_collision(i.box, j.box, i.velocity, j.velocity)
+    ),
     "mttc_2d": lambda i, j: within_horizon(
         interactions.modified_ttc(i.box, j.box, i.speed, j.speed, i.acceleration, j.acceleration)
     ),
@@ -89,16 +101,24 @@ MEASURES: dict[str, Callable[[Side, Side], np.ndarray]] = {
         interactions.relative_speed(i.velocity, j.velocity),
     ),
     "distance": lambda i, j: interactions.gaps_of_pairs(i.box, j.box),
-    "min_distance_20s": lambda i, j: interactions.nearest_approach(i.box, j.box, i.velocity, j.velocity, HORIZON)[0],
+    "min_distance_20s": lambda i, j: interactions.nearest_approach(
+        i.box, j.box, i.velocity, j.velocity, HORIZON
+    )[0],
     "closing_speed": lambda i, j: interactions.closing_speed(i.box, j.box, i.velocity, j.velocity),
-    "closing_speed_boxes": lambda i, j: interactions.closing_speed_of_boxes(i.box, j.box, i.velocity, j.velocity),
+    "closing_speed_boxes": lambda i, j: interactions.closing_speed_of_boxes(
+        i.box, j.box, i.velocity, j.velocity
+    ),
     "relative_speed": lambda i, j: interactions.relative_speed(i.velocity, j.velocity),
     "delta_v_i": lambda i, j: interactions.delta_v(i.velocity, j.velocity, i.mass, j.mass)[:, 0],
     "delta_v_j": lambda i, j: interactions.delta_v(i.velocity, j.velocity, i.mass, j.mass)[:, 1],
     "impact_heading": lambda i, j: interactions.impact_heading(i.box, j.box),
     "impact_direction_i": lambda i, j: interactions.impact_direction(i.box, i.velocity, j.velocity),
-    "pet": lambda i, j: np.abs(interactions.post_encroachment_time(i.box, j.box, i.velocity, j.velocity, WINDOW)),
-    "pet_area": lambda i, j: interactions.conflict_area_pet(i.box, j.box, i.velocity, j.velocity, WINDOW),
+    "pet": lambda i, j: np.abs(
+        interactions.post_encroachment_time(i.box, j.box, i.velocity, j.velocity, WINDOW)
+    ),
+    "pet_area": lambda i, j: interactions.conflict_area_pet(
+        i.box, j.box, i.velocity, j.velocity, WINDOW
+    ),
 }
 ABSOLUTE = {
     "ttc_2d": 1e-6,
@@ -122,22 +142,36 @@ def test_surrogate_measure(surrogates: Mapping[str, Any], name: str) -> None:
     if name == "mttc_2d":
         counts &= ~np.array(surrogates["expected"]["mttc_2d_graze"])
     assert counts.any()
-    tolerance = {"rtol": 0.0, "atol": ABSOLUTE[name]} if name in ABSOLUTE else {"rtol": 1e-9, "atol": 1e-9}
+    tolerance = (
+        {"rtol": 0.0, "atol": ABSOLUTE[name]} if name in ABSOLUTE else {"rtol": 1e-9, "atol": 1e-9}
+    )
     np.testing.assert_allclose(found[counts], expected[counts], **tolerance)
 
 
 def test_every_expected_field_is_compared(surrogates: Mapping[str, Any]) -> None:
-    assert set(surrogates["expected"]) == {*MEASURES, "t_min_distance", "pet_first", "mttc_2d_graze"}
-    assert {len(values) for values in surrogates["expected"].values()} == {len(surrogates["inputs"]["x_i"])}
+    assert set(surrogates["expected"]) == {
+        *MEASURES,
+        "t_min_distance",
+        "pet_first",
+        "mttc_2d_graze",
+    }
+    assert {len(values) for values in surrogates["expected"].values()} == {
+        len(surrogates["inputs"]["x_i"])
+    }
 
 
 def test_the_time_of_the_least_distance_where_there_is_one(surrogates: Mapping[str, Any]) -> None:
     """Where a side passes along the other's corner, the gap stays the least for a while: any of these times will do."""
     i, j = side_of(surrogates, "i"), side_of(surrogates, "j")
-    expected, least = (numbers(surrogates["expected"][name]) for name in ("t_min_distance", "min_distance_20s"))
+    expected, least = (
+        numbers(surrogates["expected"][name]) for name in ("t_min_distance", "min_distance_20s")
+    )
     found = interactions.nearest_approach(i.box, j.box, i.velocity, j.velocity, HORIZON)[1]
     for times in (found, expected):
-        moved = [np.column_stack([one.box[:, :2] + times[:, None] * one.velocity, one.box[:, 2:]]) for one in (i, j)]
+        moved = [
+            np.column_stack([one.box[:, :2] + times[:, None] * one.velocity, one.box[:, 2:]])
+            for one in (i, j)
+        ]
         np.testing.assert_allclose(interactions.gaps_of_pairs(moved[0], moved[1]), least, atol=1e-9)
     assert (np.abs(found - expected) > 1e-3).mean() < 0.02
 
@@ -147,15 +181,21 @@ def test_who_is_first(surrogates: Mapping[str, Any]) -> None:
     times = interactions.post_encroachment_time(i.box, j.box, i.velocity, j.velocity, WINDOW)
     known = ~np.isnan(numbers(surrogates["expected"]["pet"]))
     words = np.where(np.isfinite(times) & (times != 0), np.where(times > 0, "i", "j"), "")
-    np.testing.assert_array_equal(words[known], np.array(surrogates["expected"]["pet_first"])[known])
+    np.testing.assert_array_equal(
+        words[known], np.array(surrogates["expected"]["pet_first"])[known]
+    )
 
 
 @pytest.mark.parametrize(("measure", "name"), [("ttc_2d", "lib_ttc"), ("drac_2d", "lib_drac")])
-def test_as_the_library_has_it_below_20_s(surrogates: Mapping[str, Any], measure: str, name: str) -> None:
+def test_as_the_library_has_it_below_20_s(
+    surrogates: Mapping[str, Any], measure: str, name: str
+) -> None:
     expected = numbers(surrogates["library"][name])
     i, j = side_of(surrogates, "i"), side_of(surrogates, "j")
     times = interactions.time_to_collision(i.box, j.box, i.velocity, j.velocity)
-    found = times if measure == "ttc_2d" else interactions.drac(i.box, j.box, i.velocity, j.velocity)
+    found = (
+        times if measure == "ttc_2d" else interactions.drac(i.box, j.box, i.velocity, j.velocity)
+    )
     overlapping = times == 0  # where the library goes on calculating with −1
     assert (numbers(surrogates["library"]["lib_ttc"])[overlapping] == -1).all()
     near = ~overlapping & (times < HORIZON)
@@ -167,14 +207,21 @@ def test_exposed_and_integrated_times(surrogates: Mapping[str, Any]) -> None:
     assert surrogates["tet_tit"]
     for series in surrogates["tet_tit"]:
         times = numbers(series["ttc"])
-        for function, name in ((interactions.time_exposed, "TET"), (interactions.time_integrated, "TIT")):
-            assert function(times, series["tau"], series["dt"]) == pytest.approx(series[name], abs=1e-9), name
+        for function, name in (
+            (interactions.time_exposed, "TET"),
+            (interactions.time_integrated, "TIT"),
+        ):
+            assert function(times, series["tau"], series["dt"]) == pytest.approx(
+                series[name], abs=1e-9
+            ), name
 
 
 CORNERS = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) / 2
 
 
-def pair_and_start(case: Mapping[str, Any], *, braking: bool) -> tuple[Pair, np.ndarray, np.ndarray]:
+def pair_and_start(
+    case: Mapping[str, Any], *, braking: bool
+) -> tuple[Pair, np.ndarray, np.ndarray]:
     pair = pair_of([case["path_A"], case["path_B"]], [case["size_A"], case["size_B"]])
     start = case["t_warning"] + case["reaction"]
     starts = [start if braking and name in case["brakes"] else np.inf for name in "AB"]
@@ -188,7 +235,9 @@ def separations(pair: Pair, starts: np.ndarray, deceleration: np.ndarray) -> np.
     for motion, size, start in zip(pair.motions, pair.sizes, starts[0], strict=True):
         plans = braking_plans(motion, [start], deceleration)
         x, y, yaw = replay(motion, plans, np.zeros(len(times), dtype=np.int64), times).poses.T
-        turns = np.stack([np.stack([np.cos(yaw), np.sin(yaw)], -1), np.stack([-np.sin(yaw), np.cos(yaw)], -1)], 1)
+        turns = np.stack(
+            [np.stack([np.cos(yaw), np.sin(yaw)], -1), np.stack([-np.sin(yaw), np.cos(yaw)], -1)], 1
+        )
         corners.append(np.stack([x, y], -1)[:, None] + (CORNERS * size) @ turns)
         axes += [turns[:, 0], turns[:, 1]]
     gaps = []
@@ -210,7 +259,9 @@ def test_contact_and_speeds(golden, kind: str) -> None:
     time = float(times[0])
     assert np.isfinite(time) == contact_made(pair, starts, deceleration)[0] == expected["contact"]
     if not expected["contact"]:
-        assert separations(pair, starts, deceleration).min() == pytest.approx(expected["min_gap"], abs=0.02)
+        assert separations(pair, starts, deceleration).min() == pytest.approx(
+            expected["min_gap"], abs=0.02
+        )
         return
     assert time == pytest.approx(expected["t_contact"], abs=2e-3)
     assert (time <= pair.duration + 1e-9) == expected["within_recording"]
@@ -257,10 +308,22 @@ def test_outcome_and_last_moment(golden) -> None:
         assert found.extrapolated[0, 0] == (not after["within_recording"])
         change = after["rel_speed"] / before["rel_speed"]
         assert found.reduction[0, 0] == pytest.approx(1 - change, abs=0.02)
-        stopped = all(after[f"speed_{name}"] < 0.5 <= before[f"speed_{name}"] for name in case["brakes"])
-        told = "worsened" if change >= 1.1 else "stopped" if stopped else "mitigated" if change <= 0.9 else "unchanged"
+        stopped = all(
+            after[f"speed_{name}"] < 0.5 <= before[f"speed_{name}"] for name in case["brakes"]
+        )
+        told = (
+            "worsened"
+            if change >= 1.1
+            else "stopped"
+            if stopped
+            else "mitigated"
+            if change <= 0.9
+            else "unchanged"
+        )
         assert outcome == told
-    scan = last_moments(pair_of(paths, [case["size_A"], case["size_B"]]), brakers, [case["deceleration"]])
+    scan = last_moments(
+        pair_of(paths, [case["size_A"], case["size_B"]]), brakers, [case["deceleration"]]
+    )
     expected = case["expected"]["last_moment"]
     assert np.isfinite(scan.time[0]) == expected["avoidable"]
     assert scan.switches[0] == expected["switches"]
@@ -290,14 +353,18 @@ def test_where_braking_alone_ends(golden) -> None:
             continue
         assert plans.speeds[0] == pytest.approx(expected[f"v_at_brake_{name}"], abs=0.02)
         seconds = plans.speeds[0] / deceleration[0]
-        assert plans.arcs[0] + plans.speeds[0] * seconds / 2 == pytest.approx(expected[f"stop_s_{name}"], abs=1e-3)
+        assert plans.arcs[0] + plans.speeds[0] * seconds / 2 == pytest.approx(
+            expected[f"stop_s_{name}"], abs=1e-3
+        )
         assert plans.starts[0] + seconds == pytest.approx(expected[f"stop_t_{name}"], abs=1e-3)
 
 
 @pytest.mark.golden_cases("safety/ledger_and_cost", "ledger")
 def test_leads_of_all_coalitions_and_shapley_values(golden) -> None:
     entry = golden.entry
-    observed = np.array([[entry["observed"][agent][which] for which in "AB"] for agent in AGENTS], dtype=bool)
+    observed = np.array(
+        [[entry["observed"][agent][which] for which in "AB"] for agent in AGENTS], dtype=bool
+    )
     assert observed.shape == (5, 2, entry["frames"])
     leads = coalition_leads(observed)
     expected = entry["expected"]["lead_seconds"]
@@ -315,4 +382,6 @@ def test_false_alarm_cost(golden) -> None:
     runs = AlarmRuns.of(np.array([entry["alarm"]]) > 0, entry["fps"])
     assert len(runs.row) == expected["episodes"]
     assert runs.length.sum() / entry["fps"] == pytest.approx(expected["alarm_seconds"], rel=1e-9)
-    assert runs.braking_seconds(entry["reaction"])[0] == pytest.approx(expected["braking_seconds"], rel=1e-9, abs=1e-9)
+    assert runs.braking_seconds(entry["reaction"])[0] == pytest.approx(
+        expected["braking_seconds"], rel=1e-9, abs=1e-9
+    )

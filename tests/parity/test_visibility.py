@@ -43,7 +43,9 @@ def test_one_agents_mask_equals_the_single_agent_variants(golden) -> None:
     for a, mask in enumerate(masks_of(golden)):
         ids = golden["ids", a]
         assert_array_equal(mask, golden["out_single_valid", a])
-        assert_array_equal(3 * (mask & (ids != UNTRACKED_ID) & (ids < 2_000_000)) + 1, golden["out_single_vis", a])
+        assert_array_equal(
+            3 * (mask & (ids != UNTRACKED_ID) & (ids < 2_000_000)) + 1, golden["out_single_vis", a]
+        )
 
 
 def test_whether_each_agent_itself_sees_the_others_of_the_accident(golden) -> None:
@@ -58,7 +60,9 @@ def test_whether_each_agent_itself_sees_the_others_of_the_accident(golden) -> No
 def test_another_handedness_sees_the_same(golden) -> None:
     for a, mask in enumerate(masks_of(golden)):
         fields = golden["cls", a], golden["pts", a], golden["cam", a]
-        flipped = visible_mask(golden["xy", a] * (1, -1), *fields, infrastructure=AGENTS[a] == INFRASTRUCTURE)
+        flipped = visible_mask(
+            golden["xy", a] * (1, -1), *fields, infrastructure=AGENTS[a] == INFRASTRUCTURE
+        )
         assert_array_equal(flipped, mask)
 
 
@@ -76,5 +80,7 @@ def test_accident_visibility_equals_the_released_codes(golden) -> None:
     own = scene["agent_ids"].get(scene["agent"])
     now = pair_in_view(mask, ids, (int(first), int(second)), own)
     assert_array_equal(now, in_view[-1])
-    assert_array_equal(accident_visible_mask([*in_view[:-1], now], collision=first != "-1"), expected)
+    assert_array_equal(
+        accident_visible_mask([*in_view[:-1], now], collision=first != "-1"), expected
+    )
     assert str(bool(expected)) == scene["accident_visibility"]

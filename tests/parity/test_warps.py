@@ -102,7 +102,10 @@ def test_past_frames_are_warped_as_by_the_released_code(golden_row, mode, orient
     pattern = RELEASED.reorient(whole(golden_row)["warp_pattern"].astype(np.float32), orientation)
     motion = flip_six_vector(chain_of(golden_row))
     warped = past_to_present(
-        np.stack([pattern] * len(whole(golden_row)["past_warp_nearest"])), motion, grid=grid, mode=mode
+        np.stack([pattern] * len(whole(golden_row)["past_warp_nearest"])),
+        motion,
+        grid=grid,
+        mode=mode,
     )[golden_row.index]
     assert_warped(grid.reorient(warped, "released"), golden_row[f"past_warp_{mode}"], mode)
 
@@ -116,8 +119,12 @@ def test_agents_maps_are_warped_as_by_the_released_code(golden_row, mode, orient
     pattern = RELEASED.reorient(arrays["warp_pattern"].astype(np.float32), orientation)
     for name in (each for each in arrays if each.startswith("v2x_warp_pose_")):
         pose = flip_six_vector(arrays[name])
-        warped = agents_to_ego(np.stack([pattern] * len(pose)), pose, grid=grid, mode=mode)[golden_row.index]
-        assert_warped(grid.reorient(warped, "released"), golden_row[name.replace("pose", mode)], mode)
+        warped = agents_to_ego(np.stack([pattern] * len(pose)), pose, grid=grid, mode=mode)[
+            golden_row.index
+        ]
+        assert_warped(
+            grid.reorient(warped, "released"), golden_row[name.replace("pose", mode)], mode
+        )
 
 
 def scene_of(golden) -> dict[str, np.ndarray]:
@@ -129,7 +136,9 @@ def scene_of(golden) -> dict[str, np.ndarray]:
 
 def whole(golden_row) -> dict[str, np.ndarray]:
     """All arrays of the part."""
-    assert golden_row.index is not None, f"{golden_row.folder}: no array {golden_row.key} in {golden_row.part}.npz"
+    assert golden_row.index is not None, (
+        f"{golden_row.folder}: no array {golden_row.key} in {golden_row.part}.npz"
+    )
     with np.load(golden_row.folder / f"{golden_row.part}.npz") as archive:
         return dict(archive)
 
@@ -152,15 +161,25 @@ def labels_of(stored: dict[str, np.ndarray], orientation) -> MotionLabels:
         )
         for name in MAPS
     }
-    config = MotionLabelConfig(orientation=orientation, augmentation=augmentation_of(stored.get("aug_transform")))
+    config = MotionLabelConfig(
+        orientation=orientation, augmentation=augmentation_of(stored.get("aug_transform"))
+    )
     return record(turned, config, flip_six_vector(stored["future_egomotions"][2:]))
 
 
-def record(maps: dict[str, np.ndarray], config: MotionLabelConfig, egomotion: np.ndarray) -> MotionLabels:
+def record(
+    maps: dict[str, np.ndarray], config: MotionLabelConfig, egomotion: np.ndarray
+) -> MotionLabels:
     dtypes = {"segmentation": np.uint8, "instance": np.int32}
-    typed: dict[str, Any] = {name: np.array(values, dtypes.get(name, np.float32)) for name, values in maps.items()}
-    motion = np.concatenate([np.zeros((config.receptive_field - 1, 6)), egomotion]).astype(np.float32)
-    return MotionLabels(config=config, future_egomotion=motion, valid=np.ones(len(motion), bool), id_map={}, **typed)
+    typed: dict[str, Any] = {
+        name: np.array(values, dtypes.get(name, np.float32)) for name, values in maps.items()
+    }
+    motion = np.concatenate([np.zeros((config.receptive_field - 1, 6)), egomotion]).astype(
+        np.float32
+    )
+    return MotionLabels(
+        config=config, future_egomotion=motion, valid=np.ones(len(motion), bool), id_map={}, **typed
+    )
 
 
 def augmentation_of(matrix: np.ndarray | None) -> Augmentation | None:

@@ -38,7 +38,9 @@ def point_sets(draw: st.DrawFn) -> list[np.ndarray]:
     """Sets of lattice points: single ones, straight lines and scattered ones."""
     sets = []
     for _ in range(draw(st.integers(1, 5))):
-        points = draw(hnp.arrays(np.int64, st.tuples(st.integers(1, 12), st.just(2)), elements=coordinates))
+        points = draw(
+            hnp.arrays(np.int64, st.tuples(st.integers(1, 12), st.just(2)), elements=coordinates)
+        )
         if draw(st.booleans()):
             points = points[:1] + np.arange(len(points))[:, None] * points[-1:]
         sets.append(points)
@@ -130,7 +132,9 @@ def test_perfect_maps_are_perfect_whatever_their_ids(cars, names) -> None:
     made = PAPER.result([PAPER.counts(output, label, UNKNOWN)])
     for each in (made, made.beside["sample_choice=mean_first"]):
         assert each.apa == 1 if each.positives else math.isnan(each.apa)
-        assert (each.position_error, each.time_error) == ((0, 0) if each.positives else (None, None))
+        assert (each.position_error, each.time_error) == (
+            (0, 0) if each.positives else (None, None)
+        )
     # of equally near pairs that with the lower ids is taken, and the names of the first prediction order otherwise
     assert made.beside["sample_choice=mean_first"].id_error == (0 if made.positives else None)
 
@@ -141,14 +145,19 @@ def test_perfect_heads_are_perfect(cars) -> None:
     label = scene(cars)
     made = PAPER.result([PAPER.counts(as_heads(label, label), label, UNKNOWN)])
     assert made.apa == 1 if made.positives else math.isnan(made.apa)
-    assert (made.id_error, made.position_error, made.time_error) == ((0, 0, 0) if made.positives else (None,) * 3)
+    assert (made.id_error, made.position_error, made.time_error) == (
+        (0, 0, 0) if made.positives else (None,) * 3
+    )
 
 
 @settings(max_examples=15)
 @given(st.lists(st.tuples(crowds(4), crowds(4)), min_size=1, max_size=4), st.integers(0, 3))
 def test_any_order_and_any_split_give_the_same_bits(pairs, cut) -> None:
     whole, left, right = (AccidentEvaluator(protocol=PAPER) for _ in range(3))
-    samples = [(f"s{number}", as_maps(scene(told)), scene(true)) for number, (told, true) in enumerate(pairs)]
+    samples = [
+        (f"s{number}", as_maps(scene(told)), scene(true))
+        for number, (told, true) in enumerate(pairs)
+    ]
     for sample in samples:
         whole.update(*sample)
     for number, sample in enumerate(reversed(samples)):
@@ -157,12 +166,18 @@ def test_any_order_and_any_split_give_the_same_bits(pairs, cut) -> None:
     assert repr(expected.as_dict()) == repr(found.as_dict())
 
 
-@given(hnp.arrays(np.float64, (3, 5, 2), elements=st.floats(-20, 20)), st.permutations(range(5)), st.floats(0.1, 30))
+@given(
+    hnp.arrays(np.float64, (3, 5, 2), elements=st.floats(-20, 20)),
+    st.permutations(range(5)),
+    st.floats(0.1, 30),
+)
 def test_a_match_is_one_to_one_within_the_gate_and_finds_the_same(center, order, gate) -> None:
     truth = InstanceTracks(identity=np.arange(5) + 7, center=center)
     same = InstanceTracks(identity=np.arange(5), center=center[:, list(order)])
     assert_allclose(
-        center[:, [match - 7 for match in match_tracks(same, truth, gate).values()]], same.center, atol=1e-9
+        center[:, [match - 7 for match in match_tracks(same, truth, gate).values()]],
+        same.center,
+        atol=1e-9,
     )
     apart = replace(same, center=same.center + np.array([100.0, 0.0]))
     assert match_tracks(apart, truth, gate) == {}

@@ -7,7 +7,15 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 from strategies import arrays, boxes, cameras, clouds, grids, points, poses, upright_boxes
 
-from deepaccident_devkit.geometry import SE3, BevGrid, Boxes, BoxVisibility, LidarPointCloud, PinholeCamera, quaternions
+from deepaccident_devkit.geometry import (
+    SE3,
+    BevGrid,
+    Boxes,
+    BoxVisibility,
+    LidarPointCloud,
+    PinholeCamera,
+    quaternions,
+)
 from deepaccident_devkit.geometry.bev_grid import ORIENTATIONS, Orientation
 
 
@@ -16,7 +24,9 @@ def plainly_contains(given_boxes: Boxes, given_points: np.ndarray) -> np.ndarray
     offset = given_points - given_boxes.center[:, None]
     axes = quaternions.to_matrix(given_boxes.rotation)[:, None]
     along = [
-        offset[..., 0] * axes[..., 0, axis] + offset[..., 1] * axes[..., 1, axis] + offset[..., 2] * axes[..., 2, axis]
+        offset[..., 0] * axes[..., 0, axis]
+        + offset[..., 1] * axes[..., 1, axis]
+        + offset[..., 2] * axes[..., 2, axis]
         for axis in range(3)
     ]
     return (np.abs(np.stack(along, axis=-1)) <= given_boxes.size[:, None] / 2).all(axis=-1)
@@ -31,7 +41,9 @@ def test_points_in_boxes_are_the_definitions_to_the_bit(
     given_boxes: Boxes, anywhere: np.ndarray, offsets: np.ndarray
 ) -> None:
     near = given_boxes.center + offsets[: len(given_boxes)]
-    some = np.concatenate([anywhere, near, given_boxes.center, given_boxes.corners().reshape(-1, 3), [[np.nan] * 3]])
+    some = np.concatenate(
+        [anywhere, near, given_boxes.center, given_boxes.corners().reshape(-1, 3), [[np.nan] * 3]]
+    )
     expected = plainly_contains(given_boxes, some)
     assert_array_equal(given_boxes.contains(some), expected)
     assert_array_equal(given_boxes.count_points(some), expected.sum(axis=1))
@@ -46,7 +58,9 @@ def test_points_in_boxes_of_whole_clouds(seed: int, count: int, reach: float) ->
     center, size = rng.normal(size=(count, 3)) * reach, rng.uniform(0.2, 9, (count, 3)).round(1)
     upright = Boxes.from_arrays(center.round(1), size, rng.choice([0, np.pi / 2, 0.3], count))
     for some in (upright, upright.transform(turned, "ego")):
-        spread = some.center[rng.integers(0, count, 9000)] + (rng.normal(size=(9000, 3)) * 3).round(1)
+        spread = some.center[rng.integers(0, count, 9000)] + (rng.normal(size=(9000, 3)) * 3).round(
+            1
+        )
         assert_array_equal(some.contains(spread), plainly_contains(some, spread))
 
 
@@ -55,7 +69,9 @@ def test_iou_on_the_ground_is_the_polygons(one: Boxes, two: Boxes) -> None:
     mine, theirs = footprints(one)[:, None], footprints(two)
     common = shapely.area(shapely.intersection(mine, theirs))
     iou = one.iou_bev(two)
-    assert_allclose(iou, common / (shapely.area(mine) + shapely.area(theirs) - common), rtol=0, atol=1e-9)
+    assert_allclose(
+        iou, common / (shapely.area(mine) + shapely.area(theirs) - common), rtol=0, atol=1e-9
+    )
     assert_allclose(two.iou_bev(one).T, iou, rtol=0, atol=1e-12)
     assert ((iou >= 0) & (iou <= 1)).all()
     assert_allclose(np.diag(one.iou_bev(one)), np.ones(len(one)), rtol=0, atol=1e-12)
@@ -64,9 +80,14 @@ def test_iou_on_the_ground_is_the_polygons(one: Boxes, two: Boxes) -> None:
 @given(upright_boxes(), upright_boxes())
 def test_iou_in_space_is_ground_times_height(one: Boxes, two: Boxes) -> None:
     ground = shapely.area(shapely.intersection(footprints(one)[:, None], footprints(two)))
-    spans = [(some.corners()[..., 2].min(axis=1), some.corners()[..., 2].max(axis=1)) for some in (one, two)]
+    spans = [
+        (some.corners()[..., 2].min(axis=1), some.corners()[..., 2].max(axis=1))
+        for some in (one, two)
+    ]
     (low, high), (other_low, other_high) = spans
-    common = ground * np.maximum(np.minimum(high[:, None], other_high) - np.maximum(low[:, None], other_low), 0)
+    common = ground * np.maximum(
+        np.minimum(high[:, None], other_high) - np.maximum(low[:, None], other_low), 0
+    )
     expected = common / (one.size.prod(axis=1)[:, None] + two.size.prod(axis=1) - common)
     iou = one.iou_3d(two)
     assert_allclose(iou, expected, rtol=0, atol=1e-9)
@@ -78,7 +99,9 @@ def test_iou_in_space_is_ground_times_height(one: Boxes, two: Boxes) -> None:
 @given(upright_boxes(reach=20.0), upright_boxes(reach=20.0))
 def test_gaps_are_the_polygons_distances(one: Boxes, two: Boxes) -> None:
     gap = one.distance_bev(two)
-    assert_allclose(gap, shapely.distance(footprints(one)[:, None], footprints(two)), rtol=0, atol=1e-9)
+    assert_allclose(
+        gap, shapely.distance(footprints(one)[:, None], footprints(two)), rtol=0, atol=1e-9
+    )
     assert_allclose(two.distance_bev(one).T, gap, rtol=0, atol=1e-12)
     apart = np.linalg.norm(one.center[:, None, :2] - two.center[:, :2], axis=-1)
     assert (gap <= apart + 1e-9).all()
@@ -86,7 +109,9 @@ def test_gaps_are_the_polygons_distances(one: Boxes, two: Boxes) -> None:
 
 
 @given(upright_boxes(), upright_boxes(), st.floats(-np.pi, np.pi), arrays((3,), 1000.0))
-def test_comparing_boxes_does_not_depend_on_the_frame(one: Boxes, two: Boxes, yaw: float, place: np.ndarray) -> None:
+def test_comparing_boxes_does_not_depend_on_the_frame(
+    one: Boxes, two: Boxes, yaw: float, place: np.ndarray
+) -> None:
     pose = SE3.from_yaw(yaw, place)
     moved, moved_too = (some.transform(pose, "world") for some in (one, two))
     assert_allclose(moved.iou_bev(moved_too), one.iou_bev(two), rtol=0, atol=1e-9)
@@ -102,7 +127,8 @@ def test_visibility_is_that_of_the_corners(camera: PinholeCamera, pose: SE3, som
     for level, corners in zip(levels, in_camera.corners(), strict=True):
         pixels, depth = camera.project(corners)
         seen = [
-            0 <= u < camera.width and 0 <= v < camera.height and z > 1 for (u, v), z in zip(pixels, depth, strict=True)
+            0 <= u < camera.width and 0 <= v < camera.height and z > 1
+            for (u, v), z in zip(pixels, depth, strict=True)
         ]
         in_front = all(depth > 0.1)
         assert (level <= BoxVisibility.ALL) == (in_front and all(seen))

@@ -45,10 +45,18 @@ def test_flipping_twice_is_identity_and_changes_no_argument(flip, shape, data) -
 
 @given(arrays((2, 4, 4), 1e3), arrays((2, 3, 3), 2e3))
 def test_cameras_and_intrinsics_come_back(camera: np.ndarray, raw_intrinsic: np.ndarray) -> None:
-    assert_array_equal(conventions.camera_from_lidar_to_raw(conventions.camera_from_lidar(camera)), camera)
-    assert_array_equal(conventions.camera_from_lidar(conventions.camera_from_lidar_to_raw(camera)), camera)
-    assert_array_equal(conventions.intrinsic_to_raw(conventions.intrinsic(raw_intrinsic)), raw_intrinsic)
-    assert_array_equal(conventions.intrinsic(conventions.intrinsic_to_raw(raw_intrinsic)), raw_intrinsic)
+    assert_array_equal(
+        conventions.camera_from_lidar_to_raw(conventions.camera_from_lidar(camera)), camera
+    )
+    assert_array_equal(
+        conventions.camera_from_lidar(conventions.camera_from_lidar_to_raw(camera)), camera
+    )
+    assert_array_equal(
+        conventions.intrinsic_to_raw(conventions.intrinsic(raw_intrinsic)), raw_intrinsic
+    )
+    assert_array_equal(
+        conventions.intrinsic(conventions.intrinsic_to_raw(raw_intrinsic)), raw_intrinsic
+    )
 
 
 @given(matrices(), arrays((5, 3), 100))
@@ -62,11 +70,15 @@ def test_flipped_pose_moves_flipped_points(pose: np.ndarray, points: np.ndarray)
 def test_clockwise_yaw_becomes_counter_clockwise(raw_yaw: float) -> None:
     # clockwise seen from above, towards y right
     ahead = conventions.flip_points([np.cos(raw_yaw), np.sin(raw_yaw), 0.0])
-    assert_allclose(SE3.from_yaw(float(conventions.flip_yaw(raw_yaw))).apply([1.0, 0.0, 0.0]), ahead, atol=1e-12)
+    assert_allclose(
+        SE3.from_yaw(float(conventions.flip_yaw(raw_yaw))).apply([1.0, 0.0, 0.0]), ahead, atol=1e-12
+    )
 
 
 @given(ANGLES, ANGLES, ANGLES, arrays((3,), 100))
-def test_six_vector_flips_as_its_pose_does(rx: float, ry: float, rz: float, translation: np.ndarray) -> None:
+def test_six_vector_flips_as_its_pose_does(
+    rx: float, ry: float, rz: float, translation: np.ndarray
+) -> None:
     """(tx, ty, tz, rx, ry, rz) with R = Rx(rx) Ry(ry) Rz(rz): turning about x and z changes sense, about y not."""
 
     def pose_of(six: np.ndarray) -> np.ndarray:
@@ -81,12 +93,21 @@ def test_six_vector_flips_as_its_pose_does(rx: float, ry: float, rz: float, tran
         return pose
 
     six = np.array([*translation, rx, ry, rz])
-    assert_allclose(pose_of(conventions.flip_six_vector(six)), conventions.flip_pose(pose_of(six)), atol=1e-12)
+    assert_allclose(
+        pose_of(conventions.flip_six_vector(six)), conventions.flip_pose(pose_of(six)), atol=1e-12
+    )
 
 
 def carla_matrix(location: np.ndarray, yaw: float, pitch: float, roll: float) -> np.ndarray:
     """The matrix that CARLA's Transform.get_matrix() returns: left-handed, nose up for a positive pitch."""
-    cy, sy, cp, sp, cr, sr = np.cos(yaw), np.sin(yaw), np.cos(pitch), np.sin(pitch), np.cos(roll), np.sin(roll)
+    cy, sy, cp, sp, cr, sr = (
+        np.cos(yaw),
+        np.sin(yaw),
+        np.cos(pitch),
+        np.sin(pitch),
+        np.cos(roll),
+        np.sin(roll),
+    )
     x, y, z = location
     return np.array(
         [
@@ -119,7 +140,9 @@ def vehicle_poses() -> st.SearchStrategy[np.ndarray]:
 
 LIDAR_TO_EGO = carla_matrix(np.array([0.1, -0.2, 1.94]), 0.12, 0.02, -0.03)
 # front: upper left, upper right, lower right, lower left, then the same behind; y is right, so −1 is left
-RAW_CORNERS = np.array([[x, y, z] for x in (1, -1) for y, z in ((-1, 1), (1, 1), (1, -1), (-1, -1))])
+RAW_CORNERS = np.array(
+    [[x, y, z] for x in (1, -1) for y, z in ((-1, 1), (1, 1), (1, -1), (-1, -1))]
+)
 
 
 @settings(max_examples=20)
@@ -131,21 +154,32 @@ RAW_CORNERS = np.array([[x, y, z] for x in (1, -1) for y, z in ((-1, 1), (1, 1),
     camera=st.sampled_from(CAMERAS),
 )
 def test_a_point_its_box_and_its_pixel_stay_together_on_the_way_to_another_agents_camera(
-    scratch: Path, one_to_world: np.ndarray, other_to_world: np.ndarray, center: np.ndarray, yaw: float, camera: str
+    scratch: Path,
+    one_to_world: np.ndarray,
+    other_to_world: np.ndarray,
+    center: np.ndarray,
+    yaw: float,
+    camera: str,
 ) -> None:
     # the files of two agents, by CARLA's rules
     other = raw_calib(other_to_world, LIDAR_TO_EGO)
     (scratch / "one.pkl").write_bytes(pickle.dumps(raw_calib(one_to_world, LIDAR_TO_EGO)))
     (scratch / "other.pkl").write_bytes(pickle.dumps(other))
     x, y, z = center.tolist()
-    (scratch / "label.txt").write_text(f"1 2\ncar {x} {y} {z} 4.2 1.9 1.5 {yaw} 3.0 -1.0 7 5 True\n")
+    (scratch / "label.txt").write_text(
+        f"1 2\ncar {x} {y} {z} 4.2 1.9 1.5 {yaw} 3.0 -1.0 7 5 True\n"
+    )
 
     # the left-handed way: the formulas of docs/format.md, Calib, and nothing else
     c, s = np.cos(yaw), np.sin(yaw)
     half = np.array([4.2, 1.9, 1.5]) / 2
-    spots = np.concatenate([[[0, 0, 0]], RAW_CORNERS, [[0.6, -0.8, 0.3]]]) * half  # centre, corners, a point inside
+    spots = (
+        np.concatenate([[[0, 0, 0]], RAW_CORNERS, [[0.6, -0.8, 0.3]]]) * half
+    )  # centre, corners, a point inside
     raw_lidar = center + spots @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]).T
-    raw_world = one_to_world @ LIDAR_TO_EGO @ np.column_stack([raw_lidar, np.ones(len(raw_lidar))]).T
+    raw_world = (
+        one_to_world @ LIDAR_TO_EGO @ np.column_stack([raw_lidar, np.ones(len(raw_lidar))]).T
+    )
     in_other = np.linalg.inv(other_to_world @ LIDAR_TO_EGO) @ raw_world
     raw_camera = (other[f"lidar_to_{camera}"] @ in_other)[:3]
     raw_pixel = other[f"intrinsic_{camera}"] @ raw_camera
@@ -164,13 +198,19 @@ def test_a_point_its_box_and_its_pixel_stay_together_on_the_way_to_another_agent
     write_lidar(scratch / "points.npz", raw_lidar * [1, -1, 1], np.zeros(len(raw_lidar)))
     cloud = read_lidar(scratch / "points.npz").transform(world_from_lidar, "world")
 
-    assert_allclose(read_lidar(scratch / "points.npz", raw=True)[:, :3], raw_lidar, rtol=1e-6, atol=1e-5)
+    assert_allclose(
+        read_lidar(scratch / "points.npz", raw=True)[:, :3], raw_lidar, rtol=1e-6, atol=1e-5
+    )
     assert_allclose(in_world.center[0], raw_world[:3, 0] * [1, -1, 1], atol=1e-9)
     assert_allclose(in_world.velocity[0], raw_velocity * [1, -1, 1], atol=1e-9)
     assert_allclose(in_world.corners()[0], raw_world[:3, 1:9].T * [1, -1, 1], atol=1e-9)
     assert_allclose(pinhole.project(in_camera.center)[0], raw_pixel[:1], atol=1e-6)
     assert_allclose(pinhole.project(in_camera.corners()[0])[0], raw_pixel[1:9], atol=1e-6)
-    assert_allclose(pinhole.project(camera_from_world.apply(cloud.xyz))[0], raw_pixel, atol=0.05)  # float32 points
-    assert_allclose(in_camera.center[0], (raw_camera[1, 0], -raw_camera[2, 0], raw_camera[0, 0]), atol=1e-9)
+    assert_allclose(
+        pinhole.project(camera_from_world.apply(cloud.xyz))[0], raw_pixel, atol=0.05
+    )  # float32 points
+    assert_allclose(
+        in_camera.center[0], (raw_camera[1, 0], -raw_camera[2, 0], raw_camera[0, 0]), atol=1e-9
+    )
     assert in_world.contains(cloud.xyz[[0, 9]]).all()
     assert in_camera.contains(camera_from_world.apply(cloud.xyz[[0, 9]])).all()

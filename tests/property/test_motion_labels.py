@@ -9,7 +9,12 @@ from strategies import ANGLES, grids, numbers
 
 from deepaccident_devkit.geometry import SE3, BevGrid, conventions
 from deepaccident_devkit.geometry.bev_grid import ORIENTATIONS, cells_in, to_orientation, vectors_in
-from deepaccident_devkit.motion import LABEL_PROTOCOLS, FrameBoxes, MotionLabelConfig, motion_labels_from_boxes
+from deepaccident_devkit.motion import (
+    LABEL_PROTOCOLS,
+    FrameBoxes,
+    MotionLabelConfig,
+    motion_labels_from_boxes,
+)
 
 CELL = 0.5
 orientations = st.sampled_from(ORIENTATIONS)
@@ -37,7 +42,11 @@ def frame(center, size, yaw) -> FrameBoxes:
 
 def labels(frames, motion, orientation="devkit", protocol="clean"):
     config = MotionLabelConfig(
-        receptive_field=1, future_frames=len(frames) - 1, orientation=orientation, protocol=protocol, draw_ego=False
+        receptive_field=1,
+        future_frames=len(frames) - 1,
+        orientation=orientation,
+        protocol=protocol,
+        draw_ego=False,
     )
     return motion_labels_from_boxes(frames, motion, config)
 
@@ -58,8 +67,19 @@ def test_the_cells_of_an_id_are_its_box(box, orientation) -> None:
     assert_array_equal(made.segmentation[0] == 1, drawn)
 
 
-@given(placed_boxes(30.0), numbers(8.0), numbers(8.0), ANGLES, numbers(5.0), numbers(5.0), numbers(0.3), orientations)
-def test_flow_leads_to_where_the_box_is_at_the_next_frame(box, dx, dy, turned, ex, ey, eyaw, orientation) -> None:
+@given(
+    placed_boxes(30.0),
+    numbers(8.0),
+    numbers(8.0),
+    ANGLES,
+    numbers(5.0),
+    numbers(5.0),
+    numbers(0.3),
+    orientations,
+)
+def test_flow_leads_to_where_the_box_is_at_the_next_frame(
+    box, dx, dy, turned, ex, ey, eyaw, orientation
+) -> None:
     """In metres, seen from this frame's ego, to the cells' accuracy.
 
     Each of two centres is off by less than a cell, for the corners are, and rounded; the warp adds half a diagonal.
@@ -73,7 +93,9 @@ def test_flow_leads_to_where_the_box_is_at_the_next_frame(box, dx, dy, turned, e
     flow = made.flow[0][:, made.instance[0] == 1]
     assert (flow == flow[:, :1]).all()
     grid = made.config.grid
-    step = np.stack([grid.centers()[1, 0] - grid.centers()[0, 0], grid.centers()[0, 1] - grid.centers()[0, 0]])
+    step = np.stack(
+        [grid.centers()[1, 0] - grid.centers()[0, 0], grid.centers()[0, 1] - grid.centers()[0, 0]]
+    )
     assert_allclose(flow[:, 0] @ step, [dx, dy], atol=(2 * 1.5 + np.sqrt(0.5)) * CELL)
     assert (made.flow[0][:, made.instance[0] == 0] == 255).all()
 
@@ -85,31 +107,47 @@ def test_offsets_lead_to_the_peak(boxes, ahead, turn, orientation, protocol) -> 
     made = labels([frame(centers, sizes, yaws)] * 3, motion, orientation, protocol)
     t, row, column = np.nonzero(made.instance)
     down, along = made.offset[t, :, row, column].T
-    assert (made.centerness[t, 0, (row + down).astype(int), (column + along).astype(int)] == 1).all()
+    assert (
+        made.centerness[t, 0, (row + down).astype(int), (column + along).astype(int)] == 1
+    ).all()
     assert ((made.offset == 255).all(axis=1) == (made.instance == 0)).all()
-    assert ((made.centerness == 1).sum(axis=(1, 2, 3)) <= made.instance.reshape(3, -1).max(axis=1)).all()
+    assert (
+        (made.centerness == 1).sum(axis=(1, 2, 3)) <= made.instance.reshape(3, -1).max(axis=1)
+    ).all()
 
 
 @given(st.lists(placed_boxes(), max_size=4), numbers(3.0), numbers(0.3), orientations, protocols)
-def test_labels_of_every_orientation_are_the_same_cells(boxes, ahead, turn, orientation, protocol) -> None:
+def test_labels_of_every_orientation_are_the_same_cells(
+    boxes, ahead, turn, orientation, protocol
+) -> None:
     centers, sizes, yaws = (np.array([box[part] for box in boxes]) for part in range(3))
     motion = np.tile([ahead, 0, 0, 0, 0, turn], (2, 1))
     frames = [frame(centers, sizes, yaws)] * 2
     devkit, other = (labels(frames, motion, lying, protocol) for lying in ("devkit", orientation))
     for name in ("segmentation", "instance", "centerness", "offset", "flow"):
         turned = to_orientation(
-            getattr(devkit, name), vectors=name in ("offset", "flow"), source="devkit", target=orientation, ignore=255
+            getattr(devkit, name),
+            vectors=name in ("offset", "flow"),
+            source="devkit",
+            target=orientation,
+            ignore=255,
         )
         assert_array_equal(getattr(other, name), turned)
 
 
-@given(hnp.arrays(np.float32, (3, 2, 4, 5), elements=st.integers(-2, 3)), *[orientations] * 3, st.booleans())
+@given(
+    hnp.arrays(np.float32, (3, 2, 4, 5), elements=st.integers(-2, 3)),
+    *[orientations] * 3,
+    st.booleans(),
+)
 def test_orientations_compose(maps, first, second, third, vectors) -> None:
     def turned(array, source, target):
         return to_orientation(array, vectors=vectors, source=source, target=target, ignore=3)
 
     assert_array_equal(turned(turned(maps, first, second), second, first), maps)
-    assert_array_equal(turned(turned(maps, first, second), second, third), turned(maps, first, third))
+    assert_array_equal(
+        turned(turned(maps, first, second), second, third), turned(maps, first, third)
+    )
 
 
 @given(grids(), orientations, st.data())
@@ -122,7 +160,9 @@ def test_cells_and_vectors_change_with_the_maps(grid: BevGrid, target, data) -> 
     lying = {"source": grid.orientation, "target": target}
     there = cells_in(np.array(row), np.array(column), grid.shape, **lying)
     turned = to_orientation(raster, vectors=True, **lying)
-    assert_array_equal(turned[:, there[0], there[1]], vectors_in(np.array(down), np.array(along), **lying))
+    assert_array_equal(
+        turned[:, there[0], there[1]], vectors_in(np.array(down), np.array(along), **lying)
+    )
     assert_allclose(grid.with_orientation(target).centers()[there], grid.centers()[row, column])
 
 

@@ -9,7 +9,14 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from numpy.testing import assert_allclose, assert_array_equal
 
-from deepaccident_devkit.evaluation.instances import iou, longest, mask_counts, match_trajectories, padded, vpq_counts
+from deepaccident_devkit.evaluation.instances import (
+    iou,
+    longest,
+    mask_counts,
+    match_trajectories,
+    padded,
+    vpq_counts,
+)
 from deepaccident_devkit.evaluation.motion import MotionEvaluator, motion_counts
 from deepaccident_devkit.evaluation.predictions import instances_of
 from deepaccident_devkit.geometry import BevGrid
@@ -39,7 +46,9 @@ def paths(draw: st.DrawFn) -> dict[int, np.ndarray]:
     }
 
 
-def plain_vpq(prediction: np.ndarray, label: np.ndarray, *, temporally_consistent: bool) -> list[list[float]]:
+def plain_vpq(
+    prediction: np.ndarray, label: np.ndarray, *, temporally_consistent: bool
+) -> list[list[float]]:
     """[iou, tp, fp, fn] of the instances in each frame, as docs/released_code.md, IoU and VPQ, tells it."""
     result, partner = [], {}
     for predicted, true in zip(prediction, label, strict=True):
@@ -47,7 +56,10 @@ def plain_vpq(prediction: np.ndarray, label: np.ndarray, *, temporally_consisten
         mine, theirs = set(predicted[predicted > 0].tolist()), set(true[true > 0].tolist())
         for name in sorted(theirs):
             for other in sorted(mine):
-                both, either = (true == name) & (predicted == other), (true == name) | (predicted == other)
+                both, either = (
+                    (true == name) & (predicted == other),
+                    (true == name) | (predicted == other),
+                )
                 if both.sum() / either.sum() > 0.5:
                     changed = temporally_consistent and partner.get(name, other) != other
                     partner[name] = other
@@ -66,7 +78,9 @@ def test_vpq_is_what_the_plain_rules_say(given_pair, consistent: bool) -> None:
     found = vpq_counts(*given_pair, temporally_consistent=consistent)
     columns = (found.iou, found.true_positive, found.false_positive, found.false_negative)
     expected = plain_vpq(*given_pair, temporally_consistent=consistent)
-    assert_allclose(np.stack([values[:, 1] for values in columns], axis=1), expected, rtol=0, atol=1e-12)
+    assert_allclose(
+        np.stack([values[:, 1] for values in columns], axis=1), expected, rtol=0, atol=1e-12
+    )
 
 
 @given(given_pair=pairs(), names=st.permutations(range(1, 5)), large=st.booleans())
@@ -124,11 +138,15 @@ def test_everybody_is_matched_once_or_not_at_all(prediction, truth) -> None:
 
 
 @given(prediction=paths(), truth=paths())
-def test_sides_in_another_order_have_the_same_partners_where_nothing_ties(prediction, truth) -> None:
+def test_sides_in_another_order_have_the_same_partners_where_nothing_ties(
+    prediction, truth
+) -> None:
     length = longest(truth)
     mine, theirs = padded(prediction, length), padded(truth, length)
     found = match_trajectories(mine, theirs)
-    costs = [np.linalg.norm(a[:length] - b, axis=1).sum() for a in mine.values() for b in theirs.values()]
+    costs = [
+        np.linalg.norm(a[:length] - b, axis=1).sum() for a in mine.values() for b in theirs.values()
+    ]
     if len(set(np.round(costs, 9))) == len(costs):
         backwards = match_trajectories(dict(reversed(mine.items())), dict(reversed(theirs.items())))
         assert backwards == found
@@ -154,9 +172,16 @@ MAPS = hnp.arrays(np.int32, (3, *GRID.shape), elements=IDS)
 
 
 @settings(max_examples=30)
-@given(maps=st.lists(st.tuples(MAPS, MAPS), min_size=1, max_size=6), order=st.randoms(), parts=st.integers(1, 3))
+@given(
+    maps=st.lists(st.tuples(MAPS, MAPS), min_size=1, max_size=6),
+    order=st.randoms(),
+    parts=st.integers(1, 3),
+)
 def test_any_order_and_any_parts_give_the_same_bits(maps, order, parts: int) -> None:
-    samples = {str(n): motion_counts(instances_of(mine, GRID), label_of(true)) for n, (mine, true) in enumerate(maps)}
+    samples = {
+        str(n): motion_counts(instances_of(mine, GRID), label_of(true))
+        for n, (mine, true) in enumerate(maps)
+    }
     expected = MotionEvaluator()
     for token, counts in samples.items():
         expected.add(token, counts)

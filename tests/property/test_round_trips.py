@@ -56,10 +56,18 @@ def test_label(scratch: Path, given_labels: Labels) -> None:
 
 
 @given(labels())
-def test_label_in_the_other_handedness_is_the_same_boxes(scratch: Path, given_labels: Labels) -> None:
+def test_label_in_the_other_handedness_is_the_same_boxes(
+    scratch: Path, given_labels: Labels
+) -> None:
     write_label(scratch / "label.txt", given_labels)
     other = read_label(scratch / "label.txt", raw=not given_labels.raw)
-    for name, y in {"center": [1, -1, 1], "velocity": [1, -1], "agent_velocity": [1, -1], "yaw": -1, "size": 1}.items():
+    for name, y in {
+        "center": [1, -1, 1],
+        "velocity": [1, -1],
+        "agent_velocity": [1, -1],
+        "yaw": -1,
+        "size": 1,
+    }.items():
         assert_array_equal(getattr(other, name), getattr(given_labels, name) * y)
 
 
@@ -73,7 +81,9 @@ def test_many_labels_are_the_files_one_after_another(scratch: Path, several: lis
     for field in fields(Labels):
         if field.name != "raw":
             have = getattr(together, field.name)
-            assert_array_equal(have, np.concatenate([have[:0], *[getattr(one, field.name) for one in apart]]))
+            assert_array_equal(
+                have, np.concatenate([have[:0], *[getattr(one, field.name) for one in apart]])
+            )
 
 
 @given(metas())
@@ -92,7 +102,9 @@ def test_calib(scratch: Path, several: list[Calib]) -> None:
         assert_array_equal(read.ego_from_lidar.matrix, calib.ego_from_lidar.matrix)
         assert_array_equal(read.world_from_ego.matrix, calib.world_from_ego.matrix)
         for camera in CAMERAS:
-            assert_array_equal(read.camera_from_lidar[camera].matrix, calib.camera_from_lidar[camera].matrix)
+            assert_array_equal(
+                read.camera_from_lidar[camera].matrix, calib.camera_from_lidar[camera].matrix
+            )
             assert_array_equal(read.intrinsic[camera], calib.intrinsic[camera])
     stacked = read_calibs(paths)
     assert len(stacked) == len(several)
@@ -100,7 +112,9 @@ def test_calib(scratch: Path, several: list[Calib]) -> None:
     assert_array_equal(stacked.world_from_ego, [calib.world_from_ego.matrix for calib in several])
     cameras = [[calib.camera_from_lidar[camera].matrix for camera in CAMERAS] for calib in several]
     assert_array_equal(stacked.camera_from_lidar, cameras)
-    assert_array_equal(stacked.intrinsic, [[calib.intrinsic[camera] for camera in CAMERAS] for calib in several])
+    assert_array_equal(
+        stacked.intrinsic, [[calib.intrinsic[camera] for camera in CAMERAS] for calib in several]
+    )
 
 
 @given(clouds())

@@ -11,7 +11,9 @@ from deepaccident_devkit.geometry.boxes import CORNER_SIGNS
 
 @given(poses(), poses(), points())
 def test_compose_then_apply_is_apply_twice(a_from_b: SE3, b_from_c: SE3, p_c: np.ndarray) -> None:
-    assert_allclose((a_from_b @ b_from_c).apply(p_c), a_from_b.apply(b_from_c.apply(p_c)), atol=1e-9)
+    assert_allclose(
+        (a_from_b @ b_from_c).apply(p_c), a_from_b.apply(b_from_c.apply(p_c)), atol=1e-9
+    )
     assert_allclose(a_from_b @ p_c, a_from_b.apply(p_c), rtol=0)
 
 
@@ -33,8 +35,12 @@ def test_quaternion_there_and_back(pose: SE3) -> None:
     quaternion = pose.quaternion
     assert quaternion.w >= 0
     assert_allclose(quaternion.norm, 1, atol=1e-12)
-    assert_allclose(quaternion.rotation_matrix, pose.rotation, atol=1e-9)  # pyquaternion's own formula
-    assert_allclose(SE3.from_quaternion(quaternion, pose.translation).matrix, pose.matrix, atol=1e-9)
+    assert_allclose(
+        quaternion.rotation_matrix, pose.rotation, atol=1e-9
+    )  # pyquaternion's own formula
+    assert_allclose(
+        SE3.from_quaternion(quaternion, pose.translation).matrix, pose.matrix, atol=1e-9
+    )
 
 
 @given(poses(), arrays((3,), 100))
@@ -71,7 +77,9 @@ def test_boxes_and_their_corners_move_together(target_from_source: SE3, given_bo
 
 @given(poses(), boxes())
 def test_boxes_come_back(target_from_source: SE3, given_boxes: Boxes) -> None:
-    back = given_boxes.transform(target_from_source, "world").transform(target_from_source.inverse(), "lidar")
+    back = given_boxes.transform(target_from_source, "world").transform(
+        target_from_source.inverse(), "lidar"
+    )
     assert_allclose(back.corners(), given_boxes.corners(), atol=1e-8)
     assert_allclose(back.velocity, given_boxes.velocity, atol=1e-9)
 
@@ -84,27 +92,40 @@ def test_points_in_boxes_by_their_own_coordinates(given_boxes: Boxes, unit: np.n
         box = given_boxes.select([index])
         axes = Quaternion(box.rotation[0]).rotation_matrix
         points = box.center[0] + (clear_of_the_faces * box.size[0] / 2) @ axes.T
-        np.testing.assert_array_equal(box.contains(points)[0], (np.abs(clear_of_the_faces) <= 1).all(axis=1))
-        assert_allclose(box.corners()[0], box.center[0] + (CORNER_SIGNS * box.size[0] / 2) @ axes.T, atol=1e-9)
+        np.testing.assert_array_equal(
+            box.contains(points)[0], (np.abs(clear_of_the_faces) <= 1).all(axis=1)
+        )
+        assert_allclose(
+            box.corners()[0], box.center[0] + (CORNER_SIGNS * box.size[0] / 2) @ axes.T, atol=1e-9
+        )
 
 
 @given(poses())
 def test_six_vector_there_and_back(pose: SE3) -> None:
-    assert_allclose(SE3.from_six(pose.to_six()).matrix, pose.matrix, atol=1e-7)  # the gimbal costs half the digits
+    assert_allclose(
+        SE3.from_six(pose.to_six()).matrix, pose.matrix, atol=1e-7
+    )  # the gimbal costs half the digits
 
 
 @given(arrays((3,), 1e3), ANGLES, st.floats(-1.5, 1.5), ANGLES)
-def test_six_numbers_there_and_back(translation: np.ndarray, rx: float, ry: float, rz: float) -> None:
+def test_six_numbers_there_and_back(
+    translation: np.ndarray, rx: float, ry: float, rz: float
+) -> None:
     six = SE3.from_six([*translation, rx, ry, rz]).to_six()
     assert_array_equal(six[:3], translation)
     turns = np.abs(six[3:] - [rx, ry, rz])
-    assert_allclose(np.minimum(turns, 2 * np.pi - turns), 0, atol=1e-9)  # −π and π are the same turn
+    assert_allclose(
+        np.minimum(turns, 2 * np.pi - turns), 0, atol=1e-9
+    )  # −π and π are the same turn
 
 
 @given(arrays((3,), 1e3), ANGLES, ANGLES, ANGLES)
-def test_six_turns_about_z_then_y_then_x(translation: np.ndarray, rx: float, ry: float, rz: float) -> None:
+def test_six_turns_about_z_then_y_then_x(
+    translation: np.ndarray, rx: float, ry: float, rz: float
+) -> None:
     x, y, z = (
-        Quaternion(axis=axis, angle=angle).rotation_matrix for axis, angle in zip(np.eye(3), (rx, ry, rz), strict=True)
+        Quaternion(axis=axis, angle=angle).rotation_matrix
+        for axis, angle in zip(np.eye(3), (rx, ry, rz), strict=True)
     )
     pose = SE3.from_six([*translation, rx, ry, rz])
     assert_allclose(pose.rotation, x @ y @ z, atol=1e-12)
@@ -114,4 +135,6 @@ def test_six_turns_about_z_then_y_then_x(translation: np.ndarray, rx: float, ry:
 @given(poses())
 def test_a_flipped_six_vector_is_the_flipped_poses(pose: SE3) -> None:
     flipped = conventions.flip_six_vector(pose.to_six())
-    assert_allclose(conventions.matrices_of_six(flipped), conventions.flip_pose(pose.matrix), atol=1e-7)
+    assert_allclose(
+        conventions.matrices_of_six(flipped), conventions.flip_pose(pose.matrix), atol=1e-7
+    )

@@ -17,7 +17,8 @@ PLACES = st.tuples(st.sampled_from(AGENTS), st.integers(1, 6))
 LINKS = st.builds(
     Link,
     latency=st.sampled_from((0.0, 0.1, 0.3)),
-    pose_noise=st.none() | st.builds(PoseNoise, mean=st.floats(0, 0.5), heading_std=st.floats(0, 0.1)),
+    pose_noise=st.none()
+    | st.builds(PoseNoise, mean=st.floats(0, 0.5), heading_std=st.floats(0, 0.1)),
     packet_loss=st.sampled_from((0.0, 0.5)),
     seed=st.integers(0, 100),
 )
@@ -36,7 +37,9 @@ def test_there_and_back_is_the_identity(da: DeepAccident, a, b, frame_a, frame_b
     assert_allclose(there.inverse().matrix, back.matrix, atol=1e-6)
 
 
-@given(chain=st.lists(st.tuples(PLACES, FRAMES), min_size=5, max_size=5), p_world=points(reach=1000.0))
+@given(
+    chain=st.lists(st.tuples(PLACES, FRAMES), min_size=5, max_size=5), p_world=points(reach=1000.0)
+)
 def test_a_world_point_seen_from_five_agents_returns(da: DeepAccident, chain, p_world) -> None:
     """Through five frames one after another, and back to world: within 1e-4 m."""
     position, here, frame = p_world, sample_of(da, (AGENTS[0], 1)), "world"
@@ -47,7 +50,9 @@ def test_a_world_point_seen_from_five_agents_returns(da: DeepAccident, chain, p_
 
 
 @given(place=PLACES, chain=st.lists(st.tuples(PLACES, FRAMES), min_size=1, max_size=4))
-def test_points_that_a_label_claims_lie_in_their_box_after_any_chain(da: DeepAccident, place, chain) -> None:
+def test_points_that_a_label_claims_lie_in_their_box_after_any_chain(
+    da: DeepAccident, place, chain
+) -> None:
     """Each box holds as many points as its label says, and keeps them wherever both are moved (faces ± 1 mm)."""
     sample = sample_of(da, place)
     cloud, boxes = da.load_point_cloud(sample, "lidar").xyz, da.boxes(sample, "lidar")
@@ -60,7 +65,9 @@ def test_points_that_a_label_claims_lie_in_their_box_after_any_chain(da: DeepAcc
         cloud, boxes = target_from_here.apply(cloud), boxes.transform(target_from_here, next_frame)
         here, frame = sample_of(da, to), next_frame
     box, point = np.nonzero(hits)
-    local = np.einsum("nj,njk->nk", cloud[point] - boxes.center[box], quaternions.to_matrix(boxes.rotation)[box])
+    local = np.einsum(
+        "nj,njk->nk", cloud[point] - boxes.center[box], quaternions.to_matrix(boxes.rotation)[box]
+    )
     assert (np.abs(local) <= boxes.size[box] / 2 + 1e-3).all()
 
 
@@ -74,7 +81,9 @@ def test_relative_poses_are_the_transforms(da: DeepAccident, index, ego) -> None
 
 
 @given(ego=st.sampled_from(AGENTS), link=LINKS, config=st.sampled_from(sorted(AGENT_CONFIGS)))
-def test_a_link_draws_the_same_in_any_order_and_spares_the_ego(da: DeepAccident, ego, link, config) -> None:
+def test_a_link_draws_the_same_in_any_order_and_spares_the_ego(
+    da: DeepAccident, ego, link, config
+) -> None:
     sample = sample_of(da, (ego, 5))
     first = da.cooperative_boxes(sample, agents=config, link=link)
     da.cooperative_boxes(sample, agents="all", link=Link(pose_noise=0.1, seed=link.seed))

@@ -22,9 +22,17 @@ from deepaccident_devkit.motion.warping import (
 RELEASED, CLEAN = LABEL_PROTOCOLS["released"], LABEL_PROTOCOLS["clean"]
 RULES = st.sampled_from(list(LABEL_PROTOCOLS.values()))
 ORIENTATIONS = st.sampled_from(("devkit", "released", "fiery"))
-STEPS = st.tuples(*(st.floats(-5, 5) for _ in range(2)), st.just(0.0), st.just(0.0), st.just(0.0), st.floats(-3, 3))
+STEPS = st.tuples(
+    *(st.floats(-5, 5) for _ in range(2)),
+    st.just(0.0),
+    st.just(0.0),
+    st.just(0.0),
+    st.floats(-3, 3),
+)
 """Motions in the plane."""
-AUGMENTATIONS = st.builds(Augmentation, rotation=st.floats(-3, 3), scale=st.floats(0.9, 1.1), flip=st.booleans())
+AUGMENTATIONS = st.builds(
+    Augmentation, rotation=st.floats(-3, 3), scale=st.floats(0.9, 1.1), flip=st.booleans()
+)
 
 
 def noise(grid: BevGrid) -> np.ndarray:
@@ -36,7 +44,9 @@ def test_standing_still_keeps_every_cell(grid, rules, orientation) -> None:
     grid = grid.with_orientation(orientation)
     raster = noise(grid)
     assert_array_equal(warp(raster, np.eye(4), grid, rules, orientation=orientation), raster)
-    assert_array_equal(warp(raster, np.eye(4), grid, CLEAN, "bilinear", orientation=orientation), raster)
+    assert_array_equal(
+        warp(raster, np.eye(4), grid, CLEAN, "bilinear", orientation=orientation), raster
+    )
 
 
 @given(grids())

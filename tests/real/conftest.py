@@ -24,7 +24,9 @@ def real_root(request: pytest.FixtureRequest) -> Path:
 @pytest.fixture(scope="session")
 def real(real_root: Path, tmp_path_factory: pytest.TempPathFactory) -> DeepAccident:
     """It, opened; the index lies elsewhere."""
-    return DeepAccident("v1", real_root, index_dir=tmp_path_factory.mktemp("real index"), verbose=False)
+    return DeepAccident(
+        "v1", real_root, index_dir=tmp_path_factory.mktemp("real index"), verbose=False
+    )
 
 
 @pytest.fixture(scope="session")

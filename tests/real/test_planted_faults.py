@@ -16,12 +16,16 @@ from deepaccident_devkit.testing.breakages.breakage import FIELD
 from deepaccident_devkit.validation import validate_release
 from real.conftest import TOKEN
 
-SHALLOW = [name for name, kind in MUTATIONS.items() if not kind.deep and name not in (*BEYOND, *HARMLESS)]
+SHALLOW = [
+    name for name, kind in MUTATIONS.items() if not kind.deep and name not in (*BEYOND, *HARMLESS)
+]
 
 
 def doubts(root: Path, *, deep: bool = False) -> set[str]:
     report = validate_release(root, deep=deep, workers=1)
-    return {f"{finding.code}: {finding}" for finding in report.findings if finding.severity != "note"}
+    return {
+        f"{finding.code}: {finding}" for finding in report.findings if finding.severity != "note"
+    }
 
 
 @pytest.fixture(scope="session")
@@ -36,7 +40,9 @@ def sound(real_copy: Path) -> set[str]:
 
 
 @pytest.mark.parametrize("name", SHALLOW)
-def test_a_planted_fault_is_told(real_copy: Path, real_places: dict[str, Place], sound: set[str], name: str) -> None:
+def test_a_planted_fault_is_told(
+    real_copy: Path, real_places: dict[str, Place], sound: set[str], name: str
+) -> None:
     try:
         place = mutate(Job(name, 0), real_places)
     except (NoVictimError, FileNotFoundError) as error:
@@ -127,9 +133,22 @@ def damaged(real_root: Path, tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize(
-    "plant", [_two_frames, _two_agents, _shifted, _mirrored, _halved, _turned, _raised, _one_late, _miscounted]
+    "plant",
+    [
+        _two_frames,
+        _two_agents,
+        _shifted,
+        _mirrored,
+        _halved,
+        _turned,
+        _raised,
+        _one_late,
+        _miscounted,
+    ],
 )
-def test_a_cloud_that_does_not_fit_its_label_is_told(damaged: Path, plant: Callable[[Path], None]) -> None:
+def test_a_cloud_that_does_not_fit_its_label_is_told(
+    damaged: Path, plant: Callable[[Path], None]
+) -> None:
     before = doubts(damaged, deep=True)
     plant(damaged)
     assert any("points-differ" in doubt for doubt in doubts(damaged, deep=True) - before)

@@ -48,7 +48,11 @@ def test_it_opens_as_its_files_say(real: DeepAccident) -> None:
         "Noon",
         "three-way junction",
     )
-    assert (scenario["collision"], scenario["num_frames"], scenario["velocity_frame"]) == (None, 100, "released")
+    assert (scenario["collision"], scenario["num_frames"], scenario["velocity_frame"]) == (
+        None,
+        100,
+        "released",
+    )
     assert [agent["name"] for agent in real.agent] == list(AGENTS)
     assert len(real.sample) == 500
 
@@ -58,21 +62,30 @@ def test_few_pairs_interact_and_one_of_them_touches(real: DeepAccident) -> None:
     actors = len(real.instance)
     assert 0 < len(found.pairs) < actors * (actors - 1) / 2 / 4
     assert len(found) < 10 * real.scenario[0]["num_frames"]
-    assert not (found.pairs.actor_ids >= STATIC_ACTOR_ID).all(axis=1).any(), "parked cars are no pair"
+    assert not (found.pairs.actor_ids >= STATIC_ACTOR_ID).all(axis=1).any(), (
+        "parked cars are no pair"
+    )
     touching = found.pairs.min_gap == 0
     assert touching.sum() == 1, "a car drives over a pedestrian's box, which meta does not name"
     assert found.pairs.min_ttc[touching] == found.pairs.pet[touching] == 0
     pedestrian = real.get("instance", f"{TOKEN}/actor/{found.pairs.actor_ids[touching][0, 1]}")
     assert pedestrian["category"] == "pedestrian"
     text = real.describe(TOKEN).text
-    assert "meta names no collision in 9.9 s. The outlines of the other vehicle and a pedestrian overlap." in text
+    assert (
+        "meta names no collision in 9.9 s. The outlines of the other vehicle and a pedestrian overlap."
+        in text
+    )
 
 
 @pytest.mark.parametrize("deep", [False, True])
 def test_validate_tells_what_is_missing_and_nothing_else(real_root: Path, deep: bool) -> None:
     report = validate_release(real_root, deep=deep, workers=1)
     told = [finding for finding in report.findings if finding.code != "sensor-frames-missing"]
-    said = [finding.what for finding in told if (finding.code, finding.severity) != ("box-points-differ", "note")]
+    said = [
+        finding.what
+        for finding in told
+        if (finding.code, finding.severity) != ("box-points-differ", "note")
+    ]
     assert said == ["actors 7242, 7247 overlap by up to 0.56 m, frames 24–28"]
     assert {finding.severity for finding in told} == {"note"}
     assert report.velocity_frames == {TOKEN: "released"}
@@ -98,10 +111,16 @@ def test_decoded_velocities_are_the_displacements(real: DeepAccident) -> None:
         moved = derived.velocity[:, :2]
         speed = np.linalg.norm(moved, axis=1)
         telling = (speed > 1.0) & (decoded.actor_id > 0)
-        off.append(np.linalg.norm(decoded.velocity[:, :2] - moved, axis=1)[telling] / speed[telling])
+        off.append(
+            np.linalg.norm(decoded.velocity[:, :2] - moved, axis=1)[telling] / speed[telling]
+        )
         raw_off.append(np.linalg.norm(raw[:, :2] - moved, axis=1)[telling] / speed[telling])
         category.append(decoded.category[telling])
-    share, raw_share, cars = np.concatenate(off), np.concatenate(raw_off), np.concatenate(category) == 0
+    share, raw_share, cars = (
+        np.concatenate(off),
+        np.concatenate(raw_off),
+        np.concatenate(category) == 0,
+    )
     assert len(share) > 5000
     assert np.median(share) < 0.01
     assert (share[cars] < 0.1).mean() > 0.98
@@ -130,20 +149,31 @@ def test_untracked_boxes_and_ends_of_tracks_have_velocities(real: DeepAccident) 
     assert (boxes["actor_id"] == UNTRACKED_ID).any()
 
 
-def test_a_sensor_has_one_row_and_every_frame_its_exact_matrix(real: DeepAccident, real_root: Path) -> None:
+def test_a_sensor_has_one_row_and_every_frame_its_exact_matrix(
+    real: DeepAccident, real_root: Path
+) -> None:
     assert len(real.calibrated_sensor) <= 45
     folder, name = TOKEN.split("/")
     for agent in AGENTS:
         for frame in (1, 50, 100):
-            calib = read_calib(real_root / folder / agent / "calib" / name / f"{name}_{frame:03d}.pkl")
+            calib = read_calib(
+                real_root / folder / agent / "calib" / name / f"{name}_{frame:03d}.pkl"
+            )
             sample = sample_token(agent, frame)
-            np.testing.assert_array_equal(real.ego_from(sample, LIDAR).matrix, calib.ego_from_lidar.matrix)
             np.testing.assert_array_equal(
-                real.world_from(sample, "lidar").matrix, (calib.world_from_ego @ calib.ego_from_lidar).matrix
+                real.ego_from(sample, LIDAR).matrix, calib.ego_from_lidar.matrix
+            )
+            np.testing.assert_array_equal(
+                real.world_from(sample, "lidar").matrix,
+                (calib.world_from_ego @ calib.ego_from_lidar).matrix,
             )
             for camera in CAMERAS:
-                camera_from_lidar = real.ego_from(sample, camera).inverse() @ real.ego_from(sample, LIDAR)
-                np.testing.assert_allclose(camera_from_lidar.matrix, calib.camera_from_lidar[camera].matrix, atol=1e-12)
+                camera_from_lidar = real.ego_from(sample, camera).inverse() @ real.ego_from(
+                    sample, LIDAR
+                )
+                np.testing.assert_allclose(
+                    camera_from_lidar.matrix, calib.camera_from_lidar[camera].matrix, atol=1e-12
+                )
                 nominal = real.get("calibrated_sensor", f"{TOKEN}/{agent}/{camera}")["matrix"]
                 np.testing.assert_allclose(nominal, real.ego_from(sample, camera).matrix, atol=1e-3)
 
@@ -154,16 +184,25 @@ def test_labels_are_read_to_the_digit(real: DeepAccident, real_root: Path) -> No
     for agent in AGENTS:
         for frame in range(1, 101):
             path = real_root / folder / agent / "label" / name / f"{name}_{frame:03d}.txt"
-            first, *lines = [line.split() for line in path.read_text().splitlines() if len(line.split()) > 1]
-            labels, boxes = read_label(path, raw=True), real.boxes(sample_token(agent, frame), "lidar")
+            first, *lines = [
+                line.split() for line in path.read_text().splitlines() if len(line.split()) > 1
+            ]
+            labels, boxes = (
+                read_label(path, raw=True),
+                real.boxes(sample_token(agent, frame), "lidar"),
+            )
             words = np.array([[float(word) for word in line[1:10]] for line in lines])
             np.testing.assert_array_equal(labels.agent_velocity[0], [float(word) for word in first])
             numbers = np.column_stack([labels.center, labels.size, labels.yaw, labels.velocity])
             np.testing.assert_array_equal(numbers, words)
             np.testing.assert_array_equal(boxes.center * (1, -1, 1), words[:, :3])
-            assert [line[0] for line in lines] == [box.category for box in real.get_boxes(sample_token(agent, frame))]
+            assert [line[0] for line in lines] == [
+                box.category for box in real.get_boxes(sample_token(agent, frame))
+            ]
             np.testing.assert_array_equal(boxes.num_lidar_pts, [int(line[11]) for line in lines])
-            np.testing.assert_array_equal(boxes.camera_visible, [line[12] == "True" for line in lines])
+            np.testing.assert_array_equal(
+                boxes.camera_visible, [line[12] == "True" for line in lines]
+            )
 
 
 def test_all_agents_see_an_actor_in_the_same_place(real: DeepAccident) -> None:
@@ -190,7 +229,9 @@ def test_the_ground_is_where_all_agents_see_it(real: DeepAccident) -> None:
         for sample in samples:
             points = real.load_point_cloud(sample, "world").xyz
             near = points[np.abs(points[:, 2] - road) < 0.3]
-            cells, place = np.unique(np.floor(near[:, :2] / 0.5).astype(int), axis=0, return_inverse=True)
+            cells, place = np.unique(
+                np.floor(near[:, :2] / 0.5).astype(int), axis=0, return_inverse=True
+            )
             low = np.full(len(cells), np.inf)
             np.minimum.at(low, place.reshape(-1), near[:, 2])
             grounds.append(dict(zip(map(tuple, cells.tolist()), low.tolist(), strict=True)))
@@ -208,7 +249,9 @@ def test_points_fall_on_the_right_pixels(real: DeepAccident) -> None:
         sample = sample_token(INFRASTRUCTURE, frame)
         cloud = real.load_point_cloud(sample, "lidar")
         for camera in CAMERAS:
-            image = cv2.cvtColor(real.load_image(f"{sample}/{camera}"), cv2.COLOR_RGB2GRAY).astype(np.float32)
+            image = cv2.cvtColor(real.load_image(f"{sample}/{camera}"), cv2.COLOR_RGB2GRAY).astype(
+                np.float32
+            )
             slope = np.abs(cv2.Sobel(cv2.GaussianBlur(image, (0, 0), 2), cv2.CV_32F, 1, 0))
             seen = project_to_image(real, cloud, sample, f"{sample}/{camera}", colors=False)
             places = _depth_edges(seen.pixels[seen.mask], seen.depth[seen.mask])
@@ -237,7 +280,9 @@ def test_boxes_hold_the_points_that_labels_count(real: DeepAccident) -> None:
     for agent in AGENTS:
         for frame in CLOUD_FRAMES:
             boxes = real.boxes(sample_token(agent, frame), "lidar")
-            counted.append(boxes.count_points(real.load_point_cloud(sample_token(agent, frame), "lidar").xyz))
+            counted.append(
+                boxes.count_points(real.load_point_cloud(sample_token(agent, frame), "lidar").xyz)
+            )
             said.append(boxes.num_lidar_pts)
     recount, label = np.concatenate(counted), np.concatenate(said)
     with_points = (recount > 0) | (label > 0)
@@ -294,7 +339,16 @@ def test_the_index_costs_at_most_one_percent(real: DeepAccident) -> None:
 def test_it_can_be_drawn(real: DeepAccident, tmp_path: Path, view: str, token: str) -> None:
     out = tmp_path / "picture.png"
     index = real.tables_folder.parents[1]
-    arguments = ["render", *view.split(), str(real.dataroot), token, "--index-dir", str(index), "--out", str(out)]
+    arguments = [
+        "render",
+        *view.split(),
+        str(real.dataroot),
+        token,
+        "--index-dir",
+        str(index),
+        "--out",
+        str(out),
+    ]
     result = CliRunner().invoke(deepaccident, arguments, catch_exceptions=False)
     assert result.exit_code == 0, result.output
     picture = cv2.imread(str(out))
@@ -306,17 +360,32 @@ def test_it_can_be_exported_to_mcap(real: DeepAccident, tmp_path: Path) -> None:
     """Of frame 51 all clouds and the pole's images are there; what is not there is left out and told."""
     mcap_reading = pytest.importorskip("mcap_reading")
     out, index = tmp_path / "real.mcap", str(real.tables_folder.parents[1])
-    arguments = ["export", "mcap", str(real.dataroot), TOKEN, "--index-dir", index, "--frame-range", "50..52"]
-    result = CliRunner().invoke(deepaccident, [*arguments, "--out", str(out)], catch_exceptions=False)
+    arguments = [
+        "export",
+        "mcap",
+        str(real.dataroot),
+        TOKEN,
+        "--index-dir",
+        index,
+        "--frame-range",
+        "50..52",
+    ]
+    result = CliRunner().invoke(
+        deepaccident, [*arguments, "--out", str(out)], catch_exceptions=False
+    )
     assert result.exit_code == 0, result.output
     messages = mcap_reading.read_mcap(out).messages
-    assert {agent: len(messages[f"/{agent}/{LIDAR}/points"]) for agent in AGENTS} == dict.fromkeys(AGENTS, 1)
-    assert {camera: len(messages[f"/{INFRASTRUCTURE}/{camera}/image"]) for camera in CAMERAS} == dict.fromkeys(
-        CAMERAS, 1
+    assert {agent: len(messages[f"/{agent}/{LIDAR}/points"]) for agent in AGENTS} == dict.fromkeys(
+        AGENTS, 1
     )
+    assert {
+        camera: len(messages[f"/{INFRASTRUCTURE}/{camera}/image"]) for camera in CAMERAS
+    } == dict.fromkeys(CAMERAS, 1)
 
 
 def test_facts_say_nothing_false(real: DeepAccident) -> None:
     rows = {row.key: row for row in release_facts(real, workers=1).facts}
     assert {row.verdict for row in rows.values()} == {"agree", "cannot say"}
-    assert [rows[key].here for key in ("slow", "fast", "vehicles")] == pytest.approx([0.16, 0.11, 11], abs=0.02)
+    assert [rows[key].here for key in ("slow", "fast", "vehicles")] == pytest.approx(
+        [0.16, 0.11, 11], abs=0.02
+    )

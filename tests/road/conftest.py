@@ -21,7 +21,9 @@ _NEEDED = ("nuscenes", "torch")
 
 if missing := [name for name in _NEEDED if importlib.util.find_spec(name) is None]:
     if os.environ.get("DEEPACCIDENT_REQUIRE_NUSCENES"):
-        raise pytest.UsageError(f"DEEPACCIDENT_REQUIRE_NUSCENES is set, but {', '.join(missing)} is not installed")
+        raise pytest.UsageError(
+            f"DEEPACCIDENT_REQUIRE_NUSCENES is set, but {', '.join(missing)} is not installed"
+        )
     collect_ignore_glob = ["test_*.py"]
 
 
@@ -43,7 +45,9 @@ class Pair:
 
 
 @pytest.fixture(scope="session", params=["ego", "nuscenes"])
-def pair(request: pytest.FixtureRequest, made: DeepAccident, tmp_path_factory: pytest.TempPathFactory) -> Pair:
+def pair(
+    request: pytest.FixtureRequest, made: DeepAccident, tmp_path_factory: pytest.TempPathFactory
+) -> Pair:
     """The release and its export, with either axes of the LiDAR."""
     folder = tmp_path_factory.mktemp("road") / request.param
     export_release(made, folder, NuScenes(agents=("ego_vehicle",), lidar_axes=request.param))
@@ -60,6 +64,14 @@ def pair(request: pytest.FixtureRequest, made: DeepAccident, tmp_path_factory: p
 def made(tmp_path_factory: pytest.TempPathFactory) -> DeepAccident:
     """Accidents and their twins of 31 frames: each fifth one, from the first to the last, is a keyframe."""
     config = SynthConfig(
-        scenarios=8, frames=31, image_size=(160, 90), seed=8, sensor_step=5, unplanned=0, designed=True
+        scenarios=8,
+        frames=31,
+        image_size=(160, 90),
+        seed=8,
+        sensor_step=5,
+        unplanned=0,
+        designed=True,
     )
-    return DeepAccident("v1", make_release(tmp_path_factory.mktemp("made") / "release", config), verbose=False)
+    return DeepAccident(
+        "v1", make_release(tmp_path_factory.mktemp("made") / "release", config), verbose=False
+    )

@@ -14,7 +14,9 @@ from deepaccident_devkit.plugins.nuscenes.check import check_source, look_at
 
 def test_a_good_source_passes(pair) -> None:
     found = check_source(pair.road)
-    assert [words for words in found.unchecked() if not words.startswith("whether the images")] == []
+    assert [
+        words for words in found.unchecked() if not words.startswith("whether the images")
+    ] == []
 
 
 def test_the_release_passes_too(pair) -> None:
@@ -35,8 +37,22 @@ def test_training_begins_with_it(pair, tmp_path: Path) -> None:
     folder = copied(pair.folder, tmp_path / "wrong")
     MISTAKES["mirrored"][0](folder)
     run = tmp_path / "run"
-    for first, others in ((folder, ["--agents", "single"]), (pair.release.dataroot, ["--also", str(folder)])):
-        words = ["train", str(first), "--preset", "tiny", "--steps", "1", "--validation", "none", "--out", str(run)]
+    for first, others in (
+        (folder, ["--agents", "single"]),
+        (pair.release.dataroot, ["--also", str(folder)]),
+    ):
+        words = [
+            "train",
+            str(first),
+            "--preset",
+            "tiny",
+            "--steps",
+            "1",
+            "--validation",
+            "none",
+            "--out",
+            str(run),
+        ]
         result = CliRunner().invoke(deepaccident, [*words, *others])
         assert isinstance(result.exception, SourceError)
         assert "y is mirrored" in str(result.exception)

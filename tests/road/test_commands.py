@@ -48,19 +48,46 @@ def test_both_are_learned_from(trained: Path) -> None:
     assert len((trained / "both" / "log.jsonl").read_text().splitlines()) == 2
 
 
-def test_the_road_is_predicted_and_evaluated_by_its_rules(pair, trained: Path, tmp_path: Path) -> None:
+def test_the_road_is_predicted_and_evaluated_by_its_rules(
+    pair, trained: Path, tmp_path: Path
+) -> None:
     out = tmp_path / "results"
     told = run("predict", trained / "road", pair.folder, "--agents", "single", "--samples", "all", "--split", "val",
                "--out", out)  # fmt: skip
     assert str(out / NUSCENES_RESULTS_FILE) in told
     fiery = ["--split", "val", "--samples", "all", "--switch", "labels=fiery"]
-    assert "vpq 100x100" in run("evaluate", "motion", pair.folder, "--results", out / "motion", *fiery)
-    ours = run("evaluate", "detection", pair.folder, "--results", out / "detection.json", *fiery[:4])
+    assert "vpq 100x100" in run(
+        "evaluate", "motion", pair.folder, "--results", out / "motion", *fiery
+    )
+    ours = run(
+        "evaluate", "detection", pair.folder, "--results", out / "detection.json", *fiery[:4]
+    )
     assert "mean_average_precision" in ours or "mAP" in ours
-    for name, source, results in (("road", pair.folder, out), ("ours", pair.release.dataroot, tmp_path / "ours")):
+    for name, source, results in (
+        ("road", pair.folder, out),
+        ("ours", pair.release.dataroot, tmp_path / "ours"),
+    ):
         if name == "ours":
-            run("predict", "constant_velocity", source, "--task", "motion", *fiery[:4], "--out", results)
-        run("evaluate", "motion", source, "--results", results / "motion", *fiery, "--out", tmp_path / f"of_{name}")
+            run(
+                "predict",
+                "constant_velocity",
+                source,
+                "--task",
+                "motion",
+                *fiery[:4],
+                "--out",
+                results,
+            )
+        run(
+            "evaluate",
+            "motion",
+            source,
+            "--results",
+            results / "motion",
+            *fiery,
+            "--out",
+            tmp_path / f"of_{name}",
+        )
     both = run("evaluate", "compare", tmp_path / "of_road", tmp_path / "of_ours")
     assert f"{pair.folder}, v1.0-deepaccident" in both
     assert "no sample in common" in both
@@ -70,17 +97,23 @@ def test_the_road_is_predicted_and_evaluated_by_its_rules(pair, trained: Path, t
 
 def test_what_is_true_has_ap_1_by_nuscenes_own_evaluation(pair, tmp_path: Path) -> None:
     tokens = pair.road.samples("train", "all")
-    with ResultsWriter(tmp_path / "detection.json", "detection", meta={"method": "truth"}) as writer:
+    with ResultsWriter(
+        tmp_path / "detection.json", "detection", meta={"method": "truth"}
+    ) as writer:
         for token in tokens:
             boxes = pair.road.boxes(token)
-            boxes = boxes.select((boxes.actor_id != OWN_ACTOR_ID) & (boxes.num_lidar_pts > 0))  # others are no truth
+            boxes = boxes.select(
+                (boxes.actor_id != OWN_ACTOR_ID) & (boxes.num_lidar_pts > 0)
+            )  # others are no truth
             arrays = (boxes.center, boxes.size, boxes.yaw, [0.9] * len(boxes))
             how = {"frame": "world", "category": boxes.category, "velocity": boxes.velocity[:, :2]}
             writer.add(token, DetectedBoxes.from_arrays(*arrays, **how))
     path = write_detections(pair.road, tmp_path / "detection.json")
     nusc = NuScenes("v1.0-deepaccident", str(pair.folder), verbose=False)
     config = config_factory("detection_cvpr_2019")
-    evaluation = DetectionEval(nusc, config, str(path), "deepaccident_train", str(tmp_path / "out"), verbose=False)
+    evaluation = DetectionEval(
+        nusc, config, str(path), "deepaccident_train", str(tmp_path / "out"), verbose=False
+    )
     metrics, _ = evaluation.evaluate()
     present = {box.detection_name for box in evaluation.gt_boxes.all}
     assert {"car", "pedestrian"} <= present
@@ -90,7 +123,14 @@ def test_what_is_true_has_ap_1_by_nuscenes_own_evaluation(pair, tmp_path: Path) 
 
 def test_rigs_say_what_is_odd(pair, tmp_path: Path) -> None:
     told = json.loads(
-        run("sensor-setups", pair.release.dataroot, pair.folder, "--json", "--out", tmp_path / "rigs.png")
+        run(
+            "sensor-setups",
+            pair.release.dataroot,
+            pair.folder,
+            "--json",
+            "--out",
+            tmp_path / "rigs.png",
+        )
     )
     ours, road = told["sources"]
     assert ours["cameras"] == road["cameras"]
@@ -101,7 +141,10 @@ def test_rigs_say_what_is_odd(pair, tmp_path: Path) -> None:
 
 def test_either_source_is_rendered(pair, tmp_path: Path) -> None:
     token = pair.road.samples("train", "all")[0]
-    for source, of, name in ((pair.folder, token, "road"), (pair.release.dataroot, pair.ours[token], "ours")):
+    for source, of, name in (
+        (pair.folder, token, "road"),
+        (pair.release.dataroot, pair.ours[token], "ours"),
+    ):
         run("render", "sample", source, of, "--out", tmp_path / f"{name}.png")
         run("render", "labels", source, of, "--out", tmp_path / f"{name}-labels.png")
     assert (tmp_path / "road.png").exists()

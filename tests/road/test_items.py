@@ -33,9 +33,13 @@ def test_items_of_keyframes_are_the_releases(pair) -> None:
         for name in ("centerness", "offset", "flow", "future_egomotion"):  # of single precision
             torch.testing.assert_close(one[name], other[name], rtol=0, atol=5e-5)
         others = other["actor_ids"] != OWN_ACTOR_ID  # nuScenes does not annotate the ego
-        given = torch.where(other["categories"] == VAN, CAR, other["categories"])[others]  # it has no vans
+        given = torch.where(other["categories"] == VAN, CAR, other["categories"])[
+            others
+        ]  # it has no vans
         assert torch.equal(one["categories"], given)
-        torch.testing.assert_close(one["boxes"][:, :7], other["boxes"][others][:, :7], rtol=1e-6, atol=1e-5)
+        torch.testing.assert_close(
+            one["boxes"][:, :7], other["boxes"][others][:, :7], rtol=1e-6, atol=1e-5
+        )
         for mine, theirs in zip(one["points"][0], other["points"][0], strict=True):
             torch.testing.assert_close(mine, theirs, rtol=1e-6, atol=1e-4)
 
@@ -44,9 +48,13 @@ def test_poses_of_sensors_are_those_of_the_tables(pair) -> None:
     """The release's calib files jitter by 1e-5; nuScenes has one row a sensor, as `calibrated_sensor` has."""
     for token in keys(pair):
         for channel in (*CAMERAS, LIDAR):
-            row = pair.release.get("sample_data", f"{pair.ours[token]}/{channel}")["calibrated_sensor_token"]
+            row = pair.release.get("sample_data", f"{pair.ours[token]}/{channel}")[
+                "calibrated_sensor_token"
+            ]
             meant = np.array(pair.release.get("calibrated_sensor", row)["matrix"])
-            np.testing.assert_allclose(pair.road.ego_from(token, channel).matrix, meant, rtol=1e-6, atol=1e-6)
+            np.testing.assert_allclose(
+                pair.road.ego_from(token, channel).matrix, meant, rtol=1e-6, atol=1e-6
+            )
 
 
 def test_velocities_are_those_that_nuscenes_derives(pair) -> None:
@@ -68,7 +76,11 @@ def test_actors_are_the_same_and_untracked_ones_get_an_id(pair) -> None:
         assert len(road) == len(ours)
         pairs = {*zip(road.actor_id.tolist(), ours.actor_id.tolist(), strict=True)}
         tracked = {(mine, theirs) for mine, theirs in pairs if theirs != UNTRACKED_ID}
-        assert len({mine for mine, _ in tracked}) == len({theirs for _, theirs in tracked}) == len(tracked)
+        assert (
+            len({mine for mine, _ in tracked})
+            == len({theirs for _, theirs in tracked})
+            == len(tracked)
+        )
         assert (road.actor_id > 0).all()
 
 
@@ -84,7 +96,9 @@ def test_labels_are_fierys_cell_by_cell(pair) -> None:
 
 def test_a_split_of_nuscenes_is_a_dataset(pair) -> None:
     nusc = NuScenes("v1.0-deepaccident", str(pair.folder), verbose=False)
-    data = NuScenesDataset(nusc, "train", V2XConfig(images=ImageConfig(resize=(36, 64)), labels="fiery"))
+    data = NuScenesDataset(
+        nusc, "train", V2XConfig(images=ImageConfig(resize=(36, 64)), labels="fiery")
+    )
     assert len(data) == 7 * len(pair.road.split_scenarios("train"))
     batch = next(iter(DataLoader(data, batch_size=2, collate_fn=collate, num_workers=1)))
     assert batch["images"].shape == (2, 1, 1, 6, 3, 36, 64)

@@ -30,7 +30,9 @@ def public_names(kind: type) -> set[str]:
         names |= {
             node.attr
             for node in ast.walk(tree)
-            if isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Store) and ast.unparse(node.value) == "self"
+            if isinstance(node, ast.Attribute)
+            and isinstance(node.ctx, ast.Store)
+            and ast.unparse(node.value) == "self"
         }
     return {name for name in names if not name.startswith("_")}
 
@@ -39,7 +41,9 @@ def own_names(kind: type) -> set[str]:
     return {name for name in {*dir(kind), *getattr(kind, "__slots__", ())} if hasattr(kind, name)}
 
 
-@pytest.mark.parametrize(("theirs", "ours", "hints"), PAIRS, ids=lambda each: getattr(each, "__name__", ""))
+@pytest.mark.parametrize(
+    ("theirs", "ours", "hints"), PAIRS, ids=lambda each: getattr(each, "__name__", "")
+)
 def test_each_name_is_here_or_hinted(theirs: type, ours: type, hints: dict[str, str]) -> None:
     known = own_names(ours) | {"token", "velocity", "dataroot", "version"}  # set on the object
     assert public_names(theirs) - known - hints.keys() == set()

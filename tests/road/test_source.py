@@ -57,7 +57,9 @@ def test_the_official_splits_are_the_nuscenes_devkits(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_a_dataroot_written_by_hand_says_what_the_nuscenes_devkit_says(tmp_path: Path, seed: int) -> None:
+def test_a_dataroot_written_by_hand_says_what_the_nuscenes_devkit_says(
+    tmp_path: Path, seed: int
+) -> None:
     """Keyframes at odd times, objects that are not at all of them, sweeps, classes that we lack."""
     made = write_dataroot(tmp_path / "road", seed=seed)
     nusc = NuScenes(made.version, str(made.folder), verbose=False)
@@ -68,9 +70,15 @@ def test_a_dataroot_written_by_hand_says_what_the_nuscenes_devkit_says(tmp_path:
             continue
         sample = nusc.get("sample", road.nuscenes_token(record["token"]))
         first = nusc.get("sample", nusc.get("scene", sample["scene_token"])["first_sample_token"])
-        assert record["timestamp"] == pytest.approx((sample["timestamp"] - first["timestamp"]) * 1e-6, abs=1e-6)
-        pose = nusc.get("ego_pose", nusc.get("sample_data", sample["data"]["LIDAR_TOP"])["ego_pose_token"])
-        np.testing.assert_allclose(road.world_from(record["token"], "ego").translation, pose["translation"], atol=1e-9)
+        assert record["timestamp"] == pytest.approx(
+            (sample["timestamp"] - first["timestamp"]) * 1e-6, abs=1e-6
+        )
+        pose = nusc.get(
+            "ego_pose", nusc.get("sample_data", sample["data"]["LIDAR_TOP"])["ego_pose_token"]
+        )
+        np.testing.assert_allclose(
+            road.world_from(record["token"], "ego").translation, pose["translation"], atol=1e-9
+        )
         rows = [nusc.get("sample_annotation", token) for token in sample["anns"]]
         boxes = road.with_ignored.boxes(record["token"])
         np.testing.assert_allclose(boxes.center, [row["translation"] for row in rows], atol=1e-8)
@@ -85,16 +93,23 @@ def test_a_dataroot_written_by_hand_says_what_the_nuscenes_devkit_says(tmp_path:
 
 def test_splits_and_names_are_the_exports(pair) -> None:
     for split in ("train", "val"):
-        ours = {pair.ours[f"{scene}/ego_vehicle/001"].rsplit("/", 2)[0] for scene in pair.road.split_scenarios(split)}
+        ours = {
+            pair.ours[f"{scene}/ego_vehicle/001"].rsplit("/", 2)[0]
+            for scene in pair.road.split_scenarios(split)
+        }
         assert ours == pair.release.split_scenarios(split)
-    assert {record["town"] for record in pair.road.scenario} == {record["town"] for record in pair.release.scenario}
+    assert {record["town"] for record in pair.road.scenario} == {
+        record["town"] for record in pair.release.scenario
+    }
     assert (pair.road.layout, pair.road.version) == ("nuScenes", VERSION)
 
 
 def test_what_is_no_dataroot_of_nuscenes(pair, tmp_path: Path) -> None:
     with pytest.raises(DatarootError, match=r"has no tables of nuScenes"):
         open_nuscenes(tmp_path)
-    with pytest.raises(DatarootError, match=r"is a dataroot of nuScenes; open it with nuscenes\.open_nuscenes"):
+    with pytest.raises(
+        DatarootError, match=r"is a dataroot of nuScenes; open it with nuscenes\.open_nuscenes"
+    ):
         DeepAccident("v1", pair.folder)
     both = copied(pair.folder, tmp_path / "two")
     shutil.copytree(both / VERSION, both / "v1.0-other")
@@ -115,7 +130,10 @@ def test_classes_that_we_lack_are_ignored_and_not_background(pair, tmp_path: Pat
     ignored = every["actor_id"] >= IGNORED_ID
     before = pair.road.columns("annotation")["category"]
     np.testing.assert_array_equal(ignored, np.isin(before, [1, 3]))
-    assert {*every["category"][ignored].tolist()} == {1, 5}  # a bus is most like a truck, an animal like a pedestrian
+    assert {*every["category"][ignored].tolist()} == {
+        1,
+        5,
+    }  # a bus is most like a truck, an animal like a pedestrian
     assert {*road.columns("annotation")["category"].tolist()} == {0, 4, 5}
     config = V2XConfig(labels=None, visible=None)
     [item] = V2XDataset(road, [road.sample[0]["token"]], config)
@@ -131,7 +149,9 @@ def test_intensities_of_nuscenes_become_shares(pair, tmp_path: Path) -> None:
     file = pair.road.sensor_path(token, "lidar01").relative_to(pair.folder)
     content = np.fromfile(pair.folder / file, dtype="<f4").reshape(-1, 5)
     (folder / "samples").unlink()
-    shutil.copytree(pair.folder / "samples", folder / "samples", symlinks=False, copy_function=shutil.copyfile)
+    shutil.copytree(
+        pair.folder / "samples", folder / "samples", symlinks=False, copy_function=shutil.copyfile
+    )
     content[:, 3] = np.linspace(0, 255, len(content), dtype=np.float32)
     content.tofile(folder / file)
     road = open_nuscenes(folder)

@@ -16,7 +16,9 @@ HAS_TORCH = importlib.util.find_spec("torch") is not None
 if not HAS_TORCH:
     if os.environ.get("DEEPACCIDENT_REQUIRE_TORCH"):
         raise pytest.UsageError("DEEPACCIDENT_REQUIRE_TORCH is set, but torch is not installed")
-    collect_ignore = [path.name for path in Path(__file__).parent.glob("*.py") if path.name != "test_installed.py"]
+    collect_ignore = [
+        path.name for path in Path(__file__).parent.glob("*.py") if path.name != "test_installed.py"
+    ]
     collect_ignore += ["model", "study"]
 
 

@@ -39,7 +39,9 @@ EVERYTHING = V2XConfig(
     link=Link(latency=0.1, pose_noise=0.3, packet_loss=0.3),
     past=2,
     images=ImageConfig(resize=(18, 32)),
-    labels=MotionLabelConfig(grid=BevGrid(x=(-50, 50, 1), y=(-50, 50, 1)), receptive_field=2, future_frames=2, step=1),
+    labels=MotionLabelConfig(
+        grid=BevGrid(x=(-50, 50, 1), y=(-50, 50, 1)), receptive_field=2, future_frames=2, step=1
+    ),
     bev_segmentation=BevGrid(x=(-30, 30, 1), y=(-30, 30, 1)),
     augmentation=RandomAugmentation(),
 )
@@ -63,12 +65,17 @@ def test_agents_side_by_side(da: DeepAccident, tokens: list[str]) -> None:
 
 
 def test_agents_one_after_another(da: DeepAccident, tokens: list[str]) -> None:
-    items = [V2XDataset(da, [tokens[0]], V2XConfig(agents=agents))[0] for agents in ("+other", "single", "all")]
+    items = [
+        V2XDataset(da, [tokens[0]], V2XConfig(agents=agents))[0]
+        for agents in ("+other", "single", "all")
+    ]
     batch = collate_fusion(items)
     assert (batch["record_len"].tolist(), batch["record_len"].dtype) == ([2, 1, 5], torch.int64)
     assert (batch["ego_from_agent"].shape, len(batch["points"])) == ((8, 1, 4, 4), 8)
     pairwise = batch["pairwise_t_matrix"]
-    assert_array_equal(torch.cat([pairwise[1], pairwise[0, 2:]]), np.broadcast_to(np.eye(4), (8, 5, 4, 4)))
+    assert_array_equal(
+        torch.cat([pairwise[1], pairwise[0, 2:]]), np.broadcast_to(np.eye(4), (8, 5, 4, 4))
+    )
     frames = [da.get_sample(da.scenario[0], name, 4) for name in items[2]["agents"]]
     expected = [[da.transform(target, source).matrix for target in frames] for source in frames]
     assert_allclose(pairwise[2], expected, atol=1e-3)
@@ -81,19 +88,27 @@ def test_agents_that_a_partial_release_lacks(own_release: Path) -> None:
         shutil.rmtree(folder)
     partial = DeepAccident("v1", own_release, verbose=False)
     here = [f"{record['token']}/ego_vehicle/004" for record in partial.scenario]
-    data = V2XDataset(partial, here, V2XConfig(agents=None, points=False, past=2, step=1, labels="deepaccident"))
+    data = V2XDataset(
+        partial, here, V2XConfig(agents=None, points=False, past=2, step=1, labels="deepaccident")
+    )
     counts = [4 if scenario in token else 5 for token in here]
     assert set(counts) == {4, 5}
     arguments = {"batch_size": len(here), "num_workers": 1, "multiprocessing_context": "fork"}
     [side_by_side] = DataLoader(data, collate_fn=collate, **arguments)
     assert side_by_side["agent_valid"].sum(dim=(1, 2)).tolist() == [2 * count for count in counts]
     [one_after_another] = DataLoader(data, collate_fn=collate_fusion, **arguments)
-    assert one_after_another["record_len"].tolist() == [len(names) for names in one_after_another["agents"]] == counts
+    assert (
+        one_after_another["record_len"].tolist()
+        == [len(names) for names in one_after_another["agents"]]
+        == counts
+    )
 
 
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
 @pytest.mark.parametrize("start", [None, "spawn"])
-def test_a_loader_without_collate_fn_batches_as_collate_does(da: DeepAccident, sample: str, start: str | None) -> None:
+def test_a_loader_without_collate_fn_batches_as_collate_does(
+    da: DeepAccident, sample: str, start: str | None
+) -> None:
     """The registry of torch's own collation; the items differ in boxes and points, which torch could not stack."""
     partner = sample.replace("ego_vehicle", "infrastructure")
     data = V2XDataset(da, [sample, partner], V2XConfig(agents="all"))
@@ -104,7 +119,9 @@ def test_a_loader_without_collate_fn_batches_as_collate_does(da: DeepAccident, s
     assert type(batch) is dict
 
 
-def test_skipped_files_are_as_if_they_had_not_arrived(da: DeepAccident, da_partial: DeepAccident, sample: str) -> None:
+def test_skipped_files_are_as_if_they_had_not_arrived(
+    da: DeepAccident, da_partial: DeepAccident, sample: str
+) -> None:
     """The pole has no LiDAR, and the ego no front camera: with the pole, images are of the other vehicles."""
     both = {"agents": ["ego_vehicle", "other_vehicle", "infrastructure"], "past": 2, "step": 1}
     images = V2XConfig(**both, on_missing="skip", points=False, images=ImageConfig())
@@ -113,11 +130,18 @@ def test_skipped_files_are_as_if_they_had_not_arrived(da: DeepAccident, da_parti
     assert_refused(
         (lambda: V2XDataset(da_partial, [sample], V2XConfig(**both))[0], MissingFileError, skip),
         *[
-            (partial(V2XDataset(da_partial, [sample], config).__getitem__, 0), MissingFileError, own)
+            (
+                partial(V2XDataset(da_partial, [sample], config).__getitem__, 0),
+                MissingFileError,
+                own,
+            )
             for config in (images, replace(images, on_missing="raise"))
         ],
     )
-    item, whole = (V2XDataset(each, [sample], V2XConfig(**both, on_missing="skip"))[0] for each in (da_partial, da))
+    item, whole = (
+        V2XDataset(each, [sample], V2XConfig(**both, on_missing="skip"))[0]
+        for each in (da_partial, da)
+    )
     missing = [[0, 0], [0, 0], [1, 1]]
     assert (~item["agent_valid"]).long().tolist() == item["files_missing"].tolist() == missing
     assert same(item["points"], [*whole["points"][:2], [cloud[:0] for cloud in whole["points"][0]]])
@@ -126,7 +150,9 @@ def test_skipped_files_are_as_if_they_had_not_arrived(da: DeepAccident, da_parti
 
 
 @pytest.mark.parametrize("collated", [collate, collate_fusion])
-def test_items_that_make_no_batch(da: DeepAccident, tokens: list[str], collated: Callable[..., Any]) -> None:
+def test_items_that_make_no_batch(
+    da: DeepAccident, tokens: list[str], collated: Callable[..., Any]
+) -> None:
     plain, small, large, longer = (
         V2XDataset(da, tokens[:1], V2XConfig(points=False, boxes=None, **fields))[0]
         for fields in (
@@ -148,22 +174,36 @@ def test_items_that_make_no_batch(da: DeepAccident, tokens: list[str], collated:
             ConfigError,
             r"images: items of shapes .*9, 16\) and .*18, 32\) make no batch; .*resize=",
         ),
-        (lambda: collated([plain, longer]), ConfigError, r"agent_valid: items of shapes .* make no batch"),
+        (
+            lambda: collated([plain, longer]),
+            ConfigError,
+            r"agent_valid: items of shapes .* make no batch",
+        ),
     )
 
 
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
 @pytest.mark.parametrize("start", ["fork", "spawn"])
-def test_workers_give_what_one_process_gives(da: DeepAccident, tokens: list[str], start: str) -> None:
-    load = partial(DataLoader, V2XDataset(da, tokens[:4], EVERYTHING), batch_size=2, collate_fn=collate_fusion)
+def test_workers_give_what_one_process_gives(
+    da: DeepAccident, tokens: list[str], start: str
+) -> None:
+    load = partial(
+        DataLoader, V2XDataset(da, tokens[:4], EVERYTHING), batch_size=2, collate_fn=collate_fusion
+    )
     assert same(list(load()), list(load(num_workers=2, multiprocessing_context=start)))
 
 
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
 def test_workers_that_stay_hear_of_the_epoch(da: DeepAccident, tokens: list[str]) -> None:
-    data = V2XDataset(da, tokens[:3], V2XConfig(points=False, boxes=None, augmentation=RandomAugmentation()))
+    data = V2XDataset(
+        da, tokens[:3], V2XConfig(points=False, boxes=None, augmentation=RandomAugmentation())
+    )
     loader = DataLoader(
-        data, collate_fn=collate, num_workers=1, persistent_workers=True, multiprocessing_context="fork"
+        data,
+        collate_fn=collate,
+        num_workers=1,
+        persistent_workers=True,
+        multiprocessing_context="fork",
     )
     epochs = []
     for epoch in range(2):
@@ -175,7 +215,9 @@ def test_workers_that_stay_hear_of_the_epoch(da: DeepAccident, tokens: list[str]
 
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
 def test_errors_come_out_of_workers_as_they_are(da_b: DeepAccident) -> None:
-    loader = DataLoader(V2XDataset(da_b, [da_b.sample[0]["token"]]), num_workers=1, collate_fn=collate)
+    loader = DataLoader(
+        V2XDataset(da_b, [da_b.sample[0]["token"]]), num_workers=1, collate_fn=collate
+    )
     assert_refused((lambda: next(iter(loader)), MissingFileError, "no such file"))
 
 
@@ -188,18 +230,27 @@ def test_a_dataset_pickles_cheaply(da: DeepAccident) -> None:
 
 
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
-def test_the_documented_training_loop_learns(da: DeepAccident, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_documented_training_loop_learns(
+    da: DeepAccident, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The code of docs/training.md as it stands there; the session's release takes the place of its own."""
     page = Path(__file__).parents[2] / "docs" / "training.md"
     blocks = re.findall(r"```(python|bash)\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
     (tmp_path / "training_release").symlink_to(da.dataroot)
     monkeypatch.chdir(tmp_path)
-    for name, value in {"RANK": "0", "WORLD_SIZE": "1", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": "0"}.items():
+    for name, value in {
+        "RANK": "0",
+        "WORLD_SIZE": "1",
+        "MASTER_ADDR": "127.0.0.1",
+        "MASTER_PORT": "0",
+    }.items():
         monkeypatch.setenv(name, value)  # as torchrun does
     names: dict[str, Any] = {}
     for language, code in blocks:
         if language == "bash":
-            CliRunner().invoke(deepaccident, code.split()[1:], catch_exceptions=False, standalone_mode=False)
+            CliRunner().invoke(
+                deepaccident, code.split()[1:], catch_exceptions=False, standalone_mode=False
+            )
         else:
             exec(compile(code, str(page), "exec"), names)  # noqa: S102
     shown = (names["item"]["images"], names["fiery_batch"]["image"], names["fiery_batch"]["flow"])

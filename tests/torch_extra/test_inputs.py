@@ -20,12 +20,21 @@ from deepaccident_devkit.motion import (
     past_to_present,
 )
 
-CONFIG = MotionLabelConfig(grid=BevGrid(x=(-4, 4, 1), y=(-3, 3, 1)), receptive_field=1, future_frames=1)
-SHAPES = {"segmentation": (2, 2, 6, 8), "centerness": (2, 1, 6, 8), "offset": (2, 2, 6, 8), "flow": (2, 2, 6, 8)}
+CONFIG = MotionLabelConfig(
+    grid=BevGrid(x=(-4, 4, 1), y=(-3, 3, 1)), receptive_field=1, future_frames=1
+)
+SHAPES = {
+    "segmentation": (2, 2, 6, 8),
+    "centerness": (2, 1, 6, 8),
+    "offset": (2, 2, 6, 8),
+    "flow": (2, 2, 6, 8),
+}
 
 
 def heads(tensor: torch.Tensor) -> Any:
-    return MotionHeads(**{name: tensor.expand(shape) for name, shape in SHAPES.items()}).segmentation
+    return MotionHeads(
+        **{name: tensor.expand(shape) for name, shape in SHAPES.items()}
+    ).segmentation
 
 
 def heads_in_order(tensor: torch.Tensor) -> Any:
@@ -33,7 +42,9 @@ def heads_in_order(tensor: torch.Tensor) -> Any:
 
 
 def labels_of_a_batch(tensor: torch.Tensor) -> Any:
-    batch: dict[str, Any] = motion_labels_from_boxes([None, None], np.zeros((2, 6)), CONFIG).as_batch("beverse")
+    batch: dict[str, Any] = motion_labels_from_boxes(
+        [None, None], np.zeros((2, 6)), CONFIG
+    ).as_batch("beverse")
     batch["instance_offset"] = tensor.expand(batch["instance_offset"].shape)
     return MotionLabels.from_batch(batch, CONFIG, "beverse").offset
 
@@ -54,7 +65,9 @@ ENTRIES: list[Callable[[torch.Tensor], Any]] = [
 
 @pytest.mark.parametrize("entry", ENTRIES)
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.float16, torch.int32])
-def test_tensors_on_the_processor_are_read(entry: Callable[[torch.Tensor], Any], dtype: torch.dtype) -> None:
+def test_tensors_on_the_processor_are_read(
+    entry: Callable[[torch.Tensor], Any], dtype: torch.dtype
+) -> None:
     entry(torch.zeros((), dtype=dtype))
 
 
@@ -69,12 +82,21 @@ def test_tensors_on_the_processor_are_read(entry: Callable[[torch.Tensor], Any],
     ],
     ids=["grad", "device", "bfloat16", "complex"],
 )
-def test_others_are_refused_with_the_remedy(entry: Callable[[torch.Tensor], Any], tensor: torch.Tensor) -> None:
+def test_others_are_refused_with_the_remedy(
+    entry: Callable[[torch.Tensor], Any], tensor: torch.Tensor
+) -> None:
     assert_refused(
-        (lambda: entry(tensor), GeometryError, ("found Tensor (", "pass a torch tensor as tensor.detach().cpu()"))
+        (
+            lambda: entry(tensor),
+            GeometryError,
+            ("found Tensor (", "pass a torch tensor as tensor.detach().cpu()"),
+        )
     )
 
 
 def test_numbers_beyond_float32_are_refused() -> None:
-    huge, named = torch.full((), 1e300, dtype=torch.float64), "expected numbers within float32's range, found 1e"
+    huge, named = (
+        torch.full((), 1e300, dtype=torch.float64),
+        "expected numbers within float32's range, found 1e",
+    )
     assert_refused(*((partial(entry, huge), GeometryError, named) for entry in ENTRIES[:3]))

@@ -14,12 +14,18 @@ from deepaccident_devkit.training.torch import ImageConfig, V2XConfig, V2XDatase
 @pytest.mark.slow
 @pytest.mark.parametrize("method", ["fork", "spawn"])
 @pytest.mark.filterwarnings("ignore:This process .* is multi-threaded:DeprecationWarning")
-def test_two_workers_read_a_zip(method: str, da: DeepAccident, release_root: Path, tmp_path: Path) -> None:
-    zipped = DeepAccident(dataroot=packed(release_root, tmp_path / "all.zip"), workers=1, verbose=False)
+def test_two_workers_read_a_zip(
+    method: str, da: DeepAccident, release_root: Path, tmp_path: Path
+) -> None:
+    zipped = DeepAccident(
+        dataroot=packed(release_root, tmp_path / "all.zip"), workers=1, verbose=False
+    )
     tokens = [da.sample[number]["token"] for number in (1, 4, 8)]
     config = V2XConfig(agents="+infrastructure", images=ImageConfig(resize=(18, 32)))
     expected = list(DataLoader(V2XDataset(da, tokens, config), collate_fn=collate))
     data = V2XDataset(zipped, tokens, config)
     data[0]  # the archive is open before the fork
-    found = list(DataLoader(data, collate_fn=collate, num_workers=2, multiprocessing_context=method))
+    found = list(
+        DataLoader(data, collate_fn=collate, num_workers=2, multiprocessing_context=method)
+    )
     assert same(found, expected)

@@ -6,7 +6,16 @@ import sys
 
 import pytest
 
-from deepaccident_devkit import DeepAccident, descriptions, interactions, maps, motion, render, selection, validation
+from deepaccident_devkit import (
+    DeepAccident,
+    descriptions,
+    interactions,
+    maps,
+    motion,
+    render,
+    selection,
+    validation,
+)
 
 LATE = {
     name: getattr(package, name)
@@ -17,11 +26,28 @@ LATE = {
 
 
 def run(code: str) -> str:
-    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300, check=True).stdout
+    return subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=300, check=True
+    ).stdout
 
 
-PARTS = ("motion", "render", "descriptions", "interactions", "maps", "validation", "evaluation", "plugins")
-HEAVY = [*(f"deepaccident_devkit.{name}" for name in PARTS), "cv2", "matplotlib", "scipy", "shapely"]
+PARTS = (
+    "motion",
+    "render",
+    "descriptions",
+    "interactions",
+    "maps",
+    "validation",
+    "evaluation",
+    "plugins",
+)
+HEAVY = [
+    *(f"deepaccident_devkit.{name}" for name in PARTS),
+    "cv2",
+    "matplotlib",
+    "scipy",
+    "shapely",
+]
 
 
 @pytest.mark.parametrize(

@@ -29,7 +29,20 @@ class Named:
 
 @pytest.mark.parametrize(
     "given",
-    [None, b"/data", 3, 3.5, True, [], "", "a\0b", "\ud800", "~nobody-of-this-name/x", Path("a\0b"), Named(b"a")],
+    [
+        None,
+        b"/data",
+        3,
+        3.5,
+        True,
+        [],
+        "",
+        "a\0b",
+        "\ud800",
+        "~nobody-of-this-name/x",
+        Path("a\0b"),
+        Named(b"a"),
+    ],
 )
 def test_what_is_no_path_is_refused(given: Any, da: DeepAccident) -> None:
     assert_refused(
@@ -41,7 +54,9 @@ def test_what_is_no_path_is_refused(given: Any, da: DeepAccident) -> None:
         ),
     )
     for refused in (
-        lambda: DeepAccident("v1", da.dataroot, index_dir=given if given is not None else "", verbose=False),
+        lambda: DeepAccident(
+            "v1", da.dataroot, index_dir=given if given is not None else "", verbose=False
+        ),
         lambda: read_results(given),
         lambda: ResultsWriter(given, "detection"),
         lambda: read_bundle(given),

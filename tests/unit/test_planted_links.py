@@ -30,7 +30,9 @@ Writer = Callable[[DeepAccident, Path], object]
 def small(tmp_path_factory: pytest.TempPathFactory) -> DeepAccident:
     """Two scenarios with a camera."""
     root = tmp_path_factory.mktemp("small") / "release"
-    wanted = SmallRelease(splits=("train",), agents=("ego_vehicle",), frames=8, channels=("Camera_Front",))
+    wanted = SmallRelease(
+        splits=("train",), agents=("ego_vehicle",), frames=8, channels=("Camera_Front",)
+    )
     write_small_release(root, wanted)
     return DeepAccident(dataroot=root, verbose=False)
 
@@ -67,12 +69,15 @@ def a_release(_: DeepAccident, folder: Path, left: float = math.inf) -> None:
             raise KeyboardInterrupt
         for kind in ("label", "calib"):
             write_bytes(
-                job.root / job.folder.scenario_type / "ego_vehicle" / kind / f"{job.plan.name}.txt", b"recorded"
+                job.root / job.folder.scenario_type / "ego_vehicle" / kind / f"{job.plan.name}.txt",
+                b"recorded",
             )
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(generate, "record_scenario", record)
-        make_release(folder / "out", SynthConfig(scenarios=2, frames=1, sensors=False, seed=7), workers=1)
+        make_release(
+            folder / "out", SynthConfig(scenarios=2, frames=1, sensors=False, seed=7), workers=1
+        )
 
 
 def half_a_release(dataset: DeepAccident, folder: Path) -> None:
@@ -81,7 +86,9 @@ def half_a_release(dataset: DeepAccident, folder: Path) -> None:
 
 def an_index(dataset: DeepAccident, folder: Path) -> None:
     if not (folder / "release").exists():
-        shutil.copytree(dataset.dataroot, folder / "release", ignore=shutil.ignore_patterns(".deepaccident"))
+        shutil.copytree(
+            dataset.dataroot, folder / "release", ignore=shutil.ignore_patterns(".deepaccident")
+        )
     opened = DeepAccident(dataroot=folder / "release", verbose=False)
     for row in opened.scenario:
         opened.interactions(row["token"])
@@ -103,7 +110,10 @@ def spots(folder: Path) -> Iterator[str]:
     """Each folder, and one file of each."""
     for path, folders, files in os.walk(folder):
         inside = Path(path).relative_to(folder)
-        yield from ((inside / name).as_posix() for name in [*folders, *sorted(files)[:1], *sorted(files)[-1:]])
+        yield from (
+            (inside / name).as_posix()
+            for name in [*folders, *sorted(files)[:1], *sorted(files)[-1:]]
+        )
 
 
 def states(folder: Path) -> dict[str, tuple[int, bytes | None]]:
@@ -116,9 +126,13 @@ def states(folder: Path) -> dict[str, tuple[int, bytes | None]]:
 @pytest.mark.slow
 @pytest.mark.parametrize("dangling", [False, True], ids=["to something", "dangling"])
 @pytest.mark.parametrize("what", WRITERS)
-def test_a_link_in_any_place_leads_nothing_out(small: DeepAccident, tmp_path: Path, what: str, dangling: bool) -> None:
+def test_a_link_in_any_place_leads_nothing_out(
+    small: DeepAccident, tmp_path: Path, what: str, dangling: bool
+) -> None:
     begin, go = WRITERS[what]
-    begun, done, outside, folder = (tmp_path / name for name in ("begun", "done", "outside", "folder"))
+    begun, done, outside, folder = (
+        tmp_path / name for name in ("begun", "done", "outside", "folder")
+    )
     for each in (begun, outside):
         each.mkdir()
     begin(small, begun)
@@ -126,7 +140,9 @@ def test_a_link_in_any_place_leads_nothing_out(small: DeepAccident, tmp_path: Pa
     go(small, done)
     places = {name: path / name for path in (done, begun) for name in spots(path)}
     if what == "a release":
-        places |= {name.replace("out", ".out.unfinished/release", 1): path for name, path in places.items()}
+        places |= {
+            name.replace("out", ".out.unfinished/release", 1): path for name, path in places.items()
+        }
     elif what == "an index":
         places = {name: path for name, path in places.items() if "/.deepaccident/" in name}
     refused = 0
@@ -141,7 +157,11 @@ def test_a_link_in_any_place_leads_nothing_out(small: DeepAccident, tmp_path: Pa
         before = states(outside)
         try:
             go(small, folder)
-        except (DeepAccidentError, OSError, ValueError) as error:  # the last of a format that reads a stranger's part
+        except (
+            DeepAccidentError,
+            OSError,
+            ValueError,
+        ) as error:  # the last of a format that reads a stranger's part
             refused += isinstance(error, OutputFolderError)
         assert states(outside) == before, name
     assert refused
@@ -176,7 +196,9 @@ ATTACKS = {
 
 @pytest.mark.parametrize("of_another", [False, True], ids=["of the unit", "of another unit"])
 @pytest.mark.parametrize("attack", ATTACKS)
-def test_a_journal_removes_nothing_outside(small: DeepAccident, tmp_path: Path, attack: str, of_another: bool) -> None:
+def test_a_journal_removes_nothing_outside(
+    small: DeepAccident, tmp_path: Path, attack: str, of_another: bool
+) -> None:
     """Its lines are paths of which an unfinished export removes those that it does not write again."""
     half_an_export(small, tmp_path)
     out, outside, line = tmp_path / EXPORT, tmp_path / "outside", ATTACKS[attack]
@@ -221,7 +243,10 @@ def test_what_leads_out_is_refused(tmp_path: Path, path: str) -> None:
         (lambda: remove_in(root, path), OutputFolderError, r"a symbolic link|is no path below it"),
         (lambda: place_in(root, "link", opened=True), OutputFolderError, linked),
     )
-    assert (place_in(named, "a/b/c"), place_in(root, "link")) == (named / "a" / "b" / "c", root / "link")
+    assert (place_in(named, "a/b/c"), place_in(root, "link")) == (
+        named / "a" / "b" / "c",
+        root / "link",
+    )
     for name in ("link", "a", "not there", "a/not/there"):
         remove_in(root, name)
     assert ([*root.iterdir()], (outside / "b").is_dir()) == ([], True)

@@ -63,17 +63,19 @@ TEXTS = {
     "LidarPointCloud(3 points in ego: x -1.0 to 30.0 m, y -4.0 to 2.0 m, z 0.0 to 0.2 m)": cloud,
     "LidarPointCloud(0 points in ego)": lambda: cloud().select([]),
     "MotionHeads(5 frames of 24 × 16 cells, devkit)": heads,
-    "MotionOutput(2 predictions of 5 frames, 24 × 16 cells of 0.5 × 0.25 m, heads)": lambda: MotionOutput(
-        grid=GRID, heads=(heads(), heads())
+    "MotionOutput(2 predictions of 5 frames, 24 × 16 cells of 0.5 × 0.25 m, heads)": lambda: (
+        MotionOutput(grid=GRID, heads=(heads(), heads()))
     ),
-    "MotionOutput(1 prediction of 5 frames, 200 × 200 cells of 0.5 m, instances)": lambda: MotionOutput(
-        grid=BevGrid(), instances=np.zeros((1, 5, 200, 200), dtype=np.int32)
+    "MotionOutput(1 prediction of 5 frames, 200 × 200 cells of 0.5 m, instances)": lambda: (
+        MotionOutput(grid=BevGrid(), instances=np.zeros((1, 5, 200, 200), dtype=np.int32))
     ),
     f"{START}released, each frame in its own ego frame)": labels,
-    f"{START}clean, all at the present)": lambda: labels(protocol=LABEL_PROTOCOLS["clean"]).to_present(),
+    f"{START}clean, all at the present)": lambda: labels(
+        protocol=LABEL_PROTOCOLS["clean"]
+    ).to_present(),
     f"{START}own protocol, each frame in its own ego frame)": lambda: labels(protocol=MINE),
-    "DetectedBoxes(boxes=Boxes(2 in Camera_Front_Left: 1 car, 1 truck), scores=(2,) float64)": lambda: DetectedBoxes(
-        boxes=boxes()[:2], scores=np.array([0.5, 0.25])
+    "DetectedBoxes(boxes=Boxes(2 in Camera_Front_Left: 1 car, 1 truck), scores=(2,) float64)": lambda: (
+        DetectedBoxes(boxes=boxes()[:2], scores=np.array([0.5, 0.25]))
     ),
     "Accident(positions=(2, 2) float64, time=1.5, score=1, ids=(3, 7))": lambda: Accident(
         positions=np.zeros((2, 2)), time=1.5, ids=(3, 7)
@@ -88,13 +90,21 @@ def test_texts(text: str) -> None:
 
 def test_results_print_their_first_headlines() -> None:
     result = replace(AccidentEvaluator().compute(), samples=1234, apa=0.5, id_error=0.25)
-    assert repr(result) == ("AccidentResult(1,234 samples: apa 0.500, accuracy@5 –, accuracy@10 –, accuracy@15 –, …)")
+    assert repr(result) == (
+        "AccidentResult(1,234 samples: apa 0.500, accuracy@5 –, accuracy@10 –, accuracy@15 –, …)"
+    )
     page = Page(result._repr_html_())
     assert page.text.startswith("AccidentResult, 1,234 samplesnumbervalue")
     assert page.text.endswith("id_error0.250position_error20.000 mtime_error1.000 s")
 
 
-PICTURED = [boxes, cloud, labels, lambda: labels().to_present(), lambda: cloud().transform(SE3.identity(), "world")]
+PICTURED = [
+    boxes,
+    cloud,
+    labels,
+    lambda: labels().to_present(),
+    lambda: cloud().transform(SE3.identity(), "world"),
+]
 
 
 @pytest.mark.parametrize("make", PICTURED)
@@ -102,12 +112,20 @@ def test_a_notebook_shows_a_small_picture(make: Callable[[], Any]) -> None:
     page = Page(make()._repr_html_())
     [image] = page.all("img")
     kind, _, content = str(image["src"]).partition(",")
-    assert (kind, 1000 < len(content) < 60_000, page.text) == ("data:image/png;base64", True, repr(make()))
+    assert (kind, 1000 < len(content) < 60_000, page.text) == (
+        "data:image/png;base64",
+        True,
+        repr(make()),
+    )
     assert plt.imread(BytesIO(base64.b64decode(content))).shape == (256, 288, 4)
 
 
-def test_a_notebook_shows_the_text_where_there_is_no_picture(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_notebook_shows_the_text_where_there_is_no_picture(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     for empty in (boxes()[:0], cloud().select([])):
         assert empty._repr_html_() == f"<pre>{empty!r}</pre>"
-    monkeypatch.setattr(deepaccident_devkit.render.notebook, "png_of", Mock(side_effect=RuntimeError))
+    monkeypatch.setattr(
+        deepaccident_devkit.render.notebook, "png_of", Mock(side_effect=RuntimeError)
+    )
     assert Page(labels()._repr_html_()).text == repr(labels())

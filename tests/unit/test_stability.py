@@ -25,9 +25,17 @@ CHANGED = """what is public is no longer what docs/public_names.json says:
 Was that wanted? docs/stability.md says which version may do it. Write it into CHANGELOG.md, with what to use instead,
 and run: python docs/make_public_names.py"""
 OLD = {
-    "rooms": {"geometry": {"Box": "class ()", "area": "(box: Box, scale: float=1.0) -> float", "gone": ": int"}},
+    "rooms": {
+        "geometry": {
+            "Box": "class ()",
+            "area": "(box: Box, scale: float=1.0) -> float",
+            "gone": ": int",
+        }
+    },
     "commands": {"deepaccident info": "DATAROOT --json"},
-    "daily": {"geometry.area": {"page": "docs/reading.md", "is": "(box: Box, scale: float=1.0) -> float"}},
+    "daily": {
+        "geometry.area": {"page": "docs/reading.md", "is": "(box: Box, scale: float=1.0) -> float"}
+    },
 }
 
 
@@ -44,11 +52,15 @@ def listed(script: ModuleType) -> dict[str, Any]:
 def test_what_is_public_is_what_the_list_says(script: ModuleType, listed: dict[str, Any]) -> None:
     changes = script.differences(json.loads(script.FILE.read_text(encoding="utf-8")), listed)
     assert changes == [], CHANGED.format("\n".join(changes))
-    assert script.FILE.read_text(encoding="utf-8") == script.as_json(listed), "run: python docs/make_public_names.py"
+    assert script.FILE.read_text(encoding="utf-8") == script.as_json(listed), (
+        "run: python docs/make_public_names.py"
+    )
 
 
 def test_a_change_is_named(script: ModuleType) -> None:
-    new = json.loads(json.dumps(OLD).replace("scale: float=1.0", "scale: float=2.0").replace("gone", "came"))
+    new = json.loads(
+        json.dumps(OLD).replace("scale: float=1.0", "scale: float=2.0").replace("gone", "came")
+    )
     new["commands"]["deepaccident info"] += " --out"
     new["daily"]["geometry.area"]["page"] = "docs/safety.md"
     was, now = (f"(box: Box, scale: float={value}) -> float" for value in ("1.0", "2.0"))
@@ -84,12 +96,24 @@ def test_code_of_pages_imports_public_names_alone(script: ModuleType) -> None:
 def test_it_has_the_versions_of_files() -> None:
     versions = re.findall(r"^\| [^|]+ \| (\d) \| ", PAGE, re.MULTILINE)
     assert versions == [
-        str(each) for each in (SCHEMA_VERSION, label_folder.LABEL_FORMAT_VERSION, FORMAT_VERSION, SUMMARY_VERSION)
+        str(each)
+        for each in (
+            SCHEMA_VERSION,
+            label_folder.LABEL_FORMAT_VERSION,
+            FORMAT_VERSION,
+            SUMMARY_VERSION,
+        )
     ]
 
 
 def test_every_package_of_the_reference_says_what_is_public() -> None:
     listed = {name for names in loaded_script("docs/conf.py").REFERENCE.values() for name in names}
-    names = [f".{name}" for name in listed - {"training.torch", "plugins.model"} if name.rpartition(".")[2].islower()]
+    names = [
+        f".{name}"
+        for name in listed - {"training.torch", "plugins.model"}
+        if name.rpartition(".")[2].islower()
+    ]
     packages = [import_module(name, "deepaccident_devkit") for name in names]
-    assert [each for each in packages if hasattr(each, "__path__") and not hasattr(each, "__all__")] == []
+    assert [
+        each for each in packages if hasattr(each, "__path__") and not hasattr(each, "__all__")
+    ] == []

@@ -12,9 +12,16 @@ sys.path.insert(0, str(_TOP / "tests"))  # for what it shares with the tests
 
 
 @click.command()
-@click.option("--count", default=EACH, show_default=True, help="How many changed files of each kind.")
+@click.option(
+    "--count", default=EACH, show_default=True, help="How many changed files of each kind."
+)
 @click.option("--kinds", metavar="NAME[,NAME…]", help="Only these kinds of files; the page stays.")
-@click.option("--kills", default=100, show_default=True, help="How many killed processes; 0: no full disks either.")
+@click.option(
+    "--kills",
+    default=100,
+    show_default=True,
+    help="How many killed processes; 0: no full disks either.",
+)
 @click.option("--seed", default=0, show_default=True)
 def main(count: int, kinds: str | None, kills: int, seed: int) -> None:
     """Change files, kill processes and fill disks; exit status 1 if anything failed.

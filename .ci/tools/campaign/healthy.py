@@ -59,11 +59,29 @@ RECIPE = {
     "question": "Is each of them read?",
     "releases": {
         "there": {"dataroot": "/data/DeepAccident", "version": "v1"},
-        "made": {"seed": 3, "scenarios": 4, "frames": 20, "spec": "scenes/mine.yaml", "nuscenes": True},
+        "made": {
+            "seed": 3,
+            "scenarios": 4,
+            "frames": 20,
+            "spec": "scenes/mine.yaml",
+            "nuscenes": True,
+        },
     },
     "weights": {
-        "first": {"release": "there", "split": "train", "preset": "tiny", "steps": 10, "learning_rate": 0.001},
-        "second": {"release": "made", "also": "there", "also_split": "val", "mix": 0.25, "from": "first"},
+        "first": {
+            "release": "there",
+            "split": "train",
+            "preset": "tiny",
+            "steps": 10,
+            "learning_rate": 0.001,
+        },
+        "second": {
+            "release": "made",
+            "also": "there",
+            "also_split": "val",
+            "mix": 0.25,
+            "from": "first",
+        },
         "given": {"file": "tiny"},
     },
     "test": {
@@ -79,10 +97,26 @@ RECIPE = {
     },
     "seeds": [1, 2],
     "rows": [
-        {"name": "{agents}, {latency} s", "weights": "first", "agents": ["single", "all"], "latency": [0.0, 0.2]},
-        {"name": "boxes", "weights": "second", "baseline": "constant_velocity", "budget": 1000, "packet_loss": 0.1},
+        {
+            "name": "{agents}, {latency} s",
+            "weights": "first",
+            "agents": ["single", "all"],
+            "latency": [0.0, 0.2],
+        },
+        {
+            "name": "boxes",
+            "weights": "second",
+            "baseline": "constant_velocity",
+            "budget": 1000,
+            "packet_loss": 0.1,
+        },
         {"name": "black", "weights": "given", "control": "blank"},
-        {"name": "off {pose_noise} m", "baseline": "standing", "pose_noise": [0.0, 0.5], "horizon": 2.0},
+        {
+            "name": "off {pose_noise} m",
+            "baseline": "standing",
+            "pose_noise": [0.0, 0.5],
+            "horizon": 2.0,
+        },
         {"name": "nothing", "trivial": "nothing"},
     ],
     "groups": {"hidden": ["hidden_collider=true"]},
@@ -117,7 +151,9 @@ def make_healthy(folder: Path) -> Path:
     for task in SETUPS:
         _write_results(dataset, folder / "results" / task, task)
     for task, setup in SETUPS.items():
-        run = evaluate_results(dataset, folder / "results" / task, setup, selection(task), workers=1)
+        run = evaluate_results(
+            dataset, folder / "results" / task, setup, selection(task), workers=1
+        )
         run = run.broken_down(("all", "agent"), Resampling(resamples=20))
         save_run(run, folder / "bundles" / task, include_results=True)
     write_label_files(dataset, folder / "labels", tokens(dataset), LABELS, workers=1)
@@ -126,7 +162,9 @@ def make_healthy(folder: Path) -> Path:
     (folder / "recipes").mkdir()
     for name in ("agents", "road"):
         shutil.copy(SHIPPED_RECIPES / f"{name}.yaml", folder / "recipes")
-    (folder / "recipes" / "every_key.yaml").write_text(yaml.safe_dump(RECIPE, sort_keys=False), encoding="utf-8")
+    (folder / "recipes" / "every_key.yaml").write_text(
+        yaml.safe_dump(RECIPE, sort_keys=False), encoding="utf-8"
+    )
     _write_exports(dataset, sensors, folder)
     for method in ("stored", "deflated"):
         packed(folder / "small", folder / "zips" / f"{method}.zip", method)
@@ -162,8 +200,12 @@ def copied(healthy: Path, home: Path) -> Path:
 
 def selection(task: str) -> SampleSelection:
     """The samples of the results of a task."""
-    agents = AGENTS[:1] if task in ("planning", "forecasting") else None  # the infrastructure does not drive
-    return SampleSelection(split="train", samples="all", agents=agents, horizon=SETUPS[task].horizon)
+    agents = (
+        AGENTS[:1] if task in ("planning", "forecasting") else None
+    )  # the infrastructure does not drive
+    return SampleSelection(
+        split="train", samples="all", agents=agents, horizon=SETUPS[task].horizon
+    )
 
 
 def tokens(dataset: DeepAccident, task: str = "motion") -> list[str]:
@@ -185,7 +227,10 @@ def _write_exports(dataset: DeepAccident, sensors: DeepAccident, folder: Path) -
         (begun / "before" / f"{name}.yaml").write_bytes(b"written by the killed one\n")
     windows = WindowRules(observe=0, ahead=1, stride=0.5)
     export_release(dataset, folder / "questions", Questions(window=windows), workers=1)
-    truth = [json.loads(line) for line in (folder / "questions" / "truth.jsonl").read_bytes().splitlines()]
+    truth = [
+        json.loads(line)
+        for line in (folder / "questions" / "truth.jsonl").read_bytes().splitlines()
+    ]
     answers = [
         {
             "id": each["id"],
@@ -209,7 +254,9 @@ def _link(source: str, target: str) -> None:
 def _write_results(dataset: DeepAccident, path: Path, task: str) -> None:
     grid = LABELS.grid if task == "motion" else None
     path.parent.mkdir(exist_ok=True)
-    with ResultsWriter(path, task, meta={"method": "a healthy one"}, grid=grid, step=HORIZON) as writer:  # type: ignore[arg-type]
+    with ResultsWriter(
+        path, task, meta={"method": "a healthy one"}, grid=grid, step=HORIZON
+    ) as writer:  # type: ignore[arg-type]
         for token in tokens(dataset, task):
             writer.add(token, _prediction(dataset, token, task))
 
@@ -224,7 +271,10 @@ def _prediction(dataset: DeepAccident, token: str, task: str) -> object:
     times = [0.1, HORIZON]
     if task == "planning":
         plans = ([[1.0, 0.0], [5.0, 0.5]], [[0.5, 0.0], [2.0, 0.0]])
-        return [Plan(times=times, path=path, score=1.0 - place, yaw=[0.0, 0.1]) for place, path in enumerate(plans)]
+        return [
+            Plan(times=times, path=path, score=1.0 - place, yaw=[0.0, 0.1])
+            for place, path in enumerate(plans)
+        ]
     if task == "forecasting":
         paths = [[[1.0, 2.0], [3.0, 4.0]], [[1.0, 2.0], [1.0, 2.5]]]
         actors = dataset.boxes(token).actor_id.tolist()

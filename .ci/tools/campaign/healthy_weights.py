@@ -11,7 +11,13 @@ from deepaccident_devkit.plugins.model.network import V2XFormer
 from deepaccident_devkit.plugins.model.training_run import TrainConfig
 
 TRAINING = TrainConfig(
-    steps=1, egos=1, samples="every", agents="available", validation=None, save_every=1, seed=RUN.seed
+    steps=1,
+    egos=1,
+    samples="every",
+    agents="available",
+    validation=None,
+    save_every=1,
+    seed=RUN.seed,
 )
 
 
@@ -25,7 +31,11 @@ def write_weight_files(folder: Path) -> None:
     """Our own format, and both of PyTorch."""
     folder.mkdir()
     state = small_network().state_dict()
-    write_weights(folder / "own.safetensors", state, {"preset": "tiny", "fusion": None, "horizon": None, "step": 7})
+    write_weights(
+        folder / "own.safetensors",
+        state,
+        {"preset": "tiny", "fusion": None, "horizon": None, "step": 7},
+    )
     torch.save(state, folder / "new.pt")
     torch.save(state, folder / "old.pth", _use_new_zipfile_serialization=False)
 

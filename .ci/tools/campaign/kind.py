@@ -78,7 +78,9 @@ class Kind:
 
     def files(self, tree: Path) -> list[Path]:
         """The files of this kind that are not empty."""
-        return sorted(path for path in tree.glob(self.pattern) if path.is_file() and path.stat().st_size)
+        return sorted(
+            path for path in tree.glob(self.pattern) if path.is_file() and path.stat().st_size
+        )
 
 
 @cache

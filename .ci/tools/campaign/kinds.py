@@ -33,7 +33,14 @@ from deepaccident_devkit.validation import validate_release
 
 
 def _opened(room: Room, on_error: Any) -> DeepAccident:
-    return DeepAccident("v1", room.tree, index_dir=room.scratch / "index", workers=1, verbose=False, on_error=on_error)
+    return DeepAccident(
+        "v1",
+        room.tree,
+        index_dir=room.scratch / "index",
+        workers=1,
+        verbose=False,
+        on_error=on_error,
+    )
 
 
 def _validate(room: Room, *, deep: bool = False) -> Any:
@@ -42,7 +49,9 @@ def _validate(room: Room, *, deep: bool = False) -> Any:
 
 
 def _judge_sentences(_room: Room, sentences: list[str]) -> str | None:
-    return next((f"a sentence of {len(each)} characters" for each in sentences if len(each) > 2000), None)
+    return next(
+        (f"a sentence of {len(each)} characters" for each in sentences if len(each) > 2000), None
+    )
 
 
 _SMALL = (
@@ -102,7 +111,9 @@ def _image(room: Room) -> Any:
 
 
 def _judge_image(room: Room, read: Any) -> str | None:
-    return None if np.array_equal(read, plain.image(room.victim)) else "other pixels than Pillow reads"
+    return (
+        None if np.array_equal(read, plain.image(room.victim)) else "other pixels than Pillow reads"
+    )
 
 
 def _judge_lidar(room: Room, read: Any) -> str | None:
@@ -130,7 +141,11 @@ def _predictions(room: Room) -> Any:
 
 def _top(room: Room) -> Path:
     """The results' file or folder."""
-    return room.tree / room.victim.relative_to(room.tree).parts[0] if room.tree.name == "results" else room.tree
+    return (
+        room.tree / room.victim.relative_to(room.tree).parts[0]
+        if room.tree.name == "results"
+        else room.tree
+    )
 
 
 def _judge_accidents(room: Room, read: Mapping[str, Any]) -> str | None:
@@ -138,8 +153,14 @@ def _judge_accidents(room: Room, read: Mapping[str, Any]) -> str | None:
     if list(read) != list(said):
         return "other samples"
     for token, accidents in read.items():
-        found = [(each.positions.tolist(), each.time, each.score, each.ids and list(each.ids)) for each in accidents]
-        if found != [(each["positions"], each["time"], each["score"], each.get("ids")) for each in said[token]]:
+        found = [
+            (each.positions.tolist(), each.time, each.score, each.ids and list(each.ids))
+            for each in accidents
+        ]
+        if found != [
+            (each["positions"], each["time"], each["score"], each.get("ids"))
+            for each in said[token]
+        ]:
             return f"{token}: other accidents"
     return None
 
@@ -151,7 +172,8 @@ def _judge_boxes(room: Room, read: Mapping[str, Any]) -> str | None:
     for token, detected in read.items():
         found = np.column_stack([detected.boxes.center, detected.boxes.size, detected.scores])
         rows = [
-            (*each["translation"], *np.take(each["size"], [1, 0, 2]), each["detection_score"]) for each in said[token]
+            (*each["translation"], *np.take(each["size"], [1, 0, 2]), each["detection_score"])
+            for each in said[token]
         ]
         if not np.array_equal(found, np.reshape(rows, (-1, 7))):
             return f"{token}: other boxes"
@@ -162,7 +184,12 @@ def _judge_plans(room: Room, read: Mapping[str, Any]) -> str | None:
     return _fault_of_entries(
         room,
         read,
-        lambda plan: [plan.times.tolist(), plan.path.tolist(), plan.score, plan.yaw is not None and plan.yaw.tolist()],
+        lambda plan: [
+            plan.times.tolist(),
+            plan.path.tolist(),
+            plan.score,
+            plan.yaw is not None and plan.yaw.tolist(),
+        ],
         lambda entry: [entry["times"], entry["path"], entry["score"], entry.get("yaw") or False],
     )
 
@@ -171,13 +198,21 @@ def _judge_forecasts(room: Room, read: Mapping[str, Any]) -> str | None:
     return _fault_of_entries(
         room,
         read,
-        lambda each: [each.actor_id, each.times.tolist(), each.paths.tolist(), each.probabilities.tolist()],
+        lambda each: [
+            each.actor_id,
+            each.times.tolist(),
+            each.paths.tolist(),
+            each.probabilities.tolist(),
+        ],
         lambda entry: [entry["id"], entry["times"], entry["paths"], entry["probabilities"]],
     )
 
 
 def _fault_of_entries(
-    room: Room, read: Mapping[str, Any], facts: Callable[[Any], list[Any]], stated: Callable[[Any], list[Any]]
+    room: Room,
+    read: Mapping[str, Any],
+    facts: Callable[[Any], list[Any]],
+    stated: Callable[[Any], list[Any]],
 ) -> str | None:
     """A sample whose predictions are not what the file states, entry by entry."""
     entries = plain.json_file(room.victim)["results"]
@@ -192,7 +227,10 @@ def _fault_of_entries(
 def _judge_motion(room: Room, read: Mapping[str, Any]) -> str | None:
     shards = [path for path in (room.tree / "motion" / "shards").glob("*.npz") if path.is_file()]
     for token, output in read.items():
-        if not any(np.array_equal(output.instances, plain.array(shard, f"{token}/instance")) for shard in shards):
+        if not any(
+            np.array_equal(output.instances, plain.array(shard, f"{token}/instance"))
+            for shard in shards
+        ):
             return f"{token}: other instances"
     return None
 
@@ -202,7 +240,9 @@ def _evaluation(task: str) -> Action:
 
     def read(room: Room) -> Any:
         dataset = dataset_of(room.home)
-        run = evaluate_results(dataset, _top(room), SETUPS[task], selection(task), workers=1, allow_partial=True)
+        run = evaluate_results(
+            dataset, _top(room), SETUPS[task], selection(task), workers=1, allow_partial=True
+        )
         return run.summary(), report_html(run, [])
 
     def judge(_room: Room, read: tuple[Any, str]) -> str | None:
@@ -266,7 +306,10 @@ def _judge_labels(room: Room, read: Mapping[str, Any]) -> str | None:
     for token, labels in read.items():
         recording, _, frame = token.rpartition("/")
         path = room.tree / f"{recording}.npz"
-        for name, found in (("instance", labels.instance), ("future_egomotion", labels.future_egomotion)):
+        for name, found in (
+            ("instance", labels.instance),
+            ("future_egomotion", labels.future_egomotion),
+        ):
             if not np.array_equal(found, plain.array(path, f"{frame}/{name}"), equal_nan=True):
                 return f"{token}: other {name} than numpy reads"
     return None
@@ -288,18 +331,31 @@ def _judge_spec(room: Room, read: Part) -> str | None:
 def _part_fault(part: Part, said: Any, path: str) -> str | None:
     """The first value that differs; keys of a file have their field's name, `from` alone another one."""
     for name, choice in part.fields.items():
-        value = next(said[key] for key in (name, name.removesuffix("_arm"), name.replace("_", "-")) if key in said)
+        value = next(
+            said[key]
+            for key in (name, name.removesuffix("_arm"), name.replace("_", "-"))
+            if key in said
+        )
         if isinstance(choice, Part):
             faults: Iterator[str | None] = iter([_part_fault(choice, value, f"{path}.{name}")])
         elif isinstance(choice, AllOf):
             pairs = zip(choice.items, value, strict=True)
-            faults = (_part_fault(item, each, name) if isinstance(item, Part) else None for item, each in pairs)
+            faults = (
+                _part_fault(item, each, name) if isinstance(item, Part) else None
+                for item, each in pairs
+            )
         else:
             found = list(choice.alternatives())
             expected = value if isinstance(value, list) else [value]
-            plain_values = all(isinstance(each, str | int | float | bool | None) for each in [*found, *expected])
+            plain_values = all(
+                isinstance(each, str | int | float | bool | None) for each in [*found, *expected]
+            )
             faults = iter(
-                [f"{path}.{name}: {found} and not {expected}" if plain_values and found != expected else None]
+                [
+                    f"{path}.{name}: {found} and not {expected}"
+                    if plain_values and found != expected
+                    else None
+                ]
             )
         if fault := next(filter(None, faults), None):
             return fault
@@ -313,15 +369,21 @@ def _index(room: Room, *, check: bool = False) -> Any:
     if check:
         from deepaccident_devkit.tables import open_index
 
-        open_index(find_release(room.home / "release"), index_dir=room.tree, workers=1, check_files=True)
-    dataset = DeepAccident("v1", room.home / "release", index_dir=room.tree, workers=1, verbose=False)
+        open_index(
+            find_release(room.home / "release"), index_dir=room.tree, workers=1, check_files=True
+        )
+    dataset = DeepAccident(
+        "v1", room.home / "release", index_dir=room.tree, workers=1, verbose=False
+    )
     dataset.table_names.sort()
     return {name: dataset.arrow(name).to_pydict() for name in dataset.table_names}
 
 
 @cache
 def _healthy_tables(home: Path) -> Any:
-    dataset = DeepAccident("v1", home / "release", index_dir=home / "kept" / "index", workers=1, verbose=False)
+    dataset = DeepAccident(
+        "v1", home / "release", index_dir=home / "kept" / "index", workers=1, verbose=False
+    )
     return {name: dataset.arrow(name).to_pydict() for name in dataset.table_names}
 
 
@@ -335,7 +397,11 @@ def _judge_opened(room: Room, read: Any) -> str | None:
         return None
     index = Index.read(room.tree / "v1")
     files = index.table_files if index else {}
-    damaged = [name for name, (_, checksum) in files.items() if _checksum(index.tables_folder / name) != checksum]
+    damaged = [
+        name
+        for name, (_, checksum) in files.items()
+        if _checksum(index.tables_folder / name) != checksum
+    ]
     return None if damaged else "other values, and all checksums are right"
 
 
@@ -354,14 +420,23 @@ KINDS = {
         Kind("calib", "pickle", "small", "*/*/calib/*/*.pkl", (*_SMALL, _CALIB)),
         Kind("meta", "text", "small", "*/meta/*.txt", _SMALL),
         Kind("split file", "text", "small", "train.txt", _SPLITS),
-        Kind("image", "image", "sensors", "*/*/Camera_Front/*/*.jpg", (Action(_image, _judge_image), _DEEP)),
+        Kind(
+            "image",
+            "image",
+            "sensors",
+            "*/*/Camera_Front/*/*.jpg",
+            (Action(_image, _judge_image), _DEEP),
+        ),
         Kind(
             "LiDAR",
             "npz",
             "sensors",
             "*/*/lidar01/*/*.npz",
             (
-                Action(lambda room: _sensors(room.tree).load_point_cloud(_token(room), frame="lidar"), _judge_lidar),
+                Action(
+                    lambda room: _sensors(room.tree).load_point_cloud(_token(room), frame="lidar"),
+                    _judge_lidar,
+                ),
                 _DEEP,
             ),
         ),

@@ -25,7 +25,19 @@ _JSON = ("json", "manifest", "record", "address", "tables")
 _ARCHIVES = ("zip", "pt")
 _YAML = ("yaml", "recipe")
 _OTHERS = ("journal", "images", "safetensors", "pth", *_ARCHIVES)
-FORMS = ("text", *_JSON, "lines", *_YAML, "pickle", "npz", "image", "arrow", "parquet", "shard", *_OTHERS)
+FORMS = (
+    "text",
+    *_JSON,
+    "lines",
+    *_YAML,
+    "pickle",
+    "npz",
+    "image",
+    "arrow",
+    "parquet",
+    "shard",
+    *_OTHERS,
+)
 GROUPS = ("bytes", "numbers", "types", "bombs", "links", "names")
 MARKER = "a pickle has run"
 """The folder beside the changed files that a pickle makes whose code is run."""
@@ -64,7 +76,9 @@ MUTATIONS: dict[str, Mutation] = {}
 """By name."""
 
 
-def by_path(group: str, *forms: str) -> Callable[[Callable[[Path, Rng], None]], Callable[[Path, Rng], None]]:
+def by_path(
+    group: str, *forms: str
+) -> Callable[[Callable[[Path, Rng], None]], Callable[[Path, Rng], None]]:
     """Enter a function that changes what is at a path."""
 
     def enter(apply: Callable[[Path, Rng], None]) -> Callable[[Path, Rng], None]:
@@ -97,7 +111,9 @@ def replace(path: Path, content: bytes) -> None:
 
 def fitting(form: str, group: str) -> list[str]:
     """The names of the mutations of a group for a form, in a fixed order."""
-    return sorted(name for name, each in MUTATIONS.items() if each.group == group and form in each.forms)
+    return sorted(
+        name for name, each in MUTATIONS.items() if each.group == group and form in each.forms
+    )
 
 
 def outside_of(path: Path) -> Path:
@@ -188,8 +204,15 @@ def all_garbage(content: bytes, rng: Rng) -> bytes:
 @by_content("bytes", *_TEXTS)
 def odd_line_ends_or_marks(content: bytes, rng: Rng) -> bytes:
     mark = b"\xef\xbb\xbf"
-    options = (content.replace(b"\n", b"\r\n"), content.replace(b"\n", b"\r"), mark + content, mark + mark + content)
-    return any_of(rng, (*options, content.replace(b"\n", b"\n" + mark, 1), content.decode().encode("utf-16")))
+    options = (
+        content.replace(b"\n", b"\r\n"),
+        content.replace(b"\n", b"\r"),
+        mark + content,
+        mark + mark + content,
+    )
+    return any_of(
+        rng, (*options, content.replace(b"\n", b"\n" + mark, 1), content.decode().encode("utf-16"))
+    )
 
 
 @by_content("bytes", *_TEXTS)
@@ -213,7 +236,20 @@ _HUGE = (
     b"-9223372036854775809",
     b"18446744073709551616",
 )
-_ODD = (b"0x10", b"1_000", b"\xd9\xa1", b"--1", b"+5", b"1e", b"010", b".5", b"0", b"-0.0", b"2147483648", b"1e-400")
+_ODD = (
+    b"0x10",
+    b"1_000",
+    b"\xd9\xa1",
+    b"--1",
+    b"+5",
+    b"1e",
+    b"010",
+    b".5",
+    b"0",
+    b"-0.0",
+    b"2147483648",
+    b"1e-400",
+)
 
 
 @by_content("numbers", *_TEXTS)
@@ -225,10 +261,15 @@ def number_replaced(content: bytes, rng: Rng) -> bytes:
 
 @by_content("numbers", "pickle", "npz", "image", "arrow", "parquet", "shard", *_OTHERS)
 def bytes_to_a_huge_number(content: bytes, rng: Rng) -> bytes:
-    number = any_of(rng, (0x7FFFFFFF, 0xFFFFFFFF, 0x80000000, 0x7FFFFFFFFFFFFFFF, 0xFFFFFFFFFFFFFFFF, 1 << 33, 0))
+    number = any_of(
+        rng,
+        (0x7FFFFFFF, 0xFFFFFFFF, 0x80000000, 0x7FFFFFFFFFFFFFFF, 0xFFFFFFFFFFFFFFFF, 1 << 33, 0),
+    )
     form = any_of(rng, ("<Q", ">Q") if number >= 1 << 32 else ("<I", ">I", "<Q"))
     packed = struct.pack(form, number)
-    begin = any_of(rng, (int(rng.integers(len(content))), int(rng.integers(min(256, len(content))))))
+    begin = any_of(
+        rng, (int(rng.integers(len(content))), int(rng.integers(min(256, len(content)))))
+    )
     return content[:begin] + packed + content[begin + len(packed) :]
 
 
@@ -243,7 +284,17 @@ def image_of_another_size(content: bytes, rng: Rng) -> bytes:
 def array_of_another_size(content: bytes, rng: Rng) -> bytes:
     def change(name: str, member: bytes) -> bytes:
         shape = any_of(
-            rng, (b"(999999999999, 4)", b"(-1, 4)", b"(4,)", b"()", b"(0, 4)", b"(1e3, 4)", b"(" * 99, b"(9" * 9)
+            rng,
+            (
+                b"(999999999999, 4)",
+                b"(-1, 4)",
+                b"(4,)",
+                b"()",
+                b"(0, 4)",
+                b"(1e3, 4)",
+                b"(" * 99,
+                b"(9" * 9,
+            ),
         )
         return _header(member, rb"\([^)]*\)", shape)
 
@@ -253,7 +304,23 @@ def array_of_another_size(content: bytes, rng: Rng) -> bytes:
 # ---- types
 
 _VALUES: tuple[Any, ...] = (
-    *(None, True, -1, 0, 2**63, 10**30, 1.5, float("nan"), float("inf"), "", "text", "<b>", "../..", "\0", "\ud800"),
+    *(
+        None,
+        True,
+        -1,
+        0,
+        2**63,
+        10**30,
+        1.5,
+        float("nan"),
+        float("inf"),
+        "",
+        "text",
+        "<b>",
+        "../..",
+        "\0",
+        "\ud800",
+    ),
     *([], {}, [[]], [None], {"": {}}, {"a": [1, "b"]}, [1, 2, 3], list(range(5000))),
 )
 
@@ -285,7 +352,10 @@ def json_key_twice(content: bytes, rng: Rng) -> bytes:
 
 @by_content("types", *_JSON, *_YAML)
 def another_top(_before: bytes, rng: Rng) -> bytes:
-    return any_of(rng, (b"[]", b"{}", b"null", b"1", b'"text"', b"[" * 50 + b"]" * 50, b"{}{}", b"NaN", b"true"))
+    return any_of(
+        rng,
+        (b"[]", b"{}", b"null", b"1", b'"text"', b"[" * 50 + b"]" * 50, b"{}{}", b"NaN", b"true"),
+    )
 
 
 @by_content("types", *_YAML)
@@ -301,10 +371,25 @@ def yaml_value_replaced(content: bytes, rng: Rng) -> bytes:
 @by_path("types", *_YAML)
 def yaml_tags(path: Path, rng: Rng) -> None:
     made = json.dumps(str(path.parent / MARKER)).encode()
-    tags = (b"!!python/object/apply:os.mkdir [" + made + b"]", b"!!python/name:os.system", b"!!binary aGk=", b"!!int x")
-    odd = (b"!!set {a, b}", b"!!timestamp 2001-01-01", b"*unknown", b"&a [*a]", b"{? [a] : b}", b"0o7", b"1:30")
+    tags = (
+        b"!!python/object/apply:os.mkdir [" + made + b"]",
+        b"!!python/name:os.system",
+        b"!!binary aGk=",
+        b"!!int x",
+    )
+    odd = (
+        b"!!set {a, b}",
+        b"!!timestamp 2001-01-01",
+        b"*unknown",
+        b"&a [*a]",
+        b"{? [a] : b}",
+        b"0o7",
+        b"1:30",
+    )
     lines = path.read_bytes().splitlines()
-    at = any_of(rng, [number for number, line in enumerate(lines) if b": " in line and b"{" not in line])
+    at = any_of(
+        rng, [number for number, line in enumerate(lines) if b": " in line and b"{" not in line]
+    )
     lines[at] = lines[at].split(b": ")[0] + b": " + any_of(rng, (*tags, *odd))
     replace(path, b"\n".join(lines) + b"\n")
 
@@ -321,9 +406,27 @@ def pickle_of_other_things(content: bytes, rng: Rng) -> bytes:
     arrays = pickle.loads(content)
     key = any_of(rng, list(arrays))
     here = arrays[key]
-    odd = (here.astype("c8"), here.astype("f2"), here.astype(">f8"), here.astype("i4"), here.astype(object), here[0])
-    more = (here.tolist(), str(here), np.asfortranarray(here), here[None], np.ma.array(here), None, np.float64(1), b"")
-    arrays[key] = any_of(rng, (*odd, *more, np.zeros(here.shape, "M8[s]"), np.full(here.shape, np.nan), here * 1e300))
+    odd = (
+        here.astype("c8"),
+        here.astype("f2"),
+        here.astype(">f8"),
+        here.astype("i4"),
+        here.astype(object),
+        here[0],
+    )
+    more = (
+        here.tolist(),
+        str(here),
+        np.asfortranarray(here),
+        here[None],
+        np.ma.array(here),
+        None,
+        np.float64(1),
+        b"",
+    )
+    arrays[key] = any_of(
+        rng, (*odd, *more, np.zeros(here.shape, "M8[s]"), np.full(here.shape, np.nan), here * 1e300)
+    )
     return pickle.dumps(arrays, protocol=int(rng.integers(6)))
 
 
@@ -338,7 +441,15 @@ def pickle_asks_for_a_name(content: bytes, rng: Rng) -> bytes:
         b"copyreg\n_reconstructor",
     )
     name = any_of(
-        rng, (*names, b"numpy\nfromfile", b"numpy.core.multiarray\nfrombuffer", b"posix\nfork", b"\n", b"a.b\nc.d")
+        rng,
+        (
+            *names,
+            b"numpy\nfromfile",
+            b"numpy.core.multiarray\nfrombuffer",
+            b"posix\nfork",
+            b"\n",
+            b"a.b\nc.d",
+        ),
     )
     end = any_of(rng, (b"(S'ls'\ntR.", b".", b"(tR.", b"}b.", b")\x81.", b"0" + content))
     return any_of(rng, (b"", b"\x80\x04")) + b"c" + name + b"\n" + end
@@ -366,10 +477,30 @@ def array_with_another_header(content: bytes, rng: Rng) -> bytes:
     def change(name: str, member: bytes) -> bytes:
         version = any_of(rng, (b"\x02\x00", b"\x03\x00", b"\x09\x09"))
         text = any_of(
-            rng, (b"'|O'", b"'<f9'", b"'<U99999999'", b"[('a', '<f8')]", b"__import__('os')", b"{}", b"'f8,f8'")
+            rng,
+            (
+                b"'|O'",
+                b"'<f9'",
+                b"'<U99999999'",
+                b"[('a', '<f8')]",
+                b"__import__('os')",
+                b"{}",
+                b"'f8,f8'",
+            ),
         )
-        edits = (_header(member, rb"'[<>|=][a-zA-Z]\d+'", text), member[:6] + version + member[8:], member[10:])
-        return any_of(rng, (*edits, _header(member, rb"False", b"True"), _header(member, rb"'shape'", b"'shapes'")))
+        edits = (
+            _header(member, rb"'[<>|=][a-zA-Z]\d+'", text),
+            member[:6] + version + member[8:],
+            member[10:],
+        )
+        return any_of(
+            rng,
+            (
+                *edits,
+                _header(member, rb"False", b"True"),
+                _header(member, rb"'shape'", b"'shapes'"),
+            ),
+        )
 
     return _zipped(content, rng, change)
 
@@ -389,17 +520,28 @@ def archive_of_other_members(content: bytes, rng: Rng) -> bytes:
         members[name] = garbage(bytes(100), rng)
     members = {name: member[:_MOST_BYTES] for name, member in members.items()}
     stored = packed(
-        members, any_of(rng, (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA))
+        members,
+        any_of(
+            rng, (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA)
+        ),
     )
-    return stored if choice != 4 else stored.replace(zlib.crc32(members[name]).to_bytes(4, "little"), b"\1\2\3\4")
+    return (
+        stored
+        if choice != 4
+        else stored.replace(zlib.crc32(members[name]).to_bytes(4, "little"), b"\1\2\3\4")
+    )
 
 
 @by_content("types", "npz", *_ARCHIVES)
 def archive_that_lies(content: bytes, rng: Rng) -> bytes:
     """A field of the archive's directory or of a local header is another."""
-    at = any_of(rng, [match.start() for match in re.finditer(rb"PK(?:\x01\x02|\x03\x04|\x05\x06)", content)])
+    at = any_of(
+        rng, [match.start() for match in re.finditer(rb"PK(?:\x01\x02|\x03\x04|\x05\x06)", content)]
+    )
     at += int(rng.integers(4, 40))
-    return content[:at] + any_of(rng, (b"\xff\xff", b"\1\0", b"\x63\0", b"\0\0")) + content[at + 2 :]
+    return (
+        content[:at] + any_of(rng, (b"\xff\xff", b"\1\0", b"\x63\0", b"\0\0")) + content[at + 2 :]
+    )
 
 
 @by_content("types", "image")
@@ -451,19 +593,27 @@ def hole_of_gigabytes(path: Path, rng: Rng) -> None:
 
 @by_content("bombs", *_TEXTS)
 def endless_line(content: bytes, rng: Rng) -> bytes:
-    return any_of(rng, (content, b"")) + any_of(rng, (b"9", b" ", b"x", b"-", b'"', b"1 ")) * 4_000_000
+    return (
+        any_of(rng, (content, b"")) + any_of(rng, (b"9", b" ", b"x", b"-", b'"', b"1 ")) * 4_000_000
+    )
 
 
 @by_content("bombs", *_TEXTS)
 def many_lines(content: bytes, rng: Rng) -> bytes:
     line = any_of(rng, (content.splitlines(keepends=True)[-1], b"\n", b"-\n"))
-    return content + (b"\n" if not content.endswith(b"\n") else b"") + line * min(50_000, _MOST_ADDED // len(line))
+    return (
+        content
+        + (b"\n" if not content.endswith(b"\n") else b"")
+        + line * min(50_000, _MOST_ADDED // len(line))
+    )
 
 
 @by_content("bombs", *_JSON, *_YAML)
 def deep_nesting(content: bytes, rng: Rng) -> bytes:
     depth = any_of(rng, (900, 5_000, 200_000))
-    nest = any_of(rng, (b"[" * depth + b"]" * depth, b'{"a":' * depth + b"1" + b"}" * depth, b"[" * depth))
+    nest = any_of(
+        rng, (b"[" * depth + b"]" * depth, b'{"a":' * depth + b"1" + b"}" * depth, b"[" * depth)
+    )
     spans = [match.span() for match in _NUMBER.finditer(content)] or [(0, len(content))]
     begin, end = any_of(rng, (any_of(rng, spans), (0, len(content))))
     return content[:begin] + nest + content[end:]
@@ -507,7 +657,10 @@ def archive_bomb(content: bytes, rng: Rng) -> bytes:
     members = members_of(content)
     name = any_of(rng, list(members))
     shape = any_of(rng, (b"(28125000, 4)", b"(900000000, 1)", b"(1, 900000000)"))
-    text = b"{'descr': '%s', 'fortran_order': False, 'shape': %s, }" % (any_of(rng, (b"<f8", b"|u1")), shape)
+    text = b"{'descr': '%s', 'fortran_order': False, 'shape': %s, }" % (
+        any_of(rng, (b"<f8", b"|u1")),
+        shape,
+    )
     head = b"\x93NUMPY\1\0" + struct.pack("<H", 118) + text.ljust(117) + b"\n"
     stored, checksum, size = squeezed(any_of(rng, (head, members[name])))
     return packed(
@@ -522,7 +675,9 @@ def image_bomb(_before: bytes, rng: Rng) -> bytes:
     """A PNG of 900 million pixels in a megabyte, or one that only says so."""
     side = any_of(rng, (30_000, 65_500))
     head = struct.pack(">IIBBBBB", side, side, 1, 0, 0, 0, 0)
-    rows = zlib.compress(bytes((side // 8 + 1) * 2000), 1) if rng.integers(2) else zlib.compress(b"")
+    rows = (
+        zlib.compress(bytes((side // 8 + 1) * 2000), 1) if rng.integers(2) else zlib.compress(b"")
+    )
     text = zlib.compress(bytes(50_000_000), 1)
     chunks = (
         (b"IHDR", head),
@@ -531,7 +686,8 @@ def image_bomb(_before: bytes, rng: Rng) -> bytes:
         (b"IEND", b""),
     )
     return b"\x89PNG\r\n\x1a\n" + b"".join(
-        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data)) for kind, data in chunks
+        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+        for kind, data in chunks
     )
 
 
@@ -572,7 +728,17 @@ def links_in_a_loop(path: Path, _rng: Rng) -> None:
 def link_elsewhere(path: Path, rng: Rng) -> None:
     place = any_of(
         rng,
-        ("/dev/zero", "/dev/urandom", "/dev/full", "/dev/tty", "/proc/self/mem", "/etc/passwd", "/nowhere", ".", "/"),
+        (
+            "/dev/zero",
+            "/dev/urandom",
+            "/dev/full",
+            "/dev/tty",
+            "/proc/self/mem",
+            "/etc/passwd",
+            "/nowhere",
+            ".",
+            "/",
+        ),
     )
     _gone(path).symlink_to(place)
 
@@ -624,7 +790,13 @@ ODD_NAMES = (
 def neighbour_with_an_odd_name(path: Path, rng: Rng) -> None:
     """Beside the file, or beside its folder, there is one more with an odd name."""
     name = any_of(
-        rng, (*ODD_NAMES, f"{path.stem}{path.suffix}~", path.stem.upper() + path.suffix, f"{path.stem} 2{path.suffix}")
+        rng,
+        (
+            *ODD_NAMES,
+            f"{path.stem}{path.suffix}~",
+            path.stem.upper() + path.suffix,
+            f"{path.stem} 2{path.suffix}",
+        ),
     )
     name = name.replace("/", "∕")
     beside = any_of(rng, (path.parent, path.parent.parent))
@@ -636,7 +808,9 @@ def neighbour_with_an_odd_name(path: Path, rng: Rng) -> None:
     elif kind == 1:
         os.mkfifo(beside / name)
     elif kind == 2:
-        Path(os.fsdecode(os.fsencode(beside) + b"/\xff\xfe" + path.suffix.encode())).write_bytes(path.read_bytes())
+        Path(os.fsdecode(os.fsencode(beside) + b"/\xff\xfe" + path.suffix.encode())).write_bytes(
+            path.read_bytes()
+        )
     else:
         (beside / name[:200]).with_suffix(path.suffix).write_bytes(path.read_bytes())
 
@@ -688,7 +862,9 @@ def containers(tree: Any) -> list[Any]:
     return found
 
 
-def _edited_json(content: bytes, rng: Rng, edit: Callable[[Any], Any], only: type = object) -> bytes:
+def _edited_json(
+    content: bytes, rng: Rng, edit: Callable[[Any], Any], only: type = object
+) -> bytes:
     tree = json.loads(content)
     places = [
         (inside, key)
@@ -722,7 +898,9 @@ def _header(member: bytes, pattern: bytes, text: bytes) -> bytes:
     return member[:8] + struct.pack("<H", len(header)) + header + member[10 + size :]
 
 
-def packed(members: dict[str, bytes], way: int, last: tuple[str, bytes, int, int] | None = None) -> bytes:
+def packed(
+    members: dict[str, bytes], way: int, last: tuple[str, bytes, int, int] | None = None
+) -> bytes:
     """An archive; the last member may be given as it is stored: name, deflated bytes, checksum and size."""
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", way) as archive:

@@ -47,9 +47,14 @@ def _judge_exported(room: Room, read: Mapping[str, bytes]) -> str | None:
     """
     folder, whole = _export(room), room.home / "exports" / "whole"
     told, expected = (plain.json_file(each / "opencood.manifest.json") for each in (folder, whole))
-    if told["settings"] != expected["settings"] or told["release"]["scenarios"] != expected["release"]["scenarios"]:
+    if (
+        told["settings"] != expected["settings"]
+        or told["release"]["scenarios"] != expected["release"]["scenarios"]
+    ):
         return "other settings or scenarios"
-    files = {path.relative_to(whole).as_posix(): path.read_bytes() for path in whole.rglob("*.yaml")}
+    files = {
+        path.relative_to(whole).as_posix(): path.read_bytes() for path in whole.rglob("*.yaml")
+    }
     wrong = [name for name in read.keys() & files.keys() if read[name] != files[name]]
     return f"{wrong[0]} differs from that of a whole export" if wrong else None
 
@@ -72,7 +77,9 @@ def _judge_answers(room: Room, read: Any) -> str | None:
         expected.setdefault(f"{line['sample'].rpartition('/')[0]}/{line['last_frame']:03d}", [])
     for answer in lines:
         question = asked[answer["id"]]
-        expected[question["sample"]].append(tuple(question["actors"][name] for name in answer["who"]))
+        expected[question["sample"]].append(
+            tuple(question["actors"][name] for name in answer["who"])
+        )
     found = {token: [each.ids for each in accidents] for token, accidents in read.accidents.items()}
     return None if found == expected else "other samples or actors"
 
@@ -89,12 +96,19 @@ def _cached(room: Room) -> dict[str, Any]:
     dataset, images = _sensors(room.home), ImageCache(room.tree)
     agents = [f"{each['token']}/{AGENTS[0]}" for each in dataset.scenario]
     images.check_release(dataset, agents)
-    return {agent: images.load(images.images, dataset, f"{agent}/001/{CHANNELS[0]}")[0].copy() for agent in agents}
+    return {
+        agent: images.load(images.images, dataset, f"{agent}/001/{CHANNELS[0]}")[0].copy()
+        for agent in agents
+    }
 
 
 def _judge_cached(room: Room, read: Mapping[str, Any]) -> str | None:
     settings = plain.json_file(room.tree / "cache.manifest.json")["settings"]
-    shape = settings["images"]["resize"] if settings["images"]["crop"] is None else settings["images"]["crop"][2:]
+    shape = (
+        settings["images"]["resize"]
+        if settings["images"]["crop"] is None
+        else settings["images"]["crop"][2:]
+    )
     place = settings["agents"].index(AGENTS[0]), settings["images"]["cameras"].index(CHANNELS[0])
     for agent, found in read.items():
         path = room.tree / f"{agent.rpartition('/')[0].replace('/', '__')}.images"
@@ -109,7 +123,10 @@ def _judge_cached(room: Room, read: Mapping[str, Any]) -> str | None:
 def _scheduled(room: Room) -> str:
     """Nobody listens at the healthy address, and it is right to say so."""
     try:
-        with patch.object(executors, "ADDRESS_WAIT", 0.2), cluster_executor(scheduler_file=room.victim):
+        with (
+            patch.object(executors, "ADDRESS_WAIT", 0.2),
+            cluster_executor(scheduler_file=room.victim),
+        ):
             return "a scheduler"
     except WorkerError:
         same = room.victim.is_file() and room.victim.stat().st_size == room.healthy.stat().st_size
@@ -133,11 +150,15 @@ def _from_zip(room: Room) -> dict[str, Any]:
 def _judge_zip(room: Room, read: Mapping[str, Any]) -> str | None:
     """Unpacked without a look at checksums, the release says the same."""
     unpacked = plain.unpacked(room.victim, room.scratch / "unpacked")
-    return judge_tables(Room(room.home, unpacked, room.victim, room.scratch, room.outside, room.healthy), read)
+    return judge_tables(
+        Room(room.home, unpacked, room.victim, room.scratch, room.outside, room.healthy), read
+    )
 
 
 def _validated_zip(room: Room) -> list[str]:
-    return [str(finding) for finding in validate_release(room.victim, workers=1, deep=True).findings]
+    return [
+        str(finding) for finding in validate_release(room.victim, workers=1, deep=True).findings
+    ]
 
 
 def _judge_findings(room: Room, sentences: list[str]) -> str | None:
@@ -147,7 +168,9 @@ def _judge_findings(room: Room, sentences: list[str]) -> str | None:
     if any(room.victim.name in each for each in sentences):
         return None
     damaged = [name for name, (_, right) in plain.members(room.victim).items() if not right]
-    untold = [name for name in damaged if not any(name.rpartition("/")[2] in each for each in sentences)]
+    untold = [
+        name for name in damaged if not any(name.rpartition("/")[2] in each for each in sentences)
+    ]
     return f"no word of {untold[0]}, which is damaged" if untold else None
 
 
@@ -165,7 +188,11 @@ def _judge_recipe(room: Room, read: Recipe) -> str | None:
             return f"other {part}"
     keys = ("agents", "latency", "pose_noise", "packet_loss", "budget", "horizon")
     lists = [[row[key] for key in keys if isinstance(row.get(key), list)] for row in said["rows"]]
-    return None if len(read.rows) == sum(prod(map(len, each)) for each in lists) else "another number of rows"
+    return (
+        None
+        if len(read.rows) == sum(prod(map(len, each)) for each in lists)
+        else "another number of rows"
+    )
 
 
 _EXPORTED = Action(_exported, _judge_exported)
@@ -173,10 +200,25 @@ _CACHED = Action(_cached, _judge_cached)
 _JOURNALS = ".deepaccident-parts/kept/opencood/*.paths"
 _DONE = ".deepaccident-parts/kept/opencood/*/done"
 KINDS = (
-    Kind("export's manifest", "manifest", "exports", "*/opencood.manifest.json", (_EXPORTED,), writes=True),
-    Kind("export's journals", "journal", "exports", f"begun/{_JOURNALS}", (_EXPORTED,), writes=True),
+    Kind(
+        "export's manifest",
+        "manifest",
+        "exports",
+        "*/opencood.manifest.json",
+        (_EXPORTED,),
+        writes=True,
+    ),
+    Kind(
+        "export's journals", "journal", "exports", f"begun/{_JOURNALS}", (_EXPORTED,), writes=True
+    ),
     Kind("export's done records", "record", "exports", f"begun/{_DONE}", (_EXPORTED,), writes=True),
-    Kind("questions' truth", "lines", "questions", "truth.jsonl", (Action(_answered, _judge_answers),)),
+    Kind(
+        "questions' truth",
+        "lines",
+        "questions",
+        "truth.jsonl",
+        (Action(_answered, _judge_answers),),
+    ),
     Kind("images cache's list", "manifest", "cache", "cache.manifest.json", (_CACHED,)),
     Kind("images cache", "images", "cache", "*.images", (_CACHED,)),
     Kind(
@@ -189,7 +231,13 @@ KINDS = (
             Action(lambda room: read_recipe(str(room.victim), smoke=True)),
         ),
     ),
-    Kind("scheduler file", "address", "schedulers", "scheduler.json", (Action(_scheduled, _judge_scheduled),)),
+    Kind(
+        "scheduler file",
+        "address",
+        "schedulers",
+        "scheduler.json",
+        (Action(_scheduled, _judge_scheduled),),
+    ),
     Kind(
         "zip of a release",
         "zip",

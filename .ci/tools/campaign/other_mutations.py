@@ -12,7 +12,17 @@ from typing import Any
 
 import yaml
 
-from campaign.mutations import ODD_NAMES, Rng, any_of, by_content, by_path, containers, outside_of, replace, squeezed
+from campaign.mutations import (
+    ODD_NAMES,
+    Rng,
+    any_of,
+    by_content,
+    by_path,
+    containers,
+    outside_of,
+    replace,
+    squeezed,
+)
 
 _EXPORTED = ("manifest", "journal", "record")
 _LONG = 5_000_000
@@ -33,7 +43,9 @@ def link_out_of_the_export(path: Path, rng: Rng) -> None:
     place, outside = any_of(rng, places), outside_of(path)
     aside = outside.with_name("aside")
     place.rename(aside)
-    place.symlink_to(any_of(rng, (outside, outside / "kept.txt", outside / "folder", outside / "new")))
+    place.symlink_to(
+        any_of(rng, (outside, outside / "kept.txt", outside / "folder", outside / "new"))
+    )
 
 
 @by_path("links", *_EXPORTED, "images")
@@ -54,7 +66,15 @@ def _ways_out(path: Path) -> tuple[str, ...]:
         *(f"{away}/{name}" for name in ("kept.txt", "folder", "folder/inner.txt", ".", "")),
         *(f"{outside}/{name}" for name in ("kept.txt", "folder", "")),
         *(f"linked/{name}" for name in ("kept.txt", "folder", "folder/inner.txt")),
-        *(f"a/../{away}/kept.txt", f"./{away}", "..", "../..", "linked", f"//{outside}/kept.txt", f"{away}//folder"),
+        *(
+            f"a/../{away}/kept.txt",
+            f"./{away}",
+            "..",
+            "../..",
+            "linked",
+            f"//{outside}/kept.txt",
+            f"{away}//folder",
+        ),
     )
 
 
@@ -68,7 +88,19 @@ def journal_that_leads_out(path: Path, rng: Rng) -> None:
 
 @by_content("names", "journal")
 def journal_of_odd_names(content: bytes, rng: Rng) -> bytes:
-    odd = ("", ".", "/", "//", "~", "\\..\\x", "x" * 300, "\ud800", "C:\\x", ".deepaccident-parts", "*")
+    odd = (
+        "",
+        ".",
+        "/",
+        "//",
+        "~",
+        "\\..\\x",
+        "x" * 300,
+        "\ud800",
+        "C:\\x",
+        ".deepaccident-parts",
+        "*",
+    )
     names = [any_of(rng, (*ODD_NAMES, *odd)) for _ in range(int(rng.integers(1, 9)))]
     return content + "".join(f"{name}\0" for name in names).encode("utf-8", "surrogatepass")
 
@@ -77,14 +109,21 @@ def journal_of_odd_names(content: bytes, rng: Rng) -> bytes:
 def journal_of_many_or_long_paths(content: bytes, rng: Rng) -> bytes:
     deep = b"a/" * 100_000
     return content + any_of(
-        rng, (b"x" * _LONG, b"x/y\0" * 20_000, b"\0" * _LONG, deep, deep + b"\0", b"x" * _LONG + b"\0")
+        rng,
+        (b"x" * _LONG, b"x/y\0" * 20_000, b"\0" * _LONG, deep, deep + b"\0", b"x" * _LONG + b"\0"),
     )
 
 
 @by_content("numbers", "journal")
 def journal_without_ends(content: bytes, rng: Rng) -> bytes:
     return any_of(
-        rng, (content.replace(b"\0", b"\n"), content.rstrip(b"\0"), content.replace(b"\0", b"\0\0"), b"\0" + content)
+        rng,
+        (
+            content.replace(b"\0", b"\n"),
+            content.rstrip(b"\0"),
+            content.replace(b"\0", b"\0\0"),
+            b"\0" + content,
+        ),
     )
 
 
@@ -95,7 +134,15 @@ def journal_of_another_unit(content: bytes, rng: Rng) -> bytes:
     rng.shuffle(paths)  # type: ignore[arg-type]
     turned = b"".join(each + b"\0" for each in paths)
     return any_of(
-        rng, (turned, content + content, content.decode().encode("utf-16"), b"\xff\xfe\0" + content, b"[]", b"{}")
+        rng,
+        (
+            turned,
+            content + content,
+            content.decode().encode("utf-16"),
+            b"\xff\xfe\0" + content,
+            b"[]",
+            b"{}",
+        ),
     )
 
 
@@ -155,7 +202,8 @@ def recipe_key_added_or_left_out(content: bytes, rng: Rng) -> bytes:
     """Keys that recipes know, where they do not belong."""
     tree, places = _recipe(content)
     known = sorted(
-        {str(key) for _, key in places} | {"mix", "also_split", "file", "spec", "validation", "over", "name"}
+        {str(key) for _, key in places}
+        | {"mix", "also_split", "file", "spec", "validation", "over", "name"}
     )
     inside = any_of(rng, [each for each in containers(tree) if each and isinstance(each, dict)])
     if rng.integers(2):
@@ -170,7 +218,9 @@ def recipe_number_beyond_bounds(content: bytes, rng: Rng) -> bytes:
     tree, places = _recipe(content)
     numbers = [(inside, key) for inside, key in places if isinstance(inside[key], int | float)]
     inside, key = any_of(rng, numbers)
-    inside[key] = any_of(rng, (0, -1, 1e9, -1e9, 1e300, 10**12, 10**40, 0.1 + 1e-9, math.inf, -math.inf, math.nan))
+    inside[key] = any_of(
+        rng, (0, -1, 1e9, -1e9, 1e300, 10**12, 10**40, 0.1 + 1e-9, math.inf, -math.inf, math.nan)
+    )
     return _yaml(tree)
 
 
@@ -179,7 +229,10 @@ def recipe_multiplied(content: bytes, rng: Rng) -> bytes:
     """Lists in several keys of a row, each with many values."""
     tree, _ = _recipe(content)
     count = any_of(rng, (10, 100, 1000))
-    lists = {key: [float(each) for each in range(count)] for key in ("latency", "pose_noise", "packet_loss", "horizon")}
+    lists = {
+        key: [float(each) for each in range(count)]
+        for key in ("latency", "pose_noise", "packet_loss", "horizon")
+    }
     row = {"name": "{latency} {agents}", "baseline": "standing", "agents": ["all"] * count, **lists}
     tree["rows"] = any_of(rng, ([row], [*tree["rows"], row], [row] * 20))
     return _yaml(tree)
@@ -195,7 +248,13 @@ def recipe_of_many(content: bytes, rng: Rng) -> bytes:
         (
             ("rows", [{**row, "name": f"{name}{each}"} for each in range(_MANY)]),
             ("weights", {f"{name}{each}": {"file": "tiny"} for each in range(_MANY)}),
-            ("releases", {**tree["releases"], **{f"{name}{each}": {"scenarios": 2} for each in range(_MANY)}}),
+            (
+                "releases",
+                {
+                    **tree["releases"],
+                    **{f"{name}{each}": {"scenarios": 2} for each in range(_MANY)},
+                },
+            ),
             ("groups", {f"{name}{each}": ["town=Town03"] for each in range(_MANY)}),
             ("compare", [[row["name"], row["name"]]] * _MANY),
             ("seeds", list(range(_MANY))),
@@ -240,7 +299,16 @@ def long_setting(content: bytes, rng: Rng) -> bytes:
 def scenario_with_another_name(content: bytes, rng: Rng) -> bytes:
     """A scenario's token is another one, or leads elsewhere."""
     token = next((each for each in content.split(b'"') if b"scenario0" in each), b"scenarios")
-    odd = (b"../../outside/kept", b"/etc/passwd", b"..", b"", b"\\u001b[31mred", b"\\u202ex", b"type1/x", b"x" * 5000)
+    odd = (
+        b"../../outside/kept",
+        b"/etc/passwd",
+        b"..",
+        b"",
+        b"\\u001b[31mred",
+        b"\\u202ex",
+        b"type1/x",
+        b"x" * 5000,
+    )
     return content.replace(token, any_of(rng, odd))
 
 
@@ -250,7 +318,9 @@ def long_address(_content: bytes, rng: Rng) -> bytes:
     text = any_of(rng, ("9", "x", "[", "%", "\x1b[2J", "\u202e"))
     long = f"tcp://127.0.0.1:{text * (50_000_000 // len(text))}"
     address = any_of(rng, (long, long, [long[:100]] * 100_000, "://" * 100_000))
-    return json.dumps({"type": "Scheduler", "address": address}, ensure_ascii=bool(rng.integers(2))).encode()
+    return json.dumps(
+        {"type": "Scheduler", "address": address}, ensure_ascii=bool(rng.integers(2))
+    ).encode()
 
 
 @by_content("types", "address")
@@ -270,7 +340,13 @@ def address_of_another_kind(content: bytes, rng: Rng) -> bytes:
         "tcp://127.0.0.1",
         "inproc://1/2/3",
     )
-    more = ("file:///etc/passwd", "tls://127.0.0.1:1", "ucx://127.0.0.1:1", "ws://127.0.0.1:1", "tcp://127.0.0.1:99999")
+    more = (
+        "file:///etc/passwd",
+        "tls://127.0.0.1:1",
+        "ucx://127.0.0.1:1",
+        "ws://127.0.0.1:1",
+        "tcp://127.0.0.1:99999",
+    )
     tree["address"] = any_of(
         rng, (*odd, *more, "tcp://127.0.0.1:-1", "tcp://[::1]:1", "tcp://a b:1", "x://y\n\x1b[31m")
     )
@@ -300,7 +376,9 @@ def line_of_other_values(content: bytes, rng: Rng) -> bytes:
         [None],
         list(range(5000)),
     )
-    return _one_line(content, rng, lambda line: line.__setitem__(any_of(rng, list(line)), any_of(rng, odd)))
+    return _one_line(
+        content, rng, lambda line: line.__setitem__(any_of(rng, list(line)), any_of(rng, odd))
+    )
 
 
 @by_content("types", "lines")
@@ -320,7 +398,9 @@ def line_that_is_no_object(content: bytes, rng: Rng) -> bytes:
 @by_content("bombs", "lines")
 def line_of_deep_nesting(content: bytes, rng: Rng) -> bytes:
     depth = any_of(rng, (900, 5000, 200_000))
-    nest = any_of(rng, (b"[" * depth + b"]" * depth, b'{"a":' * depth + b"1" + b"}" * depth, b"[" * depth))
+    nest = any_of(
+        rng, (b"[" * depth + b"]" * depth, b'{"a":' * depth + b"1" + b"}" * depth, b"[" * depth)
+    )
     return content + any_of(rng, (nest, b'{"id": ' + nest + b"}")) + b"\n"
 
 
@@ -339,7 +419,9 @@ def line_of_long_texts(content: bytes, rng: Rng) -> bytes:
 def line_with_an_odd_name(content: bytes, rng: Rng) -> bytes:
     def edit(line: dict[str, Any]) -> None:
         texts = [name for name, value in line.items() if isinstance(value, str)]
-        line[any_of(rng, texts)] = any_of(rng, (*ODD_NAMES, "a/b/c/d", "a/b/ego_vehicle/000", "a/b/ego_vehicle/٠٠١"))
+        line[any_of(rng, texts)] = any_of(
+            rng, (*ODD_NAMES, "a/b/c/d", "a/b/ego_vehicle/000", "a/b/ego_vehicle/٠٠١")
+        )
 
     return _one_line(content, rng, edit)
 
@@ -396,7 +478,9 @@ def images_of_another_scenario_in_a_link(path: Path, rng: Rng) -> None:
 @by_path("names", "images")
 def images_beside_odd_names(path: Path, rng: Rng) -> None:
     for name in ODD_NAMES[:6]:
-        (path.parent / f"{name.replace('/', '_')[:200]}.images").write_bytes(path.read_bytes()[: int(rng.integers(99))])
+        (path.parent / f"{name.replace('/', '_')[:200]}.images").write_bytes(
+            path.read_bytes()[: int(rng.integers(99))]
+        )
 
 
 # ---- archives of releases
@@ -430,7 +514,9 @@ def member_elsewhere(path: Path, rng: Rng) -> None:
             f"a/../{name}",
             f"./{name}",
         )
-        entry.filename = any_of(rng, (*ways, f"{name}/", name.upper(), name.replace("/", "//"), *ODD_NAMES))
+        entry.filename = any_of(
+            rng, (*ways, f"{name}/", name.upper(), name.replace("/", "//"), *ODD_NAMES)
+        )
 
     zipped(path, change)
 
@@ -460,7 +546,10 @@ def member_is_a_link(path: Path, rng: Rng) -> None:
         number = int(rng.integers(len(members)))
         entry, _ = members[number]
         entry.external_attr = any_of(rng, (0o120777, 0o060666, 0o010666, 0o040755)) << 16
-        members[number] = entry, any_of(rng, (b"/etc/passwd", b"../../outside/kept.txt", b"/dev/zero"))
+        members[number] = (
+            entry,
+            any_of(rng, (b"/etc/passwd", b"../../outside/kept.txt", b"/dev/zero")),
+        )
 
     zipped(path, change)
 
@@ -470,16 +559,22 @@ def member_twice(path: Path, rng: Rng) -> None:
     def change(members: list[Any]) -> None:
         entry, member = members[int(rng.integers(len(members)))]
         name = entry.filename
-        odd = (f"./{name}", f"x/{name}") if path.suffix == ".zip" else ()  # PyTorch reads no file with both
+        odd = (
+            (f"./{name}", f"x/{name}") if path.suffix == ".zip" else ()
+        )  # PyTorch reads no file with both
         again = zipfile.ZipInfo(any_of(rng, (name, name, *odd)))
-        members.insert(int(rng.integers(len(members))), (again, any_of(rng, (member, b"", member[:-9]))))
+        members.insert(
+            int(rng.integers(len(members))), (again, any_of(rng, (member, b"", member[:-9])))
+        )
 
     zipped(path, change)
 
 
 @by_path("types", "zip")
 def member_of_another_method(path: Path, rng: Rng) -> None:
-    method = any_of(rng, (zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA, zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED))
+    method = any_of(
+        rng, (zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA, zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+    )
 
     def change(members: list[Any]) -> None:
         members[int(rng.integers(len(members)))][0].compress_type = method
@@ -491,13 +586,25 @@ def member_of_another_method(path: Path, rng: Rng) -> None:
 def directory_entry_that_lies(content: bytes, rng: Rng) -> bytes:
     """Flags (encrypted), method, checksum, sizes, or the place of a member are others: overlapping, beyond, zip64."""
     offset, form = any_of(
-        rng, ((8, "<H"), (10, "<H"), (16, "<I"), (20, "<I"), (24, "<I"), (28, "<H"), (30, "<H"), (42, "<I"))
+        rng,
+        (
+            (8, "<H"),
+            (10, "<H"),
+            (16, "<I"),
+            (20, "<I"),
+            (24, "<I"),
+            (28, "<H"),
+            (30, "<H"),
+            (42, "<I"),
+        ),
     )
     places = _entries(content)
     place = any_of(rng, places)
     other = struct.unpack_from(form, content, any_of(rng, places) + offset)[0]
     odd = (
-        (1, 0, 8, 99, 0xFFFF, 2049) if form == "<H" else (0, 1, other, 0xFFFFFFFF, 0xFFFFFFFE, 0x7FFFFFFF, len(content))
+        (1, 0, 8, 99, 0xFFFF, 2049)
+        if form == "<H"
+        else (0, 1, other, 0xFFFFFFFF, 0xFFFFFFFE, 0x7FFFFFFF, len(content))
     )
     changed = bytearray(content)
     struct.pack_into(form, changed, place + offset, any_of(rng, odd))
@@ -511,8 +618,15 @@ def end_that_lies(content: bytes, rng: Rng) -> bytes:
     numbers = (0, 1, 0xFFFF, 0xFFFFFFFF, 0xFFFFFFFFFFFFFFFF, 1 << 40, end, len(content))
     if rng.integers(2):
         changed = bytearray(content)
-        offset, form = any_of(rng, ((4, "<H"), (8, "<H"), (10, "<H"), (12, "<I"), (16, "<I"), (20, "<H")))
-        struct.pack_into(form, changed, end + offset, any_of(rng, numbers) & (0xFFFF if form == "<H" else 0xFFFFFFFF))
+        offset, form = any_of(
+            rng, ((4, "<H"), (8, "<H"), (10, "<H"), (12, "<I"), (16, "<I"), (20, "<H"))
+        )
+        struct.pack_into(
+            form,
+            changed,
+            end + offset,
+            any_of(rng, numbers) & (0xFFFF if form == "<H" else 0xFFFFFFFF),
+        )
         return bytes(changed)
     lies = [any_of(rng, numbers) for _ in range(4)]
     large = struct.pack("<4sQHHIIQQQQ", b"PK\6\6", 44, 45, 45, 0, 0, *lies)

@@ -30,7 +30,10 @@ def summary(outcomes: Sequence[Outcome], stops: Sequence[Stopped], command: str)
     """What the page says of a run: the numbers of all kinds of files and of all commands."""
     head, *_, every = _rows(outcomes)
     cells = [re.findall(r"\d+", cell) or ["0"] * 3 for cell in every[1:]]
-    changed = [["", *head[1:]], *([name, *(cell[row] for cell in cells)] for row, name in enumerate(VERDICTS))]
+    changed = [
+        ["", *head[1:]],
+        *([name, *(cell[row] for cell in cells)] for row, name in enumerate(VERDICTS)),
+    ]
     kills = sum(each.stop.kind == "kill" for each in stops)
     head, *_, every = _stop_rows(stops)
     return _SUMMARY.format(
@@ -76,7 +79,12 @@ def _stop_rows(stops: Sequence[Stopped]) -> list[list[str]]:
             sum(any(text in each.fault for text in texts) for each in of_verb)
             for texts in (("not whole",), ("left over", "unequal"), ("status",))
         ]
-        rows.append([name if name == "all" else f"`{name}`", *map(str, (kinds["kill"], kinds["full disk"], *faults))])
+        rows.append(
+            [
+                name if name == "all" else f"`{name}`",
+                *map(str, (kinds["kill"], kinds["full disk"], *faults)),
+            ]
+        )
     return rows
 
 

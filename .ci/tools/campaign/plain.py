@@ -33,7 +33,13 @@ def label(path: Path) -> tuple[tuple[float, ...], list[tuple[Any, ...]]]:
     head, *rows = [line for line in words if len(line) > 1]
     speed = tuple(float(word) for word in head)
     return speed, [
-        (row[0], *map(float, row[1:10]), int(row[10]), int(row[11]), {"True": True, "False": False}[row[12]])
+        (
+            row[0],
+            *map(float, row[1:10]),
+            int(row[10]),
+            int(row[11]),
+            {"True": True, "False": False}[row[12]],
+        )
         for row in rows
     ]
 
@@ -44,7 +50,10 @@ def meta(path: Path) -> dict[str, Any]:
     first, *others = [line.strip() for line in lines if line.strip()]
     words = first.split()
     assert len(words) == 9, words
-    return {"first": words, **{key.strip(): text.strip() for key, _, text in (line.partition(":") for line in others)}}
+    return {
+        "first": words,
+        **{key.strip(): text.strip() for key, _, text in (line.partition(":") for line in others)},
+    }
 
 
 def split_file(path: Path) -> list[str]:
@@ -99,7 +108,11 @@ def cached_image(path: Path, agent: int, camera: int, height: int, width: int) -
     rows, cameras = np.frombuffer(content, "<i8", 2, offset=8).tolist()
     table = np.frombuffer(content, "<i8", rows * cameras * 2, offset=24).reshape(rows, cameras, 2)
     begin, length = table[agent * rows if agent else 0, camera].tolist()
-    return np.frombuffer(content[begin : begin + length], np.uint8).reshape(3, height, width).transpose(1, 2, 0)
+    return (
+        np.frombuffer(content[begin : begin + length], np.uint8)
+        .reshape(3, height, width)
+        .transpose(1, 2, 0)
+    )
 
 
 def members(archive: Path) -> dict[str, tuple[bytes, bool]]:
@@ -114,15 +127,24 @@ def members(archive: Path) -> dict[str, tuple[bytes, bool]]:
         inside = _OF_RELEASE.search(str(PurePosixPath(entry.filename.replace("\\", "/"))))
         if inside is None:
             continue
-        begin = entry.header_offset + 30 + sum(struct.unpack_from("<HH", content, entry.header_offset + 26))
+        begin = (
+            entry.header_offset
+            + 30
+            + sum(struct.unpack_from("<HH", content, entry.header_offset + 26))
+        )
         stored = content[begin : begin + entry.compress_size]
         try:
             if entry.compress_type != zipfile.ZIP_STORED:
-                stored = zlib.decompressobj(-zlib.MAX_WBITS).decompress(stored, min(entry.file_size, _LARGE) + 1)
+                stored = zlib.decompressobj(-zlib.MAX_WBITS).decompress(
+                    stored, min(entry.file_size, _LARGE) + 1
+                )
             member = stored if entry.file_size < _LARGE else b""
         except zlib.error:
             member = b""
-        found[inside[0]] = member, zlib.crc32(member) == entry.CRC and len(member) == entry.file_size
+        found[inside[0]] = (
+            member,
+            zlib.crc32(member) == entry.CRC and len(member) == entry.file_size,
+        )
     return found
 
 
@@ -165,7 +187,13 @@ def checkpoint(path: Path) -> dict[str, Flat]:
     """The tensors of a checkpoint, by PyTorch itself, which runs no code of it; numpy's numbers may be beside them."""
     import torch
 
-    numpy = np.float64(1).__reduce__()[0], np.zeros(1).__reduce__()[0], np.ndarray, np.dtype, type(np.dtype("f8"))
+    numpy = (
+        np.float64(1).__reduce__()[0],
+        np.zeros(1).__reduce__()[0],
+        np.ndarray,
+        np.dtype,
+        type(np.dtype("f8")),
+    )
     with torch.serialization.safe_globals([*numpy, type(np.dtype("f4"))]):
         found = torch.load(path, map_location="cpu", weights_only=True)
     for name in ("state_dict", "model"):

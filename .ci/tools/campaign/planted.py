@@ -61,7 +61,9 @@ class _AsItIsError(ReleaseError):
 
 def _unless_healthy(read: Any) -> Any:
     """Healthy files are read well: only the file's changed content is met by the fault."""
-    return lambda room: "healthy" if room.victim.read_bytes() == room.healthy.read_bytes() else read(room)
+    return lambda room: (
+        "healthy" if room.victim.read_bytes() == room.healthy.read_bytes() else read(room)
+    )
 
 
 _READERS = {
@@ -69,10 +71,16 @@ _READERS = {
     "memory": Action(_unless_healthy(_takes_memory)),
     "memory, asked for": Action(_unless_healthy(_asks_for_memory)),
     "foreign": Action(_unless_healthy(_raises_another)),
-    "message": Action(_unless_healthy(lambda room: _raises(_AsItIsError(f"{room.victim}: {'x' * 2000}")))),
-    "message, nameless": Action(_unless_healthy(lambda _: _raises(ReleaseError("something is wrong")))),
+    "message": Action(
+        _unless_healthy(lambda room: _raises(_AsItIsError(f"{room.victim}: {'x' * 2000}")))
+    ),
+    "message, nameless": Action(
+        _unless_healthy(lambda _: _raises(ReleaseError("something is wrong")))
+    ),
     "crash": Action(_unless_healthy(_dies)),
-    "message, of a terminal": Action(_unless_healthy(lambda room: _raises(_AsItIsError(f"{room.victim}: \x1b[2J")))),
+    "message, of a terminal": Action(
+        _unless_healthy(lambda room: _raises(_AsItIsError(f"{room.victim}: \x1b[2J")))
+    ),
     "outside": Action(_unless_healthy(_writes_outside)),
     "code": Action(_unless_healthy(_runs_code)),
     "wrong": Action(
@@ -80,10 +88,15 @@ _READERS = {
         lambda room, read: None if read == room.healthy.read_bytes() else "other bytes",
     ),
     "wrong, too lenient": Action(
-        lambda room: Path(room.victim).read_bytes(), lambda _, read: None if len(read.decode().split()) > 1 else "few"
+        lambda room: Path(room.victim).read_bytes(),
+        lambda _, read: None if len(read.decode().split()) > 1 else "few",
     ),
-    "refused": Action(_unless_healthy(lambda room: _raises(ReleaseError(f"{room.victim}: damaged")))),
+    "refused": Action(
+        _unless_healthy(lambda room: _raises(ReleaseError(f"{room.victim}: damaged")))
+    ),
     "read": Action(lambda room: room.victim.read_bytes()),
 }
-KINDS = {name: Kind(name, "text", "small", "train.txt", (action,)) for name, action in _READERS.items()}
+KINDS = {
+    name: Kind(name, "text", "small", "train.txt", (action,)) for name, action in _READERS.items()
+}
 """By the verdict that each should get, and more words where a verdict has several."""

@@ -34,7 +34,12 @@ def drawn(count: int, seed: int, kinds: Collection[str] = tuple(KINDS)) -> list[
     A kind has a seed of its own, so that a new kind changes nothing of the others. Kinds that need a package which is
     not there are left out.
     """
-    return [case for name in kinds if KINDS[name].can_be_read for case in _drawn_of(KINDS[name], count, seed)]
+    return [
+        case
+        for name in kinds
+        if KINDS[name].can_be_read
+        for case in _drawn_of(KINDS[name], count, seed)
+    ]
 
 
 def left_out(kinds: Collection[str] = tuple(KINDS)) -> dict[str, str]:
@@ -47,7 +52,9 @@ def _drawn_of(kind: Kind, count: int, seed: int) -> Iterator[Case]:
     groups = [names for group in GROUPS if (names := fitting(kind.form, group))]
     for number in range(count):
         names = groups[number % len(groups)]
-        yield Case(kind.name, names[int(rng.integers(len(names)))], number // len(groups) + 1000 * seed)
+        yield Case(
+            kind.name, names[int(rng.integers(len(names)))], number // len(groups) + 1000 * seed
+        )
 
 
 def run(
@@ -99,7 +106,9 @@ def _server(healthy: Path, number: int, kinds: str) -> Iterator[tuple[IO[str], I
     """A process that answers cases, with its input and its output."""
     home = healthy.with_name(f"{healthy.name} of worker {number}")
     command = [sys.executable, "-W", "ignore", worker.__file__, str(healthy), str(home), kinds]
-    paths = os.pathsep.join([str(_TOOLS), str(_TOP / "tests"), str(_TOP), os.environ.get("PYTHONPATH", "")])
+    paths = os.pathsep.join(
+        [str(_TOOLS), str(_TOP / "tests"), str(_TOP), os.environ.get("PYTHONPATH", "")]
+    )
     environment = {**os.environ, "PYTHONPATH": paths, "OMP_NUM_THREADS": "1", _CONNECT: "1s"}
     environment.pop("DEEPACCIDENT_LIMITS", None)
     pipe = subprocess.PIPE

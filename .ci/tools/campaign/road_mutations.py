@@ -5,7 +5,15 @@ from typing import Any
 
 from campaign.mutations import Rng, any_of, by_content
 
-_TOKENS = ("next", "prev", "first_sample_token", "sample_token", "scene_token", "instance_token", "ego_pose_token")
+_TOKENS = (
+    "next",
+    "prev",
+    "first_sample_token",
+    "sample_token",
+    "scene_token",
+    "instance_token",
+    "ego_pose_token",
+)
 _NUMBERS = (0, -1, 1e308, -1e308, 1e-300, float("nan"), float("inf"), 2**53 + 1)
 
 
@@ -23,10 +31,14 @@ def _dumped(content: bytes, rows: list[dict[str, Any]]) -> bytes:
 def row_that_leads_elsewhere(content: bytes, rng: Rng) -> bytes:
     """A token is that of another row, of its own row, of none, or empty."""
     rows = _rows(content)
-    places = [(row, name) for row in rows for name in row if name in _TOKENS or name.endswith("_token")]
+    places = [
+        (row, name) for row in rows for name in row if name in _TOKENS or name.endswith("_token")
+    ]
     if places:
         row, name = any_of(rng, places)
-        row[name] = any_of(rng, (row["token"], any_of(rng, rows)["token"], any_of(rng, rows)[name], "nowhere", ""))
+        row[name] = any_of(
+            rng, (row["token"], any_of(rng, rows)["token"], any_of(rng, rows)[name], "nowhere", "")
+        )
     return _dumped(content, rows)
 
 
@@ -55,7 +67,14 @@ def token_or_name_twice(content: bytes, rng: Rng) -> bytes:
 def numbers_of_a_row(content: bytes, rng: Rng) -> bytes:
     """A vector or a number of one row, or of all rows, is zero, huge, tiny, negative or none."""
     rows = _rows(content)
-    names = sorted({name for row in rows for name, value in row.items() if isinstance(value, list | int | float)})
+    names = sorted(
+        {
+            name
+            for row in rows
+            for name, value in row.items()
+            if isinstance(value, list | int | float)
+        }
+    )
     if names:
         name, value = any_of(rng, names), any_of(rng, _NUMBERS)
         for row in rows if rng.integers(2) else [any_of(rng, rows)]:

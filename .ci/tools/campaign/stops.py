@@ -13,7 +13,15 @@ import killed
 import numpy as np
 
 SCENARIO = "type1_subtype1_accident/Town03_type001_subtype0001_scenario00001"
-_IMPORTED = ("matplotlib.pyplot", "scipy.optimize", "shapely", "cv2", "yaml", "pyarrow.parquet", "PIL.ImageFont")
+_IMPORTED = (
+    "matplotlib.pyplot",
+    "scipy.optimize",
+    "shapely",
+    "cv2",
+    "yaml",
+    "pyarrow.parquet",
+    "PIL.ImageFont",
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +48,11 @@ _SENSORS = f"{{home}}/sensors {SCENARIO} --index-dir {{home}}/index_of_sensors -
 _EVALUATE = f"{_RELEASE} --split train --samples all"
 VERBS = (
     Verb("check index", "check index {home}/release --index-dir {out} --workers 1"),
-    Verb("labels", f"labels {_RELEASE} --split train --out {{out}}/labels", progress="labels/manifest.json"),
+    Verb(
+        "labels",
+        f"labels {_RELEASE} --split train --out {{out}}/labels",
+        progress="labels/manifest.json",
+    ),
     Verb("synth", "synth {out}/made --scenarios 2 --frames 3 --sensors none --seed 1 --workers 1"),
     Verb("split", f"split {_RELEASE} --out {{out}} --overwrite"),
     Verb("split to a file", f"split {_RELEASE} --out {{out}}/mine.txt --overwrite"),
@@ -55,9 +67,18 @@ VERBS = (
         "evaluate compare {home}/bundles/accident {home}/bundles/accident --resamples 20 --out {out}/a.csv "
         "--out {out}/a.json --out {out}/a.png",
     ),
-    Verb("predict", f"predict constant_velocity {_EVALUATE} --task accident --horizon 0.5 --out {{out}}/predicted"),
-    Verb("render bev", f"render bev {_RELEASE} {SCENARIO}/ego_vehicle/003 --out {{out}}/picture.png --dpi 40"),
-    Verb("render video", f"render video {_RELEASE} {SCENARIO} --what bev --size 160x90 --out {{out}}/video.gif"),
+    Verb(
+        "predict",
+        f"predict constant_velocity {_EVALUATE} --task accident --horizon 0.5 --out {{out}}/predicted",
+    ),
+    Verb(
+        "render bev",
+        f"render bev {_RELEASE} {SCENARIO}/ego_vehicle/003 --out {{out}}/picture.png --dpi 40",
+    ),
+    Verb(
+        "render video",
+        f"render video {_RELEASE} {SCENARIO} --what bev --size 160x90 --out {{out}}/video.gif",
+    ),
     Verb("export mcap", f"export mcap {_SENSORS} --out {{out}}/scenario.mcap"),
     *(
         Verb(
@@ -65,7 +86,12 @@ VERBS = (
             f"export {name} {_RELEASE} --out {{out}}/{name}{own}",
             progress=f"{name}/{name}.manifest.json",
         )
-        for name, own in {"opencood": " --without-clouds", "nuscenes": "", "parquet": "", "webdataset": ""}.items()
+        for name, own in {
+            "opencood": " --without-clouds",
+            "nuscenes": "",
+            "parquet": "",
+            "webdataset": "",
+        }.items()
     ),
     Verb(
         "export questions",
@@ -123,8 +149,13 @@ class _Healthy:
 def drawn_stops(kills: int, seed: int) -> list[Stop]:
     """So many kills, the verbs by turns, at moments by chance; and for each verb four sizes of a full disk."""
     rng = np.random.default_rng(seed)
-    moments = [Stop(VERBS[number % len(VERBS)].name, "kill", float(rng.uniform(0.0, 1.05))) for number in range(kills)]
-    return moments + [Stop(verb.name, "full disk", share) for verb in VERBS for share in (0.0, 0.01, 0.5, 0.999)]
+    moments = [
+        Stop(VERBS[number % len(VERBS)].name, "kill", float(rng.uniform(0.0, 1.05)))
+        for number in range(kills)
+    ]
+    return moments + [
+        Stop(verb.name, "full disk", share) for verb in VERBS for share in (0.0, 0.01, 0.5, 0.999)
+    ]
 
 
 class Stopper:
@@ -141,14 +172,20 @@ class Stopper:
         healthy = self._undisturbed(verb)
         out = self._new_folder()
         largest = max(map(len, healthy.files.values()))
-        how = {"delay": stop.share * healthy.seconds} if stop.kind == "kill" else {"limit": int(stop.share * largest)}
+        how = (
+            {"delay": stop.share * healthy.seconds}
+            if stop.kind == "kill"
+            else {"limit": int(stop.share * largest)}
+        )
         first = self._run(verb, out, **how)
         faults = [
             *(_told(first) if stop.kind == "full disk" else ()),
             *_unwhole(files_in(out), healthy.files, verb.progress),
         ]
         if stop.kind == "kill" and not faults and files_in(out) == healthy.files:
-            return Stopped(stop, "")  # killed when all was written; some verbs refuse to write it again
+            return Stopped(
+                stop, ""
+            )  # killed when all was written; some verbs refuse to write it again
         again = self._run(verb, out)
         if again["status"] != 0:
             faults.append(f"the next run: status {again['status']}: {again['message'][-300:]}")
@@ -177,7 +214,9 @@ class Stopper:
     def _run(self, verb: Verb, out: Path, **how: Any) -> dict[str, Any]:
         assert self._server.stdin
         assert self._server.stdout
-        self._server.stdin.write(json.dumps({"words": verb.words_for(self._home, out), **how}) + "\n")
+        self._server.stdin.write(
+            json.dumps({"words": verb.words_for(self._home, out), **how}) + "\n"
+        )
         self._server.stdin.flush()
         answer: dict[str, Any] = json.loads(self._server.stdout.readline())
         return answer
@@ -187,7 +226,9 @@ class Stopper:
 def stopper(home: Path, folder: Path) -> Iterator[Stopper]:
     """A server of processes to stop, for the healthy files in `home`; outputs go into `folder`."""
     command = [sys.executable, "-W", "ignore", killed.__file__, *_IMPORTED]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as server:
+    with subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as server:
         try:
             yield Stopper(home, folder, server)
         finally:
@@ -210,7 +251,9 @@ def run_stops(
 def files_in(folder: Path) -> dict[str, bytes]:
     """Path → content of all files of a folder, hidden ones too."""
     return {
-        path.relative_to(folder).as_posix(): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()
+        path.relative_to(folder).as_posix(): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
     }
 
 
@@ -223,10 +266,15 @@ def _told(run: Mapping[str, Any]) -> Iterator[str]:
         yield f"status {run['status']}: {run['message'][-300:]}"
 
 
-def _unwhole(found: Mapping[str, bytes], healthy: Mapping[str, bytes], progress: str) -> Iterator[str]:
+def _unwhole(
+    found: Mapping[str, bytes], healthy: Mapping[str, bytes], progress: str
+) -> Iterator[str]:
     """Files under a final name that are not those of an undisturbed run; what an evaluation resumes from has none."""
     for name, content in found.items():
-        own = any(part.startswith(".") or part.endswith(".unfinished") or part == "locks" for part in name.split("/"))
+        own = any(
+            part.startswith(".") or part.endswith(".unfinished") or part == "locks"
+            for part in name.split("/")
+        )
         if name == progress:
             json.loads(content)
         elif not own and healthy.get(name) != content:

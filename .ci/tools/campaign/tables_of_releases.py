@@ -13,7 +13,11 @@ from deepaccident_devkit import DeepAccident
 def tables(dataset: DeepAccident) -> dict[str, Any]:
     """All that the tables say of small files, by the token of the sample or scenario."""
     read: dict[str, Any] = {
-        each["token"]: (each["velocity"], dataset.boxes(each["token"], frame="lidar", velocity="label"), pose)
+        each["token"]: (
+            each["velocity"],
+            dataset.boxes(each["token"], frame="lidar", velocity="label"),
+            pose,
+        )
         for each, pose in zip(dataset.sample, dataset.columns("ego_pose")["matrix"], strict=True)
     }
     return read | {each["token"]: each for each in dataset.scenario}
@@ -26,12 +30,18 @@ def judge_tables(room: Room, read: Mapping[str, Any]) -> str | None:
         folder = room.tree / scenario_type
         if not sample:
             meta = folder / "meta" / f"{name}.txt"
-            fault = _meta_fault(value, plain.meta(meta)) if meta.is_file() else _known(value["weather"])
+            fault = (
+                _meta_fault(value, plain.meta(meta)) if meta.is_file() else _known(value["weather"])
+            )
         else:
             stem = f"{name}/{name}_{sample[1]}"
             velocity, boxes, pose = value
             label = folder / sample[0] / "label" / f"{stem}.txt"
-            fault = _label_fault(velocity, boxes, *plain.label(label)) if label.is_file() else _known(velocity)
+            fault = (
+                _label_fault(velocity, boxes, *plain.label(label))
+                if label.is_file()
+                else _known(velocity)
+            )
             calib = plain.calib(folder / sample[0] / "calib" / f"{stem}.pkl")
             flipped = plain.LEFT_TO_RIGHT @ calib["ego_to_world"] @ plain.LEFT_TO_RIGHT
             fault = fault or (None if np.array_equal(pose, flipped.ravel()) else "ego_to_world")
@@ -45,7 +55,9 @@ def _known(value: Any) -> str | None:
     return None if value is None else f"{value}, though the file is not there"
 
 
-def _label_fault(velocity: Any, boxes: Any, speed: tuple[float, ...], rows: list[tuple[Any, ...]]) -> str | None:
+def _label_fault(
+    velocity: Any, boxes: Any, speed: tuple[float, ...], rows: list[tuple[Any, ...]]
+) -> str | None:
     if not np.array_equal(velocity, [speed[0], -speed[1]], equal_nan=True):
         return f"speed {velocity} and not {speed}"
     if len(boxes) != len(rows):
@@ -61,7 +73,9 @@ def _label_fault(velocity: Any, boxes: Any, speed: tuple[float, ...], rows: list
 
 def _meta_fault(scenario: Mapping[str, Any], said: Mapping[str, Any]) -> str | None:
     first, collision = said["first"], scenario["collision"]
-    expected = None if "-1" in (first[1], first[3]) else ([int(first[1]), int(first[3])], float(first[5]))
+    expected = (
+        None if "-1" in (first[1], first[3]) else ([int(first[1]), int(first[3])], float(first[5]))
+    )
     found = None if collision is None else (collision["ids"], collision["impact"])
     if expected != found:
         return f"collision {found} and not {expected}"

@@ -54,8 +54,13 @@ def _same(read: Mapping[str, Any], said: Mapping[str, Any]) -> str | None:
         there = next((said[each] for each in names if each in said), None)
         if there is None:
             return f"{name[:100]} is not in the file"
-        (shape, found), (same, expected) = tensor if isinstance(tensor, tuple) else plain.flat(tensor), there
-        if shape != same or not np.array_equal(found, expected.astype(found.dtype), equal_nan=found.dtype.kind == "f"):
+        (shape, found), (same, expected) = (
+            tensor if isinstance(tensor, tuple) else plain.flat(tensor),
+            there,
+        )
+        if shape != same or not np.array_equal(
+            found, expected.astype(found.dtype), equal_nan=found.dtype.kind == "f"
+        ):
             return f"{name[:100]} has another shape or other numbers"
     return None
 

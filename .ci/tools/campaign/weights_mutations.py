@@ -13,7 +13,17 @@ from typing import Any
 import numpy as np
 from fault_injection.mutations.calib import Bomb
 
-from campaign.mutations import MARKER, ODD_NAMES, Rng, any_of, by_content, by_path, members_of, packed, replace
+from campaign.mutations import (
+    MARKER,
+    ODD_NAMES,
+    Rng,
+    any_of,
+    by_content,
+    by_path,
+    members_of,
+    packed,
+    replace,
+)
 
 _TORCH = ("pt", "pth")
 _GIGABYTES = 6 << 30
@@ -43,7 +53,18 @@ def _tensor_of(header: dict[str, Any], rng: Rng) -> str:
 @by_content("numbers", "safetensors")
 def header_of_another_length(content: bytes, rng: Rng) -> bytes:
     length = int.from_bytes(content[:8], "little")
-    odd = (0, 1, length - 1, length + 1, length + 8, len(content), 100_000_001, 1 << 40, (1 << 63) - 1, (1 << 64) - 1)
+    odd = (
+        0,
+        1,
+        length - 1,
+        length + 1,
+        length + 8,
+        len(content),
+        100_000_001,
+        1 << 40,
+        (1 << 63) - 1,
+        (1 << 64) - 1,
+    )
     return struct.pack("<Q", any_of(rng, odd)) + content[8:]
 
 
@@ -51,7 +72,20 @@ def header_of_another_length(content: bytes, rng: Rng) -> bytes:
 def tensor_of_another_size(content: bytes, rng: Rng) -> bytes:
     """Its shape, or where its bytes lie, is another."""
     header, data = _header_of(content)
-    odd = (0, 1, -1, 1 << 32, 1 << 62, (1 << 64) - 1, 1.5, "1", None, True, len(data), len(data) + 1)
+    odd = (
+        0,
+        1,
+        -1,
+        1 << 32,
+        1 << 62,
+        (1 << 64) - 1,
+        1.5,
+        "1",
+        None,
+        True,
+        len(data),
+        len(data) + 1,
+    )
     tensor = header[_tensor_of(header, rng)]
     numbers = tensor[any_of(rng, ("shape", "data_offsets"))]
     if numbers and rng.integers(3):
@@ -66,7 +100,10 @@ def numbers_of_a_tensor_are_odd(content: bytes, rng: Rng) -> bytes:
     """All of them are NaN, infinite or huge."""
     header, data = _header_of(content)
     begin, end = header[_tensor_of(header, rng)]["data_offsets"]
-    value = any_of(rng, (np.float32("nan"), np.float32("inf"), np.float32(3e38), np.float32(-1), np.float32(1e-45)))
+    value = any_of(
+        rng,
+        (np.float32("nan"), np.float32("inf"), np.float32(3e38), np.float32(-1), np.float32(1e-45)),
+    )
     filled = (value.tobytes() * ((end - begin) // 4 + 1))[: end - begin]
     return _with_header(header, data[:begin] + filled + data[end:])
 
@@ -111,7 +148,16 @@ def header_of_other_values(content: bytes, rng: Rng) -> bytes:
 def tensor_lost_or_added(content: bytes, rng: Rng) -> bytes:
     header, data = _header_of(content)
     last = max(each["data_offsets"][1] for name, each in header.items() if name != "__metadata__")
-    name = any_of(rng, ("another", "optimizer.0.exp_avg", "optimizer.x.step", "optimizer.", "optimizer.99999999.step"))
+    name = any_of(
+        rng,
+        (
+            "another",
+            "optimizer.0.exp_avg",
+            "optimizer.x.step",
+            "optimizer.",
+            "optimizer.99999999.step",
+        ),
+    )
     added = {"dtype": "F32", "shape": [4], "data_offsets": [last, last + 16]}
     if rng.integers(2):
         return _with_header(header | {name: added}, data + bytes(16))
@@ -127,11 +173,43 @@ def tensor_lost_or_added(content: bytes, rng: Rng) -> bytes:
 def notes_of_other_values(content: bytes, rng: Rng) -> bytes:
     header, data = _header_of(content)
     notes = json.loads(header["__metadata__"]["deepaccident"])
-    odd = (None, True, -1, 1 << 70, 1.5, "", "x", [], {}, [1], {"a": 1}, float("nan"), "tiny", "\ud800")
+    odd = (
+        None,
+        True,
+        -1,
+        1 << 70,
+        1.5,
+        "",
+        "x",
+        [],
+        {},
+        [1],
+        {"a": 1},
+        float("nan"),
+        "tiny",
+        "\ud800",
+    )
     notes[any_of(rng, (*notes, "step", "best", "preset", "another"))] = any_of(rng, odd)
-    texts = (json.dumps(notes), json.dumps(notes), json.dumps(notes), "", "[]", "null", "x", "{" * 5000, "[" * 200_000)
+    texts = (
+        json.dumps(notes),
+        json.dumps(notes),
+        json.dumps(notes),
+        "",
+        "[]",
+        "null",
+        "x",
+        "{" * 5000,
+        "[" * 200_000,
+    )
     header["__metadata__"] = any_of(
-        rng, ({"deepaccident": any_of(rng, texts)}, {"deepaccident": any_of(rng, texts)}, {}, {"deepaccident": {}}, "x")
+        rng,
+        (
+            {"deepaccident": any_of(rng, texts)},
+            {"deepaccident": any_of(rng, texts)},
+            {},
+            {"deepaccident": {}},
+            "x",
+        ),
     )
     return _with_header(header, data)
 
@@ -145,7 +223,9 @@ def header_of_many_tensors(content: bytes, rng: Rng) -> bytes:
     if (way := int(rng.integers(3))) == 0:
         return _with_header(header | {f"{number}": empty for number in range(50_000)}, data)
     if way == 1:
-        shape = any_of(rng, ([0, 1 << 40], [1 << 40, 0], [1 << 31, 1 << 31, 0], [0] * 10_000, [1] * 100_000))
+        shape = any_of(
+            rng, ([0, 1 << 40], [1 << 40, 0], [1 << 31, 1 << 31, 0], [0] * 10_000, [1] * 100_000)
+        )
         return _with_header(header | {"another": empty | {"shape": shape}}, data)
     nest = b"[" * any_of(rng, (5000, 200_000))
     return struct.pack("<Q", len(nest) + 6) + b'{"a": ' + nest + data
@@ -194,7 +274,9 @@ def notes_with_odd_names(content: bytes, rng: Rng) -> bytes:
 
 @by_path("types", *_TORCH)
 def checkpoint_runs_code(path: Path, rng: Rng) -> None:
-    _saved(path, lambda state: state | {any_of(rng, ("another", *state)): Bomb(path.parent / MARKER)})
+    _saved(
+        path, lambda state: state | {any_of(rng, ("another", *state)): Bomb(path.parent / MARKER)}
+    )
 
 
 @by_path("types", *_TORCH)
@@ -205,7 +287,15 @@ def checkpoint_of_odd_tensors(path: Path, rng: Rng) -> None:
     def change(state: dict[str, Any]) -> Any:
         name = any_of(rng, list(state))
         here = state[name].float() if state[name].ndim else torch.ones(3)
-        dtypes = (torch.float64, torch.float16, torch.bfloat16, torch.int64, torch.int8, torch.bool, torch.complex64)
+        dtypes = (
+            torch.float64,
+            torch.float16,
+            torch.bfloat16,
+            torch.int64,
+            torch.int8,
+            torch.bool,
+            torch.complex64,
+        )
         odd: tuple[Callable[[], Any], ...] = (
             *(lambda dtype=dtype: here.to(dtype) for dtype in dtypes),
             lambda: here.to("meta"),
@@ -235,7 +325,11 @@ def checkpoint_of_other_things(path: Path, rng: Rng) -> None:
 
     ways: tuple[Callable[[dict[str, Any]], Any], ...] = (
         lambda state: {"state_dict": state},
-        lambda state: {"model": OrderedDict(state), "optimizer": {"state": {0: torch.ones(2)}}, "epoch": 3},
+        lambda state: {
+            "model": OrderedDict(state),
+            "optimizer": {"state": {0: torch.ones(2)}},
+            "epoch": 3,
+        },
         lambda state: {f"module.{name}": each for name, each in state.items()},
         lambda state: dict(enumerate(state.values())),
         lambda state: {**state, 0: torch.ones(1), None: 1, (1, 2): torch.ones(1)},
@@ -327,9 +421,14 @@ def checkpoint_asks_for_a_name(content: bytes, rng: Rng) -> bytes:
         b"torch.jit\nload",
         b"\x1b[31m\n\xe2\x80\xae",
     )
-    end = any_of(rng, (b"(X\2\0\0\0lstR.", b".", b"(tR.", b"}b.", b")\x81.", b"X\2\0\0\0lsQ.", b"0"))
+    end = any_of(
+        rng, (b"(X\2\0\0\0lstR.", b".", b"(tR.", b"}b.", b")\x81.", b"X\2\0\0\0lsQ.", b"0")
+    )
     name = any_of(rng, (*names, *more))
-    return _with_pickle(content, lambda before: b"\x80\2c" + name + b"\n" + (end if end != b"0" else b"0" + before[2:]))
+    return _with_pickle(
+        content,
+        lambda before: b"\x80\2c" + name + b"\n" + (end if end != b"0" else b"0" + before[2:]),
+    )
 
 
 @by_content("numbers", *_TORCH)
@@ -337,7 +436,9 @@ def number_of_a_pickle(content: bytes, rng: Rng) -> bytes:
     """An offset, a size, a stride or the length of a storage is another."""
 
     def change(before: bytes) -> bytes:
-        number = any_of(rng, (0, 1, 2, 255, 1 << 16, 1 << 31, 1 << 40, (1 << 63) - 1, 1 << 70, -1, -(1 << 40)))
+        number = any_of(
+            rng, (0, 1, 2, 255, 1 << 16, 1 << 31, 1 << 40, (1 << 63) - 1, 1 << 70, -1, -(1 << 40))
+        )
         length = max((number.bit_length() + 8) // 8, 1)
         return _edited(
             before,
@@ -366,7 +467,9 @@ def text_of_a_pickle(content: bytes, rng: Rng) -> bytes:
     )
     text = any_of(rng, odd).encode()
     other = b"X" + struct.pack("<I", len(text)) + text
-    return _with_pickle(content, lambda before: _edited(before, rng, ("BINUNICODE", "SHORT_BINUNICODE"), other))
+    return _with_pickle(
+        content, lambda before: _edited(before, rng, ("BINUNICODE", "SHORT_BINUNICODE"), other)
+    )
 
 
 @by_content("types", *_TORCH)
@@ -386,7 +489,9 @@ def global_of_a_pickle(content: bytes, rng: Rng) -> bytes:
         b"torch\nTensor",
     )
     name = any_of(rng, (*names, *more))
-    return _with_pickle(content, lambda before: _edited(before, rng, ("GLOBAL",), b"c" + name + b"\n"))
+    return _with_pickle(
+        content, lambda before: _edited(before, rng, ("GLOBAL",), b"c" + name + b"\n")
+    )
 
 
 @by_content("bombs", "pt")
@@ -413,7 +518,12 @@ def storage_lost_or_cut(content: bytes, rng: Rng) -> bytes:
     else:
         head = name.partition("/")[0]
         members |= any_of(
-            rng, ({f"{head}/byteorder": b"big"}, {f"{head}/version": b"99"}, {f"{head}/constants.pkl": b"\x80\2N."})
+            rng,
+            (
+                {f"{head}/byteorder": b"big"},
+                {f"{head}/version": b"99"},
+                {f"{head}/constants.pkl": b"\x80\2N."},
+            ),
         )
     return packed(members, zipfile.ZIP_STORED)
 
@@ -440,7 +550,9 @@ def _saved(path: Path, change: Callable[[dict[str, Any]], Any]) -> None:
 def _with_pickle(content: bytes, change: Callable[[bytes], bytes]) -> bytes:
     """A checkpoint with another pickle of what is where."""
     if not content.startswith(b"PK"):
-        begin, end = _pickles(content)[3]  # after a number, a version, and what kind of machine wrote it
+        begin, end = _pickles(content)[
+            3
+        ]  # after a number, a version, and what kind of machine wrote it
         return content[:begin] + change(content[begin:end]) + content[end:]
     members = members_of(content)
     name = next(each for each in members if each.endswith("data.pkl"))
@@ -461,6 +573,8 @@ def _pickles(content: bytes) -> list[tuple[int, int]]:
 
 def _edited(before: bytes, rng: Rng, kinds: tuple[str, ...], other: bytes) -> bytes:
     """A pickle in which one instruction of these kinds is another."""
-    places = [(place, code.name) for code, _, place in pickletools.genops(before)] + [(len(before), "")]
+    places = [(place, code.name) for code, _, place in pickletools.genops(before)] + [
+        (len(before), "")
+    ]
     number = any_of(rng, [number for number, (_, name) in enumerate(places) if name in kinds])
     return before[: places[number][0]] + other + before[places[number + 1][0] :]

@@ -33,7 +33,9 @@ from campaign.mutations import MARKER, MUTATIONS
 from deepaccident_devkit.errors import DeepAccidentError
 from deepaccident_devkit.support.files import temporary_path
 
-assert all((pyarrow.compute, pyarrow.parquet, scipy.optimize, shapely))  # what the readers import when they need it
+assert all(
+    (pyarrow.compute, pyarrow.parquet, scipy.optimize, shapely)
+)  # what the readers import when they need it
 if HAS_TORCH:
     importlib.import_module("campaign.healthy_weights")
 
@@ -120,16 +122,25 @@ class _Worker:
             _serve(Bench(healthy, home, kinds), os.fdopen(reading), writing)
         for end in (reading, writing):
             os.close(end)
-        os.read(self._from_fork, 1)  # it is ready: copying the healthy files is none of a case's time
+        os.read(
+            self._from_fork, 1
+        )  # it is ready: copying the healthy files is none of a case's time
 
     def answer(self, line: str, seconds: float) -> str | None:
         """The outcome's JSON; None if there is none in time, or the process ended."""
         self._seconds = seconds
         os.write(self._to_fork, line.encode())
-        until, worked = time.monotonic() + PATIENCE * seconds, _processor_seconds(self._process) + seconds
+        until, worked = (
+            time.monotonic() + PATIENCE * seconds,
+            _processor_seconds(self._process) + seconds,
+        )
         while b"\n" not in self._buffer:
             ready, _, _ = select.select([self._from_fork], [], [], 0.5)
-            if not ready and time.monotonic() < until and _processor_seconds(self._process) < worked:
+            if (
+                not ready
+                and time.monotonic() < until
+                and _processor_seconds(self._process) < worked
+            ):
                 continue
             more = os.read(self._from_fork, 1 << 16) if ready else b""
             if not more:
@@ -198,20 +209,30 @@ class Bench:
         if (room.victim.parent / MARKER).exists():
             return Outcome(case, "code", "a pickle ran its code")
         if changed := {name for name, _ in _tree(room.outside).items() ^ _OUTSIDE.items()}:
-            return Outcome(case, "outside", f"{min(changed)} was changed outside ({verdicts[0][:2]})")
+            return Outcome(
+                case, "outside", f"{min(changed)} was changed outside ({verdicts[0][:2]})"
+            )
         most = max(megabytes for *_, megabytes in verdicts)
         failed = [each for each in verdicts if each[0] not in ("read", "refused")]
-        verdict, detail, _ = (failed or [each for each in verdicts if each[0] == "refused"] or verdicts)[0]
+        verdict, detail, _ = (
+            failed or [each for each in verdicts if each[0] == "refused"] or verdicts
+        )[0]
         return Outcome(case, verdict, detail, most)
 
     def room(self, case: Case) -> Room:
         """A fresh copy of the case's folder, in which one file is changed."""
         kind, rng = self._kinds[case.kind], seeded(f"{case.kind} {case.mutation}", case.seed)
-        source, tree, scratch = self._healthy / kind.folder, self._home / "case" / kind.folder, self._home / "scratch"
+        source, tree, scratch = (
+            self._healthy / kind.folder,
+            self._home / "case" / kind.folder,
+            self._home / "scratch",
+        )
         for folder in (self._home / "case", scratch):
             shutil.rmtree(folder, ignore_errors=True)
         if kind.writes:
-            shutil.copytree(source, tree)  # what is written into a hard link is written into the healthy file
+            shutil.copytree(
+                source, tree
+            )  # what is written into a hard link is written into the healthy file
         else:
             copied(source, tree)
         scratch.mkdir()
@@ -236,7 +257,9 @@ class Bench:
         if megabytes > MEGABYTES:
             return (
                 "memory",
-                f"{megabytes:.0f} MB more than the healthy run ({verdict}: {detail})"[:LONGEST_MESSAGE],
+                f"{megabytes:.0f} MB more than the healthy run ({verdict}: {detail})"[
+                    :LONGEST_MESSAGE
+                ],
                 megabytes,
             )
         if verdict == "read" and (fault := _judged(action.judge, room, read)):
@@ -260,7 +283,11 @@ def _of_error(error: BaseException, room: Room) -> tuple[str, str]:
     if any(isinstance(each, MemoryError) for each in causes):
         return "memory", f"ran into the limit: {short}"
     if not isinstance(error, DeepAccidentError):
-        frames = [each for each in traceback.extract_tb(error.__traceback__) if "deepaccident_devkit" in each.filename]
+        frames = [
+            each
+            for each in traceback.extract_tb(error.__traceback__)
+            if "deepaccident_devkit" in each.filename
+        ]
         where = f" ({Path(frames[-1].filename).name}:{frames[-1].lineno})" if frames else ""
         return "foreign", short + where
     if len(str(error)) > LONGEST_MESSAGE:
@@ -292,7 +319,8 @@ def _made_outside(folder: Path) -> Path:
 def _tree(folder: Path) -> dict[str, bytes | None]:
     """Path → content of all below a folder; None for folders."""
     return {
-        path.relative_to(folder).as_posix(): path.read_bytes() if path.is_file() else None for path in folder.rglob("*")
+        path.relative_to(folder).as_posix(): path.read_bytes() if path.is_file() else None
+        for path in folder.rglob("*")
     }
 
 

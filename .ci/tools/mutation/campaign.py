@@ -71,7 +71,9 @@ class Campaign:
 
     def __init__(self, mutants: Sequence[Mutant], results: Path) -> None:
         self.mutants, self.results = mutants, results
-        self._sources = {each.path: (PACKAGE / each.path).read_text(encoding="utf-8") for each in mutants}
+        self._sources = {
+            each.path: (PACKAGE / each.path).read_text(encoding="utf-8") for each in mutants
+        }
         self._tests: dict[str, _Test] = {}
 
     def run(self) -> int:
@@ -79,8 +81,12 @@ class Campaign:
         rooms = sorted({_room_of(mutant.path) for mutant in self.mutants})
         places = [place for room in rooms for place in _places(room)]
         found = {path for place in places for path in ROOT.glob(f"{place}*")}
-        paths = map(str, sorted(found, reverse=True))  # the package after its tests: as pytest does by itself
-        return pytest.main(["-q", "-m", "", "-p", "no:cacheprovider", "-p", "no:xdist", *paths], plugins=[self])
+        paths = map(
+            str, sorted(found, reverse=True)
+        )  # the package after its tests: as pytest does by itself
+        return pytest.main(
+            ["-q", "-m", "", "-p", "no:cacheprovider", "-p", "no:xdist", *paths], plugins=[self]
+        )
 
     @staticmethod
     def pytest_collection() -> None:
@@ -89,7 +95,9 @@ class Campaign:
 
         parent = settings.get_profile("repeatable")
         phases, checks = (Phase.explicit, Phase.generate), list(HealthCheck)
-        settings.register_profile("mutation", parent=parent, phases=phases, suppress_health_check=checks)
+        settings.register_profile(
+            "mutation", parent=parent, phases=phases, suppress_health_check=checks
+        )
         settings.load_profile("mutation")
 
     def pytest_runtestloop(self, session: pytest.Session) -> bool:
@@ -109,7 +117,11 @@ class Campaign:
             chosen = self._chosen(mutant, items)
             outcome, by = self._in_fork([items[name] for name in chosen], mutant)
             killer = by.split(": ")[0]
-            if killer in items and killer not in trusted and self._in_fork([items[killer]], None)[0] != "survived":
+            if (
+                killer in items
+                and killer not in trusted
+                and self._in_fork([items[killer]], None)[0] != "survived"
+            ):
                 raise session.Interrupted(f"fails in a fork without a mutant: {by}")
             trusted.add(killer)
             record = {
@@ -123,7 +135,15 @@ class Campaign:
             }
             with self.results.open("a", encoding="utf-8") as file:
                 file.write(json.dumps(record, ensure_ascii=False) + "\n")
-            print(number, mutant.path, mutant.line, mutant.change, record["outcome"], record["seconds"], flush=True)
+            print(
+                number,
+                mutant.path,
+                mutant.line,
+                mutant.change,
+                record["outcome"],
+                record["seconds"],
+                flush=True,
+            )
         return True
 
     @pytest.hookimpl(wrapper=True)
@@ -139,15 +159,22 @@ class Campaign:
 
     def _learn(self, items: Sequence[pytest.Item]) -> None:
         """Run the tests that are not known as they are now, and of the others enough to have the session's fixtures."""
-        package = "".join(path.read_text(encoding="utf-8") for path in sorted(PACKAGE.rglob("*.py")))
-        marks = {item.path: fingerprint(package + item.path.read_text(encoding="utf-8")) for item in items}
+        package = "".join(
+            path.read_text(encoding="utf-8") for path in sorted(PACKAGE.rglob("*.py"))
+        )
+        marks = {
+            item.path: fingerprint(package + item.path.read_text(encoding="utf-8"))
+            for item in items
+        }
         kept = self.results.with_suffix(".tests.json")
         known = json.loads(kept.read_text(encoding="utf-8")) if kept.exists() else {}
         for item in items:
             if known.get(item.nodeid, {}).get("mark") != marks[item.path]:
                 known.pop(item.nodeid, None)
         waiting, fixtures = [], set()
-        for item in sorted(items, key=lambda item: known[item.nodeid]["seconds"] if item.nodeid in known else 0.0):
+        for item in sorted(
+            items, key=lambda item: known[item.nodeid]["seconds"] if item.nodeid in known else 0.0
+        ):
             own = _session_fixtures(item)
             if item.nodeid not in known or not own <= fixtures:
                 waiting.append(item)
@@ -202,7 +229,12 @@ class Campaign:
         for name in sorted(names, key=lambda name: self._tests[name].seconds):
             test = self._tests[name]
             reached = any(file in files and first <= line <= last for file, line in test.reached)
-            if reached and name.startswith(places) and computing < _BUDGET and test.seconds < _LONGEST:
+            if (
+                reached
+                and name.startswith(places)
+                and computing < _BUDGET
+                and test.seconds < _LONGEST
+            ):
                 found.append(name)
                 computing += test.computing
         return found
@@ -236,7 +268,9 @@ class Campaign:
         if os.WIFSIGNALED(status):
             late = os.WTERMSIG(status) in {signal.SIGPROF, signal.SIGALRM}
             return "timed out" if late else "killed", by
-        return {_SURVIVED: "survived", _KILLED: "killed", _NOT_PLANTED: "not planted"}[os.WEXITSTATUS(status)], by
+        return {_SURVIVED: "survived", _KILLED: "killed", _NOT_PLANTED: "not planted"}[
+            os.WEXITSTATUS(status)
+        ], by
 
     def _child(self, items: Sequence[pytest.Item], mutant: Mutant | None, told: int) -> int:
         self._forget()
@@ -262,7 +296,9 @@ def _caches() -> list[Any]:
     """All that the package remembers of calls."""
     kind = type(functools.lru_cache(len))
     return [
-        each for each in gc.get_objects() if isinstance(each, kind) and str(each.__module__).startswith(PACKAGE.name)
+        each
+        for each in gc.get_objects()
+        if isinstance(each, kind) and str(each.__module__).startswith(PACKAGE.name)
     ]
 
 
@@ -295,4 +331,6 @@ def _importing(path: str) -> tuple[str, ...]:
     """The files that import from a file."""
     name = _module_name(path)
     texts = ((file, file.read_text(encoding="utf-8")) for file in PACKAGE.rglob("*.py"))
-    return tuple(str(file.relative_to(PACKAGE)) for file, text in texts if f"from {name} import" in text)
+    return tuple(
+        str(file.relative_to(PACKAGE)) for file, text in texts if f"from {name} import" in text
+    )

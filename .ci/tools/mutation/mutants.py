@@ -101,7 +101,11 @@ def _below(parent: ast.AST) -> Iterator[Change]:
             if not isinstance(node, ast.AST) or _is_text(node):
                 continue
             for new, words in _replacements(node):
-                yield node, _setting(parent, name, at if isinstance(value, list) else None, new), words
+                yield (
+                    node,
+                    _setting(parent, name, at if isinstance(value, list) else None, new),
+                    words,
+                )
             if not isinstance(node, ast.Raise):
                 yield from _below(node)
 
@@ -133,14 +137,19 @@ def _replacements(node: ast.AST) -> Iterator[tuple[ast.AST, str]]:
         here, there = (ast.unparse(each).split("\n")[0] for each in (node, new))
         same = takewhile(lambda pair: pair[0] == pair[1], zip(here, there, strict=False))
         begin = max(0, len([*same]) - 25)
-        yield ast.copy_location(new, node), f"{here[begin : begin + 60]} → {there[begin : begin + 60]}"
+        yield (
+            ast.copy_location(new, node),
+            f"{here[begin : begin + 60]} → {there[begin : begin + 60]}",
+        )
 
 
 def _others(node: ast.AST) -> Iterator[ast.AST]:
     made = _BY_TYPE.get(type(node))
     if made is not None:
         yield from made(node)
-    if isinstance(node, ast.If | ast.While | ast.IfExp) and isinstance(node.test, ast.Name | ast.Call | ast.Attribute):
+    if isinstance(node, ast.If | ast.While | ast.IfExp) and isinstance(
+        node.test, ast.Name | ast.Call | ast.Attribute
+    ):
         yield _with(node, test=ast.UnaryOp(ast.Not(), node.test))
     if isinstance(node, ast.comprehension) and node.ifs:
         yield _with(node, ifs=[])
@@ -212,7 +221,9 @@ def _returned(node: ast.Return) -> Iterator[ast.AST]:
 def _left_out(node: ast.AST) -> Iterator[ast.AST]:
     if isinstance(node, ast.Expr) and not isinstance(node.value, ast.Call):
         return
-    if isinstance(node, ast.Assign) and not isinstance(node.targets[0], ast.Subscript | ast.Attribute):
+    if isinstance(node, ast.Assign) and not isinstance(
+        node.targets[0], ast.Subscript | ast.Attribute
+    ):
         return
     yield ast.Pass()
 

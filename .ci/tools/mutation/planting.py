@@ -19,7 +19,11 @@ _PLAIN = (bool, int, float, str, bytes, type(None))
 
 def plant(module: ModuleType, tree: ast.Module) -> bool:
     """Make a module as the tree says; whether anything differs that can be changed."""
-    made = {"__name__": module.__name__, "__file__": module.__file__, "__package__": module.__package__}
+    made = {
+        "__name__": module.__name__,
+        "__file__": module.__file__,
+        "__package__": module.__package__,
+    }
     exec(compile(tree, str(module.__file__), "exec"), made)  # noqa: S102 - our own source
     planted = False
     for name, new in made.items():
@@ -55,7 +59,9 @@ def _is_plain(value: Any) -> bool:
 
 def _adapt(old: Any, new: Any, home: str) -> bool:
     """Give something the code, the defaults and the plain values of its new version; whether any differs."""
-    if old is new or type(old).__qualname__ != type(new).__qualname__:  # a record is of its module's own class
+    if (
+        old is new or type(old).__qualname__ != type(new).__qualname__
+    ):  # a record is of its module's own class
         return False
     if isinstance(old, FunctionType):
         return _adapt_function(old, new)
@@ -64,15 +70,26 @@ def _adapt(old: Any, new: Any, home: str) -> bool:
     if isinstance(old, Mapping):
         return sum(_adapt(old[key], new[key], home) for key in old if key in new) > 0
     if dataclasses.is_dataclass(old):
-        return sum(_adapt_field(old, new, field.name, home) for field in dataclasses.fields(old)) > 0
+        return (
+            sum(_adapt_field(old, new, field.name, home) for field in dataclasses.fields(old)) > 0
+        )
     inside = ("fget", "fset", "__func__", "__wrapped__", "func")
-    return sum(_adapt(getattr(old, name, None), getattr(new, name, None), home) for name in inside) > 0
+    return (
+        sum(_adapt(getattr(old, name, None), getattr(new, name, None), home) for name in inside) > 0
+    )
 
 
 def _adapt_function(old: FunctionType, new: FunctionType) -> bool:
     defaults = tuple(map(_other, old.__defaults__ or (), new.__defaults__ or ()))
-    by_name = {name: _other(value, new.__kwdefaults__[name]) for name, value in (old.__kwdefaults__ or {}).items()}
-    if (new.__code__, defaults, by_name) == (old.__code__, old.__defaults__ or (), old.__kwdefaults__ or {}):
+    by_name = {
+        name: _other(value, new.__kwdefaults__[name])
+        for name, value in (old.__kwdefaults__ or {}).items()
+    }
+    if (new.__code__, defaults, by_name) == (
+        old.__code__,
+        old.__defaults__ or (),
+        old.__kwdefaults__ or {},
+    ):
         return False
     old.__code__, old.__defaults__, old.__kwdefaults__ = new.__code__, defaults, by_name
     return True

@@ -20,10 +20,14 @@ def drawn(count: int, seed: int) -> list[Mutant]:
     """
     ranked = []
     for area in AREAS:
-        for path in [PACKAGE / area] if area.endswith(".py") else sorted((PACKAGE / area).rglob("*.py")):
+        for path in (
+            [PACKAGE / area] if area.endswith(".py") else sorted((PACKAGE / area).rglob("*.py"))
+        ):
             mutants, lines = mutants_of(path), lines_of_code(path.read_text(encoding="utf-8"))
             Random(f"{seed} {path.relative_to(PACKAGE)}").shuffle(mutants)  # noqa: S311
-            ranked += [((rank + 0.5) / lines, mutant.key, mutant) for rank, mutant in enumerate(mutants)]
+            ranked += [
+                ((rank + 0.5) / lines, mutant.key, mutant) for rank, mutant in enumerate(mutants)
+            ]
     return [mutant for _, _, mutant in sorted(ranked, key=lambda each: each[:2])[:count]]
 
 
@@ -71,5 +75,9 @@ def _functions(tree: ast.Module) -> Iterator[tuple[int, int, int]]:
         classes = [node for node in waiting if isinstance(node, ast.ClassDef)]
         for node in waiting:
             if isinstance(node, ast.FunctionDef):
-                yield min(each.lineno for each in (node, *node.decorator_list)), node.body[0].lineno, node.end_lineno
+                yield (
+                    min(each.lineno for each in (node, *node.decorator_list)),
+                    node.body[0].lineno,
+                    node.end_lineno,
+                )
         waiting = [inner for outer in classes for inner in outer.body]

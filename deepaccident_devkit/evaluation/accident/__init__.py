@@ -112,7 +112,9 @@ class AccidentEvaluator(Evaluator[AccidentResult]):
                 another outcome.
         """
         checked_facts(label, context)
-        counts = self.protocol.counts(checked_prediction(prediction), label, context or AccidentContext())
+        counts = self.protocol.counts(
+            checked_prediction(prediction), label, context or AccidentContext()
+        )
         self.add(token, dict(counts))
 
     def result_of(self, counts: Collection[Counts]) -> AccidentResult:
@@ -127,8 +129,14 @@ class AccidentEvaluator(Evaluator[AccidentResult]):
         for distance, within in result.within.items():
             row |= {f"{case}_{distance:g}m": getattr(within, case) for case in ("tp", "fp", "fn")}
         widest = result.within[max(result.within)]
-        errors = {"position_error": widest.position_error, "time_error": widest.time_error, "id_error": widest.id_error}
-        return row | {name: None if error is None else float(error) for name, error in errors.items()}
+        errors = {
+            "position_error": widest.position_error,
+            "time_error": widest.time_error,
+            "id_error": widest.id_error,
+        }
+        return row | {
+            name: None if error is None else float(error) for name, error in errors.items()
+        }
 
     def pooled(self, counts: Collection[Counts]) -> Sequence[Counts]:
         """Fewer counts with the same result."""
@@ -136,7 +144,10 @@ class AccidentEvaluator(Evaluator[AccidentResult]):
 
 
 def compared_accidents(
-    prediction: Prediction, label: MotionLabels | None, context: AccidentContext, protocol: AccidentProtocol
+    prediction: Prediction,
+    label: MotionLabels | None,
+    context: AccidentContext,
+    protocol: AccidentProtocol,
 ) -> ComparedAccidents:
     """Which accidents a protocol sees in a prediction and in the truth.
 

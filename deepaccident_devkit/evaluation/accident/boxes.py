@@ -27,10 +27,20 @@ from deepaccident_devkit.evaluation.accident.scoring import (
     tally_result,
     united,
 )
-from deepaccident_devkit.evaluation.alarms import Pair, named_alarms, position_difference, within_horizon
+from deepaccident_devkit.evaluation.alarms import (
+    Pair,
+    named_alarms,
+    position_difference,
+    within_horizon,
+)
 from deepaccident_devkit.evaluation.evaluator import Counts
 from deepaccident_devkit.evaluation.map_accidents import AccidentReading
-from deepaccident_devkit.evaluation.predictions import Accident, MotionOutput, Prediction, checked_prediction
+from deepaccident_devkit.evaluation.predictions import (
+    Accident,
+    MotionOutput,
+    Prediction,
+    checked_prediction,
+)
 from deepaccident_devkit.evaluation.truth import SLACK, AccidentContext, BoxTruth, not_counted_notes
 from deepaccident_devkit.motion import MotionLabels
 
@@ -91,7 +101,9 @@ class BoxAccidents:
 
     reading: AccidentReading = field(default_factory=AccidentReading)
 
-    def counts(self, prediction: Prediction, label: MotionLabels | None, context: AccidentContext) -> Counts:
+    def counts(
+        self, prediction: Prediction, label: MotionLabels | None, context: AccidentContext
+    ) -> Counts:
         """What one sample adds.
 
         Args:
@@ -112,7 +124,9 @@ class BoxAccidents:
         raised = named_alarms(checked_prediction(prediction), label, truth, self.reading)
         within = within_horizon(raised, truth)
         judged = [  # the alarms that the recording can refute
-            each for each in within if truth.accident is not None or each[0].time <= float(truth.time[-1]) + SLACK
+            each
+            for each in within
+            if truth.accident is not None or each[0].time <= float(truth.time[-1]) + SLACK
         ]
         return {
             "positive": truth.accident is not None,
@@ -125,7 +139,10 @@ class BoxAccidents:
         }
 
     def compared(
-        self, given: MotionOutput | list[Accident], label: MotionLabels | None, context: AccidentContext
+        self,
+        given: MotionOutput | list[Accident],
+        label: MotionLabels | None,
+        context: AccidentContext,
     ) -> ComparedAccidents:
         """Which accidents it sees; raises EvaluationError."""
         truth = _truth_of(context)
@@ -140,11 +157,17 @@ class BoxAccidents:
         given = _united(counts)
         base = tally_result(given["tally"], ERRORS_AT)
         if not base.positives:
-            nothing = {distance: replace(each, accuracy=math.nan) for distance, each in base.within.items()}
+            nothing = {
+                distance: replace(each, accuracy=math.nan) for distance, each in base.within.items()
+            }
             base = replace(base, apa=math.nan, within=nothing)
         at = base.within[ERRORS_AT]
         return BoxAccidentResult(
-            **{each.name: getattr(base, each.name) for each in fields(AccidentResult) if each.name != "notes"},
+            **{
+                each.name: getattr(base, each.name)
+                for each in fields(AccidentResult)
+                if each.name != "notes"
+            },
             notes=(*base.notes, *not_counted_notes(given["unplaced"], given["beyond"])),
             precision=_share(at.tp, at.tp + at.fp),
             recall=_share(at.tp, base.positives),
@@ -166,7 +189,9 @@ def _united(counts: Collection[Counts]) -> dict[str, Any]:
         `tally`; `alarms`: [score, whether it is the right one] of each; `lateness`: in sum, of the right ones;
         `false_samples`: how many raise an alarm without an accident to come; and of `_LEFT_OUT` each.
     """
-    complete = [{"unplaced": 0, **each} for each in counts]  # runs kept by earlier versions refused such samples
+    complete = [
+        {"unplaced": 0, **each} for each in counts
+    ]  # runs kept by earlier versions refused such samples
     given = [each if "tally" in each else _tallied(each) for each in complete]
     return {
         "tally": united(each["tally"] for each in given),

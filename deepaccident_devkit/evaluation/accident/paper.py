@@ -22,7 +22,12 @@ from deepaccident_devkit.evaluation.accident.scoring import (
     tally_result,
     united,
 )
-from deepaccident_devkit.evaluation.alarms import MATCH_DISTANCE, by_sureness, nearest_two, position_difference
+from deepaccident_devkit.evaluation.alarms import (
+    MATCH_DISTANCE,
+    by_sureness,
+    nearest_two,
+    position_difference,
+)
 from deepaccident_devkit.evaluation.evaluator import Counts
 from deepaccident_devkit.evaluation.map_accidents import (
     AccidentReading,
@@ -51,7 +56,10 @@ from deepaccident_devkit.taxonomy import FRAME_PERIOD
 SampleChoice = Literal["best", "mean_first"]
 _NO_LABEL: Final = "label: the accident protocol 'paper' needs the sample's motion labels"
 # Forms of a prediction that are not heads, as counts and as notes have them.
-_FORMS: Final[Mapping[str, str]] = {"instance_maps": "instance maps", "explicit": "explicit accidents"}
+_FORMS: Final[Mapping[str, str]] = {
+    "instance_maps": "instance maps",
+    "explicit": "explicit accidents",
+}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -77,7 +85,9 @@ class PaperAccidents:
         """Check the values; raises ChoiceError."""
         settle_choices(self, {"sample_choice": get_args(SampleChoice)})
 
-    def counts(self, prediction: Prediction, label: MotionLabels | None, context: AccidentContext) -> Counts:
+    def counts(
+        self, prediction: Prediction, label: MotionLabels | None, context: AccidentContext
+    ) -> Counts:
         """What one sample adds.
 
         Where heads are predicted, the truth is the labels as heads, through the same grouping and linking; where
@@ -119,28 +129,46 @@ class PaperAccidents:
             "instance_maps": isinstance(given, MotionOutput) and given.instances is not None,
             "explicit": not isinstance(given, MotionOutput),
             # the first with the least difference of positions; the first at all where there is no truth to differ from
-            "best": min(filter(None, alarms), key=lambda alarm: alarm["position"] or 0.0, default=None),
+            "best": min(
+                filter(None, alarms), key=lambda alarm: alarm["position"] or 0.0, default=None
+            ),
             "mean_first": next((alarm for alarm in (*alarms[-1:], *alarms[:-1]) if alarm), None),
         }
 
     def compared(
-        self, given: MotionOutput | list[Accident], label: MotionLabels | None, _context: AccidentContext
+        self,
+        given: MotionOutput | list[Accident],
+        label: MotionLabels | None,
+        _context: AccidentContext,
     ) -> ComparedAccidents:
         """Which accidents it sees; raises EvaluationError."""
         if label is None:
             raise EvaluationError(_NO_LABEL)
-        frames, labels, step = frames_there(label), label.config.rules, label.config.step * FRAME_PERIOD
+        frames, labels, step = (
+            frames_there(label),
+            label.config.rules,
+            label.config.step * FRAME_PERIOD,
+        )
         shown = self.truth_map(given, labels_at_present(label), frames)
         true = accident_of(shown, label.config.grid, labels, self.reading).explicit(step)
         if isinstance(given, MotionOutput):
-            read = [each.explicit(step) for each in predicted_accidents(given, labels, self.reading, frames)]
-            return ComparedAccidents(true=true, predicted=tuple(each for each in read if each is not None))
-        return ComparedAccidents(true=true, predicted=tuple(surest_within(given, (frames - 0.5) * step)))
+            read = [
+                each.explicit(step)
+                for each in predicted_accidents(given, labels, self.reading, frames)
+            ]
+            return ComparedAccidents(
+                true=true, predicted=tuple(each for each in read if each is not None)
+            )
+        return ComparedAccidents(
+            true=true, predicted=tuple(surest_within(given, (frames - 0.5) * step))
+        )
 
     def result(self, counts: Collection[Counts]) -> AccidentResult:
         """The metrics of some samples' counts, in any order."""
         given = _united(counts)
-        chosen, other = sorted(get_args(SampleChoice), key=lambda choice: choice != self.sample_choice)
+        chosen, other = sorted(
+            get_args(SampleChoice), key=lambda choice: choice != self.sample_choice
+        )
         result, beside = (tally_result(given[choice], ERRORS_AT) for choice in (chosen, other))
         notes = tuple(
             f"{given[form]} of {result.samples} predictions were given as {words}: their truth is the labels' instance "
@@ -154,7 +182,9 @@ class PaperAccidents:
         """The sums of all counts, which have the same result."""
         return [{"tallies": _united(counts)}]
 
-    def truth_map(self, given: MotionOutput | list[Accident], label: MotionLabels, frames: int) -> AnyArray:
+    def truth_map(
+        self, given: MotionOutput | list[Accident], label: MotionLabels, frames: int
+    ) -> AnyArray:
         """(T, H, W) the instances that a prediction is compared with, of labels at the present; as the labels lie."""
         if not isinstance(given, MotionOutput) or given.heads is None:
             return label.instance[:frames]
@@ -171,7 +201,9 @@ def _united(counts: Collection[Counts]) -> dict[str, Any]:
 
 
 def _tallies(sample: Counts) -> dict[str, Any]:
-    alarms = {choice: [sample[choice]] if sample[choice] else [] for choice in get_args(SampleChoice)}
+    alarms = {
+        choice: [sample[choice]] if sample[choice] else [] for choice in get_args(SampleChoice)
+    }
     return {
         **{choice: alarms_tally(sample, each) for choice, each in alarms.items()},
         **{form: int(sample[form]) for form in _FORMS},
@@ -239,5 +271,7 @@ def _id_error(
     if predicted.ids is not None:
         return None if None in actors else int(set(predicted.ids) != set(actors))
     frame = min(round(predicted.time / seconds), len(truth.tracks.center) - 1)
-    nearest = nearest_two(predicted.positions, truth.tracks.identity, truth.tracks.center[frame], MATCH_DISTANCE)
+    nearest = nearest_two(
+        predicted.positions, truth.tracks.identity, truth.tracks.center[frame], MATCH_DISTANCE
+    )
     return int(set(nearest) != set(truth.contact.ids))

@@ -28,7 +28,13 @@ from deepaccident_devkit.evaluation.accident.scoring import (
 )
 from deepaccident_devkit.evaluation.alarms import position_difference
 from deepaccident_devkit.evaluation.evaluator import Counts
-from deepaccident_devkit.evaluation.instances import Paths, instance_paths, longest, match_trajectories, padded
+from deepaccident_devkit.evaluation.instances import (
+    Paths,
+    instance_paths,
+    longest,
+    match_trajectories,
+    padded,
+)
 from deepaccident_devkit.evaluation.predictions import (
     Accident,
     MotionOutput,
@@ -78,7 +84,9 @@ class ReleasedAccidents:
     maps_alone: ClassVar[bool] = True
     """It compares no explicit accidents."""
 
-    def counts(self, prediction: Prediction, label: MotionLabels | None, context: AccidentContext) -> Counts:
+    def counts(
+        self, prediction: Prediction, label: MotionLabels | None, context: AccidentContext
+    ) -> Counts:
         """What one sample adds.
 
         Raises:
@@ -94,19 +102,29 @@ class ReleasedAccidents:
         truth, present = self.truth_paths(label, frames)
         points = longest(truth.paths) or len(truth.drawn)
         truth, *predictions = (
-            padded_paths(each, points) for each in (truth, *self.prediction_paths(prediction, frames))
+            padded_paths(each, points)
+            for each in (truth, *self.prediction_paths(prediction, frames))
         )
         matches = [match_trajectories(each.paths, truth.paths).pairs for each in predictions]
         counts, pair = accident_counts(predictions, truth, matches)
-        actors = None if pair is None else [actor_of(present == name, 0, label, context) for name in pair]
+        actors = (
+            None
+            if pair is None
+            else [actor_of(present == name, 0, label, context) for name in pair]
+        )
         return counts | {"named": named(actors, context)}
 
     def compared(
-        self, given: MotionOutput | list[Accident], label: MotionLabels | None, _context: AccidentContext
+        self,
+        given: MotionOutput | list[Accident],
+        label: MotionLabels | None,
+        _context: AccidentContext,
     ) -> ComparedAccidents:
         """Which accidents it sees; raises EvaluationError."""
         if label is None or not isinstance(given, MotionOutput):
-            raise EvaluationError("the released protocol compares motion: give a MotionOutput and the motion labels")
+            raise EvaluationError(
+                "the released protocol compares motion: give a MotionOutput and the motion labels"
+            )
         frames = frames_there(label)
         truth, _ = self.truth_paths(labels_at_present(label), frames)
         points = longest(truth.paths) or len(truth.drawn)
@@ -125,14 +143,18 @@ class ReleasedAccidents:
             predictions = []
         return ComparedAccidents(
             true=next(iter(found(truth, self.truth_gap)), None),
-            predicted=tuple(alarm for each in predictions for alarm in found(each, self.prediction_gap)),
+            predicted=tuple(
+                alarm for each in predictions for alarm in found(each, self.prediction_gap)
+            ),
         )
 
     def result(self, counts: Collection[Counts]) -> AccidentResult:
         """The metrics of some samples' counts, in any order."""
         made = tally_result(_united(counts), DISTANCES[0])
         errors: dict[str, Any] = {
-            f"{name}_error": self._error([getattr(each, f"{name}_error") for each in made.within.values()], name)
+            f"{name}_error": self._error(
+                [getattr(each, f"{name}_error") for each in made.within.values()], name
+            )
             for name in ERRORS
         }
         return replace(made, **errors)
@@ -143,7 +165,9 @@ class ReleasedAccidents:
 
     def truth_paths(self, label: MotionLabels, frames: int) -> tuple[DrawnPaths, AnyArray]:
         """What predictions are compared with, and (H, W) its ids at the present."""
-        return paths_of_heads(first_frames(MotionHeads.from_labels(label), frames), label.config.grid)
+        return paths_of_heads(
+            first_frames(MotionHeads.from_labels(label), frames), label.config.grid
+        )
 
     def prediction_paths(self, output: MotionOutput, frames: int) -> list[DrawnPaths]:
         """What is compared of each of the K predictions, cut to so many frames."""
@@ -197,7 +221,9 @@ def accident_counts(
         counts["fn"] = [1] * len(DISTANCES)
         return counts, true
     position, best, same = min(foreseen, key=lambda each: each[0])
-    named_so = all(any((name, other) in same for other in true) for name in best)  # by the matches of their paths
+    named_so = all(
+        any((name, other) in same for other in true) for name in best
+    )  # by the matches of their paths
     errors = {"id": int(not named_so), "position": position, "time": 0.0}
     within = [position <= distance for distance in DISTANCES]
     counts |= {"tp": [int(each) for each in within], "fp": [int(not each) for each in within]}
@@ -216,19 +242,26 @@ def collision(given: DrawnPaths, frame: int, gap: float) -> _Pair | None:
 
 def _apart(alarm: tuple[DrawnPaths, _Pair], true: tuple[DrawnPaths, _Pair], frame: int) -> float:
     """Metres: the sum of the distances of the predicted from the true two, in the order with the smaller sum."""
-    here, there = (np.array([each.paths[name][frame] for name in pair]) for each, pair in (alarm, true))
+    here, there = (
+        np.array([each.paths[name][frame] for name in pair]) for each, pair in (alarm, true)
+    )
     return position_difference(here, there)
 
 
 def _united(counts: Collection[Counts]) -> Counts:
     """The tally of samples, those of `pooled` among them."""
-    return united(each if "numbers" in each else sample_tally(each, _by_distance(each)) for each in counts)
+    return united(
+        each if "numbers" in each else sample_tally(each, _by_distance(each)) for each in counts
+    )
 
 
 def _by_distance(counts: Counts) -> list[dict[str, Any]]:
     return [
-        {"tp": tp, "fp": fp, "fn": fn} | {name: [counts[name][index]] if tp else [] for name in ERRORS}
-        for index, (tp, fp, fn) in enumerate(zip(counts["tp"], counts["fp"], counts["fn"], strict=True))
+        {"tp": tp, "fp": fp, "fn": fn}
+        | {name: [counts[name][index]] if tp else [] for name in ERRORS}
+        for index, (tp, fp, fn) in enumerate(
+            zip(counts["tp"], counts["fp"], counts["fn"], strict=True)
+        )
     ]
 
 
@@ -252,7 +285,9 @@ def paths_of_heads(heads: MotionHeads, grid: BevGrid) -> tuple[DrawnPaths, AnyAr
     linked = predict_instances(heads, "accident")
     drawn = linked.instance if linked.redrawn is None else linked.redrawn
     drawn = to_orientation(drawn, vectors=False, source=heads.orientation, target="released")
-    paths = trajectories(linked, grid, half_cell_shift=False)  # as instance maps' are: only differences count
+    paths = trajectories(
+        linked, grid, half_cell_shift=False
+    )  # as instance maps' are: only differences count
     return DrawnPaths(paths=paths, drawn=drawn), linked.instance[0]
 
 
@@ -283,7 +318,9 @@ def _redrawn(instance: AnyArray, ids: IntArray) -> AnyArray:
     return result
 
 
-def _centers(key: IntArray, position: IntArray, shape: tuple[int, int]) -> tuple[FloatArray, BoolArray]:
+def _centers(
+    key: IntArray, position: IntArray, shape: tuple[int, int]
+) -> tuple[FloatArray, BoolArray]:
     """(I, T, 2) mean rows and columns of cells by key, 0 where there are none, and (I, T) where there are some."""
     length = shape[0] * shape[1]
     count = np.bincount(key, minlength=length)

@@ -128,7 +128,10 @@ def sample_tally(sample: Counts, within: Sequence[Mapping[str, Any]]) -> _Tally:
         within: for each distance how many are `tp`, `fp` and `fn`, and lists of each of `ERRORS` that is known.
     """
     names = [int(sample["named"] == name) for name in NAMED]
-    numbers = [[*(each[case] for case in _CASES), *(len(each[error]) for error in ERRORS)] for each in within]
+    numbers = [
+        [*(each[case] for case in _CASES), *(len(each[error]) for error in ERRORS)]
+        for each in within
+    ]
     return {
         "numbers": [1, int(sample["positive"]), *names, *chain.from_iterable(numbers)],
         "errors": [each[error] for each in within for error in ERRORS],
@@ -139,8 +142,12 @@ def united(tallies: Iterable[_Tally]) -> _Tally:
     """The tally of several together."""
     given = [_NOTHING, *tallies]
     return {
-        "numbers": [sum(column) for column in zip(*(each["numbers"] for each in given), strict=True)],
-        "errors": [exact_parts(column) for column in zip(*(each["errors"] for each in given), strict=True)],
+        "numbers": [
+            sum(column) for column in zip(*(each["numbers"] for each in given), strict=True)
+        ],
+        "errors": [
+            exact_parts(column) for column in zip(*(each["errors"] for each in given), strict=True)
+        ],
     }
 
 
@@ -185,10 +192,15 @@ def tally_result(tally: _Tally, errors_at: float) -> AccidentResult:
     )
 
 
-def _within(distance: float, numbers: Sequence[int], errors: Sequence[Sequence[float]]) -> AccidentsWithin:
+def _within(
+    distance: float, numbers: Sequence[int], errors: Sequence[Sequence[float]]
+) -> AccidentsWithin:
     """Of one distance: what `numbers` and `errors` begin with."""
     tp, fp, fn, *known = numbers[: len(_CASES) + len(ERRORS)]
-    means = [math.fsum(parts) / count if count else None for parts, count in zip(errors, known, strict=False)]
+    means = [
+        math.fsum(parts) / count if count else None
+        for parts, count in zip(errors, known, strict=False)
+    ]
     return AccidentsWithin(
         distance=distance,
         tp=tp,
@@ -212,11 +224,21 @@ ERRORS_AT: Final = 10.0
 
 def hit_of(alarms: Sequence[Alarm], distance: float) -> Alarm | None:
     """The first alarm that foresees the true accident nearer than a distance."""
-    return next((each for each in alarms if each["position"] is not None and each["position"] < distance - TIE), None)
+    return next(
+        (
+            each
+            for each in alarms
+            if each["position"] is not None and each["position"] < distance - TIE
+        ),
+        None,
+    )
 
 
 def foreseen(
-    position: float | None = None, time: float | None = None, id_error: int | None = None, **more: float
+    position: float | None = None,
+    time: float | None = None,
+    id_error: int | None = None,
+    **more: float,
 ) -> dict[str, Any]:
     """An `Alarm`, of whose positions those that differ by less than `TIE` are equal; `more` is kept with it."""
     position = None if position is None else float(even(np.asarray(position)))
@@ -258,7 +280,9 @@ def _cases_within(sample: Counts, alarms: Sequence[Alarm], distance: float) -> d
     }
 
 
-def actor_of(cells: BoolArray, frame: int, label: MotionLabels, context: AccidentContext) -> int | None:
+def actor_of(
+    cells: BoolArray, frame: int, label: MotionLabels, context: AccidentContext
+) -> int | None:
     """The actor to which most of an instance's labelled cells belong; of equal ones the one rasterised first.
 
     Args:

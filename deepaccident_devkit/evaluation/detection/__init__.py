@@ -27,7 +27,12 @@ from deepaccident_devkit.evaluation.detection.matching import (
     nearest_by_truth,
     ring_of,
 )
-from deepaccident_devkit.evaluation.detection.result import DetectionResult, Ledger, detection_result, drawn_results
+from deepaccident_devkit.evaluation.detection.result import (
+    DetectionResult,
+    Ledger,
+    detection_result,
+    drawn_results,
+)
 from deepaccident_devkit.evaluation.evaluator import Counts, Evaluator
 from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.geometry.boxes import checked_boxes
@@ -118,13 +123,18 @@ class DetectionEvaluator(Evaluator[DetectionResult]):
                 f"DetectedBoxes.from_arrays(center, size, yaw, scores, frame={frame!r}), of no rows where nothing is "
                 "detected"
             )
-        for name, boxes in (("prediction", prediction.boxes), ("truth", checked_boxes("truth", truth))):
+        for name, boxes in (
+            ("prediction", prediction.boxes),
+            ("truth", checked_boxes("truth", truth)),
+        ):
             if boxes.frame != frame:
                 raise GeometryError(
                     f"{token}: {name} in frame {boxes.frame!r}, the protocol counts in {frame!r}; transform them, or "
                     "choose frame="
                 )
-        counts = frame_counts(columns_of(prediction.boxes, prediction.scores), columns_of(truth), self.protocol)
+        counts = frame_counts(
+            columns_of(prediction.boxes, prediction.scores), columns_of(truth), self.protocol
+        )
         self.add(token, {"token": token, **counts})
 
     def result_of(self, counts: Collection[Counts]) -> DetectionResult:
@@ -136,13 +146,19 @@ class DetectionEvaluator(Evaluator[DetectionResult]):
         counts, thresholds = self._counts[token], self.protocol.thresholds
         hits = Counter(cell % len(thresholds) for cell in counts["tp"][0])
         row = {"truths": sum(counts["truths"]), "detections": len(counts["detections"][0])}
-        return row | {f"tp_{threshold:g}": hits[level] for level, threshold in enumerate(thresholds)}
+        return row | {
+            f"tp_{threshold:g}": hits[level] for level, threshold in enumerate(thresholds)
+        }
 
-    def resampled(self, parts: Sequence[Sequence[Counts]], times: IntArray) -> Iterator[DetectionResult]:
+    def resampled(
+        self, parts: Sequence[Sequence[Counts]], times: IntArray
+    ) -> Iterator[DetectionResult]:
         """The result of each draw (`Evaluator.resampled`); what does not depend on the draw is made once."""
         owner = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
         ledger = Ledger([counts for part in parts for counts in part], self.protocol)
-        yield from drawn_results(ledger, self.protocol, times[:, owner[ledger.order]].astype(np.int32))
+        yield from drawn_results(
+            ledger, self.protocol, times[:, owner[ledger.order]].astype(np.int32)
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -186,7 +202,9 @@ def detection_matches(
     rules = detection_protocol(protocol)
     chosen = threshold or rules.error_threshold or rules.thresholds[len(rules.thresholds) // 2]
     if chosen not in rules.thresholds:
-        raise ChoiceError(f"threshold: expected one of {', '.join(map(str, rules.thresholds))}, found {threshold!r}")
+        raise ChoiceError(
+            f"threshold: expected one of {', '.join(map(str, rules.thresholds))}, found {threshold!r}"
+        )
     detected, true = columns_of(prediction.boxes, prediction.scores), columns_of(truth)
     (detected, rows), (true, true_rows) = boxes_taken(detected, true, rules)
     pairs: list[tuple[int, int]] = []
@@ -196,7 +214,11 @@ def detection_matches(
         ring = ring_of(detected, true, rules, position)
         holder = _holders(ring, rules, rules.thresholds.index(chosen))
         counts, true_counts = ring.counts, ring.truth_counts
-        pairs += [(rows[by], true_rows[one]) for one, by in holder.items() if counts[by] and true_counts[one]]
+        pairs += [
+            (rows[by], true_rows[one])
+            for one, by in holder.items()
+            if counts[by] and true_counts[one]
+        ]
         unmatched |= {*np.flatnonzero(counts).tolist()} - {*holder.values()}
         missed |= {*np.flatnonzero(true_counts).tolist()} - {*holder}
     matched = np.array(sorted(pairs), dtype=np.int64).reshape(-1, 2)

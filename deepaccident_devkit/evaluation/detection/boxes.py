@@ -137,13 +137,19 @@ class DetectionProtocol:
         settle_choices(self, _CHOICES)
         _check_classes(self.classes)
         if self.frame not in ("lidar", "ego"):
-            raise ConfigError(f"frame: expected 'lidar' or 'ego', found {self.frame!r}: ranges are around the agent")
+            raise ConfigError(
+                f"frame: expected 'lidar' or 'ego', found {self.frame!r}: ranges are around the agent"
+            )
         if not self.thresholds or not self.ranges:
             raise ConfigError("thresholds and ranges: expected at least one of each")
         if self.small_thresholds is not None and len(self.small_thresholds) != len(self.thresholds):
-            raise ConfigError(f"small_thresholds: expected as many as thresholds, found {self.small_thresholds}")
+            raise ConfigError(
+                f"small_thresholds: expected as many as thresholds, found {self.small_thresholds}"
+            )
         if not (self.points > 1 and 0 <= self.min_recall < 1 and 0 <= self.min_precision < 1):
-            raise ConfigError("points, min_recall, min_precision: expected at least 2, and shares from 0 and below 1")
+            raise ConfigError(
+                "points, min_recall, min_precision: expected at least 2, and shares from 0 and below 1"
+            )
         curves = len(self.classes) * len(self.ranges) * len(self.thresholds)
         if curves * self.points > _MOST_POINTS:
             raise ConfigError(
@@ -155,7 +161,9 @@ class DetectionProtocol:
                 f"global_sort: the curve {self.curve!r} is by the order of all scores; choose curve='voc'"
             )
         if self.error_threshold is not None and (
-            self.error_threshold not in self.thresholds or len(self.ranges) > 1 or self.curve == "voc"
+            self.error_threshold not in self.thresholds
+            or len(self.ranges) > 1
+            or self.curve == "voc"
         ):
             raise ConfigError(
                 f"error_threshold: {self.error_threshold} needs to be one of the thresholds {self.thresholds}, a "
@@ -165,7 +173,11 @@ class DetectionProtocol:
     def limits(self, name: str) -> tuple[float, ...]:
         """The thresholds of a class by its name."""
         small = self.small_thresholds is not None and name in SMALL_CATEGORIES
-        return self.small_thresholds if small and self.small_thresholds is not None else self.thresholds
+        return (
+            self.small_thresholds
+            if small and self.small_thresholds is not None
+            else self.thresholds
+        )
 
     def as_dict(self) -> dict[str, Any]:
         """All choices, as JSON holds them."""
@@ -258,7 +270,9 @@ class DetectedBoxes(FrozenArrays):
         checked_boxes("detected boxes", self.boxes)
         scores = checked("scores", self.scores, (len(self.boxes),)).copy()
         if not np.isfinite(scores).all():
-            raise GeometryError("scores: not all numbers are finite; leave out the boxes that have none")
+            raise GeometryError(
+                "scores: not all numbers are finite; leave out the boxes that have none"
+            )
         object.__setattr__(self, "scores", scores)
         FrozenArrays.__post_init__(self)
 
@@ -333,15 +347,25 @@ class BoxColumns:
 
     def select(self, which: AnyArray) -> BoxColumns:
         """The boxes that a mask or an array of rows picks."""
-        return BoxColumns(**{name: getattr(self, name)[which] for name in self.__dataclass_fields__})
+        return BoxColumns(
+            **{name: getattr(self, name)[which] for name in self.__dataclass_fields__}
+        )
 
     @property
     def surest_first(self) -> IntArray:
         """(N,) rows by falling score, equal ones by what is in the boxes: the same boxes in any order of the rows."""
         return np.lexsort(
-            np.column_stack([-self.score, self.category, self.center, self.size, self.yaw, self.velocity, self.own]).T[
-                ::-1
-            ]
+            np.column_stack(
+                [
+                    -self.score,
+                    self.category,
+                    self.center,
+                    self.size,
+                    self.yaw,
+                    self.velocity,
+                    self.own,
+                ]
+            ).T[::-1]
         )
 
     def rounded(self) -> BoxColumns:
@@ -402,13 +426,19 @@ def detection_truth(
     rules = detection_protocol(protocol)
     record = dataset.get("sample", sample)
     if not record["labelled"]:
-        raise NotAvailableError(f"{record['token']}: has no label, so that nothing can be evaluated")
+        raise NotAvailableError(
+            f"{record['token']}: has no label, so that nothing can be evaluated"
+        )
     if rules.truth == "cooperative":
         boxes = cooperative_boxes(dataset, sample, agents=agents, frame=rules.frame)
         own_actor = dataset.get("agent", record["agent_token"])["actor_id"]
-        own = boxes.actor_id == (OWN_ACTOR_ID if own_actor is None or own_actor == UNTRACKED_ID else own_actor)
+        own = boxes.actor_id == (
+            OWN_ACTOR_ID if own_actor is None or own_actor == UNTRACKED_ID else own_actor
+        )
     elif agents is not None:
-        raise ConfigError(f"agents: the truth of this protocol is {rules.truth!r}; choose truth='cooperative', or None")
+        raise ConfigError(
+            f"agents: the truth of this protocol is {rules.truth!r}; choose truth='cooperative', or None"
+        )
     else:
         boxes = dataset.boxes(sample, rules.frame, "released" if rules.truth == "visible" else None)
         own = boxes.actor_id == OWN_ACTOR_ID
@@ -417,9 +447,15 @@ def detection_truth(
     return boxes.select(rules.own_box | ~own)
 
 
-def _with_label_velocity(dataset: Dataset, sample: RowArgument, boxes: Boxes, rules: DetectionProtocol) -> Boxes:
+def _with_label_velocity(
+    dataset: Dataset, sample: RowArgument, boxes: Boxes, rules: DetectionProtocol
+) -> Boxes:
     """The boxes with the velocities that stand in the label, which the released code takes to be in LiDAR axes."""
     if rules.frame != "lidar" or rules.truth == "cooperative":
-        raise ConfigError("label_velocity: the label's velocities are those of one agent's LiDAR frame; choose False")
-    written = dataset.columns("annotation")["velocity_label"][dataset.annotation_rows(sample)][boxes.row]
+        raise ConfigError(
+            "label_velocity: the label's velocities are those of one agent's LiDAR frame; choose False"
+        )
+    written = dataset.columns("annotation")["velocity_label"][dataset.annotation_rows(sample)][
+        boxes.row
+    ]
     return replace(boxes, velocity=np.column_stack([written, np.zeros(len(written))]))

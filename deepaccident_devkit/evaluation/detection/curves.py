@@ -99,12 +99,19 @@ def recall_matches(truths: IntArray, points: int) -> IntArray:
 class _Sums:
     """How much comes of a cell's rows in each draw."""
 
-    def __init__(self, cell: Cell, times: IntArray, rows: IntArray, each: IntArray | None = None) -> None:
+    def __init__(
+        self, cell: Cell, times: IntArray, rows: IntArray, each: IntArray | None = None
+    ) -> None:
         """Count some rows as often as their samples are taken, times what each adds, 1 if None."""
         weights = np.take(times, cell.sample[rows], axis=1)
         self._rows = rows
         self._sums: AnyArray = np.zeros((len(times), len(rows) + 1), dtype=np.int32)
-        np.cumsum(weights if each is None else weights * each, axis=1, dtype=np.int32, out=self._sums[:, 1:])
+        np.cumsum(
+            weights if each is None else weights * each,
+            axis=1,
+            dtype=np.int32,
+            out=self._sums[:, 1:],
+        )
 
     @property
     def all(self) -> IntArray:
@@ -133,7 +140,8 @@ def _released(cell: Cell, protocol: DetectionProtocol, times: IntArray) -> Point
         # how many rows have at least each score: equal scores come in together
         ends = np.where(is_reached, np.searchsorted(-cell.scores, -threshold, side="right"), 0)
     tp, spent, detected = (
-        _Sums(cell, times, np.flatnonzero(each)).above(ends) for each in (cell.tp, cell.spent, cell.detected)
+        _Sums(cell, times, np.flatnonzero(each)).above(ends)
+        for each in (cell.tp, cell.spent, cell.detected)
     )
     changed = np.flatnonzero(cell.excused)
     excused = _Sums(cell, times, changed, cell.excused[changed]).above(ends)
@@ -145,7 +153,9 @@ def _released(cell: Cell, protocol: DetectionProtocol, times: IntArray) -> Point
         precision=precision,
         recall=recall,
         average=np.array([_mean(each[first:]) for each in precision]),
-        errors=np.array([[_mean(column) for column in each[first:].T] for each in _errors_at(cell, times, ends)]),
+        errors=np.array(
+            [[_mean(column) for column in each[first:].T] for each in _errors_at(cell, times, ends)]
+        ),
     )
 
 
@@ -178,12 +188,17 @@ def _drawn(cell: Cell, protocol: DetectionProtocol, times: IntArray) -> Iterator
         copies = np.repeat(np.arange(len(starts)), each[cell.sample[starts]])
         length = lengths[copies]
         ends = np.cumsum(length)
-        rows = np.arange(ends[-1] if ends.size else 0) + np.repeat(starts[copies] - (ends - length), length)
+        rows = np.arange(ends[-1] if ends.size else 0) + np.repeat(
+            starts[copies] - (ends - length), length
+        )
         error = with_error[rows]
         yield replace(
             cell,
             truths=cell.truths * each,
-            **{name: getattr(cell, name)[rows] for name in ("scores", "sample", "detected", "tp", "spent", "excused")},
+            **{
+                name: getattr(cell, name)[rows]
+                for name in ("scores", "sample", "detected", "tp", "spent", "excused")
+            },
             error_rows=np.flatnonzero(error >= 0),
             errors=cell.errors[error[error >= 0]],
         )
@@ -194,10 +209,15 @@ def _nuscenes(cell: Cell, protocol: DetectionProtocol) -> Points:
     levels = np.linspace(0, 1, protocol.points)
     found, counted = np.cumsum(cell.tp), np.cumsum(cell.detected - cell.spent)
     if not found.size or not found[-1] or not truths:
-        return Points(precision=np.zeros(len(levels)), recall=levels, average=0.0, errors=np.ones(4))
+        return Points(
+            precision=np.zeros(len(levels)), recall=levels, average=0.0, errors=np.ones(4)
+        )
     recall = found / truths
     precision = np.interp(
-        levels, recall, np.divide(found, counted, out=np.zeros(len(found)), where=counted > 0), right=0
+        levels,
+        recall,
+        np.divide(found, counted, out=np.zeros(len(found)), where=counted > 0),
+        right=0,
     )
     scores = np.interp(levels, recall, cell.scores, right=0)
     first = round(protocol.min_recall * (protocol.points - 1)) + 1
@@ -222,7 +242,9 @@ def _interpolated_errors(cell: Cell, scores: FloatArray, first: int, last: int) 
     sums, numbers = np.cumsum(np.where(known, cell.errors, 0), axis=0), np.cumsum(known, axis=0)
     running = np.divide(sums, numbers, out=np.zeros_like(sums), where=numbers > 0)
     rising = cell.scores[cell.error_rows][::-1]
-    means = [_mean(np.interp(scores[first : last + 1], rising, column[::-1])) for column in running.T]
+    means = [
+        _mean(np.interp(scores[first : last + 1], rising, column[::-1])) for column in running.T
+    ]
     return np.where(numbers[-1] > 0, means, nan)
 
 
@@ -240,7 +262,10 @@ def _voc(cell: Cell, protocol: DetectionProtocol) -> Points:
     return Points(precision=sampled, recall=levels, average=average, errors=np.full(4, nan))
 
 
-_CURVES: Final[Mapping[str, Callable[[Cell, DetectionProtocol], Points]]] = {"nuscenes": _nuscenes, "voc": _voc}
+_CURVES: Final[Mapping[str, Callable[[Cell, DetectionProtocol], Points]]] = {
+    "nuscenes": _nuscenes,
+    "voc": _voc,
+}
 
 
 def _ratio(part: AnyArray, whole: IntArray, otherwise: float) -> FloatArray:

@@ -17,7 +17,14 @@ import numpy as np
 
 from deepaccident_devkit.evaluation.detection.boxes import BoxColumns, DetectionProtocol
 from deepaccident_devkit.geometry.box_arrays import intersection_areas
-from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray, IntArray, as_floats, readonly
+from deepaccident_devkit.support.arrays import (
+    AnyArray,
+    BoolArray,
+    FloatArray,
+    IntArray,
+    as_floats,
+    readonly,
+)
 from deepaccident_devkit.taxonomy import CATEGORIES
 
 # Candidate → (true box, rank) of the pairs that are near enough.
@@ -53,7 +60,9 @@ class Steps:
             self.excused.append((arriving, excused))
 
 
-def nearest_by_truth(reach: Reach, counts: Mapping[int, bool], truth_counts: Sequence[bool]) -> Steps:
+def nearest_by_truth(
+    reach: Reach, counts: Mapping[int, bool], truth_counts: Sequence[bool]
+) -> Steps:
     """Each true box in turn takes the candidate of the lowest rank that is left, for every score at once.
 
     Each new candidate is offered to the true boxes in their order. The first that has none or ranks it lower
@@ -86,7 +95,9 @@ def nearest_by_truth(reach: Reach, counts: Mapping[int, bool], truth_counts: Seq
     return steps
 
 
-def _taker(pairs: Sequence[tuple[int, int]], behind: int, ranks: Mapping[int, int]) -> tuple[int, int]:
+def _taker(
+    pairs: Sequence[tuple[int, int]], behind: int, ranks: Mapping[int, int]
+) -> tuple[int, int]:
     """The first true box after `behind` that takes a candidate with these pairs, and their rank."""
     for truth, rank in pairs:
         if truth > behind and ranks.get(truth, rank) >= rank:
@@ -140,7 +151,9 @@ def limit_of(threshold: float, protocol: DetectionProtocol) -> float:
     return threshold if protocol.measure.startswith("distance") else -threshold
 
 
-def match_errors(detections: BoxColumns, truth: BoxColumns, protocol: DetectionProtocol) -> FloatArray:
+def match_errors(
+    detections: BoxColumns, truth: BoxColumns, protocol: DetectionProtocol
+) -> FloatArray:
     """The errors of M matches, `detections[i]` with `truth[i]`: (M, 4) in the order of `ERRORS`; NaN where unknown."""
     offset = as_floats(detections.center) - truth.center
     if protocol.error_of_bottoms:
@@ -151,26 +164,36 @@ def match_errors(detections: BoxColumns, truth: BoxColumns, protocol: DetectionP
     turn = _turn_between(as_floats(detections.yaw), as_floats(truth.yaw), protocol)
     speed = as_floats(truth.velocity) - detections.velocity
     speed_error = np.sqrt(speed[:, 0] ** 2 + speed[:, 1] ** 2)
-    return np.column_stack([translation, 1 - _overlap_of_matches(detections, truth, protocol), turn, speed_error])
+    return np.column_stack(
+        [translation, 1 - _overlap_of_matches(detections, truth, protocol), turn, speed_error]
+    )
 
 
-def _overlap_of_matches(detections: BoxColumns, truth: BoxColumns, protocol: DetectionProtocol) -> FloatArray:
+def _overlap_of_matches(
+    detections: BoxColumns, truth: BoxColumns, protocol: DetectionProtocol
+) -> FloatArray:
     if protocol.scale_by_overlap:
         return as_floats(_iou_3d(detections, truth, protocol).diagonal())
     mine, theirs = as_floats(detections.size), as_floats(truth.size)
     return _over_union(_product(np.minimum(mine, theirs)), _product(mine), _product(theirs))
 
 
-def _turn_between(detected: FloatArray, true: FloatArray, protocol: DetectionProtocol) -> FloatArray:
+def _turn_between(
+    detected: FloatArray, true: FloatArray, protocol: DetectionProtocol
+) -> FloatArray:
     if not protocol.orientation_unwrapped:
         return as_floats(np.abs((true - detected + np.pi) % (2 * np.pi) - np.pi))
     true = true % RELEASED_TURN
-    if protocol.single_precision:  # the released code writes this back into single precision, the detection's not
+    if (
+        protocol.single_precision
+    ):  # the released code writes this back into single precision, the detection's not
         true = as_floats(true.astype(np.float32))
     return np.abs(true - detected % RELEASED_TURN)
 
 
-def _distance_of_bottoms(detections: BoxColumns, truth: BoxColumns, _: DetectionProtocol) -> AnyArray:
+def _distance_of_bottoms(
+    detections: BoxColumns, truth: BoxColumns, _: DetectionProtocol
+) -> AnyArray:
     squares = _squares(truth.center[:, 0], detections.center[:, 0])
     squares += _squares(truth.center[:, 1], detections.center[:, 1])
     squares += _squares(truth.bottom, detections.bottom)
@@ -194,12 +217,16 @@ def _iou_3d(detections: BoxColumns, truth: BoxColumns, protocol: DetectionProtoc
     down = protocol.bottom_taken_as_top
     (low, high), (true_low, true_high) = _heights(detections, down=down), _heights(truth, down=down)
     shared = np.minimum(high[:, None], true_high) - np.maximum(low[:, None], true_low)
-    return _over_union(areas * np.maximum(shared, 0), _product(detections.size)[:, None], _product(truth.size))
+    return _over_union(
+        areas * np.maximum(shared, 0), _product(detections.size)[:, None], _product(truth.size)
+    )
 
 
 def _iou_bev(detections: BoxColumns, truth: BoxColumns, _: DetectionProtocol) -> FloatArray:
     areas = intersection_areas(detections.footprint, truth.footprint)
-    return _over_union(areas, _product(detections.size[:, :2])[:, None], _product(truth.size[:, :2]))
+    return _over_union(
+        areas, _product(detections.size[:, :2])[:, None], _product(truth.size[:, :2])
+    )
 
 
 def _heights(boxes: BoxColumns, *, down: bool) -> tuple[FloatArray, FloatArray]:
@@ -252,14 +279,21 @@ class Ring:
     def reach(self, threshold: int) -> Reach:
         """The pairs at a threshold."""
         near = self.near[threshold]
-        pairs = zip(self.candidate[near].tolist(), self.truth[near].tolist(), self.rank[near].tolist(), strict=True)
+        pairs = zip(
+            self.candidate[near].tolist(),
+            self.truth[near].tolist(),
+            self.rank[near].tolist(),
+            strict=True,
+        )
         result: dict[int, list[tuple[int, int]]] = {}
         for candidate, truth, rank in pairs:
             result.setdefault(candidate, []).append((truth, rank))
         return result
 
 
-def frame_counts(detections: BoxColumns, truth: BoxColumns, protocol: DetectionProtocol) -> dict[str, Any]:
+def frame_counts(
+    detections: BoxColumns, truth: BoxColumns, protocol: DetectionProtocol
+) -> dict[str, Any]:
     """Match one sample's detections with its true boxes, both in the protocol's frame, and count.
 
     A *group* is a class within a range (class · ranges + range); a *cell* is a group at a threshold (group · thresholds
@@ -294,7 +328,9 @@ def frame_counts(detections: BoxColumns, truth: BoxColumns, protocol: DetectionP
         group = codes * ring_count + position
         for one in (true_codes[ring.truth_counts] * ring_count + position).tolist():
             result["truths"][one] += 1
-        _extend(result["detections"], group[ring.counts].tolist(), np.flatnonzero(ring.counts).tolist())
+        _extend(
+            result["detections"], group[ring.counts].tolist(), np.flatnonzero(ring.counts).tolist()
+        )
         for level in range(level_count):
             _count_level(result, ring, (position, level), detections, truth, protocol)
     return result
@@ -310,7 +346,10 @@ def ring_of(
     """One of the protocol's ranges, counted from 0, of a sample's boxes; `cost` as `measures.costs` gives it."""
     codes, true_codes = class_codes(detections, protocol), class_codes(truth, protocol)
     cost = costs(detections, truth, protocol) if cost is None else cost
-    beyond, true_beyond = ~_in_range(detections, protocol, position), ~_in_range(truth, protocol, position)
+    beyond, true_beyond = (
+        ~_in_range(detections, protocol, position),
+        ~_in_range(truth, protocol, position),
+    )
     same = codes[:, None] == true_codes
     by_truth = protocol.matching == "by_truth"
     allowed = same | beyond[:, None] if by_truth else same & ~beyond[:, None] & ~true_beyond
@@ -364,21 +403,34 @@ def _count_level(
 
     counts, truth_counts = ring.counts.tolist(), ring.truth_counts.tolist()
     if protocol.matching == "by_truth":
-        steps = nearest_by_truth(reach, {one: counts[one // classes] for one in reach}, truth_counts)
+        steps = nearest_by_truth(
+            reach, {one: counts[one // classes] for one in reach}, truth_counts
+        )
         _extend(result["tp"], cells(steps.tp), rows(steps.tp))
         _extend(result["spent"], cells(steps.spent), rows(steps.spent))
         changed = [candidate for candidate, _ in steps.excused]
-        _extend(result["excused"], cells(changed), rows(changed), [change for _, change in steps.excused])
+        _extend(
+            result["excused"],
+            cells(changed),
+            rows(changed),
+            [change for _, change in steps.excused],
+        )
         taken = highest_score_by_truth(reach)
-        matched = {one: by for one, by in taken.items() if truth_counts[one] and counts[by // classes]}
+        matched = {
+            one: by for one, by in taken.items() if truth_counts[one] and counts[by // classes]
+        }
         _extend(result["matches"], cells(matched.values()), rows(matched.values()))
     else:
         matched = nearest_by_score(reach)
         _extend(result["tp"], cells(matched.values()), rows(matched.values()))
     if protocol.thresholds[level] == protocol.error_threshold and matched:
         by = rows(matched.values())
-        values = match_errors(detections.select(np.array(by)), truth.select(np.array(list(matched))), protocol)
-        columns = [[None if isnan(value) else value for value in column] for column in values.T.tolist()]
+        values = match_errors(
+            detections.select(np.array(by)), truth.select(np.array(list(matched))), protocol
+        )
+        columns = [
+            [None if isnan(value) else value for value in column] for column in values.T.tolist()
+        ]
         _extend(result["errors"], [one % classes for one in matched.values()], by, *columns)
 
 
@@ -439,7 +491,9 @@ def _in_range(boxes: BoxColumns, protocol: DetectionProtocol, position: int) -> 
 
 def _standing_if_unknown(truth: BoxColumns) -> BoxColumns:
     unknown = np.isnan(truth.velocity)
-    return replace(truth, velocity=np.where(unknown, 0.0, truth.velocity)) if unknown.any() else truth
+    return (
+        replace(truth, velocity=np.where(unknown, 0.0, truth.velocity)) if unknown.any() else truth
+    )
 
 
 @lru_cache(maxsize=8)
@@ -455,5 +509,10 @@ def _class_table(protocol: DetectionProtocol) -> IntArray:
 def _limits(protocol: DetectionProtocol) -> FloatArray:
     """(classes, thresholds) costs that pairs of each class must be below."""
     return readonly(
-        np.array([[limit_of(one, protocol) for one in protocol.limits(name)] for name, _ in protocol.classes])
+        np.array(
+            [
+                [limit_of(one, protocol) for one in protocol.limits(name)]
+                for name, _ in protocol.classes
+            ]
+        )
     )

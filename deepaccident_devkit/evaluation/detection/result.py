@@ -78,7 +78,10 @@ class DetectionResult(TaskResult, FrozenArrays):
                 "thresholds": self.thresholds[position].tolist(),
                 "AP": plain(self.average_precision[position]),
                 "mean_AP": plain(self.class_average_precision[name]),
-                **{error: plain(value) for error, value in zip(ERRORS, self.errors[position].tolist(), strict=True)},
+                **{
+                    error: plain(value)
+                    for error, value in zip(ERRORS, self.errors[position].tolist(), strict=True)
+                },
                 "truths": self.truths[position].tolist(),
                 "detections": self.detections[position].tolist(),
             }
@@ -95,7 +98,11 @@ class DetectionResult(TaskResult, FrozenArrays):
 
 def mean_of(values: AnyArray) -> float:
     """The exact mean of the numbers that are not NaN; NaN if there are none."""
-    known = [value for value in np.asarray(values, dtype=np.float64).reshape(-1).tolist() if not isnan(value)]
+    known = [
+        value
+        for value in np.asarray(values, dtype=np.float64).reshape(-1).tolist()
+        if not isnan(value)
+    ]
     return fsum(known) / len(known) if known else nan
 
 
@@ -105,24 +112,39 @@ def detection_result(counts: Collection[Counts], protocol: DetectionProtocol) ->
     return next(drawn_results(ledger, protocol, np.ones((1, len(ledger)), dtype=np.int64)))
 
 
-def drawn_results(ledger: Ledger, protocol: DetectionProtocol, times: IntArray) -> Iterator[DetectionResult]:
+def drawn_results(
+    ledger: Ledger, protocol: DetectionProtocol, times: IntArray
+) -> Iterator[DetectionResult]:
     """The result of each draw; `times` (D, S) says how often it takes each sample."""
     shape = len(protocol.classes), len(protocol.ranges), len(protocol.thresholds)
-    cells = [ledger.cell(group, level) for group in range(shape[0] * shape[1]) for level in range(shape[2])]
+    cells = [
+        ledger.cell(group, level)
+        for group in range(shape[0] * shape[1])
+        for level in range(shape[2])
+    ]
     most = max(len(cell.scores) for cell in cells)
     together = max(1, _MOST_VALUES // max(most, protocol.points, 1))
     for first in range(0, len(times), together):
         some = times[first : first + together]
         points = [curves(cell, protocol, some) for cell in cells]
-        columns = {name: _by_draw(points, name, shape) for name in ("average", "precision", "recall", "errors")}
-        truths, detections = ((some @ each).reshape(-1, *shape[:2]) for each in (ledger.truths, ledger.detections))
+        columns = {
+            name: _by_draw(points, name, shape)
+            for name in ("average", "precision", "recall", "errors")
+        }
+        truths, detections = (
+            (some @ each).reshape(-1, *shape[:2]) for each in (ledger.truths, ledger.detections)
+        )
         for draw, samples in enumerate(some.sum(axis=1).tolist()):
             drawn = {name: column[draw] for name, column in columns.items()}
             yield _result(protocol, drawn, truths[draw], detections[draw], samples)
 
 
 def _result(
-    protocol: DetectionProtocol, points: Mapping[str, FloatArray], truths: IntArray, detections: IntArray, samples: int
+    protocol: DetectionProtocol,
+    points: Mapping[str, FloatArray],
+    truths: IntArray,
+    detections: IntArray,
+    samples: int,
 ) -> DetectionResult:
     """A result of what `curves` gives for all cells: (C, R, K) shares, (C, R, K, P) points and (C, R, K, 4) errors."""
     names = [name for name, _ in protocol.classes]
@@ -168,7 +190,9 @@ class Ledger:
     def __init__(self, counts: Sequence[Mapping[str, Any]], protocol: DetectionProtocol) -> None:
         """Put the samples' counts (with their `token`) in order."""
         self._protocol = protocol
-        self.order = np.array(sorted(range(len(counts)), key=lambda each: counts[each]["token"]), dtype=np.int64)
+        self.order = np.array(
+            sorted(range(len(counts)), key=lambda each: counts[each]["token"]), dtype=np.int64
+        )
         counts = [counts[each] for each in self.order.tolist()]
         lengths = np.array([len(each["scores"]) for each in counts], dtype=np.int64)
         self._first = np.cumsum(lengths) - lengths
@@ -180,10 +204,14 @@ class Ledger:
         self._position[order] = rows
         self._scores, self._sample = scores[order], sample[order]
         groups = len(protocol.classes) * len(protocol.ranges)
-        self.truths: IntArray = _joined([each["truths"] for each in counts], np.int64).reshape(-1, groups)
+        self.truths: IntArray = _joined([each["truths"] for each in counts], np.int64).reshape(
+            -1, groups
+        )
         self._events = {name: self._by_key([each[name] for each in counts]) for name in COLUMNS}
         group, row, _ = self._events["detections"]
-        if len(group) and not 0 <= group[0] <= group[-1] < groups:  # else one number could ask for gigabytes
+        if (
+            len(group) and not 0 <= group[0] <= group[-1] < groups
+        ):  # else one number could ask for gigabytes
             raise EvaluationError(
                 f"detections: expected groups from 0 to {groups - 1}, found {group[0]} to {group[-1]}"
             )
@@ -199,11 +227,14 @@ class Ledger:
         levels, ranges = len(self._protocol.thresholds), len(self._protocol.ranges)
         key = group * levels + level
         detected, tp, spent = (
-            self._of(name, which)[0] for name, which in (("detections", group), ("tp", key), ("spent", key))
+            self._of(name, which)[0]
+            for name, which in (("detections", group), ("tp", key), ("spent", key))
         )
         excused, change = self._of("excused", key)
         with_errors = self._protocol.thresholds[level] == self._protocol.error_threshold
-        error_rows, errors = self._of("errors", group // ranges) if with_errors else (tp[:0], np.zeros((0, 4)))
+        error_rows, errors = (
+            self._of("errors", group // ranges) if with_errors else (tp[:0], np.zeros((0, 4)))
+        )
         rows = np.unique(np.concatenate([detected, excused, tp, spent]))
         matched, _ = self._of("matches" if self._protocol.matching == "by_truth" else "tp", key)
         return Cell(
@@ -213,19 +244,25 @@ class Ledger:
             detected=np.isin(rows, detected).astype(np.int64),
             tp=np.isin(rows, tp).astype(np.int64),
             spent=np.isin(rows, spent).astype(np.int64),
-            excused=np.bincount(np.searchsorted(rows, excused), change.reshape(-1), len(rows)).astype(np.int64),
+            excused=np.bincount(
+                np.searchsorted(rows, excused), change.reshape(-1), len(rows)
+            ).astype(np.int64),
             matched=np.searchsorted(rows, matched),
             error_rows=np.searchsorted(rows, error_rows),
             errors=errors.reshape(-1, 4),
         )
 
-    def _by_key(self, columns: Sequence[Sequence[Sequence[Any]]]) -> tuple[IntArray, IntArray, FloatArray]:
+    def _by_key(
+        self, columns: Sequence[Sequence[Sequence[Any]]]
+    ) -> tuple[IntArray, IntArray, FloatArray]:
         """Keys, positions in the order of scores and further values of all samples' columns, by key and position."""
         width = max((len(each) for each in columns), default=2)
         keys = _joined([each[0] for each in columns], np.int64)
         offset = np.repeat(self._first, [len(each[0]) for each in columns]).astype(np.int64)
         rows = self._position[_joined([each[1] for each in columns], np.int64) + offset]
-        values = [_joined([each[column] for each in columns], np.float64) for column in range(2, width)]
+        values = [
+            _joined([each[column] for each in columns], np.float64) for column in range(2, width)
+        ]
         order = np.lexsort((rows, keys))
         stacked = np.stack(values, axis=1) if values else np.zeros((len(keys), 0))
         return keys[order], rows[order], stacked[order]
@@ -238,4 +275,6 @@ class Ledger:
 
 def _joined(parts: Sequence[Sequence[Any]], dtype: type[np.generic]) -> Any:
     """All numbers behind one another; None is NaN."""
-    return np.concatenate([np.zeros(0, dtype=dtype), *(np.asarray(part, dtype=dtype) for part in parts)])
+    return np.concatenate(
+        [np.zeros(0, dtype=dtype), *(np.asarray(part, dtype=dtype) for part in parts)]
+    )

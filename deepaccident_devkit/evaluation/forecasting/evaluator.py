@@ -33,7 +33,13 @@ from deepaccident_devkit.evaluation.forecasting.truth import (
     ForecastingTruth,
     forecasting_truth,
 )
-from deepaccident_devkit.evaluation.means import MEAN_OF_SCENARIOS, MeansEvaluator, MeansResult, Sums, table_rows
+from deepaccident_devkit.evaluation.means import (
+    MEAN_OF_SCENARIOS,
+    MeansEvaluator,
+    MeansResult,
+    Sums,
+    table_rows,
+)
 from deepaccident_devkit.evaluation.predictions import LONG_PATHS, LONGEST_PATH
 from deepaccident_devkit.evaluation.task import Row
 from deepaccident_devkit.support.arrays import FloatArray, check_least
@@ -63,10 +69,14 @@ class ForecastingProtocol:
         for name, low, high in (("horizons", FRAME_PERIOD, LONGEST), ("modes", 1, math.inf)):
             given = getattr(self, name)
             if not given or not all(low <= each <= high for each in given):
-                raise ConfigError(f"{name}: expected numbers from {low:g} to {high:g}, found {given!r}")
+                raise ConfigError(
+                    f"{name}: expected numbers from {low:g} to {high:g}, found {given!r}"
+                )
 
 
-FORECASTING_PROTOCOLS: Final[Mapping[str, ForecastingProtocol]] = MappingProxyType({"clean": ForecastingProtocol()})
+FORECASTING_PROTOCOLS: Final[Mapping[str, ForecastingProtocol]] = MappingProxyType(
+    {"clean": ForecastingProtocol()}
+)
 
 
 def table_name(horizon: float, modes: int) -> str:
@@ -143,18 +153,24 @@ class ForecastingEvaluator(MeansEvaluator[ForecastingResult]):
         self.add(token, _counts(token, forecasts, truth, self.protocol))
 
 
-def _counts(token: str, forecasts: Iterable[Forecast], truth: ForecastingTruth, rules: ForecastingProtocol) -> Counts:
+def _counts(
+    token: str, forecasts: Iterable[Forecast], truth: ForecastingTruth, rules: ForecastingProtocol
+) -> Counts:
     """What a sample adds."""
     given: list[object] = list(forecasts)
     of_actor = {each.actor_id: each for each in given if isinstance(each, Forecast)}
     if len(of_actor) < len(given):
-        raise EvaluationError(f"{token}: expected Forecasts, one of each actor, found {shortened(repr(given))}")
+        raise EvaluationError(
+            f"{token}: expected Forecasts, one of each actor, found {shortened(repr(given))}"
+        )
     sums, actors = Sums(), set(truth.actor_id.tolist())
     ends = np.array([of_actor[actor].times[-1] for actor in of_actor.keys() & actors])
     sums.note(_WITHOUT, len(actors) - len(ends))
     sums.note(_UNKNOWN, len(of_actor) - len(ends))
     main = rules.horizons[0]
-    sums.note(f"no numbers at {main:g} s: {{forecast}} ending earlier", (ends < main - SAME_TIME).sum())
+    sums.note(
+        f"no numbers at {main:g} s: {{forecast}} ending earlier", (ends < main - SAME_TIME).sum()
+    )
     sums.note(LONG_PATHS, (ends > LONGEST_PATH).sum())
     if not actors:
         return sums.counts(truth.scenario)
@@ -166,13 +182,17 @@ def _counts(token: str, forecasts: Iterable[Forecast], truth: ForecastingTruth, 
         path, true, valid = paths[:, :, there], truth.path[:, there], recorded[:, there]
         errors = actor_errors(path, true, valid, chances, most, rules.miss_distance)
         errors["without"] = np.where(valid[:, -1], np.isnan(errors["min_fde"]), np.nan)
-        sums.add_rows(table, groups if most == rules.modes[0] else {EVERYBODY: groups[EVERYBODY]}, errors)
+        sums.add_rows(
+            table, groups if most == rules.modes[0] else {EVERYBODY: groups[EVERYBODY]}, errors
+        )
         for column, value in _together(path, true, chances, most, rules.miss_distance).items():
             sums.add(table, TOGETHER, column, value)
     return sums.counts(truth.scenario)
 
 
-def _arrays(of_actor: Mapping[int, Forecast], truth: ForecastingTruth) -> tuple[FloatArray, FloatArray]:
+def _arrays(
+    of_actor: Mapping[int, Forecast], truth: ForecastingTruth
+) -> tuple[FloatArray, FloatArray]:
     """(A, K, S, 2) the modes' paths at the truth's steps, and (A, K) probabilities; NaN of those that are not there."""
     steps = np.arange(1, truth.path.shape[1] + 1) * FRAME_PERIOD
     most = max((len(each.paths) for each in of_actor.values()), default=1)
@@ -181,7 +201,10 @@ def _arrays(of_actor: Mapping[int, Forecast], truth: ForecastingTruth) -> tuple[
     for row, actor in enumerate(truth.actor_id.tolist()):
         if actor in of_actor:
             found = of_actor[actor].at(steps, truth.present[row])
-            paths[row, : len(found)], chances[row, : len(found)] = found, of_actor[actor].probabilities
+            paths[row, : len(found)], chances[row, : len(found)] = (
+                found,
+                of_actor[actor].probabilities,
+            )
     return paths, chances
 
 
@@ -202,8 +225,15 @@ def _together(
     ade, fde, missed = world_errors(worlds, truth[actors], miss_distance)
     best = int(np.argmin(fde))
     hits = collisions(worlds[:, best : best + 1])
-    return {"min_fde": fde[best], "min_ade": ade[best], "miss": missed[:, best].mean(), "collisions": hits.mean()}
+    return {
+        "min_fde": fde[best],
+        "min_ade": ade[best],
+        "miss": missed[:, best].mean(),
+        "collisions": hits.mean(),
+    }
 
 
 _WITHOUT: Final = "no forecast of {true actor}: without errors, counted in `without`"
-_UNKNOWN: Final = "not counted: {forecast} of the agent itself, or of an actor that no label shows then"
+_UNKNOWN: Final = (
+    "not counted: {forecast} of the agent itself, or of an actor that no label shows then"
+)

@@ -14,7 +14,13 @@ import numpy as np
 from deepaccident_devkit.errors import GeometryError
 from deepaccident_devkit.evaluation.instances import distances
 from deepaccident_devkit.evaluation.predictions import ascending_times
-from deepaccident_devkit.support.arrays import BoolArray, FloatArray, FrozenArrays, checked, checked_whole
+from deepaccident_devkit.support.arrays import (
+    BoolArray,
+    FloatArray,
+    FrozenArrays,
+    checked,
+    checked_whole,
+)
 
 # Metres; a larger error at the end is a miss.
 MISS_DISTANCE: Final = 2.0
@@ -46,11 +52,20 @@ class Forecast(FrozenArrays):
         probabilities = checked("probabilities", self.probabilities, (None,)).copy()
         paths = checked("paths", self.paths, (len(probabilities), len(times), 2)).copy()
         if not len(paths) or not np.isfinite(paths).all():
-            raise GeometryError("paths: expected one mode or more of finite numbers; leave out what is not predicted")
+            raise GeometryError(
+                "paths: expected one mode or more of finite numbers; leave out what is not predicted"
+            )
         if not ((probabilities >= 0) & (probabilities <= 1)).all():
-            raise GeometryError(f"probabilities: expected numbers from 0 to 1, found {probabilities.tolist()}")
+            raise GeometryError(
+                f"probabilities: expected numbers from 0 to 1, found {probabilities.tolist()}"
+            )
         actor_id = checked_whole("actor id", self.actor_id)
-        values = {"actor_id": actor_id, "times": times, "paths": paths, "probabilities": probabilities}
+        values = {
+            "actor_id": actor_id,
+            "times": times,
+            "paths": paths,
+            "probabilities": probabilities,
+        }
         for name, value in values.items():
             object.__setattr__(self, name, value)
         FrozenArrays.__post_init__(self)
@@ -72,7 +87,9 @@ class Forecast(FrozenArrays):
         return np.where((steps <= times[-1] + SAME_TIME)[:, None], found, np.nan)
 
 
-def mode_errors(paths: FloatArray, truth: FloatArray, valid: BoolArray) -> tuple[FloatArray, FloatArray]:
+def mode_errors(
+    paths: FloatArray, truth: FloatArray, valid: BoolArray
+) -> tuple[FloatArray, FloatArray]:
     """How far each mode is from the recorded path.
 
     Args:
@@ -123,10 +140,13 @@ def actor_errors(
     """
     first = np.argsort(-probabilities, axis=1, kind="stable")[:, :most]
     ade, fde, chance = (
-        np.take_along_axis(each, first, 1) for each in (*mode_errors(paths, truth, valid), probabilities)
+        np.take_along_axis(each, first, 1)
+        for each in (*mode_errors(paths, truth, valid), probabilities)
     )
     best = np.argmin(np.where(np.isnan(fde), np.inf, fde), axis=1)[:, None]
-    min_ade, min_fde, probability = (np.take_along_axis(each, best, 1)[:, 0] for each in (ade, fde, chance))
+    min_ade, min_fde, probability = (
+        np.take_along_axis(each, best, 1)[:, 0] for each in (ade, fde, chance)
+    )
     least = np.fmin.reduce(ade, axis=1)
     whole = valid.all(axis=1)
     return {

@@ -6,7 +6,11 @@ import numpy as np
 
 from deepaccident_devkit.evaluation.alarms import LABEL_STEP, MATCH_DISTANCE
 from deepaccident_devkit.evaluation.forecasting.metrics import Forecast
-from deepaccident_devkit.evaluation.map_accidents import InstanceTracks, match_tracks, predicted_tracks
+from deepaccident_devkit.evaluation.map_accidents import (
+    InstanceTracks,
+    match_tracks,
+    predicted_tracks,
+)
 from deepaccident_devkit.evaluation.predictions import MotionOutput
 from deepaccident_devkit.motion import LABEL_PROTOCOLS
 from deepaccident_devkit.support.arrays import FloatArray, IntArray
@@ -49,12 +53,19 @@ def forecasts_of(
         for instance, actor in match_tracks(now, truth, MATCH_DISTANCE).items():
             path = tracks.center[:, tracks.identity.searchsorted(instance)]
             there = np.isfinite(path[:, 0])
-            modes.setdefault(actor, []).append(path[1 : len(path) if there.all() else int(np.argmin(there))])
+            modes.setdefault(actor, []).append(
+                path[1 : len(path) if there.all() else int(np.argmin(there))]
+            )
     forecasts = []
     for actor, paths in sorted(modes.items()):
         frames = max(map(len, paths))
         kept = np.array([path for path in paths if len(path) == frames])
         if frames:
-            times, chances = np.arange(1.0, frames + 1) * step, np.full(len(kept), 1 / len(predicted))
-            forecasts.append(Forecast(actor_id=actor, times=times, paths=kept, probabilities=chances))
+            times, chances = (
+                np.arange(1.0, frames + 1) * step,
+                np.full(len(kept), 1 / len(predicted)),
+            )
+            forecasts.append(
+                Forecast(actor_id=actor, times=times, paths=kept, probabilities=chances)
+            )
     return forecasts

@@ -24,7 +24,10 @@ EVERYBODY: Final = "all"
 CLASSES: Final = tuple(f"class {name}" for name in CATEGORIES)
 ROLES: Final = ("collider", "other")
 SEEN: Final = ("seen by ego", "seen by a partner alone", "seen by nobody")
-TO_IMPACT: Final = (*(f"{second}–{second + 1} s to impact" for second in range(_LAST_SECONDS)), "normal")
+TO_IMPACT: Final = (
+    *(f"{second}–{second + 1} s to impact" for second in range(_LAST_SECONDS)),
+    "normal",
+)
 MOTIONS: Final = ("moving", "standing")
 
 
@@ -51,7 +54,9 @@ class ForecastingTruth(FrozenArrays):
     members: BoolArray
 
 
-def forecasting_truth(dataset: Dataset, sample: RowArgument, seconds: float = LONGEST) -> ForecastingTruth:
+def forecasting_truth(
+    dataset: Dataset, sample: RowArgument, seconds: float = LONGEST
+) -> ForecastingTruth:
     """The truth that forecasts of a sample are compared with, from the labels of all agents of the release.
 
     Args:
@@ -70,7 +75,10 @@ def forecasting_truth(dataset: Dataset, sample: RowArgument, seconds: float = LO
     first, end = tracks.index.searchsorted((number, last + 1))
     rows = np.arange(first, end)
     own = dataset.get("agent", there["agent_token"])["actor_id"]
-    now = rows[(tracks.index[rows] == number) & (tracks.actor_id[rows] != (OWN_ACTOR_ID if own is None else own))]
+    now = rows[
+        (tracks.index[rows] == number)
+        & (tracks.actor_id[rows] != (OWN_ACTOR_ID if own is None else own))
+    ]
     actor = tracks.actor_id[now]
     rows = rows[np.isin(tracks.actor_id[rows], actor)]
     path = np.full((len(actor), last - number + 1, 2), np.nan)
@@ -88,19 +96,28 @@ def forecasting_truth(dataset: Dataset, sample: RowArgument, seconds: float = LO
     )
 
 
-def _groups(dataset: Dataset, token: str, tracks: ScenarioTracks, now: IntArray) -> Iterator[tuple[str, BoolArray]]:
+def _groups(
+    dataset: Dataset, token: str, tracks: ScenarioTracks, now: IntArray
+) -> Iterator[tuple[str, BoolArray]]:
     """Groups of the actors at some rows of the tracks, by name; of the groups of one kind each actor is in one."""
     sample, actor = dataset.get("sample", token), tracks.actor_id[now]
-    scenario, everybody = dataset.get("scenario", sample["scenario_token"]), np.ones(len(now), dtype=bool)
+    scenario, everybody = (
+        dataset.get("scenario", sample["scenario_token"]),
+        np.ones(len(now), dtype=bool),
+    )
     yield EVERYBODY, everybody
     yield from ((name, tracks.boxes.category[now] == code) for code, name in enumerate(CLASSES))
     if scenario["weather"] is not None:  # else there is no meta file
         ahead, collision = sample["time_to_impact"], scenario["collision"]
         collides = np.isin(actor, [] if collision is None else collision["ids"])
         yield from zip(ROLES, (collides, ~collides), strict=True)
-        second = _LAST_SECONDS if ahead is None else max(int(np.ceil(ahead - FRAME_PERIOD / 2)), 1) - 1
+        second = (
+            _LAST_SECONDS if ahead is None else max(int(np.ceil(ahead - FRAME_PERIOD / 2)), 1) - 1
+        )
         yield from (
-            (name, everybody) for name in TO_IMPACT[second : second + 1] if ahead is None or second < _LAST_SECONDS
+            (name, everybody)
+            for name in TO_IMPACT[second : second + 1]
+            if ahead is None or second < _LAST_SECONDS
         )
     seen = seen_actors(dataset, token, agents=None)
     eyes = np.zeros(len(actor), dtype=np.uint8)

@@ -7,7 +7,12 @@ from deepaccident_devkit.evaluation.planning.evaluator import (
     PlanningEvaluator,
     PlanningResult,
 )
-from deepaccident_devkit.evaluation.planning.scene import Plan, PlanningScene, planning_scene, trivial_plans
+from deepaccident_devkit.evaluation.planning.scene import (
+    Plan,
+    PlanningScene,
+    planning_scene,
+    trivial_plans,
+)
 
 __all__ = [
     "CELL_PROTOCOLS",

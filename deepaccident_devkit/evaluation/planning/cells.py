@@ -109,7 +109,9 @@ def occupied(corners: FloatArray, rules: CellRules) -> BoolArray:
     if rules.cell == 0.5:
         cells = np.round((vertices + HALF) / rules.cell)
     else:
-        cells = np.trunc((vertices.astype(np.float32) + np.float32(rules.middle)) / np.float32(rules.cell))
+        cells = np.trunc(
+            (vertices.astype(np.float32) + np.float32(rules.middle)) / np.float32(rules.cell)
+        )
     import cv2
 
     drawn = np.zeros((rules.size, rules.size), dtype=np.uint8)
@@ -119,7 +121,9 @@ def occupied(corners: FloatArray, rules: CellRules) -> BoolArray:
     return drawn.astype(bool)
 
 
-def touching(path: FloatArray, cells: BoolArray, ego: tuple[float, float], rules: CellRules) -> BoolArray:
+def touching(
+    path: FloatArray, cells: BoolArray, ego: tuple[float, float], rules: CellRules
+) -> BoolArray:
     """(2, 6) whether the ego's box, and the path's point, is on an occupied one of the cells (6, H, W) of each step.
 
     Args:
@@ -153,8 +157,14 @@ def _box(path: FloatArray, ego: tuple[float, float], rules: CellRules) -> IntArr
         far = np.hypot(step[:, 0], step[:, 1]) >= _LEAST_STEP
         angle = np.where(far, np.arctan2(step[:, 1], step[:, 0]), 0.0)[:, None]
         centre = (rules.size - 1) / 2
-        columns = np.round((ahead - centre) * np.cos(angle) - (aside - centre) * np.sin(angle) + centre) + x
-        rows = np.round((ahead - centre) * np.sin(angle) + (aside - centre) * np.cos(angle) + centre) + y
+        columns = (
+            np.round((ahead - centre) * np.cos(angle) - (aside - centre) * np.sin(angle) + centre)
+            + x
+        )
+        rows = (
+            np.round((ahead - centre) * np.sin(angle) + (aside - centre) * np.cos(angle) + centre)
+            + y
+        )
     else:
         rows = rules.size - x - ahead if rules.rows == "backward" else x + ahead
         columns = aside + (-y if rules.mirrored else y)
@@ -171,12 +181,19 @@ def _point(path: FloatArray, rules: CellRules) -> IntArray:
     if rules.point_far_off:
         cells = np.stack([rules.middle / 2 - x, rules.middle / 2 - y])
     else:
-        cells = np.stack([y, x] if rules.rows == "sideways" else [x, -y if rules.mirrored else y]) + rules.middle
+        cells = (
+            np.stack([y, x] if rules.rows == "sideways" else [x, -y if rules.mirrored else y])
+            + rules.middle
+        )
     return np.trunc(cells / rules.cell).astype(np.int64)
 
 
 def cell_numbers(
-    path: FloatArray, recorded: FloatArray, valid: BoolArray, touched: tuple[BoolArray, BoolArray], rules: CellRules
+    path: FloatArray,
+    recorded: FloatArray,
+    valid: BoolArray,
+    touched: tuple[BoolArray, BoolArray],
+    rules: CellRules,
 ) -> dict[str, FloatArray]:
     """The numbers of a path (6, 2) beside the recorded one (6, 2), of which steps (6,) exist, at 1, 2 and 3 s.
 
@@ -198,7 +215,10 @@ def cell_numbers(
         "left_out": (masked, "mean" if rules.box_over == "any" else rules.box_over),
     }
     counts = valid.all() or not rules.whole_futures
-    return {name: _over(values, how) if counts else np.full(3, np.nan) for name, (values, how) in by_step.items()}
+    return {
+        name: _over(values, how) if counts else np.full(3, np.nan)
+        for name, (values, how) in by_step.items()
+    }
 
 
 def _over(values: AnyArray, how: Over) -> FloatArray:

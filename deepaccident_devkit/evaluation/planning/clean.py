@@ -15,7 +15,12 @@ from deepaccident_devkit.collisions.replay import HORIZON
 from deepaccident_devkit.evaluation.means import Sums
 from deepaccident_devkit.evaluation.planning.cells import HORIZONS, STEP
 from deepaccident_devkit.evaluation.planning.contacts import Contacts, first_contacts, without_gaps
-from deepaccident_devkit.evaluation.planning.scene import Plan, PlanningScene, recorded_poses, steps_of
+from deepaccident_devkit.evaluation.planning.scene import (
+    Plan,
+    PlanningScene,
+    recorded_poses,
+    steps_of,
+)
 from deepaccident_devkit.geometry.box_arrays import gaps_of_pairs
 from deepaccident_devkit.support.arrays import FloatArray
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
@@ -43,7 +48,9 @@ class CleanPlanning:
     braking: float = 3.0
 
 
-def add_clean(sums: Sums, plans: Mapping[str, Plan], scene: PlanningScene, rules: CleanPlanning) -> None:
+def add_clean(
+    sums: Sums, plans: Mapping[str, Plan], scene: PlanningScene, rules: CleanPlanning
+) -> None:
     """Add what plans do, among others that keep their recorded motion, to the sums.
 
     Args:
@@ -53,7 +60,9 @@ def add_clean(sums: Sums, plans: Mapping[str, Plan], scene: PlanningScene, rules
         rules: the protocol.
     """
     if len(scene.recorded) < 2:
-        sums.note("no numbers of {sample} without a later frame that counts; twins end where their accident does")
+        sums.note(
+            "no numbers of {sample} without a later frame that counts; twins end where their accident does"
+        )
         return
     margin = _margin(scene)
     found = {name: _contacts(plan, scene, margin) for name, plan in plans.items()}
@@ -92,11 +101,15 @@ def _contacts(plan: Plan, scene: PlanningScene, margin: float) -> Contacts:
         scene.size,
         _prolonged(scene, len(times)),
         np.where(scene.partner, margin, 0.0),
-        np.where(scene.partner, until, min(scene.duration, max(float(plan.times[-1]), HORIZONS[-1]))),
+        np.where(
+            scene.partner, until, min(scene.duration, max(float(plan.times[-1]), HORIZONS[-1]))
+        ),
     )
 
 
-def _at_horizon(away: FloatArray, scene: PlanningScene, contacts: Contacts, horizon: int) -> dict[str, float]:
+def _at_horizon(
+    away: FloatArray, scene: PlanningScene, contacts: Contacts, horizon: int
+) -> dict[str, float]:
     """Errors (N,) at the recorded steps, and contacts, of a plan up to a horizon; NaN where nothing is recorded."""
     last = round(horizon / STEP)
     touches = (contacts.time <= min(horizon, scene.duration) + _SLACK).any()
@@ -146,7 +159,9 @@ def box_path(poses: FloatArray, offset: FloatArray) -> FloatArray:
 
 def _margin(scene: PlanningScene) -> float:
     """The gap between the recorded pair at the end, which counts as contact; NaN without a partner."""
-    ego = np.concatenate([box_path(scene.recorded[-1:], scene.offset)[0, :2], scene.size, scene.recorded[-1, 2:]])
+    ego = np.concatenate(
+        [box_path(scene.recorded[-1:], scene.offset)[0, :2], scene.size, scene.recorded[-1, 2:]]
+    )
     gaps = gaps_of_pairs(ego, scene.footprint[-1, scene.partner])
     return float(gaps[0]) + TOUCHING if len(gaps) else np.nan
 
@@ -182,7 +197,9 @@ def _progress(plan: Plan, scene: PlanningScene, until: float) -> tuple[float, fl
     lengths = np.hypot(*steps.T)
     arcs = np.append(0.0, np.cumsum(lengths))
     place = plan.poses(np.array([until]))[0, :2] - path[:-1]
-    share = np.divide((place * steps).sum(axis=1), lengths**2, out=np.zeros(len(steps)), where=lengths > 0).clip(0, 1)
+    share = np.divide(
+        (place * steps).sum(axis=1), lengths**2, out=np.zeros(len(steps)), where=lengths > 0
+    ).clip(0, 1)
     nearest = int(np.argmin(np.hypot(*(place - share[:, None] * steps).T)))
     way = float(np.interp(until, times, arcs))
     return way - float(arcs[nearest] + share[nearest] * lengths[nearest]), way
@@ -197,5 +214,7 @@ def _unusable(scene: PlanningScene, margin: float, true: Contacts) -> str:
     if not margin <= MOST_MARGIN:
         return f"the pair is {margin:.2f} m apart at the end"
     return (
-        "" if true.time[scene.partner][0] <= scene.duration + _SLACK else "the recorded path does not meet the partner"
+        ""
+        if true.time[scene.partner][0] <= scene.duration + _SLACK
+        else "the recorded path does not meet the partner"
     )

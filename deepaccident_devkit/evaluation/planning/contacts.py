@@ -55,10 +55,16 @@ def first_contacts(
     overlapping = gaps_of_pairs(own[:1], others[0]) <= margins
     found = np.tile([np.inf, np.nan, np.nan, 0.0], (len(margins), 1))
     for actor in np.flatnonzero(_near(own, others, margins, until) & ~overlapping).tolist():
-        found[actor] = _contact(path, size, others[:, actor], float(margins[actor]), float(until[actor]))
+        found[actor] = _contact(
+            path, size, others[:, actor], float(margins[actor]), float(until[actor])
+        )
     time, speed, relative_speed, struck = found.T
     return Contacts(
-        time=time, speed=speed, relative_speed=relative_speed, struck=struck.astype(bool), overlapping=overlapping
+        time=time,
+        speed=speed,
+        relative_speed=relative_speed,
+        struck=struck.astype(bool),
+        overlapping=overlapping,
     )
 
 
@@ -77,10 +83,18 @@ def _contact(
     if np.isinf(time[0]):
         return _NOTHING
     impact = impacts(pair, _NO_BRAKING, [1.0], time)
-    ego, hit = (np.array([np.interp(time[0], each.times, values) for values in each.poses.T]) for each in pair.motions)
+    ego, hit = (
+        np.array([np.interp(time[0], each.times, values) for values in each.poses.T])
+        for each in pair.motions
+    )
     ahead = np.cos(ego[2]) * (hit[0] - ego[0]) + np.sin(ego[2]) * (hit[1] - ego[1])
     speed, relative = float(impact.speeds[0, 0]), float(impact.relative_speeds[0])
-    return float(time[0]) + first * FRAME_PERIOD, speed, relative, speed <= _STANDS or ahead < -size[0] / 2
+    return (
+        float(time[0]) + first * FRAME_PERIOD,
+        speed,
+        relative,
+        speed <= _STANDS or ahead < -size[0] / 2,
+    )
 
 
 _NOTHING: Final = (math.inf, math.nan, math.nan, 0.0)
@@ -89,7 +103,11 @@ _NOTHING: Final = (math.inf, math.nan, math.nan, 0.0)
 def _near(own: FloatArray, others: FloatArray, margins: FloatArray, until: FloatArray) -> BoolArray:
     """(A,) whether two can come to touch in time, by their distances at the frames and their ways between them."""
     reach = np.hypot(*own[0, 2:4]) / 2 + np.hypot(others[..., 2], others[..., 3]) / 2
-    apart = np.hypot(others[..., 0] - own[:, None, 0], others[..., 1] - own[:, None, 1]) - reach - margins
+    apart = (
+        np.hypot(others[..., 0] - own[:, None, 0], others[..., 1] - own[:, None, 1])
+        - reach
+        - margins
+    )
     in_time = np.arange(len(own))[:, None] * FRAME_PERIOD < until + FRAME_PERIOD
     step = np.hypot(*np.diff(own[:, :2], axis=0).T).max()
     steps = np.diff(others[..., :2], axis=0)
@@ -106,5 +124,7 @@ def without_gaps(others: FloatArray) -> FloatArray:
         if len(labelled):
             rows[labelled, 4] = np.unwrap(rows[labelled, 4])
             columns = rows[labelled].T
-            rows[:] = np.column_stack([np.interp(frames, labelled, values, np.nan, np.nan) for values in columns])
+            rows[:] = np.column_stack(
+                [np.interp(frames, labelled, values, np.nan, np.nan) for values in columns]
+            )
     return filled

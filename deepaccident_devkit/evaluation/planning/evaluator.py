@@ -36,7 +36,9 @@ from deepaccident_devkit.support.arrays import BoolArray
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
 _Protocol = CleanPlanning | CellRules
-PLANNING_PROTOCOLS: Final[Mapping[str, _Protocol]] = MappingProxyType({"clean": CleanPlanning(), **CELL_PROTOCOLS})
+PLANNING_PROTOCOLS: Final[Mapping[str, _Protocol]] = MappingProxyType(
+    {"clean": CleanPlanning(), **CELL_PROTOCOLS}
+)
 GIVEN: Final = "given"
 TRIVIAL: Final = ("recorded", "standing", "constant velocity", "full braking")
 _MEAN: Final = "mean"
@@ -109,7 +111,12 @@ class PlanningEvaluator(MeansEvaluator[PlanningResult]):
 
     protocol: _Protocol
     order: ClassVar[Sequence[str]] = (
-        *(f"{role}{lead}{end}" for role in ("", "bystander, ") for end in ("", " to contact") for lead in BY_LEAD),
+        *(
+            f"{role}{lead}{end}"
+            for role in ("", "bystander, ")
+            for end in ("", " to contact")
+            for lead in BY_LEAD
+        ),
         *_BY_HORIZON,
         _MEAN,
         GIVEN,
@@ -150,7 +157,9 @@ class PlanningEvaluator(MeansEvaluator[PlanningResult]):
         self.add(token, sums.counts())
 
 
-def _add_cells(sums: Sums, token: str, rows: Mapping[str, Plan], scene: PlanningScene, rules: CellRules) -> None:
+def _add_cells(
+    sums: Sums, token: str, rows: Mapping[str, Plan], scene: PlanningScene, rules: CellRules
+) -> None:
     sums.note(_LEFT_OUT)
     if rules.point_far_off:
         sums.note(_FAR_OFF)
@@ -164,7 +173,10 @@ def _add_cells(sums: Sums, token: str, rows: Mapping[str, Plan], scene: Planning
     valid = frames < len(scene.recorded)
     nobody = np.zeros((0, 5))
     drawn = _drawn(scene, rules)
-    shown = [scene.footprint[at, drawn] if there else nobody for at, there in zip(frames, valid, strict=True)]
+    shown = [
+        scene.footprint[at, drawn] if there else nobody
+        for at, there in zip(frames, valid, strict=True)
+    ]
     boxes = [each[np.isfinite(each[:, 0])] for each in shown]
     cells = np.stack([occupied(corner_offsets(each) + each[:, None, :2], rules) for each in boxes])
     paths = {name: plan.poses(times)[:, :2] for name, plan in rows.items()}

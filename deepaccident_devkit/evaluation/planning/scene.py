@@ -52,10 +52,17 @@ class Plan(FrozenArrays):
         path = checked("path", self.path, (len(times), 2)).copy()
         yaw = None if self.yaw is None else checked("yaw", self.yaw, (len(times),)).copy()
         if not times[-1] > 0:
-            raise GeometryError("times: expected a plan for after the present, found the present alone")
+            raise GeometryError(
+                "times: expected a plan for after the present, found the present alone"
+            )
         if not np.isfinite(path).all() or (yaw is not None and not np.isfinite(yaw).all()):
             raise GeometryError("path: not all numbers are finite; leave out what is not planned")
-        checks = {"times": times, "path": path, "yaw": yaw, "score": checked_number("score", self.score)}
+        checks = {
+            "times": times,
+            "path": path,
+            "yaw": yaw,
+            "score": checked_number("score", self.score),
+        }
         for name, value in checks.items():
             object.__setattr__(self, name, value)
         FrozenArrays.__post_init__(self)
@@ -78,7 +85,10 @@ class Plan(FrozenArrays):
         values = np.column_stack([path, np.unwrap(yaw)])
         if len(path) > 1:
             onward = (*steps[-1] * (_ONWARD / (moments[-1] - moments[-2])), 0.0)
-            moments, values = np.append(moments, moments[-1] + _ONWARD), np.vstack([values, values[-1] + onward])
+            moments, values = (
+                np.append(moments, moments[-1] + _ONWARD),
+                np.vstack([values, values[-1] + onward]),
+            )
         return np.column_stack([np.interp(times, moments, each) for each in values.T])
 
 
@@ -221,19 +231,26 @@ def trivial_plans(scene: PlanningScene) -> Mapping[str, Plan]:
         "constant velocity": (coarse, coarse[:, None] * np.append(scene.before, 0.0)),
         "full braking": (fine, recorded_poses(scene, fine, 0.0)),
     }
-    return {name: Plan(times=times, path=each[:, :2], yaw=each[:, 2]) for name, (times, each) in poses.items()}
+    return {
+        name: Plan(times=times, path=each[:, :2], yaw=each[:, 2])
+        for name, (times, each) in poses.items()
+    }
 
 
 def steps_of(step: float, until: float) -> FloatArray:
     """(N,) the seconds of steps up to a time."""
-    return np.asarray(np.arange(1, math.floor(until / step + _SAME_TIME) + 1, dtype=np.float64) * step)
+    return np.asarray(
+        np.arange(1, math.floor(until / step + _SAME_TIME) + 1, dtype=np.float64) * step
+    )
 
 
 # Share of a step by which a time that is meant to be a step's may miss it.
 _SAME_TIME: Final = 1e-6
 
 
-def recorded_poses(scene: PlanningScene, times: FloatArray, braking_from: float = np.inf) -> FloatArray:
+def recorded_poses(
+    scene: PlanningScene, times: FloatArray, braking_from: float = np.inf
+) -> FloatArray:
     """(N, 3) x, y, yaw of the recorded ego frame at times (N,), after its end straight on; braking from a time on."""
     if len(scene.recorded) < 2:
         return np.zeros((len(times), 3))

@@ -91,7 +91,11 @@ class MotionForm:
         """Check the values; raises ResultsError that names the field."""
         if not isinstance(self.grid, BevGrid):
             raise ResultsError(f"grid: expected a BevGrid, found {type(self.grid).__name__}")
-        settle_choices(self, {"stored": get_args(Stored), "labels": (*LABEL_PROTOCOLS, None)}, error=ResultsError)
+        settle_choices(
+            self,
+            {"stored": get_args(Stored), "labels": (*LABEL_PROTOCOLS, None)},
+            error=ResultsError,
+        )
         for name in ("predictions", "frames"):
             if type(value := getattr(self, name)) is not int or value < 1:
                 raise ResultsError(f"{name}: expected a whole number from 1, found {value!r}")
@@ -125,7 +129,10 @@ class MotionForm:
         """The form that JSON holds; raises ContentError that names the field."""
         try:
             grid = BevGrid(told.x, told.y, told.orientation)
-            others = {name: getattr(told, name) for name in ("stored", "predictions", "frames", "step", "labels")}
+            others = {
+                name: getattr(told, name)
+                for name in ("stored", "predictions", "frames", "step", "labels")
+            }
             return cls(grid=grid, **others)
         except DeepAccidentError as error:
             raise ContentError(str(error)) from error
@@ -175,15 +182,23 @@ def _shards_of(shards: Sequence[Shard], root: Path) -> dict[str, Shard]:
                 check_token(token)
             if token in shard_of:
                 others = "twice" if shard_of[token] is shard else f"also in {shard_of[token].file}"
-                raise ContentError(f"{shard.file}: {token}: stands there {others}; store a sample once")
+                raise ContentError(
+                    f"{shard.file}: {token}: stands there {others}; store a sample once"
+                )
             shard_of[token] = shard
     return shard_of
 
 
 def _check_file(shard: Shard, root: Path, others: AbstractSet[str]) -> None:
     """Whether a shard's file is there, as long as it should be, in the folder, and not another shard's too."""
-    if not shard.file.isprintable() or "\\" in shard.file or not _is_inside(PurePosixPath(shard.file)):
-        raise ContentError(f"file: expected a path inside the folder of the results, found {shortened(shard.file)!r}")
+    if (
+        not shard.file.isprintable()
+        or "\\" in shard.file
+        or not _is_inside(PurePosixPath(shard.file))
+    ):
+        raise ContentError(
+            f"file: expected a path inside the folder of the results, found {shortened(shard.file)!r}"
+        )
     path = root / shard.file
     if shard.file in others:
         raise ContentError(f"file: {shard.file} is another entry's too; list each file once")
@@ -191,15 +206,21 @@ def _check_file(shard: Shard, root: Path, others: AbstractSet[str]) -> None:
         status = path.stat()
         inside = path.resolve().is_relative_to(root.resolve())
     except OSError as error:
-        raise ContentError(f"file: {shard.file} cannot be opened ({error.strerror}); copy it to its place") from error
+        raise ContentError(
+            f"file: {shard.file} cannot be opened ({error.strerror}); copy it to its place"
+        ) from error
     if not inside:
-        raise ContentError(f"file: {shard.file} is a link that leads out of the folder; put the file itself there")
+        raise ContentError(
+            f"file: {shard.file} is a link that leads out of the folder; put the file itself there"
+        )
     irregular = irregular_text(status.st_mode)
     if irregular:
         raise ContentError(f"file: {shard.file} is {irregular}")
     check_size(status.st_size, "results", shard.file)
     if status.st_size != shard.bytes:
-        raise ContentError(f"bytes: {shard.file} should have {shard.bytes}, found {status.st_size}; copy it again")
+        raise ContentError(
+            f"bytes: {shard.file} should have {shard.bytes}, found {status.st_size}; copy it again"
+        )
 
 
 def _is_inside(path: PurePosixPath) -> bool:
@@ -221,7 +242,9 @@ def opened(root: Path, shard: Shard) -> zipfile.ZipFile:
     try:
         return open_zip(root / shard.file)
     except DAMAGED_ARCHIVE as error:
-        raise ContentError(f"is no npz archive that can be read ({error}); copy it again") from error
+        raise ContentError(
+            f"is no npz archive that can be read ({error}); copy it again"
+        ) from error
 
 
 def check_shard(root: Path, form: MotionForm, shard: Shard) -> None:
@@ -229,7 +252,9 @@ def check_shard(root: Path, form: MotionForm, shard: Shard) -> None:
     path, within = root / shard.file, ""
     try:
         if path.stat().st_size != shard.bytes or file_checksum(path) != shard.checksum:
-            raise ContentError("its bytes are not those that the checksum is of; copy it again from where it was made")
+            raise ContentError(
+                "its bytes are not those that the checksum is of; copy it again from where it was made"
+            )
         with opened(root, shard) as archive:
             _check_members(archive, shard, form)
             for within in shard.tokens:
@@ -243,7 +268,9 @@ def _check_members(archive: zipfile.ZipFile, shard: Shard, form: MotionForm) -> 
     for name, times in Counter(archive.namelist()).items():
         token, _, array = name.rpartition("/")
         if token not in tokens or array not in arrays:
-            raise ContentError(f"{name}: belongs to no sample of the shard; store the arrays of its tokens alone")
+            raise ContentError(
+                f"{name}: belongs to no sample of the shard; store the arrays of its tokens alone"
+            )
         if times > 1:
             raise ContentError(f"{name}: stands there {times} times; store each array once")
 
@@ -268,7 +295,9 @@ def stored_output(archive: zipfile.ZipFile, token: str, form: MotionForm) -> Mot
     if form.stored == "instances":
         maps = arrays["instance"]
         if maps.min() < 0 or maps.max() > _HIGHEST_ID:
-            raise ContentError(f"instance: expected ids from 0 to {_HIGHEST_ID}, found {maps.min()} to {maps.max()}")
+            raise ContentError(
+                f"instance: expected ids from 0 to {_HIGHEST_ID}, found {maps.min()} to {maps.max()}"
+            )
         return MotionOutput(grid=form.grid, instances=maps.astype(np.int32))
     try:
         return MotionOutput.from_arrays(*arrays.values(), grid=form.grid)
@@ -285,16 +314,26 @@ def take_array(archive: zipfile.ZipFile, member: str, shape: Sequence[int], kind
     expected = f"expected shape (1 to {shape[0]}, {', '.join(map(str, shape[1:]))})"
     most = math.prod(shape) * _WIDEST + _LONGEST_HEADER
     if entry.file_size > most:
-        raise ContentError(f"{expected}, which has at most {most:,} bytes, found {entry.file_size:,} bytes")
+        raise ContentError(
+            f"{expected}, which has at most {most:,} bytes, found {entry.file_size:,} bytes"
+        )
     try:
         content = read_member(archive, entry, "results")
         array = array_of(content, "results")
     except DAMAGED_ARCHIVE as error:
-        raise ContentError(f"cannot be read ({error}); the file is damaged, copy it again") from error
+        raise ContentError(
+            f"cannot be read ({error}); the file is damaged, copy it again"
+        ) from error
     if not content.startswith(_NPY):
         raise ContentError("expected npy format 1.0, as numpy.save writes numbers")
     if array.dtype.kind not in kinds:
-        raise ContentError(f"expected {' or '.join(_KINDS[kind] for kind in kinds)}, found {array.dtype}")
-    if array.ndim != len(shape) or not 1 <= len(array) <= shape[0] or array.shape[1:] != tuple(shape[1:]):
+        raise ContentError(
+            f"expected {' or '.join(_KINDS[kind] for kind in kinds)}, found {array.dtype}"
+        )
+    if (
+        array.ndim != len(shape)
+        or not 1 <= len(array) <= shape[0]
+        or array.shape[1:] != tuple(shape[1:])
+    ):
         raise ContentError(f"{expected}, found {array.shape}")
     return array

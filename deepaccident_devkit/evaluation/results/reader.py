@@ -122,7 +122,9 @@ class Results:
         """
         contents = self._contents
         if token not in contents.tokens:
-            raise TokenError(f"{self.path}: has no prediction of {token!r}; `tokens` lists those that it has")
+            raise TokenError(
+                f"{self.path}: has no prediction of {token!r}; `tokens` lists those that it has"
+            )
         return contents.prediction(token)
 
     def check(
@@ -162,7 +164,9 @@ def read_results(path: str | os.PathLike[str]) -> Results:
     contents, fingerprint = contents_of(file)
     task = contents.task
     if task == "motion" and file.name != RESULTS_FILE:
-        raise ResultsError(f"{file}: is the manifest of motion results; call it {RESULTS_FILE}, as others look for it")
+        raise ResultsError(
+            f"{file}: is the manifest of motion results; call it {RESULTS_FILE}, as others look for it"
+        )
     return Results(file.parent if task == "motion" else file, task, fingerprint)
 
 
@@ -271,7 +275,9 @@ class Entries:
     columns: Columns
 
     @classmethod
-    def read(cls, results: Mapping[str, Sequence[Any]], columns: Callable[[Mapping[str, Any]], Columns]) -> Entries:
+    def read(
+        cls, results: Mapping[str, Sequence[Any]], columns: Callable[[Mapping[str, Any]], Columns]
+    ) -> Entries:
         """The entries by token; raises ContentError that names the token, the entry (from 0), and the field."""
         with at("results"):
             for token in results:
@@ -290,7 +296,9 @@ def accident_columns(results: Mapping[str, Sequence[AccidentEntry]]) -> Columns:
     """Of N accidents positions (N, 2, 2) metres, time (N,) seconds, score (N,), ids (N, 2), identified (N,) bool."""
     accidents = list(chain.from_iterable(results.values()))
     return {
-        "positions": _floats([(*one, *other) for one, other in (each.positions for each in accidents)], 2, 2),
+        "positions": _floats(
+            [(*one, *other) for one, other in (each.positions for each in accidents)], 2, 2
+        ),
         "time": np.array([each.time for each in accidents], dtype=np.float64),
         "score": np.array([each.score for each in accidents], dtype=np.float64),
         "ids": np.array([each.ids or (0, 0) for each in accidents], dtype=np.int64).reshape(-1, 2),
@@ -323,7 +331,9 @@ def detection_columns(results: Mapping[str, Sequence[BoxEntry]]) -> Columns:
         others = [number for number, box in enumerate(given) if box.sample_token != token]
         if others:
             place, found = entry_place(token, others[0]), shortened(given[others[0]].sample_token)
-            raise ContentError(f"{place}.sample_token: expected {token}, under which it stands, found {found!r}")
+            raise ContentError(
+                f"{place}.sample_token: expected {token}, under which it stands, found {found!r}"
+            )
     boxes = list(chain.from_iterable(results.values()))
     rotation = _floats([box.rotation for box in boxes], 4)
     with np.errstate(over="ignore"):
@@ -331,9 +341,15 @@ def detection_columns(results: Mapping[str, Sequence[BoxEntry]]) -> Columns:
     wrong = np.flatnonzero(np.abs(length - 1) > _UNIT_TOLERANCE)
     if len(wrong):
         row = int(wrong[0])
-        places = [entry_place(token, number) for token, given in results.items() for number in range(len(given))]
+        places = [
+            entry_place(token, number)
+            for token, given in results.items()
+            for number in range(len(given))
+        ]
         found = f"{list(boxes[row].rotation)}, {length[row]:.3g} long"
-        raise ContentError(f"{places[row]}.rotation: expected a unit quaternion [w, x, y, z], found {found}")
+        raise ContentError(
+            f"{places[row]}.rotation: expected a unit quaternion [w, x, y, z], found {found}"
+        )
     velocity = _floats([box.velocity or _UNKNOWN for box in boxes], 2)
     code = {name: number for number, name in enumerate(CATEGORIES)}
     return {
@@ -372,21 +388,32 @@ def plan_columns(results: Mapping[str, Sequence[PlanEntry]]) -> Columns:
     """(N,) plans; raises ContentError for one whose lists do not go together, or a sample without any."""
     for token, given in results.items():
         if not given:
-            raise ContentError(f"{entry_place(token)}: expected one plan or more, found none; leave the sample out")
+            raise ContentError(
+                f"{entry_place(token)}: expected one plan or more, found none; leave the sample out"
+            )
     return _objects(
-        results, lambda each: Plan(times=each.times, path=each.path, score=each.score, yaw=each.yaw or None)
+        results,
+        lambda each: Plan(times=each.times, path=each.path, score=each.score, yaw=each.yaw or None),
     )
 
 
 def forecast_columns(results: Mapping[str, Sequence[ForecastEntry]]) -> Columns:
     """(N,) forecasts; raises ContentError for one whose lists do not go together, or an actor that comes twice."""
     for token, given in results.items():
-        again = [number for number, each in enumerate(given) if each.id in {other.id for other in given[:number]}]
+        again = [
+            number
+            for number, each in enumerate(given)
+            if each.id in {other.id for other in given[:number]}
+        ]
         if again:
-            raise ContentError(f"{entry_place(token, again[0])}.id: actor {given[again[0]].id} comes twice")
+            raise ContentError(
+                f"{entry_place(token, again[0])}.id: actor {given[again[0]].id} comes twice"
+            )
     return _objects(
         results,
-        lambda each: Forecast(actor_id=each.id, times=each.times, paths=each.paths, probabilities=each.probabilities),
+        lambda each: Forecast(
+            actor_id=each.id, times=each.times, paths=each.paths, probabilities=each.probabilities
+        ),
     )
 
 

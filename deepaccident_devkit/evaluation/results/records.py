@@ -81,19 +81,27 @@ class AccidentEntry(msgspec.Struct, forbid_unknown_fields=True, gc=False):
 class BoxEntry(msgspec.Struct, forbid_unknown_fields=True, gc=False):
     """A detected box, with nuScenes' fields."""
 
-    sample_token: Annotated[Token, Meta(description="The sample's token, under which the box stands.")]
+    sample_token: Annotated[
+        Token, Meta(description="The sample's token, under which the box stands.")
+    ]
     translation: Annotated[
-        tuple[_Measure, _Measure, _Measure], Meta(description="Centre x, y, z in the world, right-handed, metres.")
+        tuple[_Measure, _Measure, _Measure],
+        Meta(description="Centre x, y, z in the world, right-handed, metres."),
     ]
     size: Annotated[
-        tuple[FromZero, FromZero, FromZero], Meta(description="WIDTH, LENGTH, HEIGHT, metres: nuScenes' order.")
+        tuple[FromZero, FromZero, FromZero],
+        Meta(description="WIDTH, LENGTH, HEIGHT, metres: nuScenes' order."),
     ]
     rotation: Annotated[
         tuple[float, float, float, float],
-        Meta(description="Unit quaternion w, x, y, z: the box's axes (x along its length) in the world."),
+        Meta(
+            description="Unit quaternion w, x, y, z: the box's axes (x along its length) in the world."
+        ),
     ]
     detection_name: Annotated[Literal[CATEGORIES], Meta(description="Category.")]  # type: ignore[valid-type]
-    detection_score: Annotated[float, Meta(description="How sure the model is, the more the higher.")]
+    detection_score: Annotated[
+        float, Meta(description="How sure the model is, the more the higher.")
+    ]
     velocity: Annotated[
         tuple[_Measure, _Measure] | UnsetType | None,
         Meta(description="x and y in the world over the ground, m/s; null if not known."),
@@ -104,7 +112,9 @@ class BoxEntry(msgspec.Struct, forbid_unknown_fields=True, gc=False):
 
 
 Place = tuple[_Measure, _Measure]
-Times = Annotated[list[FromZero], Meta(min_length=1, description="Seconds after the present, ascending.")]
+Times = Annotated[
+    list[FromZero], Meta(min_length=1, description="Seconds after the present, ascending.")
+]
 
 
 class PlanEntry(msgspec.Struct, forbid_unknown_fields=True, gc=False):
@@ -118,10 +128,14 @@ class PlanEntry(msgspec.Struct, forbid_unknown_fields=True, gc=False):
             description="Where its ego frame is at these times: x forward, y left, metres, in the present ego frame.",
         ),
     ]
-    score: Annotated[float, Meta(description="How good the plan is; the one with the highest is evaluated.")]
+    score: Annotated[
+        float, Meta(description="How good the plan is; the one with the highest is evaluated.")
+    ]
     yaw: Annotated[
         list[_Measure] | UnsetType | None,
-        Meta(description="Its headings at these times, radians, counter-clockwise; null for those of the steps."),
+        Meta(
+            description="Its headings at these times, radians, counter-clockwise; null for those of the steps."
+        ),
     ] = UNSET
 
 
@@ -139,7 +153,8 @@ class ForecastEntry(msgspec.Struct, forbid_unknown_fields=True, gc=False):
         ),
     ]
     probabilities: Annotated[
-        list[Annotated[float, Meta(ge=0, le=1)]], Meta(min_length=1, description="Of the modes; not normalised.")
+        list[Annotated[float, Meta(ge=0, le=1)]],
+        Meta(min_length=1, description="Of the modes; not normalised."),
     ]
 
 
@@ -156,11 +171,20 @@ class FormRecord(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
     """How motion is stored."""
 
     stored: Annotated[Stored, Meta(description="Maps of ids, or a model's own maps.")]
-    x: Annotated[Axis, Meta(description="Start, end and cell size, metres, x forward in the present ego frame.")]
-    y: Annotated[Axis, Meta(description="Start, end and cell size, metres, y left in the present ego frame.")]
+    x: Annotated[
+        Axis,
+        Meta(description="Start, end and cell size, metres, x forward in the present ego frame."),
+    ]
+    y: Annotated[
+        Axis, Meta(description="Start, end and cell size, metres, y left in the present ego frame.")
+    ]
     orientation: Annotated[Orientation, Meta(description="How cells lie in the maps.")]
-    predictions: Annotated[Count, Meta(description="K: how many a sample has at most; the last one is the mean.")]
-    frames: Annotated[Count, Meta(description="T: how many a prediction has, the present one first.")]
+    predictions: Annotated[
+        Count, Meta(description="K: how many a sample has at most; the last one is the mean.")
+    ]
+    frames: Annotated[
+        Count, Meta(description="T: how many a prediction has, the present one first.")
+    ]
     step: Annotated[float, Meta(gt=0, description="Seconds from one frame to the next.")]
     labels: Annotated[
         Literal[(*LABEL_PROTOCOLS,)] | None,  # type: ignore[valid-type]
@@ -173,10 +197,13 @@ class Shard(msgspec.Struct, forbid_unknown_fields=True, kw_only=True, frozen=Tru
 
     file: Annotated[str, Meta(min_length=1, description="Path of the archive in the folder.")]
     tokens: Annotated[
-        tuple[Token, ...], Meta(min_length=1, description="Its samples.", extra_json_schema={"uniqueItems": True})
+        tuple[Token, ...],
+        Meta(min_length=1, description="Its samples.", extra_json_schema={"uniqueItems": True}),
     ]
     bytes: Annotated[int, Meta(ge=0, description="Its size.")]
-    checksum: Annotated[str, Meta(description="BLAKE2b of its bytes, 16 bytes as hexadecimal digits.")]
+    checksum: Annotated[
+        str, Meta(description="BLAKE2b of its bytes, 16 bytes as hexadecimal digits.")
+    ]
 
 
 class _File(msgspec.Struct, forbid_unknown_fields=True, kw_only=True, tag_field="task"):
@@ -184,7 +211,10 @@ class _File(msgspec.Struct, forbid_unknown_fields=True, kw_only=True, tag_field=
     version: Version
     meta: Annotated[
         msgspec.Raw,
-        Meta(description="What the author says: the method, its training.", extra_json_schema={"type": "object"}),
+        Meta(
+            description="What the author says: the method, its training.",
+            extra_json_schema={"type": "object"},
+        ),
     ]
 
     @property
@@ -197,7 +227,9 @@ class _File(msgspec.Struct, forbid_unknown_fields=True, kw_only=True, tag_field=
 _BY_TOKEN: Final = Meta(
     min_length=1,
     description="Sample token to what is predicted of it; [] for nothing.",
-    extra_json_schema={"propertyNames": {"pattern": WORDS}},  # which msgspec finds itself from 0.22 on
+    extra_json_schema={
+        "propertyNames": {"pattern": WORDS}
+    },  # which msgspec finds itself from 0.22 on
 )
 
 
@@ -296,7 +328,9 @@ def decoded(content: bytes, kind: type[Kind]) -> Kind:
         value = parsed_json(content)  # it says of NaN where it stands
         said, _, place = str(error).partition(" - at `$")
         place = place.strip(".`")
-        told = _told(shortened(said[:1].lower() + said[1:], MOST_TOLD), value, inspect.type_info(kind), place)
+        told = _told(
+            shortened(said[:1].lower() + said[1:], MOST_TOLD), value, inspect.type_info(kind), place
+        )
         raise ContentError(f"{place}: {told}" if place else told) from error
 
 
@@ -311,21 +345,36 @@ def _told(said: str, value: Any, kind: inspect.Type, place: str) -> str:
         value = value[int(part) if isinstance(value, list) else part]
         inner = [each for outer in kinds for each in _inner(outer, part)]
         kinds = [each for whole in inner for each in _single(whole)]
-        notes = [each.extra_json_schema or {} for each in inner if isinstance(each, inspect.Metadata)]
-        meaning = next((f" ({note['description']})" for note in notes if "description" in note), meaning)
+        notes = [
+            each.extra_json_schema or {} for each in inner if isinstance(each, inspect.Metadata)
+        ]
+        meaning = next(
+            (f" ({note['description']})" for note in notes if "description" in note), meaning
+        )
     if said.startswith("object "):  # lacks a field, or has one too many
-        names = [field.encode_name for each in kinds if isinstance(each, inspect.StructType) for field in each.fields]
+        names = [
+            field.encode_name
+            for each in kinds
+            if isinstance(each, inspect.StructType)
+            for field in each.fields
+        ]
         return f"{said} (expected {', '.join(names)})" if "unknown" in said and names else said
-    choices = [str(word) for each in kinds if isinstance(each, inspect.LiteralType) for word in each.values]
+    choices = [
+        str(word) for each in kinds if isinstance(each, inspect.LiteralType) for word in each.values
+    ]
     if choices:
-        return f"expected {'one of ' * (len(choices) > 1)}{', '.join(choices)}, found {shown(value)}"
+        return (
+            f"expected {'one of ' * (len(choices) > 1)}{', '.join(choices)}, found {shown(value)}"
+        )
     return f"{said.partition(', got ')[0]}, found {shown(value)}{meaning}"
 
 
 def _inner(kind: inspect.Type, part: str) -> Sequence[inspect.Type]:
     """The kinds that a field or an entry of a value of a kind may have."""
     if isinstance(kind, inspect.StructType):
-        return [each.type for each in kind.fields if each.encode_name == part] or [inspect.LiteralType((kind.tag,))]
+        return [each.type for each in kind.fields if each.encode_name == part] or [
+            inspect.LiteralType((kind.tag,))
+        ]
     if isinstance(kind, inspect.TupleType):
         return [kind.item_types[int(part)]]
     return [kind.item_type] if isinstance(kind, inspect.ListType | inspect.VarTupleType) else []
@@ -335,13 +384,19 @@ def _single(kind: inspect.Type) -> list[inspect.Type]:
     """The kinds that a kind joins, without notes on them."""
     if isinstance(kind, inspect.Metadata):
         return _single(kind.type)
-    return [part for each in kind.types for part in _single(each)] if isinstance(kind, inspect.UnionType) else [kind]
+    return (
+        [part for each in kind.types for part in _single(each)]
+        if isinstance(kind, inspect.UnionType)
+        else [kind]
+    )
 
 
 def json_meta(meta: object) -> dict[str, Any]:
     """A copy of `meta` as JSON holds it; raises ContentError."""
     if not isinstance(meta, Mapping):
-        raise ContentError(f"meta: expected a mapping of names to what JSON holds, found {type(meta).__name__}")
+        raise ContentError(
+            f"meta: expected a mapping of names to what JSON holds, found {type(meta).__name__}"
+        )
     try:
         text = json.dumps(dict(meta), allow_nan=False)
     except (TypeError, ValueError, RecursionError) as error:
@@ -388,13 +443,26 @@ def _strict_meta(content: bytes, document: ResultsFile) -> object:
     if not isinstance(document, MotionFile):
         record = ENTRY_RECORDS[document.task]
         entries = list(chain.from_iterable(document.results.values()))
-        optional = record.__struct_fields__[len(record.__struct_fields__) - len(record.__struct_defaults__) :]
-        kinds = Counter(chain.from_iterable(map(type, map(attrgetter(name), entries)) for name in optional))
-        ignored = [getattr(each, name) for each in entries for name in optional] if kinds[msgspec.Raw] else []
-        unread = b"[%s]" % b",".join([document.meta, *(each for each in ignored if isinstance(each, msgspec.Raw))])
+        optional = record.__struct_fields__[
+            len(record.__struct_fields__) - len(record.__struct_defaults__) :
+        ]
+        kinds = Counter(
+            chain.from_iterable(map(type, map(attrgetter(name), entries)) for name in optional)
+        )
+        ignored = (
+            [getattr(each, name) for each in entries for name in optional]
+            if kinds[msgspec.Raw]
+            else []
+        )
+        unread = b"[%s]" % b",".join(
+            [document.meta, *(each for each in ignored if isinstance(each, msgspec.Raw))]
+        )
         # the file's own names, the task among them, those of samples, and those of entries
         names = (
-            len(document.__struct_fields__) + 1 + len(document.results) + len(entries) * len(record.__struct_fields__)
+            len(document.__struct_fields__)
+            + 1
+            + len(document.results)
+            + len(entries) * len(record.__struct_fields__)
         )
         colons = np.count_nonzero(np.frombuffer(content, np.uint8) == ord(":"))
         with suppress(ContentError):
@@ -416,7 +484,11 @@ def _tell(content: bytes, path: Path) -> None:
         )
     version = told.get("version")
     if told.get("format") == FORMAT and type(version) is int and version != FORMAT_VERSION:
-        age, remedy = ("a newer", "update the devkit") if version > FORMAT_VERSION else ("an older", "write it again")
+        age, remedy = (
+            ("a newer", "update the devkit")
+            if version > FORMAT_VERSION
+            else ("an older", "write it again")
+        )
         raise ResultsError(
             f"{path}: version: {age} results format ({shown(version)}, this devkit's is {FORMAT_VERSION}); {remedy}"
         )

@@ -101,9 +101,21 @@ class ResultsWriter:
             told = json_meta({} if meta is None else meta)
         except ContentError as error:
             raise ResultsError(str(error)) from error
-        self._header = {"format": FORMAT, "version": FORMAT_VERSION, "task": self.task, "meta": told}
-        form = MotionForm(stored=store, grid=grid or BevGrid(), predictions=1, frames=1, step=step, labels=labels)
-        self._motion: dict[str, Any] = {"grid": grid, "step": form.step, "labels": form.labels, "store": form.stored}
+        self._header = {
+            "format": FORMAT,
+            "version": FORMAT_VERSION,
+            "task": self.task,
+            "meta": told,
+        }
+        form = MotionForm(
+            stored=store, grid=grid or BevGrid(), predictions=1, frames=1, step=step, labels=labels
+        )
+        self._motion: dict[str, Any] = {
+            "grid": grid,
+            "step": form.step,
+            "labels": form.labels,
+            "store": form.stored,
+        }
         self._check_free()
         self._tokens: set[str] = set()
         self._stack = ExitStack()
@@ -127,7 +139,10 @@ class ResultsWriter:
         return self
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
     ) -> None:
         """Put the results in their place, or after an exception remove what was written."""
         body, self._body = self._body, None
@@ -136,13 +151,19 @@ class ResultsWriter:
             return
         with _told(self.path), self._stack:
             if body is None:
-                raise ResultsError("a prediction could not be written, so that none is kept; write all of them again")
+                raise ResultsError(
+                    "a prediction could not be written, so that none is kept; write all of them again"
+                )
             body.finish()
 
     def add(
         self,
         token: str,
-        prediction: MotionOutput | Iterable[Accident] | DetectedBoxes | Iterable[Plan] | Iterable[Forecast],
+        prediction: MotionOutput
+        | Iterable[Accident]
+        | DetectedBoxes
+        | Iterable[Plan]
+        | Iterable[Forecast],
     ) -> None:
         """Write the prediction of a sample.
 
@@ -184,14 +205,18 @@ class ResultsWriter:
 
     def _opened(self) -> EntryWriter | ShardWriter:
         if self._body is None:
-            raise ResultsError(f"{self.path}: is not open; add predictions inside `with ResultsWriter(…) as writer:`")
+            raise ResultsError(
+                f"{self.path}: is not open; add predictions inside `with ResultsWriter(…) as writer:`"
+            )
         return self._body
 
     def _check_free(self) -> None:
         with _told(self.path):
             empty = self.task == "motion" and self.path.is_dir() and not any(self.path.iterdir())
             if not empty and (self.path.exists() or self.path.is_symlink()):
-                raise ResultsError(f"{self.path}: is there already{self._other()}; choose another path, or remove it")
+                raise ResultsError(
+                    f"{self.path}: is there already{self._other()}; choose another path, or remove it"
+                )
 
     def _other(self) -> str:
         """How the notes of results that are there differ, in brackets; empty where nothing is known."""
@@ -203,7 +228,10 @@ class ResultsWriter:
         if there.meta.get("method") != asked.get("method"):  # all else differs with it
             there_is, wanted = (shortened(repr(meta.get("method"))) for meta in (there.meta, asked))
             return f" (of method {there_is}, not of {wanted})"
-        notes = ({name: note for name, note in meta.items() if name != "bytes"} for meta in (there.meta, asked))
+        notes = (
+            {name: note for name, note in meta.items() if name != "bytes"}
+            for meta in (there.meta, asked)
+        )
         return f" ({differing_text(*notes) or 'of other samples'})"  # bytes follow from the rest
 
 
@@ -220,7 +248,9 @@ def _told(path: Path) -> Iterator[None]:
 
 
 def _unwritten(path: Path, error: OSError) -> ResultsError:
-    return ResultsError(f"{path}: results cannot be written ({error}); make room there, or choose another path")
+    return ResultsError(
+        f"{path}: results cannot be written ({error}); make room there, or choose another path"
+    )
 
 
 class EntryWriter:
@@ -232,7 +262,9 @@ class EntryWriter:
         self._count = 0
         self._file = path.open("w", encoding="utf-8", newline="\n")
         for name, value in header.items():
-            self._file.write(f"{',' if self._file.tell() else '{'}\n{json.dumps(name)}: {json.dumps(value)}")
+            self._file.write(
+                f"{',' if self._file.tell() else '{'}\n{json.dumps(name)}: {json.dumps(value)}"
+            )
         self._file.write(_BODY)
 
     def add(self, token: str, prediction: object) -> None:
@@ -267,7 +299,9 @@ def _accidents(token: str, prediction: object) -> list[dict[str, Any]]:
     except EvaluationError as error:
         raise ResultsError(str(error)) from error
     if isinstance(accidents, MotionOutput):
-        raise ResultsError("expected a list of Accidents, found a MotionOutput; write that to results of task 'motion'")
+        raise ResultsError(
+            "expected a list of Accidents, found a MotionOutput; write that to results of task 'motion'"
+        )
     return [
         {
             "positions": each.positions.tolist(),
@@ -345,7 +379,9 @@ def _all_of(kind: type[Kind], prediction: object) -> list[Kind]:
     given = list(prediction) if isinstance(prediction, Iterable) else [prediction]
     others = [each for each in given if not isinstance(each, kind)]
     if others:
-        raise ResultsError(f"expected a list of {kind.__name__}s, found {type(others[0]).__name__} in it")
+        raise ResultsError(
+            f"expected a list of {kind.__name__}s, found {type(others[0]).__name__} in it"
+        )
     return [each for each in given if isinstance(each, kind)]
 
 
@@ -386,7 +422,9 @@ class ShardWriter:
         arrays = self._arrays(output)
         predictions, frames = next(iter(arrays.values())).shape[:2]
         if self._frames not in (0, frames):
-            raise ResultsError(f"expected {self._frames} frames as of the samples before, found {frames}")
+            raise ResultsError(
+                f"expected {self._frames} frames as of the samples before, found {frames}"
+            )
         self._form(output.grid, predictions, frames)
         self._grid, self._frames = output.grid, frames
         self._predictions = max(self._predictions, predictions)
@@ -406,7 +444,10 @@ class ShardWriter:
         self._grid, self._frames = contents.form.grid, contents.form.frames
         self._predictions = max(self._predictions, contents.form.predictions)
         for shard in contents.shards:
-            with open_file(part.path / shard.file) as source, (self._folder / self._file).open("wb") as target:
+            with (
+                open_file(part.path / shard.file) as source,
+                (self._folder / self._file).open("wb") as target,
+            ):
                 shutil.copyfileobj(source, target)
             self._shards.append(msgspec.structs.replace(shard, file=self._file))
 
@@ -456,11 +497,15 @@ class ShardWriter:
 
     def _arrays(self, output: MotionOutput) -> dict[str, AnyArray]:
         if output.instances is not None and output.instances.min() < 0:
-            raise ResultsError(f"instances: expected ids from 1, and 0 elsewhere, found {output.instances.min()}")
+            raise ResultsError(
+                f"instances: expected ids from 1, and 0 elsewhere, found {output.instances.min()}"
+            )
         if self._store == "instances":
             return instance_arrays(output)
         if output.heads is None:
-            raise ResultsError("expected heads, found instance maps; write those with store='instances'")
+            raise ResultsError(
+                "expected heads, found instance maps; write those with store='instances'"
+            )
         if any(heads.ignore_index is not None for heads in output.heads):
             raise ResultsError(
                 "expected a model's heads, found those of labels, which hold values to ignore; write them with "
@@ -503,9 +548,13 @@ def instance_arrays(output: MotionOutput) -> dict[str, AnyArray]:
 def put_array(archive: zipfile.ZipFile, member: str, array: AnyArray) -> None:
     """Add an array to an archive; the bytes do not depend on the time."""
     buffer = io.BytesIO()
-    np.lib.format.write_array(buffer, np.ascontiguousarray(array), version=(1, 0), allow_pickle=False)
+    np.lib.format.write_array(
+        buffer, np.ascontiguousarray(array), version=(1, 0), allow_pickle=False
+    )
     entry = zipfile.ZipInfo(member, _FIRST_DATE)
     entry.external_attr = 0o644 << 16
-    maps_of_floats = array.dtype.kind == "f" and array.ndim > 3  # noise: deflating takes a second and saves nothing
+    maps_of_floats = (
+        array.dtype.kind == "f" and array.ndim > 3
+    )  # noise: deflating takes a second and saves nothing
     way = zipfile.ZIP_STORED if maps_of_floats else zipfile.ZIP_DEFLATED
     archive.writestr(entry, buffer.getvalue(), way, compresslevel=6)

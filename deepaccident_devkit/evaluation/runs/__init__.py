@@ -4,8 +4,17 @@
 says which differences of two are real.
 """
 
-from deepaccident_devkit.evaluation.runs.bundles import Bundle, checked_target, read_bundle, save_run
-from deepaccident_devkit.evaluation.runs.comparison import ComparedNumber, Comparison, compare_bundles
+from deepaccident_devkit.evaluation.runs.bundles import (
+    Bundle,
+    checked_target,
+    read_bundle,
+    save_run,
+)
+from deepaccident_devkit.evaluation.runs.comparison import (
+    ComparedNumber,
+    Comparison,
+    compare_bundles,
+)
 from deepaccident_devkit.evaluation.runs.evaluation_run import (
     BREAKDOWNS,
     EvaluationRun,

@@ -19,7 +19,11 @@ from deepaccident_devkit.errors import MOST_TOLD, EvaluationError, ResultsError,
 from deepaccident_devkit.evaluation.breakdowns import cluster_of
 from deepaccident_devkit.evaluation.evaluator import Evaluator
 from deepaccident_devkit.evaluation.results.records import check_token
-from deepaccident_devkit.evaluation.runs.evaluation_run import SUMMARY_FORMAT, SUMMARY_VERSION, EvaluationRun
+from deepaccident_devkit.evaluation.runs.evaluation_run import (
+    SUMMARY_FORMAT,
+    SUMMARY_VERSION,
+    EvaluationRun,
+)
 from deepaccident_devkit.evaluation.runs.rows import Row, read_rows, sample_rows, write_rows
 from deepaccident_devkit.evaluation.runs.setups import (
     EvaluationSetup,
@@ -33,7 +37,13 @@ from deepaccident_devkit.release.fingerprints import ScenarioHashes
 from deepaccident_devkit.support.arrays import ShortRepr
 from deepaccident_devkit.support.files import remove_in, replacing_folder, temporary_path
 from deepaccident_devkit.support.json_text import Record, as_record, parsed_json
-from deepaccident_devkit.support.reading import check_size, fault_text, file_checksum, irregular_text, read_bytes
+from deepaccident_devkit.support.reading import (
+    check_size,
+    fault_text,
+    file_checksum,
+    irregular_text,
+    read_bytes,
+)
 from deepaccident_devkit.support.text import differing_text, path_of
 from deepaccident_devkit.taxonomy import SPLIT_CHOICES
 
@@ -200,7 +210,9 @@ class Bundle(ShortRepr):
             evaluator.compute()
         except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
             told = f"{type(error).__name__}: {shortened(str(error))}"
-            raise ResultsError(f"{path}: does not hold counts of its protocol ({told}); evaluate again") from error
+            raise ResultsError(
+                f"{path}: does not hold counts of its protocol ({told}); evaluate again"
+            ) from error
         return evaluator
 
     def results_copy(self) -> Path | None:
@@ -217,7 +229,9 @@ class Bundle(ShortRepr):
                 raise ResultsError(f"{self.folder}: {shortened(name)} is {irregular}; {_REMEDY}")
         inside = sorted(copies.iterdir()) if copies.is_dir() else []
         if len(inside) != 1:
-            raise ResultsError(f"{copies}: expected one results file or folder, found {len(inside)}; {_REMEDY}")
+            raise ResultsError(
+                f"{copies}: expected one results file or folder, found {len(inside)}; {_REMEDY}"
+            )
         return inside[0]
 
 
@@ -245,7 +259,9 @@ def read_bundle(folder: Path) -> Bundle:
 def _stated_setup(path: Path, summary: Mapping[str, Any]) -> EvaluationSetup:
     """Return the setup that a summary states; raises ResultsError."""
     with _stating(path):
-        return EvaluationSetup(**{name: summary[name] for name in ("task", "protocol", "switches", "horizon")})
+        return EvaluationSetup(
+            **{name: summary[name] for name in ("task", "protocol", "switches", "horizon")}
+        )
 
 
 @contextmanager
@@ -253,8 +269,15 @@ def _stating(path: Path) -> Iterator[None]:
     """Turn errors of impossible values into a ResultsError that names the summary."""
     try:
         yield
-    except (ArithmeticError, LookupError, TypeError, ValueError) as error:  # whatever a switch's value can cause
-        raise ResultsError(f"{path}: {_UNCLEAR}{shortened(str(error), MOST_TOLD)}; {_REMEDY}") from error
+    except (
+        ArithmeticError,
+        LookupError,
+        TypeError,
+        ValueError,
+    ) as error:  # whatever a switch's value can cause
+        raise ResultsError(
+            f"{path}: {_UNCLEAR}{shortened(str(error), MOST_TOLD)}; {_REMEDY}"
+        ) from error
 
 
 def chosen_threshold(folder: Path, by: Chooser, tokens: Iterable[str]) -> float:
@@ -274,18 +297,28 @@ def chosen_threshold(folder: Path, by: Chooser, tokens: Iterable[str]) -> float:
             f"{folder}: is an evaluation of {' '.join(kind)}; expected one of warning, protocol clean"
         )
     own = {cluster_of(scenario) for scenario in bundle.scenarios()}
-    shared = sorted({scenario for scenario in map(scenario_of, tokens) if cluster_of(scenario) in own})
+    shared = sorted(
+        {scenario for scenario in map(scenario_of, tokens) if cluster_of(scenario) in own}
+    )
     if shared:
         raise EvaluationError(
             f"{folder}: is an evaluation of {shared[0]} or its twin, too; a threshold that is chosen on the recordings "
             "it is tried on flatters: give one of another split, such as train or val"
         )
     try:
-        groups: Mapping[str, Any] = bundle.summary["prevented" if by == "braking" else "metrics"]["groups"]
+        groups: Mapping[str, Any] = bundle.summary["prevented" if by == "braking" else "metrics"][
+            "groups"
+        ]
         group = next((name for name in GROUPS if name in groups), None)
-        threshold = None if group is None else groups[group]["quiet_braking" if by == "braking" else by]
+        threshold = (
+            None if group is None else groups[group]["quiet_braking" if by == "braking" else by]
+        )
     except (LookupError, TypeError) as error:
-        what, how = ("prevented accidents", " with --prevented") if by == "braking" else ("metrics of warnings", "")
+        what, how = (
+            ("prevented accidents", " with --prevented")
+            if by == "braking"
+            else ("metrics of warnings", "")
+        )
         raise ResultsError(f"{folder}: its summary has no {what}; evaluate again{how}") from error
     if not isinstance(threshold, float) or not math.isfinite(threshold):
         raise EvaluationError(
@@ -316,7 +349,9 @@ def own_file(path: Path) -> Path:
 def read_json(path: Path, expected: str | None) -> dict[str, Any]:
     """One of a bundle's JSON files, of a format; None for the counts. Raises ResultsError."""
     try:
-        content = parsed_json(read_bytes(own_file(path), "bundle" if expected else "results"), constants=not expected)
+        content = parsed_json(
+            read_bytes(own_file(path), "bundle" if expected else "results"), constants=not expected
+        )
     except FileNotFoundError as error:
         raise ResultsError(f"{path}: is missing; {_REMEDY}") from error
     except (OSError, ValueError) as error:
@@ -329,9 +364,13 @@ def read_json(path: Path, expected: str | None) -> dict[str, Any]:
     if expected is None:
         return content
     if found != expected:
-        raise ResultsError(f"{path}: expected the format {expected!r}, found {shortened(repr(found))}; {_REMEDY}")
+        raise ResultsError(
+            f"{path}: expected the format {expected!r}, found {shortened(repr(found))}; {_REMEDY}"
+        )
     if content.get("version") != SUMMARY_VERSION:
-        version, writer = (shortened(repr(content.get(name))) for name in ("version", "devkit_version"))
+        version, writer = (
+            shortened(repr(content.get(name))) for name in ("version", "devkit_version")
+        )
         raise ResultsError(
             f"{path}: is of version {version}, this devkit reads {SUMMARY_VERSION}; use the devkit that wrote it "
             f"({writer})"
@@ -368,7 +407,9 @@ def checksums_of(folder: Path, listed: Collection[str] | None = None) -> dict[st
         if listed is None:
             found[name] = file_checksum(folder / name)
         else:
-            found[name] = irregular or (_checksum(folder / name) if name in listed else "a file that is not listed")
+            found[name] = irregular or (
+                _checksum(folder / name) if name in listed else "a file that is not listed"
+            )
     return found
 
 
@@ -411,10 +452,14 @@ def save_run(
             _write(run, temporary, include_results=include_results)
             for extra in extras:
                 extra(temporary)
-            _write_json(temporary / FILES_FILE, FILES_FORMAT, run, {"files": checksums_of(temporary)})
+            _write_json(
+                temporary / FILES_FILE, FILES_FORMAT, run, {"files": checksums_of(temporary)}
+            )
             before = _moved_aside(target)
     except OSError as error:
-        raise ResultsError(f"{target}: cannot be written ({error}); make room there, or choose another") from error
+        raise ResultsError(
+            f"{target}: cannot be written ({error}); make room there, or choose another"
+        ) from error
     finally:
         if before is not None and not target.exists():
             before.rename(target)
@@ -425,7 +470,10 @@ def save_run(
 
 
 def checked_target(
-    folder: str | os.PathLike[str], *, overwrite: bool = False, asked: Mapping[str, Any] | None = None
+    folder: str | os.PathLike[str],
+    *,
+    overwrite: bool = False,
+    asked: Mapping[str, Any] | None = None,
 ) -> Path:
     """The path of a folder that a bundle can be written to; changes nothing.
 
@@ -447,10 +495,14 @@ def checked_target(
         bundle = read_bundle(target)
         own = {*bundle.checksums(), FILES_FILE}
     except ResultsError as error:
-        raise ResultsError(f"{target}: is not empty and holds no evaluation ({error}); choose a new folder") from error
+        raise ResultsError(
+            f"{target}: is not empty and holds no evaluation ({error}); choose a new folder"
+        ) from error
     foreign = [name for name in found if name not in own]
     if foreign:
-        raise ResultsError(f"{target}: holds {foreign[0]}, which is not of its evaluation; move it, or choose another")
+        raise ResultsError(
+            f"{target}: holds {foreign[0]}, which is not of its evaluation; move it, or choose another"
+        )
     if not overwrite:
         there = {**bundle.summary, "results": bundle.summary["results"]["path"]}
         text = differing_text({name: there[name] for name in asked or {}}, asked or {})
@@ -469,12 +521,16 @@ def _moved_aside(target: Path) -> Path | None:
 
 
 def _write(run: EvaluationRun, folder: Path, *, include_results: bool) -> None:
-    (folder / SUMMARY_FILE).write_text(json.dumps(run.summary(), indent=1, ensure_ascii=False), encoding="utf-8")
+    (folder / SUMMARY_FILE).write_text(
+        json.dumps(run.summary(), indent=1, ensure_ascii=False), encoding="utf-8"
+    )
     run.evaluator.save(folder / COUNTS_FILE)
     counts = json.loads((folder / COUNTS_FILE).read_text(encoding="utf-8"))
     (folder / COUNTS_FILE).write_text(json.dumps(run.stamp | counts), encoding="utf-8")
     write_rows(folder / ROWS_FILE, sample_rows(run), run.stamp)
-    _write_json(folder / SCENARIOS_FILE, SCENARIOS_FORMAT, run, {"scenarios": dict(run.release.scenarios)})
+    _write_json(
+        folder / SCENARIOS_FILE, SCENARIOS_FORMAT, run, {"scenarios": dict(run.release.scenarios)}
+    )
     if include_results:
         _copy(Path(run.results.path), folder / RESULTS_FOLDER)
 

@@ -123,7 +123,11 @@ class Comparison(Report):
 
     def to_text(self) -> str:
         """A table of the headlines, how many other numbers differ, and what to make of that."""
-        marks = [f"a, b: only the samples that both have; {self.left_out} left out"] if self.left_out else []
+        marks = (
+            [f"a, b: only the samples that both have; {self.left_out} left out"]
+            if self.left_out
+            else []
+        )
         samples, scenarios = counted(self.samples, "sample"), counted(self.scenarios, "scenario")
         head = [
             f"{self.task}, protocol {self.protocol}: {samples} of {scenarios}",
@@ -135,10 +139,14 @@ class Comparison(Report):
         ]
         shown = [each for each in self.numbers if each.headline]
         percent = f"{self.resampling.confidence:.0%}"
-        rows: list[Sequence[str]] = [("number", "a", "b", "b − a", f"{percent} interval", "p", "decision")]
+        rows: list[Sequence[str]] = [
+            ("number", "a", "b", "b − a", f"{percent} interval", "p", "decision")
+        ]
         rows += [text_row(each) for each in shown]
         few = [each.decision for each in shown if each.decision.startswith(_IMPOSSIBLE)]
-        told = [f"{_TOO_FEW}: {few[-1]}"] if few else []  # the first headline, tested alone, needs fewer
+        told = (
+            [f"{_TOO_FEW}: {few[-1]}"] if few else []
+        )  # the first headline, tested alone, needs fewer
         return "\n".join([*head, "", columns_text(rows), "", *told, *self.notes()])
 
     def notes(self) -> list[str]:
@@ -161,7 +169,9 @@ class Comparison(Report):
 
     def to_dict(self) -> dict[str, Any]:
         """All of it, as JSON holds it."""
-        made: dict[str, Any] = plain(asdict(self) | {"a": os.fspath(self.a), "b": os.fspath(self.b)})
+        made: dict[str, Any] = plain(
+            asdict(self) | {"a": os.fspath(self.a), "b": os.fspath(self.b)}
+        )
         return made | {"notes": self.notes()}
 
     def named_tables(self) -> dict[str, list[Row]]:
@@ -172,7 +182,9 @@ class Comparison(Report):
 def text_row(each: ComparedNumber) -> tuple[str, ...]:
     """The cells of a number's row."""
     unit = f" ({each.unit})" if each.unit and each.unit != "share" else ""
-    interval = "–" if each.low is None or each.high is None else f"[{each.low:+.3f}, {each.high:+.3f}]"
+    interval = (
+        "–" if each.low is None or each.high is None else f"[{each.low:+.3f}, {each.high:+.3f}]"
+    )
     return (
         f"{each.headline}{unit}",
         *("–" if value is None else f"{value:.3f}" for value in (each.a, each.b)),
@@ -210,11 +222,17 @@ def compare_bundles(
     results = [evaluator.compute(tokens) for evaluator in evaluators]
     shown = {each.path: each for result in results for each in headlines(result)}
     first, second = (numbers_of(result) for result in results)
-    names = list(dict.fromkeys([*(name for name in shown if name in {**first, **second}), *first, *second]))
-    values = np.array([[numbers.get(name, math.nan) for name in names] for numbers in (first, second)])
+    names = list(
+        dict.fromkeys([*(name for name in shown if name in {**first, **second}), *first, *second])
+    )
+    values = np.array(
+        [[numbers.get(name, math.nan) for name in names] for numbers in (first, second)]
+    )
     cluster_names = {token: cluster_of(scenario_of(token)) for token in tokens}
     clusters = evaluators[0].clustered(cluster_names), evaluators[1].clustered(cluster_names)
-    test = paired_test(evaluators[0], clusters, dict(zip(names, values[1] - values[0], strict=True)), chosen)
+    test = paired_test(
+        evaluators[0], clusters, dict(zip(names, values[1] - values[0], strict=True)), chosen
+    )
     partial = [bundle.summary["partial"] for bundle in bundles]
     return Comparison(
         a=bundles[0].folder,
@@ -225,7 +243,9 @@ def compare_bundles(
         scenarios=len(scenarios),
         clusters=test.clusters,
         left_out=len(evaluators[0].tokens ^ evaluators[1].tokens),
-        partial=tuple(f"{name}: {mark['mark']}" for name, mark in zip("ab", partial, strict=True) if mark),
+        partial=tuple(
+            f"{name}: {mark['mark']}" for name, mark in zip("ab", partial, strict=True) if mark
+        ),
         resampling=chosen,
         swaps=len(test.swaps.swapped),
         all_swaps=test.swaps.complete,
@@ -234,10 +254,16 @@ def compare_bundles(
 
 
 def _compared(
-    names: list[str], values: FloatArray, test: PairedTest, shown: Mapping[str, Headline], scenarios: int
+    names: list[str],
+    values: FloatArray,
+    test: PairedTest,
+    shown: Mapping[str, Headline],
+    scenarios: int,
 ) -> tuple[ComparedNumber, ...]:
     main = next(iter(shown), None)
-    families: list[Family] = ["main" if name == main else "headlines" if name in shown else "other" for name in names]
+    families: list[Family] = [
+        "main" if name == main else "headlines" if name in shown else "other" for name in names
+    ]
     tested = np.array([family == "headlines" for family in families]) & np.isfinite(test.p)
     adjusted = test.p.copy()
     adjusted[tested] = holm(test.p[tested])
@@ -247,7 +273,13 @@ def _compared(
         headline = shown.get(name)
         real = family != "other" and bool(adjusted[at] <= 1 - test.resampling.confidence)
         better = _better(test.differences[at], headline) if real else None
-        decision = "for exploration" if family == "other" else f"{better} is better" if better else "they differ"
+        decision = (
+            "for exploration"
+            if family == "other"
+            else f"{better} is better"
+            if better
+            else "they differ"
+        )
         compared.append(
             ComparedNumber(
                 number=name,
@@ -263,7 +295,9 @@ def _compared(
                 adjusted_p=known(adjusted[at]),
                 real=real,
                 better=better,
-                decision=decision if real or family == "other" else undecided(test, at, together[family], scenarios),
+                decision=decision
+                if real or family == "other"
+                else undecided(test, at, together[family], scenarios),
             )
         )
     return tuple(compared)
@@ -275,7 +309,9 @@ def _better(difference: float, headline: Headline | None) -> str | None:
     return "b" if (difference > 0) == headline.higher_is_better else "a"
 
 
-def comparable(bundles: Sequence[Bundle], *, common: bool) -> tuple[list[Evaluator[Any]], list[str]]:
+def comparable(
+    bundles: Sequence[Bundle], *, common: bool
+) -> tuple[list[Evaluator[Any]], list[str]]:
     """The counts of bundles, and the samples that all of them have; arguments and errors as of `compare_bundles`."""
     for bundle in bundles[1:]:
         _check_rules(bundles[0], bundle)
@@ -319,7 +355,9 @@ def _cells(bundle: Bundle) -> dict[str, Any]:
 
 def _check_truth(one: Bundle, other: Bundle, scenarios: list[str]) -> None:
     mine, theirs = one.scenarios(), other.scenarios()
-    changed = [name for name in scenarios if name not in mine or not mine[name].is_like(theirs.get(name))]
+    changed = [
+        name for name in scenarios if name not in mine or not mine[name].is_like(theirs.get(name))
+    ]
     if changed:
         raise EvaluationError(
             f"{one.folder} and {other.folder}: the label, meta or calib files of {len(changed)} scenarios are not the "
@@ -328,7 +366,10 @@ def _check_truth(one: Bundle, other: Bundle, scenarios: list[str]) -> None:
 
 
 def _shared_tokens(
-    bundles: tuple[Bundle, Bundle], evaluators: tuple[Evaluator[Any], Evaluator[Any]], *, common: bool
+    bundles: tuple[Bundle, Bundle],
+    evaluators: tuple[Evaluator[Any], Evaluator[Any]],
+    *,
+    common: bool,
 ) -> list[str]:
     mine, theirs = (each.tokens for each in evaluators)
     if mine != theirs and not common:
@@ -343,7 +384,9 @@ def _shared_tokens(
         )
     shared = sorted(mine & theirs)
     if not shared:
-        raise EvaluationError(f"{bundles[0].folder} and {bundles[1].folder}: have no sample in common")
+        raise EvaluationError(
+            f"{bundles[0].folder} and {bundles[1].folder}: have no sample in common"
+        )
     return shared
 
 
@@ -379,7 +422,9 @@ def swaps_of(clusters: int, resampling: Resampling) -> Swaps:
         numbers = np.arange(number)[:, None]
         return Swaps(swapped=(numbers << 1) >> np.arange(clusters) & 1 == 1, complete=True)
     source = np.random.default_rng(resampling.seed)
-    return Swaps(swapped=source.integers(2, size=(resampling.resamples, clusters)) == 1, complete=False)
+    return Swaps(
+        swapped=source.integers(2, size=(resampling.resamples, clusters)) == 1, complete=False
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -408,7 +453,10 @@ class PairedTest:
 
 
 def paired_test(
-    evaluator: Evaluator[Any], runs: tuple[Clusters, Clusters], differences: Mapping[str, float], resampling: Resampling
+    evaluator: Evaluator[Any],
+    runs: tuple[Clusters, Clusters],
+    differences: Mapping[str, float],
+    resampling: Resampling,
 ) -> PairedTest:
     """Test the differences (number, by its path → second − first) of two runs' counts of the same clusters."""
     resampling = resampling if evaluator.has_intervals else replace(resampling, resamples=0)
@@ -417,7 +465,9 @@ def paired_test(
     unlike = [one != other for one, other in zip(*runs, strict=True)]
     swaps = swaps_of(sum(unlike), resampling)
     if resampling.resamples:
-        ordered = [[run[at] for at in np.argsort(np.logical_not(unlike), kind="stable")] for run in runs]
+        ordered = [
+            [run[at] for at in np.argsort(np.logical_not(unlike), kind="stable")] for run in runs
+        ]
         p = p_values(observed, swapped_differences(evaluator, ordered, swaps, names), swaps)
     if resampling.resamples and len(unlike) > 1:
         low, high, errors = difference_intervals(evaluator, runs, differences, resampling)
@@ -480,7 +530,10 @@ def holm(p: FloatArray) -> FloatArray:
 
 def undecided(test: PairedTest, at: int, together: int, scenarios: int) -> str:
     """Why a difference is not real, and how many more scenarios than these would decide it."""
-    difference, level = abs(float(test.differences[at])), (1 - test.resampling.confidence) / together
+    difference, level = (
+        abs(float(test.differences[at])),
+        (1 - test.resampling.confidence) / together,
+    )
     if math.isnan(difference):
         return "nothing to compare"
     if difference == 0:

@@ -230,7 +230,11 @@ class EvaluationRun:
             "format": SUMMARY_FORMAT,
             "version": SUMMARY_VERSION,
             **self.stamp,
-            **{name: each for name, each in self.setup.as_dict().items() if name not in ("task", "protocol")},
+            **{
+                name: each
+                for name, each in self.setup.as_dict().items()
+                if name not in ("task", "protocol")
+            },
             **{name: each for name, each in self.selection.as_dict().items() if name != "horizon"},
             "counts": {
                 "samples": len(self.evaluator),
@@ -348,8 +352,12 @@ def evaluate_results(
         IndexStoreError: files of these scenarios have changed since the index was made.
         WorkerError: a worker was killed, or cannot do the work.
     """
-    chosen = selection if isinstance(selection, SampleSelection) else default_selection(setup, selection)
-    loader = SampleLoader(dataset, results if isinstance(results, Results) else read_results(results), setup)
+    chosen = (
+        selection if isinstance(selection, SampleSelection) else default_selection(setup, selection)
+    )
+    loader = SampleLoader(
+        dataset, results if isinstance(results, Results) else read_results(results), setup
+    )
     check_recordings(loader.results, dataset)
     covered = coverage(dataset, loader.results.tokens, chosen, explain=not allow_partial)
     tokens = _covered_tokens(dataset, loader.results, chosen, covered, allow_partial=allow_partial)
@@ -363,7 +371,9 @@ def evaluate_results(
     prints = {"results": loader.results.fingerprint, "release": fingerprint(hashes)}
     checkpoint = None if out is None else checkpoint_path(out, setup, tokens, prints)
     samples = {token: token for token in tokens}
-    evaluator = evaluate_samples(setup.evaluator(), samples, loader, checkpoint=checkpoint, places=loader.places, **how)
+    evaluator = evaluate_samples(
+        setup.evaluator(), samples, loader, checkpoint=checkpoint, places=loader.places, **how
+    )
     return EvaluationRun(
         setup=setup,
         selection=chosen,
@@ -374,7 +384,9 @@ def evaluate_results(
         attributes=_AttributesWhenAsked(dataset, tokens),
         times_to_impact={token: dataset.get("sample", token)["time_to_impact"] for token in tokens},
         breakdowns=(),
-        release=ReleaseInfo(dataroot=str(dataset.dataroot), version=dataset.version, scenarios=hashes),
+        release=ReleaseInfo(
+            dataroot=str(dataset.dataroot), version=dataset.version, scenarios=hashes
+        ),
         results=results_info(loader.results),
     )
 
@@ -391,7 +403,12 @@ def results_info(results: Results) -> ResultsInfo:
 
 
 def _covered_tokens(
-    dataset: Dataset, results: Results, selection: SampleSelection, covered: Coverage, *, allow_partial: bool
+    dataset: Dataset,
+    results: Results,
+    selection: SampleSelection,
+    covered: Coverage,
+    *,
+    allow_partial: bool,
 ) -> list[str]:
     if not covered.is_complete and not allow_partial:
         remedy = (

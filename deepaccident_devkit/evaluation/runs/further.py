@@ -51,12 +51,18 @@ def extra_result(name: str) -> ExtraResult:
     if name not in loaders:
         loaders = offers(lambda plugin: plugin.extra_results).by_name
     if name not in loaders:
-        raise MissingPluginError(f"{name}: needs a plug-in that is not installed; install it, or the whole devkit")
+        raise MissingPluginError(
+            f"{name}: needs a plug-in that is not installed; install it, or the whole devkit"
+        )
     return loaders[name]()
 
 
 def with_further(
-    run: EvaluationRun, name: str, dataset: Dataset, resampling: Resampling | None = None, **how: Unpack[Engine]
+    run: EvaluationRun,
+    name: str,
+    dataset: Dataset,
+    resampling: Resampling | None = None,
+    **how: Unpack[Engine],
 ) -> EvaluationRun:
     """The same run with a further result, and intervals of its numbers.
 
@@ -81,5 +87,11 @@ def further_results(summary: Json) -> Iterator[tuple[ExtraResult, Json]]:
 def further_names(summary: Json) -> list[str]:
     """The names of the further results that a summary holds."""
     own = offers(lambda plugin: plugin.extra_results, own=True).by_name
-    found = {name for name, value in summary.items() if isinstance(value, Mapping) and "interval_notes" in value}
-    return [name for name in summary if name in found or (name in own and summary[name] is not None)]
+    found = {
+        name
+        for name, value in summary.items()
+        if isinstance(value, Mapping) and "interval_notes" in value
+    }
+    return [
+        name for name in summary if name in found or (name in own and summary[name] is not None)
+    ]

@@ -99,14 +99,22 @@ class OverBytes(Report):
     def to_text(self) -> str:
         """A line for each headline of each evaluation."""
         rows = [
-            ("number", "evaluation", "bytes a sample", "value", f"{self.resampling.confidence:.0%} interval"),
+            (
+                "number",
+                "evaluation",
+                "bytes a sample",
+                "value",
+                f"{self.resampling.confidence:.0%} interval",
+            ),
             *(
                 (
                     each.headline,
                     each.evaluation,
                     f"{each.bytes:,.0f}",
                     value_text(each.value, each.unit),
-                    "–" if each.low is None or each.high is None else f"[{each.low:.3f}, {each.high:.3f}]",
+                    "–"
+                    if each.low is None or each.high is None
+                    else f"[{each.low:.3f}, {each.high:.3f}]",
                 )
                 for each in self.points
             ),
@@ -120,7 +128,10 @@ class OverBytes(Report):
 
 
 def over_bytes(
-    folders: Sequence[str | os.PathLike[str]], resampling: Resampling | None = None, *, common: bool = False
+    folders: Sequence[str | os.PathLike[str]],
+    resampling: Resampling | None = None,
+    *,
+    common: bool = False,
 ) -> OverBytes:
     """The headlines that all of some bundles have, over the bytes that partners sent for them.
 
@@ -133,7 +144,10 @@ def over_bytes(
         ResultsError: one of them is no bundle.
         EvaluationError: results do not note the bytes; or as of `compare_bundles`.
     """
-    bundles, chosen = [read_bundle(path_of(folder)) for folder in folders], resampling or Resampling()
+    bundles, chosen = (
+        [read_bundle(path_of(folder)) for folder in folders],
+        resampling or Resampling(),
+    )
     sent = [each for bundle in bundles if (each := sent_bytes(bundle.summary))]
     if len(sent) < len(bundles):
         raise EvaluationError(
@@ -143,7 +157,9 @@ def over_bytes(
         )
     runs, tokens = comparable(bundles, common=common)
     task, points = bundles[0].setup.task, list[BytesPoint]()
-    clusters = dict(sorted(((token, cluster_of(scenario_of(token))) for token in tokens), key=itemgetter(1)))
+    clusters = dict(
+        sorted(((token, cluster_of(scenario_of(token))) for token in tokens), key=itemgetter(1))
+    )
     names = [bundle.folder.name for bundle in bundles]
     for name, bundle, by, run in zip(names, bundles, sent, runs, strict=True):
         result = run.compute(tokens)
@@ -162,11 +178,17 @@ def over_bytes(
             for each in headlines(result)
             if each.value is not None
         ]
-    shown = [name for name, count in Counter(each.headline for each in points).items() if count == len(bundles)]
+    shown = [
+        name
+        for name, count in Counter(each.headline for each in points).items()
+        if count == len(bundles)
+    ]
     return OverBytes(
         task=task,
         protocol=bundles[0].setup.protocol,
         samples=len(tokens),
         resampling=chosen,
-        points=tuple(each for headline in shown[:4] for each in points if each.headline == headline),
+        points=tuple(
+            each for headline in shown[:4] for each in points if each.headline == headline
+        ),
     )

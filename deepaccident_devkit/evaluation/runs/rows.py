@@ -29,8 +29,13 @@ def sample_rows(run: EvaluationRun) -> list[Row]:
     - warning: the plain values of the sample's counts, and how many entries its lists have;
     - planning, forecasting: the headlines of the sample.
     """
-    rows = [_which(run, token) | run.evaluator.sample_row(token) for token in sorted(run.evaluator.tokens)]
-    columns = dict.fromkeys(name for row in rows for name in row)  # a table of means has only what a sample counts in
+    rows = [
+        _which(run, token) | run.evaluator.sample_row(token)
+        for token in sorted(run.evaluator.tokens)
+    ]
+    columns = dict.fromkeys(
+        name for row in rows for name in row
+    )  # a table of means has only what a sample counts in
     return [{name: plain(row.get(name)) for name in columns} for row in rows]
 
 
@@ -56,14 +61,18 @@ def write_rows(path: Path, rows: Sequence[Mapping[str, Any]], stamp: Mapping[str
     """Write rows as a Parquet file, with a stamp in its metadata."""
     from pyarrow import parquet
 
-    parquet.write_table(rows_table(rows).replace_schema_metadata({STAMP_KEY: json.dumps(dict(stamp))}), path)
+    parquet.write_table(
+        rows_table(rows).replace_schema_metadata({STAMP_KEY: json.dumps(dict(stamp))}), path
+    )
 
 
 def rows_table(rows: Sequence[Mapping[str, Any]]) -> Any:
     """Make the Arrow table of rows with the same columns: texts, numbers, booleans or None, of one kind in a column."""
     import pyarrow as pa
 
-    return pa.table({name: _column([row[name] for row in rows]) for name in (rows[0] if rows else ())})
+    return pa.table(
+        {name: _column([row[name] for row in rows]) for name in (rows[0] if rows else ())}
+    )
 
 
 def read_rows(path: Path) -> tuple[list[dict[str, Any]], dict[str, Any]]:

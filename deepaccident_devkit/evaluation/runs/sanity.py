@@ -27,7 +27,12 @@ from deepaccident_devkit.evaluation.forecasting import Forecast, ForecastingTrut
 from deepaccident_devkit.evaluation.forecasting.metrics import SAME_TIME
 from deepaccident_devkit.evaluation.motion import actor_cells
 from deepaccident_devkit.evaluation.planning import Plan, PlanningScene
-from deepaccident_devkit.evaluation.predictions import Accident, MotionOutput, frames_there, labels_at_present
+from deepaccident_devkit.evaluation.predictions import (
+    Accident,
+    MotionOutput,
+    frames_there,
+    labels_at_present,
+)
 from deepaccident_devkit.evaluation.results import Results
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup, SampleLoader
 from deepaccident_devkit.evaluation.task import FrozenMappings
@@ -64,8 +69,16 @@ _MARGIN: Final = 2.0
 # The share that it has to reach, if not one half; in time, slow predictions reach a part, too.
 _LEAST: Final[Mapping[str, float]] = {"place": 0.2, "time": 0.4}
 # Cells, accidents, boxes, or places of paths that have to be hit.
-_EVIDENCE: Final = {"motion": 100, "accident": 4, "detection": 10, "planning": 10, "forecasting": 10}
-_THINGS: Final = dict(zip(_EVIDENCE, ("cells", "accidents", "true boxes", "places", "places"), strict=True))
+_EVIDENCE: Final = {
+    "motion": 100,
+    "accident": 4,
+    "detection": 10,
+    "planning": 10,
+    "forecasting": 10,
+}
+_THINGS: Final = dict(
+    zip(_EVIDENCE, ("cells", "accidents", "true boxes", "places", "places"), strict=True)
+)
 # Metres: as near on the ground, a box is found, and both places of an accident are hit on average.
 _NEAR: Final = 2.0
 # Nearer in height, 0.7 m, since LiDAR and ego frame differ by the LiDAR's height alone, some 2 m.
@@ -84,13 +97,19 @@ MOVING: Final = 4.0
 STRAIGHT: Final = np.deg2rad(15)
 # Name → the order of the given sizes, and by what they are multiplied to undo it.
 _SIZES: Final = {
-    f"sizes in the order {', '.join(('length', 'width', 'height')[axis] for axis in order)}": (order, 1.0)
+    f"sizes in the order {', '.join(('length', 'width', 'height')[axis] for axis in order)}": (
+        order,
+        1.0,
+    )
     for order in permutations(range(3))
     if order != (0, 1, 2)
 } | {"half sizes": ((0, 1, 2), 2.0), "double sizes": ((0, 1, 2), 0.5)}
 # Name → how much of the box's height is added to undo it.
 _HEIGHTS: Final = {"z of the lower face": 0.5, "z of the upper face": -0.5}
-_VELOCITIES: Final = {"velocities per frame": 1 / FRAME_PERIOD, "velocities per step": 1 / LABEL_STEP}
+_VELOCITIES: Final = {
+    "velocities per frame": 1 / FRAME_PERIOD,
+    "velocities per step": 1 / LABEL_STEP,
+}
 _DEGREES: Final = "yaw in degrees"
 # Name → what headings are multiplied by, and what is added to them, to undo it.
 _YAWS: Final = {
@@ -113,7 +132,9 @@ _SECONDS: Final = "times are in seconds after the present"
 # Group → mistakes that are undone on trial → what is right.
 _SAYS: Final[Mapping[str, Mapping[str, str]]] = {
     "place": {
-        **dict.fromkeys(_AXES, "x is forward and y to the left; of maps, state the orientation that they have"),
+        **dict.fromkeys(
+            _AXES, "x is forward and y to the left; of maps, state the orientation that they have"
+        ),
         "world frame for ego frame": "places are given in the world frame; give them in the present ego frame",
         "ego frame for world frame": 'boxes are given in the ego frame; move them by da.world_from(token, "ego")',
         "LiDAR frame for world frame": 'boxes are given in the LiDAR frame; move them by da.world_from(token, "lidar")',
@@ -179,7 +200,9 @@ class SanityReport(FrozenMappings):
         """Which mistakes were not made, or that nothing can be said; empty beside warnings of mistakes."""
         if not self.sought:
             return "Cannot say whether a mistake was made: there is too little to compare."
-        return "" if self.warnings else f"None of these mistakes was found: {', '.join(self.sought)}."
+        return (
+            "" if self.warnings else f"None of these mistakes was found: {', '.join(self.sought)}."
+        )
 
     def warnings_text(self) -> str:
         """Return the warnings alone, a line each; empty if there is none."""
@@ -209,7 +232,9 @@ def check_sanity(
         EvaluationError: the results are not of a kind that the task takes, or there is no sample.
     """
     if not tokens:
-        raise EvaluationError(f"{results.path}: there is no sample to look at, so that nothing can be compared")
+        raise EvaluationError(
+            f"{results.path}: there is no sample to look at, so that nothing can be compared"
+        )
     lists = results.task == "accident"
     alarmed = [token for token in tokens if lists and results.prediction(token)]  # few may be
     most = LISTS if results.task in ("accident", "planning") else SAMPLES
@@ -226,7 +251,9 @@ def check_sanity(
         warnings=(*mistakes_of(sums, results.task), *facts_of(seen, ranked=ranked)),
         compared=f"{hit:,.0f} of {whole:,.0f} {_THINGS[results.task]} are hit as they are given",
         sought=tuple(
-            name for name in filter(sums.__contains__, chain(*_SAYS.values())) if sums[name][:2].max() >= evidence
+            name
+            for name in filter(sums.__contains__, chain(*_SAYS.values()))
+            if sums[name][:2].max() >= evidence
         ),
     )
 
@@ -270,7 +297,10 @@ def mistakes_of(sums: Mapping[str, FloatArray], task: str) -> Iterator[str]:
         for name in filter(sums.__contains__, says):
             tally = class_tally(sums[name]) if name == _CLASSES else sums[name]
             score, given = map(_worst, tally[::2], tally[1::2])
-            if score >= max(_LEAST.get(group, 0.5), _MARGIN * given) and tally[0].sum() >= _EVIDENCE[task]:
+            if (
+                score >= max(_LEAST.get(group, 0.5), _MARGIN * given)
+                and tally[0].sum() >= _EVIDENCE[task]
+            ):
                 suspected.append((score, given, name))
         if suspected:
             score, given, name = max(suspected, key=itemgetter(0))
@@ -279,7 +309,10 @@ def mistakes_of(sums: Mapping[str, FloatArray], task: str) -> Iterator[str]:
                 return
         elif group in _UNFIT and group in sums:
             right, whole = sums[group][2:, 0].astype(int).tolist()
-            if whole >= max(_EVIDENCE[task], _LEAST["place"] * sums["place"][1].sum()) and right < whole / 2:
+            if (
+                whole >= max(_EVIDENCE[task], _LEAST["place"] * sums["place"][1].sum())
+                and right < whole / 2
+            ):
                 yield _UNFIT[group].format(right, whole)
 
 
@@ -298,7 +331,9 @@ def facts_of(seen: Sequence[Seen], *, ranked: bool) -> Iterator[str]:
             f"all {len(scores)} scores are {scores[0]:g}: numbers that depend on their order, such as an average "
             "precision, then say little; give surer predictions higher scores"
         )
-    if any(each.probabilities for each in seen) and all(each.probabilities or each.empty for each in seen):
+    if any(each.probabilities for each in seen) and all(
+        each.probabilities or each.empty for each in seen
+    ):
         yield (
             "all values of the heads' segmentation are between 0 and 1: write logits and not probabilities, which the "
             "released accident rule takes for actors everywhere"
@@ -346,24 +381,36 @@ def tallies_of(
     tallies = {group: tally_of(0, off <= near, np.isfinite(off).sum())}
     for name, things in undone.items():
         tells = np.isfinite(off) & (apart(things, given) > 2 * np.asarray(near))
-        tallies[name] = tally_of(tells & (apart(things, true) <= near), tells & (off <= near), tells.sum())
+        tallies[name] = tally_of(
+            tells & (apart(things, true) <= near), tells & (off <= near), tells.sum()
+        )
     return tallies
 
 
-def _motion_seen(_: SampleLoader, __: str, prediction: MotionOutput, label: MotionLabels, *___: object) -> Seen:
+def _motion_seen(
+    _: SampleLoader, __: str, prediction: MotionOutput, label: MotionLabels, *___: object
+) -> Seen:
     """Compare the cells of actors: for places in the present frame, for times where the frames differ."""
     frames, grid = frames_there(label), label.config.grid
     true = grid.reorient(labels_at_present(label).segmentation[:frames] == 1, "devkit")
     every = prediction.grid.reorient(actor_cells(prediction), "devkit")
     given = every[:frames]
-    axes_of = {name: axes for name, axes in _AXES.items() if grid.x == grid.y or axes[2] == 1} | {"place": (1, 1, 1)}
-    tallies = {name: _overlap(_turned_maps(given[:1], *axes), true[:1], given[:1]) for name, axes in axes_of.items()}
+    axes_of = {name: axes for name, axes in _AXES.items() if grid.x == grid.y or axes[2] == 1} | {
+        "place": (1, 1, 1)
+    }
+    tallies = {
+        name: _overlap(_turned_maps(given[:1], *axes), true[:1], given[:1])
+        for name, axes in axes_of.items()
+    }
     changing = true.any(axis=0) & ~true.all(axis=0)
     true, given, backwards = true & changing, given & changing, every[::-1][:frames] & changing
     times = {"frames reversed": _overlap(backwards, true, given)}
     if frames > FEWEST_FRAMES:
         times["one step late"] = _overlap(given[1:], true[:-1], given[:-1])
-    tallies |= {name: np.pad(each, ((0, 0), (0, len(every) - each.shape[1]))) for name, each in times.items()}
+    tallies |= {
+        name: np.pad(each, ((0, 0), (0, len(every) - each.shape[1])))
+        for name, each in times.items()
+    }
     values, empty = [heads.segmentation for heads in (prediction.heads or ())[-1:]], not every.any()
     probabilities = not empty and any(each.min() >= 0 and each.max() <= 1 for each in values)
     return Seen(tallies=tallies, empty=empty, probabilities=probabilities)
@@ -417,7 +464,12 @@ def _nearest(found: FloatArray, true: FloatArray) -> IntArray:
 
 def _pair_tallies(found: Boxes, true: Boxes) -> dict[str, FloatArray]:
     """Compare N true boxes with those found at their places on the ground."""
-    z, height, size, velocity = found.center[:, 2], true.size[:, 2], found.size, found.velocity[:, :2]
+    z, height, size, velocity = (
+        found.center[:, 2],
+        true.size[:, 2],
+        found.size,
+        found.velocity[:, :2],
+    )
     heights = {name: z + part * height for name, part in _HEIGHTS.items()}
     sizes = {name: factor * size[:, np.argsort(order)] for name, (order, factor) in _SIZES.items()}
     velocities = {name: factor * velocity for name, factor in _VELOCITIES.items()}
@@ -455,13 +507,19 @@ def class_tally(names: FloatArray) -> FloatArray:
     changed = np.flatnonzero((other != np.arange(len(names))) & (number >= _FEWEST))
     alone = len(changed) == 1 and 2 * number[changed].sum() < number.sum()
     if alone or len(set(other[changed])) < len(changed):
-        changed = changed[:0]  # a rare class, or several, that are taken for another: no mistake of order
+        changed = changed[
+            :0
+        ]  # a rare class, or several, that are taken for another: no mistake of order
     whole = number[changed]
     return np.array([names[changed, other[changed]], whole, names[changed, changed], whole])
 
 
 def _accidents_seen(
-    loader: SampleLoader, token: str, alarms: Sequence[Accident], _: object, context: AccidentContext
+    loader: SampleLoader,
+    token: str,
+    alarms: Sequence[Accident],
+    _: object,
+    context: AccidentContext,
 ) -> Seen:
     """Compare the surest accident with the true one: its places, and its time."""
     tallies: dict[str, FloatArray] = {}
@@ -474,7 +532,9 @@ def _accidents_seen(
             "frames reversed": loader.setup.horizon - time,
             "times in frames": time * FRAME_PERIOD,
         }
-        tallies |= tallies_of("place", places, surest.positions, true.positions, 2 * _NEAR, position_difference)
+        tallies |= tallies_of(
+            "place", places, surest.positions, true.positions, 2 * _NEAR, position_difference
+        )
         tallies |= tallies_of("time", times, time, true.time, NEAR_IN_TIME)
     return Seen(tallies=tallies, empty=not alarms, scores=[each.score for each in alarms])
 
@@ -483,13 +543,19 @@ def _places_undone(dataset: Dataset, token: str, places: FloatArray) -> dict[str
     """Mistake → places (N, 2) in the present ego frame where they should be."""
     in_world = np.column_stack([places, np.zeros(len(places))])
     in_ego = dataset.world_from(token, "ego").inverse().apply(in_world)[:, :2]
-    return {name: _turned(places, *axes) for name, axes in _AXES.items()} | {"world frame for ego frame": in_ego}
+    return {name: _turned(places, *axes) for name, axes in _AXES.items()} | {
+        "world frame for ego frame": in_ego
+    }
 
 
-def _plan_seen(loader: SampleLoader, token: str, plans: Sequence[Plan], scene: PlanningScene) -> Seen:
+def _plan_seen(
+    loader: SampleLoader, token: str, plans: Sequence[Plan], scene: PlanningScene
+) -> Seen:
     """Compare the best plan with the recorded path, and its headings with the recorded ones."""
     plan = max(plans, key=lambda plan: plan.score)
-    tallies = _path_tallies(loader, token, plan.times, plan.path, np.zeros(2), scene.recorded[_FRAMES, :2])
+    tallies = _path_tallies(
+        loader, token, plan.times, plan.path, np.zeros(2), scene.recorded[_FRAMES, :2]
+    )
     if plan.yaw is not None:
         undone = {name: factor * plan.yaw + offset for name, (factor, offset) in _YAWS.items()}
         undone[_DEGREES] = np.where(np.abs(plan.yaw) > _LARGE_YAW, np.deg2rad(plan.yaw), plan.yaw)
@@ -499,7 +565,9 @@ def _plan_seen(loader: SampleLoader, token: str, plans: Sequence[Plan], scene: P
     return Seen(tallies=tallies)
 
 
-def _forecasts_seen(loader: SampleLoader, token: str, forecasts: Sequence[Forecast], truth: ForecastingTruth) -> Seen:
+def _forecasts_seen(
+    loader: SampleLoader, token: str, forecasts: Sequence[Forecast], truth: ForecastingTruth
+) -> Seen:
     """Compare the most probable path of each actor with the recorded one."""
     tallies = []
     for forecast in forecasts:
@@ -511,7 +579,12 @@ def _forecasts_seen(loader: SampleLoader, token: str, forecasts: Sequence[Foreca
 
 
 def _path_tallies(
-    loader: SampleLoader, token: str, times: FloatArray, path: FloatArray, present: FloatArray, true: FloatArray
+    loader: SampleLoader,
+    token: str,
+    times: FloatArray,
+    path: FloatArray,
+    present: FloatArray,
+    true: FloatArray,
 ) -> dict[str, FloatArray]:
     """Compare a path (T, 2) from a present place (2,) with the first true places (S, 2) at `_STEPS`."""
     places = _places_undone(loader.dataset, token, path)
@@ -525,7 +598,9 @@ def _path_tallies(
         "": (times, path),
     }
     true = true[: np.count_nonzero(times[-1] + SAME_TIME >= _STEPS)]
-    undone = {name: _places_at(when, where, present)[: len(true)] for name, (when, where) in paths.items()}
+    undone = {
+        name: _places_at(when, where, present)[: len(true)] for name, (when, where) in paths.items()
+    }
     given = undone.pop("")
     near = np.maximum(_NEAR_ON_PATH, _distance(true, present) / 10)
     return tallies_of("place", undone, given, true, near, _distance)

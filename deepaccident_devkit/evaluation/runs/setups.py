@@ -35,7 +35,15 @@ from deepaccident_devkit.support.arrays import ShortRepr
 from deepaccident_devkit.support.files import remove_in
 from deepaccident_devkit.support.parallel import Places, Store, unfinished_folder
 from deepaccident_devkit.support.plugins import offers
-from deepaccident_devkit.support.text import choice, choices, counted, meant_text, path_of, settle_choices, spelled
+from deepaccident_devkit.support.text import (
+    choice,
+    choices,
+    counted,
+    meant_text,
+    path_of,
+    settle_choices,
+    spelled,
+)
 from deepaccident_devkit.support.version import __version__
 from deepaccident_devkit.taxonomy import AGENTS, FRAME_PERIOD, SPLIT_CHOICES, SPLITS, VEHICLE_AGENTS
 
@@ -89,10 +97,14 @@ class SampleSelection:
                 f"horizon: samples to evaluate are {LIST_STEP} s apart, so that {horizon:g} s does not say which; "
                 f"choose a multiple, or samples='all'"
             )
-        listed = samples(dataset, self.split, self.samples, "paper", horizon=horizon, scope=self.scope)
+        listed = samples(
+            dataset, self.split, self.samples, "paper", horizon=horizon, scope=self.scope
+        )
         if self.samples == "all" and self.scope == "accident":
             listed = [token for token in listed if token.partition("/")[0].endswith("_accident")]
-        chosen = [token for token in listed if self.agents is None or agent_of(token) in self.agents]
+        chosen = [
+            token for token in listed if self.agents is None or agent_of(token) in self.agents
+        ]
         if not chosen:
             whose = "" if self.agents is None else f" of {', '.join(self.agents)}"
             raise NotAvailableError(
@@ -114,8 +126,14 @@ class SampleSelection:
 
 def label_rules(task: str) -> dict[str, str]:
     """What to say of the name of a protocol of labels that is given as a protocol of a task."""
-    given = "; choose the labels by the switch labels={0!r} (--switch labels={0})" if task == "motion" else ""
-    return {name: f"; {name!r} is a protocol of labels{given.format(name)}" for name in LABEL_PROTOCOLS}
+    given = (
+        "; choose the labels by the switch labels={0!r} (--switch labels={0})"
+        if task == "motion"
+        else ""
+    )
+    return {
+        name: f"; {name!r} is a protocol of labels{given.format(name)}" for name in LABEL_PROTOCOLS
+    }
 
 
 def scenario_of(token: str) -> str:
@@ -165,15 +183,26 @@ class Coverage(ShortRepr):
         if self.is_complete:
             return f"all {self.expected} samples have a prediction, and nothing else has"
         parts = [
-            _named(self.missing, f"without a prediction: {len(self.missing)} of {counted(self.expected, 'sample')}"),
-            _named(self.extra, f"{counted(len(self.extra), 'prediction')} of samples that are not evaluated"),
-            _named(self.unknown, f"{counted(len(self.unknown), 'prediction')} of no sample of this release"),
+            _named(
+                self.missing,
+                f"without a prediction: {len(self.missing)} of {counted(self.expected, 'sample')}",
+            ),
+            _named(
+                self.extra,
+                f"{counted(len(self.extra), 'prediction')} of samples that are not evaluated",
+            ),
+            _named(
+                self.unknown,
+                f"{counted(len(self.unknown), 'prediction')} of no sample of this release",
+            ),
         ]
         if self.options:
             remedy = "evaluate with these options, too, or predict again without them"
             parts = [f"the predictions are of the samples of {self.options}: {remedy}"]
         elif self.agents:
-            parts.append(f"the predictions are of --split {', '.join(self.splits)} --agents {','.join(self.agents)}")
+            parts.append(
+                f"the predictions are of --split {', '.join(self.splits)} --agents {','.join(self.agents)}"
+            )
         if self.extra and not (self.missing or self.unknown):
             parts.append(
                 "leave them out with --allow-partial (allow_partial=True), or evaluate whole scenarios with --samples "
@@ -203,7 +232,9 @@ def coverage(
     others = given.difference(expected)
     unknown = {token for token in others if not _is_sample(dataset, token)}
     present = set(map(agent_of, given - unknown))
-    of_scenarios = {dataset.get("scenario", name)["split"] for name in set(map(scenario_of, given - unknown))}
+    of_scenarios = {
+        dataset.get("scenario", name)["split"] for name in set(map(scenario_of, given - unknown))
+    }
     splits = tuple(name for name in SPLITS if name in of_scenarios)
     agents = tuple(name for name in AGENTS if name in present)
     is_sought = explain or given.isdisjoint(expected)
@@ -215,12 +246,18 @@ def coverage(
         unknown=tuple(sorted(unknown)),
         splits=splits,
         agents=agents,
-        options=_missing_options(dataset, given, selection, splits, agents) if is_sought and is_known else "",
+        options=_missing_options(dataset, given, selection, splits, agents)
+        if is_sought and is_known
+        else "",
     )
 
 
 def _missing_options(
-    dataset: Dataset, tokens: set[str], asked: SampleSelection, splits: Iterable[str], agents: tuple[str, ...]
+    dataset: Dataset,
+    tokens: set[str],
+    asked: SampleSelection,
+    splits: Iterable[str],
+    agents: tuple[str, ...],
 ) -> str:
     """Return the options that select exactly these samples, where they differ; empty if there are none."""
     horizon = max(dataset.get("sample", token)["time_to_end"] for token in tokens)
@@ -236,7 +273,10 @@ def _missing_options(
         with suppress(ConfigError, NotAvailableError):
             if set(made.tokens(dataset)) == tokens:
                 changed = asdict(made).items() - asdict(asked).items()
-                texts = {name: ",".join(value) if name == "agents" else value for name, value in sorted(changed)}
+                texts = {
+                    name: ",".join(value) if name == "agents" else value
+                    for name, value in sorted(changed)
+                }
                 return " ".join(f"--{name} {text}" for name, text in texts.items())
     return ""
 
@@ -249,7 +289,11 @@ def release_note(dataset: Dataset, scenarios: Iterable[str]) -> dict[str, Any]:
         scenarios: tokens of the scenarios that have a prediction.
     """
     recordings = dataset.recordings(scenarios)
-    return {"version": dataset.version, "index": dataset.tables_folder.name, "recordings": recordings}
+    return {
+        "version": dataset.version,
+        "index": dataset.tables_folder.name,
+        "recordings": recordings,
+    }
 
 
 def check_recordings(results: Results, dataset: Dataset) -> None:
@@ -318,9 +362,13 @@ def evaluator_class(task: str) -> type[Evaluator[Any]]:
     names = (*TASKS, *found.by_name)
     remedy = f"; if a plug-in has this task, install it. {found.refusals_text()}".rstrip()
     hint = meant_text(str(task), names) or remedy
-    evaluator = found.by_name[choice("task", task, names, elsewhere={str(task).lower(): hint})].load()
+    evaluator = found.by_name[
+        choice("task", task, names, elsewhere={str(task).lower(): hint})
+    ].load()
     if not evaluator.protocols:
-        raise ConfigError(f"{evaluator.__name__}: has no protocols; give it one, such as an empty frozen dataclass")
+        raise ConfigError(
+            f"{evaluator.__name__}: has no protocols; give it one, such as an empty frozen dataclass"
+        )
     return evaluator
 
 
@@ -349,10 +397,14 @@ class EvaluationSetup:
         task = evaluator_class(self.task)
         object.__setattr__(self, "task", task.task)
         protocols = task.protocols
-        protocol = choice(f"protocol of {self.task}", self.protocol, protocols, elsewhere=label_rules(self.task))
+        protocol = choice(
+            f"protocol of {self.task}", self.protocol, protocols, elsewhere=label_rules(self.task)
+        )
         object.__setattr__(self, "protocol", protocol)
         if not 0 < self.horizon <= _LONGEST_HORIZON:
-            raise ConfigError(f"horizon: expected seconds above 0, at most {_LONGEST_HORIZON}, found {self.horizon!r}")
+            raise ConfigError(
+                f"horizon: expected seconds above 0, at most {_LONGEST_HORIZON}, found {self.horizon!r}"
+            )
         object.__setattr__(self, "switches", FrozenDict(self.switches))
         switched(protocols[protocol], self.switches)  # refuses impossible choices
 
@@ -367,7 +419,10 @@ class EvaluationSetup:
 
     def as_dict(self) -> dict[str, Any]:
         """All of it, as JSON holds it, with the evaluator's own `settings`: every choice."""
-        return asdict(self) | {"switches": dict(self.switches), "settings": self.evaluator().settings}
+        return asdict(self) | {
+            "switches": dict(self.switches),
+            "settings": self.evaluator().settings,
+        }
 
 
 def default_selection(
@@ -392,7 +447,9 @@ def default_selection(
     """
     if agents is None and evaluator_class(setup.task).vehicles_only:
         agents = VEHICLE_AGENTS
-    listed: SampleList = samples or ("all" if evaluator_class(setup.task).needs_whole_recordings else "evaluate")
+    listed: SampleList = samples or (
+        "all" if evaluator_class(setup.task).needs_whole_recordings else "evaluate"
+    )
     return SampleSelection(
         split=os.fspath(split),
         samples=listed,
@@ -430,7 +487,10 @@ class SampleLoader:
                 "give motion results, or choose protocol 'paper' or 'boxes'"
             )
         form = self.results.form
-        if form is not None and (ahead := (form.frames - 1) * form.step) < self.setup.horizon - FRAME_PERIOD / 2:
+        if (
+            form is not None
+            and (ahead := (form.frames - 1) * form.step) < self.setup.horizon - FRAME_PERIOD / 2
+        ):
             raise EvaluationError(
                 f"{self.results.path}: its predictions look {ahead:g} s ahead "
                 f"({form.frames} frames, {form.step:g} s apart, from the present on), less than the horizon of "
@@ -444,7 +504,9 @@ class SampleLoader:
 
     def __call__(self, token: str) -> tuple[Any, ...]:
         """Return the prediction of a sample and its truth, which the evaluator's `update` takes."""
-        truth = self.setup.evaluator().truth(self.dataset, token, self.results.form, self.setup.horizon)
+        truth = self.setup.evaluator().truth(
+            self.dataset, token, self.results.form, self.setup.horizon
+        )
         return self.prediction(token), *truth
 
     def prediction(self, token: str) -> Any:
@@ -453,7 +515,9 @@ class SampleLoader:
 
     def label(self, token: str) -> MotionLabels | None:
         """The sample's motion labels that the results are compared with; None where there is none."""
-        return compared_labels(self.dataset, token, self.setup.rules, self.results.form, self.setup.horizon)
+        return compared_labels(
+            self.dataset, token, self.setup.rules, self.results.form, self.setup.horizon
+        )
 
 
 _COUNTS: Final = "counts"
@@ -464,7 +528,9 @@ def evaluation_store(out: str | os.PathLike[str], command: str = "") -> Store:
 
     `command` says which evaluation that is.
     """
-    return Store(unfinished_folder(path_of(out)), path_of(out), "evaluates for it", ResultsError, command)
+    return Store(
+        unfinished_folder(path_of(out)), path_of(out), "evaluates for it", ResultsError, command
+    )
 
 
 def checkpoint_path(

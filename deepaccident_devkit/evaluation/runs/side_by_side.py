@@ -35,8 +35,13 @@ def side_by_side(bundles: Sequence[Bundle]) -> SideBySide:
     numbers = [{each["name"]: each["text"] for each in summary["headlines"]} for summary in told]
     rows = {
         "evaluation": [bundle.folder.name for bundle in bundles],
-        "release": [f"{summary['release']['dataroot']}, {summary['release']['version']}" for summary in told],
-        "rules": [", ".join(map(str, (each["task"], each["protocol"], *each["switches"].values()))) for each in told],
+        "release": [
+            f"{summary['release']['dataroot']}, {summary['release']['version']}" for summary in told
+        ],
+        "rules": [
+            ", ".join(map(str, (each["task"], each["protocol"], *each["switches"].values())))
+            for each in told
+        ],
         "samples": [f"{summary['counts']['samples']:,}" for summary in told],
         **{name: [own.get(name, "–") for own in numbers] for own in numbers for name in own},
     }

@@ -50,7 +50,11 @@ _CLEAN_COLUMNS: Final[Mapping[str, str]] = {
     "tta_hit": "operating/tta_hit",
 }
 _PRINTED: Final = {"AP": "average_precision", "mTTA": "mean_time", "TTA@R80": "time_at_r80"}
-_AT_HALF: Final = {"P@0.5": "precision_at_half", "R@0.5": "recall_at_half", "TTA@0.5": "time_at_half"}
+_AT_HALF: Final = {
+    "P@0.5": "precision_at_half",
+    "R@0.5": "recall_at_half",
+    "TTA@0.5": "time_at_half",
+}
 _FIELD_COLUMNS: Final[Mapping[str, Mapping[str, str]]] = {
     "ustring": _PRINTED,
     "dsta": _PRINTED | {"P@R80": "precision_at_r80"},
@@ -74,7 +78,11 @@ def summary_text(summary: Json, by: Sequence[str] = SHOWN_BREAKDOWNS) -> str:
         ("means", _means_text(summary)),
         *((each.title, each.text(part)) for each, part in further_results(summary)),
         ("counts", _counts(summary["metrics"])),
-        *((f"by {name}", _breakdown(summary, name)) for name in by if name in summary["breakdowns"]),
+        *(
+            (f"by {name}", _breakdown(summary, name))
+            for name in by
+            if name in summary["breakdowns"]
+        ),
         ("notes", "\n".join([*notes_of(summary["metrics"]), *reading_notes(summary)])),
     ]
     return "\n\n".join(f"{title}{mark}\n{_indented(text)}" for title, text in blocks if text)
@@ -110,7 +118,9 @@ def _headlines(summary: Json) -> str:
     intervals = groups[0]["intervals"] if groups else {}
     beside: Mapping[str, Any] = summary["metrics"].get("beside") or {}
     percent = f"{everyone['resampling']['confidence']:.0%} interval" if intervals else ""
-    rows = [("number", "value", *([percent] if percent else []), *(f"if {name}" for name in beside))]
+    rows = [
+        ("number", "value", *([percent] if percent else []), *(f"if {name}" for name in beside))
+    ]
     for each in summary["headlines"]:
         interval = [_interval(intervals.get(each["path"]))] if percent else []
         others = (_number(_at(part, each["path"])) for part in beside.values())
@@ -118,13 +128,20 @@ def _headlines(summary: Json) -> str:
     notes = groups[0]["notes"] if groups else []
     if percent:  # by the names of the rows, of which some may have no interval
         names = [name for name, value, interval, *_ in rows if interval == "–" != value]
-        notes = [f"no interval of {', '.join(names)}: too few clusters have or change them"] * bool(names)
+        notes = [f"no interval of {', '.join(names)}: too few clusters have or change them"] * bool(
+            names
+        )
     return "\n".join([columns_text(rows), *notes])
 
 
 def _counts(metrics: Json) -> str:
     """A line for each part of the metrics that holds whole numbers."""
-    return _aligned({part: ", ".join(map(" ".join, numbers.items())) for part, numbers in _whole_numbers(metrics, "")})
+    return _aligned(
+        {
+            part: ", ".join(map(" ".join, numbers.items()))
+            for part, numbers in _whole_numbers(metrics, "")
+        }
+    )
 
 
 def _whole_numbers(part: Json, path: str) -> Iterator[tuple[str, dict[str, str]]]:
@@ -140,12 +157,18 @@ def _whole_numbers(part: Json, path: str) -> Iterator[tuple[str, dict[str, str]]
 def _whole(value: object) -> str:
     """Text of a whole number, or of several; empty for all else."""
     numbers = value if isinstance(value, list) else [value]
-    return "+".join(map(str, numbers)) if numbers and all(type(each) is int for each in numbers) else ""
+    return (
+        "+".join(map(str, numbers))
+        if numbers and all(type(each) is int for each in numbers)
+        else ""
+    )
 
 
 def _breakdown(summary: Json, name: str) -> str:
     shown = summary["headlines"][:_COLUMNS]
-    names = (each["name"] + ("" if each["unit"] == "share" else f", {each['unit']}") for each in shown)
+    names = (
+        each["name"] + ("" if each["unit"] == "share" else f", {each['unit']}") for each in shown
+    )
     rows = [("value", "samples", "scenarios", *names)]
     for group in summary["breakdowns"][name]["groups"]:
         values = (_number(group["headlines"].get(each["path"])) for each in shown)
@@ -158,7 +181,9 @@ def notes_of(metrics: Json) -> Iterator[str]:
     """What a result says beside its numbers, each sentence once."""
     yield from dict.fromkeys(metrics.get("notes") or ())
     for name, part in (metrics.get("beside") or {}).items():
-        yield from (f"if {name}: {note}" for note in part.get("notes") or () if note not in metrics["notes"])
+        yield from (
+            f"if {name}: {note}" for note in part.get("notes") or () if note not in metrics["notes"]
+        )
 
 
 def _at(part: Any, path: str) -> Any:
@@ -190,7 +215,10 @@ def predictor_tables(metrics: Json) -> list[Table]:
     for group, given in groups.items():
         everyone = {GIVEN: given, **{name: each[group] for name, each in references.items()}}
         columns = _CLEAN_COLUMNS if clean else _FIELD_COLUMNS[group.partition(" ")[0]]
-        rows = [(name, *(_cell(figures, path) for path in columns.values())) for name, figures in everyone.items()]
+        rows = [
+            (name, *(_cell(figures, path) for path in columns.values()))
+            for name, figures in everyone.items()
+        ]
         notes = tuple(_operating(metrics, given)) if clean else ()
         tables.append(Table(rows=((group, *columns), *rows), notes=notes))
     return tables
@@ -207,7 +235,10 @@ def means_tables(summary: Json) -> dict[str, Table]:
     Numbers are the columns, or where they are more than the rows, these.
     """
     tables, metrics = {}, summary["metrics"]
-    units = {row.path.rpartition("/")[2]: row.unit for row in evaluator_class(summary["task"]).result_class.rows}
+    units = {
+        row.path.rpartition("/")[2]: row.unit
+        for row in evaluator_class(summary["task"]).result_class.rows
+    }
     for name, means in (metrics.get("means") or {}).items():
         counted = metrics["counted"][name]
         columns = dict.fromkeys(column for row in means.values() for column in row)
@@ -215,7 +246,9 @@ def means_tables(summary: Json) -> dict[str, Table]:
         most = {row: max(counts.values()) for row, counts in counted.items()}
         cells = [(name, "n", *headings)]
         for row, values in means.items():
-            told = (_mean(values.get(each), counted[row].get(each, 0), most[row]) for each in columns)
+            told = (
+                _mean(values.get(each), counted[row].get(each, 0), most[row]) for each in columns
+            )
             cells.append((row, f"{most[row]:,}", *told))
         wide = len(cells[0]) > len(cells) + _WIDER
         tables[name] = Table(rows=list(zip(*cells, strict=True)) if wide else cells)
@@ -253,11 +286,18 @@ def _operating(metrics: Json, given: Json) -> Iterator[str]:
     operating, after = given["operating"], given["tta0_after"]
     threshold = operating["threshold"]
     found = "none" if threshold is None else f"{threshold:.4g}"
-    how = "given" if metrics["operating_by"] == "given" else "of recall 0.8, or the highest, on these recordings"
+    how = (
+        "given"
+        if metrics["operating_by"] == "given"
+        else "of recall 0.8, or the highest, on these recordings"
+    )
     others = ", ".join(f"{name} {_cell(given, name)}" for name in _TOLD)
     yield f"threshold {found} ({how}); for another split: {others}"
     if after:
-        told = ", ".join(f"{latency} s: {'–' if left is None else f'{left:.3f} s'}" for latency, left in after.items())
+        told = ", ".join(
+            f"{latency} s: {'–' if left is None else f'{left:.3f} s'}"
+            for latency, left in after.items()
+        )
         yield f"tta0 if the two who collide are told after a latency of {told}"
 
 
@@ -284,7 +324,11 @@ def results_text(results: Results) -> str:
 def reading_notes(summary: Json) -> list[str]:
     """Sentences on a summary's numbers: cells, frames and predictions that published ones do not have, and others."""
     form, metrics = summary["results"]["form"], summary["metrics"]
-    notes = [] if form is None else [*_cells(form, metrics.get("ranges") or ()), *_frames(form, summary["horizon"])]
+    notes = (
+        []
+        if form is None
+        else [*_cells(form, metrics.get("ranges") or ()), *_frames(form, summary["horizon"])]
+    )
     released = summary["protocol"] == "released"
     if summary["task"] == "motion":
         notes += _paths(metrics)
@@ -310,7 +354,9 @@ def _infeasible(metrics: Json) -> Iterator[str]:
 def _cells(form: Json, ranges: Sequence[str]) -> Iterator[str]:
     if form["x"] == form["y"] == _PUBLISHED_CELLS:
         return
-    axes = ", ".join(f"{name} from {low:g} to {high:g} m" for name in "xy" for low, high, _ in [form[name]])
+    axes = ", ".join(
+        f"{name} from {low:g} to {high:g} m" for name in "xy" for low, high, _ in [form[name]]
+    )
     yield (
         f"the maps have cells of {form['x'][2]:g} m, {axes}, and so have the labels that they are compared with; "
         "published numbers are of cells of 0.5 m, x and y from -50 to 50 m, and cannot be compared with these"

@@ -62,7 +62,9 @@ class Difference(ShortRepr):
 
     def text(self) -> str:
         """In a line."""
-        where = shortened(self.where if self.where.isprintable() else ascii(self.where), _LONGEST_PLACE)
+        where = shortened(
+            self.where if self.where.isprintable() else ascii(self.where), _LONGEST_PLACE
+        )
         return f"{where}: stored {_short(self.stored)}, found {_short(self.found)}"
 
 
@@ -76,15 +78,22 @@ def differing(
     if path in without:
         return
     parts: Mapping[Any, tuple[Any, Any]] = {}
-    stored, found = (value.as_dict() if isinstance(value, ScenarioHashes) else value for value in (stored, found))
+    stored, found = (
+        value.as_dict() if isinstance(value, ScenarioHashes) else value for value in (stored, found)
+    )
     if isinstance(stored, Mapping) and isinstance(found, Mapping):
-        parts = {name: (stored.get(name, ABSENT), found.get(name, ABSENT)) for name in {**stored, **found}}
+        parts = {
+            name: (stored.get(name, ABSENT), found.get(name, ABSENT))
+            for name in {**stored, **found}
+        }
     elif isinstance(stored, list) and isinstance(found, list) and len(stored) == len(found):
         parts = dict(enumerate(zip(stored, found, strict=True)))
     elif type(stored) is not type(found) or stored != found:
         yield path, stored, found
     for name, (one, other) in parts.items():
-        yield from differing(one, other, without=without, path=f"{path}/{name}" if path else str(name))
+        yield from differing(
+            one, other, without=without, path=f"{path}/{name}" if path else str(name)
+        )
 
 
 def _short(value: Any) -> str:
@@ -182,7 +191,9 @@ def verify_bundle(
         found += _differences(bundle, run)
         notes += [
             f"evaluated with {name} {stored}, verified with {now}"
-            for name, stored, now in differing(bundle.summary["environment"], run.summary()["environment"])
+            for name, stored, now in differing(
+                bundle.summary["environment"], run.summary()["environment"]
+            )
         ]
     if bundle.summary.get("sanity") is not None:
         notes.append("the sanity check is not made again")
@@ -231,7 +242,9 @@ def _resampling(part: Any) -> Resampling:
     try:
         return Resampling(**part["resampling"])
     except (LookupError, TypeError) as error:
-        raise ResultsError(f"{SUMMARY_FILE}: does not say how intervals were made ({error})") from error
+        raise ResultsError(
+            f"{SUMMARY_FILE}: does not say how intervals were made ({error})"
+        ) from error
 
 
 def _differences(bundle: Bundle, run: EvaluationRun) -> Iterator[Difference]:
@@ -239,17 +252,27 @@ def _differences(bundle: Bundle, run: EvaluationRun) -> Iterator[Difference]:
     elsewhere = ("split",) if "split" in bundle.outside_paths() else ()
     truth, summary = dict(run.release.scenarios), run.summary()
     with suppress(ResultsError):  # is a difference of the file, below
-        truth |= {token: hashes for token, hashes in bundle.scenarios().items() if hashes.is_like(truth.get(token))}
+        truth |= {
+            token: hashes
+            for token, hashes in bundle.scenarios().items()
+            if hashes.is_like(truth.get(token))
+        }
         summary["release"]["fingerprint"] = fingerprint(truth)
-    for where, stored, found in differing(bundle.summary, summary, without=(*_NOT_COMPARED, *elsewhere)):
+    for where, stored, found in differing(
+        bundle.summary, summary, without=(*_NOT_COMPARED, *elsewhere)
+    ):
         yield Difference(where=f"{SUMMARY_FILE}: {where}", stored=stored, found=found)
-    rows = {row["token"]: row for row in rows_table(sample_rows(run)).to_pylist()}  # as a file would have them
+    rows = {
+        row["token"]: row for row in rows_table(sample_rows(run)).to_pylist()
+    }  # as a file would have them
     yield from _compared(SCENARIOS_FILE, bundle.scenarios, lambda _: truth)
     yield from _compared(COUNTS_FILE, bundle.counts, lambda _: dict(run.evaluator.counts))
     yield from _compared(ROWS_FILE, bundle.rows, lambda _: rows)
 
 
-def _compared(name: str, read: Callable[[], Any], again: Callable[[Any], Any]) -> Iterator[Difference]:
+def _compared(
+    name: str, read: Callable[[], Any], again: Callable[[Any], Any]
+) -> Iterator[Difference]:
     """The differences of a bundle's file; one if it cannot be read."""
     try:
         stored = read()

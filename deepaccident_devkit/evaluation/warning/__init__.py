@@ -1,6 +1,10 @@
 """How early an accident is warned of, and how often an alarm is false."""
 
-from deepaccident_devkit.evaluation.warning.anticipation import AnticipationFigures, AnticipationResult, CleanWarnings
+from deepaccident_devkit.evaluation.warning.anticipation import (
+    AnticipationFigures,
+    AnticipationResult,
+    CleanWarnings,
+)
 from deepaccident_devkit.evaluation.warning.clean import CleanScores, OperatingPoint
 from deepaccident_devkit.evaluation.warning.evaluator import WARNING_PROTOCOLS, WarningEvaluator
 from deepaccident_devkit.evaluation.warning.field import (

@@ -36,7 +36,12 @@ RANDOM_DRAWS: Final = 20
 # Seconds that a warning may need from an agent that sees the danger to the two that collide.
 LATENCIES: Final = (0.0, 0.1, 0.3)
 _ANY: Final = float(np.nextafter(0.0, 1.0))
-_FIXED: Final[Mapping[str, float]] = {"always": 1.0, "never": 1.0, "random per frame": 0.5, "random per recording": 0.5}
+_FIXED: Final[Mapping[str, float]] = {
+    "always": 1.0,
+    "never": 1.0,
+    "random per frame": 0.5,
+    "random per recording": 0.5,
+}
 
 
 def reference_threshold(predictor: str) -> float:
@@ -146,9 +151,13 @@ class CleanWarnings:
             notes=tuple(_notes(samples, recordings, self)),
         )
 
-    def resampled(self, parts: Sequence[Sequence[Counts]], times: IntArray) -> Iterator[AnticipationResult]:
+    def resampled(
+        self, parts: Sequence[Sequence[Counts]], times: IntArray
+    ) -> Iterator[AnticipationResult]:
         """The result of each draw, without references; see `Evaluator.resampled`."""
-        tables = {group: _Table(those, GIVEN, self) for group, those in by_group(recordings_of(parts))}
+        tables = {
+            group: _Table(those, GIVEN, self) for group, those in by_group(recordings_of(parts))
+        }
         samples, beyond = (
             np.array([sum(count(each) for each in part) for part in parts], dtype=np.int64)
             for count in (lambda _: 1, lambda each: each["beyond"])
@@ -166,11 +175,15 @@ class CleanWarnings:
 class _Table:
     """One predictor's scores of one group of recordings, to be asked with any weights."""
 
-    def __init__(self, recordings: Sequence[Recording], predictor: str, rules: CleanWarnings, draw: int = 0) -> None:
+    def __init__(
+        self, recordings: Sequence[Recording], predictor: str, rules: CleanWarnings, draw: int = 0
+    ) -> None:
         self._predictor, self._rules = predictor, rules
         series = series_of(recordings, predictor, rules.scores_of, draw)
         everyone = (
-            None if rules.scores_of == "recording" else series_of(recordings, predictor, "recording", draw).highest()
+            None
+            if rules.scores_of == "recording"
+            else series_of(recordings, predictor, "recording", draw).highest()
         )
         self._scores = CleanScores(series, everyone)
         self._pairs = twin_pairs(recordings)
@@ -202,7 +215,9 @@ class _Table:
             at_p80=scores.at(scores.threshold_of_precision(weight), weight),
             best_f1=scores.threshold_of_best_f1(weight),
             quiet=scores.threshold_of_alarm_time(weight),
-            tta0_after={latency: after(latency) for latency in LATENCIES} if self._sees_others else {},
+            tta0_after={latency: after(latency) for latency in LATENCIES}
+            if self._sees_others
+            else {},
             recordings={kind: int(weight[self._kind == kind].sum()) for kind in KINDS},
             twins=int(weight[self._pairs[:, 0]].sum()),
         )
@@ -214,9 +229,13 @@ class _Table:
         return ratio(float((won * pairs).sum()), float(pairs.sum()))
 
 
-def _figures(recordings: Sequence[Recording], predictor: str, rules: CleanWarnings) -> AnticipationFigures:
+def _figures(
+    recordings: Sequence[Recording], predictor: str, rules: CleanWarnings
+) -> AnticipationFigures:
     """One predictor's figures; of a random one their means over some draws, so that no luck ranks it."""
-    drawn = [_Table(recordings, predictor, rules, draw).figures() for draw in range(draws_of(predictor))]
+    drawn = [
+        _Table(recordings, predictor, rules, draw).figures() for draw in range(draws_of(predictor))
+    ]
     return drawn[0] if len(drawn) == 1 else mean_of(drawn)
 
 
@@ -235,12 +254,18 @@ def mean_of(parts: Sequence[Any]) -> Any:
         return {name: mean_of([each[name] for each in parts]) for name in first}
     if is_dataclass(first) and not isinstance(first, type):
         return replace(
-            first, **{each.name: mean_of([getattr(part, each.name) for part in parts]) for each in fields(first)}
+            first,
+            **{
+                each.name: mean_of([getattr(part, each.name) for part in parts])
+                for each in fields(first)
+            },
         )
     return first
 
 
-def _notes(counts: Collection[Counts], recordings: Sequence[Recording], rules: CleanWarnings) -> Iterator[str]:
+def _notes(
+    counts: Collection[Counts], recordings: Sequence[Recording], rules: CleanWarnings
+) -> Iterator[str]:
     kinds = {each.kind for each in recordings}
     if recordings and "accident" not in kinds:
         yield "no recording of an accident was evaluated; give accident scenarios too for warnings"

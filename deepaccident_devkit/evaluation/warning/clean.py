@@ -82,14 +82,18 @@ class CleanScores:
         self._scores = np.where(valid, series.scores, -np.inf)
         lasting = np.minimum(self._scores[:, 1:], self._scores[:, :-1])
         self._lasting = np.concatenate([np.full((len(lasting), 1), -np.inf), lasting], axis=1)
-        is_early = series.toa[:, None] - np.arange(series.scores.shape[1]) > EARLY * series.fps + _SLACK
+        is_early = (
+            series.toa[:, None] - np.arange(series.scores.shape[1]) > EARLY * series.fps + _SLACK
+        )
         self._early = valid & series.positive[:, None] & is_early
         # beyond all thresholds of use: those that a recording's highest score is
         self._levels = np.unique(self.highest[np.isfinite(self.highest)])[::-1]
         self._leads = series.leads(self._levels)
         self._place = np.searchsorted(-self._levels, -self.highest, side="left")
         below = [np.searchsorted(row, self._levels) for row in np.sort(self._scores, axis=1)]
-        self._alarmed = self._scores.shape[1] - np.array(below).reshape(len(below), len(self._levels))
+        self._alarmed = self._scores.shape[1] - np.array(below).reshape(
+            len(below), len(self._levels)
+        )
 
     def __repr__(self) -> str:
         return f"CleanScores({self.series!r})"
@@ -125,7 +129,9 @@ class CleanScores:
         true, _ = self._raised(weight)
         gained = np.diff(true, prepend=0.0) / self._accidents(weight)
         positive = self.series.positive
-        seconds = np.where(np.isfinite(self._leads), self._leads, 0.0)[positive] * weight[positive, None]
+        seconds = (
+            np.where(np.isfinite(self._leads), self._leads, 0.0)[positive] * weight[positive, None]
+        )
         return math.fsum((gained * shares(seconds.sum(axis=0), true)).tolist())
 
     def threshold_of_highest_recall(self, weight: FloatArray) -> float:
@@ -141,7 +147,9 @@ class CleanScores:
     def threshold_of_precision(self, weight: FloatArray, precision: float = SAME_RECALL) -> float:
         """Of the thresholds with at least a precision that of the highest recall, then the highest; NaN if none has."""
         true, false = self._raised(weight)
-        good = np.flatnonzero((shares(true, true + false) >= precision - _SLACK) & (true + false > 0))
+        good = np.flatnonzero(
+            (shares(true, true + false) >= precision - _SLACK) & (true + false > 0)
+        )
         return float(self._levels[good[np.argmax(true[good])]]) if len(good) else math.nan
 
     def threshold_of_best_f1(self, weight: FloatArray) -> float:
@@ -157,7 +165,9 @@ class CleanScores:
         if not frames:
             return math.nan
         alarmed = (self._alarmed[others] * weight[others, None]).sum(axis=0)
-        raised = np.diff(sum(self._raised(weight)), prepend=0.0) > 0  # levels of recordings that count
+        raised = (
+            np.diff(sum(self._raised(weight)), prepend=0.0) > 0
+        )  # levels of recordings that count
         good = np.flatnonzero((alarmed * MINUTE <= seconds_per_minute * frames + _SLACK) & raised)
         return float(self._levels[good[-1]]) if len(good) else math.nan
 
@@ -186,10 +196,13 @@ class CleanScores:
             tta0=ratio(seconds, accidents),
             time_in_alarm=share,
             alarm_seconds_per_minute=share * MINUTE,
-            episodes_per_minute=ratio(float((begun.sum(axis=1) * others).sum()), frames / series.fps / MINUTE),
+            episodes_per_minute=ratio(
+                float((begun.sum(axis=1) * others).sum()), frames / series.fps / MINUTE
+            ),
             false_recordings=false,
             early_share=ratio(
-                float((early.sum(axis=1) * weight).sum()), float((self._early.sum(axis=1) * weight).sum())
+                float((early.sum(axis=1) * weight).sum()),
+                float((self._early.sum(axis=1) * weight).sum()),
             ),
         )
 
@@ -208,7 +221,11 @@ class CleanScores:
         """(K,) accident recordings, and others, whose highest score is at least each level."""
         there = np.isfinite(self.highest)
         true, false = (
-            np.cumsum(np.bincount(self._place[chosen], weight[chosen], len(self._levels)).astype(np.float64))
+            np.cumsum(
+                np.bincount(self._place[chosen], weight[chosen], len(self._levels)).astype(
+                    np.float64
+                )
+            )
             for chosen in (there & self.series.positive, there & ~self.series.positive)
         )
         return true, false

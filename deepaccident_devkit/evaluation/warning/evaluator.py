@@ -39,7 +39,9 @@ class WarningEvaluator(Evaluator[Any]):
     """
 
     task = "warning"
-    description = "Evaluate warnings: how early they come before accidents, and how often an alarm is false."
+    description = (
+        "Evaluate warnings: how early they come before accidents, and how often an alarm is false."
+    )
     result_kinds: ClassVar[tuple[str, ...]] = ("motion", "accident")
     protocols = WARNING_PROTOCOLS
     result_class = WarningResult

@@ -133,7 +133,9 @@ def _recordings(series: ScoreSeries, code: FieldCode) -> tuple[FieldFigures, flo
     high = np.flatnonzero(levels.recall >= 0.8)
     if code == "dsta" and not len(high):
         raise IndexError("no recall of 0.8")
-    return _of_levels(levels, precision_at_r80=float(levels.precision[high[0]]) if code == "dsta" else None)
+    return _of_levels(
+        levels, precision_at_r80=float(levels.precision[high[0]]) if code == "dsta" else None
+    )
 
 
 def _dad(series: ScoreSeries, _code: FieldCode) -> tuple[FieldFigures, float]:
@@ -142,7 +144,9 @@ def _dad(series: ScoreSeries, _code: FieldCode) -> tuple[FieldFigures, float]:
     thresholds = thresholds[thresholds != 0]
     points, _ = _counted(series, thresholds, _DAD_SECONDS)
     unused = np.zeros(series.scores.size - len(thresholds))
-    columns = (np.concatenate([each, unused]) for each in (points.precision, points.recall, points.time))
+    columns = (
+        np.concatenate([each, unused]) for each in (points.precision, points.recall, points.time)
+    )
     levels = _levels(_Points(*columns), drop_lowest=False)
     known = np.isfinite(levels.precision)
     if not known.any():
@@ -155,7 +159,9 @@ def _drive(series: ScoreSeries, _code: FieldCode) -> tuple[FieldFigures, float]:
     thresholds = np.arange(0, 1.1, 0.1)
     thresholds[[0, -1]] += (_NUDGE, -_NUDGE)
     counted = _frames(series, np.append(thresholds, 0.5))
-    precision, recall, time = (each[-1].item() for each in (counted.precision, counted.recall, counted.time))
+    precision, recall, time = (
+        each[-1].item() for each in (counted.precision, counted.recall, counted.time)
+    )
     points = _Points(counted.precision[:-1], counted.recall[:-1], counted.time[:-1])
     levels = _levels(points, drop_lowest=len(np.unique(points.recall)) > 1)
     return _of_levels(levels, precision_at_half=precision, recall_at_half=recall, time_at_half=time)
@@ -178,7 +184,9 @@ def _filled(series: ScoreSeries) -> ScoreSeries:
     )
 
 
-def _counted(series: ScoreSeries, thresholds: FloatArray, seconds: float) -> tuple[_Points, BoolArray]:
+def _counted(
+    series: ScoreSeries, thresholds: FloatArray, seconds: float
+) -> tuple[_Points, BoolArray]:
     """Recordings counted at each threshold, NaN for 0 / 0; and (K,) whether any recording raises an alarm.
 
     Times are shares of `toa` before the impact times `seconds`, missed accidents left out. At the threshold 0 a
@@ -225,7 +233,9 @@ def _levels(points: _Points, *, drop_lowest: bool) -> _Points:
         IndexError: no recall is left.
     """
     order = np.argsort(points.recall, kind="stable")
-    precision, recall, time = (each[order] for each in (points.precision, points.recall, points.time))
+    precision, recall, time = (
+        each[order] for each in (points.precision, points.recall, points.time)
+    )
     starts = np.unique(recall, return_index=True)[1]
     starts = starts[1:] if drop_lowest else starts
     if not len(starts):
@@ -258,7 +268,9 @@ def _nothing(code: FieldCode, why: str) -> FieldFigures:
         "dsta": {"precision_at_r80": math.nan},
         "drive": dict.fromkeys(("precision_at_half", "recall_at_half", "time_at_half"), math.nan),
     }.get(code, {})
-    return FieldFigures(average_precision=math.nan, mean_time=math.nan, time_at_r80=math.nan, note=why, **known)
+    return FieldFigures(
+        average_precision=math.nan, mean_time=math.nan, time_at_r80=math.nan, note=why, **known
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -290,7 +302,10 @@ class FieldWarnings:
     def result(self, counts: Collection[Counts], *, references: bool = False) -> FieldResult:
         """The metrics of some samples' counts, with those of the reference predictors or without."""
         parts = parts_of(counts)
-        groups, samples = dict(by_group(recordings_of(parts))), [sample for part in parts for sample in part]
+        groups, samples = (
+            dict(by_group(recordings_of(parts))),
+            [sample for part in parts for sample in part],
+        )
         made = {
             predictor: {
                 f"{code} {group}": field_figures(series_of(those, predictor, "recording"), code)
@@ -300,11 +315,17 @@ class FieldWarnings:
             for predictor in (PREDICTORS if references else PREDICTORS[:1])
         }
         given = made.pop(GIVEN)
-        notes = [*left_out_notes(samples), *(f"{name}: {each.note}" for name, each in given.items() if each.note)]
+        notes = [
+            *left_out_notes(samples),
+            *(f"{name}: {each.note}" for name, each in given.items() if each.note),
+        ]
         return FieldResult(
             samples=len(samples),
             figures=given,
             references=made,
             beyond=sum(each["beyond"] for each in samples),
-            notes=(*notes, "times and precisions of different codes are not comparable; the protocol clean ranks"),
+            notes=(
+                *notes,
+                "times and precisions of different codes are not comparable; the protocol clean ranks",
+            ),
         )

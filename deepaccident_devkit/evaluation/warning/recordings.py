@@ -16,7 +16,12 @@ from typing import Final, Literal, get_args
 import numpy as np
 
 from deepaccident_devkit.errors import EvaluationError
-from deepaccident_devkit.evaluation.alarms import Pair, named_alarms, position_difference, within_horizon
+from deepaccident_devkit.evaluation.alarms import (
+    Pair,
+    named_alarms,
+    position_difference,
+    within_horizon,
+)
 from deepaccident_devkit.evaluation.breakdowns import cluster_of
 from deepaccident_devkit.evaluation.evaluator import Counts
 from deepaccident_devkit.evaluation.map_accidents import TIE, AccidentReading
@@ -30,7 +35,13 @@ from deepaccident_devkit.evaluation.truth import (
     not_counted_notes,
 )
 from deepaccident_devkit.motion import MotionLabels
-from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray, FrozenArrays, IntArray
+from deepaccident_devkit.support.arrays import (
+    AnyArray,
+    BoolArray,
+    FloatArray,
+    FrozenArrays,
+    IntArray,
+)
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
 # Columns: times are decimal numbers, which binary numbers only approximate.
@@ -58,7 +69,9 @@ class ScoreSeries(FrozenArrays):
     @property
     def valid(self) -> BoolArray:
         """(N, T) whether there is a score that counts: all from the impact on do not exist."""
-        return np.asarray(~np.isnan(self.scores) & (np.arange(self.scores.shape[1]) < self.toa[:, None]))
+        return np.asarray(
+            ~np.isnan(self.scores) & (np.arange(self.scores.shape[1]) < self.toa[:, None])
+        )
 
     def highest(self) -> FloatArray:
         """(N,) the highest score of each recording; −inf without any."""
@@ -70,12 +83,16 @@ class ScoreSeries(FrozenArrays):
         column = np.ceil(self.toa[:, None] - moments - _SLACK).astype(np.int64)
         there = (column >= 0) & (column < self.scores.shape[1])
         rows = np.arange(len(self.toa))[:, None]
-        return np.where(there, np.where(self.valid, self.scores, np.nan)[rows, column * there], np.nan)
+        return np.where(
+            there, np.where(self.valid, self.scores, np.nan)[rows, column * there], np.nan
+        )
 
     def first(self, thresholds: FloatArray) -> IntArray:
         """(N, K) the first column with a score of at least each of K thresholds; T where there is none."""
         so_far = np.maximum.accumulate(np.where(self.valid, self.scores, -np.inf), axis=1)
-        first = np.array([np.searchsorted(row, thresholds, side="left") for row in so_far], dtype=np.int64)
+        first = np.array(
+            [np.searchsorted(row, thresholds, side="left") for row in so_far], dtype=np.int64
+        )
         return first.reshape(len(so_far), len(thresholds))
 
     def leads(self, thresholds: FloatArray) -> FloatArray:
@@ -186,10 +203,15 @@ def sample_counts(
         "ahead": None if ahead is None else round(ahead / FRAME_PERIOD),
         "to_end": None if end is None else round(end / FRAME_PERIOD),
         "alarms": [[each[0].score, int(_is_right(*each, truth, context))] for each in judged],
-        "unjudged": [each[0].score for each in within if each not in judged] if len(judged) < len(within) else [],
+        "unjudged": [each[0].score for each in within if each not in judged]
+        if len(judged) < len(within)
+        else [],
         "beyond": len(raised) - len(within),
         "references": [
-            surest([[each.score, int(_is_right(each, each.ids, truth, context))] for each in alarms], kind)
+            surest(
+                [[each.score, int(_is_right(each, each.ids, truth, context))] for each in alarms],
+                kind,
+            )
             for alarms in context.references.values()
         ],
     }
@@ -201,7 +223,12 @@ def surest(alarms: Sequence[Sequence[float]], kind: str) -> list[float | None]:
     Where nobody collides no alarm is right, and both are of the surest one.
     """
     best = max((score for score, _ in alarms), default=None)
-    return [max((score for score, right in alarms if right), default=None) if kind == "accident" else best, best]
+    return [
+        max((score for score, right in alarms if right), default=None)
+        if kind == "accident"
+        else best,
+        best,
+    ]
 
 
 def _place(token: object) -> tuple[str, int]:
@@ -220,13 +247,18 @@ def _kind(context: AccidentContext) -> _Kind:
     return "twins" if context.twin else "others"
 
 
-def _is_right(accident: Accident, ids: Pair | None, truth: BoxTruth, context: AccidentContext) -> bool:
+def _is_right(
+    accident: Accident, ids: Pair | None, truth: BoxTruth, context: AccidentContext
+) -> bool:
     """Whether an alarm names the pair that collides, in either order, or the place where they meet."""
     if context.time_to_impact is None or context.pair is None:
         return False
     if ids is not None and set(ids) == set(context.pair):
         return True
-    return truth.impact is not None and position_difference(accident.positions, truth.impact.positions) < _NEAR - TIE
+    return (
+        truth.impact is not None
+        and position_difference(accident.positions, truth.impact.positions) < _NEAR - TIE
+    )
 
 
 # What a sample's score in an accident recording is: that of its surest right alarm, or of its surest alarm.
@@ -240,7 +272,9 @@ GROUPS: Final = (*get_args(Involvement), "unknown")
 # Of a recording; the longest have some hundred.
 _MOST_FRAMES: Final = 10_000
 _PLACE: Final = itemgetter("recording", "frame")
-_COLUMN: Final[Mapping[ScoresOf, int]] = {name: column for column, name in enumerate(get_args(ScoresOf))}
+_COLUMN: Final[Mapping[ScoresOf, int]] = {
+    name: column for column, name in enumerate(get_args(ScoresOf))
+}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -275,7 +309,10 @@ PART: Final = "part"
 
 def parts_of(counts: Collection[Counts]) -> list[Sequence[Counts]]:
     """The samples' counts: those by themselves, then each group of them that was pooled."""
-    return [[each for each in counts if PART not in each], *(each[PART] for each in counts if PART in each)]
+    return [
+        [each for each in counts if PART not in each],
+        *(each[PART] for each in counts if PART in each),
+    ]
 
 
 def recordings_of(parts: Sequence[Collection[Counts]]) -> list[Recording]:
@@ -284,17 +321,22 @@ def recordings_of(parts: Sequence[Collection[Counts]]) -> list[Recording]:
         _recording(name, list(those), part)
         for part, counts in enumerate(parts)
         for name, those in groupby(
-            sorted((each for each in counts if each["kind"] != UNPLACED), key=_PLACE), key=itemgetter("recording")
+            sorted((each for each in counts if each["kind"] != UNPLACED), key=_PLACE),
+            key=itemgetter("recording"),
         )
     ]
 
 
 def left_out_notes(samples: Collection[Counts]) -> list[str]:
     """Say which samples and alarms do not count."""
-    return not_counted_notes(sum(each["kind"] == UNPLACED for each in samples), sum(each["beyond"] for each in samples))
+    return not_counted_notes(
+        sum(each["kind"] == UNPLACED for each in samples), sum(each["beyond"] for each in samples)
+    )
 
 
-def series_of(recordings: Sequence[Recording], predictor: str, scores_of: ScoresOf, draw: int = 0) -> ScoreSeries:
+def series_of(
+    recordings: Sequence[Recording], predictor: str, scores_of: ScoresOf, draw: int = 0
+) -> ScoreSeries:
     """The scores of some recordings, a column a step: the smallest from a sample to the next of any of them.
 
     Lengths must not tell which recordings end in an accident. So twins end where their accident does, and others at
@@ -310,15 +352,23 @@ def series_of(recordings: Sequence[Recording], predictor: str, scores_of: Scores
     step = max(min(gaps, default=1), 1)
     begin = np.array([each.frame[0] for each in recordings], dtype=np.float64)
     columns = [np.rint((each.frame - each.frame[0]) / step).astype(np.int64) for each in recordings]
-    scores = np.full((len(recordings), 1 + max((int(each[-1]) for each in columns), default=0)), np.nan)
+    scores = np.full(
+        (len(recordings), 1 + max((int(each[-1]) for each in columns), default=0)), np.nan
+    )
     for row, (recording, column) in enumerate(zip(recordings, columns, strict=True)):
         known = recording.scores.get(predictor)
-        scores[row, column] = _trivial(predictor, recording, draw) if known is None else known[:, _COLUMN[scores_of]]
+        scores[row, column] = (
+            _trivial(predictor, recording, draw) if known is None else known[:, _COLUMN[scores_of]]
+        )
     kinds = np.array([each.kind for each in recordings])
     toa = (np.array([each.end for each in recordings], dtype=np.float64) - begin) / step
     if (kinds == "accident").any():
-        toa[kinds == "others"] = np.minimum(toa, np.median(toa[kinds == "accident"]))[kinds == "others"]
-    return ScoreSeries(scores=scores, positive=kinds == "accident", toa=toa, fps=1 / (step * FRAME_PERIOD))
+        toa[kinds == "others"] = np.minimum(toa, np.median(toa[kinds == "accident"]))[
+            kinds == "others"
+        ]
+    return ScoreSeries(
+        scores=scores, positive=kinds == "accident", toa=toa, fps=1 / (step * FRAME_PERIOD)
+    )
 
 
 def twin_pairs(recordings: Sequence[Recording]) -> IntArray:
@@ -336,8 +386,12 @@ def _recording(name: str, samples: Sequence[Counts], part: int) -> Recording:
     first = samples[0]
     scenario, _, agent = name.rpartition("/")
     frame = np.array([each["frame"] for each in samples], dtype=np.int64)
-    if not (frame.min() >= 0 and frame.max() <= _MOST_FRAMES):  # a column each: else one could ask for gigabytes
-        raise EvaluationError(f"{name}: expected frames up to {_MOST_FRAMES:,}, found {frame.min()} to {frame.max()}")
+    if not (
+        frame.min() >= 0 and frame.max() <= _MOST_FRAMES
+    ):  # a column each: else one could ask for gigabytes
+        raise EvaluationError(
+            f"{name}: expected frames up to {_MOST_FRAMES:,}, found {frame.min()} to {frame.max()}"
+        )
     kind: _Kind = first["kind"]
     ends = [each["frame"] + each["to_end"] for each in samples if each["to_end"] is not None]
     given = [[*each["alarms"], *([score, 0] for score in each["unjudged"])] for each in samples]
@@ -352,7 +406,10 @@ def _recording(name: str, samples: Sequence[Counts], part: int) -> Recording:
         scores={
             GIVEN: _scores(surest(each, kind) for each in given),
             **{
-                name: _scores(each["references"][number] if each["references"] else [None, None] for each in samples)
+                name: _scores(
+                    each["references"][number] if each["references"] else [None, None]
+                    for each in samples
+                )
                 for number, name in enumerate(REFERENCES)
             },
         },
@@ -361,7 +418,9 @@ def _recording(name: str, samples: Sequence[Counts], part: int) -> Recording:
 
 def _scores(pairs: Iterable[Sequence[float | None]]) -> FloatArray:
     """(S, 2) of pairs of scores, None for no alarm."""
-    scores = np.array([[math.nan if each is None else each for each in pair] for pair in pairs], dtype=np.float64)
+    scores = np.array(
+        [[math.nan if each is None else each for each in pair] for pair in pairs], dtype=np.float64
+    )
     return np.nan_to_num(scores.reshape(-1, 2), nan=-np.inf, neginf=-np.inf)
 
 
@@ -369,7 +428,9 @@ def _trivial(predictor: str, recording: Recording, draw: int) -> FloatArray:
     """(S,) scores of a predictor that knows nothing; random ones are seeded by the recording and the draw."""
     if predictor in ("always", "never"):
         return np.full(len(recording.frame), 1.0 if predictor == "always" else -np.inf)
-    source = np.random.default_rng([zlib.crc32(recording.name.encode()), TRIVIAL.index(predictor), draw])
+    source = np.random.default_rng(
+        [zlib.crc32(recording.name.encode()), TRIVIAL.index(predictor), draw]
+    )
     frames = 1 if predictor == "random per recording" else int(recording.frame[-1]) + 1
     return source.random(frames)[recording.frame % frames]
 

@@ -74,14 +74,25 @@ def export_mcap(
     config = McapConfig.of(**choices)
     target = path_of(path)
     if target.is_dir():
-        raise ChoiceError(f"path: expected a file, such as {target / 'accident.mcap'}, found the folder {target}")
+        raise ChoiceError(
+            f"path: expected a file, such as {target / 'accident.mcap'}, found the folder {target}"
+        )
     try:
         from deepaccident_devkit.export.mcap.scenario import write_scenario
     except ModuleNotFoundError as error:
-        if (error.name or "").partition(".")[0] not in ("mcap", "mcap_protobuf", "foxglove_schemas_protobuf", "google"):
+        if (error.name or "").partition(".")[0] not in (
+            "mcap",
+            "mcap_protobuf",
+            "foxglove_schemas_protobuf",
+            "google",
+        ):
             raise
-        raise MissingExtraError(f"the MCAP export needs {error.name}: in a checkout, pip install '.[mcap]'") from error
-    return write_scenario(dataset, scenario, target, config, prediction=prediction, progress=progress)
+        raise MissingExtraError(
+            f"the MCAP export needs {error.name}: in a checkout, pip install '.[mcap]'"
+        ) from error
+    return write_scenario(
+        dataset, scenario, target, config, prediction=prediction, progress=progress
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -108,7 +119,9 @@ class McapConfig:
         object.__setattr__(self, "channels", _channel_names(self.channels))
         object.__setattr__(self, "frames", _frame_numbers(self.frames))
         if checked_whole("points", self.points, "n for every n-th point", ChoiceError) < 1:
-            raise ChoiceError(f"points: expected a number from 1, for every n-th point, found {self.points!r}")
+            raise ChoiceError(
+                f"points: expected a number from 1, for every n-th point, found {self.points!r}"
+            )
         if self.motion_labels is not None:
             object.__setattr__(self, "motion_labels", resolved_label_config(self.motion_labels))
 
@@ -118,7 +131,9 @@ class McapConfig:
         names = [field.name for field in fields(cls)]
         for name in choices:
             if name not in names:
-                raise ChoiceError(f"export_mcap has no {name!r}; there are {possible_text(name, names)}")
+                raise ChoiceError(
+                    f"export_mcap has no {name!r}; there are {possible_text(name, names)}"
+                )
         return cls(**choices)
 
     def frame_numbers(self, last: int) -> tuple[int, ...]:
@@ -145,9 +160,13 @@ def _frame_numbers(given: object) -> tuple[int, ...] | None:
     if given is None:
         return None
     if isinstance(given, str) or not isinstance(given, Iterable):
-        raise ChoiceError(f"frames: expected frame numbers from 1, such as range(1, 11), found {given!r}")
+        raise ChoiceError(
+            f"frames: expected frame numbers from 1, such as range(1, 11), found {given!r}"
+        )
     meaning = "whole numbers from 1"
-    numbers = tuple(sorted({checked_whole("frames", number, meaning, ChoiceError) for number in given}))
+    numbers = tuple(
+        sorted({checked_whole("frames", number, meaning, ChoiceError) for number in given})
+    )
     if not numbers:
         raise ChoiceError("frames: expected at least one frame number, found none")
     return numbers

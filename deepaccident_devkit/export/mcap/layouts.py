@@ -57,15 +57,23 @@ def write_layouts(path: Path, topics: Sequence[str]) -> None:
             "topics": {
                 "/road/points": {"visible": True, "colorMode": "rgba-fields", "pointSize": 4},
                 "/actors": {"visible": True},
-                **{topic: {"visible": True, "colorMode": "colormap", "colorField": "z"} for topic in clouds},
+                **{
+                    topic: {"visible": True, "colorMode": "colormap", "colorField": "z"}
+                    for topic in clouds
+                },
             },
         },
-        "Plot!values": {"paths": [{"value": f"{topic}.value", "enabled": True} for topic in values]},
+        "Plot!values": {
+            "paths": [{"value": f"{topic}.value", "enabled": True} for topic in values]
+        },
     }
     side: Any = "Plot!values"
     for number, topic in enumerate(cameras):
         panels[f"Image!{number}"] = {
-            "imageMode": {"imageTopic": topic, "calibrationTopic": topic.replace("/image", "/calibration")}
+            "imageMode": {
+                "imageTopic": topic,
+                "calibrationTopic": topic.replace("/image", "/calibration"),
+            }
         }
         side = {"direction": "column", "first": f"Image!{number}", "second": side}
     layout = {"direction": "row", "first": "3D!scene", "second": side, "splitPercentage": 60}

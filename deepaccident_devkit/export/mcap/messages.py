@@ -47,7 +47,15 @@ from deepaccident_devkit.v2x.agents import Agents, agents_of, cooperating_agents
 _FRAME_NANOSECONDS: Final = 100_000_000
 _SECOND_NANOSECONDS: Final = 1_000_000_000
 COLORED_POINT: Final = np.dtype(
-    [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1"), ("alpha", "u1")]
+    [
+        ("x", "<f4"),
+        ("y", "<f4"),
+        ("z", "<f4"),
+        ("red", "u1"),
+        ("green", "u1"),
+        ("blue", "u1"),
+        ("alpha", "u1"),
+    ]
 )
 """A point of a rendering; viewers take the colour from the last four fields."""
 _NUMERIC_TYPES: Final = {
@@ -94,7 +102,10 @@ class McapRecording:
         return self
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
     ) -> None:
         """Write the indexes and the summary, if there was no error."""
         if error is None:
@@ -163,7 +174,9 @@ def moment_of(scenario: str, index: int, agents: tuple[str, ...]) -> Moment:
 
 def exported_agents(dataset: Dataset, scenario: str, agents: Agents) -> tuple[str, ...]:
     """The agents that an `agents=` argument means, in usual order; raises ChoiceError and NotAvailableError."""
-    chosen = cooperating_agents(dataset, sample_token(scenario, agents_of(dataset, scenario)[0], 1), agents)
+    chosen = cooperating_agents(
+        dataset, sample_token(scenario, agents_of(dataset, scenario)[0], 1), agents
+    )
     return tuple(agent for agent in AGENTS if agent in chosen)
 
 
@@ -173,7 +186,9 @@ class Roles:
     def __init__(self, dataset: Dataset, scenario: str) -> None:
         """Read the roles of a scenario from its meta."""
         collision = dataset.get("scenario", scenario)["collision"]
-        self.pair: frozenset[int] = frozenset() if collision is None else frozenset(collision["ids"])
+        self.pair: frozenset[int] = (
+            frozenset() if collision is None else frozenset(collision["ids"])
+        )
         self.agents: Mapping[int, str] = recorders_of(dataset, scenario)
 
     def role(self, actor: int) -> str:
@@ -242,7 +257,9 @@ def cloud_message(points: AnyArray, frame: str, index: int) -> Any:
         pose=pose(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])),
         point_stride=points.dtype.itemsize,
         fields=[
-            PackedElementField(name=name, offset=columns[name][1], type=_NUMERIC_TYPES[columns[name][0]])
+            PackedElementField(
+                name=name, offset=columns[name][1], type=_NUMERIC_TYPES[columns[name][0]]
+            )
             for name in points.dtype.names or ()
         ],
         data=points.tobytes(),
@@ -251,11 +268,15 @@ def cloud_message(points: AnyArray, frame: str, index: int) -> Any:
 
 def scene_update(entities: Sequence[Any], index: int) -> Any:
     """A SceneUpdate that shows these entities and removes all others of its topic."""
-    everything = SceneEntityDeletion(timestamp=protobuf_timestamp(index), type=SceneEntityDeletion.ALL)
+    everything = SceneEntityDeletion(
+        timestamp=protobuf_timestamp(index), type=SceneEntityDeletion.ALL
+    )
     return SceneUpdate(deletions=[everything], entities=entities)
 
 
-def entity(name: str, frame: str, index: int, facts: Mapping[str, str], **primitives: Sequence[Any]) -> Any:
+def entity(
+    name: str, frame: str, index: int, facts: Mapping[str, str], **primitives: Sequence[Any]
+) -> Any:
     """A SceneEntity in a coordinate frame: its primitives, and facts that the viewer shows after a click on it."""
     seconds = (index - 1) * FRAME_PERIOD
     return SceneEntity(
@@ -263,7 +284,10 @@ def entity(name: str, frame: str, index: int, facts: Mapping[str, str], **primit
         frame_id=frame,
         id=name,
         frame_locked=False,
-        metadata=[KeyValuePair(key=key, value=value) for key, value in {**facts, "seconds": f"{seconds:.1f}"}.items()],
+        metadata=[
+            KeyValuePair(key=key, value=value)
+            for key, value in {**facts, "seconds": f"{seconds:.1f}"}.items()
+        ],
         **primitives,
     )
 
@@ -309,7 +333,9 @@ def box_segments(boxes: Boxes) -> FloatArray:
 
 def above(boxes: Boxes, row: int) -> FloatArray:
     """(3,) the place of a box's text."""
-    return np.asarray(boxes.center[row] + np.array([0.0, 0.0, boxes.size[row, 2] / 2 + _TEXT_ABOVE]))
+    return np.asarray(
+        boxes.center[row] + np.array([0.0, 0.0, boxes.size[row, 2] / 2 + _TEXT_ABOVE])
+    )
 
 
 def segment_points(segments: FloatArray, color: str, alpha: float = 1.0) -> AnyArray:
@@ -321,7 +347,9 @@ def segment_points(segments: FloatArray, color: str, alpha: float = 1.0) -> AnyA
     which = np.repeat(np.arange(len(segments)), counts)
     step = np.arange(len(which)) - np.repeat(np.cumsum(counts) - counts, counts)
     share = (step / np.maximum(counts - 1, 1)[which])[:, None]
-    return colored_points(segments[which, 0] * (1 - share) + segments[which, 1] * share, color, alpha)
+    return colored_points(
+        segments[which, 0] * (1 - share) + segments[which, 1] * share, color, alpha
+    )
 
 
 def strip_points(points: FloatArray, color: str, alpha: float = 1.0) -> AnyArray:

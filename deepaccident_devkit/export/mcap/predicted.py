@@ -36,13 +36,28 @@ from deepaccident_devkit.export.mcap.messages import (
     vector,
 )
 from deepaccident_devkit.geometry import BevGrid
-from deepaccident_devkit.motion import OWN_BOX_ID, MotionLabelConfig, MotionLabels, motion_labels_of, predict_instances
-from deepaccident_devkit.render.styles import AGENT_COLORS, COLLIDER_COLOR, INSTANCE_COLORS, PREDICTED_COLOR
+from deepaccident_devkit.motion import (
+    OWN_BOX_ID,
+    MotionLabelConfig,
+    MotionLabels,
+    motion_labels_of,
+    predict_instances,
+)
+from deepaccident_devkit.render.styles import (
+    AGENT_COLORS,
+    COLLIDER_COLOR,
+    INSTANCE_COLORS,
+    PREDICTED_COLOR,
+)
 from deepaccident_devkit.support.arrays import AnyArray, BoolArray
 from deepaccident_devkit.taxonomy import CATEGORIES
 
 CELL_POINT: Final = np.dtype(
-    [*((name, COLORED_POINT[name].str) for name in COLORED_POINT.names or ()), ("instance", "<i4"), ("frame", "<i4")]
+    [
+        *((name, COLORED_POINT[name].str) for name in COLORED_POINT.names or ()),
+        ("instance", "<i4"),
+        ("frame", "<i4"),
+    ]
 )
 """A point of a map: `instance` is the map's id, `frame` counts from 0, the present."""
 FRAME_HEIGHT: Final = 0.2
@@ -64,7 +79,9 @@ class MotionMapMessages:
 
     def write(self, moment: Moment, recording: McapRecording) -> None:
         """Write the motion labels of the samples of a moment that have labels."""
-        records = {agent: self._dataset.get("sample", sample) for agent, sample in moment.samples.items()}
+        records = {
+            agent: self._dataset.get("sample", sample) for agent, sample in moment.samples.items()
+        }
         labelled = {agent: record for agent, record in records.items() if record["labelled"]}
         made = motion_labels_of(self._dataset, labelled.values(), self._config)
         for (agent, record), labels in zip(labelled.items(), made, strict=True):
@@ -74,8 +91,15 @@ class MotionMapMessages:
             recording.write(f"/{agent}/motion_labels/points", message, moment.index)
 
     def _points(self, labels: MotionLabels, agent: str, own_actor: int | None) -> AnyArray:
-        actors = {own_actor if actor == OWN_BOX_ID else actor: name for actor, name in labels.id_map.items()}
-        colors = {name: AGENT_COLORS[agent] for actor, name in labels.id_map.items() if actor == OWN_BOX_ID}
+        actors = {
+            own_actor if actor == OWN_BOX_ID else actor: name
+            for actor, name in labels.id_map.items()
+        }
+        colors = {
+            name: AGENT_COLORS[agent]
+            for actor, name in labels.id_map.items()
+            if actor == OWN_BOX_ID
+        }
         for actor, name in actors.items():
             if actor in self._roles.pair:
                 colors[name] = COLLIDER_COLOR
@@ -85,7 +109,10 @@ class MotionMapMessages:
 
 
 def cell_points(
-    instance: AnyArray, grid: BevGrid, valid: BoolArray | None = None, colors: Mapping[int, str] | None = None
+    instance: AnyArray,
+    grid: BevGrid,
+    valid: BoolArray | None = None,
+    colors: Mapping[int, str] | None = None,
 ) -> AnyArray:
     """The cells of instance maps (T, H, W) as points (N,) of `CELL_POINT`, by frame; later frames are paler and higher.
 
@@ -110,7 +137,9 @@ def cell_points(
 
 
 def _colors(names: Sequence[int], chosen: Mapping[int, str]) -> AnyArray:
-    colors: Any = [rgb(chosen.get(name, INSTANCE_COLORS[name % len(INSTANCE_COLORS)])) for name in names]
+    colors: Any = [
+        rgb(chosen.get(name, INSTANCE_COLORS[name % len(INSTANCE_COLORS)])) for name in names
+    ]
     return np.array(colors, dtype=np.uint8).reshape(-1, 3)
 
 
@@ -143,10 +172,14 @@ def _write(agent: str, prediction: object, index: int, recording: McapRecording)
     topic = f"/{agent}/prediction"
     if isinstance(prediction, MotionOutput):
         points = cell_points(_instances(prediction), prediction.grid)
-        recording.write(f"{topic}/motion/points", cloud_message(points, frame_id(agent, "ego"), index), index)
+        recording.write(
+            f"{topic}/motion/points", cloud_message(points, frame_id(agent, "ego"), index), index
+        )
     elif isinstance(prediction, DetectedBoxes):
         _write_boxes(agent, prediction, f"{topic}/boxes", index, recording)
-    elif isinstance(prediction, Sequence) and all(isinstance(each, Accident) for each in prediction):
+    elif isinstance(prediction, Sequence) and all(
+        isinstance(each, Accident) for each in prediction
+    ):
         _write_accidents(agent, prediction, f"{topic}/accidents", index, recording)
     else:
         raise ConfigError(
@@ -162,7 +195,9 @@ def _instances(output: MotionOutput) -> Any:
     return np.asarray(output.instances)[-1]
 
 
-def _write_boxes(agent: str, detected: DetectedBoxes, topic: str, index: int, recording: McapRecording) -> None:
+def _write_boxes(
+    agent: str, detected: DetectedBoxes, topic: str, index: int, recording: McapRecording
+) -> None:
     boxes, frame = detected.boxes, frame_id(agent, detected.boxes.frame)
     segments = box_segments(boxes)
     entities = [
@@ -199,10 +234,15 @@ def _write_accidents(
                 facts,
                 spheres=[_sphere(place) for place in places],
                 lines=[lines(places[None], PREDICTED_COLOR)],
-                texts=[label(text, places.mean(axis=0) + np.array([0.0, 0.0, _MARK]), PREDICTED_COLOR)],
+                texts=[
+                    label(text, places.mean(axis=0) + np.array([0.0, 0.0, _MARK]), PREDICTED_COLOR)
+                ],
             )
         )
-        points += [colored_points(places, PREDICTED_COLOR), segment_points(places[None], PREDICTED_COLOR)]
+        points += [
+            colored_points(places, PREDICTED_COLOR),
+            segment_points(places[None], PREDICTED_COLOR),
+        ]
     recording.write(topic, scene_update(entities, index), index)
     recording.write(f"{topic}/points", cloud_message(joined(points), frame, index), index)
 

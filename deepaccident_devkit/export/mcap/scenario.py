@@ -93,7 +93,9 @@ def write_poses(dataset: Dataset, moment: Moment, recording: McapRecording) -> N
         there = transform_message("world", own, dataset.world_from(sample, "ego"), moment.index)
         transforms.append(there)
         transforms += [
-            transform_message(own, frame_id(agent, channel), dataset.ego_from(sample, channel), moment.index)
+            transform_message(
+                own, frame_id(agent, channel), dataset.ego_from(sample, channel), moment.index
+            )
             for channel in EXPORTED_CHANNELS
         ]
         poses.append((agent, there))
@@ -114,11 +116,15 @@ def write_road(dataset: Dataset, moment: Moment, recording: McapRecording) -> No
         image, height = dataset.load_bev(sample), -POLE_HEIGHT if agent == INFRASTRUCTURE else 0.0
         tags, middle = image.semantic[::_ROAD_STEP, ::_ROAD_STEP], (len(image.semantic) - 1) / 2
         for name, color in MAP_COLORS.items():
-            ahead, left = (middle - _ROAD_STEP * np.argwhere(tags == TAGS.get(name, -1)).T) * image.resolution
+            ahead, left = (
+                middle - _ROAD_STEP * np.argwhere(tags == TAGS.get(name, -1)).T
+            ) * image.resolution
             ground = np.column_stack([ahead, left, np.full(len(ahead), height)])
             parts.append(colored_points(dataset.world_from(sample, "ego").apply(ground), color))
     if parts:
-        recording.write("/road/points", cloud_message(joined(parts), "world", moment.index), moment.index)
+        recording.write(
+            "/road/points", cloud_message(joined(parts), "world", moment.index), moment.index
+        )
 
 
 def write_scenario(
@@ -134,7 +140,9 @@ def write_scenario(
     record = dataset.scenario[dataset.getind("scenario", scenario)]
     token = record["token"]
     agents = exported_agents(dataset, token, config.agents)
-    moments = [moment_of(token, index, agents) for index in config.frame_numbers(record["num_frames"])]
+    moments = [
+        moment_of(token, index, agents) for index in config.frame_numbers(record["num_frames"])
+    ]
     sensors = _SensorMessages(dataset, config)
     parts: list[Callable[[Moment, McapRecording], None]]
     parts = [
@@ -144,10 +152,16 @@ def write_scenario(
         _ActorMessages(dataset, token).write,
     ]
     if config.motion_labels is not None:
-        parts.append(MotionMapMessages(dataset, token, resolved_label_config(config.motion_labels)).write)
+        parts.append(
+            MotionMapMessages(dataset, token, resolved_label_config(config.motion_labels)).write
+        )
     if prediction is not None:
         parts.append(_predicted(prediction, moments, token).write)
-    with replacing(path) as temporary, temporary.open("wb") as stream, McapRecording(stream) as recording:
+    with (
+        replacing(path) as temporary,
+        temporary.open("wb") as stream,
+        McapRecording(stream) as recording,
+    ):
         recording.add_metadata(METADATA, scenario_metadata(dataset, token))
         write_road(dataset, moments[0], recording)
         for moment in tqdm(moments, desc=path.name, disable=not progress, unit="frame"):
@@ -194,7 +208,9 @@ class _StoryMessages:
         if not self._told:
             self._told = True
             _log(self._facts(), moment.index, recording)
-        left = self._dataset.get("frame", frame_token(moment.scenario, moment.index))["time_to_impact"]
+        left = self._dataset.get("frame", frame_token(moment.scenario, moment.index))[
+            "time_to_impact"
+        ]
         if left is None:
             return
         recording.write("/time_to_impact", DoubleValue(value=left), moment.index)
@@ -204,19 +220,30 @@ class _StoryMessages:
             _log(f"{left:.1f} s to the impact", moment.index, recording)
 
     def _facts(self) -> str:
-        told = ", ".join(f"{name} {self._record[name]}" for name in _SHOWN if self._record[name] is not None)
-        ending = f"ends in an accident: {self._pair()}" if self._record["collision"] else "no collision is known"
+        told = ", ".join(
+            f"{name} {self._record[name]}" for name in _SHOWN if self._record[name] is not None
+        )
+        ending = (
+            f"ends in an accident: {self._pair()}"
+            if self._record["collision"]
+            else "no collision is known"
+        )
         return f"{self._record['token']}: {told}; {ending}"
 
     def _pair(self) -> str:
         collision = self._record["collision"]
         return " and ".join(
-            f"{kind} {actor}" for kind, actor in zip(collision["classes"], collision["ids"], strict=True)
+            f"{kind} {actor}"
+            for kind, actor in zip(collision["classes"], collision["ids"], strict=True)
         )
 
 
 def _log(text: str, index: int, recording: McapRecording, level: int = Log.INFO) -> None:
-    recording.write("/log", Log(timestamp=protobuf_timestamp(index), level=level, message=text, name=METADATA), index)
+    recording.write(
+        "/log",
+        Log(timestamp=protobuf_timestamp(index), level=level, message=text, name=METADATA),
+        index,
+    )
 
 
 class _SensorMessages:
@@ -245,11 +272,17 @@ class _SensorMessages:
         """Log how many files were left out, if any."""
         self._files.tell()
 
-    def _write_image(self, agent: str, token: str, path: ReleasePath, index: int, recording: McapRecording) -> None:
+    def _write_image(
+        self, agent: str, token: str, path: ReleasePath, index: int, recording: McapRecording
+    ) -> None:
         (content, size), channel = read_jpeg(path), token.rsplit("/", 1)[1]
         frame = frame_id(agent, channel)
-        image = CompressedImage(timestamp=protobuf_timestamp(index), frame_id=frame, data=content, format="jpeg")
-        recording.write(f"/{frame}/calibration", _calibration(self._dataset, token, size, frame, index), index)
+        image = CompressedImage(
+            timestamp=protobuf_timestamp(index), frame_id=frame, data=content, format="jpeg"
+        )
+        recording.write(
+            f"/{frame}/calibration", _calibration(self._dataset, token, size, frame, index), index
+        )
         recording.write(f"/{frame}/image", image, index)
 
     def _write_cloud(self, agent: str, sample: str, index: int, recording: McapRecording) -> None:
@@ -257,13 +290,17 @@ class _SensorMessages:
         rows = slice(None, None, self._step)
         points = np.zeros(len(cloud.xyz[rows]), dtype=LIDAR_POINT)
         # few digits are small when compressed: clouds are most of a file
-        points["x"], points["y"], points["z"] = (cloud.xyz[rows] * _LIDAR_STEPS).round().T / _LIDAR_STEPS
+        points["x"], points["y"], points["z"] = (
+            cloud.xyz[rows] * _LIDAR_STEPS
+        ).round().T / _LIDAR_STEPS
         points["intensity"] = (cloud.intensity[rows] * _INTENSITIES).round() / _INTENSITIES
         frame = frame_id(agent, "lidar")
         recording.write(f"/{frame}/points", cloud_message(points, frame, index), index)
 
 
-def _calibration(dataset: Dataset, token: str, size: tuple[int, int], frame: str, index: int) -> Any:
+def _calibration(
+    dataset: Dataset, token: str, size: tuple[int, int], frame: str, index: int
+) -> Any:
     """A CameraCalibration for an image of `size` (width, height), which may be smaller than calib says."""
     lens = dataset.camera(token).resized(*size)
     return CameraCalibration(
@@ -314,7 +351,9 @@ class _ActorMessages:
             trail, path = self._trail(actor, moment.index)
             facts = {
                 **self._facts(boxes, row, actor),
-                "annotated_by": ", ".join([name for bit, name in enumerate(AGENTS) if view.seen_by[row] >> bit & 1]),
+                "annotated_by": ", ".join(
+                    [name for bit, name in enumerate(AGENTS) if view.seen_by[row] >> bit & 1]
+                ),
                 "seen_by": ", ".join(agent for agent, actors in seen.items() if actor in actors),
             }
             name = str(actor)
@@ -345,16 +384,31 @@ class _ActorMessages:
                 speed = DoubleValue(value=float(np.linalg.norm(boxes.velocity[row])))
                 recording.write(f"/{agent}/speed", speed, moment.index)
         recording.write("/actors", scene_update(entities, moment.index), moment.index)
-        recording.write("/actors/points", cloud_message(joined(points), "world", moment.index), moment.index)
+        recording.write(
+            "/actors/points", cloud_message(joined(points), "world", moment.index), moment.index
+        )
 
-    def _write_annotations(self, agent: str, sample: str, index: int, recording: McapRecording) -> None:
-        boxes, actors = self._dataset.boxes(sample, "lidar"), self._dataset.actor_ids(sample).tolist()
+    def _write_annotations(
+        self, agent: str, sample: str, index: int, recording: McapRecording
+    ) -> None:
+        boxes, actors = (
+            self._dataset.boxes(sample, "lidar"),
+            self._dataset.actor_ids(sample).tolist(),
+        )
         segments, color = box_segments(boxes), AGENT_COLORS[agent]
         entities = []
         for row, actor in enumerate(actors):
             facts = {**self._facts(boxes, row, actor), "label_id": str(boxes.actor_id[row])}
             name = f"{actor}/{boxes.row[row]}"
-            entities.append(entity(name, frame_id(agent, "lidar"), index, facts, lines=[lines(segments[row], color)]))
+            entities.append(
+                entity(
+                    name,
+                    frame_id(agent, "lidar"),
+                    index,
+                    facts,
+                    lines=[lines(segments[row], color)],
+                )
+            )
         recording.write(f"/{agent}/annotations", scene_update(entities, index), index)
 
     def _facts(self, boxes: Boxes, row: int, actor: int) -> dict[str, str]:

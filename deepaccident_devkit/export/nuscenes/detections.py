@@ -86,12 +86,16 @@ def _read(document: object, ours: Mapping[str, str]) -> NuScenesDetections:
     if not isinstance(document, dict):
         raise ContentError(f"expected a JSON object, found {shown(document)}")
     if document.get("format") == FORMAT:
-        raise ContentError("is in DeepAccident's own format, which `deepaccident evaluate` takes as it is")
+        raise ContentError(
+            "is in DeepAccident's own format, which `deepaccident evaluate` takes as it is"
+        )
     meta, results = document.get("meta", {}), document.get("results")
     if not isinstance(meta, dict):
         raise ContentError(f"meta: expected an object, found {shown(meta)}")
     if not isinstance(results, dict) or not results:
-        raise ContentError(f"results: expected an object, sample token to list of boxes, found {shown(results)}")
+        raise ContentError(
+            f"results: expected an object, sample token to list of boxes, found {shown(results)}"
+        )
     left_out = _take_our_classes(results)
     records = {}
     for theirs, given in results.items():
@@ -101,7 +105,9 @@ def _read(document: object, ours: Mapping[str, str]) -> NuScenesDetections:
     boxes = {}
     for theirs in entries.number:
         if theirs not in ours:
-            raise ContentError(f"results: {shortened(theirs)}: is no sample of this release's export")
+            raise ContentError(
+                f"results: {shortened(theirs)}: is no sample of this release's export"
+            )
         found, others = boxes_at(entries, theirs), left_out.get(theirs, {})
         kept = np.array([number not in others for number in range(len(found))], dtype=bool)
         boxes[ours[theirs]] = DetectedBoxes(boxes=found.boxes[kept], scores=found.scores[kept])
@@ -127,7 +133,9 @@ def _take_our_classes(results: dict[str, Any]) -> dict[str, dict[int, str]]:
                 entry["detection_name"] = CATEGORIES[0]
             elif name == "bicycle":  # the others have our names
                 entry["detection_name"] = "cyclist"
-            if isinstance(velocity, list) and any(isinstance(each, float) and math.isnan(each) for each in velocity):
+            if isinstance(velocity, list) and any(
+                isinstance(each, float) and math.isnan(each) for each in velocity
+            ):
                 entry["velocity"] = None  # the nuScenes devkit writes it so where it is not known
     return left_out
 
@@ -136,6 +144,8 @@ def _key_samples(dataset: Dataset) -> Iterator[str]:
     """The samples that the export has: the keyframes of each agent."""
     samples, scenarios = dataset.columns("sample"), dataset.columns("scenario")
     rows = samples["scenario_row"]
-    to_end = scenarios["num_frames"][rows] - (samples["frame_row"] - scenarios["first_frame_row"][rows] + 1)
+    to_end = scenarios["num_frames"][rows] - (
+        samples["frame_row"] - scenarios["first_frame_row"][rows] + 1
+    )
     for row in np.flatnonzero(to_end % KEY_STEP == 0).tolist():
         yield dataset.sample[row]["token"]

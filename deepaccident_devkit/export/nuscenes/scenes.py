@@ -20,7 +20,15 @@ from deepaccident_devkit.geometry import quaternions
 from deepaccident_devkit.release import read_lidar
 from deepaccident_devkit.release.store import ReleasePath
 from deepaccident_devkit.tables.tokens import agent_token, sample_data_token, sample_token
-from deepaccident_devkit.taxonomy import AGENTS, BEV_CAMERA, CAMERAS, LIDAR, OWN_ACTOR_ID, STATIC_ACTOR_ID, UNTRACKED_ID
+from deepaccident_devkit.taxonomy import (
+    AGENTS,
+    BEV_CAMERA,
+    CAMERAS,
+    LIDAR,
+    OWN_ACTOR_ID,
+    STATIC_ACTOR_ID,
+    UNTRACKED_ID,
+)
 from deepaccident_devkit.v2x.agents import agents_of
 
 if TYPE_CHECKING:
@@ -34,7 +42,14 @@ CAMERA_CHANNELS: Final = MappingProxyType(
     dict(
         zip(
             CAMERAS,
-            ("CAM_FRONT", "CAM_FRONT_LEFT", "CAM_FRONT_RIGHT", "CAM_BACK", "CAM_BACK_LEFT", "CAM_BACK_RIGHT"),
+            (
+                "CAM_FRONT",
+                "CAM_FRONT_LEFT",
+                "CAM_FRONT_RIGHT",
+                "CAM_BACK",
+                "CAM_BACK_LEFT",
+                "CAM_BACK_RIGHT",
+            ),
             strict=True,
         )
     )
@@ -73,7 +88,9 @@ AXES_ROTATIONS: Final = {
 
 def token(kind: str, *parts: object) -> str:
     """A token of 32 hexadecimal digits for a row of a table, from what it is."""
-    return hashlib.md5("/".join(map(str, (kind, *parts))).encode(), usedforsecurity=False).hexdigest()
+    return hashlib.md5(
+        "/".join(map(str, (kind, *parts))).encode(), usedforsecurity=False
+    ).hexdigest()
 
 
 def sensor_path(scene: str, channel: str, stamp: int, *, key: bool) -> str:
@@ -149,7 +166,9 @@ class AgentScene:
     def rows(self) -> _RowsByTable:
         """The rows of `scene`, `log`, `sample` and `ego_pose`."""
         about = self.dataset.scenario.get(self.scenario)
-        scene, log = (token(table, agent_token(self.scenario, self.agent)) for table in ("scene", "log"))
+        scene, log = (
+            token(table, agent_token(self.scenario, self.agent)) for table in ("scene", "log")
+        )
         samples = linked([self._sample_row(number, scene) for number in keyframes(self.last)])
         facts = (about["town"], about["weather"], about["time_of_day"], about["road_type"])
         scene_row = {
@@ -159,7 +178,9 @@ class AgentScene:
             "first_sample_token": samples[0]["token"],
             "last_sample_token": samples[-1]["token"],
             "name": self.name,
-            "description": ", ".join(filter(None, (*facts, "collision" if about["collision"] else None))),
+            "description": ", ".join(
+                filter(None, (*facts, "collision" if about["collision"] else None))
+            ),
             "agent": self.agent,
             "split": about["split"],
         }
@@ -194,9 +215,15 @@ class AgentScene:
         }
 
 
-def scenes_of(dataset: Dataset, scenario: str, agents: Sequence[str], *, sweeps: bool) -> Iterator[AgentScene]:
+def scenes_of(
+    dataset: Dataset, scenario: str, agents: Sequence[str], *, sweeps: bool
+) -> Iterator[AgentScene]:
     """The scenes of those of the agents that recorded a scenario."""
-    return (AgentScene(dataset, scenario, agent, sweeps) for agent in agents_of(dataset, scenario) if agent in agents)
+    return (
+        AgentScene(dataset, scenario, agent, sweeps)
+        for agent in agents_of(dataset, scenario)
+        if agent in agents
+    )
 
 
 def linked(rows: list[NuScenesRow]) -> list[NuScenesRow]:
@@ -218,7 +245,9 @@ def box_rows(scene: AgentScene, van: Van, output: Output) -> _RowsByTable:
     for number in range(1, scene.last + 1):
         sample = scene.dataset.sample.get(scene.sample(number))
         if not scene.is_key(number):
-            output.leave_out("boxes between keyframes, which readers interpolate", sample["num_annotations"])
+            output.leave_out(
+                "boxes between keyframes, which readers interpolate", sample["num_annotations"]
+            )
             continue
         output.leave_out("labels that are not in this release", not sample["labelled"])
         for row in _annotations(scene, number, output):
@@ -226,7 +255,10 @@ def box_rows(scene: AgentScene, van: Van, output: Output) -> _RowsByTable:
             tracks.setdefault(row["instance_token"], []).append(row)
     for track in tracks.values():
         linked(track)
-    return {"instance": [_instance(track, van) for track in tracks.values()], "sample_annotation": rows}
+    return {
+        "instance": [_instance(track, van) for track in tracks.values()],
+        "sample_annotation": rows,
+    }
 
 
 def _annotations(scene: AgentScene, number: int, output: Output) -> Iterator[NuScenesRow]:
@@ -234,10 +266,14 @@ def _annotations(scene: AgentScene, number: int, output: Output) -> Iterator[NuS
     sample = scene.sample(number)
     boxes = scene.dataset.boxes(sample)
     derived = scene.dataset.boxes(sample, velocity="derived").velocity
-    velocity = np.where(np.isnan(derived), boxes.velocity, derived)  # an untracked actor has the label's alone
+    velocity = np.where(
+        np.isnan(derived), boxes.velocity, derived
+    )  # an untracked actor has the label's alone
     speed = np.hypot(velocity[:, 0], velocity[:, 1]).tolist()
     seen = {OWN_ACTOR_ID}
-    for index, (actor, category) in enumerate(zip(boxes.actor_id.tolist(), boxes.category_names, strict=True)):
+    for index, (actor, category) in enumerate(
+        zip(boxes.actor_id.tolist(), boxes.category_names, strict=True)
+    ):
         if actor == OWN_ACTOR_ID:
             output.leave_out("boxes of the recording agents themselves")
             continue
@@ -249,9 +285,13 @@ def _annotations(scene: AgentScene, number: int, output: Output) -> Iterator[NuS
         yield {
             "token": own,
             "sample_token": token("sample", sample),
-            "instance_token": token("instance", *((own,) if alone else (scene.scenario, scene.agent, actor))),
+            "instance_token": token(
+                "instance", *((own,) if alone else (scene.scenario, scene.agent, actor))
+            ),
             "visibility_token": _SEEN[boxes.camera_visible.item(index)],
-            "attribute_tokens": [token("attribute", name) for name in _attributes(category, actor, speed[index])],
+            "attribute_tokens": [
+                token("attribute", name) for name in _attributes(category, actor, speed[index])
+            ],
             "translation": boxes.center[index].tolist(),
             "size": [width, length, height],
             "rotation": boxes.rotation[index].tolist(),
@@ -280,7 +320,9 @@ def _instance(rows: list[NuScenesRow], van: Van) -> NuScenesRow:
     category = rows[0]["category_deepaccident"]
     return {
         "token": rows[0]["instance_token"],
-        "category_token": token("category", NUSCENES_CATEGORIES[van if category == "van" else category]),
+        "category_token": token(
+            "category", NUSCENES_CATEGORIES[van if category == "van" else category]
+        ),
         "nbr_annotations": len(rows),
         "first_annotation_token": rows[0]["token"],
         "last_annotation_token": rows[-1]["token"],
@@ -302,12 +344,21 @@ def write_sensors(scene: AgentScene, axes: LidarAxes, output: Output) -> _RowsBy
         for number in scene.frames:
             source = sample_data_token(scene.sample(number), channel)
             record = scene.dataset.sample_data.get(source)
-            lens = None if channel == LIDAR else stored_camera(scene.dataset, source, files.get(number, any_file))
+            lens = (
+                None
+                if channel == LIDAR
+                else stored_camera(scene.dataset, source, files.get(number, any_file))
+            )
             sensor = record["calibrated_sensor_token"]
-            if lens is not None and (lens.width, lens.height) != (record["width"], record["height"]):
+            if lens is not None and (lens.width, lens.height) != (
+                record["width"],
+                record["height"],
+            ):
                 sensor = f"{sensor} {lens.width} x {lens.height}"  # with a K of its own
             if sensor not in calibrated:
-                calibrated[sensor] = _calibrated_row(scene, record["calibrated_sensor_token"], sensor, lens, axes)
+                calibrated[sensor] = _calibrated_row(
+                    scene, record["calibrated_sensor_token"], sensor, lens, axes
+                )
             path = sensor_path(scene.name, channel, scene.stamp(number), key=scene.is_key(number))
             rows.append(_data_row(scene, number, channel, sensor, path, lens))
             if number not in files:
@@ -318,7 +369,9 @@ def write_sensors(scene: AgentScene, axes: LidarAxes, output: Output) -> _RowsBy
                 output.link(files[number][0], path)
         data += linked(rows)
         what = "point clouds" if channel == LIDAR else "images"
-        output.leave_out(f"{what} that are not in this release (the tables name them)", len(rows) - len(files))
+        output.leave_out(
+            f"{what} that are not in this release (the tables name them)", len(rows) - len(files)
+        )
     bev = sensor_files(scene.dataset, scene.scenario, scene.agent, BEV_CAMERA)
     output.leave_out("files of the BEV camera", len(bev))
     return {"sample_data": data, "calibrated_sensor": list(calibrated.values())}
@@ -349,7 +402,9 @@ def _calibrated_row(
     record = scene.dataset.calibrated_sensor.get(source)
     rotation, intrinsic = record["rotation"], []
     if lens is None:
-        rotation = quaternions.from_matrix(quaternions.to_matrix(rotation) @ AXES_ROTATIONS[axes].T).tolist()
+        rotation = quaternions.from_matrix(
+            quaternions.to_matrix(rotation) @ AXES_ROTATIONS[axes].T
+        ).tolist()
     else:
         intrinsic = lens.intrinsic.tolist()
     return {

@@ -38,7 +38,13 @@ _OF_UNITS: Final = (
     *("instance", "sample_annotation"),
 )
 _ATTRIBUTES: Final = (
-    *("vehicle.moving", "vehicle.stopped", "vehicle.parked", "cycle.with_rider", "cycle.without_rider"),
+    *(
+        "vehicle.moving",
+        "vehicle.stopped",
+        "vehicle.parked",
+        "cycle.with_rider",
+        "cycle.without_rider",
+    ),
     *("pedestrian.moving", "pedestrian.standing", "pedestrian.sitting_lying_down"),
 )
 _VISIBILITIES: Final = {"1": "v0-40", "2": "v40-60", "3": "v60-80", "4": "v80-100"}
@@ -80,9 +86,13 @@ class NuScenes(Format):
             rows.append({**scene.rows(), **files, **box_rows(scene, self.van, output)})
             output.tally.samples += len(scene.frames)
             output.leave_out("frames between keyframes", scene.last - len(scene.frames))
-        output.leave_out("agents of scenarios that are not in this release", len(self.agents) - len(rows))
+        output.leave_out(
+            "agents of scenarios that are not in this release", len(self.agents) - len(rows)
+        )
         for table in _OF_UNITS:
-            lines = "".join(f"{json.dumps(row)}\n" for scene_rows in rows for row in scene_rows[table])
+            lines = "".join(
+                f"{json.dumps(row)}\n" for scene_rows in rows for row in scene_rows[table]
+            )
             write_bytes(output.parts / f"{table}.jsonl", lines.encode())
 
     def finish(
@@ -95,9 +105,12 @@ class NuScenes(Format):
         """Write the 13 tables, `splits.json` and masks of maps; only rows of scenes and logs are in memory at once."""
         folders = [parts(unit) for unit in units]
         for table in _OF_UNITS:
-            _write_table(table, (line for folder in folders for line in _lines(folder, table)), output)
+            _write_table(
+                table, (line for folder in folders for line in _lines(folder, table)), output
+            )
         scenes, logs = (
-            [json.loads(line) for folder in folders for line in _lines(folder, each)] for each in ("scene", "log")
+            [json.loads(line) for folder in folders for line in _lines(folder, each)]
+            for each in ("scene", "log")
         )
         for table, rows in {**_fixed_tables(), "map": _maps(logs)}.items():
             _write_table(table, map(json.dumps, rows), output)
@@ -111,7 +124,9 @@ class NuScenes(Format):
     def scenes(self, dataset: Dataset, unit: Unit) -> list[AgentScene]:
         """The scenes of a unit."""
         return [
-            scene for token in unit.scenarios for scene in scenes_of(dataset, token, self.agents, sweeps=self.sweeps)
+            scene
+            for token in unit.scenarios
+            for scene in scenes_of(dataset, token, self.agents, sweeps=self.sweeps)
         ]
 
 
@@ -121,7 +136,10 @@ def _lines(folder: Path, table: str) -> list[str]:
 
 def _write_table(table: str, rows: Iterable[str], output: Output) -> None:
     """Write a table of rows that are JSON, as they come."""
-    with output.file(f"{NUSCENES_VERSION}/{table}.json") as path, path.open("w", encoding="utf-8") as file:
+    with (
+        output.file(f"{NUSCENES_VERSION}/{table}.json") as path,
+        path.open("w", encoding="utf-8") as file,
+    ):
         separator = "[\n"
         for row in rows:
             file.write(f"{separator}{row}")
@@ -131,14 +149,20 @@ def _write_table(table: str, rows: Iterable[str], output: Output) -> None:
 
 def _fixed_tables() -> dict[str, list[NuScenesRow]]:
     """The tables that are the same in every export."""
-    sensors = {name: "lidar" if name == LIDAR_CHANNEL else "camera" for name in CHANNEL_NAMES.values()}
+    sensors = {
+        name: "lidar" if name == LIDAR_CHANNEL else "camera" for name in CHANNEL_NAMES.values()
+    }
     return {
         "sensor": [
-            {"token": token("sensor", name), "channel": name, "modality": kind} for name, kind in sensors.items()
+            {"token": token("sensor", name), "channel": name, "modality": kind}
+            for name, kind in sensors.items()
         ],
         "category": [_word("category", name) for name in NUSCENES_CATEGORIES.values()],
         "attribute": [_word("attribute", name) for name in _ATTRIBUTES],
-        "visibility": [{"token": key, "level": level, "description": ""} for key, level in _VISIBILITIES.items()],
+        "visibility": [
+            {"token": key, "level": level, "description": ""}
+            for key, level in _VISIBILITIES.items()
+        ],
     }
 
 

@@ -113,9 +113,16 @@ def answer_schema(seconds: int) -> dict[str, Any]:
         "type": "object",
         "properties": {
             "id": {"type": "string"},
-            "accident": {"type": "array", "items": likely, "minItems": seconds, "maxItems": seconds},
+            "accident": {
+                "type": "array",
+                "items": likely,
+                "minItems": seconds,
+                "maxItems": seconds,
+            },
             "who": {"anyOf": [{"type": "array", "items": name, **pair}, {"type": "null"}]},
-            "where": {"anyOf": [point, {"type": "array", "items": point, **pair}, {"type": "null"}]},
+            "where": {
+                "anyOf": [point, {"type": "array", "items": point, **pair}, {"type": "null"}]
+            },
             "when": {"anyOf": [{"type": "number", "minimum": 0}, {"type": "null"}]},
             "why": {"type": ["string", "null"]},
         },
@@ -207,7 +214,11 @@ def read_answers(
             )
         question = asked[answer.id]
         accidents[question.sample] += _alarms(where, answer, question, threshold)
-    return Answers(accidents=accidents, answered=len(lines), missing=tuple(key for key in asked if key not in lines))
+    return Answers(
+        accidents=accidents,
+        answered=len(lines),
+        missing=tuple(key for key in asked if key not in lines),
+    )
 
 
 def results_of_answers(
@@ -236,7 +247,11 @@ def results_of_answers(
     """
     ResultsWriter(out, "accident")  # refuses a path that is taken
     read = read_answers(answers, truth, threshold=threshold)
-    said = {"questions": len(read.missing) + read.answered, "answered": read.answered, "threshold": threshold}
+    said = {
+        "questions": len(read.missing) + read.answered,
+        "answered": read.answered,
+        "threshold": threshold,
+    }
     with ResultsWriter(out, "accident", meta={**said, **(meta or {})}) as writer:
         for token, accidents in read.accidents.items():
             writer.add(token, list(accidents))
@@ -246,7 +261,10 @@ def results_of_answers(
 def _asked(path: Path) -> dict[str, _Question]:
     """Id → the line of the truth file, in the order of the samples."""
     remedy = "give truth.jsonl of the export of the questions"
-    found = {line.id: line for _, line in _lines(path, _Question, f"this is no line of a truth file; {remedy}")}
+    found = {
+        line.id: line
+        for _, line in _lines(path, _Question, f"this is no line of a truth file; {remedy}")
+    }
     if not found:
         raise ResultsError(f"{path}: holds no question; {remedy}")
     return dict(sorted(found.items(), key=lambda each: each[1].sample))
@@ -257,7 +275,9 @@ def _lines(path: Path, kind: type[Record], remedy: str) -> Iterator[tuple[int, R
     try:
         content = read_bytes(path, "results")
     except OSError as error:
-        raise ResultsError(f"{path}: {fault_text(error)}; give a file of JSON lines that can be read") from error
+        raise ResultsError(
+            f"{path}: {fault_text(error)}; give a file of JSON lines that can be read"
+        ) from error
     for number, line in enumerate(content.split(b"\n"), start=1):
         if not line.strip():
             continue
@@ -276,7 +296,11 @@ def _alarms(where: str, answer: _Answer, question: _Question, threshold: float) 
             f"{where}: accident: expected {seconds} times true, false or a probability from 0 to 1, found "
             f"{_shown(answer.accident)}; {_REMEDY}"
         )
-    ids, positions, when = _who(where, answer.who, question.actors), _where(where, answer.where), answer.when
+    ids, positions, when = (
+        _who(where, answer.who, question.actors),
+        _where(where, answer.where),
+        answer.when,
+    )
     best = int(np.argmax(scores))
     if scores[best] == 0 or scores[best] < threshold:
         return []
@@ -286,7 +310,9 @@ def _alarms(where: str, answer: _Answer, question: _Question, threshold: float) 
     return [Accident(positions=positions, time=time, score=scores[best], ids=ids)]
 
 
-def _who(where: str, given: tuple[str | None, str | None] | None, actors: Mapping[str, int]) -> tuple[int, int] | None:
+def _who(
+    where: str, given: tuple[str | None, str | None] | None, actors: Mapping[str, int]
+) -> tuple[int, int] | None:
     """The actor ids of two names; None if one of them is not known."""
     if given is None:
         return None
@@ -306,7 +332,9 @@ def _where(where: str, given: list[Any] | None) -> FloatArray | None:
     if given is None:
         return None
     if isinstance(given[0], list) != isinstance(given[1], list):
-        raise ResultsError(f"{where}: where: expected [x, y], or [[x, y], [x, y]], found {_shown(given)}; {_REMEDY}")
+        raise ResultsError(
+            f"{where}: where: expected [x, y], or [[x, y], [x, y]], found {_shown(given)}; {_REMEDY}"
+        )
     return np.broadcast_to(np.array(given, dtype=np.float64), (2, 2)).copy()
 
 

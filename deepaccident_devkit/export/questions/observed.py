@@ -27,7 +27,14 @@ from deepaccident_devkit.support.arrays import (
     checked_whole,
 )
 from deepaccident_devkit.tables.tokens import agent_token, sample_token
-from deepaccident_devkit.taxonomy import AGENTS, FRAME_PERIOD, INFRASTRUCTURE, OWN_ACTOR_ID, UNTRACKED_ID, AgentName
+from deepaccident_devkit.taxonomy import (
+    AGENTS,
+    FRAME_PERIOD,
+    INFRASTRUCTURE,
+    OWN_ACTOR_ID,
+    UNTRACKED_ID,
+    AgentName,
+)
 from deepaccident_devkit.v2x.cooperation import cooperative_view
 
 if TYPE_CHECKING:
@@ -39,7 +46,11 @@ RATE: Final = round(1 / _STEP)
 """Moments a second."""
 _SAME = 1e-6
 SeenRule = Literal["released", "camera", "annotated"]
-_VISIBLE: Final[dict[SeenRule, Visible | None]] = {"released": "released", "camera": "camera", "annotated": None}
+_VISIBLE: Final[dict[SeenRule, Visible | None]] = {
+    "released": "released",
+    "camera": "camera",
+    "annotated": None,
+}
 _EGO: Final = "ego"
 _PLACES: Final = 2
 # Decimals of metres and metres a second, and of radians.
@@ -101,7 +112,10 @@ class WindowRules:
         """The windows of a recording of frames 1 to `last`, in the order of time."""
         stride, past = round(self.stride / FRAME_PERIOD), round(self.observe / FRAME_PERIOD)
         presents = sorted(range(last - stride, past, -stride))
-        return [QuestionWindow(frames=tuple(range(present - past, present + 1, KEY_STEP))) for present in presents]
+        return [
+            QuestionWindow(frames=tuple(range(present - past, present + 1, KEY_STEP)))
+            for present in presents
+        ]
 
 
 def digest(seed: str, *words: str) -> str:
@@ -114,7 +128,9 @@ def _check_steps(name: str, value: float, *, least: int) -> None:
     seconds = checked_number(name, value, "a number of seconds", ConfigError)
     steps = seconds / _STEP
     if not math.isfinite(steps) or steps < least - _SAME or abs(steps - round(steps)) > _SAME:
-        raise ConfigError(f"{name}: expected seconds from {least * _STEP:g} in steps of {_STEP:g}, found {value!r}")
+        raise ConfigError(
+            f"{name}: expected seconds from {least * _STEP:g} in steps of {_STEP:g}, found {value!r}"
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -163,18 +179,23 @@ class Observations:
         own_ids: agent → its actor id; None for the infrastructure.
     """
 
-    def __init__(self, dataset: Dataset, scenario: str, agents: tuple[AgentName, ...], seen: SeenRule) -> None:
+    def __init__(
+        self, dataset: Dataset, scenario: str, agents: tuple[AgentName, ...], seen: SeenRule
+    ) -> None:
         """Look at nothing yet."""
         self.dataset, self.scenario, self.agents, self._seen = dataset, scenario, agents, seen
         self.own_ids: dict[AgentName, int | None] = {
-            agent: dataset.get("agent", agent_token(scenario, agent))["actor_id"] for agent in agents
+            agent: dataset.get("agent", agent_token(scenario, agent))["actor_id"]
+            for agent in agents
         }
         self._moments: dict[int, tuple[Boxes, FloatArray, AnyArray]] = {}
 
     def is_labelled(self, window: QuestionWindow) -> bool:
         """Whether each agent of the set has a label at each moment: without one it is not known what it saw."""
         labelled = self.dataset.columns("sample")["labelled"]
-        return all(labelled[self._row(agent, frame)] for agent in self.agents for frame in window.frames)
+        return all(
+            labelled[self._row(agent, frame)] for agent in self.agents for frame in window.frames
+        )
 
     def seen(self, window: QuestionWindow) -> SeenRows:
         """The actors that at least one agent sees, by moment, in the ego frame of the window's present.
@@ -195,7 +216,10 @@ class Observations:
         return [self._path(agent, window) for agent in self.agents]
 
     def _path(self, agent: AgentName, window: QuestionWindow) -> AgentPath:
-        ego_from_world, rows = self._ego_from_world(window), [self._row(agent, frame) for frame in window.frames]
+        ego_from_world, rows = (
+            self._ego_from_world(window),
+            [self._row(agent, frame) for frame in window.frames],
+        )
         poses = [ego_from_world @ self._world_from_agent(agent, frame) for frame in window.frames]
         labelled = self.dataset.boxes(sample_token(self.scenario, agent, window.present), "lidar")
         own = labelled.select(np.flatnonzero(labelled.actor_id == OWN_ACTOR_ID)[:1])
@@ -211,8 +235,14 @@ class Observations:
         """Boxes in world, speeds, and by whom they are seen."""
         if frame not in self._moments:
             ego = sample_token(self.scenario, self.agents[0], frame)
-            view = cooperative_view(self.dataset, ego, agents=self.agents, frame="world", visible=_VISIBLE[self._seen])
-            members = [OWN_ACTOR_ID, UNTRACKED_ID, *(each for each in self.own_ids.values() if each is not None)]
+            view = cooperative_view(
+                self.dataset, ego, agents=self.agents, frame="world", visible=_VISIBLE[self._seen]
+            )
+            members = [
+                OWN_ACTOR_ID,
+                UNTRACKED_ID,
+                *(each for each in self.own_ids.values() if each is not None),
+            ]
             kept = np.flatnonzero(~np.isin(view.boxes.actor_id, members))
             boxes, source = view.boxes.select(kept), view.source[kept]
             self._moments[frame] = boxes, self._speeds(frame, source, boxes.row), view.seen_by[kept]
@@ -222,7 +252,9 @@ class Observations:
         """The speeds (N,) in rows of the labels of some agents."""
         first = np.zeros(len(AGENTS), dtype=np.int64)
         for agent in self.agents:
-            first[AGENTS.index(agent)] = self.dataset.annotation_rows(sample_token(self.scenario, agent, frame)).start
+            first[AGENTS.index(agent)] = self.dataset.annotation_rows(
+                sample_token(self.scenario, agent, frame)
+            ).start
         said = self.dataset.columns("annotation")["velocity_label"]
         speed: FloatArray = np.linalg.norm(said[first[source] + row], axis=1)
         return speed
@@ -257,7 +289,10 @@ class Names:
 
 
 def names_of(
-    seen: SeenRows, paths: Sequence[AgentPath], own_ids: Mapping[AgentName, int | None], times: Sequence[float]
+    seen: SeenRows,
+    paths: Sequence[AgentPath],
+    own_ids: Mapping[AgentName, int | None],
+    times: Sequence[float],
 ) -> Names:
     """Name those that a question shows: nothing but what was observed decides the names.
 
@@ -281,17 +316,31 @@ def names_of(
     named = {f"a{number}": actor for number, actor in enumerate(first_seen, start=1)}
     members = {name: own_ids[agent] for name, agent in observers.items()}
     own = {name: actor for name, actor in members.items() if actor is not None}
-    last = {actor: times[moment] for actor, moment in zip(ids.tolist(), seen.moment.tolist(), strict=True)}
-    return Names(observers=observers, actors={**own, **named}, last_seen={**last, **dict.fromkeys(own.values(), 0.0)})
+    last = {
+        actor: times[moment]
+        for actor, moment in zip(ids.tolist(), seen.moment.tolist(), strict=True)
+    }
+    return Names(
+        observers=observers,
+        actors={**own, **named},
+        last_seen={**last, **dict.fromkeys(own.values(), 0.0)},
+    )
 
 
 def question_facts(
-    seen: SeenRows, paths: Sequence[AgentPath], names: Names, window: QuestionWindow, scenario: Mapping[str, Any]
+    seen: SeenRows,
+    paths: Sequence[AgentPath],
+    names: Names,
+    window: QuestionWindow,
+    scenario: Mapping[str, Any],
 ) -> dict[str, Any]:
     """What a question says, but its id, what it asks, and pictures; of a scenario only `CONDITIONS` are taken."""
     of_agent = {path.agent: path for path in paths}
     of_name = {agent: name for name, agent in names.observers.items()}
-    sets = {bits: [of_name[agent] for agent in _agents_in(bits, of_name)] for bits in np.unique(seen.seen_by).tolist()}
+    sets = {
+        bits: [of_name[agent] for agent in _agents_in(bits, of_name)]
+        for bits in np.unique(seen.seen_by).tolist()
+    }
     members = set(names.observers)
     return {
         "moments": window.times,

@@ -143,14 +143,22 @@ class Questions(ShortRepr, Format):
             content = "".join(f"{json.dumps(pair[number], allow_nan=False)}\n" for pair in lines)
             write_bytes(output.parts / name, content.encode())
 
-    def finish(self, dataset: Dataset, units: Sequence[Unit], output: Output, parts: Callable[[Unit], Path]) -> None:  # noqa: ARG002 - others need the release
+    def finish(
+        self,
+        dataset: Dataset,  # noqa: ARG002
+        units: Sequence[Unit],
+        output: Output,
+        parts: Callable[[Unit], Path],
+    ) -> None:
         """Join the questions of all scenarios, and their truth, in the order of the ids, which were drawn."""
         folders, rules = [parts(unit) for unit in units], self.window
         for name, path in ((QUESTIONS, f"{_FOLDER}/{QUESTIONS}"), (TRUTH, TRUTH)):
             lines = _by_id([folder / name for folder in folders])
             with output.file(path) as temporary, temporary.open("wb") as file:
                 file.writelines(lines)
-        text = questions_readme(seconds=rules.ahead, observe=rules.observe, seen=self.seen, pictures=bool(self.cameras))
+        text = questions_readme(
+            seconds=rules.ahead, observe=rules.observe, seen=self.seen, pictures=bool(self.cameras)
+        )
         output.write(f"{_FOLDER}/README.md", text)
         schema = json.dumps(answer_schema(rules.ahead), indent=1)
         output.write(f"{_FOLDER}/answer.schema.json", f"{schema}\n".encode())
@@ -177,13 +185,17 @@ def _observers(given: str | Sequence[str]) -> str | tuple[str, ...]:
     return _names("observers", given, AGENTS)
 
 
-def _names(argument: str, given: str | Sequence[str], words: Sequence[AnyText]) -> tuple[AnyText, ...]:
+def _names(
+    argument: str, given: str | Sequence[str], words: Sequence[AnyText]
+) -> tuple[AnyText, ...]:
     """A name or several, each once, in their usual order; raises ChoiceError."""
     named = choices(argument, given, words, empty=True)
     return tuple(name for name in words if name in named)
 
 
-def questions_of(dataset: Dataset, scenario: str, form: Questions, output: Output) -> list[_QuestionPair]:
+def questions_of(
+    dataset: Dataset, scenario: str, form: Questions, output: Output
+) -> list[_QuestionPair]:
     """The questions of a scenario, given by its token; puts the pictures there, and counts what is left out."""
     record = dataset.scenario.get(scenario)
     if reason := unanswerable(dataset, record):
@@ -199,7 +211,9 @@ def questions_of(dataset: Dataset, scenario: str, form: Questions, output: Outpu
         if agents and windows:
             asked.append((Observations(dataset, scenario, agents, form.seen), windows))
     why = why_facts(dataset, record) if asked else None
-    return [pair for observed, windows in asked for pair in _pairs(observed, windows, form, why, output)]
+    return [
+        pair for observed, windows in asked for pair in _pairs(observed, windows, form, why, output)
+    ]
 
 
 def _pairs(
@@ -210,7 +224,11 @@ def _pairs(
     output: Output,
 ) -> Iterator[_QuestionPair]:
     """Question and truth of each window of a recording that is asked about."""
-    scenario, ahead, rules = observed.dataset.scenario.get(observed.scenario), form.window.ahead, form.window
+    scenario, ahead, rules = (
+        observed.dataset.scenario.get(observed.scenario),
+        form.window.ahead,
+        form.window,
+    )
     files: dict[tuple[str, str], dict[int, tuple[ReleasePath, int]]] = {
         (agent, camera): sensor_files(observed.dataset, observed.scenario, agent, camera)
         for agent, camera in product(observed.agents, form.cameras)
@@ -223,12 +241,18 @@ def _pairs(
         seen, paths = observed.seen(window), observed.paths(window)
         names = names_of(seen, paths, observed.own_ids, window.times)
         what = (sample, *observed.agents, f"{rules.observe:g}", str(RATE), form.seen)
-        key = digest(form.seed, "question", *what)  # the same for the same sample, observers and moments
+        key = digest(
+            form.seed, "question", *what
+        )  # the same for the same sample, observers and moments
         question = {
             "id": key,
             "seconds": ahead,
             **question_facts(seen, paths, names, window, scenario),
-            **({"images": _pictures(files, form.cameras, window, names, key, output)} if form.cameras else {}),
+            **(
+                {"images": _pictures(files, form.cameras, window, names, key, output)}
+                if form.cameras
+                else {}
+            ),
         }
         yield question, {"id": key, **truth_facts(observed.dataset, sample, names, ahead, why)}
 
@@ -258,7 +282,9 @@ def _pictures(
     return listed
 
 
-def _agents_of(dataset: Dataset, scenario: str, ego: AgentName, wanted: str | tuple[str, ...]) -> tuple[AgentName, ...]:
+def _agents_of(
+    dataset: Dataset, scenario: str, ego: AgentName, wanted: str | tuple[str, ...]
+) -> tuple[AgentName, ...]:
     """The agents that observe with an ego; none if one of them is not in this (partial) release."""
     named = wanted if isinstance(wanted, str) else [ego, *wanted]
     try:
@@ -286,7 +312,9 @@ def seconds_ahead(frames_to_impact: int | None, frames_to_end: int, ahead: int) 
     Counted in recorded frames. Nobody knows what comes after an impact, or after the recording: these seconds are None.
     """
     if frames_to_impact is None:
-        return [False if second * _SECOND <= frames_to_end else None for second in range(1, ahead + 1)]
+        return [
+            False if second * _SECOND <= frames_to_end else None for second in range(1, ahead + 1)
+        ]
     there = math.ceil(frames_to_impact / _SECOND)
     return [second == there if second <= there else None for second in range(1, ahead + 1)]
 
@@ -335,7 +363,10 @@ def why_facts(dataset: Dataset, scenario: Mapping[str, Any]) -> dict[str, Any] |
         contact = collision(dataset, scenario["token"])
     except NotAvailableError:  # the two are never labelled together
         contact = None
-    return {**design, **{name: None if contact is None else _plain(getattr(contact, name)) for name in _CONTACT}}
+    return {
+        **design,
+        **{name: None if contact is None else _plain(getattr(contact, name)) for name in _CONTACT},
+    }
 
 
 def _plain(value: Any) -> Any:

@@ -79,7 +79,16 @@ def _start(mask: AnyArray, cells: IntArray) -> int:
 
 def _follow(mask: bytes, width: int, start: int) -> list[int]:
     """The cells where the border turns, from `start`, its part's first one, counter-clockwise (Suzuki and Abe)."""
-    around = (1, 1 - width, -width, -width - 1, -1, width - 1, width, width + 1)  # from the right, counter-clockwise
+    around = (
+        1,
+        1 - width,
+        -width,
+        -width - 1,
+        -1,
+        width - 1,
+        width,
+        width + 1,
+    )  # from the right, counter-clockwise
     turns = around + around
     back = next((turn for turn in (3, 2, 1, 0, 7, 6, 5) if mask[start + around[turn]]), None)
     if back is None:
@@ -150,7 +159,9 @@ def _first_corner(places: list[int]) -> int:
 
 
 # The turns that make edges at the lowest, rightmost, highest and leftmost corner lie like one at the lowest.
-_QUARTER_TURNS = np.array([[[1, 0], [0, 1]], [[0, 1], [-1, 0]], [[-1, 0], [0, -1]], [[0, -1], [1, 0]]])
+_QUARTER_TURNS = np.array(
+    [[[1, 0], [0, 1]], [[0, 1], [-1, 0]], [[-1, 0], [0, -1]], [[0, -1], [1, 0]]]
+)
 
 
 def min_area_rects(hulls: Sequence[Sequence[Point]]) -> tuple[AnyArray, AnyArray]:
@@ -166,10 +177,14 @@ def min_area_rects(hulls: Sequence[Sequence[Point]]) -> tuple[AnyArray, AnyArray
     broad = np.flatnonzero(corners > 2).tolist()
     if broad:
         most = corners[broad].max()
-        points = np.array([[*hulls[index], *[hulls[index][0]] * (most - corners[index])] for index in broad])
+        points = np.array(
+            [[*hulls[index], *[hulls[index][0]] * (most - corners[index])] for index in broad]
+        )
         width, height = _rectangles(points, corners[broad])
         side[broad] = width
-        size[broad] = np.sqrt((np.stack([width, height], axis=1).astype(np.float64) ** 2).sum(axis=-1))
+        size[broad] = np.sqrt(
+            (np.stack([width, height], axis=1).astype(np.float64) ** 2).sum(axis=-1)
+        )
     angle = np.arctan2(side[:, 1], side[:, 0]).astype(np.float32)
     return size, ((angle * np.float32(180)).astype(np.float64) / np.pi).astype(np.float32)
 
@@ -194,7 +209,9 @@ def _rectangles(points: IntArray, corners: IntArray) -> tuple[AnyArray, AnyArray
     return np.stack([a * width, b * width], axis=1), np.stack([-b * height, a * height], axis=1)
 
 
-def _rotate(points: IntArray, edges: IntArray, corners: IntArray) -> tuple[IntArray, IntArray, IntArray]:
+def _rotate(
+    points: IntArray, edges: IntArray, corners: IntArray
+) -> tuple[IntArray, IntArray, IntArray]:
     """Turn four lines around all hulls at once, from edge to edge.
 
     For each step: the corners (C, N, 4) that the lines touch after it, the edge (C, N) that one of them came to lie on,
@@ -202,7 +219,9 @@ def _rotate(points: IntArray, edges: IntArray, corners: IntArray) -> tuple[IntAr
     """
     which = np.arange(len(points))
     x, y = points[..., 0], points[..., 1]
-    touching = np.stack([y.argmin(axis=1), x.argmax(axis=1), y.argmax(axis=1), x.argmin(axis=1)], axis=1)
+    touching = np.stack(
+        [y.argmin(axis=1), x.argmax(axis=1), y.argmax(axis=1), x.argmin(axis=1)], axis=1
+    )
     turned_edges = np.einsum("lij,ncj->lnci", _QUARTER_TURNS, edges)
     steps, leading, turned = [], [], []
     for _ in range(points.shape[1]):
@@ -301,7 +320,10 @@ def _headings(path: FloatArray, angle: FloatArray) -> FloatArray:
 
 def _corners(centers: FloatArray, half: FloatArray, angle: FloatArray) -> FloatArray:
     """(N, 4, 2) columns and rows of the corners of boxes around `centers` (rows, columns), half as long and wide."""
-    cosine, sine = (np.array([function(a) for a in angle.tolist()])[:, None] for function in (math.cos, math.sin))
+    cosine, sine = (
+        np.array([function(a) for a in angle.tolist()])[:, None]
+        for function in (math.cos, math.sin)
+    )
     across, along = np.moveaxis(_CORNERS * half[:, None, ::-1], -1, 0)
     column = cosine * across + sine * along + centers[:, 1:]
     row = -sine * across + cosine * along + centers[:, :1]

@@ -56,7 +56,9 @@ _ENTRIES: Final = tuple({way_out: way_in for way_in, way_out in exits.items()} f
 _OPPOSITE: Final = (_BOTTOM, _RIGHT, _TOP, _LEFT)
 
 
-def pair_gaps(image: AnyArray, ids: IntArray, *, below: float = np.inf) -> tuple[IntArray, FloatArray]:
+def pair_gaps(
+    image: AnyArray, ids: IntArray, *, below: float = np.inf
+) -> tuple[IntArray, FloatArray]:
     """Pairs (P, 2) of `ids`, ascending, and the distances (P,) between their outlines in a map (H, W), cells.
 
     0 where outlines overlap, `NO_OUTLINE` where one has none; pairs that cannot be nearer than `below` are left out.
@@ -113,7 +115,9 @@ def simplified_outlines(outlines: list[FloatArray]) -> list[FloatArray]:
         first, farthest, last = first[split], farthest[split], last[split]
         kept[farthest] = True
         first, last = np.concatenate([first, farthest]), np.concatenate([farthest, last])
-    return [outline[keep] for outline, keep in zip(outlines, np.split(kept, ends[:-1]), strict=True)]
+    return [
+        outline[keep] for outline, keep in zip(outlines, np.split(kept, ends[:-1]), strict=True)
+    ]
 
 
 def _places(image: AnyArray, ids: IntArray) -> list[_Place | None]:
@@ -142,13 +146,21 @@ def _box_gaps(places: Sequence[_Place | None]) -> FloatArray:
     return np.where(np.isnan(gaps), NO_OUTLINE, gaps)
 
 
-def _shapes(image: AnyArray, ids: IntArray, places: Sequence[_Place | None], wanted: IntArray) -> AnyArray:
+def _shapes(
+    image: AnyArray, ids: IntArray, places: Sequence[_Place | None], wanted: IntArray
+) -> AnyArray:
     """(N,) shapely's polygons of the instances number `wanted`; None for the others and those without an outline."""
     import shapely
 
     there = [index for index in wanted.tolist() if places[index] is not None]
-    outlines = simplified_outlines([first_outline(image, ids.item(index), places[index]) for index in there])
-    broad = [(index, points) for index, points in zip(there, outlines, strict=True) if _corners(points) >= 3]
+    outlines = simplified_outlines(
+        [first_outline(image, ids.item(index), places[index]) for index in there]
+    )
+    broad = [
+        (index, points)
+        for index, points in zip(there, outlines, strict=True)
+        if _corners(points) >= 3
+    ]
     shapes = np.full(len(ids), None)
     if broad:
         owner = np.repeat(np.arange(len(broad)), [len(points) for _, points in broad])

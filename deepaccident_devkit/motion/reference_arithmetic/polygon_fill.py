@@ -44,11 +44,15 @@ def topmost(
     coincide or cross; `image` (N,) says which of the images each is drawn into, None the first. Raises GeometryError.
     """
     corners = checked("polygons", polygons, (None, None, 2), np.int64)
-    where = checked("image", np.zeros(len(corners)) if image is None else image, (len(corners),), np.int64)
+    where = checked(
+        "image", np.zeros(len(corners)) if image is None else image, (len(corners),), np.int64
+    )
     if corners.shape[1] < 3:
         raise GeometryError(f"polygons: expected at least 3 corners, found {corners.shape[1]}")
     if len(where) and not 0 <= where.min() <= where.max() < images:
-        raise GeometryError(f"image: expected numbers from 0 to {images - 1}, found {where.min()} to {where.max()}")
+        raise GeometryError(
+            f"image: expected numbers from 0 to {images - 1}, found {where.min()} to {where.max()}"
+        )
     first, last, owner = _runs(corners, shape)
     lengths = last - first + 1
     before = np.cumsum(lengths) - lengths
@@ -70,13 +74,19 @@ def _runs(corners: IntArray, shape: tuple[int, int]) -> tuple[IntArray, IntArray
     simple, others = whole[owner], np.flatnonzero(~whole)
     runs = np.stack([row, first, last, owner])
     *between, whose = _between(corners[others], shape)
-    parts = [np.stack(_merged(*runs[:, simple])), runs[:, ~simple], np.stack([*between, others[whose]])]
+    parts = [
+        np.stack(_merged(*runs[:, simple])),
+        runs[:, ~simple],
+        np.stack([*between, others[whose]]),
+    ]
     row, first, last, owner = np.concatenate(parts, axis=1)
     start = row * shape[1]
     return start + first, start + last, near[owner]
 
 
-def _merged(row: IntArray, first: IntArray, last: IntArray, owner: IntArray) -> tuple[IntArray, ...]:
+def _merged(
+    row: IntArray, first: IntArray, last: IntArray, owner: IntArray
+) -> tuple[IntArray, ...]:
     """The runs (R,) of each polygon merged into one for each row, from the first column of all to the last."""
     if not len(row):
         return row, first, last, owner
@@ -159,7 +169,9 @@ class _Lines:
         return (x + first).astype(np.int64), (x + last).astype(np.int64)
 
 
-def _between(corners: IntArray, shape: tuple[int, int]) -> tuple[IntArray, IntArray, IntArray, IntArray]:
+def _between(
+    corners: IntArray, shape: tuple[int, int]
+) -> tuple[IntArray, IntArray, IntArray, IntArray]:
     """The runs between the edges of polygons in the image: row, first and last column, polygon."""
     height, width = shape
     low = np.maximum(corners[..., 1].min(axis=1), 0)
@@ -170,7 +182,9 @@ def _between(corners: IntArray, shape: tuple[int, int]) -> tuple[IntArray, IntAr
     downward = (start[..., 1] < corners[..., 1])[..., None]
     upper, lower = np.where(downward, start, corners), np.where(downward, corners, start)
     ahead = (lower[..., 0] - upper[..., 0]) << _FIXED
-    slope = np.sign(ahead) * (np.abs(ahead) // np.maximum(lower[..., 1] - upper[..., 1], 1))  # C++ rounds towards 0
+    slope = np.sign(ahead) * (
+        np.abs(ahead) // np.maximum(lower[..., 1] - upper[..., 1], 1)
+    )  # C++ rounds towards 0
     below = row[:, None] - upper[owner, :, 1]
     crossing = (upper[owner, :, 0] << _FIXED) + below * slope[owner]
     crossing[(below < 0) | (row[:, None] >= lower[owner, :, 1])] = _BEYOND
@@ -211,6 +225,8 @@ def _clip_end(near: IntArray, far: IntArray, axis: int, most: int, which: BoolAr
         return
     edge, corner = edge[beyond], near[beyond]
     way = far[beyond] - corner
-    share: FloatArray = (edge - corner[:, axis]).astype(np.float64) * way[:, 1 - axis] / way[:, axis]
+    share: FloatArray = (
+        (edge - corner[:, axis]).astype(np.float64) * way[:, 1 - axis] / way[:, axis]
+    )
     near[beyond, 1 - axis] += share.astype(np.int64)  # C++ rounds towards 0
     near[beyond, axis] = edge

@@ -24,7 +24,13 @@ CellIndices = NDArray[np.intp]
 OUTSIDE: Final = -1
 """In indices of cells: the sample point is outside the grid and has no value."""
 
-_SINE: Final = (2.605780704850265e-06, -0.00019809602928568679, 0.008333066246354204, -0.16666659550431576, 1.0)
+_SINE: Final = (
+    2.605780704850265e-06,
+    -0.00019809602928568679,
+    0.008333066246354204,
+    -0.16666659550431576,
+    1.0,
+)
 """sin t / t as a polynomial of t², the highest power first.
 
 torch rounds 2–5 % of all sines and cosines to the neighbour of the nearest float32, because it uses a polynomial of
@@ -56,7 +62,9 @@ def sines_and_cosines(angle: ArrayLike) -> Float32Array:
     radians = np.asarray(angle, dtype=np.float32).astype(np.float64)
     turns = radians / np.pi
     half_turns = np.rint(np.array([turns, turns + 0.5]))
-    within = np.array([radians - half_turns[0] * np.pi, radians - (half_turns[1] - 0.5) * np.pi])  # [−π/2, π/2]
+    within = np.array(
+        [radians - half_turns[0] * np.pi, radians - (half_turns[1] - 0.5) * np.pi]
+    )  # [−π/2, π/2]
     square = within * within
     ratio = square * _SINE[0] + _SINE[1]
     for factor in _SINE[2:]:
@@ -79,7 +87,9 @@ def fused_product(first: Float32Array, second: Float32Array) -> Float32Array:
     """`product` with fused multiply-add, which numpy's own products of two matrices use on today's processors."""
     total = np.zeros((*first.shape[:-1], second.shape[-1]), dtype=np.float32)
     for inner in range(first.shape[-1]):
-        exact = np.multiply(first[..., :, inner, None], second[..., None, inner, :], dtype=np.float64)
+        exact = np.multiply(
+            first[..., :, inner, None], second[..., None, inner, :], dtype=np.float64
+        )
         total = (exact + total).astype(np.float32)
     return total
 
@@ -106,7 +116,9 @@ def inverse(matrix: Float32Array) -> Float32Array:
         below = slice(step + 1, 3)
         # getrf multiplies by the reciprocal of the pivot
         mixed[:, below, step] *= np.float32(1) / mixed[:, step, step, None]
-        mixed[:, below, step + 1 :] -= mixed[:, below, step, None] * mixed[:, step, None, step + 1 :]
+        mixed[:, below, step + 1 :] -= (
+            mixed[:, below, step, None] * mixed[:, step, None, step + 1 :]
+        )
     solved = np.zeros_like(matrix)
     solved[count[:, None], np.arange(4), order] = 1
     for row, others in ((1, (0,)), (2, (0, 1)), (2, (3,)), (1, (3, 2)), (0, (3, 2, 1))):
@@ -148,7 +160,9 @@ class SamplingLine(NamedTuple):
         point += self.shift[matrix]
         return self.finish(point)
 
-    def points_of(self, matrix: IntArray, row: IntArray, column: IntArray, run: IntArray) -> AnyArray:
+    def points_of(
+        self, matrix: IntArray, row: IntArray, column: IntArray, run: IntArray
+    ) -> AnyArray:
         """(P,), bit by bit those of `points`, of the target cells in `column` (P,) of `run` (P,).
 
         `matrix` and `row` (R,) are those of the runs; the columns of matrix m count from m · W.
@@ -159,7 +173,9 @@ class SamplingLine(NamedTuple):
         return self.finish(point)
 
 
-def stretched_lines(planes: Float32Array, axes: tuple[_Axis, _Axis]) -> tuple[SamplingLine, SamplingLine]:
+def stretched_lines(
+    planes: Float32Array, axes: tuple[_Axis, _Axis]
+) -> tuple[SamplingLine, SamplingLine]:
     """Rows and columns at which the released warp samples a raster with these axes of rows and columns.
 
     `planes` (N, 2, 3) are, for rows and for columns, factors of the target's metres along both, and a shift.
@@ -168,7 +184,9 @@ def stretched_lines(planes: Float32Array, axes: tuple[_Axis, _Axis]) -> tuple[Sa
     lines = []
     for axis, plane in zip(axes, planes.swapaxes(0, 1), strict=True):
         finish = functools.partial(_stretched, axis)
-        lines.append(SamplingLine(plane[:, :1] * rows, plane[:, 1:2] * columns, plane[:, 2], finish))
+        lines.append(
+            SamplingLine(plane[:, :1] * rows, plane[:, 1:2] * columns, plane[:, 2], finish)
+        )
     return lines[0], lines[1]
 
 
@@ -227,7 +245,9 @@ def take_cells(cells: AnyArray, indices: CellIndices, fill: float = 0) -> AnyArr
     return taken
 
 
-def blend_cells(raster: AnyArray, points: tuple[AnyArray, AnyArray], fill: float = 0) -> Float32Array:
+def blend_cells(
+    raster: AnyArray, points: tuple[AnyArray, AnyArray], fill: float = 0
+) -> Float32Array:
     """The values (…, H, W) of a raster at sample points, each the weighted mean of the four cells around.
 
     Nearly all is done in the memory of the points, whose numbers are lost.
@@ -244,7 +264,9 @@ def blend_cells(raster: AnyArray, points: tuple[AnyArray, AnyArray], fill: float
     above += wide + 1
     index = above.astype(np.int32).astype(np.intp)  # in two steps: three times as fast
     up, back = 1 - down, 1 - right
-    result: Float32Array = cells.take(index, axis=-1, mode="wrap")  # all are inside; the fastest mode
+    result: Float32Array = cells.take(
+        index, axis=-1, mode="wrap"
+    )  # all are inside; the fastest mode
     result *= up * back
     up *= right
     back *= down
@@ -276,7 +298,9 @@ def _released_coordinates(axis: _Axis) -> Float32Array:
 def _centers(axis: _Axis) -> FloatArray:
     """(n,) metres: the cells' centres."""
     low, high, size = axis
-    centers: FloatArray = low + (np.arange(round((high - low) / size), dtype=np.float64) + 0.5) * size
+    centers: FloatArray = (
+        low + (np.arange(round((high - low) / size), dtype=np.float64) + 0.5) * size
+    )
     return centers
 
 

@@ -49,7 +49,9 @@ def check_splits(sides: tuple[str, ...], as_json: bool) -> None:
 @index_dir_parameter
 @on_error_parameter
 @json_parameter
-def check_scores(dataroot: str, file: str, split: str | None, as_json: bool, **release: Any) -> None:
+def check_scores(
+    dataroot: str, file: str, split: str | None, as_json: bool, **release: Any
+) -> None:
     """Find what scores of accidents depend on: length of the clip, folder, name, town, weather or actors.
 
     FILE has results of the task accident, JSON of token and score, or CSV of token,score.
@@ -83,7 +85,9 @@ def check_reader(target: str, write_release: bool, as_json: bool) -> None:
     if write_release:
         refuse_unused("with --write-release", "as_json")
         path = write_audit_release(path_of(target))
-        click.echo(f"written: {path}; let your reader write JSON of it, and give that folder to `check reader`")
+        click.echo(
+            f"written: {path}; let your reader write JSON of it, and give that folder to `check reader`"
+        )
         return
     try:
         report = audit_reader(target if Path(target).is_dir() else _function(target))
@@ -91,7 +95,9 @@ def check_reader(target: str, write_release: bool, as_json: bool) -> None:
         raise
     except (Exception, SystemExit) as error:
         traceback.print_exc()
-        raise ConfigError(f"{target}: ended with {type(error).__name__}, so nothing was compared") from error
+        raise ConfigError(
+            f"{target}: ended with {type(error).__name__}, so nothing was compared"
+        ) from error
     _end(report, as_json)
 
 
@@ -106,7 +112,10 @@ def _function(target: str) -> Callable[[str], object]:
     place, _, name = target.rpartition(":")
     sys.path.insert(0, str(Path(place).parent))  # of a module: here
     try:
-        return cast("Callable[[str], object]", resolve_name(f"{Path(place).name.removesuffix('.py')}:{name}"))
+        return cast(
+            "Callable[[str], object]",
+            resolve_name(f"{Path(place).name.removesuffix('.py')}:{name}"),
+        )
     except (ImportError, AttributeError, ValueError) as error:
         expected = "expected a folder, module:function or file.py:function"
         raise click.UsageError(f"TARGET: {expected}, found {target!r} ({error})") from error

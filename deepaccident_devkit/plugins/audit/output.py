@@ -39,7 +39,9 @@ def values_in_folder(folder: Path) -> Iterator[tuple[list[str], Any]]:
         yield from values_in(value, {}, _keys([""], path.stem))
 
 
-def values_in(value: Any, known: dict[int, object], keys: list[str]) -> Iterator[tuple[list[str], Any]]:
+def values_in(
+    value: Any, known: dict[int, object], keys: list[str]
+) -> Iterator[tuple[list[str], Any]]:
     """Yield the keys of each value without parts, or too deep or large to have them, and the value.
 
     Args:
@@ -80,7 +82,11 @@ def _parts(value: Any) -> Any:
     abilities = {*dir(type(value))}
     if {"keys", "items"} <= abilities:  # also a table of pandas
         return value.items()
-    for method in {"to_pydict", "to_dict", "_asdict"} & abilities:  # a table of Arrow or Polars, a named tuple
+    for method in {
+        "to_pydict",
+        "to_dict",
+        "_asdict",
+    } & abilities:  # a table of Arrow or Polars, a named tuple
         return [(None, getattr(value, method)())]
     if {"__array__", "__array_interface__"} & abilities:
         return _parts_of_array(value)

@@ -32,7 +32,9 @@ PLUGIN: Final = Plugin(
     name="audit",
     protocol_version=PROTOCOL_VERSION,
     verbs={
-        "check reader": LazyVerb("Find columns that a reader of the files mistakes for others.", _check_reader),
+        "check reader": LazyVerb(
+            "Find columns that a reader of the files mistakes for others.", _check_reader
+        ),
         "check scores": LazyVerb("Find what scores of accidents depend on.", _check_scores),
         "check splits": LazyVerb("Find what stands on two sides of a split.", _check_splits),
     },

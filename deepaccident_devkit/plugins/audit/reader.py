@@ -54,10 +54,18 @@ _RAW: Final = "raw|label|undecoded|stored"
 _SIZE: Final = "size|dim|_d[xyz]_"
 # Place in the files → the column.
 _COLUMNS: Final[Mapping[str, _Column]] = {
-    "line 1 of the labels, number 1": _Column(14.05, 0.003, "own velocity along the world's x", _VELOCITY, "x"),
-    "line 1 of the labels, number 2": _Column(-15.05, -0.003, "own velocity along the world's y", _VELOCITY, "y"),
-    "column 2 of the labels": _Column(20.03, 0.03, "x of the box's centre in the LiDAR frame", _CENTER, "x"),
-    "column 3 of the labels": _Column(-31.03, -0.03, "y of the box's centre, to the right", _CENTER, "y"),
+    "line 1 of the labels, number 1": _Column(
+        14.05, 0.003, "own velocity along the world's x", _VELOCITY, "x"
+    ),
+    "line 1 of the labels, number 2": _Column(
+        -15.05, -0.003, "own velocity along the world's y", _VELOCITY, "y"
+    ),
+    "column 2 of the labels": _Column(
+        20.03, 0.03, "x of the box's centre in the LiDAR frame", _CENTER, "x"
+    ),
+    "column 3 of the labels": _Column(
+        -31.03, -0.03, "y of the box's centre, to the right", _CENTER, "y"
+    ),
     "column 4 of the labels": _Column(-1.61, -0.001, "z of the box's centre", _CENTER, "z"),
     "column 5 of the labels": _Column(
         4.513, 0.002, "the box's length; next are width and height", f"length|_l_|{_SIZE}", "x"
@@ -71,18 +79,28 @@ _COLUMNS: Final[Mapping[str, _Column]] = {
     "column 8 of the labels": _Column(
         2.513, 0.0015, "the box's yaw in the LiDAR frame, clockwise", "yaw_$|head|rot|angle"
     ),
-    "column 9 of the labels": _Column(41.03, 0.03, "vx, of no frame until it is decoded", _RAW, "x"),
-    "column 10 of the labels": _Column(-51.03, -0.03, "vy, of no frame until it is decoded", _RAW, "y"),
+    "column 9 of the labels": _Column(
+        41.03, 0.03, "vx, of no frame until it is decoded", _RAW, "x"
+    ),
+    "column 10 of the labels": _Column(
+        -51.03, -0.03, "vy, of no frame until it is decoded", _RAW, "y"
+    ),
     "column 11 of the labels": _Column(0, 0, "the actor's id", "_ids?_|actor|track"),
-    "column 12 of the labels": _Column(2103, 7, "the LiDAR points in the box", "point|pts|lidar|_num_|_count_"),
-    "column 13 of the labels": _Column(0, 0, "whether a camera of the agent sees the box", "visib|seen|occl"),
+    "column 12 of the labels": _Column(
+        2103, 7, "the LiDAR points in the box", "point|pts|lidar|_num_|_count_"
+    ),
+    "column 13 of the labels": _Column(
+        0, 0, "whether a camera of the agent sees the box", "visib|seen|occl"
+    ),
     "line 1 of meta, word 9": _Column(
         12, 0, "the simulated frames, ten more than recorded", "frame|length|_num_|count|total"
     ),
 }
 # Names that say what something is: of what no column has, and those that are right of some column.
 _BELIEFS: Final = "|".join(
-    ["ttc|tta_|eta_|countdown|time_to|remaining|_left_|until|rate_|angular|accel|speed|vel|_v_|_v_?[xyz]_"]
+    [
+        "ttc|tta_|eta_|countdown|time_to|remaining|_left_|until|rate_|angular|accel|speed|vel|_v_|_v_?[xyz]_"
+    ]
     + ["colli|crash|accident|_hit_"]
     + [column.right for column in _COLUMNS.values()]
 )
@@ -90,7 +108,9 @@ _BELIEFS: Final = "|".join(
 _AXIS: Final = re.compile("_(?:v|d|c|p|t|pos|loc|vel|coord|cent(?:er|re))?([xyz])(?=_)")
 # Files, keys and paths with such a name may be pictures.
 _PICTURE: Final = re.compile(r"image|img|rgb|picture|photo|\.(jpe?g|png)$", re.IGNORECASE)
-_DECODING: Final = "docs/format.md says what each column holds; of vx and vy, v_world = Rz(−yaw) · (vx, vy)."
+_DECODING: Final = (
+    "docs/format.md says what each column holds; of vx and vy, v_world = Rz(−yaw) · (vx, vy)."
+)
 _AXES: Final = (
     "In the files x is forward, y to the right and z up. If yours are others on purpose, as in nuScenes' LiDAR frame, "
     "this is as it should be."
@@ -111,9 +131,13 @@ def write_audit_release(out: Path) -> Path:
     check_free(out)
     first, step = np.array([column[:2] for column in _COLUMNS.values()]).T
     with replacing_folder(out) as made:
-        write_small_release(made, SmallRelease(frames=2, splits=("train",), channels=(*CAMERAS, LIDAR)))
+        write_small_release(
+            made, SmallRelease(frames=2, splits=("train",), channels=(*CAMERAS, LIDAR))
+        )
         for label, path in enumerate(sorted(made.glob("*/*/label/*/*.txt"))):
-            numbers = (first + step * np.arange(_ROWS * label, _ROWS * (label + 1))[:, None]).tolist()
+            numbers = (
+                first + step * np.arange(_ROWS * label, _ROWS * (label + 1))[:, None]
+            ).tolist()
             lines = [numbers[0][:2]]
             for place, line in enumerate(path.read_text().splitlines()[1:]):
                 category, *_, actor, _, _ = line.split()
@@ -151,7 +175,11 @@ def audit_reader(reader: Callable[[str], object] | str | os.PathLike[str]) -> Au
     with TemporaryDirectory() as temporary:
         release = write_audit_release(Path(temporary) / "release")
         columns = _numbers_of(release)
-        values = values_in(reader(str(release)), {}, [""]) if callable(reader) else values_in_folder(path_of(reader))
+        values = (
+            values_in(reader(str(release)), {}, [""])
+            if callable(reader)
+            else values_in_folder(path_of(reader))
+        )
         numbers, pictures, unread = _collected(values)
     rows = dict[str, Row]()
     findings = list[AuditFinding]()
@@ -180,13 +208,17 @@ def audit_reader(reader: Callable[[str], object] | str | os.PathLike[str]) -> Au
     others.difference_update(map(_whole, rows))
     cannot_say = {
         "no key holds numbers as they are in the release's files.": not rows,
-        "the keys' names do not say what they hold; compare the table with what you read.": rows and not judged,
+        "the keys' names do not say what they hold; compare the table with what you read.": rows
+        and not judged,
         f"the numbers of {possible_text('', others)} are of no column; they may be computed or scaled.": others,
         f"not looked into: {possible_text('', sorted(unread))}.": unread,
     }
     return AuditReport(
         # where numbers were not recognised, right pictures do not speak for them
-        compared={"keys by their names": judged, "pictures": len(pictures) if rows or not others | unread else 0},
+        compared={
+            "keys by their names": judged,
+            "pictures": len(pictures) if rows or not others | unread else 0,
+        },
         cannot_say=tuple(reason for reason, is_so in cannot_say.items() if is_so),
         findings=tuple(findings),
         tables={"keys": [("key", "holds", "values", ""), *rows.values()]},
@@ -217,7 +249,11 @@ def _collected(
             numbers[key.lstrip("/")].append(number)
         if keys and math.isnan(number):
             name = value if isinstance(value, str) else keys[0].lstrip("/")
-            if _PICTURE.search(name) and not pictures.get(name) and (is_bev := _is_bev(value)) is not None:
+            if (
+                _PICTURE.search(name)
+                and not pictures.get(name)
+                and (is_bev := _is_bev(value)) is not None
+            ):
                 pictures[name] = is_bev
             elif keys == [""] or not isinstance(value, str | float | None):
                 unread.add(name if isinstance(value, Path) else type(value).__qualname__)
@@ -243,13 +279,18 @@ def _misread(key: str, name: str, place: str) -> list[AuditFinding]:
     if is_right and (not axes or column.axis in ("", axes[-1])):
         return []
     what = f"{key} holds {place}: {column.meaning}; you read it as `{name.strip('_')}`."
-    return [AuditFinding(kind="misread", what=what, remedy=_AXES if is_right else _DECODING, number=1)]
+    return [
+        AuditFinding(kind="misread", what=what, remedy=_AXES if is_right else _DECODING, number=1)
+    ]
 
 
 def _numbers_of(release: Path) -> dict[str, FloatArray]:
     """Return the numbers that each place in the files has, or could have in more rows, without their signs."""
     rows = np.arange(_ROWS * _LABELS)
-    numbers = {place: np.unique(np.abs(first + step * rows)) for place, (first, step, *_) in _COLUMNS.items()}
+    numbers = {
+        place: np.unique(np.abs(first + step * rows))
+        for place, (first, step, *_) in _COLUMNS.items()
+    }
     labels = read_labels(sorted(release.glob("*/*/label/*/*.txt")))
     return {**numbers, "column 11 of the labels": np.unique(np.abs(labels.actor_id)).astype(float)}
 
@@ -259,9 +300,14 @@ def _column(values: FloatArray, columns: Mapping[str, FloatArray]) -> tuple[str,
     if np.isin(values, (0, 1)).all():
         seen, number = int(values.sum()), len(values)
         # seven of the ten rows of a label, or of nine without the own one
-        return "column 13 of the labels", number * (seen % 7 == 0 and 9 * seen <= 7 * number <= 10 * seen)
+        return "column 13 of the labels", number * (
+            seen % 7 == 0 and 9 * seen <= 7 * number <= 10 * seen
+        )
     numbers = np.abs(values[np.isfinite(values) & (values != 0)])  # zeros tell nothing
-    near = {place: numbers[np.abs(numbers[:, None] - of).min(axis=1) < 0.0051] for place, of in columns.items()}
+    near = {
+        place: numbers[np.abs(numbers[:, None] - of).min(axis=1) < 0.0051]
+        for place, of in columns.items()
+    }
     best = max(near, key=lambda place: len(near[place]))
     is_constant = len(np.unique(near[best])) < min(2, len(columns[best]))
     return best, len(near[best]) * (len(near[best]) >= 0.8 * len(numbers) and not is_constant)
@@ -286,7 +332,11 @@ def _is_bev(picture: Any) -> bool | None:
     import cv2
 
     with suppress(TypeError, ValueError, cv2.error):
-        pixels = read_image(Path(picture)) if isinstance(picture, str | Path) else np.asarray(picture, dtype=np.uint8)
+        pixels = (
+            read_image(Path(picture))
+            if isinstance(picture, str | Path)
+            else np.asarray(picture, dtype=np.uint8)
+        )
         if pixels.ndim == 3 and pixels.shape[2] == 3:
             small = cv2.resize(pixels, (12, 12), interpolation=cv2.INTER_AREA).astype(float)
             true = _bev()[50::100, 50::100]

@@ -45,19 +45,27 @@ def places_in(scenario: ScenarioFolder) -> IntArray:
         if not len(labels):
             continue
         calibs = read_calibs([scenario.calib_path(agent, frame) for frame in frames])
-        pose = np.repeat(calibs.world_from_ego @ calibs.ego_from_lidar, labels.num_boxes, axis=0)[:, :2]
+        pose = np.repeat(calibs.world_from_ego @ calibs.ego_from_lidar, labels.num_boxes, axis=0)[
+            :, :2
+        ]
         center = np.einsum("nij,nj->ni", pose[..., :3], labels.center) + pose[..., 3]
         velocity = np.nan_to_num(world_from_label_velocity(labels.velocity, labels.yaw))
         is_used = (np.hypot(*velocity.T) > _MIN_SPEED_MPS) | (labels.actor_id >= STATIC_ACTOR_ID)
         for later in range(_PREDICTED_FRAMES):
-            x, y = ((center + later * FRAME_PERIOD * velocity)[is_used] // _CELL_M).astype(np.int64).T % _CELLS
+            x, y = ((center + later * FRAME_PERIOD * velocity)[is_used] // _CELL_M).astype(
+                np.int64
+            ).T % _CELLS
             place = (labels.actor_id[is_used] * _CELLS + x) * _CELLS + y
-            parts.append(np.column_stack([place, np.repeat(frames, labels.num_boxes)[is_used] + later]))
+            parts.append(
+                np.column_stack([place, np.repeat(frames, labels.num_boxes)[is_used] + later])
+            )
     places = np.concatenate(parts)
     return places[np.unique(places[:, 0], return_index=True)[1]]
 
 
-def shared_moments(mine: Sequence[IntArray], theirs: Sequence[IntArray]) -> dict[tuple[int, int], int]:
+def shared_moments(
+    mine: Sequence[IntArray], theirs: Sequence[IntArray]
+) -> dict[tuple[int, int], int]:
     """Return which of two releases' recordings have a road user at the same place.
 
     Args:

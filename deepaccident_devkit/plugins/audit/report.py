@@ -54,7 +54,13 @@ class AuditReport(CheckReport):
     def to_text(self) -> str:
         """A paragraph for each finding, what was compared, the tables and the notes."""
         paragraphs = [
-            "\n  ".join([f"FOUND {each.kind}: {each.what}", *map("such as {}".format, each.examples), each.remedy])
+            "\n  ".join(
+                [
+                    f"FOUND {each.kind}: {each.what}",
+                    *map("such as {}".format, each.examples),
+                    each.remedy,
+                ]
+            )
             for each in self.findings
         ]
         if self.exit_status == 0:

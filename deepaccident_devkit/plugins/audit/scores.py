@@ -56,9 +56,7 @@ _REMEDY: Final = (
     "give results of the task accident, a JSON object of token and score, or a .csv of lines `token,score`, with a "
     "comma, a semicolon, a tab or a bar"
 )
-_ALIKE: Final = (
-    "scenarios that end alike hardly differ in it, so scores that go by it cannot be told apart from the truth here."
-)
+_ALIKE: Final = "scenarios that end alike hardly differ in it, so scores that go by it cannot be told apart from the truth here."
 _FEW: Final = f"nothing can be found: all are equal, or fewer than {LEAST_CLUSTERS} scenarios (twins are one) have one."
 
 
@@ -83,14 +81,20 @@ def read_scores(path: str | os.PathLike[str]) -> dict[str, float]:
         else:
             given = dict(document)
     except (TypeError, LookupError) as error:
-        raise ResultsError(f"{file}: expected an object of token and score, or a list of these; {_REMEDY}") from error
+        raise ResultsError(
+            f"{file}: expected an object of token and score, or a list of these; {_REMEDY}"
+        ) from error
     except (OSError, ValueError) as error:
-        raise ResultsError(f"{file}: {shortened(fault_text(error), MOST_TOLD)}; {_REMEDY}") from error
+        raise ResultsError(
+            f"{file}: {shortened(fault_text(error), MOST_TOLD)}; {_REMEDY}"
+        ) from error
     if not given:
         raise ResultsError(f"{file}: has no token with a score; {_REMEDY}")
     if "results" in given and (results := read_results(file)).task == "accident":
         given = {
-            token: max((accident.score for accident in cast("Any", results.prediction(token))), default=0.0)
+            token: max(
+                (accident.score for accident in cast("Any", results.prediction(token))), default=0.0
+            )
             for token in results.tokens
         }
     for token, score in given.items():
@@ -105,7 +109,9 @@ def _pairs_of_table(text: str) -> Iterator[tuple[str, float | None]]:
         if "/" in line:
             found = _LINE.fullmatch(line)
             if found is None:
-                raise ValueError(f"line {number}: expected a token and then its score, found {shortened(line)}")
+                raise ValueError(
+                    f"line {number}: expected a token and then its score, found {shortened(line)}"
+                )
             yield found["token"], number_of(found["score"].replace(",", "."))
 
 
@@ -133,9 +139,13 @@ def audit_scores(
     ]
     chosen = [*dataset.split_scenarios(split)] if split else tokens
     counts = np.isin(tokens, chosen) & np.array(view["weather"].is_valid())
-    rows, frame, score = np.array([case for case in cases if counts[case[0]]], dtype=float).reshape(-1, 3).T
+    rows, frame, score = (
+        np.array([case for case in cases if counts[case[0]]], dtype=float).reshape(-1, 3).T
+    )
     if not len(rows):
-        raise ResultsError("no scenario with meta has a score; give scores of a split whose meta is published")
+        raise ResultsError(
+            "no scenario with meta has a score; give scores of a split whose meta is published"
+        )
     scenario, of = np.unique(rows.astype(int), return_inverse=True)
     highest = np.full(len(scenario), -np.inf)
     np.maximum.at(highest, of, score)
@@ -186,7 +196,10 @@ def audit_scores(
         cannot_say=(*[_FEW] * is_few, *[f"{', '.join(untold)}: {_ALIKE}"] * bool(untold)),
         findings=tuple(findings),
         tables={"scores": [_HEADING, ("the scores", own, *[None] * 6), *table]},
-        notes=(f"{counted(len(truth), 'scenario')} with meta and a score, {truth.sum()} with a collision.", *_NOTES),
+        notes=(
+            f"{counted(len(truth), 'scenario')} with meta and a score, {truth.sum()} with a collision.",
+            *_NOTES,
+        ),
     )
 
 
@@ -216,13 +229,19 @@ def _correlations(columns: Sequence[Any], alike: IntArray, cluster: IntArray) ->
         ranks = [rankdata(table[each], axis=0) - (len(each) + 1) / 2 for each in groups]
         products = [each.T @ each for each in (ranks[0], np.concatenate(ranks[1:]))]
         return np.stack(
-            [each[:-1, -1] / np.sqrt(np.diag(each)[:-1] * each[-1, -1] + 1e-9) for each in products], axis=-1
+            [
+                each[:-1, -1] / np.sqrt(np.diag(each)[:-1] * each[-1, -1] + 1e-9)
+                for each in products
+            ],
+            axis=-1,
         )
 
     parts = [np.flatnonzero(cluster == each) for each in np.unique(cluster)]
     draws = np.random.default_rng(0).integers(len(parts), size=(_RESAMPLES, len(parts)))
     drawn = [of(np.concatenate([parts[part] for part in draw])) for draw in draws]
     ends = (
-        np.quantile(drawn, (0.025, 0.975), axis=0) if len(parts) >= LEAST_CLUSTERS else [[[-1]], [[1]]] + 0 * drawn[0]
+        np.quantile(drawn, (0.025, 0.975), axis=0)
+        if len(parts) >= LEAST_CLUSTERS
+        else [[[-1]], [[1]]] + 0 * drawn[0]
     )
     return np.stack([of(np.arange(len(table))), *ends], axis=-1).round(3)

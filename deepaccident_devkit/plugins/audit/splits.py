@@ -12,7 +12,11 @@ from typing import Final
 
 from deepaccident_devkit.collisions.twins import torn_twins
 from deepaccident_devkit.errors import ConfigError, SplitFileError, shortened
-from deepaccident_devkit.plugins.audit.releases import MIN_SHARED_ROAD_USERS, places_in, shared_moments
+from deepaccident_devkit.plugins.audit.releases import (
+    MIN_SHARED_ROAD_USERS,
+    places_in,
+    shared_moments,
+)
 from deepaccident_devkit.plugins.audit.report import AuditFinding, AuditReport
 from deepaccident_devkit.release import find_release
 from deepaccident_devkit.release.store import read_lines
@@ -34,8 +38,14 @@ _SAYS: Final = {
         "recording",
         "on two sides, whole or in part, as by a random split by frames: frames 0.1 s apart are nearly the same",
     ),
-    "twins": ("twin pair", "torn apart, as by a random split by names: twins share junction, traffic and weather"),
-    "mini": ("scenario", "of the mini release beside the full one: of equal names it has other recordings, much alike"),
+    "twins": (
+        "twin pair",
+        "torn apart, as by a random split by names: twins share junction, traffic and weather",
+    ),
+    "mini": (
+        "scenario",
+        "of the mini release beside the full one: of equal names it has other recordings, much alike",
+    ),
 }
 
 
@@ -72,24 +82,39 @@ def audit_splits(paths: Iterable[str | os.PathLike[str]]) -> AuditReport:
         for token, frame in _items(path):
             on[token].add(side)
             on[f"{token} frame {frame}" if frame else token].add(side)
-    recordings, frames = ({item: on[item] for item in sorted(on) if (" " in item) is of} for of in (False, True))
-    full = set[str]().union(*(sides for token, sides in recordings.items() if not token.startswith("mini:")))
-    mini = {token: sides | full for token, sides in recordings.items() if full and token.startswith("mini:")}
+    recordings, frames = (
+        {item: on[item] for item in sorted(on) if (" " in item) is of} for of in (False, True)
+    )
+    full = set[str]().union(
+        *(sides for token, sides in recordings.items() if not token.startswith("mini:"))
+    )
+    mini = {
+        token: sides | full
+        for token, sides in recordings.items()
+        if full and token.startswith("mini:")
+    }
     twins = torn_twins({token: " and ".join(sorted(sides)) for token, sides in recordings.items()})
     cases = {
         "frames": _shared(frames),
         "recordings": _shared(recordings),
-        "twins": [" and ".join(map("{} in {}".format, pair.scenarios, pair.splits)) for pair in twins],
+        "twins": [
+            " and ".join(map("{} in {}".format, pair.scenarios, pair.splits)) for pair in twins
+        ],
         "mini": _shared(mini),
     }
     remedy = "Split by scenarios of one release, twins together: deepaccident split DATAROOT --out FOLDER."
-    rows = [[side, *(sum(map({side}.issubset, on.values())) for on in (recordings, frames))] for side in places]
+    rows = [
+        [side, *(sum(map({side}.issubset, on.values())) for on in (recordings, frames))]
+        for side in places
+    ]
     return _report(cases, remedy, [("side", "recordings", "frames named"), *rows])
 
 
 def _shared(on: Mapping[str, set[str]]) -> list[str]:
     """Return which items are on two sides or more, and on which, a phrase each."""
-    return [f"{item}: {' and '.join(sorted(sides))}" for item, sides in on.items() if len(sides) > 1]
+    return [
+        f"{item}: {' and '.join(sorted(sides))}" for item, sides in on.items() if len(sides) > 1
+    ]
 
 
 def _report(cases: Mapping[str, Sequence[str]], remedy: str, rows: Sequence[Row]) -> AuditReport:
@@ -116,14 +141,19 @@ def _report(cases: Mapping[str, Sequence[str]], remedy: str, rows: Sequence[Row]
 def _audit_releases(sides: Mapping[str, Path]) -> AuditReport:
     """Look for recordings of which parts stand in two releases, and for torn twins."""
     releases = {side: find_release(path).scenarios for side, path in sides.items()}
-    places = {side: run_batch(places_in, scenarios, label="reading") for side, scenarios in releases.items()}
+    places = {
+        side: run_batch(places_in, scenarios, label="reading")
+        for side, scenarios in releases.items()
+    }
     cases: dict[str, list[str]] = {"recordings": [], "twins": []}
     for side, other in combinations(sides, 2):
         for (row, other_row), moving in sorted(shared_moments(places[side], places[other]).items()):
             one, two = releases[side][row].token, releases[other][other_row].token
             twins = torn_twins({one: side, two: other})
             if twins or moving >= MIN_SHARED_ROAD_USERS:
-                cases["twins" if twins else "recordings"].append(f"{one} of {side} and {two} of {other}")
+                cases["twins" if twins else "recordings"].append(
+                    f"{one} of {side} and {two} of {other}"
+                )
     remedy = "Make one of the two with another seed, or leave these recordings out."
     rows = [(side, sum(map(bool, map(len, recordings)))) for side, recordings in places.items()]
     return _report(cases, remedy, [("side", "recordings"), *rows])
@@ -139,6 +169,10 @@ def _items(path: Path) -> Iterator[tuple[str, int]]:
                 f"{path}:{number}: expected a scenario's type and name, such as type1_subtype1_accident/Town03_type001_"
                 f"subtype0001_scenario00024, found {shortened(line.strip())!r}; {remedy}: a name alone is not unique"
             )
-        places = (line.partition("type")[0], path.parent.name, "" if path.stem in MINI_SPLITS else path.stem)
+        places = (
+            line.partition("type")[0],
+            path.parent.name,
+            "" if path.stem in MINI_SPLITS else path.stem,
+        )
         mini = "mini:" * any(map(_MINI.search, places))
         yield from ((f"{mini}{kind}/{name}", int(frame or 0)) for kind, name, frame in found)

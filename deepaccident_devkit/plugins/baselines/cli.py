@@ -5,7 +5,11 @@ from typing import Any
 
 import click
 
-from deepaccident_devkit.cli.agents import cooperating_parameter, link_parameters, names_or_configuration
+from deepaccident_devkit.cli.agents import (
+    cooperating_parameter,
+    link_parameters,
+    names_or_configuration,
+)
 from deepaccident_devkit.cli.options import (
     PATH,
     engine_of,
@@ -52,7 +56,9 @@ Examples:
 @verb(epilog=_EXAMPLES)
 @click.argument("model")
 @release_parameters
-@click.option("--split", default="val", show_default=True, help="Name of a split, or a split file (.txt).")
+@click.option(
+    "--split", default="val", show_default=True, help="Name of a split, or a split file (.txt)."
+)
 @cooperating_parameter("Agents that cooperate with each ego", "all; of a baseline: single")
 @click.option(
     "--task",
@@ -99,7 +105,9 @@ def predict(model: str, purpose: Any, **options: Any) -> None:
     path that a baseline plans for a vehicle is its own, if it goes on so.
     """
     if not Path(model).exists():  # before PyTorch is asked for
-        model = choice("MODEL, which is no file and no folder", model, (*MOTION_MODELS, *SHIPPED_WEIGHTS))
+        model = choice(
+            "MODEL, which is no file and no folder", model, (*MOTION_MODELS, *SHIPPED_WEIGHTS)
+        )
     if purpose == "all":
         refuse_unused("with --samples all, which are those of all scenarios", "scope")
     seed, link = options["seed"], _link_of(options, "boxes" if model in MOTION_MODELS else "bev")
@@ -109,7 +117,9 @@ def predict(model: str, purpose: Any, **options: Any) -> None:
 
 
 @workers_kept()
-def _by_baseline(model: Any, purpose: Any, *, agents: Any, link: Link | None, out: Path, **options: Any) -> None:
+def _by_baseline(
+    model: Any, purpose: Any, *, agents: Any, link: Link | None, out: Path, **options: Any
+) -> None:
     refuse_unused("with a baseline", "device", "images_cache")
     agents = agents or _ALONE
     if agents == _ALONE:
@@ -123,21 +133,34 @@ def _by_baseline(model: Any, purpose: Any, *, agents: Any, link: Link | None, ou
     released = chosen.horizon == _RELEASED_HORIZON and options["scope"] == "accident"
     engine = engine_of(options)
     dataset = open_release(**release_of(options), **engine)
-    tokens = _samples(dataset, purpose, "released" if released else "paper", chosen.horizon, options)
+    tokens = _samples(
+        dataset, purpose, "released" if released else "paper", chosen.horizon, options
+    )
     for task in asked:
         path, own = folder / RESULTS_NAMES[task], tokens
         if task == "planning":
             own = [token for token in tokens if agent_of(token) in VEHICLE_AGENTS]
         kept = is_predicted(dataset, task, own, path, chosen)
         predict_results(dataset, task, own, path, chosen, **engine, progress=True)
-        click.echo(f"{task}: {counted(len(own), 'sample')} in {path}{', which were there already' if kept else ''}")
+        click.echo(
+            f"{task}: {counted(len(own), 'sample')} in {path}{', which were there already' if kept else ''}"
+        )
 
 
-def _by_network(model: str, purpose: Any, *, agents: Any, link: Link | None, seed: int, **options: Any) -> None:
-    refuse_unused("with a trained model, which predicts all tasks as far as it was trained", "tasks", "horizon")
+def _by_network(
+    model: str, purpose: Any, *, agents: Any, link: Link | None, seed: int, **options: Any
+) -> None:
+    refuse_unused(
+        "with a trained model, which predicts all tasks as far as it was trained",
+        "tasks",
+        "horizon",
+    )
     refuse_unused("with a trained model, which runs on this machine", "scheduler")
     if agents == _ALONE:
-        refuse_unused("with --agents single, which has no partners", *(name for name in _LINK if name != "seed"))
+        refuse_unused(
+            "with --agents single, which has no partners",
+            *(name for name in _LINK if name != "seed"),
+        )
     need_plugin("model", "a trained model")
     use_threads_sparingly()
     from deepaccident_devkit.plugins.model import (
@@ -164,7 +187,9 @@ def _by_network(model: str, purpose: Any, *, agents: Any, link: Link | None, see
     for task, path in paths.items():
         click.echo(f"{task}: {counted(len(tokens), 'sample')} in {path}")
     if dataset.layout == "nuScenes":
-        from deepaccident_devkit.plugins.nuscenes.results import write_detections  # the plug-in opened the release
+        from deepaccident_devkit.plugins.nuscenes.results import (
+            write_detections,
+        )  # the plug-in opened the release
 
         written = write_detections(dataset, paths["detection"])
         click.echo(f"detection, for nuScenes' own evaluation: {written}")
@@ -172,12 +197,16 @@ def _by_network(model: str, purpose: Any, *, agents: Any, link: Link | None, see
         click.echo(scores_text(network, dataset, tokens, paths["motion"]))
 
 
-def _samples(dataset: DeepAccident, purpose: Any, rules: Any, horizon: float, options: dict[str, Any]) -> list[str]:
+def _samples(
+    dataset: DeepAccident, purpose: Any, rules: Any, horizon: float, options: dict[str, Any]
+) -> list[str]:
     """The samples to predict; raises NotAvailableError if there are none."""
     split, scope = options["split"], options["scope"]
     tokens = dataset.samples(split, purpose, rules, horizon=horizon, scope=scope)
     if not tokens:
-        raise NotAvailableError(f"{split}: has no samples to predict; {no_samples_text(dataset, split, scope)}")
+        raise NotAvailableError(
+            f"{split}: has no samples to predict; {no_samples_text(dataset, split, scope)}"
+        )
     return tokens
 
 

@@ -41,7 +41,9 @@ def constant_velocity(pose: FloatArray, velocity: FloatArray, times: FloatArray)
     return constant_turn_rate(pose, velocity, np.zeros(len(pose)), times)
 
 
-def constant_turn_rate(pose: FloatArray, velocity: FloatArray, turn_rate: FloatArray, times: FloatArray) -> FloatArray:
+def constant_turn_rate(
+    pose: FloatArray, velocity: FloatArray, turn_rate: FloatArray, times: FloatArray
+) -> FloatArray:
     """At a constant speed, while velocity and heading turn alike.
 
     Args:
@@ -142,5 +144,9 @@ def outlook(
     if model == "standing":
         seen = replace(seen, boxes=replace(seen.boxes, velocity=np.zeros_like(seen.boxes.velocity)))
     turns = model == "constant_turn_rate"
-    rate = turn_rates(dataset, sample, agents=agents, link=link) if turns else np.zeros(len(seen.boxes))
+    rate = (
+        turn_rates(dataset, sample, agents=agents, link=link)
+        if turns
+        else np.zeros(len(seen.boxes))
+    )
     return Outlook(seen=seen, turn_rate=rate)

@@ -24,7 +24,14 @@ from deepaccident_devkit.geometry.boxes import concatenate
 from deepaccident_devkit.motion import FrameBoxes, MotionLabelConfig, motion_labels_from_boxes
 from deepaccident_devkit.plugins.baselines.outlook import MotionModel, Outlook, outlook
 from deepaccident_devkit.support.arrays import BoolArray, FloatArray, IntArray
-from deepaccident_devkit.taxonomy import AGENTS, CATEGORIES, FRAME_PERIOD, LIDAR, OWN_ACTOR_ID, UNTRACKED_ID
+from deepaccident_devkit.taxonomy import (
+    AGENTS,
+    CATEGORIES,
+    FRAME_PERIOD,
+    LIDAR,
+    OWN_ACTOR_ID,
+    UNTRACKED_ID,
+)
 from deepaccident_devkit.v2x import Agents, Link, future_egomotion
 from deepaccident_devkit.v2x.cooperation import SeenActors, seen_actors
 
@@ -76,7 +83,9 @@ def predict_motion(
     """
     chosen = config or MotionLabelConfig()
     ahead = outlook(dataset, sample, agents=agents, model=model, link=link)
-    return motion_prediction(ahead.seen, ahead.poses(label_times(chosen)), dataset.ego_from(sample, LIDAR), chosen)
+    return motion_prediction(
+        ahead.seen, ahead.poses(label_times(chosen)), dataset.ego_from(sample, LIDAR), chosen
+    )
 
 
 def label_times(config: MotionLabelConfig) -> FloatArray:
@@ -112,7 +121,9 @@ def _ego_poses(poses: FloatArray, *, has_own: bool) -> list[SE3]:
     return [pose @ box_from_ego for pose in present_from_box]
 
 
-def _frame_boxes(seen: SeenActors, pose: FloatArray, lidar_from_present: SE3, ego_from_lidar: SE3) -> FrameBoxes:
+def _frame_boxes(
+    seen: SeenActors, pose: FloatArray, lidar_from_present: SE3, ego_from_lidar: SE3
+) -> FrameBoxes:
     """The boxes that would be annotated at a moment, all of them seen."""
     boxes = seen.boxes
     center = np.column_stack([pose[:, :2], boxes.center[:, 2]])
@@ -178,7 +189,9 @@ def detected_accidents(
     alone = seen_actors(dataset, sample)
     own = alone.boxes.select(alone.boxes.actor_id == OWN_ACTOR_ID)
     found = detected.boxes.select(detected.scores >= _LIKELY)
-    ego_from_source = dataset.world_from(sample, own.frame).inverse() @ dataset.world_from(sample, found.frame)
+    ego_from_source = dataset.world_from(sample, own.frame).inverse() @ dataset.world_from(
+        sample, found.frame
+    )
     found = found.transform(ego_from_source, own.frame)
     apart = np.linalg.norm(found.center[:, None, :2] - own.center[None, :, :2], axis=-1)
     boxes = concatenate([own, found.select((apart > _ON_IT).all(axis=1))], own.frame)
@@ -207,7 +220,9 @@ def predict_detections(
     watchers = np.unpackbits(seen.seen_by[:, None], axis=1).sum(axis=1)
     points = seen.boxes.num_lidar_pts
     scores = (watchers + points / (points + _ENOUGH_POINTS)) / (len(AGENTS) + 1)
-    return DetectedBoxes(boxes=seen.boxes, scores=np.where(seen.boxes.actor_id == OWN_ACTOR_ID, 0.0, scores))
+    return DetectedBoxes(
+        boxes=seen.boxes, scores=np.where(seen.boxes.actor_id == OWN_ACTOR_ID, 0.0, scores)
+    )
 
 
 def predict_forecasts(
@@ -258,7 +273,9 @@ def predict_plan(
     ahead = outlook(dataset, sample, model=model)
     if not ahead.seen.has_own:
         token = dataset.get("sample", sample)["token"]
-        raise NotAvailableError(f"{token}: has no own vehicle to plan for; choose a sample of a vehicle")
+        raise NotAvailableError(
+            f"{token}: has no own vehicle to plan for; choose a sample of a vehicle"
+        )
     times = path_times(horizon)
     poses = _ego_poses(ahead.poses(np.append(0.0, times)), has_own=True)
     present_from_ego = [poses[0].inverse() @ pose for pose in poses[1:]]
@@ -270,11 +287,15 @@ def path_times(horizon: float) -> FloatArray:
     """(T,) seconds after the present up to a horizon, in steps of 0.5, of 100 at most; raises ConfigError otherwise."""
     steps = horizon / PATH_STEP
     if not (0.5 <= horizon <= 100 and abs(steps - round(steps)) < 1e-6):
-        raise ConfigError(f"horizon: {horizon!r} s is no number of steps of 0.5 s; choose 0.5, 1, 1.5, … up to 100")
+        raise ConfigError(
+            f"horizon: {horizon!r} s is no number of steps of 0.5 s; choose 0.5, 1, 1.5, … up to 100"
+        )
     return np.arange(1.0, round(steps) + 1) * PATH_STEP
 
 
-def accidents_ahead(outlook: Outlook, horizon: float, danger_distance: float = DANGER_DISTANCE) -> list[Accident]:
+def accidents_ahead(
+    outlook: Outlook, horizon: float, danger_distance: float = DANGER_DISTANCE
+) -> list[Accident]:
     """The accidents of an outlook within a horizon (seconds), the surest first, in the present ego frame.
 
     A pair is named at the first moment, in steps of 0.1 s, at which the gap between its boxes is below the danger
@@ -297,20 +318,28 @@ def accidents_ahead(outlook: Outlook, horizon: float, danger_distance: float = D
     approaching = (approaching & ~_is_driving_up(poses[0], first, second)) | (gap[0] == 0)
     score = (1 - least / danger_distance) / (1 + times[moment])
     alarms = [
-        _accident(outlook, poses, (int(first[row]), int(second[row])), int(moment[row]), float(score[row]))
+        _accident(
+            outlook, poses, (int(first[row]), int(second[row])), int(moment[row]), float(score[row])
+        )
         for row in np.flatnonzero(near.any(axis=0) & approaching)
     ]
     return _one_a_site(alarms)
 
 
-def _candidates(outlook: Outlook, poses: FloatArray, danger_distance: float) -> tuple[IntArray, IntArray]:
+def _candidates(
+    outlook: Outlook, poses: FloatArray, danger_distance: float
+) -> tuple[IntArray, IntArray]:
     """Pairs (rows of the boxes) whose circles meet at some moment, not both standing nor both on foot."""
     place, size = poses[..., :2], outlook.seen.boxes.size
     reach = np.hypot(size[:, 0], size[:, 1]) / 2
     apart = np.linalg.norm(place[:, :, None] - place[:, None], axis=-1).min(axis=0, initial=np.inf)
     moves = np.linalg.norm(np.ptp(place, axis=0), axis=-1) >= _MOVES
     drives = outlook.seen.boxes.category != _PEDESTRIAN
-    near = (apart < reach[:, None] + reach + danger_distance) & (moves[:, None] | moves) & (drives[:, None] | drives)
+    near = (
+        (apart < reach[:, None] + reach + danger_distance)
+        & (moves[:, None] | moves)
+        & (drives[:, None] | drives)
+    )
     first, second = np.nonzero(np.triu(near, 1))
     return first, second
 
@@ -331,7 +360,9 @@ def _gaps(outlook: Outlook, poses: FloatArray, first: IntArray, second: IntArray
     return gaps_of_pairs(footprints[:, first], footprints[:, second])
 
 
-def _accident(outlook: Outlook, poses: FloatArray, pair: tuple[int, int], moment: int, score: float) -> Accident:
+def _accident(
+    outlook: Outlook, poses: FloatArray, pair: tuple[int, int], moment: int, score: float
+) -> Accident:
     one, other = (_actor_id(outlook, row) for row in pair)
     return Accident(
         positions=poses[moment, list(pair), :2],
@@ -349,7 +380,9 @@ def _actor_id(outlook: Outlook, row: int) -> int | None:
 def _one_a_site(alarms: list[Accident]) -> list[Accident]:
     """The surest alarm of each place; the earliest of equally sure ones, then by place and ids."""
     kept: list[Accident] = []
-    for alarm in sorted(alarms, key=lambda each: (-each.score, each.time, each.positions.tolist(), each.ids or ())):
+    for alarm in sorted(
+        alarms, key=lambda each: (-each.score, each.time, each.positions.tolist(), each.ids or ())
+    ):
         middle = alarm.positions.mean(axis=0)
         if all(np.linalg.norm(middle - other.positions.mean(axis=0)) >= _SITE for other in kept):
             kept.append(alarm)

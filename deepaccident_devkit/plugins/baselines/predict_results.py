@@ -15,7 +15,12 @@ from typing import TYPE_CHECKING, Any, get_args
 
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import ResultsError
-from deepaccident_devkit.evaluation.results import Prediction, ResultsTask, ResultsWriter, read_results
+from deepaccident_devkit.evaluation.results import (
+    Prediction,
+    ResultsTask,
+    ResultsWriter,
+    read_results,
+)
 from deepaccident_devkit.evaluation.runs.setups import release_note, scenario_of
 from deepaccident_devkit.motion import MotionLabelConfig
 from deepaccident_devkit.plugins.baselines.outlook import MotionModel
@@ -76,7 +81,9 @@ class Baseline:
         if task == "motion":
             return predict_motion(dataset, token, model=self.model, config=self.config, **seeing)
         if task == "accident":
-            return predict_accidents(dataset, token, model=self.model, horizon=self.horizon, **seeing)
+            return predict_accidents(
+                dataset, token, model=self.model, horizon=self.horizon, **seeing
+            )
         if task == "detection":
             return predict_detections(dataset, token, **seeing)
         going: dict[str, Any] = {"model": self.model, "horizon": self.horizon_of(task)}
@@ -86,7 +93,9 @@ class Baseline:
 
     def horizon_of(self, task: ResultsTask) -> float:
         """Seconds that its predictions for a task look ahead."""
-        return max(self.horizon, PATH_HORIZON) if task in ("planning", "forecasting") else self.horizon
+        return (
+            max(self.horizon, PATH_HORIZON) if task in ("planning", "forecasting") else self.horizon
+        )
 
     def meta(self) -> dict[str, Any]:
         """Its notes in a results file, as JSON holds them."""
@@ -141,7 +150,9 @@ def predict_results(
         return path
     work.writer(path)  # refuses what stands there
     for own in scenarios.values():
-        cooperating_agents(dataset, own[0], work.baseline.agents)  # fails now, and not in every worker
+        cooperating_agents(
+            dataset, own[0], work.baseline.agents
+        )  # fails now, and not in every worker
     jobs = {
         scenario: _Job(replace(work, scenarios=(scenario,)), own, store, f"{name}/{scenario}")
         for scenario, own in scenarios.items()
@@ -201,8 +212,16 @@ class _Work:
     @property
     def meta(self) -> dict[str, Any]:
         """The notes in its results, but the bytes that partners send, which follow from these and the samples."""
-        horizon, release = self.baseline.horizon_of(self.task), release_note(self.dataset, self.scenarios)
-        return {**self.baseline.meta(), "horizon": horizon, "release": release, "devkit": __version__}
+        horizon, release = (
+            self.baseline.horizon_of(self.task),
+            release_note(self.dataset, self.scenarios),
+        )
+        return {
+            **self.baseline.meta(),
+            "horizon": horizon,
+            "release": release,
+            "devkit": __version__,
+        }
 
     def digest(self, scenarios: Mapping[str, tuple[str, ...]]) -> str:
         """Of all that decides the results of these samples."""
@@ -234,7 +253,9 @@ class _Work:
             return ResultsWriter(path, self.task, meta=meta)
         config = self.baseline.config
         step = config.step * FRAME_PERIOD
-        return ResultsWriter(path, self.task, meta=meta, grid=config.grid, step=step, labels="released")
+        return ResultsWriter(
+            path, self.task, meta=meta, grid=config.grid, step=step, labels="released"
+        )
 
 
 @dataclass(frozen=True, slots=True)

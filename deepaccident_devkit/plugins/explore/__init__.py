@@ -58,7 +58,15 @@ def explore(
     explorer.begin()
     try:
         page = explorer.first_page
-        serve(app, host=host, port=port, root_path=root_path, page=page, open_browser=open_browser, say=say)
+        serve(
+            app,
+            host=host,
+            port=port,
+            root_path=root_path,
+            page=page,
+            open_browser=open_browser,
+            say=say,
+        )
     finally:
         explorer.jobs.end()
 

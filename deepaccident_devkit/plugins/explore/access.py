@@ -185,7 +185,11 @@ class _Answer:
 
     async def send(self, send: Send, *, head: bool) -> None:
         body = f"{self.sentence}\n".encode() if self.sentence else b""
-        headers = {"content-type": "text/plain; charset=utf-8", "content-length": str(len(body)), **self.headers}
+        headers = {
+            "content-type": "text/plain; charset=utf-8",
+            "content-length": str(len(body)),
+            **self.headers,
+        }
         encoded = [(name.encode("ascii"), value.encode("ascii")) for name, value in headers.items()]
         await send({"type": "http.response.start", "status": self.status, "headers": encoded})
         await send({"type": "http.response.body", "body": b"" if head else body})
@@ -197,12 +201,19 @@ _NO_HOST = _Answer(
     "The explorer does not know the host that the request names: start it with --root-path and the address that the "
     "browser shows, if a proxy is between them, or else with --address and that host.",
 )
-_METHOD = _Answer(405, "The explorer only shows: it answers GET and HEAD.", {"allow": ", ".join(_METHODS)})
-_FOREIGN = _Answer(403, "A page of another site asked for this; open the address that the command printed.")
-_WRONG_TOKEN = _Answer(
-    403, "The token is wrong; open the address that the command printed. Every start of it makes a new token."
+_METHOD = _Answer(
+    405, "The explorer only shows: it answers GET and HEAD.", {"allow": ", ".join(_METHODS)}
 )
-_NO_TOKEN = _Answer(401, "Open the address that the command `deepaccident explore` printed: it has the token.")
+_FOREIGN = _Answer(
+    403, "A page of another site asked for this; open the address that the command printed."
+)
+_WRONG_TOKEN = _Answer(
+    403,
+    "The token is wrong; open the address that the command printed. Every start of it makes a new token.",
+)
+_NO_TOKEN = _Answer(
+    401, "Open the address that the command `deepaccident explore` printed: it has the token."
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -226,7 +237,14 @@ class _Request:
             name = raw_name.decode("latin-1").lower()
             headers[name] = (*headers.get(name, ()), value.decode("latin-1"))
         query = scope.get("query_string", b"").decode("latin-1")
-        return cls(scope["method"], asked, asked if rest is None else rest, rest is not None, query, headers)
+        return cls(
+            scope["method"],
+            asked,
+            asked if rest is None else rest,
+            rest is not None,
+            query,
+            headers,
+        )
 
     @property
     def host(self) -> HostPort | None:
@@ -237,15 +255,23 @@ class _Request:
     @property
     def tokens(self) -> list[str]:
         """The values of the parameter `token`."""
-        return [unquote_plus(part.partition("=")[2]) for part in self.query.split("&") if _is_token(part)]
+        return [
+            unquote_plus(part.partition("=")[2])
+            for part in self.query.split("&")
+            if _is_token(part)
+        ]
 
     def without_token(self) -> _Request:
         """The same without the parameter."""
-        return replace(self, query="&".join(part for part in self.query.split("&") if not _is_token(part)))
+        return replace(
+            self, query="&".join(part for part in self.query.split("&") if not _is_token(part))
+        )
 
     def address(self, end: str = "") -> str:
         """Its own address and, behind it, `end`: relative, so that it is right behind all proxies."""
-        address = "./" + self.asked.rpartition("/")[2] + end + (f"?{self.query}" if self.query else "")
+        address = (
+            "./" + self.asked.rpartition("/")[2] + end + (f"?{self.query}" if self.query else "")
+        )
         return quote(address.encode("latin-1"), safe=_SAFE)
 
 
@@ -310,13 +336,20 @@ class Gate:
                 return
         path = request.path
         headers = [pair for pair in scope["headers"] if pair[0].lower() != b"cookie"]
-        passed = {**scope, "path": unquote(path), "raw_path": path.encode("latin-1"), "headers": headers}
+        passed = {
+            **scope,
+            "path": unquote(path),
+            "raw_path": path.encode("latin-1"),
+            "headers": headers,
+        }
         try:
             await self._app(passed, receive, send)
         except Exception:  # noqa: BLE001 - an error of ours, which the reader's terminal shows
             _log.exception("a page of the explorer failed")
             if not send.started:
-                await _Answer(500, "The page failed; the terminal of the command says why.").send(send, head=head)
+                await _Answer(500, "The page failed; the terminal of the command says why.").send(
+                    send, head=head
+                )
 
     def _target(self, request: _Request) -> _Answer | None:
         return None if request.asked.startswith("/") else _NO_TARGET
@@ -337,7 +370,11 @@ class Gate:
         if len(given) > 1 or scheme not in _SCHEME_PORTS or origin is None:
             return _FOREIGN
         own = (request.host, self._access.root.place)
-        return None if any(place is not None and origin.is_at(scheme, place) for place in own) else _FOREIGN
+        return (
+            None
+            if any(place is not None and origin.is_at(scheme, place) for place in own)
+            else _FOREIGN
+        )
 
     def _fetch(self, request: _Request) -> _Answer | None:
         """Let other sites only link to the pages. Other ports of this host are the same site, but not the reader's."""
@@ -363,7 +400,9 @@ class Gate:
 
     def _slash(self, request: _Request) -> _Answer | None:
         """Relative links of a page at the root path itself need a slash at its end."""
-        return _Answer(308, headers={"location": request.address("/")}) if request.path == "" else None
+        return (
+            _Answer(308, headers={"location": request.address("/")}) if request.path == "" else None
+        )
 
     def _is_right(self, token: str) -> bool:
         ticket, until = self._ticket or ("", 0.0)
@@ -373,15 +412,26 @@ class Gate:
         return _same(token, self._access.token)
 
     def _has_cookie(self, request: _Request) -> bool:
-        pairs = [pair.strip().partition("=") for text in request.headers.get("cookie", ()) for pair in text.split(";")]
-        return any(name == self._access.cookie and _same(value, self._access.session) for name, _, value in pairs)
+        pairs = [
+            pair.strip().partition("=")
+            for text in request.headers.get("cookie", ())
+            for pair in text.split(";")
+        ]
+        return any(
+            name == self._access.cookie and _same(value, self._access.session)
+            for name, _, value in pairs
+        )
 
     def _set_cookie(self, request: _Request) -> str:
         """For the root path alone, if the reader may see the pages there; without a proxy they are below `/`."""
         access, host = self._access, request.host
         direct = not request.kept and host is not None and host.name in _LOOPBACK
         path = "/" if direct else access.root.path or "/"
-        behind = access.root.place is not None and host is not None and host.name == access.root.place.name
+        behind = (
+            access.root.place is not None
+            and host is not None
+            and host.name == access.root.place.name
+        )
         secure = behind and access.root.scheme == "https"
         kept = f"{access.cookie}={access.session}; Path={path}; HttpOnly; SameSite=Lax"
         return f"{kept}; Secure" if secure else kept

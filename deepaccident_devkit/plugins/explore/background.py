@@ -75,7 +75,9 @@ class Jobs:
                 self._jobs[name] = Job(name, title, work)
                 self._queue.put(self._jobs[name])
                 if self._thread is None:
-                    self._thread = threading.Thread(target=self._run, name="explore-background", daemon=True)
+                    self._thread = threading.Thread(
+                        target=self._run, name="explore-background", daemon=True
+                    )
                     self._thread.start()
             self._jobs[name].asked = next(self._asked)
             return self._jobs[name]
@@ -88,7 +90,9 @@ class Jobs:
     def wait(self, timeout: float | None = None) -> bool:
         """Wait until all that was asked for is done; whether it is."""
         with self._changed:
-            return self._changed.wait_for(lambda: all(job.is_done for job in self._jobs.values()), timeout)
+            return self._changed.wait_for(
+                lambda: all(job.is_done for job in self._jobs.values()), timeout
+            )
 
     def end(self) -> None:
         """Begin no more. What runs is not waited for: its thread ends with the process."""

@@ -68,11 +68,17 @@ class Choices:
         An address may come from anyone, so it cannot ask for more than a page has. Values that the scenarios have all
         count, others only if they are few.
         """
-        known = {} if scenarios is None else {each.name: frozenset(each.values) for each in scenarios.facets()}
+        known = (
+            {}
+            if scenarios is None
+            else {each.name: frozenset(each.values) for each in scenarios.facets()}
+        )
         others = {name: value for name, value in given if name not in FIELDS}
         facets: dict[str, tuple[str, ...]] = {}
         unknown = 0
-        for name, value in dict.fromkeys(pair for pair in given if pair[0] in FIELDS and len(pair[1]) <= MOST_WORD):
+        for name, value in dict.fromkeys(
+            pair for pair in given if pair[0] in FIELDS and len(pair[1]) <= MOST_WORD
+        ):
             unknown += value not in known.get(name, ())
             if unknown <= _MOST_FREE or value in known.get(name, ()):
                 facets[name] = (*facets.get(name, ()), value)
@@ -99,7 +105,10 @@ class Choices:
     @property
     def filters(self) -> list[str]:
         """The texts of `da.find` and `--where`."""
-        return [*(f"{name}={','.join(values)}" for name, values in self.facets.items()), *self.lines]
+        return [
+            *(f"{name}={','.join(values)}" for name, values in self.facets.items()),
+            *self.lines,
+        ]
 
     @property
     def lines(self) -> list[str]:
@@ -113,7 +122,16 @@ class Choices:
 
     def command(self, dataroot: str) -> str:
         """The command that writes the same scenarios into a split file."""
-        return shlex.join(["deepaccident", "split", dataroot, *where_words(self.filters), "--out", "selection.txt"])
+        return shlex.join(
+            [
+                "deepaccident",
+                "split",
+                dataroot,
+                *where_words(self.filters),
+                "--out",
+                "selection.txt",
+            ]
+        )
 
 
 def find_call(filters: Iterable[str]) -> str:
@@ -147,12 +165,20 @@ class Found:
 def found_by(scenarios: Scenarios, choices: Choices, scores: Mapping[str, Model]) -> Found:
     """The scenarios that match all that was chosen; models' scores (`score:MODEL`) may still be computed."""
     facets = scenarios.facets()
-    chosen = {each.name: choices.facets[each.name] for each in facets if each.name in choices.facets}
-    masks = {each.name: _matching(each, chosen[each.name]) for each in facets if each.name in chosen}
-    rest, faults, waiting = _by_query(scenarios, choices, [name for name in choices.facets if name not in chosen])
+    chosen = {
+        each.name: choices.facets[each.name] for each in facets if each.name in choices.facets
+    }
+    masks = {
+        each.name: _matching(each, chosen[each.name]) for each in facets if each.name in chosen
+    }
+    rest, faults, waiting = _by_query(
+        scenarios, choices, [name for name in choices.facets if name not in chosen]
+    )
     missed = sum((~mask for mask in masks.values()), np.zeros(len(scenarios), dtype=np.int64))
     counts = {  # of the rows that no other facet misses
-        each.name: _counts(each, rest & (missed == ~masks.get(each.name, np.True_)), chosen.get(each.name, ()))
+        each.name: _counts(
+            each, rest & (missed == ~masks.get(each.name, np.True_)), chosen.get(each.name, ())
+        )
         for each in facets
     }
     ranked, not_ready = _sorted(scenarios, choices, np.flatnonzero(rest & (missed == 0)), scores)
@@ -160,7 +186,9 @@ def found_by(scenarios: Scenarios, choices: Choices, scores: Mapping[str, Model]
 
 
 def _matching(facet: Facet, values: Sequence[str]) -> BoolArray:
-    return np.isin(facet.codes, [place for place, value in enumerate(facet.values) if value in values])
+    return np.isin(
+        facet.codes, [place for place, value in enumerate(facet.values) if value in values]
+    )
 
 
 def _counts(facet: Facet, rows: BoolArray, chosen: Sequence[str]) -> tuple[dict[str, Any], ...]:
@@ -171,7 +199,9 @@ def _counts(facet: Facet, rows: BoolArray, chosen: Sequence[str]) -> tuple[dict[
     )
 
 
-def _by_query(scenarios: Scenarios, choices: Choices, plain: Sequence[str]) -> tuple[BoolArray, list[str], list[str]]:
+def _by_query(
+    scenarios: Scenarios, choices: Choices, plain: Sequence[str]
+) -> tuple[BoolArray, list[str], list[str]]:
     """Which scenarios match the query, chosen values of fields that are no facets (yet), faults, what is awaited."""
     matching = np.ones(len(scenarios), dtype=bool)
     faults, waiting = [], []
@@ -184,7 +214,11 @@ def _by_query(scenarios: Scenarios, choices: Choices, plain: Sequence[str]) -> t
                 waiting.append(_waiting_text(line, late))
                 continue
             values = scenarios.values(looked.name) or []
-            words = {word for value in values for word in (value if isinstance(value, tuple) else (value,))}
+            words = {
+                word
+                for value in values
+                for word in (value if isinstance(value, tuple) else (value,))
+            }
             condition = condition_of(wanted, looked, words if looked.kind == "word" else ())
             matching &= np.array([condition.holds(value) for value in values], dtype=bool)
         except DeepAccidentError as error:

@@ -11,7 +11,9 @@ from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.evaluation.runs.bundles import SUMMARY_FILE
 
 
-def _address(context: click.Context, parameter: click.Parameter, value: str | None) -> dict[str, Any]:
+def _address(
+    context: click.Context, parameter: click.Parameter, value: str | None
+) -> dict[str, Any]:
     """Parse a host, a port, or both with a colon between them; nothing without a text."""
     if value is None:
         return {}
@@ -19,7 +21,9 @@ def _address(context: click.Context, parameter: click.Parameter, value: str | No
 
     place = HostPort.parse(f"127.0.0.1:{value}" if value.isdecimal() else value)
     if place is None or place.port == 0:
-        raise click.BadParameter(f"expected HOST:PORT, HOST or PORT, found {value!r}", context, parameter)
+        raise click.BadParameter(
+            f"expected HOST:PORT, HOST or PORT, found {value!r}", context, parameter
+        )
     return {"host": place.name, "port": place.port}
 
 
@@ -84,4 +88,9 @@ def explore(target: Path | None, predictions: tuple[Path, ...], **options: Any) 
         path = export_pages(dataset, target, where=where, **shown, **how)
         click.echo(f"written: {path}; open it in a browser")
         return
-    show(Explorer(dataset, **shown, workers=options["workers"]), open_browser=not no_open, say=click.echo, **server)
+    show(
+        Explorer(dataset, **shown, workers=options["workers"]),
+        open_browser=not no_open,
+        say=click.echo,
+        **server,
+    )

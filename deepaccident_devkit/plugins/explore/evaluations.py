@@ -28,7 +28,15 @@ _Json = Mapping[str, Any]
 _Interval = tuple[float, float]
 _Row = Mapping[str, Any]
 # Columns that say which sample it is.
-_WHICH: Final = ("token", "scenario", "agent", "frame", "time_to_impact", "accident_visibility", "recording")
+_WHICH: Final = (
+    "token",
+    "scenario",
+    "agent",
+    "frame",
+    "time_to_impact",
+    "accident_visibility",
+    "recording",
+)
 _NUMBER: Final = r"[0-9]+(?:\.[0-9]+)?"
 _CASES: Final = ("tp", "fp", "fn")
 # Column → what is said of it.
@@ -127,7 +135,9 @@ def evaluated(bundle: Bundle) -> Evaluated:
     try:
         as_record(summary, _Shown)
     except ValueError as error:
-        raise ResultsError(f"{bundle.folder / SUMMARY_FILE}: cannot be shown ({error}); evaluate again") from error
+        raise ResultsError(
+            f"{bundle.folder / SUMMARY_FILE}: cannot be shown ({error}); evaluate again"
+        ) from error
     everything = summary["breakdowns"].get(EVERYTHING)
     group = next(iter(everything["groups"]), None) if everything is not None else None
     main = _main_number(summary)
@@ -140,7 +150,9 @@ def evaluated(bundle: Bundle) -> Evaluated:
         facts=_facts(bundle),
         mark="" if summary["partial"] is None else summary["partial"]["mark"],
         headlines=tuple(_headline_row(each, group) for each in summary["headlines"]),
-        interval="interval" if everything is None else f"{100 * everything['resampling']['confidence']:g} % interval",
+        interval="interval"
+        if everything is None
+        else f"{100 * everything['resampling']['confidence']:g} % interval",
         notes=() if group is None else tuple(group["notes"]),
         main=main,
         breakdowns={by: each for by, each in bars.items() if len(each) > 1},
@@ -152,7 +164,11 @@ def _facts(bundle: Bundle) -> dict[str, str]:
     summary, setup = bundle.summary, bundle.setup
     changed = ", ".join(f"{name} = {scalar(value)}" for name, value in setup.switches.items())
     counts, results, release = summary["counts"], summary["results"], summary["release"]
-    left_out = f"; {counts['left_out']:,} predictions of other samples left out" if counts["left_out"] else ""
+    left_out = (
+        f"; {counts['left_out']:,} predictions of other samples left out"
+        if counts["left_out"]
+        else ""
+    )
     return {
         "task": setup.task,
         "protocol": setup.protocol + (f", but {changed}" if changed else ""),
@@ -170,7 +186,9 @@ def _facts(bundle: Bundle) -> dict[str, str]:
 def _main_number(summary: _Json) -> MainNumber | None:
     """The first of the task's main numbers that the result has."""
     there = {each["path"]: each for each in summary["headlines"]}
-    path = next((path for path in evaluator_class(summary["task"]).main_numbers if path in there), None)
+    path = next(
+        (path for path in evaluator_class(summary["task"]).main_numbers if path in there), None
+    )
     if path is None:
         return None
     unit: Any = there[path]["unit"]
@@ -181,7 +199,12 @@ def _headline_row(headline: _Json, group: _Json | None) -> dict[str, str]:
     higher, unit = headline.get("higher_is_better"), headline["unit"]
     better = "higher" if higher is True else "lower" if higher is False else ""
     interval = _interval_text(_ends(group, headline["path"]), unit)
-    return {"name": headline["name"], "text": headline["text"], "interval": interval, "better": better}
+    return {
+        "name": headline["name"],
+        "text": headline["text"],
+        "interval": interval,
+        "better": better,
+    }
 
 
 def _bar(group: _Json, main: MainNumber | None) -> dict[str, Any]:
@@ -242,7 +265,9 @@ def verdict_text(task: str, row: _Row, *, whole: bool = False) -> str:
 
 def other_values(row: _Row) -> dict[str, str]:
     """What the row has except which sample it is: name → text."""
-    return {name.replace("_", " "): scalar(value) for name, value in row.items() if name not in _WHICH}
+    return {
+        name.replace("_", " "): scalar(value) for name, value in row.items() if name not in _WHICH
+    }
 
 
 def _accident(row: _Row, *, whole: bool) -> str:
@@ -258,7 +283,9 @@ def _accident(row: _Row, *, whole: bool) -> str:
 def _cases(row: _Row, distance: str) -> str:
     tp, fp, fn = (_count(row, f"{case}_{distance}m") for case in _CASES)
     unknown: dict[str, Any] = {"id_error": None, "position_error": None, "time_error": None}
-    return count_words(AccidentsWithin(distance=float(distance), tp=tp, fp=fp, fn=fn, accuracy=math.nan, **unknown))
+    return count_words(
+        AccidentsWithin(distance=float(distance), tp=tp, fp=fp, fn=fn, accuracy=math.nan, **unknown)
+    )
 
 
 def _motion(row: _Row, *, whole: bool) -> str:
@@ -267,7 +294,10 @@ def _motion(row: _Row, *, whole: bool) -> str:
 
 
 def _instances(row: _Row, around: str) -> str:
-    shares = [f"{name} {_percent(row.get(f'{key}_{around}'))}" for name, key in (("VPQ", "pq"), ("IoU", "iou"))]
+    shares = [
+        f"{name} {_percent(row.get(f'{key}_{around}'))}"
+        for name, key in (("VPQ", "pq"), ("IoU", "iou"))
+    ]
     counts = [f"{_count(row, f'{case}_{around}')} {case.upper()}" for case in _CASES]
     return f"{around} m: {', '.join([*shares, *counts])}"
 
@@ -276,7 +306,9 @@ def _detection(row: _Row, *, whole: bool) -> str:
     thresholds = _named(row, rf"tp_({_NUMBER})")
     shown = thresholds if whole else thresholds[len(thresholds) // 2 :][:1]
     found = [f"{_count(row, f'tp_{each}')} TP at {each}" for each in shown]
-    return ", ".join([f"{_count(row, 'truths')} true boxes", f"{_count(row, 'detections')} detections", *found])
+    return ", ".join(
+        [f"{_count(row, 'truths')} true boxes", f"{_count(row, 'detections')} detections", *found]
+    )
 
 
 def _values(row: _Row, **_: bool) -> str:

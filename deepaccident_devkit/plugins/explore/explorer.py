@@ -96,7 +96,9 @@ class Explorer:
         self.workers = workers or _few_workers(len(dataset.scenario))
         self.jobs = Jobs()
         self.scenarios = Scenarios(dataset, self.jobs, workers=self.workers)
-        self.models: Mapping[str, Model] = open_models(map(Path, bundles), map(Path, results), self.jobs)
+        self.models: Mapping[str, Model] = open_models(
+            map(Path, bundles), map(Path, results), self.jobs
+        )
         self.pictures: Kept[bytes] = Kept(_MOST_PICTURES, len)
         self.replays: Kept[dict[str, Any]] = Kept(_MOST_REPLAYS)
         self._recordings: Kept[ReplayRecording] = Kept(_MOST_REPLAYS)
@@ -122,13 +124,27 @@ class Explorer:
     @property
     def scores(self) -> dict[str, Model]:
         """Columns `score:MODEL`, of models that have scores."""
-        return {f"{SCORE_PREFIX}{name}": model for name, model in self.models.items() if model.bundle is not None}
+        return {
+            f"{SCORE_PREFIX}{name}": model
+            for name, model in self.models.items()
+            if model.bundle is not None
+        }
 
     def thumbnail(self, token: str) -> bytes:
         """A scenario's thumbnail as JPEG; raises TokenError."""
         record = self.dataset.scenario.get(token)
-        identity = repr((_VERSION, PICTURE_SIZE, token, str(self.dataset.dataroot), _last_images(self.dataset, record)))
-        return self.thumbnails.get(identity, "thumbnail.jpg", lambda: thumbnail(self.dataset, record))
+        identity = repr(
+            (
+                _VERSION,
+                PICTURE_SIZE,
+                token,
+                str(self.dataset.dataroot),
+                _last_images(self.dataset, record),
+            )
+        )
+        return self.thumbnails.get(
+            identity, "thumbnail.jpg", lambda: thumbnail(self.dataset, record)
+        )
 
     def recording(self, token: str) -> ReplayRecording:
         """What replays know of a scenario; raises TokenError."""
@@ -204,13 +220,17 @@ class KeptFiles:
 
     def get(self, identity: str, name: str, make: Callable[[], bytes]) -> bytes:
         """The content of a file; `identity` tells it from all others. Raises what `make` raises."""
-        digest = hashlib.blake2b(identity.encode(errors="surrogateescape"), digest_size=16).hexdigest()
+        digest = hashlib.blake2b(
+            identity.encode(errors="surrogateescape"), digest_size=16
+        ).hexdigest()
         place = f"{digest[:2]}/{digest[2:]}/{name}"
         kept = self._store.kept(place, digest, "image")
         if kept is not None:
             return kept
         content = make()
-        with suppress(OSError):  # no room, or a folder that may not be written to: it is made again the next time
+        with suppress(
+            OSError
+        ):  # no room, or a folder that may not be written to: it is made again the next time
             self._store.keep(place, digest, content)
         return content
 
@@ -234,7 +254,9 @@ def thumbnail(dataset: Dataset, record: ScenarioRecord) -> bytes:
 
 def _last_images(dataset: Dataset, record: ScenarioRecord) -> tuple[int, list[tuple[str, str]]]:
     """The number of the last frame with an image, or without any the last one, and the agents and cameras of those."""
-    cameras = {key: frames for key, frames in dataset.sensor_frames(record).items() if key[1] in CAMERAS}
+    cameras = {
+        key: frames for key, frames in dataset.sensor_frames(record).items() if key[1] in CAMERAS
+    }
     last = max((frames[-1] for frames in cameras.values() if frames), default=record["num_frames"])
     return last, [key for key, frames in cameras.items() if last in frames[-1:]]
 
@@ -254,7 +276,9 @@ def _photo(dataset: Dataset, camera: str, pair: Boxes) -> Any:
 
     width, height = PICTURE_SIZE
     try:
-        picture = Image.fromarray(dataset.load_image(camera, least=(height, width), size=(height, width)))
+        picture = Image.fromarray(
+            dataset.load_image(camera, least=(height, width), size=(height, width))
+        )
     except SensorFileError:
         return None
     sample, channel = camera.rsplit("/", 1)
@@ -284,7 +308,9 @@ def _from_above(dataset: Dataset, record: ScenarioRecord, boxes: Boxes, pair: Bo
     places = (boxes.bottom_corners()[..., :2] - middle) * as_floats([scale, -scale]) + as_floats(
         [width / 2, height / 2]
     )
-    for outline, actor, category in zip(places, boxes.actor_id.tolist(), boxes.category_names, strict=True):
+    for outline, actor, category in zip(
+        places, boxes.actor_id.tolist(), boxes.category_names, strict=True
+    ):
         color = actor_color(category, recorders.get(actor), collides=actor in pair.actor_id)
         pen.polygon([tuple(place) for place in outline.tolist()], fill=color)
     return picture

@@ -25,7 +25,11 @@ if TYPE_CHECKING:
     from deepaccident_devkit.plugins.explore.scenarios import Scenarios
 
 # Kind of results → the protocol by which they are looked at without a bundle; `clean` of others.
-_PROTOCOL_OF: Final[Mapping[str, str]] = {"motion": "released", "accident": "boxes", "detection": "released"}
+_PROTOCOL_OF: Final[Mapping[str, str]] = {
+    "motion": "released",
+    "accident": "boxes",
+    "detection": "released",
+}
 # Results that a replay can show.
 FORESEEN: Final = ("motion", "accident")
 
@@ -83,7 +87,9 @@ class Model:
         task = self.results.task if self.results is not None else "accident"
         form = None if self.results is None else self.results.form
         horizon = 2.0 if form is None else min(2.0, (form.frames - 1) * form.step)
-        return EvaluationSetup(task=task, protocol=_PROTOCOL_OF.get(task, "clean"), horizon=horizon or 0.5)
+        return EvaluationSetup(
+            task=task, protocol=_PROTOCOL_OF.get(task, "clean"), horizon=horizon or 0.5
+        )
 
     @cached_property
     def rows(self) -> Mapping[str, Mapping[str, Any]]:
@@ -133,7 +139,9 @@ class Model:
         paths = evaluator.main_numbers
         main = next((known[path] for path in paths if path in known), None)
         if main is None:  # this protocol has no such number
-            return Scores(name=paths[0] if paths else "", higher_is_better=True, samples={}, scenarios={})
+            return Scores(
+                name=paths[0] if paths else "", higher_is_better=True, samples={}, scenarios={}
+            )
         higher = main.higher_is_better is not False
 
         def score(tokens: Sequence[str]) -> Score:
@@ -148,7 +156,9 @@ class Model:
         return Scores(
             name=main.name,
             higher_is_better=higher,
-            samples=dict(sorted(samples.items(), key=lambda item: _badness(item[1].value, higher=higher))),
+            samples=dict(
+                sorted(samples.items(), key=lambda item: _badness(item[1].value, higher=higher))
+            ),
             scenarios={scenario: score(tokens) for scenario, tokens in by_scenario.items()},
         )
 
@@ -194,7 +204,9 @@ def _free(name: str, taken: Mapping[str, object]) -> str:
 def sample_values_job(jobs: Jobs, model: Model) -> Job:
     """The work that gives the `sample_values` of a model that has a bundle, after that which gives its scores."""
     _ = model.job  # which comes first
-    return jobs.ask(f"order {model.name}", f"the worst samples of {model.name}", lambda: sample_values(model))
+    return jobs.ask(
+        f"order {model.name}", f"the worst samples of {model.name}", lambda: sample_values(model)
+    )
 
 
 def sample_values(model: Model) -> dict[str, float | None]:
@@ -209,17 +221,25 @@ def sample_values(model: Model) -> dict[str, float | None]:
         if value is None and _is_false(model.rows.get(token, {})):
             found[token] = 0.0
     sign = 1 if scores.higher_is_better else -1
-    return dict(sorted(found.items(), key=lambda item: (item[1] is None, sign * (item[1] or 0.0), item[0])))
+    return dict(
+        sorted(found.items(), key=lambda item: (item[1] is None, sign * (item[1] or 0.0), item[0]))
+    )
 
 
 def scores_of(model: Model) -> Scores:
     """A model's scores; raises EvaluationError if it has none."""
     scores = model.scores
     if scores is None:
-        raise EvaluationError(f"{model.name}: has no scores ({model.job.error or 'it has no evaluation'})")
+        raise EvaluationError(
+            f"{model.name}: has no scores ({model.job.error or 'it has no evaluation'})"
+        )
     return scores
 
 
 def _is_false(row: Mapping[str, Any]) -> bool:
     """Whether something is predicted at a sample where nothing is to be found."""
-    return any((finite(row[name]) or 0) > 0 for name in row if name.startswith("fp_") or name == "detections")
+    return any(
+        (finite(row[name]) or 0) > 0
+        for name in row
+        if name.startswith("fp_") or name == "detections"
+    )

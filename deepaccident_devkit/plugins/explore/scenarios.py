@@ -32,7 +32,10 @@ _JOB_OF: Final = {
     **dict.fromkeys(("min_ttc", "min_pet", "min_gap", "max_drac"), INTERACTIONS),
     **dict.fromkeys(("closing_speed", "accident_visibility", "lead", "lead_all"), ACCIDENTS),
 }
-_TITLES: Final = {INTERACTIONS: "how near pairs come", ACCIDENTS: "lead times, visibility and closing speeds"}
+_TITLES: Final = {
+    INTERACTIONS: "how near pairs come",
+    ACCIDENTS: "lead times, visibility and closing speeds",
+}
 # How an accident is seen to come → its place in an order.
 VISIBILITY_RANKS: Final[Mapping[str, float]] = {"visible": 0.0, "partial": 1.0, "invisible": 2.0}
 # Facets that stand above the others.
@@ -118,7 +121,10 @@ class Scenarios:
         if values is None:
             return None
         ranks = VISIBILITY_RANKS if column == "accident_visibility" else {}
-        return np.array([math.nan if each is None else ranks.get(each, each) for each in values], dtype=np.float64)
+        return np.array(
+            [math.nan if each is None else ranks.get(each, each) for each in values],
+            dtype=np.float64,
+        )
 
     def facets(self) -> list[Facet]:
         """The facets, the most asked for first; without those of one value, and of those that are not ready."""
@@ -137,7 +143,9 @@ class Scenarios:
         return _columns(INTERACTIONS, [measures_of_moving_pairs(each) for each in found])
 
     def _accidents(self) -> dict[str, list[Any]]:
-        found = each_scenario(accident_fields, self.dataset, label="accidents", workers=self._workers)
+        found = each_scenario(
+            accident_fields, self.dataset, label="accidents", workers=self._workers
+        )
         return _columns(ACCIDENTS, those_of(dict, found))
 
 
@@ -152,7 +160,10 @@ def accident_fields(dataset: Dataset, record: ScenarioRecord) -> dict[str, Any]:
         leads = lead_times(dataset, record)
     except NotAvailableError:
         leads = None
-    told = {name: FIELDS[name].read(dataset, record) for name in ("closing_speed", "accident_visibility")}
+    told = {
+        name: FIELDS[name].read(dataset, record)
+        for name in ("closing_speed", "accident_visibility")
+    }
     known = {"lead": leads.alone, "lead_all": leads.together} if leads is not None else {}
     return {**told, **{name: _known(known.get(name)) for name in ("lead", "lead_all")}}
 
@@ -165,5 +176,7 @@ def _facet(name: str, texts: Sequence[str | None]) -> Facet:
     values = sorted({text for text in texts if text is not None}, key=natural_order)
     values += [UNKNOWN_VALUE] * (None in texts)
     place = {value: number for number, value in enumerate(values)}
-    codes = np.array([place[UNKNOWN_VALUE if text is None else text] for text in texts], dtype=np.int64)
+    codes = np.array(
+        [place[UNKNOWN_VALUE if text is None else text] for text in texts], dtype=np.int64
+    )
     return Facet(name=name, values=tuple(values), codes=codes)

@@ -42,7 +42,9 @@ def need_extra() -> None:
     """Raise MissingExtraError unless the extra `explore` is installed."""
     missing = [name for name in _NEEDED if find_spec(name) is None]
     if missing:
-        raise MissingExtraError(f"the explorer needs {', '.join(missing)}; in a checkout: pip install '.[explore]'")
+        raise MissingExtraError(
+            f"the explorer needs {', '.join(missing)}; in a checkout: pip install '.[explore]'"
+        )
 
 
 def serve(
@@ -81,7 +83,9 @@ def serving(
     listening = _listen(host, port)
     address, number = listening.getsockname()[:2]
     bound = ip_address(address)
-    access = Access(port=number, root=root, names=_names(host, bound), any_address=bound.is_unspecified)
+    access = Access(
+        port=number, root=root, names=_names(host, bound), any_address=bound.is_unspecified
+    )
     gate = Gate(app, access)
     running = _Running(gate, listening)
     try:
@@ -145,7 +149,9 @@ class Served:
             lines.append(f"on your notebook server or portal: {root}{query}")
         inner = "localhost" if self.bound.is_loopback or self.bound.is_unspecified else self.host
         tunnel = f"ssh -L {self.port}:{HostPort(inner, None)}:{self.port} {here}"
-        lines.append(f"from another machine: {tunnel}, and there {_origin('localhost', self.port)}{query}")
+        lines.append(
+            f"from another machine: {tunnel}, and there {_origin('localhost', self.port)}{query}"
+        )
         return lines
 
     def open_browser(self) -> None:
@@ -230,7 +236,11 @@ class _Running:
         looks: dict[Any, int] = {}
         while True:
             await asyncio.sleep(_SWEEP_SECONDS)
-            waiting = [(each, each.cycle) for each in connections if each.conn.their_state in (IDLE, SEND_BODY)]
+            waiting = [
+                (each, each.cycle)
+                for each in connections
+                if each.conn.their_state in (IDLE, SEND_BODY)
+            ]
             looks = {key: looks.get(key, 0) + 1 for key in waiting}
             most = 1 if len(connections) > _MOST_CONNECTIONS else _REQUEST_SECONDS / _SWEEP_SECONDS
             for (connection, _), count in looks.items():
@@ -258,7 +268,9 @@ def _listener(host: str, port: int) -> socket.socket:
     try:
         found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
         family, _, _, _, address = min(found, key=lambda each: each[0] != socket.AF_INET)
-        return socket.create_server(address, family=family, dualstack_ipv6=family == socket.AF_INET6)
+        return socket.create_server(
+            address, family=family, dualstack_ipv6=family == socket.AF_INET6
+        )
     except PermissionError as error:
         raise ConfigError(f"port {port}: not allowed here; choose a port from 1024 on") from error
     except (OSError, UnicodeError) as error:

@@ -86,7 +86,10 @@ def exported(target: Path) -> Iterator[Path]:
     try:
         with replacing_folder(target) as made:
             yield made
-            write_bytes(made / MARK, "".join(f"{line}\n" for line in (_HEAD, *sorted(_files(made)))).encode())
+            write_bytes(
+                made / MARK,
+                "".join(f"{line}\n" for line in (_HEAD, *sorted(_files(made)))).encode(),
+            )
             if target.is_dir() and any(target.iterdir()):
                 target.rename(aside)
     finally:
@@ -148,7 +151,9 @@ def tell(dataset: Dataset, folder: Path, work: _ExportedScenario) -> Told:
     record = dataset.scenario.get(work.token)
     own = folder / work.folder
     write_bytes(own / THUMBNAIL, thumbnail(dataset, record))
-    measures = accident_fields(dataset, record) | measures_of_moving_pairs(interactions(dataset, record))
+    measures = accident_fields(dataset, record) | measures_of_moving_pairs(
+        interactions(dataset, record)
+    )
     model, reason = _make_replay(dataset, work, own / _REPLAY_FILE)
     return Told(
         facts=facts(recording_of(dataset, work.token, None)),
@@ -171,7 +176,11 @@ def _part(dataset: Dataset, token: str, name: str) -> str:
     context = part_context(dataset, token, name)
     if "findings" in context:
         context["findings"] = [
-            replace(each, where=_without_place(dataset, each.where), what=_without_place(dataset, each.what))
+            replace(
+                each,
+                where=_without_place(dataset, each.where),
+                what=_without_place(dataset, each.what),
+            )
             for each in context["findings"]
         ]
     return rendered(f"parts/{name}.html", root="", static=True, frame_number=str, **context)
@@ -218,9 +227,15 @@ def export_pages(
         WorkerError: as `parallel.Engine` says.
 
     Examples:
-        >>> export_pages(da, "night", where=["time_of_day=Night", "collision=true"])  # doctest: +SKIP
+        >>> export_pages(
+        ...     da, "night", where=["time_of_day=Night", "collision=true"]
+        ... )  # doctest: +SKIP
     """
-    given = None if scenarios is None else [dataset.get("scenario", each)["token"] for each in scenarios]
+    given = (
+        None
+        if scenarios is None
+        else [dataset.get("scenario", each)["token"] for each in scenarios]
+    )
     records = _chosen(dataset, where, given)
     target = target_folder(folder)
     models = open_models(bundles, results, Jobs())
@@ -230,27 +245,38 @@ def export_pages(
     return target / INDEX
 
 
-def _chosen(dataset: Dataset, where: Sequence[str], given: Sequence[str] | None) -> list[ScenarioRecord]:
+def _chosen(
+    dataset: Dataset, where: Sequence[str], given: Sequence[str] | None
+) -> list[ScenarioRecord]:
     """The scenarios to write; raises ConfigError if they are too many."""
     records = find(dataset, *where)
     if given is not None:
         by_token = {record["token"]: record for record in records}
         records = [by_token[token] for token in dict.fromkeys(given) if token in by_token]
     if not records:
-        raise NotAvailableError("no scenario matches, so there is nothing to export; change --where")
+        raise NotAvailableError(
+            "no scenario matches, so there is nothing to export; change --where"
+        )
     if len(records) > MOST_SCENARIOS:
-        raise ConfigError(f"{len(records)} scenarios match, and at most {MOST_SCENARIOS} are exported; narrow --where")
+        raise ConfigError(
+            f"{len(records)} scenarios match, and at most {MOST_SCENARIOS} are exported; narrow --where"
+        )
     return records
 
 
 def _folders(records: Sequence[ScenarioRecord]) -> dict[str, str]:
     """Scenario → its folder, `TYPE/NAME` in letters that all file systems and addresses know."""
-    types = plain_names(dict.fromkeys(record["scenario_type"] for record in records), taken=(_STATIC, INDEX, MARK))
+    types = plain_names(
+        dict.fromkeys(record["scenario_type"] for record in records), taken=(_STATIC, INDEX, MARK)
+    )
     names = {
-        kind: plain_names(record["name"] for record in records if record["scenario_type"] == kind) for kind in types
+        kind: plain_names(record["name"] for record in records if record["scenario_type"] == kind)
+        for kind in types
     }
     return {
-        record["token"]: f"{types[record['scenario_type']]}/{names[record['scenario_type']][record['name']]}"
+        record[
+            "token"
+        ]: f"{types[record['scenario_type']]}/{names[record['scenario_type']][record['name']]}"
         for record in records
     }
 
@@ -259,7 +285,11 @@ class _Pages:
     """The pages of an export that is being written into a folder."""
 
     def __init__(
-        self, dataset: Dataset, folder: Path, records: Sequence[ScenarioRecord], models: Mapping[str, Model]
+        self,
+        dataset: Dataset,
+        folder: Path,
+        records: Sequence[ScenarioRecord],
+        models: Mapping[str, Model],
     ) -> None:
         self._dataset, self._folder, self._records, self._models = dataset, folder, records, models
         self._names = _folders(records)
@@ -284,7 +314,9 @@ class _Pages:
         return tuple(
             (name, model.results)
             for name, model in self._models.items()
-            if model.results is not None and model.results.task in FORESEEN and token in model.scenarios
+            if model.results is not None
+            and model.results.task in FORESEEN
+            and token in model.scenarios
         )
 
     def _write_index(self, filters: Sequence[str], told: Sequence[Told]) -> None:
@@ -299,7 +331,9 @@ class _Pages:
             slow=SLOW,
             release=self._dataset.version,
             python=find_call(filters),
-            command=shlex.join(["deepaccident", "explore", "DATAROOT", *where_words(filters), "--out", "DIR"]),
+            command=shlex.join(
+                ["deepaccident", "explore", "DATAROOT", *where_words(filters), "--out", "DIR"]
+            ),
         )
 
     def _write_scenario(self, place: int, told: Told) -> None:

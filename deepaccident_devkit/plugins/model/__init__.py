@@ -20,7 +20,13 @@ from typing import TYPE_CHECKING, Any
 from deepaccident_devkit.errors import MissingExtraError
 
 if TYPE_CHECKING:
-    from deepaccident_devkit.plugins.model.checkpoint import Loaded, Weights, load_weights, read_weights, write_weights
+    from deepaccident_devkit.plugins.model.checkpoint import (
+        Loaded,
+        Weights,
+        load_weights,
+        read_weights,
+        write_weights,
+    )
     from deepaccident_devkit.plugins.model.inputs import ModelInputs, model_inputs
     from deepaccident_devkit.plugins.model.network import ModelConfig, ModelPredictions, V2XFormer
     from deepaccident_devkit.plugins.model.presets import MODEL_PRESETS, ModelChoice, load_model
@@ -32,15 +38,24 @@ if TYPE_CHECKING:
         scores_text,
     )
     from deepaccident_devkit.plugins.model.training_loop import train
-    from deepaccident_devkit.plugins.model.training_run import SecondSource, TrainConfig, checked_device
+    from deepaccident_devkit.plugins.model.training_run import (
+        SecondSource,
+        TrainConfig,
+        checked_device,
+    )
 
 # Public name → its module.
 _HOMES = {
-    **dict.fromkeys(("Loaded", "Weights", "load_weights", "read_weights", "write_weights"), "checkpoint"),
+    **dict.fromkeys(
+        ("Loaded", "Weights", "load_weights", "read_weights", "write_weights"), "checkpoint"
+    ),
     **dict.fromkeys(("ModelInputs", "model_inputs"), "inputs"),
     **dict.fromkeys(("ModelConfig", "ModelPredictions", "V2XFormer"), "network"),
     **dict.fromkeys(("MODEL_PRESETS", "ModelChoice", "load_model"), "presets"),
-    **dict.fromkeys(("PredictConfig", "SamplePrediction", "predict_results", "predictions", "scores_text"), "results"),
+    **dict.fromkeys(
+        ("PredictConfig", "SamplePrediction", "predict_results", "predictions", "scores_text"),
+        "results",
+    ),
     **dict.fromkeys(("SecondSource", "TrainConfig", "checked_device"), "training_run"),
     "train": "training_loop",
 }

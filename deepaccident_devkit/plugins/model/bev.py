@@ -27,7 +27,9 @@ def crop(features: Tensor, source: BevGrid, target: BevGrid) -> Tensor:
     """
     rows, columns = source.shape
     if features.dim() != 4 or tuple(features.shape[-2:]) != (rows, columns):
-        raise GeometryError(f"features: expected (N, C, {rows}, {columns}), found {tuple(features.shape)}")
+        raise GeometryError(
+            f"features: expected (N, C, {rows}, {columns}), found {tuple(features.shape)}"
+        )
     if source.orientation != target.orientation:
         raise GeometryError(
             f"target: expected a grid in the source's orientation, {source.orientation!r}, found "
@@ -49,7 +51,11 @@ def crop(features: Tensor, source: BevGrid, target: BevGrid) -> Tensor:
 def _sample_points(target: Axis, source: Axis, device: torch.device) -> Tensor:
     """A target axis's cell centres; −1 and 1 are the centres of the source axis's first and last cell."""
     low, high, size = target
-    centers = low + (torch.arange(round((high - low) / size), device=device, dtype=torch.float64) + 0.5) * size
+    centers = (
+        low
+        + (torch.arange(round((high - low) / size), device=device, dtype=torch.float64) + 0.5)
+        * size
+    )
     low, high, size = source
     return (2 * centers - (low + high)) / (high - low - size)
 
@@ -80,7 +86,9 @@ class BevEncode(nn.Module):
         """Make the layers of the given sizes."""
         super().__init__()
         inputs = (config.in_channels, *config.widths[:-1])
-        self.layers = nn.ModuleList(_stage(*widths) for widths in zip(inputs, config.widths, strict=True))
+        self.layers = nn.ModuleList(
+            _stage(*widths) for widths in zip(inputs, config.widths, strict=True)
+        )
         middle = 2 * config.out_channels
         self.up1 = _UpAndJoin(config.widths[0] + config.widths[-1], middle)
         self.up2 = nn.Sequential(
@@ -129,7 +137,9 @@ class BevUNet(nn.Module):
     def forward(self, features: Tensor) -> Tensor:
         """(N, in_channels, H, W) → (N, out_channels, H / 2, W / 2), odd sizes rounded up."""
         fine = self.fine(features)
-        coarse = functional.interpolate(self.coarse(fine), size=fine.shape[-2:], mode="bilinear", align_corners=False)
+        coarse = functional.interpolate(
+            self.coarse(fine), size=fine.shape[-2:], mode="bilinear", align_corners=False
+        )
         return self.join(torch.cat([fine, coarse], dim=1))
 
 
@@ -142,11 +152,15 @@ class _ResidualBlock(nn.Module):
         self.bn1 = nn.BatchNorm2d(outputs)
         self.conv2 = nn.Conv2d(outputs, outputs, 3, padding=1, bias=False)
         self.bn2 = nn.BatchNorm2d(outputs)
-        self.downsample = nn.Conv2d(inputs, outputs, 3, stride=stride, padding=1) if stride > 1 else nn.Identity()
+        self.downsample = (
+            nn.Conv2d(inputs, outputs, 3, stride=stride, padding=1) if stride > 1 else nn.Identity()
+        )
 
     def forward(self, features: Tensor) -> Tensor:
         inner = functional.relu(self.bn1(self.conv1(features)), inplace=True)
-        return functional.relu(self.bn2(self.conv2(inner)) + self.downsample(features), inplace=True)
+        return functional.relu(
+            self.bn2(self.conv2(inner)) + self.downsample(features), inplace=True
+        )
 
 
 class _UpAndJoin(nn.Module):
@@ -157,12 +171,16 @@ class _UpAndJoin(nn.Module):
         self.conv = nn.Sequential(*_convolution(inputs, outputs), *_convolution(outputs, outputs))
 
     def forward(self, coarse: Tensor, fine: Tensor) -> Tensor:
-        coarse = functional.interpolate(coarse, size=fine.shape[-2:], mode="bilinear", align_corners=True)
+        coarse = functional.interpolate(
+            coarse, size=fine.shape[-2:], mode="bilinear", align_corners=True
+        )
         return self.conv(torch.cat([fine, coarse], dim=1))
 
 
 def _stage(inputs: int, outputs: int) -> nn.Sequential:
-    return nn.Sequential(_ResidualBlock(inputs, outputs, stride=2), _ResidualBlock(outputs, outputs))
+    return nn.Sequential(
+        _ResidualBlock(inputs, outputs, stride=2), _ResidualBlock(outputs, outputs)
+    )
 
 
 def _convolution(inputs: int, outputs: int) -> tuple[nn.Module, nn.Module, nn.Module]:

@@ -22,7 +22,13 @@ from torch import Tensor, nn
 
 from deepaccident_devkit.errors import MOST_TOLD, ConfigError, shortened
 from deepaccident_devkit.plugins.model.images import from_official
-from deepaccident_devkit.release.checkpoints import FAULTS, NUMBER_BYTES, Storages, StoredTensor, read_checkpoint
+from deepaccident_devkit.release.checkpoints import (
+    FAULTS,
+    NUMBER_BYTES,
+    Storages,
+    StoredTensor,
+    read_checkpoint,
+)
 from deepaccident_devkit.support.arrays import ShortRepr
 from deepaccident_devkit.support.files import write_bytes
 from deepaccident_devkit.support.json_text import as_record, parsed_json, parsed_record
@@ -36,7 +42,9 @@ FINAL: Final = "final.safetensors"
 # state from which it goes on.
 LAST: Final = "last.safetensors"
 # Weights that come with the devkit, by name; their notes say how they were made, and what they score where.
-SHIPPED: Final = MappingProxyType({name: Path(__file__).with_name(f"{name}.safetensors") for name in SHIPPED_WEIGHTS})
+SHIPPED: Final = MappingProxyType(
+    {name: Path(__file__).with_name(f"{name}.safetensors") for name in SHIPPED_WEIGHTS}
+)
 # Beginning of the names of the optimizer's tensors in that state.
 OPTIMIZER: Final = "optimizer."
 _META: Final = "deepaccident"
@@ -107,14 +115,19 @@ def read_weights(path: str | os.PathLike[str]) -> Weights:
     if not path.exists():
         path = SHIPPED.get(str(path), path)
     if path.is_dir():
-        path = next((path / name for name in (BEST, FINAL, LAST) if (path / name).is_file()), path / BEST)
+        path = next(
+            (path / name for name in (BEST, FINAL, LAST) if (path / name).is_file()), path / BEST
+        )
     try:
         content = read_bytes(path, "weights")
     except OSError as error:
         raise ConfigError(
             f"{path}: weights cannot be read ({error.strerror or error}); give a file of weights"
         ) from error
-    if content[8:9] != b"{" and content[:2] in (b"PK", b"\x80\x02"):  # what torch.save writes, or wrote
+    if content[8:9] != b"{" and content[:2] in (
+        b"PK",
+        b"\x80\x02",
+    ):  # what torch.save writes, or wrote
         return Weights(tensors=_foreign(content, path), meta={}, path=path)
     try:
         length = int.from_bytes(content[:8], "little")
@@ -138,7 +151,9 @@ def reason_of(error: Exception) -> str:
     return shortened(fault_text(error).splitlines()[0], MOST_TOLD)
 
 
-def write_weights(path: Path, tensors: Mapping[str, Tensor], meta: Mapping[str, Any], *, half: bool = False) -> None:
+def write_weights(
+    path: Path, tensors: Mapping[str, Tensor], meta: Mapping[str, Any], *, half: bool = False
+) -> None:
     """Write weights as safetensors, completely or not at all; the same ones give the same bytes.
 
     Args:
@@ -147,7 +162,10 @@ def write_weights(path: Path, tensors: Mapping[str, Tensor], meta: Mapping[str, 
         meta: what to note with them, as JSON holds it.
         half: whether floats are rounded to float16.
     """
-    stored = {name: (each.half() if half and each.is_floating_point() else each) for name, each in tensors.items()}
+    stored = {
+        name: (each.half() if half and each.is_floating_point() else each)
+        for name, each in tensors.items()
+    }
     ready = {name: each.detach().cpu().contiguous() for name, each in stored.items()}
     write_bytes(path, save(ready, metadata={_META: json.dumps(dict(meta), sort_keys=True)}))
 
@@ -185,7 +203,11 @@ def _is_apart(name: str) -> bool:
 
 
 def _difference(
-    weights: Weights, own: Mapping[str, Tensor], other: Sequence[str], missing: Sequence[str], unused: Sequence[str]
+    weights: Weights,
+    own: Mapping[str, Tensor],
+    other: Sequence[str],
+    missing: Sequence[str],
+    unused: Sequence[str],
 ) -> str:
     """What keeps weights from fitting a model, with the remedy."""
     told = []
@@ -199,13 +221,13 @@ def _difference(
         told.append(f"{len(unused)} are not the model's ({_some(unused)})")
     preset = weights.meta.get("preset")
     whose = f"weights of the preset {shortened(repr(preset))}" if preset else "weights"
-    return (
-        f"{whose} do not fit this model: {', '.join(told)}; give the preset and the options that they were trained with"
-    )
+    return f"{whose} do not fit this model: {', '.join(told)}; give the preset and the options that they were trained with"
 
 
 def _some(names: Sequence[str]) -> str:
-    return ", ".join(map(shortened, names[:_TOLD])) + (f", … ({len(names)})" if len(names) > _TOLD else "")
+    return ", ".join(map(shortened, names[:_TOLD])) + (
+        f", … ({len(names)})" if len(names) > _TOLD else ""
+    )
 
 
 def _foreign(content: bytes, path: Path) -> dict[str, Tensor]:
@@ -216,10 +238,16 @@ def _foreign(content: bytes, path: Path) -> dict[str, Tensor]:
             if isinstance(found, dict) and isinstance(found.get(name), dict):
                 found = found[name]
         pairs = found.items() if isinstance(found, dict) else ()
-        stored = {name: each for name, each in pairs if isinstance(name, str) and isinstance(each, StoredTensor)}
+        stored = {
+            name: each
+            for name, each in pairs
+            if isinstance(name, str) and isinstance(each, StoredTensor)
+        }
         if sum(each.size for each in stored.values()) > _FACTOR * len(content) + _ROOM:
             raise ValueError("its tensors are far larger than the file")
-        named = {name.removeprefix("module."): each for name, each in _made(stored, storages).items()}
+        named = {
+            name.removeprefix("module."): each for name, each in _made(stored, storages).items()
+        }
         if "patch_embed.proj.weight" in named:
             named = from_official(named)
     except _FAULTS as error:
@@ -229,13 +257,17 @@ def _foreign(content: bytes, path: Path) -> dict[str, Tensor]:
     if not named:
         raise ConfigError(f"{path}: holds no tensors by name; give a state dict")
     if not any("." in name and name.split(".")[0] in _PARTS for name in named):
-        named = {f"img_backbone.{name}": each for name, each in named.items()}  # an image encoder alone
+        named = {
+            f"img_backbone.{name}": each for name, each in named.items()
+        }  # an image encoder alone
     return named
 
 
 def _made(stored: Mapping[str, StoredTensor], storages: Storages) -> dict[str, Tensor]:
     """Tensors, of which those of one storage share its memory; raises one of `_FAULTS`."""
-    contents = {name: bytearray(storages(name)) for name in {each.storage for each in stored.values()}}
+    contents = {
+        name: bytearray(storages(name)) for name in {each.storage for each in stored.values()}
+    }
     tensors = {}
     for name, each in stored.items():
         content, dtype = contents[each.storage], getattr(torch, each.dtype)

@@ -38,9 +38,13 @@ Examples:
     help="The model: the released one, or one that a laptop trains.",
 )
 @click.option(
-    "--fusion", type=WordChoice(get_args(ModelFusion)), help="How the agents' maps are joined.  [default: the preset's]"
+    "--fusion",
+    type=WordChoice(get_args(ModelFusion)),
+    help="How the agents' maps are joined.  [default: the preset's]",
 )
-@click.option("--horizon", type=float, help="How many seconds to predict, in steps of 0.5.  [default: 2]")
+@click.option(
+    "--horizon", type=float, help="How many seconds to predict, in steps of 0.5.  [default: 2]"
+)
 @advanced(
     "--focal",
     type=float,
@@ -52,9 +56,14 @@ Examples:
     help="Motion labels by FIERY's rules, as nuScenes is evaluated with.  [default: the preset's]",
 )
 @cooperating_parameter("Agents that cooperate with each ego", "all")
-@click.option("--split", default="train", show_default=True, help="Name of a split, or a split file (.txt).")
 @click.option(
-    "--validation", default="val", show_default=True, help="Split whose score chooses the best weights; none for none."
+    "--split", default="train", show_default=True, help="Name of a split, or a split file (.txt)."
+)
+@click.option(
+    "--validation",
+    default="val",
+    show_default=True,
+    help="Split whose score chooses the best weights; none for none.",
 )
 @click.option(
     "--samples",
@@ -63,28 +72,67 @@ Examples:
     show_default=True,
     help="train: one a second, as released. all: two a second. every: ten a second.",
 )
-@click.option("--steps", type=click.IntRange(min=1), default=1500, show_default=True, help="Steps of the optimizer.")
-@advanced(
-    "--moments", type=click.IntRange(min=1), default=1, show_default=True, help="Moments a step, each with all agents."
+@click.option(
+    "--steps",
+    type=click.IntRange(min=1),
+    default=1500,
+    show_default=True,
+    help="Steps of the optimizer.",
 )
-@advanced("--egos", type=click.IntRange(min=1), help="Agents of a moment that are the ego in turn.  [default: all]")
-@advanced("--learning-rate", type=float, default=2e-3, show_default=True, help="The highest learning rate.")
-@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Seed of all that is drawn.")
+@advanced(
+    "--moments",
+    type=click.IntRange(min=1),
+    default=1,
+    show_default=True,
+    help="Moments a step, each with all agents.",
+)
+@advanced(
+    "--egos",
+    type=click.IntRange(min=1),
+    help="Agents of a moment that are the ego in turn.  [default: all]",
+)
+@advanced(
+    "--learning-rate",
+    type=float,
+    default=2e-3,
+    show_default=True,
+    help="The highest learning rate.",
+)
+@click.option(
+    "--seed",
+    type=click.IntRange(min=0),
+    default=0,
+    show_default=True,
+    help="Seed of all that is drawn.",
+)
 @click.option(
     "--from",
     "weights",
     type=PATH,
     help="Run or file of weights to begin from, `tiny`, `tiny_lidar`, or a checkpoint of the release, BEVerse or Swin.",
 )
-@click.option("--also", type=PATH, metavar="DATAROOT", help="Another release, or nuScenes, to learn from too.")
-@click.option("--mix", type=float, default=0.5, show_default=True, help="Share of the moments that are from --also.")
+@click.option(
+    "--also", type=PATH, metavar="DATAROOT", help="Another release, or nuScenes, to learn from too."
+)
+@click.option(
+    "--mix",
+    type=float,
+    default=0.5,
+    show_default=True,
+    help="Share of the moments that are from --also.",
+)
 @advanced(
-    "--freeze", multiple=True, metavar="NAME", help="Do not train parameters whose names begin so; you can repeat this."
+    "--freeze",
+    multiple=True,
+    metavar="NAME",
+    help="Do not train parameters whose names begin so; you can repeat this.",
 )
 @model_parameters
 @advanced("--bf16", is_flag=True, help="Compute in bfloat16, on GPUs.")
 @figure_style_parameter
-@click.option("--out", required=True, type=PATH, metavar="RUN", help="Folder of weights, log and curves.")
+@click.option(
+    "--out", required=True, type=PATH, metavar="RUN", help="Folder of weights, log and curves."
+)
 def train(weights: Path | None, also: Path | None, mix: float, **options: Any) -> None:
     """Train the model on the release in DATAROOT, or on nuScenes.
 
@@ -101,11 +149,16 @@ def train(weights: Path | None, also: Path | None, mix: float, **options: Any) -
         agents=names_or_configuration(options["agents"]) or "all",
         learning_rate=options["learning_rate"],
         freeze=options["freeze"],
-        **{**{name: options[name] for name in _TRAINING}, "validation": None if validation == "none" else validation},
+        **{
+            **{name: options[name] for name in _TRAINING},
+            "validation": None if validation == "none" else validation,
+        },
     )
     choice = ModelChoice(**{name: options[name] for name in _CHOICE})
     dataset = open_release(**release_of(options))
-    second = None if also is None else SecondSource(dataset=open_release(also, version="v1"), mix=mix)
+    second = (
+        None if also is None else SecondSource(dataset=open_release(also, version="v1"), mix=mix)
+    )
     for source in (dataset, *([] if second is None else [second.dataset])):
         if source.layout == "nuScenes":
             from deepaccident_devkit.plugins.nuscenes.check import check_source  # opened it

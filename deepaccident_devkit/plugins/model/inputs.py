@@ -26,7 +26,15 @@ _MIRROR: Final = (1.0, -1.0, 1.0, 1.0)
 _BOX_MIRROR: Final = (1.0, -1.0, 1.0, 1.0, 1.0, 1.0, -1.0, 1.0, -1.0)
 _OF_EGOS: Final = ("ego_rows", "ego_from_agent", "partners")
 # Attributes whose second axis is that of the agents.
-_OF_AGENTS: Final = ("images", "cameras", "egomotion", "frame_valid", *_OF_EGOS[1:], "is_infrastructure", "delay")
+_OF_AGENTS: Final = (
+    "images",
+    "cameras",
+    "egomotion",
+    "frame_valid",
+    *_OF_EGOS[1:],
+    "is_infrastructure",
+    "delay",
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -66,7 +74,9 @@ class ModelInputs:
     def to(self, device: torch.device | str) -> ModelInputs:
         """The same on another device."""
         moved = partial(_mapped, lambda each: each.to(device, non_blocking=True))
-        return replace(self, **{each.name: moved(getattr(self, each.name)) for each in fields(self)})
+        return replace(
+            self, **{each.name: moved(getattr(self, each.name)) for each in fields(self)}
+        )
 
     def of_egos(self, rows: Tensor) -> ModelInputs:
         """The same with some egos, by their positions (G',) int64, and without agents that none of them hears."""
@@ -75,7 +85,9 @@ class ModelInputs:
         return some if heard.all() else _of_agents(some, heard)
 
 
-def model_inputs(batch: Mapping[str, Any], handedness: Handedness = "right", *, delay: int = 0) -> ModelInputs:
+def model_inputs(
+    batch: Mapping[str, Any], handedness: Handedness = "right", *, delay: int = 0
+) -> ModelInputs:
     """The inputs of a batch with images, points or both, of all its egos, or with each item's first agent as the ego.
 
     Args:
@@ -89,7 +101,9 @@ def model_inputs(batch: Mapping[str, Any], handedness: Handedness = "right", *, 
     source = torch.where(valid, torch.arange(valid.shape[-1]), valid.shape[-1] - 1)
     rows = batch.get("ego_rows")
     if rows is None:
-        rows = torch.stack([torch.arange(len(arrived)), torch.zeros(len(arrived), dtype=torch.int64)], 1)
+        rows = torch.stack(
+            [torch.arange(len(arrived)), torch.zeros(len(arrived), dtype=torch.int64)], 1
+        )
     moment, agent = rows.unbind(1)
     present = batch["ego_from_agent"][:, :, -1].double()
     ego_from_agent = torch.linalg.inv(present[moment, agent])[:, None] @ present[moment]
@@ -100,14 +114,20 @@ def model_inputs(batch: Mapping[str, Any], handedness: Handedness = "right", *, 
     roadside = torch.zeros(arrived.shape[:2], dtype=torch.bool)
     for row, names in zip(roadside, batch["agents"], strict=True):
         row[: len(names)] = torch.tensor([name == INFRASTRUCTURE for name in names])
-    points, point_frames = _points(batch["points"], source, roadside, handedness) if "points" in batch else (None, None)
+    points, point_frames = (
+        _points(batch["points"], source, roadside, handedness)
+        if "points" in batch
+        else (None, None)
+    )
     transform = _mirrored(batch["augmentation"].double(), handedness)
     return ModelInputs(
         images=_taken(batch["images"], source) if "images" in batch else None,
         cameras=_cameras(batch, source, handedness) if "images" in batch else None,
         points=points,
         point_frames=point_frames,
-        egomotion=_egomotion(_mirrored(batch["agent_from_past"].double(), handedness), valid, transform),
+        egomotion=_egomotion(
+            _mirrored(batch["agent_from_past"].double(), handedness), valid, transform
+        ),
         frame_valid=valid,
         bev_transform=transform.float(),
         ego_rows=rows,
@@ -121,7 +141,9 @@ def model_inputs(batch: Mapping[str, Any], handedness: Handedness = "right", *, 
 def _of_agents(inputs: ModelInputs, kept: Tensor) -> ModelInputs:
     """The inputs with some of the agents, (A,) bool, among them all egos."""
     place = kept.cumsum(0) - 1
-    changes = {name: _mapped(lambda each: each[:, kept], getattr(inputs, name)) for name in _OF_AGENTS}
+    changes = {
+        name: _mapped(lambda each: each[:, kept], getattr(inputs, name)) for name in _OF_AGENTS
+    }
     changes["ego_rows"] = torch.stack([inputs.ego_rows[:, 0], place[inputs.ego_rows[:, 1]]], 1)
     if inputs.points is not None and inputs.point_frames is not None:
         frames = inputs.frame_valid.shape[2]
@@ -129,7 +151,9 @@ def _of_agents(inputs: ModelInputs, kept: Tensor) -> ModelInputs:
         moment, agent = sender // len(kept), sender % len(kept)
         there = kept[agent]
         changes["points"] = inputs.points[there]
-        changes["point_frames"] = (((moment * int(kept.sum())) + place[agent]) * frames + frame)[there]
+        changes["point_frames"] = (((moment * int(kept.sum())) + place[agent]) * frames + frame)[
+            there
+        ]
     return replace(inputs, **changes)
 
 
@@ -151,7 +175,10 @@ def _cameras(batch: Mapping[str, Any], source: Tensor, handedness: Handedness) -
 
 
 def _points(
-    clouds: Sequence[Sequence[Sequence[Tensor]]], source: Tensor, roadside: Tensor, handedness: Handedness
+    clouds: Sequence[Sequence[Sequence[Tensor]]],
+    source: Tensor,
+    roadside: Tensor,
+    handedness: Handedness,
 ) -> tuple[Tensor, Tensor]:
     """All points (K, 4) and their frames (K,) of B items' agents' clouds (N, 4), from the frames `source` (B, A, P)."""
     frames = source.shape[2]
@@ -193,5 +220,7 @@ def _taken(values: Tensor, source: Tensor) -> Tensor:
 def _mapped(change: Callable[[Tensor], Tensor], value: Any) -> Any:
     """A tensor, or those of cameras, changed; None is None."""
     if isinstance(value, CameraGeometry):
-        return replace(value, **{each.name: change(getattr(value, each.name)) for each in fields(value)})
+        return replace(
+            value, **{each.name: change(getattr(value, each.name)) for each in fields(value)}
+        )
     return None if value is None else change(value)

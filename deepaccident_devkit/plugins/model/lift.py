@@ -76,7 +76,9 @@ class LiftConfig:
         object.__setattr__(self, "y", grid.y)
         _steps("depth", self.depth)
         if _steps("z", self.z) != 1:
-            raise ConfigError(f"z: expected one step, as in ({self.z[0]}, {self.z[1]}, {self.z[1] - self.z[0]})")
+            raise ConfigError(
+                f"z: expected one step, as in ({self.z[0]}, {self.z[1]}, {self.z[1] - self.z[0]})"
+            )
         if self.band is not None and not self.band[0] < self.band[1]:
             raise ConfigError(f"band: expected a lower and a higher end, found {self.band}")
         if any(size < self.stride or size % self.stride for size in self.image_size):
@@ -113,7 +115,9 @@ class CameraGeometry:
 
     def flattened(self) -> CameraGeometry:
         """The cameras of (B, A, P, N, …) tensors, with A agents, as those of B · A samples."""
-        return CameraGeometry(**{each.name: getattr(self, each.name).flatten(0, 1) for each in fields(self)})
+        return CameraGeometry(
+            **{each.name: getattr(self, each.name).flatten(0, 1) for each in fields(self)}
+        )
 
 
 class LiftSplat(nn.Module):
@@ -145,7 +149,9 @@ class LiftSplat(nn.Module):
         cells = self.cells(cameras)
         expected = (*features.shape[:3], depths, rows, columns)
         if cells.shape != expected:
-            raise GeometryError(f"cameras: expected cells {expected} for these features, found {tuple(cells.shape)}")
+            raise GeometryError(
+                f"cameras: expected cells {expected} for these features, found {tuple(cells.shape)}"
+            )
         # sums of thousands of points need more than half precision
         logits = precise(self.depthnet(features.flatten(0, 2)))
         return self._splat(logits[:, :depths].softmax(1), logits[:, depths:], cells)
@@ -164,7 +170,9 @@ class LiftSplat(nn.Module):
         rows, columns = config.grid_shape
         inside = ((steps >= 0) & (steps < steps.new_tensor([columns, rows, 1]))).all(-1)
         if config.band is not None:
-            road = torch.where(cameras.translation[..., 2] > _LEAST_CAMERA, 0.0, -POLE_HEIGHT)[..., None, None, None]
+            road = torch.where(cameras.translation[..., 2] > _LEAST_CAMERA, 0.0, -POLE_HEIGHT)[
+                ..., None, None, None
+            ]
             above = points[..., 2] - road
             inside &= (above >= config.band[0]) & (above < config.band[1])
         column, row, _ = torch.where(inside[..., None], steps, 0).long().unbind(-1)
@@ -199,7 +207,9 @@ class LiftSplat(nn.Module):
         maps = features.new_zeros(samples * frames * rows * columns, context.shape[1])
         maps = maps.index_add_(0, cell, features)
         if self.config.pooling == "mean":
-            maps = maps / (chances.new_zeros(len(maps), 1).index_add_(0, cell, chances) + _LEAST_MASS)
+            maps = maps / (
+                chances.new_zeros(len(maps), 1).index_add_(0, cell, chances) + _LEAST_MASS
+            )
         return maps.view(samples, frames, rows, columns, -1).permute(0, 1, 4, 2, 3).contiguous()
 
 
@@ -221,5 +231,7 @@ def _steps(name: str, axis: Axis) -> int:
     start, end, step = axis
     count = (end - start) / step if step > 0 else 0.0
     if round(count) < 1 or abs(count - round(count)) > _WHOLE:
-        raise ConfigError(f"{name}: expected start, end and step with a whole number of steps between, found {axis}")
+        raise ConfigError(
+            f"{name}: expected start, end and step with a whole number of steps between, found {axis}"
+        )
     return round(count)

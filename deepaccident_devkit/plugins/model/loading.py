@@ -19,7 +19,9 @@ from deepaccident_devkit.support.parallel import FEWER_WORKERS, starting_workers
 _WORKERS_FAULT: Final = re.compile(r"DataLoader worker|</torch_|ancdata")
 
 
-def read_batches(data: Any, collate: Callable[..., Any], workers: int, **options: Any) -> Iterator[dict[str, Any]]:
+def read_batches(
+    data: Any, collate: Callable[..., Any], workers: int, **options: Any
+) -> Iterator[dict[str, Any]]:
     """Start to read batches by worker processes, or by this one (0).
 
     Args:
@@ -34,7 +36,15 @@ def read_batches(data: Any, collate: Callable[..., Any], workers: int, **options
     with starting_workers():
         if workers:
             multiprocessing.Queue()  # torch would print tracebacks
-        return iter(DataLoader(data, collate_fn=collate, num_workers=workers, worker_init_fn=_send_faults, **options))
+        return iter(
+            DataLoader(
+                data,
+                collate_fn=collate,
+                num_workers=workers,
+                worker_init_fn=_send_faults,
+                **options,
+            )
+        )
 
 
 @contextmanager
@@ -49,7 +59,9 @@ def worker_faults_named() -> Iterator[None]:
         if isinstance(error, DeepAccidentError) or not _WORKERS_FAULT.search(str(error)):
             raise
         *_, cause = str(error).strip().splitlines()
-        raise WorkerError(f"a worker that reads samples failed ({shortened(cause)}); {FEWER_WORKERS}") from error
+        raise WorkerError(
+            f"a worker that reads samples failed ({shortened(cause)}); {FEWER_WORKERS}"
+        ) from error
 
 
 def _send_faults(_: int) -> None:

@@ -26,7 +26,13 @@ from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.export.images import ImageConfig
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.motion import MotionLabelConfig
-from deepaccident_devkit.plugins.model.bev import BevEncode, BevEncodeConfig, BevUNet, BevUNetConfig, crop
+from deepaccident_devkit.plugins.model.bev import (
+    BevEncode,
+    BevEncodeConfig,
+    BevUNet,
+    BevUNetConfig,
+    crop,
+)
 from deepaccident_devkit.plugins.model.detection import (
     CenterHead,
     DecodingConfig,
@@ -111,22 +117,54 @@ class ModelConfig:
         """Check what parts have to have in common; raises ConfigError."""
         cameras, pillars, channels = self.cameras, self.pillars, self.temporal.channels
         if cameras is None and pillars is None:
-            raise ConfigError("cameras, pillars: expected one of them or both; without, a model sees nothing")
+            raise ConfigError(
+                "cameras, pillars: expected one of them or both; without, a model sees nothing"
+            )
         pairs: list[tuple[str, Any, str, Any]] = [
             ("bev.in_channels", self.bev.in_channels, "temporal.channels", channels),
-            ("motion.in_channels", self.motion.in_channels, "bev.out_channels", self.bev.out_channels),
-            ("detection.in_channels", self.detection.in_channels, "bev.out_channels", self.bev.out_channels),
-            ("motion.future_frames", self.motion.future_frames, "labels.future_frames", self.labels.future_frames),
-            ("temporal.frames", self.temporal.frames, "labels.receptive_field", self.labels.receptive_field),
+            (
+                "motion.in_channels",
+                self.motion.in_channels,
+                "bev.out_channels",
+                self.bev.out_channels,
+            ),
+            (
+                "detection.in_channels",
+                self.detection.in_channels,
+                "bev.out_channels",
+                self.bev.out_channels,
+            ),
+            (
+                "motion.future_frames",
+                self.motion.future_frames,
+                "labels.future_frames",
+                self.labels.future_frames,
+            ),
+            (
+                "temporal.frames",
+                self.temporal.frames,
+                "labels.receptive_field",
+                self.labels.receptive_field,
+            ),
         ]
         if cameras is not None:
             pairs += [
-                ("images.dtype", cameras.images.dtype, "uint8, which the model scales itself", "uint8"),
+                (
+                    "images.dtype",
+                    cameras.images.dtype,
+                    "uint8, which the model scales itself",
+                    "uint8",
+                ),
                 ("lift.channels", cameras.lift.channels, "temporal.channels", channels),
             ]
         if self.one_bev:
             pairs.append(
-                ("temporal.grid", _extent(self.temporal.grid), "the extent of labels.grid", _extent(self.labels.grid))
+                (
+                    "temporal.grid",
+                    _extent(self.temporal.grid),
+                    "the extent of labels.grid",
+                    _extent(self.labels.grid),
+                )
             )
         if pillars is not None:
             pairs += [
@@ -160,7 +198,10 @@ class ModelConfig:
             link: what happens to the partners' data.
             changes: other fields of `V2XConfig`, such as those of targets.
         """
-        seen = {"images": None if self.cameras is None else self.cameras.images, "points": self.pillars is not None}
+        seen = {
+            "images": None if self.cameras is None else self.cameras.images,
+            "points": self.pillars is not None,
+        }
         given: dict[str, Any] = {**seen, "boxes": None, "on_missing": "skip", **changes}
         past, step = self.labels.receptive_field, self.labels.step
         return V2XConfig(agents=agents, link=link, past=past, step=step, **given)
@@ -224,7 +265,9 @@ class V2XFormer(nn.Module):
             noise: of the latents (`motion.MotionHead`); drawn if None.
             generator: draws it.
         """
-        return self.pts_bbox_head(self.fused(self.encoded(inputs), inputs), targets, noise=noise, generator=generator)
+        return self.pts_bbox_head(
+            self.fused(self.encoded(inputs), inputs), targets, noise=noise, generator=generator
+        )
 
     def encoded(self, inputs: ModelInputs) -> Tensor:
         """Each agent's own map (B, A, C, H, W) of the present, in its own frame: what it would send."""
@@ -251,7 +294,9 @@ class V2XFormer(nn.Module):
             seen.append(self.transformer(features, _given("images", inputs.cameras).flattened()))
         if self.config.pillars is not None:
             points, frame = _given("points", inputs.points), _given("points", inputs.point_frames)
-            seen.append(self.pillars(points, frame, samples * frames).unflatten(0, (samples, frames)))
+            seen.append(
+                self.pillars(points, frame, samples * frames).unflatten(0, (samples, frames))
+            )
         if len(seen) == 1:
             return seen[0]
         return self.join(torch.cat(seen, 2).flatten(0, 1)).unflatten(0, (samples, frames))
@@ -284,7 +329,14 @@ class V2XFormer(nn.Module):
         """What the draws of a prediction need, (draws, egos, latent, rows, columns), on the generator's device."""
         motion = self.config.motion
         cells = [-(-size // motion.upsample // 4) for size in self.config.labels.grid.shape]
-        return torch.randn(motion.samples, egos, motion.latent, *cells, generator=generator, device=generator.device)
+        return torch.randn(
+            motion.samples,
+            egos,
+            motion.latent,
+            *cells,
+            generator=generator,
+            device=generator.device,
+        )
 
 
 class TaskHeads(nn.Module):
@@ -335,7 +387,9 @@ def _extent(grid: BevGrid) -> tuple[float, ...]:
 def _given(name: str, value: _Input | None) -> _Input:
     """An input that the model sees with; raises ConfigError if there is none."""
     if value is None:
-        raise ConfigError(f"inputs: have no {name}, which this model sees with; make items by its config.inputs(…)")
+        raise ConfigError(
+            f"inputs: have no {name}, which this model sees with; make items by its config.inputs(…)"
+        )
     return value
 
 

@@ -80,7 +80,9 @@ class PillarEncoder(nn.Module):
         pillar = (frame[inside] * rows + index[:, 1]) * columns + index[:, 0]
         where = points[:, :2] / (high - low)
         features = self.point(
-            torch.cat([place - index - 0.5, points[:, 2:], where, where.norm(dim=1, keepdim=True)], 1)
+            torch.cat(
+                [place - index - 0.5, points[:, 2:], where, where.norm(dim=1, keepdim=True)], 1
+            )
         )
         features = features.relu()
         # an empty pillar's zeros take part in the maximum of others too: it is at least 0 there already

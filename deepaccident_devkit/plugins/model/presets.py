@@ -75,7 +75,9 @@ class ModelChoice:
 
     def __post_init__(self) -> None:
         """Check; raises ChoiceError or ConfigError."""
-        settle_choices(self, {"preset": get_args(ModelPreset), "fusion": (None, *get_args(ModelFusion))})
+        settle_choices(
+            self, {"preset": get_args(ModelPreset), "fusion": (None, *get_args(ModelFusion))}
+        )
         settle_choices(self, {"labels": (None, "fiery")})
         self.config  # noqa: B018 - refuses what does not go together
 
@@ -100,8 +102,17 @@ class ModelChoice:
 
     def as_dict(self) -> dict[str, Any]:
         """All of it, as JSON holds it."""
-        later = {name: value for name in ("focal", "labels") if (value := getattr(self, name)) is not None}
-        return {"preset": self.preset, "fusion": self.fusion, "horizon": self.horizon, **later}  # older runs lack these
+        later = {
+            name: value
+            for name in ("focal", "labels")
+            if (value := getattr(self, name)) is not None
+        }
+        return {
+            "preset": self.preset,
+            "fusion": self.fusion,
+            "horizon": self.horizon,
+            **later,
+        }  # older runs lack these
 
     @classmethod
     def from_dict(cls, described: Mapping[str, Any], path: Path) -> ModelChoice:
@@ -134,13 +145,17 @@ class ModelChoice:
         images = cameras.images
         size = images.crop[2:] if images.crop is not None else images.resize or (0, 0)
         virtual = VirtualCamera(self.focal or 0, *size)
-        return replace(cameras, images=replace(images, resize=None, crop=None, virtual_camera=virtual))
+        return replace(
+            cameras, images=replace(images, resize=None, crop=None, virtual_camera=virtual)
+        )
 
     def _frames(self, config: ModelConfig) -> int:
         step = config.labels.step * FRAME_PERIOD
         frames = (self.horizon or 0.0) / step
         if not (1 <= frames < 100 and abs(frames - round(frames)) < 1e-6):
-            raise ConfigError(f"horizon: {self.horizon!r} s is no number of steps of {step:g} s; choose 0.5, 1, 1.5, …")
+            raise ConfigError(
+                f"horizon: {self.horizon!r} s is no number of steps of {step:g} s; choose 0.5, 1, 1.5, …"
+            )
         return round(frames)
 
 
@@ -170,10 +185,14 @@ def fusion_config(name: str, channels: int) -> FusionConfig:
         "released": lambda: ReleasedFusionConfig(channels=channels),
         "disconet": lambda: DiscoNetConfig(channels=channels),
         "cobevt": lambda: (
-            CobevtConfig(channels=channels, depth=1, window=5) if small else CobevtConfig(channels=channels)
+            CobevtConfig(channels=channels, depth=1, window=5)
+            if small
+            else CobevtConfig(channels=channels)
         ),
         "v2xvit": lambda: (
-            V2XViTConfig(channels=channels, depth=1, windows=(5, 10, 20)) if small else V2XViTConfig(channels=channels)
+            V2XViTConfig(channels=channels, depth=1, windows=(5, 10, 20))
+            if small
+            else V2XViTConfig(channels=channels)
         ),
     }
     return made[chosen_word("fusion", name, get_args(ModelFusion))]()
@@ -247,16 +266,30 @@ def tiny() -> ModelConfig:
                 pooling="mean",
             ),
         ),
-        temporal=TemporalConfig(channels=32, grid=BevGrid(x=along, y=along), frames=2, kind="concat"),
+        temporal=TemporalConfig(
+            channels=32, grid=BevGrid(x=along, y=along), frames=2, kind="concat"
+        ),
         fusion=PoolFusionConfig(),
         bev=BevUNetConfig(),
         one_bev=True,
         motion=MotionHeadConfig(
-            in_channels=32, latent=8, decoders="shuffled", hidden=48, upsample=4, samples=0, detach=False
+            in_channels=32,
+            latent=8,
+            decoders="shuffled",
+            hidden=48,
+            upsample=4,
+            samples=0,
+            detach=False,
         ),
         motion_loss=MotionLossConfig(offset=0.5, flow=0.5),  # vectors count cells of half a metre
         detection=DetectionConfig(
-            in_channels=32, shared_channels=24, class_slots=ONE_TASK, x=along, y=along, branches="joint", upsample=2
+            in_channels=32,
+            shared_channels=24,
+            class_slots=ONE_TASK,
+            x=along,
+            y=along,
+            branches="joint",
+            upsample=2,
         ),
         labels=MotionLabelConfig(grid=BevGrid(), receptive_field=2, protocol="clean"),
     )
@@ -265,7 +298,9 @@ def tiny() -> ModelConfig:
 def tiny_both() -> ModelConfig:
     """`tiny`, which also sees with LiDARs."""
     config = tiny()
-    return replace(config, pillars=PillarConfig(channels=config.temporal.channels, grid=config.grid))
+    return replace(
+        config, pillars=PillarConfig(channels=config.temporal.channels, grid=config.grid)
+    )
 
 
 def tiny_lidar() -> ModelConfig:

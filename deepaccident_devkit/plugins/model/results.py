@@ -86,7 +86,12 @@ class PredictConfig:
 
 
 def predictions(
-    model: V2XFormer, dataset: Dataset, tokens: Sequence[str], config: PredictConfig, *, progress: bool = False
+    model: V2XFormer,
+    dataset: Dataset,
+    tokens: Sequence[str],
+    config: PredictConfig,
+    *,
+    progress: bool = False,
 ) -> Iterator[SamplePrediction]:
     """Predict samples one after another; the result does not depend on the others.
 
@@ -109,7 +114,9 @@ def predictions(
     try:
         with worker_faults_named():
             batches = read_batches(data, collate, config.workers)
-            for batch in tqdm(batches, desc="predicting", total=len(tokens), unit="sample", disable=not progress):
+            for batch in tqdm(
+                batches, desc="predicting", total=len(tokens), unit="sample", disable=not progress
+            ):
                 yield prediction_of(model, batch, config)
     finally:
         model.train(training)
@@ -124,7 +131,10 @@ def _inputs(model: V2XFormer, config: PredictConfig) -> V2XConfig:
 
 def _features(model: V2XFormer) -> tuple[int, dict[str, Any]]:
     """Bytes of a partner's message, its own map of the present (`V2XFormer.encoded`) and its pose; form of the map."""
-    shape, dtype = [model.config.temporal.channels, *model.config.grid.shape], next(model.parameters()).dtype
+    shape, dtype = (
+        [model.config.temporal.channels, *model.config.grid.shape],
+        next(model.parameters()).dtype,
+    )
     return (
         POSE_BYTES + math.prod(shape) * dtype.itemsize,
         {"shape": shape, "dtype": str(dtype).removeprefix("torch.")},
@@ -138,7 +148,9 @@ def check_sensor_files(model: ModelConfig, dataset: Dataset, tokens: Sequence[st
         (model.pillars, (LIDAR,), "LiDARs", "point clouds", f"{LIDAR} folders"),
     )
     for part, channels, sensors, files, folders in kinds:
-        paths = [dataset.sensor_path(f"{token}/{channel}") for token in tokens for channel in channels]
+        paths = [
+            dataset.sensor_path(f"{token}/{channel}") for token in tokens for channel in channels
+        ]
         if part is not None and paths and not any(path.exists() for path in paths):
             raise NotAvailableError(
                 f"{paths[0]}: the model sees with {sensors}, and this release has no {files} of {tokens[0]}; unpack "
@@ -147,7 +159,9 @@ def check_sensor_files(model: ModelConfig, dataset: Dataset, tokens: Sequence[st
             )
 
 
-def prediction_of(model: V2XFormer, batch: dict[str, Any], config: PredictConfig) -> SamplePrediction:
+def prediction_of(
+    model: V2XFormer, batch: dict[str, Any], config: PredictConfig
+) -> SamplePrediction:
     """The prediction of a batch of one item of `training.torch.collate`, by a model in evaluation mode."""
     [token] = batch["token"]
     delay = 0 if config.link is None else config.link.latency_frames
@@ -156,7 +170,9 @@ def prediction_of(model: V2XFormer, batch: dict[str, Any], config: PredictConfig
     with torch.inference_mode():
         predicted = model(inputs, noise=model.noise(1, generator).to(config.device))
     [found] = decode_detections(predicted.detection, model.config.detection, model.config.decoding)
-    motion = motion_output(PredictedMotionMaps(*(each[:, 0] for each in predicted.motion.maps)), model)
+    motion = motion_output(
+        PredictedMotionMaps(*(each[:, 0] for each in predicted.motion.maps)), model
+    )
     accident = foreseen_accident(
         motion, step=model.config.labels.step * FRAME_PERIOD, labels=model.config.labels_protocol
     )
@@ -165,15 +181,23 @@ def prediction_of(model: V2XFormer, batch: dict[str, Any], config: PredictConfig
         motion=motion,
         accidents=[] if accident is None else [accident],
         boxes=detected_boxes(
-            replace(found, boxes=mirrored_boxes(found.boxes, model.config.handedness)), batch["world_from_ego"][0]
+            replace(found, boxes=mirrored_boxes(found.boxes, model.config.handedness)),
+            batch["world_from_ego"][0],
         ),
     )
 
 
 def motion_output(maps: PredictedMotionMaps, model: V2XFormer) -> MotionOutput:
     """The devkit's form of the maps (K, T, …) of one ego: centres as probabilities, on the labels' grid."""
-    given = maps.segmentation, maps.instance_center.sigmoid(), maps.instance_offset, maps.instance_flow
-    return MotionOutput.from_arrays(*(each.float().cpu().numpy() for each in given), grid=model.config.labels.grid)
+    given = (
+        maps.segmentation,
+        maps.instance_center.sigmoid(),
+        maps.instance_offset,
+        maps.instance_flow,
+    )
+    return MotionOutput.from_arrays(
+        *(each.float().cpu().numpy() for each in given), grid=model.config.labels.grid
+    )
 
 
 def predict_results(
@@ -204,7 +228,9 @@ def predict_results(
     """
     config = config or PredictConfig()
     folder = writable_folder(out)
-    paths: dict[ResultsTask, Path] = {task: folder / name for task, name in RESULTS_NAMES.items() if task != "planning"}
+    paths: dict[ResultsTask, Path] = {
+        task: folder / name for task, name in RESULTS_NAMES.items() if task != "planning"
+    }
     meta = _meta(model, dataset, tokens, config)
     labels = model.config.labels
     form: dict[str, Any] = {
@@ -223,11 +249,15 @@ def predict_results(
             writers["motion"].add(found.token, found.motion)
             writers["accident"].add(found.token, found.accidents)
             writers["detection"].add(found.token, found.boxes)
-            writers["forecasting"].add(found.token, _forecasts(dataset, found, form["step"], form["labels"]))
+            writers["forecasting"].add(
+                found.token, _forecasts(dataset, found, form["step"], form["labels"])
+            )
     return paths
 
 
-def _forecasts(dataset: Dataset, found: SamplePrediction, step: float, labels: str) -> list[Forecast]:
+def _forecasts(
+    dataset: Dataset, found: SamplePrediction, step: float, labels: str
+) -> list[Forecast]:
     """Of the actors that labels show at a sample's present; none without labels, which say who is who."""
     scenario, _, number = found.token.rsplit("/", 2)
     boxes = scenario_tracks(dataset, scenario).at(int(number))
@@ -239,7 +269,9 @@ def scores_text(model: V2XFormer, dataset: Dataset, tokens: Sequence[str], path:
     """IoU and VPQ of motion results at samples, beside what the notes of shipped weights expect of another release."""
     rules = replace(MOTION_PROTOCOLS["paper"], labels=model.config.labels_protocol)
     evaluator, results = MotionEvaluator(rules, trajectories=False), read_results(path)
-    for token, labels in zip(tokens, motion_labels_of(dataset, tokens, model.config.labels), strict=True):
+    for token, labels in zip(
+        tokens, motion_labels_of(dataset, tokens, model.config.labels), strict=True
+    ):
         predicted: Any = results.prediction(token)
         evaluator.update(token, predicted, labels)
     here, told = evaluator.compute().ranges["100x100"], model.notes["scored"]
@@ -251,7 +283,9 @@ def scores_text(model: V2XFormer, dataset: Dataset, tokens: Sequence[str], path:
     )
 
 
-def _meta(model: V2XFormer, dataset: Dataset, tokens: Sequence[str], config: PredictConfig) -> dict[str, Any]:
+def _meta(
+    model: V2XFormer, dataset: Dataset, tokens: Sequence[str], config: PredictConfig
+) -> dict[str, Any]:
     """The notes in the results."""
     return {
         "method": "V2XFormer of the devkit",
@@ -265,7 +299,9 @@ def _meta(model: V2XFormer, dataset: Dataset, tokens: Sequence[str], config: Pre
     }
 
 
-def _sent(model: V2XFormer, dataset: Dataset, tokens: Sequence[str], config: PredictConfig) -> dict[str, Any]:
+def _sent(
+    model: V2XFormer, dataset: Dataset, tokens: Sequence[str], config: PredictConfig
+) -> dict[str, Any]:
     """The note on the bytes that partners send; those whose sensor files are not there send none."""
     check_sensor_files(model.config, dataset, tokens[:1])
     size, form = _features(model)

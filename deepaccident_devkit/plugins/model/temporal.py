@@ -32,7 +32,9 @@ from deepaccident_devkit.support.text import settle_choices
 class ConvBnRelu3d(nn.Module):
     """A convolution (kernel: steps, rows, columns) without bias, batch norm and ReLU; keeps T, H and W."""
 
-    def __init__(self, in_channels: int, out_channels: int, kernel: tuple[int, int, int] = (1, 1, 1)) -> None:
+    def __init__(
+        self, in_channels: int, out_channels: int, kernel: tuple[int, int, int] = (1, 1, 1)
+    ) -> None:
         super().__init__()
         padding = (0, kernel[1] // 2, kernel[2] // 2)
         self.conv = nn.Conv3d(in_channels, out_channels, kernel, padding=padding, bias=False)
@@ -59,7 +61,9 @@ class PooledStep(nn.Module):
         As in the released code a further step, the last one's own mean, counts in the batch statistics.
         """
         means = x.mean((-2, -1), keepdim=True)
-        pairs = torch.cat([means[:, :, :1], (means[:, :, 1:] + means[:, :, :-1]) / 2, means[:, :, -1:]], 2)
+        pairs = torch.cat(
+            [means[:, :, :1], (means[:, :, 1:] + means[:, :, :-1]) / 2, means[:, :, -1:]], 2
+        )
         return self.conv_bn_relu(pairs)[:, :, :-1].expand(-1, -1, -1, *x.shape[-2:])
 
 
@@ -93,13 +97,17 @@ class TemporalBlock(nn.Module):
         self.projection = (
             nn.Identity()
             if in_channels == out_channels
-            else nn.Sequential(nn.Conv3d(in_channels, out_channels, 1, bias=False), nn.BatchNorm3d(out_channels))
+            else nn.Sequential(
+                nn.Conv3d(in_channels, out_channels, 1, bias=False), nn.BatchNorm3d(out_channels)
+            )
         )
 
     def forward(self, x: Tensor) -> Tensor:
         """(B, C, T, H, W) → (B, C', T, H, W)."""
         paths = [path(x) for path in self.convolution_paths]
-        return self.projection(x) + self.aggregation(torch.cat([*paths, self.pyramid_pooling(x)], 1))
+        return self.projection(x) + self.aggregation(
+            torch.cat([*paths, self.pyramid_pooling(x)], 1)
+        )
 
 
 class Bottleneck3d(nn.Module):
@@ -179,7 +187,11 @@ class Temporal3D(nn.Module):
         self.model = nn.Sequential(*map(TemporalBlock, widths[:-1], widths[1:]))
 
     def forward(
-        self, features: Tensor, egomotion: Tensor, valid: Tensor, bev_transform: Tensor | None = None
+        self,
+        features: Tensor,
+        egomotion: Tensor,
+        valid: Tensor,
+        bev_transform: Tensor | None = None,
     ) -> Tensor:
         """Maps (N, P, C, H, W), each in its own frame, the present last → the present's (N, C, H, W).
 
@@ -215,7 +227,11 @@ class TemporalConcat(nn.Module):
         )
 
     def forward(
-        self, features: Tensor, egomotion: Tensor, valid: Tensor, bev_transform: Tensor | None = None
+        self,
+        features: Tensor,
+        egomotion: Tensor,
+        valid: Tensor,
+        bev_transform: Tensor | None = None,
     ) -> Tensor:
         """One map of the present; arguments and result as `Temporal3D.forward`.
 
@@ -223,13 +239,19 @@ class TemporalConcat(nn.Module):
         """
         past = valid[:, :-1]
         egomotion = torch.cat(
-            [egomotion[:, :-1].masked_fill(~past[..., None], 0), torch.zeros_like(egomotion[:, -1:])], 1
+            [
+                egomotion[:, :-1].masked_fill(~past[..., None], 0),
+                torch.zeros_like(egomotion[:, -1:]),
+            ],
+            1,
         )
         warped = _warped_to_present(features, egomotion, bev_transform, self.config)
         present = features[:, -1:]
         warped = torch.where(valid[..., None, None, None], warped, present)
         motion = _motion_input(egomotion[:, :-1], bev_transform, self.config)
-        return self.mix(torch.cat([warped.flatten(1, 2), _as_maps(motion, warped).flatten(1, 2)], 1))
+        return self.mix(
+            torch.cat([warped.flatten(1, 2), _as_maps(motion, warped).flatten(1, 2)], 1)
+        )
 
 
 def _warped_to_present(
@@ -237,12 +259,16 @@ def _warped_to_present(
 ) -> Tensor:
     """(N, P, C, H, W) in the present's frame; the present itself is not warped."""
     past = features[:, :-1]
-    chain = present_from_past_batch(egomotion[:, :-1], chain=config.chain, bev_transform=bev_transform)
+    chain = present_from_past_batch(
+        egomotion[:, :-1], chain=config.chain, bev_transform=bev_transform
+    )
     warped = warp_features(past.flatten(0, 1), chain.flatten(0, 1), config.grid, warp=config.warp)
     return torch.cat([warped.view_as(past), features[:, -1:]], 1)
 
 
-def _motion_input(egomotion: Tensor, bev_transform: Tensor | None, config: TemporalConfig) -> Tensor:
+def _motion_input(
+    egomotion: Tensor, bev_transform: Tensor | None, config: TemporalConfig
+) -> Tensor:
     """(N, T, 6) the motions that the convolutions see."""
     if bev_transform is None or config.egomotion_input == "raw":
         return egomotion

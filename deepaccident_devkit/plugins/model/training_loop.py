@@ -19,7 +19,13 @@ from tqdm.auto import tqdm
 
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.plugins.model.checkpoint import BEST, FINAL, load_weights, read_weights, write_weights
+from deepaccident_devkit.plugins.model.checkpoint import (
+    BEST,
+    FINAL,
+    load_weights,
+    read_weights,
+    write_weights,
+)
 from deepaccident_devkit.plugins.model.loading import worker_faults_named
 from deepaccident_devkit.plugins.model.network import V2XFormer
 from deepaccident_devkit.plugins.model.presets import ModelChoice
@@ -109,18 +115,24 @@ def train(  # noqa: PLR0913 - on what, to where, what, how, from what, and on wh
         folder = writable_folder(out)
         moments: Moments | MixedMoments = (first := _moments(dataset, choice, config, images_cache))
         if also is not None:
-            there = replace(config, split=also.split, agents="available")  # nuScenes has no partners
+            there = replace(
+                config, split=also.split, agents="available"
+            )  # nuScenes has no partners
             moments = MixedMoments((first, _moments(also.dataset, choice, there, None)), also.mix)
         run = _Run(
             folder=folder,
-            notes=_notes(dataset, choice, config, weights) | ({"also": also.as_dict()} if also else {}),
+            notes=_notes(dataset, choice, config, weights)
+            | ({"also": also.as_dict()} if also else {}),
             dataset=dataset,
             moments=moments,
             validated=validation_samples(dataset, config),
             config=config,
             place=place,
             predict=PredictConfig(
-                agents=config.agents, device=place.device, workers=workers, images_cache=images_cache
+                agents=config.agents,
+                device=place.device,
+                workers=workers,
+                images_cache=images_cache,
             ),
             say=say or (lambda _text: None),
             bar=say is not None,
@@ -132,14 +144,18 @@ def train(  # noqa: PLR0913 - on what, to where, what, how, from what, and on wh
             return run.trained(model.to(place.device))
 
 
-def _moments(dataset: Dataset, choice: ModelChoice, config: TrainConfig, images_cache: Any) -> Moments:
+def _moments(
+    dataset: Dataset, choice: ModelChoice, config: TrainConfig, images_cache: Any
+) -> Moments:
     """Those of a source that has what the model sees with."""
     moments = Moments(dataset, choice.config, config, images_cache=images_cache)
     check_sensor_files(choice.config, dataset, moments.data.egos[0])
     return moments
 
 
-def new_model(choice: ModelChoice, config: TrainConfig, weights: str | os.PathLike[str] | None, say: Say) -> V2XFormer:
+def new_model(
+    choice: ModelChoice, config: TrainConfig, weights: str | os.PathLike[str] | None, say: Say
+) -> V2XFormer:
     """The model before the first step."""
     torch.manual_seed(config.seed)
     model = V2XFormer(choice.config)
@@ -150,7 +166,10 @@ def new_model(choice: ModelChoice, config: TrainConfig, weights: str | os.PathLi
 
 
 def _notes(
-    dataset: Dataset, choice: ModelChoice, config: TrainConfig, weights: str | os.PathLike[str] | None
+    dataset: Dataset,
+    choice: ModelChoice,
+    config: TrainConfig,
+    weights: str | os.PathLike[str] | None,
 ) -> dict[str, Any]:
     """What a run notes of itself, and what must be the same to go on with it."""
     return {
@@ -169,7 +188,9 @@ def _claim(folder: Path, notes: Mapping[str, Any]) -> None:
         try:
             there = parsed_json(read_bytes(path, "bundle"))
         except (OSError, ValueError) as error:
-            raise ConfigError(f"{path}: cannot be read ({fault_text(error)}); remove it, or train elsewhere") from error
+            raise ConfigError(
+                f"{path}: cannot be read ({fault_text(error)}); remove it, or train elsewhere"
+            ) from error
         if text := differing_text(there if isinstance(there, dict) else {}, notes):
             raise ConfigError(
                 f"{path}: is of another run ({text}); give the same options to go on with it, or another folder"
@@ -208,7 +229,9 @@ class _Run:
         )
         given = batches(self.moments, numbers, self.config, workers=self.predict.workers)
         steps = range(progress.step, self.config.steps)
-        with tqdm(steps, initial=progress.step, total=self.config.steps, unit="step", disable=not self.bar) as bar:
+        with tqdm(
+            steps, initial=progress.step, total=self.config.steps, unit="step", disable=not self.bar
+        ) as bar:
             for number in bar:
                 row = self._step(number, step, optimizer, given)
                 bar.set_postfix(loss=f"{row['loss']:.3g}")
@@ -250,7 +273,12 @@ class _Run:
         }
 
     def _losses(self, step: nn.Module, batch: Mapping[str, Any], number: int) -> dict[str, Tensor]:
-        seeds = (self.config.seed, number, 0, self.place.rank)  # the 0 keeps the draws of published runs
+        seeds = (
+            self.config.seed,
+            number,
+            0,
+            self.place.rank,
+        )  # the 0 keeps the draws of published runs
         generator = generator_of(*seeds)
         torch.manual_seed(generator_of(*seeds).initial_seed())  # dropout, and the latents' noise
         inputs, targets = training_batch(batch, self.moments.model, self.config, generator)
@@ -276,7 +304,9 @@ class _Run:
             own = self.validated[self.place.rank :: self.place.ranks]
             scores = validated(model, self.dataset, own, self.predict)
             row["validation"] = scores
-            self.say(f"step {done:,}: {', '.join(f'{name} {value:.3f}' for name, value in scores.items())}")
+            self.say(
+                f"step {done:,}: {', '.join(f'{name} {value:.3f}' for name, value in scores.items())}"
+            )
             if progress.best is None or scores[SCORE] > progress.best:
                 progress = replace(progress, best=scores[SCORE])
                 self._weights(model, progress, BEST)
@@ -292,5 +322,9 @@ class _Run:
         """Write the weights alone, on the first process."""
         path = self.folder / name
         if self.place.is_first:
-            write_weights(path, model.state_dict(), {**self.notes, "step": progress.step, "score": progress.best})
+            write_weights(
+                path,
+                model.state_dict(),
+                {**self.notes, "step": progress.step, "score": progress.best},
+            )
         return path

@@ -19,7 +19,13 @@ from torch.optim import AdamW
 
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import ConfigError, shortened
-from deepaccident_devkit.plugins.model.checkpoint import LAST, OPTIMIZER, read_weights, reason_of, write_weights
+from deepaccident_devkit.plugins.model.checkpoint import (
+    LAST,
+    OPTIMIZER,
+    read_weights,
+    reason_of,
+    write_weights,
+)
 from deepaccident_devkit.selection.samples import Purpose
 from deepaccident_devkit.support.arrays import checked_number, checked_whole
 from deepaccident_devkit.support.files import write_bytes
@@ -40,7 +46,9 @@ _WHOLE: Final = {
 # Field → least and highest value, and what is expected.
 _NUMBERS: Final = {
     **dict.fromkeys(("warm_up", "partner_dropout", "alone"), (0, 1, "a share from 0 to 1")),
-    **dict.fromkeys(("learning_rate", "clip"), (math.ulp(0), sys.float_info.max, "a number above 0")),
+    **dict.fromkeys(
+        ("learning_rate", "clip"), (math.ulp(0), sys.float_info.max, "a number above 0")
+    ),
     "weight_decay": (0, sys.float_info.max, "a number from 0"),
 }
 _LOG_FILE = "log.jsonl"
@@ -108,7 +116,9 @@ class TrainConfig:
                 raise ConfigError(f"{name}: expected {expected}, found {value!r}")
         settle_choices(self, {"samples": get_args(Purpose)})
         object.__setattr__(
-            self, "freeze", tuple(members_of("freeze", self.freeze, "beginnings of names", error=ConfigError))
+            self,
+            "freeze",
+            tuple(members_of("freeze", self.freeze, "beginnings of names", error=ConfigError)),
         )
 
     def as_dict(self) -> dict[str, Any]:
@@ -176,7 +186,9 @@ def checked_device(device: str) -> str:
     try:
         torch.zeros(1, device=device)
     except (RuntimeError, AssertionError) as error:  # an AssertionError: torch without CUDA
-        raise ConfigError(f"device: {device!r} cannot be used ({str(error).splitlines()[0]}); choose cpu") from error
+        raise ConfigError(
+            f"device: {device!r} cannot be used ({str(error).splitlines()[0]}); choose cpu"
+        ) from error
     return device
 
 
@@ -201,7 +213,9 @@ def processes(device: str) -> Iterator[RunProcess]:
             f"({shortened(str(error))}); start all of them by torchrun, or unset WORLD_SIZE to train in this one"
         ) from error
     try:
-        yield RunProcess(device=chosen, rank=distributed.get_rank(), ranks=distributed.get_world_size())
+        yield RunProcess(
+            device=chosen, rank=distributed.get_rank(), ranks=distributed.get_world_size()
+        )
     finally:
         distributed.destroy_process_group()
 
@@ -254,7 +268,9 @@ def add_to_log(folder: Path, row: Mapping[str, Any]) -> None:
 
 def _row(where: str, line: bytes) -> dict[str, Any]:
     try:
-        row: dict[str, Any] = msgspec.json.decode(line)  # a log may have a million lines: ten times as fast as others
+        row: dict[str, Any] = msgspec.json.decode(
+            line
+        )  # a log may have a million lines: ten times as fast as others
         as_record(row, _Row)
     except (ValueError, msgspec.DecodeError, RecursionError) as error:
         raise ConfigError(
@@ -277,12 +293,18 @@ class TrainingProgress:
 
 
 def save_state(
-    folder: Path, model: nn.Module, optimizer: AdamW, progress: TrainingProgress, meta: Mapping[str, Any]
+    folder: Path,
+    model: nn.Module,
+    optimizer: AdamW,
+    progress: TrainingProgress,
+    meta: Mapping[str, Any],
 ) -> None:
     """Write the last checkpoint, completely or not at all."""
     tensors = dict(model.state_dict())
     for number, state in optimizer.state_dict()["state"].items():
-        tensors |= {f"{OPTIMIZER}{number}.{name}": torch.as_tensor(each) for name, each in state.items()}
+        tensors |= {
+            f"{OPTIMIZER}{number}.{name}": torch.as_tensor(each) for name, each in state.items()
+        }
     write_weights(folder / LAST, tensors, {**meta, "step": progress.step, "best": progress.best})
 
 
@@ -308,17 +330,25 @@ def load_state(folder: Path, model: nn.Module, optimizer: AdamW, steps: int) -> 
             f"{path}: is no checkpoint of this run ({reason_of(error)}); remove it, or train elsewhere"
         ) from error
     model.load_state_dict({name: weights.tensors[name] for name in model.state_dict()})
-    optimizer.load_state_dict({"state": states, "param_groups": optimizer.state_dict()["param_groups"]})
+    optimizer.load_state_dict(
+        {"state": states, "param_groups": optimizer.state_dict()["param_groups"]}
+    )
     return noted
 
 
-def _states(tensors: Mapping[str, Tensor], model: nn.Module, optimizer: AdamW) -> dict[int, dict[str, Tensor]]:
+def _states(
+    tensors: Mapping[str, Tensor], model: nn.Module, optimizer: AdamW
+) -> dict[int, dict[str, Tensor]]:
     """The optimizer's state of each parameter; raises ValueError if tensors are not just the model's and those."""
     wanted, states = dict(model.state_dict()), {}
-    for number, parameter in enumerate(each for group in optimizer.param_groups for each in group["params"]):
+    for number, parameter in enumerate(
+        each for group in optimizer.param_groups for each in group["params"]
+    ):
         likes = {"step": torch.zeros(()), "exp_avg": parameter, "exp_avg_sq": parameter}
         names = {part: f"{OPTIMIZER}{number}.{part}" for part in likes}
-        if not tensors.keys().isdisjoint(names.values()):  # a parameter without any gradient has no state
+        if not tensors.keys().isdisjoint(
+            names.values()
+        ):  # a parameter without any gradient has no state
             wanted |= {names[part]: like for part, like in likes.items()}
             states[number] = names
     if strange := sorted(tensors.keys() ^ wanted.keys()):
@@ -326,7 +356,10 @@ def _states(tensors: Mapping[str, Tensor], model: nn.Module, optimizer: AdamW) -
     for name, like in wanted.items():
         if _form(tensors[name]) != _form(like):
             raise ValueError(f"{name} is {_form(tensors[name])}, not {_form(like)}")
-    return {number: {part: tensors[name] for part, name in names.items()} for number, names in states.items()}
+    return {
+        number: {part: tensors[name] for part, name in names.items()}
+        for number, names in states.items()
+    }
 
 
 def _form(tensor: Tensor) -> str:

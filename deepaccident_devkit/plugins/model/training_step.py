@@ -27,7 +27,12 @@ from deepaccident_devkit.plugins.model.network import ModelConfig, V2XFormer
 from deepaccident_devkit.plugins.model.results import PredictConfig, predictions
 from deepaccident_devkit.plugins.model.training_run import TrainConfig
 from deepaccident_devkit.selection.samples import samples
-from deepaccident_devkit.training.torch import AllEgosDataset, RandomAugmentation, collate_all_egos, merged_evaluator
+from deepaccident_devkit.training.torch import (
+    AllEgosDataset,
+    RandomAugmentation,
+    collate_all_egos,
+    merged_evaluator,
+)
 
 # The mean of the IoU and the VPQ at all distances: what the best checkpoint has most of.
 SCORE = "score"
@@ -38,7 +43,9 @@ _LISTS = ("boxes", "categories", "velocity_known")
 class Moments(TorchDataset[dict[str, Any]]):
     """The moments of a split as `AllEgosDataset` has them, numbered on through the epochs."""
 
-    def __init__(self, dataset: Dataset, model: ModelConfig, config: TrainConfig, *, images_cache: Any = None) -> None:
+    def __init__(
+        self, dataset: Dataset, model: ModelConfig, config: TrainConfig, *, images_cache: Any = None
+    ) -> None:
         """Find the labelled moments of the training's split; `images_cache` is that of `V2XConfig`.
 
         Raises NotAvailableError: the split has no labelled samples; and the errors of `AllEgosDataset`.
@@ -46,7 +53,9 @@ class Moments(TorchDataset[dict[str, Any]]):
         self.model = model
         tokens = samples(dataset, config.split, config.samples)
         if not tokens:
-            raise NotAvailableError(f"{config.split}: has no samples to learn from; choose another split")
+            raise NotAvailableError(
+                f"{config.split}: has no samples to learn from; choose another split"
+            )
         self.data = AllEgosDataset(
             dataset,
             tokens,
@@ -85,7 +94,9 @@ class MixedMoments(TorchDataset[dict[str, Any]]):
         """The moment of a number."""
         return self.sources[number[0]][number[1]]
 
-    def numbers(self, config: TrainConfig, *, first: int, rank: int = 0, ranks: int = 1) -> Iterator[tuple[int, int]]:
+    def numbers(
+        self, config: TrainConfig, *, first: int, rank: int = 0, ranks: int = 1
+    ) -> Iterator[tuple[int, int]]:
         """The numbers of a process's moments, without end: each source's in its own order, spread evenly."""
         for number in count(first * ranks + rank, ranks):
             before = math.floor(number * self.mix)
@@ -95,10 +106,16 @@ class MixedMoments(TorchDataset[dict[str, Any]]):
 
 
 def batches(
-    moments: Moments | MixedMoments, numbers: Iterable[Any], config: TrainConfig, *, workers: int = 0
+    moments: Moments | MixedMoments,
+    numbers: Iterable[Any],
+    config: TrainConfig,
+    *,
+    workers: int = 0,
 ) -> Iterator[dict[str, Any]]:
     """Read batches of moments in the order of their numbers (`positions`), as of `read_batches`."""
-    return read_batches(moments, collate_all_egos, workers, batch_size=config.moments, sampler=numbers)
+    return read_batches(
+        moments, collate_all_egos, workers, batch_size=config.moments, sampler=numbers
+    )
 
 
 def validation_samples(dataset: Dataset, config: TrainConfig) -> list[str]:
@@ -115,7 +132,9 @@ def validation_samples(dataset: Dataset, config: TrainConfig) -> list[str]:
     return [listed[index * len(listed) // wanted] for index in range(wanted)]
 
 
-def validated(model: V2XFormer, dataset: Dataset, tokens: Sequence[str], config: PredictConfig) -> dict[str, float]:
+def validated(
+    model: V2XFormer, dataset: Dataset, tokens: Sequence[str], config: PredictConfig
+) -> dict[str, float]:
     """IoU, VPQ and distance mAP of a model at samples (tokens), in [0, 1], and the `score`; NaN becomes 0.
 
     Where several processes train, the tokens are this one's, and the scores are of all of them.
@@ -127,10 +146,16 @@ def validated(model: V2XFormer, dataset: Dataset, tokens: Sequence[str], config:
     for found, truth in zip(made, motion_labels_of(dataset, tokens, labels), strict=True):
         motion.update(found.token, found.motion, truth)
         pose = dataset.world_from(found.token, rules.frame).inverse()
-        boxes = DetectedBoxes(boxes=found.boxes.boxes.transform(pose, rules.frame), scores=found.boxes.scores)
+        boxes = DetectedBoxes(
+            boxes=found.boxes.boxes.transform(pose, rules.frame), scores=found.boxes.scores
+        )
         detection.update(found.token, boxes, detection_truth(dataset, found.token, rules))
     wide = merged_evaluator(motion).compute().ranges[_WIDE]
-    percent = {"iou": wide.iou, "vpq": wide.pq, "map": merged_evaluator(detection).compute().mean_average_precision}
+    percent = {
+        "iou": wide.iou,
+        "vpq": wide.pq,
+        "map": merged_evaluator(detection).compute().mean_average_precision,
+    }
     known = {name: 0.0 if math.isnan(value) else value / 100 for name, value in percent.items()}
     return {**known, SCORE: (known["iou"] + known["vpq"]) / 2}
 
@@ -164,13 +189,18 @@ def optimizer_of(model: nn.Module, config: TrainConfig) -> AdamW:
     """AdamW over what is trained; vectors (biases, norms) do not decay."""
     trained = [parameter for parameter in model.parameters() if parameter.requires_grad]
     groups = [
-        {"params": [each for each in trained if each.ndim > 1], "weight_decay": config.weight_decay},
+        {
+            "params": [each for each in trained if each.ndim > 1],
+            "weight_decay": config.weight_decay,
+        },
         {"params": [each for each in trained if each.ndim <= 1], "weight_decay": 0.0},
     ]
     return AdamW(groups, lr=config.learning_rate)
 
 
-def positions(count: int, config: TrainConfig, *, first: int, rank: int = 0, ranks: int = 1) -> Iterator[int]:
+def positions(
+    count: int, config: TrainConfig, *, first: int, rank: int = 0, ranks: int = 1
+) -> Iterator[int]:
     """The moments of a process, without end: numbers of (epoch · count + position), each epoch in an order of its own.
 
     They depend on the seed alone, so that a resumed run goes on where it stopped, after the `first` moments that this
@@ -182,7 +212,10 @@ def positions(count: int, config: TrainConfig, *, first: int, rank: int = 0, ran
     while True:
         epoch, position = divmod(number, count)
         if order is None or epoch != ordered:
-            order, ordered = torch.randperm(count, generator=generator_of(config.seed, epoch)), epoch
+            order, ordered = (
+                torch.randperm(count, generator=generator_of(config.seed, epoch)),
+                epoch,
+            )
         yield epoch * count + int(order[position])
         number += ranks
 
@@ -214,7 +247,9 @@ class Targets:
     def to(self, device: torch.device | str) -> Targets:
         """The same on another device."""
         lists = {name: [each.to(device) for each in getattr(self, name)] for name in _LISTS}
-        return replace(self, motion=MotionTargets(*(each.to(device) for each in self.motion)), **lists)
+        return replace(
+            self, motion=MotionTargets(*(each.to(device) for each in self.motion)), **lists
+        )
 
 
 def training_batch(
@@ -233,7 +268,10 @@ def training_batch(
     kept = rows.tolist()
     targets = Targets(
         motion=MotionTargets(
-            **{name: batch[name][rows] for name in ("segmentation", "centerness", "offset", "flow")}, frame_mask=mask
+            **{
+                name: batch[name][rows] for name in ("segmentation", "centerness", "offset", "flow")
+            },
+            frame_mask=mask,
         ),
         boxes=[mirrored_boxes(batch["boxes"][row], model.handedness) for row in kept],
         categories=[batch["categories"][row] for row in kept],
@@ -242,7 +280,9 @@ def training_batch(
     return inputs.of_egos(rows), targets
 
 
-def with_dropped_partners(inputs: ModelInputs, config: TrainConfig, generator: torch.Generator) -> ModelInputs:
+def with_dropped_partners(
+    inputs: ModelInputs, config: TrainConfig, generator: torch.Generator
+) -> ModelInputs:
     """The inputs with some partners not heard: each with one probability, all with another; never the ego itself."""
     shape = inputs.partners.shape
     kept = torch.rand(shape, generator=generator) >= config.partner_dropout
@@ -258,12 +298,18 @@ class TrainingStep(nn.Module):
         super().__init__()
         self.model = model
 
-    def forward(self, inputs: ModelInputs, targets: Targets, noise: Tensor | None = None) -> dict[str, Tensor]:
+    def forward(
+        self, inputs: ModelInputs, targets: Targets, noise: Tensor | None = None
+    ) -> dict[str, Tensor]:
         """The weighted losses of G egos by name, whose sum is minimised; noise of the latents is drawn if None."""
         config = self.model.config
         predicted = self.model(inputs, targets.motion, noise=noise)
         losses = motion_losses(predicted.motion, targets.motion, config.motion_loss)
         wanted = detection_targets(
-            targets.boxes, targets.categories, config.detection, config.targets, velocity_known=targets.velocity_known
+            targets.boxes,
+            targets.categories,
+            config.detection,
+            config.targets,
+            velocity_known=targets.velocity_known,
         )
         return losses | detection_losses(predicted.detection, wanted, config.detection_loss)

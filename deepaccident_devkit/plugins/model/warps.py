@@ -45,7 +45,9 @@ def six_from_matrices(matrix: Tensor) -> Tensor:
     return torch.cat([matrix[..., :3, 3], torch.stack([rx, ry, rz], -1)], -1)
 
 
-def between_augmented(target_from_source: Tensor, target_bev: Tensor | None, source_bev: Tensor | None) -> Tensor:
+def between_augmented(
+    target_from_source: Tensor, target_bev: Tensor | None, source_bev: Tensor | None
+) -> Tensor:
     """A transform of frames → the one between their augmented maps (…, 4, 4): A_target · transform · A_source⁻¹."""
     if target_bev is not None:
         target_from_source = _product(target_bev, target_from_source)
@@ -65,7 +67,9 @@ def present_from_past_batch(
     """
     way = _product if chain == "exact" else lambda later, earlier: _product(earlier, later)
     products = list(accumulate(matrices_from_six(egomotion).unbind(1)[::-1], way))
-    stacked = torch.stack(products[::-1], 1) if products else egomotion.new_zeros(len(egomotion), 0, 4, 4)
+    stacked = (
+        torch.stack(products[::-1], 1) if products else egomotion.new_zeros(len(egomotion), 0, 4, 4)
+    )
     return _augmented(stacked, bev_transform)
 
 
@@ -105,12 +109,18 @@ def warp_features(
     points = _sample_points(target_from_source, grid, warp)
     working = features if features.dtype == torch.float64 else features.float()
     sampled = functional.grid_sample(
-        working, points.to(working.dtype), mode=mode, padding_mode="zeros", align_corners=warp == "stretched"
+        working,
+        points.to(working.dtype),
+        mode=mode,
+        padding_mode="zeros",
+        align_corners=warp == "stretched",
     )
     return sampled.to(features.dtype)
 
 
-def inside_mask(target_from_source: Tensor, grid: BevGrid, *, warp: FeatureWarpRule = "exact") -> Tensor:
+def inside_mask(
+    target_from_source: Tensor, grid: BevGrid, *, warp: FeatureWarpRule = "exact"
+) -> Tensor:
     """(N, H, W) bool: the cells that the source's grid covers, by nearest sampling, of transforms (N, 4, 4), metres."""
     ones = target_from_source.new_ones(len(target_from_source), 1, *grid.shape)
     return warp_features(ones, target_from_source, grid, warp=warp, mode="nearest")[:, 0] > 0.5
@@ -131,7 +141,9 @@ def features_to_ego(
         (B, A, C, H, W).
     """
     partners = features[:, 1:]
-    warped = warp_features(partners.flatten(0, 1), ego_from_agent[:, 1:].flatten(0, 1), grid, warp=warp)
+    warped = warp_features(
+        partners.flatten(0, 1), ego_from_agent[:, 1:].flatten(0, 1), grid, warp=warp
+    )
     return torch.cat([features[:, :1], warped.view_as(partners)], 1)
 
 
@@ -142,7 +154,9 @@ def agents_mask(
 
     Transforms (B, A, 4, 4), metres, are the identity where an agent is missing.
     """
-    inside = inside_mask(ego_from_agent.flatten(0, 1), grid, warp=warp).unflatten(0, agent_valid.shape)
+    inside = inside_mask(ego_from_agent.flatten(0, 1), grid, warp=warp).unflatten(
+        0, agent_valid.shape
+    )
     mask = inside & agent_valid[..., None, None]
     mask[:, 0] = True
     return mask
@@ -154,7 +168,9 @@ def _sample_points(target_from_source: Tensor, grid: BevGrid, warp: FeatureWarpR
     columns, rows = (_coordinates(axis, warp, source_from_target) for axis in (grid.x, grid.y))
     points = []
     for number, (low, high, _) in enumerate((grid.x, grid.y)):
-        along_x, along_y, shift = (source_from_target[:, number, column, None, None] for column in (0, 1, 3))
+        along_x, along_y, shift = (
+            source_from_target[:, number, column, None, None] for column in (0, 1, 3)
+        )
         metres = along_x * columns[None, None, :] + along_y * rows[None, :, None] + shift
         points.append((metres - (low + high) / 2) / ((high - low) / 2))
     return torch.stack(points, -1)
@@ -164,4 +180,6 @@ def _coordinates(axis: Axis, warp: FeatureWarpRule, like: Tensor) -> Tensor:
     """(n,) metres: the centres of an axis' cells; if stretched, from the first centre to the *end*, evenly."""
     low, high, size = axis
     last = high if warp == "stretched" else high - size / 2
-    return torch.linspace(low + size / 2, last, round((high - low) / size), dtype=like.dtype, device=like.device)
+    return torch.linspace(
+        low + size / 2, last, round((high - low) / size), dtype=like.dtype, device=like.device
+    )

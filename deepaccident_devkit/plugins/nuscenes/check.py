@@ -86,7 +86,11 @@ class SourceCheck(ShortRepr):
         turned = _is_above((np.abs(self.turns) > _ASIDE) - _MOST_ASIDE)
         road, floor = _mean(self.road), _mean(self.boxes)
         heights = (self.road, self.boxes - np.nan_to_num(road))
-        sunk = [-_mean(height) for height in heights if _is_above(height * np.sign(_mean(height)) - _OFF)]
+        sunk = [
+            -_mean(height)
+            for height in heights
+            if _is_above(height * np.sign(_mean(height)) - _OFF)
+        ]
         where = f"the road lies at {road:.1f} m, boxes stand at {floor:.1f} m"
         side = self._side_fault()
         if self.lidar < _AT_ORIGIN and (turned or sunk):
@@ -110,7 +114,9 @@ class SourceCheck(ShortRepr):
         if len(self.held) < _LEAST_VALUES:
             yield "whether y is to the left, since few boxes should hold points"
         clearer = self._clearer()
-        unclear = [name for code, name in enumerate(CAMERAS) if not _is_above(clearer[:, code, code])]
+        unclear = [
+            name for code, name in enumerate(CAMERAS) if not _is_above(clearer[:, code, code])
+        ]
         if unclear:
             yield f"whether the images are those of {', '.join(unclear)}, since boxes hardly stand out in them"
 
@@ -120,7 +126,11 @@ class SourceCheck(ShortRepr):
         shares = f"points lie in {_mean(given):.0%} of the boxes, in {_mean(mirrored):.0%} of them mirrored"
         if not _is_above(_LEAST_SHARE - given):
             return ""
-        return f"y is mirrored: {shares}" if _is_above(mirrored - given) else f"boxes are in other places: {shares}"
+        return (
+            f"y is mirrored: {shares}"
+            if _is_above(mirrored - given)
+            else f"boxes are in other places: {shares}"
+        )
 
     def _clearer(self) -> FloatArray:
         """(S, 6, 6) the contrasts of boxes beside those of the same boxes, and of the same image."""
@@ -140,13 +150,21 @@ class SourceCheck(ShortRepr):
         return [f"{CAMERAS[images[at]]} shows what {CAMERAS[at]} should" for at in moved.tolist()]
 
     def _turned_away(self, turn: float) -> list[str]:
-        nearest = np.abs((self.looks[:, None] - turn - _LOOKS + 180) % 360 - 180).argmin(axis=1).tolist()
-        return [f"{CAMERAS[at]} looks where {CAMERAS[to]} should" for at, to in enumerate(nearest) if at != to]
+        nearest = (
+            np.abs((self.looks[:, None] - turn - _LOOKS + 180) % 360 - 180).argmin(axis=1).tolist()
+        )
+        return [
+            f"{CAMERAS[at]} looks where {CAMERAS[to]} should"
+            for at, to in enumerate(nearest)
+            if at != to
+        ]
 
 
 def _mean(values: FloatArray, axis: int | None = None) -> Any:
     """The mean of those that are known, NaN of none; along an axis, which stays."""
-    return np.ma.filled(np.ma.masked_invalid(values).mean(axis=axis, keepdims=axis is not None), np.nan)
+    return np.ma.filled(
+        np.ma.masked_invalid(values).mean(axis=axis, keepdims=axis is not None), np.nan
+    )
 
 
 def _is_above(values: AnyArray, tests: int = 1) -> bool:
@@ -172,7 +190,9 @@ def check_source(dataset: Dataset) -> SourceCheck:
     """
     found = look_at(dataset)
     if faults := list(found.faults()):
-        raise SourceError(f"{dataset.dataroot}: {'; '.join(faults)}; mend it first: a model would learn it")
+        raise SourceError(
+            f"{dataset.dataroot}: {'; '.join(faults)}; mend it first: a model would learn it"
+        )
     if unchecked := list(found.unchecked()):
         logger.warning("%s: could not be checked: %s", dataset.dataroot, "; ".join(unchecked))
     return found
@@ -184,7 +204,10 @@ def look_at(dataset: Dataset) -> SourceCheck:
     with_clouds = [sample for sample in samples if dataset.sensor_path(sample, LIDAR).exists()]
     chosen = spread(with_clouds or samples, _SAMPLES)
     boxes = [dataset.with_ignored.boxes(sample, "ego") for sample in chosen]
-    boxes = [each.select((each.num_lidar_pts >= _LEAST_POINTS) & (each.actor_id != OWN_ACTOR_ID)) for each in boxes]
+    boxes = [
+        each.select((each.num_lidar_pts >= _LEAST_POINTS) & (each.actor_id != OWN_ACTOR_ID))
+        for each in boxes
+    ]
     clouds = [dataset.load_point_cloud(sample, "ego").xyz for sample in chosen if with_clouds]
     held = [
         np.column_stack([each.count_points(points * side) > 0 for side in _SIDES])
@@ -195,10 +218,14 @@ def look_at(dataset: Dataset) -> SourceCheck:
         turns=turns[np.isfinite(turns)],
         road=np.array([road_height(points) for points in clouds] or [np.nan] * len(chosen)),
         boxes=np.array([_floor(each) for each in boxes]),
-        lidar=float(np.median([dataset.ego_from(sample, LIDAR).translation[2] for sample in chosen])),
+        lidar=float(
+            np.median([dataset.ego_from(sample, LIDAR).translation[2] for sample in chosen])
+        ),
         looks=np.array([looks_to(dataset.ego_from(chosen[0], camera)) for camera in CAMERAS]),
         held=np.concatenate([np.zeros((0, 2)), *held]),
-        contrasts=np.stack([_contrasts(dataset, *each) for each in zip(chosen, boxes, strict=True)]),
+        contrasts=np.stack(
+            [_contrasts(dataset, *each) for each in zip(chosen, boxes, strict=True)]
+        ),
     )
 
 
@@ -216,7 +243,10 @@ def labelled_rows(dataset: Dataset) -> IntArray:
 def spread(samples: Sequence[str], most: int) -> list[str]:
     """So many of them, evenly from the first to the last."""
     return [
-        samples[place] for place in np.unique(np.linspace(0, len(samples) - 1, min(most, len(samples))).astype(int))
+        samples[place]
+        for place in np.unique(
+            np.linspace(0, len(samples) - 1, min(most, len(samples))).astype(int)
+        )
     ]
 
 
@@ -224,7 +254,9 @@ def _turn(dataset: Dataset, sample: str, following: str) -> float:
     """Degrees from the ego's x to where it is at the next sample; NaN if that is near, or of another recording."""
     if sample.rsplit("/", 1)[0] != following.rsplit("/", 1)[0]:
         return np.nan
-    x, y, _ = (dataset.world_from(sample, "ego").inverse() @ dataset.world_from(following, "ego")).translation
+    x, y, _ = (
+        dataset.world_from(sample, "ego").inverse() @ dataset.world_from(following, "ego")
+    ).translation
     return float(np.degrees(np.arctan2(y, x))) if np.hypot(x, y) > _STEP else np.nan
 
 
@@ -256,17 +288,24 @@ def _contrasts(dataset: Dataset, sample: str, boxes: Boxes) -> FloatArray:
         for row, camera in zip(contrasts, CAMERAS, strict=True):
             shown = _rectangles(dataset, sample, camera, boxes)
             if len(shown):
-                row[:] = [np.log1p([_contrast(image, *each) for each in shown]).mean() for image in images]
+                row[:] = [
+                    np.log1p([_contrast(image, *each) for each in shown]).mean() for image in images
+                ]
     return contrasts
 
 
 def _rectangles(dataset: Dataset, sample: str, camera: str, boxes: Boxes) -> FloatArray:
     """Return middle and half size (K, 2, 2), as shares of the image, of the boxes that it should show."""
-    camera_from_ego = dataset.world_from(sample, camera).inverse() @ dataset.world_from(sample, "ego")
+    camera_from_ego = dataset.world_from(sample, camera).inverse() @ dataset.world_from(
+        sample, "ego"
+    )
     corners = boxes.transform(camera_from_ego, camera).corners()
     near = ((corners[..., 2] > _DEPTHS[0]) & (corners[..., 2] < _DEPTHS[1])).all(axis=1)
     lens = dataset.camera(sample, camera)
-    pixels = lens.project(corners[near].reshape(-1, 3))[0].reshape(-1, 8, 2) / (lens.width, lens.height)
+    pixels = lens.project(corners[near].reshape(-1, 3))[0].reshape(-1, 8, 2) / (
+        lens.width,
+        lens.height,
+    )
     middle, half = (pixels.max(axis=1) + pixels.min(axis=1)) / 2, np.ptp(pixels, axis=1) / 2
     shown = (middle > 0) & (middle < 1) & (half > _LEAST_HALF) & (half < _MOST_HALF)
     return np.asarray(np.stack([middle, half], axis=1)[shown.all(axis=1)])

@@ -24,10 +24,14 @@ CLASSES: Final = MappingProxyType(
     }
 )
 """nuScenes' category → ours; it has no vans."""
-DETECTION_NAMES: Final = MappingProxyType({**{name: name for name in CATEGORIES}, "van": "car", "cyclist": "bicycle"})
+DETECTION_NAMES: Final = MappingProxyType(
+    {**{name: name for name in CATEGORIES}, "van": "car", "cyclist": "bicycle"}
+)
 """Our category → nuScenes' detection class."""
 
 
 def category_of(category: str) -> int:
     """The index of our category for one of nuScenes'; of an ignored one, what it is most like."""
-    return CATEGORIES.index(CLASSES.get(category, "truck" if category.startswith("vehicle.") else "pedestrian"))
+    return CATEGORIES.index(
+        CLASSES.get(category, "truck" if category.startswith("vehicle.") else "pedestrian")
+    )

@@ -5,7 +5,12 @@ from pathlib import Path
 
 import click
 
-from deepaccident_devkit.cli.options import PATH, figure_style_parameter, json_parameter, open_release
+from deepaccident_devkit.cli.options import (
+    PATH,
+    figure_style_parameter,
+    json_parameter,
+    open_release,
+)
 from deepaccident_devkit.cli.verbs import verb
 from deepaccident_devkit.plugins.nuscenes.sensor_setups import sensor_setup_report
 
@@ -22,11 +27,15 @@ def sensor_setups(first: Path, second: Path | None, out: Path | None, as_json: b
     Each is a release or a dataroot of nuScenes. With OTHER, the last lines say what a model that learned on DATAROOT
     will find odd in OTHER.
     """
-    report = sensor_setup_report(*(open_release(each) for each in (first, second) if each is not None))
+    report = sensor_setup_report(
+        *(open_release(each) for each in (first, second) if each is not None)
+    )
     click.echo(report.to_json() if as_json else report.to_text())
     if out is not None:
         from deepaccident_devkit.plugins.nuscenes.sensor_setup_figures import sensor_setups_figure
         from deepaccident_devkit.render.figures import write_report_figure
 
-        click.echo(f"written: {write_report_figure(sensor_setups_figure(report), out)}", err=as_json)
+        click.echo(
+            f"written: {write_report_figure(sensor_setups_figure(report), out)}", err=as_json
+        )
     sys.exit(report.exit_status)

@@ -16,7 +16,12 @@ class NuScenesDataset(V2XDataset):
     """
 
     def __init__(
-        self, nusc: Any, split: str, config: V2XConfig | None = None, *, index_dir: Path | None = None
+        self,
+        nusc: Any,
+        split: str,
+        config: V2XConfig | None = None,
+        *,
+        index_dir: Path | None = None,
     ) -> None:
         """Choose a split.
 

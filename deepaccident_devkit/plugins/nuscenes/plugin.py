@@ -35,7 +35,9 @@ PLUGIN: Final = Plugin(
     name="nuscenes",
     protocol_version=PROTOCOL_VERSION,
     verbs={
-        "sensor-setups": LazyVerb("Compare what the vehicles of two sources carry.", _sensor_setups),
+        "sensor-setups": LazyVerb(
+            "Compare what the vehicles of two sources carry.", _sensor_setups
+        ),
     },
     openers={"nuScenes": Opener(recognizes=_is_dataroot, open_release=_open)},
 )

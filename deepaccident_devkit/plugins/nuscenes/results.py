@@ -38,11 +38,15 @@ def write_detections(release: DeepAccident, results: Path) -> Path:
         DeepAccidentError: as of `read_results`.
     """
     if not isinstance(release, NuScenesRelease):
-        raise ConfigError(f"{release.dataroot}: is no dataroot of nuScenes; open one with open_nuscenes")
+        raise ConfigError(
+            f"{release.dataroot}: is no dataroot of nuScenes; open one with open_nuscenes"
+        )
     read = read_results(results)
     if read.task != "detection":
         raise ResultsError(f"{results}: has results of {read.task}; nuScenes evaluates detections")
-    found: dict[str, Any] = {release.nuscenes_token(token): read.prediction(token) for token in read.tokens}
+    found: dict[str, Any] = {
+        release.nuscenes_token(token): read.prediction(token) for token in read.tokens
+    }
     preset = read.meta.get("model", {}).get("preset", "tiny")
     document = {
         "meta": {
@@ -60,9 +64,18 @@ def write_detections(release: DeepAccident, results: Path) -> Path:
 def _entries(token: str, found: DetectedBoxes) -> list[dict[str, Any]]:
     """Return the best boxes of a sample, with nuScenes' classes and attributes."""
     best = (-found.scores).argsort(kind="stable")[:_MOST]
-    entries = detection_entries(token, DetectedBoxes(boxes=found.boxes.select(best), scores=found.scores[best]))
+    entries = detection_entries(
+        token, DetectedBoxes(boxes=found.boxes.select(best), scores=found.scores[best])
+    )
     for entry in entries:
-        name, velocity = DETECTION_NAMES[entry["detection_name"]], entry["velocity"] or [math.nan, math.nan]
+        name, velocity = (
+            DETECTION_NAMES[entry["detection_name"]],
+            entry["velocity"] or [math.nan, math.nan],
+        )
         moving = math.hypot(*velocity) > _MOVING
-        entry |= {"detection_name": name, "velocity": velocity, "attribute_name": _ATTRIBUTES[name][moving]}
+        entry |= {
+            "detection_name": name,
+            "velocity": velocity,
+            "attribute_name": _ATTRIBUTES[name][moving],
+        }
     return entries

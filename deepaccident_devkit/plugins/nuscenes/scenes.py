@@ -58,7 +58,9 @@ class NuScenesScene:
         self._rotations = self._quaternions(self._boxes)
         self._files = [self._channels(sample) for sample in self._samples]
         self._world_from_ego, self._ego_from_sensor = self._poses(LIDAR_CHANNEL)
-        self._ego_from_lidar = self._turned(upright=bool((np.abs(self._rotations[:, 1:3]) < _LEAN).all()))
+        self._ego_from_lidar = self._turned(
+            upright=bool((np.abs(self._rotations[:, 1:3]) < _LEAN).all())
+        )
         self._calibs = self._all_calibs()
         self._columns = self._box_columns()
 
@@ -70,11 +72,15 @@ class NuScenesScene:
         links = [scene.first_sample_token, *(sample.next for sample in samples)]
         for row, link, token in zip([scene, *samples], links, tokens, strict=True):
             if link != token or not samples:
-                raise source.error(row, f"next sample: expected {token!r} by its time, found {shortened(link)!r}")
+                raise source.error(
+                    row, f"next sample: expected {token!r} by its time, found {shortened(link)!r}"
+                )
         self._stamps = 1e-6 * np.array([sample.timestamp for sample in samples])
         gaps = np.diff(self._stamps, append=np.inf)
         if gaps.min() < _MIN_GAP_S:
-            raise source.error(samples[gaps.argmin()], "timestamp: expected the next sample to be later")
+            raise source.error(
+                samples[gaps.argmin()], "timestamp: expected the next sample to be later"
+            )
         return samples
 
     def _channels(self, sample: Any) -> dict[str, Any]:
@@ -86,7 +92,9 @@ class NuScenesScene:
             if file.is_key_frame
         }
         if lacking := CHANNEL_NAMES.values() - files.keys():
-            raise self._source.error(sample, f"token: sample_data.json has no {', '.join(sorted(lacking))} for it")
+            raise self._source.error(
+                sample, f"token: sample_data.json has no {', '.join(sorted(lacking))} for it"
+            )
         return files
 
     def _poses(self, channel: str) -> list[FloatArray]:
@@ -110,7 +118,9 @@ class NuScenesScene:
         errors = np.abs(np.linalg.norm(rotations, axis=1) - 1)
         if errors.max(initial=0) > _UNIT_TOLERANCE:
             row = rows[errors.argmax()]
-            raise self._source.error(row, f"rotation: expected a unit quaternion, found {row.rotation}")
+            raise self._source.error(
+                row, f"rotation: expected a unit quaternion, found {row.rotation}"
+            )
         return rotations
 
     def _turned(self, *, upright: bool) -> FloatArray:
@@ -130,7 +140,9 @@ class NuScenesScene:
         `first` is the row of the scene's first sample.
         """
         matrices = (inverses(self._ego_from_lidar) @ self._ego_from_sensor).reshape(-1, 16).tolist()
-        for number, (sample, files, matrix) in enumerate(zip(self._samples, self._files, matrices, strict=True)):
+        for number, (sample, files, matrix) in enumerate(
+            zip(self._samples, self._files, matrices, strict=True)
+        ):
             for channel, name in CHANNEL_NAMES.items():
                 row = (first + KEY_STEP * number) * len(CHANNELS) + CHANNELS.index(channel)
                 yield row, files[name].filename, sample.token, matrix
@@ -139,10 +151,17 @@ class NuScenesScene:
         """Return the rows of all tables, with boxes of all classes or of ours only."""
         place = ScenarioFolder(self._source.folder.parent, "", "nuscenes", self._row.name, (AGENT,))
         scan = ScenarioScan(
-            agents=(AGENT,), has_meta=False, labelled=(AGENT,), num_frames=self.frames, problems=(), notices=()
+            agents=(AGENT,),
+            has_meta=False,
+            labelled=(AGENT,),
+            num_frames=self.frames,
+            problems=(),
+            notices=(),
         )
         is_key = np.arange(self.frames) % KEY_STEP == 0
-        times = np.interp(np.arange(self.frames), np.flatnonzero(is_key), self._stamps - self._stamps[0]).round(6)
+        times = np.interp(
+            np.arange(self.frames), np.flatnonzero(is_key), self._stamps - self._stamps[0]
+        ).round(6)
         chosen = (self._columns["actor_id"] < IGNORED_ID) | every_class
         moved = np.diff(self._calibs.world_from_ego[:, :2, 3], axis=0, append=np.nan)
         labels = Labels(
@@ -151,12 +170,16 @@ class NuScenesScene:
             agent_velocity=moved / np.diff(times, append=np.nan)[:, None],
             **{name: column[chosen] for name, column in self._columns.items()},
         )
-        rows = scenario_rows(ScenarioFiles(scenario=place, scan=scan, meta=None, calibs=self._calibs, labels=labels))
+        rows = scenario_rows(
+            ScenarioFiles(scenario=place, scan=scan, meta=None, calibs=self._calibs, labels=labels)
+        )
         images = [self._files[0][channel] for channel in CAMERA_CHANNELS.values()]
         sizes = {}
         for side in ("width", "height"):  # K says only where their middle may be
             others = rows["sample_data"][side][len(images) : len(CHANNELS)]
-            sizes[side] = np.tile([*(getattr(image, side) for image in images), *others], self.frames)
+            sizes[side] = np.tile(
+                [*(getattr(image, side) for image in images), *others], self.frames
+            )
         own_columns: dict[str, ColumnArrays] = {
             "scenario": {"town": [self._source.follow(self._row, "log_token").location]},
             "frame": {"timestamp": times},
@@ -186,7 +209,9 @@ class NuScenesScene:
         cameras, intrinsics = [], []
         for channel in CAMERA_CHANNELS.values():
             then, ego_from_camera = self._poses(channel)
-            ego_then = inverses(then @ ego_from_camera) @ world  # the camera's ego is where it was at its own time
+            ego_then = (
+                inverses(then @ ego_from_camera) @ world
+            )  # the camera's ego is where it was at its own time
             cameras.append(ego_then @ self._ego_from_lidar)
             intrinsics.append(np.stack([self._intrinsic(files[channel]) for files in self._files]))
         return Calibs(
@@ -201,9 +226,13 @@ class NuScenesScene:
         mount = self._source.follow(image, "calibrated_sensor_token")
         matrix = np.array(mount.camera_intrinsic)
         if matrix.shape != (3, 3) or matrix.diagonal().min() < _MIN_FOCAL_PX:
-            raise self._source.error(mount, "camera_intrinsic: expected 3 x 3 numbers with focal lengths in pixels")
+            raise self._source.error(
+                mount, "camera_intrinsic: expected 3 x 3 numbers with focal lengths in pixels"
+            )
         if min(image.width, image.height) < 1:
-            raise self._source.error(image, "width, height: expected the pixels of an image, found 0")
+            raise self._source.error(
+                image, "width, height: expected the pixels of an image, found 0"
+            )
         return matrix
 
     def _box_columns(self) -> dict[str, Any]:
@@ -225,7 +254,9 @@ class NuScenesScene:
             "velocity": label_from_world_velocity(velocity, yaw),
             "actor_id": ids,
             "num_lidar_pts": np.array([box.num_lidar_pts for box in boxes], dtype=np.int64),
-            "camera_visible": np.array([box.visibility_token != _UNSEEN for box in boxes], dtype=bool),
+            "camera_visible": np.array(
+                [box.visibility_token != _UNSEEN for box in boxes], dtype=bool
+            ),
         }
 
     def _tracks(self, places: FloatArray) -> tuple[IntArray, FloatArray]:
@@ -240,9 +271,13 @@ class NuScenesScene:
             tracks[box.instance_token].append(row)
         for number, rows in enumerate(tracks.values(), start=1):
             ids[rows] = number
-            for before, row, after in zip([rows[0], *rows[:-1]], rows, [*rows[1:], rows[-1]], strict=True):
+            for before, row, after in zip(
+                [rows[0], *rows[:-1]], rows, [*rows[1:], rows[-1]], strict=True
+            ):
                 if before < row and times[before] == times[row]:
-                    raise self._source.error(self._boxes[row], "instance_token: two boxes of its sample have it")
+                    raise self._source.error(
+                        self._boxes[row], "instance_token: two boxes of its sample have it"
+                    )
                 seconds = times[after] - times[before]
                 if 0 < seconds <= _MAX_GAP_S * ((before < row) + (row < after)):
                     velocity[row] = (places[after] - places[before]) / seconds

@@ -27,7 +27,13 @@ def sensor_setups_figure(report: SensorSetupReport) -> Figure:
     for number, source in enumerate(report.sources):
         place = np.arange(len(names)) + (number - (count - 1) / 2) * 0.8 / count
         color = SERIES_COLORS[number]
-        classes.barh(place, [source.shares[name] * 100 for name in names], 0.8 / count, color=color, label=source.name)
+        classes.barh(
+            place,
+            [source.shares[name] * 100 for name in names],
+            0.8 / count,
+            color=color,
+            label=source.name,
+        )
     classes.set_yticks(range(len(names)), names)
     classes.invert_yaxis()
     classes.set_xlabel("share of the boxes (%)")
@@ -44,12 +50,27 @@ def _draw_cameras(ax: Axes, source: SensorSetupFacts) -> None:
     for number, each in enumerate(source.cameras):
         middle, half = 90 + each.looks, each.field_of_view / 2
         color = SERIES_COLORS[number % len(SERIES_COLORS)]
-        ax.add_patch(Wedge((0, 0), 1, middle - half, middle + half, facecolor=color, alpha=0.3, edgecolor=color))
+        ax.add_patch(
+            Wedge(
+                (0, 0), 1, middle - half, middle + half, facecolor=color, alpha=0.3, edgecolor=color
+            )
+        )
         angle = np.radians(middle)
-        words = f"{each.camera.removeprefix('Camera_')}\n{each.field_of_view:.0f}°, {each.above:.1f} m"
-        ax.text(0.72 * np.cos(angle), 0.72 * np.sin(angle), words, ha="center", va="center", fontsize=text_size())
+        words = (
+            f"{each.camera.removeprefix('Camera_')}\n{each.field_of_view:.0f}°, {each.above:.1f} m"
+        )
+        ax.text(
+            0.72 * np.cos(angle),
+            0.72 * np.sin(angle),
+            words,
+            ha="center",
+            va="center",
+            fontsize=text_size(),
+        )
     ax.set(xlim=(-1.15, 1.15), ylim=(-1.15, 1.15), xticks=[], yticks=[], aspect="equal")
-    lidar = f"LiDAR {source.lidar_above:.1f} m" + (f", {source.lanes} lanes" if source.lanes else "")
+    lidar = f"LiDAR {source.lidar_above:.1f} m" + (
+        f", {source.lanes} lanes" if source.lanes else ""
+    )
     ax.set_title(source.name)
     ax.set_xlabel(f"{lidar}\n{source.labels_a_second:g} labels a second", color=MUTED_COLOR)
     for edge in ax.spines.values():

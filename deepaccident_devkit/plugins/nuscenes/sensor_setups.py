@@ -108,8 +108,14 @@ class SensorSetupReport(CheckReport):
 
     def named_tables(self) -> dict[str, list[Row]]:
         """A table of cameras for each source, and one of all else."""
-        tables = {f"cameras of {source.name}": record_rows(CameraFacts, source.cameras) for source in self.sources}
-        columns = [(source.name, *attrgetter(*_FACTS)(source), *source.shares.values()) for source in self.sources]
+        tables = {
+            f"cameras of {source.name}": record_rows(CameraFacts, source.cameras)
+            for source in self.sources
+        }
+        columns = [
+            (source.name, *attrgetter(*_FACTS)(source), *source.shares.values())
+            for source in self.sources
+        ]
         names = ("", *_FACTS, *map("share of {}".format, _SHARES))
         return {**tables, "sources": [*zip(names, *columns, strict=True)]}
 
@@ -119,7 +125,9 @@ class SensorSetupReport(CheckReport):
         text = CheckReport.to_text(self)  # no `super()`: a dataclass with slots is another class
         if len(names) == 1:
             return text
-        odd = "".join(f"\n- {sentence}" for sentence in self.odd or ("nothing of what was compared",))
+        odd = "".join(
+            f"\n- {sentence}" for sentence in self.odd or ("nothing of what was compared",)
+        )
         return f"{text}\n\na model that learned on {names[0]} will find odd in {names[1]}:{odd}"
 
 
@@ -133,7 +141,9 @@ def sensor_setup_report(*datasets: Dataset) -> SensorSetupReport:
     missing = [name for name in _FACTS if None in map(attrgetter(name), sources)]
     return SensorSetupReport(
         compared={"cameras": len(CAMERAS), "other facts": len(_FACTS) + 1 - len(missing)},
-        cannot_say=(f"{', '.join(missing)}: a source has no files of the LiDAR.",) if missing else (),
+        cannot_say=(f"{', '.join(missing)}: a source has no files of the LiDAR.",)
+        if missing
+        else (),
         sources=sources,
         odd=tuple(_odd(*sources)) if len(sources) == 2 else (),
     )
@@ -153,7 +163,8 @@ def sensor_setup_facts(dataset: Dataset) -> SensorSetupFacts:
     counts = np.bincount(codes, minlength=len(_CLASSES)) / max(len(codes), 1)
     ranges = np.linalg.norm(np.concatenate(clouds), axis=1) if clouds else np.zeros(0)
     roads = [
-        road_height(dataset.ego_from(token, LIDAR).apply(each)) for token, each in zip(chosen, clouds, strict=True)
+        road_height(dataset.ego_from(token, LIDAR).apply(each))
+        for token, each in zip(chosen, clouds, strict=True)
     ]
     return SensorSetupFacts(
         name=dataset.dataroot.name,
@@ -163,7 +174,9 @@ def sensor_setup_facts(dataset: Dataset) -> SensorSetupFacts:
         points=round(float(np.median([len(cloud) for cloud in clouds]))) if clouds else None,
         reach=round(float(np.quantile(ranges, 0.99)), 1) if clouds else None,
         road=round(float(np.nanmedian(roads)), 2) if clouds else None,
-        labels_a_second=round(1 / (FRAME_PERIOD * float(np.median(apart))), 1) if len(apart) else 0.0,
+        labels_a_second=round(1 / (FRAME_PERIOD * float(np.median(apart))), 1)
+        if len(apart)
+        else 0.0,
         boxes=round(len(codes) / len(rows), 1),
         shares=dict(zip(_SHARES, counts.round(4).tolist(), strict=True)),
     )
@@ -205,7 +218,11 @@ def _odd(first: SensorSetupFacts, second: SensorSetupFacts) -> Iterator[str]:
         if apart := ", ".join(_apart(one, other)):
             yield f"{one.camera}: {apart}"
     yield from _moved("the LiDAR is {:.1f} m {}", _RISE, second.lidar_above - first.lidar_above)
-    for name, words in (("lanes", "lanes of the LiDAR"), ("points", "points a cloud"), ("reach", "metres of reach")):
+    for name, words in (
+        ("lanes", "lanes of the LiDAR"),
+        ("points", "points a cloud"),
+        ("reach", "metres of reach"),
+    ):
         was, now = getattr(first, name), getattr(second, name)
         if was and now and not 0.8 < now / was < 1.25:
             yield f"{now:,.0f} {words}, not {was:,.0f}"
@@ -221,7 +238,9 @@ def _apart(one: CameraFacts, other: CameraFacts) -> Iterator[str]:
     """Yield what differs between two cameras of one name."""
     larger = other.focal / one.focal
     if abs(larger - 1) > _LARGER:
-        views = f"its field of view is {other.field_of_view:.0f} degrees, not {one.field_of_view:.0f}"
+        views = (
+            f"its field of view is {other.field_of_view:.0f} degrees, not {one.field_of_view:.0f}"
+        )
         yield f"things look {larger:.2g} times as large in it, since {views}"
     yield from _moved("it is {:.1f} m {}", _RISE, other.above - one.above)
     yield from _moved("it looks {:.0f} degrees {}", _TURN, other.pitch - one.pitch)
@@ -232,7 +251,9 @@ def _apart(one: CameraFacts, other: CameraFacts) -> Iterator[str]:
         yield f"its images are {shape:.2f} times as wide as high, not {wanted:.2f}"
 
 
-def _moved(sentence: str, least: float, change: float, sides: tuple[str, str] = ("higher", "lower")) -> Iterator[str]:
+def _moved(
+    sentence: str, least: float, change: float, sides: tuple[str, str] = ("higher", "lower")
+) -> Iterator[str]:
     """Yield a sentence on a change of metres or degrees, with its size and side, unless it is too small to matter."""
     if abs(change) >= least:
         yield sentence.format(abs(change), sides[change < 0])

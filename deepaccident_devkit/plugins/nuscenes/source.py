@@ -23,7 +23,13 @@ import numpy as np
 
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.deepaccident import DeepAccident
-from deepaccident_devkit.errors import ConfigError, DatarootError, MissingExtraError, SensorFileError, shortened
+from deepaccident_devkit.errors import (
+    ConfigError,
+    DatarootError,
+    MissingExtraError,
+    SensorFileError,
+    shortened,
+)
 from deepaccident_devkit.export.frames import KEY_STEP
 from deepaccident_devkit.export.nuscenes.scenes import CHANNEL_NAMES
 from deepaccident_devkit.geometry import SE3, LidarPointCloud
@@ -57,7 +63,9 @@ class _File(TypedDict):
     row: Annotated[int, Number(dtype="int64", doc="row of `sample_data`; ascending")]
     filename: Annotated[str, Word(doc="the file, below the dataroot")]
     token: Annotated[str, Word(doc="nuScenes' token of the sample")]
-    matrix: Annotated[list[list[float]], Vector(shape=(4, 4), doc="`lidar_from_sensor` of the sample's LiDAR")]
+    matrix: Annotated[
+        list[list[float]], Vector(shape=(4, 4), doc="`lidar_from_sensor` of the sample's LiDAR")
+    ]
 
 
 _FILES: Final = TableSpec("files", "Files of keyframes.", record_columns(_File))
@@ -74,7 +82,11 @@ class _KeyframeResolver(Resolver):
     def filename(self, sample_data_row: int) -> str:
         """Return the path of a file below the dataroot; between keyframes a path at which there is no file."""
         place = _place(self._files, sample_data_row)
-        return super().filename(sample_data_row) if place is None else str(self._files["filename"][place])
+        return (
+            super().filename(sample_data_row)
+            if place is None
+            else str(self._files["filename"][place])
+        )
 
 
 def _place(files: Mapping[str, Any], sample_data_row: int) -> int | None:
@@ -113,30 +125,42 @@ class NuScenesRelease(DeepAccident):
         """NuScenes' token of a sample that is a keyframe; raises TokenError, and ConfigError for one that is none."""
         place = _place(self._files, self.getind("sample", sample) * len(CHANNELS) + _LIDAR)
         if place is None:
-            raise ConfigError(f"{sample}: is between two keyframes, of which alone nuScenes has samples")
+            raise ConfigError(
+                f"{sample}: is between two keyframes, of which alone nuScenes has samples"
+            )
         return str(self._files["token"][place])
 
     def sensor_frames(self, scenario: RowArgument) -> dict[tuple[str, str], tuple[int, ...]]:
         """As of `Dataset`: the keyframes, whose files nuScenes' tables name."""
         keyframes = tuple(range(1, len(self._samples(scenario)) + 1, KEY_STEP))
-        return {(AGENT, channel): keyframes if channel in CHANNEL_NAMES else () for channel in CHANNELS}
+        return {
+            (AGENT, channel): keyframes if channel in CHANNEL_NAMES else () for channel in CHANNELS
+        }
 
     def truth_hashes(self, scenario: str) -> ScenarioHashes:
         """Hashes of a scenario's boxes, in place of label files, and of its poses."""
         rows, boxes = self._samples(scenario), self.columns("annotation")
         own = slice(*boxes["sample_row"].searchsorted((rows.start, rows.stop)))
-        label = [boxes[name][own].tolist() for name in ("actor_id", "category", "translation", "size", "yaw")]
+        label = [
+            boxes[name][own].tolist()
+            for name in ("actor_id", "category", "translation", "size", "yaw")
+        ]
         calib = self.columns("ego_pose")["matrix"][rows.start : rows.stop].tolist()
         return ScenarioHashes(label=digest_of(label), meta=None, calib=digest_of(calib))
 
     def _lidar_cloud(self, row: int) -> LidarPointCloud:
         """As of `Dataset`. Intensities beyond 1 are nuScenes', from 0 to 255, and become those from 0 to 1."""
-        path, place = self._channel_path(row, LIDAR), _place(self._files, row * len(CHANNELS) + _LIDAR)
+        path, place = (
+            self._channel_path(row, LIDAR),
+            _place(self._files, row * len(CHANNELS) + _LIDAR),
+        )
         if place is None:
             return super()._lidar_cloud(row)  # which says that there is no file
         content = np.frombuffer(read_bytes(path, "lidar"), dtype="<f4")
         if len(content) % 5:
-            raise SensorFileError(f"{path}: expected points of five numbers each, found {len(content)} numbers")
+            raise SensorFileError(
+                f"{path}: expected points of five numbers each, found {len(content)} numbers"
+            )
         points = content.reshape(-1, 5)
         intensity = points[:, 3] / (255 if points[:, 3].max(initial=0) > 1 else 1)
         cloud = LidarPointCloud(points[:, :3].astype(np.float64), intensity, "lidar")
@@ -148,7 +172,9 @@ class NuScenesRelease(DeepAccident):
         return range(*self.columns("sample")["scenario_row"].searchsorted((row, row + 1)).tolist())
 
 
-def open_nuscenes(dataroot: str | os.PathLike[str], index_dir: Path | None = None) -> NuScenesRelease:
+def open_nuscenes(
+    dataroot: str | os.PathLike[str], index_dir: Path | None = None
+) -> NuScenesRelease:
     """Open a nuScenes dataroot as a release, and make its tables where they are not kept yet.
 
     Args:
@@ -164,7 +190,9 @@ def open_nuscenes(dataroot: str | os.PathLike[str], index_dir: Path | None = Non
     """
     tables = nuscenes_tables(path_of(dataroot))
     if tables is None:
-        raise DatarootError(f"{dataroot}: has no tables of nuScenes, such as v1.0-mini/{NUSCENES_TABLE}")
+        raise DatarootError(
+            f"{dataroot}: has no tables of nuScenes, such as v1.0-mini/{NUSCENES_TABLE}"
+        )
     folder = _kept_in(tables, index_dir)
     try:
         if not folder.is_dir():
@@ -187,8 +215,12 @@ def _kept_in(tables: Path, index_dir: Path | None) -> Path:
     for path in sorted(tables.glob("*.json")):
         state = path.lstat()
         key.update(repr((path.name, state.st_size, state.st_mtime_ns, state.st_ctime_ns)).encode())
-    places = [place / tables.name / key.hexdigest() for place in index_places(tables.parent, index_dir)]
-    return next((each for each in places if each.is_dir() or is_writable_folder(each.parent)), places[-1])
+    places = [
+        place / tables.name / key.hexdigest() for place in index_places(tables.parent, index_dir)
+    ]
+    return next(
+        (each for each in places if each.is_dir() or is_writable_folder(each.parent)), places[-1]
+    )
 
 
 def _write(folder: Path, made: Path) -> None:
@@ -215,7 +247,9 @@ def _write(folder: Path, made: Path) -> None:
         join_tables(made / boxes, paths, [*split_of.values()])
         for path in paths:
             path.unlink()
-    write_table(made, _FILES, dict(zip(_File.__annotations__, zip(*files, strict=True), strict=True)))
+    write_table(
+        made, _FILES, dict(zip(_File.__annotations__, zip(*files, strict=True), strict=True))
+    )
 
 
 def _splits(folder: Path) -> dict[str, str]:
@@ -229,7 +263,9 @@ def _splits(folder: Path) -> dict[str, str]:
         for scene in named.get(f"{prefix}{split}", ()):
             other = splits.setdefault(scene, split)
             if other != split:
-                raise DatarootError(f"{listed}: {shortened(scene)} is in {other} and in {split}; remove it from one")
+                raise DatarootError(
+                    f"{listed}: {shortened(scene)} is in {other} and in {split}; remove it from one"
+                )
     return splits
 
 

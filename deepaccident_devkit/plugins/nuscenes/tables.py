@@ -33,7 +33,9 @@ _FIELD_TYPES: Final[Mapping[str, Any]] = {
     "size": tuple[_LENGTH, _LENGTH, _LENGTH],
     "camera_intrinsic": Annotated[list[_VECTOR], Meta(max_length=3)],
     "is_key_frame": bool,
-    "filename": Annotated[str, Meta(pattern=r"(?s)\A(?!/)(?!(.*/)?\.\.(/|\Z))[^\x00]+\Z", max_length=4096)],
+    "filename": Annotated[
+        str, Meta(pattern=r"(?s)\A(?!/)(?!(.*/)?\.\.(/|\Z))[^\x00]+\Z", max_length=4096)
+    ],
     "width": _PIXELS,
     "height": _PIXELS,
     "num_lidar_pts": Annotated[int, Meta(ge=0, le=1 << 31)],
@@ -56,7 +58,11 @@ _FIELDS: Final = {
     "sample_annotation": "sample_token instance_token visibility_token translation rotation size num_lidar_pts",
 }
 # Table → the field that says to what its rows belong.
-_OWNERS: Final = {"sample": "scene_token", "sample_data": "sample_token", "sample_annotation": "sample_token"}
+_OWNERS: Final = {
+    "sample": "scene_token",
+    "sample_data": "sample_token",
+    "sample_annotation": "sample_token",
+}
 
 
 class NuScenesTables:
@@ -96,7 +102,9 @@ class NuScenesTables:
 
     def _read(self, table: str, fields: list[str]) -> dict[str, Any]:
         """Return the rows of a table by their tokens."""
-        kind = msgspec.defstruct(table, [(field, _FIELD_TYPES.get(field, str)) for field in ("token", *fields)])
+        kind = msgspec.defstruct(
+            table, [(field, _FIELD_TYPES.get(field, str)) for field in ("token", *fields)]
+        )
         rows = read_table(self.folder / f"{table}.json", list[kind])  # type: ignore[valid-type]
         by_token = {row.token: row for row in rows}
         if len(by_token) < len(rows):
@@ -111,7 +119,11 @@ def read_table(path: Path, kind: Any) -> Any:
         content = read_bytes(path, "tables")
         try:
             return msgspec.json.decode(content, type=kind)
-        except (msgspec.DecodeError, RecursionError, UnicodeDecodeError):  # NaN, too, which Python writes
+        except (
+            msgspec.DecodeError,
+            RecursionError,
+            UnicodeDecodeError,
+        ):  # NaN, too, which Python writes
             return as_record(parsed_json(content, constants=True), kind)
     except (OSError, ValueError) as error:
         raise DatarootError(f"{path}: {fault_text(error)}; {NUSCENES_REMEDY}") from error

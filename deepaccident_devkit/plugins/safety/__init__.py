@@ -15,8 +15,19 @@ from deepaccident_devkit.plugins.safety.lead_times import (
     lead_time_ledger,
     lead_times,
 )
-from deepaccident_devkit.plugins.safety.report import AccidentRow, PairMeasures, SafetyReport, safety_report
-from deepaccident_devkit.plugins.safety.twins import Parting, TwinDiff, TwinReport, twin_diff, twin_report
+from deepaccident_devkit.plugins.safety.report import (
+    AccidentRow,
+    PairMeasures,
+    SafetyReport,
+    safety_report,
+)
+from deepaccident_devkit.plugins.safety.twins import (
+    Parting,
+    TwinDiff,
+    TwinReport,
+    twin_diff,
+    twin_report,
+)
 
 __all__ = [
     "COALITIONS",

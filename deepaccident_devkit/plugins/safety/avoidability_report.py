@@ -26,7 +26,12 @@ from deepaccident_devkit.collisions.recorded import (
     those_of,
 )
 from deepaccident_devkit.dataset import Dataset, RowArgument
-from deepaccident_devkit.descriptions.avoidability import BRAKERS, Avoidability, avoidability_of, unusable
+from deepaccident_devkit.descriptions.avoidability import (
+    BRAKERS,
+    Avoidability,
+    avoidability_of,
+    unusable,
+)
 from deepaccident_devkit.support.arrays import FloatArray, FrozenArrays, IntArray, as_floats
 from deepaccident_devkit.support.reports import Report, Row
 from deepaccident_devkit.support.text import columns_text
@@ -111,7 +116,9 @@ def outcome_shares(accidents: Sequence[Avoidability]) -> list[OutcomeShares]:
     return [_shares(group, warned, those) for (group, warned), those in told.items() if those]
 
 
-def _shares(group: str, warned: str, told: Sequence[tuple[Avoidability, Outcomes]]) -> OutcomeShares:
+def _shares(
+    group: str, warned: str, told: Sequence[tuple[Avoidability, Outcomes]]
+) -> OutcomeShares:
     brakings = told[0][0].brakings
     longest = max(len(outcomes.outcome) for _, outcomes in told)
     sums = np.zeros((longest, len(brakings), len(OUTCOMES) + 5))
@@ -121,7 +128,9 @@ def _shares(group: str, warned: str, told: Sequence[tuple[Avoidability, Outcomes
         accidents[rows] += 1
         sums[rows] += _figures(accident, outcomes)
     means = sums / accidents[:, None, None]
-    shares, extrapolated, relative, delta_v = np.split(means, np.cumsum([len(OUTCOMES), 1, 1]), axis=2)
+    shares, extrapolated, relative, delta_v = np.split(
+        means, np.cumsum([len(OUTCOMES), 1, 1]), axis=2
+    )
     return OutcomeShares(
         group=group,
         warned=warned,
@@ -140,7 +149,9 @@ def _figures(accident: Avoidability, outcomes: Outcomes) -> FloatArray:
     relative = outcomes.delta_v.sum(axis=-1)  # the shares of the two add up to 1
     ranges = delta_v_ranges(accident.accident.masses, relative).max(axis=-2)
     classes = outcomes.outcome[..., None] == np.arange(len(OUTCOMES))
-    return np.dstack([classes, outcomes.extrapolated, relative, outcomes.delta_v.max(axis=-1), ranges])
+    return np.dstack(
+        [classes, outcomes.extrapolated, relative, outcomes.delta_v.max(axis=-1), ranges]
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -176,7 +187,9 @@ class AvoidabilityReport(Report):
             "dropped": {each.scenario: each.reason for each in self.dropped},
             "skipped": {each.scenario: each.reason for each in self.skipped},
             "margins": dict(self.margins),
-            "accidents": [{"group": group_of(each), **each.to_dict(warnings=False)} for each in self.accidents],
+            "accidents": [
+                {"group": group_of(each), **each.to_dict(warnings=False)} for each in self.accidents
+            ],
         }
 
     def named_tables(self) -> dict[str, Iterable[Row]]:
@@ -191,7 +204,10 @@ class AvoidabilityReport(Report):
 
     def to_text(self) -> str:
         """Some aligned blocks for a terminal."""
-        left_out = {"dropped, as the two are too far apart at the end": self.dropped, "skipped": self.skipped}
+        left_out = {
+            "dropped, as the two are too far apart at the end": self.dropped,
+            "skipped": self.skipped,
+        }
         counts = [
             f"{len(self.accidents)} accidents",
             *(f"{len(each)} {word}" for word, each in left_out.items() if each),
@@ -224,14 +240,21 @@ class AvoidabilityReport(Report):
         heading = ["brakes", "m/s²", "avoidable", "hit only after the end"]
         rows = [heading + [f"reaction {each:g} s" for each in reactions]]
         slack = np.stack([each.slack for each in members])
-        extrapolated = np.stack([each.last_moments.extrapolated for each in members]).reshape(slack.shape)
+        extrapolated = np.stack([each.last_moments.extrapolated for each in members]).reshape(
+            slack.shape
+        )
         for row, brakers in enumerate(BRAKERS):
             for column, deceleration in enumerate(members[0].decelerations.tolist()):
                 needed = np.sort(slack[:, row, column])  # those that nothing avoids are last
                 places = [int(np.ceil(share * len(needed))) - 1 for share in _SHARES]
                 counts = (np.isfinite(needed).sum(), extrapolated[:, row, column].sum())
-                cells = [" / ".join(_seconds_text(needed[place] + each) for place in places) for each in reactions]
-                rows.append([brakers, f"{deceleration:g}", *(str(count) for count in counts), *cells])
+                cells = [
+                    " / ".join(_seconds_text(needed[place] + each) for place in places)
+                    for each in reactions
+                ]
+                rows.append(
+                    [brakers, f"{deceleration:g}", *(str(count) for count in counts), *cells]
+                )
         meant = " and ".join(f"{share:.0%}" for share in _SHARES)
         return (
             f"{group}: {len(members)} accidents; seconds of warning that {meant} of them need\n{columns_text(rows)}\n"
@@ -251,13 +274,31 @@ class AvoidabilityReport(Report):
         )
 
     def _last_moment_rows(self) -> Iterator[Row]:
-        names = ("brakers", "deceleration", "avoidable", "last_moment", "slack", "switches", "extrapolated")
+        names = (
+            "brakers",
+            "deceleration",
+            "avoidable",
+            "last_moment",
+            "slack",
+            "switches",
+            "extrapolated",
+        )
         yield ("scenario", "group", "first_id", "first", "second_id", "second", *names, "secondary")
         for each in self.accidents:
             accident = each.accident
-            who = [value for pair in zip(accident.actor_ids, accident.categories, strict=True) for value in pair]
+            who = [
+                value
+                for pair in zip(accident.actor_ids, accident.categories, strict=True)
+                for value in pair
+            ]
             for row in each.last_moment_rows():
-                yield (accident.scenario, group_of(each), *who, *map(row.get, names), len(row["secondary"]))
+                yield (
+                    accident.scenario,
+                    group_of(each),
+                    *who,
+                    *map(row.get, names),
+                    len(row["secondary"]),
+                )
 
     def _secondary_rows(self) -> Iterator[Row]:
         names = ("actor_id", "other_id", "category", "time", "extrapolated")
@@ -265,7 +306,12 @@ class AvoidabilityReport(Report):
         for each in self.accidents:
             for row in each.last_moment_rows():
                 for contact in row["secondary"]:
-                    yield (each.accident.scenario, row["brakers"], row["deceleration"], *map(contact.get, names))
+                    yield (
+                        each.accident.scenario,
+                        row["brakers"],
+                        row["deceleration"],
+                        *map(contact.get, names),
+                    )
 
     def _share_rows(self) -> Iterator[Row]:
         yield (
@@ -279,8 +325,18 @@ class AvoidabilityReport(Report):
                         *(*each.shares[row, column], each.extrapolated[row, column]),
                         *(each.relative_speed[row, column], *each.delta_v[row, column]),
                     )
-                    key = (each.group, each.warned, braking.reaction, braking.deceleration, round(lead, 1))
-                    yield (*key, int(each.accidents[row]), *(round(float(value), 6) for value in values))
+                    key = (
+                        each.group,
+                        each.warned,
+                        braking.reaction,
+                        braking.deceleration,
+                        round(lead, 1),
+                    )
+                    yield (
+                        *key,
+                        int(each.accidents[row]),
+                        *(round(float(value), 6) for value in values),
+                    )
 
     def _check_rows(self) -> Iterator[Row]:
         sides = ("first", "second")
@@ -292,7 +348,12 @@ class AvoidabilityReport(Report):
             told = each.to_dict(warnings=False)["recorded"]
             changes = zip(told["delta_v"], told["delta_v_ranges"], strict=True)
             delta_v = [value for change, both in changes for value in (change, *both)]
-            key = (each.accident.scenario, told["margin"], told["time"], round(each.accident.duration, 1))
+            key = (
+                each.accident.scenario,
+                told["margin"],
+                told["time"],
+                round(each.accident.duration, 1),
+            )
             yield (*key, *told["speeds"], *delta_v)
 
     def _left_out_rows(self) -> Iterator[Row]:
@@ -322,7 +383,9 @@ def looked_into(dataset: Dataset, scenario: ScenarioRecord) -> Avoidability | Dr
         return None
     check = undisturbed(accident)
     if not check.usable:
-        return Dropped(Skipped(scenario=accident.scenario, reason=unusable(accident, check)), check.margin)
+        return Dropped(
+            Skipped(scenario=accident.scenario, reason=unusable(accident, check)), check.margin
+        )
     return avoidability_of(accident, scenario_tracks(dataset, scenario))
 
 
@@ -342,10 +405,14 @@ def avoidability_report(
         TokenError: no such scenario.
     """
     work: Callable[[Dataset, Any], Avoidability | Dropped | None] = looked_into
-    return report_of(dataset, each_scenario(work, dataset, scenarios, label="replaying", at_once=1, **how))
+    return report_of(
+        dataset, each_scenario(work, dataset, scenarios, label="replaying", at_once=1, **how)
+    )
 
 
-def report_of(dataset: Dataset, found: Sequence[Avoidability | Dropped | Skipped | None]) -> AvoidabilityReport:
+def report_of(
+    dataset: Dataset, found: Sequence[Avoidability | Dropped | Skipped | None]
+) -> AvoidabilityReport:
     """The report of what `looked_into` gave for scenarios, in their order."""
     accidents, dropped = those_of(Avoidability, found), those_of(Dropped, found)
     return AvoidabilityReport(
@@ -364,7 +431,10 @@ def report_of(dataset: Dataset, found: Sequence[Avoidability | Dropped | Skipped
 def _secondary_text(accidents: Sequence[Avoidability]) -> str:
     """In how many replays of braking at the last moment another actor is touched."""
     touched = [{each.replay for each in accident.secondary} for accident in accidents]
-    before = [{each.replay for each in accident.secondary if not each.extrapolated} for accident in accidents]
+    before = [
+        {each.replay for each in accident.secondary if not each.extrapolated}
+        for accident in accidents
+    ]
     replays = sum(int(np.isfinite(accident.last_moments.time).sum()) for accident in accidents)
     return (
         f"other road users, who do not react, are touched in {sum(map(len, before))} of {replays} replays of the last "

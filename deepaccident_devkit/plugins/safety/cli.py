@@ -20,7 +20,12 @@ from deepaccident_devkit.cli.options import (
 from deepaccident_devkit.cli.verbs import WordChoice, field_option, verb
 from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.descriptions import ObservationRule, stories
-from deepaccident_devkit.plugins.safety import avoidability_report, lead_time_ledger, safety_report, twin_report
+from deepaccident_devkit.plugins.safety import (
+    avoidability_report,
+    lead_time_ledger,
+    safety_report,
+    twin_report,
+)
 from deepaccident_devkit.plugins.safety.avoidability_report import ACCIDENT_GROUPS
 from deepaccident_devkit.plugins.safety.figures import (
     AVOIDABILITY_SIZE,
@@ -46,24 +51,36 @@ def _replay_count(context: click.Context, parameter: click.Parameter, value: str
     if word == "all":
         return None
     if word != "none" and not word.isdecimal():
-        raise click.BadParameter(f"expected a number, all or none, found {value!r}", context, parameter)
+        raise click.BadParameter(
+            f"expected a number, all or none, found {value!r}", context, parameter
+        )
     return 0 if word == "none" else int(word)
 
 
-def _picture(render: Callable[..., Any], size: tuple[float, float], *what: Any) -> Callable[[Path], Path]:
+def _picture(
+    render: Callable[..., Any], size: tuple[float, float], *what: Any
+) -> Callable[[Path], Path]:
     """What renders a figure of this size into a file."""
-    return lambda path: write_report_figure(render(*what, fig=report_figure(size, column=COLUMN_HEIGHT)), path)
+    return lambda path: write_report_figure(
+        render(*what, fig=report_figure(size, column=COLUMN_HEIGHT)), path
+    )
 
 
-def _lead_time(dataset: DeepAccident, chosen: _Scenarios, *, kind: Any, **engine: Any) -> tuple[Any, Files]:
+def _lead_time(
+    dataset: DeepAccident, chosen: _Scenarios, *, kind: Any, **engine: Any
+) -> tuple[Any, Files]:
     ledger = lead_time_ledger(dataset, chosen, ObservationRule(kind=kind), **engine)
-    return ledger, {"lead_times.png": _picture(render_lead_times, LEAD_TIME_SIZE, ledger)} if ledger.accidents else {}
+    return ledger, {
+        "lead_times.png": _picture(render_lead_times, LEAD_TIME_SIZE, ledger)
+    } if ledger.accidents else {}
 
 
 def _avoidability(dataset: DeepAccident, chosen: _Scenarios, **engine: Any) -> tuple[Any, Files]:
     report = avoidability_report(dataset, chosen, **engine)
     return report, {
-        f"avoidability_{group.replace('-', '_')}.png": _picture(render_avoidability, AVOIDABILITY_SIZE, report, group)
+        f"avoidability_{group.replace('-', '_')}.png": _picture(
+            render_avoidability, AVOIDABILITY_SIZE, report, group
+        )
         for group in ACCIDENT_GROUPS
         if report.members(group)
     }
@@ -119,7 +136,9 @@ _OF_TOPIC: Final = {
 )
 @figure_style_parameter
 @json_parameter
-def safety(topic: str, where: tuple[str, ...], out: str | None, as_json: bool, **options: Any) -> None:
+def safety(
+    topic: str, where: tuple[str, ...], out: str | None, as_json: bool, **options: Any
+) -> None:
     """Look into the accidents in DATAROOT. TOPIC says what is asked of them:
 
     \b
@@ -141,7 +160,9 @@ def safety(topic: str, where: tuple[str, ...], out: str | None, as_json: bool, *
     if topic == "report" and out is None:
         raise click.UsageError("Missing option '--out': the folder of the page.")
     if topic == "describe" and out is not None and Path(out).is_dir():
-        raise click.BadParameter(f"--out: {out} is a folder; give a file, such as {out}/stories.jsonl")
+        raise click.BadParameter(
+            f"--out: {out} is a folder; give a file, such as {out}/stories.jsonl"
+        )
     target = None if out is None else Path(out) if topic == "describe" else writable_folder(out)
     dataset, engine = DeepAccident(**options), engine_of(options)
     chosen = dataset.find(*where) if where else None
@@ -154,12 +175,16 @@ def safety(topic: str, where: tuple[str, ...], out: str | None, as_json: bool, *
             written += [write(target / file) for file, write in files.items()]
         say_report(report, written, target, as_json=as_json)
     elif topic == "describe":
-        _describe(dataset, chosen if scenario is None else [scenario], target, as_json=as_json, **engine)
+        _describe(
+            dataset, chosen if scenario is None else [scenario], target, as_json=as_json, **engine
+        )
     elif target is not None:
         _report(dataset, chosen, target, replays, **engine)
 
 
-def _describe(dataset: DeepAccident, chosen: _Scenarios, out: Path | None, *, as_json: bool, **engine: Any) -> None:
+def _describe(
+    dataset: DeepAccident, chosen: _Scenarios, out: Path | None, *, as_json: bool, **engine: Any
+) -> None:
     told = stories(dataset, chosen, **engine)
     lines = [json.dumps({**each.facts, "text": each.text}, allow_nan=False) for each in told]
     if out is not None:
@@ -172,11 +197,25 @@ def _describe(dataset: DeepAccident, chosen: _Scenarios, out: Path | None, *, as
         click.echo(f"written: {counted(len(lines), 'scenario')} in {out}", err=as_json)
 
 
-def _report(dataset: DeepAccident, chosen: _Scenarios, folder: Path, replays: int | None, **engine: Any) -> None:
+def _report(
+    dataset: DeepAccident, chosen: _Scenarios, folder: Path, replays: int | None, **engine: Any
+) -> None:
     if chosen is not None and not chosen:
-        raise click.UsageError("no scenario matches --where, so there is nothing to write; change it")
+        raise click.UsageError(
+            "no scenario matches --where, so there is nothing to write; change it"
+        )
     found = safety_report(dataset, chosen, progress=True, **engine)
-    written = save_safety_report(found, folder, dataset=dataset, replays=replays, progress=True, **engine)
-    left_out = f"; {len(found.left_out)} reasons for what is left out are in the page" if found.left_out else ""
-    click.echo(f"{counted(len(found.rows), 'accident')} of {counted(found.scenarios, 'scenario')}{left_out}")
-    click.echo(f"written: {counted(len(written), 'file')} in {folder}; open {written[-1]} in a browser")
+    written = save_safety_report(
+        found, folder, dataset=dataset, replays=replays, progress=True, **engine
+    )
+    left_out = (
+        f"; {len(found.left_out)} reasons for what is left out are in the page"
+        if found.left_out
+        else ""
+    )
+    click.echo(
+        f"{counted(len(found.rows), 'accident')} of {counted(found.scenarios, 'scenario')}{left_out}"
+    )
+    click.echo(
+        f"written: {counted(len(written), 'file')} in {folder}; open {written[-1]} in a browser"
+    )

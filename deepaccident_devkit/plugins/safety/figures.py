@@ -88,15 +88,23 @@ def render_avoidability(
     group = choice("group", group, ACCIDENT_GROUPS)
     shares = [each for each in report.shares if each.group == group]
     if not shares:
-        raise NotAvailableError(f"{report.dataroot}: no accident of the group {group!r}, so nothing to render")
+        raise NotAvailableError(
+            f"{report.dataroot}: no accident of the group {group!r}, so nothing to render"
+        )
     fig = figure_or_new(fig, AVOIDABILITY_SIZE, column=COLUMN_HEIGHT)
     rows = list(_ROWS.items())
     if current_style().room == "column":
         rows, shares = rows[:1], [each for each in shares if each.warned == "both"]
     panels = fig.subplots(len(rows), len(shares), squeeze=False, sharex="col", sharey=True)
     for row, (label, values_of) in enumerate(rows):
-        drawn = [_draw(ax, each, values_of(each)) for ax, each in zip(panels[row], shares, strict=True)]
-        highest = 1.0 if row == 0 else max(1.0, *(float(np.nanmax(np.asarray(image.get_array()))) for image in drawn))
+        drawn = [
+            _draw(ax, each, values_of(each)) for ax, each in zip(panels[row], shares, strict=True)
+        ]
+        highest = (
+            1.0
+            if row == 0
+            else max(1.0, *(float(np.nanmax(np.asarray(image.get_array()))) for image in drawn))
+        )
         for image in drawn:
             image.set(clim=(0, highest), cmap=_BETTER if row == 0 else f"{_BETTER}_r")
         fig.colorbar(drawn[-1], ax=list(panels[row]), label=label, pad=0.01)
@@ -114,9 +122,14 @@ def _draw(ax: Axes, shares: OutcomeShares, values: FloatArray) -> AxesImage:
     enough = (2 * shares.accidents >= shares.accidents.max()) & (shares.leads <= _LONGEST + 1e-9)
     step, rows = float(shares.leads[1]) if len(shares.leads) > 1 else 1.0, len(shares.brakings)
     sides = shares.leads[0] - step / 2, shares.leads[enough].max(initial=0.0) + step / 2
-    ax.set_yticks(range(rows), [f"{each.reaction:g} s, {each.deceleration:g} m/s²" for each in shares.brakings])
+    ax.set_yticks(
+        range(rows),
+        [f"{each.reaction:g} s, {each.deceleration:g} m/s²" for each in shares.brakings],
+    )
     ax.tick_params(labelsize=text_size())
-    return ax.imshow(values[enough].T, aspect="auto", extent=(*sides, rows - 0.5, -0.5), interpolation="nearest")
+    return ax.imshow(
+        values[enough].T, aspect="auto", extent=(*sides, rows - 0.5, -0.5), interpolation="nearest"
+    )
 
 
 @in_own_settings
@@ -138,7 +151,9 @@ def render_lead_times(ledger: LeadTimeLedger, *, fig: Figure | None = None) -> F
         NotAvailableError: the ledger has no accident.
     """
     if not ledger.accidents:
-        raise NotAvailableError(f"{ledger.dataroot}: no accident whose lead times can be told, so nothing to render")
+        raise NotAvailableError(
+            f"{ledger.dataroot}: no accident whose lead times can be told, so nothing to render"
+        )
     column = current_style().room == "column"
     fig = figure_or_new(fig, LEAD_TIME_SIZE, column=COLUMN_HEIGHT)
     ratios = (1.2, 3) if column else (1.2, 4, 3)
@@ -149,14 +164,18 @@ def render_lead_times(ledger: LeadTimeLedger, *, fig: Figure | None = None) -> F
     for ax in shapley:
         _draw_shapley(ax, ledger.mean_shapley)
     set_title(fig, f"{len(ledger.accidents)} accidents; observed: {ledger.rule.text}")
-    fig.supxlabel(CAVEAT.replace("; ", ";\n") if column else CAVEAT, fontsize=text_size(), color=MUTED_COLOR)
+    fig.supxlabel(
+        CAVEAT.replace("; ", ";\n") if column else CAVEAT, fontsize=text_size(), color=MUTED_COLOR
+    )
     return fig
 
 
 def _best_sets(means: Sequence[MeanTime]) -> list[int]:
     """The numbers of the sets of one and two agents, and of the best of each larger size."""
     sizes = range(3, 1 + len(AGENTS))
-    of_size = [[number for number, names in enumerate(COALITIONS) if len(names) == size] for size in sizes]
+    of_size = [
+        [number for number, names in enumerate(COALITIONS) if len(names) == size] for size in sizes
+    ]
     best = [max(numbers, key=lambda number: means[number].mean or 0.0) for numbers in of_size]
     small = [(len(names), number) for number, names in enumerate(COALITIONS) if len(names) < 3]
     return [*(number for _, number in sorted(small)), *best]
@@ -167,10 +186,19 @@ def _draw_members(ax: Axes, order: Sequence[int]) -> None:
     for row, number in enumerate(order):
         for column, agent in enumerate(AGENTS):
             ax.plot(
-                column, row, "o", color=AGENT_COLORS[agent] if agent in COALITIONS[number] else "none", markersize=_DOT
+                column,
+                row,
+                "o",
+                color=AGENT_COLORS[agent] if agent in COALITIONS[number] else "none",
+                markersize=_DOT,
             )
     ax.set(xlim=(-0.6, len(AGENTS) - 0.4), ylim=(len(order) - 0.4, -0.6), yticks=[])
-    ax.set_xticks(range(len(AGENTS)), [short_name(agent) for agent in AGENTS], rotation=90, fontsize=text_size())
+    ax.set_xticks(
+        range(len(AGENTS)),
+        [short_name(agent) for agent in AGENTS],
+        rotation=90,
+        fontsize=text_size(),
+    )
     set_title(ax, "set of agents", fontsize=text_size())
     ax.spines[:].set_visible(False)
     ax.tick_params(length=0)
@@ -185,7 +213,10 @@ def _draw_leads(ax: Axes, means: Sequence[MeanTime]) -> None:
 def _draw_shapley(ax: Axes, means: Sequence[MeanTime]) -> None:
     _draw_means(ax, means, [AGENT_COLORS[agent] for agent in PARTNERS])
     total = sum(mean.mean or 0.0 for mean in means)
-    words = [short_name(agent) + _share_text(mean.mean, total) for agent, mean in zip(PARTNERS, means, strict=True)]
+    words = [
+        short_name(agent) + _share_text(mean.mean, total)
+        for agent, mean in zip(PARTNERS, means, strict=True)
+    ]
     ax.set_yticks(range(len(words)), words, fontsize=text_size())
     ax.set(xlabel="mean Shapley value (s) →")
     set_title(ax, "what each partner adds to the ego", fontsize=text_size())
@@ -195,7 +226,14 @@ def _draw_means(ax: Axes, means: Sequence[MeanTime], colors: Sequence[str]) -> N
     """A dot for each mean, the first on top, with its interval; nothing where there is no mean."""
     for row, (each, color) in enumerate(zip(means, colors, strict=True)):
         if each.low is not None and each.high is not None:
-            ax.plot([each.low, each.high], [row, row], color=color, linewidth=1.4, marker="|", markersize=_DOT)
+            ax.plot(
+                [each.low, each.high],
+                [row, row],
+                color=color,
+                linewidth=1.4,
+                marker="|",
+                markersize=_DOT,
+            )
         if each.mean is not None:
             ax.plot(each.mean, row, "o", color=color, markersize=_DOT)
     ax.set(ylim=(len(means) - 0.4, -0.6), xlim=(0, None))

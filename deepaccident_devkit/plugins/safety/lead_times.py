@@ -64,7 +64,8 @@ _OF_ACCIDENT: Final = (
 
 _MEMBERS: Final = coalition_members(len(PARTNERS))
 COALITIONS: Final[tuple[tuple[AgentName, ...], ...]] = tuple(
-    (_EGO, *(name for name, joins in zip(PARTNERS, row, strict=True) if joins)) for row in _MEMBERS.tolist()
+    (_EGO, *(name for name, joins in zip(PARTNERS, row, strict=True) if joins))
+    for row in _MEMBERS.tolist()
 )
 """The sixteen sets of agents with the ego; partner i belongs to those whose number has bit i."""
 # Numbers of the sets of the ego and one partner.
@@ -168,10 +169,14 @@ class LeadTimes(FrozenArrays):
 
     @property
     def _everyone(self) -> int:
-        return sum(bit for bit, name in zip(_ALONE, PARTNERS, strict=True) if name not in self.missing)
+        return sum(
+            bit for bit, name in zip(_ALONE, PARTNERS, strict=True) if name not in self.missing
+        )
 
 
-def lead_times(dataset: Dataset, scenario: RowArgument, rule: ObservationRule | None = None) -> LeadTimes | None:
+def lead_times(
+    dataset: Dataset, scenario: RowArgument, rule: ObservationRule | None = None
+) -> LeadTimes | None:
     """When each set of agents with `ego_vehicle` first observes both colliders of an accident.
 
     Args:
@@ -192,7 +197,9 @@ def lead_times(dataset: Dataset, scenario: RowArgument, rule: ObservationRule | 
     rule = rule or ObservationRule()
     there, observed = observed_actors(dataset, accident.scenario, accident.actor_ids, rule)
     if _EGO not in there:
-        raise NotAvailableError(f"{accident.scenario}: has no labels of {_EGO}, whose lead time is asked; unpack them")
+        raise NotAvailableError(
+            f"{accident.scenario}: has no labels of {_EGO}, whose lead time is asked; unpack them"
+        )
     first, leads, shapley = _whole_ledger(observed, there[1:])
     return LeadTimes(
         scenario=accident.scenario,
@@ -209,13 +216,18 @@ def lead_times(dataset: Dataset, scenario: RowArgument, rule: ObservationRule | 
     )
 
 
-def _whole_ledger(observed: BoolArray, partners: tuple[AgentName, ...]) -> tuple[IntArray, FloatArray, FloatArray]:
+def _whole_ledger(
+    observed: BoolArray, partners: tuple[AgentName, ...]
+) -> tuple[IntArray, FloatArray, FloatArray]:
     """First frames (16,), leads (16,) and Shapley values (4,), of which those of missing partners are not known."""
     places = np.array([PARTNERS.index(name) for name in partners], dtype=np.int64)
     numbers = coalition_members(len(partners)) @ (1 << places)
     first = first_together(observed)
     leads = leads_from(first, observed.shape[-1])
-    every_frame, every_lead = np.zeros(len(COALITIONS), dtype=np.int64), np.full(len(COALITIONS), np.nan)
+    every_frame, every_lead = (
+        np.zeros(len(COALITIONS), dtype=np.int64),
+        np.full(len(COALITIONS), np.nan),
+    )
     every_frame[numbers], every_lead[numbers] = first + 1, leads
     shapley = np.full(len(PARTNERS), np.nan)
     shapley[places] = shapley_values(leads)
@@ -243,7 +255,9 @@ class MeanTime:
         """Such as `1.52 [1.20, 1.86]`."""
         if self.mean is None:
             return "–"
-        return f"{self.mean:.2f}" + ("" if self.low is None else f" [{self.low:.2f}, {self.high:.2f}]")
+        return f"{self.mean:.2f}" + (
+            "" if self.low is None else f" [{self.low:.2f}, {self.high:.2f}]"
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -269,22 +283,30 @@ class LeadTimeLedger(Report):
     @cached_property
     def mean_leads(self) -> tuple[MeanTime, ...]:
         """Of each of `COALITIONS`, the mean lead time; accidents without one of its agents do not count."""
-        return mean_times(np.array([each.leads for each in self.accidents]).reshape(-1, len(COALITIONS)))
+        return mean_times(
+            np.array([each.leads for each in self.accidents]).reshape(-1, len(COALITIONS))
+        )
 
     @cached_property
     def mean_gains(self) -> tuple[MeanTime, ...]:
         """Of each of `PARTNERS`, the mean of what it adds to the ego alone."""
-        return mean_times(np.array([each.gains for each in self.accidents]).reshape(-1, len(PARTNERS)))
+        return mean_times(
+            np.array([each.gains for each in self.accidents]).reshape(-1, len(PARTNERS))
+        )
 
     @cached_property
     def mean_losses(self) -> tuple[MeanTime, ...]:
         """Of each of `PARTNERS`, the mean of what all agents lose without it."""
-        return mean_times(np.array([each.losses for each in self.accidents]).reshape(-1, len(PARTNERS)))
+        return mean_times(
+            np.array([each.losses for each in self.accidents]).reshape(-1, len(PARTNERS))
+        )
 
     @cached_property
     def mean_shapley(self) -> tuple[MeanTime, ...]:
         """Of each of `PARTNERS`, its mean Shapley value."""
-        return mean_times(np.array([each.shapley for each in self.accidents]).reshape(-1, len(PARTNERS)))
+        return mean_times(
+            np.array([each.shapley for each in self.accidents]).reshape(-1, len(PARTNERS))
+        )
 
     @property
     def mean_together(self) -> MeanTime:
@@ -335,7 +357,10 @@ class LeadTimeLedger(Report):
 
     def named_tables(self) -> dict[str, Iterable[Row]]:
         """`lead_times`, a row an accident, seconds with all their digits; and `skipped`."""
-        return {"lead_times": [_CSV_HEADING, *map(_csv_row, self.accidents)], "skipped": skipped_rows(self.skipped)}
+        return {
+            "lead_times": [_CSV_HEADING, *map(_csv_row, self.accidents)],
+            "skipped": skipped_rows(self.skipped),
+        }
 
     def to_text(self) -> str:
         """A table of the accidents and of their means, for a terminal."""
@@ -354,12 +379,20 @@ class LeadTimeLedger(Report):
         return "\n\n".join(blocks)
 
     def _accidents_text(self) -> str:
-        heading = ("seconds before the impact", "ego alone", *(f"+ {short_name(name)}" for name in PARTNERS), "all")
+        heading = (
+            "seconds before the impact",
+            "ego alone",
+            *(f"+ {short_name(name)}" for name in PARTNERS),
+            "all",
+        )
         rows = [
             (
                 each.scenario,
                 _lead_text(each.alone, never=each.never_alone),
-                *(_gain_text(*pair) for pair in zip(each.gains.tolist(), each.shapley.tolist(), strict=True)),
+                *(
+                    _gain_text(*pair)
+                    for pair in zip(each.gains.tolist(), each.shapley.tolist(), strict=True)
+                ),
                 _lead_text(each.together, never=each.never_together) + "*" * bool(each.missing),
             )
             for each in self.accidents
@@ -381,7 +414,9 @@ class LeadTimeLedger(Report):
         return "\n".join(
             [
                 "means in seconds [interval of 95 %, bootstrap over accidents]",
-                columns_text([("partner", "adds to the ego", "all lose without", "Shapley value"), *rows]),
+                columns_text(
+                    [("partner", "adds to the ego", "all lose without", "Shapley value"), *rows]
+                ),
                 f"lead time: the ego alone {alone}, all agents {together}",
                 f"{never}{_percent(self.share_never_together)} of the accidents",
                 f"{start}{_percent(self.share_from_the_start)}",
@@ -397,11 +432,19 @@ def mean_times(values: FloatArray) -> tuple[MeanTime, ...]:
     count = len(values)
     known = np.isfinite(values)
     if not count:
-        return tuple(MeanTime(mean=None, low=None, high=None, accidents=0) for _ in range(values.shape[1]))
-    times = np.random.default_rng(0).multinomial(count, np.full(count, 1 / count), size=_RESAMPLES).astype(np.float64)
+        return tuple(
+            MeanTime(mean=None, low=None, high=None, accidents=0) for _ in range(values.shape[1])
+        )
+    times = (
+        np.random.default_rng(0)
+        .multinomial(count, np.full(count, 1 / count), size=_RESAMPLES)
+        .astype(np.float64)
+    )
     with np.errstate(invalid="ignore"):
         drawn = times @ np.where(known, values, 0) / (times @ known)
-    return tuple(_mean_time(values[known[:, at], at], drawn[:, at]) for at in range(values.shape[1]))
+    return tuple(
+        _mean_time(values[known[:, at], at], drawn[:, at]) for at in range(values.shape[1])
+    )
 
 
 def _mean_time(values: FloatArray, drawn: FloatArray) -> MeanTime:
@@ -424,7 +467,10 @@ _CSV_HEADING: Final = (
 def _csv_row(times: LeadTimes) -> list[Any]:
     told = times.to_dict()
     lists = ("actor_ids", "categories", "colliding_agents", "missing")
-    words = {name: " ".join("none" if each is None else str(each) for each in told[name]) for name in lists}
+    words = {
+        name: " ".join("none" if each is None else str(each) for each in told[name])
+        for name in lists
+    }
     return [
         *({**told, **words}[name] for name in _OF_ACCIDENT),
         *told["lead_seconds"].values(),
@@ -471,11 +517,15 @@ def lead_time_ledger(
         TokenError: no such scenario.
     """
     rule = rule or ObservationRule()
-    found = each_scenario(partial(lead_times, rule=rule), dataset, scenarios, label="lead times", **how)
+    found = each_scenario(
+        partial(lead_times, rule=rule), dataset, scenarios, label="lead times", **how
+    )
     return ledger_of(dataset, found, rule)
 
 
-def ledger_of(dataset: Dataset, found: Sequence[LeadTimes | Skipped | None], rule: ObservationRule) -> LeadTimeLedger:
+def ledger_of(
+    dataset: Dataset, found: Sequence[LeadTimes | Skipped | None], rule: ObservationRule
+) -> LeadTimeLedger:
     """The ledger of what `lead_times` found in scenarios."""
     return LeadTimeLedger(
         dataroot=str(dataset.dataroot),

@@ -13,7 +13,13 @@ from urllib.parse import quote
 from deepaccident_devkit.collisions import OUTCOMES
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import ChoiceError
-from deepaccident_devkit.plugins.safety import COALITIONS, PARTNERS, AccidentRow, OutcomeShares, SafetyReport
+from deepaccident_devkit.plugins.safety import (
+    COALITIONS,
+    PARTNERS,
+    AccidentRow,
+    OutcomeShares,
+    SafetyReport,
+)
 from deepaccident_devkit.plugins.safety.avoidability_report import ACCIDENT_GROUPS
 from deepaccident_devkit.plugins.safety.figures import (
     AVOIDABILITY_SIZE,
@@ -104,12 +110,19 @@ def save_safety_report(
     written.append(folder / "safety.json")
     write_bytes(written[-1], report.to_json().encode())
     drawn, pictures = list(figures_of(report)), place_in(folder, "figures", opened=True)
-    figures = [(each, write_report_figure(each.draw(), pictures / f"{each.name}.png")) for each in drawn]
-    names = {} if dataset is None else replay_names([row.scenario for row in by_severity(report.rows)][:replays])
+    figures = [
+        (each, write_report_figure(each.draw(), pictures / f"{each.name}.png")) for each in drawn
+    ]
+    names = (
+        {}
+        if dataset is None
+        else replay_names([row.scenario for row in by_severity(report.rows)][:replays])
+    )
     failed = {} if dataset is None else _make_replays(dataset, folder.absolute(), names, **how)
     pages = {scenario: name for scenario, name in names.items() if scenario not in failed}
     write_bytes(
-        folder / SAFETY_REPORT_FILE, safety_report_html(report, figures, pages, sorted(failed.items())).encode()
+        folder / SAFETY_REPORT_FILE,
+        safety_report_html(report, figures, pages, sorted(failed.items())).encode(),
     )
     return [
         *written,
@@ -145,7 +158,11 @@ def safety_report_html(
         partners=[
             [short_name(name), *(mean.text for mean in means)]
             for name, *means in zip(
-                PARTNERS, report.ledger.mean_gains, report.ledger.mean_losses, report.ledger.mean_shapley, strict=True
+                PARTNERS,
+                report.ledger.mean_gains,
+                report.ledger.mean_losses,
+                report.ledger.mean_shapley,
+                strict=True,
             )
         ],
         sets=[
@@ -156,9 +173,13 @@ def safety_report_html(
         largest=[[name, number_text(gap, 3)] for name, gap in largest],
         nearest=list(_nearest(report))[:_LISTED],
         torn_twins=[
-            [each.scenarios[0], each.splits[0], each.scenarios[1], each.splits[1]] for each in report.twins.torn
+            [each.scenarios[0], each.splits[0], each.scenarios[1], each.splits[1]]
+            for each in report.twins.torn
         ],
-        left_out=[*report.left_out, *((scenario, "replay pages", reason) for scenario, reason in failed)],
+        left_out=[
+            *report.left_out,
+            *((scenario, "replay pages", reason) for scenario, reason in failed),
+        ],
         pictures=[(read_bytes(path, "image"), each.alt, each.caption) for each, path in figures],
         rows=by_severity(report.rows),
         pages={scenario: quote(name) for scenario, name in pages.items()},
@@ -191,10 +212,15 @@ def _shares(report: SafetyReport) -> Iterator[dict[str, Any]]:
     """A table of the shares that braking avoids, by the seconds of warning, for each group and for who is warned."""
     shares = report.avoidability.shares
     order = [each.group for each in shares], list(_WARNED)
-    for each in sorted(shares, key=lambda each: (order[0].index(each.group), order[1].index(each.warned))):
+    for each in sorted(
+        shares, key=lambda each: (order[0].index(each.group), order[1].index(each.warned))
+    ):
         leads = [(lead, round(lead * 10)) for lead in _LEADS if round(lead * 10) < len(each.leads)]
         rows = [
-            [f"reaction {way.reaction:g} s, {way.deceleration:g} m/s²", *(_share(each, at, column) for _, at in leads)]
+            [
+                f"reaction {way.reaction:g} s, {way.deceleration:g} m/s²",
+                *(_share(each, at, column) for _, at in leads),
+            ]
             for column, way in enumerate(each.brakings)
         ]
         counts = ["accidents recorded for so long", *(f"{each.accidents[at]:,}" for _, at in leads)]
@@ -208,7 +234,10 @@ def _shares(report: SafetyReport) -> Iterator[dict[str, Any]]:
 
 def _share(shares: OutcomeShares, at: int, column: int) -> tuple[str, str]:
     """The share avoided, and below it the share that is hit only later."""
-    share, later = shares.shares[at, column, OUTCOMES.index("avoided")], shares.extrapolated[at, column]
+    share, later = (
+        shares.shares[at, column, OUTCOMES.index("avoided")],
+        shares.extrapolated[at, column],
+    )
     return f"{100 * share:.0f} %", f"{100 * later:.0f} % later" if later else ""
 
 
@@ -217,7 +246,11 @@ def _nearest(report: SafetyReport) -> Iterator[list[str]]:
     for story in report.normal:
         if (nearest := story.facts["nearest"]) is not None:
             numbers = (number_text(nearest[name], 2) for name in ("min_ttc", "min_gap"))
-            yield [story.facts["scenario"], *numbers, " and ".join(map(actor_name, nearest["pair"]))]
+            yield [
+                story.facts["scenario"],
+                *numbers,
+                " and ".join(map(actor_name, nearest["pair"])),
+            ]
 
 
 def replay_names(scenarios: Iterable[str]) -> dict[str, str]:
@@ -225,12 +258,18 @@ def replay_names(scenarios: Iterable[str]) -> dict[str, str]:
     return {scenario: f"replays/{name}.html" for scenario, name in plain_names(scenarios).items()}
 
 
-def _make_replays(dataset: Dataset, folder: Path, names: Mapping[str, str], **how: Unpack[Engine]) -> dict[str, str]:
+def _make_replays(
+    dataset: Dataset, folder: Path, names: Mapping[str, str], **how: Unpack[Engine]
+) -> dict[str, str]:
     """Write the replay pages; scenario → why it has none, of those where a file cannot be read."""
     places = Places(reads=dataset.places, writes=(folder,))
     work = partial(_make_replay, dataset, folder)
     reasons = run_batch(work, list(names.items()), label="replay pages", places=places, **how)
-    return {scenario: reason for scenario, reason in zip(names, reasons, strict=True) if reason is not None}
+    return {
+        scenario: reason
+        for scenario, reason in zip(names, reasons, strict=True)
+        if reason is not None
+    }
 
 
 def _make_replay(dataset: Dataset, folder: Path, named: tuple[str, str]) -> str | None:
@@ -245,7 +284,9 @@ def figures_of(report: SafetyReport) -> Iterator[_Drawn]:
             name="lead_times",
             caption="Mean lead times of sets of agents with the ego, and what each partner adds.",
             alt="Mean lead times by set of agents and Shapley values of the partners; the tables have the numbers.",
-            draw=lambda: render_lead_times(report.ledger, fig=report_figure(LEAD_TIME_SIZE, column=COLUMN_HEIGHT)),
+            draw=lambda: render_lead_times(
+                report.ledger, fig=report_figure(LEAD_TIME_SIZE, column=COLUMN_HEIGHT)
+            ),
         )
     for group in ACCIDENT_GROUPS:
         if report.avoidability.members(group):
@@ -258,4 +299,6 @@ def figures_of(report: SafetyReport) -> Iterator[_Drawn]:
 
 
 def _draw_avoidability(report: SafetyReport, group: str) -> Figure:
-    return render_avoidability(report.avoidability, group, fig=report_figure(AVOIDABILITY_SIZE, column=COLUMN_HEIGHT))
+    return render_avoidability(
+        report.avoidability, group, fig=report_figure(AVOIDABILITY_SIZE, column=COLUMN_HEIGHT)
+    )

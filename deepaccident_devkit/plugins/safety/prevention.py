@@ -23,8 +23,17 @@ from deepaccident_devkit.evaluation.intervals import Resampling
 from deepaccident_devkit.evaluation.runs import EvaluationRun
 from deepaccident_devkit.evaluation.runs.further import ExtraResult, Json, with_further
 from deepaccident_devkit.evaluation.runs.text import number_text
-from deepaccident_devkit.evaluation.warning import WARNING_PROTOCOLS, CleanWarnings, WarningEvaluator
-from deepaccident_devkit.evaluation.warning.anticipation import LATENCIES, draws_of, mean_of, reference_threshold
+from deepaccident_devkit.evaluation.warning import (
+    WARNING_PROTOCOLS,
+    CleanWarnings,
+    WarningEvaluator,
+)
+from deepaccident_devkit.evaluation.warning.anticipation import (
+    LATENCIES,
+    draws_of,
+    mean_of,
+    reference_threshold,
+)
 from deepaccident_devkit.evaluation.warning.recordings import (
     GIVEN,
     PREDICTORS,
@@ -117,7 +126,9 @@ def with_prevented(
     return with_further(run, "prevented", dataset, resampling, **how)
 
 
-def prevention_evaluator(dataset: Dataset, evaluator: Evaluator[Any], **how: Unpack[Engine]) -> PreventedEvaluator:
+def prevention_evaluator(
+    dataset: Dataset, evaluator: Evaluator[Any], **how: Unpack[Engine]
+) -> PreventedEvaluator:
     """An evaluator with the same counts that computes prevented accidents; see `prevented_accidents`."""
     protocol = getattr(evaluator, "protocol", None)
     if not isinstance(protocol, CleanWarnings):
@@ -149,7 +160,9 @@ def accident_outcomes(
     """
     work = partial(_outcomes_of, dataset)
     places = Places(reads=dataset.places)
-    parts = list(in_order(run_unordered(work, sorted(frames.items()), label="braking", places=places, **how)))
+    parts = list(
+        in_order(run_unordered(work, sorted(frames.items()), label="braking", places=places, **how))
+    )
     return AccidentOutcomes(
         tables={name: table for each in parts for name, table in each.tables.items()},
         dropped=tuple(chain.from_iterable(each.dropped for each in parts)),
@@ -165,16 +178,29 @@ def _outcomes_of(dataset: Dataset, item: tuple[str, FramesByAgent]) -> AccidentO
     except NotAvailableError as error:
         return AccidentOutcomes(skipped=(Skipped(scenario=scenario, reason=str(error)),))
     if accident is None:
-        return AccidentOutcomes(skipped=(Skipped(scenario=scenario, reason="its meta file names no collision"),))
+        return AccidentOutcomes(
+            skipped=(Skipped(scenario=scenario, reason="its meta file names no collision"),)
+        )
     check = undisturbed(accident)
     if not check.usable:
-        found = f"{check.margin:.2f} m between the two at its last frame" if check.collides else "no contact"
+        found = (
+            f"{check.margin:.2f} m between the two at its last frame"
+            if check.collides
+            else "no contact"
+        )
         reason = f"the recording does not show the impact: {found}, though nobody brakes"
         return AccidentOutcomes(dropped=(Skipped(scenario=scenario, reason=reason),))
-    frame = np.unique(np.concatenate([np.array(those, dtype=np.int64) for those in agents.values()]))
-    own = {agent: (accident.agents[0] == agent, accident.agents[1] == agent) for agent in sorted(agents)}
+    frame = np.unique(
+        np.concatenate([np.array(those, dtype=np.int64) for those in agents.values()])
+    )
+    own = {
+        agent: (accident.agents[0] == agent, accident.agents[1] == agent)
+        for agent in sorted(agents)
+    }
     made = {each: _table(accident, each, frame) for each in dict.fromkeys(own.values())}
-    return AccidentOutcomes(tables={f"{scenario}/{agent}": made[each] for agent, each in own.items()})
+    return AccidentOutcomes(
+        tables={f"{scenario}/{agent}": made[each] for agent, each in own.items()}
+    )
 
 
 def _table(accident: Accident, own: tuple[bool, bool], frame: IntArray) -> OutcomeTable:
@@ -184,7 +210,10 @@ def _table(accident: Accident, own: tuple[bool, bool], frame: IntArray) -> Outco
     """
     seconds = (frame - accident.first_frame) * FRAME_PERIOD
     brakers, latencies = (own, LATENCIES[:1]) if any(own) else ((True, True), LATENCIES)
-    ends = [outcomes_of(accident, brakers, np.append(seconds, np.nan), latency=each) for each in latencies]
+    ends = [
+        outcomes_of(accident, brakers, np.append(seconds, np.nan), latency=each)
+        for each in latencies
+    ]
     return OutcomeTable(
         frame=frame,
         outcome=np.stack([each.outcome for each in ends]).astype(np.int8),
@@ -237,7 +266,9 @@ class PreventedEvaluator(Evaluator[PreventedResult]):
             return super().compute(tokens)
         return self._result(parts_of(list(self._counts.values())), references=True)
 
-    def resampled(self, parts: Sequence[Sequence[Counts]], times: IntArray) -> Iterator[PreventedResult]:
+    def resampled(
+        self, parts: Sequence[Sequence[Counts]], times: IntArray
+    ) -> Iterator[PreventedResult]:
         """The result of each draw, without references and curves."""
         groups = dict(self._groups(recordings_of(parts)))
         tables = {group: self._ends(those, GIVEN) for group, those in groups.items()}
@@ -277,25 +308,40 @@ class PreventedEvaluator(Evaluator[PreventedResult]):
     @property
     def _alarms(self) -> str:
         """A predictor that names nobody has no right alarms."""
-        return next(name for name, (_, scores_of) in _ALARMS.items() if scores_of == self.protocol.scores_of)
+        return next(
+            name for name, (_, scores_of) in _ALARMS.items() if scores_of == self.protocol.scores_of
+        )
 
     def _groups(self, recordings: Sequence[Recording]) -> Iterator[tuple[str, list[Recording]]]:
         """Group → its recordings, accidents of pedestrians apart; those without an accident are in both."""
         tables = self._outcomes.tables
         for group, those in by_group(recordings):
-            walking = {each.name for each in those if each.name in tables and tables[each.name].pedestrian}
+            walking = {
+                each.name for each in those if each.name in tables and tables[each.name].pedestrian
+            }
             yield group, [each for each in those if each.name not in walking]
             if walking:
-                yield f"{group}{_WALKING}", [each for each in those if each.kind != "accident" or each.name in walking]
+                yield (
+                    f"{group}{_WALKING}",
+                    [each for each in those if each.kind != "accident" or each.name in walking],
+                )
 
-    def _ends(self, recordings: Sequence[Recording], predictor: str, draw: int = 0) -> Mapping[str, AlarmOutcomes]:
+    def _ends(
+        self, recordings: Sequence[Recording], predictor: str, draw: int = 0
+    ) -> Mapping[str, AlarmOutcomes]:
         """Which alarms warn → one predictor's scores of a group of recordings, with the ends of its accidents."""
         tables = self._outcomes.tables
         right = AlarmOutcomes(recordings, predictor, "pair", tables, draw)
-        any_alarm = right if predictor in TRIVIAL else AlarmOutcomes(recordings, predictor, "recording", tables, draw)
+        any_alarm = (
+            right
+            if predictor in TRIVIAL
+            else AlarmOutcomes(recordings, predictor, "recording", tables, draw)
+        )
         return {"right": right, "any_alarm": any_alarm}
 
-    def _given(self, ends: Mapping[str, AlarmOutcomes], draw: IntArray | None = None) -> PreventionFigures:
+    def _given(
+        self, ends: Mapping[str, AlarmOutcomes], draw: IntArray | None = None
+    ) -> PreventionFigures:
         main = ends[self._alarms]
         weight = np.ones(len(main.part)) if draw is None else draw[main.part].astype(np.float64)
         quiet = main.quiet_braking(weight)
@@ -316,20 +362,35 @@ class PreventedEvaluator(Evaluator[PreventedResult]):
             **{alarms: each.ends(threshold, weight) for alarms, each in ends.items()},
         )
 
-    def _references(self, recordings: Sequence[Recording]) -> Iterator[tuple[str, PreventionFigures]]:
+    def _references(
+        self, recordings: Sequence[Recording]
+    ) -> Iterator[tuple[str, PreventionFigures]]:
         """Predictor → figures; of a random one the means over some draws, also at the threshold within the budget."""
         weight = np.ones(len(recordings))
         for predictor in PREDICTORS[1:]:
             fixed = reference_threshold(predictor)
             if draws_of(predictor) == 1:
-                yield predictor, self._figures(self._ends(recordings, predictor), fixed, math.nan, weight)
+                yield (
+                    predictor,
+                    self._figures(self._ends(recordings, predictor), fixed, math.nan, weight),
+                )
             else:
-                drawn = [self._ends(recordings, predictor, draw) for draw in range(draws_of(predictor))]
+                drawn = [
+                    self._ends(recordings, predictor, draw) for draw in range(draws_of(predictor))
+                ]
                 quiet = [each[self._alarms].quiet_braking(weight) for each in drawn]
-                for name, thresholds in ((predictor, [fixed] * len(drawn)), (f"{predictor}{_QUIET}", quiet)):
+                for name, thresholds in (
+                    (predictor, [fixed] * len(drawn)),
+                    (f"{predictor}{_QUIET}", quiet),
+                ):
                     yield (
                         name,
-                        _mean([self._figures(*each, weight) for each in zip(drawn, thresholds, quiet, strict=True)]),
+                        _mean(
+                            [
+                                self._figures(*each, weight)
+                                for each in zip(drawn, thresholds, quiet, strict=True)
+                            ]
+                        ),
                     )
 
     def _notes(self, groups: Mapping[str, PreventionFigures]) -> Iterator[str]:
@@ -374,11 +435,17 @@ def prevention_tables(prevented: Json) -> list[Table]:
     """Two tables for each group of recordings: predictors at the nominal setting, and predictions at all settings."""
     tables = []
     for group, given in prevented["groups"].items():
-        everyone = {GIVEN: given, **{name: each[group] for name, each in prevented["references"].items()}}
+        everyone = {
+            GIVEN: given,
+            **{name: each[group] for name, each in prevented["references"].items()},
+        }
         head = (f"{group}, {NOMINAL}", *_COLUMNS)
         rows = tuple((name, *_cells(given, prevented["alarms"], setting=name)) for name in SETTINGS)
         tables += [
-            Table((head, *_predictors(prevented["alarms"], everyone)), tuple(_notes(prevented, group, given))),
+            Table(
+                (head, *_predictors(prevented["alarms"], everyone)),
+                tuple(_notes(prevented, group, given)),
+            ),
             Table(((f"{group}, {GIVEN}", *_COLUMNS), *rows)),
         ]
     return tables
@@ -397,7 +464,11 @@ def _predictors(alarms: str, everyone: Mapping[str, Json]) -> Iterator[tuple[str
 
 
 def _cells(
-    given: Json, alarms: str, latency: str = _AT_ONCE, setting: str = NOMINAL, lasting: str | None = "lasting"
+    given: Json,
+    alarms: str,
+    latency: str = _AT_ONCE,
+    setting: str = NOMINAL,
+    lasting: str | None = "lasting",
 ) -> Iterator[str]:
     figures = given[alarms][latency][setting]
     avoided = None if lasting is None else given[lasting][latency][setting]["shares"][OUTCOMES[0]]
@@ -407,7 +478,11 @@ def _cells(
 
 def _notes(prevented: Json, group: str, given: Json) -> Iterator[str]:
     threshold, quiet = given["threshold"], given["quiet_braking"]
-    how = "given" if prevented["operating_by"] == "given" else "at most 1 braking s/min on these recordings"
+    how = (
+        "given"
+        if prevented["operating_by"] == "given"
+        else "at most 1 braking s/min on these recordings"
+    )
     figures = given[prevented["alarms"]][_AT_ONCE][NOMINAL]
     lasting = given["lasting"][_AT_ONCE][NOMINAL]
     path = f"groups/{group}/{prevented['alarms']}/{_AT_ONCE}/{NOMINAL}/shares/{OUTCOMES[0]}"
@@ -426,11 +501,16 @@ def _notes(prevented: Json, group: str, given: Json) -> Iterator[str]:
 
 
 def _figures(result: PreventedResult) -> Iterator[RunFigure]:
-    from deepaccident_devkit.plugins.safety.prevention_figures import prevention_figures  # which imports matplotlib
+    from deepaccident_devkit.plugins.safety.prevention_figures import (
+        prevention_figures,
+    )  # which imports matplotlib
 
     return prevention_figures(result)
 
 
 PREVENTED: Final = ExtraResult(
-    title="prevented accidents", evaluator=prevention_evaluator, tables=prevention_tables, figures=_figures
+    title="prevented accidents",
+    evaluator=prevention_evaluator,
+    tables=prevention_tables,
+    figures=_figures,
 )

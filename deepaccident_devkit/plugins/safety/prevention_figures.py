@@ -10,13 +10,24 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from deepaccident_devkit.evaluation.warning.recordings import GIVEN
-from deepaccident_devkit.plugins.safety.prevention_result import BUDGET, NOMINAL, SETTINGS, PreventedResult
+from deepaccident_devkit.plugins.safety.prevention_result import (
+    BUDGET,
+    NOMINAL,
+    SETTINGS,
+    PreventedResult,
+)
 from deepaccident_devkit.render.captions import draw_legend, set_title
 from deepaccident_devkit.render.chips import place_chips
 from deepaccident_devkit.render.evaluation.figures import RunFigure, listed
 from deepaccident_devkit.render.evaluation.panels import PANEL, draw_nothing
 from deepaccident_devkit.render.figures import axes_or_new, with_light_grid
-from deepaccident_devkit.render.styles import ESTIMATE_COLOR, GRID_COLOR, MUTED_COLOR, TRUE_PLACE_COLOR, in_own_settings
+from deepaccident_devkit.render.styles import (
+    ESTIMATE_COLOR,
+    GRID_COLOR,
+    MUTED_COLOR,
+    TRUE_PLACE_COLOR,
+    in_own_settings,
+)
 from deepaccident_devkit.support.arrays import FloatArray
 
 if TYPE_CHECKING:
@@ -39,7 +50,9 @@ def prevention_figures(result: PreventedResult) -> Iterator[RunFigure]:
 
 
 @in_own_settings
-def render_prevention(result: PreventedResult, group: str | None = None, *, ax: Axes | None = None) -> Axes:
+def render_prevention(
+    result: PreventedResult, group: str | None = None, *, ax: Axes | None = None
+) -> Axes:
     """Render the share of accidents avoided over the braking seconds a minute, one line for each way of braking.
 
     Args:
@@ -51,10 +64,17 @@ def render_prevention(result: PreventedResult, group: str | None = None, *, ax: 
         The axes. The line of the nominal setting is thick, with its operating point and those of the reference
         predictors; the dashed line adds the accidents that are milder; the upright line is the headline's cost.
     """
-    ax, name = axes_or_new(ax, PANEL), group if group is not None else next(iter(result.groups), "no recording")
+    ax, name = (
+        axes_or_new(ax, PANEL),
+        group if group is not None else next(iter(result.groups), "no recording"),
+    )
     set_title(ax, f"Accidents prevented by braking: {name}", fontsize="medium")
     curve = result.curves.get(name)
-    if curve is None or not np.isfinite(curve.avoided).any() or not np.isfinite(curve.braking_seconds_per_minute).any():
+    if (
+        curve is None
+        or not np.isfinite(curve.avoided).any()
+        or not np.isfinite(curve.braking_seconds_per_minute).any()
+    ):
         return draw_nothing(ax, "needs accidents and recordings without one")
     nominal = SETTINGS.index(NOMINAL)
     costs = curve.braking_seconds_per_minute
@@ -62,8 +82,23 @@ def render_prevention(result: PreventedResult, group: str | None = None, *, ax: 
         if setting != nominal:
             _steps(ax, costs[:, setting], curve.avoided[:, setting], color=GRID_COLOR, linewidth=1)
     either = curve.avoided[:, nominal] + curve.mitigated[:, nominal]
-    _steps(ax, costs[:, nominal], either, color=ESTIMATE_COLOR, linewidth=1, linestyle="--", label="or milder")
-    _steps(ax, costs[:, nominal], curve.avoided[:, nominal], color=ESTIMATE_COLOR, linewidth=2, label=f"at {NOMINAL}")
+    _steps(
+        ax,
+        costs[:, nominal],
+        either,
+        color=ESTIMATE_COLOR,
+        linewidth=1,
+        linestyle="--",
+        label="or milder",
+    )
+    _steps(
+        ax,
+        costs[:, nominal],
+        curve.avoided[:, nominal],
+        color=ESTIMATE_COLOR,
+        linewidth=2,
+        label=f"at {NOMINAL}",
+    )
     ax.plot([], [], color=GRID_COLOR, linewidth=1, label="other ways of braking")
     ax.axvline(BUDGET, color=MUTED_COLOR, linewidth=0.8, linestyle=":")
     _points(ax, result, name)
@@ -71,10 +106,15 @@ def render_prevention(result: PreventedResult, group: str | None = None, *, ax: 
     ticks = [0, 0.5, 1, 2, 5, 10, 20, 40]
     ax.set_xticks(ticks, [f"{each:g}" for each in ticks])
     ax.set_xticks([], minor=True)
-    ax.set(xlabel="← better: braking seconds a minute without an accident", ylabel="share of the accidents, better →")
+    ax.set(
+        xlabel="← better: braking seconds a minute without an accident",
+        ylabel="share of the accidents, better →",
+    )
     ax.set(xlim=(-0.03, 1.4 * _MOST), ylim=(-0.03, 1.05))
     handles, _ = ax.get_legend_handles_labels()
-    draw_legend(ax, handles, columns=3, loc="upper center", bbox_to_anchor=(0.5, -0.22))  # inside are points
+    draw_legend(
+        ax, handles, columns=3, loc="upper center", bbox_to_anchor=(0.5, -0.22)
+    )  # inside are points
     return with_light_grid(ax, "both")
 
 
@@ -94,6 +134,13 @@ def _points(ax: Axes, result: PreventedResult, group: str) -> None:
         if math.isnan(x) or math.isnan(y):
             continue
         given = name == GIVEN
-        ax.plot([x], [y], "o", color=ESTIMATE_COLOR if given else TRUE_PLACE_COLOR, markersize=5, zorder=3)
+        ax.plot(
+            [x],
+            [y],
+            "o",
+            color=ESTIMATE_COLOR if given else TRUE_PLACE_COLOR,
+            markersize=5,
+            zorder=3,
+        )
         chips.append((name, (x, y)))
     place_chips(ax, chips)

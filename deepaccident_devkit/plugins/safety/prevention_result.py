@@ -18,8 +18,20 @@ from deepaccident_devkit.collisions.recorded import Skipped
 from deepaccident_devkit.errors import EvaluationError
 from deepaccident_devkit.evaluation.evaluator import ratio
 from deepaccident_devkit.evaluation.task import FrozenMappings, Row
-from deepaccident_devkit.evaluation.warning.recordings import MINUTE, AlarmRuns, Recording, ScoresOf, series_of
-from deepaccident_devkit.support.arrays import BoolArray, FloatArray, FrozenArrays, IntArray, ShortRepr
+from deepaccident_devkit.evaluation.warning.recordings import (
+    MINUTE,
+    AlarmRuns,
+    Recording,
+    ScoresOf,
+    series_of,
+)
+from deepaccident_devkit.support.arrays import (
+    BoolArray,
+    FloatArray,
+    FrozenArrays,
+    IntArray,
+    ShortRepr,
+)
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
 SETTINGS: Final = tuple(f"{each.reaction:g} s, {each.deceleration:g} m/s²" for each in BRAKINGS)
@@ -60,7 +72,9 @@ class OutcomeTable(FrozenArrays):
         if np.any(np.diff(self.frame) <= 0):
             raise EvaluationError("OutcomeTable.frame: expected ascending frame numbers; sort them")
         if not np.isin(self.outcome, range(len(OUTCOMES))).all():
-            raise EvaluationError(f"OutcomeTable.outcome: expected positions in OUTCOMES, 0 to {len(OUTCOMES) - 1}")
+            raise EvaluationError(
+                f"OutcomeTable.outcome: expected positions in OUTCOMES, 0 to {len(OUTCOMES) - 1}"
+            )
 
     def rows(self, frames: IntArray) -> IntArray:
         """(C,) which of the W + 1 rows a first alarm at each frame has; the last one for frames of no sample."""
@@ -246,11 +260,14 @@ class AlarmOutcomes:
         own = [outcomes[recordings[row].name] for row in self.accident.tolist()]
         self._latencies = own[0].latencies if own else (0.0,)
         rows = [
-            table.rows(self._frames(recordings[row])) for table, row in zip(own, self.accident.tolist(), strict=True)
+            table.rows(self._frames(recordings[row]))
+            for table, row in zip(own, self.accident.tolist(), strict=True)
         ]
         shape = (len(own), len(self._latencies), self._series.scores.shape[1] + 1, len(BRAKINGS))
         self._outcome, self._extrapolated = (
-            np.array([getattr(table, name)[:, each] for table, each in zip(own, rows, strict=True)]).reshape(shape)
+            np.array(
+                [getattr(table, name)[:, each] for table, each in zip(own, rows, strict=True)]
+            ).reshape(shape)
             for name in ("outcome", "extrapolated")
         )
         self._found: dict[float, _Alarms] = {}
@@ -266,7 +283,9 @@ class AlarmOutcomes:
         """(K,) braking seconds a minute of each setting; NaN without a recording that has no accident."""
         minutes = self.minutes(weight)
         seconds = self._at(threshold).seconds @ weight[self.normal]
-        return np.asarray(np.array([ratio(each, minutes) for each in seconds.tolist()])[_REACTION_OF])
+        return np.asarray(
+            np.array([ratio(each, minutes) for each in seconds.tolist()])[_REACTION_OF]
+        )
 
     def quiet_braking(self, weight: FloatArray) -> float:
         """The lowest threshold within the budget at the nominal reaction; infinite if there is none, NaN without cost.
@@ -279,12 +298,16 @@ class AlarmOutcomes:
         most = BUDGET * minutes + _SLACK
 
         def is_quiet(threshold: float) -> int:
-            return int(float(self._at(threshold).seconds[_NOMINAL_REACTION] @ weight[self.normal]) <= most)
+            return int(
+                float(self._at(threshold).seconds[_NOMINAL_REACTION] @ weight[self.normal]) <= most
+            )
 
         place = bisect_left(self.levels.tolist(), 1, key=is_quiet)
         return float(self.levels[place]) if place < len(self.levels) else math.inf
 
-    def ends(self, threshold: float, weight: FloatArray, *, lasting: bool = False) -> FiguresByLatency:
+    def ends(
+        self, threshold: float, weight: FloatArray, *, lasting: bool = False
+    ) -> FiguresByLatency:
         """Latency → setting → figures at a threshold, with (N,) weights of the recordings; all NaN at NaN.
 
         If `lasting`, alarms warn only if they outlast the reaction time.
@@ -294,12 +317,22 @@ class AlarmOutcomes:
         columns = alarms.first_lasting if lasting else alarms.first
         costs = np.full(len(BRAKINGS), math.nan) if unknown else self.costs(threshold, weight)
         counting = weight[self.accident] * (math.nan if unknown else 1.0)
-        warned = (counting[:, None] * (columns < self._series.scores.shape[1])).sum(axis=0)[_REACTION_OF].tolist()
+        warned = (
+            (counting[:, None] * (columns < self._series.scores.shape[1]))
+            .sum(axis=0)[_REACTION_OF]
+            .tolist()
+        )
         found: dict[float, dict[str, OutcomeFigures]] = {}
         for place, latency in enumerate(self._latencies):
             sums, beyond = self._sums(place, columns, counting)
             found[latency] = {
-                setting: _figures(sums[row], float(beyond[row]), warned[row], float(counting.sum()), float(costs[row]))
+                setting: _figures(
+                    sums[row],
+                    float(beyond[row]),
+                    warned[row],
+                    float(counting.sum()),
+                    float(costs[row]),
+                )
                 for row, setting in enumerate(SETTINGS)
             }
         return found
@@ -328,24 +361,37 @@ class AlarmOutcomes:
         """The alarms at a threshold; kept."""
         if threshold not in self._found:
             alarm, fps = self._scores >= threshold, self._series.fps
-            accidents, normal = (AlarmRuns.of(alarm[rows], fps) for rows in (self.accident, self.normal))
+            accidents, normal = (
+                AlarmRuns.of(alarm[rows], fps) for rows in (self.accident, self.normal)
+            )
             first = self._series.first(np.array([threshold]))[self.accident]
             self._found[threshold] = _Alarms(
                 first=np.repeat(first, len(_REACTIONS), axis=1),
-                first_lasting=np.stack([accidents.first_lasting(each) for each in _REACTIONS], axis=1),
+                first_lasting=np.stack(
+                    [accidents.first_lasting(each) for each in _REACTIONS], axis=1
+                ),
                 seconds=np.stack([normal.braking_seconds(each) for each in _REACTIONS]),
             )
         return self._found[threshold]
 
-    def _sums(self, latency: int, columns: IntArray, weight: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def _sums(
+        self, latency: int, columns: IntArray, weight: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
         """(K, C) weights of the accidents of each class and setting, and (K,) of those that are extrapolated."""
-        at = (np.arange(len(self.accident))[:, None], latency, columns[:, _REACTION_OF], np.arange(len(BRAKINGS)))
+        at = (
+            np.arange(len(self.accident))[:, None],
+            latency,
+            columns[:, _REACTION_OF],
+            np.arange(len(BRAKINGS)),
+        )
         codes = self._outcome[at]
         sums = [((codes == code) * weight[:, None]).sum(axis=0) for code in range(len(OUTCOMES))]
         return np.stack(sums, axis=1), (self._extrapolated[at] * weight[:, None]).sum(axis=0)
 
 
-def _figures(sums: FloatArray, beyond: float, warned: float, accidents: float, cost: float) -> OutcomeFigures:
+def _figures(
+    sums: FloatArray, beyond: float, warned: float, accidents: float, cost: float
+) -> OutcomeFigures:
     known = {name: float(each) for name, each in zip(OUTCOMES, sums, strict=True)}
     return OutcomeFigures(
         warned=ratio(warned, accidents),

@@ -14,9 +14,25 @@ from deepaccident_devkit.descriptions.avoidability import BRAKERS, Avoidability
 from deepaccident_devkit.descriptions.observation import ObservationRule
 from deepaccident_devkit.descriptions.stories import Story, scenario_facts, story_text
 from deepaccident_devkit.interactions import InteractionConfig, InteractionPairs, interactions
-from deepaccident_devkit.plugins.safety.avoidability_report import AvoidabilityReport, Dropped, looked_into, report_of
-from deepaccident_devkit.plugins.safety.lead_times import LeadTimeLedger, LeadTimes, lead_times, ledger_of
-from deepaccident_devkit.plugins.safety.twins import Parting, TwinDiff, TwinReport, diff_of_accident, twins_of
+from deepaccident_devkit.plugins.safety.avoidability_report import (
+    AvoidabilityReport,
+    Dropped,
+    looked_into,
+    report_of,
+)
+from deepaccident_devkit.plugins.safety.lead_times import (
+    LeadTimeLedger,
+    LeadTimes,
+    lead_times,
+    ledger_of,
+)
+from deepaccident_devkit.plugins.safety.twins import (
+    Parting,
+    TwinDiff,
+    TwinReport,
+    diff_of_accident,
+    twins_of,
+)
 from deepaccident_devkit.support.arrays import ShortRepr, known
 from deepaccident_devkit.support.reports import Report, Row
 from deepaccident_devkit.taxonomy import AGENTS, short_name
@@ -66,7 +82,11 @@ class PairMeasures:
     def of(cls, pairs: InteractionPairs, first: int, second: int) -> PairMeasures | None:
         """Those of two actors in `interactions(…).pairs`; None if they never come under a threshold there."""
         at = pairs.position(first, second)
-        return None if at is None else cls(time_exposed=known(pairs.tet[at, 0], 2), pet=known(abs(pairs.pet[at]), 2))
+        return (
+            None
+            if at is None
+            else cls(time_exposed=known(pairs.tet[at, 0], 2), pet=known(abs(pairs.pet[at]), 2))
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -105,7 +125,10 @@ class AccidentRow(ShortRepr):
     @property
     def severity(self) -> float:
         """The larger delta-v of the two, m/s; −1 if none is known."""
-        return max((each["delta_v"] for each in self.colliders if each["delta_v"] is not None), default=-1.0)
+        return max(
+            (each["delta_v"] for each in self.colliders if each["delta_v"] is not None),
+            default=-1.0,
+        )
 
     @property
     def leads(self) -> dict[str, float | None]:
@@ -128,7 +151,9 @@ class AccidentRow(ShortRepr):
         row = BRAKERS.index("both")
         if len(self.brakes) == 1:
             row = self.replayed.accident.agents.index("ego_vehicle")
-        values = zip(self.replayed.decelerations.tolist(), self.replayed.slack[row].tolist(), strict=True)
+        values = zip(
+            self.replayed.decelerations.tolist(), self.replayed.slack[row].tolist(), strict=True
+        )
         return {deceleration: known(slack, 2) for deceleration, slack in values}
 
     @property
@@ -161,7 +186,11 @@ class AccidentRow(ShortRepr):
 def actor_name(actor: Mapping[str, Any]) -> str:
     """An actor of a story's facts: `ego (car)`, or `cyclist 1234` for one that is no agent."""
     category = actor["category"] or "road user"
-    return f"{short_name(actor['agent'])} ({category})" if actor["agent"] else f"{category} {actor['actor_id']}"
+    return (
+        f"{short_name(actor['agent'])} ({category})"
+        if actor["agent"]
+        else f"{category} {actor['actor_id']}"
+    )
 
 
 def csv_row(row: AccidentRow) -> list[Any]:
@@ -229,7 +258,9 @@ class SafetyReport(Report):
         for name, skipped in parts.items():
             for each in skipped:
                 reasons.setdefault((each.scenario, each.reason), []).append(name)
-        return [(scenario, ", ".join(names), reason) for (scenario, reason), names in reasons.items()]
+        return [
+            (scenario, ", ".join(names), reason) for (scenario, reason), names in reasons.items()
+        ]
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON; None for what is not known."""
@@ -243,7 +274,10 @@ class SafetyReport(Report):
             "margins": dict(self.avoidability.margins),
             "normal": [{**each.facts, "text": each.text} for each in self.normal],
             "torn": [asdict(each) for each in self.twins.torn],
-            "left_out": [dict(zip(("scenario", "part", "reason"), each, strict=True)) for each in self.left_out],
+            "left_out": [
+                dict(zip(("scenario", "part", "reason"), each, strict=True))
+                for each in self.left_out
+            ],
         }
 
     def named_tables(self) -> dict[str, Iterable[Row]]:
@@ -280,21 +314,33 @@ def safety_report(
     Raises:
         TokenError: no such scenario.
     """
-    looked = those_of(_Looked, each_scenario(_looked_at, dataset, scenarios, label="safety", at_once=1, **how))
+    looked = those_of(
+        _Looked, each_scenario(_looked_at, dataset, scenarios, label="safety", at_once=1, **how)
+    )
     return SafetyReport(
         scenarios=len(looked),
         rows=tuple(_rows(looked)),
         avoidability=report_of(dataset, [each.replayed for each in looked]),
         ledger=ledger_of(dataset, [each.times for each in looked], ObservationRule()),
         twins=twins_of(dataset, [each.twin for each in looked]),
-        normal=tuple(sorted((each.story for each in looked if each.story.facts["collision"] is False), key=_urgency)),
-        broken=tuple(Skipped(scenario=each.scenario, reason=" ".join(each.messages)) for each in dataset.problems),
+        normal=tuple(
+            sorted(
+                (each.story for each in looked if each.story.facts["collision"] is False),
+                key=_urgency,
+            )
+        ),
+        broken=tuple(
+            Skipped(scenario=each.scenario, reason=" ".join(each.messages))
+            for each in dataset.problems
+        ),
     )
 
 
 def _looked_at(dataset: Dataset, record: ScenarioRecord) -> _Looked:
     replayed: Avoidability | Dropped | Skipped | None = tried(looked_into, dataset, record)
-    facts = scenario_facts(dataset, record, replayed.why if isinstance(replayed, Dropped) else replayed)
+    facts = scenario_facts(
+        dataset, record, replayed.why if isinstance(replayed, Dropped) else replayed
+    )
     measures = None
     if facts["accident"] is not None:
         found = interactions(dataset, record).pairs

@@ -62,7 +62,9 @@ def twin_recording(dataset: Dataset, scenario: str) -> TwinRecording:
     """
     tracks = scenario_tracks(dataset, scenario)
     if not len(tracks.index):
-        raise NotAvailableError(f"{scenario} has no labels (the test split ships without), which say where actors are")
+        raise NotAvailableError(
+            f"{scenario} has no labels (the test split ships without), which say where actors are"
+        )
     frames = dataset.scenario.get(scenario)["num_frames"]
     ids, first, which = np.unique(tracks.actor_id, return_index=True, return_inverse=True)
     poses, speeds = np.full((len(ids), frames, 3), np.nan), np.full((len(ids), frames), np.nan)
@@ -70,7 +72,10 @@ def twin_recording(dataset: Dataset, scenario: str) -> TwinRecording:
     speeds[which, tracks.index - 1] = np.linalg.norm(tracks.boxes.velocity[:, :2], axis=1)
     size = np.zeros((len(ids), 3))
     size[which] = tracks.boxes.size
-    own = {name: dataset.agent.get(f"{scenario}/{name}")["actor_id"] for name in agents_of(dataset, scenario)}
+    own = {
+        name: dataset.agent.get(f"{scenario}/{name}")["actor_id"]
+        for name in agents_of(dataset, scenario)
+    }
     return TwinRecording(
         scenario=scenario,
         actor_id=ids,
@@ -97,7 +102,10 @@ def shift_of(first: TwinRecording, second: TwinRecording) -> int:
         end = min(begin + frames, first.poses.shape[1], second.poses.shape[1] - shift)
         if not pairs or end - begin < frames:
             continue
-        moved = second.poses[list(pairs.values()), begin + shift : end + shift] - first.poses[list(pairs), begin:end]
+        moved = (
+            second.poses[list(pairs.values()), begin + shift : end + shift]
+            - first.poses[list(pairs), begin:end]
+        )
         apart = np.minimum(np.hypot(moved[..., 0], moved[..., 1]), _CAP)
         if np.isnan(apart).all():
             continue
@@ -136,10 +144,16 @@ def matched_rows(first: TwinRecording, second: TwinRecording) -> dict[int, tuple
     }
     rows, other_rows = _rows_by_id(first), _rows_by_id(second)
     common = [name for name in first.agents if name in second.agents]
-    if len(common) >= _FEWEST_AGENTS and all(first.agents[name] == second.agents[name] for name in common):
+    if len(common) >= _FEWEST_AGENTS and all(
+        first.agents[name] == second.agents[name] for name in common
+    ):
         for actor, row in rows.items():
             other = other_rows.get(actor)
-            if row not in result and other is not None and first.category[row] == second.category[other]:
+            if (
+                row not in result
+                and other is not None
+                and first.category[row] == second.category[other]
+            ):
                 result[row] = (other, "id")
     return {**result, **{row: (other, "start") for row, other in _by_start(first, second, result)}}
 
@@ -148,7 +162,11 @@ def _agent_rows(first: TwinRecording, second: TwinRecording) -> dict[int, int]:
     """Row → row of the vehicles that record in both."""
     rows, other_rows = _rows_by_id(first), _rows_by_id(second)
     ids = [(actor, second.agents.get(name)) for name, actor in first.agents.items()]
-    return {rows[mine]: other_rows[theirs] for mine, theirs in ids if mine in rows and theirs in other_rows}
+    return {
+        rows[mine]: other_rows[theirs]
+        for mine, theirs in ids
+        if mine in rows and theirs in other_rows
+    }
 
 
 def _rows_by_id(recording: TwinRecording) -> dict[int | None, int]:
@@ -166,7 +184,11 @@ def _by_start(
     apart = _start_distances(first, second)[np.ix_(left, right)]
     near = apart <= START_DISTANCE
     chosen = linear_sum_assignment(np.where(near, apart, 1e3 * START_DISTANCE))
-    return [(int(left[row]), int(right[column])) for row, column in zip(*chosen, strict=True) if near[row, column]]
+    return [
+        (int(left[row]), int(right[column]))
+        for row, column in zip(*chosen, strict=True)
+        if near[row, column]
+    ]
 
 
 def _start_distances(first: TwinRecording, second: TwinRecording) -> FloatArray:
@@ -176,7 +198,8 @@ def _start_distances(first: TwinRecording, second: TwinRecording) -> FloatArray:
     there = frame < min(first.poses.shape[1], second.poses.shape[1])
     frame = np.where(there, frame, 0)
     apart = (
-        first.poses[np.arange(len(starts[0]))[:, None], frame, :2] - second.poses[np.arange(len(starts[1])), frame, :2]
+        first.poses[np.arange(len(starts[0]))[:, None], frame, :2]
+        - second.poses[np.arange(len(starts[1])), frame, :2]
     )
     distance = np.hypot(apart[..., 0], apart[..., 1])
     same = there & (first.category[:, None] == second.category) & ~np.isnan(distance)

@@ -31,10 +31,24 @@ from deepaccident_devkit.plugins.safety.twin_matching import (
     twin_recording,
 )
 from deepaccident_devkit.release.fingerprints import digest_of
-from deepaccident_devkit.support.arrays import BoolArray, FloatArray, FrozenArrays, IntArray, checked_number, known
+from deepaccident_devkit.support.arrays import (
+    BoolArray,
+    FloatArray,
+    FrozenArrays,
+    IntArray,
+    checked_number,
+    known,
+)
 from deepaccident_devkit.support.reports import Report, Row
 from deepaccident_devkit.support.text import columns_text, number_text
-from deepaccident_devkit.taxonomy import CATEGORIES, FRAME_PERIOD, UNTRACKED_ID, AgentName, frame_timestamp, short_name
+from deepaccident_devkit.taxonomy import (
+    CATEGORIES,
+    FRAME_PERIOD,
+    UNTRACKED_ID,
+    AgentName,
+    frame_timestamp,
+    short_name,
+)
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -165,7 +179,9 @@ class TwinDiff(FrozenArrays):
     @property
     def parting_frames(self) -> IntArray:
         """(N,) the first frame at which an actor is elsewhere or turned otherwise; 0 for one that never is."""
-        parted = (np.abs(self.heading_differences) > self.parting.heading) | (self.distances > self.parting.distance)
+        parted = (np.abs(self.heading_differences) > self.parting.heading) | (
+            self.distances > self.parting.distance
+        )
         return np.where(parted.any(axis=1), parted.argmax(axis=1) + 1, 0)
 
     @property
@@ -227,7 +243,9 @@ class TwinDiff(FrozenArrays):
             "parting_heading": self.parting.heading,
             "parting_frame": parting,
             "parting_time": None if parting is None else frame_timestamp(parting),
-            "time_to_impact": None if parting is None else (self.num_frames[0] - parting) * FRAME_PERIOD,
+            "time_to_impact": None
+            if parting is None
+            else (self.num_frames[0] - parting) * FRAME_PERIOD,
             "pair": [int(self.actor_ids[row, 0]) for row in self.pair],
             "gap_at_impact": known(self.gaps[0, self.num_frames[0] - 1]),
             "nearest_gap_in_twin": None if nearest is None else nearest.gap,
@@ -279,7 +297,9 @@ def twin_diff(dataset: Dataset, scenario: RowArgument, parting: Parting | None =
     record = dataset.scenario[dataset.getind("scenario", scenario)]
     other = twin_of(dataset, record)
     if other is None:
-        raise NotAvailableError(f"{record['token']}: this release has no twin of it, with the same name and subtype")
+        raise NotAvailableError(
+            f"{record['token']}: this release has no twin of it, with the same name and subtype"
+        )
     if record["collision"] is None and other["collision"] is not None:
         record, other = other, record
     accident = accident_of(dataset, record)
@@ -290,7 +310,9 @@ def twin_diff(dataset: Dataset, scenario: RowArgument, parting: Parting | None =
     recordings = mine, shifted_recording(theirs, shift)
     matched = matched_rows(*recordings)
     rows = _rows_of_both(recordings, matched)
-    ids = np.column_stack([_taken(each.actor_id, rows[:, at], UNTRACKED_ID) for at, each in enumerate(recordings)])
+    ids = np.column_stack(
+        [_taken(each.actor_id, rows[:, at], UNTRACKED_ID) for at, each in enumerate(recordings)]
+    )
     codes = [_taken(each.category, rows[:, at], -1) for at, each in enumerate(recordings)]
     names = [{actor: name for name, actor in each.agents.items()} for each in recordings]
     first, second = (int(np.flatnonzero(ids[:, 0] == actor)[0]) for actor in accident.actor_ids)
@@ -299,9 +321,13 @@ def twin_diff(dataset: Dataset, scenario: RowArgument, parting: Parting | None =
         twin=other["token"],
         parting=parting or Parting(),
         actor_ids=ids,
-        categories=tuple(CATEGORIES[code] for code in np.where(codes[0] < 0, codes[1], codes[0]).tolist()),
+        categories=tuple(
+            CATEGORIES[code] for code in np.where(codes[0] < 0, codes[1], codes[0]).tolist()
+        ),
         agents=tuple(names[0].get(one) or names[1].get(two) for one, two in ids.tolist()),
-        matched_by=tuple(matched[row][1] if row in matched else None for row in rows[:, 0].tolist()),
+        matched_by=tuple(
+            matched[row][1] if row in matched else None for row in rows[:, 0].tolist()
+        ),
         num_frames=(record["num_frames"], other["num_frames"]),
         shift=shift,
         poses=_stacked(recordings, "poses", rows),
@@ -315,9 +341,12 @@ def _rows_of_both(
     recordings: tuple[TwinRecording, TwinRecording], matched: Mapping[int, tuple[int, MatchedBy]]
 ) -> IntArray:
     """(N, 2) rows of each actor in the two recordings, −1 for none: those of both first."""
-    both = np.array([(row, matched[row][0]) for row in sorted(matched)], dtype=np.int64).reshape(-1, 2)
+    both = np.array([(row, matched[row][0]) for row in sorted(matched)], dtype=np.int64).reshape(
+        -1, 2
+    )
     alone, alone_there = (
-        np.setdiff1d(np.arange(len(each.actor_id)), both[:, at]) for at, each in enumerate(recordings)
+        np.setdiff1d(np.arange(len(each.actor_id)), both[:, at])
+        for at, each in enumerate(recordings)
     )
     return np.concatenate(
         [
@@ -328,10 +357,14 @@ def _rows_of_both(
     )
 
 
-def _stacked(recordings: tuple[TwinRecording, TwinRecording], name: str, rows: IntArray) -> FloatArray:
+def _stacked(
+    recordings: tuple[TwinRecording, TwinRecording], name: str, rows: IntArray
+) -> FloatArray:
     """(2, N, F, …) a field of both recordings, as long as the longer one."""
     parts = [_taken(getattr(each, name), rows[:, at]) for at, each in enumerate(recordings)]
-    result = np.full((2, len(rows), max(part.shape[1] for part in parts), *parts[0].shape[2:]), np.nan)
+    result = np.full(
+        (2, len(rows), max(part.shape[1] for part in parts), *parts[0].shape[2:]), np.nan
+    )
     for at, part in enumerate(parts):
         result[at, :, : part.shape[1]] = part
     return result
@@ -378,7 +411,11 @@ class TwinReport(Report):
     def named_tables(self) -> dict[str, Iterable[Row]]:
         """`twins`, `twin_actors`, `torn_twins` and `skipped`; metres, seconds, m/s, radians."""
         told = [each.to_dict() for each in self.diffs]
-        actors = ((each["accident"], *map(actor.get, _OF_ACTORS)) for each in told for actor in each["actors"])
+        actors = (
+            (each["accident"], *map(actor.get, _OF_ACTORS))
+            for each in told
+            for actor in each["actors"]
+        )
         return {
             "twins": [_OF_TWINS, *([each[name] for name in _OF_TWINS] for each in told)],
             "twin_actors": [("accident", *_OF_ACTORS), *actors],
@@ -393,7 +430,15 @@ class TwinReport(Report):
         """A line for each accident."""
         blocks = [f"Twins: DeepAccident {self.version} at {self.dataroot} ({self.fingerprint})"]
         if self.diffs:
-            heading = ("accident", "parts at", "to impact", "first", "acting differently", "in one alone", "nearest")
+            heading = (
+                "accident",
+                "parts at",
+                "to impact",
+                "first",
+                "acting differently",
+                "in one alone",
+                "nearest",
+            )
             rows = [heading, *map(_line, self.diffs)]
             notes = "seconds from the first frame, and to the impact; nearest: the colliders' least gap in the twin (m)"
             apart = sum(not each.begins_together for each in self.diffs)
@@ -432,7 +477,11 @@ def twin_report(
     return twins_of(
         dataset,
         each_scenario(
-            partial(diff_of_accident, parting=parting or Parting()), dataset, scenarios, label="twins", **how
+            partial(diff_of_accident, parting=parting or Parting()),
+            dataset,
+            scenarios,
+            label="twins",
+            **how,
         ),
     )
 
@@ -458,7 +507,10 @@ def _first_to_part(diff: TwinDiff) -> str:
     """The actors that part first: two by name, agents before others."""
     rows = np.flatnonzero(diff.parting_frames == (diff.parting_frame or -1)).tolist()
     rows.sort(key=lambda row: diff.agents[row] is None)
-    names = [_who(diff.categories[row], diff.agents[row], diff.actor_ids[row, 0]) for row in rows[:_NAMED]]
+    names = [
+        _who(diff.categories[row], diff.agents[row], diff.actor_ids[row, 0])
+        for row in rows[:_NAMED]
+    ]
     more = f" and {len(rows) - _NAMED} more" if len(rows) > _NAMED else ""
     return f"{', '.join(names)}{more}"
 

@@ -8,4 +8,12 @@ from deepaccident_devkit.plugins.study.recipe import Recipe, read_recipe
 from deepaccident_devkit.plugins.study.run import run_study
 from deepaccident_devkit.plugins.study.summary import Counted, StudyReport, read_counts, summarised
 
-__all__ = ["Counted", "Recipe", "StudyReport", "read_counts", "read_recipe", "run_study", "summarised"]
+__all__ = [
+    "Counted",
+    "Recipe",
+    "StudyReport",
+    "read_counts",
+    "read_recipe",
+    "run_study",
+    "summarised",
+]

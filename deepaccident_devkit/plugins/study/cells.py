@@ -76,7 +76,9 @@ class Bench:
 
     def cell(self, kind: str, name: str, work: _Work, **decides: Any) -> StudyCell:
         """A cell, with all that decides it, as JSON holds it."""
-        return StudyCell(self, kind, name, digest_of({"devkit": __version__, "kind": kind, **decides}), work)
+        return StudyCell(
+            self, kind, name, digest_of({"devkit": __version__, "kind": kind, **decides}), work
+        )
 
     def split(self, scenarios: Sequence[str]) -> Path:
         """A split file of scenarios, named by what it holds."""
@@ -84,13 +86,17 @@ class Bench:
         write_split_file(path, scenarios)
         return path
 
-    def make(self, cells: Iterable[StudyCell], label: str, reads: tuple[Path, ...], **how: Unpack[Engine]) -> None:
+    def make(
+        self, cells: Iterable[StudyCell], label: str, reads: tuple[Path, ...], **how: Unpack[Engine]
+    ) -> None:
         """Make the cells that are not there, those of one key once; raises SomeFailedError and more, as `Store.run`.
 
         `reads` are folders outside that workers must see.
         """
         missing = {f"{each.kind}/{each.key}": each for each in cells if each.kept is None}
-        self.store.run(make, missing, label=label, places=Places(reads=reads, writes=(self.out,)), **how)
+        self.store.run(
+            make, missing, label=label, places=Places(reads=reads, writes=(self.out,)), **how
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,8 +141,14 @@ def make(cell: StudyCell) -> None:
         told = cell.work(cell.folder)
     except DeepAccidentError as error:
         raise type(error)(f"{cell.name}: {error}") from error
-    notes = {"seconds": round(time.monotonic() - began, 1), "machine": machine(cell.bench.device), **told}
-    cell.bench.store.keep(f"{cell.kind}/{cell.key}", cell.key, gzip.compress(json.dumps(notes).encode(), mtime=0))
+    notes = {
+        "seconds": round(time.monotonic() - began, 1),
+        "machine": machine(cell.bench.device),
+        **told,
+    }
+    cell.bench.store.keep(
+        f"{cell.kind}/{cell.key}", cell.key, gzip.compress(json.dumps(notes).encode(), mtime=0)
+    )
 
 
 def machine(device: str) -> str:
@@ -173,7 +185,10 @@ def trained(
     with one_thread():
         train(dataset, folder, choice, config, weights=start, device=device, also=also)
     log = read_log(folder)
-    return {"loss": fmean(row["loss"] for row in log[-50:]), "seconds": round(sum(row["seconds"] for row in log), 1)}
+    return {
+        "loss": fmean(row["loss"] for row in log[-50:]),
+        "seconds": round(sum(row["seconds"] for row in log), 1),
+    }
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -204,13 +219,22 @@ class Counting:
         for task, setup in self._setups.items():
             if task == "accident" and dataset.layout == "nuScenes":
                 continue  # it has none
-            run = evaluate_results(dataset, folder / RESULTS_NAMES[task], setup, self.selection, workers=1)
+            run = evaluate_results(
+                dataset, folder / RESULTS_NAMES[task], setup, self.selection, workers=1
+            )
             counts[str(task)] = dict(run.evaluator.counts)
-        motion, boxes = (read_results(folder / RESULTS_NAMES[task]) for task in ("motion", "detection"))
+        motion, boxes = (
+            read_results(folder / RESULTS_NAMES[task]) for task in ("motion", "detection")
+        )
         for token in self.selection.tokens(dataset):
-            moved, found = cast("Any", motion.prediction(token)), cast("Any", boxes.prediction(token))
+            moved, found = (
+                cast("Any", motion.prediction(token)),
+                cast("Any", boxes.prediction(token)),
+            )
             own = found.boxes.transform(dataset.world_from(token, "ego").inverse(), "ego")
-            hidden.update(token, dataset, self.labels, moved, DetectedBoxes(boxes=own, scores=found.scores))
+            hidden.update(
+                token, dataset, self.labels, moved, DetectedBoxes(boxes=own, scores=found.scores)
+            )
         return {"counts": {**counts, HIDDEN: dict(hidden.counts)}}
 
     @property
@@ -220,15 +244,26 @@ class Counting:
 
     def _predict(self, place: Path) -> None:
         labels, tokens, dataset = self.labels, self.selection.tokens(self.dataset), self.dataset
-        motion: Any = {"grid": labels.grid, "step": labels.step * FRAME_PERIOD, "labels": labels.protocol}
+        motion: Any = {
+            "grid": labels.grid,
+            "step": labels.step * FRAME_PERIOD,
+            "labels": labels.protocol,
+        }
         meta = {"method": self.row.name, "devkit": __version__}
         with replacing_folder(place) as folder, ExitStack() as stack:
             writers = [
-                ResultsWriter(folder / RESULTS_NAMES[task], task, meta=meta, **(motion if task == "motion" else {}))
+                ResultsWriter(
+                    folder / RESULTS_NAMES[task],
+                    task,
+                    meta=meta,
+                    **(motion if task == "motion" else {}),
+                )
                 for task in self._setups
             ]
             for writer in writers:
                 stack.enter_context(writer)
-            for token, found in predictions_of(self.row, self.weights, self.device, dataset, tokens, labels):
+            for token, found in predictions_of(
+                self.row, self.weights, self.device, dataset, tokens, labels
+            ):
                 for writer, each in zip(writers, cast("Any", found), strict=True):
                     writer.add(token, each)

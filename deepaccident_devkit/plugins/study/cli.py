@@ -28,9 +28,18 @@ Examples:
 @verb(epilog=_EXAMPLES)
 @click.argument("recipe")
 @click.argument("out", type=PATH)
-@click.option("--smoke", is_flag=True, help="Run the recipe's tiny version, of minutes; its numbers say nothing.")
+@click.option(
+    "--smoke",
+    is_flag=True,
+    help="Run the recipe's tiny version, of minutes; its numbers say nothing.",
+)
 @engine_parameters
-@click.option("--device", default="auto", show_default=True, help="cpu, cuda, …; auto takes a GPU where there is one.")
+@click.option(
+    "--device",
+    default="auto",
+    show_default=True,
+    help="cpu, cuda, …; auto takes a GPU where there is one.",
+)
 @figure_style_parameter
 @workers_kept()
 def study(recipe: str, out: Path, smoke: bool, device: str, **options: Any) -> None:

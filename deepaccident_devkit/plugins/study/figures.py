@@ -26,7 +26,13 @@ if TYPE_CHECKING:
 
 # Inches: the width of a panel.
 _PANEL: Final = 2.7
-_UNITS: Final = {"latency": "s", "pose_noise": "m", "packet_loss": "share", "budget": "bytes a frame", "horizon": "s"}
+_UNITS: Final = {
+    "latency": "s",
+    "pose_noise": "m",
+    "packet_loss": "share",
+    "budget": "bytes a frame",
+    "horizon": "s",
+}
 _NOTE: Final = "lines: intervals of 95 % over pairs; pale dots: seeds"
 
 
@@ -39,7 +45,12 @@ def rows_figure(summary: Mapping[str, Any]) -> Figure:
     rows = summary["rows"]
     fig, panels = _panels(summary, beside=1.8, height=1.2 + 0.26 * len(rows), sharey=True)
     for number, ax in panels.items():
-        _draw(ax, range(len(rows)), [each["groups"][ALL][number] for each in rows.values()], upright=False)
+        _draw(
+            ax,
+            range(len(rows)),
+            [each["groups"][ALL][number] for each in rows.values()],
+            upright=False,
+        )
         with_light_grid(ax, "x")
     first = next(iter(panels.values()))
     first.set_yticks(range(len(rows)), list(rows), fontsize=text_size())
@@ -80,7 +91,9 @@ def _panels(
     """A figure with a panel for each main number; inches of the room beside them, and of its height."""
     numbers = main_numbers(summary)[: 2 if current_style().room == "column" else None]
     fig = report_figure((beside + _PANEL * len(numbers), height), column=1.1)
-    panels = dict(zip(numbers, fig.subplots(1, len(numbers), squeeze=False, **shared)[0], strict=True))
+    panels = dict(
+        zip(numbers, fig.subplots(1, len(numbers), squeeze=False, **shared)[0], strict=True)
+    )
     for number, ax in panels.items():
         set_title(ax, NUMBERS[number][2], fontsize=text_size())
     fig.supxlabel(_NOTE, fontsize=text_size(), color=MUTED_COLOR)
@@ -97,12 +110,18 @@ def _draw(
     label: str = "",
 ) -> None:
     """Numbers with intervals and seeds at some places, joined by a line if they stand upright; what is None not."""
-    values, low, high = (np.array([each[name] for each in found], dtype=float) for name in ("value", "low", "high"))
+    values, low, high = (
+        np.array([each[name] for each in found], dtype=float) for name in ("value", "low", "high")
+    )
     at = np.array(list(places), dtype=float)
-    seeds = [(x, value) for x, each in zip(at, found, strict=True) for value in each["seeds"].values()]
+    seeds = [
+        (x, value) for x, each in zip(at, found, strict=True) for value in each["seeds"].values()
+    ]
     alone = np.array(seeds, dtype=float).reshape(-1, 2).T
     (ax.vlines if upright else ax.hlines)(at, low, high, color=color, linewidth=1.4)
-    ax.plot(*(alone if upright else alone[::-1]), "o", color=SERIES_COLORS[-1], markersize=3, zorder=1.5)
+    ax.plot(
+        *(alone if upright else alone[::-1]), "o", color=SERIES_COLORS[-1], markersize=3, zorder=1.5
+    )
     ax.plot(
         *((at, values) if upright else (values, at)),
         "o-" if upright else "o",

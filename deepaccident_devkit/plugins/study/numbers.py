@@ -66,7 +66,9 @@ EvaluatorsBySeed = Mapping[str, Evaluators]
 def setups_of(labels: str, horizon: float = 2.0) -> dict[ResultsTask, EvaluationSetup]:
     """Task → by which rules it is evaluated."""
     return {
-        "motion": EvaluationSetup(task="motion", protocol="paper", switches={"labels": labels}, horizon=horizon),
+        "motion": EvaluationSetup(
+            task="motion", protocol="paper", switches={"labels": labels}, horizon=horizon
+        ),
         "accident": EvaluationSetup(task="accident", protocol="boxes", horizon=horizon),
         "detection": EvaluationSetup(task="detection", protocol="paper", horizon=horizon),
     }
@@ -74,7 +76,10 @@ def setups_of(labels: str, horizon: float = 2.0) -> dict[ResultsTask, Evaluation
 
 def evaluators_of(labels: str) -> dict[str, Evaluator[Any]]:
     """New evaluators by these rules, which are the same for every horizon, and that of hidden actors."""
-    return {**{task: setup.evaluator() for task, setup in setups_of(labels).items()}, HIDDEN: HiddenActors()}
+    return {
+        **{task: setup.evaluator() for task, setup in setups_of(labels).items()},
+        HIDDEN: HiddenActors(),
+    }
 
 
 class HiddenActors(Evaluator[dict[str, float]]):
@@ -93,11 +98,18 @@ class HiddenActors(Evaluator[dict[str, float]]):
         return {"near": DETECTION_RADIUS, "least_score": LEAST_BOX_SCORE}
 
     def update(
-        self, token: str, dataset: Dataset, labels: MotionLabelConfig, motion: MotionOutput, boxes: DetectedBoxes
+        self,
+        token: str,
+        dataset: Dataset,
+        labels: MotionLabelConfig,
+        motion: MotionOutput,
+        boxes: DetectedBoxes,
     ) -> None:
         """Count a sample; the boxes are in its ego frame, the motion is given as instance maps, the last one counts."""
         if motion.instances is None:
-            raise EvaluationError(f"{token}: expected instance maps, found heads; read them from a results file")
+            raise EvaluationError(
+                f"{token}: expected instance maps, found heads; read them from a results file"
+            )
         drawn = motion_labels(dataset, token, labels).segmentation[0] > 0
         foreground = motion.grid.reorient(motion.instances[-1, 0] > 0, labels.grid.orientation)
         seen = seen_actors(dataset, token, agents=AVAILABLE, frame="ego")
@@ -106,16 +118,29 @@ class HiddenActors(Evaluator[dict[str, float]]):
         actors, hidden = center[chosen], (seen.seen_by[chosen] & own_bit) == 0
         found = boxes.boxes.center[boxes.scores >= LEAST_BOX_SCORE, :2]
         on_grid = found[labels.grid.index_of(found)[1]]
-        counts = {"cells": foreground, "false_cells": foreground & ~drawn, "false_boxes": ~_near(on_grid, center)}
+        counts = {
+            "cells": foreground,
+            "false_cells": foreground & ~drawn,
+            "false_boxes": ~_near(on_grid, center),
+        }
         on_map, detected = _at_cells(foreground, actors, labels), _near(actors, found)
         for who, those in {"hidden": hidden, "seen": ~hidden}.items():
-            counts |= {who: those, f"{who}_foreground": those & on_map, f"{who}_detected": those & detected}
+            counts |= {
+                who: those,
+                f"{who}_foreground": those & on_map,
+                f"{who}_detected": those & detected,
+            }
         self.add(token, {name: int(each.sum()) for name, each in counts.items()})
 
     def result_of(self, counts: Collection[Counts]) -> dict[str, float]:
         """Shares, and boxes a sample."""
-        of = {"false_foreground": ("false_cells", "cells"), **{name: (name, name.split("_")[0]) for name in _SHARES}}
-        shares = {name: ratio(total(counts, one), total(counts, all_)) for name, (one, all_) in of.items()}
+        of = {
+            "false_foreground": ("false_cells", "cells"),
+            **{name: (name, name.split("_")[0]) for name in _SHARES},
+        }
+        shares = {
+            name: ratio(total(counts, one), total(counts, all_)) for name, (one, all_) in of.items()
+        }
         return {**shares, "false_boxes": ratio(total(counts, "false_boxes"), len(counts))}
 
 
@@ -172,7 +197,9 @@ def numbers_of_rows(
     return {name: found[name] for name in NUMBERS if name in found}
 
 
-def _values(seeds: EvaluatorsBySeed, kind: str, tokens: Collection[str], paths: Iterable[str]) -> dict[str, FloatArray]:
+def _values(
+    seeds: EvaluatorsBySeed, kind: str, tokens: Collection[str], paths: Iterable[str]
+) -> dict[str, FloatArray]:
     """Return each seed's numbers (M,) at some samples, NaN for none."""
     values = {}
     for seed, evaluators in seeds.items():
@@ -181,10 +208,14 @@ def _values(seeds: EvaluatorsBySeed, kind: str, tokens: Collection[str], paths: 
     return values
 
 
-def _drawn(seeds: EvaluatorsBySeed, kind: str, clusters: Mapping[str, str], paths: Iterable[str]) -> FloatArray:
+def _drawn(
+    seeds: EvaluatorsBySeed, kind: str, clusters: Mapping[str, str], paths: Iterable[str]
+) -> FloatArray:
     """Return the draws (2P, M) of `intervals.draws_of_parts`, the mean of those of the seeds that have a number."""
     evaluators = [each[kind] for each in seeds.values()]
-    drawn = np.array([draws_of_parts(each, each.clustered(clusters), paths, RESAMPLING) for each in evaluators])
+    drawn = np.array(
+        [draws_of_parts(each, each.clustered(clusters), paths, RESAMPLING) for each in evaluators]
+    )
     return np.asarray(np.ma.masked_invalid(drawn).mean(axis=0).filled(math.nan))
 
 

@@ -27,12 +27,17 @@ def known_scenarios(learned: ReleaseScenarios, tested: ReleaseScenarios) -> list
     Twins and copies have the same actors, whatever the names of scenarios and files, and whichever frames there are.
     Within a release twins also have the same name.
     """
-    clusters = {cluster_of(token) for token in learned[1] if learned[0].dataroot == tested[0].dataroot}
+    clusters = {
+        cluster_of(token) for token in learned[1] if learned[0].dataroot == tested[0].dataroot
+    }
     with_ids = "nuScenes" not in (learned[0].layout, tested[0].layout)
     known, found = (_actors(*each, with_ids=with_ids) for each in (learned, tested))
     shown = []
     for token, actors in found.items():
-        shares = [len(actors & others) / max(min(len(actors), len(others)), _FEW) for others in known.values()]
+        shares = [
+            len(actors & others) / max(min(len(actors), len(others)), _FEW)
+            for others in known.values()
+        ]
         if cluster_of(token) in clusters or max(shares, default=0.0) >= _LEAST_SHARE:
             shown.append(token)
     return shown
@@ -49,5 +54,7 @@ def _actors(dataset: Dataset, scenarios: Collection[str], *, with_ids: bool) -> 
     found = {}
     for token in scenarios:
         own = instances["scenario_row"] == dataset.getind("scenario", token)
-        found[token] = {tuple(actor) for actor in actors[own].tolist() if 0 <= actor[0] < STATIC_ACTOR_ID}
+        found[token] = {
+            tuple(actor) for actor in actors[own].tolist() if 0 <= actor[0] < STATIC_ACTOR_ID
+        }
     return found

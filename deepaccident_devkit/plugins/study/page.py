@@ -53,7 +53,9 @@ def save_study(report: StudyReport, counted: Counted, folder: str | os.PathLike[
 
 def study_html(summary: Mapping[str, Any], figures: Sequence[tuple[Path, str]]) -> str:
     """The complete page; `figures` are PNG files, which become part of it, with what they show."""
-    words = "Intervals of 95 %, over pairs of an accident and its twin; the tables have the numbers."
+    words = (
+        "Intervals of 95 %, over pairs of an accident and its twin; the tables have the numbers."
+    )
     tested, groups = summary["groups"][ALL], [group for group in summary["groups"] if group != ALL]
     return document(
         "study.html",
@@ -62,16 +64,23 @@ def study_html(summary: Mapping[str, Any], figures: Sequence[tuple[Path, str]]) 
         header={
             "question": summary["question"],
             "test": f"{tested['samples']:,} samples of {tested['pairs']:,} pairs of an accident and its twin"
-            + ", which the training may have shown" * summary["recipe"]["test"]["includes_training"],
+            + ", which the training may have shown"
+            * summary["recipe"]["test"]["includes_training"],
             "recipe": summary["recipe"]["name"],
             "devkit": summary["devkit"],
             "hours of one process": f"{sum(each['seconds'] for each in summary['cells']) / 3600:.2f}",
             "made on": "; ".join(sorted({each["machine"] for each in summary["cells"]})),
         },
-        pictures=[(read_bytes(path, "image"), f"{said} {words}", f"{said} {words}") for path, said in figures],
+        pictures=[
+            (read_bytes(path, "image"), f"{said} {words}", f"{said} {words}")
+            for path, said in figures
+        ],
         numbers=[NUMBERS[number][2] for number in known_numbers(summary)],
         rows=[
-            [name, *(_cell(each["groups"][ALL][number], number) for number in known_numbers(summary))]
+            [
+                name,
+                *(_cell(each["groups"][ALL][number], number) for number in known_numbers(summary)),
+            ]
             for name, each in summary["rows"].items()
         ],
         comparisons=[
@@ -109,5 +118,8 @@ def study_html(summary: Mapping[str, Any], figures: Sequence[tuple[Path, str]]) 
 
 def _cell(found: Mapping[str, Any], number: str) -> tuple[str, str]:
     """A number with its interval, and below it those of single seeds."""
-    alone = (number_with_interval({"value": each, "low": None}, number) for each in found["seeds"].values())
+    alone = (
+        number_with_interval({"value": each, "low": None}, number)
+        for each in found["seeds"].values()
+    )
     return number_with_interval(found, number), ", ".join(alone)

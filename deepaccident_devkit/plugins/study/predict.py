@@ -34,7 +34,12 @@ Predicted = tuple[MotionOutput, list[Accident], DetectedBoxes]
 
 
 def predictions_of(
-    row: StudyRow, weights: Path | None, device: str, dataset: Dataset, tokens: Sequence[str], labels: MotionLabelConfig
+    row: StudyRow,
+    weights: Path | None,
+    device: str,
+    dataset: Dataset,
+    tokens: Sequence[str],
+    labels: MotionLabelConfig,
 ) -> Iterator[tuple[str, Predicted]]:
     """Predict samples, one after another; yields their tokens, too.
 
@@ -58,28 +63,50 @@ def predictions_of(
         yield token, _without_model(row, dataset, token, labels)
 
 
-def _without_model(row: StudyRow, dataset: Dataset, token: str, labels: MotionLabelConfig) -> Predicted:
+def _without_model(
+    row: StudyRow, dataset: Dataset, token: str, labels: MotionLabelConfig
+) -> Predicted:
     step, seeing = labels.step * FRAME_PERIOD, dict[str, Any](agents=row.cooperating, link=row.link)
     if row.baseline is not None:
         motion = predict_motion(dataset, token, model=row.baseline, config=labels, **seeing)
-        ahead = predict_accidents(dataset, token, model=row.baseline, horizon=labels.future_frames * step, **seeing)
+        ahead = predict_accidents(
+            dataset, token, model=row.baseline, horizon=labels.future_frames * step, **seeing
+        )
         return motion, ahead, predict_detections(dataset, token, **seeing)
     if row.trivial == "labels":
         told = motion_labels(dataset, token, replace(labels, agents=row.cooperating)).to_present()
         seen = {OWN_BOX_ID, *visible_actors(dataset, token, **seeing).tolist()}
-        known = [number for actor, number in told.id_map.items() if actor in seen]  # not who comes into sight later
+        known = [
+            number for actor, number in told.id_map.items() if actor in seen
+        ]  # not who comes into sight later
         motion = MotionOutput(
-            grid=labels.grid, instances=np.where(np.isin(told.instance, known), told.instance, 0)[None]
+            grid=labels.grid,
+            instances=np.where(np.isin(told.instance, known), told.instance, 0)[None],
         )
         foreseen = foreseen_accident(motion, step=step, labels=str(labels.protocol))
-        return motion, [] if foreseen is None else [foreseen], predict_detections(dataset, token, **seeing)
-    maps = np.full((1, labels.label_frames, *labels.grid.shape), row.trivial == "everything", dtype=np.int32)
+        return (
+            motion,
+            [] if foreseen is None else [foreseen],
+            predict_detections(dataset, token, **seeing),
+        )
+    maps = np.full(
+        (1, labels.label_frames, *labels.grid.shape), row.trivial == "everything", dtype=np.int32
+    )
     empty = Boxes.from_arrays(np.zeros((0, 3)), np.zeros((0, 3)), [], frame="world")
-    return MotionOutput(grid=labels.grid, instances=maps), [], DetectedBoxes(boxes=empty, scores=np.zeros(0))
+    return (
+        MotionOutput(grid=labels.grid, instances=maps),
+        [],
+        DetectedBoxes(boxes=empty, scores=np.zeros(0)),
+    )
 
 
 def _by_model(
-    row: StudyRow, weights: Path, device: str, dataset: Dataset, tokens: Sequence[str], labels: MotionLabelConfig
+    row: StudyRow,
+    weights: Path,
+    device: str,
+    dataset: Dataset,
+    tokens: Sequence[str],
+    labels: MotionLabelConfig,
 ) -> Iterator[tuple[str, Predicted]]:
     from deepaccident_devkit.plugins.model import PredictConfig, load_model, predictions
     from deepaccident_devkit.plugins.model.results import prediction_of
@@ -97,7 +124,9 @@ def _by_model(
     else:
         given = model.config.inputs(config.agents, link=config.link)
         items: Any = V2XDataset(dataset, tokens, given)
-        foreign: Any = V2XDataset(dataset, strangers_of(tokens), given) if row.control == "strangers" else None
+        foreign: Any = (
+            V2XDataset(dataset, strangers_of(tokens), given) if row.control == "strangers" else None
+        )
         changed = (
             blanked(items[at]) if foreign is None else with_strangers(items[at], foreign[at])
             for at in range(len(items))
@@ -108,7 +137,9 @@ def _by_model(
             ahead = (
                 each.accidents
                 if row.baseline is None
-                else detected_accidents(dataset, each.token, each.boxes, horizon=model.config.horizon)
+                else detected_accidents(
+                    dataset, each.token, each.boxes, horizon=model.config.horizon
+                )
             )
             yield each.token, (each.motion, ahead, each.boxes)
 
@@ -123,17 +154,28 @@ def strangers_of(tokens: Sequence[str]) -> list[str]:
         scenarios.setdefault(scenario_of(token), []).append(token)
     names, chosen = list(scenarios), []
     for at, name in enumerate(names):
-        other = next((each for each in names[at:] + names[:at] if cluster_of(each) != cluster_of(name)), None)
+        other = next(
+            (each for each in names[at:] + names[:at] if cluster_of(each) != cluster_of(name)), None
+        )
         if other is None:
-            raise NotAvailableError(f"{name}: there is no other pair to take strangers from; test on several pairs")
-        chosen += [scenarios[other][min(rank, len(scenarios[other]) - 1)] for rank in range(len(scenarios[name]))]
+            raise NotAvailableError(
+                f"{name}: there is no other pair to take strangers from; test on several pairs"
+            )
+        chosen += [
+            scenarios[other][min(rank, len(scenarios[other]) - 1)]
+            for rank in range(len(scenarios[name]))
+        ]
     return chosen
 
 
 def blanked(item: Mapping[str, Any]) -> dict[str, Any]:
     """An item of `V2XDataset` with all images black, and no point in any cloud."""
     images = {name: item[name] * 0 for name in ("images",) if name in item}
-    points = {name: [[cloud[:0] for cloud in each] for each in item[name]] for name in ("points",) if name in item}
+    points = {
+        name: [[cloud[:0] for cloud in each] for each in item[name]]
+        for name in ("points",)
+        if name in item
+    }
     return {**item, **images, **points}
 
 

@@ -47,7 +47,9 @@ _LISTS: Final = ("agents", "horizon", *_EFFECTS)
 # Rows of a recipe, when each list has become a row for each of its values.
 MOST_ROWS: Final = 1000
 # Up to 100 numbers that fit into torch's generator.
-StudySeeds = Annotated[tuple[Annotated[int, msgspec.Meta(ge=0, lt=1 << 62)], ...], msgspec.Meta(max_length=100)]
+StudySeeds = Annotated[
+    tuple[Annotated[int, msgspec.Meta(ge=0, lt=1 << 62)], ...], msgspec.Meta(max_length=100)
+]
 
 
 class _Part(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -145,7 +147,9 @@ class StudyRow(_Part, frozen=True, kw_only=True):
     @property
     def link(self) -> Link | None:
         """What happens to partners' data; None for nothing. Raises ConfigError."""
-        chosen: dict[str, Any] = {name: getattr(self, name) for name in _EFFECTS if getattr(self, name)}
+        chosen: dict[str, Any] = {
+            name: getattr(self, name) for name in _EFFECTS if getattr(self, name)
+        }
         if self.budget:
             chosen["payload"] = "bev" if self.weights else "boxes"
         return Link(**chosen) if chosen else None
@@ -153,13 +157,17 @@ class StudyRow(_Part, frozen=True, kw_only=True):
     @property
     def faults(self) -> list[str]:
         """What does not go together."""
-        kinds = [name for name in ("weights", "baseline", "trivial") if getattr(self, name) is not None]
+        kinds = [
+            name for name in ("weights", "baseline", "trivial") if getattr(self, name) is not None
+        ]
         told = {
             "expected one of weights, baseline and trivial, or weights and the baseline constant_velocity, found "
             f"{' and '.join(kinds) or 'none'}": len(kinds) != 1
             and (kinds, self.baseline) != (["weights", "baseline"], "constant_velocity"),
-            "control: spoils what a model sees; leave it out, or give weights": self.control and not self.weights,
-            "horizon: is what the weights were trained for; leave it out here": self.horizon and self.weights,
+            "control: spoils what a model sees; leave it out, or give weights": self.control
+            and not self.weights,
+            "horizon: is what the weights were trained for; leave it out here": self.horizon
+            and self.weights,
             "control, budget: do not go together; leave one out": self.control and self.budget,
         }
         return [each for each, found in told.items() if found]
@@ -259,10 +267,15 @@ def read_recipe(recipe: str, *, smoke: bool = False) -> Recipe:
     path = Path(recipe)
     if path.suffix not in (".yaml", ".yml"):
         known = sorted(each.stem for each in SHIPPED_RECIPES.glob("*.yaml"))
-        path = SHIPPED_RECIPES / f"{choice('RECIPE, which is no file .yaml', recipe, known, error=ConfigError)}.yaml"
+        path = (
+            SHIPPED_RECIPES
+            / f"{choice('RECIPE, which is no file .yaml', recipe, known, error=ConfigError)}.yaml"
+        )
     try:
         text = read_bytes(path, "spec").decode().strip()
-        if len(text) > 100_000:  # those that ship have up to 3,000; PyYAML would read more for many seconds
+        if (
+            len(text) > 100_000
+        ):  # those that ship have up to 3,000; PyYAML would read more for many seconds
             raise ConfigError(f"{path}: has more than 100,000 characters; split the study")
         told = _plain(parse_yaml(text or "{}", str(path)))
     except (OSError, UnicodeDecodeError) as error:
@@ -271,7 +284,9 @@ def read_recipe(recipe: str, *, smoke: bool = False) -> Recipe:
         file = as_record(told, _File)
         if smoke and not file.smoke:
             raise ConfigError("smoke: is missing; write this part, or leave out --smoke")
-        chosen = _merged(told, file.smoke if smoke else {}) | {"name": f"{path.stem}{'-smoke' * smoke}"}
+        chosen = _merged(told, file.smoke if smoke else {}) | {
+            "name": f"{path.stem}{'-smoke' * smoke}"
+        }
         chosen.pop("smoke", None)
         file = as_record(chosen, _File)
         count = sum(math.prod(map(len, _lists(row).values())) for row in file.rows)
@@ -300,7 +315,11 @@ def recipe_place(path: Path | str, place: str) -> Iterator[None]:
 def synth_config_of(source: Mapping[str, Any]) -> SynthConfig | None:
     """How a release is made; None for one that is there. Raises ConfigError, ChoiceError or ValueError."""
     own = "dataroot" in source
-    possible = ("dataroot", "version") if own else [NUSCENES, *(each.name for each in dataclasses.fields(SynthConfig))]
+    possible = (
+        ("dataroot", "version")
+        if own
+        else [NUSCENES, *(each.name for each in dataclasses.fields(SynthConfig))]
+    )
     for key in source:
         choice("key", key, possible)
     given = {**source, "spec": Path(source["spec"])} if source.get("spec") else dict(source)
@@ -327,7 +346,9 @@ def _checked(path: Path, recipe: Recipe) -> Recipe:
         with recipe_place(path, f"rows: {row.name}"):
             _check_row(row, recipe)
             if names[row.name] > 1:
-                raise ConfigError("name: is there twice; name the keys that have lists in it, such as {agents}")
+                raise ConfigError(
+                    "name: is there twice; name the keys that have lists in it, such as {agents}"
+                )
     with recipe_place(path, "test.where, groups"):
         for text in chain(test.where, *recipe.groups.values()):
             parse_where(text)
@@ -354,13 +375,17 @@ def _check_plan(recipe: Recipe, name: str, above: Collection[Any]) -> None:
     _check_name("also", plan.also, (None, *recipe.releases))
     _check_name("from, which stands above", plan.start, above)
     if not 0 < plan.mix < 1:
-        raise ConfigError(f"mix: expected a share between 0 and 1 of all moments, found {plan.mix!r}")
+        raise ConfigError(
+            f"mix: expected a share between 0 and 1 of all moments, found {plan.mix!r}"
+        )
 
 
 def _check_name(kind: str, name: str | None, names: Collection[str | None]) -> None:
     """Raise ChoiceError if a name is none of these, and ConfigError if it is spelled in another way."""
     if choice(kind, name, names) != name:
-        raise ConfigError(f"{kind}: found {name!r}; write it with the same capital letters everywhere")
+        raise ConfigError(
+            f"{kind}: found {name!r}; write it with the same capital letters everywhere"
+        )
 
 
 def _check_row(row: StudyRow, recipe: Recipe) -> None:

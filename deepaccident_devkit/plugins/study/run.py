@@ -31,7 +31,13 @@ from deepaccident_devkit.plugins.study.recipe import (
     recipe_place,
     synth_config_of,
 )
-from deepaccident_devkit.plugins.study.summary import ALL, Counted, StudyReport, counted_of, summarised
+from deepaccident_devkit.plugins.study.summary import (
+    ALL,
+    Counted,
+    StudyReport,
+    counted_of,
+    summarised,
+)
 from deepaccident_devkit.plugins.synth import make_release
 from deepaccident_devkit.plugins.synth.generate import file_text
 from deepaccident_devkit.release.fingerprints import fingerprint, scenario_hashes
@@ -87,11 +93,16 @@ def run_study(
 
         device = checked_device(device)
     bench = Bench(writable_folder(out).absolute(), device if recipe.weights else "cpu")
-    engine: Any = {**how, "workers": how.get("workers") or (1 if device.startswith("cuda") else usable_cores())}
+    engine: Any = {
+        **how,
+        "workers": how.get("workers") or (1 if device.startswith("cuda") else usable_cores()),
+    }
     with bench.store.shared():
         releases = {name: _release(bench, name, recipe, **how) for name in recipe.releases}
         test, dataset = recipe.test, releases[recipe.test.release][1]
-        tested = _matching(dataset, test.where, _scenarios(dataset, test.split), recipe, "test.where")
+        tested = _matching(
+            dataset, test.where, _scenarios(dataset, test.split), recipe, "test.where"
+        )
         if not test.includes_training:
             _refuse_known_tests(recipe, releases, (dataset, tested))
         weights = _weights(recipe, bench, releases, **engine)
@@ -111,7 +122,12 @@ def run_study(
             | {name: value for name, value in (each.kept or {}).items() if name != "counts"}
             for each in cells
         ]
-    summary = {**summarised(counted), "recipe": msgspec.to_builtins(recipe), "devkit": __version__, "cells": notes}
+    summary = {
+        **summarised(counted),
+        "recipe": msgspec.to_builtins(recipe),
+        "devkit": __version__,
+        "cells": notes,
+    }
     report = StudyReport(summary=json.loads(json.dumps(summary)))
     save_study(report, counted, bench.out / recipe.name)
     return report
@@ -124,7 +140,9 @@ def _release(bench: Bench, name: str, recipe: Recipe, **how: Unpack[Engine]) -> 
         dataset = _opened(source)
         told = {**source, "release": release_note(dataset, _scenarios(dataset))}
     else:
-        settings = {name: each for name, each in asdict(config).items() if _LATER.get(name, ...) != each}
+        settings = {
+            name: each for name, each in asdict(config).items() if _LATER.get(name, ...) != each
+        }
         told = {**settings, "spec": config.spec and file_text(config.spec)}
         if source.get(NUSCENES):
             told[NUSCENES] = True
@@ -155,7 +173,10 @@ def _made(source: Mapping[str, Any], how: Any, folder: Path) -> dict[str, Any]:
         form = NuScenes(agents=AGENTS[:1], lidar_axes="nuscenes", sweeps=False)
         export_release(DeepAccident("v1", release, verbose=False), folder / NUSCENES, form, **how)
     folder.mkdir(parents=True, exist_ok=True)  # of one that was there it has nothing
-    dataset, engine = _opened(source, folder), {name: each for name, each in how.items() if name != "progress"}
+    dataset, engine = (
+        _opened(source, folder),
+        {name: each for name, each in how.items() if name != "progress"},
+    )
     hashes = scenario_hashes(dataset, _scenarios(dataset), **engine)
     return {"scenarios": len(hashes), "fingerprint": fingerprint(hashes)}
 
@@ -166,11 +187,17 @@ def _scenarios(dataset: DeepAccident, split: str = "all") -> list[str]:
     return [record["token"] for record in dataset.scenario if record["token"] in chosen]
 
 
-def _refuse_known_tests(recipe: Recipe, releases: Mapping[str, _Release], tested: ReleaseScenarios) -> None:
+def _refuse_known_tests(
+    recipe: Recipe, releases: Mapping[str, _Release], tested: ReleaseScenarios
+) -> None:
     """Raise ConfigError if a training shows scenarios of the test, or their twins."""
     for name in recipe.weights:
         plan = recipe.plan(name)
-        splits = (plan.release, plan.split), (plan.release, plan.validation), (plan.also, plan.also_split)
+        splits = (
+            (plan.release, plan.split),
+            (plan.release, plan.validation),
+            (plan.also, plan.also_split),
+        )
         for release, split in splits:
             if release and split:
                 with recipe_place(recipe.name, f"weights.{name}"):
@@ -195,16 +222,30 @@ def _weights(
             found[name] = _seeds(name, recipe, bench, releases, found)
     places = tuple(place for _, dataset in releases.values() for place in dataset.places)
     for depth in range(max(depths.values()) + 1):
-        together = [cell for name, (_, cells) in found.items() if depths[name] == depth for cell in cells.values()]
+        together = [
+            cell
+            for name, (_, cells) in found.items()
+            if depths[name] == depth
+            for cell in cells.values()
+        ]
         bench.make(together, "weights", places, **how)
     return found
 
 
 def _seeds(
-    name: str, recipe: Recipe, bench: Bench, releases: Mapping[str, _Release], others: Mapping[str, _Weights]
+    name: str,
+    recipe: Recipe,
+    bench: Bench,
+    releases: Mapping[str, _Release],
+    others: Mapping[str, _Weights],
 ) -> _Weights:
     """The weights of one name; raises ConfigError, ChoiceError or ValueError."""
-    from deepaccident_devkit.plugins.model import ModelChoice, SecondSource, TrainConfig, read_weights
+    from deepaccident_devkit.plugins.model import (
+        ModelChoice,
+        SecondSource,
+        TrainConfig,
+        read_weights,
+    )
 
     plan, given = recipe.plan(name), recipe.weights[name]
     if plan.file is not None:
@@ -212,7 +253,9 @@ def _seeds(
         cell = bench.cell("weights", name, partial(taken, read.path), file=file_checksum(read.path))
         return ModelChoice.from_dict(read.meta, read.path), {"": cell}
     release, dataset = releases[plan.release]
-    models, trainings = ([each.name for each in fields(kind)] for kind in (ModelChoice, TrainConfig))
+    models, trainings = (
+        [each.name for each in fields(kind)] for kind in (ModelChoice, TrainConfig)
+    )
     told: dict[str, Any] = {}
     second = None
     if plan.also is not None:
@@ -226,19 +269,35 @@ def _seeds(
         choice(
             "key",
             key,
-            [each for each in (*TrainingPlan.__struct_encode_fields__, *models, *trainings) if each != "seed"],
+            [
+                each
+                for each in (*TrainingPlan.__struct_encode_fields__, *models, *trainings)
+                if each != "seed"
+            ],
         )
     inherited, starts = others[plan.start] if plan.start else (ModelChoice(), {})
-    model = as_record({**inherited.as_dict(), **{key: given[key] for key in models if key in given}}, ModelChoice)
+    model = as_record(
+        {**inherited.as_dict(), **{key: given[key] for key in models if key in given}}, ModelChoice
+    )
     split, cells = bench.split(_scenarios(dataset, plan.split)), {}
     for seed in recipe.seeds:
         training = {key: given[key] for key in trainings if key in given}
-        config = as_record({"validation": None, **training, "split": str(split), "seed": seed}, TrainConfig)
+        config = as_record(
+            {"validation": None, **training, "split": str(split), "seed": seed}, TrainConfig
+        )
         first = starts.get(str(seed), starts.get(""))
         cells[str(seed)] = bench.cell(
             "weights",
             f"{name}, seed {seed}",
-            partial(trained, dataset, model, config, None if first is None else first.folder, second, bench.device),
+            partial(
+                trained,
+                dataset,
+                model,
+                config,
+                None if first is None else first.folder,
+                second,
+                bench.device,
+            ),
             release=release.key,
             model=model.as_dict(),
             training={**config.as_dict(), "split": split.name},
@@ -249,12 +308,17 @@ def _seeds(
 
 
 def _rows(
-    recipe: Recipe, bench: Bench, release: _Release, weights: Mapping[str, _Weights], scenarios: Sequence[str]
+    recipe: Recipe,
+    bench: Bench,
+    release: _Release,
+    weights: Mapping[str, _Weights],
+    scenarios: Sequence[str],
 ) -> dict[str, dict[str, StudyCell]]:
     """Row → seed → its cell, all at the same samples of some scenarios."""
     (cell, dataset), test, found = release, recipe.test, {}
     horizons = {
-        row.name: (weights[row.weights][0] if row.weights else row).horizon or DEFAULT_HORIZON for row in recipe.rows
+        row.name: (weights[row.weights][0] if row.weights else row).horizon or DEFAULT_HORIZON
+        for row in recipe.rows
     }
     selection = SampleSelection(
         split=str(bench.split(scenarios)),
@@ -268,9 +332,15 @@ def _rows(
             raise ConfigError("where: no pair of scenarios matches; change the filters")
         selection.tokens(dataset)
     for row in recipe.rows:
-        seeds: Mapping[str, StudyCell | None] = weights[row.weights][1] if row.weights else {"": None}
+        seeds: Mapping[str, StudyCell | None] = (
+            weights[row.weights][1] if row.weights else {"": None}
+        )
         labels, told = test.label_config(horizons[row.name]), msgspec.to_builtins(row)
-        decides = {key: each for key, each in told.items() if key not in ("name", "weights", "over", "horizon")}
+        decides = {
+            key: each
+            for key, each in told.items()
+            if key not in ("name", "weights", "over", "horizon")
+        }
         found[row.name] = {
             seed: bench.cell(
                 "row",
@@ -295,7 +365,11 @@ def _rows(
 
 
 def _matching(
-    dataset: DeepAccident, where: Sequence[str], scenarios: Iterable[str], recipe: Recipe, place: str
+    dataset: DeepAccident,
+    where: Sequence[str],
+    scenarios: Iterable[str],
+    recipe: Recipe,
+    place: str,
 ) -> list[str]:
     """Those scenarios of whose pair one matches all filters; raises ConfigError."""
     with recipe_place(recipe.name, place):
@@ -303,7 +377,9 @@ def _matching(
     return [token for token in scenarios if cluster_of(token) in pairs]
 
 
-def _counted(recipe: Recipe, dataset: DeepAccident, rows: Mapping[str, Mapping[str, StudyCell]]) -> Counted:
+def _counted(
+    recipe: Recipe, dataset: DeepAccident, rows: Mapping[str, Mapping[str, StudyCell]]
+) -> Counted:
     """What was counted of all rows, and the groups of samples."""
     told = {
         "title": recipe.title,
@@ -313,14 +389,22 @@ def _counted(recipe: Recipe, dataset: DeepAccident, rows: Mapping[str, Mapping[s
         "compare": [list(pair) for pair in recipe.pairs],
         "over": {row.name: row.over and list(row.over) for row in recipe.rows},
     }
-    counts = {name: {seed: (cell.kept or {})["counts"] for seed, cell in of.items()} for name, of in rows.items()}
+    counts = {
+        name: {seed: (cell.kept or {})["counts"] for seed, cell in of.items()}
+        for name, of in rows.items()
+    }
     tokens = sorted(next(iter(next(iter(counts.values())).values()))[HIDDEN])
     groups = {ALL: tokens}
     for name, where in recipe.groups.items():
-        matching = set(_matching(dataset, where, map(scenario_of, tokens), recipe, f"groups.{name}"))
+        matching = set(
+            _matching(dataset, where, map(scenario_of, tokens), recipe, f"groups.{name}")
+        )
         groups[name] = [token for token in tokens if scenario_of(token) in matching]
     attributes = sample_attributes(dataset, tokens) if recipe.by else {}
     for by in recipe.by:
         values = tokens_by_value(attributes, by)
-        groups |= {f"{by}={value or 'unknown'}": values[value] for value in sorted(values, key=natural_order)}
+        groups |= {
+            f"{by}={value or 'unknown'}": values[value]
+            for value in sorted(values, key=natural_order)
+        }
     return counted_of(counts, groups, told)

@@ -60,13 +60,18 @@ def write_counts(counted: Counted, path: str | os.PathLike[str]) -> None:
     """Write all counts, packed; the same ones give the same bytes."""
     rows = {
         name: {
-            seed: {kind: {token: each.counts[token] for token in sorted(each.tokens)} for kind, each in of.items()}
+            seed: {
+                kind: {token: each.counts[token] for token in sorted(each.tokens)}
+                for kind, each in of.items()
+            }
             for seed, of in seeds.items()
         }
         for name, seeds in counted.rows.items()
     }
     told = {**counted.told, "groups": counted.groups, "rows": rows}
-    write_bytes(path_of(path), gzip.compress(json.dumps(told, separators=(",", ":")).encode(), mtime=0))
+    write_bytes(
+        path_of(path), gzip.compress(json.dumps(told, separators=(",", ":")).encode(), mtime=0)
+    )
 
 
 def read_counts(path: str | os.PathLike[str]) -> Counted:
@@ -76,11 +81,15 @@ def read_counts(path: str | os.PathLike[str]) -> Counted:
         told = parsed_json(gzip.decompress(read_bytes(source, "results")), constants=True)
         return counted_of(told.pop("rows"), told.pop("groups"), told)
     except (OSError, EOFError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise ResultsError(f"{source}: no counts of a study ({fault_text(error)}); run the study again") from error
+        raise ResultsError(
+            f"{source}: no counts of a study ({fault_text(error)}); run the study again"
+        ) from error
 
 
 def counted_of(
-    counts: Mapping[str, Mapping[str, Any]], groups: Mapping[str, Sequence[str]], told: Mapping[str, Any]
+    counts: Mapping[str, Mapping[str, Any]],
+    groups: Mapping[str, Sequence[str]],
+    told: Mapping[str, Any],
 ) -> Counted:
     """From row → seed → what evaluates → token → counts."""
     rows: dict[str, dict[str, Evaluators]] = {}
@@ -107,7 +116,9 @@ def summarised(counted: Counted) -> dict[str, Any]:
         {
             "row": row,
             "less": less,
-            "groups": {group: numbers_of_rows(tokens, rows[row], rows[less]) for group, tokens in groups},
+            "groups": {
+                group: numbers_of_rows(tokens, rows[row], rows[less]) for group, tokens in groups
+            },
         }
         for row, less in counted.told["compare"]
     ]
@@ -117,7 +128,10 @@ def summarised(counted: Counted) -> dict[str, Any]:
         "question": counted.told["question"],
         "headline": None if headline is None else _headline(headline, comparisons),
         "groups": {
-            group: {"samples": len(tokens), "pairs": len({cluster_of(scenario_of(token)) for token in tokens})}
+            group: {
+                "samples": len(tokens),
+                "pairs": len({cluster_of(scenario_of(token)) for token in tokens}),
+            }
             for group, tokens in groups
         },
         "rows": {
@@ -131,11 +145,15 @@ def summarised(counted: Counted) -> dict[str, Any]:
     }
 
 
-def _headline(headline: Mapping[str, Any], comparisons: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
+def _headline(
+    headline: Mapping[str, Any], comparisons: Iterable[Mapping[str, Any]]
+) -> dict[str, Any]:
     """With what came out."""
     row, less, number, where = (headline[name] for name in ("row", "less", "number", "where"))
     found = next(
-        each["groups"][where or ALL][number] for each in comparisons if (each["row"], each["less"]) == (row, less)
+        each["groups"][where or ALL][number]
+        for each in comparisons
+        if (each["row"], each["less"]) == (row, less)
     )
     size, said = difference_text(found, number), NUMBERS[number][2]
     told = _WORDS[verdict(found)].format(row=f"`{row}`", less=f"`{less}`", number=said, size=size)
@@ -148,7 +166,11 @@ def number_with_interval(found: Mapping[str, Any], number: str) -> str:
     digits = 1 if NUMBERS[number][2].endswith("(%)") else 2
     if found["value"] is None:
         return "–"
-    ends = "" if found["low"] is None else f" [{fixed_text(found['low'], digits)}, {fixed_text(found['high'], digits)}]"
+    ends = (
+        ""
+        if found["low"] is None
+        else f" [{fixed_text(found['low'], digits)}, {fixed_text(found['high'], digits)}]"
+    )
     return fixed_text(found["value"], digits) + ends
 
 
@@ -186,25 +208,54 @@ class StudyReport(Report):
     def named_tables(self) -> Mapping[str, Iterable[Row]]:
         """`rows` and `comparisons`: a line for each number in each group."""
         rows = [((name,), each["groups"]) for name, each in self.summary["rows"].items()]
-        pairs = [((each["row"], each["less"]), each["groups"]) for each in self.summary["comparisons"]]
-        return {"rows": self._table(("row",), rows), "comparisons": self._table(("row", "less"), pairs)}
+        pairs = [
+            ((each["row"], each["less"]), each["groups"]) for each in self.summary["comparisons"]
+        ]
+        return {
+            "rows": self._table(("row",), rows),
+            "comparisons": self._table(("row", "less"), pairs),
+        }
 
-    def _table(self, heads: tuple[str, ...], lines: Sequence[tuple[tuple[str, ...], Any]]) -> Iterator[Row]:
+    def _table(
+        self, heads: tuple[str, ...], lines: Sequence[tuple[tuple[str, ...], Any]]
+    ) -> Iterator[Row]:
         seeds = list(
-            dict.fromkeys(seed for _, groups in lines for each in groups[ALL].values() for seed in each["seeds"])
+            dict.fromkeys(
+                seed
+                for _, groups in lines
+                for each in groups[ALL].values()
+                for seed in each["seeds"]
+            )
         )
-        yield (*heads, "group", "number", "value", "low", "high", *(f"seed {seed}" for seed in seeds))
+        yield (
+            *heads,
+            "group",
+            "number",
+            "value",
+            "low",
+            "high",
+            *(f"seed {seed}" for seed in seeds),
+        )
         for names, groups in lines:
             for group, numbers in groups.items():
                 for number, each in numbers.items():
                     ends = (each[name] for name in ("value", "low", "high"))
-                    yield (*names, group, number, *ends, *(each["seeds"].get(seed) for seed in seeds))
+                    yield (
+                        *names,
+                        group,
+                        number,
+                        *ends,
+                        *(each["seeds"].get(seed) for seed in seeds),
+                    )
 
     def to_text(self) -> str:
         """The headline, and the rows with the main numbers."""
         numbers = main_numbers(self.summary)
         rows = [
-            [name, *(number_with_interval(each["groups"][ALL][number], number) for number in numbers)]
+            [
+                name,
+                *(number_with_interval(each["groups"][ALL][number], number) for number in numbers),
+            ]
             for name, each in self.summary["rows"].items()
         ]
         table = columns_text([["row", *(NUMBERS[number][2] for number in numbers)], *rows])

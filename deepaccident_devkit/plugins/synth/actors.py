@@ -9,7 +9,13 @@ from numpy.typing import ArrayLike
 from deepaccident_devkit.plugins.synth import solids
 from deepaccident_devkit.plugins.synth.shapes import MODELS, shape_of
 from deepaccident_devkit.plugins.synth.solids import Color, Solids
-from deepaccident_devkit.support.arrays import AnyArray, FloatArray, FrozenArrays, IntArray, readonly
+from deepaccident_devkit.support.arrays import (
+    AnyArray,
+    FloatArray,
+    FrozenArrays,
+    IntArray,
+    readonly,
+)
 from deepaccident_devkit.taxonomy import CATEGORIES, STATIC_ACTOR_ID
 
 # Seconds: a time may be this far before the first sample or after the last one and still counts as inside.
@@ -116,11 +122,15 @@ class Actors:
             all=ordered,
             actor_id=readonly(np.array([actor.actor_id for actor in ordered], dtype=np.int64)),
             object_id=readonly(np.array([actor.object_id for actor in ordered], dtype=np.int64)),
-            category=readonly(np.array([CATEGORIES.index(actor.category) for actor in ordered], dtype=np.int8)),
+            category=readonly(
+                np.array([CATEGORIES.index(actor.category) for actor in ordered], dtype=np.int8)
+            ),
             size=readonly(np.array([actor.size for actor in ordered], dtype=np.float64)),
             origin=readonly(np.array([actor.origin for actor in ordered], dtype=np.float64)),
             solids=solids.concatenate_solids([actor.shape for actor in ordered]),
-            solid_actor=readonly(np.repeat(np.arange(len(ordered)), [len(actor.shape) for actor in ordered])),
+            solid_actor=readonly(
+                np.repeat(np.arange(len(ordered)), [len(actor.shape) for actor in ordered])
+            ),
             motions=_together([actor.motion for actor in ordered]),
         )
 
@@ -196,7 +206,12 @@ _PAINTS: tuple[Color, ...] = (
 _CLOTHES: tuple[Color, ...] = (
     (168, 44, 52), (52, 84, 150), (70, 110, 70), (200, 176, 120), (90, 70, 110), (64, 66, 74), (214, 212, 206),
 )  # fmt: skip
-_TRUCK_BOXES: tuple[Color, ...] = ((226, 226, 222), (180, 190, 200), (200, 170, 120), (90, 120, 150))
+_TRUCK_BOXES: tuple[Color, ...] = (
+    (226, 226, 222),
+    (180, 190, 200),
+    (200, 170, 120),
+    (90, 120, 150),
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -18,7 +18,13 @@ import numpy as np
 
 from deepaccident_devkit.errors import SplitFileError
 from deepaccident_devkit.plugins.synth.plan import SynthConfig
-from deepaccident_devkit.release import ScenarioFolder, find_release, read_bev, read_image, read_lidar
+from deepaccident_devkit.release import (
+    ScenarioFolder,
+    find_release,
+    read_bev,
+    read_image,
+    read_lidar,
+)
 from deepaccident_devkit.release.fingerprints import POINTS_TOLERANCE, digest_of, folder_hashes
 from deepaccident_devkit.release.layout import frame_numbers
 from deepaccident_devkit.release.store import ReleasePath, read_lines
@@ -34,7 +40,9 @@ if TYPE_CHECKING:
 
 # Benchmark → what it is made of. Whatever the generator learns, these stay as they are, byte for byte.
 BENCHMARKS: Final[Mapping[str, SynthConfig]] = {
-    "v1": SynthConfig(scenarios=240, image_size=(320, 180), seed=20261201, sensor_step=5, decimals=4, traffic="v1")
+    "v1": SynthConfig(
+        scenarios=240, image_size=(320, 180), seed=20261201, sensor_step=5, decimals=4, traffic="v1"
+    )
 }
 # How far a file may be from the published one: the root of the mean squared difference of its pixels on a scale to
 # 255; of a cloud, as `_sketch_of` says. docs/benchmark.md says what was measured.
@@ -71,7 +79,9 @@ def described(scenario: ScenarioFolder) -> dict[str, Any]:
 def described_release(root: Path, **how: Unpack[Engine]) -> dict[str, Any]:
     """What is compared of a release: `splits`, a hash of its split files, and `scenarios` by token, as `described`."""
     layout = find_release(root)
-    splits = {name: read_lines(path, "split", SplitFileError) for name, path in layout.split_files.items()}
+    splits = {
+        name: read_lines(path, "split", SplitFileError) for name, path in layout.split_files.items()
+    }
     made = run_batch(described, layout.scenarios, label="comparing", **how)
     tokens = [scenario.token for scenario in layout.scenarios]
     return {"splits": digest_of(splits), "scenarios": dict(zip(tokens, made, strict=True))}
@@ -97,18 +107,33 @@ def differences(found: Mapping[str, Any], wanted: Mapping[str, Any]) -> list[str
         if here is None or there is None:
             lines.append(f"{token}: is {'missing' if here is None else 'not of the benchmark'}")
             continue
-        lines += [f"{token}: {kind} differ" for kind in ("boxes", "meta", "calib") if here[kind] != there[kind]]
+        lines += [
+            f"{token}: {kind} differ"
+            for kind in ("boxes", "meta", "calib")
+            if here[kind] != there[kind]
+        ]
         for kind in compared_kinds(found):
             mine, theirs = here[kind], there[kind]
             names = sorted({*mine, *theirs})
-            far = [name for name in names if distance(mine.get(name, ()), theirs.get(name, ())) > TOLERANCES[kind]]
-            lines += [f"{token}: {kind} differ by more than the tolerance, such as {name}" for name in far[:1]]
+            far = [
+                name
+                for name in names
+                if distance(mine.get(name, ()), theirs.get(name, ())) > TOLERANCES[kind]
+            ]
+            lines += [
+                f"{token}: {kind} differ by more than the tolerance, such as {name}"
+                for name in far[:1]
+            ]
     return lines
 
 
 def compared_kinds(found: Mapping[str, Any]) -> list[str]:
     """Return what a release, described by `described_release`, has of all that is compared within a tolerance."""
-    return [kind for kind in TOLERANCES if any(scenario[kind] for scenario in found["scenarios"].values())]
+    return [
+        kind
+        for kind in TOLERANCES
+        if any(scenario[kind] for scenario in found["scenarios"].values())
+    ]
 
 
 def _sketch_of(path: ReleasePath, kind: str) -> Sketch:
@@ -120,7 +145,9 @@ def _sketch_of(path: ReleasePath, kind: str) -> Sketch:
     """
     if kind == "clouds":
         cloud = read_lidar(path)
-        return whole_numbers((0.5 + cloud.intensity) @ np.cos(cloud.xyz.astype(np.float32) @ _WAVES[:3] + _WAVES[3]))
+        return whole_numbers(
+            (0.5 + cloud.intensity) @ np.cos(cloud.xyz.astype(np.float32) @ _WAVES[:3] + _WAVES[3])
+        )
     step = _STEPS[kind]
     pixels = (read_image(path) if kind == "images" else read_bev(path, raw=True))[::step, ::step]
     return sketch((pixels - np.float32(128)) / np.sqrt(pixels.size))

@@ -6,7 +6,13 @@ from typing import Any, Final
 
 import click
 
-from deepaccident_devkit.cli.options import PATH, engine_of, engine_parameters, pixel_size, refuse_unused
+from deepaccident_devkit.cli.options import (
+    PATH,
+    engine_of,
+    engine_parameters,
+    pixel_size,
+    refuse_unused,
+)
 from deepaccident_devkit.cli.verbs import WordChoice, advanced, field_option, verb
 from deepaccident_devkit.plugins.synth import SynthConfig, make_release
 from deepaccident_devkit.plugins.synth.benchmark import (
@@ -44,11 +50,15 @@ def _number(context: click.Context, parameter: click.Parameter, text: str) -> in
     return int(kind.convert(text, parameter, context))
 
 
-def _designs(context: click.Context, parameter: click.Parameter, given: tuple[str, ...]) -> dict[str, Any]:
+def _designs(
+    context: click.Context, parameter: click.Parameter, given: tuple[str, ...]
+) -> dict[str, Any]:
     """The fields `designs` and `spec` of what was given: numbers of designs, or one scenario file."""
     files = [text for text in given if not text.isdecimal()]
     if len(files) > 1 or (files and len(given) > 1):
-        raise click.BadParameter("give one scenario file, or numbers of designs", context, parameter)
+        raise click.BadParameter(
+            "give one scenario file, or numbers of designs", context, parameter
+        )
     numbers = () if files else tuple(_number(context, parameter, text) for text in given)
     return {"designs": numbers, "spec": Path(files[0]) if files else None}
 
@@ -112,18 +122,27 @@ def synth(out: Path, *, designs: dict[str, Any], benchmark: str | None, **option
     """
     how = engine_of(options)
     if benchmark is not None:
-        refuse_unused("with --benchmark, which says all of it", *(set(options) | {"designs"}) - {*how, "sensors"})
+        refuse_unused(
+            "with --benchmark, which says all of it",
+            *(set(options) | {"designs"}) - {*how, "sensors"},
+        )
         _make_benchmark(out, benchmark, options["sensors"], how)
         return
     options = {name: each for name, each in options.items() if name not in how} | designs
     if options["spec"] is not None or options["view"] == "hidden":
-        refuse_unused("with a scenario file or --view hidden, which ask for one certain accident", "unplanned")
+        refuse_unused(
+            "with a scenario file or --view hidden, which ask for one certain accident", "unplanned"
+        )
     config = SynthConfig(**options)
     if config.sensors == "none" and not has_embree():
-        click.echo("slow without the package embreex; in a checkout: pip install '.[synth]'", err=True)
+        click.echo(
+            "slow without the package embreex; in a checkout: pip install '.[synth]'", err=True
+        )
     made = make_release(out, config, progress=True, **how)
     frames = "" if config.frames is None else f" of {counted(config.frames, 'frame')}"
-    click.echo(f"{made}: {counted(config.scenarios, 'scenario')}{frames} with five agents, layout {config.layout}")
+    click.echo(
+        f"{made}: {counted(config.scenarios, 'scenario')}{frames} with five agents, layout {config.layout}"
+    )
     click.echo(f"next: deepaccident info {made}")
     if config.spec is None or read_spec(config.spec).meets:
         layers = " --layers boxes" if config.sensors == "none" else ""

@@ -59,7 +59,9 @@ MODEL_PICTURE: Final = "model_1s_before.png"
 _REPLAY_FILE: Final = "replay.html"
 REPORT_FOLDER: Final = "evaluation"
 # A browser loads only what lies beside the page, on a disk or a server; only the pages in frames run anything.
-_POLICY: Final = "default-src 'none'; img-src 'self' file:; frame-src 'self' file:; style-src 'unsafe-inline'"
+_POLICY: Final = (
+    "default-src 'none'; img-src 'self' file:; frame-src 'self' file:; style-src 'unsafe-inline'"
+)
 SCENARIO: Final = """\
 # The accident of `deepaccident demo`: in clear weather, by day, the other car runs a red light. A house hides it from
 # ego until about 2.5 s before the impact; from then on it is in ego's front camera.
@@ -90,7 +92,9 @@ _REACH: Final = 35.0
 # The released labels, but they end at the impact.
 _LABELS: Final = MotionLabelConfig(future_frames=2)
 # The samples of the table and of the report: ego's in the last four seconds of the accident and of its twin.
-_SELECTION: Final = SampleSelection(split="train", scope="all", agents=("ego_vehicle",), horizon=4.0)
+_SELECTION: Final = SampleSelection(
+    split="train", scope="all", agents=("ego_vehicle",), horizon=4.0
+)
 _AGENTS: Final = {"single": "single vehicle", "all": "five agents"}
 # Task → the protocol, and the heading of each number of the table with its name in the result.
 _NUMBERS: Final[Mapping[ResultsTask, tuple[str, Mapping[str, str]]]] = {
@@ -168,7 +172,9 @@ def demo_page(table: Sequence[Sequence[str]], steps: Sequence[NextStep], *, mode
         steps: what to try next.
         model: whether there is a picture of a model's predictions.
     """
-    heading, *rows = zip(*table, strict=True)  # a column for each set of agents: it fits a narrow window
+    heading, *rows = zip(
+        *table, strict=True
+    )  # a column for each set of agents: it fits a narrow window
     return document(
         "demo.html",
         style=page_style(),
@@ -188,7 +194,9 @@ def draw_accident(release: DeepAccident, out: Path) -> None:
     """Render the first accident: the countdown to it, and the five agents, ego's cameras and labels a second before."""
     accident, before = _accident_and_before(release)
     ego = release.samples_of(before)[0]
-    countdown = partial(release.render_accident, seconds=_COUNTDOWN, agents=("ego_vehicle", "infrastructure"))
+    countdown = partial(
+        release.render_accident, seconds=_COUNTDOWN, agents=("ego_vehicle", "infrastructure")
+    )
     drawings: tuple[tuple[tuple[float, float], Callable[..., Any], RowArgument], ...] = (
         ((17.0, 8.6), countdown, accident),
         ((20.0, 6.5), release.render_frame, before),
@@ -224,16 +232,22 @@ def draw_model(release: DeepAccident, out: Path) -> bool:
         fig.subplots(2, 2).T, ("single", "all"), ("ego alone", "five agents"), strict=True
     ):
         [found] = predictions(model, release, [token], PredictConfig(agents=agents))
-        for ax, frame, moment in zip(column, (0, None), (before["index"], accident["num_frames"]), strict=True):
+        for ax, frame, moment in zip(
+            column, (0, None), (before["index"], accident["num_frames"]), strict=True
+        ):
             draw_motion_outcome(found.motion, label, frame=frame, ax=ax)
-            ax.set(xlim=(-_REACH, _REACH), ylim=(-_REACH, _REACH), title=f"{title}: {ax.get_title()}")
+            ax.set(
+                xlim=(-_REACH, _REACH), ylim=(-_REACH, _REACH), title=f"{title}: {ax.get_title()}"
+            )
             draw_underlay(road, ax, target_from_ego=SE3.identity(), view_range=_REACH)
             _draw_pair(release, accident, token, moment, ax)
     save_picture(fig, out / MODEL_PICTURE, dpi=80)
     return True
 
 
-def _draw_pair(release: DeepAccident, accident: ScenarioRecord, sample: str, moment: int, ax: Any) -> None:
+def _draw_pair(
+    release: DeepAccident, accident: ScenarioRecord, sample: str, moment: int, ax: Any
+) -> None:
     """Render the true outlines of an accident's pair at a frame, in the ego frame of a sample, with names."""
     scenario, collision = accident["token"], accident["collision"]
     boxes = scenario_tracks(release, scenario).at(moment)
@@ -257,7 +271,9 @@ def _step(bar: tqdm[Any], name: str) -> Iterator[None]:
     """Name a step on the bar, and move the bar to its end; a log gets a line at its beginning."""
     bar.set_description_str(name)
     if _is_log(bar):
-        click.echo(f"{[*_STEPS].index(name) + 1} of {len(_STEPS)}: {name}, which takes some {_STEPS[name]:.0f} s")
+        click.echo(
+            f"{[*_STEPS].index(name) + 1} of {len(_STEPS)}: {name}, which takes some {_STEPS[name]:.0f} s"
+        )
     end = sum(list(_STEPS.values())[: list(_STEPS).index(name) + 1])
     yield
     bar.update(end - bar.n)
@@ -313,7 +329,9 @@ def demo_table(release: DeepAccident) -> list[list[str]]:
         baseline, row = Baseline(agents=agents, horizon=_SELECTION.horizon), [name]
         with TemporaryDirectory() as folder:
             for task, (protocol, numbers) in _NUMBERS.items():
-                path = predict_results(release, task, tokens, Path(folder) / task, baseline, workers=1)
+                path = predict_results(
+                    release, task, tokens, Path(folder) / task, baseline, workers=1
+                )
                 setup = EvaluationSetup(task=task, protocol=protocol, horizon=_SELECTION.horizon)
                 run = evaluate_results(release, path, setup, _SELECTION, workers=1)
                 found = {each.name: each for each in headlines(run.result)}
@@ -326,7 +344,10 @@ def _evaluate(release: DeepAccident, out: Path) -> None:
     """Evaluate what the baseline of a single vehicle predicts, and write a report and a bundle."""
     path = out / _RESULTS
     path.unlink(missing_ok=True)  # of an earlier demo
-    baseline, tokens = Baseline(agents="single", horizon=_SELECTION.horizon), _SELECTION.tokens(release)
+    baseline, tokens = (
+        Baseline(agents="single", horizon=_SELECTION.horizon),
+        _SELECTION.tokens(release),
+    )
     results = read_results(predict_results(release, "accident", tokens, path, baseline, workers=1))
     setup = EvaluationSetup(task="accident", protocol="boxes", horizon=_SELECTION.horizon)
     run = evaluate_results(release, results, setup, _SELECTION, workers=1).broken_down()
@@ -336,16 +357,28 @@ def _evaluate(release: DeepAccident, out: Path) -> None:
 
 
 def _next_steps(out: Path) -> tuple[NextStep, ...]:
-    names = ("release", "five_agents", "own", _SCENARIO_FILE, f"{REPORT_FOLDER}/{_RUN}", "five_agents/evaluation")
+    names = (
+        "release",
+        "five_agents",
+        "own",
+        _SCENARIO_FILE,
+        f"{REPORT_FOLDER}/{_RUN}",
+        "five_agents/evaluation",
+    )
     root, five, own, scenario, bundle, second = (shlex.quote(str(out / name)) for name in names)
-    of_both = f"--split {_SELECTION.split} --scope {_SELECTION.scope} --horizon {_SELECTION.horizon:g}"
+    of_both = (
+        f"--split {_SELECTION.split} --scope {_SELECTION.scope} --horizon {_SELECTION.horizon:g}"
+    )
     return (
         NextStep("See what the release holds:", f"deepaccident info {root} --where collision=true"),
         NextStep(
             "See in your browser which predictions were right; this needs the extra: pip install '.[explore]'",
             f"deepaccident explore {root} --results {bundle}",
         ),
-        NextStep("Check its files, as you would check your download:", f"deepaccident validate {root} --deep"),
+        NextStep(
+            "Check its files, as you would check your download:",
+            f"deepaccident validate {root} --deep",
+        ),
         NextStep(
             "Let five agents predict together:",
             f"deepaccident predict constant_velocity {root} {of_both} --task accident --agents all --out {five}",

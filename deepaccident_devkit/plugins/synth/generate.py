@@ -16,8 +16,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.plugins.synth.plan import ScenarioPlan, SynthConfig, plan_scenarios, plan_splits
-from deepaccident_devkit.plugins.synth.scenario import RecordingJob, forget_scenario, part_count, record_scenario
+from deepaccident_devkit.plugins.synth.plan import (
+    ScenarioPlan,
+    SynthConfig,
+    plan_scenarios,
+    plan_splits,
+)
+from deepaccident_devkit.plugins.synth.scenario import (
+    RecordingJob,
+    forget_scenario,
+    part_count,
+    record_scenario,
+)
 from deepaccident_devkit.plugins.synth.sensors.caster import require_embree
 from deepaccident_devkit.release.store.members import SPLIT_FILE_FOLDER
 from deepaccident_devkit.support.cores import usable_cores
@@ -82,7 +92,9 @@ class Unfinished:
     def note(self, name: str) -> None:
         """Remember that a part is complete; raises ConfigError if it was removed meanwhile."""
         if not (self.folder / _CONFIG_FILE).exists():
-            raise ConfigError(f"{self.folder}: was removed while parts of the release were recorded; make it again")
+            raise ConfigError(
+                f"{self.folder}: was removed while parts of the release were recorded; make it again"
+            )
         self.store.keep(name, _MADE, b"")
 
     def gather(self, names: Iterable[str]) -> None:
@@ -222,11 +234,15 @@ def make_release(
     unfinished = Unfinished(out.absolute())
     with unfinished_release(unfinished, wanted) as alone:
         count = workers or _worker_count(wanted, len(plans))
-        parts = {name: part for plan in plans for name, part in _parts(unfinished, wanted, plan).items()}
+        parts = {
+            name: part for plan in plans for name, part in _parts(unfinished, wanted, plan).items()
+        }
         places = Places(writes=(unfinished.folder,))
         how: dict[str, Any] = {"workers": count, "executor": executor, "progress": progress}
         try:
-            unfinished.store.run(partial(_record, unfinished), parts, label="recording", places=places, **how)
+            unfinished.store.run(
+                partial(_record, unfinished), parts, label="recording", places=places, **how
+            )
         finally:
             forget_scenario()
         if alone():
@@ -235,18 +251,27 @@ def make_release(
             splits = plan_splits(plans)
             splits.save(unfinished.release, overwrite=True)
             if wanted.for_released_code:
-                splits.save(place_in(unfinished.release, SPLIT_FILE_FOLDER, opened=True), overwrite=True)
+                splits.save(
+                    place_in(unfinished.release, SPLIT_FILE_FOLDER, opened=True), overwrite=True
+                )
             unfinished.complete()
     return out
 
 
-def _parts(unfinished: Unfinished, config: SynthConfig, plan: ScenarioPlan) -> dict[str, RecordingJob]:
+def _parts(
+    unfinished: Unfinished, config: SynthConfig, plan: ScenarioPlan
+) -> dict[str, RecordingJob]:
     """The parts of a scenario by their names."""
     if config.sensors == "accidents":
         config = replace(config, sensors="all" if plan.accident else "none")
     parts = part_count(config)
-    names = {first: f"{plan.scenario_type}_{plan.name}_{first}of{parts}" for first in range(1, parts + 1)}
-    return {name: RecordingJob(unfinished.part(name), config, plan, first, parts) for first, name in names.items()}
+    names = {
+        first: f"{plan.scenario_type}_{plan.name}_{first}of{parts}" for first in range(1, parts + 1)
+    }
+    return {
+        name: RecordingJob(unfinished.part(name), config, plan, first, parts)
+        for first, name in names.items()
+    }
 
 
 def _record(unfinished: Unfinished, job: RecordingJob) -> None:

@@ -137,17 +137,25 @@ class SynthConfig:
             _check_range("decimals", self.decimals, 3, 15)  # with fewer a rotation would be none
         if isinstance(self.sensors, bool):
             object.__setattr__(self, "sensors", "all" if self.sensors else "none")
-        words = {"layout": get_args(Layout), "sensors": get_args(Sensors), "view": (None, *get_args(View))}
+        words = {
+            "layout": get_args(Layout),
+            "sensors": get_args(Sensors),
+            "view": (None, *get_args(View)),
+        }
         words |= {"rig": get_args(RigName), "traffic": get_args(TrafficName)}
         settle_choices(self, words, error=ConfigError)
         if len(self.pixels) != 2:
             raise ConfigError(f"image_size: expected (width, height), found {self.image_size!r}")
-        for name, value, least in zip(("width", "height"), self.pixels, MIN_IMAGE_SIZE, strict=True):
+        for name, value, least in zip(
+            ("width", "height"), self.pixels, MIN_IMAGE_SIZE, strict=True
+        ):
             _check_range(f"image_size: {name}", value, least, 8192)
         for design in self.designs:
             _check_range("designs", design, DESIGN_NUMBERS[0], DESIGN_NUMBERS[-1])
         if not 0 <= self.unplanned <= 1:
-            raise ConfigError(f"unplanned: {self.unplanned} is not a share; choose a number from 0 to 1")
+            raise ConfigError(
+                f"unplanned: {self.unplanned} is not a share; choose a number from 0 to 1"
+            )
         if self.spec is not None and self.designs:
             raise ConfigError(
                 "spec, designs: a release is made of a scenario file or of designs; choose one of the two"
@@ -249,7 +257,9 @@ class ScenarioPlan:
     def draw(self, rng: np.random.Generator) -> ScenarioSpec:
         """A draw from its template that has the plan's traits; the same random numbers give the same draw."""
         spec = draw(self.template, rng)
-        while Traits.of(spec) != self.traits or (self.kind and self.kind.joins and not paths_join(spec)):
+        while Traits.of(spec) != self.traits or (
+            self.kind and self.kind.joins and not paths_join(spec)
+        ):
             spec = draw(self.template, rng)
         if self.view is not None:
             spec = _seen(spec, self.view, rng)
@@ -301,7 +311,10 @@ def plan_scenarios(config: SynthConfig) -> list[ScenarioPlan]:
         template = own or read_design(designs[pair % len(designs)])
         plans.append(_plan(config, pair, template, accident=second == 0))
     split_of = {
-        token: name for name, tokens in plan_splits(plans).by_name().items() if name in SPLITS for token in tokens
+        token: name
+        for name, tokens in plan_splits(plans).by_name().items()
+        if name in SPLITS
+        for token in tokens
     }
     return [replace(plan, split=split_of[plan.token]) for plan in plans]
 
@@ -321,7 +334,8 @@ def plan_splits(plans: Sequence[ScenarioPlan]) -> Splits:
         dealt = split_records([_record(plan) for plan in plans])
     else:
         train, val, test = (
-            tuple(sorted(plan.token for plan in plans if _small_split(plan.pair) == split)) for split in SPLITS
+            tuple(sorted(plan.token for plan in plans if _small_split(plan.pair) == split))
+            for split in SPLITS
         )
         dealt = Splits(train=train, val=val, test=test, train_mini=train, val_mini=val)
     return replace(
@@ -331,14 +345,18 @@ def plan_splits(plans: Sequence[ScenarioPlan]) -> Splits:
     )
 
 
-def _plan(config: SynthConfig, pair: int, template: SpecTemplate, *, accident: bool) -> ScenarioPlan:
+def _plan(
+    config: SynthConfig, pair: int, template: SpecTemplate, *, accident: bool
+) -> ScenarioPlan:
     rng = np.random.default_rng([config.seed, pair, _PLAN_STREAM])
     town = TOWNS[int(rng.integers(len(TOWNS)))]
     unplanned = rng.random() < config.unplanned and config.spec is None and config.view != "hidden"
     spec = draw(template, rng)
     traits, kind, misfiled = Traits.of(spec), None, False
     if config.lifelike:
-        kind = draw_kind(np.random.default_rng([config.seed, pair, _KIND_STREAM]), spec, TRAFFICS[config.traffic])
+        kind = draw_kind(
+            np.random.default_rng([config.seed, pair, _KIND_STREAM]), spec, TRAFFICS[config.traffic]
+        )
         of_folder = np.random.default_rng([config.seed, pair, _KIND_STREAM, accident])
         unplanned, misfiled = kind.pair is None, of_folder.random() < MISFILED[accident]
     if config.view == "hidden" and traits.spawn_side not in ("left", "right"):
@@ -383,7 +401,9 @@ def _small_split(pair: int) -> str:
     return "train" if share < 0.7 else "val" if share < 0.85 else "test"
 
 
-def _mini(plans: Sequence[ScenarioPlan], split: Sequence[str], wanted: Collection[str]) -> tuple[str, ...]:
+def _mini(
+    plans: Sequence[ScenarioPlan], split: Sequence[str], wanted: Collection[str]
+) -> tuple[str, ...]:
     """The wanted whole pairs, as many as `_MINI_SHARE` of the split allows; if none, the split's smallest pair."""
     members, wanted = set(split), set(wanted)
     pairs: dict[int, list[str]] = {}

@@ -111,8 +111,14 @@ def build_scenario(config: SynthConfig, plan: ScenarioPlan) -> Scenario:
     `MAX_DRAWS` draws; the message says how near they came, and what to change.
     """
     # a stream for each part of the scene, so that a change to one part leaves the others
-    seeds = [config.seed, plan.pair, *([1] if plan.misfiled else [])]  # it shows other scenes than its twin
-    of_world, of_traffic, of_ids, of_end = map(np.random.default_rng, np.random.SeedSequence(seeds).spawn(4))
+    seeds = [
+        config.seed,
+        plan.pair,
+        *([1] if plan.misfiled else []),
+    ]  # it shows other scenes than its twin
+    of_world, of_traffic, of_ids, of_end = map(
+        np.random.default_rng, np.random.SeedSequence(seeds).spawn(4)
+    )
     while True:
         stage, accident, draws = _first_good_draw(of_traffic, config, plan)
         recorded = (
@@ -158,7 +164,9 @@ def _first_good_draw(
         if plan.unplanned:
             on_foot = None if plan.kind is None else plan.kind.labelled and rng.random() < ON_FOOT
             spec = unplanned(rng, spec, junction, on_foot=on_foot)
-        stage = set_stage(rng, spec, junction, usual_duration(rng, config.frames, plan.kind), plan.kind)
+        stage = set_stage(
+            rng, spec, junction, usual_duration(rng, config.frames, plan.kind), plan.kind
+        )
         if spec.meet is None:
             return stage, None, draws
         tried = try_accident(stage)
@@ -174,7 +182,9 @@ def _first_good_draw(
     )
 
 
-def _twin(rng: np.random.Generator, stage: Stage, config: SynthConfig, plan: ScenarioPlan) -> Recorded | None:
+def _twin(
+    rng: np.random.Generator, stage: Stage, config: SynthConfig, plan: ScenarioPlan
+) -> Recorded | None:
     """The recording of a normal scenario; None where all is as in the real release and another draw is needed."""
     normal = perform_twin(stage, latest_end(stage, config.frames))
     if normal is not None:
@@ -203,7 +213,9 @@ class _Ids(NamedTuple):
         actor += [STATIC_ACTOR_ID + row for row in range(moving, count)]
         camera = rng.choice(np.arange(1, 2**16), count, replace=False).tolist()
         agents = {
-            AGENT_OF_ROLE[user.role]: actor[row] for row, user in enumerate(stage.users) if user.role in AGENT_OF_ROLE
+            AGENT_OF_ROLE[user.role]: actor[row]
+            for row, user in enumerate(stage.users)
+            if user.role in AGENT_OF_ROLE
         }
         return cls(tuple(actor), tuple(camera), {agent: agents[agent] for agent in VEHICLE_AGENTS})
 
@@ -224,7 +236,10 @@ def _actors(stage: Stage, recorded: Recorded, ids: _Ids) -> list[Actor]:
         actors.append(_actor(ids, row, stage.users[row].body, motion))
     for row, vehicle in enumerate(stage.parked, start=len(stage.users)):
         motion = SampledMotion(
-            start=0.0, period=PERIOD, samples=np.array([vehicle.pose]), sample_velocities=np.zeros((1, 2))
+            start=0.0,
+            period=PERIOD,
+            samples=np.array([vehicle.pose]),
+            sample_velocities=np.zeros((1, 2)),
         )
         actors.append(_actor(ids, row, vehicle.body, motion))
     return actors
@@ -242,8 +257,14 @@ def _actor(ids: _Ids, row: int, body: Body, motion: SampledMotion) -> Actor:
     )
 
 
-def _meta(plan: ScenarioPlan, stage: Stage, recorded: Recorded, ids: _Ids, decimals: int | None) -> Meta:
-    spec, collision, planned = stage.spec, _collision(stage, recorded, ids, decimals), _pair_agents(stage)
+def _meta(
+    plan: ScenarioPlan, stage: Stage, recorded: Recorded, ids: _Ids, decimals: int | None
+) -> Meta:
+    spec, collision, planned = (
+        stage.spec,
+        _collision(stage, recorded, ids, decimals),
+        _pair_agents(stage),
+    )
     ego, ego_behind, other, other_behind = (ids.agents[agent] for agent in VEHICLE_AGENTS)
     return Meta(
         weather=spec.weather,
@@ -255,11 +276,15 @@ def _meta(plan: ScenarioPlan, stage: Stage, recorded: Recorded, ids: _Ids, decim
         spawn_side=plan.traits.spawn_side,
         ego_direction=spec.actor("ego").turn,
         other_direction=spec.actor("other").turn,
-        planned_agents=None if collision or planned == (None, None) or (stage.kind and ego % 2) else planned,
+        planned_agents=None
+        if collision or planned == (None, None) or (stage.kind and ego % 2)
+        else planned,
     )
 
 
-def _collision(stage: Stage, recorded: Recorded, ids: _Ids, decimals: int | None) -> Collision | None:
+def _collision(
+    stage: Stage, recorded: Recorded, ids: _Ids, decimals: int | None
+) -> Collision | None:
     impact, pair = recorded.impact, stage.cast.pair
     if impact is None or pair is None:
         return None
@@ -277,7 +302,9 @@ def _collision(stage: Stage, recorded: Recorded, ids: _Ids, decimals: int | None
 def _pair_agents(stage: Stage) -> tuple[AgentName | None, AgentName | None]:
     """The agents of the two who are timed to meet; None for a road user that is no agent, or if nobody is timed."""
     first, second = (
-        (AGENT_OF_ROLE.get(stage.users[row].role) for row in stage.cast.pair) if stage.cast.pair else (None, None)
+        (AGENT_OF_ROLE.get(stage.users[row].role) for row in stage.cast.pair)
+        if stage.cast.pair
+        else (None, None)
     )
     return first, second
 
@@ -318,7 +345,9 @@ def record_scenario(job: RecordingJob) -> None:
     scenario, rig = _KEPT.made_ready(_Task(job.config, job.plan))
     labelled = job.plan.split != "test" or not job.config.unlabelled_test
     step = job.config.sensor_step
-    recorder = _Recorder(folder=job.folder, scenario=scenario, rig=rig, labelled=labelled, sensor_step=step)
+    recorder = _Recorder(
+        folder=job.folder, scenario=scenario, rig=rig, labelled=labelled, sensor_step=step
+    )
     if labelled and job.first == 1:
         write_meta(real_path(job.folder.meta_path), scenario.meta)
     for frame in range(job.first, scenario.frames + 1, job.step):
@@ -401,7 +430,9 @@ class _Recorder:
                 self._record_arrays(scene, sighting.points, agent, frame)
             if around:
                 for channel, image in rig.images(scene, around, agent, frame):
-                    write_image(real_path(self.folder.channel_path(agent.name, channel, frame)), image)
+                    write_image(
+                        real_path(self.folder.channel_path(agent.name, channel, frame)), image
+                    )
 
     def _record_arrays(self, scene: Scene, points: Scan, agent: Agent, frame: int) -> None:
         """Write the point cloud, and if all is recorded and labelled also the BEV array, whose instances are labels."""
@@ -409,11 +440,17 @@ class _Recorder:
         write_lidar(place, points.xyz, intensity(points, self.rig.air))
         if self.labelled and self.rig.studio:
             bev = self.rig.bev(scene, agent)
-            write_bev(real_path(self.folder.channel_path(agent.name, BEV_CAMERA, frame)), bev.semantic, bev.instance)
+            write_bev(
+                real_path(self.folder.channel_path(agent.name, BEV_CAMERA, frame)),
+                bev.semantic,
+                bev.instance,
+            )
 
     def _signals(self, time: float) -> Mapping[Arm, int]:
         """Arm → the state of its traffic light."""
         signals = self.scenario.signals
         if signals is None:
             return {}
-        return {head.arm: int(signals.state(head.arm, time)) for head in self.scenario.world.signals}
+        return {
+            head.arm: int(signals.state(head.arm, time)) for head in self.scenario.world.signals
+        }

@@ -44,16 +44,32 @@ class _ShapeFrame:
 def wheels(axles: tuple[float, ...], y: float, radius: float, width: float = 0.22) -> list[Block]:
     """Wheels on both sides, whose outer faces are `y` metres from the middle."""
     sides = ((y - width, y), (-y, -y + width))
-    return [block for axle in axles for side in sides for block in wheel(axle, side, radius, main=False)]
+    return [
+        block for axle in axles for side in sides for block in wheel(axle, side, radius, main=False)
+    ]
 
 
-def wheel(axle: float, across: tuple[float, float], radius: float, *, main: bool) -> tuple[Block, Block, Block]:
+def wheel(
+    axle: float, across: tuple[float, float], radius: float, *, main: bool
+) -> tuple[Block, Block, Block]:
     """A wheel of three blocks: two that give the tyre six corners, seen from the side, and a rim."""
     middle, cut, rim = 0.03 + radius, 0.5 * radius, 0.52 * radius
     upper = Block(
-        (axle - radius, axle + radius), across, (middle, middle + radius), TIRE, inset=(cut, cut, 0.0), main=main
+        (axle - radius, axle + radius),
+        across,
+        (middle, middle + radius),
+        TIRE,
+        inset=(cut, cut, 0.0),
+        main=main,
     )
-    lower = Block((axle - cut, axle + cut), across, (middle - radius, middle), TIRE, inset=(-cut, -cut, 0.0), main=main)
+    lower = Block(
+        (axle - cut, axle + cut),
+        across,
+        (middle - radius, middle),
+        TIRE,
+        inset=(-cut, -cut, 0.0),
+        main=main,
+    )
     beyond = (across[0] - 0.008, across[1] + 0.008)
     hub = Block((axle - rim, axle + rim), beyond, (middle - rim, middle + rim), RIM, main=False)
     return upper, lower, hub
@@ -81,7 +97,10 @@ def mirrors(x: float, body: float, y: float, height: float, color: Color) -> lis
     """Mirrors between the body's side and `y` metres from the middle."""
     z = (height, height + 0.14)
     sides = ((body - 0.02, y), (-y, -body + 0.02))
-    return [Block((x - 0.06, x + 0.1), side, z, color, inset=(0.04, 0.0, 0.0), main=False) for side in sides]
+    return [
+        Block((x - 0.06, x + 0.1), side, z, color, inset=(0.04, 0.0, 0.0), main=False)
+        for side in sides
+    ]
 
 
 # Half the thickness of arms and legs, metres.
@@ -93,8 +112,12 @@ def motorcycle(frame: _ShapeFrame) -> list[Block]:
     x = frame.x
     return [
         *_two_wheels(x, 0.32, 0.07),
-        Block((-0.5 * x, 0.42 * x), (-0.15, 0.15), (0.34, 0.7), frame.color, inset=(0.12, 0.05, 0.03)),
-        Block((-0.05 * x, 0.36 * x), (-0.16, 0.16), (0.7, 0.92), frame.color, inset=(0.1, 0.12, 0.05)),
+        Block(
+            (-0.5 * x, 0.42 * x), (-0.15, 0.15), (0.34, 0.7), frame.color, inset=(0.12, 0.05, 0.03)
+        ),
+        Block(
+            (-0.05 * x, 0.36 * x), (-0.16, 0.16), (0.7, 0.92), frame.color, inset=(0.1, 0.12, 0.05)
+        ),
         Block((-0.78 * x, -0.1 * x), (-0.12, 0.12), (0.7, 0.8), DARK, inset=(0.0, 0.06, 0.02)),
         _fork(0.72 * x, 0.3, 0.98),
         _handlebar(0.38 * x, frame.y, 0.98),
@@ -109,9 +132,13 @@ def scooter(frame: _ShapeFrame) -> list[Block]:
     x = frame.x
     return [
         *_two_wheels(x, 0.26, 0.06),
-        Block((-0.85 * x, -0.1 * x), (-0.17, 0.17), (0.38, 0.76), frame.color, inset=(0.1, 0.06, 0.04)),
+        Block(
+            (-0.85 * x, -0.1 * x), (-0.17, 0.17), (0.38, 0.76), frame.color, inset=(0.1, 0.06, 0.04)
+        ),
         Block((-0.12 * x, 0.5 * x), (-0.15, 0.15), (0.26, 0.36), frame.color),
-        Block((0.46 * x, 0.54 * x), (-0.22, 0.22), (0.32, 0.95), frame.color, inset=(0.1, -0.1, 0.05)),
+        Block(
+            (0.46 * x, 0.54 * x), (-0.22, 0.22), (0.32, 0.95), frame.color, inset=(0.1, -0.1, 0.05)
+        ),
         Block((-0.7 * x, -0.1 * x), (-0.13, 0.13), (0.76, 0.82), DARK),
         _handlebar(0.4 * x, frame.y, 0.98),
         Block((0.44 * x, 0.52 * x), (-0.08, 0.08), (0.82, 0.94), LAMP, main=False),
@@ -125,9 +152,23 @@ def cyclist(frame: _ShapeFrame) -> list[Block]:
     x = frame.x
     return [
         *_two_wheels(x, 0.33, 0.025),
-        Block((-0.1 * x, 0.42 * x), (-0.025, 0.025), (0.44, 0.5), frame.color, inset=(-0.1, -0.02, 0.0), main=False),
+        Block(
+            (-0.1 * x, 0.42 * x),
+            (-0.025, 0.025),
+            (0.44, 0.5),
+            frame.color,
+            inset=(-0.1, -0.02, 0.0),
+            main=False,
+        ),
         Block((-0.2 * x, 0.5 * x), (-0.025, 0.025), (0.74, 0.8), frame.color, main=False),
-        Block((-0.22 * x, -0.16 * x), (-0.03, 0.03), (0.36, 0.92), DARK, inset=(0.1, -0.1, 0.0), main=False),
+        Block(
+            (-0.22 * x, -0.16 * x),
+            (-0.03, 0.03),
+            (0.36, 0.92),
+            DARK,
+            inset=(0.1, -0.1, 0.0),
+            main=False,
+        ),
         _fork(0.62 * x, 0.3, 1.0),
         _handlebar(0.46 * x, frame.y, 1.0),
         *_rider(frame, seat=-0.28 * x, low=0.9, reach=0.5 * x, helmet=(226, 228, 230)),
@@ -142,7 +183,13 @@ def walker(frame: _ShapeFrame) -> list[Block]:
 def stroller(frame: _ShapeFrame) -> list[Block]:
     """A person with a short step and a bag on the back."""
     y, top = frame.y, frame.top
-    bag = Block((-frame.x, -0.4 * frame.x), (-0.6 * y, 0.6 * y), (0.56 * top, 0.78 * top), DARK, inset=(0, 0.02, 0.02))
+    bag = Block(
+        (-frame.x, -0.4 * frame.x),
+        (-0.6 * y, 0.6 * y),
+        (0.56 * top, 0.78 * top),
+        DARK,
+        inset=(0, 0.02, 0.02),
+    )
     return [*_person(frame, stride=0.5 * frame.x), bag]
 
 
@@ -153,11 +200,19 @@ def _person(frame: _ShapeFrame, stride: float) -> list[Block]:
     return [
         _limb(stride, (0.015, 0.14), (0.03, hip), frame.accent),
         _limb(-stride, (-0.14, -0.015), (0.03, hip), frame.accent),
-        Block((-reach, reach), (-0.72 * y, 0.72 * y), (hip, neck), color, inset=(0.02, 0.02, -0.02)),
+        Block(
+            (-reach, reach), (-0.72 * y, 0.72 * y), (hip, neck), color, inset=(0.02, 0.02, -0.02)
+        ),
         _limb(-0.6 * stride, (0.76 * y, y), (0.46 * top, 0.82 * top), color),
         _limb(0.6 * stride, (-y, -0.76 * y), (0.46 * top, 0.82 * top), color),
         Block((-0.05, 0.05), (-0.05, 0.05), (neck, neck + 0.04), SKIN, main=False),
-        Block((-0.08, 0.1), (-0.075, 0.075), (neck + 0.03, top - 0.06), SKIN, inset=(0.01, -0.01, -0.01)),
+        Block(
+            (-0.08, 0.1),
+            (-0.075, 0.075),
+            (neck + 0.03, top - 0.06),
+            SKIN,
+            inset=(0.01, -0.01, -0.01),
+        ),
         Block((-0.1, 0.08), (-0.085, 0.085), (top - 0.1, top), DARK, inset=(0.03, 0.03, 0.03)),
     ]
 
@@ -171,7 +226,11 @@ def _rider(frame: _ShapeFrame, seat: float, low: float, reach: float, helmet: Co
     hand = 1.0 if neck > 1.1 else 0.9 * neck
     return [
         Block(
-            (seat - 0.14, seat + 0.12), (-side + 0.05, side - 0.05), (low, neck), frame.accent, inset=(-lean, lean, 0.0)
+            (seat - 0.14, seat + 0.12),
+            (-side + 0.05, side - 0.05),
+            (low, neck),
+            frame.accent,
+            inset=(-lean, lean, 0.0),
         ),
         *(
             Block((seat, seat + 0.15), across, (0.36, low + 0.08), DARK, inset=(-0.06, -0.02, 0.0))
@@ -188,8 +247,16 @@ def _rider(frame: _ShapeFrame, seat: float, low: float, reach: float, helmet: Co
             )
             for across in arms
         ),
-        Block((shoulder - 0.08, shoulder + 0.14), (-0.1, 0.1), (neck, top - 0.14), SKIN, main=False),
-        Block((shoulder - 0.12, shoulder + 0.14), (-0.12, 0.12), (top - 0.18, top), helmet, inset=(0.05, 0.05, 0.04)),
+        Block(
+            (shoulder - 0.08, shoulder + 0.14), (-0.1, 0.1), (neck, top - 0.14), SKIN, main=False
+        ),
+        Block(
+            (shoulder - 0.12, shoulder + 0.14),
+            (-0.12, 0.12),
+            (top - 0.18, top),
+            helmet,
+            inset=(0.05, 0.05, 0.04),
+        ),
     ]
 
 
@@ -200,11 +267,17 @@ def _limb(end: float, y: tuple[float, float], z: tuple[float, float], color: Col
 
 def _two_wheels(x: float, radius: float, half_width: float) -> list[Block]:
     across = (-half_width, half_width)
-    return [block for axle in (x - radius, radius - x) for block in wheel(axle, across, radius, main=True)]
+    return [
+        block
+        for axle in (x - radius, radius - x)
+        for block in wheel(axle, across, radius, main=True)
+    ]
 
 
 def _fork(x: float, low: float, high: float) -> Block:
-    return Block((x - 0.03, x + 0.03), (-0.05, 0.05), (low, high), DARK, inset=(0.16, -0.16, 0.0), main=False)
+    return Block(
+        (x - 0.03, x + 0.03), (-0.05, 0.05), (low, high), DARK, inset=(0.16, -0.16, 0.0), main=False
+    )
 
 
 def _handlebar(x: float, y: float, height: float) -> Block:
@@ -255,7 +328,10 @@ def hatchback(frame: _ShapeFrame) -> list[Block]:
 def off_roader(frame: _ShapeFrame) -> list[Block]:
     """A steep car of two boxes on large wheels, with rails on the roof."""
     x, top = frame.x, frame.top
-    rails = [Block((-0.7 * x, 0.05 * x), y, (top - 0.05, top), DARK, main=False) for y in ((0.5, 0.56), (-0.56, -0.5))]
+    rails = [
+        Block((-0.7 * x, 0.05 * x), y, (top - 0.05, top), DARK, main=False)
+        for y in ((0.5, 0.56), (-0.56, -0.5))
+    ]
     return [*_car(frame, _OFF_ROADER), *rails]
 
 
@@ -263,11 +339,17 @@ def _car(frame: _ShapeFrame, line: _Line) -> list[Block]:
     x, body, top, color = frame.x, _BODY * frame.y, frame.top, frame.color
     waist, roof = line.waist * top, top - 0.05
     between = waist + 0.6 * (roof - waist)
-    (rear, front), (roof_rear, roof_front) = ((share * x for share in span) for span in (line.cabin, line.roof))
+    (rear, front), (roof_rear, roof_front) = (
+        (share * x for share in span) for span in (line.cabin, line.roof)
+    )
     upper = 0.6
     blocks = [
         Block(
-            (-x + 0.06, x - 0.06), (-body + 0.05, body - 0.05), (line.sill, 0.42), color, inset=(-0.05, -0.05, -0.05)
+            (-x + 0.06, x - 0.06),
+            (-body + 0.05, body - 0.05),
+            (line.sill, 0.42),
+            color,
+            inset=(-0.05, -0.05, -0.05),
         ),
         Block((-x + 0.01, x - 0.01), (-body, body), (0.42, waist), color, inset=(0.16, 0.07, 0.05)),
         Block(
@@ -286,8 +368,20 @@ def _car(frame: _ShapeFrame, line: _Line) -> list[Block]:
             glass=_ALL_AROUND,
             inset=((1 - upper) * (front - roof_front), (1 - upper) * (roof_rear - rear), 0.1),
         ),
-        Block((roof_rear, roof_front), (-body + 0.26, body - 0.26), (roof, top), color, inset=(0.12, 0.12, 0.1)),
-        Block((0.9 * front, x - 0.2), (-body + 0.12, body - 0.12), (waist, waist + 0.05), color, inset=(0.25, 0, 0.1)),
+        Block(
+            (roof_rear, roof_front),
+            (-body + 0.26, body - 0.26),
+            (roof, top),
+            color,
+            inset=(0.12, 0.12, 0.1),
+        ),
+        Block(
+            (0.9 * front, x - 0.2),
+            (-body + 0.12, body - 0.12),
+            (waist, waist + 0.05),
+            color,
+            inset=(0.25, 0, 0.1),
+        ),
         Block((x - 0.1, x - 0.01), (-0.5 * body, 0.5 * body), (0.27, 0.39), DARK, main=False),
         *_pillars(0.5 * (roof_rear + roof_front), body - 0.09, waist, roof, frame),
         *mirrors(0.72 * front, body - 0.06, frame.y, waist + 0.02, color),
@@ -297,14 +391,21 @@ def _car(frame: _ShapeFrame, line: _Line) -> list[Block]:
     ]
     if line.boot:
         lid = (line.boot[0] * x, line.boot[1] * x)
-        blocks.append(Block(lid, (-body + 0.1, body - 0.1), (waist, waist + 0.06), color, inset=(0, 0.08, 0.08)))
+        blocks.append(
+            Block(
+                lid, (-body + 0.1, body - 0.1), (waist, waist + 0.06), color, inset=(0, 0.08, 0.08)
+            )
+        )
     return blocks
 
 
 def _pillars(x: float, side: float, waist: float, roof: float, frame: _ShapeFrame) -> list[Block]:
     """An upright post between the side windows, left and right."""
     outer = ((side - 0.04, side + 0.005), (-side - 0.005, -side + 0.04))
-    return [Block((x - 0.05, x + 0.05), across, (waist, roof), frame.color, main=False) for across in outer]
+    return [
+        Block((x - 0.05, x + 0.05), across, (waist, roof), frame.color, main=False)
+        for across in outer
+    ]
 
 
 # The same share for vans and trucks.
@@ -335,7 +436,9 @@ def tank_truck(frame: _ShapeFrame) -> list[Block]:
     along, narrow = (-x, 0.5 * x), 0.4 * y
     return [
         *_chassis(frame, 0.74 * frame.top),
-        Block(along, (-y + narrow, y - narrow), (0.95, low), frame.accent, inset=(0.0, 0.0, -narrow)),
+        Block(
+            along, (-y + narrow, y - narrow), (0.95, low), frame.accent, inset=(0.0, 0.0, -narrow)
+        ),
         Block(along, (-y, y), (low, high), frame.accent),
         Block(along, (-y, y), (high, top), frame.accent, inset=(0.0, 0.0, narrow)),
         Block((-0.3 * x, 0.0), (-0.3, 0.3), (top, frame.top), DARK),
@@ -347,7 +450,13 @@ def _van(frame: _ShapeFrame, panes: tuple[tuple[float, float], ...]) -> list[Blo
     waist = 0.52 * top
     sides = ((y - 0.12, y - 0.045), (0.045 - y, 0.12 - y))
     return [
-        Block((-x + 0.04, x - 0.06), (-y + 0.05, y - 0.05), (0.22, 0.44), color, inset=(-0.04, -0.02, -0.05)),
+        Block(
+            (-x + 0.04, x - 0.06),
+            (-y + 0.05, y - 0.05),
+            (0.22, 0.44),
+            color,
+            inset=(-0.04, -0.02, -0.05),
+        ),
         Block((-x + 0.01, x - 0.01), (-y, y), (0.44, waist), color, inset=(0.2, 0.0, 0.03)),
         Block(
             (-x + 0.02, 0.8 * x),
@@ -357,10 +466,28 @@ def _van(frame: _ShapeFrame, panes: tuple[tuple[float, float], ...]) -> list[Blo
             glass=(FRONT,),
             inset=(0.62, 0.05, 0.05),
         ),
-        Block((-x + 0.09, 0.78 * x - 0.62), (-y + 0.1, y - 0.1), (top - 0.08, top), color, inset=(0.12, 0.1, 0.12)),
-        Block((-x + 0.01, -x + 0.1), (-0.7 * y, 0.7 * y), (waist + 0.1, top - 0.35), solids.GLASS, main=False),
+        Block(
+            (-x + 0.09, 0.78 * x - 0.62),
+            (-y + 0.1, y - 0.1),
+            (top - 0.08, top),
+            color,
+            inset=(0.12, 0.1, 0.12),
+        ),
+        Block(
+            (-x + 0.01, -x + 0.1),
+            (-0.7 * y, 0.7 * y),
+            (waist + 0.1, top - 0.35),
+            solids.GLASS,
+            main=False,
+        ),
         *(
-            Block((span[0] * x, span[1] * x), side, (waist + 0.06, top - 0.34), solids.GLASS, main=False)
+            Block(
+                (span[0] * x, span[1] * x),
+                side,
+                (waist + 0.06, top - 0.34),
+                solids.GLASS,
+                main=False,
+            )
             for span in panes
             for side in sides
         ),
@@ -388,7 +515,11 @@ def _chassis(frame: _ShapeFrame, cab_top: float) -> list[Block]:
             inset=(0.16, 0.0, 0.05),
         ),
         Block(
-            (cab[0], cab[1] - 0.2), (-y + 0.09, y - 0.09), (cab_top - 0.15, cab_top), frame.color, inset=(0.2, 0, 0.1)
+            (cab[0], cab[1] - 0.2),
+            (-y + 0.09, y - 0.09),
+            (cab_top - 0.15, cab_top),
+            frame.color,
+            inset=(0.2, 0, 0.1),
         ),
         Block((x - 0.1, x), (-0.6 * y, 0.6 * y), (0.6, 0.95), DARK, glass=(REAR,), main=False),
         *mirrors(cab[1] - 0.3, y - 0.06, frame.y, middle + 0.15, DARK),
@@ -408,12 +539,16 @@ MODELS: dict[str, tuple[Callable[[_ShapeFrame], list[Block]], ...]] = {
 }
 
 
-def shape_of(category: str, size: tuple[float, float, float], color: Color, accent: Color, model: int = 0) -> Solids:
+def shape_of(
+    category: str, size: tuple[float, float, float], color: Color, accent: Color, model: int = 0
+) -> Solids:
     """The solids of a road user with a label box of length, width and height, metres, and two colours.
 
     The model is one of the category's `MODELS`; after the last one, the first follows.
     """
     length, width, height = size
-    frame = _ShapeFrame(length / 2 - INSET, width / 2 - INSET, BOX_CLEARANCE + height - INSET, color, accent)
+    frame = _ShapeFrame(
+        length / 2 - INSET, width / 2 - INSET, BOX_CLEARANCE + height - INSET, color, accent
+    )
     models = MODELS[category]
     return solids.build(models[model % len(models)](frame))

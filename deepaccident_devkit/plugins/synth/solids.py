@@ -6,14 +6,23 @@ from dataclasses import dataclass
 import numpy as np
 
 from deepaccident_devkit.geometry.boxes import CORNER_SIGNS
-from deepaccident_devkit.support.arrays import BoolArray, ByteArray, FloatArray, IntArray, checked, readonly
+from deepaccident_devkit.support.arrays import (
+    BoolArray,
+    ByteArray,
+    FloatArray,
+    IntArray,
+    checked,
+    readonly,
+)
 
 # Red, green, blue, 0 to 255.
 Color = tuple[int, int, int]
 
 # Corners (in the order of `CORNER_SIGNS`) of the faces front, rear, left, right, top, bottom; counter-clockwise
 # seen from outside.
-FACES = np.array([[0, 1, 2, 3], [4, 7, 6, 5], [0, 3, 7, 4], [1, 5, 6, 2], [0, 4, 5, 1], [3, 2, 6, 7]])
+FACES = np.array(
+    [[0, 1, 2, 3], [4, 7, 6, 5], [0, 3, 7, 4], [1, 5, 6, 2], [0, 4, 5, 1], [3, 2, 6, 7]]
+)
 FRONT, REAR, LEFT, RIGHT, TOP, BOTTOM = range(6)
 FACES_A_SOLID = len(FACES)
 
@@ -37,7 +46,12 @@ class Solids:
     def __post_init__(self) -> None:
         """Check the shapes; raises GeometryError."""
         count = len(self.corners)
-        columns = {"corners": (count, 8, 3), "colors": (count, 6, 3), "facade": (count,), "main": (count,)}
+        columns = {
+            "corners": (count, 8, 3),
+            "colors": (count, 6, 3),
+            "facade": (count,),
+            "main": (count,),
+        }
         types = {"corners": np.float64, "colors": np.uint8, "facade": np.bool_, "main": np.bool_}
         for name, shape in columns.items():
             array = checked(f"Solids.{name}", getattr(self, name), shape, types[name])
@@ -92,7 +106,9 @@ def build(blocks: Sequence[Block]) -> Solids:
 
 def concatenate_solids(parts: Sequence[Solids]) -> Solids:
     """All solids of `parts`, in order."""
-    return Solids(*(np.concatenate([getattr(part, name) for part in parts]) for name in Solids.__slots__))
+    return Solids(
+        *(np.concatenate([getattr(part, name) for part in parts]) for name in Solids.__slots__)
+    )
 
 
 def face_corners(corners: FloatArray) -> FloatArray:
@@ -113,7 +129,9 @@ def _corners(block: Block) -> FloatArray:
     corners = np.where(CORNER_SIGNS > 0, high, low)
     front, rear, side = block.inset
     upper = CORNER_SIGNS[:, 2] > 0
-    shift = np.column_stack([np.where(CORNER_SIGNS[:, 0] > 0, -front, rear), -side * CORNER_SIGNS[:, 1]])
+    shift = np.column_stack(
+        [np.where(CORNER_SIGNS[:, 0] > 0, -front, rear), -side * CORNER_SIGNS[:, 1]]
+    )
     corners[upper, :2] += shift[upper]
     return corners
 

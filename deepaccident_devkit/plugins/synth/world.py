@@ -139,7 +139,13 @@ def random_world(
     height = float(pole.uniform(*(_LOW_POLE_HEIGHTS if low_pole else _POLE_HEIGHTS)))
     x, y = (sign * (spec.sidewalk_edge - _POLE_INSET) for sign in corner)
     signs = [yield_sign(spec, arm) for arm in spec.yielding_arms]
-    stands: list[Prop] = [*lights, *signs, mast(x, y, height - _POLE_UNDER_SENSOR), *buildings, *plants]
+    stands: list[Prop] = [
+        *lights,
+        *signs,
+        mast(x, y, height - _POLE_UNDER_SENSOR),
+        *buildings,
+        *plants,
+    ]
     stands += [each for each in lanterns(spec) if not any(overlap(each, other) for other in stands)]
     props = [settled_prop(each, terrain) for each in stands]
     ground = junction.ground_map()
@@ -186,7 +192,10 @@ def settled_prop(prop: Prop, terrain: Terrain) -> Prop:
         return prop
     lift = float(terrain.height(_corners(prop)).min())
     return replace(
-        prop, blocks=tuple(replace(block, z=(block.z[0] + lift, block.z[1] + lift)) for block in prop.blocks)
+        prop,
+        blocks=tuple(
+            replace(block, z=(block.z[0] + lift, block.z[1] + lift)) for block in prop.blocks
+        ),
     )
 
 
@@ -197,7 +206,9 @@ def solids_of(props: Sequence[Prop]) -> Solids:
 
 def top_map(ground: GroundMap, props: Sequence[Prop]) -> GroundMap:
     """The map from above: lower things are painted first, so that higher things cover them."""
-    flat = [(block.z[1], prop.code, (*block.x, *block.y)) for prop in props for block in prop.blocks]
+    flat = [
+        (block.z[1], prop.code, (*block.x, *block.y)) for prop in props for block in prop.blocks
+    ]
     flat.sort(key=lambda entry: entry[0])
     return ground.with_rectangles(
         np.array([extent for _, _, extent in flat]).reshape(-1, 4),
@@ -259,8 +270,12 @@ def _triangle(x: float, y: float, arm: Arm, z: tuple[float, float], color: Color
     """A plate across an arm, nearly a point at the bottom, and at the top as wide as it is high."""
     tip, wide, thin = 0.02, (z[1] - z[0]) * 0.5, 0.02
     if OUTWARD[arm][0]:
-        return Block((x - thin, x + thin), (y - tip, y + tip), z, color, inset=(0.0, 0.0, tip - wide))
-    return Block((x - tip, x + tip), (y - thin, y + thin), z, color, inset=(tip - wide, tip - wide, 0.0))
+        return Block(
+            (x - thin, x + thin), (y - tip, y + tip), z, color, inset=(0.0, 0.0, tip - wide)
+        )
+    return Block(
+        (x - tip, x + tip), (y - thin, y + thin), z, color, inset=(tip - wide, tip - wide, 0.0)
+    )
 
 
 def _column(x: float, y: float, z: tuple[float, float], half: float = 0.09) -> Block:
@@ -291,14 +306,25 @@ def _tree(rng: np.random.Generator, x: float, y: float) -> Prop:
         (
             Block((x - 0.14, x + 0.14), (y - 0.14, y + 0.14), (-0.1, 2.3), _BARK),
             Block(*crown, (2.2, 3.3), leaves, inset=(-0.1, -0.1, -0.1)),
-            Block((x - 1.15, x + 1.15), (y - 1.15, y + 1.15), (3.3, top), leaves, inset=(0.7, 0.7, 0.7)),
+            Block(
+                (x - 1.15, x + 1.15),
+                (y - 1.15, y + 1.15),
+                (3.3, top),
+                leaves,
+                inset=(0.7, 0.7, 0.7),
+            ),
         ),
     )
 
 
 def houses(rng: np.random.Generator, spec: RoadSpec) -> list[Prop]:
     """A corner building in each quadrant and a row of houses along each of its two sides."""
-    blocks = [block for sign_x in (1, -1) for sign_y in (1, -1) for block in _quadrant(rng, spec, sign_x, sign_y)]
+    blocks = [
+        block
+        for sign_x in (1, -1)
+        for sign_y in (1, -1)
+        for block in _quadrant(rng, spec, sign_x, sign_y)
+    ]
     if spec.kind == "three-way":
         blocks += _closed_side(rng, spec)
     return [Prop(FIRST_BUILDING + number % _CODES, (block,)) for number, block in enumerate(blocks)]
@@ -313,10 +339,15 @@ def kerb_house(spec: RoadSpec, corner: tuple[int, int]) -> Prop:
     kept = KERB_RADIUS - KERB_INSET - _MAST_ROOM
     near = max(near, spec.road_edge + KERB_RADIUS - kept / float(np.sqrt(2)))
     x, y = (_mirrored((near, near + _KERB_HOUSE_LENGTH), sign) for sign in corner)
-    return Prop(FIRST_BUILDING, (Block(x, y, (-BASEMENT, STOREY * _KERB_HOUSE_STOREYS + 0.8), _WALLS[0], facade=True),))
+    return Prop(
+        FIRST_BUILDING,
+        (Block(x, y, (-BASEMENT, STOREY * _KERB_HOUSE_STOREYS + 0.8), _WALLS[0], facade=True),),
+    )
 
 
-def _quadrant(rng: np.random.Generator, spec: RoadSpec, sign_x: int, sign_y: int) -> Iterator[Block]:
+def _quadrant(
+    rng: np.random.Generator, spec: RoadSpec, sign_x: int, sign_y: int
+) -> Iterator[Block]:
     setback = spec.sidewalk_edge + rng.uniform(*_SETBACK, 2)
     end = setback + rng.uniform(15, 22, 2)
     yield _house(rng, (setback[0], end[0]), (setback[1], end[1]), (sign_x, sign_y), storeys=(3, 6))
@@ -333,7 +364,9 @@ def _closed_side(rng: np.random.Generator, spec: RoadSpec) -> Iterator[Block]:
     yield _house(rng, (-half, half), (front, front + rng.uniform(9, 14)), (1, 1), storeys=(2, 4))
 
 
-def _row(rng: np.random.Generator, spec: RoadSpec, start: float, deepest: float) -> Iterator[tuple[Span, Span]]:
+def _row(
+    rng: np.random.Generator, spec: RoadSpec, start: float, deepest: float
+) -> Iterator[tuple[Span, Span]]:
     """Houses side by side from `start`: their extents along the road and away from it."""
     position = start + rng.uniform(1.5, 6)
     while position < _LAST_HOUSE:
@@ -343,12 +376,18 @@ def _row(rng: np.random.Generator, spec: RoadSpec, start: float, deepest: float)
 
 
 def _house(
-    rng: np.random.Generator, x: Span, y: Span, signs: tuple[int, int], storeys: tuple[int, int] = (2, 5)
+    rng: np.random.Generator,
+    x: Span,
+    y: Span,
+    signs: tuple[int, int],
+    storeys: tuple[int, int] = (2, 5),
 ) -> Block:
     """A house of the first quadrant, mirrored into another."""
     height = STOREY * int(rng.integers(*storeys)) + 0.8
     wall = _WALLS[rng.integers(len(_WALLS))]
-    return Block(_mirrored(x, signs[0]), _mirrored(y, signs[1]), (-BASEMENT, height), wall, facade=True)
+    return Block(
+        _mirrored(x, signs[0]), _mirrored(y, signs[1]), (-BASEMENT, height), wall, facade=True
+    )
 
 
 def _mirrored(span: Span, sign: int) -> Span:
@@ -358,9 +397,12 @@ def _mirrored(span: Span, sign: int) -> Span:
 
 def _signals(junction: Junction, lights: list[Prop]) -> list[SignalHead]:
     """Where the lamps of the arms' traffic lights are, whose blocks are the first of the world's solids."""
-    ends = accumulate(len(light.blocks) for light in lights)  # the lamps are the last blocks of a light
+    ends = accumulate(
+        len(light.blocks) for light in lights
+    )  # the lamps are the last blocks of a light
     return [
-        SignalHead(arm=arm, rows=(end - 3, end - 2, end - 1)) for arm, end in zip(junction.arms, ends, strict=False)
+        SignalHead(arm=arm, rows=(end - 3, end - 2, end - 1))
+        for arm, end in zip(junction.arms, ends, strict=False)
     ]
 
 
@@ -386,7 +428,11 @@ def _corner_between(junction: Junction, arms: tuple[Arm, Arm]) -> Corner:
 
 def _random_place(rng: np.random.Generator, terrain: Terrain) -> SE3:
     """Some hundred metres from the town's origin, in any direction; on a gentle slope if the ground has no hump."""
-    slope, uphill, yaw = rng.uniform(0, _MAX_SLOPE), rng.uniform(-np.pi, np.pi), rng.uniform(-np.pi, np.pi)
+    slope, uphill, yaw = (
+        rng.uniform(0, _MAX_SLOPE),
+        rng.uniform(-np.pi, np.pi),
+        rng.uniform(-np.pi, np.pi),
+    )
     if not terrain.is_flat:
         slope = 0.0
     across = SE3.from_quaternion((np.cos(slope / 2), 0.0, np.sin(slope / 2), 0.0))

@@ -57,7 +57,9 @@ def release_folder(parts: Sequence[str]) -> str | None:
     does not matter, so that an archive may hold any part of a release, below any folders. Empty for the release's own
     folder; None for one that holds files of no release.
     """
-    if any(name.startswith(".") or name == _FROM_MACOS for name in parts):  # hidden, or leading out of an archive
+    if any(
+        name.startswith(".") or name == _FROM_MACOS for name in parts
+    ):  # hidden, or leading out of an archive
         return None
     types = [place for place, name in enumerate(parts) if SCENARIO_TYPE.fullmatch(name)]
     if not types:
@@ -131,16 +133,29 @@ class Members:
             names = batch.column("name")
             _, offsets, content = names.buffers()
             self.archives: tuple[str, ...] = tuple(map(str, head["archives"]))
-            self.states = {str(name): (int(size), str(text)) for name, (size, text) in head["states"].items()}
+            self.states = {
+                str(name): (int(size), str(text)) for name, (size, text) in head["states"].items()
+            }
             self.lacking = [archive for archive in self.states if archive not in self.archives]
-            self._rows = {str(folder): (int(first), int(last)) for folder, first, last in head["folders"]}
+            self._rows = {
+                str(folder): (int(first), int(last)) for folder, first, last in head["folders"]
+            }
             self._starts = np.frombuffer(offsets, np.int64) if offsets else np.zeros(1, np.int64)
             self._content = memoryview(content) if content else memoryview(b"")
             self._numbers = np.frombuffer(batch.column("member").buffers()[1] or b"", _NUMBERS)
             if len(self._numbers) < len(names) or self._starts[-1] > len(self._content):
                 raise ValueError("its columns do not fit together")
-        except (OSError, pa.ArrowException, KeyError, TypeError, ValueError, AttributeError) as error:
-            raise IndexStoreError(f"{path}: cannot be read ({shortened(str(error))}); {_REMEDY}") from error
+        except (
+            OSError,
+            pa.ArrowException,
+            KeyError,
+            TypeError,
+            ValueError,
+            AttributeError,
+        ) as error:
+            raise IndexStoreError(
+                f"{path}: cannot be read ({shortened(str(error))}); {_REMEDY}"
+            ) from error
         self._children: dict[str, dict[str, None]] = {"": {}}
         for folder in self._rows:
             self._add_folder(folder)
@@ -173,7 +188,10 @@ class Members:
     def files_in(self, folder: str) -> list[tuple[str, Member]]:
         """The names of a folder's files in order, and where they are."""
         low, high = self._rows.get(folder, (0, 0))
-        return [(self._name(row).decode(errors="surrogateescape"), self._member(row)) for row in range(low, high)]
+        return [
+            (self._name(row).decode(errors="surrogateescape"), self._member(row))
+            for row in range(low, high)
+        ]
 
     def number_of(self, member: Member) -> int:
         """Return a number that changes with a file, and with the archive that it is in."""
@@ -196,7 +214,9 @@ class Members:
             siblings[name] = None
 
 
-def write_members(path: Path, listings: Sequence[Listing], states: Mapping[str, tuple[int, str]]) -> None:
+def write_members(
+    path: Path, listings: Sequence[Listing], states: Mapping[str, tuple[int, str]]
+) -> None:
     """Write the list of some archives' files, as `Members` has it; raises DatarootError for a file that is twice."""
     import pyarrow as pa
 
@@ -210,17 +230,26 @@ def write_members(path: Path, listings: Sequence[Listing], states: Mapping[str, 
         parts.append(
             pa.table(
                 {
-                    "folder": np.array([number_of[name] for name in listing.folders], np.int32)[listing.folder],
+                    "folder": np.array([number_of[name] for name in listing.folders], np.int32)[
+                        listing.folder
+                    ],
                     "name": pa.array(
-                        [name.encode(errors="surrogateescape") for name in listing.names], pa.large_binary()
+                        [name.encode(errors="surrogateescape") for name in listing.names],
+                        pa.large_binary(),
                     ),
                     "member": pa.FixedSizeBinaryArray.from_buffers(
-                        pa.binary(_NUMBERS.itemsize), len(numbers), [None, pa.py_buffer(numbers.tobytes())]
+                        pa.binary(_NUMBERS.itemsize),
+                        len(numbers),
+                        [None, pa.py_buffer(numbers.tobytes())],
                     ),
                 }
             )
         )
-    table = pa.concat_tables(parts).sort_by([("folder", "ascending"), ("name", "ascending")]).combine_chunks()
+    table = (
+        pa.concat_tables(parts)
+        .sort_by([("folder", "ascending"), ("name", "ascending")])
+        .combine_chunks()
+    )
     archives = [listing.archive for listing in listings]
     folder = table["folder"].to_numpy()
     _check_once(table, folder, folders, archives)
@@ -229,7 +258,11 @@ def write_members(path: Path, listings: Sequence[Listing], states: Mapping[str, 
     head = json.dumps({"form": FORM, "archives": archives, "folders": list(rows), "states": states})
     table = table.select(["name", "member"]).replace_schema_metadata({_HEAD: head.encode()})
     with replacing(path) as temporary, pa.ipc.new_file(str(temporary), table.schema) as writer:
-        writer.write_batch(pa.RecordBatch.from_arrays([_one(column) for column in table.columns], schema=table.schema))
+        writer.write_batch(
+            pa.RecordBatch.from_arrays(
+                [_one(column) for column in table.columns], schema=table.schema
+            )
+        )
 
 
 def _one(column: Any) -> Any:
@@ -239,7 +272,9 @@ def _one(column: Any) -> Any:
     return column.chunk(0) if column.num_chunks else pa.array([], column.type)
 
 
-def _check_once(table: Any, folder: AnyArray, folders: Sequence[str], archives: Sequence[str]) -> None:
+def _check_once(
+    table: Any, folder: AnyArray, folders: Sequence[str], archives: Sequence[str]
+) -> None:
     """Raise DatarootError if two rows, which are neighbours as they are sorted, are of the same file."""
     import pyarrow.compute as pc
 
@@ -250,8 +285,12 @@ def _check_once(table: Any, folder: AnyArray, folders: Sequence[str], archives: 
     if same.any():
         row = int(np.flatnonzero(same)[0])
         name = names[row].as_py().decode(errors="backslashreplace")
-        members = (np.frombuffer(table["member"][each].as_py(), _NUMBERS) for each in (row, row + 1))
+        members = (
+            np.frombuffer(table["member"][each].as_py(), _NUMBERS) for each in (row, row + 1)
+        )
         first, second = (archives[int(member["archive"][0])] for member in members)
         where = f"in {first} and in {second}" if first != second else f"twice in {first}"
         more = f", and so are {same.sum() - 1:,} more" if same.sum() > 1 else ""
-        raise DatarootError(f"{folders[folder[row]]}/{name}: is {where}{more}; keep one of them in this folder")
+        raise DatarootError(
+            f"{folders[folder[row]]}/{name}: is {where}{more}; keep one of them in this folder"
+        )

@@ -30,7 +30,13 @@ from deepaccident_devkit.release.store.members import (
     release_folder,
     write_members,
 )
-from deepaccident_devkit.release.store.paths import Dataroot, ReleasePath, StorePath, folder_entries, is_folder
+from deepaccident_devkit.release.store.paths import (
+    Dataroot,
+    ReleasePath,
+    StorePath,
+    folder_entries,
+    is_folder,
+)
 from deepaccident_devkit.release.store.sources import UrlSource, asked, list_zip
 from deepaccident_devkit.release.store.store import opened_store
 from deepaccident_devkit.support.files import is_writable_folder
@@ -51,9 +57,7 @@ _ENDING: Final = ".zip"
 _DEEPEST: Final = 3
 # How the name of a list of a store's files begins.
 _LIST: Final = "files-"
-_WITHOUT_THEM: Final = (
-    "\nThe others can be read without them: move them out of the folder, or pass on_error='skip' (--on-error skip)."
-)
+_WITHOUT_THEM: Final = "\nThe others can be read without them: move them out of the folder, or pass on_error='skip' (--on-error skip)."
 _logger = logging.getLogger(__name__)
 
 
@@ -104,7 +108,9 @@ def open_dataroot(
 
 def refused_archives(root: ReleasePath) -> list[str]:
     """Return a sentence for each archive that was left out of a store: which one, what is wrong with it, a remedy."""
-    results = [] if isinstance(root, Path) else _listings(root.store.base, root.store.members.lacking)
+    results = (
+        [] if isinstance(root, Path) else _listings(root.store.base, root.store.members.lacking)
+    )
     return [result.message for result in results if not isinstance(result, Listing)]
 
 
@@ -116,11 +122,18 @@ def index_places(dataroot: Dataroot, index_dir: Path | None = None) -> Iterator[
     located = _located(dataroot.store.place if isinstance(dataroot, StorePath) else dataroot)
     identity = os.fsencode(located)
     if isinstance(located, Path):
-        yield located.parent / INDEX_FOLDER / located.name if located.is_file() else located / INDEX_FOLDER
+        yield (
+            located.parent / INDEX_FOLDER / located.name
+            if located.is_file()
+            else located / INDEX_FOLDER
+        )
         identity = os.fsencode(os.path.realpath(located))  # `resolve` raises for a link to itself
     from platformdirs import user_cache_path
 
-    yield user_cache_path("deepaccident_devkit") / hashlib.blake2b(identity, digest_size=8).hexdigest()
+    yield (
+        user_cache_path("deepaccident_devkit")
+        / hashlib.blake2b(identity, digest_size=8).hexdigest()
+    )
 
 
 def list_files_in(place: Path) -> list[Path]:
@@ -143,7 +156,10 @@ def _archives(path: Path) -> list[Path]:
     """The archives that a path stands for: itself, or those in a folder that holds no release; none for others."""
     if path.suffix.lower() == _ENDING and path.is_file():
         return [path]
-    if any(_has_scenarios(folder) for folder in (path, *(path / name for name in (*SPLIT_FOLDERS, MINI_FOLDER)))):
+    if any(
+        _has_scenarios(folder)
+        for folder in (path, *(path / name for name in (*SPLIT_FOLDERS, MINI_FOLDER)))
+    ):
         return []
     found: list[Path] = []
     folders = [(path, 0)]
@@ -154,19 +170,30 @@ def _archives(path: Path) -> list[Path]:
                 inside = folder / entry.name
                 if is_folder(entry) and depth < _DEEPEST and not entry.name.startswith("."):
                     folders.append((inside, depth + 1))
-                elif entry.name.lower().endswith(_ENDING) and inside.is_file() and not entry.name.startswith("."):
+                elif (
+                    entry.name.lower().endswith(_ENDING)
+                    and inside.is_file()
+                    and not entry.name.startswith(".")
+                ):
                     found.append(inside)
     return sorted(found)
 
 
 def _has_scenarios(folder: Path) -> bool:
     with suppress(OSError):
-        return any(SCENARIO_TYPE.fullmatch(entry.name) and is_folder(entry) for entry in folder_entries(folder))
+        return any(
+            SCENARIO_TYPE.fullmatch(entry.name) and is_folder(entry)
+            for entry in folder_entries(folder)
+        )
     return False
 
 
 def _opened_archives(
-    path: Path, archives: Sequence[Path], places: Sequence[Path], on_error: OnError, **how: Unpack[Engine]
+    path: Path,
+    archives: Sequence[Path],
+    places: Sequence[Path],
+    on_error: OnError,
+    **how: Unpack[Engine],
 ) -> StorePath:
     base = path.parent if archives == [path] else path
     split_files = (path / below / name for below in ("", SPLIT_FILE_FOLDER) for name in SPLIT_FILES)
@@ -191,7 +218,9 @@ def state_of(file: Path) -> tuple[int, str]:
     return status.st_size, f"{status.st_mtime_ns} {status.st_ctime_ns}"
 
 
-def _opened_url(source: UrlSource, places: Sequence[Path], on_error: OnError, *, refresh: bool) -> StorePath:
+def _opened_url(
+    source: UrlSource, places: Sequence[Path], on_error: OnError, *, refresh: bool
+) -> StorePath:
     url = source.url
     base = UrlSource(url.rpartition("/")[0]) if url.lower().endswith(_ENDING) else source
     with _told(url):
@@ -201,7 +230,9 @@ def _opened_url(source: UrlSource, places: Sequence[Path], on_error: OnError, *,
             listings = _accepted(url, _listings(base.url, archives, workers=1), on_error)
             listings = _with_loose(listings, others)
             if on_error == "raise" and not any(listing.names for listing in listings):
-                raise DatarootError(f"{url}: no file of a release found; give the URL that the release lies below")
+                raise DatarootError(
+                    f"{url}: no file of a release found; give the URL that the release lies below"
+                )
             known = _written(places, [*archives.items(), *others.items()], listings, archives)
     return StorePath(opened_store(url, base.url, known))
 
@@ -210,10 +241,16 @@ def _listings(
     base: str, archives: Iterable[str], places: tuple[Path, ...] = (), **how: Unpack[Engine]
 ) -> list[Listing | Failure]:
     """List archives by their paths from the base, a folder or a URL; a Failure says why one cannot be listed."""
-    from deepaccident_devkit.support.parallel import Places, Tried, run_batch  # here: few dataroots are archives
+    from deepaccident_devkit.support.parallel import (
+        Places,
+        Tried,
+        run_batch,
+    )  # here: few dataroots are archives
 
     work = Tried(partial(_listing_of, base))
-    return run_batch(work, list(archives), label="listing archives", places=Places(reads=places), **how)
+    return run_batch(
+        work, list(archives), label="listing archives", places=Places(reads=places), **how
+    )
 
 
 def _listing_of(base: str, name: str) -> Listing:
@@ -228,13 +265,17 @@ def _listing_of(base: str, name: str) -> Listing:
     except OSError as error:
         if isinstance(error, DatarootError):
             raise
-        raise DatarootError(f"{shown}: {fault_text(error)}; make it readable, or fetch it again") from error
+        raise DatarootError(
+            f"{shown}: {fault_text(error)}; make it readable, or fetch it again"
+        ) from error
 
 
 def _accepted(place: str, results: Sequence[Listing | Failure], on_error: OnError) -> list[Listing]:
     """Return the listings of archives; those that cannot be listed are logged, or DatarootError names all of them."""
     refused = [result.message for result in results if not isinstance(result, Listing)]
-    text = "\n  ".join([f"{place}: {len(refused)} of {len(results)} archives cannot be read:", *refused])
+    text = "\n  ".join(
+        [f"{place}: {len(refused)} of {len(results)} archives cannot be read:", *refused]
+    )
     if refused and on_error == "raise":
         raise DatarootError(text + _WITHOUT_THEM * (len(refused) < len(results)))
     if refused:
@@ -247,7 +288,9 @@ def _known_list(base: UrlSource, places: Sequence[Path]) -> Path | None:
     for path in (path for place in places for path in list_files_in(place)):
         with suppress(IndexStoreError):
             members = Members(path)
-            if not members.lacking and all(base.state_of(name) == state for name, state in members.states.items()):
+            if not members.lacking and all(
+                base.state_of(name) == state for name, state in members.states.items()
+            ):
                 return path
     return None
 
@@ -262,7 +305,9 @@ def _files_at(base: UrlSource, url: str) -> tuple[_States, _States]:
         return {name: base.state_of(name)}, {}
     files = dict(sorted(base.list_files().items()))
     archives = {name: state for name, state in files.items() if name.lower().endswith(_ENDING)}
-    if not archives or any(release_folder(folder.split("/")) for folder in {each.rpartition("/")[0] for each in files}):
+    if not archives or any(
+        release_folder(folder.split("/")) for folder in {each.rpartition("/")[0] for each in files}
+    ):
         return {}, files
     return archives, {name: state for name, state in files.items() if _is_split(name)}
 
@@ -276,7 +321,10 @@ def _is_split(path: str) -> bool:
 def _with_loose(listings: Sequence[Listing], files: _States) -> list[Listing]:
     """The listings of archives, and of files beside them; a split file that an archive holds counts more than those."""
     packed = {name for listing in listings for name in listing.names if name in SPLIT_FILES}
-    return [*listings, *_loose({path: files[path] for path in files if path.rpartition("/")[2] not in packed})]
+    return [
+        *listings,
+        *_loose({path: files[path] for path in files if path.rpartition("/")[2] not in packed}),
+    ]
 
 
 def _loose(files: _States) -> list[Listing]:
@@ -300,7 +348,9 @@ def _loose(files: _States) -> list[Listing]:
         }
         names = [path.rpartition("/")[2] for path in paths]
         zeros = np.zeros(len(paths), int)
-        listings.append(Listing(archive=folder, folders=[found], folder=zeros, names=names, numbers=numbers))
+        listings.append(
+            Listing(archive=folder, folders=[found], folder=zeros, names=names, numbers=numbers)
+        )
     return listings
 
 
@@ -324,7 +374,9 @@ def _written(
     place = next((place for place in places if is_writable_folder(place)), None)
     if place is None:
         told = " or ".join(map(str, places))
-        raise IndexStoreError(f"{told}: no place to write the index; give a writable folder with index_dir=")
+        raise IndexStoreError(
+            f"{told}: no place to write the index; give a writable folder with index_dir="
+        )
     try:
         write_members(place / name, listings, states)
         for path in list_files_in(place):
@@ -333,7 +385,9 @@ def _written(
     except OSError as error:
         if isinstance(error, DeepAccidentError):
             raise
-        raise IndexStoreError(f"{place / name}: cannot be written ({fault_text(error)}); make room there") from error
+        raise IndexStoreError(
+            f"{place / name}: cannot be written ({fault_text(error)}); make room there"
+        ) from error
     return place / name
 
 
@@ -345,5 +399,11 @@ def _told(url: str) -> Iterator[None]:
     except OSError as error:
         if isinstance(error, DeepAccidentError):
             raise
-        what = "does not exist, or may not be listed" if isinstance(error, FileNotFoundError) else fault_text(error)
-        raise DatarootError(f"{url}: {what}; check the URL, and the credentials in the environment") from None
+        what = (
+            "does not exist, or may not be listed"
+            if isinstance(error, FileNotFoundError)
+            else fault_text(error)
+        )
+        raise DatarootError(
+            f"{url}: {what}; check the URL, and the credentials in the environment"
+        ) from None

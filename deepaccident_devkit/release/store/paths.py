@@ -11,7 +11,12 @@ from functools import total_ordering
 from pathlib import Path, PurePath, PurePosixPath
 from typing import Final, TypeAlias
 
-from deepaccident_devkit.errors import DatarootError, MissingFileError, NotAvailableError, ReleaseError
+from deepaccident_devkit.errors import (
+    DatarootError,
+    MissingFileError,
+    NotAvailableError,
+    ReleaseError,
+)
 from deepaccident_devkit.release.store.store import COMPARES, READ_BEFORE, ReleaseStore
 from deepaccident_devkit.support.reading import FileKind, fault_text, read_bytes
 
@@ -121,7 +126,9 @@ def places_of(root: ReleasePath) -> tuple[Path, ...]:
     return (root,) if isinstance(root, Path) else root.store.places
 
 
-def read_content(path: ReleasePath, kind: FileKind, fault: type[ReleaseError], remedy: str = REMEDY) -> bytes:
+def read_content(
+    path: ReleasePath, kind: FileKind, fault: type[ReleaseError], remedy: str = REMEDY
+) -> bytes:
     """A file's bytes; raises MissingFileError, and `fault` if it cannot be read or is too large for its kind."""
     try:
         return read_bytes(path, kind)
@@ -132,14 +139,21 @@ def read_content(path: ReleasePath, kind: FileKind, fault: type[ReleaseError], r
 
 
 def read_lines(
-    path: ReleasePath, kind: FileKind, fault: type[ReleaseError], remedy: str = REMEDY, *, errors: str = "strict"
+    path: ReleasePath,
+    kind: FileKind,
+    fault: type[ReleaseError],
+    remedy: str = REMEDY,
+    *,
+    errors: str = "strict",
 ) -> list[str]:
     """The lines of a UTF-8 file, without line ends; raises as `read_content` does, and `fault` if it is no text.
 
     `errors` says what to do with bytes that are not UTF-8, as of `bytes.decode`.
     """
     try:
-        return read_content(path, kind, fault, remedy).decode("utf-8-sig", errors=errors).splitlines()
+        return (
+            read_content(path, kind, fault, remedy).decode("utf-8-sig", errors=errors).splitlines()
+        )
     except UnicodeDecodeError as error:
         raise fault(f"{path}: not a text file ({error.reason}); {remedy}") from error
 
@@ -148,7 +162,9 @@ def real_path(path: ReleasePath) -> Path:
     """A path that other programs can write to; raises NotAvailableError if this has no path of the system."""
     if isinstance(path, Path):
         return path
-    raise NotAvailableError(f"{path}: lies in an archive or at a URL, and has no path of its own; unpack it first")
+    raise NotAvailableError(
+        f"{path}: lies in an archive or at a URL, and has no path of its own; unpack it first"
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -186,7 +202,10 @@ def folder_entries(folder: ReleasePath) -> list[FolderEntry]:
         if folder.is_file():
             raise NotADirectoryError(str(folder))
         raise FileNotFoundError(str(folder))
-    folders = [StoreEntry(name, StoreStatus(stat.S_IFDIR, 0, 0)) for name in members.folders_in(folder.inside)]
+    folders = [
+        StoreEntry(name, StoreStatus(stat.S_IFDIR, 0, 0))
+        for name in members.folders_in(folder.inside)
+    ]
     files = [
         StoreEntry(name, StoreStatus(stat.S_IFREG, member.size, members.number_of(member)))
         for name, member in members.files_in(folder.inside)
@@ -222,7 +241,9 @@ def _fetched(paths: Sequence[StorePath]) -> dict[str, bytes] | None:
     except FileNotFoundError:  # one after the other they say which one is gone
         return None
     except OSError as error:
-        raise DatarootError(f"{store.place}: {fault_text(error)}; check the connection and the credentials") from error
+        raise DatarootError(
+            f"{store.place}: {fault_text(error)}; check the connection and the credentials"
+        ) from error
 
 
 @contextmanager

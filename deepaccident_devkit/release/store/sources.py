@@ -19,7 +19,12 @@ from urllib.parse import urlsplit
 import numpy as np
 
 from deepaccident_devkit.errors import MOST_TOLD, DatarootError, MissingExtraError, shortened
-from deepaccident_devkit.release.store.members import Listing, Member, is_release_file, release_folder
+from deepaccident_devkit.release.store.members import (
+    Listing,
+    Member,
+    is_release_file,
+    release_folder,
+)
 from deepaccident_devkit.support.reading import (
     DAMAGED_ARCHIVE,
     LIMITS_VARIABLE,
@@ -86,7 +91,11 @@ class LocalSource(Source):
         opened = self._opened.get(archive) or self._open(archive)
         descriptor = opened.descriptor
         content = os.pread(descriptor, stop - start, start)
-        return content if len(content) == stop - start else self._rest(descriptor, content, start, stop)
+        return (
+            content
+            if len(content) == stop - start
+            else self._rest(descriptor, content, start, stop)
+        )
 
     def _open(self, archive: str) -> _Archive:
         with open_file(self._folder / archive) as file:
@@ -116,7 +125,9 @@ class UrlSource(Source):
     def read(self, archive: str, start: int, stop: int) -> bytes:
         """Bytes of an archive, or of a file."""
         files, root = self._files()
-        return cast("bytes", asked(lambda: files.cat_file(f"{root}/{archive}", start=start, end=stop)))
+        return cast(
+            "bytes", asked(lambda: files.cat_file(f"{root}/{archive}", start=start, end=stop))
+        )
 
     def read_all(self, ranges: Sequence[ByteRange]) -> list[bytes]:
         """Several parts, together: what lies close together comes as one."""
@@ -124,11 +135,15 @@ class UrlSource(Source):
 
         files, root = self._files()
         names, starts, stops = (list(each) for each in zip(*ranges, strict=True))
-        merged = merge_offset_ranges(names, starts, stops, max_gap=_LARGEST_GAP, max_block=_LARGEST_RANGE, sort=True)
+        merged = merge_offset_ranges(
+            names, starts, stops, max_gap=_LARGEST_GAP, max_block=_LARGEST_RANGE, sort=True
+        )
         names, starts, stops = merged
         paths = [f"{root}/{name}" for name in names]
         blocks = asked(lambda: files.cat_ranges(paths, starts, stops, on_error="raise"))
-        found = {(name, start): block for name, start, block in zip(names, starts, blocks, strict=True)}
+        found = {
+            (name, start): block for name, start, block in zip(names, starts, blocks, strict=True)
+        }
         firsts: dict[str, list[int]] = {}
         for name, start in sorted(found):
             firsts.setdefault(name, []).append(start)
@@ -142,7 +157,11 @@ class UrlSource(Source):
         """The files below the URL: path from there → bytes, and a text that changes with the file; raises OSError."""
         files, root = self._files()
         found = asked(lambda: files.find(root, detail=True))
-        return {path.removeprefix(f"{root}/"): _state(detail) for path, detail in found.items() if path != root}
+        return {
+            path.removeprefix(f"{root}/"): _state(detail)
+            for path, detail in found.items()
+            if path != root
+        }
 
     def state_of(self, archive: str) -> tuple[int, str]:
         """An archive's bytes, and a text that changes with it; raises OSError."""
@@ -180,7 +199,9 @@ def _fsspec(url: str) -> Any:
     try:
         import fsspec.core
     except ModuleNotFoundError as error:
-        raise MissingExtraError(f"{url}: needs fsspec: in a checkout, pip install '.[cloud]'") from error
+        raise MissingExtraError(
+            f"{url}: needs fsspec: in a checkout, pip install '.[cloud]'"
+        ) from error
     logging.getLogger("fsspec").addHandler(logging.NullHandler())
     return fsspec
 
@@ -224,17 +245,25 @@ def list_zip(file: BinaryIO, archive: str, shown: str) -> Listing:
         with zipfile.ZipFile(file) as opened:
             entries = opened.infolist()
     except RefusedFileError as error:  # by the gate, or by a URL
-        sound = f"; if the archive is sound, set {LIMITS_VARIABLE}=archive=4G" if error.errno == errno.EFBIG else ""
+        sound = (
+            f"; if the archive is sound, set {LIMITS_VARIABLE}=archive=4G"
+            if error.errno == errno.EFBIG
+            else ""
+        )
         raise DatarootError(f"{shown}: {fault_text(error)}{sound}") from error
     except DAMAGED_ARCHIVE as error:
         told = shortened(fault_text(error), MOST_TOLD)
-        raise DatarootError(f"{shown}: not a readable zip archive ({told}; {size:,} bytes); {_REMEDY}") from error
+        raise DatarootError(
+            f"{shown}: not a readable zip archive ({told}; {size:,} bytes); {_REMEDY}"
+        ) from error
     leading = PurePosixPath(archive).with_suffix("").parts
     folder_of: dict[str, str | None] = {}
     number_of: dict[str, int] = {}
     folder, names, rows = [], [], []
     for entry in entries:
-        above, _, name = entry.filename.replace("\\", "/").rpartition("/")  # old tools of Windows write backslashes
+        above, _, name = entry.filename.replace("\\", "/").rpartition(
+            "/"
+        )  # old tools of Windows write backslashes
         if above not in folder_of:
             folder_of[above] = release_folder((*leading, *PurePosixPath(above).parts))
         found = folder_of[above]
@@ -244,10 +273,20 @@ def list_zip(file: BinaryIO, archive: str, shown: str) -> Listing:
         folder.append(number_of.setdefault(found, len(number_of)))
         names.append(name)
         deflated = entry.compress_type == zipfile.ZIP_DEFLATED
-        rows.append((entry.header_offset, entry.compress_size, entry.file_size, entry.CRC, deflated))
+        rows.append(
+            (entry.header_offset, entry.compress_size, entry.file_size, entry.CRC, deflated)
+        )
     columns = zip(*rows, strict=True) if rows else ((),) * 5
-    numbers = {name: np.array(column) for name, column in zip(Member._fields[1:], columns, strict=True)}
-    return Listing(archive=archive, folders=[*number_of], folder=np.array(folder, int), names=names, numbers=numbers)
+    numbers = {
+        name: np.array(column) for name, column in zip(Member._fields[1:], columns, strict=True)
+    }
+    return Listing(
+        archive=archive,
+        folders=[*number_of],
+        folder=np.array(folder, int),
+        names=names,
+        numbers=numbers,
+    )
 
 
 def member_bytes(content: bytes, member: Member) -> bytes:

@@ -29,7 +29,13 @@ from deepaccident_devkit.release.store.sources import (
     source_of,
 )
 from deepaccident_devkit.support.files import place_in, remove_in, temporary_of, write_bytes
-from deepaccident_devkit.support.reading import FileKind, RefusedFileError, bytes_of, check_size, fault_text
+from deepaccident_devkit.support.reading import (
+    FileKind,
+    RefusedFileError,
+    bytes_of,
+    check_size,
+    fault_text,
+)
 
 FOLDER_VARIABLE: Final = "DEEPACCIDENT_CACHE"
 SIZE_VARIABLE: Final = "DEEPACCIDENT_CACHE_SIZE"
@@ -60,14 +66,22 @@ class FileCache:
 
         most = bytes_of(os.environ.get(SIZE_VARIABLE) or _DEFAULT_SIZE)
         if most is None:
-            raise ConfigError(f"{SIZE_VARIABLE}: expected bytes with K, M, G or T, such as {_DEFAULT_SIZE}")
+            raise ConfigError(
+                f"{SIZE_VARIABLE}: expected bytes with K, M, G or T, such as {_DEFAULT_SIZE}"
+            )
         folder = os.environ.get(FOLDER_VARIABLE)
-        place = Path(folder).expanduser() if folder else user_cache_path("deepaccident_devkit") / "files"
+        place = (
+            Path(folder).expanduser()
+            if folder
+            else user_cache_path("deepaccident_devkit") / "files"
+        )
         return cls(place.absolute(), most)
 
     def path_of(self, identity: str, name: str) -> Path:
         """Where the copy of a file would lie, of which `identity` is the only one; raises OutputFolderError."""
-        digest = hashlib.blake2b(identity.encode(errors="surrogateescape"), digest_size=16).hexdigest()
+        digest = hashlib.blake2b(
+            identity.encode(errors="surrogateescape"), digest_size=16
+        ).hexdigest()
         return place_in(self.folder, f"{digest[:2]}/{digest[2:]}/{name}", opened=True)
 
     def found(self, path: Path, size: int) -> bool:
@@ -178,13 +192,17 @@ class ReleaseStore:
         try:
             return self._kept(name, self._member(name))
         except FileNotFoundError:
-            raise MissingFileError(f"{self.place}/{name}: no such file; add the archive that holds it") from None
+            raise MissingFileError(
+                f"{self.place}/{name}: no such file; add the archive that holds it"
+            ) from None
         except OSError as error:
             raise SensorFileError(f"{self.place}/{name}: {fault_text(error)}") from error
 
     def fetch(self, names: Iterable[str]) -> dict[str, bytes]:
         """Small files by name, read together, without those that are not there or damaged; raises OSError."""
-        wanted = [(name, member) for name in names if (member := self.members.find(name)) is not None]
+        wanted = [
+            (name, member) for name in names if (member := self.members.find(name)) is not None
+        ]
         if not wanted:
             return {}
         contents = self._source.read_all([self._range(name, member) for name, member in wanted])
@@ -209,7 +227,9 @@ class ReleaseStore:
         return member
 
     def _kept(self, name: str, member: Member) -> Path:
-        path = self._cache.path_of(f"{self.place}\n{name}\n{self.members.number_of(member)}", name.rpartition("/")[2])
+        path = self._cache.path_of(
+            f"{self.place}\n{name}\n{self.members.number_of(member)}", name.rpartition("/")[2]
+        )
         if not self._cache.found(path, member.size):
             self._cache.put(path, self._bytes(name, member))
         return path

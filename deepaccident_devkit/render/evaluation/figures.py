@@ -28,9 +28,20 @@ from deepaccident_devkit.motion import MotionLabels
 from deepaccident_devkit.render.captions import draw_legend_of_fills, set_scene_title, set_title
 from deepaccident_devkit.render.evaluation import tasks
 from deepaccident_devkit.render.evaluation.panels import PANEL, UNKNOWN, render_breakdown
-from deepaccident_devkit.render.figures import axes_or_new, report_figure, titled_from_above, write_report_figure
+from deepaccident_devkit.render.figures import (
+    axes_or_new,
+    report_figure,
+    titled_from_above,
+    write_report_figure,
+)
 from deepaccident_devkit.render.outcomes import draw_accident_outcome, draw_detection_outcome
-from deepaccident_devkit.render.styles import MUTED_COLOR, OUTCOME_COLORS, WARNING_COLOR, current_style, in_own_settings
+from deepaccident_devkit.render.styles import (
+    MUTED_COLOR,
+    OUTCOME_COLORS,
+    WARNING_COLOR,
+    current_style,
+    in_own_settings,
+)
 from deepaccident_devkit.support.arrays import BoolArray
 from deepaccident_devkit.support.version import __version__
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
@@ -75,7 +86,9 @@ class RunFigure:
 def save_figure(run: EvaluationRun, drawn: RunFigure, folder: Path) -> Path:
     """Render a figure of a run into a PNG file of a folder, over one that is there, as `write_report_figure` does."""
     said = {"Title": drawn.name, "Description": " ".join(filter(None, (_mark(run), _made_of(run))))}
-    return write_report_figure(complete_figure(run, drawn), folder / f"{drawn.name}.png", dpi=_DPI, words=said)
+    return write_report_figure(
+        complete_figure(run, drawn), folder / f"{drawn.name}.png", dpi=_DPI, words=said
+    )
 
 
 @in_own_settings
@@ -104,8 +117,12 @@ def run_figures(run: EvaluationRun) -> tuple[RunFigure, ...]:
     for name, told in run.further.items():
         own += extra_result(name).figures(told.groups[0].result)
     left_out = (EVERYTHING, *(WITHIN_RECORDINGS if run.evaluator.needs_whole_recordings else ()))
-    broken = {each.by: each for each in run.breakdowns if each.by not in left_out and len(each.groups) > 1}
-    numbers = [path for path in run.evaluator.main_numbers if _headline(run.result, path) is not None]
+    broken = {
+        each.by: each for each in run.breakdowns if each.by not in left_out and len(each.groups) > 1
+    }
+    numbers = [
+        path for path in run.evaluator.main_numbers if _headline(run.result, path) is not None
+    ]
     pairs = [(path, each) for path in numbers[:1] for each in broken.values()]
     pairs[1:1] = [(path, broken[_BY_TIME]) for path in numbers[1:] if _BY_TIME in broken]
     shown = [(path, each) for path, each in pairs if _has_numbers(each, path)]
@@ -116,7 +133,11 @@ def _accident(run: EvaluationRun) -> Iterator[RunFigure]:
     evaluator, result = run.evaluator, run.result
     if not isinstance(evaluator, AccidentEvaluator):
         return
-    curve = "" if tasks.has_alarms(evaluator) else " The released protocol counts only at these three distances."
+    curve = (
+        ""
+        if tasks.has_alarms(evaluator)
+        else " The released protocol counts only at these three distances."
+    )
     yield RunFigure(
         name="accuracy",
         caption=f"Accident prediction accuracy over the allowed distance; APA is the mean of the three points.{curve}",
@@ -155,7 +176,11 @@ def _detection(run: EvaluationRun) -> Iterator[RunFigure]:
     for row, ring in np.argwhere(result.truths).tolist():
         name, (low, high) = result.classes[row], result.ranges[ring].tolist()
         where = f" from {low:g} to {high:g} m" if several else ""
-        limits = zip(result.thresholds[row].tolist(), result.average_precision[row, ring].tolist(), strict=True)
+        limits = zip(
+            result.thresholds[row].tolist(),
+            result.average_precision[row, ring].tolist(),
+            strict=True,
+        )
         yield RunFigure(
             name=f"precision_recall_{name}" + f"_{low:g}_{high:g}m" * several,
             caption=f"Precision over recall: {name}{where}, one line for each threshold ({unit}).",
@@ -211,7 +236,9 @@ _FIGURES: Final[dict[str, Callable[[EvaluationRun], Iterator[RunFigure]]]] = {
 def _by(broken: Breakdown[Any], path: str) -> RunFigure:
     values = [(group.value or UNKNOWN, _headline(group.result, path)) for group in broken.groups]
     name = next(headline.name for _, headline in values if headline is not None)
-    words = ", ".join(f"{value} {'–' if headline is None else headline.text()}" for value, headline in values)
+    words = ", ".join(
+        f"{value} {'–' if headline is None else headline.text()}" for value, headline in values
+    )
     by, percent = broken.by.replace("_", " "), 100 * broken.resampling.confidence
     return RunFigure(
         name=f"{path.rsplit('/', 1)[-1]}_by_{broken.by}",
@@ -233,7 +260,9 @@ def _headline(result: Any, path: str) -> Headline | None:
 
 def listed(values: Iterable[tuple[str, float | None]]) -> str:
     """Names with their values, with three digits, as the words of a figure."""
-    known = [(name, None if value is None or math.isnan(value) else value) for name, value in values]
+    known = [
+        (name, None if value is None or math.isnan(value) else value) for name, value in values
+    ]
     return ", ".join(f"{name} {'–' if value is None else f'{value:.3g}'}" for name, value in known)
 
 
@@ -246,7 +275,9 @@ def sample_figures(run: EvaluationRun, dataset: Dataset, results: Results) -> tu
         return ()
     ranked = _ranked(run)
     count = min(_EACH, len(ranked) // 2)
-    worst = [each for each in ranked[:count] if each[1] != ranked[-1][1]]  # none where all are alike
+    worst = [
+        each for each in ranked[:count] if each[1] != ranked[-1][1]
+    ]  # none where all are alike
     best = ranked[max(len(ranked) - _EACH, len(worst)) :]
     load = SampleLoader(dataset, results, run.setup)
     return tuple(
@@ -264,7 +295,11 @@ def sample_figures(run: EvaluationRun, dataset: Dataset, results: Results) -> tu
 
 @in_own_settings
 def draw_motion_outcome(
-    prediction: MotionOutput, label: MotionLabels, *, frame: int | None = None, ax: Axes | None = None
+    prediction: MotionOutput,
+    label: MotionLabels,
+    *,
+    frame: int | None = None,
+    ax: Axes | None = None,
 ) -> Axes:
     """Render a frame's cells: actors that are predicted, predicted falsely, and missed.
 
@@ -287,12 +322,24 @@ def draw_motion_outcome(
     there = prediction.grid.reorient(_actors(prediction, frame), "devkit")
     true = grid.reorient(truth.segmentation[frame] == 1, "devkit")
     picture = np.zeros((*true.shape, 4))  # transparent where nobody is
-    for kind, cells in (("right", there & true), ("false", there & ~true), ("missed", true & ~there)):
+    for kind, cells in (
+        ("right", there & true),
+        ("false", there & ~true),
+        ("missed", true & ~there),
+    ):
         picture[cells] = to_rgba(OUTCOME_COLORS[kind])
-    ax.imshow(picture, origin="lower", extent=(*grid.x[:2], *grid.y[:2]), interpolation="nearest", zorder=0.5)
+    ax.imshow(
+        picture,
+        origin="lower",
+        extent=(*grid.x[:2], *grid.y[:2]),
+        interpolation="nearest",
+        zorder=0.5,
+    )
     draw_legend_of_fills(ax, OUTCOME_COLORS)
     seconds = frame * label.config.step * FRAME_PERIOD
-    return titled_from_above(ax, f"actors {seconds:g} s ahead" if frame else "actors now", grid=True)
+    return titled_from_above(
+        ax, f"actors {seconds:g} s ahead" if frame else "actors now", grid=True
+    )
 
 
 def _draw(load: SampleLoader, token: str, text: str, *, ax: Axes) -> Axes:

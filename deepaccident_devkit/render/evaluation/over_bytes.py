@@ -11,7 +11,13 @@ from deepaccident_devkit.render.captions import set_title
 from deepaccident_devkit.render.chips import keep_free, place_chips
 from deepaccident_devkit.render.evaluation.panels import PANEL
 from deepaccident_devkit.render.figures import figure_or_new, with_light_grid
-from deepaccident_devkit.render.styles import ESTIMATE_COLOR, MUTED_COLOR, current_style, in_own_settings, text_size
+from deepaccident_devkit.render.styles import (
+    ESTIMATE_COLOR,
+    MUTED_COLOR,
+    current_style,
+    in_own_settings,
+    text_size,
+)
 from deepaccident_devkit.support.text import counted
 
 if TYPE_CHECKING:
@@ -35,7 +41,9 @@ def render_over_bytes(report: OverBytes, *, fig: Figure | None = None) -> Figure
     names = list(dict.fromkeys(each.headline for each in report.points))[: 2 * columns]
     rows = -(-len(names) // columns) or 1
     fig = figure_or_new(fig, (PANEL[0] * columns, PANEL[1] * rows + 0.7), column=0.75 * rows)
-    set_title(fig, f"{report.task}, protocol {report.protocol}: {counted(report.samples, 'sample')}")
+    set_title(
+        fig, f"{report.task}, protocol {report.protocol}: {counted(report.samples, 'sample')}"
+    )
     fig.supxlabel(
         f"bytes a sample, as powers of 2\nwhiskers: {100 * report.resampling.confidence:g} % intervals",
         fontsize=text_size(),
@@ -58,7 +66,14 @@ def _draw(points: Sequence[BytesPoint], ax: Axes) -> None:
     for each in points:
         x = math.log2(each.bytes) if each.bytes else edge[0]
         low, high = (each.value if end is None else end for end in (each.low, each.high))
-        ax.plot((x, x, x), (low, each.value, high), "o-", markevery=[1], markersize=6.5, color=ESTIMATE_COLOR)
+        ax.plot(
+            (x, x, x),
+            (low, each.value, high),
+            "o-",
+            markevery=[1],
+            markersize=6.5,
+            color=ESTIMATE_COLOR,
+        )
         keep_free(ax, [[(x, low), (x, high)]], margin=(-4, -4, 4, 4))
         place_chips(ax, [(each.evaluation, (x, each.value))])
     ax.set(

@@ -67,8 +67,14 @@ def draw_bars(bars: Sequence[Bar], ax: Axes, limit: float | None = None) -> Axes
         if bar.value is not None:
             ax.barh(row, bar.value, height=0.66, color=bar.color)
             own.append(bar.value)
-        if bar.value is not None and bar.interval is not None and all(map(math.isfinite, bar.interval)):
-            ax.plot(bar.interval, (row, row), color="black", linewidth=1.2, marker="|", markersize=7)
+        if (
+            bar.value is not None
+            and bar.interval is not None
+            and all(map(math.isfinite, bar.interval))
+        ):
+            ax.plot(
+                bar.interval, (row, row), color="black", linewidth=1.2, marker="|", markersize=7
+            )
             own += bar.interval
         ax.annotate(
             "–" if bar.value is None else bar.text,
@@ -77,7 +83,11 @@ def draw_bars(bars: Sequence[Bar], ax: Axes, limit: float | None = None) -> Axes
             textcoords="offset points",
             va="center",
             fontsize=text_size(),
-            bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.5},  # over a line that marks a value
+            bbox={
+                "facecolor": "white",
+                "edgecolor": "none",
+                "pad": 0.5,
+            },  # over a line that marks a value
         )
         reached += own
     if min(reached) < 0:
@@ -117,7 +127,11 @@ def render_breakdown(broken: Breakdown[Any], number: str, *, ax: Axes | None = N
         shown = headline or shown
         bars.append(_bar(group, headline, AGENT_COLORS.get(group.value or "", ESTIMATE_COLOR)))
     draw_bars(bars, ax, None if shown is None else LIMITS.get(shown.unit))
-    set_title(ax, f"{number if shown is None else shown.name} by {broken.by.replace('_', ' ')}", fontsize="medium")
+    set_title(
+        ax,
+        f"{number if shown is None else shown.name} by {broken.by.replace('_', ' ')}",
+        fontsize="medium",
+    )
     unit = "" if shown is None or shown.unit == "share" else f" ({shown.unit})"
     ax.set_xlabel("" if shown is None else f"{shown.name}{unit}")
     return ax
@@ -160,7 +174,9 @@ def render_comparison(comparison: Comparison, *, fig: Figure | None = None) -> F
     )
     color = WARNING_COLOR if comparison.partial else None
     set_title(fig, "\n".join([title, *comparison.partial]), fontsize=11, color=color)
-    interval = f"whiskers: {100 * comparison.resampling.confidence:g} % intervals; full dots: significant"
+    interval = (
+        f"whiskers: {100 * comparison.resampling.confidence:g} % intervals; full dots: significant"
+    )
     names = f"a: {comparison.a.name}; b: {comparison.b.name}"
     fig.supxlabel(f"{names}\n{interval}", fontsize=text_size(), color=MUTED_COLOR)
     axes = fig.subplots(len(heights), 1, squeeze=False, height_ratios=heights)[:, 0]
@@ -179,11 +195,31 @@ def _draw_differences(ax: Axes, rows: Sequence[tuple[ComparedNumber, float]]) ->
     ax.axvline(0, color=MUTED_COLOR, linewidth=1)
     for row, (each, difference) in enumerate(rows):
         if each.low is not None and each.high is not None:
-            ax.plot((each.low, each.high), (row, row), color=ESTIMATE_COLOR, linewidth=1.4, marker="|", markersize=7)
+            ax.plot(
+                (each.low, each.high),
+                (row, row),
+                color=ESTIMATE_COLOR,
+                linewidth=1.4,
+                marker="|",
+                markersize=7,
+            )
         face = ESTIMATE_COLOR if each.real else "white"
-        ax.plot(difference, row, "o", markersize=6.5, markerfacecolor=face, markeredgecolor=ESTIMATE_COLOR)
+        ax.plot(
+            difference,
+            row,
+            "o",
+            markersize=6.5,
+            markerfacecolor=face,
+            markeredgecolor=ESTIMATE_COLOR,
+        )
         text = _text(difference, each, "+") + (f", {each.better} is better" if each.better else "")
-        ax.annotate(text, (1.015, row), xycoords=("axes fraction", "data"), va="center", fontsize=text_size())
+        ax.annotate(
+            text,
+            (1.015, row),
+            xycoords=("axes fraction", "data"),
+            va="center",
+            fontsize=text_size(),
+        )
         least = 10.0 ** -_decimals(each)  # smaller differences are none to the reader
         ax.update_datalim([(-least, row), (least, row)])
     labels = [f"{each.headline}\n{_text(each.a, each)} → {_text(each.b, each)}" for each, _ in rows]

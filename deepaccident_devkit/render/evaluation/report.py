@@ -20,7 +20,12 @@ from deepaccident_devkit.evaluation.runs.over_bytes import sent_bytes
 from deepaccident_devkit.evaluation.runs.sanity import SanityReport
 from deepaccident_devkit.evaluation.runs.text import means_tables, predictor_tables, reading_notes
 from deepaccident_devkit.evaluation.task import Headline, headlines
-from deepaccident_devkit.render.evaluation.figures import RunFigure, run_figures, sample_figures, save_figure
+from deepaccident_devkit.render.evaluation.figures import (
+    RunFigure,
+    run_figures,
+    sample_figures,
+    save_figure,
+)
 from deepaccident_devkit.render.evaluation.panels import UNKNOWN
 from deepaccident_devkit.render.styles import page_style
 from deepaccident_devkit.support.files import place_in, writable_folder, write_bytes
@@ -50,7 +55,9 @@ def report_context(run: EvaluationRun) -> dict[str, Any]:
     everything = next((each for each in run.breakdowns if each.by == EVERYTHING), None)
     group = everything.groups[0] if everything is not None and everything.groups else None
     percent = "" if everything is None else f"{100 * everything.resampling.confidence:g} % "
-    same = {each.by: each.groups[0].value or UNKNOWN for each in run.breakdowns if len(each.groups) == 1}
+    same = {
+        each.by: each.groups[0].value or UNKNOWN for each in run.breakdowns if len(each.groups) == 1
+    }
     return {
         "title": f"{run.setup.task.capitalize()}, protocol {run.setup.protocol}",
         "partial": "" if run.partial is None else run.partial.text(),
@@ -66,11 +73,17 @@ def report_context(run: EvaluationRun) -> dict[str, Any]:
             each.title.capitalize(): (each.tables(part), [*part["notes"], *part["interval_notes"]])
             for each, part in further_results(summary)
         },
-        "whole_numbers": {name: result_text(value) for name, value in told.items() if isinstance(value, int)},
+        "whole_numbers": {
+            name: result_text(value) for name, value in told.items() if isinstance(value, int)
+        },
         "said": [*(told.get("notes") or ()), *reading_notes(summary)],
         "counts": _counts(run.result, told),
         "breakdowns": [_breakdown(each) for each in run.breakdowns if each.by not in same],
-        "same": [f"{name.replace('_', ' ')} {value}" for name, value in same.items() if name != EVERYTHING],
+        "same": [
+            f"{name.replace('_', ' ')} {value}"
+            for name, value in same.items()
+            if name != EVERYTHING
+        ],
         "sanity": None if run.sanity is None else SanityReport(**run.sanity),
         "choices": dict(_choices(run)),
     }
@@ -83,7 +96,9 @@ def _header(run: EvaluationRun, summary: Mapping[str, Any]) -> dict[str, str]:
     return {
         "task": setup.task,
         "protocol": setup.protocol + (f", but {changed}" if changed else ""),
-        **{name: scalar(run.results.meta[name]) for name in _SHOWN_META if name in run.results.meta},
+        **{
+            name: scalar(run.results.meta[name]) for name in _SHOWN_META if name in run.results.meta
+        },
         "samples": f"{summary['counts']['samples']:,} of {summary['counts']['scenarios']:,} scenarios",
         "selection": run.selection.text(),
         **({"horizon": f"{setup.horizon:g} s"} if run.evaluator.has_horizon else {}),
@@ -93,7 +108,9 @@ def _header(run: EvaluationRun, summary: Mapping[str, Any]) -> dict[str, str]:
         "release": f"{run.release.version}, {run.release.dataroot}",
         "release's hash": run.release.fingerprint,
         "devkit": summary["devkit_version"],
-        "made with": ", ".join(f"{name} {version}" for name, version in summary["environment"].items()),
+        "made with": ", ".join(
+            f"{name} {version}" for name, version in summary["environment"].items()
+        ),
     }
 
 
@@ -108,12 +125,22 @@ def _counts(result: object, told: Mapping[str, Any]) -> dict[str, Any]:
 def _columns(value: Any) -> Any:
     """Pairs as a text of ranges, a mapping of numbers as texts by name, one of mappings as rows with a heading."""
     if not isinstance(value, Mapping):
-        return "; ".join(f"{low:g} m and more" if high is None else f"{low:g} to {high:g} m" for low, high in value)
+        return "; ".join(
+            f"{low:g} m and more" if high is None else f"{low:g} to {high:g} m"
+            for low, high in value
+        )
     if not all(isinstance(each, Mapping) for each in value.values()):
         return {str(name): result_text(each) for name, each in value.items()}
     names = list(dict.fromkeys(name for each in value.values() for name in each))
-    plain = [name for name in names if not any(isinstance(each.get(name), Mapping) for each in value.values())]
-    return [["", *plain], *([key, *(result_text(each.get(name)) for name in plain)] for key, each in value.items())]
+    plain = [
+        name
+        for name in names
+        if not any(isinstance(each.get(name), Mapping) for each in value.values())
+    ]
+    return [
+        ["", *plain],
+        *([key, *(result_text(each.get(name)) for name in plain)] for key, each in value.items()),
+    ]
 
 
 def _breakdown(broken: Breakdown[Any]) -> dict[str, Any]:
@@ -131,9 +158,19 @@ def _groups(broken: Breakdown[Any], groups: Sequence[Group[Any]], whose: str) ->
     names = list(dict.fromkeys(each.name for group in groups for each in _headlines(group.result)))
     rows = []
     for group in groups:
-        known = {each.name: (each.text(), _interval_text(each, group)) for each in _headlines(group.result)}
+        known = {
+            each.name: (each.text(), _interval_text(each, group))
+            for each in _headlines(group.result)
+        }
         label = UNKNOWN if group.value is None else group.value
-        rows.append([label, f"{group.samples:,}", f"{group.scenarios:,}", *(known.get(name, "–") for name in names)])
+        rows.append(
+            [
+                label,
+                f"{group.samples:,}",
+                f"{group.scenarios:,}",
+                *(known.get(name, "–") for name in names),
+            ]
+        )
     how = f"{100 * broken.resampling.confidence:g} % intervals, if there are {LEAST_CLUSTERS} clusters"
     heading = [broken.by.replace("_", " "), "samples", "scenarios", *names]
     return {"heading": heading, "rows": rows, "caption": f"{whose}; {how}"}
@@ -159,11 +196,19 @@ def _absent_classes(result: object) -> list[str]:
     """Classes without true boxes, of a detection's result."""
     if not isinstance(result, DetectionResult):
         return []
-    return [name for name, truths in zip(result.classes, result.truths.sum(axis=1), strict=True) if not truths]
+    return [
+        name
+        for name, truths in zip(result.classes, result.truths.sum(axis=1), strict=True)
+        if not truths
+    ]
 
 
 def _interval_text(headline: Headline, group: Group[Any] | None) -> str:
-    low, high = (math.nan, math.nan) if group is None else group.intervals.get(headline.path, (math.nan, math.nan))
+    low, high = (
+        (math.nan, math.nan)
+        if group is None
+        else group.intervals.get(headline.path, (math.nan, math.nan))
+    )
     if headline.value is None or math.isnan(low) or math.isnan(high):
         return ""
     digits = 2 if headline.unit == "%" else 3
@@ -208,4 +253,6 @@ def save_report(
 def report_html(run: EvaluationRun, figures: Sequence[tuple[RunFigure, Path]]) -> str:
     """The complete page, of which the figures' PNG files become part."""
     pictures = [(read_bytes(path, "image"), each.alt, each.caption) for each, path in figures]
-    return document("evaluation_report.html", style=page_style(), pictures=pictures, **report_context(run))
+    return document(
+        "evaluation_report.html", style=page_style(), pictures=pictures, **report_context(run)
+    )

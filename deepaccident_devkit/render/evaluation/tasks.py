@@ -49,7 +49,9 @@ _DASHES: Final = ("-", "--", "-.", ":")
 
 
 @in_own_settings
-def render_quality_by_time(evaluator: MotionEvaluator, step: float = 0.5, *, ax: Axes | None = None) -> Axes:
+def render_quality_by_time(
+    evaluator: MotionEvaluator, step: float = 0.5, *, ax: Axes | None = None
+) -> Axes:
     """Render the panoptic quality of each future frame, one line for each range.
 
     Args:
@@ -69,7 +71,13 @@ def render_quality_by_time(evaluator: MotionEvaluator, step: float = 0.5, *, ax:
     given = [each["vpq"] for each in counts]
     for index, (name, color) in enumerate(zip(RANGES, cycle(SERIES_COLORS[1:]), strict=False)):
         quality = [_quality([each[index] for each in given], frame) for frame in range(frames)]
-        ax.plot([step * frame for frame in range(frames)], quality, marker="o", color=color, label=f"{name} m")
+        ax.plot(
+            [step * frame for frame in range(frames)],
+            quality,
+            marker="o",
+            color=color,
+            label=f"{name} m",
+        )
     ax.set(xlabel="seconds from the present", ylabel="PQ (%)", ylim=(0, 104))
     ax.set_xticks([step * frame for frame in range(frames)])
     ax.legend(fontsize=text_size(), loc="lower left")
@@ -109,7 +117,12 @@ def render_accuracy(evaluator: AccidentEvaluator, *, ax: Axes | None = None) -> 
         if np.isfinite(within.accuracy):
             ax.plot(distance, within.accuracy, "o", color=ESTIMATE_COLOR, markersize=6)
             write_beside(ax, f"{within.accuracy:.3f}", (distance, within.accuracy), GRID_COLOR)
-    ax.set(xlim=(0, _FARTHEST), ylim=(0, 1.04), xlabel="distance allowed (m)", ylabel="tp / (tp + fp/2 + fn/2)")
+    ax.set(
+        xlim=(0, _FARTHEST),
+        ylim=(0, 1.04),
+        xlabel="distance allowed (m)",
+        ylabel="tp / (tp + fp/2 + fn/2)",
+    )
     apa = "nothing to count" if np.isnan(result.apa) else f"APA {result.apa:.3f}"
     positives = f"{result.positives:,} of {result.samples:,} samples have an accident"
     set_title(ax, f"{apa}: mean of the three distances; {positives}", fontsize="medium")
@@ -117,7 +130,9 @@ def render_accuracy(evaluator: AccidentEvaluator, *, ax: Axes | None = None) -> 
 
 
 @in_own_settings
-def render_errors(evaluator: AccidentEvaluator, error: Literal["position", "time"], *, ax: Axes | None = None) -> Axes:
+def render_errors(
+    evaluator: AccidentEvaluator, error: Literal["position", "time"], *, ax: Axes | None = None
+) -> Axes:
     """Render a histogram of how far off the predicted accidents are, for samples before an accident.
 
     Args:
@@ -132,17 +147,30 @@ def render_errors(evaluator: AccidentEvaluator, error: Literal["position", "time
 
     ax, values = axes_or_new(ax, PANEL), errors_of_first(evaluator, error)
     if error == "position":
-        edges, label = np.arange(0, _FARTHEST + 1.1), "position errors of the two, sum (m); the last bin: and more"
+        edges, label = (
+            np.arange(0, _FARTHEST + 1.1),
+            "position errors of the two, sum (m); the last bin: and more",
+        )
         for distance in DISTANCES:
             ax.axvline(distance, color=GRID_COLOR, linestyle="--", zorder=0)
     else:
         edges, label = _TIME_EDGES, "predicted moment minus true moment (s): late to the right"
-    set_title(ax, f"Errors of {error}: {len(values):,} accidents with a prediction", fontsize="medium")
+    set_title(
+        ax, f"Errors of {error}: {len(values):,} accidents with a prediction", fontsize="medium"
+    )
     if not len(values):
         return draw_nothing(ax, "no accident has a prediction")
     middles = (edges[:-1] + edges[1:]) / 2
     counts, _ = np.histogram(np.clip(values, middles[0], middles[-1]), edges)
-    ax.bar(edges[:-1], counts, np.diff(edges), align="edge", color=ESTIMATE_COLOR, edgecolor="white", linewidth=0.5)
+    ax.bar(
+        edges[:-1],
+        counts,
+        np.diff(edges),
+        align="edge",
+        color=ESTIMATE_COLOR,
+        edgecolor="white",
+        linewidth=0.5,
+    )
     ax.set(xlabel=label, ylabel="accidents", xlim=(edges[0], edges[-1]))
     ax.yaxis.set_major_locator(MaxNLocator(nbins=6, integer=True))
     return with_light_grid(ax, "y")
@@ -166,7 +194,10 @@ def render_alarms(evaluator: AccidentEvaluator, *, ax: Axes | None = None) -> Ax
         return draw_nothing(ax, "no alarms, or no accidents")
     ax.step(recall, precision, where="pre", color=ESTIMATE_COLOR, marker="o", markersize=4)
     ax.set(
-        xlim=(0, 1.02), ylim=(0, 1.04), xlabel="recall: accidents foreseen", ylabel="precision: alarms that are true"
+        xlim=(0, 1.02),
+        ylim=(0, 1.04),
+        xlabel="recall: accidents foreseen",
+        ylabel="precision: alarms that are true",
     )
     return with_light_grid(ax, "both")
 
@@ -242,7 +273,9 @@ def _alarms(protocol: Any, sample: Counts) -> Sequence[Alarm]:
 
 
 @in_own_settings
-def render_precision_recall(result: DetectionResult, name: str, *, ring: int = 0, ax: Axes | None = None) -> Axes:
+def render_precision_recall(
+    result: DetectionResult, name: str, *, ring: int = 0, ax: Axes | None = None
+) -> Axes:
     """Render precision over recall of one class, one line for each threshold.
 
     Args:
@@ -262,18 +295,28 @@ def render_precision_recall(result: DetectionResult, name: str, *, ring: int = 0
         raise ChoiceError(f"ring: expected 0 to {len(result.ranges) - 1}, found {ring!r}")
     ax, row = axes_or_new(ax, PANEL), result.classes.index(name)
     truths, found = int(result.truths[row, ring]), int(result.detections[row, ring])
-    set_title(ax, f"{name}: {truths:,} true, {found:,} detected{_ring_text(result, ring)}", fontsize="medium")
+    set_title(
+        ax,
+        f"{name}: {truths:,} true, {found:,} detected{_ring_text(result, ring)}",
+        fontsize="medium",
+    )
     if not truths:
         return draw_nothing(ax, "none in the truth")
     count = result.thresholds.shape[1]
     styles = zip(cycle(SERIES_COLORS), cycle(_DASHES))
-    for level, (threshold, (color, dash)) in enumerate(zip(result.thresholds[row].tolist(), styles, strict=False)):
+    for level, (threshold, (color, dash)) in enumerate(
+        zip(result.thresholds[row].tolist(), styles, strict=False)
+    ):
         precision, recall = result.precision[row, ring, level], result.recall[row, ring, level]
         reached = np.isfinite(recall) & (precision > 0)
         average = float(result.average_precision[row, ring, level])
-        label = f"{threshold:g}: AP {average:.1f} %" if math.isfinite(average) else f"{threshold:g}: –"
+        label = (
+            f"{threshold:g}: AP {average:.1f} %" if math.isfinite(average) else f"{threshold:g}: –"
+        )
         width = 1.2 + 0.8 * (count - 1 - level)  # so that all of several equal curves are seen
-        ax.plot(recall[reached], precision[reached], dash, color=color, label=label, linewidth=width)
+        ax.plot(
+            recall[reached], precision[reached], dash, color=color, label=label, linewidth=width
+        )
     ax.set(xlim=(0, 1.02), ylim=(0, 1.02), xlabel="recall", ylabel="precision")
     ax.legend(title="threshold", fontsize=text_size(), title_fontsize=text_size(), loc="best")
     return with_light_grid(ax, "both")
@@ -301,7 +344,10 @@ def render_predictors(result: AnticipationResult, *, ax: Axes | None = None) -> 
     ax, group = axes_or_new(ax, PANEL), next(iter(result.groups), None)
     if group is None:
         return draw_nothing(ax, "no recording")
-    everyone = {"given": result.groups[group], **{name: each[group] for name, each in result.references.items()}}
+    everyone = {
+        "given": result.groups[group],
+        **{name: each[group] for name, each in result.references.items()},
+    }
     bars = [
         Bar(
             label=name,
@@ -313,7 +359,9 @@ def render_predictors(result: AnticipationResult, *, ax: Axes | None = None) -> 
     ]
     ax = draw_bars(bars, ax, 1.0)
     ax.axvline(0.5, color="black", linestyle="--", linewidth=1)
-    ax.set(xlabel="chance that an accident's score is above\nanother recording's at the same moment")
+    ax.set(
+        xlabel="chance that an accident's score is above\nanother recording's at the same moment"
+    )
     set_title(ax, f"Accidents distinguished from other recordings\n{group}", fontsize="medium")
     return ax
 
@@ -330,17 +378,34 @@ def render_plans(result: PlanningResult, *, ax: Axes | None = None) -> Axes:
         The axes, with a line for each plan, the trivial ones among them: from the longest lead, where it is named, to
         the shortest.
     """
-    ax, tables = axes_or_new(ax, PANEL), [table for name, table in result.means.items() if name in BY_LEAD]
+    ax, tables = (
+        axes_or_new(ax, PANEL),
+        [table for name, table in result.means.items() if name in BY_LEAD],
+    )
     lines = {
-        row: [(table[row].get("lost_twins", math.nan), table[row].get("avoided", math.nan)) for table in tables]
+        row: [
+            (table[row].get("lost_twins", math.nan), table[row].get("avoided", math.nan))
+            for table in tables
+        ]
         for row in (tables[0] if tables else ())
     }
-    if not any(math.isfinite(lost + avoided) for points in lines.values() for lost, avoided in points):
+    if not any(
+        math.isfinite(lost + avoided) for points in lines.values() for lost, avoided in points
+    ):
         return draw_nothing(ax, "no accident with a twin")
     for (row, points), dash in zip(lines.items(), cycle(_DASHES), strict=False):
         color = ESTIMATE_COLOR if row == GIVEN else TRUE_PLACE_COLOR
         ax.plot(*zip(*points, strict=True), color=color, linestyle=dash, marker="o", markersize=4)
         place_chips(ax, [(row, points[0])])
-    ax.set(xlabel="progress lost in twins (%)", ylabel="accidents avoided (%)", ymargin=0.1, xmargin=0.1)
-    set_title(ax, f"Accidents avoided, and what that costs\n{BY_LEAD[0]} (named) to {BY_LEAD[-1]}", fontsize="medium")
+    ax.set(
+        xlabel="progress lost in twins (%)",
+        ylabel="accidents avoided (%)",
+        ymargin=0.1,
+        xmargin=0.1,
+    )
+    set_title(
+        ax,
+        f"Accidents avoided, and what that costs\n{BY_LEAD[0]} (named) to {BY_LEAD[-1]}",
+        fontsize="medium",
+    )
     return with_light_grid(ax, "both")

@@ -7,7 +7,10 @@ from deepaccident_devkit.render.outcomes.above import (
     draw_motion_side,
     motion_outcome,
 )
-from deepaccident_devkit.render.outcomes.cameras import draw_outcome_in_camera, render_outcome_in_cameras
+from deepaccident_devkit.render.outcomes.cameras import (
+    draw_outcome_in_camera,
+    render_outcome_in_cameras,
+)
 from deepaccident_devkit.render.outcomes.evaluation import render_evaluation
 from deepaccident_devkit.render.outcomes.verdicts import Verdict, sample_verdict
 

@@ -29,12 +29,27 @@ from deepaccident_devkit.evaluation.predictions import (
 )
 from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.motion import POST_PROCESSING, MotionLabels
-from deepaccident_devkit.render.boxes import draw_boxes_from_above, draw_ids_from_above, draw_trail, write_beside
+from deepaccident_devkit.render.boxes import (
+    draw_boxes_from_above,
+    draw_ids_from_above,
+    draw_trail,
+    write_beside,
+)
 from deepaccident_devkit.render.captions import INSIDE, draw_legend, draw_legend_of_fills
 from deepaccident_devkit.render.chips import keep_free
 from deepaccident_devkit.render.figures import Layer, axes_or_new, layers_of, titled_from_above
-from deepaccident_devkit.render.motion_maps import MotionMaps, draw_trail_of, maps_of_labels, maps_of_output
-from deepaccident_devkit.render.styles import BEYOND_COLOR, COLLIDER_COLOR, OUTCOME_COLORS, in_own_settings
+from deepaccident_devkit.render.motion_maps import (
+    MotionMaps,
+    draw_trail_of,
+    maps_of_labels,
+    maps_of_output,
+)
+from deepaccident_devkit.render.styles import (
+    BEYOND_COLOR,
+    COLLIDER_COLOR,
+    OUTCOME_COLORS,
+    in_own_settings,
+)
 from deepaccident_devkit.support.arrays import AnyArray, FloatArray, IntArray, ShortRepr
 
 if TYPE_CHECKING:
@@ -59,7 +74,10 @@ DASHED: Final = (0, (2, 1))
 _Side = Literal["true", "predicted"]
 MOTION_LAYERS: Final[tuple[Layer, ...]] = ("labels", "trajectories", "ids", "grid")
 _RIGHT, _WRONG, _UNCOUNTED = 1, 2, 3
-_WORDS: Final[dict[_Side, tuple[str, str]]] = {"true": ("found", "missed"), "predicted": ("right", "false")}
+_WORDS: Final[dict[_Side, tuple[str, str]]] = {
+    "true": ("found", "missed"),
+    "predicted": ("right", "false"),
+}
 
 
 def layers_but_ids(given: Iterable[Layer] | None, possible: Sequence[Layer]) -> frozenset[Layer]:
@@ -104,11 +122,27 @@ def draw_accidents(
         _draw_actors(truth, compared, shown, ax)
     if compared.true is not None:
         x, y = compared.true.positions.T
-        (line,) = ax.plot(x, y, "o-", markersize=12, fillstyle="none", color=COLLIDER_COLOR, linewidth=1.6, zorder=5)
+        (line,) = ax.plot(
+            x,
+            y,
+            "o-",
+            markersize=12,
+            fillstyle="none",
+            color=COLLIDER_COLOR,
+            linewidth=1.6,
+            zorder=5,
+        )
         line.set_label("to come")
         _keep_line_free(*compared.true.positions, ax=ax)
     for alarm in compared.predicted:
-        (line,) = ax.plot(*alarm.positions.T, "x--", color=FORESEEN_COLOR, markersize=9, markeredgewidth=2, zorder=6)
+        (line,) = ax.plot(
+            *alarm.positions.T,
+            "x--",
+            color=FORESEEN_COLOR,
+            markersize=9,
+            markeredgewidth=2,
+            zorder=6,
+        )
         line.set_label("foreseen" if alarm is compared.predicted[0] else "")
         if truth is not None and "trajectories" in shown:
             _draw_foreseen_ways(alarm, truth, ax)
@@ -144,12 +178,18 @@ def coming_words(compared: ComparedAccidents) -> str:
     """Whether an accident comes, and when."""
     if compared.unplaced is not None:
         return f"an accident comes in {compared.unplaced:.1f} s that no label shows both actors of"
-    return "no accident comes" if compared.true is None else f"an accident comes in {compared.true.time:.1f} s"
+    return (
+        "no accident comes"
+        if compared.true is None
+        else f"an accident comes in {compared.true.time:.1f} s"
+    )
 
 
 def verdict_words(result: AccidentResult) -> str:
     """What one sample counts as, by the allowed distance: `5 m: FP + FN, 10 m: TP`; `TN` if nothing is counted."""
-    return ", ".join(f"{distance:g} m: {count_words(within)}" for distance, within in result.within.items())
+    return ", ".join(
+        f"{distance:g} m: {count_words(within)}" for distance, within in result.within.items()
+    )
 
 
 def count_words(within: AccidentsWithin) -> str:
@@ -159,7 +199,9 @@ def count_words(within: AccidentsWithin) -> str:
     return " + ".join(said) or "TN"
 
 
-def _draw_actors(truth: BoxTruth, compared: ComparedAccidents, shown: frozenset[Layer], ax: Axes) -> None:
+def _draw_actors(
+    truth: BoxTruth, compared: ComparedAccidents, shown: frozenset[Layer], ax: Axes
+) -> None:
     boxes = _boxes_at(truth, 0)
     ids = _pair_ids(compared, truth)
     pair = np.isin(boxes.actor_id, ids).tolist()
@@ -202,7 +244,13 @@ def _draw_foreseen_ways(alarm: Accident, truth: BoxTruth, ax: Axes) -> None:
     now = dict(zip(truth.actor_id.tolist(), truth.footprint[0, :, :2], strict=True))
     for actor, place in zip(alarm.ids or (), alarm.positions, strict=False):
         if actor in now:
-            ax.plot(*np.stack([now[actor], place]).T, color=FORESEEN_COLOR, linestyle=DASHED, linewidth=1.0, zorder=4)
+            ax.plot(
+                *np.stack([now[actor], place]).T,
+                color=FORESEEN_COLOR,
+                linestyle=DASHED,
+                linewidth=1.0,
+                zorder=4,
+            )
 
 
 def _draw_differences(alarm: Accident, true: Accident, ax: Axes) -> None:
@@ -225,7 +273,9 @@ def _pairs(places: FloatArray, others: FloatArray) -> list[tuple[FloatArray, Flo
     return list(zip(places, others if straight else others[::-1], strict=True))
 
 
-def shown_square(compared: ComparedAccidents, truth: BoxTruth | None) -> tuple[tuple[float, float], float]:
+def shown_square(
+    compared: ComparedAccidents, truth: BoxTruth | None
+) -> tuple[tuple[float, float], float]:
     """The middle of what is shown, and metres to each side: of the accidents, the agent and, if known, the pair now."""
     accidents = [*([] if compared.true is None else [compared.true]), *compared.predicted]
     places = np.concatenate([np.zeros((1, 2)), *(each.positions for each in accidents)])
@@ -278,7 +328,9 @@ def draw_detection_outcome(
     ax.set(xlim=(-VIEW_RANGE, VIEW_RANGE), ylim=(-VIEW_RANGE, VIEW_RANGE))
     names = {"right": "detected", "false": "false", "missed": "missed"}
     draw_legend_of_fills(ax, {words: OUTCOME_COLORS[kind] for kind, words in names.items()})
-    return titled_from_above(ax, detection_words(prediction, truth, matches, protocol), grid="grid" in shown)
+    return titled_from_above(
+        ax, detection_words(prediction, truth, matches, protocol), grid="grid" in shown
+    )
 
 
 def draw_true(truth: Boxes, matches: DetectionMatches, ax: Axes) -> None:
@@ -290,7 +342,10 @@ def draw_true(truth: Boxes, matches: DetectionMatches, ax: Axes) -> None:
 
 
 def detection_words(
-    prediction: DetectedBoxes, truth: Boxes, matches: DetectionMatches, protocol: str | DetectionProtocol
+    prediction: DetectedBoxes,
+    truth: Boxes,
+    matches: DetectionMatches,
+    protocol: str | DetectionProtocol,
 ) -> str:
     """The threshold, how many boxes are right, false and missed, and how far off the right ones are."""
     metres = detection_protocol(protocol).measure.startswith("distance")
@@ -311,7 +366,9 @@ def _draw_offsets(detected: Boxes, truth: Boxes, matches: DetectionMatches, ax: 
     from matplotlib.collections import LineCollection
 
     ends = detected.center[matches.detection, :2], truth.center[matches.truth, :2]
-    ax.add_collection(LineCollection(list(np.stack(ends, axis=1)), colors="black", linewidths=1.0, zorder=4))
+    ax.add_collection(
+        LineCollection(list(np.stack(ends, axis=1)), colors="black", linewidths=1.0, zorder=4)
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -344,16 +401,23 @@ class MotionOutcome(ShortRepr):
 
     def judged(self, side: _Side, frame: int) -> dict[str, IntArray]:
         """A frame's ids by the kinds of `OUTCOME_COLORS`: `right`, and `false` or (true ones) `missed`; none beyond."""
-        maps, kinds = (self.true if side == "true" else self.predicted).instance[frame], self.outcomes(side)[frame]
+        maps, kinds = (
+            (self.true if side == "true" else self.predicted).instance[frame],
+            self.outcomes(side)[frame],
+        )
         named = {"right": _RIGHT, "missed" if side == "true" else "false": _WRONG}
-        return {name: np.unique(maps[kinds == kind]).astype(np.int64) for name, kind in named.items()}
+        return {
+            name: np.unique(maps[kinds == kind]).astype(np.int64) for name, kind in named.items()
+        }
 
 
 def motion_outcome(prediction: MotionOutput, label: MotionLabels) -> MotionOutcome:
     """Which instances of the last prediction match by VPQ in its widest range. Raises EvaluationError: no present."""
     frames = frames_there(label)
     true = _cut(maps_of_labels(labels_at_present(label)), frames)
-    predicted = maps_of_output(prediction, step=true.step, post_processing=POST_PROCESSING["motion"])
+    predicted = maps_of_output(
+        prediction, step=true.step, post_processing=POST_PROCESSING["motion"]
+    )
     predicted = _cut(predicted, frames)
     extent = max(RANGES.values())
     within = (slice(None), *cells_within(true.grid, extent))
@@ -363,7 +427,11 @@ def motion_outcome(prediction: MotionOutput, label: MotionLabels) -> MotionOutco
 
 @in_own_settings
 def draw_motion_side(
-    outcome: MotionOutcome, side: _Side, *, layers: Iterable[Layer] | None = None, ax: Axes | None = None
+    outcome: MotionOutcome,
+    side: _Side,
+    *,
+    layers: Iterable[Layer] | None = None,
+    ax: Axes | None = None,
 ) -> Axes:
     """Render `true` instances as found or missed, or `predicted` ones as right or false; later frames are paler.
 
@@ -374,16 +442,29 @@ def draw_motion_side(
     ax = axes_or_new(ax, (6, 6.4))
     maps = outcome.true if side == "true" else outcome.predicted
     right, wrong = _WORDS[side]
-    colors = {right: OUTCOME_COLORS["right"], wrong: OUTCOME_COLORS["missed" if side == "true" else "false"]}
-    draw_trail_of(_recolored(maps, outcome.outcomes(side), [*colors.values()]), shown & {"labels"}, ax)
+    colors = {
+        right: OUTCOME_COLORS["right"],
+        wrong: OUTCOME_COLORS["missed" if side == "true" else "false"],
+    }
+    draw_trail_of(
+        _recolored(maps, outcome.outcomes(side), [*colors.values()]), shown & {"labels"}, ax
+    )
     draw_trail_of(_recolored(maps, maps.instance, []), shown - {"labels", "grid"}, ax)
     half = outcome.extent / 2
-    ax.plot(np.array([-1, 1, 1, -1, -1]) * half, np.array([-1, -1, 1, 1, -1]) * half, ":", color="black", linewidth=0.8)
+    ax.plot(
+        np.array([-1, 1, 1, -1, -1]) * half,
+        np.array([-1, -1, 1, 1, -1]) * half,
+        ":",
+        color="black",
+        linewidth=0.8,
+    )
     draw_legend_of_fills(ax, colors)
     counted = maps.instance[(slice(None), *cells_within(maps.grid, outcome.extent))]
     total = sum(np.unique(frame[frame > 0]).size for frame in counted)
     found = len(outcome.matches)
-    return titled_from_above(ax, f"{side} instances: {found} {right}, {total - found} {wrong}", grid="grid" in shown)
+    return titled_from_above(
+        ax, f"{side} instances: {found} {right}, {total - found} {wrong}", grid="grid" in shown
+    )
 
 
 def _cut(maps: MotionMaps, frames: int) -> MotionMaps:
@@ -394,5 +475,11 @@ def _recolored(maps: MotionMaps, instance: AnyArray, colors: list[str]) -> Motio
     """The maps with other ids in their cells and a colour for each; without colours, for black paths."""
     from matplotlib.colors import to_rgb
 
-    chosen = ["white", *colors, BEYOND_COLOR] if colors else ["white", *["black"] * int(instance.max(initial=0))]
-    return replace(maps, instance=instance, colors=np.array([to_rgb(color) for color in chosen]), own=-1)
+    chosen = (
+        ["white", *colors, BEYOND_COLOR]
+        if colors
+        else ["white", *["black"] * int(instance.max(initial=0))]
+    )
+    return replace(
+        maps, instance=instance, colors=np.array([to_rgb(color) for color in chosen]), own=-1
+    )

@@ -15,7 +15,12 @@ from deepaccident_devkit.evaluation.predictions import Prediction
 from deepaccident_devkit.geometry import SE3, Boxes, PinholeCamera
 from deepaccident_devkit.geometry.cell_outlines import outlines
 from deepaccident_devkit.motion import MotionLabels
-from deepaccident_devkit.render.boxes import EDGES, draw_boxes_in_image, segments_in_image, write_beside
+from deepaccident_devkit.render.boxes import (
+    EDGES,
+    draw_boxes_in_image,
+    segments_in_image,
+    write_beside,
+)
 from deepaccident_devkit.render.camera import draw_camera_boxes, draw_image
 from deepaccident_devkit.render.captions import draw_legend, is_there, set_scene_title
 from deepaccident_devkit.render.chips import keep_free
@@ -31,7 +36,12 @@ from deepaccident_devkit.render.outcomes.verdicts import (
     sample_verdict,
 )
 from deepaccident_devkit.render.samples import CAMERA_GRID
-from deepaccident_devkit.render.styles import CASING_COLOR, COLLIDER_COLOR, OUTCOME_COLORS, in_own_settings
+from deepaccident_devkit.render.styles import (
+    CASING_COLOR,
+    COLLIDER_COLOR,
+    OUTCOME_COLORS,
+    in_own_settings,
+)
 from deepaccident_devkit.support.arrays import AnyArray, FloatArray
 from deepaccident_devkit.support.text import choice
 from deepaccident_devkit.taxonomy import CAMERAS, INFRASTRUCTURE, OWN_ACTOR_ID, POLE_HEIGHT
@@ -86,7 +96,9 @@ class CameraView:
 
     def optical(self, places: FloatArray, height: float = 0.0) -> FloatArray:
         """Points (N, 3) of the optical frame, so many metres above places (N, 2) of the ego frame."""
-        return self.optical_from_ego.apply(np.column_stack([places, np.full(len(places), self.ground + height)]))
+        return self.optical_from_ego.apply(
+            np.column_stack([places, np.full(len(places), self.ground + height)])
+        )
 
     def on_ground(self, lines: Sequence[FloatArray]) -> list[FloatArray]:
         """Lines (P, 2) on the ground, metres of the ego frame, as pixels (V, 2) of their parts in front of the camera.
@@ -95,24 +107,37 @@ class CameraView:
         """
         if not lines:
             return []
-        points, owner = self.optical(np.concatenate(lines)), np.repeat(np.arange(len(lines)), [*map(len, lines)])
+        points, owner = (
+            self.optical(np.concatenate(lines)),
+            np.repeat(np.arange(len(lines)), [*map(len, lines)]),
+        )
         within = owner[1:] == owner[:-1]
-        pixels, drawn = segments_in_image(np.stack([points[:-1], points[1:]], axis=1)[within], self.lens)
+        pixels, drawn = segments_in_image(
+            np.stack([points[:-1], points[1:]], axis=1)[within], self.lens
+        )
         rows, starts = np.unique(owner[1:][within][drawn], return_index=True)
         return np.split(pixels.reshape(-1, 2), 2 * starts[1:]) if len(rows) else []
 
-    def draw_lines(self, lines: Sequence[FloatArray], color: str, *, width: float, dashed: bool = False) -> None:
+    def draw_lines(
+        self, lines: Sequence[FloatArray], color: str, *, width: float, dashed: bool = False
+    ) -> None:
         """Render lines (V, 2) in pixels, on wider ones that set them off from the image."""
         from matplotlib.collections import LineCollection
 
-        below = LineCollection(lines, colors=CASINGS.get(color, CASING_COLOR), linewidths=width + _CASING, alpha=0.7)
-        above = LineCollection(lines, colors=color, linewidths=width, linestyles=DASHED if dashed else "solid")
+        below = LineCollection(
+            lines, colors=CASINGS.get(color, CASING_COLOR), linewidths=width + _CASING, alpha=0.7
+        )
+        above = LineCollection(
+            lines, colors=color, linewidths=width, linestyles=DASHED if dashed else "solid"
+        )
         self.ax.add_collection(below, autolim=False)  # the image has set the limits
         self.ax.add_collection(above, autolim=False)
 
     def posts(self, places: FloatArray) -> FloatArray:
         """Feet and tops (V, 2, 2), pixels, of posts at places (N, 2) of the ego frame; of those in front alone."""
-        pixels, _ = segments_in_image(np.stack([self.optical(places), self.optical(places, _POST)], axis=1), self.lens)
+        pixels, _ = segments_in_image(
+            np.stack([self.optical(places), self.optical(places, _POST)], axis=1), self.lens
+        )
         return pixels
 
     def write(self, words: str, places: FloatArray, color: str) -> None:
@@ -125,7 +150,9 @@ class CameraView:
             write_beside(self.ax, words, (u, v), color)
 
 
-def view_of(dataset: Dataset, sample: str, camera: str, ax: Axes, *, image: bool = True) -> CameraView:
+def view_of(
+    dataset: Dataset, sample: str, camera: str, ax: Axes, *, image: bool = True
+) -> CameraView:
     """A panel with an image of a sample, or of another agent at its moment (both are tokens), or with its absence."""
     lens = camera_of(dataset, camera)
     draw_image(dataset, dataset.get("sample_data", camera), ax, image=image)
@@ -135,7 +162,8 @@ def view_of(dataset: Dataset, sample: str, camera: str, ax: Axes, *, image: bool
         camera=camera,
         sample=sample,
         lens=lens,
-        optical_from_ego=dataset.world_from(*camera.rsplit("/", 1)).inverse() @ dataset.world_from(sample, "ego"),
+        optical_from_ego=dataset.world_from(*camera.rsplit("/", 1)).inverse()
+        @ dataset.world_from(sample, "ego"),
         ground=-POLE_HEIGHT if dataset.get("sample", sample)["agent"] == INFRASTRUCTURE else 0.0,
         ax=ax,
     )
@@ -181,7 +209,12 @@ def render_outcome_in_cameras(
 
 @in_own_settings
 def draw_outcome_in_camera(
-    dataset: Dataset, verdict: Verdict, camera: str, *, frame: int | None = None, ax: Axes | None = None
+    dataset: Dataset,
+    verdict: Verdict,
+    camera: str,
+    *,
+    frame: int | None = None,
+    ax: Axes | None = None,
 ) -> Axes:
     """Render one panel (a channel) of `render_outcome_in_cameras`, in pixels. Raises ChoiceError."""
     channel, number = choice("camera", camera, CAMERAS), _checked_frame(verdict, frame)
@@ -206,8 +239,12 @@ def draw_accidents_in_camera(
     """
     view, true = view_of(dataset, verdict.sample, camera, ax, image=image), verdict.compared.true
     record, boxes = dataset.get("sample_data", camera), boxes_of(dataset, verdict)
-    own = dataset.get("agent", dataset.get("sample", record["sample_token"])["agent_token"])["actor_id"]
-    optical = boxes.transform(dataset.world_from(*camera.rsplit("/", 1)).inverse(), record["channel"])
+    own = dataset.get("agent", dataset.get("sample", record["sample_token"])["agent_token"])[
+        "actor_id"
+    ]
+    optical = boxes.transform(
+        dataset.world_from(*camera.rsplit("/", 1)).inverse(), record["channel"]
+    )
     draw_camera_boxes(dataset, record, optical.select(boxes.actor_id != own), {"boxes"}, ax)
     if true is not None:
         _draw_places(true.positions, _RING, COLLIDER_COLOR, view)
@@ -235,19 +272,28 @@ def _draw_detection(verdict: DetectionVerdict, dataset: Dataset, view: CameraVie
     sample, channel, matches = view.sample, view.camera.rsplit("/", 1)[1], verdict.matches
     own = verdict.truth.actor_id == OWN_ACTOR_ID
     others, missed = ~own[matches.truth], matches.missed[~own[matches.missed]]
-    optical = dataset.world_from(sample, channel).inverse() @ dataset.world_from(sample, verdict.rules.frame)
-    truth, detected = (each.transform(optical, channel) for each in (verdict.truth, verdict.detected.boxes))
+    optical = dataset.world_from(sample, channel).inverse() @ dataset.world_from(
+        sample, verdict.rules.frame
+    )
+    truth, detected = (
+        each.transform(optical, channel) for each in (verdict.truth, verdict.detected.boxes)
+    )
     _draw_edges(truth.select(matches.truth[others]), "black", view, width=0.7)
     boxes = detected.select(np.concatenate([matches.detection[others], matches.false]))
     kinds = np.repeat(["right", "false"], [int(others.sum()), len(matches.false)])
     order = np.argsort(-boxes.center[:, 2], kind="stable")
     draw_boxes_in_image(
-        boxes.select(order), view.lens, view.ax, [OUTCOME_COLORS[kind] for kind in kinds[order].tolist()]
+        boxes.select(order),
+        view.lens,
+        view.ax,
+        [OUTCOME_COLORS[kind] for kind in kinds[order].tolist()],
     )
     _draw_edges(truth.select(missed), OUTCOME_COLORS["missed"], view, width=1.6, dashed=True)
 
 
-def _draw_edges(optical: Boxes, color: str, view: CameraView, *, width: float, dashed: bool = False) -> None:
+def _draw_edges(
+    optical: Boxes, color: str, view: CameraView, *, width: float, dashed: bool = False
+) -> None:
     pixels, _ = segments_in_image(optical.corners()[:, EDGES].reshape(-1, 2, 3), view.lens)
     view.draw_lines(list(pixels), color, width=width, dashed=dashed)
 
@@ -259,11 +305,16 @@ def _draw_motion(verdict: MotionVerdict, frame: int, view: CameraView) -> None:
     missed = outcome.judged("true", frame)["missed"]
     for name, ids in outcome.judged("predicted", frame).items():
         areas = view.on_ground(_outlines(outcome.predicted, frame, ids))
-        filled = PolyCollection(areas, facecolors=OUTCOME_COLORS[name], alpha=_FILL, edgecolors="none")
+        filled = PolyCollection(
+            areas, facecolors=OUTCOME_COLORS[name], alpha=_FILL, edgecolors="none"
+        )
         view.ax.add_collection(filled, autolim=False)
         view.draw_lines(areas, OUTCOME_COLORS[name], width=1.6)
     view.draw_lines(
-        view.on_ground(_outlines(outcome.true, frame, missed)), OUTCOME_COLORS["missed"], width=1.6, dashed=True
+        view.on_ground(_outlines(outcome.true, frame, missed)),
+        OUTCOME_COLORS["missed"],
+        width=1.6,
+        dashed=True,
     )
 
 
@@ -271,15 +322,21 @@ def _outlines(maps: MotionMaps, frame: int, ids: AnyArray) -> list[FloatArray]:
     """Closed lines (P, 2), metres of the ego frame, around the cells of instances; holes have none."""
     low, _, size = np.array([maps.grid.x, maps.grid.y]).T
     polygons = [
-        part for identity in ids.tolist() for part in outlines(maps.instance[frame] == identity, np.zeros(2), 1.0).geoms
+        part
+        for identity in ids.tolist()
+        for part in outlines(maps.instance[frame] == identity, np.zeros(2), 1.0).geoms
     ]
     return [low + np.asarray(part.exterior.coords) * size for part in polygons]
 
 
-def _draw_places(places: FloatArray, mark: Sequence[FloatArray], color: str, view: CameraView) -> None:
+def _draw_places(
+    places: FloatArray, mark: Sequence[FloatArray], color: str, view: CameraView
+) -> None:
     """A mark and a post at each of two places (2, 2), and a thin line from one to the other."""
     view.draw_lines([*view.on_ground([places]), *view.posts(places)], color, width=1.2)
-    view.draw_lines(view.on_ground([place + line for place in places for line in mark]), color, width=1.8)
+    view.draw_lines(
+        view.on_ground([place + line for place in places for line in mark]), color, width=1.8
+    )
 
 
 def _handles(verdict: Verdict) -> list[Artist]:
@@ -288,7 +345,15 @@ def _handles(verdict: Verdict) -> list[Artist]:
 
     if isinstance(verdict, AccidentVerdict):
         how: dict[str, Any] = {"linestyle": "none", "markersize": 9, "markeredgewidth": 1.8}
-        ring = Line2D([], [], marker="o", fillstyle="none", color=COLLIDER_COLOR, label="accident to come", **how)
+        ring = Line2D(
+            [],
+            [],
+            marker="o",
+            fillstyle="none",
+            color=COLLIDER_COLOR,
+            label="accident to come",
+            **how,
+        )
         return [ring, Line2D([], [], marker="x", color=FORESEEN_COLOR, label="foreseen", **how)]
     detects = isinstance(verdict, DetectionVerdict)
     fills: list[Artist] = [
@@ -297,5 +362,9 @@ def _handles(verdict: Verdict) -> list[Artist]:
     ]
     pale = OUTCOME_COLORS["missed"]
     missed = Patch(label="missed", facecolor=pale, edgecolor=CASINGS[pale], linestyle=DASHED)
-    found = [Line2D([], [], color="black", linewidth=0.9, label="true box of a detection")] if detects else []
+    found = (
+        [Line2D([], [], color="black", linewidth=0.9, label="true box of a detection")]
+        if detects
+        else []
+    )
     return [*fills, missed, *found]

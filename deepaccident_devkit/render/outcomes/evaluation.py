@@ -120,7 +120,12 @@ def _edge_pair(label: MotionLabels, ids: Collection[int], ax: Axes) -> None:
     """Render red edges around the present cells of the actors with these label ids."""
     maps = maps_of_labels(labels_at_present(label))
     for actor in ids:
-        draw_edge(maps, label.id_map.get(OWN_BOX_ID if actor == OWN_ACTOR_ID else actor, -1), ax, COLLIDER_COLOR)
+        draw_edge(
+            maps,
+            label.id_map.get(OWN_BOX_ID if actor == OWN_ACTOR_ID else actor, -1),
+            ax,
+            COLLIDER_COLOR,
+        )
 
 
 def _draw_accident(
@@ -130,7 +135,10 @@ def _draw_accident(
     middle, half = shown_square(verdict.compared, verdict.truth)
     view = BevView(agents=None, view_range=half, center=middle, beside=True)
     draw_bev(dataset, verdict.sample, view, shown - {"trajectories"}, right)
-    draw_legend(right.figure, draw_accidents(verdict.compared, verdict.truth, shown & {"trajectories", "grid"}, right))
+    draw_legend(
+        right.figure,
+        draw_accidents(verdict.compared, verdict.truth, shown & {"trajectories", "grid"}, right),
+    )
     camera = best_camera(dataset, verdict)
     draw_accidents_in_camera(dataset, verdict, camera, left, image="image" in shown)
     agent, _, channel = camera.rsplit("/", 3)[1:]
@@ -143,13 +151,20 @@ def best_camera(dataset: Dataset, verdict: AccidentVerdict) -> str:
     The front camera of the sample's agent, if no camera shows them.
     """
     boxes = boxes_of(dataset, verdict)
-    samples = [each["token"] for each in dataset.samples_of(dataset.get("sample", verdict.sample)["frame_token"])]
+    samples = [
+        each["token"]
+        for each in dataset.samples_of(dataset.get("sample", verdict.sample)["frame_token"])
+    ]
     view = best_view(dataset, samples, boxes) if len(boxes) else None
     return f"{verdict.sample}/Camera_Front" if view is None else view.camera
 
 
 def _draw_detection(
-    verdict: DetectionVerdict, pair_ids: Collection[int], shown: frozenset[Layer], left: Axes, right: Axes
+    verdict: DetectionVerdict,
+    pair_ids: Collection[int],
+    shown: frozenset[Layer],
+    left: Axes,
+    right: Axes,
 ) -> None:
     truth, matches = verdict.truth, verdict.matches
     draw_detection_outcome(verdict.detected, truth, verdict.rules, layers=shown, ax=right)
@@ -160,5 +175,7 @@ def _draw_detection(
             draw_boxes_from_above(pair, ax, [COLLIDER_COLOR] * len(pair), fill=0, linewidths=1.6)
     left.set(xlim=(-VIEW_RANGE, VIEW_RANGE), ylim=(-VIEW_RANGE, VIEW_RANGE))
     titled_from_above(
-        left, f"true boxes: {len(matches.truth)} found, {len(matches.missed)} missed (dashed)", grid="grid" in shown
+        left,
+        f"true boxes: {len(matches.truth)} found, {len(matches.missed)} missed (dashed)",
+        grid="grid" in shown,
     )

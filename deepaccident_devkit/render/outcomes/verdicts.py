@@ -25,7 +25,12 @@ from deepaccident_devkit.evaluation.detection import (
     detection_truth,
 )
 from deepaccident_devkit.evaluation.motion import MotionEvaluator
-from deepaccident_devkit.evaluation.predictions import Accident, MotionOutput, Prediction, checked_prediction
+from deepaccident_devkit.evaluation.predictions import (
+    Accident,
+    MotionOutput,
+    Prediction,
+    checked_prediction,
+)
 from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.motion import MotionLabelConfig, MotionLabels, motion_labels
 from deepaccident_devkit.render.outcomes.above import MotionOutcome, motion_outcome, verdict_words
@@ -127,23 +132,33 @@ def sample_verdict(
         return _of_detection(dataset, token, given, protocol or "released")
     if isinstance(given, MotionOutput) and chosen == "motion":
         judge = MotionEvaluator(protocol or "released")
-        return _of_motion(token, given, label or _label(dataset, token, given, judge.protocol.labels), judge)
+        return _of_motion(
+            token, given, label or _label(dataset, token, given, judge.protocol.labels), judge
+        )
     default = "released" if isinstance(given, MotionOutput) else "boxes"
     return _of_accident(dataset, token, given, label, AccidentEvaluator(protocol or default))
 
 
-def _of_motion(token: str, given: MotionOutput, label: MotionLabels, judge: MotionEvaluator) -> MotionVerdict:
+def _of_motion(
+    token: str, given: MotionOutput, label: MotionLabels, judge: MotionEvaluator
+) -> MotionVerdict:
     judge.update(token, given, label)
     ranges = [
         f"{name} m: IoU {within.iou:.1f} %, VPQ {within.pq:.1f} %, {within.true_positive} TP, "
         f"{within.false_positive} FP, {within.false_negative} FN"
         for name, within in judge.compute().ranges.items()
     ]
-    return MotionVerdict(sample=token, label=label, outcome=motion_outcome(given, label), words="; ".join(ranges))
+    return MotionVerdict(
+        sample=token, label=label, outcome=motion_outcome(given, label), words="; ".join(ranges)
+    )
 
 
 def _of_accident(
-    dataset: Dataset, token: str, given: Prediction, label: MotionLabels | None, judge: AccidentEvaluator
+    dataset: Dataset,
+    token: str,
+    given: Prediction,
+    label: MotionLabels | None,
+    judge: AccidentEvaluator,
 ) -> AccidentVerdict:
     if label is None and hasattr(judge.protocol, "labels"):
         label = _label(dataset, token, given, judge.protocol.labels)
@@ -157,10 +172,14 @@ def _of_accident(
     )
 
 
-def _of_detection(dataset: Dataset, token: str, given: DetectedBoxes, protocol: Any) -> DetectionVerdict:
+def _of_detection(
+    dataset: Dataset, token: str, given: DetectedBoxes, protocol: Any
+) -> DetectionVerdict:
     rules = detection_protocol(protocol)
     truth = detection_truth(dataset, token, rules)
-    here = dataset.world_from(token, rules.frame).inverse() @ dataset.world_from(token, given.boxes.frame)
+    here = dataset.world_from(token, rules.frame).inverse() @ dataset.world_from(
+        token, given.boxes.frame
+    )
     detected = DetectedBoxes(boxes=given.boxes.transform(here, rules.frame), scores=given.scores)
     judge = DetectionEvaluator(rules)
     judge.update(token, detected, truth)
@@ -202,4 +221,6 @@ def boxes_of(dataset: Dataset, verdict: AccidentVerdict) -> Boxes:
     collision = dataset.get("scenario", record["scenario_token"])["collision"]
     named = next((alarm.ids for alarm in verdict.compared.predicted), None)
     boxes = cooperative_boxes(dataset, record)
-    return boxes.select(np.isin(boxes.actor_id, (named or ()) if collision is None else collision["ids"]))
+    return boxes.select(
+        np.isin(boxes.actor_id, (named or ()) if collision is None else collision["ids"])
+    )

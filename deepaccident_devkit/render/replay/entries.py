@@ -12,7 +12,13 @@ from numpy.typing import ArrayLike
 
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import NotAvailableError
-from deepaccident_devkit.evaluation import Accident, AccidentContext, BoxAccidents, MotionOutput, accident_context
+from deepaccident_devkit.evaluation import (
+    Accident,
+    AccidentContext,
+    BoxAccidents,
+    MotionOutput,
+    accident_context,
+)
 from deepaccident_devkit.evaluation.accident import Prediction
 from deepaccident_devkit.evaluation.accident.scoring import ERRORS_AT, hit_of
 from deepaccident_devkit.evaluation.alarms import Pair, named_alarms
@@ -26,7 +32,13 @@ from deepaccident_devkit.motion import MotionLabels
 from deepaccident_devkit.render.boxes import actor_color, agent_letters, camera_name, recorders_of
 from deepaccident_devkit.render.outcomes.above import count_words
 from deepaccident_devkit.render.styles import AGENT_COLORS
-from deepaccident_devkit.support.arrays import AnyArray, FloatArray, FrozenArrays, IntArray, as_floats
+from deepaccident_devkit.support.arrays import (
+    AnyArray,
+    FloatArray,
+    FrozenArrays,
+    IntArray,
+    as_floats,
+)
 from deepaccident_devkit.tables.tokens import sample_token
 from deepaccident_devkit.taxonomy import AGENTS, CAMERAS, AgentName, short_name
 from deepaccident_devkit.v2x import Agents, Contact, collision, cooperating_agents
@@ -87,7 +99,9 @@ class ReplayRecording(FrozenArrays):
 
     def actor_of(self, agent: str) -> int | None:
         """The actor id of an agent; None for the infrastructure, and if meta does not give it."""
-        actor: int | None = self.dataset.get("agent", f"{self.scenario['token']}/{agent}")["actor_id"]
+        actor: int | None = self.dataset.get("agent", f"{self.scenario['token']}/{agent}")[
+            "actor_id"
+        ]
         return actor
 
     def places(self, xy: ArrayLike) -> list[Any]:
@@ -101,8 +115,12 @@ def recording_of(dataset: Dataset, scenario: RowArgument | None, agents: Agents)
     Agents are as `cooperating_agents` takes them, seen from the first that is there; its errors are raised, and
     NotAvailableError if the release has no scenario.
     """
-    record = dataset.scenario[dataset.getind("scenario", default_scenario(dataset) if scenario is None else scenario)]
-    chosen = cooperating_agents(dataset, sample_token(record["token"], agents_of(dataset, record)[0], 1), agents)
+    record = dataset.scenario[
+        dataset.getind("scenario", default_scenario(dataset) if scenario is None else scenario)
+    ]
+    chosen = cooperating_agents(
+        dataset, sample_token(record["token"], agents_of(dataset, record)[0], 1), agents
+    )
     contact, unknown = None, ""
     try:
         contact = collision(dataset, record)
@@ -122,7 +140,10 @@ def _origin(dataset: Dataset, record: ScenarioRecord, contact: Contact | None) -
     """The place of the impact or, without one, the middle of the agents at the end; in whole metres."""
     if contact is not None:
         return as_floats(np.round(contact.point[:2]))
-    poses = [dataset.world_from(sample, "ego").translation for sample in dataset.samples_of(record["last_frame_token"])]
+    poses = [
+        dataset.world_from(sample, "ego").translation
+        for sample in dataset.samples_of(record["last_frame_token"])
+    ]
     return as_floats(np.round(np.mean(poses, axis=0)[:2]))
 
 
@@ -130,7 +151,10 @@ def agent_entries(recording: ReplayRecording) -> list[dict[str, Any]]:
     """The agents as the page has them: names, colour, actor id, and one pose for each frame (cm, cm, mrad)."""
     described = []
     for agent in recording.agents:
-        poses = [recording.dataset.world_from(recording.sample(agent, frame), "ego") for frame in recording.frames]
+        poses = [
+            recording.dataset.world_from(recording.sample(agent, frame), "ego")
+            for frame in recording.frames
+        ]
         yaw = quaternions.yaw_of(np.array([pose.quaternion.elements for pose in poses]))
         places = recording.places([pose.translation[:2] for pose in poses])
         described.append(
@@ -140,7 +164,10 @@ def agent_entries(recording: ReplayRecording) -> list[dict[str, Any]]:
                 "short": agent_letters(agent),
                 "color": AGENT_COLORS[agent],
                 "actor": recording.actor_of(agent),
-                "poses": [[*place, _milliradians(turn)] for place, turn in zip(places, yaw.tolist(), strict=True)],
+                "poses": [
+                    [*place, _milliradians(turn)]
+                    for place, turn in zip(places, yaw.tolist(), strict=True)
+                ],
             }
         )
     return described
@@ -159,7 +186,8 @@ def actor_entries(recording: ReplayRecording) -> list[dict[str, Any]]:
     ids = np.unique(tracks.actor_id)
     seen = _seen(recording, ids)
     order = sorted(
-        range(len(ids)), key=lambda row: (ids[row] not in recording.pair, int(ids[row]) not in recorders, ids[row])
+        range(len(ids)),
+        key=lambda row: (ids[row] not in recording.pair, int(ids[row]) not in recorders, ids[row]),
     )
     return [_actor(recording, tracks, int(ids[row]), recorders, seen[row]) for row in order]
 
@@ -193,7 +221,9 @@ def camera_entries(recording: ReplayRecording) -> list[list[dict[str, Any]]]:
     pose world_from_camera, with optical axes: x, y (cm from the page's origin), z (cm), and a unit quaternion w, x, y,
     z (ten thousandths).
     """
-    return [[_camera(recording, agent, channel) for channel in CAMERAS] for agent in recording.agents]
+    return [
+        [_camera(recording, agent, channel) for channel in CAMERAS] for agent in recording.agents
+    ]
 
 
 def _camera(recording: ReplayRecording, agent: str, channel: str) -> dict[str, Any]:
@@ -201,18 +231,29 @@ def _camera(recording: ReplayRecording, agent: str, channel: str) -> dict[str, A
     lens = recording.dataset.camera(samples[0], channel)
     poses = [recording.dataset.world_from(sample, channel) for sample in samples]
     (fx, _, cx), (_, fy, cy) = lens.intrinsic[:2].tolist()
-    turns = np.rint(np.array([pose.quaternion.elements for pose in poses]) * 10_000).astype(int).tolist()
+    turns = (
+        np.rint(np.array([pose.quaternion.elements for pose in poses]) * 10_000)
+        .astype(int)
+        .tolist()
+    )
     places = recording.places([pose.translation[:2] for pose in poses])
     heights = [round(float(pose.translation[2]) * 100) for pose in poses]
     return {
         "title": camera_name(channel),
         "lens": [lens.width, lens.height, *(round(each, 2) for each in (fx, fy, cx, cy))],
-        "poses": [[*place, height, *turn] for place, height, turn in zip(places, heights, turns, strict=True)],
+        "poses": [
+            [*place, height, *turn]
+            for place, height, turn in zip(places, heights, turns, strict=True)
+        ],
     }
 
 
 def _actor(
-    recording: ReplayRecording, tracks: ScenarioTracks, actor: int, recorders: Mapping[int, str], seen: AnyArray
+    recording: ReplayRecording,
+    tracks: ScenarioTracks,
+    actor: int,
+    recorders: Mapping[int, str],
+    seen: AnyArray,
 ) -> dict[str, Any]:
     rows = np.flatnonzero(tracks.actor_id == actor)
     boxes, agent = tracks.boxes.select(rows), recorders.get(actor)
@@ -252,7 +293,9 @@ def _seen(recording: ReplayRecording, ids: IntArray) -> AnyArray:
     seen = np.zeros((len(ids), len(recording.frames)), dtype=np.uint8)
     for bit, agent in enumerate(recording.agents):
         for column, frame in enumerate(recording.frames):
-            visible = visible_actors(recording.dataset, recording.sample(agent, frame), agents=[agent])
+            visible = visible_actors(
+                recording.dataset, recording.sample(agent, frame), agents=[agent]
+            )
             seen[np.isin(ids, visible), column] |= 1 << bit
     return seen
 
@@ -288,10 +331,14 @@ def foreseen_entries(recording: ReplayRecording, prediction: Foreseen) -> dict[s
 
 def _horizon(prediction: Foreseen) -> float:
     form = prediction.form if isinstance(prediction, Results) else None
-    return RELEASED_HORIZON if form is None else min(RELEASED_HORIZON, (form.frames - 1) * form.step)
+    return (
+        RELEASED_HORIZON if form is None else min(RELEASED_HORIZON, (form.frames - 1) * form.step)
+    )
 
 
-def _sample(recording: ReplayRecording, prediction: Foreseen, agent: str, frame: int, horizon: float) -> dict[str, Any]:
+def _sample(
+    recording: ReplayRecording, prediction: Foreseen, agent: str, frame: int, horizon: float
+) -> dict[str, Any]:
     token = recording.sample(agent, frame)
     given, label, context = _loaded(recording, prediction, token, horizon)
     truth = context.truth
@@ -319,7 +366,11 @@ def _loaded(
         setup = EvaluationSetup(task="accident", protocol="boxes", horizon=horizon)
         given, label, context = SampleLoader(recording.dataset, prediction, setup)(token)
         return checked_prediction(given), label, context
-    return checked_prediction(prediction[token]), None, accident_context(recording.dataset, token, horizon)
+    return (
+        checked_prediction(prediction[token]),
+        None,
+        accident_context(recording.dataset, token, horizon),
+    )
 
 
 def _verdict(given: Prediction, label: MotionLabels | None, context: AccidentContext) -> str:
@@ -331,7 +382,11 @@ def _verdict(given: Prediction, label: MotionLabels | None, context: AccidentCon
 
 
 def _alarm(
-    recording: ReplayRecording, accident: Accident, ids: Pair | None, context: AccidentContext, world_from_ego: SE3
+    recording: ReplayRecording,
+    accident: Accident,
+    ids: Pair | None,
+    context: AccidentContext,
+    world_from_ego: SE3,
 ) -> dict[str, Any]:
     counts = _RULES.counts([accident], None, context)
     off = counts["alarms"][0] if counts["alarms"] else None
@@ -346,7 +401,9 @@ def _alarm(
         names = " and ".join("an unknown actor" if each is None else str(each) for each in ids)
         text += f"; names {names}{', who collide' if right_two else ''}"
     return {
-        "places": recording.places(world_from_ego.apply([[x, y, 0.0] for x, y in accident.positions.tolist()])[:, :2]),
+        "places": recording.places(
+            world_from_ego.apply([[x, y, 0.0] for x, y in accident.positions.tolist()])[:, :2]
+        ),
         "right": right,
         "time": round(accident.time, 1),
         "text": text,

@@ -106,7 +106,9 @@ def render_replay(
     """
     target = path_of(path)
     if target.is_dir():
-        raise ChoiceError(f"{target}: is a folder; name a file in it, such as {target / 'replay.html'}")
+        raise ChoiceError(
+            f"{target}: is a folder; name a file in it, such as {target / 'replay.html'}"
+        )
     recording = recording_of(dataset, scenario, agents)
     files, clouds = camera_files(recording), lidar_files(recording)
     data, followed = _data(recording, prediction, files, clouds)
@@ -121,7 +123,9 @@ def render_replay(
     return target
 
 
-def tried_replay(dataset: Dataset, scenario: str, path: Path, *, prediction: Foreseen | None = None) -> str | None:
+def tried_replay(
+    dataset: Dataset, scenario: str, path: Path, *, prediction: Foreseen | None = None
+) -> str | None:
     """Write a scenario's replay; None, or why there is none: a file cannot be read, or the prediction not be shown."""
     try:
         render_replay(dataset, scenario, path, prediction=prediction)
@@ -155,11 +159,16 @@ def served_replay(
 def lidar_files(recording: ReplayRecording) -> list[list[bool]]:
     """For each agent and frame whether the LiDAR file is there."""
     there = recording.dataset.sensor_frames(recording.scenario["token"])
-    return [[frame in there[agent, LIDAR] for frame in recording.frames] for agent in recording.agents]
+    return [
+        [frame in there[agent, LIDAR] for frame in recording.frames] for agent in recording.agents
+    ]
 
 
 def _data(
-    recording: ReplayRecording, prediction: Foreseen | None, files: CameraFiles, clouds: list[list[bool]]
+    recording: ReplayRecording,
+    prediction: Foreseen | None,
+    files: CameraFiles,
+    clouds: list[list[bool]],
 ) -> tuple[dict[str, Any], Followed]:
     """The page's data, except pictures and points, and the cameras that follow the pair.
 
@@ -168,7 +177,8 @@ def _data(
     """
     contact = recording.contact
     moments = [
-        recording.dataset.get("frame", f"{recording.scenario['token']}/{frame:03d}") for frame in recording.frames
+        recording.dataset.get("frame", f"{recording.scenario['token']}/{frame:03d}")
+        for frame in recording.frames
     ]
     data: dict[str, Any] = {
         "scenario": recording.scenario["token"],
@@ -198,7 +208,10 @@ def _data(
     followed = follow_pair(recording, seen, there)
     data["automatic"] = {
         "agents": [recording.agents.index(agent) for agent in followed.agents],
-        "cameras": [[camera_name(channel) for channel in followed.channels[agent]] for agent in recording.agents],
+        "cameras": [
+            [camera_name(channel) for channel in followed.channels[agent]]
+            for agent in recording.agents
+        ],
     }
     return data, followed
 
@@ -211,7 +224,11 @@ def _with_pictures(
     for agent, entries in zip(recording.agents, cameras, strict=True):
         own = {camera_name(channel): each for channel, each in jpegs.get(agent, {}).items()}
         shown.append(
-            [{**entry, "pictures": [*map(_coded, own[entry["title"]])]} for entry in entries if entry["title"] in own]
+            [
+                {**entry, "pictures": [*map(_coded, own[entry["title"]])]}
+                for entry in entries
+                if entry["title"] in own
+            ]
         )
     return shown
 
@@ -229,7 +246,14 @@ def replay_page(title: str, data: Mapping[str, Any]) -> str:
     style = COLORS + replay_style()
     policy = f"default-src 'none'; img-src data:; style-src '{source_hash(style)}'; base-uri 'none'; form-action 'none'"
     written = script_json(data)
-    return document("replay/replay.html", style=style, policy=policy, script=replay_script(), title=title, data=written)
+    return document(
+        "replay/replay.html",
+        style=style,
+        policy=policy,
+        script=replay_script(),
+        title=title,
+        data=written,
+    )
 
 
 def script_json(data: Mapping[str, Any]) -> str:
@@ -266,12 +290,23 @@ def notes(
 
     The settings are None if there is no picture; `most` is how many points a cloud may have.
     """
-    return [*_labels(recording), *_missing_pictures(files), *_pictures(files, settings), *_clouds(clouds, most)]
+    return [
+        *_labels(recording),
+        *_missing_pictures(files),
+        *_pictures(files, settings),
+        *_clouds(clouds, most),
+    ]
 
 
-def served_notes(recording: ReplayRecording, files: CameraFiles, clouds: list[list[bool]]) -> list[str]:
+def served_notes(
+    recording: ReplayRecording, files: CameraFiles, clouds: list[list[bool]]
+) -> list[str]:
     """Sentences on what is missing in the release, for a page that has no pictures itself."""
-    return [*_labels(recording), *_missing_pictures(files), *_clouds(clouds, served_points(recording))]
+    return [
+        *_labels(recording),
+        *_missing_pictures(files),
+        *_clouds(clouds, served_points(recording)),
+    ]
 
 
 def _setting(recording: ReplayRecording) -> Iterator[tuple[str, str]]:
@@ -284,7 +319,10 @@ def _setting(recording: ReplayRecording) -> Iterator[tuple[str, str]]:
     yield "Ego goes", scenario["ego_direction"] or ""
     side = f"comes from {scenario['spawn_side']}" if scenario["spawn_side"] else ""
     yield "Other goes", ", ".join(filter(None, (scenario["other_direction"], side)))
-    yield "Recorded", f"{len(recording.frames)} frames, {len(recording.frames) * FRAME_PERIOD:.1f} s at 10 Hz"
+    yield (
+        "Recorded",
+        f"{len(recording.frames)} frames, {len(recording.frames) * FRAME_PERIOD:.1f} s at 10 Hz",
+    )
     yield "Split", scenario["split"] or ""
 
 
@@ -295,16 +333,27 @@ def _ending(recording: ReplayRecording) -> Iterator[tuple[str, str]]:
         return
     names = [f"{kind} {actor}" for kind, actor in zip(told["classes"], told["ids"], strict=True)]
     agents = told["agents"] or [None, None]
-    who = [f"{name} ({short_name(agent)})" if agent else name for name, agent in zip(names, agents, strict=True)]
+    who = [
+        f"{name} ({short_name(agent)})" if agent else name
+        for name, agent in zip(names, agents, strict=True)
+    ]
     kind = recording.scenario["accident_type"]
     yield "Ends", f"{who[0]} and {who[1]} collide"
     yield "Accident type", "" if kind is None else f"{kind} of the paper's 12"
     if contact is not None:
         yield "Contact", contact_words(contact.touching, contact.gap)
-        yield "Speeds", ", ".join(f"{name} {_speed(speed)}" for name, speed in zip(names, contact.speeds, strict=True))
+        yield (
+            "Speeds",
+            ", ".join(
+                f"{name} {_speed(speed)}" for name, speed in zip(names, contact.speeds, strict=True)
+            ),
+        )
         yield "Closing speed", _speed(contact.closing_speed)
         yield "Angle between", f"{math.degrees(contact.impact_angle):.0f}°"
-        yield "Sides", ", ".join(f"{name} {side}" for name, side in zip(names, contact.sides, strict=True))
+        yield (
+            "Sides",
+            ", ".join(f"{name} {side}" for name, side in zip(names, contact.sides, strict=True)),
+        )
 
 
 def _speed(speed: float) -> str:
@@ -315,7 +364,9 @@ def _labels(recording: ReplayRecording) -> Iterator[str]:
     absent = [short_name(agent) for agent in AGENTS if agent not in recording.agents]
     if absent:
         yield f"Agents not shown: {', '.join(absent)}."
-    samples = [recording.sample(agent, frame) for agent in recording.agents for frame in recording.frames]
+    samples = [
+        recording.sample(agent, frame) for agent in recording.agents for frame in recording.frames
+    ]
     unlabelled = sum(not recording.dataset.sample.get(sample)["labelled"] for sample in samples)
     if unlabelled == len(samples):
         yield "The release has no labels of this scenario: the page has no boxes and does not show who sees whom."
@@ -329,7 +380,9 @@ def _labels(recording: ReplayRecording) -> Iterator[str]:
 
 def _pictures(files: CameraFiles, settings: PictureSettings | None) -> Iterator[str]:
     if settings is None:
-        yield from ["No pictures: the file would be too large with them."] * any(map(any, files.values()))
+        yield from ["No pictures: the file would be too large with them."] * any(
+            map(any, files.values())
+        )
         return
     yield f"Pictures are up to {settings.width} pixels wide, of JPEG quality {settings.quality}."
     if settings.every > 1:

@@ -44,22 +44,37 @@ def road_picture(recording: ReplayRecording) -> dict[str, Any] | None:
     if not seen and town is None:
         return None
     reach = BEV_RESOLUTION * BEV_SHAPE[0] / 2
-    poses = [pose for _, pose in seen] or [recording.dataset.world_from(sample, "ego") for sample in samples]
+    poses = [pose for _, pose in seen] or [
+        recording.dataset.world_from(sample, "ego") for sample in samples
+    ]
     middles = np.array([pose.translation[:2] for pose in poses])
     low, high = middles.min(axis=0) - reach, middles.max(axis=0) + reach
-    grounds = (_merged(seen, low, high, cell) if town is None else _mapped(town, low, high, cell) for cell in _CELLS)
+    grounds = (
+        _merged(seen, low, high, cell) if town is None else _mapped(town, low, high, cell)
+        for cell in _CELLS
+    )
     png = next((each for each in map(_png, grounds) if len(each) <= _MOST), None)
     if png is None:
         return None
     left, top = recording.places([low[0], high[1]])
     width, height = np.rint((high - low) * 100).astype(int).tolist()
-    return {"png": base64.b64encode(png).decode("ascii"), "left": left, "top": top, "width": width, "height": height}
+    return {
+        "png": base64.b64encode(png).decode("ascii"),
+        "left": left,
+        "top": top,
+        "width": width,
+        "height": height,
+    }
 
 
 def _samples(recording: ReplayRecording) -> list[str]:
     """The samples (tokens) of the agents at a few moments."""
     frames = np.linspace(recording.frames[0], recording.frames[-1], _MOMENTS).round().astype(int)
-    return [recording.sample(agent, frame) for agent in recording.agents for frame in np.unique(frames).tolist()]
+    return [
+        recording.sample(agent, frame)
+        for agent in recording.agents
+        for frame in np.unique(frames).tolist()
+    ]
 
 
 def _seen(recording: ReplayRecording, samples: Sequence[str]) -> list[tuple[BevImage, SE3]]:
@@ -69,7 +84,9 @@ def _seen(recording: ReplayRecording, samples: Sequence[str]) -> list[tuple[BevI
     return [(dataset.load_bev(sample), dataset.world_from(sample, "ego")) for sample in there]
 
 
-def _merged(seen: Sequence[tuple[BevImage, SE3]], low: FloatArray, high: FloatArray, cell: float) -> ByteArray:
+def _merged(
+    seen: Sequence[tuple[BevImage, SE3]], low: FloatArray, high: FloatArray, cell: float
+) -> ByteArray:
     """(H, W) uint8: in each cell the ground, from 1, of the first picture that has any there; the top is high y.
 
     Args:
@@ -85,15 +102,23 @@ def _merged(seen: Sequence[tuple[BevImage, SE3]], low: FloatArray, high: FloatAr
     merged = np.zeros((len(y), len(x)), dtype=np.uint8)
     for image, pose in seen:
         yaw = np.arctan2(pose.rotation[1, 0], pose.rotation[0, 0])
-        reach = image.resolution * len(image.semantic) * np.array([-1.0, 1.0])  # farther than its corners
+        reach = (
+            image.resolution * len(image.semantic) * np.array([-1.0, 1.0])
+        )  # farther than its corners
         columns = slice(*x.searchsorted(pose.translation[0] + reach))
         rows = slice(*(-y).searchsorted(reach - pose.translation[1]))
         own = merged[rows, columns]
         right, up = x[None, columns] - pose.translation[0], y[rows, None] - pose.translation[1]
         middle = (len(image.semantic) - 1) / 2
-        row = np.rint(middle - (right * np.cos(yaw) + up * np.sin(yaw)) / image.resolution).astype(np.int64)
-        column = np.rint(middle - (up * np.cos(yaw) - right * np.sin(yaw)) / image.resolution).astype(np.int64)
-        free = (own == 0) & (row >= 0) & (row <= 2 * middle) & (column >= 0) & (column <= 2 * middle)
+        row = np.rint(middle - (right * np.cos(yaw) + up * np.sin(yaw)) / image.resolution).astype(
+            np.int64
+        )
+        column = np.rint(
+            middle - (up * np.cos(yaw) - right * np.sin(yaw)) / image.resolution
+        ).astype(np.int64)
+        free = (
+            (own == 0) & (row >= 0) & (row <= 2 * middle) & (column >= 0) & (column <= 2 * middle)
+        )
         own[free] = kinds[image.semantic[row[free], column[free]]]
     return merged
 
@@ -101,7 +126,9 @@ def _merged(seen: Sequence[tuple[BevImage, SE3]], low: FloatArray, high: FloatAr
 def _mapped(town: Any, low: FloatArray, high: FloatArray, cell: float) -> ByteArray:
     """(H, W) uint8: the ground by a town's map, as `_merged` gives it."""
     across, down = np.meshgrid(*_middles(low, high, cell))
-    return ground_at(town, np.column_stack([across.ravel(), down.ravel()]), _GROUND).reshape(across.shape)
+    return ground_at(town, np.column_stack([across.ravel(), down.ravel()]), _GROUND).reshape(
+        across.shape
+    )
 
 
 def _middles(low: FloatArray, high: FloatArray, cell: float) -> tuple[FloatArray, FloatArray]:
@@ -114,5 +141,7 @@ def _png(cells: ByteArray) -> bytes:
     from PIL import Image, ImageColor
 
     picture = Image.fromarray(cells)
-    picture.putpalette([255, 255, 255, *(part for name in _GROUND for part in ImageColor.getrgb(BEV_COLORS[name]))])
+    picture.putpalette(
+        [255, 255, 255, *(part for name in _GROUND for part in ImageColor.getrgb(BEV_COLORS[name]))]
+    )
     return picture_bytes(picture, "PNG", optimize=True, bits=2, transparency=0)

@@ -34,7 +34,17 @@ _LARGE: Final = 0.1
 _LAYERS: Final = as_floats([1, 2, 3]) / 3
 FRONT: Final = CAMERAS[0]
 # Width in pixels and JPEG quality; the first pair that fits is taken.
-LADDER: Final = ((960, 80), (800, 75), (640, 75), (640, 65), (560, 60), (480, 60), (480, 50), (400, 50), (320, 45))
+LADDER: Final = (
+    (960, 80),
+    (800, 75),
+    (640, 75),
+    (640, 65),
+    (560, 60),
+    (480, 60),
+    (480, 50),
+    (400, 50),
+    (320, 45),
+)
 # For each step of the ladder, one of how many frames has a picture of the other cameras; the last is for the rest.
 OTHERS: Final = (1, 2, 2, 2, 4)
 # Pixels: the other cameras' pictures are half as wide as the others, but not smaller than this.
@@ -81,18 +91,25 @@ class Followed:
 
 
 def follow_pair(
-    recording: ReplayRecording, seen: Mapping[int, Sequence[int]], there: Mapping[tuple[str, str], Sequence[bool]]
+    recording: ReplayRecording,
+    seen: Mapping[int, Sequence[int]],
+    there: Mapping[tuple[str, str], Sequence[bool]],
 ) -> Followed:
     """Choose cameras so that most of the pair is in the picture, large and not hidden, and changes are few.
 
     `seen` has for an actor id and a frame a bit mask over the recording's agents, `there` for an agent, a camera and a
     frame whether there is a picture.
     """
-    scores = {agent: _scores(recording, bit, seen, there) for bit, agent in enumerate(recording.agents)}
+    scores = {
+        agent: _scores(recording, bit, seen, there) for bit, agent in enumerate(recording.agents)
+    }
     chosen = {agent: steady(each) for agent, each in scores.items()}
     best = [each[np.arange(len(each)), chosen[agent]] for agent, each in scores.items()]
     return Followed(
-        channels={agent: tuple(CAMERAS[channel] for channel in channels) for agent, channels in chosen.items()},
+        channels={
+            agent: tuple(CAMERAS[channel] for channel in channels)
+            for agent, channels in chosen.items()
+        },
         agents=tuple(recording.agents[number] for number in steady(np.stack(best, axis=1))),
     )
 
@@ -119,19 +136,27 @@ def _scores(
     return scores
 
 
-def _shown(recording: ReplayRecording, agent: str, channel: str, boxes: Boxes, row: IntArray) -> FloatArray:
+def _shown(
+    recording: ReplayRecording, agent: str, channel: str, boxes: Boxes, row: IntArray
+) -> FloatArray:
     """(N,) from 0 to 1: the share of boxes, in world, that a camera's picture has, less if they are small.
 
     `row` (N,) says at which frame, from 0, each box is. The lens is that of the first frame.
     """
     samples = [recording.sample(agent, frame) for frame in recording.frames]
     lens = recording.dataset.camera(samples[0], channel)
-    poses = np.array([recording.dataset.world_from(sample, channel).matrix for sample in samples])[row]
+    poses = np.array([recording.dataset.world_from(sample, channel).matrix for sample in samples])[
+        row
+    ]
     center = boxes.center[:, None]
     layers = center[:, None] + _LAYERS[:, None, None] * (boxes.corners() - center)[:, None]
     world = layers.reshape(len(boxes), layers.shape[1] * layers.shape[2], 3) - poses[:, None, :3, 3]
     places = (world @ poses[:, :3, :3]).reshape(-1, 3)
-    inside = lens.in_image(*lens.project(places), min_depth=IN_FRONT_DEPTH).reshape(world.shape[:2]).mean(axis=1)
+    inside = (
+        lens.in_image(*lens.project(places), min_depth=IN_FRONT_DEPTH)
+        .reshape(world.shape[:2])
+        .mean(axis=1)
+    )
     away = np.linalg.norm(boxes.center - poses[:, :3, 3], axis=1).clip(1.0)
     size = lens.intrinsic[0, 0] / lens.width * boxes.size[:, 0] / away
     return as_floats(inside * size / (size + _LARGE))
@@ -227,7 +252,9 @@ def _paths(recording: ReplayRecording, agent: str, channel: str) -> Iterator[Rel
 def _ladder(frames: int) -> Iterator[PictureSettings]:
     """Ways to write pictures, each smaller than the one before."""
     for number, (width, quality) in enumerate(LADDER):
-        yield PictureSettings(width=width, quality=quality, others=OTHERS[min(number, len(OTHERS) - 1)])
+        yield PictureSettings(
+            width=width, quality=quality, others=OTHERS[min(number, len(OTHERS) - 1)]
+        )
     every = 1
     while every < 2 * frames:
         yield PictureSettings(width=width, quality=quality, every=every, others=0)
@@ -241,7 +268,10 @@ def _fitting(
     for settings in ladder if probes else ():
         kept = _kept(images, settings)
         written = [image for each in kept.values() for image in each if image is not None]
-        weight = {large: sum(len(_jpeg(each, settings, large=large)) for each in probes) for large in (True, False)}
+        weight = {
+            large: sum(len(_jpeg(each, settings, large=large)) for each in probes)
+            for large in (True, False)
+        }
         if sum(weight[image.large] for image in written) / len(probes) > limit:
             continue
         encoded = _encoded(written, settings, progress=progress)
@@ -263,7 +293,10 @@ def _kept(images: _Images, settings: PictureSettings) -> _Images:
         every = settings.every if image is not None and image.large else settings.others
         return image if every and frame % every == 0 else None
 
-    return {key: [kept(image, frame) for frame, image in enumerate(each)] for key, each in images.items()}
+    return {
+        key: [kept(image, frame) for frame, image in enumerate(each)]
+        for key, each in images.items()
+    }
 
 
 def _encoded(images: Sequence[_Image], settings: PictureSettings, *, progress: bool) -> list[bytes]:
@@ -309,7 +342,10 @@ def lidar_points(recording: ReplayRecording, most: int) -> list[list[str | None]
     None stands for a missing file; an agent of which all are missing has no list, and without any there is none.
     Raises SensorFileError.
     """
-    clouds = [[cloud_text(recording, agent, frame, most) for frame in recording.frames] for agent in recording.agents]
+    clouds = [
+        [cloud_text(recording, agent, frame, most) for frame in recording.frames]
+        for agent in recording.agents
+    ]
     shown = [each if set(each) != {None} else None for each in clouds]
     return shown if any(shown) else None
 
@@ -319,7 +355,9 @@ def served_points(recording: ReplayRecording) -> int:
     return most_points(len(recording.agents) * len(recording.frames), SERVED_POINTS)
 
 
-def cloud_text(recording: ReplayRecording, agent: str, frame: int, most: int | None = None) -> str | None:
+def cloud_text(
+    recording: ReplayRecording, agent: str, frame: int, most: int | None = None
+) -> str | None:
     """A cloud above the road: int16 x, y, z, x, y, z, …, little-endian, decimetres from the origin, as base64.
 
     z is that of world. At most so many points, by default `served_points`, spread evenly over the

@@ -3,7 +3,14 @@
 Every function that works on many scenarios or samples takes `workers` and `executor`; none has a pool of its own.
 """
 
-from deepaccident_devkit.support.parallel.batches import Engine, Places, Progress, in_order, run_batch, run_unordered
+from deepaccident_devkit.support.parallel.batches import (
+    Engine,
+    Places,
+    Progress,
+    in_order,
+    run_batch,
+    run_unordered,
+)
 from deepaccident_devkit.support.parallel.executors import (
     FEWER_WORKERS,
     cluster_executor,

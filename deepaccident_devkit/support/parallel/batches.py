@@ -100,7 +100,15 @@ def run_batch(
             version of it.
     """
     results = dict(
-        run_unordered(work, items, workers=workers, executor=executor, label=label, progress=progress, places=places)
+        run_unordered(
+            work,
+            items,
+            workers=workers,
+            executor=executor,
+            label=label,
+            progress=progress,
+            places=places,
+        )
     )
     return [results[position] for position in range(len(items))]
 
@@ -122,10 +130,15 @@ def run_unordered(
     errors are those of `run_batch`; `progress` may be a function that gets each item's share of the work, and `sizes`
     is how far each item moves the progress bar; None for one step each.
     """
-    from tqdm.auto import tqdm  # here: with asyncio and multiprocessing, a third of the package's import time
+    from tqdm.auto import (
+        tqdm,
+    )  # here: with asyncio and multiprocessing, a third of the package's import time
 
     count, steps = _worker_count(workers, len(items)), sizes or [1] * len(items)
-    with tqdm(total=sum(steps), desc=label, disable=progress is not True, unit="") as bar, ExitStack() as stack:
+    with (
+        tqdm(total=sum(steps), desc=label, disable=progress is not True, unit="") as bar,
+        ExitStack() as stack,
+    ):
         if executor is not None:
             seen = stack.enter_context(marked(places or Places()))
             results = _on(executor, [Call(work, item, seen) for item in items], cancel=True)
@@ -180,7 +193,9 @@ def _on(
             if time.monotonic() - asked >= _WIDTH_SECONDS:
                 width, asked = width_of(executor), time.monotonic()
             oldest = next(iter(running.values()), upcoming)
-            last = min(len(calls), upcoming + _AHEAD * width - len(running), oldest + _FAR_AHEAD * width)
+            last = min(
+                len(calls), upcoming + _AHEAD * width - len(running), oldest + _FAR_AHEAD * width
+            )
             if upcoming < last:
                 with main_module_hidden(), signals_put_off():
                     for position in range(upcoming, last):
@@ -226,9 +241,13 @@ class Call(Generic[_Item, _Result]):
         So a scheduler on the way needs no devkit, and a worker without one, or that cannot open the dataset of the
         item, says so as the task's error; dask's workers end if a message cannot be unpickled.
         """
-        from multiprocessing.reduction import ForkingPickler  # here, as it takes ten milliseconds to import
+        from multiprocessing.reduction import (
+            ForkingPickler,
+        )  # here, as it takes ten milliseconds to import
 
-        done_when_read = _DoneWhenRead(bytes(ForkingPickler.dumps((self.work, self.item))), self.seen)
+        done_when_read = _DoneWhenRead(
+            bytes(ForkingPickler.dumps((self.work, self.item))), self.seen
+        )
         return partial, (ForkingPickler.loads, bytes(ForkingPickler.dumps(done_when_read)))
 
 

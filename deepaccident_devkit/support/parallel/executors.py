@@ -19,7 +19,13 @@ from contextvars import ContextVar
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from deepaccident_devkit.errors import MOST_TOLD, DeepAccidentError, MissingExtraError, WorkerError, shortened
+from deepaccident_devkit.errors import (
+    MOST_TOLD,
+    DeepAccidentError,
+    MissingExtraError,
+    WorkerError,
+    shortened,
+)
 from deepaccident_devkit.support.cores import usable_cores
 from deepaccident_devkit.support.reading import fault_text, read_bytes
 from deepaccident_devkit.support.version import __version__
@@ -36,9 +42,7 @@ _USUAL_WIDTH: Final = 64
 MPI: Final = "mpi"
 # How long an empty file of a scheduler may still get its address.
 ADDRESS_WAIT: Final = 10.0
-FEWER_WORKERS: Final = (
-    "if memory or shared memory (/dev/shm) ran out, use fewer workers, or none (for training: without --workers)"
-)
+FEWER_WORKERS: Final = "if memory or shared memory (/dev/shm) ran out, use fewer workers, or none (for training: without --workers)"
 _PACKAGE: Final = __name__.partition(".")[0]
 # Within `workers_kept`: number of processes → a pool of them that waits for work.
 _kept: ContextVar[dict[int, ProcessPoolExecutor] | None] = ContextVar("kept", default=None)
@@ -46,10 +50,14 @@ _kept: ContextVar[dict[int, ProcessPoolExecutor] | None] = ContextVar("kept", de
 
 def width_of(executor: Executor) -> int:
     """How many tasks an executor does at once, as far as it says it."""
-    client: Client | None = getattr(executor, "_client", None)  # of a dask executor, whose workers come and go
+    client: Client | None = getattr(
+        executor, "_client", None
+    )  # of a dask executor, whose workers come and go
     if client is not None:
         return sum(client.ncores().values()) or _USUAL_WIDTH
-    told: int | None = getattr(executor, "num_workers", None) or getattr(executor, "_max_workers", None)
+    told: int | None = getattr(executor, "num_workers", None) or getattr(
+        executor, "_max_workers", None
+    )
     return told or _USUAL_WIDTH  # the first is MPI's name, the second Python's
 
 
@@ -69,7 +77,9 @@ def fault_of_workers(error: Exception) -> str | None:
 
 
 @contextmanager
-def cluster_executor(address: str | None = None, scheduler_file: Path | None = None) -> Iterator[Executor | None]:
+def cluster_executor(
+    address: str | None = None, scheduler_file: Path | None = None
+) -> Iterator[Executor | None]:
     """An executor on the workers of a cluster, while the block runs; None without a scheduler.
 
     What is sent to a scheduler and comes back is pickled: it must be one that you trust.
@@ -98,11 +108,17 @@ def _mpi_executor() -> Iterator[Executor]:
     try:
         from mpi4py import MPI as mpi  # noqa: N811 - the name of its C library
         from mpi4py.futures import MPIPoolExecutor
-    except (ImportError, OSError, RuntimeError) as error:  # the last: there is no MPI on this machine
+    except (
+        ImportError,
+        OSError,
+        RuntimeError,
+    ) as error:  # the last: there is no MPI on this machine
         raise MissingExtraError(
             f"mpi4py cannot be imported ({error}); install an MPI, and: pip install mpi4py"
         ) from error
-    if mpi.COMM_WORLD.size < 2 or mpi.COMM_WORLD.rank:  # a rank but the first runs this: all would do the same
+    if (
+        mpi.COMM_WORLD.size < 2 or mpi.COMM_WORLD.rank
+    ):  # a rank but the first runs this: all would do the same
         raise WorkerError(
             "this is no MPI program whose other ranks wait for work; start it with: mpiexec -n 8 python -m "
             f"mpi4py.futures -m {_PACKAGE}.cli …"
@@ -116,7 +132,9 @@ def _dask_client(address: str | None, scheduler_file: Path | None) -> Iterator[C
     try:
         from distributed import Client
     except ImportError as error:
-        raise MissingExtraError("dask is not installed; in a checkout: pip install '.[distributed]'") from error
+        raise MissingExtraError(
+            "dask is not installed; in a checkout: pip install '.[distributed]'"
+        ) from error
     place = str(scheduler_file or address)
     try:
         if scheduler_file is not None:
@@ -150,7 +168,10 @@ def _address_in(file: Path) -> str:
 
     Raises OSError or ValueError. Dask itself would wait for it for ever, and read anything.
     """
-    from deepaccident_devkit.support.json_text import as_record, parsed_json  # here, as it takes some milliseconds
+    from deepaccident_devkit.support.json_text import (
+        as_record,
+        parsed_json,
+    )  # here, as it takes some milliseconds
 
     end, content = time.monotonic() + ADDRESS_WAIT, b""
     while not content:
@@ -185,7 +206,9 @@ def starting_workers() -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise WorkerError(f"worker processes cannot be started ({error}); {FEWER_WORKERS}") from error
+        raise WorkerError(
+            f"worker processes cannot be started ({error}); {FEWER_WORKERS}"
+        ) from error
 
 
 @contextmanager
@@ -229,7 +252,9 @@ def _begin_worker() -> None:
     from tqdm import tqdm
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    tqdm.set_lock(threading.RLock())  # its own is one for all processes, and stays in the system if this one is killed
+    tqdm.set_lock(
+        threading.RLock()
+    )  # its own is one for all processes, and stays in the system if this one is killed
     threading.Thread(target=_end_with_parent, name="end-with-parent", daemon=True).start()
 
 
@@ -257,7 +282,8 @@ def signals_put_off() -> Iterator[None]:
     handlers = {
         number: signal.signal(number, lambda each, _frame: came.append(each))
         for number in (signal.SIGINT, signal.SIGTERM)
-        if signal.getsignal(number) is not None  # one of a program that embeds Python cannot be put back
+        if signal.getsignal(number)
+        is not None  # one of a program that embeds Python cannot be put back
     }
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:

@@ -6,7 +6,13 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
-from deepaccident_devkit.errors import DeepAccidentError, MissingExtraError, ReleaseError, SomeFailedError, WorkerError
+from deepaccident_devkit.errors import (
+    DeepAccidentError,
+    MissingExtraError,
+    ReleaseError,
+    SomeFailedError,
+    WorkerError,
+)
 
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
@@ -48,8 +54,12 @@ class Tried(Generic[_Item, _Result]):
 def check_failures(results: Iterable[tuple[str, object]], where: str) -> None:
     """Raise SomeFailedError if there is a Failure among named results; the message lists them all."""
     everything = list(results)
-    failed = [f"  {name}: {result.message}" for name, result in everything if isinstance(result, Failure)]
+    failed = [
+        f"  {name}: {result.message}" for name, result in everything if isinstance(result, Failure)
+    ]
     if failed:
         lines = [f"{where}: {len(failed)} of {len(everything)} failed:", *failed]
-        lines.append("The others are done; mend these, and run the same again: it does what is left.")
+        lines.append(
+            "The others are done; mend these, and run the same again: it does what is left."
+        )
         raise SomeFailedError("\n".join(lines))

@@ -108,7 +108,10 @@ class Store:
 
     @contextmanager
     def shared(
-        self, begin: Callable[[], object] = lambda: None, *, tidy: Callable[[], object] = lambda: None
+        self,
+        begin: Callable[[], object] = lambda: None,
+        *,
+        tidy: Callable[[], object] = lambda: None,
     ) -> Iterator[_Turn]:
         """Take part in the work on the items, together with others, while the block runs.
 
@@ -140,7 +143,9 @@ class Store:
             finally:
                 turn.end()
 
-    def run(self, work: Callable[[_Item], _Result], items: Mapping[str, _Item], **how: Any) -> dict[str, _Result]:
+    def run(
+        self, work: Callable[[_Item], _Result], items: Mapping[str, _Item], **how: Any
+    ) -> dict[str, _Result]:
         """Apply `work` to every item that no other process has at hand; then to those, once they have been let go.
 
         Args:
@@ -166,7 +171,9 @@ class Store:
             results |= {name: result for (name, _), result in zip(left, done, strict=True)}
             left = [each for each in left if isinstance(results[each[0]], _AtHand)]
         check_failures(results.items(), str(self.out))
-        return {name: each for name, each in results.items() if not isinstance(each, Failure | _AtHand)}
+        return {
+            name: each for name, each in results.items() if not isinstance(each, Failure | _AtHand)
+        }
 
     def take(self, file: int, kind: int, *, wait: bool = False) -> bool:
         """Take the lock of an open file; false if another process holds it and this one does not wait.
@@ -184,7 +191,9 @@ class Store:
             fault = _fault_of_lock(file, kind, _WAIT_HOURS * 3600)
             if isinstance(fault, TimeoutError):
                 remedy = f"end it, or if there is none any more, remove {self.folder}"
-                raise self.error(f"{self.out}: another process has held a lock for {_WAIT_HOURS} hours; {remedy}")
+                raise self.error(
+                    f"{self.out}: another process has held a lock for {_WAIT_HOURS} hours; {remedy}"
+                )
         if fault is None or isinstance(fault, BlockingIOError):
             return fault is None
         _without_locks.add(device)
@@ -196,7 +205,9 @@ class Store:
 
     def say_waiting(self) -> None:
         """Say once that this process waits for another one, and for how long at most."""
-        warn_once(f"{self.out}: another process {self.task} there; waiting for it, for at most {_WAIT_HOURS} hours")
+        warn_once(
+            f"{self.out}: another process {self.task} there; waiting for it, for at most {_WAIT_HOURS} hours"
+        )
 
     def lock_path(self, name: str) -> Path:
         """The lock of an item; raises OutputFolderError if a link leads there."""
@@ -218,7 +229,9 @@ class _Turn:
         command, others = self._store.command.encode(), False
         while True:
             self.end()
-            self._lock, self._making = (_opened(place_in(self._store.folder, name, opened=True)) for name in _LOCKS)
+            self._lock, self._making = (
+                _opened(place_in(self._store.folder, name, opened=True)) for name in _LOCKS
+            )
             take = self._store.take
             if take(self._lock, fcntl.LOCK_EX, wait=others) and self._is_there():
                 begin()
@@ -240,7 +253,9 @@ class _Turn:
 
         if self._making < 0:  # it could not join
             return False
-        self._store.take(self._making, fcntl.LOCK_UN)  # NFS: two that hold it together would wait for each other
+        self._store.take(
+            self._making, fcntl.LOCK_UN
+        )  # NFS: two that hold it together would wait for each other
         return self._store.take(self._making, fcntl.LOCK_EX, wait=wait) and self._is_there()
 
     def tidy(self) -> None:
@@ -266,7 +281,10 @@ class _Turn:
         """Whether the locks that are open are those that others find by their names."""
         opened = zip(_LOCKS, (self._lock, self._making), strict=True)
         try:
-            return all(os.path.samestat((self._store.folder / name).lstat(), os.fstat(file)) for name, file in opened)
+            return all(
+                os.path.samestat((self._store.folder / name).lstat(), os.fstat(file))
+                for name, file in opened
+            )
         except OSError:
             return False
 
@@ -290,7 +308,11 @@ class _Alone(Generic[_Item, _Result]):
         name, item = named
         file = _opened(self.store.lock_path(name))
         try:
-            return self.work(item) if self.store.take(file, fcntl.LOCK_EX, wait=self.wait) else _AtHand()
+            return (
+                self.work(item)
+                if self.store.take(file, fcntl.LOCK_EX, wait=self.wait)
+                else _AtHand()
+            )
         finally:
             os.close(file)
 
@@ -333,4 +355,6 @@ def _fault_of_lock(file: int, kind: int, seconds: float) -> OSError | None:
 
 
 def _seal(key: str, content: bytes) -> bytes:
-    return hashlib.blake2b(content, digest_size=_SEAL, key=hashlib.blake2b(key.encode()).digest()).digest()
+    return hashlib.blake2b(
+        content, digest_size=_SEAL, key=hashlib.blake2b(key.encode()).digest()
+    ).digest()

@@ -9,7 +9,12 @@ from deepaccident_devkit.release import ScenarioFolder, find_release
 from deepaccident_devkit.support.text import choice
 from deepaccident_devkit.taxonomy import VEHICLE_AGENTS
 from deepaccident_devkit.testing.breakages import files, folders
-from deepaccident_devkit.testing.breakages.breakage import Breakage, BrokenRelease, ScenarioEditor, Victim
+from deepaccident_devkit.testing.breakages.breakage import (
+    Breakage,
+    BrokenRelease,
+    ScenarioEditor,
+    Victim,
+)
 from deepaccident_devkit.testing.releases import SmallRelease, write_small_release
 
 _GROUPS = (
@@ -27,7 +32,9 @@ _GROUPS = (
     folders.SPLIT_FILE,
     folders.LEGAL,
 )
-BREAKAGES: Mapping[str, Breakage] = {breakage.name: breakage for group in _GROUPS for breakage in group.breakages}
+BREAKAGES: Mapping[str, Breakage] = {
+    breakage.name: breakage for group in _GROUPS for breakage in group.breakages
+}
 """Name → breakage."""
 
 
@@ -46,7 +53,12 @@ def break_release(root: Path, name: str) -> BrokenRelease:
     editor = _Watched(root, _first_labelled(root))
     agent = next((agent for agent in editor.agents if agent in VEHICLE_AGENTS), editor.agents[0])
     frame = editor.frames[len(editor.frames) // 2]
-    victim = Victim(editor=editor, agent=agent, frame=frame, marker=root.with_name(f"{root.name} - code has run"))
+    victim = Victim(
+        editor=editor,
+        agent=agent,
+        frame=frame,
+        marker=root.with_name(f"{root.name} - code has run"),
+    )
     try:
         path = breakage.apply(victim)
     except (FileNotFoundError, LookupError, ValueError) as error:
@@ -113,10 +125,21 @@ def _digest(path: Path) -> bytes | None:
 
 
 def _first_labelled(root: Path) -> ScenarioFolder:
-    labelled = [one for one in find_release(root).scenarios if one.kind_folder(one.agents[0], "label").is_dir()]
+    labelled = [
+        one
+        for one in find_release(root).scenarios
+        if one.kind_folder(one.agents[0], "label").is_dir()
+    ]
     if not labelled:
         raise ConfigError(f"{root}: has no labelled scenario to break; give another release")
     return labelled[0]
 
 
-__all__ = ["BREAKAGES", "Breakage", "BrokenRelease", "break_release", "broken_release", "checked_breakage"]
+__all__ = [
+    "BREAKAGES",
+    "Breakage",
+    "BrokenRelease",
+    "break_release",
+    "broken_release",
+    "checked_breakage",
+]

@@ -143,14 +143,25 @@ class ScenarioEditor:
 
     def rows(self, agent: str, frame: int) -> LabelRows:
         """The words of a label file's lines."""
-        return [line.split() for line in self.file(agent, "label", frame).read_text("ascii").splitlines()]
+        return [
+            line.split()
+            for line in self.file(agent, "label", frame).read_text("ascii").splitlines()
+        ]
 
     def write_rows(self, agent: str, frame: int, rows: LabelRows) -> Path:
         """Replace a label."""
-        return self.write(self.file(agent, "label", frame), "\n".join(" ".join(row) for row in rows).encode("ascii"))
+        return self.write(
+            self.file(agent, "label", frame),
+            "\n".join(" ".join(row) for row in rows).encode("ascii"),
+        )
 
     def edit_rows(
-        self, agent: str, frames: Sequence[int], edit: Callable[[list[str]], None], *, actor: int | None = None
+        self,
+        agent: str,
+        frames: Sequence[int],
+        edit: Callable[[list[str]], None],
+        *,
+        actor: int | None = None,
     ) -> Path:
         """Apply `edit` to the words of each box line of the frames; with `actor`, only to lines with this id."""
         for frame in frames:
@@ -172,7 +183,9 @@ class ScenarioEditor:
         write_raw_calib(path, calib)
         return path
 
-    def edit_calib(self, agent: str, frames: Sequence[int], key: str, edit: Callable[[AnyArray], AnyArray]) -> Path:
+    def edit_calib(
+        self, agent: str, frames: Sequence[int], key: str, edit: Callable[[AnyArray], AnyArray]
+    ) -> Path:
         """Replace one array in the calib files of the frames."""
         for frame in frames:
             calib = self.calib(agent, frame)
@@ -183,7 +196,9 @@ class ScenarioEditor:
         """The array of an npz file, unchanged."""
         return read_npz(self.file(agent, channel, frame), "lidar")
 
-    def write_array(self, agent: str, channel: str, frame: int, array: Any, *, key: str = KEY) -> Path:
+    def write_array(
+        self, agent: str, channel: str, frame: int, array: Any, *, key: str = KEY
+    ) -> Path:
         """Replace an npz file by one with any array, of objects too, under any key."""
         content = io.BytesIO()
         np.savez_compressed(content, **{key: array})
@@ -217,7 +232,9 @@ class Victim:
     @property
     def other(self) -> AgentName:
         """Another vehicle. Raises LookupError if there is none."""
-        others = [agent for agent in self.editor.agents if agent not in (self.agent, INFRASTRUCTURE)]
+        others = [
+            agent for agent in self.editor.agents if agent not in (self.agent, INFRASTRUCTURE)
+        ]
         if not others:
             raise LookupError("a second vehicle that records")
         return others[0]
@@ -231,7 +248,9 @@ class Victim:
         path = self.file(kind)
         return self.editor.write(path, change(path.read_bytes()))
 
-    def replace_array(self, channel: str, change: Callable[[AnyArray], AnyArray], *, key: str = KEY) -> Path:
+    def replace_array(
+        self, channel: str, change: Callable[[AnyArray], AnyArray], *, key: str = KEY
+    ) -> Path:
         """Change the array of the victim's npz file; returns the file."""
         array = change(self.editor.array(self.agent, channel, self.frame))
         return self.editor.write_array(self.agent, channel, self.frame, array, key=key)

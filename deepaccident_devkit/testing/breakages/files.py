@@ -49,7 +49,9 @@ def label_cut(victim: Victim) -> Path:
 @LABEL_FORM.enter("label-unreadable")
 def label_zeros(victim: Victim) -> Path:
     """The second half of a label file is zero bytes, as after a write to a full disk."""
-    return victim.replace("label", lambda content: content[: len(content) // 2] + bytes(len(content) // 2))
+    return victim.replace(
+        "label", lambda content: content[: len(content) // 2] + bytes(len(content) // 2)
+    )
 
 
 @LABEL_FORM.enter("label-unreadable")
@@ -114,7 +116,9 @@ def label_right_handed(victim: Victim) -> Path:
 def labels_of_two_agents_swapped(victim: Victim) -> Path:
     """Two vehicles' labels are swapped at all frames."""
     for frame in victim.editor.frames:
-        victim.editor.exchange(*(victim.editor.file(agent, "label", frame) for agent in (victim.agent, victim.other)))
+        victim.editor.exchange(
+            *(victim.editor.file(agent, "label", frame) for agent in (victim.agent, victim.other))
+        )
     return victim.editor.folder(victim.agent, "label")
 
 
@@ -159,7 +163,9 @@ def calib_wrong_shape(victim: Victim) -> Path:
 @CALIB_FORM.enter("calib-unreadable")
 def calib_nan(victim: Victim) -> Path:
     """A pose contains NaN."""
-    victim.editor.edit_calib(victim.agent, [victim.frame], "ego_to_world", lambda pose: pose * np.nan)
+    victim.editor.edit_calib(
+        victim.agent, [victim.frame], "ego_to_world", lambda pose: pose * np.nan
+    )
     return victim.file("calib")
 
 
@@ -167,7 +173,9 @@ def calib_nan(victim: Victim) -> Path:
 def calib_mirrored(victim: Victim) -> Path:
     """A pose is a reflection: its determinant is −1."""
     mirror = np.diag([1.0, -1.0, 1.0, 1.0])
-    victim.editor.edit_calib(victim.agent, [victim.frame], "ego_to_world", lambda pose: pose @ mirror)
+    victim.editor.edit_calib(
+        victim.agent, [victim.frame], "ego_to_world", lambda pose: pose @ mirror
+    )
     return victim.file("calib")
 
 
@@ -178,13 +186,19 @@ def calib_wrong_k(victim: Victim) -> Path:
     def ordinary(raw: np.ndarray) -> np.ndarray:
         return np.array([[raw[0, 1], 0, raw[0, 0]], [0, raw[0, 1], raw[1, 0]], [0, 0, 1]])
 
-    return victim.editor.edit_calib(victim.agent, victim.editor.frames, "intrinsic_Camera_Front", ordinary)
+    return victim.editor.edit_calib(
+        victim.agent, victim.editor.frames, "intrinsic_Camera_Front", ordinary
+    )
 
 
-@CALIB_MEANING.enter("headings-differ", "own-box-apart", "positions-differ", "speed-off", "velocity-off")
+@CALIB_MEANING.enter(
+    "headings-differ", "own-box-apart", "positions-differ", "speed-off", "velocity-off"
+)
 def calib_inverse(victim: Victim) -> Path:
     """An agent's poses are inverted: `ego_from_world`."""
-    return victim.editor.edit_calib(victim.agent, victim.editor.frames, "ego_to_world", np.linalg.inv)
+    return victim.editor.edit_calib(
+        victim.agent, victim.editor.frames, "ego_to_world", np.linalg.inv
+    )
 
 
 @CALIB_MEANING.enter("camera-misplaced")
@@ -304,7 +318,9 @@ def lidar_objects(victim: Victim) -> Path:
 @SENSOR_MEANING.enter("points-differ", channel=LIDAR)
 def lidar_right_handed(victim: Victim) -> Path:
     """A point cloud has the other handedness."""
-    return victim.replace_array(LIDAR, lambda points: points * np.array([1, -1, 1, 1], dtype=np.float32))
+    return victim.replace_array(
+        LIDAR, lambda points: points * np.array([1, -1, 1, 1], dtype=np.float32)
+    )
 
 
 @SENSOR_FORM.enter("sensor-unreadable", channel=BEV_CAMERA)

@@ -16,7 +16,12 @@ from deepaccident_devkit.taxonomy import (
     SPLITS,
     UNTRACKED_ID,
 )
-from deepaccident_devkit.testing.breakages.breakage import FIELD, FILE_ENDINGS, BreakageGroup, Victim
+from deepaccident_devkit.testing.breakages.breakage import (
+    FIELD,
+    FILE_ENDINGS,
+    BreakageGroup,
+    Victim,
+)
 
 BROKEN = BreakageGroup("release", opening=BrokenReleaseError)
 ODD = BreakageGroup("release")
@@ -89,7 +94,9 @@ def agents_swapped(victim: Victim) -> Path:
     """All folders of two vehicles are swapped."""
     for kind in FILE_ENDINGS:
         for frame in victim.editor.frames:
-            files = [victim.editor.file(agent, kind, frame) for agent in (victim.agent, victim.other)]
+            files = [
+                victim.editor.file(agent, kind, frame) for agent in (victim.agent, victim.other)
+            ]
             if all(path.exists() for path in files):
                 victim.editor.exchange(*files)
     return victim.editor.folder(victim.agent, "calib").parents[1]
@@ -99,7 +106,9 @@ def agents_swapped(victim: Victim) -> Path:
 def frames_swapped(victim: Victim) -> Path:
     """Two frames' label files of an agent are swapped."""
     frames = victim.editor.frames
-    victim.editor.exchange(*(victim.editor.file(victim.agent, "label", frame) for frame in (frames[0], frames[-1])))
+    victim.editor.exchange(
+        *(victim.editor.file(victim.agent, "label", frame) for frame in (frames[0], frames[-1]))
+    )
     return victim.editor.folder(victim.agent, "label")
 
 
@@ -114,7 +123,9 @@ def split_file_garbled(victim: Victim) -> Path:
 def split_line_twice(victim: Victim) -> Path:
     """A split file lists a scenario twice."""
     files = (victim.editor.root / f"{split}.txt" for split in SPLITS)
-    path = max(files, key=lambda path: path.stat().st_size)  # files of splits that were not made are empty
+    path = max(
+        files, key=lambda path: path.stat().st_size
+    )  # files of splits that were not made are empty
     return victim.editor.write(path, path.read_bytes() * 2)
 
 

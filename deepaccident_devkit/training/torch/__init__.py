@@ -26,7 +26,12 @@ except ModuleNotFoundError as error:
     ) from error
 
 from deepaccident_devkit.export.images import ImageConfig
-from deepaccident_devkit.training.torch.collate import collate, collate_all_egos, collate_fusion, merged_evaluator
+from deepaccident_devkit.training.torch.collate import (
+    collate,
+    collate_all_egos,
+    collate_fusion,
+    merged_evaluator,
+)
 from deepaccident_devkit.training.torch.config import RandomAugmentation, V2XConfig
 from deepaccident_devkit.training.torch.dataset import AllEgosDataset, V2XDataset
 

@@ -20,7 +20,13 @@ if TYPE_CHECKING:
     from torch import Tensor
     from torch.distributed import ProcessGroup
 
-_MATRICES: Final = ("ego_from_agent", "agent_from_past", "intrinsics", "ego_from_camera", "image_from_ego")
+_MATRICES: Final = (
+    "ego_from_agent",
+    "agent_from_past",
+    "intrinsics",
+    "ego_from_camera",
+    "image_from_ego",
+)
 # Tensors whose first axis counts agents.
 _OF_AGENTS: Final = ("agent_valid", "files_missing", "images", *_MATRICES)
 _OF_BOXES: Final = ("boxes", "velocity_known", "categories", "actor_ids")
@@ -91,17 +97,29 @@ def collate_fusion(items: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
     _check_alike(items)
     present = [item["agent_valid"][:, -1] for item in items]
-    batch = collate([{key: value for key, value in item.items() if key not in _OF_AGENTS} for item in items])
+    batch = collate(
+        [{key: value for key, value in item.items() if key not in _OF_AGENTS} for item in items]
+    )
     for key in _OF_AGENTS:
         if key in items[0]:
-            batch[key] = _joined(key, [item[key][kept] for item, kept in zip(items, present, strict=True)])
+            batch[key] = _joined(
+                key, [item[key][kept] for item, kept in zip(items, present, strict=True)]
+            )
     kept_rows = [kept.nonzero()[:, 0].tolist() for kept in present]
-    batch["agents"] = [tuple(item["agents"][row] for row in rows) for item, rows in zip(items, kept_rows, strict=True)]
+    batch["agents"] = [
+        tuple(item["agents"][row] for row in rows)
+        for item, rows in zip(items, kept_rows, strict=True)
+    ]
     if "points" in batch:
-        batch["points"] = [item["points"][row] for item, rows in zip(items, kept_rows, strict=True) for row in rows]
+        batch["points"] = [
+            item["points"][row] for item, rows in zip(items, kept_rows, strict=True) for row in rows
+        ]
     batch["record_len"] = torch.tensor([len(rows) for rows in kept_rows])
     batch["pairwise_t_matrix"] = torch.stack(
-        [_pairwise(item["ego_from_agent"][kept, -1]) for item, kept in zip(items, present, strict=True)]
+        [
+            _pairwise(item["ego_from_agent"][kept, -1])
+            for item, kept in zip(items, present, strict=True)
+        ]
     )
     return batch
 
@@ -121,12 +139,21 @@ def collate_all_egos(items: Sequence[dict[str, Any]]) -> dict[str, Any]:
     import torch
 
     _check_alike(items)
-    batch = collate([{key: value for key, value in item.items() if key not in _OF_EGOS} for item in items])
+    batch = collate(
+        [{key: value for key, value in item.items() if key not in _OF_EGOS} for item in items]
+    )
     batch["egos"] = [ego for item in items for ego in item["egos"]]
-    names = [(b, item["agents"].index(ego.rsplit("/", 2)[1])) for b, item in enumerate(items) for ego in item["egos"]]
+    names = [
+        (b, item["agents"].index(ego.rsplit("/", 2)[1]))
+        for b, item in enumerate(items)
+        for ego in item["egos"]
+    ]
     batch["ego_rows"] = torch.tensor(names, dtype=torch.int64).reshape(-1, 2)
     agents = max(len(item["agents"]) for item in items)
-    padded = [torch.nn.functional.pad(item["partners"], (0, agents - len(item["agents"]))) for item in items]
+    padded = [
+        torch.nn.functional.pad(item["partners"], (0, agents - len(item["agents"])))
+        for item in items
+    ]
     batch["partners"] = torch.cat(padded)
     targets = [target for item in items for target in item["targets"]]
     for key in targets[0]:
@@ -143,7 +170,9 @@ def _collate_by_default(items: Sequence[V2XItem], **_: object) -> dict[str, Any]
 with suppress(ImportError):  # torch's documented registry, which has no public place
     from torch.utils.data._utils.collate import default_collate_fn_map
 
-    default_collate_fn_map.update({V2XItem: _collate_by_default})  # the site's mock of torch takes no items
+    default_collate_fn_map.update(
+        {V2XItem: _collate_by_default}
+    )  # the site's mock of torch takes no items
 
 
 class _ByValue:
@@ -167,8 +196,12 @@ def _sent(value: Any) -> Any:
         return type(value)(map(_sent, value))
     if isinstance(value, dict):
         return {key: _sent(each) for key, each in value.items()}
-    if isinstance(value, torch.Tensor) and value.nbytes <= 1 << 16:  # shared memory takes 1 ms to set up
-        with suppress(TypeError, RuntimeError):  # numpy lacks its type, or it is on a GPU, or has a gradient
+    if (
+        isinstance(value, torch.Tensor) and value.nbytes <= 1 << 16
+    ):  # shared memory takes 1 ms to set up
+        with suppress(
+            TypeError, RuntimeError
+        ):  # numpy lacks its type, or it is on a GPU, or has a gradient
             return _ByValue(value.numpy())
     return value
 
@@ -196,7 +229,9 @@ def _joined(key: str, parts: Sequence[Tensor]) -> Tensor:
     sizes = sorted({tuple(part.shape[1:]) for part in parts})
     if len(sizes) > 1:
         remedy = "choose resize=" if key == "images" else "batch items of one V2XConfig at a time"
-        raise ConfigError(f"{key}: items of shapes {sizes[0]} and {sizes[-1]} make no batch; {remedy}")
+        raise ConfigError(
+            f"{key}: items of shapes {sizes[0]} and {sizes[-1]} make no batch; {remedy}"
+        )
     if len(parts) == 1:
         return parts[0]
     if len({len(part) for part in parts}) == 1:

@@ -22,7 +22,14 @@ from deepaccident_devkit.export.images import ImageConfig
 from deepaccident_devkit.geometry import BevGrid, Boxes, LidarPointCloud, conventions
 from deepaccident_devkit.motion import Augmentation, MotionLabelConfig
 from deepaccident_devkit.motion.warping import WarpMode
-from deepaccident_devkit.support.arrays import AnyArray, FloatArray, as_floats, checked, checked_number, checked_whole
+from deepaccident_devkit.support.arrays import (
+    AnyArray,
+    FloatArray,
+    as_floats,
+    checked,
+    checked_number,
+    checked_whole,
+)
 from deepaccident_devkit.support.text import settle_choices
 from deepaccident_devkit.taxonomy import OnError
 from deepaccident_devkit.v2x import Agents, Link
@@ -93,16 +100,32 @@ class V2XConfig:
             object.__setattr__(self, "labels", MotionLabelConfig.preset(self.labels))
         if self.step is None:
             labels = self.labels
-            object.__setattr__(self, "step", labels.step if isinstance(labels, MotionLabelConfig) else _DEFAULT_STEP)
+            object.__setattr__(
+                self,
+                "step",
+                labels.step if isinstance(labels, MotionLabelConfig) else _DEFAULT_STEP,
+            )
         for name, least in (("past", 1), ("step", 1), ("seed", 0)):
             object.__setattr__(self, name, _count(name, getattr(self, name), least))
-        words = {"boxes": get_args(BoxSource), "visible": get_args(Visible), "to_present": get_args(WarpMode)}
+        words = {
+            "boxes": get_args(BoxSource),
+            "visible": get_args(Visible),
+            "to_present": get_args(WarpMode),
+        }
         settle_choices(self, {name: (None, *possible) for name, possible in words.items()})
         settle_choices(self, {"on_missing": get_args(OnError)})
         if self.images_cache is not None and self.images is None:
-            raise ConfigError("images_cache: changes nothing without images=ImageConfig(…); give that too")
-        if self.images_cache is not None and self.images is not None and self.images.virtual_camera is not None:
-            raise ConfigError("images_cache: has images as their own cameras took them; leave out the virtual camera")
+            raise ConfigError(
+                "images_cache: changes nothing without images=ImageConfig(…); give that too"
+            )
+        if (
+            self.images_cache is not None
+            and self.images is not None
+            and self.images.virtual_camera is not None
+        ):
+            raise ConfigError(
+                "images_cache: has images as their own cameras took them; leave out the virtual camera"
+            )
         if isinstance(self.labels, MotionLabelConfig) and self.labels.augmentation is not None:
             raise ConfigError(
                 "labels: their augmentation is that of boxes, points and poses; give V2XConfig(augmentation=…) alone"
@@ -117,7 +140,9 @@ class V2XConfig:
         if not isinstance(self.points, bool):
             raise ConfigError(f"points: expected True or False, found {self.points!r}")
         if not (
-            self.augmentation is None or isinstance(self.augmentation, Augmentation) or callable(self.augmentation)
+            self.augmentation is None
+            or isinstance(self.augmentation, Augmentation)
+            or callable(self.augmentation)
         ):
             raise ConfigError(
                 f"augmentation: expected an Augmentation or a function that draws one, found {self.augmentation!r}"
@@ -133,7 +158,9 @@ class V2XConfig:
             return self.augmentation or Augmentation()
         drawn = self.augmentation(np.random.default_rng([self.seed, epoch, index]))
         if not isinstance(drawn, Augmentation):
-            raise ConfigError(f"augmentation: its function must return an Augmentation, and returned {drawn!r}")
+            raise ConfigError(
+                f"augmentation: its function must return an Augmentation, and returned {drawn!r}"
+            )
         return drawn
 
 
@@ -207,7 +234,9 @@ def augmented_boxes(boxes: Boxes, augmentation: Augmentation) -> FloatArray:
 
 def augmented_points(cloud: LidarPointCloud, augmentation: Augmentation) -> AnyArray:
     """A cloud of an ego frame in the augmented one, (N, 4) float32: x y z in metres, and the unchanged intensity."""
-    return np.column_stack([transformed(augmentation.matrix, cloud.xyz), cloud.intensity]).astype(np.float32)
+    return np.column_stack([transformed(augmentation.matrix, cloud.xyz), cloud.intensity]).astype(
+        np.float32
+    )
 
 
 def augmented_pose(pose: ArrayLike, augmentation: Augmentation) -> FloatArray:
@@ -218,7 +247,9 @@ def augmented_pose(pose: ArrayLike, augmentation: Augmentation) -> FloatArray:
 
 def augmented_six_vectors(six: ArrayLike, augmentation: Augmentation) -> FloatArray:
     """The same for 6-vectors (…, 6): translations are scaled; rotations stay rotations, even with a flip."""
-    return conventions.six_vectors_of(augmented_pose(conventions.matrices_of_six(six), augmentation))
+    return conventions.six_vectors_of(
+        augmented_pose(conventions.matrices_of_six(six), augmentation)
+    )
 
 
 def transformed(matrix: FloatArray, points: FloatArray) -> FloatArray:

@@ -24,7 +24,11 @@ from deepaccident_devkit.taxonomy import IGNORED_ID, AgentName
 from deepaccident_devkit.training.image_cache import ImageCache
 from deepaccident_devkit.training.torch import sensor_data
 from deepaccident_devkit.training.torch.collate import V2XItem
-from deepaccident_devkit.training.torch.config import V2XConfig, augmented_boxes, augmented_six_vectors
+from deepaccident_devkit.training.torch.config import (
+    V2XConfig,
+    augmented_boxes,
+    augmented_six_vectors,
+)
 from deepaccident_devkit.v2x import cooperative_boxes
 
 if TYPE_CHECKING:
@@ -94,7 +98,9 @@ class V2XDataset(TorchDataset):
     # Whether an item cannot be made without the files of the sample's own agent.
     _needs_own: ClassVar[bool] = True
 
-    def __init__(self, dataset: Dataset, tokens: Iterable[RowArgument], config: V2XConfig | None = None) -> None:
+    def __init__(
+        self, dataset: Dataset, tokens: Iterable[RowArgument], config: V2XConfig | None = None
+    ) -> None:
         """Choose samples, such as those of `motion.training_samples`, and the contents of their items.
 
         Args:
@@ -113,7 +119,9 @@ class V2XDataset(TorchDataset):
         import torch
 
         if config is not None and not isinstance(config, V2XConfig):
-            raise ConfigError(f"config: expected a V2XConfig, such as V2XConfig(agents='all'), found {config!r}")
+            raise ConfigError(
+                f"config: expected a V2XConfig, such as V2XConfig(agents='all'), found {config!r}"
+            )
         self.config = V2XConfig() if config is None else config
         self._dataset = dataset
         self._rows = np.array(_sample_rows(dataset, tokens), dtype=np.int64)
@@ -131,7 +139,10 @@ class V2XDataset(TorchDataset):
     def __repr__(self) -> str:
         """The number of samples, who cooperates, and what an item has."""
         config = self.config
-        wanted = {name: getattr(config, name) for name in ("points", "images", "boxes", "labels", "bev_segmentation")}
+        wanted = {
+            name: getattr(config, name)
+            for name in ("points", "images", "boxes", "labels", "bev_segmentation")
+        }
         contents = "".join(f", {name}" for name, value in wanted.items() if value)
         return f"V2XDataset({len(self):,} sample{'s' * (len(self) != 1)}, agents {config.agents!r}{contents})"
 
@@ -159,7 +170,10 @@ class V2XDataset(TorchDataset):
         position = range(len(self))[operator.index(index)]
         sample = self._dataset.sample[int(self._rows[position])]["token"]
         augmentation = self.config.augmentation_of(int(self._epoch), position)
-        return V2XItem(self._received_item(sample, augmentation) | self._target_items([sample], augmentation)[0])
+        return V2XItem(
+            self._received_item(sample, augmentation)
+            | self._target_items([sample], augmentation)[0]
+        )
 
     def senders(self) -> list[tuple[AgentName, ...]]:
         """For each item the agents whose data of the present it has, its own first; nothing is read but what is there.
@@ -175,7 +189,13 @@ class V2XDataset(TorchDataset):
         names = sensor_data.participants(self._dataset, sample, self.config.agents)
         received = sensor_data.received(self._dataset, sample, names, self.config)
         return names, *sensor_data.with_files(
-            self._dataset, sample, names, received, self.config, self._cache, needs_own=self._needs_own
+            self._dataset,
+            sample,
+            names,
+            received,
+            self.config,
+            self._cache,
+            needs_own=self._needs_own,
         )
 
     def _received_item(self, sample: str, augmentation: Augmentation) -> dict[str, Any]:
@@ -184,13 +204,19 @@ class V2XDataset(TorchDataset):
 
         dataset, config = self._dataset, self.config
         names, arrived, lacking = self._arrived(sample)
-        world_from_ego = dataset.world_from(sample, "ego").matrix @ np.linalg.inv(augmentation.matrix)
+        world_from_ego = dataset.world_from(sample, "ego").matrix @ np.linalg.inv(
+            augmentation.matrix
+        )
         item: dict[str, Any] = {
             "token": sample,
             "agents": names,
             "agent_valid": tensor(sensor_data.valid_mask(names, arrived)),
-            "ego_from_agent": tensor(sensor_data.relative_poses(dataset, sample, names, arrived, augmentation)),
-            "agent_from_past": tensor(sensor_data.own_motions(dataset, names, arrived, augmentation)),
+            "ego_from_agent": tensor(
+                sensor_data.relative_poses(dataset, sample, names, arrived, augmentation)
+            ),
+            "agent_from_past": tensor(
+                sensor_data.own_motions(dataset, names, arrived, augmentation)
+            ),
             "world_from_ego": tensor(world_from_ego),
             "augmentation": tensor(augmentation.matrix, np.float32),
         }
@@ -200,14 +226,22 @@ class V2XDataset(TorchDataset):
             clouds = sensor_data.point_clouds(dataset, names, arrived, augmentation)
             item["points"] = [[tensor(cloud) for cloud in of_agent] for of_agent in clouds]
         if config.images is not None:
-            arrays = sensor_data.camera_arrays(dataset, names, arrived, augmentation, config.images, self._cache)
-            item |= {name: torch.from_numpy(array) for name, array in arrays.items()}  # new arrays: no copy
+            arrays = sensor_data.camera_arrays(
+                dataset, names, arrived, augmentation, config.images, self._cache
+            )
+            item |= {
+                name: torch.from_numpy(array) for name, array in arrays.items()
+            }  # new arrays: no copy
         return item
 
-    def _target_items(self, samples: Sequence[str], augmentation: Augmentation) -> list[dict[str, Any]]:
+    def _target_items(
+        self, samples: Sequence[str], augmentation: Augmentation
+    ) -> list[dict[str, Any]]:
         """The tensors to be predicted, with each sample's agent as the ego."""
         items: list[dict[str, Any]] = [{} for _ in samples]
-        for item, sample, labels in zip(items, samples, self._label_items(samples, augmentation), strict=True):
+        for item, sample, labels in zip(
+            items, samples, self._label_items(samples, augmentation), strict=True
+        ):
             if self.config.boxes is not None:
                 item.update(self._box_item(sample, augmentation))
             item.update(labels)
@@ -226,11 +260,15 @@ class V2XDataset(TorchDataset):
         return {
             "boxes": tensor(np.nan_to_num(augmented_boxes(boxes, augmentation)), np.float32),
             "velocity_known": tensor(np.isfinite(boxes.velocity).all(axis=1)),
-            "categories": tensor(np.where(boxes.actor_id < IGNORED_ID, boxes.category, -1), np.int64),
+            "categories": tensor(
+                np.where(boxes.actor_id < IGNORED_ID, boxes.category, -1), np.int64
+            ),
             "actor_ids": tensor(boxes.actor_id),
         }
 
-    def _label_items(self, samples: Sequence[str], augmentation: Augmentation) -> Iterator[dict[str, Tensor]]:
+    def _label_items(
+        self, samples: Sequence[str], augmentation: Augmentation
+    ) -> Iterator[dict[str, Tensor]]:
         config = self.config.labels
         if not isinstance(config, MotionLabelConfig):
             yield from ({} for _ in samples)
@@ -247,7 +285,9 @@ class V2XDataset(TorchDataset):
                 "centerness": tensor(shown.centerness),
                 "offset": tensor(shown.offset),
                 "flow": tensor(shown.flow),
-                "future_egomotion": tensor(augmented_six_vectors(shown.future_egomotion, augmentation), np.float32),
+                "future_egomotion": tensor(
+                    augmented_six_vectors(shown.future_egomotion, augmentation), np.float32
+                ),
                 "label_valid": tensor(shown.label_valid),
             }
 
@@ -257,9 +297,13 @@ class V2XDataset(TorchDataset):
             return None
         cache = ImageCache(self.config.images_cache)
         cache.check(self.config.images)
-        _, first = np.unique(self._dataset.columns("sample")["agent_row"][self._rows], return_index=True)
+        _, first = np.unique(
+            self._dataset.columns("sample")["agent_row"][self._rows], return_index=True
+        )
         asked: dict[str, None] = {}
-        for row in self._rows[first].tolist():  # one sample of each agent: its partners are always the same
+        for row in self._rows[
+            first
+        ].tolist():  # one sample of each agent: its partners are always the same
             sample = self._dataset.sample[row]["token"]
             scenario = sample.rsplit("/", 2)[0]
             names = sensor_data.participants(self._dataset, sample, self.config.agents)
@@ -291,7 +335,10 @@ class V2XDataset(TorchDataset):
         first = scenarios["first_frame_row"][samples["scenario_row"][self._rows]]
         early = self._rows[samples["frame_row"][self._rows] - first < frames]
         tokens = [self._dataset.sample[row]["token"] for row in early.tolist()]
-        alone = [len(sensor_data.participants(self._dataset, token, self.config.agents)) == 1 for token in tokens]
+        alone = [
+            len(sensor_data.participants(self._dataset, token, self.config.agents)) == 1
+            for token in tokens
+        ]
         refused = [token for token, without in zip(tokens, alone, strict=True) if not without]
         if refused:
             raise ConfigError(
@@ -304,7 +351,9 @@ class V2XDataset(TorchDataset):
 def _sample_rows(dataset: Dataset, tokens: Iterable[RowArgument]) -> list[int]:
     """Return the rows of samples; raises ConfigError and TokenError."""
     if not isinstance(dataset, Dataset):
-        raise ConfigError(f"dataset: expected an open release, DeepAccident(dataroot=…), found {dataset!r}")
+        raise ConfigError(
+            f"dataset: expected an open release, DeepAccident(dataroot=…), found {dataset!r}"
+        )
     if isinstance(tokens, str | Mapping):
         raise ConfigError(
             "tokens: expected a list of samples, such as da.training_samples('train') or [sample], found "
@@ -339,7 +388,9 @@ class AllEgosDataset(V2XDataset):
 
     _needs_own = False
 
-    def __init__(self, dataset: Dataset, tokens: Iterable[RowArgument], config: V2XConfig | None = None) -> None:
+    def __init__(
+        self, dataset: Dataset, tokens: Iterable[RowArgument], config: V2XConfig | None = None
+    ) -> None:
         """Choose the egos' samples, in any order; those of one moment become one item.
 
         Args:
@@ -353,7 +404,9 @@ class AllEgosDataset(V2XDataset):
         """
         config = V2XConfig() if config is None else config
         if config.link is not None:
-            raise ConfigError("link: each ego receives its own messages; use V2XDataset for data that came over a link")
+            raise ConfigError(
+                "link: each ego receives its own messages; use V2XDataset for data that came over a link"
+            )
         moments: dict[tuple[str, str], list[str]] = {}
         for row in _sample_rows(dataset, tokens):
             sample = dataset.sample[row]["token"]
@@ -362,7 +415,9 @@ class AllEgosDataset(V2XDataset):
         self.egos = list(moments.values())
         self._agents = config.agents
         super().__init__(dataset, [egos[0] for egos in self.egos], replace(config, agents=None))
-        for ego in (ego for egos in self.egos[:1] for ego in egos):  # a mistake is the same for all moments
+        for ego in (
+            ego for egos in self.egos[:1] for ego in egos
+        ):  # a mistake is the same for all moments
             sensor_data.participants(dataset, ego, config.agents)
 
     def __getitem__(self, index: int) -> V2XItem:
@@ -374,7 +429,11 @@ class AllEgosDataset(V2XDataset):
         position = range(len(self))[operator.index(index)]
         augmentation = self.config.augmentation_of(epoch, position)
         item = self._received_item(self.egos[position][0], augmentation)
-        there = [name for name, valid in zip(item["agents"], item["agent_valid"][:, -1], strict=True) if valid]
+        there = [
+            name
+            for name, valid in zip(item["agents"], item["agent_valid"][:, -1], strict=True)
+            if valid
+        ]
         egos = [ego for ego in self.egos[position] if ego.rsplit("/", 2)[1] in there]
         if not egos:
             raise MissingFileError(
@@ -383,6 +442,8 @@ class AllEgosDataset(V2XDataset):
             )
         heard = [sensor_data.participants(self._dataset, ego, self._agents) for ego in egos]
         item["egos"] = tuple(egos)
-        item["partners"] = tensor(np.array([[name in names for name in item["agents"]] for names in heard]))
+        item["partners"] = tensor(
+            np.array([[name in names for name in item["agents"]] for names in heard])
+        )
         item["targets"] = self._target_items(egos, augmentation)
         return V2XItem(item)

@@ -13,7 +13,14 @@ from deepaccident_devkit.errors import ConfigError, MissingFileError
 from deepaccident_devkit.export.images import ImageConfig
 from deepaccident_devkit.motion import Augmentation
 from deepaccident_devkit.release.layout import MissingFiles
-from deepaccident_devkit.support.arrays import AnyArray, BoolArray, ByteArray, FloatArray, IntArray, keep_freed
+from deepaccident_devkit.support.arrays import (
+    AnyArray,
+    BoolArray,
+    ByteArray,
+    FloatArray,
+    IntArray,
+    keep_freed,
+)
 from deepaccident_devkit.support.parallel.executors import own_threads
 from deepaccident_devkit.tables.tokens import sample_token
 from deepaccident_devkit.taxonomy import LIDAR, AgentName
@@ -35,7 +42,9 @@ def participants(dataset: Dataset, sample: str, agents: Agents) -> tuple[AgentNa
     return tuple(dict.fromkeys([*own, *cooperating_agents(dataset, sample, agents)]))
 
 
-def received(dataset: Dataset, sample: str, names: tuple[AgentName, ...], config: V2XConfig) -> Received:
+def received(
+    dataset: Dataset, sample: str, names: tuple[AgentName, ...], config: V2XConfig
+) -> Received:
     """The messages that arrive at a sample and at the `config.past` − 1 moments before it, each through the link.
 
     A moment before the recording has no messages. If latency asks for data from before the recording, the moment has no
@@ -50,7 +59,9 @@ def received(dataset: Dataset, sample: str, names: tuple[AgentName, ...], config
             continue
         heard = names if not steps_back or _reaches(config.link, index) else names[:1]
         then = sample_token(scenario, ego, index)
-        result.append({message.agent: message for message in messages(dataset, then, heard, config.link)})
+        result.append(
+            {message.agent: message for message in messages(dataset, then, heard, config.link)}
+        )
     return result
 
 
@@ -78,18 +89,26 @@ def with_files(
     """
     channels = (*[LIDAR] * config.points, *(() if config.images is None else config.images.cameras))
     skippable = MissingFiles(dataset.dataroot, config.on_missing)
-    necessary = MissingFiles(dataset.dataroot, "skip")  # their error has another remedy than skipping
+    necessary = MissingFiles(
+        dataset.dataroot, "skip"
+    )  # their error has another remedy than skipping
 
     def lacks(token: str, channel: str, *, own: bool) -> bool:
         if cache is not None and channel != LIDAR:
-            return (own or config.on_missing == "skip") and not cache.has(token)  # else the error comes from loading it
+            return (own or config.on_missing == "skip") and not cache.has(
+                token
+            )  # else the error comes from loading it
         return not (necessary if own else skippable).has(dataset.sensor_path(token), channel)
 
     lacking = np.zeros((len(names), len(arrived)), dtype=np.int64)
     for p in reversed(range(len(arrived))):  # the present first, whose lack cannot be helped
         for name, message in arrived[p].items():
             own = needs_own and message.sample == sample
-            absent = [channel for channel in channels if lacks(f"{message.sample}/{channel}", channel, own=own)]
+            absent = [
+                channel
+                for channel in channels
+                if lacks(f"{message.sample}/{channel}", channel, own=own)
+            ]
             if own and absent:
                 where = "" if cache is None or absent[0] == LIDAR else " in the cache of images"
                 raise MissingFileError(
@@ -112,7 +131,11 @@ def valid_mask(names: Sequence[AgentName], arrived: Received) -> BoolArray:
 
 
 def relative_poses(
-    dataset: Dataset, sample: str, names: Sequence[AgentName], arrived: Received, augmentation: Augmentation
+    dataset: Dataset,
+    sample: str,
+    names: Sequence[AgentName],
+    arrived: Received,
+    augmentation: Augmentation,
 ) -> AnyArray:
     """`ego_from_agent` (A, P, 4, 4) float32: augmented, with the link's errors; the identity without a message."""
     ego_from_world = dataset.world_from(sample, "ego").inverse()
@@ -149,7 +172,10 @@ def point_clouds(
     def cloud(message: Message) -> AnyArray:
         return augmented_points(dataset.load_point_cloud(message.sample, "ego"), augmentation)
 
-    return [[cloud(moment[name]) if name in moment else _NO_POINTS for moment in arrived] for name in names]
+    return [
+        [cloud(moment[name]) if name in moment else _NO_POINTS for moment in arrived]
+        for name in names
+    ]
 
 
 def camera_arrays(
@@ -172,8 +198,13 @@ def camera_arrays(
     mapped = map if cache is not None or get_worker_info() is not None else _by_threads
     shape = (len(names), len(arrived), len(config.cameras))
     keep_freed()
-    images: ByteArray = np.zeros((*shape, 3, 0, 0), dtype=np.uint8)  # until the first one tells the size
-    result = {key: np.tile(np.eye(size, dtype=np.float32), (*shape, 1, 1)) for key, size in _MATRICES.items()}
+    images: ByteArray = np.zeros(
+        (*shape, 3, 0, 0), dtype=np.uint8
+    )  # until the first one tells the size
+    result = {
+        key: np.tile(np.eye(size, dtype=np.float32), (*shape, 1, 1))
+        for key, size in _MATRICES.items()
+    }
     for p, moment in enumerate(arrived):
         for name, message in moment.items():
             a, intrinsics = names.index(name), []
@@ -188,7 +219,9 @@ def camera_arrays(
                     )
                 images[a, p, c] = pixels.transpose(2, 0, 1)
                 intrinsics.append(intrinsic)
-            matrices = _matrices(dataset, message.sample, augmentation, config, np.stack(intrinsics))
+            matrices = _matrices(
+                dataset, message.sample, augmentation, config, np.stack(intrinsics)
+            )
             for key, each in matrices.items():
                 result[key][a, p] = each
     return {"images": config.values(images, valid_mask(names, arrived)), **result}
@@ -201,11 +234,17 @@ def _by_threads(function: Callable[[str], Any], values: Iterable[str]) -> list[A
 
 
 def _matrices(
-    dataset: Dataset, sample: str, augmentation: Augmentation, config: ImageConfig, intrinsics: FloatArray
+    dataset: Dataset,
+    sample: str,
+    augmentation: Augmentation,
+    config: ImageConfig,
+    intrinsics: FloatArray,
 ) -> dict[str, AnyArray]:
     """One agent's cameras at one moment: the matrices of `camera_arrays` without the first two axes."""
     ego_from_world = dataset.world_from(sample, "ego").inverse()
-    poses = [(ego_from_world @ dataset.world_from(sample, channel)).matrix for channel in config.cameras]
+    poses = [
+        (ego_from_world @ dataset.world_from(sample, channel)).matrix for channel in config.cameras
+    ]
     ego_from_camera: FloatArray = augmentation.matrix @ np.stack(poses)
     projection = np.tile(np.eye(4), (len(poses), 1, 1))
     projection[:, :3, :3] = intrinsics

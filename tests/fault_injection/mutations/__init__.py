@@ -31,7 +31,9 @@ _GROUPS = (
     sensors.BEVS,
     release.GROUP,
 )
-MUTATIONS: Mapping[str, Mutation] = {mutation.name: mutation for group in _GROUPS for mutation in group.mutations}
+MUTATIONS: Mapping[str, Mutation] = {
+    mutation.name: mutation for group in _GROUPS for mutation in group.mutations
+}
 """Name → mutation, in the table's order."""
 HARMLESS: Mapping[str, str] = {
     name: mutation.harmless for name, mutation in MUTATIONS.items() if mutation.harmless is not None

@@ -12,7 +12,13 @@ from fault_injection.place import Place
 
 GROUP = Group("calib, form")
 POSES = Group("calib, poses")
-KEYS = ("lidar_to_ego", "ego_to_world", "lidar_to_Camera_Front", "intrinsic_Camera_Back", "lidar_to_Camera_BackLeft")
+KEYS = (
+    "lidar_to_ego",
+    "ego_to_world",
+    "lidar_to_Camera_Front",
+    "intrinsic_Camera_Back",
+    "lidar_to_Camera_BackLeft",
+)
 _LEFT_TO_RIGHT = np.diag([1.0, -1.0, 1.0, 1.0])
 _ON_ITS_SIDE = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 POSE = "ego_to_world"
@@ -34,7 +40,9 @@ def marker(root: Path) -> Path:
 
 
 def _bomb(place: Place) -> bytes:
-    return pickle.dumps({**dict.fromkeys(KEYS, np.eye(4)), "extra": Bomb(marker(place.root))}, protocol=3)
+    return pickle.dumps(
+        {**dict.fromkeys(KEYS, np.eye(4)), "extra": Bomb(marker(place.root))}, protocol=3
+    )
 
 
 def _of_any_key(edit: Callable[[np.ndarray, np.random.Generator], np.ndarray]) -> Apply:
@@ -47,7 +55,11 @@ def _of_any_key(edit: Callable[[np.ndarray, np.random.Generator], np.ndarray]) -
 
 def _drop_key(place: Place, rng: np.random.Generator) -> None:
     agent, frame, key = place.any_agent(rng), place.any_frame(rng), str(rng.choice(KEYS))
-    place.write_calib(agent, frame, {name: value for name, value in place.calib(agent, frame).items() if name != key})
+    place.write_calib(
+        agent,
+        frame,
+        {name: value for name, value in place.calib(agent, frame).items() if name != key},
+    )
 
 
 def _with_nan(array: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -62,7 +74,10 @@ GROUP.add(
         "calib_emptied": ("A calib file is empty.", in_file("calib", emptied)),
         "calib_garbage": ("A calib file holds random bytes.", in_file("calib", garbage)),
         "calib_key_dropped": ("A calib file lacks a key.", _drop_key),
-        "calib_wrong_shape": ("A matrix lacks its last row.", _of_any_key(lambda array, _: array[:-1])),
+        "calib_wrong_shape": (
+            "A matrix lacks its last row.",
+            _of_any_key(lambda array, _: array[:-1]),
+        ),
         "calib_nan": ("A matrix contains NaN.", _of_any_key(_with_nan)),
         "calib_malicious": (
             "A calib file is a pickle that runs a command.",
@@ -115,7 +130,10 @@ POSES.add(
             "A pose's rotation is a reflection (determinant −1) at one frame.",
             in_calib(POSE, _reflected, always=False),
         ),
-        "poses_mirrored": ("All poses of an agent are reflections.", in_calib(POSE, _reflected, always=True)),
+        "poses_mirrored": (
+            "All poses of an agent are reflections.",
+            in_calib(POSE, _reflected, always=True),
+        ),
         "poses_right_handed": (
             "All poses of an agent have the other sign of y and yaw, properly right-handed.",
             in_calib(POSE, _right_handed, always=True),
@@ -124,7 +142,10 @@ POSES.add(
             "All poses of all agents are right-handed, but the labels are not.",
             lambda place, _: _of_all(place, _right_handed),
         ),
-        "pose_inverted": ("An agent's ego_to_world is its inverse.", in_calib(POSE, np.linalg.inv, always=True)),
+        "pose_inverted": (
+            "An agent's ego_to_world is its inverse.",
+            in_calib(POSE, np.linalg.inv, always=True),
+        ),
         "pose_transposed": (
             "A pose is written for row vectors (transposed) at one frame.",
             in_calib(POSE, np.transpose, always=False),
@@ -145,7 +166,10 @@ POSES.add(
             "All poses of an agent are 1 m too far to one side.",
             in_calib(POSE, drawn=_moved, always=True),
         ),
-        "poses_turned": ("All poses of an agent are turned by 3°.", in_calib(POSE, drawn=_turned, always=True)),
+        "poses_turned": (
+            "All poses of an agent are turned by 3°.",
+            in_calib(POSE, drawn=_turned, always=True),
+        ),
     },
 )
 POSES.add(
@@ -177,7 +201,9 @@ POSES.add(
         ),
         "calibs_of_two_agents_exchanged": (
             "Two agents' calib files are exchanged at one frame.",
-            lambda place, rng: place.exchange_agents(place.two_agents(rng), "calib", [place.any_frame(rng)]),
+            lambda place, rng: place.exchange_agents(
+                place.two_agents(rng), "calib", [place.any_frame(rng)]
+            ),
         ),
     },
 )

@@ -84,7 +84,9 @@ GROUP.add(
 def _of_larger_images(place: Place, rng: np.random.Generator) -> None:
     agent = place.any_agent(rng)
     for camera in CAMERAS:
-        place.edit_calib(agent, place.frames, f"intrinsic_{camera}", lambda intrinsic: intrinsic * _LARGER)
+        place.edit_calib(
+            agent, place.frames, f"intrinsic_{camera}", lambda intrinsic: intrinsic * _LARGER
+        )
 
 
 GROUP.add(

@@ -33,13 +33,23 @@ def _repeat_last(place: Place, agents: Sequence[str], *kinds: str, later: int = 
     last = place.frames[-1]
     for agent in agents:
         for kind in kinds:
-            place.write(place.file(agent, kind, last + later), place.file(agent, kind, last).read_bytes())
+            place.write(
+                place.file(agent, kind, last + later), place.file(agent, kind, last).read_bytes()
+            )
 
 
-def _under_another_name(place: Place, rng: np.random.Generator, old: str, new: str, *, copied: bool) -> None:
-    agent, kind, frame = place.any_agent(rng), str(rng.choice(list(FILE_ENDINGS))), place.any_frame(rng)
+def _under_another_name(
+    place: Place, rng: np.random.Generator, old: str, new: str, *, copied: bool
+) -> None:
+    agent, kind, frame = (
+        place.any_agent(rng),
+        str(rng.choice(list(FILE_ENDINGS))),
+        place.any_frame(rng),
+    )
     path = place.file(agent, kind, frame)
-    place.write(path.with_name(path.name.replace(old.format(frame), new.format(frame))), path.read_bytes())
+    place.write(
+        path.with_name(path.name.replace(old.format(frame), new.format(frame))), path.read_bytes()
+    )
     if not copied:
         place.remove(path)
 
@@ -66,14 +76,22 @@ GROUP.add(
         ),
         "middle_frame_of_agent_removed": (
             "A frame in the middle of the scenario is missing in one agent.",
-            lambda place, rng: _remove_frame(place, [place.any_agent(rng)], place.middle_frame(rng)),
+            lambda place, rng: _remove_frame(
+                place, [place.any_agent(rng)], place.middle_frame(rng)
+            ),
         ),
         "last_frame_of_agent_removed": (
             "The last frame of one agent is missing.",
             lambda place, rng: _remove_frame(place, [place.any_agent(rng)], place.frames[-1]),
         ),
-        "label_removed": ("A label file is missing.", lambda place, rng: _remove_file(place, rng, "label")),
-        "calib_removed": ("A calib file is missing.", lambda place, rng: _remove_file(place, rng, "calib")),
+        "label_removed": (
+            "A label file is missing.",
+            lambda place, rng: _remove_file(place, rng, "label"),
+        ),
+        "calib_removed": (
+            "A calib file is missing.",
+            lambda place, rng: _remove_file(place, rng, "calib"),
+        ),
         "sensor_file_removed": (
             "A file of one sensor is missing.",
             lambda place, rng: _remove_file(place, rng, *CHANNELS),
@@ -86,7 +104,10 @@ GROUP.add(
             "One agent has labels and sensors, but no calib files.",
             lambda place, rng: place.remove_folder(place.folder(place.any_agent(rng), "calib")),
         ),
-        "file_for_folder": ("A file is where an agent's folder of labels must be.", _file_for_folder),
+        "file_for_folder": (
+            "A file is where an agent's folder of labels must be.",
+            _file_for_folder,
+        ),
         "extra_frame": (
             "An agent has a copy of its last frame as one more frame.",
             lambda place, rng: _repeat_last(place, [place.any_agent(rng)], *FILE_ENDINGS),
@@ -105,11 +126,15 @@ GROUP.add(
         ),
         "file_renamed": (
             "A file's frame number has two digits.",
-            lambda place, rng: _under_another_name(place, rng, "_{:03d}.", "_{:02d}.", copied=False),
+            lambda place, rng: _under_another_name(
+                place, rng, "_{:03d}.", "_{:02d}.", copied=False
+            ),
         ),
         "file_of_another_scenario": (
             "A folder has a file with another scenario's name.",
-            lambda place, rng: _under_another_name(place, rng, "scenario0", "scenario9", copied=True),
+            lambda place, rng: _under_another_name(
+                place, rng, "scenario0", "scenario9", copied=True
+            ),
         ),
     },
 )

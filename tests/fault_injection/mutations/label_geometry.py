@@ -52,10 +52,14 @@ def _turn_velocity(row: list[str]) -> None:
     row[vx], row[vy] = repr(-float(row[vy])), row[vx]
 
 
-def _of_box(edit_by: Callable[[np.random.Generator], Edit], when: Frames = once, **which: Any) -> Apply:
+def _of_box(
+    edit_by: Callable[[np.random.Generator], Edit], when: Frames = once, **which: Any
+) -> Apply:
     """Edit an actor's box in one agent's label of one frame, or of others."""
     return of_actor(
-        lambda place, rng, agent, frames, actor: place.edit_rows(agent, frames, edit_by(rng), actor=actor),
+        lambda place, rng, agent, frames, actor: place.edit_rows(
+            agent, frames, edit_by(rng), actor=actor
+        ),
         when,
         **which,
     )
@@ -93,7 +97,9 @@ GROUP.add(
         ),
         "y_flipped_in_a_frame": (
             "All y of one label file have the other sign.",
-            lambda place, rng: place.edit_rows(place.any_agent(rng), [place.any_frame(rng)], _scale("y")),
+            lambda place, rng: place.edit_rows(
+                place.any_agent(rng), [place.any_frame(rng)], _scale("y")
+            ),
         ),
         "y_flipped": ("All y of an agent have the other sign.", _of_agent(_scale("y"))),
         "yaw_flipped": ("All yaws of an agent have the other sign.", _of_agent(_scale("yaw"))),
@@ -105,7 +111,10 @@ GROUP.add(
             "All agents' labels are right-handed, but the poses are not.",
             _of_all(_scale("y", "yaw", "vy")),
         ),
-        "yaw_in_degrees": ("An agent's yaws are degrees.", _of_agent(_scale("yaw", by=180 / np.pi))),
+        "yaw_in_degrees": (
+            "An agent's yaws are degrees.",
+            _of_agent(_scale("yaw", by=180 / np.pi)),
+        ),
         "yaw_turned": (
             "A box is turned by 90° at one frame.",
             _of_box(lambda _: _add(["yaw"], [np.pi / 2])),
@@ -133,13 +142,20 @@ GROUP.add(
     },
 )
 GROUP.add(
-    {"all_sizes_halved": ("All boxes of all agents have half their size.", _of_all(_scale("l", "w", "h", by=0.5)))},
+    {
+        "all_sizes_halved": (
+            "All boxes of all agents have half their size.",
+            _of_all(_scale("l", "w", "h", by=0.5)),
+        )
+    },
     deep=True,
 )
 
 
 def _offset(length: float) -> Apply:
-    return lambda place, rng: place.edit_rows(place.any_agent(rng), place.frames, _move(rng, length))
+    return lambda place, rng: place.edit_rows(
+        place.any_agent(rng), place.frames, _move(rng, length)
+    )
 
 
 def _lone_moved(place: Place, rng: np.random.Generator) -> None:
@@ -150,7 +166,10 @@ def _lone_moved(place: Place, rng: np.random.Generator) -> None:
 GROUP.add(
     {
         "positions_offset": ("All boxes of an agent are 0.3 m too far to one side.", _offset(0.3)),
-        "positions_offset_by_a_metre": ("All boxes of an agent are 1 m too far to one side.", _offset(1.0)),
+        "positions_offset_by_a_metre": (
+            "All boxes of an agent are 1 m too far to one side.",
+            _offset(1.0),
+        ),
         "heights_of_the_ground": (
             "z of an agent's boxes is at their bottom, not at their centre.",
             _of_agent(_to_the_ground),
@@ -176,7 +195,9 @@ GROUP.add(
 )
 
 
-def _change_speeds(place: Place, agent: str, frames: Sequence[int], way: tuple[float, float], *, own_row: bool) -> None:
+def _change_speeds(
+    place: Place, agent: str, frames: Sequence[int], way: tuple[float, float], *, own_row: bool
+) -> None:
     for frame in frames:
         rows = place.rows(agent, frame)
         rows[0] = [repr(float(word) + more) for word, more in zip(rows[0], way, strict=True)]
@@ -197,10 +218,15 @@ def _freeze(place: Place, rng: np.random.Generator) -> None:
 
 GROUP.add(
     {
-        "box_lifted": ("A box is 1.5 m too high at one frame.", _of_box(lambda _: _add("z", [1.5]))),
+        "box_lifted": (
+            "A box is 1.5 m too high at one frame.",
+            _of_box(lambda _: _add("z", [1.5])),
+        ),
         "own_row_moved": (
             "The recording agent's own box is 3 m away from its place at all frames.",
-            lambda place, rng: place.edit_rows(place.vehicle(rng), place.frames, _move(rng, 3.0), actor=OWN_ACTOR_ID),
+            lambda place, rng: place.edit_rows(
+                place.vehicle(rng), place.frames, _move(rng, 3.0), actor=OWN_ACTOR_ID
+            ),
         ),
         "speed_changed": (
             "The header's speed is wrong by 5 m/s at one frame.",
@@ -210,13 +236,18 @@ GROUP.add(
         ),
         "speeds_changed": (
             "The speed in header and own line of an agent is wrong by 5 m/s at all frames.",
-            lambda place, rng: _change_speeds(place, place.vehicle(rng), place.frames, _way(rng, 5.0), own_row=True),
+            lambda place, rng: _change_speeds(
+                place, place.vehicle(rng), place.frames, _way(rng, 5.0), own_row=True
+            ),
         ),
         "velocity_reversed": (
             "A moving actor's velocity has the other sign in one agent.",
             _of_box(lambda _: _scale("vx", "vy"), always, moving=True),
         ),
-        "velocities_in_another_frame": ("All velocities of an agent are turned by 90°.", _of_agent(_turn_velocity)),
+        "velocities_in_another_frame": (
+            "All velocities of an agent are turned by 90°.",
+            _of_agent(_turn_velocity),
+        ),
         "track_frozen": (
             "A moving actor stays where it was for two frames in one agent's labels, in the world.",
             _freeze,

@@ -18,16 +18,28 @@ def _set_id(place: Place, agent: str, frames: Sequence[int], actor: int, new: in
     place.edit_rows(agent, frames, lambda row: row.__setitem__(_ID, str(new)), actor=actor)
 
 
-def _renew_id(place: Place, _: np.random.Generator, agent: str, frames: Sequence[int], actor: int) -> None:
+def _renew_id(
+    place: Place, _: np.random.Generator, agent: str, frames: Sequence[int], actor: int
+) -> None:
     """Give an actor an id that nobody has."""
-    _set_id(place, agent, frames, actor, 1 + max(actor for seen in place.sightings.values() for actor in seen))
+    _set_id(
+        place,
+        agent,
+        frames,
+        actor,
+        1 + max(actor for seen in place.sightings.values() for actor in seen),
+    )
 
 
-def _lose_id(place: Place, _: np.random.Generator, agent: str, frames: Sequence[int], actor: int) -> None:
+def _lose_id(
+    place: Place, _: np.random.Generator, agent: str, frames: Sequence[int], actor: int
+) -> None:
     _set_id(place, agent, frames, actor, -1)
 
 
-def _remove(place: Place, _: np.random.Generator, agent: str, frames: Sequence[int], actor: int) -> None:
+def _remove(
+    place: Place, _: np.random.Generator, agent: str, frames: Sequence[int], actor: int
+) -> None:
     place.remove_row(agent, frames, actor)
 
 
@@ -124,13 +136,18 @@ def _give_odd_id(place: Place, rng: np.random.Generator) -> None:
 
 def _lose_ids(place: Place, agent: str, frames: Sequence[int]) -> None:
     own = str(OWN_ACTOR_ID)
-    place.edit_rows(agent, frames, lambda row: row.__setitem__(_ID, own if row[_ID] == own else "-1"))
+    place.edit_rows(
+        agent, frames, lambda row: row.__setitem__(_ID, own if row[_ID] == own else "-1")
+    )
 
 
 GROUP.add(
     {
         "id_twice": ("Two boxes of one label file have the same id.", _give_id_twice),
-        "id_odd": ("An actor's id is impossible in the format, in all labels of all agents.", _give_odd_id),
+        "id_odd": (
+            "An actor's id is impossible in the format, in all labels of all agents.",
+            _give_odd_id,
+        ),
     },
 )
 GROUP.add(
@@ -157,7 +174,13 @@ def _tell_own_id(place: Place, rng: np.random.Generator) -> None:
 
 def _give_the_pole_an_own_row(place: Place, rng: np.random.Generator) -> None:
     frame = place.any_frame(rng)
-    _set_id(place, "infrastructure", [frame], one_of(sorted(place.steady("infrastructure")), rng), OWN_ACTOR_ID)
+    _set_id(
+        place,
+        "infrastructure",
+        [frame],
+        one_of(sorted(place.steady("infrastructure")), rng),
+        OWN_ACTOR_ID,
+    )
 
 
 def _contradict_size(place: Place, rng: np.random.Generator) -> None:
@@ -186,7 +209,9 @@ GROUP.add(
         ),
         "own_row_removed": (
             "The recording agent's own line is missing at one frame.",
-            lambda place, rng: place.remove_row(place.vehicle(rng), [place.any_frame(rng)], OWN_ACTOR_ID),
+            lambda place, rng: place.remove_row(
+                place.vehicle(rng), [place.any_frame(rng)], OWN_ACTOR_ID
+            ),
         ),
         "own_row_removed_always": (
             "The recording agent's own line is missing at all frames.",
@@ -197,7 +222,10 @@ GROUP.add(
             "The recording agent's own line has its actor id instead of −100, at all frames.",
             _tell_own_id,
         ),
-        "own_row_on_the_pole": ("The infrastructure's label has an own line (−100).", _give_the_pole_an_own_row),
+        "own_row_on_the_pole": (
+            "The infrastructure's label has an own line (−100).",
+            _give_the_pole_an_own_row,
+        ),
         "class_exchanged": (
             "One line has another class of the same kind, such as truck for car.",
             of_actor(_set_class(lambda old: _EXCHANGED.get(old, "cyclist")), once),
@@ -222,10 +250,15 @@ GROUP.add(
             "All labels of the standing infrastructure are one frame early; the last one is there twice.",
             lambda place, _: place.one_frame_early("infrastructure", "label"),
         ),
-        "labels_of_two_frames_exchanged": ("Two frames' label files of an agent are exchanged.", _exchange_frames),
+        "labels_of_two_frames_exchanged": (
+            "Two frames' label files of an agent are exchanged.",
+            _exchange_frames,
+        ),
         "labels_of_two_agents_exchanged": (
             "Two agents' label files are exchanged at one frame.",
-            lambda place, rng: place.exchange_agents(place.two_agents(rng), "label", [place.any_frame(rng)]),
+            lambda place, rng: place.exchange_agents(
+                place.two_agents(rng), "label", [place.any_frame(rng)]
+            ),
         ),
         "labels_of_two_agents_exchanged_always": (
             "Two agents' label files are exchanged at all frames.",

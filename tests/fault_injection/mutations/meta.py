@@ -25,7 +25,13 @@ def _set_word(place: Place, number: int, word: object) -> None:
 
 
 def _set_entry(place: Place, key: str, value: object) -> None:
-    _write(place, [f" {key}: {value}" if line.split(":")[0].strip() == key else line for line in place.meta_lines()])
+    _write(
+        place,
+        [
+            f" {key}: {value}" if line.split(":")[0].strip() == key else line
+            for line in place.meta_lines()
+        ],
+    )
 
 
 def _set_ids(place: Place, ids: Sequence[int]) -> None:
@@ -38,7 +44,11 @@ def _cut(place: Place, rng: np.random.Generator) -> None:
 
 
 def _count_other_frames(place: Place, rng: np.random.Generator) -> None:
-    _set_word(place, NUMBER_OF_FRAMES, int(place.meta_lines()[0].split()[-1]) + int(rng.choice([-3, -2, -1, 1, 2, 3])))
+    _set_word(
+        place,
+        NUMBER_OF_FRAMES,
+        int(place.meta_lines()[0].split()[-1]) + int(rng.choice([-3, -2, -1, 1, 2, 3])),
+    )
 
 
 GROUP.add(
@@ -61,12 +71,18 @@ GROUP.add(
 )
 GROUP.add(
     {
-        "meta_emptied": ("The meta file is empty.", lambda place, _: place.write(place.scenario.meta_path, b"")),
+        "meta_emptied": (
+            "The meta file is empty.",
+            lambda place, _: place.write(place.scenario.meta_path, b""),
+        ),
         "meta_garbage": (
             "The meta file holds random bytes.",
             lambda place, rng: place.write(place.scenario.meta_path, garbage(bytes(200), rng)),
         ),
-        "meta_frames_changed": ("The meta file counts one to three frames more or less.", _count_other_frames),
+        "meta_frames_changed": (
+            "The meta file counts one to three frames more or less.",
+            _count_other_frames,
+        ),
     },
 )
 
@@ -91,18 +107,27 @@ def _other_pair(place: Place, rng: np.random.Generator) -> None:
 
 def _other_class(place: Place, rng: np.random.Generator) -> None:
     number = int(rng.choice(CLASSES))
-    _set_word(place, number, rng.choice(sorted({"pedestrian", "motorcycle"} - {place.meta_lines()[0].split()[number]})))
+    _set_word(
+        place,
+        number,
+        rng.choice(sorted({"pedestrian", "motorcycle"} - {place.meta_lines()[0].split()[number]})),
+    )
 
 
 def _no_collision(place: Place, rng: np.random.Generator) -> None:
     first, _, *others = place.meta_lines()
     words = first.split()
-    _write(place, [" ".join([words[0], *["-1"] * 7, words[8]]), " colliding agents: none none", *others])
+    _write(
+        place,
+        [" ".join([words[0], *["-1"] * 7, words[8]]), " colliding agents: none none", *others],
+    )
 
 
 def _other_id(place: Place, rng: np.random.Generator) -> None:
     words, agents = place.meta_lines()[0].split(), place.agent_ids()
-    _set_word(place, int(rng.choice([number for number in IDS if int(words[number]) in agents])), "19876")
+    _set_word(
+        place, int(rng.choice([number for number in IDS if int(words[number]) in agents])), "19876"
+    )
 
 
 GROUP.add(
@@ -112,8 +137,14 @@ GROUP.add(
             "A colliding actor's id is that of another actor, far from the collision.",
             _id_from_afar,
         ),
-        "meta_colliding_agents": ("The colliding agents are not those of the colliding ids.", _other_pair),
-        "meta_class_changed": ("A colliding actor has another class than in the labels.", _other_class),
+        "meta_colliding_agents": (
+            "The colliding agents are not those of the colliding ids.",
+            _other_pair,
+        ),
+        "meta_class_changed": (
+            "A colliding actor has another class than in the labels.",
+            _other_class,
+        ),
         "meta_class_unknown": (
             "A colliding actor's class does not exist.",
             lambda place, rng: _set_word(place, int(rng.choice(CLASSES)), "bus"),
@@ -177,11 +208,15 @@ GROUP.add(
         "meta_agent_id_changed": ("An agent's id is a wrong number.", _change_id),
         "meta_road_type": (
             "The road type does not exist.",
-            lambda place, rng: _set_entry(place, "road_type", rng.choice(["five-way junction", "unknown", "four-way"])),
+            lambda place, rng: _set_entry(
+                place, "road_type", rng.choice(["five-way junction", "unknown", "four-way"])
+            ),
         ),
         "meta_weather": (
             "The weather and time of day do not exist.",
-            lambda place, rng: _set_word(place, 0, rng.choice(["SnowNoon", "Rainy", "ClearMidnight", "wetnoon"])),
+            lambda place, rng: _set_word(
+                place, 0, rng.choice(["SnowNoon", "Rainy", "ClearMidnight", "wetnoon"])
+            ),
         ),
         "meta_direction": (
             "A direction does not exist.",

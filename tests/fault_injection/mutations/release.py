@@ -36,7 +36,10 @@ def _drop(place: Place, *lines: bytes) -> None:
 
 def _files(place: Place) -> list[Path]:
     kinds = [(agent, kind) for agent in place.agents for kind in ("label", "calib")]
-    return [place.scenario.meta_path, *(place.file(*each, frame) for each in kinds for frame in place.frames)]
+    return [
+        place.scenario.meta_path,
+        *(place.file(*each, frame) for each in kinds for frame in place.frames),
+    ]
 
 
 def _list_with_its_twin_elsewhere(place: Place, rng: np.random.Generator) -> None:
@@ -112,7 +115,9 @@ GROUP.add(
         ),
         "scenario_in_two_splits": (
             "A second split file lists the scenario.",
-            lambda place, rng: _append(place, str(rng.choice(["val.txt", "test.txt"])), _line(place)),
+            lambda place, rng: _append(
+                place, str(rng.choice(["val.txt", "test.txt"])), _line(place)
+            ),
         ),
         "twins_in_two_splits": (
             "The scenario is listed in another split than its twin.",
@@ -120,10 +125,18 @@ GROUP.add(
         ),
         "split_line_twice": (
             "A split file lists the scenario twice.",
-            lambda place, rng: _append(place, str(rng.choice(["train.txt", "train_mini.txt"])), _line(place)),
+            lambda place, rng: _append(
+                place, str(rng.choice(["train.txt", "train_mini.txt"])), _line(place)
+            ),
         ),
-        "scenario_in_no_split": ("No split file lists the scenario.", lambda place, _: _drop(place, _line(place))),
-        "scenario_in_two_folders": ("The scenario is in a split folder too (layout B).", _copy_to_val),
+        "scenario_in_no_split": (
+            "No split file lists the scenario.",
+            lambda place, _: _drop(place, _line(place)),
+        ),
+        "scenario_in_two_folders": (
+            "The scenario is in a split folder too (layout B).",
+            _copy_to_val,
+        ),
         "type_folder_unpacked_beside": (
             "An agent's files are in a folder beside the scenario type's, as a second download is unpacked.",
             _unpack_beside,
@@ -131,7 +144,9 @@ GROUP.add(
         "split_line_of_one_word": (
             "A split file has a line with a single word.",
             lambda place, rng: _append(
-                place, str(rng.choice(["train.txt", "val.txt"])), place.scenario.name.encode() + b"\n"
+                place,
+                str(rng.choice(["train.txt", "val.txt"])),
+                place.scenario.name.encode() + b"\n",
             ),
         ),
         "split_file_garbage": (
@@ -145,7 +160,9 @@ GROUP.add(
         "split_lists_absent_scenario": (
             "A split file lists a scenario that is not there.",
             lambda place, _: _append(
-                place, "train.txt", b"type1_subtype2_normal Town07_type001_subtype0002_scenario00099\n"
+                place,
+                "train.txt",
+                b"type1_subtype2_normal Town07_type001_subtype0002_scenario00099\n",
             ),
         ),
     },

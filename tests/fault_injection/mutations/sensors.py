@@ -27,7 +27,9 @@ def _in_image(change: Matrix) -> Apply:
     return in_file("Camera", lambda content, _: _jpeg(change(_pixels(content))))
 
 
-def _in_array(channel: str, change: Callable[[np.ndarray, np.random.Generator], np.ndarray]) -> Apply:
+def _in_array(
+    channel: str, change: Callable[[np.ndarray, np.random.Generator], np.ndarray]
+) -> Apply:
     """Change the array of a point cloud or BEV file."""
 
     def apply(place: Place, rng: np.random.Generator) -> None:
@@ -107,27 +109,46 @@ IMAGES.add(
             "An image file holds random bytes.",
             in_file("Camera", garbage),
         ),
-        "image_size": ("An image has half the size of the others.", _in_image(lambda pixels: pixels[::2, ::2])),
+        "image_size": (
+            "An image has half the size of the others.",
+            _in_image(lambda pixels: pixels[::2, ::2]),
+        ),
     },
 )
 IMAGES.add(
-    {"image_grey": ("All of an image has one grey.", _in_image(lambda pixels: np.full_like(pixels, 128)))},
+    {
+        "image_grey": (
+            "All of an image has one grey.",
+            _in_image(lambda pixels: np.full_like(pixels, 128)),
+        )
+    },
     beyond=_WALL,
 )
 
 
 def _of_camera(place: Place, rng: np.random.Generator) -> None:
     agent, frame = place.any_agent(rng), place.any_frame(rng)
-    one, other = (place.file(agent, str(camera), frame) for camera in rng.choice(CAMERAS, size=2, replace=False))
+    one, other = (
+        place.file(agent, str(camera), frame)
+        for camera in rng.choice(CAMERAS, size=2, replace=False)
+    )
     place.write(one, other.read_bytes())
 
 
 def _of_twin(place: Place, rng: np.random.Generator) -> None:
     of_type = place.scenario.scenario_type
     kind = of_type.rsplit("_", 1)[1]
-    (agent, other), (frame, other_frame), camera = place.two_agents(rng), _two_frames(place, rng), _camera(rng)
+    (agent, other), (frame, other_frame), camera = (
+        place.two_agents(rng),
+        _two_frames(place, rng),
+        _camera(rng),
+    )
     path = place.file(other, camera, other_frame).relative_to(place.root / of_type)
-    twin = place.root / of_type.replace(kind, {"accident": "normal", "normal": "accident"}[kind]) / path
+    twin = (
+        place.root
+        / of_type.replace(kind, {"accident": "normal", "normal": "accident"}[kind])
+        / path
+    )
     place.write(place.file(agent, camera, frame), twin.read_bytes())
 
 
@@ -139,7 +160,10 @@ def _exchange_cameras(place: Place, rng: np.random.Generator) -> None:
 
 IMAGES.add(
     {
-        "image_of_camera": ("An image is another camera's of the same agent and frame.", _of_camera),
+        "image_of_camera": (
+            "An image is another camera's of the same agent and frame.",
+            _of_camera,
+        ),
         "image_of_agent": (
             "An image is another agent's of the same camera and frame.",
             lambda place, rng: _of_agent(place, rng, _camera(rng)),
@@ -202,7 +226,10 @@ LIDARS.add(
             _in_array(LIDAR, lambda points, _: points[:, :3]),
         ),
         "lidar_nan": ("A hundred points of a cloud are NaN.", _in_array(LIDAR, _with_nan)),
-        "lidar_without_points": ("A cloud has no points.", _in_array(LIDAR, lambda points, _: points[:0])),
+        "lidar_without_points": (
+            "A cloud has no points.",
+            _in_array(LIDAR, lambda points, _: points[:0]),
+        ),
         "lidar_halved": (
             "Half of a cloud's points are missing.",
             _in_array(LIDAR, lambda points, _: points[: len(points) // 2]),
@@ -252,7 +279,10 @@ def _all_flipped(place: Place, rng: np.random.Generator) -> None:
 BEVS.add(
     {
         "bev_cut": ("A BEV file ends at a random byte.", in_file(BEV_CAMERA, cut)),
-        "bev_wrong_shape": ("A BEV array has half the rows.", _in_array(BEV_CAMERA, lambda picture, _: picture[::2])),
+        "bev_wrong_shape": (
+            "A BEV array has half the rows.",
+            _in_array(BEV_CAMERA, lambda picture, _: picture[::2]),
+        ),
         "bev_channels_reversed": (
             "A BEV array's channels are in the reverse order.",
             _in_array(BEV_CAMERA, lambda picture, _: picture[..., ::-1]),
@@ -268,7 +298,10 @@ BEVS.add(
         "bevs_flipped": ("All BEV arrays of an agent are flipped left to right.", _all_flipped),
         "bev_zoomed": (
             "A BEV array shows 30 m instead of 60 m to each side.",
-            _in_array(BEV_CAMERA, lambda picture, _: picture[300:900, 300:900].repeat(2, axis=0).repeat(2, axis=1)),
+            _in_array(
+                BEV_CAMERA,
+                lambda picture, _: picture[300:900, 300:900].repeat(2, axis=0).repeat(2, axis=1),
+            ),
         ),
         "bev_of_agent": (
             "A BEV array is another agent's of the same frame.",

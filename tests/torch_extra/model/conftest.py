@@ -63,7 +63,9 @@ def predicted() -> Callable[..., list[Any]]:
     """A model's maps of both tasks for each ego, with the same draws for all of them."""
 
     def of(model: "V2XFormer", inputs: "ModelInputs") -> list[Any]:
-        noise = model.noise(1, torch.Generator().manual_seed(4)).expand(-1, len(inputs.ego_rows), -1, -1, -1)
+        noise = model.noise(1, torch.Generator().manual_seed(4)).expand(
+            -1, len(inputs.ego_rows), -1, -1, -1
+        )
         with torch.inference_mode():
             found = model(inputs, noise=noise)
         maps = [each.movedim(1, 0) for each in found.motion.maps]

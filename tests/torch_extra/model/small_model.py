@@ -56,7 +56,9 @@ def small() -> ModelConfig:
         ),
         temporal=replace(tiny.temporal, channels=8, grid=BevGrid(x=ALONG, y=ALONG)),
         bev=BevUNetConfig(in_channels=8, out_channels=16, widths=(16, 16)),
-        motion=replace(tiny.motion, in_channels=16, latent=4, future_frames=2, hidden=8, upsample=2, samples=2),
+        motion=replace(
+            tiny.motion, in_channels=16, latent=4, future_frames=2, hidden=8, upsample=2, samples=2
+        ),
         detection=replace(tiny.detection, in_channels=16, shared_channels=8, x=ALONG, y=ALONG),
         labels=replace(tiny.labels, grid=BevGrid(x=ALONG, y=ALONG), step=1, future_frames=2),
     )
@@ -82,7 +84,11 @@ def small_released() -> ModelConfig:
         cameras=CameraConfig(
             images=ImageConfig(resize=(36, 64), crop=(4, 0, 32, 64), dtype="uint8"),
             encoder=SwinConfig(
-                embed_dims=8, depths=(1, 1, 1, 1), num_heads=(1, 2, 2, 4), window_size=4, neck_channels=16
+                embed_dims=8,
+                depths=(1, 1, 1, 1),
+                num_heads=(1, 2, 2, 4),
+                window_size=4,
+                neck_channels=16,
             ),
             lift=replace(
                 released.cameras.lift,
@@ -101,7 +107,11 @@ def small_released() -> ModelConfig:
         detection=replace(released.detection, in_channels=16, shared_channels=8, x=along, y=along),
         labels=replace(
             released.labels,
-            grid=BevGrid(x=(-48.0, 48.0, 2.0), y=(-48.0, 48.0, 2.0), orientation=released.labels.grid.orientation),
+            grid=BevGrid(
+                x=(-48.0, 48.0, 2.0),
+                y=(-48.0, 48.0, 2.0),
+                orientation=released.labels.grid.orientation,
+            ),
             step=1,
             future_frames=2,
         ),
@@ -109,13 +119,23 @@ def small_released() -> ModelConfig:
 
 
 def trained(
-    dataset: DeepAccident, folder: Path, config: TrainConfig = RUN, *, curves: bool = False, **options: Any
+    dataset: DeepAccident,
+    folder: Path,
+    config: TrainConfig = RUN,
+    *,
+    curves: bool = False,
+    **options: Any,
 ) -> Path:
     """A run with `small` in the place of `tiny`, on one thread; curves, which take seconds, are left out."""
     torch.set_num_threads(1)
     drawn = training.save_training if curves else lambda *_: None
-    with patch.object(presets, "MODEL_PRESETS", {"tiny": small}), patch.object(training, "save_training", drawn):
-        return training.train(dataset, folder, presets.ModelChoice(), config, device="cpu", **options)
+    with (
+        patch.object(presets, "MODEL_PRESETS", {"tiny": small}),
+        patch.object(training, "save_training", drawn),
+    ):
+        return training.train(
+            dataset, folder, presets.ModelChoice(), config, device="cpu", **options
+        )
 
 
 def killed_run(root: str, folder: str, step: int) -> None:
@@ -141,7 +161,9 @@ def one_of_several(root: str, folder: Path) -> None:
         return made[-1]
 
     with patch.object(training, "new_model", watched):
-        trained(DeepAccident("v1", root, verbose=False), folder, replace(RUN, steps=2, validation=None))
+        trained(
+            DeepAccident("v1", root, verbose=False), folder, replace(RUN, steps=2, validation=None)
+        )
     torch.save(dict(made[0].named_parameters()), folder / f"rank_{os.environ['RANK']}.pth")
 
 

@@ -10,7 +10,13 @@ from refusals import assert_refused
 from deepaccident_devkit.errors import ConfigError, GeometryError
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.geometry.bev_grid import ORIENTATIONS
-from deepaccident_devkit.plugins.model.bev import BevEncode, BevEncodeConfig, BevUNet, BevUNetConfig, crop
+from deepaccident_devkit.plugins.model.bev import (
+    BevEncode,
+    BevEncodeConfig,
+    BevUNet,
+    BevUNetConfig,
+    crop,
+)
 
 SOURCE = BevGrid((-8.0, 10.0, 1.0), (-9.0, 6.0, 0.5))
 ENCODERS = [
@@ -36,7 +42,10 @@ def test_beyond_the_source_features_fade_to_zero_within_half_a_cell() -> None:
     target = BevGrid((-20.0, 20.0, 0.2), (-20.0, 20.0, 0.2))
     x, y = np.moveaxis(target.centers(), -1, 0)
     beyond = np.maximum(
-        *(abs(p - (low + high) / 2) - (high - low) / 2 for p, (low, high, _) in ((x, SOURCE.x), (y, SOURCE.y)))
+        *(
+            abs(p - (low + high) / 2) - (high - low) / 2
+            for p, (low, high, _) in ((x, SOURCE.x), (y, SOURCE.y))
+        )
     )
     found = crop(torch.ones(1, 1, *SOURCE.shape), SOURCE, target)[0, 0].numpy()
     np.testing.assert_allclose(found[beyond > 0.5], 0, atol=1e-5)
@@ -65,14 +74,26 @@ def test_encoders_have_their_sizes_and_use_every_weight(encoder, shape) -> None:
     result = encoder(torch.rand(2, 6, 16, 24))
     assert tuple(result.shape) == (2, *shape)
     result.square().sum().backward()
-    assert [name for name, each in encoder.named_parameters() if each.grad is None or not each.grad.any()] == []
+    assert [
+        name
+        for name, each in encoder.named_parameters()
+        if each.grad is None or not each.grad.any()
+    ] == []
 
 
 @pytest.mark.parametrize(
     ("config", "values", "message"),
     [
-        (BevEncodeConfig, {"widths": (8, 16)}, r"channels of 3 stages, such as \(32, 64, 128\), found \(8, 16\)"),
-        (BevUNetConfig, {"widths": (8, 0)}, r"channels of 2 stages, such as \(32, 64\), found \(8, 0\)"),
+        (
+            BevEncodeConfig,
+            {"widths": (8, 16)},
+            r"channels of 3 stages, such as \(32, 64, 128\), found \(8, 16\)",
+        ),
+        (
+            BevUNetConfig,
+            {"widths": (8, 0)},
+            r"channels of 2 stages, such as \(32, 64\), found \(8, 0\)",
+        ),
         (BevEncodeConfig, {"out_channels": 0}, "out_channels: expected a number from 1, found 0"),
         (BevUNetConfig, {"in_channels": -1}, "in_channels: expected a number from 1, found -1"),
     ],

@@ -15,7 +15,13 @@ from torch_extra.compared import same
 from torch_extra.model.small_model import small, small_released
 
 from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.plugins.model.checkpoint import BEST, FINAL, load_weights, read_weights, write_weights
+from deepaccident_devkit.plugins.model.checkpoint import (
+    BEST,
+    FINAL,
+    load_weights,
+    read_weights,
+    write_weights,
+)
 from deepaccident_devkit.plugins.model.images import SwinConfig
 from deepaccident_devkit.plugins.model.network import V2XFormer
 
@@ -30,7 +36,11 @@ def model(seed: int) -> V2XFormer:
 
 def trained_alone(model: torch.nn.Module) -> dict[str, torch.Tensor]:
     """What training changes, and a file must have."""
-    return {name: each for name, each in model.state_dict().items() if not name.endswith("num_batches_tracked")}
+    return {
+        name: each
+        for name, each in model.state_dict().items()
+        if not name.endswith("num_batches_tracked")
+    }
 
 
 def test_weights_come_back_bit_for_bit(tmp_path: Path) -> None:
@@ -78,7 +88,9 @@ def test_what_is_missing_begins_at_random_unless_all_are_needed(tmp_path: Path) 
     done = load_weights(fresh, weights)
     assert done.unused == ("other.weight",)
     assert not any(name.startswith("img_") for name in done.kept)
-    assert same(*[{name: each.state_dict()[name] for name in done.kept} for each in (fresh, model(1))])
+    assert same(
+        *[{name: each.state_dict()[name] for name in done.kept} for each in (fresh, model(1))]
+    )
     lacking, strange = (
         r"weights do not fit this model: \d+ of the model are missing",
         r"not the model's \(other\.weight",
@@ -92,11 +104,15 @@ def test_what_is_missing_begins_at_random_unless_all_are_needed(tmp_path: Path) 
 @pytest.mark.parametrize("zipped", [True, False])
 @pytest.mark.parametrize("prefix", ["", "module."])
 @pytest.mark.parametrize("wrapped", [True, False])
-def test_foreign_checkpoints_have_our_names(tmp_path: Path, *, zipped: bool, prefix: str, wrapped: bool) -> None:
+def test_foreign_checkpoints_have_our_names(
+    tmp_path: Path, *, zipped: bool, prefix: str, wrapped: bool
+) -> None:
     """Of mmcv, with or without what it wraps around them; new and old files of torch."""
     path = tmp_path / "epoch_20.pth"
     tensors: Any = {f"{prefix}{name}": each for name, each in model(0).state_dict().items()}
-    content = {"meta": {"epoch": 20, "config": "text"}, "state_dict": tensors} if wrapped else tensors
+    content = (
+        {"meta": {"epoch": 20, "config": "text"}, "state_dict": tensors} if wrapped else tensors
+    )
     torch.save(content, path, _use_new_zipfile_serialization=zipped)
     weights, fresh = read_weights(path), model(1)
     assert weights.meta == {}
@@ -106,7 +122,11 @@ def test_foreign_checkpoints_have_our_names(tmp_path: Path, *, zipped: bool, pre
 
 def test_the_release_s_further_layers_are_told(tmp_path: Path) -> None:
     """Its dead V2X layers, and BEVerse's map task."""
-    first, second, path = V2XFormer(small_released()), V2XFormer(small_released()), tmp_path / "beverse.pth"
+    first, second, path = (
+        V2XFormer(small_released()),
+        V2XFormer(small_released()),
+        tmp_path / "beverse.pth",
+    )
     further = {
         "v2x_fusion.model.0.conv.weight": torch.zeros(2),
         "v2x_fusion.compression.0.weight": torch.zeros(2),
@@ -150,7 +170,9 @@ def assert_unreadable(path: Path, message: str) -> None:
 
 def noted(text: str) -> Callable[[Path], None]:
     """A file of ours with these notes."""
-    return lambda path: save_file({"img_neck.weight": torch.zeros(1)}, path, metadata={"deepaccident": text})
+    return lambda path: save_file(
+        {"img_neck.weight": torch.zeros(1)}, path, metadata={"deepaccident": text}
+    )
 
 
 def cut(write: Callable[[Path], object], share: float) -> Callable[[Path], None]:
@@ -193,7 +215,9 @@ def cut(write: Callable[[Path], object], share: float) -> Callable[[Path], None]
         ),
     ],
 )
-def test_what_is_no_file_of_weights_is_refused(tmp_path: Path, make: Callable[[Path], object], message: str) -> None:
+def test_what_is_no_file_of_weights_is_refused(
+    tmp_path: Path, make: Callable[[Path], object], message: str
+) -> None:
     """Absent, another file, nothing by name, notes that are no JSON object, cut off."""
     path = tmp_path / "weights.pth"
     make(path)
@@ -201,7 +225,9 @@ def test_what_is_no_file_of_weights_is_refused(tmp_path: Path, make: Callable[[P
 
 
 def test_of_a_run_the_best_weights_are_read(tmp_path: Path) -> None:
-    assert_refused((lambda: read_weights(tmp_path), ConfigError, r"best\.safetensors: weights cannot be read"))
+    assert_refused(
+        (lambda: read_weights(tmp_path), ConfigError, r"best\.safetensors: weights cannot be read")
+    )
     for name in (FINAL, BEST):
         write_weights(tmp_path / name, {name: torch.ones(2)}, META)
         weights = read_weights(tmp_path)
@@ -210,10 +236,18 @@ def test_of_a_run_the_best_weights_are_read(tmp_path: Path) -> None:
 
 def test_official_swin_weights_go_into_the_image_encoder(tmp_path: Path) -> None:
     """Microsoft's names, under `model`; the parity tests compare the order of tokens."""
-    encoder, cameras = SwinConfig(embed_dims=8, depths=(1, 1), num_heads=(1, 1), out_stages=(0, 1)), small().cameras
-    cameras = replace(cameras, encoder=encoder, lift=replace(cameras.lift, stride=4, in_channels=512))
+    encoder, cameras = (
+        SwinConfig(embed_dims=8, depths=(1, 1), num_heads=(1, 1), out_stages=(0, 1)),
+        small().cameras,
+    )
+    cameras = replace(
+        cameras, encoder=encoder, lift=replace(cameras.lift, stride=4, in_channels=512)
+    )
     model, path = V2XFormer(replace(small(), cameras=cameras)), tmp_path / "swin.pth"
-    official = {"patch_embed.proj.weight": torch.full((8, 3, 4, 4), 2.0), "norm.weight": torch.zeros(16)}
+    official = {
+        "patch_embed.proj.weight": torch.full((8, 3, 4, 4), 2.0),
+        "norm.weight": torch.zeros(16),
+    }
     torch.save({"model": official}, path)
     done = load_weights(model, read_weights(path))
     assert done.unused == ("img_backbone.norm.weight",)

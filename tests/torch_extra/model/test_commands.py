@@ -36,7 +36,12 @@ def trained(release_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Pat
 
 @pytest.mark.parametrize(
     ("agents", "link"),
-    [("all", ()), ("single", ()), ("+other", ("--pose-noise", 0.3, "--packet-loss", 0.5)), ("all", ("--budget", 1))],
+    [
+        ("all", ()),
+        ("single", ()),
+        ("+other", ("--pose-noise", 0.3, "--packet-loss", 0.5)),
+        ("all", ("--budget", 1)),
+    ],
 )
 def test_one_set_of_weights_predicts_for_any_agents(
     trained: Path, release_root: Path, tmp_path: Path, agents: str, link: tuple[object, ...]
@@ -55,34 +60,95 @@ def test_one_set_of_weights_predicts_for_any_agents(
         "forecasting": ("forecasting.json", "--samples", "evaluate"),
     }
     for task, (name, *protocol) in tasks.items():
-        found, judged = read_results(out / name), ("--split", split, "--scope", "all", "--json", *protocol)
-        assert (found.task, found.meta["agents"], found.meta["model"]["preset"]) == (task, agents, "tiny")
-        assert (found.meta["bytes"]["partners"] > 0) == (agents != "single" and "--budget" not in link)
+        found, judged = (
+            read_results(out / name),
+            ("--split", split, "--scope", "all", "--json", *protocol),
+        )
+        assert (found.task, found.meta["agents"], found.meta["model"]["preset"]) == (
+            task,
+            agents,
+            "tiny",
+        )
+        assert (found.meta["bytes"]["partners"] > 0) == (
+            agents != "single" and "--budget" not in link
+        )
         assert f"{task}: {len(found.tokens)} samples in {out / name}" in result.output
         assert run("evaluate", task, release_root, "--results", out / name, *judged).exit_code == 0
     assert read_results(out / "motion").form.grid.shape == (200, 200)
 
 
-def test_what_is_there_already_is_not_overwritten(trained: Path, release_root: Path, tmp_path: Path) -> None:
+def test_what_is_there_already_is_not_overwritten(
+    trained: Path, release_root: Path, tmp_path: Path
+) -> None:
     (tmp_path / "accident.json").write_text("mine", encoding="utf-8")
-    words = ("predict", trained, release_root, "--split", "train", "--scope", "all", "--out", tmp_path)
+    words = (
+        "predict",
+        trained,
+        release_root,
+        "--split",
+        "train",
+        "--scope",
+        "all",
+        "--out",
+        tmp_path,
+    )
     refused(DeepAccidentError, ("accident.json: is there already",), *words, "--device", "cpu")
-    assert {path.name: path.read_text(encoding="utf-8") for path in tmp_path.iterdir()} == {"accident.json": "mine"}
+    assert {path.name: path.read_text(encoding="utf-8") for path in tmp_path.iterdir()} == {
+        "accident.json": "mine"
+    }
 
 
-def test_weights_of_another_model_say_which_keys_differ(trained: Path, release_root: Path, tmp_path: Path) -> None:
-    words = ("train", release_root, "--fusion", "disconet", "--steps", 1, "--out", tmp_path / "run", *QUICK)
+def test_weights_of_another_model_say_which_keys_differ(
+    trained: Path, release_root: Path, tmp_path: Path
+) -> None:
+    words = (
+        "train",
+        release_root,
+        "--fusion",
+        "disconet",
+        "--steps",
+        1,
+        "--out",
+        tmp_path / "run",
+        *QUICK,
+    )
     assert "as they were: v2x_fusion." in run(*words, "--from", trained).output
-    other = ("train", release_root, "--preset", "released", "--steps", 1, "--out", tmp_path / "big", *QUICK)
-    named = ("weights of the preset 'tiny' do not fit this model", " of the model are missing (img_backbone.")
+    other = (
+        "train",
+        release_root,
+        "--preset",
+        "released",
+        "--steps",
+        1,
+        "--out",
+        tmp_path / "big",
+        *QUICK,
+    )
+    named = (
+        "weights of the preset 'tiny' do not fit this model",
+        " of the model are missing (img_backbone.",
+    )
     refused(ConfigError, named, *other, "--from", trained)
 
 
 def test_a_release_without_images(release_root_b: Path, trained: Path, tmp_path: Path) -> None:
     named = ("this release has no images", "deepaccident synth OUT --sensors cameras")
-    train, predict = ("train", release_root_b), ("predict", trained, release_root_b, "--samples", "all")
+    train, predict = (
+        ("train", release_root_b),
+        ("predict", trained, release_root_b, "--samples", "all"),
+    )
     for words in (train, predict):
-        refused(NotAvailableError, named, *words, "--out", tmp_path / "out", "--split", "train", "--device", "cpu")
+        refused(
+            NotAvailableError,
+            named,
+            *words,
+            "--out",
+            tmp_path / "out",
+            "--split",
+            "train",
+            "--device",
+            "cpu",
+        )
 
 
 @pytest.mark.parametrize(
@@ -96,7 +162,9 @@ def test_a_release_without_images(release_root_b: Path, trained: Path, tmp_path:
         (("--validation", "test"), "(--validation; none trains without it)"),
     ],
 )
-def test_wrong_options_are_one_line(release_root: Path, tmp_path: Path, words: tuple[object, ...], said: str) -> None:
+def test_wrong_options_are_one_line(
+    release_root: Path, tmp_path: Path, words: tuple[object, ...], said: str
+) -> None:
     given = ("train", release_root, "--steps", 1, *QUICK, *words, "--out", tmp_path / "run")
     refused(DeepAccidentError, (said,), *given)
     assert not list(tmp_path.glob("run/*"))
@@ -104,14 +172,18 @@ def test_wrong_options_are_one_line(release_root: Path, tmp_path: Path, words: t
 
 def test_the_pages_commands_exist() -> None:
     """They would take half an hour; here they are only parsed."""
-    lines = re.findall(r"^    deepaccident (train|predict) (.+)$", PAGE.read_text(encoding="utf-8"), re.MULTILINE)
+    lines = re.findall(
+        r"^    deepaccident (train|predict) (.+)$", PAGE.read_text(encoding="utf-8"), re.MULTILINE
+    )
     assert {verb for verb, _ in lines} == {"train", "predict"}
     for verb, words in lines:
         command = deepaccident.get_command(None, verb)
         command.make_context(verb, words.split(), resilient_parsing=True)
 
 
-def test_a_partial_release_trains_with_the_agents_that_are_there(da_partial: DeepAccident, tmp_path: Path) -> None:
+def test_a_partial_release_trains_with_the_agents_that_are_there(
+    da_partial: DeepAccident, tmp_path: Path
+) -> None:
     """It has no other_vehicle_behind, and the ego no front camera."""
     words = ("train", da_partial.dataroot, "--steps", 1, "--out", tmp_path / "run", *QUICK)
     refused(NotAvailableError, ("other_vehicle_behind is not in this release",), *words)

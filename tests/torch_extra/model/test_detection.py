@@ -47,16 +47,22 @@ BUILT = settings(max_examples=20)
 
 def features_of(config: DetectionConfig, samples: int = 2) -> Tensor:
     rows, columns = (count // config.upsample for count in config.shape)
-    return torch.randn(samples, config.in_channels, rows, columns, generator=torch.Generator().manual_seed(0))
+    return torch.randn(
+        samples, config.in_channels, rows, columns, generator=torch.Generator().manual_seed(0)
+    )
 
 
 def random_boxes(seed: int, count: int) -> tuple[Tensor, Tensor]:
     """Boxes in cells of their own, and categories."""
     random = np.random.default_rng(seed)
     cell = random.choice(16 * 12, count, replace=False)
-    place = np.stack([cell % 16 - 8, cell // 16 - 6], axis=1) + random.uniform(0.01, 0.99, (count, 2))
+    place = np.stack([cell % 16 - 8, cell // 16 - 6], axis=1) + random.uniform(
+        0.01, 0.99, (count, 2)
+    )
     size = random.uniform(0.5, 6.0, (count, 3))
-    others = np.column_stack([random.uniform(-3.0, 3.0, (count, 1)), size, random.uniform(-3.1, 3.1, (count, 1))])
+    others = np.column_stack(
+        [random.uniform(-3.0, 3.0, (count, 1)), size, random.uniform(-3.1, 3.1, (count, 1))]
+    )
     rows = np.column_stack([place, others, random.uniform(-20.0, 20.0, (count, 2))])
     return torch.from_numpy(rows).float(), torch.from_numpy(random.integers(0, 6, count))
 
@@ -65,18 +71,27 @@ def random_boxes(seed: int, count: int) -> tuple[Tensor, Tensor]:
 def test_gradients_reach_every_parameter(config: DetectionConfig) -> None:
     head = CenterHead(config)
     boxes, categories = zip(*(random_boxes(seed, 20) for seed in (1, 2)), strict=True)
-    losses = detection_losses(head(features_of(config)), detection_targets(boxes, categories, config))
+    losses = detection_losses(
+        head(features_of(config)), detection_targets(boxes, categories, config)
+    )
     torch.stack(list(losses.values())).sum().backward()
-    assert all(weight.grad is not None and bool(weight.grad.abs().sum() > 0) for weight in head.parameters())
+    assert all(
+        weight.grad is not None and bool(weight.grad.abs().sum() > 0)
+        for weight in head.parameters()
+    )
 
 
-@pytest.mark.parametrize("head", [SMALL, replace(SMALL, class_slots=ONE_TASK)], ids=["tasks", "one task"])
+@pytest.mark.parametrize(
+    "head", [SMALL, replace(SMALL, class_slots=ONE_TASK)], ids=["tasks", "one task"]
+)
 @given(seed=SEEDS, count=st.integers(0, 30))
 @BUILT
 def test_perfect_maps_give_the_boxes_back(head: DetectionConfig, seed: int, count: int) -> None:
     boxes, categories = random_boxes(seed, count)
     no_suppression = DecodingConfig(nms=(NmsConfig(threshold=1.0),))
-    (found,) = decode_detections(perfect_maps(detection_targets([boxes], [categories], head)), head, no_suppression)
+    (found,) = decode_detections(
+        perfect_maps(detection_targets([boxes], [categories], head)), head, no_suppression
+    )
     ours, truth = found.boxes[:, 0].argsort(), boxes[:, 0].argsort()
     torch.testing.assert_close(found.boxes[ours], boxes[truth], rtol=0, atol=1e-4)
     assert torch.equal(found.categories[ours], categories[truth])
@@ -94,7 +109,11 @@ def test_targets_do_not_depend_on_the_other_samples(seed: int) -> None:
 
 def test_boxes_outside_or_of_no_category_are_left_out() -> None:
     boxes = torch.tensor([[0.0, 0.0, 0.0, 4.0, 2.0, 1.5, 0.0, 0.0, 0.0]]).repeat(6, 1)
-    boxes[1, 0], boxes[2, 1], boxes[3, 4] = -8.9, 6.01, 0.0  # in the folded first column; beyond the last row; no width
+    boxes[1, 0], boxes[2, 1], boxes[3, 4] = (
+        -8.9,
+        6.01,
+        0.0,
+    )  # in the folded first column; beyond the last row; no width
     categories = torch.tensor([0, 0, 0, 0, -1, 5])
     cars, *_ = detection_targets([boxes], [categories], replace(SMALL, class_slots=((0,), (1, 2))))
     assert cars.place[cars.mask].tolist() == [6 * 16 + 8, 6 * 16]
@@ -111,7 +130,9 @@ def test_unknown_velocities_are_trained_to_zero_or_not_at_all() -> None:
         wrong = [task._replace(vel=task.vel + 1) for task in perfect_maps(targets)]
         found = detection_losses(wrong, targets, DetectionLossConfig(weight=1.0, box_weight=1.0))
         counts = [float(target.mask.sum()) + 1e-4 for target in targets]
-        losses = [float(found[f"task{task}.loss_bbox"]) * count for task, count in enumerate(counts)]
+        losses = [
+            float(found[f"task{task}.loss_bbox"]) * count for task, count in enumerate(counts)
+        ]
         assert sum(losses) == pytest.approx(loss, abs=1e-3)
 
 
@@ -175,7 +196,11 @@ def test_kept_boxes_do_not_overlap_and_cover_those_that_went(seed: int, threshol
 @BUILT
 def test_suppression_depends_neither_on_the_order_nor_on_the_axes(method: Any, seed: int) -> None:
     random = np.random.default_rng(seed)
-    boxes, scores, slots = as_boxes(rectangles(seed, 20)), random.random(20), random.integers(0, 2, 20)
+    boxes, scores, slots = (
+        as_boxes(rectangles(seed, 20)),
+        random.random(20),
+        random.integers(0, 2, 20),
+    )
     rules = NmsConfig(method=method, scale=(0.6, 1.3))
     kept = suppress(boxes, scores, slots, rules)
     order = random.permutation(20)
@@ -192,14 +217,22 @@ def test_suppression_depends_neither_on_the_order_nor_on_the_axes(method: Any, s
 
 def test_detected_boxes_stand_in_the_world() -> None:
     boxes = torch.tensor([[10.0, 2.0, 1.0, 4.0, 2.0, 1.5, 0.25, 5.0, 1.0]])
-    found = Detections(boxes=boxes.requires_grad_(), scores=torch.tensor([0.5]), categories=torch.tensor([3]))
+    found = Detections(
+        boxes=boxes.requires_grad_(), scores=torch.tensor([0.5]), categories=torch.tensor([3])
+    )
     pose = SE3.from_yaw(math.pi / 2, (100.0, 200.0, 3.0))
     expected = [[98.0, 210.0, 4.0, 4.0, 2.0, 1.5, 0.25 + math.pi / 2, -1.0, 5.0, 0.0]]
     for given_pose in (pose, pose.matrix, torch.from_numpy(pose.matrix.copy())):
         world = detected_boxes(found, given_pose)
-        rows = np.column_stack([world.boxes.center, world.boxes.size, world.boxes.yaw, world.boxes.velocity])
+        rows = np.column_stack(
+            [world.boxes.center, world.boxes.size, world.boxes.yaw, world.boxes.velocity]
+        )
         np.testing.assert_allclose(rows, expected, atol=1e-6)
-        assert (world.boxes.frame, world.boxes.category_names, world.scores.tolist()) == ("world", ["cyclist"], [0.5])
+        assert (world.boxes.frame, world.boxes.category_names, world.scores.tolist()) == (
+            "world",
+            ["cyclist"],
+            [0.5],
+        )
     assert_refused((lambda: detected_boxes(found, np.ones((4, 4))), GeometryError, r"SE3\.matrix"))
 
 
@@ -210,26 +243,56 @@ def suppressed_by(*nms: NmsConfig) -> object:
 @pytest.mark.parametrize(
     ("make", "sentence"),
     [
-        (lambda: DetectionConfig(class_slots=((0,), ())), "class_slots: expected tasks of one slot or more"),
-        (lambda: DetectionConfig(class_slots=((0, 0),)), "class_slots: expected each category 0 to 5 at most once"),
-        (lambda: DetectionConfig(class_slots=((6,),)), "class_slots: expected each category 0 to 5 at most once"),
+        (
+            lambda: DetectionConfig(class_slots=((0,), ())),
+            "class_slots: expected tasks of one slot or more",
+        ),
+        (
+            lambda: DetectionConfig(class_slots=((0, 0),)),
+            "class_slots: expected each category 0 to 5 at most once",
+        ),
+        (
+            lambda: DetectionConfig(class_slots=((6,),)),
+            "class_slots: expected each category 0 to 5 at most once",
+        ),
         (lambda: DetectionConfig(x=(0.0, 1.0, 0.3)), "x: 0 to 1 m is not a whole number of cells"),
         (lambda: DetectionConfig(upsample=0), "upsample: expected a number from 1, found 0"),
-        (lambda: DetectionConfig(branches="shared"), "branches: expected one of separate, joint, found 'shared'"),
-        (lambda: TargetConfig(min_overlap=1.0), "min_overlap: expected a number between 0 and 1, found 1.0"),
+        (
+            lambda: DetectionConfig(branches="shared"),
+            "branches: expected one of separate, joint, found 'shared'",
+        ),
+        (
+            lambda: TargetConfig(min_overlap=1.0),
+            "min_overlap: expected a number between 0 and 1, found 1.0",
+        ),
         (lambda: TargetConfig(max_boxes=0), "max_boxes: expected a number from 1, found 0"),
-        (lambda: TargetConfig(unknown_velocity="nan"), "unknown_velocity: expected one of ignore, zero, found 'nan'"),
+        (
+            lambda: TargetConfig(unknown_velocity="nan"),
+            "unknown_velocity: expected one of ignore, zero, found 'nan'",
+        ),
         (lambda: DetectionLossConfig(weight=-1.0), "weight: expected a number from 0, found -1.0"),
         (lambda: DecodingConfig(candidates=0), "candidates: expected a number from 1, found 0"),
-        (lambda: DecodingConfig(center_range=(1, 1, 1, 0, 2, 2)), "center_range: expected least x, y, z, then"),
+        (
+            lambda: DecodingConfig(center_range=(1, 1, 1, 0, 2, 2)),
+            "center_range: expected least x, y, z, then",
+        ),
         (lambda: DecodingConfig(nms=()), "nms: expected one NmsConfig, or one a task, found none"),
         (lambda: NmsConfig(method="oval"), "method: expected one of rotated, circle, found 'oval'"),
         (lambda: NmsConfig(threshold=-0.1), "threshold: expected a number from 0, found -0.1"),
         (lambda: NmsConfig(scale=(1.0, 0.0)), "scale: expected one number above 0, or one a slot"),
         (lambda: NmsConfig(keep=0), "keep: expected a number from 1, found 0"),
-        (lambda: suppressed_by(NmsConfig(), NmsConfig()), "nms: expected one NmsConfig, or 4, one a task; found 2"),
-        (lambda: suppressed_by(NmsConfig(scale=(1.0, 1.0, 1.0))), "nms: task 0 has 1 slots, found 3 scales"),
-        (lambda: CenterHead(JOINT)(torch.zeros(1, 4, 12, 16)), "24 × 32 cells after upsampling by 2, expected 12 × 16"),
+        (
+            lambda: suppressed_by(NmsConfig(), NmsConfig()),
+            "nms: expected one NmsConfig, or 4, one a task; found 2",
+        ),
+        (
+            lambda: suppressed_by(NmsConfig(scale=(1.0, 1.0, 1.0))),
+            "nms: task 0 has 1 slots, found 3 scales",
+        ),
+        (
+            lambda: CenterHead(JOINT)(torch.zeros(1, 4, 12, 16)),
+            "24 × 32 cells after upsampling by 2, expected 12 × 16",
+        ),
     ],
 )
 def test_what_cannot_be_is_refused(make: Callable[[], object], sentence: str) -> None:
@@ -245,7 +308,9 @@ def test_what_is_found_on_ignored_boxes_is_not_wrong(config: DetectionConfig) ->
     boxes, categories = random_boxes(3, 6)
     bus = torch.tensor([[1.0, -2.0, 0.0, 5.0, 3.0, 2.0, 0.6, 0.0, 0.0]])
     plain = detection_targets([boxes], [categories], config)
-    ignoring = detection_targets([torch.cat([boxes, bus])], [torch.cat([categories, torch.tensor([-1])])], config)
+    ignoring = detection_targets(
+        [torch.cat([boxes, bus])], [torch.cat([categories, torch.tensor([-1])])], config
+    )
     maps = CenterHead(config)(features_of(config, 1))
     covered = torch.zeros(config.shape, dtype=torch.bool)
     for task, other in zip(plain, ignoring, strict=True):
@@ -258,7 +323,9 @@ def test_what_is_found_on_ignored_boxes_is_not_wrong(config: DetectionConfig) ->
     place = torch.stack([columns - 7.5, rows - 5.5], dim=1) - bus[0, :2]
     turn = torch.tensor([[math.cos(0.6), math.sin(0.6)], [-math.sin(0.6), math.cos(0.6)]])
     assert ((place @ turn.T).abs() <= torch.tensor([2.5, 1.5])).all()
-    shouting = [one._replace(heatmap=torch.where(covered, one.heatmap + 9, one.heatmap)) for one in maps]
+    shouting = [
+        one._replace(heatmap=torch.where(covered, one.heatmap + 9, one.heatmap)) for one in maps
+    ]
     quiet, loud, counted = (
         detection_losses(given, wanted)["task0.loss_heatmap"].item()
         for given, wanted in ((maps, ignoring), (shouting, ignoring), (shouting, plain))

@@ -27,7 +27,9 @@ SHORT = r"\A.{,600}\Z"
 
 def network() -> torch.nn.Module:
     torch.manual_seed(0)
-    return torch.nn.Sequential(OrderedDict(img_neck=torch.nn.Conv2d(3, 4, 3), transformer=torch.nn.BatchNorm2d(4)))
+    return torch.nn.Sequential(
+        OrderedDict(img_neck=torch.nn.Conv2d(3, 4, 3), transformer=torch.nn.BatchNorm2d(4))
+    )
 
 
 def trained(model: torch.nn.Module) -> dict[str, Any]:
@@ -66,21 +68,42 @@ FORMS = {
     "parameters": lambda: dict(network().named_parameters()),
     "kinds of numbers": lambda: {
         f"img_neck.{kind}": BASE.to(getattr(torch, kind))
-        for kind in ("float64", "float16", "bfloat16", "int64", "int32", "int16", "int8", "uint8", "bool")
+        for kind in (
+            "float64",
+            "float16",
+            "bfloat16",
+            "int64",
+            "int32",
+            "int16",
+            "int8",
+            "uint8",
+            "bool",
+        )
     },
-    "shared storages": lambda: {f"img_neck.{n}": each for n, each in enumerate((BASE, BASE[3:], BASE.view(3, 4).t()))},
-    "scalars and empty ones": lambda: {"img_neck.a": torch.tensor(3.0), "img_neck.b": torch.zeros(0, 4)},
+    "shared storages": lambda: {
+        f"img_neck.{n}": each for n, each in enumerate((BASE, BASE[3:], BASE.view(3, 4).t()))
+    },
+    "scalars and empty ones": lambda: {
+        "img_neck.a": torch.tensor(3.0),
+        "img_neck.b": torch.zeros(0, 4),
+    },
     "other things beside": lambda: {**network().state_dict(), "epoch": 3, 4: BASE, "none": None},
 }
 
 
 @pytest.mark.parametrize("form", FORMS)
-@pytest.mark.parametrize("way", [{}, {"pickle_protocol": 4}, {"_use_new_zipfile_serialization": False}])
+@pytest.mark.parametrize(
+    "way", [{}, {"pickle_protocol": 4}, {"_use_new_zipfile_serialization": False}]
+)
 def test_forms_in_use_load(tmp_path: Path, form: str, way: dict[str, Any]) -> None:
     path, content = tmp_path / "weights.pth", FORMS[form]()
     torch.save(content, path, **way)
     tensors = content.get("state_dict", content.get("model", content))
-    wanted = {name: each for name, each in tensors.items() if isinstance(name, str) and isinstance(each, torch.Tensor)}
+    wanted = {
+        name: each
+        for name, each in tensors.items()
+        if isinstance(name, str) and isinstance(each, torch.Tensor)
+    }
     torch.testing.assert_close(dict(read_weights(path).tensors), wanted, rtol=0, atol=0)
 
 
@@ -88,11 +111,18 @@ def test_forms_in_use_load(tmp_path: Path, form: str, way: dict[str, Any]) -> No
 def test_the_healthy_file_beside_the_hostile_ones(tmp_path: Path, *, old_form: bool) -> None:
     path = tmp_path / "weights.pth"
     path.write_bytes(old(GOOD) if old_form else pt(GOOD))
-    assert read_weights(path).tensors[NAME].tolist() == torch.load(path, weights_only=True)[NAME].tolist() == [0.0]
+    assert (
+        read_weights(path).tensors[NAME].tolist()
+        == torch.load(path, weights_only=True)[NAME].tolist()
+        == [0.0]
+    )
 
 
 def test_items_as_python_2_wrote_them(tmp_path: Path) -> None:
-    path, items = tmp_path / "old.pth", b"]](U\x0fimg_neck.weight" + tensor(b"K\x02\x85", b"K\x01\x85") + b"ea"
+    path, items = (
+        tmp_path / "old.pth",
+        b"]](U\x0fimg_neck.weight" + tensor(b"K\x02\x85", b"K\x01\x85") + b"ea",
+    )
     path.write_bytes(pt(b"ccollections\nOrderedDict\n" + items + b"\x85R."))
     assert list(read_weights(path).tensors) == [NAME]
 
@@ -110,7 +140,15 @@ def pt(pickled: bytes, storage: bytes = bytes(16), way: int = zipfile.ZIP_STORED
 def tensor(shape: bytes, strides: bytes, offset: bytes = b"K\0") -> bytes:
     """A tensor of the storage 0; shape and strides as opcodes."""
     storage = b"(U\x07storagectorch\nFloatStorage\nU\x010U\x03cpuK\x04tQ"
-    return b"ctorch._utils\n_rebuild_tensor_v2\n(" + storage + offset + shape + strides + b"\x89Nt" + b"R"
+    return (
+        b"ctorch._utils\n_rebuild_tensor_v2\n("
+        + storage
+        + offset
+        + shape
+        + strides
+        + b"\x89Nt"
+        + b"R"
+    )
 
 
 def named(value: bytes, name: bytes = b"U\x0fimg_neck.weight") -> bytes:
@@ -118,7 +156,9 @@ def named(value: bytes, name: bytes = b"U\x0fimg_neck.weight") -> bytes:
     return b"}" + name + value + b"s."
 
 
-def old(held: bytes, names: bytes = b"](U\x010e.", storages: bytes = struct.pack("<q", 4) + bytes(16)) -> bytes:
+def old(
+    held: bytes, names: bytes = b"](U\x010e.", storages: bytes = struct.pack("<q", 4) + bytes(16)
+) -> bytes:
     """A file as torch wrote it before 1.6."""
     begin = b"\x80\x02\x8a\nl\xfc\x9cF\xf9 j\xa8P\x19.\x80\x02M\xe9\x03.\x80\x02}U\x0dlittle_endian\x88s."
     held = held.replace(b"K\x04tQ", b"K\x04NtQ")  # and not a view of another storage
@@ -246,7 +286,9 @@ def test_bombs_and_nonsense_are_refused_in_little_memory(tmp_path: Path) -> None
     paths = [str(tmp_path / f"{number}.pth") for number in range(len(HOSTILE))]
     for path, content in zip(paths, HOSTILE.values(), strict=True):
         Path(path).write_bytes(content)
-    ended = subprocess.run([sys.executable, "-c", CODE, *paths], capture_output=True, text=True, check=True)
+    ended = subprocess.run(
+        [sys.executable, "-c", CODE, *paths], capture_output=True, text=True, check=True
+    )
     told = dict(zip(HOSTILE, map(json.loads, ended.stdout.splitlines()), strict=True))
     refusal = re.compile(r"(?P<path>.*\.pth): (is no|holds no) .*; give .*")
     wrong = {
@@ -274,4 +316,7 @@ def test_notes_of_no_model_are_refused(tmp_path: Path, change: dict[str, Any]) -
     path = tmp_path / "weights.safetensors"
     write_weights(path, {NAME: BASE}, {"preset": "tiny", "fusion": None, "horizon": None, **change})
     told = r"does not say which model its weights are of \([^\n]*\); give"
-    assert_refused((lambda: load_model(path), ConfigError, told), (lambda: load_model(path), ConfigError, SHORT))
+    assert_refused(
+        (lambda: load_model(path), ConfigError, told),
+        (lambda: load_model(path), ConfigError, SHORT),
+    )

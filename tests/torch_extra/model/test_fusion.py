@@ -29,8 +29,12 @@ RELEASED = ReleasedFusionConfig(channels=C, ego_channels=(1, 4))
 DISCONET = DiscoNetConfig(channels=C, hidden=(16, 4))
 COBEVT = CobevtConfig(channels=C, depth=2, window=4)
 V2XVIT = V2XViTConfig(channels=C, depth=2, heads=2, windows=(2, 4), window_heads=(2, 1))
-ALL = pytest.mark.parametrize("config", [MEAN, MAX, RELEASED, DISCONET, COBEVT, V2XVIT], ids=lambda c: type(c).__name__)
-LEARNED = pytest.mark.parametrize("config", [DISCONET, COBEVT, V2XVIT], ids=lambda c: type(c).__name__)
+ALL = pytest.mark.parametrize(
+    "config", [MEAN, MAX, RELEASED, DISCONET, COBEVT, V2XVIT], ids=lambda c: type(c).__name__
+)
+LEARNED = pytest.mark.parametrize(
+    "config", [DISCONET, COBEVT, V2XVIT], ids=lambda c: type(c).__name__
+)
 Batch = tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]
 
 
@@ -67,11 +71,15 @@ def test_partners_count_in_any_order(config: FusionConfig) -> None:
 def test_what_the_mask_hides_has_no_effect(config: FusionConfig, training: bool) -> None:
     x, mask, infra, delay = batch()
     garbage = torch.where(mask[:, :, None], x, torch.nan)
-    assert torch.equal(*[module(config).train(training)(each, mask, infra, delay) for each in (x, garbage)])
+    assert torch.equal(
+        *[module(config).train(training)(each, mask, infra, delay) for each in (x, garbage)]
+    )
 
 
 @ALL
-def test_every_partner_counts_where_it_is_seen_and_each_sample_for_itself(config: FusionConfig) -> None:
+def test_every_partner_counts_where_it_is_seen_and_each_sample_for_itself(
+    config: FusionConfig,
+) -> None:
     x, mask, infra, delay = batch()
     model, whole = module(config), torch.ones_like(mask)
     fused = model(x, whole, infra, delay)
@@ -110,19 +118,28 @@ def test_mean_and_maximum_are_over_those_that_are_seen() -> None:
         torch.testing.assert_close(module(config)(x, mask, infra, delay)[0, :, 3, 4], expected)
 
 
-@pytest.mark.parametrize("config", [replace(V2XVIT, masked_cells="windowed"), replace(COBEVT, masked_cells="averaged")])
+@pytest.mark.parametrize(
+    "config", [replace(V2XVIT, masked_cells="windowed"), replace(COBEVT, masked_cells="averaged")]
+)
 def test_transformers_can_see_what_the_mask_hides(config: FusionConfig) -> None:
     x, mask, infra, delay = batch()
     louder = torch.where(mask[:, :, None], x, 3 * x)
-    assert not torch.allclose(*[module(config)(each, mask, infra, delay) for each in (louder, x)], atol=1e-4)
+    assert not torch.allclose(
+        *[module(config)(each, mask, infra, delay) for each in (louder, x)], atol=1e-4
+    )
 
 
 @settings(max_examples=30)
 @given(st.integers(1, 4), st.integers(1, 9), st.integers(1, 9), st.booleans())
-def test_windows_are_joined_as_they_were_split(size: int, height: int, width: int, strided: bool) -> None:
+def test_windows_are_joined_as_they_were_split(
+    size: int, height: int, width: int, strided: bool
+) -> None:
     windows = Windows(size=size, strided=strided)
     maps = torch.rand(2, 3, height, width, 2) + 1
-    tokens, known = windows.split(maps), windows.split_mask(torch.ones(2, 3, height, width, dtype=torch.bool))
+    tokens, known = (
+        windows.split(maps),
+        windows.split_mask(torch.ones(2, 3, height, width, dtype=torch.bool)),
+    )
     assert torch.equal(windows.join(tokens, maps.shape[:4]), maps)
     assert torch.equal(known, tokens[..., 0] > 0)
     assert known.any(1).all()
@@ -130,7 +147,9 @@ def test_windows_are_joined_as_they_were_split(size: int, height: int, width: in
 
 
 @pytest.mark.parametrize(("strided", "held"), [(False, [2, 3, 8, 9]), (True, [1, 4, 13, 16])])
-def test_windows_hold_neighbours_or_cells_spread_over_the_map(strided: bool, held: list[int]) -> None:
+def test_windows_hold_neighbours_or_cells_spread_over_the_map(
+    strided: bool, held: list[int]
+) -> None:
     numbers = torch.arange(24).view(1, 1, 4, 6, 1)
     assert Windows(size=2, strided=strided).split(numbers)[1, :, 0].tolist() == held
 
@@ -138,12 +157,36 @@ def test_windows_hold_neighbours_or_cells_spread_over_the_map(strided: bool, hel
 def test_wrong_configs_say_so() -> None:
     cobevt_of_slots = module(replace(COBEVT, agent_relation="slots", agents=4))
     assert_refused(
-        (lambda: ReleasedFusionConfig(channels=C), ConfigError, r"expected numbers from 0 to 7, found \[31, 41"),
-        (lambda: cobevt_of_slots(*batch(agents=5)), ConfigError, r"4 slots, found 5; raise CobevtConfig\.agents"),
+        (
+            lambda: ReleasedFusionConfig(channels=C),
+            ConfigError,
+            r"expected numbers from 0 to 7, found \[31, 41",
+        ),
+        (
+            lambda: cobevt_of_slots(*batch(agents=5)),
+            ConfigError,
+            r"4 slots, found 5; raise CobevtConfig\.agents",
+        ),
         (lambda: replace(COBEVT, heads=3), ConfigError, "heads: 3 do not divide 8 channels"),
-        (lambda: replace(V2XVIT, window_heads=(2, 3)), ConfigError, "window_heads: 3 do not divide 8 channels"),
-        (lambda: replace(V2XVIT, window_heads=(2,)), ConfigError, r"one number for each of 2 windows, found \(2,\)"),
-        (lambda: PoolFusionConfig(by="sum"), ConfigError, "by: expected one of mean, max, found 'sum'"),
-        (lambda: Agent3DConfig(channels=C, agents=1), ConfigError, "agents: expected at least 2, found 1"),
+        (
+            lambda: replace(V2XVIT, window_heads=(2, 3)),
+            ConfigError,
+            "window_heads: 3 do not divide 8 channels",
+        ),
+        (
+            lambda: replace(V2XVIT, window_heads=(2,)),
+            ConfigError,
+            r"one number for each of 2 windows, found \(2,\)",
+        ),
+        (
+            lambda: PoolFusionConfig(by="sum"),
+            ConfigError,
+            "by: expected one of mean, max, found 'sum'",
+        ),
+        (
+            lambda: Agent3DConfig(channels=C, agents=1),
+            ConfigError,
+            "agents: expected at least 2, found 1",
+        ),
         (lambda: fusion("mean"), ConfigError, "the config of a fusion module, found 'mean'"),
     )

@@ -45,7 +45,9 @@ def rig(seed: int = 0, shape: tuple[int, int, int] = (2, 2, 3)) -> CameraGeometr
         "translation": random.uniform(-2, 2, (count, 3)),
         "intrinsics": np.tile(CAMERA.intrinsic, (count, 1, 1)),
     }
-    return CameraGeometry(**{name: torch.tensor(each).float().unflatten(0, shape) for name, each in given.items()})
+    return CameraGeometry(
+        **{name: torch.tensor(each).float().unflatten(0, shape) for name, each in given.items()}
+    )
 
 
 def lift_of(config: LiftConfig) -> LiftSplat:
@@ -68,25 +70,39 @@ def posed(rotation: np.ndarray, position: ArrayLike) -> SE3:
 
 def one_camera(camera: PinholeCamera, ego_from_camera: SE3) -> CameraGeometry:
     parts = (ego_from_camera.matrix[:3, :3], ego_from_camera.matrix[:3, 3], camera.intrinsic)
-    rotation, translation, intrinsics = (torch.tensor(np.array(each))[None, None, None] for each in parts)
+    rotation, translation, intrinsics = (
+        torch.tensor(np.array(each))[None, None, None] for each in parts
+    )
     return CameraGeometry(rotation=rotation, translation=translation, intrinsics=intrinsics)
 
 
 # --- geometry
 
 
-@given(ANGLES, ANGLES, ANGLES, arrays((3,), 5.0), st.floats(10, 200), st.floats(10, 200), arrays((2,), 30.0))
+@given(
+    ANGLES,
+    ANGLES,
+    ANGLES,
+    arrays((3,), 5.0),
+    st.floats(10, 200),
+    st.floats(10, 200),
+    arrays((2,), 30.0),
+)
 def test_points_lie_where_the_devkit_sees_them(yaw, pitch, roll, position, fx, fy, centre):
     """Points project onto the centres of their pixels at their depths, and their cells are those of a BevGrid."""
     lift = lift_of(replace(CONFIG, z=(-100, 100, 200)))
-    camera = PinholeCamera(np.array([[fx, 0, 20 + centre[0]], [0, fy, 12 + centre[1]], [0, 0, 1]]), 40, 24)
+    camera = PinholeCamera(
+        np.array([[fx, 0, 20 + centre[0]], [0, fy, 12 + centre[1]], [0, 0, 1]]), 40, 24
+    )
     ego_from_camera = posed(rotation_matrix(yaw, pitch, roll), position)
     cameras = one_camera(camera, ego_from_camera)
     points = lift.points(cameras).numpy().reshape(-1, 3)
     pixels, depth = camera.project(ego_from_camera.inverse().apply(points))
     d, i, j = np.meshgrid(np.arange(8), np.arange(3), np.arange(5), indexing="ij")
     np.testing.assert_allclose(depth, 2.0 + 2 * d.ravel(), atol=1e-4)
-    np.testing.assert_allclose(pixels, np.stack([8 * j.ravel() + 4, 8 * i.ravel() + 4], 1), atol=1e-3)
+    np.testing.assert_allclose(
+        pixels, np.stack([8 * j.ravel() + 4, 8 * i.ravel() + 4], 1), atol=1e-3
+    )
 
     index, inside = BevGrid(x=CONFIG.x, y=CONFIG.y).index_of(points)
     expected = np.where(inside & (np.abs(points[:, 2]) < 100), index @ (32, 1), -1)
@@ -102,16 +118,25 @@ def test_one_pixel_at_one_depth_lights_one_cell():
     lift.depthnet.weight.data[8:, :3, 0, 0] = torch.eye(3)
     features, expected = torch.zeros(1, 1, 1, 5, 3, 5), torch.zeros(1, 1, 3, 64, 32)
     features[0, 0, 0, :3, 1, 3] = expected[0, 0, :, 26, 22] = torch.tensor([1.0, 2.0, 3.0])
-    torch.testing.assert_close(lift(features, one_camera(CAMERA, posed(FORWARD, (0, 0, 1)))), expected)
+    torch.testing.assert_close(
+        lift(features, one_camera(CAMERA, posed(FORWARD, (0, 0, 1)))), expected
+    )
 
 
 @pytest.mark.parametrize(
     ("frustum", "columns", "rows"),
-    [("centres", [4, 12, 20, 28, 36], [4, 12, 20]), ("corners", [0, 9.75, 19.5, 29.25, 39], [0, 11.5, 23])],
+    [
+        ("centres", [4, 12, 20, 28, 36], [4, 12, 20]),
+        ("corners", [0, 9.75, 19.5, 29.25, 39], [0, 11.5, 23]),
+    ],
 )
 def test_rays_pass_through_the_centres_or_from_corner_to_corner(frustum, columns, rows):
     rays = LiftSplat(replace(CONFIG, frustum=frustum)).frustum
-    depths, down, along = torch.arange(2.0, 18, 2), torch.tensor(rows).float(), torch.tensor(columns).float()
+    depths, down, along = (
+        torch.arange(2.0, 18, 2),
+        torch.tensor(rows).float(),
+        torch.tensor(columns).float(),
+    )
     expected = torch.stack(torch.meshgrid(depths, down, along, indexing="ij")[::-1], dim=-1)
     torch.testing.assert_close(rays, expected, rtol=0, atol=0)
 
@@ -123,7 +148,9 @@ def test_a_wide_map_holds_all_that_the_pixels_have():
     """Probabilities of depths sum to 1, so that the map's sum is the sum over pixels, frame by frame."""
     lift, features = lift_of(WIDE), noise(2, 2, 3, 5, 3, 5)
     pixels = lift.depthnet(features.flatten(0, 2))[:, 8:].unflatten(0, (2, 2, 3))
-    torch.testing.assert_close(lift(features, rig()).sum((3, 4)), pixels.sum((2, 4, 5)), atol=1e-4, rtol=1e-4)
+    torch.testing.assert_close(
+        lift(features, rig()).sum((3, 4)), pixels.sum((2, 4, 5)), atol=1e-4, rtol=1e-4
+    )
 
 
 def test_gradients_reach_the_features_and_every_weight():
@@ -150,9 +177,15 @@ def test_only_points_in_the_band_above_the_road_count():
 
 def test_a_mean_does_not_grow_with_the_number_of_points():
     """Where all features are equal, each cell that is reached has them, or nearly."""
-    lift, cameras = without_weights(replace(CONFIG, pooling="mean"), {8: 1.0, 9: 2.0, 10: 3.0}), rig()
+    lift, cameras = (
+        without_weights(replace(CONFIG, pooling="mean"), {8: 1.0, 9: 2.0, 10: 3.0}),
+        rig(),
+    )
     maps, cells = lift(noise(2, 2, 3, 5, 3, 5), cameras), lift.cells(cameras).flatten(2)
-    points = [[torch.bincount(each[each >= 0], minlength=64 * 32).view(64, 32) for each in row] for row in cells]
+    points = [
+        [torch.bincount(each[each >= 0], minlength=64 * 32).view(64, 32) for each in row]
+        for row in cells
+    ]
     mass = torch.stack([torch.stack(row) for row in points]) / 8
     expected = (mass / (mass + 0.01))[:, :, None] * torch.tensor([1.0, 2.0, 3.0])[:, None, None]
     torch.testing.assert_close(maps, expected)
@@ -181,5 +214,9 @@ def test_features_of_another_shape_are_named():
     lift, good = lift_of(CONFIG), noise(2, 2, 3, 5, 3, 5)
     assert_refused(
         (lambda: lift(noise(2, 2, 3, 5, 5, 3), rig()), GeometryError, ("features", "(…, 3, 5)")),
-        (lambda: lift(good, rig(shape=(2, 2, 2))), GeometryError, ("cameras", "cells (2, 2, 3, 8, 3, 5)")),
+        (
+            lambda: lift(good, rig(shape=(2, 2, 2))),
+            GeometryError,
+            ("cameras", "cells (2, 2, 3, 8, 3, 5)"),
+        ),
     )

@@ -69,7 +69,9 @@ def read(make: Callable[[], object]) -> list[Any]:
         (without_a_file, SensorFileError, ("image.jpg", "restore it")),
     ],
 )
-def test_a_worker_that_fails_ends_the_reading(make: Callable[[], object], error: type[Exception], facts: Any) -> None:
+def test_a_worker_that_fails_ends_the_reading(
+    make: Callable[[], object], error: type[Exception], facts: Any
+) -> None:
     assert_refused((lambda: read(make), error, facts))
 
 
@@ -78,4 +80,6 @@ def test_workers_that_cannot_start_are_named(monkeypatch: pytest.MonkeyPatch) ->
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(multiprocessing, "Queue", no_room)
-    assert_refused((lambda: read(int), WorkerError, ("cannot be started", "No space left", *REMEDY)))
+    assert_refused(
+        (lambda: read(int), WorkerError, ("cannot be started", "No space left", *REMEDY))
+    )

@@ -51,9 +51,15 @@ def test_shapes_with_and_without_targets(config) -> None:
 @pytest.mark.parametrize("hidden_warp", ["none", "warped"])
 @pytest.mark.parametrize("detach", [True, False])
 def test_every_weight_learns(config, hidden_warp, detach) -> None:
-    head, features, targets = head_and_data(dataclasses.replace(config, hidden_warp=hidden_warp, detach=detach))
+    head, features, targets = head_and_data(
+        dataclasses.replace(config, hidden_warp=hidden_warp, detach=detach)
+    )
     sum(motion_losses(head(features, targets), targets, LOSSES).values()).backward()
-    unused = [name for name, values in head.named_parameters() if values.grad is None or not values.grad.any()]
+    unused = [
+        name
+        for name, values in head.named_parameters()
+        if values.grad is None or not values.grad.any()
+    ]
     assert not unused
 
 
@@ -85,8 +91,12 @@ def test_the_posterior_sees_the_future_and_not_the_present() -> None:
 
 
 @pytest.mark.parametrize(("posterior_ignore", "is_seen"), [("keep", True), ("zero", False)])
-def test_the_posterior_sees_the_mark_of_ignored_cells_only_where_it_is_kept(posterior_ignore, is_seen) -> None:
-    head, features, targets = head_and_data(dataclasses.replace(SEPARATE, posterior_ignore=posterior_ignore))
+def test_the_posterior_sees_the_mark_of_ignored_cells_only_where_it_is_kept(
+    posterior_ignore, is_seen
+) -> None:
+    head, features, targets = head_and_data(
+        dataclasses.replace(SEPARATE, posterior_ignore=posterior_ignore)
+    )
     cleared = targets._replace(offset=targets.offset.where(targets.offset != 255, 0))
     marked, zero = (head.eval()(features, given).future.mu for given in (targets, cleared))
     assert torch.equal(marked, zero) is not is_seen
@@ -101,7 +111,9 @@ def test_frames_that_do_not_count_change_no_loss() -> None:
     present = LatentDistribution(*(torch.cat([each[:1], each[1:] + 3]) for each in outputs.present))
     before = motion_losses(outputs, targets, LOSSES)
     assert all(loss.item() > 0 for loss in before.values())
-    assert same(motion_losses(MotionOutputs(changed, present, outputs.future), targets, LOSSES), before)
+    assert same(
+        motion_losses(MotionOutputs(changed, present, outputs.future), targets, LOSSES), before
+    )
 
 
 def test_a_batch_without_a_frame_that_counts_gives_zero_gradients() -> None:
@@ -123,8 +135,14 @@ def test_a_certain_and_wrong_centre_costs_a_finite_loss() -> None:
 
 
 def test_a_sample_without_its_past_has_no_frame_that_counts() -> None:
-    label_valid, past_valid = torch.tensor([[1, 1, 0], [1, 1, 1]]).bool(), torch.tensor([[1, 1], [0, 1]]).bool()
-    assert frame_mask(label_valid, past_valid).tolist() == [[True, True, False], [False, False, False]]
+    label_valid, past_valid = (
+        torch.tensor([[1, 1, 0], [1, 1, 1]]).bool(),
+        torch.tensor([[1, 1], [0, 1]]).bool(),
+    )
+    assert frame_mask(label_valid, past_valid).tolist() == [
+        [True, True, False],
+        [False, False, False],
+    ]
 
 
 def test_what_does_not_fit_is_refused() -> None:
@@ -156,14 +174,38 @@ def test_what_does_not_fit_is_refused() -> None:
 @pytest.mark.parametrize(
     ("config", "values", "message"),
     [
-        (MotionHeadConfig, {"hidden_warp": "moved"}, "hidden_warp: expected one of none, warped, found 'moved'"),
-        (MotionHeadConfig, {"posterior_ignore": "drop"}, "posterior_ignore: expected one of keep, zero, found 'drop'"),
-        (MotionHeadConfig, {"decoders": "none"}, "decoders: expected one of separate, shuffled, found 'none'"),
+        (
+            MotionHeadConfig,
+            {"hidden_warp": "moved"},
+            "hidden_warp: expected one of none, warped, found 'moved'",
+        ),
+        (
+            MotionHeadConfig,
+            {"posterior_ignore": "drop"},
+            "posterior_ignore: expected one of keep, zero, found 'drop'",
+        ),
+        (
+            MotionHeadConfig,
+            {"decoders": "none"},
+            "decoders: expected one of separate, shuffled, found 'none'",
+        ),
         (MotionHeadConfig, {"latent": 0}, "latent: expected a number from 1, found 0"),
-        (MotionHeadConfig, {"log_sigma": (5, -5)}, r"smaller limit first, such as \(-5, 5\), found \(5, -5\)"),
-        (MotionHeadConfig, {"upsample": 2}, "separate decoders keep the states' resolution, found 2; choose 1, or"),
+        (
+            MotionHeadConfig,
+            {"log_sigma": (5, -5)},
+            r"smaller limit first, such as \(-5, 5\), found \(5, -5\)",
+        ),
+        (
+            MotionHeadConfig,
+            {"upsample": 2},
+            "separate decoders keep the states' resolution, found 2; choose 1, or",
+        ),
         (MotionLossConfig, {"top_k": 0}, "top_k: expected a share above 0 and at most 1, found 0"),
-        (MotionLossConfig, {"class_weights": (1.0,)}, r"those of background and foreground, found \(1.0,\)"),
+        (
+            MotionLossConfig,
+            {"class_weights": (1.0,)},
+            r"those of background and foreground, found \(1.0,\)",
+        ),
     ],
 )
 def test_impossible_values_are_refused(config, values, message) -> None:
@@ -177,6 +219,11 @@ def head_and_data(config: MotionHeadConfig) -> tuple[MotionHead, Tensor, MotionT
     segmentation[..., 2:8, 2:10] = 1
     centerness = 0.5 * segmentation[:, :, None].float()
     centerness[..., 4, 6] = 1
-    vectors = [torch.randn(2, frames, 2, *size).where(segmentation[:, :, None] == 1, 255.0) for _ in range(2)]
-    targets = MotionTargets(segmentation, centerness, *vectors, torch.ones(2, frames, dtype=torch.bool))
+    vectors = [
+        torch.randn(2, frames, 2, *size).where(segmentation[:, :, None] == 1, 255.0)
+        for _ in range(2)
+    ]
+    targets = MotionTargets(
+        segmentation, centerness, *vectors, torch.ones(2, frames, dtype=torch.bool)
+    )
     return MotionHead(config).train(), torch.randn(2, config.in_channels, ROWS, COLUMNS), targets

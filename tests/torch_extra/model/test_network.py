@@ -23,7 +23,9 @@ FUSIONS = get_args(ModelFusion)
 BOTH = "cameras and LiDARs"
 
 
-def assert_same(found: list[torch.Tensor], expected: list[torch.Tensor], tolerance: float = 1e-4) -> None:
+def assert_same(
+    found: list[torch.Tensor], expected: list[torch.Tensor], tolerance: float = 1e-4
+) -> None:
     for one, other in zip(found, expected, strict=True):
         assert_close(one, other, atol=tolerance, rtol=tolerance)
 
@@ -35,22 +37,33 @@ def apart(one: list[torch.Tensor], other: list[torch.Tensor]) -> float:
 def of_fusion(name: str) -> ModelConfig:
     if name == BOTH:
         return small_both()
-    own = ReleasedFusionConfig(channels=8, ego_channels=(1, 5))  # the released numbers are of 64 channels
+    own = ReleasedFusionConfig(
+        channels=8, ego_channels=(1, 5)
+    )  # the released numbers are of 64 channels
     return replace(small(), fusion=own if name == "released" else fusion_config(name, 8))
 
 
-def alone(da: DeepAccident, token: str, config: ModelConfig, agents: Any, **options: Any) -> dict[str, Any]:
+def alone(
+    da: DeepAccident, token: str, config: ModelConfig, agents: Any, **options: Any
+) -> dict[str, Any]:
     return V2XDataset(da, [token], config.inputs(agents, **options))[0]
 
 
 def egos_by_themselves(
-    model: V2XFormer, predicted: Predicted, da: DeepAccident, tokens: list[str], agents: str, rows: slice = slice(None)
+    model: V2XFormer,
+    predicted: Predicted,
+    da: DeepAccident,
+    tokens: list[str],
+    agents: str,
+    rows: slice = slice(None),
 ) -> list[str]:
     """A moment's egos; what is predicted for some of them at once is what is predicted for each by itself."""
     [item] = AllEgosDataset(da, tokens, model.config.inputs(agents))
     together = predicted(model, model_inputs(collate_all_egos([item]), model.config.handedness))
     for row, token in list(enumerate(item["egos"]))[rows]:
-        inputs = model_inputs(collate([alone(da, token, model.config, agents)]), model.config.handedness)
+        inputs = model_inputs(
+            collate([alone(da, token, model.config, agents)]), model.config.handedness
+        )
         assert_same([each[row : row + 1] for each in together], predicted(model, inputs))
     return list(item["egos"])
 
@@ -83,7 +96,9 @@ def test_agents_that_no_ego_hears_are_not_encoded(
 ) -> None:
     """Of two moments; what is predicted for the egos that are left is what it was."""
     model = seeded(make())
-    data = AllEgosDataset(da, [*moment, *(token[:-1] + "5" for token in moment)], model.config.inputs(agents))
+    data = AllEgosDataset(
+        da, [*moment, *(token[:-1] + "5" for token in moment)], model.config.inputs(agents)
+    )
     inputs = model_inputs(collate_all_egos([data[0], data[1]]))
     rows = torch.tensor([7, 3])  # the second moment's ego first
     some = inputs.of_egos(rows)
@@ -94,7 +109,11 @@ def test_agents_that_no_ego_hears_are_not_encoded(
 
 @pytest.mark.parametrize("make", [small, small_lidar, small_both])
 def test_other_moments_of_a_batch_change_nothing(
-    da: DeepAccident, moment: list[str], seeded: Seeded, predicted: Predicted, make: Callable[[], ModelConfig]
+    da: DeepAccident,
+    moment: list[str],
+    seeded: Seeded,
+    predicted: Predicted,
+    make: Callable[[], ModelConfig],
 ) -> None:
     """Nor does it matter that an item has fewer agents, or another augmentation."""
     config = make()
@@ -115,8 +134,17 @@ def test_the_order_of_partners_does_not_matter(
 ) -> None:
     model, order = seeded(of_fusion(name)), [0, 3, 1, 4, 2]
     item = alone(da, moment[0], model.config, "all")
-    tensors = ("agent_valid", "files_missing", "images", "ego_from_agent", "agent_from_past", "intrinsics")
-    shuffled = item | {key: item[key][order] for key in (*tensors, "ego_from_camera", "image_from_ego")}
+    tensors = (
+        "agent_valid",
+        "files_missing",
+        "images",
+        "ego_from_agent",
+        "agent_from_past",
+        "intrinsics",
+    )
+    shuffled = item | {
+        key: item[key][order] for key in (*tensors, "ego_from_camera", "image_from_ego")
+    }
     for key in {"agents", "points"} & item.keys():
         shuffled[key] = type(item[key])(item[key][row] for row in order)
     assert_same(*[predicted(model, model_inputs(collate([each]))) for each in (item, shuffled)])
@@ -138,11 +166,17 @@ def test_partners_that_are_not_heard_leave_the_ego_alone(
 
 
 def test_all_egos_of_a_partial_release_are_each_by_itself(
-    da_partial: DeepAccident, moment: list[str], config: ModelConfig, seeded: Seeded, predicted: Predicted
+    da_partial: DeepAccident,
+    moment: list[str],
+    config: ModelConfig,
+    seeded: Seeded,
+    predicted: Predicted,
 ) -> None:
     """The moment's first agent lacks a camera: it is no ego and no partner, and the others' places stay right."""
     there = [token for token in moment if "other_vehicle_behind" not in token]
-    assert egos_by_themselves(seeded(config), predicted, da_partial, there, "available") == there[1:]
+    assert (
+        egos_by_themselves(seeded(config), predicted, da_partial, there, "available") == there[1:]
+    )
 
 
 def test_fusions_that_ask_know_kinds_and_delays(
@@ -151,7 +185,10 @@ def test_fusions_that_ask_know_kinds_and_delays(
     """Of the right agents, in whichever order they stand."""
     batch = collate([alone(da, moment[0], of_fusion("v2xvit"), "all")])
     inputs = model_inputs(batch)
-    late, parked = model_inputs(batch, delay=2), replace(inputs, is_infrastructure=torch.zeros(1, 5).bool())
+    late, parked = (
+        model_inputs(batch, delay=2),
+        replace(inputs, is_infrastructure=torch.zeros(1, 5).bool()),
+    )
     for name, differs in (("mean", False), ("v2xvit", True)):
         model = seeded(of_fusion(name))
         for changed in (late, parked):

@@ -26,7 +26,9 @@ def encoder() -> PillarEncoder:
     return PillarEncoder(PillarConfig(channels=4, grid=GRID, width=6)).eval()
 
 
-def reached(encoder: PillarEncoder, points: list[list[float]], frame: list[int], frames: int = 1) -> torch.Tensor:
+def reached(
+    encoder: PillarEncoder, points: list[list[float]], frame: list[int], frames: int = 1
+) -> torch.Tensor:
     """(frames, Y, X) bool: where a map differs from that of no points."""
     with torch.inference_mode():
         maps = encoder(torch.tensor(points), torch.tensor(frame), frames)
@@ -47,7 +49,9 @@ def test_points_are_of_their_own_frame(encoder: PillarEncoder) -> None:
     assert not (found[1] & found[2]).any()
 
 
-@pytest.mark.parametrize("point", [(10.5, 0, 0), (-10.01, 0, 0), (0, 5.0, 0), (0, -5.5, 0), (0, 0, -0.6), (0, 0, 4.0)])
+@pytest.mark.parametrize(
+    "point", [(10.5, 0, 0), (-10.01, 0, 0), (0, 5.0, 0), (0, -5.5, 0), (0, 0, -0.6), (0, 0, 4.0)]
+)
 def test_what_lies_outside_does_not_count(encoder: PillarEncoder, point: tuple[float, ...]) -> None:
     assert not reached(encoder, [[*point, 0.5]], [0]).any()
 
@@ -64,7 +68,9 @@ def test_points_stand_on_the_road(da: DeepAccident, moment: list[str]) -> None:
         assert abs(float(own[:, 2].median())) < 1.0
 
 
-def test_a_frame_that_did_not_arrive_has_the_points_of_the_present(da: DeepAccident, moment: list[str]) -> None:
+def test_a_frame_that_did_not_arrive_has_the_points_of_the_present(
+    da: DeepAccident, moment: list[str]
+) -> None:
     """As it has the images of the present."""
     first = moment[0].rsplit("/", 1)[0] + "/001"
     inputs = model_inputs(collate([V2XDataset(da, [first], small_lidar().inputs("single"))[0]]))
@@ -81,5 +87,9 @@ def test_faults_are_named(da: DeepAccident, moment: list[str]) -> None:
     assert_refused(
         (lambda: model(seen), ConfigError, ("inputs: have no images", "config.inputs")),
         (lambda: replace(made, split=0), ConfigError, "split: expected a number from 1"),
-        (lambda: replace(made, height=(2.0, 1.0)), ConfigError, "height: expected a lower and a higher end"),
+        (
+            lambda: replace(made, height=(2.0, 1.0)),
+            ConfigError,
+            "height: expected a lower and a higher end",
+        ),
     )

@@ -97,8 +97,14 @@ def test_the_seed_changes_the_draws_but_not_the_mean(
     model: V2XFormer, da: DeepAccident, tokens: list[str], found: list[SamplePrediction]
 ) -> None:
     [other] = predict(model, da, tokens[:1], PredictConfig(seed=1))
-    segmentations = [[heads.segmentation for heads in each.motion.heads or ()] for each in (found[0], other)]
-    assert [np.array_equal(*pair) for pair in zip(*segmentations, strict=True)] == [False, False, True]
+    segmentations = [
+        [heads.segmentation for heads in each.motion.heads or ()] for each in (found[0], other)
+    ]
+    assert [np.array_equal(*pair) for pair in zip(*segmentations, strict=True)] == [
+        False,
+        False,
+        True,
+    ]
     assert not np.array_equal(*segmentations[0][:2])
 
 
@@ -106,7 +112,9 @@ def test_partners_and_the_link_matter(
     model: V2XFormer, da: DeepAccident, tokens: list[str], found: list[SamplePrediction]
 ) -> None:
     links = ({"agents": "single"}, {"link": Link(latency=0.2)}, {"link": Link(packet_loss=1.0)})
-    single, late, lost = (predict(model, da, tokens[:1], PredictConfig(**each))[0] for each in links)
+    single, late, lost = (
+        predict(model, da, tokens[:1], PredictConfig(**each))[0] for each in links
+    )
     assert (same(single, found[0]), same(late, found[0])) == (False, False)
     for a, b in zip(arrays(lost), arrays(single), strict=True):
         np.testing.assert_allclose(a, b, atol=1e-4)
@@ -116,8 +124,13 @@ def test_a_release_without_images_is_refused(
     model: V2XFormer, release_root: Path, moment: list[str], tmp_path: Path
 ) -> None:
     """Such as one whose camera archives were not unpacked."""
-    shutil.copytree(release_root, tmp_path / "blind", ignore=shutil.ignore_patterns(".deepaccident", "Camera_*"))
-    blind, named = DeepAccident("v1", tmp_path / "blind", verbose=False), ("no images", "unpack", "--sensors cameras")
+    shutil.copytree(
+        release_root, tmp_path / "blind", ignore=shutil.ignore_patterns(".deepaccident", "Camera_*")
+    )
+    blind, named = (
+        DeepAccident("v1", tmp_path / "blind", verbose=False),
+        ("no images", "unpack", "--sensors cameras"),
+    )
     assert_refused((lambda: predict(model, blind, moment[:1]), NotAvailableError, named))
     assert predict(model, blind, []) == []
 
@@ -125,20 +138,30 @@ def test_a_release_without_images_is_refused(
 def test_a_release_without_point_clouds_is_refused_by_models_that_need_them(
     release_root: Path, moment: list[str], tmp_path: Path
 ) -> None:
-    shutil.copytree(release_root, tmp_path / "flat", ignore=shutil.ignore_patterns(".deepaccident", "lidar01"))
+    shutil.copytree(
+        release_root, tmp_path / "flat", ignore=shutil.ignore_patterns(".deepaccident", "lidar01")
+    )
     flat = DeepAccident("v1", tmp_path / "flat", verbose=False)
     with pytest.raises(NotAvailableError, match=r"no point clouds.*--sensors all"):
         predict(V2XFormer(small_lidar()).eval(), flat, moment[:1])
 
 
 def test_results_are_written_and_read(
-    model: V2XFormer, da: DeepAccident, tokens: list[str], found: list[SamplePrediction], tmp_path: Path
+    model: V2XFormer,
+    da: DeepAccident,
+    tokens: list[str],
+    found: list[SamplePrediction],
+    tmp_path: Path,
 ) -> None:
     paths = predict_results(model, da, tokens, tmp_path / "results")
     assert [*paths] == ["motion", "accident", "detection", "forecasting"]
     for task, path in paths.items():
         results = read_results(path)
-        assert (results.task, set(results.tokens), results.meta["agents"]) == (task, set(tokens), "all")
+        assert (results.task, set(results.tokens), results.meta["agents"]) == (
+            task,
+            set(tokens),
+            "all",
+        )
     form: Any = {"grid": model.config.labels.grid, "step": 0.1, "labels": "clean", "store": "heads"}
     with ResultsWriter(tmp_path / "heads", "motion", **form) as writer:
         for each in found:
@@ -150,7 +173,9 @@ FEATURES = 24 + 8 * 40 * 40 * 4
 """Bytes of the map that an agent of `small` sends, and its pose."""
 
 
-def sent(model: V2XFormer, da: DeepAccident, tokens: list[str], out: Path, config: PredictConfig) -> Any:
+def sent(
+    model: V2XFormer, da: DeepAccident, tokens: list[str], out: Path, config: PredictConfig
+) -> Any:
     """What results note of the bytes."""
     paths = predict_results(model, da, tokens, out, config)
     notes = [read_results(path).meta["bytes"] for path in paths.values()]
@@ -161,11 +186,20 @@ def sent(model: V2XFormer, da: DeepAccident, tokens: list[str], out: Path, confi
 def test_results_note_the_features_that_partners_send(
     model: V2XFormer, da: DeepAccident, tokens: list[str], tmp_path: Path
 ) -> None:
-    form = {"payload": "bev", "shape": [8, 40, 40], "dtype": "float32", "samples": 3, "budget": None}
+    form = {
+        "payload": "bev",
+        "shape": [8, 40, 40],
+        "dtype": "float32",
+        "samples": 3,
+        "budget": None,
+    }
     means = {"mean": 4.0 * FEATURES, "link": float(FEATURES), "partners": 4.0}
     assert sent(model, da, tokens, tmp_path / "all", ALL) == form | means
     nothing = {"mean": 0.0, "link": 0.0, "partners": 0.0}
-    assert sent(model, da, tokens, tmp_path / "single", PredictConfig(agents="single")) == form | nothing
+    assert (
+        sent(model, da, tokens, tmp_path / "single", PredictConfig(agents="single"))
+        == form | nothing
+    )
     lossy = PredictConfig(link=Link(packet_loss=1.0))
     assert sent(model, da, tokens, tmp_path / "lost", lossy) == form | nothing
 
@@ -174,9 +208,15 @@ def test_a_budget_is_of_the_models_own_features(
     model: V2XFormer, da: DeepAccident, tokens: list[str], tmp_path: Path
 ) -> None:
     config = PredictConfig(link=Link(budget=3 * FEATURES - 1, payload="bev"))
-    with patch.object(V2XFormer, "forward", autospec=True, side_effect=V2XFormer.forward) as forward:
+    with patch.object(
+        V2XFormer, "forward", autospec=True, side_effect=V2XFormer.forward
+    ) as forward:
         note = sent(model, da, tokens, tmp_path / "some", config)
-    assert (note["partners"], note["mean"], note["budget"]) == (2.0, 2.0 * FEATURES, 3 * FEATURES - 1)
+    assert (note["partners"], note["mean"], note["budget"]) == (
+        2.0,
+        2.0 * FEATURES,
+        3 * FEATURES - 1,
+    )
     heard = [call.args[1].partners.tolist() for call in forward.call_args_list]
     assert heard == [[[True, True, True, False, False]]] * 3
 
@@ -190,35 +230,61 @@ class TestPerfectMaps:
 
     @pytest.mark.parametrize("row", [0, 3, 4])
     def test_boxes_are_at_their_places_in_the_world(
-        self, perfect: V2XFormer, da: DeepAccident, moment: list[str], monkeypatch: pytest.MonkeyPatch, row: int
+        self,
+        perfect: V2XFormer,
+        da: DeepAccident,
+        moment: list[str],
+        monkeypatch: pytest.MonkeyPatch,
+        row: int,
     ) -> None:
         config, token = perfect.config, moment[row]
         item = V2XDataset(da, [token], V2XConfig(points=False))[0]
         inside = (item["boxes"][:, :2].abs() < 45).all(1)
         boxes = mirrored_boxes(item["boxes"][inside], config.handedness)
-        targets = detection_targets([boxes], [item["categories"][inside]], config.detection, config.targets)
-        monkeypatch.setattr(V2XFormer, "forward", told(lambda found: found._replace(detection=perfect_maps(targets))))
+        targets = detection_targets(
+            [boxes], [item["categories"][inside]], config.detection, config.targets
+        )
+        monkeypatch.setattr(
+            V2XFormer,
+            "forward",
+            told(lambda found: found._replace(detection=perfect_maps(targets))),
+        )
         [prediction] = predict(perfect, da, [token])
         found, truth = prediction.boxes.boxes, da.boxes(token, "world", "released")[inside.numpy()]
         assert (len(truth) > 3, found.frame) == (True, "world")
         match = np.linalg.norm(found.center[:, None] - truth.center, axis=-1).argmin(1)
         assert sorted(match) == list(range(len(truth)))
         rows = [
-            np.column_stack([each.center, each.size, np.cos(each.yaw), np.sin(each.yaw), velocity, each.category])
+            np.column_stack(
+                [
+                    each.center,
+                    each.size,
+                    np.cos(each.yaw),
+                    np.sin(each.yaw),
+                    velocity,
+                    each.category,
+                ]
+            )
             for each in (found, truth.select(match))
             for velocity in [np.nan_to_num(each.velocity)[:, :2]]
         ]
         np.testing.assert_allclose(*rows, atol=2e-3, rtol=0)
 
     def test_motion_maps_score_as_their_labels(
-        self, perfect: V2XFormer, da: DeepAccident, moment: list[str], monkeypatch: pytest.MonkeyPatch
+        self,
+        perfect: V2XFormer,
+        da: DeepAccident,
+        moment: list[str],
+        monkeypatch: pytest.MonkeyPatch,
     ) -> None:
         token, evaluator = moment[0], motion_evaluator(perfect)
         label = motion_labels(da, token, perfect.config.labels).to_present("bilinear")
         heads = MotionHeads.from_labels(label)
         centerness = logit(heads.centerness.clip(1e-6, 1 - 1e-6))
         fields = (heads.segmentation, centerness, heads.offset, heads.flow)
-        maps = PredictedMotionMaps(*[torch.as_tensor(np.array(each))[None, None].float() for each in fields])
+        maps = PredictedMotionMaps(
+            *[torch.as_tensor(np.array(each))[None, None].float() for each in fields]
+        )
         motion = told(lambda found: found._replace(motion=found.motion._replace(maps=maps)))
         monkeypatch.setattr(V2XFormer, "forward", motion)
         evaluator.update(token, predict(perfect, da, [token])[0].motion, label)
@@ -234,6 +300,8 @@ def told(change: Callable[[Any], Any]) -> Callable[..., Any]:
 
 def test_delays_reach_the_model(model: V2XFormer, da: DeepAccident, tokens: list[str]) -> None:
     """From the link, for fusions that know them."""
-    with patch.object(V2XFormer, "forward", autospec=True, side_effect=V2XFormer.forward) as forward:
+    with patch.object(
+        V2XFormer, "forward", autospec=True, side_effect=V2XFormer.forward
+    ) as forward:
         predict(model, da, tokens[:1], PredictConfig(link=Link(latency=0.3)))
     assert [call.args[1].delay.tolist() for call in forward.call_args_list] == [[[0, 3, 3, 3, 3]]]

@@ -18,7 +18,12 @@ from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.plugins.model import presets
 from deepaccident_devkit.plugins.model.bev import BevUNetConfig
 from deepaccident_devkit.plugins.model.checkpoint import FINAL, write_weights
-from deepaccident_devkit.plugins.model.fusion import CobevtConfig, DiscoNetConfig, PoolFusionConfig, V2XViTConfig
+from deepaccident_devkit.plugins.model.fusion import (
+    CobevtConfig,
+    DiscoNetConfig,
+    PoolFusionConfig,
+    V2XViTConfig,
+)
 from deepaccident_devkit.plugins.model.network import CameraConfig, ModelConfig, V2XFormer
 from deepaccident_devkit.plugins.model.pillars import PillarConfig
 from deepaccident_devkit.plugins.model.presets import (
@@ -32,11 +37,18 @@ from deepaccident_devkit.plugins.model.presets import (
 )
 from deepaccident_devkit.taxonomy import ModelFusion
 
-SIZES = [(tiny, 0.4e6, 0.6e6), (tiny_lidar, 0.2e6, 1e6), (tiny_both, 0.4e6, 1e6), (released, 82.5e6, 83.5e6)]
+SIZES = [
+    (tiny, 0.4e6, 0.6e6),
+    (tiny_lidar, 0.2e6, 1e6),
+    (tiny_both, 0.4e6, 1e6),
+    (released, 82.5e6, 83.5e6),
+]
 
 
 @pytest.mark.parametrize(("preset", "least", "most"), SIZES)
-def test_presets_have_their_sizes(preset: Callable[[], ModelConfig], least: float, most: float) -> None:
+def test_presets_have_their_sizes(
+    preset: Callable[[], ModelConfig], least: float, most: float
+) -> None:
     """The released one: 83.0 million, less the frustum."""
     with torch.device("meta"):
         assert least < sum(each.numel() for each in V2XFormer(preset()).parameters()) < most
@@ -44,7 +56,12 @@ def test_presets_have_their_sizes(preset: Callable[[], ModelConfig], least: floa
 
 @pytest.mark.parametrize(
     ("fusion", "kind"),
-    [("mean", PoolFusionConfig), ("disconet", DiscoNetConfig), ("cobevt", CobevtConfig), ("v2xvit", V2XViTConfig)],
+    [
+        ("mean", PoolFusionConfig),
+        ("disconet", DiscoNetConfig),
+        ("cobevt", CobevtConfig),
+        ("v2xvit", V2XViTConfig),
+    ],
 )
 @pytest.mark.parametrize("preset", MODEL_PRESETS)
 def test_a_fusion_fits_its_preset(fusion: ModelFusion, kind: type, preset: Any) -> None:
@@ -64,28 +81,42 @@ def test_a_horizon_is_a_number_of_frames(horizon: float, frames: int) -> None:
 @pytest.mark.parametrize(
     ("choice", "error", "named"),
     [
-        *(({"horizon": each}, ConfigError, ("horizon", "0.5 s", "choose")) for each in (0.0, -1.0, 0.7, 1e3, np.nan)),
+        *(
+            ({"horizon": each}, ConfigError, ("horizon", "0.5 s", "choose"))
+            for each in (0.0, -1.0, 0.7, 1e3, np.nan)
+        ),
         ({"preset": "large"}, ChoiceError, ("preset", "released, tiny")),
         ({"preset": "tiny_lidar", "focal": 100.0}, ConfigError, ("focal", "no cameras")),
         ({"fusion": "sum"}, ChoiceError, ("fusion",)),
         ({"preset": "tiny", "fusion": "released"}, ConfigError, ("ego_channels", "from 0 to 31")),
     ],
 )
-def test_other_choices_are_refused(choice: dict[str, Any], error: type[Exception], named: tuple[str, ...]) -> None:
+def test_other_choices_are_refused(
+    choice: dict[str, Any], error: type[Exception], named: tuple[str, ...]
+) -> None:
     """The released fusion has channels that a small model lacks."""
     assert_refused((lambda: ModelChoice(**choice), error, named))
 
 
 def test_a_choice_can_be_noted_and_made_again() -> None:
-    choice, path = ModelChoice(preset="released", fusion="cobevt", horizon=3), Path("weights.safetensors")
+    choice, path = (
+        ModelChoice(preset="released", fusion="cobevt", horizon=3),
+        Path("weights.safetensors"),
+    )
     assert ModelChoice.from_dict({**choice.as_dict(), "step": 7}, path) == choice
     untold = ("weights.safetensors: does not say which model its weights are of",)
     assert_refused(
         (lambda: ModelChoice.from_dict({}, path), ConfigError, untold),
         (lambda: ModelChoice.from_dict({"preset": "tiny"}, path), ConfigError, untold),
-        (lambda: ModelChoice.from_dict({**choice.as_dict(), "preset": "large"}, path), ConfigError, untold),
         (
-            lambda: ModelChoice.from_dict({"preset": "tiny", "fusion": None, "horizon": "long"}, path),
+            lambda: ModelChoice.from_dict({**choice.as_dict(), "preset": "large"}, path),
+            ConfigError,
+            untold,
+        ),
+        (
+            lambda: ModelChoice.from_dict(
+                {"preset": "tiny", "fusion": None, "horizon": "long"}, path
+            ),
             ConfigError,
             "deepaccident train --from",
         ),
@@ -106,7 +137,11 @@ def test_a_model_is_loaded_by_its_notes(tmp_path: Path, monkeypatch: pytest.Monk
     assert same(dict(found.state_dict()), dict(model.state_dict()))
     assert loaded({**notes, "fusion": "mean"}).config.fusion == PoolFusionConfig()
     assert_refused(
-        (lambda: loaded({**notes, "fusion": "disconet"}), ConfigError, ("of the model are missing (v2x_fusion.score",)),
+        (
+            lambda: loaded({**notes, "fusion": "disconet"}),
+            ConfigError,
+            ("of the model are missing (v2x_fusion.score",),
+        ),
         (lambda: loaded({}), ConfigError, "does not say which model"),
     )
 
@@ -126,17 +161,32 @@ def small_with(**lift: Any) -> CameraConfig:
             {"cameras": replace(small().cameras, images=ImageConfig(resize=(36, 64)))},
             "images.dtype: expected 'uint8'",
         ),
-        ({"cameras": small_with(channels=9)}, "lift.channels: expected 8, as temporal.channels, found 9"),
+        (
+            {"cameras": small_with(channels=9)},
+            "lift.channels: expected 8, as temporal.channels, found 9",
+        ),
         (
             {"pillars": PillarConfig(channels=9, grid=small().grid)},
             "pillars.channels: expected 8, as temporal.channels",
         ),
         ({"pillars": PillarConfig(channels=8, grid=BevGrid())}, "pillars.grid: expected BevGrid"),
         ({"bev": BevUNetConfig(in_channels=9, out_channels=16)}, "bev.in_channels: expected 8"),
-        ({"motion": replace(small().motion, in_channels=9)}, "motion.in_channels: expected 16, as bev.out_channels"),
-        ({"detection": replace(small().detection, in_channels=9)}, "detection.in_channels: expected 16"),
-        ({"motion": replace(small().motion, future_frames=9)}, "motion.future_frames: expected 2, as labels.future"),
-        ({"temporal": replace(small().temporal, frames=3)}, "temporal.frames: expected 2, as labels.receptive_field"),
+        (
+            {"motion": replace(small().motion, in_channels=9)},
+            "motion.in_channels: expected 16, as bev.out_channels",
+        ),
+        (
+            {"detection": replace(small().detection, in_channels=9)},
+            "detection.in_channels: expected 16",
+        ),
+        (
+            {"motion": replace(small().motion, future_frames=9)},
+            "motion.future_frames: expected 2, as labels.future",
+        ),
+        (
+            {"temporal": replace(small().temporal, frames=3)},
+            "temporal.frames: expected 2, as labels.receptive_field",
+        ),
     ],
 )
 def test_parts_that_do_not_fit_are_named(changes: dict[str, Any], message: str) -> None:
@@ -144,9 +194,19 @@ def test_parts_that_do_not_fit_are_named(changes: dict[str, Any], message: str) 
 
 
 def test_a_virtual_camera_and_fierys_labels_are_noted_where_they_are_chosen(tmp_path: Path) -> None:
-    assert ModelChoice().as_dict() == {"preset": "tiny", "fusion": None, "horizon": None}  # as runs before noted it
+    assert ModelChoice().as_dict() == {
+        "preset": "tiny",
+        "fusion": None,
+        "horizon": None,
+    }  # as runs before noted it
     choice = ModelChoice(focal=100.0, labels="fiery", horizon=1.0)
     assert ModelChoice.from_dict(choice.as_dict(), tmp_path) == choice
     config = choice.config
-    assert config.cameras.images == ImageConfig(virtual_camera=(100.0, 90, 160), dtype="uint8", decode="scaled")
-    assert (config.labels.protocol, config.labels.future_frames, config.labels.only_vehicle) == ("fiery", 2, True)
+    assert config.cameras.images == ImageConfig(
+        virtual_camera=(100.0, 90, 160), dtype="uint8", decode="scaled"
+    )
+    assert (config.labels.protocol, config.labels.future_frames, config.labels.only_vehicle) == (
+        "fiery",
+        2,
+        True,
+    )

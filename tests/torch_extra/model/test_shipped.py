@@ -21,7 +21,10 @@ demo: Any = importlib.import_module("deepaccident_devkit.plugins.synth.demo")
 @pytest.mark.parametrize("name", SHIPPED)
 def test_they_are_small_halves_with_their_provenance(name: str) -> None:
     weights = read_weights(name)
-    assert (weights.path, {each.dtype for each in weights.tensors.values()}) == (SHIPPED[name], {torch.float16})
+    assert (weights.path, {each.dtype for each in weights.tensors.values()}) == (
+        SHIPPED[name],
+        {torch.float16},
+    )
     assert weights.path.stat().st_size < 1.3e6
     made = weights.meta["made"]
     assert (weights.meta["preset"], made["seed"], len(made["release"]) > 10) == (name, 1, True)
@@ -49,7 +52,15 @@ def test_a_folder_of_that_name_comes_first(tmp_path: Path, monkeypatch: pytest.M
 
 @pytest.mark.parametrize("name", SHIPPED)
 def test_predict_takes_them_by_their_name(name: str, release_root: Path, tmp_path: Path) -> None:
-    words = ("predict", name, str(release_root), "--split", "train_mini", "--out", str(tmp_path / "results"))
+    words = (
+        "predict",
+        name,
+        str(release_root),
+        "--split",
+        "train_mini",
+        "--out",
+        str(tmp_path / "results"),
+    )
     result = CliRunner().invoke(deepaccident, words, catch_exceptions=False)
     assert (tmp_path / "results" / "accident.json").is_file()
     told = read_weights(name).meta["scored"]["scores"]
@@ -58,14 +69,21 @@ def test_predict_takes_them_by_their_name(name: str, release_root: Path, tmp_pat
     assert f"here; IoU {told['iou']:.1%}, VPQ {told['vpq']:.1%} on 2 synthetic scenarios" in line
 
 
-def test_the_demo_shows_their_prediction(da: DeepAccident, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_demo_shows_their_prediction(
+    da: DeepAccident, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(demo, "_SECONDS_BEFORE", 0.1)  # the release is short
     written = Mock(side_effect=demo.write_beside)
     monkeypatch.setattr(demo, "write_beside", written)
     assert demo.draw_model(da, tmp_path)
-    assert sorted(call.args[1] for call in written.call_args_list) == ["ego"] * 4 + ["other"] * 4  # in four panels
+    assert (
+        sorted(call.args[1] for call in written.call_args_list) == ["ego"] * 4 + ["other"] * 4
+    )  # in four panels
     name = demo.MODEL_PICTURE
     assert (tmp_path / name).stat().st_size > 20_000
-    monkeypatch.setattr("deepaccident_devkit.plugins.model.load_model", Mock(side_effect=MissingExtraError("no torch")))
+    monkeypatch.setattr(
+        "deepaccident_devkit.plugins.model.load_model",
+        Mock(side_effect=MissingExtraError("no torch")),
+    )
     assert not demo.draw_model(da, tmp_path)
     assert not (tmp_path / name).exists()

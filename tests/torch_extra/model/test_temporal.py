@@ -6,7 +6,12 @@ from refusals import assert_refused
 
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.geometry import BevGrid
-from deepaccident_devkit.plugins.model.temporal import Temporal3D, TemporalConcat, TemporalConfig, temporal_model
+from deepaccident_devkit.plugins.model.temporal import (
+    Temporal3D,
+    TemporalConcat,
+    TemporalConfig,
+    temporal_model,
+)
 
 GRID = BevGrid(x=(-6, 6, 1), y=(-4, 4, 1))
 KINDS = ["blocks", "concat"]
@@ -22,7 +27,9 @@ def batch(frames: int = 3, samples: int = 2) -> tuple[torch.Tensor, torch.Tensor
 
 def model_of(kind: str, frames: int = 3, **options: object) -> Temporal3D | TemporalConcat:
     torch.manual_seed(0)
-    return temporal_model(TemporalConfig(channels=6, grid=GRID, kind=kind, frames=frames, **options)).eval()
+    return temporal_model(
+        TemporalConfig(channels=6, grid=GRID, kind=kind, frames=frames, **options)
+    ).eval()
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -40,7 +47,9 @@ def test_every_frame_its_motion_and_the_warp_count(kind: str) -> None:
     model = model_of(kind)
     features, egomotion, valid = batch()
     result = model(features, egomotion, valid)
-    first, second, unused = (egomotion + 0.4 * (torch.arange(3) == frame)[:, None] for frame in range(3))
+    first, second, unused = (
+        egomotion + 0.4 * (torch.arange(3) == frame)[:, None] for frame in range(3)
+    )
     assert torch.equal(model(features, unused, valid), result)
     others = (model_of(kind, warp="stretched"), model_of(kind, chain="released"))
     for other, motion in ((model, first), (model, second), *((each, egomotion) for each in others)):

@@ -25,12 +25,30 @@ from hypothesis import strategies as st
 from refusals import assert_refused
 from safetensors.torch import load_file
 from torch_extra.model import small_model
-from torch_extra.model.small_model import RUN, small, small_both, small_lidar, small_released, trained
+from torch_extra.model.small_model import (
+    RUN,
+    small,
+    small_both,
+    small_lidar,
+    small_released,
+    trained,
+)
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.errors import ChoiceError, ConfigError, DeepAccidentError, NotAvailableError
+from deepaccident_devkit.errors import (
+    ChoiceError,
+    ConfigError,
+    DeepAccidentError,
+    NotAvailableError,
+)
 from deepaccident_devkit.plugins.model import training_loop as training
-from deepaccident_devkit.plugins.model.checkpoint import BEST, FINAL, LAST, read_weights, write_weights
+from deepaccident_devkit.plugins.model.checkpoint import (
+    BEST,
+    FINAL,
+    LAST,
+    read_weights,
+    write_weights,
+)
 from deepaccident_devkit.plugins.model.inputs import ModelInputs, model_inputs
 from deepaccident_devkit.plugins.model.network import ModelConfig, V2XFormer
 from deepaccident_devkit.plugins.model.training_run import (
@@ -66,8 +84,14 @@ def tensors(folder: Path, name: str = LAST) -> dict[str, torch.Tensor]:
 
 def other_process(*words: str) -> subprocess.CompletedProcess[bytes]:
     """Python with these words, on one thread."""
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(TESTS), *sys.path]), "OMP_NUM_THREADS": "1"}
-    return subprocess.run([sys.executable, *words], env=environment, check=False, capture_output=True, timeout=600)
+    environment = {
+        **os.environ,
+        "PYTHONPATH": os.pathsep.join([str(TESTS), *sys.path]),
+        "OMP_NUM_THREADS": "1",
+    }
+    return subprocess.run(
+        [sys.executable, *words], env=environment, check=False, capture_output=True, timeout=600
+    )
 
 
 def assert_equal(found: Any, expected: Any) -> None:
@@ -84,7 +108,8 @@ def learned(da: DeepAccident, tokens: list[str], config: ModelConfig) -> dict[st
 def rows(folder: Path) -> list[dict[str, Any]]:
     """The log without what depends on the machine's speed."""
     return [
-        {name: each for name, each in row.items() if name not in ("seconds", "waiting")} for row in read_log(folder)
+        {name: each for name, each in row.items() if name not in ("seconds", "waiting")}
+        for row in read_log(folder)
     ]
 
 
@@ -103,20 +128,33 @@ def test_the_rate_rises_and_falls_to_nothing(steps: int, warm_up: float) -> None
 
 
 @given(st.integers(1, 12), st.integers(1, 4), st.integers(0, 30), st.integers(0, 5))
-def test_processes_share_each_epoch_and_go_on_in_its_middle(count: int, ranks: int, first: int, seed: int) -> None:
+def test_processes_share_each_epoch_and_go_on_in_its_middle(
+    count: int, ranks: int, first: int, seed: int
+) -> None:
     config = TrainConfig(seed=seed)
     length = 3 * count
     whole = list(islice(positions(count, config, first=0), length * ranks))
     for epoch in range(3 * ranks):
-        assert sorted(whole[epoch * count : (epoch + 1) * count]) == list(range(epoch * count, (epoch + 1) * count))
-    parts = [list(islice(positions(count, config, first=0, rank=rank, ranks=ranks), length)) for rank in range(ranks)]
+        assert sorted(whole[epoch * count : (epoch + 1) * count]) == list(
+            range(epoch * count, (epoch + 1) * count)
+        )
+    parts = [
+        list(islice(positions(count, config, first=0, rank=rank, ranks=ranks), length))
+        for rank in range(ranks)
+    ]
     assert [part[index] for index in range(length) for part in parts] == whole
     for rank, part in enumerate(parts):
         rest = list(islice(positions(count, config, first=first, rank=rank, ranks=ranks), length))
         assert rest[: max(length - first, 0)] == part[first:]
 
 
-@given(st.integers(1, 9), st.integers(1, 9), st.floats(0.05, 0.95), st.integers(0, 40), st.integers(1, 3))
+@given(
+    st.integers(1, 9),
+    st.integers(1, 9),
+    st.floats(0.05, 0.95),
+    st.integers(0, 40),
+    st.integers(1, 3),
+)
 def test_two_sources_come_by_turns_each_in_its_own_order(
     one: int, other: int, mix: float, first: int, ranks: int
 ) -> None:
@@ -130,7 +168,9 @@ def test_two_sources_come_by_turns_each_in_its_own_order(
         own = [number for of, number in whole if of == source]
         assert own == list(islice(positions(count, config, first=0), len(own)))
     rank = ranks - 1
-    mine = list(islice(moments.numbers(config, first=first, rank=rank, ranks=ranks), 60 - min(first, 59)))
+    mine = list(
+        islice(moments.numbers(config, first=first, rank=rank, ranks=ranks), 60 - min(first, 59))
+    )
     assert mine[: max(60 - first, 0)] == whole[rank::ranks][first:]
 
 
@@ -151,10 +191,14 @@ def inputs(batch: dict[str, Any]) -> ModelInputs:
 def test_partners_are_dropped_but_never_the_ego(inputs: ModelInputs) -> None:
     config = replace(RUN, partner_dropout=0.3, alone=0.2)
     egos = torch.eye(5).bool()
-    heard = torch.stack([with_dropped_partners(inputs, config, generator_of(0, n)).partners for n in range(800)])
+    heard = torch.stack(
+        [with_dropped_partners(inputs, config, generator_of(0, n)).partners for n in range(800)]
+    )
     assert heard[:, egos].all()
     partners = heard[:, ~egos].view(800, 5, 4)
-    shares = [found.float().mean().item() for found in (partners, ~partners.any(2), partners.all(2))]
+    shares = [
+        found.float().mean().item() for found in (partners, ~partners.any(2), partners.all(2))
+    ]
     assert shares == pytest.approx([0.7 * 0.8, 0.2 + 0.8 * 0.3**4, 0.8 * 0.7**4], abs=0.02)
     absent = replace(inputs, partners=inputs.partners & (egos | (torch.arange(5) != 2)))
     for dropout, alone, kept in ((0, 0, absent.partners), (1, 0, egos), (0, 1, egos)):
@@ -162,7 +206,9 @@ def test_partners_are_dropped_but_never_the_ego(inputs: ModelInputs) -> None:
         assert torch.equal(with_dropped_partners(absent, changed, generator_of(0)).partners, kept)
 
 
-def test_egos_are_drawn_from_every_moment(da: DeepAccident, moment: list[str], config: ModelConfig) -> None:
+def test_egos_are_drawn_from_every_moment(
+    da: DeepAccident, moment: list[str], config: ModelConfig
+) -> None:
     joined = learned(da, [*moment, *(each.replace("/004", "/006") for each in moment[3:])], config)
     whole, seen = joined["ego_rows"].tolist(), Counter[tuple[int, int]]()
     for number in range(60):
@@ -177,10 +223,14 @@ def test_egos_are_drawn_from_every_moment(da: DeepAccident, moment: list[str], c
     assert all(10 < seen[0, agent] < 40 for agent in range(5))
 
 
-def test_frames_beyond_the_recording_are_not_learned(da: DeepAccident, moment: list[str], config: ModelConfig) -> None:
+def test_frames_beyond_the_recording_are_not_learned(
+    da: DeepAccident, moment: list[str], config: ModelConfig
+) -> None:
     """By the released rule, nor is any of a sample without its past."""
     tokens = [moment[0].replace("/004", frame) for frame in ("/001", "/004", "/005", "/006")]
-    _, targets = training_batch(learned(da, tokens, config), config, replace(RUN, egos=None), generator_of(0))
+    _, targets = training_batch(
+        learned(da, tokens, config), config, replace(RUN, egos=None), generator_of(0)
+    )
     masks = [[False] * 3, [True] * 3, [True, True, False], [True, False, False]]
     assert targets.motion.frame_mask.tolist() == masks
 
@@ -196,7 +246,9 @@ def test_every_parameter_has_a_gradient_at_every_moment(
     losses = step(*training_batch(batch, step.model.config, RUN, generator_of(0)))
     torch.stack(list(losses.values())).sum().backward()
     gradients = {name: each.grad for name, each in step.model.named_parameters()}
-    assert [name for name, each in gradients.items() if each is None or not each.isfinite().all()] == []
+    assert [
+        name for name, each in gradients.items() if each is None or not each.isfinite().all()
+    ] == []
 
 
 # --- what is trained
@@ -208,7 +260,10 @@ def test_frozen_parameters_stay_bit_for_bit(da: DeepAccident, tmp_path: Path) ->
     config = replace(SHORT, freeze=("img_", "transformer.depthnet"))
     after = read_weights(trained(da, tmp_path, config)).tensors
     for name, parameter in V2XFormer(small()).named_parameters():
-        assert torch.equal(before[name], after[name]) == name.startswith(config.freeze), (name, parameter.shape)
+        assert torch.equal(before[name], after[name]) == name.startswith(config.freeze), (
+            name,
+            parameter.shape,
+        )
 
 
 # --- runs
@@ -224,9 +279,17 @@ def whole(da: DeepAccident, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_run_leaves_its_files(whole: Path) -> None:
-    assert {path.name for path in whole.iterdir()} == {"run.json", "log.jsonl", "curves.png", BEST, LAST}
+    assert {path.name for path in whole.iterdir()} == {
+        "run.json",
+        "log.jsonl",
+        "curves.png",
+        BEST,
+        LAST,
+    }
     log = read_log(whole)
-    assert [(row["step"], "validation" in row) for row in log] == [(step, step in (4, 6)) for step in range(1, 7)]
+    assert [(row["step"], "validation" in row) for row in log] == [
+        (step, step in (4, 6)) for step in range(1, 7)
+    ]
     for row in log:
         assert row["loss"] == pytest.approx(sum(row["losses"].values()))
         assert row["rate"] == learning_rate(row["step"] - 1, RUN)
@@ -252,12 +315,18 @@ def test_a_killed_run_goes_on_as_if_nothing_had_been(
         assert_equal(tensors(folder, name), tensors(whole, name))
 
 
-def test_other_options_in_the_same_folder_are_refused(da: DeepAccident, whole: Path, tmp_path: Path) -> None:
+def test_other_options_in_the_same_folder_are_refused(
+    da: DeepAccident, whole: Path, tmp_path: Path
+) -> None:
     before = {path.name: path.read_bytes() for path in whole.iterdir()}
     seed = ("run.json: is of another run", "training/seed: 0, asked for 1", "give the same options")
     assert_refused(
         (lambda: trained(da, whole, replace(RUN, seed=1)), ConfigError, seed),
-        (lambda: trained(da, whole, weights=whole / BEST), ConfigError, ("is of another run", "from: ", BEST)),
+        (
+            lambda: trained(da, whole, weights=whole / BEST),
+            ConfigError,
+            ("is of another run", "from: ", BEST),
+        ),
     )
     assert {path.name: path.read_bytes() for path in whole.iterdir()} == before
     for content, said in (("[]", "is of another run"), ('{"preset": ', "cannot be read")):
@@ -275,10 +344,16 @@ def test_other_options_in_the_same_folder_are_refused(da: DeepAccident, whole: P
     ],
     ids=["empty", "text", "folder", "weights alone"],
 )
-def test_a_checkpoint_of_another_run_is_refused(da: DeepAccident, whole: Path, tmp_path: Path, put: Any) -> None:
+def test_a_checkpoint_of_another_run_is_refused(
+    da: DeepAccident, whole: Path, tmp_path: Path, put: Any
+) -> None:
     put(tmp_path / LAST, whole)
     assert_refused(
-        (lambda: trained(da, tmp_path), ConfigError, r"last\.safetensors.*: (is no |weights cannot be read)")
+        (
+            lambda: trained(da, tmp_path),
+            ConfigError,
+            r"last\.safetensors.*: (is no |weights cannot be read)",
+        )
     )
 
 
@@ -300,10 +375,16 @@ def scaled(name: str, factor: float) -> Any:
             lambda held, _: held.update({"optimizer.x.step": torch.ones(())}),
             r"'optimizer\.x\.step' is missing, or should",
         ),
-        (lambda held, _: held.update({"x" * 10**6: torch.ones(())}), r"'x{10,60} … x{10,60}' is missing, or should"),
+        (
+            lambda held, _: held.update({"x" * 10**6: torch.ones(())}),
+            r"'x{10,60} … x{10,60}' is missing, or should",
+        ),
         (lambda held, _: held.pop("optimizer.0.exp_avg"), r"'optimizer\.0\.exp_avg' is missing"),
         (lambda held, _: held.pop(next(iter(held))), "is missing, or should not be there"),
-        (lambda held, _: held.update({"optimizer.0.exp_avg": torch.ones(3)}), r"optimizer\.0\.exp_avg is \(3,\) of"),
+        (
+            lambda held, _: held.update({"optimizer.0.exp_avg": torch.ones(3)}),
+            r"optimizer\.0\.exp_avg is \(3,\) of",
+        ),
         (
             lambda held, _: held.update({"optimizer.0.step": torch.ones((), dtype=torch.int8)}),
             r"of torch\.int8, not \(\)",
@@ -313,7 +394,9 @@ def scaled(name: str, factor: float) -> Any:
         (scaled("optimizer.0.step", 100), "its optimizer has"),
     ],
 )
-def test_a_changed_checkpoint_is_refused(whole: Path, tmp_path: Path, change: Any, told: str) -> None:
+def test_a_changed_checkpoint_is_refused(
+    whole: Path, tmp_path: Path, change: Any, told: str
+) -> None:
     weights = read_weights(whole / LAST)
     held, notes = dict(weights.tensors), dict(weights.meta)
     change(held, notes)
@@ -324,7 +407,9 @@ def test_a_changed_checkpoint_is_refused(whole: Path, tmp_path: Path, change: An
 
 
 @pytest.mark.parametrize("name", ["run.json", "log.jsonl"])
-def test_too_large_files_of_a_run_are_refused(da: DeepAccident, whole: Path, tmp_path: Path, name: str) -> None:
+def test_too_large_files_of_a_run_are_refused(
+    da: DeepAccident, whole: Path, tmp_path: Path, name: str
+) -> None:
     folder = shutil.copytree(whole, tmp_path / "run")
     (folder / name).write_bytes(b" " * (65 << 20))
     assert_refused((lambda: trained(da, folder), ConfigError, rf"{name}: .*; remove "))
@@ -332,10 +417,21 @@ def test_too_large_files_of_a_run_are_refused(da: DeepAccident, whole: Path, tmp
 
 def test_a_run_begins_from_weights(da: DeepAccident, whole: Path, tmp_path: Path) -> None:
     said: list[str] = []
-    trained(da, tmp_path, replace(SHORT, learning_rate=1e-30, weight_decay=0), weights=whole / BEST, say=said.append)
+    trained(
+        da,
+        tmp_path,
+        replace(SHORT, learning_rate=1e-30, weight_decay=0),
+        weights=whole / BEST,
+        say=said.append,
+    )
     assert re.match(rf"{whole / BEST}: .* tensors loaded", said[0])
     names = [name for name, _ in V2XFormer(small()).named_parameters()]
-    assert_equal(*[[held[name] for name in names] for held in (tensors(tmp_path, FINAL), tensors(whole, BEST))])
+    assert_equal(
+        *[
+            [held[name] for name in names]
+            for held in (tensors(tmp_path, FINAL), tensors(whole, BEST))
+        ]
+    )
 
 
 def test_the_best_weights_are_kept(da: DeepAccident, tmp_path: Path) -> None:
@@ -346,8 +442,14 @@ def test_the_best_weights_are_kept(da: DeepAccident, tmp_path: Path) -> None:
         return {"score": next(scores)}
 
     with patch.object(training, "validated", validated):
-        weights = read_weights(trained(da, tmp_path, replace(RUN, steps=3, validate_every=1, save_every=3)))
-    assert (weights.meta["step"], weights.meta["score"], read_weights(tmp_path / LAST).meta["best"]) == (2, 0.6, 0.6)
+        weights = read_weights(
+            trained(da, tmp_path, replace(RUN, steps=3, validate_every=1, save_every=3))
+        )
+    assert (
+        weights.meta["step"],
+        weights.meta["score"],
+        read_weights(tmp_path / LAST).meta["best"],
+    ) == (2, 0.6, 0.6)
     assert_equal(dict(weights.tensors), states[1])
 
 
@@ -367,13 +469,24 @@ def test_workers_and_epochs_give_the_same_moments(da: DeepAccident, config: Mode
 def test_two_processes_train_one_model(root: str, tmp_path: Path) -> None:
     """Under `torchrun` as users start it: equal weights at the end, and one log."""
     folder = tmp_path / "run"
-    command = ("-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2", small_model.__file__)
+    command = (
+        "-m",
+        "torch.distributed.run",
+        "--standalone",
+        "--nproc-per-node=2",
+        small_model.__file__,
+    )
     ended = other_process(*command, root, str(folder))
     assert ended.returncode == 0, ended.stderr.decode()[-3000:]
-    first, second = (torch.load(folder / f"rank_{rank}.pth", weights_only=True) for rank in range(2))
+    first, second = (
+        torch.load(folder / f"rank_{rank}.pth", weights_only=True) for rank in range(2)
+    )
     assert_equal(first, second)
     stored = tensors(folder, FINAL)
-    assert_equal({name: each.detach() for name, each in first.items()}, {name: stored[name] for name in first})
+    assert_equal(
+        {name: each.detach() for name, each in first.items()},
+        {name: stored[name] for name in first},
+    )
     assert [row["step"] for row in read_log(folder)] == [1, 2]
     assert {path.name for path in folder.iterdir()} == {
         "run.json", "log.jsonl", LAST, FINAL, "rank_0.pth", "rank_1.pth",
@@ -393,13 +506,21 @@ def test_the_log_is_read_up_to_a_line_that_is_cut_off(tmp_path: Path) -> None:
     cut_log(tmp_path, 2)
     assert path.read_bytes() == b'{"step": 1}\n{"step": 2}\n'
     told = r"log\.jsonl:2: expected a JSON object with a step \(.*; remove the line"
-    for line in (b"no json\n", b"[1]\n", b'{"loss": 1}\n', b'{"step": "1"}\n', b'{"step": 1, "losses": [1]}\n'):
+    for line in (
+        b"no json\n",
+        b"[1]\n",
+        b'{"loss": 1}\n',
+        b'{"step": "1"}\n',
+        b'{"step": 1, "losses": [1]}\n',
+    ):
         path.write_bytes(b'{"step": 1}\n' + line)
         assert_refused((lambda: read_log(tmp_path), ConfigError, told))
 
 
 @pytest.mark.parametrize("linked", [Path.symlink_to, Path.hardlink_to])
-def test_a_run_adds_nothing_to_a_file_elsewhere(tmp_path: Path, linked: Callable[[Path, Path], None]) -> None:
+def test_a_run_adds_nothing_to_a_file_elsewhere(
+    tmp_path: Path, linked: Callable[[Path, Path], None]
+) -> None:
     elsewhere, folder = tmp_path / "elsewhere.jsonl", tmp_path / "run"
     folder.mkdir()
     elsewhere.write_bytes(b'{"step": 1}\n')
@@ -418,7 +539,11 @@ def test_a_run_adds_nothing_to_a_file_elsewhere(tmp_path: Path, linked: Callable
         ({"egos": 0}, ConfigError, "egos: expected a whole number from 1"),
         ({"seed": -1}, ConfigError, "seed: expected a whole number from 0"),
         ({"save_every": 0}, ConfigError, "save_every"),
-        ({"partner_dropout": 1.1}, ConfigError, r"partner_dropout: expected a share from 0 to 1, found 1\.1"),
+        (
+            {"partner_dropout": 1.1},
+            ConfigError,
+            r"partner_dropout: expected a share from 0 to 1, found 1\.1",
+        ),
         ({"alone": -0.1}, ConfigError, "alone: expected a share from 0 to 1"),
         ({"warm_up": float("nan")}, ConfigError, "warm_up: expected a share"),
         ({"learning_rate": 0.0}, ConfigError, "learning_rate: expected a number above 0"),
@@ -429,17 +554,25 @@ def test_a_run_adds_nothing_to_a_file_elsewhere(tmp_path: Path, linked: Callable
         ({"samples": "some"}, ChoiceError, "samples: expected one of"),
     ],
 )
-def test_wrong_options_are_named(changes: dict[str, Any], error: type[DeepAccidentError], message: str) -> None:
+def test_wrong_options_are_named(
+    changes: dict[str, Any], error: type[DeepAccidentError], message: str
+) -> None:
     assert_refused((lambda: TrainConfig(**changes), error, message))
 
 
 @pytest.mark.parametrize(
     ("variables", "facts"),
     [
-        *((f"WORLD_SIZE={word}", (f"WORLD_SIZE={word}",)) for word in ("abc", "0", "-1", "1.5", "", "9" * 5000)),
+        *(
+            (f"WORLD_SIZE={word}", (f"WORLD_SIZE={word}",))
+            for word in ("abc", "0", "-1", "1.5", "", "9" * 5000)
+        ),
         ("WORLD_SIZE=2 RANK=2 LOCAL_RANK=0", ("RANK=2",)),
         ("WORLD_SIZE=2 RANK=one", ("RANK=one",)),
-        ("WORLD_SIZE=99999999999999999999 RANK=0 MASTER_ADDR=127.0.0.1 MASTER_PORT=1", ("WORLD_SIZE=9999",)),
+        (
+            "WORLD_SIZE=99999999999999999999 RANK=0 MASTER_ADDR=127.0.0.1 MASTER_PORT=1",
+            ("WORLD_SIZE=9999",),
+        ),
         ("WORLD_SIZE=2 RANK=0", ("WORLD_SIZE=2", "MASTER_ADDR")),
         ("WORLD_SIZE=2 RANK=0 MASTER_ADDR=127.0.0.1 MASTER_PORT=high", ("WORLD_SIZE=2", "high")),
     ],
@@ -457,16 +590,36 @@ def test_a_wrong_environment_is_refused(
         with processes("cpu"):
             pass
 
-    assert_refused((begin, ConfigError, (*(fact[:40] for fact in facts), "torchrun", "unset WORLD_SIZE")))
+    assert_refused(
+        (begin, ConfigError, (*(fact[:40] for fact in facts), "torchrun", "unset WORLD_SIZE"))
+    )
 
 
-def test_unknown_devices_and_releases_without_samples_are_refused(da: DeepAccident, tmp_path: Path) -> None:
+def test_unknown_devices_and_releases_without_samples_are_refused(
+    da: DeepAccident, tmp_path: Path
+) -> None:
     absent, unknown = replace(SHORT, split="test"), replace(SHORT, split="exam")
     assert_refused(
-        (lambda: checked_device("cuda:99"), ConfigError, ("device", "cuda:99", "cannot be used", "choose cpu")),
-        (lambda: checked_device("gpu"), ConfigError, ("device", "gpu", "cannot be used", "choose cpu")),
-        (lambda: trained(da, tmp_path / "a", absent), NotAvailableError, "test: no scenario of this split"),
+        (
+            lambda: checked_device("cuda:99"),
+            ConfigError,
+            ("device", "cuda:99", "cannot be used", "choose cpu"),
+        ),
+        (
+            lambda: checked_device("gpu"),
+            ConfigError,
+            ("device", "gpu", "cannot be used", "choose cpu"),
+        ),
+        (
+            lambda: trained(da, tmp_path / "a", absent),
+            NotAvailableError,
+            "test: no scenario of this split",
+        ),
         (lambda: trained(da, tmp_path / "b", unknown), ChoiceError, "split"),
-        (lambda: trained(da, tmp_path / "c", replace(SHORT, freeze=("",))), ConfigError, "nothing is left to train"),
+        (
+            lambda: trained(da, tmp_path / "c", replace(SHORT, freeze=("",))),
+            ConfigError,
+            "nothing is left to train",
+        ),
     )
     assert (checked_device("cpu"), checked_device("auto") in ("cpu", "cuda")) == ("cpu", True)

@@ -23,7 +23,9 @@ six = st.tuples(*[st.floats(-3, 3, width=32)] * 3, *[st.floats(-1.5, 1.5, width=
     lambda values: torch.tensor(values, dtype=torch.float64)
 )
 planar = st.tuples(st.floats(-4, 4), st.floats(-4, 4), st.floats(-3, 3)).map(
-    lambda pose: matrices_from_six(torch.tensor([[pose[0], pose[1], 0, 0, 0, pose[2]]], dtype=torch.float64))
+    lambda pose: matrices_from_six(
+        torch.tensor([[pose[0], pose[1], 0, 0, 0, pose[2]]], dtype=torch.float64)
+    )
 )
 
 
@@ -37,9 +39,13 @@ def centres() -> tuple[torch.Tensor, torch.Tensor]:
 
 
 @given(six)
-def test_matrices_equal_those_of_the_geometry_and_give_the_vectors_back(vector: torch.Tensor) -> None:
+def test_matrices_equal_those_of_the_geometry_and_give_the_vectors_back(
+    vector: torch.Tensor,
+) -> None:
     matrix = matrices_from_six(vector)
-    np.testing.assert_allclose(matrix.numpy(), conventions.matrices_of_six(vector.numpy()), atol=1e-12)
+    np.testing.assert_allclose(
+        matrix.numpy(), conventions.matrices_of_six(vector.numpy()), atol=1e-12
+    )
     np.testing.assert_allclose(six_from_matrices(matrix).numpy(), vector.numpy(), atol=1e-7)
 
 
@@ -55,15 +61,21 @@ def test_exact_chains_lead_from_each_frame_to_the_present(vectors: list[torch.Te
 
 @settings(max_examples=40)
 @given(planar)
-def test_an_exact_warp_gives_a_linear_field_its_values_in_the_other_frame(target_from_source: torch.Tensor) -> None:
+def test_an_exact_warp_gives_a_linear_field_its_values_in_the_other_frame(
+    target_from_source: torch.Tensor,
+) -> None:
     """Bilinear sampling has no error on such a field, but next to the border, where zeros mix in."""
     x, y = (each.double() for each in centres())
     warped = warp_features((3 + 0.5 * x - 0.25 * y)[None, None], target_from_source, GRID)[0, 0]
     source = torch.linalg.inv(target_from_source)[0]
-    source_x, source_y = (source[row, 0] * x + source[row, 1] * y + source[row, 3] for row in (0, 1))
+    source_x, source_y = (
+        source[row, 0] * x + source[row, 1] * y + source[row, 3] for row in (0, 1)
+    )
     beyond_x, beyond_y = (source_x - 2).abs() - 10, source_y.abs() - 6  # below 0 inside the grid
     inner, outside = (beyond_x < -0.6) & (beyond_y < -0.3), (beyond_x > 0.6) | (beyond_y > 0.3)
-    torch.testing.assert_close(warped[inner], (3 + 0.5 * source_x - 0.25 * source_y)[inner], atol=1e-9, rtol=0)
+    torch.testing.assert_close(
+        warped[inner], (3 + 0.5 * source_x - 0.25 * source_y)[inner], atol=1e-9, rtol=0
+    )
     assert not warped[outside].any()
     beyond = torch.maximum(beyond_x, beyond_y)
     clear = beyond.abs() > 1e-6

@@ -50,16 +50,29 @@ def test_the_nine_ways_to_brake() -> None:
 
 def test_a_striker_that_brakes_earlier_hits_slower_and_then_not_at_all() -> None:
     """10 m/s of closing speed need 10 m of way at 5 m/s²: the last moment is 1 s before the end."""
-    told = outcomes_of(rear_end(20, 10), FIRST, [np.nan, 5.0, 4.99, 4.5, 4.01, 3.99], brakings=AT_ONCE)
-    assert names(told.outcome) == ["unchanged", "unchanged", "unchanged", "mitigated", "mitigated", "avoided"]
-    np.testing.assert_array_equal(told.extrapolated.ravel(), [False, False, True, True, True, False])
+    told = outcomes_of(
+        rear_end(20, 10), FIRST, [np.nan, 5.0, 4.99, 4.5, 4.01, 3.99], brakings=AT_ONCE
+    )
+    assert names(told.outcome) == [
+        "unchanged",
+        "unchanged",
+        "unchanged",
+        "mitigated",
+        "mitigated",
+        "avoided",
+    ]
+    np.testing.assert_array_equal(
+        told.extrapolated.ravel(), [False, False, True, True, True, False]
+    )
     assert told.time[0, 0] == pytest.approx(5, abs=1e-6)
     assert np.isinf(told.time[-1, 0])
     # 5 m left at 4.5 s: 10 τ − 5 τ²/2 = 5
     slower = np.sqrt(100 - 2 * 5 * 5)
     assert told.speeds[3, 0] == pytest.approx([10 + slower, 10], abs=1e-3)
     assert told.delta_v[3, 0] == pytest.approx([slower / 2, slower / 2], abs=1e-3)
-    assert told.reduction[:, 0] == pytest.approx([0, 0, 1 - np.sqrt(0.99), 1 - slower / 10, 0.9, 1], abs=2e-3)
+    assert told.reduction[:, 0] == pytest.approx(
+        [0, 0, 1 - np.sqrt(0.99), 1 - slower / 10, 0.9, 1], abs=2e-3
+    )
     assert np.isnan(told.speeds[-1, 0]).all()
     np.testing.assert_array_equal(told.delta_v[-1, 0], 0)
 
@@ -108,10 +121,16 @@ def test_without_a_warning_or_brakers_nothing_changes() -> None:
 
 def test_latency_and_reaction_delay_the_braking() -> None:
     case = rear_end()
-    late = outcomes_of(case, FIRST, [3.7], brakings=[Braking(reaction=0.5, deceleration=5.0)], latency=0.3)
-    assert 5 < late.time[0, 0] == outcomes_of(case, FIRST, [4.5], brakings=AT_ONCE).time[0, 0] < np.inf
+    late = outcomes_of(
+        case, FIRST, [3.7], brakings=[Braking(reaction=0.5, deceleration=5.0)], latency=0.3
+    )
+    assert (
+        5 < late.time[0, 0] == outcomes_of(case, FIRST, [4.5], brakings=AT_ONCE).time[0, 0] < np.inf
+    )
     from_start = outcomes_of(case, FIRST, [0.0], brakings=AT_ONCE)
-    np.testing.assert_array_equal(from_start.reduction, outcomes_of(case, FIRST, [-7.0], brakings=AT_ONCE).reduction)
+    np.testing.assert_array_equal(
+        from_start.reduction, outcomes_of(case, FIRST, [-7.0], brakings=AT_ONCE).reduction
+    )
 
 
 def test_the_check_of_a_recording() -> None:
@@ -136,13 +155,18 @@ def test_the_gap_at_the_end_counts_as_contact_up_to_a_metre(gap: float, usable: 
 def test_delta_v_and_its_range() -> None:
     np.testing.assert_allclose(delta_v_of([1000, 3000], [8.0, 0.0]), [[6, 2], [0, 0]])
     ranges = delta_v_ranges([1000, 3000], 8.0)
-    np.testing.assert_allclose(ranges, [[8 * 2100 / 3400, 8 * 3900 / 4600], [8 * 700 / 4600, 8 * 1300 / 3400]])
+    np.testing.assert_allclose(
+        ranges, [[8 * 2100 / 3400, 8 * 3900 / 4600], [8 * 700 / 4600, 8 * 1300 / 3400]]
+    )
 
 
 def test_no_delta_v_in_the_recording() -> None:
     """Both drive side by side at the same speed and touch all the time: only braking makes a difference of speeds."""
     told = outcomes_of(
-        accident(straight((0, 0), 0, 10, 31), straight((0, 2), 0, 10, 31)), FIRST, [np.nan, 1.0], brakings=AT_ONCE
+        accident(straight((0, 0), 0, 10, 31), straight((0, 2), 0, 10, 31)),
+        FIRST,
+        [np.nan, 1.0],
+        brakings=AT_ONCE,
     )
     assert names(told.outcome) == ["unchanged", "unchanged"]  # they touch before anyone brakes
     np.testing.assert_array_equal(told.reduction, 0)
@@ -156,11 +180,23 @@ def test_earlier_braking_of_a_striker_from_behind_never_hits_faster(
 ) -> None:
     """The leader may brake and speed up as it likes."""
     rng, frames = np.random.default_rng(seed), 41
-    way = np.append(0, np.cumsum(np.maximum(share * speed + np.repeat(rng.normal(0, 2, 8), 5), 0))) / 10
-    second = np.column_stack([way - way[-1] + 3.9 + speed * (frames - 1) / 10, np.zeros(frames), np.zeros(frames)])
+    way = (
+        np.append(0, np.cumsum(np.maximum(share * speed + np.repeat(rng.normal(0, 2, 8), 5), 0)))
+        / 10
+    )
+    second = np.column_stack(
+        [way - way[-1] + 3.9 + speed * (frames - 1) / 10, np.zeros(frames), np.zeros(frames)]
+    )
     case = accident(straight((0, 0), 0, speed, frames), second)
-    assume(undisturbed(case).time > 3.9)  # else it drives into the leader before, and may do so more than once
-    told = outcomes_of(case, FIRST, np.arange(0, 4.05, 0.05), brakings=[Braking(reaction=0, deceleration=deceleration)])
+    assume(
+        undisturbed(case).time > 3.9
+    )  # else it drives into the leader before, and may do so more than once
+    told = outcomes_of(
+        case,
+        FIRST,
+        np.arange(0, 4.05, 0.05),
+        brakings=[Braking(reaction=0, deceleration=deceleration)],
+    )
     assert (np.diff(np.nan_to_num(told.speeds[:, 0, 0], nan=-1.0)) >= -1e-3).all()
 
 

@@ -6,7 +6,12 @@ import pytest
 from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.collisions.recorded import CLASS_MASSES, accident_of, accidents_of, masses_of
+from deepaccident_devkit.collisions.recorded import (
+    CLASS_MASSES,
+    accident_of,
+    accidents_of,
+    masses_of,
+)
 from deepaccident_devkit.errors import ConfigError, NotAvailableError
 from deepaccident_devkit.tables.records import ScenarioRecord
 from deepaccident_devkit.testing import SmallRelease, write_small_release
@@ -17,13 +22,18 @@ def test_the_pair_of_an_accident(da_motion: DeepAccident) -> None:
     accident = accident_of(da_motion, scenario)
     assert accident is not None
     contact = da_motion.collision(scenario)
-    assert (accident.actor_ids, accident.agents) == (contact.actor_ids, tuple(scenario["collision"]["agents"]))
+    assert (accident.actor_ids, accident.agents) == (
+        contact.actor_ids,
+        tuple(scenario["collision"]["agents"]),
+    )
     assert accident.categories == tuple(scenario["collision"]["classes"])
     assert accident.last_frame == accident.num_frames == scenario["num_frames"]
     assert accident.paths.shape == (2, accident.num_frames, 3)
     assert accident.duration == pytest.approx((accident.num_frames - 1) / 10)
     for which, token in enumerate(contact.instances):
-        np.testing.assert_allclose(accident.paths[which, :, :2], da_motion.trajectory(token).center[:, :2])
+        np.testing.assert_allclose(
+            accident.paths[which, :, :2], da_motion.trajectory(token).center[:, :2]
+        )
     assert (accident.masses > 0).all()
 
 
@@ -35,7 +45,9 @@ def without_first(root: Path, scenario: ScenarioRecord, *frames: int) -> None:
         if int(label.stem[-3:]) in frames:
             gone = [first, "-100"] if f"/{agent}/" in str(label) else [first]
             rows = label.read_text().splitlines(keepends=True)
-            label.write_text("".join(row for row in rows if row.split()[-3:-2] not in [[each] for each in gone]))
+            label.write_text(
+                "".join(row for row in rows if row.split()[-3:-2] not in [[each] for each in gone])
+            )
     shutil.rmtree(root / ".deepaccident", ignore_errors=True)
 
 
@@ -51,7 +63,9 @@ def test_a_missing_label_is_bridged_the_shorter_way(own_release: Path) -> None:
 def test_scenarios_that_lack_something_are_named_and_the_others_stay(own_release: Path) -> None:
     accidents = DeepAccident("v1", own_release, verbose=False).find(collision=True)
     silent, seen_once = accidents[:2]
-    (own_release / silent["folder"] / silent["scenario_type"] / "meta" / f"{silent['name']}.txt").unlink()
+    (
+        own_release / silent["folder"] / silent["scenario_type"] / "meta" / f"{silent['name']}.txt"
+    ).unlink()
     without_first(own_release, seen_once, 1, 3, 4)
     found, skipped = accidents_of(DeepAccident("v1", own_release, verbose=False))
     assert {each.scenario for each in found} == {each["token"] for each in accidents[2:]}
@@ -67,7 +81,11 @@ def test_a_scenario_without_labels_is_named(tmp_path: Path) -> None:
         shutil.rmtree(label)
     da = DeepAccident("v1", root, verbose=False)
     assert_refused(
-        (lambda: accident_of(da, da.find(collision=True, signalized=True)[0]), NotAvailableError, "has no labels"),
+        (
+            lambda: accident_of(da, da.find(collision=True, signalized=True)[0]),
+            NotAvailableError,
+            "has no labels",
+        ),
     )
 
 

@@ -7,15 +7,26 @@ from hypothesis import strategies as st
 from refusals import assert_refused
 from replayed_accidents import straight, wild_paths
 
-from deepaccident_devkit.collisions.replay import HORIZON, Motion, ReplayStates, braking_plans, motion_of, replay
+from deepaccident_devkit.collisions.replay import (
+    HORIZON,
+    Motion,
+    ReplayStates,
+    braking_plans,
+    motion_of,
+    replay,
+)
 from deepaccident_devkit.errors import GeometryError
 
 NEVER = np.inf
 
 
-def at(motion: Motion, times: np.ndarray, start: float = NEVER, deceleration: float = 5.0) -> ReplayStates:
+def at(
+    motion: Motion, times: np.ndarray, start: float = NEVER, deceleration: float = 5.0
+) -> ReplayStates:
     rows = np.zeros(len(times), dtype=np.int64)
-    return replay(motion, braking_plans(motion, [start], [deceleration]), rows, np.asarray(times, dtype=float))
+    return replay(
+        motion, braking_plans(motion, [start], [deceleration]), rows, np.asarray(times, dtype=float)
+    )
 
 
 def test_without_braking_it_is_the_recording_and_goes_straight_on() -> None:
@@ -40,7 +51,10 @@ def test_without_braking_it_is_the_recording_and_goes_straight_on() -> None:
 
 @pytest.mark.parametrize(("step", "moves"), [(0.0009, False), (0.0011, True)])
 def test_who_hardly_moved_at_the_end_stands_afterwards(step: float, moves: bool) -> None:
-    assert (at(motion_of([[0, 0, 0], [1, 0, 0], [1 + step, 0, 0]]), np.array([3.0])).poses[0, 0] > 1 + step) == moves
+    assert (
+        at(motion_of([[0, 0, 0], [1, 0, 0], [1 + step, 0, 0]]), np.array([3.0])).poses[0, 0]
+        > 1 + step
+    ) == moves
 
 
 def test_braking_from_constant_speed() -> None:
@@ -56,7 +70,9 @@ def test_braking_from_constant_speed() -> None:
 
 def test_a_recording_that_brakes_harder_stays() -> None:
     speeds = np.array([10.0, 10, 1, 1, 1, 1, 1, 1])
-    motion = motion_of(np.column_stack([np.append(0, np.cumsum(speeds) / 10), np.zeros(9), np.zeros(9)]))
+    motion = motion_of(
+        np.column_stack([np.append(0, np.cumsum(speeds) / 10), np.zeros(9), np.zeros(9)])
+    )
     times = np.linspace(0, 0.8, 81)
     recorded, braked = at(motion, times), at(motion, times, start=0.05, deceleration=4.0)
     late = times > 0.29
@@ -65,15 +81,21 @@ def test_a_recording_that_brakes_harder_stays() -> None:
     assert braked.arcs[15] < recorded.arcs[15]
 
 
-def test_who_stands_when_braking_begins_keeps_the_heading_from_which_the_recording_drives_on() -> None:
-    motion = motion_of(np.column_stack([[0, 1, 1, 1, 2, 3], np.zeros(6), [0, 0, 0.1, 0.2, 0.2, 0.2]]))
+def test_who_stands_when_braking_begins_keeps_the_heading_from_which_the_recording_drives_on() -> (
+    None
+):
+    motion = motion_of(
+        np.column_stack([[0, 1, 1, 1, 2, 3], np.zeros(6), [0, 0, 0.1, 0.2, 0.2, 0.2]])
+    )
     standing = at(motion, np.array([0.25, 0.35, 0.6]), start=0.15)  # 0 m/s there: it never leaves
     np.testing.assert_allclose(standing.poses, [[1, 0, 0.15], [1, 0, 0.2], [1, 0, 0.2]], atol=1e-12)
     np.testing.assert_allclose(standing.speeds, 0)
 
 
 def test_when_braking_has_no_effect_or_begins_at_once() -> None:
-    plans = braking_plans(motion_of(straight((0, 0), 0, 10, 11)), [1.0, 5.0, np.inf, np.nan, -3.0, 0.99], 4.0)
+    plans = braking_plans(
+        motion_of(straight((0, 0), 0, 10, 11)), [1.0, 5.0, np.inf, np.nan, -3.0, 0.99], 4.0
+    )
     np.testing.assert_array_equal(plans.starts, [np.inf, np.inf, np.inf, np.inf, 0.0, 0.99])
     np.testing.assert_allclose(plans.speeds, [0, 0, 0, 0, 10, 10])
 
@@ -105,5 +127,7 @@ def test_a_replay_stays_on_its_path(path: np.ndarray, start: float, deceleration
     braked = at(motion, np.linspace(0, motion.duration + HORIZON, 300), start, deceleration)
     for axis in (0, 1):
         np.testing.assert_allclose(
-            braked.poses[:, axis], np.interp(braked.arcs, motion.arcs, motion.poses[:, axis]), atol=1e-6
+            braked.poses[:, axis],
+            np.interp(braked.arcs, motion.arcs, motion.poses[:, axis]),
+            atol=1e-6,
         )

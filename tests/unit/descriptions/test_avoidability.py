@@ -14,7 +14,12 @@ from deepaccident_devkit.collisions import Accident, accidents_of, outcomes_of, 
 from deepaccident_devkit.collisions.contact import pair_of
 from deepaccident_devkit.collisions.outcomes import delta_v_ranges
 from deepaccident_devkit.descriptions import avoidability, avoidability_of
-from deepaccident_devkit.descriptions.avoidability import BRAKERS, MASKS, last_moments, secondary_contacts
+from deepaccident_devkit.descriptions.avoidability import (
+    BRAKERS,
+    MASKS,
+    last_moments,
+    secondary_contacts,
+)
 from deepaccident_devkit.errors import GeometryError, NotAvailableError
 from deepaccident_devkit.geometry import Boxes, quaternions
 from deepaccident_devkit.support.arrays import FloatArray
@@ -64,7 +69,9 @@ def test_answers_that_change_three_times() -> None:
     case = accident(straight((0, 0), 0, 10, 61), np.column_stack([x, y, np.full(61, np.pi / 2)]))
     moments = scanned(case, FIRST, 8.0)
     assert (moments.switches.tolist(), moments.time[0] > 4) == ([3], True)
-    at = [outcomes_of(case, FIRST, [start]).outcome[0, 2] for start in (0.0, 0.9, 3.0)]  # 0.5 s to react, 8 m/s²
+    at = [
+        outcomes_of(case, FIRST, [start]).outcome[0, 2] for start in (0.0, 0.9, 3.0)
+    ]  # 0.5 s to react, 8 m/s²
     assert [code == 0 for code in at] == [True, False, True]
 
 
@@ -81,15 +88,26 @@ def test_the_tables_of_an_accident() -> None:
     assert (found.secondary, found.head_on, found.pedestrian) == ((), False, False)
     assert found.relative_speed == pytest.approx(10)
     walking = replace(case, categories=("car", "pedestrian"))
-    assert (avoidability_of(head_on(10, 2)).head_on, avoidability_of(walking).pedestrian) == (True, True)
+    assert (avoidability_of(head_on(10, 2)).head_on, avoidability_of(walking).pedestrian) == (
+        True,
+        True,
+    )
 
 
 def test_what_cannot_be_told_is_refused() -> None:
     case = rear_end()
     farther = replace(case, paths=np.add(case.paths, [[[0.0, 0, 0]], [[2.5, 0, 0]]]))
     assert_refused(
-        (lambda: avoidability_of(farther), NotAvailableError, ("11 and 12", "2.50 m apart at their last frame")),
-        (lambda: last_moments(pair_of(case.paths, case.sizes), FIRST, 4.0), GeometryError, ("decelerations",)),
+        (
+            lambda: avoidability_of(farther),
+            NotAvailableError,
+            ("11 and 12", "2.50 m apart at their last frame"),
+        ),
+        (
+            lambda: last_moments(pair_of(case.paths, case.sizes), FIRST, 4.0),
+            GeometryError,
+            ("decelerations",),
+        ),
     )
 
 
@@ -98,16 +116,27 @@ def test_in_time_is_what_the_last_moment_says() -> None:
     found = avoidability_of(rear_end(18, 7))
     columns = np.searchsorted(found.decelerations, [each.deceleration for each in found.brakings])
     needed = found.slack[0, columns] + [each.reaction for each in found.brakings]
-    np.testing.assert_array_equal(found.outcomes[0].outcome == 0, found.leads[:, None] >= needed - 1e-9)
+    np.testing.assert_array_equal(
+        found.outcomes[0].outcome == 0, found.leads[:, None] >= needed - 1e-9
+    )
 
 
 def test_values_for_json() -> None:
     told = json.loads(json.dumps(avoidability_of(rear_end(20, 10)).to_dict(), allow_nan=False))
-    assert told["actors"][0] == {"actor_id": 11, "category": "car", "agent": "ego_vehicle", "mass": 1500}
+    assert told["actors"][0] == {
+        "actor_id": 11,
+        "category": "car",
+        "agent": "ego_vehicle",
+        "mass": 1500,
+    }
     ranges = np.round(delta_v_ranges([1500, 1500], 10.0), 3).tolist()
     assert (told["recorded"]["delta_v"], told["recorded"]["delta_v_ranges"]) == ([5, 5], ranges)
     first, leader = told["last_moments"][0], told["last_moments"][3]
-    assert (first["avoidable"], first["slack"], first["switches"]) == (True, pytest.approx(1.25, abs=0.011), 1)
+    assert (first["avoidable"], first["slack"], first["switches"]) == (
+        True,
+        pytest.approx(1.25, abs=0.011),
+        1,
+    )
     assert (leader["avoidable"], leader["last_moment"], leader["slack"]) == (False, None, None)
     worst = told["warnings"][9]
     assert (worst["brakers"], worst["outcome"][-1]) == ("second", "worsened")
@@ -122,10 +151,18 @@ def test_of_a_scenario(da_motion: DeepAccident) -> None:
     assert {each.other_id for each in found.secondary}.isdisjoint(found.accident.actor_ids)
 
 
-def test_every_generated_accident_collides_by_its_end(da_b: DeepAccident, da_motion: DeepAccident) -> None:
-    found = [(undisturbed(each), each) for dataset in (da_b, da_motion) for each in accidents_of(dataset)[0]]
+def test_every_generated_accident_collides_by_its_end(
+    da_b: DeepAccident, da_motion: DeepAccident
+) -> None:
+    found = [
+        (undisturbed(each), each)
+        for dataset in (da_b, da_motion)
+        for each in accidents_of(dataset)[0]
+    ]
     assert len(found) > 3
-    assert [each.scenario for check, each in found if not check.usable or check.time > each.duration] == []
+    assert [
+        each.scenario for check, each in found if not check.usable or check.time > each.duration
+    ] == []
 
 
 CASE = rear_end(20, 10)
@@ -134,7 +171,11 @@ CASE = rear_end(20, 10)
 
 def tracks_of(others: dict[int, tuple[range, FloatArray]]) -> ScenarioTracks:
     """Tracks of the pair of `CASE` and of others: frames and their x, y, yaw."""
-    rows = [(frame, 11 + which, path[frame - 1]) for which, path in enumerate(CASE.paths) for frame in range(1, 52)]
+    rows = [
+        (frame, 11 + which, path[frame - 1])
+        for which, path in enumerate(CASE.paths)
+        for frame in range(1, 52)
+    ]
     for actor, (frames, path) in others.items():
         rows += [(frame, actor, pose) for frame, pose in zip(frames, path, strict=True)]
     rows.sort(key=lambda row: row[:2])
@@ -151,17 +192,26 @@ def tracks_of(others: dict[int, tuple[range, FloatArray]]) -> ScenarioTracks:
         camera_visible=np.zeros(count, dtype=bool),
         row=np.arange(count),
     )
-    return ScenarioTracks(boxes=boxes, index=np.array([frame for frame, _, _ in rows]), agents=np.ones(count, np.uint8))
+    return ScenarioTracks(
+        boxes=boxes,
+        index=np.array([frame for frame, _, _ in rows]),
+        agents=np.ones(count, np.uint8),
+    )
 
 
 FOLLOWER, ALL = straight((-10, 0), 0, 20, 51), range(1, 52)
 STARTS, HARD = np.array([[2.0, np.inf], [np.inf, np.inf]]), np.array([8.0, 8.0])
 
 
-def contacts(others: dict[int, tuple[range, FloatArray]], starts: Any = None, hard: Any = None) -> Any:
+def contacts(
+    others: dict[int, tuple[range, FloatArray]], starts: Any = None, hard: Any = None
+) -> Any:
     """Those of who brakes from 2 s on, or from other starts."""
     return secondary_contacts(
-        CASE, tracks_of(others), STARTS if starts is None else starts, HARD if hard is None else hard
+        CASE,
+        tracks_of(others),
+        STARTS if starts is None else starts,
+        HARD if hard is None else hard,
     )
 
 
@@ -169,7 +219,9 @@ def test_a_follower_runs_into_who_brakes() -> None:
     (found,) = contacts({30: (ALL, FOLLOWER)})
     assert (found.replay, found.actor_id, found.other_id, found.category) == (0, 11, 30, "car")
     assert found.time == pytest.approx(2 + np.sqrt(2 * 6 / 8), abs=1e-5)  # a gap of 6 m
-    (late,) = contacts({30: (range(38, 52), FOLLOWER[37:])})  # who comes into sight late counts from there
+    (late,) = contacts(
+        {30: (range(38, 52), FOLLOWER[37:])}
+    )  # who comes into sight late counts from there
     assert late.time == pytest.approx(3.7)
     (after,) = contacts({30: (ALL, straight((-72, 0), 0, 20, 51))})
     assert (found.extrapolated, after.extrapolated, after.time > 5) == (False, True, True)

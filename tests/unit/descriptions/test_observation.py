@@ -11,7 +11,12 @@ from hypothesis.extra.numpy import arrays
 from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.descriptions import ObservationRule, coalition_leads, observed_actors, shapley_values
+from deepaccident_devkit.descriptions import (
+    ObservationRule,
+    coalition_leads,
+    observed_actors,
+    shapley_values,
+)
 from deepaccident_devkit.descriptions.observation import by_rule, coalition_members, first_together
 from deepaccident_devkit.errors import ChoiceError, ConfigError, GeometryError
 from deepaccident_devkit.tables import visible_mask
@@ -28,14 +33,20 @@ def own_id(da: DeepAccident, scenario: Mapping[str, Any], agent: str) -> int | N
     return da.get("agent", f"{scenario['token']}/{agent}")["actor_id"]
 
 
-def test_annotated_is_the_tracks_agents(da_motion: DeepAccident, accident: Mapping[str, Any]) -> None:
+def test_annotated_is_the_tracks_agents(
+    da_motion: DeepAccident, accident: Mapping[str, Any]
+) -> None:
     actors, tracks = all_actors(da_motion, accident), scenario_tracks(da_motion, accident["token"])
-    agents, observed = observed_actors(da_motion, accident, actors, ObservationRule(kind="annotated"))
+    agents, observed = observed_actors(
+        da_motion, accident, actors, ObservationRule(kind="annotated")
+    )
     assert (agents, observed.shape) == (AGENTS, (5, len(actors), accident["num_frames"]))
     expected = np.zeros_like(observed)
     for which, actor in enumerate(actors):
         rows = np.flatnonzero(tracks.actor_id == actor)
-        expected[:, which, tracks.index[rows] - 1] = tracks.agents[rows] >> np.arange(5)[:, None] & 1
+        expected[:, which, tracks.index[rows] - 1] = (
+            tracks.agents[rows] >> np.arange(5)[:, None] & 1
+        )
     np.testing.assert_array_equal(observed, expected)
     assert 0 < expected.mean() < 1
 
@@ -48,7 +59,9 @@ def all_actors(da: DeepAccident, scenario: Mapping[str, Any]) -> list[int]:
 
 
 @pytest.mark.parametrize("kind", ["points", "released"])
-def test_rules_on_each_label(da_motion: DeepAccident, accident: Mapping[str, Any], kind: str) -> None:
+def test_rules_on_each_label(
+    da_motion: DeepAccident, accident: Mapping[str, Any], kind: str
+) -> None:
     actors = all_actors(da_motion, accident)
     rule = ObservationRule(kind=kind, least_points=3)
     _, observed = observed_actors(da_motion, accident["token"], actors, rule)
@@ -60,7 +73,9 @@ def test_rules_on_each_label(da_motion: DeepAccident, accident: Mapping[str, Any
         if kind == "released":
             columns = boxes.center[:, :2], boxes.category, boxes.num_lidar_pts, boxes.camera_visible
             seen = visible_mask(*columns, infrastructure=agent == "infrastructure")
-        expected[row, :, frame] = np.isin(actors, [*ids[seen], own_id(da_motion, accident, agent) or -1])
+        expected[row, :, frame] = np.isin(
+            actors, [*ids[seen], own_id(da_motion, accident, agent) or -1]
+        )
     np.testing.assert_array_equal(observed, expected)
     assert 0 < expected[4].mean() < 1
 
@@ -74,22 +89,51 @@ def test_the_pole_has_a_distance_of_its_own() -> None:
         "camera_visible": np.zeros(3, dtype=bool),
     }
     dataset: Any = SimpleNamespace(columns=lambda _: columns)
-    seen = by_rule(dataset, slice(0, 3), np.array([1, 2]), np.array([False, True]), ObservationRule(kind="released"))
+    seen = by_rule(
+        dataset,
+        slice(0, 3),
+        np.array([1, 2]),
+        np.array([False, True]),
+        ObservationRule(kind="released"),
+    )
     assert seen.tolist() == [False, True]
 
 
 def test_who_observes_itself(da_motion: DeepAccident, accident: Mapping[str, Any]) -> None:
-    rule, ego = ObservationRule(kind="points", least_points=10**9), own_id(da_motion, accident, "ego_vehicle")
+    rule, ego = (
+        ObservationRule(kind="points", least_points=10**9),
+        own_id(da_motion, accident, "ego_vehicle"),
+    )
     _, observed = observed_actors(da_motion, accident, [ego], rule)
-    assert observed.all(axis=(1, 2)).tolist() == observed.any(axis=(1, 2)).tolist() == [True, *[False] * 4]
+    assert (
+        observed.all(axis=(1, 2)).tolist()
+        == observed.any(axis=(1, 2)).tolist()
+        == [True, *[False] * 4]
+    )
 
 
 def test_what_does_not_fit_is_refused() -> None:
     assert_refused(
-        (lambda: ObservationRule(kind="seen"), ChoiceError, ("kind", "points, released, annotated", "'seen'")),
-        (lambda: ObservationRule(least_points=0), ConfigError, ("least_points", "from 1", "found 0")),
-        (lambda: ObservationRule(least_points=1.5), ConfigError, ("least_points", "a whole number")),
-        (lambda: coalition_leads(np.zeros((5, 3, 4), dtype=bool)), GeometryError, ("observed", "found (5, 3, 4)")),
+        (
+            lambda: ObservationRule(kind="seen"),
+            ChoiceError,
+            ("kind", "points, released, annotated", "'seen'"),
+        ),
+        (
+            lambda: ObservationRule(least_points=0),
+            ConfigError,
+            ("least_points", "from 1", "found 0"),
+        ),
+        (
+            lambda: ObservationRule(least_points=1.5),
+            ConfigError,
+            ("least_points", "a whole number"),
+        ),
+        (
+            lambda: coalition_leads(np.zeros((5, 3, 4), dtype=bool)),
+            GeometryError,
+            ("observed", "found (5, 3, 4)"),
+        ),
         (lambda: shapley_values(np.zeros(6)), GeometryError, ("2^n coalitions", "(6,)")),
     )
 
@@ -104,18 +148,26 @@ def plain_lead(observed: np.ndarray, agents: list[int]) -> float:
 
 @given(observations)
 def test_leads_are_those_of_a_plain_search(observed: np.ndarray) -> None:
-    plain = [plain_lead(observed, [0, *(np.flatnonzero(members) + 1)]) for members in coalition_members(4)]
+    plain = [
+        plain_lead(observed, [0, *(np.flatnonzero(members) + 1)])
+        for members in coalition_members(4)
+    ]
     assert coalition_leads(observed) == pytest.approx(plain, abs=1e-12)
 
 
 @given(observations)
 def test_more_agents_never_see_later(observed: np.ndarray) -> None:
     leads = coalition_leads(observed)
-    assert all(leads[fewer | more] >= leads[fewer] for fewer, more in itertools.product(range(16), repeat=2))
+    assert all(
+        leads[fewer | more] >= leads[fewer]
+        for fewer, more in itertools.product(range(16), repeat=2)
+    )
 
 
 @given(observations)
-def test_shapley_values_share_the_whole_gain_and_are_means_over_orders(observed: np.ndarray) -> None:
+def test_shapley_values_share_the_whole_gain_and_are_means_over_orders(
+    observed: np.ndarray,
+) -> None:
     leads = coalition_leads(observed)
     values = shapley_values(leads)
     assert values.sum() == pytest.approx(leads[-1] - leads[0], abs=1e-9)

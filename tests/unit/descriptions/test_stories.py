@@ -108,7 +108,9 @@ def without(facts: dict[str, Any], path: tuple[Any, ...]) -> dict[str, Any]:
         *((NORMAL | {"duration": 9.9}, path, clause) for path, clause in OF_NORMAL.items()),
     ],
 )
-def test_a_clause_goes_with_its_value(facts: dict[str, Any], path: tuple[Any, ...], clause: str) -> None:
+def test_a_clause_goes_with_its_value(
+    facts: dict[str, Any], path: tuple[Any, ...], clause: str
+) -> None:
     text = story_text(without(facts, path))
     assert clause in story_text(facts)
     assert (holding(text, clause, "None"), text[-1]) == ([], ".")
@@ -147,8 +149,12 @@ def test_stories_of_a_release(da_motion: DeepAccident) -> None:
     assert f"{pair[0]['speed']:.1f} m/s" in str(story)
     assert json.loads(story.to_json())["text"] == story.text
     assert "nobody collides in 3.4 s" in da_motion.describe(normal).text
-    assert list(stories(da_motion, workers=1)) == [da_motion.describe(each) for each in da_motion.scenario]
-    assert_refused((lambda: da_motion.describe("type1/nowhere"), TokenError, ("no scenario", "type1/nowhere")))
+    assert list(stories(da_motion, workers=1)) == [
+        da_motion.describe(each) for each in da_motion.scenario
+    ]
+    assert_refused(
+        (lambda: da_motion.describe("type1/nowhere"), TokenError, ("no scenario", "type1/nowhere"))
+    )
 
 
 def test_the_command(da_motion: DeepAccident, tmp_path: Path) -> None:

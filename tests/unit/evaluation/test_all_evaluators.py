@@ -31,9 +31,15 @@ MOTION: dict[str, Callable[[], Evaluator[Any]]] = {
     "motion released": MotionEvaluator,
     "motion paper": lambda: MotionEvaluator("paper"),
 }
-ACCIDENT = {f"accident {name}": lambda name=name: AccidentEvaluator(name) for name in ("released", "paper", "boxes")}
+ACCIDENT = {
+    f"accident {name}": lambda name=name: AccidentEvaluator(name)
+    for name in ("released", "paper", "boxes")
+}
 DETECTION = {
-    **{f"detection {name}": lambda name=name: DetectionEvaluator(name) for name in DETECTION_PROTOCOLS},
+    **{
+        f"detection {name}": lambda name=name: DetectionEvaluator(name)
+        for name in DETECTION_PROTOCOLS
+    },
     "detection opencood by sample": lambda: DetectionEvaluator("opencood", global_sort=False),
 }
 ALL = {**MOTION, **ACCIDENT, **DETECTION}
@@ -55,7 +61,9 @@ class Samples:
 
     def __init__(self, dataset: DeepAccident, tokens: Sequence[str]) -> None:
         self.dataset = dataset
-        self.labels = {token: dataset.motion_labels(token).to_present("bilinear") for token in tokens}
+        self.labels = {
+            token: dataset.motion_labels(token).to_present("bilinear") for token in tokens
+        }
         self.contexts = {token: accident_context(dataset, token, 2.0) for token in tokens}
 
     def given(self, how: str, name: str, token: str) -> Sequence[Any]:
@@ -65,13 +73,21 @@ class Samples:
             label, other = self.labels[token], self.labels[min(self.labels)]
             output = instances_of(label.instance * (how == "perfect"), label.config.grid)
             if how == "some":
-                output = MotionOutput(grid=label.config.grid, heads=tuple(map(MotionHeads.from_labels, (label, other))))
+                output = MotionOutput(
+                    grid=label.config.grid,
+                    heads=tuple(map(MotionHeads.from_labels, (label, other))),
+                )
             return (output, label, *([self.contexts[token]] if name in ACCIDENT else []))
         truth = detection_truth(self.dataset, token, DETECTION[name]().protocol)
-        source, share = np.random.default_rng(int(token[-3:])), {"perfect": 1.0, "empty": 0.0, "some": 0.8}[how]
+        source, share = (
+            np.random.default_rng(int(token[-3:])),
+            {"perfect": 1.0, "empty": 0.0, "some": 0.8}[how],
+        )
         boxes = truth.select(source.uniform(size=len(truth)) < share)
         off = source.normal(0, 0.5, (len(boxes), 3)) * (how == "some")
-        scores = np.round(source.uniform(size=len(boxes)), 1) if how == "some" else np.ones(len(boxes))
+        scores = (
+            np.round(source.uniform(size=len(boxes)), 1) if how == "some" else np.ones(len(boxes))
+        )
         return DetectedBoxes(boxes=replace(boxes, center=boxes.center + off), scores=scores), truth
 
     def evaluated(self, how: str, name: str, tokens: Sequence[str]) -> Evaluator[Any]:
@@ -88,7 +104,9 @@ def samples(da_motion: DeepAccident, tokens: list[str]) -> Samples:
 
 @pytest.mark.slow
 @of_all
-def test_order_parts_and_pauses_change_no_bit(samples: Samples, tokens: list[str], name: str, tmp_path: Path) -> None:
+def test_order_parts_and_pauses_change_no_bit(
+    samples: Samples, tokens: list[str], name: str, tmp_path: Path
+) -> None:
     arguments = {token: samples.given("some", name, token) for token in tokens}
     whole = samples.evaluated("some", name, tokens)
     expected = bits(whole.compute())
@@ -111,7 +129,9 @@ def test_order_parts_and_pauses_change_no_bit(samples: Samples, tokens: list[str
 
 
 @of_all
-def test_counts_are_json_and_pooled_they_have_the_same_result(samples: Samples, tokens: list[str], name: str) -> None:
+def test_counts_are_json_and_pooled_they_have_the_same_result(
+    samples: Samples, tokens: list[str], name: str
+) -> None:
     evaluator = samples.evaluated("some", name, tokens[::3])
     counts = [evaluator.counts[token] for token in tokens[::3]]
     assert json.loads(json.dumps(counts, allow_nan=False)) == counts
@@ -123,11 +143,17 @@ def test_empty_predictions_score_0(samples: Samples, tokens: list[str], name: st
     evaluator = samples.evaluated("empty", name, tokens)
     result = evaluator.compute()
     if name in MOTION:
-        assert [value for each in result.ranges.values() for value in (each.iou, each.pq, each.sq, each.rq)] == [0] * 8
+        assert [
+            value
+            for each in result.ranges.values()
+            for value in (each.iou, each.pq, each.sq, each.rq)
+        ] == [0] * 8
         assert (result.path_accuracy, result.paths) == (0, 0)
     elif name in ACCIDENT:
         assert (result.positives > 0, result.apa) == (True, 0)
-        assert [(each.tp, each.fp, each.fn) for each in result.within.values()] == [(0, 0, result.positives)] * 3
+        assert [(each.tp, each.fp, each.fn) for each in result.within.values()] == [
+            (0, 0, result.positives)
+        ] * 3
     else:
         assert result.mean_average_precision == 0
     for some in ((), tokens[:1]):
@@ -137,13 +163,21 @@ def test_empty_predictions_score_0(samples: Samples, tokens: list[str], name: st
 
 @pytest.mark.parametrize("name", MOTION | DETECTION)
 @pytest.mark.parametrize("given", [None, np.zeros((2, 5, 200, 200), dtype=int)])
-def test_predictions_that_are_none(samples: Samples, tokens: list[str], name: str, given: object) -> None:
+def test_predictions_that_are_none(
+    samples: Samples, tokens: list[str], name: str, given: object
+) -> None:
     prediction, truth = samples.given("perfect", name, tokens[0])
     update, wrong = ALL[name]().update, type(given).__name__
-    kind, of_truth = ("a MotionOutput", "MotionLabels") if name in MOTION else ("DetectedBoxes", "Boxes")
+    kind, of_truth = (
+        ("a MotionOutput", "MotionLabels") if name in MOTION else ("DetectedBoxes", "Boxes")
+    )
     error = EvaluationError if name in MOTION else GeometryError
     assert_refused(
-        (lambda: update(tokens[0], given, truth), EvaluationError, (f"expected {kind}", "from_arrays(", wrong)),
+        (
+            lambda: update(tokens[0], given, truth),
+            EvaluationError,
+            (f"expected {kind}", "from_arrays(", wrong),
+        ),
         (lambda: update(tokens[0], prediction, given), error, (f"expected {of_truth}", wrong)),
     )
 
@@ -152,13 +186,27 @@ def test_predictions_that_are_none(samples: Samples, tokens: list[str], name: st
 def test_perfect_predictions(samples: Samples, tokens: list[str], name: str) -> None:
     result = samples.evaluated("perfect", name, tokens).compute()
     if name in MOTION:
-        assert [value for each in result.ranges.values() for value in (each.iou, each.pq, each.sq, each.rq)] == [
-            100
-        ] * 8
-        assert (result.min_ade, result.min_fde, result.miss_rate, result.path_accuracy) == (0, 0, 0, 1)
+        assert [
+            value
+            for each in result.ranges.values()
+            for value in (each.iou, each.pq, each.sq, each.rq)
+        ] == [100] * 8
+        assert (result.min_ade, result.min_fde, result.miss_rate, result.path_accuracy) == (
+            0,
+            0,
+            0,
+            1,
+        )
     elif name == "accident paper":
-        assert (result.apa, result.id_error, result.position_error, result.time_error) == (1, 0, 0, 0)
-        assert [(each.tp > 0, each.fp, each.fn) for each in result.within.values()] == [(True, 0, 0)] * 3
+        assert (result.apa, result.id_error, result.position_error, result.time_error) == (
+            1,
+            0,
+            0,
+            0,
+        )
+        assert [(each.tp > 0, each.fp, each.fn) for each in result.within.values()] == [
+            (True, 0, 0)
+        ] * 3
     elif name.startswith("detection opencood"):
         assert result.mean_average_precision == pytest.approx(100, abs=1e-9)
     elif name in DETECTION:
@@ -170,7 +218,9 @@ def test_perfect_predictions(samples: Samples, tokens: list[str], name: str) -> 
 def bits(value: Any) -> Any:
     """A result to its last bit, whatever the order of its mappings."""
     if is_dataclass(value):
-        return type(value).__name__, [(field.name, bits(getattr(value, field.name))) for field in fields(value)]
+        return type(value).__name__, [
+            (field.name, bits(getattr(value, field.name))) for field in fields(value)
+        ]
     if isinstance(value, np.ndarray):
         return value.shape, value.dtype.str, value.tobytes()
     if isinstance(value, dict):

@@ -66,7 +66,9 @@ def attributes_of(number: int, **changes: Any) -> SampleAttributes:
 def filled(numbers: range = range(100), kind: type[Ratios] = Ratios) -> Ratios:
     evaluator = kind()
     for number in numbers:
-        evaluator.add(f"{number:03d}", {"above": float(number % 7 == 0 or number // 10 == 3), "below": 1.0})
+        evaluator.add(
+            f"{number:03d}", {"above": float(number % 7 == 0 or number // 10 == 3), "below": 1.0}
+        )
     return evaluator
 
 
@@ -104,7 +106,10 @@ def test_everything_is_a_breakdown_too() -> None:
 
 
 def changed(some: Callable[[int], bool], **changes: Any) -> dict[str, SampleAttributes]:
-    return {token: replace(each, **changes) if some(int(token)) else each for token, each in MANY.items()}
+    return {
+        token: replace(each, **changes) if some(int(token)) else each
+        for token, each in MANY.items()
+    }
 
 
 FIRST_TWO = changed(lambda number: number in (0, 13), time_to_impact=None, impact_step=NO_IMPACT)
@@ -134,12 +139,24 @@ AGENT_EACH = {token: replace(each, agent=AGENTS[int(token) % 5]) for token, each
             },
             None,
         ),
-        (POLES, "town", {"Town00": 40, "Town01": 30, "Town02": 30}, {"Town00": 24, "Town01": 18, "Town02": 18}),
+        (
+            POLES,
+            "town",
+            {"Town00": 40, "Town01": 30, "Town02": 30},
+            {"Town00": 24, "Town01": 18, "Town02": 18},
+        ),
         (POLES, "agent", {"ego_vehicle": 60, INFRASTRUCTURE: 40}, {"ego_vehicle": 60}),
-        (AGENT_EACH, "agent", dict.fromkeys(AGENTS, 20), dict.fromkeys(AGENTS[:-1], 20)),  # in their usual order
+        (
+            AGENT_EACH,
+            "agent",
+            dict.fromkeys(AGENTS, 20),
+            dict.fromkeys(AGENTS[:-1], 20),
+        ),  # in their usual order
     ],
 )
-def test_groups_are_in_order_and_the_pole_is_left_out_beside(attributes, by, groups, without) -> None:
+def test_groups_are_in_order_and_the_pole_is_left_out_beside(
+    attributes, by, groups, without
+) -> None:
     """What is unknown comes last."""
     found = breakdown(filled(), attributes, by, ALL_AT_ONCE)
     assert list(shown(found.groups).items()) == list(groups.items())
@@ -193,9 +210,17 @@ def test_an_accident_and_its_twin_are_one_cluster() -> None:
 def test_what_cannot_be_broken_down() -> None:
     few = dict(list(MANY.items())[:-1])
     assert_refused(
-        (lambda: breakdown(filled(), few, "town"), EvaluationError, ("1 samples", "such as 099", "sample_attributes")),
+        (
+            lambda: breakdown(filled(), few, "town"),
+            EvaluationError,
+            ("1 samples", "such as 099", "sample_attributes"),
+        ),
         (lambda: breakdown(filled(), {}, "town"), EvaluationError, ("100 samples", "such as 000")),
-        (lambda: breakdown(filled(), MANY, "moon"), ChoiceError, ("by: expected one of", "town", "'moon'")),
+        (
+            lambda: breakdown(filled(), MANY, "moon"),
+            ChoiceError,
+            ("by: expected one of", "town", "'moon'"),
+        ),
         (lambda: MANY["000"].value("moon"), ChoiceError, ("by: expected one of", "'moon'")),
     )
 
@@ -232,7 +257,9 @@ def test_the_attributes_of_samples_are_those_of_their_records(da_motion: DeepAcc
             sample["agent"],
             f"{(35 - int(token[-3:])) / 10:.1f}",
         )
-        assert (each.time_to_impact, each.impact_step) == (bins if scenario["collision"] else (NO_IMPACT, NO_IMPACT))
+        assert (each.time_to_impact, each.impact_step) == (
+            bins if scenario["collision"] else (NO_IMPACT, NO_IMPACT)
+        )
         assert each.accident_visibility == words[accident_visible(da_motion, token)]
         assert [each.value(name) for name in ("agent", "all", "town", "Weather")] == [
             sample["agent"],
@@ -241,11 +268,18 @@ def test_the_attributes_of_samples_are_those_of_their_records(da_motion: DeepAcc
             scenario["weather"],
         ]
     within = ("accident_visibility", "time_to_impact", "impact_step", "time_to_end")
-    assert (ATTRIBUTES[0], ATTRIBUTES[-5:], {*WITHIN_RECORDINGS}) == ("all", ("agent", *within), {*within})
+    assert (ATTRIBUTES[0], ATTRIBUTES[-5:], {*WITHIN_RECORDINGS}) == (
+        "all",
+        ("agent", *within),
+        {*within},
+    )
     chosen = {token: attributes[token] for token in evaluated}
     by_value = {name: tokens_by_value(chosen, name) for name in ATTRIBUTES}
     assert {sum(map(len, each.values())) for each in by_value.values()} == {len(evaluated)}
-    assert {value: len(each) for value, each in by_value["time_to_impact"].items()} == {"2 s": 10, "1 s": 10}
+    assert {value: len(each) for value, each in by_value["time_to_impact"].items()} == {
+        "2 s": 10,
+        "1 s": 10,
+    }
 
 
 def test_without_meta_it_is_not_known_whether_there_is_an_impact(
@@ -253,7 +287,17 @@ def test_without_meta_it_is_not_known_whether_there_is_an_impact(
 ) -> None:
     [record, *_] = [each for each in da_motion.scenario if each["collision"] is None]
     token = f"{record['token']}/ego_vehicle/010"
-    unknown = {name: None for name, value in record.items() if name != "token" and not isinstance(value, int)}
-    monkeypatch.setattr(type(da_motion), "scenario", {record["token"]: record | unknown}, raising=False)
+    unknown = {
+        name: None
+        for name, value in record.items()
+        if name != "token" and not isinstance(value, int)
+    }
+    monkeypatch.setattr(
+        type(da_motion), "scenario", {record["token"]: record | unknown}, raising=False
+    )
     [each] = sample_attributes(da_motion, [token]).values()
-    assert (each.time_to_impact, each.impact_step, each.value("collision_status")) == (None, None, None)
+    assert (each.time_to_impact, each.impact_step, each.value("collision_status")) == (
+        None,
+        None,
+        None,
+    )

@@ -51,13 +51,25 @@ def test_some_samples_alone() -> None:
     evaluator = filled("abcd")
     assert (evaluator.compute(["b", "d"]), evaluator.compute([])) == (1.1, 0.0)
     assert_refused(
-        (lambda: evaluator.compute(["a", *"zyxwvut"]), EvaluationError, ("7 samples have no prediction, such as t",)),
+        (
+            lambda: evaluator.compute(["a", *"zyxwvut"]),
+            EvaluationError,
+            ("7 samples have no prediction, such as t",),
+        ),
         *(
-            (lambda given=given: evaluator.compute(given), EvaluationError, ("tokens: expected", "found"))
+            (
+                lambda given=given: evaluator.compute(given),
+                EvaluationError,
+                ("tokens: expected", "found"),
+            )
             for given in ("ab", 3, ["a", 1], [b"a"], [["a"]])
         ),
         *(
-            (lambda token=token: Sums().add(token, {"value": 1.0}), EvaluationError, ("token", "a text", repr(token)))
+            (
+                lambda token=token: Sums().add(token, {"value": 1.0}),
+                EvaluationError,
+                ("token", "a text", repr(token)),
+            )
             for token in (3, None, b"a")
         ),
     )
@@ -68,7 +80,12 @@ def test_a_fresh_one_has_the_settings_alone() -> None:
     fresh = one.fresh()
     assert (len(fresh), fresh.settings) == (0, {"scale": 3.0})
     fresh.merge(filled("a", scale=3.0)).merge(filled("a", scale=3.0))
-    assert (fresh.tokens, fresh.repeated, one.tokens, one.repeated) == ({"a"}, {"a"}, {"a", "b", "c"}, {"b"})
+    assert (fresh.tokens, fresh.repeated, one.tokens, one.repeated) == (
+        {"a"},
+        {"a"},
+        {"a", "b", "c"},
+        {"b"},
+    )
     assert [repr(each) for each in (one, fresh)] == ["Sums(3 samples)", "Sums(1 sample)"]
 
 
@@ -78,7 +95,13 @@ def test_a_broken_off_run_goes_on(tmp_path: Path) -> None:
     assert (resumed.repeated, resumed.merge(filled("d")).compute()) == ({"b"}, 1.1)
     again = filled("ab").resume(path)
     assert (again.compute(), again.repeated) == (1.0, {"a", "b"})
-    other = filled("c").merge(filled("a")).merge(filled("b")).merge(filled("b")).save(tmp_path / "other.json")
+    other = (
+        filled("c")
+        .merge(filled("a"))
+        .merge(filled("b"))
+        .merge(filled("b"))
+        .save(tmp_path / "other.json")
+    )
     assert other.read_bytes() == path.read_bytes()
 
 
@@ -90,13 +113,35 @@ def test_runs_and_evaluators_of_other_settings_makers_or_versions_do_not_go_toge
 
     path = filled("a").save(tmp_path / "state.json")
     assert_refused(
-        (lambda: filled("a").merge(filled("b", scale=2.0)), EvaluationError, ("cannot merge", "same settings", "2.0")),
-        (lambda: filled("a").merge(Others()), EvaluationError, ("cannot merge", "Sums of", "Others of")),
-        (lambda: Sums(scale=2.0).resume(path), EvaluationError, ("state.json", "saved with other settings", "1.0")),
-        (lambda: Others().resume(path), EvaluationError, ("saved by Sums of devkit", "this is Others", "begin again")),
+        (
+            lambda: filled("a").merge(filled("b", scale=2.0)),
+            EvaluationError,
+            ("cannot merge", "same settings", "2.0"),
+        ),
+        (
+            lambda: filled("a").merge(Others()),
+            EvaluationError,
+            ("cannot merge", "Sums of", "Others of"),
+        ),
+        (
+            lambda: Sums(scale=2.0).resume(path),
+            EvaluationError,
+            ("state.json", "saved with other settings", "1.0"),
+        ),
+        (
+            lambda: Others().resume(path),
+            EvaluationError,
+            ("saved by Sums of devkit", "this is Others", "begin again"),
+        ),
     )
     monkeypatch.setattr("deepaccident_devkit.evaluation.sample_counts.__version__", "99")
-    assert_refused((lambda: Sums().resume(path), EvaluationError, ("was saved by", "this is Sums of devkit 99")))
+    assert_refused(
+        (
+            lambda: Sums().resume(path),
+            EvaluationError,
+            ("was saved by", "this is Sums of devkit 99"),
+        )
+    )
 
 
 LONG = "x" * 10**6
@@ -122,7 +167,9 @@ STATE: dict[str, Any] = {"made_by": "", "settings": {}, "counts": {}, "repeated"
 def test_a_damaged_or_hostile_state_is_refused_in_few_words(tmp_path: Path, text: str) -> None:
     path = tmp_path / "state.json"
     path.write_text(text, encoding="utf-8")
-    with pytest.raises(EvaluationError, match=r"state\.json: (no saved evaluation|was saved) .*begin again") as raised:
+    with pytest.raises(
+        EvaluationError, match=r"state\.json: (no saved evaluation|was saved) .*begin again"
+    ) as raised:
         Sums().resume(path)
     assert len(str(raised.value)) <= MOST_SAID
 
@@ -132,9 +179,17 @@ def test_places_that_cannot_be_read_or_written_are_our_errors(tmp_path: Path) ->
     os.mkfifo(tmp_path / "pipe")
     below = tmp_path / "file" / "state.json"
     assert_refused(
-        (lambda: filled("a").save(below), EvaluationError, ("state.json", "cannot be saved", "choose another file")),
+        (
+            lambda: filled("a").save(below),
+            EvaluationError,
+            ("state.json", "cannot be saved", "choose another file"),
+        ),
         (lambda: Sums().resume(tmp_path / "pipe"), EvaluationError, ("a named pipe",)),
-        (lambda: Sums().resume(tmp_path / "nowhere"), EvaluationError, ("nowhere", "no saved evaluation")),
+        (
+            lambda: Sums().resume(tmp_path / "nowhere"),
+            EvaluationError,
+            ("nowhere", "no saved evaluation"),
+        ),
     )
 
 
@@ -147,7 +202,11 @@ def test_counts_cannot_be_changed() -> None:
     evaluator.counts["n"]["lists"][1]["of"].append(3)
     assert evaluator.counts["n"]["lists"] == [[1], {"of": [2]}]
     assert evaluator.compute(["a"]) == 1e16
-    assert (list(evaluator.counts), len(evaluator.counts), "a" in evaluator.counts) == (["a", "n"], 2, True)
+    assert (list(evaluator.counts), len(evaluator.counts), "a" in evaluator.counts) == (
+        ["a", "n"],
+        2,
+        True,
+    )
     assert list(evaluator.pooled([{"value": 1.0}])) == [{"value": 1.0}]
 
 
@@ -159,5 +218,9 @@ def test_draws_take_whole_parts_so_often() -> None:
 
 
 def test_ratios_and_totals() -> None:
-    assert (ratio(1, 4), ratio(0, 4), total([{"a": 1e16}, {"a": 1.0}, {"a": -1e16}], "a")) == (0.25, 0.0, 1.0)
+    assert (ratio(1, 4), ratio(0, 4), total([{"a": 1e16}, {"a": 1.0}, {"a": -1e16}], "a")) == (
+        0.25,
+        0.0,
+        1.0,
+    )
     assert math.isnan(ratio(0, 0))

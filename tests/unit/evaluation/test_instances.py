@@ -43,7 +43,11 @@ def test_instances_match_as_vpq_counts(large: int) -> None:
         mine, theirs = prediction[frame] == predicted, label[frame] == true
         assert 2 * (mine & theirs).sum() > (mine | theirs).sum()
     assert_refused(
-        (lambda: vpq_matches(prediction[0], label), GeometryError, ("prediction", "(T, H, W)", "(3, 20, 20)")),
+        (
+            lambda: vpq_matches(prediction[0], label),
+            GeometryError,
+            ("prediction", "(T, H, W)", "(3, 20, 20)"),
+        ),
         (lambda: vpq_counts(prediction[:2], label), GeometryError, ("(3, 20, 20)", "(2, 20, 20)")),
     )
 
@@ -78,7 +82,10 @@ def test_the_background_counts_as_one_that_is_never_missed_nor_a_false_alarm() -
 def test_an_id_that_changes_is_a_miss_unless_frames_are_alone() -> None:
     label = np.full((4, 2, 2), 3)
     prediction = np.array([5, 5, 7, 7])[:, None, None] * np.ones((1, 2, 2), dtype=np.int64)
-    found = [vpq_counts(prediction, label, temporally_consistent=each).true_positive[:, 1] for each in (True, False)]
+    found = [
+        vpq_counts(prediction, label, temporally_consistent=each).true_positive[:, 1]
+        for each in (True, False)
+    ]
     assert [each.tolist() for each in found] == [[1, 1, 0, 1], [1, 1, 1, 1]]
 
 
@@ -92,7 +99,9 @@ def test_iou_of_classes() -> None:
 
 
 def test_quality_of_sums() -> None:
-    assert panoptic_quality(3.0, 4, 2, 6) == PanopticQuality(pq=3 / 8, sq=3 / 4, rq=4 / 8, denominator=8)
+    assert panoptic_quality(3.0, 4, 2, 6) == PanopticQuality(
+        pq=3 / 8, sq=3 / 4, rq=4 / 8, denominator=8
+    )
     assert panoptic_quality(0.0, 0, 1, 0) == PanopticQuality(pq=0.0, sq=0.0, rq=0.0, denominator=1)
 
 
@@ -110,10 +119,13 @@ def test_paths_of_instances(orientation) -> None:
         2: [[-29.0, 1.0], [-28.0, 1.0]],
     }
     below = np.where(turned == 0, -3, turned)
-    assert [path.tolist() for path in instance_paths(below, grid.with_orientation(orientation)).values()] == [
-        path.tolist() for path in found.values()
-    ]
-    assert (instance_paths(maps[:2] * 0, grid), instance_paths(maps[1:] * [[[0]], [[1]]], grid)) == ({}, {})
+    assert [
+        path.tolist() for path in instance_paths(below, grid.with_orientation(orientation)).values()
+    ] == [path.tolist() for path in found.values()]
+    assert (
+        instance_paths(maps[:2] * 0, grid),
+        instance_paths(maps[1:] * [[[0]], [[1]]], grid),
+    ) == ({}, {})
 
 
 def row(*x: float) -> np.ndarray:
@@ -130,11 +142,35 @@ def test_a_path_that_ends_early_goes_on_ever_faster() -> None:
 @pytest.mark.parametrize(
     ("predicted", "true", "pairs", "costs", "left"),
     [
-        ({5: row(4, 4, 4)}, {8: row(0, 0, 0)}, ((5, 8),), (12,), ((), ())),  # a mean of 4 metres over the frames
+        (
+            {5: row(4, 4, 4)},
+            {8: row(0, 0, 0)},
+            ((5, 8),),
+            (12,),
+            ((), ()),
+        ),  # a mean of 4 metres over the frames
         ({5: row(4.001, 4, 4)}, {8: row(0, 0, 0)}, (), (), ((5,), (8,))),
-        ({5: row(0, 0), 6: row(9, 9)}, {8: row(9, 8), 7: row(1, 2)}, ((6, 8), (5, 7)), (1, 3), ((), ())),  # by cost
-        ({4: row(99), 5: row(0), 2: row(50)}, {8: row(1)}, ((5, 8),), (1,), ((2, 4), ())),  # left over, ascending
-        ({5: row(0, 0)}, {8: row(9, 0), 9: row(0, 20), 7: row(0, 21)}, (), (), ((5,), (7, 9, 8))),  # too far: used up
+        (
+            {5: row(0, 0), 6: row(9, 9)},
+            {8: row(9, 8), 7: row(1, 2)},
+            ((6, 8), (5, 7)),
+            (1, 3),
+            ((), ()),
+        ),  # by cost
+        (
+            {4: row(99), 5: row(0), 2: row(50)},
+            {8: row(1)},
+            ((5, 8),),
+            (1,),
+            ((2, 4), ()),
+        ),  # left over, ascending
+        (
+            {5: row(0, 0)},
+            {8: row(9, 0), 9: row(0, 20), 7: row(0, 21)},
+            (),
+            (),
+            ((5,), (7, 9, 8)),
+        ),  # too far: used up
         ({5: row(0, 0, 7)}, {8: row(0, 0)}, ((5, 8),), (0,), ((), ())),  # only so many points count
     ],
 )
@@ -146,18 +182,36 @@ def test_partners_are_the_nearest_two_first(predicted, true, pairs, costs, left)
 
 def test_paths_of_several_lengths_are_refused() -> None:
     assert_refused(
-        (lambda: match_trajectories({5: row(0, 0)}, {8: row(0, 0, 0)}), GeometryError, ("3 points", "padded")),
-        (lambda: match_trajectories({}, {8: row(0, 0, 0), 9: row(0)}), GeometryError, ("3 points", "padded")),
+        (
+            lambda: match_trajectories({5: row(0, 0)}, {8: row(0, 0, 0)}),
+            GeometryError,
+            ("3 points", "padded"),
+        ),
+        (
+            lambda: match_trajectories({}, {8: row(0, 0, 0), 9: row(0)}),
+            GeometryError,
+            ("3 points", "padded"),
+        ),
     )
 
 
 @pytest.mark.parametrize(
     ("end", "ade", "fde", "missed"),
-    [(5.0, 2.5, 5.0, 0), (5.5, 2.75, 5.5, 1), (11.0, 5.5, 10.0, 1), (17.0, 8.0, 10.0, 1), (0.0, 0.0, 0.0, 0)],
+    [
+        (5.0, 2.5, 5.0, 0),
+        (5.5, 2.75, 5.5, 1),
+        (11.0, 5.5, 10.0, 1),
+        (17.0, 8.0, 10.0, 1),
+        (0.0, 0.0, 0.0, 0),
+    ],
 )
-def test_errors_at_the_end_and_their_limits(end: float, ade: float, fde: float, missed: int) -> None:
+def test_errors_at_the_end_and_their_limits(
+    end: float, ade: float, fde: float, missed: int
+) -> None:
     truth, predicted = {1: row(0, 0)}, {4: row(0, end)}
-    made = trajectory_errors([predicted], truth, [replace(match_trajectories(truth, truth), pairs=((4, 1),))])
+    made = trajectory_errors(
+        [predicted], truth, [replace(match_trajectories(truth, truth), pairs=((4, 1),))]
+    )
     assert (made.ade, made.fde, made.missed, made.count) == (ade, fde, missed, 1)
 
 

@@ -34,7 +34,9 @@ from deepaccident_devkit.plugins.safety.prevention_result import PreventedResult
 
 
 def made(
-    above: Sequence[float], below: Sequence[float] | None = None, resampling: Resampling | None = None
+    above: Sequence[float],
+    below: Sequence[float] | None = None,
+    resampling: Resampling | None = None,
 ) -> Intervals:
     """Of one sample a cluster."""
     given = zip(above, below or [1.0] * len(above), strict=True)
@@ -73,7 +75,9 @@ def test_a_share_that_all_clusters_agree_on_is_not_sure(hit: float, at: int) -> 
         assert ends == pytest.approx(wilson(hit, 12, 2.2010), abs=1e-4)
         assert ends[at] == hit
         assert abs(ends[1 - at] - hit) > 0.25
-    few = made([hit] * 8 + [0] * 50, [1] * 8 + [0] * 50).ends["ratio"]  # 50 clusters have nothing to count
+    few = made([hit] * 8 + [0] * 50, [1] * 8 + [0] * 50).ends[
+        "ratio"
+    ]  # 50 clusters have nothing to count
     assert few == pytest.approx(wilson(hit, 8, 2.3646), abs=1e-4)
 
 
@@ -100,7 +104,13 @@ LEFT_OUT = f"(an accident and its twin are one); at least {LEAST_CLUSTERS} are n
             ("no interval of ratio: fewer than 6 clusters have such a number",),
         ),
         ([2.5] * 20, None, None, (), ("no interval of ratio: fewer than 6 clusters change it",)),
-        ([0.1 * 3, 0.3] * 10, [0.1, 0.1] * 10, None, (), ("no interval of ratio: fewer than 6 clusters change it",)),
+        (
+            [0.1 * 3, 0.3] * 10,
+            [0.1, 0.1] * 10,
+            None,
+            (),
+            ("no interval of ratio: fewer than 6 clusters change it",),
+        ),
         ([0, 1] * 10, None, None, ("ratio",), ()),  # of NaN and of medians there is none
         ([0, 1] * 10, None, Resampling(resamples=0), (), ()),
     ],
@@ -138,7 +148,11 @@ def plain_ends(
     t = scipy.stats.t.ppf(likely, max(min(changing - 1, count / max(unlike, 1e-12)), 1))
     if math.isinf(most):
         factor = math.exp(t * error / value)
-        return (value / factor, value * factor) if least == 0 else (value - t * error, value + t * error)
+        return (
+            (value / factor, value * factor)
+            if least == 0
+            else (value - t * error, value + t * error)
+        )
     share, one_a_part = (value - least) / width, scipy.stats.t.ppf(likely, having - 1) ** 2 / having
     unsure = one_a_part
     if not same:
@@ -156,7 +170,9 @@ def test_ends_are_those_of_the_formulas_number_by_number(seed: int) -> None:
     count, confidence = int(source.integers(6, 25)), (0.9, 0.95)[seed % 2]
     limits = [(0.0, 1.0), (0.0, 100.0), (0.0, math.inf), (-math.inf, math.inf)]
     values = source.uniform(0.2, 0.8, 4) * [1, 100, 9, 9]
-    apart = source.normal(0, source.choice([0.1, 0.01, 0.3]), (count, 4)) * (source.random((count, 4)) < 0.8)
+    apart = source.normal(0, source.choice([0.1, 0.01, 0.3]), (count, 4)) * (
+        source.random((count, 4)) < 0.8
+    )
     apart[0] *= source.choice([1, 5])
     apart *= [0.1, 10, 0.9, 0.9] * (source.random(4) < 0.9)
     having = source.integers(5, count + 1, 4)
@@ -170,7 +186,9 @@ def test_ends_are_those_of_the_formulas_number_by_number(seed: int) -> None:
 @pytest.mark.parametrize(("share", "end"), [(0.0, 0), (1.0, 1)])
 def test_a_share_of_none_or_all_ends_there_exactly(share: float, end: int) -> None:
     for count in range(LEAST_CLUSTERS, 400):
-        ends = interval_ends(np.array([share]), np.full((count, 1), share), np.array([[0, 1]]), 0.95)
+        ends = interval_ends(
+            np.array([share]), np.full((count, 1), share), np.array([[0, 1]]), 0.95
+        )
         assert ends[end] == share
         assert ends[1 - end] != share
 
@@ -180,7 +198,11 @@ def test_settings_and_their_edges() -> None:
     assert Resampling(resamples=100_000, confidence=0.001, seed=0).resamples == 100_000
     assert_refused(
         *(
-            (partial(Resampling, **{name: value}), ConfigError, (f"{name}: expected", words, f"found {value!r}"))
+            (
+                partial(Resampling, **{name: value}),
+                ConfigError,
+                (f"{name}: expected", words, f"found {value!r}"),
+            )
             for name, words, values in (
                 ("resamples", "from 0 to 100,000", (100_001, -1, True, 10.0)),
                 ("seed", "from 0", (-1, 1.0)),
@@ -192,10 +214,18 @@ def test_settings_and_their_edges() -> None:
 
 
 def test_the_difference_of_two_runs_has_its_own_interval() -> None:
-    first, second = ([[{"above": hit, "below": 1.0}] for hit in run] for run in ([0.5] * 20, [-0.5, 3.5] * 10))
-    made = difference_intervals(Ratios(), (first, second), {"ratio": 1.0, "median_of_all": 0.0}, Resampling())
+    first, second = (
+        [[{"above": hit, "below": 1.0}] for hit in run] for run in ([0.5] * 20, [-0.5, 3.5] * 10)
+    )
+    made = difference_intervals(
+        Ratios(), (first, second), {"ratio": 1.0, "median_of_all": 0.0}, Resampling()
+    )
     error = 2 / math.sqrt(19)
-    assert_allclose(made, [[1 - 2.0930 * error, math.nan], [1 + 2.0930 * error, math.nan], [error, 0]], atol=1e-3)
+    assert_allclose(
+        made,
+        [[1 - 2.0930 * error, math.nan], [1 + 2.0930 * error, math.nan], [error, 0]],
+        atol=1e-3,
+    )
 
 
 def test_a_share_that_hangs_on_one_part_is_no_less_sure_than_as_many_draws_as_parts() -> None:
@@ -207,10 +237,15 @@ def test_a_share_that_hangs_on_one_part_is_no_less_sure_than_as_many_draws_as_pa
 
 def test_the_numbers_of_a_result() -> None:
     numbers = numbers_of(MotionEvaluator().compute())
-    scales = [f"ranges/{name}/{each}" for name in ("30x30", "100x100") for each in ("iou", "pq", "sq", "rq")]
+    scales = [
+        f"ranges/{name}/{each}"
+        for name in ("30x30", "100x100")
+        for each in ("iou", "pq", "sq", "rq")
+    ]
     assert list(numbers) == [*scales, "min_ade", "min_fde", "miss_rate", "path_accuracy"]
     assert numbers_of({5.0: [Ratio(0.5)], "words": ("a", None, 3, 2.0)}) == pytest.approx(
-        {"5/0/ratio": 0.5, "5/0/nothing": math.nan, "5/0/median_of_all": 0.5, "words/3": 2.0}, nan_ok=True
+        {"5/0/ratio": 0.5, "5/0/nothing": math.nan, "5/0/median_of_all": 0.5, "words/3": 2.0},
+        nan_ok=True,
     )
 
 
@@ -225,8 +260,21 @@ PERCENTS = (
     "class_average_precision/car",
 )
 SHARES = (
-    *("apa", "average_precision", "false_alarm_rate", "id_error", "precision", "recall", "within/5/accuracy"),
-    *("beside/sample_choice=mean_first/within/5/accuracy", "mean_errors/ASE", "miss_rate", "path_accuracy"),
+    *(
+        "apa",
+        "average_precision",
+        "false_alarm_rate",
+        "id_error",
+        "precision",
+        "recall",
+        "within/5/accuracy",
+    ),
+    *(
+        "beside/sample_choice=mean_first/within/5/accuracy",
+        "mean_errors/ASE",
+        "miss_rate",
+        "path_accuracy",
+    ),
     *(
         "groups/all/auc_ahead",
         "groups/all/twin_wins",
@@ -242,14 +290,33 @@ SHARES = (
     *("shares/a", "warned", "extrapolated"),
 )
 SIGNED = (
-    *(f"means/lead 2 s/given/{name}" for name in ("lost", "lost_way", "lost_twins", "lost_way_twins")),
-    *("means/lead 0.5 s/full braking/lost", "beside/leads=1/means/bystander, lead 1 s/given/lost_way"),
+    *(
+        f"means/lead 2 s/given/{name}"
+        for name in ("lost", "lost_way", "lost_twins", "lost_way_twins")
+    ),
+    *(
+        "means/lead 0.5 s/full braking/lost",
+        "beside/leads=1/means/bystander, lead 1 s/given/lost_way",
+    ),
 )
 AMOUNTS = (
-    *("min_ade", "min_fde", "position_error", "time_error", "mean_errors/ATE", "mean_errors/AOE", "mean_errors/AVE"),
+    *(
+        "min_ade",
+        "min_fde",
+        "position_error",
+        "time_error",
+        "mean_errors/ATE",
+        "mean_errors/AOE",
+        "mean_errors/AVE",
+    ),
     *("groups/all/mean_time", "operating/tta_hit", "operating/tta0", "groups/all/tta0_after/2"),
     "figures/dad all/time_at_r80",
-    *("time_at_half", "episodes_per_minute", "alarm_seconds_per_minute", "braking_seconds_per_minute"),
+    *(
+        "time_at_half",
+        "episodes_per_minute",
+        "alarm_seconds_per_minute",
+        "braking_seconds_per_minute",
+    ),
 )
 
 
@@ -259,7 +326,10 @@ AMOUNTS = (
         *((path, (0, 100)) for path in PERCENTS),
         *((path, (0, 1)) for path in SHARES),
         *((path, (0, math.inf)) for path in AMOUNTS),
-        *((path, (-math.inf, math.inf)) for path in ("lateness", "beside/time/lateness", "theirs", *SIGNED)),
+        *(
+            (path, (-math.inf, math.inf))
+            for path in ("lateness", "beside/time/lateness", "theirs", *SIGNED)
+        ),
     ],
 )
 def test_a_unit_tells_what_a_number_can_be(path: str, expected: tuple[float, float]) -> None:
@@ -278,7 +348,9 @@ def test_a_unit_tells_what_a_number_can_be(path: str, expected: tuple[float, flo
         ([-0.001, 3.0], (-math.inf, math.inf)),
     ],
 )
-def test_a_number_of_others_is_what_its_clusters_are(alone: list[float], expected: tuple[float, float]) -> None:
+def test_a_number_of_others_is_what_its_clusters_are(
+    alone: list[float], expected: tuple[float, float]
+) -> None:
     assert range_of("theirs", np.array(alone), ROWS) == expected
 
 
@@ -287,12 +359,26 @@ def test_a_number_that_is_larger_of_all_clusters_than_of_each_is_no_share() -> N
     clusters = [[{"above": 0.2 + 0.01 * at, "below": 0.0}] for at in range(12)]
     found = intervals_of(Totals(), clusters, Totals().result_of([each for (each,) in clusters]))
     assert found.notes == ()
-    assert 0 < found.ends["ratio"][0] < sum(each["above"] for (each,) in clusters) < found.ends["ratio"][1]
+    assert (
+        0
+        < found.ends["ratio"][0]
+        < sum(each["above"] for (each,) in clusters)
+        < found.ends["ratio"][1]
+    )
 
 
 def test_totals_settings_and_medians_have_no_interval() -> None:
-    without = ("false_recordings", "within/5/distance", "median_warning", "threshold", "at/best_f1", "quiet")
-    assert [has_interval(path) for path in (*without, "beside/a=b/within/5/distance")] == [False] * 7
+    without = (
+        "false_recordings",
+        "within/5/distance",
+        "median_warning",
+        "threshold",
+        "at/best_f1",
+        "quiet",
+    )
+    assert [has_interval(path) for path in (*without, "beside/a=b/within/5/distance")] == [
+        False
+    ] * 7
     assert all(has_interval(path.replace("*", "5")) for path in (row.path for row in ROWS))
 
 

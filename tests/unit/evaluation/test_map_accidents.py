@@ -29,8 +29,18 @@ GONE, X = (math.nan, math.nan), -7 / 6
     ("predicted", "truth", "gate", "pairs"),
     [
         # 1 is 3 m from 7 and 5 m from 8; 2 stands on 7 and is 3 m from 8: the least sum of all would leave 1 alone
-        (tracks([1, 2], [(X, math.sqrt(9 - X * X)), (0, 0)]), tracks([7, 8], [(0, 0), (3, 0)]), 4.0, {1: 7, 2: 8}),
-        (tracks([1, 2], [(X, math.sqrt(9 - X * X)), (0, 0)]), tracks([7, 8], [(0, 0), (3, 0)]), 6.0, {1: 8, 2: 7}),
+        (
+            tracks([1, 2], [(X, math.sqrt(9 - X * X)), (0, 0)]),
+            tracks([7, 8], [(0, 0), (3, 0)]),
+            4.0,
+            {1: 7, 2: 8},
+        ),
+        (
+            tracks([1, 2], [(X, math.sqrt(9 - X * X)), (0, 0)]),
+            tracks([7, 8], [(0, 0), (3, 0)]),
+            6.0,
+            {1: 8, 2: 7},
+        ),
         # the mean over the moments at which both are there
         (
             tracks([1, 2], [(0, 0), (9, 9)], [(0, 8), GONE]),
@@ -38,10 +48,17 @@ GONE, X = (math.nan, math.nan), -7 / 6
             4.0,
             {1: 7},
         ),
-        (tracks([1, 2], [(0, 0), (9, 9)], [(0, 8), GONE]), tracks([7, 8], [(0, 0), GONE], [(0, 0), (9, 9)]), 3.99, {}),
+        (
+            tracks([1, 2], [(0, 0), (9, 9)], [(0, 8), GONE]),
+            tracks([7, 8], [(0, 0), GONE], [(0, 0), (9, 9)]),
+            3.99,
+            {},
+        ),
     ],
 )
-def test_who_is_matched_within_the_gate(predicted, truth, gate: float, pairs: dict[int, int]) -> None:
+def test_who_is_matched_within_the_gate(
+    predicted, truth, gate: float, pairs: dict[int, int]
+) -> None:
     """As many as possible: pairs beyond the gate use nobody up."""
     assert match_tracks(predicted, truth, gate) == pairs
 
@@ -57,7 +74,12 @@ ACROSS = [([100, 104, 108], [100, 103, 106], 1), ([102], [99], 2)]
         (POINTS_AND_LINES, BevGrid(), 2.0, (0, (5, 7), math.sqrt(5) / 2)),
         (ACROSS, BevGrid(), 1.01, (0, (1, 2), 1)),
         (ACROSS, BevGrid(), 1.0, None),  # a metre across is none either
-        (POINTS_AND_LINES, BevGrid((-50, 50, 0.5), (-100, 100, 1.0)), 2.0, (0, (5, 7), math.sqrt(2))),  # of 0.5 × 1 m
+        (
+            POINTS_AND_LINES,
+            BevGrid((-50, 50, 0.5), (-100, 100, 1.0)),
+            2.0,
+            (0, (5, 7), math.sqrt(2)),
+        ),  # of 0.5 × 1 m
         ([], BevGrid(), 1.0, None),
     ],
 )
@@ -73,13 +95,18 @@ def test_points_and_lines_have_distances_too(cells, grid: BevGrid, danger: float
 
 
 @pytest.mark.parametrize(
-    ("rules", "place"), [(None, (0.5, 0.5)), (LABEL_PROTOCOLS["clean"], (0.5, 0.5)), (RELEASED, (0, 1))]
+    ("rules", "place"),
+    [(None, (0.5, 0.5)), (LABEL_PROTOCOLS["clean"], (0.5, 0.5)), (RELEASED, (0, 1))],
 )
-def test_positions_are_means_of_cells_where_the_labels_have_them(rules, place: tuple[float, float]) -> None:
+def test_positions_are_means_of_cells_where_the_labels_have_them(
+    rules, place: tuple[float, float]
+) -> None:
     maps = np.zeros((2, 200, 200), dtype=np.int32)
     maps[1, 100, [100, 102]], maps[1, 101, 103] = 3, 4
     found = accident_of(maps, BevGrid(), rules, AccidentReading())
-    assert found.positions.tolist() == [[(x + place[0]) / 2, (y + place[1]) / 2] for x, y in ((1, 0), (3, 1))]
+    assert found.positions.tolist() == [
+        [(x + place[0]) / 2, (y + place[1]) / 2] for x, y in ((1, 0), (3, 1))
+    ]
     explicit = found.explicit(0.5)
     assert (explicit.time, explicit.score, explicit.ids) == (0.5, 1.0, None)
     assert accident_of(maps[:1], BevGrid(), rules, AccidentReading()).explicit(0.5) is None
@@ -90,13 +117,27 @@ def test_positions_are_means_of_cells_where_the_labels_have_them(rules, place: t
     [
         ([(3, 4)], [0], [[(3, 4)]]),
         ([(0, 0), (2, 2), (1, 1)], [0, 0, 0], [[(0, 0), (2, 2)]]),
-        ([(0, 0), (1, 1), (0, 2), (2, 0), (2, 2), (0, 1)], [0] * 6, [[(0, 0), (2, 0), (2, 2), (0, 2)]]),
-        ([(5, 5), (0, 0), (0, 1)], [1, 0, 0], [[(0, 0), (0, 1)], [(5, 5), (5, 5)]]),  # the last one again
+        (
+            [(0, 0), (1, 1), (0, 2), (2, 0), (2, 2), (0, 1)],
+            [0] * 6,
+            [[(0, 0), (2, 0), (2, 2), (0, 2)]],
+        ),
+        (
+            [(5, 5), (0, 0), (0, 1)],
+            [1, 0, 0],
+            [[(0, 0), (0, 1)], [(5, 5), (5, 5)]],
+        ),  # the last one again
     ],
 )
 def test_hulls_of_points_and_lines_have_one_or_two_corners(points, group, hulls) -> None:
-    assert convex_hulls(np.array(points), np.array(group)).tolist() == [[list(each) for each in hull] for hull in hulls]
+    assert convex_hulls(np.array(points), np.array(group)).tolist() == [
+        [list(each) for each in hull] for hull in hulls
+    ]
 
 
 def test_of_no_points_there_are_no_hulls() -> None:
-    assert convex_hulls(np.zeros((0, 2), dtype=np.int64), np.zeros(0, dtype=np.int64)).shape == (0, 1, 2)
+    assert convex_hulls(np.zeros((0, 2), dtype=np.int64), np.zeros(0, dtype=np.int64)).shape == (
+        0,
+        1,
+        2,
+    )

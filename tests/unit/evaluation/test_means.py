@@ -10,8 +10,19 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from deepaccident_devkit.evaluation.evaluator import Evaluator
-from deepaccident_devkit.evaluation.intervals import Resampling, intervals_of, numbers_of, numbers_of_draws
-from deepaccident_devkit.evaluation.means import MEAN_OF_SCENARIOS, MeansEvaluator, MeansResult, Sums, table_rows
+from deepaccident_devkit.evaluation.intervals import (
+    Resampling,
+    intervals_of,
+    numbers_of,
+    numbers_of_draws,
+)
+from deepaccident_devkit.evaluation.means import (
+    MEAN_OF_SCENARIOS,
+    MeansEvaluator,
+    MeansResult,
+    Sums,
+    table_rows,
+)
 from deepaccident_devkit.evaluation.task import Row, headlines
 
 
@@ -20,7 +31,9 @@ class Lengths(MeansResult):
 
     __slots__ = ()
     rows: ClassVar[tuple[Row, ...]] = table_rows(
-        columns=(Row("far", "m", "higher"), Row("near", "m", is_headline=False)), main_tables=("late",), main_row="all"
+        columns=(Row("far", "m", "higher"), Row("near", "m", is_headline=False)),
+        main_tables=("late",),
+        main_row="all",
     )
 
 
@@ -69,7 +82,10 @@ def test_tables_rows_and_columns_stand_in_their_order() -> None:
         "early": ["all", "2 s", "10 s", "a", "b"],
     }
     assert [*result.means["late"]["a"]] == ["far", "near"]
-    assert (result.counted["late"]["a"], result.counted["early"]["a"]) == ({"far": 0, "near": 0}, {"near": 2})
+    assert (result.counted["late"]["a"], result.counted["early"]["a"]) == (
+        {"far": 0, "near": 0},
+        {"near": 2},
+    )
     assert headlines(result) == ()
     assert LengthsEvaluator("other").settings["seed"] == 1
 
@@ -77,11 +93,16 @@ def test_tables_rows_and_columns_stand_in_their_order() -> None:
 def test_rows_are_those_of_their_masks() -> None:
     sums = Sums()
     masks = {"all": np.ones(3, dtype=bool), "few": np.array([True, False, True])}
-    sums.add_rows("late", masks, {"far": np.array([1.0, 2.0, np.nan]), "near": np.array([np.inf, 5.0, 7.0])})
+    sums.add_rows(
+        "late", masks, {"far": np.array([1.0, 2.0, np.nan]), "near": np.array([np.inf, 5.0, 7.0])}
+    )
     evaluator = LengthsEvaluator()
     evaluator.add("t", sums.counts())
     result = evaluator.compute()
-    assert result.means["late"] == {"all": {"far": 1.5, "near": 6.0}, "few": {"far": 1.0, "near": 7.0}}
+    assert result.means["late"] == {
+        "all": {"far": 1.5, "near": 6.0},
+        "few": {"far": 1.0, "near": 7.0},
+    }
     assert result.counted["late"] == {"all": {"far": 2, "near": 2}, "few": {"far": 1, "near": 1}}
 
 
@@ -91,7 +112,9 @@ def test_sums_are_the_same_in_any_order_and_parts(values: list[list[float]]) -> 
     expected = whole.compute()
     assert whole.result_of(counts[::-1]) == expected
     assert (
-        whole.result_of([*whole.pooled(counts[:16]), *whole.pooled(counts[16:])]).means["late"]["all"]
+        whole.result_of([*whole.pooled(counts[:16]), *whole.pooled(counts[16:])]).means["late"][
+            "all"
+        ]
         == (expected.means["late"]["all"])
     )
     stored = json.loads(json.dumps(counts))
@@ -111,7 +134,9 @@ def test_the_mean_of_scenarios(values: list[list[float]]) -> None:
 
 def test_draws_at_once_are_those_of_one_after_another(values: list[list[float]]) -> None:
     evaluator = filled(values)
-    clusters = evaluator.clustered({token: f"c{int(token) % 8}" for token in sorted(evaluator.tokens)})
+    clusters = evaluator.clustered(
+        {token: f"c{int(token) % 8}" for token in sorted(evaluator.tokens)}
+    )
     times = np.random.default_rng(1).integers(0, 3, (20, len(clusters)))
     names = [*numbers_of(evaluator.compute()), "means/late/nobody/far"]
     slowly = [numbers_of(each) for each in Evaluator.resampled(evaluator, clusters, times)]
@@ -122,11 +147,17 @@ def test_draws_at_once_are_those_of_one_after_another(values: list[list[float]])
 def test_a_cluster_without_a_number_does_not_change_it() -> None:
     """The jackknife counts the clusters that change a number; rounding must not make them more."""
     source = np.random.default_rng(5)
-    evaluator = filled([[value] if number % 8 < 5 else [] for number, value in enumerate(source.uniform(0, 9, 80))])
-    clusters = evaluator.clustered({token: f"c{int(token) % 8}" for token in sorted(evaluator.tokens)})
+    evaluator = filled(
+        [[value] if number % 8 < 5 else [] for number, value in enumerate(source.uniform(0, 9, 80))]
+    )
+    clusters = evaluator.clustered(
+        {token: f"c{int(token) % 8}" for token in sorted(evaluator.tokens)}
+    )
     found = intervals_of(evaluator, clusters, evaluator.compute())
     assert found.ends == {}
-    assert any("fewer than 6 clusters" in note and "means/late/all/far" in note for note in found.notes)
+    assert any(
+        "fewer than 6 clusters" in note and "means/late/all/far" in note for note in found.notes
+    )
 
 
 def test_notes_count_over_the_samples(tmp_path: Path) -> None:

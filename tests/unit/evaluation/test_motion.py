@@ -10,7 +10,12 @@ from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, EvaluationError, GeometryError
-from deepaccident_devkit.evaluation.motion import MOTION_PROTOCOLS, MotionEvaluator, MotionProtocol, motion_counts
+from deepaccident_devkit.evaluation.motion import (
+    MOTION_PROTOCOLS,
+    MotionEvaluator,
+    MotionProtocol,
+    motion_counts,
+)
 from deepaccident_devkit.evaluation.predictions import MotionOutput, instances_of
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.geometry.bev_grid import ORIENTATIONS, to_orientation
@@ -25,12 +30,16 @@ def labels(da_motion: DeepAccident) -> dict[str, MotionLabels]:
     """Of samples whose recording ends after 1 to 5 label frames, each frame in its own frame."""
     scenario = next(record["token"] for record in da_motion.scenario if record["designed_accident"])
     tokens = [
-        f"{scenario}/{agent}/{index:03d}" for agent in ("ego_vehicle", "infrastructure") for index in (15, 25, 35)
+        f"{scenario}/{agent}/{index:03d}"
+        for agent in ("ego_vehicle", "infrastructure")
+        for index in (15, 25, 35)
     ]
     return {token: da_motion.motion_labels(token) for token in tokens}
 
 
-def boxes_label(*frames: np.ndarray, config: MotionLabelConfig = CONFIG, recorded: int = 5) -> MotionLabels:
+def boxes_label(
+    *frames: np.ndarray, config: MotionLabelConfig = CONFIG, recorded: int = 5
+) -> MotionLabels:
     """Labels at the present with these instance maps; the first `recorded` frames are in the recording."""
     instance = np.zeros((config.label_frames, *config.grid.shape), dtype=np.int32)
     instance[: len(frames)] = np.reshape(frames, (-1, *config.grid.shape))
@@ -59,7 +68,9 @@ def boxes(**columns: int) -> np.ndarray:
 
 def still(*maps: np.ndarray) -> MotionOutput:
     """Predictions in which nothing moves, one a map."""
-    return MotionOutput(grid=CONFIG.grid, instances=np.stack([np.stack([each] * 5) for each in maps]))
+    return MotionOutput(
+        grid=CONFIG.grid, instances=np.stack([np.stack([each] * 5) for each in maps])
+    )
 
 
 def over(*maps: np.ndarray) -> MotionOutput:
@@ -67,31 +78,45 @@ def over(*maps: np.ndarray) -> MotionOutput:
     return instances_of(np.stack(maps), CONFIG.grid)
 
 
-def evaluated(prediction: MotionOutput, label: MotionLabels, protocol: str | MotionProtocol = "released"):
+def evaluated(
+    prediction: MotionOutput, label: MotionLabels, protocol: str | MotionProtocol = "released"
+):
     evaluator = MotionEvaluator(protocol)
     evaluator.update("a", prediction, label)
     return evaluator.compute()
 
 
-def test_instance_maps_are_told_and_recorded_frames_counted(labels: dict[str, MotionLabels]) -> None:
+def test_instance_maps_are_told_and_recorded_frames_counted(
+    labels: dict[str, MotionLabels],
+) -> None:
     evaluator = MotionEvaluator()
     for token, label in labels.items():
         evaluator.update(token, instances_of(label.to_present().instance, label.config.grid), label)
     result = evaluator.compute()
     assert all(each.true_positive > 0 for each in result.ranges.values())
     assert (result.samples, result.frames) == (len(labels), 2 * (5 + 3 + 1))
-    assert result.notes[0].startswith(f"{len(labels)} of {len(labels)} predictions: given as instance maps")
+    assert result.notes[0].startswith(
+        f"{len(labels)} of {len(labels)} predictions: given as instance maps"
+    )
 
 
-@pytest.mark.parametrize("shape", [(200, 200), (5, 100, 100), (1, 5, 200, 100), (1, 1, 5, 200, 200)])
-def test_maps_of_another_shape_are_refused_with_the_shape_that_was_given(shape: tuple[int, ...]) -> None:
+@pytest.mark.parametrize(
+    "shape", [(200, 200), (5, 100, 100), (1, 5, 200, 100), (1, 1, 5, 200, 200)]
+)
+def test_maps_of_another_shape_are_refused_with_the_shape_that_was_given(
+    shape: tuple[int, ...],
+) -> None:
     names = ("(T, 200, 200)", "(K, T, 200, 200)", f"found {shape}")
-    assert_refused((lambda: instances_of(np.zeros(shape, dtype=int), CONFIG.grid), GeometryError, names))
+    assert_refused(
+        (lambda: instances_of(np.zeros(shape, dtype=int), CONFIG.grid), GeometryError, names)
+    )
 
 
 @pytest.mark.parametrize("orientation", ORIENTATIONS)
 @pytest.mark.parametrize("as_heads", [False, True])
-def test_the_orientation_of_a_prediction_makes_no_difference(labels, orientation, as_heads: bool) -> None:
+def test_the_orientation_of_a_prediction_makes_no_difference(
+    labels, orientation, as_heads: bool
+) -> None:
     label, other = labels[next(iter(labels))], labels[list(labels)[3]]
     grid = CONFIG.grid.with_orientation(orientation)
     if as_heads:
@@ -100,14 +125,19 @@ def test_the_orientation_of_a_prediction_makes_no_difference(labels, orientation
         second = MotionOutput(grid=grid, heads=(heads.in_orientation(orientation),) * 2)
     else:
         maps = other.to_present().instance
-        turned = to_orientation(maps, vectors=False, source=CONFIG.grid.orientation, target=orientation)
+        turned = to_orientation(
+            maps, vectors=False, source=CONFIG.grid.orientation, target=orientation
+        )
         first, second = instances_of(maps, CONFIG.grid), instances_of(turned, grid)
     assert motion_counts(second, label) == motion_counts(first, label)
 
 
 @pytest.mark.parametrize(("protocol", "nothing"), [("released", 0.0), ("paper", math.nan)])
 def test_nothing_to_count(protocol: str, nothing: float) -> None:
-    for result in (evaluated(still(boxes()), boxes_label(), protocol), MotionEvaluator(protocol).compute()):
+    for result in (
+        evaluated(still(boxes()), boxes_label(), protocol),
+        MotionEvaluator(protocol).compute(),
+    ):
         for each in result.ranges.values():
             np.testing.assert_array_equal([getattr(each, name) for name in SCALES], [nothing] * 4)
         assert math.isnan(result.path_accuracy)
@@ -129,13 +159,30 @@ COUNTS = ("true_positive", "false_positive", "false_negative")
     ("prediction", "label", "name", "expected"),
     [
         # a box 45 m ahead is only within 100 m; one across the border of the 30 m counts with its part inside
-        (still(boxes(_2=128)), [boxes(_1=190, _2=127)] * 5, "30x30", {"true_positive": 5, "false_negative": 0}),
+        (
+            still(boxes(_2=128)),
+            [boxes(_1=190, _2=127)] * 5,
+            "30x30",
+            {"true_positive": 5, "false_negative": 0},
+        ),
         (still(boxes(_2=128)), [boxes(_1=190, _2=127)] * 5, "30x30", {"iou": 100 * 2 / 3}),
-        (still(boxes(_2=128)), [boxes(_1=190, _2=127)] * 5, "100x100", {"true_positive": 5, "false_negative": 5}),
-        (still(boxes(_2=128)), [boxes(_1=190, _2=127)] * 5, "100x100", {"sq": 60, "pq": 100 * 3 / 7.5}),
+        (
+            still(boxes(_2=128)),
+            [boxes(_1=190, _2=127)] * 5,
+            "100x100",
+            {"true_positive": 5, "false_negative": 5},
+        ),
+        (
+            still(boxes(_2=128)),
+            [boxes(_1=190, _2=127)] * 5,
+            "100x100",
+            {"sq": 60, "pq": 100 * 3 / 7.5},
+        ),
         (over(*[boxes(_1=100)] * 2, *[boxes()] * 3), TRUE[:2], "100x100", {"pq": 100}),
         (
-            over(*[boxes(_1=100)] * 2, *[boxes(_2=100)] * 3),  # an id that changes is a miss and a false alarm
+            over(
+                *[boxes(_1=100)] * 2, *[boxes(_2=100)] * 3
+            ),  # an id that changes is a miss and a false alarm
             TRUE,
             "100x100",
             {"true_positive": 4, "false_positive": 1, "false_negative": 1, "rq": 80},
@@ -144,14 +191,21 @@ COUNTS = ("true_positive", "false_positive", "false_negative")
         (still(boxes(_7=100), boxes(_1=50)), TRUE, "30x30", {"pq": 0}),
         (MotionOutput(grid=CONFIG.grid, heads=(UNSURE,)), TRUE, "30x30", {"iou": 50}),
         (MotionOutput(grid=CONFIG.grid, heads=(UNSURE,)), TRUE, "100x100", {"iou": 50}),
-        (MotionOutput(grid=CONFIG.grid, heads=(UNSURE, NOBODY)), TRUE, "100x100", {"iou": 0, "false_negative": 5}),
+        (
+            MotionOutput(grid=CONFIG.grid, heads=(UNSURE, NOBODY)),
+            TRUE,
+            "100x100",
+            {"iou": 0, "false_negative": 5},
+        ),
         (MotionOutput(grid=CONFIG.grid, heads=(NOBODY, UNSURE)), TRUE, "100x100", {"iou": 50}),
     ],
 )
 def test_cells_and_instances_within_a_range(prediction, label, name, expected) -> None:
     """The label has as many recorded frames as there are maps."""
     result = evaluated(prediction, boxes_label(*label, recorded=len(label)))
-    assert {each: getattr(result.ranges[name], each) for each in expected} == pytest.approx(expected)
+    assert {each: getattr(result.ranges[name], each) for each in expected} == pytest.approx(
+        expected
+    )
     assert result.frames == len(label)
 
 
@@ -164,8 +218,16 @@ def test_cells_and_instances_within_a_range(prediction, label, name, expected) -
             {"min_ade": 1, "min_fde": 1, "miss_rate": 0, "paths": 1},
         ),  # the best
         (still(boxes(_1=106)), TRUE, {"min_fde": 3, "path_accuracy": 1}),
-        (still(boxes(_1=109)), TRUE, {"paths": 0, "path_false_positive": 1, "path_false_negative": 1}),  # too far away
-        (still(boxes(), boxes(_1=100)), TRUE, {"paths": 0, "path_true_positive": 1}),  # an empty first one ends it
+        (
+            still(boxes(_1=109)),
+            TRUE,
+            {"paths": 0, "path_false_positive": 1, "path_false_negative": 1},
+        ),  # too far away
+        (
+            still(boxes(), boxes(_1=100)),
+            TRUE,
+            {"paths": 0, "path_true_positive": 1},
+        ),  # an empty first one ends it
         (  # two cells a frame, then gone: 2, 4, 6 cells a frame as released, where the truth keeps to 2
             over(boxes(_1=100), boxes(_1=102), *[boxes()] * 3),
             [boxes(_1=100 + 2 * frame) for frame in range(5)],
@@ -185,7 +247,9 @@ def test_paths(prediction, label, expected) -> None:
 
 def test_paths_can_be_left_out() -> None:
     evaluator = MotionEvaluator(trajectories=False)
-    assert json.loads(json.dumps(evaluator.settings)) == MotionEvaluator().settings | {"trajectories": False}
+    assert json.loads(json.dumps(evaluator.settings)) == MotionEvaluator().settings | {
+        "trajectories": False
+    }
     evaluator.update("a", still(boxes(_1=100)), boxes_label(*TRUE))
     assert evaluator.counts["a"]["paths"] is None
     result = evaluator.compute()
@@ -202,19 +266,36 @@ def test_the_released_breakdown_takes_other_samples_frames() -> None:
     wrong, right = evaluator.selected_as_released(order, {"c"}), evaluator.compute({"c"})
     assert (right.ranges["100x100"].pq, wrong.ranges["100x100"].pq) == (100.0, 0.0)
     assert (right.ranges["100x100"].iou, wrong.ranges["100x100"].iou) == (100.0, 100.0)
-    assert_refused((lambda: evaluator.selected_as_released(["a", "d"], {"a"}), EvaluationError, ("1 samples", "d")))
+    assert_refused(
+        (
+            lambda: evaluator.selected_as_released(["a", "d"], {"a"}),
+            EvaluationError,
+            ("1 samples", "d"),
+        )
+    )
 
 
 def test_what_cannot_be_compared_is_refused() -> None:
-    label, clean = boxes_label(*TRUE), boxes_label(*TRUE, config=MotionLabelConfig(protocol="clean"))
+    label, clean = (
+        boxes_label(*TRUE),
+        boxes_label(*TRUE, config=MotionLabelConfig(protocol="clean")),
+    )
     coarse = instances_of(np.zeros((5, 100, 100)), BevGrid((-50, 50, 1), (-50, 50, 1)))
     few = instances_of(np.zeros((4, 200, 200)), CONFIG.grid)
     assert_refused(
         (lambda: motion_counts(coarse, label), EvaluationError, ("same grid", "(-50", "x (-50")),
         (lambda: motion_counts(few, label), EvaluationError, ("at least 5 frames", "found 4")),
-        (lambda: motion_counts(still(boxes()), boxes_label(recorded=0)), EvaluationError, ("present frame",)),
+        (
+            lambda: motion_counts(still(boxes()), boxes_label(recorded=0)),
+            EvaluationError,
+            ("present frame",),
+        ),
         (lambda: MotionEvaluator("clean"), ChoiceError, ("protocol", "released, paper", "clean")),
-        (lambda: MotionProtocol(labels="dirty"), ChoiceError, ("labels", "released, clean", "or None", "dirty")),
+        (
+            lambda: MotionProtocol(labels="dirty"),
+            ChoiceError,
+            ("labels", "released, clean", "or None", "dirty"),
+        ),
         *(
             (
                 lambda name=name: evaluated(still(boxes()), clean, name),
@@ -225,7 +306,10 @@ def test_what_cannot_be_compared_is_refused() -> None:
         ),
     )
     for labels in ("clean", None):
-        assert evaluated(still(boxes(_1=100)), clean, MotionProtocol(labels=labels)).ranges["30x30"].pq == 100.0
+        assert (
+            evaluated(still(boxes(_1=100)), clean, MotionProtocol(labels=labels)).ranges["30x30"].pq
+            == 100.0
+        )
 
 
 def test_the_choices_of_the_protocols_and_what_counts_hold() -> None:
@@ -256,8 +340,20 @@ def test_the_choices_of_the_protocols_and_what_counts_hold() -> None:
     }
     evaluator = MotionEvaluator("paper")
     evaluator.add("a", counts)
-    ranges = {"iou": 100.0, "pq": 100.0, "sq": 100.0, "rq": 100.0, **dict(zip(COUNTS, (5, 0, 0), strict=True))}
-    far = {"iou": 100 / 3, "pq": 50.0, "sq": 100.0, "rq": 50.0, **dict(zip(COUNTS, (5, 5, 5), strict=True))}
+    ranges = {
+        "iou": 100.0,
+        "pq": 100.0,
+        "sq": 100.0,
+        "rq": 100.0,
+        **dict(zip(COUNTS, (5, 0, 0), strict=True)),
+    }
+    far = {
+        "iou": 100 / 3,
+        "pq": 50.0,
+        "sq": 100.0,
+        "rq": 50.0,
+        **dict(zip(COUNTS, (5, 5, 5), strict=True)),
+    }
     result = evaluator.compute().as_dict()
     assert result.pop("notes")[0].startswith("1 of 1 prediction: given as instance maps")
     assert result == {

@@ -12,7 +12,13 @@ from evaluation_runs import stored_run
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.evaluation import DetectedBoxes, Evaluator
 from deepaccident_devkit.evaluation.evaluator import Counts, ratio, total
-from deepaccident_devkit.evaluation.runs import compare_bundles, evaluate_results, read_bundle, sample_rows, save_run
+from deepaccident_devkit.evaluation.runs import (
+    compare_bundles,
+    evaluate_results,
+    read_bundle,
+    sample_rows,
+    save_run,
+)
 from deepaccident_devkit.evaluation.runs.setups import TASKS, EvaluationSetup
 from deepaccident_devkit.evaluation.runs.verification import verify_bundle
 from deepaccident_devkit.evaluation.task import Row, TaskResult
@@ -41,7 +47,10 @@ class AgentCountEvaluator(Evaluator[AgentCountResult]):
     task = "agent_count"
     description = "Evaluate how many agents are predicted."
     result_kinds: ClassVar[tuple[str, ...]] = ("detection",)
-    protocols: ClassVar[dict[str, Any]] = {"all": AgentCountRules(), "sure": AgentCountRules(min_score=0.5)}
+    protocols: ClassVar[dict[str, Any]] = {
+        "all": AgentCountRules(),
+        "sure": AgentCountRules(min_score=0.5),
+    }
     result_class = AgentCountResult
 
     def truth(self, dataset: Any, token: str, /, *_unused: Any) -> tuple[int]:
@@ -59,7 +68,9 @@ class AgentCountEvaluator(Evaluator[AgentCountResult]):
 def test_a_new_task_is_a_class_and_its_name(
     da_motion: DeepAccident, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    _, results = stored_run(da_motion, EvaluationSetup(task="detection", protocol="paper"), tmp_path / "results")
+    _, results = stored_run(
+        da_motion, EvaluationSetup(task="detection", protocol="paper"), tmp_path / "results"
+    )
     monkeypatch.setitem(TASKS, "agent_count", AgentCountEvaluator)
     shares = {}
     for protocol in AgentCountEvaluator.protocols:
@@ -71,6 +82,9 @@ def test_a_new_task_is_a_class_and_its_name(
         [headline] = read_bundle(tmp_path / protocol).summary["headlines"]
         assert (headline["name"], headline["value"]) == ("predicted_share", shares[protocol])
         assert {row["predicted_share"] is None for row in sample_rows(run)} == {False}
-        assert verify_bundle(tmp_path / protocol, da_motion, results=results, workers=1).differences == ()
+        assert (
+            verify_bundle(tmp_path / protocol, da_motion, results=results, workers=1).differences
+            == ()
+        )
     assert 0 < shares["sure"] < shares["all"] < 1
     assert compare_bundles(tmp_path / "all", tmp_path / "all").numbers

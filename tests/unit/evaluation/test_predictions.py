@@ -12,7 +12,12 @@ from refusals import assert_refused
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, EvaluationError, GeometryError
 from deepaccident_devkit.evaluation import Accident, MotionOutput
-from deepaccident_devkit.evaluation.predictions import cells_within, checked_prediction, label_config, labels_at_present
+from deepaccident_devkit.evaluation.predictions import (
+    cells_within,
+    checked_prediction,
+    label_config,
+    labels_at_present,
+)
 from deepaccident_devkit.geometry import BevGrid, Boxes
 from deepaccident_devkit.geometry.bev_grid import ORIENTATIONS
 from deepaccident_devkit.motion import MotionLabelConfig
@@ -24,13 +29,18 @@ NAMES = ("segmentation", "centerness", "offset", "flow")
 def stacked(count: int = 3, shape: tuple[int, int] = GRID.shape) -> list[np.ndarray]:
     """Heads of so many predictions of 5 frames, no two values alike."""
     source = np.random.default_rng(0)
-    return [source.normal(size=(count, 5, channels, *shape)).astype(np.float32) for channels in (2, 1, 2, 2)]
+    return [
+        source.normal(size=(count, 5, channels, *shape)).astype(np.float32)
+        for channels in (2, 1, 2, 2)
+    ]
 
 
 def assert_same(output: MotionOutput, *arrays: np.ndarray, orientation: str = "devkit") -> None:
     """Heads of these maps, one a prediction."""
     found = [{name: getattr(each, name) for name in NAMES} for each in output.heads or ()]
-    np.testing.assert_equal(found, [dict(zip(NAMES, each, strict=True)) for each in zip(*arrays, strict=True)])
+    np.testing.assert_equal(
+        found, [dict(zip(NAMES, each, strict=True)) for each in zip(*arrays, strict=True)]
+    )
     assert (output.grid, output.orientation) == (GRID.with_orientation(orientation), None)
     assert {each.orientation for each in output.heads or ()} == {orientation}
 
@@ -52,23 +62,36 @@ class TestMotionOutput:
             MotionOutput(grid=GRID, heads=[one]),  # type: ignore[arg-type]  # any sequence is
             pickle.loads(pickle.dumps(MotionOutput(grid=GRID, heads=(one,)))),
             MotionOutput.from_arrays(*(each[1] for each in arrays), grid=GRID),
-            MotionOutput.from_arrays(segmentation[1], centerness[1, :, 0], offset[1], flow[1], grid=GRID),
+            MotionOutput.from_arrays(
+                segmentation[1], centerness[1, :, 0], offset[1], flow[1], grid=GRID
+            ),
         ):
             assert_same(some, *of_one)
 
     def test_the_orientation_is_the_grids_unless_it_is_given(self) -> None:
-        arrays, maps = stacked(shape=GRID.shape[::-1]), np.zeros((1, 5, *GRID.shape[::-1]), dtype=np.int32)
+        arrays, maps = (
+            stacked(shape=GRID.shape[::-1]),
+            np.zeros((1, 5, *GRID.shape[::-1]), dtype=np.int32),
+        )
         output = MotionOutput.from_arrays(*arrays, grid=GRID, orientation="fiery")
         for some in (output, MotionOutput(grid=GRID, heads=output.heads, orientation="fiery")):
             assert_same(some, *arrays, orientation="fiery")
-        assert MotionOutput(grid=GRID, instances=maps, orientation="fiery").grid.orientation == "fiery"
+        assert (
+            MotionOutput(grid=GRID, instances=maps, orientation="fiery").grid.orientation == "fiery"
+        )
         north = partial(MotionOutput, grid=GRID, instances=maps, orientation="north")
         assert_refused(
-            (lambda: MotionOutput(grid=GRID, heads=output.heads), GeometryError, ("orientation devkit", "in fiery")),
+            (
+                lambda: MotionOutput(grid=GRID, heads=output.heads),
+                GeometryError,
+                ("orientation devkit", "in fiery"),
+            ),
             (north, ChoiceError, ("orientation: expected one of", "north")),
         )
 
-    @pytest.mark.parametrize("heads", [stacked()[0], stacked(), dict(zip(NAMES, stacked(), strict=True)), 3, [None]])
+    @pytest.mark.parametrize(
+        "heads", [stacked()[0], stacked(), dict(zip(NAMES, stacked(), strict=True)), 3, [None]]
+    )
     def test_arrays_are_no_heads(self, heads: Any) -> None:
         words = ("heads: expected MotionHeads, found", "MotionOutput.from_arrays(")
         assert_refused((lambda: MotionOutput(grid=GRID, heads=heads), GeometryError, words))
@@ -77,19 +100,30 @@ class TestMotionOutput:
         none = Boxes.from_arrays(np.zeros((0, 3)), np.zeros((0, 3)), [])
         words = ("a MotionOutput or a list of Accidents", "Boxes", "instances_of")
         assert_refused(
-            *((lambda given=given: checked_prediction(given), EvaluationError, words) for given in (none, [none]))
+            *(
+                (lambda given=given: checked_prediction(given), EvaluationError, words)
+                for given in (none, [none])
+            )
         )
 
     def test_what_is_no_output(self) -> None:
         segmentation, centerness, offset, flow = stacked()
-        coarse = MotionOutput.from_arrays(*stacked(1, (6, 8)), grid=BevGrid((-4.0, 4.0, 1.0), (-3.0, 3.0, 1.0)))
+        coarse = MotionOutput.from_arrays(
+            *stacked(1, (6, 8)), grid=BevGrid((-4.0, 4.0, 1.0), (-3.0, 3.0, 1.0))
+        )
         none = np.zeros((0, 5, *GRID.shape), dtype=int)
         assert_refused(
             *(
                 (partial(MotionOutput.from_arrays, *arrays, grid=GRID), GeometryError, words)
                 for arrays, words in (
-                    ((segmentation, centerness, offset[:2], flow), ("offset", "(K, T, channels, H, W)", "(2, 5")),
-                    ((segmentation[0, 0], centerness, offset, flow), ("segmentation", "(K, T, channels, H, W)")),
+                    (
+                        (segmentation, centerness, offset[:2], flow),
+                        ("offset", "(K, T, channels, H, W)", "(2, 5"),
+                    ),
+                    (
+                        (segmentation[0, 0], centerness, offset, flow),
+                        ("segmentation", "(K, T, channels, H, W)"),
+                    ),
                     ((segmentation, centerness, offset, flow[:, :4]), ("flow", "expected shape")),
                     ([each[:0] for each in stacked()], ("at least one prediction",)),
                 )
@@ -98,12 +132,19 @@ class TestMotionOutput:
                 (partial(MotionOutput, grid=GRID, **given), GeometryError, words)
                 for given, words in (
                     ({}, ("heads, or instances", "not both")),
-                    ({"heads": coarse.heads}, ("(12, 16) cells in orientation devkit", "(6, 8) in devkit")),
+                    (
+                        {"heads": coarse.heads},
+                        ("(12, 16) cells in orientation devkit", "(6, 8) in devkit"),
+                    ),
                     ({"heads": ()}, ("at least one prediction",)),
                     ({"instances": none}, ("at least one prediction",)),
                 )
             ),
-            (partial(MotionOutput.from_arrays, *stacked(), grid=None), GeometryError, ("grid", "BevGrid", "NoneType")),
+            (
+                partial(MotionOutput.from_arrays, *stacked(), grid=None),
+                GeometryError,
+                ("grid", "BevGrid", "NoneType"),
+            ),
         )
 
 

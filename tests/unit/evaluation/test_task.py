@@ -20,7 +20,13 @@ from deepaccident_devkit.evaluation.detection import DETECTION_PROTOCOLS
 from deepaccident_devkit.evaluation.intervals import numbers_of
 from deepaccident_devkit.evaluation.motion import MotionEvaluator
 from deepaccident_devkit.evaluation.runs.setups import TASKS, EvaluationSetup
-from deepaccident_devkit.evaluation.task import FrozenDict, headlines, switch_names, switched, value_text
+from deepaccident_devkit.evaluation.task import (
+    FrozenDict,
+    headlines,
+    switch_names,
+    switched,
+    value_text,
+)
 
 every_protocol = pytest.mark.parametrize(
     ("task", "protocol"), [(task, protocol) for task in TASKS for protocol in TASKS[task].protocols]
@@ -38,7 +44,9 @@ every_protocol = pytest.mark.parametrize(
         pytest.param("forecasting", "clean", marks=pytest.mark.slow),
     ],
 )
-def test_read_truth_update_compute(task: str, protocol: str, da_motion: DeepAccident, tmp_path: Path) -> None:
+def test_read_truth_update_compute(
+    task: str, protocol: str, da_motion: DeepAccident, tmp_path: Path
+) -> None:
     setup = EvaluationSetup(task=task, protocol=protocol)
     run, results = stored_run(da_motion, setup, tmp_path / "results")
     evaluator = TASKS[task](protocol)
@@ -62,7 +70,10 @@ def test_every_protocol_makes_an_evaluator_and_its_kind_of_result(task: str, pro
 
 
 def test_what_each_task_is() -> None:
-    facts = {name: (each.result_kinds, each.needs_whole_recordings, each.needs_meta) for name, each in TASKS.items()}
+    facts = {
+        name: (each.result_kinds, each.needs_whole_recordings, each.needs_meta)
+        for name, each in TASKS.items()
+    }
     assert facts == {
         "motion": (("motion",), False, False),
         "accident": (("motion", "accident"), False, True),
@@ -72,7 +83,11 @@ def test_what_each_task_is() -> None:
         "forecasting": (("forecasting",), True, False),
     }
     assert [name for name, each in TASKS.items() if each.vehicles_only] == ["planning"]
-    assert [name for name, each in TASKS.items() if not each.has_horizon] == ["detection", "planning", "forecasting"]
+    assert [name for name, each in TASKS.items() if not each.has_horizon] == [
+        "detection",
+        "planning",
+        "forecasting",
+    ]
 
 
 @every_protocol
@@ -82,36 +97,77 @@ def test_each_choice_of_every_protocol_can_be_given(task: str, protocol: str) ->
         value: Any = rules
         for part in name.split("."):
             value = getattr(value, part)
-        assert switched(rules, {name: json.loads(json.dumps(value)) if value != np.inf else value}) == rules
+        assert (
+            switched(rules, {name: json.loads(json.dumps(value)) if value != np.inf else value})
+            == rules
+        )
     assert switched(rules, {}) is rules
 
 
 def test_choices_may_be_of_a_part_lists_for_tuples_and_null_where_one_takes_it() -> None:
     released, paper = DETECTION_PROTOCOLS["released"], DETECTION_PROTOCOLS["paper"]
-    changed = switched(PaperAccidents(), {"reading.danger_distance": 2, "sample_choice": "mean_first"})
+    changed = switched(
+        PaperAccidents(), {"reading.danger_distance": 2, "sample_choice": "mean_first"}
+    )
     assert switch_names(changed) == ["reading.danger_distance", "sample_choice"]
     assert (changed.reading.danger_distance, changed.sample_choice) == (2, "mean_first")
     assert switched(released, {"area": None, "error_threshold": None}).error_threshold is None
-    rings = switched(paper, {"ranges": [[0, 30], [30, 50]], "error_threshold": None})  # which go together alone
+    rings = switched(
+        paper, {"ranges": [[0, 30], [30, 50]], "error_threshold": None}
+    )  # which go together alone
     assert rings.ranges == ((0, 30), (30, 50))
 
 
 @pytest.mark.parametrize(
     ("rules", "switches", "words"),
     [
-        (PaperAccidents(), {"reading.danger_distnce": 1}, ("did you mean 'reading.danger_distance'", "there are read")),
+        (
+            PaperAccidents(),
+            {"reading.danger_distnce": 1},
+            ("did you mean 'reading.danger_distance'", "there are read"),
+        ),
         (PaperAccidents(), {"reading": {}}, ("no switch 'reading'",)),
-        (PaperAccidents(), {"reading.danger_distance": "2"}, ("danger_distance", "a number, such as 1.0", "'2'")),
-        (PaperAccidents(), {"reading.danger_distance": True}, ("danger_distance", "a number, such as 1.0", "True")),
+        (
+            PaperAccidents(),
+            {"reading.danger_distance": "2"},
+            ("danger_distance", "a number, such as 1.0", "'2'"),
+        ),
+        (
+            PaperAccidents(),
+            {"reading.danger_distance": True},
+            ("danger_distance", "a number, such as 1.0", "True"),
+        ),
         (PaperAccidents(), {"sample_choice": 3}, ("sample_choice", "a word, such as 'best'", "3")),
-        (PaperAccidents(), {"sample_choice": "all"}, ("sample_choice", "best, mean_first", "'all'")),
-        (DETECTION_PROTOCOLS["paper"], {"min_recall": None}, ("min_recall", "a number, such as 0.1", "None")),
-        (DETECTION_PROTOCOLS["paper"], {"own_box": 1}, ("own_box", "true or false, such as False", "1")),
-        (DETECTION_PROTOCOLS["paper"], {"thresholds": 1}, ("thresholds", "a list, such as (1.0, 2.0, 4.0)", "found 1")),
-        (TASKS["warning"].protocols["field"], {"scores_of": "pair"}, ("no switch 'scores_of'", "it has none")),
+        (
+            PaperAccidents(),
+            {"sample_choice": "all"},
+            ("sample_choice", "best, mean_first", "'all'"),
+        ),
+        (
+            DETECTION_PROTOCOLS["paper"],
+            {"min_recall": None},
+            ("min_recall", "a number, such as 0.1", "None"),
+        ),
+        (
+            DETECTION_PROTOCOLS["paper"],
+            {"own_box": 1},
+            ("own_box", "true or false, such as False", "1"),
+        ),
+        (
+            DETECTION_PROTOCOLS["paper"],
+            {"thresholds": 1},
+            ("thresholds", "a list, such as (1.0, 2.0, 4.0)", "found 1"),
+        ),
+        (
+            TASKS["warning"].protocols["field"],
+            {"scores_of": "pair"},
+            ("no switch 'scores_of'", "it has none"),
+        ),
     ],
 )
-def test_choices_that_are_none(rules: Any, switches: dict[str, Any], words: tuple[str, ...]) -> None:
+def test_choices_that_are_none(
+    rules: Any, switches: dict[str, Any], words: tuple[str, ...]
+) -> None:
     assert_refused((lambda: switched(rules, switches), ChoiceError, words))
 
 
@@ -120,7 +176,11 @@ def test_each_headline_is_a_number_of_the_result_by_its_path(task: str, protocol
     result = EvaluationSetup(task=task, protocol=protocol).evaluator().compute()
     known, found = numbers_of(result), headlines(result)
     assert len({each.name for each in found}) == len(found)
-    assert len(found) > 2 or task in ("warning", "planning", "forecasting")  # by group, of which there is none yet
+    assert len(found) > 2 or task in (
+        "warning",
+        "planning",
+        "forecasting",
+    )  # by group, of which there is none yet
     for each in found:
         value = known.get(each.path, math.nan)
         assert each.value == (None if math.isnan(value) else value)
@@ -141,7 +201,9 @@ HEADLINES = {
 def test_headlines_have_names_units_and_a_better_side(task: str, protocol: str) -> None:
     found = headlines(EvaluationSetup(task=task, protocol=protocol).evaluator().compute())
     sides = {True: "+", False: "-", None: " "}
-    assert [f"{each.name} {each.unit}{sides[each.higher_is_better]}" for each in found] == HEADLINES[task].split(", ")
+    assert [
+        f"{each.name} {each.unit}{sides[each.higher_is_better]}" for each in found
+    ] == HEADLINES[task].split(", ")
 
 
 @pytest.mark.parametrize(
@@ -162,8 +224,19 @@ def test_texts_of_values(value: float | None, unit: Any, signed: bool, text: str
 
 def test_mappings_of_results_are_frozen_and_have_a_hash() -> None:
     frozen = FrozenDict({"a": 1, "b": 2})
-    changes = ("__setitem__", "__delitem__", "__ior__", "clear", "pop", "popitem", "setdefault", "update")
-    assert_refused(*((getattr(frozen, name), TypeError, ("make a dict of it",)) for name in changes))
+    changes = (
+        "__setitem__",
+        "__delitem__",
+        "__ior__",
+        "clear",
+        "pop",
+        "popitem",
+        "setdefault",
+        "update",
+    )
+    assert_refused(
+        *((getattr(frozen, name), TypeError, ("make a dict of it",)) for name in changes)
+    )
     assert [pickle.loads(pickle.dumps(frozen)), copy.deepcopy(frozen)] == [frozen] * 2
     nested = replace(MotionEvaluator().compute(), ranges={"a": {"b": 1}}).ranges["a"]
     assert (type(nested), nested) == (FrozenDict, {"b": 1})

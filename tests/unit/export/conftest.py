@@ -12,7 +12,9 @@ from deepaccident_devkit.testing import SmallRelease, write_small_release
 @pytest.fixture(scope="session")
 def small_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Three scenarios of three frames and two agents; indexed; read-only by agreement."""
-    wanted = SmallRelease(splits=("train", "val"), agents=("ego_vehicle", "other_vehicle"), channels=("Camera_Front",))
+    wanted = SmallRelease(
+        splits=("train", "val"), agents=("ego_vehicle", "other_vehicle"), channels=("Camera_Front",)
+    )
     root = tmp_path_factory.mktemp("small") / "release"
     write_small_release(root, wanted)
     DeepAccident(dataroot=root, verbose=False)

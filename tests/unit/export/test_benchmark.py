@@ -9,8 +9,12 @@ benchmark = of_checkout("benchmarks.export")
 
 
 @pytest.mark.slow
-def test_every_format_is_measured_with_links_and_with_copies(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(benchmark, "RELEASE", SynthConfig(scenarios=1, frames=6, image_size=(64, 36), designed=True))
+def test_every_format_is_measured_with_links_and_with_copies(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(
+        benchmark, "RELEASE", SynthConfig(scenarios=1, frames=6, image_size=(64, 36), designed=True)
+    )
     for name in ("SCENARIOS", "REPEATS"):
         monkeypatch.setattr(benchmark, name, 1)
     found = {figure.name: figure for figure in benchmark.measure()}

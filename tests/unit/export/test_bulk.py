@@ -38,7 +38,15 @@ from deepaccident_devkit.errors import (
     SomeFailedError,
     WorkerError,
 )
-from deepaccident_devkit.export.bulk import Export, Exported, Format, LinkKind, Manifest, Output, export_release
+from deepaccident_devkit.export.bulk import (
+    Export,
+    Exported,
+    Format,
+    LinkKind,
+    Manifest,
+    Output,
+    export_release,
+)
 from deepaccident_devkit.export.images import ImageConfig
 from deepaccident_devkit.export.nuscenes import NuScenes
 from deepaccident_devkit.export.opencood import OpenCood
@@ -66,7 +74,8 @@ Contents = dict[str, bytes | None]
 def contents(folder: Path) -> Contents:
     """Path → content; None for a folder."""
     return {
-        path.relative_to(folder).as_posix(): None if path.is_dir() else path.read_bytes() for path in folder.rglob("*")
+        path.relative_to(folder).as_posix(): None if path.is_dir() else path.read_bytes()
+        for path in folder.rglob("*")
     }
 
 
@@ -78,7 +87,9 @@ def states(folder: Path) -> dict[str, tuple[int, ...]]:
     }
 
 
-def written(dataset: DeepAccident, folder: Path, form: TinyFormat | None = None, **options: Any) -> Exported:
+def written(
+    dataset: DeepAccident, folder: Path, form: TinyFormat | None = None, **options: Any
+) -> Exported:
     return export_release(dataset, folder, form or TinyFormat(), **{"workers": 1, **options})
 
 
@@ -86,7 +97,9 @@ def reopened(root: Path) -> DeepAccident:
     return DeepAccident(dataroot=root, verbose=False)
 
 
-def stopped(dataset: DeepAccident, folder: Path, units: int, form: TinyFormat | None = None) -> None:
+def stopped(
+    dataset: DeepAccident, folder: Path, units: int, form: TinyFormat | None = None
+) -> None:
     """An export that comes to an end when so many units are done."""
     with pytest.MonkeyPatch.context() as patch:
         whole, left = TinyFormat.write, iter(range(units))
@@ -129,13 +142,27 @@ def remove_scenario(root: Path, token: str) -> None:
 
 def test_what_is_there(small: DeepAccident, tmp_path: Path) -> None:
     done = written(small, tmp_path / "deep" / "out")
-    files = {name for name, content in contents(done.folder).items() if content is not None and name != ARCHIVE}
+    files = {
+        name
+        for name, content in contents(done.folder).items()
+        if content is not None and name != ARCHIVE
+    }
     assert len(files) == PICTURES + SCENARIOS * (1 + 3 + 1) + 1 + 1
-    assert (done.written, done.kept, done.tally.samples, done.tally.files) == (3, 0, PICTURES, SCENARIOS * 5 + 1)
+    assert (done.written, done.kept, done.tally.samples, done.tally.files) == (
+        3,
+        0,
+        PICTURES,
+        SCENARIOS * 5 + 1,
+    )
     told = json.loads((done.folder / MANIFEST).read_bytes())
-    assert (told["written"], told["written"]["left_out"]) == (asdict(done.tally), {"clouds": PICTURES, "maps": 1})
+    assert (told["written"], told["written"]["left_out"]) == (
+        asdict(done.tally),
+        {"clouds": PICTURES, "maps": 1},
+    )
     assert told["written"]["bytes"] == sum(
-        (done.folder / name).stat().st_size for name in files - {MANIFEST} if not name.endswith(".jpg")
+        (done.folder / name).stat().st_size
+        for name in files - {MANIFEST}
+        if not name.endswith(".jpg")
     )
     hashes = scenario_hashes(small, [record["token"] for record in small.scenario])
     assert told["release"]["fingerprint"] == fingerprint(hashes)
@@ -163,14 +190,21 @@ def test_a_killed_worker_is_told_and_leaves_nothing_half_written(
     small: DeepAccident, whole: Contents, tmp_path: Path
 ) -> None:
     out = tmp_path / "out"
-    assert_refused((lambda: export_release(small, out, KilledFormat(), workers=2), WorkerError, "was killed"))
+    assert_refused(
+        (lambda: export_release(small, out, KilledFormat(), workers=2), WorkerError, "was killed")
+    )
     assert not [name for name in contents(out) if temporary_of(Path(name).name)]
     assert contents(written(small, out).folder) == whole
 
 
-def test_a_complete_export_is_kept_as_it_is_whatever_the_way_of_links(small: DeepAccident, tmp_path: Path) -> None:
+def test_a_complete_export_is_kept_as_it_is_whatever_the_way_of_links(
+    small: DeepAccident, tmp_path: Path
+) -> None:
     shares: list[float] = []
-    first, before = written(small, tmp_path / "out", progress=shares.append), states(tmp_path / "out")
+    first, before = (
+        written(small, tmp_path / "out", progress=shares.append),
+        states(tmp_path / "out"),
+    )
     assert shares == pytest.approx([1 / SCENARIOS] * SCENARIOS)
     for form in (TinyFormat(), TinyFormat(link="copy")):
         again = written(small, tmp_path / "out", form)
@@ -183,7 +217,10 @@ def test_a_complete_export_is_kept_as_it_is_whatever_the_way_of_links(small: Dee
     [
         (TinyFormat(greeting="hi"), "greeting: 'hello', asked for 'hi'"),
         (TinyFormat(split="train"), "split: None, asked for 'train'"),
-        (TinyFormat(agents=("ego_vehicle",), where=("length>=1",)), r"'ego_vehicle'.*where: .*'length>=1'"),
+        (
+            TinyFormat(agents=("ego_vehicle",), where=("length>=1",)),
+            r"'ego_vehicle'.*where: .*'length>=1'",
+        ),
     ],
 )
 @pytest.mark.parametrize("units", [1, SCENARIOS])
@@ -204,12 +241,28 @@ def test_a_folder_with_other_things_is_refused(small: DeepAccident, tmp_path: Pa
     (locked / ".deepaccident-parts" / ".lock").mkdir(parents=True)
     before = states(tmp_path)
     assert_refused(
-        (lambda: written(small, notes.parent), ExportError, ("not empty (notes.txt)", "tiny", "choose a new folder")),
+        (
+            lambda: written(small, notes.parent),
+            ExportError,
+            ("not empty (notes.txt)", "tiny", "choose a new folder"),
+        ),
         (lambda: written(small, notes), ExportError, ("notes.txt: is a file", "give a folder")),
-        (lambda: written(small, notes / "out"), ExportError, ("cannot be written", "Not a directory")),
-        (lambda: written(small, Path("/proc/out")), ExportError, ("/proc/out: cannot be written", "make room there")),
+        (
+            lambda: written(small, notes / "out"),
+            ExportError,
+            ("cannot be written", "Not a directory"),
+        ),
+        (
+            lambda: written(small, Path("/proc/out")),
+            ExportError,
+            ("/proc/out: cannot be written", "make room there"),
+        ),
         (lambda: written(small, locked), ExportError, "cannot be written"),
-        (lambda: written(small, tmp_path / "out", workers=-3), ChoiceError, ("workers", "at least 1", "-3")),
+        (
+            lambda: written(small, tmp_path / "out", workers=-3),
+            ChoiceError,
+            ("workers", "at least 1", "-3"),
+        ),
     )
     assert states(tmp_path) == before
 
@@ -229,7 +282,13 @@ def test_a_damaged_archive_of_a_complete_export_is_named(changing: Path, tmp_pat
     whole = (out / ARCHIVE).read_bytes()
     for content in (b"", whole[:-40], whole[:200] + b"?" + whole[201:]):
         (out / ARCHIVE).write_bytes(content)
-        assert_refused((lambda: written(reopened(changing), out), ExportError, (ARCHIVE, "remove it", "as a whole")))
+        assert_refused(
+            (
+                lambda: written(reopened(changing), out),
+                ExportError,
+                (ARCHIVE, "remove it", "as a whole"),
+            )
+        )
     for name in ("../../kept.txt", str(tmp_path / "kept.txt")):
         with zipfile.ZipFile(out / ARCHIVE, "w") as archive:
             archive.writestr(name, b"")
@@ -248,11 +307,17 @@ class TestRelease:
         out = written(dataset, tmp_path / "out").folder
         before, token = states(out), dataset.scenario[1]["token"]
         edit_label(changing, token)
-        sentence = ("another state of the release", "1 scenarios have changed, come or gone since", token)
+        sentence = (
+            "another state of the release",
+            "1 scenarios have changed, come or gone since",
+            token,
+        )
         assert_refused(*[(lambda: written(reopened(changing), out), ExportError, sentence)] * 2)
         assert states(out) == before
 
-    def test_files_that_the_index_was_not_made_from_are_refused(self, changing: Path, tmp_path: Path) -> None:
+    def test_files_that_the_index_was_not_made_from_are_refused(
+        self, changing: Path, tmp_path: Path
+    ) -> None:
         """What is written comes from the index, and the hashes beside it would be of other files."""
         dataset = reopened(changing)
         token = dataset.scenario[1]["token"]
@@ -301,25 +366,37 @@ class TestRelease:
         assert (done.written, done.kept) == (SCENARIOS - units + 1, units - 1)
         fresh = written(reopened(changing), tmp_path / "fresh")
         assert (contents(out), done.tally) == (contents(fresh.folder), fresh.tally)
-        kept = {name for name, state in states(out).items() if before.get(name) == state and name.endswith(".txt")}
+        kept = {
+            name
+            for name, state in states(out).items()
+            if before.get(name) == state and name.endswith(".txt")
+        }
         assert len(kept) >= (units - 1) * 4
         assert written(reopened(changing), out).written == 0
 
-    def test_links_to_its_files_leave_the_index_as_it_is(self, changing: Path, tmp_path: Path) -> None:
+    def test_links_to_its_files_leave_the_index_as_it_is(
+        self, changing: Path, tmp_path: Path
+    ) -> None:
         """A link changes a file's ctime."""
         done = written(reopened(changing), tmp_path / "out")
         assert done.tally.linked
         assert current_index(find_release(changing)) is not None
 
-    def test_sensor_files_that_a_format_does_not_need_change_nothing(self, changing: Path, tmp_path: Path) -> None:
+    def test_sensor_files_that_a_format_does_not_need_change_nothing(
+        self, changing: Path, tmp_path: Path
+    ) -> None:
         form = TinyFormat(agents=("other_vehicle",))
         written(reopened(changing), tmp_path / "out", form)
         for path in changing.glob("*/ego_vehicle/Camera_Front/*/*_002.jpg"):
             path.unlink()
         assert written(reopened(changing), tmp_path / "out", form).written == 0
 
-    @pytest.mark.parametrize("moment", ["Store.drop", "Store.remove", "Manifest.write", "Export._remove_others"])
-    def test_a_call_that_is_killed_as_it_packs_or_unpacks(self, changing: Path, tmp_path: Path, moment: str) -> None:
+    @pytest.mark.parametrize(
+        "moment", ["Store.drop", "Store.remove", "Manifest.write", "Export._remove_others"]
+    )
+    def test_a_call_that_is_killed_as_it_packs_or_unpacks(
+        self, changing: Path, tmp_path: Path, moment: str
+    ) -> None:
         name, method = moment.split(".")
         kind = {"Store": Store, "Manifest": Manifest, "Export": Export}[name]
         out = written(reopened(changing), tmp_path / "out").folder
@@ -344,7 +421,9 @@ class TestRelease:
         done = written(dataset, tmp_path / "out")
         assert contents(done.folder) == contents(written(dataset, tmp_path / "fresh").folder)
 
-    def test_a_scenario_that_went_after_opening_is_told(self, changing: Path, tmp_path: Path) -> None:
+    def test_a_scenario_that_went_after_opening_is_told(
+        self, changing: Path, tmp_path: Path
+    ) -> None:
         dataset = reopened(changing)
         token = dataset.scenario[2]["token"]
         remove_scenario(changing, token)
@@ -412,7 +491,11 @@ def test_a_file_that_cannot_be_read_costs_its_scenario(changing: Path, tmp_path:
 
 @pytest.mark.parametrize("after", [0, 7, 14])
 def test_a_disk_that_is_full_amid_writing(
-    small: DeepAccident, whole: Contents, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, after: int
+    small: DeepAccident,
+    whole: Contents,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    after: int,
 ) -> None:
     with monkeypatch.context() as patch:
         write, left = Path.write_bytes, iter(range(after))
@@ -437,7 +520,15 @@ def test_a_disk_that_is_full_amid_writing(
 class TestDamage:
     """What is in the way of a manifest or of a record."""
 
-    TEXTS = ("", "{", "[]", "null", "1e999", "[" * 100_000, '{"what": "DeepAccident export", "format": "other"}')
+    TEXTS = (
+        "",
+        "{",
+        "[]",
+        "null",
+        "1e999",
+        "[" * 100_000,
+        '{"what": "DeepAccident export", "format": "other"}',
+    )
 
     @pytest.mark.parametrize(
         "damage",
@@ -469,10 +560,18 @@ class TestDamage:
         else:
             told = json.loads(whole[MANIFEST] or b"") | dict([damage])
             (tmp_path / MANIFEST).write_text(json.dumps(told).replace('"INFINITE"', "1e999"))
-        assert_refused((lambda: written(small, tmp_path), ExportError, (MANIFEST, "export again into an empty folder")))
+        assert_refused(
+            (
+                lambda: written(small, tmp_path),
+                ExportError,
+                (MANIFEST, "export again into an empty folder"),
+            )
+        )
         assert [path.name for path in tmp_path.iterdir()] == [MANIFEST]
 
-    @pytest.mark.parametrize("text", [*TEXTS, None, '{"devkit": "$", "scenarios": 3, "written": {}}'])
+    @pytest.mark.parametrize(
+        "text", [*TEXTS, None, '{"devkit": "$", "scenarios": 3, "written": {}}']
+    )
     def test_a_damaged_record_is_written_again(
         self, small: DeepAccident, whole: Contents, tmp_path: Path, text: str | None
     ) -> None:
@@ -486,7 +585,9 @@ class TestDamage:
         done = written(small, tmp_path / "out")
         assert (done.written, contents(done.folder)) == (2, whole)
 
-    @pytest.mark.parametrize("path", ["../kept.txt", "{root}/kept.txt", ".", "", "frames/../../kept.txt", "\udcff"])
+    @pytest.mark.parametrize(
+        "path", ["../kept.txt", "{root}/kept.txt", ".", "", "frames/../../kept.txt", "\udcff"]
+    )
     def test_a_strange_path_in_a_journal_removes_nothing(
         self, small: DeepAccident, whole: Contents, tmp_path: Path, path: str
     ) -> None:
@@ -497,7 +598,9 @@ class TestDamage:
         for journal in (tmp_path / "out" / ".deepaccident-parts" / "kept" / "tiny").glob("*.paths"):
             with journal.open("ab") as file:
                 file.write(f"{path.format(root=tmp_path)}\0".encode(errors="surrogateescape"))
-            shutil.rmtree(journal.with_name(journal.name.removesuffix(".paths")), ignore_errors=True)
+            shutil.rmtree(
+                journal.with_name(journal.name.removesuffix(".paths")), ignore_errors=True
+            )
         assert contents(written(small, tmp_path / "out").folder) == whole
         assert kept.exists()
 
@@ -509,7 +612,9 @@ def source(tmp_path: Path) -> Path:
     return path
 
 
-def output_of(tmp_path: Path, link: LinkKind = "hard", note: Callable[[str], object] = lambda _: None) -> Output:
+def output_of(
+    tmp_path: Path, link: LinkKind = "hard", note: Callable[[str], object] = lambda _: None
+) -> Output:
     return Output(tmp_path / "out", tmp_path / "parts", link, note=note)
 
 
@@ -521,7 +626,9 @@ def refusing(code: int) -> Callable[..., None]:
 
 
 def names(folder: Path) -> list[str]:
-    return sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if not path.is_dir())
+    return sorted(
+        path.relative_to(folder).as_posix() for path in folder.rglob("*") if not path.is_dir()
+    )
 
 
 def test_files_are_noted_counted_and_whole(tmp_path: Path, source: Path) -> None:
@@ -552,7 +659,9 @@ class TestLinks:
             output.link(given, "a/b.png")
         assert (output.tally.linked, output.tally.files) == ({link: 2}, 0)
         assert (target.read_bytes(), list(target.parent.iterdir())) == (b"a picture", [target])
-        assert (target.readlink() if target.is_symlink() else None) == (source if link == "symbolic" else None)
+        assert (target.readlink() if target.is_symlink() else None) == (
+            source if link == "symbolic" else None
+        )
         assert (not target.is_symlink() and target.samefile(source)) == (link == "hard")
 
     @pytest.mark.parametrize("code", [errno.EXDEV, errno.EPERM, errno.ENOTSUP, errno.EMLINK])
@@ -576,7 +685,9 @@ class TestLinks:
     ) -> None:
         monkeypatch.setattr(os, "link", refusing(errno.ENOSPC))
         monkeypatch.setattr(Path, "symlink_to", refusing(errno.ENOSPC))
-        assert_refused((lambda: output_of(tmp_path, link).link(source, "a.jpg"), OSError, "No space left"))
+        assert_refused(
+            (lambda: output_of(tmp_path, link).link(source, "a.jpg"), OSError, "No space left")
+        )
         assert names(tmp_path / "out") == []
 
     @pytest.mark.parametrize("link", ["hard", "symbolic", "copy"])
@@ -591,7 +702,9 @@ class TestLinks:
         ],
         ids=["missing", "pipe", "folder", "link to nothing", "link to itself"],
     )
-    def test_what_is_no_file(self, tmp_path: Path, make: Callable[[Path], None], words: str, link: LinkKind) -> None:
+    def test_what_is_no_file(
+        self, tmp_path: Path, make: Callable[[Path], None], words: str, link: LinkKind
+    ) -> None:
         path = tmp_path / "odd.jpg"
         make(path)
         assert_refused(
@@ -604,10 +717,15 @@ class TestLinks:
         assert not (tmp_path / "out").exists()
 
 
-def test_several_calls_share_the_scenarios(small: DeepAccident, whole: Contents, tmp_path: Path) -> None:
+def test_several_calls_share_the_scenarios(
+    small: DeepAccident, whole: Contents, tmp_path: Path
+) -> None:
     with ThreadPoolExecutor(3) as threads:
         done = list(threads.map(lambda _: written(small, tmp_path / "shared"), range(3)))
-    assert (sum(each.written for each in done), {each.tally.files for each in done}) == (SCENARIOS, {SCENARIOS * 5 + 1})
+    assert (sum(each.written for each in done), {each.tally.files for each in done}) == (
+        SCENARIOS,
+        {SCENARIOS * 5 + 1},
+    )
     assert contents(tmp_path / "shared") == whole
 
 
@@ -615,7 +733,12 @@ def test_a_worker_that_was_taken_for_lost_keeps_its_unit(
     small: DeepAccident, whole: Contents, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Of a scheduler that died: the next call neither takes its half-written files away nor writes beside it."""
-    write_all, begun, go_on, first = TinyFormat.write, threading.Event(), threading.Event(), iter([True])
+    write_all, begun, go_on, first = (
+        TinyFormat.write,
+        threading.Event(),
+        threading.Event(),
+        iter([True]),
+    )
 
     def write(self: TinyFormat, dataset: Any, unit: Any, output: Any) -> None:
         if next(first, False):
@@ -639,7 +762,9 @@ def test_a_worker_that_was_taken_for_lost_keeps_its_unit(
     for each in (lost, again):
         each.join()
     found = contents(tmp_path / "out")
-    locks = {name for name in found if name.startswith(".deepaccident-parts/locks")}  # of the lost one's next units
+    locks = {
+        name for name in found if name.startswith(".deepaccident-parts/locks")
+    }  # of the lost one's next units
     assert {name: found[name] for name in found.keys() - locks} == whole
 
 
@@ -661,19 +786,37 @@ IMAGES = ImageConfig(resize=(9, 16), cameras=("Camera_Back",))
 @pytest.mark.parametrize(
     ("form", "told"),
     [
-        (ReleasedInfos(), r"in the split files train\.txt or val\.txt .*; add these files, or choose other scenarios"),
+        (
+            ReleasedInfos(),
+            r"in the split files train\.txt or val\.txt .*; add these files, or choose other scenarios",
+        ),
         (OpenCood(), "has its point clouds; unpack the archives of lidar01"),
-        (CachedImages(split="train", images=IMAGES), "none of these images is in this release; unpack"),
+        (
+            CachedImages(split="train", images=IMAGES),
+            "none of these images is in this release; unpack",
+        ),
         (Questions(agents=ABSENT), "no recording is long enough"),
         (OpenCood(agents=ABSENT, without_clouds=True), "no moment"),
-        (TinyFormat(split="val", where=("length>=3", "designed_accident=false")), "is in that split and matches"),
-        *((kind(agents=ABSENT), "no chosen agent recorded one of") for kind in (NuScenes, Parquet, WebDataset)),
+        (
+            TinyFormat(split="val", where=("length>=3", "designed_accident=false")),
+            "is in that split and matches",
+        ),
+        *(
+            (kind(agents=ABSENT), "no chosen agent recorded one of")
+            for kind in (NuScenes, Parquet, WebDataset)
+        ),
     ],
 )
 @pytest.mark.parametrize("dry_run", [False, True])
-def test_nothing_to_write(small: DeepAccident, tmp_path: Path, form: Format, told: str, dry_run: bool) -> None:
+def test_nothing_to_write(
+    small: DeepAccident, tmp_path: Path, form: Format, told: str, dry_run: bool
+) -> None:
     assert_refused(
-        (lambda: export_release(small, tmp_path / "out", form, workers=1, dry_run=dry_run), NotAvailableError, told)
+        (
+            lambda: export_release(small, tmp_path / "out", form, workers=1, dry_run=dry_run),
+            NotAvailableError,
+            told,
+        )
     )
     assert not list(tmp_path.iterdir())
 
@@ -684,14 +827,19 @@ def test_killed_around_every_renaming_and_removal(
 ) -> None:
     command = [sys.executable, killed.__file__, "tiny_format"]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment) as server:
+    with subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment
+    ) as server:
         asked: Any = server.stdin
         answers: Any = server.stdout
 
         def status(step: int) -> int:
             """Of an export that is killed around its operation of that number."""
             call = {"function": ["tiny_format", "export_tiny"], "step": step, "after": after}
-            asked.write(json.dumps({**call, "arguments": [str(small_root), str(tmp_path / str(step)), 1]}) + "\n")
+            asked.write(
+                json.dumps({**call, "arguments": [str(small_root), str(tmp_path / str(step)), 1]})
+                + "\n"
+            )
             asked.flush()
             return int(json.loads(answers.readline())["status"])
 
@@ -705,9 +853,16 @@ def test_killed_around_every_renaming_and_removal(
     assert contents(tmp_path / str(step)) == whole
 
 
-def test_a_dry_run_writes_nothing_and_counts_what_is_left(small: DeepAccident, tmp_path: Path) -> None:
+def test_a_dry_run_writes_nothing_and_counts_what_is_left(
+    small: DeepAccident, tmp_path: Path
+) -> None:
     done = written(small, tmp_path / "out", dry_run=True)
-    assert (done.written, done.kept, done.tally.samples, done.tally.files) == (SCENARIOS, 0, PICTURES, 5 * SCENARIOS)
+    assert (done.written, done.kept, done.tally.samples, done.tally.files) == (
+        SCENARIOS,
+        0,
+        PICTURES,
+        5 * SCENARIOS,
+    )
     copies = written(small, tmp_path / "out", TinyFormat(link="copy"), dry_run=True)
     assert (sum(done.tally.linked.values()), copies.tally.linked) == (PICTURES, {"copy": PICTURES})
     pictures = sum(path.stat().st_size for path in small.dataroot.glob("*/*/Camera_Front/*/*.jpg"))

@@ -37,17 +37,25 @@ def resized(tmp_path_factory: pytest.TempPathFactory) -> tuple[DeepAccident, str
     """A release in which one image of the last moment, here the token of its sample, has another size and shape."""
     root = tmp_path_factory.mktemp("resized") / "release"
     channels = ("Camera_Front", "Camera_Back", "lidar01")
-    write_small_release(root, SmallRelease(splits=("val",), agents=("ego_vehicle",), channels=channels))
+    write_small_release(
+        root, SmallRelease(splits=("val",), agents=("ego_vehicle",), channels=channels)
+    )
     dataset = DeepAccident("v1", root, verbose=False)
     token = f"{dataset.scenario[0]['token']}/ego_vehicle/003"
-    write_image(dataset.get_sample_data_path(token, "Camera_Front"), np.zeros((SIZE[1], SIZE[0], 3), np.uint8))
+    write_image(
+        dataset.get_sample_data_path(token, "Camera_Front"),
+        np.zeros((SIZE[1], SIZE[0], 3), np.uint8),
+    )
     return dataset, token
 
 
 def opencood(out: Path, token: str) -> Found:
     (scenario,) = out.glob(f"*/{token.split('/ego', maxsplit=1)[0].replace('/', '__')}")
     facts = facts_of(scenario, "1", "000003")
-    return {name: (facts[theirs]["intrinsic"], None) for name, theirs in (("Front", "camera0"), ("Back", "camera3"))}
+    return {
+        name: (facts[theirs]["intrinsic"], None)
+        for name, theirs in (("Front", "camera0"), ("Back", "camera3"))
+    }
 
 
 def webdataset(out: Path, token: str) -> Found:
@@ -57,7 +65,9 @@ def webdataset(out: Path, token: str) -> Found:
         assert content is not None
         cameras = json.load(content)["cameras"]
     found = {name: cameras[f"camera_{name.lower()}"] for name in ("Front", "Back")}
-    return {name: (each["intrinsic"], (each["width"], each["height"])) for name, each in found.items()}
+    return {
+        name: (each["intrinsic"], (each["width"], each["height"])) for name, each in found.items()
+    }
 
 
 def nuscenes(out: Path, token: str) -> Found:
@@ -66,7 +76,10 @@ def nuscenes(out: Path, token: str) -> Found:
         key = tables["sample"][row["sample_token"]]
         if key["deepaccident_token"] == token and row["is_key_frame"]:
             k = tables["calibrated_sensor"][row["calibrated_sensor_token"]]["camera_intrinsic"]
-            found[row["filename"].split("/")[1].removeprefix("CAM_").title()] = k, (row["width"], row["height"])
+            found[row["filename"].split("/")[1].removeprefix("CAM_").title()] = (
+                k,
+                (row["width"], row["height"]),
+            )
     return found
 
 
@@ -74,7 +87,9 @@ def mmdet3d(out: Path, token: str) -> Found:
     infos = pickle.loads((out / "deepaccident_infos_val.pkl").read_bytes())["data_list"]
     frame = {"scenario": token.rsplit("/", 2)[0], "agent": "ego_vehicle", "frame": 3}
     (info,) = (each for each in infos if each["deepaccident"] == frame)
-    return {name: (info["images"][f"CAM_{name.upper()}"]["cam2img"], None) for name in ("Front", "Back")}
+    return {
+        name: (info["images"][f"CAM_{name.upper()}"]["cam2img"], None) for name in ("Front", "Back")
+    }
 
 
 @pytest.mark.parametrize(
@@ -87,7 +102,10 @@ def mmdet3d(out: Path, token: str) -> Found:
     ],
 )
 def test_k_is_of_the_file_that_is_there(
-    resized: tuple[DeepAccident, str], tmp_path: Path, forms: tuple[Any, ...], read: Callable[[Path, str], Found]
+    resized: tuple[DeepAccident, str],
+    tmp_path: Path,
+    forms: tuple[Any, ...],
+    read: Callable[[Path, str], Found],
 ) -> None:
     dataset, token = resized
     for form in forms:
@@ -97,7 +115,9 @@ def test_k_is_of_the_file_that_is_there(
         lens = dataset.camera(token, f"Camera_{name}")
         width, height = size or (lens.width, lens.height)
         k, told = found[name]
-        np.testing.assert_allclose(k, np.diag([width / lens.width, height / lens.height, 1]) @ lens.intrinsic)
+        np.testing.assert_allclose(
+            k, np.diag([width / lens.width, height / lens.height, 1]) @ lens.intrinsic
+        )
         assert told in (None, (width, height))
         assert (lens.width, lens.height) != SIZE
 
@@ -124,7 +144,9 @@ OPENERS: dict[str, Callable[[Path], Any]] = {
     "opencood": lambda out: sorted(out.rglob("*.yaml")),
     "parquet": parquet_tokens,
     "questions": first_line,
-    "town-maps": lambda out: json.loads(next(out.glob("*.geojson")).read_text(encoding="utf-8"))["features"],
+    "town-maps": lambda out: json.loads(next(out.glob("*.geojson")).read_text(encoding="utf-8"))[
+        "features"
+    ],
     "webdataset": tar_names,
 }
 """Format → function that opens what `deepaccident export FORMAT` wrote and returns some of it."""
@@ -136,7 +158,9 @@ def test_every_format_of_the_command_line_can_be_opened(
 ) -> None:
     assert name in OPENERS, f"add a function that opens the format {name} to OPENERS"
     out = tmp_path / ("scene.mcap" if name == "mcap" else "out")
-    dataset = request.getfixturevalue("da_motion" if name == "questions" else "da")  # questions need longer recordings
+    dataset = request.getfixturevalue(
+        "da_motion" if name == "questions" else "da"
+    )  # questions need longer recordings
     options = ("--observe", "1", "--ahead", "1") if name == "questions" else ()
     called("export", name, dataset.dataroot, "--out", out, *options)
     assert OPENERS[name](tmp_path if name == "mcap" else out)

@@ -22,14 +22,21 @@ from deepaccident_devkit.export.webdataset import WebDataset
 from deepaccident_devkit.training.image_cache import CachedImages
 
 TYPE = "type1_subtype1_accident"
-TOKENS = st.text(st.characters(exclude_categories=("Cs",), exclude_characters="/\0"), min_size=1, max_size=250)
+TOKENS = st.text(
+    st.characters(exclude_categories=("Cs",), exclude_characters="/\0"), min_size=1, max_size=250
+)
 
 
 def test_choices_get_their_usual_spelling_and_order() -> None:
     form = TinyFormat(
-        agents=("Infrastructure", "EGO_VEHICLE", "ego_vehicle"), link="Copy", split="VAL", where="length>=3"
+        agents=("Infrastructure", "EGO_VEHICLE", "ego_vehicle"),
+        link="Copy",
+        split="VAL",
+        where="length>=3",
     )  # type: ignore[arg-type]
-    usual = TinyFormat(agents=("ego_vehicle", "infrastructure"), link="copy", split="val", where=("length>=3",))
+    usual = TinyFormat(
+        agents=("ego_vehicle", "infrastructure"), link="copy", split="val", where=("length>=3",)
+    )
     assert (form, form.settings()) == (usual, usual.settings())
     assert TinyFormat(agents="ego_vehicle").agents == ("ego_vehicle",)  # type: ignore[arg-type]
 
@@ -56,7 +63,11 @@ ONE_SIZE = ImageConfig(resize=(18, 30))
         (WebDataset, {"frames": "2hz"}, "frames: expected one of every, keyframes"),
         (CachedImages, {"images": ONE_SIZE, "codec": "png"}, "codec: expected one of raw, jpeg"),
         (Questions, {"observers": "nobody"}, "^observers: expected one of single"),
-        (Questions, {"observers": ("ego_vehicle", "me")}, "^observers: expected one of ego_vehicle"),
+        (
+            Questions,
+            {"observers": ("ego_vehicle", "me")},
+            "^observers: expected one of ego_vehicle",
+        ),
         (Questions, {"seen": "heard"}, "^seen: expected one of released, camera, annotated"),
         (Questions, {"cameras": ("Camera_Up",)}, "^cameras: expected one of Camera_Front"),
         (Questions, {"link": "symbolic"}, "^link: a symbolic link shows the name of the scenario"),
@@ -73,11 +84,19 @@ def test_a_wrong_choice_is_refused_before_a_release_is_opened(
     [
         (WebDataset, {"shard_size": 0}, "shard_size: expected a number of bytes from 1, found 0"),
         (Parquet, {"shard_scenarios": 0}, "shard_scenarios: .*from 1.*0"),
-        (CachedImages, {"images": ImageConfig()}, "a cache holds images of one size; give ImageConfig"),
+        (
+            CachedImages,
+            {"images": ImageConfig()},
+            "a cache holds images of one size; give ImageConfig",
+        ),
         (ImageConfig, {"decode": "half"}, "decode: expected one of full, scaled"),
         (Questions, {"seed": 3}, "^seed: expected a text, found 3"),
         (Questions, {"window": 5}, "^window: expected WindowRules, found int"),
-        (WindowRules, {"observe": 0.3}, "^observe: expected seconds from 0 in steps of 0.5, found 0.3"),
+        (
+            WindowRules,
+            {"observe": 0.3},
+            "^observe: expected seconds from 0 in steps of 0.5, found 0.3",
+        ),
         (WindowRules, {"observe": -1}, "^observe: expected seconds from 0"),
         (WindowRules, {"observe": float("nan")}, "^observe: expected"),
         (WindowRules, {"stride": 0}, "^stride: expected seconds from 0.5 in steps of 0.5, found 0"),
@@ -85,7 +104,9 @@ def test_a_wrong_choice_is_refused_before_a_release_is_opened(
         (WindowRules, {"ahead": 0}, "^ahead: expected a whole number from 1, found 0"),
     ],
 )
-def test_impossible_settings_are_refused(kind: Callable[..., object], options: dict[str, Any], words: str) -> None:
+def test_impossible_settings_are_refused(
+    kind: Callable[..., object], options: dict[str, Any], words: str
+) -> None:
     assert_refused((lambda: kind(**options), ConfigError, words))
 
 
@@ -104,5 +125,11 @@ class TestNames:
     @pytest.mark.parametrize("odd", ["a b", "a\nb", "ä_b", "a" * 240])
     def test_those_that_would_be_alike(self, odd: str) -> None:
         made = flat_name(f"{TYPE}/{odd}")
-        alike = [made, *(flat_name(f"{TYPE}/{name}") for name in (made.split("__")[1], "a_b", "__b", "a" * 241))]
+        alike = [
+            made,
+            *(
+                flat_name(f"{TYPE}/{name}")
+                for name in (made.split("__")[1], "a_b", "__b", "a" * 241)
+            ),
+        ]
         assert len(set(alike)) == len(alike)

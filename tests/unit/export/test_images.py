@@ -33,11 +33,14 @@ def test_full_is_pillows_bilinear_filter(da: DeepAccident, camera: str) -> None:
     np.testing.assert_allclose(image.astype(int), np.asarray(whole)[2:14, 3:23], rtol=0, atol=1)
 
 
-def test_scaled_has_the_same_intrinsic_and_nearly_the_same_pixels(da: DeepAccident, camera: str) -> None:
+def test_scaled_has_the_same_intrinsic_and_nearly_the_same_pixels(
+    da: DeepAccident, camera: str
+) -> None:
     for resize in ((18, 32), (9, 16), (17, 40), (36, 64), (72, 128)):
         crop = (1, 2, resize[0] - 3, resize[1] - 4)
         full, scaled = (
-            ImageConfig(resize=resize, crop=crop, decode=each).load(da, camera) for each in ("full", "scaled")
+            ImageConfig(resize=resize, crop=crop, decode=each).load(da, camera)
+            for each in ("full", "scaled")
         )
         assert full[0].shape == scaled[0].shape
         np.testing.assert_array_equal(full[1], scaled[1])
@@ -45,21 +48,33 @@ def test_scaled_has_the_same_intrinsic_and_nearly_the_same_pixels(da: DeepAccide
 
 
 def test_scaled_without_a_size_is_full(da: DeepAccident, camera: str) -> None:
-    np.testing.assert_array_equal(ImageConfig(decode="scaled").load(da, camera)[0], da.load_image(camera))
+    np.testing.assert_array_equal(
+        ImageConfig(decode="scaled").load(da, camera)[0], da.load_image(camera)
+    )
 
 
 @pytest.mark.parametrize(
     ("least", "shape"),
-    [((34, 60), (66, 120)), ((32, 60), (33, 60)), ((16, 20), (17, 30)), ((8, 15), (9, 15)), ((1, 1), (9, 15))],
+    [
+        ((34, 60), (66, 120)),
+        ((32, 60), (33, 60)),
+        ((16, 20), (17, 30)),
+        ((8, 15), (9, 15)),
+        ((1, 1), (9, 15)),
+    ],
 )
-def test_a_jpeg_is_decoded_no_smaller(tmp_path: Path, least: tuple[int, int], shape: tuple[int, int]) -> None:
+def test_a_jpeg_is_decoded_no_smaller(
+    tmp_path: Path, least: tuple[int, int], shape: tuple[int, int]
+) -> None:
     write_image(tmp_path / "image.jpg", picture(66, 120))
     assert read_image(tmp_path / "image.jpg", least=least).shape == (*shape, 3)
 
 
 def test_a_png_is_decoded_whole(tmp_path: Path) -> None:
     Image.fromarray(picture(64, 120)).save(tmp_path / "image.jpg", format="PNG")
-    np.testing.assert_array_equal(read_image(tmp_path / "image.jpg", least=(8, 8)), picture(64, 120))
+    np.testing.assert_array_equal(
+        read_image(tmp_path / "image.jpg", least=(8, 8)), picture(64, 120)
+    )
 
 
 @pytest.mark.parametrize("share", [0.3, 0.6, 0.9])
@@ -67,23 +82,36 @@ def test_a_truncated_jpeg_is_no_half_grey_picture(tmp_path: Path, share: float) 
     path = tmp_path / "image.jpg"
     write_image(path, picture(64, 120))
     path.write_bytes(path.read_bytes()[: int(path.stat().st_size * share)])
-    assert_refused((lambda: read_image(path, least=(16, 16)), SensorFileError, r"image\.jpg: not a readable image"))
+    assert_refused(
+        (
+            lambda: read_image(path, least=(16, 16)),
+            SensorFileError,
+            r"image\.jpg: not a readable image",
+        )
+    )
 
 
 @pytest.mark.parametrize("decode", ["full", "scaled"])
 @given(st.data())
-def test_a_part_is_what_pillow_or_opencv_makes_of_the_whole(decode: str, data: st.DataObject) -> None:
+def test_a_part_is_what_pillow_or_opencv_makes_of_the_whole(
+    decode: str, data: st.DataObject
+) -> None:
     """At most 1 of 255 from it, shrunk or grown; where an image does both, OpenCV's area filter is another one."""
     old = data.draw(st.tuples(st.integers(1, 60), st.integers(1, 60)))
     size = data.draw(st.tuples(st.integers(1, 60), st.integers(1, 60)))
     assume(decode == "full" or (size[0] - old[0]) * (size[1] - old[1]) >= 0)
     top, left = (data.draw(st.integers(0, each - 1)) for each in size)
-    height, width = data.draw(st.integers(1, size[0] - top)), data.draw(st.integers(1, size[1] - left))
+    height, width = (
+        data.draw(st.integers(1, size[0] - top)),
+        data.draw(st.integers(1, size[1] - left)),
+    )
     image = np.random.default_rng(sum(old)).integers(0, 2, (*old, 3), dtype=np.uint8) * 255
     if decode == "full":
         whole = np.asarray(Image.fromarray(image).resize(size[::-1], Image.Resampling.BILINEAR))
     else:
-        whole = image if old == size else cv2.resize(image, size[::-1], interpolation=cv2.INTER_AREA)
+        whole = (
+            image if old == size else cv2.resize(image, size[::-1], interpolation=cv2.INTER_AREA)
+        )
     part = resized_part(image, size, (top, left, height, width), decode)
     difference = np.abs(part.astype(int) - whole[top : top + height, left : left + width])
     assert (difference.shape, difference.max() <= 1) == ((height, width, 3), True)
@@ -104,7 +132,9 @@ def test_a_virtual_camera_sees_the_same_in_the_same_directions(
     v, u = np.mgrid[0:120, 0:160]
     whole = np.stack([u, v, np.full_like(u, 200)], axis=-1).astype(np.uint8)
     own = np.array([[100 * zoom, 0, 160 * across], [0, 110 * zoom, 120 * down], [0, 0, 1]])
-    image, intrinsic = VirtualCamera(focal, height, width).taken(whole, PinholeCamera(own, 160, 120), "full")
+    image, intrinsic = VirtualCamera(focal, height, width).taken(
+        whole, PinholeCamera(own, 160, 120), "full"
+    )
     assert image.shape == (height, width, 3)
     half_a_pixel = np.diag(own)[:2] / (160, 120) / 2  # of the scaled whole image's size
     assert (np.abs(np.diag(intrinsic)[:2] - focal) <= half_a_pixel + 1e-9).all()
@@ -115,7 +145,9 @@ def test_a_virtual_camera_sees_the_same_in_the_same_directions(
     inner = ((at > 3) & (at < np.array([[156], [116]]))).all(axis=0)
     np.testing.assert_allclose(image[row, column][inner, :2], at.T[inner], atol=2.1)
     black = np.nonzero(image[..., 2] == 0)
-    rays = np.linalg.inv(intrinsic) @ np.stack([black[1] + 0.5, black[0] + 0.5, np.ones(len(black[0]))])
+    rays = np.linalg.inv(intrinsic) @ np.stack(
+        [black[1] + 0.5, black[0] + 0.5, np.ones(len(black[0]))]
+    )
     beyond = (own @ rays)[:2]
     assert ((beyond < 1.5 / zoom + 3) | (beyond > np.array([[156], [116]]))).any(axis=0).all()
 
@@ -128,7 +160,11 @@ def test_a_virtual_camera_takes_the_place_of_resizing(da: DeepAccident, camera: 
 
 @pytest.mark.parametrize(
     "wrong",
-    [{"virtual_camera": (0, 9, 9)}, {"virtual_camera": (9, 0, 9)}, {"virtual_camera": (9, 9, 9), "resize": (9, 9)}],
+    [
+        {"virtual_camera": (0, 9, 9)},
+        {"virtual_camera": (9, 0, 9)},
+        {"virtual_camera": (9, 9, 9), "resize": (9, 9)},
+    ],
 )
 def test_a_virtual_camera_that_cannot_be(wrong: dict) -> None:
     with pytest.raises(ConfigError, match=r"virtual_camera: expected"):

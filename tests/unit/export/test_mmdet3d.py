@@ -52,7 +52,9 @@ def points_in(box: np.ndarray, points: np.ndarray) -> int:
     cos, sin = np.cos(box[6]), np.sin(box[6])
     length, width, height = box[3:6] / 2 + 1e-4
     along, across = x * cos + y * sin, y * cos - x * sin
-    return int(((np.abs(along) <= length) & (np.abs(across) <= width) & (np.abs(z) <= height)).sum())
+    return int(
+        ((np.abs(along) <= length) & (np.abs(across) <= width) & (np.abs(z) <= height)).sum()
+    )
 
 
 def disagreement(folder: Path) -> float:
@@ -73,12 +75,16 @@ def test_boxes_hold_the_points_that_their_labels_count(exported: Exported) -> No
     assert disagreement(exported.folder) == 0
 
 
-def test_an_info_is_a_sample_of_the_tables_with_its_files(da: DeepAccident, exported: Exported) -> None:
+def test_an_info_is_a_sample_of_the_tables_with_its_files(
+    da: DeepAccident, exported: Exported
+) -> None:
     rows = json.loads((exported.folder / "v1.0-deepaccident" / "sample.json").read_text())
     data = json.loads((exported.folder / "v1.0-deepaccident" / "sample_data.json").read_text())
     names = {row["token"]: Path(row["filename"]) for row in data}
     splits = [infos(exported.folder, split) for split in ("train", "val")]
-    assert [[info["sample_idx"] for info in each] for each in splits] == [[*range(len(each))] for each in splits]
+    assert [[info["sample_idx"] for info in each] for each in splits] == [
+        [*range(len(each))] for each in splits
+    ]
     found = {info["token"]: info for each in splits for info in each}
     assert set(found) == {row["token"] for row in rows}
     for row in rows:
@@ -87,7 +93,10 @@ def test_an_info_is_a_sample_of_the_tables_with_its_files(da: DeepAccident, expo
         assert told == (row["deepaccident_token"], row["timestamp"] / 1e6)
         for channel, image in info["images"].items():
             path = Path("samples", channel, image["img_path"])
-            assert (names[image["sample_data_token"]], (exported.folder / path).is_file()) == (path, True)
+            assert (names[image["sample_data_token"]], (exported.folder / path).is_file()) == (
+                path,
+                True,
+            )
         for sweep in info["lidar_sweeps"]:
             assert str(names[sweep["sample_data_token"]]) == sweep["lidar_points"]["lidar_path"]
     assert exported.tally.samples == len(rows) == 2 * len(AGENTS) * len(da.scenario)
@@ -96,26 +105,40 @@ def test_an_info_is_a_sample_of_the_tables_with_its_files(da: DeepAccident, expo
 def test_labels_are_nuscenes_own(da: DeepAccident, exported: Exported, tmp_path: Path) -> None:
     trucks = exported_to(da, tmp_path / "trucks", agents=("ego_vehicle",), van="truck")
     for folder, van in ((exported.folder, "car"), (trucks.folder, "truck")):
-        instances = [each for split in ("train", "val") for info in infos(folder, split) for each in info["instances"]]
+        instances = [
+            each
+            for split in ("train", "val")
+            for info in infos(folder, split)
+            for each in info["instances"]
+        ]
         named = {
             (each["category"], NUSCENES_CLASSES[each[key]])
             for each in instances
             for key in ("bbox_label_3d", "bbox_label")
         }
         ours = {category for category, _ in named}
-        assert named == {(each, {"van": van, "cyclist": "bicycle"}.get(each, each)) for each in ours} > {("van", van)}
+        assert (
+            named
+            == {(each, {"van": van, "cyclist": "bicycle"}.get(each, each)) for each in ours}
+            > {("van", van)}
+        )
 
 
 def test_velocities_are_of_the_positions(da: DeepAccident, exported: Exported) -> None:
     info = infos(exported.folder)[1]
-    boxes = da.boxes("{scenario}/{agent}/{frame:03d}".format(**info["deepaccident"]), "lidar", velocity="derived")
+    boxes = da.boxes(
+        "{scenario}/{agent}/{frame:03d}".format(**info["deepaccident"]), "lidar", velocity="derived"
+    )
     others = boxes.select(boxes.actor_id != OWN_ACTOR_ID)
     assert_allclose([each["velocity"] for each in info["instances"]], others.velocity[:, :2])
     assert np.isfinite(others.velocity).all(axis=1).sum() > 3
 
 
 def test_sweeps_are_the_clouds_before_newest_first(exported: Exported) -> None:
-    first, last = (next(info for info in infos(exported.folder) if info["deepaccident"]["frame"] == n) for n in (1, 6))
+    first, last = (
+        next(info for info in infos(exported.folder) if info["deepaccident"]["frame"] == n)
+        for n in (1, 6)
+    )
     assert first["lidar_sweeps"] == []
     ages = [last["timestamp"] - sweep["timestamp"] for sweep in last["lidar_sweeps"]]
     assert_allclose(ages, [0.1, 0.2, 0.3, 0.4, 0.5], atol=1e-6)
@@ -123,13 +146,19 @@ def test_sweeps_are_the_clouds_before_newest_first(exported: Exported) -> None:
     assert folders == ["sweeps"] * 4 + ["samples"]
 
 
-def test_axes_of_nuscenes_turn_boxes_clouds_and_poses(da: DeepAccident, exported: Exported, tmp_path: Path) -> None:
-    turned = exported_to(da, tmp_path / "turned", lidar_axes="nuscenes", split="val", agents=("ego_vehicle",))
+def test_axes_of_nuscenes_turn_boxes_clouds_and_poses(
+    da: DeepAccident, exported: Exported, tmp_path: Path
+) -> None:
+    turned = exported_to(
+        da, tmp_path / "turned", lidar_axes="nuscenes", split="val", agents=("ego_vehicle",)
+    )
     assert disagreement(turned.folder) == 0
     ours, theirs = infos(exported.folder)[1], infos(turned.folder)[1]
     for one, other in zip(ours["instances"], theirs["instances"], strict=True):
         in_world, again = (
-            np.array(info["ego2global"]) @ info["lidar_points"]["lidar2ego"] @ [*instance["bbox_3d"][:3], 1]
+            np.array(info["ego2global"])
+            @ info["lidar_points"]["lidar2ego"]
+            @ [*instance["bbox_3d"][:3], 1]
             for info, instance in ((ours, one), (theirs, other))
         )
         assert_allclose(in_world, again, atol=1e-6)
@@ -138,9 +167,13 @@ def test_axes_of_nuscenes_turn_boxes_clouds_and_poses(da: DeepAccident, exported
 
 def test_a_partial_release_is_written_and_counted(da_partial: DeepAccident, tmp_path: Path) -> None:
     made = exported_to(da_partial, tmp_path / "out")
-    assert made.tally.left_out["images that are not in this release"] == 2 * len(da_partial.scenario)
+    assert made.tally.left_out["images that are not in this release"] == 2 * len(
+        da_partial.scenario
+    )
     found = infos(made.folder)
-    assert {info["deepaccident"]["agent"] for info in found} == set(AGENTS) - {"other_vehicle_behind"}
+    assert {info["deepaccident"]["agent"] for info in found} == set(AGENTS) - {
+        "other_vehicle_behind"
+    }
     for info in found:
         agent, first = info["deepaccident"]["agent"], info["deepaccident"]["frame"] == 1
         there = "CAM_FRONT" in info["images"], info["lidar_sweeps"] == []
@@ -154,8 +187,12 @@ def test_without_labels_there_are_no_instances_and_without_a_split_another_file(
         path.unlink()
     for path in own_release.glob("*.txt"):
         path.unlink()
-    (own_release / "train" / "type1_subtype1_accident").rename(own_release / "type1_subtype1_accident")
-    made = exported_to(DeepAccident("v1", own_release, verbose=False), tmp_path / "out", agents=("ego_vehicle",))
+    (own_release / "train" / "type1_subtype1_accident").rename(
+        own_release / "type1_subtype1_accident"
+    )
+    made = exported_to(
+        DeepAccident("v1", own_release, verbose=False), tmp_path / "out", agents=("ego_vehicle",)
+    )
     assert "deepaccident_infos_unknown.pkl" in {path.name for path in made.folder.glob("*.pkl")}
     assert [info["instances"] for info in infos(made.folder, "test")] == [[]] * 2
 
@@ -164,8 +201,16 @@ def test_a_folder_without_that_nuscenes_export_is_refused(da: DeepAccident, tmp_
     new, other, ego = tmp_path / "new", tmp_path / "other", ("ego_vehicle",)
     export_release(da, other, NuScenes(agents=ego, sweeps=False))
     assert_refused(
-        (lambda: export_release(da, new, Mmdet3d()), ExportError, "holds no complete nuscenes export"),
-        (lambda: export_release(da, other, Mmdet3d(agents=ego)), ConfigError, "export to nuscenes with other settings"),
+        (
+            lambda: export_release(da, new, Mmdet3d()),
+            ExportError,
+            "holds no complete nuscenes export",
+        ),
+        (
+            lambda: export_release(da, other, Mmdet3d(agents=ego)),
+            ConfigError,
+            "export to nuscenes with other settings",
+        ),
     )
     assert not new.exists()
 
@@ -189,6 +234,10 @@ def test_the_command_makes_the_nuscenes_export_too(da: DeepAccident, tmp_path: P
         (("--root-prefix", "./a/b"), "--root-prefix changes nothing without --style released"),
     ],
 )
-def test_options_of_the_other_style_are_refused(tmp_path: Path, words: tuple[str, ...], sentence: str) -> None:
-    run = CliRunner().invoke(export, ["mmdet3d", str(tmp_path), "--out", str(tmp_path / "out"), *words])
+def test_options_of_the_other_style_are_refused(
+    tmp_path: Path, words: tuple[str, ...], sentence: str
+) -> None:
+    run = CliRunner().invoke(
+        export, ["mmdet3d", str(tmp_path), "--out", str(tmp_path / "out"), *words]
+    )
     assert (run.exit_code, sentence in run.output) == (2, True)

@@ -9,7 +9,16 @@ from typing import Any
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from nuscenes_reader import TABLES, Tables, boxes_in, channel_of, count_points, faults_of, points_of, tables_of
+from nuscenes_reader import (
+    TABLES,
+    Tables,
+    boxes_in,
+    channel_of,
+    count_points,
+    faults_of,
+    points_of,
+    tables_of,
+)
 from pyquaternion import Quaternion
 
 from deepaccident_devkit import DeepAccident
@@ -40,7 +49,11 @@ def one(da: DeepAccident, tmp_path: Path) -> Callable[..., tuple[Exported, Table
     """Exports what the ego of the first accident recorded, with other settings."""
 
     def export(dataset: DeepAccident = da, **settings: Any) -> tuple[Exported, Tables]:
-        chosen = {"where": ("designed_accident=true", "split=train"), "agents": ("ego_vehicle",), **settings}
+        chosen = {
+            "where": ("designed_accident=true", "split=train"),
+            "agents": ("ego_vehicle",),
+            **settings,
+        }
         made = export_release(dataset, tmp_path / "out", NuScenes(**chosen), workers=1)
         return made, tables_of(made.folder / VERSION)
 
@@ -48,7 +61,11 @@ def one(da: DeepAccident, tmp_path: Path) -> Callable[..., tuple[Exported, Table
 
 
 def rows(tables: Tables, table: str, **values: Any) -> list[dict[str, Any]]:
-    return [row for row in tables[table].values() if all(row[name] == value for name, value in values.items())]
+    return [
+        row
+        for row in tables[table].values()
+        if all(row[name] == value for name, value in values.items())
+    ]
 
 
 def frame_of(tables: Tables, data: dict[str, Any]) -> tuple[str, int]:
@@ -88,21 +105,34 @@ def test_boxes_hold_the_points_that_their_rows_count(exported: Exported, tables:
 def test_boxes_are_where_ours_are_in_every_sensor(da: DeepAccident, tables: Tables) -> None:
     ours = {name: channel for channel, name in CHANNEL_NAMES.items()}
     for data in rows(tables, "sample_data", is_key_frame=True)[::13]:
-        boxes = da.boxes(tables["sample"][data["sample_token"]]["deepaccident_token"], ours[channel_of(tables, data)])
+        boxes = da.boxes(
+            tables["sample"][data["sample_token"]]["deepaccident_token"],
+            ours[channel_of(tables, data)],
+        )
         boxes = boxes[boxes.actor_id != OWN_ACTOR_ID]
         _, centers, turned = zip(*boxes_in(tables, data), strict=True)
         assert np.allclose(centers, boxes.center, atol=1e-6)
-        assert max(map(Quaternion.absolute_distance, turned, map(Quaternion, boxes.rotation))) < 1e-6
+        assert (
+            max(map(Quaternion.absolute_distance, turned, map(Quaternion, boxes.rotation))) < 1e-6
+        )
 
 
-def test_files_are_those_of_the_release(da: DeepAccident, exported: Exported, tables: Tables) -> None:
+def test_files_are_those_of_the_release(
+    da: DeepAccident, exported: Exported, tables: Tables
+) -> None:
     seen = set()
     for data in rows(tables, "sample_data"):
         scene, number = frame_of(tables, data)
         scenario, agent = scene.rsplit("-", 1)
-        sample, channel = f"{scenario.replace('-', '/', 1)}/{agent}/{number:03d}", channel_of(tables, data)
+        sample, channel = (
+            f"{scenario.replace('-', '/', 1)}/{agent}/{number:03d}",
+            channel_of(tables, data),
+        )
         path = exported.folder / data["filename"]
-        assert (path.parent.name, path.parents[1].name) == (channel, "samples" if number in KEYS else "sweeps")
+        assert (path.parent.name, path.parents[1].name) == (
+            channel,
+            "samples" if number in KEYS else "sweeps",
+        )
         seen.add(path)
         if channel != "LIDAR_TOP":
             ours = next(each for each, name in CHANNEL_NAMES.items() if name == channel)
@@ -119,10 +149,13 @@ def test_files_are_those_of_the_release(da: DeepAccident, exported: Exported, ta
 def test_sweeps_belong_to_the_keyframe_after_them(tables: Tables) -> None:
     times = {token: row["timestamp"] for token, row in tables["sample"].items()}
     waits = {
-        times[each["sample_token"]] - each["timestamp"] for each in rows(tables, "sample_data", is_key_frame=False)
+        times[each["sample_token"]] - each["timestamp"]
+        for each in rows(tables, "sample_data", is_key_frame=False)
     }
     assert waits == {100_000 * number for number in range(1, 5)}
-    assert {times[row["next"]] - times[token] for token, row in tables["sample"].items() if row["next"]} == {500_000}
+    assert {
+        times[row["next"]] - times[token] for token, row in tables["sample"].items() if row["next"]
+    } == {500_000}
 
 
 def test_scenes_and_splits(da: DeepAccident, exported: Exported, tables: Tables) -> None:
@@ -136,7 +169,9 @@ def test_scenes_and_splits(da: DeepAccident, exported: Exported, tables: Tables)
         for split in ("train", "val", "test")
     }
     assert json.loads((exported.folder / VERSION / "splits.json").read_text()) == expected
-    assert sorted(row["name"] for row in tables["scene"].values()) == sorted(chain(*expected.values()))
+    assert sorted(row["name"] for row in tables["scene"].values()) == sorted(
+        chain(*expected.values())
+    )
     for row in tables["map"].values():
         assert (exported.folder / row["filename"]).read_bytes().startswith(b"\x89PNG")
 
@@ -144,7 +179,9 @@ def test_scenes_and_splits(da: DeepAccident, exported: Exported, tables: Tables)
 def test_own_rows_are_left_out_and_untracked_ones_stand_alone(
     da: DeepAccident, exported: Exported, tables: Tables
 ) -> None:
-    actors = np.concatenate([da.boxes(row["deepaccident_token"]).actor_id for row in tables["sample"].values()])
+    actors = np.concatenate(
+        [da.boxes(row["deepaccident_token"]).actor_id for row in tables["sample"].values()]
+    )
     own, untracked = (int(np.sum(actors == kind)) for kind in (OWN_ACTOR_ID, UNTRACKED_ID))
     assert min(own, untracked) > 0
     assert len(rows(tables, "instance", actor_id=UNTRACKED_ID)) == untracked
@@ -167,10 +204,18 @@ def test_attributes_say_who_moves(da: DeepAccident, tables: Tables) -> None:
             assert word == "vehicle.parked"
         elif row["prev"] and row["category_deepaccident"] == "car":
             way = np.hypot(
-                *np.subtract(row["translation"], tables["sample_annotation"][row["prev"]]["translation"])[:2]
+                *np.subtract(
+                    row["translation"], tables["sample_annotation"][row["prev"]]["translation"]
+                )[:2]
             )
             assert way < 0.5 if word == "vehicle.stopped" else way > 0.02
-    assert seen >= {"vehicle.moving", "vehicle.stopped", "vehicle.parked", "cycle.with_rider", "pedestrian.moving"}
+    assert seen >= {
+        "vehicle.moving",
+        "vehicle.stopped",
+        "vehicle.parked",
+        "cycle.with_rider",
+        "pedestrian.moving",
+    }
 
 
 def test_an_id_that_stands_twice_in_a_label_is_two_instances(own_release: Path, one: Any) -> None:
@@ -179,7 +224,10 @@ def test_an_id_that_stands_twice_in_a_label_is_two_instances(own_release: Path, 
     tracked = next(line for line in lines[1:] if int(line.split()[10]) > 0)
     label.write_text("\n".join([*lines, tracked, ""]))
     _, tables = one(DeepAccident("v1", own_release, verbose=False))
-    assert [row["nbr_annotations"] for row in rows(tables, "instance", actor_id=int(tracked.split()[10]))] == [1, 1]
+    assert [
+        row["nbr_annotations"]
+        for row in rows(tables, "instance", actor_id=int(tracked.split()[10]))
+    ] == [1, 1]
     assert list(faults_of(tables)) == []
 
 
@@ -188,8 +236,12 @@ def test_axes_of_nuscenes(da: DeepAccident, one: Any) -> None:
     made, tables = one(lidar_axes="nuscenes", where=())
     assert disagreement(made.folder, tables) == 0
     data = rows(tables, "sample_data", is_key_frame=True, fileformat="pcd")[0]
-    x, y, z = da.load_point_cloud(tables["sample"][data["sample_token"]]["deepaccident_token"], "lidar").xyz.T
-    assert np.allclose(points_of(made.folder / data["filename"])[:, :3], np.column_stack([-y, x, z]), atol=1e-4)
+    x, y, z = da.load_point_cloud(
+        tables["sample"][data["sample_token"]]["deepaccident_token"], "lidar"
+    ).xyz.T
+    assert np.allclose(
+        points_of(made.folder / data["filename"])[:, :3], np.column_stack([-y, x, z]), atol=1e-4
+    )
 
 
 @pytest.mark.parametrize("van", ["car", "truck"])
@@ -199,7 +251,11 @@ def test_vans_become(one: Any, van: str) -> None:
         row["category_deepaccident"]: tables["category"][row["category_token"]]["name"]
         for row in tables["instance"].values()
     }
-    assert [names[ours] for ours in ("van", "car", "cyclist")] == [f"vehicle.{van}", "vehicle.car", "vehicle.bicycle"]
+    assert [names[ours] for ours in ("van", "car", "cyclist")] == [
+        f"vehicle.{van}",
+        "vehicle.car",
+        "vehicle.bicycle",
+    ]
 
 
 def test_a_partial_release(da_partial: DeepAccident, tmp_path: Path) -> None:
@@ -220,14 +276,37 @@ def test_a_partial_release(da_partial: DeepAccident, tmp_path: Path) -> None:
 def test_without_labels_there_are_sensors_and_poses(unlabelled: DeepAccident, one: Any) -> None:
     made, tables = one(unlabelled)
     assert made.tally.left_out["labels that are not in this release"] == 1
-    assert [len(tables[name]) for name in ("instance", "sample_annotation", "ego_pose", "sample")] == [0, 0, 4, 1]
+    assert [
+        len(tables[name]) for name in ("instance", "sample_annotation", "ego_pose", "sample")
+    ] == [0, 0, 4, 1]
     assert list(faults_of(tables)) == []
 
 
 def test_the_command_has_the_settings(da: DeepAccident, tmp_path: Path) -> None:
-    words = ["export", "nuscenes", str(da.dataroot), "--out", str(tmp_path / "out"), "--agents", "infrastructure"]
-    more = ["--van", "truck", "--lidar-axes", "nuscenes", "--no-sweeps", "--where", "split=val", "--workers", "1"]
-    assert "left out: " in CliRunner().invoke(deepaccident, [*words, *more], catch_exceptions=False).output
+    words = [
+        "export",
+        "nuscenes",
+        str(da.dataroot),
+        "--out",
+        str(tmp_path / "out"),
+        "--agents",
+        "infrastructure",
+    ]
+    more = [
+        "--van",
+        "truck",
+        "--lidar-axes",
+        "nuscenes",
+        "--no-sweeps",
+        "--where",
+        "split=val",
+        "--workers",
+        "1",
+    ]
+    assert (
+        "left out: "
+        in CliRunner().invoke(deepaccident, [*words, *more], catch_exceptions=False).output
+    )
     told = json.loads((tmp_path / "out" / "nuscenes.manifest.json").read_text())["settings"]
     assert [told[name] for name in ("van", "lidar_axes", "sweeps")] == ["truck", "nuscenes", False]
     assert all((tmp_path / "out" / VERSION / f"{name}.json").is_file() for name in TABLES)

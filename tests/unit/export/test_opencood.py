@@ -54,7 +54,9 @@ def disagreement(da: DeepAccident, scenario: Path) -> float:
             expected = expected_counts(da, f"{token}/{agent}/{int(timestamp):03d}")
             found = counts_of(facts, points_of(scenario, place, timestamp))
             assert found.keys() == expected.keys()
-            wrong += sum(abs(found[actor] - count) > 1 + 0.02 * count for actor, count in expected.items())
+            wrong += sum(
+                abs(found[actor] - count) > 1 + 0.02 * count for actor, count in expected.items()
+            )
             total += len(expected)
     assert total > 100
     return wrong / total
@@ -79,12 +81,17 @@ def test_every_moment_has_all_files_and_the_pole_is_the_last(scenario: Path) -> 
     assert agents_of(scenario) == list(PLACES)
     ends = (".yaml", ".json", ".pcd", *(f"_camera{number}.png" for number in range(6)))
     names = {f"{moment:06d}{end}" for moment in range(1, 7) for end in ends}
-    assert [{path.name for path in (scenario / place).iterdir()} for place in PLACES] == [names] * len(PLACES)
+    assert [{path.name for path in (scenario / place).iterdir()} for place in PLACES] == [
+        names
+    ] * len(PLACES)
 
 
 def test_json_says_the_same_with_ids_as_words(scenario: Path) -> None:
     told, again = facts_of(scenario, "1", "000003"), facts_of(scenario, "1", "000003", "json")
-    assert again == {**told, "vehicles": {str(actor): vehicle for actor, vehicle in told["vehicles"].items()}}
+    assert again == {
+        **told,
+        "vehicles": {str(actor): vehicle for actor, vehicle in told["vehicles"].items()},
+    }
 
 
 def test_cameras_are_where_their_extrinsics_say(da: DeepAccident, scenario: Path) -> None:
@@ -92,14 +99,22 @@ def test_cameras_are_where_their_extrinsics_say(da: DeepAccident, scenario: Path
     facts = facts_of(scenario, "1", "000001")
     camera = facts["camera0"]
     ahead = world_from(camera["cords"]) @ [10.0, 0, 0, 1]
-    x, y, z, _ = np.array(camera["extrinsic"]) @ np.linalg.inv(world_from(facts["lidar_pose"])) @ ahead
+    x, y, z, _ = (
+        np.array(camera["extrinsic"]) @ np.linalg.inv(world_from(facts["lidar_pose"])) @ ahead
+    )
     u, v, depth = np.array(camera["intrinsic"]) @ [y, -z, x]
     assert np.allclose([x, y, z], [10, 0, 0], atol=1e-9)
-    assert np.allclose([u / depth, v / depth], [camera["intrinsic"][0][2], camera["intrinsic"][1][2]])
+    assert np.allclose(
+        [u / depth, v / depth], [camera["intrinsic"][0][2], camera["intrinsic"][1][2]]
+    )
 
 
-def test_images_are_links_to_those_of_the_release(da: DeepAccident, scenario: Path, exported: Exported) -> None:
-    source = da.get_sample_data_path(f"{scenario.name.replace('__', '/', 1)}/ego_vehicle/002/Camera_BackRight")
+def test_images_are_links_to_those_of_the_release(
+    da: DeepAccident, scenario: Path, exported: Exported
+) -> None:
+    source = da.get_sample_data_path(
+        f"{scenario.name.replace('__', '/', 1)}/ego_vehicle/002/Camera_BackRight"
+    )
     assert (scenario / "1" / "000002_camera1.png").samefile(source)
     assert exported.tally.linked == {"hard": len(list(exported.folder.rglob("*.png")))}
 
@@ -107,9 +122,12 @@ def test_images_are_links_to_those_of_the_release(da: DeepAccident, scenario: Pa
 def test_splits_have_their_folders(da: DeepAccident, exported: Exported) -> None:
     theirs = {"train": "train", "val": "validate", "test": "test"}
     found = {
-        path.parent.relative_to(exported.folder).as_posix() for path in exported.folder.rglob("data_protocol.yaml")
+        path.parent.relative_to(exported.folder).as_posix()
+        for path in exported.folder.rglob("data_protocol.yaml")
     }
-    assert found == {f"{theirs[each['split']]}/{each['token'].replace('/', '__')}" for each in da.scenario}
+    assert found == {
+        f"{theirs[each['split']]}/{each['token'].replace('/', '__')}" for each in da.scenario
+    }
 
 
 def test_ego_can_be_another_vehicle_and_classes_more(da: DeepAccident, tmp_path: Path) -> None:
@@ -118,9 +136,13 @@ def test_ego_can_be_another_vehicle_and_classes_more(da: DeepAccident, tmp_path:
     form = OpenCood(ego="other_vehicle", classes=("pedestrian", "car"), agents=agents, where=chosen)
     (folder,) = export_release(da, tmp_path / "out", form).folder.glob("train/*")
     assert agents_of(folder) == ["1", "2"]
-    actors = {actor for sample in (1, 2) for actor in facts_of(folder, str(sample), "000006")["vehicles"]}
+    actors = {
+        actor for sample in (1, 2) for actor in facts_of(folder, str(sample), "000006")["vehicles"]
+    }
     walkers = da.boxes(f"{token}/ego_vehicle/006")
-    seen = walkers.actor_id[(np.array(walkers.category_names) == "pedestrian") & (walkers.num_lidar_pts > 0)]
+    seen = walkers.actor_id[
+        (np.array(walkers.category_names) == "pedestrian") & (walkers.num_lidar_pts > 0)
+    ]
     assert set(seen.tolist()) - {UNTRACKED_ID} <= actors
 
 
@@ -148,7 +170,9 @@ def test_all_agents_have_the_same_moments_and_each_its_cloud(
     warned: bool,
 ) -> None:
     """Of three moments of two agents in each of three scenarios; loaders take no cloud for one without points."""
-    wanted = SmallRelease(agents=("ego_vehicle", "other_vehicle"), channels=("lidar01", "Camera_Front"))
+    wanted = SmallRelease(
+        agents=("ego_vehicle", "other_vehicle"), channels=("lidar01", "Camera_Front")
+    )
     write_small_release(tmp_path / "release", wanted)
     for agent, numbers in gone.items():
         for number in numbers:
@@ -175,17 +199,28 @@ def test_all_agents_have_the_same_moments_and_each_its_cloud(
             assert timestamps_of(folder, agent) == clouds == moments
     written = len(agents) * len(moments) * len(folders)
     assert made.tally.samples == written
-    assert made.tally.left_out["samples of agents or moments without point clouds"] == whole.tally.samples - written
+    assert (
+        made.tally.left_out["samples of agents or moments without point clouds"]
+        == whole.tally.samples - written
+    )
     assert ("most of the export" in caplog.text) == warned
 
 
-def test_without_labels_there_are_poses_and_clouds(unlabelled: DeepAccident, tmp_path: Path) -> None:
-    made = export_release(unlabelled, tmp_path / "out", OpenCood(agents=("ego_vehicle",), without_clouds=True))
-    assert made.tally.left_out["labels that are not in this release"] == len(unlabelled.scenario) * 4
+def test_without_labels_there_are_poses_and_clouds(
+    unlabelled: DeepAccident, tmp_path: Path
+) -> None:
+    made = export_release(
+        unlabelled, tmp_path / "out", OpenCood(agents=("ego_vehicle",), without_clouds=True)
+    )
+    assert (
+        made.tally.left_out["labels that are not in this release"] == len(unlabelled.scenario) * 4
+    )
     (folder, *_) = made.folder.glob("*/*/1")
     facts = facts_of(folder.parent, "1", "000002")
     assert facts["vehicles"] == {}
-    before, after = (facts_of(folder.parent, "1", name)["true_ego_pos"][:2] for name in ("000001", "000003"))
+    before, after = (
+        facts_of(folder.parent, "1", name)["true_ego_pos"][:2] for name in ("000001", "000003")
+    )
     assert facts["ego_speed"] == pytest.approx(np.hypot(*np.subtract(after, before)) / 0.2 * 3.6)
 
 
@@ -194,7 +229,10 @@ DEGREES = st.floats(-179.9, 179.9)
 
 def carla_matrix(x: float, y: float, z: float, roll: float, yaw: float, pitch: float) -> np.ndarray:
     """What `carla.Transform.get_matrix` gives: metres and degrees, left-handed, as its `Transform` computes it."""
-    (cr, cy, cp), (sr, sy, sp) = np.cos(np.radians([roll, yaw, pitch])), np.sin(np.radians([roll, yaw, pitch]))
+    (cr, cy, cp), (sr, sy, sp) = (
+        np.cos(np.radians([roll, yaw, pitch])),
+        np.sin(np.radians([roll, yaw, pitch])),
+    )
     return np.array(
         [
             [cp * cy, cy * sp * sr - sy * cr, -cy * sp * cr - sy * sr, x],
@@ -205,8 +243,15 @@ def carla_matrix(x: float, y: float, z: float, roll: float, yaw: float, pitch: f
     )
 
 
-@given(roll=DEGREES, yaw=DEGREES, pitch=st.floats(-89, 89), place=st.tuples(*[st.floats(-1e3, 1e3)] * 3))
-def test_a_carla_transform_there_and_back(roll: float, yaw: float, pitch: float, place: tuple[float, ...]) -> None:
+@given(
+    roll=DEGREES,
+    yaw=DEGREES,
+    pitch=st.floats(-89, 89),
+    place=st.tuples(*[st.floats(-1e3, 1e3)] * 3),
+)
+def test_a_carla_transform_there_and_back(
+    roll: float, yaw: float, pitch: float, place: tuple[float, ...]
+) -> None:
     six = carla_six(flip_pose(carla_matrix(*place, roll, yaw, pitch)))
     assert_allclose(six, [*place, roll, yaw, pitch], rtol=0, atol=1e-9)
 

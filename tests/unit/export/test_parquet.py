@@ -23,7 +23,9 @@ RECORDED = ("agent", "sample", "sample_data", "calibrated_sensor", "ego_pose", "
 def rows_of(folder: Path, table: str, split: str = "*") -> list[dict[str, Any]]:
     """The rows of a table, in the order of its files."""
     return [
-        row for path in sorted((folder / table).glob(f"{split}-*.parquet")) for row in pq.read_table(path).to_pylist()
+        row
+        for path in sorted((folder / table).glob(f"{split}-*.parquet"))
+        for row in pq.read_table(path).to_pylist()
     ]
 
 
@@ -48,7 +50,9 @@ def assert_all_rows(dataset: DeepAccident, folder: Path) -> None:
             assert rows_of(folder, table) == [dict(record) for record in getattr(dataset, table)]
             continue
         expected = told(dataset, table)
-        assert {split: list(map(repr, rows_of(folder, table, split))) for split in expected} == expected
+        assert {
+            split: list(map(repr, rows_of(folder, table, split))) for split in expected
+        } == expected
 
 
 @pytest.mark.slow
@@ -59,7 +63,9 @@ def test_rows_are_the_records_in_shards_of_any_size(
     made = export(both_layouts, tmp_path / "out", Parquet(shard_scenarios=shard_scenarios))
     assert_all_rows(both_layouts, made.folder)
     for split, rows in told(both_layouts, "scenario").items():
-        assert len(list((made.folder / "scenario").glob(f"{split}-*"))) == -(-len(rows) // shard_scenarios)
+        assert len(list((made.folder / "scenario").glob(f"{split}-*"))) == -(
+            -len(rows) // shard_scenarios
+        )
     assert made.tally.samples == len(both_layouts.sample)
 
 
@@ -82,10 +88,14 @@ def test_only_what_the_agents_recorded(da: DeepAccident, tmp_path: Path) -> None
         assert {row["token"] for row in rows_of(made.folder, table)} == wanted
 
 
-def test_a_partial_release_has_the_rows_that_are_there(da_partial: DeepAccident, tmp_path: Path) -> None:
+def test_a_partial_release_has_the_rows_that_are_there(
+    da_partial: DeepAccident, tmp_path: Path
+) -> None:
     made = export(da_partial, tmp_path / "out")
     assert_all_rows(da_partial, made.folder)
-    assert made.tally.left_out["agents of scenarios that are not in this release"] == len(da_partial.scenario)
+    assert made.tally.left_out["agents of scenarios that are not in this release"] == len(
+        da_partial.scenario
+    )
 
 
 def test_a_table_without_rows_has_no_file(unlabelled: DeepAccident, tmp_path: Path) -> None:
@@ -94,10 +104,23 @@ def test_a_table_without_rows_has_no_file(unlabelled: DeepAccident, tmp_path: Pa
     assert_all_rows(unlabelled, folder)
     _, head, body = (folder / "README.md").read_text().split("---\n", maxsplit=2)
     named = {config["config_name"] for config in yaml.safe_load(head)["configs"]}
-    assert (named, "Here: no rows." in body) == (set(table_names()) - {"annotation", "instance", "track"}, True)
+    assert (named, "Here: no rows." in body) == (
+        set(table_names()) - {"annotation", "instance", "track"},
+        True,
+    )
 
 
 def test_on_the_command_line(da: DeepAccident, tmp_path: Path) -> None:
-    words = ["export", "parquet", str(da.dataroot), "--out", str(tmp_path / "out"), "--split", "train"]
+    words = [
+        "export",
+        "parquet",
+        str(da.dataroot),
+        "--out",
+        str(tmp_path / "out"),
+        "--split",
+        "train",
+    ]
     CliRunner().invoke(deepaccident, [*words, "--workers", "1"], catch_exceptions=False)
-    assert list(map(repr, rows_of(tmp_path / "out", "annotation"))) == told(da, "annotation")["train"]
+    assert (
+        list(map(repr, rows_of(tmp_path / "out", "annotation"))) == told(da, "annotation")["train"]
+    )

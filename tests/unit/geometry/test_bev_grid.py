@@ -36,7 +36,9 @@ def test_the_devkits_raster_is_the_released_upside_down_and_fierys_transposed() 
     devkit, raster = BevGrid((0, 3, 1), (0, 2, 1)), np.arange(12).reshape(2, 2, 3)
     assert_array_equal(devkit.reorient(raster, "released"), raster[..., ::-1, :])
     assert_array_equal(devkit.reorient(raster, "fiery"), raster.swapaxes(1, 2))
-    assert_array_equal(devkit.with_orientation("released").reorient(raster[..., ::-1, :], "devkit"), raster)
+    assert_array_equal(
+        devkit.with_orientation("released").reorient(raster[..., ::-1, :], "devkit"), raster
+    )
     fiery = devkit.with_orientation("fiery")
     assert_array_equal(fiery.reorient(raster.swapaxes(1, 2), "released"), raster[..., ::-1, :])
     assert_refused(
@@ -50,7 +52,14 @@ def test_the_devkits_raster_is_the_released_upside_down_and_fierys_transposed() 
 
 def test_a_cell_owns_its_lower_edges_and_nothing_beside_the_grid_has_one() -> None:
     grid = BevGrid((0, 1, 0.1), (-1, 1, 1))
-    points = [[0, -1, 5], [0.1, 0, 5], [1, 0, 5], [np.nextafter(1, 0), 0.999, 5], [0.5, 1, 5], [np.nan, 0, 5]]
+    points = [
+        [0, -1, 5],
+        [0.1, 0, 5],
+        [1, 0, 5],
+        [np.nextafter(1, 0), 0.999, 5],
+        [0.5, 1, 5],
+        [np.nan, 0, 5],
+    ]
     index, inside = grid.index_of(points)
     assert_array_equal(index, [[0, 0], [1, 1], [-1, -1], [1, 9], [-1, -1], [-1, -1]])
     assert_array_equal(inside, [True, True, False, True, False, False])
@@ -60,14 +69,23 @@ def test_a_cell_owns_its_lower_edges_and_nothing_beside_the_grid_has_one() -> No
     assert grid.index_of(np.zeros((0, 2)))[0].shape == (0, 2)
     assert_refused(
         *[
-            (partial(grid.index_of, wrong), GeometryError, r"points: expected shape \(N, 2\) or \(N, 3\)")
+            (
+                partial(grid.index_of, wrong),
+                GeometryError,
+                r"points: expected shape \(N, 2\) or \(N, 3\)",
+            )
             for wrong in ([1, 2], np.zeros((2, 4)), 3)
         ],
     )
 
 
 def test_equal_grids_are_one_key() -> None:
-    grids = {BevGrid(x=(-50, 50, 1)), BevGrid(x=(-50.0, 50.0, 1.0)), BevGrid(x=[-50, 50, 1]), BevGrid()}  # type: ignore[arg-type]
+    grids = {
+        BevGrid(x=(-50, 50, 1)),
+        BevGrid(x=(-50.0, 50.0, 1.0)),
+        BevGrid(x=[-50, 50, 1]),
+        BevGrid(),
+    }  # type: ignore[arg-type]
     assert len(grids) == 2
     assert BevGrid() != BevGrid(orientation="fiery")
     assert pickle.loads(pickle.dumps(BevGrid(orientation="fiery"))) == BevGrid(orientation="fiery")
@@ -104,9 +122,17 @@ def test_ranges_that_are_no_cells_are_refused(x: object, message: str) -> None:
 
 def test_an_unknown_orientation_and_what_is_no_points_are_refused() -> None:
     assert_refused(
-        (lambda: BevGrid(orientation="up"), ChoiceError, ("one of devkit, released, fiery", "'up'")),  # type: ignore[arg-type]
+        (
+            lambda: BevGrid(orientation="up"),
+            ChoiceError,
+            ("one of devkit, released, fiery", "'up'"),
+        ),  # type: ignore[arg-type]
         *[
-            (partial(BevGrid().index_of, points), GeometryError, ("points: expected points of shape (N, 2) or (N, 3)",))
+            (
+                partial(BevGrid().index_of, points),
+                GeometryError,
+                ("points: expected points of shape (N, 2) or (N, 3)",),
+            )
             for points in ("a", None, [["1", "2"]], [[1, 2], [1, 2, 3]])
         ],
     )

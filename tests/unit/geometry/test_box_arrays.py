@@ -15,7 +15,10 @@ AHEAD = [24.0, 0.0, 4.0, 2.0, 0.0]
 
 
 def seconds(first, second, first_velocity, second_velocity) -> float:
-    arrays = (np.array([each], dtype=np.float64) for each in (first, second, first_velocity, second_velocity))
+    arrays = (
+        np.array([each], dtype=np.float64)
+        for each in (first, second, first_velocity, second_velocity)
+    )
     return time_to_collision(*arrays).item()
 
 
@@ -43,12 +46,16 @@ def test_boxes_that_touch_now_have_no_time() -> None:
 
 def test_as_brute_force_has_it(pytestconfig: pytest.Config) -> None:
     golden = json.loads(
-        (Path(pytestconfig.getoption("golden")) / "safety" / "surrogates.json").read_text(encoding="utf-8")
+        (Path(pytestconfig.getoption("golden")) / "safety" / "surrogates.json").read_text(
+            encoding="utf-8"
+        )
     )
     given = {name: np.array(values) for name, values in golden["inputs"].items() if name != "kind"}
     sides = [
         (
-            np.stack([given[f"{part}_{side}"] for part in ("x", "y", "length", "width", "yaw")], axis=1),
+            np.stack(
+                [given[f"{part}_{side}"] for part in ("x", "y", "length", "width", "yaw")], axis=1
+            ),
             given[f"speed_{side}"][:, None]
             * np.stack([np.cos(given[f"yaw_{side}"]), np.sin(given[f"yaw_{side}"])], axis=1),
         )

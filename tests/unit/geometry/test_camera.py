@@ -39,7 +39,10 @@ def test_the_image_starts_at_zero_and_ends_before_its_size() -> None:
 
 
 def test_a_resized_camera_sees_the_same_parts_of_its_picture() -> None:
-    camera, points = PinholeCamera.from_field_of_view(1600, 900, 1.2), np.array([[1.0, -2.0, 9.0], [-3.0, 0.5, 20.0]])
+    camera, points = (
+        PinholeCamera.from_field_of_view(1600, 900, 1.2),
+        np.array([[1.0, -2.0, 9.0], [-3.0, 0.5, 20.0]]),
+    )
     smaller = camera.resized(400, 300)
     assert (smaller.width, smaller.height) == (400, 300)
     assert_allclose(smaller.project(points)[0] * [4, 3], camera.project(points)[0])
@@ -50,9 +53,12 @@ def test_in_image_by_depth_and_margin() -> None:
     camera = PinholeCamera.from_field_of_view(100, 50, 1.2)
     pixels = [[50, 25], [50, 25], [1, 25], [-1, 25], [98, 25], [99, 25]]
     assert_array_equal(
-        camera.in_image(pixels, [3, 1, 3, 3, 3, -3], min_depth=1), [True, False, True, False, True, False]
+        camera.in_image(pixels, [3, 1, 3, 3, 3, -3], min_depth=1),
+        [True, False, True, False, True, False],
     )
-    assert_array_equal(camera.in_image(pixels, [3, 1, 3, 3, 3, -3]), [True, True, True, False, True, False])
+    assert_array_equal(
+        camera.in_image(pixels, [3, 1, 3, 3, 3, -3]), [True, True, True, False, True, False]
+    )
     assert_array_equal(camera.in_image(pixels, margin=1), [True, True, True, False, True, False])
     assert_array_equal(camera.in_image(pixels, margin=-1), [True] * 6)
     top_and_bottom = [[50, 0.5], [50, 1], [50, 48.5], [50, 49]]
@@ -64,7 +70,15 @@ def test_in_image_by_depth_and_margin() -> None:
 def test_a_box_is_seen_whole_in_part_or_not() -> None:
     """Ahead; cut by the left edge; beside; behind; around the camera; with corners nearer than 1 m; too large."""
     camera = PinholeCamera.from_field_of_view(100, 100, np.pi / 2)
-    centers = [[0, 0, 10], [-10, 0, 10], [-30, 0, 10], [0, 0, -10], [0, 0, 0.5], [0, 0, 1.2], [0, 0, 10]]
+    centers = [
+        [0, 0, 10],
+        [-10, 0, 10],
+        [-30, 0, 10],
+        [0, 0, -10],
+        [0, 0, 0.5],
+        [0, 0, 1.2],
+        [0, 0, 10],
+    ]
     sizes = [[2, 2, 2], [2, 2, 2], [2, 2, 2], [2, 2, 2], [2, 2, 2], [1, 1, 1], [40, 40, 2]]
     boxes = Boxes.from_arrays(centers, sizes, np.zeros(7), frame="Camera_Front")
     whole, part, none = BoxVisibility.ALL, BoxVisibility.ANY, BoxVisibility.NONE
@@ -79,7 +93,10 @@ def test_all_corners_must_be_a_little_in_front() -> None:
     camera = PinholeCamera.from_field_of_view(100, 100, np.pi / 2)
     sizes = np.column_stack([np.ones((4, 2)), 3 - np.array([0.2, 0.11, 0.09, -0.05])])
     boxes = Boxes.from_arrays(
-        np.column_stack([np.zeros((4, 2)), 3 - sizes[:, 2] / 2]), sizes, [0] * 4, frame="Camera_Back"
+        np.column_stack([np.zeros((4, 2)), 3 - sizes[:, 2] / 2]),
+        sizes,
+        [0] * 4,
+        frame="Camera_Back",
     )
     assert_array_equal(camera.boxes_in_image(boxes), [True, True, False, False])
 
@@ -87,7 +104,10 @@ def test_all_corners_must_be_a_little_in_front() -> None:
 def test_boxes_must_be_in_the_cameras_frame() -> None:
     camera = PinholeCamera.from_field_of_view(100, 100, 1.2)
     box = Boxes.from_arrays([[10, 0, 0]], [[2, 2, 2]], [0], frame="lidar")
-    others = [replace(box, frame=frame) for frame in ("world", "ego", "lidar", "lidar01", "BEV_instance_camera")]
+    others = [
+        replace(box, frame=frame)
+        for frame in ("world", "ego", "lidar", "lidar01", "BEV_instance_camera")
+    ]
     assert_refused(
         *[
             (partial(call, other), GeometryError, (f"'{other.frame}'", "camera_from_source"))
@@ -104,7 +124,11 @@ def test_cameras_and_pixels_that_cannot_be() -> None:
     camera = PinholeCamera(np.eye(3), np.int64(8), np.uint16(6))
     assert (type(camera.width), camera.width, camera.height) == (int, 8, 6)
     assert_refused(
-        (lambda: PinholeCamera(np.eye(4), 10, 10), GeometryError, ("PinholeCamera.intrinsic", "(3, 3)")),
+        (
+            lambda: PinholeCamera(np.eye(4), 10, 10),
+            GeometryError,
+            ("PinholeCamera.intrinsic", "(3, 3)"),
+        ),
         (lambda: camera.project([1, 2, 3]), GeometryError, ("points", "(N, 3)")),
         (lambda: camera.in_image([[1, 2, 3]]), GeometryError, ("pixels", "(N, 2)")),
         (lambda: camera.in_image(np.zeros((6, 2)), [1.0]), GeometryError, ("depth", "(6)")),
@@ -151,7 +175,11 @@ def test_cameras_and_pixels_that_cannot_be() -> None:
 def test_levels_that_do_not_exist() -> None:
     camera = PinholeCamera.from_field_of_view(100, 100, 1.2)
     box = Boxes.from_arrays([[0, 0, 10]], [[2, 2, 2]], [0], frame="Camera_Front")
-    assert [(level.name, level.value) for level in BoxVisibility] == [("ALL", 0), ("ANY", 1), ("NONE", 2)]
+    assert [(level.name, level.value) for level in BoxVisibility] == [
+        ("ALL", 0),
+        ("ANY", 1),
+        ("NONE", 2),
+    ]
     assert camera.boxes_in_image(box, 1)  # type: ignore[arg-type]
     assert_refused(
         *[
@@ -162,7 +190,11 @@ def test_levels_that_do_not_exist() -> None:
             )
             for wrong in ("any", 3, None)
         ],
-        (lambda: camera.box_visibility(None), GeometryError, "boxes: expected Boxes, found NoneType"),
+        (
+            lambda: camera.box_visibility(None),
+            GeometryError,
+            "boxes: expected Boxes, found NoneType",
+        ),
     )
 
 

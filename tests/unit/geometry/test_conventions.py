@@ -13,8 +13,12 @@ K = [[560.166, 0, 800], [0, 560.166, 450], [0, 0, 1]]
 
 
 def test_y_changes_its_sign_and_nothing_else() -> None:
-    assert_array_equal(conventions.flip_points([-38.698, -19.789, -0.882]), [-38.698, 19.789, -0.882])
-    assert_array_equal(conventions.flip_vectors2([[0.0034441, -5.6166797]]), [[0.0034441, 5.6166797]])
+    assert_array_equal(
+        conventions.flip_points([-38.698, -19.789, -0.882]), [-38.698, 19.789, -0.882]
+    )
+    assert_array_equal(
+        conventions.flip_vectors2([[0.0034441, -5.6166797]]), [[0.0034441, 5.6166797]]
+    )
     assert_array_equal(conventions.flip_yaw([-0.000518, 2.19]), [0.000518, -2.19])
     assert_array_equal(conventions.flip_six_vector([1, 2, 3, 4, 5, 6]), [1, -2, 3, -4, 5, -6])
 
@@ -22,7 +26,8 @@ def test_y_changes_its_sign_and_nothing_else() -> None:
 def test_matrices_by_hand() -> None:
     matrix = np.arange(1.0, 17).reshape(4, 4)
     assert_array_equal(
-        conventions.flip_pose(matrix), [[1, -2, 3, 4], [-5, 6, -7, -8], [9, -10, 11, 12], [13, -14, 15, 16]]
+        conventions.flip_pose(matrix),
+        [[1, -2, 3, 4], [-5, 6, -7, -8], [9, -10, 11, 12], [13, -14, 15, 16]],
     )
 
 
@@ -68,8 +73,20 @@ def test_at_the_gimbal_the_pose_stays_although_the_angles_do_not() -> None:
 
 def test_wrong_shapes_are_refused() -> None:
     assert_refused(
-        (lambda: conventions.six_vectors_of(np.eye(3)), GeometryError, ("matrix", "(…, 4, 4)", "(3, 3)")),
-        (lambda: conventions.matrices_of_six(np.zeros(4)), GeometryError, ("six", "(…, 6)", "(4,)")),
+        (
+            lambda: conventions.six_vectors_of(np.eye(3)),
+            GeometryError,
+            ("matrix", "(…, 4, 4)", "(3, 3)"),
+        ),
+        (
+            lambda: conventions.matrices_of_six(np.zeros(4)),
+            GeometryError,
+            ("six", "(…, 6)", "(4,)"),
+        ),
         (lambda: SE3.from_six(np.zeros((1, 6))), GeometryError, ("vector: expected shape (6)",)),
-        (lambda: SE3.from_six([0, 0, np.nan, 0, 0, 0]), GeometryError, ("vector: ", "holds NaN or infinity")),
+        (
+            lambda: SE3.from_six([0, 0, np.nan, 0, 0, 0]),
+            GeometryError,
+            ("vector: ", "holds NaN or infinity"),
+        ),
     )

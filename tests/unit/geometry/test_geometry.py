@@ -35,8 +35,16 @@ WRITTEN = {
 
 def test_every_default_and_constant_written_out() -> None:
     assert written_out("deepaccident_devkit.geometry") == WRITTEN
-    nobody, pose = Boxes.from_arrays(np.zeros((0, 3)), np.zeros((0, 3)), [], frame="Camera_Front"), SE3.from_yaw(0.1)
+    nobody, pose = (
+        Boxes.from_arrays(np.zeros((0, 3)), np.zeros((0, 3)), [], frame="Camera_Front"),
+        SE3.from_yaw(0.1),
+    )
     cloud = LidarPointCloud(np.zeros((0, 3)), np.zeros(0)).transform(pose, "ego").crop(BevGrid())
     camera = PinholeCamera.from_field_of_view(10, 10, 1.0)
-    assert [len(nobody), len(cloud), len(camera.boxes_in_image(nobody)), *nobody[:0].center.flat] == [0] * 3
+    assert [
+        len(nobody),
+        len(cloud),
+        len(camera.boxes_in_image(nobody)),
+        *nobody[:0].center.flat,
+    ] == [0] * 3
     assert len(pose.to_six()) == 6

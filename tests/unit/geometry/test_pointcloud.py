@@ -24,7 +24,8 @@ def test_points_move_and_intensity_stays() -> None:
 @pytest.fixture
 def cloud() -> LidarPointCloud:
     return LidarPointCloud(
-        np.array([[0.0, 0, 0], [1, 1, 0], [1.4, 1.4, 0.4], [-3, 4, 1], [10, -2, 2]]), np.arange(5) / 10
+        np.array([[0.0, 0, 0], [1, 1, 0], [1.4, 1.4, 0.4], [-3, 4, 1], [10, -2, 2]]),
+        np.arange(5) / 10,
     )
 
 
@@ -45,7 +46,10 @@ def rows(part: LidarPointCloud) -> list[int]:
     ],
 )
 def test_crop_by_ranges_and_by_grid(
-    cloud: LidarPointCloud, grid: BevGrid | None, ranges: dict[str, tuple[float, float]], expected: list[int]
+    cloud: LidarPointCloud,
+    grid: BevGrid | None,
+    ranges: dict[str, tuple[float, float]],
+    expected: list[int],
 ) -> None:
     assert rows(cloud.crop(grid, **ranges)) == expected
 
@@ -56,7 +60,9 @@ def test_remove_close_cuts_a_circle_around_the_sensor(cloud: LidarPointCloud) ->
     assert rows(cloud.remove_close(1, sensor=(10, -2, -7))) == [0, 1, 2, 3]
     in_world = cloud.transform(SE3.from_yaw(0, (100, 0, 0)), "world")
     assert rows(in_world.remove_close(1.5, sensor=(100, 0, 2))) == [2, 3, 4]
-    assert_refused((lambda: in_world.remove_close(1.5), GeometryError, ("sensor=(x, y, z)", "frame='lidar'")))
+    assert_refused(
+        (lambda: in_world.remove_close(1.5), GeometryError, ("sensor=(x, y, z)", "frame='lidar'"))
+    )
 
 
 def test_select_picks_points(cloud: LidarPointCloud) -> None:
@@ -93,12 +99,28 @@ def test_misuse_of_clouds_says_what_to_give(cloud: LidarPointCloud) -> None:
             GeometryError,
             ("LidarPointCloud.xyz: expected shape",),
         ),
-        (lambda: LidarPointCloud(cloud.xyz, np.zeros(3)), GeometryError, ("LidarPointCloud.intensity", "(5)", "(3,)")),
-        (lambda: replace(cloud, time_lag=[0, 0]), GeometryError, ("LidarPointCloud.time_lag", "(5)", "(2,)")),
-        (lambda: cloud.crop(y=(1, 0)), GeometryError, ("y: expected a start and an end not before it", "(1, 0)")),
+        (
+            lambda: LidarPointCloud(cloud.xyz, np.zeros(3)),
+            GeometryError,
+            ("LidarPointCloud.intensity", "(5)", "(3,)"),
+        ),
+        (
+            lambda: replace(cloud, time_lag=[0, 0]),
+            GeometryError,
+            ("LidarPointCloud.time_lag", "(5)", "(2,)"),
+        ),
+        (
+            lambda: cloud.crop(y=(1, 0)),
+            GeometryError,
+            ("y: expected a start and an end not before it", "(1, 0)"),
+        ),
         (lambda: cloud.crop(z=(1, 2, 3)), GeometryError, ("z: expected shape (2)",)),
         (lambda: cloud.select([5]), GeometryError, ("does not pick from 5 points",)),
-        (lambda: concatenate_clouds([cloud], "ego"), GeometryError, ("'lidar'", "'ego'", "transform them first")),
+        (
+            lambda: concatenate_clouds([cloud], "ego"),
+            GeometryError,
+            ("'lidar'", "'ego'", "transform them first"),
+        ),
         *[
             (
                 partial(LidarPointCloud, np.zeros((1, 3)), [0], wrong),
@@ -108,7 +130,11 @@ def test_misuse_of_clouds_says_what_to_give(cloud: LidarPointCloud) -> None:
             for wrong in (7, None, "")
         ],
         *[
-            (partial(cloud.remove_close, wrong), GeometryError, "radius: expected metres from 0 on, found")
+            (
+                partial(cloud.remove_close, wrong),
+                GeometryError,
+                "radius: expected metres from 0 on, found",
+            )
             for wrong in ("near", None, [1.0], -1)
         ],
         (
@@ -116,13 +142,23 @@ def test_misuse_of_clouds_says_what_to_give(cloud: LidarPointCloud) -> None:
             GeometryError,
             r"grid: expected a BevGrid, found \(-50, 50\); ranges go by name",
         ),
-        (lambda: cloud.transform(None, "ego"), GeometryError, "target_from_source: expected an SE3, found NoneType"),
-        (lambda: cloud.transform(SE3.identity(), 5), GeometryError, "frame: expected the name of a frame"),
+        (
+            lambda: cloud.transform(None, "ego"),
+            GeometryError,
+            "target_from_source: expected an SE3, found NoneType",
+        ),
+        (
+            lambda: cloud.transform(SE3.identity(), 5),
+            GeometryError,
+            "frame: expected the name of a frame",
+        ),
     )
     assert rows(cloud.remove_close(np.float32(1.5))) == rows(cloud.remove_close(1.5))
 
 
 def test_points_at_infinity_warn_of_nothing() -> None:
-    cloud = LidarPointCloud([[np.inf, 0, 0], [1, -np.inf, 2], [np.nan, 0, 0], [5, 0, 0]], [0, 0.1, 0.2, 0.3])
+    cloud = LidarPointCloud(
+        [[np.inf, 0, 0], [1, -np.inf, 2], [np.nan, 0, 0], [5, 0, 0]], [0, 0.1, 0.2, 0.3]
+    )
     assert (rows(cloud.crop(BevGrid())), rows(cloud.remove_close(2))) == ([3], [0, 1, 3])
     assert len(cloud.transform(SE3.from_yaw(0.3), "ego")) == 4

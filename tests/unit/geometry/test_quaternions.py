@@ -21,13 +21,23 @@ def test_against_pyquaternion() -> None:
     matrices = np.array([q.rotation_matrix for q in oracles])
     assert_allclose(quaternions.to_matrix(elements), matrices, atol=1e-12)
     assert_allclose(quaternions.from_matrix(matrices), elements, atol=1e-9)
-    assert_allclose([quaternions.single_from_matrix(matrix) for matrix in matrices], elements, atol=1e-9)
-    assert_allclose(quaternions.yaw_of(elements), np.arctan2(matrices[:, 1, 0], matrices[:, 0, 0]), atol=1e-9)
+    assert_allclose(
+        [quaternions.single_from_matrix(matrix) for matrix in matrices], elements, atol=1e-9
+    )
+    assert_allclose(
+        quaternions.yaw_of(elements), np.arctan2(matrices[:, 1, 0], matrices[:, 0, 0]), atol=1e-9
+    )
     products = [(one * two).elements for one, two in zip(oracles[:100], oracles[100:], strict=True)]
     left = quaternions.left_multiplier(np.array([q.elements for q in oracles[:100]]))
-    assert_allclose((left @ np.array([q.elements for q in oracles[100:]])[:, :, None])[..., 0], products, atol=1e-12)
     assert_allclose(
-        quaternions.single_left_multiplier(matrices[0]), quaternions.left_multiplier(elements[0]), atol=1e-9
+        (left @ np.array([q.elements for q in oracles[100:]])[:, :, None])[..., 0],
+        products,
+        atol=1e-12,
+    )
+    assert_allclose(
+        quaternions.single_left_multiplier(matrices[0]),
+        quaternions.left_multiplier(elements[0]),
+        atol=1e-9,
     )
 
 
@@ -35,9 +45,14 @@ def test_against_pyquaternion() -> None:
 def test_leading_axes_are_kept(shape: tuple[int, ...]) -> None:
     yaw = np.full(shape, 0.7)
     quaternion = quaternions.from_yaw(yaw)
-    assert (quaternion.shape, quaternions.to_matrix(quaternion).shape) == ((*shape, 4), (*shape, 3, 3))
+    assert (quaternion.shape, quaternions.to_matrix(quaternion).shape) == (
+        (*shape, 4),
+        (*shape, 3, 3),
+    )
     assert quaternions.left_multiplier(quaternion).shape == (*shape, 4, 4)
-    assert_allclose(quaternions.from_matrix(quaternions.to_matrix(quaternion)), quaternion, atol=1e-12)
+    assert_allclose(
+        quaternions.from_matrix(quaternions.to_matrix(quaternion)), quaternion, atol=1e-12
+    )
     assert_allclose(quaternions.yaw_of(quaternion), yaw)
 
 

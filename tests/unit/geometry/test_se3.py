@@ -29,7 +29,9 @@ def test_constructors_agree() -> None:
     want = SE3.from_rotation(QUARTER_LEFT, (1, 2, 3)).matrix
     assert_allclose(SE3.from_quaternion(quaternion, (1, 2, 3)).matrix, want, atol=1e-15)
     assert_allclose(SE3.from_quaternion(2.5 * quaternion, (1, 2, 3)).matrix, want, atol=1e-15)
-    assert_allclose(SE3.from_quaternion([0.5**0.5, 0, 0, 0.5**0.5], (1, 2, 3)).matrix, want, atol=1e-15)
+    assert_allclose(
+        SE3.from_quaternion([0.5**0.5, 0, 0, 0.5**0.5], (1, 2, 3)).matrix, want, atol=1e-15
+    )
     assert_allclose(SE3.from_yaw(np.pi / 2, (1, 2, 3)).matrix, want, atol=1e-15)
     assert_array_equal(SE3.identity().matrix, np.eye(4))
 
@@ -37,7 +39,9 @@ def test_constructors_agree() -> None:
 def test_stored_transforms_have_the_last_row_of_every_transform() -> None:
     pose = SE3.from_yaw(0.3, (1, 2, 3)).matrix
     for kept in (12, 16):
-        assert_array_equal(stored_transforms(np.tile(pose.ravel()[:kept], (2, 5, 1))), np.tile(pose, (2, 5, 1, 1)))
+        assert_array_equal(
+            stored_transforms(np.tile(pose.ravel()[:kept], (2, 5, 1))), np.tile(pose, (2, 5, 1, 1))
+        )
 
 
 @pytest.mark.parametrize(
@@ -47,7 +51,10 @@ def test_stored_transforms_have_the_last_row_of_every_transform() -> None:
         (np.diag([1.0, np.nan, 1, 1]), "holds NaN or infinity"),
         (np.diag([1.0, -1, 1, 1]), "mirror image"),
         (np.diag([2.0, 2, 2, 1]), "not orthonormal"),
-        (np.block([[np.full((3, 3), 1e200) * [1, -1, 1], np.zeros((3, 1))], [np.eye(4)[3]]]), "not orthonormal"),
+        (
+            np.block([[np.full((3, 3), 1e200) * [1, -1, 1], np.zeros((3, 1))], [np.eye(4)[3]]]),
+            "not orthonormal",
+        ),
         (np.diag([1.0, 1, 1, 2]), "last row"),
         (np.vstack([np.eye(4)[:3], [1, 0, 0, 1]]), "last row"),
         ("no matrix", r"SE3.matrix: expected an array of shape \(4, 4\)"),
@@ -90,7 +97,10 @@ def test_boxes_a_box_and_a_cloud_are_carried_along(boxes: Boxes) -> None:
 
 def test_misuse_says_what_to_give(boxes: Boxes) -> None:
     pose = SE3.identity()
-    assert repr(SE3.from_yaw(np.float32(0.5), (1, -2, 3))) == "SE3(translation=[1.000, -2.000, 3.000], yaw=0.5000)"
+    assert (
+        repr(SE3.from_yaw(np.float32(0.5), (1, -2, 3)))
+        == "SE3(translation=[1.000, -2.000, 3.000], yaw=0.5000)"
+    )
     wrong_points = (None, "abc", object(), ["1", "2", "3"], [[1, 2], [1, 2, 3]], {})
     assert_refused(
         *[
@@ -102,16 +112,35 @@ def test_misuse_says_what_to_give(boxes: Boxes) -> None:
             for move in (pose.apply, pose.__matmul__)
             for points in wrong_points
         ],
-        *[(partial(pose.rotate, points), GeometryError, ("vectors of shape (…, 3)",)) for points in wrong_points],
+        *[
+            (partial(pose.rotate, points), GeometryError, ("vectors of shape (…, 3)",))
+            for points in wrong_points
+        ],
         *[
             (partial(pose.apply, points), GeometryError, ("points: expected shape (N, 3) or (3,)",))
             for points in (3.0, [1, 2], np.zeros((2, 4)), np.zeros((1, 2, 3)))
         ],
-        (lambda: pose.apply(np.zeros((3, 8))), GeometryError, ("points: ", "found (3, 8); transpose it (.T)")),
+        (
+            lambda: pose.apply(np.zeros((3, 8))),
+            GeometryError,
+            ("points: ", "found (3, 8); transpose it (.T)"),
+        ),
         (lambda: pose @ np.eye(4), GeometryError, ("found (4, 4); of a matrix (4, 4) make SE3",)),
-        (lambda: pose.rotate(np.zeros((3, 2))), GeometryError, ("vectors: expected shape (…, 3), found (3, 2)",)),
-        (lambda: pose.apply([1, 2, 3], frame="ego"), GeometryError, ("frame: ", "carry no name", "'ego'")),
-        (lambda: pose.apply(boxes, frame=5), GeometryError, ("frame: expected the name of a frame", "5")),
+        (
+            lambda: pose.rotate(np.zeros((3, 2))),
+            GeometryError,
+            ("vectors: expected shape (…, 3), found (3, 2)",),
+        ),
+        (
+            lambda: pose.apply([1, 2, 3], frame="ego"),
+            GeometryError,
+            ("frame: ", "carry no name", "'ego'"),
+        ),
+        (
+            lambda: pose.apply(boxes, frame=5),
+            GeometryError,
+            ("frame: expected the name of a frame", "5"),
+        ),
         *[
             (partial(SE3.from_yaw, wrong), GeometryError, ("yaw: ", "angle in radians, found"))
             for wrong in ("left", None, [0.1], np.nan)
@@ -149,15 +178,25 @@ def test_ways_there_and_back_end_where_they_began_though_poses_are_rounded(how: 
         assert_allclose((a @ a.inverse()).matrix, np.eye(4), atol=1e-9)
         points = source.uniform(-600, 600, (9, 3))
         assert_allclose(b_from_a.apply(a_from_b.apply(points)), points, atol=1e-9)
-        assert_allclose(((a.inverse() @ b) @ (b.inverse() @ c) @ (c.inverse() @ a)).apply(points), points, atol=1e-9)
+        assert_allclose(
+            ((a.inverse() @ b) @ (b.inverse() @ c) @ (c.inverse() @ a)).apply(points),
+            points,
+            atol=1e-9,
+        )
         boxes = Boxes.from_arrays(points, np.full((9, 3), 8.0), source.uniform(-3, 3, 9), frame="a")
-        assert_allclose(boxes.transform(b_from_a, "b").transform(a_from_b, "a").corners(), boxes.corners(), atol=1e-5)
+        assert_allclose(
+            boxes.transform(b_from_a, "b").transform(a_from_b, "a").corners(),
+            boxes.corners(),
+            atol=1e-5,
+        )
 
 
 def test_a_rounded_pose_keeps_its_numbers_and_has_the_nearest_rotations_quaternion() -> None:
     turn = SE3.from_six([0, 0, 0, 0.4, -0.3, 2.0]).rotation
     stretch = np.eye(3) + 1e-4 * np.array([[1, 2, -1], [2, 0, 3], [-1, 3, -2]])
-    pose = SE3.from_rotation(turn @ stretch)  # a polar decomposition: the nearest rotation is `turn`
+    pose = SE3.from_rotation(
+        turn @ stretch
+    )  # a polar decomposition: the nearest rotation is `turn`
     assert_array_equal(pose.rotation, turn @ stretch)
     assert_allclose(pose.quaternion.rotation_matrix, turn, atol=1e-7)
     assert_allclose(pose.inverse().quaternion.rotation_matrix, turn.T, atol=1e-7)

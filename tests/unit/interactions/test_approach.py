@@ -7,7 +7,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from deepaccident_devkit.interactions import gaps_of_pairs, modified_ttc, nearest_approach, time_to_collision
+from deepaccident_devkit.interactions import (
+    gaps_of_pairs,
+    modified_ttc,
+    nearest_approach,
+    time_to_collision,
+)
 
 CAR = np.array([0.0, 0.0, 4.0, 2.0, 0.0])
 AHEAD = np.array([24.0, 0.0, 4.0, 2.0, 0.0])
@@ -22,7 +27,10 @@ def seconds(first, second, *motion: float) -> float:
 def test_passing_by_the_gap_is_least_beside_the_other() -> None:
     beside = np.array([24.0, 5.0, 4.0, 2.0, 0.0])
     assert nearest_approach(CAR, beside, TEN, STILL) == (pytest.approx(3), pytest.approx(2))
-    assert nearest_approach(CAR, beside, TEN, STILL, horizon=1.0) == (pytest.approx(math.hypot(10, 3)), 1)
+    assert nearest_approach(CAR, beside, TEN, STILL, horizon=1.0) == (
+        pytest.approx(math.hypot(10, 3)),
+        1,
+    )
     assert nearest_approach(CAR, beside, -TEN, STILL) == (pytest.approx(math.hypot(20, 3)), 0)
     assert nearest_approach(CAR, AHEAD, TEN, STILL) == (0, pytest.approx(2))
     assert nearest_approach(CAR, AHEAD, TEN, STILL, horizon=1.0) == (pytest.approx(10), 1)
@@ -48,7 +56,11 @@ def test_passing_by_the_gap_is_least_beside_the_other() -> None:
     ],
 )
 def test_one_that_brakes_stops_and_stays(
-    first: np.ndarray, second: np.ndarray, speeds: tuple[float, float], rates: tuple[float, float], expected: float
+    first: np.ndarray,
+    second: np.ndarray,
+    speeds: tuple[float, float],
+    rates: tuple[float, float],
+    expected: float,
 ) -> None:
     assert seconds(first, second, *speeds, *rates) == pytest.approx(expected, nan_ok=True)
 
@@ -75,12 +87,15 @@ def test_as_steps_of_time_have_it(first, second, one, other, first_rate, second_
     touching = np.flatnonzero(gaps <= 0)
     if len(touching):
         assert found <= times[touching[0]] + 1e-9
-        assert found >= times[max(touching[0] - 1, 0)] - 1e-9 or gaps[: touching[0]].min() < 0.1  # a graze before
+        assert (
+            found >= times[max(touching[0] - 1, 0)] - 1e-9 or gaps[: touching[0]].min() < 0.1
+        )  # a graze before
     elif found < 10:
         assert gaps.min() < 0.2  # a graze shorter than a step
     if found < 10:
         there = gaps_of_pairs(
-            at(first, one, first_rate, np.array([found])), at(second, other, second_rate, np.array([found]))
+            at(first, one, first_rate, np.array([found])),
+            at(second, other, second_rate, np.array([found])),
         )
         assert there.item() <= 1e-6
 
@@ -88,18 +103,24 @@ def test_as_steps_of_time_have_it(first, second, one, other, first_rate, second_
 @given(boxes, boxes, speeds, speeds)
 def test_without_accelerations_it_is_the_time_to_collision(first, second, one, other) -> None:
     velocity = [
-        speed * np.array([math.cos(box[4]), math.sin(box[4])]) for box, speed in ((first, one), (second, other))
+        speed * np.array([math.cos(box[4]), math.sin(box[4])])
+        for box, speed in ((first, one), (second, other))
     ]
     expected = time_to_collision(first, second, *velocity)
     gap, _ = nearest_approach(first, second, *velocity, horizon=1e6)
     if not 0 < gap < 1e-6:  # neither a touch nor none
-        assert seconds(first, second, one, other, 0, 0) == pytest.approx(expected, rel=1e-6, abs=1e-6)
+        assert seconds(first, second, one, other, 0, 0) == pytest.approx(
+            expected, rel=1e-6, abs=1e-6
+        )
 
 
 @given(boxes, boxes, speeds, speeds, st.floats(0.5, 20))
-def test_the_nearest_approach_is_the_least_of_many_moments(first, second, one, other, horizon) -> None:
+def test_the_nearest_approach_is_the_least_of_many_moments(
+    first, second, one, other, horizon
+) -> None:
     velocity = [
-        speed * np.array([math.cos(box[4]), math.sin(box[4])]) for box, speed in ((first, one), (second, other))
+        speed * np.array([math.cos(box[4]), math.sin(box[4])])
+        for box, speed in ((first, one), (second, other))
     ]
     gap, time = nearest_approach(first, second, *velocity, horizon)
     times = np.append(np.linspace(0, horizon, 200), time)

@@ -12,16 +12,31 @@ from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.interactions import CLASS_MASSES, InteractionConfig, gaps_of_pairs, time_to_collision
-from deepaccident_devkit.interactions.compute import ActorMotion, Measured, actor_motion, measured_pairs, pair_summaries
+from deepaccident_devkit.interactions import (
+    CLASS_MASSES,
+    InteractionConfig,
+    gaps_of_pairs,
+    time_to_collision,
+)
+from deepaccident_devkit.interactions.compute import (
+    ActorMotion,
+    Measured,
+    actor_motion,
+    measured_pairs,
+    pair_summaries,
+)
 from deepaccident_devkit.v2x.tracks import scenario_tracks
 
 DEFAULT = InteractionConfig()
 
 
-def of_scene(paths, sizes=None, unknown=(), config=DEFAULT) -> tuple[ActorMotion, Measured, dict[str, np.ndarray]]:
+def of_scene(
+    paths, sizes=None, unknown=(), config=DEFAULT
+) -> tuple[ActorMotion, Measured, dict[str, np.ndarray]]:
     motion = actor_motion(
-        tracks_of(paths, sizes or {}, unknown), max((len(path) for path in paths.values()), default=0), config
+        tracks_of(paths, sizes or {}, unknown),
+        max((len(path) for path in paths.values()), default=0),
+        config,
     )
     measured = measured_pairs(motion, config)
     return motion, measured, pair_summaries(motion, measured, config)
@@ -42,9 +57,15 @@ def test_one_that_drives_up_to_another() -> None:
     np.testing.assert_allclose(measured.values["drac"][0], 100 / (2 * gaps))
     np.testing.assert_allclose(measured.values["closing_speed"][0], 10)
     assert (found["num_frames"].tolist(), found["moving"].tolist()) == ([11], [False])
-    assert (found["min_ttc"].item(), found["min_gap"].item()) == (pytest.approx(1.6), pytest.approx(16))
+    assert (found["min_ttc"].item(), found["min_gap"].item()) == (
+        pytest.approx(1.6),
+        pytest.approx(16),
+    )
     assert found["min_ttc_frame"].item() == found["min_gap_frame"].item() == 10
-    assert (found["max_drac"].item(), found["tet"].tolist()) == (pytest.approx(100 / 32), [[0, pytest.approx(1.1)]])
+    assert (found["max_drac"].item(), found["tet"].tolist()) == (
+        pytest.approx(100 / 32),
+        [[0, pytest.approx(1.1)]],
+    )
     assert found["tit"].item(1) == pytest.approx(0.1 * sum(3 - gap / 10 for gap in gaps))
 
 
@@ -59,16 +80,23 @@ def test_one_that_drives_up_to_another() -> None:
         (InteractionConfig(radius=26.1), [(1, 2), (1, 3)]),
     ],
 )
-def test_thresholds_decide_and_so_does_the_radius(config: InteractionConfig, expected: list[tuple[int, int]]) -> None:
+def test_thresholds_decide_and_so_does_the_radius(
+    config: InteractionConfig, expected: list[tuple[int, int]]
+) -> None:
     assert (
-        pairs_in({1: straight(5, 0, 0, 10), 2: straight(5, 30, 0, 0), 3: straight(5, 0, 5.5, 10)}, config=config)
+        pairs_in(
+            {1: straight(5, 0, 0, 10), 2: straight(5, 30, 0, 0), 3: straight(5, 0, 5.5, 10)},
+            config=config,
+        )
         == expected
     )
 
 
 def test_one_dimension_is_that_of_the_one_who_drives_up() -> None:
     for driver, turned in ((1, 2), (2, 1)):
-        _, measured, _ = of_scene({driver: straight(5, 0, 0, 10), turned: straight(5, 30, 0, 0, 90)})
+        _, measured, _ = of_scene(
+            {driver: straight(5, 0, 0, 10), turned: straight(5, 30, 0, 0, 90)}
+        )
         np.testing.assert_allclose(measured.values["ttc_1d"][0], (27 - np.arange(5)) / 10)
 
 
@@ -83,19 +111,28 @@ def test_side_by_side_there_is_a_gap_and_no_time() -> None:
 
 def test_two_that_stand_are_none_and_frames_at_which_both_stand_do_not_count() -> None:
     assert pairs_in({1: straight(4, 0, 0, 0), 2: straight(4, 3, 0, 0.4)}) == []  # one in the other
-    _, measured, found = of_scene({1: [*straight(4, 0, 0, 10), *[(3.0, 0.0, 0.0)] * 4], 2: straight(8, 9, 0, 0)})
-    assert (measured.counts[0].tolist(), found["num_frames"].tolist()) == ([True] * 4 + [False] * 4, [4])
+    _, measured, found = of_scene(
+        {1: [*straight(4, 0, 0, 10), *[(3.0, 0.0, 0.0)] * 4], 2: straight(8, 9, 0, 0)}
+    )
+    assert (measured.counts[0].tolist(), found["num_frames"].tolist()) == (
+        [True] * 4 + [False] * 4,
+        [4],
+    )
 
 
 def test_what_rides_on_another_is_no_pair_and_one_that_is_hit_is() -> None:
     sizes, ride = {2: BIKE, 3: PEDESTRIAN}, {2: straight(6, 0, 0, 6), 3: straight(6, 0.2, 0, 6)}
     assert pairs_in(ride, sizes=sizes) == []
-    assert pairs_in({**ride, 3: [*straight(3, 0.2, 0, 6), *straight(3, 1.9, 3, 0)]}, sizes=sizes) == [(2, 3)]
+    assert pairs_in(
+        {**ride, 3: [*straight(3, 0.2, 0, 6), *straight(3, 1.9, 3, 0)]}, sizes=sizes
+    ) == [(2, 3)]
     assert pairs_in({2: straight(6, 0, 0, 6), 3: straight(6, 0.2, 0, 0)}, sizes=sizes) == [(2, 3)]
 
 
 def test_who_is_not_there_and_nobody_at_all() -> None:
-    motion, measured, found = of_scene({1: straight(6, 0, 0, 10), 2: [None, None, (15.0, 0.0, 0.0), None, None, None]})
+    motion, measured, found = of_scene(
+        {1: straight(6, 0, 0, 10), 2: [None, None, (15.0, 0.0, 0.0), None, None, None]}
+    )
     assert measured.counts.sum() == found["num_frames"].item() == 1
     assert (found["min_ttc"].item(), found["min_ttc_frame"].item()) == (pytest.approx(0.9), 2)
     assert motion.acceleration[1].tolist() == [0] * 6
@@ -105,14 +142,22 @@ def test_who_is_not_there_and_nobody_at_all() -> None:
 
 
 def test_an_unknown_velocity_is_the_displacement_or_makes_no_numbers() -> None:
-    motion, measured, _ = of_scene({1: straight(5, 0, 0, 10), 2: straight(5, 30, 0, 0)}, unknown=(1,))
+    motion, measured, _ = of_scene(
+        {1: straight(5, 0, 0, 10), 2: straight(5, 30, 0, 0)}, unknown=(1,)
+    )
     np.testing.assert_allclose(motion.velocity[0], np.tile([10, 0], (5, 1)))
     np.testing.assert_allclose(measured.values["ttc"][0], (26 - np.arange(5)) / 10)
-    _, measured, found = of_scene({1: [(6.0, 0.0, 0.0), *[None] * 4], 2: straight(5, 0, 0, 5)}, unknown=(1,))
+    _, measured, found = of_scene(
+        {1: [(6.0, 0.0, 0.0), *[None] * 4], 2: straight(5, 0, 0, 5)}, unknown=(1,)
+    )
     for name in ("ttc", "ttc_1d", "drac", "mttc", "closing_speed", "delta_v"):
         assert np.isnan(measured.values[name][0, 0]).all(), name
     assert measured.values["gap"][0, 0] == pytest.approx(2)
-    assert (found["min_ttc"].item(), found["max_drac"].item(), found["min_mttc"].item()) == (math.inf, 0, math.inf)
+    assert (found["min_ttc"].item(), found["max_drac"].item(), found["min_mttc"].item()) == (
+        math.inf,
+        0,
+        math.inf,
+    )
 
 
 def test_braking_is_in_the_time_with_accelerations_alone() -> None:
@@ -125,7 +170,9 @@ def test_braking_is_in_the_time_with_accelerations_alone() -> None:
 @pytest.mark.parametrize(
     "config", [DEFAULT, InteractionConfig(max_ttc=2, max_gap=1, radius=40)], ids=["wide", "narrow"]
 )
-def test_nothing_is_left_out_and_least_is_over_all_frames(da_motion: DeepAccident, config: InteractionConfig) -> None:
+def test_nothing_is_left_out_and_least_is_over_all_frames(
+    da_motion: DeepAccident, config: InteractionConfig
+) -> None:
     """Against every pair at every frame, without circles around boxes."""
     scenario = da_motion.find(collision=True)[0]
     motion = actor_motion(scenario_tracks(da_motion, scenario), scenario["num_frames"], config)
@@ -133,7 +180,9 @@ def test_nothing_is_left_out_and_least_is_over_all_frames(da_motion: DeepAcciden
     found = pair_summaries(motion, measured, config)
     pairs = np.array(list(combinations(range(len(motion.ids)), 2)))
     first, second = pairs.T
-    ttc = time_to_collision(motion.boxes[first], motion.boxes[second], motion.velocity[first], motion.velocity[second])
+    ttc = time_to_collision(
+        motion.boxes[first], motion.boxes[second], motion.velocity[first], motion.velocity[second]
+    )
     ttc = np.where(ttc > config.horizon, np.inf, ttc)
     gap = gaps_of_pairs(motion.boxes[first], motion.boxes[second])
     apart = np.linalg.norm(motion.boxes[first, :, :2] - motion.boxes[second, :, :2], axis=-1)
@@ -143,8 +192,12 @@ def test_nothing_is_left_out_and_least_is_over_all_frames(da_motion: DeepAcciden
     assert 3 < listed.sum() < len(pairs)
     np.testing.assert_array_equal(measured.pairs, pairs[listed])
     np.testing.assert_array_equal(measured.rows, under[listed])
-    np.testing.assert_array_equal(found["min_ttc"], np.where(counts, ttc, np.inf).min(axis=1)[listed])
-    np.testing.assert_array_equal(found["min_gap"], np.where(counts, gap, np.inf).min(axis=1)[listed])
+    np.testing.assert_array_equal(
+        found["min_ttc"], np.where(counts, ttc, np.inf).min(axis=1)[listed]
+    )
+    np.testing.assert_array_equal(
+        found["min_gap"], np.where(counts, gap, np.inf).min(axis=1)[listed]
+    )
 
 
 def test_a_config_is_checked_and_travels() -> None:

@@ -7,7 +7,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from deepaccident_devkit.interactions import conflict_area_pet, gaps_of_pairs, post_encroachment_time, time_to_collision
+from deepaccident_devkit.interactions import (
+    conflict_area_pet,
+    gaps_of_pairs,
+    post_encroachment_time,
+    time_to_collision,
+)
 
 EAST = np.array([-20.0, 0.0, 4.0, 2.0, 0.0])
 NORTH = np.array([0.0, -40.0, 4.0, 2.0, math.pi / 2])
@@ -24,7 +29,9 @@ def test_one_crosses_two_seconds_after_the_other() -> None:
 
 def test_the_window_ends_what_counts() -> None:
     assert post_encroachment_time(EAST, NORTH, TEN_EAST, TEN_NORTH, window=3.6) == math.inf
-    assert post_encroachment_time(EAST, NORTH, TEN_EAST, TEN_NORTH, window=3.8) == pytest.approx(1.4)
+    assert post_encroachment_time(EAST, NORTH, TEN_EAST, TEN_NORTH, window=3.8) == pytest.approx(
+        1.4
+    )
     assert math.isnan(conflict_area_pet(EAST, NORTH, TEN_EAST, TEN_NORTH, window=3.6))
 
 
@@ -40,7 +47,9 @@ def test_who_stands_is_always_there() -> None:
 
 
 def test_one_behind_the_other_follows_at_its_headway() -> None:
-    assert post_encroachment_time(EAST, np.array([-40.0, 0.0, 4.0, 2.0, 0.0]), TEN_EAST, TEN_EAST) == pytest.approx(1.6)
+    assert post_encroachment_time(
+        EAST, np.array([-40.0, 0.0, 4.0, 2.0, 0.0]), TEN_EAST, TEN_EAST
+    ) == pytest.approx(1.6)
 
 
 places = st.floats(-25, 25)
@@ -61,7 +70,9 @@ def test_as_a_grid_of_times_has_it(first, second, one, other) -> None:
     delays, touching = np.abs(times[None, :] - times[:, None]), gaps <= 0
     if touching.any():
         assert abs(found) <= delays[touching].min() + 1e-9
-    slack = gaps <= 0.05 * (np.hypot(*one) + np.hypot(*other)) + 1e-9  # what may touch between the grid's times
+    slack = (
+        gaps <= 0.05 * (np.hypot(*one) + np.hypot(*other)) + 1e-9
+    )  # what may touch between the grid's times
     assert abs(found) >= (delays[slack].min() - 0.1 if slack.any() else np.inf) - 1e-9
 
 

@@ -37,7 +37,9 @@ def test_behind_another_the_gap_counts_at_the_closing_speed() -> None:
     assert time_to_collision_1d(CAR, AHEAD, TEN, FIVE) == pytest.approx(4)
     assert drac_1d(CAR, AHEAD, TEN, FIVE) == pytest.approx(25 / 40)
     assert drac(CAR, AHEAD, TEN, FIVE) == pytest.approx(5 / 8)
-    assert closing_speed(CAR, AHEAD, TEN, FIVE) == closing_speed_of_boxes(CAR, AHEAD, TEN, FIVE) == 5
+    assert (
+        closing_speed(CAR, AHEAD, TEN, FIVE) == closing_speed_of_boxes(CAR, AHEAD, TEN, FIVE) == 5
+    )
     assert relative_speed(TEN, NORTH) == pytest.approx(math.sqrt(200))
 
 
@@ -50,13 +52,21 @@ def test_one_dimension_sees_no_crossing_and_nobody_beside() -> None:
     assert time_to_collision(CAR, CROSSING, TEN, NORTH) == pytest.approx(1)
     assert time_to_collision_1d(CAR, CROSSING, TEN, NORTH) == math.inf
     assert time_to_collision_1d(CAR, BESIDE, TEN, STILL) == math.inf
-    assert drac_1d(CAR, BESIDE, TEN, STILL) == drac_1d(CAR, AHEAD, FIVE, TEN) == drac(CAR, BESIDE, TEN, STILL) == 0
+    assert (
+        drac_1d(CAR, BESIDE, TEN, STILL)
+        == drac_1d(CAR, AHEAD, FIVE, TEN)
+        == drac(CAR, BESIDE, TEN, STILL)
+        == 0
+    )
     assert modified_ttc_1d(CAR, BESIDE, TEN, STILL, np.float64(1), np.float64(0)) == math.inf
 
 
 def test_at_contact_there_is_no_time_and_no_brake_is_enough() -> None:
     touching = np.array([3.0, 0.5, 4.0, 2.0, 0.2])
-    assert (time_to_collision_1d(CAR, touching, TEN, STILL), time_to_collision_1d(CAR, touching, STILL, TEN)) == (0, 0)
+    assert (
+        time_to_collision_1d(CAR, touching, TEN, STILL),
+        time_to_collision_1d(CAR, touching, STILL, TEN),
+    ) == (0, 0)
     assert drac_1d(CAR, touching, TEN, STILL) == drac(CAR, touching, STILL, STILL) == math.inf
     assert modified_ttc_1d(CAR, touching, TEN, STILL, np.float64(0), np.float64(0)) == 0
     assert math.isnan(closing_speed_of_boxes(CAR, touching, TEN, STILL))
@@ -67,7 +77,9 @@ def test_accelerations_along_one_line() -> None:
     brakes = modified_ttc_1d(CAR, AHEAD, TEN, TEN, np.float64(0), np.float64(-2.5))
     assert brakes == pytest.approx(4)  # 20 m = 2.5 t² / 2
     assert modified_ttc_1d(CAR, AHEAD, TEN, FIVE, np.float64(-10), np.float64(0)) == math.inf
-    assert modified_ttc_1d(CAR, AHEAD, TEN, FIVE, np.float64(1e-14), np.float64(0)) == pytest.approx(4)
+    assert modified_ttc_1d(
+        CAR, AHEAD, TEN, FIVE, np.float64(1e-14), np.float64(0)
+    ) == pytest.approx(4)
     # who brakes behind reverses in this definition, and the one ahead backs into it
     assert modified_ttc_1d(AHEAD, CAR, TEN, FIVE, np.float64(-10), np.float64(0)) == pytest.approx(
         (5 + math.sqrt(25 + 400)) / 10
@@ -83,7 +95,9 @@ def test_what_a_collision_would_do() -> None:
     assert impact_direction(CROSSING, TEN, STILL) == pytest.approx(-math.pi / 2)
     assert math.isnan(impact_direction(CAR, TEN, TEN))
     backwards = np.array([0.0, 0.0, 4.0, 2.0, math.pi])
-    assert impact_heading(CAR, backwards) == impact_heading(backwards, CAR) == pytest.approx(math.pi)
+    assert (
+        impact_heading(CAR, backwards) == impact_heading(backwards, CAR) == pytest.approx(math.pi)
+    )
 
 
 def test_time_below_a_threshold() -> None:
@@ -94,13 +108,22 @@ def test_time_below_a_threshold() -> None:
 
 
 def test_an_unknown_velocity_makes_no_number() -> None:
-    for measure in (time_to_collision, time_to_collision_1d, drac, drac_1d, closing_speed, closing_speed_of_boxes):
+    for measure in (
+        time_to_collision,
+        time_to_collision_1d,
+        drac,
+        drac_1d,
+        closing_speed,
+        closing_speed_of_boxes,
+    ):
         for velocities in ((UNKNOWN, TEN), (TEN, UNKNOWN)):
             assert math.isnan(measure(CAR, AHEAD, *velocities)), measure.__name__
 
 
 positions = st.floats(-40, 40)
-boxes = st.tuples(positions, positions, st.floats(0.3, 12), st.floats(0.3, 3), st.floats(-7, 7)).map(np.array)
+boxes = st.tuples(
+    positions, positions, st.floats(0.3, 12), st.floats(0.3, 3), st.floats(-7, 7)
+).map(np.array)
 velocities = st.tuples(st.floats(-15, 15), st.floats(-15, 15)).map(np.array)
 
 
@@ -111,13 +134,15 @@ def test_pairs_are_symmetric(first, second, first_velocity, second_velocity) -> 
     for measure in (time_to_collision, closing_speed, drac):
         assert measure(*there) == pytest.approx(measure(*back), rel=1e-6, abs=1e-9, nan_ok=True)
     assert gaps_of_pairs(first, second) == pytest.approx(gaps_of_pairs(second, first), abs=1e-9)
-    assert impact_heading(first, second) == pytest.approx(-impact_heading(second, first), abs=1e-9) or abs(
-        impact_heading(first, second)
-    ) == pytest.approx(math.pi)
+    assert impact_heading(first, second) == pytest.approx(
+        -impact_heading(second, first), abs=1e-9
+    ) or abs(impact_heading(first, second)) == pytest.approx(math.pi)
 
 
 @given(boxes, boxes, velocities, velocities)
-def test_the_gap_shrinks_at_the_boxes_closing_speed(first, second, first_velocity, second_velocity) -> None:
+def test_the_gap_shrinks_at_the_boxes_closing_speed(
+    first, second, first_velocity, second_velocity
+) -> None:
     speed = closing_speed_of_boxes(first, second, first_velocity, second_velocity)
     gap = gaps_of_pairs(first, second)
     if np.isnan(speed):

@@ -13,7 +13,9 @@ from deepaccident_devkit.interactions.encroachment import pieces_of, recorded_pe
 
 
 def track(path, size=(4.0, 2.0)) -> np.ndarray:
-    return np.array([(np.nan,) * 5 if place is None else (*place[:2], *size, place[2]) for place in path])
+    return np.array(
+        [(np.nan,) * 5 if place is None else (*place[:2], *size, place[2]) for place in path]
+    )
 
 
 def pet(first, second) -> float:
@@ -41,12 +43,16 @@ def test_a_stop_on_the_way_is_a_piece_of_its_own() -> None:
     np.testing.assert_allclose(pieces.velocity[:, 0], [10] * 10 + [0] + [10] * 10)
     np.testing.assert_allclose(pieces.spans[10], [1, 3])
     assert pet(path, straight(41, -20, 0, 10)) == 0
-    assert pet(path, straight(26, -30, 0, 10)) == pytest.approx(1.6)  # until 2.5 s it is behind the one that stands
+    assert pet(path, straight(26, -30, 0, 10)) == pytest.approx(
+        1.6
+    )  # until 2.5 s it is behind the one that stands
 
 
 def test_gaps_are_bridged_and_one_frame_is_enough() -> None:
     east, north = straight(60, -20, 0, 10), straight(60, 0, -40, 10, 90)
-    assert pet([place if frame % 5 == 0 else None for frame, place in enumerate(east)], north) == pytest.approx(1.4)
+    assert pet(
+        [place if frame % 5 == 0 else None for frame, place in enumerate(east)], north
+    ) == pytest.approx(1.4)
     once = [None] * 20 + [(0.0, 0.0, 0.0)] + [None] * 39
     assert (pet(once, north), pet(once, once)) == (pytest.approx(3.7 - 2.0), 0)
     assert pet(once, straight(60, 0, 9, 10)) == math.inf

@@ -12,7 +12,12 @@ from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, TokenError
-from deepaccident_devkit.interactions import InteractionConfig, Interactions, interactions_of, scenario
+from deepaccident_devkit.interactions import (
+    InteractionConfig,
+    Interactions,
+    interactions_of,
+    scenario,
+)
 from deepaccident_devkit.interactions.table import interaction_specs
 from deepaccident_devkit.tables import clear_index
 from deepaccident_devkit.testing import SmallRelease, write_small_release
@@ -65,7 +70,9 @@ def test_it_is_computed_once_and_kept(own: DeepAccident, computed: list[str]) ->
 
 FAULTS: dict[str, Callable[[Path, bytes], object]] = {
     "cut": lambda path, content: path.write_bytes(content[:-20]),
-    "changed": lambda path, content: path.write_bytes(content[:400] + bytes([content[400] ^ 1]) + content[401:]),
+    "changed": lambda path, content: path.write_bytes(
+        content[:400] + bytes([content[400] ^ 1]) + content[401:]
+    ),
     "empty": lambda path, _: path.write_bytes(b""),
     "foreign": lambda path, _: shutil.copyfile(next(path.parents[4].glob("kept/*/*")), path),
     "older": lambda path, content: path.write_bytes(content),
@@ -105,12 +112,19 @@ def test_it_goes_with_the_tables_and_with_the_index(own_release: Path, own: Deep
 def test_many_at_once_are_as_one_by_one(own: DeepAccident, computed: list[str]) -> None:
     tokens = [each["token"] for each in own.scenario]
     assert_refused(
-        (lambda: next(iter(interactions_of(own, workers=0))), ChoiceError, "workers: expected a number of at least 1"),
+        (
+            lambda: next(iter(interactions_of(own, workers=0))),
+            ChoiceError,
+            "workers: expected a number of at least 1",
+        ),
         (lambda: interactions_of(own, ["x/y"]), TokenError, "has no token 'x/y'"),
     )
     assert [each.scenario for each in list(interactions_of(own))] == tokens == computed
     shutil.rmtree(own.tables_folder / scenario.FOLDER)
-    assert [each.config.max_ttc for each in list(interactions_of(own, tokens[:2], InteractionConfig(max_ttc=1)))] == [
+    assert [
+        each.config.max_ttc
+        for each in list(interactions_of(own, tokens[:2], InteractionConfig(max_ttc=1)))
+    ] == [
         1,
         1,
     ]
@@ -119,7 +133,10 @@ def test_many_at_once_are_as_one_by_one(own: DeepAccident, computed: list[str]) 
 
 def test_tables_are_as_their_schema_says(da_motion: DeepAccident) -> None:
     found = da_motion.interactions(da_motion.find(collision=True)[0])
-    for name, table in (("interaction", found.to_arrow()), ("interaction_pair", found.pairs.to_arrow())):
+    for name, table in (
+        ("interaction", found.to_arrow()),
+        ("interaction_pair", found.pairs.to_arrow()),
+    ):
         schema = json.loads((SCHEMA / f"{name}.json").read_text(encoding="utf-8"))
         jsonschema.Draft202012Validator.check_schema(schema)
         validator, records = jsonschema.Draft202012Validator(schema), table.to_pylist()
@@ -127,9 +144,14 @@ def test_tables_are_as_their_schema_says(da_motion: DeepAccident) -> None:
         for record in records[:: max(1, len(records) // 20)]:
             validator.validate(record)
             assert (
-                list(record) == list(schema["properties"]) == [each.field for each in interaction_specs()[name].columns]
+                list(record)
+                == list(schema["properties"])
+                == [each.field for each in interaction_specs()[name].columns]
             )
-    ids = [da_motion.get("instance", token)["actor_id"] for token in found.pairs.to_arrow()["first_token"].to_pylist()]
+    ids = [
+        da_motion.get("instance", token)["actor_id"]
+        for token in found.pairs.to_arrow()["first_token"].to_pylist()
+    ]
     assert ids == found.pairs.actor_ids[:, 0].tolist()
 
 

@@ -21,7 +21,10 @@ from deepaccident_devkit.taxonomy import CAMERAS, LIDAR
 def copied(release_root: Path, root: Path) -> Path:
     """A copy of the release with labels, calib, meta and BEV cameras."""
     shutil.copytree(
-        release_root, root, copy_function=os.link, ignore=shutil.ignore_patterns(".deepaccident", *CAMERAS, LIDAR)
+        release_root,
+        root,
+        copy_function=os.link,
+        ignore=shutil.ignore_patterns(".deepaccident", *CAMERAS, LIDAR),
     )
     return root
 
@@ -57,7 +60,9 @@ def mapped(bev_release: DeepAccident, town: str) -> TownMap:
 @pytest.fixture(scope="session")
 def world(bev_release: DeepAccident) -> World:
     """The generator's world of that town."""
-    config = SynthConfig(scenarios=4, frames=6, image_size=(64, 36), seed=3, unplanned=0, exact=True, designed=True)
+    config = SynthConfig(
+        scenarios=4, frames=6, image_size=(64, 36), seed=3, unplanned=0, exact=True, designed=True
+    )
     plan = plan_scenarios(config)[0]
     assert plan.token == bev_release.scenario[0]["token"]
     return build_scenario(config, plan).world
@@ -69,6 +74,8 @@ def true_codes(world: World) -> Callable[[FloatArray], FloatArray]:
     turned = world.world_from_ground.matrix[:2, :2]
 
     def at(xy: FloatArray) -> FloatArray:
-        return world.ground.at((xy - world.world_from_ground.translation[:2]) @ np.linalg.inv(turned).T)
+        return world.ground.at(
+            (xy - world.world_from_ground.translation[:2]) @ np.linalg.inv(turned).T
+        )
 
     return at

@@ -28,18 +28,30 @@ from deepaccident_devkit.taxonomy import AGENTS, BEV_CAMERA
 def checkered(side: int) -> ByteArray:
     """Squares of road and sidewalk, larger than cells."""
     index = np.arange(1200) // side
-    return np.where((index[:, None] + index[None, :]) % 2 == 0, TAGS["road"], TAGS["sidewalk"]).astype(np.uint8)
+    return np.where(
+        (index[:, None] + index[None, :]) % 2 == 0, TAGS["road"], TAGS["sidewalk"]
+    ).astype(np.uint8)
 
 
-@given(st.floats(-300, 300), st.floats(-300, 300), st.floats(-4, 4), st.floats(-0.15, 0.15), st.integers(0, 10**6))
-def test_a_point_of_the_picture_is_at_its_place_in_the_world(x: float, y: float, yaw: float, tilt: float, seed: int):
+@given(
+    st.floats(-300, 300),
+    st.floats(-300, 300),
+    st.floats(-4, 4),
+    st.floats(-0.15, 0.15),
+    st.integers(0, 10**6),
+)
+def test_a_point_of_the_picture_is_at_its_place_in_the_world(
+    x: float, y: float, yaw: float, tilt: float, seed: int
+):
     pitch = SE3.from_quaternion((np.cos(tilt / 2), 0, np.sin(tilt / 2), 0))
     world_from_ego = SE3.from_yaw(yaw, (x, y, 1.0)) @ pitch
     tags, resolution = checkered(40), 0.25
     (first_row, first_column), codes = codes_in_world(tags, world_from_ego.matrix, resolution)
     points = np.random.default_rng(seed).uniform(-59, 59, (200, 2))
     row, column = np.rint(599.5 - points.T / 0.1).astype(int)
-    away = np.minimum(*(np.abs((each + 20) % 40 - 20 + 0.5) for each in (row, column))) > 4  # of a square's edge
+    away = (
+        np.minimum(*(np.abs((each + 20) % 40 - 20 + 0.5) for each in (row, column))) > 4
+    )  # of a square's edge
     placed = world_from_ego.apply(np.column_stack([points, np.zeros(len(points))]))[:, :2]
     cell_column, cell_row = np.floor(placed / resolution).astype(int).T
     found = codes[cell_row - first_row, cell_column - first_column]
@@ -66,7 +78,10 @@ def test_what_moves_and_what_has_no_tag_says_nothing_of_the_ground() -> None:
         tags[row : row + 100] = TAGS[name]
     tags[1100:] = 0
     (first_row, first_column), codes = codes_in_world(tags, np.eye(4), 0.5)
-    seen = {name: codes[-first_row, int((599.5 - row - 50) * 0.1 / 0.5) - first_column] for name, row in rows.items()}
+    seen = {
+        name: codes[-first_row, int((599.5 - row - 50) * 0.1 / 0.5) - first_column]
+        for name, row in rows.items()
+    }
     assert seen == {"pedestrian": 0, "vehicle": 0, "road_line": 2, "road": 1, "sidewalk": 3}
     assert codes[-first_row, int(-55 / 0.5) - first_column] == 0
     assert codes[-first_row, int(55 / 0.5) - first_column] == 1 + GROUND_CLASSES.index("other")
@@ -75,7 +90,9 @@ def test_what_moves_and_what_has_no_tag_says_nothing_of_the_ground() -> None:
 @pytest.mark.parametrize("resolution", [0.1, 0.25, 0.7])
 def test_the_cells_around_hold_every_picture(resolution: float) -> None:
     rng = np.random.default_rng(5)
-    poses = np.stack([SE3.from_yaw(yaw, (*rng.uniform(-90, 90, 2), 0)).matrix for yaw in rng.uniform(-4, 4, 6)])
+    poses = np.stack(
+        [SE3.from_yaw(yaw, (*rng.uniform(-90, 90, 2), 0)).matrix for yaw in rng.uniform(-4, 4, 6)]
+    )
     low, high = cells_around(poses, resolution)
     parts = [cells_around(pose[None], resolution) for pose in poses]
     np.testing.assert_array_equal(low, np.min([part[0] for part in parts], axis=0))
@@ -95,7 +112,9 @@ def test_what_is_no_setting() -> None:
         ("period", float("inf"), ("above 0", "found inf")),
         ("travel", "far", ("a number", "found 'far'")),
     ):
-        assert_refused((partial(TownMapConfig, **{name: value}), ConfigError, (f"{name}: expected", *told)))
+        assert_refused(
+            (partial(TownMapConfig, **{name: value}), ConfigError, (f"{name}: expected", *told))
+        )
 
 
 @pytest.fixture
@@ -108,7 +127,11 @@ def street() -> np.ndarray:
 
 def test_a_hole_is_what_lies_around_it(street: np.ndarray) -> None:
     street[3:7, 24:31] = 2  # road lines are taken for road
-    for hole in ((slice(4, 6), slice(10, 15)), (slice(4, 6), slice(25, 30)), (slice(22, 24), slice(10, 15))):
+    for hole in (
+        (slice(4, 6), slice(10, 15)),
+        (slice(4, 6), slice(25, 30)),
+        (slice(22, 24), slice(10, 15)),
+    ):
         street[hole] = 0
     expected = np.zeros_like(street)
     expected[4:6, 10:15] = expected[4:6, 25:30] = 1

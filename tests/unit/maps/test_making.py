@@ -34,24 +34,43 @@ def overlap(first: BoolArray, second: BoolArray) -> float:
 
 
 def same(first: TownMap, second: TownMap) -> bool:
-    names = ("town", "resolution", "scenarios", "looks", "missing", "damaged", "origin", "counts", "agents", "hidden")
+    names = (
+        "town",
+        "resolution",
+        "scenarios",
+        "looks",
+        "missing",
+        "damaged",
+        "origin",
+        "counts",
+        "agents",
+        "hidden",
+    )
     return all(np.array_equal(getattr(first, name), getattr(second, name)) for name in names)
 
 
 def bev_files(da: DeepAccident, town: str, *agents: str) -> list[Path]:
     samples = product(da.field2token("scenario", "town", town), agents, (1, 6))
-    return [da.get_sample_data_path(f"{token}/{agent}/{frame:03d}/{BEV_CAMERA}") for token, agent, frame in samples]
+    return [
+        da.get_sample_data_path(f"{token}/{agent}/{frame:03d}/{BEV_CAMERA}")
+        for token, agent, frame in samples
+    ]
 
 
 def test_where_three_agents_looked_the_map_is_the_generators_ground(
     mapped: TownMap, true_codes: Callable[[FloatArray], FloatArray]
 ) -> None:
     """The bound of the issue is 0.9; a cell at an edge may go either way. Of a map a cell off less agrees."""
-    here, beside = (true_codes(middles(mapped) + off).reshape(mapped.shape) for off in (0.0, mapped.resolution))
+    here, beside = (
+        true_codes(middles(mapped) + off).reshape(mapped.shape) for off in (0.0, mapped.resolution)
+    )
     looked = mapped.agents >= 3
     assert looked.sum() * mapped.resolution**2 > 10_000
     assert overlap(mapped.area("sidewalk") & looked, (here == SIDEWALK) & looked) > 0.95
-    right, wrong = (overlap(mapped.drivable() & looked, np.isin(each, ROAD_CODES) & looked) for each in (here, beside))
+    right, wrong = (
+        overlap(mapped.drivable() & looked, np.isin(each, ROAD_CODES) & looked)
+        for each in (here, beside)
+    )
     assert right > 0.99
     assert right > wrong + 0.01
 
@@ -64,7 +83,9 @@ def test_actors_leave_no_holes(
 ) -> None:
     token = bev_release.field2token("scenario", "town", town)[0]
     pole = bev_release.world_from(f"{token}/infrastructure/001", "ego").translation[:2]
-    places = np.concatenate([bev_release.boxes(f"{token}/{agent}/001").center[:, :2] for agent in AGENTS])
+    places = np.concatenate(
+        [bev_release.boxes(f"{token}/{agent}/001").center[:, :2] for agent in AGENTS]
+    )
     near = places[np.hypot(*(places - pole).T) < 45]
     on_road = near[np.isin(true_codes(near), ROAD_CODES)]
     assert len(on_road) > 10
@@ -89,7 +110,9 @@ def test_each_picture_counts_once_and_each_agent_of_a_scenario_once(mapped: Town
 def test_neither_the_order_of_scenarios_nor_the_executor_changes_anything(
     bev_release: DeepAccident, town: str, mapped: TownMap, workers: int | None
 ) -> None:
-    before = {path: path.read_bytes() for path in bev_release.tables_folder.glob("town_maps/kept/*")}
+    before = {
+        path: path.read_bytes() for path in bev_release.tables_folder.glob("town_maps/kept/*")
+    }
     for path in before:
         path.unlink()
     tokens = [*reversed(bev_release.field2token("scenario", "town", town))]
@@ -144,14 +167,20 @@ def test_towns_and_scenarios_that_are_none(bev_release: DeepAccident, town: str)
         return lambda: town_map(bev_release, town, scenarios=scenarios)
 
     assert_refused(
-        (lambda: town_map(bev_release, "Town99"), ChoiceError, ("town: expected one of", town, "'Town99'")),
+        (
+            lambda: town_map(bev_release, "Town99"),
+            ChoiceError,
+            ("town: expected one of", town, "'Town99'"),
+        ),
         (some(["x"]), TokenError, ("'x'",)),
         (some("x"), TokenError, ("'x'",)),  # a single one counts as a list
         (some([elsewhere]), NotAvailableError, ("none of the 1 scenarios given", town)),
     )
 
 
-def test_a_damaged_kept_map_is_made_again(own_bev_release: DeepAccident, town: str, mapped: TownMap) -> None:
+def test_a_damaged_kept_map_is_made_again(
+    own_bev_release: DeepAccident, town: str, mapped: TownMap
+) -> None:
     town_map(own_bev_release, town, workers=1)
     (place,) = own_bev_release.tables_folder.glob("town_maps/kept/*")
     for damage in (b"", b"PK", place.read_bytes()[:-1]):

@@ -59,7 +59,14 @@ def test_drivable_needs_more_than_half_and_as_many_looks_as_asked_for() -> None:
 
 
 def test_classes_at_points() -> None:
-    points = [[10.0, -20.0], [10.49, -19.51], [10.5, -20.0], [11.99, -18.51], [10.6, -18.9], [11.99, -19.99]]
+    points = [
+        [10.0, -20.0],
+        [10.49, -19.51],
+        [10.5, -20.0],
+        [11.99, -18.51],
+        [10.6, -18.9],
+        [11.99, -19.99],
+    ]
     outside = [[9.99, -20], [12.0, -20], [10, -20.01], [10, -18.5], [np.nan, 0]]
     assert tiny().classes_at(points + outside).tolist() == [1, 1, 2, 0, 1, 4] + [0] * 5
 
@@ -76,13 +83,19 @@ def test_a_part_has_the_cells_of_its_place() -> None:
 
 def test_what_does_not_fit_is_refused() -> None:
     assert_refused(
-        (lambda: tiny().polygons("grass"), ChoiceError, ("of", "drivable, road_line, sidewalk", "'grass'")),  # type: ignore[arg-type]
+        (
+            lambda: tiny().polygons("grass"),
+            ChoiceError,
+            ("of", "drivable, road_line, sidewalk", "'grass'"),
+        ),  # type: ignore[arg-type]
         (lambda: tiny().classes_at([1.0, 2.0]), GeometryError, ("points", "shape")),
     )
 
 
 ORIGIN = np.array([-12.5, 7.25])
-masks = st.tuples(st.integers(1, 12), st.integers(1, 12)).flatmap(lambda shape: arrays(np.bool_, shape))
+masks = st.tuples(st.integers(1, 12), st.integers(1, 12)).flatmap(
+    lambda shape: arrays(np.bool_, shape)
+)
 
 
 @given(masks)
@@ -96,7 +109,10 @@ def test_an_outline_holds_its_cells_and_no_others(mask: np.ndarray) -> None:
     assert simplified_polygons(polygons, 0, 0).equals_exact(polygons, 0)
     for each in (polygons, simplified_polygons(polygons, 0.25, 0.0625)):
         assert each.is_valid
-        rings = [(part.exterior.is_ccw, any(ring.is_ccw for ring in part.interiors)) for part in each.geoms]
+        rings = [
+            (part.exterior.is_ccw, any(ring.is_ccw for ring in part.interiors))
+            for part in each.geoms
+        ]
         assert rings == [(True, False)] * len(rings)
 
 
@@ -104,7 +120,9 @@ def test_small_islands_and_holes_go() -> None:
     mask = np.zeros((40, 40), np.bool_)
     mask[2:30, 2:30] = mask[35:37, 35:37] = True
     mask[5:7, 5:7] = mask[10:16, 10:16] = False  # 0.25 m² and 2.25 m²
-    kept, everything = (simplified_polygons(outlines(mask, ORIGIN, 0.25), 0, least) for least in (1.0, 0.25))
+    kept, everything = (
+        simplified_polygons(outlines(mask, ORIGIN, 0.25), 0, least) for least in (1.0, 0.25)
+    )
     (part,) = kept.geoms
     assert [shapely.Polygon(ring).area for ring in part.interiors] == [2.25]
     assert (len(everything.geoms), len(everything.geoms[0].interiors)) == (2, 2)
@@ -120,7 +138,9 @@ def test_steps_of_a_slanting_edge_become_a_line() -> None:
 
 def test_the_polygons_of_a_map_are_its_raster(mapped: TownMap) -> None:
     rows, columns = np.indices(mapped.shape)[:, ::7, ::7]
-    x, y = (mapped.origin[:, None, None] + (np.stack([columns, rows]) + 0.5) * mapped.resolution).astype(float)
+    x, y = (
+        mapped.origin[:, None, None] + (np.stack([columns, rows]) + 0.5) * mapped.resolution
+    ).astype(float)
     for area in ("drivable", "sidewalk", "road_line"):
         cells, exact = mapped.area(area), mapped.polygons(area, tolerance=0, least_area=0)
         assert exact.area == pytest.approx(cells.sum() * mapped.resolution**2)
@@ -133,9 +153,13 @@ def test_the_polygons_of_a_map_are_its_raster(mapped: TownMap) -> None:
 def test_geojson_is_read_back_as_the_same_polygons(mapped: TownMap, tmp_path: Path) -> None:
     path = mapped.to_geojson(tmp_path / "deep" / "town.geojson")
     told = json.loads(path.read_text(encoding="utf-8"))
-    properties = {(each["properties"]["town"], each["properties"]["area"]) for each in told["features"]}
+    properties = {
+        (each["properties"]["town"], each["properties"]["area"]) for each in told["features"]
+    }
     assert properties == {(mapped.town, "drivable"), (mapped.town, "sidewalk")}
     for area in ("drivable", "sidewalk"):
-        parts = [each["geometry"] for each in told["features"] if each["properties"]["area"] == area]
+        parts = [
+            each["geometry"] for each in told["features"] if each["properties"]["area"] == area
+        ]
         read = shapely.MultiPolygon([shapely.geometry.shape(each) for each in parts])
         assert read.symmetric_difference(mapped.polygons(area)).area < 1.0

@@ -6,7 +6,12 @@ from refusals import assert_refused
 from deepaccident_devkit.errors import ChoiceError, ConfigError, FieldError, GeometryError
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.geometry.conventions import flip_six_vector
-from deepaccident_devkit.motion import FrameBoxes, MotionLabelConfig, MotionLabels, motion_labels_from_boxes
+from deepaccident_devkit.motion import (
+    FrameBoxes,
+    MotionLabelConfig,
+    MotionLabels,
+    motion_labels_from_boxes,
+)
 from deepaccident_devkit.motion.batch_names import HEAD_NAMES, MAPS, config_from_names
 
 NAMES = ("fiery", "beverse", "deepaccident")
@@ -42,7 +47,9 @@ def test_a_batch_read_back_is_the_same_labels(names, orientation) -> None:
         assert getattr(back, name).dtype == getattr(labels, name).dtype
     assert_array_equal(back.valid, labels.valid if names != "fiery" else np.ones(7))
     assert not back.at_present
-    assert MotionLabels.from_batch(labels.as_batch(names), labels.config, names, at_present=True).at_present
+    assert MotionLabels.from_batch(
+        labels.as_batch(names), labels.config, names, at_present=True
+    ).at_present
 
 
 def test_fierys_batch() -> None:
@@ -83,7 +90,10 @@ def test_beverses_and_deepaccidents_batches() -> None:
     assert_array_equal(beverse["instance_flow"], labels.flow)
     assert_array_equal(deepaccident["motion_instance"], labels.instance[:, ::-1])
     assert_array_equal(deepaccident["instance_offset"], made(orientation="released").offset)
-    assert_array_equal(deepaccident["future_egomotions"], flip_six_vector(labels.future_egomotion).astype(np.float32))
+    assert_array_equal(
+        deepaccident["future_egomotions"],
+        flip_six_vector(labels.future_egomotion).astype(np.float32),
+    )
 
 
 def test_labels_answer_to_the_names_of_the_heads() -> None:
@@ -108,7 +118,9 @@ def test_batches_that_do_not_fit_are_refused() -> None:
         ),
         (
             lambda: MotionLabels.from_batch(
-                {**batch, "motion_segmentation": batch["motion_instance"][None]}, labels.config, "beverse"
+                {**batch, "motion_segmentation": batch["motion_instance"][None]},
+                labels.config,
+                "beverse",
             ),
             GeometryError,
             r"motion_segmentation: expected shape \(5, 80, 100\)",
@@ -120,7 +132,11 @@ def test_settings_of_the_other_codes() -> None:
     fiery = {
         "TIME_RECEPTIVE_FIELD": 3,
         "N_FUTURE_FRAMES": 6,
-        "LIFT": {"X_BOUND": [-40.0, 40.0, 0.5], "Y_BOUND": [-50.0, 50.0, 0.5], "D_BOUND": [2.0, 50.0, 1.0]},
+        "LIFT": {
+            "X_BOUND": [-40.0, 40.0, 0.5],
+            "Y_BOUND": [-50.0, 50.0, 0.5],
+            "D_BOUND": [2.0, 50.0, 1.0],
+        },
         "DATASET": {"IGNORE_INDEX": 200, "FILTER_INVISIBLE_VEHICLES": False},
         "BATCHSIZE": 3,
     }
@@ -132,9 +148,14 @@ def test_settings_of_the_other_codes() -> None:
         ignore_index=200,
         filter_invisible=False,
     )
-    converter = {"grid_conf": {"xbound": [0, 30, 0.15], "ybound": [-15, 30, 0.15]}, "only_vehicle": False}
+    converter = {
+        "grid_conf": {"xbound": [0, 30, 0.15], "ybound": [-15, 30, 0.15]},
+        "only_vehicle": False,
+    }
     assert config_from_names(converter, "beverse").grid == BevGrid((0, 30, 0.15), (-15, 30, 0.15))
-    assert config_from_names(converter, "deepaccident").grid == BevGrid((0, 30, 0.15), (-30, 15, 0.15))
+    assert config_from_names(converter, "deepaccident").grid == BevGrid(
+        (0, 30, 0.15), (-30, 15, 0.15)
+    )
     assert config_from_names({}, "beverse") == MotionLabelConfig.preset("beverse")
     assert_refused(
         (

@@ -43,7 +43,10 @@ def test_what_lies_ahead_on_the_left_is_there_in_every_orientation(orientation: 
 
 def test_wide_classes_need_half_a_cell_and_thin_ones_a_pixel() -> None:
     # the cell of x 0…0.5, y 0…0.5 covers rows 595…599 and columns 595…599
-    columns, line = (ROAD, slice(595, 600), slice(595, 597)), (LANE_LINE, slice(599, 600), slice(599, 600))
+    columns, line = (
+        (ROAD, slice(595, 600), slice(595, 597)),
+        (LANE_LINE, slice(599, 600), slice(599, 600)),
+    )
     few = _image(columns, (ROAD, slice(595, 597), slice(597, 598)), line)  # 12 of 25 pixels
     grid = BevGrid()
     (cell,), _ = grid.index_of([[0.25, 0.25]])
@@ -51,25 +54,37 @@ def test_wide_classes_need_half_a_cell_and_thin_ones_a_pixel() -> None:
     assert not targets.mask("road")[tuple(cell)]
     assert targets.mask("lane_line")[tuple(cell)]
     assert targets.mask("lane_line").sum() == 1
-    assert segmentation_of(_image(columns, (ROAD, slice(595, 598), slice(597, 598))), grid).mask("road")[tuple(cell)]
+    assert segmentation_of(_image(columns, (ROAD, slice(595, 598), slice(597, 598))), grid).mask(
+        "road"
+    )[tuple(cell)]
 
 
 def test_cells_beyond_the_camera_are_unknown_and_empty() -> None:
-    targets = segmentation_of(_image((ROAD, slice(None), slice(None))), BevGrid((-80, 80, 0.5), (-70, 70, 0.5)))
+    targets = segmentation_of(
+        _image((ROAD, slice(None), slice(None))), BevGrid((-80, 80, 0.5), (-70, 70, 0.5))
+    )
     assert targets.known.sum() == 240 * 240
     np.testing.assert_array_equal(targets.mask("road"), targets.known)
 
 
 def test_cells_finer_than_pixels_take_the_nearest() -> None:
-    targets = segmentation_of(_image((ROAD, slice(0, 600), slice(None))), BevGrid((-1, 1, 0.05), (-1, 1, 0.05)))
-    np.testing.assert_array_equal(targets.mask("road"), np.broadcast_to(np.arange(40) >= 20, (40, 40)))
+    targets = segmentation_of(
+        _image((ROAD, slice(0, 600), slice(None))), BevGrid((-1, 1, 0.05), (-1, 1, 0.05))
+    )
+    np.testing.assert_array_equal(
+        targets.mask("road"), np.broadcast_to(np.arange(40) >= 20, (40, 40))
+    )
 
 
 def test_an_augmentation_moves_the_ground_as_it_moves_points() -> None:
     augmentation = Augmentation(rotation=math.radians(90), scale=1.1, flip=True)
     moved = augmentation.matrix @ np.array([20.25, 10.25, 0.0, 1.0])
-    targets = segmentation_of(_image((VEHICLE, *_pixel(20.25, 10.25))), BevGrid(), augmentation=augmentation)
-    np.testing.assert_allclose(BevGrid().centers()[targets.mask("vehicle")].mean(axis=0), moved[:2], atol=0.3)
+    targets = segmentation_of(
+        _image((VEHICLE, *_pixel(20.25, 10.25))), BevGrid(), augmentation=augmentation
+    )
+    np.testing.assert_allclose(
+        BevGrid().centers()[targets.mask("vehicle")].mean(axis=0), moved[:2], atol=0.3
+    )
 
 
 def test_boxes_of_a_sample_lie_on_vehicle_cells(da: DeepAccident) -> None:
@@ -78,7 +93,9 @@ def test_boxes_of_a_sample_lie_on_vehicle_cells(da: DeepAccident) -> None:
     index, inside = targets.grid.index_of(boxes.select(np.flatnonzero(boxes.category < 3)).center)
     painted = targets.mask("vehicle")[index[inside, 0], index[inside, 1]]
     assert len(painted) >= 3
-    assert painted.mean() > 0.6  # the rest are hidden under others or parked beyond the drawn ground
+    assert (
+        painted.mean() > 0.6
+    )  # the rest are hidden under others or parked beyond the drawn ground
     assert targets.mask("road").any()
 
 
@@ -92,7 +109,8 @@ def test_of_a_sample_the_ground_is_augmented_too(da: DeepAccident) -> None:
     sample, augmentation = da.sample[3], Augmentation(rotation=math.radians(90), flip=True)
     mine = bev_segmentation(da, sample, augmentation=augmentation)
     np.testing.assert_array_equal(
-        mine.mask("road"), segmentation_of(da.load_bev(sample), BevGrid(), augmentation=augmentation).mask("road")
+        mine.mask("road"),
+        segmentation_of(da.load_bev(sample), BevGrid(), augmentation=augmentation).mask("road"),
     )
     assert (mine.mask("road") != bev_segmentation(da, sample).mask("road")).any()
 
@@ -101,16 +119,26 @@ def test_of_a_sample_the_ground_is_augmented_too(da: DeepAccident) -> None:
 def test_cells_count_the_pixels_at_their_points(augmentation: Augmentation | None) -> None:
     """Cells of 5 × 4 points, each looked at by itself; where half of a cell is enough, 10 of 20 are."""
     tags = {"road": 7, "lane_line": 6, "sidewalk": 8, "vehicle": 10, "pedestrian": 4}
-    assert (dict(COVERAGE), BEV_CLASSES) == ({name: 0.5 * (name[0] in "rsv") for name in tags}, tuple(tags))
+    assert (dict(COVERAGE), BEV_CLASSES) == (
+        {name: 0.5 * (name[0] in "rsv") for name in tags},
+        tuple(tags),
+    )
     generator, image, halves = np.random.default_rng(3), _image(), 0
-    semantic = generator.choice([0, *tags.values()], BEV_SHAPE, p=[0.02, 0.48, 0.04, 0.42, 0.02, 0.02]).astype(np.uint8)
+    semantic = generator.choice(
+        [0, *tags.values()], BEV_SHAPE, p=[0.02, 0.48, 0.04, 0.42, 0.02, 0.02]
+    ).astype(np.uint8)
     grid = BevGrid((-3, 3, 0.5), (-2, 2, 0.4))
     targets = segmentation_of(BevImage(semantic, image.instance), grid, augmentation=augmentation)
     back = np.linalg.inv(np.eye(4) if augmentation is None else augmentation.matrix)
     for row, column in np.ndindex(10, 12):  # y to the left by rows, x ahead by columns
         counts = dict.fromkeys((0, *tags.values()), 0)
         for along, across in np.ndindex(5, 4):
-            x, y, *_ = back @ (-3 + column / 2 + 0.1 * (along + 0.5), -2 + row / 2.5 + 0.1 * (across + 0.5), 0, 1)
+            x, y, *_ = back @ (
+                -3 + column / 2 + 0.1 * (along + 0.5),
+                -2 + row / 2.5 + 0.1 * (across + 0.5),
+                0,
+                1,
+            )
             counts[semantic.item(round(599.5 - x / 0.1), round(599.5 - y / 0.1))] += 1
         halves += counts[7] == 10
         assert targets.masks[:, row, column].tolist() == [

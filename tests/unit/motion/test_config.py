@@ -17,7 +17,10 @@ from deepaccident_devkit.v2x import AgentConfig
 def test_the_default_is_the_released_labels_in_the_devkits_orientation() -> None:
     config = MotionLabelConfig()
     assert (config.label_frames, config.frames, config.grid.orientation) == (5, 7, "devkit")
-    assert (list(config.offsets), config.rules) == ([-10, -5, 0, 5, 10, 15, 20], LABEL_PROTOCOLS["released"])
+    assert (list(config.offsets), config.rules) == (
+        [-10, -5, 0, 5, 10, 15, 20],
+        LABEL_PROTOCOLS["released"],
+    )
     assert config == MotionLabelConfig.preset("deepaccident")
 
 
@@ -25,8 +28,15 @@ def test_the_orientation_is_the_grids_and_a_new_grid_brings_its_own() -> None:
     fiery, released = BevGrid(orientation="fiery"), BevGrid(orientation="released")
     assert MotionLabelConfig(grid=fiery).grid is fiery
     config = MotionLabelConfig(grid=fiery, orientation="released")
-    assert (config.grid, config.orientation, replace(config, grid=fiery).grid) == (released, None, fiery)
-    assert (replace(config, grid=BevGrid()).grid, replace(config, orientation="fiery").grid) == (BevGrid(), fiery)
+    assert (config.grid, config.orientation, replace(config, grid=fiery).grid) == (
+        released,
+        None,
+        fiery,
+    )
+    assert (replace(config, grid=BevGrid()).grid, replace(config, orientation="fiery").grid) == (
+        BevGrid(),
+        fiery,
+    )
     assert replace(config, future_frames=2).grid == released
 
 
@@ -49,11 +59,20 @@ def test_a_presets_orientation_is_kept_unless_the_grid_or_the_caller_says_otherw
         ),
         ({"future_frames": 10**9}, "found 1000000000"),
         ({"future_frames": 1001}, "found 1001"),
-        ({"receptive_field": True}, "receptive_field: expected a whole number from 1 .* found True"),
-        ({"step": 2.5}, r"step: expected a whole number from 1 to 1,000 \(recorded frames .* found 2.5"),
+        (
+            {"receptive_field": True},
+            "receptive_field: expected a whole number from 1 .* found True",
+        ),
+        (
+            {"step": 2.5},
+            r"step: expected a whole number from 1 to 1,000 \(recorded frames .* found 2.5",
+        ),
         ({"ignore_index": 0}, "ignore_index: expected a whole number from 1 to 255 .*, found 0"),
         ({"ignore_index": 256}, "ignore_index: .* found 256"),
-        ({"ignore_index": 199}, "199 may also be a number of cells in offset and flow; choose 200 to 255"),
+        (
+            {"ignore_index": 199},
+            "199 may also be a number of cells in offset and flow; choose 200 to 255",
+        ),
         ({"sigma": 0}, "sigma: expected cells from 0.01 to 10,000, such as 3, found 0"),
         ({"sigma": 0.009}, "sigma: .* found 0.009"),
         ({"sigma": 10_001}, "sigma: .* found 10001"),
@@ -95,7 +114,11 @@ def test_unknown_words_are_refused() -> None:
             r"drawn_when: expected one of present, .*, found 'later'",
         ),
         *[
-            (partial(MotionLabelConfig, protocol=protocol), ChoiceError, "protocol: expected one of released")
+            (
+                partial(MotionLabelConfig, protocol=protocol),
+                ChoiceError,
+                "protocol: expected one of released",
+            )
             for protocol in (3, ["clean"], None)
         ],
         (
@@ -112,7 +135,11 @@ def test_unknown_words_are_refused() -> None:
             (partial(MotionLabelConfig, agents=agents), ChoiceError, "agents: expected")
             for agents in ("nobody", ["pole"], [], 5)
         ],
-        (lambda: MotionLabelConfig(grid=BevGrid((-50, 50, 0.3))), ConfigError, "is not a whole number of cells"),
+        (
+            lambda: MotionLabelConfig(grid=BevGrid((-50, 50, 0.3))),
+            ConfigError,
+            "is not a whole number of cells",
+        ),
     )
 
 
@@ -143,7 +170,10 @@ def test_a_digest_tells_configurations_apart_by_what_they_draw() -> None:
         ({"agents": ["ego_vehicle"]}, {"agents": ("ego_vehicle",)}),
         ({"orientation": "fiery"}, {"grid": BevGrid(orientation="fiery")}),
         ({"grid": BevGrid((-50, 50, 0.5))}, {}),
-        ({"augmentation": Augmentation(scale=1)}, {"augmentation": Augmentation(scale=np.float64(1))}),
+        (
+            {"augmentation": Augmentation(scale=1)},
+            {"augmentation": Augmentation(scale=np.float64(1))},
+        ),
     ],
 )
 def test_the_same_said_otherwise_is_equal_and_has_the_same_digest(mine, theirs) -> None:
@@ -153,7 +183,10 @@ def test_the_same_said_otherwise_is_equal_and_has_the_same_digest(mine, theirs) 
 
 
 def test_a_configuration_may_be_named() -> None:
-    assert (resolved_label_config("fiery"), resolved_label_config(None)) == (PRESETS["fiery"], MotionLabelConfig())
+    assert (resolved_label_config("fiery"), resolved_label_config(None)) == (
+        PRESETS["fiery"],
+        MotionLabelConfig(),
+    )
     assert resolved_label_config(PRESETS["beverse"]) is PRESETS["beverse"]
     assert_refused(
         (
@@ -186,19 +219,33 @@ def test_an_augmentation_turns_then_scales_then_mirrors() -> None:
             ConfigError,
             "augmentation: rotation: expected finite radians, found nan",
         ),
-        (lambda: Augmentation(flip="no"), ConfigError, "augmentation: flip: expected True or False, found 'no'"),
-        (lambda: Augmentation(rotation="x"), ConfigError, "augmentation: rotation: expected finite radians, found 'x'"),
+        (
+            lambda: Augmentation(flip="no"),
+            ConfigError,
+            "augmentation: flip: expected True or False, found 'no'",
+        ),
+        (
+            lambda: Augmentation(rotation="x"),
+            ConfigError,
+            "augmentation: rotation: expected finite radians, found 'x'",
+        ),
     )
 
 
 def test_the_narrowest_and_the_widest_centre() -> None:
     assert [MotionLabelConfig(sigma=sigma).sigma for sigma in (0.01, 10_000)] == [0.01, 10_000]
-    assert MotionLabelConfig(ignore_index=200, future_frames=1000, step=1, receptive_field=1).frames == 1001
+    assert (
+        MotionLabelConfig(ignore_index=200, future_frames=1000, step=1, receptive_field=1).frames
+        == 1001
+    )
 
 
 def test_agents_of_a_configuration_are_described_by_name_and_partners() -> None:
     agents = AgentConfig("mine", ("behind", "infrastructure"))
-    assert MotionLabelConfig(agents=agents).as_dict()["agents"] == {"name": "mine", "partners": list(agents.partners)}
+    assert MotionLabelConfig(agents=agents).as_dict()["agents"] == {
+        "name": "mine",
+        "partners": list(agents.partners),
+    }
 
 
 def test_every_preset_written_out() -> None:
@@ -224,21 +271,49 @@ def test_every_preset_written_out() -> None:
         "deepaccident-4s": ("released", {"future_frames": 8}, "20daa06506a4a130"),
         "deepaccident-5s": ("released", {"future_frames": 10}, "adb29110af8447f4"),
         "beverse": ("beverse", others, "3d559a2d563f3af4"),
-        "fiery": ("fiery", {**others, "agents": "single", "orientation": "fiery"}, "e880ac3b47b82b25"),
+        "fiery": (
+            "fiery",
+            {**others, "agents": "single", "orientation": "fiery"},
+            "e880ac3b47b82b25",
+        ),
     }
     assert list(PRESETS) == list(expected)
     for name, (protocol, changes, digest) in expected.items():
         described = PRESETS[name].as_dict()
         assert described.pop("protocol")["native"] == LABEL_PROTOCOLS[protocol].native
-        assert (described, PRESETS[name].protocol, PRESETS[name].digest) == ({**plain, **changes}, protocol, digest)
+        assert (described, PRESETS[name].protocol, PRESETS[name].digest) == (
+            {**plain, **changes},
+            protocol,
+            digest,
+        )
 
 
 def test_every_protocol_written_out() -> None:
     yes, no = True, False
     assert {name: astuple(rules) for name, rules in LABEL_PROTOCOLS.items()} == {
-        "released": (*[yes] * 4, "present", *[yes] * 5, "stretched", "released", "released", "whole"),
+        "released": (
+            *[yes] * 4,
+            "present",
+            *[yes] * 5,
+            "stretched",
+            "released",
+            "released",
+            "whole",
+        ),
         "clean": (*[no] * 4, "since", *[no] * 5, "exact", "released", "released", "whole"),
-        "beverse": (*[yes] * 4, "now", yes, no, yes, yes, no, "stretched", "devkit", "released", "whole"),
+        "beverse": (
+            *[yes] * 4,
+            "now",
+            yes,
+            no,
+            yes,
+            yes,
+            no,
+            "stretched",
+            "devkit",
+            "released",
+            "whole",
+        ),
         "fiery": (*[yes] * 4, "now", no, no, yes, yes, yes, "fiery", "fiery", "camera", "yaw"),
     }
     assert [(rules.right_handed, rules.place_in_cell) for rules in LABEL_PROTOCOLS.values()] == [
@@ -264,12 +339,22 @@ def test_no_augmentation_changes_nothing() -> None:
     assert astuple(Augmentation()) == (0.0, 1.0, False)
     np.testing.assert_array_equal(Augmentation().matrix, np.eye(4))
     assert_refused(
-        (lambda: Augmentation(scale=-1), ConfigError, "scale: expected a factor above 0, 1 for none, found -1"),
+        (
+            lambda: Augmentation(scale=-1),
+            ConfigError,
+            "scale: expected a factor above 0, 1 for none, found -1",
+        ),
     )
 
 
-@pytest.mark.parametrize("described", [{}, [], None, {**MotionLabelConfig().as_dict(), "colour": "red"}])
+@pytest.mark.parametrize(
+    "described", [{}, [], None, {**MotionLabelConfig().as_dict(), "colour": "red"}]
+)
 def test_what_describes_no_configuration_is_refused(described: object) -> None:
     assert_refused(
-        (lambda: MotionLabelConfig.from_dict(described), ConfigError, r"label configuration: cannot be read \(.+\)"),
+        (
+            lambda: MotionLabelConfig.from_dict(described),
+            ConfigError,
+            r"label configuration: cannot be read \(.+\)",
+        ),
     )

@@ -25,7 +25,9 @@ from deepaccident_devkit.motion.reference_arithmetic.contours import redrawn_cel
 SHAPE = (30, 40)
 
 
-def drawn(*frames: dict[tuple[int, int], tuple[float, float]], orientation="released") -> MotionHeads:
+def drawn(
+    *frames: dict[tuple[int, int], tuple[float, float]], orientation="released"
+) -> MotionHeads:
     """Perfect heads of 5 × 5 squares: per frame, where their middles are and their flow."""
     logit = np.full((len(frames), 2, *SHAPE), [[[1]], [[-1]]], dtype=np.float32)
     centerness = np.zeros((len(frames), 1, *SHAPE), dtype=np.float32)
@@ -38,7 +40,9 @@ def drawn(*frames: dict[tuple[int, int], tuple[float, float]], orientation="rele
             centerness[t, 0, row, column] = 1
             offset[t, 0][here], offset[t, 1][here] = (row - down)[here], (column - across)[here]
             flow[t, :, here] = move
-    return MotionHeads(segmentation=logit, centerness=centerness, offset=offset, flow=flow, orientation=orientation)
+    return MotionHeads(
+        segmentation=logit, centerness=centerness, offset=offset, flow=flow, orientation=orientation
+    )
 
 
 def ids_at(maps: np.ndarray, *cells: tuple[int, int]) -> list[int]:
@@ -46,7 +50,9 @@ def ids_at(maps: np.ndarray, *cells: tuple[int, int]) -> list[int]:
 
 
 def test_a_square_that_moves_keeps_its_id_and_has_a_path() -> None:
-    linked = predict_instances(drawn({(5, 5): (0, 4), (20, 30): (0, 0)}, {(20, 31): (0, 0), (5, 9): (0, 0)}))
+    linked = predict_instances(
+        drawn({(5, 5): (0, 4), (20, 30): (0, 0)}, {(20, 31): (0, 0), (5, 9): (0, 0)})
+    )
     assert ids_at(linked.instance[1], (5, 9), (20, 31), (0, 0)) == [1, 2, 0]
     assert_array_equal(linked.centers[1], [[5, 5], [5, 9]])
     assert_array_equal(linked.paths[2].cell_counts, [25, 25])
@@ -55,8 +61,12 @@ def test_a_square_that_moves_keeps_its_id_and_has_a_path() -> None:
 
 def test_a_pair_must_be_nearer_than_the_link_distance() -> None:
     heads = drawn({(5, 5): (0, 0)}, {(5, 13): (0, 0)})
-    assert ids_at(predict_instances(heads, PostProcessing(link_distance=8.0)).instance[1], (5, 13)) == [2]
-    assert ids_at(predict_instances(heads, PostProcessing(link_distance=8.01)).instance[1], (5, 13)) == [1]
+    assert ids_at(
+        predict_instances(heads, PostProcessing(link_distance=8.0)).instance[1], (5, 13)
+    ) == [2]
+    assert ids_at(
+        predict_instances(heads, PostProcessing(link_distance=8.01)).instance[1], (5, 13)
+    ) == [1]
     assert ids_at(predict_instances(heads, "fiery").instance[1], (5, 13)) == [2]
 
 
@@ -79,7 +89,9 @@ def test_new_ids_follow_the_order_of_a_python_set() -> None:
 
 def test_without_any_background_the_lowest_instance_becomes_it() -> None:
     heads = drawn({(5, 5): (0, 0), (20, 30): (0, 0)})
-    full = replace(heads, segmentation=np.broadcast_to(np.float32([[[-1]], [[1]]]), heads.segmentation.shape))
+    full = replace(
+        heads, segmentation=np.broadcast_to(np.float32([[[-1]], [[1]]]), heads.segmentation.shape)
+    )
     linked = predict_instances(full)
     assert (ids_at(linked.instance[0], (5, 5), (20, 30)), list(linked.paths)) == ([0, 1], [1])
     accident = predict_instances(full, "accident")
@@ -92,13 +104,18 @@ def test_the_first_of_too_many_centres_are_kept_and_all_of_a_plateau() -> None:
     flat = np.zeros_like(heads.centerness)
     flat[0, 0, 3, 3:6], flat[0, 0, 20, 20] = 0.2, 0.9
     assert_array_equal(
-        predict_instances(replace(heads, centerness=flat)).frame_centers[0], [[3, 3], [3, 4], [3, 5], [20, 20]]
+        predict_instances(replace(heads, centerness=flat)).frame_centers[0],
+        [[3, 3], [3, 4], [3, 5], [20, 20]],
     )
     first = predict_instances(replace(heads, centerness=flat), PostProcessing(max_centers=2))
     assert_array_equal(first.frame_centers[0], [[3, 3], [3, 4]])
-    threshold = predict_instances(replace(heads, centerness=flat), PostProcessing(center_threshold=0.2))
+    threshold = predict_instances(
+        replace(heads, centerness=flat), PostProcessing(center_threshold=0.2)
+    )
     assert_array_equal(threshold.frame_centers[0], [[20, 20]])
-    from_below = predict_instances(replace(heads, centerness=flat), PostProcessing(max_centers=1, scan="devkit"))
+    from_below = predict_instances(
+        replace(heads, centerness=flat), PostProcessing(max_centers=1, scan="devkit")
+    )
     assert_array_equal(from_below.frame_centers[0], [[20, 20]])
 
 
@@ -109,23 +126,35 @@ def test_labels_are_not_taken_for_logits(orientation) -> None:
     encoded = replace(heads, segmentation=np.stack([~actor, actor], axis=1) * np.float32(10))
     for rules in (POST_PROCESSING["accident"], PostProcessing(foreground="sigmoid")):
         assert (predict_instances(encoded, rules).instance > 0).sum() == 25
-        assert (predict_instances(encoded, replace(rules, labels_bypass_sigmoid=False)).frame_instance == 0).all()
+        assert (
+            predict_instances(encoded, replace(rules, labels_bypass_sigmoid=False)).frame_instance
+            == 0
+        ).all()
 
 
 def test_the_sigmoid_is_above_its_threshold_where_its_logit_is() -> None:
     heads = drawn({(5, 5): (0, 0)})
     logit = np.full_like(heads.segmentation, -5)
     logit[0, 1, 5, 4:7] = np.log(0.4 / 0.6) + np.array([-1e-6, 1e-6, 1], dtype=np.float32)
-    found = predict_instances(replace(heads, segmentation=logit), PostProcessing(foreground="sigmoid"))
+    found = predict_instances(
+        replace(heads, segmentation=logit), PostProcessing(foreground="sigmoid")
+    )
     assert ids_at(found.instance[0], (5, 4), (5, 5), (5, 6)) == [0, 1, 1]
 
 
 def test_redrawn_boxes_follow_the_path_but_not_across_a_gap() -> None:
-    redrawn = predict_instances(drawn({(5, 5): (0, 8)}, {(5, 13): (0, 8)}, {(5, 21): (0, 0)}), "accident").redrawn
+    redrawn = predict_instances(
+        drawn({(5, 5): (0, 8)}, {(5, 13): (0, 8)}, {(5, 21): (0, 0)}), "accident"
+    ).redrawn
     assert redrawn is not None
     for frame, column in zip(redrawn, (5, 13, 21), strict=True):
         rows, columns = np.nonzero(frame)
-        assert (rows.min(), rows.max(), columns.min(), columns.max()) == (3, 7, column - 2, column + 2)
+        assert (rows.min(), rows.max(), columns.min(), columns.max()) == (
+            3,
+            7,
+            column - 2,
+            column + 2,
+        )
     missing = predict_instances(drawn({(5, 5): (0, 8)}, {}, {(5, 5): (0, 0)}), "accident")
     assert_array_equal(missing.paths[1].frames, [0, 2])
     assert missing.redrawn is not None
@@ -142,13 +171,19 @@ def test_redrawn_boxes_are_cut_to_a_cars_size_and_later_ids_lie_on_top() -> None
     linked = predict_instances(replace(heads, segmentation=long, centerness=centerness), "accident")
     assert linked.redrawn is not None
     rows, columns = np.nonzero(linked.redrawn[0] == 3)
-    assert (np.ptp(rows), np.ptp(columns), ids_at(linked.redrawn[0], (4, 12), (4, 9))) == (2, 10, [2, 1])
+    assert (np.ptp(rows), np.ptp(columns), ids_at(linked.redrawn[0], (4, 12), (4, 9))) == (
+        2,
+        10,
+        [2, 1],
+    )
 
 
 def test_trajectories_undo_the_half_cell() -> None:
     grid, heads = BevGrid(x=(-10, 10, 0.5), y=(-5, 10, 0.5)), drawn({(5, 8): (0, 0)})
     assert_allclose(trajectories(predict_instances(heads), grid)[1], [[-6.0, 7.5]])
-    assert_allclose(trajectories(predict_instances(heads), grid, half_cell_shift=False)[1], [[-5.75, 7.25]])
+    assert_allclose(
+        trajectories(predict_instances(heads), grid, half_cell_shift=False)[1], [[-5.75, 7.25]]
+    )
     turned = predict_instances(heads.in_orientation("devkit"))
     assert_array_equal(turned.centers[1], [[24, 8]])
     assert_allclose(trajectories(turned, grid)[1], [[-6.0, 7.5]])
@@ -161,7 +196,9 @@ def test_trajectories_undo_the_half_cell() -> None:
     }.items():
         for linked in (turned, native):
             assert_allclose(trajectories(linked, grid, protocol)[1], [place])
-            assert_allclose(trajectories(linked, grid, protocol, half_cell_shift=False)[1], [[-5.75, 7.25]])
+            assert_allclose(
+                trajectories(linked, grid, protocol, half_cell_shift=False)[1], [[-5.75, 7.25]]
+            )
     assert_refused(
         (
             lambda: trajectories(turned, BevGrid(x=(0, 10, 0.5), y=(-5, 10, 0.5))),
@@ -199,9 +236,21 @@ def test_settings_that_cannot_be() -> None:
             ConfigError,
             r"max_centers: expected a whole number from 1 .*, found True",
         ),
-        (lambda: PostProcessing(max_centers=2**24 + 1), ConfigError, "from 1 to 16,777,216 .* found 16777217"),
-        (lambda: PostProcessing(max_centers=0), ConfigError, "max_centers: expected a whole number from 1 .* found 0"),
-        (lambda: PostProcessing(link_distance=-0.1), ConfigError, "a number of cells from 0, found -0.1"),
+        (
+            lambda: PostProcessing(max_centers=2**24 + 1),
+            ConfigError,
+            "from 1 to 16,777,216 .* found 16777217",
+        ),
+        (
+            lambda: PostProcessing(max_centers=0),
+            ConfigError,
+            "max_centers: expected a whole number from 1 .* found 0",
+        ),
+        (
+            lambda: PostProcessing(link_distance=-0.1),
+            ConfigError,
+            "a number of cells from 0, found -0.1",
+        ),
         (
             lambda: PostProcessing(center_threshold=-0.1),
             ConfigError,
@@ -235,7 +284,9 @@ def test_the_named_settings_written_out() -> None:
 
 
 @pytest.mark.parametrize(("move", "turns"), [(3, False), (4, True)])
-def test_a_redrawn_box_turns_after_a_move_of_four_cells_and_is_10_by_4_at_most(move: int, turns: bool) -> None:
+def test_a_redrawn_box_turns_after_a_move_of_four_cells_and_is_10_by_4_at_most(
+    move: int, turns: bool
+) -> None:
     hull = [(28, 8), (28, 16), (12, 16), (12, 8)]  # 16 × 8, along a row
     centers = np.array([[[12.0, 20.0], [12.0 + move, 20.0], [13.0 + move, 20.0]]])
     positions, ids = redrawn_cells([hull], centers, np.ones((1, 3), dtype=bool), (40, 40))
@@ -260,13 +311,20 @@ def test_the_smallest_redrawn_box_has_three_cells_a_side_and_stays_in_the_grid()
 
 def test_heads_come_from_anything_that_holds_an_array() -> None:
     heads = drawn({(5, 5): (0, 0)}, {(5, 6): (0, 0)}, orientation="devkit")
-    maps = [np.array(array) for array in (heads.segmentation, heads.centerness, heads.offset, heads.flow)]
+    maps = [
+        np.array(array)
+        for array in (heads.segmentation, heads.centerness, heads.offset, heads.flow)
+    ]
     maps[1] = maps[1][:, 0]
     expected = predict_instances(heads).instance
     for wrap in (np.asarray, np.ndarray.tolist, lambda array: array.astype(np.float16)):
-        assert_array_equal(predict_instances(MotionHeads.from_arrays(*map(wrap, maps))).instance, expected)
+        assert_array_equal(
+            predict_instances(MotionHeads.from_arrays(*map(wrap, maps))).instance, expected
+        )
         names = ("segmentation", "centerness", "offset", "flow")
-        by_name = MotionHeads(**{name: wrap(values) for name, values in zip(names, maps, strict=True)})
+        by_name = MotionHeads(
+            **{name: wrap(values) for name, values in zip(names, maps, strict=True)}
+        )
         assert_array_equal(predict_instances(by_name).instance, expected)
     assert np.shares_memory(MotionHeads.from_arrays(*maps).offset, maps[2])
     assert MotionHeads.from_arrays(*maps, ignore_index=255).ignore_index == 255
@@ -324,7 +382,9 @@ def test_heads_that_cannot_be() -> None:
             r"segmentation: nan at \(1, 0, 2, 3\) cannot be used",
         ),
         (
-            lambda: MotionHeads.from_arrays(np.where(np.isnan(broken), np.nan, np.inf), heat, good, good),
+            lambda: MotionHeads.from_arrays(
+                np.where(np.isnan(broken), np.nan, np.inf), heat, good, good
+            ),
             GeometryError,
             r"segmentation: nan at \(1, 0, 2, 3\) cannot be used",
         ),
@@ -347,7 +407,9 @@ def test_heads_that_cannot_be() -> None:
 
 
 def test_labels_are_a_prediction_that_is_right_and_255_is_no_vector() -> None:
-    config = MotionLabelConfig(grid=BevGrid(x=(0, 20, 0.5), y=(0, 15, 0.5)), receptive_field=1, future_frames=1)
+    config = MotionLabelConfig(
+        grid=BevGrid(x=(0, 20, 0.5), y=(0, 15, 0.5)), receptive_field=1, future_frames=1
+    )
     heads = drawn({(5, 5): (0, 0)}, {(5, 6): (0, 0)}, orientation="devkit")
     actor = heads.segmentation[:, 1] > 0
     background = np.broadcast_to(~actor[:, None], heads.offset.shape)

@@ -70,12 +70,18 @@ CONFIGS = {
     "everybody": MotionLabelConfig(filter_invisible=False),
     "released orientation": MotionLabelConfig(orientation="released"),
     "clean, as fiery": MotionLabelConfig(protocol="clean", orientation="fiery", draw_ego=False),
-    "fiery, as released": MotionLabelConfig.preset("fiery", orientation="released", ignore_index=201),
+    "fiery, as released": MotionLabelConfig.preset(
+        "fiery", orientation="released", ignore_index=201
+    ),
     "oblong": MotionLabelConfig(grid=OBLONG, receptive_field=1, future_frames=2, step=2),
     "oblong, as fiery": MotionLabelConfig(grid=OBLONG, orientation="fiery", protocol="clean"),
-    "large": MotionLabelConfig(grid=BevGrid((-100.0, 100.0, 0.5), (-100.0, 100.0, 0.5)), future_frames=1),
+    "large": MotionLabelConfig(
+        grid=BevGrid((-100.0, 100.0, 0.5), (-100.0, 100.0, 0.5)), future_frames=1
+    ),
     "augmented": MotionLabelConfig(augmentation=Augmentation(rotation=0.3, scale=1.04, flip=True)),
-    "quirks of one's own": MotionLabelConfig(protocol=replace(LABEL_PROTOCOLS["clean"], untracked_share_an_id=True)),
+    "quirks of one's own": MotionLabelConfig(
+        protocol=replace(LABEL_PROTOCOLS["clean"], untracked_share_an_id=True)
+    ),
     "one agent's sight": MotionLabelConfig(agents=("ego_vehicle",)),
 }
 
@@ -99,7 +105,9 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 def two_people(agent: str, frame: int) -> list[str]:
     """tiny's boxes, and two untracked people, seen."""
-    people = [f"pedestrian {x} {4 + frame / 5} -0.9 0.6 0.6 1.86 0 0.0 0.0 -1 9 True" for x in (8.0, 11.0)]
+    people = [
+        f"pedestrian {x} {4 + frame / 5} -0.9 0.6 0.6 1.86 0 0.0 0.0 -1 9 True" for x in (8.0, 11.0)
+    ]
     return [*tiny.label_lines(agent, frame), *people]
 
 
@@ -128,7 +136,13 @@ def tokens_of(release: DeepAccident, *frames: int, agents: tuple[str, ...] = AGE
     return [record["token"] for record in release.sample if record["token"].endswith(ends)]
 
 
-def write(release: DeepAccident, folder: Path, tokens: list[str], config: MotionLabelConfig | None = None, **more: Any):
+def write(
+    release: DeepAccident,
+    folder: Path,
+    tokens: list[str],
+    config: MotionLabelConfig | None = None,
+    **more: Any,
+):
     return write_label_files(release, folder, tokens, config, **{"workers": 1, **more})
 
 
@@ -153,7 +167,9 @@ def lift(release: Path, agent: str, name: str = tiny.NAME, frame: int = 6) -> No
 
 
 @pytest.mark.parametrize("name", CONFIGS)
-def test_labels_of_every_configuration_come_back(da_motion: DeepAccident, tmp_path: Path, name: str) -> None:
+def test_labels_of_every_configuration_come_back(
+    da_motion: DeepAccident, tmp_path: Path, name: str
+) -> None:
     tokens = tokens_of(da_motion, 1, 27, agents=("ego_vehicle", "infrastructure"))
     write(da_motion, tmp_path, tokens, CONFIGS[name])
     files = LabelFiles(tmp_path)
@@ -161,7 +177,9 @@ def test_labels_of_every_configuration_come_back(da_motion: DeepAccident, tmp_pa
         assert_same(files[token], motion_labels(da_motion, token, CONFIGS[name]))
 
 
-@pytest.mark.parametrize("name", ["clean, everybody, untracked too", "everybody", "quirks of one's own"])
+@pytest.mark.parametrize(
+    "name", ["clean, everybody, untracked too", "everybody", "quirks of one's own"]
+)
 def test_untracked_actors(small: DeepAccident, tmp_path: Path, name: str) -> None:
     """Each row is an instance without an actor, or all are actor −1."""
     config, tokens = replace(CONFIGS[name], filter_invisible=False), tokens_of(small, 1, 9, 12)
@@ -196,7 +214,9 @@ def test_more_instances_than_a_byte_counts(tmp_path: Path, count: int) -> None:
     assert_same(stored.labels(config), labels)
 
 
-def test_bytes_do_not_depend_on_time_workers_or_order(da_motion: DeepAccident, tmp_path: Path) -> None:
+def test_bytes_do_not_depend_on_time_workers_or_order(
+    da_motion: DeepAccident, tmp_path: Path
+) -> None:
     tokens = tokens_of(da_motion, 5, 30)
     write(da_motion, tmp_path / "one", tokens)
     write(da_motion, tmp_path / "two", tokens[::-1], workers=2)
@@ -207,7 +227,9 @@ def test_bytes_do_not_depend_on_time_workers_or_order(da_motion: DeepAccident, t
 
 
 @pytest.mark.parametrize("name", ["deepaccident", "oblong, as fiery"])
-def test_the_lines_of_the_page_rebuild_the_maps(da_motion: DeepAccident, tmp_path: Path, name: str) -> None:
+def test_the_lines_of_the_page_rebuild_the_maps(
+    da_motion: DeepAccident, tmp_path: Path, name: str
+) -> None:
     """With numpy alone, to the bit; a sample in the midst and one whose future is beyond the recording."""
     _, _, rest = PAGE.read_text(encoding="utf-8").partition("```python\n")
     lines, fence, _ = rest.partition("```")
@@ -221,18 +243,24 @@ def test_the_lines_of_the_page_rebuild_the_maps(da_motion: DeepAccident, tmp_pat
         for one in ("segmentation", "instance", "centerness", "offset", "flow"):
             ours, theirs = getattr(labels, one), rebuilt[one]
             assert (ours.dtype, ours.shape) == (theirs.dtype, theirs.shape)
-            assert ours.tobytes() == theirs.tobytes(), f"{one}: {int((ours != theirs).sum())} cells differ"
+            assert ours.tobytes() == theirs.tobytes(), (
+                f"{one}: {int((ours != theirs).sum())} cells differ"
+            )
 
 
 @pytest.mark.parametrize("name", get_args(BatchNames))
-def test_the_loop_of_the_page_reads_batches(small: DeepAccident, out: Path, name: BatchNames) -> None:
+def test_the_loop_of_the_page_reads_batches(
+    small: DeepAccident, out: Path, name: BatchNames
+) -> None:
     _, _, rest = PAGE.read_text(encoding="utf-8").partition("A training loop")
     lines = rest.partition("```python\n")[2].partition("```")[0]
     tokens = tokens_of(small, 3, 12)
     write_label_files(small, out, tokens, names=name, workers=1)
     run = {"folder": str(out)}
     exec(compile(lines, PAGE, "exec"), run)  # noqa: S102 - our own page
-    assert sorted(path.relative_to(out).with_suffix("").as_posix() for path in run["paths"]) == sorted(tokens)
+    assert sorted(
+        path.relative_to(out).with_suffix("").as_posix() for path in run["paths"]
+    ) == sorted(tokens)
     expected = motion_labels(small, tokens[0]).as_batch(name)
     assert {key: (array.dtype, array.shape[1:]) for key, array in run["batch"].items()} == {
         key: (array.dtype, array.shape) for key, array in expected.items()
@@ -241,7 +269,9 @@ def test_the_loop_of_the_page_reads_batches(small: DeepAccident, out: Path, name
 
 @pytest.mark.parametrize("name", get_args(BatchNames))
 @pytest.mark.parametrize("config", ["deepaccident", "fiery", "clean", "oblong"])
-def test_batches_of_every_code_and_sample(small: DeepAccident, out: Path, name: BatchNames, config: str) -> None:
+def test_batches_of_every_code_and_sample(
+    small: DeepAccident, out: Path, name: BatchNames, config: str
+) -> None:
     tokens = tokens_of(small, 1, 12, agents=("ego_vehicle", "infrastructure"))
     done = write_label_files(small, out, tokens, CONFIGS[config], names=name, workers=1)
     assert done == LabelsWritten(samples=4, written=4, kept=0)
@@ -278,7 +308,9 @@ def test_stopped_after_any_file_it_goes_on_there(
         assert contents(tmp_path / f"{stop}") == contents(tmp_path / "fresh")
 
 
-def test_samples_can_be_added_and_damaged_files_are_made_again(small: DeepAccident, out: Path) -> None:
+def test_samples_can_be_added_and_damaged_files_are_made_again(
+    small: DeepAccident, out: Path
+) -> None:
     some, more = (tokens_of(small, frame, agents=("ego_vehicle",)) for frame in (2, 7))
     done = [write(small, out, tokens, names="beverse") for tokens in (some, more)]
     assert [(each.written, each.kept) for each in done] == [(1, 0), (1, 1)]
@@ -316,13 +348,18 @@ def test_folders_of_other_names_are_refused_and_left(small: DeepAccident, tmp_pa
     )
 
 
-def test_what_is_whole_is_kept_and_fewer_samples_remove_nothing(small: DeepAccident, out: Path) -> None:
+def test_what_is_whole_is_kept_and_fewer_samples_remove_nothing(
+    small: DeepAccident, out: Path
+) -> None:
     some, others = tokens_of(small, 2, 7), tokens_of(small, 7, 12, agents=("ego_vehicle",))
     assert write(small, out, some) == LabelsWritten(samples=10, written=5, kept=0)
     assert write(small, out, others) == LabelsWritten(samples=2, written=1, kept=0)
     before = contents(out)
     assert write(small, out, some[:1]) == LabelsWritten(samples=1, written=0, kept=1)
-    assert (write(small, out, some), contents(out)) == (LabelsWritten(samples=10, written=0, kept=5), before)
+    assert (write(small, out, some), contents(out)) == (
+        LabelsWritten(samples=10, written=0, kept=5),
+        before,
+    )
     files = LabelFiles(out)
     assert set(files) == {*some, *others}
     for token in files:
@@ -330,12 +367,16 @@ def test_what_is_whole_is_kept_and_fewer_samples_remove_nothing(small: DeepAccid
 
 
 @pytest.mark.parametrize("names", [None, "fiery"])
-def test_what_the_release_changed_is_made_again(root: Path, out: Path, names: BatchNames | None) -> None:
+def test_what_the_release_changed_is_made_again(
+    root: Path, out: Path, names: BatchNames | None
+) -> None:
     """A label row of an agent that is not asked for, a LiDAR's pose; then nothing."""
     tokens = tokens_of(opened(root), 1, agents=("ego_vehicle", "infrastructure"))
     write(opened(root), out, tokens, names=names)
     change_label(root, "other_vehicle")
-    assert write(opened(root), out, tokens, names=names) == LabelsWritten(samples=2, written=2, kept=0)
+    assert write(opened(root), out, tokens, names=names) == LabelsWritten(
+        samples=2, written=2, kept=0
+    )
     lift(root, "ego_vehicle")
     assert [write(opened(root), out, tokens, names=names).written for _ in range(2)] == [2, 0]
 
@@ -344,8 +385,12 @@ def test_a_file_depends_on_the_rows_of_its_own_scenario_alone(tmp_path: Path, ou
     """Of a frame, and of two whose first one has no boxes: each change makes its own file again."""
     names = {tiny.NAME: 1, tiny.NAME.replace("24", "25"): 2}
     for name, frames in names.items():
-        boxes = lambda agent, at, last=frames: tiny.label_lines(agent, at) if at == last else ["0 0"]  # noqa: E731
-        tiny.write_tiny_release(tmp_path, frames=frames, name=name, agents=("infrastructure",), lines_of=boxes)
+        boxes = lambda agent, at, last=frames: (  # noqa: E731
+            tiny.label_lines(agent, at) if at == last else ["0 0"]
+        )
+        tiny.write_tiny_release(
+            tmp_path, frames=frames, name=name, agents=("infrastructure",), lines_of=boxes
+        )
     tokens = [f"{tiny.TYPE}/{name}/infrastructure/001" for name in names]
     write(opened(tmp_path), out, tokens)
     for name, change in ((name, change) for name in names for change in (change_label, lift)):
@@ -393,9 +438,12 @@ def test_folders_that_are_something_else(small: DeepAccident, tmp_path: Path) ->
             for folder, told in {
                 "": "found an empty path; give '.' for the current one",
                 tmp_path / "file": "file: is a file; give a folder",
-                tmp_path / "photos": "photos: is not empty and holds no motion labels; choose a new folder",
+                tmp_path
+                / "photos": "photos: is not empty and holds no motion labels; choose a new folder",
                 tmp_path / "odd": r"manifest.json: not a regular file \(a folder\)",
-                tmp_path / "file" / "below": "below: cannot be written .*; make room there, or choose another folder",
+                tmp_path
+                / "file"
+                / "below": "below: cannot be written .*; make room there, or choose another folder",
                 "/proc/nowhere": "nowhere: cannot be written .*; make room there, or choose another folder",
             }.items()
         ],
@@ -414,10 +462,14 @@ def test_folders_that_are_something_else(small: DeepAccident, tmp_path: Path) ->
     assert write(small, tmp_path / "empty", tokens_of(small, 3)).written == 5
 
 
-def test_what_cannot_be_drawn_is_said_before_anything_is_written(root: Path, tmp_path: Path) -> None:
+def test_what_cannot_be_drawn_is_said_before_anything_is_written(
+    root: Path, tmp_path: Path
+) -> None:
     small, out = opened(root), tmp_path / "labels"
     unlabelled = opened(tiny.write_tiny_release(tmp_path / "test", labelled=False))
-    two = opened(tiny.write_tiny_release(tmp_path / "two", agents=("ego_vehicle", "infrastructure")))
+    two = opened(
+        tiny.write_tiny_release(tmp_path / "two", agents=("ego_vehicle", "infrastructure"))
+    )
     assert_refused(
         (
             lambda: write(two, out, tokens_of(two, 3), MotionLabelConfig(agents="+other")),
@@ -429,7 +481,11 @@ def test_what_cannot_be_drawn_is_said_before_anything_is_written(root: Path, tmp
             NotAvailableError,
             "ego_vehicle/003 has no label",
         ),
-        (lambda: write(small, out, [*tokens_of(small, 3), "nothing"]), TokenError, "no token 'nothing'"),
+        (
+            lambda: write(small, out, [*tokens_of(small, 3), "nothing"]),
+            TokenError,
+            "no token 'nothing'",
+        ),
         (lambda: write(small, out, []), ChoiceError, "expected at least one sample, found none"),
         *[
             (partial(write_label_files, small, out, one), ChoiceError, "put it into a list")
@@ -451,7 +507,10 @@ class TestReading:
         assert all(token in files for token in tokens)
         recording = tokens[0].removesuffix("/004")
         for other in (
-            *(f"{recording}/{number}" for number in ("4", "0004", "005", "٠٠٤", "-04", "+04", " 04", "", "004/")),
+            *(
+                f"{recording}/{number}"
+                for number in ("4", "0004", "005", "٠٠٤", "-04", "+04", " 04", "", "004/")
+            ),
             recording,
             f"/{tokens[0]}",
             "",
@@ -460,7 +519,9 @@ class TestReading:
             da_motion.get("sample", tokens[0]),
         ):
             assert other not in files
-            with pytest.raises(TokenError, match=r"has no labels of .*; `deepaccident labels` can add them"):
+            with pytest.raises(
+                TokenError, match=r"has no labels of .*; `deepaccident labels` can add them"
+            ):
                 files[other]
 
     def test_threads_and_spawned_processes_read_the_same(self, files: LabelFiles) -> None:
@@ -470,7 +531,9 @@ class TestReading:
             for token, labels in zip(tokens, threads.map(files.__getitem__, tokens), strict=True):
                 assert_same(labels, expected[token])
         with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as processes:
-            assert_same(processes.submit(operator.getitem, files, tokens[0]).result(), expected[tokens[0]])
+            assert_same(
+                processes.submit(operator.getitem, files, tokens[0]).result(), expected[tokens[0]]
+            )
         assert_same(pickle.loads(pickle.dumps(files))[tokens[1]], expected[tokens[1]])
 
 
@@ -518,22 +581,34 @@ class TestDamage:
         assert contents(folder) == before
         assert_same(files[tokens[1]], motion_labels(small, tokens[1]))
 
-    def test_a_file_of_another_folder(self, small: DeepAccident, folder: Path, path: Path, tmp_path: Path) -> None:
+    def test_a_file_of_another_folder(
+        self, small: DeepAccident, folder: Path, path: Path, tmp_path: Path
+    ) -> None:
         token = tokens_of(small, 3)[0]
         write(small, tmp_path / "clean", [token], MotionLabelConfig(protocol="clean"))
         shutil.copy(tmp_path / "clean" / path.relative_to(folder), path)
         assert_refused(
-            (lambda: LabelFiles(folder)[token], LabelFilesError, "holds labels of another configuration; remove it"),
+            (
+                lambda: LabelFiles(folder)[token],
+                LabelFilesError,
+                "holds labels of another configuration; remove it",
+            ),
         )
         assert write(small, folder, [token]).written == 1
         assert_same(LabelFiles(folder)[token], motion_labels(small, token))
 
-    @pytest.mark.parametrize("member", ["instance", "center", "flow", "actor", "future_egomotion", "valid"])
+    @pytest.mark.parametrize(
+        "member", ["instance", "center", "flow", "actor", "future_egomotion", "valid"]
+    )
     def test_arrays_that_cannot_be_the_samples(
         self, small: DeepAccident, path: Path, folder: Path, member: str
     ) -> None:
         with zipfile.ZipFile(path) as archive:
-            others = {name: archive.read(name) for name in archive.namelist() if name != f"003/{member}.npy"}
+            others = {
+                name: archive.read(name)
+                for name in archive.namelist()
+                if name != f"003/{member}.npy"
+            }
             with archive.open(f"003/{member}.npy") as file:
                 array = np.lib.format.read_array(file)
         with zipfile.ZipFile(path, "w") as archive:
@@ -551,15 +626,32 @@ class TestDamage:
 
     @pytest.mark.parametrize(
         "text",
-        ["", "{", "[]", "null", "3", "\0", "[" * 100_000, "\xff", '{"format": "DeepAccident motion labels"}'],
+        [
+            "",
+            "{",
+            "[]",
+            "null",
+            "3",
+            "\0",
+            "[" * 100_000,
+            "\xff",
+            '{"format": "DeepAccident motion labels"}',
+        ],
     )
     def test_a_manifest_that_is_none(self, small: DeepAccident, folder: Path, text: str) -> None:
         (folder / MANIFEST).write_text(text, encoding="latin-1")
         before = contents(folder)
         assert_refused(
             *[
-                (use, LabelFilesError, r"manifest\.json: cannot be read .*; make the labels again in an")
-                for use in (lambda: LabelFiles(folder), lambda: write(small, folder, tokens_of(small, 3)))
+                (
+                    use,
+                    LabelFilesError,
+                    r"manifest\.json: cannot be read .*; make the labels again in an",
+                )
+                for use in (
+                    lambda: LabelFiles(folder),
+                    lambda: write(small, folder, tokens_of(small, 3)),
+                )
             ],
         )
         assert contents(folder) == before
@@ -587,7 +679,9 @@ class TestDamage:
     )
     def test_a_manifest_with_a_wrong_value(self, folder: Path, change: dict[str, object]) -> None:
         restate(folder, **change)
-        assert_refused((lambda: LabelFiles(folder), LabelFilesError, r"manifest\.json: cannot be read"))
+        assert_refused(
+            (lambda: LabelFiles(folder), LabelFilesError, r"manifest\.json: cannot be read")
+        )
 
     def test_a_manifest_that_is_a_pipe_or_a_giant(self, folder: Path) -> None:
         path = folder / MANIFEST
@@ -605,25 +699,30 @@ class TestDamage:
         )
         told = json.loads(content)
         config = MotionLabelConfig(grid=BevGrid((-1000.0, 1000.0, 0.1), (-1000.0, 1000.0, 0.1)))
-        path.write_text(json.dumps({**told, "config": config.as_dict(), "config_digest": config.digest}))
+        path.write_text(
+            json.dumps({**told, "config": config.as_dict(), "config_digest": config.digest})
+        )
         assert_refused(
             (lambda: LabelFiles(folder), LabelFilesError, "a sample takes 32,000,000,000 bytes"),
         )
 
-    @pytest.mark.parametrize(("version", "kind"), [(LABEL_FORMAT_VERSION + 1, "newer"), (0, "older")])
+    @pytest.mark.parametrize(
+        ("version", "kind"), [(LABEL_FORMAT_VERSION + 1, "newer"), (0, "older")]
+    )
     def test_another_devkits_labels_are_refused_and_kept(
         self, small: DeepAccident, folder: Path, version: int, kind: str
     ) -> None:
         path = folder / MANIFEST
         path.write_text(json.dumps({**json.loads(path.read_text()), "version": version, "new": 1}))
         before = contents(folder)
-        sentence = (
-            rf"{kind} devkit's labels \(format version {version}, this devkit's is {LABEL_FORMAT_VERSION}\); .* or make"
-        )
+        sentence = rf"{kind} devkit's labels \(format version {version}, this devkit's is {LABEL_FORMAT_VERSION}\); .* or make"
         assert_refused(
             *[
                 (use, LabelFilesError, sentence)
-                for use in (lambda: LabelFiles(folder), lambda: write(small, folder, tokens_of(small, 3)))
+                for use in (
+                    lambda: LabelFiles(folder),
+                    lambda: write(small, folder, tokens_of(small, 3)),
+                )
             ],
         )
         assert contents(folder) == before
@@ -647,7 +746,9 @@ except LabelFilesError as error:
 def python(script: str, *arguments: object) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-c", script, *map(str, arguments)]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
-    return subprocess.run(command, capture_output=True, text=True, timeout=300, check=False, env=environment)
+    return subprocess.run(
+        command, capture_output=True, text=True, timeout=300, check=False, env=environment
+    )
 
 
 def test_a_full_disk(root: Path, tmp_path: Path) -> None:
@@ -673,14 +774,21 @@ def whole(da_b: DeepAccident, tmp_path_factory: pytest.TempPathFactory) -> dict[
     return contents(folder)
 
 
-def test_several_calls_share_the_scenarios(da_b: DeepAccident, out: Path, whole: dict[str, bytes]) -> None:
+def test_several_calls_share_the_scenarios(
+    da_b: DeepAccident, out: Path, whole: dict[str, bytes]
+) -> None:
     with ThreadPoolExecutor(3) as threads:
         done = list(threads.map(lambda _: write(da_b, out, two_agents(da_b)), range(3)))
     assert sum(each.written for each in done) == 12
-    assert ({(each.samples, each.written + each.kept) for each in done}, contents(out)) == ({(24, 12)}, whole)
+    assert ({(each.samples, each.written + each.kept) for each in done}, contents(out)) == (
+        {(24, 12)},
+        whole,
+    )
 
 
-def test_nothing_is_listed_before_all_is_there(da_b: DeepAccident, out: Path, whole: dict[str, bytes]) -> None:
+def test_nothing_is_listed_before_all_is_there(
+    da_b: DeepAccident, out: Path, whole: dict[str, bytes]
+) -> None:
     """And what a killed process has begun is removed, unless others are at work."""
     store = label_store(out, "")
     with store.shared():
@@ -700,7 +808,9 @@ def test_what_fails_is_listed_and_the_rest_is_done(
 ) -> None:
     made, broken = label_files.motion_labels_of, two_agents(da_b, 4)[3]
 
-    def fail_once(dataset: DeepAccident, tokens: list[str], *more: object) -> Iterator[MotionLabels]:
+    def fail_once(
+        dataset: DeepAccident, tokens: list[str], *more: object
+    ) -> Iterator[MotionLabels]:
         if broken in tokens:
             raise NotAvailableError("nothing to see")
         return made(dataset, tokens, *more)

@@ -46,7 +46,11 @@ def lines(agent: str, frame: int) -> list[str]:
 
 @pytest.fixture(scope="module")
 def small(tmp_path_factory: pytest.TempPathFactory) -> DeepAccident:
-    return opened(tiny.write_tiny_release(tmp_path_factory.mktemp("tiny") / "release", frames=31, lines_of=lines))
+    return opened(
+        tiny.write_tiny_release(
+            tmp_path_factory.mktemp("tiny") / "release", frames=31, lines_of=lines
+        )
+    )
 
 
 def opened(root: Path) -> DeepAccident:
@@ -63,18 +67,26 @@ def drawn(labels: MotionLabels, actor: int) -> list[int]:
 @pytest.mark.parametrize(
     "config",
     [
-        *(config for name, config in PRESETS.items() if name != "fiery"),  # test_it_draws_as_fierys_class
+        *(
+            config for name, config in PRESETS.items() if name != "fiery"
+        ),  # test_it_draws_as_fierys_class
         MotionLabelConfig(protocol="clean"),
         MotionLabelConfig(agents="single"),
         MotionLabelConfig(agents=("infrastructure", "other_vehicle"), protocol="beverse"),
-        MotionLabelConfig(agents="+behind", protocol="clean", receptive_field=1, future_frames=7, step=3),
+        MotionLabelConfig(
+            agents="+behind", protocol="clean", receptive_field=1, future_frames=7, step=3
+        ),
         MotionLabelConfig(filter_invisible=False),
     ],
 )
-def test_it_draws_what_boxes_poses_and_visible_actors_say(da_motion: DeepAccident, config: MotionLabelConfig) -> None:
+def test_it_draws_what_boxes_poses_and_visible_actors_say(
+    da_motion: DeepAccident, config: MotionLabelConfig
+) -> None:
     """The same through the public calls, a moment at a time; of one sample, and of many whatever lies beside them."""
     places = [(scenario["token"], agent) for scenario in da_motion.scenario for agent in AGENTS]
-    records = [da_motion.get_sample(*place, number) for number in (1, 13, 26, 35) for place in places]
+    records = [
+        da_motion.get_sample(*place, number) for number in (1, 13, 26, 35) for place in places
+    ]
     for record, labels in zip(records, da_motion.motion_labels_of(records, config), strict=True):
         assert_same(labels, by_public_calls(da_motion, record, config))
     assert_same(da_motion.motion_labels(records[-1], config), labels)
@@ -83,7 +95,9 @@ def test_it_draws_what_boxes_poses_and_visible_actors_say(da_motion: DeepAcciden
 def by_public_calls(release: DeepAccident, record: dict, config: MotionLabelConfig) -> MotionLabels:
     recording, number = record["token"].rsplit("/", 1)
     length = release.get("scenario", record["scenario_token"])["num_frames"]
-    numbers = [int(number) + offset for offset in (*config.offsets, config.offsets[-1] + config.step)]
+    numbers = [
+        int(number) + offset for offset in (*config.offsets, config.offsets[-1] + config.step)
+    ]
     tokens = [f"{recording}/{one:03d}" if 1 <= one <= length else None for one in numbers]
     poses = [np.eye(4) if one is None else release.world_from(one, "ego").matrix for one in tokens]
     frames = []
@@ -93,8 +107,14 @@ def by_public_calls(release: DeepAccident, record: dict, config: MotionLabelConf
             continue
         boxes, rows = release.boxes(token, "lidar"), release.annotation_rows(token)
         actors = boxes.actor_id
-        seen = visible_actors(release, token, agents=config.agents) if config.filter_invisible else actors
-        columns = {name: getattr(boxes, name) for name in ("center", "size", "actor_id", "category")}
+        seen = (
+            visible_actors(release, token, agents=config.agents)
+            if config.filter_invisible
+            else actors
+        )
+        columns = {
+            name: getattr(boxes, name) for name in ("center", "size", "actor_id", "category")
+        }
         frames.append(
             FrameBoxes(
                 **columns,
@@ -128,7 +148,10 @@ def test_labels_of_the_last_frames(small: DeepAccident, number: int) -> None:
     after = [number + 5 * step <= 31 for step in range(-1, 6)]
     for protocol, mark in (("released", 0), ("clean", 255)):
         labels = small.motion_labels(f"{EGO}/{number:03d}", MotionLabelConfig(protocol=protocol))
-        assert (labels.valid.tolist(), labels.future_egomotion.any(axis=1).tolist()) == (there, after)
+        assert (labels.valid.tolist(), labels.future_egomotion.any(axis=1).tolist()) == (
+            there,
+            after,
+        )
         missing = ~labels.label_valid
         for name in ("segmentation", "instance", "centerness"):
             assert (getattr(labels, name)[missing] == mark).all()
@@ -140,7 +163,9 @@ def test_labels_of_the_last_frames(small: DeepAccident, number: int) -> None:
 
 
 def test_a_step_and_a_past_that_leave_the_recording(small: DeepAccident) -> None:
-    labels = small.motion_labels(f"{EGO}/016", MotionLabelConfig(receptive_field=9, future_frames=1, step=20))
+    labels = small.motion_labels(
+        f"{EGO}/016", MotionLabelConfig(receptive_field=9, future_frames=1, step=20)
+    )
     assert labels.valid.tolist() == [False] * 8 + [True, False]
     assert_array_equal(labels.future_egomotion, 0)
     assert not labels.instance[1].any()
@@ -175,7 +200,9 @@ def test_untracked_actors_are_seen_by_nobody(small: DeepAccident) -> None:
             .segmentation[:, 70:130, 50:70]
             .any()
         )
-        everybody = small.motion_labels(f"{EGO}/006", MotionLabelConfig(protocol=protocol, filter_invisible=False))
+        everybody = small.motion_labels(
+            f"{EGO}/006", MotionLabelConfig(protocol=protocol, filter_invisible=False)
+        )
         left = [len(np.unique(frame[70:130, 50:70])) - 1 for frame in everybody.instance]
         assert left == [1 if protocol == "released" else 2] * 5
 
@@ -199,7 +226,9 @@ def test_whose_sight_counts(tmp_path: Path) -> None:
         "vehicles": False,
         ("ego_vehicle", "other_vehicle"): False,
     }.items():
-        assert (VAN in release.motion_labels(f"{EGO}/002", MotionLabelConfig(agents=agents)).id_map) == there, agents
+        assert (
+            VAN in release.motion_labels(f"{EGO}/002", MotionLabelConfig(agents=agents)).id_map
+        ) == there, agents
 
 
 def test_ids_go_on_from_the_sample_before(small: DeepAccident) -> None:
@@ -207,7 +236,10 @@ def test_ids_go_on_from_the_sample_before(small: DeepAccident) -> None:
     assert {*small.motion_labels(f"{EGO}/001").id_map} == {OWN_BOX_ID, VAN, WALKER}
     before = {VAN: 1, 4711: 2}
     second = small.motion_labels(f"{EGO}/016", id_map=before)
-    assert (dict(second.id_map), before) == ({VAN: 1, 4711: 2, OWN_BOX_ID: 3, LATER: 4, WALKER: 5}, {VAN: 1, 4711: 2})
+    assert (dict(second.id_map), before) == (
+        {VAN: 1, 4711: 2, OWN_BOX_ID: 3, LATER: 4, WALKER: 5},
+        {VAN: 1, 4711: 2},
+    )
     fresh = small.motion_labels(f"{EGO}/016")
     for actor, number in fresh.id_map.items():
         assert_array_equal(fresh.instance == number, second.instance == second.id_map[actor])
@@ -223,7 +255,9 @@ def test_vectors_turn_with_their_cells(tmp_path: Path, monkeypatch: pytest.Monke
     monkeypatch.setattr(tiny, "ego_to_world", lambda _agent, frame: tiny.pose(2.0 * frame))
     release, errors = opened(tiny.write_tiny_release(tmp_path, frames=31)), {}
     for protocol in ("released", "clean"):
-        labels = release.motion_labels(f"{EGO}/003", MotionLabelConfig(protocol=protocol)).to_present()
+        labels = release.motion_labels(
+            f"{EGO}/003", MotionLabelConfig(protocol=protocol)
+        ).to_present()
         assert min(drawn(labels, VAN)) > 20
         errors[protocol] = [spread(labels, t, VAN) for t in range(5)]
     assert errors["released"][0] == 0 < min(errors["released"][2:]), errors
@@ -249,9 +283,13 @@ def test_a_sample_without_a_label(tmp_path: Path) -> None:
 
 
 def test_agents_of_a_partial_release(tmp_path: Path) -> None:
-    two = opened(tiny.write_tiny_release(tmp_path, agents=("ego_vehicle", "infrastructure"), lines_of=lines))
+    two = opened(
+        tiny.write_tiny_release(tmp_path, agents=("ego_vehicle", "infrastructure"), lines_of=lines)
+    )
     assert VAN in two.motion_labels(f"{EGO}/002").id_map
-    assert VAN in two.motion_labels(f"{EGO}/002", MotionLabelConfig(agents="+infrastructure")).id_map
+    assert (
+        VAN in two.motion_labels(f"{EGO}/002", MotionLabelConfig(agents="+infrastructure")).id_map
+    )
     assert_refused(
         *[
             (
@@ -262,14 +300,32 @@ def test_agents_of_a_partial_release(tmp_path: Path) -> None:
             for agents in ("+other", "all", ("ego_vehicle", "other_vehicle"))
         ],
     )
-    assert VAN in two.motion_labels(f"{EGO}/002", MotionLabelConfig(agents="+other", filter_invisible=False)).id_map
+    assert (
+        VAN
+        in two.motion_labels(
+            f"{EGO}/002", MotionLabelConfig(agents="+other", filter_invisible=False)
+        ).id_map
+    )
 
 
 def test_what_is_no_sample_and_agents_that_do_not_exist(small: DeepAccident) -> None:
     assert_refused(
         *[
-            (partial(small.motion_labels, sample), TokenError, r"no token|expected a token or a record")
-            for sample in ("", "nothing", f"{EGO}/0", f"{EGO}/2", f"{EGO}/099", None, 3, {"token": 3})
+            (
+                partial(small.motion_labels, sample),
+                TokenError,
+                r"no token|expected a token or a record",
+            )
+            for sample in (
+                "",
+                "nothing",
+                f"{EGO}/0",
+                f"{EGO}/2",
+                f"{EGO}/099",
+                None,
+                3,
+                {"token": 3},
+            )
         ],
         (lambda: small.motion_labels_of(f"{EGO}/001"), ChoiceError, "put it into a list"),
         *[
@@ -283,14 +339,19 @@ def test_an_agent_without_labels_sees_nothing(tmp_path: Path) -> None:
     tiny.write_tiny_release(tmp_path, agents=("infrastructure",), labelled=False)
     release = opened(tiny.write_tiny_release(tmp_path, agents=("ego_vehicle",)))
     assert {*release.motion_labels(f"{EGO}/002").id_map} == {OWN_BOX_ID, VAN}
-    assert {*release.motion_labels(f"{EGO}/002", MotionLabelConfig(agents=("infrastructure",))).id_map} == {OWN_BOX_ID}
+    assert {
+        *release.motion_labels(f"{EGO}/002", MotionLabelConfig(agents=("infrastructure",))).id_map
+    } == {OWN_BOX_ID}
 
 
 def test_a_label_without_boxes(tmp_path: Path) -> None:
     release = opened(tiny.write_tiny_release(tmp_path, lines_of=lambda _agent, _frame: ["0.0 0.0"]))
     released = release.motion_labels(f"{EGO}/002")
     assert {*released.id_map} == {OWN_BOX_ID}  # the default box
-    for token, config in ((f"{EGO}/002", MotionLabelConfig(protocol="clean")), (f"{POLE}/002", None)):
+    for token, config in (
+        (f"{EGO}/002", MotionLabelConfig(protocol="clean")),
+        (f"{POLE}/002", None),
+    ):
         labels = release.motion_labels(token, config)
         assert not labels.id_map
         assert not labels.instance[0].any()
@@ -300,7 +361,9 @@ def test_a_label_without_boxes(tmp_path: Path) -> None:
 def leaning(agent: str, frame: int):
     """Up to 16° of lean; agents turn while they drive."""
     pose = tiny.pose(0, x=12.0 * tiny.AGENTS.index(agent) + 0.3 * frame, y=-4.0, z=0.5)
-    turn = Quaternion(axis=(0, 0, 1), degrees=35 + 3 * frame) * Quaternion(axis=(0, 1, 0), degrees=13)
+    turn = Quaternion(axis=(0, 0, 1), degrees=35 + 3 * frame) * Quaternion(
+        axis=(0, 1, 0), degrees=13
+    )
     pose[:3, :3] = (turn * Quaternion(axis=(1, 0, 0), degrees=9 - frame / 3)).rotation_matrix
     return pose
 
@@ -329,7 +392,9 @@ def lines_around(agent: str, frame: int) -> list[str]:
 def slope(tmp_path_factory: pytest.TempPathFactory) -> DeepAccident:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(tiny, "ego_to_world", leaning)
-        root = tiny.write_tiny_release(tmp_path_factory.mktemp("slope") / "release", frames=28, lines_of=lines_around)
+        root = tiny.write_tiny_release(
+            tmp_path_factory.mktemp("slope") / "release", frames=28, lines_of=lines_around
+        )
     return DeepAccident(dataroot=root, verbose=False, workers=1)
 
 
@@ -348,6 +413,13 @@ def test_it_draws_as_fierys_class(slope: DeepAccident, agent: str, filter_invisi
 def test_its_choices_are_fields(slope: DeepAccident) -> None:
     fiery = PRESETS["fiery"]
     assert (fiery.agents, fiery.rules.sight, fiery.rules.pose) == ("single", "camera", "yaw")
-    others = {(rules.sight, rules.pose) for name, rules in LABEL_PROTOCOLS.items() if name != "fiery"}
-    assert (others, MotionLabelConfig.from_dict(fiery.as_dict())) == ({("released", "whole")}, fiery)
-    assert {"sight", "pose"}.isdisjoint(MotionLabelConfig().as_dict()["protocol"]), "digests of older files stay"
+    others = {
+        (rules.sight, rules.pose) for name, rules in LABEL_PROTOCOLS.items() if name != "fiery"
+    }
+    assert (others, MotionLabelConfig.from_dict(fiery.as_dict())) == (
+        {("released", "whole")},
+        fiery,
+    )
+    assert {"sight", "pose"}.isdisjoint(MotionLabelConfig().as_dict()["protocol"]), (
+        "digests of older files stay"
+    )

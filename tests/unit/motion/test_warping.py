@@ -41,26 +41,40 @@ def at(x: float, y: float, grid: BevGrid = GRID, value: float = 1) -> np.ndarray
 
 @ORIENTATIONS
 @pytest.mark.parametrize("protocol", ["clean", "fiery"])
-def test_an_agent_that_stands_ahead_sees_things_further_ahead(protocol: str, orientation: Any) -> None:
+def test_an_agent_that_stands_ahead_sees_things_further_ahead(
+    protocol: str, orientation: Any
+) -> None:
     grid = GRID.with_orientation(orientation)
     maps = np.stack([at(0.5, 1.5, grid), at(0.5, 1.5, grid)])
     assert_array_equal(
-        agents_to_ego(maps, [[0] * 6, ONE_AHEAD], grid=grid, protocol=protocol), [maps[0], at(1.5, 1.5, grid)]
+        agents_to_ego(maps, [[0] * 6, ONE_AHEAD], grid=grid, protocol=protocol),
+        [maps[0], at(1.5, 1.5, grid)],
     )
 
 
 @ORIENTATIONS
-def test_an_agent_that_looks_left_sees_ahead_what_the_ego_sees_on_its_left(orientation: Any) -> None:
+def test_an_agent_that_looks_left_sees_ahead_what_the_ego_sees_on_its_left(
+    orientation: Any,
+) -> None:
     grid = GRID.with_orientation(orientation)
     for protocol in ("clean", "fiery"):
-        found = agents_to_ego(np.stack([at(2.5, 0.5, grid)] * 2), [[0] * 6, QUARTER_LEFT], grid=grid, protocol=protocol)
+        found = agents_to_ego(
+            np.stack([at(2.5, 0.5, grid)] * 2),
+            [[0] * 6, QUARTER_LEFT],
+            grid=grid,
+            protocol=protocol,
+        )
         assert_array_equal(found[1], at(-0.5, 2.5, grid), protocol)
 
 
 def test_fierys_sideways_shift_has_the_wrong_sign() -> None:
     to_the_left, maps = [[0] * 6, [0, 1.0, 0, 0, 0, 0]], np.stack([at(0.5, 0.5)] * 2)
-    assert_array_equal(agents_to_ego(maps, to_the_left, grid=GRID, protocol="clean")[1], at(0.5, 1.5))
-    assert_array_equal(agents_to_ego(maps, to_the_left, grid=GRID, protocol="fiery")[1], at(0.5, -0.5))
+    assert_array_equal(
+        agents_to_ego(maps, to_the_left, grid=GRID, protocol="clean")[1], at(0.5, 1.5)
+    )
+    assert_array_equal(
+        agents_to_ego(maps, to_the_left, grid=GRID, protocol="fiery")[1], at(0.5, -0.5)
+    )
 
 
 @RULES
@@ -69,15 +83,21 @@ def test_indices_outside_are_minus_one_and_warps_fill_there(rules: LabelProtocol
     far[0, 3] = 1e7
     assert_array_equal(nearest_indices(far, GRID, rules), np.full(64, -1))
     for mode in ("nearest", "bilinear"):
-        assert_array_equal(warp(np.ones((2, 8, 8)), far, GRID, rules, mode, fill=7), np.full((2, 8, 8), 7))  # type: ignore[arg-type]
+        assert_array_equal(
+            warp(np.ones((2, 8, 8)), far, GRID, rules, mode, fill=7), np.full((2, 8, 8), 7)
+        )  # type: ignore[arg-type]
 
 
 @RULES
-def test_oblong_grids_that_are_not_centred_keep_their_cells_where_nothing_moves(rules: LabelProtocol) -> None:
+def test_oblong_grids_that_are_not_centred_keep_their_cells_where_nothing_moves(
+    rules: LabelProtocol,
+) -> None:
     for grid in (BevGrid((0, 30, 0.5), (-10, 20, 1.5)), BevGrid((-1, 0, 1), (-20, 20, 0.1))):
         for orientation in (None, "devkit", "released", "fiery"):
             assert_array_equal(
-                nearest_indices(np.eye(4), grid, rules, orientation=orientation), np.arange(grid.cells), str(grid)
+                nearest_indices(np.eye(4), grid, rules, orientation=orientation),
+                np.arange(grid.cells),
+                str(grid),
             )
 
 
@@ -96,8 +116,16 @@ def test_what_does_not_fit_is_refused() -> None:
             GeometryError,
             r"raster: expected shape \(…, 8, 8\), found \(8, 7\)",
         ),
-        (lambda: warp(raster, np.eye(3), GRID, CLEAN), GeometryError, r"source_from_target: expected shape \(4, 4\)"),
-        (lambda: warp(raster, np.full((4, 4), np.nan), GRID, RELEASED), GeometryError, "not all numbers are finite"),
+        (
+            lambda: warp(raster, np.eye(3), GRID, CLEAN),
+            GeometryError,
+            r"source_from_target: expected shape \(4, 4\)",
+        ),
+        (
+            lambda: warp(raster, np.full((4, 4), np.nan), GRID, RELEASED),
+            GeometryError,
+            "not all numbers are finite",
+        ),
         (
             lambda: warp(raster, np.eye(4), GRID, CLEAN, "cubic"),
             ChoiceError,
@@ -121,12 +149,17 @@ def test_what_does_not_fit_is_refused() -> None:
     )
 
 
-def test_past_motions_are_multiplied_in_the_order_of_time_as_released_and_rightly_if_exact() -> None:
+def test_past_motions_are_multiplied_in_the_order_of_time_as_released_and_rightly_if_exact() -> (
+    None
+):
     first, second = ONE_AHEAD, QUARTER_LEFT
     exact = present_from_past([first, second], CLEAN)
     released = present_from_past([first, second], RELEASED)
     # left-handed: turning is the other way round
-    ahead, turn = conventions.matrices_of_six(first), conventions.matrices_of_six(np.negative(second))
+    ahead, turn = (
+        conventions.matrices_of_six(first),
+        conventions.matrices_of_six(np.negative(second)),
+    )
     np.testing.assert_allclose(exact, [turn @ ahead, turn], atol=1e-12)
     np.testing.assert_allclose(released, [ahead @ turn, turn], atol=1e-6)
     assert present_from_past(np.zeros((0, 6)), RELEASED).shape == (0, 4, 4)
@@ -141,7 +174,9 @@ def test_one_moment_alone_and_the_ego_alone_stay_as_they_are() -> None:
 def test_augmented_maps_move_along_the_augmented_axes() -> None:
     """Mirrored maps of an agent one metre to the left stand one metre to the right."""
     augmentation, pose = Augmentation(flip=True), [[0] * 6, [0, 1.0, 0, 0, 0, 0]]
-    found = agents_to_ego(np.stack([at(0.5, 0.5)] * 2), pose, grid=GRID, protocol="clean", augmentation=augmentation)
+    found = agents_to_ego(
+        np.stack([at(0.5, 0.5)] * 2), pose, grid=GRID, protocol="clean", augmentation=augmentation
+    )
     assert_array_equal(found[1], at(0.5, -0.5))
 
 
@@ -152,10 +187,14 @@ def test_single_precision_inverses_are_inverses() -> None:
     np.testing.assert_allclose(matrices, conventions.matrices_of_six(six), atol=1e-6)
     for inverse in (single_precision.inverse, single_precision.rigid_inverse):
         np.testing.assert_allclose(
-            single_precision.product(inverse(matrices), matrices), np.tile(np.eye(4), (50, 1, 1)), atol=1e-5
+            single_precision.product(inverse(matrices), matrices),
+            np.tile(np.eye(4), (50, 1, 1)),
+            atol=1e-5,
         )
     scaled = matrices * np.float32([[1.05], [-1.05], [1.05], [1]])
-    np.testing.assert_allclose(sampling_matrix(scaled, RELEASED) @ scaled, np.tile(np.eye(4), (50, 1, 1)), atol=1e-5)
+    np.testing.assert_allclose(
+        sampling_matrix(scaled, RELEASED) @ scaled, np.tile(np.eye(4), (50, 1, 1)), atol=1e-5
+    )
 
 
 def test_sines_are_torchs_and_not_the_nearest_float32() -> None:
@@ -164,25 +203,48 @@ def test_sines_are_torchs_and_not_the_nearest_float32() -> None:
     assert_array_equal(
         single_precision.sines_and_cosines(angles)[1],
         np.array(
-            [-0.9606141, -0.9548646, -0.94222236, -0.9709582, -0.9577872, -0.9204396, 1.0, -0.99913514],
+            [
+                -0.9606141,
+                -0.9548646,
+                -0.94222236,
+                -0.9709582,
+                -0.9577872,
+                -0.9204396,
+                1.0,
+                -0.99913514,
+            ],
             dtype=np.float32,
         ),
     )
     assert_array_equal(
         single_precision.sines_and_cosines(angles)[0],
         np.array(
-            [-0.27788603, -0.29704145, -0.3349882, -0.23924924, -0.28747812, -0.3908848, 0.0, 0.04158076],
+            [
+                -0.27788603,
+                -0.29704145,
+                -0.3349882,
+                -0.23924924,
+                -0.28747812,
+                -0.3908848,
+                0.0,
+                0.04158076,
+            ],
             dtype=np.float32,
         ),
     )
-    assert (single_precision.sines_and_cosines(angles)[1] != np.cos(angles.astype(np.float64)).astype(np.float32)).any()
+    assert (
+        single_precision.sines_and_cosines(angles)[1]
+        != np.cos(angles.astype(np.float64)).astype(np.float32)
+    ).any()
 
 
 def make_labels(config: MotionLabelConfig, step: list[float]) -> MotionLabels:
     """One cell of an instance, 2.5 m ahead and 0.5 m to the left of each frame's own ego, which moves by `step`."""
     mask = np.broadcast_to(at(2.5, 0.5, config.grid) > 0, (config.label_frames, *config.grid.shape))
     ahead = {"devkit": (0, 1), "released": (0, 1), "fiery": (1, 0)}[config.grid.orientation]
-    vectors = np.where(mask[:, None], np.reshape(ahead, (1, 2, 1, 1)), config.ignore_index).astype(np.float32)
+    vectors = np.where(mask[:, None], np.reshape(ahead, (1, 2, 1, 1)), config.ignore_index).astype(
+        np.float32
+    )
     return MotionLabels(
         config=config,
         segmentation=mask.astype(np.uint8),
@@ -199,7 +261,9 @@ def make_labels(config: MotionLabelConfig, step: list[float]) -> MotionLabels:
 @ORIENTATIONS
 def test_what_is_ahead_of_an_ego_that_turned_left_is_on_the_presents_left(orientation: Any) -> None:
     """Points of a frame seen from the next: turning left turns them right."""
-    config = MotionLabelConfig(grid=GRID, orientation=orientation, protocol="clean", future_frames=1)
+    config = MotionLabelConfig(
+        grid=GRID, orientation=orientation, protocol="clean", future_frames=1
+    )
     labels = make_labels(config, np.negative(QUARTER_LEFT).tolist())
     present = labels.to_present()
     assert present.at_present
@@ -218,7 +282,9 @@ def test_what_is_ahead_of_an_ego_that_turned_left_is_on_the_presents_left(orient
 
 @pytest.mark.parametrize(("protocol", "beside"), [("released", 0), ("clean", 255)])
 def test_what_comes_in_from_beside_the_grid(protocol: str, beside: int) -> None:
-    labels = make_labels(MotionLabelConfig(grid=GRID, protocol=protocol, future_frames=1), [-3.0, 0, 0, 0, 0, 0])
+    labels = make_labels(
+        MotionLabelConfig(grid=GRID, protocol=protocol, future_frames=1), [-3.0, 0, 0, 0, 0, 0]
+    )
     present = labels.to_present(centerness="bilinear")
     assert_array_equal(present.flow[1][:, :, :2], beside)
     assert_array_equal(present.offset[1][:, :, 4:7], 255)
@@ -247,7 +313,9 @@ def test_labels_at_the_present_are_not_warped_again() -> None:
     assert_refused(
         (present.to_present, NotAvailableError, "in the present frame already"),
         (
-            lambda: make_labels(MotionLabelConfig(grid=GRID), ONE_AHEAD).to_present(centerness="linear"),
+            lambda: make_labels(MotionLabelConfig(grid=GRID), ONE_AHEAD).to_present(
+                centerness="linear"
+            ),
             ChoiceError,
             "mode: expected one of nearest, bilinear",
         ),

@@ -25,7 +25,11 @@ def test_channels(path: Path, key: str) -> None:
     np.testing.assert_array_equal(image.semantic, semantic, strict=True)
     np.testing.assert_array_equal(image.instance, instance, strict=True)
     np.testing.assert_array_equal(read_bev(path, raw=True), raw)
-    assert (image.resolution, image.semantic.flags.writeable, image.instance.flags.writeable) == (0.1, False, False)
+    assert (image.resolution, image.semantic.flags.writeable, image.instance.flags.writeable) == (
+        0.1,
+        False,
+        False,
+    )
 
 
 def test_written_channels(path: Path) -> None:
@@ -37,9 +41,12 @@ def test_written_channels(path: Path) -> None:
 
 @pytest.mark.parametrize("raw", [False, True])
 @pytest.mark.parametrize(
-    ("shape", "dtype"), [((1200, 1200), "u1"), ((600, 600, 3), "u1"), ((3, 1200, 1200), "u1"), ((1200, 1200, 3), "i2")]
+    ("shape", "dtype"),
+    [((1200, 1200), "u1"), ((600, 600, 3), "u1"), ((3, 1200, 1200), "u1"), ((1200, 1200, 3), "i2")],
 )
-def test_other_arrays_are_refused(path: Path, shape: tuple[int, ...], dtype: str, raw: bool) -> None:
+def test_other_arrays_are_refused(
+    path: Path, shape: tuple[int, ...], dtype: str, raw: bool
+) -> None:
     np.savez_compressed(path, data=np.zeros(shape, dtype=dtype))
     found = f"found {shape} of {np.dtype(dtype)}".replace("(", r"\(").replace(")", r"\)")
     message = rf"^{path}: expected shape \(1200, 1200, 3\) of uint8, {found}; restore the file from its archive$"

@@ -35,7 +35,9 @@ def test_format_mds_example(path: Path, raw_calib: RawCalib) -> None:
         "intrinsic_Camera_Back": np.array([[800, 560.166, 0], [450, 0, -560.166], [1, 0, 0]]),
     }
     calib = read_calib(dump(path, raw))
-    assert_array_equal(calib.intrinsic["Camera_Back"], [[560.166, 0, 800], [0, 560.166, 450], [0, 0, 1]])
+    assert_array_equal(
+        calib.intrinsic["Camera_Back"], [[560.166, 0, 800], [0, 560.166, 450], [0, 0, 1]]
+    )
     # 10 m behind, 1 m left, 1 m up in the LiDAR frame: to the right of the middle, above it
     in_camera = calib.camera_from_lidar["Camera_Back"].apply([[-10.0, 1, 1]])
     assert_allclose(in_camera, [[1, -1.3, 7.904]])
@@ -78,7 +80,9 @@ def test_several_files_are_stacked(
         assert_array_equal(calibs.world_from_ego[index], single.world_from_ego.matrix)
         assert_array_equal(calibs.ego_from_lidar[index], single.ego_from_lidar.matrix)
         for number, camera in enumerate(CAMERAS):
-            assert_array_equal(calibs.camera_from_lidar[index, number], single.camera_from_lidar[camera].matrix)
+            assert_array_equal(
+                calibs.camera_from_lidar[index, number], single.camera_from_lidar[camera].matrix
+            )
             assert_array_equal(calibs.intrinsic[index, number], single.intrinsic[camera])
     with pytest.raises(ValueError, match="read-only"):
         calibs.world_from_ego[0] = 0
@@ -101,7 +105,10 @@ def with_item(key: str, place: tuple[int, int], value: float) -> Callable[[RawCa
     ("spoil", "message"),
     [
         (lambda raw: {k: v for k, v in raw.items() if k != "ego_to_world"}, "lacks ego_to_world"),
-        (lambda raw: {"lidar_to_ego": raw["lidar_to_ego"]}, "lacks ego_to_world, lidar_to_Camera_Front, .*BackRight"),
+        (
+            lambda raw: {"lidar_to_ego": raw["lidar_to_ego"]},
+            "lacks ego_to_world, lidar_to_Camera_Front, .*BackRight",
+        ),
         (lambda _: {}, "lacks lidar_to_ego"),
         (lambda raw: list(raw.values()), "expected a dict of arrays, found list"),
         (lambda _: None, "expected a dict of arrays, found NoneType"),
@@ -120,24 +127,48 @@ def with_item(key: str, place: tuple[int, int], value: float) -> Callable[[RawCa
         (changed("ego_to_world", lambda _: "eye"), "ego_to_world: .*found str"),
         (with_item("ego_to_world", (0, 0), np.nan), "ego_to_world: holds NaN or infinity"),
         (with_item("ego_to_world", (0, 3), np.inf), "ego_to_world: holds NaN or infinity"),
-        (with_item("ego_to_world", (0, 3), -1e300), "ego_to_world: holds NaN or infinity, or a number beyond 1e"),
+        (
+            with_item("ego_to_world", (0, 3), -1e300),
+            "ego_to_world: holds NaN or infinity, or a number beyond 1e",
+        ),
         (
             with_item("intrinsic_Camera_Front", (1, 2), 1e39),
             "intrinsic_Camera_Front: holds NaN or infinity, or a",
         ),
-        (with_item("lidar_to_Camera_Front", (2, 1), np.inf), "lidar_to_Camera_Front: holds NaN or infinity"),
-        (with_item("intrinsic_Camera_Front", (0, 0), np.nan), "intrinsic_Camera_Front: holds NaN or infinity"),
+        (
+            with_item("lidar_to_Camera_Front", (2, 1), np.inf),
+            "lidar_to_Camera_Front: holds NaN or infinity",
+        ),
+        (
+            with_item("intrinsic_Camera_Front", (0, 0), np.nan),
+            "intrinsic_Camera_Front: holds NaN or infinity",
+        ),
         (with_item("lidar_to_ego", (0, 0), 1e200), "lidar_to_ego: its rotation is not orthonormal"),
-        (changed("lidar_to_Camera_Back", lambda a: a * 1.01), "lidar_to_Camera_Back: its last row is"),
-        (changed("lidar_to_ego", lambda a: a @ np.diag([1.01, 1, 1, 1])), "lidar_to_ego: its rotation is not ortho"),
-        (changed("lidar_to_ego", lambda a: a @ np.diag([1, -1, 1, 1])), "lidar_to_ego: its rotation is a mirror image"),
+        (
+            changed("lidar_to_Camera_Back", lambda a: a * 1.01),
+            "lidar_to_Camera_Back: its last row is",
+        ),
+        (
+            changed("lidar_to_ego", lambda a: a @ np.diag([1.01, 1, 1, 1])),
+            "lidar_to_ego: its rotation is not ortho",
+        ),
+        (
+            changed("lidar_to_ego", lambda a: a @ np.diag([1, -1, 1, 1])),
+            "lidar_to_ego: its rotation is a mirror image",
+        ),
         (changed("ego_to_world", lambda a: a.T), "ego_to_world: its last row is"),
         (changed("ego_to_world", np.zeros_like), "ego_to_world: its last row is"),
     ],
 )
-def test_faults_name_file_key_and_remedy(path: Path, raw_calib: RawCalib, spoil: Callable, message: str) -> None:
+def test_faults_name_file_key_and_remedy(
+    path: Path, raw_calib: RawCalib, spoil: Callable, message: str
+) -> None:
     dump(path, spoil(raw_calib))
-    for read in (read_calib, lambda path: read_calib(path, raw=True), lambda path: read_calibs([path])):
+    for read in (
+        read_calib,
+        lambda path: read_calib(path, raw=True),
+        lambda path: read_calibs([path]),
+    ):
         with pytest.raises(CalibError, match=f"^{path}: {message}.*{REMEDY}$"):
             read(path)
 
@@ -155,7 +186,9 @@ def test_slightly_imprecise_poses_are_taken(path: Path, raw_calib: RawCalib) -> 
     single = {key: array.astype(np.float32) for key, array in raw_calib.items()}
     calib = read_calib(dump(path, single))
     assert calib.world_from_ego.matrix.dtype == np.float64
-    assert_allclose(calib.world_from_ego.translation, raw_calib["ego_to_world"][:3, 3] * [1, -1, 1], rtol=1e-6)
+    assert_allclose(
+        calib.world_from_ego.translation, raw_calib["ego_to_world"][:3, 3] * [1, -1, 1], rtol=1e-6
+    )
 
 
 def test_written_files_hold_the_raw_values_under_names_that_every_numpy_knows(

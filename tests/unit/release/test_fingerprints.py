@@ -35,7 +35,11 @@ def folder_of(root: Path, scenario: str) -> ScenarioFolder:
 
 @pytest.mark.parametrize(
     ("kind", "pattern"),
-    [("label", "ego_vehicle/label/*/*.txt"), ("calib", "ego_vehicle/calib/*/*.pkl"), ("meta", "meta/*.txt")],
+    [
+        ("label", "ego_vehicle/label/*/*.txt"),
+        ("calib", "ego_vehicle/calib/*/*.pkl"),
+        ("meta", "meta/*.txt"),
+    ],
 )
 def test_one_file_changes_one_hash_and_the_index_is_refused(
     own_release: Path, scenario: str, kind: str, pattern: str
@@ -43,12 +47,19 @@ def test_one_file_changes_one_hash_and_the_index_is_refused(
     """Hashes are of the files that the index was made from: of others there are none."""
     opened = DeepAccident(dataroot=own_release, verbose=False)
     before = scenario_hashes(opened, [scenario])[scenario]
-    assert opened.indexed_hashes(scenario) == before == folder_hashes(folder_of(own_release, scenario))
+    assert (
+        opened.indexed_hashes(scenario) == before == folder_hashes(folder_of(own_release, scenario))
+    )
     path = min(own_release.glob(f"train/*_accident/{pattern}"))
     path.write_bytes(path.read_bytes()[:-1] + b" ")
     changed = folder_hashes(folder_of(own_release, scenario)).as_dict()
     assert [name for name, value in before.as_dict().items() if changed[name] != value] == [kind]
-    named = (str(own_release), "the index is out of date", scenario, "deepaccident check index DATAROOT")
+    named = (
+        str(own_release),
+        "the index is out of date",
+        scenario,
+        "deepaccident check index DATAROOT",
+    )
     assert_refused((lambda: scenario_hashes(opened, [scenario]), IndexStoreError, named))
     others = opened.split_scenarios("val")
     assert list(scenario_hashes(opened, others)) == sorted(others)
@@ -94,7 +105,9 @@ def test_other_boxes_or_unknown_ones_are_not_alike(own_release: Path, scenario: 
     path.write_text(" ".join([*words[:5], "9" + words[5], *words[6:]]))
     after = folder_hashes(folder)
     assert after.points == before.points
-    assert not any(mine.is_like(after) for mine in (before, unknown, replace(before, label=after.label)))
+    assert not any(
+        mine.is_like(after) for mine in (before, unknown, replace(before, label=after.label))
+    )
     assert not before.is_like(None)
 
 
@@ -104,7 +117,9 @@ def test_a_file_that_cannot_be_read_is_named(own_release: Path, scenario: str) -
     path = first(own_release, "label", "txt")
     path.unlink()
     os.mkfifo(path)
-    with pytest.raises(ReleaseError, match=rf"^{path}: not a regular file \(a named pipe\); restore the file"):
+    with pytest.raises(
+        ReleaseError, match=rf"^{path}: not a regular file \(a named pipe\); restore the file"
+    ):
         scenario_hashes(opened, [scenario])
 
 

@@ -24,7 +24,12 @@ def path(tmp_path: Path) -> Path:
 def quarters() -> np.ndarray:
     """Red and green above, blue and grey below: tells colours, rows and columns apart."""
     image = np.zeros((32, 64, 3), dtype=np.uint8)
-    image[:16, :32], image[:16, 32:], image[16:, :32], image[16:, 32:] = (255, 0, 0), (0, 255, 0), (0, 0, 255), 128
+    image[:16, :32], image[:16, 32:], image[16:, :32], image[16:, 32:] = (
+        (255, 0, 0),
+        (0, 255, 0),
+        (0, 0, 255),
+        128,
+    )
     return image
 
 
@@ -60,13 +65,17 @@ def test_truncated_garbage_empty_and_missing(path: Path, quarters: np.ndarray, r
 
 @pytest.mark.parametrize("raw", [False, True])
 @pytest.mark.parametrize("size", [0xFFFF, 0x2800], ids=["bomb", "large"])
-def test_a_damaged_size_is_no_decompression_bomb(path: Path, quarters: np.ndarray, size: int, raw: bool) -> None:
+def test_a_damaged_size_is_no_decompression_bomb(
+    path: Path, quarters: np.ndarray, size: int, raw: bool
+) -> None:
     write_image(path, quarters)
     content = bytearray(path.read_bytes())
     start = content.find(b"\xff\xc0") + 5
     content[start : start + 4] = size.to_bytes(2, "big") * 2
     path.write_bytes(content)
-    assert_refused((lambda: read_image(path, raw=raw), SensorFileError, f"(?s)^{path}: .*{REMEDY}$"))
+    assert_refused(
+        (lambda: read_image(path, raw=raw), SensorFileError, f"(?s)^{path}: .*{REMEDY}$")
+    )
 
 
 @pytest.mark.parametrize(
@@ -80,7 +89,9 @@ def test_a_damaged_size_is_no_decompression_bomb(path: Path, quarters: np.ndarra
     ],
     ids=["grey", "rgba", "two-channels", "empty", "floats"],
 )
-def test_writing_other_than_rgb_is_refused_and_leaves_nothing(path: Path, image: np.ndarray) -> None:
+def test_writing_other_than_rgb_is_refused_and_leaves_nothing(
+    path: Path, image: np.ndarray
+) -> None:
     assert_refused((lambda: write_image(path, image), SensorFileError, r"image\.jpg: .*shape"))
     assert list(path.parent.iterdir()) == []
 
@@ -97,15 +108,27 @@ def test_damage_raises_our_error_or_nothing(
 
 
 @pytest.mark.parametrize("kind", ["GIF", "TIFF", "BMP", "EPS", "PPM", "WEBP"])
-def test_other_formats_are_refused_whatever_their_name(path: Path, quarters: np.ndarray, kind: str) -> None:
+def test_other_formats_are_refused_whatever_their_name(
+    path: Path, quarters: np.ndarray, kind: str
+) -> None:
     """Decoders of some start programs: EPS starts Ghostscript."""
     Image.fromarray(quarters).save(path, kind)
-    assert_refused((lambda: read_image(path), SensorFileError, r"not a readable image \(expected JPEG or PNG\)"))
+    assert_refused(
+        (
+            lambda: read_image(path),
+            SensorFileError,
+            r"not a readable image \(expected JPEG or PNG\)",
+        )
+    )
 
 
 def test_a_picture_of_too_many_pixels_is_refused_before_it_is_decoded(path: Path) -> None:
     Image.new("1", (9000, 9000)).save(path, "PNG")  # a few kilobytes
-    named = ("takes 243,000,000 bytes", "more than 33,554,432", "set DEEPACCIDENT_LIMITS=image=232M")
+    named = (
+        "takes 243,000,000 bytes",
+        "more than 33,554,432",
+        "set DEEPACCIDENT_LIMITS=image=232M",
+    )
     tracemalloc.start()
     assert_refused((lambda: read_image(path), SensorFileError, named))
     assert tracemalloc.get_traced_memory()[1] < 10 << 20

@@ -52,7 +52,14 @@ def test_the_real_lines_to_the_bit(write) -> None:
     labels = read_label(write(REAL), raw=True)
     assert labels.raw
     assert_array_equal(numbers_of(labels), expected(REAL))
-    names = ("num_boxes", "agent_velocity", "category", "actor_id", "num_lidar_pts", "camera_visible")
+    names = (
+        "num_boxes",
+        "agent_velocity",
+        "category",
+        "actor_id",
+        "num_lidar_pts",
+        "camera_visible",
+    )
     assert {name: getattr(labels, name).tolist() for name in names} == {
         "num_boxes": [4],
         "agent_velocity": [[0.0034441, -5.6166797]],
@@ -74,7 +81,9 @@ def test_right_handed_means_y_yaw_and_vy_change_their_signs(write) -> None:
 def test_boxes_are_right_handed_whatever_raw_was(write, raw: bool) -> None:
     boxes = read_label(write(REAL), raw=raw).boxes()
     assert (boxes.frame, boxes.category_names) == ("lidar", ["car", "car", "pedestrian", "car"])
-    assert_array_equal(boxes.center[3], [-13.459459497478285, 0.0037344838527602064, -1.2119891287962656])
+    assert_array_equal(
+        boxes.center[3], [-13.459459497478285, 0.0037344838527602064, -1.2119891287962656]
+    )
     assert_array_equal(boxes.velocity[3], [-4.587319957896956, 0.016017722274652455, 0])
     assert_allclose(boxes.yaw, [0.000518, 0, -2.19, -0.00033209590742323136], atol=1e-15)
     assert_array_equal([boxes.row, boxes.actor_id], [[0, 1, 2, 3], [20001, -100, -1, 5481]])
@@ -116,7 +125,10 @@ def test_boxes_are_right_handed_whatever_raw_was(write, raw: bool) -> None:
 def test_tolerated_forms_read_as_the_clean_file(write, text: str) -> None:
     clean, odd = read_label(write(REAL, "clean.txt")), write(text)
     # alone, and where it spoils the fast way for its neighbours
-    for labels in (read_label(odd), read_labels([write(HEADER, "empty.txt"), odd, write(HEADER, "other.txt")])):
+    for labels in (
+        read_label(odd),
+        read_labels([write(HEADER, "empty.txt"), odd, write(HEADER, "other.txt")]),
+    ):
         assert_array_equal(numbers_of(labels), numbers_of(clean))
         assert_array_equal(labels.actor_id, clean.actor_id)
         assert_array_equal(labels.camera_visible, clean.camera_visible)
@@ -132,27 +144,47 @@ def test_a_label_of_line_one_alone_is_valid(write, text: str) -> None:
 
 
 def test_several_files_keep_their_order_and_their_counts(write) -> None:
-    paths = [write(REAL, "1"), write("1 2", "2"), write("\n".join(["3 4", WALKER]), "3"), write("5 6\n\n", "4")]
+    paths = [
+        write(REAL, "1"),
+        write("1 2", "2"),
+        write("\n".join(["3 4", WALKER]), "3"),
+        write("5 6\n\n", "4"),
+    ]
     labels = read_labels(paths)
     assert_array_equal(labels.num_boxes, [4, 0, 1, 0])
     assert_array_equal(labels.agent_velocity, [[0.0034441, 5.6166797], [1, -2], [3, -4], [5, -6]])
     assert_array_equal(labels.boxes().row, [0, 1, 2, 3, 0])
     nothing = read_labels([])
-    found = (len(nothing), len(nothing.num_boxes), nothing.agent_velocity.shape, len(nothing.boxes()))
+    found = (
+        len(nothing),
+        len(nothing.num_boxes),
+        nothing.agent_velocity.shape,
+        len(nothing.boxes()),
+    )
     assert found == (0, 0, (0, 2), 0)
 
 
 def test_of_many_files_the_first_faulty_one_is_named(write) -> None:
-    good, first, second = write(REAL, "good.txt"), write("1 x", "first.txt"), write("1 y", "second.txt")
+    good, first, second = (
+        write(REAL, "good.txt"),
+        write("1 x", "first.txt"),
+        write("1 y", "second.txt"),
+    )
     paths = [good] * 300 + [first] + [good] * 2500 + [second] + [good] * 10
     assert_refused(
         (lambda: read_labels(paths), LabelError, rf"^{first}:1: 'x' is no number"),
-        (lambda: read_labels([*paths[:300], good.with_name("gone.txt"), *paths]), MissingFileError, r"gone\.txt"),
+        (
+            lambda: read_labels([*paths[:300], good.with_name("gone.txt"), *paths]),
+            MissingFileError,
+            r"gone\.txt",
+        ),
     )
 
 
 WORDS = st.one_of(
-    st.floats(-1e9, 1e9).flatmap(lambda x: st.sampled_from([repr(x), f"{x:.17g}", f"{x:.25e}", f"{x:E}", f"{x:.3e}"])),
+    st.floats(-1e9, 1e9).flatmap(
+        lambda x: st.sampled_from([repr(x), f"{x:.17g}", f"{x:.25e}", f"{x:E}", f"{x:.3e}"])
+    ),
     st.from_regex(r"-?[0-9]{1,25}(\.[0-9]{0,25})?([eE][+-]?[0-9]{1,2})?", fullmatch=True),
     st.from_regex(r"-?\.[0-9]{1,25}", fullmatch=True),
     st.floats(-2.3e-308, 2.3e-308).map(repr),
@@ -180,15 +212,21 @@ WORDS = st.one_of(
 
 @settings(max_examples=20)
 @given(st.lists(st.lists(WORDS, min_size=9, max_size=9), min_size=1, max_size=8))
-def test_numbers_are_what_float_says_to_the_bit(tmp_path_factory: pytest.TempPathFactory, rows: list) -> None:
+def test_numbers_are_what_float_says_to_the_bit(
+    tmp_path_factory: pytest.TempPathFactory, rows: list
+) -> None:
     path = tmp_path_factory.getbasetemp() / "numbers.txt"
-    path.write_text("\n".join(["0 0", *(" ".join(["van", *row, "7", "0", "True"]) for row in rows)]))
+    path.write_text(
+        "\n".join(["0 0", *(" ".join(["van", *row, "7", "0", "True"]) for row in rows)])
+    )
     want = np.array([[float(word) for word in row] for row in rows])
     assert_array_equal(numbers_of(read_label(path, raw=True)).view(np.int64), want.view(np.int64))
 
 
 @pytest.mark.parametrize("raw", [False, True])
-@pytest.mark.parametrize("word", ["nan", "NaN", "NAN", "-nan", "inf", "-inf", "Infinity", "1e999", "-1e300", "1e39"])
+@pytest.mark.parametrize(
+    "word", ["nan", "NaN", "NAN", "-nan", "inf", "-inf", "Infinity", "1e999", "-1e300", "1e39"]
+)
 def test_a_velocity_that_is_no_number_is_unknown(write, word: str, raw: bool) -> None:
     for written, expected in ((f"{word} 2.5", [np.nan, 2.5]), (f"2.5 {word}", [2.5, np.nan])):
         labels = read_label(write(f"{HEADER}\n{PARKED.replace('0.0 0.0', written)}"), raw=raw)
@@ -198,30 +236,78 @@ def test_a_velocity_that_is_no_number_is_unknown(write, word: str, raw: bool) ->
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (f"{HEADER}\n{PARKED}\n{WALKER[:30]}", r":3: expected 13 fields, found 5: 'pedestrian 21.8"),
+        (
+            f"{HEADER}\n{PARKED}\n{WALKER[:30]}",
+            r":3: expected 13 fields, found 5: 'pedestrian 21.8",
+        ),
         (f"{HEADER}\n{PARKED[: -len(' True')]}\n", r":2: expected 13 fields, found 12: 'car -38"),
         (f"{HEADER}\n{PARKED} 1\n", r":2: expected 13 fields, found more than 13: 'car"),
-        (f"{HEADER}\n\n{OWN}\nx\n{PARKED[:-2]}", r":5: camera_visible is 'Tr', expected True or False"),
-        (f"{HEADER}\n{PARKED.replace('True', 'true')}", r":2: camera_visible is 'true', expected True or False"),
-        (f"{HEADER}\n{PARKED.replace('-38.698', 'nan')}", r":2: x is 'nan', expected a finite number"),
-        (f"{HEADER}\n{PARKED.replace('-0.000518', 'inf')}", r":2: yaw is 'inf', expected a finite number"),
-        (f"{HEADER}\n{PARKED.replace('1.381', '-Infinity')}", r":2: h is '-Infinity', expected a finite number"),
-        (f"{HEADER}\n{PARKED.replace('-19.789', '1e400')}", r":2: y is '1e400', expected a finite number"),
-        (f"{HEADER}\n{PARKED.replace('-19.789', '-1e300')}", r":2: y is '-1e300', expected a finite number up to 1e"),
-        (f"{HEADER}\n{PARKED.replace('1.381', '1e39')}", r":2: h is '1e39', expected a finite number up to 1e"),
+        (
+            f"{HEADER}\n\n{OWN}\nx\n{PARKED[:-2]}",
+            r":5: camera_visible is 'Tr', expected True or False",
+        ),
+        (
+            f"{HEADER}\n{PARKED.replace('True', 'true')}",
+            r":2: camera_visible is 'true', expected True or False",
+        ),
+        (
+            f"{HEADER}\n{PARKED.replace('-38.698', 'nan')}",
+            r":2: x is 'nan', expected a finite number",
+        ),
+        (
+            f"{HEADER}\n{PARKED.replace('-0.000518', 'inf')}",
+            r":2: yaw is 'inf', expected a finite number",
+        ),
+        (
+            f"{HEADER}\n{PARKED.replace('1.381', '-Infinity')}",
+            r":2: h is '-Infinity', expected a finite number",
+        ),
+        (
+            f"{HEADER}\n{PARKED.replace('-19.789', '1e400')}",
+            r":2: y is '1e400', expected a finite number",
+        ),
+        (
+            f"{HEADER}\n{PARKED.replace('-19.789', '-1e300')}",
+            r":2: y is '-1e300', expected a finite number up to 1e",
+        ),
+        (
+            f"{HEADER}\n{PARKED.replace('1.381', '1e39')}",
+            r":2: h is '1e39', expected a finite number up to 1e",
+        ),
         (f"{HEADER}\n{PARKED.replace('-0.882', 'low')}", r":2: z is 'low', expected a number"),
         (f"{HEADER}\n{PARKED.replace('-0.882', '1_0')}", r":2: z is '1_0', expected a number"),
         (f"{HEADER}\n{PARKED.replace('0.0 0.0', '0.0 ?')}", r":2: vy is '\?', expected a number"),
-        (f"{HEADER}\n{OWN}\n{PARKED.replace('car', 'bus')}", r":3: class is 'bus', expected one of car, truck"),
+        (
+            f"{HEADER}\n{OWN}\n{PARKED.replace('car', 'bus')}",
+            r":3: class is 'bus', expected one of car, truck",
+        ),
         (f"{HEADER}\n{PARKED.replace('car', 'Car')}", r":2: class is 'Car'"),
-        (f"{HEADER}\n{PARKED.replace('car', chr(34) + 'car' + chr(34))}", r":2: class is '\"car\"'"),
-        (f"{HEADER}\n{PARKED.replace('20001', '20001.0')}", r":2: id is '20001.0', expected an integer"),
-        (f"{HEADER}\n{PARKED.replace('20001', '+20001')}", r":2: id is '\+20001', expected an integer"),
+        (
+            f"{HEADER}\n{PARKED.replace('car', chr(34) + 'car' + chr(34))}",
+            r":2: class is '\"car\"'",
+        ),
+        (
+            f"{HEADER}\n{PARKED.replace('20001', '20001.0')}",
+            r":2: id is '20001.0', expected an integer",
+        ),
+        (
+            f"{HEADER}\n{PARKED.replace('20001', '+20001')}",
+            r":2: id is '\+20001', expected an integer",
+        ),
         (f"{HEADER}\n{PARKED}\u00a0", r":2: camera_visible is 'True\\xa0', expected True or False"),
         (f"{HEADER}\n{PARKED.replace('20001', '0x10')}", r":2: id is '0x10', expected an integer"),
-        (f"{HEADER}\n{PARKED.replace('20001', str(2**63))}", r":2: id is '9223372036854775808', expected an integer"),
-        (f"{HEADER}\n{PARKED.replace(' 0 True', ' 0xA True')}", r":2: num_lidar_pts is '0xA', expected an integer"),
-        (f"{HEADER}\n{PARKED.replace(' 0 True', ' many True')}", r":2: num_lidar_pts is 'many', expected an integer"),
+        (
+            f"{HEADER}\n{PARKED.replace('20001', str(2**63))}",
+            r":2: id is '9223372036854775808', expected an integer",
+        ),
+        (
+            f"{HEADER}\n{PARKED.replace(' 0 True', ' 0xA True')}",
+            r":2: num_lidar_pts is '0xA', expected an integer",
+        ),
+        (
+            f"{HEADER}\n{PARKED.replace(' 0 True', ' many True')}",
+            r":2: num_lidar_pts is 'many', expected an integer",
+        ),
         (PARKED, r":1: expected '<speed_x> <speed_y>', found 13 fields: 'car"),
         ("1 2 3\n", r":1: expected '<speed_x> <speed_y>', found 3 fields: '1 2 3'"),
         ("fast 2\n", r":1: 'fast' is no number"),
@@ -250,16 +336,22 @@ def test_faults_name_file_line_and_remedy(write, text: str, message: str) -> Non
     ],
 )
 def test_binary_garbage_is_a_label_error(write, content: bytes) -> None:
-    assert_refused((lambda: read_label(write(content)), LabelError, r"label\.txt:\d+: .*restore the file"))
+    assert_refused(
+        (lambda: read_label(write(content)), LabelError, r"label\.txt:\d+: .*restore the file")
+    )
 
 
 @pytest.mark.parametrize("marks", [1, 2])
 @pytest.mark.parametrize("place", [0, len(HEADER) + 1])
-def test_a_byte_order_mark_means_the_same_alone_and_among_others(write, outcome, place: int, marks: int) -> None:
+def test_a_byte_order_mark_means_the_same_alone_and_among_others(
+    write, outcome, place: int, marks: int
+) -> None:
     """Arrow drops one at the start of what it is given, which is only the first file's."""
     text = f"{HEADER}\n{PARKED}\n".encode()
     marked = write(text[:place] + b"\xef\xbb\xbf" * marks + text[place:], "marked.txt")
-    alone, last = (outcome(LabelError, read_labels, paths) for paths in ([marked], [write(REAL), marked]))
+    alone, last = (
+        outcome(LabelError, read_labels, paths) for paths in ([marked], [write(REAL), marked])
+    )
     assert alone[1] == last[1]
     assert (alone[0] and alone[0].actor_id[-1]) == (last[0] and last[0].actor_id[-1])
 
@@ -292,10 +384,22 @@ def test_damage_raises_our_error_or_nothing(
         ("1 " * 100_000, r":1: expected '<speed_x> <speed_y>', found more than 13 fields: '1 1 "),
         (f"{'9' * 5000}x 1", r":1: '9+ … 9+x' is no number"),
         (f"{HEADER}\n" + "1 " * 100_000, r":2: expected 13 fields, found more than 13: '1 1 "),
-        (f"{HEADER}\n{PARKED.replace('car', 'c' * 5000)}", r":2: class is 'c+ … c+', expected one of"),
-        (f"{HEADER}\n{PARKED.replace('-38.698', '9' * 5000)}", r":2: x is '9+ … 9+', expected a finite number"),
-        (f"{HEADER}\n{PARKED.replace('20001', '9' * 5000)}", r":2: id is '9+ … 9+', expected an integer"),
-        (f"{HEADER}\n{PARKED.replace('True', chr(27) + '[2J')}", r":2: camera_visible is '\\x1b\[2J', expected"),
+        (
+            f"{HEADER}\n{PARKED.replace('car', 'c' * 5000)}",
+            r":2: class is 'c+ … c+', expected one of",
+        ),
+        (
+            f"{HEADER}\n{PARKED.replace('-38.698', '9' * 5000)}",
+            r":2: x is '9+ … 9+', expected a finite number",
+        ),
+        (
+            f"{HEADER}\n{PARKED.replace('20001', '9' * 5000)}",
+            r":2: id is '9+ … 9+', expected an integer",
+        ),
+        (
+            f"{HEADER}\n{PARKED.replace('True', chr(27) + '[2J')}",
+            r":2: camera_visible is '\\x1b\[2J', expected",
+        ),
     ],
 )
 def test_a_message_quotes_little(write, text: str, message: str) -> None:
@@ -305,9 +409,13 @@ def test_a_message_quotes_little(write, text: str, message: str) -> None:
 
 
 @pytest.mark.parametrize("ends", ["\n", "\r"])
-def test_a_file_of_too_many_lines_is_refused(write, monkeypatch: pytest.MonkeyPatch, ends: str) -> None:
+def test_a_file_of_too_many_lines_is_refused(
+    write, monkeypatch: pytest.MonkeyPatch, ends: str
+) -> None:
     path = write(HEADER + ends * 300_000)
-    with pytest.raises(LabelError, match=r"has 300,00\d lines, more than 262,144; if it is sound") as raised:
+    with pytest.raises(
+        LabelError, match=r"has 300,00\d lines, more than 262,144; if it is sound"
+    ) as raised:
         read_label(path)
     word = str(raised.value).split("set ")[1].split(";")[0]
     monkeypatch.setenv(LIMITS_VARIABLE, word.removeprefix(f"{LIMITS_VARIABLE}="))
@@ -320,7 +428,13 @@ def test_the_first_fault_among_many_boxes_is_named(write, line: int, ends: str) 
     lines = [HEADER, *[PARKED] * 4999, "van 1", "bus 2"]
     lines[line - 1] = "bus 1"
     path = write(ends.join(lines))
-    assert_refused((lambda: read_label(path), LabelError, rf"label\.txt:{line}: expected 13 fields, found 2: 'bus 1'"))
+    assert_refused(
+        (
+            lambda: read_label(path),
+            LabelError,
+            rf"label\.txt:{line}: expected 13 fields, found 2: 'bus 1'",
+        )
+    )
 
 
 READ = """
@@ -338,7 +452,11 @@ for path in sys.argv[1:]:
 
 def test_lines_of_too_many_words_are_read_in_arrows_own_memory(write) -> None:
     """Arrow's reader of CSV, up to 19, writes beyond it (apache/arrow 45497)."""
-    texts = ("1 " * 100_000, f"{HEADER}\n" + "1 " * 100_000, f"{HEADER}\n" + f"{PARKED}\n" * 3000 + "1 " * 9000)
+    texts = (
+        "1 " * 100_000,
+        f"{HEADER}\n" + "1 " * 100_000,
+        f"{HEADER}\n" + f"{PARKED}\n" * 3000 + "1 " * 9000,
+    )
     paths = [str(write(text, f"{number}.txt")) for number, text in enumerate(texts)]
     environment = {**os.environ, "ARROW_DEBUG_MEMORY_POOL": "abort"}
     words = [sys.executable, "-c", READ, *paths]
@@ -357,6 +475,10 @@ def test_words_alone_on_a_line_are_told(write, end: str, cut: bool) -> None:
 def test_write_refuses_the_labels_of_several_files(write, tmp_path: Path) -> None:
     out, labels = tmp_path / "out.txt", read_labels([write(REAL), write(REAL)])
     assert_refused(
-        (lambda: write_label(out, labels), LabelError, r"out\.txt: expected the labels of one file, found 2")
+        (
+            lambda: write_label(out, labels),
+            LabelError,
+            r"out\.txt: expected the labels of one file, found 2",
+        )
     )
     assert not out.exists()

@@ -9,7 +9,10 @@ from deepaccident_devkit.release.layout import frame_numbers, left_aside
 from deepaccident_devkit.release.store import open_dataroot
 
 ACCIDENT, NORMAL = "type1_subtype1_accident", "type1_subtype2_normal"
-NAME, OTHER = "Town03_type001_subtype0001_scenario00024", "Town10HD_type001_subtype0001_scenario00014"
+NAME, OTHER = (
+    "Town03_type001_subtype0001_scenario00024",
+    "Town10HD_type001_subtype0001_scenario00014",
+)
 
 
 @pytest.fixture
@@ -20,7 +23,9 @@ def root(tmp_path: Path) -> Path:
     return path
 
 
-def scenario(folder: Path, scenario_type: str = ACCIDENT, name: str = NAME, agents=("ego_vehicle",)) -> None:
+def scenario(
+    folder: Path, scenario_type: str = ACCIDENT, name: str = NAME, agents=("ego_vehicle",)
+) -> None:
     for agent in agents:
         (folder / scenario_type / agent / "calib" / name).mkdir(parents=True)
 
@@ -37,7 +42,9 @@ def found(root: Path, version: str = "v1") -> list[tuple[str, str]]:
         ("A+B", [("val", ACCIDENT, NAME), ("", ACCIDENT, OTHER)]),
     ],
 )
-def test_layouts_in_the_order_of_tokens(root: Path, layout: str, scenarios: list[tuple[str, str, str]]) -> None:
+def test_layouts_in_the_order_of_tokens(
+    root: Path, layout: str, scenarios: list[tuple[str, str, str]]
+) -> None:
     """A scenario may stand in two splits."""
     for folder, kind, name in reversed(scenarios):
         scenario(root / folder, kind, name)
@@ -61,35 +68,72 @@ def test_no_release_there(root: Path, version: str) -> None:
     file, gone = root / "file.txt", root / "gone"
     file.write_text("")
     assert_refused(
-        (lambda: find_release(gone, version), DatarootError, (f"{gone}: does not exist", "give the folder")),
-        (lambda: find_release(file, version), DatarootError, (f"{file}: is a file", "give the folder")),
-        (lambda: find_release(root, version), DatarootError, (f"{root}: no scenario found", "deepaccident synth OUT")),
+        (
+            lambda: find_release(gone, version),
+            DatarootError,
+            (f"{gone}: does not exist", "give the folder"),
+        ),
+        (
+            lambda: find_release(file, version),
+            DatarootError,
+            (f"{file}: is a file", "give the folder"),
+        ),
+        (
+            lambda: find_release(root, version),
+            DatarootError,
+            (f"{root}: no scenario found", "deepaccident synth OUT"),
+        ),
     )
     # the shell of one: sensors and labels, but no calib; files where folders are expected
     (root / ACCIDENT / "ego_vehicle" / "label" / NAME).mkdir(parents=True)
     for name in (f"{ACCIDENT}/other_vehicle", NORMAL, "train"):
         (root / name).write_text("")
     assert_refused(
-        (lambda: find_release(root, version), DatarootError if version == "v1" else VersionError, f"^{root}: ")
+        (
+            lambda: find_release(root, version),
+            DatarootError if version == "v1" else VersionError,
+            f"^{root}: ",
+        )
     )
     scenario(root)
     of_type = root / ACCIDENT
     assert_refused(
-        (lambda: find_release(of_type), DatarootError, f"{of_type}: no scenario found; .* type: give {root}; expected"),
-        (lambda: find_release(root, "v2"), VersionError, "unknown version 'v2'; known are v1, v1-mini"),
-        (lambda: find_release(root, "v1-mini"), VersionError, (f"{root}: holds no mini release", "version='v1'")),
+        (
+            lambda: find_release(of_type),
+            DatarootError,
+            f"{of_type}: no scenario found; .* type: give {root}; expected",
+        ),
+        (
+            lambda: find_release(root, "v2"),
+            VersionError,
+            "unknown version 'v2'; known are v1, v1-mini",
+        ),
+        (
+            lambda: find_release(root, "v1-mini"),
+            VersionError,
+            (f"{root}: holds no mini release", "version='v1'"),
+        ),
     )
 
 
 def test_agents_are_those_with_a_calib_folder_in_the_usual_order(root: Path) -> None:
     scenario(root, agents=("infrastructure", "other_vehicle", "ego_vehicle", "bystander"))
     (root / ACCIDENT / "ego_vehicle_behind" / "label" / NAME).mkdir(parents=True)
-    assert find_release(root).scenarios[0].agents == ("ego_vehicle", "other_vehicle", "infrastructure")
+    assert find_release(root).scenarios[0].agents == (
+        "ego_vehicle",
+        "other_vehicle",
+        "infrastructure",
+    )
 
 
 def test_what_else_lies_about_is_ignored(root: Path) -> None:
     scenario(root)
-    for kind in ("type1_subtype1_accident_old", "my_notes", f"trainval/{ACCIDENT}", f".deepaccident/{ACCIDENT}"):
+    for kind in (
+        "type1_subtype1_accident_old",
+        "my_notes",
+        f"trainval/{ACCIDENT}",
+        f".deepaccident/{ACCIDENT}",
+    ):
         scenario(root, kind)
     (root / ACCIDENT / "ego_vehicle" / "calib" / ".cache").mkdir()
     (root / ACCIDENT / "ego_vehicle" / "calib" / "readme.txt").write_text("")
@@ -142,7 +186,11 @@ def test_links_that_lead_to_themselves_or_back_hold_nothing(root: Path) -> None:
     loops += [root / ACCIDENT / "infrastructure", ego / "label"]
     for path in loops:
         path.symlink_to(path.name)
-    back = {root / "val": root, root / "type1_subtype2_accident": root, root / ACCIDENT / "other_vehicle": ego.parent}
+    back = {
+        root / "val": root,
+        root / "type1_subtype2_accident": root,
+        root / ACCIDENT / "other_vehicle": ego.parent,
+    }
     for path, end in back.items():
         path.symlink_to(end)
     assert found(root) == [("", f"{ACCIDENT}/{NAME}")]
@@ -162,11 +210,24 @@ def test_a_dataroot_that_links_to_itself(root: Path, name: str) -> None:
             DatarootError,
             rf"{link}: is a link that leads nowhere; give the folder",
         ),
-        (lambda: find_release(open_dataroot(root)), DatarootError, rf"{root}: no scenario found; {link} is a link"),
+        (
+            lambda: find_release(open_dataroot(root)),
+            DatarootError,
+            rf"{root}: no scenario found; {link} is a link",
+        ),
     )
 
 
-COPIES = ("{}-001", "{} (1)", "{} 2", "{}-20240101T000000Z-001", "{} - Copy", "Copy of {}", "{}_old", "{}.1")
+COPIES = (
+    "{}-001",
+    "{} (1)",
+    "{} 2",
+    "{}-20240101T000000Z-001",
+    "{} - Copy",
+    "Copy of {}",
+    "{}_old",
+    "{}.1",
+)
 
 
 @pytest.mark.parametrize("copy", COPIES)
@@ -185,10 +246,14 @@ def test_folders_that_look_like_those_of_a_release_are_named(root: Path, copy: s
     scenario(root / copy.format("train"))
     scenario(root / copy.format("DeepAccident_mini") / "DeepAccident_mini")
     expected |= {root / copy.format(name): name for name in ("train", "DeepAccident_mini")}
-    with pytest.raises(DatarootError, match=rf"^{root}: no scenario found; {root}.* looks like .*: rename it"):
+    with pytest.raises(
+        DatarootError, match=rf"^{root}: no scenario found; {root}.* looks like .*: rename it"
+    ):
         find_release(root)
     scenario(root, agents=("ego_vehicle_behind", "veh1"))
     (root / copy.format("test")).mkdir()  # holds no scenario
     aside = dict(left_aside(root))
-    assert (aside.pop(root / ACCIDENT / "veh1") or "").startswith("an agent, of which the release has ego_vehicle, ego")
+    assert (aside.pop(root / ACCIDENT / "veh1") or "").startswith(
+        "an agent, of which the release has ego_vehicle, ego"
+    )
     assert aside == expected

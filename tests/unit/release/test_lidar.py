@@ -52,10 +52,22 @@ def test_other_arrays_are_refused(path: Path, data: np.ndarray, found: str, raw:
 def test_writing_restores_carlas_signs_in_single_precision_as_float64(path: Path) -> None:
     write_lidar(path, [[1, 2, 0.1]], [0.5])
     with np.load(path) as archive:
-        np.testing.assert_array_equal(archive["data"], np.array([[1, -2, np.float32(0.1), 0.5]]), strict=True)
+        np.testing.assert_array_equal(
+            archive["data"], np.array([[1, -2, np.float32(0.1), 0.5]]), strict=True
+        )
 
 
-@pytest.mark.parametrize(("xyz", "intensity"), [([[1, 2]], [1]), ([[1, 2, 3]], [1, 2]), ([[1, 2, 3]], 1)])
-def test_writing_other_shapes_is_refused_and_leaves_nothing(path: Path, xyz: list, intensity: list) -> None:
-    assert_refused((lambda: write_lidar(path, xyz, intensity), GeometryError, r"(xyz|intensity): expected shape"))
+@pytest.mark.parametrize(
+    ("xyz", "intensity"), [([[1, 2]], [1]), ([[1, 2, 3]], [1, 2]), ([[1, 2, 3]], 1)]
+)
+def test_writing_other_shapes_is_refused_and_leaves_nothing(
+    path: Path, xyz: list, intensity: list
+) -> None:
+    assert_refused(
+        (
+            lambda: write_lidar(path, xyz, intensity),
+            GeometryError,
+            r"(xyz|intensity): expected shape",
+        )
+    )
     assert list(path.parent.iterdir()) == []

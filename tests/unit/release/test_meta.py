@@ -102,14 +102,20 @@ def test_tolerated_forms(write, text: str) -> None:
 )
 def test_a_missing_or_empty_line_is_none(write, line: int, field: str) -> None:
     lines = ACCIDENT.splitlines()
-    assert read_meta(write("\n".join(lines[:line] + lines[line + 1 :]))) == replace(ACCIDENT_META, **{field: None})
+    assert read_meta(write("\n".join(lines[:line] + lines[line + 1 :]))) == replace(
+        ACCIDENT_META, **{field: None}
+    )
     if line > 2:
         lines[line] = lines[line].split(":")[0] + ":"
         assert getattr(read_meta(write("\n".join(lines))), field) is None
 
 
-@pytest.mark.parametrize(("named", "agents"), [("", None), (" colliding agents: ego none\n", ("ego_vehicle", None))])
-def test_colliding_agents_may_be_missing_or_third_road_users(write, named: str, agents: tuple | None) -> None:
+@pytest.mark.parametrize(
+    ("named", "agents"), [("", None), (" colliding agents: ego none\n", ("ego_vehicle", None))]
+)
+def test_colliding_agents_may_be_missing_or_third_road_users(
+    write, named: str, agents: tuple | None
+) -> None:
     read = read_meta(write(ACCIDENT.replace(" colliding agents: ego_behind other_behind\n", named)))
     assert read.collision == replace(ACCIDENT_META.collision, agents=agents)
 
@@ -139,16 +145,37 @@ def test_a_pair_with_an_untracked_id_is_no_collision(write) -> None:
         (ACCIDENT.replace(" same", ""), ":1: expected 9 words '<weather.*found 8: 'HardRainNoon"),
         (ACCIDENT.replace(" same", " same same"), ":1: expected 9 words .*found 10"),
         (ACCIDENT.replace("1236 car", "x36 car"), ":1: first id: expected an integer, found 'x36'"),
-        (ACCIDENT.replace("1237 car", "12.5 car"), ":1: second id: expected an integer, found '12.5'"),
-        (ACCIDENT.replace("6790.168605131015", "hard"), ":1: impact: expected a finite number, found 'hard'"),
-        (ACCIDENT.replace("6790.168605131015", "1e300"), ":1: impact: expected a finite number, found '1e300'"),
-        (ACCIDENT.replace("6790.168605131015", "nan"), ":1: impact: expected a finite number, found 'nan'"),
-        ("\n\n" + ACCIDENT.replace("78", "many"), ":3: simulated frames: expected an integer, found 'many'"),
-        (ACCIDENT.replace("ego_behind other", "ego_behind"), ":2: expected two of ego, ego_behind, .*'ego_behind_b"),
+        (
+            ACCIDENT.replace("1237 car", "12.5 car"),
+            ":1: second id: expected an integer, found '12.5'",
+        ),
+        (
+            ACCIDENT.replace("6790.168605131015", "hard"),
+            ":1: impact: expected a finite number, found 'hard'",
+        ),
+        (
+            ACCIDENT.replace("6790.168605131015", "1e300"),
+            ":1: impact: expected a finite number, found '1e300'",
+        ),
+        (
+            ACCIDENT.replace("6790.168605131015", "nan"),
+            ":1: impact: expected a finite number, found 'nan'",
+        ),
+        (
+            "\n\n" + ACCIDENT.replace("78", "many"),
+            ":3: simulated frames: expected an integer, found 'many'",
+        ),
+        (
+            ACCIDENT.replace("ego_behind other", "ego_behind"),
+            ":2: expected two of ego, ego_behind, .*'ego_behind_b",
+        ),
         (ACCIDENT.replace("ego_behind other_behind", "ego"), ":2: expected two of .*, found 'ego'"),
         (ACCIDENT.replace("1212", "twelve"), ":3: agent's id: expected an integer, found 'twelve'"),
         (ACCIDENT.replace(" 1212", ""), ":3: expected four agents' ids, found '1223 1236 1237'"),
-        (ACCIDENT.replace("road_type:", "road_type"), ":4: expected '<key>: <value>', found 'road_type four-way"),
+        (
+            ACCIDENT.replace("road_type:", "road_type"),
+            ":4: expected '<key>: <value>', found 'road_type four-way",
+        ),
         ("", ":1: expected '<weather.*found an empty file"),
         (" \n\n", ":1: expected '<weather.*found an empty file"),
     ],
@@ -162,12 +189,17 @@ def test_binary_garbage_and_a_missing_file(write, tmp_path: Path) -> None:
     path = write(b"\x80\x04\x95\xff\xfe" * 10)
     assert_refused(
         (lambda: read_meta(path), MetaError, f"^{path}: not a text file .*{REMEDY}$"),
-        (lambda: read_meta(tmp_path / "gone.txt"), MissingFileError, r"gone\.txt: no such file; unpack"),
+        (
+            lambda: read_meta(tmp_path / "gone.txt"),
+            MissingFileError,
+            r"gone\.txt: no such file; unpack",
+        ),
     )
 
 
 @pytest.mark.parametrize(
-    ("meta", "text"), [(ACCIDENT_META, ACCIDENT), (QUIET_META, f"{NO_COLLISION}\n colliding agents: none none\n")]
+    ("meta", "text"),
+    [(ACCIDENT_META, ACCIDENT), (QUIET_META, f"{NO_COLLISION}\n colliding agents: none none\n")],
 )
 def test_written_text_is_as_the_release_has_it(tmp_path: Path, meta: Meta, text: str) -> None:
     write_meta(tmp_path / "meta.txt", meta)
@@ -175,10 +207,15 @@ def test_written_text_is_as_the_release_has_it(tmp_path: Path, meta: Meta, text:
 
 
 @pytest.mark.parametrize("names", ["other other_behind", "ego none"])
-def test_a_normal_scenario_names_those_who_were_to_collide(write, tmp_path: Path, names: str) -> None:
+def test_a_normal_scenario_names_those_who_were_to_collide(
+    write, tmp_path: Path, names: str
+) -> None:
     text = f"{NO_COLLISION}\n colliding agents: {names}"
     meta = read_meta(write(text))
-    assert (meta.collision, meta.planned_agents) == (None, tuple(META_AGENTS[name] for name in names.split()))
+    assert (meta.collision, meta.planned_agents) == (
+        None,
+        tuple(META_AGENTS[name] for name in names.split()),
+    )
     write_meta(tmp_path / "meta.txt", meta)
     assert (tmp_path / "meta.txt").read_text() == text
 
@@ -198,8 +235,16 @@ def test_damage_raises_our_error_or_nothing(
     [
         ("four-way junction", "x" * 200_000, None),
         (" agents id: ", " " + "x" * 200_000, r"expected '<key>: <value>', found 'x+ … "),
-        (" agents id: ", f" agents id: {'7 ' * 100_000}", r"expected four agents' ids, found '7 7 "),
-        (" agents id: ", f" agents id: {'7' * 5000}", r"agent's id: expected an integer, found '7+ … 7+1223'"),
+        (
+            " agents id: ",
+            f" agents id: {'7 ' * 100_000}",
+            r"expected four agents' ids, found '7 7 ",
+        ),
+        (
+            " agents id: ",
+            f" agents id: {'7' * 5000}",
+            r"agent's id: expected an integer, found '7+ … 7+1223'",
+        ),
         (" agents id: ", " agents id: ٧", r"agent's id: expected an integer, found '٧"),
         (" agents id: ", " agents id: 1_0", r"agent's id: expected an integer, found '1_0"),
         (" agents id: ", f" agents id: {2**63}", r"agent's id: expected an integer, found '9223"),

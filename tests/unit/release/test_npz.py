@@ -46,8 +46,12 @@ def test_the_array_named_data_or_the_only_one(path: Path, save) -> None:
     np.testing.assert_array_equal(read_npz(path, "lidar"), DATA, strict=True)
 
 
-@pytest.mark.parametrize("array", [DATA, DATA.T, DATA[:0], DATA.astype(">f8"), np.arange(3, dtype=np.uint8), DATA[::2]])
-def test_written_arrays_come_back_and_bytes_are_the_same_twice(path: Path, array: np.ndarray) -> None:
+@pytest.mark.parametrize(
+    "array", [DATA, DATA.T, DATA[:0], DATA.astype(">f8"), np.arange(3, dtype=np.uint8), DATA[::2]]
+)
+def test_written_arrays_come_back_and_bytes_are_the_same_twice(
+    path: Path, array: np.ndarray
+) -> None:
     write_npz(path, array)
     np.testing.assert_array_equal(read_npz(path, "lidar"), array, strict=True)
     with np.load(path) as archive:
@@ -69,7 +73,11 @@ def test_two_arrays_none_named_data_and_a_bare_array(path: Path) -> None:
             SensorFileError,
             (*expected, "points, intensity"),
         ),
-        (lambda: read(lambda: write_members(path, {})), SensorFileError, (*expected, "found no array")),
+        (
+            lambda: read(lambda: write_members(path, {})),
+            SensorFileError,
+            (*expected, "found no array"),
+        ),
         (
             lambda: read(lambda: path.write_bytes(npy(DATA))),
             SensorFileError,
@@ -81,7 +89,11 @@ def test_two_arrays_none_named_data_and_a_bare_array(path: Path) -> None:
 def test_objects_empty_truncated_garbage_and_missing(path: Path) -> None:
     """Objects are never unpickled."""
     assert_refused(
-        (lambda: read_npz(path, "lidar"), MissingFileError, ("points.npz: no such file", "unpack the archive"))
+        (
+            lambda: read_npz(path, "lidar"),
+            MissingFileError,
+            ("points.npz: no such file", "unpack the archive"),
+        )
     )
     np.savez(path, data=np.array([{"a": 1}]))
     objects = path.read_bytes()
@@ -104,7 +116,9 @@ def with_field(content: bytes, local: int, central: int, value: int) -> bytes:
 
 def huge_header() -> bytes:
     header = io.BytesIO()
-    np.lib.format.write_array_header_1_0(header, {"descr": "<f4", "fortran_order": False, "shape": (10**13, 4)})
+    np.lib.format.write_array_header_1_0(
+        header, {"descr": "<f4", "fortran_order": False, "shape": (10**13, 4)}
+    )
     return header.getvalue()
 
 
@@ -119,9 +133,19 @@ def huge_header() -> bytes:
         ({"data.npy": npy(DATA)}, (8, 10, 99)),
         ({"data.npy": npy(DATA)}, (4, 6, 255)),
     ],
-    ids=["text-as-data", "text", "empty-member", "more-than-fits", "encrypted", "unknown-compression", "new-version"],
+    ids=[
+        "text-as-data",
+        "text",
+        "empty-member",
+        "more-than-fits",
+        "encrypted",
+        "unknown-compression",
+        "new-version",
+    ],
 )
-def test_archives_that_are_not_numpys(path: Path, members: dict[str, bytes], fields: tuple | None) -> None:
+def test_archives_that_are_not_numpys(
+    path: Path, members: dict[str, bytes], fields: tuple | None
+) -> None:
     write_members(path, members)
     if fields:
         assert read_npz(path, "lidar").shape == DATA.shape

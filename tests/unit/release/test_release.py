@@ -11,7 +11,9 @@ from deepaccident_devkit.errors import MissingFileError, ReleaseError
 
 READERS = {name: getattr(release, name) for name in release.__all__ if name.startswith("read_")}
 SINGLE = {
-    name: reader if name not in ("read_calibs", "read_labels") else lambda path, reader=reader: reader([path])
+    name: reader
+    if name not in ("read_calibs", "read_labels")
+    else lambda path, reader=reader: reader([path])
     for name, reader in READERS.items()
 }
 
@@ -20,7 +22,10 @@ SINGLE = {
 def test_a_missing_file_is_ours_and_pythons_own_error(tmp_path: Path, read: Callable) -> None:
     gone = tmp_path / "gone"
     assert_refused(
-        *((lambda: read(gone), kind, f"^{gone}: no such file") for kind in (MissingFileError, FileNotFoundError))
+        *(
+            (lambda: read(gone), kind, f"^{gone}: no such file")
+            for kind in (MissingFileError, FileNotFoundError)
+        )
     )
 
 

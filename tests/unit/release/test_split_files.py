@@ -34,7 +34,9 @@ def test_tokens_in_the_files_order_each_once(path: Path, text: str) -> None:
 
 
 @pytest.mark.parametrize("count", [0, 2])
-def test_raw_keeps_repeated_lines_and_an_empty_file_names_no_scenario(path: Path, count: int) -> None:
+def test_raw_keeps_repeated_lines_and_an_empty_file_names_no_scenario(
+    path: Path, count: int
+) -> None:
     path.write_text(f"{TYPE} {NAME}\n\n" * count + "\n \n")
     assert read_split_file(path, raw=True) == [f"{TYPE}/{NAME}"] * count
     assert read_split_file(path) == [f"{TYPE}/{NAME}"] * min(count, 1)
@@ -42,7 +44,9 @@ def test_raw_keeps_repeated_lines_and_an_empty_file_names_no_scenario(path: Path
 
 @pytest.mark.parametrize("line", [NAME, f"{TYPE} {NAME} 3"])
 @pytest.mark.parametrize("raw", [False, True])
-def test_a_malformed_line_is_named_by_its_number_in_the_file(path: Path, line: str, raw: bool) -> None:
+def test_a_malformed_line_is_named_by_its_number_in_the_file(
+    path: Path, line: str, raw: bool
+) -> None:
     path.write_text(f"{TYPE} {NAME}\n\n{line}\n")
     message = rf"^{path}:3: expected '<scenario_type> <scenario>', found '{line}'; mend or remove the line$"
     assert_refused((lambda: read_split_file(path, raw=raw), SplitFileError, message))
@@ -63,11 +67,15 @@ def test_binary_garbage_and_a_missing_file(path: Path) -> None:
 
 def test_a_name_that_is_no_utf8_hides_no_other(path: Path) -> None:
     path.write_bytes(f"{TYPE} {NAME}\n".encode() + b"type1_subtype1_accident \xff\xfe\n")
-    assert read_split_file(path) == [f"{TYPE}/{NAME}", f"type1_subtype1_accident/{os.fsdecode(bytes([255, 254]))}"]
+    assert read_split_file(path) == [
+        f"{TYPE}/{NAME}",
+        f"type1_subtype1_accident/{os.fsdecode(bytes([255, 254]))}",
+    ]
 
 
 @pytest.mark.parametrize(
-    ("tokens", "text"), [([f"{TYPE}/{NAME}", f"{TWIN}/{NAME}"], f"{TYPE} {NAME}\n{TWIN} {NAME}\n"), ([], "")]
+    ("tokens", "text"),
+    [([f"{TYPE}/{NAME}", f"{TWIN}/{NAME}"], f"{TYPE} {NAME}\n{TWIN} {NAME}\n"), ([], "")],
 )
 def test_written_text(path: Path, tokens: list[str], text: str) -> None:
     write_split_file(path, tokens)

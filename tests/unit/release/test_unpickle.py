@@ -44,13 +44,17 @@ def renamed(content: bytes, core: str) -> bytes:
         longer = content.count(counted) * (len(new) - len(old))
         if longer:  # protocols 4 and 5 say how long the frame is
             frame = int.from_bytes(content[3:11], "little") + longer
-            content = content[:3] + frame.to_bytes(8, "little") + content[11:].replace(counted, recounted)
+            content = (
+                content[:3] + frame.to_bytes(8, "little") + content[11:].replace(counted, recounted)
+            )
     return content
 
 
 @pytest.mark.parametrize("core", ["numpy.core", "numpy._core"])
 @pytest.mark.parametrize("protocol", PROTOCOLS)
-def test_every_protocol_of_both_numpys(tmp_path: Path, raw_calib: Calibs, protocol: int, core: str) -> None:
+def test_every_protocol_of_both_numpys(
+    tmp_path: Path, raw_calib: Calibs, protocol: int, core: str
+) -> None:
     content = renamed(pickle.dumps(raw_calib, protocol), core)
     assert f"{core}.".encode() in content
     assert_read_back(tmp_path / "calib.pkl", content, raw_calib)
@@ -66,9 +70,21 @@ def python2_pickle(raw: Calibs) -> bytes:
         rows, columns = array.shape
         dtype = b"cnumpy\ndtype\n" + string(b"f8") + b"K\x00K\x01\x87R(K\x03" + string(b"<")
         dtype += b"NNNJ\xff\xff\xff\xffJ\xff\xff\xff\xffK\x00tb"
-        empty = b"cnumpy.core.multiarray\n_reconstruct\ncnumpy\nndarray\nK\x00\x85" + string(b"b") + b"\x87R"
+        empty = (
+            b"cnumpy.core.multiarray\n_reconstruct\ncnumpy\nndarray\nK\x00\x85"
+            + string(b"b")
+            + b"\x87R"
+        )
         shape = b"K" + bytes([rows]) + b"K" + bytes([columns]) + b"\x86"
-        return empty + b"(K\x01" + shape + dtype + b"\x89" + string(array.astype("<f8").tobytes()) + b"tb"
+        return (
+            empty
+            + b"(K\x01"
+            + shape
+            + dtype
+            + b"\x89"
+            + string(array.astype("<f8").tobytes())
+            + b"tb"
+        )
 
     items = b"".join(string(key.encode()) + dumped(array) for key, array in raw.items())
     return b"\x80\x02}(" + items + b"u."
@@ -113,14 +129,18 @@ def touching(flag: str) -> dict[str, Call]:
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
 @pytest.mark.parametrize("name", list(touching("")))
-def test_a_pickle_that_runs_something_runs_nothing(tmp_path: Path, raw_calib: Calibs, name: str, protocol: int) -> None:
+def test_a_pickle_that_runs_something_runs_nothing(
+    tmp_path: Path, raw_calib: Calibs, name: str, protocol: int
+) -> None:
     folder = tmp_path / "made"
     folder.mkdir()
     path = tmp_path / "calib.pkl"
     attack = touching(str(folder / "flag"))[name]
     for place in ({**raw_calib, "more": attack}, {"first": attack, **raw_calib}, attack, [attack]):
         path.write_bytes(pickle.dumps(place, protocol))
-        with pytest.raises(CalibError, match=rf"^{path}: not a readable calibration \(.*not allowed\); restore"):
+        with pytest.raises(
+            CalibError, match=rf"^{path}: not a readable calibration \(.*not allowed\); restore"
+        ):
             read_calib(path)
         assert list(folder.iterdir()) == []
     pickle.loads(path.read_bytes())
@@ -221,7 +241,13 @@ HOSTILE = {
 def test_hostile_opcodes(tmp_path: Path, raw_calib: Calibs, name: str) -> None:
     flag, path = tmp_path / "flag", tmp_path / "calib.pkl"
     path.write_bytes(HOSTILE[name].replace(b"FLAG", bytes(flag)))
-    assert_refused((lambda: read_calib(path), CalibError, rf"(?s)^{path}: .*; restore the file from its archive$"))
+    assert_refused(
+        (
+            lambda: read_calib(path),
+            CalibError,
+            rf"(?s)^{path}: .*; restore the file from its archive$",
+        )
+    )
     assert not flag.exists()
     # nothing of it stays behind in the stand-ins
     assert_read_back(path, pickle.dumps(raw_calib, 2), raw_calib)
@@ -254,7 +280,9 @@ def int4(number: int) -> bytes:
 
 def in_dict(*values: bytes) -> bytes:
     """A protocol 4 pickle of a dict of these values."""
-    return b"\x80\x04}(" + b"".join(b"V%d\n" % key + value for key, value in enumerate(values)) + b"u."
+    return (
+        b"\x80\x04}(" + b"".join(b"V%d\n" % key + value for key, value in enumerate(values)) + b"u."
+    )
 
 
 LONG_TEXT = b"X" + int4(800_000) + b"x" * 800_000
@@ -266,19 +294,43 @@ MEMO_BOMB = b"r\xff\xff\xff\x0f"
 # number's last 3 bytes and the opcode C, and then run C's contents.
 FRAME_TRICK = b"V0\n\x95\x02" + bytes(7) + b"J\x00" + bytes(3) + b"C(N" + MEMO_BOMB.ljust(39, b"0")
 BOMBS = {
-    "deep key": (b"\x80\x02})" + b"\x85" * 1_000_000 + b"Ns.", "byte 10,000: more than 10,000 opcodes"),
-    "deep key, short": (b"\x80\x02})" + b"\x85" * 9_000 + b"Ns.", "a key that is no text and no whole number"),
-    "deep list": (in_dict(b"]" * 4_900 + b"a" * 4_899), "more than 20 containers within each other"),
-    "deep dict": (in_dict(b"}Va\n" * 3_000 + b"N" + b"s" * 3_000), "more than 20 containers within each other"),
+    "deep key": (
+        b"\x80\x02})" + b"\x85" * 1_000_000 + b"Ns.",
+        "byte 10,000: more than 10,000 opcodes",
+    ),
+    "deep key, short": (
+        b"\x80\x02})" + b"\x85" * 9_000 + b"Ns.",
+        "a key that is no text and no whole number",
+    ),
+    "deep list": (
+        in_dict(b"]" * 4_900 + b"a" * 4_899),
+        "more than 20 containers within each other",
+    ),
+    "deep dict": (
+        in_dict(b"}Va\n" * 3_000 + b"N" + b"s" * 3_000),
+        "more than 20 containers within each other",
+    ),
     "tuple as a key": (b"})Ns.", "a key that is no text and no whole number"),
     "array as a key": (b"}" + EMPTY_ARRAY + b"Ns.", "a key that is no text and no whole number"),
     "number as a key within": (in_dict(b"}K\x01K\x02s"), "a key that is no text, or"),
-    "doubling key": (b"}(Va\n(" + DOUBLING + b"th\x3cNu.", "a key that is no text and no whole number"),
-    "doubling dtype": (b"}(Va\n(" + DOUBLING + b"tVb\n" + DTYPE + b"h\x3c\x85Ru.", "an array of what is no text"),
-    "doubling value": (b"}(Va\n(" + DOUBLING + b"h\x10tu.", "values that are far larger than their pickle"),
+    "doubling key": (
+        b"}(Va\n(" + DOUBLING + b"th\x3cNu.",
+        "a key that is no text and no whole number",
+    ),
+    "doubling dtype": (
+        b"}(Va\n(" + DOUBLING + b"tVb\n" + DTYPE + b"h\x3c\x85Ru.",
+        "an array of what is no text",
+    ),
+    "doubling value": (
+        b"}(Va\n(" + DOUBLING + b"h\x10tu.",
+        "values that are far larger than their pickle",
+    ),
     "list in itself": (in_dict(b"]q\x00h\x00a"), "more than 20 containers within each other"),
     "dict in itself": (b"}q\x00Va\nh\x00s.", "more than 20 containers within each other"),
-    "list in itself twice": (in_dict(b"]q\x00(h\x00h\x00e"), "more than 20 containers within each other"),
+    "list in itself twice": (
+        in_dict(b"]q\x00(h\x00h\x00e"),
+        "more than 20 containers within each other",
+    ),
     "memo": (b"\x80\x02}" + MEMO_BOMB + b".", "lacks lidar_to_ego"),
     "memo by text": (b"}p99999999999\n.", "lacks lidar_to_ego"),
     "memo by a word": (b"}pno\n.", "not a readable calibration"),
@@ -288,16 +340,34 @@ BOMBS = {
     "many nones": (b"(" + b"N" * 1_000_000 + b"l.", "more than 10,000 opcodes"),
     "many lists": (b"(" + b"]" * 1_000_000 + b"l.", "more than 10,000 opcodes"),
     "many entries": (b"}(" + b"Vkey\nN" * 100_000 + b"u.", "more than 10,000 opcodes"),
-    "long whole number": (b"I" + b"7" * 1_000_000 + b"\n.", "byte 0: a number of 1,000,000 characters"),
+    "long whole number": (
+        b"I" + b"7" * 1_000_000 + b"\n.",
+        "byte 0: a number of 1,000,000 characters",
+    ),
     "long Python 2 number": (b"L" + b"7" * 1_000_000 + b"L\n.", "a number of 1,000,001 characters"),
     "long fraction": (b"F" + b"7" * 1_000_000 + b"\n.", "a number of 1,000,000 characters"),
-    "number of bytes": (b"\x8b" + int4(1_000_000) + b"\x7f" * 1_000_000 + b".", "the opcode LONG4 is not allowed"),
-    "text of 8 GiB": (b"\x8d" + (1 << 33).to_bytes(8, "little") + b".", "the opcode BINUNICODE8 is not allowed"),
-    "bytes of 8 GiB": (b"\x8e" + (1 << 33).to_bytes(8, "little") + b".", "the opcode BINBYTES8 is not allowed"),
+    "number of bytes": (
+        b"\x8b" + int4(1_000_000) + b"\x7f" * 1_000_000 + b".",
+        "the opcode LONG4 is not allowed",
+    ),
+    "text of 8 GiB": (
+        b"\x8d" + (1 << 33).to_bytes(8, "little") + b".",
+        "the opcode BINUNICODE8 is not allowed",
+    ),
+    "bytes of 8 GiB": (
+        b"\x8e" + (1 << 33).to_bytes(8, "little") + b".",
+        "the opcode BINBYTES8 is not allowed",
+    ),
     "bytes of 4 GiB": (b"B" + int4(0xFFFFFFFF) + b".", "byte 0: the pickle ends too early"),
     "text of 4 GiB": (b"X" + int4(0xFFFFFFFF) + b".", "byte 0: the pickle ends too early"),
-    "byte array of 800 MB": (b"\x96" + (800_000_000).to_bytes(8, "little") + b".", "byte 0: the pickle ends too early"),
-    "frame of 800 MB": (b"\x95" + (800_000_000).to_bytes(8, "little") + b"}.", "not a readable calibration"),
+    "byte array of 800 MB": (
+        b"\x96" + (800_000_000).to_bytes(8, "little") + b".",
+        "byte 0: the pickle ends too early",
+    ),
+    "frame of 800 MB": (
+        b"\x95" + (800_000_000).to_bytes(8, "little") + b"}.",
+        "not a readable calibration",
+    ),
     "name without end": (b"c" + b"x" * 1_000_000, "byte 0: the pickle ends too early"),
     "set": (b"\x80\x04\x8f.", "the opcode EMPTY_SET is not allowed"),
     "duplicate": (b"}2.", "the opcode DUP is not allowed"),
@@ -307,7 +377,14 @@ BOMBS = {
     ),
     "array again and again": (
         in_dict(
-            EMPTY_ARRAY + b"(K\x01(J" + int4(100_000) + b"t" + F8 + b"\x89" + LONG_BYTES + b"tbq\x00",
+            EMPTY_ARRAY
+            + b"(K\x01(J"
+            + int4(100_000)
+            + b"t"
+            + F8
+            + b"\x89"
+            + LONG_BYTES
+            + b"tbq\x00",
             *[b"h\x00"] * 4_900,
         ),
         "values that are far larger than their pickle",
@@ -322,17 +399,35 @@ BOMBS = {
     ),
     "long name": (b"cposix\n" + b"x" * 1_000_000 + b"\n.", "the pickle asks for posix.xxx"),
     "long dtype": (DTYPE + b"(" + LONG_TEXT + b"tR.", "an array of 'xxx"),
-    "long attribute": (in_dict(F8 + b"(N(d" + LONG_TEXT + b"Nstb"), "an array of numbers with parts"),
-    "name that changes the screen": (b"cposix\n\x1b[2J\n.", r"the pickle asks for posix.\x1b[2J, which"),
-    "name with half a character": (b"\x80\x04\x8c\x05posix\x8c\x03\xed\xa0\x80\x93.", r"asks for posix.\ud800, which"),
-    "key that changes the screen": (b"}V\x1b[2J\nNs.", "a key that is no text, or cannot be printed"),
+    "long attribute": (
+        in_dict(F8 + b"(N(d" + LONG_TEXT + b"Nstb"),
+        "an array of numbers with parts",
+    ),
+    "name that changes the screen": (
+        b"cposix\n\x1b[2J\n.",
+        r"the pickle asks for posix.\x1b[2J, which",
+    ),
+    "name with half a character": (
+        b"\x80\x04\x8c\x05posix\x8c\x03\xed\xa0\x80\x93.",
+        r"asks for posix.\ud800, which",
+    ),
+    "key that changes the screen": (
+        b"}V\x1b[2J\nNs.",
+        "a key that is no text, or cannot be printed",
+    ),
     "shape with a hole": (array_of(b"J\xff\xff\xff\xff"), "shape is not what its bytes have"),
-    "shape beyond its bytes": (array_of(b"J\xff\xff\xff\x7f", b"J\xff\xff\xff\x7f"), "cannot reshape array of size 1"),
+    "shape beyond its bytes": (
+        array_of(b"J\xff\xff\xff\x7f", b"J\xff\xff\xff\x7f"),
+        "cannot reshape array of size 1",
+    ),
     "shape of a huge number": (array_of(b"\x8a\xff" + b"\x7f" * 255), "not a readable calibration"),
     "shape of nothing": (array_of(b"N"), "not a readable calibration"),
     "shape of fractions": (array_of(b"F1.0\n"), "not a readable calibration"),
     "shape of many lengths": (array_of(*[b"K\x01"] * 9_000), "not a readable calibration"),
-    "part of a number": (array_of(b"K\x01", content=b"C\x07sevenoh"), "buffer size must be a multiple"),
+    "part of a number": (
+        array_of(b"K\x01", content=b"C\x07sevenoh"),
+        "buffer size must be a multiple",
+    ),
     "array without numbers": (in_dict(EMPTY_ARRAY), "an array without its numbers is not allowed"),
     "dtype as a value": (in_dict(F8), "a part of numpy in place of a value is not allowed"),
     "class as a value": (in_dict(NDARRAY), "a part of numpy in place of a value is not allowed"),
@@ -348,7 +443,9 @@ def bomb_outcomes(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict]:
     for path, (content, _) in zip(paths, BOMBS.values(), strict=True):
         path.write_bytes(content)
     script = Path(__file__).parents[2] / "forked.py"
-    read = subprocess.run([sys.executable, script, *paths], capture_output=True, text=True, check=True)
+    read = subprocess.run(
+        [sys.executable, script, *paths], capture_output=True, text=True, check=True
+    )
     return dict(zip(BOMBS, map(json.loads, read.stdout.splitlines()), strict=True))
 
 
@@ -375,9 +472,51 @@ def _little_memory():
 
 PIECES = [
     *(RECONSTRUCT, NDARRAY, DTYPE, FROMBUFFER, ENCODE, SYSTEM, EMPTY_ARRAY, F8),
-    *(b"(", b"t", b"R", b"b", b"d", b"l", b"s", b"a", b"u", b"e", b"0", b"1", b"2", b".", b"N", b"\x81", b"\x92", b"o"),
-    *(b"Vlatin1\n", b"Vf8\n", b"V__class__\n", b"I1\n", b"I01\n", b"C\x08abcdefgh", b"p0\n", b"g0\n", b"\x85", b"\x86"),
-    *(b"\x80\x04", b"\x8c\x05numpy", b"\x8c\x05dtype", b"\x93", b"}", b"]", b")", b"\x8f", b"\x90", b"\x91", b"\x98"),
+    *(
+        b"(",
+        b"t",
+        b"R",
+        b"b",
+        b"d",
+        b"l",
+        b"s",
+        b"a",
+        b"u",
+        b"e",
+        b"0",
+        b"1",
+        b"2",
+        b".",
+        b"N",
+        b"\x81",
+        b"\x92",
+        b"o",
+    ),
+    *(
+        b"Vlatin1\n",
+        b"Vf8\n",
+        b"V__class__\n",
+        b"I1\n",
+        b"I01\n",
+        b"C\x08abcdefgh",
+        b"p0\n",
+        b"g0\n",
+        b"\x85",
+        b"\x86",
+    ),
+    *(
+        b"\x80\x04",
+        b"\x8c\x05numpy",
+        b"\x8c\x05dtype",
+        b"\x93",
+        b"}",
+        b"]",
+        b")",
+        b"\x8f",
+        b"\x90",
+        b"\x91",
+        b"\x98",
+    ),
 ]
 
 
@@ -385,7 +524,11 @@ PIECES = [
 @settings(max_examples=150)
 @given(data=st.data(), protocol=st.sampled_from(PROTOCOLS))
 def test_damage_raises_our_error_or_nothing(
-    tmp_path_factory: pytest.TempPathFactory, raw_calib: Calibs, outcome, data: st.DataObject, protocol: int
+    tmp_path_factory: pytest.TempPathFactory,
+    raw_calib: Calibs,
+    outcome,
+    data: st.DataObject,
+    protocol: int,
 ) -> None:
     path = tmp_path_factory.getbasetemp() / "damaged.pkl"
     path.write_bytes(data.draw(mutations(pickle.dumps(raw_calib, protocol))))
@@ -396,7 +539,9 @@ def test_damage_raises_our_error_or_nothing(
 @pytest.mark.usefixtures("_little_memory")
 @settings(max_examples=200)
 @given(pieces=st.lists(st.sampled_from(PIECES), max_size=25))
-def test_random_programs_raise_our_error(tmp_path_factory: pytest.TempPathFactory, pieces: list[bytes]) -> None:
+def test_random_programs_raise_our_error(
+    tmp_path_factory: pytest.TempPathFactory, pieces: list[bytes]
+) -> None:
     path = tmp_path_factory.getbasetemp() / "program.pkl"
     path.write_bytes(b"".join(pieces) + b".")
     assert_refused((lambda: read_calib(path), CalibError, r"program\.pkl: "))
@@ -408,7 +553,11 @@ def test_random_programs_raise_our_error(tmp_path_factory: pytest.TempPathFactor
         st.text(st.characters(exclude_categories=["C", "Z"])),
         hypothesis_numpy.arrays(
             st.sampled_from(
-                [order + code for order in "<>" for code in ("f2", "f4", "f8", "i2", "i8", "u4", "u1", "b1")]
+                [
+                    order + code
+                    for order in "<>"
+                    for code in ("f2", "f4", "f8", "i2", "i8", "u4", "u1", "b1")
+                ]
             ),
             hypothesis_numpy.array_shapes(max_dims=4, max_side=4),
         ),
@@ -425,7 +574,9 @@ def test_all_arrays_are_read_back(arrays: Calibs, protocol: int, *, fortran: boo
         assert not np.shares_memory(array, read[key])
     assert list(read) == list(arrays)
     for key, array in stored.items():
-        np.testing.assert_array_equal(read[key], array.astype(array.dtype.newbyteorder("=")), strict=True)
+        np.testing.assert_array_equal(
+            read[key], array.astype(array.dtype.newbyteorder("=")), strict=True
+        )
 
 
 def outcome_of(content: bytes) -> Calibs | str:
@@ -439,7 +590,9 @@ def outcome_of(content: bytes) -> Calibs | str:
 def test_changed_bytes_are_refused_or_read_as_python_reads_them(
     raw_calib: Calibs, monkeypatch: pytest.MonkeyPatch, protocol: int
 ) -> None:
-    content = pickle.dumps({key: raw_calib[key] for key in ("ego_to_world", "intrinsic_Camera_Back")}, protocol)
+    content = pickle.dumps(
+        {key: raw_calib[key] for key in ("ego_to_world", "intrinsic_Camera_Back")}, protocol
+    )
     load_arrays(content)
     remembered = list(pickles.layouts)
     rng = np.random.default_rng(protocol)
@@ -458,7 +611,11 @@ def test_changed_bytes_are_refused_or_read_as_python_reads_them(
             values += 1
             try:
                 plain = pickle.loads(bytes(changed), encoding="latin1")
-            except (TypeError, ValueError, Warning):  # what numpy writes of empty arrays is not looked at here
+            except (
+                TypeError,
+                ValueError,
+                Warning,
+            ):  # what numpy writes of empty arrays is not looked at here
                 continue
             assert list(fresh) == list(known) == list(plain)
             for key, array in plain.items():

@@ -54,7 +54,13 @@ def da_designs(tmp_path_factory: pytest.TempPathFactory) -> DeepAccident:
     """An accident of each of the twelve designs and its normal twin, labels only."""
     root = tmp_path_factory.mktemp("synthetic") / "designs"
     config = SynthConfig(
-        scenarios=24, frames=6, seed=7, sensors=False, unplanned=0, designs=tuple(range(1, 13)), designed=True
+        scenarios=24,
+        frames=6,
+        seed=7,
+        sensors=False,
+        unplanned=0,
+        designs=tuple(range(1, 13)),
+        designed=True,
     )
     return DeepAccident("v1", make_release(root, config, workers=1), verbose=False)
 

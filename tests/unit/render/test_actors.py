@@ -19,12 +19,19 @@ from deepaccident_devkit.v2x import visible_instances
 
 def test_an_annotation_is_shown_large_from_above_and_in_words(da: DeepAccident, frame: str) -> None:
     scenario = frame.rsplit("/", 1)[0]
-    sample, ego = f"{scenario}/ego_vehicle_behind/004", da.get("agent", f"{scenario}/ego_vehicle")["actor_id"]
+    sample, ego = (
+        f"{scenario}/ego_vehicle_behind/004",
+        da.get("agent", f"{scenario}/ego_vehicle")["actor_id"],
+    )
     boxes = da.boxes(sample, "ego")
     row = boxes.actor_id.tolist().index(ego)
-    camera, above, words = render_annotation(da, f"{sample}/{row}", margin=8, fig=detached_figure((10, 5))).axes
+    camera, above, words = render_annotation(
+        da, f"{sample}/{row}", margin=8, fig=detached_figure((10, 5))
+    ).axes
     assert camera.get_title() == "front"
-    np.testing.assert_allclose(np.mean([above.get_xlim(), above.get_ylim()], axis=1), boxes.center[row, :2], atol=1e-9)
+    np.testing.assert_allclose(
+        np.mean([above.get_xlim(), above.get_ylim()], axis=1), boxes.center[row, :2], atol=1e-9
+    )
     assert np.ptp(above.get_xlim()) == pytest.approx(16)
     length, width, height = boxes.size[row]
     assert not lacking(
@@ -60,7 +67,9 @@ def drawn(da: DeepAccident, instance: str, **how: Any) -> dict[str, Any]:
 def test_the_path_is_where_all_agents_labels_have_the_actor(da: DeepAccident, other: str) -> None:
     path, centers = drawn(da, other)["path"], da.trajectory(other).center[:, :2]
     line, star = of_kind(path, LineCollection)[0], of_kind(path, PathCollection)[0]
-    np.testing.assert_allclose(line.get_segments(), np.stack([centers[:-1], centers[1:]], axis=1)[::-1, ::-1])
+    np.testing.assert_allclose(
+        line.get_segments(), np.stack([centers[:-1], centers[1:]], axis=1)[::-1, ::-1]
+    )
     assert to_hex(line.get_color()[0]) == COLLIDER_COLOR
     np.testing.assert_allclose(star.get_offsets(), centers[-1:])
     low, high = np.array([path.get_xlim(), path.get_ylim()]).T
@@ -70,20 +79,29 @@ def test_the_path_is_where_all_agents_labels_have_the_actor(da: DeepAccident, ot
 def test_speed_and_points_are_drawn_over_time(da: DeepAccident, other: str) -> None:
     panels, track = drawn(da, other), da.trajectory(other)
     speeds = np.linalg.norm(track.velocity, axis=1)
-    np.testing.assert_allclose(panels["speed"].lines[0].get_xydata(), np.column_stack([track.timestamp, speeds]))
+    np.testing.assert_allclose(
+        panels["speed"].lines[0].get_xydata(), np.column_stack([track.timestamp, speeds])
+    )
     scenario, actor = other.split("/actor/")
     ego = next(line for line in panels["points"].lines if line.get_label() == "ego")
-    np.testing.assert_array_equal(ego.get_ydata(), sightings(da, scenario, "ego_vehicle", int(actor)).points)
+    np.testing.assert_array_equal(
+        ego.get_ydata(), sightings(da, scenario, "ego_vehicle", int(actor)).points
+    )
     assert to_hex(ego.get_color()) == AGENT_COLORS["ego_vehicle"]
 
 
 def test_a_bar_an_agent_says_when_it_sees_the_actor(da: DeepAccident, other: str) -> None:
     ax, (scenario, actor) = drawn(da, other)["seen"], other.split("/actor/")
-    assert [one.get_text() for one in ax.get_yticklabels()] == [short_name(agent) for agent in AGENTS]
+    assert [one.get_text() for one in ax.get_yticklabels()] == [
+        short_name(agent) for agent in AGENTS
+    ]
     bars = [one for one in ax.collections if type(one) is not LineCollection]
     for full, pale, agent in zip(bars[::2], bars[1::2], AGENTS, strict=False):
         known = sightings(da, scenario, agent, int(actor))
-        assert (len(full.get_paths()), len(pale.get_paths())) == (known.seen.sum(), (~known.seen).sum())
+        assert (len(full.get_paths()), len(pale.get_paths())) == (
+            known.seen.sum(),
+            (~known.seen).sum(),
+        )
         starts = [path.vertices[:, 0].min() for path in full.get_paths()]
         np.testing.assert_allclose(starts, known.timestamp[known.seen] - 0.05, atol=1e-9)
 
@@ -107,7 +125,9 @@ def test_agents_and_layers_can_be_chosen(da: DeepAccident, other: str) -> None:
 
 
 @pytest.mark.parametrize("agent", AGENTS)
-def test_sightings_are_the_agent_s_annotations_and_the_released_rule(da: DeepAccident, other: str, agent: str) -> None:
+def test_sightings_are_the_agent_s_annotations_and_the_released_rule(
+    da: DeepAccident, other: str, agent: str
+) -> None:
     scenario, actor = other.split("/actor/")
     found, known = [], sightings(da, scenario, agent, int(actor))
     for each in da.annotation:

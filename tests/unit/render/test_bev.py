@@ -48,20 +48,31 @@ def test_boxes_and_points_are_where_the_sample_has_them(da: DeepAccident, approa
     near = boxes.select((np.abs(boxes.center[:, :2]) < 35).all(axis=1))
     assert set(outlines(ax)) == footprints(near)
     (points,) = of_kind(ax, PathCollection)
-    np.testing.assert_allclose(points.get_offsets(), cloud[(np.abs(cloud[:, :2]) < 30).all(axis=1), :2])
+    np.testing.assert_allclose(
+        points.get_offsets(), cloud[(np.abs(cloud[:, :2]) < 30).all(axis=1), :2]
+    )
     assert to_hex(points.get_facecolor()[0]) == POINT_COLOR
     np.testing.assert_allclose([ax.get_xlim(), ax.get_ylim()], [(-30, 30), (-30, 30)], atol=1e-9)
 
 
-def test_the_outline_of_a_collider_is_red_within_two_pixels_of_its_corners(da: DeepAccident, approach: str) -> None:
-    ax, boxes = render_bev(da, approach, layers=("boxes",), ax=new_axes()), da.boxes(approach, "ego")
+def test_the_outline_of_a_collider_is_red_within_two_pixels_of_its_corners(
+    da: DeepAccident, approach: str
+) -> None:
+    ax, boxes = (
+        render_bev(da, approach, layers=("boxes",), ax=new_axes()),
+        da.boxes(approach, "ego"),
+    )
     (actor,) = collider_ids(da, approach) - {OWN_ACTOR_ID}
     corners = boxes.bottom_corners()[boxes.actor_id == actor][0, :, :2]
     picture = rendered(ax)
-    assert [has_color(picture, place, COLLIDER_COLOR) for place in on_canvas(ax, corners)] == [True] * 4
+    assert [has_color(picture, place, COLLIDER_COLOR) for place in on_canvas(ax, corners)] == [
+        True
+    ] * 4
 
 
-def test_of_several_agents_each_has_its_colour_its_name_and_its_place(da: DeepAccident, approach: str) -> None:
+def test_of_several_agents_each_has_its_colour_its_name_and_its_place(
+    da: DeepAccident, approach: str
+) -> None:
     ax = render_bev(da, approach, agents=None, frame="world", view_range=80, ax=new_axes())
     scenario, _, number = approach.rsplit("/", 2)
     marks, colors = of_kind(ax, PolyCollection)[-1], list(AGENT_COLORS.values())
@@ -71,21 +82,31 @@ def test_of_several_agents_each_has_its_colour_its_name_and_its_place(da: DeepAc
     world_from_ego = [da.world_from(f"{scenario}/{agent}/{number}", "ego") for agent in AGENTS]
     tips = [pose.apply([[1.8, 0, 0]])[0, :2] for pose in world_from_ego]
     np.testing.assert_allclose([path.vertices[0] for path in marks.get_paths()], tips)
-    np.testing.assert_allclose([text.xy for text in ax.texts], [pose.translation[:2] for pose in world_from_ego])
+    np.testing.assert_allclose(
+        [text.xy for text in ax.texts], [pose.translation[:2] for pose in world_from_ego]
+    )
     assert texts(ax) == [short_name(agent) for agent in AGENTS]
-    np.testing.assert_allclose(np.mean([ax.get_xlim(), ax.get_ylim()], axis=1), world_from_ego[0].translation[:2])
+    np.testing.assert_allclose(
+        np.mean([ax.get_xlim(), ax.get_ylim()], axis=1), world_from_ego[0].translation[:2]
+    )
 
 
 def test_several_agents_boxes_are_drawn_once_an_actor(da: DeepAccident, approach: str) -> None:
     agents = ("ego_vehicle", "infrastructure")
     ax = render_bev(da, approach, agents=agents, layers=["boxes"], ax=new_axes())
     union = cooperative_boxes(da, approach, agents=agents, frame="ego")
-    assert set(outlines(ax)) == footprints(union.select((np.abs(union.center[:, :2]) < 55).all(axis=1)))
+    assert set(outlines(ax)) == footprints(
+        union.select((np.abs(union.center[:, :2]) < 55).all(axis=1))
+    )
 
 
-def test_a_link_moves_what_a_partner_sends_and_not_the_partner_s_mark(da: DeepAccident, approach: str) -> None:
+def test_a_link_moves_what_a_partner_sends_and_not_the_partner_s_mark(
+    da: DeepAccident, approach: str
+) -> None:
     both, link = ("ego_vehicle", "infrastructure"), Link(pose_noise=PoseNoise(mean=3.0, std=0.0))
-    true, wrong = (render_bev(da, approach, agents=both, link=one, ax=new_axes()) for one in (None, link))
+    true, wrong = (
+        render_bev(da, approach, agents=both, link=one, ax=new_axes()) for one in (None, link)
+    )
     np.testing.assert_allclose(places(true), places(wrong))
     first, second = places(true, 1), places(wrong, 1)
     assert first.shape != second.shape or np.abs(first - second).max() > 1
@@ -94,7 +115,9 @@ def test_a_link_moves_what_a_partner_sends_and_not_the_partner_s_mark(da: DeepAc
 
 
 def test_sweeps_add_the_points_of_the_frames_before(da: DeepAccident, approach: str) -> None:
-    one, three = (len(places(render_bev(da, approach, sweeps=sweeps, ax=new_axes()))) for sweeps in (1, 3))
+    one, three = (
+        len(places(render_bev(da, approach, sweeps=sweeps, ax=new_axes()))) for sweeps in (1, 3)
+    )
     assert 2.5 * one < three < 3.5 * one
 
 
@@ -102,12 +125,18 @@ def test_each_layer_draws_its_own_and_nothing_else(da: DeepAccident, approach: s
     kinds = {}
     for layer in ("bev", "points", "boxes", "ids", "velocities", "trajectories"):
         ax = render_bev(da, approach, layers=[layer], ax=new_axes())
-        drawn = {type(one).__name__ for one in ax.collections[:-1]} | {type(one).__name__ for one in ax.images}
+        drawn = {type(one).__name__ for one in ax.collections[:-1]} | {
+            type(one).__name__ for one in ax.images
+        }
         kinds[layer] = drawn | {"text" for _ in ax.texts}
     assert kinds == {
         "bev": {"AxesImage"},
         "points": {PathCollection.__name__},
-        "boxes": {PolyCollection.__name__, LineCollection.__name__, "text"},  # the colliding pair's names
+        "boxes": {
+            PolyCollection.__name__,
+            LineCollection.__name__,
+            "text",
+        },  # the colliding pair's names
         "ids": {"text"},
         "velocities": {Quiver.__name__},
         "trajectories": {LineCollection.__name__},
@@ -117,7 +146,9 @@ def test_each_layer_draws_its_own_and_nothing_else(da: DeepAccident, approach: s
 def test_trajectories_fade_from_the_present_to_where_the_actors_were_and_will_be(
     da: DeepAccident, approach: str
 ) -> None:
-    ax = render_bev(da, approach, layers=["trajectories"], seconds=(0.2, 0.3), view_range=25, ax=new_axes())
+    ax = render_bev(
+        da, approach, layers=["trajectories"], seconds=(0.2, 0.3), view_range=25, ax=new_axes()
+    )
     scenario, _, number = approach.rsplit("/", 2)
     own = da.get("agent", f"{scenario}/ego_vehicle")["actor_id"]
     path = da.trajectory(f"{scenario}/actor/{own}", approach, "ego")
@@ -132,9 +163,12 @@ def test_trajectories_fade_from_the_present_to_where_the_actors_were_and_will_be
 
 
 @pytest.mark.parametrize(
-    ("x", "y", "yaw"), [(20.0, 0.0, 0.0), (0.0, 20.0, 0.0), (-15.0, 10.0, 0.0), (18.0, 7.0, 0.5), (12.0, -20.0, -2.2)]
+    ("x", "y", "yaw"),
+    [(20.0, 0.0, 0.0), (0.0, 20.0, 0.0), (-15.0, 10.0, 0.0), (18.0, 7.0, 0.5), (12.0, -20.0, -2.2)],
 )
-def test_the_bev_camera_lies_under_the_picture_the_right_way_round(x: float, y: float, yaw: float) -> None:
+def test_the_bev_camera_lies_under_the_picture_the_right_way_round(
+    x: float, y: float, yaw: float
+) -> None:
     semantic = np.zeros((1200, 1200), dtype=np.uint8)
     row, column = round(599.5 - x / 0.1), round(599.5 - y / 0.1)
     semantic[row - 15 : row + 16, column - 15 : column + 16] = TAGS["vehicle"]
@@ -144,7 +178,9 @@ def test_the_bev_camera_lies_under_the_picture_the_right_way_round(x: float, y: 
     draw_underlay(image, ax, target_from_ego=world_from_ego, view_range=30)
     assert (ax.get_xlim(), ax.get_ylim()) == ((70, 130), (-80, -20))
     picture, corners = rendered(ax), [(-1, -1), (-1, 1), (1, -1), (1, 1)]
-    places = world_from_ego.apply([[x + dx, y + dy, 0] for dx, dy in (*corners, (3, 0), (0, -3))])[:, :2]
+    places = world_from_ego.apply([[x + dx, y + dy, 0] for dx, dy in (*corners, (3, 0), (0, -3))])[
+        :, :2
+    ]
     vehicle = {"color": BEV_COLORS["vehicle"], "within": 1.0, "tolerance": 3}
     found = [has_color(picture, place, **vehicle) for place in on_canvas(ax, places)]
     assert found == [True] * 4 + [False] * 2
@@ -166,9 +202,15 @@ def test_a_release_without_sensor_files_is_drawn_from_its_labels(da_b: DeepAccid
 def test_the_receiver_s_own_box_is_where_it_is_and_not_where_a_partner_s_message_has_it(
     da: DeepAccident, approach: str
 ) -> None:
-    both, link = ("ego_vehicle", "other_vehicle"), Link(latency=0.2, pose_noise=PoseNoise(mean=2.0, std=0.0))
+    both, link = (
+        ("ego_vehicle", "other_vehicle"),
+        Link(latency=0.2, pose_noise=PoseNoise(mean=2.0, std=0.0)),
+    )
     ax = render_bev(da, approach, agents=both, link=link, sweeps=2, layers=["boxes"], ax=new_axes())
-    own, moved = da.boxes(approach, "ego"), cooperative_boxes(da, approach, agents=both, frame="ego", link=link)
+    own, moved = (
+        da.boxes(approach, "ego"),
+        cooperative_boxes(da, approach, agents=both, frame="ego", link=link),
+    )
     own = own.select(own.actor_id == OWN_ACTOR_ID)
     assert footprints(own) <= set(outlines(ax))
     sent = moved.select(moved.actor_id == da.get("agent", approach.replace("/003", ""))["actor_id"])
@@ -176,6 +218,11 @@ def test_the_receiver_s_own_box_is_where_it_is_and_not_where_a_partner_s_message
 
 
 def test_the_title_says_what_the_link_does(da: DeepAccident, approach: str) -> None:
-    both, link = ("ego_vehicle", "other_vehicle"), Link(latency=0.2, pose_noise=PoseNoise(mean=2.0, std=0.0))
-    assert not lacking(render_bev(da, approach, agents=both, link=link, ax=new_axes()).get_title(), "0.2 s", "2 m")
+    both, link = (
+        ("ego_vehicle", "other_vehicle"),
+        Link(latency=0.2, pose_noise=PoseNoise(mean=2.0, std=0.0)),
+    )
+    assert not lacking(
+        render_bev(da, approach, agents=both, link=link, ax=new_axes()).get_title(), "0.2 s", "2 m"
+    )
     assert "0.2 s" not in render_bev(da, approach, link=link, ax=new_axes()).get_title()

@@ -15,7 +15,12 @@ from wording import lacking
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, MissingFileError
 from deepaccident_devkit.render import detached_figure, style
-from deepaccident_devkit.render.captions import missing_words, moment_words, scenario_words, set_scene_title
+from deepaccident_devkit.render.captions import (
+    missing_words,
+    moment_words,
+    scenario_words,
+    set_scene_title,
+)
 from deepaccident_devkit.render.styles import MISSING_COLOR, current_style
 
 
@@ -24,7 +29,10 @@ def test_a_moment_in_words(da: DeepAccident, frame: str) -> None:
     record = da.scenario.get(scenario)
     for changed, words in (
         ({}, "Town02, wet cloudy night: car hits van"),
-        ({"collision": {"classes": ["pedestrian", "truck"]}}, "Town02, wet cloudy night: truck hits pedestrian"),
+        (
+            {"collision": {"classes": ["pedestrian", "truck"]}},
+            "Town02, wet cloudy night: truck hits pedestrian",
+        ),
         ({"collision": None}, "Town02, wet cloudy night: no collision"),
         ({"weather": None, "time_of_day": None, "collision": None}, "Town02: end unknown"),
     ):
@@ -38,7 +46,9 @@ def test_a_paper_and_a_slide_have_their_sizes_and_no_tokens(da: DeepAccident, fr
         figure = da.render_frame(frame)
         assert (figure.get_figwidth(), current_style().dpi, tokens_of(figure)) == (7.16, 300, [])
     with style("slide"):
-        assert da.render_frame(frame).get_size_inches() * current_style().dpi == pytest.approx([1920, 1080])
+        assert da.render_frame(frame).get_size_inches() * current_style().dpi == pytest.approx(
+            [1920, 1080]
+        )
     with style(title=False):
         assert da.render_frame(frame).get_suptitle() == ""
     with pytest.raises(ChoiceError, match=r"cvpr-column.*'poster'"):
@@ -55,18 +65,32 @@ def grey_panels(figure: Figure) -> int:
 
 VIEWS: list[tuple[Callable[[DeepAccident, str], Any], int, list[str]]] = [
     (lambda da, scenario: da.render_sample(f"{scenario}/ego_vehicle/003"), 1, [FRONT]),
-    (lambda da, scenario: da.render_sample(f"{scenario}/ego_vehicle/003", agents="available"), 1, [FRONT, POLE]),
+    (
+        lambda da, scenario: da.render_sample(f"{scenario}/ego_vehicle/003", agents="available"),
+        1,
+        [FRONT, POLE],
+    ),
     (lambda da, scenario: da.render_sample(f"{scenario}/infrastructure/003"), 0, [POLE]),
     (lambda da, scenario: da.render_frame(f"{scenario}/003"), 1, [FRONT, POLE]),
     (lambda da, scenario: da.render_calibration(f"{scenario}/003"), 1, [FRONT, POLE]),
     (
-        lambda da, scenario: da.render_calibration(f"{scenario}/ego_vehicle/003", agents=["infrastructure"]),
+        lambda da, scenario: da.render_calibration(
+            f"{scenario}/ego_vehicle/003", agents=["infrastructure"]
+        ),
         1,
         [FRONT, POLE],
     ),
     (lambda da, scenario: da.render_visibility(f"{scenario}/003", layers=["points"]), 0, [POLE]),
-    (lambda da, scenario: da.render_sample_data(f"{scenario}/ego_vehicle/003/Camera_Front"), 1, [FRONT]),
-    (lambda da, scenario: da.render_sample_data(f"{scenario}/infrastructure/003/lidar01"), 0, [POLE]),
+    (
+        lambda da, scenario: da.render_sample_data(f"{scenario}/ego_vehicle/003/Camera_Front"),
+        1,
+        [FRONT],
+    ),
+    (
+        lambda da, scenario: da.render_sample_data(f"{scenario}/infrastructure/003/lidar01"),
+        0,
+        [POLE],
+    ),
     (
         lambda da, scenario: da.render_sample_data(
             f"{scenario}/infrastructure/003/Camera_Front", layers=["image", "points"]
@@ -74,8 +98,20 @@ VIEWS: list[tuple[Callable[[DeepAccident, str], Any], int, list[str]]] = [
         0,
         [POLE],
     ),
-    (lambda da, scenario: da.render_pointcloud_in_image(f"{scenario}/ego_vehicle/003/Camera_Front"), 1, [FRONT]),
-    (lambda da, scenario: da.render_pointcloud_in_image(f"{scenario}/infrastructure/003/Camera_Front"), 0, [POLE]),
+    (
+        lambda da, scenario: da.render_pointcloud_in_image(
+            f"{scenario}/ego_vehicle/003/Camera_Front"
+        ),
+        1,
+        [FRONT],
+    ),
+    (
+        lambda da, scenario: da.render_pointcloud_in_image(
+            f"{scenario}/infrastructure/003/Camera_Front"
+        ),
+        0,
+        [POLE],
+    ),
     (
         lambda da, scenario: da.render_pointcloud_in_image(
             f"{scenario}/ego_vehicle_behind/003/Camera_Front", color_by="agent"
@@ -91,8 +127,12 @@ def scenario(da_partial: DeepAccident) -> str:
     return next(record["token"] for record in da_partial.scenario if record["collision"])
 
 
-def test_one_frame_that_is_missing_is_not_called_a_missing_download(release_root: Path, tmp_path: Path) -> None:
-    root = shutil.copytree(release_root, tmp_path / "release", ignore=shutil.ignore_patterns(".deepaccident"))
+def test_one_frame_that_is_missing_is_not_called_a_missing_download(
+    release_root: Path, tmp_path: Path
+) -> None:
+    root = shutil.copytree(
+        release_root, tmp_path / "release", ignore=shutil.ignore_patterns(".deepaccident")
+    )
     da = DeepAccident(dataroot=root, verbose=False)
     sample = da.get_sample(da.scenario[0], "ego_vehicle", 3)
     da.get_sample_data_path(sample, "Camera_Front").unlink()
@@ -104,20 +144,31 @@ def test_one_frame_that_is_missing_is_not_called_a_missing_download(release_root
 
 @pytest.mark.parametrize(("view", "grey", "words"), VIEWS)
 def test_a_picture_names_what_is_not_there(
-    da_partial: DeepAccident, scenario: str, view: Callable[[DeepAccident, str], Any], grey: int, words: list[str]
+    da_partial: DeepAccident,
+    scenario: str,
+    view: Callable[[DeepAccident, str], Any],
+    grey: int,
+    words: list[str],
 ) -> None:
     figure = view(da_partial, scenario).figure
     assert (grey_panels(figure), missing_words(figure)) == (grey, words)
     titles = [title_of(figure), *(ax.get_title() for ax in figure.axes)]
-    assert any(POLE in title.replace("\n", " ") for title in titles) == (POLE in words)  # not over the data
+    assert any(POLE in title.replace("\n", " ") for title in titles) == (
+        POLE in words
+    )  # not over the data
 
 
 def test_a_whole_release_lacks_nothing(da: DeepAccident, scenario: str) -> None:
-    for figure in (da.render_sample(f"{scenario}/ego_vehicle/003", agents="all"), da.render_frame(f"{scenario}/003")):
+    for figure in (
+        da.render_sample(f"{scenario}/ego_vehicle/003", agents="all"),
+        da.render_frame(f"{scenario}/003"),
+    ):
         assert (grey_panels(figure), missing_words(figure)) == (0, [])
 
 
-def test_only_nothing_at_all_is_an_error(da_b: DeepAccident, da_partial: DeepAccident, scenario: str) -> None:
+def test_only_nothing_at_all_is_an_error(
+    da_b: DeepAccident, da_partial: DeepAccident, scenario: str
+) -> None:
     front = f"{scenario}/ego_vehicle/003/Camera_Front"
     other = f"{da_b.sample[0]['token']}/Camera_Front"
     assert_refused(
@@ -134,7 +185,9 @@ def test_only_nothing_at_all_is_an_error(da_b: DeepAccident, da_partial: DeepAcc
     )
     figure = da_b.render_sample(da_b.sample[0])
     assert grey_panels(figure) == 6
-    assert not lacking(missing_words(figure), "no LiDAR file of ego_vehicle", "BEV_instance_camera: not downloaded")
+    assert not lacking(
+        missing_words(figure), "no LiDAR file of ego_vehicle", "BEV_instance_camera: not downloaded"
+    )
 
 
 def test_the_token_is_written_once(da: DeepAccident, frame: str) -> None:
@@ -147,9 +200,13 @@ def test_the_token_is_written_once(da: DeepAccident, frame: str) -> None:
 
 
 @pytest.mark.slow
-def test_accident_video_and_replay_are_rendered(da_partial: DeepAccident, scenario: str, tmp_path: Path) -> None:
+def test_accident_video_and_replay_are_rendered(
+    da_partial: DeepAccident, scenario: str, tmp_path: Path
+) -> None:
     assert set(missing_words(da_partial.render_accident(scenario))) <= {FRONT}
     what = ["sample", "Camera_Front", "calibration"]
-    da_partial.render_scenario_video(scenario, tmp_path / "v.gif", what=what, frames=[3], size=(480, 180), workers=1)
+    da_partial.render_scenario_video(
+        scenario, tmp_path / "v.gif", what=what, frames=[3], size=(480, 180), workers=1
+    )
     da_partial.render_replay(scenario, tmp_path / "replay.html")
     assert len([path for path in tmp_path.iterdir() if path.stat().st_size > 0]) == 2

@@ -40,14 +40,18 @@ def cover(one: FloatArray, other: FloatArray) -> bool:
 def test_chips_cover_neither_each_other_nor_cars_nor_the_frame(seed: int) -> None:
     centers = np.random.default_rng(seed).uniform(-40, 40, (40, 2))
     cars, ax = centers[:, None] + CAR, new_view()
-    place_chips(ax, [(str(20_000 + number), center) for number, center in enumerate(centers)], avoid=cars)
+    place_chips(
+        ax, [(str(20_000 + number), center) for number, center in enumerate(centers)], avoid=cars
+    )
     for dpi in (60, 110):
         rendered(ax, dpi)
         chips = shown(ax)
         assert len(chips) >= 36
         pairs = [*combinations(chips, 2), *product(chips, bounds_of(ax, cars))]
         assert [pair for pair in pairs if cover(*pair)] == []
-        assert all((chip[:2] >= ax.bbox.min).all() and (chip[2:] <= ax.bbox.max).all() for chip in chips)
+        assert all(
+            (chip[:2] >= ax.bbox.min).all() and (chip[2:] <= ax.bbox.max).all() for chip in chips
+        )
 
 
 def test_calls_on_the_same_axes_know_of_each_other() -> None:
@@ -57,7 +61,9 @@ def test_calls_on_the_same_axes_know_of_each_other() -> None:
     keep_free(ax, CAR[None])
     rendered(ax)
     first, second = shown(ax)
-    assert [pair for pair in combinations([first, second, *bounds_of(ax, CAR)], 2) if cover(*pair)] == []
+    assert [
+        pair for pair in combinations([first, second, *bounds_of(ax, CAR)], 2) if cover(*pair)
+    ] == []
 
 
 def test_a_chip_without_room_or_place_is_left_out_and_the_first_ones_stay() -> None:

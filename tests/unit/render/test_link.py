@@ -30,7 +30,9 @@ def drawn(da: DeepAccident, sample: Any, link: Link, **how: Any) -> Any:
 
 
 def test_arrows_are_as_long_as_the_poses_are_off(da_motion: DeepAccident, moving: Any) -> None:
-    figure = drawn(da_motion, moving, NOISE, agents=["ego_vehicle", "other_vehicle"], layers=["boxes"])
+    figure = drawn(
+        da_motion, moving, NOISE, agents=["ego_vehicle", "other_vehicle"], layers=["boxes"]
+    )
     (ax,) = figure.axes
     (found,) = of_kind(ax, Quiver)
     true = da_motion.cooperative_boxes(moving, agents=["other_vehicle"], frame="ego").center[:, :2]
@@ -52,14 +54,19 @@ def test_latency_moves_only_what_moves(da_motion: DeepAccident, moving: Any) -> 
 
 def test_a_lost_message_is_said(da_motion: DeepAccident, moving: Any) -> None:
     figure = drawn(da_motion, moving, Link(packet_loss=1.0), agents="+behind", layers=["boxes"])
-    assert (legend_words(figure)[0], of_kind(figure.axes[0], Quiver)) == ("ego behind: nothing arrived", [])
+    assert (legend_words(figure)[0], of_kind(figure.axes[0], Quiver)) == (
+        "ego behind: nothing arrived",
+        [],
+    )
 
 
 def test_clouds_are_side_by_side(da: DeepAccident) -> None:
     sample, link = da.get_sample(da.scenario[0], "ego_vehicle", 5), Link(latency=0.2)
     _, now, late = drawn(da, sample, link, agents="+other", view_range=50.0).axes
     for ax, through in ((now, None), (late, link)):
-        cloud = da.aggregate_point_cloud(sample, agents=["other_vehicle"], frame="ego", link=through).xyz[:, :2]
+        cloud = da.aggregate_point_cloud(
+            sample, agents=["other_vehicle"], frame="ego", link=through
+        ).xyz[:, :2]
         shown = cloud[(np.abs(cloud) < 50).all(axis=1)]
         drawn_ = [np.asarray(each.get_offsets()) for each in ax.collections]
         assert any(each.shape == shown.shape and np.allclose(each, shown) for each in drawn_)
@@ -69,7 +76,9 @@ def test_clouds_are_side_by_side(da: DeepAccident) -> None:
     ("layers", "place", "panels"),
     [(["boxes"], None, 1), (None, None, 3), (None, "slide", 2), (None, "cvpr-column", 1)],
 )
-def test_all_partners_are_in_one_panel(da: DeepAccident, layers: Any, place: Any, panels: int) -> None:
+def test_all_partners_are_in_one_panel(
+    da: DeepAccident, layers: Any, place: Any, panels: int
+) -> None:
     with style(place):
         figure = drawn(da, da.get_sample(da.scenario[0], "ego_vehicle", 5), NOISE, layers=layers)
     assert len(figure.axes) == panels
@@ -81,7 +90,10 @@ def test_all_partners_are_in_one_panel(da: DeepAccident, layers: Any, place: Any
     ("link", "facts"),
     [
         (Link(latency=0.2), ["0.2 s"]),
-        (Link(pose_noise=PoseNoise(mean=0.3, heading_std=0.1), packet_loss=0.1), ["0.3 m", "5.7°", "10 %"]),
+        (
+            Link(pose_noise=PoseNoise(mean=0.3, heading_std=0.1), packet_loss=0.1),
+            ["0.3 m", "5.7°", "10 %"],
+        ),
         (Link(budget=12_000, payload="boxes"), ["12,000 bytes"]),
     ],
 )

@@ -33,7 +33,12 @@ from deepaccident_devkit.render import (
 )
 from deepaccident_devkit.render.boxes import collider_ids
 from deepaccident_devkit.render.motion_maps import PALEST
-from deepaccident_devkit.render.styles import AGENT_COLORS, COLLIDER_COLOR, INSTANCE_COLORS, OWN_COLOR
+from deepaccident_devkit.render.styles import (
+    AGENT_COLORS,
+    COLLIDER_COLOR,
+    INSTANCE_COLORS,
+    OWN_COLOR,
+)
 
 
 def figure_of(labels: MotionLabels, **how: Any) -> Any:
@@ -41,7 +46,10 @@ def figure_of(labels: MotionLabels, **how: Any) -> Any:
 
 
 CONFIG = MotionLabelConfig(
-    grid=BevGrid(x=(-20, 30, 0.5), y=(-15, 15, 0.5)), receptive_field=1, future_frames=2, protocol="clean"
+    grid=BevGrid(x=(-20, 30, 0.5), y=(-15, 15, 0.5)),
+    receptive_field=1,
+    future_frames=2,
+    protocol="clean",
 )
 RECTANGLE = np.array([[-2.2, -1.2], [-2.2, 1.2], [2.2, 1.2], [2.2, -1.2]])
 STEP = (3.0, 1.5)
@@ -52,7 +60,9 @@ def two_cars(config: MotionLabelConfig = CONFIG, *, frames: int = 3) -> MotionLa
     """The ego, which stands, and car 7, which starts at (10.25, 5.25) and drives on; some frames are recorded."""
     moments = [
         FramePolygons(
-            corners=np.array([RECTANGLE + 0.25, RECTANGLE + (10.25, 5.25) + frame * np.array(STEP)]),
+            corners=np.array(
+                [RECTANGLE + 0.25, RECTANGLE + (10.25, 5.25) + frame * np.array(STEP)]
+            ),
             key=np.array([OWN_BOX_ID, 7]),
         )
         for frame in range(frames)
@@ -71,7 +81,10 @@ def color_at(ax: Any, x: float, y: float) -> Any:
     left, right, low, high = ax.images[0].get_extent()
     colors = picture(ax)
     assert ax.images[0].origin == "lower"
-    row, column = (y - low) / (high - low) * colors.shape[0], (x - left) / (right - left) * colors.shape[1]
+    row, column = (
+        (y - low) / (high - low) * colors.shape[0],
+        (x - left) / (right - left) * colors.shape[1],
+    )
     return colors[int(row), int(column)]
 
 
@@ -79,11 +92,15 @@ def test_instances_are_where_they_are_and_have_their_colours() -> None:
     labels = two_cars()
     ax, later = panel(labels, "instance"), panel(labels, "instance", 2)
     car = color_at(ax, 10.2, 5.2)
-    np.testing.assert_allclose([color_at(ax, 0.2, 0.2), color_at(ax, 5, -10)], [to_rgb(OWN_COLOR), (1, 1, 1)])
+    np.testing.assert_allclose(
+        [color_at(ax, 0.2, 0.2), color_at(ax, 5, -10)], [to_rgb(OWN_COLOR), (1, 1, 1)]
+    )
     assert not np.allclose(car, 1)
     np.testing.assert_allclose(color_at(later, 16.2, 8.2), car)  # the same in all frames
     one, both = (panel(labels, "instance", marked=marked) for marked in ({7}, {7, -100}))
-    np.testing.assert_allclose([color_at(one, 10.2, 5.2), color_at(both, 0.2, 0.2)], [to_rgb(COLLIDER_COLOR)] * 2)
+    np.testing.assert_allclose(
+        [color_at(one, 10.2, 5.2), color_at(both, 0.2, 0.2)], [to_rgb(COLLIDER_COLOR)] * 2
+    )
     assert len(both.collections) == 1  # the own box's edge
 
 
@@ -96,12 +113,18 @@ def test_recording_vehicles_have_their_hues_and_others_shades_in_the_picture_and
 
 
 def test_arrows_lead_from_instances_to_where_they_are_next() -> None:
-    flow, last, offset = panel(two_cars(), "flow"), panel(two_cars(), "flow", 2), panel(two_cars(), "offset")
+    flow, last, offset = (
+        panel(two_cars(), "flow"),
+        panel(two_cars(), "flow", 2),
+        panel(two_cars(), "offset"),
+    )
     (found,) = of_kind(flow, Quiver)
     np.testing.assert_allclose(
         np.column_stack([found.XY, found.U, found.V]), [(0.25, 0.25, 0, 0), (10.25, 5.25, *STEP)]
     )
-    assert of_kind(last, Quiver) + of_kind(offset, Quiver) == []  # nothing is known of what comes after the last
+    assert (
+        of_kind(last, Quiver) + of_kind(offset, Quiver) == []
+    )  # nothing is known of what comes after the last
     assert len(np.unique(picture(flow).reshape(-1, 3), axis=0)) == 3  # nothing, no way, a way
 
 
@@ -111,7 +134,9 @@ def test_forward_is_to_the_right_in_every_orientation(name: str) -> None:
         found = [np.column_stack([each.XY, each.U, each.V]) for each in of_kind(ax, Quiver)]
         return sorted(np.round(np.concatenate(found), 6).tolist()) if found else []
 
-    first, *others = (panel(two_cars(replace(CONFIG, orientation=each)), name) for each in ORIENTATIONS)
+    first, *others = (
+        panel(two_cars(replace(CONFIG, orientation=each)), name) for each in ORIENTATIONS
+    )
     for other in others:
         np.testing.assert_allclose(picture(other), picture(first))
         assert other.images[0].get_extent() == first.images[0].get_extent() == [-20, 30, -15, 15]
@@ -137,11 +162,20 @@ def test_an_empty_road_is_drawn() -> None:
 
 def test_a_sample_of_an_accident(da_motion: DeepAccident) -> None:
     accident = next(scenario for scenario in da_motion.scenario if scenario["collision"])
-    sample, figure = da_motion.get_sample(accident, "ego_vehicle", frame=15), detached_figure((12, 9))
+    sample, figure = (
+        da_motion.get_sample(accident, "ego_vehicle", frame=15),
+        detached_figure((12, 9)),
+    )
     assert da_motion.render_motion_labels(sample, fig=figure) is figure
-    assert (len(figure.axes), tokens_of(figure)) == (4 * (5 + 1), [sample["token"]])  # five frames and a key
+    assert (len(figure.axes), tokens_of(figure)) == (
+        4 * (5 + 1),
+        [sample["token"]],
+    )  # five frames and a key
     labels = da_motion.motion_labels(sample).to_present()
-    pair = [labels.id_map[OWN_BOX_ID if actor == -100 else actor] for actor in collider_ids(da_motion, sample)]
+    pair = [
+        labels.id_map[OWN_BOX_ID if actor == -100 else actor]
+        for actor in collider_ids(da_motion, sample)
+    ]
     red = [np.isclose(picture(ax), to_rgb(COLLIDER_COLOR)).all(axis=-1) for ax in figure.axes[:5]]
     np.testing.assert_array_equal(red, np.isin(labels.instance, pair))
 
@@ -149,12 +183,24 @@ def test_a_sample_of_an_accident(da_motion: DeepAccident) -> None:
 def test_what_is_not_there_is_named(labels: MotionLabels) -> None:
     alone = instances_of(labels.instance, labels.config.grid)
     assert_refused(
-        (lambda: panel(two_cars(), "centre"), ChoiceError, ("map", "instance, centerness, offset, flow", "'centre'")),
+        (
+            lambda: panel(two_cars(), "centre"),
+            ChoiceError,
+            ("map", "instance, centerness, offset, flow", "'centre'"),
+        ),
         (lambda: panel(two_cars(), "flow", -1), ChoiceError, ("frame", "0 to 2", "found -1")),
         (lambda: panel(two_cars(), "flow", 3), ChoiceError, ("frame", "0 to 2", "found 3")),
         (lambda: draw_motion_map(alone, "flow", 0), ChoiceError, ("map", "only instance", "heads")),
-        (lambda: draw_motion_output(alone, number=1), ChoiceError, ("prediction", "0 to 0", "found 1")),
-        (lambda: draw_motion_output(alone, style="film"), ChoiceError, ("style", "maps, trail", "'film'")),
+        (
+            lambda: draw_motion_output(alone, number=1),
+            ChoiceError,
+            ("prediction", "0 to 0", "found 1"),
+        ),
+        (
+            lambda: draw_motion_output(alone, style="film"),
+            ChoiceError,
+            ("style", "maps, trail", "'film'"),
+        ),
     )
 
 
@@ -168,7 +214,9 @@ def test_a_trail_is_opaque_at_the_present_and_paler_after(labels: MotionLabels) 
     expected = 1 - np.outer(opacity, 1 - np.array(to_rgb(COLLIDER_COLOR)))
     np.testing.assert_allclose(picture(ax)[101, [51, 57, 60, 69]], expected)
     np.testing.assert_allclose(picture(ax)[90, 51], 1)
-    (path,) = next(each for each in ax.collections if isinstance(each, LineCollection)).get_segments()
+    (path,) = next(
+        each for each in ax.collections if isinstance(each, LineCollection)
+    ).get_segments()
     np.testing.assert_allclose(path, [(-50 + 0.5 * (column + 4), 1.0) for column in columns])
     none = draw_motion_trail(instances_of(instance, grid), layers=["ids"], ax=new_axes())
     assert (len(none.images), texts(none)) == (0, ["1"])
@@ -181,5 +229,7 @@ def test_outputs_are_drawn_as_they_lie(labels: MotionLabels, orientation: Any) -
     shown = picture(draw_motion_map(output, "instance", 0, ax=new_axes()))
     np.testing.assert_array_equal((shown != 1).any(axis=-1), labels.segmentation[0] == 1)
     for name in ("offset", "flow"):
-        mine, true = (picture(draw_motion_map(each, name, 0, ax=new_axes())) for each in (output, labels))
+        mine, true = (
+            picture(draw_motion_map(each, name, 0, ax=new_axes())) for each in (output, labels)
+        )
         np.testing.assert_allclose(mine, true, atol=1e-6)

@@ -23,7 +23,9 @@ from deepaccident_devkit.statistics import DatasetStatistics, dataset_statistics
 
 
 @pytest.mark.slow
-def test_every_group_is_drawn_on_the_figure_given(statistics: DatasetStatistics, da: DeepAccident) -> None:
+def test_every_group_is_drawn_on_the_figure_given(
+    statistics: DatasetStatistics, da: DeepAccident
+) -> None:
     nothing = dataset_statistics(da, [])
     for group in STATISTICS_FIGURES:
         figure = detached_figure((10, 8))
@@ -32,7 +34,11 @@ def test_every_group_is_drawn_on_the_figure_given(statistics: DatasetStatistics,
         render_statistics(nothing, group, fig=detached_figure((10, 8))).canvas.draw()
     angles = statistics.histograms["collision_angles"]
     assert_refused(
-        (lambda: render_statistics(statistics, "weather"), ChoiceError, ("scenarios, ends, ego", "'weather'")),
+        (
+            lambda: render_statistics(statistics, "weather"),
+            ChoiceError,
+            ("scenarios, ends, ego", "'weather'"),
+        ),
         (lambda: draw_angles(angles, ax=figure.add_subplot()), ChoiceError, ("polar axes",)),
     )
 
@@ -46,20 +52,25 @@ def test_words_are_apart_and_large(statistics: DatasetStatistics, group: str) ->
 @pytest.mark.slow
 def test_files_are_the_same_bytes_each_time(statistics: DatasetStatistics, tmp_path: Path) -> None:
     first, second = (
-        {path.name: path.read_bytes() for path in save_statistics(statistics, tmp_path / name)} for name in ("a", "b")
+        {path.name: path.read_bytes() for path in save_statistics(statistics, tmp_path / name)}
+        for name in ("a", "b")
     )
     assert first == second
     assert (len(first), min(map(len, first.values())) > 5000) == (2 * len(STATISTICS_FIGURES), True)
     assert sorted(first) == sorted(path.name for path in (tmp_path / "a").iterdir())
     file = next((tmp_path / "a").iterdir())
-    assert_refused((lambda: save_statistics(statistics, file), ConfigError, ("is a file", "give a folder")))
+    assert_refused(
+        (lambda: save_statistics(statistics, file), ConfigError, ("is a file", "give a folder"))
+    )
 
 
 def test_bars_add_up_to_the_counts(statistics: DatasetStatistics) -> None:
     table, histogram = statistics.counts["weathers"], statistics.histograms["distances"]
     ax = detached_figure((4, 3)).add_subplot()
     assert draw_counts(table, ax=ax) is ax
-    assert sum(bar.get_width() for bar in ax.patches) == table.total() == statistics.scenarios["total"]
+    assert (
+        sum(bar.get_width() for bar in ax.patches) == table.total() == statistics.scenarios["total"]
+    )
     ax = draw_histogram(histogram, new_axes())
     assert sum(bar.get_height() for bar in ax.patches) == sum(histogram.counts["total"])
     ax = draw_relative_positions(statistics.collisions, new_axes())

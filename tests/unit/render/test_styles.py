@@ -125,7 +125,9 @@ def test_no_setting_of_the_user_changes_a_file(tmp_path: Path) -> None:
     assert written[0] == written[1]
 
 
-def test_axes_of_the_user_stay_theirs_but_images_stand_upright(da: DeepAccident, sample: str) -> None:
+def test_axes_of_the_user_stay_theirs_but_images_stand_upright(
+    da: DeepAccident, sample: str
+) -> None:
     with mpl.rc_context({"image.origin": "lower", "axes.facecolor": "black"}):
         _, ax = plt.subplots()
         da.render_sample_data(f"{sample}/Camera_Front", ax=ax)
@@ -162,7 +164,9 @@ def script() -> ModuleType:
         ("a town's ground", 9),
     ],
 )
-def test_colours_that_stand_together_are_distinguished(script: ModuleType, group: str, bound: float, eye: str) -> None:
+def test_colours_that_stand_together_are_distinguished(
+    script: ModuleType, group: str, bound: float, eye: str
+) -> None:
     assert script.least_distance(script.GROUPS[group], eye) >= bound
 
 
@@ -175,7 +179,13 @@ def test_nothing_but_the_pair_is_red(script: ModuleType) -> None:
         each
         for name, value in vars(styles).items()
         if name.isupper() and name[0] != "_" and name not in ("COLLIDER_COLOR", "CATEGORY_MARKERS")
-        for each in ([value] if isinstance(value, str) else value.values() if hasattr(value, "values") else value)
+        for each in (
+            [value]
+            if isinstance(value, str)
+            else value.values()
+            if hasattr(value, "values")
+            else value
+        )
         if each.startswith("#")
     ]
     assert len(others) > 40

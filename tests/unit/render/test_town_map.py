@@ -25,20 +25,35 @@ from deepaccident_devkit.taxonomy import BEV_CAMERA, CAMERAS, LIDAR
 @pytest.fixture(scope="module")
 def mapped(release_root: Path, tmp_path_factory: pytest.TempPathFactory) -> DeepAccident:
     """The release without images and points; of its first scenario the ego has no BEV camera."""
-    root, ignored = tmp_path_factory.mktemp("mapped") / "release", (".deepaccident", *CAMERAS, LIDAR)
-    shutil.copytree(release_root, root, copy_function=os.link, ignore=shutil.ignore_patterns(*ignored))
+    root, ignored = (
+        tmp_path_factory.mktemp("mapped") / "release",
+        (".deepaccident", *CAMERAS, LIDAR),
+    )
+    shutil.copytree(
+        release_root, root, copy_function=os.link, ignore=shutil.ignore_patterns(*ignored)
+    )
     da = DeepAccident("v1", root, verbose=False)
-    shutil.rmtree(da.get_sample_data_path(f"{da.scenario[0]['token']}/ego_vehicle/001/{BEV_CAMERA}").parent)
+    shutil.rmtree(
+        da.get_sample_data_path(f"{da.scenario[0]['token']}/ego_vehicle/001/{BEV_CAMERA}").parent
+    )
     return da
 
 
 def ground_of(ax: Axes) -> list[set[str]]:
     """The colours of the pictures drawn, the lowest first."""
-    pictures = [np.asarray(one.get_array()) for one in sorted(ax.images, key=lambda image: image.get_zorder())]
-    return [{to_hex(color / 255) for color in np.unique(each.reshape(-1, 3), axis=0)} for each in pictures]
+    pictures = [
+        np.asarray(one.get_array())
+        for one in sorted(ax.images, key=lambda image: image.get_zorder())
+    ]
+    return [
+        {to_hex(color / 255) for color in np.unique(each.reshape(-1, 3), axis=0)}
+        for each in pictures
+    ]
 
 
-def test_a_kept_map_takes_the_place_of_a_missing_bev_camera_and_is_not_made_for_it(mapped: DeepAccident) -> None:
+def test_a_kept_map_takes_the_place_of_a_missing_bev_camera_and_is_not_made_for_it(
+    mapped: DeepAccident,
+) -> None:
     sample, how = f"{mapped.scenario[0]['token']}/ego_vehicle/003", {"layers": ("bev", "boxes")}
     ax = render_bev(mapped, sample, ax=new_axes(), **how)
     assert (ground_of(ax), missing_words(ax)) == ([], [f"{BEV_CAMERA}: not downloaded"])
@@ -51,19 +66,26 @@ def test_a_kept_map_takes_the_place_of_a_missing_bev_camera_and_is_not_made_for_
 
 @pytest.mark.slow
 @pytest.mark.parametrize("frame", ["ego", "world"])
-def test_the_map_lies_where_the_bev_camera_sees_the_ground(mapped: DeepAccident, frame: str) -> None:
+def test_the_map_lies_where_the_bev_camera_sees_the_ground(
+    mapped: DeepAccident, frame: str
+) -> None:
     sample = f"{mapped.scenario[0]['token']}/other_vehicle/003"
     ax = render_bev(mapped, sample, layers=("map",), frame=frame, view_range=40, ax=new_axes())
     picture, tags = rendered(ax), mapped.load_bev(sample).semantic
     points = np.random.default_rng(2).uniform(-27, 27, (1500, 2))
     corners = np.rint(599.5 - points / 0.1).astype(int) - 12
-    inner = [np.unique(tags[row : row + 25, column : column + 25]).tolist() for row, column in corners.tolist()]
+    inner = [
+        np.unique(tags[row : row + 25, column : column + 25]).tolist()
+        for row, column in corners.tolist()
+    ]
     axes_from_ego = mapped.world_from(sample, frame).inverse() @ mapped.world_from(sample, "ego")
     places = axes_from_ego.apply(np.column_stack([points, np.zeros(len(points))]))[:, :2]
     for name in ("road", "sidewalk"):
         alone = on_canvas(ax, places[[kinds == [TAGS[name]] for kinds in inner]])
         assert len(alone) > 8
-        assert {has_color(picture, place, BEV_COLORS[name], tolerance=2.0) for place in alone} == {True}
+        assert {has_color(picture, place, BEV_COLORS[name], tolerance=2.0) for place in alone} == {
+            True
+        }
 
 
 def test_where_no_agent_has_a_bev_camera_the_picture_says_so(da_b: DeepAccident) -> None:

@@ -14,7 +14,12 @@ def rows(steps: int) -> list[dict]:
     """A log with two losses, and two scores at every fourth step."""
     log = []
     for step in range(1, steps + 1):
-        row = {"step": step, "loss": 3.0, "losses": {"seg": 2.0 / step, "flow": 1.0 + step}, "rate": 0.1}
+        row = {
+            "step": step,
+            "loss": 3.0,
+            "losses": {"seg": 2.0 / step, "flow": 1.0 + step},
+            "rate": 0.1,
+        }
         if step % 4 == 0:
             row["validation"] = {"iou": step / 100, "score": 0.5}
         log.append(row)
@@ -32,7 +37,9 @@ def test_each_number_has_a_panel() -> None:
 
 
 def test_a_loss_of_nothing_is_a_gap() -> None:
-    log = [{"step": step, "losses": {"seg": 0.0 if step in (3, 4) else 1.0}} for step in range(1, 7)]
+    log = [
+        {"step": step, "losses": {"seg": 0.0 if step in (3, 4) else 1.0}} for step in range(1, 7)
+    ]
     (ax, *_) = render_training(log, "a run", fig=detached_figure((10, 3))).axes
     for line in ax.get_lines():
         assert np.isnan(line.get_ydata()).tolist() == [False, False, True, True, False, False]

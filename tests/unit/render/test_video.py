@@ -18,12 +18,20 @@ from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, MissingExtraError
 from deepaccident_devkit.render.camera import CAMERA_DEFAULT, draw_camera
 from deepaccident_devkit.render.styles import AGENT_COLORS, COLLIDER_COLOR
-from deepaccident_devkit.render.video import VIEWS, VideoScene, render_scenario_video, views_of, write_video
+from deepaccident_devkit.render.video import (
+    VIEWS,
+    VideoScene,
+    render_scenario_video,
+    views_of,
+    write_video,
+)
 from deepaccident_devkit.taxonomy import CAMERAS
 
 
 @pytest.mark.slow
-def test_two_workers_and_an_executor_write_the_same_bytes_as_one(video: Callable[..., Path]) -> None:
+def test_two_workers_and_an_executor_write_the_same_bytes_as_one(
+    video: Callable[..., Path],
+) -> None:
     how = {"what": [grey, "bev"], "frames": slice(0, 3)}
     one, two = (video(f"{count}.mp4", workers=count, **how) for count in (1, 2))
     with ThreadPoolExecutor(3) as executor:
@@ -33,7 +41,9 @@ def test_two_workers_and_an_executor_write_the_same_bytes_as_one(video: Callable
 
 @pytest.mark.slow
 @pytest.mark.parametrize("suffix", [".mp4", ".gif", ".webp"])
-def test_a_video_has_all_frames_in_order_at_its_size(video: Callable[..., Path], suffix: str) -> None:
+def test_a_video_has_all_frames_in_order_at_its_size(
+    video: Callable[..., Path], suffix: str
+) -> None:
     path = video(f"v{suffix}")
     assert greys(path) == [1, 2, 3, 4, 5, 6]
     assert {picture.shape for picture in decoded(path)} == {(SIZE[1], SIZE[0], 3)}
@@ -72,7 +82,11 @@ def test_errors_come_before_anything_is_drawn(video: Callable[..., Path], tmp_pa
 
     assert_refused(
         (write("v.avi"), ChoiceError, ("path", ".mp4, .gif, .webp", "v.avi")),
-        (write(size=(161, 90)), ChoiceError, ("size", "even width and height", "MP4", "give (160, 90)")),
+        (
+            write(size=(161, 90)),
+            ChoiceError,
+            ("size", "even width and height", "MP4", "give (160, 90)"),
+        ),
         (write(size=(0, 90)), ChoiceError, ("size", "at least 16 pixels")),
         (write(fps=0), ChoiceError, ("fps", "above 0")),
         (write(what="film"), ChoiceError, ("what", "frame, sample, accident", "'film'")),
@@ -81,7 +95,11 @@ def test_errors_come_before_anything_is_drawn(video: Callable[..., Path], tmp_pa
         (write(frames=[1, 7]), ChoiceError, ("frames", "1 to 6", "found 7")),
         (write(frames=slice(9, None)), ChoiceError, ("frames", "1 to 6", "found none")),
         (write(agents=["pole"]), ChoiceError, ("agent", "ego_vehicle", "'pole'")),
-        (write(what=lambda *_: None, workers=2), ChoiceError, ("cannot be sent to other processes", "a module")),
+        (
+            write(what=lambda *_: None, workers=2),
+            ChoiceError,
+            ("cannot be sent to other processes", "a module"),
+        ),
     )
     assert not list(tmp_path.iterdir())
     (tmp_path / "a.gif").mkdir()
@@ -99,15 +117,22 @@ def video(da: DeepAccident, accident: str, tmp_path: Path) -> Callable[..., Path
 
     def write(name: str, **options: Any) -> Path:
         return render_scenario_video(
-            da, accident, tmp_path / name, **{"what": grey, "size": SIZE, "progress": False, **options}
+            da,
+            accident,
+            tmp_path / name,
+            **{"what": grey, "size": SIZE, "progress": False, **options},
         )
 
     return write
 
 
-def picture_of(da: DeepAccident, frame: str, what: Any, size: tuple[int, int], agents: Any = None) -> Any:
+def picture_of(
+    da: DeepAccident, frame: str, what: Any, size: tuple[int, int], agents: Any = None
+) -> Any:
     """A frame of a video."""
-    scene = VideoScene(dataset=da, views=views_of(what, None), agents=agents, width=size[0], height=size[1])
+    scene = VideoScene(
+        dataset=da, views=views_of(what, None), agents=agents, width=size[0], height=size[1]
+    )
     return scene.picture(frame)
 
 
@@ -140,7 +165,10 @@ def test_a_camera_is_the_one_of_the_first_agent_named(da: DeepAccident, accident
 
 
 def test_each_view_draws_those_of_the_layers_that_it_has() -> None:
-    chosen = [layers for _, layers in views_of(["Camera_Front", "bev", "visibility_matrix"], ["image", "boxes"])]
+    chosen = [
+        layers
+        for _, layers in views_of(["Camera_Front", "bev", "visibility_matrix"], ["image", "boxes"])
+    ]
     assert chosen == [("image", "boxes"), ("boxes",), ()]
     assert [layers for _, layers in views_of(["Camera_Front", "bev"], None)] == [None, None]
 
@@ -161,7 +189,9 @@ def test_few_pixels_keep_their_color_in_a_gif(tmp_path: Path) -> None:
     write_video(tmp_path / "v.gif", [photo, photo[::-1]], fps=10)
     (first, _) = decoded(tmp_path / "v.gif")
     for (row, column), color in marks.items():
-        np.testing.assert_allclose(first[row, column + 5], np.array(to_rgba(color)[:3]) * 255, atol=25)
+        np.testing.assert_allclose(
+            first[row, column + 5], np.array(to_rgba(color)[:3]) * 255, atol=25
+        )
 
 
 def test_mp4_is_what_browsers_play(video: Callable[..., Path]) -> None:
@@ -172,7 +202,9 @@ def test_mp4_is_what_browsers_play(video: Callable[..., Path]) -> None:
         assert (stream.codec_context.name, stream.codec_context.pix_fmt) == ("h264", "yuv420p")
         assert (float(stream.average_rate), stream.frames) == (5.0, 6)
     content = path.read_bytes()
-    assert content.index(b"moov") < content.index(b"mdat"), "the index is in front, so that it plays while it loads"
+    assert content.index(b"moov") < content.index(b"mdat"), (
+        "the index is in front, so that it plays while it loads"
+    )
 
 
 @pytest.mark.parametrize(("suffix", "duration"), [(".gif", 200), (".webp", 200)])
@@ -191,5 +223,7 @@ def test_without_av_mp4_is_refused_before_anything_is_drawn(
 ) -> None:
     monkeypatch.setitem(sys.modules, "av", None)
     told = ("MP4 needs PyAV", "[video]", ".gif or .webp")
-    assert_refused((lambda: video(name, what=lambda *_: pytest.fail("drawn")), MissingExtraError, told))
+    assert_refused(
+        (lambda: video(name, what=lambda *_: pytest.fail("drawn")), MissingExtraError, told)
+    )
     assert not list(tmp_path.iterdir())

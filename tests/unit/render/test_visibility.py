@@ -11,7 +11,11 @@ from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.plugins.synth import SynthConfig, make_release
 from deepaccident_devkit.render import detached_figure
 from deepaccident_devkit.render.styles import AGENT_COLORS
-from deepaccident_devkit.render.visibility import render_visibility, render_visibility_matrix, visibility_of
+from deepaccident_devkit.render.visibility import (
+    render_visibility,
+    render_visibility_matrix,
+    visibility_of,
+)
 from deepaccident_devkit.taxonomy import AGENTS
 
 
@@ -19,7 +23,9 @@ from deepaccident_devkit.taxonomy import AGENTS
 def hidden(tmp_path_factory: pytest.TempPathFactory) -> DeepAccident:
     """An accident whose ego and other are hidden from each other behind a house until late."""
     root = tmp_path_factory.mktemp("synthetic") / "hidden"
-    make_release(root, SynthConfig(scenarios=1, frames=15, view="hidden", seed=2, sensors=False), workers=1)
+    make_release(
+        root, SynthConfig(scenarios=1, frames=15, view="hidden", seed=2, sensors=False), workers=1
+    )
     return DeepAccident("v1", root, verbose=False)
 
 
@@ -31,7 +37,11 @@ def panel(da: DeepAccident, moment: Any, size: tuple[float, float] = (5, 5.6), *
 
 def dots(ax: Any) -> dict[str, Any]:
     """Agent → (n, 2) the places that have its dot."""
-    return {each.get_label(): each.get_offsets() for each in ax.collections if each.get_label() in AGENTS}
+    return {
+        each.get_label(): each.get_offsets()
+        for each in ax.collections
+        if each.get_label() in AGENTS
+    }
 
 
 def lines_of(ax: Any) -> Any:
@@ -45,7 +55,9 @@ def test_dots_are_at_who_is_visible_by_the_rule(hidden: DeepAccident) -> None:
     ax, boxes = panel(hidden, sample), hidden.cooperative_boxes(sample, frame="ego")
     for agent in AGENTS:
         seen = hidden.visible_instances(f"{scenario}/{agent}/010", agents=[agent])
-        known = boxes.select(np.isin(boxes.actor_id, [int(token.rsplit("/", 1)[1]) for token in seen]))
+        known = boxes.select(
+            np.isin(boxes.actor_id, [int(token.rsplit("/", 1)[1]) for token in seen])
+        )
         tops = known.bottom_corners()[..., 1].max(axis=1)
         np.testing.assert_allclose(dots(ax)[agent], np.column_stack([known.center[:, 0], tops]))
     (other,) = (each for each in ax.collections if each.get_label() == AGENTS[2])
@@ -55,11 +67,21 @@ def test_dots_are_at_who_is_visible_by_the_rule(hidden: DeepAccident) -> None:
 def test_the_hidden_collider_stands_out(hidden: DeepAccident) -> None:
     scenario = hidden.scenario[0]
     known = visibility_of(hidden, hidden.get_sample(scenario, "ego_vehicle", 2))
-    other = known.boxes.actor_id == hidden.get("agent", f"{scenario['token']}/other_vehicle")["actor_id"]
+    other = (
+        known.boxes.actor_id
+        == hidden.get("agent", f"{scenario['token']}/other_vehicle")["actor_id"]
+    )
     assert known.hidden_from("ego_vehicle")[other].all()
-    ax, later = panel(hidden, known.sample), panel(hidden, hidden.get_sample(scenario, "ego_vehicle", 15))
+    ax, later = (
+        panel(hidden, known.sample),
+        panel(hidden, hidden.get_sample(scenario, "ego_vehicle", 15)),
+    )
     assert (texts(ax), texts(later)) == (["ego cannot see"], [])
-    dashed = next(each for each in ax.collections if each.get_linestyle()[0][1] is not None and len(each.get_paths()))
+    dashed = next(
+        each
+        for each in ax.collections
+        if each.get_linestyle()[0][1] is not None and len(each.get_paths())
+    )
     corners = np.concatenate([path.vertices[:4] for path in dashed.get_paths()])
     apart = known.boxes.select(other).bottom_corners()[0, :, None, :2] - corners
     assert np.linalg.norm(apart, axis=-1).min(axis=1).max() < 1e-9
@@ -67,7 +89,9 @@ def test_the_hidden_collider_stands_out(hidden: DeepAccident) -> None:
 
 def test_frames_agents_and_layers_are_the_callers(hidden: DeepAccident) -> None:
     token = f"{hidden.scenario[0]['token']}/010"
-    ax = panel(hidden, hidden.get("frame", token), agents=["infrastructure", "ego_vehicle"], frame="world")
+    ax = panel(
+        hidden, hidden.get("frame", token), agents=["infrastructure", "ego_vehicle"], frame="world"
+    )
     assert [*dots(ax)] == ["ego_vehicle", "infrastructure"]
     assert visibility_of(hidden, token).sample.endswith("ego_vehicle/010")  # the first agent there
     bare, wide = panel(hidden, token, layers=["ids"]), panel(hidden, token, view_range=12.0)
@@ -93,7 +117,10 @@ def test_the_matrix_has_a_cell_for_each_actor_and_agent(hidden: DeepAccident) ->
 def test_two_that_see_each_other_have_two_lines(hidden: DeepAccident) -> None:
     ax = panel(hidden, hidden.get_sample(hidden.scenario[0], "ego_vehicle", 15))
     lines = lines_of(ax)
-    ways = {to_hex(color): line for color, line in zip(lines.get_colors(), lines.get_segments(), strict=True)}
+    ways = {
+        to_hex(color): line
+        for color, line in zip(lines.get_colors(), lines.get_segments(), strict=True)
+    }
     out, back = ways[AGENT_COLORS["ego_vehicle"]], ways[AGENT_COLORS["other_vehicle"]]
     np.testing.assert_allclose(
         out[1] - out[0], back[0] - back[1], atol=0.5

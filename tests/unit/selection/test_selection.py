@@ -36,7 +36,9 @@ def da(tmp_path_factory: pytest.TempPathFactory) -> DeepAccident:
         (NORMAL, named("Town10HD", 5), QUIET, 8),
     ]
     for kind, name, meta, frames in scenarios:
-        write_tiny_release(root, scenario_type=kind, name=name, meta=meta, frames=frames, agents=("ego_vehicle",))
+        write_tiny_release(
+            root, scenario_type=kind, name=name, meta=meta, frames=frames, agents=("ego_vehicle",)
+        )
     (root / "train.txt").write_text(f"{TYPE} {named('Town03', 1)}\n")
     return DeepAccident(dataroot=root, verbose=False)
 
@@ -67,7 +69,11 @@ def numbers(da: DeepAccident, *where: str, **filters) -> list[int]:
         (("accident_type=1",), {"accident_type": 1}, [1]),
         (("accident_type=none",), {"accident_type": None}, [2, 3, 4, 5]),
         (("road_type=four-way junction",), {"road_type": "four-way junction"}, [1, 4]),
-        (("spawn_side=left", "ego_direction=straight"), {"spawn_side": "left", "other_direction": "straight"}, [1, 4]),
+        (
+            ("spawn_side=left", "ego_direction=straight"),
+            {"spawn_side": "left", "other_direction": "straight"},
+            [1, 4],
+        ),
         (("num_frames=5..7",), {"length": "5..7"}, [2, 3, 4]),
         (("length=..5,8",), {"num_frames": ["..5", 8]}, [1, 2, 5]),
         (("length=7..",), {"length": range(7, 9)}, [4, 5]),
@@ -86,7 +92,11 @@ def numbers(da: DeepAccident, *where: str, **filters) -> list[int]:
         (("weather_group=Clear,Rainy",), {"weather_group": ["clear", "RAINY"]}, [1, 2, 5]),
         (("weather_group=Wet",), {"weather_group": "Wet"}, [4]),
         (("time_of_day_group=Daytime",), {"time_of_day_group": "Daytime"}, [1, 4]),
-        (("collision_status=collides_between_vehicles",), {"collision_status": "collides_between_vehicles"}, [1, 4]),
+        (
+            ("collision_status=collides_between_vehicles",),
+            {"collision_status": "collides_between_vehicles"},
+            [1, 4],
+        ),
         (("collision_status=unknown",), {"collision_status": None}, [3]),
         (("trajectory_type=straight_straight",), {"trajectory_type": "straight_straight"}, [1, 4]),
         (("contact_side=front_side",), {"contact_side": "Front Side"}, [1, 4]),
@@ -94,16 +104,26 @@ def numbers(da: DeepAccident, *where: str, **filters) -> list[int]:
         (("contact_side!=unknown",), {"spawn_relation": "same"}, [1, 4]),
         (("collision_ids=1300",), {"collision_ids": {1300, 5}}, [4]),
         (("collision_ids>1250",), {"collision_ids": "1251.."}, [4]),
-        (("collision_agents=ego_vehicle", "length<5"), {"collision_agents": "ego_vehicle", "length": 4}, [1]),
+        (
+            ("collision_agents=ego_vehicle", "length<5"),
+            {"collision_agents": "ego_vehicle", "length": 4},
+            [1],
+        ),
         (("collision_classes!=car",), {"collision_classes": None}, [2, 3, 5]),
         (("impact>6790.1", "impact<6790.2"), {"impact": "6790.1..6790.2"}, [1, 4]),
         (("impact>=6790.168605131015",), {"impact": 6790.168605131015}, [1, 4]),
         (("impact>6790.168605131015",), {"impact": "<6790.168605131015"}, []),
-        (("closing_speed=unknown", "length>4"), {"closing_speed": None, "length": "5.."}, [2, 3, 5]),
+        (
+            ("closing_speed=unknown", "length>4"),
+            {"closing_speed": None, "length": "5.."},
+            [2, 3, 5],
+        ),
         (("velocity_frame=unknown",), {"velocity_frame": None}, [1, 2, 3, 4, 5]),
     ],
 )
-def test_texts_and_keywords_find_the_same(da: DeepAccident, where, filters, found: list[int]) -> None:
+def test_texts_and_keywords_find_the_same(
+    da: DeepAccident, where, filters, found: list[int]
+) -> None:
     assert numbers(da, *where) == numbers(da, **filters) == found
 
 
@@ -111,15 +131,30 @@ def test_closing_speed_is_the_contacts(da_motion: DeepAccident) -> None:
     (accident,) = (one for one in da_motion.scenario if one["collision"])
     speed = da_motion.collision(accident).closing_speed
     assert speed > 1
-    assert da_motion.find(closing_speed=speed) == da_motion.find(f"closing_speed>{speed - 0.01:.4f}") == [accident]
+    assert (
+        da_motion.find(closing_speed=speed)
+        == da_motion.find(f"closing_speed>{speed - 0.01:.4f}")
+        == [accident]
+    )
     assert da_motion.find(f"closing_speed>{speed + 0.01:.4f}") == []
     assert accident not in da_motion.find(closing_speed=None)
 
 
-def test_every_column_is_a_field_and_every_group_of_a_breakdown_of_scenarios_too(da: DeepAccident) -> None:
+def test_every_column_is_a_field_and_every_group_of_a_breakdown_of_scenarios_too(
+    da: DeepAccident,
+) -> None:
     of_collisions = CollisionRecord.__annotations__.keys() - {"ids", "classes", "agents"}
-    of_samples = {"all", "agent", "accident_visibility", "time_to_impact", "impact_step", "time_to_end"}
-    assert {*ScenarioRecord.__annotations__, *of_collisions, *set(ATTRIBUTES) - of_samples} <= set(FIELDS)
+    of_samples = {
+        "all",
+        "agent",
+        "accident_visibility",
+        "time_to_impact",
+        "impact_step",
+        "time_to_end",
+    }
+    assert {*ScenarioRecord.__annotations__, *of_collisions, *set(ATTRIBUTES) - of_samples} <= set(
+        FIELDS
+    )
     stories = {one["token"]: group_texts(da, one) for one in da.scenario}
     for name in set(ATTRIBUTES) - of_samples:
         for value in {story[name] for story in stories.values()}:
@@ -156,18 +191,30 @@ NOTHING = ("weather", "time_of_day", "collision", "road_type")
         ({"other_direction": None}, {"trajectory_type": None}),
         (
             dict.fromkeys(NOTHING),
-            dict.fromkeys((*NOTHING[2:], "weather_group", "time_of_day_group", "collision_status", "trajectory_type")),
+            dict.fromkeys(
+                (
+                    *NOTHING[2:],
+                    "weather_group",
+                    "time_of_day_group",
+                    "collision_status",
+                    "trajectory_type",
+                )
+            ),
         ),
     ],
 )
-def test_the_released_evaluations_groups(da: DeepAccident, changes, told: dict[str, str | None]) -> None:
+def test_the_released_evaluations_groups(
+    da: DeepAccident, changes, told: dict[str, str | None]
+) -> None:
     (accident,) = da.find(length=4)
     if changes.get("collision"):
         changes = {"collision": accident["collision"] | changes["collision"]}
     assert group_texts(da, accident | changes).items() >= told.items()  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("field", ["weather=Wet", "length=5..7", "collision=true", "accident_type=1", "town=Town07"])
+@pytest.mark.parametrize(
+    "field", ["weather=Wet", "length=5..7", "collision=true", "accident_type=1", "town=Town07"]
+)
 def test_not_equal_finds_all_that_equal_leaves_out(da: DeepAccident, field: str) -> None:
     assert sorted(numbers(da, field) + numbers(da, field.replace("=", "!="))) == [1, 2, 3, 4, 5]
 
@@ -196,7 +243,9 @@ def test_parsed_texts(text: str, parsed: Filter) -> None:
     assert parse_where(text) == parsed
 
 
-@pytest.mark.parametrize("text", ["", "town", "=Town03", "town=", "town=Town03,", "length>", "to wn=Town03"])
+@pytest.mark.parametrize(
+    "text", ["", "town", "=Town03", "town=", "town=Town03,", "length>", "to wn=Town03"]
+)
 def test_texts_that_are_no_filter(text: str) -> None:
     assert_refused((lambda: parse_where(text), ChoiceError, "expected field=value"))
 
@@ -207,24 +256,55 @@ NUMBER = "num_frames: expected a number, a range such as 40..60"
 @pytest.mark.parametrize(
     ("asked", "error", "names"),
     [
-        ({"wether": "Clear"}, FieldError, ("cannot be found by 'wether'; the fields are weather, ",)),
+        (
+            {"wether": "Clear"},
+            FieldError,
+            ("cannot be found by 'wether'; the fields are weather, ",),
+        ),
         ("frame=1", FieldError, ("cannot be found by 'frame'",)),
         (
             {"weather": "heavyrain"},
             ChoiceError,
-            ("weather: found 'heavyrain'; possible are Clear, ", "WetCloudy; did you mean 'HardRain'?"),
+            (
+                "weather: found 'heavyrain'; possible are Clear, ",
+                "WetCloudy; did you mean 'HardRain'?",
+            ),
         ),
-        ({"town": "town3"}, ChoiceError, ("possible are Town01, Town02, Town03", "; did you mean 'Town03'?")),
-        ({"time_of_day": "night_time"}, ChoiceError, ("Noon, Sunset, Night; did you mean 'Night'?",)),
+        (
+            {"town": "town3"},
+            ChoiceError,
+            ("possible are Town01, Town02, Town03", "; did you mean 'Town03'?"),
+        ),
+        (
+            {"time_of_day": "night_time"},
+            ChoiceError,
+            ("Noon, Sunset, Night; did you mean 'Night'?",),
+        ),
         ("town==", ChoiceError, ("town: found '='; possible are Town01",)),
-        ({"type": "normal"}, ChoiceError, ("scenario_type: found 'normal'; possible are ", "type1_subtype2_normal")),
-        ({"accident_visibility": "seen"}, ChoiceError, ("'seen'; possible are visible, partial, invisible",)),
-        ("collision=maybe", ChoiceError, ("collision: expected true, false or unknown, found 'maybe'",)),
+        (
+            {"type": "normal"},
+            ChoiceError,
+            ("scenario_type: found 'normal'; possible are ", "type1_subtype2_normal"),
+        ),
+        (
+            {"accident_visibility": "seen"},
+            ChoiceError,
+            ("'seen'; possible are visible, partial, invisible",),
+        ),
+        (
+            "collision=maybe",
+            ChoiceError,
+            ("collision: expected true, false or unknown, found 'maybe'",),
+        ),
         ({"signalized": 1}, ChoiceError, ("signalized: expected true, false or unknown, found 1",)),
         ({"length": "long"}, ChoiceError, (NUMBER, "found 'long'")),
         ({"length": True}, ChoiceError, (NUMBER, "found True")),
         ({"length": 4.5}, ChoiceError, (NUMBER, "found 4.5")),
-        ({"accident_type": 13}, ChoiceError, ("accident_type: found 13; possible are 1, 2, ", "12")),
+        (
+            {"accident_type": 13},
+            ChoiceError,
+            ("accident_type: found 13; possible are 1, 2, ", "12"),
+        ),
         ("length=60..40", ChoiceError, ("num_frames: '60..40': 60 is more than 40",)),
         ("town>=3", ChoiceError, ("town: '>=3' is a range, which only numbers have",)),
         ("length>3,4", ChoiceError, ("'length>3,4': > takes one number, found 2",)),
@@ -235,11 +315,17 @@ NUMBER = "num_frames: expected a number, a range such as 40..60"
         ),
     ],
 )
-def test_what_is_impossible_is_named_with_what_is_possible(da: DeepAccident, asked, error, names) -> None:
-    assert_refused((lambda: da.find(asked) if isinstance(asked, str) else da.find(**asked), error, names))
+def test_what_is_impossible_is_named_with_what_is_possible(
+    da: DeepAccident, asked, error, names
+) -> None:
+    assert_refused(
+        (lambda: da.find(asked) if isinstance(asked, str) else da.find(**asked), error, names)
+    )
 
 
-@pytest.mark.parametrize("field", ["town", "num_frames", "accident_type", "collision", "accident_visibility"])
+@pytest.mark.parametrize(
+    "field", ["town", "num_frames", "accident_type", "collision", "accident_visibility"]
+)
 @pytest.mark.parametrize(
     "value",
     [
@@ -272,21 +358,35 @@ def test_values_that_no_field_has_are_our_error(da: DeepAccident, field: str, va
     with pytest.raises(ChoiceError, match=f"^{field}: ") as caught:
         da.find(**{field: value})
     assert len(str(caught.value)) < 400
-    assert any(remedy in str(caught.value) for remedy in ("possible are", "expected", "only numbers have"))
+    assert any(
+        remedy in str(caught.value) for remedy in ("possible are", "expected", "only numbers have")
+    )
 
 
-@pytest.mark.parametrize("text", [None, 5, ["town=Town03"], {"town": "Town03"}, np.array(["town=Town03"])])
+@pytest.mark.parametrize(
+    "text", [None, 5, ["town=Town03"], {"town": "Town03"}, np.array(["town=Town03"])]
+)
 def test_a_text_that_is_none_is_our_error(da: DeepAccident, text) -> None:
     assert_refused(
-        (lambda: da.find(text), DeepAccidentError, r"expected a text such as town=Town03,Town05, found .*as keywords")
+        (
+            lambda: da.find(text),
+            DeepAccidentError,
+            r"expected a text such as town=Town03,Town05, found .*as keywords",
+        )
     )
 
 
 @pytest.mark.parametrize(
     ("seen_at", "expected"),
-    [(range(41), "visible"), ((), "invisible"), ((35,), "partial")],  # evaluated are 20, 25, 30 and 35
+    [
+        (range(41), "visible"),
+        ((), "invisible"),
+        ((35,), "partial"),
+    ],  # evaluated are 20, 25, 30 and 35
 )
-def test_scenarios_are_found_by_how_well_their_accident_is_seen(tmp_path: Path, seen_at, expected: str) -> None:
+def test_scenarios_are_found_by_how_well_their_accident_is_seen(
+    tmp_path: Path, seen_at, expected: str
+) -> None:
     """The rule itself is in tests/unit/v2x/test_accident_visibility.py."""
 
     def lines(agent: str, frame: int) -> list[str]:
@@ -300,16 +400,35 @@ def test_scenarios_are_found_by_how_well_their_accident_is_seen(tmp_path: Path, 
 
 
 @pytest.mark.parametrize("hidden", [True, False])
-def test_a_hidden_collider_is_one_of_the_accident_and_of_its_twin(tmp_path: Path, hidden: bool) -> None:
+def test_a_hidden_collider_is_one_of_the_accident_and_of_its_twin(
+    tmp_path: Path, hidden: bool
+) -> None:
     """The rule itself is in tests/unit/v2x/test_agents.py. Without an accident it is not known."""
 
     def lines(agent: str, frame: int) -> list[str]:
-        return [*label_lines(agent, frame), f"car 30 0 0 4.5 1.9 1.5 0 0 0 1212 {9 * (not hidden)} {not hidden}"]
+        return [
+            *label_lines(agent, frame),
+            f"car 30 0 0 4.5 1.9 1.5 0 0 0 1212 {9 * (not hidden)} {not hidden}",
+        ]
 
-    accident, alone, first = named("Town03", 1), named("Town03", 2), TYPE.replace("accident", "normal")
-    for kind, name, meta in ((TYPE, accident, META), (first, accident, QUIET), (first, alone, QUIET)):
+    accident, alone, first = (
+        named("Town03", 1),
+        named("Town03", 2),
+        TYPE.replace("accident", "normal"),
+    )
+    for kind, name, meta in (
+        (TYPE, accident, META),
+        (first, accident, QUIET),
+        (first, alone, QUIET),
+    ):
         write_tiny_release(
-            tmp_path, scenario_type=kind, name=name, meta=meta, frames=20, agents=("ego_vehicle",), lines_of=lines
+            tmp_path,
+            scenario_type=kind,
+            name=name,
+            meta=meta,
+            frames=20,
+            agents=("ego_vehicle",),
+            lines_of=lines,
         )
     da = DeepAccident(dataroot=tmp_path, verbose=False)
     pair, rest = [f"{TYPE}/{accident}", f"{first}/{accident}"], [f"{first}/{alone}"]
@@ -317,16 +436,25 @@ def test_a_hidden_collider_is_one_of_the_accident_and_of_its_twin(tmp_path: Path
     assert [one["token"] for one in da.find(hidden_collider=None)] == rest
 
 
-def test_the_most_critical_moving_pair(da_motion: DeepAccident, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_most_critical_moving_pair(
+    da_motion: DeepAccident, monkeypatch: pytest.MonkeyPatch
+) -> None:
     accident, normal = (da_motion.find(collision=collided)[0] for collided in (True, False))
     pairs = da_motion.interactions(accident).pairs
-    assert {name: FIELDS[name].read(da_motion, accident) for name in ("min_ttc", "min_pet", "min_gap", "max_drac")} == {
+    assert {
+        name: FIELDS[name].read(da_motion, accident)
+        for name in ("min_ttc", "min_pet", "min_gap", "max_drac")
+    } == {
         "min_ttc": pairs.min_ttc[pairs.moving].min(),
         "min_pet": np.abs(pairs.pet[pairs.moving]).min(),
         "min_gap": pairs.min_gap[pairs.moving].min(),
         "max_drac": pairs.max_drac[pairs.moving].max(),
     }
-    near = (da_motion.find(min_ttc="..0.3"), da_motion.find("min_ttc<=0.3"), da_motion.find("max_drac>20"))
+    near = (
+        da_motion.find(min_ttc="..0.3"),
+        da_motion.find("min_ttc<=0.3"),
+        da_motion.find("max_drac>20"),
+    )
     assert near == ([accident],) * 3
     assert da_motion.find("min_ttc>0.3") == [normal]
     asked: list[str] = []
@@ -341,7 +469,9 @@ def test_the_most_critical_moving_pair(da_motion: DeepAccident, monkeypatch: pyt
     assert asked == [normal["token"]], "costly fields come last"
 
 
-def test_without_pairs_nothing_is_near_and_without_labels_nothing_is_known(da: DeepAccident, tmp_path: Path) -> None:
+def test_without_pairs_nothing_is_near_and_without_labels_nothing_is_known(
+    da: DeepAccident, tmp_path: Path
+) -> None:
     far = {"min_ttc": np.inf, "min_pet": np.inf, "min_gap": np.inf, "max_drac": 0.0}
     assert {name: {FIELDS[name].read(da, one) for one in da.scenario} for name in far} == {
         name: {value} for name, value in far.items()

@@ -23,8 +23,16 @@ from deepaccident_devkit.taxonomy import CATEGORIES
 QUIET = "ClearNight -1 -1 -1 -1 -1 -1 -1 45\n"
 NORMAL = "type1_subtype2_normal"
 EGO = ("ego_vehicle",)
-WALKER = META.replace("1212 car", "1400 pedestrian").replace("ego other", "ego none").replace("HardRainNoon", "WetNoon")
-THIRD = META.replace("1212 car", "1300 van").replace("ego other", "ego none").replace("four-way", "three-way")
+WALKER = (
+    META.replace("1212 car", "1400 pedestrian")
+    .replace("ego other", "ego none")
+    .replace("HardRainNoon", "WetNoon")
+)
+THIRD = (
+    META.replace("1212 car", "1300 van")
+    .replace("ego other", "ego none")
+    .replace("four-way", "three-way")
+)
 ODD = META.replace("spawn_side: left", "spawn_side: opposite")
 
 
@@ -39,7 +47,9 @@ def tiny(tmp_path_factory: pytest.TempPathFactory) -> DeepAccident:
     write_tiny_release(root, name=named(1))
     write_tiny_release(root, name=named(2), scenario_type=NORMAL, meta=QUIET, agents=EGO, frames=35)
     write_tiny_release(root, name=named(3), meta=WALKER, agents=EGO, frames=2)
-    write_tiny_release(root, name=named(4), meta=THIRD, agents=("ego_vehicle", "infrastructure"), frames=2)
+    write_tiny_release(
+        root, name=named(4), meta=THIRD, agents=("ego_vehicle", "infrastructure"), frames=2
+    )
     write_tiny_release(root, name=named(5), meta=ODD, agents=EGO, frames=1)
     write_tiny_release(root, name=named(6), meta=None, labelled=False, agents=EGO, frames=30)
     (root / "train.txt").write_text(f"{TYPE} {named(1)}\n{TYPE} {named(3)}\n{TYPE} {named(5)}\n")
@@ -64,7 +74,9 @@ def test_scenarios_are_counted_by_split(of_tiny: DatasetStatistics) -> None:
 
 def test_how_scenarios_ended_and_in_which_weather(of_tiny: DatasetStatistics) -> None:
     found = {
-        name: {end: row["total"] for end, row in of_tiny.counts[name].counts.items() if row["total"]}
+        name: {
+            end: row["total"] for end, row in of_tiny.counts[name].counts.items() if row["total"]
+        }
         for name in ("ends", "collisions", "weathers")
     }
     once = (
@@ -111,11 +123,24 @@ def test_lengths_have_the_references_seven_bins(of_tiny: DatasetStatistics) -> N
     )
 
 
-def test_ego_drives_at_ten_metres_a_second_and_has_the_size_of_its_row(of_tiny: DatasetStatistics) -> None:
+def test_ego_drives_at_ten_metres_a_second_and_has_the_size_of_its_row(
+    of_tiny: DatasetStatistics,
+) -> None:
     speeds, sizes = of_tiny.histograms["ego_speeds"], of_tiny.quantiles["ego_sizes"]
-    assert (speeds.counts["total"][10], speeds.total(), speeds.left_out.counts["test"]) == (4 + 35 + 2 + 2 + 1, 44, 30)
-    assert [sizes.median(field, "ego_vehicle") for field in ("length", "width", "height")] == [4.5, 1.9, 1.5]
-    known = (sizes.row("length", "ego_vehicle").number, sizes.median("length", "ego_vehicle", "test"))
+    assert (speeds.counts["total"][10], speeds.total(), speeds.left_out.counts["test"]) == (
+        4 + 35 + 2 + 2 + 1,
+        44,
+        30,
+    )
+    assert [sizes.median(field, "ego_vehicle") for field in ("length", "width", "height")] == [
+        4.5,
+        1.9,
+        1.5,
+    ]
+    known = (
+        sizes.row("length", "ego_vehicle").number,
+        sizes.median("length", "ego_vehicle", "test"),
+    )
     assert (*known, sizes.left_out.counts["total"]) == (5, None, 1)
     assert_refused((lambda: sizes.row("depth", "ego_vehicle"), KeyError, "depth"))
 
@@ -123,12 +148,22 @@ def test_ego_drives_at_ten_metres_a_second_and_has_the_size_of_its_row(of_tiny: 
 def test_the_pair_as_ego_sees_it(of_tiny: DatasetStatistics) -> None:
     """Ego at (5, −4.1) looks along −y, the other at (−19.9, 0) along x."""
     first, third = of_tiny.collisions
-    assert (first.actor, first.other, first.end, first.split) == ("ego_vehicle", "other_vehicle", "design 1", "train")
+    assert (first.actor, first.other, first.end, first.split) == (
+        "ego_vehicle",
+        "other_vehicle",
+        "design 1",
+        "train",
+    )
     assert (first.angle, first.x, first.y) == pytest.approx((90.0, -4.1, -24.9))
     assert (third.actor, third.other, third.other_category) == ("ego_vehicle", None, "van")
-    angles, bearings = of_tiny.histograms["collision_angles"], of_tiny.histograms["collision_bearings"]
+    angles, bearings = (
+        of_tiny.histograms["collision_angles"],
+        of_tiny.histograms["collision_bearings"],
+    )
     assert angles.counts["train"] == tuple(int(index == 3) for index in range(12))
-    assert bearings.counts["train"] == tuple(int(index == 9) for index in range(12))  # 260.6° is near 270°
+    assert bearings.counts["train"] == tuple(
+        int(index == 9) for index in range(12)
+    )  # 260.6° is near 270°
     assert angles.left_out is not None
     assert angles.left_out.counts == {"total": 2, "train": 2, "val": 0, "test": 0, "unknown": 0}
 
@@ -151,10 +186,17 @@ def test_equal_to_plain_python_over_records(both_layouts: DeepAccident) -> None:
         for group in GROUPS:
             key = (category, group)
             assert made.counts["annotations"].counts[category][group] == annotations[key]
-            for table, field, values in (("box_sizes", "length", lengths), ("distance_quantiles", "distance", far)):
+            for table, field, values in (
+                ("box_sizes", "length", lengths),
+                ("distance_quantiles", "distance", far),
+            ):
                 median = made.quantiles[table].median(field, category, group)
-                assert median == (pytest.approx(plain.median(values[key])) if key in values else None)
-    assert made.histograms["distances"].counts["total"] == tuple(numbers[index] for index in range(20))
+                assert median == (
+                    pytest.approx(plain.median(values[key])) if key in values else None
+                )
+    assert made.histograms["distances"].counts["total"] == tuple(
+        numbers[index] for index in range(20)
+    )
     parked = {record["token"] for record in da.instance if record["actor_id"] >= 20000}
     speeds = [
         (track["category"], math.hypot(*track["velocity"][:2]))
@@ -164,25 +206,36 @@ def test_equal_to_plain_python_over_records(both_layouts: DeepAccident) -> None:
     for category in CATEGORIES:
         row = made.quantiles["speed_quantiles"].row("speed", category)
         values = [speed for name, speed in speeds if name == category]
-        assert (row.number, row.values[-1] if row.values else 0) == (len(values), pytest.approx(max(values, default=0)))
+        assert (row.number, row.values[-1] if row.values else 0) == (
+            len(values),
+            pytest.approx(max(values, default=0)),
+        )
     ended = (row["total"] for row in made.counts["ends"].counts.values())
     assert (made.counts["instances"].total(), sum(ended)) == (len(da.instance), len(da.scenario))
 
 
 def test_a_selection_counts_alone(tiny: DeepAccident, of_tiny: DatasetStatistics) -> None:
     train = dataset_statistics(tiny, tiny.find(split="train"))
-    rest = dataset_statistics(tiny, [record["token"] for record in tiny.scenario if record["split"] != "train"])
+    rest = dataset_statistics(
+        tiny, [record["token"] for record in tiny.scenario if record["split"] != "train"]
+    )
     assert train.selected
     for name, table in of_tiny.counts.items():
         for group in GROUPS:
-            assert train.counts[name].total(group) + rest.counts[name].total(group) == table.total(group)
+            assert train.counts[name].total(group) + rest.counts[name].total(group) == table.total(
+                group
+            )
     for name, histogram in of_tiny.histograms.items():
         assert train.histograms[name].counts["train"] == histogram.counts["train"]
         assert train.histograms[name].total() + rest.histograms[name].total() == histogram.total()
     sizes, of_all = (each.quantiles["box_sizes"] for each in (train, of_tiny))
     assert sizes.row("length", "van").values == of_all.row("length", "van", "train").values
     nothing = dataset_statistics(tiny, [])
-    assert (nothing.scenarios["total"], nothing.collisions, nothing.counts["annotations"].total()) == (0, (), 0)
+    assert (
+        nothing.scenarios["total"],
+        nothing.collisions,
+        nothing.counts["annotations"].total(),
+    ) == (0, (), 0)
     assert_refused((lambda: dataset_statistics(tiny, ["nowhere/at all"]), TokenError, "nowhere"))
 
 
@@ -193,7 +246,10 @@ def test_json_and_csv_say_the_same(of_tiny: DatasetStatistics, tmp_path: Path) -
     written = of_tiny.to_csv(tmp_path / "new" / "folder")
     assert sorted((tmp_path / "new" / "folder").iterdir()) == sorted(written)
     tables = {path.stem: list(csv.reader(path.read_text().splitlines())) for path in written}
-    assert (len(tables), tables["ends"][4]) == (len(of_tiny.tables) + 1, ["design 1", "1", "1", "0", "0", "0"])
+    assert (len(tables), tables["ends"][4]) == (
+        len(of_tiny.tables) + 1,
+        ["design 1", "1", "1", "0", "0", "0"],
+    )
     head, first, *_, last = tables["lengths"]
     assert (head, first, last) == (
         ["length from (frames)", "to (frames)", *GROUPS],
@@ -210,8 +266,12 @@ def test_pairs_and_scenarios_are_in_their_bins(da_b: DeepAccident) -> None:
     plain = dataset_statistics(da_b)
     assert not {"pair_min_ttcs", "scenario_min_ttcs"} & plain.histograms.keys()
     made = dataset_statistics(da_b, interactions=True)
-    assert {name: each for name, each in made.histograms.items() if name in plain.histograms} == plain.histograms
-    times = [found.pairs.min_ttc[found.pairs.moving] for found in map(da_b.interactions, da_b.scenario)]
+    assert {
+        name: each for name, each in made.histograms.items() if name in plain.histograms
+    } == plain.histograms
+    times = [
+        found.pairs.min_ttc[found.pairs.moving] for found in map(da_b.interactions, da_b.scenario)
+    ]
     pairs, scenarios = made.histograms["pair_min_ttcs"], made.histograms["scenario_min_ttcs"]
     together = np.concatenate(times)
     assert (pairs.counts["total"], pairs.outside["total"], pairs.left_out.counts["total"]) == (
@@ -228,7 +288,11 @@ def test_pairs_and_scenarios_are_in_their_bins(da_b: DeepAccident) -> None:
 def test_the_verb_counts_interactions(da_b: DeepAccident) -> None:
     output = (
         CliRunner()
-        .invoke(deepaccident, ["info", str(da_b.dataroot), "--statistics", "--interactions"], catch_exceptions=False)
+        .invoke(
+            deepaccident,
+            ["info", str(da_b.dataroot), "--statistics", "--interactions"],
+            catch_exceptions=False,
+        )
         .output
     )
     assert output.rstrip("\n") == dataset_statistics(da_b, interactions=True).to_text()

@@ -24,11 +24,21 @@ from deepaccident_devkit.v2x import cooperative_view
 from deepaccident_devkit.v2x.tracks import scenario_tracks
 
 
-@pytest.mark.parametrize("values", ["abc", ["1", "2"], None, [None, 1.0], [[1], [1, 2]], [1j, 2], object()])
+@pytest.mark.parametrize(
+    "values", ["abc", ["1", "2"], None, [None, 1.0], [[1], [1, 2]], [1j, 2], object()]
+)
 def test_what_is_no_numbers_is_refused(values: object) -> None:
     refused = [
-        (lambda: checked("weights", values, (None,)), GeometryError, ("weights: expected an array of shape (N), fo",)),
-        (lambda: as_numbers("weights", values), GeometryError, ("weights: expected numbers, found",)),
+        (
+            lambda: checked("weights", values, (None,)),
+            GeometryError,
+            ("weights: expected an array of shape (N), fo",),
+        ),
+        (
+            lambda: as_numbers("weights", values),
+            GeometryError,
+            ("weights: expected numbers, found",),
+        ),
     ]
     if values not in (["1", "2"], None, [None, 1.0]):  # what numpy itself reads as numbers or NaN
         refused.append((lambda: as_floats(values), GeometryError, ("expected numbers, found",)))
@@ -38,7 +48,13 @@ def test_what_is_no_numbers_is_refused(values: object) -> None:
 @pytest.mark.parametrize("wrong", [[1.5, 2], [np.nan, 2], [1e30, 2], [300, 1]])
 def test_integers_must_be_whole_and_in_range(wrong: list[float]) -> None:
     assert checked("ids", [1.0, 2.0], (2,), np.int64).tolist() == [1, 2]
-    assert_refused((lambda: checked("ids", wrong, (2,), np.int8), GeometryError, "ids: expected whole numbers of int8"))
+    assert_refused(
+        (
+            lambda: checked("ids", wrong, (2,), np.int8),
+            GeometryError,
+            "ids: expected whole numbers of int8",
+        )
+    )
 
 
 @pytest.mark.parametrize(
@@ -65,7 +81,11 @@ def test_a_cloud_in_place_of_an_array_is_named_so() -> None:
     cloud = LidarPointCloud(np.zeros((2, 3)), np.zeros(2, dtype=np.float32))
     boxes = Boxes.from_arrays(np.zeros((1, 3)), np.ones((1, 3)), [0.0])
     told = ("points: ", "found LidarPointCloud ", "give its array, .xyz")
-    calls = (boxes.contains, boxes.count_points, PinholeCamera.from_field_of_view(8, 6, 1.0).project)
+    calls = (
+        boxes.contains,
+        boxes.count_points,
+        PinholeCamera.from_field_of_view(8, 6, 1.0).project,
+    )
     assert_refused(*((lambda call=call: call(cloud), GeometryError, told) for call in calls))
     assert boxes.count_points(cloud.xyz).tolist() == [2]
 
@@ -106,7 +126,9 @@ def test_arrays_of_other_frameworks_are_read(kind: type[Foreign]) -> None:
 
 @pytest.mark.parametrize("kind", [WithArray, OnlyDlpack])
 @pytest.mark.parametrize("error", [TypeError, RuntimeError, BufferError, ValueError])
-def test_arrays_that_cannot_be_read_say_what_to_do(kind: type[Foreign], error: type[Exception]) -> None:
+def test_arrays_that_cannot_be_read_say_what_to_do(
+    kind: type[Foreign], error: type[Exception]
+) -> None:
     given = kind([1.0], error("it is on another device"))
     remedy = r"another device\); pass a torch tensor as tensor\.detach\(\)\.cpu\(\)\.float\(\), another framework's"
     assert_refused(
@@ -115,7 +137,11 @@ def test_arrays_that_cannot_be_read_say_what_to_do(kind: type[Foreign], error: t
             GeometryError,
             rf"x: expected an array of shape \(1\), found {kind.__name__} .*{remedy}",
         ),
-        (lambda: as_floats(given), GeometryError, rf"^expected numbers, found {kind.__name__} .*{remedy}"),
+        (
+            lambda: as_floats(given),
+            GeometryError,
+            rf"^expected numbers, found {kind.__name__} .*{remedy}",
+        ),
     )
 
 
@@ -131,12 +157,16 @@ def test_masked_numbers_are_nobodys_to_unmask() -> None:
 
 def test_numbers_beyond_a_float_type_are_refused() -> None:
     told = ("x: expected numbers within float32's range, found -1e+300",)
-    assert_refused((lambda: checked("x", [1.0, np.inf, np.nan, -1e300], (4,), np.float32), GeometryError, told))
+    assert_refused(
+        (lambda: checked("x", [1.0, np.inf, np.nan, -1e300], (4,), np.float32), GeometryError, told)
+    )
     kept = [1.0, np.inf, -np.inf, np.nan]
     assert_array_equal(checked("x", kept, (4,), np.float32), kept)
 
 
-@pytest.mark.parametrize("value", [2, 2.0, np.float32(2), np.int64(2), np.array(2), Fraction(2), np.uint8(2)])
+@pytest.mark.parametrize(
+    "value", [2, 2.0, np.float32(2), np.int64(2), np.array(2), Fraction(2), np.uint8(2)]
+)
 def test_single_numbers_of_python_and_numpy(value: object) -> None:
     number = checked_number("x", value)
     assert (type(number), number) == (float, 2.0)
@@ -149,9 +179,13 @@ def test_single_numbers_of_python_and_numpy(value: object) -> None:
 def test_what_is_no_single_number(wrong: object) -> None:
     number, whole = (("x: expected metres, found",), ("x: expected frames, found",))
     if not isinstance(wrong, float):
-        assert_refused((lambda: checked_number("x", wrong, "metres", ConfigError), ConfigError, number))
+        assert_refused(
+            (lambda: checked_number("x", wrong, "metres", ConfigError), ConfigError, number)
+        )
     if not isinstance(wrong, int):
-        assert_refused((lambda: checked_whole("x", wrong, "frames", ConfigError), ConfigError, whole))
+        assert_refused(
+            (lambda: checked_whole("x", wrong, "frames", ConfigError), ConfigError, whole)
+        )
 
 
 def arrays_of(record: object) -> dict[str, np.ndarray]:
@@ -184,7 +218,9 @@ COPIES = [lambda record: pickle.loads(pickle.dumps(record)), copy.deepcopy, copy
 
 
 @pytest.mark.parametrize("copied", COPIES, ids=["pickle", "deepcopy", "copy"])
-def test_arrays_stay_read_only_in_every_copy(da: DeepAccident, copied: Callable[[object], object]) -> None:
+def test_arrays_stay_read_only_in_every_copy(
+    da: DeepAccident, copied: Callable[[object], object]
+) -> None:
     for record in records(da):
         assert isinstance(record, FrozenArrays)
         twin, have = copied(record), arrays_of(record)
@@ -192,6 +228,8 @@ def test_arrays_stay_read_only_in_every_copy(da: DeepAccident, copied: Callable[
         assert have
         for name, array in arrays_of(twin).items():
             assert_array_equal(array, have[name])
-            assert (have[name].flags.writeable, array.flags.writeable) == (False, False), f"{type(record)}.{name}"
+            assert (have[name].flags.writeable, array.flags.writeable) == (False, False), (
+                f"{type(record)}.{name}"
+            )
     box = copied(da.get_boxes(da.sample[0])[0])
     assert (box.center.flags.writeable, box.token is not None) == (False, True)

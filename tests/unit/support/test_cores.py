@@ -37,7 +37,12 @@ def a_system(root: Path, groups: str, quotas: dict[str, str], files: dict[str, s
         ("0::/docker/not_seen_from_inside", {"": "500000 100000"}, VERSION_2, 5),
         ("0::/../other", {"": "500000 100000"}, VERSION_2, 5),
         ("4:cpu,cpuacct:/job", {"cpu/job": "250000 50000"}, VERSION_1, 5),
-        ("4:cpuacct,cpu:/job/step", {"cpu/job": "250000 50000", "cpu/job/step": "-1 50000"}, VERSION_1, 5),
+        (
+            "4:cpuacct,cpu:/job/step",
+            {"cpu/job": "250000 50000", "cpu/job/step": "-1 50000"},
+            VERSION_1,
+            5,
+        ),
         ("4:cpu:/docker/not_seen_from_inside", {"cpu": "100000 100000"}, VERSION_1, 1),
         ("4:cpuset:/job", {"cpu/job": "100000 100000"}, VERSION_1, math.inf),
         ("0::/\n4:cpu:/job", {"cpu/job": "300000 100000"}, VERSION_1, 3),
@@ -55,7 +60,9 @@ def test_workers_and_threads_follow_the_quota(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr("os.cpu_count", lambda: 64)
     monkeypatch.setattr("os.sched_getaffinity", lambda _: set(range(64)), raising=False)
     for quota, cores in ((3.0, 3), (2.5, 3), (0.1, 1), (math.inf, 64)):
-        monkeypatch.setattr("deepaccident_devkit.support.cores.quota_below", lambda _, quota=quota: quota)
+        monkeypatch.setattr(
+            "deepaccident_devkit.support.cores.quota_below", lambda _, quota=quota: quota
+        )
         assert (usable_cores(), batches._worker_count(None, 10_000)) == (cores, cores)
         with own_threads() as threads:
             assert threads._max_workers == cores

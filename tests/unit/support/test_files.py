@@ -78,7 +78,11 @@ def test_the_next_run_removes_what_a_killed_one_left(tmp_path: Path) -> None:
         remove_leftovers(tmp_path)
         assert [temporary_of(name) for name in names(tmp_path)] == ["run", "table.json"]  # it lives
         os.kill(writer.pid, signal.SIGKILL)
-        wait_for(lambda: Path(f"/proc/{writer.pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z")
+        wait_for(
+            lambda: (
+                Path(f"/proc/{writer.pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
+            )
+        )
         write_bytes(tmp_path / "other.json", b"")  # nobody has asked for its status yet
         assert names(tmp_path) == ["other.json"]
 
@@ -94,7 +98,10 @@ def elsewhere(name: str) -> str:
 @pytest.mark.parametrize(
     ("kept", "gone", "days"),
     [(str, other_process, (0, 0)), (elsewhere, elsewhere, (0.9, 1.1))],
-    ids=["the number of a dead writer is another process's", "writers on other hosts are given a day"],
+    ids=[
+        "the number of a dead writer is another process's",
+        "writers on other hosts are given a day",
+    ],
 )
 def test_whose_leftovers_are_removed(tmp_path: Path, kept, gone, days: tuple[float, float]) -> None:
     fresh = left_by(tmp_path, kept, age=days[0] * DAY)
@@ -123,10 +130,13 @@ def test_a_link_is_removed_and_not_what_it_leads_to(tmp_path: Path) -> None:
 
 def test_plain_names_are_names_on_any_file_system() -> None:
     names = plain_names(
-        ["a/b", "A_b", "a?b", "..", "", "x" * 300, f"{'x' * 300}y", "café"], taken=["INDEX.html", "a_b"]
+        ["a/b", "A_b", "a?b", "..", "", "x" * 300, f"{'x' * 300}y", "café"],
+        taken=["INDEX.html", "a_b"],
     )
     assert len({name.lower() for name in names.values()} | {"index.html", "a_b"}) == 10
-    assert all(re.fullmatch(r"[A-Za-z0-9_.-]{1,140}", name) and name.strip(".") for name in names.values())
+    assert all(
+        re.fullmatch(r"[A-Za-z0-9_.-]{1,140}", name) and name.strip(".") for name in names.values()
+    )
     given = plain_names(["index.html", "../../up"], taken=["INDEX.html"])
     assert given == {"index.html": "index.html_2", "../../up": ".._.._up"}
 
@@ -149,7 +159,9 @@ def a_link_to_a_pipe(path: Path) -> None:
 
 
 @pytest.mark.parametrize("make", [os.mkfifo, a_socket, a_device, Path.mkdir, a_link_to_a_pipe])
-def test_what_is_no_regular_file_is_not_replaced(tmp_path: Path, make: Callable[[Path], object]) -> None:
+def test_what_is_no_regular_file_is_not_replaced(
+    tmp_path: Path, make: Callable[[Path], object]
+) -> None:
     path = tmp_path / "output"
     make(path)
     before = {entry.name: entry.lstat() for entry in tmp_path.iterdir()}
@@ -168,7 +180,9 @@ def test_what_is_no_regular_file_is_not_replaced(tmp_path: Path, make: Callable[
 
 
 @pytest.mark.parametrize("make", [os.mkfifo, a_socket, a_device, Path.touch, a_link_to_a_pipe])
-def test_what_is_no_folder_is_not_replaced_by_one(tmp_path: Path, make: Callable[[Path], object]) -> None:
+def test_what_is_no_folder_is_not_replaced_by_one(
+    tmp_path: Path, make: Callable[[Path], object]
+) -> None:
     path = tmp_path / "output"
     make(path)
     before = names(tmp_path)
@@ -182,8 +196,17 @@ def test_nothing_is_written_among_devices_and_open_files(tmp_path: Path) -> None
     """Such as `/dev/stdout`, where the output of a command goes to a file."""
     (tmp_path / "link").symlink_to("/proc/self/fd")
     with (tmp_path / "opened").open("w") as opened:
-        for path in (Path(f"/proc/self/fd/{opened.fileno()}"), tmp_path / "link" / str(opened.fileno())):
-            assert_refused((lambda path=path: write_bytes(path, b"new"), OutputFolderError, ("open file", "new file")))
+        for path in (
+            Path(f"/proc/self/fd/{opened.fileno()}"),
+            tmp_path / "link" / str(opened.fileno()),
+        ):
+            assert_refused(
+                (
+                    lambda path=path: write_bytes(path, b"new"),
+                    OutputFolderError,
+                    ("open file", "new file"),
+                )
+            )
 
 
 def test_a_link_to_a_file_or_to_nothing_is_replaced_itself(tmp_path: Path) -> None:

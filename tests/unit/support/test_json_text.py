@@ -10,17 +10,27 @@ from refusals import assert_refused
 from deepaccident_devkit.support.json_text import MOST_LEVELS, parsed_json, parsed_record
 
 
-@pytest.mark.parametrize("value", [None, 1, "a", [], {}, {"a": [1.5, {"b": '[[[\\"{'}], "[": "\\"}, '\\"' * 3, "é😀"])
+@pytest.mark.parametrize(
+    "value", [None, 1, "a", [], {}, {"a": [1.5, {"b": '[[[\\"{'}], "[": "\\"}, '\\"' * 3, "é😀"]
+)
 def test_json_is_read(value: Any) -> None:
     assert parsed_json(json.dumps(value).encode()) == value
     assert parsed_json(json.dumps(value, ensure_ascii=False, indent=1).encode()) == value
 
 
-@pytest.mark.parametrize("text", ["[" * 100, '"' + "{" * 100, "\\" * 99 + '"' + "[" * 100, "]" * 100])
+@pytest.mark.parametrize(
+    "text", ["[" * 100, '"' + "{" * 100, "\\" * 99 + '"' + "[" * 100, "]" * 100]
+)
 def test_brackets_in_texts_are_no_levels(text: str) -> None:
     assert parsed_json(json.dumps({"a": text}).encode()) == {"a": text}
     after = b'["\\\\", "\\"", ' + b"[" * MOST_LEVELS + b"]" * (MOST_LEVELS + 1)
-    assert_refused((lambda: parsed_json(after), ValueError, (f"is nested more than {MOST_LEVELS} levels deep",)))
+    assert_refused(
+        (
+            lambda: parsed_json(after),
+            ValueError,
+            (f"is nested more than {MOST_LEVELS} levels deep",),
+        )
+    )
 
 
 @pytest.mark.parametrize("far", [0, 3 << 20])
@@ -60,7 +70,9 @@ def test_what_is_none_is_told_in_few_words(content: bytes, told: str) -> None:
         parsed_json(content)
 
 
-@pytest.mark.parametrize("content", [b"9" * 5_000_000, b'"' * 5_000_000, b'{"a":[' * 20 + b"1," * 2_000_000])
+@pytest.mark.parametrize(
+    "content", [b"9" * 5_000_000, b'"' * 5_000_000, b'{"a":[' * 20 + b"1," * 2_000_000]
+)
 def test_what_is_long_is_refused_as_soon(content: bytes) -> None:
     """Were the time that it takes not linear, this would take hours."""
     assert_refused((lambda: parsed_json(content), ValueError, ("is no JSON",)))

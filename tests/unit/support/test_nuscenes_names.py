@@ -55,8 +55,12 @@ def test_each_counterpart_is_here(names: Mapping[str, str]) -> None:
 OWNERS = {"DeepAccident": "da", "Box": "box", "LidarPointCloud": "cloud"}
 
 
-@pytest.mark.parametrize(("kind", "name"), [(kind, name) for kind, names in CLASSES for name in names])
-def test_a_name_of_nuscenes_names_the_counterpart(request: pytest.FixtureRequest, kind: type, name: str) -> None:
+@pytest.mark.parametrize(
+    ("kind", "name"), [(kind, name) for kind, names in CLASSES for name in names]
+)
+def test_a_name_of_nuscenes_names_the_counterpart(
+    request: pytest.FixtureRequest, kind: type, name: str
+) -> None:
     """Ours, and an attribute error; of a cloud's class too, from which one is read."""
     owner = request.getfixturevalue(OWNERS[kind.__name__])
     named = (
@@ -73,7 +77,11 @@ def test_other_names_fail_as_ever(da: DeepAccident) -> None:
     assert_refused(
         (lambda: da.samplex, AttributeError, r"^'DeepAccident' object has no attribute 'samplex'$"),
         # the error of the property itself
-        (lambda: object.__new__(DeepAccident).scenario, AttributeError, r"^'DeepAccident' .* attribute '_tables'$"),
+        (
+            lambda: object.__new__(DeepAccident).scenario,
+            AttributeError,
+            r"^'DeepAccident' .* attribute '_tables'$",
+        ),
         (lambda: da.get("sampel", "x"), TableError, r"category; did you mean 'sample'\?$"),
     )
     assert copy.copy(da).sample[0] == da.sample[0]
@@ -85,7 +93,9 @@ def test_an_unknown_table_of_nuscenes_names_the_counterpart(da: DeepAccident, na
     assert_refused((lambda: da.get(name, "x"), TableError, named))
 
 
-@pytest.mark.parametrize("name", ["get_sample_data", *(each for each in render.__all__ if each.startswith("render_"))])
+@pytest.mark.parametrize(
+    "name", ["get_sample_data", *(each for each in render.__all__ if each.startswith("render_"))]
+)
 def test_an_argument_of_nuscenes_names_the_counterpart(da: DeepAccident, name: str) -> None:
     method = getattr(da, name)
     own = inspect.signature(method).parameters
@@ -106,7 +116,11 @@ def test_an_argument_of_nuscenes_names_the_counterpart(da: DeepAccident, name: s
         (lambda da: da.get(table_name="sample"), "table_name", "first argument"),
         (lambda da: da.get_boxes(sample_data_token=None), "sample_data_token", "first argument"),
         (lambda da: da.render_bev(da.sample[0], axis=None), "axis", "did you mean 'ax'?"),
-        (lambda da: da.get_boxes(da.sample[0])[0].corners(wlh_factor=2), "wlh_factor", "Box.from_wlh"),
+        (
+            lambda da: da.get_boxes(da.sample[0])[0].corners(wlh_factor=2),
+            "wlh_factor",
+            "Box.from_wlh",
+        ),
     ],
 )
 def test_a_misspelt_argument_is_named(da: DeepAccident, call, argument: str, meant: str) -> None:
@@ -121,11 +135,19 @@ def test_a_field_of_nuscenes_names_the_counterpart(da: DeepAccident, table: str)
     no = "the record has no field '{}'"
     assert_refused(
         *(
-            (lambda field=field: record[field], FieldError, (f"{no.format(field)}: {counterpart} ",))
+            (
+                lambda field=field: record[field],
+                FieldError,
+                (f"{no.format(field)}: {counterpart} ",),
+            )
             for field, counterpart in nuscenes_names.FIELD_HINTS.items()
             if field not in record
         ),
-        (lambda: record["tokn"], KeyError, (f"{no.format('tokn')}; it has token, ", "; did you mean 'token'?")),
+        (
+            lambda: record["tokn"],
+            KeyError,
+            (f"{no.format('tokn')}; it has token, ", "; did you mean 'token'?"),
+        ),
     )
     assert record.get("data") is None
 
@@ -133,5 +155,10 @@ def test_a_field_of_nuscenes_names_the_counterpart(da: DeepAccident, table: str)
 def test_records_are_dicts_and_their_copies_plain(da: DeepAccident) -> None:
     record = da.sample[0]
     assert (json.loads(json.dumps(record)), repr(record)) == (record, repr(dict(record)))
-    for copied in (copy.copy(record), copy.deepcopy(record), pickle.loads(pickle.dumps(record)), record.copy()):
+    for copied in (
+        copy.copy(record),
+        copy.deepcopy(record),
+        pickle.loads(pickle.dumps(record)),
+        record.copy(),
+    ):
         assert (type(copied), copied) == (dict, record)

@@ -36,7 +36,12 @@ def test_trees_hold_all_values() -> None:
         '<table class="tree"><tr><th scope="row">&lt;a&gt;</th><td>1, –, yes</td></tr></table>'
     )
     assert "0.333333</td>" in filled(TREE, value=[{"name": "a", "share": 1 / 3}, {"other": 2}])
-    assert [filled(TREE, value=each) for each in ([], {}, [[1, 2], [3]], [""])] == ["none", "none", "1, 2; 3", ""]
+    assert [filled(TREE, value=each) for each in ([], {}, [[1, 2], [3]], [""])] == [
+        "none",
+        "none",
+        "1, 2; 3",
+        "",
+    ]
 
 
 def test_results_have_three_decimals_or_digits() -> None:

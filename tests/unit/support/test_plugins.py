@@ -11,7 +11,13 @@ from click.testing import CliRunner
 from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.errors import MissingPluginError
 from deepaccident_devkit.support import plugins
-from deepaccident_devkit.support.plugins import PROTOCOL_VERSION, LazyVerb, Plugin, offers, own_plugins
+from deepaccident_devkit.support.plugins import (
+    PROTOCOL_VERSION,
+    LazyVerb,
+    Plugin,
+    offers,
+    own_plugins,
+)
 
 
 def plugin_with(name: str, *verbs: str, version: int = PROTOCOL_VERSION) -> Plugin:
@@ -91,10 +97,15 @@ def test_a_plugin_that_cannot_be_used_is_named_and_stops_nothing(
 
 
 def test_two_plugins_with_one_verb_are_both_named(install: Callable[..., None]) -> None:
-    install(first=lambda: plugin_with("first"), second=lambda: plugin_with("second", "greet", "wink"))
+    install(
+        first=lambda: plugin_with("first"), second=lambda: plugin_with("second", "greet", "wink")
+    )
     status, output = called("greet")
     said = " ".join(output.split())
-    assert (status, "first and second both offer 'greet'; uninstall one of them" in said) == (2, True)
+    assert (status, "first and second both offer 'greet'; uninstall one of them" in said) == (
+        2,
+        True,
+    )
     assert called("wink") == (0, "good morning\n")
 
 
@@ -108,11 +119,15 @@ def test_a_verb_that_cannot_be_imported_is_named(install: Callable[..., None]) -
     verbs = {"wave": LazyVerb("Wave.", missing)}  # type: ignore[arg-type]
     install(waving=lambda: Plugin(name="waving", protocol_version=PROTOCOL_VERSION, verbs=verbs))
     assert "Wave." in called("--help")[1]
-    with pytest.raises(MissingPluginError, match=r"^wave: its plug-in fails with ModuleNotFoundError: .*nowhere"):
+    with pytest.raises(
+        MissingPluginError, match=r"^wave: its plug-in fails with ModuleNotFoundError: .*nowhere"
+    ):
         CliRunner().invoke(deepaccident, ["wave"], catch_exceptions=False)
 
 
-def test_they_can_be_switched_off(install: Callable[..., None], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_they_can_be_switched_off(
+    install: Callable[..., None], monkeypatch: pytest.MonkeyPatch
+) -> None:
     install(greeting=greeting)
     monkeypatch.setenv("DEEPACCIDENT_PLUGINS", "off")
     assert plugins.all_plugins() == own_plugins()

@@ -52,11 +52,15 @@ def test_a_file_is_mapped_or_else_read(
         (tmp_path / name).write_bytes(content)
         assert memoryview(mapped_file(tmp_path / name)) == memoryview(content).cast("b")
     said = [record.getMessage() for record in caplog.records]
-    assert [(str(tmp_path) in each, "--index-dir" in each) for each in said] == [(True, True)] * len(impossible)
+    assert [(str(tmp_path) in each, "--index-dir" in each) for each in said] == [
+        (True, True)
+    ] * len(impossible)
     assert_refused((lambda: mapped_file(tmp_path / "gone"), FileNotFoundError, "gone"))
 
 
-def test_a_link_to_a_file_and_one_that_says_it_is_empty_are_read(path: Path, tmp_path: Path) -> None:
+def test_a_link_to_a_file_and_one_that_says_it_is_empty_are_read(
+    path: Path, tmp_path: Path
+) -> None:
     (tmp_path / "there").write_bytes(b"content")
     path.symlink_to("there")
     assert read_bytes(path, "meta") == b"content"
@@ -84,7 +88,11 @@ def test_what_is_no_file_is_refused_at_once(path: Path, make, said: str, read) -
 @pytest.mark.parametrize("read", [lambda path: read_bytes(path, "label"), open_file, file_checksum])
 def test_what_can_be_no_name_is_said_in_our_words(tmp_path: Path, name: str, read) -> None:
     assert_refused(
-        (lambda: read(tmp_path / name), OSError, "cannot be a file's name: it holds a NUL character, or half of a pair")
+        (
+            lambda: read(tmp_path / name),
+            OSError,
+            "cannot be a file's name: it holds a NUL character, or half of a pair",
+        )
     )
 
 
@@ -110,7 +118,9 @@ def test_a_remedy_that_is_followed_helps(path: Path, monkeypatch: pytest.MonkeyP
     assert len(read_bytes(path, "meta")) == BYTE_LIMITS["meta"] + 1
 
 
-@pytest.mark.parametrize("text", ["label", "label=", "label=0", "labels=3M", "label=3X", "label=-1", "x" * 10_000])
+@pytest.mark.parametrize(
+    "text", ["label", "label=", "label=0", "labels=3M", "label=3X", "label=-1", "x" * 10_000]
+)
 def test_limits_that_cannot_be_read_are_refused(monkeypatch: pytest.MonkeyPatch, text: str) -> None:
     monkeypatch.setenv(LIMITS_VARIABLE, text)
     with pytest.raises(OSError, match=LIMITS_VARIABLE) as raised:
@@ -120,7 +130,12 @@ def test_limits_that_cannot_be_read_are_refused(monkeypatch: pytest.MonkeyPatch,
 
 def test_a_long_text_loses_its_middle() -> None:
     long = shortened("begin" + "x" * 10**6 + "end")
-    assert (shortened("short"), long[:5], long[-3:], len(long) <= 100) == ("short", "begin", "end", True)
+    assert (shortened("short"), long[:5], long[-3:], len(long) <= 100) == (
+        "short",
+        "begin",
+        "end",
+        True,
+    )
 
 
 OTHER_WAYS_TO_READ = re.compile(
@@ -211,7 +226,8 @@ def read_npz(content: bytes) -> np.ndarray:
 
 @pytest.mark.parametrize("way", [zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED])
 @pytest.mark.parametrize(
-    "array", [ARRAY, ARRAY.T, ARRAY[:0], np.array(3), np.array("words"), ARRAY.astype(">i8"), ARRAY > 3]
+    "array",
+    [ARRAY, ARRAY.T, ARRAY[:0], np.array(3), np.array("words"), ARRAY.astype(">i8"), ARRAY > 3],
 )
 def test_a_sound_array_is_read_as_numpy_reads_it(array: np.ndarray, way: int) -> None:
     content = npz(array, way)
@@ -223,7 +239,9 @@ def test_a_sound_array_is_read_as_numpy_reads_it(array: np.ndarray, way: int) ->
 HOSTILE = {
     "zeros that unpack to 256 MB": lambda: zipped(b"\x93NUMPY" + bytes(1 << 28)),
     "a shape of a gigabyte": lambda: zipped(headed("(268435456,)")),
-    "a shape of many exabytes": lambda: zipped(headed("(4611686018427387904, 4611686018427387904)")),
+    "a shape of many exabytes": lambda: zipped(
+        headed("(4611686018427387904, 4611686018427387904)")
+    ),
     "a shape below zero": lambda: zipped(headed("(-1, 4)")),
     "a shape that is no number": lambda: zipped(headed("('x',)")),
     "a nested head": lambda: zipped(headed("(" * 5000 + ")" * 5000)),
@@ -262,7 +280,9 @@ def test_a_hostile_archive_is_refused_in_little_memory(name: str) -> None:
     assert len(str(raised.value)) < 500
 
 
-@pytest.mark.parametrize("content", [patched(zipped(b""), 16, 7), patched(npz(), 24, 0)], ids=["another", "no size"])
+@pytest.mark.parametrize(
+    "content", [patched(zipped(b""), 16, 7), patched(npz(), 24, 0)], ids=["another", "no size"]
+)
 def test_a_member_without_bytes_has_a_checksum_as_well(content: bytes) -> None:
     with open_zip(content) as archive, pytest.raises(zipfile.BadZipFile, match="CRC"):
         read_member(archive, archive.infolist()[0], "lidar")
@@ -282,7 +302,19 @@ def test_an_end_that_leads_to_a_larger_directory_is_refused() -> None:
     large = b"PK\x06\x06" + struct.pack("<QHHLLQQQQ", 44, 45, 45, 0, 0, 1, 1, 1 << 32, 0)
     rest = b"PK\x06\x07" + struct.pack("<LQL", 0, end, 1) + content[end:]
     assert_refused(
-        (lambda: open_zip(content[:end] + large + rest), OSError, ("directory has 4,294,967,296 bytes",)),
-        (lambda: open_zip(content[:end] + large[:-1] + rest), zipfile.BadZipFile, ("its end is damaged",)),
-        (lambda: array_of(b"\x93NUMPY\x09\x00" + bytes(20), "lidar"), ValueError, ("version (9, 0)",)),
+        (
+            lambda: open_zip(content[:end] + large + rest),
+            OSError,
+            ("directory has 4,294,967,296 bytes",),
+        ),
+        (
+            lambda: open_zip(content[:end] + large[:-1] + rest),
+            zipfile.BadZipFile,
+            ("its end is damaged",),
+        ),
+        (
+            lambda: array_of(b"\x93NUMPY\x09\x00" + bytes(20), "lidar"),
+            ValueError,
+            ("version (9, 0)",),
+        ),
     )

@@ -47,7 +47,11 @@ class Checked(CheckReport):
 
 
 def test_checks_say_what_they_compared() -> None:
-    for compared, is_right, status in (({"speeds": 1200, "names": 0}, True, 0), ({}, True, 2), ({"a": 0}, False, 1)):
+    for compared, is_right, status in (
+        ({"speeds": 1200, "names": 0}, True, 0),
+        ({}, True, 2),
+        ({"a": 0}, False, 1),
+    ):
         report = Checked(compared=compared, is_right=is_right, cannot_say=("no name.",))
         assert (report.exit_status, json.loads(report.to_json())["compared"]) == (status, compared)
         assert report.to_text().endswith("\nCannot say: no name.")
@@ -56,11 +60,20 @@ def test_checks_say_what_they_compared() -> None:
 
 def test_a_file_is_no_folder(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    assert_refused((lambda: Speeds(speeds={}).to_csv(tmp_path / "file"), ConfigError, "is a file; give a folder"))
+    assert_refused(
+        (
+            lambda: Speeds(speeds={}).to_csv(tmp_path / "file"),
+            ConfigError,
+            "is a file; give a folder",
+        )
+    )
 
 
 def test_notes_stand_below_a_table() -> None:
-    assert Table(rows=[("a", "b"), ("name", "1.0")], notes=("of one",)).to_text() == "a       b\nname  1.0\nof one"
+    assert (
+        Table(rows=[("a", "b"), ("name", "1.0")], notes=("of one",)).to_text()
+        == "a       b\nname  1.0\nof one"
+    )
     assert table_html([("a",), ("b",)], "c") == (
         "<table><caption>c</caption><tr><th>a</th></tr><tr><td>b</td></tr></table>"
     )

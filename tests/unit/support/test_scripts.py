@@ -94,13 +94,20 @@ def test_each_module_stands_once_and_after_those_that_it_imports(tmp_path: Path)
     ],
 )
 def test_other_forms_are_refused(line: str, tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"page\.js: the bundler does not know this form: (import|export) "):
+    with pytest.raises(
+        ValueError, match=r"page\.js: the bundler does not know this form: (import|export) "
+    ):
         script_of(tmp_path, page=f"{line}\n", numbers=MODULES["numbers"])
 
 
 def test_modules_that_import_each_other_are_refused(tmp_path: Path) -> None:
-    circle = {name: f'import {{ a }} from "./{other}.js";\n' for name, other in (("a", "b"), ("b", "c"), ("c", "a"))}
-    with pytest.raises(ValueError, match="modules import each other: a imports b imports c imports a"):
+    circle = {
+        name: f'import {{ a }} from "./{other}.js";\n'
+        for name, other in (("a", "b"), ("b", "c"), ("c", "a"))
+    }
+    with pytest.raises(
+        ValueError, match="modules import each other: a imports b imports c imports a"
+    ):
         script_of(tmp_path, **circle)
 
 

@@ -13,8 +13,20 @@ from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.cli.agents import agent_names, names_or_configuration
 from deepaccident_devkit.cli.verbs import WordChoice
-from deepaccident_devkit.errors import ChoiceError, ConfigError, DeepAccidentError, TableError, TokenError, VersionError
-from deepaccident_devkit.evaluation import AccidentEvaluator, DetectionEvaluator, MotionEvaluator, WarningEvaluator
+from deepaccident_devkit.errors import (
+    ChoiceError,
+    ConfigError,
+    DeepAccidentError,
+    TableError,
+    TokenError,
+    VersionError,
+)
+from deepaccident_devkit.evaluation import (
+    AccidentEvaluator,
+    DetectionEvaluator,
+    MotionEvaluator,
+    WarningEvaluator,
+)
 from deepaccident_devkit.evaluation.runs import SampleSelection
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 from deepaccident_devkit.export.mcap import McapConfig
@@ -37,19 +49,79 @@ def warped(mode: str) -> np.ndarray:
 
 CALLS: list[tuple[str, str, str, type[DeepAccidentError], Callable[[DeepAccident, str], Any]]] = [
     ("LIDAR", "lidar", "lidarr", ChoiceError, lambda da, word: da.boxes(da.sample[0], word).frame),
-    ("camera_back", "Camera_Back", "Camera_Bck", ChoiceError, lambda da, word: da.boxes(da.sample[0], word).frame),
-    ("Camera", "camera", "camra", ChoiceError, lambda da, word: repr(da.boxes(da.sample[0], visible=word))),
-    ("DERIVED", "derived", "derive", ChoiceError, lambda da, word: repr(da.boxes(da.sample[0], velocity=word))),
-    ("RELEASED", "released", "relased", ChoiceError, lambda da, w: repr(da.cooperative_boxes(da.sample[0], visible=w))),
-    ("LIDAR01", "lidar01", "lidar1", TokenError, lambda da, word: da.get_sample_data_path(da.sample[0], word)),
-    ("Ego_Vehicle", "ego_vehicle", "ego", TokenError, lambda da, word: da.get_sample(da.scenario[0], word, 1)),
+    (
+        "camera_back",
+        "Camera_Back",
+        "Camera_Bck",
+        ChoiceError,
+        lambda da, word: da.boxes(da.sample[0], word).frame,
+    ),
+    (
+        "Camera",
+        "camera",
+        "camra",
+        ChoiceError,
+        lambda da, word: repr(da.boxes(da.sample[0], visible=word)),
+    ),
+    (
+        "DERIVED",
+        "derived",
+        "derive",
+        ChoiceError,
+        lambda da, word: repr(da.boxes(da.sample[0], velocity=word)),
+    ),
+    (
+        "RELEASED",
+        "released",
+        "relased",
+        ChoiceError,
+        lambda da, w: repr(da.cooperative_boxes(da.sample[0], visible=w)),
+    ),
+    (
+        "LIDAR01",
+        "lidar01",
+        "lidar1",
+        TokenError,
+        lambda da, word: da.get_sample_data_path(da.sample[0], word),
+    ),
+    (
+        "Ego_Vehicle",
+        "ego_vehicle",
+        "ego",
+        TokenError,
+        lambda da, word: da.get_sample(da.scenario[0], word, 1),
+    ),
     ("Val", "val", "vall", ChoiceError, lambda da, word: da.split_scenarios(word)),
     ("Train", "train", "trian", ChoiceError, lambda da, word: da.samples("train", word)),
-    ("+Behind", "+behind", "+behnd", ChoiceError, lambda da, word: cooperating_agents(da, da.sample[0], word)),
-    ("Available", "available", "availible", ChoiceError, lambda da, word: cooperating_agents(da, da.sample[0], word)),
-    ("EGO_VEHICLE", "ego_vehicle", "ego", ChoiceError, lambda da, word: cooperating_agents(da, da.sample[0], [word])),
+    (
+        "+Behind",
+        "+behind",
+        "+behnd",
+        ChoiceError,
+        lambda da, word: cooperating_agents(da, da.sample[0], word),
+    ),
+    (
+        "Available",
+        "available",
+        "availible",
+        ChoiceError,
+        lambda da, word: cooperating_agents(da, da.sample[0], word),
+    ),
+    (
+        "EGO_VEHICLE",
+        "ego_vehicle",
+        "ego",
+        ChoiceError,
+        lambda da, word: cooperating_agents(da, da.sample[0], [word]),
+    ),
     ("Sample_Data", "sample_data", "sampledata", TableError, lambda da, word: len(da.arrow(word))),
-    ("V1", "v1", "v1.0-trainval", VersionError, lambda da, word: find_release(da.dataroot, word).version),
+    (
+        "V1",
+        "v1",
+        "v1.0-trainval",
+        VersionError,
+        lambda da, word: find_release(da.dataroot, word).version,
+    ),
 ]
 """A word in another case, as it is known, a wrong one, its error, and a call."""
 MAKERS: list[tuple[str, str, str, type[DeepAccidentError], Callable[[str], Any]]] = [
@@ -59,17 +131,41 @@ MAKERS: list[tuple[str, str, str, type[DeepAccidentError], Callable[[str], Any]]
     ("Clean", "clean", "cleen", ChoiceError, lambda word: MotionLabelConfig(protocol=word)),
     ("Paper", "paper", "papers", ChoiceError, lambda word: MotionEvaluator(protocol=word).protocol),
     ("Boxes", "boxes", "box", ChoiceError, lambda word: AccidentEvaluator(protocol=word).protocol),
-    ("OpenCOOD", "opencood", "open", ChoiceError, lambda word: DetectionEvaluator(protocol=word).protocol),
-    ("Field", "field", "fields", ChoiceError, lambda word: WarningEvaluator(protocol=word).protocol),
+    (
+        "OpenCOOD",
+        "opencood",
+        "open",
+        ChoiceError,
+        lambda word: DetectionEvaluator(protocol=word).protocol,
+    ),
+    (
+        "Field",
+        "field",
+        "fields",
+        ChoiceError,
+        lambda word: WarningEvaluator(protocol=word).protocol,
+    ),
     ("Motion", "motion", "motoin", ChoiceError, lambda word: EvaluationSetup(task=word)),
-    ("Accident", "accident", "acident", ChoiceError, lambda word: SampleSelection(split="val", scope=word)),
+    (
+        "Accident",
+        "accident",
+        "acident",
+        ChoiceError,
+        lambda word: SampleSelection(split="val", scope=word),
+    ),
     ("Lidar01", "lidar01", "lidar", ChoiceError, lambda word: McapConfig(channels=[word])),
     ("Boxes", "boxes", "box", ChoiceError, lambda word: layers_of([word], ())),
     ("Other", "other", "othr", ChoiceError, lambda word: AgentConfig("mine", (word,))),
     ("Hidden", "hidden", "hiden", ConfigError, lambda word: SynthConfig(view=word)),
     ("INFRASTRUCTURE", "infrastructure", "infra", ConfigError, lambda w: SmallRelease(agents=(w,))),
     ("BEVerse", "beverse", "bevers", ChoiceError, lambda word: config_from_names(SETTINGS, word)),
-    ("DeepAccident", "deepaccident", "accident", ChoiceError, lambda word: config_from_names(SETTINGS, word)),
+    (
+        "DeepAccident",
+        "deepaccident",
+        "accident",
+        ChoiceError,
+        lambda word: config_from_names(SETTINGS, word),
+    ),
     (
         "Bilinear",
         "bilinear",
@@ -77,7 +173,13 @@ MAKERS: list[tuple[str, str, str, type[DeepAccidentError], Callable[[str], Any]]
         ChoiceError,
         lambda word: warped(word).dtype,
     ),
-    ("Constant_Turn_Rate", "constant_turn_rate", "constant_turn", ChoiceError, lambda word: Baseline(model=word)),
+    (
+        "Constant_Turn_Rate",
+        "constant_turn_rate",
+        "constant_turn",
+        ChoiceError,
+        lambda word: Baseline(model=word),
+    ),
     ("Infrastructure", "infrastructure", "infra", ChoiceError, lambda word: agent_names((word,))),
     ("VEHICLES", "vehicles", "vehicle", ChoiceError, lambda word: names_or_configuration((word,))),
 ]
@@ -85,10 +187,18 @@ MAKERS: list[tuple[str, str, str, type[DeepAccidentError], Callable[[str], Any]]
 
 @pytest.mark.parametrize(
     ("given", "known", "wrong", "error", "call"),
-    [*CALLS, *((*words, error, lambda _, word, make=make: make(word)) for *words, error, make in MAKERS)],
+    [
+        *CALLS,
+        *((*words, error, lambda _, word, make=make: make(word)) for *words, error, make in MAKERS),
+    ],
 )
 def test_a_word_is_taken_in_any_case(
-    da: DeepAccident, given: str, known: str, wrong: str, error: type[DeepAccidentError], call: Callable[..., Any]
+    da: DeepAccident,
+    given: str,
+    known: str,
+    wrong: str,
+    error: type[DeepAccidentError],
+    call: Callable[..., Any],
 ) -> None:
     assert call(da, given) == call(da, known)
     assert_refused((lambda: call(da, wrong), error, r"; did you mean '[\w+-]+'\?$"))
@@ -110,11 +220,20 @@ def test_a_word_that_is_like_none_has_no_suggestion(wrong: Any) -> None:
     splits = ("train", "val", "test")
     meant = [meant_text(wrong, splits) for wrong in ("validation", "training", "Testing")]
     assert meant == [f"; did you mean {split!r}?" for split in ("val", "train", "test")]
-    assert meant_text("qqq", ["left", "right"]) == meant_text("", ["left"]) == meant_text(None, ["left"]) == ""
+    assert (
+        meant_text("qqq", ["left", "right"])
+        == meant_text("", ["left"])
+        == meant_text(None, ["left"])
+        == ""
+    )
     told = r"^turn: expected one of left, right, found .*[^?]$"
     assert_refused(
         (lambda: choice("turn", wrong, ("left", "right")), ChoiceError, told),
-        (lambda: choice("turn", 3, (None, "left")), ChoiceError, r"expected one of left, or None, found 3$"),
+        (
+            lambda: choice("turn", 3, (None, "left")),
+            ChoiceError,
+            r"expected one of left, or None, found 3$",
+        ),
     )
     assert choice("turn", None, (None, "left")) is None
 
@@ -124,9 +243,17 @@ def test_what_differs_is_told_with_both_values() -> None:
     asked = {"agents": ("ego",), "training": {"steps": 3, "rate": 0.1}}
     assert differing_text(there, asked) == "old: 1, asked for None; training/steps: 2, asked for 3"
     assert differing_text(there, there) == ""
-    assert differing_text({}, dict.fromkeys("abcde", 1)).endswith("c: None, asked for 1; and 2 more")
+    assert differing_text({}, dict.fromkeys("abcde", 1)).endswith(
+        "c: None, asked for 1; and 2 more"
+    )
 
 
 def test_a_word_that_means_something_elsewhere_is_told_so() -> None:
     elsewhere = {"left": "; that is a side"}
-    assert_refused((lambda: choice("way", "LEFT", ("on", "off"), elsewhere=elsewhere), ChoiceError, ("a side",)))
+    assert_refused(
+        (
+            lambda: choice("way", "LEFT", ("on", "off"), elsewhere=elsewhere),
+            ChoiceError,
+            ("a side",),
+        )
+    )

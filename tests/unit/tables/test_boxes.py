@@ -17,17 +17,23 @@ def fit(boxes: int, **fits: int) -> VelocityFit:
     return VelocityFit(boxes=boxes, fits={name: fits.get(name, 0) for name in VELOCITY_FRAMES})
 
 
-@given(velocity=hnp.arrays(float, (5, 2), elements=NUMBERS), yaw=hnp.arrays(float, 5, elements=NUMBERS))
+@given(
+    velocity=hnp.arrays(float, (5, 2), elements=NUMBERS), yaw=hnp.arrays(float, 5, elements=NUMBERS)
+)
 def test_there_and_back_in_either_handedness(velocity: np.ndarray, yaw: np.ndarray) -> None:
     written = label_from_world_velocity(velocity, yaw)
     np.testing.assert_allclose(world_from_label_velocity(written, yaw), velocity, atol=1e-9)
-    np.testing.assert_allclose(label_from_world_velocity(velocity * (1, -1), -yaw), written * (1, -1), atol=1e-9)
+    np.testing.assert_allclose(
+        label_from_world_velocity(velocity * (1, -1), -yaw), written * (1, -1), atol=1e-9
+    )
 
 
 def test_a_real_line_is_what_the_format_says() -> None:
     """A car with yaw 90° (clockwise, y right) in the label that drives along world x has its velocity along y."""
     np.testing.assert_allclose(
-        label_from_world_velocity(np.array([[8.0, 0.0]]), np.array([np.pi / 2])), [[0, 8]], atol=1e-12
+        label_from_world_velocity(np.array([[8.0, 0.0]]), np.array([np.pi / 2])),
+        [[0, 8]],
+        atol=1e-12,
     )
 
 
@@ -35,7 +41,10 @@ def test_a_real_line_is_what_the_format_says() -> None:
     ("found", "best"),
     [
         (fit(100, released=97, lidar=18), "released"),
-        (fit(100, released=96, lidar=100), "released"),  # all drive along x: nothing tells them apart
+        (
+            fit(100, released=96, lidar=100),
+            "released",
+        ),  # all drive along x: nothing tells them apart
         (fit(100, released=60, lidar=100), "lidar"),
         (fit(100, released=49, world=20), None),
         (fit(19, released=19), None),
@@ -47,7 +56,9 @@ def test_the_best_frame(found: VelocityFit, best: str | None) -> None:
 
 
 def test_fits_add_up() -> None:
-    assert total_fit([fit(10, released=9), fit(15, released=15, box=2)]) == fit(25, released=24, box=2)
+    assert total_fit([fit(10, released=9), fit(15, released=15, box=2)]) == fit(
+        25, released=24, box=2
+    )
     assert total_fit([]).best is None
 
 

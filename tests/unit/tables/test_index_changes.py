@@ -29,7 +29,9 @@ def root(tmp_path: Path) -> Path:
 
 def file_of(root: Path, kind: str) -> Path:
     folder = root / tiny.TYPE / kind
-    return folder / f"{tiny.NAME}.txt" if kind == META else min((folder / tiny.NAME).glob("*_002.*"))
+    return (
+        folder / f"{tiny.NAME}.txt" if kind == META else min((folder / tiny.NAME).glob("*_002.*"))
+    )
 
 
 def edited(path: Path) -> bytes:
@@ -37,7 +39,9 @@ def edited(path: Path) -> bytes:
     content = path.read_bytes()
     for old, new in ((b" 1300 12 ", b" 1300 72 "), (b"car 1212", b"car 1236")):
         content = content.replace(old, new)
-    return content + b" " if path.suffix == ".pkl" else content  # after a pickle's end nothing is read
+    return (
+        content + b" " if path.suffix == ".pkl" else content
+    )  # after a pickle's end nothing is read
 
 
 def keep_times(path: Path, change: Callable[[], object]) -> None:
@@ -64,7 +68,9 @@ def copied_folder(path: Path, content: bytes) -> None:
 
 CHANGES: dict[str, Change] = {
     "replaced": replaced,
-    "replaced, with all times kept": lambda path, content: keep_times(path, lambda: replaced(path, content)),
+    "replaced, with all times kept": lambda path, content: keep_times(
+        path, lambda: replaced(path, content)
+    ),
     "its folder replaced by a copy with kept times": copied_folder,
 }
 
@@ -86,7 +92,9 @@ def test_a_file_in_the_place_of_another_is_seen(root: Path, kind: str, change: s
 
 
 @pytest.mark.parametrize("kind", [LABEL, CALIB, META])
-def test_what_was_written_in_place_is_seen_by_index_and_told_by_validate(root: Path, kind: str) -> None:
+def test_what_was_written_in_place_is_seen_by_index_and_told_by_validate(
+    root: Path, kind: str
+) -> None:
     """Even if its size and time are those of before: its ctime is not."""
     before = opened(root)
     path = file_of(root, kind)
@@ -95,15 +103,23 @@ def test_what_was_written_in_place_is_seen_by_index_and_told_by_validate(root: P
     os.utime(path, ns=(keep.st_atime_ns, keep.st_mtime_ns))
     if path.stat().st_size == keep.st_size:
         assert opened(root).tables_folder == before.tables_folder
-        (finding,) = [each for each in validate_release(root, workers=1).findings if each.code == "index-outdated"]
+        (finding,) = [
+            each
+            for each in validate_release(root, workers=1).findings
+            if each.code == "index-outdated"
+        ]
         assert (finding.severity, finding.scenario) == ("warning", tiny.TOKEN)
         assert "deepaccident check index DATAROOT" in finding.remedy
     called("index", root)
     assert is_right(opened(root), root)
-    assert "index-outdated" not in {finding.code for finding in validate_release(root, workers=1).findings}
+    assert "index-outdated" not in {
+        finding.code for finding in validate_release(root, workers=1).findings
+    }
 
 
-def test_a_release_that_moved_with_its_index_is_indexed_once_more(root: Path, tmp_path: Path) -> None:
+def test_a_release_that_moved_with_its_index_is_indexed_once_more(
+    root: Path, tmp_path: Path
+) -> None:
     before = contents(opened(root).tables_folder)
     shutil.copytree(root, tmp_path / "copy")
     assert current_index(find_release(tmp_path / "copy")) is None
@@ -111,7 +127,9 @@ def test_a_release_that_moved_with_its_index_is_indexed_once_more(root: Path, tm
     assert current_index(find_release(tmp_path / "copy")) is not None
 
 
-def test_an_index_of_an_earlier_devkit_is_made_again(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_index_of_an_earlier_devkit_is_made_again(
+    root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """One without hashes, whose manifest has a digest of another kind."""
     with monkeypatch.context() as patch:
         patch.setattr(indexing, "HASHES", "contents")
@@ -133,5 +151,7 @@ def test_a_damaged_list_of_hashes_is_refused_and_validate_goes_on(root: Path) ->
     table.unlink()
     table.write_bytes(content.replace(b'{"label"', b'["label"'))
     assert validate_release(root, workers=1).scenarios == 1
-    with pytest.raises(index_module.IndexStoreError, match=r"hashes of its files are damaged; .* check index"):
+    with pytest.raises(
+        index_module.IndexStoreError, match=r"hashes of its files are damaged; .* check index"
+    ):
         opened(root).indexed_hashes(tiny.TOKEN)

@@ -15,7 +15,9 @@ def test_rows_in_any_order_are_the_records(both_layouts: DeepAccident, table: st
     records = getattr(both_layouts, table)
     rows = np.random.default_rng(0).permutation(len(records))[:300]
     found = RecordTables(both_layouts).table(table, rows).to_pylist()
-    assert list(map(repr, found)) == [repr(dict(records[row])) for row in rows]  # in which NaN equals NaN
+    assert list(map(repr, found)) == [
+        repr(dict(records[row])) for row in rows
+    ]  # in which NaN equals NaN
 
 
 def test_the_rows_of_scenarios_and_agents(both_layouts: DeepAccident) -> None:

@@ -19,7 +19,9 @@ CHAINED = [name for name, field, _ in KEYS if field == "next"]
 
 
 @pytest.mark.parametrize(("table", "field", "target"), KEYS)
-def test_every_foreign_key_names_a_row(both_layouts: DeepAccident, table: str, field: str, target: str) -> None:
+def test_every_foreign_key_names_a_row(
+    both_layouts: DeepAccident, table: str, field: str, target: str
+) -> None:
     tokens = {record[field] for record in getattr(both_layouts, table)} - {None}
     assert tokens, "a column of nothing but nulls tests nothing"
     for token in tokens:
@@ -27,7 +29,9 @@ def test_every_foreign_key_names_a_row(both_layouts: DeepAccident, table: str, f
 
 
 @pytest.mark.parametrize("table", CHAINED)
-def test_chains_reach_every_row_once_and_run_both_ways(both_layouts: DeepAccident, table: str) -> None:
+def test_chains_reach_every_row_once_and_run_both_ways(
+    both_layouts: DeepAccident, table: str
+) -> None:
     records = {record["token"]: record for record in getattr(both_layouts, table)}
     walked = []
     for record in [record for record in records.values() if record["prev"] is None]:
@@ -58,5 +62,7 @@ print(len(os.listdir("/proc/self/task")) - before)
 
 
 def test_streams_are_written_and_read_without_threads() -> None:
-    ran = subprocess.run([sys.executable, "-c", STREAMED], check=False, capture_output=True, text=True)
+    ran = subprocess.run(
+        [sys.executable, "-c", STREAMED], check=False, capture_output=True, text=True
+    )
     assert (ran.stdout, ran.stderr) == ("0\n", "")

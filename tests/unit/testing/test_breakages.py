@@ -56,7 +56,10 @@ def test_what_the_devkit_says(make_deepaccident_release, tmp_path: Path, name: s
     report = validate_release(broken.root, deep=breakage.deep, workers=1)
     assert tuple(sorted({finding.code for finding in report.findings})) == breakage.codes
     assert {finding.scenario for finding in report.findings} <= {broken.scenario, None}
-    assert raised_by(lambda: DeepAccident("v1", broken.root, workers=1, verbose=False)) == breakage.opening
+    assert (
+        raised_by(lambda: DeepAccident("v1", broken.root, workers=1, verbose=False))
+        == breakage.opening
+    )
     if breakage.reading or broken.path.is_file():
         assert raised_by(lambda: read(broken.path)) == breakage.reading
     assert not broken.marker.exists()
@@ -71,7 +74,9 @@ def raised_by(call: Callable[[], object]) -> type[DeepAccidentError] | None:
     return None
 
 
-@pytest.mark.parametrize("name", ["frame-lost", "scenario-twice", "split-line-twice", "infrastructure-absent"])
+@pytest.mark.parametrize(
+    "name", ["frame-lost", "scenario-twice", "split-line-twice", "infrastructure-absent"]
+)
 def test_folders_in_the_other_layout(make_deepaccident_release, tmp_path: Path, name: str) -> None:
     options = SmallRelease(layout="B", splits=("train",), channels=(CAMERA,))
     broken = break_release(copied(make_deepaccident_release(options), tmp_path / "release"), name)
@@ -79,11 +84,15 @@ def test_folders_in_the_other_layout(make_deepaccident_release, tmp_path: Path, 
     assert tuple(sorted({finding.code for finding in report.findings})) == BREAKAGES[name].codes
 
 
-def test_a_program_in_a_calib_file_runs_where_it_is_unpickled(make_deepaccident_release, tmp_path: Path) -> None:
+def test_a_program_in_a_calib_file_runs_where_it_is_unpickled(
+    make_deepaccident_release, tmp_path: Path
+) -> None:
     """So that `marker` can tell."""
     import pickle
 
-    broken = break_release(copied(make_deepaccident_release(BARE), tmp_path / "release"), "calib-code")
+    broken = break_release(
+        copied(make_deepaccident_release(BARE), tmp_path / "release"), "calib-code"
+    )
     pickle.loads(broken.path.read_bytes())
     assert broken.marker.is_dir()
 
@@ -95,10 +104,25 @@ LACKS = "which lacks a part: "
 @pytest.mark.parametrize(
     ("name", "config", "error", "names"),
     [
-        ("label-purple", BARE, ChoiceError, ("breakage: expected one of label-empty, ", "found 'label-purple'")),
+        (
+            "label-purple",
+            BARE,
+            ChoiceError,
+            ("breakage: expected one of label-empty, ", "found 'label-purple'"),
+        ),
         ("lidar-cut", BARE, ConfigError, ("'lidar-cut' cannot break ", LACKS, "npz")),
-        ("agents-swapped", ALONE, ConfigError, (LACKS, "a second vehicle that records; choose a complete")),
-        ("lidar-cut", SmallRelease(splits=("test",), frames=1, channels=()), ConfigError, ("no labelled scenario",)),
+        (
+            "agents-swapped",
+            ALONE,
+            ConfigError,
+            (LACKS, "a second vehicle that records; choose a complete"),
+        ),
+        (
+            "lidar-cut",
+            SmallRelease(splits=("test",), frames=1, channels=()),
+            ConfigError,
+            ("no labelled scenario",),
+        ),
         *(
             (
                 name,
@@ -115,15 +139,25 @@ LACKS = "which lacks a part: "
         ),
     ],
 )
-def test_what_cannot_be_broken_and_what_would_stay_whole(tmp_path: Path, name: str, config, error, names) -> None:
+def test_what_cannot_be_broken_and_what_would_stay_whole(
+    tmp_path: Path, name: str, config, error, names
+) -> None:
     assert_refused((lambda: broken_release(tmp_path / "release", name, config), error, names))
     assert (tmp_path / "release").exists() == (error is not ChoiceError)
 
 
 @pytest.mark.parametrize(
     ("first", "then"),
-    [("label-garbage", "label-nan"), ("meta-empty", "meta-pair-wrong"), ("calib-key-missing", "calib-key-missing")],
+    [
+        ("label-garbage", "label-nan"),
+        ("meta-empty", "meta-pair-wrong"),
+        ("calib-key-missing", "calib-key-missing"),
+    ],
 )
-def test_what_is_broken_already_may_be_too_broken_for_more(tmp_path: Path, first: str, then: str) -> None:
+def test_what_is_broken_already_may_be_too_broken_for_more(
+    tmp_path: Path, first: str, then: str
+) -> None:
     root = broken_release(tmp_path / "release", first, BARE).root
-    assert_refused((lambda: break_release(root, then), ConfigError, (f"'{then}' cannot break ", LACKS)))
+    assert_refused(
+        (lambda: break_release(root, then), ConfigError, (f"'{then}' cannot break ", LACKS))
+    )

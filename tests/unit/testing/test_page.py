@@ -9,7 +9,9 @@ pytestmark = pytest.mark.slow
 
 DOCS = Path(__file__).parents[3] / "docs"
 PAGE = (DOCS / "testing.md").read_text(encoding="utf-8")
-TESTS, CONFTEST, ALONE, STRATEGIES = re.findall(r"^```python\n(.*?)^```", PAGE, re.DOTALL | re.MULTILINE)
+TESTS, CONFTEST, ALONE, STRATEGIES = re.findall(
+    r"^```python\n(.*?)^```", PAGE, re.DOTALL | re.MULTILINE
+)
 MINE = """
 import pytest
 from deepaccident_devkit import DeepAccident
@@ -33,7 +35,9 @@ def test_the_tests_on_the_page_pass_in_a_project_of_somebody_else(foreign) -> No
     (foreign.folder / "mine.py").write_text(MINE)
     (foreign.folder / "test_mine.py").write_text(TESTS)
     (foreign.folder / "test_property.py").write_text(STRATEGIES)
-    ran = foreign.pytest("-k", "every_label or (layout_A and not (label or meta or split or files))")
+    ran = foreign.pytest(
+        "-k", "every_label or (layout_A and not (label or meta or split or files))"
+    )
     assert " passed" in ran.stdout, ran.stdout + ran.stderr
     assert "failed" not in ran.stdout, ran.stdout
 

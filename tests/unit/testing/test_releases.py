@@ -22,7 +22,11 @@ BARE = SmallRelease(channels=())
 
 
 def contents(root: Path) -> dict[str, bytes]:
-    files = (path for path in sorted(root.rglob("*")) if path.is_file() and ".deepaccident" not in path.parts)
+    files = (
+        path
+        for path in sorted(root.rglob("*"))
+        if path.is_file() and ".deepaccident" not in path.parts
+    )
     return {path.relative_to(root).as_posix(): path.read_bytes() for path in files}
 
 
@@ -34,26 +38,42 @@ def opened(deepaccident_release: Path) -> DeepAccident:
 def test_nothing_is_wrong_with_it(deepaccident_release: Path) -> None:
     """Points are counted, top views show the boxes, poses and velocities agree: `validate` would say if not."""
     report = validate_release(deepaccident_release, deep=True, workers=1)
-    assert {(finding.severity, finding.code) for finding in report.findings} == {("note", "unlabelled")}
+    assert {(finding.severity, finding.code) for finding in report.findings} == {
+        ("note", "unlabelled")
+    }
 
 
-def test_it_lies_in_the_layout_asked_for(deepaccident_release: Path, deepaccident_layout: str) -> None:
+def test_it_lies_in_the_layout_asked_for(
+    deepaccident_release: Path, deepaccident_layout: str
+) -> None:
     layout = find_release(deepaccident_release)
     folders = {"A": {""}, "B": {"train", "val", "test"}}[deepaccident_layout]
-    assert (layout.layout, {scenario.folder for scenario in layout.scenarios}) == (deepaccident_layout, folders)
+    assert (layout.layout, {scenario.folder for scenario in layout.scenarios}) == (
+        deepaccident_layout,
+        folders,
+    )
 
 
-def test_the_splits_are_an_accident_and_its_twin_an_accident_and_an_unlabelled_one(opened: DeepAccident) -> None:
-    splits = {split: sorted(opened.split_scenarios(split)) for split in ("train", "val", "test", "train_mini")}
+def test_the_splits_are_an_accident_and_its_twin_an_accident_and_an_unlabelled_one(
+    opened: DeepAccident,
+) -> None:
+    splits = {
+        split: sorted(opened.split_scenarios(split))
+        for split in ("train", "val", "test", "train_mini")
+    }
     accident, twin = splits["train"]
     assert (accident.split("/")[1], splits["train_mini"]) == (twin.split("/")[1], splits["train"])
-    types = [opened.get("scenario", token)["accident_type"] for token in (accident, twin, *splits["val"])]
+    types = [
+        opened.get("scenario", token)["accident_type"] for token in (accident, twin, *splits["val"])
+    ]
     assert types == [1, None, 7]
     first_frame = opened.get("scenario", splits["test"][0])["first_frame_token"]
     assert [sample["labelled"] for sample in opened.samples_of(first_frame)] == [False] * 5
 
 
-def test_the_pair_meets_in_the_last_frame_and_no_sooner_and_not_at_all_in_the_twin(opened: DeepAccident) -> None:
+def test_the_pair_meets_in_the_last_frame_and_no_sooner_and_not_at_all_in_the_twin(
+    opened: DeepAccident,
+) -> None:
     accident, twin = sorted(opened.split_scenarios("train"))
     pair = opened.get("scenario", accident)["collision"]["ids"]
 
@@ -87,7 +107,11 @@ def test_the_same_options_give_the_same_values_and_another_seed_others(tmp_path:
         for number, seed in seeds
     )
     assert (first == again, first.keys()) == (True, other.keys())
-    assert [name for name in first if first[name] == other[name] and ("/calib/" in name or "/meta/" in name)] == []
+    assert [
+        name
+        for name in first
+        if first[name] == other[name] and ("/calib/" in name or "/meta/" in name)
+    ] == []
 
 
 def test_options_choose_what_is_written(tmp_path: Path) -> None:
@@ -96,8 +120,14 @@ def test_options_choose_what_is_written(tmp_path: Path) -> None:
     root = write_small_release(tmp_path / "release", options)
     (scenario,) = find_release(root).scenarios
     assert (scenario.agents, (root / "train.txt").read_bytes()) == (agents, b"")
-    assert {name.split("/")[3] for name in contents(root) if name.count("/") > 3} == {"label", "calib"}
-    assert read_calib(scenario.calib_path("infrastructure", 2)).ego_from_lidar.matrix.tolist() == np.eye(4).tolist()
+    assert {name.split("/")[3] for name in contents(root) if name.count("/") > 3} == {
+        "label",
+        "calib",
+    }
+    assert (
+        read_calib(scenario.calib_path("infrastructure", 2)).ego_from_lidar.matrix.tolist()
+        == np.eye(4).tolist()
+    )
     assert len({len(read_label(scenario.label_path(agent, 2))) for agent in agents}) == 1
 
 
@@ -105,7 +135,10 @@ def test_options_choose_what_is_written(tmp_path: Path) -> None:
     ("options", "sentence"),
     [
         ({"layout": "C"}, "layout: expected one of A, B, found 'C'"),
-        ({"splits": ("train", "train_mini")}, "splits: expected one of train, val, test, found 'train_mini'"),
+        (
+            {"splits": ("train", "train_mini")},
+            "splits: expected one of train, val, test, found 'train_mini'",
+        ),
         ({"splits": ()}, "splits: expected some of train, val, test, found none"),
         ({"agents": ()}, "agents: expected some of .*, found none"),
         ({"agents": ("ego",)}, f"agents: expected one of {AGENTS[0]}.*found 'ego'"),
@@ -115,7 +148,10 @@ def test_options_choose_what_is_written(tmp_path: Path) -> None:
         ({"channels": 1}, "channels: expected some of .*, found 1"),
         ({"image_size": 32}, "image_size: expected a tuple or a list, found 32"),
         ({"image_size": (32,)}, r"image_size: expected \(width, height\), found \(32,\)"),
-        ({"image_size": (8, 9)}, r"image_size: expected width and height from \(16, 9\) to \(1600, 900\)"),
+        (
+            {"image_size": (8, 9)},
+            r"image_size: expected width and height from \(16, 9\) to \(1600, 900\)",
+        ),
     ],
 )
 def test_options_that_cannot_be_carried_out(options, sentence) -> None:

@@ -28,9 +28,14 @@ ALL = ("length>=1",)
 FEW = ("ego_vehicle", "infrastructure")
 
 
-def made(dataset: DeepAccident, folder: Path, images: ImageConfig = IMAGES, **fields: Any) -> ImageCache:
+def made(
+    dataset: DeepAccident, folder: Path, images: ImageConfig = IMAGES, **fields: Any
+) -> ImageCache:
     export_release(
-        dataset, folder, CachedImages(**{"images": images, "where": ALL, "agents": FEW, **fields}), workers=1
+        dataset,
+        folder,
+        CachedImages(**{"images": images, "where": ALL, "agents": FEW, **fields}),
+        workers=1,
     )
     return ImageCache(folder)
 
@@ -50,20 +55,28 @@ def test_raw_images_are_the_uncached_ones(da: DeepAccident, tmp_path: Path, deco
     images = replace(IMAGES, decode=decode)
     cache = pickle.loads(pickle.dumps(made(da, tmp_path / "out", images)))
     for camera in cameras_of(da):
-        for found, expected in zip(cache.load(images, da, camera), images.load(da, camera), strict=True):
+        for found, expected in zip(
+            cache.load(images, da, camera), images.load(da, camera), strict=True
+        ):
             np.testing.assert_array_equal(found, expected)
         assert cache.has(camera)
 
 
-def test_whole_images_can_be_cropped_later_and_cameras_chosen(da: DeepAccident, tmp_path: Path) -> None:
+def test_whole_images_can_be_cropped_later_and_cameras_chosen(
+    da: DeepAccident, tmp_path: Path
+) -> None:
     cache = made(da, tmp_path / "out", replace(IMAGES, crop=None))
     wanted, camera = replace(IMAGES, cameras=("Camera_Back", "Camera_Front")), cameras_of(da)[5]
     cache.check(wanted)
-    for found, expected in zip(cache.load(wanted, da, camera), wanted.load(da, camera), strict=True):
+    for found, expected in zip(
+        cache.load(wanted, da, camera), wanted.load(da, camera), strict=True
+    ):
         np.testing.assert_array_equal(found, expected)
 
 
-def test_jpeg_images_are_nearly_the_uncached_ones(da: DeepAccident, cache: ImageCache, tmp_path: Path) -> None:
+def test_jpeg_images_are_nearly_the_uncached_ones(
+    da: DeepAccident, cache: ImageCache, tmp_path: Path
+) -> None:
     smaller = made(da, tmp_path / "out", codec="jpeg")
     for camera in cameras_of(da)[::7]:
         found, intrinsic = smaller.load(IMAGES, da, camera)
@@ -73,7 +86,9 @@ def test_jpeg_images_are_nearly_the_uncached_ones(da: DeepAccident, cache: Image
 
 
 @pytest.mark.parametrize(("codec", "exact"), [("raw", 0), ("jpeg", 0.5)])
-def test_the_plan_is_what_is_written(da: DeepAccident, tmp_path: Path, codec: Any, exact: float) -> None:
+def test_the_plan_is_what_is_written(
+    da: DeepAccident, tmp_path: Path, codec: Any, exact: float
+) -> None:
     form = CachedImages(images=IMAGES, where=ALL, codec=codec)
     done = export_release(da, tmp_path / "out", form, workers=1).tally
     told = export_release(da, tmp_path / "none", form, dry_run=True).tally
@@ -89,8 +104,13 @@ def test_what_a_partial_release_lacks_is_absent(da_partial: DeepAccident, tmp_pa
         "agents of scenarios that are not in this release": len(da_partial.scenario),
         "images that are not in this release": frames,
     }
-    cache, sample = ImageCache(tmp_path / "out"), f"{da_partial.scenario[0]['token']}/ego_vehicle/003"
-    assert [cache.has(f"{sample}/{camera}") for camera in CAMERAS] == [camera != "Camera_Front" for camera in CAMERAS]
+    cache, sample = (
+        ImageCache(tmp_path / "out"),
+        f"{da_partial.scenario[0]['token']}/ego_vehicle/003",
+    )
+    assert [cache.has(f"{sample}/{camera}") for camera in CAMERAS] == [
+        camera != "Camera_Front" for camera in CAMERAS
+    ]
     assert_refused(
         (
             lambda: cache.load(IMAGES, da_partial, f"{sample}/Camera_Front"),
@@ -103,7 +123,10 @@ def test_what_a_partial_release_lacks_is_absent(da_partial: DeepAccident, tmp_pa
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"resize": (36, 60)}, r"has resize=\(18, 30\), wanted is \(36, 60\); choose the same, or make another"),
+        (
+            {"resize": (36, 60)},
+            r"has resize=\(18, 30\), wanted is \(36, 60\); choose the same, or make another",
+        ),
         ({"crop": None}, r"has crop=\(2, 3, 12, 25\), wanted is None"),
         ({"crop": (2, 3, 12, 24)}, r"has crop=\(2, 3, 12, 25\), wanted is \(2, 3, 12, 24\)"),
         ({"decode": "scaled"}, "has decode='full', wanted is 'scaled'"),
@@ -119,9 +142,15 @@ def test_another_release_and_agents_without_images_are_refused(
 ) -> None:
     scenario = da.scenario[0]["token"]
     cache.check_release(da, [f"{scenario}/ego_vehicle"])
-    shutil.copytree(release_root, tmp_path / "edited", ignore=shutil.ignore_patterns(".deepaccident", "Camera_*"))
+    shutil.copytree(
+        release_root,
+        tmp_path / "edited",
+        ignore=shutil.ignore_patterns(".deepaccident", "Camera_*"),
+    )
     edited = DeepAccident("v1", tmp_path / "edited", verbose=False)
-    cache.check_release(edited, [f"{scenario}/ego_vehicle"])  # the images themselves need not be there
+    cache.check_release(
+        edited, [f"{scenario}/ego_vehicle"]
+    )  # the images themselves need not be there
     kind, name = scenario.split("/")
     label = next((tmp_path / "edited" / kind / "ego_vehicle" / "label" / name).glob("*_002.txt"))
     label.write_text(label.read_text() + "\n")
@@ -130,7 +159,11 @@ def test_another_release_and_agents_without_images_are_refused(
     assert_refused(
         (changed, ConfigError, ("another release", f"another state of {scenario}", "make a cache")),
         *(
-            (partial(cache.check_release, da, [token]), ConfigError, (f"no images of {token}; choose other samples",))
+            (
+                partial(cache.check_release, da, [token]),
+                ConfigError,
+                (f"no images of {token}; choose other samples",),
+            )
             for token in (f"{scenario}/other_vehicle", "elsewhere/unknown/ego_vehicle")
         ),
     )
@@ -142,9 +175,17 @@ def test_what_is_no_complete_cache_is_refused(
     out, form = tmp_path / "out", CachedImages(images=IMAGES, where=ALL, agents=("infrastructure",))
     monkeypatch.setattr(CachedImages, "finish", lambda *_: 1 / 0)
     assert_refused(
-        (lambda: ImageCache(tmp_path), ConfigError, ("holds no cache of images", "make one with deepaccident cache")),
+        (
+            lambda: ImageCache(tmp_path),
+            ConfigError,
+            ("holds no cache of images", "make one with deepaccident cache"),
+        ),
         (lambda: export_release(da, out, form, workers=1), ZeroDivisionError, "division by zero"),
-        (lambda: ImageCache(out), ConfigError, ("is not complete", "run the deepaccident cache that makes it again")),
+        (
+            lambda: ImageCache(out),
+            ConfigError,
+            ("is not complete", "run the deepaccident cache that makes it again"),
+        ),
     )
 
 
@@ -161,7 +202,10 @@ def test_what_is_no_complete_cache_is_refused(
         (lambda _: headed(-1, 6), "is cut off"),
         (lambda _: headed(1 << 60, 6), "its table"),
         (lambda _: headed(1, 6, *[0, 1 << 40] * 6), "is cut off"),
-        (lambda _: headed(1, 6, *[0, 33 << 20] * 6).ljust(40 << 20, b"\0"), "an image takes .* limit for image"),
+        (
+            lambda _: headed(1, 6, *[0, 33 << 20] * 6).ljust(40 << 20, b"\0"),
+            "an image takes .* limit for image",
+        ),
     ],
 )
 def test_a_damaged_file_or_one_of_another_cache_is_refused(
@@ -187,9 +231,21 @@ def headed(rows: int, cameras: int, *table: int) -> bytes:
     ("name", "value", "place"),
     [
         ("images", {}, "its images have no cameras"),
-        ("images", {"resize": [18, 30], "crop": None, "decode": "full"}, "its images have no cameras"),
-        ("images", {"resize": [18, 30], "crop": None, "cameras": [], "decode": "full"}, "cameras: expected some of"),
-        ("images", {"resize": [18, "1"], "crop": None, "cameras": [], "decode": "full"}, "images\\.resize\\[1\\]"),
+        (
+            "images",
+            {"resize": [18, 30], "crop": None, "decode": "full"},
+            "its images have no cameras",
+        ),
+        (
+            "images",
+            {"resize": [18, 30], "crop": None, "cameras": [], "decode": "full"},
+            "cameras: expected some of",
+        ),
+        (
+            "images",
+            {"resize": [18, "1"], "crop": None, "cameras": [], "decode": "full"},
+            "images\\.resize\\[1\\]",
+        ),
         ("images", [1], "at `\\$\\.images`"),
         ("codec", "x" * 1_000_000, "invalid enum value 'x+ … x+"),
         ("agents", [], "at `\\$\\.agents`"),
@@ -199,7 +255,9 @@ def headed(rows: int, cameras: int, *table: int) -> bytes:
         ("version", None, "at `\\$\\.version`"),
     ],
 )
-def test_changed_settings_are_refused(cache: ImageCache, tmp_path: Path, name: str, value: Any, place: str) -> None:
+def test_changed_settings_are_refused(
+    cache: ImageCache, tmp_path: Path, name: str, value: Any, place: str
+) -> None:
     shutil.copytree(cache.folder, tmp_path / "out")
     path = tmp_path / "out" / "cache.manifest.json"
     told = json.loads(path.read_text())
@@ -217,8 +275,25 @@ def command(*words: str | Path) -> Any:
 
 
 def test_on_the_command_line(da: DeepAccident, tmp_path: Path) -> None:
-    words = [da.dataroot, "--out", tmp_path / "out", "--workers", "1", "--size", "30x18", "--crop", "3,2,25,12"]
-    words += ["--agents", "ego_vehicle", "--channels", "Camera_Back,Camera_Front", "--decode", "scaled"]
+    words = [
+        da.dataroot,
+        "--out",
+        tmp_path / "out",
+        "--workers",
+        "1",
+        "--size",
+        "30x18",
+        "--crop",
+        "3,2,25,12",
+    ]
+    words += [
+        "--agents",
+        "ego_vehicle",
+        "--channels",
+        "Camera_Back,Camera_Front",
+        "--decode",
+        "scaled",
+    ]
     refused = command(*words)
     assert isinstance(refused.exception, ConfigError)
     assert "(--split, --where)" in str(refused.exception)
@@ -232,10 +307,14 @@ def test_on_the_command_line(da: DeepAccident, tmp_path: Path) -> None:
     assert "0 scenarios written now" in command(*words).output
 
 
-def test_a_disk_that_is_too_small_is_refused(da: DeepAccident, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_disk_that_is_too_small_is_refused(
+    da: DeepAccident, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     usage = shutil.disk_usage(tmp_path)._replace(free=100_000)
     monkeypatch.setattr(shutil, "disk_usage", lambda _: usage)
-    found = command(da.dataroot, "--out", tmp_path / "out", "--size", "30x18", "--where", "length>=1").exception
+    found = command(
+        da.dataroot, "--out", tmp_path / "out", "--size", "30x18", "--where", "length>=1"
+    ).exception
     assert "too little room" in str(found)
     assert not (tmp_path / "out").exists()
 

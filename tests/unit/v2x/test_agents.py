@@ -14,7 +14,11 @@ from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, GeometryError, NotAvailableError, TokenError
-from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup, SampleSelection, default_selection
+from deepaccident_devkit.evaluation.runs.setups import (
+    EvaluationSetup,
+    SampleSelection,
+    default_selection,
+)
 from deepaccident_devkit.export.images import ImageConfig
 from deepaccident_devkit.export.mcap import McapConfig
 from deepaccident_devkit.export.opencood import OpenCood
@@ -48,7 +52,10 @@ def test_the_papers_seven_as_seen_from_the_ego_vehicle() -> None:
         "vehicles": (EGO, EGO_BEHIND, OTHER, OTHER_BEHIND),
         "all": AGENTS,
     }
-    assert ((*AGENT_CONFIGS, "available"), AgentConfig("alone").agents_for(POLE)) == (AGENT_SETS, (POLE,))
+    assert ((*AGENT_CONFIGS, "available"), AgentConfig("alone").agents_for(POLE)) == (
+        AGENT_SETS,
+        (POLE,),
+    )
 
 
 @pytest.mark.parametrize(
@@ -62,7 +69,9 @@ def test_the_papers_seven_as_seen_from_the_ego_vehicle() -> None:
         (POLE, OTHER, (OTHER_BEHIND, EGO, EGO_BEHIND, OTHER)),
     ],
 )
-def test_partners_are_renamed_as_in_the_released_code(ego: str, side: str, expected: tuple[str, ...]) -> None:
+def test_partners_are_renamed_as_in_the_released_code(
+    ego: str, side: str, expected: tuple[str, ...]
+) -> None:
     """The released V2X dataset's name_mapping, written out (docs/released_code.md, Poses)."""
     everyone = AGENT_CONFIGS["all"].agents_for(ego, side=side)
     assert (everyone, set(everyone)) == ((ego, *expected), set(AGENTS))
@@ -82,7 +91,11 @@ def test_what_an_agents_argument_means(da_b: DeepAccident) -> None:
             ChoiceError,
             "one of single, .*infrastructure, found 'bus'",
         ),
-        (lambda: cooperating_agents(da_b, sample, []), ChoiceError, "expected some of ego_vehicle, .*found none"),
+        (
+            lambda: cooperating_agents(da_b, sample, []),
+            ChoiceError,
+            "expected some of ego_vehicle, .*found none",
+        ),
         (lambda: cooperating_agents(da_b, sample + "9"), TokenError, "table 'sample' has no token"),
     )
 
@@ -97,12 +110,18 @@ def test_what_an_agents_argument_means(da_b: DeepAccident) -> None:
         (lambda names: OpenCood(classes=names), ("van",), "van"),
         (lambda names: OpenCood(agents=names), (EGO,), EGO),
         (lambda names: SampleSelection(split="val", agents=names), (POLE,), POLE),
-        (lambda names: default_selection(EvaluationSetup(task="accident"), "val", agents=names), (POLE,), POLE),
+        (
+            lambda names: default_selection(EvaluationSetup(task="accident"), "val", agents=names),
+            (POLE,),
+            POLE,
+        ),
         (lambda names: SmallRelease(splits=names), ["val"], "val"),
         (lambda names: Baseline(agents=names).meta(), [POLE], "Infrastructure"),
     ],
 )
-def test_a_single_name_is_a_list_of_one(make: Callable[[Any], object], several: object, single: str) -> None:
+def test_a_single_name_is_a_list_of_one(
+    make: Callable[[Any], object], several: object, single: str
+) -> None:
     assert make(single) == make(several)
 
 
@@ -117,7 +136,12 @@ def test_an_agent_that_was_not_downloaded_is_named(tmp_path: Path) -> None:
                 NotAvailableError,
                 r"other_vehicle is not in .* which has ego_vehicle, infrastructure",
             )
-            for call in (da.cooperative_boxes, da.visible_instances, da.aggregate_point_cloud, da.message_sizes)
+            for call in (
+                da.cooperative_boxes,
+                da.visible_instances,
+                da.aggregate_point_cloud,
+                da.message_sizes,
+            )
         ],
     )
     assert len(da.cooperative_boxes(sample)) > 0
@@ -125,21 +149,39 @@ def test_an_agent_that_was_not_downloaded_is_named(tmp_path: Path) -> None:
         (
             lambda: cooperating_agents(da, sample, "all"),
             NotAvailableError,
-            ("; unpack its archive", "name the agents that are there", "agents='available' (--agents available)"),
+            (
+                "; unpack its archive",
+                "name the agents that are there",
+                "agents='available' (--agents available)",
+            ),
         ),
     )
     assert cooperating_agents(da, sample, "available") == (EGO, POLE)
-    assert len(da.cooperative_boxes(sample, agents="available")) == len(da.cooperative_boxes(sample))
+    assert len(da.cooperative_boxes(sample, agents="available")) == len(
+        da.cooperative_boxes(sample)
+    )
     assert MotionLabelConfig(agents="available").digest == MotionLabelConfig().digest
 
 
 def test_names_roles_sides_and_views_that_are_none(da_b: DeepAccident) -> None:
-    sample, everyone, agents = da_b.sample[0], AGENT_CONFIGS["all"], np.array(["infrastructure", "ego_vehicle"])
+    sample, everyone, agents = (
+        da_b.sample[0],
+        AGENT_CONFIGS["all"],
+        np.array(["infrastructure", "ego_vehicle"]),
+    )
     assert cooperating_agents(da_b, sample, agents) == ("ego_vehicle", "infrastructure")
     assert AgentConfig("mine", ["behind"]) == AgentConfig("mine", ("behind",))
     assert_refused(
-        (lambda: AgentConfig("mine", ("front",)), ChoiceError, ("partners: expected one of behind", "'front'")),
-        (lambda: everyone.agents_for("bus"), ChoiceError, ("agent: expected one of ego_vehicle", "'bus'")),
+        (
+            lambda: AgentConfig("mine", ("front",)),
+            ChoiceError,
+            ("partners: expected one of behind", "'front'"),
+        ),
+        (
+            lambda: everyone.agents_for("bus"),
+            ChoiceError,
+            ("agent: expected one of ego_vehicle", "'bus'"),
+        ),
         (
             lambda: everyone.agents_for(POLE, side="left"),
             ChoiceError,
@@ -154,11 +196,19 @@ def test_names_roles_sides_and_views_that_are_none(da_b: DeepAccident) -> None:
             for wrong in (3, 2.5, object())
         ],
         *[
-            (partial(cooperating_agents, da_b, sample, wrong), ChoiceError, ("agents: expected one of ego_vehicle",))
+            (
+                partial(cooperating_agents, da_b, sample, wrong),
+                ChoiceError,
+                ("agents: expected one of ego_vehicle",),
+            )
             for wrong in ([None], [3], [np.zeros(2)])
         ],
         *[
-            (partial(AgentConfig, "mine", wrong), ChoiceError, ("partners: expected some of behind",))
+            (
+                partial(AgentConfig, "mine", wrong),
+                ChoiceError,
+                ("partners: expected some of behind",),
+            )
             for wrong in (3, None)
         ],
         *[
@@ -175,7 +225,10 @@ SEEN = [False, True, False, True, False, True, True, True]
 def test_unseen_is_not_in_view_now_and_at_one_moment_before() -> None:
     assert_array_equal(accident_visible_mask(VIEWS), SEEN)
     assert_array_equal(accident_visible_mask(VIEWS.reshape(2, 4, 3)), np.reshape(SEEN, (2, 4)))
-    assert (accident_visible_mask([1, 0, 0]), accident_visible_mask(np.zeros((0, 3))).shape) == (np.array(False), (0,))
+    assert (accident_visible_mask([1, 0, 0]), accident_visible_mask(np.zeros((0, 3))).shape) == (
+        np.array(False),
+        (0,),
+    )
 
 
 def test_without_a_collision_and_behind_sheer_curtains_all_is_seen() -> None:
@@ -193,7 +246,9 @@ def test_a_pair_is_in_view_if_all_but_the_agent_itself_are() -> None:
     assert pair_in_view(mask, ids, np.array([5, 7]), own_id=7)
 
 
-def watched(root: Path, seen: Collection[int], frames: int = 21, agent: str = "ego_vehicle", **release) -> DeepAccident:
+def watched(
+    root: Path, seen: Collection[int], frames: int = 21, agent: str = "ego_vehicle", **release
+) -> DeepAccident:
     """One agent alone, which sees 1212 at the frames `seen`, and 1223 (the ego) always."""
 
     def lines(_: str, frame: int) -> list[str]:
@@ -228,8 +283,13 @@ def test_an_accident_is_seen_at_the_four_moments_or_at_some(
     da = watched(tmp_path, seen, frames)
     assert accident_visibility(da, tiny.TOKEN) == expected
     for index in range(1, frames + 1):
-        now, missed = index in seen, sum(moment not in seen for moment in (index, index - 5, index - 10))
-        assert accident_visible(da, f"{tiny.TOKEN}/ego_vehicle/{index:03d}") == (now or missed < 2), index
+        now, missed = (
+            index in seen,
+            sum(moment not in seen for moment in (index, index - 5, index - 10)),
+        )
+        assert accident_visible(da, f"{tiny.TOKEN}/ego_vehicle/{index:03d}") == (
+            now or missed < 2
+        ), index
 
 
 @pytest.mark.parametrize(
@@ -260,13 +320,25 @@ def test_whether_a_collider_is_hidden_may_be_unknown(tmp_path: Path, da: DeepAcc
     ):
         assert hidden_collider(watched(tmp_path / place, (), **release), tiny.TOKEN) is None, place
     bystander = tiny.META.replace("id: 1223 1236", "id: 1300 1236")
-    assert hidden_collider(watched(tmp_path / "one", (), meta=bystander), tiny.TOKEN)  # of two, one is seen
-    assert hidden_collider(da, next(scenario for scenario in da.scenario if scenario["collision"] is None)) is None
+    assert hidden_collider(
+        watched(tmp_path / "one", (), meta=bystander), tiny.TOKEN
+    )  # of two, one is seen
+    assert (
+        hidden_collider(
+            da, next(scenario for scenario in da.scenario if scenario["collision"] is None)
+        )
+        is None
+    )
     [curtain, *_] = SHEER_CURTAINS
-    assert hidden_collider(watched(tmp_path / "curtain", (), name=curtain), f"{tiny.TYPE}/{curtain}") is False
+    assert (
+        hidden_collider(watched(tmp_path / "curtain", (), name=curtain), f"{tiny.TYPE}/{curtain}")
+        is False
+    )
 
 
-def test_what_cannot_be_judged_and_what_always_counts_as_seen(tmp_path: Path, da: DeepAccident) -> None:
+def test_what_cannot_be_judged_and_what_always_counts_as_seen(
+    tmp_path: Path, da: DeepAccident
+) -> None:
     for place, told, release in (
         ("silent", None, {"meta": None}),
         ("unlabelled", None, {"labelled": False}),
@@ -277,10 +349,18 @@ def test_what_cannot_be_judged_and_what_always_counts_as_seen(tmp_path: Path, da
         assert accident_visibility(other, tiny.TOKEN) is told, place
     pole = watched(tmp_path / "pole", {6}, 6, "infrastructure")
     assert accident_visibility(pole, tiny.TOKEN) is None
-    assert [accident_visible(pole, f"{tiny.TOKEN}/infrastructure/{frame:03d}") for frame in (5, 6)] == [False, True]
+    assert [
+        accident_visible(pole, f"{tiny.TOKEN}/infrastructure/{frame:03d}") for frame in (5, 6)
+    ] == [False, True]
     for number, name in enumerate(SHEER_CURTAINS):
         assert (
-            accident_visibility(watched(tmp_path / f"{number}", (), 6, name=name), f"{tiny.TYPE}/{name}") == "visible"
+            accident_visibility(
+                watched(tmp_path / f"{number}", (), 6, name=name), f"{tiny.TYPE}/{name}"
+            )
+            == "visible"
         )
     [calm] = [scenario for scenario in da.scenario if scenario["collision"] is None][:1]
-    assert (accident_visibility(da, calm), accident_visible(da, f"{calm['token']}/infrastructure/001")) == (None, True)
+    assert (
+        accident_visibility(da, calm),
+        accident_visible(da, f"{calm['token']}/infrastructure/001"),
+    ) == (None, True)

@@ -25,7 +25,9 @@ def sample(da: DeepAccident) -> str:
 def test_agents_and_sweeps_come_one_after_another(da: DeepAccident, sample: str) -> None:
     scenario, cloud = da.scenario[0]["token"], da.aggregate_point_cloud(sample, sweeps=2)
     parts = [
-        da.load_point_cloud(f"{scenario}/{agent}/{index}", "world") for index in ("004", "003") for agent in AGENTS
+        da.load_point_cloud(f"{scenario}/{agent}/{index}", "world")
+        for index in ("004", "003")
+        for agent in AGENTS
     ]
     assert cloud.frame == "world"
     assert_allclose(cloud.xyz, np.concatenate([part.xyz for part in parts]), atol=1e-6)
@@ -50,7 +52,11 @@ def test_missing_clouds_are_an_error_or_left_out(
     names = list(AGENTS[:3])
     assert_refused(
         *[
-            (partial(call, sample), MissingFileError, r"no such file; .*, or leave out .* with on_missing='skip'")
+            (
+                partial(call, sample),
+                MissingFileError,
+                r"no such file; .*, or leave out .* with on_missing='skip'",
+            )
             for call in (da_partial.aggregate_point_cloud, da_partial.message_sizes)
         ],
         *[
@@ -68,7 +74,10 @@ def test_missing_clouds_are_an_error_or_left_out(
     sizes = da_partial.message_sizes(sample, on_missing="skip")
     assert sizes["infrastructure"].cloud is None
     assert {name: sizes[name] for name in names} == da.message_sizes(sample, agents=names)
-    assert ["2 of 8" in caplog.records[0].getMessage(), "1 of 4" in caplog.records[1].getMessage()] == [True, True]
+    assert [
+        "2 of 8" in caplog.records[0].getMessage(),
+        "1 of 4" in caplog.records[1].getMessage(),
+    ] == [True, True]
     only = da_partial.aggregate_point_cloud(sample, agents=["infrastructure"], on_missing="skip")
     assert (len(only), only.frame) == (0, "world")
 
@@ -82,10 +91,16 @@ def test_compensated_points_lie_on_the_actors_of_the_present(da: DeepAccident, s
         points = da.load_point_cloud(f"{sample.rsplit('/', 2)[0]}/{agent}/{index:03d}", "world").xyz
         recorded += points_inside(tracks.at(index), moving, points)
     smeared, sharp = (
-        points_inside(tracks.at(4), moving, da.aggregate_point_cloud(sample, sweeps=4, compensate=compensate).xyz)
+        points_inside(
+            tracks.at(4),
+            moving,
+            da.aggregate_point_cloud(sample, sweeps=4, compensate=compensate).xyz,
+        )
         for compensate in (False, True)
     )
-    assert_allclose(sharp, recorded, rtol=0.1, atol=20)  # a point's range is off by more than a box's side is thick
+    assert_allclose(
+        sharp, recorded, rtol=0.1, atol=20
+    )  # a point's range is off by more than a box's side is thick
     assert smeared.sum() < 0.95 * recorded.sum()
     assert len(da.aggregate_point_cloud(sample, sweeps=4)) == len(
         da.aggregate_point_cloud(sample, sweeps=4, compensate=True)
@@ -96,7 +111,9 @@ def points_inside(boxes: Boxes, actors: np.ndarray, points: np.ndarray) -> np.nd
     """How many points (M, 3) lie in each actor's box, 1 cm to each side."""
     boxes = boxes.select(boxes.actor_id.searchsorted(actors))
     np.testing.assert_array_equal(boxes.actor_id, actors)
-    return Boxes.from_arrays(boxes.center, boxes.size + 0.02, boxes.yaw).contains(points).sum(axis=1)
+    return (
+        Boxes.from_arrays(boxes.center, boxes.size + 0.02, boxes.yaw).contains(points).sum(axis=1)
+    )
 
 
 def test_compensation_makes_up_for_latency(da: DeepAccident, sample: str) -> None:
@@ -115,38 +132,56 @@ def test_compensation_makes_up_for_latency(da: DeepAccident, sample: str) -> Non
 
 
 def test_a_point_keeps_its_place_in_its_box() -> None:
-    then = Boxes.from_arrays([[0.0, 0, 0], [50, 0, 0]], [[4.0, 2, 2]] * 2, [0.0, 0], actor_id=[7, 8])
-    now = Boxes.from_arrays([[10.0, 5, 1], [0, 0, 0]], [[4.0, 2, 2]] * 2, [np.pi / 2, 0], actor_id=[7, 9])
+    then = Boxes.from_arrays(
+        [[0.0, 0, 0], [50, 0, 0]], [[4.0, 2, 2]] * 2, [0.0, 0], actor_id=[7, 8]
+    )
+    now = Boxes.from_arrays(
+        [[10.0, 5, 1], [0, 0, 0]], [[4.0, 2, 2]] * 2, [np.pi / 2, 0], actor_id=[7, 9]
+    )
     points = np.array([[1.5, 0.5, 0.2], [3, 0, 0], [50, 0, 0]])
     assert_allclose(moved_points(points, then, now), [[9.5, 6.5, 1.2], [3, 0, 0], [50, 0, 0]])
     assert_allclose(points[0], [1.5, 0.5, 0.2])
 
 
-def test_of_boxes_that_overlap_the_last_moves_a_point_and_one_that_only_turns_moves_it_too() -> None:
+def test_of_boxes_that_overlap_the_last_moves_a_point_and_one_that_only_turns_moves_it_too() -> (
+    None
+):
     center, size = [[0.0, 0, 0], [1, 0, 0], [9, 0, 0]], [[4.0, 2, 2]] * 3
     then = Boxes.from_arrays(center, size, [0.0, 0, 0], actor_id=[5, 6, 7])
-    now = Boxes.from_arrays([[0.0, 0, 9], [1, 0, 0], [9, 0, 0]], size, [0.0, np.pi / 2, 0], actor_id=[5, 6, 7])
+    now = Boxes.from_arrays(
+        [[0.0, 0, 9], [1, 0, 0], [9, 0, 0]], size, [0.0, np.pi / 2, 0], actor_id=[5, 6, 7]
+    )
     points = np.array([[-1.5, 0, 0], [1.5, 0.5, 0], [9.5, 0.1, 0.3]])
-    assert_allclose(moved_points(points, then, now), [[-1.5, 0, 9], [0.5, 0.5, 0], [9.5, 0.1, 0.3]], atol=1e-12)
+    assert_allclose(
+        moved_points(points, then, now), [[-1.5, 0, 9], [0.5, 0.5, 0], [9.5, 0.1, 0.3]], atol=1e-12
+    )
     assert_array_equal(moved_points(points, then, now.select([])), points)
 
 
 def test_each_point_says_whose_and_how_old_it_is(da: DeepAccident, sample: str) -> None:
     """Of three sweeps 0.1 s apart; the partner's arrive 0.1 s late, the ego's do not, and none is from frame 0."""
-    cloud = da.aggregate_point_cloud(sample, agents=["infrastructure"], sweeps=3, link=Link(latency=0.1))
-    both = da.aggregate_point_cloud(sample, agents="+infrastructure", sweeps=3, link=Link(latency=0.1))
+    cloud = da.aggregate_point_cloud(
+        sample, agents=["infrastructure"], sweeps=3, link=Link(latency=0.1)
+    )
+    both = da.aggregate_point_cloud(
+        sample, agents="+infrastructure", sweeps=3, link=Link(latency=0.1)
+    )
     for each, names in ((cloud, ["infrastructure"]), (both, ["ego_vehicle", "infrastructure"])):
         for name in names:
             of_agent = each.select(each.agent == AGENTS.index(name))
             for back in range(3):
                 lag = round(0.1 * (back + (name == "infrastructure")), 1)
                 taken = da.get_sample(da.scenario[0], name, 4 - round(lag * 10))
-                assert (of_agent.time_lag == np.float32(lag)).sum() == len(da.load_point_cloud(taken))
+                assert (of_agent.time_lag == np.float32(lag)).sum() == len(
+                    da.load_point_cloud(taken)
+                )
     assert {AGENTS[code] for code in both.agent} == {"ego_vehicle", "infrastructure"}
 
 
 def test_lost_clouds_leave_no_points(da: DeepAccident, sample: str) -> None:
-    cloud = da.aggregate_point_cloud(sample, agents=["infrastructure"], link=Link(packet_loss=1), frame="ego")
+    cloud = da.aggregate_point_cloud(
+        sample, agents=["infrastructure"], link=Link(packet_loss=1), frame="ego"
+    )
     assert len(cloud) == len(cloud.agent) == len(cloud.time_lag) == 0
     assert cloud.frame == "ego"
 
@@ -154,7 +189,9 @@ def test_lost_clouds_leave_no_points(da: DeepAccident, sample: str) -> None:
 def test_a_cloud_in_an_image_of_its_own_agent(da: DeepAccident, sample: str) -> None:
     camera = f"{sample}/Camera_Front"
     image, shown = da.load_image(camera), da.map_pointcloud_to_image(camera)
-    optical = da.transform(sample, sample, "Camera_Front", "lidar").apply(da.load_point_cloud(sample, "lidar").xyz)
+    optical = da.transform(sample, sample, "Camera_Front", "lidar").apply(
+        da.load_point_cloud(sample, "lidar").xyz
+    )
     assert_allclose(shown.depth, optical[:, 2], atol=1e-9)
     assert shown.mask.sum() > 100
     assert not shown.mask[optical[:, 2] <= 0].any()
@@ -171,7 +208,8 @@ def test_an_image_that_was_stored_smaller_is_read_at_the_same_place() -> None:
     last = np.nextafter(13.0, 0)  # times 5/13 that is 5, which is no column any more
     lens, pixels = PinholeCamera(np.eye(3), 13, 13), np.array([[last, last], [0, 3.0], [20, 1]])
     assert_array_equal(
-        colors_at(image, lens, pixels, np.array([True, True, False])), [image[4, 4], image[1, 0], [0, 0, 0]]
+        colors_at(image, lens, pixels, np.array([True, True, False])),
+        [image[4, 4], image[1, 0], [0, 0, 0]],
     )
 
 
@@ -184,7 +222,9 @@ def test_points_of_any_agent_in_any_camera_and_frame(da: DeepAccident, sample: s
         da.project_to_image(world, pole, camera, colors=False),
         da.project_to_image(world.xyz, sample, camera, colors=False),
         da.project_to_image(cloud.xyz, pole, camera, frame="lidar", colors=False),
-        da.project_to_image(LidarPointCloud(cloud.xyz, cloud.intensity), pole, camera, colors=False),
+        da.project_to_image(
+            LidarPointCloud(cloud.xyz, cloud.intensity), pole, camera, colors=False
+        ),
     ):
         assert_allclose(again.depth, shown.depth, atol=1e-6)
         assert_array_equal(again.mask, shown.mask)
@@ -193,7 +233,11 @@ def test_points_of_any_agent_in_any_camera_and_frame(da: DeepAccident, sample: s
 
 def test_sensors_that_are_no_camera_or_of_another_scenario(da: DeepAccident, sample: str) -> None:
     assert_refused(
-        (lambda: da.map_pointcloud_to_image(f"{sample}/Camera_Top"), TokenError, r"the channels are Camera_Front"),
+        (
+            lambda: da.map_pointcloud_to_image(f"{sample}/Camera_Top"),
+            TokenError,
+            r"the channels are Camera_Front",
+        ),
         (
             lambda: da.map_pointcloud_to_image(f"{sample}/lidar01"),
             ChoiceError,
@@ -214,7 +258,10 @@ def test_message_sizes(da: DeepAccident, sample: str) -> None:
     sizes = da.message_sizes(sample, bev_shape=(8, 100, 50), bev_dtype=np.float16)
     assert list(sizes) == list(AGENTS)
     mine = sizes["ego_vehicle"]
-    assert (mine.images, mine.cloud) == (24 + 6 * 64 * 36 * 3, 24 + 16 * len(da.load_point_cloud(sample)))
+    assert (mine.images, mine.cloud) == (
+        24 + 6 * 64 * 36 * 3,
+        24 + 16 * len(da.load_point_cloud(sample)),
+    )
     assert (mine.boxes, mine.bev) == (24 + 45 * len(da.boxes(sample)), 24 + 8 * 100 * 50 * 2)
     assert da.message_sizes(sample, agents="single", clouds=False)["ego_vehicle"].cloud is None
     assert_refused(
@@ -228,8 +275,15 @@ def test_message_sizes(da: DeepAccident, sample: str) -> None:
             "bev_dtype: expected a type such as 'float32', found 'foo'",
         ),
     )
-    assert da.message_sizes(sample, agents="single", bev_shape=np.array((8, 100, 50)))["ego_vehicle"].bev == 24 + 160000
-    assert da.message_sizes(sample, agents="single", bev_shape=(1, 1, 1))["ego_vehicle"].bev == 24 + 4
+    assert (
+        da.message_sizes(sample, agents="single", bev_shape=np.array((8, 100, 50)))[
+            "ego_vehicle"
+        ].bev
+        == 24 + 160000
+    )
+    assert (
+        da.message_sizes(sample, agents="single", bev_shape=(1, 1, 1))["ego_vehicle"].bev == 24 + 4
+    )
     usual = da.message_sizes(sample, agents="single")["ego_vehicle"]
     assert (usual.bev, usual.cloud) == (24 + 64 * 200 * 200 * 4, mine.cloud)
 
@@ -238,7 +292,9 @@ def test_message_sizes_are_of_what_arrives(da: DeepAccident, sample: str) -> Non
     late = da.message_sizes(sample, link=Link(latency=0.2, pose_noise=0.3))
     then, now = da.message_sizes(sample.replace("/004", "/002")), da.message_sizes(sample)
     assert late["ego_vehicle"] == now["ego_vehicle"]
-    assert {agent: late[agent] for agent in AGENTS[1:]} == {agent: then[agent] for agent in AGENTS[1:]}
+    assert {agent: late[agent] for agent in AGENTS[1:]} == {
+        agent: then[agent] for agent in AGENTS[1:]
+    }
     assert late != now
     lossy = Link(packet_loss=0.5, seed=2)
     arrived = [message.agent for message in messages(da, sample, None, lossy)]
@@ -275,10 +331,12 @@ def test_the_lidars_frame_has_one_name(da: DeepAccident, sample: str) -> None:
         da.trajectory(da.instance[0], sample, "lidar01"),
     ]
     assert [result.frame for result in results] == ["lidar"] * len(results)
-    assert_array_equal(da.world_from(sample, "lidar01").matrix, da.world_from(sample, "lidar").matrix)
-    assert da.boxes(sample, "lidar01").iou_bev(da.cooperative_boxes(sample, frame="lidar")).max() == pytest.approx(
-        1, abs=1e-12
+    assert_array_equal(
+        da.world_from(sample, "lidar01").matrix, da.world_from(sample, "lidar").matrix
     )
+    assert da.boxes(sample, "lidar01").iou_bev(
+        da.cooperative_boxes(sample, frame="lidar")
+    ).max() == pytest.approx(1, abs=1e-12)
 
 
 @pytest.mark.parametrize("frame", ["map", "", None, 3, ["ego"]])

@@ -23,12 +23,16 @@ def test_the_union_has_each_actor_once_and_nobody_else(da: DeepAccident) -> None
             tokens = [token for token in samples if token.split("/")[-2] in agents]
             view = cooperative_view(da, tokens[0], agents=agents)
             ids = view.boxes.actor_id
-            assert ids[ids >= 0].tolist() == sorted(set.union(*(label_ids(da, token) for token in tokens)))
+            assert ids[ids >= 0].tolist() == sorted(
+                set.union(*(label_ids(da, token) for token in tokens))
+            )
             assert -100 not in ids
             for agent in AGENTS:
                 seen = (view.seen_by >> AGENTS.index(agent) & 1).astype(bool)
                 token = next((token for token in tokens if f"/{agent}/" in token), None)
-                assert set(ids[seen & (ids >= 0)].tolist()) == (label_ids(da, token) if token else set())
+                assert set(ids[seen & (ids >= 0)].tolist()) == (
+                    label_ids(da, token) if token else set()
+                )
 
 
 def test_each_box_is_its_sources_own_in_the_frame_asked_for(da: DeepAccident) -> None:
@@ -51,7 +55,8 @@ def test_actor_ids_are_those_of_the_instances(da: DeepAccident) -> None:
     for sample in (da.sample[7], da.sample[-1]):
         instances = [box.instance_token for box in da.get_boxes(sample)]
         assert_array_equal(
-            da.actor_ids(sample), [-1 if token is None else int(token.rsplit("/", 1)[1]) for token in instances]
+            da.actor_ids(sample),
+            [-1 if token is None else int(token.rsplit("/", 1)[1]) for token in instances],
         )
 
 
@@ -67,7 +72,10 @@ def stacked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     def opened(rows: dict[str, Sequence[str]]) -> DeepAccident:
         monkeypatch.setattr(tiny, "ego_to_world", lambda *_: tiny.pose())
         monkeypatch.setattr(tiny, "lidar_height", lambda _: 0.0)
-        return DeepAccident(dataroot=tiny.write_tiny_release(tmp_path, frames=2, lines_of=scene(rows)), verbose=False)
+        return DeepAccident(
+            dataroot=tiny.write_tiny_release(tmp_path, frames=2, lines_of=scene(rows)),
+            verbose=False,
+        )
 
     return opened
 
@@ -78,7 +86,10 @@ def row(x: float, actor: int, points: int = 9, category: str = "car", camera: bo
 
 def test_own_rows_become_actors_and_give_way_to_what_others_see(stacked) -> None:
     da = stacked(
-        {"ego_vehicle": [row(0.1, -100, 900, camera=False)], "other_vehicle": [row(30.0, -100), row(0.0, 1223, 7)]}
+        {
+            "ego_vehicle": [row(0.1, -100, 900, camera=False)],
+            "other_vehicle": [row(30.0, -100), row(0.0, 1223, 7)],
+        }
     )
     view = cooperative_view(da, f"{tiny.TOKEN}/ego_vehicle/001")
     assert_array_equal(view.boxes.actor_id, [1212, 1223])
@@ -102,7 +113,12 @@ def test_the_egos_box_counts_before_the_others_and_points_add_up(stacked) -> Non
 def test_untracked_rows_stay_but_once_a_place(stacked) -> None:
     rows = {
         "ego_vehicle": [row(50.0, -1), row(50.3, -1), row(70.0, 8)],
-        "other_vehicle": [row(50.2, -1), row(50.2, -1, category="truck"), row(70.1, -1), row(90.0, -1)],
+        "other_vehicle": [
+            row(50.2, -1),
+            row(50.2, -1, category="truck"),
+            row(70.1, -1),
+            row(90.0, -1),
+        ],
         "infrastructure": [row(90.4, -1), row(91.0, -1)],
     }
     boxes = stacked(rows).cooperative_boxes(f"{tiny.TOKEN}/ego_vehicle/001")
@@ -125,11 +141,19 @@ def test_half_a_metre_apart_are_two_actors(stacked, apart: float, kept: int) -> 
 
 def test_visible_only(stacked) -> None:
     rows = {
-        "ego_vehicle": [row(0.0, -100), row(20.0, 5, 1), row(40.0, 6, 9, camera=False), row(12.0, -1)],
+        "ego_vehicle": [
+            row(0.0, -100),
+            row(20.0, 5, 1),
+            row(40.0, 6, 9, camera=False),
+            row(12.0, -1),
+        ],
         "infrastructure": [row(40.0, 6, 2), row(14.0, 7, 1, camera=False)],
     }
     da, sample = stacked(rows), f"{tiny.TOKEN}/ego_vehicle/001"
-    seen = {visible: da.cooperative_boxes(sample, visible=visible) for visible in (None, "camera", "released")}
+    seen = {
+        visible: da.cooperative_boxes(sample, visible=visible)
+        for visible in (None, "camera", "released")
+    }
     assert_array_equal(seen[None].actor_id, [5, 6, 7, 1223, -1])
     assert_array_equal(seen["camera"].actor_id, [5, 6, 1223, -1])
     assert_array_equal(seen["released"].actor_id, [6, 7])

@@ -39,7 +39,9 @@ def test_a_latency_that_is_no_multiple_of_a_frame_names_the_two_nearest() -> Non
     )
 
 
-def test_a_latency_longer_than_the_past_names_what_there_is(da_b: DeepAccident, sample: str) -> None:
+def test_a_latency_longer_than_the_past_names_what_there_is(
+    da_b: DeepAccident, sample: str
+) -> None:
     assert len(da_b.cooperative_boxes(sample, link=Link(latency=0.3))) > 0
     assert_refused(
         *[
@@ -48,7 +50,12 @@ def test_a_latency_longer_than_the_past_names_what_there_is(da_b: DeepAccident, 
                 ConfigError,
                 r"from frame 004; the longest possible is 0\.3 s; .* a frame that has 5 others before it",
             )
-            for call in (da_b.cooperative_boxes, da_b.visible_instances, da_b.aggregate_point_cloud, da_b.message_sizes)
+            for call in (
+                da_b.cooperative_boxes,
+                da_b.visible_instances,
+                da_b.aggregate_point_cloud,
+                da_b.message_sizes,
+            )
         ],
     )
 
@@ -58,18 +65,26 @@ def test_settings_that_are_not_possible() -> None:
         (lambda: Link(packet_loss=2), ConfigError, "packet_loss: 2 is no probability"),
         (lambda: PoseNoise(std=-1), ConfigError, "std is -1; choose a finite number"),
     )
-    with pytest.raises(ConfigError, match="pose_noise: expected metres or a PoseNoise, found 'much'"):
+    with pytest.raises(
+        ConfigError, match="pose_noise: expected metres or a PoseNoise, found 'much'"
+    ):
         Link(pose_noise="much")  # type: ignore[arg-type]
     assert Link(pose_noise=0.3) == Link(pose_noise=PoseNoise(mean=0.3, std=0.02, heading_std=0))
     assert pickle.loads(pickle.dumps(Link(pose_noise=0.3))) == Link(pose_noise=0.3)
 
 
-def test_a_draw_depends_on_seed_scenario_partner_and_frame_alone(da_b: DeepAccident, sample: str) -> None:
+def test_a_draw_depends_on_seed_scenario_partner_and_frame_alone(
+    da_b: DeepAccident, sample: str
+) -> None:
     link = Link(pose_noise=0.3, packet_loss=0.4, seed=7)
 
     def errors(agents: list[str] | None, link: Link) -> dict[str, bytes]:
         received = messages(da_b, sample, agents, link)
-        return {message.agent: message.pose_error.matrix.tobytes() for message in received if message.pose_error}
+        return {
+            message.agent: message.pose_error.matrix.tobytes()
+            for message in received
+            if message.pose_error
+        }
 
     together = errors(None, Link(pose_noise=0.3, seed=7))
     assert len(set(together.values())) == len(AGENTS) - 1
@@ -80,7 +95,9 @@ def test_a_draw_depends_on_seed_scenario_partner_and_frame_alone(da_b: DeepAccid
 
 def test_the_egos_own_data_are_never_disturbed(da_b: DeepAccident, sample: str) -> None:
     link = Link(latency=0.2, pose_noise=0.5, packet_loss=1)
-    alone, through = (da_b.cooperative_boxes(sample, agents="single", link=way) for way in (None, link))
+    alone, through = (
+        da_b.cooperative_boxes(sample, agents="single", link=way) for way in (None, link)
+    )
     everyone = da_b.cooperative_boxes(sample, link=link)
     for got in (through, everyone):
         assert_array_equal(got.center, alone.center)
@@ -90,19 +107,31 @@ def test_the_egos_own_data_are_never_disturbed(da_b: DeepAccident, sample: str) 
     assert da_b.visible_instances(sample, agents=["infrastructure"], link=link) == []
 
 
-def test_pose_noise_moves_all_of_a_partners_boxes_by_the_same_distance(da_b: DeepAccident, sample: str) -> None:
+def test_pose_noise_moves_all_of_a_partners_boxes_by_the_same_distance(
+    da_b: DeepAccident, sample: str
+) -> None:
     pole = ["infrastructure"]
-    true, noisy = (da_b.cooperative_boxes(sample, agents=pole, link=link) for link in (None, Link(pose_noise=0.4)))
+    true, noisy = (
+        da_b.cooperative_boxes(sample, agents=pole, link=link)
+        for link in (None, Link(pose_noise=0.4))
+    )
     off = noisy.center - true.center
     assert_allclose(off, np.broadcast_to(off[0], off.shape), atol=1e-9)
-    assert (off[0, 2], np.hypot(*off[0, :2])) == (pytest.approx(0, abs=1e-9), pytest.approx(0.4, abs=0.1))
+    assert (off[0, 2], np.hypot(*off[0, :2])) == (
+        pytest.approx(0, abs=1e-9),
+        pytest.approx(0.4, abs=0.1),
+    )
 
 
 def test_a_wrong_heading_turns_about_the_partner(da_b: DeepAccident, sample: str) -> None:
     link = Link(pose_noise=PoseNoise(std=0, heading_std=0.1))
     pole = da_b.world_from(sample.replace("ego_vehicle", "infrastructure"), "ego").translation
-    true, noisy = (da_b.cooperative_boxes(sample, agents=["infrastructure"], link=way) for way in (None, link))
-    assert_allclose(*[np.linalg.norm(boxes.center - pole, axis=1) for boxes in (true, noisy)], atol=1e-9)
+    true, noisy = (
+        da_b.cooperative_boxes(sample, agents=["infrastructure"], link=way) for way in (None, link)
+    )
+    assert_allclose(
+        *[np.linalg.norm(boxes.center - pole, axis=1) for boxes in (true, noisy)], atol=1e-9
+    )
     turned = np.angle(np.exp(1j * (noisy.yaw - true.yaw)))
     assert_allclose(turned, turned[0], atol=1e-6)
     assert abs(turned[0]) > 1e-3
@@ -138,13 +167,21 @@ def test_what_is_no_number_is_refused(wrong: object) -> None:
             for name in ("latency", "packet_loss")
         ],
         *[
-            (partial(PoseNoise, **{name: wrong}), ConfigError, f"pose noise: {name}: expected a number from 0, found")
+            (
+                partial(PoseNoise, **{name: wrong}),
+                ConfigError,
+                f"pose noise: {name}: expected a number from 0, found",
+            )
             for name in ("mean", "std", "heading_std")
         ],
     )
     if wrong is not None:
         assert_refused(
-            (lambda: Link(pose_noise=wrong), ConfigError, "pose_noise: expected metres or a PoseNoise, found"),
+            (
+                lambda: Link(pose_noise=wrong),
+                ConfigError,
+                "pose_noise: expected metres or a PoseNoise, found",
+            ),
         )
 
 
@@ -161,20 +198,49 @@ def test_seeds_are_whole_numbers() -> None:
 def test_equal_links_draw_alike_whatever_their_numbers_types() -> None:
     links = [
         Link(latency=0.3, pose_noise=0.5, packet_loss=0.5, seed=1),
-        Link(latency=0.1 + 0.2, pose_noise=np.float32(0.5), packet_loss=np.float16(0.5), seed=np.int64(1)),
-        Link(latency=np.float32(0.3), pose_noise=np.array(0.5), packet_loss=np.float64(0.5), seed=True),
+        Link(
+            latency=0.1 + 0.2,
+            pose_noise=np.float32(0.5),
+            packet_loss=np.float16(0.5),
+            seed=np.int64(1),
+        ),
+        Link(
+            latency=np.float32(0.3),
+            pose_noise=np.array(0.5),
+            packet_loss=np.float64(0.5),
+            seed=True,
+        ),
     ]
     assert len(set(links)) == 1
     for link in links:
         assert (type(link.latency), type(link.packet_loss), type(link.seed)) == (float, float, int)
         assert type(link.pose_noise.mean) is float
-        assert len({link.pose_error("scenario", "agent", 4, np.zeros(3)).matrix.tobytes() for link in links}) == 1
-    assert Link(pose_noise=np.int64(1)) == Link(pose_noise=1.0) == Link(pose_noise=PoseNoise(mean=np.uint8(1)))
+        assert (
+            len(
+                {
+                    link.pose_error("scenario", "agent", 4, np.zeros(3)).matrix.tobytes()
+                    for link in links
+                }
+            )
+            == 1
+        )
+    assert (
+        Link(pose_noise=np.int64(1))
+        == Link(pose_noise=1.0)
+        == Link(pose_noise=PoseNoise(mean=np.uint8(1)))
+    )
 
 
 @pytest.mark.parametrize("wrong", [{"latency": 0.2}, "a", 0.2, Link])
-def test_what_is_no_link_is_refused_by_every_call(da_b: DeepAccident, sample: str, wrong: object) -> None:
-    calls = (da_b.cooperative_boxes, da_b.visible_instances, da_b.aggregate_point_cloud, da_b.message_sizes)
+def test_what_is_no_link_is_refused_by_every_call(
+    da_b: DeepAccident, sample: str, wrong: object
+) -> None:
+    calls = (
+        da_b.cooperative_boxes,
+        da_b.visible_instances,
+        da_b.aggregate_point_cloud,
+        da_b.message_sizes,
+    )
     assert_refused(
         *[
             (
@@ -208,16 +274,32 @@ def test_the_ends_of_each_range() -> None:
     assert Link(latency=0.1 + 0.9e-7).latency == Link(latency=0.1 - 0.9e-7).latency == 0.1
     assert PoseNoise(mean=0, std=0, heading_std=math.pi).heading_std == math.pi
     assert_refused(
-        (lambda: Link(packet_loss=-0.01), ConfigError, "packet_loss: -0.01 is no probability; choose a number from 0"),
+        (
+            lambda: Link(packet_loss=-0.01),
+            ConfigError,
+            "packet_loss: -0.01 is no probability; choose a number from 0",
+        ),
         (lambda: Link(packet_loss=1.01), ConfigError, "packet_loss: 1.01 is no probability"),
         (
             lambda: Link(latency=0.1 + 1.1e-7),
             ConfigError,
             r"is no multiple of a frame .* nearest are 0\.1 s and 0\.2 s",
         ),
-        (lambda: Link(latency=20.1), ConfigError, r"20\.1 s is longer than any scenario; .* give 0\.0201"),
-        (lambda: PoseNoise(heading_std=3.15), ConfigError, r"heading_std is 3\.15 radians, .*; .* give 0\.05498"),
-        (lambda: PoseNoise(mean=math.inf), ConfigError, "mean is inf; choose a finite number of at least 0"),
+        (
+            lambda: Link(latency=20.1),
+            ConfigError,
+            r"20\.1 s is longer than any scenario; .* give 0\.0201",
+        ),
+        (
+            lambda: PoseNoise(heading_std=3.15),
+            ConfigError,
+            r"heading_std is 3\.15 radians, .*; .* give 0\.05498",
+        ),
+        (
+            lambda: PoseNoise(mean=math.inf),
+            ConfigError,
+            "mean is inf; choose a finite number of at least 0",
+        ),
     )
     assert Link(latency=0.3).frame_sent("scenario", 4) == 1
     assert_refused(
@@ -235,11 +317,15 @@ def box_bytes(da: DeepAccident, sample: str) -> dict[str, int]:
     return {agent: each.boxes for agent, each in sizes.items() if agent != sample.split("/")[2]}
 
 
-def senders(da: DeepAccident, sample: str, link: Link, agents: object = "all", sweeps: int = 1) -> list[str]:
+def senders(
+    da: DeepAccident, sample: str, link: Link, agents: object = "all", sweeps: int = 1
+) -> list[str]:
     return [message.agent for message in messages(da, sample, agents, link, sweeps=sweeps)]  # type: ignore[arg-type]
 
 
-def test_within_a_budget_each_partner_sends_that_still_fits(da_b: DeepAccident, sample: str) -> None:
+def test_within_a_budget_each_partner_sends_that_still_fits(
+    da_b: DeepAccident, sample: str
+) -> None:
     sizes = box_bytes(da_b, sample)
     total = sum(sizes.values())
     for budget in (1, min(sizes.values()) - 1, *sizes.values(), total - 1, total):
@@ -255,17 +341,25 @@ def test_within_a_budget_each_partner_sends_that_still_fits(da_b: DeepAccident, 
     assert senders(da_b, sample, link) == ["ego_vehicle", *sizes]
 
 
-def test_a_message_that_does_not_fit_does_not_keep_a_smaller_one_out(da_b: DeepAccident, sample: str) -> None:
+def test_a_message_that_does_not_fit_does_not_keep_a_smaller_one_out(
+    da_b: DeepAccident, sample: str
+) -> None:
     sizes = box_bytes(da_b, sample)
     large, small = max(sizes, key=sizes.__getitem__), min(sizes, key=sizes.__getitem__)
     assert sizes[small] < sizes[large]
-    assert senders(da_b, sample, Link(budget=sizes[small], payload="boxes"), [large, small]) == [small]
+    assert senders(da_b, sample, Link(budget=sizes[small], payload="boxes"), [large, small]) == [
+        small
+    ]
 
 
 def test_a_budget_is_of_each_frame_and_of_what_arrives(da_b: DeepAccident, sample: str) -> None:
     one = {"budget": 1500, "payload": 1000}
     assert senders(da_b, sample, Link(**one), sweeps=2) == ["ego_vehicle", "ego_vehicle_behind"] * 2
-    seeds = [each for each in range(20) if Link(packet_loss=0.5, seed=each).loses(da_b.scenario[0]["token"], BEHIND, 4)]
+    seeds = [
+        each
+        for each in range(20)
+        if Link(packet_loss=0.5, seed=each).loses(da_b.scenario[0]["token"], BEHIND, 4)
+    ]
     assert seeds
     for seed in seeds:
         arriving = senders(da_b, sample, Link(packet_loss=0.5, seed=seed))
@@ -275,7 +369,11 @@ def test_a_budget_is_of_each_frame_and_of_what_arrives(da_b: DeepAccident, sampl
 def test_whoever_does_not_fit_is_not_heard(da_b: DeepAccident, sample: str) -> None:
     alone, limited, everyone = (
         seen_actors(da_b, sample, agents=agents, link=link)
-        for agents, link in (("single", None), ("all", Link(budget=1, payload="bev")), ("all", None))
+        for agents, link in (
+            ("single", None),
+            ("all", Link(budget=1, payload="bev")),
+            ("all", None),
+        )
     )
     assert_array_equal(limited.boxes.actor_id, alone.boxes.actor_id)
     assert len(everyone.boxes) > len(alone.boxes)
@@ -291,10 +389,15 @@ def test_bytes_of_a_message_are_those_of_its_sizes(da: DeepAccident, da_b: DeepA
     assert message_bytes(da_b, blind, "boxes") == 24 + 45 * len(da_b.boxes(blind))
 
 
-def test_traffic_is_that_of_partners_after_latency_and_loss(da_b: DeepAccident, sample: str) -> None:
+def test_traffic_is_that_of_partners_after_latency_and_loss(
+    da_b: DeepAccident, sample: str
+) -> None:
     sizes, early = box_bytes(da_b, sample), box_bytes(da_b, sample.replace("/004", "/002"))
     assert traffic(da_b, sample, "all", None, "boxes") == (sum(sizes.values()), 4)
-    assert traffic(da_b, sample, "all", Link(latency=0.2, pose_noise=0.3), "boxes") == (sum(early.values()), 4)
+    assert traffic(da_b, sample, "all", Link(latency=0.2, pose_noise=0.3), "boxes") == (
+        sum(early.values()),
+        4,
+    )
     assert traffic(da_b, sample, "all", Link(packet_loss=1), "boxes") == (0, 0)
     assert traffic(da_b, sample, "single", None, "boxes") == (0, 0)
     assert traffic(da_b, sample, ["infrastructure"], None, 70) == (70, 1)
@@ -304,15 +407,31 @@ def test_budgets_that_are_none() -> None:
     bytes_ = r"expected a whole number from 1 to 1,125,899,906,842,624 \(bytes"
     assert_refused(
         *[
-            (partial(Link, budget=wrong, payload="boxes"), ConfigError, f"budget: {bytes_} a frame\\), found")
+            (
+                partial(Link, budget=wrong, payload="boxes"),
+                ConfigError,
+                f"budget: {bytes_} a frame\\), found",
+            )
             for wrong in (0, -1, 1.5, "many", True, 2**50 + 1)
         ],
         *[
-            (partial(Link, payload=wrong), ConfigError, f"payload: {bytes_} of every message\\), found")
+            (
+                partial(Link, payload=wrong),
+                ConfigError,
+                f"payload: {bytes_} of every message\\), found",
+            )
             for wrong in (0, 2.5, ["boxes"])
         ],
-        (lambda: Link(payload="pictures"), ChoiceError, "payload: expected one of images, cloud, boxes, bev, or None"),
-        (lambda: Link(budget=9), ConfigError, "budget: needs the kind of data .* give payload='boxes' or another of"),
+        (
+            lambda: Link(payload="pictures"),
+            ChoiceError,
+            "payload: expected one of images, cloud, boxes, bev, or None",
+        ),
+        (
+            lambda: Link(budget=9),
+            ConfigError,
+            "budget: needs the kind of data .* give payload='boxes' or another of",
+        ),
     )
     assert Link(budget=np.int64(2**50), payload=np.int64(1)) == Link(budget=2**50, payload=1)
     assert Link(payload="bev").payload == "bev"

@@ -13,7 +13,12 @@ from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.geometry import SE3
 from deepaccident_devkit.plugins.synth import SynthConfig
 from deepaccident_devkit.plugins.synth.plan import plan_scenarios
-from deepaccident_devkit.plugins.synth.scenario import RecordingJob, Scenario, build_scenario, record_scenario
+from deepaccident_devkit.plugins.synth.scenario import (
+    RecordingJob,
+    Scenario,
+    build_scenario,
+    record_scenario,
+)
 from deepaccident_devkit.plugins.synth.sensors.agents import Agent, Camera, make_agents
 from deepaccident_devkit.plugins.synth.sensors.render import ray_directions, slopes
 from deepaccident_devkit.plugins.synth.sensors.scene import Scene, Setting, make_scene
@@ -39,14 +44,20 @@ def painted(scene: Scene, camera: Camera, ground_from_camera: SE3) -> np.ndarray
     directions = ray_directions(ground_from_camera, right[None, :], down[:, None])
     _, face = scene.cast(ground_from_camera.translation, directions.reshape(-1, 3))
     owner = scene.face_owner[face]
-    return np.where(owner >= 0, scene.actors.actor_id[np.maximum(owner, 0)], -1).reshape(directions.shape[:2])
+    return np.where(owner >= 0, scene.actors.actor_id[np.maximum(owner, 0)], -1).reshape(
+        directions.shape[:2]
+    )
 
 
 def unoccluded(scene: Scene, ground_from_camera: SE3) -> set[int]:
     """The actors (true poses) towards whose middle the first surface is their own."""
     middle = scene.frames[:, :3, 3] + scene.frames[:, :3, 2] * scene.actors.size[:, 2:] / 2
-    _, face = scene.cast(ground_from_camera.translation, (middle - ground_from_camera.translation).astype(np.float32))
-    return set(scene.actors.actor_id[scene.face_owner[face] == np.arange(len(scene.actors))].tolist())
+    _, face = scene.cast(
+        ground_from_camera.translation, (middle - ground_from_camera.translation).astype(np.float32)
+    )
+    return set(
+        scene.actors.actor_id[scene.face_owner[face] == np.arange(len(scene.actors))].tolist()
+    )
 
 
 def drawn_large(picture: np.ndarray) -> set[int]:
@@ -62,8 +73,13 @@ def hits_and_tries(da: DeepAccident, scene: Scene, agent: Agent, labeller: str) 
     boxes, ids = da.boxes(source, "lidar"), da.actor_ids(source)
     for camera in agent.cameras:
         ground_from_camera = agent.ground_from_lidar(scene) @ camera.camera_from_lidar.inverse()
-        picture, free = painted(scene, camera, ground_from_camera), unoccluded(scene, ground_from_camera)
-        shown = da.project_to_image(boxes.center, source, f"{sample}/{camera.channel}", frame="lidar", colors=False)
+        picture, free = (
+            painted(scene, camera, ground_from_camera),
+            unoccluded(scene, ground_from_camera),
+        )
+        shown = da.project_to_image(
+            boxes.center, source, f"{sample}/{camera.channel}", frame="lidar", colors=False
+        )
         wanted = shown.mask & np.isin(ids, list(free & drawn_large(picture)))
         u, v = shown.pixels[wanted].astype(int).T
         hits += int((picture[v, u] == ids[wanted]).sum())
@@ -73,7 +89,9 @@ def hits_and_tries(da: DeepAccident, scene: Scene, agent: Agent, labeller: str) 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("labeller", ["ego_vehicle", "other_vehicle_behind", "infrastructure"])
-def test_box_centres_fall_on_their_actors_pixels(recorded: tuple[DeepAccident, Scenario], labeller: str) -> None:
+def test_box_centres_fall_on_their_actors_pixels(
+    recorded: tuple[DeepAccident, Scenario], labeller: str
+) -> None:
     da, scenario = recorded
     scene = make_scene(Setting(scenario.world, scenario.actors), frame_timestamp(FRAME))
     agents = make_agents(scenario.world, scenario.actors, scenario.agents, CONFIG.image_size)

@@ -17,7 +17,11 @@ from deepaccident_devkit.geometry import SE3
 from deepaccident_devkit.taxonomy import AGENTS
 from deepaccident_devkit.v2x import future_egomotion, relative_pose_to_ego
 
-POSES = [SE3.from_six([600, -600, 1, 0.01, 0.02, 2.0]), SE3.from_six([590, -580, 2, 0, 0.01, 1.0]), SE3.identity()]
+POSES = [
+    SE3.from_six([600, -600, 1, 0.01, 0.02, 2.0]),
+    SE3.from_six([590, -580, 2, 0, 0.01, 1.0]),
+    SE3.identity(),
+]
 
 
 def test_transforms_are_taken_as_they_are() -> None:
@@ -25,10 +29,13 @@ def test_transforms_are_taken_as_they_are() -> None:
     for given in (POSES, tuple(POSES), [POSES[0], POSES[1].matrix, POSES[2].matrix.tolist()]):
         assert_array_equal(relative_pose_to_ego(given), relative_pose_to_ego(matrices))
         assert_array_equal(future_egomotion(given), future_egomotion(matrices))
-    assert_allclose(relative_pose_to_ego(POSES)[1], (POSES[0].inverse() @ POSES[1]).to_six(), atol=1e-9)
+    assert_allclose(
+        relative_pose_to_ego(POSES)[1], (POSES[0].inverse() @ POSES[1]).to_six(), atol=1e-9
+    )
     assert_allclose(future_egomotion(POSES)[0], (POSES[1].inverse() @ POSES[0]).to_six(), atol=1e-9)
     assert_array_equal(
-        future_egomotion([POSES[0], np.full((4, 4), np.nan), POSES[2]], [True, False, True]), np.zeros((2, 6))
+        future_egomotion([POSES[0], np.full((4, 4), np.nan), POSES[2]], [True, False, True]),
+        np.zeros((2, 6)),
     )
 
 
@@ -43,9 +50,21 @@ def test_what_is_no_poses_is_refused() -> None:
         *[
             (partial(function, poses), GeometryError, r"world_from_(agent|ego): expected")
             for function in (relative_pose_to_ego, future_egomotion)
-            for poses in (None, "abc", SE3.identity(), [], np.eye(4), [np.eye(3)], [SE3.identity(), None])
+            for poses in (
+                None,
+                "abc",
+                SE3.identity(),
+                [],
+                np.eye(4),
+                [np.eye(3)],
+                [SE3.identity(), None],
+            )
         ],
-        (lambda: relative_pose_to_ego(np.zeros((2, 4, 4))), GeometryError, ("has no inverse", "no rotation")),
+        (
+            lambda: relative_pose_to_ego(np.zeros((2, 4, 4))),
+            GeometryError,
+            ("has no inverse", "no rotation"),
+        ),
     )
 
 

@@ -54,6 +54,14 @@ def test_every_default_and_constant_written_out(da_b: DeepAccident) -> None:
     assert written_out("deepaccident_devkit.v2x") == WRITTEN
     # of each module something is called: what the mutation runner changes is looked for by tests that come there
     nobody = Boxes.from_arrays(np.zeros((0, 3)), np.zeros((0, 3)), [])
-    assert len(moved_points(np.zeros((0, 3)), nobody, nobody)) == len(relative_pose_to_ego([SE3.identity()])) - 1 == 0
+    assert (
+        len(moved_points(np.zeros((0, 3)), nobody, nobody))
+        == len(relative_pose_to_ego([SE3.identity()])) - 1
+        == 0
+    )
     assert labelled_pair(None, np.zeros(1)) is None
-    assert len(cooperative_view(da_b, da_b.sample[0]).source) > 0 < len(scenario_tracks(da_b, da_b.scenario[0]).index)
+    assert (
+        len(cooperative_view(da_b, da_b.sample[0]).source)
+        > 0
+        < len(scenario_tracks(da_b, da_b.scenario[0]).index)
+    )

@@ -57,13 +57,19 @@ def write_files(root: Path, *tokens: str, frames: int = 2) -> Path:
 def linked(release_root: Path, tmp_path: Path) -> Path:
     """A release with all sensors, of which a test may remove files."""
     root = tmp_path / "release"
-    shutil.copytree(release_root, root, ignore=shutil.ignore_patterns(".deepaccident"), copy_function=os.link)
+    shutil.copytree(
+        release_root, root, ignore=shutil.ignore_patterns(".deepaccident"), copy_function=os.link
+    )
     return root
 
 
 def test_a_whole_release_lacks_nothing(release_root: Path) -> None:
     found = release_completeness(release_root, workers=1)
-    sizes = [path.stat().st_size for folder in release_root.glob("type*") for path in folder.rglob("*.???")]
+    sizes = [
+        path.stat().st_size
+        for folder in release_root.glob("type*")
+        for path in folder.rglob("*.???")
+    ]
     assert (found.scenarios, found.whole, found.lacking, found.total.missing) == (4, 4, {}, 0)
     assert (found.total.expected, found.total.bytes) == (4 * (5 * 10 * 6 + 1), sum(sizes))
     for split in found.splits.values():
@@ -105,7 +111,9 @@ def test_the_test_split_ships_without_labels_bev_and_meta(tmp_path: Path) -> Non
             shutil.rmtree(folder)
     found = release_completeness(tmp_path, workers=1)
     assert (found.whole, found.total.expected, found.splits["test"].whole) == (1, 5 * 8 * 2, 1)
-    label = ScenarioFolder(tmp_path, "", *ACCIDENT.split("/"), AGENTS).label_path("other_vehicle", 2)
+    label = ScenarioFolder(tmp_path, "", *ACCIDENT.split("/"), AGENTS).label_path(
+        "other_vehicle", 2
+    )
     label.parent.mkdir(parents=True)
     label.write_text("0 0\n")
     assert release_completeness(tmp_path, workers=1).lacking[ACCIDENT]["label"] == 1
@@ -117,7 +125,9 @@ def test_the_mini_release_is_one_split(tmp_path: Path) -> None:
     write_files(tmp_path / "DeepAccident_mini", ACCIDENT)
     write_split_file(tmp_path / "train.txt", [ACCIDENT, NORMAL])
     found = release_completeness(tmp_path, "v1-mini", workers=1)
-    assert {name: (each.scenarios, each.expected) for name, each in found.splits.items()} == {"v1-mini": (1, 20)}
+    assert {name: (each.scenarios, each.expected) for name, each in found.splits.items()} == {
+        "v1-mini": (1, 20)
+    }
 
 
 @pytest.fixture(scope="module")
@@ -130,9 +140,13 @@ def single(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_any_files_may_be_missing(single: Path, data: st.DataObject) -> None:
     """What is missing is what was removed, as long as one label tells how many frames there are."""
     files = list(files_of(single, ACCIDENT, 2))
-    kept = data.draw(st.sampled_from([each for each in files if each[1] == "label" and each[2].stem[-1] == "2"]))
+    kept = data.draw(
+        st.sampled_from([each for each in files if each[1] == "label" and each[2].stem[-1] == "2"])
+    )
     agents = data.draw(st.sets(st.sampled_from(AGENTS), max_size=2))
-    gone = (data.draw(st.sets(st.sampled_from(files))) | {each for each in files if each[0] in agents}) - {kept}
+    gone = (
+        data.draw(st.sets(st.sampled_from(files))) | {each for each in files if each[0] in agents}
+    ) - {kept}
     for *_, path in gone:
         path.unlink()
     found = release_completeness(single, workers=1)
@@ -149,7 +163,9 @@ def test_what_cannot_be_listed_or_read_is_named(tmp_path: Path) -> None:
     write_files(tmp_path, ACCIDENT)
     folder, split = next(tmp_path.glob("*/ego_vehicle/lidar01/*")), tmp_path / "val.txt"
     told = ("has no scenario 'nowhere'",)
-    assert_refused((lambda: release_completeness(tmp_path, workers=1, scenarios=["nowhere"]), TokenError, told))
+    assert_refused(
+        (lambda: release_completeness(tmp_path, workers=1, scenarios=["nowhere"]), TokenError, told)
+    )
     split.write_text("three words here\n")
     told = ("val.txt:1: expected '<scenario_type> <scenario>'",)
     assert_refused((lambda: release_completeness(tmp_path, workers=1), SplitFileError, told))
@@ -161,13 +177,17 @@ def test_what_cannot_be_listed_or_read_is_named(tmp_path: Path) -> None:
 
 def test_it_is_printed_for_a_release_that_cannot_be_indexed(tmp_path: Path) -> None:
     """No file can be read, and calib files are missing; no line is wider than 100 columns."""
-    write_files(tmp_path, *(ACCIDENT.replace("00014", f"{number:05}") for number in range(14, 26)), frames=1)
+    write_files(
+        tmp_path, *(ACCIDENT.replace("00014", f"{number:05}") for number in range(14, 26)), frames=1
+    )
     for agent in AGENTS[1:]:
         shutil.rmtree(tmp_path / TYPE / agent / "calib")
     text = run(tmp_path, "--workers", 1).stdout
     assert max(map(len, text.splitlines()[1:])) <= 100
     assert "--json lists all" in text
-    assert json.loads(run(tmp_path, "--json").stdout) == asdict(release_completeness(tmp_path, workers=1))
+    assert json.loads(run(tmp_path, "--json").stdout) == asdict(
+        release_completeness(tmp_path, workers=1)
+    )
     assert not (tmp_path / ".deepaccident").exists()
 
 

@@ -45,13 +45,28 @@ def test_each_file_is_in_the_file_set_of_its_kind(both_layouts: DeepAccident) ->
     paths = [path.relative_to(root).as_posix() for path in root.rglob("*") if path.is_file()]
     sets = {each["name"]: each["includes"] for each in data_card(both_layouts)["distribution"]}
     for path in (path for path in paths if path[0] != "."):
-        kinds = {name for name, includes in sets.items() if any(fnmatch(path, each) for each in includes)}
-        by_hand = next((part for part in path.split("/")[:-1] if part in ("label", "calib", "meta", *CHANNELS)), None)
+        kinds = {
+            name for name, includes in sets.items() if any(fnmatch(path, each) for each in includes)
+        }
+        by_hand = next(
+            (
+                part
+                for part in path.split("/")[:-1]
+                if part in ("label", "calib", "meta", *CHANNELS)
+            ),
+            None,
+        )
         labels = {"label", "label_lines"}
         assert kinds == (labels if by_hand == "label" else {by_hand or "split_lists"}), path
-    globbed = {path for includes in sets.values() for each in includes for path in root.glob(each)}  # `*` without `/`
-    assert {path.relative_to(root).as_posix() for path in globbed} == {path for path in paths if path[0] != "."}
-    assert {name for name in sets if name in CHANNELS} == {name for name in CHANNELS if f"/{name}/" in " ".join(paths)}
+    globbed = {
+        path for includes in sets.values() for each in includes for path in root.glob(each)
+    }  # `*` without `/`
+    assert {path.relative_to(root).as_posix() for path in globbed} == {
+        path for path in paths if path[0] != "."
+    }
+    assert {name for name in sets if name in CHANNELS} == {
+        name for name in CHANNELS if f"/{name}/" in " ".join(paths)
+    }
 
 
 def test_what_a_partial_download_lacks_is_told(da_partial: DeepAccident) -> None:
@@ -65,7 +80,10 @@ def test_paths_say_whose_a_label_is(both_layouts: DeepAccident) -> None:
     layout_b = both_layouts.layout == "B"
     assert ("split" in fields) == layout_b
     for path in root.rglob("*/label/*/*.txt"):
-        told = {name: found_by(field, path.relative_to(root).as_posix()) for name, field in fields.items()}
+        told = {
+            name: found_by(field, path.relative_to(root).as_posix())
+            for name, field in fields.items()
+        }
         sample = both_layouts.get(
             "sample", f"{told['scenario_type']}/{told['scenario']}/{told['agent']}/{told['frame']}"
         )
@@ -76,13 +94,18 @@ def test_paths_say_whose_a_label_is(both_layouts: DeepAccident) -> None:
 
 def test_the_licence_is_the_users(da: DeepAccident) -> None:
     without, stated = data_card(da), data_card(da, licence=LICENCE)
-    assert ("license" in without, "ask the dataset's authors" in without["description"]) == (False, True)
+    assert ("license" in without, "ask the dataset's authors" in without["description"]) == (
+        False,
+        True,
+    )
     assert (stated["license"], "licence" in stated["description"]) == (LICENCE, False)
     with pytest.raises(ChoiceError, match="licence: expected a text such as a URL, found ' '"):
         data_card(da, licence=" ")
 
 
-def test_the_same_release_elsewhere_has_the_same_card(da_b: DeepAccident, own_release: Path) -> None:
+def test_the_same_release_elsewhere_has_the_same_card(
+    da_b: DeepAccident, own_release: Path
+) -> None:
     moved = json.dumps(data_card(DeepAccident(dataroot=own_release, verbose=False)))
     assert moved == json.dumps(data_card(da_b))
     assert str(da_b.dataroot) not in moved
@@ -97,13 +120,19 @@ def test_other_datasets_have_no_card(da_b: DeepAccident, monkeypatch: pytest.Mon
 def test_the_command_prints_the_card_alone(da: DeepAccident) -> None:
     printed = called("info", da.dataroot, "--croissant", "--licence", LICENCE).stdout
     assert json.loads(printed) == json.loads(json.dumps(data_card(da, licence=LICENCE)))
-    for words in (("--croissant", "--json"), ("--croissant", "--where", "town=Town03"), ("--licence", LICENCE)):
+    for words in (
+        ("--croissant", "--json"),
+        ("--croissant", "--where", "town=Town03"),
+        ("--licence", LICENCE),
+    ):
         assert "changes nothing" in called("info", da.dataroot, *words, status=2).output
 
 
 @pytest.fixture
 def mlcroissant() -> ModuleType:
-    if importlib.util.find_spec("mlcroissant") is None and not os.environ.get("DEEPACCIDENT_REQUIRE_CROISSANT"):
+    if importlib.util.find_spec("mlcroissant") is None and not os.environ.get(
+        "DEEPACCIDENT_REQUIRE_CROISSANT"
+    ):
         pytest.skip("no mlcroissant")
     return importlib.import_module("mlcroissant")
 
@@ -121,16 +150,26 @@ def test_mlcroissant_takes_the_card_and_reads_what_it_can(
         beside.write_text(ran("info", root, "--croissant", *options).stdout, encoding="utf-8")
         read = mlcroissant.Dataset(beside)
         issues = read.metadata.ctx.issues
-        assert (issues.errors, re.findall(r"schema.org/(\w+)", " ".join(issues.warnings))) == (set(), warned)
+        assert (issues.errors, re.findall(r"schema.org/(\w+)", " ".join(issues.warnings))) == (
+            set(),
+            warned,
+        )
     card = data_card(both_layouts, licence=LICENCE)
     for name in ("splits", "counts"):
-        rows = [{key.partition("/")[2]: value for key, value in row.items()} for row in read.records(name)]
+        rows = [
+            {key.partition("/")[2]: value for key, value in row.items()}
+            for row in read.records(name)
+        ]
         assert rows == [dict(sorted(row.items())) for row in rows_of(card, name)]
     samples = [
-        {key.partition("/")[2]: each.decode() if isinstance(each, bytes) else each for key, each in row.items()}
+        {
+            key.partition("/")[2]: each.decode() if isinstance(each, bytes) else each
+            for key, each in row.items()
+        }
         for row in read.records("samples")
     ]
-    assert {f"{each['scenario_type']}/{each['scenario']}/{each['agent']}/{each['frame']:03d}" for each in samples} == {
-        each["token"] for each in both_layouts.sample
-    }
+    assert {
+        f"{each['scenario_type']}/{each['scenario']}/{each['agent']}/{each['frame']:03d}"
+        for each in samples
+    } == {each["token"] for each in both_layouts.sample}
     assert len(samples) == len(both_layouts.sample)

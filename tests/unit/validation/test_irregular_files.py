@@ -24,8 +24,15 @@ def test_pipes_in_the_place_of_files_are_findings(small: Path) -> None:
         os.mkfifo(path)
     os.mkfifo(small / "train.txt")
     found = [one for one in validate_release(small, workers=1).findings if one.severity == "error"]
-    assert {one.where: one.code for one in found} == {**pipes, str(small / "train.txt"): "split-file-unreadable"}
-    told = {one.what for one in validate_release(small, deep=True, workers=1).findings if one.where in pipes}
+    assert {one.where: one.code for one in found} == {
+        **pipes,
+        str(small / "train.txt"): "split-file-unreadable",
+    }
+    told = {
+        one.what
+        for one in validate_release(small, deep=True, workers=1).findings
+        if one.where in pipes
+    }
     assert told == {"not a regular file (a named pipe)"}
 
 
@@ -46,7 +53,9 @@ def test_links_to_themselves_are_findings(small: Path, pattern: str, code: str) 
     path = next(small.glob(pattern))
     path.rename(small / "aside")
     path.symlink_to(path.name)
-    (found,) = [finding for finding in validate_release(small, workers=1).findings if finding.code == code]
+    (found,) = [
+        finding for finding in validate_release(small, workers=1).findings if finding.code == code
+    ]
     assert found.where.startswith(str(path))
     assert "Too many levels of symbolic links" in found.what
 
@@ -54,5 +63,9 @@ def test_links_to_themselves_are_findings(small: Path, pattern: str, code: str) 
 def test_a_scenario_type_that_is_a_link_to_itself_is_a_note(small: Path) -> None:
     (small / "type2_subtype1_normal").symlink_to("type2_subtype1_normal")
     (note,) = [one for one in validate_release(small, workers=1).findings if one.scenario is None]
-    assert (note.code, note.severity, Path(note.where).name) == ("link-leads-nowhere", "note", "type2_subtype1_normal")
+    assert (note.code, note.severity, Path(note.where).name) == (
+        "link-leads-nowhere",
+        "note",
+        "type2_subtype1_normal",
+    )
     assert len(DeepAccident(dataroot=small, workers=1, verbose=False).scenario) == 1

@@ -32,7 +32,9 @@ def test_a_stretch_is_found_wherever_it_lies(subsampling: int, stretch: int) -> 
     content = jpeg(scene(), quality=95, subsampling=subsampling)
     first = content.index(b"\xff\xda") + 14
     for start in np.linspace(first, len(content) - stretch, 9, dtype=int).tolist():
-        place, length = zero_stretch(content[:start] + bytes(stretch) + content[start + stretch :]) or (-99, 0)
+        place, length = zero_stretch(
+            content[:start] + bytes(stretch) + content[start + stretch :]
+        ) or (-99, 0)
         assert (abs(place - start) <= 8, length >= stretch) == (True, True)
     assert zero_stretch(content[: len(content) // 2] + bytes(len(content) // 2)) is not None
 
@@ -59,7 +61,9 @@ def even_and_regular() -> dict[str, np.ndarray]:
 
 @pytest.mark.parametrize("optimize", [False, True])
 @pytest.mark.parametrize("progressive", [False, True])
-def test_no_encoder_writes_such_a_stretch(optimize: bool, progressive: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_encoder_writes_such_a_stretch(
+    optimize: bool, progressive: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("PIL.ImageFile.MAXBLOCK", 1 << 22)  # Pillow's buffer for optimised noise
     for name, picture in even_and_regular().items():
         for quality in (1, 50, 75, 90, 95, 100):
@@ -78,7 +82,8 @@ def test_an_even_picture_with_tables_of_its_own_may_be_zeros() -> None:
 
 
 @pytest.mark.parametrize(
-    "content", [b"", b"\xff", b"\xff\xd8", b"\xff\xd8\xff\xc4", b"\xff\xd8\xff\xda", b"\x89PNG" + bytes(999)]
+    "content",
+    [b"", b"\xff", b"\xff\xd8", b"\xff\xd8\xff\xc4", b"\xff\xd8\xff\xda", b"\x89PNG" + bytes(999)],
 )
 def test_what_is_no_jpeg_has_no_stretch(content: bytes) -> None:
     assert zero_stretch(content) is None
@@ -96,8 +101,12 @@ def test_damaged_headers_end_nothing() -> None:
 
 
 @pytest.mark.parametrize("size", [(180, 320), (177, 313)])
-@pytest.mark.parametrize("options", [{"subsampling": 0}, {"subsampling": 1}, {"subsampling": 2, "optimize": True}])
-def test_data_that_end_before_an_end_marker_are_told(size: tuple[int, int], options: dict[str, object]) -> None:
+@pytest.mark.parametrize(
+    "options", [{"subsampling": 0}, {"subsampling": 1}, {"subsampling": 2, "optimize": True}]
+)
+def test_data_that_end_before_an_end_marker_are_told(
+    size: tuple[int, int], options: dict[str, object]
+) -> None:
     """Decoders fill the rest with grey and say nothing; the last block alone may lose some bits."""
     content = jpeg(scene()[: size[0], : size[1]], quality=90, **options)
     assert not ends_early(content, decoded(content))

@@ -16,7 +16,9 @@ from deepaccident_devkit.validation import validate_release
 def healthy(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Labels of one accident, long enough for tracks."""
     root = tmp_path_factory.mktemp("healthy") / "release"
-    return make_release(root, SynthConfig(scenarios=2, frames=12, seed=11, sensors=False, designed=True), workers=1)
+    return make_release(
+        root, SynthConfig(scenarios=2, frames=12, seed=11, sensors=False, designed=True), workers=1
+    )
 
 
 @pytest.fixture
@@ -64,13 +66,23 @@ def untracked(rows: Rows, which: Callable[[int, list[str]], bool]) -> Rows:
 @pytest.mark.parametrize(
     "change",
     [
-        lambda _, rows: [[row[0], *(f"{float(word):.3f}" for word in row[1:10]), *row[10:]] for row in rows],
+        lambda _, rows: [
+            [row[0], *(f"{float(word):.3f}" for word in row[1:10]), *row[10:]] for row in rows
+        ],
         lambda _, rows: [row for row in rows if seen(row)],
         lambda _, rows: [row for row in rows if distance(row) < 33],
-        lambda number, rows: untracked(rows, lambda place, row: (number + place) % 5 == 0 and abs(float(row[1])) > 15),
+        lambda number, rows: untracked(
+            rows, lambda place, row: (number + place) % 5 == 0 and abs(float(row[1])) > 15
+        ),
         lambda _, rows: untracked(rows, lambda _, row: distance(row) >= 20),
     ],
-    ids=["three decimals", "visible alone", "a small radius", "tracking that comes and goes", "far ones untracked"],
+    ids=[
+        "three decimals",
+        "visible alone",
+        "a small radius",
+        "tracking that comes and goes",
+        "far ones untracked",
+    ],
 )
 def test_what_labels_may_be_like(release: Path, change: Callable[[int, Rows], Rows]) -> None:
     """−1 is normal where it begins at a distance, whoever else is nearer (docs/format.md, Label)."""
@@ -78,7 +90,9 @@ def test_what_labels_may_be_like(release: Path, change: Callable[[int, Rows], Ro
     assert told(release) == set()
 
 
-def test_hidden_actors_in_one_agents_labels_tell_of_those_missing_in_anothers(release: Path) -> None:
+def test_hidden_actors_in_one_agents_labels_tell_of_those_missing_in_anothers(
+    release: Path,
+) -> None:
     """All labels of a scenario are written by one rule."""
     others = [path for path in release.glob(LABELS) if "infrastructure" not in path.parts]
     rewrite(others, lambda _, rows: [row for row in rows if seen(row)])
@@ -94,7 +108,11 @@ def test_one_agent_alone(release: Path) -> None:
 
 @pytest.mark.parametrize("frames", [1, 2, 3])
 def test_short_scenarios(tmp_path: Path, frames: int) -> None:
-    root = make_release(tmp_path / "release", SynthConfig(scenarios=1, frames=frames, seed=3, sensors=False), workers=1)
+    root = make_release(
+        tmp_path / "release",
+        SynthConfig(scenarios=1, frames=frames, seed=3, sensors=False),
+        workers=1,
+    )
     assert told(root) == set()
 
 
@@ -105,7 +123,9 @@ def test_labels_without_boxes(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("word", "code"), [("1e7", "odd-position"), ("1e300", "label-unreadable")])
 def test_absurd_numbers_are_findings_and_end_nothing(release: Path, word: str, code: str) -> None:
-    rewrite([next(release.glob(LABELS))], lambda _, rows: [[rows[0][0], word, *rows[0][2:]], *rows[1:]])
+    rewrite(
+        [next(release.glob(LABELS))], lambda _, rows: [[rows[0][0], word, *rows[0][2:]], *rows[1:]]
+    )
     assert code in told(release)
 
 
@@ -113,14 +133,29 @@ def test_one_agent_alone_that_tracks_nobody(own_release: Path) -> None:
     """It is told where two vehicles or more were seen from within 15 m."""
 
     def near(row: list[str]) -> bool:
-        return row[0] in ("car", "truck", "van") and row[10] != "-100" and distance(row) < 15 and seen(row)
+        return (
+            row[0] in ("car", "truck", "van")
+            and row[10] != "-100"
+            and distance(row) < 15
+            and seen(row)
+        )
 
     for folder in own_release.glob("*/*/*"):
         if folder.name not in ("meta", "ego_vehicle"):
             shutil.rmtree(folder)
     folders = [*own_release.glob("*/*/ego_vehicle/label/*")]
-    texts = {str(each): [path.read_text().splitlines()[1:] for path in each.iterdir()] for each in folders}
-    counts = {where: sum(near(line.split()) for lines in labels for line in lines) for where, labels in texts.items()}
+    texts = {
+        str(each): [path.read_text().splitlines()[1:] for path in each.iterdir()]
+        for each in folders
+    }
+    counts = {
+        where: sum(near(line.split()) for lines in labels for line in lines)
+        for where, labels in texts.items()
+    }
     rewrite(own_release.glob("*/" + LABELS), lambda _, rows: untracked(rows, lambda *_: True))
-    found = {one.where for one in validate_release(own_release, workers=1).findings if one.code == "ids-untracked"}
+    found = {
+        one.where
+        for one in validate_release(own_release, workers=1).findings
+        if one.code == "ids-untracked"
+    }
     assert found == {where for where, count in counts.items() if count >= 2} != set()

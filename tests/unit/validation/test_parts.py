@@ -86,7 +86,9 @@ def test_what_was_found_in_other_files_or_ways_is_not_taken(
     validate_release(small, workers=1, parts=parts)
     del looked[:]
     root = CHANGES[change](small, monkeypatch)
-    validate_release(root if change == "another place" else small, workers=1, parts=parts, deep=change == "deep")
+    validate_release(
+        root if change == "another place" else small, workers=1, parts=parts, deep=change == "deep"
+    )
     assert looked
 
 

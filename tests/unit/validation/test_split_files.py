@@ -31,10 +31,14 @@ def root(tmp_path: Path) -> Path:
 def of_splits(report: ValidationReport) -> dict[str, str]:
     """Code → where, of findings on splits."""
     kinds = ("split", "twins", "two-places", "in-no-split")
-    return {finding.code: finding.where for finding in report.findings if finding.code.startswith(kinds)}
+    return {
+        finding.code: finding.where for finding in report.findings if finding.code.startswith(kinds)
+    }
 
 
-@pytest.mark.parametrize(("split", "content"), [("train", b"\xff\xfe\x00"), ("val_mini", b"three words here\n")])
+@pytest.mark.parametrize(
+    ("split", "content"), [("train", b"\xff\xfe\x00"), ("val_mini", b"three words here\n")]
+)
 def test_a_file_of_garbage_leaves_the_others_known(root: Path, split: str, content: bytes) -> None:
     (root / f"{split}.txt").write_bytes(content)
     report, known = validate_release(root), {"train": 2, "val": 1}
@@ -50,7 +54,9 @@ def test_split_files_against_folders(own_release: Path) -> None:
     (own_release / "train.txt").write_text("".join(others))
     with (own_release / "val.txt").open("a") as file:
         file.write(line)
-    assert {each.code for each in validate_release(own_release, workers=1).findings} == {"splits-contradict"}
+    assert {each.code for each in validate_release(own_release, workers=1).findings} == {
+        "splits-contradict"
+    }
 
 
 def test_a_twin_in_another_splits_folder(own_release: Path) -> None:

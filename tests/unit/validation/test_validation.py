@@ -46,11 +46,16 @@ def test_healthy_releases_are_clean(release_root: Path, release_root_b: Path) ->
     for root, deep in ((release_root, True), (release_root_b, False)):
         report = validate_release(root, deep=deep)
         assert (report.findings, report.is_good, report.velocity.best) == ([], True, "released")
-        assert set(report.velocity_frames) == {f"{path.parts[-3]}/{path.stem}" for path in root.glob("**/meta/*.txt")}
+        assert set(report.velocity_frames) == {
+            f"{path.parts[-3]}/{path.stem}" for path in root.glob("**/meta/*.txt")
+        }
 
 
 def test_partial_downloads_are_notes(own_release: Path) -> None:
-    for folder in (*own_release.glob("train/*/infrastructure"), *own_release.glob("test/*/*/label")):
+    for folder in (
+        *own_release.glob("train/*/infrastructure"),
+        *own_release.glob("test/*/*/label"),
+    ):
         shutil.rmtree(folder)
     report = validate_release(own_release)
     assert (report.is_good, codes(report)) == (True, {"agent-missing", "unlabelled"})
@@ -65,12 +70,19 @@ def test_partial_downloads_are_notes(own_release: Path) -> None:
 
 def test_a_few_frames_of_a_sensor_are_listed(release_root: Path, tmp_path: Path) -> None:
     root = tmp_path / "release"
-    shutil.copytree(release_root, root, ignore=shutil.ignore_patterns(".deepaccident", "Camera_*", "*_BEV_*"))
+    shutil.copytree(
+        release_root, root, ignore=shutil.ignore_patterns(".deepaccident", "Camera_*", "*_BEV_*")
+    )
     scenario = DeepAccident(dataroot=root, verbose=False).scenario[0]
-    for agent, frame in (*product(["ego_vehicle"], (1, 3, 4, 6)), *product(["other_vehicle"], (5, 6))):
+    for agent, frame in (
+        *product(["ego_vehicle"], (1, 3, 4, 6)),
+        *product(["other_vehicle"], (5, 6)),
+    ):
         folder = root / scenario["scenario_type"] / agent / "lidar01" / scenario["name"]
         (folder / f"{scenario['name']}_{frame:03d}.npz").unlink()
-    few, last = (each.what for each in validate_release(root, scenarios=[scenario["token"]]).findings)
+    few, last = (
+        each.what for each in validate_release(root, scenarios=[scenario["token"]]).findings
+    )
     assert ("(2, 5)" in few, "5–6" in last) == (True, True)
 
 
@@ -85,7 +97,9 @@ def write_velocities(root: Path, angle: Callable[[float, float], float]) -> dict
         agent_yaw = float(np.arctan2(rotation[1, 0], rotation[0, 0]))
         scenario = release.get("scenario", sample["scenario_token"])
         frame, name = release.get("frame", sample["frame_token"])["index"], scenario["name"]
-        folder = root / scenario["folder"] / scenario["scenario_type"] / sample["agent"] / "label" / name
+        folder = (
+            root / scenario["folder"] / scenario["scenario_type"] / sample["agent"] / "label" / name
+        )
         velocities = iter(boxes.velocity[:, :2])
 
         def turned(words: list[str], rows=velocities, agent_yaw=agent_yaw) -> list[str]:
@@ -130,7 +144,12 @@ def test_velocities_in_another_frame_are_told_and_decoded(
 
 def test_velocities_of_no_frame_are_told(own_release: Path) -> None:
     for path in labels_of(own_release, "*"):
-        rewrite_boxes(path, lambda words: words if words[10] == "-100" else [*words[:8], "31.0", "-17.0", *words[10:]])
+        rewrite_boxes(
+            path,
+            lambda words: (
+                words if words[10] == "-100" else [*words[:8], "31.0", "-17.0", *words[10:]]
+            ),
+        )
     report = validate_release(own_release)
     assert (report.velocity.best, codes(report)) == (None, {"velocity-unexplained"})
 
@@ -145,12 +164,20 @@ def test_findings_of_one_scenario_even_if_it_is_left_out(tmp_path: Path) -> None
     (finding,) = [found for found in release.findings(tiny.TOKEN) if found.severity == "error"]
     told = ("label-unreadable", f"{label}:2", "expected 13 fields, found 3: 'car 1 2'")
     assert (finding.code, finding.where, finding.what) == told
-    assert [str(finding)] == list(release.problems[0].messages)  # one implementation: what indexing said
-    assert not [found for found in release.findings(release.scenario[0]) if found.severity == "error"]
+    assert [str(finding)] == list(
+        release.problems[0].messages
+    )  # one implementation: what indexing said
+    assert not [
+        found for found in release.findings(release.scenario[0]) if found.severity == "error"
+    ]
     assert_refused(
         (lambda: release.findings("nowhere"), TokenError, "has no scenario 'nowhere'"),
         *(
-            (lambda given=each: release.findings(given), TokenError, "expected a token or a record with one, found")
+            (
+                lambda given=each: release.findings(given),
+                TokenError,
+                "expected a token or a record with one, found",
+            )
             for each in (None, 5, {}, {"token": None}, ["a/b"])
         ),
     )
@@ -161,9 +188,14 @@ def test_the_known_faults_of_the_release_are_told_apart(tmp_path: Path) -> None:
         report = validate_release(tiny.write_tiny_release(tmp_path / number, **of_scenario))
         return {one.code: (one.known, one.severity) for one in report.findings}
 
-    curtain = {"scenario_type": "type1_subtype2_accident", "name": "Town05_type001_subtype0002_scenario00035"}
+    curtain = {
+        "scenario_type": "type1_subtype2_accident",
+        "name": "Town05_type001_subtype0002_scenario00035",
+    }
     known = found("curtain", **curtain, meta="ClearNoon -1 -1 -1 -1 -1 -1 -1 14\n")
-    assert {known[code][0] for code in ("sheer-curtain", "no-collision-in-accident", "meta-incomplete")} == {True}
+    assert {
+        known[code][0] for code in ("sheer-curtain", "no-collision-in-accident", "meta-incomplete")
+    } == {True}
     normal = {"scenario_type": "type1_subtype2_normal"}
     assert found("normal", **normal)["collision-in-normal"] == (True, "note")
 
@@ -172,10 +204,22 @@ def test_the_known_faults_of_the_release_are_told_apart(tmp_path: Path) -> None:
     ("changes", "codes_told", "said"),
     [
         ({"1212 car": "0 car"}, {"counterpart-unknown"}, "nobody annotated actor 0"),
-        ({"1212 car": "7 bus", "ego other": "ego none"}, {"counterpart-unknown"}, "nobody annotated actor 7"),
-        ({"1212 car": "7 car"}, {"counterpart-unknown", "meta-pair"}, "'ego other' are not the pair (1223, 7)"),
+        (
+            {"1212 car": "7 bus", "ego other": "ego none"},
+            {"counterpart-unknown"},
+            "nobody annotated actor 7",
+        ),
+        (
+            {"1212 car": "7 car"},
+            {"counterpart-unknown", "meta-pair"},
+            "'ego other' are not the pair (1223, 7)",
+        ),
         ({"ego other": "none none"}, {"nobody-named"}, "the colliding agents are 'none none'"),
-        ({"same": "across"}, {"collision-word"}, "spawn relation is 'across', the release is known to have same, opp"),
+        (
+            {"same": "across"},
+            {"collision-word"},
+            "spawn relation is 'across', the release is known to have same, opp",
+        ),
         ({"front_side": "left_side"}, {"collision-word"}, "contact side is 'left_side'"),
         ({"same front_side": "opposite rear"}, set(), ""),
     ],
@@ -199,20 +243,36 @@ def test_what_meta_says_of_a_collision(
 
 @pytest.mark.parametrize(
     ("speed", "gap", "said"),
-    [(0.0, -0.5, ""), (2.0, 0.5, ""), (2.0, -0.2, "actors 1300, 1400 overlap by up to 0.20 m, frame 4")],
+    [
+        (0.0, -0.5, ""),
+        (2.0, 0.5, ""),
+        (2.0, -0.2, "actors 1300, 1400 overlap by up to 0.20 m, frame 4"),
+    ],
 )
-def test_a_mover_that_overlaps_somebody_is_noted(tmp_path: Path, speed: float, gap: float, said: str) -> None:
+def test_a_mover_that_overlaps_somebody_is_noted(
+    tmp_path: Path, speed: float, gap: float, said: str
+) -> None:
     """Parked rows overlap in the release, and in an accident the pair does."""
 
     def lines(agent: str, frame: int) -> list[str]:
         x = 20.0 + speed * (frame - 4) / 10
         rows = [(x, 1300, speed), (24.0 + gap, 1400, 0.0)] if agent == "infrastructure" else []
-        return ["0 0", *(f"car {at} 0 -1.2 4 2 1.5 0 {now} 0 {actor} 9 True" for at, actor, now in rows)]
+        return [
+            "0 0",
+            *(f"car {at} 0 -1.2 4 2 1.5 0 {now} 0 {actor} 9 True" for at, actor, now in rows),
+        ]
 
-    where = {"scenario_type": "type1_subtype1_normal", "meta": "ClearNoon -1 -1 -1 -1 -1 -1 -1 14\n"}
+    where = {
+        "scenario_type": "type1_subtype1_normal",
+        "meta": "ClearNoon -1 -1 -1 -1 -1 -1 -1 14\n",
+    }
     root = tiny.write_tiny_release(tmp_path, lines_of=lines, agents=("infrastructure",), **where)
-    told = [finding for finding in validate_release(root).findings if finding.code == "overlap-unnamed"]
-    assert [(finding.what, finding.severity) for finding in told] == ([(said, "note")] if said else [])
+    told = [
+        finding for finding in validate_release(root).findings if finding.code == "overlap-unnamed"
+    ]
+    assert [(finding.what, finding.severity) for finding in told] == (
+        [(said, "note")] if said else []
+    )
 
 
 def test_what_is_left_aside_is_named(tmp_path: Path) -> None:
@@ -226,7 +286,11 @@ def test_what_is_left_aside_is_named(tmp_path: Path) -> None:
         ("link-leads-nowhere", "note", str(loop)),
     ]
     assert told[0].what == f"is not read; it looks like {tiny.TYPE}"
-    assert [found for found in validate_release(root, scenarios=[tiny.TOKEN]).findings if not found.scenario] == []
+    assert [
+        found
+        for found in validate_release(root, scenarios=[tiny.TOKEN]).findings
+        if not found.scenario
+    ] == []
 
 
 TURNS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
@@ -241,15 +305,23 @@ TURNS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("orientation", [name for name in PICTURE_ORIENTATIONS if name != "forward-up"])
-def test_a_turned_bev_camera_is_recognised(release_root: Path, tmp_path: Path, orientation: str) -> None:
+@pytest.mark.parametrize(
+    "orientation", [name for name in PICTURE_ORIENTATIONS if name != "forward-up"]
+)
+def test_a_turned_bev_camera_is_recognised(
+    release_root: Path, tmp_path: Path, orientation: str
+) -> None:
     agent = next(release_root.glob("*_accident")) / "ego_vehicle"
     for kind in ("calib", "label", "BEV_instance_camera"):
         shutil.copytree(agent / kind, tmp_path / agent.parent.name / agent.name / kind)
     for path in tmp_path.glob("*/ego_vehicle/BEV_instance_camera/*/*.npz"):
         np.savez(path, data=TURNS[orientation](read_npz(path, "bev")))
     findings = validate_release(tmp_path, deep=True).findings
-    assert {f"'{orientation}'" in finding.what for finding in findings if finding.code == "bev-orientation"} == {True}
+    assert {
+        f"'{orientation}'" in finding.what
+        for finding in findings
+        if finding.code == "bev-orientation"
+    } == {True}
 
 
 def test_images_out_of_sequence() -> None:
@@ -271,16 +343,23 @@ def test_at_the_impact_another_car_may_fill_the_view(
     da: DeepAccident, tmp_path: Path, place: int, *, is_told: bool
 ) -> None:
     accidents = (each for each in da.scenario if each["collision"])
-    token, agent = next((each["token"], name) for each in accidents for name in each["collision"]["agents"] if name)
+    token, agent = next(
+        (each["token"], name) for each in accidents for name in each["collision"]["agents"] if name
+    )
     of_type, name = token.split("/")
-    for folder in (*(f"{agent}/{kind}/{name}" for kind in ("calib", "label", "Camera_Front")), "meta"):
+    for folder in (
+        *(f"{agent}/{kind}/{name}" for kind in ("calib", "label", "Camera_Front")),
+        "meta",
+    ):
         shutil.copytree(da.dataroot / of_type / folder, tmp_path / of_type / folder)
     images = sorted(tmp_path.glob("*/*/Camera_Front/*/*.jpg"))
     for path in images[1:]:
         shutil.copy(images[0], path)
     other = np.random.default_rng(0).integers(0, 256, (36, 64, 3), dtype=np.uint8)
     Image.fromarray(other).save(images[place], quality=90)
-    assert ("image-out-of-sequence" in codes(validate_release(tmp_path, deep=True, scenarios=[token]))) is is_told
+    assert (
+        "image-out-of-sequence" in codes(validate_release(tmp_path, deep=True, scenarios=[token]))
+    ) is is_told
 
 
 def test_json_has_everything_and_exit_status_tells(own_release: Path) -> None:
@@ -305,22 +384,40 @@ def test_the_worst_scenario_comes_first(own_release: Path) -> None:
     warned, broken = sorted({path.parent for path in files})[:2]
     for path in broken.iterdir():
         path.write_text("")
-    rewrite_boxes(sorted(warned.iterdir())[1], lambda row: [row[0], repr(float(row[1]) + 3), *row[2:]])
+    rewrite_boxes(
+        sorted(warned.iterdir())[1], lambda row: [row[0], repr(float(row[1]) + 3), *row[2:]]
+    )
     findings = validate_release(own_release).findings
-    order = [str(scenario).split("/")[1] for scenario in dict.fromkeys(finding.scenario for finding in findings)]
+    order = [
+        str(scenario).split("/")[1]
+        for scenario in dict.fromkeys(finding.scenario for finding in findings)
+    ]
     assert order == [broken.name, warned.name]
-    assert findings == sorted(findings, key=lambda finding: ("error", "warning", "note").index(finding.severity))
+    assert findings == sorted(
+        findings, key=lambda finding: ("error", "warning", "note").index(finding.severity)
+    )
 
 
 @pytest.mark.parametrize(
     ("change", "code", "severity", "line"),
     [
-        (lambda text: text.replace(b"\n", b"\n" + 100 * b"word" + b"\n", 1) + b"\nanother\n", *SKIPPED, 2),
-        (lambda text: 2 * b"\xef\xbb\xbf" + text, "label-unreadable", "error", 1),  # alone, Arrow would drop one
+        (
+            lambda text: text.replace(b"\n", b"\n" + 100 * b"word" + b"\n", 1) + b"\nanother\n",
+            *SKIPPED,
+            2,
+        ),
+        (
+            lambda text: 2 * b"\xef\xbb\xbf" + text,
+            "label-unreadable",
+            "error",
+            1,
+        ),  # alone, Arrow would drop one
     ],
     ids=["words alone on a line", "two marks of byte order"],
 )
-def test_a_label_that_is_read_in_part_or_not(small: Path, change, code: str, severity: str, line: int) -> None:
+def test_a_label_that_is_read_in_part_or_not(
+    small: Path, change, code: str, severity: str, line: int
+) -> None:
     path = labels_of(small, "ego_vehicle")[2]
     path.write_bytes(change(path.read_bytes()))
     (finding,) = validate_new(small)
@@ -332,20 +429,28 @@ def test_a_label_that_is_read_in_part_or_not(small: Path, change, code: str, sev
 def test_a_crowd_at_one_place_is_told_in_time_that_grows_with_it(small: Path, actor: str) -> None:
     """20,000 boxes would be 200 million pairs."""
     path = labels_of(small, "ego_vehicle")[2]
-    rows = (f"car 9.0 9.0 -1.0 4.0 2.0 1.5 0.0 0.0 0.0 {actor.format(row=row)} 5 True" for row in range(40_000, 60_000))
+    rows = (
+        f"car 9.0 9.0 -1.0 4.0 2.0 1.5 0.0 0.0 0.0 {actor.format(row=row)} 5 True"
+        for row in range(40_000, 60_000)
+    )
     lines = [*path.read_text().splitlines(), *rows]
     path.write_text("\n".join(lines))
     tracemalloc.start()
     found = {finding.code: finding.what for finding in validate_new(small)}
     assert tracemalloc.get_traced_memory()[1] < 100 * 2**20
     tracemalloc.stop()
-    assert found["label-crowded"] == f"up to {len(lines) - 1:,} boxes in a label, more than 500, frame 3"
+    assert (
+        found["label-crowded"]
+        == f"up to {len(lines) - 1:,} boxes in a label, more than 500, frame 3"
+    )
     assert found["duplicate-box"].startswith("two boxes stand in the same place")
 
 
 def validate_new(root: Path) -> list[Finding]:
     """Findings but for the four agents that a small release lacks, and what follows from it."""
-    return [one for one in validate_release(root, workers=1).findings if one.code != "agent-missing"]
+    return [
+        one for one in validate_release(root, workers=1).findings if one.code != "agent-missing"
+    ]
 
 
 def test_labels_that_are_good_alone_but_not_together_are_a_finding(
@@ -358,4 +463,7 @@ def test_labels_that_are_good_alone_but_not_together_are_a_finding(
 
     monkeypatch.setattr(scan, "read_labels", read)
     (finding,) = validate_new(small)
-    assert (finding.code, str(finding)) == ("label-unreadable", "the labels: do not go together; mend them")
+    assert (finding.code, str(finding)) == (
+        "label-unreadable",
+        "the labels: do not go together; mend them",
+    )

@@ -10,7 +10,13 @@ from starlette.exceptions import HTTPException
 from starlette.requests import Request
 from starlette.responses import Response
 
-from deepaccident_devkit.errors import ChoiceError, DeepAccidentError, FieldError, NotAvailableError, TokenError
+from deepaccident_devkit.errors import (
+    ChoiceError,
+    DeepAccidentError,
+    FieldError,
+    NotAvailableError,
+    TokenError,
+)
 from deepaccident_devkit.plugins.explore.explorer import Explorer
 from deepaccident_devkit.plugins.explore.pages import models, release, scenario
 from deepaccident_devkit.plugins.explore.pages.responses import page, static_routes
@@ -48,5 +54,8 @@ async def _failed(request: Request, error: Exception) -> Response:
     """What the devkit cannot read or find, in its own words."""
     found = not isinstance(error, _NOT_THERE)
     logger.debug("%s", request.url.path, exc_info=error)
-    said: dict[str, Any] = {"title": "Cannot be shown" if found else "Not here", "words": str(error)}
+    said: dict[str, Any] = {
+        "title": "Cannot be shown" if found else "Not here",
+        "words": str(error),
+    }
     return page(request, "error.html", status=500 if found else 404, **said)

@@ -15,14 +15,25 @@ from starlette.responses import Response
 from starlette.routing import Route
 
 from deepaccident_devkit.errors import NotAvailableError
-from deepaccident_devkit.evaluation.runs import Bundle, ComparedNumber, Comparison, compare_bundles, results_text
+from deepaccident_devkit.evaluation.runs import (
+    Bundle,
+    ComparedNumber,
+    Comparison,
+    compare_bundles,
+    results_text,
+)
 from deepaccident_devkit.evaluation.task import value_text
 from deepaccident_devkit.plugins.explore.background import Job
 from deepaccident_devkit.plugins.explore.evaluations import Evaluated, evaluated, verdict_text
 from deepaccident_devkit.plugins.explore.explorer import Explorer
 from deepaccident_devkit.plugins.explore.models import Model, Score, sample_values, scores_of
 from deepaccident_devkit.plugins.explore.pages import samples
-from deepaccident_devkit.plugins.explore.pages.responses import explorer_of, page, part_of, with_slash
+from deepaccident_devkit.plugins.explore.pages.responses import (
+    explorer_of,
+    page,
+    part_of,
+    with_slash,
+)
 from deepaccident_devkit.plugins.explore.pages.samples import (
     SAMPLE,
     SAMPLES_PER_PAGE,
@@ -92,8 +103,12 @@ def _model(request: Request) -> Response:
     explorer, model = explorer_of(request), model_of(request)
     context: dict[str, Any] = {
         "model": model,
-        "others": [each for each in models_of_task(explorer, model.setup.task) if each is not model],
-        "away": sorted(token for token in model.scenarios if token not in explorer.scenarios.row_of),
+        "others": [
+            each for each in models_of_task(explorer, model.setup.task) if each is not model
+        ],
+        "away": sorted(
+            token for token in model.scenarios if token not in explorer.scenarios.row_of
+        ),
         "count": len([*model.tokens]),
     }
     if model.bundle is None:
@@ -119,8 +134,22 @@ def _results_context(explorer: Explorer, model: Model) -> dict[str, Any]:
     if model.results is None:
         return {}
     setup, dataset = model.setup, explorer.dataset
-    command = ["deepaccident", "evaluate", setup.task, str(dataset.dataroot), "--version", dataset.version]
-    command += ["--results", str(model.results.path), "--protocol", setup.protocol, "--out", f"{model.name}_bundle"]
+    command = [
+        "deepaccident",
+        "evaluate",
+        setup.task,
+        str(dataset.dataroot),
+        "--version",
+        dataset.version,
+    ]
+    command += [
+        "--results",
+        str(model.results.path),
+        "--protocol",
+        setup.protocol,
+        "--out",
+        f"{model.name}_bundle",
+    ]
     return {
         "text": results_text(model.results),
         "command": shlex.join(command),
@@ -164,13 +193,19 @@ class ComparedSamples:
 
     def chosen(self, better: str) -> Sequence[ComparedSample]:
         """Those where `a` or `b` is better; all for any other text."""
-        return [each for each in self.samples if each.better == better] if better in ("a", "b") else self.samples
+        return (
+            [each for each in self.samples if each.better == better]
+            if better in ("a", "b")
+            else self.samples
+        )
 
 
 def bundle_of(model: Model) -> Bundle:
     """A model's bundle; raises NotAvailableError if it has none."""
     if model.bundle is None:
-        raise NotAvailableError(f"{model.name}: these are results without an evaluation; only evaluations are compared")
+        raise NotAvailableError(
+            f"{model.name}: these are results without an evaluation; only evaluations are compared"
+        )
     return model.bundle
 
 
@@ -195,7 +230,8 @@ def _compared(a: Model, b: Model) -> ComparedSamples:
     main = evaluated(bundle_of(a)).main
     best = 0.0 if not first.higher_is_better else 1.0 if main is None else main.limit
     ranked = [
-        {token: best if value is None else value for token, value in sample_values(model).items()} for model in (a, b)
+        {token: best if value is None else value for token, value in sample_values(model).items()}
+        for model in (a, b)
     ]
     shared = sorted(ranked[0].keys() & ranked[1].keys())
     samples = []
@@ -221,7 +257,9 @@ def _comparison(request: Request) -> Response:
     explorer, (a, b) = explorer_of(request), _pair(request)
     common = request.query_params.get("common") == "1"
     differences = differences_job(explorer, a, b) if a.setup.task == b.setup.task else None
-    tests = comparison_job(explorer, a, b, common=common)  # after the differences, since it takes longer
+    tests = comparison_job(
+        explorer, a, b, common=common
+    )  # after the differences, since it takes longer
     work = [tests] if differences is None else [differences, tests]
     waits = titles(work)  # before their results are read: what comes later is not missed
     found: ComparedSamples | None = None if differences is None else differences.result
@@ -237,11 +275,15 @@ def _comparison(request: Request) -> Response:
         marks=[(name, each.mark) for name, each in zip(_BETTER, told, strict=True) if each.mark],
         tests=tests,
         comparison=compared,
-        numbers=_sides(*told) if compared is None else [_tested(each) for each in compared.numbers if each.headline],
+        numbers=_sides(*told)
+        if compared is None
+        else [_tested(each) for each in compared.numbers if each.headline],
         partly=not common and a.rows.keys() != b.rows.keys(),
         found=found,
         fault="" if differences is None else differences.error,
-        counts={"": len(found.samples), **{each: len(found.chosen(each)) for each in _BETTER}} if found else {},
+        counts={"": len(found.samples), **{each: len(found.chosen(each)) for each in _BETTER}}
+        if found
+        else {},
         better=better,
         address=partial(_address, better=better, common="1" if common else ""),
         swapped=_address(better=_OTHER.get(better, ""), common="1" if common else ""),
@@ -270,7 +312,9 @@ def _tested(number: ComparedNumber) -> dict[str, str]:
         "a": value_text(number.a, unit),
         "b": value_text(number.b, unit),
         "difference": value_text(number.difference, unit, signed=True),
-        "interval": "" if number.low is None or number.high is None else f"{number.low:+.3f} to {number.high:+.3f}",
+        "interval": ""
+        if number.low is None or number.high is None
+        else f"{number.low:+.3f} to {number.high:+.3f}",
         "p": "–" if number.adjusted_p is None else f"{number.adjusted_p:.3f}",
         "decision": number.decision,
     }
@@ -281,7 +325,10 @@ def _sides(a: Evaluated, b: Evaluated) -> list[dict[str, str]]:
     values = [{each["name"]: each["text"] for each in told.headlines} for told in (a, b)]
     names = list(dict.fromkeys(name for each in values for name in each))
     return [
-        {"name": name, **{side: each.get(name, "–") for side, each in zip(_BETTER, values, strict=True)}}
+        {
+            "name": name,
+            **{side: each.get(name, "–") for side, each in zip(_BETTER, values, strict=True)},
+        }
         for name in names
     ]
 

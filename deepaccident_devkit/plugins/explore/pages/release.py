@@ -25,7 +25,12 @@ from deepaccident_devkit.plugins.explore.choices import (
 )
 from deepaccident_devkit.plugins.explore.explorer import Explorer
 from deepaccident_devkit.plugins.explore.models import Model
-from deepaccident_devkit.plugins.explore.pages.responses import explorer_of, page, picture, with_slash
+from deepaccident_devkit.plugins.explore.pages.responses import (
+    explorer_of,
+    page,
+    picture,
+    with_slash,
+)
 from deepaccident_devkit.plugins.explore.scenarios import UNKNOWN_VALUE, VISIBILITY_RANKS
 from deepaccident_devkit.render.captions import scenario_words
 from deepaccident_devkit.render.figures import detached_figure
@@ -89,7 +94,10 @@ def list_context(explorer: Explorer, choices: Choices, found: Found) -> dict[str
     pages = max(1, -(-len(found.rows) // SCENARIOS_PER_PAGE))
     here = min(choices.page, pages)
     shown = found.rows[(here - 1) * SCENARIOS_PER_PAGE : here * SCENARIOS_PER_PAGE].tolist()
-    sorts = [*SORTS.items(), *((name, f"score of {name.removeprefix(SCORE_PREFIX)}") for name in explorer.scores)]
+    sorts = [
+        *SORTS.items(),
+        *((name, f"score of {name.removeprefix(SCORE_PREFIX)}") for name in explorer.scores),
+    ]
     return {
         "choices": choices,
         "found": found,
@@ -98,7 +106,9 @@ def list_context(explorer: Explorer, choices: Choices, found: Found) -> dict[str
         "facets": [
             {"name": name, "counts": values, "open": place < _OPEN or name in choices.facets}
             for place, (name, counts) in enumerate(found.counts.items())
-            if (values := [each for each in counts if each["count"] or each["chosen"]])  # others would find nothing
+            if (
+                values := [each for each in counts if each["count"] or each["chosen"]]
+            )  # others would find nothing
         ],
         "chosen": _chosen(choices),
         "sorts": [(name, title, _sort_waits(explorer, name)) for name, title in sorts],
@@ -120,9 +130,16 @@ def entries(explorer: Explorer, rows: Sequence[int], sort: str) -> list[dict[str
     shown = []
     for row in rows:
         record = scenarios.records[row]
-        measures = {name: WAITING if values is None else cell(values[row]) for name, values in slow.items()}
+        measures = {
+            name: WAITING if values is None else cell(values[row]) for name, values in slow.items()
+        }
         shown.append(
-            entry(record, measures, {name: score_cell(each, record["token"]) for name, each in scores.items()}, sort)
+            entry(
+                record,
+                measures,
+                {name: score_cell(each, record["token"]) for name, each in scores.items()},
+                sort,
+            )
         )
     return shown
 
@@ -143,7 +160,10 @@ WAITING: Final = _TableCell("…", "")
 
 
 def entry(
-    record: ScenarioRecord, measures: Mapping[str, _TableCell], scores: Mapping[str, _TableCell], sort: str = ""
+    record: ScenarioRecord,
+    measures: Mapping[str, _TableCell],
+    scores: Mapping[str, _TableCell],
+    sort: str = "",
 ) -> dict[str, Any]:
     """What the grid and the table show of a scenario: its values of `SLOW`, and models' scores by their columns.
 
@@ -192,10 +212,19 @@ def _chosen(choices: Choices) -> list[tuple[str, str]]:
     for name, values in choices.facets.items():
         for value in values:
             left = tuple(each for each in values if each != value)
-            facets = {**choices.facets, name: left} if left else {k: v for k, v in choices.facets.items() if k != name}
+            facets = (
+                {**choices.facets, name: left}
+                if left
+                else {k: v for k, v in choices.facets.items() if k != name}
+            )
             chosen.append((f"{name}={value}", choices.address(facets=facets, page=1)))
     return chosen + [
-        (line, choices.address(query="; ".join(each for each in choices.lines if each != line), page=1))
+        (
+            line,
+            choices.address(
+                query="; ".join(each for each in choices.lines if each != line), page=1
+            ),
+        )
         for line in choices.lines
     ]
 
@@ -219,17 +248,35 @@ async def _waiting(request: Request) -> Response:
     return JSONResponse([job.title for job in explorer_of(request).jobs.all() if not job.is_done])
 
 
-def _page(request: Request, tab: str, *, job: Job | None = None, state: State = "ready", **context: Any) -> Response:
+def _page(
+    request: Request, tab: str, *, job: Job | None = None, state: State = "ready", **context: Any
+) -> Response:
     """A page about the release; as long as a job's state says that it is not done, the page loads itself again."""
-    return page(request, f"release_{tab or 'contents'}.html", tab=tab, tabs=TABS, job=job, state=state, **context)
+    return page(
+        request,
+        f"release_{tab or 'contents'}.html",
+        tab=tab,
+        tabs=TABS,
+        job=job,
+        state=state,
+        **context,
+    )
 
 
 def _contents(request: Request) -> Response:
     """Counted in the background, since the folders of all sensors are listed."""
     explorer = explorer_of(request)
-    job = explorer.jobs.ask("overview", "what the release holds", lambda: overview(explorer.dataset))
+    job = explorer.jobs.ask(
+        "overview", "what the release holds", lambda: overview(explorer.dataset)
+    )
     state = job.state  # looked at once: it changes at any moment
-    return _page(request, "", job=job, state=state, **(_overview_context(job.result) if state == "ready" else {}))
+    return _page(
+        request,
+        "",
+        job=job,
+        state=state,
+        **(_overview_context(job.result) if state == "ready" else {}),
+    )
 
 
 def _overview_context(told: Overview) -> dict[str, Any]:
@@ -240,7 +287,10 @@ def _overview_context(told: Overview) -> dict[str, Any]:
         "splits": [(name, count, told.expected.get(name)) for name, count in told.splits.items()],
         "whole": None if of_splits else sum(told.expected.values()),
         "attributes": {
-            field: [(UNKNOWN_VALUE if value == _NONE else value, count) for value, count in counts.items()]
+            field: [
+                (UNKNOWN_VALUE if value == _NONE else value, count)
+                for value, count in counts.items()
+            ]
             for field, counts in told.attributes.items()
         },
     }
@@ -249,7 +299,9 @@ def _overview_context(told: Overview) -> dict[str, Any]:
 def _maps(request: Request) -> Response:
     """The maps that are kept beside the index."""
     dataset = explorer_of(request).dataset
-    return _page(request, "maps", towns={town: kept_town_map(dataset, town) for town in towns_of(dataset)})
+    return _page(
+        request, "maps", towns={town: kept_town_map(dataset, town) for town in towns_of(dataset)}
+    )
 
 
 def _map(request: Request) -> Response:
@@ -263,7 +315,9 @@ def _map(request: Request) -> Response:
         draw_whole_map(found, figure.subplots())
         return figure
 
-    return picture(explorer.drawn(("map", town, found.looks, found.missing, found.damaged), draw), "png")
+    return picture(
+        explorer.drawn(("map", town, found.looks, found.missing, found.damaged), draw), "png"
+    )
 
 
 def _conventions(request: Request) -> Response:

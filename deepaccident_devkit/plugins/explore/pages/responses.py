@@ -50,14 +50,25 @@ def root_of(path: str) -> str:
 def page(request: Request, template: str, *, status: int = 200, **context: Any) -> Response:
     """A page from a template."""
     root = root_of(request.scope["path"])
-    return HTMLResponse(rendered_page(explorer_of(request), template, root, **context), status_code=status)
+    return HTMLResponse(
+        rendered_page(explorer_of(request), template, root, **context), status_code=status
+    )
 
 
 def rendered_page(explorer: Explorer, template: str, root: str, **context: Any) -> str:
     """A template as text, given the relative address of the first page (`root`); all texts are escaped."""
-    addresses: dict[str, Any] = {"asset": asset, "scenario_at": scenario_address, "thumbnail_at": thumbnail_address}
+    addresses: dict[str, Any] = {
+        "asset": asset,
+        "scenario_at": scenario_address,
+        "thumbnail_at": thumbnail_address,
+    }
     addresses["named"] = lambda token: scenario_words(explorer.dataset.scenario.get(token))
-    served = {"root": root, "models": [*explorer.models], "static": False, "frame_number": frame_button}
+    served = {
+        "root": root,
+        "models": [*explorer.models],
+        "static": False,
+        "frame_number": frame_button,
+    }
     return filled(template, **addresses, **served, **context)
 
 
@@ -150,11 +161,17 @@ def part_of(request: Request, items: Sequence[Any], size: int) -> _ListPage:
     """The page of a list that the address names by `page`, with so many entries."""
     given = request.query_params.get("page", "")
     pages = max(1, -(-len(items) // size))
-    asked = int(given) if given.isascii() and given.isdigit() and len(given) < len(str(_LAST_PAGE)) else 1
+    asked = (
+        int(given)
+        if given.isascii() and given.isdigit() and len(given) < len(str(_LAST_PAGE))
+        else 1
+    )
     here = min(max(asked, 1), pages)
 
     def address(number: int) -> str:
-        others = [(name, value) for name, value in request.query_params.multi_items() if name != "page"]
+        others = [
+            (name, value) for name, value in request.query_params.multi_items() if name != "page"
+        ]
         return f"?{urlencode([*others, ('page', str(number))])}" if 1 <= number <= pages else ""
 
     return _ListPage(

@@ -14,7 +14,11 @@ from starlette.responses import Response
 from starlette.routing import Route
 
 from deepaccident_devkit.errors import EvaluationError, NotAvailableError, TokenError
-from deepaccident_devkit.evaluation.breakdowns import SampleAttributes, attribute_name, sample_attributes
+from deepaccident_devkit.evaluation.breakdowns import (
+    SampleAttributes,
+    attribute_name,
+    sample_attributes,
+)
 from deepaccident_devkit.evaluation.detection import DetectedBoxes
 from deepaccident_devkit.evaluation.runs.setups import SampleLoader, agent_of, scenario_of
 from deepaccident_devkit.plugins.explore.background import Job
@@ -37,7 +41,11 @@ if TYPE_CHECKING:
 
 _SampleOrder = Literal["worst", "best", "time"]
 # Order → its name for readers.
-ORDERS: Final[Mapping[_SampleOrder, str]] = {"worst": "worst first", "best": "best first", "time": "in time"}
+ORDERS: Final[Mapping[_SampleOrder, str]] = {
+    "worst": "worst first",
+    "best": "best first",
+    "time": "in time",
+}
 _PictureKind = Literal["above", "cameras"]
 _PictureSize = Literal["whole", "half"]
 # Inches; half is for two side by side. A whole picture from above has its task's own size.
@@ -125,19 +133,27 @@ def listed_samples(explorer: Explorer, model: Model, choices: SampleChoices) -> 
     known = attributes_job(explorer, model) if choices.by else None
     ranks = sample_values_job(explorer.jobs, model) if model.bundle is not None else None
     jobs = [job for job in (known, ranks) if job is not None]
-    waiting = [job for job in jobs if not job.is_done]  # before their results are read: what comes later is not missed
+    waiting = [
+        job for job in jobs if not job.is_done
+    ]  # before their results are read: what comes later is not missed
     groups: dict[str, int] = {}
     unknown = 0
     if known is not None:
         found: Mapping[str, SampleAttributes] | None = known.result
-        values = {token: each.value(choices.by) or UNKNOWN_VALUE for token, each in (found or {}).items()}
-        groups = dict(sorted(Counter(values.values()).items(), key=lambda item: natural_order(item[0])))
+        values = {
+            token: each.value(choices.by) or UNKNOWN_VALUE for token, each in (found or {}).items()
+        }
+        groups = dict(
+            sorted(Counter(values.values()).items(), key=lambda item: natural_order(item[0]))
+        )
         unknown = 0 if found is None else len(tokens) - len(values)
         tokens = [token for token in tokens if values.get(token) == choices.value]
     if choices.scenario:
         tokens = [token for token in tokens if scenario_of(token) == choices.scenario]
     # warnings are judged over recordings: single samples have no numbers
-    ranked = ranks is not None and (ranks.result is None or any(each is not None for each in ranks.result.values()))
+    ranked = ranks is not None and (
+        ranks.result is None or any(each is not None for each in ranks.result.values())
+    )
     order: _SampleOrder = choices.order or "worst" if ranked else "time"
     return Listed(
         tokens=tuple(_ordered(tokens, order, ranks.result or {} if ranks is not None else {})),
@@ -150,13 +166,18 @@ def listed_samples(explorer: Explorer, model: Model, choices: SampleChoices) -> 
     )
 
 
-def _ordered(tokens: Iterable[str], order: _SampleOrder, values: Mapping[str, float | None]) -> list[str]:
+def _ordered(
+    tokens: Iterable[str], order: _SampleOrder, values: Mapping[str, float | None]
+) -> list[str]:
     """By the main number, samples without one last; in time as long as they are not known."""
     in_time = sorted(tokens)
     chosen = set() if order == "time" else set(in_time)
     ranked = [token for token, value in values.items() if value is not None and token in chosen]
     others = set(ranked)
-    return [*(ranked if order == "worst" else ranked[::-1]), *(token for token in in_time if token not in others)]
+    return [
+        *(ranked if order == "worst" else ranked[::-1]),
+        *(token for token in in_time if token not in others),
+    ]
 
 
 def attributes_job(explorer: Explorer, model: Model) -> Job:
@@ -165,7 +186,9 @@ def attributes_job(explorer: Explorer, model: Model) -> Job:
     return explorer.jobs.ask(
         f"attributes {model.name}",
         f"attributes of the samples of {model.name}",
-        lambda: sample_attributes(dataset, [token for token in model.tokens if is_sample(dataset, token)]),
+        lambda: sample_attributes(
+            dataset, [token for token in model.tokens if is_sample(dataset, token)]
+        ),
     )
 
 
@@ -226,7 +249,9 @@ def rules_words(model: Model) -> str:
         form = model.results.form
         ahead = _OTHER_HORIZON if form is None else (form.frames - 1) * form.step
         if abs(ahead - model.setup.horizon) > FRAME_PERIOD / 2:
-            return f"These pictures look {ahead:g} s ahead, the evaluation {model.setup.horizon:g} s."
+            return (
+                f"These pictures look {ahead:g} s ahead, the evaluation {model.setup.horizon:g} s."
+            )
     return ""
 
 
@@ -235,7 +260,9 @@ def _sample_picture(explorer: Explorer, model: Model, token: str, shown: _Pictur
     reason = why_not(explorer, model, token)
     if reason:
         raise NotAvailableError(f"{token}: {reason}")
-    return explorer.drawn(("predicted", model.name, token, shown), lambda: _figure(explorer, model, token, shown))
+    return explorer.drawn(
+        ("predicted", model.name, token, shown), lambda: _figure(explorer, model, token, shown)
+    )
 
 
 def frames_ahead(explorer: Explorer, model: Model, token: str) -> list[float]:
@@ -257,35 +284,48 @@ def _figure(explorer: Explorer, model: Model, token: str, shown: _PictureChoice)
         raise NotAvailableError(f"{model.name}: its predictions were not given")
     loader = SampleLoader(explorer.dataset, results, model.setup)
     prediction, rules = loader.prediction(token), model.setup.rules
-    how: dict[str, Any] = {"task": _task(model), "protocol": None if model.setup.task == "warning" else rules}
+    how: dict[str, Any] = {
+        "task": _task(model),
+        "protocol": None if model.setup.task == "warning" else rules,
+    }
     if not isinstance(prediction, DetectedBoxes):
         how["label"] = loader.label(token)
     figure = detached_figure(_SIZES.get((shown.kind, shown.size), FIGURE_SIZES[_task(model)]))
     if shown.kind == "above":
         return render_evaluation(explorer.dataset, token, prediction, **how, fig=figure)
     frame = shown.ahead if model.setup.task == "motion" else None
-    return render_outcome_in_cameras(explorer.dataset, token, prediction, **how, frame=frame, fig=figure)
+    return render_outcome_in_cameras(
+        explorer.dataset, token, prediction, **how, frame=frame, fig=figure
+    )
 
 
 def model_of(request: Request, name: str = "model") -> Model:
     """The model that a part of an address names; raises NotAvailableError."""
     given, models = request.path_params[name], explorer_of(request).models
     if given not in models:
-        raise NotAvailableError(f"there is no model {given!r}; those that were given: {', '.join(models) or 'none'}")
+        raise NotAvailableError(
+            f"there is no model {given!r}; those that were given: {', '.join(models) or 'none'}"
+        )
     return models[given]
 
 
 def sample_path(token: str) -> str:
     """A sample in an address: `type/scenario/agent/12`."""
     scenario, _, frame = token.rpartition("/")
-    return path_in_address(f"{scenario}/{int(frame)}" if frame.isdecimal() and frame.isascii() else token)
+    return path_in_address(
+        f"{scenario}/{int(frame)}" if frame.isdecimal() and frame.isascii() else token
+    )
 
 
 def known_sample(request: Request, *models: Model) -> str:
     """The sample that an address names; raises TokenError if neither the release nor a model has it."""
     token = sample_of(request)
-    if not is_sample(explorer_of(request).dataset, token) and not any(token in model.tokens for model in models):
-        raise TokenError(f"neither the release nor {', '.join(each.name for each in models)} has the sample {token!r}")
+    if not is_sample(explorer_of(request).dataset, token) and not any(
+        token in model.tokens for model in models
+    ):
+        raise TokenError(
+            f"neither the release nor {', '.join(each.name for each in models)} has the sample {token!r}"
+        )
     return token
 
 
@@ -304,7 +344,11 @@ def titles(jobs: Iterable[Job]) -> list[str]:
 
 def models_of_task(explorer: Explorer, task: str) -> list[Model]:
     """The evaluated models of a task."""
-    return [each for each in explorer.models.values() if each.bundle is not None and each.setup.task == task]
+    return [
+        each
+        for each in explorer.models.values()
+        if each.bundle is not None and each.setup.task == task
+    ]
 
 
 def routes() -> list[Route]:
@@ -382,7 +426,9 @@ def _sample(request: Request) -> Response:
 def sample_context(explorer: Explorer, model: Model, token: str) -> dict[str, Any]:
     """What is shown of a model at a sample."""
     row = model.rows.get(token)
-    name, score = ("", None) if model.scores is None else (model.scores.name, model.scores.samples.get(token))
+    name, score = (
+        ("", None) if model.scores is None else (model.scores.name, model.scores.samples.get(token))
+    )
     return {
         "model": model,
         "token": token,
@@ -404,7 +450,11 @@ def sample_context(explorer: Explorer, model: Model, token: str) -> dict[str, An
 
 def _remedy(model: Model) -> str:
     """Where the results were of a bundle that has none to show; empty if there are results."""
-    return "" if model.results is not None or model.bundle is None else str(model.bundle.summary["results"]["path"])
+    return (
+        ""
+        if model.results is not None or model.bundle is None
+        else str(model.bundle.summary["results"]["path"])
+    )
 
 
 def list_position(tokens: Sequence[str], token: str) -> dict[str, Any] | None:
@@ -426,7 +476,9 @@ def _picture(request: Request) -> Response:
     if kind not in get_args(_PictureKind):
         raise HTTPException(404)
     size: _PictureSize = "half" if request.query_params.get("size") == "half" else "whole"
-    shown = _PictureChoice(kind=kind, size=size, ahead=asked_ahead(request) if kind == "cameras" else 0)
+    shown = _PictureChoice(
+        kind=kind, size=size, ahead=asked_ahead(request) if kind == "cameras" else 0
+    )
     return picture(_sample_picture(explorer, model, known_sample(request, model), shown), "png")
 
 

@@ -89,7 +89,11 @@ def _scenario(request: Request) -> Response:
     explorer, token = explorer_of(request), _scenario_token(request)
     if token not in explorer.scenarios.row_of:
         return _left_out(request, explorer, token)
-    return page(request, "scenario.html", **scenario_context(explorer, token, request.query_params.get("model")))
+    return page(
+        request,
+        "scenario.html",
+        **scenario_context(explorer, token, request.query_params.get("model")),
+    )
 
 
 def _left_out(request: Request, explorer: Explorer, token: str) -> Response:
@@ -103,8 +107,14 @@ def _left_out(request: Request, explorer: Explorer, token: str) -> Response:
 def scenario_context(explorer: Explorer, token: str, model: str | None) -> dict[str, Any]:
     """What a scenario's page shows, with the predictions of a model (a name) in its replay; None for none."""
     row, rows = explorer.scenarios.row_of[token], explorer.scenarios
-    telling = [name for name, each in explorer.models.items() if each.results and token in each.scenarios]
-    shown = model if model in telling and explorer.models[model].setup.task in (*FORESEEN, "warning") else None
+    telling = [
+        name for name, each in explorer.models.items() if each.results and token in each.scenarios
+    ]
+    shown = (
+        model
+        if model in telling and explorer.models[model].setup.task in (*FORESEEN, "warning")
+        else None
+    )
     twin, played = twin_of(explorer.dataset, token), explorer.replay(token, shown)
     return {
         "token": token,
@@ -122,7 +132,11 @@ def scenario_context(explorer: Explorer, token: str, model: str | None) -> dict[
 def _player(request: Request) -> Response:
     """The replay alone, for a page that shows two of them side by side."""
     explorer, token = explorer_of(request), _scenario_token(request)
-    return page(request, "player.html", **scenario_context(explorer, token, request.query_params.get("model")))
+    return page(
+        request,
+        "player.html",
+        **scenario_context(explorer, token, request.query_params.get("model")),
+    )
 
 
 def _twin(request: Request) -> Response:
@@ -130,14 +144,21 @@ def _twin(request: Request) -> Response:
     explorer, token = explorer_of(request), _scenario_token(request)
     twin = twin_of(explorer.dataset, token)
     if twin is None:
-        raise NotAvailableError(f"{token}: this release has no twin of it, with the same name and subtype")
+        raise NotAvailableError(
+            f"{token}: this release has no twin of it, with the same name and subtype"
+        )
     try:
         diff = twin_diff(explorer.dataset, token)
         shift = diff.shift if diff.accident == token else -diff.shift
     except NotAvailableError:
         shift = 0
     offset = explorer.recording(twin["token"]).origin - explorer.recording(token).origin
-    others: dict[str, Any] = {"token": token, "twin": twin["token"], "shift": shift, "offset": offset.tolist()}
+    others: dict[str, Any] = {
+        "token": token,
+        "twin": twin["token"],
+        "shift": shift,
+        "offset": offset.tolist(),
+    }
     return page(request, "twins.html", **others)
 
 
@@ -145,7 +166,11 @@ def _twin(request: Request) -> Response:
 
 
 def _part(request: Request) -> Response:
-    explorer, token, name = explorer_of(request), _scenario_token(request), request.path_params["part"]
+    explorer, token, name = (
+        explorer_of(request),
+        _scenario_token(request),
+        request.path_params["part"],
+    )
     if name not in PARTS:
         raise HTTPException(404)
     return HTMLResponse(part_html(explorer, token, name, root_of(request.scope["path"])))
@@ -153,7 +178,9 @@ def _part(request: Request) -> Response:
 
 def part_html(explorer: Explorer, token: str, name: str, root: str) -> str:
     """One of `PARTS` of a scenario as HTML."""
-    return rendered_page(explorer, f"parts/{name}.html", root, **part_context(explorer.dataset, token, name))
+    return rendered_page(
+        explorer, f"parts/{name}.html", root, **part_context(explorer.dataset, token, name)
+    )
 
 
 def part_context(dataset: Dataset, token: str, name: str) -> dict[str, Any]:
@@ -173,7 +200,10 @@ def _pairs(dataset: Dataset, token: str) -> dict[str, Any]:
         {
             "names": [names(actor) for actor in pairs.actor_ids[at].tolist()],
             "moving": bool(pairs.moving[at]),
-            **{name: float(getattr(pairs, name)[at]) for name in ("min_ttc", "min_gap", "max_drac", "pet")},
+            **{
+                name: float(getattr(pairs, name)[at])
+                for name in ("min_ttc", "min_gap", "max_drac", "pet")
+            },
             "ttc_frame": int(pairs.min_ttc_frame[at]),
             "gap_frame": int(pairs.min_gap_frame[at]),
         }
@@ -204,10 +234,14 @@ def _ledger(dataset: Dataset, token: str) -> dict[str, Any]:
             "lead": lead,
             "frame": frame,
         }
-        for agents, lead, frame in zip(COALITIONS, leads.leads.tolist(), leads.first_frames.tolist(), strict=True)
+        for agents, lead, frame in zip(
+            COALITIONS, leads.leads.tolist(), leads.first_frames.tolist(), strict=True
+        )
         if not math.isnan(lead)
     ]
-    partners = zip(PARTNERS, leads.gains.tolist(), leads.losses.tolist(), leads.shapley.tolist(), strict=True)
+    partners = zip(
+        PARTNERS, leads.gains.tolist(), leads.losses.tolist(), leads.shapley.tolist(), strict=True
+    )
     return {"sets": sets, "partners": [(short_name(name), *values) for name, *values in partners]}
 
 
@@ -275,7 +309,9 @@ def _image(request: Request) -> Response:
         raise HTTPException(404)
     explorer = explorer_of(request)
     width = _width(request.query_params.get("width", ""))
-    made = explorer.pictures.get((sample, channel, width), lambda: _jpeg(explorer, sample, channel, width))
+    made = explorer.pictures.get(
+        (sample, channel, width), lambda: _jpeg(explorer, sample, channel, width)
+    )
     return picture(made, "jpeg")
 
 
@@ -308,5 +344,7 @@ def _view(request: Request) -> Response:
     if name not in _VIEWS:
         raise HTTPException(404)
     draw, size = _VIEWS[name]
-    made = explorer.drawn((name, sample), lambda: draw(explorer.dataset, sample, fig=detached_figure(size)))
+    made = explorer.drawn(
+        (name, sample), lambda: draw(explorer.dataset, sample, fig=detached_figure(size))
+    )
     return picture(made, "png")

@@ -15,10 +15,21 @@ from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.evaluation import DetectedBoxes
 from deepaccident_devkit.geometry import SE3
 from deepaccident_devkit.geometry.box_arrays import intersection_areas
-from deepaccident_devkit.plugins.model.detection.head import CODE_CHANNELS, ClassSlots, DetectionConfig, TaskMaps
+from deepaccident_devkit.plugins.model.detection.head import (
+    CODE_CHANNELS,
+    ClassSlots,
+    DetectionConfig,
+    TaskMaps,
+)
 from deepaccident_devkit.plugins.model.detection.targets import gather_cells
 from deepaccident_devkit.plugins.model.warps import precise
-from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray, IntArray, check_least
+from deepaccident_devkit.support.arrays import (
+    AnyArray,
+    BoolArray,
+    FloatArray,
+    IntArray,
+    check_least,
+)
 from deepaccident_devkit.support.text import settle_choices
 
 Method = Literal["rotated", "circle"]
@@ -49,7 +60,9 @@ class NmsConfig:
         settle_choices(self, {"method": get_args(Method)})
         check_least(self, threshold=0, keep=1)
         if not self.scale or not min(self.scale) > 0:
-            raise ConfigError(f"scale: expected one number above 0, or one a slot, found {self.scale!r}")
+            raise ConfigError(
+                f"scale: expected one number above 0, or one a slot, found {self.scale!r}"
+            )
 
 
 RELEASED_NMS: tuple[NmsConfig, ...] = (
@@ -66,7 +79,9 @@ They were chosen for nuScenes' classes. No golden numbers test the `rotated` one
 """
 
 
-def suppress(boxes: AnyArray, scores: AnyArray, slots: AnyArray, config: NmsConfig | None = None) -> IntArray:
+def suppress(
+    boxes: AnyArray, scores: AnyArray, slots: AnyArray, config: NmsConfig | None = None
+) -> IntArray:
     """Rows of the boxes that stay, the best first; of equal scores by what is in the boxes, whatever their order.
 
     Slots do not protect each other: a truck suppresses a van of the same task, as in the release.
@@ -136,14 +151,26 @@ class DecodingConfig:
 
     candidates: int = 500
     score_threshold: float = 0.1
-    center_range: tuple[float, float, float, float, float, float] = (-61.2, -61.2, -10.0, 61.2, 61.2, 10.0)
+    center_range: tuple[float, float, float, float, float, float] = (
+        -61.2,
+        -61.2,
+        -10.0,
+        61.2,
+        61.2,
+        10.0,
+    )
     nms: tuple[NmsConfig, ...] = (NmsConfig(),)
 
     def __post_init__(self) -> None:
         """Check; raises ConfigError."""
         check_least(self, candidates=1)
-        if not all(low < high for low, high in zip(self.center_range[:3], self.center_range[3:], strict=True)):
-            raise ConfigError(f"center_range: expected least x, y, z, then greatest, found {self.center_range!r}")
+        if not all(
+            low < high
+            for low, high in zip(self.center_range[:3], self.center_range[3:], strict=True)
+        ):
+            raise ConfigError(
+                f"center_range: expected least x, y, z, then greatest, found {self.center_range!r}"
+            )
         if not self.nms:
             raise ConfigError("nms: expected one NmsConfig, or one a task, found none")
 
@@ -179,7 +206,9 @@ class Detections:
     categories: Tensor
 
 
-def decode_candidates(maps: TaskMaps, head: DetectionConfig, config: DecodingConfig | None = None) -> Candidates:
+def decode_candidates(
+    maps: TaskMaps, head: DetectionConfig, config: DecodingConfig | None = None
+) -> Candidates:
     """The best cells of a task as boxes, before suppression; the released CenterPointBBoxCoder's.
 
     Args:
@@ -195,12 +224,19 @@ def decode_candidates(maps: TaskMaps, head: DetectionConfig, config: DecodingCon
     code = gather_cells(precise(maps.code), cell)
     offset, z, size, turn, velocity = code.split(list(CODE_CHANNELS.values()), dim=2)
     place = torch.stack([cell % columns, cell // columns], dim=2) + offset
-    center = place * place.new_tensor([head.x[2], head.y[2]]) + place.new_tensor([head.x[0], head.y[0]])
+    center = place * place.new_tensor([head.x[2], head.y[2]]) + place.new_tensor(
+        [head.x[0], head.y[0]]
+    )
     yaw = torch.atan2(turn[:, :, :1], turn[:, :, 1:])
     boxes = torch.cat([center, z, size.exp(), yaw, velocity], dim=2)
     low, high = boxes.new_tensor(rules.center_range).view(2, 3)
     inside = ((boxes[:, :, :3] >= low) & (boxes[:, :, :3] <= high)).all(dim=2)
-    return Candidates(boxes, scores, slots, (scores > rules.score_threshold) & inside & boxes.isfinite().all(dim=2))
+    return Candidates(
+        boxes,
+        scores,
+        slots,
+        (scores > rules.score_threshold) & inside & boxes.isfinite().all(dim=2),
+    )
 
 
 def decode_detections(
@@ -255,7 +291,9 @@ def detected_boxes(detections: Detections, world_from_ego: SE3 | ArrayLike) -> D
 def _nms_of_tasks(nms: tuple[NmsConfig, ...], class_slots: ClassSlots) -> tuple[NmsConfig, ...]:
     every = nms * len(class_slots) if len(nms) == 1 else nms
     if len(every) != len(class_slots):
-        raise ConfigError(f"nms: expected one NmsConfig, or {len(class_slots)}, one a task; found {len(nms)}")
+        raise ConfigError(
+            f"nms: expected one NmsConfig, or {len(class_slots)}, one a task; found {len(nms)}"
+        )
     for task, (each, slots) in enumerate(zip(every, class_slots, strict=True)):
         if len(each.scale) not in (1, len(slots)):
             raise ConfigError(
@@ -278,7 +316,8 @@ def _kept(candidates: Candidates, slots: tuple[int | None, ...], nms: NmsConfig)
 
 def _joined(parts: Sequence[Detections]) -> Detections:
     boxes, scores, categories = (
-        torch.cat([getattr(each, name) for each in parts]) for name in ("boxes", "scores", "categories")
+        torch.cat([getattr(each, name) for each in parts])
+        for name in ("boxes", "scores", "categories")
     )
     order = scores.argsort(descending=True, stable=True)
     return Detections(boxes=boxes[order], scores=scores[order], categories=categories[order])

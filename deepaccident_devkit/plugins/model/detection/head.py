@@ -155,7 +155,8 @@ class CenterHead(nn.Module):
         self.shared_conv = ConvBlock(config.in_channels, config.shared_channels)
         kind = SeparateHead if config.branches == "separate" else JointHead
         self.task_heads = nn.ModuleList(
-            kind(config.shared_channels, len(slots), config.heatmap_bias) for slots in config.class_slots
+            kind(config.shared_channels, len(slots), config.heatmap_bias)
+            for slots in config.class_slots
         )
 
     def forward(self, features: Tensor) -> list[TaskMaps]:
@@ -176,7 +177,9 @@ class CenterHead(nn.Module):
             )
         shared = self.shared_conv(features)
         if self.config.upsample > 1:
-            shared = functional.interpolate(shared, size=(rows, columns), mode="bilinear", align_corners=False)
+            shared = functional.interpolate(
+                shared, size=(rows, columns), mode="bilinear", align_corners=False
+            )
         return [head(shared) for head in self.task_heads]
 
 

@@ -10,7 +10,12 @@ import torch
 from torch import Tensor
 
 from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.plugins.model.detection.head import CODE_CHANNELS, CODE_SIZE, DetectionConfig, TaskMaps
+from deepaccident_devkit.plugins.model.detection.head import (
+    CODE_CHANNELS,
+    CODE_SIZE,
+    DetectionConfig,
+    TaskMaps,
+)
 from deepaccident_devkit.plugins.model.warps import precise
 from deepaccident_devkit.support.arrays import check_least
 from deepaccident_devkit.support.text import settle_choices
@@ -46,7 +51,9 @@ def draw_peaks(heatmap: Tensor, layer: Tensor, cell: Tensor, radius: Tensor) -> 
     offset = torch.arange(-reach, reach + 1, device=heatmap.device)
     column, row = cell[:, :1] + offset, cell[:, 1:] + offset  # (N, side)
     sigma = (2 * radius[:, None].to(heatmap.dtype) + 1) / 6
-    bell = torch.exp(-(offset.to(heatmap.dtype) ** 2) / (2 * sigma**2)) * (offset.abs() <= radius[:, None])
+    bell = torch.exp(-(offset.to(heatmap.dtype) ** 2) / (2 * sigma**2)) * (
+        offset.abs() <= radius[:, None]
+    )
     # what lies beyond an edge is moved onto it, where the Gaussian itself is larger
     place = row.clamp(0, rows - 1)[:, :, None] * columns + column.clamp(0, columns - 1)[:, None]
     place = place + layer[:, None, None] * (rows * columns)
@@ -77,7 +84,9 @@ class TargetConfig:
         """Check; raises ConfigError or ChoiceError."""
         settle_choices(self, {"unknown_velocity": get_args(UnknownVelocity)})
         if not 0 < self.min_overlap < 1:
-            raise ConfigError(f"min_overlap: expected a number between 0 and 1, found {self.min_overlap!r}")
+            raise ConfigError(
+                f"min_overlap: expected a number between 0 and 1, found {self.min_overlap!r}"
+            )
         check_least(self, min_radius=0, max_boxes=1)
 
 
@@ -139,11 +148,19 @@ def detection_targets(
     """
     rules = config or TargetConfig()
     placed = _placed(boxes, categories, velocity_known, head, rules)
-    made = [_task_targets(placed, task, len(boxes), head, rules) for task in range(len(head.class_slots))]
+    made = [
+        _task_targets(placed, task, len(boxes), head, rules)
+        for task in range(len(head.class_slots))
+    ]
     if all(bool((each >= 0).all()) for each in categories):
         return made
-    ignored = torch.stack([_covered(box[each < 0], head) for box, each in zip(boxes, categories, strict=True)])[:, None]
-    return [one._replace(heatmap=torch.where(ignored, one.heatmap.clamp(min=_ANYTHING), one.heatmap)) for one in made]
+    ignored = torch.stack(
+        [_covered(box[each < 0], head) for box, each in zip(boxes, categories, strict=True)]
+    )[:, None]
+    return [
+        one._replace(heatmap=torch.where(ignored, one.heatmap.clamp(min=_ANYTHING), one.heatmap))
+        for one in made
+    ]
 
 
 def _covered(boxes: Tensor, head: DetectionConfig) -> Tensor:
@@ -152,10 +169,15 @@ def _covered(boxes: Tensor, head: DetectionConfig) -> Tensor:
         low + step * (torch.arange(count, device=boxes.device, dtype=boxes.dtype) + 0.5)
         for (low, _, step), count in zip((head.y, head.x), head.shape, strict=True)
     )
-    away_x, away_y = x[None, None] - boxes[:, 0, None, None], y[None, :, None] - boxes[:, 1, None, None]
+    away_x, away_y = (
+        x[None, None] - boxes[:, 0, None, None],
+        y[None, :, None] - boxes[:, 1, None, None],
+    )
     cosine, sine = boxes[:, 6, None, None].cos(), boxes[:, 6, None, None].sin()
     along, across = (away_x * cosine + away_y * sine).abs(), (away_y * cosine - away_x * sine).abs()
-    return ((along <= boxes[:, 3, None, None] / 2) & (across <= boxes[:, 4, None, None] / 2)).any(dim=0)
+    return ((along <= boxes[:, 3, None, None] / 2) & (across <= boxes[:, 4, None, None] / 2)).any(
+        dim=0
+    )
 
 
 def _placed(
@@ -172,14 +194,23 @@ def _placed(
     place = (box[:, :2] - low) / step
     cell = place.trunc()
     size = box[:, 3:5] / step
-    inside = ((cell >= 0) & (cell < box.new_tensor([columns, rows]))).all(dim=1) & (box[:, 3:6] > 0).all(dim=1)
+    inside = ((cell >= 0) & (cell < box.new_tensor([columns, rows]))).all(dim=1) & (
+        box[:, 3:6] > 0
+    ).all(dim=1)
     known = box[:, 7:].isfinite().all(dim=1)
     if velocity_known is not None:
         known = known & torch.cat(list(velocity_known))
-    yaw, velocity = box[:, 6:7], torch.where(known[:, None], box[:, 7:], torch.zeros_like(box[:, 7:]))
-    code = torch.cat([place - cell, box[:, 2:3], box[:, 3:6].log(), yaw.sin(), yaw.cos(), velocity], dim=1)
+    yaw, velocity = (
+        box[:, 6:7],
+        torch.where(known[:, None], box[:, 7:], torch.zeros_like(box[:, 7:])),
+    )
+    code = torch.cat(
+        [place - cell, box[:, 2:3], box[:, 3:6].log(), yaw.sin(), yaw.cos(), velocity], dim=1
+    )
     task, slot = _slots_of(category, head)
-    radius = peak_radius(size[:, 0], size[:, 1], config.min_overlap).long().clamp(min=config.min_radius)
+    radius = (
+        peak_radius(size[:, 0], size[:, 1], config.min_overlap).long().clamp(min=config.min_radius)
+    )
     return _Placed(
         sample=torch.repeat_interleave(torch.arange(len(boxes), device=box.device), counts),
         task=task,
@@ -194,7 +225,11 @@ def _placed(
 
 def _slots_of(category: Tensor, head: DetectionConfig) -> tuple[Tensor, Tensor]:
     """Task, and slot in it, of each category; task −1 for those that have none."""
-    places = {each: (task, slot) for task, slots in enumerate(head.class_slots) for slot, each in enumerate(slots)}
+    places = {
+        each: (task, slot)
+        for task, slots in enumerate(head.class_slots)
+        for slot, each in enumerate(slots)
+    }
     rows = [places.get(each, (-1, -1)) for each in range(len(CATEGORIES))]
     table = torch.tensor([*rows, (-1, -1)], device=category.device)
     known = (category >= 0) & (category < len(CATEGORIES))
@@ -202,7 +237,9 @@ def _slots_of(category: Tensor, head: DetectionConfig) -> tuple[Tensor, Tensor]:
     return found[:, 0], found[:, 1]
 
 
-def _task_targets(placed: _Placed, task: int, samples: int, head: DetectionConfig, config: TargetConfig) -> TaskTargets:
+def _task_targets(
+    placed: _Placed, task: int, samples: int, head: DetectionConfig, config: TargetConfig
+) -> TaskTargets:
     """Boxes stand in the order of their slots, then as given; one outside leaves its place empty, as in the release."""
     slots, (rows, columns) = len(head.class_slots[task]), head.shape
     mine = torch.nonzero(placed.task == task)[:, 0]
@@ -216,7 +253,10 @@ def _task_targets(placed: _Placed, task: int, samples: int, head: DetectionConfi
     size = (samples, config.max_boxes)
     box = placed.code.new_zeros((*size, CODE_SIZE))
     place = mine.new_zeros(size)
-    mask, known = torch.zeros_like(place, dtype=torch.bool), torch.zeros_like(place, dtype=torch.bool)
+    mask, known = (
+        torch.zeros_like(place, dtype=torch.bool),
+        torch.zeros_like(place, dtype=torch.bool),
+    )
     box[sample, number] = placed.code[mine]
     place[sample, number] = cell[:, 1] * columns + cell[:, 0]
     mask[sample, number] = True
@@ -250,7 +290,9 @@ class DetectionLossConfig:
 
 
 def detection_losses(
-    maps: Sequence[TaskMaps], targets: Sequence[TaskTargets], config: DetectionLossConfig | None = None
+    maps: Sequence[TaskMaps],
+    targets: Sequence[TaskTargets],
+    config: DetectionLossConfig | None = None,
 ) -> dict[str, Tensor]:
     """`task0.loss_heatmap`, `task0.loss_bbox`, … as the released CenterHeadv1 has them, times the weights.
 
@@ -265,8 +307,12 @@ def detection_losses(
     weights = config or DetectionLossConfig()
     losses: dict[str, Tensor] = {}
     for number, (map_, target) in enumerate(zip(maps, targets, strict=True)):
-        losses[f"task{number}.loss_heatmap"] = weights.weight * heatmap_loss(map_.heatmap, target.heatmap)
-        losses[f"task{number}.loss_bbox"] = weights.weight * weights.box_weight * box_loss(map_.code, target)
+        losses[f"task{number}.loss_heatmap"] = weights.weight * heatmap_loss(
+            map_.heatmap, target.heatmap
+        )
+        losses[f"task{number}.loss_bbox"] = (
+            weights.weight * weights.box_weight * box_loss(map_.code, target)
+        )
     return losses
 
 

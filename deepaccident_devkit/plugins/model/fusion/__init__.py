@@ -20,9 +20,16 @@ from deepaccident_devkit.plugins.model.fusion.simple import (
     ReleasedFusion,
     ReleasedFusionConfig,
 )
-from deepaccident_devkit.plugins.model.fusion.transformers import CobevtConfig, CobevtFusion, V2XViTConfig, V2XViTFusion
+from deepaccident_devkit.plugins.model.fusion.transformers import (
+    CobevtConfig,
+    CobevtFusion,
+    V2XViTConfig,
+    V2XViTFusion,
+)
 
-FusionConfig: TypeAlias = PoolFusionConfig | ReleasedFusionConfig | DiscoNetConfig | CobevtConfig | V2XViTConfig
+FusionConfig: TypeAlias = (
+    PoolFusionConfig | ReleasedFusionConfig | DiscoNetConfig | CobevtConfig | V2XViTConfig
+)
 _MODULES: Final[Mapping[type, Callable[[Any], Fusion]]] = {
     PoolFusionConfig: PoolFusion,
     ReleasedFusionConfig: ReleasedFusion,

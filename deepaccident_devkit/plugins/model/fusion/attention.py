@@ -34,9 +34,13 @@ class Windows:
         batch, agents, height, width, channels = padded.shape
         down, along = height // size, width // size
         if self.strided:
-            parts = padded.view(batch, agents, size, down, size, along, channels).permute(0, 3, 5, 1, 2, 4, 6)
+            parts = padded.view(batch, agents, size, down, size, along, channels).permute(
+                0, 3, 5, 1, 2, 4, 6
+            )
         else:
-            parts = padded.view(batch, agents, down, size, along, size, channels).permute(0, 2, 4, 1, 3, 5, 6)
+            parts = padded.view(batch, agents, down, size, along, size, channels).permute(
+                0, 2, 4, 1, 3, 5, 6
+            )
         return parts.reshape(batch * down * along, agents * size * size, channels)
 
     def join(self, tokens: Tensor, shape: torch.Size) -> Tensor:
@@ -139,7 +143,9 @@ class AgentAttention(nn.Module):
         """Maps (B, A, H, W, C), mask (B, A, H, W) and kinds (B, A) → the same shape as the maps."""
         kind = agent_is_infra.long()
         cells = x.flatten(2, 3)
-        query, key, value = (self._by_head(layer(cells, kind)) for layer in (self.query, self.key, self.value))
+        query, key, value = (
+            self._by_head(layer(cells, kind)) for layer in (self.query, self.key, self.value)
+        )
         scale = query.shape[-1] ** -0.5
         by_kind = [
             self._related(query, self.relation_att, kind, other) * scale @ key.transpose(-1, -2)
@@ -179,13 +185,17 @@ class WindowAttention(nn.Module):
         span = 2 * windows.size - 1
         self.pos_embedding = nn.Parameter(torch.randn(span, span))
         # the original's bias goes by key − query
-        self.register_buffer("positions", relative_positions(windows.size).T.contiguous(), persistent=False)
+        self.register_buffer(
+            "positions", relative_positions(windows.size).T.contiguous(), persistent=False
+        )
 
     def forward(self, x: Tensor) -> Tensor:
         """Maps (M, 1, H, W, C) → the same shape; cells added to fill the windows are not attended to."""
         keys = None
         if x.shape[2] % self.windows.size or x.shape[3] % self.windows.size:
-            keys = self.windows.split_mask(torch.ones(x.shape[:4], dtype=torch.bool, device=x.device))
+            keys = self.windows.split_mask(
+                torch.ones(x.shape[:4], dtype=torch.bool, device=x.device)
+            )
         bias = self.pos_embedding.flatten()[self.positions][None]
         attended = attention(self.windows.split(self.to_qkv(x)), self.heads, bias, keys)
         return self.windows.join(self.to_out(attended), x.shape[:4])
@@ -214,7 +224,9 @@ class SplitAttention(nn.Module):
 class MultiWindowAttention(nn.Module):
     """Window attention with windows of several sizes, joined by split attention; each agent's map for itself."""
 
-    def __init__(self, channels: int, sizes: Sequence[int], heads: Sequence[int], dropout: float) -> None:
+    def __init__(
+        self, channels: int, sizes: Sequence[int], heads: Sequence[int], dropout: float
+    ) -> None:
         super().__init__()
         self.branches = nn.ModuleList(
             WindowAttention(channels, Windows(size=size), count, dropout)

@@ -77,7 +77,9 @@ class Agent3DConfig:
     def __post_init__(self) -> None:
         """Check the number of agents; raises ConfigError."""
         if self.agents < 2:
-            raise ConfigError(f"agents: expected at least 2, found {self.agents}; one agent has nothing to fuse")
+            raise ConfigError(
+                f"agents: expected at least 2, found {self.agents}; one agent has nothing to fuse"
+            )
 
 
 class Agent3D(nn.Module):
@@ -96,7 +98,9 @@ class Agent3D(nn.Module):
             layers.extend(Bottleneck3d(width) for _ in range(config.bottlenecks))
         self.model = nn.Sequential(*layers)
         self.compression = nn.Sequential(
-            nn.Conv2d(config.agents * width, width, 3, padding=1, bias=False), nn.BatchNorm2d(width), nn.ReLU()
+            nn.Conv2d(config.agents * width, width, 3, padding=1, bias=False),
+            nn.BatchNorm2d(width),
+            nn.ReLU(),
         )
 
     def forward(self, x: Tensor, relative_pose: Tensor) -> Tensor:
@@ -113,7 +117,9 @@ class Agent3D(nn.Module):
 
     def over_agents(self, x: Tensor, relative_pose: Tensor) -> Tensor:
         """(B, A, C, H, W) after the 3D convolutions; arguments as `forward`."""
-        pose = torch.cat([torch.zeros_like(relative_pose[:, :1]), relative_pose[:, 1:]], 1).to(x.dtype)
+        pose = torch.cat([torch.zeros_like(relative_pose[:, :1]), relative_pose[:, 1:]], 1).to(
+            x.dtype
+        )
         maps = torch.cat([x, pose[..., None, None].expand(-1, -1, -1, *x.shape[-2:])], 2)
         return self.model(maps.transpose(1, 2)).transpose(1, 2)
 

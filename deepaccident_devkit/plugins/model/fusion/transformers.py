@@ -64,7 +64,9 @@ class CobevtConfig:
         words = {"agent_relation": ("classes", "slots"), "masked_cells": ("hidden", "averaged")}
         settle_choices(self, words, error=ConfigError)
         if self.channels % self.heads:
-            raise ConfigError(f"heads: {self.heads} do not divide {self.channels} channels; choose a divisor")
+            raise ConfigError(
+                f"heads: {self.heads} do not divide {self.channels} channels; choose a divisor"
+            )
 
 
 class AgentWindowAttention(nn.Module):
@@ -77,21 +79,30 @@ class AgentWindowAttention(nn.Module):
         self.config, self.windows = config, windows
         relations = _RELATIONS if config.agent_relation == "classes" else 2 * config.agents - 1
         self.to_qkv = nn.Linear(config.channels, 3 * config.channels, bias=False)
-        self.to_out = nn.Sequential(nn.Linear(config.channels, config.channels, bias=False), nn.Dropout(config.dropout))
-        self.bias_table = nn.Parameter(torch.empty(relations * (2 * windows.size - 1) ** 2, config.heads))
+        self.to_out = nn.Sequential(
+            nn.Linear(config.channels, config.channels, bias=False), nn.Dropout(config.dropout)
+        )
+        self.bias_table = nn.Parameter(
+            torch.empty(relations * (2 * windows.size - 1) ** 2, config.heads)
+        )
         nn.init.trunc_normal_(self.bias_table, std=0.02)
         self.register_buffer("positions", relative_positions(windows.size), persistent=False)
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
         """Maps (B, A, H, W, C) → the same shape; only cells of the mask (B, A, H, W) are attended to."""
         qkv = self.windows.split(self.to_qkv(x))
-        attended = attention(qkv, self.config.heads, self.bias(x.shape[1]), self.windows.split_mask(mask))
+        attended = attention(
+            qkv, self.config.heads, self.bias(x.shape[1]), self.windows.split_mask(mask)
+        )
         return self.windows.join(self.to_out(attended), x.shape[:4])
 
     def bias(self, agents: int) -> Tensor:
         """(heads, A · size², A · size²) by agent and cell of query and key. Raises ConfigError: too many agents."""
         relation = self._relations(agents)
-        index = relation[:, None, :, None] * (2 * self.windows.size - 1) ** 2 + self.positions[None, :, None, :]
+        index = (
+            relation[:, None, :, None] * (2 * self.windows.size - 1) ** 2
+            + self.positions[None, :, None, :]
+        )
         return self.bias_table[index.flatten(2, 3).flatten(0, 1)].permute(2, 0, 1)
 
     def _relations(self, agents: int) -> Tensor:
@@ -114,9 +125,13 @@ class AxialLayer(nn.Module):
     def __init__(self, config: CobevtConfig) -> None:
         super().__init__()
         width, hidden = config.channels, config.expansion * config.channels
-        self.window_attention = PreNorm(width, AgentWindowAttention(config, Windows(size=config.window)))
+        self.window_attention = PreNorm(
+            width, AgentWindowAttention(config, Windows(size=config.window))
+        )
         self.window_feed_forward = PreNorm(width, FeedForward(width, hidden, config.dropout))
-        self.grid_attention = PreNorm(width, AgentWindowAttention(config, Windows(size=config.window, strided=True)))
+        self.grid_attention = PreNorm(
+            width, AgentWindowAttention(config, Windows(size=config.window, strided=True))
+        )
         self.grid_feed_forward = PreNorm(width, FeedForward(width, hidden, config.dropout))
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
@@ -132,7 +147,9 @@ class CobevtFusion(Fusion):
         super().__init__()
         self.config = config
         self.layers = nn.ModuleList(AxialLayer(config) for _ in range(config.depth))
-        self.head = nn.Sequential(nn.LayerNorm(config.channels), nn.Linear(config.channels, config.channels))
+        self.head = nn.Sequential(
+            nn.LayerNorm(config.channels), nn.Linear(config.channels, config.channels)
+        )
 
     def forward(self, x: Tensor, mask: Tensor, agent_is_infra: Tensor, delay: Tensor) -> Tensor:  # noqa: ARG002
         """As `Fusion.forward`; kinds of agents and delays do not count. Raises ConfigError: more agents than slots."""
@@ -177,9 +194,14 @@ class V2XViTConfig:
             raise ConfigError(
                 f"window_heads: expected one number for each of {len(self.windows)} windows, found {self.window_heads}"
             )
-        for name, heads in (("heads", self.heads), *(("window_heads", count) for count in self.window_heads)):
+        for name, heads in (
+            ("heads", self.heads),
+            *(("window_heads", count) for count in self.window_heads),
+        ):
             if self.channels % heads:
-                raise ConfigError(f"{name}: {heads} do not divide {self.channels} channels; choose a divisor")
+                raise ConfigError(
+                    f"{name}: {heads} do not divide {self.channels} channels; choose a divisor"
+                )
 
 
 class DelayEncoding(nn.Module):
@@ -192,14 +214,18 @@ class DelayEncoding(nn.Module):
 
     def forward(self, delay: Tensor) -> Tensor:
         """(B, A) steps → (B, A, C)."""
-        return self.linear(sinusoid(self.delay_rate * delay, self.channels).to(self.linear.weight.dtype))
+        return self.linear(
+            sinusoid(self.delay_rate * delay, self.channels).to(self.linear.weight.dtype)
+        )
 
 
 def sinusoid(place: Tensor, channels: int) -> Tensor:
     """(…,) → (…, C) float32: sines and cosines by turns, of wavelengths from 2π to 10000 · 2π places, over √C."""
     rate = torch.arange(0, channels, 2, device=place.device) * (-math.log(10000) / channels)
     angle = place[..., None] * rate.exp()
-    return torch.stack([angle.sin(), angle.cos()], -1).flatten(-2)[..., :channels] / math.sqrt(channels)
+    return torch.stack([angle.sin(), angle.cos()], -1).flatten(-2)[..., :channels] / math.sqrt(
+        channels
+    )
 
 
 class _TransformerBlock(nn.Module):
@@ -209,7 +235,9 @@ class _TransformerBlock(nn.Module):
         super().__init__()
         width = config.channels
         self.agents = PreNorm(width, AgentAttention(width, config.heads, config.dropout))
-        self.windows = PreNorm(width, MultiWindowAttention(width, config.windows, config.window_heads, config.dropout))
+        self.windows = PreNorm(
+            width, MultiWindowAttention(width, config.windows, config.window_heads, config.dropout)
+        )
         self.feed_forward = PreNorm(width, FeedForward(width, width, config.dropout))
 
     def forward(self, x: Tensor, mask: Tensor, agent_is_infra: Tensor) -> Tensor:

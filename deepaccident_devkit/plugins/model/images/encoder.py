@@ -31,7 +31,9 @@ class FpnNeck(nn.Module):
         super().__init__()
         self.out_channels = out_channels
         layers = nn.Sequential(
-            nn.Conv2d(in_channels, out_channels, first_kernel, padding=first_kernel // 2, bias=False),
+            nn.Conv2d(
+                in_channels, out_channels, first_kernel, padding=first_kernel // 2, bias=False
+            ),
             nn.BatchNorm2d(out_channels),
             nn.ReLU(inplace=True),
             nn.Conv2d(out_channels, out_channels, 3, padding=1, bias=False),
@@ -43,7 +45,9 @@ class FpnNeck(nn.Module):
     def forward(self, maps: tuple[Tensor, Tensor]) -> Tensor:
         """The maps (N, C, h', w') and (N, C', h'', w''), the fine one first, as one map (N, `out_channels`, h', w')."""
         fine, coarse = maps
-        enlarged = functional.interpolate(coarse, size=fine.shape[-2:], mode="bilinear", align_corners=True)
+        enlarged = functional.interpolate(
+            coarse, size=fine.shape[-2:], mode="bilinear", align_corners=True
+        )
         return self.up["conv"](torch.cat([fine, enlarged], 1))
 
 
@@ -80,7 +84,9 @@ class SmallConv(nn.Module):
         super().__init__()
         first, second, third = config.widths
         self.out_channels = (third, config.branch)
-        self.fine = nn.Sequential(_halved(3, first), _halved(first, second), _halved(second, third), _Residual(third))
+        self.fine = nn.Sequential(
+            _halved(3, first), _halved(first, second), _halved(second, third), _Residual(third)
+        )
         self.coarse = nn.Sequential(_halved(third, config.branch), _Residual(config.branch))
 
     def forward(self, images: Tensor) -> tuple[Tensor, Tensor]:
@@ -93,7 +99,9 @@ class _Residual(nn.Module):
     def __init__(self, channels: int) -> None:
         super().__init__()
         self.layers = nn.Sequential(
-            *_convolution(channels, channels), nn.ReLU(inplace=True), *_convolution(channels, channels)
+            *_convolution(channels, channels),
+            nn.ReLU(inplace=True),
+            *_convolution(channels, channels),
         )
 
     def forward(self, features: Tensor) -> Tensor:
@@ -104,8 +112,12 @@ def _halved(in_channels: int, out_channels: int) -> nn.Sequential:
     return nn.Sequential(*_convolution(in_channels, out_channels, stride=2), nn.ReLU(inplace=True))
 
 
-def _convolution(in_channels: int, out_channels: int, *, stride: int = 1) -> tuple[nn.Conv2d, nn.BatchNorm2d]:
-    return nn.Conv2d(in_channels, out_channels, 3, stride, padding=1, bias=False), nn.BatchNorm2d(out_channels)
+def _convolution(
+    in_channels: int, out_channels: int, *, stride: int = 1
+) -> tuple[nn.Conv2d, nn.BatchNorm2d]:
+    return nn.Conv2d(in_channels, out_channels, 3, stride, padding=1, bias=False), nn.BatchNorm2d(
+        out_channels
+    )
 
 
 EncoderConfig = SwinConfig | SmallConvConfig
@@ -128,7 +140,9 @@ def image_encoder(config: EncoderConfig) -> tuple[Swin | SmallConv, FpnNeck]:
     backbone = Swin(config) if isinstance(config, SwinConfig) else SmallConv(config)
     # the small encoder saves time where most of its neck's work would be
     first_kernel = 1 if isinstance(config, SmallConvConfig) else 3
-    return backbone, FpnNeck(sum(backbone.out_channels), config.neck_channels, first_kernel=first_kernel)
+    return backbone, FpnNeck(
+        sum(backbone.out_channels), config.neck_channels, first_kernel=first_kernel
+    )
 
 
 def normalised(images: Tensor) -> Tensor:
@@ -138,6 +152,10 @@ def normalised(images: Tensor) -> Tensor:
         ConfigError: the images are not uint8, so that it is not known what was done to them.
     """
     if images.dtype != torch.uint8:
-        raise ConfigError(f"images: expected uint8, found {images.dtype}; load them with ImageConfig(dtype='uint8')")
-    mean, std = (torch.tensor(three, device=images.device)[:, None, None] for three in (_MEAN, _STD))
+        raise ConfigError(
+            f"images: expected uint8, found {images.dtype}; load them with ImageConfig(dtype='uint8')"
+        )
+    mean, std = (
+        torch.tensor(three, device=images.device)[:, None, None] for three in (_MEAN, _STD)
+    )
     return (images / 255 - mean) / std

@@ -36,7 +36,9 @@ class _SwinAttention(nn.Module):
         parts = self.qkv(tokens).unflatten(-1, (3, self.heads, channels // self.heads))
         query, key, value = parts.permute(3, 0, 1, 4, 2, 5).unbind(0)
         scores = (query * query.shape[-1] ** -0.5) @ key.transpose(-1, -2)
-        scores = scores + self.relative_position_bias_table[self.relative_position_index].permute(2, 0, 1)
+        scores = scores + self.relative_position_bias_table[self.relative_position_index].permute(
+            2, 0, 1
+        )
         if together is not None:
             scores = scores.masked_fill(~together[:, None], -torch.inf)
         return self.proj((scores.softmax(-1) @ value).transpose(2, 3).flatten(3))
@@ -92,13 +94,17 @@ def map_of(windows: Tensor, rows: int, columns: int) -> Tensor:
     return cut.transpose(2, 3).reshape(count, rows, columns, channels)
 
 
-def neighbours(rows: int, columns: int, window: int, shift: int, device: torch.device | str | None = None) -> Tensor:
+def neighbours(
+    rows: int, columns: int, window: int, shift: int, device: torch.device | str | None = None
+) -> Tensor:
     """Which tokens of the windows of a shifted map may see each other, (K, L, L) bool.
 
     Those that lay beside each other before the shift: not the two sides of the map that it brought together.
     """
     # in the last row and column of windows the last `shift` steps come from the other side
-    down, along = ((torch.arange(size, device=device) >= size - shift).long() for size in (rows, columns))
+    down, along = (
+        (torch.arange(size, device=device) >= size - shift).long() for size in (rows, columns)
+    )
     sides = windows_of((2 * down[:, None] + along)[None, :, :, None], window)[0, :, :, 0]
     return sides[:, :, None] == sides[:, None, :]
 
@@ -135,12 +141,18 @@ class SwinConfig:
         """Check that the stages fit together; raises ConfigError."""
         stages = len(self.depths)
         if len(self.num_heads) != stages:
-            raise ConfigError(f"num_heads: expected {stages}, one for each of depths, found {self.num_heads!r}")
+            raise ConfigError(
+                f"num_heads: expected {stages}, one for each of depths, found {self.num_heads!r}"
+            )
         for width, heads in zip(self.widths, self.num_heads, strict=True):
             if width % heads:
-                raise ConfigError(f"num_heads: {width} channels cannot be shared by {heads} heads; choose a divisor")
+                raise ConfigError(
+                    f"num_heads: {width} channels cannot be shared by {heads} heads; choose a divisor"
+                )
         if self.out_stages not in pairwise(range(stages)):
-            raise ConfigError(f"out_stages: expected one of {[*pairwise(range(stages))]}, found {self.out_stages!r}")
+            raise ConfigError(
+                f"out_stages: expected one of {[*pairwise(range(stages))]}, found {self.out_stages!r}"
+            )
 
     @property
     def widths(self) -> tuple[int, ...]:
@@ -169,7 +181,8 @@ class Swin(nn.Module):
         self.out_channels = (config.widths[first], config.widths[second])
         self.patch_embed = PatchEmbedding(config.embed_dims)
         self.stages = nn.ModuleList(
-            _SwinStage(config, i, downsample=i < len(config.depths) - 1) for i in range(len(config.depths))
+            _SwinStage(config, i, downsample=i < len(config.depths) - 1)
+            for i in range(len(config.depths))
         )
         for i in config.out_stages:
             self.add_module(f"norm{i}", nn.LayerNorm(config.widths[i]))
@@ -208,7 +221,8 @@ class _SwinStage(nn.Module):
         self.checkpointing = config.checkpointing
         channels, heads, window = config.widths[index], config.num_heads[index], config.window_size
         self.blocks = nn.ModuleList(
-            _SwinBlock(channels, heads, window, shift=window // 2 if i % 2 else 0) for i in range(config.depths[index])
+            _SwinBlock(channels, heads, window, shift=window // 2 if i % 2 else 0)
+            for i in range(config.depths[index])
         )
         self.downsample = PatchMerging(channels) if downsample else None
 
@@ -231,7 +245,9 @@ class _SwinBlock(nn.Module):
         self.attn = ShiftedWindowAttention(channels, heads, window, shift)
         self.norm2 = nn.LayerNorm(channels)
         hidden = _MLP_RATIO * channels
-        layers = nn.Sequential(nn.Sequential(nn.Linear(channels, hidden), nn.GELU()), nn.Linear(hidden, channels))
+        layers = nn.Sequential(
+            nn.Sequential(nn.Linear(channels, hidden), nn.GELU()), nn.Linear(hidden, channels)
+        )
         self.ffn = nn.ModuleDict({"layers": layers})
 
     def forward(self, features: Tensor) -> Tensor:
@@ -253,7 +269,9 @@ class PatchMerging(nn.Module):
 
     def forward(self, features: Tensor) -> Tensor:
         """Features (N, h, w, C) → (N, h / 2, w / 2, 2C); zeros fill what lacks to even sizes."""
-        padded = nn.functional.pad(features, (0, 0, 0, features.shape[2] % 2, 0, features.shape[1] % 2))
+        padded = nn.functional.pad(
+            features, (0, 0, 0, features.shape[2] % 2, 0, features.shape[1] % 2)
+        )
         count, rows, columns, channels = padded.shape
         cut = padded.reshape(count, rows // 2, 2, columns // 2, 2, channels)
         return self.reduction(self.norm(cut.permute(0, 1, 3, 5, 2, 4).flatten(3)))
@@ -280,7 +298,9 @@ _RENAMED: Final = (
 )
 # The classifier, and masks that depend on the size of the image alone.
 _DROPPED: Final = re.compile(r"head\..+|layers\.\d+\.blocks\.\d+\.attn_mask")
-_MERGING: Final = re.compile(r"layers\.\d+\.downsample\.(norm\.weight|norm\.bias|reduction\.weight)")
+_MERGING: Final = re.compile(
+    r"layers\.\d+\.downsample\.(norm\.weight|norm\.bias|reduction\.weight)"
+)
 
 
 def from_official(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:

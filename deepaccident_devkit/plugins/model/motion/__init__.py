@@ -1,6 +1,9 @@
 """The motion head: distributions of the latent, future states by flow and GRU, decoders, labels and losses."""
 
-from deepaccident_devkit.plugins.model.motion.decoders import LatentDistribution, PredictedMotionMaps
+from deepaccident_devkit.plugins.model.motion.decoders import (
+    LatentDistribution,
+    PredictedMotionMaps,
+)
 from deepaccident_devkit.plugins.model.motion.head import (
     MotionHead,
     MotionHeadConfig,

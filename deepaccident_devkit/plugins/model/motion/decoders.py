@@ -32,23 +32,31 @@ class LatentDistribution(NamedTuple):
     def sample(self, noise: Tensor) -> Tensor:
         """The latent (N, L, h, w) that belongs to standard normal noise of that shape; raises GeometryError."""
         if noise.shape != self.mu.shape:
-            raise GeometryError(f"noise: expected shape {tuple(self.mu.shape)}, found {tuple(noise.shape)}")
+            raise GeometryError(
+                f"noise: expected shape {tuple(self.mu.shape)}, found {tuple(noise.shape)}"
+            )
         return self.mu + noise.to(self.mu) * self.log_sigma.exp()
 
     def noise(self, generator: torch.Generator | None = None) -> Tensor:
         """Standard normal noise of this shape, from a generator on the same device or from torch's own."""
-        return torch.randn(self.mu.shape, generator=generator, device=self.mu.device, dtype=self.mu.dtype)
+        return torch.randn(
+            self.mu.shape, generator=generator, device=self.mu.device, dtype=self.mu.dtype
+        )
 
 
 class SpatialDistribution(nn.Module):
     """Features → `LatentDistribution`: two bottlenecks of stride 2, and a 1 × 1 convolution."""
 
-    def __init__(self, inputs: int, hidden: int, latent: int, log_sigma: tuple[float, float]) -> None:
+    def __init__(
+        self, inputs: int, hidden: int, latent: int, log_sigma: tuple[float, float]
+    ) -> None:
         """Make the layers, with `hidden` channels between them, and the range of `LatentDistribution.log_sigma`."""
         super().__init__()
         self._log_sigma = log_sigma
         self.encoder = nn.Sequential(
-            OrderedDict(model=nn.Sequential(_Bottleneck(inputs, hidden), _Bottleneck(hidden, hidden)))
+            OrderedDict(
+                model=nn.Sequential(_Bottleneck(inputs, hidden), _Bottleneck(hidden, hidden))
+            )
         )
         last = nn.Conv2d(hidden, 2 * latent, 1)
         # two distributions that begin far apart have a divergence of thousands, beside which nothing else is learned
@@ -111,14 +119,18 @@ def warp_with_flow(features: Tensor, flow: Tensor) -> Tensor:
     dtype = torch.promote_types(features.dtype, torch.float32)
     along = torch.arange(columns, device=flow.device, dtype=dtype) + flow[:, 0].to(dtype)
     down = torch.arange(rows, device=flow.device, dtype=dtype)[:, None] + flow[:, 1].to(dtype)
-    points = torch.stack([2 * along / max(columns - 1, 1) - 1, 2 * down / max(rows - 1, 1) - 1], dim=-1)
+    points = torch.stack(
+        [2 * along / max(columns - 1, 1) - 1, 2 * down / max(rows - 1, 1) - 1], dim=-1
+    )
     return functional.grid_sample(features.to(dtype), points, align_corners=True).to(features.dtype)
 
 
 class FlowGru(nn.Module):
     """Latent and present state → the states of the future frames (the released `ResFuturePrediction`)."""
 
-    def __init__(self, channels: int, latent: int, frames: int, *, hidden_warp: HiddenWarp, detach: bool) -> None:
+    def __init__(
+        self, channels: int, latent: int, frames: int, *, hidden_warp: HiddenWarp, detach: bool
+    ) -> None:
         """Make the layers for so many future frames.
 
         The GRU updates the last state in its old place (`none`, as released), or moved along the flow as its input is
@@ -176,7 +188,12 @@ class _ConvNorm(nn.Module):
         return functional.relu(self.norm(self.conv(features)), inplace=True)
 
 
-_CHANNELS: Final = {"segmentation": 2, "instance_center": 1, "instance_offset": 2, "instance_flow": 2}
+_CHANNELS: Final = {
+    "segmentation": 2,
+    "instance_center": 1,
+    "instance_offset": 2,
+    "instance_flow": 2,
+}
 # First bias of the centres' logits: one cell in ten, so that empty cells do not dominate the first steps (CenterNet,
 # arXiv:1904.07850).
 _RARE: Final = -2.19
@@ -205,7 +222,12 @@ class SeparateDecoders(nn.ModuleDict):
         """Make the layers for states of so many channels."""
         super().__init__(
             {
-                name: _decoder(channels, channels, count, rare=slice(0, 1) if name == "instance_center" else None)
+                name: _decoder(
+                    channels,
+                    channels,
+                    count,
+                    rare=slice(0, 1) if name == "instance_center" else None,
+                )
                 for name, count in _CHANNELS.items()
             }
         )
@@ -223,7 +245,9 @@ class ShuffledDecoder(nn.Module):
         super().__init__()
         self._upsample, cells = upsample, upsample**2
         first = cells * _CHANNELS["segmentation"]
-        self.layers = _decoder(channels, hidden, cells * sum(_CHANNELS.values()), rare=slice(first, first + cells))
+        self.layers = _decoder(
+            channels, hidden, cells * sum(_CHANNELS.values()), rare=slice(first, first + cells)
+        )
 
     def forward(self, states: Tensor) -> PredictedMotionMaps:
         """Decode states (M, C, H, W) to maps (M, …, H', W') on the finer grid."""

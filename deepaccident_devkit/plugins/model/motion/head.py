@@ -124,11 +124,17 @@ class MotionHeadConfig:
 
     def __post_init__(self) -> None:
         """Check the values; raises ConfigError."""
-        words = {"decoders": get_args(Decoders), "posterior_ignore": POSTERIOR_IGNORES, "hidden_warp": HIDDEN_WARPS}
+        words = {
+            "decoders": get_args(Decoders),
+            "posterior_ignore": POSTERIOR_IGNORES,
+            "hidden_warp": HIDDEN_WARPS,
+        }
         settle_choices(self, words, error=ConfigError)
         check_least(self, in_channels=2, latent=1, future_frames=1, samples=0, hidden=1, upsample=1)
         if not self.log_sigma[0] < self.log_sigma[1]:
-            raise ConfigError(f"log_sigma: expected the smaller limit first, such as (-5, 5), found {self.log_sigma!r}")
+            raise ConfigError(
+                f"log_sigma: expected the smaller limit first, such as (-5, 5), found {self.log_sigma!r}"
+            )
         if self.decoders == "separate" and self.upsample != 1:
             raise ConfigError(
                 f"upsample: separate decoders keep the states' resolution, found {self.upsample!r}; choose 1, or "
@@ -169,7 +175,11 @@ class MotionHead(nn.Module):
             for inputs in (channels, channels + labels)
         )
         self.future_prediction = FlowGru(
-            channels, config.latent, config.future_frames, hidden_warp=config.hidden_warp, detach=config.detach
+            channels,
+            config.latent,
+            config.future_frames,
+            hidden_warp=config.hidden_warp,
+            detach=config.detach,
         )
 
     def forward(
@@ -199,14 +209,20 @@ class MotionHead(nn.Module):
             self._check_targets(features, targets)
             config = self.config
             labels = targets.posterior_input(
-                stride=config.upsample, ignore=config.posterior_ignore, ignore_index=config.ignore_index
+                stride=config.upsample,
+                ignore=config.posterior_ignore,
+                ignore_index=config.ignore_index,
             )
             future = self.future_distribution(torch.cat([features, labels.to(features)], dim=1))
             latent = future.sample(future.noise(generator) if noise is None else noise)
             return MotionOutputs(self._decoded(features, latent), present, future)
         # one draw after the other: all at once would need as many times the memory
-        draws = [self._decoded(features, latent) for latent in self._draws(present, noise, generator)]
-        return MotionOutputs(PredictedMotionMaps(*map(torch.stack, zip(*draws, strict=True))), present, None)
+        draws = [
+            self._decoded(features, latent) for latent in self._draws(present, noise, generator)
+        ]
+        return MotionOutputs(
+            PredictedMotionMaps(*map(torch.stack, zip(*draws, strict=True))), present, None
+        )
 
     def _draws(
         self, present: LatentDistribution, noise: Tensor | None, generator: torch.Generator | None
@@ -214,18 +230,24 @@ class MotionHead(nn.Module):
         """The latent of each draw and, last, the mean."""
         count = self.config.samples
         if noise is not None and len(noise) != count:
-            raise GeometryError(f"noise: expected that of {count} draws, found {len(noise)}; change noise or samples")
+            raise GeometryError(
+                f"noise: expected that of {count} draws, found {len(noise)}; change noise or samples"
+            )
         for draw in range(count):
             yield present.sample(present.noise(generator) if noise is None else noise[draw])
         yield present.mu
 
     def _decoded(self, features: Tensor, latent: Tensor) -> PredictedMotionMaps:
         """The maps (N, T, …) of the features with one latent."""
-        latent = functional.interpolate(latent, size=features.shape[-2:], mode="bilinear", align_corners=False)
+        latent = functional.interpolate(
+            latent, size=features.shape[-2:], mode="bilinear", align_corners=False
+        )
         future = self.future_prediction(latent, features)
         states = torch.cat([features[:, None], future], dim=1)
         frames = states.shape[:2]
-        return PredictedMotionMaps(*(each.unflatten(0, frames) for each in self.task_heads(states.flatten(0, 1))))
+        return PredictedMotionMaps(
+            *(each.unflatten(0, frames) for each in self.task_heads(states.flatten(0, 1)))
+        )
 
     def _check_targets(self, features: Tensor, targets: MotionTargets) -> None:
         rows, columns = (self.config.upsample * size for size in features.shape[-2:])
@@ -266,14 +288,18 @@ class MotionLossConfig:
     def __post_init__(self) -> None:
         """Check the values; raises ConfigError."""
         if not 0 < self.top_k <= 1:
-            raise ConfigError(f"top_k: expected a share above 0 and at most 1, found {self.top_k!r}")
+            raise ConfigError(
+                f"top_k: expected a share above 0 and at most 1, found {self.top_k!r}"
+            )
         if len(self.class_weights) != 2:
             raise ConfigError(
                 f"class_weights: expected those of background and foreground, found {self.class_weights!r}"
             )
 
 
-def motion_losses(outputs: MotionOutputs, targets: MotionTargets, config: MotionLossConfig) -> dict[str, Tensor]:
+def motion_losses(
+    outputs: MotionOutputs, targets: MotionTargets, config: MotionLossConfig
+) -> dict[str, Tensor]:
     """All losses of a batch, weighed: `motion_seg`, `_centerness`, `_offset`, `_flow` and `_prob`, scalars.
 
     Frames that `targets.frame_mask` leaves out do not count. If nothing counts, a loss is zero, with zero gradients.
@@ -287,11 +313,15 @@ def motion_losses(outputs: MotionOutputs, targets: MotionTargets, config: Motion
         NotAvailableError: the outputs are of a call without targets.
     """
     if outputs.future is None:
-        raise NotAvailableError("outputs: expected those of a call with targets, found no posterior; give the targets")
+        raise NotAvailableError(
+            "outputs: expected those of a call with targets, found no posterior; give the targets"
+        )
     maps, mask = outputs.maps, targets.frame_mask
     losses = {
-        "seg": config.segmentation * segmentation_loss(maps.segmentation, targets.segmentation, mask, config),
-        "centerness": config.centerness * center_loss(maps.instance_center, targets.centerness, mask, config),
+        "seg": config.segmentation
+        * segmentation_loss(maps.segmentation, targets.segmentation, mask, config),
+        "centerness": config.centerness
+        * center_loss(maps.instance_center, targets.centerness, mask, config),
         "offset": config.offset * vector_loss(maps.instance_offset, targets.offset, mask, config),
         "flow": config.flow * vector_loss(maps.instance_flow, targets.flow, mask, config),
         "prob": config.prob * latent_loss(outputs.present, outputs.future, mask.any(dim=1)),
@@ -299,7 +329,9 @@ def motion_losses(outputs: MotionOutputs, targets: MotionTargets, config: Motion
     return {f"motion_{name}": loss for name, loss in losses.items()}
 
 
-def segmentation_loss(logits: Tensor, target: Tensor, frame_mask: Tensor, config: MotionLossConfig) -> Tensor:
+def segmentation_loss(
+    logits: Tensor, target: Tensor, frame_mask: Tensor, config: MotionLossConfig
+) -> Tensor:
     """Weighted cross entropy of each frame's hardest cells of (N, T, 2, H, W), averaged over all that are kept.
 
     The target is (N, T, H, W) int64, whose ignored cells have no loss; the mask (N, T) bool.
@@ -318,7 +350,9 @@ def segmentation_loss(logits: Tensor, target: Tensor, frame_mask: Tensor, config
     return _mean(per_frame, frame_mask)
 
 
-def center_loss(logits: Tensor, target: Tensor, frame_mask: Tensor, config: MotionLossConfig) -> Tensor:
+def center_loss(
+    logits: Tensor, target: Tensor, frame_mask: Tensor, config: MotionLossConfig
+) -> Tensor:
     """Gaussian focal loss (CornerNet, arXiv:1808.01244) of (N, T, 1, H, W), over the discounted number of centres."""
     logits = precise(logits)
     likely = logits.sigmoid().clamp(_CLIP, 1 - _CLIP)
@@ -330,31 +364,41 @@ def center_loss(logits: Tensor, target: Tensor, frame_mask: Tensor, config: Moti
     return loss / (center.flatten(2).sum(dim=2) * weight).sum().clamp(min=1)
 
 
-def vector_loss(vectors: Tensor, target: Tensor, frame_mask: Tensor, config: MotionLossConfig) -> Tensor:
+def vector_loss(
+    vectors: Tensor, target: Tensor, frame_mask: Tensor, config: MotionLossConfig
+) -> Tensor:
     """Absolute error of (N, T, 2, H, W), cells, summed over both channels, averaged over cells that are not ignored.
 
     A cell is ignored if either channel of the target has the mark; the frames' mask is (N, T) bool.
     """
     vectors = precise(vectors)
-    error = (vectors - target.to(vectors)).abs().sum(dim=2) * _discounts(vectors, config)[:, None, None]
+    error = (vectors - target.to(vectors)).abs().sum(dim=2) * _discounts(vectors, config)[
+        :, None, None
+    ]
     return _mean(error, (target != config.ignore_index).all(dim=2) & frame_mask[:, :, None, None])
 
 
-def latent_loss(present: LatentDistribution, future: LatentDistribution, sample_mask: Tensor) -> Tensor:
+def latent_loss(
+    present: LatentDistribution, future: LatentDistribution, sample_mask: Tensor
+) -> Tensor:
     """The divergence KL(future ‖ present): what the posterior says that the present's distribution does not.
 
     Summed over the latent's channels, averaged over its cells and over the samples in `sample_mask` (N,) bool.
     """
     mu, log_sigma = (precise(each) for each in present)
     future_mu, future_log_sigma = (precise(each) for each in future)
-    spread = (2 * (future_log_sigma - log_sigma)).exp() + ((future_mu - mu) * (-log_sigma).exp()).square()
+    spread = (2 * (future_log_sigma - log_sigma)).exp() + (
+        (future_mu - mu) * (-log_sigma).exp()
+    ).square()
     divergence = (log_sigma - future_log_sigma + (spread - 1) / 2).sum(dim=1)
     return _mean(divergence, sample_mask[:, None, None].expand_as(divergence))
 
 
 def _discounts(like: Tensor, config: MotionLossConfig) -> Tensor:
     """(T,) the weight of each frame of maps (N, T, …)."""
-    return torch.pow(config.discount, torch.arange(like.shape[1], device=like.device, dtype=like.dtype))
+    return torch.pow(
+        config.discount, torch.arange(like.shape[1], device=like.device, dtype=like.dtype)
+    )
 
 
 def _mean(values: Tensor, mask: Tensor) -> Tensor:

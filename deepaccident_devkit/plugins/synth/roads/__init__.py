@@ -21,8 +21,22 @@ from deepaccident_devkit.plugins.synth.roads.junction import (
     Turn,
     tag_of_code,
 )
-from deepaccident_devkit.plugins.synth.roads.layout import ARMS, LANE_WIDTH, Arm, Hump, RoadKind, RoadSpec, Terrain
-from deepaccident_devkit.plugins.synth.roads.paths import Meeting, Path, crossing, lane_change, straight
+from deepaccident_devkit.plugins.synth.roads.layout import (
+    ARMS,
+    LANE_WIDTH,
+    Arm,
+    Hump,
+    RoadKind,
+    RoadSpec,
+    Terrain,
+)
+from deepaccident_devkit.plugins.synth.roads.paths import (
+    Meeting,
+    Path,
+    crossing,
+    lane_change,
+    straight,
+)
 
 __all__ = [
     "ARMS",

@@ -31,7 +31,14 @@ from deepaccident_devkit.plugins.synth.roads.paths import (
     tangent_of_radius,
 )
 from deepaccident_devkit.release.npz import TAGS
-from deepaccident_devkit.support.arrays import BoolArray, ByteArray, FloatArray, FrozenArrays, ShortRepr, readonly
+from deepaccident_devkit.support.arrays import (
+    BoolArray,
+    ByteArray,
+    FloatArray,
+    FrozenArrays,
+    ShortRepr,
+    readonly,
+)
 
 # The raster covers −`MAP_EXTENT` to `MAP_EXTENT` in x and y, metres.
 MAP_EXTENT = EXTENT
@@ -122,7 +129,9 @@ def paint_junction(spec: RoadSpec) -> GroundMap:
     axis = cell_axis()
     band = np.digitize(np.abs(axis), (spec.road_edge, spec.sidewalk_edge))
     kinds = np.array([ROAD, SIDEWALK, GRASS], dtype=np.uint8)[band]
-    codes = np.minimum.outer(kinds, kinds)  # where two roads cross, the lower code lies nearer to the traffic
+    codes = np.minimum.outer(
+        kinds, kinds
+    )  # where two roads cross, the lower code lies nearer to the traffic
     if spec.kind == "three-way":
         beyond = axis > spec.road_edge
         codes[beyond] = kinds[beyond, None]
@@ -153,7 +162,10 @@ def _round_left_corner(view: ByteArray, axis: FloatArray, spec: RoadSpec) -> Non
     """Make the corner between an arm and the one to its left round, in place."""
     along = axis[_HALF:]
     low, high = spec.road_edge, spec.road_edge + KERB_RADIUS
-    rows, columns = np.flatnonzero((axis > low) & (axis < high)), np.flatnonzero((along > low) & (along < high))
+    rows, columns = (
+        np.flatnonzero((axis > low) & (axis < high)),
+        np.flatnonzero((along > low) & (along < high)),
+    )
     off = np.hypot(axis[rows, None] - high, along[None, columns] - high)
     patch = view[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
     patch[off > KERB_RADIUS] = ROAD
@@ -169,7 +181,12 @@ def _paint_arm(view: ByteArray, beside: FloatArray, spec: RoadSpec, *, yields: b
     for divider in range(1, spec.lanes):
         _paint(view, np.abs(across - divider * LANE_WIDTH) < 0.06, dashes, WHITE)
     _paint(view, np.abs(across - spec.lanes_edge) < 0.06, dashes, WHITE)
-    _paint(view, (across > spec.lanes_edge) & (across < spec.road_edge), _slot_lines(along, spec), WHITE)
+    _paint(
+        view,
+        (across > spec.lanes_edge) & (across < spec.road_edge),
+        _slot_lines(along, spec),
+        WHITE,
+    )
     low, high = spec.crosswalk
     _paint(view, _stripes(beside, spec.road_edge), (along > low) & (along < high), WHITE)
     incoming = (beside > 0.2) & (beside < spec.lanes_edge)
@@ -285,7 +302,9 @@ class Junction:
     def stop_line(self, arm: Arm) -> FloatArray:
         """The line where those who come by this arm stop, (2, 2) metres: from the middle line to the lanes' edge."""
         self._check_arm(arm)
-        return readonly(_on_arm(arm, np.full(2, self.spec.stop_line[1]), np.array([0.0, self.spec.lanes_edge])))
+        return readonly(
+            _on_arm(arm, np.full(2, self.spec.stop_line[1]), np.array([0.0, self.spec.lanes_edge]))
+        )
 
     def crosswalk(self, arm: Arm) -> Path:
         """The path across an arm's road, between the sidewalks: seen outward, from right to left; marked or not."""
@@ -354,7 +373,9 @@ def _way(arm: Arm, offset: float, turn: Turn, tangent: float, reach: float) -> P
         return straight(place, yaw, 2 * reach)
     side = 1 if turn == "left" else -1
     run = reach + side * offset - tangent
-    return bent(place, yaw, [(run, 0.0, 0.0), *quarter_turn(tangent, left=turn == "left"), (run, 0.0, 0.0)])
+    return bent(
+        place, yaw, [(run, 0.0, 0.0), *quarter_turn(tangent, left=turn == "left"), (run, 0.0, 0.0)]
+    )
 
 
 def _tangent(spec: RoadSpec, offset: float, turn: Turn) -> float:

@@ -14,7 +14,12 @@ Arm = Literal["west", "south", "east", "north"]
 # The four sides of a junction, counter-clockwise.
 ARMS: tuple[Arm, ...] = get_args(Arm)
 # Unit vectors from the middle of the junction along its arms, ground frame.
-OUTWARD: dict[Arm, tuple[int, int]] = {"west": (-1, 0), "south": (0, -1), "east": (1, 0), "north": (0, 1)}
+OUTWARD: dict[Arm, tuple[int, int]] = {
+    "west": (-1, 0),
+    "south": (0, -1),
+    "east": (1, 0),
+    "north": (0, 1),
+}
 
 # The ground covers −`EXTENT` to `EXTENT` in x and y, metres.
 EXTENT = 150.0
@@ -104,7 +109,10 @@ class Terrain:
         fade, fade_slope = _fade(beside)
         outward = np.array(OUTWARD[self.hump.arm])
         sideways = np.array([-outward[1], outward[0]])
-        normals[..., :2] = -(profile_slope * fade)[..., None] * outward - (profile * fade_slope)[..., None] * sideways
+        normals[..., :2] = (
+            -(profile_slope * fade)[..., None] * outward
+            - (profile * fade_slope)[..., None] * sideways
+        )
         return np.asarray(normals / np.linalg.norm(normals, axis=-1, keepdims=True))
 
     def triangles(self) -> Float32Array:
@@ -113,7 +121,10 @@ class Terrain:
         arm: Arm = "east"
         if self.hump is not None and not self.is_flat:
             arm = self.hump.arm
-            low, high = self.hump.distance - self.hump.length / 2, self.hump.distance + self.hump.length / 2
+            low, high = (
+                self.hump.distance - self.hump.length / 2,
+                self.hump.distance + self.hump.length / 2,
+            )
             along = _with_lines(np.linspace(low, high, int(np.ceil(self.hump.length / _STEP)) + 1))
             slope = np.linspace(*_SHOULDERS, 12)
             beside = _with_lines(np.concatenate([-slope[::-1], slope]))
@@ -145,7 +156,11 @@ def _profile(along: FloatArray, hump: Hump) -> tuple[FloatArray, FloatArray]:
     height = np.where(
         off < curve,
         hump.height - grade * off**2 / (2 * curve),
-        np.where(to_foot < curve, grade * to_foot**2 / (2 * curve), hump.height - grade * (off - curve / 2)),
+        np.where(
+            to_foot < curve,
+            grade * to_foot**2 / (2 * curve),
+            hump.height - grade * (off - curve / 2),
+        ),
     )
     slope = grade * np.minimum(np.minimum(off, to_foot) / curve, 1.0)
     return height, -np.sign(along - hump.distance) * slope
@@ -194,9 +209,13 @@ class RoadSpec:
 
     def __post_init__(self) -> None:
         """Check every field."""
-        object.__setattr__(self, "kind", choice("road.kind", self.kind, get_args(RoadKind), error=ConfigError))
+        object.__setattr__(
+            self, "kind", choice("road.kind", self.kind, get_args(RoadKind), error=ConfigError)
+        )
         if not 1 <= self.lanes <= MAX_LANES:
-            raise ConfigError(f"road.lanes: expected 1 or {MAX_LANES} in each direction, found {self.lanes}")
+            raise ConfigError(
+                f"road.lanes: expected 1 or {MAX_LANES} in each direction, found {self.lanes}"
+            )
         if self.hump is not None:
             self._check_hump(self.hump)
 
@@ -208,7 +227,9 @@ class RoadSpec:
     @property
     def yielding_arms(self) -> tuple[Arm, ...]:
         """The arms that have a yield line: at a junction without lights, those of the road from south to north."""
-        return () if self.signalized else tuple(arm for arm in self.arms if arm in ("south", "north"))
+        return (
+            () if self.signalized else tuple(arm for arm in self.arms if arm in ("south", "north"))
+        )
 
     @property
     def lanes_edge(self) -> float:
@@ -268,7 +289,9 @@ _LAST = 110.0
 def slot_edges(spec: RoadSpec) -> FloatArray:
     """The edges of the parking slots, metres along an arm, (S + 1,)."""
     first = spec.stop_line[1] + _KEPT_FREE
-    return np.asarray(first + SLOT_LENGTH * np.arange(int((_LAST - first) / SLOT_LENGTH) + 1, dtype=np.float64))
+    return np.asarray(
+        first + SLOT_LENGTH * np.arange(int((_LAST - first) / SLOT_LENGTH) + 1, dtype=np.float64)
+    )
 
 
 def parking_places(spec: RoadSpec) -> FloatArray:

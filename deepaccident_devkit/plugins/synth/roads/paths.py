@@ -11,7 +11,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from deepaccident_devkit.errors import GeometryError
-from deepaccident_devkit.support.arrays import BoolArray, FloatArray, FrozenArrays, IntArray, checked, readonly
+from deepaccident_devkit.support.arrays import (
+    BoolArray,
+    FloatArray,
+    FrozenArrays,
+    IntArray,
+    checked,
+    readonly,
+)
 
 # The largest distance between samples, metres.
 SPACING = 0.1
@@ -53,10 +60,14 @@ class Path(FrozenArrays):
         """Check the shapes; raises GeometryError."""
         xy = checked("Path.xy", self.xy, (None, 2))
         if len(xy) < 2:
-            raise GeometryError(f"Path.xy: expected two samples or more, found {len(xy)}; sample the path more densely")
+            raise GeometryError(
+                f"Path.xy: expected two samples or more, found {len(xy)}; sample the path more densely"
+            )
         object.__setattr__(self, "xy", readonly(xy))
         for name in ("yaw", "curvature", "s"):
-            object.__setattr__(self, name, readonly(checked(f"Path.{name}", getattr(self, name), (len(xy),))))
+            object.__setattr__(
+                self, name, readonly(checked(f"Path.{name}", getattr(self, name), (len(xy),)))
+            )
 
     @property
     def length(self) -> float:
@@ -146,7 +157,9 @@ def bent(start: tuple[float, float], yaw: float, pieces: list[tuple[float, float
     nodes, weights = _GAUSS
     step = s[1] - s[0]
     middle_yaw, _ = bend(s[:-1, None] + step * (nodes + 1) / 2)
-    moves = np.stack([np.cos(middle_yaw) @ weights, np.sin(middle_yaw) @ weights], axis=1) * step / 2
+    moves = (
+        np.stack([np.cos(middle_yaw) @ weights, np.sin(middle_yaw) @ weights], axis=1) * step / 2
+    )
     xy = np.array(start) + np.concatenate([np.zeros((1, 2)), np.cumsum(moves, axis=0)])
     at_yaw, curvature = bend(s)
     return Path(xy=xy, yaw=at_yaw, curvature=curvature, s=s)
@@ -164,7 +177,9 @@ def through(points: ArrayLike) -> Path:
     """A path through dense points (N, 2), metres; they must be smooth: yaw and curvature are their differences."""
     raw = checked("points", points, (None, 2))
     if len(raw) < 3:
-        raise GeometryError(f"points: expected three points or more, found {len(raw)}; sample the way more densely")
+        raise GeometryError(
+            f"points: expected three points or more, found {len(raw)}; sample the way more densely"
+        )
     along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(raw, axis=0).T))])
     direction = np.gradient(raw, along, axis=0, edge_order=2)
     yaw = np.unwrap(np.arctan2(direction[:, 1], direction[:, 0]))
@@ -210,7 +225,9 @@ def _near(points: FloatArray, path: Path, within: float) -> BoolArray:
 
 def _squares(points: FloatArray, others: FloatArray) -> FloatArray:
     """Squared distances (N, M) from each of the points (N, 2) to each of the others (M, 2)."""
-    return np.asarray((points[:, None, 0] - others[:, 0]) ** 2 + (points[:, None, 1] - others[:, 1]) ** 2)
+    return np.asarray(
+        (points[:, None, 0] - others[:, 0]) ** 2 + (points[:, None, 1] - others[:, 1]) ** 2
+    )
 
 
 # The angle that the arc turns, radians; the two clothoids together turn as much.

@@ -18,7 +18,9 @@ from deepaccident_devkit.taxonomy import CAMERAS, INFRASTRUCTURE, VEHICLE_AGENTS
 
 # The pole's cameras are placed as on a vehicle of this length and width (metres) with the x and y axes exchanged.
 POLE_LENGTH, POLE_WIDTH = 4.9373, 8.9666
-_CAMERA_YAW = dict(zip(CAMERAS, np.deg2rad([0.0, 55.0, -55.0, 180.0, 110.0, -110.0]).tolist(), strict=True))
+_CAMERA_YAW = dict(
+    zip(CAMERAS, np.deg2rad([0.0, 55.0, -55.0, 180.0, 110.0, -110.0]).tolist(), strict=True)
+)
 # Camera → its place on the box: 1 front or left, −1 back or right, 0 neither.
 _SIDES = dict(zip(CAMERAS, ((1, 0), (1, 1), (1, -1), (-1, 0), (-1, 1), (-1, -1)), strict=True))
 
@@ -90,7 +92,11 @@ class Agent:
 
     def ground_from_ego(self, scene: Scene) -> SE3:
         """The agent's pose at a moment, with the tilt of the ground."""
-        return self.box_from_ego if self.row is None else SE3(scene.frames[self.row]) @ self.box_from_ego
+        return (
+            self.box_from_ego
+            if self.row is None
+            else SE3(scene.frames[self.row]) @ self.box_from_ego
+        )
 
     def ground_from_lidar(self, scene: Scene) -> SE3:
         """The LiDAR's pose at a moment."""
@@ -115,7 +121,9 @@ def make_agents(
 ) -> tuple[Agent, ...]:
     """The five agents, in the order of `taxonomy.AGENTS`; `ids` are the actors of the four that are vehicles."""
     rows = {name: actors.row_of(ids[name]) for name in VEHICLE_AGENTS}
-    vehicles = [_vehicle(name, row, actors.all[row], image_size, mount) for name, row in rows.items()]
+    vehicles = [
+        _vehicle(name, row, actors.all[row], image_size, mount) for name, row in rows.items()
+    ]
     pole = Agent(
         name=INFRASTRUCTURE,
         row=None,
@@ -126,7 +134,9 @@ def make_agents(
     return (*vehicles, pole)
 
 
-def _vehicle(name: AgentName, row: int, actor: Actor, image_size: tuple[int, int], mount: Mount) -> Agent:
+def _vehicle(
+    name: AgentName, row: int, actor: Actor, image_size: tuple[int, int], mount: Mount
+) -> Agent:
     x, y = actor.origin
     return Agent(
         name=name,
@@ -142,12 +152,18 @@ def _vehicle_places(actor: Actor) -> dict[str, tuple[float, float]]:
     length, width, _ = actor.size
     x, y = actor.origin
     ahead, aside = length / 2 + _CLEAR_OF_HULL, width / 2 + _CLEAR_OF_HULL
-    return {camera: (along * ahead - x, across * aside - y) for camera, (along, across) in _SIDES.items()}
+    return {
+        camera: (along * ahead - x, across * aside - y)
+        for camera, (along, across) in _SIDES.items()
+    }
 
 
 def _pole_places() -> dict[str, tuple[float, float]]:
     """x, y of each camera in the LiDAR frame, metres."""
-    return {camera: (-across * POLE_WIDTH / 2, along * POLE_LENGTH / 2) for camera, (along, across) in _SIDES.items()}
+    return {
+        camera: (-across * POLE_WIDTH / 2, along * POLE_LENGTH / 2)
+        for camera, (along, across) in _SIDES.items()
+    }
 
 
 def _cameras(
@@ -174,15 +190,22 @@ def with_single_precision(calib: Calib) -> Calib:
     rigid only to about 1e-7. This function does the same, without random numbers. Intrinsics do not change.
     """
     world_from_lidar = calib.world_from_ego.matrix @ calib.ego_from_lidar.matrix
-    lidar_from_camera = np.linalg.inv(np.stack([pose.matrix for pose in calib.camera_from_lidar.values()]))
-    world_from_ego, lidar = _single(calib.world_from_ego.matrix), _single(_by_quaternion(world_from_lidar))
+    lidar_from_camera = np.linalg.inv(
+        np.stack([pose.matrix for pose in calib.camera_from_lidar.values()])
+    )
+    world_from_ego, lidar = (
+        _single(calib.world_from_ego.matrix),
+        _single(_by_quaternion(world_from_lidar)),
+    )
     camera_from_world = np.linalg.inv(_single(world_from_lidar @ lidar_from_camera))
     return Calib(
         ego_from_lidar=trusted_se3(np.linalg.inv(world_from_ego) @ lidar),
         world_from_ego=trusted_se3(world_from_ego),
         camera_from_lidar={
             channel: trusted_se3(pose)
-            for channel, pose in zip(calib.camera_from_lidar, camera_from_world @ lidar, strict=True)
+            for channel, pose in zip(
+                calib.camera_from_lidar, camera_from_world @ lidar, strict=True
+            )
         },
         intrinsic=calib.intrinsic,
     )

@@ -23,24 +23,38 @@ from deepaccident_devkit.taxonomy import CATEGORIES, OWN_ACTOR_ID, UNTRACKED_ID
 # Corners that are at least so many metres ahead of the camera are projected.
 CLOSE = 0.05
 # The pairs of corners that are the edges of a box.
-_EDGES = np.array([(a, b) for a, b in combinations(range(8), 2) if (CORNER_SIGNS[a] == CORNER_SIGNS[b]).sum() == 2])
+_EDGES = np.array(
+    [
+        (a, b)
+        for a, b in combinations(range(8), 2)
+        if (CORNER_SIGNS[a] == CORNER_SIGNS[b]).sum() == 2
+    ]
+)
 # Pixels that are added around a rectangle.
 _SPARE = 1.0
 
 
-def rectangles(corners: FloatArray, slope: FloatArray, size: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
+def rectangles(
+    corners: FloatArray, slope: FloatArray, size: tuple[int, int]
+) -> tuple[FloatArray, FloatArray]:
     """Least and greatest column and row, (A, 2) each, not rounded, of boxes (A, 8, 3), metres, in the optical frame.
 
     Of a box that is partly behind the camera, only the part ahead counts; if all of it is behind, the two are equal.
     `slope` is that of a pixel, across and down, (2,) or (A, 2); `size` the picture's width and height.
     """
-    low, high = _spans(corners[..., :2] / np.maximum(corners[..., 2:], CLOSE), corners[..., 2] >= CLOSE)
-    partly = np.flatnonzero((corners[..., 2].min(axis=1) < CLOSE) & (corners[..., 2].max(axis=1) > CLOSE))
+    low, high = _spans(
+        corners[..., :2] / np.maximum(corners[..., 2:], CLOSE), corners[..., 2] >= CLOSE
+    )
+    partly = np.flatnonzero(
+        (corners[..., 2].min(axis=1) < CLOSE) & (corners[..., 2].max(axis=1) > CLOSE)
+    )
     if len(partly):
         cut, crosses = _cut_edges(corners[partly])
         ahead = np.concatenate([corners[partly], cut], axis=1)
         shown = np.concatenate([corners[partly, :, 2] >= CLOSE, crosses], axis=1)
-        low[partly], high[partly] = _spans(ahead[..., :2] / np.maximum(ahead[..., 2:], CLOSE), shown)
+        low[partly], high[partly] = _spans(
+            ahead[..., :2] / np.maximum(ahead[..., 2:], CLOSE), shown
+        )
     middle = np.array(size) / 2
     return low / slope + middle, high / slope + middle
 
@@ -118,7 +132,9 @@ class _Windows:
 class CameraViews:
     """What C cameras at poses `ground_from_camera` might see of road users, rows (K,), at a moment."""
 
-    def __init__(self, scene: Scene, cameras: Sequence[Camera], poses: Sequence[SE3], rows: IntArray) -> None:
+    def __init__(
+        self, scene: Scene, cameras: Sequence[Camera], poses: Sequence[SE3], rows: IntArray
+    ) -> None:
         matrices = np.stack([pose.matrix for pose in poses])
         self._axes, self._origins = matrices[:, :3, :3], matrices[:, :3, 3]
         self._slopes = np.stack([_slope(camera) for camera in cameras])
@@ -126,12 +142,16 @@ class CameraViews:
         corners = (scene.box_corners[rows] - self._origins[:, None, None]) @ self._axes[:, None]
         self._windows = _windows(corners, self._slopes)
 
-    def pixels(self, wanted: BoolArray | None = None, *, rays_across: int = _RAYS_ACROSS) -> IntArray:
+    def pixels(
+        self, wanted: BoolArray | None = None, *, rays_across: int = _RAYS_ACROSS
+    ) -> IntArray:
         """How many pixels (C, K) int64 of a `WIDTH` × `HEIGHT` picture road users have; large numbers are approximate.
 
         Those that are not `wanted` (K,) have 0. At most so many rays are cast to each, across and also down.
         """
-        windows = self._windows if wanted is None else self._windows.select(wanted[self._windows.actor])
+        windows = (
+            self._windows if wanted is None else self._windows.select(wanted[self._windows.actor])
+        )
         pixel, window, step = _pixels(windows, rays_across)
         camera = windows.camera[window]
         aside = (pixel + 0.5 - (WIDTH / 2, HEIGHT / 2)) * self._slopes[camera]
@@ -141,7 +161,11 @@ class CameraViews:
         met = np.flatnonzero(self._scene.face_owner[face] == self._rows[windows.actor[window]])
         place = camera[met] * len(self._rows) + windows.actor[window[met]]
         count = len(self._slopes) * len(self._rows)
-        return np.bincount(place, step[window[met]] ** 2, minlength=count).astype(np.int64).reshape(-1, len(self._rows))
+        return (
+            np.bincount(place, step[window[met]] ** 2, minlength=count)
+            .astype(np.int64)
+            .reshape(-1, len(self._rows))
+        )
 
 
 def camera_visible(scene: Scene, agent: Agent, ground_from_lidar: SE3, rows: IntArray) -> BoolArray:
@@ -161,13 +185,17 @@ def camera_visible(scene: Scene, agent: Agent, ground_from_lidar: SE3, rows: Int
 def _slope(camera: Camera) -> FloatArray:
     """The slope of one pixel of the `WIDTH` × `HEIGHT` picture, across and down, (2,)."""
     optics = camera.optics
-    return np.asarray(np.array([optics.width / WIDTH, optics.height / HEIGHT]) / optics.intrinsic[0, 0])
+    return np.asarray(
+        np.array([optics.width / WIDTH, optics.height / HEIGHT]) / optics.intrinsic[0, 0]
+    )
 
 
 def _windows(corners: FloatArray, slopes: FloatArray) -> _Windows:
     """The pixels that boxes (C, K, 8, 3) in C optical frames may cover; `slopes` (C, 2) are those of a pixel."""
     count = corners.shape[1]
-    low, high = rectangles(corners.reshape(-1, 8, 3), np.repeat(slopes, count, axis=0), (WIDTH, HEIGHT))
+    low, high = rectangles(
+        corners.reshape(-1, 8, 3), np.repeat(slopes, count, axis=0), (WIDTH, HEIGHT)
+    )
     first = np.floor(low).clip(0, (WIDTH, HEIGHT)).astype(np.int64)
     size = np.ceil(high).clip(0, (WIDTH, HEIGHT)).astype(np.int64) - first
     rows = np.flatnonzero((size > 0).all(axis=1))
@@ -198,7 +226,9 @@ MOST_AHEAD = 0.012
 _PEDESTRIAN = CATEGORIES.index("pedestrian")
 
 
-def annotate(scene: Scene, agent: Agent, world_from_ground: SE3, scan: Scan, *, exact: bool) -> Labels:
+def annotate(
+    scene: Scene, agent: Agent, world_from_ground: SE3, scan: Scan, *, exact: bool
+) -> Labels:
     """The labels of one agent at one moment: parked vehicles, other vehicles, pedestrians.
 
     `num_lidar_pts` counts all stored points of the scan in each box; if `exact` in the annotated boxes, and not in
@@ -210,7 +240,10 @@ def annotate(scene: Scene, agent: Agent, world_from_ground: SE3, scan: Scan, *, 
     rows = _in_order(scene, distance <= LABEL_RANGE)
     actor_id = np.where(distance > TRACKING_RANGE, UNTRACKED_ID, scene.actors.actor_id)
     lidar_from_ground = ground_from_lidar.inverse()
-    lidar_center, lidar_velocity = lidar_from_ground.apply(center), lidar_from_ground.rotate(velocity)
+    lidar_center, lidar_velocity = (
+        lidar_from_ground.apply(center),
+        lidar_from_ground.rotate(velocity),
+    )
     lidar_yaw = _turned(yaw, lidar_from_ground)
     world_velocity = world_from_ground.rotate(velocity)[:, :2]
     agent_velocity = np.zeros((1, 2))
@@ -218,7 +251,10 @@ def annotate(scene: Scene, agent: Agent, world_from_ground: SE3, scan: Scan, *, 
         actor_id[agent.row] = OWN_ACTOR_ID
         agent_velocity[0] = world_velocity[agent.row]
         lidar_yaw[agent.row], lidar_velocity[agent.row] = 0.0, 0.0
-    size, ahead = scene.actors.size[rows], np.zeros((len(rows), 3)) if exact else gone_on(lidar_velocity[rows])
+    size, ahead = (
+        scene.actors.size[rows],
+        np.zeros((len(rows), 3)) if exact else gone_on(lidar_velocity[rows]),
+    )
     counted = Boxes.from_arrays(lidar_center[rows] + ahead, size, lidar_yaw[rows], frame="lidar")
     return Labels(
         raw=False,
@@ -238,7 +274,10 @@ def annotate(scene: Scene, agent: Agent, world_from_ground: SE3, scan: Scan, *, 
 def gone_on(velocity: FloatArray) -> FloatArray:
     """How far (N, 3), metres, actors with velocities (N, 3) have moved on when points are counted."""
     way = COUNTED_LATER * velocity
-    return np.asarray(way * np.minimum(1.0, MOST_AHEAD / np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-9)))
+    return np.asarray(
+        way
+        * np.minimum(1.0, MOST_AHEAD / np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-9))
+    )
 
 
 def _in_order(scene: Scene, wanted: BoolArray) -> IntArray:

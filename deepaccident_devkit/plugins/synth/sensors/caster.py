@@ -67,18 +67,26 @@ class EmbreeCaster:
     def __init__(self, corners: FloatArray, terrain: Terrain | None = None) -> None:
         from embreex import mesh_construction, rtcore_scene
 
-        vertices, triangles = corners.reshape(-1, 3).astype(np.float32), _triangles_of_solids(len(corners))
+        vertices, triangles = (
+            corners.reshape(-1, 3).astype(np.float32),
+            _triangles_of_solids(len(corners)),
+        )
         self._faces = len(corners) * FACES_A_SOLID
         self._plane = terrain is not None and terrain.is_flat
         if terrain is not None and not terrain.is_flat:
             ground = terrain.triangles().reshape(-1, 3)
             numbers = np.arange(len(ground)).reshape(-1, 3) + len(vertices)
-            vertices, triangles = np.concatenate([vertices, ground]), np.concatenate([triangles, _as_tuples(numbers)])
+            vertices, triangles = (
+                np.concatenate([vertices, ground]),
+                np.concatenate([triangles, _as_tuples(numbers)]),
+            )
         self._is_empty = len(triangles) == 0
         self._scene: Any = rtcore_scene.EmbreeScene()
         if not self._is_empty:
             # Embree reads the numbers one by one: with Python's own it takes half the time
-            self._mesh: Any = mesh_construction.TriangleMesh(self._scene, vertices.astype(object), triangles)
+            self._mesh: Any = mesh_construction.TriangleMesh(
+                self._scene, vertices.astype(object), triangles
+            )
 
     def cast(
         self, origin: FloatArray, directions: AnyArray, reach: AnyArray | None = None
@@ -86,10 +94,15 @@ class EmbreeCaster:
         """See `Caster`."""
         rays = np.ascontiguousarray(directions, dtype=np.float32)
         if self._is_empty or not len(rays):
-            distance, face = np.full(len(rays), np.inf, np.float32), np.full(len(rays), NOTHING, np.int32)
+            distance, face = (
+                np.full(len(rays), np.inf, np.float32),
+                np.full(len(rays), NOTHING, np.int32),
+            )
         else:
             starts = np.broadcast_to(origin.astype(np.float32), rays.shape)
-            ends = None if reach is None else reach.astype(np.float32)  # a copy, because Embree writes into it
+            ends = (
+                None if reach is None else reach.astype(np.float32)
+            )  # a copy, because Embree writes into it
             hits = self._scene.run(starts, rays, ends, query="INTERSECT", output=True)
             face, distance = hits["primID"] >> 1, hits["tfar"]
             distance[face < 0] = np.inf
@@ -122,7 +135,9 @@ class NumpyCaster:
         self._normals = normals.reshape(-1, FACES_A_SOLID, 3)
         self._offsets = offsets.reshape(-1, FACES_A_SOLID)
         self._middle = corners.mean(axis=1)
-        self._radius = np.linalg.norm(corners - self._middle[:, None], axis=2).max(axis=1, initial=0.0)
+        self._radius = np.linalg.norm(corners - self._middle[:, None], axis=2).max(
+            axis=1, initial=0.0
+        )
         self._terrain = terrain
 
     def cast(
@@ -130,7 +145,9 @@ class NumpyCaster:
     ) -> tuple[AnyArray, AnyArray]:
         """See `Caster`."""
         rays = np.asarray(directions, dtype=np.float64)
-        distance, face = self._cast_in_turn(origin, rays) if origin.ndim == 2 else self._cast_from(origin, rays)
+        distance, face = (
+            self._cast_in_turn(origin, rays) if origin.ndim == 2 else self._cast_from(origin, rays)
+        )
         if reach is not None:
             beyond = distance > reach
             distance[beyond], face[beyond] = np.inf, NOTHING
@@ -146,7 +163,9 @@ class NumpyCaster:
             face[np.isfinite(distance)] = GROUND
         for first in range(0, len(self._radius), _SOLIDS_AT_ONCE):
             solids = np.arange(first, min(first + _SOLIDS_AT_ONCE, len(self._radius)))
-            for solid, is_near in zip(solids.tolist(), self._near(solids, origin, units), strict=True):
+            for solid, is_near in zip(
+                solids.tolist(), self._near(solids, origin, units), strict=True
+            ):
                 near = np.flatnonzero(is_near)
                 entry, entered = self._entry(solid, origin, rays[near])
                 closer = entry < distance[near]
@@ -173,7 +192,9 @@ class NumpyCaster:
         around = (towards**2).sum(axis=1) <= radius**2
         return np.asarray((along >= least[:, None]) | around[:, None])
 
-    def _entry(self, solid: int, origin: FloatArray, rays: FloatArray) -> tuple[FloatArray, IntArray]:
+    def _entry(
+        self, solid: int, origin: FloatArray, rays: FloatArray
+    ) -> tuple[FloatArray, IntArray]:
         """Where rays enter a solid (infinite if they do not), and the face through which they enter."""
         towards = rays @ self._normals[solid].T
         height = self._offsets[solid] - self._normals[solid] @ origin
@@ -216,6 +237,8 @@ def plane_distance(height: float | FloatArray, upwards: NDArray[Any]) -> NDArray
     return np.where(falling, height / -np.where(falling, upwards, -1.0), np.inf)
 
 
-def _height_above(terrain: Terrain, origin: FloatArray, rays: FloatArray, reached: FloatArray) -> FloatArray:
+def _height_above(
+    terrain: Terrain, origin: FloatArray, rays: FloatArray, reached: FloatArray
+) -> FloatArray:
     points = origin + rays * reached[:, None]
     return np.asarray(points[:, 2] - terrain.height(points[:, :2]))

@@ -15,7 +15,14 @@ from deepaccident_devkit.plugins.synth.sensors.caster import NOTHING, make_caste
 from deepaccident_devkit.plugins.synth.sensors.scene import Scene, Setting
 from deepaccident_devkit.plugins.synth.shapes import BOX_CLEARANCE
 from deepaccident_devkit.plugins.synth.solids import FACES_A_SOLID
-from deepaccident_devkit.support.arrays import AnyArray, BoolArray, Float32Array, FloatArray, IntArray, readonly
+from deepaccident_devkit.support.arrays import (
+    AnyArray,
+    BoolArray,
+    Float32Array,
+    FloatArray,
+    IntArray,
+    readonly,
+)
 
 LIDAR_CHANNELS = 32
 # Elevation of the lowest and the highest channel, degrees.
@@ -56,14 +63,22 @@ def rays_to_boxes(scene: Scene, ground_from_lidar: SE3, *groups: IntArray) -> Bo
     """Which rays may pass through a box of each group of actors, (G, 32 · 1400): those in a window around each box."""
     rows = np.concatenate(groups)
     frames, half = scene.frames[rows], scene.actors.size[rows, :2] / 2
-    corners = ground_from_lidar.inverse().apply(scene.box_corners[rows].reshape(-1, 3)).reshape(-1, 8, 3)
-    place = np.einsum("nk,nkl->nl", ground_from_lidar.translation - frames[:, :3, 3], frames[:, :3, :3])
+    corners = (
+        ground_from_lidar.inverse().apply(scene.box_corners[rows].reshape(-1, 3)).reshape(-1, 8, 3)
+    )
+    place = np.einsum(
+        "nk,nkl->nl", ground_from_lidar.translation - frames[:, :3, 3], frames[:, :3, :3]
+    )
     gap = np.maximum(np.abs(place[:, :2]) - half - _SPARE, 0.0)
     reach = np.hypot(corners[..., 0], corners[..., 1])
     nearest = np.hypot(gap[:, 0], gap[:, 1]) * _CLOSER
-    first, last = _channels(corners[..., 2].min(axis=1), corners[..., 2].max(axis=1), nearest, reach.max(axis=1))
+    first, last = _channels(
+        corners[..., 2].min(axis=1), corners[..., 2].max(axis=1), nearest, reach.max(axis=1)
+    )
     start, count = _azimuths(corners, around=nearest == 0)
-    met = np.zeros((len(groups), LIDAR_CHANNELS, 2 * AZIMUTHS), dtype=bool)  # 2 turns, for windows across the end
+    met = np.zeros(
+        (len(groups), LIDAR_CHANNELS, 2 * AZIMUTHS), dtype=bool
+    )  # 2 turns, for windows across the end
     group = np.repeat(np.arange(len(groups)), [len(each) for each in groups])
     for row in np.flatnonzero(nearest < RANGE).tolist():
         met[group[row], first[row] : last[row], start[row] : start[row] + count[row]] = True
@@ -99,12 +114,17 @@ def _channels(
 def _azimuths(corners: FloatArray, *, around: BoolArray) -> tuple[IntArray, IntArray]:
     """First azimuth and number of azimuths of the rays to boxes (N, 8, 3); all azimuths if a box is `around`."""
     middle = np.arctan2(*corners[..., :2].mean(axis=1).T[::-1])
-    aside = np.abs((np.arctan2(corners[..., 1], corners[..., 0]) - middle[:, None] + np.pi) % (2 * np.pi) - np.pi)
+    aside = np.abs(
+        (np.arctan2(corners[..., 1], corners[..., 0]) - middle[:, None] + np.pi) % (2 * np.pi)
+        - np.pi
+    )
     half_turn = np.where(around, np.pi, aside.max(axis=1))
     column = (np.pi - middle) / (2 * np.pi) * AZIMUTHS
     wide = half_turn / (2 * np.pi) * AZIMUTHS + 1
     start = np.floor(column - wide).astype(np.int64)
-    return start % AZIMUTHS, np.minimum(np.ceil(column + wide).astype(np.int64) + 1 - start, AZIMUTHS)
+    return start % AZIMUTHS, np.minimum(
+        np.ceil(column + wide).astype(np.int64) + 1 - start, AZIMUTHS
+    )
 
 
 @cache
@@ -197,11 +217,19 @@ def make_lidar(setting: Setting, agent: Agent) -> Lidar:
     caster = make_caster(setting.moving_shapes.corners[solids])
     distance, face = caster.cast(place, turned_rays(np.eye(3), body))
     first = setting.faces + FACES_A_SOLID * int(solids[0])
-    return Lidar(row=agent.row, body=body, distance=distance, face=np.where(face >= 0, face + first, face))
+    return Lidar(
+        row=agent.row, body=body, distance=distance, face=np.where(face >= 0, face + first, face)
+    )
 
 
 def scan(
-    scene: Scene, lidar: Lidar, ground_from_lidar: SE3, air: Air, rng: np.random.Generator, *, boxed: bool = False
+    scene: Scene,
+    lidar: Lidar,
+    ground_from_lidar: SE3,
+    air: Air,
+    rng: np.random.Generator,
+    *,
+    boxed: bool = False,
 ) -> Scan:
     """What a LiDAR at this pose measures; the number of random draws does not depend on what the rays meet.
 
@@ -223,7 +251,10 @@ def scan(
     ray, reach = rows[back], reach[back]
     measured = np.maximum(reach + np.float32(RANGE_NOISE) * normal[noise + ray], np.float32(0.1))
     return Scan(
-        (lidar_ray_directions().take(ray, axis=0) * measured[:, None]).astype(np.float32), ray, face[back], reach
+        (lidar_ray_directions().take(ray, axis=0) * measured[:, None]).astype(np.float32),
+        ray,
+        face[back],
+        reach,
     )
 
 
@@ -236,28 +267,38 @@ def _brightness(reach: AnyArray, air: Air) -> Float32Array:
     return np.asarray(np.exp(-(_ATTENUATION + air.attenuation) * reach), dtype=np.float32)
 
 
-def cast_all(scene: Scene, lidar: Lidar, ground_from_lidar: SE3) -> tuple[IntArray, AnyArray, AnyArray]:
+def cast_all(
+    scene: Scene, lidar: Lidar, ground_from_lidar: SE3
+) -> tuple[IntArray, AnyArray, AnyArray]:
     """The rows of all rays; how far they go, correct up to `RANGE`; and what they meet."""
     setting, rays = scene.setting, turned_rays(ground_from_lidar.rotation)
     pose = ground_from_lidar.matrix.tobytes()
     origin, columns = ground_from_lidar.translation, rays.reshape(LIDAR_CHANNELS, AZIMUTHS, 3)
     still = setting.kept(pose, lambda: setting.cast_columns(origin, columns, RANGE))
-    near = np.flatnonzero(rays_to_boxes(scene, ground_from_lidar, _others(setting.moving, lidar))[0])
+    near = np.flatnonzero(
+        rays_to_boxes(scene, ground_from_lidar, _others(setting.moving, lidar))[0]
+    )
     distance, face = scene.with_movers(origin, rays, still, near)
     met = np.isfinite(lidar.distance)
     distance[lidar.body[met]], face[lidar.body[met]] = lidar.distance[met], lidar.face[met]
     return np.arange(len(rays)), distance, face
 
 
-def _cast_boxed(scene: Scene, lidar: Lidar, ground_from_lidar: SE3) -> tuple[IntArray, AnyArray, AnyArray]:
+def _cast_boxed(
+    scene: Scene, lidar: Lidar, ground_from_lidar: SE3
+) -> tuple[IntArray, AnyArray, AnyArray]:
     """The same as `cast_all`, for only the rays that may pass through a box."""
     setting = scene.setting
-    near, others = rays_to_boxes(scene, ground_from_lidar, _others(setting.moving, lidar), setting.parked)
+    near, others = rays_to_boxes(
+        scene, ground_from_lidar, _others(setting.moving, lidar), setting.parked
+    )
     wanted = near | others
     wanted[lidar.body[np.isfinite(lidar.distance)]] = False
     rows = np.flatnonzero(wanted)
     rays = turned_rays(ground_from_lidar.rotation, rows)
-    distance, face = scene.cast(ground_from_lidar.translation, rays, near=np.flatnonzero(near[rows]))
+    distance, face = scene.cast(
+        ground_from_lidar.translation, rays, near=np.flatnonzero(near[rows])
+    )
     own = np.flatnonzero(~wanted[lidar.body])
     return (
         np.concatenate([rows, lidar.body[own]]),
@@ -273,7 +314,10 @@ def _random_numbers() -> tuple[Float32Array, Float32Array]:
     Each turn takes them from another place: to draw new ones would take as long as to cast the rays to the boxes.
     """
     rng = np.random.default_rng(0)
-    normal, even = rng.standard_normal(_NUMBERS, dtype=np.float32), rng.random(_NUMBERS, dtype=np.float32)
+    normal, even = (
+        rng.standard_normal(_NUMBERS, dtype=np.float32),
+        rng.random(_NUMBERS, dtype=np.float32),
+    )
     return readonly(normal), readonly(even)
 
 
@@ -284,5 +328,8 @@ def _others(rows: IntArray, lidar: Lidar) -> IntArray:
 def returns(reach: Float32Array, luck: Float32Array, air: Air) -> NDArray[np.bool_]:
     """Which rays (N,) return, by the distance in metres at which they met something: of the weak ones fewer."""
     near = np.minimum(reach, RANGE)
-    lost = _LOST_DARK * np.maximum(1 - _brightness(near, air) / _SURE, 0) + air.lost * (near / RANGE) ** 2
+    lost = (
+        _LOST_DARK * np.maximum(1 - _brightness(near, air) / _SURE, 0)
+        + air.lost * (near / RANGE) ** 2
+    )
     return np.asarray((reach <= RANGE) & (luck >= lost))

@@ -9,7 +9,13 @@ from deepaccident_devkit.plugins.synth.roads import MAP_EXTENT, Arm
 from deepaccident_devkit.plugins.synth.sensors.scene import Scene
 from deepaccident_devkit.plugins.synth.solids import Color
 from deepaccident_devkit.plugins.synth.world import LAMP_COLORS, LANTERN_COLOR, World
-from deepaccident_devkit.support.arrays import AnyArray, ByteArray, Float32Array, FloatArray, readonly
+from deepaccident_devkit.support.arrays import (
+    AnyArray,
+    ByteArray,
+    Float32Array,
+    FloatArray,
+    readonly,
+)
 from deepaccident_devkit.taxonomy import CATEGORIES
 
 
@@ -118,7 +124,9 @@ def light_of(weather: str, time_of_day: str) -> Light:
     sky, air = _TIMES[time_of_day], _WEATHERS[weather]
     elevation = np.deg2rad(sky.elevation)
     level = np.cos(elevation)
-    to_sun = np.array([level * np.cos(_SUN_AZIMUTH), level * np.sin(_SUN_AZIMUTH), np.sin(elevation)])
+    to_sun = np.array(
+        [level * np.cos(_SUN_AZIMUTH), level * np.sin(_SUN_AZIMUTH), np.sin(elevation)]
+    )
     grey = _GREY * float(np.mean(sky.horizon)) / 210
     return Light(
         to_sun=readonly(to_sun),
@@ -162,7 +170,9 @@ class Sky:
         column = np.asarray(azimuth) * np.float32(_COLUMNS / (2 * np.pi))
         rise = np.clip(z / np.maximum(np.asarray(run), np.float32(1e-6)), 0, np.float32(_STEEPEST))
         row = rise * np.float32((_ROWS - 1) / _STEEPEST)
-        return np.asarray(cv2.remap(self.picture, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
+        return np.asarray(
+            cv2.remap(self.picture, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        )
 
 
 def make_sky(light: Light, rng: np.random.Generator) -> Sky:
@@ -170,26 +180,41 @@ def make_sky(light: Light, rng: np.random.Generator) -> Sky:
     azimuth = (np.arange(_COLUMNS) + 0.5) / _COLUMNS * 2 * np.pi
     rise = np.arange(_ROWS) / (_ROWS - 1) * _STEEPEST
     up = (np.minimum(rise / 0.6, 1.0) ** 0.7)[:, None, None]
-    color = np.broadcast_to(light.horizon * (1 - up) + light.zenith * up, (_ROWS, _COLUMNS, 3)).copy()
-    directions = np.stack(np.broadcast_arrays(np.cos(azimuth), np.sin(azimuth), rise[:, None]), axis=-1)
+    color = np.broadcast_to(
+        light.horizon * (1 - up) + light.zenith * up, (_ROWS, _COLUMNS, 3)
+    ).copy()
+    directions = np.stack(
+        np.broadcast_arrays(np.cos(azimuth), np.sin(azimuth), rise[:, None]), axis=-1
+    )
     directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
     glow = np.maximum(directions @ light.to_sun, 0.0)[..., None]
     strength = 1 - light.ambient
     color += strength * light.tint * (90 * glow**12 + 400 * glow**900)
-    cover = _clouds(azimuth, rise, light.cover, rng)[..., None] * np.minimum(rise / 0.12, 1.0)[:, None, None]
+    cover = (
+        _clouds(azimuth, rise, light.cover, rng)[..., None]
+        * np.minimum(rise / 0.12, 1.0)[:, None, None]
+    )
     lit = light.horizon * (0.92 + 0.12 * glow**4)
     picture = (color * (1 - cover) + lit * cover).clip(0, 255).astype(np.uint8)
     return Sky(np.concatenate([picture, picture[:, :1]], axis=1))
 
 
-def _clouds(azimuth: FloatArray, rise: FloatArray, cover: float, rng: np.random.Generator) -> FloatArray:
+def _clouds(
+    azimuth: FloatArray, rise: FloatArray, cover: float, rng: np.random.Generator
+) -> FloatArray:
     """How much of each pixel (rows, columns) a layer of clouds takes, 0 to 0.85."""
     import cv2
 
     noise = _seamless_noise(256, rng)
     distance = _DRIFT / np.maximum(rise, 0.04)[:, None]
-    column, row = ((distance * turn * 8 % 256).astype(np.float32) for turn in (np.cos(azimuth), np.sin(azimuth)))
-    layer = np.asarray(cv2.remap(noise, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP), dtype=np.float64)
+    column, row = (
+        (distance * turn * 8 % 256).astype(np.float32)
+        for turn in (np.cos(azimuth), np.sin(azimuth))
+    )
+    layer = np.asarray(
+        cv2.remap(noise, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP),
+        dtype=np.float64,
+    )
     level = np.quantile(noise, 1 - min(cover + 0.15, 0.98))
     return np.asarray(0.85 * np.clip((layer - level) / (0.6 * float(noise.std())), 0, 1))
 
@@ -197,7 +222,9 @@ def _clouds(azimuth: FloatArray, rise: FloatArray, cover: float, rng: np.random.
 def _seamless_noise(side: int, rng: np.random.Generator) -> Float32Array:
     """Rough and fine noise (side, side) that continues from each edge to the opposite edge."""
     frequency = np.hypot(*np.meshgrid(np.fft.fftfreq(side), np.fft.fftfreq(side)))
-    spectrum = np.fft.fft2(rng.standard_normal((side, side))) / np.maximum(frequency, 1 / side) ** 1.6
+    spectrum = (
+        np.fft.fft2(rng.standard_normal((side, side))) / np.maximum(frequency, 1 / side) ** 1.6
+    )
     spectrum[0, 0] = 0
     return np.asarray(np.fft.ifft2(spectrum).real, dtype=np.float32)
 
@@ -242,11 +269,17 @@ def lamplight(scene: Scene) -> Float32Array:
     import cv2
 
     lit = np.zeros((_CELLS, _CELLS), dtype=np.float32)
-    for row in scene.setting.moving[np.isin(scene.actors.category[scene.setting.moving], _WITH_LAMPS)].tolist():
+    for row in scene.setting.moving[
+        np.isin(scene.actors.category[scene.setting.moving], _WITH_LAMPS)
+    ].tolist():
         x, y, yaw = scene.snapshot.poses[row].tolist()
         _add_beam(lit, x, y, yaw, float(scene.actors.size[row, 0]) / 2)
     props = scene.setting.world.props
-    for x, y in props.corners[(props.colors[:, 0] == LANTERN_COLOR).all(axis=1), :, :2].mean(axis=1).tolist():
+    for x, y in (
+        props.corners[(props.colors[:, 0] == LANTERN_COLOR).all(axis=1), :, :2]
+        .mean(axis=1)
+        .tolist()
+    ):
         _add_pool(lit, x, y)
     return np.asarray(cv2.GaussianBlur(lit, (5, 5), 0))
 
@@ -266,16 +299,20 @@ def _add_beam(lit: Float32Array, x: float, y: float, yaw: float, half: float) ->
     ahead = np.cos(yaw) * east + np.sin(yaw) * north - half
     aside = np.abs(np.cos(yaw) * north - np.sin(yaw) * east)
     width = 0.9 + _SPREAD * np.maximum(ahead, 0)
-    beam = np.clip(ahead / 2, 0, 1) * np.clip(1 - ahead / _BEAM, 0, 1) ** 1.5 * np.clip(1.6 - aside / width, 0, 1)
+    beam = (
+        np.clip(ahead / 2, 0, 1)
+        * np.clip(1 - ahead / _BEAM, 0, 1) ** 1.5
+        * np.clip(1.6 - aside / width, 0, 1)
+    )
     behind = 0.12 * np.clip(1 - np.hypot(ahead + 2 * half + 1, aside) / 4, 0, 1)
     lit[rows, columns] += (_BEAM_LIGHT * beam + behind).astype(np.float32)
 
 
 def _add_pool(lit: Float32Array, x: float, y: float) -> None:
     rows, columns, east, north = _around(x, y, _LANTERN_REACH)
-    lit[rows, columns] += (_LANTERN_LIGHT * np.clip(1 - np.hypot(east, north) / _LANTERN_REACH, 0, 1)).astype(
-        np.float32
-    )
+    lit[rows, columns] += (
+        _LANTERN_LIGHT * np.clip(1 - np.hypot(east, north) / _LANTERN_REACH, 0, 1)
+    ).astype(np.float32)
 
 
 def _around(x: float, y: float, reach: float) -> tuple[slice, slice, AnyArray, AnyArray]:

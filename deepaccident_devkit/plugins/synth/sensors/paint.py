@@ -13,7 +13,13 @@ from deepaccident_devkit.plugins.synth.sensors.scene import Scene, Setting, Surf
 from deepaccident_devkit.plugins.synth.shapes import LAMP, TAIL
 from deepaccident_devkit.plugins.synth.solids import FACES_A_SOLID, GLASS, Color
 from deepaccident_devkit.plugins.synth.world import LANTERN_COLOR, STOREY
-from deepaccident_devkit.support.arrays import BoolArray, ByteArray, Float32Array, FloatArray, IntArray
+from deepaccident_devkit.support.arrays import (
+    BoolArray,
+    ByteArray,
+    Float32Array,
+    FloatArray,
+    IntArray,
+)
 
 # Share of the sky's light that glass mirrors.
 _MIRRORED = 0.5
@@ -84,13 +90,17 @@ def moving_palette(scene: Scene, light: Light) -> Palette:
     heads = scene.frames[:, :3, 3] + (0, 0, 1.0) * (scene.actors.size[:, 2:] + _ABOVE)
     in_sun = _in_sun(scene.setting, heads, light)[scene.movers.owner]
     lamps_on = light.lamps > _LAMPS_ON or light.rain > 0.5
-    return _palette(scene.movers, light, in_sun, {LAMP: _HEADLIGHT, TAIL: _TAILLIGHT} if lamps_on else {})
+    return _palette(
+        scene.movers, light, in_sun, {LAMP: _HEADLIGHT, TAIL: _TAILLIGHT} if lamps_on else {}
+    )
 
 
 def packed(still: Palette, moving: Palette, lamps: Mapping[int, Color]) -> Colors:
     """All colours of a moment, each kind in one table; `lamps`: row of a solid that stands still → its light."""
     wall, shaded, window, shining = (
-        np.concatenate([getattr(still, name), getattr(moving, name), np.zeros((2, 3))]).clip(0, 255).astype(np.uint8)
+        np.concatenate([getattr(still, name), getattr(moving, name), np.zeros((2, 3))])
+        .clip(0, 255)
+        .astype(np.uint8)
         for name in ("wall", "shaded", "window", "shining")
     )
     for row, color in lamps.items():
@@ -99,7 +109,10 @@ def packed(still: Palette, moving: Palette, lamps: Mapping[int, Color]) -> Color
     shines: BoolArray = np.asarray(shining.any(axis=1))
     kind[shines] = SHINES
     return Colors(
-        _paints(np.where(shines[:, None], shining, wall), kind), _paints(shaded), _paints(window, SHINES), shining
+        _paints(np.where(shines[:, None], shining, wall), kind),
+        _paints(shaded),
+        _paints(window, SHINES),
+        shining,
     )
 
 
@@ -119,10 +132,14 @@ def is_facade(surfaces: Surfaces) -> BoolArray:
 def _in_sun(setting: Setting, points: FloatArray, light: Light) -> BoolArray:
     """Which points (N, 3) are in the sun, (N,): not in the shadow of anything that stands still."""
     ray = light.to_sun[None]
-    return np.array([setting.caster.cast(point, ray)[1][0] == NOTHING for point in points], dtype=bool)
+    return np.array(
+        [setting.caster.cast(point, ray)[1][0] == NOTHING for point in points], dtype=bool
+    )
 
 
-def _palette(surfaces: Surfaces, light: Light, in_sun: BoolArray, shining: Mapping[Color, Color]) -> Palette:
+def _palette(
+    surfaces: Surfaces, light: Light, in_sun: BoolArray, shining: Mapping[Color, Color]
+) -> Palette:
     normals, _ = surfaces.planes
     colors = surfaces.colors
     upward = normals[:, 2:]
@@ -205,7 +222,10 @@ def facades_of(surfaces: Surfaces) -> Facades:
 
 
 def on_facades(
-    shown: BoolArray, face: IntArray, xyz: tuple[Float32Array, Float32Array, Float32Array], facades: Facades
+    shown: BoolArray,
+    face: IntArray,
+    xyz: tuple[Float32Array, Float32Array, Float32Array],
+    facades: Facades,
 ) -> OnFacades:
     """The façade of each pixel (R, C) that shows one, and its place on it; `xyz` are metres of the points shown."""
     x, y, z = xyz
@@ -215,7 +235,9 @@ def on_facades(
     return OnFacades(pixel, met, across, z.take(pixel) - facades.foot.take(met))
 
 
-def windows_on(painted: NDArray[np.uint32], places: OnFacades, facades: Facades, colors: Colors, *, lit: bool) -> None:
+def windows_on(
+    painted: NDArray[np.uint32], places: OnFacades, facades: Facades, colors: Colors, *, lit: bool
+) -> None:
     """Paint windows on façades into a picture (R, C), as `Colors` has them, in place; if `lit`, two of five shine."""
     if not len(places.pixel):
         return
@@ -233,4 +255,6 @@ def windows_on(painted: NDArray[np.uint32], places: OnFacades, facades: Facades,
     flat[places.pixel.take(glass)] = colors.window.take(face)
     if lit:
         number = bay[glass].astype(np.int64) * 7 + storey[glass].astype(np.int64) * 13 + face
-        flat[places.pixel[glass[number % 5 < _LIT_OF_FIVE]]] = _paints(np.array([_LIT], dtype=np.uint8), SHINES)
+        flat[places.pixel[glass[number % 5 < _LIT_OF_FIVE]]] = _paints(
+            np.array([_LIT], dtype=np.uint8), SHINES
+        )

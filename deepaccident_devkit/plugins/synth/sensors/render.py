@@ -46,7 +46,14 @@ from deepaccident_devkit.plugins.synth.sensors.shadows import (
     still_ground,
     wall_shadows,
 )
-from deepaccident_devkit.support.arrays import AnyArray, BoolArray, ByteArray, Float32Array, FloatArray, IntArray
+from deepaccident_devkit.support.arrays import (
+    AnyArray,
+    BoolArray,
+    ByteArray,
+    Float32Array,
+    FloatArray,
+    IntArray,
+)
 
 # Offsets of the rays of a pixel on an outline, pixels.
 _SUBPIXELS = ((-0.25, -0.25), (0.25, 0.25))
@@ -96,7 +103,9 @@ def look(scene: Scene, camera: Camera, ground_from_camera: SE3) -> Buffers:
     movers = nearest_movers(scene, camera, ground_from_camera)
     rays = ray_directions(ground_from_camera, right[None, :], down[:, None])
     origin, setting = ground_from_camera.translation, scene.setting
-    still = setting.kept(ground_from_camera.matrix.tobytes(), lambda: setting.cast_columns(origin, rays))
+    still = setting.kept(
+        ground_from_camera.matrix.tobytes(), lambda: setting.cast_columns(origin, rays)
+    )
     near = np.flatnonzero(movers[: height + 2 : 2, : width + 2 : 2].ravel() < still[0])
     depth, face = scene.with_movers(origin, rays.reshape(-1, 3), still, near)
     coarse_face, coarse_depth = face.reshape(shape), depth.reshape(shape).astype(np.float32)
@@ -108,7 +117,9 @@ def look(scene: Scene, camera: Camera, ground_from_camera: SE3) -> Buffers:
     full_depth.reshape(-1)[outline] = fine.depth.reshape(-1)[: len(outline)]
     all_right, all_down = slopes(camera, np.arange(width), np.arange(height))
     spacing = _spacing(all_right[:2])
-    return Buffers(Rays(all_right[None, :], all_down[:, None], full_face, full_depth, spacing), outline, fine)
+    return Buffers(
+        Rays(all_right[None, :], all_down[:, None], full_face, full_depth, spacing), outline, fine
+    )
 
 
 def slopes(camera: Camera, column: AnyArray, row: AnyArray) -> tuple[Float32Array, Float32Array]:
@@ -118,7 +129,9 @@ def slopes(camera: Camera, column: AnyArray, row: AnyArray) -> tuple[Float32Arra
     return right.astype(np.float32), down.astype(np.float32)
 
 
-def ray_directions(ground_from_camera: SE3, right: Float32Array, down: Float32Array) -> Float32Array:
+def ray_directions(
+    ground_from_camera: SE3, right: Float32Array, down: Float32Array
+) -> Float32Array:
     """Directions (…, 3) float32 in the ground frame, of one metre ahead, so that distances along them are depths."""
     axes = ground_from_camera.rotation.astype(np.float32)
     rays = np.empty((*np.broadcast_shapes(right.shape, down.shape), 3), dtype=np.float32)
@@ -132,7 +145,10 @@ def _spread(coarse: IntArray, height: int, width: int) -> tuple[IntArray, NDArra
     same = coarse[:-1, :-1] == coarse[1:, :-1]
     same &= coarse[:-1, :-1] == coarse[:-1, 1:]
     same &= coarse[:-1, :-1] == coarse[1:, 1:]
-    full, mixed = (np.empty((2 * same.shape[0], 2 * same.shape[1]), dtype=each.dtype) for each in (coarse, same))
+    full, mixed = (
+        np.empty((2 * same.shape[0], 2 * same.shape[1]), dtype=each.dtype)
+        for each in (coarse, same)
+    )
     for fine, each in ((full, coarse[:-1, :-1]), (mixed, ~same)):
         fine[::2, ::2] = fine[::2, 1::2] = each
         fine[1::2] = fine[::2]
@@ -150,10 +166,14 @@ def _interpolated(depth: Float32Array, height: int, width: int) -> Float32Array:
         return np.ascontiguousarray(1 / full[:height, :width])
 
 
-def _fine(scene: Scene, camera: Camera, ground_from_camera: SE3, outline: IntArray, movers: Float32Array) -> Rays:
+def _fine(
+    scene: Scene, camera: Camera, ground_from_camera: SE3, outline: IntArray, movers: Float32Array
+) -> Rays:
     """Two rays for each pixel of `outline`; `movers` comes from `nearest_movers`."""
     width, height = camera.optics.width, camera.optics.height
-    filled = np.pad(outline, (0, -len(outline) % _COLUMNS), mode="edge" if len(outline) else "empty")
+    filled = np.pad(
+        outline, (0, -len(outline) % _COLUMNS), mode="edge" if len(outline) else "empty"
+    )
     row, column = np.divmod(filled, width)
     across, downwards = np.array(_SUBPIXELS).T[..., None]
     right, down = slopes(camera, np.arange(width) + across, np.arange(height) + downwards)
@@ -225,13 +245,17 @@ def shade(rays: Rays, around: Surroundings, ground_from_camera: SE3) -> ByteArra
     points = _points(rays, ground_from_camera)
     painted = around.colors.wall.take(rays.face, mode="wrap")
     table = painted.view(np.uint8).reshape(*painted.shape, 4)
-    places = on_facades(table[..., 3] == FACADE, rays.face, (points.x, points.y, points.z), around.facades)
+    places = on_facades(
+        table[..., 3] == FACADE, rays.face, (points.x, points.y, points.z), around.facades
+    )
     shadows_on(painted, places, around.shadows, around.colors)
     windows_on(painted, places, around.facades, around.colors, lit=around.light.lamps > 0.5)
     picture = np.asarray(cv2.cvtColor(table, cv2.COLOR_RGBA2RGB), dtype=np.uint8)
     _add_ground(picture, rays, points, around.ground, float(ground_from_camera.translation[2]))
     if around.lamplight is not None:
-        share = np.where(table[..., 3] == SHINES, 0, np.where(rays.face == GROUND, 1, _ON_THINGS)).astype(np.float32)
+        share = np.where(
+            table[..., 3] == SHINES, 0, np.where(rays.face == GROUND, 1, _ON_THINGS)
+        ).astype(np.float32)
         picture = _lamplit(picture, share, points, around)
     picture = _hazed(picture, rays, around.light)
     _add_sky(picture, rays.face == NOTHING, points, around.sky)
@@ -239,23 +263,35 @@ def shade(rays: Rays, around: Surroundings, ground_from_camera: SE3) -> ByteArra
 
 
 def _points(rays: Rays, ground_from_camera: SE3) -> _RayHits:
-    axes, origin = ground_from_camera.rotation.astype(np.float32), ground_from_camera.translation.astype(np.float32)
+    axes, origin = (
+        ground_from_camera.rotation.astype(np.float32),
+        ground_from_camera.translation.astype(np.float32),
+    )
     depth = np.minimum(rays.depth, _FAR)
     along = [rays.right * axes[k, 0] + (rays.down * axes[k, 1] + axes[k, 2]) for k in range(3)]
     x, y, z = (depth * along[k] + origin[k] for k in range(3))
     return _RayHits(x, y, z, *along)
 
 
-def _add_ground(picture: ByteArray, rays: Rays, points: _RayHits, ground: Ground, height: float) -> None:
+def _add_ground(
+    picture: ByteArray, rays: Rays, points: _RayHits, ground: Ground, height: float
+) -> None:
     """Paint the pixels that show the ground, in place, each from the picture with the matching resolution."""
     import cv2
 
-    shown, ends = rays.face == GROUND, (np.sqrt(span * max(height, 0.5) / rays.spacing) for span in _COARSER)
+    shown, ends = (
+        rays.face == GROUND,
+        (np.sqrt(span * max(height, 0.5) / rays.spacing) for span in _COARSER),
+    )
     for level, end in enumerate((*ends, np.inf)):
         here = shown & (rays.depth < end)
         shown ^= here
         for part in _part_of(here):
-            cv2.copyTo(ground.at(points.x[part], points.y[part], level), here[part].view(np.uint8), picture[part])
+            cv2.copyTo(
+                ground.at(points.x[part], points.y[part], level),
+                here[part].view(np.uint8),
+                picture[part],
+            )
 
 
 def _add_sky(picture: ByteArray, shown: BoolArray, points: _RayHits, sky: Sky) -> None:
@@ -273,7 +309,9 @@ def _part_of(mask: BoolArray) -> list[tuple[slice, slice]]:
     return [np.s_[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]] if len(rows) else []
 
 
-def _lamplit(picture: ByteArray, share: Float32Array, points: _RayHits, around: Surroundings) -> ByteArray:
+def _lamplit(
+    picture: ByteArray, share: Float32Array, points: _RayHits, around: Surroundings
+) -> ByteArray:
     """The picture with the light of lamps, multiplied by `share` (R, C), where it reaches."""
     import cv2
 
@@ -317,7 +355,9 @@ class Studio:
         light: light and air.
     """
 
-    def __init__(self, setting: Setting, weather: str, time_of_day: str, rng: np.random.Generator) -> None:
+    def __init__(
+        self, setting: Setting, weather: str, time_of_day: str, rng: np.random.Generator
+    ) -> None:
         self.light = light_of(weather, time_of_day)
         self._sky = make_sky(self.light, rng)
         self._ground = PassingGround(still_ground(setting, self.light, rng))
@@ -345,7 +385,11 @@ class Studio:
 
 
 def camera_picture(
-    scene: Scene, around: Surroundings, camera: Camera, ground_from_camera: SE3, rng: np.random.Generator
+    scene: Scene,
+    around: Surroundings,
+    camera: Camera,
+    ground_from_camera: SE3,
+    rng: np.random.Generator,
 ) -> ByteArray:
     """The picture (H, W, 3) uint8, RGB; `rng` draws the rain."""
     import cv2
@@ -387,7 +431,9 @@ def _with_reflections(
         upper = int(np.argmax((rays[..., 2] < 0).any(axis=1)))
         origin, mirrored, falling = _below_level_ground(eye, rays[upper:])
     else:
-        pixels = np.ix_(rows.astype(np.intp).clip(max=height - 1), columns.astype(np.intp).clip(max=width - 1))
+        pixels = np.ix_(
+            rows.astype(np.intp).clip(max=height - 1), columns.astype(np.intp).clip(max=width - 1)
+        )
         upper = int(np.argmax((buffers.all.face[pixels] == GROUND).any(axis=1)))
         depth = np.minimum(buffers.all.depth[pixels], _FAR)[upper:]
         origin, mirrored, falling = _off_slopes(eye, rays[upper:], depth, terrain)
@@ -408,7 +454,9 @@ def _with_reflections(
     return picture
 
 
-def _below_level_ground(eye: FloatArray, rays: Float32Array) -> tuple[FloatArray, Float32Array, AnyArray]:
+def _below_level_ground(
+    eye: FloatArray, rays: Float32Array
+) -> tuple[FloatArray, Float32Array, AnyArray]:
     """The mirrored rays of level ground: those of the camera's mirror image below it.
 
     Returns where they begin (3,), their directions (R, C, 3), and how much they fall to the ground (R, C).
@@ -425,7 +473,11 @@ def _off_slopes(
     normal = terrain.normal(met[..., :2])
     falling = -(rays * normal).sum(axis=-1)
     begin = met + _CLEAR_OF_GROUND * normal
-    return begin.reshape(-1, 3), (rays + 2 * falling[..., None] * normal).astype(np.float32), falling
+    return (
+        begin.reshape(-1, 3),
+        (rays + 2 * falling[..., None] * normal).astype(np.float32),
+        falling,
+    )
 
 
 def _with_glow(picture: ByteArray, buffers: Buffers, around: Surroundings) -> ByteArray:
@@ -436,7 +488,9 @@ def _with_glow(picture: ByteArray, buffers: Buffers, around: Surroundings) -> By
     if not half.any():
         return picture
     wide = max(3, picture.shape[1] // 80) | 1
-    small = cv2.resize(half, (-(-half.shape[1] // 2), -(-half.shape[0] // 2)), interpolation=cv2.INTER_AREA)
+    small = cv2.resize(
+        half, (-(-half.shape[1] // 2), -(-half.shape[0] // 2)), interpolation=cv2.INTER_AREA
+    )
     glow = cv2.GaussianBlur(small, (0, 0), wide / 4)
     bright = cv2.resize(glow, (picture.shape[1], picture.shape[0]))
     return np.asarray(cv2.addWeighted(picture, 1.0, bright, _GLOW * around.light.lamps, 0))

@@ -10,10 +10,29 @@ from deepaccident_devkit.geometry import SE3
 from deepaccident_devkit.geometry.se3 import trusted_se3
 from deepaccident_devkit.plugins.synth.actors import Actors
 from deepaccident_devkit.plugins.synth.plan import RigName, Sensors
-from deepaccident_devkit.plugins.synth.roads import MAP_EXTENT, MAP_RESOLUTION, TERRAIN, Arm, GroundMap, tag_of_code
-from deepaccident_devkit.plugins.synth.sensors.agents import MOUNTS, Agent, make_agents, with_single_precision
+from deepaccident_devkit.plugins.synth.roads import (
+    MAP_EXTENT,
+    MAP_RESOLUTION,
+    TERRAIN,
+    Arm,
+    GroundMap,
+    tag_of_code,
+)
+from deepaccident_devkit.plugins.synth.sensors.agents import (
+    MOUNTS,
+    Agent,
+    make_agents,
+    with_single_precision,
+)
 from deepaccident_devkit.plugins.synth.sensors.annotate import annotate
-from deepaccident_devkit.plugins.synth.sensors.lidar import AIR_OF_WEATHER, Air, Lidar, Scan, make_lidar, scan
+from deepaccident_devkit.plugins.synth.sensors.lidar import (
+    AIR_OF_WEATHER,
+    Air,
+    Lidar,
+    Scan,
+    make_lidar,
+    scan,
+)
 from deepaccident_devkit.plugins.synth.sensors.render import Studio, Surroundings, camera_picture
 from deepaccident_devkit.plugins.synth.sensors.scene import Scene, Setting, make_scene
 from deepaccident_devkit.plugins.synth.world import World
@@ -25,7 +44,8 @@ from deepaccident_devkit.taxonomy import AGENTS, BEV_RESOLUTION, BEV_SHAPE, CATE
 # Row and column of the agent.
 _MIDDLE = (BEV_SHAPE[0] - 1) / 2
 _TAG_OF_CATEGORY = np.array(
-    [TAGS["pedestrian" if category == "pedestrian" else "vehicle"] for category in CATEGORIES], dtype=np.uint8
+    [TAGS["pedestrian" if category == "pedestrian" else "vehicle"] for category in CATEGORIES],
+    dtype=np.uint8,
 )
 
 
@@ -34,7 +54,9 @@ def bev_picture(scene: Scene, top: GroundMap, ground_from_ego: SE3) -> BevImage:
     import cv2
 
     x, y = ground_from_ego.translation[:2].tolist()
-    semantic = np.asarray(cv2.LUT(_map_around(top, x, y, ground_from_ego.yaw), tag_of_code()), dtype=np.uint8)
+    semantic = np.asarray(
+        cv2.LUT(_map_around(top, x, y, ground_from_ego.yaw), tag_of_code()), dtype=np.uint8
+    )
     instance = np.zeros(BEV_SHAPE, dtype=np.uint16)
     poses = _relative_poses(scene.snapshot.poses, x, y, ground_from_ego.yaw)
     actors = scene.actors
@@ -59,7 +81,12 @@ def _map_around(top: GroundMap, x: float, y: float, yaw: float) -> ByteArray:
     flags = cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP
     return np.asarray(
         cv2.warpAffine(
-            top.codes, map_from_picture, BEV_SHAPE, flags=flags, borderMode=cv2.BORDER_CONSTANT, borderValue=(TERRAIN,)
+            top.codes,
+            map_from_picture,
+            BEV_SHAPE,
+            flags=flags,
+            borderMode=cv2.BORDER_CONSTANT,
+            borderValue=(TERRAIN,),
         )
     )
 
@@ -80,7 +107,9 @@ def _footprint(pose: FloatArray, size: FloatArray) -> tuple[tuple[slice, slice],
     ahead = ((_MIDDLE - np.arange(rows.start, rows.stop)) * BEV_RESOLUTION - x)[:, None]
     left = ((_MIDDLE - np.arange(columns.start, columns.stop)) * BEV_RESOLUTION - y)[None, :]
     cos, sin = np.cos(yaw), np.sin(yaw)
-    inside = (np.abs(cos * ahead + sin * left) <= length / 2) & (np.abs(cos * left - sin * ahead) <= width / 2)
+    inside = (np.abs(cos * ahead + sin * left) <= length / 2) & (
+        np.abs(cos * left - sin * ahead) <= width / 2
+    )
     return (rows, columns), inside
 
 
@@ -149,12 +178,17 @@ class Rig:
         ground_from_ego = agent.ground_from_ego(scene)
         ground_from_lidar = ground_from_ego @ agent.ego_from_lidar
         rng = self._random(_LIDAR, frame, agent)
-        points = scan(scene, self.lidars[agent.name], ground_from_lidar, self.air, rng, boxed=not self.clouds)
+        points = scan(
+            scene, self.lidars[agent.name], ground_from_lidar, self.air, rng, boxed=not self.clouds
+        )
         labels = annotate(scene, agent, world_from_ground, points, exact=self.exact)
         calib = agent.calib(world_from_ground @ ground_from_ego)
         calib = calib if self.exact else with_single_precision(calib)
         if self.decimals is not None:
-            labels, calib = _rounded_labels(labels, self.decimals), _rounded_calib(calib, self.decimals)
+            labels, calib = (
+                _rounded_labels(labels, self.decimals),
+                _rounded_calib(calib, self.decimals),
+            )
         return Sighting(labels, calib, points)
 
     def bev(self, scene: Scene, agent: Agent) -> BevImage:
@@ -168,13 +202,20 @@ class Rig:
         """
         return self.studio.surroundings(scene, signals) if self.studio else None
 
-    def images(self, scene: Scene, around: Surroundings, agent: Agent, frame: int) -> Iterator[tuple[str, ByteArray]]:
+    def images(
+        self, scene: Scene, around: Surroundings, agent: Agent, frame: int
+    ) -> Iterator[tuple[str, ByteArray]]:
         """Channel and picture (H, W, 3) of each camera of an agent, one at a time."""
         rng = self._random(_CAMERAS, frame, agent)
         ground_from_lidar = agent.ground_from_lidar(scene)
         for camera in agent.cameras:
-            picture = camera_picture(scene, around, camera, ground_from_lidar @ camera.lidar_from_camera, rng)
-            yield camera.channel, picture if self.name == "released" else _by_other_optics(picture, rng)
+            picture = camera_picture(
+                scene, around, camera, ground_from_lidar @ camera.lidar_from_camera, rng
+            )
+            yield (
+                camera.channel,
+                picture if self.name == "released" else _by_other_optics(picture, rng),
+            )
 
     def _random(self, purpose: int, frame: int, agent: Agent) -> np.random.Generator:
         return np.random.default_rng([*self.seed, purpose, frame, AGENTS.index(agent.name)])
@@ -208,7 +249,9 @@ def make_rig(  # noqa: PLR0913 - where, who, under which sky, and what is record
         lidars={agent.name: make_lidar(setting, agent) for agent in agents},
         air=AIR_OF_WEATHER[weather],
         clouds=sensors in ("all", "clouds"),
-        studio=None if sensors in ("clouds", "none") else Studio(setting, weather, time_of_day, rng),
+        studio=None
+        if sensors in ("clouds", "none")
+        else Studio(setting, weather, time_of_day, rng),
         seed=seed,
         exact=exact,
         decimals=decimals,
@@ -228,7 +271,9 @@ def _rounded_calib(calib: Calib, decimals: int) -> Calib:
     return Calib(
         ego_from_lidar=rounded(calib.ego_from_lidar),
         world_from_ego=rounded(calib.world_from_ego),
-        camera_from_lidar={channel: rounded(pose) for channel, pose in calib.camera_from_lidar.items()},
+        camera_from_lidar={
+            channel: rounded(pose) for channel, pose in calib.camera_from_lidar.items()
+        },
         intrinsic={channel: matrix.round(decimals) for channel, matrix in calib.intrinsic.items()},
     )
 

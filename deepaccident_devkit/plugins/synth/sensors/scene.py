@@ -9,7 +9,13 @@ import numpy as np
 from deepaccident_devkit.geometry.boxes import CORNER_SIGNS
 from deepaccident_devkit.plugins.synth.actors import Actors, Snapshot
 from deepaccident_devkit.plugins.synth.roads import Terrain
-from deepaccident_devkit.plugins.synth.sensors.caster import GROUND, NOTHING, Caster, make_caster, plane_distance
+from deepaccident_devkit.plugins.synth.sensors.caster import (
+    GROUND,
+    NOTHING,
+    Caster,
+    make_caster,
+    plane_distance,
+)
 from deepaccident_devkit.plugins.synth.shapes import BOX_CLEARANCE
 from deepaccident_devkit.plugins.synth.solids import (
     FACES_A_SOLID,
@@ -26,7 +32,9 @@ from deepaccident_devkit.taxonomy import CATEGORIES
 _AXLES, _WHEELS = 0.3, 0.4
 
 
-def placed_on(terrain: Terrain, poses: FloatArray, size: FloatArray, upright: BoolArray) -> FloatArray:
+def placed_on(
+    terrain: Terrain, poses: FloatArray, size: FloatArray, upright: BoolArray
+) -> FloatArray:
     """The frames of bodies on the ground, (A, 4, 4): origin on the ground below the box's centre, x forward, z up.
 
     Poses are (A, 3) x, y (metres), yaw (radians) of the boxes' centres, sizes (A, 3) length, width, height, metres;
@@ -166,14 +174,20 @@ class Setting:
         The last two are for `caster.GROUND` and `caster.NOTHING`, so that every face can be used as an index.
         """
         return np.concatenate(
-            [self.still.face_owner, np.repeat(self.moving_owner, FACES_A_SOLID), [_NO_OWNER, _NO_OWNER]]
+            [
+                self.still.face_owner,
+                np.repeat(self.moving_owner, FACES_A_SOLID),
+                [_NO_OWNER, _NO_OWNER],
+            ]
         )
 
     def frames(self, poses: FloatArray) -> FloatArray:
         """The actors' frames on the ground, (A, 4, 4), at poses (A, 3)."""
         return placed_on(self.terrain, poses, self.actors.size, self.actors.category == _UPRIGHT)
 
-    def cast_columns(self, origin: FloatArray, rays: AnyArray, limit: float = np.inf) -> tuple[AnyArray, AnyArray]:
+    def cast_columns(
+        self, origin: FloatArray, rays: AnyArray, limit: float = np.inf
+    ) -> tuple[AnyArray, AnyArray]:
         """What `caster.cast` does for columns of rays (R, C, 3), (R · C,), but skips rays that meet the ground first.
 
         It knows them on flat ground, where all rays of a column go over the same line; if they do not, all are cast.
@@ -200,7 +214,9 @@ class Setting:
         reached, _ = self._fence.cast(np.array([*origin[:2], 0.0]), level)
         return np.asarray(reached * np.linalg.norm(level, axis=1))
 
-    def kept(self, pose: bytes, cast: Callable[[], tuple[AnyArray, AnyArray]]) -> tuple[AnyArray, AnyArray]:
+    def kept(
+        self, pose: bytes, cast: Callable[[], tuple[AnyArray, AnyArray]]
+    ) -> tuple[AnyArray, AnyArray]:
         """The result of `cast`; from memory if it was called twice for the same pose before. Do not change it."""
         stands = pose in self._kept
         found = self._kept.pop(pose, None) or cast()
@@ -277,7 +293,11 @@ class Scene:
         return distance, face
 
     def with_movers(
-        self, origin: FloatArray, directions: AnyArray, still: tuple[AnyArray, AnyArray], near: IntArray
+        self,
+        origin: FloatArray,
+        directions: AnyArray,
+        still: tuple[AnyArray, AnyArray],
+        near: IntArray,
     ) -> tuple[AnyArray, AnyArray]:
         """What rays meet, given that they meet `still` without moving road users; all else is as in `cast`."""
         reached, met = self._cast_at_movers(origin, directions, near)
@@ -286,7 +306,9 @@ class Scene:
         distance[near[ahead]], face[near[ahead]] = reached[ahead], met[ahead]
         return distance, face
 
-    def _cast_at_movers(self, origin: FloatArray, directions: AnyArray, rows: IntArray) -> tuple[AnyArray, AnyArray]:
+    def _cast_at_movers(
+        self, origin: FloatArray, directions: AnyArray, rows: IntArray
+    ) -> tuple[AnyArray, AnyArray]:
         """How far the rays of `rows` go until they meet a moving road user, and the faces that they meet."""
         rays = directions.take(rows, axis=0)
         reached, met = self.caster.cast(origin if origin.ndim == 1 else origin[rows], rays)

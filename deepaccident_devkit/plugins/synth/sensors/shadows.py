@@ -6,7 +6,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deepaccident_devkit.plugins.synth import roads
-from deepaccident_devkit.plugins.synth.roads import MAP_CELLS, MAP_EXTENT, MAP_RESOLUTION, GroundMap, Terrain
+from deepaccident_devkit.plugins.synth.roads import (
+    MAP_CELLS,
+    MAP_EXTENT,
+    MAP_RESOLUTION,
+    GroundMap,
+    Terrain,
+)
 from deepaccident_devkit.plugins.synth.sensors.caster import NOTHING
 from deepaccident_devkit.plugins.synth.sensors.light import Light
 from deepaccident_devkit.plugins.synth.sensors.paint import Colors, Facades, OnFacades
@@ -14,7 +20,9 @@ from deepaccident_devkit.plugins.synth.sensors.scene import Scene, Setting, move
 from deepaccident_devkit.support.arrays import ByteArray, Float32Array, FloatArray, IntArray
 
 
-def add_shadows(picture: ByteArray, corners: FloatArray, to_sun: FloatArray, brightness: float) -> IntArray:
+def add_shadows(
+    picture: ByteArray, corners: FloatArray, to_sun: FloatArray, brightness: float
+) -> IntArray:
     """Paint the shadows of solids into a picture of the ground, (3000, 3000, 3) cells of `roads.GroundMap`, in place.
 
     Corners are (P, 8, 3), metres, ground frame, z above the ground below them; `brightness` is the share of that in the
@@ -32,7 +40,10 @@ def _shadowed(outlines: IntArray) -> IntArray:
     import cv2
 
     cells = [np.zeros(0, dtype=np.int64)]
-    lows, highs = np.maximum(outlines.min(axis=1), 0), np.minimum(outlines.max(axis=1) + 1, MAP_CELLS)
+    lows, highs = (
+        np.maximum(outlines.min(axis=1), 0),
+        np.minimum(outlines.max(axis=1) + 1, MAP_CELLS),
+    )
     for solid in np.flatnonzero((lows < highs).all(axis=1)).tolist():
         low, high = lows[solid], highs[solid]
         mask = np.zeros(high[::-1] - low[::-1], dtype=np.uint8)
@@ -53,7 +64,9 @@ def above_ground(corners: FloatArray, terrain: Terrain) -> FloatArray:
 
 def _outlines(corners: FloatArray, to_sun: FloatArray) -> IntArray:
     """Map cells (column, row) that the corners' shadows fall on, (P, 8, 2)."""
-    fallen: FloatArray = corners[..., :2] - np.maximum(corners[..., 2:], 0.0) * (to_sun[:2] / to_sun[2])
+    fallen: FloatArray = corners[..., :2] - np.maximum(corners[..., 2:], 0.0) * (
+        to_sun[:2] / to_sun[2]
+    )
     return np.asarray(np.floor((fallen + MAP_EXTENT) / MAP_RESOLUTION).astype(np.int64))
 
 
@@ -95,18 +108,26 @@ def wall_shadows(setting: Setting, facades: Facades, light: Light) -> WallShadow
     first = 1 + (counts + 2).cumsum() - (counts + 2)
     column[sunny] = first + 0.5
     lit = _sun_on(setting, light, sunny, counts)
-    return WallShadows(np.concatenate([np.full((len(lit), 1), 255, dtype=np.uint8), lit], axis=1), column, density)
+    return WallShadows(
+        np.concatenate([np.full((len(lit), 1), 255, dtype=np.uint8), lit], axis=1), column, density
+    )
 
 
 def _sun_on(setting: Setting, light: Light, faces: IntArray, counts: IntArray) -> ByteArray:
     """Which cells of façades the sun reaches, (R, sum of `counts`, and two more for each façade) uint8, 0 or 255."""
     quads, normals = setting.still.quads[faces], setting.still.planes[0][faces]
-    along, foot, top = quads[..., :2].sum(axis=2), quads[..., 2].min(axis=1), quads[..., 2].max(axis=1)
+    along, foot, top = (
+        quads[..., :2].sum(axis=2),
+        quads[..., 2].min(axis=1),
+        quads[..., 2].max(axis=1),
+    )
     every = np.arange(len(faces))
     first, last = quads[every, along.argmin(axis=1)], quads[every, along.argmax(axis=1)]
     strips = counts + 2
     which = np.repeat(every, strips)
-    cell = (np.arange(len(which)) - np.repeat(strips.cumsum() - strips, strips) - 1).clip(0, counts[which] - 1)
+    cell = (np.arange(len(which)) - np.repeat(strips.cumsum() - strips, strips) - 1).clip(
+        0, counts[which] - 1
+    )
     share = (cell + 0.5) / counts[which]
     places = first[which] + (last - first)[which] * share[:, None] + normals[which] * _OFF
     rows = int(np.ceil((top - foot).max() / _CELL))
@@ -117,7 +138,9 @@ def _sun_on(setting: Setting, light: Light, faces: IntArray, counts: IntArray) -
     return np.where(met == NOTHING, np.uint8(255), np.uint8(0)).reshape(rows, -1)
 
 
-def shadows_on(painted: NDArray[np.uint32], places: OnFacades, shadows: WallShadows, colors: Colors) -> None:
+def shadows_on(
+    painted: NDArray[np.uint32], places: OnFacades, shadows: WallShadows, colors: Colors
+) -> None:
     """Darken façades of a picture (R, C), as `Colors` has them, where the sun does not reach them, in place."""
     import cv2
 
@@ -132,7 +155,11 @@ def shadows_on(painted: NDArray[np.uint32], places: OnFacades, shadows: WallShad
     for start in range(0, len(row), _AT_ONCE):
         block = slice(start, start + _AT_ONCE)
         found = cv2.remap(
-            shadows.lit, column[None, block], row[None, block], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+            shadows.lit,
+            column[None, block],
+            row[None, block],
+            cv2.INTER_LINEAR,
+            borderMode=cv2.BORDER_REPLICATE,
         )
         seen[block] = np.asarray(found)[0]
     flat = painted.reshape(-1)
@@ -140,7 +167,9 @@ def shadows_on(painted: NDArray[np.uint32], places: OnFacades, shadows: WallShad
     flat[pixel.take(dark)] = colors.shaded.take(face.take(dark))
     weight, shaded = seen[edge, None] / np.float32(255), colors.shaded[face[edge]]
     lit = flat[pixel[edge]]
-    mixed = lit.view(np.uint8).reshape(-1, 4) * weight + shaded.view(np.uint8).reshape(-1, 4) * (1 - weight)
+    mixed = lit.view(np.uint8).reshape(-1, 4) * weight + shaded.view(np.uint8).reshape(-1, 4) * (
+        1 - weight
+    )
     flat[pixel[edge]] = mixed.astype(np.uint8).view(np.uint32)[:, 0]
 
 
@@ -191,7 +220,9 @@ def still_ground(setting: Setting, light: Light, rng: np.random.Generator) -> Gr
     """The ground with the shadows of all that stands still; `rng` draws its grain."""
     lit = light.sky + light.sun * light.to_sun[2]
     plain = _picture(setting.world.ground, lit, light.wet_ground, rng)
-    add_shadows(plain, above_ground(setting.still.corners, setting.terrain), light.to_sun, light.in_shadow)
+    add_shadows(
+        plain, above_ground(setting.still.corners, setting.terrain), light.to_sun, light.in_shadow
+    )
     return _with_coarser(plain, _coarser(plain, len(plain) // SHRINK))
 
 
@@ -210,7 +241,9 @@ class PassingGround:
         for now, still, changed in zip(self._now, self._still, self._changed, strict=True):
             now.reshape(-1, 3)[changed] = still.reshape(-1, 3).take(changed, axis=0)
         finest, coarser = self._now
-        corners = above_ground(scene.movers.corners[scene.movers.solids.main], scene.setting.terrain)
+        corners = above_ground(
+            scene.movers.corners[scene.movers.solids.main], scene.setting.terrain
+        )
         cells = [add_shadows(finest, corners, light.to_sun, light.in_shadow)]
         upwards = np.array([0.0, 0.0, 1.0])
         for beyond, brightness in _CLOSE_BY:
@@ -271,11 +304,25 @@ def _picture(ground: GroundMap, lit: FloatArray, wet: float, rng: np.random.Gene
     palette = np.zeros((256, 3))
     for code, color in _COLORS.items():
         palette[code] = np.array(color) * lit * wet
-    patches = cv2.resize(rng.normal(0, _PATCHES, (25, 25)), (_TILE, _TILE), interpolation=cv2.INTER_CUBIC)
-    grain = (rng.normal(0, _GRAIN, (_TILE, _TILE)) + np.asarray(patches)).round().clip(-32, 32).astype(np.int16)
+    patches = cv2.resize(
+        rng.normal(0, _PATCHES, (25, 25)), (_TILE, _TILE), interpolation=cv2.INTER_CUBIC
+    )
+    grain = (
+        (rng.normal(0, _GRAIN, (_TILE, _TILE)) + np.asarray(patches))
+        .round()
+        .clip(-32, 32)
+        .astype(np.int16)
+    )
     scale = float(lit.mean()) * wet
-    shades = (palette[:, None, :] + scale * np.arange(-32, 33)[None, :, None]).clip(0, 255).astype(np.uint8)
-    repeated, picture = np.tile(grain + 32, MAP_CELLS // _TILE), np.empty((MAP_CELLS, MAP_CELLS, 3), dtype=np.uint8)
+    shades = (
+        (palette[:, None, :] + scale * np.arange(-32, 33)[None, :, None])
+        .clip(0, 255)
+        .astype(np.uint8)
+    )
+    repeated, picture = (
+        np.tile(grain + 32, MAP_CELLS // _TILE),
+        np.empty((MAP_CELLS, MAP_CELLS, 3), dtype=np.uint8),
+    )
     for top in range(0, MAP_CELLS, _TILE):
         place = ground.codes[top : top + _TILE].astype(np.intp) * shades.shape[1] + repeated
         picture[top : top + _TILE] = shades.reshape(-1, 3).take(place, axis=0)

@@ -14,7 +14,13 @@ from deepaccident_devkit.plugins.synth.spec.catalogue import (
     read_design,
     read_spec,
 )
-from deepaccident_devkit.plugins.synth.spec.model import ActorSpec, BackgroundSpec, MeetSpec, ScenarioSpec, View
+from deepaccident_devkit.plugins.synth.spec.model import (
+    ActorSpec,
+    BackgroundSpec,
+    MeetSpec,
+    ScenarioSpec,
+    View,
+)
 
 __all__ = [
     "DESIGN_NUMBERS",

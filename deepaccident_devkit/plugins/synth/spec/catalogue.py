@@ -10,7 +10,12 @@ import numpy as np
 
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.plugins.synth.roads import ARMS, Arm
-from deepaccident_devkit.plugins.synth.spec.checks import LEADERS, check_scenario_spec, meeting_roles, usual_lanes
+from deepaccident_devkit.plugins.synth.spec.checks import (
+    LEADERS,
+    check_scenario_spec,
+    meeting_roles,
+    usual_lanes,
+)
 from deepaccident_devkit.plugins.synth.spec.model import ActorSpec, AllOf, Part, Role, ScenarioSpec
 from deepaccident_devkit.plugins.synth.spec.reading import parse_yaml, read_part
 from deepaccident_devkit.support.reading import fault_text, read_bytes
@@ -70,7 +75,10 @@ def draw(template: SpecTemplate, rng: np.random.Generator) -> ScenarioSpec:
     """
     spec = cast("ScenarioSpec", template.root.draw(rng))
     named = cast("AllOf", template.root.fields["actors"]).items
-    actors = [_completed(actor, cast("Part", part), spec, rng) for actor, part in zip(spec.actors, named, strict=True)]
+    actors = [
+        _completed(actor, cast("Part", part), spec, rng)
+        for actor, part in zip(spec.actors, named, strict=True)
+    ]
     roles = {actor.role for actor in actors}
     actors += [ActorSpec(role=role) for role in LEADERS if role not in roles]
     spec = replace(spec, actors=tuple(actors))
@@ -78,7 +86,9 @@ def draw(template: SpecTemplate, rng: np.random.Generator) -> ScenarioSpec:
     return _exchanged(spec) if exchanged else replace(spec, exchange=False)
 
 
-def _completed(actor: ActorSpec, part: Part, spec: ScenarioSpec, rng: np.random.Generator) -> ActorSpec:
+def _completed(
+    actor: ActorSpec, part: Part, spec: ScenarioSpec, rng: np.random.Generator
+) -> ActorSpec:
     """An actor with the values that follow from others."""
     if actor.role == "pedestrian":
         return replace(actor, category="pedestrian")
@@ -90,7 +100,9 @@ def _completed(actor: ActorSpec, part: Part, spec: ScenarioSpec, rng: np.random.
 def _exchanged(spec: ScenarioSpec) -> ScenarioSpec:
     """The scenario with ego in the place of other, and other in the place of ego."""
     came_from = spec.actor("ego").from_arm
-    actors = tuple(replace(actor, role=_EXCHANGED.get(actor.role, actor.role)) for actor in spec.actors)
+    actors = tuple(
+        replace(actor, role=_EXCHANGED.get(actor.role, actor.role)) for actor in spec.actors
+    )
     meet = spec.meet
     if meet is not None:
         first, second = (_EXCHANGED.get(role, role) for role in meet.actors)
@@ -112,7 +124,8 @@ def _turned(spec: ScenarioSpec, quarters: int) -> ScenarioSpec:
     if hump is not None:
         hump = replace(hump, arm=turned(hump.arm))
     actors = tuple(
-        actor if actor.from_arm is None else replace(actor, from_arm=turned(actor.from_arm)) for actor in spec.actors
+        actor if actor.from_arm is None else replace(actor, from_arm=turned(actor.from_arm))
+        for actor in spec.actors
     )
     return replace(spec, road=replace(spec.road, hump=hump), actors=actors)
 
@@ -130,7 +143,9 @@ def read_spec(path: str | os.PathLike[str]) -> SpecTemplate:
     try:
         text = read_bytes(path_of(path), "spec").decode()
     except FileNotFoundError as error:
-        raise ConfigError(f"{path}: no such file; give the path of a scenario file (docs/synth.md)") from error
+        raise ConfigError(
+            f"{path}: no such file; give the path of a scenario file (docs/synth.md)"
+        ) from error
     except (OSError, ValueError) as error:
         told = fault_text(error) if isinstance(error, OSError) else f"cannot be read ({error})"
         raise ConfigError(f"{path}: {told}; give a YAML file in UTF-8") from error
@@ -169,7 +184,9 @@ def design_text(number: int) -> str:
     for entry in files("deepaccident_devkit.plugins.synth.spec").joinpath("designs").iterdir():
         if entry.name.startswith(f"{number:02d}_") and entry.name.endswith(".yaml"):
             return entry.read_text(encoding="utf-8")
-    raise ConfigError(f"design: {number} is not one of 1 to {len(DESIGN_NUMBERS)}; choose one of these")
+    raise ConfigError(
+        f"design: {number} is not one of 1 to {len(DESIGN_NUMBERS)}; choose one of these"
+    )
 
 
 @cache

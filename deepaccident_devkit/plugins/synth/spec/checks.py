@@ -56,7 +56,12 @@ def _role(actor: Part) -> Role:
 
 def _check_roles(root: Part, actors: Sequence[Part]) -> None:
     if len(actors) > _MOST_ACTORS:
-        raise _fault(root, "actors", f"there are {len(actors)}; no road has room for so many", f"keep {_MOST_ACTORS}")
+        raise _fault(
+            root,
+            "actors",
+            f"there are {len(actors)}; no road has room for so many",
+            f"keep {_MOST_ACTORS}",
+        )
     counts = Counter(_role(actor) for actor in actors)
     for role in _LEADING:
         if not counts[role]:
@@ -65,7 +70,9 @@ def _check_roles(root: Part, actors: Sequence[Part]) -> None:
     for actor in actors:
         role = _role(actor)
         if role in _AGENTS and role in seen:
-            raise _fault(actor, "role", f"there are {counts[role]} actors with role {role}", "keep one")
+            raise _fault(
+                actor, "role", f"there are {counts[role]} actors with role {role}", "keep one"
+            )
         seen.add(role)
 
 
@@ -74,9 +81,13 @@ def _junctions(root: Part) -> tuple[Junction, ...]:
     pairs = {
         pair
         for road in root.values("road")
-        for pair in (product(road.values("kind"), road.values("lanes")) if isinstance(road, Part) else ())
+        for pair in (
+            product(road.values("kind"), road.values("lanes")) if isinstance(road, Part) else ()
+        )
     }
-    return tuple(Junction(RoadSpec(kind=kind, lanes=lanes)) for kind, lanes in sorted(pairs)) or (Junction(),)
+    return tuple(Junction(RoadSpec(kind=kind, lanes=lanes)) for kind, lanes in sorted(pairs)) or (
+        Junction(),
+    )
 
 
 def _check_fields(actor: Part) -> None:
@@ -85,7 +96,12 @@ def _check_fields(actor: Part) -> None:
         if name in _FORBIDDEN[role]:
             raise _fault(actor, name, f"is not possible for the role {role}", "leave it out")
     if role not in LEADERS and "from_arm" not in actor.fields:
-        raise _fault(actor, "from_arm", f"is missing; the role {role} needs it", f"add one of {', '.join(ARMS)}")
+        raise _fault(
+            actor,
+            "from_arm",
+            f"is missing; the role {role} needs it",
+            f"add one of {', '.join(ARMS)}",
+        )
 
 
 def _check_category(actor: Part) -> None:
@@ -93,9 +109,7 @@ def _check_category(actor: Part) -> None:
     possible = _possible_categories(role)
     for category in actor.values("category") if "category" in actor.fields else ():
         if category not in possible:
-            remedy = (
-                f"choose {', '.join(possible)}; a cyclist has the role background, a pedestrian the role pedestrian"
-            )
+            remedy = f"choose {', '.join(possible)}; a cyclist has the role background, a pedestrian the role pedestrian"
             raise _fault(actor, "category", f"the role {role} cannot be a {category}", remedy)
 
 
@@ -115,7 +129,12 @@ def _check_way(actor: Part, junctions: Sequence[Junction]) -> None:
             raise _fault(actor, "from_arm", f"a {kind} junction has no {arm} arm", remedy)
         if _drives(actor) and turn not in junction.turns(arm):
             remedy = f"choose {' or '.join(junction.turns(arm))}"
-            raise _fault(actor, "turn", f"nobody can go {turn} from the {arm} arm of a {kind} junction", remedy)
+            raise _fault(
+                actor,
+                "turn",
+                f"nobody can go {turn} from the {arm} arm of a {kind} junction",
+                remedy,
+            )
 
 
 def _drives(actor: Part) -> bool:
@@ -161,7 +180,11 @@ def _try(part: Part) -> None:
     except ConfigError as error:
         place, _, sentence = str(error).partition(": ")
         name = place.rpartition(".")[2]
-        line, path = (part.line(name), part.path_of(name)) if name in part.fields else (part.where, part.path)
+        line, path = (
+            (part.line(name), part.path_of(name))
+            if name in part.fields
+            else (part.where, part.path)
+        )
         raise ConfigError(f"{line}: {path}: {sentence}") from error
 
 
@@ -184,7 +207,12 @@ def _check_meeting(root: Part, actors: Sequence[Part], junctions: Sequence[Junct
         first, second = meeting_roles(meeting)
         for role in (first, second):
             if role in LEADERS or role == "parked":
-                raise _fault(meeting, "actors", f"{role} cannot be timed", "choose two roles such as ego and other")
+                raise _fault(
+                    meeting,
+                    "actors",
+                    f"{role} cannot be timed",
+                    "choose two roles such as ego and other",
+                )
             if counts[role] != 1:
                 sentence = f"there are {counts[role]} actors with role {role}"
                 raise _fault(meeting, "actors", sentence, "choose roles that one actor has")
@@ -192,7 +220,10 @@ def _check_meeting(root: Part, actors: Sequence[Part], junctions: Sequence[Junct
             raise _fault(meeting, "actors", f"{first} cannot meet itself", "name two roles")
         for role in (first, second) if None not in root.values("meet") else ():
             _check_timed(meeting, by_role[role])
-        if all(_drives(by_role[role]) and by_role[role].values("lane_change") == (None,) for role in (first, second)):
+        if all(
+            _drives(by_role[role]) and by_role[role].values("lane_change") == (None,)
+            for role in (first, second)
+        ):
             _check_crossing(meeting, by_role[first], by_role[second], junctions)
 
 
@@ -201,17 +232,23 @@ def _check_timed(meeting: Part, actor: Part) -> None:
     role = _role(actor)
     if role != _WALKING and actor.values("start_distance") != (None,):
         sentence = f"follows from meet ({meeting.where}) for {role}, who is timed"
-        raise _fault(actor, "start_distance", sentence, "leave it out; meet.offset says who comes later")
+        raise _fault(
+            actor, "start_distance", sentence, "leave it out; meet.offset says who comes later"
+        )
 
 
 def meeting_roles(meeting: Part) -> tuple[Role, Role]:
     """Who is timed to meet."""
     (pair,) = meeting.values("actors")
-    roles = tuple(next(item.alternatives()) for item in pair.items) if isinstance(pair, AllOf) else pair
+    roles = (
+        tuple(next(item.alternatives()) for item in pair.items) if isinstance(pair, AllOf) else pair
+    )
     return cast("tuple[Role, Role]", roles)
 
 
-def _check_crossing(meeting: Part, first: Part, second: Part, junctions: Sequence[Junction]) -> None:
+def _check_crossing(
+    meeting: Part, first: Part, second: Part, junctions: Sequence[Junction]
+) -> None:
     for junction in junctions:
         for ways in product(_ways(first, junction), _ways(second, junction)):
             if junction.conflicts(*(junction.route(*way) for way in ways)) is None:
@@ -219,7 +256,12 @@ def _check_crossing(meeting: Part, first: Part, second: Part, junctions: Sequenc
                     f"{_role(actor)} ({' '.join(map(str, way))})"
                     for actor, way in zip((first, second), ways, strict=True)
                 ]
-                raise _fault(meeting, "actors", f"the ways of {' and '.join(texts)} do not meet", _way_to_meet(*ways))
+                raise _fault(
+                    meeting,
+                    "actors",
+                    f"the ways of {' and '.join(texts)} do not meet",
+                    _way_to_meet(*ways),
+                )
 
 
 def _way_to_meet(one: _Way, other: _Way) -> str:
@@ -232,7 +274,11 @@ def _way_to_meet(one: _Way, other: _Way) -> str:
 def _ways(actor: Part, junction: Junction) -> Iterator[_Way]:
     """Every arm, turn and lane of a driver that can be drawn."""
     for arm, turn in product(actor.values("from_arm"), actor.values("turn")):
-        lanes = actor.values("lane") if "lane" in actor.fields else usual_lanes(turn, junction.spec.lanes)
+        lanes = (
+            actor.values("lane")
+            if "lane" in actor.fields
+            else usual_lanes(turn, junction.spec.lanes)
+        )
         yield from ((arm, turn, lane) for lane in lanes)
 
 

@@ -261,12 +261,19 @@ class Part:
 
     def values(self, name: str) -> tuple[Any, ...]:
         """The alternatives of a field; its default if the file does not name it."""
-        return tuple(self.fields[name].alternatives()) if name in self.fields else (default_of(self.kind, name),)
+        return (
+            tuple(self.fields[name].alternatives())
+            if name in self.fields
+            else (default_of(self.kind, name),)
+        )
 
     def instances(self) -> Iterator[Any]:
         """Each instance that can be drawn (of a range only its ends), made one at a time."""
         options = [tuple(_instances(choice)) for choice in self.fields.values()]
-        return (self.kind(**dict(zip(self.fields, values, strict=True))) for values in itertools.product(*options))
+        return (
+            self.kind(**dict(zip(self.fields, values, strict=True)))
+            for values in itertools.product(*options)
+        )
 
     def line(self, name: str) -> str:
         """The line of a field; if the file does not name the field, the line of the part."""
@@ -294,4 +301,6 @@ def key_of(name: str) -> str:
 def default_of(kind: type[Any], name: str) -> Any:
     """The default of a field."""
     field = next(field for field in dataclasses.fields(kind) if field.name == name)
-    return field.default if field.default_factory is dataclasses.MISSING else field.default_factory()
+    return (
+        field.default if field.default_factory is dataclasses.MISSING else field.default_factory()
+    )

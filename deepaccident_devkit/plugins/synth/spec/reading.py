@@ -7,10 +7,30 @@ import re
 import types
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, TypeAlias, Union, get_args, get_origin, get_type_hints
+from typing import (
+    TYPE_CHECKING,
+    Annotated,
+    Any,
+    Final,
+    Literal,
+    TypeAlias,
+    Union,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 from deepaccident_devkit.errors import ConfigError, shortened
-from deepaccident_devkit.plugins.synth.spec.model import AllOf, Bounds, FieldChoice, Fixed, OneOf, Part, Range, key_of
+from deepaccident_devkit.plugins.synth.spec.model import (
+    AllOf,
+    Bounds,
+    FieldChoice,
+    Fixed,
+    OneOf,
+    Part,
+    Range,
+    key_of,
+)
 from deepaccident_devkit.support.text import meant_text, spelled
 
 if TYPE_CHECKING:
@@ -18,10 +38,13 @@ if TYPE_CHECKING:
 
 # The tags that PyYAML gives to plain values by itself.
 _PLAIN_TAGS: Final = tuple(
-    f"tag:yaml.org,2002:{name}" for name in ("map", "seq", "str", "int", "float", "bool", "null", "timestamp")
+    f"tag:yaml.org,2002:{name}"
+    for name in ("map", "seq", "str", "int", "float", "bool", "null", "timestamp")
 )
 # YAML 1.1 also reads 010 as eight, 1:30 as ninety and 1_0 as ten, which few expect.
-_DECIMAL: Final = re.compile(r"[-+]?(\.inf|\.nan|(0|[1-9]\d*)(\.\d*)?([eE][-+]?\d+)?|\.\d+)", re.IGNORECASE)
+_DECIMAL: Final = re.compile(
+    r"[-+]?(\.inf|\.nan|(0|[1-9]\d*)(\.\d*)?([eE][-+]?\d+)?|\.\d+)", re.IGNORECASE
+)
 # The type of a plain word of YAML: a string, a number, a boolean, None; or something that fits no field.
 Scalar: TypeAlias = object
 
@@ -51,7 +74,9 @@ def parse_yaml(text: str, source: str) -> Node:
         loader = yaml.SafeLoader(text)
         root = loader.get_single_node()
         if root is None:
-            raise ConfigError(f"{source}: is empty; write at least the actors ego and other (docs/synth.md)")
+            raise ConfigError(
+                f"{source}: is empty; write at least the actors ego and other (docs/synth.md)"
+            )
         return _Tree(source, loader).node(root, root.start_mark.line)
     except yaml.MarkedYAMLError as error:
         raise ConfigError(f"{source}:{_fault(error)}") from error
@@ -86,24 +111,42 @@ class _Tree:
             raise self._error(line, path, "aliases (*name) are not read here; write the value out")
         self._seen.add(id(raw))
         if not raw.tag.startswith(_PLAIN_TAGS):
-            raise self._error(line, path, f"tags ({shortened(raw.tag)}) are not read here; leave the tag out")
+            raise self._error(
+                line, path, f"tags ({shortened(raw.tag)}) are not read here; leave the tag out"
+            )
         if isinstance(raw, yaml.MappingNode):
             return Node(where, self._entries(raw, path))
         if isinstance(raw, yaml.SequenceNode):
             items = enumerate(raw.value)
-            return Node(where, tuple(self.node(item, item.start_mark.line, f"{path}[{k}]") for k, item in items))
+            return Node(
+                where,
+                tuple(self.node(item, item.start_mark.line, f"{path}[{k}]") for k, item in items),
+            )
         return Node(where, self._scalar(raw, line, path))
 
     def _scalar(self, raw: yaml.Node, line: int, path: str) -> Scalar:
         try:
             value = self._loader.construct_object(raw)
-        except (ValueError, LookupError, AttributeError, OverflowError) as error:  # of PyYAML, if a tag does not fit
+        except (
+            ValueError,
+            LookupError,
+            AttributeError,
+            OverflowError,
+        ) as error:  # of PyYAML, if a tag does not fit
             told = shortened(str(error))
-            sentence = f"{raw.value[:40]!r} cannot be read ({told}); put it in quotes if it is a word"
+            sentence = (
+                f"{raw.value[:40]!r} cannot be read ({told}); put it in quotes if it is a word"
+            )
             raise self._error(line, path, sentence) from error
-        if isinstance(value, int | float) and not isinstance(value, bool) and not _DECIMAL.fullmatch(raw.value):
+        if (
+            isinstance(value, int | float)
+            and not isinstance(value, bool)
+            and not _DECIMAL.fullmatch(raw.value)
+        ):
             found = f"{shortened(raw.value)!r} is not a plain decimal number"
-            raise self._error(line, path, f"{found}; write one, or put it in quotes if it is a word")
+            raise self._error(
+                line, path, f"{found}; write one, or put it in quotes if it is a word"
+            )
         return value
 
     def _entries(self, raw: yaml.MappingNode, path: str) -> dict[str, Node]:
@@ -111,7 +154,11 @@ class _Tree:
         for raw_key, raw_value in raw.value:
             key, line = raw_key.value, raw_key.start_mark.line
             if not isinstance(key, str):
-                raise self._error(line, path, "expected a key that is a word, found a list or mapping; write a word")
+                raise self._error(
+                    line,
+                    path,
+                    "expected a key that is a word, found a list or mapping; write a word",
+                )
             inner = f"{path}.{key}" if path else key
             if key in entries:
                 raise self._error(line, inner, "is there twice; keep one of them")
@@ -162,7 +209,11 @@ def required_fields(kind: type[Any]) -> tuple[str, ...]:
     """The fields of a dataclass that have no default."""
     missing = dataclasses.MISSING
     fields = dataclasses.fields(kind)
-    return tuple(field.name for field in fields if field.default is missing and field.default_factory is missing)
+    return tuple(
+        field.name
+        for field in fields
+        if field.default is missing and field.default_factory is missing
+    )
 
 
 def read_part(node: Node, kind: type[Any], path: str = "") -> Part:
@@ -185,7 +236,8 @@ def read_part(node: Node, kind: type[Any], path: str = "") -> Part:
             raise ConfigError(f"{node.where}: {prefix}{key_of(name)}: is missing; add it")
     present = [(key, name) for key, name in names.items() if key in entries]
     fields = {
-        name: _read(entries[key], types_of[name], prefix + key, settled=name in _SETTLED) for key, name in present
+        name: _read(entries[key], types_of[name], prefix + key, settled=name in _SETTLED)
+        for key, name in present
     }
     return Part(kind, node.where, path, fields, {name: entries[key].where for key, name in present})
 
@@ -216,7 +268,9 @@ def _read(node: Node, wanted: FieldType, path: str, *, settled: bool = False) ->
         return _read_range(node, wanted, path)
     if not node.value:
         raise _wrong(node, path, _described(wanted), node)
-    return OneOf(tuple(_read_one(item, wanted, f"{path}[{k}]") for k, item in enumerate(node.value)))
+    return OneOf(
+        tuple(_read_one(item, wanted, f"{path}[{k}]") for k, item in enumerate(node.value))
+    )
 
 
 def _read_list(node: Node, wanted: FieldType, path: str) -> FieldChoice:
@@ -234,7 +288,9 @@ def _read_range(node: Node, wanted: FieldType, path: str) -> FieldChoice:
         raise _wrong(node, path, f"{_described(wanted)}, or [low, high]", node)
     low, high = (_number(end, wanted, f"{path}[{k}]") for k, end in enumerate(ends))
     if low > high:
-        raise ConfigError(f"{node.where}: {path}: expected [low, high], found [{low:g}, {high:g}]; exchange the two")
+        raise ConfigError(
+            f"{node.where}: {path}: expected [low, high], found [{low:g}, {high:g}]; exchange the two"
+        )
     return Range(low, high, wanted.base is int)
 
 
@@ -249,7 +305,13 @@ def _read_one(node: Node, wanted: FieldType, path: str) -> FieldChoice:
     value = spelled(value, wanted.words)
     fits = value in wanted.words if wanted.words else isinstance(value, wanted.base)
     if not fits:
-        raise _wrong(node, path, _described(wanted), node, _remedy(wanted, value) + meant_text(value, wanted.words))
+        raise _wrong(
+            node,
+            path,
+            _described(wanted),
+            node,
+            _remedy(wanted, value) + meant_text(value, wanted.words),
+        )
     return Fixed(value)
 
 
@@ -271,7 +333,12 @@ def _wrong(node: Node, path: str, expected: str, found: Node, remedy: str = "") 
 
 def _remedy(wanted: FieldType, value: Scalar) -> str:
     """The remedy if only quotes are wrong or missing, or if YAML reads a number such as `1e1` as a text."""
-    if wanted.base is str and not wanted.words and not isinstance(value, Mapping | tuple) and value is not None:
+    if (
+        wanted.base is str
+        and not wanted.words
+        and not isinstance(value, Mapping | tuple)
+        and value is not None
+    ):
         return "; put it in quotes"
     if wanted.base in (int, float) and isinstance(value, str):
         return "; write a decimal number, without quotes and without e"
@@ -283,7 +350,9 @@ def _described(wanted: FieldType) -> str:
     if wanted.words:
         return f"one of {', '.join(wanted.words)}"
     if wanted.base is tuple and wanted.items is not None:
-        return f"a list, as [{', '.join(wanted.items.words[:2])}]" if wanted.items.words else "a list"
+        return (
+            f"a list, as [{', '.join(wanted.items.words[:2])}]" if wanted.items.words else "a list"
+        )
     names = {str: "a text", bool: "true or false", int: "a whole number", float: "a number"}
     text = names.get(wanted.base, "keys and values")
     return f"{text}, {wanted.bounds}" if wanted.bounds else text

@@ -13,7 +13,11 @@ from deepaccident_devkit.plugins.synth.roads import Junction
 from deepaccident_devkit.plugins.synth.spec import ScenarioSpec
 from deepaccident_devkit.plugins.synth.spec.checks import LEADERS
 from deepaccident_devkit.plugins.synth.spec.model import Role
-from deepaccident_devkit.plugins.synth.traffic.background import ParkedVehicle, background_users, parked_vehicles
+from deepaccident_devkit.plugins.synth.traffic.background import (
+    ParkedVehicle,
+    background_users,
+    parked_vehicles,
+)
 from deepaccident_devkit.plugins.synth.traffic.driving import RoadUser, middle_of
 from deepaccident_devkit.plugins.synth.traffic.grazes import swerves
 from deepaccident_devkit.plugins.synth.traffic.lifelike import (
@@ -25,7 +29,12 @@ from deepaccident_devkit.plugins.synth.traffic.lifelike import (
     lively,
 )
 from deepaccident_devkit.plugins.synth.traffic.placement import WARM_UP, Cast, cast_actors
-from deepaccident_devkit.plugins.synth.traffic.rights import AXIS_OF_ARM, SignalPlan, find_rights, plan_with_green
+from deepaccident_devkit.plugins.synth.traffic.rights import (
+    AXIS_OF_ARM,
+    SignalPlan,
+    find_rights,
+    plan_with_green,
+)
 from deepaccident_devkit.plugins.synth.traffic.simulate import Simulation, gap, separation, simulate
 from deepaccident_devkit.support.arrays import FloatArray
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
@@ -93,7 +102,11 @@ class Stage:
     @property
     def unlabelled(self) -> int | None:
         """The row of the road user that labels and sensors leave out, None if there is none."""
-        return None if self.cast.pair is None or self.kind is None or self.kind.labelled else self.cast.pair[1]
+        return (
+            None
+            if self.cast.pair is None or self.kind is None or self.kind.labelled
+            else self.cast.pair[1]
+        )
 
     @property
     def users(self) -> tuple[RoadUser, ...]:
@@ -150,14 +163,20 @@ class Recorded:
 
 
 def set_stage(
-    rng: np.random.Generator, spec: ScenarioSpec, junction: Junction, duration: float, kind: AccidentKind | None = None
+    rng: np.random.Generator,
+    spec: ScenarioSpec,
+    junction: Junction,
+    duration: float,
+    kind: AccidentKind | None = None,
 ) -> Stage:
     """Everyone's place at the beginning; the pair meets `duration` seconds after the first recorded frame."""
     cast = cast_actors(rng, spec, junction, duration, kind)
     signals = _signal_plan(rng, cast) if spec.road.signalized else None
     hold = max(duration - _LONGEST_DRIVE, 0.0)
     background = background_users(rng, spec, junction, cast.users, signals, cast.begin + hold)
-    parked = tuple(parked_vehicles(rng, spec, junction, [user for user in cast.users if user.walks]))
+    parked = tuple(
+        parked_vehicles(rng, spec, junction, [user for user in cast.users if user.walks])
+    )
     if kind is not None:
         background = [lively(rng, user, kind.traffic, cast.begin + hold) for user in background]
         parked = crowded(rng, parked)
@@ -181,8 +200,12 @@ def try_accident(stage: Stage) -> Performance | float:
     if pair is None:
         return np.inf
     unruly = [replace(user, ignores=("signal", "priority")) for user in stage.cast.users]
-    ahead = {LEADERS.get(stage.users[row].role) for row in pair}  # whose followers could not come if they waited
-    pushing = [row for row, user in enumerate(stage.cast.users) if row in pair or user.role in ahead]
+    ahead = {
+        LEADERS.get(stage.users[row].role) for row in pair
+    }  # whose followers could not come if they waited
+    pushing = [
+        row for row, user in enumerate(stage.cast.users) if row in pair or user.role in ahead
+    ]
     users = [unruly[row] if row in pushing else user for row, user in enumerate(stage.users)]
     performance = _perform(stage, users, _LATEST, watched=pair, pushing=pushing)
     if performance is None:
@@ -200,7 +223,10 @@ def perform_twin(stage: Stage, end: float) -> Performance | None:
     """
     roles, narrow = _later_roles(stage.cast), None
     for late in _DELAYS:
-        users = [_later(user.obeying(), late) if user.role in roles else user.obeying() for user in stage.users]
+        users = [
+            _later(user.obeying(), late) if user.role in roles else user.obeying()
+            for user in stage.users
+        ]
         performance = _perform(stage, users, end)
         if performance is None:
             continue
@@ -210,7 +236,9 @@ def perform_twin(stage: Stage, end: float) -> Performance | None:
     return narrow
 
 
-def recorded_accident(rng: np.random.Generator, stage: Stage, performance: Performance, frames: int | None) -> Recorded:
+def recorded_accident(
+    rng: np.random.Generator, stage: Stage, performance: Performance, frames: int | None
+) -> Recorded:
     """The recording that ends with the impact, or, with a kind of accident, about then.
 
     None records all frames that there are, within limits.
@@ -220,31 +248,48 @@ def recorded_accident(rng: np.random.Generator, stage: Stage, performance: Perfo
     impact = impact_of(performance.simulation, pair, size)
     end = impact.time
     if stage.kind is not None:
-        simulation, after = beyond_contact(rng, performance.simulation, pair, size, stage.kind.traffic)
+        simulation, after = beyond_contact(
+            rng, performance.simulation, pair, size, stage.kind.traffic
+        )
         performance, end = replace(performance, simulation=simulation), end + after
     count = frames or _natural_frames(stage, end)
-    return Recorded(performance=performance, start=end - FRAME_PERIOD * (count - 1), frames=count, impact=impact)
+    return Recorded(
+        performance=performance, start=end - FRAME_PERIOD * (count - 1), frames=count, impact=impact
+    )
 
 
-def recorded_normal(rng: np.random.Generator, stage: Stage, performance: Performance, frames: int | None) -> Recorded:
+def recorded_normal(
+    rng: np.random.Generator, stage: Stage, performance: Performance, frames: int | None
+) -> Recorded:
     """The recording that ends when ego has arrived, or when time is over; arguments as in `recorded_accident`."""
     begin = stage.cast.begin + WARM_UP
     if stage.kind is None:
-        natural = _natural_frames(stage, min(_arrival_time(stage, performance), begin + _LATEST_END))
+        natural = _natural_frames(
+            stage, min(_arrival_time(stage, performance), begin + _LATEST_END)
+        )
     else:
         natural = int(rng.integers(*NORMAL_FRAMES))
     if frames is None:
         return Recorded(performance=performance, start=begin, frames=natural, impact=None)
     end = begin + FRAME_PERIOD * (max(natural, frames) - 1)
-    return Recorded(performance=performance, start=end - FRAME_PERIOD * (frames - 1), frames=frames, impact=None)
+    return Recorded(
+        performance=performance, start=end - FRAME_PERIOD * (frames - 1), frames=frames, impact=None
+    )
 
 
 def with_graze(stage: Stage, recorded: Recorded) -> Recorded:
     """Return a recording in which a driver scrapes along another, none of them in the accident, if any pass closely."""
     performance, pair = recorded.performance, stage.cast.pair or ()
     users = [stage.users[row] for row in performance.present]
-    drivers = [place for place, row in enumerate(performance.present) if row not in pair and not users[place].walks]
-    window = (recorded.start + _BEFORE_GRAZE, recorded.start + FRAME_PERIOD * recorded.frames - _AFTER_GRAZE)
+    drivers = [
+        place
+        for place, row in enumerate(performance.present)
+        if row not in pair and not users[place].walks
+    ]
+    window = (
+        recorded.start + _BEFORE_GRAZE,
+        recorded.start + FRAME_PERIOD * recorded.frames - _AFTER_GRAZE,
+    )
     touching = _touching(stage, users, performance.simulation)
     for two, simulation in swerves(performance.simulation, _sizes(users), drivers, window):
         if sorted(_touching(stage, users, simulation)) == sorted([*touching, two]):
@@ -252,9 +297,13 @@ def with_graze(stage: Stage, recorded: Recorded) -> Recorded:
     return recorded
 
 
-def usual_duration(rng: np.random.Generator, frames: int | None, kind: AccidentKind | None = None) -> float:
+def usual_duration(
+    rng: np.random.Generator, frames: int | None, kind: AccidentKind | None = None
+) -> float:
     """Seconds from the beginning until the pair meets: drawn, or as many as the wanted number of frames needs."""
-    usual = accident_duration(rng, kind.traffic) if kind else rng.uniform(_EARLIEST, _LATEST_END + 0.3)
+    usual = (
+        accident_duration(rng, kind.traffic) if kind else rng.uniform(_EARLIEST, _LATEST_END + 0.3)
+    )
     natural = float(usual)
     return natural if frames is None else max(natural, frames * FRAME_PERIOD + 1.5)
 
@@ -277,7 +326,11 @@ def _held(user: RoadUser, seconds: float) -> RoadUser:
 
 def _later_roles(cast: Cast) -> tuple[Role, ...]:
     """The roles that come later in a delay: those of the pair except ego and other; if none, other and its follower."""
-    strangers = [cast.users[row].role for row in cast.pair or () if cast.users[row].role not in ("ego", "other")]
+    strangers = [
+        cast.users[row].role
+        for row in cast.pair or ()
+        if cast.users[row].role not in ("ego", "other")
+    ]
     return tuple(strangers) or ("other", "other_behind")
 
 
@@ -307,9 +360,16 @@ def _perform(
     present = list(range(len(users)))
     for _ in range(_ROUNDS):
         there = [users[row] for row in present]
-        rights = find_rights(there, minor=stage.spec.road.yielding_arms, blind=watched, pushing=pushing)
+        rights = find_rights(
+            there, minor=stage.spec.road.yielding_arms, blind=watched, pushing=pushing
+        )
         simulation = simulate(
-            there, begin=stage.cast.begin, end=end, rights=rights, signals=stage.signals, watched=watched
+            there,
+            begin=stage.cast.begin,
+            end=end,
+            rights=rights,
+            signals=stage.signals,
+            watched=watched,
         )
         pairs = set(_touching(stage, there, simulation)) - {tuple(sorted(watched or ()))}
         if not pairs:
@@ -321,11 +381,14 @@ def _perform(
     return None
 
 
-def _touching(stage: Stage, users: Sequence[RoadUser], simulation: Simulation) -> list[tuple[int, int]]:
+def _touching(
+    stage: Stage, users: Sequence[RoadUser], simulation: Simulation
+) -> list[tuple[int, int]]:
     """Pairs of rows that touch; parked vehicles come after the users."""
     standing = np.array([vehicle.pose for vehicle in stage.parked]).reshape(-1, 3)
     poses = np.concatenate(
-        [simulation.poses, np.broadcast_to(standing, (len(simulation.time), *standing.shape))], axis=1
+        [simulation.poses, np.broadcast_to(standing, (len(simulation.time), *standing.shape))],
+        axis=1,
     )
     size = _sizes([*users, *stage.parked])
     return [(i, j) for i, j in touching_pairs(poses, size, _MARGIN) if i < len(users)]
@@ -399,7 +462,9 @@ def contact_side(poses: FloatArray, size: FloatArray) -> _ContactSide:
     Poses are (2, 3) x, y (metres), yaw (radians) of the centres, sizes (2, 2) length and width, metres.
     """
     cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
-    axes = np.stack([np.stack([cos, sin], axis=1), np.stack([-sin, cos], axis=1)], axis=1)  # box, axis, xy
+    axes = np.stack(
+        [np.stack([cos, sin], axis=1), np.stack([-sin, cos], axis=1)], axis=1
+    )  # box, axis, xy
     normals = axes.reshape(4, 2)
     reach = np.abs(np.einsum("na,bka->nbk", normals, axes) * size / 2).sum(axis=(1, 2))
     apart = normals @ (poses[1, :2] - poses[0, :2])
@@ -416,13 +481,20 @@ def touching_pairs(poses: FloatArray, size: FloatArray, margin: float) -> list[t
     Poses are (S, A, 3) x, y (metres), yaw (radians) of the boxes' centres, sizes (A, 2) length and width, metres.
     """
     near = _near_pairs(poses, size, margin)
-    return [(i, j) for i, j in near if separation(poses[:, i], size[i], poses[:, j], size[j]).min() < margin]
+    return [
+        (i, j)
+        for i, j in near
+        if separation(poses[:, i], size[i], poses[:, j], size[j]).min() < margin
+    ]
 
 
 def least_gap(poses: FloatArray, size: FloatArray, rows: list[int], enough: float) -> float:
     """The least distance in metres between any two of `rows`, or `enough`; arguments as in `touching_pairs`."""
     pairs = _near_pairs(poses[:, rows], size[rows], enough)
-    gaps = [float(gap(poses[:, rows[i]], size[rows[i]], poses[:, rows[j]], size[rows[j]]).min()) for i, j in pairs]
+    gaps = [
+        float(gap(poses[:, rows[i]], size[rows[i]], poses[:, rows[j]], size[rows[j]]).min())
+        for i, j in pairs
+    ]
     return min([*gaps, enough])
 
 

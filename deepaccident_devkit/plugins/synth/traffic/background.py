@@ -9,7 +9,13 @@ from deepaccident_devkit.plugins.synth.actors import Body, random_body
 from deepaccident_devkit.plugins.synth.roads import Junction, Path, Route
 from deepaccident_devkit.plugins.synth.roads.layout import OUTWARD
 from deepaccident_devkit.plugins.synth.spec import ActorSpec, ScenarioSpec
-from deepaccident_devkit.plugins.synth.traffic.driving import MANNERS, RoadUser, lane_span, lane_way, shifted_path
+from deepaccident_devkit.plugins.synth.traffic.driving import (
+    MANNERS,
+    RoadUser,
+    lane_span,
+    lane_way,
+    shifted_path,
+)
 from deepaccident_devkit.plugins.synth.traffic.rights import RED, SignalPlan
 from deepaccident_devkit.support.arrays import FloatArray
 
@@ -45,8 +51,14 @@ def background_users(
     users: list[RoadUser] = []
     sidewalks = [path for path in junction.sidewalk_paths() if not _built_over(spec, path)]
     kinds: list[tuple[int, Callable[[], RoadUser | None]]] = [
-        (spec.background.vehicles, lambda: _driver(rng, junction, _DRIVERS, placed, signals, begin)),
-        (spec.background.two_wheelers, lambda: _driver(rng, junction, _RIDERS, placed, signals, begin)),
+        (
+            spec.background.vehicles,
+            lambda: _driver(rng, junction, _DRIVERS, placed, signals, begin),
+        ),
+        (
+            spec.background.two_wheelers,
+            lambda: _driver(rng, junction, _RIDERS, placed, signals, begin),
+        ),
         (spec.background.walking if sidewalks else 0, lambda: _walker(rng, sidewalks)),
         (spec.background.crossing, lambda: _crosser(rng, junction, named, signals, begin)),
     ]
@@ -68,7 +80,10 @@ class _Lanes:
 
     def is_free(self, route: Route, place: float) -> bool:
         """Whether one can start at `place` metres along a route."""
-        return not any(low < place < high and _share_lane(route, other, place) for other, low, high in self._taken)
+        return not any(
+            low < place < high and _share_lane(route, other, place)
+            for other, low, high in self._taken
+        )
 
     def take(self, user: RoadUser, route: Route) -> None:
         """Mark the place around a road user's start as not free."""
@@ -129,7 +144,11 @@ def _random_route(rng: np.random.Generator, junction: Junction, category: str) -
     turns = [turn for turn in junction.turns(arm) if category != "cyclist" or turn != "left"]
     weights = np.array([3.0 if turn == "straight" else 1.0 for turn in turns])
     turn = turns[rng.choice(len(turns), p=weights / weights.sum())]
-    lane = int(rng.integers(junction.spec.lanes)) if turn == "straight" and category != "cyclist" else None
+    lane = (
+        int(rng.integers(junction.spec.lanes))
+        if turn == "straight" and category != "cyclist"
+        else None
+    )
     return junction.route(arm, turn, lane)
 
 
@@ -137,7 +156,10 @@ def _built_over(spec: ScenarioSpec, sidewalk: Path) -> bool:
     """Whether the house of a hidden view, between ego and other, stands on a sidewalk."""
     if spec.view != "hidden":
         return False
-    out = np.array([OUTWARD[spec.actor(role).from_arm or "west"] for role in ("ego", "other")], dtype=np.float64)
+    out = np.array(
+        [OUTWARD[spec.actor(role).from_arm or "west"] for role in ("ego", "other")],
+        dtype=np.float64,
+    )
     corner = out.sum(axis=0)
     near = np.abs(sidewalk.xy).max(axis=1) < _HOUSE_REACH
     return bool((near & (sidewalk.xy * corner > 0).all(axis=1)).any())
@@ -146,11 +168,15 @@ def _built_over(spec: ScenarioSpec, sidewalk: Path) -> bool:
 def _walker(rng: np.random.Generator, sidewalks: Sequence[Path]) -> RoadUser:
     """A pedestrian on a sidewalk, in either direction."""
     path = sidewalks[int(rng.integers(len(sidewalks)))]
-    path = shifted_path(path if rng.random() < 0.5 else path.reversed(), float(-rng.uniform(*_SIDEWALK_OFFSETS)))
+    path = shifted_path(
+        path if rng.random() < 0.5 else path.reversed(), float(-rng.uniform(*_SIDEWALK_OFFSETS))
+    )
     body, manner = random_body(rng, "pedestrian"), MANNERS["pedestrian"]
     speed = rng.uniform(*manner.max_speed)
     start = float(path.length / 2 + rng.uniform(-55, 45))
-    return RoadUser(role="pedestrian", body=body, path=path, start=start, start_speed=speed, max_speed=speed)
+    return RoadUser(
+        role="pedestrian", body=body, path=path, start=start, start_speed=speed, max_speed=speed
+    )
 
 
 def _crosser(
@@ -170,7 +196,9 @@ def _crosser(
     body, manner = random_body(rng, "pedestrian"), MANNERS["pedestrian"]
     speed = rng.uniform(*manner.max_speed)
     path = junction.crosswalk(arm)
-    path = shifted_path(path if rng.random() < 0.5 else path.reversed(), float(-rng.uniform(*_CROSSWALK_OFFSETS)))
+    path = shifted_path(
+        path if rng.random() < 0.5 else path.reversed(), float(-rng.uniform(*_CROSSWALK_OFFSETS))
+    )
     needed = path.length / speed
     if signals is not None and any(
         signals.state(arm, begin + delay + share * needed) != RED for share in (0.0, 0.5, 1.0)
@@ -220,7 +248,11 @@ def parked_vehicles(
     They keep some distance from the paths of pedestrians who cross a road.
     """
     places = junction.parking_places()
-    free = [row for row, place in enumerate(places) if not any(_in_the_way(place, user) for user in walking)]
+    free = [
+        row
+        for row, place in enumerate(places)
+        if not any(_in_the_way(place, user) for user in walking)
+    ]
     vehicles = []
     for actor in spec.actors:
         if actor.role == "parked" and free:
@@ -228,21 +260,26 @@ def parked_vehicles(
             vehicles.append(_parked(rng, actor.category, places[free.pop(row)]))
     count = min(spec.background.parked, len(free))
     others = sorted(rng.permutation(len(free))[:count].tolist())
-    return vehicles + [_parked(rng, str(rng.choice(_CATEGORIES)), places[free[row]]) for row in others]
+    return vehicles + [
+        _parked(rng, str(rng.choice(_CATEGORIES)), places[free[row]]) for row in others
+    ]
 
 
 def _in_the_way(place: FloatArray, user: RoadUser) -> bool:
     """Whether a vehicle on a slot would stand where someone steps onto the road."""
     along, left = user.path.project(place[:2])
     return bool(
-        -_HALF_LENGTH < along[0] < user.path.length + _HALF_LENGTH and abs(left[0]) < _HALF_LENGTH + _FREE_PATH / 2
+        -_HALF_LENGTH < along[0] < user.path.length + _HALF_LENGTH
+        and abs(left[0]) < _HALF_LENGTH + _FREE_PATH / 2
     )
 
 
 def _nearest(rng: np.random.Generator, actor: ActorSpec, places: FloatArray) -> int:
     """The row of the slot (N, 3) that is nearest to the place that a file gives for a vehicle."""
     out = np.array(OUTWARD[actor.from_arm or "west"], dtype=np.float64)
-    distance = actor.start_distance if actor.start_distance is not None else rng.uniform(*_DISTANCES)
+    distance = (
+        actor.start_distance if actor.start_distance is not None else rng.uniform(*_DISTANCES)
+    )
     left = np.array([-out[1], out[0]])
     side = 1.0 if actor.side == "right" else -1.0
     along, beside = places[:, :2] @ out, side * (places[:, :2] @ left)
@@ -253,4 +290,6 @@ def _nearest(rng: np.random.Generator, actor: ActorSpec, places: FloatArray) -> 
 def _parked(rng: np.random.Generator, category: str, place: FloatArray) -> ParkedVehicle:
     x, y, yaw = place.tolist()
     shift = rng.uniform(-_SHIFT, _SHIFT)
-    return ParkedVehicle(random_body(rng, category), (x + shift * np.cos(yaw), y + shift * np.sin(yaw), yaw))
+    return ParkedVehicle(
+        random_body(rng, category), (x + shift * np.cos(yaw), y + shift * np.sin(yaw), yaw)
+    )

@@ -74,7 +74,9 @@ class Wheels:
     along: FloatArray
 
 
-def step(wheels: Wheels, acceleration: FloatArray, on_path: FloatArray, wheelbase: FloatArray) -> None:
+def step(
+    wheels: Wheels, acceleration: FloatArray, on_path: FloatArray, wheelbase: FloatArray
+) -> None:
     """Move all road users by one period, in place; for those without wheels only `speed` and `along` are valid.
 
     The acceleration is (A,) m/s², `on_path` (4, A) x, y, yaw, curvature of the paths at `wheels.along`, the wheelbase
@@ -103,14 +105,21 @@ def _off_path(wheels: Wheels, on_path: FloatArray) -> tuple[FloatArray, FloatArr
 
 
 def _wanted_steer(
-    speed: FloatArray, lateral: FloatArray, turned: FloatArray, curvature: FloatArray, wheelbase: FloatArray
+    speed: FloatArray,
+    lateral: FloatArray,
+    turned: FloatArray,
+    curvature: FloatArray,
+    wheelbase: FloatArray,
 ) -> FloatArray:
     """The steering angle that follows the path and returns to it, critically damped over the distance ahead."""
     ahead = _LOOK_AHEAD[0] + _LOOK_AHEAD[1] * speed
     wanted = curvature - lateral / ahead**2 - 2 * turned / ahead
     most = _MAX_TANGENT / wheelbase
     return np.asarray(
-        np.arctan(np.where(wheelbase < np.inf, wheelbase, 0.0) * np.minimum(np.maximum(wanted, -most), most))
+        np.arctan(
+            np.where(wheelbase < np.inf, wheelbase, 0.0)
+            * np.minimum(np.maximum(wanted, -most), most)
+        )
     )
 
 
@@ -122,7 +131,11 @@ class Tracks:
     """
 
     def __init__(
-        self, paths: Sequence[Path], lateral: FloatArray, stops: BoolArray, paces: Sequence[Sequence[Stretch]] = ()
+        self,
+        paths: Sequence[Path],
+        lateral: FloatArray,
+        stops: BoolArray,
+        paces: Sequence[Sequence[Stretch]] = (),
     ) -> None:
         along = np.arange(0.0, max(path.length for path in paths) + _BEYOND, _TABLE_SPACING)
         distinct = {id(path): path for path in paths}
@@ -167,7 +180,9 @@ class Tracks:
         return low, place - low
 
 
-def _allowed_speed(along: FloatArray, curvature: FloatArray, lateral: FloatArray, ends: FloatArray) -> FloatArray:
+def _allowed_speed(
+    along: FloatArray, curvature: FloatArray, lateral: FloatArray, ends: FloatArray
+) -> FloatArray:
     """(A, K) m/s: so slow that each enters the bends ahead slowly enough, and stops at its path's end if it must."""
     bend = lateral[:, None] / np.maximum(np.abs(curvature), 1e-4)
     bend[along >= ends[:, None]] = 0.0
@@ -209,7 +224,9 @@ def hardest_braking(speed: FloatArray) -> FloatArray:
     return np.minimum(_GENTLE_STOP[0] + _GENTLE_STOP[1] * speed, HARDEST_BRAKING)
 
 
-def interaction(temper: Temper, speed: FloatArray, gap: FloatArray, leader_speed: FloatArray) -> FloatArray:
+def interaction(
+    temper: Temper, speed: FloatArray, gap: FloatArray, leader_speed: FloatArray
+) -> FloatArray:
     """The acceleration (A,) m/s², 0 or less, that each adds because of the road user ahead.
 
     The gap is (A,) metres, infinite without one; its speed is that along the same path, (A,) m/s.
@@ -219,7 +236,9 @@ def interaction(temper: Temper, speed: FloatArray, gap: FloatArray, leader_speed
 
 def stopping(temper: Temper, speed: FloatArray, gap: FloatArray) -> FloatArray:
     """The acceleration (A,) m/s² to stop before a line `gap` (A,) metres ahead; `gap` is infinite if there is none."""
-    return _interaction(temper, speed, gap, np.zeros_like(speed), np.full_like(speed, 0.5), 0.3 * temper.time_gap)
+    return _interaction(
+        temper, speed, gap, np.zeros_like(speed), np.full_like(speed, 0.5), 0.3 * temper.time_gap
+    )
 
 
 def can_stop(temper: Temper, speed: FloatArray, gap: FloatArray) -> FloatArray:
@@ -242,7 +261,11 @@ def _interaction(
 
 def lane_way(junction: Junction, route: Route, category: str) -> Path:
     """The path of a driver or rider on a route."""
-    return route.path if category != "cyclist" else _cyclist_path(junction.spec, route.from_arm, route.turn, route.lane)
+    return (
+        route.path
+        if category != "cyclist"
+        else _cyclist_path(junction.spec, route.from_arm, route.turn, route.lane)
+    )
 
 
 def lane_span(route: Route) -> tuple[float, float]:
@@ -262,7 +285,9 @@ def road_crossing(spec: RoadSpec, arm: Arm, along: float, side: Side) -> Path:
     """
     out_x, out_y = OUTWARD[arm]
     beside = spec.road_edge + _KERB_ROOM
-    sign = 1.0 if side == "right" else -1.0  # the right of a driver inward is the left, seen outward
+    sign = (
+        1.0 if side == "right" else -1.0
+    )  # the right of a driver inward is the left, seen outward
     left = np.array([-out_y, out_x], dtype=np.float64)
     start = along * np.array([out_x, out_y]) + sign * beside * left
     yaw = float(np.arctan2(-sign * left[1], -sign * left[0]))

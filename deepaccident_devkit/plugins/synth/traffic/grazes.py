@@ -47,7 +47,9 @@ def swerves(
                 yield (row, other), swerving
 
 
-def _swerving(simulation: Simulation, row: int, step: int, shift: float, wheelbase: float) -> Simulation:
+def _swerving(
+    simulation: Simulation, row: int, step: int, shift: float, wheelbase: float
+) -> Simulation:
     """Return a simulation in which one driver is `shift` metres farther to the left at a step."""
     states, velocities = simulation.states.copy(), simulation.velocities.copy()
     x, y, yaw, speed, _ = states[:, row].T

@@ -21,7 +21,13 @@ from deepaccident_devkit.plugins.synth.traffic.simulate import Simulation, separ
 from deepaccident_devkit.support.arrays import FloatArray
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
-_BACKGROUND = {"vehicles": (4, 10), "two_wheelers": (0, 3), "parked": (1, 3), "walking": (0, 4), "crossing": (0, 3)}
+_BACKGROUND = {
+    "vehicles": (4, 10),
+    "two_wheelers": (0, 3),
+    "parked": (1, 3),
+    "walking": (0, 4),
+    "crossing": (0, 3),
+}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -74,7 +80,8 @@ TRAFFICS: Final[Mapping[str, Traffic]] = {
         no_touch=0.07,
     ),
     "v2": Traffic(
-        background=_BACKGROUND | {"vehicles": (5, 11), "two_wheelers": (0, 2), "parked": (1, 2), "walking": (2, 7)},
+        background=_BACKGROUND
+        | {"vehicles": (5, 11), "two_wheelers": (0, 2), "parked": (1, 2), "walking": (2, 7)},
         frames=(61.5, 0.29, 36, 78),
         slow=0.95,
         rolling=0.35,
@@ -120,7 +127,9 @@ class AccidentKind:
 ACCIDENT_KINDS: Final[Mapping[str, AccidentKind]] = {
     "crossing": AccidentKind(weight=16),
     "merge": AccidentKind(weight=36, late=(-1.0, 1.0), joins=True),
-    "ego is run into": AccidentKind(weight=9, pair=("ego", "ego_behind"), late=(2.0, 3.0), gap=(3.0, 9.0), stops=True),
+    "ego is run into": AccidentKind(
+        weight=9, pair=("ego", "ego_behind"), late=(2.0, 3.0), gap=(3.0, 9.0), stops=True
+    ),
     "other is run into": AccidentKind(
         weight=9, pair=("other", "other_behind"), late=(2.0, 3.0), gap=(3.0, 9.0), stops=True
     ),
@@ -171,12 +180,21 @@ def paths_join(spec: ScenarioSpec) -> bool:
 
 def as_kind(rng: np.random.Generator, spec: ScenarioSpec, kind: AccidentKind) -> ScenarioSpec:
     """A designed scenario with this kind of accident, and with fewer road users on steeper roads."""
-    background = BackgroundSpec(**{name: int(rng.integers(*span)) for name, span in kind.traffic.background.items()})
+    background = BackgroundSpec(
+        **{name: int(rng.integers(*span)) for name, span in kind.traffic.background.items()}
+    )
     meet = MeetSpec(actors=kind.pair or ("ego", "other"), offset=rng.uniform(*kind.late))
-    gaps = {"ego_behind": rng.uniform(*kind.gap), "other_behind": rng.uniform(*(kind.gap if kind.stops else _GAP))}
-    ordered = sorted(spec.actors, key=lambda actor: (actor.role != "other", actor.role == "other_behind"))  # as ids
+    gaps = {
+        "ego_behind": rng.uniform(*kind.gap),
+        "other_behind": rng.uniform(*(kind.gap if kind.stops else _GAP)),
+    }
+    ordered = sorted(
+        spec.actors, key=lambda actor: (actor.role != "other", actor.role == "other_behind")
+    )  # as ids
     actors = tuple(replace(actor, gap=gaps.get(actor.role)) for actor in ordered)
-    return replace(spec, road=_steeper(rng, spec.road), actors=actors, meet=meet, background=background)
+    return replace(
+        spec, road=_steeper(rng, spec.road), actors=actors, meet=meet, background=background
+    )
 
 
 def _steeper(rng: np.random.Generator, road: RoadSpec) -> RoadSpec:
@@ -193,7 +211,9 @@ def accident_duration(rng: np.random.Generator, traffic: Traffic) -> float:
     return int(np.clip(median * np.exp(spread * rng.standard_normal()), least, most)) * FRAME_PERIOD
 
 
-def erring(rng: np.random.Generator, user: RoadUser, place: float, traffic: Traffic, *, stops: bool) -> RoadUser:
+def erring(
+    rng: np.random.Generator, user: RoadUser, place: float, traffic: Traffic, *, stops: bool
+) -> RoadUser:
     """Return a driver of the pair, who brakes, hesitates or swerves shortly before `place` (metres along its path)."""
     if user.route is None:
         return user
@@ -206,7 +226,9 @@ def erring(rng: np.random.Generator, user: RoadUser, place: float, traffic: Traf
         start_speed, to_go = traffic.rolling * speed, rng.uniform(*traffic.to_go)
     start = place - (to_go or 30.0 + 2.0 * start_speed)
     path, error = user.path, rng.random()
-    pace: tuple[Stretch, ...] = (_stop(rng, place - rng.uniform(25, 60), speed),) if rng.random() < 0.25 else ()
+    pace: tuple[Stretch, ...] = (
+        (_stop(rng, place - rng.uniform(25, 60), speed),) if rng.random() < 0.25 else ()
+    )
     if to_go and start_speed:
         pace = ((0.0, start, start_speed),)
     if stops:
@@ -245,9 +267,16 @@ def lively(rng: np.random.Generator, user: RoadUser, traffic: Traffic, begin: fl
     elif not cycles and chance[0] < traffic.standing + traffic.fast:
         speed = rng.uniform(*traffic.fast_speeds)
     if chance[1] < 0.85:
-        begins = user.start + rng.uniform(3, 40) + np.cumsum(rng.uniform(5, 30, size=2)) + np.arange(2) * speed**2 / 4
+        begins = (
+            user.start
+            + rng.uniform(3, 40)
+            + np.cumsum(rng.uniform(5, 30, size=2))
+            + np.arange(2) * speed**2 / 4
+        )
         pace = tuple(_stop(rng, float(begin), speed) for begin in begins)
-    return replace(user, start_speed=start_speed, max_speed=speed, delay=delay, pace=pace, brisk=True)
+    return replace(
+        user, start_speed=start_speed, max_speed=speed, delay=delay, pace=pace, brisk=True
+    )
 
 
 def _stop(rng: np.random.Generator, begin: float, speed: float) -> Stretch:
@@ -262,19 +291,30 @@ def crowded(rng: np.random.Generator, parked: Sequence[ParkedVehicle]) -> tuple[
         return tuple(at_kerb)
     first = at_kerb[int(rng.integers(len(parked)))].pose
     shifts = np.cumsum(rng.uniform(*_PITCHES, size=int(rng.integers(*_CROWD))))
-    shifts *= np.sign(first[0] * np.cos(first[2]) + first[1] * np.sin(first[2]))  # away from the junction's middle
-    row = [ParkedVehicle(random_body(rng, "car"), _beside(first, shift, 0.0)) for shift in shifts.tolist()]
+    shifts *= np.sign(
+        first[0] * np.cos(first[2]) + first[1] * np.sin(first[2])
+    )  # away from the junction's middle
+    row = [
+        ParkedVehicle(random_body(rng, "car"), _beside(first, shift, 0.0))
+        for shift in shifts.tolist()
+    ]
     return (*at_kerb, *row)
 
 
-def _beside(pose: tuple[float, float, float], ahead: float, right: float) -> tuple[float, float, float]:
+def _beside(
+    pose: tuple[float, float, float], ahead: float, right: float
+) -> tuple[float, float, float]:
     x, y, yaw = pose
     cos, sin = float(np.cos(yaw)), float(np.sin(yaw))
     return x + ahead * cos + right * sin, y + ahead * sin - right * cos, yaw
 
 
 def beyond_contact(
-    rng: np.random.Generator, simulation: Simulation, pair: tuple[int, int], size: FloatArray, traffic: Traffic
+    rng: np.random.Generator,
+    simulation: Simulation,
+    pair: tuple[int, int],
+    size: FloatArray,
+    traffic: Traffic,
 ) -> tuple[Simulation, float]:
     """A simulation that goes on after its last step, and how many seconds later (or earlier) its recording ends.
 
@@ -288,7 +328,9 @@ def beyond_contact(
     velocity = simulation.velocities[-1].copy()
     mean = velocity[rows].mean(axis=0)
     way = 2.0 * np.hypot(*(velocity[pair[0]] - mean)) * after
-    velocity[rows] = mean + min(1.0 - _GIVES_WAY, 1.3 * deepest / max(way, 1e-6)) * (velocity[rows] - mean)
+    velocity[rows] = mean + min(1.0 - _GIVES_WAY, 1.3 * deepest / max(way, 1e-6)) * (
+        velocity[rows] - mean
+    )
     states = np.repeat(simulation.states[-1:], len(steps), axis=0)
     states[..., :2] += steps[:, None, None] * period * velocity
     depth = -separation(states[:, pair[0], :3], size[0], states[:, pair[1], :3], size[1])
@@ -297,6 +339,8 @@ def beyond_contact(
         simulation,
         time=np.concatenate([simulation.time, simulation.time[-1] + period * steps[:count]]),
         states=np.concatenate([simulation.states, states[:count]]),
-        velocities=np.concatenate([simulation.velocities, np.repeat(velocity[None], count, axis=0)]),
+        velocities=np.concatenate(
+            [simulation.velocities, np.repeat(velocity[None], count, axis=0)]
+        ),
     )
     return added, min(after, (count - 1) * period)

@@ -6,7 +6,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from deepaccident_devkit.plugins.synth.actors import random_body
-from deepaccident_devkit.plugins.synth.roads import LANE_WIDTH, Arm, Junction, Path, Route, Turn, crossing, lane_change
+from deepaccident_devkit.plugins.synth.roads import (
+    LANE_WIDTH,
+    Arm,
+    Junction,
+    Path,
+    Route,
+    Turn,
+    crossing,
+    lane_change,
+)
 from deepaccident_devkit.plugins.synth.spec import ActorSpec, MeetSpec, ScenarioSpec
 from deepaccident_devkit.plugins.synth.spec.checks import LEADERS
 from deepaccident_devkit.plugins.synth.spec.model import Role, Side
@@ -58,17 +67,23 @@ class Approach:
         if time < 0:
             return replace(self.user, start=self.user.start + self.user.start_speed * time)
         row = min(round(time / PERIOD), len(self.along) - 1)
-        return replace(self.user, start=float(self.along[row]), start_speed=float(self.speed[row]), delay=0.0)
+        return replace(
+            self.user, start=float(self.along[row]), start_speed=float(self.speed[row]), delay=0.0
+        )
 
 
 def drive_alone(user: RoadUser, to: float = 0.0) -> Approach:
     """The drive of a road user that is alone and stays on its path, at least until its centre is `to` metres along."""
-    tracks = Tracks([user.path], np.array([user.manner.lateral]), np.array([user.walks]), [user.pace])
+    tracks = Tracks(
+        [user.path], np.array([user.manner.lateral]), np.array([user.walks]), [user.pace]
+    )
     temper, back = temper_of([user]), user.wheelbase / 2
     along, speed = np.array([user.start - back]), np.array([user.start_speed])
     steps = PERIOD * np.arange(1, DECISION_STEPS + 1)
     places, speeds = [along], [speed]
-    usual, longest = (round(seconds / (PERIOD * DECISION_STEPS)) for seconds in (_USUAL_DRIVE, _LONGEST_DRIVE))
+    usual, longest = (
+        round(seconds / (PERIOD * DECISION_STEPS)) for seconds in (_USUAL_DRIVE, _LONGEST_DRIVE)
+    )
     for count in range(longest):
         if count >= usual and along[0] + back >= to:
             break
@@ -120,7 +135,11 @@ class Cast:
 
 
 def cast_actors(
-    rng: np.random.Generator, spec: ScenarioSpec, junction: Junction, duration: float, kind: AccidentKind | None = None
+    rng: np.random.Generator,
+    spec: ScenarioSpec,
+    junction: Junction,
+    duration: float,
+    kind: AccidentKind | None = None,
 ) -> Cast:
     """The moving road users that a file names; the pair meets `duration` seconds after the first recorded frame.
 
@@ -130,7 +149,9 @@ def cast_actors(
     named = [actor for actor in spec.actors if actor.role != "parked"]
     leading = [actor for actor in named if actor.role not in LEADERS]
     pair = _pair_rows(spec, leading)
-    users = [_drawn(rng, actor, junction, timed=row in (pair or ())) for row, actor in enumerate(leading)]
+    users = [
+        _drawn(rng, actor, junction, timed=row in (pair or ())) for row, actor in enumerate(leading)
+    ]
     if pair is not None and spec.meet is not None:
         meeting = crossing(users[pair[0]].path, users[pair[1]].path)
         if meeting is None:
@@ -142,15 +163,26 @@ def cast_actors(
                 for row, place in zip(pair, meeting, strict=True):
                     stops = kind.stops and spec.meet.actors[0] == users[row].role
                     users[row] = erring(rng, users[row], place, kind.traffic, stops=stops)
-            places = [place + _ahead(spec, role) for place, role in zip(meeting, spec.meet.actors, strict=True)]
-            approaches = [drive_alone(users[row], to=place) for row, place in zip(pair, places, strict=True)]
-            for row, place, late, approach in zip(pair, places, (0.0, spec.meet.offset), approaches, strict=True):
+            places = [
+                place + _ahead(spec, role)
+                for place, role in zip(meeting, spec.meet.actors, strict=True)
+            ]
+            approaches = [
+                drive_alone(users[row], to=place) for row, place in zip(pair, places, strict=True)
+            ]
+            for row, place, late, approach in zip(
+                pair, places, (0.0, spec.meet.offset), approaches, strict=True
+            ):
                 users[row] = approach.at(approach.time_to(place) + begin - late)
     for actor in named:
         if actor.role in LEADERS:
             leader = next(user for user in users if user.role == LEADERS[actor.role])
             # a follower does not change lanes with its leader, or it would collide with a vehicle beside it
-            way = leader if kind is None and spec.actor(leader.role).lane_change is None else leader.route or leader
+            way = (
+                leader
+                if kind is None and spec.actor(leader.role).lane_change is None
+                else leader.route or leader
+            )
             users.append(_follower(rng, actor, leader, way.path))
     if pair is not None and spec.meet is not None:
         roles = [user.role for user in users]
@@ -180,7 +212,9 @@ def _ahead(spec: ScenarioSpec, role: Role) -> float:
     return _LENGTH + max(_CLOSED * (spec.actor(role).gap or 0.0), _GAPS[0])
 
 
-def _drawn(rng: np.random.Generator, actor: ActorSpec, junction: Junction, *, timed: bool) -> RoadUser:
+def _drawn(
+    rng: np.random.Generator, actor: ActorSpec, junction: Junction, *, timed: bool
+) -> RoadUser:
     """A road user that follows nobody; if `timed`, it starts far away and standing, if the file gives no start."""
     body, manner = random_body(rng, actor.category), MANNERS[actor.category]
     max_speed = actor.max_speed if actor.max_speed is not None else rng.uniform(*manner.max_speed)
@@ -239,12 +273,18 @@ def _follower(rng: np.random.Generator, actor: ActorSpec, leader: RoadUser, path
         path=path,
         start=start,
         start_speed=leader.start_speed,
-        max_speed=max(own_speed, leader.max_speed if leader.brisk else _KEEPING_UP * leader.max_speed),
+        max_speed=max(
+            own_speed, leader.max_speed if leader.brisk else _KEEPING_UP * leader.max_speed
+        ),
         delay=leader.delay,
         route=leader.route,
         span=leader.span,
         ignores=leader.ignores,
-        pace=tuple((begin, end - leader.start + start, speed) for begin, end, speed in leader.pace if begin == 0.0),
+        pace=tuple(
+            (begin, end - leader.start + start, speed)
+            for begin, end, speed in leader.pace
+            if begin == 0.0
+        ),
         brisk=leader.brisk,
     )
 

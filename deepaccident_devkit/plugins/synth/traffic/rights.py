@@ -44,7 +44,9 @@ class SignalPlan:
         half = self.green + AMBER_TIME + CLEARANCE_TIME
         shift = 0.0 if AXIS_OF_ARM[arm] == self.first else half
         phase = (np.asarray(times, dtype=np.float64) - self.start - shift) % (2 * half)
-        colors = np.where(phase < self.green, GREEN, np.where(phase < self.green + AMBER_TIME, AMBER, RED))
+        colors = np.where(
+            phase < self.green, GREEN, np.where(phase < self.green + AMBER_TIME, AMBER, RED)
+        )
         return np.asarray(colors, dtype=np.int64)
 
     def shifted(self, seconds: float) -> "SignalPlan":
@@ -117,7 +119,9 @@ def _meeting(
     """Where two lines of points (K, 3) are within `reach`: begin and end on each line; None if they never are."""
     if not len(first) or not len(second):
         return None
-    square = (first[:, None, 0] - second[None, :, 0]) ** 2 + (first[:, None, 1] - second[None, :, 1]) ** 2
+    square = (first[:, None, 0] - second[None, :, 0]) ** 2 + (
+        first[:, None, 1] - second[None, :, 1]
+    ) ** 2
     near = square < reach**2
     rows, columns = near.any(axis=1), near.any(axis=0)
     if not rows.any():
@@ -167,7 +171,9 @@ def find_rights(
             sees[row, list(blind)] = False
         waits[list(pushing)] = False
     widths = np.array([user.body.size[1] for user in users])
-    zones = find_zones([user.path for user in users], [user.span for user in users], widths, together)
+    zones = find_zones(
+        [user.path for user in users], [user.span for user in users], widths, together
+    )
     return Rights(zones, waits, sees)
 
 
@@ -177,7 +183,11 @@ def _go_together(one: RoadUser, other: RoadUser) -> bool:
 
 
 def _same_arm(one: RoadUser, other: RoadUser) -> bool:
-    return one.route is not None and other.route is not None and one.route.from_arm == other.route.from_arm
+    return (
+        one.route is not None
+        and other.route is not None
+        and one.route.from_arm == other.route.from_arm
+    )
 
 
 def _waits(one: RoadUser, other: RoadUser, minor: Sequence[Arm]) -> bool:
@@ -189,7 +199,9 @@ def _waits(one: RoadUser, other: RoadUser, minor: Sequence[Arm]) -> bool:
         return False
     if (one.route.from_arm in minor) != (other.route.from_arm in minor):
         return one.route.from_arm in minor
-    opposite = OUTWARD[one.route.from_arm] == tuple(-value for value in OUTWARD[other.route.from_arm])
+    opposite = OUTWARD[one.route.from_arm] == tuple(
+        -value for value in OUTWARD[other.route.from_arm]
+    )
     return opposite and one.route.turn == "left" and other.route.turn != "left"
 
 
@@ -206,7 +218,12 @@ _BEFORE_ZONE = 1.0
 
 
 def waiting_gap(
-    rights: Rights, front: FloatArray, rear: FloatArray, speed: FloatArray, top_speed: FloatArray, held: BoolArray
+    rights: Rights,
+    front: FloatArray,
+    rear: FloatArray,
+    speed: FloatArray,
+    top_speed: FloatArray,
+    held: BoolArray,
 ) -> FloatArray:
     """Distance (A,) in metres to where each has to stop for others; infinite for those who may go.
 
@@ -216,11 +233,17 @@ def waiting_gap(
     to_enter = rights.zones.enter - front[:, None]
     to_leave = rights.zones.leave - rear[:, None]
     with np.errstate(invalid="ignore"):
-        comes = _earliest(np.maximum(to_enter, 0.0), speed[:, None], top_speed[:, None], _ACCELERATION[0])
-        goes = _earliest(np.maximum(to_leave, 0.0), speed[:, None], top_speed[:, None], _ACCELERATION[1])
+        comes = _earliest(
+            np.maximum(to_enter, 0.0), speed[:, None], top_speed[:, None], _ACCELERATION[0]
+        )
+        goes = _earliest(
+            np.maximum(to_leave, 0.0), speed[:, None], top_speed[:, None], _ACCELERATION[1]
+        )
         gone = np.maximum(to_leave, 0.0) / np.maximum(speed[:, None], _CREEPING)
     inside = (to_enter <= 0) & (to_leave > 0)
-    cannot_stop = (to_enter > 0) & (speed[:, None] ** 2 > 2 * _HARD_BRAKING * np.maximum(to_enter - 0.3, 0.0))
+    cannot_stop = (to_enter > 0) & (
+        speed[:, None] ** 2 > 2 * _HARD_BRAKING * np.maximum(to_enter - 0.3, 0.0)
+    )
     coming = (to_leave.T > 0) & (np.isfinite(to_enter.T)) & ~held[None, :]
     first = goes + _GAP_BEFORE < comes.T
     reaching = to_enter / np.maximum(speed[:, None], _CREEPING)
@@ -231,7 +254,9 @@ def waiting_gap(
     return np.asarray(gap.min(axis=1))
 
 
-def _earliest(distance: FloatArray, speed: FloatArray, top_speed: FloatArray, acceleration: float) -> FloatArray:
+def _earliest(
+    distance: FloatArray, speed: FloatArray, top_speed: FloatArray, acceleration: float
+) -> FloatArray:
     """The least seconds that somebody needs for a distance (metres) with this acceleration, up to a top speed."""
     speeding_up = (np.sqrt(speed**2 + 2 * acceleration * distance) - speed) / acceleration
     return np.asarray(np.maximum(speeding_up, distance / top_speed))

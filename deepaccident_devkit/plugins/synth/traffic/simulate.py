@@ -22,7 +22,13 @@ from deepaccident_devkit.plugins.synth.traffic.driving import (
     stopping,
     temper_of,
 )
-from deepaccident_devkit.plugins.synth.traffic.rights import AMBER, GREEN, Rights, SignalPlan, waiting_gap
+from deepaccident_devkit.plugins.synth.traffic.rights import (
+    AMBER,
+    GREEN,
+    Rights,
+    SignalPlan,
+    waiting_gap,
+)
 from deepaccident_devkit.support.arrays import BoolArray, FloatArray, FrozenArrays, IntArray
 
 _SPACING = 2.0
@@ -55,7 +61,9 @@ class Bodies:
     width: FloatArray
 
 
-def leaders(bodies: Bodies, tracks: Tracks, centers: FloatArray, sees: BoolArray) -> tuple[FloatArray, FloatArray]:
+def leaders(
+    bodies: Bodies, tracks: Tracks, centers: FloatArray, sees: BoolArray
+) -> tuple[FloatArray, FloatArray]:
     """Gap (A,) in metres to the nearest one ahead on each path, infinite if there is none, and that one's speed (A,).
 
     Centres are (A,) metres along each path; `sees` (A, A) tells whether the row's road user reacts to the column's.
@@ -181,12 +189,16 @@ def simulate(
         if row % DECISION_STEPS == 0:
             run.decide(states[row], velocities[row], float(time[row]) - begin, float(time[row]))
             if watched is not None:
-                contact = _first_contact(states, run.size, watched, max(row - DECISION_STEPS, 0), row + 1)
+                contact = _first_contact(
+                    states, run.size, watched, max(row - DECISION_STEPS, 0), row + 1
+                )
                 if contact is not None:
                     count = contact + 1
                     break
         run.advance()
-    return Simulation(time=time[:count], states=states[:count], velocities=velocities[:count], contact=contact)
+    return Simulation(
+        time=time[:count], states=states[:count], velocities=velocities[:count], contact=contact
+    )
 
 
 class _Run:
@@ -200,19 +212,28 @@ class _Run:
         watched: tuple[int, int] | None,
     ) -> None:
         self.size = np.array([user.body.size[:2] for user in users])
-        wheelbase, self._walks = np.array([user.wheelbase for user in users]), np.array([user.walks for user in users])
+        wheelbase, self._walks = (
+            np.array([user.wheelbase for user in users]),
+            np.array([user.walks for user in users]),
+        )
         self._ahead, self._wheelbase = wheelbase / 2, np.where(self._walks, np.inf, wheelbase)
         self._walkers = np.flatnonzero(self._walks)
         self._temper = temper_of(users)
         lateral = np.array([user.manner.lateral for user in users])
-        self._tracks = Tracks([user.path for user in users], lateral, self._walks, [user.pace for user in users])
+        self._tracks = Tracks(
+            [user.path for user in users], lateral, self._walks, [user.pace for user in users]
+        )
         self._delay = np.array([user.delay for user in users])
         self._rights = rights
         self._lights = _Lights(users, signals)
         self._alarm = (
             None
             if watched is None
-            else ContactAlarm(np.array(watched), self.size[[*watched]], np.array([users[row].alert for row in watched]))
+            else ContactAlarm(
+                np.array(watched),
+                self.size[[*watched]],
+                np.array([users[row].alert for row in watched]),
+            )
         )
         along = np.array([user.start for user in users]) - self._ahead
         self._on_path = self._tracks.at(along)
@@ -228,12 +249,17 @@ class _Run:
         across = wheels.speed * np.tan(wheels.steer) / 2
         states[:, 0], states[:, 1] = wheels.x + self._ahead * cos, wheels.y + self._ahead * sin
         states[:, 2], states[:, 3], states[:, 4] = wheels.yaw, wheels.speed, wheels.steer
-        velocities[:, 0], velocities[:, 1] = wheels.speed * cos - across * sin, wheels.speed * sin + across * cos
+        velocities[:, 0], velocities[:, 1] = (
+            wheels.speed * cos - across * sin,
+            wheels.speed * sin + across * cos,
+        )
 
     def decide(self, states: FloatArray, velocities: FloatArray, since: float, time: float) -> None:
         """Choose everyone's acceleration, `since` seconds after the start."""
         wheels, temper = self._wheels, self._temper
-        acceleration = free_acceleration(temper, wheels.speed, self._tracks.allowed_speed(wheels.along))
+        acceleration = free_acceleration(
+            temper, wheels.speed, self._tracks.allowed_speed(wheels.along)
+        )
         if self._rights is not None:
             acceleration = acceleration + self._for_others(self._rights, states, time)
         hardest = -hardest_braking(wheels.speed)
@@ -257,7 +283,9 @@ class _Run:
         bodies = Bodies(states[:, :3], speed, self.size[:, 0], self.size[:, 1])
         gap, leader_speed = leaders(bodies, self._tracks, centers, rights.sees)
         red = self._lights.gap(time, front, speed, temper)
-        stop = np.minimum(red, waiting_gap(rights, front, rear, speed, temper.max_speed, red < np.inf))
+        stop = np.minimum(
+            red, waiting_gap(rights, front, rear, speed, temper.max_speed, red < np.inf)
+        )
         following = np.where(self._walks, 0.0, interaction(temper, speed, gap, leader_speed))
         return np.asarray(np.minimum(following, stopping(temper, speed, stop)))
 
@@ -269,14 +297,19 @@ class _Lights:
         self._signals = signals
         self._arms = [user.route.from_arm if user.route else None for user in users]
         self._stop = np.array(
-            [user.route.stop_s if user.route and "signal" not in user.ignores else -np.inf for user in users]
+            [
+                user.route.stop_s if user.route and "signal" not in user.ignores else -np.inf
+                for user in users
+            ]
         )
 
     def gap(self, time: float, front: FloatArray, speed: FloatArray, temper: Temper) -> FloatArray:
         """(A,) metres to the stop line; infinite for those who need not stop there."""
         if self._signals is None:
             return np.full(len(front), np.inf)
-        colors = {arm: int(self._signals.state(arm, time)) for arm in set(self._arms) - {None} if arm}
+        colors = {
+            arm: int(self._signals.state(arm, time)) for arm in set(self._arms) - {None} if arm
+        }
         color = np.array([colors[arm] if arm else GREEN for arm in self._arms])
         gap = self._stop - front
         stops = (color != GREEN) & (gap > -0.5)
@@ -284,15 +317,21 @@ class _Lights:
         return np.where(stops, np.maximum(gap, 0.0), np.inf)
 
 
-def _first_contact(states: FloatArray, size: FloatArray, pair: tuple[int, int], low: int, high: int) -> int | None:
+def _first_contact(
+    states: FloatArray, size: FloatArray, pair: tuple[int, int], low: int, high: int
+) -> int | None:
     """The first row at which the boxes of a pair touch, `low` included and `high` excluded; None if there is none."""
     first, second = pair
-    apart = separation(states[low:high, first, :3], size[first], states[low:high, second, :3], size[second])
+    apart = separation(
+        states[low:high, first, :3], size[first], states[low:high, second, :3], size[second]
+    )
     touching: BoolArray = apart <= 0
     return low + int(touching.argmax()) if touching.any() else None
 
 
-def separation(poses_a: FloatArray, size_a: FloatArray, poses_b: FloatArray, size_b: FloatArray) -> FloatArray:
+def separation(
+    poses_a: FloatArray, size_a: FloatArray, poses_b: FloatArray, size_b: FloatArray
+) -> FloatArray:
     """The widest gap (…) along any side's normal, metres: 0 where rectangles just touch, negative if they overlap.
 
     Poses are (…, 3) x, y, yaw of the centres, sizes (…, 2) full length and width, metres; all broadcast.
@@ -311,7 +350,9 @@ def separation(poses_a: FloatArray, size_a: FloatArray, poses_b: FloatArray, siz
     return np.asarray(np.max(np.stack(np.broadcast_arrays(*gaps)), axis=0))
 
 
-def gap(poses_a: FloatArray, size_a: FloatArray, poses_b: FloatArray, size_b: FloatArray) -> FloatArray:
+def gap(
+    poses_a: FloatArray, size_a: FloatArray, poses_b: FloatArray, size_b: FloatArray
+) -> FloatArray:
     """The distance between rectangles (…), metres, 0 where they overlap; arguments as in `separation`.
 
     Two disjoint rectangles are nearest at a corner of one of them.
@@ -323,7 +364,10 @@ def relative(poses: FloatArray, points: FloatArray) -> FloatArray:
     """Return points (…, 2) in the frames of poses (…, 3)."""
     delta = points - poses[..., :2]
     cos, sin = np.cos(poses[..., 2]), np.sin(poses[..., 2])
-    return np.stack([cos * delta[..., 0] + sin * delta[..., 1], cos * delta[..., 1] - sin * delta[..., 0]], axis=-1)
+    return np.stack(
+        [cos * delta[..., 0] + sin * delta[..., 1], cos * delta[..., 1] - sin * delta[..., 0]],
+        axis=-1,
+    )
 
 
 def _footprints(poses: FloatArray, size: FloatArray) -> FloatArray:

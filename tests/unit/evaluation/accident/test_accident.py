@@ -39,7 +39,12 @@ def test_the_protocols_and_their_choices() -> None:
         "boxes": {"protocol": "BoxAccidents", "choices": choices},
     }
     released = PROTOCOLS["released"]
-    assert (released.labels, released.truth_gap, released.prediction_gap, PROTOCOLS["paper"].labels) == (
+    assert (
+        released.labels,
+        released.truth_gap,
+        released.prediction_gap,
+        PROTOCOLS["paper"].labels,
+    ) == (
         "released",
         0.001,
         5.0,
@@ -62,18 +67,32 @@ def test_other_predictions_and_labels_are_refused(protocol: str) -> None:
     evaluator, maps = AccidentEvaluator(protocol=protocol), as_maps(label)
     assert_refused(
         *(
-            (lambda given=given: evaluator.update("one", given, label, KNOWN), EvaluationError, "list of Accidents")
+            (
+                lambda given=given: evaluator.update("one", given, label, KNOWN),
+                EvaluationError,
+                "list of Accidents",
+            )
             for given in (None, label.instance, PAIR, "alarm", [PAIR, None])
         ),
-        (lambda: evaluator.update("one", maps, label.instance), EvaluationError, ("label", "MotionLabels", "ndarray")),
-        (lambda: evaluator.update("one", maps, label, TRUTH), EvaluationError, ("context", "AccidentContext")),
+        (
+            lambda: evaluator.update("one", maps, label.instance),
+            EvaluationError,
+            ("label", "MotionLabels", "ndarray"),
+        ),
+        (
+            lambda: evaluator.update("one", maps, label, TRUTH),
+            EvaluationError,
+            ("context", "AccidentContext"),
+        ),
     )
     assert len(evaluator) == 0
 
 
 @pytest.mark.parametrize("protocol", [3, None, "papr"])
 def test_a_protocol_that_is_none(protocol) -> None:
-    assert_refused((lambda: AccidentEvaluator(protocol=protocol), ChoiceError, ("released, paper, boxes",)))
+    assert_refused(
+        (lambda: AccidentEvaluator(protocol=protocol), ChoiceError, ("released, paper, boxes",))
+    )
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
@@ -84,7 +103,9 @@ def test_ids_may_be_large_and_below_1_is_background(protocol: str, names: dict[i
     counts = []
     for maps in (label.instance, np.where(label.instance == old, new, label.instance)):
         evaluator = AccidentEvaluator(protocol=protocol)
-        evaluator.update("one", MotionOutput(grid=label.config.grid, instances=maps[None]), label, KNOWN)
+        evaluator.update(
+            "one", MotionOutput(grid=label.config.grid, instances=maps[None]), label, KNOWN
+        )
         counts.append(dict(evaluator.counts))
         assert evaluator.compute().positives == 1
     assert counts[0] == counts[1]
@@ -95,11 +116,17 @@ def test_pooled_counts_are_exact_and_can_be_pooled_again(protocol: str) -> None:
     """Sums of floats that only add up to the same in exact arithmetic."""
     evaluator, label = AccidentEvaluator(protocol=protocol), scene(CARS)
     for number, shift in enumerate(np.random.default_rng(5).uniform(0, 2, 10)):
-        alarms = [Accident(positions=PAIR.positions + shift, time=2.0 - shift, score=round(shift, 1))]
+        alarms = [
+            Accident(positions=PAIR.positions + shift, time=2.0 - shift, score=round(shift, 1))
+        ]
         cars = {name: [(x, y + shift) for x, y in path] for name, path in CARS.items()}
-        evaluator.update(str(number), alarms if protocol == "boxes" else as_maps(scene(cars)), label, KNOWN)
+        evaluator.update(
+            str(number), alarms if protocol == "boxes" else as_maps(scene(cars)), label, KNOWN
+        )
     counts = [*evaluator.counts.values()]
-    parts = [each for part in (counts[:2], counts[2:6], counts[6:]) for each in evaluator.pooled(part)]
+    parts = [
+        each for part in (counts[:2], counts[2:6], counts[6:]) for each in evaluator.pooled(part)
+    ]
     for pooled in (parts, evaluator.pooled(parts), evaluator.pooled(counts)):
         assert len(pooled) < len(counts)
         assert evaluator.result_of(pooled).as_dict() == evaluator.compute().as_dict()
@@ -110,7 +137,11 @@ def test_protocols_that_compare_with_nothing_are_refused() -> None:
     label = scene({1: standing(20, 10)})
     assert_refused(
         *(
-            (partial(compared_accidents, given, beside, AccidentContext(), PROTOCOLS[name]), EvaluationError, words)
+            (
+                partial(compared_accidents, given, beside, AccidentContext(), PROTOCOLS[name]),
+                EvaluationError,
+                words,
+            )
             for name, given, beside, words in (
                 ("released", [], None, ("compares motion",)),
                 ("released", [], label, ("compares motion",)),
@@ -148,4 +179,6 @@ def test_which_accidents_are_compared(protocol, form, predicted, label, times) -
     assert (made.true and made.true.time, made.unplaced) == (2.0 if len(label) > 1 else None, None)
     for accident in (made.true, *made.predicted) if len(label) > 1 else ():
         ends = [path[-1] for path in label.values()]
-        np.testing.assert_allclose(np.sort(accident.positions, axis=0), np.sort(ends, axis=0), atol=1.1)
+        np.testing.assert_allclose(
+            np.sort(accident.positions, axis=0), np.sort(ends, axis=0), atol=1.1
+        )

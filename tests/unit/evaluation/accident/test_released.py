@@ -65,7 +65,12 @@ both = pytest.mark.parametrize("form", [as_heads, as_maps])
         ([{}], HIT, [MISSED] * 3, [0] * 3),
         ([{}], {}, [NEITHER] * 3, [0] * 3),
         ([HIT], {}, [FALSE] * 3, [0] * 3),
-        ([NEAR], NEAR, [FALSE] * 3, [0] * 3),  # the true ones must overlap, the predicted ones be near
+        (
+            [NEAR],
+            NEAR,
+            [FALSE] * 3,
+            [0] * 3,
+        ),  # the true ones must overlap, the predicted ones be near
         ([PASSING], PASSING, [NEITHER] * 3, [0] * 3),  # only the last frame counts
         ([SHORT], SHORT, [TRUE] * 3, [0] * 3),  # which is that of the longest true path
         ([moved(2.5)], HIT, [TRUE] * 3, [5] * 3),  # exactly as far as allowed
@@ -73,7 +78,12 @@ both = pytest.mark.parametrize("form", [as_heads, as_maps])
         ([{}, HIT, HIT], HIT, [MISSED] * 3, [0] * 3),  # an empty first prediction ends it
         ([{}, HIT, HIT], CALM, [NEITHER] * 3, [0] * 3),
         ([CALM, CALM, HIT, CALM], HIT, [TRUE] * 3, [0] * 3),  # any prediction may foresee
-        ([CALM, CALM, HIT, CALM], CALM, [NEITHER] * 3, [0] * 3),  # only the mean gives a false alarm
+        (
+            [CALM, CALM, HIT, CALM],
+            CALM,
+            [NEITHER] * 3,
+            [0] * 3,
+        ),  # only the mean gives a false alarm
         ([CALM, HIT], CALM, [FALSE] * 3, [0] * 3),
         ([moved(3), moved(1), moved(2)], HIT, [TRUE] * 3, [2] * 3),  # the nearest
     ],
@@ -107,7 +117,9 @@ def test_others_in_the_accident_are_an_id_error() -> None:
 def test_instance_maps_are_drawn_like_heads() -> None:
     label = scene(HIT)
     from_heads, present = paths_of_heads(MotionHeads.from_labels(label), label.config.grid)
-    from_maps = paths_of_instances(np.where(label.instance > 0, label.instance * 7, 0), label.config.grid)
+    from_maps = paths_of_instances(
+        np.where(label.instance > 0, label.instance * 7, 0), label.config.grid
+    )
     assert sorted(from_maps.paths) == [7, 14, 21]
     np.testing.assert_array_equal(from_maps.drawn > 0, from_heads.drawn > 0)
     assert set(np.unique(present)) == {0, 1, 2, 3}
@@ -120,7 +132,9 @@ def test_paths_go_on_faster_and_faster() -> None:
     x, y = ending.paths[1][-1]
     other = np.tile([0.0, 0.0], (FRAMES, 1))
     truth = DrawnPaths(paths={1: np.tile([x + 6, y], (FRAMES, 1)), 2: other}, drawn=touching())
-    predicted = padded_paths(DrawnPaths(paths={1: ending.paths[1], 2: other}, drawn=touching()), FRAMES)
+    predicted = padded_paths(
+        DrawnPaths(paths={1: ending.paths[1], 2: other}, drawn=touching()), FRAMES
+    )
     found, pair = accident_counts([predicted], truth, [[(1, 1), (2, 2)]])
     assert pair == (1, 2)
     assert found["position"] == pytest.approx([3] * 3)
@@ -163,8 +177,18 @@ ABOUT = {3: [(4, 13), (4, 10.5), (4, 13), (4, 13), (4, 13)]}
         (HIT, {}, PAIR, "unknown"),
         (HIT, {-101: 1, 2: 2}, {"pair": (2, 77), "known": True, "own_actor_id": 77}, "meta"),
         (HIT, {-101: 1, 2: 2}, {"pair": (2, 77), "known": True}, "unknown"),
-        ({9: standing(-20, -20), 8: standing(-20, 20), **HIT}, None, PAIR, "meta"),  # others are drawn first
-        (HIT | ABOUT, None, PAIR, "meta"),  # who is there at the present: later a third car is where one was
+        (
+            {9: standing(-20, -20), 8: standing(-20, 20), **HIT},
+            None,
+            PAIR,
+            "meta",
+        ),  # others are drawn first
+        (
+            HIT | ABOUT,
+            None,
+            PAIR,
+            "meta",
+        ),  # who is there at the present: later a third car is where one was
     ],
 )
 def test_whom_the_truth_names(cars, ids, context, named) -> None:
@@ -181,7 +205,10 @@ def test_what_results_hold() -> None:
     for token, (predicted, label) in cases.items():
         evaluator.update(token, as_heads(predicted), label, AccidentContext(**PAIR))
     names = ("distance", "tp", "fp", "fn", "accuracy", "id_error", "position_error", "time_error")
-    rows = [(5, 1, 2, 1, 1 / 2.5, 0, 0, 0), *((distance, 2, 1, 1, 2 / 3, 0, 3.5, 0) for distance in (10, 15))]
+    rows = [
+        (5, 1, 2, 1, 1 / 2.5, 0, 0, 0),
+        *((distance, 2, 1, 1, 2 / 3, 0, 3.5, 0) for distance in (10, 15)),
+    ]
     assert evaluator.compute().as_dict() == {
         "within": {str(row[0]): dict(zip(names, row, strict=True)) for row in rows},
         "apa": pytest.approx((0.4 + 4 / 3) / 3),
@@ -196,7 +223,12 @@ def test_what_results_hold() -> None:
         "beside": {},
     }
     nothing = evaluator.compute(["c"])
-    assert (nothing.apa, nothing.id_error, nothing.position_error, nothing.time_error) == (0, 1, 20, 1)
+    assert (nothing.apa, nothing.id_error, nothing.position_error, nothing.time_error) == (
+        0,
+        1,
+        20,
+        1,
+    )
 
 
 def test_what_cannot_be_evaluated() -> None:
@@ -205,7 +237,11 @@ def test_what_cannot_be_evaluated() -> None:
     elsewhere = MotionOutput(grid=BevGrid((-51, 49, 0.5)), instances=label.instance[None])
     explicit = [Accident(positions=np.zeros((2, 2)), time=1.0)]
     assert_refused(
-        (lambda: counts(explicit, label), EvaluationError, ("give a MotionOutput", "protocol='paper' or 'boxes'")),
+        (
+            lambda: counts(explicit, label),
+            EvaluationError,
+            ("give a MotionOutput", "protocol='paper' or 'boxes'"),
+        ),
         (lambda: counts(as_heads(label), None), EvaluationError, ("motion labels",)),
         (lambda: counts(few, label), EvaluationError, ("at least 5 frames", "found 3")),
         (lambda: counts(elsewhere, label), EvaluationError, ("same grid",)),

@@ -21,7 +21,9 @@ from deepaccident_devkit.evaluation.map_accidents import accident_of
 from deepaccident_devkit.geometry import BevGrid
 
 GRID = BevGrid()
-PLACES = [(int(row), int(column)) for row, column in np.random.default_rng(0).integers(30, 95, (60, 2))]
+PLACES = [
+    (int(row), int(column)) for row, column in np.random.default_rng(0).integers(30, 95, (60, 2))
+]
 """At some of them means of three cells are off by the last bits."""
 
 
@@ -47,14 +49,26 @@ def counted(predicted: np.ndarray, truth: np.ndarray):
 @pytest.mark.parametrize(
     ("drawn", "cells", "ids", "actor"),
     [
-        ([0, 0, 0, 0, 7, 7, 9], [0, 1, 2, 3, 4, 5, 6], {70: 7, 90: 9}, 70),  # most of its labelled cells
+        (
+            [0, 0, 0, 0, 7, 7, 9],
+            [0, 1, 2, 3, 4, 5, 6],
+            {70: 7, 90: 9},
+            70,
+        ),  # most of its labelled cells
         ([0, 0, 0, 0, 7, 7, 9], [6], {70: 7, 90: 9}, 90),
         ([0, 0, 0, 0, 7, 7, 9], [0, 1, 2, 3], {70: 7, 90: 9}, None),
-        ([9, 7, 9, 7, 0, 0, 0], [0, 1, 2, 3], {90: 9, 70: 7, -101: 3}, 70),  # of equally many the one drawn first
+        (
+            [9, 7, 9, 7, 0, 0, 0],
+            [0, 1, 2, 3],
+            {90: 9, 70: 7, -101: 3},
+            70,
+        ),  # of equally many the one drawn first
         ([1, 1, 2, 0, 0, 0, 0], [0, 1, 2], {-101: 1, 70: 2}, 5),
     ],
 )
-def test_an_instance_is_of_the_actor_that_most_of_its_labelled_cells_are(drawn, cells, ids, actor) -> None:
+def test_an_instance_is_of_the_actor_that_most_of_its_labelled_cells_are(
+    drawn, cells, ids, actor
+) -> None:
     label = SimpleNamespace(instance=np.array([[[0] * 7], [drawn]]), id_map=ids)
     there = np.isin(np.arange(7), cells)[None]
     assert actor_of(there, 1, label, AccidentContext(own_actor_id=5)) == actor
@@ -62,8 +76,18 @@ def test_an_instance_is_of_the_actor_that_most_of_its_labelled_cells_are(drawn, 
 
 def test_the_first_alarm_that_is_near_enough_hits() -> None:
     alarms = [foreseen(), *(foreseen(position) for position in (5 - 1e-10, 5 - 1e-8, 1.0))]
-    assert [hit_of(alarms, distance) for distance in (1.0, 1.1, 5.0, 5.1)] == [None, alarms[3], alarms[2], alarms[1]]
-    assert foreseen(1 / 3, 0.5, 1, score=2.0) == {"position": 0.333333333, "time": 0.5, "id": 1, "score": 2.0}
+    assert [hit_of(alarms, distance) for distance in (1.0, 1.1, 5.0, 5.1)] == [
+        None,
+        alarms[3],
+        alarms[2],
+        alarms[1],
+    ]
+    assert foreseen(1 / 3, 0.5, 1, score=2.0) == {
+        "position": 0.333333333,
+        "time": 0.5,
+        "id": 1,
+        "score": 2.0,
+    }
 
 
 def test_of_two_pairs_alike_that_with_the_lower_ids_collides() -> None:
@@ -97,7 +121,9 @@ def test_alarms_exactly_at_the_distance_miss_and_their_order_counts_nothing() ->
     evaluators = [AccidentEvaluator(protocol="boxes") for _ in range(3)]
     for number in range(60):
         pair, angle = source.uniform(-50, 50, (2, 2)), source.uniform(0, 2 * math.pi)
-        off = Accident(positions=pair + 2.5 * np.array([math.cos(angle), math.sin(angle)]), time=2.0)
+        off = Accident(
+            positions=pair + 2.5 * np.array([math.cos(angle), math.sin(angle)]), time=2.0
+        )
         right = [Accident(positions=pair + shift, time=2.0, ids=(1, 9)) for shift in (0.5, 1.0)]
         truth = BoxTruth(
             time=np.arange(21) / 10,
@@ -105,7 +131,9 @@ def test_alarms_exactly_at_the_distance_miss_and_their_order_counts_nothing() ->
             footprint=np.zeros((21, 0, 5)),
             accident=Accident(positions=pair, time=2.0, ids=(1, 2)),
         )
-        for evaluator, alarms in zip(evaluators, ([off, *right], [*right[::-1], off], [off]), strict=True):
+        for evaluator, alarms in zip(
+            evaluators, ([off, *right], [*right[::-1], off], [off]), strict=True
+        ):
             evaluator.update(str(number), alarms, None, AccidentContext(truth=truth))
     forwards, backwards, alone = (evaluator.compute() for evaluator in evaluators)
     assert forwards == backwards

@@ -121,8 +121,16 @@ def test_the_edges_of_what_can_be() -> None:
     released_iou = DETECTION_PROTOCOLS["released_iou"]
     assert [released_iou.limits(name) for name in ("car", "cyclist")] == [(0.3, 0.15), (0.2, 0.1)]
     assert_refused(
-        (lambda: DetectionEvaluator("kitti"), ChoiceError, ("protocol", "released, released_iou, paper", "kitti")),
-        (lambda: DetectionEvaluator("paper", treshold=1), ChoiceError, ("no switch 'treshold'", "thresholds")),
+        (
+            lambda: DetectionEvaluator("kitti"),
+            ChoiceError,
+            ("protocol", "released, released_iou, paper", "kitti"),
+        ),
+        (
+            lambda: DetectionEvaluator("paper", treshold=1),
+            ChoiceError,
+            ("no switch 'treshold'", "thresholds"),
+        ),
         *(
             (
                 partial(detection_protocol, "paper", **{name: "other"}),
@@ -164,7 +172,9 @@ def test_the_truth_of_each_protocol(da: DeepAccident) -> None:
     released = detection_truth(da, sample)
     assert released.actor_id.tolist() == every.actor_id.tolist()
     rows = da.annotation_rows(sample)
-    np.testing.assert_array_equal(released.velocity[:, :2], da.columns("annotation")["velocity_label"][rows])
+    np.testing.assert_array_equal(
+        released.velocity[:, :2], da.columns("annotation")["velocity_label"][rows]
+    )
     paper = detection_truth(da, sample, "paper")
     assert paper.actor_id.tolist() == da.boxes(sample, "lidar", "released").actor_id.tolist()
     cooperative = detection_truth(da, sample, "opencood")
@@ -181,21 +191,35 @@ def test_the_truth_of_each_protocol(da: DeepAccident) -> None:
             ConfigError,
             ("truth='cooperative'", "visible"),
         ),
-        (lambda: detection_truth(da, sample, velocities), ConfigError, ("label_velocity", "choose False")),
+        (
+            lambda: detection_truth(da, sample, velocities),
+            ConfigError,
+            ("label_velocity", "choose False"),
+        ),
     )
 
 
 def test_detected_boxes_say_their_frame_and_change_it() -> None:
     arrays = [[1.0, 2.0, 3.0]], [[4.0, 2.0, 1.5]], [0.5], [0.9]
-    moved = DetectedBoxes.from_arrays(*arrays, frame="lidar").transform(SE3.from_yaw(0, (10, 0, 0)), "world")
-    assert (moved.boxes.frame, moved.boxes.center.tolist(), moved.scores.tolist()) == ("world", [[11, 2, 3]], [0.9])
+    moved = DetectedBoxes.from_arrays(*arrays, frame="lidar").transform(
+        SE3.from_yaw(0, (10, 0, 0)), "world"
+    )
+    assert (moved.boxes.frame, moved.boxes.center.tolist(), moved.scores.tolist()) == (
+        "world",
+        [[11, 2, 3]],
+        [0.9],
+    )
     assert (len(moved), moved.scores.flags.writeable) == (1, False)
     for velocity in ([[3.0, 4.0]], [[3.0, 4.0, 0.0]], None):
         given = DetectedBoxes.from_arrays(*arrays, frame="lidar", velocity=velocity).boxes.velocity
         np.testing.assert_array_equal(given, [[math.nan] * 3] if velocity is None else [[3, 4, 0]])
     assert_refused(
         (lambda: DetectedBoxes(boxes=moved.boxes, scores=[0.5, 0.6]), GeometryError, ("scores",)),
-        (lambda: DetectedBoxes(boxes=moved.boxes, scores=[math.nan]), GeometryError, ("not all numbers are finite",)),
+        (
+            lambda: DetectedBoxes(boxes=moved.boxes, scores=[math.nan]),
+            GeometryError,
+            ("not all numbers are finite",),
+        ),
     )
 
 
@@ -204,4 +228,6 @@ def test_a_sample_without_label_has_no_truth(own_release: Path) -> None:
         for file in path.rglob("*.txt"):
             file.unlink()
     opened = DeepAccident("v1", own_release, verbose=False, on_error="skip")
-    assert_refused((lambda: detection_truth(opened, opened.sample[0]), NotAvailableError, ("has no label",)))
+    assert_refused(
+        (lambda: detection_truth(opened, opened.sample[0]), NotAvailableError, ("has no label",))
+    )

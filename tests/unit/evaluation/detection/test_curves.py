@@ -16,7 +16,9 @@ def test_levels_of_recall_are_sums_in_double_precision() -> None:
     assert recall_matches(np.array([2, 0]), 4).tolist() == [[1, 2, 2, 3], [1, 1, 1, 2]]
 
 
-def test_a_first_row_that_does_not_count_has_no_precision_and_a_first_sample_may_have_no_rows() -> None:
+def test_a_first_row_that_does_not_count_has_no_precision_and_a_first_sample_may_have_no_rows() -> (
+    None
+):
     """Of three true boxes two are found by the second and the fourth row; the second sample is drawn twice or not."""
     ones = np.array([0, 1, 1, 1])
     cell = Cell(
@@ -37,15 +39,21 @@ def test_a_first_row_that_does_not_count_has_no_precision_and_a_first_sample_may
         np.testing.assert_allclose(made.precision[0], [1, 1, 2 / 3, 0])
         np.testing.assert_allclose(made.average, [5 / 9, (1 + 1 + 3 / 4) / 4, 1 / 4])
     made = curves(cell, detection_protocol("paper", points=4, min_recall=0, min_precision=0), times)
-    np.testing.assert_allclose(made.precision, [[0, 1 / 2, 2 / 3, 0], [0, 1, 13 / 18, 0], [0, 1 / 3, 0, 0]])
+    np.testing.assert_allclose(
+        made.precision, [[0, 1 / 2, 2 / 3, 0], [0, 1, 13 / 18, 0], [0, 1 / 3, 0, 0]]
+    )
 
 
 def test_detections_of_groups_that_are_not_there_are_refused() -> None:
     """Of counts that somebody else has made."""
     evaluator = DetectionEvaluator("opencood")
-    counts = {"token": "a", "truths": [0], "scores": [0.5]} | {name: [[]] * width for name, width in COLUMNS.items()}
+    counts = {"token": "a", "truths": [0], "scores": [0.5]} | {
+        name: [[]] * width for name, width in COLUMNS.items()
+    }
     assert evaluator.result_of([counts | {"detections": [[0], [0]]}]).detections.tolist() == [[1]]
     for groups in ([-1], [0, 1]):
         others = counts | {"detections": [groups, [0] * len(groups)]}
         words = ("groups from 0 to 0", f"found {groups[0]} to {groups[-1]}")
-        assert_refused((lambda others=others: evaluator.result_of([others]), EvaluationError, words))
+        assert_refused(
+            (lambda others=others: evaluator.result_of([others]), EvaluationError, words)
+        )

@@ -30,14 +30,20 @@ PROTOCOLS = sorted(DETECTION_PROTOCOLS)
 
 
 def truth_at(
-    *places: tuple[float, float], category: str = "car", size: Any = SIZE, yaw: float = 0.0, **columns
+    *places: tuple[float, float],
+    category: str = "car",
+    size: Any = SIZE,
+    yaw: float = 0.0,
+    **columns,
 ) -> Boxes:
     """On the ground, standing if nothing else is said; velocity None for unknown."""
     count = len(places)
     center = np.array([(*place, 0.75) for place in places]).reshape(count, 3)
     columns = {"velocity": np.zeros((count, 3)), "category": [category] * count, **columns}
     columns = {name: each for name, each in columns.items() if each is not None}
-    return Boxes.from_arrays(center, np.tile(size, (count, 1)), np.full(count, yaw), frame="lidar", **columns)
+    return Boxes.from_arrays(
+        center, np.tile(size, (count, 1)), np.full(count, yaw), frame="lidar", **columns
+    )
 
 
 def found_at(*places: tuple[float, float, float], **columns) -> DetectedBoxes:
@@ -46,7 +52,9 @@ def found_at(*places: tuple[float, float, float], **columns) -> DetectedBoxes:
     return DetectedBoxes(boxes=boxes, scores=np.array([place[2] for place in places]))
 
 
-def evaluated(protocol: str, *samples: tuple[DetectedBoxes, Boxes], **switches) -> DetectionEvaluator:
+def evaluated(
+    protocol: str, *samples: tuple[DetectedBoxes, Boxes], **switches
+) -> DetectionEvaluator:
     evaluator = DetectionEvaluator(protocol, **switches)
     for number, (prediction, truth) in enumerate(samples):
         evaluator.update(f"s/ego_vehicle/{number:03d}", prediction, truth)
@@ -88,9 +96,24 @@ ALL = 35 / 36
 @pytest.mark.parametrize(
     ("protocol", "samples", "switches", "expected"),
     [
-        ("paper", [perfect(THREE), perfect(truth_at((5, 5)))], {}, {"mAP": 100, "errors": [0] * 4, "counted": [4, 4]}),
-        ("opencood", [perfect(THREE), perfect(truth_at((5, 5)))], {}, {"mAP": 100, "AP": [100] * 3}),
-        ("released", [perfect(THREE)], {}, {"AP": [100 * ALL] * 4, "errors": [NEVER] * 4, "mAP": 100 * ALL / 6}),
+        (
+            "paper",
+            [perfect(THREE), perfect(truth_at((5, 5)))],
+            {},
+            {"mAP": 100, "errors": [0] * 4, "counted": [4, 4]},
+        ),
+        (
+            "opencood",
+            [perfect(THREE), perfect(truth_at((5, 5)))],
+            {},
+            {"mAP": 100, "AP": [100] * 3},
+        ),
+        (
+            "released",
+            [perfect(THREE)],
+            {},
+            {"AP": [100 * ALL] * 4, "errors": [NEVER] * 4, "mAP": 100 * ALL / 6},
+        ),
         (  # beyond |x| = 84.85 m a detection does not count, but uses up the truth, neither found nor missed
             "released",
             [(found_at((85.0, 0, 0.9), (10, 0, 0.5)), truth_at((84.0, 0), (10, 0)))],
@@ -115,39 +138,116 @@ ALL = 35 / 36
             {},
             {"counted": [1, 2], "precision": [0.5, 0.5, 1, 1]},
         ),
-        ("released", [perfect(truth_at((10, 200)))], {}, {"counted": [1, 1]}),  # the range is of x alone
-        ("released", [perfect(truth_at((10, 200)))], {"range_from_x_alone": False}, {"counted": [0, 0]}),
-        ("paper", [(found_at((10, 0, 0.5), (60, 0, 0.9)), OWN)], {}, {"counted": [1, 1], "mAP": 100}),
+        (
+            "released",
+            [perfect(truth_at((10, 200)))],
+            {},
+            {"counted": [1, 1]},
+        ),  # the range is of x alone
+        (
+            "released",
+            [perfect(truth_at((10, 200)))],
+            {"range_from_x_alone": False},
+            {"counted": [0, 0]},
+        ),
+        (
+            "paper",
+            [(found_at((10, 0, 0.5), (60, 0, 0.9)), OWN)],
+            {},
+            {"counted": [1, 1], "mAP": 100},
+        ),
         ("paper", [(found_at(), OWN)], {"own_box": True}, {"counted": [2, 0]}),
         ("paper", [(found_at(), OWN)], {"area": None}, {"counted": [3, 0]}),
-        ("paper", [(DetectedBoxes(boxes=HIGH, scores=[1.0]), truth_at((10, 0)))], {}, {"AP": [0, 100, 100]}),  # strict
-        ("released", [(DetectedBoxes(boxes=HIGH, scores=[1.0]), truth_at((10, 0)))], {}, {"AP": [0] * 4}),
+        (
+            "paper",
+            [(DetectedBoxes(boxes=HIGH, scores=[1.0]), truth_at((10, 0)))],
+            {},
+            {"AP": [0, 100, 100]},
+        ),  # strict
+        (
+            "released",
+            [(DetectedBoxes(boxes=HIGH, scores=[1.0]), truth_at((10, 0)))],
+            {},
+            {"AP": [0] * 4},
+        ),
         ("paper", [(TURNED, TURNED_TRUTH)], {}, {"errors": [0.5, 0.5, 3, 5]}),
-        ("paper", [(TURNED, truth_at((10, 0), yaw=3.0))], {}, {"errors": [0.5, 0.5, 2 * math.pi - 6, 4]}),
+        (
+            "paper",
+            [(TURNED, truth_at((10, 0), yaw=3.0))],
+            {},
+            {"errors": [0.5, 0.5, 2 * math.pi - 6, 4]},
+        ),
         (  # the heading is not wrapped, the scale not aligned, and an unknown true velocity is one of 0
             "released",
-            [(found_at((11, 0, 0.5), yaw=-0.1, velocity=[[3.0, 4.0, 0]]), truth_at((10, 0), yaw=0.1, velocity=None))],
+            [
+                (
+                    found_at((11, 0, 0.5), yaw=-0.1, velocity=[[3.0, 4.0, 0]]),
+                    truth_at((10, 0), yaw=0.1, velocity=None),
+                )
+            ],
             {},
-            {"errors": [1, 0.462387148 * ALL + NEVER, (6.2831852 - 0.2) * ALL + NEVER, 5 * ALL + NEVER]},
+            {
+                "errors": [
+                    1,
+                    0.462387148 * ALL + NEVER,
+                    (6.2831852 - 0.2) * ALL + NEVER,
+                    5 * ALL + NEVER,
+                ]
+            },
         ),
         (  # of several true velocities those not known are 0
             "released",
-            [(found_at((10, 0, 0.9), (30, 0, 0.5)), truth_at((10, 0), (30, 0), velocity=[[math.nan] * 3, [0.0] * 3]))],
+            [
+                (
+                    found_at((10, 0, 0.9), (30, 0, 0.5)),
+                    truth_at((10, 0), (30, 0), velocity=[[math.nan] * 3, [0.0] * 3]),
+                )
+            ],
             {},
             {"errors": [NEVER] * 4},
         ),
-        ("paper", [(found_at((10, 0, 0.5), velocity=None), truth_at((10, 0)))], {}, {"errors": [0, 0, 0, math.nan]}),
-        ("opencood", [(HALF, truth_at((10, 0), category="truck"))], {}, {"AP": [100, 100, 0]}),  # the threshold too
+        (
+            "paper",
+            [(found_at((10, 0, 0.5), velocity=None), truth_at((10, 0)))],
+            {},
+            {"errors": [0, 0, 0, math.nan]},
+        ),
+        (
+            "opencood",
+            [(HALF, truth_at((10, 0), category="truck"))],
+            {},
+            {"AP": [100, 100, 0]},
+        ),  # the threshold too
         ("opencood", [perfect(truth_at((10, 0), category="pedestrian"))], {}, {"counted": [0, 0]}),
-        ("opencood", [perfect(truth_at((138.1, 0), (137.9, 0)))], {}, {"counted": [1, 1]}),  # wholly in range
+        (
+            "opencood",
+            [perfect(truth_at((138.1, 0), (137.9, 0)))],
+            {},
+            {"counted": [1, 1]},
+        ),  # wholly in range
         ("opencood", [(found_at((10, 0, 0.9)), truth_at((10, 0), (30, 0)))], {}, {"AP": [50] * 3}),
-        ("paper", [(found_at(*((*place, 0.9) for place in GRID[:10])), truth_at(*GRID))], {}, {"errors": [1] * 4}),
-        ("paper", [(found_at(*((*place, 0.9) for place in GRID[:11])), truth_at(*GRID))], {}, {"errors": [0] * 4}),
+        (
+            "paper",
+            [(found_at(*((*place, 0.9) for place in GRID[:10])), truth_at(*GRID))],
+            {},
+            {"errors": [1] * 4},
+        ),
+        (
+            "paper",
+            [(found_at(*((*place, 0.9) for place in GRID[:11])), truth_at(*GRID))],
+            {},
+            {"errors": [0] * 4},
+        ),
         (  # 12 of 100 are found, the least sure one 1.2 m off: 0 on average up to recall 0.11, 0.1 m up to 0.12
             "paper",
             [
                 (
-                    found_at(*((x, y + 1.2 * (at == 11), 0.9 - at / 100) for at, (x, y) in enumerate(GRID[:12]))),
+                    found_at(
+                        *(
+                            (x, y + 1.2 * (at == 11), 0.9 - at / 100)
+                            for at, (x, y) in enumerate(GRID[:12])
+                        )
+                    ),
                     truth_at(*GRID),
                 )
             ],
@@ -155,7 +255,12 @@ ALL = 35 / 36
             {"errors": [0.05, 0, 0, 0]},
         ),
         ("opencood", [FIRST, SECOND], {}, {"AP": [100] * 3}),  # the order of all scores
-        ("opencood", [FIRST, SECOND], {"global_sort": False}, {"AP": [100 * (1 / 2 + 2 / 3 / 2)] * 3}),  # or by sample
+        (
+            "opencood",
+            [FIRST, SECOND],
+            {"global_sort": False},
+            {"AP": [100 * (1 / 2 + 2 / 3 / 2)] * 3},
+        ),  # or by sample
         ("opencood", [(found_at(), truth_at())], {"absent_class_is_zero": True}, {"mAP": 0}),
         ("paper", [SPARE], {}, {"mAP": 99.382716}),  # at a recall of 1 the precision is that of all
         ("paper", [SPARE], {"absent_class_is_zero": True}, {"mAP": 99.382716 / 6}),
@@ -173,8 +278,13 @@ def test_small_classes_have_thresholds_of_their_own(category: str) -> None:
     found, at = [], CATEGORIES.index(category)
     for overlap in (0.31, 0.21, 0.16, 0.11, 0.09):
         ahead = 4 * (1 - overlap) / (1 + overlap)
-        sample = found_at((10 + ahead, 0, 0.5), category=category), truth_at((10, 0), category=category)
-        found.append((evaluated("released_iou", sample).compute().average_precision[at, 0] > 0).tolist())
+        sample = (
+            found_at((10 + ahead, 0, 0.5), category=category),
+            truth_at((10, 0), category=category),
+        )
+        found.append(
+            (evaluated("released_iou", sample).compute().average_precision[at, 0] > 0).tolist()
+        )
     both, one, none = [True, True], [False, True], [False, False]
     small = category in SMALL_CATEGORIES
     assert found == ([both, both, one, one, none] if small else [both, one, one, none, none])
@@ -217,13 +327,17 @@ def test_what_a_result_holds() -> None:
     )
     opencood = evaluated("opencood", (found_at((10, 0, 0.9)), truth_at((10, 0), (30, 0)))).compute()
     assert opencood.classes == ("vehicle",)
-    assert opencood.precision[0, 0, 0].tolist() == [1.0] * 51 + [0.0] * 50  # beyond the recall that is reached
+    assert (
+        opencood.precision[0, 0, 0].tolist() == [1.0] * 51 + [0.0] * 50
+    )  # beyond the recall that is reached
 
 
 def test_a_box_of_which_a_corner_is_out_of_range_does_not_count() -> None:
     """Turned by 45°, a car of 4 × 2 m reaches 2.12 m along each axis, with another corner each time."""
     for reach, counted in ((1.8, 0), (2.2, 4)):
-        truth = truth_at((140 - reach, 0), (reach - 140, 0), (0, 40 - reach), (0, reach - 40), yaw=math.pi / 4)
+        truth = truth_at(
+            (140 - reach, 0), (reach - 140, 0), (0, 40 - reach), (0, reach - 40), yaw=math.pi / 4
+        )
         assert evaluated("opencood", perfect(truth)).compute().truths[0, 0] == counted
 
 
@@ -267,39 +381,68 @@ def detected_at(*places: tuple[float, float]) -> DetectedBoxes:
 
 @pytest.mark.parametrize("protocol", DETECTION_PROTOCOLS)
 @pytest.mark.parametrize("nearest", [0, 1])
-def test_of_several_that_are_near_enough_the_nearest_is_matched(protocol: str, nearest: int) -> None:
+def test_of_several_that_are_near_enough_the_nearest_is_matched(
+    protocol: str, nearest: int
+) -> None:
     """A detection looks for its true box or, in the released way, a true box for its detection: here one for two."""
     rules = DETECTION_PROTOCOLS[protocol]
     one, two = [(10.0, 0.0)], [(10.3, 0.0)] * 2
     two[nearest] = (10.1, 0.0)
     by_score = rules.matching == "by_score"
     detected = found_at(*((*place, 1.0) for place in (one if by_score else two)))
-    found = detection_matches(detected, truth_at(*(two if by_score else one)), rules, rules.thresholds[0])
+    found = detection_matches(
+        detected, truth_at(*(two if by_score else one)), rules, rules.thresholds[0]
+    )
     assert (found.truth if by_score else found.detection).tolist() == [nearest]
 
 
 def test_the_threshold_that_is_not_given_is_that_of_the_errors_or_the_middle_one() -> None:
     expected = {"released": 2.0, "released_iou": 0.15, "paper": 2.0, "opencood": 0.5}
-    assert {name: detection_matches(detected_at(), truth_at(), name).threshold for name in expected} == expected
+    assert {
+        name: detection_matches(detected_at(), truth_at(), name).threshold for name in expected
+    } == expected
 
 
 def test_pairs_of_which_one_is_out_of_range_are_neither_matches_nor_errors() -> None:
     """The released range ends at x = 84.85 m: the first pair has its truth beyond, the second its detection."""
     truth = truth_at((85.5, 0), (84.0, 20), (10, 0), (30, 0))
-    found = detection_matches(detected_at((84.5, 0), (85.0, 20), (50, 0), (10, 0), (40, 0)), truth, "released", 4.0)
+    found = detection_matches(
+        detected_at((84.5, 0), (85.0, 20), (50, 0), (10, 0), (40, 0)), truth, "released", 4.0
+    )
     columns = (found.detection, found.truth, found.false, found.missed)
     assert [each.tolist() for each in columns] == [[3], [2], [2, 4], [3]]
 
 
 def test_matches_are_within_one_ring() -> None:
     rules = detection_protocol(
-        "paper", ranges=((0.0, 30.0), (30.0, 50.0)), area=(-30.0, 31.0, -49.9, 50.0), error_threshold=None
+        "paper",
+        ranges=((0.0, 30.0), (30.0, 50.0)),
+        area=(-30.0, 31.0, -49.9, 50.0),
+        error_threshold=None,
     )
-    places = [(0, 0), (18, 24), (-30, 40), (-30, 0), (31, 0), (0, -49.9), (0, 50.0), (0, 29.9), (9, 40), (-31, 0)]
-    rows = [detection_matches(detected_at(place), truth_at(place), rules, 4.0).truth.tolist() for place in places]
+    places = [
+        (0, 0),
+        (18, 24),
+        (-30, 40),
+        (-30, 0),
+        (31, 0),
+        (0, -49.9),
+        (0, 50.0),
+        (0, 29.9),
+        (9, 40),
+        (-31, 0),
+    ]
+    rows = [
+        detection_matches(detected_at(place), truth_at(place), rules, 4.0).truth.tolist()
+        for place in places
+    ]
     assert rows == [[0], [0], [], [0], [0], [0], [], [0], [0], []]
-    across = detection_matches(detected_at((0, 29), (0, 40)), truth_at((0, 30.5), (0, 41)), rules, 4.0)
-    assert [each.tolist() for each in (across.detection, across.truth, across.false, across.missed)] == [
+    across = detection_matches(
+        detected_at((0, 29), (0, 40)), truth_at((0, 30.5), (0, 41)), rules, 4.0
+    )
+    assert [
+        each.tolist() for each in (across.detection, across.truth, across.false, across.missed)
+    ] == [
         [1],
         [1],
         [0],
@@ -310,9 +453,15 @@ def test_matches_are_within_one_ring() -> None:
 def test_what_cannot_be_compared() -> None:
     nothing = Boxes.from_arrays(np.zeros((0, 3)), np.zeros((0, 3)), [])
     assert_refused(
-        (lambda: DetectionEvaluator().update("a", found_at(), nothing), GeometryError, ("a: truth", "'lidar'")),
         (
-            lambda: DetectionEvaluator().update("a", DetectedBoxes(boxes=nothing, scores=[]), truth_at()),
+            lambda: DetectionEvaluator().update("a", found_at(), nothing),
+            GeometryError,
+            ("a: truth", "'lidar'"),
+        ),
+        (
+            lambda: DetectionEvaluator().update(
+                "a", DetectedBoxes(boxes=nothing, scores=[]), truth_at()
+            ),
             GeometryError,
             ("a: prediction", "'lidar'"),
         ),

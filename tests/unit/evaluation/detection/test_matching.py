@@ -9,9 +9,18 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from shapely import Polygon
 
-from deepaccident_devkit.evaluation.detection import DETECTION_PROTOCOLS, DetectionProtocol, detection_protocol
+from deepaccident_devkit.evaluation.detection import (
+    DETECTION_PROTOCOLS,
+    DetectionProtocol,
+    detection_protocol,
+)
 from deepaccident_devkit.evaluation.detection.boxes import BoxColumns
-from deepaccident_devkit.evaluation.detection.matching import costs, frame_counts, limit_of, match_errors
+from deepaccident_devkit.evaluation.detection.matching import (
+    costs,
+    frame_counts,
+    limit_of,
+    match_errors,
+)
 
 RELEASED = DETECTION_PROTOCOLS["released"]
 
@@ -36,10 +45,14 @@ def corners(boxes: BoxColumns, at: int) -> np.ndarray:
     return np.array([boxes.center[at, :2] + one * ahead + two * aside for one, two in signs])
 
 
-def overlaps(one: BoxColumns, at: int, other: BoxColumns, there: int, *, down: bool) -> tuple[float, float]:
+def overlaps(
+    one: BoxColumns, at: int, other: BoxColumns, there: int, *, down: bool
+) -> tuple[float, float]:
     """Shares of footprints and of volumes; these reach up or down from their lower faces."""
     area = Polygon(corners(one, at)).intersection(Polygon(corners(other, there))).area
-    lows = [each.center[row, 2] - each.size[row, 2] / 2 for each, row in ((one, at), (other, there))]
+    lows = [
+        each.center[row, 2] - each.size[row, 2] / 2 for each, row in ((one, at), (other, there))
+    ]
     spans = [
         (low - height * down, low + height * (not down))
         for low, height in zip(lows, (one.size[at, 2], other.size[there, 2]), strict=True)
@@ -83,14 +96,18 @@ def test_errors_of_matches_pair_by_pair(name: str) -> None:
             bottoms = apart - [0, 0, (found.size[row, 2] - truth.size[row, 2]) / 2]
             around = 2 * 3.1415926
             assert place == pytest.approx(np.linalg.norm(bottoms))
-            assert turn == pytest.approx(abs(truth.yaw[row] % around - found.yaw[row] % around), abs=1e-9)
+            assert turn == pytest.approx(
+                abs(truth.yaw[row] % around - found.yaw[row] % around), abs=1e-9
+            )
             assert scale == pytest.approx(1 - overlaps(found, row, truth, row, down=True)[1])
         else:
             common = np.minimum(found.size[row], truth.size[row]).prod()
             apart_yaw = (found.yaw[row] - truth.yaw[row]) % (2 * math.pi)
             assert place == pytest.approx(np.linalg.norm(apart[:2]))
             assert turn == pytest.approx(min(apart_yaw, 2 * math.pi - apart_yaw))
-            assert scale == pytest.approx(1 - common / (found.size[row].prod() + truth.size[row].prod() - common))
+            assert scale == pytest.approx(
+                1 - common / (found.size[row].prod() + truth.size[row].prod() - common)
+            )
 
 
 def test_a_released_turn_of_single_precision_is_rounded_for_the_truth_alone() -> None:
@@ -98,7 +115,9 @@ def test_a_released_turn_of_single_precision_is_rounded_for_the_truth_alone() ->
     found, truth = random_boxes(source, 5).rounded(), random_boxes(source, 5).rounded()
     around = 2 * 3.1415926
     true = (truth.yaw.astype(float) % around).astype(np.float32)
-    assert_array_equal(match_errors(found, truth, RELEASED)[:, 2], np.abs(true - found.yaw.astype(float) % around))
+    assert_array_equal(
+        match_errors(found, truth, RELEASED)[:, 2], np.abs(true - found.yaw.astype(float) % around)
+    )
 
 
 @pytest.mark.parametrize(
@@ -109,7 +128,12 @@ def test_a_released_turn_of_single_precision_is_rounded_for_the_truth_alone() ->
         {"area": (-20.0, 31.0, -30.0, 10.5)},
         {"area": (-20.0, 31.0, -30.0, 10.5), "area_of": "footprint"},
         {"ranges": [[0, 10], [10, 25]], "error_threshold": None},
-        {"ranges": [[0, 10], [10, 25]], "error_threshold": None, "range_from_x_alone": True, "area": None},
+        {
+            "ranges": [[0, 10], [10, 25]],
+            "error_threshold": None,
+            "range_from_x_alone": True,
+            "area": None,
+        },
         {"classes": [["vehicle", ["van", "car"]], ["walking", ["pedestrian"]]]},
     ],
 )
@@ -119,11 +143,16 @@ def test_who_counts_box_by_box(name: str, switches: dict[str, Any]) -> None:
     rules, source = detection_protocol(name, **switches), np.random.default_rng(3)
     places = np.array([-31, -30, -20.5, -20, -6, 0, 6, 8, 10, 10.5, 11, 15, 20, 25, 31, 31.5])
     boxes, truth = (
-        replace(random_boxes(source, 300), center=np.c_[source.choice(places, (300, 2)), np.zeros(300)])
+        replace(
+            random_boxes(source, 300), center=np.c_[source.choice(places, (300, 2)), np.zeros(300)]
+        )
         for _ in range(2)
     )
     counts = frame_counts(boxes, truth, rules)
-    found, true = np.zeros(len(counts["truths"]), dtype=int), np.zeros(len(counts["truths"]), dtype=int)
+    found, true = (
+        np.zeros(len(counts["truths"]), dtype=int),
+        np.zeros(len(counts["truths"]), dtype=int),
+    )
     for some, sums, is_truth in ((boxes, found, False), (truth, true, True)):
         for row in range(300):
             for group in groups_of(some, row, rules, is_truth=is_truth):
@@ -133,15 +162,23 @@ def test_who_counts_box_by_box(name: str, switches: dict[str, Any]) -> None:
     assert true.sum() > 20
 
 
-def groups_of(boxes: BoxColumns, row: int, rules: DetectionProtocol, *, is_truth: bool) -> list[int]:
+def groups_of(
+    boxes: BoxColumns, row: int, rules: DetectionProtocol, *, is_truth: bool
+) -> list[int]:
     """The classes in their ranges in which a box counts."""
     names = ("car", "truck", "van", "cyclist", "motorcycle", "pedestrian")
-    codes = [at for at, (_, taken) in enumerate(rules.classes) if names[boxes.category[row]] in taken]
-    points = corners(boxes, row) if rules.area_of == "footprint" else boxes.center[row : row + 1, :2]
+    codes = [
+        at for at, (_, taken) in enumerate(rules.classes) if names[boxes.category[row]] in taken
+    ]
+    points = (
+        corners(boxes, row) if rules.area_of == "footprint" else boxes.center[row : row + 1, :2]
+    )
     x_low, x_high, y_low, y_high = rules.area or (-math.inf, math.inf, -math.inf, math.inf)
     inside = all(x_low <= x <= x_high and y_low <= y <= y_high for x, y in points.tolist())
     x, y = boxes.center[row, :2].tolist()
     distance = math.sqrt(x * x + (x * x if rules.range_from_x_alone else y * y))
     own = is_truth and not rules.own_box and boxes.own[row]
     rings = [at for at, (low, high) in enumerate(rules.ranges) if low <= distance < high]
-    return [code * len(rules.ranges) + ring for code in codes for ring in rings if inside and not own]
+    return [
+        code * len(rules.ranges) + ring for code in codes for ring in rings if inside and not own
+    ]

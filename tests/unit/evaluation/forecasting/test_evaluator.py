@@ -40,14 +40,23 @@ def truth_of(*seconds: float, scenario: str = "a/b", collider: int = 0) -> Forec
     )
 
 
-def forecast(actor: int, aside: Sequence[float], seconds: Sequence[float] = SECONDS, chances: Any = None) -> Forecast:
+def forecast(
+    actor: int, aside: Sequence[float], seconds: Sequence[float] = SECONDS, chances: Any = None
+) -> Forecast:
     """As the actor goes, but each mode so far to the side at its end."""
-    paths = [[(10 * each, -20.0 * actor + shift * each / seconds[-1]) for each in seconds] for shift in aside]
+    paths = [
+        [(10 * each, -20.0 * actor + shift * each / seconds[-1]) for each in seconds]
+        for shift in aside
+    ]
     given = np.full(len(aside), 1 / len(aside)) if chances is None else np.array(chances)
-    return Forecast(actor_id=actor, times=np.array(seconds), paths=np.array(paths), probabilities=given)
+    return Forecast(
+        actor_id=actor, times=np.array(seconds), paths=np.array(paths), probabilities=given
+    )
 
 
-def result_of(*samples: tuple[Sequence[Forecast], ForecastingTruth], **protocol: Any) -> ForecastingResult:
+def result_of(
+    *samples: tuple[Sequence[Forecast], ForecastingTruth], **protocol: Any
+) -> ForecastingResult:
     evaluator = ForecastingEvaluator(ForecastingProtocol(**protocol))
     for number, (forecasts, truth) in enumerate(samples):
         evaluator.update(f"{truth.scenario}/ego_vehicle/{number:03d}", forecasts, truth)
@@ -56,7 +65,11 @@ def result_of(*samples: tuple[Sequence[Forecast], ForecastingTruth], **protocol:
 
 def cells(result: ForecastingResult, table: str, row: str) -> dict[str, tuple[float, int]]:
     counted = result.counted[table][row]
-    return {name: (round(value, 6), counted[name]) for name, value in result.means[table][row].items() if counted[name]}
+    return {
+        name: (round(value, 6), counted[name])
+        for name, value in result.means[table][row].items()
+        if counted[name]
+    }
 
 
 def test_errors_are_means_over_actors_at_each_horizon() -> None:
@@ -71,7 +84,9 @@ def test_errors_are_means_over_actors_at_each_horizon() -> None:
         "without": (0.0, 2),
     }
     assert result.means["1 s, K = 6"]["all"]["min_fde"] == pytest.approx(2 / 3)
-    assert [*result.means] == [f"{seconds} s, K = {most}" for seconds in (3, 1, 2, 5) for most in (6, 1)]
+    assert [*result.means] == [
+        f"{seconds} s, K = {most}" for seconds in (3, 1, 2, 5) for most in (6, 1)
+    ]
 
 
 def test_beyond_a_forecast_there_is_no_number_and_it_is_counted() -> None:
@@ -81,7 +96,10 @@ def test_beyond_a_forecast_there_is_no_number_and_it_is_counted() -> None:
     assert (main["min_fde"], main["without"]) == ((3.0, 1), (round(2 / 3, 6), 3))
     assert cells(result, "1 s, K = 6", "all")["min_fde"] == (1.0, 2)
     assert np.isnan(result.means["5 s, K = 6"]["all"]["min_fde"])
-    assert [note.split(":")[0] for note in result.notes] == ["no forecast of 1 true actor", "no numbers at 3 s"]
+    assert [note.split(":")[0] for note in result.notes] == [
+        "no forecast of 1 true actor",
+        "no numbers at 3 s",
+    ]
     assert result.notes[1].endswith(": 1 forecast ending earlier")
 
 
@@ -96,7 +114,9 @@ def test_forecasts_cut_short_improve_nothing() -> None:
 
 
 def test_times_summed_in_float32_reach_the_horizon() -> None:
-    seconds = np.cumsum(np.full(60, 0.05, dtype=np.float32), dtype=np.float32).astype(np.float64).tolist()
+    seconds = (
+        np.cumsum(np.full(60, 0.05, dtype=np.float32), dtype=np.float32).astype(np.float64).tolist()
+    )
     assert seconds[-1] != 3
     result = result_of(([forecast(1, [3.0], seconds)], truth_of(5)))
     assert cells(result, MAIN, "all")["min_fde"] == (pytest.approx(3, abs=1e-4), 1)
@@ -113,7 +133,10 @@ def test_a_short_future_counts_in_cut_ade_alone() -> None:
 def test_of_several_modes_the_most_probable_count() -> None:
     one = forecast(1, [3.0, 1.0], chances=[0.6, 0.4])
     result = result_of(([one], truth_of(5)))
-    assert (result.means[MAIN]["all"]["min_fde"], result.means[ALONE]["all"]["min_fde"]) == (1.0, 3.0)
+    assert (result.means[MAIN]["all"]["min_fde"], result.means[ALONE]["all"]["min_fde"]) == (
+        1.0,
+        3.0,
+    )
     assert result.means[MAIN]["all"]["brier_min_fde"] == pytest.approx(1.36)
     assert "other" not in result.means[ALONE]
 
@@ -132,7 +155,9 @@ def test_groups_and_scenarios() -> None:
 
 def test_a_world_has_the_modes_of_all_its_actors() -> None:
     crossing = forecast(2, [-1.0, 20.4], chances=[0.9, 0.1])
-    result = result_of(([forecast(1, [3.0, 1.0]), crossing, forecast(3, [0.0])], truth_of(5, 5, 0.5)))
+    result = result_of(
+        ([forecast(1, [3.0, 1.0]), crossing, forecast(3, [0.0])], truth_of(5, 5, 0.5))
+    )
     together = cells(result, MAIN, "together")
     assert together == {
         "min_fde": (2.0, 1),
@@ -140,7 +165,9 @@ def test_a_world_has_the_modes_of_all_its_actors() -> None:
         "miss": (0.5, 1),
         "collisions": (0.0, 1),
     }
-    near = result_of(([forecast(1, [1.0, 0.0]), forecast(2, [9.0, 19.5])], truth_of(5, 5)), modes=(1,))
+    near = result_of(
+        ([forecast(1, [1.0, 0.0]), forecast(2, [9.0, 19.5])], truth_of(5, 5)), modes=(1,)
+    )
     assert near.means[ALONE]["together"]["collisions"] == 0.0
     near = result_of(([forecast(1, [1.0]), forecast(2, [20.4])], truth_of(5, 5)))
     assert near.means[MAIN]["together"]["collisions"] == 1.0
@@ -158,13 +185,18 @@ def test_a_sample_without_other_actors() -> None:
         members=truth.members[:, :0],
     )
     assert result_of(([], empty)).means == {}
-    assert result_of(([], empty), ([forecast(1, [3.0])], truth)).means[MAIN]["all"]["min_fde"] == 3.0
+    assert (
+        result_of(([], empty), ([forecast(1, [3.0])], truth)).means[MAIN]["all"]["min_fde"] == 3.0
+    )
 
 
 def test_a_saved_evaluator_goes_on(tmp_path: Path) -> None:
     evaluator = ForecastingEvaluator()
     evaluator.update("a/b/ego_vehicle/001", [forecast(1, [3.0])], truth_of(5))
-    assert ForecastingEvaluator().resume(evaluator.save(tmp_path / "kept")).compute() == evaluator.compute()
+    assert (
+        ForecastingEvaluator().resume(evaluator.save(tmp_path / "kept")).compute()
+        == evaluator.compute()
+    )
     assert json.loads(json.dumps(evaluator.settings)) == evaluator.settings
 
 
@@ -172,7 +204,11 @@ def test_what_cannot_be_evaluated() -> None:
     update, truth = ForecastingEvaluator().update, truth_of(5)
     twice = [forecast(1, [0.0]), forecast(1, [1.0])]
     assert_refused(
-        (lambda: update("a/b/c/001", twice, truth), EvaluationError, ("a/b/c/001", "one of each actor")),
+        (
+            lambda: update("a/b/c/001", twice, truth),
+            EvaluationError,
+            ("a/b/c/001", "one of each actor"),
+        ),
         (lambda: update("a/b/c/001", [7], truth), EvaluationError, ("expected Forecasts", "7")),
         (lambda: ForecastingEvaluator("released"), ChoiceError, ("protocol", "clean", "released")),
         (lambda: ForecastingProtocol(horizons=(6.0,)), ConfigError, ("horizons", "0.1 to 5")),

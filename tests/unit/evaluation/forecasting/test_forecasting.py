@@ -2,7 +2,10 @@
 
 from written_out import written_out
 
-from deepaccident_devkit.evaluation.forecasting.evaluator import FORECASTING_PROTOCOLS, ForecastingEvaluator
+from deepaccident_devkit.evaluation.forecasting.evaluator import (
+    FORECASTING_PROTOCOLS,
+    ForecastingEvaluator,
+)
 
 WRITTEN = {
     "evaluator.TOGETHER": "'together'",
@@ -35,5 +38,9 @@ WRITTEN = {
 
 def test_every_default_and_constant_written_out() -> None:
     assert written_out("deepaccident_devkit.evaluation.forecasting") == WRITTEN
-    facts = ForecastingEvaluator.needs_whole_recordings, ForecastingEvaluator.needs_meta, [*FORECASTING_PROTOCOLS]
+    facts = (
+        ForecastingEvaluator.needs_whole_recordings,
+        ForecastingEvaluator.needs_meta,
+        [*FORECASTING_PROTOCOLS],
+    )
     assert facts == (True, False, ["clean"])

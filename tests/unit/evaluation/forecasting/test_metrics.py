@@ -10,7 +10,12 @@ from refusals import assert_refused
 
 from deepaccident_devkit.errors import GeometryError
 from deepaccident_devkit.evaluation.forecasting import Forecast
-from deepaccident_devkit.evaluation.forecasting.metrics import actor_errors, collisions, mode_errors, world_errors
+from deepaccident_devkit.evaluation.forecasting.metrics import (
+    actor_errors,
+    collisions,
+    mode_errors,
+    world_errors,
+)
 
 STEPS = np.arange(1, 11) / 10
 ALL = np.ones((1, 3), dtype=bool)
@@ -20,41 +25,67 @@ TRUTH = np.array([[[1.0, 0.0], [2.0, 0.0], [3.0, 0.0]]])
 def forecast(times: Sequence[float] = (0.5, 1.0), modes: int = 1, **changes: Any) -> Forecast:
     """Ahead at 10 m/s, each mode 1 m further to the left."""
     paths = [[(10.0 * time, mode) for time in times] for mode in range(modes)]
-    given = {"actor_id": 7, "times": times, "paths": paths, "probabilities": np.full(modes, 1 / modes), **changes}
+    given = {
+        "actor_id": 7,
+        "times": times,
+        "paths": paths,
+        "probabilities": np.full(modes, 1 / modes),
+        **changes,
+    }
     return Forecast(**given)
 
 
-def errors(offsets: Sequence[Sequence[float]], probabilities: Sequence[float], most: int = 6, **how: Any) -> Any:
+def errors(
+    offsets: Sequence[Sequence[float]], probabilities: Sequence[float], most: int = 6, **how: Any
+) -> Any:
     """Of one actor, whose modes are so far to the side at each of three steps."""
-    paths = np.stack([TRUTH[0] + np.column_stack([np.zeros(3), each]) for each in np.array(offsets)])[None]
+    paths = np.stack(
+        [TRUTH[0] + np.column_stack([np.zeros(3), each]) for each in np.array(offsets)]
+    )[None]
     return actor_errors(paths, TRUTH, how.pop("valid", ALL), np.array([probabilities]), most, **how)
 
 
 class TestForecast:
     def test_it_goes_straight_from_the_present_place_and_ends_with_its_times(self) -> None:
-        found = forecast((0.5, 0.7), paths=[[(5.0, 1.0), (5.0, 2.0)]]).at(STEPS, np.array([1.0, 1.0]))
+        found = forecast((0.5, 0.7), paths=[[(5.0, 1.0), (5.0, 2.0)]]).at(
+            STEPS, np.array([1.0, 1.0])
+        )
         x = [1.8, 2.6, 3.4, 4.2, 5.0, 5.0, 5.0, *[np.nan] * 3]
         assert_allclose(found, [np.column_stack([x, [*[1.0] * 5, 1.5, 2.0, *[np.nan] * 3]])])
 
     def test_a_stated_present_takes_the_place_of_the_label(self) -> None:
         found = forecast((0.0, 1.0), modes=2).at(STEPS, np.array([99.0, 99.0]))
-        assert_allclose(found, [np.column_stack([10 * STEPS, np.full(10, mode)]) for mode in range(2)])
+        assert_allclose(
+            found, [np.column_stack([10 * STEPS, np.full(10, mode)]) for mode in range(2)]
+        )
         assert np.isnan(forecast((0.0,)).at(STEPS, np.zeros(2))).all()
 
     def test_decimal_times_compare_as_they_are_meant(self) -> None:
         end = forecast((0.1 + 0.2,)).at(np.array([0.3]), np.zeros(2))
         assert_allclose(end, [[[3.0, 0.0]]], atol=1e-9)
-        summed = np.cumsum(np.full(300, 0.01, dtype=np.float32), dtype=np.float32).astype(np.float64)
+        summed = np.cumsum(np.full(300, 0.01, dtype=np.float32), dtype=np.float32).astype(
+            np.float64
+        )
         assert summed[-1] != 3
-        assert_allclose(forecast(summed).at(np.array([3.0]), np.zeros(2)), [[[30.0, 0.0]]], atol=1e-2)
+        assert_allclose(
+            forecast(summed).at(np.array([3.0]), np.zeros(2)), [[[30.0, 0.0]]], atol=1e-2
+        )
 
     def test_what_is_no_forecast(self) -> None:
         assert_refused(
             (lambda: forecast((1.0, 0.5)), GeometryError, ("times", "ascending")),
             (lambda: forecast((-0.5, 0.5)), GeometryError, ("times", "ascending")),
-            (lambda: forecast(probabilities=[1.5]), GeometryError, ("probabilities", "from 0 to 1")),
+            (
+                lambda: forecast(probabilities=[1.5]),
+                GeometryError,
+                ("probabilities", "from 0 to 1"),
+            ),
             (lambda: forecast(probabilities=[0.5, 0.5]), GeometryError, "paths"),
-            (lambda: forecast(paths=[[(np.nan, 0), (1, 0)]]), GeometryError, ("paths", "leave out")),
+            (
+                lambda: forecast(paths=[[(np.nan, 0), (1, 0)]]),
+                GeometryError,
+                ("paths", "leave out"),
+            ),
             (
                 lambda: forecast(paths=np.zeros((0, 2, 2)), probabilities=[]),
                 GeometryError,
@@ -68,16 +99,29 @@ class TestActors:
     def test_the_best_mode_ends_nearest_and_its_ade_counts(self) -> None:
         found = errors([[0, 0, 3], [2, 2, 2], [0.3, 0.3, 3]], [0.2, 0.5, 0.3])
         told = {name: each.item() for name, each in found.items()}
-        expected = {"min_fde": 2, "min_ade": 2, "miss": 0, "brier_min_fde": 2.25, "min_ade_any": 1, "cut_ade": 1}
+        expected = {
+            "min_fde": 2,
+            "min_ade": 2,
+            "miss": 0,
+            "brier_min_fde": 2.25,
+            "min_ade_any": 1,
+            "cut_ade": 1,
+        }
         assert told == pytest.approx(expected)
         assert errors([[0, 0, 2.001]], [1.0])["miss"].item() == 1
         assert errors([[0, 0, 2.001]], [1.0], miss_distance=3.0)["miss"].item() == 0
 
     def test_only_the_most_probable_modes_count_and_of_equal_ones_the_first(self) -> None:
         offsets = [[0, 0, 1], [0, 0, 2], [0, 0, 0.5]]
-        cases = {(0.2, 0.5, 0.3): (2, 0.5), (1 / 3, 1 / 3, 1 / 3): (1, 1), (0.1, 0.1, np.nan): (1, 1)}
+        cases = {
+            (0.2, 0.5, 0.3): (2, 0.5),
+            (1 / 3, 1 / 3, 1 / 3): (1, 1),
+            (0.1, 0.1, np.nan): (1, 1),
+        }
         for chances, expected in cases.items():
-            assert [errors(offsets, chances, most)["min_fde"].item() for most in (1, 2)] == list(expected)
+            assert [errors(offsets, chances, most)["min_fde"].item() for most in (1, 2)] == list(
+                expected
+            )
         tied = errors([[9, 9, 1], [0, 0, 1]], [0.5, 0.5])
         assert tied["min_ade"].item() == pytest.approx(19 / 3)
 
@@ -90,7 +134,9 @@ class TestActors:
             ((0, 0, 0), set()),
         ],
     )
-    def test_what_needs_which_part_of_the_future(self, valid: Sequence[int], there: set[str]) -> None:
+    def test_what_needs_which_part_of_the_future(
+        self, valid: Sequence[int], there: set[str]
+    ) -> None:
         found = errors([[1, 2, 3]], [1.0], valid=np.array([valid], dtype=bool))
         assert {name for name, each in found.items() if np.isfinite(each).all()} == there
         if "cut_ade" in there:
@@ -108,7 +154,9 @@ class TestActors:
         none = np.zeros((0, 3), dtype=bool)
         found = actor_errors(np.zeros((0, 2, 3, 2)), np.zeros((0, 3, 2)), none, np.zeros((0, 2)), 6)
         assert {each.shape for each in found.values()} == {(0,)}
-        assert [each.shape for each in mode_errors(np.zeros((0, 2, 3, 2)), np.zeros((0, 3, 2)), none)] == [(0, 2)] * 2
+        assert [
+            each.shape for each in mode_errors(np.zeros((0, 2, 3, 2)), np.zeros((0, 3, 2)), none)
+        ] == [(0, 2)] * 2
 
 
 class TestWorlds:

@@ -32,11 +32,16 @@ def output(*predictions: Instances) -> MotionOutput:
 
 
 def forecasts(*predictions: Instances) -> dict[int, Forecast]:
-    return {each.actor_id: each for each in forecasts_of(output(*predictions), ACTORS, PLACES, labels=None)}
+    return {
+        each.actor_id: each
+        for each in forecasts_of(output(*predictions), ACTORS, PLACES, labels=None)
+    }
 
 
 def test_an_instance_goes_on_as_the_actor_that_it_is_at_the_present() -> None:
-    found = forecasts({5: [(11, 0), (16, 0), (21, 1)], 3: [(10, 12), (10, 14), (10, 16)], 4: [(-20, 0)] * 3})
+    found = forecasts(
+        {5: [(11, 0), (16, 0), (21, 1)], 3: [(10, 12), (10, 14), (10, 16)], 4: [(-20, 0)] * 3}
+    )
     assert [*found] == [11, 12]
     assert_allclose(found[11].times, [0.5, 1.0])
     assert_allclose(found[11].paths, [[(16, 0), (21, 1)]])
@@ -71,7 +76,9 @@ def test_without_a_match_there_is_none() -> None:
 
 @pytest.mark.parametrize(("step", "labels"), [(0.5, "released"), (1.0, "clean")])
 def test_steps_and_the_cells_of_labels(step: float, labels: str) -> None:
-    [found] = forecasts_of(output({5: [(10, 0), (14, 0)]}), ACTORS, PLACES, step=step, labels=labels)
+    [found] = forecasts_of(
+        output({5: [(10, 0), (14, 0)]}), ACTORS, PLACES, step=step, labels=labels
+    )
     assert found.times.tolist() == [step]
     shifted = 0.25 if labels == "released" else 0.0
     assert_allclose(np.abs(found.paths - [14, 0]), shifted)
@@ -79,5 +86,9 @@ def test_steps_and_the_cells_of_labels(step: float, labels: str) -> None:
 
 def test_no_such_labels() -> None:
     assert_refused(
-        (lambda: forecasts_of(output({5: [(10, 0)]}), ACTORS, PLACES, labels="mine"), ChoiceError, ("labels", "mine"))
+        (
+            lambda: forecasts_of(output({5: [(10, 0)]}), ACTORS, PLACES, labels="mine"),
+            ChoiceError,
+            ("labels", "mine"),
+        )
     )

@@ -39,7 +39,9 @@ def test_paths_are_those_of_the_tracks(da_motion: DeepAccident, accident: str, a
         if row["instance_token"].startswith(f"{accident}/"):
             actor = da_motion.get("instance", row["instance_token"])["actor_id"]
             frame = int(row["frame_token"].rsplit("/", 1)[1])
-            places.setdefault(actor, {})[frame] = ego_from_world.apply(np.array(row["translation"]))[:2]
+            places.setdefault(actor, {})[frame] = ego_from_world.apply(
+                np.array(row["translation"])
+            )[:2]
     expected = sorted(actor for actor, those in places.items() if present in those and actor != own)
     assert (truth.scenario, truth.actor_id.tolist()) == (accident, expected)
     nowhere = np.full(2, np.nan)
@@ -52,7 +54,9 @@ def test_paths_are_those_of_the_tracks(da_motion: DeepAccident, accident: str, a
 
 
 @pytest.mark.parametrize("agent", ["ego_vehicle", INFRASTRUCTURE])
-def test_each_actor_is_in_one_group_of_a_kind(da_motion: DeepAccident, accident: str, agent: str) -> None:
+def test_each_actor_is_in_one_group_of_a_kind(
+    da_motion: DeepAccident, accident: str, agent: str
+) -> None:
     token = last_frames(da_motion, accident, agent, 15)
     truth = forecasting_truth(da_motion, token)
     everybody = set(truth.actor_id.tolist())
@@ -70,20 +74,28 @@ def test_each_actor_is_in_one_group_of_a_kind(da_motion: DeepAccident, accident:
         assert set().union(*parts) == everybody
         assert sum(map(len, parts)) == len(everybody)
     own = da_motion.get("agent", f"{accident}/{agent}")["actor_id"]
-    assert members(truth, "collider") == set(da_motion.get("scenario", accident)["collision"]["ids"]) - {own}
+    assert members(truth, "collider") == set(
+        da_motion.get("scenario", accident)["collision"]["ids"]
+    ) - {own}
     for kind, agents in (("seen by ego", [agent]), ("seen by nobody", [*AGENTS])):
         seen = {
-            da_motion.get("instance", each)["actor_id"] for each in visible_instances(da_motion, token, agents=agents)
+            da_motion.get("instance", each)["actor_id"]
+            for each in visible_instances(da_motion, token, agents=agents)
         }
         assert members(truth, kind) == (everybody & seen if len(agents) == 1 else everybody - seen)
 
 
 @pytest.mark.parametrize(
-    ("back", "group"), [(1, "0–1 s"), (10, "0–1 s"), (11, "1–2 s"), (20, "1–2 s"), (21, "2–3 s"), (34, "3–4 s")]
+    ("back", "group"),
+    [(1, "0–1 s"), (10, "0–1 s"), (11, "1–2 s"), (20, "1–2 s"), (21, "2–3 s"), (34, "3–4 s")],
 )
-def test_seconds_to_the_impact(da_motion: DeepAccident, accident: str, back: int, group: str) -> None:
+def test_seconds_to_the_impact(
+    da_motion: DeepAccident, accident: str, back: int, group: str
+) -> None:
     truth = forecasting_truth(da_motion, last_frames(da_motion, accident, "ego_vehicle", back))
-    assert [name for name in truth.groups if "impact" in name or name == "normal"] == [f"{group} to impact"]
+    assert [name for name in truth.groups if "impact" in name or name == "normal"] == [
+        f"{group} to impact"
+    ]
 
 
 def test_of_a_normal_scenario(da_motion: DeepAccident) -> None:
@@ -95,4 +107,10 @@ def test_of_a_normal_scenario(da_motion: DeepAccident) -> None:
 
 
 def test_what_has_no_truth(da_motion: DeepAccident) -> None:
-    assert_refused((lambda: forecasting_truth(da_motion, "a/b/ego_vehicle/001"), TokenError, "a/b/ego_vehicle/001"))
+    assert_refused(
+        (
+            lambda: forecasting_truth(da_motion, "a/b/ego_vehicle/001"),
+            TokenError,
+            "a/b/ego_vehicle/001",
+        )
+    )

@@ -9,8 +9,18 @@ from hypothesis import strategies as st
 from planning_scenes import CAR, GIVEN, SCENARIO, plan_at, scene, straight
 
 from deepaccident_devkit.evaluation.breakdowns import cluster_of
-from deepaccident_devkit.evaluation.intervals import intervals_of, leaving_out, numbers_of_draws, range_of
-from deepaccident_devkit.evaluation.planning import PlanningEvaluator, PlanningResult, PlanningScene, trivial_plans
+from deepaccident_devkit.evaluation.intervals import (
+    intervals_of,
+    leaving_out,
+    numbers_of_draws,
+    range_of,
+)
+from deepaccident_devkit.evaluation.planning import (
+    PlanningEvaluator,
+    PlanningResult,
+    PlanningScene,
+    trivial_plans,
+)
 from deepaccident_devkit.evaluation.planning.clean import box_path
 from deepaccident_devkit.evaluation.planning.contacts import first_contacts
 from deepaccident_devkit.evaluation.planning.scene import Plan
@@ -35,7 +45,9 @@ def test_the_recorded_plan_avoids_nothing_and_causes_nothing() -> None:
     numbers = lead(found, "recorded")
     assert numbers == pytest.approx(
         {
-            **dict.fromkeys(("avoided", "striking", "struck", "lost", "lost_way", "prolonged", "infeasible"), 0),
+            **dict.fromkeys(
+                ("avoided", "striking", "struck", "lost", "lost_way", "prolonged", "infeasible"), 0
+            ),
             "impact_speed": 10,
             "relative_speed": 10,
         }
@@ -50,7 +62,9 @@ def test_constant_velocity_is_the_recording_where_that_is_straight_and_uniform()
 
 
 @pytest.mark.parametrize(("speed", "infeasible"), [(4.0, 0), (5.0, 0), (5.1, 100), (12.0, 100)])
-def test_standing_at_once_loses_all_and_is_infeasible_above_5_metres_a_second(speed: float, infeasible: int) -> None:
+def test_standing_at_once_loses_all_and_is_infeasible_above_5_metres_a_second(
+    speed: float, infeasible: int
+) -> None:
     found = result_of(scene(speed))
     numbers = lead(found, "standing")
     assert (numbers["avoided"], numbers["lost"], numbers["striking"]) == (100, 100, 0)
@@ -114,8 +128,14 @@ def test_contacts_with_actors_who_lack_labels_are_found(gap: int) -> None:
     [
         (plan_at(10), []),
         (plan_at(10, seconds=0.5), ["continued straight on: 1 plan ending before 3 s"]),
-        (replace(plan_at(10), times=plan_at(10).times * 10), ["suspicious: 1 path longer than 10 s"]),
-        (replace(plan_at(10), yaw=np.linspace(0, 6.3, 6)), ["suspicious: 1 plan with a yaw beyond 2π"]),
+        (
+            replace(plan_at(10), times=plan_at(10).times * 10),
+            ["suspicious: 1 path longer than 10 s"],
+        ),
+        (
+            replace(plan_at(10), yaw=np.linspace(0, 6.3, 6)),
+            ["suspicious: 1 plan with a yaw beyond 2π"],
+        ),
     ],
 )
 def test_notes_on_what_looks_wrong_in_a_plan(plan: Plan, told: list[str]) -> None:
@@ -125,7 +145,9 @@ def test_notes_on_what_looks_wrong_in_a_plan(plan: Plan, told: list[str]) -> Non
 
 def test_new_collisions_are_of_whom_the_recording_does_not_touch() -> None:
     beside = straight((20, 4), 0.0, 0.0, 31)  # a parked car to the left
-    swerve = Plan(times=np.array([1.0, 2.0, 3.0]), path=np.array([[10.0, 0.0], [20.0, 4.0], [20.0, 4.0]]))
+    swerve = Plan(
+        times=np.array([1.0, 2.0, 3.0]), path=np.array([[10.0, 0.0], [20.0, 4.0], [20.0, 4.0]])
+    )
     numbers = lead(result_of(scene(10, others=[beside]), plan=swerve))
     assert (numbers["avoided"], numbers["striking"], numbers["struck"]) == (100, 100, 0)
 
@@ -154,7 +176,11 @@ def test_twins_are_the_price() -> None:
     twin = replace(scene(10, partner=False), is_twin=True, is_collider=True)
     numbers = lead(result_of(twin), "full braking")
     assert numbers["lost_twins"] == pytest.approx(100 * (30 - 6.25) / 30, abs=0.1)
-    assert (numbers["braking_twins"], "avoided" in numbers, "lost" in numbers) == (100, False, False)
+    assert (numbers["braking_twins"], "avoided" in numbers, "lost" in numbers) == (
+        100,
+        False,
+        False,
+    )
 
 
 def of_speeds(*speeds: float) -> tuple[PlanningEvaluator, list[str]]:
@@ -172,7 +198,10 @@ def test_intervals_of_progress_lost_cross_zero() -> None:
     """Of plans that go farther than the recording as often as not, a plain jackknife by t says the same."""
     evaluator, tokens = of_speeds(7, 13, 8, 12, 9, 11, 9.5, 11.5)
     clusters = evaluator.clustered({token: cluster_of(scenario_of(token)) for token in tokens})
-    paths = [f"means/lead 3 s/{GIVEN}/{name}" for name in ("lost", "lost_way", "lost_twins", "lost_way_twins")]
+    paths = [
+        f"means/lead 3 s/{GIVEN}/{name}"
+        for name in ("lost", "lost_way", "lost_twins", "lost_way_twins")
+    ]
     ends = intervals_of(evaluator, clusters, evaluator.compute()).ends
     values = numbers_of_draws(evaluator, clusters, np.ones((1, 8), dtype=np.int64), paths)[0]
     left_out = numbers_of_draws(evaluator, clusters, leaving_out(8), paths)
@@ -184,12 +213,20 @@ def test_intervals_of_progress_lost_cross_zero() -> None:
 
 @settings(max_examples=10)
 @given(st.floats(0.0, 30.0), st.floats(1.0, 30.0), st.floats(-10.0, 10.0), st.booleans())
-def test_what_can_be_negative_is_a_signed_number(planned: float, recorded: float, aside: float, twin: bool) -> None:
+def test_what_can_be_negative_is_a_signed_number(
+    planned: float, recorded: float, aside: float, twin: bool
+) -> None:
     true = replace(scene(recorded, partner=not twin), is_twin=twin, is_collider=True)
     times = np.arange(1, 7) * 0.5
-    numbers = lead(result_of(true, plan=Plan(times=times, path=np.column_stack([times * planned, times * aside]))))
+    numbers = lead(
+        result_of(
+            true, plan=Plan(times=times, path=np.column_stack([times * planned, times * aside]))
+        )
+    )
     for column, value in numbers.items():
-        least, most = range_of(f"means/lead 3 s/{GIVEN}/{column}", np.array([value]), PlanningResult.rows)
+        least, most = range_of(
+            f"means/lead 3 s/{GIVEN}/{column}", np.array([value]), PlanningResult.rows
+        )
         assert np.isnan(value) or least - 1e-6 <= value <= most + 1e-6
         assert (least < 0) == column.startswith("lost")
 
@@ -200,7 +237,9 @@ def test_bystanders_have_tables_of_their_own() -> None:
     assert found.means["bystander, lead 3 s"]["standing"]["lost"] == 100
 
 
-@pytest.mark.parametrize(("to_end", "table"), [(3.2, "lead 3 s"), (2.8, "lead 3 s"), (0.7, "lead 0.5 s"), (4.0, None)])
+@pytest.mark.parametrize(
+    ("to_end", "table"), [(3.2, "lead 3 s"), (2.8, "lead 3 s"), (0.7, "lead 0.5 s"), (4.0, None)]
+)
 def test_a_sample_counts_at_the_nearest_lead(to_end: float, table: str | None) -> None:
     found = result_of(replace(scene(10), to_end=to_end, to_contact=np.nan))
     assert [name for name in found.means if name.startswith("lead")] == ([table] if table else [])
@@ -208,7 +247,10 @@ def test_a_sample_counts_at_the_nearest_lead(to_end: float, table: str | None) -
 
 def test_leads_to_the_contact_stand_beside() -> None:
     found = result_of(replace(scene(10), to_contact=1.0))
-    assert [name for name in found.means if name.startswith("lead")] == ["lead 3 s", "lead 1 s to contact"]
+    assert [name for name in found.means if name.startswith("lead")] == [
+        "lead 3 s",
+        "lead 1 s to contact",
+    ]
 
 
 def gone_by(scene: PlanningScene, side: float) -> PlanningScene:
@@ -228,7 +270,11 @@ def test_an_accident_that_the_recording_does_not_show_is_left_out_by_name() -> N
 
 def test_of_several_plans_the_one_with_the_highest_score_counts() -> None:
     evaluator = PlanningEvaluator()
-    given = [replace(plan_at(10), score=0.1), replace(plan_at(0), score=0.9), replace(plan_at(5), score=0.9)]
+    given = [
+        replace(plan_at(10), score=0.1),
+        replace(plan_at(0), score=0.9),
+        replace(plan_at(5), score=0.9),
+    ]
     evaluator.update(TOKEN.format(1), given, scene(10))
     assert evaluator.compute().means["1 s"][GIVEN]["l2"] == pytest.approx(10)
 

@@ -30,33 +30,68 @@ def test_without_samples_there_is_nothing(protocol: str) -> None:
 def test_the_protocols() -> None:
     public = ("uniad", "stp3", "vad", "bev_planner")
     assert tuple(PLANNING_PROTOCOLS) == ("clean", *public, *(f"{name}_own_box" for name in public))
-    assert PlanningEvaluator().settings == {"leads": [3.0, 2.0, 1.0, 0.5], "most_acceleration": 10.0, "braking": 3.0}
-    facts = PlanningEvaluator.needs_whole_recordings, PlanningEvaluator.needs_meta, PlanningEvaluator.vehicles_only
+    assert PlanningEvaluator().settings == {
+        "leads": [3.0, 2.0, 1.0, 0.5],
+        "most_acceleration": 10.0,
+        "braking": 3.0,
+    }
+    facts = (
+        PlanningEvaluator.needs_whole_recordings,
+        PlanningEvaluator.needs_meta,
+        PlanningEvaluator.vehicles_only,
+    )
     assert facts == (True, True, True)
 
 
 def test_what_cannot_be_evaluated() -> None:
     evaluator, short = PlanningEvaluator("uniad"), plan_at(10, seconds=2)
     assert_refused(
-        (lambda: PlanningEvaluator("released"), ChoiceError, ("protocol", "clean, uniad", "released")),
-        (lambda: evaluator.update(TOKEN, [], scene(10)), EvaluationError, (TOKEN, "one Plan or more", "none")),
+        (
+            lambda: PlanningEvaluator("released"),
+            ChoiceError,
+            ("protocol", "clean, uniad", "released"),
+        ),
+        (
+            lambda: evaluator.update(TOKEN, [], scene(10)),
+            EvaluationError,
+            (TOKEN, "one Plan or more", "none"),
+        ),
         (lambda: evaluator.update(TOKEN, [3], scene(10)), EvaluationError, ("found int",)),
         (
             lambda: evaluator.update(TOKEN, [short], scene(10)),
             EvaluationError,
             ("ends after 2 s", "3 s ahead", "clean"),
         ),
-        (lambda: Plan(times=[1, 1], path=np.zeros((2, 2))), GeometryError, "times: expected ascending seconds"),
-        (lambda: Plan(times=[0], path=np.zeros((1, 2))), GeometryError, "times: expected a plan for after the present"),
+        (
+            lambda: Plan(times=[1, 1], path=np.zeros((2, 2))),
+            GeometryError,
+            "times: expected ascending seconds",
+        ),
+        (
+            lambda: Plan(times=[0], path=np.zeros((1, 2))),
+            GeometryError,
+            "times: expected a plan for after the present",
+        ),
         (lambda: Plan(times=[1, 2], path=np.zeros((3, 2))), GeometryError, "path: expected shape"),
-        (lambda: Plan(times=[1, 2], path=np.full((2, 2), np.nan)), GeometryError, "path: not all numbers are finite"),
-        (lambda: Plan(times=[1], path=np.zeros((1, 2)), yaw=[np.inf]), GeometryError, "not all numbers are finite"),
+        (
+            lambda: Plan(times=[1, 2], path=np.full((2, 2), np.nan)),
+            GeometryError,
+            "path: not all numbers are finite",
+        ),
+        (
+            lambda: Plan(times=[1], path=np.zeros((1, 2)), yaw=[np.inf]),
+            GeometryError,
+            "not all numbers are finite",
+        ),
     )
 
 
 @pytest.mark.parametrize("protocol", CELL_PROTOCOLS)
 def test_a_plan_equal_to_the_recorded_accident_has_no_collision(protocol: str) -> None:
-    evaluator, through = PlanningEvaluator(protocol), scene(10, others=[straight((20.0, 0.0), 0.0, 0.0, 31)])
+    evaluator, through = (
+        PlanningEvaluator(protocol),
+        scene(10, others=[straight((20.0, 0.0), 0.0, 0.0, 31)]),
+    )
     evaluator.update(TOKEN, [trivial_plans(through)["recorded"]], through)
     found = evaluator.compute()
     for table in ("1 s", "2 s", "3 s", "mean"):
@@ -75,7 +110,9 @@ def test_the_definitions_disagree_on_one_plan() -> None:
     for protocol in ("uniad_own_box", "stp3_own_box", "bev_planner_own_box"):
         evaluator = PlanningEvaluator(protocol)
         evaluator.update(TOKEN, [plan], scene(10, others=[beside], partner=False))
-        found[protocol] = [evaluator.compute().means[f"{each} s"][GIVEN]["collision"] for each in (1, 2, 3)]
+        found[protocol] = [
+            evaluator.compute().means[f"{each} s"][GIVEN]["collision"] for each in (1, 2, 3)
+        ]
     assert found["uniad_own_box"] == [0, 0, 0]
     assert found["stp3_own_box"] == pytest.approx([0, 0, 100 / 6])
     assert found["bev_planner_own_box"] == [0, 0, 100]
@@ -90,7 +127,8 @@ def test_without_a_whole_future_only_uniad_counts() -> None:
     uniad = PlanningEvaluator("uniad")
     uniad.update(TOKEN, [plan_at(0)], short)
     assert uniad.compute().means["3 s"][GIVEN] == pytest.approx(
-        {"l2": 0, "collision": 0, "point_collision": 0, "left_out": 100, "l2_endpoint": np.nan}, nan_ok=True
+        {"l2": 0, "collision": 0, "point_collision": 0, "left_out": 100, "l2_endpoint": np.nan},
+        nan_ok=True,
     )
 
 
@@ -112,13 +150,17 @@ def test_pedestrians_count_by_the_rules_that_draw_them() -> None:
 
 def test_headings_are_those_of_the_steps() -> None:
     plan = Plan(times=[1, 2, 3, 4], path=[[5, 0], [5.05, 0.05], [5.05, 5], [0, 5]])
-    assert plan.poses(np.array([0, 1, 2, 3, 4, 6]))[:, 2] == pytest.approx([0, 0, 0, np.pi / 2, np.pi, np.pi], abs=0.02)
+    assert plan.poses(np.array([0, 1, 2, 3, 4, 6]))[:, 2] == pytest.approx(
+        [0, 0, 0, np.pi / 2, np.pi, np.pi], abs=0.02
+    )
     assert plan.poses(np.array([5.0]))[0, :2] == pytest.approx([-5.05, 5])
 
 
 def collider(da_motion: DeepAccident) -> tuple[str, int]:
     """A sample of a vehicle that collides, 1 s before the end, and how many frames are left."""
-    scenario = next(each for each in da_motion.scenario if each["collision"] and each["collision"]["agents"][0])
+    scenario = next(
+        each for each in da_motion.scenario if each["collision"] and each["collision"]["agents"][0]
+    )
     agent, last = scenario["collision"]["agents"][0], scenario["num_frames"]
     return f"{scenario['token']}/{agent}/{last - 10:03d}", 10
 
@@ -137,7 +179,9 @@ def test_a_scene_of_a_release(da_motion: DeepAccident) -> None:
     own = da_motion.get("agent", f"{scenario}/{agent}")["actor_id"]
     assert own not in found.actor_id
     speed = np.hypot(*found.before)
-    assert speed == pytest.approx(np.hypot(*np.diff(found.recorded[:2, :2], axis=0)[0]) / 0.1, abs=1.0)
+    assert speed == pytest.approx(
+        np.hypot(*np.diff(found.recorded[:2, :2], axis=0)[0]) / 0.1, abs=1.0
+    )
 
 
 def test_a_twin_is_cut_to_the_accident(da_motion: DeepAccident) -> None:

@@ -29,9 +29,14 @@ def written(path: Path, task: Any, predictions: dict[str, Any], **options: Any) 
     return read_results(path)
 
 
-def heads(seed: int = 0, count: int = 2, orientation: Any = "devkit", grid: BevGrid = GRID) -> MotionOutput:
+def heads(
+    seed: int = 0, count: int = 2, orientation: Any = "devkit", grid: BevGrid = GRID
+) -> MotionOutput:
     source, laid = np.random.default_rng(seed), grid.with_orientation(orientation)
-    maps = [source.normal(size=(count, 3, channels, *laid.shape)).astype(np.float32) for channels in (2, 1, 2, 2)]
+    maps = [
+        source.normal(size=(count, 3, channels, *laid.shape)).astype(np.float32)
+        for channels in (2, 1, 2, 2)
+    ]
     return MotionOutput.from_arrays(*maps, grid=laid)
 
 
@@ -61,7 +66,9 @@ def test_of_heads_their_instances_are_stored(tmp_path: Path, orientation: Any) -
     results.check()
 
 
-@pytest.mark.parametrize(("highest", "dtype"), [(255, "u1"), (256, "u2"), (65535, "u2"), (65536, "i4")])
+@pytest.mark.parametrize(
+    ("highest", "dtype"), [(255, "u1"), (256, "u2"), (65535, "u2"), (65536, "i4")]
+)
 def test_instance_maps_are_stored_as_given(tmp_path: Path, highest: int, dtype: str) -> None:
     maps = plain.instance_arrays()["instance"].astype(np.int32)
     maps[maps == 7] = highest
@@ -71,7 +78,10 @@ def test_instance_maps_are_stored_as_given(tmp_path: Path, highest: int, dtype: 
     assert isinstance(read, MotionOutput)
     np.testing.assert_array_equal(read.instances, maps)  # type: ignore[arg-type]
     with np.load(tmp_path / "m" / "shards" / "00000.npz") as file:
-        assert (file[f"{FIRST}/instance"].dtype, {entry.date_time for entry in file.zip.infolist()}) == (
+        assert (
+            file[f"{FIRST}/instance"].dtype,
+            {entry.date_time for entry in file.zip.infolist()},
+        ) == (
             dtype,
             FIRST_DATE,
         )
@@ -95,7 +105,8 @@ def test_paths_that_earlier_files_have_are_not_read(tmp_path: Path) -> None:
     folder = plain.write_motion(tmp_path / "b")
     paths = {"trajectory_id": np.array([1, 7]), "trajectory": np.zeros((2, 3, 2))}
     plain.write_shard(
-        folder / "shards" / "00000.npz", {token: plain.instance_arrays() | paths for token in (FIRST, SECOND)}
+        folder / "shards" / "00000.npz",
+        {token: plain.instance_arrays() | paths for token in (FIRST, SECOND)},
     )
     plain.relist(folder)
     read_results(folder).check()
@@ -117,12 +128,23 @@ def test_shards_of_64_samples(tmp_path: Path) -> None:
     [
         (heads(orientation="fiery"), "expected a prediction on BevGrid"),
         (heads(grid=BevGrid((-2.0, 2.0, 0.25), GRID.y)), "expected a prediction on BevGrid"),
-        (instances_of(plain.instance_arrays()["instance"], GRID), "expected heads, found instance maps"),
-        (MotionOutput(grid=GRID, heads=(labelled(ignore=255),)), "found those of labels, which hold values to"),
-        (MotionOutput(grid=GRID, heads=(labelled(frames=2),)), "expected 3 frames as of the samples before, found"),
+        (
+            instances_of(plain.instance_arrays()["instance"], GRID),
+            "expected heads, found instance maps",
+        ),
+        (
+            MotionOutput(grid=GRID, heads=(labelled(ignore=255),)),
+            "found those of labels, which hold values to",
+        ),
+        (
+            MotionOutput(grid=GRID, heads=(labelled(frames=2),)),
+            "expected 3 frames as of the samples before, found",
+        ),
     ],
 )
-def test_predictions_that_do_not_go_together(tmp_path: Path, output: MotionOutput, words: str) -> None:
+def test_predictions_that_do_not_go_together(
+    tmp_path: Path, output: MotionOutput, words: str
+) -> None:
     with ResultsWriter(tmp_path / "m", "motion", store="heads") as writer:
         writer.add(FIRST, heads())
         assert_refused(
@@ -143,7 +165,9 @@ def test_negative_ids(tmp_path: Path) -> None:
     with ResultsWriter(tmp_path / "m", "motion") as writer:
         assert_refused(
             (
-                lambda: writer.add(FIRST, instances_of(-plain.instance_arrays()["instance"].astype(int), GRID)),
+                lambda: writer.add(
+                    FIRST, instances_of(-plain.instance_arrays()["instance"].astype(int), GRID)
+                ),
                 ResultsError,
                 "instances: expected ids from 1, and 0 elsewhere, found -7",
             ),

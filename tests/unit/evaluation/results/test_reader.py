@@ -52,8 +52,14 @@ HEADERS: dict[str, tuple[Document, str]] = {
     "another format": ({"format": "COCO"}, 'format: expected DeepAccident results, found "COCO"'),
     "no format": ({"format": ...}, 'has no "format" (a nuScenes results file?); put "format"'),
     "no version": ({"version": ...}, "required field `version`"),
-    "a newer version": ({"version": 2}, "version: a newer results format (2, this devkit's is 1); update the devkit"),
-    "an older version": ({"version": 0}, "version: an older results format (0, this devkit's is 1); write it again"),
+    "a newer version": (
+        {"version": 2},
+        "version: a newer results format (2, this devkit's is 1); update the devkit",
+    ),
+    "an older version": (
+        {"version": 0},
+        "version: an older results format (0, this devkit's is 1); write it again",
+    ),
     "a version that is a text": ({"version": "1"}, 'version: expected 1, found "1"'),
     "a version that is true": ({"version": True}, "version: expected 1, found true"),
     "no task": ({"task": ...}, "required field `task`"),
@@ -69,35 +75,80 @@ HEADERS: dict[str, tuple[Document, str]] = {
     "no meta": ({"meta": ...}, "required field `meta`"),
     "meta that is a text": ({"meta": "mine"}, "meta: expected a mapping"),
     "no results": ({"results": ...}, "required field `results`"),
-    "an unknown field": ({"result": {}}, "unknown field `result` (expected results, format, version, meta)"),
-    "results in a list": ({"results": []}, "results: expected `object`, found [] (Sample token to what"),
+    "an unknown field": (
+        {"result": {}},
+        "unknown field `result` (expected results, format, version, meta)",
+    ),
+    "results in a list": (
+        {"results": []},
+        "results: expected `object`, found [] (Sample token to what",
+    ),
     "no sample": ({"results": {}}, "results: expected `object` of length >= 1"),
     "an empty token": ({"results": {"": []}}, "results: expected a sample's token"),
-    "a token of a parent": ({"results": {"a/../b": []}}, "results: expected a sample's token, <scenario_type>"),
+    "a token of a parent": (
+        {"results": {"a/../b": []}},
+        "results: expected a sample's token, <scenario_type>",
+    ),
     "null for no accident": ({"results": {FIRST: None}}, f"results of '{FIRST}': expected `array`"),
-    "an object for a list": ({"results": {FIRST: plain.accident()}}, f"results of '{FIRST}': expected `array`"),
-    "an entry that is a number": ({"results": {FIRST: [], SECOND: [3]}}, f"results of '{SECOND}': [0]: expected"),
+    "an object for a list": (
+        {"results": {FIRST: plain.accident()}},
+        f"results of '{FIRST}': expected `array`",
+    ),
+    "an entry that is a number": (
+        {"results": {FIRST: [], SECOND: [3]}},
+        f"results of '{SECOND}': [0]: expected",
+    ),
 }
 
 
 @pytest.mark.parametrize("kind", HEADERS)
 def test_headers(tmp_path: Path, kind: str) -> None:
     changes, words = HEADERS[kind]
-    told = {name: value for name, value in {**plain.accidents(), **changes}.items() if value is not ...}
+    told = {
+        name: value for name, value in {**plain.accidents(), **changes}.items() if value is not ...
+    }
     refused(plain.write_json(tmp_path / "accident.json", told), "accident.json: ", words)
 
 
 TEXTS: dict[str, tuple[str, str, tuple[str, ...]]] = {
     "cut off": ("]}}", "]}", ("is no JSON (",)),
     "a token twice": (f'"{SECOND}"', f'"{FIRST}"', (f"results: {FIRST}: stands there twice",)),
-    "a field twice": ('"time": 0', '"time": 0, "score": 1', (f"results: {FIRST}: entry 1: score: stands there twice",)),
-    "results twice": ('"task": "accident"', '"task": "accident", "results": {}', ("results: stands there twice",)),
-    "NaN": ('"time": 0', '"time": NaN', (f"results: {FIRST}: entry 1: time: expected a finite number, found NaN",)),
-    "Infinity": ("[13.0,", "[-Infinity,", (f"{FIRST}: entry 0: positions: entry 1: entry 0: ", "found Infinity")),
-    "NaN in meta": ('"plain"', "[NaN]", ("meta: method: entry 0: expected a finite number, found NaN",)),
+    "a field twice": (
+        '"time": 0',
+        '"time": 0, "score": 1',
+        (f"results: {FIRST}: entry 1: score: stands there twice",),
+    ),
+    "results twice": (
+        '"task": "accident"',
+        '"task": "accident", "results": {}',
+        ("results: stands there twice",),
+    ),
+    "NaN": (
+        '"time": 0',
+        '"time": NaN',
+        (f"results: {FIRST}: entry 1: time: expected a finite number, found NaN",),
+    ),
+    "Infinity": (
+        "[13.0,",
+        "[-Infinity,",
+        (f"{FIRST}: entry 0: positions: entry 1: entry 0: ", "found Infinity"),
+    ),
+    "NaN in meta": (
+        '"plain"',
+        "[NaN]",
+        ("meta: method: entry 0: expected a finite number, found NaN",),
+    ),
     "beyond floats in meta": ('"plain"', "1e999", ("meta: cannot be written as JSON",)),
-    "beyond floats": ('"time": 0', '"time": 1e999', (f"results of '{FIRST}': [1].time: number out of range",)),
-    "whole beyond floats": ('"time": 0', f'"time": 1{"0" * 400}', (f"results of '{FIRST}': [1].time: ",)),
+    "beyond floats": (
+        '"time": 0',
+        '"time": 1e999',
+        (f"results of '{FIRST}': [1].time: number out of range",),
+    ),
+    "whole beyond floats": (
+        '"time": 0',
+        f'"time": 1{"0" * 400}',
+        (f"results of '{FIRST}': [1].time: ",),
+    ),
     "thousands of digits": ('"time": 0', f'"time": 1{"0" * 9000}', ("accident.json: ",)),
     "other bytes than UTF-8": ('"plain"', '"\udcff"', ("is no JSON (",)),
     "half a character in meta": (
@@ -110,7 +161,11 @@ TEXTS: dict[str, tuple[str, str, tuple[str, ...]]] = {
         '"\\uDC00"',
         ("meta: expected a name of characters, found half of one",),
     ),
-    "nested deeper than reports show": ('"plain"', f"{'[' * 40}{']' * 40}", ("meta: is nested more than 30 levels",)),
+    "nested deeper than reports show": (
+        '"plain"',
+        f"{'[' * 40}{']' * 40}",
+        ("meta: is nested more than 30 levels",),
+    ),
     "nested a million deep": ('"plain"', "[" * 10**6, ("is nested more than 64 levels deep",)),
 }
 
@@ -131,13 +186,28 @@ ACCIDENTS: dict[str, tuple[dict[str, Any], str]] = {
         {"positions": [[1, 2]]},
         ".positions: expected `array` of length 2, found [[1, 2]] (Of the two that",
     ),
-    "positions in space": ({"positions": [[1, 2, 0], [3, 4, 0]]}, ".positions[0]: expected `array` of length 2"),
+    "positions in space": (
+        {"positions": [[1, 2, 0], [3, 4, 0]]},
+        ".positions[0]: expected `array` of length 2",
+    ),
     "positions that are flat": ({"positions": [1, 2, 3, 4]}, ".positions[0]: expected `array`"),
-    "a position that is a text": ({"positions": [[1, "2"], [3, 4]]}, ".positions[0][1]: expected `float`"),
-    "a position that is true": ({"positions": [[1, True], [3, 4]]}, ".positions[0][1]: expected `float`"),
+    "a position that is a text": (
+        {"positions": [[1, "2"], [3, 4]]},
+        ".positions[0][1]: expected `float`",
+    ),
+    "a position that is true": (
+        {"positions": [[1, True], [3, 4]]},
+        ".positions[0][1]: expected `float`",
+    ),
     "a time that is a text": ({"time": "soon"}, ".time: expected `float`"),
-    "a time of the past": ({"time": -0.5}, ".time: expected `float` >= 0.0, found -0.5 (Seconds after the present.)"),
-    "positions whose squares overflow": ({"positions": [[1e200, 0], [0, 0]]}, ".positions[0][0]: expected `float` <="),
+    "a time of the past": (
+        {"time": -0.5},
+        ".time: expected `float` >= 0.0, found -0.5 (Seconds after the present.)",
+    ),
+    "positions whose squares overflow": (
+        {"positions": [[1e200, 0], [0, 0]]},
+        ".positions[0][0]: expected `float` <=",
+    ),
     "a time beyond all recordings": ({"time": 1.7e308}, ".time: expected `float` <= 1000000"),
     "no time": ({"time": ...}, ": object missing required field `time`"),
     "null for a score": ({"score": None}, ".score: expected `float`, found null (How sure"),
@@ -147,7 +217,10 @@ ACCIDENTS: dict[str, tuple[dict[str, Any], str]] = {
     "an id that is a text": ({"ids": ["1236", 1240]}, ".ids[0]: expected `int`"),
     "three ids": ({"ids": [1, 2, 3]}, ".ids: expected `array` of length 2"),
     "an id of 70 bits": ({"ids": [2**70, 1]}, ".ids[0]: expected `int` <="),
-    "a misspelt field": ({"id": [1, 2]}, ": object contains unknown field `id` (expected positions, time, score, ids)"),
+    "a misspelt field": (
+        {"id": [1, 2]},
+        ": object contains unknown field `id` (expected positions, time, score, ids)",
+    ),
 }
 
 
@@ -165,20 +238,38 @@ BOXES: dict[str, tuple[dict[str, Any], str]] = {
         f".sample_token: expected {FIRST}, under which it stands, found '{SECOND}'",
     ),
     "no token": ({"sample_token": ...}, ": object missing required field `sample_token`"),
-    "a translation on the ground": ({"translation": [1, 2]}, ".translation: expected `array` of length 3"),
-    "a translation beyond the world": ({"translation": [1e9, 2, 3]}, ".translation[0]: expected `float` <= 1000000"),
+    "a translation on the ground": (
+        {"translation": [1, 2]},
+        ".translation: expected `array` of length 3",
+    ),
+    "a translation beyond the world": (
+        {"translation": [1e9, 2, 3]},
+        ".translation[0]: expected `float` <= 1000000",
+    ),
     "a negative size": (
         {"size": [1, -2, 1]},
         ".size[1]: expected `float` >= 0.0, found -2 (WIDTH, LENGTH, HEIGHT, metres",
     ),
-    "a yaw": ({"rotation": 0.3}, ".rotation: expected `array`, found 0.3 (Unit quaternion w, x, y, z"),
-    "a quaternion of length 2": ({"rotation": [2, 0, 0, 0]}, ".rotation: expected a unit quaternion [w, x, y, z]"),
-    "a quaternion beyond floats": ({"rotation": [1e300, 0, 0, 0]}, ".rotation: expected a unit quaternion"),
+    "a yaw": (
+        {"rotation": 0.3},
+        ".rotation: expected `array`, found 0.3 (Unit quaternion w, x, y, z",
+    ),
+    "a quaternion of length 2": (
+        {"rotation": [2, 0, 0, 0]},
+        ".rotation: expected a unit quaternion [w, x, y, z]",
+    ),
+    "a quaternion beyond floats": (
+        {"rotation": [1e300, 0, 0, 0]},
+        ".rotation: expected a unit quaternion",
+    ),
     "null in a velocity": ({"velocity": [None, None]}, ".velocity[0]: expected `float`"),
     "a velocity in space": ({"velocity": [1, 2, 0]}, ".velocity: expected `array` of length 2"),
     "an unknown category": ({"detection_name": "bus"}, f'.detection_name: {CLASSES}, found "bus"'),
     "a category's number": ({"detection_name": 0}, f".detection_name: {CLASSES}, found 0"),
-    "a list of categories": ({"detection_name": ["car"]}, f'.detection_name: {CLASSES}, found ["car"]'),
+    "a list of categories": (
+        {"detection_name": ["car"]},
+        f'.detection_name: {CLASSES}, found ["car"]',
+    ),
     "a score that is a text": ({"detection_score": "0.9"}, ".detection_score: expected `float`"),
     "an unknown field": ({"tracking_id": "3"}, ": object contains unknown field `tracking_id`"),
 }
@@ -192,19 +283,43 @@ def test_boxes(tmp_path: Path, kind: str) -> None:
 
 
 PATHS: dict[str, tuple[str, dict[str, Any], str]] = {
-    "times that go back": ("planning", {"times": [1.0, 0.5]}, ": times: expected ascending seconds after the present"),
-    "a time before the present": ("planning", {"times": [-1, 0.5]}, ".times[0]: expected `float` >= 0.0"),
+    "times that go back": (
+        "planning",
+        {"times": [1.0, 0.5]},
+        ": times: expected ascending seconds after the present",
+    ),
+    "a time before the present": (
+        "planning",
+        {"times": [-1, 0.5]},
+        ".times[0]: expected `float` >= 0.0",
+    ),
     "fewer places than times": ("planning", {"path": [[1, 2]]}, ": path: "),
     "no place": ("planning", {"times": [], "path": []}, ".times: expected `array` of length >= 1"),
     "more headings than times": ("planning", {"yaw": [0, 0, 0]}, ": yaw: "),
     "no score": ("planning", {"score": ...}, ": object missing required field `score`"),
-    "a place in space": ("planning", {"path": [[1, 2, 3], [1, 2, 3]]}, ".path[0]: expected `array` of length 2"),
+    "a place in space": (
+        "planning",
+        {"path": [[1, 2, 3], [1, 2, 3]]},
+        ".path[0]: expected `array` of length 2",
+    ),
     "an actor twice": ("forecasting", {"id": 1236}, ".id: actor 1236 comes twice"),
     "an actor's name": ("forecasting", {"id": "1240"}, ".id: expected `int`"),
-    "a mode of another length": ("forecasting", {"paths": [[[1, 2]], [[1, 2], [3, 4]]]}, ": paths: "),
+    "a mode of another length": (
+        "forecasting",
+        {"paths": [[[1, 2]], [[1, 2], [3, 4]]]},
+        ": paths: ",
+    ),
     "fewer probabilities": ("forecasting", {"probabilities": [1]}, ": paths: "),
-    "a probability above 1": ("forecasting", {"probabilities": [1.5, 0]}, ".probabilities[0]: expected `float` <= 1.0"),
-    "no mode": ("forecasting", {"paths": [], "probabilities": []}, ".paths: expected `array` of length >= 1"),
+    "a probability above 1": (
+        "forecasting",
+        {"probabilities": [1.5, 0]},
+        ".probabilities[0]: expected `float` <= 1.0",
+    ),
+    "no mode": (
+        "forecasting",
+        {"paths": [], "probabilities": []},
+        ".paths: expected `array` of length >= 1",
+    ),
     "an unknown field": ("forecasting", {"score": 1}, ": object contains unknown field `score`"),
 }
 
@@ -242,26 +357,68 @@ def test_what_is_ignored_is_json_too(tmp_path: Path, kind: str) -> None:
 def test_numbers_are_read_to_the_last_bit(tmp_path: Path) -> None:
     """As Python reads them, in every way in which they can be written."""
     source = np.random.default_rng(0)
-    values = np.concatenate([source.normal(0, 1e3, 1500), source.integers(0, 2**62, 1500).view(np.float64)])
-    texts = [f"{value:.{digits}{how}}" for value in values.tolist() for digits in (15, 17, 25) for how in "eg"]
-    texts += ["-0", "-0.0", "1E+2", "5e-324", "2.2250738585072011e-308", "9007199254740993", "18446744073709551616"]
-    entries = ",".join(f'{{"positions": [[0, 0], [0, 0]], "time": 0, "score": {text}}}' for text in texts)
-    text = json.dumps(plain.document("accident", results={FIRST: 0})).replace(": 0}", f": [{entries}]}}")
+    values = np.concatenate(
+        [source.normal(0, 1e3, 1500), source.integers(0, 2**62, 1500).view(np.float64)]
+    )
+    texts = [
+        f"{value:.{digits}{how}}"
+        for value in values.tolist()
+        for digits in (15, 17, 25)
+        for how in "eg"
+    ]
+    texts += [
+        "-0",
+        "-0.0",
+        "1E+2",
+        "5e-324",
+        "2.2250738585072011e-308",
+        "9007199254740993",
+        "18446744073709551616",
+    ]
+    entries = ",".join(
+        f'{{"positions": [[0, 0], [0, 0]], "time": 0, "score": {text}}}' for text in texts
+    )
+    text = json.dumps(plain.document("accident", results={FIRST: 0})).replace(
+        ": 0}", f": [{entries}]}}"
+    )
     (tmp_path / "accident.json").write_text(text, encoding="utf-8")
     read: Any = read_results(tmp_path / "accident.json").prediction(FIRST)
     expected = np.array([float(json.loads(text)) for text in texts])
-    np.testing.assert_array_equal(np.array([each.score for each in read]).view(np.int64), expected.view(np.int64))
+    np.testing.assert_array_equal(
+        np.array([each.score for each in read]).view(np.int64), expected.view(np.int64)
+    )
 
 
 MANIFESTS: dict[str, tuple[Callable[[Document], object], tuple[str, ...]]] = {
     "no form": (lambda told: told.pop("form"), ("required field `form`",)),
-    "a form that is a text": (lambda told: told.update(form="instances"), ("form: expected `object`",)),
-    "no step": (lambda told: told["form"].pop("step"), ("form: object missing required field `step`",)),
-    "a step of no frame": (lambda told: told["form"].update(step=0.25), ("form: step: expected seconds",)),
-    "a step that is a text": (lambda told: told["form"].update(step="0.5"), ("form.step: expected `float`",)),
-    "no prediction": (lambda told: told["form"].update(predictions=0), ("form.predictions: expected `int` >= 1",)),
-    "half a frame": (lambda told: told["form"].update(frames=2.5), ("form.frames: expected `int`",)),
-    "true frames": (lambda told: told["form"].update(frames=True), ("form.frames: expected `int`",)),
+    "a form that is a text": (
+        lambda told: told.update(form="instances"),
+        ("form: expected `object`",),
+    ),
+    "no step": (
+        lambda told: told["form"].pop("step"),
+        ("form: object missing required field `step`",),
+    ),
+    "a step of no frame": (
+        lambda told: told["form"].update(step=0.25),
+        ("form: step: expected seconds",),
+    ),
+    "a step that is a text": (
+        lambda told: told["form"].update(step="0.5"),
+        ("form.step: expected `float`",),
+    ),
+    "no prediction": (
+        lambda told: told["form"].update(predictions=0),
+        ("form.predictions: expected `int` >= 1",),
+    ),
+    "half a frame": (
+        lambda told: told["form"].update(frames=2.5),
+        ("form.frames: expected `int`",),
+    ),
+    "true frames": (
+        lambda told: told["form"].update(frames=True),
+        ("form.frames: expected `int`",),
+    ),
     "more than memory": (
         lambda told: told["form"].update(predictions=10**9),
         (
@@ -277,21 +434,42 @@ MANIFESTS: dict[str, tuple[Callable[[Document], object], tuple[str, ...]]] = {
         lambda told: told["form"].update(orientation="north"),
         ("form.orientation: expected one of",),
     ),
-    "unknown labels": (lambda told: told["form"].update(labels="mine"), ('released, found "mine"',)),
-    "an axis of two numbers": (lambda told: told["form"].update(x=[-2, 2]), ("form.x: expected `array` of length 3",)),
-    "an axis of texts": (lambda told: told["form"].update(y=["a", "b", "c"]), ("form.y[0]: expected `float`",)),
-    "an axis of half cells": (lambda told: told["form"].update(x=[-2, 2, 0.3]), ("form: x: ", "whole number of cells")),
+    "unknown labels": (
+        lambda told: told["form"].update(labels="mine"),
+        ('released, found "mine"',),
+    ),
+    "an axis of two numbers": (
+        lambda told: told["form"].update(x=[-2, 2]),
+        ("form.x: expected `array` of length 3",),
+    ),
+    "an axis of texts": (
+        lambda told: told["form"].update(y=["a", "b", "c"]),
+        ("form.y[0]: expected `float`",),
+    ),
+    "an axis of half cells": (
+        lambda told: told["form"].update(x=[-2, 2, 0.3]),
+        ("form: x: ", "whole number of cells"),
+    ),
     "an unknown field": (
         lambda told: told["form"].update(z=1),
         ("form: object contains unknown field `z` (expected stored, x,",),
     ),
-    "no shards": (lambda told: told.update(shards=[]), ("shards: expected `array` of length >= 1",)),
-    "a shard that is a text": (lambda told: told["shards"].append("a.npz"), ("shards[2]: expected `object`",)),
+    "no shards": (
+        lambda told: told.update(shards=[]),
+        ("shards: expected `array` of length >= 1",),
+    ),
+    "a shard that is a text": (
+        lambda told: told["shards"].append("a.npz"),
+        ("shards[2]: expected `object`",),
+    ),
     "no checksum": (
         lambda told: told["shards"][1].pop("checksum"),
         ("shards[1]: object missing required field `checksum`",),
     ),
-    "another checksum": (lambda told: told["shards"][1].update(checksum="00"), ("shards/00001.npz: ", "checksum")),
+    "another checksum": (
+        lambda told: told["shards"][1].update(checksum="00"),
+        ("shards/00001.npz: ", "checksum"),
+    ),
     "another size": (
         lambda told: told["shards"][0].update(bytes=7),
         ("shards[0]: bytes: shards/00000.npz should have 7",),
@@ -304,8 +482,14 @@ MANIFESTS: dict[str, tuple[Callable[[Document], object], tuple[str, ...]]] = {
         lambda told: told["shards"][1].update(file="b.npz"),
         ("shards[1]: file: b.npz cannot be",),
     ),
-    "a shard outside": (lambda told: told["shards"][1].update(file="../b.npz"), ("file: expected a path inside",)),
-    "an absolute path": (lambda told: told["shards"][1].update(file="/etc/passwd"), ("file: expected a path inside",)),
+    "a shard outside": (
+        lambda told: told["shards"][1].update(file="../b.npz"),
+        ("file: expected a path inside",),
+    ),
+    "an absolute path": (
+        lambda told: told["shards"][1].update(file="/etc/passwd"),
+        ("file: expected a path inside",),
+    ),
     "a shard that is a folder": (
         lambda told: told["shards"][1].update(file="shards"),
         ("shards[1]: file: shards is not",),
@@ -379,7 +563,11 @@ ARRAYS: dict[str, tuple[str, dict[str, np.ndarray], tuple[str, ...]]] = {
         maps(instance=GOOD["instance"].astype(float)),
         ("instance: expected unsigned whole numbers or whole numbers, found float64",),
     ),
-    "ids that are true or false": ("instances", maps(instance=GOOD["instance"] > 0), ("instance: ", "found bool")),
+    "ids that are true or false": (
+        "instances",
+        maps(instance=GOOD["instance"] > 0),
+        ("instance: ", "found bool"),
+    ),
     "a negative id": (
         "instances",
         maps(instance=with_value(GOOD["instance"].astype(np.int16), -1)),
@@ -400,7 +588,11 @@ ARRAYS: dict[str, tuple[str, dict[str, np.ndarray], tuple[str, ...]]] = {
         maps(instance=np.tile(GOOD["instance"], (2, 1, 1, 1))),
         ("instance: expected shape (1 to 2, 3, 6, 8), found (4, 3, 6, 8)",),
     ),
-    "other frames": ("instances", maps(instance=GOOD["instance"][:, :2]), ("instance: expected shape", "(2, 2, 6, 8)")),
+    "other frames": (
+        "instances",
+        maps(instance=GOOD["instance"][:, :2]),
+        ("instance: expected shape", "(2, 2, 6, 8)"),
+    ),
     "cells that lie otherwise": (
         "instances",
         maps(instance=GOOD["instance"].swapaxes(2, 3)),
@@ -416,10 +608,26 @@ ARRAYS: dict[str, tuple[str, dict[str, np.ndarray], tuple[str, ...]]] = {
         maps(instance=GOOD["instance"].astype(object)),
         ("instance: cannot be read (expected numbers",),
     ),
-    "complex ids": ("instances", maps(instance=GOOD["instance"].astype(complex)), ("instance: ", "found complex128")),
-    "heads among maps": ("instances", heads(), ("segmentation.npy: belongs to no sample of the shard",)),
-    "NaN in a head": ("heads", heads(centerness=with_value(GOOD_HEADS["centerness"], np.nan)), ("centerness: nan at",)),
-    "an infinite flow": ("heads", heads(flow=with_value(GOOD_HEADS["flow"], np.inf)), ("flow: inf at",)),
+    "complex ids": (
+        "instances",
+        maps(instance=GOOD["instance"].astype(complex)),
+        ("instance: ", "found complex128"),
+    ),
+    "heads among maps": (
+        "instances",
+        heads(),
+        ("segmentation.npy: belongs to no sample of the shard",),
+    ),
+    "NaN in a head": (
+        "heads",
+        heads(centerness=with_value(GOOD_HEADS["centerness"], np.nan)),
+        ("centerness: nan at",),
+    ),
+    "an infinite flow": (
+        "heads",
+        heads(flow=with_value(GOOD_HEADS["flow"], np.inf)),
+        ("flow: inf at",),
+    ),
     "whole logits": (
         "heads",
         heads(segmentation=GOOD_HEADS["segmentation"].astype(int)),
@@ -463,7 +671,9 @@ def npy(array: np.ndarray, version: tuple[int, int] = (1, 0)) -> bytes:
 def claiming(shape: tuple[int, ...]) -> bytes:
     """The header of a larger array before the bytes of a good one."""
     good, buffer = plain.instance_arrays()["instance"], io.BytesIO()
-    np.lib.format.write_array_header_1_0(buffer, {"descr": "|u1", "fortran_order": False, "shape": shape})
+    np.lib.format.write_array_header_1_0(
+        buffer, {"descr": "|u1", "fortran_order": False, "shape": shape}
+    )
     return buffer.getvalue() + good.tobytes()
 
 
@@ -471,7 +681,10 @@ MEMBER = f"{FIRST}/instance.npy"
 CONTENTS: dict[str, tuple[bytes, str]] = {
     "a pickle": (pickle.dumps([1, 2]), "instance: cannot be read"),
     "an empty member": (b"", "instance: cannot be read"),
-    "a header that is cut": (npy(plain.instance_arrays()["instance"])[:40], "instance: cannot be read"),
+    "a header that is cut": (
+        npy(plain.instance_arrays()["instance"])[:40],
+        "instance: cannot be read",
+    ),
     "numbers that are cut": (
         npy(plain.instance_arrays()["instance"])[:-9],
         "instance: cannot be read (its array has 279",
@@ -480,7 +693,10 @@ CONTENTS: dict[str, tuple[bytes, str]] = {
         npy(plain.instance_arrays()["instance"]) + b"\0",
         "instance: cannot be read (its array has 289 bytes",
     ),
-    "the claim of a giant": (claiming((10**6, 3, 6, 8)), "instance: cannot be read (its array has 288 bytes"),
+    "the claim of a giant": (
+        claiming((10**6, 3, 6, 8)),
+        "instance: cannot be read (its array has 288 bytes",
+    ),
     "a negative shape": (
         claiming((-2, 3, 6, 8)),
         "instance: cannot be read (expected numbers or text, found shape (-2, 3, 6, 8)",
@@ -489,7 +705,10 @@ CONTENTS: dict[str, tuple[bytes, str]] = {
         npy(plain.instance_arrays()["instance"], (2, 0)),
         "instance: expected npy format 1.0, as numpy.save writes numbers",
     ),
-    "a header of 4 GB": (b"\x93NUMPY\x02\x00" + struct.pack("<I", 2**32 - 1), "instance: cannot be read ("),
+    "a header of 4 GB": (
+        b"\x93NUMPY\x02\x00" + struct.pack("<I", 2**32 - 1),
+        "instance: cannot be read (",
+    ),
 }
 
 
@@ -521,7 +740,8 @@ def test_giants(tmp_path: Path) -> None:
     with (tmp_path / "giant.json").open("wb") as file:
         file.truncate(3 << 30)
     refused(
-        tmp_path / "giant.json", "giant.json: has 3,221,225,472 bytes, more than 1,073,741,824, the limit for results"
+        tmp_path / "giant.json",
+        "giant.json: has 3,221,225,472 bytes, more than 1,073,741,824, the limit for results",
     )
     folder = plain.write_motion(tmp_path / "motion")
     with (folder / "shards" / "00000.npz").open("r+b") as file:
@@ -539,14 +759,21 @@ def test_members_that_are_packed_otherwise(tmp_path: Path, way: int) -> None:
         for name, content in contents.items():
             archive.writestr(name, content)
     plain.relist(folder)
-    refused(folder, "instance: cannot be read (a member is encrypted or compressed by an unknown method)")
+    refused(
+        folder,
+        "instance: cannot be read (a member is encrypted or compressed by an unknown method)",
+    )
 
 
 def test_a_bomb_is_not_unpacked(tmp_path: Path) -> None:
     folder = plain.write_motion(tmp_path / "motion")
     rewritten(folder, {MEMBER: npy(np.zeros(100_000_000, dtype=np.uint8))})
     tracemalloc.start()
-    refused(folder, "instance: expected shape (1 to 2, 3, 6, 8), which has at most", "found 100,000,128 bytes")
+    refused(
+        folder,
+        "instance: expected shape (1 to 2, 3, 6, 8), which has at most",
+        "found 100,000,128 bytes",
+    )
     assert tracemalloc.get_traced_memory()[1] < 10 << 20
     tracemalloc.stop()
 
@@ -559,7 +786,10 @@ def test_a_member_that_is_too_much(tmp_path: Path) -> None:
 
 def test_a_member_twice(tmp_path: Path) -> None:
     folder = plain.write_motion(tmp_path / "motion")
-    with warnings.catch_warnings(), zipfile.ZipFile(folder / "shards" / "00000.npz", "a") as archive:
+    with (
+        warnings.catch_warnings(),
+        zipfile.ZipFile(folder / "shards" / "00000.npz", "a") as archive,
+    ):
         warnings.simplefilter("ignore")
         archive.writestr(MEMBER, npy(plain.instance_arrays()["instance"]))
     plain.relist(folder)
@@ -604,7 +834,9 @@ def test_no_bit_of_a_shard_is_read_wrongly(tmp_path: Path) -> None:
     path, expected = folder / "shards" / "00000.npz", plain.instance_arrays()["instance"]
     content, outcomes = path.read_bytes(), set()
     for position in range(0, len(content), 29):
-        path.write_bytes(content[:position] + bytes([content[position] ^ 0x5A]) + content[position + 1 :])
+        path.write_bytes(
+            content[:position] + bytes([content[position] ^ 0x5A]) + content[position + 1 :]
+        )
         plain.relist(folder)
         try:
             read = read_results(folder).prediction(FIRST)
@@ -617,7 +849,10 @@ def test_no_bit_of_a_shard_is_read_wrongly(tmp_path: Path) -> None:
 
 
 def test_what_is_no_results_file(tmp_path: Path) -> None:
-    refused(tmp_path / "none.json", "none.json: no such file or folder; give the results that ResultsWriter made")
+    refused(
+        tmp_path / "none.json",
+        "none.json: no such file or folder; give the results that ResultsWriter made",
+    )
     refused(tmp_path, "holds no results.json")
     (tmp_path / "results.json").mkdir()
     refused(tmp_path, "results.json: not a regular file (a folder)")
@@ -630,7 +865,10 @@ def test_what_is_no_results_file(tmp_path: Path) -> None:
     folder = plain.write_motion(tmp_path / "motion")
     (folder / "results.json").rename(folder / "manifest.json")
     refused(folder / "manifest.json", "is the manifest of motion results; call it results.json")
-    refused(plain.write_json(tmp_path / "list.json", [1]), "list.json: expected a JSON object, found [1]")  # type: ignore[arg-type]
+    refused(
+        plain.write_json(tmp_path / "list.json", [1]),
+        "list.json: expected a JSON object, found [1]",
+    )  # type: ignore[arg-type]
 
 
 UP = float(np.nextafter(1e6, 2e6))
@@ -651,23 +889,46 @@ UP = float(np.nextafter(1e6, 2e6))
         ("detection", {"velocity": [-1e6, 1e6]}, {"velocity": [0, UP]}),
     ],
 )
-def test_ends_of_ranges(tmp_path: Path, kind: str, good: dict[str, Any], wrong: dict[str, Any]) -> None:
+def test_ends_of_ranges(
+    tmp_path: Path, kind: str, good: dict[str, Any], wrong: dict[str, Any]
+) -> None:
     path = tmp_path / f"{kind}.json"
-    assert len(read_results(plain.write_json(path, with_entry(kind, **good))).prediction(FIRST)) == 2
+    assert (
+        len(read_results(plain.write_json(path, with_entry(kind, **good))).prediction(FIRST)) == 2
+    )
     refused(plain.write_json(path, with_entry(kind, **wrong)), f"results of '{FIRST}': [1].")
 
 
 @pytest.mark.parametrize(
     ("step", "good"),
-    [(0.1, True), (0.3, True), (10, True), (0.05, False), (0.1001, False), (0.19, False), (0.0, False), (-0.5, False)],
+    [
+        (0.1, True),
+        (0.3, True),
+        (10, True),
+        (0.05, False),
+        (0.1001, False),
+        (0.19, False),
+        (0.0, False),
+        (-0.5, False),
+    ],
 )
 def test_steps_are_of_recorded_frames(step: float, *, good: bool) -> None:
-    made: dict[str, Any] = {"stored": "heads", "grid": BevGrid(), "predictions": 1, "frames": 1, "step": step}
+    made: dict[str, Any] = {
+        "stored": "heads",
+        "grid": BevGrid(),
+        "predictions": 1,
+        "frames": 1,
+        "step": step,
+    }
     if good:
         assert MotionForm(**made).as_dict()["step"] == step
     else:
         assert_refused(
-            (lambda: MotionForm(**made), ResultsError, "step: expected seconds, a whole number of recorded frames of"),
+            (
+                lambda: MotionForm(**made),
+                ResultsError,
+                "step: expected seconds, a whole number of recorded frames of",
+            ),
         )
 
 
@@ -676,9 +937,18 @@ TOKEN = "a/" * 400 + "b" * 200
 
 def test_the_longest_token_and_the_largest_form(tmp_path: Path) -> None:
     path = tmp_path / "accident.json"
-    assert read_results(plain.write_json(path, plain.document("accident", results={TOKEN: []}))).tokens == (TOKEN,)
-    refused(plain.write_json(path, plain.document("accident", results={f"{TOKEN}b": []})), "expected a sample's token")
-    form: dict[str, Any] = {"stored": "heads", "grid": BevGrid((0, 512, 0.5), (0, 512, 0.5)), "frames": 8}
+    assert read_results(
+        plain.write_json(path, plain.document("accident", results={TOKEN: []}))
+    ).tokens == (TOKEN,)
+    refused(
+        plain.write_json(path, plain.document("accident", results={f"{TOKEN}b": []})),
+        "expected a sample's token",
+    )
+    form: dict[str, Any] = {
+        "stored": "heads",
+        "grid": BevGrid((0, 512, 0.5), (0, 512, 0.5)),
+        "frames": 8,
+    }
     assert MotionForm(predictions=8, **form).predictions == 8  # of 2**20 cells
     assert_refused(
         (

@@ -37,7 +37,9 @@ def blocks(language: str) -> list[str]:
 
 def document(task: str, folder: Path) -> dict[str, Any]:
     if task == "motion":
-        told: dict[str, Any] = json.loads((plain.write_motion(folder) / "results.json").read_text(encoding="utf-8"))
+        told: dict[str, Any] = json.loads(
+            (plain.write_motion(folder) / "results.json").read_text(encoding="utf-8")
+        )
         return told
     return DOCUMENTS[task]()
 
@@ -45,7 +47,9 @@ def document(task: str, folder: Path) -> dict[str, Any]:
 def test_the_files_are_not_stale(schema_generator: ModuleType) -> None:
     files = schema_generator.generated_results_files()
     for name, content in files.items():
-        assert (SCHEMA / "results" / name).read_text(encoding="utf-8") == content, "run python schema/generate.py"
+        assert (SCHEMA / "results" / name).read_text(encoding="utf-8") == content, (
+            "run python schema/generate.py"
+        )
     assert {path.name for path in (SCHEMA / "results").iterdir()} == {*files, "README.md"}
 
 
@@ -57,7 +61,13 @@ def test_good_results_are_valid(task: str, tmp_path: Path) -> None:
 
 def test_the_examples_of_the_page(tmp_path: Path) -> None:
     found = [json.loads(block) for block in blocks("json")]
-    assert [example["task"] for example in found] == ["accident", "detection", "planning", "forecasting", "motion"]
+    assert [example["task"] for example in found] == [
+        "accident",
+        "detection",
+        "planning",
+        "forecasting",
+        "motion",
+    ]
     for example in found:
         validator(example["task"]).validate(example)
         if example["task"] != "motion":
@@ -70,7 +80,10 @@ def test_the_code_of_the_page_writes_valid_files(tmp_path: Path) -> None:
     given = {
         "folder": str(tmp_path),
         "predictions": {token: [plain.accident()], plain.TOKENS[1]: []},
-        "detections": {token: [(100.0, -20.0, 0.8, 4.5, 1.9, 1.6, 0.3, "car", 0.9)], plain.TOKENS[1]: []},
+        "detections": {
+            token: [(100.0, -20.0, 0.8, 4.5, 1.9, 1.6, 0.3, "car", 0.9)],
+            plain.TOKENS[1]: [],
+        },
         "plans": {token: np.array([[4.0, 0.0], [8.0, 0.5]]), plain.TOKENS[1]: np.ones((1, 2))},
         "forecasts": {token: {1236: np.arange(12.0).reshape(2, 3, 2)}, plain.TOKENS[1]: {}},
         "maps": {token: ids, plain.TOKENS[1]: 0 * ids},

@@ -35,5 +35,8 @@ WRITTEN = {
 
 def test_every_default_and_constant_written_out(tmp_path: Path) -> None:
     assert (written_out("deepaccident_devkit.evaluation.results"), json_meta({})) == (WRITTEN, {})
-    assert repr(ResultsWriter(tmp_path / "x", "motion")) == f"ResultsWriter(motion to {tmp_path / 'x'}: 0 samples)"
+    assert (
+        repr(ResultsWriter(tmp_path / "x", "motion"))
+        == f"ResultsWriter(motion to {tmp_path / 'x'}: 0 samples)"
+    )
     assert_refused((lambda: read_results(tmp_path / "x"), ResultsError, ("x: no such file",)))

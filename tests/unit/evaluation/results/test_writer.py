@@ -31,16 +31,26 @@ OTHER = "a/b/ego_vehicle/001"
 PREDICTIONS: dict[str, Callable[[], Any]] = {
     "motion": lambda: instances_of(plain.instance_arrays()["instance"], GRID),
     "accident": lambda: [Accident(positions=np.ones((2, 2)), time=0.5)],
-    "detection": lambda: DetectedBoxes.from_arrays(np.ones((2, 3)), np.ones((2, 3)), [0, 1], [0.5, 1], frame="world"),
-    "planning": lambda: [Plan(times=[1.0], path=[(5.0, 0.5)]), Plan(times=[0.5], path=[(3, 0)], yaw=[0.1])],
+    "detection": lambda: DetectedBoxes.from_arrays(
+        np.ones((2, 3)), np.ones((2, 3)), [0, 1], [0.5, 1], frame="world"
+    ),
+    "planning": lambda: [
+        Plan(times=[1.0], path=[(5.0, 0.5)]),
+        Plan(times=[0.5], path=[(3, 0)], yaw=[0.1]),
+    ],
     "forecasting": lambda: [
-        Forecast(actor_id=actor, times=[0.5], paths=[[(actor, 1.5)]], probabilities=[0.25]) for actor in (7, 8)
+        Forecast(actor_id=actor, times=[0.5], paths=[[(actor, 1.5)]], probabilities=[0.25])
+        for actor in (7, 8)
     ],
 }
 
 
 def files_under(folder: Path) -> dict[str, bytes]:
-    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in folder.rglob("*")
+        if path.is_file()
+    }
 
 
 def write(path: Path, task: Any, **options: Any) -> Results:
@@ -55,7 +65,10 @@ class TestWriter:
     def test_the_same_predictions_are_the_same_bytes(self, tmp_path: Path, task: Any) -> None:
         one, other = (write(tmp_path / name / "x", task) for name in ("a", "b"))
         assert files_under(tmp_path / "a") == files_under(tmp_path / "b")
-        assert (len(files_under(tmp_path / "a")), one.fingerprint) == (2 if task == "motion" else 1, other.fingerprint)
+        assert (len(files_under(tmp_path / "a")), one.fingerprint) == (
+            2 if task == "motion" else 1,
+            other.fingerprint,
+        )
 
     def test_an_exception_leaves_nothing(self, tmp_path: Path, task: Any) -> None:
         with pytest.raises(KeyboardInterrupt), ResultsWriter(tmp_path / "in" / "x", task) as writer:  # noqa: PT012
@@ -65,13 +78,20 @@ class TestWriter:
             raise KeyboardInterrupt
         assert list((tmp_path / "in").iterdir()) == []
 
-    def test_a_full_disk_leaves_nothing(self, tmp_path: Path, task: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_a_full_disk_leaves_nothing(
+        self, tmp_path: Path, task: Any, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
         def full(*arguments: object, **options: object) -> None:
             raise OSError(28, "No space left on device")
 
         where = "put_array" if task == "motion" else "EntryWriter.add"
         writer = ResultsWriter(tmp_path / "x", task)
-        with pytest.raises(ResultsError, match="x: a prediction could not be written, so that none is kept"), writer:  # noqa: PT012
+        with (  # noqa: PT012
+            pytest.raises(
+                ResultsError, match="x: a prediction could not be written, so that none is kept"
+            ),
+            writer,
+        ):
             writer.add(FIRST, PREDICTIONS[task]())
             monkeypatch.setattr(f"deepaccident_devkit.evaluation.results.writer.{where}", full)
             assert_refused(
@@ -121,7 +141,10 @@ class TestWriter:
         assert read_results(tmp_path / "x").tokens == (FIRST,)
 
     def test_without_any_sample(self, tmp_path: Path, task: Any) -> None:
-        with pytest.raises(ResultsError, match="x: no prediction was added"), ResultsWriter(tmp_path / "x", task):
+        with (
+            pytest.raises(ResultsError, match="x: no prediction was added"),
+            ResultsWriter(tmp_path / "x", task),
+        ):
             pass
         assert list(tmp_path.iterdir()) == []
         assert_refused(
@@ -133,17 +156,31 @@ class TestWriter:
         )
 
     def test_predictions_of_another_kind(self, tmp_path: Path, task: Any) -> None:
-        lidar = DetectedBoxes.from_arrays(np.zeros((1, 3)), np.ones((1, 3)), [0.0], [0.5], frame="lidar")
+        lidar = DetectedBoxes.from_arrays(
+            np.zeros((1, 3)), np.ones((1, 3)), [0.0], [0.5], frame="lidar"
+        )
         wrong: dict[str, list[tuple[Any, str]]] = {
             "motion": [([], "expected a MotionOutput, found list; make one with")],
             "accident": [
-                (PREDICTIONS["motion"](), "expected a list of Accidents, found a MotionOutput; write that to results"),
+                (
+                    PREDICTIONS["motion"](),
+                    "expected a list of Accidents, found a MotionOutput; write that to results",
+                ),
                 ([1], "expected a MotionOutput or a list of Accidents, found list with int"),
-                ([Accident(positions=np.ones((2, 2)), time=0.5, ids=(2**70, 1))], "[0].ids[0]: expected `int` <="),
+                (
+                    [Accident(positions=np.ones((2, 2)), time=0.5, ids=(2**70, 1))],
+                    "[0].ids[0]: expected `int` <=",
+                ),
             ],
             "detection": [
-                ([], "expected DetectedBoxes, found list; make them with DetectedBoxes.from_arrays("),
-                (lidar, "expected boxes in the world frame, found lidar; give detected.transform(dataset."),
+                (
+                    [],
+                    "expected DetectedBoxes, found list; make them with DetectedBoxes.from_arrays(",
+                ),
+                (
+                    lidar,
+                    "expected boxes in the world frame, found lidar; give detected.transform(dataset.",
+                ),
             ],
             "planning": [
                 ([1], "expected a list of Plans, found int in it"),
@@ -158,7 +195,11 @@ class TestWriter:
         with ResultsWriter(tmp_path / "x", task) as writer:
             assert_refused(
                 *[
-                    (partial(writer.add, FIRST, prediction), ResultsError, f"x: {FIRST}: .*{re.escape(words)}")
+                    (
+                        partial(writer.add, FIRST, prediction),
+                        ResultsError,
+                        f"x: {FIRST}: .*{re.escape(words)}",
+                    )
                     for prediction, words in wrong[task]
                 ],
             )
@@ -168,7 +209,9 @@ class TestWriter:
     def test_the_method_of_what_is_there_is_told(self, tmp_path: Path, task: Any) -> None:
         write(tmp_path / "x", task, meta={"method": "m" * 5000})
         other = partial(ResultsWriter, tmp_path / "x", task, meta={"method": "yours"})
-        assert_refused((other, ResultsError, ("of method 'mmm", "not of 'yours'", "choose another path")))
+        assert_refused(
+            (other, ResultsError, ("of method 'mmm", "not of 'yours'", "choose another path"))
+        )
 
     def test_an_empty_folder_is_free_for_motion_alone(self, tmp_path: Path, task: Any) -> None:
         (tmp_path / "x").mkdir()
@@ -210,7 +253,8 @@ def test_plans_and_forecasts_are_read_as_they_were_written(tmp_path: Path) -> No
 
 def test_tasks_without_results(tmp_path: Path) -> None:
     with pytest.raises(
-        ChoiceError, match="task: expected one of motion, accident, detection, planning, forecasting, found 'warning'"
+        ChoiceError,
+        match="task: expected one of motion, accident, detection, planning, forecasting, found 'warning'",
     ):
         ResultsWriter(tmp_path / "x", "warning")  # type: ignore[arg-type]
 
@@ -234,7 +278,11 @@ def test_a_copy_reads_again(results: Results) -> None:
     assert len(content) < 1000
     reader.kept.clear()
     copy = pickle.loads(content)
-    assert (copy.task, copy.path, copy.fingerprint) == (results.task, results.path, results.fingerprint)
+    assert (copy.task, copy.path, copy.fingerprint) == (
+        results.task,
+        results.path,
+        results.fingerprint,
+    )
     assert (copy.tokens, copy.meta, copy.form) == (results.tokens, results.meta, results.form)
     assert len(copy.prediction(SECOND)) == len(results.prediction(SECOND))
 
@@ -242,7 +290,10 @@ def test_a_copy_reads_again(results: Results) -> None:
 def test_in_threads_and_forked_processes(results: Results) -> None:
     expected = [len(results.prediction(token)) for token in plain.TOKENS]
     with ThreadPoolExecutor(8) as pool:
-        assert list(pool.map(lambda number: length(results, plain.TOKENS[number % 3]), range(60))) == expected * 20
+        assert (
+            list(pool.map(lambda number: length(results, plain.TOKENS[number % 3]), range(60)))
+            == expected * 20
+        )
     with ProcessPoolExecutor(2, mp_context=multiprocessing.get_context("fork")) as pool:
         assert list(pool.map(length, [results] * 6, plain.TOKENS * 2)) == expected * 2
 
@@ -301,7 +352,9 @@ def test_a_check_with_workers(tmp_path: Path) -> None:
 FINITE = {"allow_nan": False, "allow_infinity": False}
 numbers = st.floats(-1e6, 1e6, **FINITE)
 accidents = st.builds(
-    lambda points, time, score, ids: Accident(positions=np.reshape(points, (2, 2)), time=time, score=score, ids=ids),
+    lambda points, time, score, ids: Accident(
+        positions=np.reshape(points, (2, 2)), time=time, score=score, ids=ids
+    ),
     st.lists(numbers, min_size=4, max_size=4),
     st.floats(0, 1e3, **FINITE),
     st.floats(**FINITE),
@@ -326,7 +379,12 @@ def boxes(draw: Callable[[Any], Any]) -> DetectedBoxes:
 
 
 def as_plain(accident: Accident) -> tuple[Any, ...]:
-    return tuple(map(tuple, accident.positions.tolist())), accident.time, accident.score, accident.ids
+    return (
+        tuple(map(tuple, accident.positions.tolist())),
+        accident.time,
+        accident.score,
+        accident.ids,
+    )
 
 
 def written(path: Path, task: Any, predictions: dict[str, Any], **options: Any) -> Results:
@@ -338,9 +396,13 @@ def written(path: Path, task: Any, predictions: dict[str, Any], **options: Any) 
 
 @settings(max_examples=25)
 @given(st.lists(st.lists(accidents, max_size=4), min_size=1, max_size=4))
-def test_accidents_come_back(tmp_path_factory: pytest.TempPathFactory, lists: list[list[Accident]]) -> None:
+def test_accidents_come_back(
+    tmp_path_factory: pytest.TempPathFactory, lists: list[list[Accident]]
+) -> None:
     predictions = {f"a/b/ego_vehicle/{number:03d}": each for number, each in enumerate(lists)}
-    results = written(tmp_path_factory.mktemp("accidents") / "accident.json", "accident", predictions)
+    results = written(
+        tmp_path_factory.mktemp("accidents") / "accident.json", "accident", predictions
+    )
     assert results.tokens == tuple(predictions)
     for token, given_ones in predictions.items():
         read = results.prediction(token)
@@ -350,7 +412,9 @@ def test_accidents_come_back(tmp_path_factory: pytest.TempPathFactory, lists: li
 
 @settings(max_examples=25)
 @given(st.lists(boxes(), min_size=1, max_size=4))
-def test_boxes_come_back(tmp_path_factory: pytest.TempPathFactory, lists: list[DetectedBoxes]) -> None:
+def test_boxes_come_back(
+    tmp_path_factory: pytest.TempPathFactory, lists: list[DetectedBoxes]
+) -> None:
     predictions = {f"a/b/ego_vehicle/{number:03d}": each for number, each in enumerate(lists)}
     results = written(tmp_path_factory.mktemp("boxes") / "detection.json", "detection", predictions)
     for token, given_ones in predictions.items():
@@ -359,7 +423,9 @@ def test_boxes_come_back(tmp_path_factory: pytest.TempPathFactory, lists: list[D
         np.testing.assert_array_equal(read.scores, given_ones.scores)
         assert read.boxes.frame == "world"
         for name in ("center", "size", "rotation", "velocity", "category", "actor_id", "row"):
-            np.testing.assert_array_equal(getattr(read.boxes, name), getattr(given_ones.boxes, name))
+            np.testing.assert_array_equal(
+                getattr(read.boxes, name), getattr(given_ones.boxes, name)
+            )
 
 
 def test_the_plain_accidents(tmp_path: Path) -> None:
@@ -368,7 +434,10 @@ def test_the_plain_accidents(tmp_path: Path) -> None:
     read = results.prediction(FIRST)
     assert isinstance(read, list)
     positions = ((12.5, 0.5), (13.0, -2.0))
-    assert list(map(as_plain, read)) == [(positions, 1.5, 0.75, (1236, 1240)), (positions, 0.0, 0.75, None)]
+    assert list(map(as_plain, read)) == [
+        (positions, 1.5, 0.75, (1236, 1240)),
+        (positions, 0.0, 0.75, None),
+    ]
     assert results.prediction(THIRD) == []
 
 
@@ -386,7 +455,12 @@ def test_the_plain_boxes(tmp_path: Path) -> None:
 
 
 def test_a_velocity_that_is_known_in_part_is_unknown() -> None:
-    columns = {"center": np.zeros((2, 3)), "size": np.ones((2, 3)), "yaw": np.zeros(2), "frame": "world"}
+    columns = {
+        "center": np.zeros((2, 3)),
+        "size": np.ones((2, 3)),
+        "yaw": np.zeros(2),
+        "frame": "world",
+    }
     detected = DetectedBoxes.from_arrays(
         scores=np.ones(2), velocity=np.array([[1.0, np.nan, 0.0], [1.0, 2.0, 0.0]]), **columns
     )

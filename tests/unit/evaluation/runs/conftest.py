@@ -23,7 +23,9 @@ def release_root_b(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The labels-only release with half a second more: at the impact itself nothing can be foreseen."""
     root = tmp_path_factory.mktemp("runs") / "layout_b"
     return make_release(
-        root, SynthConfig(scenarios=6, frames=6, layout="B", seed=4, sensors=False, designed=True), workers=1
+        root,
+        SynthConfig(scenarios=6, frames=6, layout="B", seed=4, sensors=False, designed=True),
+        workers=1,
     )
 
 
@@ -36,7 +38,10 @@ def da_b(release_root_b: Path) -> DeepAccident:
 def selection() -> SampleSelection:
     """Two scenarios, an accident and its normal twin, of three agents: six samples."""
     return SampleSelection(
-        split="val", samples="evaluate", scope="all", agents=("ego_vehicle", "other_vehicle", "infrastructure")
+        split="val",
+        samples="evaluate",
+        scope="all",
+        agents=("ego_vehicle", "other_vehicle", "infrastructure"),
     )
 
 
@@ -53,7 +58,9 @@ def write_motion(da_b: DeepAccident) -> WriteMotion:
 
 
 @pytest.fixture
-def results(da_b: DeepAccident, selection: SampleSelection, tmp_path: Path, write_accidents: WriteAccidents) -> Results:
+def results(
+    da_b: DeepAccident, selection: SampleSelection, tmp_path: Path, write_accidents: WriteAccidents
+) -> Results:
     """Accidents of just the samples of `selection`."""
     return write_accidents(tmp_path / "accidents.json", selection.tokens(da_b))
 
@@ -64,19 +71,25 @@ def run(da_b: DeepAccident, results: Results, selection: SampleSelection) -> Eva
     return evaluate_results(da_b, results, SETUP, selection, workers=1)
 
 
-def _write_accidents(dataset: DeepAccident, path: Path, tokens: Iterable[str], moved: float = 0.1) -> Results:
+def _write_accidents(
+    dataset: DeepAccident, path: Path, tokens: Iterable[str], moved: float = 0.1
+) -> Results:
     with ResultsWriter(path, "accident", meta={"method": "truth", "moved": moved}) as writer:
         for token in tokens:
             truth = accident_context(dataset, token, 2.0).truth
             true = None if truth is None else truth.accident
             writer.add(
                 token,
-                [] if true is None else [Accident(positions=true.positions + moved, time=true.time, ids=true.ids)],
+                []
+                if true is None
+                else [Accident(positions=true.positions + moved, time=true.time, ids=true.ids)],
             )
     return read_results(path)
 
 
-def _write_motion(dataset: DeepAccident, path: Path, tokens: Iterable[str], moved: int = 1) -> Results:
+def _write_motion(
+    dataset: DeepAccident, path: Path, tokens: Iterable[str], moved: int = 1
+) -> Results:
     with ResultsWriter(path, "motion", meta={"moved": moved}) as writer:
         for token in tokens:
             label = dataset.motion_labels(token).to_present("bilinear")

@@ -30,26 +30,44 @@ from deepaccident_devkit.support.version import __version__
 FILES = {"metrics_summary.json", "counts.json", "samples.parquet", "scenarios.json", "files.json"}
 MISFITS: dict[str, tuple[Callable[[Any], object], str]] = {
     "no task": (lambda summary: summary.pop("task"), "object missing required field `task`"),
-    "agents": (lambda summary: summary.update(agents=3), r"expected `array \| null`, got `int` - at `\$.agents`"),
+    "agents": (
+        lambda summary: summary.update(agents=3),
+        r"expected `array \| null`, got `int` - at `\$.agents`",
+    ),
     "an agent": (
         lambda summary: summary.update(agents=["ego_vehicle", 1]),
         r"expected `str`, got `int` - at `\$.agents",
     ),
-    "a dataroot": (lambda summary: summary["release"].update(dataroot=3), r".* at `\$.release.dataroot`"),
+    "a dataroot": (
+        lambda summary: summary["release"].update(dataroot=3),
+        r".* at `\$.release.dataroot`",
+    ),
     "a long path": (
         lambda summary: summary["results"].update(path="x" * 5000),
         r".*length <= 1000 - at `\$.results.path",
     ),
-    "no number": (lambda summary: summary["counts"].update(left_out=True), r".* got `bool` - at `\$.counts.left_out`"),
-    "a partial one": (lambda summary: summary.update(partial={"mark": "\x1b[2J"}), r".* at `\$.partial.mark`"),
+    "no number": (
+        lambda summary: summary["counts"].update(left_out=True),
+        r".* got `bool` - at `\$.counts.left_out`",
+    ),
+    "a partial one": (
+        lambda summary: summary.update(partial={"mark": "\x1b[2J"}),
+        r".* at `\$.partial.mark`",
+    ),
     "a second line": (lambda summary: summary.update(split="val\n"), r".* at `\$.split`"),
-    "breakdowns": (lambda summary: summary["breakdowns"].update(all=[]), r"expected `object`, got `array` - at .*"),
+    "breakdowns": (
+        lambda summary: summary["breakdowns"].update(all=[]),
+        r"expected `object`, got `array` - at .*",
+    ),
     "a task": (lambda summary: summary.update(task="x" * 900), "task: expected one of"),
     "a horizon of years": (
         lambda summary: summary.update(horizon=1e9),
         "horizon: expected seconds above 0, at most 100",
     ),
-    "a switch": (lambda summary: summary.update(switches={"x" * 900: 1}), "these rules have no switch"),
+    "a switch": (
+        lambda summary: summary.update(switches={"x" * 900: 1}),
+        "these rules have no switch",
+    ),
 }
 JSON_FILES = sorted(name for name in FILES if name.endswith(".json"))
 
@@ -68,23 +86,39 @@ def test_holds_all_and_reads_back(run: EvaluationRun, results: Results, tmp_path
     assert (str(bundle.dataroot), bundle.release_version) == (run.release.dataroot, "v1")
     assert bundle.results_path == results.path
     assert bundle.scenarios() == run.release.scenarios
-    assert bundle.checksums() == {name: file_checksum(folder / name) for name in FILES - {"files.json"}}
+    assert bundle.checksums() == {
+        name: file_checksum(folder / name) for name in FILES - {"files.json"}
+    }
     assert run.evaluator.fresh().resume(folder / "counts.json").compute() == run.result
 
 
 def test_every_file_says_version_protocol_and_partial(run: EvaluationRun, tmp_path: Path) -> None:
-    folder = save_run(replace(run, partial=Partial(missing=1, extra=0, expected=7, evaluated=6)), tmp_path / "bundle")
-    stamps = [read(folder / name) for name in JSON_FILES] + [read_rows(folder / "samples.parquet")[1]]
+    folder = save_run(
+        replace(run, partial=Partial(missing=1, extra=0, expected=7, evaluated=6)),
+        tmp_path / "bundle",
+    )
+    stamps = [read(folder / name) for name in JSON_FILES] + [
+        read_rows(folder / "samples.parquet")[1]
+    ]
     for stamp in stamps:
-        assert (stamp["devkit_version"], stamp["task"], stamp["protocol"]) == (__version__, "accident", "boxes")
+        assert (stamp["devkit_version"], stamp["task"], stamp["protocol"]) == (
+            __version__,
+            "accident",
+            "boxes",
+        )
         assert stamp["partial"]["mark"] == "PARTIAL: 6 of 7 samples"
 
 
 def test_the_summary_says_every_choice(run: EvaluationRun) -> None:
-    summary = replace(run, setup=replace(run.setup, switches={"reading.danger_distance": 0.5})).summary()
+    summary = replace(
+        run, setup=replace(run.setup, switches={"reading.danger_distance": 0.5})
+    ).summary()
     assert summary["switches"] == {"reading.danger_distance": 0.5}
     assert summary["settings"]["choices"]["reading"]["danger_distance"] == 0.5
-    assert (summary["counts"], summary["metrics"]["positives"]) == ({"samples": 6, "scenarios": 2, "left_out": 0}, 3)
+    assert (summary["counts"], summary["metrics"]["positives"]) == (
+        {"samples": 6, "scenarios": 2, "left_out": 0},
+        3,
+    )
     assert {"python", "numpy"} <= summary["environment"].keys()
     assert summary["headlines"][0]["name"] == "apa"
 
@@ -99,7 +133,9 @@ def test_a_folder_of_results_is_copied_whole(
     copy.check()
     assert copy.fingerprint == results.fingerprint
     (folder / "results" / "another").mkdir()
-    with pytest.raises(ResultsError, match=r"results: expected one results file or folder, found 2"):
+    with pytest.raises(
+        ResultsError, match=r"results: expected one results file or folder, found 2"
+    ):
         _ = read_bundle(folder).results_path
 
 
@@ -114,14 +150,24 @@ def test_an_extra_that_fails_leaves_nothing(run: EvaluationRun, tmp_path: Path) 
     assert not list(tmp_path.glob("*bundle*"))
 
 
-def test_replaced_only_when_told_and_with_files_of_its_own_alone(run: EvaluationRun, tmp_path: Path) -> None:
+def test_replaced_only_when_told_and_with_files_of_its_own_alone(
+    run: EvaluationRun, tmp_path: Path
+) -> None:
     folder = save_run(run, tmp_path / "bundle")
-    assert_refused((lambda: save_run(run, folder), ResultsError, ("bundle: holds an evaluation", "--overwrite")))
+    assert_refused(
+        (
+            lambda: save_run(run, folder),
+            ResultsError,
+            ("bundle: holds an evaluation", "--overwrite"),
+        )
+    )
     save_run(replace(run, sanity={"warnings": []}), folder, overwrite=True)
     assert read_bundle(folder).summary["sanity"] == {"warnings": []}
     assert [path.name for path in tmp_path.iterdir() if path.is_dir()] == ["bundle"]
     (folder / "thoughts.txt").write_text("mine")
-    assert_refused((lambda: save_run(run, folder, overwrite=True), ResultsError, ("thoughts.txt", "move it")))
+    assert_refused(
+        (lambda: save_run(run, folder, overwrite=True), ResultsError, ("thoughts.txt", "move it"))
+    )
 
 
 def test_a_link_to_one_is_replaced_itself(run: EvaluationRun, tmp_path: Path) -> None:
@@ -158,7 +204,9 @@ def test_the_earlier_one_stays_if_the_new_one_fails(
 
 
 @pytest.mark.parametrize("overwrite", [False, True])
-def test_another_folder_is_never_replaced(run: EvaluationRun, tmp_path: Path, *, overwrite: bool) -> None:
+def test_another_folder_is_never_replaced(
+    run: EvaluationRun, tmp_path: Path, *, overwrite: bool
+) -> None:
     (tmp_path / "work" / "deep").mkdir(parents=True)
     (tmp_path / "work" / "deep" / "thesis.tex").touch()
     assert_refused(
@@ -171,16 +219,25 @@ def test_another_folder_is_never_replaced(run: EvaluationRun, tmp_path: Path, *,
                 ),
                 (
                     r"thesis.tex: is a file; choose a folder that is new",
-                    lambda: save_run(run, tmp_path / "work" / "deep" / "thesis.tex", overwrite=overwrite),
+                    lambda: save_run(
+                        run, tmp_path / "work" / "deep" / "thesis.tex", overwrite=overwrite
+                    ),
                 ),
-                (r"out: expected a folder, found an empty path", lambda: save_run(run, "", overwrite=overwrite)),
+                (
+                    r"out: expected a folder, found an empty path",
+                    lambda: save_run(run, "", overwrite=overwrite),
+                ),
             )
         ],
     )
 
 
 def test_an_empty_folder_is_fine_and_checkpoints_go(
-    da_b: DeepAccident, results: Results, selection: SampleSelection, run: EvaluationRun, tmp_path: Path
+    da_b: DeepAccident,
+    results: Results,
+    selection: SampleSelection,
+    run: EvaluationRun,
+    tmp_path: Path,
 ) -> None:
     out = tmp_path / "bundle"
     out.mkdir()
@@ -196,14 +253,19 @@ def test_an_empty_folder_is_fine_and_checkpoints_go(
         (None, r"metrics_summary.json: is missing; give a folder that"),
         ("{", r"metrics_summary.json: is no JSON \(line 1"),
         ("[]", r"metrics_summary.json: expected an object, found list"),
-        ('{"format": "nuScenes"}', r"expected the format 'DeepAccident metrics summary', found 'nuScenes'"),
+        (
+            '{"format": "nuScenes"}',
+            r"expected the format 'DeepAccident metrics summary', found 'nuScenes'",
+        ),
         (
             '{"format": "DeepAccident metrics summary", "version": 9, "devkit_version": "7.0"}',
             r"is of version 9, this devkit reads 1; use the devkit that wrote it \('7.0'\)",
         ),
     ],
 )
-def test_a_summary_that_is_none(run: EvaluationRun, tmp_path: Path, content: str | None, sentence: str) -> None:
+def test_a_summary_that_is_none(
+    run: EvaluationRun, tmp_path: Path, content: str | None, sentence: str
+) -> None:
     path = save_run(run, tmp_path / "bundle") / "metrics_summary.json"
     if content is None:
         path.unlink()
@@ -221,19 +283,27 @@ def test_a_summary_against_its_schema(run: EvaluationRun, tmp_path: Path, fault:
     summary = read(path)
     change(summary)
     path.write_text(json.dumps(summary), encoding="utf-8")
-    with pytest.raises(ResultsError, match=rf"metrics_summary.json: does not say what was evaluated: {told}"):
-        _ = read_bundle(path.parent).setup  # an unknown task may be one of a plug-in, and is refused here
+    with pytest.raises(
+        ResultsError, match=rf"metrics_summary.json: does not say what was evaluated: {told}"
+    ):
+        _ = read_bundle(
+            path.parent
+        ).setup  # an unknown task may be one of a plug-in, and is refused here
 
 
 DAMAGED: dict[str, Callable[[Any], object]] = {
     "no names": lambda counts: counts.pop("names"),
     "names that are none": lambda counts: counts.update(names=7),
-    "names that move a cursor": lambda counts: counts.update(names=counts["names"].replace("given", "\x1b[2J", 1)),
+    "names that move a cursor": lambda counts: counts.update(
+        names=counts["names"].replace("given", "\x1b[2J", 1)
+    ),
     "names of no table": lambda counts: counts.update(names=counts["names"].replace("/", "-")),
     "too many names": lambda counts: counts.update(names=counts["names"] + "\nmore"),
     "no numbers": lambda counts: counts.pop("numbers"),
     "numbers of three": lambda counts: counts["numbers"][0].append(1.0),
-    "words for numbers": lambda counts: counts.update(numbers=[["a", "b"]] * len(counts["numbers"])),
+    "words for numbers": lambda counts: counts.update(
+        numbers=[["a", "b"]] * len(counts["numbers"])
+    ),
     "no notes": lambda counts: counts.pop("notes"),
     "notes that are no numbers": lambda counts: counts.update(notes={"{sample}": "many"}),
     "samples that are none": lambda counts: counts.update(samples=[]),
@@ -242,7 +312,9 @@ DAMAGED: dict[str, Callable[[Any], object]] = {
 
 @pytest.mark.parametrize("damage", DAMAGED)
 @pytest.mark.parametrize("task", ["planning", "forecasting"])
-def test_damaged_counts_of_means(run: EvaluationRun, tmp_path: Path, task: str, damage: str) -> None:
+def test_damaged_counts_of_means(
+    run: EvaluationRun, tmp_path: Path, task: str, damage: str
+) -> None:
     setup = EvaluationSetup(task=task, protocol="clean")
     evaluator, sums = setup.evaluator(), Sums()
     column = "avoided" if task == "planning" else "min_fde"
@@ -266,5 +338,9 @@ def test_scenarios_without_hashes_are_no_bundle_s(run: EvaluationRun, tmp_path: 
     path = bundle.folder / "scenarios.json"
     path.write_text(json.dumps({**read(path), "scenarios": ["s"]}), encoding="utf-8")
     assert_refused(
-        (bundle.scenarios, ResultsError, r"scenarios.json: expected `object`, got `array` - at `\$.scenarios`"),
+        (
+            bundle.scenarios,
+            ResultsError,
+            r"scenarios.json: expected `object`, got `array` - at `\$.scenarios`",
+        ),
     )

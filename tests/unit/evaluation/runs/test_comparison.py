@@ -55,13 +55,19 @@ COUNT_FAULTS: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
     "a number": (lambda counts: counts[FIRST].update(paths=1), "TypeError"),
     "giants": (lambda counts: counts[FIRST].update(vpq=[[[10**400]] * 4] * 2), "OverflowError"),
     "infinity": (lambda counts: counts[FIRST].update(vpq=[[[math.inf]] * 4] * 2), "OverflowError"),
-    "no token": (lambda counts: counts.update({"x" * 10**6: counts[FIRST]}), "expected a sample's token"),
+    "no token": (
+        lambda counts: counts.update({"x" * 10**6: counts[FIRST]}),
+        "expected a sample's token",
+    ),
 }
 
 
 @pytest.fixture(scope="module")
 def motion_bundles(
-    da_b: DeepAccident, selection: SampleSelection, write_motion: Write, tmp_path_factory: pytest.TempPathFactory
+    da_b: DeepAccident,
+    selection: SampleSelection,
+    write_motion: Write,
+    tmp_path_factory: pytest.TempPathFactory,
 ) -> tuple[Path, Path]:
     """The labels moved by two cells, and by one: the second is better."""
     folder, made = tmp_path_factory.mktemp("motion"), []
@@ -76,7 +82,9 @@ def motion_bundles(
 def saved(run: EvaluationRun, da_b: DeepAccident, write_accidents: Write, tmp_path: Path) -> Save:
     """Evaluate and save: `(name, moved, tokens, setup, **of the selection)`."""
 
-    def save(name: str, moved: float = 0.1, setup: EvaluationSetup = run.setup, **selection: Any) -> Path:
+    def save(
+        name: str, moved: float = 0.1, setup: EvaluationSetup = run.setup, **selection: Any
+    ) -> Path:
         chosen = replace(run.selection, **selection)
         results = write_accidents(tmp_path / f"{name}.json", chosen.tokens(da_b), moved=moved)
         return save_run(evaluate_results(da_b, results, setup, chosen, workers=1), tmp_path / name)
@@ -92,10 +100,14 @@ def by_name(comparison: Comparison) -> dict[str, Any]:
 def generated(tmp_path: Path) -> Callable[..., Comparison]:
     """Compare two runs of the given cells found, of 100 true ones a cluster."""
 
-    def compare(a: Sequence[int], b: Sequence[int], resampling: Resampling | None = None, **how: Any) -> Comparison:
+    def compare(
+        a: Sequence[int], b: Sequence[int], resampling: Resampling | None = None, **how: Any
+    ) -> Comparison:
         folders = [
             write_bundle(
-                tmp_path / f"{name}{len(list(tmp_path.iterdir()))}", [(each, 100 - each) for each in run], **how
+                tmp_path / f"{name}{len(list(tmp_path.iterdir()))}",
+                [(each, 100 - each) for each in run],
+                **how,
             )
             for name, run in (("a", a), ("b", b))
         ]
@@ -109,7 +121,9 @@ HARD = [5 * number for number in range(16)]
 
 
 def test_the_better_one_is_named(generated: Callable[..., Comparison]) -> None:
-    iou = by_name(generated(HARD, [each + 3 + number % 3 for number, each in enumerate(HARD)]))[MAIN]
+    iou = by_name(generated(HARD, [each + 3 + number % 3 for number, each in enumerate(HARD)]))[
+        MAIN
+    ]
     assert (iou.family, iou.real, iou.better, iou.decision) == ("main", True, "b", "b is better")
     assert iou.difference == pytest.approx(iou.b - iou.a)
     assert 3 < iou.low < iou.difference < iou.high < 5
@@ -128,11 +142,15 @@ def test_pairs_are_compared(generated: Callable[..., Comparison]) -> None:
 
 def test_the_other_headlines_are_tested_together(generated: Callable[..., Comparison]) -> None:
     """Both ranges have the same numbers: by itself one is real, of several it is not."""
-    numbers = by_name(generated([50] * 10, [50 + each for each in [1, -1, 2, -1, 3, 3, 1, 2, 2, 1]]))
+    numbers = by_name(
+        generated([50] * 10, [50 + each for each in [1, -1, 2, -1, 3, 3, 1, 2, 2, 1]])
+    )
     alone, together = numbers[MAIN], numbers["iou 100x100"]
     assert alone.p == together.p == alone.adjusted_p <= 0.05 < together.adjusted_p
     assert (alone.real, together.real, together.better) == (True, False, None)
-    tested = [each for each in numbers.values() if each.family == "headlines" and each.p is not None]
+    tested = [
+        each for each in numbers.values() if each.family == "headlines" and each.p is not None
+    ]
     assert together.adjusted_p == pytest.approx(min(len(tested) * together.p, 1))
     others = [each for each in numbers.values() if each.family == "other"]
     assert {each.decision for each in others} == {"for exploration"}
@@ -160,11 +178,18 @@ def test_without_resamples(generated: Callable[..., Comparison]) -> None:
 
 def test_all_of_a_small_one(generated: Callable[..., Comparison]) -> None:
     """Of seven clusters all 64 swaps are tried: none of the others differs as much."""
-    made = generated(HARD[:7], [each + 9 + number % 2 for number, each in enumerate(HARD[:7])], twins=True)
+    made = generated(
+        HARD[:7], [each + 9 + number % 2 for number, each in enumerate(HARD[:7])], twins=True
+    )
     row = "iou 30x30 (%)    15.000  24.429  +9.429  [+8.934, +9.923]  0.016          b is better"
     assert row in made.to_text().splitlines()
     told = made.to_dict()
-    assert (told["samples"], told["clusters"], told["swaps"], told["all_swaps"]) == (14, 7, 64, True)
+    assert (told["samples"], told["clusters"], told["swaps"], told["all_swaps"]) == (
+        14,
+        7,
+        64,
+        True,
+    )
     assert (told["numbers"][1]["p"], told["numbers"][1]["adjusted_p"]) == (1 / 64, 3 / 64)
 
 
@@ -206,8 +231,13 @@ def changed(path: Path, change: Callable[[Any], object]) -> None:
     path.write_text(json.dumps(content))
 
 
-def test_other_samples_tasks_and_rules(saved: Save, motion_bundles: tuple[Path, Path], run: EvaluationRun) -> None:
-    a, other = saved("a"), saved("b", setup=replace(run.setup, switches={"reading.danger_distance": 0.5}))
+def test_other_samples_tasks_and_rules(
+    saved: Save, motion_bundles: tuple[Path, Path], run: EvaluationRun
+) -> None:
+    a, other = (
+        saved("a"),
+        saved("b", setup=replace(run.setup, switches={"reading.danger_distance": 0.5})),
+    )
     assert_refused(
         (
             lambda: compare_bundles(a, motion_bundles[0], FEW),
@@ -230,7 +260,9 @@ def test_other_samples_tasks_and_rules(saved: Save, motion_bundles: tuple[Path, 
 def test_other_cells(motion_bundles: tuple[Path, Path], tmp_path: Path) -> None:
     """Labels are made on the predictions' own cells: other cells are another truth."""
     small, axis = copytree(motion_bundles[1], tmp_path / "small"), [-25.0, 25.0, 0.5]
-    changed(small / "metrics_summary.json", lambda summary: summary["results"]["form"].update(x=axis))
+    changed(
+        small / "metrics_summary.json", lambda summary: summary["results"]["form"].update(x=axis)
+    )
     assert_refused(
         (
             lambda: compare_bundles(motion_bundles[0], small, FEW),
@@ -243,7 +275,9 @@ def test_other_cells(motion_bundles: tuple[Path, Path], tmp_path: Path) -> None:
 def test_other_labels_and_another_devkit(saved: Save, results: Results) -> None:
     a, b, c = map(saved, "abc")
     token = min(results.tokens).rsplit("/", 2)[0]
-    changed(b / "scenarios.json", lambda stored: stored["scenarios"][token].update(label="0", boxes="0"))
+    changed(
+        b / "scenarios.json", lambda stored: stored["scenarios"][token].update(label="0", boxes="0")
+    )
     path = c / "counts.json"
     path.write_text(path.read_text().replace("of devkit ", "of devkit 9."))
     assert_refused(
@@ -261,7 +295,9 @@ def test_other_labels_and_another_devkit(saved: Save, results: Results) -> None:
 
 
 @pytest.mark.parametrize(("clusters", "pairs"), [(12, 200)])
-def test_equally_good_runs_are_rarely_called_really_different(tmp_path: Path, clusters: int, pairs: int) -> None:
+def test_equally_good_runs_are_rarely_called_really_different(
+    tmp_path: Path, clusters: int, pairs: int
+) -> None:
     """Of two runs of the same law, with clusters that are hard for both, at most 5 % but for chance."""
     source, real = np.random.default_rng(clusters), 0
     for pair in range(pairs):
@@ -269,7 +305,11 @@ def test_equally_good_runs_are_rarely_called_really_different(tmp_path: Path, cl
         for name in "ab":
             found = source.binomial(20, 1 / (1 + np.exp(hard + source.normal(0, 0.7, clusters))))
             folders.append(
-                write_bundle(tmp_path / f"{pair}{name}", [(each, 20 - each) for each in found.tolist()], twins=True)
+                write_bundle(
+                    tmp_path / f"{pair}{name}",
+                    [(each, 20 - each) for each in found.tolist()],
+                    twins=True,
+                )
             )
         real += by_name(compare_bundles(*folders, Resampling(resamples=200, seed=pair)))[MAIN].real
     assert real <= binom.ppf(0.995, pairs, 0.05)
@@ -283,26 +323,51 @@ def test_counts_that_are_none_are_a_fault_of_the_bundle(tmp_path: Path, fault: s
     state = json.loads((folder / "counts.json").read_text())
     change(state["counts"])
     (folder / "counts.json").write_text(json.dumps(state))
-    with pytest.raises(ResultsError, match=rf"counts.json: does not hold counts of its protocol \(.*{told}"):
+    with pytest.raises(
+        ResultsError, match=rf"counts.json: does not hold counts of its protocol \(.*{told}"
+    ):
         compare_bundles(folder, folder)
 
 
 def test_counts_of_detections_that_ask_for_memory() -> None:
     evaluator = EvaluationSetup(task="detection").evaluator()
     columns = {name: [[], []] for name in ("tp", "spent", "matches")}
-    counts = {"token": "a", "truths": [], "scores": [0.5], "detections": [[10**12], [0]], "excused": [[]] * 3}
+    counts = {
+        "token": "a",
+        "truths": [],
+        "scores": [0.5],
+        "detections": [[10**12], [0]],
+        "excused": [[]] * 3,
+    }
     evaluator.add("a", counts | columns | {"errors": [[]] * 6})
     assert_refused(
-        (evaluator.compute, EvaluationError, r"detections: expected groups from 0 to \d+, found 10{12} to 10{12}"),
+        (
+            evaluator.compute,
+            EvaluationError,
+            r"detections: expected groups from 0 to \d+, found 10{12} to 10{12}",
+        ),
     )
 
 
 def test_counts_of_warnings_that_ask_for_memory() -> None:
     evaluator = EvaluationSetup(task="warning", protocol="clean").evaluator()
-    nothing = {"alarms": [], "unjudged": [], "references": [], "involvement": None, "ahead": None, "to_end": None}
-    evaluator.add("a", {"recording": "s/t/a", "frame": 10**9, "kind": "others", "beyond": 0} | nothing)
+    nothing = {
+        "alarms": [],
+        "unjudged": [],
+        "references": [],
+        "involvement": None,
+        "ahead": None,
+        "to_end": None,
+    }
+    evaluator.add(
+        "a", {"recording": "s/t/a", "frame": 10**9, "kind": "others", "beyond": 0} | nothing
+    )
     assert_refused(
-        (evaluator.compute, EvaluationError, "s/t/a: expected frames up to 10,000, found 1000000000"),
+        (
+            evaluator.compute,
+            EvaluationError,
+            "s/t/a: expected frames up to 10,000, found 1000000000",
+        ),
     )
 
 
@@ -331,9 +396,14 @@ class Means(Evaluator[Mean]):
         return Mean(ratio(total(counts, "value"), total(counts, "count")))
 
 
-def paired(first: np.ndarray, second: np.ndarray, resampling: Resampling | None = None) -> PairedTest:
+def paired(
+    first: np.ndarray, second: np.ndarray, resampling: Resampling | None = None
+) -> PairedTest:
     """Of a value a cluster; NaN for none."""
-    runs = tuple([[{"value": float(v), "count": 1}] if np.isfinite(v) else [] for v in run] for run in (first, second))
+    runs = tuple(
+        [[{"value": float(v), "count": 1}] if np.isfinite(v) else [] for v in run]
+        for run in (first, second)
+    )
     difference = float(np.nanmean(second) - np.nanmean(first))
     return paired_test(Means(), runs, {"mean": difference}, resampling or Resampling())  # type: ignore[arg-type]
 
@@ -400,8 +470,12 @@ def test_the_interval_is_students() -> None:
 
 def test_clusters_that_are_too_few() -> None:
     made = paired(np.zeros(5), np.arange(5) + 1.0)
-    assert undecided(made, 0, 1, 5) == "no decision is possible with 5 clusters; at least 6 are needed"
-    assert undecided(made, 0, 4, 5) == "no decision is possible with 5 clusters; at least 8 are needed"
+    assert (
+        undecided(made, 0, 1, 5) == "no decision is possible with 5 clusters; at least 6 are needed"
+    )
+    assert (
+        undecided(made, 0, 4, 5) == "no decision is possible with 5 clusters; at least 8 are needed"
+    )
     few = paired(np.zeros(30), np.eye(30)[0])
     text = "no decision is possible with 1 of 30 clusters in which the two differ; at least 6 are needed"
     assert undecided(few, 0, 1, 30) == text
@@ -409,8 +483,13 @@ def test_clusters_that_are_too_few() -> None:
 
 def test_resamples_that_are_too_few() -> None:
     made = paired(np.zeros(30), np.arange(30) + 1.0, Resampling(resamples=10))
-    assert undecided(made, 0, 1, 30) == "no decision is possible with 10 resamples; at least 19 are needed"
-    assert undecided(paired(np.zeros(9), np.ones(9), Resampling(resamples=0)), 0, 1, 9).startswith("not tested: ")
+    assert (
+        undecided(made, 0, 1, 30)
+        == "no decision is possible with 10 resamples; at least 19 are needed"
+    )
+    assert undecided(paired(np.zeros(9), np.ones(9), Resampling(resamples=0)), 0, 1, 9).startswith(
+        "not tested: "
+    )
 
 
 def test_no_difference_decides_nothing() -> None:
@@ -421,7 +500,9 @@ def test_no_difference_decides_nothing() -> None:
 
 
 def test_all_swaps_or_random_ones() -> None:
-    assert swaps_of(3, Resampling()).swapped.tolist() == [[a, b, c] for c in (0, 1) for b in (0, 1) for a in (0,)]
+    assert swaps_of(3, Resampling()).swapped.tolist() == [
+        [a, b, c] for c in (0, 1) for b in (0, 1) for a in (0,)
+    ]
     assert swaps_of(0, Resampling()).swapped.shape == (1, 0)
     assert swaps_of(11, Resampling(resamples=1000)).swapped.shape == (1000, 11)
     assert swaps_of(5, Resampling(resamples=0)).swapped.shape == (0, 5)
@@ -440,7 +521,9 @@ def test_all_swaps_or_random_ones() -> None:
         (11, 1024, True),
     ],
 )
-def test_up_to_which_number_all_swaps_are_taken(clusters: int, resamples: int, *, complete: bool) -> None:
+def test_up_to_which_number_all_swaps_are_taken(
+    clusters: int, resamples: int, *, complete: bool
+) -> None:
     made = swaps_of(clusters, Resampling(resamples=resamples))
     number = 2 ** max(clusters - 1, 0) if complete else resamples
     assert (made.complete, made.swapped.shape) == (complete, (number, clusters))
@@ -476,5 +559,9 @@ def test_how_many_scenarios_would_decide(error: float, scenarios: int, told: str
     assert (
         undecided(made, 0, 1, scenarios)
         == undecided(other, 0, 1, scenarios)
-        == ("not decided" if told is None else f"not decided: about {told} scenarios would decide it")
+        == (
+            "not decided"
+            if told is None
+            else f"not decided: about {told} scenarios would decide it"
+        )
     )

@@ -12,7 +12,12 @@ from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, EvaluationError, ResultsError
-from deepaccident_devkit.evaluation import AccidentEvaluator, Resampling, accident_context, sample_attributes
+from deepaccident_devkit.evaluation import (
+    AccidentEvaluator,
+    Resampling,
+    accident_context,
+    sample_attributes,
+)
 from deepaccident_devkit.evaluation.breakdowns import WITHIN_RECORDINGS
 from deepaccident_devkit.evaluation.results import Results, ResultsWriter
 from deepaccident_devkit.evaluation.runs import (
@@ -24,7 +29,11 @@ from deepaccident_devkit.evaluation.runs import (
     save_run,
     scenario_hashes,
 )
-from deepaccident_devkit.evaluation.runs.evaluation_run import breakdowns_of, check_metas, partial_of
+from deepaccident_devkit.evaluation.runs.evaluation_run import (
+    breakdowns_of,
+    check_metas,
+    partial_of,
+)
 from deepaccident_devkit.evaluation.runs.sanity import check_sanity
 from deepaccident_devkit.evaluation.runs.setups import (
     Coverage,
@@ -50,12 +59,17 @@ def nothing_long(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(evaluation_run, "evaluate_samples", refused)
 
 
-def test_equals_the_evaluator_by_hand(da_b: DeepAccident, results: Results, run: EvaluationRun) -> None:
+def test_equals_the_evaluator_by_hand(
+    da_b: DeepAccident, results: Results, run: EvaluationRun
+) -> None:
     by_hand = AccidentEvaluator("boxes")
     for token in results.tokens:
         by_hand.update(token, results.prediction(token), None, accident_context(da_b, token, 2.0))
     assert (run.result, run.result.positives, run.partial) == (by_hand.compute(), 3, None)
-    assert (run.attributes, set(run.times_to_impact.values())) == (sample_attributes(da_b, results.tokens), {0.5, None})
+    assert (run.attributes, set(run.times_to_impact.values())) == (
+        sample_attributes(da_b, results.tokens),
+        {0.5, None},
+    )
 
 
 def test_says_what_it_depends_on(da_b: DeepAccident, results: Results, run: EvaluationRun) -> None:
@@ -68,7 +82,9 @@ def test_breakdowns(run: EvaluationRun) -> None:
     broken = run.broken_down(["agent", "all", "agent"], Resampling(resamples=5))
     assert [each.by for each in broken.breakdowns] == ["agent", "all"]
     assert broken.breakdowns[1].groups[0].result == run.result
-    assert [each.by for each in run.broken_down(resampling=Resampling(resamples=0)).breakdowns] == list(BREAKDOWNS)
+    assert [
+        each.by for each in run.broken_down(resampling=Resampling(resamples=0)).breakdowns
+    ] == list(BREAKDOWNS)
     assert_refused(
         (
             lambda: run.broken_down(["wether"]),
@@ -91,13 +107,19 @@ class TestRefused:
         """Of another kind, of too short a look ahead, with a damaged shard, missing samples, nothing in common."""
         tokens, motion = selection.tokens(da_b), EvaluationSetup(task="motion")
         accidents = write_accidents(tmp_path / "some.json", tokens[1:])
-        others = write_accidents(tmp_path / "other.json", replace(selection, split="train").tokens(da_b))
+        others = write_accidents(
+            tmp_path / "other.json", replace(selection, split="train").tokens(da_b)
+        )
         maps, damaged = (write_motion(tmp_path / name, tokens) for name in ("motion", "damaged"))
         shard = next((tmp_path / "damaged" / "shards").iterdir())
         shard.write_bytes(shard.read_bytes()[:-100])
         evaluate = partial(evaluate_results, da_b)
         assert_refused(
-            (partial(evaluate, accidents, motion, selection), EvaluationError, ("accident results", "motion results")),
+            (
+                partial(evaluate, accidents, motion, selection),
+                EvaluationError,
+                ("accident results", "motion results"),
+            ),
             (
                 partial(evaluate, maps, replace(motion, horizon=3.0), selection),
                 EvaluationError,
@@ -131,7 +153,10 @@ class TestRefused:
         assert_refused(
             (
                 lambda: evaluate_results(
-                    release, tmp_path / "none.json", EvaluationSetup(task=task, protocol=protocol), every
+                    release,
+                    tmp_path / "none.json",
+                    EvaluationSetup(task=task, protocol=protocol),
+                    every,
                 ),
                 EvaluationError,
                 r"1 of 2 scenarios have no meta file, .*--where 'weather!=unknown'",
@@ -190,7 +215,9 @@ class TestBrokenOff:
 
         return start
 
-    def run_of(self, dataset: DeepAccident, results: Results, out: Path, **changes: Any) -> EvaluationRun:
+    def run_of(
+        self, dataset: DeepAccident, results: Results, out: Path, **changes: Any
+    ) -> EvaluationRun:
         setup = EvaluationSetup(task="accident", protocol="boxes", **changes)
         every = SampleSelection(split="train", samples="evaluate", scope="all")
         return evaluate_results(dataset, results, setup, every, workers=1, out=out)
@@ -202,7 +229,11 @@ class TestBrokenOff:
         return write_accidents(tmp_path / "accidents.json", tokens)
 
     def test_goes_on_where_it_stopped(
-        self, da_b: DeepAccident, ten: Results, tmp_path: Path, broken_after: Callable[[int | None], list[str]]
+        self,
+        da_b: DeepAccident,
+        ten: Results,
+        tmp_path: Path,
+        broken_after: Callable[[int | None], list[str]],
     ) -> None:
         first = broken_after(9)
         with pytest.raises(KeyboardInterrupt):
@@ -264,12 +295,16 @@ class Job:
 
     def whole(self, out: Path | None = None, **how: Any) -> EvaluationRun:
         return evaluate_results(
-            *(self.dataset, self.results, self.setup, self.selection), **{"workers": 1, **how}, out=out
+            *(self.dataset, self.results, self.setup, self.selection),
+            **{"workers": 1, **how},
+            out=out,
         )
 
 
 @pytest.fixture(scope="module")
-def job(da_b: DeepAccident, write_accidents: Write, tmp_path_factory: pytest.TempPathFactory) -> Job:
+def job(
+    da_b: DeepAccident, write_accidents: Write, tmp_path_factory: pytest.TempPathFactory
+) -> Job:
     """All six scenarios: thirty samples."""
     folder = tmp_path_factory.mktemp("shards")
     save_selection(da_b.find(), folder / "all.txt")
@@ -279,7 +314,9 @@ def job(da_b: DeepAccident, write_accidents: Write, tmp_path_factory: pytest.Tem
 
 @pytest.fixture(scope="module")
 def bundle(job: Job, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return save_run(job.whole().broken_down(["all", "town"], FEW), tmp_path_factory.mktemp("bundle") / "whole")
+    return save_run(
+        job.whole().broken_down(["all", "town"], FEW), tmp_path_factory.mktemp("bundle") / "whole"
+    )
 
 
 @pytest.fixture
@@ -296,7 +333,9 @@ def loaded(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return tokens
 
 
-def test_processes_that_are_given_one_folder_share_the_samples(job: Job, tmp_path: Path, loaded: list[str]) -> None:
+def test_processes_that_are_given_one_folder_share_the_samples(
+    job: Job, tmp_path: Path, loaded: list[str]
+) -> None:
     with ThreadPoolExecutor(3) as threads:
         runs = list(threads.map(lambda _: job.whole(tmp_path / "out"), range(3)))
     assert sorted(loaded) == sorted(job.results.tokens)
@@ -315,9 +354,15 @@ class Counting(ThreadPoolExecutor):
 
 CALLS: dict[str, Callable[..., Any]] = {
     "evaluate": lambda job, **how: job.whole(**how).summary(),
-    "hashes": lambda job, **how: scenario_hashes(job.dataset, map(scenario_of, job.results.tokens), **how),
-    "breakdowns": lambda job, **how: job.whole().broken_down(["agent", "all"], FEW, **how).summary(),
-    "sanity": lambda job, **how: check_sanity(job.dataset, job.results, SETUP, job.results.tokens, **how),
+    "hashes": lambda job, **how: scenario_hashes(
+        job.dataset, map(scenario_of, job.results.tokens), **how
+    ),
+    "breakdowns": lambda job, **how: (
+        job.whole().broken_down(["agent", "all"], FEW, **how).summary()
+    ),
+    "sanity": lambda job, **how: check_sanity(
+        job.dataset, job.results, SETUP, job.results.tokens, **how
+    ),
 }
 
 

@@ -63,7 +63,10 @@ def test_what_cannot_be_is_named(tmp_path: Path) -> None:
 def test_several_are_all_listed_in_order_and_the_others_are_counted(threads: int) -> None:
     evaluator, broken = Sums(), {"30": BROKEN, "02": BROKEN, "x": BROKEN}
     executor = ThreadPoolExecutor(threads) if threads else None
-    with executor or nullcontext(), pytest.raises(EvaluationError, match=r"^3 of 41 samples cannot") as caught:
+    with (
+        executor or nullcontext(),
+        pytest.raises(EvaluationError, match=r"^3 of 41 samples cannot") as caught,
+    ):
         evaluate_samples(evaluator, VALUES | broken, number, workers=1, executor=executor)
     lines = str(caught.value).splitlines()[1:]
     fault = "cannot be evaluated: FileNotFoundError: predictions/7.npz"
@@ -80,7 +83,10 @@ def test_of_other_settings_or_damaged(tmp_path: Path) -> None:
     assert not evaluate_samples(evaluator, VALUES, number, workers=1, checkpoint=path).repeated
     for kept in path.glob("kept/*"):
         kept.write_bytes(kept.read_bytes()[1:])
-    assert evaluate_samples(Sums(), VALUES, number, workers=1, checkpoint=path).compute() == sum_of_all()
+    assert (
+        evaluate_samples(Sums(), VALUES, number, workers=1, checkpoint=path).compute()
+        == sum_of_all()
+    )
 
 
 def sum_of_all() -> float:

@@ -25,12 +25,17 @@ def sent(mean: float, payload: object = "boxes") -> dict[str, object]:
 
 def bundle(folder: Path, found: int, mean: float, samples: int = 8) -> Path:
     """Some clusters, of which each has another share of its 100 cells found."""
-    return write_bundle(folder, [(found + each, 100 - found - each) for each in range(samples)], sent=sent(mean))
+    return write_bundle(
+        folder, [(found + each, 100 - found - each) for each in range(samples)], sent=sent(mean)
+    )
 
 
 @pytest.fixture
 def three(tmp_path: Path) -> list[Path]:
-    return [bundle(tmp_path / name, *each) for name, each in (("a", (40, 0.0)), ("b", (60, 1e6)), ("c", (50, 2e3)))]
+    return [
+        bundle(tmp_path / name, *each)
+        for name, each in (("a", (40, 0.0)), ("b", (60, 1e6)), ("c", (50, 2e3)))
+    ]
 
 
 def shown(found: OverBytes, headline: str = MAIN) -> list[BytesPoint]:
@@ -40,7 +45,11 @@ def shown(found: OverBytes, headline: str = MAIN) -> list[BytesPoint]:
 def test_each_evaluation_has_its_bytes_and_numbers(three: list[Path]) -> None:
     found = over_bytes(three, FEW)
     assert (found.task, found.protocol, found.samples) == ("motion", "released", 8)
-    assert [(each.evaluation, each.bytes) for each in shown(found)] == [("a", 0.0), ("b", 1e6), ("c", 2e3)]
+    assert [(each.evaluation, each.bytes) for each in shown(found)] == [
+        ("a", 0.0),
+        ("b", 1e6),
+        ("c", 2e3),
+    ]
     assert [each.value for each in shown(found)] == pytest.approx([43.5, 63.5, 53.5])
     assert {each.unit for each in shown(found)} == {"%"}
 
@@ -60,26 +69,44 @@ def test_text_and_tables(three: list[Path]) -> None:
     found = over_bytes(three, FEW)
     lines = [line.split() for line in found.to_text().splitlines()]
     point = shown(found)[1]
-    assert lines[4] == [*MAIN.split(), "b", "1,000,000", "63.50", "%", f"[{point.low:.3f},", f"{point.high:.3f}]"]
+    assert lines[4] == [
+        *MAIN.split(),
+        "b",
+        "1,000,000",
+        "63.50",
+        "%",
+        f"[{point.low:.3f},",
+        f"{point.high:.3f}]",
+    ]
     assert json.loads(found.to_json())["points"][1]["bytes"] == 1e6
 
 
 def test_folders_of_one_name_are_told_apart(tmp_path: Path) -> None:
-    folders = [bundle(tmp_path / each / "motion", 40, mean) for each, mean in (("a", 1.0), ("b", 2.0))]
-    assert [each.evaluation for each in shown(over_bytes(folders, FEW))] == [str(each) for each in folders]
+    folders = [
+        bundle(tmp_path / each / "motion", 40, mean) for each, mean in (("a", 1.0), ("b", 2.0))
+    ]
+    assert [each.evaluation for each in shown(over_bytes(folders, FEW))] == [
+        str(each) for each in folders
+    ]
 
 
 def test_samples_that_all_have(tmp_path: Path, three: list[Path]) -> None:
     longer = bundle(tmp_path / "longer", 60, 5.0, samples=10)
-    assert_refused((lambda: over_bytes([*three, longer], FEW), EvaluationError, "2 samples only in .*longer"))
+    assert_refused(
+        (lambda: over_bytes([*three, longer], FEW), EvaluationError, "2 samples only in .*longer")
+    )
     found = over_bytes([longer, *three], FEW, common=True)
     assert (found.samples, next(each.value for each in shown(found))) == (8, pytest.approx(63.5))
 
 
 @pytest.mark.parametrize(
-    "note", [None, {}, sent(-1.0), sent(1.0, payload="a\nb")], ids=["none", "empty", "less", "lines"]
+    "note",
+    [None, {}, sent(-1.0), sent(1.0, payload="a\nb")],
+    ids=["none", "empty", "less", "lines"],
 )
-def test_results_that_do_not_note_bytes_are_named(tmp_path: Path, three: list[Path], note: Any) -> None:
+def test_results_that_do_not_note_bytes_are_named(
+    tmp_path: Path, three: list[Path], note: Any
+) -> None:
     silent = write_bundle(tmp_path / "silent", [(3, 1)] * 8, sent=note)
     told = (f"{silent}: its results do not note", "predict again into a new folder")
     assert_refused((lambda: over_bytes([three[0], silent], FEW), EvaluationError, told))
@@ -90,6 +117,10 @@ def test_other_rules_and_no_evaluation(tmp_path: Path, three: list[Path]) -> Non
     path = three[2] / "metrics_summary.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | {"protocol": "paper"}))
     assert_refused(
-        (lambda: over_bytes(three, FEW), EvaluationError, "were not evaluated by the same rules: protocol"),
+        (
+            lambda: over_bytes(three, FEW),
+            EvaluationError,
+            "were not evaluated by the same rules: protocol",
+        ),
         (lambda: over_bytes([three[0], tmp_path / "none"], FEW), ResultsError, "no such folder"),
     )

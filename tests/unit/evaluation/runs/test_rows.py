@@ -15,7 +15,13 @@ from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ResultsError
 from deepaccident_devkit.evaluation import DetectedBoxes
 from deepaccident_devkit.evaluation.results import Results, ResultsWriter, read_results
-from deepaccident_devkit.evaluation.runs import EvaluationRun, SampleSelection, evaluate_results, read_rows, sample_rows
+from deepaccident_devkit.evaluation.runs import (
+    EvaluationRun,
+    SampleSelection,
+    evaluate_results,
+    read_rows,
+    sample_rows,
+)
 from deepaccident_devkit.evaluation.runs.rows import write_rows
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 
@@ -35,9 +41,15 @@ def _repeated(value: str, times: int) -> Any:
 
 
 BOMBS: dict[str, tuple[Callable[[], Any], str]] = {
-    "a long text in each of many rows": (lambda: _repeated("x" * 10**6, 10**5), "its text takes 100,000,000,000 bytes"),
+    "a long text in each of many rows": (
+        lambda: _repeated("x" * 10**6, 10**5),
+        "its text takes 100,000,000,000 bytes",
+    ),
     "many rows": (lambda: _arrow([7] * (5 * 10**6), "int64"), "its table takes 160,000,000 bytes"),
-    "rows of nothing": (lambda: _arrow([None] * (5 * 10**6), "null"), "its table takes 160,000,000 bytes"),
+    "rows of nothing": (
+        lambda: _arrow([None] * (5 * 10**6), "null"),
+        "its table takes 160,000,000 bytes",
+    ),
     "bytes": (lambda: _arrow([b"a"], "binary"), "column token is of binary"),
     "whole numbers of another size": (lambda: _arrow([7], "int32"), "column token is of int32"),
 }
@@ -53,7 +65,11 @@ def test_which_sample(run: EvaluationRun, da_b: DeepAccident) -> None:
     assert {row["time_to_impact"] for row in rows} == {0.5, None}
     for row in rows:
         sample = da_b.sample.get(row["token"])
-        assert (row["scenario"], row["agent"], row["frame"]) == (sample["scenario_token"], sample["agent"], 1)
+        assert (row["scenario"], row["agent"], row["frame"]) == (
+            sample["scenario_token"],
+            sample["agent"],
+            1,
+        )
         assert row["time_to_impact"] == sample["time_to_impact"]
         assert row["accident_visibility"] == run.attributes[row["token"]].accident_visibility
 
@@ -70,24 +86,32 @@ def test_accidents(run: EvaluationRun) -> None:
     errors = [each for each in column(rows, "position_error") if each is not None]
     assert math.fsum(errors) / len(errors) == pytest.approx(run.result.position_error)
     assert len(errors) == run.result.within[15.0].tp
-    assert Counter(column(rows, "truth")) == {name: count for name, count in run.result.truths.items() if count}
+    assert Counter(column(rows, "truth")) == {
+        name: count for name, count in run.result.truths.items() if count
+    }
 
 
-def test_motion(da_b: DeepAccident, selection: SampleSelection, tmp_path: Path, write_motion: Write) -> None:
+def test_motion(
+    da_b: DeepAccident, selection: SampleSelection, tmp_path: Path, write_motion: Write
+) -> None:
     results = write_motion(tmp_path / "motion", selection.tokens(da_b))
     run = evaluate_results(da_b, results, EvaluationSetup(task="motion"), selection, workers=1)
     rows = sample_rows(run)
     for name, part in run.result.ranges.items():
         sums = [sum(column(rows, f"{case}_{name}")) for case in ("tp", "fp", "fn")]
         assert sums == [part.true_positive, part.false_positive, part.false_negative]
-        both, mine, true = (sum(column(rows, f"cells_{case}_{name}")) for case in ("tp", "fp", "fn"))
+        both, mine, true = (
+            sum(column(rows, f"cells_{case}_{name}")) for case in ("tp", "fp", "fn")
+        )
         assert 100 * both / (both + mine + true) == pytest.approx(part.iou)
     assert sum(column(rows, "paths")) == run.result.paths
     assert column(rows, "min_ade") == pytest.approx([0.5] * len(rows), abs=0.05)  # moved by a cell
 
 
 @pytest.mark.parametrize("protocol", ["released", "opencood"])
-def test_detection(da_b: DeepAccident, selection: SampleSelection, tmp_path: Path, protocol: str) -> None:
+def test_detection(
+    da_b: DeepAccident, selection: SampleSelection, tmp_path: Path, protocol: str
+) -> None:
     tokens = selection.tokens(da_b)
     with ResultsWriter(tmp_path / "boxes.json", "detection") as writer:
         for token in tokens:
@@ -104,9 +128,13 @@ def test_detection(da_b: DeepAccident, selection: SampleSelection, tmp_path: Pat
 
 def test_warning(da_b: DeepAccident, results: Results, selection: SampleSelection) -> None:
     rows = sample_rows(
-        evaluate_results(da_b, results, EvaluationSetup(task="warning", protocol="clean"), selection, workers=1)
+        evaluate_results(
+            da_b, results, EvaluationSetup(task="warning", protocol="clean"), selection, workers=1
+        )
     )
-    assert column(rows, "alarms_count") == [len(results.prediction(token)) for token in sorted(selection.tokens(da_b))]
+    assert column(rows, "alarms_count") == [
+        len(results.prediction(token)) for token in sorted(selection.tokens(da_b))
+    ]
     assert len(rows) == 6
 
 
@@ -120,7 +148,11 @@ def test_columns_of_several_kinds_and_of_nothing(tmp_path: Path) -> None:
 def test_what_is_no_table(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "rows.parquet").write_bytes(content)
     assert_refused(
-        (lambda: read_rows(tmp_path / "rows.parquet"), ResultsError, r"rows.parquet: is no table of samples"),
+        (
+            lambda: read_rows(tmp_path / "rows.parquet"),
+            ResultsError,
+            r"rows.parquet: is no table of samples",
+        ),
     )
 
 
@@ -166,7 +198,11 @@ def test_a_text_that_is_none(tmp_path: Path) -> None:
 def test_a_pipe_and_a_giant(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     assert_refused(
-        (lambda: read_rows(tmp_path / "pipe"), ResultsError, r"not a regular file \(a named pipe\)"),
+        (
+            lambda: read_rows(tmp_path / "pipe"),
+            ResultsError,
+            r"not a regular file \(a named pipe\)",
+        ),
     )
     with (tmp_path / "giant").open("wb") as file:
         file.truncate(3 << 30)

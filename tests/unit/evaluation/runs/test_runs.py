@@ -11,7 +11,12 @@ from deepaccident_devkit.evaluation.runs.bundles import checked_target
 from deepaccident_devkit.evaluation.runs.evaluation_run import breakdowns_of
 from deepaccident_devkit.evaluation.runs.rows import read_rows, write_rows
 from deepaccident_devkit.evaluation.runs.sanity import SanityReport
-from deepaccident_devkit.evaluation.runs.setups import TASKS, Coverage, EvaluationSetup, default_selection
+from deepaccident_devkit.evaluation.runs.setups import (
+    TASKS,
+    Coverage,
+    EvaluationSetup,
+    default_selection,
+)
 from deepaccident_devkit.evaluation.runs.text import notes_of
 from deepaccident_devkit.evaluation.runs.verification import differing
 
@@ -77,11 +82,28 @@ PROTOCOLS = {
 
 def test_every_default_and_constant_written_out(tmp_path: Path) -> None:
     assert written_out("deepaccident_devkit.evaluation.runs") == WRITTEN
-    assert {task: tuple(evaluator_class.protocols) for task, evaluator_class in TASKS.items()} == PROTOCOLS
+    assert {
+        task: tuple(evaluator_class.protocols) for task, evaluator_class in TASKS.items()
+    } == PROTOCOLS
     setup = EvaluationSetup(task="motion")
-    assert default_selection(setup).text() == "split val, samples evaluate (the last 2 s), scope accident, all agents"
+    assert (
+        default_selection(setup).text()
+        == "split val, samples evaluate (the last 2 s), scope accident, all agents"
+    )
     write_rows(tmp_path / "rows", [], {})
-    assert (read_rows(tmp_path / "rows"), list(differing({}, {})), list(notes_of({}))) == (([], {}), [], [])
-    assert (checked_target(tmp_path / "new"), breakdowns_of("warning")[:2]) == (tmp_path / "new", ("all", "agent"))
-    assert (SanityReport(samples=0, warnings=()).sought, Coverage(expected=1).is_complete) == ((), True)
-    assert_refused((lambda: compare_bundles(tmp_path / "a", tmp_path / "b"), ResultsError, ("no such folder",)))
+    assert (read_rows(tmp_path / "rows"), list(differing({}, {})), list(notes_of({}))) == (
+        ([], {}),
+        [],
+        [],
+    )
+    assert (checked_target(tmp_path / "new"), breakdowns_of("warning")[:2]) == (
+        tmp_path / "new",
+        ("all", "agent"),
+    )
+    assert (SanityReport(samples=0, warnings=()).sought, Coverage(expected=1).is_complete) == (
+        (),
+        True,
+    )
+    assert_refused(
+        (lambda: compare_bundles(tmp_path / "a", tmp_path / "b"), ResultsError, ("no such folder",))
+    )

@@ -18,7 +18,12 @@ from deepaccident_devkit.errors import EvaluationError
 from deepaccident_devkit.evaluation.accident import accident_context
 from deepaccident_devkit.evaluation.detection import DetectedBoxes
 from deepaccident_devkit.evaluation.forecasting import Forecast, forecasting_truth
-from deepaccident_devkit.evaluation.planning import Plan, PlanningScene, planning_scene, trivial_plans
+from deepaccident_devkit.evaluation.planning import (
+    Plan,
+    PlanningScene,
+    planning_scene,
+    trivial_plans,
+)
 from deepaccident_devkit.evaluation.predictions import Accident, MotionOutput, instances_of
 from deepaccident_devkit.evaluation.runs import default_selection
 from deepaccident_devkit.evaluation.runs import sanity as sanity_module
@@ -91,25 +96,36 @@ def right(da_motion: DeepAccident, tokens: list[str]) -> dict[str, dict[str, Any
         boxes = boxes.select(boxes.actor_id >= 0)
         detections[token] = DetectedBoxes(boxes=boxes, scores=np.linspace(0.1, 0.9, len(boxes)))
     return {
-        "maps": {token: instances_of(each.instance, each.config.grid) for token, each in labels.items()},
+        "maps": {
+            token: instances_of(each.instance, each.config.grid) for token, each in labels.items()
+        },
         "heads": {
             token: MotionOutput(grid=each.config.grid, heads=(MotionHeads.from_labels(each),))
             for token, each in labels.items()
         },
         "accidents": accidents,
         "boxes": detections,
-        "plans": {token: [recorded_plan(da_motion, token)] for token in samples_of_vehicles(da_motion)},
-        "forecasts": {token: recorded_forecasts(da_motion, token) for token in samples_of_vehicles(da_motion)[::7]},
+        "plans": {
+            token: [recorded_plan(da_motion, token)] for token in samples_of_vehicles(da_motion)
+        },
+        "forecasts": {
+            token: recorded_forecasts(da_motion, token)
+            for token in samples_of_vehicles(da_motion)[::7]
+        },
     }
 
 
 def samples_of_vehicles(dataset: DeepAccident) -> list[str]:
-    return default_selection(EvaluationSetup(task="planning", protocol="clean"), "train").tokens(dataset)
+    return default_selection(EvaluationSetup(task="planning", protocol="clean"), "train").tokens(
+        dataset
+    )
 
 
 def recorded_plan(dataset: DeepAccident, token: str) -> Plan:
     recorded = trivial_plans(planning_scene(dataset, token))["recorded"]
-    return replace(recorded, times=recorded.times[4::5], path=recorded.path[4::5], yaw=recorded.yaw[4::5])
+    return replace(
+        recorded, times=recorded.times[4::5], path=recorded.path[4::5], yaw=recorded.yaw[4::5]
+    )
 
 
 def recorded_forecasts(dataset: DeepAccident, token: str) -> list[Forecast]:
@@ -120,11 +136,15 @@ def recorded_forecasts(dataset: DeepAccident, token: str) -> list[Forecast]:
         known = known & (np.cumsum(~known) == 0)
         times = np.arange(1, 7)[known] / 2
         if known.any():
-            forecasts.append(Forecast(actor_id=actor, times=times, paths=path[None, known], probabilities=[1.0]))
+            forecasts.append(
+                Forecast(actor_id=actor, times=times, paths=path[None, known], probabilities=[1.0])
+            )
     return forecasts
 
 
-def sanity(dataset: DeepAccident, kind: str, predictions: dict[str, Any], **how: Any) -> SanityReport:
+def sanity(
+    dataset: DeepAccident, kind: str, predictions: dict[str, Any], **how: Any
+) -> SanityReport:
     task: Any = KINDS[kind]
     protocols = {"accident": "boxes", "planning": "clean", "forecasting": "clean"}
     setup = EvaluationSetup(task=task, protocol=protocols.get(task, "released"))
@@ -132,7 +152,9 @@ def sanity(dataset: DeepAccident, kind: str, predictions: dict[str, Any], **how:
 
 
 def of_maps(change: Callable[[np.ndarray], np.ndarray]) -> Change:
-    return lambda _, __, given: instances_of(np.ascontiguousarray(change(given.instances[-1])), given.grid)
+    return lambda _, __, given: instances_of(
+        np.ascontiguousarray(change(given.instances[-1])), given.grid
+    )
 
 
 def turned_maps(matrix: list[list[int]]) -> Change:
@@ -155,7 +177,12 @@ def of_segmentation(change: Callable[[np.ndarray], np.ndarray]) -> Change:
 def of_boxes(**changes: Callable[[np.ndarray], np.ndarray]) -> Change:
     def changed(_: DeepAccident, __: str, given: DetectedBoxes) -> DetectedBoxes:
         boxes = given.boxes
-        return replace(given, boxes=replace(boxes, **{each: by(getattr(boxes, each)) for each, by in changes.items()}))
+        return replace(
+            given,
+            boxes=replace(
+                boxes, **{each: by(getattr(boxes, each)) for each, by in changes.items()}
+            ),
+        )
 
     return changed
 
@@ -178,14 +205,18 @@ def of_height(change: Callable[[Boxes], np.ndarray]) -> Change:
     return changed
 
 
-def of_paths(change: Callable[[np.ndarray, np.ndarray, Any], tuple[np.ndarray, np.ndarray]]) -> Change:
+def of_paths(
+    change: Callable[[np.ndarray, np.ndarray, Any], tuple[np.ndarray, np.ndarray]],
+) -> Change:
     """By times and places (…, T, 2) of plans or forecasts, and the ego's pose."""
 
     def changed(dataset: DeepAccident, token: str, given: list[Any]) -> list[Any]:
         paths = []
         for each in given:
             name = "path" if isinstance(each, Plan) else "paths"
-            times, places = change(each.times, getattr(each, name), dataset.world_from(token, "ego"))
+            times, places = change(
+                each.times, getattr(each, name), dataset.world_from(token, "ego")
+            )
             paths.append(replace(each, times=times, **{name: places}))
         return paths
 
@@ -210,10 +241,16 @@ def of_yaw(change: Callable[[np.ndarray], np.ndarray]) -> Change:
 
 
 PATHS: dict[str, Change] = {
-    **{name: of_paths(lambda times, at, _, by=by: (times, at @ np.transpose(by))) for name, by in AXES.items()},
+    **{
+        name: of_paths(lambda times, at, _, by=by: (times, at @ np.transpose(by)))
+        for name, by in AXES.items()
+    },
     "world frame for ego frame": of_paths(in_the_world),
     "steps for places": of_paths(
-        lambda times, at, _: (times, np.diff(at, axis=-2, prepend=2 * at[..., :1, :] - at[..., 1:2, :]))
+        lambda times, at, _: (
+            times,
+            np.diff(at, axis=-2, prepend=2 * at[..., :1, :] - at[..., 1:2, :]),
+        )
     ),
     "one step late": of_paths(late),
     "times in frames": of_paths(lambda times, at, _: (10 * times, at)),
@@ -221,7 +258,11 @@ PATHS: dict[str, Change] = {
 }
 """Mistakes of plans and forecasts alike."""
 ON_CURVES: dict[str, Change] = {
-    **{name: PATHS[name] for name in AXES if name not in ("x mirrored", "turned left", "turned right")},
+    **{
+        name: PATHS[name]
+        for name in AXES
+        if name not in ("x mirrored", "turned left", "turned right")
+    },
     "yaw in degrees": of_yaw(np.rad2deg),
     "yaw clockwise": of_yaw(np.negative),
     "yaw clockwise from y": of_yaw(lambda yaw: np.pi / 2 - yaw),
@@ -238,7 +279,9 @@ def in_ego(matrix: list[list[int]]) -> Change:
 def in_degrees(_: DeepAccident, __: str, given: DetectedBoxes) -> DetectedBoxes:
     boxes = given.boxes
     return DetectedBoxes.from_arrays(
-        *(boxes.center, boxes.size, np.rad2deg(boxes.yaw), given.scores), category=boxes.category, frame="world"
+        *(boxes.center, boxes.size, np.rad2deg(boxes.yaw), given.scores),
+        category=boxes.category,
+        frame="world",
     )
 
 
@@ -250,13 +293,16 @@ def of_earlier(dataset: DeepAccident, token: str, _: DetectedBoxes) -> DetectedB
 
 def of_accidents(**changes: Callable[[Any], Any]) -> Change:
     return lambda _, __, given: [
-        replace(each, **{name: by(getattr(each, name)) for name, by in changes.items()}) for each in given
+        replace(each, **{name: by(getattr(each, name)) for name, by in changes.items()})
+        for each in given
     ]
 
 
 def in_world(dataset: DeepAccident, token: str, given: list[Accident]) -> list[Accident]:
     def moved(positions: np.ndarray) -> np.ndarray:
-        return dataset.world_from(token, "ego").apply(np.column_stack([positions, np.zeros(2)]))[:, :2]
+        return dataset.world_from(token, "ego").apply(np.column_stack([positions, np.zeros(2)]))[
+            :, :2
+        ]
 
     return [replace(each, positions=moved(each.positions)) for each in given]
 
@@ -279,8 +325,12 @@ PLANTED: dict[tuple[str, str], Change] = {
     ("accidents", "all 20 scores are 1"): of_accidents(score=lambda _: 1.0),
     ("accidents", "all 40 predictions looked at are empty"): lambda _, __, ___: [],
     **{("boxes", name): in_ego(matrix) for name, matrix in AXES.items()},
-    ("boxes", "ego frame for world frame"): of_centers(lambda center, ego, _: ego.inverse().apply(center)),
-    ("boxes", "LiDAR frame for world frame"): of_centers(lambda center, _, lidar: lidar.inverse().apply(center)),
+    ("boxes", "ego frame for world frame"): of_centers(
+        lambda center, ego, _: ego.inverse().apply(center)
+    ),
+    ("boxes", "LiDAR frame for world frame"): of_centers(
+        lambda center, _, lidar: lidar.inverse().apply(center)
+    ),
     ("boxes", "LiDAR frame for ego frame"): of_centers(
         lambda center, ego, lidar: ego.apply(lidar.inverse().apply(center))
     ),
@@ -293,23 +343,33 @@ PLANTED: dict[tuple[str, str], Change] = {
     ("boxes", "one step late"): of_earlier,
     **{
         ("boxes", f"sizes in the order {', '.join(names)}"): of_boxes(
-            size=lambda size, names=names: size[:, [("length", "width", "height").index(each) for each in names]]
+            size=lambda size, names=names: size[
+                :, [("length", "width", "height").index(each) for each in names]
+            ]
         )
         for names in list(permutations(("length", "width", "height")))[1:]
     },
     ("boxes", "half sizes"): of_boxes(size=lambda size: size / 2),
     ("boxes", "double sizes"): of_boxes(size=lambda size: 2 * size),
     ("boxes", "sizes do not fit"): of_boxes(size=lambda size: 100 * size),
-    ("boxes", "z of the lower face"): of_height(lambda boxes: boxes.center[:, 2] - boxes.size[:, 2] / 2),
-    ("boxes", "z of the upper face"): of_height(lambda boxes: boxes.center[:, 2] + boxes.size[:, 2] / 2),
+    ("boxes", "z of the lower face"): of_height(
+        lambda boxes: boxes.center[:, 2] - boxes.size[:, 2] / 2
+    ),
+    ("boxes", "z of the upper face"): of_height(
+        lambda boxes: boxes.center[:, 2] + boxes.size[:, 2] / 2
+    ),
     ("boxes", "heights do not fit"): of_height(lambda boxes: boxes.center[:, 2] - 5),
     ("boxes", "velocities per frame"): of_boxes(velocity=lambda velocity: velocity / 10),
     ("boxes", "velocities per step"): of_boxes(velocity=lambda velocity: velocity / 2),
     ("boxes", "headings look random"): in_degrees,
-    ("boxes", "classes swapped"): of_boxes(category=lambda category: np.array([1, 2, 3, 4, 5, 0])[category]),
+    ("boxes", "classes swapped"): of_boxes(
+        category=lambda category: np.array([1, 2, 3, 4, 5, 0])[category]
+    ),
     **{("forecasts", name): change for name, change in PATHS.items()},
     **{("plans", name): change for name, change in PATHS.items() if name not in ON_CURVES},
-    ("plans", "one step early"): of_paths(lambda times, at, _: (times, np.vstack([at[1:], 2 * at[-1] - at[-2]]))),
+    ("plans", "one step early"): of_paths(
+        lambda times, at, _: (times, np.vstack([at[1:], 2 * at[-1] - at[-2]]))
+    ),
     ("plans", "yaw from y"): of_yaw(lambda yaw: yaw - np.pi / 2),
     ("plans", "yaw backwards"): of_yaw(lambda yaw: yaw - np.pi),
     ("plans", "headings look random"): of_yaw(lambda yaw: yaw + np.pi / 3),
@@ -335,7 +395,10 @@ class Loaded:
 def test_each_mistake_is_named_as_exactly_that(
     da_motion: DeepAccident, right: dict[str, dict[str, Any]], kind: str, mistake: str
 ) -> None:
-    planted = {token: PLANTED[kind, mistake](da_motion, token, given) for token, given in right[kind].items()}
+    planted = {
+        token: PLANTED[kind, mistake](da_motion, token, given)
+        for token, given in right[kind].items()
+    }
     report = sanity(da_motion, kind, planted)
     (warning,) = report.warnings
     assert warning.startswith(mistake)
@@ -353,12 +416,21 @@ def test_mistakes_of_plans_on_curves(monkeypatch: pytest.MonkeyPatch, mistake: s
     ego = SE3.from_yaw(0.7, (50.0, 30.0, 0.0))
     dataset: Any = SimpleNamespace(world_from=lambda _, __: ego, places=())
     plan = Plan(times=seconds[5:31:5], path=recorded[5:31:5, :2], yaw=yaw[5:31:5])
-    change = {**PATHS, **ON_CURVES, **{name: PLANTED["plans", name] for name in ("yaw from y", "yaw backwards")}}
+    change = {
+        **PATHS,
+        **ON_CURVES,
+        **{name: PLANTED["plans", name] for name in ("yaw from y", "yaw backwards")},
+    }
     plans = change[mistake](dataset, "", [plan]) if mistake else [plan]
     results: Any = MemoryResults("planning", {f"{number}": plans for number in range(20)})
-    monkeypatch.setattr(sanity_module, "SampleLoader", lambda *_: Loaded(dataset, results, plans, driven))
+    monkeypatch.setattr(
+        sanity_module, "SampleLoader", lambda *_: Loaded(dataset, results, plans, driven)
+    )
     report = check_sanity(
-        dataset, results, EvaluationSetup(task="planning", protocol="clean"), list(results.predictions)
+        dataset,
+        results,
+        EvaluationSetup(task="planning", protocol="clean"),
+        list(results.predictions),
     )
     assert [each.partition(":")[0] for each in report.warnings] == [mistake] * bool(mistake)
     assert report.samples == 20
@@ -375,8 +447,12 @@ def test_right_predictions_raise_no_suspicion(
     assert json.loads(json.dumps(report.as_dict(), allow_nan=False))["warnings"] == []
 
 
-def test_the_last_of_several_heads_counts(da_motion: DeepAccident, right: dict[str, dict[str, Any]]) -> None:
-    mirrored = of_segmentation(lambda logits: np.ascontiguousarray(1 / (1 + np.exp(5 - logits[..., ::-1]))))
+def test_the_last_of_several_heads_counts(
+    da_motion: DeepAccident, right: dict[str, dict[str, Any]]
+) -> None:
+    mirrored = of_segmentation(
+        lambda logits: np.ascontiguousarray(1 / (1 + np.exp(5 - logits[..., ::-1])))
+    )
     predictions = {
         token: replace(each, heads=(*mirrored(da_motion, token, each).heads, *each.heads))
         for token, each in right["heads"].items()
@@ -384,10 +460,13 @@ def test_the_last_of_several_heads_counts(da_motion: DeepAccident, right: dict[s
     assert sanity(da_motion, "heads", predictions).warnings == ()
 
 
-def shown(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[DeepAccident, str], MotionOutput]:
+def shown(
+    change: Callable[[np.ndarray], np.ndarray],
+) -> Callable[[DeepAccident, str], MotionOutput]:
     """Perfect maps, changed."""
     return lambda dataset, token: instances_of(
-        change(dataset.motion_labels(token).to_present("bilinear").instance), dataset.motion_labels(token).config.grid
+        change(dataset.motion_labels(token).to_present("bilinear").instance),
+        dataset.motion_labels(token).config.grid,
     )
 
 
@@ -396,32 +475,51 @@ def at_another_speed(plan: Plan, factor: float) -> Plan:
 
 
 def moved_boxes(detected: DetectedBoxes) -> DetectedBoxes:
-    return replace(detected, boxes=replace(detected.boxes, center=detected.boxes.center + np.array([30, 0, 0])))
+    return replace(
+        detected, boxes=replace(detected.boxes, center=detected.boxes.center + np.array([30, 0, 0]))
+    )
 
 
 HONEST: dict[str, tuple[str, Callable[[DeepAccident, str], Any]]] = {
     "baseline's maps": ("maps", predict_motion),
-    "baseline's maps, turning": ("maps", lambda da, token: predict_motion(da, token, model="constant_turn_rate")),
+    "baseline's maps, turning": (
+        "maps",
+        lambda da, token: predict_motion(da, token, model="constant_turn_rate"),
+    ),
     "nobody moves": ("maps", shown(lambda maps: maps[[0, 0, 0, 0, 0]])),
     "half as fast": ("maps", shown(lambda maps: maps[[0, 0, 1, 1, 2]])),
     "slow at first": ("maps", shown(lambda maps: maps[[0, 0, 1, 2, 2]])),
     "twice as fast": ("maps", shown(lambda maps: maps[[0, 2, 4, 4, 4]])),
     "elsewhere": ("maps", shown(lambda maps: np.roll(maps, (37, 61), (1, 2)))),
     "baseline's accidents": ("accidents", predict_accidents),
-    "baseline's accidents, all agents": ("accidents", lambda da, token: predict_accidents(da, token, agents=None)),
+    "baseline's accidents, all agents": (
+        "accidents",
+        lambda da, token: predict_accidents(da, token, agents=None),
+    ),
     "the same accident always": (
         "accidents",
-        lambda _, token: [Accident(positions=np.array([[10, 0], [13, 1]]), time=1.0, score=len(token))],
+        lambda _, token: [
+            Accident(positions=np.array([[10, 0], [13, 1]]), time=1.0, score=len(token))
+        ],
     ),
     "baseline's plans": ("plans", lambda da, token: [predict_plan(da, token)]),
     "standing": ("plans", lambda da, token: [predict_plan(da, token, model="standing")]),
     "slow plans": ("plans", lambda da, token: [at_another_speed(recorded_plan(da, token), 0.8)]),
     "fast plans": ("plans", lambda da, token: [at_another_speed(recorded_plan(da, token), 1.2)]),
     "baseline's forecasts": ("forecasts", predict_forecasts),
-    "standing actors": ("forecasts", lambda da, token: predict_forecasts(da, token, model="standing")),
-    "boxes elsewhere": ("boxes", lambda da, token: moved_boxes(predict_detections(da, token, agents=None))),
+    "standing actors": (
+        "forecasts",
+        lambda da, token: predict_forecasts(da, token, model="standing"),
+    ),
+    "boxes elsewhere": (
+        "boxes",
+        lambda da, token: moved_boxes(predict_detections(da, token, agents=None)),
+    ),
     "baseline's boxes": ("boxes", predict_detections),
-    "baseline's boxes, all agents": ("boxes", lambda da, token: predict_detections(da, token, agents=None)),
+    "baseline's boxes, all agents": (
+        "boxes",
+        lambda da, token: predict_detections(da, token, agents=None),
+    ),
 }
 
 
@@ -436,17 +534,25 @@ def test_baselines_and_bad_predictions_raise_no_suspicion(
     assert [each for each in report.warnings if "scores" not in each] == []
 
 
-def test_of_too_little_nothing_is_said(da_motion: DeepAccident, right: dict[str, dict[str, Any]]) -> None:
+def test_of_too_little_nothing_is_said(
+    da_motion: DeepAccident, right: dict[str, dict[str, Any]]
+) -> None:
     token = max(right["plans"])  # at the end of the recording
     report = sanity(da_motion, "plans", {token: right["plans"][token]})
     assert (report.sought, report.warnings) == ((), ())
-    assert report.to_text().endswith("Cannot say whether a mistake was made: there is too little to compare.")
+    assert report.to_text().endswith(
+        "Cannot say whether a mistake was made: there is too little to compare."
+    )
 
 
 def test_nothing_to_look_at(da_motion: DeepAccident, right: dict[str, dict[str, Any]]) -> None:
     results, setup = MemoryResults("motion", right["maps"]), EvaluationSetup(task="motion")
     assert_refused(
-        (lambda: check_sanity(da_motion, results, setup, []), EvaluationError, "there is no sample to look at"),
+        (
+            lambda: check_sanity(da_motion, results, setup, []),
+            EvaluationError,
+            "there is no sample to look at",
+        ),
     )
 
 
@@ -481,7 +587,9 @@ def test_from_which_shares_on_a_mistake_is_suspected(
 def test_the_worst_measurement_counts_and_the_best_mistake_of_a_group() -> None:
     two = np.array([[80.0, 20.0], [100.0, 100.0], [0.0, 0.0], [100.0, 100.0]])
     one = np.where([[0, 1], [0, 0], [0, 0], [0, 0]], 30.0, two)
-    (warning,) = mistakes_of({"x mirrored": two, "y mirrored": one, "one step late": tally_of(90, 0, 100)}, "motion")
+    (warning,) = mistakes_of(
+        {"x mirrored": two, "y mirrored": one, "one step late": tally_of(90, 0, 100)}, "motion"
+    )
     assert warning.startswith("y mirrored: ")  # and nothing of time beside it
     assert "(30% of the truth" in warning
     one_missed = np.array([[100.0, 0.0], [100.0, 1.0], [0.0, 0.0], [100.0, 1.0]])
@@ -492,8 +600,12 @@ def test_the_worst_measurement_counts_and_the_best_mistake_of_a_group() -> None:
 def test_when_headings_look_random(right: int, every: int, *, told: bool) -> None:
     found = {"heading": tally_of(0, right, every)}
     warnings = list(mistakes_of({**found, "place": tally_of(0, every, 5 * every)}, "detection"))
-    assert [each.split(",")[0] for each in warnings] == [f"headings look random: {right} of {every} are right"] * told
-    assert list(mistakes_of({**found, "place": tally_of(0, every, 6 * every)}, "detection")) == []  # found by chance
+    assert [each.split(",")[0] for each in warnings] == [
+        f"headings look random: {right} of {every} are right"
+    ] * told
+    assert (
+        list(mistakes_of({**found, "place": tally_of(0, every, 6 * every)}, "detection")) == []
+    )  # found by chance
 
 
 @pytest.mark.parametrize(
@@ -506,11 +618,17 @@ def test_when_headings_look_random(right: int, every: int, *, told: bool) -> Non
         ([{"scores": (1.0, 0.5)}], True, []),
         ([{"empty": True}, {"empty": True}], True, ["all 2 predictions looked at are empty"]),
         ([{"empty": True}, {}], True, []),
-        ([{"empty": True}, {"probabilities": True}], True, ["all values of the heads' segmentation are between 0 and"]),
+        (
+            [{"empty": True}, {"probabilities": True}],
+            True,
+            ["all values of the heads' segmentation are between 0 and"],
+        ),
         ([{"probabilities": False}, {"probabilities": True}], True, []),
     ],
 )
-def test_what_shows_without_labels(seen: list[dict[str, Any]], *, ranked: bool, told: list[str]) -> None:
+def test_what_shows_without_labels(
+    seen: list[dict[str, Any]], *, ranked: bool, told: list[str]
+) -> None:
     found = list(facts_of([Seen(tallies={}, **each) for each in seen], ranked=ranked))
     assert [each[: len(start)] for each, start in zip(found, told, strict=True)] == told
 
@@ -519,7 +637,10 @@ def test_what_shows_without_labels(seen: list[dict[str, Any]], *, ranked: bool, 
     ("numbers", "swapped"),
     [
         ({(0, 1): 5, (1, 0): 5}, [5, 5]),
-        ({(0, 1): 4, (1, 0): 5, (2, 2): 2}, []),  # a class with four boxes tells nothing, and one alone is too few
+        (
+            {(0, 1): 4, (1, 0): 5, (2, 2): 2},
+            [],
+        ),  # a class with four boxes tells nothing, and one alone is too few
         ({(0, 1): 5, (2, 2): 5}, [5]),
         ({(0, 1): 5, (2, 2): 6}, []),
         ({(0, 2): 9, (1, 2): 9}, []),  # both for one
@@ -550,6 +671,8 @@ def test_classes_that_are_swapped(numbers: dict[tuple[int, int], int], swapped: 
 def test_only_what_cannot_be_right_in_both_ways_tells(
     undone: float, given: float, true: float, hits: list[int]
 ) -> None:
-    found = tallies_of("time", {"late": np.array([undone])}, np.array([given]), np.array([true]), 1.0)
+    found = tallies_of(
+        "time", {"late": np.array([undone])}, np.array([given]), np.array([true]), 1.0
+    )
     assert found["late"][:, 0].tolist() == hits
     assert found["time"][2:, 0].tolist() == [given - true <= 1, np.isfinite(true)]

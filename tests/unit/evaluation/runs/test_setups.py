@@ -21,7 +21,12 @@ from deepaccident_devkit.evaluation import (
 )
 from deepaccident_devkit.evaluation.predictions import label_config
 from deepaccident_devkit.evaluation.results import Results, ResultsWriter, read_results
-from deepaccident_devkit.evaluation.runs import Coverage, SampleSelection, coverage, default_selection
+from deepaccident_devkit.evaluation.runs import (
+    Coverage,
+    SampleSelection,
+    coverage,
+    default_selection,
+)
 from deepaccident_devkit.evaluation.runs.setups import (
     EvaluationSetup,
     SampleLoader,
@@ -58,8 +63,16 @@ class TestSetup:
                 r"protocol of motion: expected one of released, paper, found 'boxes'",
             ),
             ({"task": "motion", "horizon": 0.0}, ConfigError, "above 0, at most 100, found 0.0"),
-            ({"task": "motion", "horizon": float("nan")}, ConfigError, "above 0, at most 100, found nan"),
-            ({"task": "motion", "switches": {"gap": 1}}, ChoiceError, r"these rules have no switch 'gap'"),
+            (
+                {"task": "motion", "horizon": float("nan")},
+                ConfigError,
+                "above 0, at most 100, found nan",
+            ),
+            (
+                {"task": "motion", "switches": {"gap": 1}},
+                ChoiceError,
+                r"these rules have no switch 'gap'",
+            ),
         ],
     )
     def test_refused(self, named: dict[str, Any], error: type[Exception], sentence: str) -> None:
@@ -77,11 +90,15 @@ class TestLoader:
     def motion(self, token: str, tmp_path: Path) -> Results:
         """Nothing predicted, on cells of 1 m, every second of a second."""
         grid = BevGrid((-50, 50, 1.0), (-50, 50, 1.0), "fiery")
-        with ResultsWriter(tmp_path / "motion", "motion", grid=grid, step=1.0, labels="clean") as writer:
+        with ResultsWriter(
+            tmp_path / "motion", "motion", grid=grid, step=1.0, labels="clean"
+        ) as writer:
             writer.add(token, instances_of(np.zeros((3, *grid.shape), int), grid))
         return read_results(tmp_path / "motion")
 
-    def test_motion_has_labels_of_its_form(self, da_motion: DeepAccident, motion: Results, token: str) -> None:
+    def test_motion_has_labels_of_its_form(
+        self, da_motion: DeepAccident, motion: Results, token: str
+    ) -> None:
         setup = EvaluationSetup(task="motion", switches={"labels": "clean"}, horizon=1.0)
         prediction, label = SampleLoader(da_motion, motion, setup)(token)
         assert isinstance(label, MotionLabels)
@@ -90,13 +107,20 @@ class TestLoader:
         assert config.grid == prediction.grid
 
     def test_the_protocol_says_which_labels_and_else_the_results(self, motion: Results) -> None:
-        for task, protocol, expected in (("accident", "paper", "released"), ("accident", "boxes", "clean")):
+        for task, protocol, expected in (
+            ("accident", "paper", "released"),
+            ("accident", "boxes", "clean"),
+        ):
             assert (
-                label_config(EvaluationSetup(task=task, protocol=protocol).rules, motion.form, horizon=2.0).protocol
+                label_config(
+                    EvaluationSetup(task=task, protocol=protocol).rules, motion.form, horizon=2.0
+                ).protocol
                 == expected
             )
 
-    def test_accidents_have_their_context(self, da_motion: DeepAccident, token: str, tmp_path: Path) -> None:
+    def test_accidents_have_their_context(
+        self, da_motion: DeepAccident, token: str, tmp_path: Path
+    ) -> None:
         alarm = Accident(positions=np.zeros((2, 2)), time=1.0)
         with ResultsWriter(tmp_path / "accidents.json", "accident") as writer:
             writer.add(token, [alarm])
@@ -119,15 +143,23 @@ class TestLoader:
         setup = EvaluationSetup(task="detection", protocol="released")
         found, truth = SampleLoader(da_motion, read_results(tmp_path / "boxes.json"), setup)(token)
         assert found.boxes.frame == truth.frame == "lidar"
-        np.testing.assert_allclose(found.boxes.center, da_motion.boxes(token, "lidar").center, atol=1e-6)
-        assert truth.center.tolist() == detection_truth(da_motion, token, setup.rules).center.tolist()
+        np.testing.assert_allclose(
+            found.boxes.center, da_motion.boxes(token, "lidar").center, atol=1e-6
+        )
+        assert (
+            truth.center.tolist() == detection_truth(da_motion, token, setup.rules).center.tolist()
+        )
 
-    def test_refused(self, da_motion: DeepAccident, motion: Results, token: str, tmp_path: Path) -> None:
+    def test_refused(
+        self, da_motion: DeepAccident, motion: Results, token: str, tmp_path: Path
+    ) -> None:
         with ResultsWriter(tmp_path / "a.json", "accident") as writer:
             writer.add(token, [])
         assert_refused(
             (
-                lambda: SampleLoader(da_motion, read_results(tmp_path / "a.json"), EvaluationSetup(task="accident")),
+                lambda: SampleLoader(
+                    da_motion, read_results(tmp_path / "a.json"), EvaluationSetup(task="accident")
+                ),
                 EvaluationError,
                 ("a.json: holds explicit accidents", "protocol 'released'"),
             ),
@@ -137,7 +169,9 @@ class TestLoader:
                 r"holds motion results; detection is evaluated from detection results",
             ),
             (
-                lambda: SampleLoader(da_motion, motion, EvaluationSetup(task="motion", horizon=2.5)),
+                lambda: SampleLoader(
+                    da_motion, motion, EvaluationSetup(task="motion", horizon=2.5)
+                ),
                 EvaluationError,
                 r"look 2 s ahead \(3 frames, 1 s apart, .*, less than the horizon of 2.5 s; add",
             ),
@@ -145,9 +179,14 @@ class TestLoader:
 
 
 def test_scope_agents_and_horizon_choose(da_motion: DeepAccident) -> None:
-    one = SampleSelection(split="train", scope="all", agents=("infrastructure",), horizon=1.0).tokens(da_motion)
+    one = SampleSelection(
+        split="train", scope="all", agents=("infrastructure",), horizon=1.0
+    ).tokens(da_motion)
     both = {f"type1_subtype1_{end}" for end in ("accident", "normal")}
-    assert ({token.split("/")[0] for token in one}, {agent_of(token) for token in one}) == (both, {"infrastructure"})
+    assert ({token.split("/")[0] for token in one}, {agent_of(token) for token in one}) == (
+        both,
+        {"infrastructure"},
+    )
     assert [int(token[-3:]) for token in one] == [25, 30] * 2
 
 
@@ -177,9 +216,21 @@ def test_agents_are_put_in_order() -> None:
 def test_wrong_choices_and_a_horizon_between_samples(da_b: DeepAccident) -> None:
     chosen = partial(SampleSelection, split="val")
     assert_refused(
-        (partial(chosen, samples="some"), ChoiceError, ("samples: expected one of evaluate, all", "'some'")),
-        (partial(chosen, scope="normal"), ChoiceError, ("scope: expected one of accident, all", "'normal'")),
-        (partial(chosen, agents=("ego",)), ChoiceError, ("agents: expected one of", "did you mean 'ego_vehicle'")),
+        (
+            partial(chosen, samples="some"),
+            ChoiceError,
+            ("samples: expected one of evaluate, all", "'some'"),
+        ),
+        (
+            partial(chosen, scope="normal"),
+            ChoiceError,
+            ("scope: expected one of accident, all", "'normal'"),
+        ),
+        (
+            partial(chosen, agents=("ego",)),
+            ChoiceError,
+            ("agents: expected one of", "did you mean 'ego_vehicle'"),
+        ),
         (
             partial(chosen, agents=()),
             ChoiceError,
@@ -209,14 +260,26 @@ MISSING, EXTRA, UNKNOWN = ({"missing": ("a", "b")}, {"extra": ("c",)}, {"unknown
     [
         ([], ["all 6 samples have a prediction, and nothing else has"]),
         ([MISSING], ["without a prediction: 2 of 6 samples (a, b)"]),
-        ([EXTRA], ["1 prediction of samples that are not evaluated (c)", "leave them out with --allow-partial"]),
+        (
+            [EXTRA],
+            [
+                "1 prediction of samples that are not evaluated (c)",
+                "leave them out with --allow-partial",
+            ],
+        ),
         ([UNKNOWN], ["3 predictions of no sample of this release (d, e, f)"]),
-        ([MISSING, EXTRA], ["without a prediction: 2 of 6", "1 prediction of samples that are not evaluated (c)"]),
+        (
+            [MISSING, EXTRA],
+            ["without a prediction: 2 of 6", "1 prediction of samples that are not evaluated (c)"],
+        ),
         ([EXTRA, UNKNOWN], ["1 prediction of samples", "3 predictions of no sample"]),
         ([{"missing": tuple("abcd")}], ["without a prediction: 4 of 6 samples (a, b, c, …)"]),
         (
             [MISSING, {"splits": ("train", "val"), "agents": ("ego_vehicle",)}],
-            ["without a prediction: 2", "the predictions are of --split train, val --agents ego_vehicle"],
+            [
+                "without a prediction: 2",
+                "the predictions are of --split train, val --agents ego_vehicle",
+            ],
         ),
     ],
 )
@@ -236,8 +299,14 @@ def test_missing_extra_and_unknown_three_of_each(
     da_b: DeepAccident, selection: SampleSelection, expected: list[str]
 ) -> None:
     extra = replace(selection, agents=("ego_vehicle_behind",)).tokens(da_b)
-    found = coverage(da_b, [*expected[4:], *extra, "mine/1", "mine/2", "mine/3", "mine/4"], selection)
-    assert (found.expected, found.missing, found.extra) == (6, tuple(expected[:4]), tuple(sorted(extra)))
+    found = coverage(
+        da_b, [*expected[4:], *extra, "mine/1", "mine/2", "mine/3", "mine/4"], selection
+    )
+    assert (found.expected, found.missing, found.extra) == (
+        6,
+        tuple(expected[:4]),
+        tuple(sorted(extra)),
+    )
     assert found.unknown == ("mine/1", "mine/2", "mine/3", "mine/4")
 
 
@@ -249,7 +318,11 @@ def test_missing_extra_and_unknown_three_of_each(
         ({"horizon": 1.0, "scope": "all"}, {"horizon": 2.0}, "--horizon 1.0 --scope all"),
         ({"samples": "all", "scope": "all"}, {}, "--samples all --scope all"),
         ({}, {"samples": "all", "scope": "all"}, "--samples evaluate --scope accident"),
-        ({"horizon": 3.0}, {"samples": "all", "scope": "all"}, "--horizon 3.0 --samples evaluate --scope accident"),
+        (
+            {"horizon": 3.0},
+            {"samples": "all", "scope": "all"},
+            "--horizon 3.0 --samples evaluate --scope accident",
+        ),
         ({}, {"scope": "all"}, "--scope accident"),
         ({"agents": ("ego_vehicle",)}, {}, "--agents ego_vehicle"),
         (
@@ -272,7 +345,9 @@ def test_the_options_that_are_missing(
     predicted = SampleSelection(**{"split": "train", **made}).tokens(da_motion)
     found = coverage(da_motion, predicted, selection)
     assert (found.options, found.is_complete) == (options, False)
-    assert found.to_text().startswith(f"the predictions are of the samples of {options}: ") == bool(options)
+    assert found.to_text().startswith(f"the predictions are of the samples of {options}: ") == bool(
+        options
+    )
     some = coverage(da_motion, [*predicted[:1], *predicted[2:]], selection)  # of no list of options
     assert (some.options, some.is_complete) == ("", False)
 
@@ -289,7 +364,9 @@ def results_of(dataset: DeepAccident, path: Path, note: object) -> Results:
     return read_results(path)
 
 
-def test_other_recordings_of_the_same_names_are_refused(da_b: DeepAccident, own_release: Path, tmp_path: Path) -> None:
+def test_other_recordings_of_the_same_names_are_refused(
+    da_b: DeepAccident, own_release: Path, tmp_path: Path
+) -> None:
     first, second, *_ = tokens = [each["token"] for each in da_b.scenario]
     note = release_note(da_b, tokens)
     assert {*note["recordings"]} == {*tokens}
@@ -306,9 +383,13 @@ def test_other_recordings_of_the_same_names_are_refused(da_b: DeepAccident, own_
             (str(results.path), "1 of 6", first, "check index DATAROOT"),
         )
     )
-    check_recordings(results_of(da_b, tmp_path / "second.json", release_note(da_b, [second])), other)
+    check_recordings(
+        results_of(da_b, tmp_path / "second.json", release_note(da_b, [second])), other
+    )
 
 
 def test_what_is_not_known_is_not_compared(da_b: DeepAccident, tmp_path: Path) -> None:
-    for number, note in enumerate(({}, None, "v1", {"version": "v1"}, {"recordings": {"elsewhere/x": "0"}})):
+    for number, note in enumerate(
+        ({}, None, "v1", {"version": "v1"}, {"recordings": {"elsewhere/x": "0"}})
+    ):
         check_recordings(results_of(da_b, tmp_path / f"{number}.json", note), da_b)

@@ -20,7 +20,9 @@ def bundle(name: str, labels: str, **headlines: str) -> Any:
 
 
 def test_a_column_has_the_rules_and_the_numbers_of_its_evaluation() -> None:
-    report = side_by_side([bundle("road", "fiery", iou="20.1 %", vpq="3.0 %"), bundle("ours", "clean", iou="41.0 %")])
+    report = side_by_side(
+        [bundle("road", "fiery", iou="20.1 %", vpq="3.0 %"), bundle("ours", "clean", iou="41.0 %")]
+    )
     assert report.rows == (
         ("evaluation", "road", "ours"),
         ("release", "data/road, v1", "data/ours, v1"),

@@ -39,7 +39,9 @@ SUMMARY_CHANGED = "files.json: metrics_summary.json"
 
 @pytest.fixture
 def bundle(run: EvaluationRun, tmp_path: Path) -> Path:
-    return save_run(run.broken_down(["all", "agent"], Resampling(resamples=10)), tmp_path / "bundle")
+    return save_run(
+        run.broken_down(["all", "agent"], Resampling(resamples=10)), tmp_path / "bundle"
+    )
 
 
 def verify(bundle: Path, dataset: DeepAccident, **named: Any) -> Verification:
@@ -77,17 +79,23 @@ def test_nothing_differs(bundle: Path, da_b: DeepAccident) -> None:
         ("forecasting", "clean"),
     ],
 )
-def test_nothing_differs_whatever_the_task(da_b: DeepAccident, tmp_path: Path, task: str, protocol: str) -> None:
+def test_nothing_differs_whatever_the_task(
+    da_b: DeepAccident, tmp_path: Path, task: str, protocol: str
+) -> None:
     """With groups, another horizon, and numbers that only some samples have."""
     setup = EvaluationSetup(task=task, protocol=protocol, horizon=0.5)
     selection = default_selection(setup, "val", agents=("ego_vehicle",), scope="all")
     run, results = stored_run(da_b, setup, tmp_path / "results", selection)
-    bundle = save_run(run.broken_down(("all", "agent"), Resampling(resamples=10)), tmp_path / "bundle")
+    bundle = save_run(
+        run.broken_down(("all", "agent"), Resampling(resamples=10)), tmp_path / "bundle"
+    )
     verification = verify(bundle, da_b, results=results)
     assert (verification.is_same, verification.differences) == (True, ())
 
 
-def test_with_results_inside_and_elsewhere(run: EvaluationRun, tmp_path: Path, own_release: Path) -> None:
+def test_with_results_inside_and_elsewhere(
+    run: EvaluationRun, tmp_path: Path, own_release: Path
+) -> None:
     bundle = save_run(run, tmp_path / "bundle", include_results=True)
     moved = tmp_path / "moved"
     shutil.move(bundle, moved)
@@ -96,7 +104,11 @@ def test_with_results_inside_and_elsewhere(run: EvaluationRun, tmp_path: Path, o
 
 
 def test_a_partial_one(
-    da_b: DeepAccident, selection: SampleSelection, tmp_path: Path, write_accidents: Write, run: EvaluationRun
+    da_b: DeepAccident,
+    selection: SampleSelection,
+    tmp_path: Path,
+    write_accidents: Write,
+    run: EvaluationRun,
 ) -> None:
     results = write_accidents(tmp_path / "some.json", selection.tokens(da_b)[1:])
     part = evaluate_results(da_b, results, run.setup, selection, allow_partial=True, workers=1)
@@ -112,17 +124,26 @@ def test_a_partial_one(
         ("environment/numpy", "1.0", []),
     ],
 )
-def test_a_value_of_the_summary(bundle: Path, da_b: DeepAccident, place: str, stored: object, named: list[str]) -> None:
+def test_a_value_of_the_summary(
+    bundle: Path, da_b: DeepAccident, place: str, stored: object, named: list[str]
+) -> None:
     """To the last bit; another numpy is a note."""
 
     def change(summary: Any) -> None:
         *parts, last = place.split("/")
-        reduce(lambda at, part: at[int(part) if part.isdigit() else part], parts, summary)[last] = stored
+        reduce(lambda at, part: at[int(part) if part.isdigit() else part], parts, summary)[last] = (
+            stored
+        )
 
     changed(bundle / "metrics_summary.json", change)
     verification = verify(bundle, da_b)
-    assert found(verification) == [SUMMARY_CHANGED, *(f"metrics_summary.json: {each}" for each in named)]
-    assert any("evaluated with numpy 1.0, verified with " in note for note in verification.notes) != bool(named)
+    assert found(verification) == [
+        SUMMARY_CHANGED,
+        *(f"metrics_summary.json: {each}" for each in named),
+    ]
+    assert any(
+        "evaluated with numpy 1.0, verified with " in note for note in verification.notes
+    ) != bool(named)
     assert verification.samples == 6
 
 
@@ -130,13 +151,20 @@ def test_a_value_of_the_summary(bundle: Path, da_b: DeepAccident, place: str, st
 def test_a_file_of_a_scenario(bundle: Path, own_release: Path, kind: str) -> None:
     """Also before the index knows of it: then there are no numbers of the files that are there."""
     opened = DeepAccident(dataroot=own_release, verbose=False)
-    path = min(own_release.glob("val/*/meta/*.txt" if kind == "meta" else f"val/*/ego_vehicle/{kind}/*/*"))
+    path = min(
+        own_release.glob("val/*/meta/*.txt" if kind == "meta" else f"val/*/ego_vehicle/{kind}/*/*")
+    )
     path.write_bytes(path.read_bytes() + b"\n")
     token, verification = min(opened.split_scenarios("val")), verify(bundle, opened)
     assert found(verification) == ["all numbers"]
     assert "the index is out of date" in verification.notes[0]
-    verification = verify(bundle, DeepAccident(dataroot=own_release, index_dir=own_release / "anew", verbose=False))
-    assert found(verification) == ["metrics_summary.json: release/fingerprint", f"scenarios.json: {token}/{kind}"]
+    verification = verify(
+        bundle, DeepAccident(dataroot=own_release, index_dir=own_release / "anew", verbose=False)
+    )
+    assert found(verification) == [
+        "metrics_summary.json: release/fingerprint",
+        f"scenarios.json: {token}/{kind}",
+    ]
 
 
 def one_more_point(release: Path) -> None:
@@ -152,13 +180,23 @@ def without_boxes(bundle: Path) -> None:
     """Make it a bundle of devkit 1.0.0, which kept the hashes of whole files only."""
     path = bundle / "scenarios.json"
     changed(
-        path, lambda stored: [each.pop(name) for each in stored["scenarios"].values() for name in ("boxes", "points")]
+        path,
+        lambda stored: [
+            each.pop(name) for each in stored["scenarios"].values() for name in ("boxes", "points")
+        ],
     )
-    changed(bundle / "files.json", lambda listed: listed["files"].update({path.name: file_checksum(path)}))
+    changed(
+        bundle / "files.json",
+        lambda listed: listed["files"].update({path.name: file_checksum(path)}),
+    )
 
 
 def test_labels_with_a_few_other_points_are_the_same(
-    bundle: Path, own_release: Path, results: Results, run: EvaluationRun, selection: SampleSelection
+    bundle: Path,
+    own_release: Path,
+    results: Results,
+    run: EvaluationRun,
+    selection: SampleSelection,
 ) -> None:
     one_more_point(own_release)
     opened = DeepAccident(dataroot=own_release, verbose=False)
@@ -176,7 +214,9 @@ def test_labels_with_a_few_other_points_are_the_same(
         compare_bundles(bundle, other)
 
 
-def test_a_bundle_of_devkit_1_0_0_verifies_and_compares(bundle: Path, da_b: DeepAccident, run: EvaluationRun) -> None:
+def test_a_bundle_of_devkit_1_0_0_verifies_and_compares(
+    bundle: Path, da_b: DeepAccident, run: EvaluationRun
+) -> None:
     new = save_run(run, bundle.with_name("new"))
     without_boxes(bundle)
     assert verify(bundle, da_b).is_same
@@ -202,9 +242,17 @@ def test_other_results(
     bundle: Path, da_b: DeepAccident, results: Results, tmp_path: Path, write_accidents: Write
 ) -> None:
     differing = found(
-        verify(bundle, da_b, results=write_accidents(tmp_path / "other.json", results.tokens, moved=1.0).path)
+        verify(
+            bundle,
+            da_b,
+            results=write_accidents(tmp_path / "other.json", results.tokens, moved=1.0).path,
+        )
     )
-    assert {each.split(": ")[0] for each in differing} == {"metrics_summary.json", "counts.json", "samples.parquet"}
+    assert {each.split(": ")[0] for each in differing} == {
+        "metrics_summary.json",
+        "counts.json",
+        "samples.parquet",
+    }
     assert "metrics_summary.json: results/fingerprint" in differing
 
 
@@ -244,16 +292,28 @@ def test_files_foreign_missing_and_damaged(bundle: Path, da_b: DeepAccident) -> 
 
 def test_another_protocol_claimed(bundle: Path, da_b: DeepAccident) -> None:
     """With a smaller danger distance the pairs that pass close by in the normal scenario are no accidents."""
-    changed(bundle / "metrics_summary.json", lambda summary: summary.update(switches={"reading.danger_distance": 0.5}))
-    normal = [token for token in json.loads((bundle / "counts.json").read_text())["counts"] if "_normal" in token]
+    changed(
+        bundle / "metrics_summary.json",
+        lambda summary: summary.update(switches={"reading.danger_distance": 0.5}),
+    )
+    normal = [
+        token
+        for token in json.loads((bundle / "counts.json").read_text())["counts"]
+        if "_normal" in token
+    ]
     differing = found(verify(bundle, da_b))
-    assert differing[:2] == [SUMMARY_CHANGED, "metrics_summary.json: settings/choices/reading/danger_distance"]
+    assert differing[:2] == [
+        SUMMARY_CHANGED,
+        "metrics_summary.json: settings/choices/reading/danger_distance",
+    ]
     assert {f"counts.json: {token}/named" for token in normal} < set(differing)
 
 
 def read_scenarios(bundle: Path, ending: str) -> list[str]:
     return [
-        token for token in json.loads((bundle / "scenarios.json").read_text())["scenarios"] if f"{ending}/" in token
+        token
+        for token in json.loads((bundle / "scenarios.json").read_text())["scenarios"]
+        if f"{ending}/" in token
     ]
 
 
@@ -274,7 +334,9 @@ def test_differing(stored: Any, found: Any, expected: list[tuple[str, Any, Any]]
     assert list(differing(stored, found, without=["skip"])) == expected
 
 
-def test_what_does_not_belong_is_named_and_not_opened(bundle: Path, da_b: DeepAccident, tmp_path: Path) -> None:
+def test_what_does_not_belong_is_named_and_not_opened(
+    bundle: Path, da_b: DeepAccident, tmp_path: Path
+) -> None:
     os.mkfifo(bundle / "a pipe")
     (bundle / "loop").symlink_to("loop")
     (bundle / "a link").symlink_to(tmp_path)
@@ -294,7 +356,8 @@ def test_what_does_not_belong_is_named_and_not_opened(bundle: Path, da_b: DeepAc
 
 
 @pytest.mark.parametrize(
-    "name", ["metrics_summary.json", "files.json", "scenarios.json", "counts.json", "samples.parquet"]
+    "name",
+    ["metrics_summary.json", "files.json", "scenarios.json", "counts.json", "samples.parquet"],
 )
 def test_a_pipe_in_the_place_of_a_file(bundle: Path, da_b: DeepAccident, name: str) -> None:
     (bundle / name).unlink()
@@ -370,7 +433,9 @@ def test_a_copy_of_the_results_that_leads_out_is_refused(
         {"seed": 0.5},
     ],
 )
-def test_counts_of_resamples_are_bounded(bundle: Path, da_b: DeepAccident, resampling: dict[str, Any]) -> None:
+def test_counts_of_resamples_are_bounded(
+    bundle: Path, da_b: DeepAccident, resampling: dict[str, Any]
+) -> None:
     changed(
         bundle / "metrics_summary.json",
         lambda summary: summary["breakdowns"]["all"].update(resampling=resampling),
@@ -380,7 +445,9 @@ def test_counts_of_resamples_are_bounded(bundle: Path, da_b: DeepAccident, resam
 
 def test_no_results(bundle: Path, da_b: DeepAccident, results: Results) -> None:
     results.path.unlink()
-    assert_refused((lambda: verify(bundle, da_b), ResultsError, ("accidents.json", "no such file or folder")))
+    assert_refused(
+        (lambda: verify(bundle, da_b), ResultsError, ("accidents.json", "no such file or folder"))
+    )
 
 
 def test_hashes_of_a_stranger_are_text(bundle: Path, da_b: DeepAccident) -> None:
@@ -388,7 +455,9 @@ def test_hashes_of_a_stranger_are_text(bundle: Path, da_b: DeepAccident) -> None
     for points in ([10**400] * 8, [1], [None] * 8):
         changed(
             bundle / "scenarios.json",
-            lambda stored, points=points: stored["scenarios"][token].update(label="\u202e", points=points),
+            lambda stored, points=points: stored["scenarios"][token].update(
+                label="\u202e", points=points
+            ),
         )
         text = verify(bundle, da_b).to_text()
         assert "scenarios.json" in text

@@ -14,7 +14,11 @@ from deepaccident_devkit.errors import ChoiceError, ConfigError
 from deepaccident_devkit.evaluation.intervals import numbers_of
 from deepaccident_devkit.evaluation.task import headlines
 from deepaccident_devkit.evaluation.warning import CleanWarnings, WarningEvaluator
-from deepaccident_devkit.evaluation.warning.anticipation import LATENCIES, mean_of, reference_threshold
+from deepaccident_devkit.evaluation.warning.anticipation import (
+    LATENCIES,
+    mean_of,
+    reference_threshold,
+)
 from deepaccident_devkit.evaluation.warning.recordings import PREDICTORS, REFERENCES, TRIVIAL
 
 
@@ -26,7 +30,11 @@ def skilled(seed: int) -> Scores:
     """Higher scores before accidents, of a kind, strength, lead and noise that the seed draws."""
     source = np.random.default_rng(seed)
     kind = seed % 4
-    strength, lead, noise = source.uniform(0.25, 0.6), source.uniform(0.5, 4.0), source.uniform(0.02, 0.3)
+    strength, lead, noise = (
+        source.uniform(0.25, 0.6),
+        source.uniform(0.5, 4.0),
+        source.uniform(0.02, 0.3),
+    )
 
     def scores(crash: bool, ahead: np.ndarray) -> np.ndarray:
         made = source.normal(0.3, noise, len(ahead))
@@ -52,7 +60,9 @@ def at_the_impact(_crash: bool, ahead: np.ndarray) -> np.ndarray:
 
 
 def late_in_twins(crash: bool, ahead: np.ndarray) -> np.ndarray:
-    return np.where((ahead < 3) & ~np.bool_(crash), 1.0, np.where(crash & (ahead == 1), 0.4, np.nan))
+    return np.where(
+        (ahead < 3) & ~np.bool_(crash), 1.0, np.where(crash & (ahead == 1), 0.4, np.nan)
+    )
 
 
 @pytest.mark.slow
@@ -106,12 +116,23 @@ def test_a_siren_pays_in_precision_and_time() -> None:
         "operating_by": "given",
         "groups": {"ego_involved": siren},
         "beyond": 0,
-        "notes": ["the rows 'TTC < 3 s' need what constant velocities lead to: accident_context(…, references=True)"],
+        "notes": [
+            "the rows 'TTC < 3 s' need what constant velocities lead to: accident_context(…, references=True)"
+        ],
     }
     assert list(references) == [*TRIVIAL, *REFERENCES]
     assert references["always"]["ego_involved"] == siren | {"operating": POINT | {"threshold": 1.0}}
-    better = ("auc_ahead", "twin_wins", "AP", "precision")  # the costs before what grows with more alarms
-    rows = [*((name, "share", True) for name in better), ("time_in_alarm", "share", False), ("recall", "share", True)]
+    better = (
+        "auc_ahead",
+        "twin_wins",
+        "AP",
+        "precision",
+    )  # the costs before what grows with more alarms
+    rows = [
+        *((name, "share", True) for name in better),
+        ("time_in_alarm", "share", False),
+        ("recall", "share", True),
+    ]
     assert [(each.name, each.unit, each.higher_is_better) for each in headlines(result)] == [
         (f"{name} ego_involved", *facts) for name, *facts in (*rows, ("tta0", "s", True))
     ]
@@ -120,18 +141,42 @@ def test_a_siren_pays_in_precision_and_time() -> None:
 @pytest.mark.parametrize(
     ("scores", "choices", "right", "expected"),
     [
-        (two_seconds, {"threshold": 0.5}, False, {"average_precision": 0, "precision": 0, "recall": 0}),  # of others
+        (
+            two_seconds,
+            {"threshold": 0.5},
+            False,
+            {"average_precision": 0, "precision": 0, "recall": 0},
+        ),  # of others
         (
             two_seconds,
             {"threshold": 0.5, "scores_of": "recording"},
             False,
-            {"average_precision": 1, "area_under_curve": 1, "twin_wins": 1, "recall": 1, "tta0": 2, "time_in_alarm": 0},
+            {
+                "average_precision": 1,
+                "area_under_curve": 1,
+                "twin_wins": 1,
+                "recall": 1,
+                "tta0": 2,
+                "time_in_alarm": 0,
+            },
         ),
-        (at_the_impact, {}, True, {"average_precision": 0, "recall": 0, "threshold": math.inf}),  # foresees nothing
-        (late_in_twins, {}, True, {"average_precision": 1, "twin_wins": 1, "time_in_alarm": 0, "threshold": 0.4}),
+        (
+            at_the_impact,
+            {},
+            True,
+            {"average_precision": 0, "recall": 0, "threshold": math.inf},
+        ),  # foresees nothing
+        (
+            late_in_twins,
+            {},
+            True,
+            {"average_precision": 1, "twin_wins": 1, "time_in_alarm": 0, "threshold": 0.4},
+        ),
     ],
 )
-def test_what_alarms_score(scores: Scores, choices: Any, right: bool, expected: dict[str, float]) -> None:
+def test_what_alarms_score(
+    scores: Scores, choices: Any, right: bool, expected: dict[str, float]
+) -> None:
     """What a twin shows after the impact would have come does not count."""
     figures = ego(evaluated(scores, CleanWarnings(**choices), pairs=3, right=right))
     found = asdict(figures) | asdict(figures.operating)
@@ -146,14 +191,25 @@ def test_length_does_not_tell_the_label() -> None:
         for each in evaluator.counts.values()
     ]
     figures = CleanWarnings().result(counts).groups["ego_involved"]
-    assert (figures.recordings, figures.auc_ahead) == ({"accident": 6, "twins": 0, "others": 6}, 0.5)
+    assert (figures.recordings, figures.auc_ahead) == (
+        {"accident": 6, "twins": 0, "others": 6},
+        0.5,
+    )
 
 
-def test_agents_are_never_pooled_and_those_who_see_the_accident_of_others_lose_the_latency() -> None:
+def test_agents_are_never_pooled_and_those_who_see_the_accident_of_others_lose_the_latency() -> (
+    None
+):
     groups = ("ego_involved", "bystander", "infrastructure", None)
-    made = evaluated(two_seconds, pairs=3, agents=[(str(each), each) for each in groups]).compute().groups
+    made = (
+        evaluated(two_seconds, pairs=3, agents=[(str(each), each) for each in groups])
+        .compute()
+        .groups
+    )
     assert [*made] == ["ego_involved", "bystander", "infrastructure", "unknown"]
-    assert {name: each.recordings["accident"] for name, each in made.items()} == dict.fromkeys(made, 3)
+    assert {name: each.recordings["accident"] for name, each in made.items()} == dict.fromkeys(
+        made, 3
+    )
     after = pytest.approx({0.0: 2.0, 0.1: 1.9, 0.3: 1.7})
     assert [each.tta0_after for each in made.values()] == [{}, after, after, {}]
     assert LATENCIES == (0.0, 0.1, 0.3)
@@ -162,15 +218,24 @@ def test_agents_are_never_pooled_and_those_who_see_the_accident_of_others_lose_t
 def test_the_operating_point_is_given_or_found() -> None:
     count = iter([0.9, 0.8, 0.7, 0.6, 0.2])
     evaluator = evaluated(
-        lambda crash, ahead: np.where(crash & (ahead == 1.5), next(count) if crash else np.nan, np.nan), pairs=5
+        lambda crash, ahead: np.where(
+            crash & (ahead == 1.5), next(count) if crash else np.nan, np.nan
+        ),
+        pairs=5,
     )
     found = evaluator.compute()
     figures = found.groups["ego_involved"]
-    assert (figures.operating, figures.operating.threshold, figures.operating.recall) == (figures.at_r80, 0.6, 0.8)
+    assert (figures.operating, figures.operating.threshold, figures.operating.recall) == (
+        figures.at_r80,
+        0.6,
+        0.8,
+    )
     assert (figures.best_f1, figures.quiet, figures.at_p80.threshold) == (0.2, 0.2, 0.2)
     assert (figures.operating.tta_hit, figures.operating.tta0) == (1.5, pytest.approx(1.2))
     given = CleanWarnings(threshold=0.75).result(list(evaluator.counts.values()))
-    assert [any("on these very recordings" in note for note in each.notes) for each in (found, given)] == [True, False]
+    assert [
+        any("on these very recordings" in note for note in each.notes) for each in (found, given)
+    ] == [True, False]
     assert (found.operating_by, given.operating_by) == ("recall", "given")
     assert given.groups["ego_involved"].operating.recall == 0.4
 
@@ -180,23 +245,37 @@ def test_draws_are_as_the_result_of_the_same_samples_given_so_often() -> None:
     by_pair: dict[str, list] = {}
     for token, counts in evaluator.counts.items():
         by_pair.setdefault(token.split("/")[1], []).append(counts)
-    parts, times = list(by_pair.values()), np.array([[1] * 6, [2, 0, 1, 0, 3, 0], [0, 6, 0, 0, 0, 0]])
+    parts, times = (
+        list(by_pair.values()),
+        np.array([[1] * 6, [2, 0, 1, 0, 3, 0], [0, 6, 0, 0, 0, 0]]),
+    )
     drawn = list(evaluator.resampled(parts, times))
     pooled = [evaluator.pooled(part) for part in parts]
     for draw, made in zip(times, drawn, strict=True):
-        again = [each for part, often in zip(pooled, draw, strict=True) for _ in range(often) for each in part]
+        again = [
+            each
+            for part, often in zip(pooled, draw, strict=True)
+            for _ in range(often)
+            for each in part
+        ]
         expected = evaluator.result_of(again)
         assert (made.samples, made.beyond, made.operating_by) == (expected.samples, 0, "recall")
         assert made.groups["ego_involved"].recordings == expected.groups["ego_involved"].recordings
         assert numbers_of(made).keys() == numbers_of(expected).keys()
-        assert_allclose(list(numbers_of(made).values()), list(numbers_of(expected).values()), rtol=1e-12)
+        assert_allclose(
+            list(numbers_of(made).values()), list(numbers_of(expected).values()), rtol=1e-12
+        )
     assert numbers_of(evaluator.result_of(list(evaluator.counts.values()))) == numbers_of(drawn[0])
 
 
 def test_choices_are_checked() -> None:
     assert asdict(CleanWarnings()) == {"scores_of": "pair", "threshold": None}
     assert_refused(
-        (lambda: CleanWarnings(scores_of="scene"), ChoiceError, ("scores_of", "pair, recording", "scene")),  # type: ignore[arg-type]
+        (
+            lambda: CleanWarnings(scores_of="scene"),
+            ChoiceError,
+            ("scores_of", "pair, recording", "scene"),
+        ),  # type: ignore[arg-type]
         (lambda: CleanWarnings(threshold=math.inf), ConfigError, ("threshold", "None", "inf")),
     )
 
@@ -209,7 +288,14 @@ def test_means_over_draws_leave_unknown_numbers_out_and_keep_counts_and_words() 
 
 def test_predictors_that_know_nothing_work_at_a_threshold_of_their_own() -> None:
     least = float(np.nextafter(0.0, 1.0))
-    assert [reference_threshold(name) for name in PREDICTORS[1:]] == [1.0, 1.0, 0.5, 0.5, least, least]
+    assert [reference_threshold(name) for name in PREDICTORS[1:]] == [
+        1.0,
+        1.0,
+        0.5,
+        0.5,
+        least,
+        least,
+    ]
     recall = {
         name: each["ego_involved"].operating.recall
         for name, each in evaluated(skilled(0), pairs=8).compute().references.items()

@@ -19,7 +19,11 @@ def test_the_protocols_and_their_choices() -> None:
     choices = {"clean": {"scores_of": "pair", "threshold": None}, "field": {}}
     assert {name: WarningEvaluator(name).settings for name in WARNING_PROTOCOLS} == choices
     assert WarningEvaluator().protocol == WARNING_PROTOCOLS["clean"]
-    facts = WarningEvaluator.needs_whole_recordings, WarningEvaluator.needs_meta, WarningEvaluator.result_kinds
+    facts = (
+        WarningEvaluator.needs_whole_recordings,
+        WarningEvaluator.needs_meta,
+        WarningEvaluator.result_kinds,
+    )
     assert facts == (True, True, ("motion", "accident"))
 
 
@@ -27,7 +31,19 @@ def test_what_cannot_be_evaluated() -> None:
     update, label = WarningEvaluator().update, scene({1: standing(20, 10)})
     assert_refused(
         (lambda: WarningEvaluator("boxes"), ChoiceError, ("protocol", "clean, field", "boxes")),
-        (lambda: update("a/b/001", [], AccidentContext()), EvaluationError, ("label", "MotionLabels or None")),
-        (lambda: update("a/b/001", [], None, label), EvaluationError, ("context", "AccidentContext or None")),
-        (lambda: update("a/b/001", []), EvaluationError, ("context", "accident_context", "horizon=2.0")),
+        (
+            lambda: update("a/b/001", [], AccidentContext()),
+            EvaluationError,
+            ("label", "MotionLabels or None"),
+        ),
+        (
+            lambda: update("a/b/001", [], None, label),
+            EvaluationError,
+            ("context", "AccidentContext or None"),
+        ),
+        (
+            lambda: update("a/b/001", []),
+            EvaluationError,
+            ("context", "accident_context", "horizon=2.0"),
+        ),
     )

@@ -11,7 +11,12 @@ from refusals import assert_refused
 
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.evaluation.task import headlines
-from deepaccident_devkit.evaluation.warning import FieldWarnings, ScoreSeries, field_figures, printed_figures
+from deepaccident_devkit.evaluation.warning import (
+    FieldWarnings,
+    ScoreSeries,
+    field_figures,
+    printed_figures,
+)
 from deepaccident_devkit.evaluation.warning.field import FIELD_CODES
 from deepaccident_devkit.evaluation.warning.recordings import REFERENCES, TRIVIAL
 
@@ -23,7 +28,9 @@ CLOSE = [[0.99] * 5 + [0.9955] * 5, [0.99] * 10, [0.99] * 4 + [0.9935] * 6]
 TWO = [True, True, False]
 FIVE = [[0.99] * 10, *[[0.99] * 3 + [0.9955] * 7] * 4, [0.9925] * 10]
 """Of five accidents four are warned of at the higher thresholds."""
-ABOVE = "recall 1.5, AP 1.5: at the threshold 0 recordings without an accident count as true positives"
+ABOVE = (
+    "recall 1.5, AP 1.5: at the threshold 0 recordings without an accident count as true positives"
+)
 RAISES = "the published code raises an error here: "
 BY_ZERO = "the published code divides 0 by 0: no accident, or thresholds at which none is warned of"
 
@@ -31,7 +38,11 @@ BY_ZERO = "the published code divides 0 by 0: no accident, or thresholds at whic
 def series(scores: Any, positive: list[bool], toa: Any = None) -> ScoreSeries:
     """Two frames a second, up to the array's end."""
     given = np.array(scores, dtype=np.float64)
-    ends = np.full(len(given), float(given.shape[1])) if toa is None else np.array(toa, dtype=np.float64)
+    ends = (
+        np.full(len(given), float(given.shape[1]))
+        if toa is None
+        else np.array(toa, dtype=np.float64)
+    )
     return ScoreSeries(scores=given, positive=np.array(positive), toa=ends, fps=2.0)
 
 
@@ -48,7 +59,9 @@ def all_unknown(code: str, note: str) -> tuple[Any, ...]:
         (
             series(RISING, [False] * 3),
             {
-                **dict.fromkeys(("ustring", "dsta"), f"{RAISES}no threshold has another recall than the others"),
+                **dict.fromkeys(
+                    ("ustring", "dsta"), f"{RAISES}no threshold has another recall than the others"
+                ),
                 "drive": (0, 0, 0, None, 0, 0, 0, ""),
                 "dad": BY_ZERO,
             },
@@ -63,10 +76,18 @@ def all_unknown(code: str, note: str) -> tuple[Any, ...]:
         ),
         (
             series(np.zeros((2, 4)), [False] * 2),
-            dict.fromkeys(("ustring", "dsta"), f"{RAISES}no threshold has another recall than the others"),
+            dict.fromkeys(
+                ("ustring", "dsta"), f"{RAISES}no threshold has another recall than the others"
+            ),
         ),
-        (series(np.zeros((3, 4)), TWO), {"ustring": ABOVE, "dsta": ABOVE, "drive": (0, 0, 0, None, 0, 0, 0, "")}),
-        (series(np.full((3, 4), LOW), TWO), {"ustring": ABOVE, "dad": (0, 0, 0, None, None, None, None, "")}),
+        (
+            series(np.zeros((3, 4)), TWO),
+            {"ustring": ABOVE, "dsta": ABOVE, "drive": (0, 0, 0, None, 0, 0, 0, "")},
+        ),
+        (
+            series(np.full((3, 4), LOW), TWO),
+            {"ustring": ABOVE, "dad": (0, 0, 0, None, None, None, None, "")},
+        ),
         (
             series(GAPS, TWO, [3, 4, 2]),
             {
@@ -98,19 +119,32 @@ def all_unknown(code: str, note: str) -> tuple[Any, ...]:
 def test_what_each_code_prints(given: ScoreSeries, expected: dict[str, Any]) -> None:
     for code, printed in expected.items():
         found = tuple(asdict(field_figures(given, code)).values())
-        assert found == pytest.approx(all_unknown(code, printed) if isinstance(printed, str) else printed, nan_ok=True)
+        assert found == pytest.approx(
+            all_unknown(code, printed) if isinstance(printed, str) else printed, nan_ok=True
+        )
 
 
 def test_what_a_code_prints_may_be_above_1() -> None:
     nothing = series(np.zeros((4, 6)), [True, False] * 2)
-    assert [printed_figures(nothing, "ustring").average_precision, field_figures(nothing, "drive").note] == [2.0, ""]
-    assert_refused((lambda: field_figures(nothing, "sota"), ChoiceError, ("code", "ustring, dsta, drive, dad", "sota")))
+    assert [
+        printed_figures(nothing, "ustring").average_precision,
+        field_figures(nothing, "drive").note,
+    ] == [2.0, ""]
+    assert_refused(
+        (
+            lambda: field_figures(nothing, "sota"),
+            ChoiceError,
+            ("code", "ustring, dsta, drive, dad", "sota"),
+        )
+    )
 
 
 @pytest.mark.parametrize("references", [False, True])
 def test_what_a_result_holds(*, references: bool) -> None:
     """For each code and group, of all alarms; of the reference predictors where they are asked for."""
-    counts = evaluated(always, pairs=2, agents=[("a", "ego_involved"), ("b", "bystander")], right=False).counts
+    counts = evaluated(
+        always, pairs=2, agents=[("a", "ego_involved"), ("b", "bystander")], right=False
+    ).counts
     made = FieldWarnings().result(list(counts.values()), references=references)
     names = [f"{code} {group}" for group in ("ego_involved", "bystander") for code in FIELD_CODES]
     assert ([*made.figures], made.samples, made.beyond) == (names, 2 * 2 * (13 + 19), 0)
@@ -129,4 +163,6 @@ def test_what_a_result_holds(*, references: bool) -> None:
 def test_silence_is_unknown_and_a_note_says_why() -> None:
     result = evaluated(never, "field", pairs=2).compute()
     assert math.isnan(result.figures["ustring ego_involved"].average_precision)
-    assert any("recordings without an accident count as true positives" in note for note in result.notes)
+    assert any(
+        "recordings without an accident count as true positives" in note for note in result.notes
+    )

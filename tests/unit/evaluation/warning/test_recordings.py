@@ -93,11 +93,19 @@ TWIN = {"kind": "twins", "ahead": None}
         ([alarm(ids=(11, 33))], context(51), {"alarms": [[1, 1]]}),  # the place
         ([alarm(x=50, ids=(11, 33))], context(51), {"alarms": [[1, 0]]}),
         ([alarm(x=4.5)], context(51), {"alarms": [[1, 1]]}),  # without ids: the boxes at that time
-        ([alarm(x=5)], context(51), {"alarms": [[1, 0]]}),  # the differences of the two add up to 10 m
+        (
+            [alarm(x=5)],
+            context(51),
+            {"alarms": [[1, 0]]},
+        ),  # the differences of the two add up to 10 m
         ([alarm(x=4.9999, ids=(11, 33))], context(51), {"alarms": [[1, 1]]}),
         ([alarm(x=5, ids=(11, 33))], context(51), {"alarms": [[1, 0]]}),
         ([alarm(time=1.6, ids=PAIR)], context(51), {"alarms": [[1, 1]]}),  # at any time
-        ([alarm(time=2.0)], context(21), {"ahead": 40, "to_end": 40, "alarms": [[1, 1]]}),  # later than one looks ahead
+        (
+            [alarm(time=2.0)],
+            context(21),
+            {"ahead": 40, "to_end": 40, "alarms": [[1, 1]]},
+        ),  # later than one looks ahead
         (
             [replace(FALSE, score=0.5), RIGHT],
             context(41, "twins", time_to_twin_impact=1.5),
@@ -106,7 +114,10 @@ TWIN = {"kind": "twins", "ahead": None}
         ([], context(41, "twins", time_to_twin_impact=-0.5), TWIN | {"to_end": -5}),
         ([], context(41, "others"), {"kind": "others", "ahead": None, "to_end": None}),
         (
-            [replace(FALSE, time=1.04), replace(FALSE, time=1.06, score=0.25)],  # within half a recorded frame
+            [
+                replace(FALSE, time=1.04),
+                replace(FALSE, time=1.06, score=0.25),
+            ],  # within half a recorded frame
             context(51, "others", involvement="bystander"),
             {
                 "kind": "others",
@@ -119,15 +130,27 @@ TWIN = {"kind": "twins", "ahead": None}
         ),
         ([replace(FALSE, time=9.0)], context(51), {"alarms": [[1, 0]]}),
         ([RIGHT], context(51, "unplaced"), {"kind": "unplaced", "alarms": [[1, 0]]}),
-        ([alarm(time=900.0, ids=PAIR)], context(31), {"ahead": 30, "to_end": 30, "alarms": [[1, 1]]}),  # no bound
+        (
+            [alarm(time=900.0, ids=PAIR)],
+            context(31),
+            {"ahead": 30, "to_end": 30, "alarms": [[1, 1]]},
+        ),  # no bound
         ([alarm(time=2.04, ids=PAIR)], context(51, horizon=2.0), {"alarms": [[1, 1]]}),
-        ([alarm(time=2.06, ids=PAIR), RIGHT], context(51, horizon=2.0), {"alarms": [[1, 1]], "beyond": 1}),
+        (
+            [alarm(time=2.06, ids=PAIR), RIGHT],
+            context(51, horizon=2.0),
+            {"alarms": [[1, 1]], "beyond": 1},
+        ),
         (
             [],
             context(51, references={"one": (FALSE, replace(RIGHT, score=0.5)), "none": ()}),
             {"references": [[0.5, 1.0], [None, None]]},
         ),
-        (as_maps(CALM, HIT), context(51), {"alarms": [[0.5, 1]]}),  # as sure as the share of them that see it
+        (
+            as_maps(CALM, HIT),
+            context(51),
+            {"alarms": [[0.5, 1]]},
+        ),  # as sure as the share of them that see it
         (as_heads(HIT, CALM), context(51), {"alarms": [[0.5, 1]]}),
     ],
 )
@@ -139,24 +162,49 @@ def test_what_cannot_be_counted() -> None:
     known = context(41)
     assert_refused(
         *(
-            (lambda token=token: sample_counts(token, [], None, known), EvaluationError, ("token", repr(token)))
+            (
+                lambda token=token: sample_counts(token, [], None, known),
+                EvaluationError,
+                ("token", repr(token)),
+            )
             for token in ("s/ego_vehicle/x", 41, "041")
         ),
         (lambda: counted(RIGHT, known), EvaluationError, ("wrap a single Accident in a list",)),
-        (lambda: counted([], AccidentContext()), EvaluationError, ("accident_context", "horizon=2.0")),
-        (lambda: counted([], replace(known, time_to_end=None)), EvaluationError, ("accident_context",)),
+        (
+            lambda: counted([], AccidentContext()),
+            EvaluationError,
+            ("accident_context", "horizon=2.0"),
+        ),
+        (
+            lambda: counted([], replace(known, time_to_end=None)),
+            EvaluationError,
+            ("accident_context",),
+        ),
     )
 
 
 def test_the_surest_right_alarm_and_the_surest() -> None:
     alarms = [[0.2, True], [0.9, False], [0.6, True]]
-    assert [surest(alarms, "accident"), surest(alarms[1:2], "accident")] == [[0.6, 0.9], [None, 0.9]]
+    assert [surest(alarms, "accident"), surest(alarms[1:2], "accident")] == [
+        [0.6, 0.9],
+        [None, 0.9],
+    ]
     assert [surest(alarms, "twins"), surest([], "accident")] == [[0.9, 0.9], [None, None]]
 
 
-def counts(frame: int, kind: str = "accident", name: str = "t_accident/s/a", **more: Any) -> dict[str, Any]:
+def counts(
+    frame: int, kind: str = "accident", name: str = "t_accident/s/a", **more: Any
+) -> dict[str, Any]:
     return (
-        COUNTS | {"recording": name, "frame": frame, "kind": kind, "to_end": None, "involvement": "ego_involved"} | more
+        COUNTS
+        | {
+            "recording": name,
+            "frame": frame,
+            "kind": kind,
+            "to_end": None,
+            "involvement": "ego_involved",
+        }
+        | more
     )
 
 
@@ -166,9 +214,13 @@ CRASH = [
     counts(17, to_end=6),
 ]
 TWINS = [
-    counts(frame, "twins", "t_normal/s/a", to_end=26 - frame, alarms=[[0.5, 0]]) for frame in (6, 11, 16, 21, 26, 31)
+    counts(frame, "twins", "t_normal/s/a", to_end=26 - frame, alarms=[[0.5, 0]])
+    for frame in (6, 11, 16, 21, 26, 31)
 ]
-ALONE = [counts(frame, "others", "n/o/a", unjudged=[0.8], beyond=2, involvement=None) for frame in (1, 11, 31)]
+ALONE = [
+    counts(frame, "others", "n/o/a", unjudged=[0.8], beyond=2, involvement=None)
+    for frame in (1, 11, 31)
+]
 LOST = [counts(3, "unplaced", "t_accident/z/a")]
 ALL = [*TWINS, *CRASH, *ALONE, *LOST]
 LOW, GAP = -math.inf, math.nan
@@ -176,7 +228,9 @@ LOW, GAP = -math.inf, math.nan
 
 def test_columns_are_steps_from_the_first_sample() -> None:
     recordings = recordings_of([ALL])
-    assert [(each.name, each.story, each.group, each.kind, each.part, each.end) for each in recordings] == [
+    assert [
+        (each.name, each.story, each.group, each.kind, each.part, each.end) for each in recordings
+    ] == [
         ("n/o/a", "n/o/a", "unknown", "others", 0, 32),
         ("t_accident/s/a", "t/s/a", "ego_involved", "accident", 0, 23),
         ("t_normal/s/a", "t/s/a", "ego_involved", "twins", 0, 26),
@@ -204,7 +258,11 @@ def test_columns_are_steps_from_the_first_sample() -> None:
         assert_array_equal(found if predictor == "given" else found[1], expected)
     pair = series_of(recordings, "given", "pair")
     assert pair.positive.tolist() == [False, True, False]
-    assert pair.toa.tolist() == [(23 - 2) / 5, (23 - 2) / 5, (26 - 6) / 5]  # the first is cut at the accident's length
+    assert pair.toa.tolist() == [
+        (23 - 2) / 5,
+        (23 - 2) / 5,
+        (26 - 6) / 5,
+    ]  # the first is cut at the accident's length
     assert (pair.fps, pair.valid.sum(axis=1).tolist()) == (pytest.approx(2.0), [2, 3, 4])
     assert pair.highest().tolist() == [0.8, 0.4, 0.5]
 
@@ -237,17 +295,29 @@ def test_what_is_left_out_is_said() -> None:
 
 
 def test_others_end_by_themselves_where_nobody_collides_or_sooner() -> None:
-    assert series_of(recordings_of([ALONE]), "given", "pair").toa.tolist() == [3.1]  # steps of ten frames
+    assert series_of(recordings_of([ALONE]), "given", "pair").toa.tolist() == [
+        3.1
+    ]  # steps of ten frames
     alone = [*ALONE[:1], counts(2, "others", "n/o/a")]
     series = series_of(recordings_of([[*alone, *CRASH]]), "given", "pair")
     assert (series.toa.tolist(), series.fps) == ([2.0, 21.0], pytest.approx(10))
-    longer = [counts(each["frame"], name="t_accident/z/a", to_end=101 - each["frame"]) for each in CRASH]
-    assert series_of(recordings_of([[*ALONE, *CRASH, *longer]]), "given", "pair").toa[0] == pytest.approx(31 / 5)
+    longer = [
+        counts(each["frame"], name="t_accident/z/a", to_end=101 - each["frame"]) for each in CRASH
+    ]
+    assert series_of(recordings_of([[*ALONE, *CRASH, *longer]]), "given", "pair").toa[
+        0
+    ] == pytest.approx(31 / 5)
     single = series_of(recordings_of([ALONE[:1]]), "given", "pair")
-    assert (single.scores.tolist(), single.toa.tolist(), single.fps) == ([[0.8]], [1.0], pytest.approx(10))
+    assert (single.scores.tolist(), single.toa.tolist(), single.fps) == (
+        [[0.8]],
+        [1.0],
+        pytest.approx(10),
+    )
     assert series_of(recordings_of([CRASH]), "given", "pair").fps == pytest.approx(2.0)
     uneven = recordings_of([[counts(frame, "others") for frame in (1, 4, 9)]])
-    assert np.isfinite(series_of(uneven, "always", "pair").scores).tolist() == [[True, True, False, True]]
+    assert np.isfinite(series_of(uneven, "always", "pair").scores).tolist() == [
+        [True, True, False, True]
+    ]
     assert series_of([], "given", "pair").scores.shape == (0, 1)
 
 
@@ -267,7 +337,10 @@ def test_a_recording_has_ten_thousand_frames_at_most() -> None:
 
 def test_first_scores_and_leads_at_the_threshold_itself() -> None:
     series = ScoreSeries(
-        scores=np.array([[0.1, 0.5, GAP, 0.5, 0.9]]), positive=np.array([True]), toa=np.array([4.0]), fps=2.0
+        scores=np.array([[0.1, 0.5, GAP, 0.5, 0.9]]),
+        positive=np.array([True]),
+        toa=np.array([4.0]),
+        fps=2.0,
     )
     thresholds = np.array([0.1, 0.1001, 0.5, 0.5001, 0.9])
     assert series.first(thresholds).tolist() == [[0, 1, 1, 5, 5]]
@@ -288,8 +361,14 @@ def test_runs_last_and_cost_what_is_left_of_them_after_the_reaction() -> None:
         [0, 3, 0, 2, 4],
         [2, 3, 1, 1, 2],
     )
-    assert [runs.braking_seconds(reaction).tolist() for reaction in (0.5, 1.0)] == [[1.5, 0, 0.5], [0.5, 0, 0]]
-    assert [runs.first_lasting(reaction).tolist() for reaction in (0.5, 1.0)] == [[0, 6, 4], [3, 6, 6]]
+    assert [runs.braking_seconds(reaction).tolist() for reaction in (0.5, 1.0)] == [
+        [1.5, 0, 0.5],
+        [0.5, 0, 0],
+    ]
+    assert [runs.first_lasting(reaction).tolist() for reaction in (0.5, 1.0)] == [
+        [0, 6, 4],
+        [3, 6, 6],
+    ]
 
 
 @given(ALARMS, ALARMS, st.sampled_from((0.0, 0.5, 1.0)))
@@ -298,6 +377,8 @@ def test_alarms_that_last_cost_something_and_fewer_never_more(
 ) -> None:
     """So the cost never rises with the threshold, and the lowest within a budget can be bisected."""
     costs = AlarmRuns.of(alarm, 2.0).braking_seconds(reaction)
-    assert ((costs > 0) == (AlarmRuns.of(alarm, 2.0).first_lasting(reaction) < alarm.shape[1])).all()
+    assert (
+        (costs > 0) == (AlarmRuns.of(alarm, 2.0).first_lasting(reaction) < alarm.shape[1])
+    ).all()
     if alarm.shape == other.shape:
         assert (AlarmRuns.of(alarm & other, 2.0).braking_seconds(reaction) <= costs).all()

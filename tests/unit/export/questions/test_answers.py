@@ -15,7 +15,12 @@ from deepaccident_devkit.errors import ConfigError, ResultsError
 from deepaccident_devkit.evaluation.results import read_results
 from deepaccident_devkit.evaluation.runs import SampleSelection, evaluate_results
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
-from deepaccident_devkit.export.questions import Questions, WindowRules, read_answers, results_of_answers
+from deepaccident_devkit.export.questions import (
+    Questions,
+    WindowRules,
+    read_answers,
+    results_of_answers,
+)
 
 Lines = list[dict[str, Any]]
 SPLIT = "train"
@@ -32,7 +37,10 @@ def asked(da_motion: DeepAccident, tmp_path_factory: pytest.TempPathFactory) -> 
 def perfect(asked: Asked) -> Lines:
     """The answers of one who knows the truth."""
     return [
-        {"accident": [*map(bool, each["accident"])], **{name: each[name] for name in ("id", "who", "where", "when")}}
+        {
+            "accident": [*map(bool, each["accident"])],
+            **{name: each[name] for name in ("id", "who", "where", "when")},
+        }
         for each in asked.truth.values()
     ]
 
@@ -44,19 +52,25 @@ def written(path: Path, lines: Lines) -> Path:
 
 def results(asked: Asked, folder: Path, answers: Lines) -> Path:
     out = folder / "accident.json"
-    results_of_answers(written(folder / "answers.jsonl", answers), asked.done.folder / "truth.jsonl", out)
+    results_of_answers(
+        written(folder / "answers.jsonl", answers), asked.done.folder / "truth.jsonl", out
+    )
     return out
 
 
 def evaluated(dataset: DeepAccident, path: Path, task: Any) -> Any:
     listed = "all" if task == "warning" else "evaluate"
     selection = SampleSelection(split=SPLIT, samples=listed, scope="all", horizon=3.0, agents=EGOS)
-    setup = EvaluationSetup(task=task, protocol="clean" if task == "warning" else "boxes", horizon=3.0)
+    setup = EvaluationSetup(
+        task=task, protocol="clean" if task == "warning" else "boxes", horizon=3.0
+    )
     partial = task == "accident"  # whose list lacks some samples that were asked about
     return evaluate_results(dataset, path, setup, selection, workers=1, allow_partial=partial)
 
 
-def test_one_who_knows_the_truth_gets_full_marks(da_motion: DeepAccident, asked: Asked, tmp_path: Path) -> None:
+def test_one_who_knows_the_truth_gets_full_marks(
+    da_motion: DeepAccident, asked: Asked, tmp_path: Path
+) -> None:
     path = results(asked, tmp_path, perfect(asked))
     run = evaluated(da_motion, path, "accident")
     assert run.partial is None
@@ -70,9 +84,16 @@ def test_one_who_knows_the_truth_gets_full_marks(da_motion: DeepAccident, asked:
 
 
 def test_answers_become_accidents(asked: Asked, tmp_path: Path) -> None:
-    sample = next(sample for sample, truth in asked.truth.items() if truth["who"] and None not in truth["who"])
+    sample = next(
+        sample for sample, truth in asked.truth.items() if truth["who"] and None not in truth["who"]
+    )
     truth = asked.truth[sample]
-    base = {"id": truth["id"], "accident": [0.2, 0.9, 0.9], "who": truth["who"][::-1], "where": [[1, 2], [3.5, -4]]}
+    base = {
+        "id": truth["id"],
+        "accident": [0.2, 0.9, 0.9],
+        "who": truth["who"][::-1],
+        "where": [[1, 2], [3.5, -4]],
+    }
 
     def alarms(threshold: float = 0.5, **changes: Any) -> Any:
         path = written(tmp_path / "answers.jsonl", [{**base, **changes}])
@@ -82,7 +103,12 @@ def test_answers_become_accidents(asked: Asked, tmp_path: Path) -> None:
         assert read.alarms == len(read.accidents[sample])
         return read.accidents[sample]
 
-    whole = {"time": 1.5, "score": 0.9, "ids": tuple(truth["actor_ids"][::-1]), "positions": [[1, 2], [3.5, -4]]}
+    whole = {
+        "time": 1.5,
+        "score": 0.9,
+        "ids": tuple(truth["actor_ids"][::-1]),
+        "positions": [[1, 2], [3.5, -4]],
+    }
     for threshold, changes, told in (
         (0.5, {}, {}),
         (0.5, {"when": 1.8, "why": "it does not brake"}, {"time": 1.8}),
@@ -96,7 +122,12 @@ def test_answers_become_accidents(asked: Asked, tmp_path: Path) -> None:
         (0.0, {"accident": [0.01, 0, 0]}, {"time": 0.5, "score": 0.01}),
     ):
         (alarm,) = alarms(threshold, **changes)
-        found = {"time": alarm.time, "score": alarm.score, "ids": alarm.ids, "positions": alarm.positions.tolist()}
+        found = {
+            "time": alarm.time,
+            "score": alarm.score,
+            "ids": alarm.ids,
+            "positions": alarm.positions.tolist(),
+        }
         assert found == {**whole, **told}
     assert alarms(0.91) == alarms(accident=[0, 0, 0.4]) == alarms(0, accident=[False] * 3) == []
 
@@ -104,13 +135,29 @@ def test_answers_become_accidents(asked: Asked, tmp_path: Path) -> None:
 def test_the_results_file(asked: Asked, tmp_path: Path) -> None:
     lines = [line for line in perfect(asked) if line["when"] != 1.0]
     out, truth = tmp_path / "accident.json", asked.done.folder / "truth.jsonl"
-    told = results_of_answers(written(tmp_path / "answers", lines), truth, out, threshold=0.3, meta={"method": "mine"})
+    told = results_of_answers(
+        written(tmp_path / "answers", lines), truth, out, threshold=0.3, meta={"method": "mine"}
+    )
     read = read_results(out)
-    assert sorted(told.missing) == sorted(each["id"] for each in asked.truth.values() if each["when"] == 1.0) != []
-    assert read.meta == {"questions": len(asked.truth), "answered": len(lines), "threshold": 0.3, "method": "mine"}
+    assert (
+        sorted(told.missing)
+        == sorted(each["id"] for each in asked.truth.values() if each["when"] == 1.0)
+        != []
+    )
+    assert read.meta == {
+        "questions": len(asked.truth),
+        "answered": len(lines),
+        "threshold": 0.3,
+        "method": "mine",
+    }
     ends = {f"{sample[:-3]}035" for sample in asked.truth}
-    alarms = {sample: True in each["accident"] and each["when"] != 1.0 for sample, each in asked.truth.items()}
-    assert {token: len(read.prediction(token)) for token in read.tokens} == alarms | dict.fromkeys(ends, 0)
+    alarms = {
+        sample: True in each["accident"] and each["when"] != 1.0
+        for sample, each in asked.truth.items()
+    }
+    assert {token: len(read.prediction(token)) for token in read.tokens} == alarms | dict.fromkeys(
+        ends, 0
+    )
     with pytest.raises(ResultsError, match=f"^{out}: "):
         results_of_answers(tmp_path / "answers", truth, out)
 
@@ -158,7 +205,9 @@ def test_malformed_answers(asked: Asked, tmp_path: Path, change: Any, facts: str
 
 
 @pytest.mark.parametrize("name", ["id", "accident", "who", "where"])
-def test_an_answer_that_lacks_something_or_comes_twice(asked: Asked, tmp_path: Path, name: str) -> None:
+def test_an_answer_that_lacks_something_or_comes_twice(
+    asked: Asked, tmp_path: Path, name: str
+) -> None:
     whole = {"id": next(iter(asked.truth.values()))["id"], **GOOD}
     lacking = {key: each for key, each in whole.items() if key != name}
     path, truth = written(tmp_path / "a.jsonl", [whole, lacking]), asked.done.folder / "truth.jsonl"
@@ -169,12 +218,19 @@ def test_an_answer_that_lacks_something_or_comes_twice(asked: Asked, tmp_path: P
             ResultsError,
             (f"{path}:2: ", f"required field `{name}`", "mend that line"),
         ),
-        (lambda: read_answers(twice, truth), ResultsError, (f"{twice}:2: id: {whole['id']}", "line 1", "leave one")),
+        (
+            lambda: read_answers(twice, truth),
+            ResultsError,
+            (f"{twice}:2: id: {whole['id']}", "line 1", "leave one"),
+        ),
     )
 
 
 def test_files_that_are_something_else(asked: Asked, tmp_path: Path) -> None:
-    path, truth = written(tmp_path / "answers.jsonl", perfect(asked)), asked.done.folder / "truth.jsonl"
+    path, truth = (
+        written(tmp_path / "answers.jsonl", perfect(asked)),
+        asked.done.folder / "truth.jsonl",
+    )
     empty = written(tmp_path / "empty", [])
     assert_refused(
         (
@@ -182,9 +238,17 @@ def test_files_that_are_something_else(asked: Asked, tmp_path: Path) -> None:
             ResultsError,
             (f"{path}:1: ", "no line of a truth file", "give truth.jsonl"),
         ),
-        (lambda: read_answers(tmp_path / "none", truth), ResultsError, f"^{tmp_path}/none: cannot be read"),
+        (
+            lambda: read_answers(tmp_path / "none", truth),
+            ResultsError,
+            f"^{tmp_path}/none: cannot be read",
+        ),
         (lambda: read_answers(path, empty), ResultsError, f"^{empty}: holds no question"),
-        (lambda: read_answers(path, truth, threshold=1.5), ConfigError, ("threshold", "from 0 to 1", "1.5")),
+        (
+            lambda: read_answers(path, truth, threshold=1.5),
+            ConfigError,
+            ("threshold", "from 0 to 1", "1.5"),
+        ),
     )
     assert read_answers(empty, truth).alarms == 0
 
@@ -204,11 +268,16 @@ def test_files_that_are_something_else(asked: Asked, tmp_path: Path) -> None:
         ("actors", {"ego": {}}, r"\$\.actors\[\.\.\.\]"),
     ],
 )
-def test_a_truth_file_that_was_changed(asked: Asked, tmp_path: Path, name: str, value: Any, place: str) -> None:
+def test_a_truth_file_that_was_changed(
+    asked: Asked, tmp_path: Path, name: str, value: Any, place: str
+) -> None:
     """The record names line and field; no other exception comes of what is in a truth file."""
     lines = [{**each} for each in asked.truth.values()]
     lines[1][name] = value
-    truth, answers = written(tmp_path / "truth.jsonl", lines), written(tmp_path / "answers.jsonl", perfect(asked))
+    truth, answers = (
+        written(tmp_path / "truth.jsonl", lines),
+        written(tmp_path / "answers.jsonl", perfect(asked)),
+    )
     assert_refused(
         (
             lambda: read_answers(answers, truth),
@@ -219,7 +288,18 @@ def test_a_truth_file_that_was_changed(asked: Asked, tmp_path: Path, name: str, 
 
 
 def test_the_command(asked: Asked, tmp_path: Path) -> None:
-    answers, out = written(tmp_path / "answers.jsonl", perfect(asked)[1:]), tmp_path / "accident.json"
-    words = [str(answers), "--truth", str(asked.done.folder / "truth.jsonl"), "--out", str(out), "--method", "mine"]
+    answers, out = (
+        written(tmp_path / "answers.jsonl", perfect(asked)[1:]),
+        tmp_path / "accident.json",
+    )
+    words = [
+        str(answers),
+        "--truth",
+        str(asked.done.folder / "truth.jsonl"),
+        "--out",
+        str(out),
+        "--method",
+        "mine",
+    ]
     said = CliRunner().invoke(deepaccident, ["results", *words], catch_exceptions=False).stdout
     assert (read_results(out).meta["method"], "1 questions" in said) == ("mine", True)

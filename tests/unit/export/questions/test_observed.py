@@ -38,7 +38,11 @@ def edited(dataset: DeepAccident, folder: Path, edit: Edit) -> Asked:
     """The questions of a copy of a release whose accident was edited."""
     root, token = folder / "edited", accident_of(dataset)
     shutil.copytree(dataset.dataroot, root, ignore=shutil.ignore_patterns(".deepaccident"))
-    edit(ScenarioEditor(root, next(each for each in find_release(root, "v1").scenarios if each.token == token)))
+    edit(
+        ScenarioEditor(
+            root, next(each for each in find_release(root, "v1").scenarios if each.token == token)
+        )
+    )
     return ask(DeepAccident(dataroot=root, verbose=False, workers=1), folder, FORM)
 
 
@@ -57,27 +61,48 @@ def without_collision(editor: ScenarioEditor) -> None:
     write_meta(path, replace(read_meta(path), collision=None, planned_agents=None))
 
 
-def test_what_comes_after_the_present_changes_nothing(da_motion: DeepAccident, before: Asked, tmp_path: Path) -> None:
+def test_what_comes_after_the_present_changes_nothing(
+    da_motion: DeepAccident, before: Asked, tmp_path: Path
+) -> None:
     scenario, present = accident_of(da_motion), 20
 
     def shift(row: list[str]) -> None:
-        row[FIELD["x"]], row[FIELD["id"]] = str(float(row[FIELD["x"]]) - 7), str(int(row[FIELD["id"]]) + 3000)
-        row[FIELD["vx"]], row[FIELD["num_lidar_pts"]], row[FIELD["camera_visible"]] = "55.5", "900", "True"
+        row[FIELD["x"]], row[FIELD["id"]] = (
+            str(float(row[FIELD["x"]]) - 7),
+            str(int(row[FIELD["id"]]) + 3000),
+        )
+        row[FIELD["vx"]], row[FIELD["num_lidar_pts"]], row[FIELD["camera_visible"]] = (
+            "55.5",
+            "900",
+            "True",
+        )
         row[FIELD["class"]], row[FIELD["l"]] = "truck", "9.5"
 
     def edit(editor: ScenarioEditor) -> None:
         for agent in editor.agents:
             editor.edit_rows(agent, range(present + 1, editor.frames[-1] + 1), shift)
-            editor.edit_calib(agent, range(present + 1, editor.frames[-1] + 1), "ego_to_world", _moved)
+            editor.edit_calib(
+                agent, range(present + 1, editor.frames[-1] + 1), "ego_to_world", _moved
+            )
         without_collision(editor)
 
     after = edited(da_motion, tmp_path, edit)
-    earlier = [sample for sample in before.lines if sample.startswith(scenario) and int(sample[-3:]) <= present]
-    later = [sample for sample in before.lines if sample.startswith(scenario) and int(sample[-3:]) > present]
+    earlier = [
+        sample
+        for sample in before.lines
+        if sample.startswith(scenario) and int(sample[-3:]) <= present
+    ]
+    later = [
+        sample
+        for sample in before.lines
+        if sample.startswith(scenario) and int(sample[-3:]) > present
+    ]
     assert len(earlier) == len(later) == 2
     assert all(before.lines[sample] == after.lines[sample] for sample in earlier)
     assert all(before.lines[sample] != after.lines[sample] for sample in later)
-    assert all(before.truth[sample]["accident"] != after.truth[sample]["accident"] for sample in earlier)
+    assert all(
+        before.truth[sample]["accident"] != after.truth[sample]["accident"] for sample in earlier
+    )
 
 
 def _moved(pose: AnyArray) -> AnyArray:
@@ -86,10 +111,14 @@ def _moved(pose: AnyArray) -> AnyArray:
     return moved
 
 
-def test_an_unknown_speed_is_not_taken_from_the_moment_after(da_motion: DeepAccident, tmp_path: Path) -> None:
+def test_an_unknown_speed_is_not_taken_from_the_moment_after(
+    da_motion: DeepAccident, tmp_path: Path
+) -> None:
     found = edited(da_motion, tmp_path, of_all_rows(_without_speed))
     sample = next(sample for sample in found.lines if sample.startswith(accident_of(da_motion)))
-    assert {speed for actor in found.question(sample)["actors"] for speed in actor["speed"]} == {None}
+    assert {speed for actor in found.question(sample)["actors"] for speed in actor["speed"]} == {
+        None
+    }
 
 
 def _without_speed(row: list[str]) -> None:
@@ -100,7 +129,10 @@ def unseen_actor(dataset: DeepAccident, asked: Asked) -> int:
     """An actor of the accident that has rows in labels of the set, but stands in no question."""
     scenario = accident_of(dataset)
     shown = {actor for truth in asked.truth.values() for actor in truth["actors"].values()}
-    rows = [dataset.boxes(f"{scenario}/{agent}/020", "lidar") for agent in ("ego_vehicle", "ego_vehicle_behind")]
+    rows = [
+        dataset.boxes(f"{scenario}/{agent}/020", "lidar")
+        for agent in ("ego_vehicle", "ego_vehicle_behind")
+    ]
     far = {
         int(actor)
         for boxes in rows
@@ -119,7 +151,9 @@ def test_an_actor_that_nobody_of_the_set_sees_changes_nothing(
     def leave_out(editor: ScenarioEditor) -> None:
         for agent, frame in product(editor.agents, editor.frames):
             first, *rows = editor.rows(agent, frame)
-            editor.write_rows(agent, frame, [first, *(row for row in rows if int(row[FIELD["id"]]) != actor)])
+            editor.write_rows(
+                agent, frame, [first, *(row for row in rows if int(row[FIELD["id"]]) != actor)]
+            )
 
     edit = leave_out if change == "gone" else of_all_rows(_pushed, actor=actor)
     assert edited(da_motion, tmp_path, edit).lines == before.lines
@@ -130,22 +164,45 @@ def _pushed(row: list[str]) -> None:
         row[FIELD[name]] = str(float(row[FIELD[name]]) * 1.1)
 
 
-def test_an_actor_that_is_seen_changes_something(da_motion: DeepAccident, before: Asked, tmp_path: Path) -> None:
+def test_an_actor_that_is_seen_changes_something(
+    da_motion: DeepAccident, before: Asked, tmp_path: Path
+) -> None:
     sample = next(sample for sample in before.truth if sample.startswith(accident_of(da_motion)))
     push = of_all_rows(_pushed, actor=before.truth[sample]["actors"]["a1"])
     assert edited(da_motion, tmp_path, push).lines[sample] != before.lines[sample]
 
 
-@pytest.mark.parametrize("form", [FORM, replace(FORM, observers="all", seen="annotated", agents=AGENTS)])
+@pytest.mark.parametrize(
+    "form", [FORM, replace(FORM, observers="all", seen="annotated", agents=AGENTS)]
+)
 def test_no_word_of_the_release_or_of_the_ending_is_in_a_question(
     da_motion: DeepAccident, tmp_path: Path, form: Questions
 ) -> None:
     found = ask(da_motion, tmp_path, form)
     text = b"\n".join(found.lines.values()).decode().lower()
     words = set(re.findall(r"[a-z0-9_]+", text))
-    told = [word for scenario in da_motion.scenario for word in re.split(r"[/_]", scenario["token"].lower())]
-    agents = {word for agent in AGENTS for word in (agent, *agent.split("_"))} - {"ego", "vehicle", "infrastructure"}
-    for word in {"accident", "normal", "collision", "impact", "split", "train", "val", "direction", *told, *agents}:
+    told = [
+        word
+        for scenario in da_motion.scenario
+        for word in re.split(r"[/_]", scenario["token"].lower())
+    ]
+    agents = {word for agent in AGENTS for word in (agent, *agent.split("_"))} - {
+        "ego",
+        "vehicle",
+        "infrastructure",
+    }
+    for word in {
+        "accident",
+        "normal",
+        "collision",
+        "impact",
+        "split",
+        "train",
+        "val",
+        "direction",
+        *told,
+        *agents,
+    }:
         assert word not in text or word.isdigit(), word
     ids = {str(actor) for truth in found.truth.values() for actor in truth["actors"].values()}
     assert (len(ids) > 10, ids & words) == (True, set())
@@ -153,10 +210,16 @@ def test_no_word_of_the_release_or_of_the_ending_is_in_a_question(
     assert keys == {"id", "seconds", "moments", "conditions", "observers", "actors"}
 
 
-def test_ids_and_order_are_drawn_by_the_seed(da_motion: DeepAccident, before: Asked, tmp_path: Path) -> None:
-    again, other = (ask(da_motion, tmp_path, form) for form in (FORM, replace(FORM, seed="a secret")))
+def test_ids_and_order_are_drawn_by_the_seed(
+    da_motion: DeepAccident, before: Asked, tmp_path: Path
+) -> None:
+    again, other = (
+        ask(da_motion, tmp_path, form) for form in (FORM, replace(FORM, seed="a secret"))
+    )
     assert list(before.lines.items()) == list(again.lines.items())
-    assert not {each["id"] for each in before.truth.values()} & {each["id"] for each in other.truth.values()}
+    assert not {each["id"] for each in before.truth.values()} & {
+        each["id"] for each in other.truth.values()
+    }
     assert list(before.lines) not in (list(other.lines), sorted(before.lines))
 
 
@@ -181,13 +244,20 @@ def test_pictures_have_neutral_names_and_show_no_path(
         for each in listed:
             frame = int(sample[-3:]) + round(each["time"] * 10)
             scenario = sample.rsplit("/", 2)[0]
-            path = da.get_sample_data_path(f"{scenario}/{observers[each['observer']]}/{frame:03d}/{each['camera']}")
+            path = da.get_sample_data_path(
+                f"{scenario}/{observers[each['observer']]}/{frame:03d}/{each['camera']}"
+            )
             assert (folder / each["path"]).read_bytes() == path.read_bytes()
             assert each["path"].startswith(f"images/{question['id']}/")
     paths = [path for path in folder.rglob("*") if path.is_file()]
     assert not any(path.is_symlink() for path in paths)
-    assert not any(re.search(r"accident|normal|scenario|town", str(path.relative_to(folder)).lower()) for path in paths)
-    assert found.done.tally.linked == {way: sum(path.suffix == ".jpg" for path in paths)} != {way: 0}
+    assert not any(
+        re.search(r"accident|normal|scenario|town", str(path.relative_to(folder)).lower())
+        for path in paths
+    )
+    assert (
+        found.done.tally.linked == {way: sum(path.suffix == ".jpg" for path in paths)} != {way: 0}
+    )
 
 
 def _refusing(*_: object) -> None:

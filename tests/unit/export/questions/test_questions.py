@@ -58,7 +58,9 @@ def test_every_window_of_every_ego_is_asked_about(da_motion: DeepAccident, asked
     assert not asked.done.tally.left_out
 
 
-def test_the_actors_of_each_moment_are_those_that_the_set_sees(da_motion: DeepAccident, asked: Asked) -> None:
+def test_the_actors_of_each_moment_are_those_that_the_set_sees(
+    da_motion: DeepAccident, asked: Asked
+) -> None:
     for sample in asked.lines:
         question, truth = asked.question(sample), asked.truth[sample]
         scenario, ego, _ = sample.rsplit("/", 2)
@@ -72,11 +74,15 @@ def test_the_actors_of_each_moment_are_those_that_the_set_sees(da_motion: DeepAc
                     for actor in question["actors"]
                     if time in actor["time"] and name in actor["seen_by"][actor["time"].index(time)]
                 }
-                tokens = visible_instances(da_motion, f"{scenario}/{agent}/{frame:03d}", agents=[agent])
+                tokens = visible_instances(
+                    da_motion, f"{scenario}/{agent}/{frame:03d}", agents=[agent]
+                )
                 assert by_it == {int(token.rsplit("/", 1)[1]) for token in tokens} - members
 
 
-def test_places_headings_speeds_and_sizes_are_those_of_the_labels(da_motion: DeepAccident, asked: Asked) -> None:
+def test_places_headings_speeds_and_sizes_are_those_of_the_labels(
+    da_motion: DeepAccident, asked: Asked
+) -> None:
     for sample in list(asked.lines)[:6]:
         question, truth = asked.question(sample), asked.truth[sample]
         scenario = sample.rsplit("/", 2)[0]
@@ -88,10 +94,14 @@ def test_places_headings_speeds_and_sizes_are_those_of_the_labels(da_motion: Dee
                 token = f"{agents[actor['seen_by'][number][0]]}/{int(sample[-3:]) + round(10 * time):03d}"
                 boxes = da_motion.boxes(token, velocity="label").transform(ego_from_world, "ego")
                 row = np.flatnonzero(boxes.actor_id == truth["actors"][actor["name"]]).item()
-                assert actor["position"][number] == pytest.approx(boxes.center[row, :2].tolist(), abs=0.011)
+                assert actor["position"][number] == pytest.approx(
+                    boxes.center[row, :2].tolist(), abs=0.011
+                )
                 turn = actor["heading"][number] - boxes.yaw[row]
                 assert np.arctan2(np.sin(turn), np.cos(turn)) == pytest.approx(0, abs=0.002)
-                assert actor["speed"][number] == pytest.approx(np.linalg.norm(boxes.velocity[row]), abs=0.006)
+                assert actor["speed"][number] == pytest.approx(
+                    np.linalg.norm(boxes.velocity[row]), abs=0.006
+                )
                 size = pytest.approx(boxes.size[row].tolist(), abs=0.006)
                 assert (actor["class"], actor["size"]) == (boxes.category_names[row], size)
 
@@ -106,7 +116,9 @@ def test_observers_know_themselves(da_motion: DeepAccident, asked: Asked) -> Non
             for number, frame in enumerate(frames_of(sample, question)):
                 token = f"{scenario}/{agent}/{frame:03d}"
                 pose = ego_from_world @ da_motion.world_from(token, "ego")
-                assert observer["position"][number] == pytest.approx(pose.translation[:2].tolist(), abs=0.006)
+                assert observer["position"][number] == pytest.approx(
+                    pose.translation[:2].tolist(), abs=0.006
+                )
                 assert observer["heading"][number] == pytest.approx(pose.yaw, abs=0.001)
             record = da_motion.agent.get(f"{scenario}/{agent}")
             assert truth["actors"].get(observer["name"]) == record["actor_id"]
@@ -119,7 +131,11 @@ def test_names_go_by_what_was_seen_alone(asked: Asked) -> None:
         assert [actor["name"] for actor in question["actors"]] == [
             f"a{number}" for number in range(1, len(question["actors"]) + 1)
         ]
-        apart = [np.hypot(*each["position"][-1]) for each in question["observers"] if "partner" in each["name"]]
+        apart = [
+            np.hypot(*each["position"][-1])
+            for each in question["observers"]
+            if "partner" in each["name"]
+        ]
         assert apart == sorted(apart)
 
 
@@ -130,18 +146,30 @@ def test_the_truth_of_an_accident(da_motion: DeepAccident, asked: Asked) -> None
         if not sample.startswith(scenario):
             whole = (35 - int(sample[-3:])) // 10
             assert truth["accident"] == [False] * whole + [None] * (3 - whole)
-            assert (truth["who"], truth["where"], truth["when"], truth["why"]) == (None, None, None, None)
+            assert (truth["who"], truth["where"], truth["when"], truth["why"]) == (
+                None,
+                None,
+                None,
+                None,
+            )
             continue
         seconds = (35 - int(sample[-3:])) / 10
         assert truth["accident"] == ([True, None, None] if seconds <= 1 else [False, True, None])
-        assert (truth["when"], truth["last_frame"], truth["actor_ids"]) == (seconds, 35, list(contact.actor_ids))
+        assert (truth["when"], truth["last_frame"], truth["actor_ids"]) == (
+            seconds,
+            35,
+            list(contact.actor_ids),
+        )
         impact = da_motion.world_from(sample, "ego").inverse()
         boxes = da_motion.boxes(f"{scenario}/ego_vehicle/035").transform(impact, "ego")
         ids = da_motion.actor_ids(f"{scenario}/ego_vehicle/035")
         for actor, place in zip(truth["actor_ids"], truth["where"], strict=True):
-            assert place == pytest.approx(boxes.center[ids == actor][0, :2].tolist(), abs=0.4)  # own rows are off
+            assert place == pytest.approx(
+                boxes.center[ids == actor][0, :2].tolist(), abs=0.4
+            )  # own rows are off
         assert [
-            truth["actors"].get(name, actor) for name, actor in zip(truth["who"], contact.actor_ids, strict=True)
+            truth["actors"].get(name, actor)
+            for name, actor in zip(truth["who"], contact.actor_ids, strict=True)
         ] == [*contact.actor_ids]
         assert truth["why"]["impact_angle"] == pytest.approx(contact.impact_angle, abs=0.006)
         assert truth["why"]["sides"] == list(contact.sides)
@@ -182,7 +210,9 @@ def without(folder: str) -> Callable[[Path, str], None]:
     def remove(root: Path, scenario: str) -> None:
         kind, name = scenario.split("/")
         for path in root.glob(f"{kind}/{folder}"):
-            shutil.rmtree(path / name) if (path / name).is_dir() else (path / f"{name}.txt").unlink()
+            shutil.rmtree(path / name) if (path / name).is_dir() else (
+                path / f"{name}.txt"
+            ).unlink()
 
     return remove
 
@@ -192,17 +222,35 @@ def naming_a_stranger(root: Path, scenario: str) -> None:
     path = root / kind / "meta" / f"{name}.txt"
     meta = read_meta(path)
     assert meta.collision is not None
-    write_meta(path, replace(meta, collision=replace(meta.collision, ids=(meta.collision.ids[0], 999_999))))
+    write_meta(
+        path, replace(meta, collision=replace(meta.collision, ids=(meta.collision.ids[0], 999_999)))
+    )
 
 
 @pytest.mark.parametrize(
     ("change", "form", "said"),
     [
-        (naming_a_stranger, FORM, {"scenarios with an actor in the accident that no label shows": 1}),
-        (without("meta"), FORM, {"scenarios without meta, which says whether there is an accident": 1}),
+        (
+            naming_a_stranger,
+            FORM,
+            {"scenarios with an actor in the accident that no label shows": 1},
+        ),
+        (
+            without("meta"),
+            FORM,
+            {"scenarios without meta, which says whether there is an accident": 1},
+        ),
         (without("*/label"), FORM, {"scenarios without labels": 1}),
-        (without("other_vehicle/label"), FORM, {"windows with a moment at which an observer has no label": 8}),
-        (without("other_vehicle/*"), FORM, {"recordings whose observers are not all in this release": 2}),
+        (
+            without("other_vehicle/label"),
+            FORM,
+            {"windows with a moment at which an observer has no label": 8},
+        ),
+        (
+            without("other_vehicle/*"),
+            FORM,
+            {"recordings whose observers are not all in this release": 2},
+        ),
         (
             without("ego_vehicle/*"),
             replace(FORM, observers="single"),
@@ -225,32 +273,76 @@ def test_what_cannot_be_asked_is_counted(
     assert len({sample.rsplit("/", 2)[0] for sample in found.lines} - {accident_of(da_motion)}) == 1
 
 
-def test_a_release_in_which_nothing_can_be_asked(da_motion: DeepAccident, da_b: DeepAccident, tmp_path: Path) -> None:
+def test_a_release_in_which_nothing_can_be_asked(
+    da_motion: DeepAccident, da_b: DeepAccident, tmp_path: Path
+) -> None:
     root = tmp_path / "release"
-    shutil.copytree(da_motion.dataroot, root, ignore=shutil.ignore_patterns(".deepaccident", "meta"))
-    without_meta, short = DeepAccident(dataroot=root, verbose=False, workers=1), WindowRules(observe=0, stride=0.5)
+    shutil.copytree(
+        da_motion.dataroot, root, ignore=shutil.ignore_patterns(".deepaccident", "meta")
+    )
+    without_meta, short = (
+        DeepAccident(dataroot=root, verbose=False, workers=1),
+        WindowRules(observe=0, stride=0.5),
+    )
     assert_refused(
         (
             lambda: ask(without_meta, tmp_path, FORM),
             NotAvailableError,
             "^no question can be asked: scenarios lack labels",
         ),
-        (lambda: ask(da_b, tmp_path, Questions(window=short)), NotAvailableError, ("no recording is long", "has 0.4")),
+        (
+            lambda: ask(da_b, tmp_path, Questions(window=short)),
+            NotAvailableError,
+            ("no recording is long", "has 0.4"),
+        ),
     )
 
 
 def test_the_command(da_motion: DeepAccident, asked: Asked, tmp_path: Path) -> None:
-    words = ["--agents", ",".join(SET), "--ego", "ego_vehicle,infrastructure", "--observe", 1, "--stride", 0.5]
-    result = verb("export", "questions", da_motion.dataroot, "--out", tmp_path / "out", "--workers", 1, *words)
+    words = [
+        "--agents",
+        ",".join(SET),
+        "--ego",
+        "ego_vehicle,infrastructure",
+        "--observe",
+        1,
+        "--stride",
+        0.5,
+    ]
+    result = verb(
+        "export", "questions", da_motion.dataroot, "--out", tmp_path / "out", "--workers", 1, *words
+    )
     assert result.exit_code == 0, result.output
     for name in ("questions/questions.jsonl", "truth.jsonl"):
         assert (tmp_path / "out" / name).read_bytes() == (asked.done.folder / name).read_bytes()
-    refused = verb("export", "questions", da_motion.dataroot, "--out", tmp_path / "out", "--channels", "Camera_Back")
-    assert (refused.exit_code, "--channels changes nothing without --images" in refused.stderr) == (2, True)
+    refused = verb(
+        "export",
+        "questions",
+        da_motion.dataroot,
+        "--out",
+        tmp_path / "out",
+        "--channels",
+        "Camera_Back",
+    )
+    assert (refused.exit_code, "--channels changes nothing without --images" in refused.stderr) == (
+        2,
+        True,
+    )
 
 
 def test_the_command_with_pictures(da: DeepAccident, tmp_path: Path) -> None:
-    words = ["--observe", 0, "--stride", 0.5, "--images", "copy", "--channels", "all", "--seed", "a b"]
+    words = [
+        "--observe",
+        0,
+        "--stride",
+        0.5,
+        "--images",
+        "copy",
+        "--channels",
+        "all",
+        "--seed",
+        "a b",
+    ]
     verb("export", "questions", da.dataroot, "--out", tmp_path / "out", "--workers", 1, *words)
     told = json.loads((tmp_path / "out" / "questions.manifest.json").read_text())
     assert (told["written"]["linked"], told["settings"]["seed"]) == ({"copy": 4 * 6}, "a b")

@@ -39,7 +39,9 @@ def split(points: np.ndarray, lengths: np.ndarray) -> list[list[tuple[int, int]]
 def test_contours_and_hulls_are_opencvs(oracle, masks) -> None:
     contours = [first_contour(*np.nonzero(mask)) for mask in masks]
     assert contours == split(oracle["contour"], oracle["contour_length"])
-    assert [convex_hull(contour) for contour in contours] == split(oracle["hull"], oracle["hull_length"])
+    assert [convex_hull(contour) for contour in contours] == split(
+        oracle["hull"], oracle["hull_length"]
+    )
 
 
 def test_rectangles_are_opencvs_to_the_last_bit(oracle) -> None:
@@ -73,4 +75,8 @@ def test_the_part_that_comes_last_outside_of_all_holes_counts() -> None:
 
 def test_no_hulls_no_rectangles() -> None:
     size, angle = min_area_rects([])
-    assert (size.shape, angle.shape, are_one_part(*[np.zeros(0, dtype=int)] * 3, 0).shape) == ((0, 2), (0,), (0,))
+    assert (size.shape, angle.shape, are_one_part(*[np.zeros(0, dtype=int)] * 3, 0).shape) == (
+        (0, 2),
+        (0,),
+        (0,),
+    )

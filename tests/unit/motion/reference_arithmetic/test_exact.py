@@ -29,4 +29,8 @@ def test_every_default_and_constant_written_out() -> None:
     assert written_out("deepaccident_devkit.motion.reference_arithmetic") == WRITTEN
     assert first_contour(np.zeros(1, dtype=int), np.zeros(1, dtype=int)) == [(0, 0)]
     assert len(pair_gaps(np.zeros((3, 3), dtype=np.int32), np.zeros(0, dtype=np.int64))[0]) == 0
-    assert len(filled_cells(np.zeros((0, 4, 2)), (3, 3))[0]) == len(pose_matrices(np.zeros((0, 6)))) == 0
+    assert (
+        len(filled_cells(np.zeros((0, 4, 2)), (3, 3))[0])
+        == len(pose_matrices(np.zeros((0, 6))))
+        == 0
+    )

@@ -51,7 +51,12 @@ def test_simplified_outlines_are_scikit_images_but_for_ties(oracle, expected) ->
     kept = np.split(oracle["kept"], np.cumsum(oracle["outline_length"])[:-1])
     found = simplified_outlines(expected)
     assert (
-        np.mean([np.array_equal(ours, points[keep]) for ours, points, keep in zip(found, expected, kept, strict=True)])
+        np.mean(
+            [
+                np.array_equal(ours, points[keep])
+                for ours, points, keep in zip(found, expected, kept, strict=True)
+            ]
+        )
         > 0.95
     )
     for ours, points in zip(found, expected, strict=True):
@@ -62,8 +67,17 @@ def test_simplified_outlines_are_scikit_images_but_for_ties(oracle, expected) ->
 def largest_distance(points: np.ndarray, chain: np.ndarray) -> float:
     """How far points are from a chain of lines at most."""
     start, along = chain[:-1], np.diff(chain, axis=0)
-    place = np.clip(((points[:, None] - start) * along).sum(axis=-1) / np.maximum((along**2).sum(axis=1), 1e-30), 0, 1)
-    return float(np.sqrt(((points[:, None] - start - place[..., None] * along) ** 2).sum(axis=-1)).min(axis=1).max())
+    place = np.clip(
+        ((points[:, None] - start) * along).sum(axis=-1)
+        / np.maximum((along**2).sum(axis=1), 1e-30),
+        0,
+        1,
+    )
+    return float(
+        np.sqrt(((points[:, None] - start - place[..., None] * along) ** 2).sum(axis=-1))
+        .min(axis=1)
+        .max()
+    )
 
 
 def test_the_first_of_ties_is_kept_whatever_the_machine() -> None:
@@ -77,7 +91,10 @@ def test_the_first_of_ties_is_kept_whatever_the_machine() -> None:
 
 def test_no_outlines_are_simplified() -> None:
     nothing = np.zeros((0, 2))
-    assert (simplified_outlines([]), [len(each) for each in simplified_outlines([nothing, np.eye(2), nothing])]) == (
+    assert (
+        simplified_outlines([]),
+        [len(each) for each in simplified_outlines([nothing, np.eye(2), nothing])],
+    ) == (
         [],
         [0, 2, 0],
     )
@@ -88,7 +105,8 @@ def test_an_outline_is_found_wherever_it_is() -> None:
     image[20:24, 10:19] = 3
     there = outline_of(image, 3)
     assert_allclose(
-        [there.min(axis=0), there.max(axis=0)], [[20 - 29 / 30, 10 - 29 / 30], [23 + 29 / 30, 18 + 29 / 30]]
+        [there.min(axis=0), there.max(axis=0)],
+        [[20 - 29 / 30, 10 - 29 / 30], [23 + 29 / 30, 18 + 29 / 30]],
     )
 
 
@@ -121,7 +139,11 @@ def boxes() -> np.ndarray:
 def test_instances_are_nearer_than_they_are_drawn(boxes) -> None:
     """By 0.9 and 0.95 cells: each outline runs where the interpolated id is 0.1."""
     gaps = gaps_of(boxes, 1, 2, 3)
-    assert (list(gaps), gaps[1, 2], gaps[2, 3]) == ([(1, 2), (1, 3), (2, 3)], pytest.approx(8 - 0.9 - 0.95), 0)
+    assert (list(gaps), gaps[1, 2], gaps[2, 3]) == (
+        [(1, 2), (1, 3), (2, 3)],
+        pytest.approx(8 - 0.9 - 0.95),
+        0,
+    )
     assert first_outline(boxes, 2, find_objects(boxes)[1])[:, 1].min() == 20 - 0.95
 
 
@@ -142,7 +164,11 @@ def test_who_is_not_there_or_too_small_is_far_away(boxes) -> None:
 
 
 def test_nobody_has_no_distances(boxes) -> None:
-    assert (gaps_of(boxes), gaps_of(boxes, 2), gaps_of(np.zeros_like(boxes), 1, 2)) == ({}, {}, {(1, 2): NO_OUTLINE})
+    assert (gaps_of(boxes), gaps_of(boxes, 2), gaps_of(np.zeros_like(boxes), 1, 2)) == (
+        {},
+        {},
+        {(1, 2): NO_OUTLINE},
+    )
 
 
 def test_ids_keep_their_order(boxes) -> None:

@@ -7,7 +7,10 @@ PEAKS = np.array([[0, 0], [0, 2]], dtype=np.float32)
 
 
 def test_the_first_of_equally_near_peaks() -> None:
-    assert_array_equal(nearest_peaks(np.array([[0, 0, 0, 5], [0.5, 1, 1.5, 1]], dtype=np.float32), PEAKS), [0, 0, 1, 0])
+    assert_array_equal(
+        nearest_peaks(np.array([[0, 0, 0, 5], [0.5, 1, 1.5, 1]], dtype=np.float32), PEAKS),
+        [0, 0, 1, 0],
+    )
 
 
 def test_distances_are_equal_where_their_float32_roots_are() -> None:

@@ -55,7 +55,13 @@ def test_later_polygons_lie_on_top_and_every_image_has_its_own() -> None:
 
 def test_triangles_and_stars_go_through_the_whole_rule() -> None:
     assert_array_equal(drawing([[[0, 0], [4, 0], [0, 4]]], (5, 5)), np.tri(5, dtype=int)[::-1])
-    star = [[5, 0], [2, 9], [10, 3], [0, 3], [8, 9]]  # turns one way, but twice around: empty in the middle
+    star = [
+        [5, 0],
+        [2, 9],
+        [10, 3],
+        [0, 3],
+        [8, 9],
+    ]  # turns one way, but twice around: empty in the middle
     filled = drawing([star], (10, 11))
     assert (filled[5, 5], filled[2, 5]) == (0, 1)
 
@@ -73,13 +79,22 @@ def test_nothing_to_draw() -> None:
 @pytest.mark.parametrize(
     ("make", "sentence"),
     [
-        (lambda: filled_cells(np.zeros((4, 2)), (8, 8)), r"polygons: expected shape \(N, N, 2\), found \(4, 2\)"),
-        (lambda: filled_cells(np.zeros((1, 2, 2)), (8, 8)), "polygons: expected at least 3 corners, found 2"),
+        (
+            lambda: filled_cells(np.zeros((4, 2)), (8, 8)),
+            r"polygons: expected shape \(N, N, 2\), found \(4, 2\)",
+        ),
+        (
+            lambda: filled_cells(np.zeros((1, 2, 2)), (8, 8)),
+            "polygons: expected at least 3 corners, found 2",
+        ),
         (
             lambda: filled_cells(np.zeros((2, 4, 2)), (8, 8), [0, 2], 2),
             "image: expected numbers from 0 to 1, found 0 to 2",
         ),
-        (lambda: filled_cells(np.full((1, 4, 2), 0.5), (8, 8)), "polygons: expected whole numbers of int64"),
+        (
+            lambda: filled_cells(np.full((1, 4, 2), 0.5), (8, 8)),
+            "polygons: expected whole numbers of int64",
+        ),
     ],
 )
 def test_what_is_no_polygon_is_refused(make: Callable[[], object], sentence: str) -> None:

@@ -127,9 +127,15 @@ def found(value: Any) -> dict[str, list[Any]]:
         lambda: dict(zip(ROWS[0], pa.Table.from_pylist(ROWS).columns, strict=True)),
         lambda: pytest.importorskip("pandas").DataFrame(ROWS),
         lambda: [row for _, row in pytest.importorskip("pandas").DataFrame(ROWS).iterrows()],
-        lambda: {name: pytest.importorskip("pandas").Series(column(name), index=["a", "b"]) for name in ROWS[0]},
+        lambda: {
+            name: pytest.importorskip("pandas").Series(column(name), index=["a", "b"])
+            for name in ROWS[0]
+        },
         lambda: pytest.importorskip("polars").DataFrame(ROWS),
-        lambda: {"ttc": pytest.importorskip("polars").Series(column("ttc")), "length": iter(column("length"))},
+        lambda: {
+            "ttc": pytest.importorskip("polars").Series(column("ttc")),
+            "length": iter(column("length")),
+        },
         lambda: [{"frame": pa.Table.from_pylist(ROWS[:1])}, (Named(**row) for row in ROWS[1:])],
     ],
 )
@@ -146,7 +152,9 @@ def test_words_numbers_and_what_is_masked_are_values() -> None:
 
 
 def test_components_and_rows_have_keys() -> None:
-    keys = dict.fromkeys(key for keys, _ in values_in({"center": np.zeros((2, 3))}, {}, [""]) for key in keys)
+    keys = dict.fromkeys(
+        key for keys, _ in values_in({"center": np.zeros((2, 3))}, {}, [""]) for key in keys
+    )
     assert [*keys][:3] == ["/center/*/*", "/center/*/*[0]", "/center/*[0]/*"]
     assert len(keys) == 1 + 3 + 2
 

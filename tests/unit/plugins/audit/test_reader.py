@@ -57,11 +57,23 @@ def of_first_lines(make: Callable[[list[float]], Any]) -> Reader:
 
 
 def frames_as_a_speed(root: str) -> Any:
-    lines = [path.read_text().splitlines()[0].split() for path in sorted(Path(root).glob("*/meta/*.txt"))]
-    return {"scenes": [{"speed": float(words[-1]), "num_frames": int(words[-1])} for words in lines]}
+    lines = [
+        path.read_text().splitlines()[0].split() for path in sorted(Path(root).glob("*/meta/*.txt"))
+    ]
+    return {
+        "scenes": [{"speed": float(words[-1]), "num_frames": int(words[-1])} for words in lines]
+    }
 
 
-COUNTDOWNS = ("ttc", "time_to_collision", "countdown", "timeToCollision", "collision_time", "eta", "seconds_left")
+COUNTDOWNS = (
+    "ttc",
+    "time_to_collision",
+    "countdown",
+    "timeToCollision",
+    "collision_time",
+    "eta",
+    "seconds_left",
+)
 OBJECT = "objects/*/"
 LINE_1 = ("line 1 of the labels, number 1", "line 1 of the labels, number 2")
 
@@ -79,7 +91,9 @@ def column(number: int) -> str:
             id="points as a countdown",
         ),
         pytest.param(
-            of_first_lines(lambda first: {"speed": first[0], "yaw_rate": first[1], "pos_x": first[0]}),
+            of_first_lines(
+                lambda first: {"speed": first[0], "yaw_rate": first[1], "pos_x": first[0]}
+            ),
             {"*/speed": LINE_1[0], "*/yaw_rate": LINE_1[1], "*/pos_x": LINE_1[0]},
             id="line 1 as speed, yaw rate and position",
         ),
@@ -94,26 +108,45 @@ def column(number: int) -> str:
             id="line 1 as the velocity in the world that it is",
         ),
         pytest.param(
-            of_rows(lambda row: dict(zip(("width", "height", "length"), map(float, row[4:7]), strict=True))),
-            {OBJECT + name: column(5 + place) for place, name in enumerate(("width", "height", "length"))},
+            of_rows(
+                lambda row: dict(
+                    zip(("width", "height", "length"), map(float, row[4:7]), strict=True)
+                )
+            ),
+            {
+                OBJECT + name: column(5 + place)
+                for place, name in enumerate(("width", "height", "length"))
+            },
             id="sizes in another order",
         ),
         pytest.param(
-            of_rows(lambda row: {"whl": list(map(float, row[4:7])), "lwh": list(map(float, row[4:7]))}),
+            of_rows(
+                lambda row: {"whl": list(map(float, row[4:7])), "lwh": list(map(float, row[4:7]))}
+            ),
             {f"{OBJECT}whl/*[{place}]": column(5 + place) for place in range(3)},
             id="sizes in a list",
         ),
         pytest.param(
-            of_rows(lambda row: dict(zip(("dy", "dx", "size_z"), map(float, row[4:7]), strict=True))),
+            of_rows(
+                lambda row: dict(zip(("dy", "dx", "size_z"), map(float, row[4:7]), strict=True))
+            ),
             {f"{OBJECT}dy": column(5), f"{OBJECT}dx": column(6)},
             id="extents along other axes",
         ),
         pytest.param(
-            of_rows(lambda row: {"collided": row[12] == "True", "crash": int(row[12] == "True"), "is_hit": row[12]}),
+            of_rows(
+                lambda row: {
+                    "collided": row[12] == "True",
+                    "crash": int(row[12] == "True"),
+                    "is_hit": row[12],
+                }
+            ),
             {OBJECT + name: column(13) for name in ("collided", "crash", "is_hit")},
             id="visibility as a collision",
         ),
-        pytest.param(frames_as_a_speed, {"scenes/*/speed": "line 1 of meta, word 9"}, id="frames as a speed"),
+        pytest.param(
+            frames_as_a_speed, {"scenes/*/speed": "line 1 of meta, word 9"}, id="frames as a speed"
+        ),
         pytest.param(
             of_rows(
                 lambda row: {
@@ -133,7 +166,9 @@ def column(number: int) -> str:
         ),
     ],
 )
-def test_a_misreading_is_named_with_its_key_and_column(reader: Reader, wrong: dict[str, str]) -> None:
+def test_a_misreading_is_named_with_its_key_and_column(
+    reader: Reader, wrong: dict[str, str]
+) -> None:
     report = audit_reader(reader)
     assert misread(report) == wrong
     assert report.exit_status == bool(wrong)
@@ -143,17 +178,26 @@ def test_the_bev_array_as_a_picture(tmp_path: Path) -> None:
     def saved(root: str) -> Any:
         for number, array in enumerate(arrays_of_bev(root)[:2]):
             cv2.imwrite(str(tmp_path / f"{number}.jpg"), array)
-        return {"images": [str(tmp_path / f"{number}.jpg") for number in range(2)], "image_height": 1200}
+        return {
+            "images": [str(tmp_path / f"{number}.jpg") for number in range(2)],
+            "image_height": 1200,
+        }
 
     for read, number in ((saved, 2), (lambda root: {"rgb": arrays_of_bev(root)[0][..., ::-1]}, 1)):
         report = audit_reader(read)
-        assert [(finding.kind, finding.number) for finding in report.findings] == [("picture", number)]
+        assert [(finding.kind, finding.number) for finding in report.findings] == [
+            ("picture", number)
+        ]
     assert (
-        audit_reader(lambda root: {"bev": arrays_of_bev(root)[0], "image": np.zeros((90, 160, 3), np.uint8)}).findings
+        audit_reader(
+            lambda root: {"bev": arrays_of_bev(root)[0], "image": np.zeros((90, 160, 3), np.uint8)}
+        ).findings
         == ()
     )
     for path in tmp_path.glob("*.jpg"):  # smaller pictures, in a folder
-        cv2.imwrite(str(path), cv2.resize(cv2.imread(str(path)), (300, 300), interpolation=cv2.INTER_AREA))
+        cv2.imwrite(
+            str(path), cv2.resize(cv2.imread(str(path)), (300, 300), interpolation=cv2.INTER_AREA)
+        )
     (tmp_path / "torn.png").write_bytes(b"\x89PNG")
     assert audit_reader(tmp_path).findings[0].examples == ("0.jpg", "1.jpg")
 
@@ -182,7 +226,11 @@ def tables(root: str) -> Any:
 
 def test_a_right_reader_is_not_blamed() -> None:
     report = audit_reader(lambda root: [*decoded(root)])
-    assert (report.findings, report.exit_status, report.compared["keys by their names"]) == ((), 0, 5)
+    assert (report.findings, report.exit_status, report.compared["keys by their names"]) == (
+        (),
+        0,
+        5,
+    )
     found = holds(report)
     assert [found[f"*/boxes/*/*[{place}]"] for place in range(7)] == [
         f"column {2 + place} of the labels" for place in range(7)
@@ -199,7 +247,11 @@ def test_the_devkit_itself_is_not_blamed() -> None:
     assert found["annotation/*/num_lidar_pts"] == "column 12 of the labels"
     assert found["annotation/*/camera_visible"] == "column 13 of the labels"
     assert found["sample/*/velocity/*[0]"] == "line 1 of the labels, number 1"
-    assert not [key for key in found if key.startswith(("annotation/*/velocity/", "track/*/velocity", "calibrated"))]
+    assert not [
+        key
+        for key in found
+        if key.startswith(("annotation/*/velocity/", "track/*/velocity", "calibrated"))
+    ]
 
 
 def test_what_was_written_of_the_release(tmp_path: Path) -> None:
@@ -220,7 +272,16 @@ def test_what_was_written_of_the_release(tmp_path: Path) -> None:
         ("text", "str"),
         (b"\x80\xff", "bytes"),
         (print, "function"),
-        ({"ttc": [None, math.inf, "x"], "image": None, "photo": "none.jpg", "deep": [[[]]], 1: {2: 3}}, ""),
+        (
+            {
+                "ttc": [None, math.inf, "x"],
+                "image": None,
+                "photo": "none.jpg",
+                "deep": [[[]]],
+                1: {2: 3},
+            },
+            "",
+        ),
         ([{"when": datetime.now(timezone.utc)}], "datetime"),
         ({"cloud": np.zeros((9000, 4))}, "ndarray"),
     ],
@@ -233,7 +294,9 @@ def test_nothing_that_is_known_is_no_verdict(output: object, unread: str) -> Non
 
 
 def test_scaled_numbers_and_names_that_say_nothing_are_no_verdict() -> None:
-    report = audit_reader(of_rows(lambda row: {"ttc": float(row[11]) / 10, "length": float(row[5]) * 100}))
+    report = audit_reader(
+        of_rows(lambda row: {"ttc": float(row[11]) / 10, "length": float(row[5]) * 100})
+    )
     assert report.exit_status == 2
     assert "objects/*/ttc" in report.cannot_say[1]
     partly = audit_reader(of_rows(lambda row: {"ttc": float(row[11]) / 10, "x": float(row[1])}))
@@ -255,7 +318,10 @@ def test_scaled_numbers_and_names_that_say_nothing_are_no_verdict() -> None:
 )
 def test_axes_that_are_exchanged(names: dict[str, str], wrong: list[str]) -> None:
     def read(row: Row) -> dict[str, Any]:
-        made = {name: [float(row["xyz".index(axis) + 1]) for axis in axes] for name, axes in names.items()}
+        made = {
+            name: [float(row["xyz".index(axis) + 1]) for axis in axes]
+            for name, axes in names.items()
+        }
         return {name: values if values[1:] else values[0] for name, values in made.items()}
 
     report = audit_reader(of_rows(read))
@@ -265,9 +331,13 @@ def test_axes_that_are_exchanged(names: dict[str, str], wrong: list[str]) -> Non
 
 def test_rows_in_place_of_columns() -> None:
     for order, wrong in (([1, 2, 3], 0), ([2, 1, 3], 2)):
-        columns = audit_reader(lambda root, order=order: {"pos": np.array(rows(root))[:, order].astype(float)})
+        columns = audit_reader(
+            lambda root, order=order: {"pos": np.array(rows(root))[:, order].astype(float)}
+        )
         assert len(columns.findings) == wrong
-        turned = audit_reader(lambda root, order=order: {"pos": np.array(rows(root))[:, order].astype(float).T})
+        turned = audit_reader(
+            lambda root, order=order: {"pos": np.array(rows(root))[:, order].astype(float).T}
+        )
         assert (len(turned.findings), turned.compared["keys by their names"]) == (wrong, 3)
 
 
@@ -284,5 +354,8 @@ def test_files_of_other_formats_are_named_and_not_opened(tmp_path: Path) -> None
     (tmp_path / "evil.pkl").write_bytes(b"cos\nsystem\n(S'touch evil'\ntR.")
     (tmp_path / "boxes.npz").write_bytes(b"PK")
     report = audit_reader(tmp_path)
-    assert (report.exit_status, report.cannot_say[1]) == (2, "not looked into: boxes.npz, evil.pkl.")
+    assert (report.exit_status, report.cannot_say[1]) == (
+        2,
+        "not looked into: boxes.npz, evil.pkl.",
+    )
     assert audit_reader(tmp_path / "nowhere").exit_status == 2

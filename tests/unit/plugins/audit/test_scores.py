@@ -45,7 +45,9 @@ def release(tmp_path_factory: pytest.TempPathFactory) -> DeepAccident:
 
 def of_scenarios(release: DeepAccident, score: Made) -> dict[str, float]:
     rng = np.random.default_rng(1)
-    return {each["token"]: float(score(dict(each), rng)) for each in release.scenario if each["weather"]}
+    return {
+        each["token"]: float(score(dict(each), rng)) for each in release.scenario if each["weather"]
+    }
 
 
 def of_samples(release: DeepAccident, score: Made) -> dict[str, float]:
@@ -70,7 +72,10 @@ def kinds(report: AuditReport) -> list[str]:
 @pytest.mark.parametrize("of", [of_scenarios, of_samples])
 @pytest.mark.parametrize(
     "score",
-    [lambda each, _rng: -each["num_frames"], lambda each, rng: -each["num_frames"] + 0.3 * rng.normal()],
+    [
+        lambda each, _rng: -each["num_frames"],
+        lambda each, rng: -each["num_frames"] + 0.3 * rng.normal(),
+    ],
     ids=["length", "length with noise"],
 )
 def test_the_length_of_clips_is_told(release: DeepAccident, of: Any, score: Made) -> None:
@@ -93,7 +98,10 @@ def test_the_length_of_clips_is_told(release: DeepAccident, of: Any, score: Made
         (of_samples, lambda each, _rng: each["collision"] is not None),
         (  # rises towards the accident
             of_samples,
-            lambda each, rng: (each["collision"] is not None) * frame_of(each) / each["num_frames"] + rng.random() / 9,
+            lambda each, rng: (
+                (each["collision"] is not None) * frame_of(each) / each["num_frames"]
+                + rng.random() / 9
+            ),
         ),
     ],
     ids=["random", "random samples", "truth", "truth with noise", "truth of samples", "rising"],
@@ -102,8 +110,12 @@ def test_other_scores_are_not_told(release: DeepAccident, of: Any, score: Made) 
     assert kinds(audit_scores(release, of(release, score))) == []
 
 
-def test_the_truth_is_not_called_its_length_though_the_length_separates_it(release: DeepAccident) -> None:
-    report = audit_scores(release, of_scenarios(release, lambda each, _rng: each["collision"] is not None))
+def test_the_truth_is_not_called_its_length_though_the_length_separates_it(
+    release: DeepAccident,
+) -> None:
+    report = audit_scores(
+        release, of_scenarios(release, lambda each, _rng: each["collision"] is not None)
+    )
     assert row_of(report, "the scores")[0] == 1
     area, overall, _, _, *within = row_of(report, "length")
     assert area > 0.9
@@ -115,13 +127,20 @@ def test_the_truth_is_not_called_its_length_though_the_length_separates_it(relea
     ("kind", "said", "of", "score"),
     [
         ("town", "a detector of towns", of_scenarios, lambda each, _rng: int(each["town"][-1]) % 3),
-        ("name", "a detector of large numbers in names", of_scenarios, lambda each, _rng: int(each["name"][-5:])),
+        (
+            "name",
+            "a detector of large numbers in names",
+            of_scenarios,
+            lambda each, _rng: int(each["name"][-5:]),
+        ),
         ("length", "a detector of long clips", of_scenarios, lambda each, _rng: each["num_frames"]),
         ("frame", "a detector of late frames", of_samples, lambda each, _rng: frame_of(each)),
         ("frame", "a detector of early frames", of_samples, lambda each, _rng: -frame_of(each)),
     ],
 )
-def test_other_attributes(release: DeepAccident, kind: str, said: str, of: Any, score: Made) -> None:
+def test_other_attributes(
+    release: DeepAccident, kind: str, said: str, of: Any, score: Made
+) -> None:
     report = audit_scores(release, of(release, score))
     assert {finding.kind: said in finding.what for finding in report.findings}[kind]
 
@@ -129,7 +148,9 @@ def test_other_attributes(release: DeepAccident, kind: str, said: str, of: Any, 
 def test_areas(release: DeepAccident) -> None:
     """Twins share name and town, which so tell nothing; the folder tells all here, and the weather of META too."""
     report = audit_scores(release, of_samples(release, lambda _each, rng: rng.random()))
-    areas = {name: row_of(report, name)[0] for name in ("folder", "name", "town", "weather", "actors")}
+    areas = {
+        name: row_of(report, name)[0] for name in ("folder", "name", "town", "weather", "actors")
+    }
     assert areas == {"folder": 1, "name": 0.5, "town": 0.5, "weather": 1, "actors": 0.5}
     scenarios = [each for each in release.scenario if each["weather"]]
     pairs = [
@@ -144,7 +165,11 @@ def test_areas(release: DeepAccident) -> None:
 def test_leaving_a_scenario_out_of_its_own_share_makes_no_area(release: DeepAccident) -> None:
     """Without twins, the other collisions of a collision's town are fewer, which must not look like a sign."""
     scores = of_scenarios(release, lambda _each, rng: rng.random())
-    alone = {token: score for token, score in scores.items() if ("accident" in token) == (int(token[-5:]) < PAIRS / 2)}
+    alone = {
+        token: score
+        for token, score in scores.items()
+        if ("accident" in token) == (int(token[-5:]) < PAIRS / 2)
+    }
     assert row_of(audit_scores(release, alone), "town")[0] == 0.5
 
 
@@ -156,12 +181,17 @@ def test_a_split_and_the_same_numbers_again(release: DeepAccident, tmp_path: Pat
     assert report.notes[0] == "16 scenarios with meta and a score, 8 with a collision."
     few = {token: scores[token] for token in reversed(chosen)}
     assert report.to_json() == audit_scores(release, few).to_json()
-    assert json.loads(report.to_json())["tables"]["scores"][1][:2] == ["the scores", row_of(report, "the scores")[0]]
+    assert json.loads(report.to_json())["tables"]["scores"][1][:2] == [
+        "the scores",
+        row_of(report, "the scores")[0],
+    ]
 
 
 def test_few_scenarios_give_no_verdict(release: DeepAccident) -> None:
     scores = of_scenarios(release, lambda each, _rng: -each["num_frames"])
-    report = audit_scores(release, {token: scores[token] for token in scores if int(token[-5:]) < 3})
+    report = audit_scores(
+        release, {token: scores[token] for token in scores if int(token[-5:]) < 3}
+    )
     assert (kinds(report), report.exit_status) == ([], 2)
     assert "fewer than 6" in report.cannot_say[0]
 
@@ -179,7 +209,10 @@ def odd_release(tmp_path_factory: pytest.TempPathFactory) -> DeepAccident:
     """As in val, some scenarios end otherwise than their folder says: two without a collision, and one with."""
     root = tmp_path_factory.mktemp("odd") / "release"
     for number in range(PAIRS):
-        for kind, meta in (("accident", SILENT if number < 2 else META), ("normal", META if number == 2 else SILENT)):
+        for kind, meta in (
+            ("accident", SILENT if number < 2 else META),
+            ("normal", META if number == 2 else SILENT),
+        ):
             write_tiny_release(
                 root,
                 frames=4,
@@ -203,7 +236,9 @@ def odd_release(tmp_path_factory: pytest.TempPathFactory) -> DeepAccident:
         (lambda _each, rng: rng.random(), []),
     ],
 )
-def test_the_folders_word_is_told_from_the_truth(odd_release: DeepAccident, score: Made, found: list[str]) -> None:
+def test_the_folders_word_is_told_from_the_truth(
+    odd_release: DeepAccident, score: Made, found: list[str]
+) -> None:
     report = audit_scores(odd_release, of_scenarios(odd_release, score))
     assert (kinds(report), report.exit_status) == (found, len(found))
     assert "folder" not in report.cannot_say[0]
@@ -236,15 +271,23 @@ def test_files_of_scores(release: DeepAccident, tmp_path: Path) -> None:
         path.write_text(lines, encoding="utf-8", newline="")
         assert read_scores(path) == {sample: 0.5, other: 0.2}, lines
     path = tmp_path / "scores.json"
-    for scores in ({sample: 1, other: 0.25}, [{"token": sample, "score": 1, "id": 3}, {"token": other, "score": 0.25}]):
+    for scores in (
+        {sample: 1, other: 0.25},
+        [{"token": sample, "score": 1, "id": 3}, {"token": other, "score": 0.25}],
+    ):
         path.write_text(json.dumps(scores))
         assert read_scores(path) == {sample: 1, other: 0.25}
-    accidents = [Accident(positions=np.zeros((2, 2)), time=1.0, score=score) for score in (0.3, 0.7)]
+    accidents = [
+        Accident(positions=np.zeros((2, 2)), time=1.0, score=score) for score in (0.3, 0.7)
+    ]
     with ResultsWriter(tmp_path / "results.json", "accident") as writer:
         writer.add(sample, accidents)
         writer.add(other, [])
     assert read_scores(tmp_path / "results.json") == {sample: 0.7, other: 0.0}
-    document = json.loads((tmp_path / "results.json").read_text()) | {"task": "detection", "results": {sample: []}}
+    document = json.loads((tmp_path / "results.json").read_text()) | {
+        "task": "detection",
+        "results": {sample: []},
+    }
     (tmp_path / "boxes.json").write_text(json.dumps(document))
     (tmp_path / "folder").mkdir()
     for name, content, told in (

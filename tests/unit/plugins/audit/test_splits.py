@@ -44,8 +44,18 @@ def path_of(token: str, frame: int, root: str = "/data/2023/DeepAccident") -> st
 
 def test_the_official_split_passes_and_so_do_its_subsets(sides: Sides) -> None:
     records = [
-        {"token": token, "scenario_type": token.split("/")[0], "name": token.split("/")[1], "collision": None}
-        | {"designed_accident": token.startswith(ACCIDENT), "road_type": None, "spawn_side": None, "weather": "Clear"}
+        {
+            "token": token,
+            "scenario_type": token.split("/")[0],
+            "name": token.split("/")[1],
+            "collision": None,
+        }
+        | {
+            "designed_accident": token.startswith(ACCIDENT),
+            "road_type": None,
+            "spawn_side": None,
+            "weather": "Clear",
+        }
         for token in TOKENS
     ]
     split = {name: list(tokens) for name, tokens in split_records(records).by_name().items()}  # type: ignore[arg-type]
@@ -53,7 +63,9 @@ def test_the_official_split_passes_and_so_do_its_subsets(sides: Sides) -> None:
     assert report.findings == ()
     assert [row[1] for row in report.tables["sides"]] == ["recordings", 56, 12, 12]
     assert numbers(sides(train_mini=split["train_mini"], val=split["val"])) == {}
-    assert numbers(sides(train_mini=split["train_mini"], train=split["train"])) == {"recordings": 10}
+    assert numbers(sides(train_mini=split["train_mini"], train=split["train"])) == {
+        "recordings": 10
+    }
 
 
 @pytest.mark.parametrize("form", ["{0} {1}", "{0}/{1}", "  {0}  {1}  "])
@@ -62,7 +74,8 @@ def test_a_random_split_by_names_tears_twins(sides: Sides, form: str) -> None:
     Random(1).shuffle(lines)  # noqa: S311
     report = sides(train=lines[:60], val=lines[60:])
     torn = len(
-        {line.split("scenario")[-1] for line in lines[:60]} & {line.split("scenario")[-1] for line in lines[60:]}
+        {line.split("scenario")[-1] for line in lines[:60]}
+        & {line.split("scenario")[-1] for line in lines[60:]}
     )
     assert numbers(report) == {"twins": torn}
     assert len(report.findings[0].examples) == 3
@@ -84,7 +97,10 @@ def test_a_random_split_by_frames_puts_recordings_on_both_sides(sides: Sides) ->
         (f"{TOKENS[0]}/ego_vehicle/007", f"{TOKENS[0]}/infrastructure/007"),
         (f"{TOKENS[0]}/007", path_of(TOKENS[0], 7)),
         (path_of(TOKENS[0], 7).replace("/", "\\"), path_of(TOKENS[0], 7, "..") + ",1"),
-        (json.dumps([path_of(TOKENS[0], 7), path_of(TOKENS[1], 8)]), f"{TOKENS[0]}/ego_vehicle/007/Camera_Front"),
+        (
+            json.dumps([path_of(TOKENS[0], 7), path_of(TOKENS[1], 8)]),
+            f"{TOKENS[0]}/ego_vehicle/007/Camera_Front",
+        ),
     ],
 )
 def test_the_same_moment_on_two_sides(sides: Sides, lines: tuple[str, str]) -> None:
@@ -94,7 +110,9 @@ def test_the_same_moment_on_two_sides(sides: Sides, lines: tuple[str, str]) -> N
 
 
 def test_a_scenario_beside_one_of_its_frames(sides: Sides) -> None:
-    assert numbers(sides(train=[TOKENS[0]], val=[f"{TOKENS[0]}/ego_vehicle/007"])) == {"recordings": 1}
+    assert numbers(sides(train=[TOKENS[0]], val=[f"{TOKENS[0]}/ego_vehicle/007"])) == {
+        "recordings": 1
+    }
     assert numbers(sides(train=[TOKENS[0]], val=[TOKENS[40]], test=[TOKENS[1]])) == {"twins": 1}
 
 
@@ -107,9 +125,13 @@ def test_mini_beside_the_full_release(sides: Sides) -> None:
 
 
 def test_files_that_are_no_splits(sides: Sides, tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"two or more split files, or dataroots, a side each, found .*train\.txt"):
+    with pytest.raises(
+        ConfigError, match=r"two or more split files, or dataroots, a side each, found .*train\.txt"
+    ):
         sides(train=[TOKENS[0]])
-    with pytest.raises(SplitFileError, match=r"val\.txt:2: expected a scenario's type and name, .*found 'Town03_x'"):
+    with pytest.raises(
+        SplitFileError, match=r"val\.txt:2: expected a scenario's type and name, .*found 'Town03_x'"
+    ):
         sides(train=[TOKENS[0]], val=["", "Town03_x"])
     with pytest.raises(MissingFileError, match=r"no\.txt: no such file"):
         audit_splits([tmp_path / "train.txt", tmp_path / "no.txt"])
@@ -125,12 +147,19 @@ def test_an_empty_side_is_compared_with_nothing(sides: Sides) -> None:
 
 
 def test_hostile_lines_end_soon(sides: Sides) -> None:
-    assert numbers(sides(train=[f"{ACCIDENT}/" * 20_000 + TOKENS[0]], val=["_" * 100_000 + TOKENS[1]])) == {}
+    assert (
+        numbers(sides(train=[f"{ACCIDENT}/" * 20_000 + TOKENS[0]], val=["_" * 100_000 + TOKENS[1]]))
+        == {}
+    )
 
 
 def copied(root: Path, copy: Path) -> Path:
     """Link a release's files, which are removed and renamed in the copy, but not written."""
-    return Path(shutil.copytree(root, copy, ignore=shutil.ignore_patterns(".deepaccident"), copy_function=os.link))
+    return Path(
+        shutil.copytree(
+            root, copy, ignore=shutil.ignore_patterns(".deepaccident"), copy_function=os.link
+        )
+    )
 
 
 def unchanged(root: Path) -> None:
@@ -150,7 +179,9 @@ def only_frames(root: Path, frames: range, first: int | None = None) -> None:
         if int(number) not in frames:
             path.unlink()
         elif first is not None:
-            path.rename(path.with_name(f"{stem}_{int(number) - frames[0] + first:03d}{path.suffix}"))
+            path.rename(
+                path.with_name(f"{stem}_{int(number) - frames[0] + first:03d}{path.suffix}")
+            )
 
 
 def renamed(root: Path, change: Callable[[str], str]) -> None:
@@ -171,7 +202,11 @@ def without(root: Path, ending: str) -> None:
     ("mine", "theirs", "wanted"),
     [
         (unchanged, unchanged, {"recordings": 2, "twins": 2}),
-        (lambda root: without(root, "normal"), lambda root: without(root, "accident"), {"twins": 1}),
+        (
+            lambda root: without(root, "normal"),
+            lambda root: without(root, "accident"),
+            {"twins": 1},
+        ),
         (
             lambda root: only_agents(root, "ego_vehicle", "ego_vehicle_behind"),
             lambda root: only_agents(root, "infrastructure", "other_vehicle"),
@@ -217,16 +252,27 @@ def test_dataroots_with_other_scenarios_of_the_same_names(
     others = sorted({path.stem for path in release_root_b.rglob("meta/*.txt")})
     other = copied(release_root_b, tmp_path / "other")
     new_names = dict(zip(others, names, strict=False))
-    renamed(other, lambda name: re.sub(r"^Town\w*scenario\d+", lambda m: new_names.get(m[0], m[0]), name))
+    renamed(
+        other,
+        lambda name: re.sub(r"^Town\w*scenario\d+", lambda m: new_names.get(m[0], m[0]), name),
+    )
     assert {*names} <= {path.stem for path in other.rglob("meta/*.txt")}
     assert numbers(audit_splits([motion_root, other])) == {}
 
 
-def test_dataroots_without_labels_have_nothing_to_compare(motion_root: Path, tmp_path: Path) -> None:
+def test_dataroots_without_labels_have_nothing_to_compare(
+    motion_root: Path, tmp_path: Path
+) -> None:
     other = copied(motion_root, tmp_path / "other")
     for folder in sorted(other.glob("*/*/label/*")):
         shutil.rmtree(folder)
     report = audit_splits([motion_root, other])
-    assert report.tables["sides"] == [("side", "recordings"), (str(motion_root), 2), (str(other), 0)]
-    with pytest.raises(ConfigError, match=r"files, or dataroots, a side each, found .*motion, .*\.txt"):
+    assert report.tables["sides"] == [
+        ("side", "recordings"),
+        (str(motion_root), 2),
+        (str(other), 0),
+    ]
+    with pytest.raises(
+        ConfigError, match=r"files, or dataroots, a side each, found .*motion, .*\.txt"
+    ):
         audit_splits([motion_root, motion_root / "train.txt"])

@@ -30,7 +30,9 @@ def sample(da: DeepAccident, agent: str = "ego_vehicle", frame: int = FRAME) -> 
 
 
 @pytest.mark.parametrize("agents", ["single", "+infrastructure", "all", ["other_vehicle"]])
-def test_it_knows_whom_the_released_rule_calls_seen_and_the_ego(da_hidden: DeepAccident, agents: str) -> None:
+def test_it_knows_whom_the_released_rule_calls_seen_and_the_ego(
+    da_hidden: DeepAccident, agents: str
+) -> None:
     token = sample(da_hidden)
     seen = seen_actors(da_hidden, token, agents=agents)
     own = da_hidden.agent.get(token.rsplit("/", 1)[0])["actor_id"]
@@ -39,7 +41,9 @@ def test_it_knows_whom_the_released_rule_calls_seen_and_the_ego(da_hidden: DeepA
     assert seen.boxes.actor_id.tolist() == [OWN_ACTOR_ID, *others]
 
 
-def test_the_ego_is_where_its_own_label_has_it_whoever_else_sees_it(da_hidden: DeepAccident) -> None:
+def test_the_ego_is_where_its_own_label_has_it_whoever_else_sees_it(
+    da_hidden: DeepAccident,
+) -> None:
     token = sample(da_hidden)
     seen = seen_actors(da_hidden, token, agents="all", link=Link(pose_noise=0.5, latency=0.5))
     own = da_hidden.boxes(token, "ego")
@@ -69,9 +73,13 @@ def test_late_boxes_lag_behind_by_the_way_made_since(da_hidden: DeepAccident) ->
         seen_actors(da_hidden, token, agents="+infrastructure", link=link, frame="world").boxes
         for link in (None, Link(latency=0.3))
     )
-    (here,), (there,) = (boxes.select(np.flatnonzero(boxes.actor_id == other)).center for boxes in (now, late))
+    (here,), (there,) = (
+        boxes.select(np.flatnonzero(boxes.actor_id == other)).center for boxes in (now, late)
+    )
     moved = now.velocity[now.actor_id == other][0]
-    np.testing.assert_allclose(here - there, 0.3 * moved, atol=0.15)  # it still gathers speed a little
+    np.testing.assert_allclose(
+        here - there, 0.3 * moved, atol=0.15
+    )  # it still gathers speed a little
 
 
 def test_who_drives_straight_on_does_not_turn(da_hidden: DeepAccident) -> None:
@@ -96,10 +104,16 @@ def test_turn_rates_are_those_since_the_earliest_sight(
         ids = [7, 8, 9] if frame == FRAME else [7, 8] if frame >= FRAME - 3 else [7]
         boxes = Boxes.from_arrays(np.zeros((3, 3)), np.ones((3, 3)), yaw, actor_id=[7, 8, 9])
         rows = np.arange(len(ids))
-        return SeenActors(boxes=boxes.select(rows), seen_by=np.zeros(len(ids), np.uint8), own_actor_id=None)
+        return SeenActors(
+            boxes=boxes.select(rows), seen_by=np.zeros(len(ids), np.uint8), own_actor_id=None
+        )
 
-    monkeypatch.setattr(import_module("deepaccident_devkit.plugins.baselines.outlook"), "seen_actors", seen)
-    np.testing.assert_allclose(turn_rates(da_hidden, sample(da_hidden)), [0.4, -0.4, 0.0], atol=1e-9)
+    monkeypatch.setattr(
+        import_module("deepaccident_devkit.plugins.baselines.outlook"), "seen_actors", seen
+    )
+    np.testing.assert_allclose(
+        turn_rates(da_hidden, sample(da_hidden)), [0.4, -0.4, 0.0], atol=1e-9
+    )
     assert asked == [0, -5, -4, -3, -2, -1]
 
 
@@ -111,7 +125,9 @@ def test_turn_rates_need_no_past(da_hidden: DeepAccident) -> None:
 
 def test_frames_are_of_the_same_boxes(da_hidden: DeepAccident) -> None:
     token = sample(da_hidden)
-    ego, world = (seen_actors(da_hidden, token, agents="all", frame=frame).boxes for frame in ("ego", "world"))
+    ego, world = (
+        seen_actors(da_hidden, token, agents="all", frame=frame).boxes for frame in ("ego", "world")
+    )
     world_from_ego: SE3 = da_hidden.world_from(token, "ego")
     np.testing.assert_allclose(world_from_ego.apply(ego.center), world.center, atol=1e-6)
 
@@ -121,11 +137,21 @@ def test_unknown_agents_are_refused_and_an_unlabelled_sample_tells_an_oracle_not
 ) -> None:
     token = sample(da_hidden)
     assert_refused(
-        (lambda: seen_actors(da_hidden, token, agents="nobody"), ChoiceError, ("agents", "single", "nobody"))
+        (
+            lambda: seen_actors(da_hidden, token, agents="nobody"),
+            ChoiceError,
+            ("agents", "single", "nobody"),
+        )
     )
     record = da_hidden.get("sample", token) | {"labelled": False}
     monkeypatch.setattr(DeepAccident, "get", lambda *_: record)
-    assert_refused((lambda: seen_actors(da_hidden, token), NotAvailableError, (token, "no label", "a labelled sample")))
+    assert_refused(
+        (
+            lambda: seen_actors(da_hidden, token),
+            NotAvailableError,
+            (token, "no label", "a labelled sample"),
+        )
+    )
 
 
 POSE = np.array([[1.0, 2.0, 0.5], [0.0, 0.0, -3.0]])
@@ -133,7 +159,9 @@ numbers = st.floats(-20, 20, allow_nan=False)
 
 
 def test_constant_velocity_goes_straight_on_and_keeps_the_heading() -> None:
-    poses = constant_velocity(POSE, np.array([[2.0, -1.0], [np.nan, np.nan]]), np.array([0.0, 0.5, 2.0]))
+    poses = constant_velocity(
+        POSE, np.array([[2.0, -1.0], [np.nan, np.nan]]), np.array([0.0, 0.5, 2.0])
+    )
     np.testing.assert_array_equal(poses[0], POSE)
     np.testing.assert_allclose(poses[1:, 0], [[2.0, 1.5, 0.5], [5.0, 0.0, 0.5]])
     np.testing.assert_array_equal(poses[1:, 1], [POSE[1], POSE[1]])  # who has no velocity stands
@@ -143,7 +171,9 @@ def test_a_full_turn_ends_where_it_began_and_half_of_it_across() -> None:
     rate, speed = 0.5, 4.0
     times = np.array([np.pi, 2 * np.pi]) / rate
     poses = constant_turn_rate(np.zeros((1, 3)), np.array([[speed, 0.0]]), np.array([rate]), times)
-    np.testing.assert_allclose(poses[0, 0], [0, 2 * speed / rate, np.pi], atol=1e-9)  # counter-clockwise, to the left
+    np.testing.assert_allclose(
+        poses[0, 0], [0, 2 * speed / rate, np.pi], atol=1e-9
+    )  # counter-clockwise, to the left
     np.testing.assert_allclose(poses[1, 0], [0, 0, 2 * np.pi], atol=1e-9)
 
 

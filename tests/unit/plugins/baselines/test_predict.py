@@ -10,7 +10,12 @@ import pytest
 from refusals import assert_refused
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.errors import ChoiceError, ConfigError, DeepAccidentError, NotAvailableError
+from deepaccident_devkit.errors import (
+    ChoiceError,
+    ConfigError,
+    DeepAccidentError,
+    NotAvailableError,
+)
 from deepaccident_devkit.evaluation import (
     AccidentEvaluator,
     DetectedBoxes,
@@ -51,7 +56,10 @@ def test_five_agents_know_the_whole_present(da_hidden: DeepAccident, tokens: lis
     known = []
     for token in tokens:
         label = da_hidden.motion_labels(token).instance[0, 8:-8, 8:-8] > 0
-        maps = [predict_motion(da_hidden, token, agents=agents).instances for agents in ("single", "all")]
+        maps = [
+            predict_motion(da_hidden, token, agents=agents).instances
+            for agents in ("single", "all")
+        ]
         alone, together = (each[0, 0, 8:-8, 8:-8] > 0 for each in maps if each is not None)
         np.testing.assert_array_equal(together, label)
         known.append((alone & label).sum() / label.sum())
@@ -66,7 +74,9 @@ def test_five_agents_foresee_what_one_does_not(da_hidden: DeepAccident, tokens: 
         for token in tokens:
             label = da_hidden.motion_labels(token, config)
             alone.update(token, predict_motion(da_hidden, token, config=config), label)
-            together.update(token, predict_motion(da_hidden, token, agents="all", config=config), label)
+            together.update(
+                token, predict_motion(da_hidden, token, agents="all", config=config), label
+            )
         score = together.compute().ranges["100x100"].pq
         assert score > least
         assert score > alone.compute().ranges["100x100"].pq + 10
@@ -78,28 +88,39 @@ def test_boxes_of_a_detector_mean_the_accidents_of_those_actors(
 ) -> None:
     """Nobody is named; unsure boxes do not count, nor those on the ego."""
     for token in tokens:
-        boxes = seen_actors(da_hidden, token, agents="all", frame=frame).boxes  # the first one is the ego
+        boxes = seen_actors(
+            da_hidden, token, agents="all", frame=frame
+        ).boxes  # the first one is the ego
         unnamed = replace(boxes, actor_id=np.full(len(boxes), UNTRACKED_ID))
         found, unsure = (
-            detected_accidents(da_hidden, token, DetectedBoxes(boxes=unnamed, scores=np.full(len(boxes), score)))
+            detected_accidents(
+                da_hidden, token, DetectedBoxes(boxes=unnamed, scores=np.full(len(boxes), score))
+            )
             for score in (0.5, 0.49)
         )
         named = predict_accidents(da_hidden, token, agents="all")
         assert [each.ids for each in found] == [None] * len(named)
-        assert [(each.time, each.score) for each in found] == [(each.time, each.score) for each in named]
+        assert [(each.time, each.score) for each in found] == [
+            (each.time, each.score) for each in named
+        ]
         for each, other in zip(found, named, strict=True):
             np.testing.assert_allclose(each.positions, other.positions, atol=1e-9)
         assert unsure == []
     assert named
 
 
-def test_the_hidden_accident_is_foreseen_by_the_pole_and_named(da_hidden: DeepAccident, tokens: list[str]) -> None:
+def test_the_hidden_accident_is_foreseen_by_the_pole_and_named(
+    da_hidden: DeepAccident, tokens: list[str]
+) -> None:
     collision = da_hidden.scenario[0]["collision"]
     assert collision is not None
     token = tokens[1]
     assert predict_accidents(da_hidden, token) == []
     (alarm,) = predict_accidents(da_hidden, token, agents="+infrastructure")
-    assert (set(alarm.ids or ()), alarm.time) == (set(collision["ids"]), pytest.approx(1.5, abs=0.11))
+    assert (set(alarm.ids or ()), alarm.time) == (
+        set(collision["ids"]),
+        pytest.approx(1.5, abs=0.11),
+    )
     evaluator = AccidentEvaluator("boxes")
     evaluator.update(token, [alarm], None, accident_context(da_hidden, token, 2.0))
     assert evaluator.compute().position_error == pytest.approx(0, abs=1.5)
@@ -114,7 +135,9 @@ def test_detections_are_the_seen_boxes_in_world(da_hidden: DeepAccident, tokens:
     np.testing.assert_array_equal(found.scores[own], [0.0])
     assert ((found.scores[~own] > 0) & (found.scores[~own] < 1)).all()
     watchers = np.array([int(bits).bit_count() for bits in seen.seen_by])
-    assert (np.diff(watchers[~own][np.argsort(found.scores[~own])]) >= 0).all()  # who is seen by more is surer
+    assert (
+        np.diff(watchers[~own][np.argsort(found.scores[~own])]) >= 0
+    ).all()  # who is seen by more is surer
 
 
 @pytest.mark.parametrize(
@@ -145,7 +168,10 @@ def test_results_are_the_predictions_and_the_same_bytes_with_two_workers(
     chosen = Baseline(agents="+infrastructure", link=Link(latency=0.1, pose_noise=0.2), horizon=3.0)
     one = predict_results(da_hidden, "motion", every, folder / "one", chosen, workers=1)
     two = predict_results(da_hidden, "motion", every, folder / "two", chosen, workers=2)
-    content = [{path.name: path.read_bytes() for path in root.rglob("*") if path.is_file()} for root in (one, two)]
+    content = [
+        {path.name: path.read_bytes() for path in root.rglob("*") if path.is_file()}
+        for root in (one, two)
+    ]
     assert content[0] == content[1]
     results = read_results(one)
     results.check()
@@ -156,7 +182,9 @@ def test_results_are_the_predictions_and_the_same_bytes_with_two_workers(
 
 
 @pytest.mark.parametrize("model", ["constant_velocity", "constant_turn_rate", "standing"])
-def test_forecasts_are_where_seen_actors_go(da_hidden: DeepAccident, tokens: list[str], model: MotionModel) -> None:
+def test_forecasts_are_where_seen_actors_go(
+    da_hidden: DeepAccident, tokens: list[str], model: MotionModel
+) -> None:
     ahead = outlook(da_hidden, tokens[1], agents="all", model=model)
     found = predict_forecasts(da_hidden, tokens[1], agents="all", model=model, horizon=4.0)
     others = ahead.seen.boxes.actor_id != OWN_ACTOR_ID
@@ -177,7 +205,8 @@ def test_a_plan_is_the_egos_own_path(da_hidden: DeepAccident, tokens: list[str])
     assert (plan.times.tolist(), plan.score) == ([0.5, 1.0, 1.5, 2.0, 2.5, 3.0], 1.0)
     ego_from_world = da_hidden.world_from(token, "ego").inverse()
     recorded = [
-        ego_from_world @ da_hidden.world_from(f"{scenario}/{agent}/{int(number) + frames:03d}", "ego")
+        ego_from_world
+        @ da_hidden.world_from(f"{scenario}/{agent}/{int(number) + frames:03d}", "ego")
         for frames in (5, 10)
     ]
     np.testing.assert_allclose(plan.path[:2], [pose.translation[:2] for pose in recorded], atol=1.0)
@@ -186,13 +215,23 @@ def test_a_plan_is_the_egos_own_path(da_hidden: DeepAccident, tokens: list[str])
     assert len(predict_plan(da_hidden, token, horizon=5.0).times) == 10
 
 
-def test_the_infrastructure_predicts_motion_but_has_no_plan(da_hidden: DeepAccident, tokens: list[str]) -> None:
+def test_the_infrastructure_predicts_motion_but_has_no_plan(
+    da_hidden: DeepAccident, tokens: list[str]
+) -> None:
     pole = tokens[0].replace("ego_vehicle", "infrastructure")
     assert np.any(predict_motion(da_hidden, pole).instances)
     assert_refused(
         (lambda: predict_plan(da_hidden, pole), NotAvailableError, (pole, "no own vehicle")),
-        (lambda: predict_plan(da_hidden, tokens[0], horizon=0.3), ConfigError, "no number of steps of 0.5 s"),
-        (lambda: predict_forecasts(da_hidden, tokens[0], horizon=np.inf), ConfigError, "no number of steps of 0.5 s"),
+        (
+            lambda: predict_plan(da_hidden, tokens[0], horizon=0.3),
+            ConfigError,
+            "no number of steps of 0.5 s",
+        ),
+        (
+            lambda: predict_forecasts(da_hidden, tokens[0], horizon=np.inf),
+            ConfigError,
+            "no number of steps of 0.5 s",
+        ),
     )
 
 
@@ -202,8 +241,14 @@ def test_paths_in_files_look_three_seconds_ahead_at_least(
 ) -> None:
     baseline = Baseline(model="standing", horizon=horizon)
     for task in ("planning", "forecasting"):
-        results = read_results(predict_results(da_hidden, task, tokens, tmp_path / task, baseline, workers=1))
-        assert (results.task, results.meta["model"], results.meta["horizon"]) == (task, "standing", steps / 2)
+        results = read_results(
+            predict_results(da_hidden, task, tokens, tmp_path / task, baseline, workers=1)
+        )
+        assert (results.task, results.meta["model"], results.meta["horizon"]) == (
+            task,
+            "standing",
+            steps / 2,
+        )
         predicted: Any = results.prediction(tokens[0])
         assert {len(each.times) for each in predicted} == {steps}
 
@@ -231,7 +276,9 @@ CAR = (4.0, 2.0, 1.5)
 
 
 def ahead(
-    *actors: tuple[int, float, float, float, float, float], own: int | None = 50, on_foot: Sequence[int] = ()
+    *actors: tuple[int, float, float, float, float, float],
+    own: int | None = 50,
+    on_foot: Sequence[int] = (),
 ) -> Outlook:
     """Cars, or whom ids say to be on foot, by actor id, x, y, yaw, speed along x, speed along y."""
     rows: Sequence[tuple[float, ...]] = actors
@@ -257,8 +304,14 @@ def test_crossing_paths_collide_where_the_boxes_first_come_near() -> None:
     (alarm,) = accidents_ahead(ahead(EGO, CROSSING), 2.0)
     # at t the centres are (10 t, 0) and (15, −15 + 10 t): the boxes touch once 15 − 10 t ≤ 3
     np.testing.assert_allclose(alarm.positions, [[12, 0], [15, -3]], atol=1e-9)
-    assert (alarm.time, alarm.ids, alarm.score) == (pytest.approx(1.2), (50, 7), pytest.approx(1 / 2.2))
-    (unknown,) = accidents_ahead(ahead(EGO, CROSSING, own=None), 2.0)  # meta does not say who the ego is
+    assert (alarm.time, alarm.ids, alarm.score) == (
+        pytest.approx(1.2),
+        (50, 7),
+        pytest.approx(1 / 2.2),
+    )
+    (unknown,) = accidents_ahead(
+        ahead(EGO, CROSSING, own=None), 2.0
+    )  # meta does not say who the ego is
     assert unknown.ids is None
 
 
@@ -267,7 +320,8 @@ SIDE_BY_SIDE = [(3, 0, 40, 0, 5, 0), (4, 0, 42.1, 0, 5, 0)]
 
 
 @pytest.mark.parametrize(
-    ("actors", "horizon"), [((EGO, CROSSING), 1.1), ((*PARKED, *SIDE_BY_SIDE), 2.0), ((), 2.0), ((EGO,), 2.0)]
+    ("actors", "horizon"),
+    [((EGO, CROSSING), 1.1), ((*PARKED, *SIDE_BY_SIDE), 2.0), ((), 2.0), ((EGO,), 2.0)],
 )
 def test_no_alarm_beyond_the_horizon_of_those_who_come_no_nearer_and_of_nobody(
     actors: tuple[tuple[int, float, float, float, float, float], ...], horizon: float
@@ -294,7 +348,9 @@ def test_who_drives_up_to_a_queue_brakes(yaw: float) -> None:
     stands = (1, 0, 0, yaw, 0, 0)
     assert accidents_ahead(ahead(stands, follower(0.5, 0.0)), 2.0) == []
     assert accidents_ahead(ahead(follower(0.5, 0.0), stands), 2.0) == []
-    assert len(accidents_ahead(ahead(stands, follower(1.5, 0.0)), 2.0)) == 1  # it comes from the next lane
+    assert (
+        len(accidents_ahead(ahead(stands, follower(1.5, 0.0)), 2.0)) == 1
+    )  # it comes from the next lane
     assert len(accidents_ahead(ahead(stands, follower(0.5, 0.6)), 2.0)) == 1  # it slides
 
 

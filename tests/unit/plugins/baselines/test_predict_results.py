@@ -19,7 +19,11 @@ from deepaccident_devkit.plugins.baselines.predict_results import is_predicted, 
 from deepaccident_devkit.v2x import Link
 
 NOISY = Baseline(agents="+behind", link=Link(latency=0.1, pose_noise=0.2, seed=4))
-NAMES: dict[ResultsTask, str] = {"motion": "motion", "accident": "accident.json", "detection": "detection.json"}
+NAMES: dict[ResultsTask, str] = {
+    "motion": "motion",
+    "accident": "accident.json",
+    "detection": "detection.json",
+}
 
 
 @pytest.fixture(scope="module")
@@ -83,11 +87,18 @@ def interrupted(call: Callable[[], object], token: str) -> None:
 
 @pytest.mark.parametrize("task", NAMES)
 def test_several_calls_share_the_scenarios(
-    da_b: DeepAccident, tokens: list[str], wholes: Path, tmp_path: Path, predicted: list[str], task: ResultsTask
+    da_b: DeepAccident,
+    tokens: list[str],
+    wholes: Path,
+    tmp_path: Path,
+    predicted: list[str],
+    task: ResultsTask,
 ) -> None:
     out = tmp_path / NAMES[task]
     with ThreadPoolExecutor(3) as threads:
-        made = threads.map(lambda _: predict_results(da_b, task, tokens, out, NOISY, workers=1), range(3))
+        made = threads.map(
+            lambda _: predict_results(da_b, task, tokens, out, NOISY, workers=1), range(3)
+        )
         assert list(made) == [out] * 3
     assert (sorted(predicted), contents(out)) == (sorted(tokens), contents(wholes / NAMES[task]))
     assert [path.name for path in tmp_path.iterdir()] == [NAMES[task]]
@@ -109,10 +120,16 @@ def test_what_was_predicted_with_other_settings_or_samples_is_not_taken(
 ) -> None:
     out = tmp_path / "accident.json"
     for samples, baseline in ((tokens[:-1], NOISY), (tokens, Baseline()), (tokens, NOISY)):
-        interrupted(partial(predict_results, da_b, "accident", samples, out, baseline, workers=1), samples[-1])
+        interrupted(
+            partial(predict_results, da_b, "accident", samples, out, baseline, workers=1),
+            samples[-1],
+        )
     del predicted[:]
     predict_results(da_b, "accident", tokens, out, NOISY, workers=1)
-    assert (predicted, [path.name for path in tmp_path.iterdir()]) == (tokens[-4:], ["accident.json"])
+    assert (predicted, [path.name for path in tmp_path.iterdir()]) == (
+        tokens[-4:],
+        ["accident.json"],
+    )
 
 
 def test_scenarios_that_fail_are_listed_and_the_others_done(
@@ -133,14 +150,26 @@ def test_an_agent_that_is_not_there_is_named_before_anything_is_written(
     for folder in own_release.glob("**/other_vehicle_behind"):
         shutil.rmtree(folder)
     out, every = tmp_path / "out" / "accident.json", Baseline(agents="all")
-    predict = partial(predict_results, DeepAccident("v1", own_release, verbose=False), "accident", tokens, out, every)
+    predict = partial(
+        predict_results,
+        DeepAccident("v1", own_release, verbose=False),
+        "accident",
+        tokens,
+        out,
+        every,
+    )
     assert_refused((predict, NotAvailableError, "other_vehicle_behind is not in this release"))
     assert not out.parent.exists()
 
 
 @pytest.mark.parametrize("task", NAMES)
 def test_complete_results_stay_and_others_are_refused(
-    da_b: DeepAccident, tokens: list[str], wholes: Path, tmp_path: Path, predicted: list[str], task: ResultsTask
+    da_b: DeepAccident,
+    tokens: list[str],
+    wholes: Path,
+    tmp_path: Path,
+    predicted: list[str],
+    task: ResultsTask,
 ) -> None:
     out, broken = wholes / NAMES[task], tmp_path / NAMES[task]
     before = contents(out)
@@ -148,7 +177,11 @@ def test_complete_results_stay_and_others_are_refused(
     assert predict_results(da_b, task, tokens, out, NOISY) == out
     broken.mkdir()
     (broken / "results.json").write_bytes(b"{}")
-    others = ((out, tokens[1:], NOISY), (out, tokens[::-1], NOISY), (out, tokens, Baseline(agents="+behind")))
+    others = (
+        (out, tokens[1:], NOISY),
+        (out, tokens[::-1], NOISY),
+        (out, tokens, Baseline(agents="+behind")),
+    )
     for path, samples, baseline in (*others, (broken, tokens, NOISY)):
         call = partial(predict_results, da_b, task, samples, path, baseline)
         assert_refused((call, ResultsError, (f"{path}: is there already", "choose another path")))
@@ -166,7 +199,9 @@ def test_results_say_of_what_they_are(da_b: DeepAccident, tokens: list[str], who
     assert (meta["bytes"]["mean"], meta["bytes"]["partners"]) == (whole / len(tokens), 1.0)
 
 
-def test_results_note_what_a_budget_lets_through(da_b: DeepAccident, tokens: list[str], tmp_path: Path) -> None:
+def test_results_note_what_a_budget_lets_through(
+    da_b: DeepAccident, tokens: list[str], tmp_path: Path
+) -> None:
     sent = {}
     for name, agents, link in (
         ("single", "single", None),
@@ -178,9 +213,19 @@ def test_results_note_what_a_budget_lets_through(da_b: DeepAccident, tokens: lis
         predict_results(da_b, "detection", tokens, path, baseline, workers=1)
         assert is_predicted(da_b, "detection", tokens, path, baseline)
         sent[name] = read_results(path).meta["bytes"]
-    assert (sent["single"]["mean"], sent["single"]["partners"], sent["single"]["payload"]) == (0.0, 0.0, "boxes")
+    assert (sent["single"]["mean"], sent["single"]["partners"], sent["single"]["payload"]) == (
+        0.0,
+        0.0,
+        "boxes",
+    )
     assert (sent["all"]["partners"], sent["all"]["link"]) == (4.0, sent["all"]["mean"] / 4)
-    features = {"payload": 400_000, "mean": 800_000.0, "link": 400_000.0, "partners": 2.0, "budget": 1_000_000}
+    features = {
+        "payload": 400_000,
+        "mean": 800_000.0,
+        "link": 400_000.0,
+        "partners": 2.0,
+        "budget": 1_000_000,
+    }
     assert sent["features"] == {**features, "samples": 16}
     assert sent["none"] == {**sent["single"], "budget": 1}
 
@@ -188,13 +233,17 @@ def test_results_note_what_a_budget_lets_through(da_b: DeepAccident, tokens: lis
 def test_a_token_that_comes_twice_is_refused_at_once(
     da_b: DeepAccident, tokens: list[str], tmp_path: Path, predicted: list[str]
 ) -> None:
-    twice = partial(predict_results, da_b, "accident", [*tokens, tokens[3]], tmp_path / "out", workers=1)
+    twice = partial(
+        predict_results, da_b, "accident", [*tokens, tokens[3]], tmp_path / "out", workers=1
+    )
     assert_refused((twice, ResultsError, (f"{tokens[3]}: comes twice", "give each sample once")))
     assert not predicted
 
 
 @pytest.mark.slow
-def test_another_executor_writes_the_same(da_b: DeepAccident, tokens: list[str], wholes: Path, tmp_path: Path) -> None:
+def test_another_executor_writes_the_same(
+    da_b: DeepAccident, tokens: list[str], wholes: Path, tmp_path: Path
+) -> None:
     with ProcessPoolExecutor(2, mp_context=multiprocessing.get_context("spawn")) as executor:
         for task, name in NAMES.items():
             path = predict_results(da_b, task, tokens, tmp_path / name, NOISY, executor=executor)

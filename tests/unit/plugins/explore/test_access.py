@@ -12,7 +12,14 @@ from refusals import assert_refused
 from wording import holding, lacking
 
 from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.plugins.explore.access import HEADERS, Access, AsgiMessage, Gate, HostPort, RootPath
+from deepaccident_devkit.plugins.explore.access import (
+    HEADERS,
+    Access,
+    AsgiMessage,
+    Gate,
+    HostPort,
+    RootPath,
+)
 from deepaccident_devkit.plugins.explore.serving import Served, serving
 
 ROOT = "/user/me/proxy/8000"
@@ -51,7 +58,14 @@ def asked(served: Served, target: str = "/", *headers: tuple[str, str], **more: 
 def passed(gate: Gate, **changes: Any) -> list[AsgiMessage]:
     """What a gate sends for a request that no client library would make."""
     sent: list[AsgiMessage] = []
-    scope = {"type": "http", "method": "GET", "path": "/", "query_string": b"", "headers": [], **changes}
+    scope = {
+        "type": "http",
+        "method": "GET",
+        "path": "/",
+        "query_string": b"",
+        "headers": [],
+        **changes,
+    }
 
     async def receive() -> AsgiMessage:
         return {"type": "websocket.connect"}
@@ -77,10 +91,16 @@ def test_the_right_token_becomes_a_cookie(served: Served) -> None:
     assert ask(served.port, f"/?token={served.token}", method="HEAD").status == 303
 
 
-@pytest.mark.parametrize("query", ["token=wrong", "token=", "token", "token={0}x", "token={0}&token={0}", "token=%ff"])
+@pytest.mark.parametrize(
+    "query", ["token=wrong", "token=", "token", "token={0}x", "token={0}&token={0}", "token=%ff"]
+)
 def test_a_wrong_token_is_refused_even_with_a_cookie(served: Served, query: str) -> None:
     answer = asked(served, "/?" + query.format(served.token))
-    assert (answer.status, "set-cookie" in answer.headers, "The token is wrong" in answer.body) == (403, False, True)
+    assert (answer.status, "set-cookie" in answer.headers, "The token is wrong" in answer.body) == (
+        403,
+        False,
+        True,
+    )
 
 
 @pytest.mark.parametrize("name", ["token", "%74oken"])
@@ -98,7 +118,9 @@ def test_a_wrong_token_is_refused_even_with_a_cookie(served: Served, query: str)
         ("/a?tokens=1&{0}", "./a?tokens=1"),
     ],
 )
-def test_the_address_without_the_token_is_relative(served: Served, target: str, location: str, name: str) -> None:
+def test_the_address_without_the_token_is_relative(
+    served: Served, target: str, location: str, name: str
+) -> None:
     answer = ask(served.port, target.format(f"{name}={served.token}"))
     assert (answer.status, answer.headers["location"]) == (303, location)
 
@@ -126,7 +148,11 @@ def test_a_ticket_is_right_once_and_for_a_minute(monkeypatch: pytest.MonkeyPatch
     gate = Gate(TinyApp(), access)
 
     def status(token: str) -> int:
-        return int(passed(gate, query_string=f"token={token}".encode(), headers=[(b"host", b"localhost")])[0]["status"])
+        return int(
+            passed(gate, query_string=f"token={token}".encode(), headers=[(b"host", b"localhost")])[
+                0
+            ]["status"]
+        )
 
     ticket = gate.ticket()
     assert [status(ticket), status(ticket)] == [303, 403]
@@ -137,7 +163,11 @@ def test_a_ticket_is_right_once_and_for_a_minute(monkeypatch: pytest.MonkeyPatch
 def test_the_application_gets_no_cookies_and_no_token() -> None:
     app, access = TinyApp(), Access(port=1)
     cookie = f"{access.cookie}={access.session}; other=1".encode()
-    passed(Gate(app, access), path="/a é", headers=[(b"host", b"localhost"), (b"Cookie", cookie), (b"a", b"b")])
+    passed(
+        Gate(app, access),
+        path="/a é",
+        headers=[(b"host", b"localhost"), (b"Cookie", cookie), (b"a", b"b")],
+    )
     told = {name: app.scopes[0][name] for name in ("headers", "path", "raw_path")}
     assert told == {
         "headers": [(b"host", b"localhost"), (b"a", b"b")],
@@ -207,7 +237,9 @@ def fetched(site: str, *more: tuple[str, str]) -> Headers:
         ),
     ],
 )  # fmt: skip
-def test_who_is_answered(served: Served, status: int, headers: Headers, how: dict[str, Any]) -> None:
+def test_who_is_answered(
+    served: Served, status: int, headers: Headers, how: dict[str, Any]
+) -> None:
     target = how.get("target", "/").format(served.port)
     assert asked(served, target, *headers, host=how.get("host", "localhost")).status == status
 
@@ -244,16 +276,29 @@ def test_a_link_with_the_token_may_come_from_a_mail(served: Served) -> None:
         ("*", True, "GET", 400),
     ],
 )
-def test_every_answer_has_the_headers(served: Served, target: str, headers: bool, method: str, status: int) -> None:
+def test_every_answer_has_the_headers(
+    served: Served, target: str, headers: bool, method: str, status: int
+) -> None:
     answer = ask(served.port, target, *([cookie_of(served)] if headers else []), method=method)
     assert (answer.status, "server" in answer.headers) == (status, False)
-    assert HEADERS.items() <= {name.encode(): value.encode() for name, value in answer.headers.items()}.items()
-    assert HEADERS.keys() <= {name.encode() for name in ask(served.port, f"/?token={served.token}").headers}
+    assert (
+        HEADERS.items()
+        <= {name.encode(): value.encode() for name, value in answer.headers.items()}.items()
+    )
+    assert HEADERS.keys() <= {
+        name.encode() for name in ask(served.port, f"/?token={served.token}").headers
+    }
 
 
-def test_a_failure_is_logged_and_the_server_goes_on(served: Served, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_failure_is_logged_and_the_server_goes_on(
+    served: Served, caplog: pytest.LogCaptureFixture
+) -> None:
     answer = asked(served, "/fail")
-    assert (answer.status, "no such page" in answer.body, "no such page" in caplog.text) == (500, False, True)
+    assert (answer.status, "no such page" in answer.body, "no such page" in caplog.text) == (
+        500,
+        False,
+        True,
+    )
     with pytest.raises(IncompleteRead):
         asked(served, "/half")
     assert asked(served).status == 200
@@ -273,13 +318,21 @@ def test_no_secret_is_logged(served: Served, caplog: pytest.LogCaptureFixture) -
 def test_a_websocket_is_closed(served: Served) -> None:
     upgrade = (("Upgrade", "websocket"), ("Connection", "Upgrade"), ("Sec-WebSocket-Key", "x" * 24))
     assert ask(served.port, "/", *upgrade, ("Sec-WebSocket-Version", "13")).status == 401
-    assert passed(Gate(TinyApp(), served.access), type="websocket") == [{"type": "websocket.close", "code": 1008}]
+    assert passed(Gate(TinyApp(), served.access), type="websocket") == [
+        {"type": "websocket.close", "code": 1008}
+    ]
 
 
-@pytest.mark.parametrize("host", ["hub.example.org", "hub.example.org:8443", "node17:8000", "localhost:8888"])
+@pytest.mark.parametrize(
+    "host", ["hub.example.org", "hub.example.org:8443", "node17:8000", "localhost:8888"]
+)
 def test_below_a_root_path_any_host_is_known(start: START, host: str) -> None:
     served = start(root_path=ROOT)
-    answers = asked(served, host=host), asked(served, host="not a host"), ask(served.port, host=host)
+    answers = (
+        asked(served, host=host),
+        asked(served, host="not a host"),
+        ask(served.port, host=host),
+    )
     assert [each.status for each in answers] == [200, 400, 401]
 
 
@@ -299,14 +352,19 @@ def test_below_a_root_path_any_host_is_known(start: START, host: str) -> None:
         ("/x" + ROOT + "/a", f"/x{ROOT}/a /x{ROOT}/a"),
     ],
 )
-def test_a_root_path_is_taken_off_if_it_is_there(start: START, root: str, target: str, path: str) -> None:
+def test_a_root_path_is_taken_off_if_it_is_there(
+    start: START, root: str, target: str, path: str
+) -> None:
     assert asked(start(root_path=root), target, host="hub.example.org").body == path
 
 
 def test_the_root_path_itself_gets_a_slash(start: START) -> None:
     served = start(root_path=ROOT)
     answers = asked(served, ROOT + "?x=1"), ask(served.port, f"{ROOT}?token={served.token}")
-    assert [(each.status, each.headers["location"]) for each in answers] == [(308, "./8000/?x=1"), (303, "./8000")]
+    assert [(each.status, each.headers["location"]) for each in answers] == [
+        (308, "./8000/?x=1"),
+        (303, "./8000"),
+    ]
 
 
 @pytest.mark.parametrize(
@@ -326,7 +384,11 @@ def test_the_cookie_is_for_the_root_path(
 ) -> None:
     served = start(root_path=root)
     headers = ask(served.port, f"{target}?token={served.token}", host=host).headers
-    found = [each for each in headers["set-cookie"].split("; ")[1:] if each not in ("HttpOnly", "SameSite=Lax")]
+    found = [
+        each
+        for each in headers["set-cookie"].split("; ")[1:]
+        if each not in ("HttpOnly", "SameSite=Lax")
+    ]
     assert (headers["location"], found) == ("./", attributes)
 
 
@@ -337,8 +399,14 @@ HUB = "hub.example.org"
     ("host", "origin", "status"),
     [
         *((host, None, 200) for host in (HUB, f"{HUB}:443", HUB.upper(), "localhost:9000")),
-        *((host, f"https://{HUB}", 200) for host in (HUB, f"{HUB}:443", HUB.upper(), "localhost:9000")),
-        *((host, "https://evil.example", 403) for host in (HUB, f"{HUB}:443", HUB.upper(), "localhost:9000")),
+        *(
+            (host, f"https://{HUB}", 200)
+            for host in (HUB, f"{HUB}:443", HUB.upper(), "localhost:9000")
+        ),
+        *(
+            (host, "https://evil.example", 403)
+            for host in (HUB, f"{HUB}:443", HUB.upper(), "localhost:9000")
+        ),
         ("localhost", f"http://{HUB}:8000", 403),
         *((host, None, 400) for host in ("evil.example", "example.org", f"x.{HUB}", "node17:8000")),
     ],
@@ -350,19 +418,34 @@ def test_a_root_path_as_url_names_the_host_and_the_origin(
     assert asked(start(root_path=URL), "/", *headers, host=host).status == status
 
 
-def test_the_hosts_of_a_server_for_the_network(start: START, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_hosts_of_a_server_for_the_network(
+    start: START, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with monkeypatch.context() as patch:
         patch.setattr("socket.gethostname", lambda: "Node17")
         patch.setattr("socket.getfqdn", lambda: "node17.cluster.example")
         served = start(host=ANYWHERE)
-    known = ("localhost", "node17:9000", "NODE17.cluster.example", "192.0.2.1", "[2001:db8::1]:80", ANYWHERE)
-    statuses = {host: asked(served, host=host).status for host in (*known, "evil.example", "cluster.example", "node18")}
+    known = (
+        "localhost",
+        "node17:9000",
+        "NODE17.cluster.example",
+        "192.0.2.1",
+        "[2001:db8::1]:80",
+        ANYWHERE,
+    )
+    statuses = {
+        host: asked(served, host=host).status
+        for host in (*known, "evil.example", "cluster.example", "node18")
+    }
     assert statuses == {host: 200 if host in known else 400 for host in statuses}
 
 
 def test_a_named_host_is_known_with_its_address() -> None:
     access = Access(port=1, names=frozenset({"node17", "192.0.2.1"}))
-    known = {host: access.knows(HostPort(host, 9)) for host in ("node17", "192.0.2.1", "192.0.2.2", "localhost")}
+    known = {
+        host: access.knows(HostPort(host, 9))
+        for host in ("node17", "192.0.2.1", "192.0.2.2", "localhost")
+    }
     assert known == {"node17": True, "192.0.2.1": True, "192.0.2.2": False, "localhost": True}
 
 
@@ -375,4 +458,10 @@ def test_a_named_host_is_known_with_its_address() -> None:
     ],
 )  # fmt: skip
 def test_a_root_path_that_is_none_is_refused(root: str) -> None:
-    assert_refused((lambda: RootPath.parse(root), ConfigError, ("--root-path", "a path such as", "a URL such as")))
+    assert_refused(
+        (
+            lambda: RootPath.parse(root),
+            ConfigError,
+            ("--root-path", "a path such as", "a URL such as"),
+        )
+    )

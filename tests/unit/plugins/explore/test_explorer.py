@@ -14,7 +14,13 @@ from replay_page import accident, normal
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.plugins.explore import explorer
-from deepaccident_devkit.plugins.explore.explorer import PICTURE_SIZE, Explorer, Kept, KeptFiles, thumbnail
+from deepaccident_devkit.plugins.explore.explorer import (
+    PICTURE_SIZE,
+    Explorer,
+    Kept,
+    KeptFiles,
+    thumbnail,
+)
 from deepaccident_devkit.release.store import store
 from deepaccident_devkit.render.styles import COLLIDER_COLOR, MISSING_COLOR
 from deepaccident_devkit.support.parallel import Store
@@ -51,10 +57,14 @@ def test_where_the_index_cannot_be_written_the_users_cache_is_taken(
     monkeypatch.setattr(explorer, "is_writable_folder", lambda _: False)
     monkeypatch.setenv(store.FOLDER_VARIABLE, str(tmp_path / "cache" / "files"))
     assert KeptFiles(da_b).get("a", "thumbnail.jpg", lambda: b"1") == b"1"
-    assert [path.relative_to(tmp_path).parts[:2] for path in tmp_path.rglob("*.jpg")] == [("cache", "thumbnails")]
+    assert [path.relative_to(tmp_path).parts[:2] for path in tmp_path.rglob("*.jpg")] == [
+        ("cache", "thumbnails")
+    ]
 
 
-def test_a_full_disk_keeps_nobody_from_the_picture(da_b: DeepAccident, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_disk_keeps_nobody_from_the_picture(
+    da_b: DeepAccident, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(Store, "keep", Mock(side_effect=OSError(28, "No space left on device")))
     assert KeptFiles(da_b).get("full", "thumbnail.jpg", lambda: b"made") == b"made"
 
@@ -108,5 +118,10 @@ def test_images_that_come_later_are_shown(da: DeepAccident, tmp_path: Path) -> N
     explorer, token = Explorer(reopened(da, tmp_path / "r", "Camera_*")), accident(da)
     before = explorer.thumbnail(token)
     assert explorer.thumbnail(token) == before
-    shutil.copytree(da.dataroot, tmp_path / "r", ignore=shutil.ignore_patterns(".deepaccident"), dirs_exist_ok=True)
+    shutil.copytree(
+        da.dataroot,
+        tmp_path / "r",
+        ignore=shutil.ignore_patterns(".deepaccident"),
+        dirs_exist_ok=True,
+    )
     assert explorer.thumbnail(token) == thumbnail(da, da.get("scenario", token)) != before

@@ -72,7 +72,10 @@ def opened(
 
 def test_a_server_answers_when_its_address_is_known_and_not_afterwards() -> None:
     with serving(TinyApp(), port=0) as served, serving(TinyApp(), port=0) as other:
-        assert (served.url, len(served.token) >= 32) == (f"http://127.0.0.1:{served.port}/?token={served.token}", True)
+        assert (served.url, len(served.token) >= 32) == (
+            f"http://127.0.0.1:{served.port}/?token={served.token}",
+            True,
+        )
         assert ask(served.port, "/page", cookie_of(served)).body == "/page /page"
         assert (other.token != served.token, other.port != served.port) == (True, True)
         assert ask(other.port, "/", cookie_of(served)).status == 401
@@ -99,7 +102,10 @@ def test_by_default_it_takes_the_first_free_port(monkeypatch: pytest.MonkeyPatch
         free.close()
         monkeypatch.setattr(module, "PORTS", (first, second))
         with serving(TinyApp()) as served, serving(TinyApp()) as other:
-            assert (served.port, other.port not in (first, second)) == (second, True)  # none is left
+            assert (served.port, other.port not in (first, second)) == (
+                second,
+                True,
+            )  # none is left
 
 
 def test_a_place_where_it_cannot_listen_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -110,12 +116,18 @@ def test_a_place_where_it_cannot_listen_is_an_error(monkeypatch: pytest.MonkeyPa
             (started(port=65536), ConfigError, ("port: ", "up to 65535", "found 65536")),
             (started(port=-1), ConfigError, ("port: ", "up to 65535", "found -1")),
             (started(host=""), ConfigError, ("host: ", "found nothing")),
-            (started(host="192.0.2.1"), ConfigError, ("host 192.0.2.1: cannot listen", "--address")),
+            (
+                started(host="192.0.2.1"),
+                ConfigError,
+                ("host 192.0.2.1: cannot listen", "--address"),
+            ),
             (started(host="x" * 70), ConfigError, ("host xx", "cannot listen")),
             (started(host="no host"), ConfigError, ("host no host", "cannot listen")),
             (started(root_path="user"), ConfigError, ("--root-path",)),
         )
-    monkeypatch.setattr(socket.socket, "bind", Mock(side_effect=PermissionError(13, "Permission denied")))
+    monkeypatch.setattr(
+        socket.socket, "bind", Mock(side_effect=PermissionError(13, "Permission denied"))
+    )
     assert_refused((started(port=80), ConfigError, ("port 80", "not allowed", "from 1024 on")))
 
 
@@ -137,7 +149,9 @@ def test_no_reader_holds_the_stop(reader: str) -> None:
     app = Endless() if reader == "takes nothing" else TinyApp()
     with ExitStack() as readers:
         with serving(app, port=0) as served:
-            connection = readers.enter_context(shown(served, "/slow" if reader == "waits for an answer" else "/"))
+            connection = readers.enter_context(
+                shown(served, "/slow" if reader == "waits for an answer" else "/")
+            )
             (thread,) = (each for each in threading.enumerate() if each.name == "explorer")
             if reader == "idle":
                 connection.getresponse().read()
@@ -171,11 +185,17 @@ ELSEWHERE = "warning: anyone who can reach this machine can try to open the page
 def test_a_browser_is_opened_with_a_token_for_one_use(monkeypatch: pytest.MonkeyPatch) -> None:
     [said, _], [address] = opened(monkeypatch, page="models/")
     origin, _, token = said.split()[-1].partition("=")
-    assert (address.partition("=")[0], token not in address, origin[-14:]) == (origin, True, "/models/?token")
+    assert (address.partition("=")[0], token not in address, origin[-14:]) == (
+        origin,
+        True,
+        "/models/?token",
+    )
 
 
 @pytest.mark.parametrize("name", ["starlette", "uvicorn"])
-def test_a_missing_extra_is_an_error_with_the_remedy(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+def test_a_missing_extra_is_an_error_with_the_remedy(
+    monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
     need_extra()
     monkeypatch.setitem(sys.modules, name, None)
     told = (f"needs {name}", "pip install '.[explore]'")
@@ -206,14 +226,19 @@ def test_the_verb_refuses_options_that_change_nothing(words: list[str], sentence
             {"host": "::1", "port": 9000, "root_path": "", "open_browser": False},
         ),
         (["--root-path", "/x"], {"root_path": "/x", "open_browser": True}),
-        (["--out", "out", "--where", "town=Town03", "--where", "a=1"], {"where": ("town=Town03", "a=1")}),
+        (
+            ["--out", "out", "--where", "town=Town03", "--where", "a=1"],
+            {"where": ("town=Town03", "a=1")},
+        ),
     ],
 )
 def test_options_of_the_verb_reach_the_server_or_the_export(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, words: list[str], told: dict[str, Any]
 ) -> None:
     called = Mock()
-    monkeypatch.setattr(import_module("deepaccident_devkit.plugins.explore.cli"), "DeepAccident", dict)
+    monkeypatch.setattr(
+        import_module("deepaccident_devkit.plugins.explore.cli"), "DeepAccident", dict
+    )
     for name in ("explore", "export_pages", "Explorer"):
         monkeypatch.setitem(vars(package), name, called)
     (tmp_path / SUMMARY_FILE).touch()
@@ -229,7 +254,10 @@ SLOW = {
     "nothing": (b"", b""),
     "half a request": (HALF, b""),
     "a header letter by letter": (HALF, b"a"),
-    "a body letter by letter": (b"POST /page HTTP/1.1\r\nHost: localhost\r\nContent-Length: 999\r\n\r\n", b"a"),
+    "a body letter by letter": (
+        b"POST /page HTTP/1.1\r\nHost: localhost\r\nContent-Length: 999\r\n\r\n",
+        b"a",
+    ),
     "half a request after a whole one": (WHOLE + HALF, b"a"),
     "a body without an end": (
         b"POST / HTTP/1.1\r\nHost: localhost\r\nTransfer-Encoding: chunked\r\n\r\n",
@@ -243,7 +271,10 @@ def test_who_sends_no_whole_request_in_time_is_cut_off(
     first: bytes, later: bytes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(module, "_REQUEST_SECONDS", 0.5)
-    with serving(TinyApp(), port=0) as served, socket.create_connection(("127.0.0.1", served.port)) as slow:
+    with (
+        serving(TinyApp(), port=0) as served,
+        socket.create_connection(("127.0.0.1", served.port)) as slow,
+    ):
         slow.sendall(first)
         slow.settimeout(0.05)
         end = time.monotonic() + AT_ONCE
@@ -264,9 +295,14 @@ def test_half_requests_leave_room_for_whole_ones(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(module, "_MOST_CONNECTIONS", 20)
     app = TinyApp()
     with serving(app, port=0) as served, ExitStack() as stack:
-        reader = stack.enter_context(shown(served, "/slow"))  # who waits for an answer keeps the connection
+        reader = stack.enter_context(
+            shown(served, "/slow")
+        )  # who waits for an answer keeps the connection
         assert app.begun.wait(AT_ONCE)
-        half = [stack.enter_context(socket.create_connection(("127.0.0.1", served.port))) for _ in range(100)]
+        half = [
+            stack.enter_context(socket.create_connection(("127.0.0.1", served.port)))
+            for _ in range(100)
+        ]
         for each in half:
             with suppress(ConnectionError):
                 each.sendall(HALF)

@@ -44,24 +44,42 @@ class Made(NamedTuple):
 @pytest.fixture(scope="module")
 def made(da_motion: DeepAccident, tmp_path_factory: pytest.TempPathFactory) -> Made:
     folder = tmp_path_factory.mktemp("made")
-    run, _ = stored_run(da_motion, EvaluationSetup(task="accident", protocol="boxes"), folder / "first.json")
+    run, _ = stored_run(
+        da_motion, EvaluationSetup(task="accident", protocol="boxes"), folder / "first.json"
+    )
     stored_run(da_motion, EvaluationSetup(task="motion"), folder / "maps")
     detection, _ = stored_run(da_motion, EvaluationSetup(task="detection"), folder / "boxes.json")
-    bundles = [save_run(detection, folder / "boxes"), save_run(run, folder / "first", include_results=True)]
+    bundles = [
+        save_run(detection, folder / "boxes"),
+        save_run(run, folder / "first", include_results=True),
+    ]
     given = {"bundles": bundles, "results": [folder / "boxes.json", folder / "maps"]}
     return Made(export_pages(da_motion, folder / "out", **given, workers=1), given)
 
 
 def contents(folder: Path) -> dict[str, bytes]:
-    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    return {
+        path.relative_to(folder).as_posix(): path.read_bytes()
+        for path in folder.rglob("*")
+        if path.is_file()
+    }
 
 
 def test_what_is_written(made: Made, da_motion: DeepAccident) -> None:
     tokens = [scenario["token"] for scenario in da_motion.scenario]
-    of_scenarios = [f"{token}/{name}" for token in tokens for name in ("index.html", "replay.html", "thumbnail.jpg")]
+    of_scenarios = [
+        f"{token}/{name}"
+        for token in tokens
+        for name in ("index.html", "replay.html", "thumbnail.jpg")
+    ]
     found = contents(made.index.parent)
     static = {"explore.css", "keys.js", "pages.css", "sorting.js"}
-    assert found.keys() == {"index.html", ".deepaccident_pages", *of_scenarios, *(f"static/{each}" for each in static)}
+    assert found.keys() == {
+        "index.html",
+        ".deepaccident_pages",
+        *of_scenarios,
+        *(f"static/{each}" for each in static),
+    }
     assert [path.name for path in made.index.parent.parent.glob(".*")] == []
 
 
@@ -69,15 +87,27 @@ def test_all_links_lead_to_files(made: Made) -> None:
     root, reached = made.index.parent, set()
     for page in root.rglob("index.html"):
         told = shown(page)
-        addresses = [each for each in (*(address for address, _ in told.links), *told.loads) if each[:5] != "data:"]
+        addresses = [
+            each
+            for each in (*(address for address, _ in told.links), *told.loads)
+            if each[:5] != "data:"
+        ]
         assert not [each for each in addresses if each.startswith("/")]
         reached |= {
-            unquote(urljoin(page.as_uri(), each)).removeprefix("file://") for each in addresses if each[0] != "#"
+            unquote(urljoin(page.as_uri(), each)).removeprefix("file://")
+            for each in addresses
+            if each[0] != "#"
         }
-    assert reached == {str(path) for path in root.rglob("*") if path.is_file() and path.name != ".deepaccident_pages"}
+    assert reached == {
+        str(path)
+        for path in root.rglob("*")
+        if path.is_file() and path.name != ".deepaccident_pages"
+    }
 
 
-def test_nothing_needs_a_network_or_tells_where_the_release_lies(made: Made, da_motion: DeepAccident) -> None:
+def test_nothing_needs_a_network_or_tells_where_the_release_lies(
+    made: Made, da_motion: DeepAccident
+) -> None:
     for name, content in contents(made.index.parent).items():
         text = content.decode(errors="replace").replace(SVG, "")
         assert not re.search(r"https?:|//[a-z]+\.", text), name
@@ -95,7 +125,9 @@ def test_the_list_has_the_scenarios_and_their_values(made: Made, da_motion: Deep
     expected = []
     for record in da_motion.scenario:
         place = explorer.scenarios.row_of[record["token"]]
-        visibility, lead = (explorer.scenarios.values(name)[place] for name in ("accident_visibility", "lead"))
+        visibility, lead = (
+            explorer.scenarios.values(name)[place] for name in ("accident_visibility", "lead")
+        )
         where = [record["token"], scenario_words(record), "train", "35"]
         expected.append([*where, visibility or "–", "–" if lead is None else f"{lead:.1f}"])
     explorer.jobs.end()
@@ -106,14 +138,25 @@ def test_the_list_has_the_scenarios_and_their_values(made: Made, da_motion: Deep
 def test_a_page_has_all_parts(made: Made, da_motion: DeepAccident, which: Any) -> None:
     token = which(da_motion)
     page, explorer = made.page(token), Explorer(da_motion)
-    parts = {name: " ".join(Shown(part_html(explorer, token, name, "../../../")).text.split()) for name in PARTS}
-    assert not lacking(page.text, *PARTS.values(), *[f"{name}{value}" for name, value in made.replay(token)["facts"]])
-    assert not lacking(" ".join(page.text.split()), *(parts[name] for name in parts if name != "findings"))
+    parts = {
+        name: " ".join(Shown(part_html(explorer, token, name, "../../../")).text.split())
+        for name in PARTS
+    }
+    assert not lacking(
+        page.text,
+        *PARTS.values(),
+        *[f"{name}{value}" for name, value in made.replay(token)["facts"]],
+    )
+    assert not lacking(
+        " ".join(page.text.split()), *(parts[name] for name in parts if name != "findings")
+    )
     assert [each["src"] for each in page.all("iframe")] == ["replay.html"]
     assert page.address_of("Its twin").startswith("../../type1_subtype1_")
 
 
-def test_the_same_call_gives_the_same_bytes(made: Made, da_motion: DeepAccident, tmp_path: Path) -> None:
+def test_the_same_call_gives_the_same_bytes(
+    made: Made, da_motion: DeepAccident, tmp_path: Path
+) -> None:
     again = export_pages(da_motion, tmp_path / "another name", **made.given, workers=2)
     assert contents(again.parent) == contents(made.index.parent)
 
@@ -136,16 +179,25 @@ def test_scenarios_are_chosen_by_filters_and_by_name(da_b: DeepAccident, tmp_pat
     wanted = [scenario["token"] for scenario in da_b.find("collision=true")]
     index = export_pages(da_b, tmp_path / "a", where=["collision=true", "length>=1"], workers=1)
     assert listed(index) == wanted
-    index = export_pages(da_b, tmp_path / "b", scenarios=[da_b.scenario[4], tokens[1], tokens[4]], workers=1)
+    index = export_pages(
+        da_b, tmp_path / "b", scenarios=[da_b.scenario[4], tokens[1], tokens[4]], workers=1
+    )
     (found,) = re.findall(r"da\.find\('(.*?)'\)", shown(index).text)
     assert listed(index) == [tokens[4], tokens[1]]
     assert {each["token"] for each in da_b.find(found)} == {tokens[4], tokens[1]}
-    index = export_pages(da_b, tmp_path / "c", scenarios=tokens[::-1], where=["collision=true"], workers=1)
+    index = export_pages(
+        da_b, tmp_path / "c", scenarios=tokens[::-1], where=["collision=true"], workers=1
+    )
     assert listed(index) == wanted[::-1]
-    assert "There is no replay: not in this test" in shown(tmp_path / "c" / wanted[0] / "index.html").text
+    assert (
+        "There is no replay: not in this test"
+        in shown(tmp_path / "c" / wanted[0] / "index.html").text
+    )
 
 
-def test_what_cannot_be_exported(da_b: DeepAccident, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_cannot_be_exported(
+    da_b: DeepAccident, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(static_pages, "MOST_SCENARIOS", 3)
 
     def export(**chosen: Any) -> Callable[[], object]:
@@ -170,7 +222,9 @@ def test_hostile_names_are_text(own_release: Path, tmp_path: Path) -> None:
     dataset = DeepAccident("v1", own_release, verbose=False)
     token = next(scenario["token"] for scenario in dataset.scenario if hostile in scenario["name"])
     page = shown(export_pages(dataset, tmp_path / "out", scenarios=[token], workers=1))
-    assert [each["src"] for each in page.all("img")] == [address for address in page.loads if address.endswith("jpg")]
+    assert [each["src"] for each in page.all("img")] == [
+        address for address in page.loads if address.endswith("jpg")
+    ]
     assert page.table("scenario")[0][0] == token
     (folder,) = (tmp_path / "out").glob("type*/*")
     assert re.fullmatch(r"[A-Za-z0-9_.-]+", folder.name)
@@ -184,8 +238,13 @@ def test_a_damaged_release(own_release: Path, tmp_path: Path) -> None:
     assert listed(index) == [scenario["token"] for scenario in damaged.dataset.scenario]
     assert damaged.broken not in listed(index)
     assert "meta-missing" in shown(tmp_path / "out" / damaged.without_meta / "index.html").text
-    told = {name: content.decode(errors="replace") for name, content in contents(tmp_path / "out").items()}
-    told |= {page: shown(page).text for page in (tmp_path / "out").rglob("index.html")}  # names are not broken in these
+    told = {
+        name: content.decode(errors="replace")
+        for name, content in contents(tmp_path / "out").items()
+    }
+    told |= {
+        page: shown(page).text for page in (tmp_path / "out").rglob("index.html")
+    }  # names are not broken in these
     assert [place for place, text in told.items() if str(own_release) in text] == []
 
 
@@ -198,7 +257,9 @@ def one(da_b: DeepAccident, _quickly: None) -> dict[str, Any]:
     return {"dataset": da_b, "scenarios": [da_b.scenario[0]], "workers": 1}
 
 
-def test_an_earlier_export_is_replaced(one: dict[str, Any], da_b: DeepAccident, tmp_path: Path) -> None:
+def test_an_earlier_export_is_replaced(
+    one: dict[str, Any], da_b: DeepAccident, tmp_path: Path
+) -> None:
     out = tmp_path / "out"
     out.mkdir()
     export_pages(folder=out, **one)
@@ -257,4 +318,7 @@ def test_an_interrupted_export_leaves_nothing(
     for folder in (kept, tmp_path / "new"):
         with pytest.raises(error):
             export_pages(folder=folder, **one)
-        assert (contents(tmp_path), [path.name for path in tmp_path.iterdir()]) == (before, ["kept"])
+        assert (contents(tmp_path), [path.name for path in tmp_path.iterdir()]) == (
+            before,
+            ["kept"],
+        )

@@ -25,7 +25,9 @@ def looked(folder: Path) -> SourceCheck:
 
 @pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize("images", ["noise", "fractal"])
-def test_a_good_source_with_images_that_say_nothing_is_not_refused(tmp_path: Path, images: Images, seed: int) -> None:
+def test_a_good_source_with_images_that_say_nothing_is_not_refused(
+    tmp_path: Path, images: Images, seed: int
+) -> None:
     check = looked(write_dataroot(tmp_path / "road", images=images, points=True, seed=seed).folder)
     assert list(check.faults()) == []
     [unchecked] = check.unchecked()
@@ -34,7 +36,9 @@ def test_a_good_source_with_images_that_say_nothing_is_not_refused(tmp_path: Pat
 
 @pytest.mark.parametrize("keyframes", [1, 2, 3])
 def test_few_keyframes_decide_nothing(tmp_path: Path, keyframes: int) -> None:
-    made = write_dataroot(tmp_path / "road", keyframes=keyframes, splits=("train",), points=True, images="noise")
+    made = write_dataroot(
+        tmp_path / "road", keyframes=keyframes, splits=("train",), points=True, images="noise"
+    )
     mirror(made)
     made.write()
     check = looked(made.folder)
@@ -55,14 +59,18 @@ def mirror(made: Dataroot) -> None:
         turn = Quaternion(pose["rotation"])
         x, y, z = turn.inverse.rotate(np.subtract(row["translation"], pose["translation"]))
         row["translation"] = np.add(turn.rotate([x, -y, z]), pose["translation"]).tolist()
-        yaw = turn.yaw_pitch_roll[0] - (Quaternion(row["rotation"]).yaw_pitch_roll[0] - turn.yaw_pitch_roll[0])
+        yaw = turn.yaw_pitch_roll[0] - (
+            Quaternion(row["rotation"]).yaw_pitch_roll[0] - turn.yaw_pitch_roll[0]
+        )
         row["rotation"] = Quaternion(axis=[0, 0, 1], radians=yaw).elements.tolist()
 
 
 def turn_axes(made: Dataroot) -> None:
     """The ego's y is forward."""
     for pose in made.tables["ego_pose"]:
-        pose["rotation"] = (Quaternion(pose["rotation"]) * Quaternion(axis=[0, 0, 1], degrees=-90)).elements.tolist()
+        pose["rotation"] = (
+            Quaternion(pose["rotation"]) * Quaternion(axis=[0, 0, 1], degrees=-90)
+        ).elements.tolist()
     for mount in made.tables["calibrated_sensor"]:
         back = Quaternion(axis=[0, 0, 1], degrees=90)
         mount["rotation"] = (back * Quaternion(mount["rotation"])).elements.tolist()
@@ -89,12 +97,17 @@ def swap_cameras(made: Dataroot) -> None:
         (mirror, "y is mirrored: points lie in"),
         (turn_axes, "x is not forward: the ego moves"),
         (sink, "sunk by 1.2 m"),
-        (swap_cameras, "cameras are in another order: Camera_FrontLeft looks where Camera_FrontRight should"),
+        (
+            swap_cameras,
+            "cameras are in another order: Camera_FrontLeft looks where Camera_FrontRight should",
+        ),
     ],
 )
 def test_a_mistake_is_named_and_no_other(tmp_path: Path, plant, words: str, seed: int) -> None:
     """Images are noise: they do not speak against what points and poses say."""
-    made = write_dataroot(tmp_path / "road", images="noise", points=True, seed=seed, keyframes=6, boxes=24)
+    made = write_dataroot(
+        tmp_path / "road", images="noise", points=True, seed=seed, keyframes=6, boxes=24
+    )
     plant(made)
     made.write()
     [fault] = looked(made.folder).faults()
@@ -103,10 +116,19 @@ def test_a_mistake_is_named_and_no_other(tmp_path: Path, plant, words: str, seed
         check_source(open_nuscenes(made.folder))
 
 
-def test_what_could_not_be_checked_is_said(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_what_could_not_be_checked_is_said(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     folder = write_dataroot(tmp_path / "road", splits=("train",), keyframes=3).folder
     check_source(open_nuscenes(folder))
-    for words in (str(folder), "could not be checked", "x is forward", "how high", "y is to the left", IMAGES_UNKNOWN):
+    for words in (
+        str(folder),
+        "could not be checked",
+        "x is forward",
+        "how high",
+        "y is to the left",
+        IMAGES_UNKNOWN,
+    ):
         assert words in caplog.text
 
 

@@ -38,7 +38,11 @@ def keyframes(road: NuScenesRelease) -> list[str]:
 
 
 def rows(made: Dataroot, table: str, **fields: str) -> list[Row]:
-    return [row for row in made.tables[table] if all(row[name] == value for name, value in fields.items())]
+    return [
+        row
+        for row in made.tables[table]
+        if all(row[name] == value for name, value in fields.items())
+    ]
 
 
 # ---- what is ignored
@@ -50,13 +54,20 @@ def test_boxes_of_other_classes_are_in_no_table(made: Dataroot, road: NuScenesRe
         there = rows(made, "sample_annotation", sample_token=road.nuscenes_token(token))
         counted = [row for row in there if classes[row["instance_token"]] in COUNTED]
         assert 0 < len(counted) < len(there)
-        np.testing.assert_allclose(road.boxes(token).center, [row["translation"] for row in counted])
-        np.testing.assert_allclose(road.with_ignored.boxes(token).center, [row["translation"] for row in there])
+        np.testing.assert_allclose(
+            road.boxes(token).center, [row["translation"] for row in counted]
+        )
+        np.testing.assert_allclose(
+            road.with_ignored.boxes(token).center, [row["translation"] for row in there]
+        )
     assert road.columns("annotation")["actor_id"].max() < IGNORED_ID
     ids = road.with_ignored.columns("annotation")["actor_id"]
     assert (ids >= IGNORED_ID).sum() == len(ids) - len(road.annotation)
     assert {*ids[ids < IGNORED_ID].tolist()} == {*road.columns("annotation")["actor_id"].tolist()}
-    assert pickle.loads(pickle.dumps(road.with_ignored)).annotation[0] == road.with_ignored.annotation[0]
+    assert (
+        pickle.loads(pickle.dumps(road.with_ignored)).annotation[0]
+        == road.with_ignored.annotation[0]
+    )
 
 
 def test_what_is_ignored_is_nowhere_true(road: NuScenesRelease) -> None:
@@ -70,12 +81,20 @@ def test_what_is_ignored_is_nowhere_true(road: NuScenesRelease) -> None:
             assert max(road.motion_labels(token, config).id_map, default=0) < IGNORED_ID
 
 
-def test_statistics_and_interactions_count_what_is_ours(made: Dataroot, road: NuScenesRelease) -> None:
+def test_statistics_and_interactions_count_what_is_ours(
+    made: Dataroot, road: NuScenesRelease
+) -> None:
     classes = {row["token"]: row["category_token"] for row in made.tables["instance"]}
     walkers = [
-        row for row in made.tables["sample_annotation"] if classes[row["instance_token"]].startswith("human.pedestrian")
+        row
+        for row in made.tables["sample_annotation"]
+        if classes[row["instance_token"]].startswith("human.pedestrian")
     ]
-    table = next(block for block in dataset_statistics(road).to_text().split("\n\n") if block.startswith("category"))
+    table = next(
+        block
+        for block in dataset_statistics(road).to_text().split("\n\n")
+        if block.startswith("category")
+    )
     [words] = [line.split() for line in table.splitlines() if line.startswith("pedestrian")]
     assert words[2] == str(len(walkers))
     pairs = [road.interactions(each).pairs.actor_ids for each in road.scenario]
@@ -88,7 +107,11 @@ def test_a_vehicle_is_a_vehicle_in_fierys_labels(road: NuScenesRelease) -> None:
     for token in keyframes(road):
         boxes = road.with_ignored.boxes(token)
         names = dict(zip(boxes.actor_id.tolist(), boxes.category_names, strict=True))
-        found |= {names.get(actor) for actor in road.motion_labels(token, "fiery").id_map if actor >= IGNORED_ID}
+        found |= {
+            names.get(actor)
+            for actor in road.motion_labels(token, "fiery").id_map
+            if actor >= IGNORED_ID
+        }
     assert found - {None} == {"truck"}
 
 
@@ -104,12 +127,17 @@ def test_times_and_velocities_are_the_keyframes_own(made: Dataroot, road: NuScen
         frames = road.field2token("frame", "scenario_token", f"nuscenes/{scene['name']}")
         found = np.array([road.get("frame", token)["timestamp"] for token in frames])
         np.testing.assert_allclose(found[::5], times, atol=1e-6)
-        keys = [f"nuscenes/{scene['name']}/ego_vehicle/{frame:03d}" for frame in range(1, len(found) + 1, 5)]
+        keys = [
+            f"nuscenes/{scene['name']}/ego_vehicle/{frame:03d}"
+            for frame in range(1, len(found) + 1, 5)
+        ]
         left = [road.get("sample", key)["time_to_end"] for key in keys]
         np.testing.assert_allclose(left, times[-1] - times, atol=1e-6)
         ego = np.array([places[rows_of_lidar(made, token)] for token in own])[:, :2]
         velocity = [road.get("sample", key)["velocity"] for key in keys[:-1]]
-        np.testing.assert_allclose(velocity, np.diff(ego, axis=0) / np.diff(times)[:, None], atol=1e-4)
+        np.testing.assert_allclose(
+            velocity, np.diff(ego, axis=0) / np.diff(times)[:, None], atol=1e-4
+        )
 
 
 def rows_of_lidar(made: Dataroot, sample: str) -> str:
@@ -160,22 +188,39 @@ def cycle(table: str, step: int) -> Change:
 DAMAGES: dict[str, tuple[Change, tuple[str, ...]]] = {
     "next of itself": (cycle("sample", 0), ("sample.json: scene-0000-0", "next")),
     "a longer cycle": (cycle("sample", 2), ("sample.json: scene-0000-2", "next")),
-    "no way to all samples": (first("sample", next=""), ("sample.json: scene-0000-0", "'scene-0000-1'")),
+    "no way to all samples": (
+        first("sample", next=""),
+        ("sample.json: scene-0000-0", "'scene-0000-1'"),
+    ),
     "a cycle of all": (cycle("sample", 4), ("sample.json: scene-0000-4", "next")),
-    "no first sample": (first("scene", first_sample_token=""), ("scene.json: scene-0000", "'scene-0000-0'")),
-    "samples of no scene": (every("sample", scene_token="scene-0001"), ("scene.json: scene-0000", "found")),  # noqa: S106
+    "no first sample": (
+        first("scene", first_sample_token=""),
+        ("scene.json: scene-0000", "'scene-0000-0'"),
+    ),
+    "samples of no scene": (
+        every("sample", scene_token="scene-0001"),  # noqa: S106
+        ("scene.json: scene-0000", "found"),
+    ),
     "an actor twice": (
-        lambda tables: tables["sample_annotation"].append({**tables["sample_annotation"][0], "token": "again"}),
+        lambda tables: tables["sample_annotation"].append(
+            {**tables["sample_annotation"][0], "token": "again"}
+        ),
         ("sample_annotation.json: again", "instance_token"),
     ),
-    "at the same time": (every("sample", timestamp=1_500_000_000_000_000), ("sample.json: scene-0000-0", "timestamp")),
+    "at the same time": (
+        every("sample", timestamp=1_500_000_000_000_000),
+        ("sample.json: scene-0000-0", "timestamp"),
+    ),
     "next unknown": (first("sample", next="zz"), ("sample.json: scene-0000-0", "'zz'")),
     "log unknown": (first("scene", log_token="zz"), ("scene.json: scene-0000", "log_token")),  # noqa: S106
     "sample unknown": (
         first("sample_annotation", sample_token="zz"),  # noqa: S106
         ("sample_annotation.json: scene-0000-actor0-0", "sample_token", "'zz'"),
     ),
-    "no intrinsic": (every("calibrated_sensor", camera_intrinsic=[]), ("calibrated_sensor.json: scene-0000-CAM",)),
+    "no intrinsic": (
+        every("calibrated_sensor", camera_intrinsic=[]),
+        ("calibrated_sensor.json: scene-0000-CAM",),
+    ),
     "intrinsic of zeros": (
         every("calibrated_sensor", camera_intrinsic=[[0, 0, 0]] * 3),
         ("calibrated_sensor.json: scene-0000-CAM", "focal"),
@@ -196,7 +241,10 @@ DAMAGES: dict[str, tuple[Change, tuple[str, ...]]] = {
         first("sample_annotation", translation=[1e308] * 3),
         ("sample_annotation.json: ", "$[0].translation"),
     ),
-    "size below 0": (first("sample_annotation", size=[-1, -1, -1]), ("sample_annotation.json: ", "$[0].size")),
+    "size below 0": (
+        first("sample_annotation", size=[-1, -1, -1]),
+        ("sample_annotation.json: ", "$[0].size"),
+    ),
     "field missing": (
         lambda tables: tables["sample"][0].pop("timestamp"),
         ("sample.json: ", "`timestamp` - at `$[0]`"),
@@ -211,17 +259,25 @@ DAMAGES: dict[str, tuple[Change, tuple[str, ...]]] = {
         first("sample_data", filename="samples/../../secret.jpg"),
         ("sample_data.json: ", "$[0].filename"),
     ),
-    "file outside, in lines": (first("sample_data", filename="a\n/../../secret"), ("$[0].filename",)),
+    "file outside, in lines": (
+        first("sample_data", filename="a\n/../../secret"),
+        ("$[0].filename",),
+    ),
     "file of the root": (first("sample_data", filename="/etc/passwd"), ("$[0].filename",)),
     "no camera": (
         lambda tables: tables.update(
-            sample_data=[row for row in tables["sample_data"] if "/CAM_BACK/" not in row["filename"]]
+            sample_data=[
+                row for row in tables["sample_data"] if "/CAM_BACK/" not in row["filename"]
+            ]
         ),
         ("sample.json: scene-0000-0", "CAM_BACK"),
     ),
     "a row that is none": (lambda tables: tables["log"].append(7), ("log.json: ", "$[3]")),
     "a table that is none": (lambda tables: tables.update(category={}), ("category.json", "array")),
-    "no scenes": (lambda tables: tables.update({name: [] for name in tables}), ("scene.json", "has no scenes")),
+    "no scenes": (
+        lambda tables: tables.update({name: [] for name in tables}),
+        ("scene.json", "has no scenes"),
+    ),
 }
 
 
@@ -234,7 +290,9 @@ def damaged(made: Dataroot, folder: Path, name: str) -> Path:
 
 
 @pytest.mark.parametrize("name", DAMAGES)
-def test_damaged_tables_are_refused_by_file_row_and_field(made: Dataroot, tmp_path: Path, name: str) -> None:
+def test_damaged_tables_are_refused_by_file_row_and_field(
+    made: Dataroot, tmp_path: Path, name: str
+) -> None:
     folder = damaged(made, tmp_path / "road", name)
     named = (*DAMAGES[name][1], str(folder), "unpack the tables again")
     assert_refused((lambda: open_nuscenes(folder), DatarootError, named))
@@ -249,13 +307,21 @@ def test_damaged_tables_are_refused_by_file_row_and_field(made: Dataroot, tmp_pa
         (None, "No such file"),
     ],
 )
-def test_unreadable_tables_are_named(made: Dataroot, tmp_path: Path, content: bytes | None, words: str) -> None:
+def test_unreadable_tables_are_named(
+    made: Dataroot, tmp_path: Path, content: bytes | None, words: str
+) -> None:
     folder = Dataroot(tmp_path / "road", made.version, made.tables).write()
     table = folder / made.version / "category.json"
     table.unlink()
     if content is not None:
         table.write_bytes(content)
-    assert_refused((lambda: open_nuscenes(folder), DatarootError, (str(table), words, "unpack the tables again")))
+    assert_refused(
+        (
+            lambda: open_nuscenes(folder),
+            DatarootError,
+            (str(table), words, "unpack the tables again"),
+        )
+    )
 
 
 @pytest.mark.parametrize(
@@ -266,7 +332,9 @@ def test_unreadable_tables_are_named(made: Dataroot, tmp_path: Path, content: by
         ([], "object"),
     ],
 )
-def test_splits_that_contradict_are_refused(made: Dataroot, tmp_path: Path, splits: Any, words: str) -> None:
+def test_splits_that_contradict_are_refused(
+    made: Dataroot, tmp_path: Path, splits: Any, words: str
+) -> None:
     folder = Dataroot(tmp_path / "road", made.version, made.tables).write()
     path = folder / made.version / "splits.json"
     path.write_text(json.dumps(splits))
@@ -283,7 +351,10 @@ def test_a_restored_table_is_read_again(made: Dataroot, tmp_path: Path) -> None:
     table.write_text(table.read_text().replace("singapore-onenorth", "singapore-queenstn"))
     os.utime(table, ns=(state.st_atime_ns, state.st_mtime_ns))
     after = open_nuscenes(folder)
-    assert (before.scenario[0]["town"], after.scenario[0]["town"]) == ("singapore-onenorth", "singapore-queenstn")
+    assert (before.scenario[0]["town"], after.scenario[0]["town"]) == (
+        "singapore-onenorth",
+        "singapore-queenstn",
+    )
 
 
 def test_what_the_nuscenes_devkit_opened(made: Dataroot, road: NuScenesRelease) -> None:

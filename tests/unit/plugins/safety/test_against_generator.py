@@ -63,7 +63,13 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Made:
 def jobs(root: Path) -> list[RecordingJob]:
     """The accidents."""
     short = SynthConfig(
-        scenarios=2 * PAIRS, frames=30, sensors=False, seed=26, unplanned=0.3, exact=True, designed=True
+        scenarios=2 * PAIRS,
+        frames=30,
+        sensors=False,
+        seed=26,
+        unplanned=0.3,
+        exact=True,
+        designed=True,
     )
     hidden = replace(short, view="hidden")
     plans = [(short, plan) for plan in plan_scenarios(short)[: 2 * OPEN_PAIRS]]
@@ -80,7 +86,11 @@ def test_they_are_of_many_kinds(made: Made) -> None:
 def test_the_pair_its_motion_and_its_contact(made: Made) -> None:
     for accident, truth in made:
         told, contact = truth.meta.collision, made.da.collision(truth.scenario)
-        assert (accident.actor_ids, accident.agents, accident.categories) == (told.ids, told.agents, told.classes)
+        assert (accident.actor_ids, accident.agents, accident.categories) == (
+            told.ids,
+            told.agents,
+            told.classes,
+        )
         np.testing.assert_allclose(accident.paths[..., :2], truth.world_paths[..., :2], atol=1e-4)
         assert np.abs(np.sin(accident.paths[..., 2] - truth.world_paths[..., 2])).max() < 1e-4
         np.testing.assert_allclose(accident.sizes, truth.sizes, atol=1e-6)
@@ -103,11 +113,15 @@ def test_speeds_and_severity(made: Made) -> None:
         check, contact = undisturbed(accident), made.da.collision(truth.scenario)
         exact, lately = truth.velocities[:, -1], truth.velocities[:, -STEPS_A_FRAME - 1 :]
         mean = (lately[:, 1:] + lately[:, :-1]).mean(axis=1) / 2
-        masses = masses_of([CATEGORIES.index(name) for name in truth.meta.collision.classes], truth.sizes)
+        masses = masses_of(
+            [CATEGORIES.index(name) for name in truth.meta.collision.classes], truth.sizes
+        )
         for velocities, tolerance in ((mean, 0.02), (exact, LAG + 0.02)):
             speeds, relative = np.hypot(*velocities.T), np.hypot(*(velocities[0] - velocities[1]))
             np.testing.assert_allclose([check.speeds, contact.speeds], [speeds] * 2, atol=tolerance)
-            np.testing.assert_allclose(check.delta_v, relative * masses[::-1] / masses.sum(), atol=2 * tolerance)
+            np.testing.assert_allclose(
+                check.delta_v, relative * masses[::-1] / masses.sum(), atol=2 * tolerance
+            )
             closing = (velocities[0] - velocities[1]) @ generator.facing(truth)
             assert contact.closing_speed == pytest.approx(closing, abs=2 * tolerance)
 
@@ -129,11 +143,16 @@ def test_who_was_hidden_and_how_long(made: Made, kind: str) -> None:
     leads = []
     for accident, truth in made:
         observed = observed_by_rays(accident, truth, kind)
-        rule, expected = ObservationRule(kind=kind), [lead(observed, members) for members in COALITIONS]
+        rule, expected = (
+            ObservationRule(kind=kind),
+            [lead(observed, members) for members in COALITIONS],
+        )
         agents, seen = observed_actors(made.da, truth.scenario, accident.actor_ids, rule)
         assert agents == AGENTS
         np.testing.assert_array_equal(seen, observed)
-        np.testing.assert_allclose(lead_times(made.da, truth.scenario, rule).leads, expected, atol=1e-9)
+        np.testing.assert_allclose(
+            lead_times(made.da, truth.scenario, rule).leads, expected, atol=1e-9
+        )
         leads.append(expected)
     alone, together = np.array(leads)[:, 0], np.array(leads)[:, -1]
     assert (alone[OPEN_PAIRS:] < 1.5).all()
@@ -146,12 +165,17 @@ def observed_by_rays(accident: Accident, truth: Truth, kind: str) -> np.ndarray:
     observed = np.zeros(sights.points.shape, dtype=bool)
     for agent, which in product(range(len(AGENTS)), (0, 1)):
         points, camera = sights.points[agent, which], sights.pixels[agent, which] > 0
-        pole, small = AGENTS[agent] == "infrastructure", accident.categories[which] not in ("car", "van", "truck")
+        pole, small = (
+            AGENTS[agent] == "infrastructure",
+            accident.categories[which] not in ("car", "van", "truck"),
+        )
         enough_near, enough_far = (1 if pole else 2 if small else 5), (1 if small else 2)
         near = sights.distance[agent, which] < (15 if pole else 10)
         released = np.where(near, camera | (points >= enough_near), camera & (points >= enough_far))
         seen = points >= 5 if kind == "points" else released
-        observed[agent, which] = (seen & (sights.tracked[agent, which] > 0)) | (accident.agents[which] == AGENTS[agent])
+        observed[agent, which] = (seen & (sights.tracked[agent, which] > 0)) | (
+            accident.agents[which] == AGENTS[agent]
+        )
     return observed
 
 

@@ -53,7 +53,9 @@ def test_each_set_of_agents_by_a_plain_search(da_motion: DeepAccident, kind: str
 
 
 def test_gains_and_losses_are_differences_of_sets() -> None:
-    leads = np.array([1.0, 1.5, 2.0, 2.25, 1.25, 3.0, 4.0, 4.5, 1.0, 5.0, 2.5, 5.5, 3.5, 6.0, 6.5, 7.0])
+    leads = np.array(
+        [1.0, 1.5, 2.0, 2.25, 1.25, 3.0, 4.0, 4.5, 1.0, 5.0, 2.5, 5.5, 3.5, 6.0, 6.5, 7.0]
+    )
     times = LeadTimes(
         scenario="type1_subtype1_accident/a",
         rule=ObservationRule(),
@@ -67,18 +69,33 @@ def test_gains_and_losses_are_differences_of_sets() -> None:
         leads=leads,
         shapley=np.ones(4),
     )
-    assert (times.ego_collides, times.alone, times.together, times.from_the_start) == (False, 1.0, 7.0, False)
-    assert (times.gains.tolist(), times.losses.tolist()) == ([0.5, 1.0, 0.25, 0.0], [0.5, 1.0, 1.5, 2.5])
+    assert (times.ego_collides, times.alone, times.together, times.from_the_start) == (
+        False,
+        1.0,
+        7.0,
+        False,
+    )
+    assert (times.gains.tolist(), times.losses.tolist()) == (
+        [0.5, 1.0, 0.25, 0.0],
+        [0.5, 1.0, 1.5, 2.5],
+    )
     frames = np.arange(16)[::-1]
-    seen = [replace(times, first_frames=first).from_the_start for first in (frames + 1, frames + 2, 0 * frames)]
+    seen = [
+        replace(times, first_frames=first).from_the_start
+        for first in (frames + 1, frames + 2, 0 * frames)
+    ]
     assert seen == [True, False, False]
     less = replace(times, missing=("infrastructure",))
     assert (less.together, less.losses.tolist()[:3]) == (4.5, [0.5, 1.5, 2.25])
 
 
-def test_missing_agents_leave_the_sets_that_are_there(da: DeepAccident, da_partial: DeepAccident) -> None:
+def test_missing_agents_leave_the_sets_that_are_there(
+    da: DeepAccident, da_partial: DeepAccident
+) -> None:
     scenario = da.find(collision=True)[0]["token"]
-    whole, partial = (lead_times(each, scenario, ObservationRule(kind="points")) for each in (da, da_partial))
+    whole, partial = (
+        lead_times(each, scenario, ObservationRule(kind="points")) for each in (da, da_partial)
+    )
     assert (whole.missing, partial.missing) == ((), ("other_vehicle_behind",))
     known = np.array(["other_vehicle_behind" not in members for members in COALITIONS])
     np.testing.assert_array_equal(partial.leads, np.where(known, whole.leads, np.nan))
@@ -94,7 +111,9 @@ def test_missing_agents_leave_the_sets_that_are_there(da: DeepAccident, da_parti
 def test_without_the_egos_labels_there_is_a_reason(own_release: Path) -> None:
     da = without(own_release, "ego_vehicle")
     accident, ledger = da.find(collision=True)[0], lead_time_ledger(da)
-    assert_refused((lambda: lead_times(da, accident), NotAvailableError, ("has no labels of ego_vehicle",)))
+    assert_refused(
+        (lambda: lead_times(da, accident), NotAvailableError, ("has no labels of ego_vehicle",))
+    )
     assert (ledger.accidents, len(ledger.skipped)) == ((), 3)
     assert "no labels of ego_vehicle" in ledger.to_text()
 
@@ -102,7 +121,10 @@ def test_without_the_egos_labels_there_is_a_reason(own_release: Path) -> None:
 def test_scenarios_are_counted_and_a_chosen_few_looked_at(da_b: DeepAccident) -> None:
     accidents = [scenario["token"] for scenario in da_b.find(collision=True)]
     ledger, few = lead_time_ledger(da_b), lead_time_ledger(da_b, [accidents[1], accidents[1]])
-    for each, tokens, others in ((ledger, accidents, len(da_b.scenario) - len(accidents)), (few, accidents[1:2], 0)):
+    for each, tokens, others in (
+        (ledger, accidents, len(da_b.scenario) - len(accidents)),
+        (few, accidents[1:2], 0),
+    ):
         assert ([one.scenario for one in each.accidents], each.without_accident) == (tokens, others)
     for means, name in ((ledger.mean_leads, "leads"), (ledger.mean_gains, "gains")):
         values = np.mean([getattr(each, name) for each in ledger.accidents], axis=0)
@@ -126,19 +148,27 @@ def test_means_have_intervals_from_six_accidents_on() -> None:
     for mean, of in ((known, values[:, 0]), (half, values[:200, 0])):
         error = of.std() / math.sqrt(len(of))
         assert mean.mean == pytest.approx(of.mean())
-        assert [mean.mean - mean.low, mean.high - mean.mean] == pytest.approx([1.96 * error] * 2, abs=0.2 * error)
+        assert [mean.mean - mean.low, mean.high - mean.mean] == pytest.approx(
+            [1.96 * error] * 2, abs=0.2 * error
+        )
 
 
 def test_the_command_prints_and_writes_the_ledger(da_b: DeepAccident, tmp_path: Path) -> None:
     command = ["safety", "lead-time", str(da_b.dataroot)]
-    result = CliRunner().invoke(deepaccident, [*command, "--seen", "annotated", "--out", str(tmp_path)])
+    result = CliRunner().invoke(
+        deepaccident, [*command, "--seen", "annotated", "--out", str(tmp_path)]
+    )
     assert result.exit_code == 0
     names = {"lead_times.csv", "lead_times.json", "lead_times.png", "skipped.csv"}
     assert {path.name for path in tmp_path.iterdir()} == names
     told = json.loads((tmp_path / "lead_times.json").read_text(encoding="utf-8"))
-    rows = list(csv.DictReader((tmp_path / "lead_times.csv").read_text(encoding="utf-8").splitlines()))
+    rows = list(
+        csv.DictReader((tmp_path / "lead_times.csv").read_text(encoding="utf-8").splitlines())
+    )
     assert len(rows) == told["summary"]["accidents"] == len(da_b.find(collision=True))
     for row, accident in zip(rows, told["accidents"], strict=True):
         values = {f"lead_{name}": str(lead) for name, lead in accident["lead_seconds"].items()}
-        values |= {f"shapley_{partner}": str(accident["shapley_seconds"][partner]) for partner in PARTNERS}
+        values |= {
+            f"shapley_{partner}": str(accident["shapley_seconds"][partner]) for partner in PARTNERS
+        }
         assert row.items() >= {**values, "scenario": accident["scenario"]}.items()

@@ -29,24 +29,36 @@ def report(da_motion: DeepAccident) -> SafetyReport:
     return safety_report(da_motion, workers=1)
 
 
-def test_its_parts_are_those_of_the_functions(da_motion: DeepAccident, report: SafetyReport) -> None:
+def test_its_parts_are_those_of_the_functions(
+    da_motion: DeepAccident, report: SafetyReport
+) -> None:
     for part, function in (
         (report.avoidability, avoidability_report),
         (report.ledger, lead_time_ledger),
         (report.twins, twin_report),
     ):
         assert part.to_dict() == function(da_motion, workers=1).to_dict()
-    assert [row.story for row in report.rows] + list(report.normal) == list(stories(da_motion, workers=1))
+    assert [row.story for row in report.rows] + list(report.normal) == list(
+        stories(da_motion, workers=1)
+    )
     assert (report.scenarios, len(report.rows), report.left_out) == (2, 1, [])
 
 
-def test_a_row_has_the_numbers_of_its_accident(da_motion: DeepAccident, report: SafetyReport) -> None:
+def test_a_row_has_the_numbers_of_its_accident(
+    da_motion: DeepAccident, report: SafetyReport
+) -> None:
     (row,) = report.rows
-    (replayed,), (times,), (twin,) = report.avoidability.accidents, report.ledger.accidents, report.twins.diffs
+    (replayed,), (times,), (twin,) = (
+        report.avoidability.accidents,
+        report.ledger.accidents,
+        report.twins.diffs,
+    )
     story, told = describe(da_motion, row.scenario).facts["accident"], row.to_dict()
     slack = replayed.slack[replayed.accident.agents.index("ego_vehicle")]
     assert (row.brakes, told["last_moments"]["6"]) == (["ego_vehicle"], story["braking"]["slack"])
-    assert row.last_moments == pytest.approx(dict(zip((4.0, 6.0, 8.0), slack, strict=True)), abs=0.005)
+    assert row.last_moments == pytest.approx(
+        dict(zip((4.0, 6.0, 8.0), slack, strict=True)), abs=0.005
+    )
     known = {**story["seen"], "ego_vehicle": times.alone, "all": times.together}
     assert row.leads == pytest.approx(known, abs=1e-6)
     assert (row.parts, row.severity) == (
@@ -75,7 +87,9 @@ def test_an_accident_that_cannot_be_replayed_keeps_its_row(
 def test_what_is_left_out_is_named(own_release: Path) -> None:
     damaged = damaged_release(own_release)
     report = safety_report(damaged.dataset, workers=1)
-    shown = [row.scenario for row in report.rows] + [each.facts["scenario"] for each in report.normal]
+    shown = [row.scenario for row in report.rows] + [
+        each.facts["scenario"] for each in report.normal
+    ]
     assert sorted(shown) == sorted(damaged.whole)
     told = {scenario: f"{part}: {reason}" for scenario, part, reason in report.left_out}
     for scenario, *words in (
@@ -88,7 +102,9 @@ def test_what_is_left_out_is_named(own_release: Path) -> None:
 
 def test_normal_scenarios_come_by_their_least_time_to_collision(da_b: DeepAccident) -> None:
     normal = safety_report(da_b, workers=1).normal
-    times = [np.inf if (each := story.facts["nearest"]) is None else each["min_ttc"] for story in normal]
+    times = [
+        np.inf if (each := story.facts["nearest"]) is None else each["min_ttc"] for story in normal
+    ]
     assert times == sorted(times)
     assert len(normal) == sum(each["collision"] is None for each in da_b.scenario)
 

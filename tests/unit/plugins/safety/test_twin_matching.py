@@ -25,7 +25,9 @@ def recording(
     """Actors that drive to the right, each a little faster than the one before it."""
     count = len(starts)
     poses = np.zeros((count, frames, 3))
-    poses[..., 0] = np.array(starts)[:, :1] + (8 + np.arange(count))[:, None] * np.arange(frames) / 10
+    poses[..., 0] = (
+        np.array(starts)[:, :1] + (8 + np.arange(count))[:, None] * np.arange(frames) / 10
+    )
     poses[..., 1] = np.array(starts)[:, 1:]
     return TwinRecording(
         scenario="type1_subtype1_accident/x",
@@ -40,13 +42,17 @@ def recording(
 
 def test_agents_are_matched_by_name_wherever_they_are() -> None:
     first = recording([(0, 0), (50, 5)], ids=[3, 7], agents={"ego_vehicle": 3, "other_vehicle": 7})
-    second = recording([(0, 40), (90, 0)], ids=[3, 7], agents={"ego_vehicle": 7, "other_vehicle": 3})
+    second = recording(
+        [(0, 40), (90, 0)], ids=[3, 7], agents={"ego_vehicle": 7, "other_vehicle": 3}
+    )
     assert matched_rows(first, second) == {0: (1, "agent"), 1: (0, "agent")}
 
 
 def test_ids_count_if_the_agents_have_equal_ones() -> None:
     agents, away = {"ego_vehicle": 1, "other_vehicle": 2}, [(0, 0), (0, 9), (70, 70), (0, 30)]
-    first = recording([(0, 0), (0, 9), (0, 20), (0, 30)], ids=[1, 2, 5, 6], agents=agents, categories=[0, 0, 0, 5])
+    first = recording(
+        [(0, 0), (0, 9), (0, 20), (0, 30)], ids=[1, 2, 5, 6], agents=agents, categories=[0, 0, 0, 5]
+    )
     second = recording(away, ids=[1, 2, 5, 6], agents=agents, categories=[0, 0, 0, 4])
     assert matched_rows(first, second) == {0: (0, "agent"), 1: (1, "agent"), 2: (2, "id")}
     of_one = matched_rows(first, recording(away, ids=[1, 2, 5, 6], agents={"ego_vehicle": 1}))
@@ -61,7 +67,12 @@ def test_starts_are_matched_with_the_least_distance_in_all() -> None:
 
 @given(st.integers(-20, 20))
 def test_the_shift_is_found_though_two_agents_go_their_own_ways(shift: int) -> None:
-    agents = {"ego_vehicle": 0, "ego_vehicle_behind": 1, "other_vehicle": 2, "other_vehicle_behind": 3}
+    agents = {
+        "ego_vehicle": 0,
+        "ego_vehicle_behind": 1,
+        "other_vehicle": 2,
+        "other_vehicle_behind": 3,
+    }
     whole = recording([(0, 0), (-10, 0), (0, 40), (-10, 40)], agents=agents, frames=90)
     poses = whole.poses[:, max(0, -shift) :].copy()
     poses[2:, :, 0] += [[30], [60]]

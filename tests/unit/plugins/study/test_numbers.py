@@ -11,13 +11,21 @@ from deepaccident_devkit.errors import EvaluationError, NotAvailableError
 from deepaccident_devkit.evaluation import DetectedBoxes, MotionOutput
 from deepaccident_devkit.geometry import BevGrid, Boxes
 from deepaccident_devkit.motion import OWN_BOX_ID, MotionLabelConfig, motion_labels
-from deepaccident_devkit.plugins.study.numbers import HIDDEN, HiddenActors, evaluators_of, numbers_of_rows, verdict
+from deepaccident_devkit.plugins.study.numbers import (
+    HIDDEN,
+    HiddenActors,
+    evaluators_of,
+    numbers_of_rows,
+    verdict,
+)
 from deepaccident_devkit.plugins.study.predict import predictions_of, strangers_of, with_strangers
 from deepaccident_devkit.plugins.study.recipe import StudyRow
 from deepaccident_devkit.v2x import visible_instances
 from deepaccident_devkit.v2x.cooperation import seen_actors
 
-LABELS = MotionLabelConfig(grid=BevGrid(x=(-50.0, 50.0, 1.0), y=(-50.0, 50.0, 1.0)), protocol="clean")
+LABELS = MotionLabelConfig(
+    grid=BevGrid(x=(-50.0, 50.0, 1.0), y=(-50.0, 50.0, 1.0)), protocol="clean"
+)
 
 
 SAMPLE = "type1_subtype1_accident/Town03_{}/ego_vehicle/010"
@@ -30,7 +38,9 @@ def boxes_at(*places: tuple[float, float], frame: str = "ego") -> DetectedBoxes:
 
 
 def motion_of(foreground: np.ndarray) -> MotionOutput:
-    return MotionOutput(grid=LABELS.grid, instances=np.repeat(foreground[None, None], 5, axis=1).astype(np.int32))
+    return MotionOutput(
+        grid=LABELS.grid, instances=np.repeat(foreground[None, None], 5, axis=1).astype(np.int32)
+    )
 
 
 def test_hidden_actors_are_those_that_a_partner_alone_sees(da: DeepAccident) -> None:
@@ -43,12 +53,18 @@ def test_hidden_actors_are_those_that_a_partner_alone_sees(da: DeepAccident) -> 
         drawn = motion_labels(da, token, LABELS).segmentation[0] > 0
         index, inside = LABELS.grid.index_of(every.center[:, :2])
         found = []
-        for actor, box, (row, column), there in zip(every.actor_id, every.center, index, inside, strict=True):
+        for actor, box, (row, column), there in zip(
+            every.actor_id, every.center, index, inside, strict=True
+        ):
             if actor >= 0 and there and drawn[row, column]:
                 found += [tuple(box[:2])] * (str(actor) in alone)
                 hidden, seen = hidden + (str(actor) not in alone), seen + (str(actor) in alone)
-        evaluator.update(token, da, LABELS, motion_of(drawn), boxes_at(*found, (49.0, -49.0), (80.0, 0.0)))
-    totals = {name: sum(each[name] for each in evaluator.counts.values()) for name in ("hidden", "seen")}
+        evaluator.update(
+            token, da, LABELS, motion_of(drawn), boxes_at(*found, (49.0, -49.0), (80.0, 0.0))
+        )
+    totals = {
+        name: sum(each[name] for each in evaluator.counts.values()) for name in ("hidden", "seen")
+    }
     assert totals == {"hidden": hidden, "seen": seen}
     assert evaluator.compute() == {
         "false_foreground": 0.0,
@@ -71,8 +87,20 @@ def seeds_of(*shares: float) -> dict[str, dict[str, Any]]:
         evaluators = evaluators_of("clean")
         for pair in range(10):
             found = round(10 * share) + (pair + seed) % 2
-            names = ("seen", "seen_foreground", "seen_detected", "cells", "false_cells", "false_boxes")
-            counts = {"hidden": 10, "hidden_foreground": found, "hidden_detected": 0, **dict.fromkeys(names, 0)}
+            names = (
+                "seen",
+                "seen_foreground",
+                "seen_detected",
+                "cells",
+                "false_cells",
+                "false_boxes",
+            )
+            counts = {
+                "hidden": 10,
+                "hidden_foreground": found,
+                "hidden_detected": 0,
+                **dict.fromkeys(names, 0),
+            }
             evaluators[HIDDEN].add(SAMPLE.format(pair), counts)
         made[str(seed)] = {HIDDEN: evaluators[HIDDEN]}
     return made
@@ -85,7 +113,9 @@ def detections_of(*models: tuple[float, float], token: str = SAMPLE) -> dict[str
         evaluator = evaluators_of("clean")["detection"]
         for pair in range(10):
             truth = boxes_at((10.0, 0.0), frame="lidar").boxes
-            both = boxes_at((10.0, 5.0 * (not (pair + seed) % 4)), (30.0, 20.0), frame="lidar").boxes
+            both = boxes_at(
+                (10.0, 5.0 * (not (pair + seed) % 4)), (30.0, 20.0), frame="lidar"
+            ).boxes
             found = DetectedBoxes(boxes=both, scores=np.array([true_score, false_score]))
             evaluator.update(token.format(pair), found, truth)
         made[str(seed)] = {"detection": evaluator}
@@ -93,7 +123,9 @@ def detections_of(*models: tuple[float, float], token: str = SAMPLE) -> dict[str
 
 
 @pytest.mark.parametrize("models", [((0.9, 0.8), (0.3, 0.2)), ((0.9, 0.8), (0.3, 0.4), (0.6, 0.6))])
-def test_a_number_over_seeds_is_the_mean_of_each_seeds_number(models: tuple[tuple[float, float], ...]) -> None:
+def test_a_number_over_seeds_is_the_mean_of_each_seeds_number(
+    models: tuple[tuple[float, float], ...],
+) -> None:
     """The curve over the boxes of both would rank the first model's false boxes above the second one's true boxes."""
     seeds = detections_of(*models)
     tokens = seeds["1"]["detection"].tokens
@@ -110,22 +142,35 @@ def test_a_number_that_a_seed_lacks_has_no_mean() -> None:
     for token in tokens:
         seeds["2"][HIDDEN]._counts[token] = {**seeds["2"][HIDDEN].counts[token], "hidden": 0}
     found = numbers_of_rows(tokens, seeds)["hidden_foreground"]
-    assert (found["value"], found["low"], found["seeds"]) == (None, None, {"1": pytest.approx(0.65), "2": None})
+    assert (found["value"], found["low"], found["seeds"]) == (
+        None,
+        None,
+        {"1": pytest.approx(0.65), "2": None},
+    )
 
 
 def test_seeds_count_together_and_each_stands_beside(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
-        "deepaccident_devkit.plugins.study.numbers.NUMBERS", {"hidden_foreground": (HIDDEN, "hidden_foreground", "")}
+        "deepaccident_devkit.plugins.study.numbers.NUMBERS",
+        {"hidden_foreground": (HIDDEN, "hidden_foreground", "")},
     )
     many, few = seeds_of(0.6, 0.7, 0.8), seeds_of(0.2, 0.3, 0.4)
     tokens = many["1"][HIDDEN].tokens
     found = numbers_of_rows(tokens, many)["hidden_foreground"]
-    assert found["seeds"] == {"1": pytest.approx(0.65), "2": pytest.approx(0.75), "3": pytest.approx(0.85)}
+    assert found["seeds"] == {
+        "1": pytest.approx(0.65),
+        "2": pytest.approx(0.75),
+        "3": pytest.approx(0.85),
+    }
     assert found["low"] < 0.75 < found["high"]
     baseline = {"": few["1"]}
     against = numbers_of_rows(tokens, many, baseline)["hidden_foreground"]
     assert against["value"] == pytest.approx(0.5)
-    assert against["seeds"] == {"1": pytest.approx(0.4), "2": pytest.approx(0.5), "3": pytest.approx(0.6)}
+    assert against["seeds"] == {
+        "1": pytest.approx(0.4),
+        "2": pytest.approx(0.5),
+        "3": pytest.approx(0.6),
+    }
     assert numbers_of_rows([*tokens][:3], many)["hidden_foreground"]["low"] is None
     assert numbers_of_rows(tokens, baseline)["hidden_foreground"]["seeds"] == {}
 
@@ -140,7 +185,9 @@ def test_seeds_count_together_and_each_stands_beside(monkeypatch: pytest.MonkeyP
         (None, None, "not decided"),
     ],
 )
-def test_the_verdict_follows_from_the_interval(low: float | None, high: float | None, told: str) -> None:
+def test_the_verdict_follows_from_the_interval(
+    low: float | None, high: float | None, told: str
+) -> None:
     assert verdict({"low": low, "high": high}) == told
 
 
@@ -150,9 +197,13 @@ def test_labels_as_predictions_know_nobody_who_comes_into_sight_later(da: DeepAc
     row = StudyRow(name="labels", trivial="labels", agents="single")
     for token, (motion, _, _) in predictions_of(row, None, "cpu", da, tokens, LABELS):
         told = motion_labels(da, token, labels).to_present()
-        seen = {int(each.rsplit("/", 1)[1]) for each in visible_instances(da, token, agents="single")} | {OWN_BOX_ID}
+        seen = {
+            int(each.rsplit("/", 1)[1]) for each in visible_instances(da, token, agents="single")
+        } | {OWN_BOX_ID}
         drawn = {actor for actor, number in told.id_map.items() if (told.instance == number).any()}
-        assert {told.id_map[actor] for actor in drawn & seen} == set(np.unique(motion.instances).tolist()) - {0}
+        assert {told.id_map[actor] for actor in drawn & seen} == set(
+            np.unique(motion.instances).tolist()
+        ) - {0}
         later += len(drawn - seen)
     assert later > 0
 
@@ -167,7 +218,9 @@ def test_strangers_are_of_another_pair() -> None:
     others = strangers_of(own)
     assert [each.split("/")[1] for each in others] == ["Town03_b"] * 4 + ["Town03_a"] * 4
     assert [each.rsplit("/", 1)[1] for each in others] == [each.rsplit("/", 1)[1] for each in own]
-    with pytest.raises(NotAvailableError, match="Town03_a: there is no other pair to take strangers from"):
+    with pytest.raises(
+        NotAvailableError, match="Town03_a: there is no other pair to take strangers from"
+    ):
         strangers_of(own[:4])
 
 
@@ -176,8 +229,18 @@ def test_partners_of_strangers_are_those_of_the_same_name() -> None:
         def clone(self) -> "Numbers":
             return Numbers(self)
 
-    item = {"token": "a", "agents": ("ego", "behind", "pole"), "images": Numbers([0, 1, 2]), "points": [[0], [1], [2]]}
-    other = {"token": "b", "agents": ("ego", "pole"), "images": Numbers([10, 12]), "points": [[10], [12]]}
+    item = {
+        "token": "a",
+        "agents": ("ego", "behind", "pole"),
+        "images": Numbers([0, 1, 2]),
+        "points": [[0], [1], [2]],
+    }
+    other = {
+        "token": "b",
+        "agents": ("ego", "pole"),
+        "images": Numbers([10, 12]),
+        "points": [[10], [12]],
+    }
     found = with_strangers(item, other)
     assert (found["token"], found["agents"]) == ("a", item["agents"])
     assert (found["images"], found["points"]) == ([0, 1, 12], [[0], [1], [12]])

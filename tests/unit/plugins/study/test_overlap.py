@@ -57,7 +57,11 @@ def test_twins_and_the_same_scenarios_of_one_release_are_known(da_b: DeepAcciden
         pair = [each for each in tokens if cluster_of(each) == cluster_of(learned)]
         assert learned in pair
         assert known_scenarios((da_b, [learned]), (da_b, tokens)) == pair
-    assert known_scenarios((da_b, []), (da_b, tokens)) == known_scenarios((da_b, tokens), (da_b, [])) == []
+    assert (
+        known_scenarios((da_b, []), (da_b, tokens))
+        == known_scenarios((da_b, tokens), (da_b, []))
+        == []
+    )
 
 
 @pytest.mark.parametrize(
@@ -72,7 +76,9 @@ def test_twins_and_the_same_scenarios_of_one_release_are_known(da_b: DeepAcciden
         (renamed, without("_accident")),
     ],
 )
-def test_a_copy_is_known_by_its_actors(changes: tuple[Changed, ...], da_b: DeepAccident, own_release: Path) -> None:
+def test_a_copy_is_known_by_its_actors(
+    changes: tuple[Changed, ...], da_b: DeepAccident, own_release: Path
+) -> None:
     """Under other names, with fewer frames, fewer agents, or of one of the twins alone."""
     copy, tokens = opened(own_release, changes), tokens_of(da_b)
     assert tokens_of(copy)
@@ -97,7 +103,9 @@ def scene(name: str, moving: list[int], parked: int, layout: str = "A") -> tuple
         "instance": {"actor_id": ids, "scenario_row": 0 * rows, "first_annotation_row": rows},
         "annotation": {"size": np.outer(ids % 1000, [0.01, 0.02, 0.03])},
     }
-    return SimpleNamespace(layout=layout, dataroot=Path(name), columns=tables.get, getind=lambda *_: 0), [name]
+    return SimpleNamespace(
+        layout=layout, dataroot=Path(name), columns=tables.get, getind=lambda *_: 0
+    ), [name]
 
 
 @pytest.mark.parametrize(
@@ -119,5 +127,9 @@ def test_a_town_has_the_same_parked_vehicles_in_all_scenarios(
 
 def test_instances_of_nuscenes_are_compared_by_their_sizes() -> None:
     """Their numbers are others: 1001 has the size of 1."""
-    assert known_scenarios(scene("a", [1, 2, 3, 4], 0), scene("b", [1001, 1002, 1003, 1004], 0, "nuScenes")) == ["b"]
-    assert known_scenarios(scene("a", [1, 2, 3, 4], 0), scene("b", [1001, 1002, 1003, 1004], 0)) == []
+    assert known_scenarios(
+        scene("a", [1, 2, 3, 4], 0), scene("b", [1001, 1002, 1003, 1004], 0, "nuScenes")
+    ) == ["b"]
+    assert (
+        known_scenarios(scene("a", [1, 2, 3, 4], 0), scene("b", [1001, 1002, 1003, 1004], 0)) == []
+    )

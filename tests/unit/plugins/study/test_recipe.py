@@ -33,54 +33,144 @@ def written(folder: Path, recipe: dict[str, Any]) -> str:
         ({"titel": "A study"}, "unknown field `titel`"),
         ({"title": 3}, r"expected `str`, got `int` - at `\$.title`"),
         ({"rows": None}, r"expected `array`, got `null` - at `\$.rows`"),
-        ({"rows": [{"name": "one"}]}, "expected one of weights, baseline and trivial, or .*, found none"),
         (
-            {"rows": [{"name": "one", "weights": "w", "baseline": "standing"}], "weights": {"w": {"file": "tiny"}}},
+            {"rows": [{"name": "one"}]},
+            "expected one of weights, baseline and trivial, or .*, found none",
+        ),
+        (
+            {
+                "rows": [{"name": "one", "weights": "w", "baseline": "standing"}],
+                "weights": {"w": {"file": "tiny"}},
+            },
             "or weights and the baseline constant_velocity, found weights and baseline",
         ),
         (
             {"rows": [{"name": "one", "baseline": "flying"}]},
             r"invalid enum value 'flying' - at `\$.rows\[0\].baseline`",
         ),
-        ({"rows": [{"name": "one", "weights": "trunk"}]}, "rows: one: weights: expected one of .*found 'trunk'"),
-        ({"rows": [{"name": "one", "trivial": "nothing"}] * 2}, "rows: one: name: is there twice; name the keys"),
-        ({"rows": [{"name": "one", "baseline": "standing", "control": "blank"}]}, "control: spoils what a model sees"),
-        ({"rows": [{"name": "one", "baseline": "standing", "agents": "+front"}]}, "agents: expected one of .*'.front'"),
-        ({"rows": [{"name": "one", "baseline": "standing", "latency": 0.15}]}, "rows: one: latency: .*0.15"),
-        ({"rows": [{"name": "one", "baseline": "standing", "horizon": 0.7}]}, "rows: one: .*0.7.*0.5"),
-        ({"rows": [{"name": "a{latency}", "trivial": "nothing", "latencies": [1]}]}, "unknown field `latencies`"),
-        ({**MODEL, "rows": [{"name": "one", "weights": "trunk", "horizon": 3.0}]}, "horizon: is what the weights were"),
-        ({**MODEL, "weights": {"trunk": {"release": "tset"}}}, "weights.trunk: release: .*did you mean 'test'"),
-        ({**MODEL, "weights": {"trunk": {"release": "test", "from": "trunk"}}}, "from, which stands above: expected"),
+        (
+            {"rows": [{"name": "one", "weights": "trunk"}]},
+            "rows: one: weights: expected one of .*found 'trunk'",
+        ),
+        (
+            {"rows": [{"name": "one", "trivial": "nothing"}] * 2},
+            "rows: one: name: is there twice; name the keys",
+        ),
+        (
+            {"rows": [{"name": "one", "baseline": "standing", "control": "blank"}]},
+            "control: spoils what a model sees",
+        ),
+        (
+            {"rows": [{"name": "one", "baseline": "standing", "agents": "+front"}]},
+            "agents: expected one of .*'.front'",
+        ),
+        (
+            {"rows": [{"name": "one", "baseline": "standing", "latency": 0.15}]},
+            "rows: one: latency: .*0.15",
+        ),
+        (
+            {"rows": [{"name": "one", "baseline": "standing", "horizon": 0.7}]},
+            "rows: one: .*0.7.*0.5",
+        ),
+        (
+            {"rows": [{"name": "a{latency}", "trivial": "nothing", "latencies": [1]}]},
+            "unknown field `latencies`",
+        ),
+        (
+            {**MODEL, "rows": [{"name": "one", "weights": "trunk", "horizon": 3.0}]},
+            "horizon: is what the weights were",
+        ),
+        (
+            {**MODEL, "weights": {"trunk": {"release": "tset"}}},
+            "weights.trunk: release: .*did you mean 'test'",
+        ),
+        (
+            {**MODEL, "weights": {"trunk": {"release": "test", "from": "trunk"}}},
+            "from, which stands above: expected",
+        ),
         (
             {**MODEL, "weights": {"trunk": {"file": "tiny", "steps": 3}}},
             "file: these weights are there; leave the other",
         ),
-        ({"releases": {"test": {"sede": 3}}}, "releases.test: key: expected one of .*did you mean 'seed'"),
-        ({"releases": {"test": {"frames": 0}}}, "releases.test: .*frames: 0 is not possible; choose a number from 1"),
-        ({"test": {"release": "training"}}, "test: release: expected .*'training'"),
-        ({"test": {"release": "test", "where": ["town"]}}, r"test.where, groups: expected field=value"),
-        ({"test": {"release": "test", "labels": "cleam"}}, "test: .*did you mean 'clean'"),
-        ({"test": {"release": "TEST"}}, "test: release: found 'TEST'; write it with the same capital letters"),
-        ({"headline": {"row": "one", "less": "two", "number": "APA"}}, "headline: number: found 'APA'"),
-        ({"rows": []}, "rows: expected 1 to 1,000, found 0"),
-        ({"rows": [{"name": "one", "trivial": "nothing", "agents": []}]}, "rows: expected 1 to 1,000, found 0"),
-        ({"rows": [{"name": "one", "baseline": "standing", "horizon": 1e9}]}, "rows: one: horizon: 1000000000.0 s"),
-        ({"test": {"release": "test", "horizon": 1e12}}, "test: horizon: 1000000000000.0 s .* up to 100"),
-        ({"releases": {"test": {"spec": 3}}}, r"expected `str`, got `int` - at `\$.releases\[...\].spec`"),
-        ({"releases": {"test": {"seed": 3, "nuscenes": "yes"}}}, "nuscenes: expected True or False"),
-        ({"releases": {"test": {"dataroot": [1]}}}, r"expected `str`, got `array` - at `\$.releases\[...\].dataroot`"),
-        *(
-            ({**MODEL, "weights": {"trunk": {"release": "test", key: value}}}, f"weights.trunk: .*{key}")
-            for key, value in {"mix": "abc", "also": 3, "also_split": [1], "split": None, "from": ["a"]}.items()
+        (
+            {"releases": {"test": {"sede": 3}}},
+            "releases.test: key: expected one of .*did you mean 'seed'",
         ),
-        ({**MODEL, "weights": {"trunk": {"release": "test", "mix": 1.5}}}, "mix: expected a share .*found 1.5"),
+        (
+            {"releases": {"test": {"frames": 0}}},
+            "releases.test: .*frames: 0 is not possible; choose a number from 1",
+        ),
+        ({"test": {"release": "training"}}, "test: release: expected .*'training'"),
+        (
+            {"test": {"release": "test", "where": ["town"]}},
+            r"test.where, groups: expected field=value",
+        ),
+        ({"test": {"release": "test", "labels": "cleam"}}, "test: .*did you mean 'clean'"),
+        (
+            {"test": {"release": "TEST"}},
+            "test: release: found 'TEST'; write it with the same capital letters",
+        ),
+        (
+            {"headline": {"row": "one", "less": "two", "number": "APA"}},
+            "headline: number: found 'APA'",
+        ),
+        ({"rows": []}, "rows: expected 1 to 1,000, found 0"),
+        (
+            {"rows": [{"name": "one", "trivial": "nothing", "agents": []}]},
+            "rows: expected 1 to 1,000, found 0",
+        ),
+        (
+            {"rows": [{"name": "one", "baseline": "standing", "horizon": 1e9}]},
+            "rows: one: horizon: 1000000000.0 s",
+        ),
+        (
+            {"test": {"release": "test", "horizon": 1e12}},
+            "test: horizon: 1000000000000.0 s .* up to 100",
+        ),
+        (
+            {"releases": {"test": {"spec": 3}}},
+            r"expected `str`, got `int` - at `\$.releases\[...\].spec`",
+        ),
+        (
+            {"releases": {"test": {"seed": 3, "nuscenes": "yes"}}},
+            "nuscenes: expected True or False",
+        ),
+        (
+            {"releases": {"test": {"dataroot": [1]}}},
+            r"expected `str`, got `array` - at `\$.releases\[...\].dataroot`",
+        ),
+        *(
+            (
+                {**MODEL, "weights": {"trunk": {"release": "test", key: value}}},
+                f"weights.trunk: .*{key}",
+            )
+            for key, value in {
+                "mix": "abc",
+                "also": 3,
+                "also_split": [1],
+                "split": None,
+                "from": ["a"],
+            }.items()
+        ),
+        (
+            {**MODEL, "weights": {"trunk": {"release": "test", "mix": 1.5}}},
+            "mix: expected a share .*found 1.5",
+        ),
         ({"seeds": [-1]}, r"expected `int` >= 0 - at `\$.seeds\[0\]`"),
         ({"seeds": list(range(101))}, r"length <= 100 - at `\$.seeds`"),
         ({"by": ["town_hall"]}, "by: by: expected one of .*'town_hall'"),
-        ({"compare": [["one", "three"]]}, "compare, headline: row: expected one of one, two, found 'three'"),
-        ({"headline": {"row": "one", "less": "two", "number": "apaa"}}, "headline: number: .*did you mean 'apa'"),
-        ({"headline": {"row": "one", "less": "two", "where": "hidden"}}, "headline: where: .*'hidden'"),
+        (
+            {"compare": [["one", "three"]]},
+            "compare, headline: row: expected one of one, two, found 'three'",
+        ),
+        (
+            {"headline": {"row": "one", "less": "two", "number": "apaa"}},
+            "headline: number: .*did you mean 'apa'",
+        ),
+        (
+            {"headline": {"row": "one", "less": "two", "where": "hidden"}},
+            "headline: where: .*'hidden'",
+        ),
     ],
 )
 def test_a_fault_is_named_with_its_file_its_key_and_a_remedy(
@@ -95,19 +185,37 @@ def test_a_fault_is_named_with_its_file_its_key_and_a_remedy(
 @pytest.mark.parametrize("rows", [5, [5], {"a": 1}, None])
 def test_rows_of_the_smoke_part_are_rows(rows: Any, tmp_path: Path) -> None:
     path = written(tmp_path, {**PLAIN, "smoke": {"rows": rows}})
-    with pytest.raises(ConfigError, match=r"mine.yaml: the recipe: expected .* got .* - at `\$.rows"):
+    with pytest.raises(
+        ConfigError, match=r"mine.yaml: the recipe: expected .* got .* - at `\$.rows"
+    ):
         read_recipe(path, smoke=True)
 
 
 def test_lists_in_many_keys_are_counted_before_they_are_multiplied_out(tmp_path: Path) -> None:
-    numbers = {key: [float(each) for each in range(100)] for key in ("horizon", "latency", "pose_noise", "packet_loss")}
-    row = {"name": "a", "baseline": "standing", **numbers, "agents": ["all"] * 100, "budget": list(range(1, 101))}
-    with pytest.raises(ConfigError, match=r"rows: expected 1 to 1,000, found 1,000,000,000,000: a list makes a row"):
+    numbers = {
+        key: [float(each) for each in range(100)]
+        for key in ("horizon", "latency", "pose_noise", "packet_loss")
+    }
+    row = {
+        "name": "a",
+        "baseline": "standing",
+        **numbers,
+        "agents": ["all"] * 100,
+        "budget": list(range(1, 101)),
+    }
+    with pytest.raises(
+        ConfigError, match=r"rows: expected 1 to 1,000, found 1,000,000,000,000: a list makes a row"
+    ):
         read_recipe(written(tmp_path, {**PLAIN, "rows": [row]}))
-    many = [{"name": f"{{agents}} {each}", "trivial": "nothing", "agents": ["all", "single"]} for each in range(500)]
+    many = [
+        {"name": f"{{agents}} {each}", "trivial": "nothing", "agents": ["all", "single"]}
+        for each in range(500)
+    ]
     assert len(read_recipe(written(tmp_path, {**PLAIN, "rows": many})).rows) == MOST_ROWS
     with pytest.raises(ConfigError, match="found 1,001"):
-        read_recipe(written(tmp_path, {**PLAIN, "rows": [*many, {"name": "one", "trivial": "nothing"}]}))
+        read_recipe(
+            written(tmp_path, {**PLAIN, "rows": [*many, {"name": "one", "trivial": "nothing"}]})
+        )
 
 
 @pytest.mark.parametrize(
@@ -117,7 +225,9 @@ def test_lists_in_many_keys_are_counted_before_they_are_multiplied_out(tmp_path:
         {"weights": {f"w{each}": {"release": "test"} for each in range(40_000)}},
     ],
 )
-def test_a_recipe_of_too_many_characters_is_not_parsed(changes: dict[str, Any], tmp_path: Path) -> None:
+def test_a_recipe_of_too_many_characters_is_not_parsed(
+    changes: dict[str, Any], tmp_path: Path
+) -> None:
     path = written(tmp_path, {**PLAIN, **changes})
     with pytest.raises(
         ConfigError, match=r"has [\d,]+ characters, more than 100,000; split the study|more than"
@@ -146,13 +256,22 @@ def test_files_that_are_no_recipes(content: str | None, told: str, tmp_path: Pat
 def test_an_unknown_recipe_and_a_smoke_part_that_is_not_there_are_refused(tmp_path: Path) -> None:
     assert_refused(
         (lambda: read_recipe("link"), ConfigError, ("'link'", "did you mean 'links'")),
-        (lambda: read_recipe(written(tmp_path, PLAIN), smoke=True), ConfigError, ("smoke", "--smoke")),
+        (
+            lambda: read_recipe(written(tmp_path, PLAIN), smoke=True),
+            ConfigError,
+            ("smoke", "--smoke"),
+        ),
     )
 
 
 def test_a_list_makes_a_row_each(tmp_path: Path) -> None:
     rows = [
-        {"name": "{agents}, {latency} s", "baseline": "standing", "agents": ["single", "all"], "latency": [0.0, 0.5]},
+        {
+            "name": "{agents}, {latency} s",
+            "baseline": "standing",
+            "agents": ["single", "all"],
+            "latency": [0.0, 0.5],
+        },
         {"name": "{agents.__class__} {weights}", "trivial": "nothing", "agents": ["all"]},
     ]
     found = read_recipe(written(tmp_path, {**PLAIN, "rows": rows})).rows
@@ -167,16 +286,27 @@ def test_a_list_makes_a_row_each(tmp_path: Path) -> None:
         for agents in ("single", "all")
         for late in (0.0, 0.5)
     ]
-    assert list(found) == [*expected, StudyRow(name="{agents.__class__} {weights}", trivial="nothing")]
+    assert list(found) == [
+        *expected,
+        StudyRow(name="{agents.__class__} {weights}", trivial="nothing"),
+    ]
     assert (found[0].link, found[1].link and found[1].link.latency_frames) == (None, 5)
-    assert StudyRow(name="a", agents="ego_vehicle,other_vehicle").cooperating == ["ego_vehicle", "other_vehicle"]
+    assert StudyRow(name="a", agents="ego_vehicle,other_vehicle").cooperating == [
+        "ego_vehicle",
+        "other_vehicle",
+    ]
 
 
 def test_the_smoke_part_replaces_what_it_names(tmp_path: Path) -> None:
     small = {"releases": {"test": {"scenarios": 2}}, "rows": PLAIN["rows"][:1], "title": "Small"}
     path = written(tmp_path, {**PLAIN, "smoke": small})
     whole, smoke = read_recipe(path), read_recipe(path, smoke=True)
-    assert (whole.name, smoke.name, whole.title, smoke.title) == ("mine", "mine-smoke", "A study", "Small")
+    assert (whole.name, smoke.name, whole.title, smoke.title) == (
+        "mine",
+        "mine-smoke",
+        "A study",
+        "Small",
+    )
     assert (len(whole.rows), len(smoke.rows)) == (2, 1)
     assert (whole.releases["test"], smoke.releases["test"]) == (
         {"seed": 3, "scenarios": 4},
@@ -195,5 +325,7 @@ def test_the_recipes_that_ship_share_releases_and_the_trunk() -> None:
 
 
 def test_a_scenario_file_lies_beside_the_recipe(tmp_path: Path) -> None:
-    recipe = written(tmp_path, {**PLAIN, "releases": {"test": {"seed": 3, "spec": "scenes/mine.yaml"}}})
+    recipe = written(
+        tmp_path, {**PLAIN, "releases": {"test": {"seed": 3, "spec": "scenes/mine.yaml"}}}
+    )
     assert read_recipe(recipe).releases["test"]["spec"] == str(tmp_path / "scenes" / "mine.yaml")

@@ -14,7 +14,13 @@ from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ConfigError, ResultsError, SomeFailedError
 from deepaccident_devkit.evaluation.runs import SampleSelection, evaluate_results
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
-from deepaccident_devkit.plugins.study import StudyReport, read_counts, read_recipe, run_study, summarised
+from deepaccident_devkit.plugins.study import (
+    StudyReport,
+    read_counts,
+    read_recipe,
+    run_study,
+    summarised,
+)
 from deepaccident_devkit.plugins.study.summary import ALL
 from deepaccident_devkit.render import style
 
@@ -36,7 +42,9 @@ def run(out: Path, tmp_path: Path) -> Run:
     """Runs the small study, with changes, in the same folder."""
 
     def of(name: str = "other", **changes: Any) -> StudyReport:
-        return run_study(read_recipe(str(written(tmp_path, {**BASELINES, **changes}, name))), out, workers=1)
+        return run_study(
+            read_recipe(str(written(tmp_path, {**BASELINES, **changes}, name))), out, workers=1
+        )
 
     return of
 
@@ -48,21 +56,38 @@ def summary_of(out: Path, name: str = "mine") -> dict[str, Any]:
 
 def kept(out: Path) -> dict[str, int]:
     """The cells that were made, and when."""
-    return {path.name: path.stat().st_mtime_ns for path in (out / "cells" / "kept" / "row").iterdir()}
+    return {
+        path.name: path.stat().st_mtime_ns for path in (out / "cells" / "kept" / "row").iterdir()
+    }
 
 
 def test_the_numbers_are_those_of_their_rows(out: Path) -> None:
     found = {name: row["groups"][ALL] for name, row in summary_of(out)["rows"].items()}
-    assert found["labels, all"]["iou_100"]["value"] == found["labels, all"]["vpq_100"]["value"] == 100
-    assert found["labels, all"]["hidden_foreground"]["value"] == found["sees all"]["hidden_detected"]["value"] == 1
     assert (
-        found["labels, single"]["hidden_foreground"]["value"] == found["sees single"]["hidden_detected"]["value"] == 0
+        found["labels, all"]["iou_100"]["value"] == found["labels, all"]["vpq_100"]["value"] == 100
+    )
+    assert (
+        found["labels, all"]["hidden_foreground"]["value"]
+        == found["sees all"]["hidden_detected"]["value"]
+        == 1
+    )
+    assert (
+        found["labels, single"]["hidden_foreground"]["value"]
+        == found["sees single"]["hidden_detected"]["value"]
+        == 0
     )
     assert found["nothing"]["iou_100"]["value"] == found["nothing"]["seen_foreground"]["value"] == 0
-    assert found["everything"]["hidden_foreground"]["value"] == 1 > found["everything"]["iou_100"]["value"] / 100 > 0
+    assert (
+        found["everything"]["hidden_foreground"]["value"]
+        == 1
+        > found["everything"]["iou_100"]["value"] / 100
+        > 0
+    )
     assert found["late 0.5 s"]["iou_100"]["value"] < found["late 0.0 s"]["iou_100"]["value"]
     assert found["sees single"]["iou_100"]["value"] < found["sees all"]["iou_100"]["value"] < 100
-    assert all(each["low"] is None and each["seeds"] == {} for each in found["nothing"].values())  # of two pairs
+    assert all(
+        each["low"] is None and each["seeds"] == {} for each in found["nothing"].values()
+    )  # of two pairs
 
 
 def test_groups_are_of_pairs_and_of_samples(out: Path) -> None:
@@ -89,7 +114,10 @@ def test_a_row_has_the_numbers_that_evaluate_gives(out: Path) -> None:
 def test_the_headline_and_the_differences(out: Path) -> None:
     summary = summary_of(out)
     rows, headline = summary["rows"], summary["headline"]
-    more, less = (rows[name]["groups"]["accidents"]["iou_100"]["value"] for name in ("sees all", "sees single"))
+    more, less = (
+        rows[name]["groups"]["accidents"]["iou_100"]["value"]
+        for name in ("sees all", "sees single")
+    )
     assert (headline["value"], headline["verdict"]) == (pytest.approx(more - less), "not decided")
     assert [(each["row"], each["less"]) for each in summary["comparisons"]] == [
         ("sees all", "sees single"),
@@ -118,7 +146,10 @@ def test_tables_and_page(out: Path) -> None:
     assert "A small <study>" in page.text  # escaped: it is no tag
     assert summary["headline"]["text"].replace("`", "") in page.text
     assert {name for name in summary["rows"] if name not in page.text} == set()
-    assert sorted(path.name for path in (out / "mine" / "figures").iterdir()) == ["over_latency.png", "rows.png"]
+    assert sorted(path.name for path in (out / "mine" / "figures").iterdir()) == [
+        "over_latency.png",
+        "rows.png",
+    ]
 
 
 def test_rows_that_are_there_are_not_made_again(out: Path, run: Run) -> None:
@@ -146,7 +177,9 @@ def test_the_same_bits_twice_and_after_a_kill(out: Path, tmp_path: Path) -> None
     path = written(tmp_path, BASELINES)
     killed(path, tmp_path / "out", "deepaccident_devkit.plugins.study.cells", "predictions_of", 2)
     assert len(kept(tmp_path / "out")) == 2
-    killed(path, tmp_path / "out", "deepaccident_devkit.plugins.study.predict", "predict_detections", 5)  # amid a row
+    killed(
+        path, tmp_path / "out", "deepaccident_devkit.plugins.study.predict", "predict_detections", 5
+    )  # amid a row
     before = kept(tmp_path / "out")
     run_study(read_recipe(str(path)), tmp_path / "out", workers=2)
     after = kept(tmp_path / "out")
@@ -159,15 +192,25 @@ def test_a_release_that_is_there(out: Path, tmp_path: Path) -> None:
     (made,) = {each["key"] for each in summary_of(out)["cells"] if each["kind"] == "release"}
     given = {**BASELINES, "releases": {"test": {"dataroot": str(out / "release" / made)}}}
     run_study(read_recipe(str(written(tmp_path, given))), tmp_path / "out", workers=1)
-    assert (tmp_path / "out" / "mine" / "counts.json.gz").read_bytes() == (out / "mine" / "counts.json.gz").read_bytes()
+    assert (tmp_path / "out" / "mine" / "counts.json.gz").read_bytes() == (
+        out / "mine" / "counts.json.gz"
+    ).read_bytes()
 
 
 def test_what_cannot_be_run_says_where(run: Run) -> None:
-    with pytest.raises(SomeFailedError, match=r"row/.*: late: latency: 1\.5 s reaches back before the first frame"):
-        run(rows=[{"name": "late", "baseline": "standing", "latency": 1.5}], compare=[], headline=None)
+    with pytest.raises(
+        SomeFailedError, match=r"row/.*: late: latency: 1\.5 s reaches back before the first frame"
+    ):
+        run(
+            rows=[{"name": "late", "baseline": "standing", "latency": 1.5}],
+            compare=[],
+            headline=None,
+        )
     with pytest.raises(ConfigError, match=r"other: groups\.mine: .*town_hall"):
         run(groups={"mine": ["town_hall=big"]}, headline=None)
-    with pytest.raises(ConfigError, match="other: test: where: no pair of scenarios matches; change the filters"):
+    with pytest.raises(
+        ConfigError, match="other: test: where: no pair of scenarios matches; change the filters"
+    ):
         run(test={"release": "test", "where": ["length>=900"]})
 
 

@@ -70,7 +70,9 @@ def elsewhere() -> dict[str, str]:
     }
 
 
-def made(root: Path, sensors: str, numbers: list[int], environment: dict[str, str]) -> dict[str, object]:
+def made(
+    root: Path, sensors: str, numbers: list[int], environment: dict[str, str]
+) -> dict[str, object]:
     words = [sys.executable, "-W", "ignore", "-c", MAKE, str(root), sensors, *map(str, numbers)]
     run = subprocess.run(words, env=environment, check=True, capture_output=True, text=True)
     found: dict[str, object] = json.loads(run.stdout)
@@ -84,7 +86,12 @@ def test_what_is_published_is_what_is_planned() -> None:
     assert Counter(plan.accident for plan in plans) == {True: 120, False: 120}
     assert {plan.design for plan in plans} == set(range(1, 13))
     numbers = {kind: {len(scenario[kind]) for scenario in told.values()} for kind in TOLERANCES}
-    assert numbers == {"num_lidar_pts": {1}, "images": {5 * 6 * 8}, "clouds": {5 * 8}, "BEV pictures": {5 * 8}}
+    assert numbers == {
+        "num_lidar_pts": {1},
+        "images": {5 * 6 * 8},
+        "clouds": {5 * 8},
+        "BEV pictures": {5 * 8},
+    }
     with pytest.raises(ChoiceError, match="benchmark: expected one of v1, found 'v2'"):
         published("v2")
 
@@ -94,7 +101,10 @@ def test_the_page_has_what_is_kept_of_the_rows(monkeypatch: pytest.MonkeyPatch) 
     rows = importlib.import_module("benchmarks.pages.benchmark")
     page = (TOP / "docs" / "benchmark.md").read_text(encoding="utf-8")
     for name in rows.ROWS:
-        assert f"| `{name}` | {' | '.join(rows.text(name, column) for column in rows.NUMBERS)} |" in page
+        assert (
+            f"| `{name}` | {' | '.join(rows.text(name, column) for column in rows.NUMBERS)} |"
+            in page
+        )
         for task in rows.TASKS:
             bundle = read_bundle(rows.KEPT / name / task)
             assert checksums_of(bundle.folder) == bundle.checksums()
@@ -110,7 +120,10 @@ def test_its_seed_is_of_no_release_that_anything_shipped_was_tuned_with() -> Non
     configs = [synth_config_of(source) for recipe in recipes for source in recipe.releases.values()]
     seeds = {config.seed for config in configs if config is not None}
     assert len(seeds) > 5
-    assert BENCHMARKS["v1"].seed not in seeds | {12, 208}  # of the baselines' page, and of the shipped weights' scores
+    assert BENCHMARKS["v1"].seed not in seeds | {
+        12,
+        208,
+    }  # of the baselines' page, and of the shipped weights' scores
 
 
 @pytest.mark.slow
@@ -121,7 +134,10 @@ def test_it_is_made_elsewhere_too(tmp_path: Path, sensors: str, numbers: list[in
     found = made(tmp_path / "there", sensors, numbers, elsewhere())
     wanted = {token: told["scenarios"][token] for token in found}
     assert len(found) == len(numbers)
-    assert differences({"splits": None, "scenarios": found}, {"splits": None, "scenarios": wanted}) == []
+    assert (
+        differences({"splits": None, "scenarios": found}, {"splits": None, "scenarios": wanted})
+        == []
+    )
 
 
 def edited(path: Path, change: Callable[[np.ndarray], np.ndarray]) -> None:
@@ -171,7 +187,11 @@ def wanted(release_root: Path) -> dict[str, object]:
         ("*/*/Camera_Back/*/*_003.jpg", lambda paths: [path.unlink() for path in paths], "images"),
         (IMAGES, each_edited(lambda pixels: cv2.flip(pixels, 1)), "images"),
         (IMAGES, each_edited(lambda pixels: cv2.add(pixels, 8.0)), "images"),
-        (IMAGES, each_edited(lambda pixels: np.full_like(pixels, pixels.mean(axis=(0, 1)))), "images"),
+        (
+            IMAGES,
+            each_edited(lambda pixels: np.full_like(pixels, pixels.mean(axis=(0, 1)))),
+            "images",
+        ),
         (IMAGES, one_frame_late, "images"),
         ("*/ego_vehicle/BEV_instance_camera/*/*.npz", one_frame_late, "BEV pictures"),
         (CLOUDS, each_edited(lambda points: np.add(points, (0, 0, 0.2))), "clouds"),
@@ -182,7 +202,12 @@ def wanted(release_root: Path) -> dict[str, object]:
     ],
 )
 def test_what_differs_is_told(
-    release_root: Path, wanted: dict[str, object], tmp_path: Path, files: str, change: Callable[..., object], told: str
+    release_root: Path,
+    wanted: dict[str, object],
+    tmp_path: Path,
+    files: str,
+    change: Callable[..., object],
+    told: str,
 ) -> None:
     root = tmp_path / "copy"
     shutil.copytree(release_root, root, ignore=shutil.ignore_patterns(".deepaccident"))
@@ -194,7 +219,15 @@ def test_what_differs_is_told(
 
 def test_scenarios_that_are_missing_or_new_are_told_and_missing_sensors_are_not() -> None:
     points = {"num_lidar_pts": {"all agents": (0,) * 8}}
-    nothing = {"boxes": "1", "meta": "2", "calib": "3", **points, "images": {}, "clouds": {}, "BEV pictures": {}}
+    nothing = {
+        "boxes": "1",
+        "meta": "2",
+        "calib": "3",
+        **points,
+        "images": {},
+        "clouds": {},
+        "BEV pictures": {},
+    }
     seen = {**nothing, "images": {"front": (1,) * 8}, "clouds": {"lidar": (2,) * 8}}
     wanted = {"splits": "4", "scenarios": {"a": seen, "b": seen}}
     found = {"splits": "4", "scenarios": {"a": nothing, "c": nothing}}

@@ -13,13 +13,19 @@ sizes = st.tuples(st.floats(0.3, 6), st.floats(0.3, 6)).map(np.array)
 
 def _polygon(pose, size):
     length, width = size / 2
-    turned = affinity.rotate(box(-length, -width, length, width), pose[2], origin=(0, 0), use_radians=True)
+    turned = affinity.rotate(
+        box(-length, -width, length, width), pose[2], origin=(0, 0), use_radians=True
+    )
     return affinity.translate(turned, *pose[:2])
 
 
 @given(poses, sizes, poses, sizes)
 def test_gap_and_overlap_equal_shapely(pose_a, size_a, pose_b, size_b):
-    a, b, apart = _polygon(pose_a, size_a), _polygon(pose_b, size_b), separation(pose_a, size_a, pose_b, size_b)
+    a, b, apart = (
+        _polygon(pose_a, size_a),
+        _polygon(pose_b, size_b),
+        separation(pose_a, size_a, pose_b, size_b),
+    )
     assert gap(pose_a, size_a, pose_b, size_b) == pytest.approx(a.distance(b), abs=1e-7)
     assert (a.intersection(b).area > 1e-9) == (apart < 0) or abs(apart) < 1e-6
 

@@ -22,7 +22,10 @@ RELEASED = ("for_released_code: the released code needs ", "leave one of")
         ({"image_size": (16, 8)}, ("height: 8",)),
         ({"image_size": (16,)}, ("expected (width, height)",)),
         ({"layout": "C"}, ("layout: expected one of A, B, found 'C'",)),
-        ({"sensors": "lidar"}, ("sensors: expected one of all, accidents, cameras, clouds, none, found 'lidar'",)),
+        (
+            {"sensors": "lidar"},
+            ("sensors: expected one of all, accidents, cameras, clouds, none, found 'lidar'",),
+        ),
         ({"view": "close"}, ("view: expected one of open, hidden, or None, found 'close'",)),
         ({"designs": (1, 13)}, ("designs: 13 is not possible", "from 1 to 12")),
         ({"unplanned": 1.5}, ("unplanned: 1.5 is not a share", "from 0 to 1")),
@@ -32,7 +35,10 @@ RELEASED = ("for_released_code: the released code needs ", "leave one of")
             ("image_size, ", "(1600, 900), found (480,", *RELEASED),
         ),
         ({"for_released_code": True, "layout": "B"}, ("layout, ", "A, found B", *RELEASED)),
-        ({"for_released_code": True, "unlabelled_test": True}, ("unlabelled_test, ", "False, found True", *RELEASED)),
+        (
+            {"for_released_code": True, "unlabelled_test": True},
+            ("unlabelled_test, ", "False, found True", *RELEASED),
+        ),
     ],
 )
 def test_what_cannot_be_made_is_refused(fields, names):
@@ -40,7 +46,8 @@ def test_what_cannot_be_made_is_refused(fields, names):
 
 
 @pytest.mark.parametrize(
-    "fields", [{"scenarios": 1, "frames": 1, "image_size": (16, 9)}, {"frames": 999}, {"frames": None}]
+    "fields",
+    [{"scenarios": 1, "frames": 1, "image_size": (16, 9)}, {"frames": 999}, {"frames": None}],
 )
 def test_smallest_and_largest_are_accepted(fields):
     assert SynthConfig(**fields).frames == fields["frames"]
@@ -48,7 +55,13 @@ def test_smallest_and_largest_are_accepted(fields):
 
 def test_sensors_may_be_said_by_yes_and_no():
     given = (True, "all", False, "None", "cameras")
-    assert [SynthConfig(sensors=one).sensors for one in given] == ["all", "all", "none", "none", "cameras"]
+    assert [SynthConfig(sensors=one).sensors for one in given] == [
+        "all",
+        "all",
+        "none",
+        "none",
+        "cameras",
+    ]
     assert SynthConfig(sensors=True) == SynthConfig()
 
 

@@ -12,7 +12,9 @@ from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.plugins.synth import SynthConfig, make_release
 
 PAGE = (Path(__file__).parents[4] / "docs" / "synth.md").read_text(encoding="utf-8")
-EXAMPLES = dict(re.findall(r"^```yaml\n# (\w+)\.yaml.*?\n(.*?)^```", PAGE, re.DOTALL | re.MULTILINE))
+EXAMPLES = dict(
+    re.findall(r"^```yaml\n# (\w+)\.yaml.*?\n(.*?)^```", PAGE, re.DOTALL | re.MULTILINE)
+)
 
 
 @pytest.fixture
@@ -23,7 +25,9 @@ def made(tmp_path):
         path = tmp_path / f"{name}.yaml"
         path.write_text(EXAMPLES[name], encoding="utf-8")
         config = SynthConfig(spec=path, scenarios=2, frames=2, sensors=False)
-        return DeepAccident("v1", make_release(tmp_path / name, config, workers=1), workers=1, verbose=False)
+        return DeepAccident(
+            "v1", make_release(tmp_path / name, config, workers=1), workers=1, verbose=False
+        )
 
     return make
 
@@ -58,13 +62,19 @@ def test_ego_runs_into_the_rear_of_the_one_who_changed_lanes(made):
     collision = da.collision(accident)
     assert (collision.sides, collision.speeds[0] < collision.speeds[1]) == (("rear", "front"), True)
     assert np.rad2deg(collision.impact_angle) < 20
-    ego, behind = (da.get_sample(accident, agent, 2) for agent in ("ego_vehicle", "other_vehicle_behind"))
+    ego, behind = (
+        da.get_sample(accident, agent, 2) for agent in ("ego_vehicle", "other_vehicle_behind")
+    )
     ego_from_behind = da.transform(ego, behind)
     # who is behind it stayed in the right lane
-    assert (ego_from_behind.translation[1], 10 * ego_from_behind.yaw) == pytest.approx((-3.5, 0), abs=0.3)
+    assert (ego_from_behind.translation[1], 10 * ego_from_behind.yaw) == pytest.approx(
+        (-3.5, 0), abs=0.3
+    )
 
 
 @pytest.mark.slow
 def test_nothing_happens_where_nobody_is_to_meet(made):
     da = made("quiet")
-    assert [(each["accident_type"], each["collision"]) for each in da.scenario] == [(None, None)] * 2
+    assert [(each["accident_type"], each["collision"]) for each in da.scenario] == [
+        (None, None)
+    ] * 2

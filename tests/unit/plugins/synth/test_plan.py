@@ -23,9 +23,16 @@ def test_accidents_and_twins_by_turns_go_round_the_designs_all_or_chosen():
     assert [plan.design for plan in plans_of(scenarios=6, designs=(3, 9))[::2]] == [3, 9, 3]
     assert {plan.traits.subtype for plan in plans[:4]} == {1, 2}
     for accident, twin in zip(plans[::2], plans[1::2], strict=True):
-        assert (accident.name, accident.split, accident.traits) == (twin.name, twin.split, twin.traits)
+        assert (accident.name, accident.split, accident.traits) == (
+            twin.name,
+            twin.split,
+            twin.traits,
+        )
         kind = f"type1_subtype{accident.traits.subtype}"
-        assert (accident.scenario_type, twin.scenario_type) == (f"{kind}_accident", f"{kind}_normal")
+        assert (accident.scenario_type, twin.scenario_type) == (
+            f"{kind}_accident",
+            f"{kind}_normal",
+        )
 
 
 def test_names_are_the_release_s_and_unique():
@@ -33,7 +40,9 @@ def test_names_are_the_release_s_and_unique():
     assert (len({plan.token for plan in plans}), len({plan.name for plan in plans})) == (60, 30)
     towns = {plan.name.split("_")[0] for plan in plans}
     assert (towns <= set(TOWNS), len(towns) > 4) == (True, True)
-    assert plans[6].name.endswith(f"_type001_subtype{plans[6].traits.subtype:04d}_scenario{1 + plans[6].pair:05d}")
+    assert plans[6].name.endswith(
+        f"_type001_subtype{plans[6].traits.subtype:04d}_scenario{1 + plans[6].pair:05d}"
+    )
 
 
 def test_seeds_differ_and_repeat_and_more_scenarios_leave_the_first_as_they_are_but_for_splits():
@@ -49,7 +58,10 @@ def test_a_draw_has_the_plan_s_traits(design):
         for seed in range(3):
             spec = plan.draw(np.random.default_rng(seed))
             assert spec.road.signalized == (plan.traits.subtype == 1) == (design < 7)
-            assert (f"{spec.road.kind} junction", spec.spawn_side) == (plan.traits.road_type, plan.traits.spawn_side)
+            assert (f"{spec.road.kind} junction", spec.spawn_side) == (
+                plan.traits.road_type,
+                plan.traits.spawn_side,
+            )
             assert spec.view == "open" or design in (1, 2, 6, 7, 8, 12)
 
 
@@ -70,14 +82,22 @@ def test_the_first_three_pairs_of_a_small_release_fill_the_splits():
 
 def test_a_large_release_is_split_by_the_official_procedure():
     plans = plans_of(scenarios=691)
-    assert Counter(plan.split for plan in plans) == {"train": 483, "val": 104, "test": 104}, "the real release's counts"
+    assert Counter(plan.split for plan in plans) == {"train": 483, "val": 104, "test": 104}, (
+        "the real release's counts"
+    )
     splits = plan_splits(plans)
-    assert set(splits.val_mini) < set(splits.val) == {plan.token for plan in plans if plan.split == "val"}
+    assert (
+        set(splits.val_mini)
+        < set(splits.val)
+        == {plan.token for plan in plans if plan.split == "val"}
+    )
     assert len({(plan.pair, plan.split) for plan in plans}) == len({plan.pair for plan in plans})
 
 
 @pytest.mark.parametrize("scenarios", [*range(1, 13), 30, 49, 240, 691])
-def test_minis_are_whole_pairs_a_fifth_at_most_and_no_split_is_empty_from_six_scenarios_on(scenarios):
+def test_minis_are_whole_pairs_a_fifth_at_most_and_no_split_is_empty_from_six_scenarios_on(
+    scenarios,
+):
     plans = plans_of(scenarios=scenarios)
     assert {plan.split for plan in plans} == {"train", "val", "test"} or scenarios <= 5
     splits, pair_of = plan_splits(plans), {plan.token: plan.pair for plan in plans}
@@ -94,7 +114,9 @@ def test_unplanned_accidents_come_at_their_rate():
         {"unplanned": 0.0, "designed": True},
         {"unplanned": 1.0, "view": "hidden"},
     )
-    shares = [np.mean([plan.unplanned for plan in plans_of(scenarios=800, **each)]) for each in asked]
+    shares = [
+        np.mean([plan.unplanned for plan in plans_of(scenarios=800, **each)]) for each in asked
+    ]
     assert shares == [pytest.approx(0.25, abs=0.05), 0, 0]
 
 
@@ -126,7 +148,9 @@ def own(tmp_path):
 
 
 def test_what_cannot_be_planned_is_refused(own):
-    opposite = OWN.replace("view: hidden\n", "").replace("from: south, turn: [left, right]", "from: east")
+    opposite = OWN.replace("view: hidden\n", "").replace(
+        "from: south, turn: [left, right]", "from: east"
+    )
     assert_refused(
         (
             lambda: plans_of(view="hidden", designs=(3,)),
@@ -148,7 +172,9 @@ def test_what_cannot_be_planned_is_refused(own):
 
 def test_an_own_file_takes_the_designs_place(own):
     plans = plans_of(
-        spec=own(OWN.replace("turn: right}", "turn: straight}", 1) + "meet: {}\n"), scenarios=40, unplanned=1.0
+        spec=own(OWN.replace("turn: right}", "turn: straight}", 1) + "meet: {}\n"),
+        scenarios=40,
+        unplanned=1.0,
     )
     assert {(plan.design, plan.unplanned, plan.traits.subtype) for plan in plans} == {
         (None, False, 1),
@@ -187,4 +213,6 @@ def test_the_lists_are_what_the_official_procedure_makes_of_what_is_built():
     official, made = split_records([record(plan) for plan in plans]), plan_splits(plans)
     assert (made.train, made.val, made.test) == (official.train, official.val, official.test)
     assert set(official.train_mini) >= set(made.train_mini)
-    assert (len(official.val_mini), len(made.val_mini)) == (0, 2), "the procedure leaves a small mini split empty"
+    assert (len(official.val_mini), len(made.val_mini)) == (0, 2), (
+        "the procedure leaves a small mini split empty"
+    )

@@ -14,12 +14,18 @@ pytestmark = pytest.mark.slow
 
 
 def test_ids_of_all_kinds_occur(scenarios):
-    labels = [(agent, read_label(each.label_path(agent, 1))) for each in scenarios for agent in AGENTS]
+    labels = [
+        (agent, read_label(each.label_path(agent, 1))) for each in scenarios for agent in AGENTS
+    ]
     ids = np.concatenate([label.actor_id for _, label in labels])
     distance = np.concatenate([np.hypot(*label.center[:, :2].T) for _, label in labels])
-    assert ({-100, -1} <= {*ids.tolist()}, ids.max() >= 20000, 100 < distance.max() <= 120) == (True,) * 3
+    assert ({-100, -1} <= {*ids.tolist()}, ids.max() >= 20000, 100 < distance.max() <= 120) == (
+        True,
+    ) * 3
     np.testing.assert_array_equal(ids == -1, distance > 115)
-    assert {(agent == "infrastructure", (label.actor_id == -100).sum()) for agent, label in labels} == {
+    assert {
+        (agent == "infrastructure", (label.actor_id == -100).sum()) for agent, label in labels
+    } == {
         (True, 0),
         (False, 1),
     }
@@ -38,7 +44,9 @@ def test_own_box_lies_around_the_ego_origin(scenarios):
 
 
 def test_calib_is_as_in_the_real_release(scenarios):
-    vehicle, pole = (read_calib(scenarios[0].calib_path(agent, 1)) for agent in ("ego_vehicle", "infrastructure"))
+    vehicle, pole = (
+        read_calib(scenarios[0].calib_path(agent, 1)) for agent in ("ego_vehicle", "infrastructure")
+    )
     label = read_label(scenarios[0].label_path("ego_vehicle", 1))
     length, width, tall = label.size[label.actor_id == -100][0]
     np.testing.assert_allclose(vehicle.ego_from_lidar.translation, [0, 0, tall + 0.5], atol=2e-4)
@@ -82,5 +90,11 @@ def test_points_are_a_scan_of_32_channels(scenarios):
     reach = np.linalg.norm(cloud.xyz, axis=1)
     elevation = np.rad2deg(np.arcsin(cloud.xyz[:, 2] / reach))
     assert (reach.max() <= 70.3, 25_000 < len(cloud) <= 32 * 1400) == (True, True)
-    assert (len(np.unique(elevation.round(3))) <= 32, elevation.min()) == (True, pytest.approx(-30, abs=1e-3))
-    assert (0 <= cloud.intensity.min() < cloud.intensity.max() <= 1, cloud.intensity.std() > 0.05) == (True, True)
+    assert (len(np.unique(elevation.round(3))) <= 32, elevation.min()) == (
+        True,
+        pytest.approx(-30, abs=1e-3),
+    )
+    assert (
+        0 <= cloud.intensity.min() < cloud.intensity.max() <= 1,
+        cloud.intensity.std() > 0.05,
+    ) == (True, True)

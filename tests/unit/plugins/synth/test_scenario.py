@@ -34,7 +34,9 @@ def gaps(scenario, first, second, times):
 
 def test_each_design_is_told_by_its_meta(built):
     accidents = [scenario for scenario in built if scenario.plan.accident]
-    types = [accident_type(each.meta, signalized=each.plan.traits.subtype == 1) for each in accidents]
+    types = [
+        accident_type(each.meta, signalized=each.plan.traits.subtype == 1) for each in accidents
+    ]
     assert sorted(types) == list(DESIGN_NUMBERS)
     assert types == [each.plan.design for each in accidents]
 
@@ -54,7 +56,9 @@ def test_the_last_frame_is_the_impact(built):
     for scenario in built:
         if scenario.plan.accident:
             end = (scenario.frames - 1) / 10
-            apart = gaps(scenario, *scenario.meta.collision.ids, [*np.arange(0, end - 0.01, 0.02), end])
+            apart = gaps(
+                scenario, *scenario.meta.collision.ids, [*np.arange(0, end - 0.01, 0.02), end]
+            )
             assert -0.3 < apart[-1] <= 1e-9
             assert (apart[:-1] > 0).all()
 
@@ -70,7 +74,9 @@ def test_ids_are_unique_and_of_their_kind(built):
         ids = scenario.actors.actor_id
         assert len(set(ids.tolist())) == len(set(scenario.actors.object_id.tolist())) == len(ids)
         assert list(scenario.agents) == list(VEHICLE_AGENTS)
-        np.testing.assert_array_equal(np.hypot(*scenario.actors.at(1.0).velocities.T)[ids >= 20000], 0)
+        np.testing.assert_array_equal(
+            np.hypot(*scenario.actors.at(1.0).velocities.T)[ids >= 20000], 0
+        )
         assert ids[ids < 20000].max() < 3000
 
 
@@ -87,7 +93,10 @@ def test_unplanned_accidents_are_with_someone_who_records_nothing():
     for plan in plan_scenarios(config)[::2]:
         meta = build_scenario(config, plan).meta
         assert accident_type(meta, signalized=plan.traits.subtype == 1) is None
-        assert (None in meta.collision.agents, {*meta.collision.ids} <= {*meta.agent_ids}) == (True, False)
+        assert (None in meta.collision.agents, {*meta.collision.ids} <= {*meta.agent_ids}) == (
+            True,
+            False,
+        )
 
 
 LATE = """\
@@ -139,7 +148,11 @@ def test_a_twin_that_cannot_be_made_is_named_by_its_file(build_own, monkeypatch)
     )
     assert_refused(
         (lambda: build_own(alone), ConfigError, (f"{told} although all obey the rules",)),
-        (lambda: build_own(timed, twin=True), ConfigError, (f"{told} in the normal twin too, even if",)),
+        (
+            lambda: build_own(timed, twin=True),
+            ConfigError,
+            (f"{told} in the normal twin too, even if",),
+        ),
     )
 
 
@@ -149,5 +162,7 @@ def test_a_slow_cyclist_is_hit(build_own):
     text = LATE.replace("ego, from: west", "ego, from: south, turn: right").replace(
         "other, from: south", "other, from: east"
     )
-    scenario = build_own(text.replace("meet: {actors: [ego, other], offset: 3", f"{cyclist}, offset: 0.5"))
+    scenario = build_own(
+        text.replace("meet: {actors: [ego, other], offset: 3", f"{cyclist}, offset: 0.5")
+    )
     assert (scenario.draws, scenario.meta.collision.classes) == (1, ("cyclist", "car"))

@@ -11,7 +11,11 @@ ALL = [(category, model) for category, models in MODELS.items() for model in ran
 @pytest.fixture(params=ALL, ids=[f"{category}-{model}" for category, model in ALL])
 def shape(request):
     category, model = request.param
-    return category, model, shape_of(category, MEDIAN_SIZES[category], (200, 30, 30), (30, 60, 200), model)
+    return (
+        category,
+        model,
+        shape_of(category, MEDIAN_SIZES[category], (200, 30, 30), (30, 60, 200), model),
+    )
 
 
 def test_shapes_fill_their_boxes_and_keep_within(shape):
@@ -19,9 +23,14 @@ def test_shapes_fill_their_boxes_and_keep_within(shape):
     category, model, _ = shape
     for factor in (0.95, 1.0, 1.05):
         size = np.array(MEDIAN_SIZES[category]) * factor
-        corners = shape_of(category, tuple(size.tolist()), (0, 0, 0), (0, 0, 0), model).corners.reshape(-1, 3)
+        corners = shape_of(
+            category, tuple(size.tolist()), (0, 0, 0), (0, 0, 0), model
+        ).corners.reshape(-1, 3)
         half = size[:2] / 2 - INSET + 1e-9
-        (x, y), (low, high) = np.abs(corners[:, :2]).max(axis=0), (corners[:, 2].min(), corners[:, 2].max())
+        (x, y), (low, high) = (
+            np.abs(corners[:, :2]).max(axis=0),
+            (corners[:, 2].min(), corners[:, 2].max()),
+        )
         assert (0.35 if category == "pedestrian" else 0.49) * size[0] < x <= half[0]
         assert 0.4 * size[1] < y <= half[1]
         assert BOX_CLEARANCE <= low < 0.05
@@ -31,4 +40,6 @@ def test_shapes_fill_their_boxes_and_keep_within(shape):
 def test_solids_are_convex_and_turned_outwards(shape):
     _, _, solids = shape
     normals, offsets = face_planes(face_corners(solids.corners))
-    assert (np.einsum("fk,fk->f", normals, np.repeat(solids.corners.mean(axis=1), 6, axis=0)) < offsets).all()
+    assert (
+        np.einsum("fk,fk->f", normals, np.repeat(solids.corners.mean(axis=1), 6, axis=0)) < offsets
+    ).all()

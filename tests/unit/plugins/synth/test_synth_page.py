@@ -19,7 +19,9 @@ def script():
 def test_the_tables_are_made_of_what_was_measured(script):
     page = (DOCS / "synth.md").read_text(encoding="utf-8")
     for name, text in script.tables(script.measured()).items():
-        assert f"<!-- {name} -->\n\n{text}\n\n<!-- end of {name} -->" in page, "run: python docs/make_tables.py synth"
+        assert f"<!-- {name} -->\n\n{text}\n\n<!-- end of {name} -->" in page, (
+            "run: python docs/make_tables.py synth"
+        )
 
 
 @pytest.mark.parametrize("number", [0, 4, 19, 34])
@@ -28,12 +30,19 @@ def test_what_was_measured_is_still_so(script, number):
     stored, now = script.measured()["pairs"][number], script.measure(number, views=False)
     message = "the generator has changed; run: python docs/make_tables.py synth"
     exact = ("design", "type", "draws", "frames", "twin_frames", "twin_touches")
-    for key, near in {**dict.fromkeys(exact, 0), "angle": 1.0, "speeds": 0.3, "twin_gap": 0.2}.items():
+    for key, near in {
+        **dict.fromkeys(exact, 0),
+        "angle": 1.0,
+        "speeds": 0.3,
+        "twin_gap": 0.2,
+    }.items():
         assert now[key] == pytest.approx(stored[key], abs=near), message
 
 
 def test_the_page_s_code_runs(tmp_path, monkeypatch, capsys):
-    code, _ = re.findall(r"^```python\n(.*?)^```", (DOCS / "synth.md").read_text("utf-8"), re.DOTALL | re.MULTILINE)
+    code, _ = re.findall(
+        r"^```python\n(.*?)^```", (DOCS / "synth.md").read_text("utf-8"), re.DOTALL | re.MULTILINE
+    )
     monkeypatch.chdir(tmp_path)
     exec(compile(code, "synth.md", "exec"), {})  # noqa: S102
     assert capsys.readouterr().out == "3\n"

@@ -19,7 +19,9 @@ def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.fixture(scope="session")
-def places(release_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, str]]:
+def places(
+    release_root: Path, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[dict[str, str]]:
     """Kind of store → what to give as dataroot."""
     folder, memory = tmp_path_factory.mktemp("stores"), fsspec.filesystem("memory")
     places = {
@@ -29,17 +31,28 @@ def places(release_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Iter
     }
     for path in release_root.rglob("*"):
         if path.is_file() and ".deepaccident" not in path.parts:
-            memory.pipe_file(f"/loose/any/{path.relative_to(release_root).as_posix()}", path.read_bytes())
+            memory.pipe_file(
+                f"/loose/any/{path.relative_to(release_root).as_posix()}", path.read_bytes()
+            )
     for path in Path(places["zips"]).rglob("*.*"):
         if path.is_file():
-            memory.pipe_file(f"/packed/{path.relative_to(places['zips']).as_posix()}", path.read_bytes())
+            memory.pipe_file(
+                f"/packed/{path.relative_to(places['zips']).as_posix()}", path.read_bytes()
+            )
     memory.pipe_file("/one/all.zip", Path(places["zip"]).read_bytes())
-    yield {**places, "memory": "memory://loose", "memory zips": "memory://packed", "memory zip": "memory://one/all.zip"}
+    yield {
+        **places,
+        "memory": "memory://loose",
+        "memory zips": "memory://packed",
+        "memory zip": "memory://one/all.zip",
+    }
     memory.rm("/", recursive=True)
 
 
 @pytest.fixture(scope="session")
-def opened(places: dict[str, str], tmp_path_factory: pytest.TempPathFactory) -> dict[str, DeepAccident]:
+def opened(
+    places: dict[str, str], tmp_path_factory: pytest.TempPathFactory
+) -> dict[str, DeepAccident]:
     """Kind of store → the release, each with an index of its own."""
     folder = tmp_path_factory.mktemp("indexes")
     return {

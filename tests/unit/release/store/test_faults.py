@@ -87,33 +87,55 @@ def test_all_bad_archives_are_named_at_once_with_the_ways_out(zips: Path) -> Non
         *(said for _, said in BAD.values()),
     )
     ways = ("fetch the archive again", "move them out of the folder", "--on-error skip")
-    assert_refused((lambda: DeepAccident(dataroot=zips, verbose=False), DatarootError, (*named, *ways)))
+    assert_refused(
+        (lambda: DeepAccident(dataroot=zips, verbose=False), DatarootError, (*named, *ways))
+    )
 
 
 def test_bad_archives_can_be_left_out(zips: Path, caplog: pytest.LogCaptureFixture) -> None:
     release = DeepAccident(dataroot=zips, on_error="skip", verbose=False)
     assert len(release.scenario) == 2
     assert all(f"more/{name}.zip: " in caplog.text for name in BAD)
-    assert_refused((lambda: DeepAccident(dataroot=zips, verbose=False), DatarootError, "5 of 7 archives"))
+    assert_refused(
+        (lambda: DeepAccident(dataroot=zips, verbose=False), DatarootError, "5 of 7 archives")
+    )
 
 
 def test_validate_lists_bad_archives_and_goes_on(zips: Path) -> None:
     (zips / "half.zip.part").write_bytes(b"PK")
     report = validate_release(zips, workers=1)
-    found = {Path(each.where).name: each for each in report.findings if each.code.startswith("archive-")}
+    found = {
+        Path(each.where).name: each for each in report.findings if each.code.startswith("archive-")
+    }
     assert report.scenarios == 2
     assert found.keys() == {*(f"{name}.zip" for name in BAD), "half.zip.part"}
     for name, (_, said) in BAD.items():
         finding = found[f"{name}.zip"]
-        assert (finding.severity, finding.code, finding.scenario) == ("error", "archive-unreadable", None)
+        assert (finding.severity, finding.code, finding.scenario) == (
+            "error",
+            "archive-unreadable",
+            None,
+        )
         assert said in finding.what
         assert f"{(zips / 'more' / f'{name}.zip').stat().st_size:,} bytes" in finding.what
         assert finding.remedy == "fetch the archive again"
-    assert (found["half.zip.part"].severity, found["half.zip.part"].code) == ("warning", "archive-unfinished")
-    assert len(json.loads(called("validate", zips, "--files", "--json", status=1).stdout)["unreadable_archives"]) == 5
+    assert (found["half.zip.part"].severity, found["half.zip.part"].code) == (
+        "warning",
+        "archive-unfinished",
+    )
+    assert (
+        len(
+            json.loads(called("validate", zips, "--files", "--json", status=1).stdout)[
+                "unreadable_archives"
+            ]
+        )
+        == 5
+    )
 
 
-def test_an_archive_that_cannot_be_opened_is_one_of_them(zips: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_archive_that_cannot_be_opened_is_one_of_them(
+    zips: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def refused(path: Path) -> BinaryIO:
         if path.name == f"{OTHER}.zip":
             raise PermissionError(13, "Permission denied")
@@ -122,7 +144,10 @@ def test_an_archive_that_cannot_be_opened_is_one_of_them(zips: Path, monkeypatch
     monkeypatch.setattr(opening, "open_file", refused)
     report = validate_release(zips, workers=1)
     assert (report.scenarios, len(report.files.unreadable_archives)) == (1, 6)
-    assert any(f"{OTHER}.zip: cannot be read (Permission denied)" in each for each in report.files.unreadable_archives)
+    assert any(
+        f"{OTHER}.zip: cannot be read (Permission denied)" in each
+        for each in report.files.unreadable_archives
+    )
 
 
 @pytest.mark.parametrize("way", ["in place", "in its place"])
@@ -154,7 +179,9 @@ def test_two_archives_with_the_same_member_are_refused(small: Path, tmp_path: Pa
 def test_a_member_that_is_twice_in_an_archive_is_refused(small: Path, tmp_path: Path) -> None:
     with zipfile.ZipFile(small, "a") as archive:
         archive.writestr(_NAME, b"other")
-    assert_refused((lambda: _opened(small, tmp_path), DatarootError, rf"{_NAME}: is twice in small\.zip"))
+    assert_refused(
+        (lambda: _opened(small, tmp_path), DatarootError, rf"{_NAME}: is twice in small\.zip")
+    )
 
 
 @pytest.mark.parametrize(
@@ -170,18 +197,28 @@ def test_members_that_cannot_be_read_in_place_are_refused(
     small: Path, tmp_path: Path, offset: int, form: str, value: int, said: str
 ) -> None:
     _changed(small, b"PK\x01\x02", offset, form, value)
-    assert_refused((lambda: _opened(small, tmp_path), DatarootError, rf"small\.zip: its member {_NAME} {said}"))
-
-
-def test_a_member_whose_head_is_gone_is_refused_when_it_is_read(small: Path, tmp_path: Path) -> None:
-    root = open_dataroot(small, tmp_path / "index", workers=1)
-    small.write_bytes(small.read_bytes().replace(b"PK\x03\x04", b"KP\x03\x04"))
     assert_refused(
-        (lambda: (root / _NAME).content("calib"), OSError, ("damaged in its archive (no head at its place)",))
+        (lambda: _opened(small, tmp_path), DatarootError, rf"small\.zip: its member {_NAME} {said}")
     )
 
 
-def test_validate_compares_checksums_and_reading_does_not(release_root: Path, tmp_path: Path) -> None:
+def test_a_member_whose_head_is_gone_is_refused_when_it_is_read(
+    small: Path, tmp_path: Path
+) -> None:
+    root = open_dataroot(small, tmp_path / "index", workers=1)
+    small.write_bytes(small.read_bytes().replace(b"PK\x03\x04", b"KP\x03\x04"))
+    assert_refused(
+        (
+            lambda: (root / _NAME).content("calib"),
+            OSError,
+            ("damaged in its archive (no head at its place)",),
+        )
+    )
+
+
+def test_validate_compares_checksums_and_reading_does_not(
+    release_root: Path, tmp_path: Path
+) -> None:
     path = packed(release_root, tmp_path / "all.zip")
     dataset = DeepAccident(dataroot=path, workers=1, verbose=False)
     token = f"{dataset.sample[0]['token']}/Camera_Front"
@@ -216,7 +253,13 @@ def test_a_bomb_is_not_unpacked(tmp_path: Path) -> None:
 
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr(_NAME, bytes(5 << 20))
-    assert_refused((lambda: read("one"), OSError, "has 5,242,880 bytes, more than 1,048,576, the limit for calib"))
+    assert_refused(
+        (
+            lambda: read("one"),
+            OSError,
+            "has 5,242,880 bytes, more than 1,048,576, the limit for calib",
+        )
+    )
     _changed(path, b"PK\x01\x02", 24, "<I", 1000)
     assert_refused((lambda: read("other"), OSError, "1,001 bytes in place of 1,000"))
 
@@ -242,23 +285,41 @@ def test_names_that_lead_out_of_an_archive_are_of_no_release(tmp_path: Path) -> 
 
 def test_archives_with_backslashes_in_their_names_are_read(tmp_path: Path) -> None:
     root = tiny.write_tiny_release(tmp_path / "release")
-    path = packed(root, tmp_path / "windows.zip", written=lambda name: f"DeepAccident/{name}".replace("/", "\\"))
+    path = packed(
+        root,
+        tmp_path / "windows.zip",
+        written=lambda name: f"DeepAccident/{name}".replace("/", "\\"),
+    )
     with zipfile.ZipFile(path, "a") as archive:
         archive.writestr("type1_subtype1_accident\\", b"")
         archive.writestr("..\\" + _NAME.replace("/", "\\"), b"x")
     release = DeepAccident(dataroot=path, workers=1, verbose=False)
-    assert len(release.annotation) == len(DeepAccident(dataroot=root, workers=1, verbose=False).annotation)
+    assert len(release.annotation) == len(
+        DeepAccident(dataroot=root, workers=1, verbose=False).annotation
+    )
     assert [each["token"] for each in release.scenario] == [tiny.TOKEN]
 
 
 @pytest.mark.parametrize(
     ("url", "said"),
     [
-        ("memory://nothing/here", r"memory://nothing/here: (does not exist|no file of a release found)"),
-        ("nosuch://bucket", r"nosuch://bucket: cannot be read \(Protocol not known: nosuch\); check the URL"),
+        (
+            "memory://nothing/here",
+            r"memory://nothing/here: (does not exist|no file of a release found)",
+        ),
+        (
+            "nosuch://bucket",
+            r"nosuch://bucket: cannot be read \(Protocol not known: nosuch\); check the URL",
+        ),
         ("s3://name:secret@bucket/x", r"s3://bucket…: holds a name, a password or a signature"),
-        ("https://host/x?signature=secret", r"https://host…: holds a name, a password or a signature"),
-        ("memory://nothing/all.zip", r"memory://nothing/all\.zip: does not exist, or may not be listed"),
+        (
+            "https://host/x?signature=secret",
+            r"https://host…: holds a name, a password or a signature",
+        ),
+        (
+            "memory://nothing/all.zip",
+            r"memory://nothing/all\.zip: does not exist, or may not be listed",
+        ),
     ],
 )
 def test_wrong_urls_are_refused_without_their_secrets(url: str, said: str, tmp_path: Path) -> None:
@@ -270,7 +331,9 @@ def test_wrong_urls_are_refused_without_their_secrets(url: str, said: str, tmp_p
 def test_a_url_of_a_truncated_archive_is_refused(small: Path, tmp_path: Path) -> None:
     memory, url = fsspec.filesystem("memory"), "memory://broken/all.zip"
     memory.pipe_file("/broken/all.zip", small.read_bytes()[:-10])
-    assert_refused((lambda: _opened(url, tmp_path), DatarootError, (f"{url}: not a readable zip archive",)))
+    assert_refused(
+        (lambda: _opened(url, tmp_path), DatarootError, (f"{url}: not a readable zip archive",))
+    )
     memory.pipe_file("/broken/small.zip", small.read_bytes())
     for _ in range(2):
         root = open_dataroot("memory://broken", tmp_path / "index", on_error="skip")
@@ -278,7 +341,9 @@ def test_a_url_of_a_truncated_archive_is_refused(small: Path, tmp_path: Path) ->
     memory.rm("/broken", recursive=True)
 
 
-def test_a_changed_archive_at_a_url_is_noticed_and_loose_files_when_asked(small: Path, tmp_path: Path) -> None:
+def test_a_changed_archive_at_a_url_is_noticed_and_loose_files_when_asked(
+    small: Path, tmp_path: Path
+) -> None:
     memory = fsspec.filesystem("memory")
     memory.pipe_file("/changing/small.zip", small.read_bytes())
     first = open_dataroot("memory://changing", tmp_path / "index")
@@ -290,7 +355,10 @@ def test_a_changed_archive_at_a_url_is_noticed_and_loose_files_when_asked(small:
     memory.pipe_file(f"/loose2/{_NAME}", b"x")
     open_dataroot("memory://loose2", tmp_path / "index2")
     memory.pipe_file(f"/loose2/{_NAME.replace('001', '002')}", b"x")
-    kept, asked = (open_dataroot("memory://loose2", tmp_path / "index2", refresh=each) for each in (False, True))
+    kept, asked = (
+        open_dataroot("memory://loose2", tmp_path / "index2", refresh=each)
+        for each in (False, True)
+    )
     assert [len(root.store.members) for root in (kept, asked)] == [1, 2]  # type: ignore[union-attr]
     assert kept.store.state != asked.store.state  # type: ignore[union-attr]
 
@@ -301,18 +369,28 @@ def test_a_damaged_list_is_made_again(small: Path, tmp_path: Path) -> None:
     content = file.read_bytes()
     file.write_bytes(content[:200])
     opened_store.cache_clear()
-    assert_refused((lambda: Members(file), IndexStoreError, ("cannot be read", "deepaccident index DATAROOT --clear")))
+    assert_refused(
+        (
+            lambda: Members(file),
+            IndexStoreError,
+            ("cannot be read", "deepaccident index DATAROOT --clear"),
+        )
+    )
     _opened(small, tmp_path)
     assert file.read_bytes() == content
 
 
-def test_full_disks_are_told(release_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_full_disks_are_told(
+    release_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path = packed(release_root, tmp_path / "all.zip")
     dataset = DeepAccident(dataroot=path, workers=1, verbose=False)
     monkeypatch.setattr(Path, "write_bytes", _no_room)
     monkeypatch.setenv("DEEPACCIDENT_CACHE", str(tmp_path / "full"))
     named = ("cannot be kept in ", "full: ", "No space left", "DEEPACCIDENT_CACHE")
-    assert_refused((lambda: dataset.local_path(dataset.sample[0], "lidar01"), SensorFileError, named))
+    assert_refused(
+        (lambda: dataset.local_path(dataset.sample[0], "lidar01"), SensorFileError, named)
+    )
     assert [each for each in (tmp_path / "full").rglob("*") if each.is_file()] == []
 
 
@@ -326,7 +404,9 @@ def test_a_wrong_size_of_the_cache_is_told(
     release_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, size: str
 ) -> None:
     monkeypatch.setenv("DEEPACCIDENT_CACHE_SIZE", size)
-    dataset = DeepAccident(dataroot=packed(release_root, tmp_path / "all.zip"), workers=1, verbose=False)
+    dataset = DeepAccident(
+        dataroot=packed(release_root, tmp_path / "all.zip"), workers=1, verbose=False
+    )
     read = partial(dataset.local_path, dataset.sample[0], "lidar01")
     assert_refused((read, ConfigError, "DEEPACCIDENT_CACHE_SIZE: expected bytes"))
 

@@ -7,26 +7,50 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from deepaccident_devkit.release.store.members import Listing, Member, Members, release_folder, write_members
+from deepaccident_devkit.release.store.members import (
+    Listing,
+    Member,
+    Members,
+    release_folder,
+    write_members,
+)
 
-_PARTS = st.text(st.characters(exclude_characters="/", exclude_categories=["Cs"]), min_size=1, max_size=9)
+_PARTS = st.text(
+    st.characters(exclude_characters="/", exclude_categories=["Cs"]), min_size=1, max_size=9
+)
 _FRAMES = st.integers(0, 1200).map(lambda number: f"name_{number:03d}.jpg")
 _PATHS = st.tuples(st.lists(_PARTS, max_size=3).map("/".join), st.one_of(_FRAMES, _PARTS))
 
 
 @settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(files=st.dictionaries(_PATHS, st.integers(0, 1 << 40), max_size=40), archives=st.integers(1, 3))
-def test_every_file_is_found_and_no_other(tmp_path: Path, files: dict[tuple[str, str], int], archives: int) -> None:
+@given(
+    files=st.dictionaries(_PATHS, st.integers(0, 1 << 40), max_size=40), archives=st.integers(1, 3)
+)
+def test_every_file_is_found_and_no_other(
+    tmp_path: Path, files: dict[tuple[str, str], int], archives: int
+) -> None:
     listings, expected = [], {}
     for number in range(archives):
         chosen = [(*path, size) for path, size in files.items() if size % archives == number]
         folders = sorted({folder for folder, *_ in chosen})
         sizes = np.array([size for *_, size in chosen], np.int64)
-        numbers = {"offset": sizes * 2, "stored": sizes, "size": sizes, "version": sizes % 7, "deflated": sizes % 2}
+        numbers = {
+            "offset": sizes * 2,
+            "stored": sizes,
+            "size": sizes,
+            "version": sizes % 7,
+            "deflated": sizes % 2,
+        }
         positions = np.array([folders.index(folder) for folder, *_ in chosen], int)
         names = [name for _, name, _ in chosen]
         listings.append(
-            Listing(archive=f"{number}.zip", folders=folders, folder=positions, names=names, numbers=numbers)
+            Listing(
+                archive=f"{number}.zip",
+                folders=folders,
+                folder=positions,
+                names=names,
+                numbers=numbers,
+            )
         )
         for folder, name, size in chosen:
             path = f"{folder}/{name}" if folder else name
@@ -59,5 +83,7 @@ KIND = "type1_subtype2_normal"
         ((".deepaccident", KIND), None),
     ],
 )
-def test_folders_of_a_release_by_what_leads_to_them(folders: tuple[str, ...], expected: str | None) -> None:
+def test_folders_of_a_release_by_what_leads_to_them(
+    folders: tuple[str, ...], expected: str | None
+) -> None:
     assert release_folder(folders) == expected

@@ -24,7 +24,9 @@ def report(*headlines: str, sent: dict[str, float] = SENT, **changes: Any) -> Ov
         for headline in headlines
         for row, (name, mean) in enumerate(sent.items())
     )
-    return OverBytes(task="accident", protocol="boxes", samples=1200, resampling=Resampling(), points=points)
+    return OverBytes(
+        task="accident", protocol="boxes", samples=1200, resampling=Resampling(), points=points
+    )
 
 
 def drawn(given: OverBytes) -> Any:
@@ -32,7 +34,13 @@ def drawn(given: OverBytes) -> Any:
 
 
 def ticks(ax: Any) -> dict[float, str]:
-    return dict(zip(ax.get_xticks().tolist(), [each.get_text() for each in ax.get_xticklabels()], strict=True))
+    return dict(
+        zip(
+            ax.get_xticks().tolist(),
+            [each.get_text() for each in ax.get_xticklabels()],
+            strict=True,
+        )
+    )
 
 
 def test_points_are_at_the_logarithm_of_their_bytes_with_their_intervals() -> None:
@@ -40,7 +48,9 @@ def test_points_are_at_the_logarithm_of_their_bytes_with_their_intervals() -> No
     ax = fig.axes[0]
     places = [line.get_xydata() for line in ax.lines]
     assert ticks(ax) == {7: "none", 9: "9", 10: "10", 11: "11", 12: "12"}
-    for at, value, place in zip((7, math.log2(900), math.log2(3000)), (0.5, 0.6, 0.7), places, strict=True):
+    for at, value, place in zip(
+        (7, math.log2(900), math.log2(3000)), (0.5, 0.6, 0.7), places, strict=True
+    ):
         assert_allclose(place, [(at, 0.3), (at, value), (at, 0.9)])
     assert (texts(ax), ax.get_ylabel()) == (["single", "some", "all"], "apa")
 
@@ -58,9 +68,16 @@ def test_whole_powers_are_named(sent: dict[str, float], expected: dict[float, st
     assert ticks(drawn(report("apa", sent=sent)).axes[0]) == expected
 
 
-@pytest.mark.parametrize(("place", "panels"), [(None, 4), ("cvpr-page", 4), ("cvpr-column", 2), ("slide", 4)])
+@pytest.mark.parametrize(
+    ("place", "panels"), [(None, 4), ("cvpr-page", 4), ("cvpr-column", 2), ("slide", 4)]
+)
 def test_a_panel_for_each_headline_with_words_that_can_be_read(place: Any, panels: int) -> None:
     with style(place):
         fig = render_over_bytes(report("apa", "precision", "recall", "false_alarm_rate"))
         assert text_faults(fig) == []
-    assert [ax.get_ylabel() for ax in fig.axes] == ["apa", "precision", "recall", "false_alarm_rate"][:panels]
+    assert [ax.get_ylabel() for ax in fig.axes] == [
+        "apa",
+        "precision",
+        "recall",
+        "false_alarm_rate",
+    ][:panels]

@@ -23,7 +23,11 @@ from deepaccident_devkit.evaluation.runs.setups import TASKS, EvaluationSetup
 from deepaccident_devkit.evaluation.task import headlines
 from deepaccident_devkit.motion import MotionLabelConfig
 from deepaccident_devkit.render.evaluation import draw_motion_outcome, save_report
-from deepaccident_devkit.render.evaluation.figures import complete_figure, run_figures, sample_figures
+from deepaccident_devkit.render.evaluation.figures import (
+    complete_figure,
+    run_figures,
+    sample_figures,
+)
 from deepaccident_devkit.render.styles import OUTCOME_COLORS, WARNING_COLOR
 
 pytestmark = pytest.mark.slow
@@ -57,42 +61,69 @@ def test_a_report_holds_all_and_asks_for_nothing(
     page = page_of(save_report(run, tmp_path))
     figures = sorted((tmp_path / "figures").iterdir())
     assert [path.stem for path in figures] == sorted(each.name for each in run_figures(run))
-    assert len(page.all("img")) == len(figures) >= (1 if TASKS[setup.task].needs_whole_recordings else 4)
+    assert (
+        len(page.all("img"))
+        == len(figures)
+        >= (1 if TASKS[setup.task].needs_whole_recordings else 4)
+    )
     assert {str(image["src"])[:22] for image in page.all("img")} == {"data:image/png;base64,"}
-    assert not holding([name for name, _ in page.found], "script", "link", "iframe", "object", "form")
-    assert {str(link["href"]) for link in page.all("a")} == {f"#{each['id']}" for each in page.all("section")}
+    assert not holding(
+        [name for name, _ in page.found], "script", "link", "iframe", "object", "form"
+    )
+    assert {str(link["href"]) for link in page.all("a")} == {
+        f"#{each['id']}" for each in page.all("section")
+    }
     assert sum(map(warning_pixels, figures)) == 0
     numbers = [words for each in headlines(run.result) for words in (each.name, each.text())]
-    told = (run.release.fingerprint, run.results.fingerprint, setup.protocol, "deepaccident check bundle")
+    told = (
+        run.release.fingerprint,
+        run.results.fingerprint,
+        setup.protocol,
+        "deepaccident check bundle",
+    )
     assert not lacking(page.text, *told, *numbers)
     assert "PARTIAL" not in page.text
 
 
 @pytest.mark.parametrize("setup", SETUPS, ids=lambda setup: f"{setup.task} {setup.protocol}")
-def test_words_of_figures_are_apart(setup: EvaluationSetup, da_motion: DeepAccident, tokens: list[str]) -> None:
+def test_words_of_figures_are_apart(
+    setup: EvaluationSetup, da_motion: DeepAccident, tokens: list[str]
+) -> None:
     run = evaluation_run(da_motion, setup, tokens, partial=PARTIAL)
     assert {each.name: text_faults(complete_figure(run, each)) for each in run_figures(run)} == {
         each.name: [] for each in run_figures(run)
     }
 
 
-def test_the_same_run_makes_the_same_bytes(da_motion: DeepAccident, tokens: list[str], tmp_path: Path) -> None:
+def test_the_same_run_makes_the_same_bytes(
+    da_motion: DeepAccident, tokens: list[str], tmp_path: Path
+) -> None:
     made = []
     for name in ("a", "b"):
         run, folder = evaluation_run(da_motion, SETUPS[2], tokens[::2]), tmp_path / name
         path = save_report(run, folder)
-        made.append({each.name: each.read_bytes() for each in (path, *(folder / "figures").iterdir())})
+        made.append(
+            {each.name: each.read_bytes() for each in (path, *(folder / "figures").iterdir())}
+        )
     assert made[0] == made[1]
     (tmp_path / "planted").mkdir()
     (tmp_path / "planted" / "figures").symlink_to(tmp_path / "a" / "figures")
     assert_refused(
         (lambda: save_report(run, path), ConfigError, ("is a file", "give a folder")),
-        (lambda: save_report(run, tmp_path / "planted"), OutputFolderError, ("figures: a symbolic link", "remove it")),
+        (
+            lambda: save_report(run, tmp_path / "planted"),
+            OutputFolderError,
+            ("figures: a symbolic link", "remove it"),
+        ),
     )
 
 
-def test_a_partial_run_says_so_everywhere(da_motion: DeepAccident, tokens: list[str], tmp_path: Path) -> None:
-    page = page_of(save_report(evaluation_run(da_motion, SETUPS[1], tokens, partial=PARTIAL), tmp_path))
+def test_a_partial_run_says_so_everywhere(
+    da_motion: DeepAccident, tokens: list[str], tmp_path: Path
+) -> None:
+    page = page_of(
+        save_report(evaluation_run(da_motion, SETUPS[1], tokens, partial=PARTIAL), tmp_path)
+    )
     marks = page.text.count("PARTIAL: 120 of 180 samples, 2 predictions left out")
     assert marks == 1 + len(page.all("section"))
     for path in (tmp_path / "figures").iterdir():
@@ -102,12 +133,22 @@ def test_a_partial_run_says_so_everywhere(da_motion: DeepAccident, tokens: list[
         assert described.startswith("PARTIAL: 120 of 180 samples")
 
 
-def test_names_from_elsewhere_are_harmless(da_motion: DeepAccident, tokens: list[str], tmp_path: Path) -> None:
+def test_names_from_elsewhere_are_harmless(
+    da_motion: DeepAccident, tokens: list[str], tmp_path: Path
+) -> None:
     meta: Mapping[str, Any] = {"method": EVIL, EVIL: [{EVIL: EVIL}]}
-    run = evaluation_run(da_motion, SETUPS[1], tokens, meta=meta, sanity={"samples": 20, "warnings": [EVIL]})
+    run = evaluation_run(
+        da_motion, SETUPS[1], tokens, meta=meta, sanity={"samples": 20, "warnings": [EVIL]}
+    )
     path = save_report(run, tmp_path)
-    page, text = page_of(path), path.read_text().replace("<wbr>", "").replace("http://x.example/y.png", "")
-    assert (page.all("script"), {str(image["src"])[:5] for image in page.all("img")}) == ([], {"data:"})
+    page, text = (
+        page_of(path),
+        path.read_text().replace("<wbr>", "").replace("http://x.example/y.png", ""),
+    )
+    assert (page.all("script"), {str(image["src"])[:5] for image in page.all("img")}) == (
+        [],
+        {"data:"},
+    )
     assert "http" not in text.replace("http-equiv", "")
 
 
@@ -117,20 +158,34 @@ def test_outcomes_of_cells_are_coloured(da_motion: DeepAccident, tokens: list[st
     own, shifted = truth.config.grid, np.roll(truth.instance, 3, 2)
     for frame, drawn in ((None, last), (0, 0)):
         ax = draw_motion_outcome(instances_of(shifted, own), label, frame=frame, ax=new_axes())
-        there, true = (own.reorient(each[drawn] > 0, "devkit") for each in (shifted, truth.segmentation == 1))
-        for kind, cells in (("right", there & true), ("false", there & ~true), ("missed", true & ~there)):
+        there, true = (
+            own.reorient(each[drawn] > 0, "devkit") for each in (shifted, truth.segmentation == 1)
+        )
+        for kind, cells in (
+            ("right", there & true),
+            ("false", there & ~true),
+            ("missed", true & ~there),
+        ):
             assert cells.any()
-            assert np.array_equal((picture(ax) == to_rgba(OUTCOME_COLORS[kind])).all(axis=-1), cells), kind
+            assert np.array_equal(
+                (picture(ax) == to_rgba(OUTCOME_COLORS[kind])).all(axis=-1), cells
+            ), kind
 
 
 @pytest.mark.parametrize("task", ["motion", "accident", "detection", "warning"])
-def test_samples_of_stored_results_are_ranked_and_drawn(task: Any, da_motion: DeepAccident, tmp_path: Path) -> None:
+def test_samples_of_stored_results_are_ranked_and_drawn(
+    task: Any, da_motion: DeepAccident, tmp_path: Path
+) -> None:
     protocol = {"accident": "boxes", "warning": "clean"}.get(task, "released")
-    run, results = stored_run(da_motion, EvaluationSetup(task=task, protocol=protocol), tmp_path / "results")
+    run, results = stored_run(
+        da_motion, EvaluationSetup(task=task, protocol=protocol), tmp_path / "results"
+    )
     figures = sample_figures(run, da_motion, results)
     ranked = [f"sample_{kind}_{number}" for kind in ("worst", "best") for number in (1, 2, 3)]
     assert [each.name for each in figures] == ([] if protocol == "clean" else ranked)
-    values = [float(re.findall(r"\d+\.\d+", each.caption.rsplit(",", 1)[1])[-1]) for each in figures]
+    values = [
+        float(re.findall(r"\d+\.\d+", each.caption.rsplit(",", 1)[1])[-1]) for each in figures
+    ]
     assert values == sorted(values[:3]) + sorted(values[3:], reverse=True)
     assert max(values[:3], default=0) <= min(values[3:], default=0)
     for each in figures:
@@ -139,4 +194,7 @@ def test_samples_of_stored_results_are_ranked_and_drawn(task: Any, da_motion: De
         assert (text_faults(figure), token in each.caption) == ([], True)
     if task == "accident":
         page = page_of(save_report(run, tmp_path / "report", dataset=da_motion, results=results))
-        assert (len(page.all("img")), META["method"] in page.text) == (len(run_figures(run)) + 6, True)
+        assert (len(page.all("img")), META["method"] in page.text) == (
+            len(run_figures(run)) + 6,
+            True,
+        )

@@ -45,7 +45,9 @@ def alarm(position: float | None, score: float, time: float | None = 0.0) -> dic
 def boxes() -> AccidentEvaluator:
     """Three accidents, one of which nobody foresees, and two samples without, one with an alarm."""
     near, late, wrong = alarm(3.0, 0.9, 0.5), alarm(12.0, 0.7, -0.5), alarm(None, 0.8, None)
-    return evaluated((True, [near, alarm(8.0, 0.4)]), (True, [late]), (True, []), (False, [wrong]), (False, []))
+    return evaluated(
+        (True, [near, alarm(8.0, 0.4)]), (True, [late]), (True, []), (False, [wrong]), (False, [])
+    )
 
 
 def test_the_accuracy_curve_goes_through_the_official_points() -> None:
@@ -62,7 +64,11 @@ def test_released_counts_have_points_alone() -> None:
     assert accuracy_by_distance(empty, np.array([5.0])) is None
     ax = render_accuracy(empty, ax=new_axes())
     assert "nothing to count" in words(ax)
-    assert [len(line.get_xdata()) for line in ax.lines] == [2, 2, 2]  # the three distances, no curve
+    assert [len(line.get_xdata()) for line in ax.lines] == [
+        2,
+        2,
+        2,
+    ]  # the three distances, no curve
 
 
 def test_the_area_under_the_alarms_is_the_average_precision() -> None:
@@ -70,7 +76,8 @@ def test_the_area_under_the_alarms_is_the_average_precision() -> None:
     result, (recall, precision) = evaluator.compute(), alarm_precision_recall(evaluator)
     area = np.sum(np.diff(recall, prepend=0) * precision)
     np.testing.assert_allclose(
-        [area, recall[-1], precision[-1]], [result.average_precision, result.recall, result.precision]
+        [area, recall[-1], precision[-1]],
+        [result.average_precision, result.recall, result.precision],
     )
     ax = render_alarms(evaluator, ax=new_axes())
     np.testing.assert_array_equal(ax.lines[0].get_xydata(), np.column_stack([recall, precision]))
@@ -84,17 +91,31 @@ def test_errors_are_counted() -> None:
 
     assert bars(boxes(), "position") == {3: 1, 12: 1}  # of the surest alarm of each accident
     assert bars(boxes(), "time") == {0.25: 1, -0.75: 1}
-    assert bars(evaluated((True, [alarm(99.0, 0.5)])), "position") == {20: 1}  # the last bin: and more
-    assert "no accident has a prediction" in words(render_errors(AccidentEvaluator("boxes"), "time", ax=new_axes()))
+    assert bars(evaluated((True, [alarm(99.0, 0.5)])), "position") == {
+        20: 1
+    }  # the last bin: and more
+    assert "no accident has a prediction" in words(
+        render_errors(AccidentEvaluator("boxes"), "time", ax=new_axes())
+    )
 
 
 def test_precision_is_drawn_up_to_the_recall_that_is_reached(detected: DetectionResult) -> None:
-    ax, nobody = (render_precision_recall(detected, name, ax=new_axes()) for name in ("car", "truck"))
+    ax, nobody = (
+        render_precision_recall(detected, name, ax=new_axes()) for name in ("car", "truck")
+    )
     np.testing.assert_array_equal(ax.lines[0].get_xydata(), [(0.25, 1), (0.5, 0.5), (0.75, 0.5)])
     assert (len(nobody.lines), "none in the truth" in words(nobody)) == (0, True)
     assert_refused(
-        (lambda: render_precision_recall(detected, "bus"), ChoiceError, ("name", "car, van, truck", "'bus'")),
-        (lambda: render_precision_recall(detected, "car", ring=1), ChoiceError, ("ring", "0 to 0", "found 1")),
+        (
+            lambda: render_precision_recall(detected, "bus"),
+            ChoiceError,
+            ("name", "car, van, truck", "'bus'"),
+        ),
+        (
+            lambda: render_precision_recall(detected, "car", ring=1),
+            ChoiceError,
+            ("ring", "0 to 0", "found 1"),
+        ),
     )
 
 

@@ -52,13 +52,20 @@ def test_accidents_without_truth(da_motion: DeepAccident) -> None:
 def test_the_verdict_names_several_of_a_kind(da_motion: DeepAccident, sample: str) -> None:
     evaluator = AccidentEvaluator("boxes")
     far = Accident(positions=np.array([[40.0, 40.0], [42.0, 40.0]]), time=1.0)
-    evaluator.update(sample, [far, replace(far, score=0.5)], None, AccidentContext(truth=box_truth(da_motion, sample)))
+    evaluator.update(
+        sample,
+        [far, replace(far, score=0.5)],
+        None,
+        AccidentContext(truth=box_truth(da_motion, sample)),
+    )
     assert verdict_words(evaluator.compute()) == "5 m: 2 FP + FN, 10 m: 2 FP + FN, 15 m: 2 FP + FN"
 
 
 def test_detections_are_coloured_by_their_matches(da_motion: DeepAccident, sample: str) -> None:
     truth = detection_truth(da_motion, sample, "paper")
-    truth = truth.select((np.abs(truth.center[:, :2]) < 50).all(axis=1))  # well within the protocol's area
+    truth = truth.select(
+        (np.abs(truth.center[:, :2]) < 50).all(axis=1)
+    )  # well within the protocol's area
     some = np.arange(2, len(truth))
     center = np.vstack([truth.center[some] + (0.3, 0.0, 0.0), [[20.0, -45.0, 0.0]]])
     detected = DetectedBoxes.from_arrays(
@@ -70,9 +77,15 @@ def test_detections_are_coloured_by_their_matches(da_motion: DeepAccident, sampl
         frame="lidar",
     )
     ax = draw_detection_outcome(detected, truth, "paper", ax=new_axes())
-    shapes = [each for each in ax.collections if isinstance(each, PolyCollection) and len(each.get_paths())]
+    shapes = [
+        each
+        for each in ax.collections
+        if isinstance(each, PolyCollection) and len(each.get_paths())
+    ]
     centers = {
-        to_hex(each.get_edgecolor()[0]): [path.vertices[:4].mean(axis=0) for path in each.get_paths()]
+        to_hex(each.get_edgecolor()[0]): [
+            path.vertices[:4].mean(axis=0) for path in each.get_paths()
+        ]
         for each in shapes
     }
     np.testing.assert_allclose(centers[OUTCOME_COLORS["false"]], [(20, -45)])
@@ -90,7 +103,9 @@ def damaged(labels: MotionLabels) -> MotionOutput:
     return instances_of(instance, labels.config.grid)
 
 
-def test_motion_outcomes_are_those_that_are_counted(da_motion: DeepAccident, sample: str, labels: MotionLabels) -> None:
+def test_motion_outcomes_are_those_that_are_counted(
+    da_motion: DeepAccident, sample: str, labels: MotionLabels
+) -> None:
     output, evaluator = damaged(labels), MotionEvaluator("released")
     evaluator.update(sample, output, labels)
     outcome, counted = motion_outcome(output, labels), evaluator.compute().ranges["100x100"]
@@ -109,15 +124,25 @@ def test_motion_outcomes_are_those_that_are_counted(da_motion: DeepAccident, sam
     np.testing.assert_allclose(picture(right)[4, 4], to_rgb(OUTCOME_COLORS["false"]))
 
 
-def test_what_lies_beyond_the_range_is_not_judged(labels: MotionLabels, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_lies_beyond_the_range_is_not_judged(
+    labels: MotionLabels, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("deepaccident_devkit.render.outcomes.above.RANGES", {"30x30": 30.0})
-    cells = motion_outcome(instances_of(labels.instance, labels.config.grid), labels).outcomes("true")
+    cells = motion_outcome(instances_of(labels.instance, labels.config.grid), labels).outcomes(
+        "true"
+    )
     assert set(np.unique(cells[0][labels.instance[0] > 0]).tolist()) == {1, 3}
 
 
 def test_actors_stand_where_the_truth_has_them(da_motion: DeepAccident, sample: str) -> None:
     truth = box_truth(da_motion, sample)
-    ax = draw_accident_outcome(ComparedAccidents(true=truth.accident, predicted=()), truth, ax=new_axes())
-    pair = da_motion.boxes(sample, "ego").bottom_corners()[da_motion.boxes(sample).actor_id == OWN_ACTOR_ID, :, :2]
-    shapes = [path.vertices[:4] for each in of_kind(ax, PolyCollection) for path in each.get_paths()]
+    ax = draw_accident_outcome(
+        ComparedAccidents(true=truth.accident, predicted=()), truth, ax=new_axes()
+    )
+    pair = da_motion.boxes(sample, "ego").bottom_corners()[
+        da_motion.boxes(sample).actor_id == OWN_ACTOR_ID, :, :2
+    ]
+    shapes = [
+        path.vertices[:4] for each in of_kind(ax, PolyCollection) for path in each.get_paths()
+    ]
     assert np.abs(np.array(shapes) - pair).max(axis=(1, 2)).min() < 0.3

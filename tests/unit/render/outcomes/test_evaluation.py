@@ -32,13 +32,20 @@ from deepaccident_devkit.taxonomy import short_name
 
 def test_accidents_have_their_metres_and_verdict(da_motion: DeepAccident, sample: str) -> None:
     true: Any = box_truth(da_motion, sample).accident
-    near = Accident(positions=true.positions + np.array([3.0, 0.0]), time=true.time + 0.5, score=0.9)
+    near = Accident(
+        positions=true.positions + np.array([3.0, 0.0]), time=true.time + 0.5, score=0.9
+    )
     figure, silent = (
-        render_evaluation(da_motion, sample, given, fig=detached_figure((10, 6))) for given in ([near], [])
+        render_evaluation(da_motion, sample, given, fig=detached_figure((10, 6)))
+        for given in ([near], [])
     )
     above = figure.axes[1]
     assert title_of(figure).endswith("accident: 5 m: FP + FN, 10 m: TP, 15 m: TP")
-    marked = {line.get_marker(): line.get_xydata() for line in above.lines if line.get_marker() in ("o", "x")}
+    marked = {
+        line.get_marker(): line.get_xydata()
+        for line in above.lines
+        if line.get_marker() in ("o", "x")
+    }
     np.testing.assert_allclose([marked["o"], marked["x"]], [true.positions, near.positions])
     assert title_of(silent).endswith("5 m: FN, 10 m: FN, 15 m: FN")
 
@@ -57,8 +64,12 @@ def test_an_accident_is_shown_on_the_road_and_in_the_camera_that_sees_both_best(
     assert camera.get_title() == f"{short_name(agent)}, {camera_name(channel)}"
     np.testing.assert_array_equal(camera.images[0].get_array(), da.load_image(best.camera))
     (road,) = above.images
-    assert BEV_COLORS["road"] in {to_hex(color / 255) for color in np.unique(road.get_array().reshape(-1, 3), axis=0)}
-    corners = [path.vertices[:4] for each in of_kind(above, PolyCollection) for path in each.get_paths()]
+    assert BEV_COLORS["road"] in {
+        to_hex(color / 255) for color in np.unique(road.get_array().reshape(-1, 3), axis=0)
+    }
+    corners = [
+        path.vertices[:4] for each in of_kind(above, PolyCollection) for path in each.get_paths()
+    ]
     middles = np.mean(corners, axis=1)
     assert np.linalg.norm(middles[:, None] - true.positions, axis=-1).min(axis=0).max() < 1.0
 
@@ -71,7 +82,9 @@ def test_the_pair_that_collides_is_red_in_every_task(
     detected = DetectedBoxes(boxes=boxes, scores=np.ones(len(boxes)))
     motion = instances_of(labels.instance, labels.config.grid)
     for prediction, panel, count in ((detected, 0, 2), ([accident], 1, 4), (motion, 0, 2)):
-        ax = render_evaluation(da_motion, sample, prediction, fig=detached_figure((10, 6))).axes[panel]
+        ax = render_evaluation(da_motion, sample, prediction, fig=detached_figure((10, 6))).axes[
+            panel
+        ]
         edges = [each for each in ax.collections if isinstance(each, (ContourSet, PolyCollection))]
         colors = [to_hex(color) for each in edges for color in each.get_edgecolor()]
         assert colors.count(COLLIDER_COLOR) == count  # of an accident also at the impact

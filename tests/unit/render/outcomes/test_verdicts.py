@@ -24,7 +24,9 @@ from deepaccident_devkit.render.outcomes.verdicts import (
 )
 
 
-def test_a_prediction_is_judged_in_its_own_task(da_motion: DeepAccident, sample: str, labels: MotionLabels) -> None:
+def test_a_prediction_is_judged_in_its_own_task(
+    da_motion: DeepAccident, sample: str, labels: MotionLabels
+) -> None:
     motion, boxes = instances_of(labels.instance, labels.config.grid), da_motion.boxes(sample)
     detected = DetectedBoxes(boxes=boxes, scores=np.ones(len(boxes)))
     for given, task, judged in (
@@ -36,12 +38,21 @@ def test_a_prediction_is_judged_in_its_own_task(da_motion: DeepAccident, sample:
         assert judged_as(given, task) == judged
     assert_refused(
         (lambda: judged_as(detected, "motion"), ChoiceError, ("task", "detection", "'motion'")),
-        (lambda: judged_as(boxes, None), EvaluationError, ("prediction", "a MotionOutput or a list of Accidents")),
+        (
+            lambda: judged_as(boxes, None),
+            EvaluationError,
+            ("prediction", "a MotionOutput or a list of Accidents"),
+        ),
     )
 
 
-def test_motion_is_judged_by_the_released_rules(da_motion: DeepAccident, sample: str, labels: MotionLabels) -> None:
-    output, context = instances_of(np.roll(labels.instance, 2, axis=-1), labels.config.grid), accident_context
+def test_motion_is_judged_by_the_released_rules(
+    da_motion: DeepAccident, sample: str, labels: MotionLabels
+) -> None:
+    output, context = (
+        instances_of(np.roll(labels.instance, 2, axis=-1), labels.config.grid),
+        accident_context,
+    )
     counted, alarms = MotionEvaluator("released"), AccidentEvaluator("released")
     counted.update(sample, output, da_motion.motion_labels(sample))
     alarms.update(sample, output, labels, context(da_motion, sample, 2.0))
@@ -51,13 +62,18 @@ def test_motion_is_judged_by_the_released_rules(da_motion: DeepAccident, sample:
     assert verdict.words.split("; ")[1].endswith(f"PQ {within.pq:.1f} %, {counts}")
     assert len(verdict.outcome.matches) == within.true_positive
     how = {"task": "accident", "label": labels}
-    seen, other = (sample_verdict(da_motion, sample, output, **how, **more) for more in ({}, {"protocol": "boxes"}))
+    seen, other = (
+        sample_verdict(da_motion, sample, output, **how, **more)
+        for more in ({}, {"protocol": "boxes"})
+    )
     assert {type(seen), type(other)} == {AccidentVerdict}
     assert seen.words == f"accident: {verdict_words(alarms.compute())}"
     assert [each.compared.true.ids is not None for each in (seen, other)] == [False, True]
 
 
-def test_detections_are_judged_in_the_frame_of_the_protocol(da_motion: DeepAccident, sample: str) -> None:
+def test_detections_are_judged_in_the_frame_of_the_protocol(
+    da_motion: DeepAccident, sample: str
+) -> None:
     truth = detection_truth(da_motion, sample, "paper")
     world = truth.transform(da_motion.world_from(sample, truth.frame), "world")
     given = DetectedBoxes(boxes=world, scores=np.ones(len(world)))

@@ -27,7 +27,12 @@ def data(page: Path) -> dict[str, Any]:
 def foreseen(dataset: DeepAccident, token: str, *, away: float = 0.0, **other: Any) -> Accident:
     """The true accident of a sample, so many metres away, or with other numbers."""
     truth = box_truth(dataset, token).accident
-    told = {"positions": truth.positions + np.array([away, 0.0]), "time": truth.time, "ids": truth.ids, **other}
+    told = {
+        "positions": truth.positions + np.array([away, 0.0]),
+        "time": truth.time,
+        "ids": truth.ids,
+        **other,
+    }
     return Accident(**told)
 
 
@@ -40,6 +45,9 @@ def predictions(da_motion: DeepAccident) -> dict[str, list[Accident]]:
         f"{ego}/030": [],
         f"{accident(da_motion)}/infrastructure/030": [
             foreseen(da_motion, f"{ego}/030", away=90.0, ids=None),
-            *(Accident(positions=np.full((2, 2), far), time=1.0, score=0.1) for far in (200.0, 300.0, 400.0)),
+            *(
+                Accident(positions=np.full((2, 2), far), time=1.0, score=0.1)
+                for far in (200.0, 300.0, 400.0)
+            ),
         ],
     }

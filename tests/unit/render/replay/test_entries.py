@@ -12,7 +12,14 @@ from replay_page import accident, data_of, normal
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import EvaluationError, NotAvailableError
-from deepaccident_devkit.evaluation import Accident, DetectedBoxes, Results, ResultsWriter, instances_of, read_results
+from deepaccident_devkit.evaluation import (
+    Accident,
+    DetectedBoxes,
+    Results,
+    ResultsWriter,
+    instances_of,
+    read_results,
+)
 from deepaccident_devkit.evaluation.predictions import labels_at_present
 from deepaccident_devkit.geometry import Boxes, quaternions
 from deepaccident_devkit.interactions import interactions
@@ -30,7 +37,10 @@ def test_actors_are_where_their_tracks_say(da: DeepAccident, data: dict[str, Any
     assert sorted(actor["id"] for actor in data["actors"]) == np.unique(tracks.actor_id).tolist()
     for actor in data["actors"]:
         rows = np.flatnonzero(tracks.actor_id == actor["id"])
-        boxes, states = tracks.boxes.select(rows), np.array([state for state in actor["states"] if state is not None])
+        boxes, states = (
+            tracks.boxes.select(rows),
+            np.array([state for state in actor["states"] if state is not None]),
+        )
         shown = [frame + 1 for frame, state in enumerate(actor["states"]) if state is not None]
         assert shown == tracks.index[rows].tolist()
         assert actor["title"].startswith(f"{boxes.category_names[0]} {actor['id']}")
@@ -38,9 +48,13 @@ def test_actors_are_where_their_tracks_say(da: DeepAccident, data: dict[str, Any
         np.testing.assert_allclose(places, boxes.center, atol=0.00501)
         np.testing.assert_allclose(states[:, 2] / 1000, boxes.yaw, atol=0.000501)
         np.testing.assert_allclose(
-            [actor[side] / 100 for side in ("length", "width", "height")], boxes.size[0], atol=0.00501
+            [actor[side] / 100 for side in ("length", "width", "height")],
+            boxes.size[0],
+            atol=0.00501,
         )
-        np.testing.assert_allclose(states[:, 5:] / 1000, quaternions.to_matrix(boxes.rotation)[:, :2, 2], atol=0.000501)
+        np.testing.assert_allclose(
+            states[:, 5:] / 1000, quaternions.to_matrix(boxes.rotation)[:, :2, 2], atol=0.000501
+        )
 
 
 def test_who_sees_whom_is_the_released_rule(da: DeepAccident, data: dict[str, Any]) -> None:
@@ -50,7 +64,9 @@ def test_who_sees_whom_is_the_released_rule(da: DeepAccident, data: dict[str, An
         assert seen == {int(token.rsplit("/", 1)[1]) for token in visible} != set()
 
 
-def test_the_pair_is_red_and_first_and_the_other_agents_have_their_hues(da: DeepAccident, data: dict[str, Any]) -> None:
+def test_the_pair_is_red_and_first_and_the_other_agents_have_their_hues(
+    da: DeepAccident, data: dict[str, Any]
+) -> None:
     pair = da.get("scenario", accident(da))["collision"]["ids"]
     agents = {agent["actor"]: agent for agent in data["agents"]}
     assert [actor["id"] for actor in data["actors"][:2]] == sorted(pair)
@@ -67,11 +83,17 @@ def test_cameras_are_where_they_record(da: DeepAccident, data: dict[str, Any]) -
     origin = np.array([*recording_of(da, scenario, None).origin, 0.0])
     for agent, cameras in zip(AGENTS, data["cameras"], strict=True):
         assert [camera["title"] for camera in cameras] == [*map(camera_name, CAMERAS)]
-        moments = ((*each, *at) for each in zip(CAMERAS, cameras, strict=True) for at in enumerate(each[1]["poses"], 1))
+        moments = (
+            (*each, *at)
+            for each in zip(CAMERAS, cameras, strict=True)
+            for at in enumerate(each[1]["poses"], 1)
+        )
         for channel, camera, frame, pose in moments:
             sample = f"{scenario}/{agent}/{frame:03d}"
             lens, there = da.camera(sample, channel), da.world_from(sample, channel)
-            np.testing.assert_allclose(np.array(pose[:3]) / 100 + origin, there.translation, atol=0.00501)
+            np.testing.assert_allclose(
+                np.array(pose[:3]) / 100 + origin, there.translation, atol=0.00501
+            )
             turned = quaternions.to_matrix(np.array(pose[3:]) / 10_000) @ ahead[0]
             np.testing.assert_allclose(turned, there.rotation @ ahead[0], atol=0.01)
             width, height, fx, fy, cx, cy = camera["lens"]
@@ -85,16 +107,27 @@ def test_the_countdown_ends_at_the_impact(da: DeepAccident, data: dict[str, Any]
     contact = da.collision(scenario)
     assert data["countdown"] == [0.5, 0.4, 0.3, 0.2, 0.1, 0.0]
     origin = recording_of(da, scenario["token"], None).origin
-    np.testing.assert_allclose(np.array(data["impact"]) / 100 + origin, contact.point[:2], atol=0.00501)
+    np.testing.assert_allclose(
+        np.array(data["impact"]) / 100 + origin, contact.point[:2], atol=0.00501
+    )
 
 
-def test_the_pair_is_as_near_as_its_interactions_say(da: DeepAccident, data: dict[str, Any]) -> None:
-    found, pair = interactions(da, accident(da)), da.get("scenario", accident(da))["collision"]["ids"]
+def test_the_pair_is_as_near_as_its_interactions_say(
+    da: DeepAccident, data: dict[str, Any]
+) -> None:
+    found, pair = (
+        interactions(da, accident(da)),
+        da.get("scenario", accident(da))["collision"]["ids"],
+    )
     own = (found.actor_ids == sorted(pair)).all(axis=1)
-    gap, ttc = (np.array(data["pair"][name], dtype=float)[found.frame[own] - 1] for name in ("gap", "ttc"))
+    gap, ttc = (
+        np.array(data["pair"][name], dtype=float)[found.frame[own] - 1] for name in ("gap", "ttc")
+    )
     assert len(gap) == len(data["countdown"])
     np.testing.assert_allclose(gap / 100, found.gap[own], atol=0.00501)
-    np.testing.assert_allclose(ttc / 10, np.where(np.isinf(found.ttc[own]), np.nan, found.ttc[own]), atol=0.0501)
+    np.testing.assert_allclose(
+        ttc / 10, np.where(np.isinf(found.ttc[own]), np.nan, found.ttc[own]), atol=0.0501
+    )
 
 
 def test_where_nobody_collides_nothing_is_red(da_b: DeepAccident, tmp_path: Path) -> None:
@@ -113,7 +146,11 @@ def test_labels_alone_are_enough(da_b: DeepAccident, tmp_path: Path) -> None:
 def test_without_labels_there_are_the_agents(own_release: Path, tmp_path: Path) -> None:
     for folder in sorted(own_release.rglob("label")):
         shutil.rmtree(folder)
-    data = data_of(render_replay(DeepAccident("v1", own_release, verbose=False), None, tmp_path / "replay.html"))
+    data = data_of(
+        render_replay(
+            DeepAccident("v1", own_release, verbose=False), None, tmp_path / "replay.html"
+        )
+    )
     assert (data["actors"], [len(agent["poses"]) for agent in data["agents"]]) == ([], [4] * 5)
     assert data["countdown"][-1] == 0
 
@@ -176,10 +213,20 @@ def test_predictions_of_something_else_are_refused(
     detection = stored(tmp_path / "boxes.json", "detection", {token: detected})
 
     def replay(prediction: Any, scenario: str | None = None) -> Callable[[], object]:
-        return lambda: render_replay(da_motion, scenario, tmp_path / "a.html", prediction=prediction)
+        return lambda: render_replay(
+            da_motion, scenario, tmp_path / "a.html", prediction=prediction
+        )
 
     assert_refused(
-        (replay(predictions, normal(da_motion)), NotAvailableError, ("prediction", normal(da_motion), "ego_vehicle")),
+        (
+            replay(predictions, normal(da_motion)),
+            NotAvailableError,
+            ("prediction", normal(da_motion), "ego_vehicle"),
+        ),
         (replay(detection), EvaluationError, ("holds detection results", "motion or accident")),
-        (replay({token: [7]}), EvaluationError, ("a MotionOutput or a list of Accidents", "list with int")),
+        (
+            replay({token: [7]}),
+            EvaluationError,
+            ("a MotionOutput or a list of Accidents", "list with int"),
+        ),
     )

@@ -29,7 +29,11 @@ def ground(road: dict[str, Any], origin: Any) -> tuple[Any, Any, float]:
     """The picture (H, W, 3), its upper left corner in world, and the side of its cells, metres."""
     assert len(road["png"]) < 300_000
     shown = np.asarray(picture(road["png"]).convert("RGB"))
-    return shown, origin + np.array([road["left"], road["top"]]) / 100, road["width"] / 100 / shown.shape[1]
+    return (
+        shown,
+        origin + np.array([road["left"], road["top"]]) / 100,
+        road["width"] / 100 / shown.shape[1],
+    )
 
 
 def share_of(shown: Any, name: str) -> float:
@@ -50,7 +54,10 @@ def test_the_road_is_where_the_bev_cameras_see_it(da: DeepAccident, data: dict[s
         for name in ("road", "sidewalk"):
             cells = shown[down, across][tags == TAGS[name]]
             assert len(cells) > 20
-            assert share_of(cells, name) > 0.95, (agent, name)  # a cell at an edge may have what is beside it
+            assert share_of(cells, name) > 0.95, (
+                agent,
+                name,
+            )  # a cell at an edge may have what is beside it
 
 
 def test_without_bev_files_there_is_no_road(da: DeepAccident, tmp_path: Path) -> None:
@@ -58,7 +65,9 @@ def test_without_bev_files_there_is_no_road(da: DeepAccident, tmp_path: Path) ->
     assert data_of(page)["road"] is None
 
 
-def test_without_bev_files_a_kept_map_of_the_town_is_the_road(da: DeepAccident, tmp_path: Path) -> None:
+def test_without_bev_files_a_kept_map_of_the_town_is_the_road(
+    da: DeepAccident, tmp_path: Path
+) -> None:
     """As of the test split, whose scenarios have no BEV camera, in a town that others were recorded in."""
     opened = linked(da, tmp_path / "release")
     token = accident(opened)

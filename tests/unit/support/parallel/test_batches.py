@@ -59,10 +59,16 @@ class Delayed(Executor):
 
 def test_any_executor_gives_the_same() -> None:
     expected = [item + 1 for item in range(50)]
-    with ThreadPoolExecutor(3) as threads, ProcessPoolExecutor(2, mp_context=get_context("spawn")) as processes:
+    with (
+        ThreadPoolExecutor(3) as threads,
+        ProcessPoolExecutor(2, mp_context=get_context("spawn")) as processes,
+    ):
         for executor in (threads, processes):
             assert run_batch(workers.following, range(50), executor=executor) == expected
-            assert list(in_order(run_unordered(workers.following, range(50), executor=executor))) == expected
+            assert (
+                list(in_order(run_unordered(workers.following, range(50), executor=executor)))
+                == expected
+            )
     assert run_batch(workers.following, [], executor=threads) == []
 
 
@@ -91,7 +97,13 @@ def test_cancelled_when_the_generator_is_closed() -> None:
 
 
 def test_a_wrong_number_of_workers() -> None:
-    assert_refused((lambda: run_batch(workers.following, [1], workers=0), ChoiceError, ("workers", "at least 1", "0")))
+    assert_refused(
+        (
+            lambda: run_batch(workers.following, [1], workers=0),
+            ChoiceError,
+            ("workers", "at least 1", "0"),
+        )
+    )
 
 
 def test_the_folders_are_marked_meanwhile(tmp_path: Path) -> None:
@@ -107,13 +119,19 @@ def test_a_worker_with_another_folder_of_the_same_name(tmp_path: Path) -> None:
     with marked(Places(writes=(tmp_path,))) as seen:
         for mark in tmp_path.iterdir():
             mark.unlink()  # as on a host where the folder is another one
-        assert_refused((Call(workers.following, 1, seen), WorkerError, rf"does not see {tmp_path}; give"))
+        assert_refused(
+            (Call(workers.following, 1, seen), WorkerError, rf"does not see {tmp_path}; give")
+        )
 
 
 def test_a_worker_with_another_version(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    sent = pickle.dumps(Call(workers.following, 1, (str(tmp_path),)))  # not checked yet in this process
+    sent = pickle.dumps(
+        Call(workers.following, 1, (str(tmp_path),))
+    )  # not checked yet in this process
     monkeypatch.setattr("deepaccident_devkit.support.parallel.batches.__version__", "9.9")
-    assert_refused((pickle.loads(sent), WorkerError, ("a worker on ", "deepaccident_devkit 9.9", "install")))
+    assert_refused(
+        (pickle.loads(sent), WorkerError, ("a worker on ", "deepaccident_devkit 9.9", "install"))
+    )
 
 
 @pytest.mark.parametrize(
@@ -128,7 +146,11 @@ def test_a_worker_without_the_package(error: Exception) -> None:
     failed.set_exception(error)
     executor = Mock(spec=Executor, submit=lambda *_, **__: failed)
     assert_refused(
-        (lambda: run_batch(workers.following, [1], executor=executor), WorkerError, "^a worker cannot do the work")
+        (
+            lambda: run_batch(workers.following, [1], executor=executor),
+            WorkerError,
+            "^a worker cannot do the work",
+        )
     )
 
 
@@ -137,7 +159,9 @@ def full_disk(item: int) -> int:
 
 
 def test_a_full_disk_ends_it_all() -> None:
-    assert_refused((lambda: run_batch(Tried(full_disk), range(5), workers=1), OSError, "No space left"))
+    assert_refused(
+        (lambda: run_batch(Tried(full_disk), range(5), workers=1), OSError, "No space left")
+    )
 
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
@@ -155,7 +179,10 @@ def ctrl_c_counts() -> Iterator[None]:
 
 
 def test_a_killed_worker_is_our_error() -> None:
-    with pytest.raises(WorkerError, match=r"^a worker process was killed \(.*memory ran out; .* with fewer workers$"):
+    with pytest.raises(
+        WorkerError,
+        match=r"^a worker process was killed \(.*memory ran out; .* with fewer workers$",
+    ):
         run_batch(workers.killed, range(6), workers=2)
 
 
@@ -194,7 +221,9 @@ def test_ctrl_c_ends_the_workers_at_once(tmp_path: Path) -> None:
     waiting = threading.Thread(target=wait_and_raise_ctrl_c, args=(tmp_path,))
     waiting.start()
     with pytest.raises(KeyboardInterrupt):
-        run_batch(workers.told_and_asleep, [str(tmp_path / str(item)) for item in range(6)], workers=2)
+        run_batch(
+            workers.told_and_asleep, [str(tmp_path / str(item)) for item in range(6)], workers=2
+        )
     waiting.join()
     assert_workers_end(tmp_path)
     assert [signal.getsignal(number) for number in SIGNALS] == before
@@ -202,7 +231,9 @@ def test_ctrl_c_ends_the_workers_at_once(tmp_path: Path) -> None:
 
 def test_an_error_lets_others_end_what_they_do(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"^broken$"):
-        run_batch(workers.told_or_broken, [str(tmp_path / str(item)) for item in range(20)], workers=2)
+        run_batch(
+            workers.told_or_broken, [str(tmp_path / str(item)) for item in range(20)], workers=2
+        )
     assert 0 < len(list(tmp_path.iterdir())) < 10
 
 
@@ -222,7 +253,11 @@ def test_signals_wait_for_the_start_of_processes(number: signal.Signals) -> None
 def test_what_is_sent_needs_no_devkit_before_it_is_called() -> None:
     """A dask scheduler unpickles it too, and a worker that cannot ends without a word."""
     sent = pickle.dumps(Call(workers.following, 1, ()))
-    names = [argument for code, argument, _ in pickletools.genops(sent) if "GLOBAL" in code.name or "UNI" in code.name]
+    names = [
+        argument
+        for code, argument, _ in pickletools.genops(sent)
+        if "GLOBAL" in code.name or "UNI" in code.name
+    ]
     assert names
     assert not any("deepaccident" in str(name) or "workers" in str(name) for name in names)
     assert pickle.loads(sent)() == 2

@@ -48,7 +48,9 @@ def test_a_dead_scheduler() -> None:
         f'{{"address": "{"x" * 100}://"}}',
     ],
 )
-def test_a_wrong_scheduler_file(tmp_path: Path, content: str | None, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_wrong_scheduler_file(
+    tmp_path: Path, content: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
     import distributed  # noqa: F401 - as above
     from dask import config
 
@@ -71,7 +73,9 @@ def test_a_wrong_scheduler_file(tmp_path: Path, content: str | None, monkeypatch
     ]
 
 
-@pytest.mark.parametrize(("package", "address"), [("distributed", "tcp://127.0.0.1:1"), ("mpi4py", "mpi")])
+@pytest.mark.parametrize(
+    ("package", "address"), [("distributed", "tcp://127.0.0.1:1"), ("mpi4py", "mpi")]
+)
 def test_without_the_package(monkeypatch: pytest.MonkeyPatch, package: str, address: str) -> None:
     monkeypatch.setitem(sys.modules, package, None)
     with pytest.raises(MissingExtraError, match="pip install"), cluster_executor(address):
@@ -93,7 +97,10 @@ def test_errors_of_the_work_are_not_those_of_workers(error: Exception) -> None:
 def test_the_option_of_verbs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     words = ["index", "release", "--scheduler"]
     refused = CliRunner().invoke(deepaccident, [*words, "tcp://x", "--workers", "2"])
-    assert (refused.exit_code, "--workers changes nothing with a scheduler" in refused.output) == (2, True)
+    assert (refused.exit_code, "--workers changes nothing with a scheduler" in refused.output) == (
+        2,
+        True,
+    )
     monkeypatch.setattr("deepaccident_devkit.support.parallel.executors.ADDRESS_WAIT", 0.2)
     absent = [*words, str(tmp_path / "absent.json")]
     invoke = partial(CliRunner().invoke, deepaccident, absent, catch_exceptions=False)
@@ -102,7 +109,9 @@ def test_the_option_of_verbs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
 
 def test_processes_that_cannot_be_started_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
     """The locks of a pool lie in /dev/shm, which may be full."""
-    monkeypatch.setattr(concurrent.futures, "ProcessPoolExecutor", Mock(side_effect=OSError(28, "No space left")))
+    monkeypatch.setattr(
+        concurrent.futures, "ProcessPoolExecutor", Mock(side_effect=OSError(28, "No space left"))
+    )
     facts = ("cannot be started", "No space left", "/dev/shm", "fewer workers")  # noqa: S108
     assert_refused((lambda: run_batch(abs, range(9), workers=2), WorkerError, facts))
 

@@ -65,9 +65,16 @@ def test_who_holds_a_lock_that_is_gone_does_not_finish(tmp_path: Path, removed: 
             assert another.alone(wait=False)
 
 
-@given(content=st.binary(max_size=40), at=st.integers(0, 60), byte=st.integers(1, 255), cut=st.booleans())
+@given(
+    content=st.binary(max_size=40),
+    at=st.integers(0, 60),
+    byte=st.integers(1, 255),
+    cut=st.booleans(),
+)
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
-def test_a_damaged_result_is_none(tmp_path: Path, content: bytes, at: int, byte: int, cut: bool) -> None:
+def test_a_damaged_result_is_none(
+    tmp_path: Path, content: bytes, at: int, byte: int, cut: bool
+) -> None:
     store = Store(tmp_path / "store", tmp_path, "tests", ConfigError)
     store.keep("a/b", "key", content)
     assert store.kept("a/b", "key") == content
@@ -81,24 +88,39 @@ def test_a_damaged_result_is_none(tmp_path: Path, content: bytes, at: int, byte:
 
 
 def test_a_failure_hides_no_result(tmp_path: Path) -> None:
-    with pytest.raises(SomeFailedError, match=r"out: 2 of 12 failed:\n  type/02: type/02: broken\n  type/03: type/03"):
+    with pytest.raises(
+        SomeFailedError,
+        match=r"out: 2 of 12 failed:\n  type/02: type/02: broken\n  type/03: type/03",
+    ):
         made(tmp_path, broken=ITEMS[2:4])
     assert not (tmp_path / "out").exists()
     made(tmp_path)
     assert (tmp_path / "out").read_bytes() == WHOLE
-    assert len(marks(tmp_path)) == len(ITEMS)  # of this process; the marks of failures are the same files
+    assert len(marks(tmp_path)) == len(
+        ITEMS
+    )  # of this process; the marks of failures are the same files
 
 
-@pytest.mark.parametrize("place", ["locks", "locks/type", f"locks/{ITEMS[1]}", "kept", "kept/type", ".lock", ".making"])
+@pytest.mark.parametrize(
+    "place", ["locks", "locks/type", f"locks/{ITEMS[1]}", "kept", "kept/type", ".lock", ".making"]
+)
 def test_no_link_is_followed(tmp_path: Path, place: str) -> None:
     folder, outside = tmp_path / "out.unfinished", tmp_path / "outside"
     outside.mkdir()
     (outside / "precious").touch()
     link = folder / place
     link.parent.mkdir(parents=True, exist_ok=True)
-    link.symlink_to(outside / "precious" if place.endswith(("lock", "making", ITEMS[1])) else outside)
+    link.symlink_to(
+        outside / "precious" if place.endswith(("lock", "making", ITEMS[1])) else outside
+    )
     before = (outside / "precious").stat()
-    assert_refused((lambda: made(tmp_path), OutputFolderError, "a symbolic link, which no devkit makes; remove it"))
+    assert_refused(
+        (
+            lambda: made(tmp_path),
+            OutputFolderError,
+            "a symbolic link, which no devkit makes; remove it",
+        )
+    )
     assert [each.name for each in outside.iterdir()] == ["precious"]
     assert (outside / "precious").stat() == before
 
@@ -134,7 +156,11 @@ def test_what_cannot_be_written_is_an_error_of_the_caller(tmp_path: Path) -> Non
 
     (tmp_path / "file").touch()
     assert_refused(
-        (fill, ConfigError, ("out: cannot be written (no room)", "make room there, or choose another")),
+        (
+            fill,
+            ConfigError,
+            ("out: cannot be written (no room)", "make room there, or choose another"),
+        ),
         (
             lambda: store_in(tmp_path / "file").shared().__enter__(),
             ConfigError,
@@ -187,7 +213,11 @@ def test_a_file_system_without_locks(
         assert list(made(tmp_path).values()) == WHOLE.split(b"\n")
         (tmp_path / "out").unlink()
     [said] = [record.getMessage() for record in caplog.records]
-    assert [fact for fact in (str(tmp_path / "out"), "locks", reason, "twice at once") if fact not in said] == []
+    assert [
+        fact
+        for fact in (str(tmp_path / "out"), "locks", reason, "twice at once")
+        if fact not in said
+    ] == []
     assert not store_in(tmp_path).folder.exists()
 
 
@@ -196,16 +226,24 @@ def test_a_lock_that_is_never_given_back(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(module, "_WAIT_HOURS", 0.0001)
-    one, other = (Store(tmp_path / "store", tmp_path / "out", "tests", ConfigError, name) for name in ("one", "other"))
+    one, other = (
+        Store(tmp_path / "store", tmp_path / "out", "tests", ConfigError, name)
+        for name in ("one", "other")
+    )
     facts = ("out: another process", "0.0001 hours", str(tmp_path / "store"))
     with one.shared() as turn, one.shared():
-        assert_refused((lambda: other.shared().__enter__(), ConfigError, facts), (turn.alone, ConfigError, facts))
+        assert_refused(
+            (lambda: other.shared().__enter__(), ConfigError, facts),
+            (turn.alone, ConfigError, facts),
+        )
     assert ["at most 0.0001 hours" in record.getMessage() for record in caplog.records] == [True]
     with other.shared():
         pass
 
 
-def test_a_disk_that_takes_half_of_a_locks_text_is_full(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_disk_that_takes_half_of_a_locks_text_is_full(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Nobody else has written it, so there is nobody to wait for."""
     write = os.pwrite
     monkeypatch.setattr(os, "pwrite", lambda file, content, place: write(file, content[:3], place))

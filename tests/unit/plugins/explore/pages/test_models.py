@@ -20,7 +20,12 @@ from wording import holding, lacking
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.evaluation import Accident, Resampling, ResultsWriter
-from deepaccident_devkit.evaluation.runs import EvaluationRun, default_selection, evaluate_results, save_run
+from deepaccident_devkit.evaluation.runs import (
+    EvaluationRun,
+    default_selection,
+    evaluate_results,
+    save_run,
+)
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 from deepaccident_devkit.plugins.explore import Explorer, make_app
 from deepaccident_devkit.plugins.explore.evaluations import verdict_text
@@ -62,7 +67,11 @@ class Site:
         """The samples of all pages of a list, in order."""
         page = self.page(address)
         found = [sample_of(urljoin(address, each)) for each in hrefs(page, "entry")]
-        return found + [token for each in hrefs(page, rel="next") for token in self.samples(urljoin(address, each))]
+        return found + [
+            token
+            for each in hrefs(page, rel="next")
+            for token in self.samples(urljoin(address, each))
+        ]
 
     def rows(self, name: str) -> Any:
         return self.explorer.models[name].rows
@@ -71,7 +80,11 @@ class Site:
 def hrefs(page: str, kind: str = "", rel: str = "") -> list[str]:
     """Addresses of the links of a class or relation, or of all links in the content."""
     tags = re.findall(r"<a [^>]*>", page.partition('<main id="content">')[2])
-    wanted = [each for each in tags if (f'class="{kind}"' in each or not kind) and (f'rel="{rel}"' in each or not rel)]
+    wanted = [
+        each
+        for each in tags
+        if (f'class="{kind}"' in each or not kind) and (f'rel="{rel}"' in each or not rel)
+    ]
     return [html.unescape(re.findall(r'href="([^"]*)"', each)[0]) for each in wanted]
 
 
@@ -87,7 +100,9 @@ def sample_of(address: str) -> str:
 
 def of(kind: str, name: str, *parts: str, **query: str) -> str:
     """An address below a model."""
-    return f"/{kind}/{quote(name, safe='')}/{'/'.join(parts)}" + (f"?{urlencode(query)}" if query else "")
+    return f"/{kind}/{quote(name, safe='')}/{'/'.join(parts)}" + (
+        f"?{urlencode(query)}" if query else ""
+    )
 
 
 def written(path: Path, foreseen: Sequence[Accident], tokens: Sequence[str]) -> Path:
@@ -112,8 +127,12 @@ def edit_summary(folder: Path, edit: Callable[[dict[str, Any]], object]) -> None
     path.write_text(json.dumps(summary))
 
 
-def bundle(da: DeepAccident, folder: Path, path: Path, setup: EvaluationSetup = BOXES, **how: Any) -> EvaluationRun:
-    run = evaluate_results(da, path, setup, default_selection(setup, "train"), workers=1, allow_partial=True)
+def bundle(
+    da: DeepAccident, folder: Path, path: Path, setup: EvaluationSetup = BOXES, **how: Any
+) -> EvaluationRun:
+    run = evaluate_results(
+        da, path, setup, default_selection(setup, "train"), workers=1, allow_partial=True
+    )
     run = run.broken_down(BREAKDOWNS, Resampling(resamples=20))
     save_run(run, folder, **how)
     return run
@@ -131,17 +150,24 @@ def site(da_motion: DeepAccident, tmp_path_factory: pytest.TempPathFactory) -> I
     runs["second"] = bundle(da, folder / "second", quiet)
     runs["paper"] = bundle(da, folder / "paper", quiet, replace(BOXES, protocol="paper"))
     runs["part"] = bundle(
-        da, folder / "part", written(folder / "few.json", ELSEWHERE, tokens[::2]), include_results=True
+        da,
+        folder / "part",
+        written(folder / "few.json", ELSEWHERE, tokens[::2]),
+        include_results=True,
     )
     shutil.copytree(folder / "second", folder / HOSTILE)
     edit_summary(folder / HOSTILE, make_hostile)
     for task in ("motion", "detection", "warning", "forecasting"):
         clean = task in ("warning", "forecasting")
         setup = EvaluationSetup(task=task, protocol="clean" if clean else "released")
-        runs[task], _ = stored_run(da, setup, folder / ("maps" if task == "motion" else f"{task}.json"))
+        runs[task], _ = stored_run(
+            da, setup, folder / ("maps" if task == "motion" else f"{task}.json")
+        )
         save_run(runs[task], folder / task, include_results=True)
     alone = written(folder / "alone.json", ELSEWHERE, tokens)
-    explorer = Explorer(da, bundles=[folder / name for name in (*runs, HOSTILE)], results=[alone], workers=1)
+    explorer = Explorer(
+        da, bundles=[folder / name for name in (*runs, HOSTILE)], results=[alone], workers=1
+    )
     explorer.begin()
     yield Site(explorer, runs, folder)
     explorer.jobs.end()
@@ -192,8 +218,12 @@ def main_number(run: EvaluationRun, token: str) -> float | None:
 def test_a_scenario_and_a_group_can_be_chosen_together(site: Site) -> None:
     tokens = site.runs["detection"].attributes
     scenario = min(each.scenario for each in tokens.values())
-    found = site.samples(of("model", "detection", "samples", by="agent", value="infrastructure", scenario=scenario))
-    assert sorted(found) == sorted(each for each in tokens if each.startswith(f"{scenario}/infrastructure/"))
+    found = site.samples(
+        of("model", "detection", "samples", by="agent", value="infrastructure", scenario=scenario)
+    )
+    assert sorted(found) == sorted(
+        each for each in tokens if each.startswith(f"{scenario}/infrastructure/")
+    )
     for nothing in ("scenario=no/such", "by=agent&value=nobody"):
         assert not site.samples(f"/model/detection/samples?{nothing}")
 
@@ -203,26 +233,48 @@ def test_warnings_are_listed_in_time_sixty_a_page(site: Site) -> None:
     address, tokens = "/model/warning/samples", site.runs["warning"].evaluator.tokens
     assert site.samples(address) == sorted(tokens)
     assert "worst" not in site.page(address)
-    assert [len(hrefs(site.page(f"{address}?page={page}"), "entry")) for page in (1, 2)] == [60, len(tokens) - 60]
-    assert all(hrefs(site.page(f"{address}?page={page}"), "entry") for page in ("-1", "0", "x", "99999999999"))
+    assert [len(hrefs(site.page(f"{address}?page={page}"), "entry")) for page in (1, 2)] == [
+        60,
+        len(tokens) - 60,
+    ]
+    assert all(
+        hrefs(site.page(f"{address}?page={page}"), "entry")
+        for page in ("-1", "0", "x", "99999999999")
+    )
 
 
 # verdicts
 
 
 def test_accident_verdicts_are_those_of_the_evaluator(site: Site) -> None:
-    for name, token in ((each, token) for each in ("first", "second", "part") for token in site.rows(each)):
+    for name, token in (
+        (each, token) for each in ("first", "second", "part") for token in site.rows(each)
+    ):
         within, row = site.runs[name].evaluator.compute([token]).within, site.rows(name)[token]
-        whole = ", ".join(f"{distance:g} m: {count_words(each)}" for distance, each in within.items())
+        whole = ", ".join(
+            f"{distance:g} m: {count_words(each)}" for distance, each in within.items()
+        )
         assert verdict_text("accident", row).split(",")[0] == count_words(within[15.0])
         assert verdict_text("accident", row, whole=True).startswith(whole)
     page = site.page(of("model", "first", "sample", sample_path(a_sample(site))))
-    assert verdict_text("accident", site.rows("first")[a_sample(site)], whole=True) in html.unescape(page)
+    assert verdict_text(
+        "accident", site.rows("first")[a_sample(site)], whole=True
+    ) in html.unescape(page)
 
 
-@pytest.mark.parametrize("task", ["accident", "motion", "detection", "warning", "planning", "forecasting"])
+@pytest.mark.parametrize(
+    "task", ["accident", "motion", "detection", "warning", "planning", "forecasting"]
+)
 def test_verdicts_of_a_strange_row_are_no_error(task: str) -> None:
-    row = {"tp_5m": "<b>", "tp_..m": 1, "pq_1x1": "x", "pq_..x.": None, "iou_1x1": True, "truths": 1e400, "tp_.": [1]}
+    row = {
+        "tp_5m": "<b>",
+        "tp_..m": 1,
+        "pq_1x1": "x",
+        "pq_..x.": None,
+        "iou_1x1": True,
+        "truths": 1e400,
+        "tp_.": [1],
+    }
     for whole in (False, True):
         assert {type(verdict_text(task, each, whole=whole)) for each in (row, {})} == {str}
 
@@ -262,7 +314,9 @@ def test_a_sample_leads_to_the_ones_before_and_after(site: Site) -> None:
     links += [re.findall(f'<a id="{name}" href="([^"]+)"', page)[0] for name in ("worse", "better")]
     expected = [*same[at - 1 : at], *same[at + 1 : at + 2], worse, better]
     assert [sample_of(urljoin(address, each)) for each in links] == expected
-    assert f"/scenario/{scenario}/?frame={int(frame)}&model=first" in [urljoin(address, each) for each in hrefs(page)]
+    assert f"/scenario/{scenario}/?frame={int(frame)}&model=first" in [
+        urljoin(address, each) for each in hrefs(page)
+    ]
 
 
 def test_a_sample_that_is_not_evaluated_is_a_sentence(site: Site) -> None:
@@ -276,16 +330,22 @@ def test_a_sample_that_is_not_evaluated_is_a_sentence(site: Site) -> None:
 # results that are not given, and what is not opened
 
 
-def test_the_results_that_a_bundle_names_are_not_opened(site: Site, opened: Callable[..., Site]) -> None:
+def test_the_results_that_a_bundle_names_are_not_opened(
+    site: Site, opened: Callable[..., Site]
+) -> None:
     """They are there, and the release has all samples; yet a bundle may come from anywhere."""
     path = site.explorer.models["second"].bundle.summary["results"]["path"]  # type: ignore[union-attr]
     assert Path(path).is_file()
     address = of("model", "second", "sample", sample_path(a_sample(site, "second")))
     names: set[str] = set()
     watching = [True]  # a hook cannot be taken away again
-    sys.addaudithook(lambda event, told: watching and event == "open" and names.add(Path(str(told[0])).name))
+    sys.addaudithook(
+        lambda event, told: watching and event == "open" and names.add(Path(str(told[0])).name)
+    )
     other = opened(bundles=[site.folder / "second"])
-    page, of_model, _ = (other.page(each) for each in (address, "/model/second/", "/model/second/samples"))
+    page, of_model, _ = (
+        other.page(each) for each in (address, "/model/second/", "/model/second/samples")
+    )
     assert other.get(f"{address}/above.png").status == 404
     watching.clear()
     assert ("samples.parquet" in names, Path(path).name in names) == (True, False)
@@ -296,16 +356,27 @@ def test_the_results_that_a_bundle_names_are_not_opened(site: Site, opened: Call
 def test_given_results_join_their_bundle(site: Site, opened: Callable[..., Site]) -> None:
     other = opened(bundles=[site.folder / "second"], results=[site.folder / "quiet.json"])
     assert [*other.explorer.models] == ["second"]
-    assert images(other.page(of("model", "second", "sample", sample_path(a_sample(site, "second")))))
+    assert images(
+        other.page(of("model", "second", "sample", sample_path(a_sample(site, "second"))))
+    )
 
 
 # the command
 
 
-def test_results_without_an_evaluation_show_how_to_make_one(site: Site, da_motion: DeepAccident) -> None:
+def test_results_without_an_evaluation_show_how_to_make_one(
+    site: Site, da_motion: DeepAccident
+) -> None:
     (shown,) = re.findall(r'<pre class="wide" id="command">(.*?)</pre>', site.page("/model/alone/"))
     words = ["deepaccident", "evaluate", "accident", str(da_motion.dataroot), "--version", "v1"]
-    words += ["--results", str(site.folder / "alone.json"), "--protocol", "boxes", "--out", "alone_bundle"]
+    words += [
+        "--results",
+        str(site.folder / "alone.json"),
+        "--protocol",
+        "boxes",
+        "--out",
+        "alone_bundle",
+    ]
     assert shlex.split(html.unescape(shown)) == words
 
 
@@ -313,16 +384,29 @@ def test_results_without_an_evaluation_show_how_to_make_one(site: Site, da_motio
 
 
 def test_names_are_escaped_and_lead_to_their_pages(site: Site) -> None:
-    address = urljoin("/models/", next(each for each in hrefs(site.page("/models/"), "entry") if "onerror" in each))
+    address = urljoin(
+        "/models/",
+        next(each for each in hrefs(site.page("/models/"), "entry") if "onerror" in each),
+    )
     own, listed = site.page(address), site.page(urljoin(address, "samples"))
     sample = site.page(urljoin(urljoin(address, "samples"), hrefs(listed, "entry")[0]))
-    for page in (site.page("/models/"), own, listed, sample, site.page(of("compare", "first", HOSTILE_PART, ""))):
+    for page in (
+        site.page("/models/"),
+        own,
+        listed,
+        sample,
+        site.page(of("compare", "first", HOSTILE_PART, "")),
+    ):
         assert not holding(page, "<img src=x", "<script>alert", "<svg onload", "<b onclick")
     assert not lacking(own, "All 20 samples", html.escape("<b onclick=x>"))
-    assert urljoin(address, next(each for each in hrefs(own) if "onload" in each)).startswith(address)
+    assert urljoin(address, next(each for each in hrefs(own) if "onload" in each)).startswith(
+        address
+    )
 
 
-HOSTILE_PART = "%3Cimg%20src%3Dx%20onerror%3Dalert%281%29%3E%20%22a%22%20%26%20%27b%27%20..%252e%252e%3F%23%3B"
+HOSTILE_PART = (
+    "%3Cimg%20src%3Dx%20onerror%3Dalert%281%29%3E%20%22a%22%20%26%20%27b%27%20..%252e%252e%3F%23%3B"
+)
 
 
 @pytest.mark.parametrize(
@@ -349,7 +433,14 @@ def test_what_is_not_there_is_not_found(site: Site, address: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "address", ["/models/", "/model/first/", "/model/alone/", "/model/first/samples", "/compare/first/second/"]
+    "address",
+    [
+        "/models/",
+        "/model/first/",
+        "/model/alone/",
+        "/model/first/samples",
+        "/compare/first/second/",
+    ],
 )
 def test_pages_keep_to_the_policy(site: Site, address: str) -> None:
     """No style and script in the page, and only relative addresses."""
@@ -357,7 +448,9 @@ def test_pages_keep_to_the_policy(site: Site, address: str) -> None:
     assert re.findall(forbidden, site.page(address)) == []
 
 
-def test_a_damaged_summary_is_a_sentence(site: Site, opened: Callable[..., Site], tmp_path: Path) -> None:
+def test_a_damaged_summary_is_a_sentence(
+    site: Site, opened: Callable[..., Site], tmp_path: Path
+) -> None:
     shutil.copytree(site.folder / "second", tmp_path / "broken")
     edit_summary(tmp_path / "broken", lambda summary: summary["headlines"][0].update(name={"a": 1}))
     answer = opened(bundles=[tmp_path / "broken"]).get("/model/broken/")
@@ -367,13 +460,21 @@ def test_a_damaged_summary_is_a_sentence(site: Site, opened: Callable[..., Site]
 # marks and warnings
 
 
-def test_another_release_lacks_the_samples(site: Site, da: DeepAccident, opened: Callable[..., Site]) -> None:
+def test_another_release_lacks_the_samples(
+    site: Site, da: DeepAccident, opened: Callable[..., Site]
+) -> None:
     other = opened(da, bundles=[site.folder / "first"])
-    assert sorted(other.samples("/model/first/samples")) == sorted(site.runs["first"].evaluator.tokens)
+    assert sorted(other.samples("/model/first/samples")) == sorted(
+        site.runs["first"].evaluator.tokens
+    )
     for address, *told in (
         ("/model/first/", "1 scenario of this evaluation is not in this release"),
         ("/model/first/samples?by=agent&value=ego_vehicle", "20 samples are not in this release"),
-        (of("model", "first", "sample", sample_path(a_sample(site))), "This sample is not in this release.", "5 m: "),
+        (
+            of("model", "first", "sample", sample_path(a_sample(site))),
+            "This sample is not in this release.",
+            "5 m: ",
+        ),
     ):
         assert not lacking(other.page(address), *told)
 
@@ -401,7 +502,10 @@ def test_a_comparison_has_the_largest_differences_first(site: Site) -> None:
 
 
 def test_what_cannot_be_compared_says_why(site: Site) -> None:
-    whys = {"second/paper": "not evaluated by the same rules", "first/motion": "compare two of the same task"}
+    whys = {
+        "second/paper": "not evaluated by the same rules",
+        "first/motion": "compare two of the same task",
+    }
     for pair, why in whys.items():
         assert not lacking(html.unescape(site.page(f"/compare/{pair}/")), "cannot be compared", why)
     assert site.samples("/compare/second/paper/")  # the samples can be, by their own numbers
@@ -411,10 +515,15 @@ def test_two_models_at_the_same_moment(site: Site) -> None:
     token = site.samples("/compare/first/second/?better=a")[0]
     address = of("compare", "first", "second", "sample", sample_path(token), better="a")
     page = site.page(address)
-    verdicts = [verdict_text("accident", site.rows(name)[token], whole=True) for name in ("first", "second")]
+    verdicts = [
+        verdict_text("accident", site.rows(name)[token], whole=True) for name in ("first", "second")
+    ]
     assert not lacking(html.unescape(page), *verdicts)
     pictures = [urlsplit(each).path.rsplit("/", 1)[1] for each in images(page)]
-    assert (page.count("<section"), pictures) == (2, ["above.png", "cameras.png"])  # second has none
+    assert (page.count("<section"), pictures) == (
+        2,
+        ["above.png", "cameras.png"],
+    )  # second has none
     assert [site.get(urljoin(address, each)).status for each in images(page)] == [200, 200]
     swapped = of("compare", "second", "first", "sample", sample_path(token), better="b")
     assert [urljoin(address, each) for each in hrefs(page) if "/second/first/" in each] == [swapped]

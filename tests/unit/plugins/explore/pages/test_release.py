@@ -72,7 +72,9 @@ def of_damaged(damaged: Damaged, request: pytest.FixtureRequest) -> Reader:
 def mapped(da: DeepAccident, tmp_path: Path, request: pytest.FixtureRequest) -> Reader:
     """Of a release with BEV cameras and without a kept map."""
     shutil.copytree(
-        da.dataroot, tmp_path / "release", ignore=shutil.ignore_patterns("Camera_*", "town_maps", "lidar01")
+        da.dataroot,
+        tmp_path / "release",
+        ignore=shutil.ignore_patterns("Camera_*", "town_maps", "lidar01"),
     )
     return reading(DeepAccident("v1", tmp_path / "release", verbose=False), request)
 
@@ -88,7 +90,9 @@ def test_all_links_lead_somewhere(of_damaged: Reader) -> None:
         assert not [address for address in named if re.match(r"[a-z]+:|/", address)]
         loads = [address for address in page.loads if not address.startswith("data:")]
         seen |= {urljoin(f"/release/{tab}", address) for address in (*named, *loads)}
-    assert [each for each in sorted(seen) if get(of_damaged.app, each).status not in (200, 307)] == []
+    assert [
+        each for each in sorted(seen) if get(of_damaged.app, each).status not in (200, 307)
+    ] == []
     assert not lacking(" ".join(seen), "/release/", "/scenario/")
 
 
@@ -104,7 +108,9 @@ def test_a_page_waits_for_its_work(reader: Reader) -> None:
 
 
 def test_what_fails_is_told(reader: Reader, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(release, "overview", Mock(side_effect=NotAvailableError("the disk <is> gone")))
+    monkeypatch.setattr(
+        release, "overview", Mock(side_effect=NotAvailableError("the disk <is> gone"))
+    )
     page = reader.ready("/release/")
     assert ("This cannot be told: the disk <is> gone" in page.text, page.all("is")) == (True, [])
 
@@ -115,10 +121,19 @@ def test_what_fails_is_told(reader: Reader, monkeypatch: pytest.MonkeyPatch) -> 
 def test_the_contents_are_the_overviews(of_damaged: Reader, damaged: Damaged) -> None:
     told, page = overview(damaged.dataset), of_damaged.ready("/release/")
     assert not lacking(page.text, told.dataroot, told.version, told.layout, told.index, __version__)
-    assert {heading: [row[:3] for row in page.table(heading)] for heading in ("split", "agent", "channel")} == {
-        "split": [[name, str(count), str(told.expected[name])] for name, count in told.splits.items()],
-        "agent": [[name, str(count), str(told.labelled[name])] for name, count in told.agents.items()],
-        "channel": [[name, str(count), str(told.files[name])] for name, count in told.channels.items()],
+    assert {
+        heading: [row[:3] for row in page.table(heading)]
+        for heading in ("split", "agent", "channel")
+    } == {
+        "split": [
+            [name, str(count), str(told.expected[name])] for name, count in told.splits.items()
+        ],
+        "agent": [
+            [name, str(count), str(told.labelled[name])] for name, count in told.agents.items()
+        ],
+        "channel": [
+            [name, str(count), str(told.files[name])] for name, count in told.channels.items()
+        ],
     }
     assert {row[3] for row in page.table("channel")} == {str(told.samples)}
     assert page.table("table") == [[name, f"{count:,}"] for name, count in told.tables.items()]
@@ -136,14 +151,18 @@ def test_its_counts_lead_to_as_many_scenarios(of_damaged: Reader, damaged: Damag
             if field in ("weather", "time_of_day", "road_type", "accident_type"):
                 assert len(links) == len(values)
                 address = links[[*values].index(value)]
-            (shown,) = re.findall(r'<b id="count">(\d+)</b>', get(of_damaged.app, urljoin("/release/", address)).text)
+            (shown,) = re.findall(
+                r'<b id="count">(\d+)</b>', get(of_damaged.app, urljoin("/release/", address)).text
+            )
             counted[field, value], found[field, value] = values[value], int(shown)
     assert found == counted
 
 
 def test_values_that_would_find_nothing_are_no_filters(reader: Reader) -> None:
     page = get(reader.app, "/?collision=true").text
-    counts = re.findall(r'name="(\w+)" value="([^"]*)"( checked)?>\n<span>.*?</span> <b>(\d+)</b>', page)
+    counts = re.findall(
+        r'name="(\w+)" value="([^"]*)"( checked)?>\n<span>.*?</span> <b>(\d+)</b>', page
+    )
     assert {name for name, *_ in counts} > {"town", "collision"}
     assert [each for each in counts if each[3] == "0"] == []
 
@@ -157,11 +176,16 @@ def test_hostile_names_are_text(own_release: Path, request: pytest.FixtureReques
         path.rename(path.with_name(path.name.replace("Town", "<i>&Town")))
     for path in own_release.rglob("*.txt"):
         if path.parent.name in ("split_txt_files", own_release.name):
-            path.write_text(path.read_text().replace(first["name"], first["name"].replace("Town", "<i>&Town")))
+            path.write_text(
+                path.read_text().replace(first["name"], first["name"].replace("Town", "<i>&Town"))
+            )
     reader = reading(DeepAccident("v1", own_release, verbose=False), request)
     for tab in ("", "maps"):
         page = reader.ready(f"/release/{tab}")
-        assert (page.all("i"), [script for script in page.all("script") if "src" not in script]) == ([], [])
+        assert (
+            page.all("i"),
+            [script for script in page.all("script") if "src" not in script],
+        ) == ([], [])
         assert "<i>&Town" in page.text
 
 
@@ -171,7 +195,10 @@ def test_hostile_names_are_text(own_release: Path, request: pytest.FixtureReques
 def test_maps_that_are_kept_are_shown(mapped: Reader) -> None:
     town, *others = towns_of(mapped.explorer.dataset)
     before, picture = mapped.page("/release/maps"), f"/release/map/{town}.png"
-    assert (before.text.count("Not made yet"), get(mapped.app, picture).status) == (len(others) + 1, 404)
+    assert (before.text.count("Not made yet"), get(mapped.app, picture).status) == (
+        len(others) + 1,
+        404,
+    )
     town_map(mapped.explorer.dataset, town)
     page = mapped.page("/release/maps")
     assert page.text.count("Not made yet") == len(others)

@@ -46,7 +46,10 @@ def here(da: DeepAccident) -> str:
 
 
 def image(answer: Answer) -> Image.Image:
-    assert (answer.status, answer.headers["content-type"] in ("image/jpeg", "image/png")) == (200, True)
+    assert (answer.status, answer.headers["content-type"] in ("image/jpeg", "image/png")) == (
+        200,
+        True,
+    )
     return Image.open(io.BytesIO(answer.body))
 
 
@@ -57,7 +60,11 @@ def status(app: Any, address: str) -> int:
 def test_no_page_is_made_in_the_servers_own_thread(app: Any, monkeypatch: Any) -> None:
     """It answers all others meanwhile."""
     found, threads = release.found_by, []
-    monkeypatch.setattr(release, "found_by", lambda *given: threads.append(threading.current_thread()) or found(*given))
+    monkeypatch.setattr(
+        release,
+        "found_by",
+        lambda *given: threads.append(threading.current_thread()) or found(*given),
+    )
     query, whole = "&".join(f"town=T{number}" for number in range(4000)), len(get(app, "/").text)
     for address in (f"/?{query}", f"/?{query}&view=table", f"/selection.txt?{query}"):
         answer = get(app, address)
@@ -65,23 +72,37 @@ def test_no_page_is_made_in_the_servers_own_thread(app: Any, monkeypatch: Any) -
     assert (len(threads), threading.main_thread() in threads) == (4, False)
 
 
-def test_the_page_plays_what_the_replay_plays(app: Any, here: str, da: DeepAccident, tmp_path: Path) -> None:
-    told, alone = data_of(get(app, here).text), data_of(render_replay(da, None, tmp_path / "replay.html"))
+def test_the_page_plays_what_the_replay_plays(
+    app: Any, here: str, da: DeepAccident, tmp_path: Path
+) -> None:
+    told, alone = (
+        data_of(get(app, here).text),
+        data_of(render_replay(da, None, tmp_path / "replay.html")),
+    )
     same = set(alone) - {"cameras", "points", "notes"}
     assert {name: told[name] for name in same} == {name: alone[name] for name in same}
     assert told["served"]["points"] == [[True] * 6] * 5
-    cameras = [[(each["channel"], each["pictures"]) for each in cameras] for cameras in told["cameras"]]
+    cameras = [
+        [(each["channel"], each["pictures"]) for each in cameras] for cameras in told["cameras"]
+    ]
     assert cameras == [[(channel, [1] * 6) for channel in CAMERAS]] * 5
 
 
 def test_its_address_ends_in_a_slash(app: Any, here: str) -> None:
     answer = get(app, f"{here.rstrip('/')}?frame=3")
-    assert (answer.status, answer.headers["location"]) == (307, f"./{here.strip('/').rsplit('/', 1)[1]}/?frame=3")
+    assert (answer.status, answer.headers["location"]) == (
+        307,
+        f"./{here.strip('/').rsplit('/', 1)[1]}/?frame=3",
+    )
 
 
-def test_images_are_the_releases_in_the_width_asked_for(app: Any, here: str, da: DeepAccident) -> None:
+def test_images_are_the_releases_in_the_width_asked_for(
+    app: Any, here: str, da: DeepAccident
+) -> None:
     address = f"{here}images/infrastructure/Camera_Back/2"
-    pictures = [image(get(app, address + query)) for query in ("?width=160", "?width=32", "", "?width=9999")]
+    pictures = [
+        image(get(app, address + query)) for query in ("?width=160", "?width=32", "", "?width=9999")
+    ]
     assert [each.size for each in pictures] == [(64, 36)] * 4  # these images are 64 wide
     wanted = da.load_image(f"{accident(da)}/infrastructure/002/Camera_Back").astype(int)
     assert np.abs(np.asarray(pictures[-1], dtype=int) - wanted).mean() < 7  # JPEG, twice
@@ -92,7 +113,10 @@ def test_points_are_the_agents_own(app: Any, here: str, da: DeepAccident) -> Non
     for agent in ("ego_vehicle", "infrastructure"):
         coded = get(app, f"{here}points/{agent}/3")
         assert coded.headers["content-type"].startswith("text/plain")
-        found = np.frombuffer(base64.b64decode(coded.body), dtype="<i2").reshape(-1, 3) / 10 + [*origin, 0.0]
+        found = np.frombuffer(base64.b64decode(coded.body), dtype="<i2").reshape(-1, 3) / 10 + [
+            *origin,
+            0.0,
+        ]
         cloud = da.load_point_cloud(f"{accident(da)}/{agent}/003", "world").xyz
         assert np.linalg.norm(found[:50, None] - cloud, axis=-1).min(axis=1).max() < 0.0867
         assert len(found) > 50
@@ -130,7 +154,9 @@ def test_what_is_not_there_is_said(app: Any, address: str) -> None:
 
 
 def test_the_parts_tell_what_the_devkit_tells(app: Any, here: str, da: DeepAccident) -> None:
-    story, pairs, ledger, _ = (get(app, f"{here}parts/{part}").text for part in PARTS if part != "twins")
+    story, pairs, ledger, _ = (
+        get(app, f"{here}parts/{part}").text for part in PARTS if part != "twins"
+    )
     assert da.describe(accident(da)).text in story.replace("&#39;", "'")
     rows = re.findall(r"<tr><th scope=\"row\">(.*?)</th><td>(yes|no)</td><td>([^<]*)</td>", pairs)
     known = da.interactions(accident(da)).pairs
@@ -149,9 +175,12 @@ def test_what_cannot_be_told_is_said_in_its_place(app: Any, da: DeepAccident) ->
 def test_a_moment_has_its_boxes(app: Any, here: str, da: DeepAccident) -> None:
     page = get(app, f"{here}moment/other_vehicle/2").text
     boxes = list(da.get_boxes(f"{accident(da)}/other_vehicle/002", "ego"))
-    rows = re.findall(r"<tr><th scope=\"row\">(\d+)</th><td>(\w+)</td><td>(-?\d+)</td>\s*<td>([-\d.]+)</td>", page)
+    rows = re.findall(
+        r"<tr><th scope=\"row\">(\d+)</th><td>(\w+)</td><td>(-?\d+)</td>\s*<td>([-\d.]+)</td>", page
+    )
     assert [(int(row), category, int(actor), float(x)) for row, category, actor, x in rows] == [
-        (row, box.category, box.actor_id, pytest.approx(box.center[0], abs=0.006)) for row, box in enumerate(boxes)
+        (row, box.category, box.actor_id, pytest.approx(box.center[0], abs=0.006))
+        for row, box in enumerate(boxes)
     ]
 
 
@@ -174,15 +203,22 @@ def test_a_partial_download_is_told(da_partial: DeepAccident) -> None:
     assert status(app, f"{here}points/infrastructure/1") == 404
 
 
-def test_a_moment_without_files_leads_to_the_nearest_with_any(da: DeepAccident, tmp_path: Path) -> None:
-    gone = shutil.ignore_patterns(".deepaccident", "*_005.jpg", "*_005.npz", "*_006.jpg", "*_006.npz")
+def test_a_moment_without_files_leads_to_the_nearest_with_any(
+    da: DeepAccident, tmp_path: Path
+) -> None:
+    gone = shutil.ignore_patterns(
+        ".deepaccident", "*_005.jpg", "*_005.npz", "*_006.jpg", "*_006.npz"
+    )
     root = shutil.copytree(da.dataroot, tmp_path / "r", ignore=gone)
     app, here = (
         make_app(Explorer(DeepAccident("v1", root, verbose=False))),
         f"/scenario/{accident(da)}/moment/ego_vehicle",
     )
     pages = {frame: get(app, f"{here}/{frame}").text for frame in (4, 6)}
-    told = {frame: re.findall(r'moment/ego_vehicle/(\d)">([\d.]+ s \w+), frame', page) for frame, page in pages.items()}
+    told = {
+        frame: re.findall(r'moment/ego_vehicle/(\d)">([\d.]+ s \w+), frame', page)
+        for frame, page in pages.items()
+    }
     assert told == {4: [], 6: [("4", "0.2 s earlier")]}
 
 
@@ -199,7 +235,9 @@ def test_a_broken_scenario_has_its_findings_alone(own_release: Path) -> None:
     app = make_app(explorer)
     page = get(app, f"/scenario/{token}/")
     assert (page.status, "label-unreadable" in page.text) == (200, True)
-    assert not lacking(get(app, "/").text, f'href="./scenario/{token}/"', "1 broken scenario is left out")
+    assert not lacking(
+        get(app, "/").text, f'href="./scenario/{token}/"', "1 broken scenario is left out"
+    )
 
 
 def test_names_are_text_everywhere(own_release: Path) -> None:
@@ -213,7 +251,10 @@ def test_names_are_text_everywhere(own_release: Path) -> None:
     (token,) = [each for each in explorer.scenarios.tokens if hostile in each]
     app, where = make_app(explorer), f"/scenario/{quote(token)}/"
     lists = ["/", "/?view=table", f"/?q={quote('name=' + hostile)}", "/?town=%3Cimg%3E&q=%3Cb%3E"]
-    parts = [f"{where}{part}" for part in ("", "twin", "moment/ego_vehicle/1", *(f"parts/{part}" for part in PARTS))]
+    parts = [
+        f"{where}{part}"
+        for part in ("", "twin", "moment/ego_vehicle/1", *(f"parts/{part}" for part in PARTS))
+    ]
     for address in (*lists, *parts):
         text = get(app, address).text
         assert not holding(text, "<img src=x", "<img>"), address
@@ -222,7 +263,9 @@ def test_names_are_text_everywhere(own_release: Path) -> None:
 
 
 def test_the_list_is_not_an_answer_to_all(app: Any) -> None:
-    saved, refused = (get(app, f"/selection.txt?{query}") for query in ("collision=true", "q=bogus%3D1"))
+    saved, refused = (
+        get(app, f"/selection.txt?{query}") for query in ("collision=true", "q=bogus%3D1")
+    )
     assert saved.headers["content-disposition"] == 'attachment; filename="selection.txt"'
     assert (refused.status, "bogus" in refused.text) == (409, True)
 
@@ -236,4 +279,6 @@ def test_static_files_are_kept_for_ever_and_nothing_else_is_one(app: Any) -> Non
 
 
 def test_no_such_bundle_is_one_sentence(da: DeepAccident, tmp_path: Path) -> None:
-    assert_refused((lambda: Explorer(da, bundles=[tmp_path / "none"]), ResultsError, "no such folder"))
+    assert_refused(
+        (lambda: Explorer(da, bundles=[tmp_path / "none"]), ResultsError, "no such folder")
+    )

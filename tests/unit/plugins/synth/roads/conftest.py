@@ -8,7 +8,9 @@ from deepaccident_devkit.plugins.synth.roads import Junction, RoadSpec
 
 SPECS = [
     RoadSpec(kind=kind, signalized=signalized, lanes=lanes)
-    for kind, signalized, lanes in itertools.product(["four-way", "three-way"], [True, False], [1, 2])
+    for kind, signalized, lanes in itertools.product(
+        ["four-way", "three-way"], [True, False], [1, 2]
+    )
 ]
 
 

@@ -24,7 +24,9 @@ def test_routes_begin_and_end_on_lane_centres(junction):
             (route.to_arm, route.path.xy[-1], route.path.yaw[-1], 1),
         ):
             out, heading = np.array(OUTWARD[arm], dtype=float), sign * np.array(OUTWARD[arm])
-            np.testing.assert_allclose(point, REACH * out + center * np.array([heading[1], -heading[0]]), atol=1e-6)
+            np.testing.assert_allclose(
+                point, REACH * out + center * np.array([heading[1], -heading[0]]), atol=1e-6
+            )
             np.testing.assert_allclose([np.cos(yaw), np.sin(yaw)], heading, atol=1e-9)
 
 
@@ -32,18 +34,26 @@ def test_even_a_truck_stays_on_the_road(junction):
     ground = junction.ground_map()
     for route in junction.routes():
         for left in (-HALF_TRUCK, 0.0, HALF_TRUCK):
-            assert np.isin(ground.at(beside(route.path, left)), ROAD_CODES).all(), (route.from_arm, route.turn)
+            assert np.isin(ground.at(beside(route.path, left)), ROAD_CODES).all(), (
+                route.from_arm,
+                route.turn,
+            )
 
 
 def test_stop_line_then_junction_then_arm(junction):
     spec = junction.spec
     for route in junction.routes():
         assert route.stop_s < route.enter_s < route.exit_s
-        stop, enter, leave = (np.array(route.path.at(s)[:2]) for s in (route.stop_s, route.enter_s, route.exit_s))
+        stop, enter, leave = (
+            np.array(route.path.at(s)[:2]) for s in (route.stop_s, route.enter_s, route.exit_s)
+        )
         inward, outward = OUTWARD[route.from_arm], OUTWARD[route.to_arm]
         found = [stop @ inward, enter @ inward, leave @ outward]
         np.testing.assert_allclose(found, [spec.stop_line[1], spec.mouth, spec.mouth], atol=1e-3)
-        assert np.linalg.norm(junction.stop_line(route.from_arm) - stop, axis=1).max() < spec.lanes_edge
+        assert (
+            np.linalg.norm(junction.stop_line(route.from_arm) - stop, axis=1).max()
+            < spec.lanes_edge
+        )
 
 
 @pytest.mark.parametrize(
@@ -84,8 +94,14 @@ def test_a_three_way_junction_has_no_way_north():
 @pytest.mark.parametrize(
     ("ask", "sentence"),
     [
-        (lambda j: j.route("north", "left"), "arm: a three-way junction has no 'north' arm; choose one of west, south"),
-        (lambda j: j.route("west", "left"), "turn: nobody can go 'left' from the west arm of a three-way junction; ch"),
+        (
+            lambda j: j.route("north", "left"),
+            "arm: a three-way junction has no 'north' arm; choose one of west, south",
+        ),
+        (
+            lambda j: j.route("west", "left"),
+            "turn: nobody can go 'left' from the west arm of a three-way junction; ch",
+        ),
         (lambda j: j.route("west", "right", 1), "lane: expected 0 to 0, found 1"),
         (lambda j: j.crosswalk("north"), "arm: a three-way junction has no 'north' arm"),
         (lambda j: j.stop_line("up"), "arm: a three-way junction has no 'up' arm"),

@@ -29,7 +29,11 @@ def test_impossible_junctions_are_refused(fields, sentence):
 
 @pytest.mark.parametrize(
     ("fields", "arms"),
-    [({}, ()), ({"signalized": False}, ("south", "north")), ({"kind": "three-way", "signalized": False}, ("south",))],
+    [
+        ({}, ()),
+        ({"signalized": False}, ("south", "north")),
+        ({"kind": "three-way", "signalized": False}, ("south",)),
+    ],
 )
 def test_who_has_a_yield_line(fields, arms):
     assert RoadSpec(**fields).yielding_arms == arms

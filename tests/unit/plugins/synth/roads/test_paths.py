@@ -23,7 +23,9 @@ def assert_consistent(path, atol=1e-3):
     assert np.diff(path.s).max() <= SPACING + 1e-9
     np.testing.assert_allclose(np.hypot(*steps.T), np.diff(path.s), atol=atol * SPACING)
     middle_yaw = (path.yaw[:-1] + path.yaw[1:]) / 2
-    np.testing.assert_allclose(np.arctan2(steps[:, 1], steps[:, 0]), np.angle(np.exp(1j * middle_yaw)), atol=atol)
+    np.testing.assert_allclose(
+        np.arctan2(steps[:, 1], steps[:, 0]), np.angle(np.exp(1j * middle_yaw)), atol=atol
+    )
     np.testing.assert_allclose(np.diff(path.yaw) / np.diff(path.s), path.curvature[:-1], atol=0.01)
 
 
@@ -50,7 +52,9 @@ def test_a_lane_change_shifts_the_rest_and_bends_gently(offset):
     np.testing.assert_allclose(y[x > 55], offset, atol=1e-9)
     assert (np.sign(np.diff(y).round(12)) * np.sign(offset) >= 0).all()
     # of the quintic: 10/√3 · offset / length²
-    np.testing.assert_allclose(np.abs(path.curvature).max(), 10 / np.sqrt(3) * 3.5 / 35**2, rtol=0.05)
+    np.testing.assert_allclose(
+        np.abs(path.curvature).max(), 10 / np.sqrt(3) * 3.5 / 35**2, rtol=0.05
+    )
 
 
 def test_lines_meet_at_their_common_point():
@@ -65,8 +69,16 @@ LANE = straight((0.0, 0.0), 0.0, 120.0)
 @pytest.mark.parametrize(
     ("other", "within", "places"),
     [
-        (lane_change(straight((0.0, 3.5), 0.0, 120.0), 30.0, 40.0, -3.5), 0.5, (30, 70, 0.4, 0.5)),  # it joins
-        (bent((5.0, -1.0), np.pi / 3, [(10.0, -0.25, -0.25)]), None, (5, 6, -0.01, 0.01)),  # the first of two counts
+        (
+            lane_change(straight((0.0, 3.5), 0.0, 120.0), 30.0, 40.0, -3.5),
+            0.5,
+            (30, 70, 0.4, 0.5),
+        ),  # it joins
+        (
+            bent((5.0, -1.0), np.pi / 3, [(10.0, -0.25, -0.25)]),
+            None,
+            (5, 6, -0.01, 0.01),
+        ),  # the first of two counts
     ],
 )
 def test_paths_meet_where_they_have_come_near(other, within, places):
@@ -76,7 +88,9 @@ def test_paths_meet_where_they_have_come_near(other, within, places):
     assert (left < x < right, low < y <= high, abs(meeting.s_a - x) < 0.2) == (True, True, True)
 
 
-@pytest.mark.parametrize("other", [straight((0.0, 3.5), 0.0, 50.0), straight((60.0, -9.0), np.pi / 2, 20.0)])
+@pytest.mark.parametrize(
+    "other", [straight((0.0, 3.5), 0.0, 50.0), straight((60.0, -9.0), np.pi / 2, 20.0)]
+)
 def test_paths_beside_each_other_never_meet(other):
     assert crossing(straight((0.0, 0.0), 0.0, 50.0), other) is None
 

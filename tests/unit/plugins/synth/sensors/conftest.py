@@ -25,7 +25,12 @@ def straight_on(x, y, yaw, speed):
     """A motion straight on for 100 s before and after time 0."""
     velocity = speed * np.array([np.cos(yaw), np.sin(yaw)])
     samples = np.array([[*((x, y) + seconds * velocity), yaw] for seconds in (-100.0, 100.0)])
-    return SampledMotion(start=-100.0, period=200.0, samples=samples, sample_velocities=np.stack([velocity, velocity]))
+    return SampledMotion(
+        start=-100.0,
+        period=200.0,
+        samples=samples,
+        sample_velocities=np.stack([velocity, velocity]),
+    )
 
 
 @pytest.fixture(scope="session")
@@ -37,7 +42,11 @@ def world():
 @pytest.fixture(scope="session")
 def hilly_world():
     """The same with a hump on the arm of the ego."""
-    spec = RoadSpec(kind="four-way", signalized=True, hump=Hump(arm="west", distance=55.0, height=2.4, length=70.0))
+    spec = RoadSpec(
+        kind="four-way",
+        signalized=True,
+        hump=Hump(arm="west", distance=55.0, height=2.4, length=70.0),
+    )
     return random_world(np.random.default_rng(0), Junction(spec))
 
 
@@ -63,11 +72,28 @@ def actor():
 def rig_of(actor):
     """Make the rig of the four agents and of others in a world; `places` moves agents."""
 
-    def make(world, others=(), *, places=None, sky=("Clear", "Noon"), image_size=(320, 180), seed=(0,), **options):
+    def make(
+        world,
+        others=(),
+        *,
+        places=None,
+        sky=("Clear", "Noon"),
+        image_size=(320, 180),
+        seed=(0,),
+        **options,
+    ):
         where = {**AGENT_PLACES, **(places or {})}
         cars = [actor(k, "car", *where[name]) for k, name in enumerate(VEHICLE_AGENTS)]
         ids = {name: car.actor_id for name, car in zip(VEHICLE_AGENTS, cars, strict=True)}
-        return make_rig(world, Actors.of([*cars, *others]), ids, sky=sky, image_size=image_size, seed=seed, **options)
+        return make_rig(
+            world,
+            Actors.of([*cars, *others]),
+            ids,
+            sky=sky,
+            image_size=image_size,
+            seed=seed,
+            **options,
+        )
 
     return make
 

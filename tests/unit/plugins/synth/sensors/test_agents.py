@@ -17,7 +17,9 @@ def rig(world, rig_of):
 
 
 def test_all_agents_have_six_cameras(rig):
-    cameras = {agent.name: tuple(camera.channel for camera in agent.cameras) for agent in rig.agents}
+    cameras = {
+        agent.name: tuple(camera.channel for camera in agent.cameras) for agent in rig.agents
+    }
     assert cameras == dict.fromkeys(AGENTS, tuple(CAMERAS))
 
 

@@ -6,7 +6,11 @@ from deepaccident_devkit.plugins.synth.roads import tag_of_code
 
 @pytest.fixture(scope="module")
 def rig(world, actor, rig_of):
-    return rig_of(world, [actor(9, "truck", -20.0, 1.75, np.pi), actor(10, "pedestrian", -20.0, 1.75)], sensors="none")
+    return rig_of(
+        world,
+        [actor(9, "truck", -20.0, 1.75, np.pi), actor(10, "pedestrian", -20.0, 1.75)],
+        sensors="none",
+    )
 
 
 def test_bev_shows_the_map_around_the_agent(world, rig):
@@ -16,7 +20,9 @@ def test_bev_shows_the_map_around_the_agent(world, rig):
         picture, ground_from_ego = rig.bev(scene, agent), agent.ground_from_ego(scene)
         ahead, left = ((599.5 - index) * 0.1 for index in (rows, columns))
         x, y, _ = ground_from_ego.apply(np.stack([ahead, left, 0.0 * left], axis=1)).T
-        expected = tag_of_code()[world.top.codes[((y + 150) * 10).astype(int), ((x + 150) * 10).astype(int)]]
+        expected = tag_of_code()[
+            world.top.codes[((y + 150) * 10).astype(int), ((x + 150) * 10).astype(int)]
+        ]
         free = picture.instance[rows, columns] == 0
         assert free.mean() > 0.9
         assert (picture.semantic[rows, columns] == expected)[free].mean() > 0.99

@@ -6,7 +6,12 @@ from deepaccident_devkit.errors import MissingExtraError
 from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.plugins.synth import SynthConfig, make_release
 from deepaccident_devkit.plugins.synth.sensors import caster
-from deepaccident_devkit.plugins.synth.sensors.caster import GROUND, NOTHING, EmbreeCaster, NumpyCaster
+from deepaccident_devkit.plugins.synth.sensors.caster import (
+    GROUND,
+    NOTHING,
+    EmbreeCaster,
+    NumpyCaster,
+)
 
 
 @pytest.mark.parametrize("kind", [EmbreeCaster, NumpyCaster])

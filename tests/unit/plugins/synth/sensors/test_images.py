@@ -12,7 +12,9 @@ pytestmark = pytest.mark.slow
 
 def picture(rig, signals=None, channel="Camera_Front", agent=0):
     scene = rig.scene(0.0)
-    return dict(rig.images(scene, rig.surroundings(scene, signals or {}), rig.agents[agent], 1))[channel]
+    return dict(rig.images(scene, rig.surroundings(scene, signals or {}), rig.agents[agent], 1))[
+        channel
+    ]
 
 
 def pose_of(agent, scene, camera):
@@ -20,14 +22,18 @@ def pose_of(agent, scene, camera):
 
 
 def test_noon_is_brighter_than_sunset_and_sunset_than_night(world, rig_of):
-    noon, sunset, night = (picture(rig_of(world, sky=("Cloudy", time))).mean() for time in ("Noon", "Sunset", "Night"))
+    noon, sunset, night = (
+        picture(rig_of(world, sky=("Cloudy", time))).mean() for time in ("Noon", "Sunset", "Night")
+    )
     assert noon > 1.15 * sunset > 1.15 * 2 * night
 
 
 def test_red_lights_are_red_and_green_ones_green(world, rig_of):
     """The light for those who come from the west, seen from the ego that waits for it."""
     rig = rig_of(world, image_size=(640, 360), places={"ego_vehicle": (-22.0, -1.75, 0.0)})
-    red, green, dark = (picture(rig, signals).astype(int) for signals in ({"west": 0}, {"west": 2}, {}))
+    red, green, dark = (
+        picture(rig, signals).astype(int) for signals in ({"west": 0}, {"west": 2}, {})
+    )
     assert 2 < (np.abs(red - green).max(axis=-1) > 60).sum() < 900
     for lit, other, channel, factor in ((red, green, 0, 2), (green, red, 1, 1.5)):
         gained = (lit - dark)[(lit - other)[..., channel] > 60]
@@ -36,7 +42,11 @@ def test_red_lights_are_red_and_green_ones_green(world, rig_of):
 
 def test_headlamps_light_the_road_ahead_at_night_alone(world, bare, rig_of):
     def ahead(time):
-        rows = picture(rig_of(bare(world), sky=("Clear", time))).astype(float)[125:160, 130:190].mean(axis=(1, 2))
+        rows = (
+            picture(rig_of(bare(world), sky=("Clear", time)))
+            .astype(float)[125:160, 130:190]
+            .mean(axis=(1, 2))
+        )
         return rows[15:].mean() / rows[:3].mean()
 
     assert ahead("Night") > 1.2 * ahead("Noon")
@@ -58,7 +68,13 @@ def test_wet_ground_mirrors_what_stands_on_it(ground, request, bare, rig_of):
 
     def before(color):
         wall = Block((0.0, 1.0), (-20.0, 20.0), (-0.1, 12.0), color)
-        image = picture(rig_of(bare(roads, [wall]), sky=("Wet", "Noon"), places={"ego_vehicle": (-25.0, -1.75, 0.0)}))
+        image = picture(
+            rig_of(
+                bare(roads, [wall]),
+                sky=("Wet", "Noon"),
+                places={"ego_vehicle": (-25.0, -1.75, 0.0)},
+            )
+        )
         return image[112:125, 140:180].astype(int).mean(axis=(0, 1))
 
     red, green, _ = before((220, 20, 20)) - before((20, 220, 20))

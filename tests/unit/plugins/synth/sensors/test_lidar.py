@@ -27,16 +27,23 @@ def test_points_lie_on_surfaces_within_the_noise(world, bare, rig_of):
     ahead = on_wall[:, 0] - pose.translation[0]
     along = (on_wall[:, 0] + 20.0) * np.linalg.norm(on_wall - pose.translation, axis=1) / ahead
     assert (len(on_wall) > 3000, np.abs(along).max() < 6 * RANGE_NOISE) == (True, True)
-    assert (along.std(), along.mean()) == (pytest.approx(RANGE_NOISE, rel=0.05), pytest.approx(0, abs=0.002))
+    assert (along.std(), along.mean()) == (
+        pytest.approx(RANGE_NOISE, rel=0.05),
+        pytest.approx(0, abs=0.002),
+    )
 
 
 @pytest.mark.parametrize("kind", ["flat", "hilly"])
 def test_points_of_the_ground_lie_on_the_terrain(world, hilly_world, rig_of, kind):
     place = world if kind == "flat" else hilly_world
-    scene, pose, points = scan_of(rig_of(place, sensors="none", places={"ego_vehicle": (-48.0, -1.75, 0.0)}))
+    scene, pose, points = scan_of(
+        rig_of(place, sensors="none", places={"ego_vehicle": (-48.0, -1.75, 0.0)})
+    )
     ground = pose.apply(points.xyz[points.face == GROUND].astype(np.float64))
     above = ground[:, 2] - scene.setting.terrain.height(ground[:, :2])
-    assert np.abs(above).max() < 3 * RANGE_NOISE  # along the ray, which looks down by 30 degrees at most
+    assert (
+        np.abs(above).max() < 3 * RANGE_NOISE
+    )  # along the ray, which looks down by 30 degrees at most
     assert (len(ground) > 5000, np.abs(ground[:, 2]).max() > 0.5) == (True, kind == "hilly")
 
 
@@ -48,12 +55,20 @@ def test_a_car_on_a_slope_is_tilted_with_its_sensors(hilly_world, rig_of):
     np.testing.assert_allclose(agent.ground_from_lidar(scene).rotation[:, 2], normal, atol=0.02)
     labels = rig.sighting(scene, agent, 1).labels
     own = int(np.flatnonzero(labels.actor_id == -100)[0])
-    bottom, above = labels.center[own, 2] - labels.size[own, 2] / 2, agent.ego_from_lidar.translation[2]
-    assert (bottom, labels.num_lidar_pts[own] > 300) == (pytest.approx(0.02 - above, abs=0.01), True)
+    bottom, above = (
+        labels.center[own, 2] - labels.size[own, 2] / 2,
+        agent.ego_from_lidar.translation[2],
+    )
+    assert (bottom, labels.num_lidar_pts[own] > 300) == (
+        pytest.approx(0.02 - above, abs=0.01),
+        True,
+    )
 
 
 def test_more_gets_lost_in_rain(world, bare, rig_of):
-    rig = rig_of(bare(world, [Block((19.0, 20.0), (-60.0, 60.0), (-0.1, 12.0), RED)]), sensors="none")
+    rig = rig_of(
+        bare(world, [Block((19.0, 20.0), (-60.0, 60.0), (-0.1, 12.0), RED)]), sensors="none"
+    )
     clear, rain = (len(scan_of(rig, air=air)[2].xyz) for air in (DRY, RAIN))
     assert rain < 0.95 * clear
 
@@ -64,5 +79,8 @@ def test_intensity_is_that_of_the_distance_before_the_noise(world, rig_of):
     bright = intensity(points, DRY)
     assert bright.dtype == np.float32
     off = np.linalg.norm(points.xyz, axis=1) + np.log(bright) / 0.03
-    assert (off.std(), off.mean()) == (pytest.approx(RANGE_NOISE, rel=0.05), pytest.approx(0, abs=0.002))
+    assert (off.std(), off.mean()) == (
+        pytest.approx(RANGE_NOISE, rel=0.05),
+        pytest.approx(0, abs=0.002),
+    )
     assert (intensity(points, RAIN) < bright).all()

@@ -6,12 +6,18 @@ import pytest
 from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.plugins.synth.sensors.annotate import gone_on
 
-TRAFFIC = [("car", 5.0, 1.75, np.pi, 6.0), ("van", -5.0, 1.75, np.pi, 6.0), ("pedestrian", -12.0, 5.0, 0.0, 1.2)]
+TRAFFIC = [
+    ("car", 5.0, 1.75, np.pi, 6.0),
+    ("van", -5.0, 1.75, np.pi, 6.0),
+    ("pedestrian", -12.0, 5.0, 0.0, 1.2),
+]
 
 
 @pytest.fixture(scope="module")
 def others(actor):
-    return [actor(10 + k, *each) for k, each in enumerate(TRAFFIC)] + [actor(20, "car", -18.0, -4.75, parked=True)]
+    return [actor(10 + k, *each) for k, each in enumerate(TRAFFIC)] + [
+        actor(20, "car", -18.0, -4.75, parked=True)
+    ]
 
 
 def sightings(rig, time=0.4, frame=5):
@@ -30,8 +36,15 @@ def same(first, second):
 @pytest.mark.parametrize("place", ["world", "hilly_world"])
 def test_labels_do_not_depend_on_images(request, rig_of, others, place):
     town = request.getfixturevalue(place)
-    given = ({}, {"image_size": (800, 450), "sensors": "all"}, {"sensors": "cameras"}, {"seed": (1,)})
-    usual, *alike, another = (sightings(rig_of(town, others, **{"sensors": "none", **each})) for each in given)
+    given = (
+        {},
+        {"image_size": (800, 450), "sensors": "all"},
+        {"sensors": "cameras"},
+        {"seed": (1,)},
+    )
+    usual, *alike, another = (
+        sightings(rig_of(town, others, **{"sensors": "none", **each})) for each in given
+    )
     assert [all(map(same, usual, each)) for each in (*alike, another)] == [True, True, False]
 
 
@@ -44,7 +57,9 @@ def test_a_moment_does_not_depend_on_what_was_recorded_before(world, rig_of, oth
 
 @pytest.mark.parametrize("place", ["world", "hilly_world"])
 def test_exact_counts_are_the_points_in_the_boxes(request, rig_of, others, place):
-    for sighting in sightings(rig_of(request.getfixturevalue(place), others, sensors="none", exact=True)):
+    for sighting in sightings(
+        rig_of(request.getfixturevalue(place), others, sensors="none", exact=True)
+    ):
         np.testing.assert_array_equal(sighting.labels.num_lidar_pts, recount(sighting))
         assert sighting.labels.num_lidar_pts.max() > 100
 
@@ -58,7 +73,9 @@ def recount(sighting):
 def test_nobody_goes_on_by_more_than_a_little_until_points_are_counted():
     """Who is slow, as far as it goes in 3 ms; who is fast, no farther than the noise of a point can hide."""
     velocity = np.array([[0.0, 0, 0], [2.0, 0, 0], [0, -30.0, 0]])
-    np.testing.assert_allclose(gone_on(velocity), [[0, 0, 0], [0.006, 0, 0], [0, -0.012, 0]], atol=1e-12)
+    np.testing.assert_allclose(
+        gone_on(velocity), [[0, 0, 0], [0.006, 0, 0], [0, -0.012, 0]], atol=1e-12
+    )
 
 
 def test_exact_calib_is_ideal(hilly_world, rig_of, others):
@@ -69,8 +86,14 @@ def test_exact_calib_is_ideal(hilly_world, rig_of, others):
     for ideal, other in zip(exact, usual, strict=True):
         np.testing.assert_array_equal(ideal.ego_from_lidar.matrix[:3, :3], np.eye(3))
         np.testing.assert_array_equal(ideal.ego_from_lidar.translation[:2], 0)
-        pairs = [(ideal.ego_from_lidar, other.ego_from_lidar), (ideal.world_from_ego, other.world_from_ego)]
-        pairs += [(pose, other.camera_from_lidar[channel]) for channel, pose in ideal.camera_from_lidar.items()]
+        pairs = [
+            (ideal.ego_from_lidar, other.ego_from_lidar),
+            (ideal.world_from_ego, other.world_from_ego),
+        ]
+        pairs += [
+            (pose, other.camera_from_lidar[channel])
+            for channel, pose in ideal.camera_from_lidar.items()
+        ]
         for one, two in pairs:
             np.testing.assert_allclose(one.matrix, two.matrix, rtol=0, atol=2e-4)
 
@@ -79,12 +102,18 @@ def test_exact_calib_is_ideal(hilly_world, rig_of, others):
 @pytest.mark.parametrize("place", ["world", "hilly_world"])
 def test_images_show_road_users_where_their_boxes_project(request, rig_of, actor, place):
     """A red car ahead: where the middle of its box projects, the picture is red or glass, not road."""
-    rig = rig_of(request.getfixturevalue(place), [actor(9, "car", -16.0, -1.75)], image_size=(640, 360))
+    rig = rig_of(
+        request.getfixturevalue(place), [actor(9, "car", -16.0, -1.75)], image_size=(640, 360)
+    )
     scene, agent = rig.scene(0.0), rig.agents[0]
-    image = dict(rig.images(scene, rig.surroundings(scene, {}), agent, 1))["Camera_Front"].astype(int)
+    image = dict(rig.images(scene, rig.surroundings(scene, {}), agent, 1))["Camera_Front"].astype(
+        int
+    )
     camera = agent.cameras[0]
     camera_from_ground = camera.camera_from_lidar @ agent.ground_from_lidar(scene).inverse()
-    pixels, _ = camera.optics.project(camera_from_ground.apply(scene.box_corners[scene.actors.row_of(1009)]))
+    pixels, _ = camera.optics.project(
+        camera_from_ground.apply(scene.box_corners[scene.actors.row_of(1009)])
+    )
     (left, top), (right, bottom) = pixels.min(axis=0), pixels.max(axis=0)
     reddish = (image[..., 0] > 1.8 * image[..., 1:].max(axis=-1)) & (image[..., 0] > 60)
     assert reddish[int(0.6 * bottom + 0.4 * top), int((left + right) / 2)]

@@ -33,6 +33,9 @@ def test_rays_that_are_not_cast_would_have_met_the_same(request, rig_of, parked,
     scene = rig.scene(0.0)
     for agent in rig.agents:
         origin, rays = rays_of(scene, agent, kind)
-        found, slow = scene.setting.cast_columns(origin, rays), scene.setting.caster.cast(origin, rays.reshape(-1, 3))
+        found, slow = (
+            scene.setting.cast_columns(origin, rays),
+            scene.setting.caster.cast(origin, rays.reshape(-1, 3)),
+        )
         np.testing.assert_array_equal(found, slow)
         assert 0.2 < (found[1] >= 0).mean() < 0.9

@@ -13,7 +13,11 @@ WALL = (120, 120, 120)
 def ego_sees(rig, actor_id, agent=0):
     scene = rig.scene(0.0)
     rows = np.array([scene.actors.row_of(actor_id)])
-    return bool(camera_visible(scene, rig.agents[agent], rig.agents[agent].ground_from_lidar(scene), rows)[0])
+    return bool(
+        camera_visible(scene, rig.agents[agent], rig.agents[agent].ground_from_lidar(scene), rows)[
+            0
+        ]
+    )
 
 
 @pytest.mark.slow
@@ -41,14 +45,23 @@ def test_a_truck_hides_the_car_before_it(world, bare, actor, rig_of, hidden):
 def test_a_rise_hides_a_pedestrian_behind_it(hilly_world, bare, actor, rig_of, x, seen):
     """The crest lies 55 m from the middle; the ego waits 30 m from it or on it, the pedestrian stands far behind."""
     places = {"ego_vehicle": (x, -1.75, np.pi), "ego_vehicle_behind": (20.0, -1.75, 0.0)}
-    assert ego_sees(rig_of(bare(hilly_world), [actor(9, "pedestrian", -86.0, -1.75)], places=places), 1009) == seen
+    assert (
+        ego_sees(
+            rig_of(bare(hilly_world), [actor(9, "pedestrian", -86.0, -1.75)], places=places), 1009
+        )
+        == seen
+    )
 
 
 def test_nobody_sees_itself_and_all_around_is_seen(world, bare, actor, rig_of):
     turns = np.deg2rad([0, 50, -50, 95, -95, 140, -140, 180])
     places = zip(-30 + 9 * np.cos(turns), -1.75 + 9 * np.sin(turns), strict=True)
-    rig = rig_of(bare(world), [actor(10 + k, "pedestrian", *place) for k, place in enumerate(places)])
-    assert [actor_id for actor_id in (1000, *range(1010, 1018)) if not ego_sees(rig, actor_id)] == [1000]
+    rig = rig_of(
+        bare(world), [actor(10 + k, "pedestrian", *place) for k, place in enumerate(places)]
+    )
+    assert [actor_id for actor_id in (1000, *range(1010, 1018)) if not ego_sees(rig, actor_id)] == [
+        1000
+    ]
 
 
 def test_pixels_are_about_those_of_the_picture(world, actor, rig_of):

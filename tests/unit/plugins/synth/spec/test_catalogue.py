@@ -32,7 +32,10 @@ def test_one_of_the_two_who_meet_breaks_a_rule(number):
 def test_both_parts_fall_to_ego_and_all_weathers_come():
     made = [draw(read_design(3), np.random.default_rng(seed)) for seed in range(100)]
     assert {spec.actor("ego").turn for spec in made} == {"left", "straight"}
-    assert (len({spec.weather for spec in made}), len({spec.time_of_day for spec in made})) == (7, 3)
+    assert (len({spec.weather for spec in made}), len({spec.time_of_day for spec in made})) == (
+        7,
+        3,
+    )
     assert 0.1 < np.mean([spec.road.hump is not None for spec in made]) < 0.4
 
 

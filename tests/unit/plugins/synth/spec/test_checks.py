@@ -22,9 +22,15 @@ from deepaccident_devkit.plugins.synth.spec import parse_spec
             r"f.yaml:4: actors\[1\].start_distance: follows from meet \(f.yaml:5\) for other, who is timed; leave it",
         ),
         ("start_distance: 0", "start_distance: follows from meet"),
-        ("lane: 1", "there is no lane 1 where the road has one lane in each direction; choose 0, or give the road two"),
+        (
+            "lane: 1",
+            "there is no lane 1 where the road has one lane in each direction; choose 0, or give the road two",
+        ),
         ("lane: [0, 1]", "there is no lane 1"),
-        ("lane_change: 50", "there is no other lane where the road has one lane in each direction; leave it out, or"),
+        (
+            "lane_change: 50",
+            "there is no other lane where the road has one lane in each direction; leave it out, or",
+        ),
     ],
 )
 def test_an_impossible_entry_is_refused(with_other, entries, sentence):
@@ -41,7 +47,10 @@ def test_an_impossible_entry_is_refused(with_other, entries, sentence):
         ("road: {kind: [four-way, three-way]}", "a three-way junction has no north arm"),
         ("road: {lanes: 3}", r"f.yaml:7: road.lanes: expected 1 or 2 in each direction, found 3"),
         ("road:\n  hump: {distance: 20}", "f.yaml:8: road.hump"),
-        ("road:\n  hump: [null, {arm: west,\n    height: [1, 9]}]", "f.yaml:8: road.hump.*: .*grade"),
+        (
+            "road:\n  hump: [null, {arm: west,\n    height: [1, 9]}]",
+            "f.yaml:8: road.hump.*: .*grade",
+        ),
         ("road:\n  kind: [four-way]\n  hump: {length: 300}", "f.yaml:9: road.hump: .*do not fit"),
     ],
 )
@@ -68,10 +77,22 @@ EGO, OTHER = "role: ego, from: west", "role: other, from: south"
             scenario(EGO, OTHER + ", turn: left, lane_change: [40, 50]", more="road: {lanes: 2}"),
             "lane_change: is possible only with the turn straight; leave it out, or go straight on",
         ),
-        (scenario(EGO, OTHER, EGO), r"f.yaml:4: actors\[2\].role: there are 2 actors with role ego; keep one"),
-        (scenario("role: ego", OTHER), r"actors\[0\].from: is missing; the role ego needs it; add one of west, "),
-        (scenario(EGO, OTHER, "role: ego_behind, from: west"), "from: is not possible for the role ego_behind"),
-        (scenario(EGO, OTHER, "role: pedestrian, category: car, from: east"), "the role pedestrian cannot be a car"),
+        (
+            scenario(EGO, OTHER, EGO),
+            r"f.yaml:4: actors\[2\].role: there are 2 actors with role ego; keep one",
+        ),
+        (
+            scenario("role: ego", OTHER),
+            r"actors\[0\].from: is missing; the role ego needs it; add one of west, ",
+        ),
+        (
+            scenario(EGO, OTHER, "role: ego_behind, from: west"),
+            "from: is not possible for the role ego_behind",
+        ),
+        (
+            scenario(EGO, OTHER, "role: pedestrian, category: car, from: east"),
+            "the role pedestrian cannot be a car",
+        ),
         (
             scenario(EGO, OTHER, "role: parked, category: cyclist, from: east"),
             "choose car, truck, van, motorcycle; ",
@@ -80,7 +101,10 @@ EGO, OTHER = "role: ego, from: west", "role: other, from: south"
             scenario(EGO, OTHER, "role: pedestrian, from: east, max_speed: [2, 3.5]"),
             r"actors\[2\].max_speed: expected 0.5 to 3 m/s for a pedestrian, found 3.5; walking is 1 to 2 m/s",
         ),
-        (scenario(EGO, OTHER, "role: parked, from: east, turn: left"), "turn: is not possible for the role parked"),
+        (
+            scenario(EGO, OTHER, "role: parked, from: east, turn: left"),
+            "turn: is not possible for the role parked",
+        ),
         (
             scenario(EGO, OTHER, more="road: {kind: three-way}"),
             r"f.yaml:3: actors\[1\].turn: nobody can go straight from the south arm of a three-way junction; choose",
@@ -89,10 +113,22 @@ EGO, OTHER = "role: ego, from: west", "role: other, from: south"
             scenario(EGO, "role: other, from: west", more="meet: {actors: [ego, other]}"),
             "do not meet; in one lane they follow each other; let one of them come by the other lane, with a",
         ),
-        (scenario(EGO, OTHER, more="meet: {actors: [ego, ego]}"), "f.yaml:4: meet.actors: ego cannot meet itself"),
-        (scenario(EGO, OTHER, more="meet: {actors: [ego]}"), r"meet.actors: expected a list of 2, found \['ego'\]"),
-        (scenario(EGO, OTHER, more="meet: {actors: [ego, ego_behind]}"), "ego_behind cannot be timed"),
-        (scenario(EGO, OTHER, more="meet: {actors: [ego, pedestrian]}"), "there are 0 actors with role pedestrian"),
+        (
+            scenario(EGO, OTHER, more="meet: {actors: [ego, ego]}"),
+            "f.yaml:4: meet.actors: ego cannot meet itself",
+        ),
+        (
+            scenario(EGO, OTHER, more="meet: {actors: [ego]}"),
+            r"meet.actors: expected a list of 2, found \['ego'\]",
+        ),
+        (
+            scenario(EGO, OTHER, more="meet: {actors: [ego, ego_behind]}"),
+            "ego_behind cannot be timed",
+        ),
+        (
+            scenario(EGO, OTHER, more="meet: {actors: [ego, pedestrian]}"),
+            "there are 0 actors with role pedestrian",
+        ),
         (
             scenario(EGO, "role: other, from: [south, east]", more="meet: {}"),
             r"meet.actors: the ways of ego \(west straight 0\) and other \(east straight 0\) do not meet",
@@ -109,7 +145,9 @@ def test_an_impossible_scenario_is_refused(text, sentence):
 
 def test_actors_that_record_nothing_may_be_several():
     walkers = ["role: pedestrian, from: east", "role: pedestrian, from: west"]
-    parse_spec(scenario(EGO, OTHER, "role: parked, from: south", *walkers, "role: background, from: north"))
+    parse_spec(
+        scenario(EGO, OTHER, "role: parked, from: south", *walkers, "role: background, from: north")
+    )
     parse_spec(scenario(EGO, OTHER, walkers[0], more="meet: {actors: [ego, pedestrian]}"))
     parse_spec(scenario(EGO, OTHER, more="view: [open, hidden]"))
 
@@ -117,6 +155,12 @@ def test_actors_that_record_nothing_may_be_several():
 def test_a_start_may_be_given_where_it_counts():
     """A pedestrian's is its place on the arm; with `null` among the values of `meet` some draws time nobody."""
     walker = "role: pedestrian, from: west, start_distance: 20"
-    parse_spec(scenario(EGO, OTHER + ", start_distance: 30", walker, more="meet: {actors: [ego, pedestrian]}"))
-    parse_spec(scenario(EGO, OTHER + ", start_distance: 30", more="meet: [null, {actors: [ego, other]}]"))
+    parse_spec(
+        scenario(
+            EGO, OTHER + ", start_distance: 30", walker, more="meet: {actors: [ego, pedestrian]}"
+        )
+    )
+    parse_spec(
+        scenario(EGO, OTHER + ", start_distance: 30", more="meet: [null, {actors: [ego, other]}]")
+    )
     parse_spec(scenario(EGO, OTHER + ", start_distance: null", more="meet: {}"))

@@ -21,15 +21,24 @@ FIELDS = "name, design, road, view, exchange, actors, meet, background, weather,
             "trun: left",
             r"f.yaml:4: actors\[1\].trun: no such field; possible: role, .*; did you mean 'turn'\?$",
         ),
-        ("colour: red", r"f.yaml:4: actors\[1\].colour: no such field; possible: role, category, from, "),
-        ("max_speed: fast", r"actors\[1\].max_speed: expected a number, 0.5 to 20 m/s, found 'fast'"),
+        (
+            "colour: red",
+            r"f.yaml:4: actors\[1\].colour: no such field; possible: role, category, from, ",
+        ),
+        (
+            "max_speed: fast",
+            r"actors\[1\].max_speed: expected a number, 0.5 to 20 m/s, found 'fast'",
+        ),
         ("max_speed: true", "expected a number, 0.5 to 20 m/s, found True"),
         ("max_speed: .nan", "expected a number, 0.5 to 20 m/s, found nan"),
         ("max_speed: 20.1", "expected a number, 0.5 to 20 m/s, found 20.1"),
         ("max_speed: [1, 2, 3]", r"expected a number, .*, or \[low, high\], found \[1, 2, 3\]"),
         ("max_speed: [5, 40]", r"max_speed\[1\]: expected a number, 0.5 to 20 m/s, found 40"),
         ("max_speed: [9, 3]", r"expected \[low, high\], found \[9, 3\]; exchange the two"),
-        ("max_speed: '8'", "expected a number, 0.5 to 20 m/s, found '8'; write a decimal number, without quotes and"),
+        (
+            "max_speed: '8'",
+            "expected a number, 0.5 to 20 m/s, found '8'; write a decimal number, without quotes and",
+        ),
         ("max_speed: 100", "found 100$"),
         ("start_distance: 130", "expected a number, 0 to 120 m, found 130$"),
         ("max_speed: 1e1", "found '1e1'; write a decimal number, without quotes and without e$"),
@@ -54,12 +63,21 @@ def test_a_wrong_value_is_refused_with_line_and_field(with_other, entries, sente
 @pytest.mark.parametrize(
     ("line", "sentence"),
     [
-        ("actor: []", rf"f.yaml:7: actor: no such field; possible: {FIELDS}.*; did you mean 'actors'\?$"),
+        (
+            "actor: []",
+            rf"f.yaml:7: actor: no such field; possible: {FIELDS}.*; did you mean 'actors'\?$",
+        ),
         ("design: 13", "design: expected a whole number, 1 to 12, found 13"),
         ("exchange: [true, false]", "exchange: expected true or false, one value and not several"),
         ("background: none", "f.yaml:7: background: expected keys and values, found 'none'"),
-        (f"road: {{hump: {{height: {'9' * 400}}}}}", "road.hump.height: expected a number, found 9"),
-        ("exchange: 'true'", "exchange: expected true or false, found 'true'; leave the quotes out"),
+        (
+            f"road: {{hump: {{height: {'9' * 400}}}}}",
+            "road.hump.height: expected a number, found 9",
+        ),
+        (
+            "exchange: 'true'",
+            "exchange: expected true or false, found 'true'; leave the quotes out",
+        ),
         ("view: 3", "view: expected one of open, hidden, found 3"),
         ("road: {signalized: 1}", "road.signalized: expected true or false, found 1"),
     ],
@@ -88,10 +106,16 @@ def test_a_file_is_read_in_utf8_and_named_in_its_errors(tmp_path, small):
     path.write_text(small.replace("small", "Straße"), encoding="utf-8")
     assert read_spec(path).name == "Straße"
     path.write_text(small + "\nview: x", encoding="utf-8")
-    assert_refused((lambda: read_spec(path), ConfigError, r"mein.yaml:7: view: expected one of open, hidden"))
+    assert_refused(
+        (lambda: read_spec(path), ConfigError, r"mein.yaml:7: view: expected one of open, hidden")
+    )
     path.write_bytes(b"\xff")
     assert_refused(
-        (lambda: read_spec(path), ConfigError, r"mein.yaml: cannot be read .*; give a YAML file in UTF-8"),
+        (
+            lambda: read_spec(path),
+            ConfigError,
+            r"mein.yaml: cannot be read .*; give a YAML file in UTF-8",
+        ),
         (
             lambda: read_spec(tmp_path / "other.yaml"),
             ConfigError,
@@ -105,7 +129,11 @@ def test_what_is_no_regular_file_is_not_opened(tmp_path):
     (tmp_path / "loop.yaml").symlink_to("loop.yaml")
     with (tmp_path / "giant.yaml").open("wb") as file:
         file.truncate(3 << 30)
-    for name, told in {"pipe": "a named pipe", "loop": "symbolic links", "giant": "has 3,221,225,472 bytes"}.items():
+    for name, told in {
+        "pipe": "a named pipe",
+        "loop": "symbolic links",
+        "giant": "has 3,221,225,472 bytes",
+    }.items():
         with pytest.raises(ConfigError, match=rf"{name}.yaml: .*{told}"):
             read_spec(tmp_path / f"{name}.yaml")
 
@@ -125,5 +153,9 @@ def test_what_is_too_large_for_a_scenario_is_not_parsed(tmp_path, small):
     path = tmp_path / "big.yaml"
     path.write_text(small + "# comment\n" * 20_000, encoding="utf-8")
     assert_refused(
-        (lambda: read_spec(path), ConfigError, r"big.yaml: has more than 200000 characters; give a scenario file")
+        (
+            lambda: read_spec(path),
+            ConfigError,
+            r"big.yaml: has more than 200000 characters; give a scenario file",
+        )
     )

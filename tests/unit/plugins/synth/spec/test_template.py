@@ -4,7 +4,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from deepaccident_devkit.plugins.synth.roads import ARMS
-from deepaccident_devkit.plugins.synth.spec import ActorSpec, MeetSpec, ScenarioSpec, draw, parse_spec
+from deepaccident_devkit.plugins.synth.spec import (
+    ActorSpec,
+    MeetSpec,
+    ScenarioSpec,
+    draw,
+    parse_spec,
+)
 
 EXCHANGING = """
 exchange: true
@@ -26,12 +32,20 @@ def draws(text: str, count: int = 200) -> list[ScenarioSpec]:
 def test_a_draw_has_what_the_file_says_and_defaults_for_the_rest(small):
     (spec,) = draws(small, 1)
     said = {"ego": "west", "other": "north", "ego_behind": None, "other_behind": None}
-    actors = tuple(ActorSpec(role=role, from_arm=arm) if arm else ActorSpec(role=role) for role, arm in said.items())
-    assert spec == ScenarioSpec(name="small", actors=actors, meet=MeetSpec(actors=("ego", "other"), offset=0.5))
+    actors = tuple(
+        ActorSpec(role=role, from_arm=arm) if arm else ActorSpec(role=role)
+        for role, arm in said.items()
+    )
+    assert spec == ScenarioSpec(
+        name="small", actors=actors, meet=MeetSpec(actors=("ego", "other"), offset=0.5)
+    )
 
 
 def test_ranges_are_filled_and_kept(with_other):
-    made = draws(with_other("max_speed: [8, 12], turn: [straight, left, left]") + "background: {parked: [3, 5]}\n")
+    made = draws(
+        with_other("max_speed: [8, 12], turn: [straight, left, left]")
+        + "background: {parked: [3, 5]}\n"
+    )
     speeds = [spec.actor("other").max_speed for spec in made]
     assert (min(speeds), max(speeds)) == pytest.approx((8.1, 11.9), abs=0.1)
     assert {spec.background.parked for spec in made} == {3, 4, 5}
@@ -44,9 +58,18 @@ def test_an_exchange_keeps_the_scene_but_for_the_names():
     assert 0.4 < np.mean([spec.exchange for spec in made]) < 0.6
     assert {spec.spawn_side for spec in made if spec.exchange} == {"left", "right"}
     for spec in made:
-        mover, turner = (spec.actor(role) for role in (("other", "ego") if spec.exchange else ("ego", "other")))
-        assert (spec.actor("ego").from_arm, turner.ignores, mover.category) == ("west", ("priority",), "van")
-        assert (spec.actor(f"{mover.role}_behind").gap, spec.meet.actors) == (7, (mover.role, turner.role))
+        mover, turner = (
+            spec.actor(role) for role in (("other", "ego") if spec.exchange else ("ego", "other"))
+        )
+        assert (spec.actor("ego").from_arm, turner.ignores, mover.category) == (
+            "west",
+            ("priority",),
+            "van",
+        )
+        assert (spec.actor(f"{mover.role}_behind").gap, spec.meet.actors) == (
+            7,
+            (mover.role, turner.role),
+        )
         assert spec.road.hump.arm == mover.from_arm, "the hump turns with the arms"
         assert spec.actor("pedestrian").from_arm == ARMS[(ARMS.index(mover.from_arm) + 2) % 4]
 
@@ -65,6 +88,8 @@ def test_a_lane_that_is_not_said_follows_from_the_turn(with_other, turn, lanes):
 
 @given(st.sampled_from(ARMS), st.sampled_from(ARMS))
 def test_spawn_sides_are_seen_from_ego(ego, other):
-    spec = ScenarioSpec(actors=(ActorSpec(role="ego", from_arm=ego), ActorSpec(role="other", from_arm=other)))
+    spec = ScenarioSpec(
+        actors=(ActorSpec(role="ego", from_arm=ego), ActorSpec(role="other", from_arm=other))
+    )
     turned = (ARMS.index(other) - ARMS.index(ego)) % 4  # the arms go round counter-clockwise
     assert spec.spawn_side == ("same", "right", "opposite", "left")[turned]

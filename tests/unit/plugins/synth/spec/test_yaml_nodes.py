@@ -10,7 +10,10 @@ def test_every_value_knows_the_line_of_its_key_or_item():
     assert root.value["a"].where == "f.yaml:1"
     assert root.value["b"].where == "f.yaml:2"
     inner = root.value["b"].value["c"]
-    assert [(item.value, item.where) for item in inner.value] == [("x", "f.yaml:3"), (2.5, "f.yaml:4")]
+    assert [(item.value, item.where) for item in inner.value] == [
+        ("x", "f.yaml:3"),
+        (2.5, "f.yaml:4"),
+    ]
 
 
 @pytest.mark.parametrize(
@@ -18,26 +21,41 @@ def test_every_value_knows_the_line_of_its_key_or_item():
     [
         ("", "f.yaml: is empty; write at least the actors"),
         ("# nothing\n", "f.yaml: is empty"),
-        ("a: 1\nb: [x\nc: 2", "f.yaml:3: no YAML: .*; correct that line, or line 2, where the faulty part begins: it"),
+        (
+            "a: 1\nb: [x\nc: 2",
+            "f.yaml:3: no YAML: .*; correct that line, or line 2, where the faulty part begins: it",
+        ),
         ("a: 1\n\tb: 2", r"f.yaml:2: no YAML: .*; correct that line: .* indent \(no tabs\)"),
         ("a: 1\nb: c: 2", "f.yaml:2: no YAML: mapping values are not allowed here"),
         ("--- 1\n--- 2", "f.yaml:2: no YAML: but found another document"),
-        ("a: &x 1\nb: [2, *x]", r"f.yaml:1: b\[1\]: aliases \(\*name\) are not read here; write the value out"),
+        (
+            "a: &x 1\nb: [2, *x]",
+            r"f.yaml:1: b\[1\]: aliases \(\*name\) are not read here; write the value out",
+        ),
         ("a: &x [*x]", r"f.yaml:1: a\[0\]: aliases"),
         ("a: !!python/object/apply:os.getcwd []", "f.yaml:1: a: tags"),
         ("a: !!python/name:os.getcwd x", "f.yaml:1: a: tags"),
         ("a:\n  b: !!bool x", r"f.yaml:2: a.b: 'x' cannot be read"),
         ("a: !!timestamp x", "f.yaml:1: a: 'x' cannot be read"),
-        ("a: 010", "f.yaml:1: a: '010' is not a plain decimal number; write one, or put it in quotes if it is a word"),
+        (
+            "a: 010",
+            "f.yaml:1: a: '010' is not a plain decimal number; write one, or put it in quotes if it is a word",
+        ),
         ("a: 1:30", "f.yaml:1: a: '1:30' is not a plain decimal number"),
         ("a: 1" + ":59" * 300 + ".5", "f.yaml:1: a: '1:59:59.*cannot be read"),
         ("a: " + "1" * 5000, r"f.yaml:1: a: '1{40}' cannot be read"),
         ("a: 1_0", "f.yaml:1: a: '1_0' is not a plain decimal number"),
         ("a: 0x1F", "f.yaml:1: a: '0x1F' is not a plain decimal number"),
-        ("a: 2020-13-40", r"f.yaml:1: a: '2020-13-40' cannot be read \(.*\); put it in quotes if it is a word"),
+        (
+            "a: 2020-13-40",
+            r"f.yaml:1: a: '2020-13-40' cannot be read \(.*\); put it in quotes if it is a word",
+        ),
         ("? [a]\n: 1", "f.yaml:1: expected a key that is a word"),
         ("a: 1\na: 2", "f.yaml:2: a: is there twice; keep one of them"),
-        ("\x00", "f.yaml: no YAML: unacceptable character #x0000: special characters are not allowed; write it again"),
+        (
+            "\x00",
+            "f.yaml: no YAML: unacceptable character #x0000: special characters are not allowed; write it again",
+        ),
         ("- " * 5000, "f.yaml: no YAML: maximum recursion depth exceeded"),
     ],
 )

@@ -29,7 +29,9 @@ def junction():
 def driver(junction):
     """Makes a driver that starts so many metres before its stop line."""
 
-    def make(arm="west", turn="straight", *, before=40.0, speed=8.0, category="car", on=None, **fields):
+    def make(
+        arm="west", turn="straight", *, before=40.0, speed=8.0, category="car", on=None, **fields
+    ):
         route = (on or junction()).route(arm, turn)
         body = random_body(np.random.default_rng(1), category)
         given = {
@@ -51,7 +53,17 @@ def walker():
 
     def make(start=(-12.0, -8.0), yaw=np.pi / 2, length=16.0, **fields):
         path = straight(start, yaw, length)
-        given = {"role": "pedestrian", "start": 0.0, "start_speed": 0.0, "max_speed": 1.4, "span": (0.0, length)}
-        return RoadUser(body=random_body(np.random.default_rng(2), "pedestrian"), path=path, **{**given, **fields})
+        given = {
+            "role": "pedestrian",
+            "start": 0.0,
+            "start_speed": 0.0,
+            "max_speed": 1.4,
+            "span": (0.0, length),
+        }
+        return RoadUser(
+            body=random_body(np.random.default_rng(2), "pedestrian"),
+            path=path,
+            **{**given, **fields},
+        )
 
     return make

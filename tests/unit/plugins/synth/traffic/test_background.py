@@ -57,19 +57,35 @@ def test_crosswalks_are_walked_over_while_their_arm_has_red(scene):
 
 def test_parked_vehicles_stand_on_their_own_slots():
     rng, junction = np.random.default_rng(4), Junction(SPEC.road)
-    named = ActorSpec(role="parked", category="van", from_arm="east", side="left", start_distance=40.0)
+    named = ActorSpec(
+        role="parked", category="van", from_arm="east", side="left", start_distance=40.0
+    )
     vehicles = parked_vehicles(rng, replace(SPEC, actors=(*SPEC.actors, named)), junction, [])
-    poses, size = (np.array(each) for each in zip(*((v.pose, v.body.size[:2]) for v in vehicles), strict=True))
+    poses, size = (
+        np.array(each) for each in zip(*((v.pose, v.body.size[:2]) for v in vehicles), strict=True)
+    )
     assert (len(vehicles), touching_pairs(poses[None], size, 0.3)) == (MANY.parked + 1, [])
     x, y, yaw = poses[0]
-    assert y < -SPEC.road.lanes_edge  # who drives towards the junction from the east has the south on his left
-    assert (vehicles[0].body.category, abs(np.cos(yaw)), x) == ("van", pytest.approx(1), pytest.approx(40, abs=3.5))
+    assert (
+        y < -SPEC.road.lanes_edge
+    )  # who drives towards the junction from the east has the south on his left
+    assert (vehicles[0].body.category, abs(np.cos(yaw)), x) == (
+        "van",
+        pytest.approx(1),
+        pytest.approx(40, abs=3.5),
+    )
 
 
 def test_nobody_parks_where_one_steps_onto_the_road():
-    walking = ActorSpec(role="pedestrian", category="pedestrian", from_arm="west", start_distance=40.0)
+    walking = ActorSpec(
+        role="pedestrian", category="pedestrian", from_arm="west", start_distance=40.0
+    )
     spec = replace(SPEC, actors=(*SPEC.actors, walking), background=replace(MANY, parked=40))
     rng, junction = np.random.default_rng(4), Junction(SPEC.road)
     users = [user for user in cast_actors(rng, spec, junction, 6.0).users if user.walks]
     vehicles = parked_vehicles(rng, spec, junction, users)
-    assert 0.5 < min(abs(vehicle.pose[0] + 40.0) - vehicle.body.size[0] / 2 for vehicle in vehicles) < 8.0
+    assert (
+        0.5
+        < min(abs(vehicle.pose[0] + 40.0) - vehicle.body.size[0] / 2 for vehicle in vehicles)
+        < 8.0
+    )

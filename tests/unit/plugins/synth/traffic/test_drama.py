@@ -42,7 +42,11 @@ def sizes(stage, performance):
 
 @pytest.mark.parametrize("design", DESIGN_NUMBERS)
 def test_the_pair_alone_meets_at_the_design_s_angle_and_only_at_the_end(design):
-    met = [(stage, accident) for stage, accident in (played(design, seed) for seed in SEEDS) if accident]
+    met = [
+        (stage, accident)
+        for stage, accident in (played(design, seed) for seed in SEEDS)
+        if accident
+    ]
     low, high = ANGLES[design]
     assert len(met) >= 3
     for stage, accident in met:
@@ -60,4 +64,6 @@ def test_the_background_is_moved_by_the_same_numbers_in_both():
     assert len(common) > 10
     for row in common - set(range(len(stage.cast.users))):
         columns = accident.present.index(row), twin.present.index(row)
-        np.testing.assert_array_equal(accident.simulation.poses[0, columns[0]], twin.simulation.poses[0, columns[1]])
+        np.testing.assert_array_equal(
+            accident.simulation.poses[0, columns[0]], twin.simulation.poses[0, columns[1]]
+        )

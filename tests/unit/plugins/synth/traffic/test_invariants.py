@@ -66,7 +66,9 @@ def runs(design, kind):
     """An accident and its twin, as a release has them."""
     view = "hidden" if kind == "hidden" else None
     plan = plan_scenarios(
-        SynthConfig(scenarios=1, designs=(design,), unplanned=0.0, seed=design, view=view, designed=True)
+        SynthConfig(
+            scenarios=1, designs=(design,), unplanned=0.0, seed=design, view=view, designed=True
+        )
     )[0]
     rng = np.random.default_rng([design, 4])
     for _ in range(5):
@@ -90,15 +92,22 @@ def test_nobody_touches_anybody(design, kind):
     for run in runs(design, kind):
         parked = np.array([vehicle.pose for vehicle in run.stage.parked]).reshape(-1, 3)
         size = np.array([vehicle.body.size[:2] for vehicle in run.stage.parked]).reshape(-1, 2)
-        poses = np.concatenate([run.poses, np.broadcast_to(parked, (len(run.time), *parked.shape))], axis=1)
+        poses = np.concatenate(
+            [run.poses, np.broadcast_to(parked, (len(run.time), *parked.shape))], axis=1
+        )
         assert touching_pairs(poses, np.concatenate([run.size, size]), 0.0) == []
 
 
 @over_scenes
 def test_wheels_roll_and_do_not_slide(design, kind):
     for run in runs(design, kind):
-        yaw, half = run.poses[:, run.driving, 2], [run.users[row].wheelbase / 2 for row in run.driving]
-        rear = run.poses[:, run.driving, :2] - np.stack([half * np.cos(yaw), half * np.sin(yaw)], axis=-1)
+        yaw, half = (
+            run.poses[:, run.driving, 2],
+            [run.users[row].wheelbase / 2 for row in run.driving],
+        )
+        rear = run.poses[:, run.driving, :2] - np.stack(
+            [half * np.cos(yaw), half * np.sin(yaw)], axis=-1
+        )
         moved, middle = np.diff(rear, axis=0) / PERIOD, (yaw[1:] + yaw[:-1]) / 2
         assert np.abs(np.cos(middle) * moved[..., 1] - np.sin(middle) * moved[..., 0]).max() < 1e-3
         assert (np.cos(middle) * moved[..., 0] + np.sin(middle) * moved[..., 1]).min() > -1e-9
@@ -114,7 +123,12 @@ def test_nobody_jumps(design, kind):
         change = np.diff(run.states[..., 3], axis=0) / PERIOD
         assert -HARDEST_BRAKING - 1e-6 <= change.min() <= change.max() < 3.5
         between = (run.velocities[1:] + run.velocities[:-1]) / 2
-        assert np.abs(np.diff(run.poses[:, run.driving, :2], axis=0) / PERIOD - between[:, run.driving]).max() < 0.05
+        assert (
+            np.abs(
+                np.diff(run.poses[:, run.driving, :2], axis=0) / PERIOD - between[:, run.driving]
+            ).max()
+            < 0.05
+        )
 
 
 @over_scenes
@@ -122,7 +136,9 @@ def test_everyone_stays_where_it_belongs(design, kind):
     for run in runs(design, kind):
         spec = run.stage.spec
         arms = tuple(spec.actor(role).from_arm or "west" for role in ("ego", "other"))
-        world = random_world(np.random.default_rng(design), run.stage.junction, spec.view, between=arms)
+        world = random_world(
+            np.random.default_rng(design), run.stage.junction, spec.view, between=arms
+        )
         codes = world.top.at(run.corners().reshape(-1, 2)).reshape(-1, len(run.users), 4)
         mapped = (np.abs(run.poses[::10, :, :2]).max(axis=-1) < MAPPED)[..., None]
         for row, user in enumerate(run.users):
@@ -136,8 +152,13 @@ def test_at_red_drives_only_who_breaks_that_rule_and_its_follower(design, kind):
         free = run.stage.cast.pair if run.accident else ()
         for row, user in ((row, user) for row, user in enumerate(run.users) if user.route):
             front = user.path.project(run.poses[::5, row, :2])[0] + user.body.size[0] / 2
-            passing = np.flatnonzero((front[:-1] < user.route.stop_s + 0.6) & (front[1:] >= user.route.stop_s + 0.6))
-            red = [run.stage.signals.state(user.route.from_arm, run.time[::5][step]) == RED for step in passing]
+            passing = np.flatnonzero(
+                (front[:-1] < user.route.stop_s + 0.6) & (front[1:] >= user.route.stop_s + 0.6)
+            )
+            red = [
+                run.stage.signals.state(user.route.from_arm, run.time[::5][step]) == RED
+                for step in passing
+            ]
             assert not any(red) or row in free or (run.accident and "signal" in user.ignores)
 
 
@@ -147,7 +168,11 @@ def test_traffic_flows_on(design, kind):
     for run in runs(design, kind):
         since, lights = max(len(run.time) - round(5.0 / PERIOD), 0), run.stage.signals
         arms = {row: run.users[row].route.from_arm for row in run.driving}
-        free = [row for row in arms if not lights or (lights.state(arms[row], run.time[since::25]) == GREEN).all()]
+        free = [
+            row
+            for row in arms
+            if not lights or (lights.state(arms[row], run.time[since::25]) == GREEN).all()
+        ]
         assert (run.states[since:, free, 3] < 0.3).all(axis=0).sum() <= 2 + len(free) / 4
 
 

@@ -26,12 +26,16 @@ def collided(built):
 def test_all_kinds_of_accidents_happen_between_those_they_name(collided):
     kinds, pairs = list(ACCIDENT_KINDS.values()), {}
     for scenario in collided:
-        agents = [agent and agent.replace("_vehicle", "") for agent in scenario.meta.collision.agents]
+        agents = [
+            agent and agent.replace("_vehicle", "") for agent in scenario.meta.collision.agents
+        ]
         pairs.setdefault(kinds.index(scenario.plan.kind), []).append(agents)
     assert len(pairs) >= len(kinds) - 1
     for number, found in pairs.items():
         named = kinds[number].pair
-        assert all(agents[1] is None if named is None else agents == list(named) for agents in found)
+        assert all(
+            agents[1] is None if named is None else agents == list(named) for agents in found
+        )
 
 
 def test_contact_begins_up_to_three_frames_before_the_end(collided):
@@ -67,9 +71,15 @@ def test_meta_has_the_words_of_the_release(collided):
 
 def test_normal_scenarios_are_longer_and_some_folders_say_otherwise(built):
     accidents, normals = (
-        [each.frames for each in built if bool(each.meta.collision) == sort] for sort in (True, False)
+        [each.frames for each in built if bool(each.meta.collision) == sort]
+        for sort in (True, False)
     )
-    assert (min(accidents) >= 36, max(accidents) <= 95, min(normals) >= 93, max(normals)) == (True, True, True, 100)
+    assert (min(accidents) >= 36, max(accidents) <= 95, min(normals) >= 93, max(normals)) == (
+        True,
+        True,
+        True,
+        100,
+    )
     misfiled = sum(plan.misfiled for plan in plan_scenarios(SynthConfig(scenarios=600, seed=1)))
     assert 9 <= misfiled <= 30
 
@@ -77,7 +87,11 @@ def test_normal_scenarios_are_longer_and_some_folders_say_otherwise(built):
 def test_agents_start_slowly_and_some_become_fast(built):
     speeds = np.concatenate(
         [
-            np.hypot(*scenario.actors.all[scenario.actors.row_of(actor)].motion.velocities([0.0, 2.0, 4.0]).T)
+            np.hypot(
+                *scenario.actors.all[scenario.actors.row_of(actor)]
+                .motion.velocities([0.0, 2.0, 4.0])
+                .T
+            )
             for scenario in built
             for actor in scenario.agents.values()
         ]

@@ -26,10 +26,14 @@ def test_each_notices_the_contact_so_long_before_it(seconds):
 
 def test_who_has_noticed_brakes_until_the_end_and_who_is_never_alert_not():
     both, never = alarm(0.2, 0.6), alarm(0.0, 0.0)
-    assert [both.rows(*crossing_poses(seconds)).tolist() for seconds in (0.13, 0.44, 5.0)] == [[1, 2]] * 3
+    assert [both.rows(*crossing_poses(seconds)).tolist() for seconds in (0.13, 0.44, 5.0)] == [
+        [1, 2]
+    ] * 3
     assert never.rows(*crossing_poses(0.0)).tolist() == []
 
 
 def test_nobody_notices_one_who_comes_from_behind():
     poses = np.array([BYSTANDER, [0.0, 0.0, 0.0], [-6.0, 0.0, 0.0]])
-    assert alarm(1.0, 1.0).rows(poses, np.array([[0.0, 0.0], [2.0, 0.0], [12.0, 0.0]])).tolist() == [2]
+    assert alarm(1.0, 1.0).rows(
+        poses, np.array([[0.0, 0.0], [2.0, 0.0], [12.0, 0.0]])
+    ).tolist() == [2]

@@ -32,7 +32,9 @@ def test_the_pair_comes_to_the_crossing_when_it_should(offset, duration):
     users = [found.users[row] for row in found.pair]
     assert (found.begin, [user.role for user in users]) == (-(duration + WARM_UP), ["ego", "other"])
     run = simulate(users, begin=found.begin, end=2.0)
-    for row, (user, place, late) in enumerate(zip(users, crossing(*(u.path for u in users)), (0, offset), strict=True)):
+    for row, (user, place, late) in enumerate(
+        zip(users, crossing(*(u.path for u in users)), (0, offset), strict=True)
+    ):
         along, _ = user.path.project(run.poses[:, row, :2])
         # who waits sets off at a decision
         assert run.time[np.searchsorted(along, place)] == pytest.approx(late, abs=0.11)
@@ -47,7 +49,10 @@ def test_those_who_meet_may_notice_each_other_at_the_last_moment_and_nobody_else
     ]
     assert 5 < sum(alert == 0 for alert in alerts) < 35
     assert 0.1 < max(alerts) < 0.5
-    assert [user.alert for user in cast().users if user.role in ("ego_behind", "other_behind")] == [0.0, 0.0]
+    assert [user.alert for user in cast().users if user.role in ("ego_behind", "other_behind")] == [
+        0.0,
+        0.0,
+    ]
 
 
 def test_a_start_that_is_given_is_kept_where_nobody_is_to_meet():

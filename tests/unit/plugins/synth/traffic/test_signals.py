@@ -1,15 +1,34 @@
 import numpy as np
 import pytest
 
-from deepaccident_devkit.plugins.synth.traffic.rights import AMBER, GREEN, RED, SignalPlan, find_rights
+from deepaccident_devkit.plugins.synth.traffic.rights import (
+    AMBER,
+    GREEN,
+    RED,
+    SignalPlan,
+    find_rights,
+)
 from deepaccident_devkit.plugins.synth.traffic.simulate import simulate
 
 PLAN = SignalPlan(first="west-east", start=0.0, green=10.0)
 
 
 def test_phases_follow_each_other():
-    assert PLAN.state("west", [0.0, 9.9, 10.1, 13.1, 28.9, 29.1]).tolist() == [GREEN, GREEN, AMBER, RED, RED, GREEN]
-    assert PLAN.state("north", [0.0, 14.4, 14.6, 24.6, 27.6]).tolist() == [RED, RED, GREEN, AMBER, RED]
+    assert PLAN.state("west", [0.0, 9.9, 10.1, 13.1, 28.9, 29.1]).tolist() == [
+        GREEN,
+        GREEN,
+        AMBER,
+        RED,
+        RED,
+        GREEN,
+    ]
+    assert PLAN.state("north", [0.0, 14.4, 14.6, 24.6, 27.6]).tolist() == [
+        RED,
+        RED,
+        GREEN,
+        AMBER,
+        RED,
+    ]
 
 
 def test_never_have_both_roads_anything_but_red():

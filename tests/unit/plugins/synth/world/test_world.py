@@ -89,11 +89,16 @@ def test_the_pole_stands_where_the_two_come_from(seed, between, corners):
 
 def test_each_arm_sees_its_lamps(named):
     junction, world = named
-    assert [head.arm for head in world.signals] == (list(junction.arms) if junction.spec.signalized else [])
+    assert [head.arm for head in world.signals] == (
+        list(junction.arms) if junction.spec.signalized else []
+    )
     for head in world.signals:
         lamps = world.props.corners[list(head.rows)].mean(axis=1)
         assert (np.diff(lamps[:, 2]) < 0).all()
-        line, shining = junction.stop_line(head.arm).mean(axis=0), np.array(OUTWARD[head.arm], dtype=np.float64)
+        line, shining = (
+            junction.stop_line(head.arm).mean(axis=0),
+            np.array(OUTWARD[head.arm], dtype=np.float64),
+        )
         waiting = np.append(line * (1 + 8 / np.hypot(*line)), 1.5)
         assert shining @ (waiting - lamps[1])[:2] > 5
         assert clear_of_props(world, lamps[1] + 0.2 * np.append(shining, 0), waiting)
@@ -114,7 +119,11 @@ def test_a_house_on_the_kerb_hides_who_comes_until_late(name, between):
         places = ((first, meeting.s_a), (second, meeting.s_b))
         return [np.array([*route.path.at(s - metres)[:2], 1.5]) for route, s in places]
 
-    assert [clear_of_props(hidden, *eyes(metres)) for metres in (20.0, 30.0, 6.0)] == [False, False, True]
+    assert [clear_of_props(hidden, *eyes(metres)) for metres in (20.0, 30.0, 6.0)] == [
+        False,
+        False,
+        True,
+    ]
     seen = [eye for metres in (0.0, 10.0, 20.0, 30.0) for eye in eyes(metres)]
     assert all(clear_of_props(hidden, hidden.lidar_pole.translation, eye) for eye in seen)
     covered = hidden.top.codes != hidden.ground.codes
@@ -128,7 +137,10 @@ def test_a_junction_with_a_hump_lies_level():
 
 @pytest.mark.parametrize(
     ("name", "between", "arms"),
-    [("four-way", ("west", "east"), "west, south, east, north"), ("three-way", ("west", "north"), "west, south, east")],
+    [
+        ("four-way", ("west", "east"), "west, south, east, north"),
+        ("three-way", ("west", "north"), "west, south, east"),
+    ],
 )
 def test_arms_without_a_corner_are_refused(name, between, arms):
     assert_refused(
