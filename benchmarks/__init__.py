@@ -1,1 +1,3 @@
-"""How fast the devkit is, as ratios to stated bounds: `python -m benchmarks [NAME…] [--json]`, from a checkout."""
+"""How fast the devkit is, as ratios to stated bounds: `python -m benchmarks [NAME…] [--json]`, from
+a checkout.
+"""

@@ -34,8 +34,8 @@ NAMES = (
     "--json", "as_json", is_flag=True, help="One flat JSON object (name: number) and nothing else."
 )
 def main(names: tuple[str, ...], as_json: bool) -> None:  # noqa: FBT001 - click's flag
-    """Measure the devkit; NAME is one of parsing, indexing, scale, validation, geometry, labels, evaluation,
-    coverage, safety, render, synth, export, loader, engine, stores, explore, beside.
+    """Measure the devkit; NAME is one of parsing, indexing, scale, validation, geometry, labels,
+    evaluation, coverage, safety, render, synth, export, loader, engine, stores, explore, beside.
     """
     figures = []
     for name in names or NAMES:

@@ -1,11 +1,13 @@
 """Ours and what one would use in its place, by turns, on the same inputs: medians and ratios.
 
-Each figure is a part of the devkit beside one other way to do it, which can be installed from PyPI; those whose
-libraries are not here are left out. All run on one core, and what is compared is processor time. nuscenes-devkit needs
+Each figure is a part of the devkit beside one other way to do it, which can be installed from PyPI;
+those whose libraries are not here are left out. All run on one core, and what is compared is
+processor time. nuscenes-devkit needs
 an environment of its own: `NUSCENES_PYTHON` names the Python of one, else one is made for the run.
 
-The released code needs more than PyPI has. `DEEPACCIDENT_RELEASED` names a folder of its repository: then its functions
-run here. Else what stands beside ours is what they took once on another machine, and the figure's name says so.
+The released code needs more than PyPI has. `DEEPACCIDENT_RELEASED` names a folder of its
+repository: then its functions run here. Else what stands beside ours is what they took once on
+    another machine, and the figure's name says so.
 """
 
 import json
@@ -38,7 +40,8 @@ from deepaccident_devkit.plugins.synth import SynthConfig, make_release
 
 Work = Callable[[], object]
 ROUNDS, LEAST_SECONDS = 15, 0.02
-"""Turns of each way, and how long one lasts: a way that takes less is run several times in a turn."""
+"""Turns of each way, and how long one lasts: a way that takes less is run several times in a turn.
+"""
 OWN_ENVIRONMENT = ("nuscenes-devkit==1.2.0", "pandas<3", "numpy<2")
 RELEASE = SynthConfig(
     scenarios=2, frames=60, image_size=(320, 180), seed=3, unplanned=0, designed=True
@@ -115,7 +118,9 @@ def in_process() -> dict[str, tuple[Work, dict[str, Work]]]:
 
 
 def gaps_by_skimage(instance: Any, ids: Any) -> object:
-    """Outlines by scikit-image and the distances of all pairs by shapely, as the released evaluation does it."""
+    """Outlines by scikit-image and the distances of all pairs by shapely, as the released
+    evaluation does it.
+    """
     import shapely
     from skimage.measure import approximate_polygon, find_contours
 
@@ -129,7 +134,9 @@ def gaps_by_skimage(instance: Any, ids: Any) -> object:
 
 
 def as_tensors(labels: MotionLabels) -> tuple[Any, ...]:
-    """Maps for nearest values (T, 6, H, W), the centres' peaks, and where each frame's points are (T, 2, 3)."""
+    """Maps for nearest values (T, 6, H, W), the centres' peaks, and where each frame's points are
+    (T, 2, 3).
+    """
     import torch
 
     maps = labels.segmentation[:, None], labels.instance[:, None], labels.offset, labels.flow
@@ -153,7 +160,9 @@ def warped_by_torch(nearest: Any, centers: Any, theta: Any) -> object:
 
 
 def beside_nuscenes_devkit() -> list[Figure]:
-    """Both devkits open the same data, read the boxes of all samples, and evaluate the same detections."""
+    """Both devkits open the same data, read the boxes of all samples, and evaluate the same
+    detections.
+    """
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder)
         python = os.environ.get("NUSCENES_PYTHON") or own_environment(root / "environment")

@@ -1,6 +1,7 @@
 """Our part of what `beside_nuscenes.py` does: `python -m benchmarks.beside_devkit FOLDER`.
 
-FOLDER holds `release/`, and in `detections.json` what nuscenes-devkit evaluated. Prints what took how long.
+FOLDER holds `release/`, and in `detections.json` what nuscenes-devkit evaluated. Prints what took
+how long.
 """
 
 import json

@@ -1,7 +1,8 @@
-"""Training images of one agent's six cameras, ours and `loader_rivals` by turns, through a DataLoader: ms an item.
+"""Training images of one agent's six cameras, ours and `loader_rivals` by turns, through a
+DataLoader: ms an item.
 
-`full` is beside those that decode whole images, `scaled` beside those that decode them at half of their size. Batches
-are of one item. The clock counts, since workers are other processes.
+`full` is beside those that decode whole images, `scaled` beside those that decode them at half of
+their size. Batches are of one item. The clock counts, since workers are other processes.
 """
 
 import tempfile

@@ -1,6 +1,8 @@
-"""nuscenes-devkit's part of `beside`, in an environment without ours: `python beside_nuscenes.py FOLDER`.
+"""nuscenes-devkit's part of `beside`, in an environment without ours: `python beside_nuscenes.py
+FOLDER`.
 
-FOLDER holds `export/`. Writes `detections.json` there: true boxes a metre off. Prints what took how long.
+FOLDER holds `export/`. Writes `detections.json` there: true boxes a metre off. Prints what took how
+long.
 """
 
 import json

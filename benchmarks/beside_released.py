@@ -1,7 +1,9 @@
-"""The released code's part of `beside`: run from a folder of its repository, or what it took on another machine.
+"""The released code's part of `beside`: run from a folder of its repository, or what it took on
+another machine.
 
-Its functions for labels, warps, post-processing and VPQ need nothing but torch, OpenCV, scikit-image and scipy; of its
-packages only the folder of these files is imported. The rest needs mmcv and CUDA.
+Its functions for labels, warps, post-processing and VPQ need nothing but torch, OpenCV,
+scikit-image and scipy; of its packages only the folder of these files is imported. The rest needs
+mmcv and CUDA.
 """
 
 import ast

@@ -1,4 +1,6 @@
-"""What several agents see at a moment: five agents of some fifty actors, from the tables of a synthetic release."""
+"""What several agents see at a moment: five agents of some fifty actors, from the tables of a
+synthetic release.
+"""
 
 import tempfile
 from collections.abc import Callable

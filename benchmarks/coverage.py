@@ -1,4 +1,5 @@
-"""How often intervals hold the truth, and how often `compare` finds a difference, there is one or not.
+"""How often intervals hold the truth, and how often `compare` finds a difference, there is one or
+not.
 
 `python -m benchmarks.coverage` prints the tables.
 """
@@ -154,7 +155,9 @@ def power_table(draws: int = DRAWS) -> str:
 
 
 def alike(draws: int = DRAWS, seed: int = 0) -> float:
-    """The most that are falsely called real if all clusters differ by the same amount: of 8 to 24 clusters."""
+    """The most that are falsely called real if all clusters differ by the same amount: of 8 to 24
+    clusters.
+    """
     source, shares = np.random.default_rng(seed), []
     for clusters in range(8, 25):
         apart = source.choice([-1.0, 1.0], (clusters, draws))
@@ -251,7 +254,9 @@ def mean(values: list[float]) -> float:
 
 
 def main() -> None:
-    """Print both tables, and how often differences that are alike in all clusters are called real."""
+    """Print both tables, and how often differences that are alike in all clusters are called
+    real.
+    """
     print(f"Intervals of 95 %, {DRAWS:,} draws for each setting:\n\n{coverage_table()}\n")
     print(f"How often a difference is called real:\n\n{power_table()}\n")
     print(f"Of differences that are alike in all clusters: {percent(alike())}")

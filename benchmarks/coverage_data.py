@@ -1,6 +1,8 @@
-"""Generated numbers of clusters whose truth is known, and the intervals and the test that were before.
+"""Generated numbers of clusters whose truth is known, and the intervals and the test that were
+before.
 
-A cluster has few samples, of five agents each, that are strongly correlated: a sample is a hit where a normal variable
+A cluster has few samples, of five agents each, that are strongly correlated: a sample is a hit
+    where a normal variable
 is below a limit, a share of whose variance (`correlation`) is the cluster's own.
 """
 
@@ -80,7 +82,9 @@ def shares(clusters: int, draws: int, source: np.random.Generator) -> Iterator[S
 
 
 def ratios(clusters: int, draws: int, source: np.random.Generator) -> Iterator[Sums]:
-    """Ratios of areas, such as IoU: that of a cluster varies around the whole one's by a logistic-normal law."""
+    """Ratios of areas, such as IoU: that of a cluster varies around the whole one's by a
+    logistic-normal law.
+    """
     points, weights = np.polynomial.hermite_e.hermegauss(99)
     for kind in SIZES:
         for middle, spread in ((0.05, 1.0), (0.4, 0.6), (0.9, 0.6), (0.98, 1.0)):
@@ -98,7 +102,9 @@ def ratios(clusters: int, draws: int, source: np.random.Generator) -> Iterator[S
 
 
 def means(clusters: int, draws: int, source: np.random.Generator) -> Iterator[Sums]:
-    """Means of errors of 1 m, whose spread in a cluster is `within`, and of clusters' lognormal ones `between`."""
+    """Means of errors of 1 m, whose spread in a cluster is `within`, and of clusters' lognormal
+    ones `between`.
+    """
     for kind in SIZES:
         for between, within in ((0.3, 0.5), (0.6, 1.0), (0.0, 1.5)):
             samples = sizes(kind, (clusters, draws), source)
@@ -136,7 +142,9 @@ def two_runs(
     shape: tuple[int, int],
     source: np.random.Generator,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Hits of two runs, the second of which has a share that is so much more, and the samples; each (C, D)."""
+    """Hits of two runs, the second of which has a share that is so much more, and the samples; each
+    (C, D).
+    """
     common, *own = source.standard_normal((3, *shape))
     samples = sizes(kind, shape, source)
     first, second = (
@@ -160,7 +168,9 @@ def old_interval(sums: Sums, source: np.random.Generator) -> tuple[FloatArray, F
 
 
 def middle(times: FloatArray, sums: Sums) -> tuple[FloatArray, FloatArray]:
-    """(D,) the ends of the middle 95 % of what resamples give; those without the number do not count."""
+    """(D,) the ends of the middle 95 % of what resamples give; those without the number do not
+    count.
+    """
     with np.errstate(invalid="ignore", divide="ignore"):
         values = np.sort((times @ sums.above) / (times @ sums.below), axis=0)
     known = np.isfinite(values).sum(axis=0)

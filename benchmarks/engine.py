@@ -1,19 +1,23 @@
-"""Bulk work on each engine: this process on one core (`here`), own processes, dask workers, ranks of MPI.
+"""Bulk work on each engine: this process on one core (`here`), own processes, dask workers, ranks
+of MPI.
 
-The work is an OpenCOOD export of labels, from scenarios about as long as real ones, with workers that have imported
-all they need; the caller is a process of its own, and so is dask's scheduler. With two workers on two cores they share
-these with both.
+The work is an OpenCOOD export of labels, from scenarios about as long as real ones, with workers
+that have imported all they need; the caller is a process of its own, and so is dask's scheduler.
+With two workers on two cores they share these with both.
 
-An item of no work, for `…_overhead_ms`, is as large as a scenario's, with the dataset; one for `…_batch_ms` is a token
-alone, and so the engine's own time.
+An item of no work, for `…_overhead_ms`, is as large as a scenario's, with the dataset; one for
+`…_batch_ms` is a token alone, and so the engine's own time.
 
-The serial share is what does not get faster with more workers, against the seconds of one core: the part of the call
-outside of `run_batch` (choosing, the manifest, files of the whole), and for each item that is handed to workers the
-processor time of the caller and of dask's scheduler, as measured on batches of no work. It is rather too high: the
-former is taken to grow with the release, which not all of it does; and MPI's caller asks for messages all the time.
+The serial share is what does not get faster with more workers, against the seconds of one core: the
+    part of the call
+outside of `run_batch` (choosing, the manifest, files of the whole), and for each item that is
+handed to workers the processor time of the caller and of dask's scheduler, as measured on batches
+of no work. It is rather too high: the former is taken to grow with the release, which not all of it
+    does; and MPI's caller asks for messages all the time.
 
-Figures `…_by_amdahl_N` are computed from that share and not measured: speed-up = 1 / (s + (1 - s) / N). Shared disks
-and networks that are slower than this machine's are not in them, nor that 512 cores do 691 scenarios in two rounds.
+Figures `…_by_amdahl_N` are computed from that share and not measured: speed-up = 1 / (s + (1 - s) /
+N). Shared disks and networks that are slower than this machine's are not in them, nor that 512
+cores do 691 scenarios in two rounds.
 """
 
 import importlib.util

@@ -54,11 +54,14 @@ class Seen:
     Attributes:
         samples: of the export.
         export_s: the whole call, with warm workers.
-        outside_s: of these, outside of `run_batch`: before, between and after the work on scenarios.
+        outside_s: of these, outside of `run_batch`: before, between and after the work on
+            scenarios.
         handed: items that the call handed to `run_batch`.
-        item_s: an item of no work as large as that of an export, in a row of many: its dataset is opened for it.
+        item_s: an item of no work as large as that of an export, in a row of many: its dataset is
+            opened for it.
         batch_s: a batch of no work, in a row of many.
-        batch_busy_s: for that, processor time of this process and of a dask scheduler, which workers do not share.
+        batch_busy_s: for that, processor time of this process and of a dask scheduler, which
+            workers do not share.
         growth_mb: of this process's memory at its highest, by all those batches.
     """
 
@@ -146,7 +149,9 @@ def busy_seconds(executor: Executor | None) -> float:
 
 
 def highest_mb() -> float:
-    """The most memory that this process has had; not `ru_maxrss`, which begins with that of its parent."""
+    """The most memory that this process has had; not `ru_maxrss`, which begins with that of its
+    parent.
+    """
     status = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines())
     return int(status["VmHWM"].split()[0]) / 1024
 

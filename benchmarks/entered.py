@@ -1,8 +1,10 @@
-"""`python -m benchmarks.entered [--list]`: how much of the package one sample enters, from results file to summary.
+"""`python -m benchmarks.entered [--list]`: how much of the package one sample enters, from results
+file to summary.
 
-What is entered is a module of the package with a traced call, and a function with one, in the second evaluation of one
-sample of a synthetic release (`evaluate_results(…).summary()`): the first opens the tables and fills what is kept.
-Comprehensions, lambdas and what dataclasses generate belong to the function or class that they stand in.
+What is entered is a module of the package with a traced call, and a function with one, in the
+second evaluation of one sample of a synthetic release (`evaluate_results(…).summary()`): the first
+opens the tables and fills what is kept. Comprehensions, lambdas and what dataclasses generate
+belong to the function or class that they stand in.
 """
 
 import sys
@@ -88,7 +90,7 @@ def walks() -> dict[str, dict[str, list[str]]]:
 def main(listed: bool) -> None:  # noqa: FBT001 - click's flag
     """Print how many modules and functions of the package one sample enters, for each task."""
     click.echo(
-        f"{'task, protocol':<22}{'modules':>9}{'of evaluation':>15}{'functions':>11}{'of evaluation':>15}"
+        f"{'task, protocol':<22}{'modules':>9}{'of evaluation':>15}{'functions':>11}{'of evaluation':>15}"  # noqa: E501
     )
     for walk, modules in walks().items():
         own = {name: each for name, each in modules.items() if name.startswith(EVALUATION)}

@@ -1,4 +1,6 @@
-"""Accident evaluation of a sample: 6 predictions of 5 frames, 30 objects, 200 × 200 cells, post-processing included."""
+"""Accident evaluation of a sample: 6 predictions of 5 frames, 30 objects, 200 × 200 cells,
+post-processing included.
+"""
 
 import numpy as np
 
@@ -42,7 +44,9 @@ def milliseconds(protocol: AccidentProtocol, output: MotionOutput, label: Motion
 
 
 def predicted(label: MotionLabels, source: np.random.Generator) -> MotionOutput:
-    """What a good model says: the labels, their outlines and vectors a little off, each time in another way."""
+    """What a good model says: the labels, their outlines and vectors a little off, each time in
+    another way.
+    """
     truth = MotionHeads.from_labels(label)
     return MotionOutput(
         grid=label.config.grid, heads=tuple(noisy(truth, source) for _ in range(PREDICTIONS))

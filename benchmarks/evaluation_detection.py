@@ -1,4 +1,6 @@
-"""Average precision and errors of a frame of 30 objects and 40 detections; and of 300 detections, untrained."""
+"""Average precision and errors of a frame of 30 objects and 40 detections; and of 300 detections,
+untrained.
+"""
 
 import numpy as np
 

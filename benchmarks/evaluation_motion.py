@@ -1,4 +1,6 @@
-"""Motion metrics of a sample: 5 frames, 30 objects, 200 × 200 cells, both ranges; the released code's times beside."""
+"""Motion metrics of a sample: 5 frames, 30 objects, 200 × 200 cells, both ranges; the released
+code's times beside.
+"""
 
 import numpy as np
 

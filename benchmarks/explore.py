@@ -1,7 +1,8 @@
-"""`deepaccident explore` on tables of the whole release's size: its list pages, twenty readers, memory, pictures.
+"""`deepaccident explore` on tables of the whole release's size: its list pages, twenty readers,
+memory, pictures.
 
-The command runs in a process of its own, and readers on the same machine ask it, each without a pause. Pictures are
-apart, of a small release with images of 1600 × 900.
+The command runs in a process of its own, and readers on the same machine ask it, each without a
+pause. Pictures are apart, of a small release with images of 1600 × 900.
 """
 
 import os
@@ -136,7 +137,9 @@ def _wait_for_work(reader: Reader) -> float:
 
 
 def _crowd(running: Served, seconds: float) -> tuple[list[float], int]:
-    """Readers who ask for lists one after another: the seconds of all pages, and how many failed."""
+    """Readers who ask for lists one after another: the seconds of all pages, and how many
+    failed.
+    """
     times: list[float] = []
     errors: list[str] = []
     end = time.monotonic() + seconds

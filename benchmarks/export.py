@@ -1,6 +1,8 @@
-"""Exports of scenarios with images and clouds in each format: samples a second and bytes a sample, on one core.
+"""Exports of scenarios with images and clouds in each format: samples a second and bytes a sample,
+on one core.
 
-The bound is a plain copy of the very files, in which linked ones are linked: what the system takes for them.
+The bound is a plain copy of the very files, in which linked ones are linked: what the system takes
+    for them.
 """
 
 import os

@@ -1,4 +1,6 @@
-"""Points in boxes, projection and rotated IoU, each against the plain or the usual way of doing it."""
+"""Points in boxes, projection and rotated IoU, each against the plain or the usual way of doing
+it.
+"""
 
 import numpy as np
 import shapely

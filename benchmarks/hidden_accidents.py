@@ -1,8 +1,11 @@
-"""`python -m benchmarks.hidden_accidents RELEASE SPLIT`: the table of what there is to gain, on docs/model.md.
+"""`python -m benchmarks.hidden_accidents RELEASE SPLIT`: the table of what there is to gain, on
+docs/model.md.
 
-Three ways to foresee accidents from labels, each alone and with all agents: constant velocity of whom they see; a weak
-sight that finds a share of these, at wrong places and speeds, three seeds pooled; and a guess without any sight: an
-alarm wherever ego arrives within 2 s at the place where its pair collides. Protocol `boxes`; intervals over pairs.
+Three ways to foresee accidents from labels, each alone and with all agents: constant velocity of
+    whom they see; a weak
+sight that finds a share of these, at wrong places and speeds, three seeds pooled; and a guess
+without any sight: an alarm wherever ego arrives within 2 s at the place where its pair collides.
+    Protocol `boxes`; intervals over pairs.
 """
 
 import sys
@@ -124,7 +127,10 @@ def main(root: str, split: str) -> None:
         more = f"{both - alone:+.2f} [{low[0]:.2f}, {high[0]:.2f}]"
         lines.append((said, f"{alone:.2f}", f"{both:.2f}", more, f"{SURE * error[0]:.2f}"))
     lines.append(("a guess without sight", *[f"{guessed.compute().apa:.2f}"] * 2, "0", "–"))
-    told = f"Of {len(guessed.tokens):,} samples of {len(clusters):,} pairs with a hidden collider, APA by `boxes`:"
+    told = (
+        f"Of {len(guessed.tokens):,} samples of {len(clusters):,} pairs with a "
+        f"hidden collider, APA by `boxes`:"
+    )
     put("gain", f"{told}\n\n{table(HEAD, lines)}")
 
 

@@ -1,4 +1,6 @@
-"""Making an index from labels, calib and meta, and its size on disk against the raw data's; how commands start."""
+"""Making an index from labels, calib and meta, and its size on disk against the raw data's; how
+commands start.
+"""
 
 import os
 import subprocess
@@ -50,7 +52,9 @@ def measure() -> list[Figure]:
 
 
 def commands() -> list[Figure]:
-    """Whole commands, the start of their process included: the clock's time of `index`, else processor time."""
+    """Whole commands, the start of their process included: the clock's time of `index`, else
+    processor time.
+    """
     with tempfile.TemporaryDirectory() as folder:
         release = labels_only_release(
             Path(folder), scenarios=STARTED_SCENARIOS, frames=STARTED_FRAMES

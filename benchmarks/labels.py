@@ -1,6 +1,8 @@
-"""Motion labels: from boxes, at the present, read off predictions, written for a split; 5 frames, 30 objects.
+"""Motion labels: from boxes, at the present, read off predictions, written for a split; 5 frames,
+30 objects.
 
-`labels_from_tables_five_ms` is of one sample, where those of a moment's five agents are made together.
+`labels_from_tables_five_ms` is of one sample, where those of a moment's five agents are made
+together.
 """
 
 import functools
@@ -75,7 +77,9 @@ def labels_ms() -> list[Figure]:
 
 
 def split_samples_per_s() -> list[Figure]:
-    """Label files of a whole release, from its tables; one sample from tables and files, and five agents' together."""
+    """Label files of a whole release, from its tables; one sample from tables and files, and five
+    agents' together.
+    """
     with tempfile.TemporaryDirectory() as folder:
         root = labels_only_release(Path(folder), scenarios=SCENARIOS, frames=FRAMES)
         dataset = DeepAccident(dataroot=root, verbose=False)
@@ -121,7 +125,9 @@ def split_samples_per_s() -> list[Figure]:
 
 
 def make_frames(source: np.random.Generator) -> list[FrameBoxes]:
-    """The ego and 30 actors around it, most of them in sight and on the grid, half a second apart."""
+    """The ego and 30 actors around it, most of them in sight and on the grid, half a second
+    apart.
+    """
     count = OBJECTS + 1
     start = np.vstack([np.zeros(2), source.uniform(-55, 55, (OBJECTS, 2))])
     yaw = np.append(0, source.uniform(-np.pi, np.pi, OBJECTS))
@@ -154,7 +160,9 @@ def make_motion() -> np.ndarray:
 
 
 def make_quads(source: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """150 quadrangles of cars' and trucks' sizes in cells, all over five images, some across the border."""
+    """150 quadrangles of cars' and trucks' sizes in cells, all over five images, some across the
+    border.
+    """
     count = 5 * OBJECTS
     size = source.uniform([7, 3.2], [18, 5.2], (count, 2))
     ahead = heading(source.uniform(-np.pi, np.pi, count))

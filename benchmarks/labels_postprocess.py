@@ -1,4 +1,6 @@
-"""Instances read off a prediction of 5 frames, 30 objects, 200 × 200 cells; and off noise, the worst that can come."""
+"""Instances read off a prediction of 5 frames, 30 objects, 200 × 200 cells; and off noise, the
+worst that can come.
+"""
 
 import numpy as np
 

@@ -29,7 +29,9 @@ def measure() -> list[Figure]:
 
 
 def make_labels(source: np.random.Generator) -> MotionLabels:
-    """Five frames of upright rectangles in cars' sizes, with centres, offsets and flow, and an ego that drives on."""
+    """Five frames of upright rectangles in cars' sizes, with centres, offsets and flow, and an ego
+    that drives on.
+    """
     config = MotionLabelConfig()
     frames, (height, width) = config.label_frames, config.grid.shape
     rows, columns = np.indices((height, width))

@@ -1,7 +1,9 @@
-"""Items a second of `V2XDataset` with images of 704 × 256 alone, whole, scaled and cached, beside what else loads them.
+"""Items a second of `V2XDataset` with images of 704 × 256 alone, whole, scaled and cached, beside
+what else loads them.
 
-The others (`loader_rivals`) load images alone, without poses. The milliseconds of an item are processor time on one
-core, the fastest of some items; images are in the page cache. `normalised` items are float32, as for ImageNet.
+The others (`loader_rivals`) load images alone, without poses. The milliseconds of an item are
+processor time on one core, the fastest of some items; images are in the page cache. `normalised`
+items are float32, as for ImageNet.
 """
 
 import tempfile
@@ -74,7 +76,9 @@ def measure() -> list[Figure]:
 
 
 def ways(dataset: DeepAccident, caches: Path | None, agents: tuple[str, ...]) -> dict[str, Any]:
-    """Each way to make the items, of the first agent's samples; out of caches only if there are any."""
+    """Each way to make the items, of the first agent's samples; out of caches only if there are
+    any.
+    """
     from deepaccident_devkit.training.torch import V2XConfig, V2XDataset
 
     tokens = [record["token"] for record in dataset.sample if record["agent"] == agents[0]]

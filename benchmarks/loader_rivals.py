@@ -1,10 +1,13 @@
-"""What one would load training images with in place of the devkit: six cameras at 704 × 256 of 1600 × 900.
+"""What one would load training images with in place of the devkit: six cameras at 704 × 256 of 1600
+× 900.
 
     from benchmarks.loader_rivals import rivals
-    images = rivals()["simplejpeg"].load(paths, normalised=False)    # paths of six JPEG files to (6, 3, 256, 704)
+    images = rivals()["simplejpeg"].load(paths, normalised=False)    # paths of six JPEG files to
+    (6, 3, 256, 704)
 
-Each is what a person writes who knows that library. `resize` smooths where it shrinks (it is antialiased) or not, which
-takes less time and makes other pixels; a rival is compared with what does the same.
+Each is what a person writes who knows that library. `resize` smooths where it shrinks (it is
+antialiased) or not, which takes less time and makes other pixels; a rival is compared with what
+does the same.
 """
 
 from __future__ import annotations
@@ -30,7 +33,8 @@ class Rival:
 
     Attributes:
         image: a file's path → (256, 704, 3) uint8, RGB; of torchvision (3, 256, 704).
-        needs: what it takes from PyPI; a module of the same name, but for the two that have another one.
+        needs: what it takes from PyPI; a module of the same name, but for the two that have another
+            one.
         smooth: whether it smooths where it shrinks.
         scaled: whether it decodes JPEG at half of its size.
     """
@@ -57,7 +61,9 @@ class Rival:
 
 
 def rivals() -> dict[str, Rival]:
-    """Name → those whose libraries are here, and run: torchvision needs the very torch that it was made for."""
+    """Name → those whose libraries are here, and run: torchvision needs the very torch that it was
+    made for.
+    """
     modules = {"pillow": "PIL", "opencv-python-headless": "cv2"}
     return {
         name: rival
@@ -75,7 +81,9 @@ def _runs(module: str) -> bool:
 
 
 def _pillow(path: Path) -> Any:
-    """As BEVDet's loader: resized whole, cropped, then an array. Its own resize is bicubic, which takes longer."""
+    """As BEVDet's loader: resized whole, cropped, then an array. Its own resize is bicubic, which
+    takes longer.
+    """
     from PIL import Image
 
     top, left, height, width = CROP

@@ -21,7 +21,8 @@ class Figure:
         unit: of value and bound.
         bound: what it should not be worse than, None for a figure that only informs.
         higher_is_better: whether the bound is a lower one.
-        reference: what the released code takes, or in `beside` the other way, in the same unit; None without such.
+        reference: what the released code takes, or in `beside` the other way, in the same unit;
+            None without such.
     """
 
     name: str

@@ -50,7 +50,9 @@ def measure() -> list[Figure]:
 
 
 def write_labels(folder: Path) -> list[Path]:
-    """Files of 30 boxes; half of the numbers with three decimals, half with seventeen digits, as real files mix."""
+    """Files of 30 boxes; half of the numbers with three decimals, half with seventeen digits, as
+    real files mix.
+    """
     source = random.Random(0)  # noqa: S311
 
     def number(index: int) -> str:

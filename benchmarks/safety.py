@@ -1,7 +1,8 @@
-"""Surrogate measures of pairs, and the derived tables of interactions; SSMsOnPlane on the same pairs beside them.
+"""Surrogate measures of pairs, and the derived tables of interactions; SSMsOnPlane on the same
+pairs beside them.
 
-SSMsOnPlane (github.com/Yiru-Jiao/SSMsOnPlane, MIT) is no package and no dependency. To time it, clone it, install
-pandas, and name the clone:
+SSMsOnPlane (github.com/Yiru-Jiao/SSMsOnPlane, MIT) is no package and no dependency. To time it,
+clone it, install pandas, and name the clone:
 
     SSMS_ON_PLANE=~/SSMsOnPlane python -m benchmarks safety
 
@@ -73,7 +74,9 @@ def measure() -> list[Figure]:
 
 
 def of_tables() -> list[Figure]:
-    """The interactions of a release of synthetic scenarios, made by two workers, and the whole release's by frames."""
+    """The interactions of a release of synthetic scenarios, made by two workers, and the whole
+    release's by frames.
+    """
     with tempfile.TemporaryDirectory(prefix="deepaccident_safety_") as name:
         folder = Path(name)
         config = SynthConfig(scenarios=MADE, frames=FRAMES, sensors=False, designed=True)
@@ -127,7 +130,9 @@ def of_tables() -> list[Figure]:
 
 
 def core_seconds(dataset: DeepAccident) -> float:
-    """Processor time of making all interactions of a release again, whatever else the machine does."""
+    """Processor time of making all interactions of a release again, whatever else the machine
+    does.
+    """
     shutil.rmtree(dataset.tables_folder / FOLDER)
     start = time.process_time()
     for _ in interactions_of(dataset, workers=1):
@@ -190,7 +195,9 @@ def library_frame(boxes: list[np.ndarray], velocities: list[np.ndarray]) -> Any:
 
 
 def make_pairs(source: np.random.Generator) -> tuple[list[np.ndarray], ...]:
-    """Both boxes, velocities, speeds and accelerations of pairs, most of which head for about the same place."""
+    """Both boxes, velocities, speeds and accelerations of pairs, most of which head for about the
+    same place.
+    """
     boxes, velocities, speeds, rates = [], [], [], []
     for _ in range(2):
         yaw, speed = source.uniform(-np.pi, np.pi, PAIRS), source.uniform(0, 15, PAIRS)

@@ -1,7 +1,8 @@
 """The whole release's size: 285k samples and 8.6 M annotations, opened in a new process.
 
-Only tables are written (no label is parsed for them), by the code that joins an index from its scenarios; the folders
-and meta files that opening looks at are there, so that the check for changes is part of the time.
+Only tables are written (no label is parsed for them), by the code that joins an index from its
+scenarios; the folders and meta files that opening looks at are there, so that the check for changes
+is part of the time.
 """
 
 import json
@@ -195,7 +196,9 @@ def told(number: int) -> dict[str, list[object]]:
 
 
 def one_scenario() -> ScenarioFiles:
-    """The contents of one scenario's files: 83 frames, 30 boxes a sample that drive straight on, random values."""
+    """The contents of one scenario's files: 83 frames, 30 boxes a sample that drive straight on,
+    random values.
+    """
     source = np.random.default_rng(0)
     samples = len(AGENTS) * FRAMES
     poses = [SE3.from_yaw(0.01 * n, (n, 2.0, 0.0)) for n in range(FRAMES)]

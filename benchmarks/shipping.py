@@ -1,7 +1,9 @@
 """Weights that ship, out of a study: `python -m benchmarks.shipping STUDIES/RECIPE NAME SEED`.
 
-They are rounded to half precision, scored on a small release of a seed of its own, and go to where the package has
-those of their preset. Their notes say how they were made and what they score: `deepaccident predict` prints that beside
+They are rounded to half precision, scored on a small release of a seed of its own, and go to where
+the package has
+those of their preset. Their notes say how they were made and what they score: `deepaccident
+    predict` prints that beside
 what it measures, and a test makes the release and scores them again.
 """
 
@@ -37,7 +39,9 @@ SCORED: Final[dict[str, Any]] = {
         "designs": [1, 2, 6, 7, 12],
     },
 }
-"""Who cooperates for the scores, and on which release, of other designs than the training's; a test makes it again."""
+"""Who cooperates for the scores, and on which release, of other designs than the training's; a test
+makes it again.
+"""
 _NOT_SHIPPED: Final = ("num_batches_tracked", "frustum")
 
 

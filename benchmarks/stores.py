@@ -1,4 +1,6 @@
-"""Sensor files in folders, zips and memory; and opening archives of as many members as the release has files."""
+"""Sensor files in folders, zips and memory; and opening archives of as many members as the release
+has files.
+"""
 
 import tempfile
 import zipfile
@@ -30,7 +32,9 @@ def measure() -> list[Figure]:
 
 
 def _reading(folder: Path) -> list[Figure]:
-    """Microseconds to read an image's bytes, and milliseconds to decode it, by where it lies; pages are cached."""
+    """Microseconds to read an image's bytes, and milliseconds to decode it, by where it lies; pages
+    are cached.
+    """
     import fsspec
 
     names = _write_images(folder / "files")
@@ -51,7 +55,8 @@ def _reading(folder: Path) -> list[Figure]:
     with one_core():
         for name, root in roots.items():
             paths = [root / each for each in order]
-            # a label's kind is not kept in the cache of a URL's files, so that the store itself is timed
+            # a label's kind is not kept in the cache of a URL's files, so that the store itself is
+            # timed
             raw[name] = (
                 1e6 / IMAGES * best_of(15, _all(lambda path: read_bytes(path, "label"), paths))
             )
@@ -111,7 +116,9 @@ def _jpeg(picture: np.ndarray, quality: int) -> bytes:
 
 
 def _opening(folder: Path) -> list[Figure]:
-    """Opening 14 archives whose members are listed already, and finding a member; the archives are empty files."""
+    """Opening 14 archives whose members are listed already, and finding a member; the archives are
+    empty files.
+    """
     archives = [folder / f"{number:02d}.zip" for number in range(14)]
     for archive in archives:
         archive.touch()

@@ -1,4 +1,6 @@
-"""Making synthetic releases: a scenario with images and point clouds, and labels alone; starting workers included."""
+"""Making synthetic releases: a scenario with images and point clouds, and labels alone; starting
+workers included.
+"""
 
 import tempfile
 from pathlib import Path

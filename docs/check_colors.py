@@ -1,7 +1,7 @@
 """Measure the colour table for normal and colour-blind eyes: `python docs/check_colors.py`.
 
-Distances are CIELAB ΔE (1976, D65); colour blindness is simulated with the matrices of Machado and others (2009),
-severity 1; contrast is WCAG's ratio of luminances.
+Distances are CIELAB ΔE (1976, D65); colour blindness is simulated with the matrices of Machado and
+others (2009), severity 1; contrast is WCAG's ratio of luminances.
 """
 
 from collections.abc import Iterable
@@ -65,7 +65,9 @@ def linear(names: Iterable[str]) -> NDArray[np.float64]:
 
 
 def lab(names: Iterable[str], eye: str = "normal") -> NDArray[np.float64]:
-    """(N, 3) lightness, green to red, and blue to yellow of CIELAB, as an eye of `EYES` sees the colours."""
+    """(N, 3) lightness, green to red, and blue to yellow of CIELAB, as an eye of `EYES` sees the
+    colours.
+    """
     seen = np.clip(linear(names) @ EYES[eye].T, 0, 1)
     part = seen @ XYZ_FROM_RGB.T / XYZ_FROM_RGB.sum(axis=1)
     x, y, z = np.where(part > (6 / 29) ** 3, np.cbrt(part), part / (3 * (6 / 29) ** 2) + 4 / 29).T

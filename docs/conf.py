@@ -1,9 +1,10 @@
-"""The documentation site: the guides as they lie in the repository, and an API reference from the docstrings.
+"""The documentation site: the guides as they lie in the repository, and an API reference from the
+docstrings.
 
     pip install '.[docs]' && sphinx-build -W --keep-going -c docs . build/site
 
-The repository's root is the source folder, so that links between docs/, schema/ and tutorials/ are the same on GitHub
-and on the site. Nothing is fetched from a network.
+The repository's root is the source folder, so that links between docs/, schema/ and tutorials/ are
+the same on GitHub and on the site. Nothing is fetched from a network.
 """
 
 import re
@@ -145,7 +146,9 @@ def write_reference(folder: Path) -> None:
 
 
 def _directive(name: str, seen: set[str]) -> str:
-    """What autodoc takes of a module, without names that stand on an earlier page; of a class or a type."""
+    """What autodoc takes of a module, without names that stand on an earlier page; of a class or a
+    type.
+    """
     path = f"deepaccident_devkit.{name}"
     if name == "DeepAccident":
         return f".. autoclass:: {path}\n   :members:\n   :inherited-members:"
@@ -165,7 +168,8 @@ def _directive(name: str, seen: set[str]) -> str:
 
 _CODE_SPAN = re.compile(r"(?<![`\\])`([^`]+)`(?!`)")
 _ARRAY = re.compile(
-    r"~?(numpy\.)?ndarray\[tuple\[[^\]]*\], ~?(numpy\.)?dtype\[~?(numpy\.|typing\.)*(?P<dtype>\w+)\]\]"
+    r"~?(numpy\.)?ndarray\[tuple\[[^\]]*\], "
+    r"~?(numpy\.)?dtype\[~?(numpy\.|typing\.)*(?P<dtype>\w+)\]\]"
 )
 _ARRAY_NAMES = {
     "float64": "FloatArray",
@@ -180,7 +184,9 @@ _SECTIONS = ("Args:", "Attributes:", "Examples:", "Raises:", "Returns:", "Yields
 
 
 def restructured(lines: list[str]) -> list[str]:
-    """A docstring's lines as reStructuredText; doctests, and the sections that napoleon takes apart, stay."""
+    """A docstring's lines as reStructuredText; doctests, and the sections that napoleon takes
+    apart, stay.
+    """
     result: list[str] = []
     block: list[str] = []
     kind = "text"

@@ -1,4 +1,5 @@
-"""Pictures of the pages that no command makes: the colour key, the designs, the sketch of a junction, the labels.
+"""Pictures of the pages that no command makes: the colour key, the designs, the sketch of a
+junction, the labels.
 
 `python docs/make_pictures.py` renders them.
 """
@@ -66,7 +67,9 @@ SPEC = RoadSpec(lanes=2)
 AROUND = 50.0
 """Metres shown to each side of the junction's middle."""
 START, PARKED, STEP_OUT = 40.0, 33.5, 27.0
-"""Distances to the junction's middle that are shown: of ego, of parked vehicles, of a pedestrian; metres."""
+"""Distances to the junction's middle that are shown: of ego, of parked vehicles, of a pedestrian;
+metres.
+"""
 ROAD, STRIP, LINE = "0.82", "0.9", "white"
 SHOWN = {"xlim": (-6, 40), "ylim": (-15, 13)}
 """Metres, of the pictures of the turn."""
@@ -221,7 +224,9 @@ def title_of(number: int) -> str:
 
 
 def draw_design(release: DeepAccident, above: Axes, image: Axes) -> None:
-    """From above with the paths of those who collide, the impact a cross; and the camera that shows both best."""
+    """From above with the paths of those who collide, the impact a cross; and the camera that shows
+    both best.
+    """
     token = release.scenario[0]["token"]
     contact = release.collision(token)
     if contact is None:
@@ -246,7 +251,9 @@ def draw_design(release: DeepAccident, above: Axes, image: Axes) -> None:
 
 
 def draw_meeting(release: DeepAccident, ego: str, contact: Contact, ax: Axes) -> None:
-    """The ways of ego and other in their hues and a red cross where they meet, in the ego frame of a sample (token)."""
+    """The ways of ego and other in their hues and a red cross where they meet, in the ego frame of
+    a sample (token).
+    """
     own = release.get("agent", ego.rsplit("/", 1)[0])["actor_id"]
     for instance, actor in zip(contact.instances, contact.actor_ids, strict=True):
         color = AGENT_COLORS["ego_vehicle" if actor == own else "other_vehicle"]

@@ -1,4 +1,6 @@
-"""Render docs/images/layers.svg from the layers of pyproject.toml: `python docs/make_architecture.py`."""
+"""Render docs/images/layers.svg from the layers of pyproject.toml: `python
+docs/make_architecture.py`.
+"""
 
 import ast
 import re
@@ -84,7 +86,9 @@ def picture() -> str:
 
 
 def _kind(rows: list[list[str]], number: int) -> str:
-    """Plug-ins stand on all; below the data set lies what reads it, and above the facade what is called by people."""
+    """Plug-ins stand on all; below the data set lies what reads it, and above the facade what is
+    called by people.
+    """
     above = [name for row in rows[: number + 1] for name in row]
     if "plugins" in rows[number]:
         return "plugins"

@@ -1,4 +1,6 @@
-"""Write docs/cli.md from the help texts of the commands themselves: `python docs/make_cli_page.py`."""
+"""Write docs/cli.md from the help texts of the commands themselves: `python
+docs/make_cli_page.py`.
+"""
 
 import inspect
 from collections.abc import Iterator
@@ -69,7 +71,9 @@ def _release(**_: object) -> None: ...
 
 
 _ALIKE = 3
-"""Options that at least so many commands of a group have in common are described once, at the group."""
+"""Options that at least so many commands of a group have in common are described once, at the
+group.
+"""
 _UNLIKE = ("video", "replay")
 _SHARED = {parameter.name for parameter in _release.params}
 
@@ -105,7 +109,9 @@ def _on_release(command: click.Command) -> bool:
 
 
 def _alike(group: click.Group) -> dict[str, click.Command]:
-    """The commands of a group that have the options of a release, except for those that differ from the others."""
+    """The commands of a group that have the options of a release, except for those that differ from
+    the others.
+    """
     context = click.Context(group)
     commands = {name: group.get_command(context, name) for name in group.list_commands(context)}
     return {

@@ -1,8 +1,10 @@
-"""Make the pictures of the pages again: `python docs/make_pictures.py [commands|explorer|drawings]… [--release DIR]`.
+"""Make the pictures of the pages again: `python docs/make_pictures.py [commands|explorer|drawings]…
+[--release DIR]`.
 
-`commands` runs those of docs/pictures.md and keeps what it shows, in some three minutes on two cores; `explorer` opens
-the explorer's pages, on a release that takes ten minutes unless it is given; `drawings` are pictures that no command
-makes. Pictures of web pages need chromium and the extra `test`.
+`commands` runs those of docs/pictures.md and keeps what it shows, in some three minutes on two
+cores; `explorer` opens the explorer's pages, on a release that takes ten minutes unless it is
+given; `drawings` are pictures that no command makes. Pictures of web pages need chromium and the
+extra `test`.
 """
 
 import os
@@ -102,7 +104,9 @@ def make_demo(folder: Path) -> None:
 
 
 def keep(picture: str, folder: Path) -> None:
-    """Copy a picture into docs/images; where no command made it, it is that of the web page of its name."""
+    """Copy a picture into docs/images; where no command made it, it is that of the web page of its
+    name.
+    """
     made = next(folder.rglob(picture), None) or page_picture(
         next(folder.rglob(f"{Path(picture).stem}.html"))
     )
@@ -111,7 +115,9 @@ def keep(picture: str, folder: Path) -> None:
 
 
 def page_picture(page: Path, anchor: str = "") -> Path:
-    """What a browser's window shows of a web page, from an anchor on; a replay half a second before its end."""
+    """What a browser's window shows of a web page, from an anchor on; a replay half a second before
+    its end.
+    """
     options = webdriver.ChromeOptions()
     for option in (
         "--headless=new",
@@ -211,7 +217,9 @@ def keep_all(served: Served, explorer: Explorer) -> None:
 
 
 def until(browser: Any, ready: str) -> None:
-    """Wait until an expression holds; a page that loads itself again meanwhile is waited for too."""
+    """Wait until an expression holds; a page that loads itself again meanwhile is waited for
+    too.
+    """
     end = time.monotonic() + WAIT
     while not browser.execute_script(
         f"return document.readyState === 'complete' && Boolean({ready})"

@@ -1,8 +1,9 @@
 """Write docs/public_names.json, the list of all that is public: `python docs/make_public_names.py`.
 
-Names are read from the text of the modules, not imported: so nobody needs PyTorch to make the list or to compare it.
-Public are the modules that docs/conf.py lists for the reference: what is in their `__all__`, or, where a module has
-none, what it defines without an underscore.
+Names are read from the text of the modules, not imported: so nobody needs PyTorch to make the list
+    or to compare it.
+Public are the modules that docs/conf.py lists for the reference: what is in their `__all__`, or,
+where a module has none, what it defines without an underscore.
 """
 
 import ast
@@ -24,9 +25,12 @@ PACKAGE = "deepaccident_devkit"
 DAILY = {
     "": "DeepAccident",
     "DeepAccident": (
-        "find scenario sample get_sample samples training_samples evaluation_samples split_scenarios get_boxes boxes "
-        "camera load_image load_point_cloud local_path world_from transform map_pointcloud_to_image "
-        "aggregate_point_cloud cooperative_boxes collision motion_labels findings describe interactions town_map "
+        "find scenario sample get_sample samples training_samples evaluation_samples "
+        "split_scenarios get_boxes boxes "
+        "camera load_image load_point_cloud local_path world_from transform "
+        "map_pointcloud_to_image "
+        "aggregate_point_cloud cooperative_boxes collision motion_labels findings "
+        "describe interactions town_map "
         "render_sample render_bev"
     ),
     "geometry": "BevGrid Box.category Box.center Boxes.yaw",
@@ -34,7 +38,8 @@ DAILY = {
     "release": "find_release read_label read_meta read_calib read_lidar",
     "motion": "MotionLabelConfig LabelFiles write_label_files predict_instances",
     "evaluation": (
-        "Accident DetectedBoxes MotionOutput ResultsWriter instances_of AccidentEvaluator DetectionEvaluator "
+        "Accident DetectedBoxes MotionOutput ResultsWriter instances_of "
+        "AccidentEvaluator DetectionEvaluator "
         "MotionEvaluator WarningEvaluator breakdown"
     ),
     "evaluation.results": "read_results",
@@ -108,7 +113,9 @@ def _lines(names: dict[str, Any]) -> dict[str, str]:
 
 
 def daily(rooms: dict[str, dict[str, str]]) -> dict[str, dict[str, str | None]]:
-    """Names of daily use → the first page whose code uses them, and what they are; None where there is none."""
+    """Names of daily use → the first page whose code uses them, and what they are; None where there
+    is none.
+    """
     uses = {page: used_names(TOP / page) for page in pages()}
     found: dict[str, dict[str, str | None]] = {}
     for group, names in DAILY.items():
@@ -126,7 +133,9 @@ def daily(rooms: dict[str, dict[str, str]]) -> dict[str, dict[str, str | None]]:
 
 
 def pages() -> list[str]:
-    """The pages that users read: those of docs/ in the order of docs/index.md, then this one and README.md."""
+    """The pages that users read: those of docs/ in the order of docs/index.md, then this one and
+    README.md.
+    """
     start = (TOP / "docs" / "index.md").read_text(encoding="utf-8")
     listed = [f"docs/{name}.md" for name in re.findall(r"^\w+$", start, re.MULTILINE)]
     return [*listed, "docs/index.md", "README.md"]
@@ -186,7 +195,9 @@ def _all_of(module: str) -> tuple[str, ...]:
 
 
 def names_of(room: str) -> dict[str, str]:
-    """A room's public names and the members of its classes → parameters, types, values, as they are written."""
+    """A room's public names and the members of its classes → parameters, types, values, as they are
+    written.
+    """
     result: dict[str, str] = {}
     for name in public_modules()[room]:
         module, node = _found(room, name)
@@ -203,7 +214,9 @@ def names_of(room: str) -> dict[str, str]:
 
 @cache
 def _describing(home: str, name: str) -> str:
-    """Of the rooms that have a name, the one that describes it: the nearest above its module, or the first."""
+    """Of the rooms that have a name, the one that describes it: the nearest above its module, or
+    the first.
+    """
     rooms = [
         room
         for room, names in public_modules().items()
@@ -246,7 +259,9 @@ def _statements(body: Iterable[ast.stmt]) -> Iterator[ast.stmt]:
 
 @cache
 def _names(module: str) -> dict[str, tuple[str, ast.stmt | str]]:
-    """Name → where it comes from: this module and the statement, or another module and the name there."""
+    """Name → where it comes from: this module and the statement, or another module and the name
+    there.
+    """
     found: dict[str, tuple[str, ast.stmt | str]] = {}
     for node in _statements(_tree(_path(module)).body):
         if isinstance(node, ast.FunctionDef | ast.ClassDef):  # of overloads the last
@@ -263,7 +278,9 @@ def _names(module: str) -> dict[str, tuple[str, ast.stmt | str]]:
 
 @cache
 def _found(module: str, name: str) -> tuple[str, ast.stmt]:
-    """The module of the devkit that defines a name of this one, and the statement; raises AttributeError."""
+    """The module of the devkit that defines a name of this one, and the statement; raises
+    AttributeError.
+    """
     if name not in _names(module):
         raise AttributeError(f"module {module!r} has no attribute {name!r}")
     home, there = _names(module)[name]
@@ -271,7 +288,9 @@ def _found(module: str, name: str) -> tuple[str, ast.stmt]:
 
 
 def _said(module: str, node: ast.stmt, *, bound: bool = False) -> str:
-    """A function's parameters and result, or a constant's type or value; `bound` leaves the first parameter out."""
+    """A function's parameters and result, or a constant's type or value; `bound` leaves the first
+    parameter out.
+    """
     if isinstance(node, ast.FunctionDef):
         parameters = _with_values(module, node.args)
         if bound:
@@ -371,7 +390,9 @@ def _is_parameter(field: ast.AnnAssign) -> bool:
 
 
 def _members(module: str, node: ast.ClassDef) -> dict[str, str]:
-    """Its public methods, properties and class attributes, with those of its bases that are not public themselves."""
+    """Its public methods, properties and class attributes, with those of its bases that are not
+    public themselves.
+    """
     result: dict[str, str] = {}
     for base in node.bases:
         if (found := _of_devkit(module, base)) and not _is_public(found[1]):

@@ -1,7 +1,9 @@
-"""Measure the numbers of the pages again, and write them where they stand: `python docs/make_tables.py [NAME…]`.
+"""Measure the numbers of the pages again, and write them where they stand: `python
+docs/make_tables.py [NAME…]`.
 
-It runs in a checkout; each NAME takes some minutes, and without a NAME all run. `--release` is a release that is taken
-in place of a new synthetic one, if it was made as the module in benchmarks/pages says.
+It runs in a checkout; each NAME takes some minutes, and without a NAME all run. `--release` is a
+release that is taken in place of a new synthetic one, if it was made as the module in
+benchmarks/pages says.
 """
 
 import sys

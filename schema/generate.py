@@ -1,6 +1,6 @@
-"""Write the JSON Schemas (also of results/) and the column tables of README.md anew: `python schema/generate.py`.
+"""Write the JSON Schemas (also those of results/) and the column tables of README.md.
 
-Both are derived from the declared records.
+Run `python schema/generate.py`. Both are derived from the declared records.
 """
 
 import json
@@ -52,14 +52,20 @@ def generated_results_files() -> dict[str, str]:
 
 
 def json_schemas(derived: Mapping[str, TableSpec] | None = None) -> dict[str, dict[str, Any]]:
-    """Table name → JSON Schema (draft 2020-12) of one of its records; of the index's tables and of derived ones."""
+    """Return the JSON Schema (draft 2020-12) of a record of each table, by the table's name.
+
+    The tables are those of the index and the derived ones.
+    """
     return {
         name: _record_schema(spec) for name, spec in {**table_specs(), **(derived or {})}.items()
     }
 
 
 def columns_markdown(derived: Mapping[str, TableSpec] | None = None) -> str:
-    """A Markdown section a table: what a row is, its token, and its columns; derived tables last, without tokens."""
+    """Return a Markdown section for each table: the meaning of a row, its token and its columns.
+
+    Derived tables, which have no tokens, come last.
+    """
     return (
         "\n\n".join(_table_markdown(spec) for spec in {**table_specs(), **(derived or {})}.values())
         + "\n"

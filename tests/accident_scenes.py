@@ -1,4 +1,6 @@
-"""Hand-made scenes for the accident metrics: cars of 4 m × 2 m that point ahead, at 2 Hz, in a frame that stands."""
+"""Hand-made scenes for the accident metrics: cars of 4 m × 2 m that point ahead, at 2 Hz, in a
+frame that stands.
+"""
 
 from collections.abc import Mapping, Sequence
 
@@ -26,8 +28,8 @@ def standing(x: float, y: float) -> Path:
 def scene(cars: Mapping[int, Path], frames: int = FRAMES, **config) -> MotionLabels:
     """Labels, at the present, of cars by their actor ids; drawn in this order.
 
-    The released rounding puts corners on half metres exactly where they are, so that cells span 4 m × 2 m, centre to
-    centre.
+    The released rounding puts corners on half metres exactly where they are, so that cells span 4 m
+    × 2 m, centre to centre.
     """
     there = [
         _frame({actor: path[t] for actor, path in cars.items() if path[t]}) for t in range(frames)

@@ -1,4 +1,6 @@
-"""A small application behind the explorer's gate, and requests to it that say exactly what a test wants them to."""
+"""A small application behind the explorer's gate, and requests to it that say exactly what a test
+wants them to.
+"""
 
 import threading
 from collections.abc import Mapping
@@ -12,7 +14,9 @@ from deepaccident_devkit.plugins.explore.serving import Served
 
 
 class TinyApp:
-    """Answers with the paths that it got; some paths are special. `/slow` ends when `go_on` is set."""
+    """Answers with the paths that it got; some paths are special. `/slow` ends when `go_on` is
+    set.
+    """
 
     def __init__(self) -> None:
         self.scopes: list[AsgiScope] = []
@@ -58,7 +62,9 @@ app: App = TinyApp()
 
 @dataclass(frozen=True)
 class Answer:
-    """What came back; names of headers are in small letters, and of several alike the last one counts."""
+    """What came back; names of headers are in small letters, and of several alike the last one
+    counts.
+    """
 
     status: int
     headers: Mapping[str, str]

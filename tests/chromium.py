@@ -12,7 +12,7 @@ return [...document.querySelectorAll('body *')]
   .filter((each) => !each.ownerSVGElement)  // a drawing is cut off at its edges
   .filter((each) => each.getBoundingClientRect().right > width + 1 && !scrolls(each.parentElement))
   .map((each) => each.outerHTML.slice(0, 200));
-"""
+"""  # noqa: E501
 
 
 class Browser:
@@ -22,7 +22,9 @@ class Browser:
         self.driver = driver
 
     def open(self, page: Path | str, width: int, height: int = 900) -> None:
-        """Open a file or an address in a window of a width and height, in pixels, as on a screen of that size."""
+        """Open a file or an address in a window of a width and height, in pixels, as on a screen of
+        that size.
+        """
         size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
         self.driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
         for kind in ("browser", "performance"):
@@ -40,7 +42,8 @@ class Browser:
     def requests(self) -> list[str]:
         """The addresses asked for since the page was opened, its own first.
 
-        Not data that stand in the page, nor the browser's own start page, which may still be on its way.
+        Not data that stand in the page, nor the browser's own start page, which may still be on its
+        way.
         """
         events = [
             json.loads(entry["message"])["message"] for entry in self.driver.get_log("performance")
@@ -69,8 +72,13 @@ class Browser:
         self.script(f"{document}.dispatchEvent(new CustomEvent('go', {{ detail: {frame} }}))")
 
     def faults(self) -> dict[str, Any]:
-        """What no page may have, by kind: what overflows, what the console says, pictures that are not loaded."""
-        pictures = "[...document.images].filter((each) => each.src && !each.naturalWidth).map((each) => each.outerHTML)"
+        """What no page may have, by kind: what overflows, what the console says, pictures that are
+        not loaded.
+        """
+        pictures = (
+            "[...document.images].filter((each) => each.src && "
+            "!each.naturalWidth).map((each) => each.outerHTML)"
+        )
         wide = self.value("document.documentElement.scrollWidth - innerWidth")
         found = {
             "overflows": self.overflowing(),
@@ -95,7 +103,9 @@ class Browser:
         ActionChains(self.driver).send_keys(*keys).perform()
 
     def overflowing(self) -> list[str]:
-        """Elements that reach beyond the right edge, outside of boxes that scroll (class `wide`)."""
+        """Elements that reach beyond the right edge, outside of boxes that scroll (class
+        `wide`).
+        """
         found: list[str] = self.script(OVERFLOWING)
         return found
 

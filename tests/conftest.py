@@ -25,7 +25,8 @@ settings.load_profile("repeatable")
 
 DATA = Path(__file__).parent / "data"
 MADE = os.environ.get("DEEPACCIDENT_TEST_RELEASES")
-"""The folder of the session's releases, if another session has made them (tests/test_plugins.py)."""
+"""The folder of the session's releases, if another session has made them (tests/test_plugins.py).
+"""
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -39,7 +40,8 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         "--real",
         type=Path,
         default=os.environ.get("DEEPACCIDENT_REAL") or None,
-        help="folder with a real scenario, for tests/real, which are skipped without [DEEPACCIDENT_REAL]",
+        help="folder with a real scenario, for tests/real, which are skipped "
+        "without [DEEPACCIDENT_REAL]",
     )
     parser.addoption(
         "--pin",
@@ -49,9 +51,11 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """A checkout that is on the path, but not installed, has no entry point for the test kit's plugin.
+    """A checkout that is on the path, but not installed, has no entry point for the test kit's
+    plugin.
 
-    Where a worker crashes, pytest-xdist (3.8) restarts it, and with tests by file then waits for ever: the run ends.
+    Where a worker crashes, pytest-xdist (3.8) restarts it, and with tests by file then waits for
+    ever: the run ends.
     """
     if getattr(config.option, "maxworkerrestart", "") is None:
         config.option.maxworkerrestart = "0"
@@ -63,9 +67,11 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_collection_finish() -> None:
-    """What the collection made stays until the end: the garbage collector need not look at it again and again.
+    """What the collection made stays until the end: the garbage collector need not look at it again
+    and again.
 
-    Hypothesis asks the collector once who holds its generator of numbers, and is not told of what is frozen.
+    Hypothesis asks the collector once who holds its generator of numbers, and is not told of what
+    is frozen.
     """
     given(nothing=none())(lambda nothing: nothing)()
     gc.collect()
@@ -81,7 +87,9 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
 
 
 def made(name: str, factory: pytest.TempPathFactory, **config: Any) -> Path:
-    """A synthetic release of this name with clean accidents, made now unless another session or process has."""
+    """A synthetic release of this name with clean accidents, made now unless another session or
+    process has.
+    """
     if MADE is not None:
         return Path(MADE) / name
     from deepaccident_devkit.plugins.synth import SynthConfig, make_release
@@ -100,9 +108,11 @@ def made(name: str, factory: pytest.TempPathFactory, **config: Any) -> Path:
 
 @pytest.fixture(scope="session")
 def release_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A synthetic release in layout A with all sensors; read-only by agreement. The path has a blank in it.
+    """A synthetic release in layout A with all sensors; read-only by agreement. The path has a
+    blank in it.
 
-    In its accidents ego and other collide, as designed. Its labels count the very points of its clouds.
+    In its accidents ego and other collide, as designed. Its labels count the very points of its
+    clouds.
     """
     size = {"scenarios": 4, "frames": 6, "image_size": (64, 36)}
     return made(
@@ -112,7 +122,9 @@ def release_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def made_demo(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
-    """The folder of a demo with few frames and small images, and what `deepaccident demo` printed."""
+    """The folder of a demo with few frames and small images, and what `deepaccident demo`
+    printed.
+    """
     out = tmp_path_factory.mktemp("demo") / "of a reader"
     demo = importlib.import_module("deepaccident_devkit.plugins.synth.demo")
     with pytest.MonkeyPatch.context() as patch:
@@ -138,7 +150,9 @@ def da(release_root: Path) -> DeepAccident:
 
 @pytest.fixture(scope="session")
 def da_partial(release_root: Path, tmp_path_factory: pytest.TempPathFactory) -> DeepAccident:
-    """`da` as a partial download: no front camera of the ego, no LiDAR of the pole, no other_vehicle_behind."""
+    """`da` as a partial download: no front camera of the ego, no LiDAR of the pole, no
+    other_vehicle_behind.
+    """
     root = tmp_path_factory.mktemp("synthetic") / "partial"
     shutil.copytree(
         release_root, root, ignore=shutil.ignore_patterns(".deepaccident", "other_vehicle_behind")
@@ -159,7 +173,9 @@ def da_b(release_root_b: Path) -> DeepAccident:
 
 @pytest.fixture(scope="session")
 def motion_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An accident of ego and other and its normal twin of 3.5 s, labels only: with pasts, futures and ends."""
+    """An accident of ego and other and its normal twin of 3.5 s, labels only: with pasts, futures
+    and ends.
+    """
     return made(
         "motion", tmp_path_factory, scenarios=2, frames=35, seed=5, sensors=False, unplanned=0
     )

@@ -20,7 +20,9 @@ class Damaged(NamedTuple):
 
 
 def damaged_release(root: Path) -> Damaged:
-    """Damage a release with three accidents or more and a normal scenario, in place; it keeps whole ones."""
+    """Damage a release with three accidents or more and a normal scenario, in place; it keeps whole
+    ones.
+    """
     records = list(DeepAccident("v1", root, verbose=False).scenario)
     accidents = [each for each in records if each["collision"]]
     without_meta, without_labels = accidents[:2]

@@ -1,4 +1,6 @@
-"""What tests of pictures measure: pixels rendered on an Agg canvas, at places given in data coordinates."""
+"""What tests of pictures measure: pixels rendered on an Agg canvas, at places given in data
+coordinates.
+"""
 
 from typing import Any
 
@@ -34,7 +36,9 @@ def on_canvas(ax: Axes, places: Any) -> Any:
 def has_color(
     picture: Any, place: Any, color: str, *, within: float = 2.0, tolerance: float = 60.0
 ) -> bool:
-    """Whether a pixel whose centre is within some pixels of a place of the canvas has a colour, nearly."""
+    """Whether a pixel whose centre is within some pixels of a place of the canvas has a colour,
+    nearly.
+    """
     height, width = picture.shape[:2]
     rows, columns = np.mgrid[:height, :width]
     near = np.hypot(columns + 0.5 - place[0], rows + 0.5 - place[1]) <= within

@@ -1,4 +1,6 @@
-"""An evaluator and loaders for tests of whole runs: in a module that a spawned process can import by name."""
+"""An evaluator and loaders for tests of whole runs: in a module that a spawned process can import
+by name.
+"""
 
 import math
 from collections.abc import Collection, Sequence

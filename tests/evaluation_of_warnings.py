@@ -1,4 +1,6 @@
-"""Recordings of accidents and of their twins with the scores of a predictor, counted for the warning protocols."""
+"""Recordings of accidents and of their twins with the scores of a predictor, counted for the
+warning protocols.
+"""
 
 import itertools
 import math
@@ -10,7 +12,9 @@ import numpy as np
 from deepaccident_devkit.evaluation.warning import CleanWarnings, FieldWarnings, WarningEvaluator
 
 Scores = Callable[[bool, np.ndarray], np.ndarray]
-"""Whether the recording is an accident, and seconds to its end at each sample → scores; NaN for no alarm."""
+"""Whether the recording is an accident, and seconds to its end at each sample → scores; NaN for no
+alarm.
+"""
 EGO = (("ego_vehicle", "ego_involved"),)
 
 
@@ -22,7 +26,9 @@ def evaluated(
     right: bool = True,
     agents: Sequence[tuple[str, str | None]] = EGO,
 ) -> WarningEvaluator:
-    """Accident recordings of 6 s and twins of 9 s, two samples a second; alarms are right before accidents, or not."""
+    """Accident recordings of 6 s and twins of 9 s, two samples a second; alarms are right before
+    accidents, or not.
+    """
     evaluator, endings = WarningEvaluator(protocol), (("accident", 61), ("normal", 91))
     for number, (ending, last), (agent, involvement) in itertools.product(
         range(pairs), endings, agents

@@ -132,7 +132,9 @@ def stored_run(
     path: Path,
     selection: SampleSelection | None = None,
 ) -> tuple[EvaluationRun, Results]:
-    """The same predictions, written as results and evaluated from there; by default of the split train."""
+    """The same predictions, written as results and evaluated from there; by default of the split
+    train.
+    """
     selection = selection or default_selection(setup, "train")
     kind: ResultsTask = "accident" if setup.task == "warning" else setup.task
     grid = MotionLabelConfig().grid if kind == "motion" else None

@@ -1,6 +1,8 @@
-"""`python forked.py CALIB…` reads each file in a process with little memory and time, and prints how it went.
+"""`python forked.py CALIB…` reads each file in a process with little memory and time, and prints
+how it went.
 
-A crash or a process that has to be killed is an outcome as well. Each is a fork of this one, which has everything
+A crash or a process that has to be killed is an outcome as well. Each is a fork of this one, which
+has everything
 imported: that costs no interpreter's start.
 """
 
@@ -24,7 +26,9 @@ def main() -> None:
 
 
 def outcome(path: Path) -> dict[str, object]:
-    """`status` is the process's exit status, negative for a signal; `message` its error, `peak` its further bytes."""
+    """`status` is the process's exit status, negative for a signal; `message` its error, `peak` its
+    further bytes.
+    """
     reading, writing = os.pipe()
     process = os.fork()
     if process == 0:

@@ -1,4 +1,6 @@
-"""Bundles of generated counts, as `compare` reads them, without a release: motion, whose IoU is a ratio of cells."""
+"""Bundles of generated counts, as `compare` reads them, without a release: motion, whose IoU is a
+ratio of cells.
+"""
 
 import json
 from collections.abc import Mapping, Sequence

@@ -1,4 +1,6 @@
-"""What the generator knows of a scenario, from its scene and its rays: nothing is read from a release's files."""
+"""What the generator knows of a scenario, from its scene and its rays: nothing is read from a
+release's files.
+"""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -144,7 +146,9 @@ def separations(truth: Truth, first: Array, second: Array) -> Array:
 
 
 def time_to_contact(truth: Truth, step: int) -> float:
-    """Seconds from a step until the colliders touch if both keep their velocities; to a millisecond."""
+    """Seconds from a step until the colliders touch if both keep their velocities; to a
+    millisecond.
+    """
     times = np.arange(0.0, 4.0, 1e-3)
     moved = [np.tile(pose, (len(times), 1)) for pose in truth.fine[:, step]]
     for poses, velocity in zip(moved, truth.velocities[:, step], strict=True):
@@ -156,7 +160,8 @@ def time_to_contact(truth: Truth, step: int) -> float:
 def last_moment(truth: Truth, brakers: tuple[bool, bool], deceleration: float) -> float:
     """The last start of a braking that avoids the contact, in steps of `STEP`; NaN if none does.
 
-    The exact motion goes on straight for 3 s at the last velocity, and is tried at all of its steps.
+    The exact motion goes on straight for 3 s at the last velocity, and is tried at all of its
+    steps.
     """
     after = np.arange(1, round(HORIZON / STEP) + 1) * STEP
     placed = []
@@ -182,7 +187,9 @@ def last_moment(truth: Truth, brakers: tuple[bool, bool], deceleration: float) -
 
 
 def facing(truth: Truth) -> Array:
-    """(2,) unit vector from the first collider to the second at the end, across the widest gap along any side."""
+    """(2,) unit vector from the first collider to the second at the end, across the widest gap
+    along any side.
+    """
     poses, sizes = truth.fine[:, -1], truth.sizes[:, :2]
     axes = np.concatenate(
         [[[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]] for yaw in poses[:, 2]]

@@ -13,7 +13,9 @@ TOLERANCE = 1e-4
 
 
 class GoldenModel:
-    """One `NAME.npz`: tensors of its inputs, outputs and state dict by their names without the prefix."""
+    """One `NAME.npz`: tensors of its inputs, outputs and state dict by their names without the
+    prefix.
+    """
 
     def __init__(self, folder: Path, name: str) -> None:
         path = folder / "model" / f"{name}.npz"
@@ -45,7 +47,9 @@ class GoldenModel:
 
 
 def check_close(ours: Any, golden: Any, tolerance: float = TOLERANCE) -> None:
-    """Check shapes, and that no value differs by more than the tolerance times max(1, the largest golden value)."""
+    """Check shapes, and that no value differs by more than the tolerance times max(1, the largest
+    golden value).
+    """
     import torch
 
     assert tuple(ours.shape) == tuple(golden.shape)

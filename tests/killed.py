@@ -1,8 +1,10 @@
-"""A server of processes that index and are stopped: `python killed.py` reads a job a line, and answers with a line.
+"""A server of processes that index and are stopped: `python killed.py` reads a job a line, and
+answers with a line.
 
-A job forks this process, which has everything imported, so that a kill costs no interpreter's start. In place of
-indexing, a job with `words` runs them as a command line, and one with a `function` (module and name) calls it with
-`arguments`. The arguments of the server are further modules to import.
+A job forks this process, which has everything imported, so that a kill costs no interpreter's
+start. In place of indexing, a job with `words` runs them as a command line, and one with a
+`function` (module and name) calls it with `arguments`. The arguments of the server are further
+modules to import.
 """
 
 import importlib
@@ -35,7 +37,9 @@ def main() -> None:
 
 
 def run(job: dict[str, Any]) -> dict[str, Any]:
-    """Index in a new process; `status` is its exit status, −9 if it was killed, `message` its error's."""
+    """Index in a new process; `status` is its exit status, −9 if it was killed, `message` its
+    error's.
+    """
     reading, writing = os.pipe()
     start = time.perf_counter()
     process = os.fork()

@@ -16,7 +16,9 @@ _NUMPY_TYPES = {1: "u1", 5: "<u4", 6: "<i4", 7: "<f4", 8: "<f8"}
 
 @dataclass(frozen=True)
 class McapFile:
-    """A file's messages by topic, (record, decoded message) in the file's order, schemas' names, metadata, summary."""
+    """A file's messages by topic, (record, decoded message) in the file's order, schemas' names,
+    metadata, summary.
+    """
 
     messages: dict[str, list[tuple[Message, Any]]]
     schemas: dict[str, str]

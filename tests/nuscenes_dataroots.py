@@ -1,4 +1,6 @@
-"""Small dataroots in nuScenes' format, written by hand: keyframes at odd times, sweeps, and classes that we lack."""
+"""Small dataroots in nuScenes' format, written by hand: keyframes at odd times, sweeps, and classes
+that we lack.
+"""
 
 import json
 from dataclasses import dataclass, field

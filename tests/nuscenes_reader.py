@@ -1,4 +1,6 @@
-"""A reader of nuScenes' tables that knows nuScenes' conventions and not the devkit: plain JSON and quaternions."""
+"""A reader of nuScenes' tables that knows nuScenes' conventions and not the devkit: plain JSON and
+quaternions.
+"""
 
 import json
 from collections import Counter
@@ -44,7 +46,9 @@ def channel_of(tables: Tables, data: dict[str, Any]) -> str:
 
 
 def faults_of(tables: Tables) -> Iterator[str]:
-    """What nuScenes' devkit would stumble over: references to nothing, broken chains, maps, times."""
+    """What nuScenes' devkit would stumble over: references to nothing, broken chains, maps,
+    times.
+    """
     for name, rows in tables.items():
         for row in rows.values():
             for field, value in row.items():
@@ -107,7 +111,9 @@ def _chain_faults(tables: Tables, name: str, group: str | None) -> Iterator[str]
 def boxes_in(
     tables: Tables, data: dict[str, Any]
 ) -> Iterator[tuple[dict[str, Any], np.ndarray, Quaternion]]:
-    """The annotations of a keyframe's sensor file, with centre and rotation in the sensor's frame."""
+    """The annotations of a keyframe's sensor file, with centre and rotation in the sensor's
+    frame.
+    """
     calibrated = tables["calibrated_sensor"][data["calibrated_sensor_token"]]
     pose = tables["ego_pose"][data["ego_pose_token"]]
     for row in tables["sample_annotation"].values():

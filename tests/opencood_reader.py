@@ -1,7 +1,8 @@
-"""A reader of OPV2V's folders, written from what OpenCOOD's loaders do with each field, without the devkit.
+"""A reader of OPV2V's folders, written from what OpenCOOD's loaders do with each field, without the
+devkit.
 
-It takes the first agent by name for the ego, adds `location` and `center` unturned, takes `extent` for half lengths and
-angles for degrees, and the world for CARLA's left-handed one.
+It takes the first agent by name for the ego, adds `location` and `center` unturned, takes `extent`
+for half lengths and angles for degrees, and the world for CARLA's left-handed one.
 """
 
 import json
@@ -16,7 +17,9 @@ Facts = Mapping[str, Any]
 
 
 def agents_of(scenario: Path) -> list[str]:
-    """The folders of a scenario in the order that loaders have: sorted as words, a first pole at the end."""
+    """The folders of a scenario in the order that loaders have: sorted as words, a first pole at
+    the end.
+    """
     names = sorted(each.name for each in scenario.iterdir() if each.is_dir())
     return [*names[1:], names[0]] if int(names[0]) < 0 else names
 
@@ -47,7 +50,9 @@ def points_of(scenario: Path, agent: str, timestamp: str) -> np.ndarray:
 
 
 def world_from(six: Any) -> np.ndarray:
-    """(4, 4) of x, y, z, roll, yaw, pitch in degrees, as CARLA turns: left-handed, roll and pitch against the screw."""
+    """(4, 4) of x, y, z, roll, yaw, pitch in degrees, as CARLA turns: left-handed, roll and pitch
+    against the screw.
+    """
     roll, yaw, pitch = np.radians(six[3:])
     cr, sr, cy, sy, cp, sp = (
         np.cos(roll),
@@ -68,7 +73,9 @@ def world_from(six: Any) -> np.ndarray:
 
 
 def counts_of(facts: Facts, points: np.ndarray, margin: float = 0.0) -> dict[int, int]:
-    """Vehicle → how many of the agent's own points lie in its box, which is larger by a margin (metres)."""
+    """Vehicle → how many of the agent's own points lie in its box, which is larger by a margin
+    (metres).
+    """
     world = points[:, :3] @ world_from(facts["lidar_pose"])[:3, :3].T + facts["lidar_pose"][:3]
     found = {}
     for actor, vehicle in facts["vehicles"].items():

@@ -27,7 +27,9 @@ def packed(
     chosen: Callable[[Path], bool] = lambda _: True,
     written: Callable[[str], str] = str,
 ) -> Path:
-    """A zip of a release's files, by their paths from there, below the folders `above`, in another way if `written`."""
+    """A zip of a release's files, by their paths from there, below the folders `above`, in another
+    way if `written`.
+    """
     archive.parent.mkdir(parents=True, exist_ok=True)
     with zipfile.ZipFile(archive, "w", _METHODS[method]) as opened:
         for path in files_of(root):
@@ -40,7 +42,9 @@ def packed(
 
 
 def packed_by_agent(root: Path, folder: Path, names: Iterable[str]) -> Path:
-    """A folder with a zip for each agent and one of the meta files, below odd folders; split files lie beside them."""
+    """A folder with a zip for each agent and one of the meta files, below odd folders; split files
+    lie beside them.
+    """
     for number, name in enumerate(names):
         method, above = KINDS[number % 2], ("", "DeepAccident/", "./data/x/")[number % 3]
         packed(

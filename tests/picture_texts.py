@@ -1,4 +1,6 @@
-"""What tests of all views ask of their texts: that they can be read, are in the picture, and do not overlap."""
+"""What tests of all views ask of their texts: that they can be read, are in the picture, and do not
+overlap.
+"""
 
 from itertools import combinations
 from typing import Any
@@ -14,7 +16,8 @@ TOUCHING = 1.5
 
 
 def text_faults(figure: Any) -> list[str]:
-    """What is wrong with the texts of a figure: outside of it, over another one, or too small; empty if nothing is.
+    """What is wrong with the texts of a figure: outside of it, over another one, or too small;
+    empty if nothing is.
 
     A token may be small, and is in the room that its title has for it.
     """
@@ -47,7 +50,9 @@ def text_faults(figure: Any) -> list[str]:
 
 
 def panels_share(figure: Any) -> float:
-    """Which share of a figure's canvas its panels are: axes that are switched off only hold words."""
+    """Which share of a figure's canvas its panels are: axes that are switched off only hold
+    words.
+    """
     areas = [ax.get_window_extent() for ax in figure.axes if ax.axison]
     return float(
         sum(area.width * area.height for area in areas) / (figure.bbox.width * figure.bbox.height)
@@ -55,7 +60,9 @@ def panels_share(figure: Any) -> float:
 
 
 def _drawn(figure: Any) -> list[Any]:
-    """The texts of a figure that are rendered: not those of ticks out of range, of axes that are off, or clipped."""
+    """The texts of a figure that are rendered: not those of ticks out of range, of axes that are
+    off, or clipped.
+    """
     hidden: set[Text] = set()
     for axes in figure.axes:
         for axis in (axes.xaxis, axes.yaxis):

@@ -1,4 +1,5 @@
-"""FIERY's own reading of a sample, computed once more and plainly: what its dataset class draws (fd03f16).
+"""FIERY's own reading of a sample, computed once more and plainly: what its dataset class draws
+(fd03f16).
 
 It takes the world's boxes and the ego's pose, as the nuScenes export writes them.
 """
@@ -11,7 +12,9 @@ from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.taxonomy import OWN_ACTOR_ID, UNTRACKED_ID
 
 INNER = slice(4, -4)
-"""Cells that no version of OpenCV fills otherwise: they differ in how they cut polygons at the edge."""
+"""Cells that no version of OpenCV fills otherwise: they differ in how they cut polygons at the
+edge.
+"""
 
 
 def instances(

@@ -1,4 +1,5 @@
-"""Post-processing a cell and an instance at a time, as docs/released_code.md, Post-processing, reads.
+"""Post-processing a cell and an instance at a time, as docs/released_code.md, Post-processing,
+reads.
 
 The devkit's arrays must give the same.
 """

@@ -1,4 +1,6 @@
-"""Small results files made with numpy and json alone: what another program would write, for tests that break them."""
+"""Small results files made with numpy and json alone: what another program would write, for tests
+that break them.
+"""
 
 import hashlib
 import json

@@ -22,7 +22,9 @@ def straight(start: tuple[float, float], yaw: float, speed: float, frames: int) 
 def scene(
     speed: float, seconds: float = 3.0, *, others: Sequence[np.ndarray] = (), partner: bool = True
 ) -> PlanningScene:
-    """The ego's front reaches a standing car, actor 1, after some seconds; others are actors from 2 on."""
+    """The ego's front reaches a standing car, actor 1, after some seconds; others are actors from 2
+    on.
+    """
     frames = round(seconds / STEP) + 1
     way = np.arange(frames) * STEP * speed
     ahead = straight((way[-1] + CAR[0], 0.0), 0.0, 0.0, frames)

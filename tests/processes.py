@@ -37,7 +37,9 @@ def works(process: int) -> bool:
 
 
 def _has(process: int, signals: str, number: int) -> bool:
-    """Whether a signal is in one of the sets that the system keeps of a process; one that has ended has none."""
+    """Whether a signal is in one of the sets that the system keeps of a process; one that has ended
+    has none.
+    """
     try:
         lines = Path(f"/proc/{process}/status").read_text().splitlines()
     except OSError:

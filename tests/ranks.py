@@ -1,4 +1,6 @@
-"""Two processes of torch.distributed over `gloo`: in a module that spawned processes can import by name."""
+"""Two processes of torch.distributed over `gloo`: in a module that spawned processes can import by
+name.
+"""
 
 import json
 import os

@@ -8,7 +8,9 @@ import pytest
 def assert_refused(
     *cases: tuple[Callable[[], object], type[Exception], str | tuple[str, ...]],
 ) -> None:
-    """Each call raises its kind of error, in whose message the pattern is found, or each of some plain words."""
+    """Each call raises its kind of error, in whose message the pattern is found, or each of some
+    plain words.
+    """
     for make, error, sentence in cases:
         with pytest.raises(error, match=sentence if isinstance(sentence, str) else None) as raised:
             make()

@@ -1,4 +1,6 @@
-"""Accidents whose outcome under braking follows from school physics, for the tests of `accidents` and `safety`."""
+"""Accidents whose outcome under braking follows from school physics, for the tests of `accidents`
+and `safety`.
+"""
 
 from collections.abc import Callable
 
@@ -53,14 +55,18 @@ def swapped(given: Accident) -> Accident:
 
 
 def rear_end(striker: float = 20.0, leader: float = 10.0, seconds: float = 5.0) -> Accident:
-    """A striker (first) reaches the rear of a leader exactly at the last frame, both at constant speeds, m/s."""
+    """A striker (first) reaches the rear of a leader exactly at the last frame, both at constant
+    speeds, m/s.
+    """
     frames = round(seconds / STEP) + 1
     ahead = CAR[0] + (striker - leader) * seconds
     return accident(straight((0, 0), 0, striker, frames), straight((ahead, 0), 0, leader, frames))
 
 
 def head_on(speed: float = 10.0, seconds: float = 5.0) -> Accident:
-    """Two that drive towards each other at the same speed, m/s, and touch exactly at the last frame."""
+    """Two that drive towards each other at the same speed, m/s, and touch exactly at the last
+    frame.
+    """
     frames = round(seconds / STEP) + 1
     apart = CAR[0] + 2 * speed * seconds
     return accident(straight((0, 0), 0, speed, frames), straight((apart, 0), np.pi, speed, frames))
@@ -68,7 +74,9 @@ def head_on(speed: float = 10.0, seconds: float = 5.0) -> Accident:
 
 @st.composite
 def wild_paths(draw: Callable[..., float], frames: int = 21) -> np.ndarray:
-    """(F, 3) of a path with turns, standing still and jumps of speed, whose last frame is near the origin."""
+    """(F, 3) of a path with turns, standing still and jumps of speed, whose last frame is near the
+    origin.
+    """
     seed = draw(st.integers(0, 10_000))
     rng = np.random.default_rng(seed)
     speeds = np.repeat(rng.choice([0.0, 2.0, 8.0, 15.0, 25.0], 7), 3)[: frames - 1] + rng.normal(

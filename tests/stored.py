@@ -1,4 +1,6 @@
-"""Work on items of a store that tests do in other processes: in a module that a spawned process can import by name."""
+"""Work on items of a store that tests do in other processes: in a module that a spawned process can
+import by name.
+"""
 
 import os
 import signal
@@ -63,7 +65,10 @@ def made(folder: Path, workers: int = 1, **how: object) -> dict[str, bytes]:
 
 def process(folder: Path, workers: int = 1, killed_at: str = "") -> "subprocess.Popen[str]":
     """Another process that makes all, and imports this module by its name as its workers do."""
-    code = f"from pathlib import Path; import stored; stored.made(Path({str(folder)!r}), {workers}, {killed_at=!r})"
+    code = (
+        f"from pathlib import Path; import stored; stored.made(Path({str(folder)!r}), "
+        f"{workers}, {killed_at=!r})"
+    )
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parent)}
     return subprocess.Popen(
         [sys.executable, "-c", code], stderr=subprocess.PIPE, text=True, env=environment

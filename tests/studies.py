@@ -1,4 +1,6 @@
-"""Studies that tests run: a small one of baselines, and a process that is killed in the middle of one."""
+"""Studies that tests run: a small one of baselines, and a process that is killed in the middle of
+one.
+"""
 
 import json
 import subprocess
@@ -66,7 +68,9 @@ def written(folder: Path, recipe: dict[str, Any], name: str = "mine") -> Path:
 
 
 def killed(recipe: Path, out: Path, module: str, name: str, after: int) -> None:
-    """Run a study in a process that is killed when a function is called once more than so many times."""
+    """Run a study in a process that is killed when a function is called once more than so many
+    times.
+    """
     words = [sys.executable, "-c", _KILLED, module, name, str(after), str(recipe), str(out)]
     ran = subprocess.run(words, check=False, capture_output=True, text=True, timeout=600)
     assert ran.returncode == -9, ran.stderr

@@ -392,7 +392,9 @@ def test_get_sample_and_samples_of(da: DeepAccident) -> None:
 
 
 def test_sensor_data_is_where_it_should_be(da: DeepAccident) -> None:
-    """LiDAR points of a box lie in it in whichever frame, and its centre projects to the same pixel."""
+    """LiDAR points of a box lie in it in whichever frame, and its centre projects to the same
+    pixel.
+    """
     for sample in da.samples_of(da.scenario[0]["first_frame_token"]):
         for frame in ("world", "ego", "lidar"):
             cloud, boxes = da.load_point_cloud(sample, frame), da.boxes(sample, frame)

@@ -1,4 +1,6 @@
-"""Some cases of each kind in a test run; every way to fail is noticed; kills, full disks, the page of the last run."""
+"""Some cases of each kind in a test run; every way to fail is noticed; kills, full disks, the page
+of the last run.
+"""
 
 import re
 from pathlib import Path

@@ -1,4 +1,6 @@
-"""Pages that the text cites ship with it: whoever reads of `docs/protocols.md` in a docstring can open it."""
+"""Pages that the text cites ship with it: whoever reads of `docs/protocols.md` in a docstring can
+open it.
+"""
 
 import re
 from collections.abc import Iterator
@@ -57,7 +59,9 @@ def cited_pages(text: str) -> set[str]:
 
 
 def ships(page: str, citing: str, files: set[str]) -> bool:
-    """Whether a page is there: seen from the citing file, from the top, from docs/, or as the end of one path alone."""
+    """Whether a page is there: seen from the citing file, from the top, from docs/, or as the end
+    of one path alone.
+    """
     folders = (str(PurePosixPath(citing).parent), ".", "docs")
     if any(normpath(f"{folder}/{page}") in files for folder in folders):
         return True

@@ -76,7 +76,7 @@ def fail(command):
 
 cli.run_interruptibly = fail
 cli.main()
-"""
+"""  # noqa: E501
 
 
 def test_of_an_error_in_a_loaders_worker_the_message_is_told_alone() -> None:
@@ -107,7 +107,9 @@ def test_a_broken_release_is_listed_and_may_be_skipped(own_release: Path) -> Non
 OF_FILES = ("--version", "--workers", "--scheduler")
 NOT_OF_ALL = {"validate": OF_FILES, "release": OF_FILES, "scores": ("--version",)}
 NOT_OF_ALL |= dict.fromkeys(("train", "explore", "results", "sensor-setups"), ())
-"""Verb on a release → the options of a release that it has; those that are left out run in one process, say."""
+"""Verb on a release → the options of a release that it has; those that are left out run in one
+process, say.
+"""
 
 
 @pytest.mark.slow
@@ -231,8 +233,8 @@ def test_info_lists_the_scenarios_of_where(own_release: Path) -> None:
     )
     none = ran("info", own_release, "--where", "length=1..2").stdout
     assert (
-        none
-        == "no scenario matches length=1..2; deepaccident info --fields lists what can be asked for\n"
+        none == "no scenario matches length=1..2; deepaccident info --fields lists "
+        "what can be asked for\n"
     )
 
 
@@ -267,7 +269,10 @@ def test_labels_writes_a_split_and_goes_on_where_it_stopped(
     switches = ("--switch", "half_cell_shift=no", "--switch", "own_box_default=no")
     made = ran(*verb, "--agents", ",".join(agents), *switches)
     scenarios = DeepAccident(dataroot=own_release).split_scenarios("train")
-    whole = f"{8 * len(scenarios)} samples in {out}: {2 * len(scenarios)} files written, 0 were there already\n"
+    whole = (
+        f"{8 * len(scenarios)} samples in {out}: {2 * len(scenarios)} files "
+        f"written, 0 were there already\n"
+    )
     assert (made.stdout, "motion labels: 100%" in made.stderr) == (whole, True)
     rules = replace(LABEL_PROTOCOLS["released"], half_cell_shift=False, own_box_default=False)
     files = LabelFiles(out, MotionLabelConfig(protocol=rules))

@@ -1,4 +1,6 @@
-"""`check splits`, `check scores` and `check reader` as users call them: exit status 1 for findings, 2 for bad input."""
+"""`check splits`, `check scores` and `check reader` as users call them: exit status 1 for findings,
+2 for bad input.
+"""
 
 import json
 from pathlib import Path

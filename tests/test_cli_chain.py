@@ -1,4 +1,6 @@
-"""From nothing to checked numbers by the command line alone: each step is a process of its own, as a user has it."""
+"""From nothing to checked numbers by the command line alone: each step is a process of its own, as
+a user has it.
+"""
 
 import json
 from pathlib import Path

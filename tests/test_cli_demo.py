@@ -1,4 +1,6 @@
-"""`deepaccident demo`: what it makes, where it refuses to, and whether its reader can see the crash coming."""
+"""`deepaccident demo`: what it makes, where it refuses to, and whether its reader can see the crash
+coming.
+"""
 
 import importlib
 import json

@@ -115,7 +115,9 @@ def write_boxes(dataset: DeepAccident, path: Path, tokens: Iterable[str]) -> Pat
 
 @pytest.fixture(scope="module")
 def results(da_motion: DeepAccident, folder: Path, tokens: list[str]) -> dict[str, Path]:
-    """The true accidents, moved a little; the labels as predictions, moved by a column; the true boxes."""
+    """The true accidents, moved a little; the labels as predictions, moved by a column; the true
+    boxes.
+    """
     return {
         "accidents": write_accidents(da_motion, folder / "accidents.json", tokens),
         "motion": write_motion(da_motion, folder / "motion", tokens, moved=1),
@@ -251,7 +253,9 @@ def test_a_partial_download_is_evaluated_and_its_report_has_pictures(
     write: Callable[..., Path],
     line: str,
 ) -> None:
-    """The truth of the agents that are there is a perfect prediction (the released AP is 97.22 %, then)."""
+    """The truth of the agents that are there is a perfect prediction (the released AP is 97.22 %,
+    then).
+    """
     tokens = da_partial.evaluation_samples("val", "paper", scope="all")
     assert {token.split("/")[2] for token in tokens} == set(taxonomy.AGENTS) - {
         "other_vehicle_behind"
@@ -303,7 +307,10 @@ class TestVerify:
         self, bundle: Path, da_motion: DeepAccident
     ) -> None:
         told = ran("check", "bundle", bundle, status=2).stderr
-        command = f"deepaccident check bundle {shlex.quote(str(bundle))} --dataroot {da_motion.dataroot}\n"
+        command = (
+            f"deepaccident check bundle {shlex.quote(str(bundle))} --dataroot "
+            f"{da_motion.dataroot}\n"
+        )
         assert (told.count("\n"), told.endswith(command)) == (1, True)
 
     def test_nothing_is_written_into_the_release(
@@ -469,7 +476,9 @@ def test_options_that_are_refused(
 def test_an_operating_point_from_another_split(
     da_motion: DeepAccident, results: dict[str, Path], bundle: Path, folder: Path
 ) -> None:
-    """The release has one pair of twins; its evaluation stands for one of others once their names are changed."""
+    """The release has one pair of twins; its evaluation stands for one of others once their names
+    are changed.
+    """
     out, samples = folder / "chooses", ("--samples", "evaluate", "--scope", "accident")
     words = ("warning", da_motion.dataroot, "--results", results["accidents"], *LIST, *samples)
     evaluate(*words, "--out", out)
@@ -489,7 +498,9 @@ def test_an_operating_point_from_another_split(
 
 @pytest.fixture(scope="module")
 def prevention(da_motion: DeepAccident, folder: Path) -> Path:
-    """An evaluation of the true accidents over whole recordings, with the accidents that they would have prevented."""
+    """An evaluation of the true accidents over whole recordings, with the accidents that they would
+    have prevented.
+    """
     tokens = [token for token in da_motion.samples("train", "all") if token.split("/")[2] in AGENTS]
     results = write_accidents(da_motion, folder / "whole.json", tokens)
     words = (

@@ -1,4 +1,6 @@
-"""`deepaccident explore`, as a reader runs it: the printed address opens the pages, Ctrl-C ends all of it."""
+"""`deepaccident explore`, as a reader runs it: the printed address opens the pages, Ctrl-C ends all
+of it.
+"""
 
 import re
 import signal

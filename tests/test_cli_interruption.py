@@ -214,7 +214,9 @@ def test_mcap(da: DeepAccident, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_signal_at_any_moment(release_root_b: Path, tmp_path: Path) -> None:
-    """From the first to the last: libraries are imported, workers start, files are written, Python ends."""
+    """From the first to the last: libraries are imported, workers start, files are written, Python
+    ends.
+    """
     source = shutil.copytree(
         release_root_b, tmp_path / "release", ignore=shutil.ignore_patterns(".deepaccident")
     )
@@ -331,7 +333,8 @@ ENDS = {
     run_interruptibly(verb)
     """: ("tidied up\n", [LINE], None),
 }
-"""A script that gets a signal, by what it is sent amid → what it prints, what it says, its status."""
+"""A script that gets a signal, by what it is sent amid → what it prints, what it says, its status.
+"""
 
 
 @pytest.mark.parametrize(("number", "status"), SIGNALS.items())

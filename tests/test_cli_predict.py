@@ -165,7 +165,10 @@ def test_predict_of_scenarios_without_an_accident_names_the_scope(
         "--workers",
         1,
     )
-    told = r"has no samples to predict; the scope accident, .* leaves out all 1 of its scenarios, .* \(--scope all\)$"
+    told = (
+        r"has no samples to predict; the scope accident, .* leaves out all 1 of its "
+        r"scenarios, .* \(--scope all\)$"
+    )
     assert_refused((lambda: run(*words, "--out", tmp_path / "out"), NotAvailableError, told))
     run(*words, "--scope", "all", "--out", tmp_path / "out")
 

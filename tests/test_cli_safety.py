@@ -28,8 +28,8 @@ def test_from_a_damaged_release_to_a_page(own_release: Path, tmp_path: Path) -> 
         token for token in damaged.whole if damaged.dataset.get("scenario", token)["collision"]
     ]
     assert (
-        f"{counted(len(accidents), 'accident')} of {counted(len(damaged.dataset.scenario), 'scenario')}; "
-        in text
+        f"{counted(len(accidents), 'accident')} of "
+        f"{counted(len(damaged.dataset.scenario), 'scenario')}; " in text
     )
     assert f"open {out / 'report.html'} in a browser" in text
     assert len(list((out / "replays").iterdir())) == 1

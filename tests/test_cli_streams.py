@@ -1,4 +1,6 @@
-"""What verbs print, on any terminal and on none: nothing that they write depends on it, and no letter ends them."""
+"""What verbs print, on any terminal and on none: nothing that they write depends on it, and no
+letter ends them.
+"""
 
 import io
 import json
@@ -187,7 +189,10 @@ def test_what_is_written_does_not_depend_on_who_reads(
         for line in done.stderr.decode().splitlines()
         if line.startswith("error") or "Traceback" in line
     ]
-    full = "error: standard output: cannot be written (No space left on device); files that the command wrote are whole"
+    full = (
+        "error: standard output: cannot be written (No space left on device); files that "
+        "the command wrote are whole"
+    )
     assert (done.returncode, told) == (OUTPUTS[output], [full] * (output == "full"))
     assert len(files(tmp_path)) >= 2
 

@@ -1,4 +1,6 @@
-"""`deepaccident study` as users call it, of baselines alone; tests/torch_extra/study has those that train."""
+"""`deepaccident study` as users call it, of baselines alone; tests/torch_extra/study has those that
+train.
+"""
 
 import json
 from pathlib import Path
@@ -30,8 +32,8 @@ def test_a_study_of_baselines(da: DeepAccident, tmp_path: Path) -> None:
     told = called("study", path, out, "--workers", "1", "--style", "cvpr-column").output
     assert f"written: {out / 'mine'}; open {out / 'mine' / 'index.html'} in a browser" in told
     assert (
-        "Among `accidents`: it is not decided whether `sees all` has more IoU 100x100 (%) than `sees single`"
-        in told
+        "Among `accidents`: it is not decided whether `sees all` has more IoU "
+        "100x100 (%) than `sees single`" in told
     )
     assert {line.split("  ")[0] for line in told.splitlines()} > {
         "sees single",

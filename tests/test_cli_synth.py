@@ -67,7 +67,9 @@ def test_every_option_reaches_the_configuration(tmp_path, made, monkeypatch, wor
 
 @pytest.mark.slow
 def test_a_benchmark_is_made_and_compared(tmp_path, monkeypatch):
-    """One that is there is compared alone; which differences there are is told, and what else was asked for refused."""
+    """One that is there is compared alone; which differences there are is told, and what else was
+    asked for refused.
+    """
     config = SynthConfig(scenarios=1, frames=2, image_size=(32, 18), seed=6)
     small = make_release(tmp_path / "small", config, workers=1)
     module = sys.modules[synth.callback.__module__]
@@ -86,7 +88,10 @@ def test_a_benchmark_is_made_and_compared(tmp_path, monkeypatch):
     first = run("--sensors", "clouds")
     assert (first.exit_code, first.stdout.splitlines()[0]) == (
         0,
-        f"{tmp_path / 'out'}: is the benchmark v1 as published, 1 scenario: labels, num_lidar_pts, clouds",
+        (
+            f"{tmp_path / 'out'}: is the benchmark v1 as published, 1 scenario: "
+            f"labels, num_lidar_pts, clouds"
+        ),
     )
     [label] = (tmp_path / "out").glob("*/infrastructure/label/*/*_002.txt")
     label.write_text(label.read_text().replace("car ", "van ", 1))

@@ -33,7 +33,10 @@ UNUSED = [
     ),
     (
         EVALUATE.format("warning") + " --protocol field --prevented",
-        "--prevented needs the scores of whole recordings, which --protocol field does not have; give --protocol clean",
+        (
+            "--prevented needs the scores of whole recordings, which --protocol field "
+            "does not have; give --protocol clean"
+        ),
     ),
     (
         EVALUATE.format("detection") + " --samples all --horizon 3",
@@ -77,7 +80,10 @@ UNUSED = [
     ),
     (
         EVALUATE.format("motion") + " --protocol clean",
-        "'clean' is a protocol of labels; choose the labels by the switch labels='clean' (--switch labels=clean)",
+        (
+            "'clean' is a protocol of labels; choose the labels by the switch "
+            "labels='clean' (--switch labels=clean)"
+        ),
     ),
     (EVALUATE.format("accident") + " --protocol fiery", "'fiery' is a protocol of labels"),
     (

@@ -1,4 +1,5 @@
-"""Intervals hold the truth as often as they say, and differences are not called real by chance: a quick look.
+"""Intervals hold the truth as often as they say, and differences are not called real by chance: a
+quick look.
 
 `python -m benchmarks.coverage` measures the whole tables.
 """

@@ -74,7 +74,7 @@ RUN_ELSEWHERE = {
 """Pages whose Python needs more than the demo's release, and the tests that run it."""
 STAND_FOR = {
     "DATAROOT": "deepaccident_demo/release",
-    "FILE": "deepaccident_demo/release/type1_subtype1_accident/meta/Town10HD_type001_subtype0001_scenario00001.txt",
+    "FILE": "deepaccident_demo/release/type1_subtype1_accident/meta/Town10HD_type001_subtype0001_scenario00001.txt",  # noqa: E501
     "LABEL": "deepaccident_demo/release/type1_subtype1_accident/ego_vehicle/label/"
     "Town10HD_type001_subtype0001_scenario00001/Town10HD_type001_subtype0001_scenario00001_001.txt",
     "OUT": "out",
@@ -86,7 +86,8 @@ NOT_RUN = {
     "check reader": "likewise",
     "synth ": "tests/test_cli_synth.py has them; some take minutes",
     "safety describe OUT": "of what synth makes",
-    "render accident OUT": "tests/unit/plugins/synth/test_own_files.py has it, on a release of a scenario file",
+    "render accident OUT": "tests/unit/plugins/synth/test_own_files.py has it, on a "
+    "release of a scenario file",
     "info s3:": "tests/cloud has releases on S3",
     "study ": "tests/test_cli_study.py has their like; some take hours",
     "train ": "tests/torch_extra/model/test_commands.py has them; they need torch",
@@ -94,12 +95,15 @@ NOT_RUN = {
     "evaluate motion training_data": "of what predict makes; likewise",
     "evaluate motion DATAROOT --results results/motion ": "likewise",
     "predict constant_velocity DATAROOT --split": "tests/test_cli_predict.py has their like",
-    "predict constant_velocity hidden_release": "benchmarks/pages/baselines.py does that and the next one",
+    "predict constant_velocity hidden_release": "benchmarks/pages/baselines.py does that "
+    "and the next one",
     "evaluate motion hidden_release": "likewise",
-    "evaluate warning DATAROOT --results all_": "of what these predict; tests/test_cli_evaluate.py has their like",
+    "evaluate warning DATAROOT --results all_": "of what these predict; "
+    "tests/test_cli_evaluate.py has their like",
     "check bundle benchmarks/": "tests/test_cli_evaluate.py has its like",
     "results ": "tests/unit/export/nuscenes/test_detections.py has it, and makes the file",
-    "sensor-setups data/": "tests/road/test_commands.py has it and its like; they need the nuScenes devkit",
+    "sensor-setups data/": "tests/road/test_commands.py has it and its like; they "
+    "need the nuScenes devkit",
     "render sample data/": "likewise",
     "evaluate motion data/": "likewise",
     "evaluate detection data/": "likewise",
@@ -114,7 +118,9 @@ NO_CALLS = (
 
 
 def run_page(page: Path, languages: str = "python|bash") -> dict[str, Any]:
-    """Run the page's Python and shell blocks, as they stand and in their order, in the working folder."""
+    """Run the page's Python and shell blocks, as they stand and in their order, in the working
+    folder.
+    """
     names: dict[str, Any] = {}
     blocks = re.findall(
         rf"^```({languages})\n(.*?)^```", page.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE
@@ -143,14 +149,18 @@ def folder_of_demo(root: Path, folder: Path) -> Path:
 def in_labels_demo(
     da_motion: DeepAccident, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> Path:
-    """A working folder in which `deepaccident_demo/release` is a small release, with labels alone."""
+    """A working folder in which `deepaccident_demo/release` is a small release, with labels
+    alone.
+    """
     monkeypatch.chdir(folder_of_demo(da_motion.dataroot, tmp_path))
     return tmp_path
 
 
 @pytest.fixture(scope="module")
 def small_demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An accident as the demo's, with all sensors: as many frames as the pages ask for, and small images."""
+    """An accident as the demo's, with all sensors: as many frames as the pages ask for, and small
+    images.
+    """
     folder = tmp_path_factory.mktemp("demo")
     config = SynthConfig(scenarios=1, frames=32, image_size=(64, 36), view="hidden")
     return make_release(folder / "release", config, workers=2)
@@ -253,7 +263,9 @@ def test_the_commands_of_the_pictures_run(da_motion: DeepAccident, in_demo: Path
 def test_the_outputs_on_the_page_of_safety_are_as_commands_print_them_now(
     in_labels_demo: Path,
 ) -> None:
-    """Their headings and rows' names are compared: `python docs/make_tables.py safety` measures on a larger release."""
+    """Their headings and rows' names are compared: `python docs/make_tables.py safety` measures on
+    a larger release.
+    """
     script = of_checkout("benchmarks.pages.safety")
     (in_labels_demo / script.RELEASE).symlink_to(in_labels_demo / "deepaccident_demo" / "release")
     there = (DOCS / "safety.md").read_text(encoding="utf-8")
@@ -368,7 +380,9 @@ KINDS = {
 
 
 def named(expression: ast.expr) -> Any:
-    """What a dotted name on the page stands for: of `da`, `box` and others the member of their class."""
+    """What a dotted name on the page stands for: of `da`, `box` and others the member of their
+    class.
+    """
     if isinstance(expression, ast.Subscript):
         return named(expression.value).__getitem__
     if isinstance(expression, ast.Attribute):

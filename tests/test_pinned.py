@@ -1,6 +1,8 @@
-"""What the devkit computes of the session's releases is what it was: exactly, and floats within a tolerance.
+"""What the devkit computes of the session's releases is what it was: exactly, and floats within a
+tolerance.
 
-`pytest tests/test_pinned.py --pin` writes tests/data/pinned.json anew, for a change that should change numbers.
+`pytest tests/test_pinned.py --pin` writes tests/data/pinned.json anew, for a change that should
+change numbers.
 """
 
 import dataclasses
@@ -56,7 +58,9 @@ Pins = dict[str, list[Any]]
 
 
 def pin(value: Any) -> list[Any]:
-    """How many values there are, a hash of all but finite floats, and two sums of these, of which one is by place."""
+    """How many values there are, a hash of all but finite floats, and two sums of these, of which
+    one is by place.
+    """
     rest, floats, count = hashlib.sha256(), [np.zeros(1)], 0
     for leaf in map(np.asarray, leaves(value)):
         count += leaf.size
@@ -113,7 +117,9 @@ def pins_of_tables(da: DeepAccident) -> Pins:
 
 
 def turns(column: str, values: Any) -> Any:
-    """A column; rotations as matrices, headings by cosine and sine: half a turn has two quaternions and two angles."""
+    """A column; rotations as matrices, headings by cosine and sine: half a turn has two quaternions
+    and two angles.
+    """
     angles = {"rotation": to_matrix, "yaw": lambda yaw: [np.cos(yaw), np.sin(yaw)]}
     return angles.get(column, lambda each: each)(values)
 

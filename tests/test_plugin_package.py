@@ -1,4 +1,6 @@
-"""The package of docs/plugins.md, installed in an environment of its own: its verb, format and task work."""
+"""The package of docs/plugins.md, installed in an environment of its own: its verb, format and task
+work.
+"""
 
 import json
 import os
@@ -21,7 +23,9 @@ PAGE = Path(__file__).parents[1] / "docs" / "plugins.md"
 
 @pytest.fixture(scope="module")
 def python(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The interpreter of a new environment with the package of the page, beside what this one has."""
+    """The interpreter of a new environment with the package of the page, beside what this one
+    has.
+    """
     folder = tmp_path_factory.mktemp("plugin")
     text = PAGE.read_text(encoding="utf-8")
     package = folder / "deepaccident-extras"

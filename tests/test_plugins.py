@@ -1,4 +1,6 @@
-"""The core without each plug-in: it imports, its commands run, its tests pass, and it names what is missing."""
+"""The core without each plug-in: it imports, its commands run, its tests pass, and it names what is
+missing.
+"""
 
 import json
 import os
@@ -82,16 +84,19 @@ for expression in asked:
     except MissingPluginError as error:
         named[expression] = str(error)
 print(json.dumps([deepaccident_devkit.__file__, len(core), named]))
-"""
+"""  # noqa: E501
 
 
 def copy_without(folder: Path, *without: str) -> Path:
-    """Copy the package into a folder, without some plug-ins; an editable installation does not provide them either."""
+    """Copy the package into a folder, without some plug-ins; an editable installation does not
+    provide them either.
+    """
     shutil.copytree(PACKAGE, folder / PACKAGE.name)
     for name in without:
         shutil.rmtree(folder / PACKAGE.name / "plugins" / name)
     (folder / "sitecustomize.py").write_text(
-        "import sys\nsys.meta_path[:] = [each for each in sys.meta_path if '__editable__' not in str(each)]\n"
+        "import sys\nsys.meta_path[:] = [each for each in sys.meta_path if "
+        "'__editable__' not in str(each)]\n"
     )
     return folder
 
@@ -111,7 +116,9 @@ def run_in(folder: Path, *words: str, **environment: str) -> subprocess.Complete
 
 
 def passed(folder: Path, releases: Path, without: tuple[str, ...], *tests: str) -> int:
-    """Return how many of the core's quick tests pass; those that need a plug-in are skipped, and none may fail."""
+    """Return how many of the core's quick tests pass; those that need a plug-in are skipped, and
+    none may fail.
+    """
     plugins = ("without_plugins", "no:cacheprovider", "no:randomly")
     words = [
         "-m",

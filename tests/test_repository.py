@@ -1,4 +1,6 @@
-"""Templates of issues name commands that exist; a wheel and a source archive hold what they should."""
+"""Templates of issues name commands that exist; a wheel and a source archive hold what they
+should.
+"""
 
 import re
 import shutil

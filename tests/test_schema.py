@@ -54,7 +54,9 @@ def test_the_page_explains_every_table_and_stored_column() -> None:
 
 
 def test_stored_columns_do_not_change_without_a_new_schema_version() -> None:
-    """An index of other columns must not be read: count SCHEMA_VERSION up and write the new digest here."""
+    """An index of other columns must not be read: count SCHEMA_VERSION up and write the new digest
+    here.
+    """
     stored = [
         (name, field.name, str(field.type), field.nullable)
         for name, spec in table_specs().items()

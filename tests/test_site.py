@@ -1,4 +1,6 @@
-"""The documentation site: what it lists, and how docstrings get onto it. `.ci/run` builds it, warnings as errors."""
+"""The documentation site: what it lists, and how docstrings get onto it. `.ci/run` builds it,
+warnings as errors.
+"""
 
 import pkgutil
 import re

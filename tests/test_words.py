@@ -52,7 +52,9 @@ def prose(path: Path) -> str:
 
 
 def words(text: str) -> Iterator[str]:
-    """The small letters of each word that can be misspelt: no abbreviations, units or names of code."""
+    """The small letters of each word that can be misspelt: no abbreviations, units or names of
+    code.
+    """
     for token in TOKEN.findall(text):
         word = re.sub(r"['’]s?$", "", token.rstrip("."))
         if len(word) > 2 and word.isalpha() and word[1:].islower():

@@ -1,4 +1,6 @@
-"""A release written by hand, without the devkit's writers: raw text, pickles and CARLA's own signs (docs/format.md)."""
+"""A release written by hand, without the devkit's writers: raw text, pickles and CARLA's own signs
+(docs/format.md).
+"""
 
 import pickle
 from collections.abc import Callable, Sequence
@@ -36,7 +38,9 @@ META = """HardRainNoon 1223 car 1212 car 6790.168605131015 same front_side 14
 
 
 def pose(yaw: float = 0.0, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> np.ndarray:
-    """A left-handed CARLA pose: yaw in degrees, clockwise from above (y is right, so the matrix looks usual)."""
+    """A left-handed CARLA pose: yaw in degrees, clockwise from above (y is right, so the matrix
+    looks usual).
+    """
     c, s = np.cos(np.radians(yaw)), np.sin(np.radians(yaw))
     return np.array([[c, -s, 0, x], [s, c, 0, y], [0, 0, 1, z], [0, 0, 0, 1.0]])
 
@@ -68,7 +72,9 @@ def ego_to_world(agent: str, frame: int) -> np.ndarray:
 
 
 def label_lines(agent: str, frame: int) -> list[str]:
-    """A van that drives at 2 m/s along world x; its velocity is turned once more by its yaw, as the release does."""
+    """A van that drives at 2 m/s along world x; its velocity is turned once more by its yaw, as the
+    release does.
+    """
     lidar_to_world = ego_to_world(agent, frame) @ pose(z=lidar_height(agent))
     world = np.array([20.0 + 0.2 * frame, 3.0, 1.3, 1.0])
     x, y, z, _ = np.linalg.inv(lidar_to_world) @ world
@@ -93,7 +99,9 @@ def write_tiny_release(
     labelled: bool = True,
     lines_of: Callable[[str, int], list[str]] = label_lines,
 ) -> Path:
-    """Write one scenario (labels, calib, meta) below `root`; the calib as an old numpy would name its modules."""
+    """Write one scenario (labels, calib, meta) below `root`; the calib as an old numpy would name
+    its modules.
+    """
     base = root / scenario_type
     if meta is not None:
         _write(base / "meta" / f"{name}.txt", meta.encode())

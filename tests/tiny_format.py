@@ -1,4 +1,6 @@
-"""A format of the tests' own that uses all that formats have; in a module that a spawned process can import by name."""
+"""A format of the tests' own that uses all that formats have; in a module that a spawned process
+can import by name.
+"""
 
 import json
 import os
@@ -20,7 +22,9 @@ CAMERA = "Camera_Front"
 
 @dataclass(frozen=True, kw_only=True)
 class TinyFormat(Format):
-    """Each scenario is a folder of linked pictures, two files and a count, which `finish` adds up."""
+    """Each scenario is a folder of linked pictures, two files and a count, which `finish` adds
+    up.
+    """
 
     greeting: str = "hello"
     name: ClassVar[str] = "tiny"

@@ -37,7 +37,9 @@ def edit(root: Path, name: str = tiny.NAME) -> None:
 
 
 def rewrite(path: Path, old: str, new: str) -> None:
-    """Change a file in place, and put its time back: its size and time stay, and its folder's state too."""
+    """Change a file in place, and put its time back: its size and time stay, and its folder's state
+    too.
+    """
     before = path.stat()
     path.write_text(path.read_text().replace(old, new))
     os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))

@@ -1,7 +1,8 @@
 """Skip tests that need a plug-in which this installation lacks; all tests of the core run.
 
-tests/test_plugins.py has pytest load this module. A test needs a plug-in that its own lines import, or that an error of
-the core names. An import by a line of the package, which must not need the plug-in, fails the test.
+tests/test_plugins.py has pytest load this module. A test needs a plug-in that its own lines import,
+or that an error of the core names. An import by a line of the package, which must not need the
+plug-in, fails the test.
 """
 
 import os

@@ -1,4 +1,6 @@
-"""Functions that tests run in other processes: in a module that a spawned process can import by name."""
+"""Functions that tests run in other processes: in a module that a spawned process can import by
+name.
+"""
 
 import os
 import signal

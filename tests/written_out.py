@@ -1,4 +1,6 @@
-"""Every default and every constant of a package in words, to be compared with what a test has written out."""
+"""Every default and every constant of a package in words, to be compared with what a test has
+written out.
+"""
 
 import ast
 import importlib
@@ -15,7 +17,9 @@ MOST = 200
 
 
 def written_out(name: str) -> dict[str, str]:
-    """Of a module, or of a package's modules: public function, class or method → its defaults; constant → its value."""
+    """Of a module, or of a package's modules: public function, class or method → its defaults;
+    constant → its value.
+    """
     module = importlib.import_module(name)
     inside = [each.name for each in pkgutil.iter_modules(getattr(module, "__path__", ()))]
     modules = [

@@ -1,12 +1,16 @@
-"""What two checkouts of the devkit compute and write, compared by named digests: `digests.py BEFORE AFTER`.
+"""What two checkouts of the devkit compute and write, compared by named digests: `digests.py BEFORE
+AFTER`.
 
-Both read the same releases, made by BEFORE with a fixed seed, one after the other in the same folder, so that paths in
-files are equal. A worker in each checkout writes a JSON file of names and digests: tables, labels, predictions, counts
-and summaries of all protocols, studies, exports, releases in nuScenes' format, a generated release. A name that a
-checkout cannot compute has the error as its digest. Then the names that changed, came and went are printed. Exit status
-1 if there is one that no --expect names.
+Both read the same releases, made by BEFORE with a fixed seed, one after the other in the same
+folder, so that paths in
+files are equal. A worker in each checkout writes a JSON file of names and digests: tables, labels,
+    predictions, counts
+and summaries of all protocols, studies, exports, releases in nuScenes' format, a generated release.
+A name that a checkout cannot compute has the error as its digest. Then the names that changed, came
+and went are printed. Exit status 1 if there is one that no --expect names.
 
-    python .ci/tools/digests.py ../main . --expect 'evaluate/warning/boxes/*' --expect 'export/*.manifest.json'
+    python .ci/tools/digests.py ../main . --expect 'evaluate/warning/boxes/*' --expect
+    'export/*.manifest.json'
 
 It takes about six minutes of a processor.
 """
@@ -70,7 +74,9 @@ EXPORTS = {
     "town-maps": ("sensors", ["export", "town-maps"]),
     "webdataset": ("sensors", ["export", "webdataset"]),
 }
-"""Name → the release that is exported, and the command; what ends in --split gets a split file of all scenarios."""
+"""Name → the release that is exported, and the command; what ends in --split gets a split file of
+all scenarios.
+"""
 NUSCENES_EXPORTS = {
     "labelled": ["--agents", "ego_vehicle,other_vehicle"],
     "sensors": ["--lidar-axes", "nuscenes", "--no-sweeps"],
@@ -146,7 +152,8 @@ KEYS_LEFT_OUT = {
     "switches": "as settings",
     "explanation": "asked for by no evaluation here",
     "sanity": "asked for by no evaluation here",
-    "results": "where the predictions are, and notes with a version; they have digests of their own",
+    "results": "where the predictions are, and notes with a version; they "
+    "have digests of their own",
 }
 """Key of an evaluation's summary that is not compared → why."""
 STUDY_KEYS_LEFT_OUT = {"devkit": "a version", "recipe": "the same in both checkouts"}
@@ -170,7 +177,9 @@ Digests = dict[str, str]
 
 
 def digest(value: object) -> str:
-    """A hash of values: arrays by type, shape and bytes, records by the fields that say something."""
+    """A hash of values: arrays by type, shape and bytes, records by the fields that say
+    something.
+    """
     made = hashlib.sha256()
     for part in _parts(value):
         made.update(part)
@@ -201,7 +210,9 @@ def _parts(value: Any) -> Iterator[bytes]:
 
 
 def leaves(value: Any, name: str = "", depth: int = 3) -> Iterator[tuple[str, str]]:
-    """Name and text of each value of a JSON document; the digest of what is long, or deeper in it."""
+    """Name and text of each value of a JSON document; the digest of what is long, or deeper in
+    it.
+    """
     if isinstance(value, list) and value and isinstance(value[0], Mapping):
         value = dict(enumerate(value))
     if isinstance(value, Mapping) and depth:
@@ -219,7 +230,9 @@ class Found:
         self.digests: Digests = {}
 
     def add(self, name: str, find: Callable[..., object], *arguments: object) -> None:
-        """Take the digest of what a function gives, or those by name that it gives, or the error that it raises."""
+        """Take the digest of what a function gives, or those by name that it gives, or the error
+        that it raises.
+        """
         try:
             found = find(*arguments)
         except (Exception, SystemExit) as error:  # noqa: BLE001 - whatever a name that went brings about
@@ -254,7 +267,9 @@ def plugin(name: str) -> ModuleType:
 
 
 def command(*arguments: str) -> None:
-    """Run a command of the devkit in this process, silently; older checkouts spell some options otherwise."""
+    """Run a command of the devkit in this process, silently; older checkouts spell some options
+    otherwise.
+    """
     import click
 
     from deepaccident_devkit.cli import deepaccident
@@ -271,7 +286,9 @@ def command(*arguments: str) -> None:
 
 
 def _as_before(arguments: Sequence[str]) -> list[str]:
-    """A command as it was written before November 2026; every spelling that went gets a line here."""
+    """A command as it was written before November 2026; every spelling that went gets a line
+    here.
+    """
     words = [word for word in arguments if word != "--designed"]
     if words != list(arguments):
         return words  # of a day on which the other spellings were there
@@ -453,7 +470,9 @@ def add_evaluations(found: Found, evaluated: Evaluated) -> None:
 
 
 def result_kinds(task: Any) -> tuple[str, ...]:
-    """Return the kinds of results that a task is evaluated from; checkouts before November 30 called them `kinds`."""
+    """Return the kinds of results that a task is evaluated from; checkouts before November 30
+    called them `kinds`.
+    """
     kinds: tuple[str, ...] = task.result_kinds if hasattr(task, "result_kinds") else task.kinds
     return kinds
 
@@ -648,7 +667,9 @@ def digests_of_generated(here: Path) -> Digests:
 
 
 def work(out: Path) -> None:
-    """Find all digests of the checkout on the path, from the releases in this folder, and write them."""
+    """Find all digests of the checkout on the path, from the releases in this folder, and write
+    them.
+    """
     import deepaccident_devkit
     from deepaccident_devkit import DeepAccident
 
@@ -721,7 +742,10 @@ def digests_in(checkout: Path, python: str, releases: Path, folder: Path) -> Dig
 def make_releases(checkout: Path, python: str, folder: Path) -> None:
     """Make the releases by a checkout."""
     for name, words in RELEASES.items():
-        call = f"import sys; sys.path.append({str(Path(__file__).parent)!r}); from digests import command"
+        call = (
+            f"import sys; sys.path.append({str(Path(__file__).parent)!r}); from "
+            f"digests import command"
+        )
         run_in(
             checkout,
             python,
@@ -748,7 +772,9 @@ def differences(before: Digests, after: Digests) -> dict[str, str]:
 
 
 def report(found: Mapping[str, str], title: str) -> None:
-    """Print names and how they differ; of a section with many, some and the number of the others."""
+    """Print names and how they differ; of a section with many, some and the number of the
+    others.
+    """
     print(f"{title}: {len(found):,}")
     printed: Counter[str] = Counter()
     for name, how in sorted(found.items()):
@@ -812,7 +838,8 @@ def main() -> int:
     }
     unexpected = {name: how for name, how in different.items() if name not in expected}
     print(
-        f"{sum(name in found[1] for name in found[0]) - sum('changed' in how for how in different.values()):,} equal"
+        f"{sum(name in found[1] for name in found[0]) - sum('changed' in how for how in different.values()):,} "  # noqa: E501
+        f"equal"
     )
     report(expected, "as expected")
     report(unexpected, "unexpected")

@@ -1,4 +1,5 @@
-"""The lower bounds of what a user or the tests install, for pip: `name==1.2.*` of each `name>=1.2` in pyproject.toml.
+"""The lower bounds of what a user or the tests install, for pip: `name==1.2.*` of each `name>=1.2`
+in pyproject.toml.
 
     pip install '.[test]' $(python .ci/tools/lower_bounds.py)
     pip install '.[synth]' $(python .ci/tools/lower_bounds.py synth)

@@ -4,7 +4,8 @@
     python .ci/tools/release.py check v1.1.0    compare these places with the tag
     python .ci/tools/release.py notes           print the section of CHANGELOG.md
 
-`deepaccident_devkit/support/version.py` is the source. The owner of the repository is read from RELEASING.md.
+`deepaccident_devkit/support/version.py` is the source. The owner of the repository is read from
+RELEASING.md.
 """
 
 from __future__ import annotations
@@ -40,7 +41,9 @@ def main(arguments: list[str], top: Path) -> int:
 
 
 def set_version(top: Path, version: str) -> int:
-    """Write a version, today's date, the matching classifier and the addresses of the repository."""
+    """Write a version, today's date, the matching classifier and the addresses of the
+    repository.
+    """
     if not VERSION.fullmatch(version):
         print(f"{version} is no version such as 1.1.0 or 1.1.0rc1", file=sys.stderr)
         return 2
@@ -64,7 +67,9 @@ def set_version(top: Path, version: str) -> int:
 
 
 def check(top: Path, tag: str | None = None) -> int:
-    """Print what disagrees with the version of the package, or with the tag; return 1 if anything does."""
+    """Print what disagrees with the version of the package, or with the tag; return 1 if anything
+    does.
+    """
     faults = list(disagreements(top, tag))
     print("\n".join(faults) or f"all files state version {version_of(top)}")
     return 1 if faults else 0
@@ -118,7 +123,9 @@ def status_of(version: str) -> str:
 
 
 def write_addresses(top: Path, repository: str) -> None:
-    """Write the addresses on GitHub into the metadata of the package, the citation and the chooser of issues."""
+    """Write the addresses on GitHub into the metadata of the package, the citation and the chooser
+    of issues.
+    """
     issues, advisories = f"{repository}/issues", f"{repository}/security/advisories/new"
     urls = f'[project.urls]\nRepository = "{repository}"\nIssues = "{issues}"\n\n'
     links = (

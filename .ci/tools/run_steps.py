@@ -1,7 +1,9 @@
-"""`.ci/run [STEP ...]`: run steps of the checks, two at a time, and report every failure at the end.
+"""`.ci/run [STEP ...]`: run steps of the checks, two at a time, and report every failure at the
+end.
 
-A step is a script `.ci/steps/NAME.sh`. It runs in a copy of the working tree of its own and goes on when one of its
-checks fails. Without names all steps run, except those that take too long and are run by hand.
+A step is a script `.ci/steps/NAME.sh`. It runs in a copy of the working tree of its own and goes on
+when one of its checks fails. Without names all steps run, except those that take too long and are
+run by hand.
 """
 
 from __future__ import annotations
@@ -118,7 +120,9 @@ def _description(script: Path) -> str:
 
 
 def _run_all(names: Sequence[str], work: Path, environments: Path) -> list[Run]:
-    """Run steps in this order, `AT_A_TIME` of them at any moment; they share the machine's cores."""
+    """Run steps in this order, `AT_A_TIME` of them at any moment; they share the machine's
+    cores.
+    """
     environments.mkdir(parents=True, exist_ok=True)
     source = work / "source"
     _copy_tree(source)
@@ -193,7 +197,9 @@ def _start(name: str, work: Path, variables: dict[str, str]) -> Run:
 
 
 def _report(runs: Sequence[Run], seconds: float) -> None:
-    """Print a table of the steps, then the output of each failure, then the summary of all tests."""
+    """Print a table of the steps, then the output of each failure, then the summary of all
+    tests.
+    """
     print("\nstep            result  seconds")
     for run in runs:
         print(f"{run.name:<15} {_result(run.passed):<7} {run.seconds:7.0f}")
@@ -210,7 +216,9 @@ def _report(runs: Sequence[Run], seconds: float) -> None:
 
 
 def _failures(run: Run) -> Iterator[tuple[str, str]]:
-    """The name of each check that failed, with its output; the script itself where it ended for another reason."""
+    """The name of each check that failed, with its output; the script itself where it ended for
+    another reason.
+    """
     for check in run.checks:
         if not check.passed:
             yield check.name, _excerpt(check.log)
@@ -224,7 +232,9 @@ def _failures(run: Run) -> Iterator[tuple[str, str]]:
 
 
 def _excerpt(log: Path) -> str:
-    """Of pytest's output what begins with the errors and failures, of other output the last lines."""
+    """Of pytest's output what begins with the errors and failures, of other output the last
+    lines.
+    """
     text = log.read_text(encoding="utf-8", errors="replace")
     found = re.search(r"^=+ (ERRORS|FAILURES) =+$", text, re.MULTILINE)
     lines = text[found.start() if found else 0 :].splitlines()

@@ -47,7 +47,9 @@ SHOWN = ("VPQ 100x100", "APA", "mAP")
 
 @dataclass(frozen=True)
 class Evaluated:
-    """A baseline's evaluations: the bundles, and of each the result of all samples with its intervals."""
+    """A baseline's evaluations: the bundles, and of each the result of all samples with its
+    intervals.
+    """
 
     folder: Path
     groups: Mapping[str, Group]
@@ -108,7 +110,8 @@ def size_text(views: Views) -> str:
     """How much the tables are of."""
     groups = {view: found["single"].groups["motion"] for view, found in views.items()}
     parts = [
-        f"{group.samples} samples of {group.scenarios} accidents ({group.clusters} clusters) in the {view} view"
+        f"{group.samples} samples of {group.scenarios} accidents ({group.clusters} "
+        f"clusters) in the {view} view"
         for view, group in groups.items()
     ]
     return f"The tables are of {', '.join(parts[:-1])} and {parts[-1]}."

@@ -1,9 +1,10 @@
-"""The rows of docs/benchmark.md: `python -m benchmarks.pages.benchmark RELEASE` predicts, evaluates and keeps them.
+"""The rows of docs/benchmark.md: `python -m benchmarks.pages.benchmark RELEASE` predicts, evaluates
+and keeps them.
 
-Each row is a folder of benchmarks/v1: `results.tar.xz`, and a bundle of each task without its pictures, which
-`deepaccident check bundle` repeats. `python docs/make_tables.py benchmark` makes the page's table of the bundles
-that are kept. With `--published RELEASE` what is published of the release itself is written (`synth/benchmark.py`),
-with `--lock` the lock file.
+Each row is a folder of benchmarks/v1: `results.tar.xz`, and a bundle of each task without its
+pictures, which `deepaccident check bundle` repeats. `python docs/make_tables.py benchmark` makes
+the page's table of the bundles that are kept. With `--published RELEASE` what is published of the
+release itself is written (`synth/benchmark.py`), with `--lock` the lock file.
 """
 
 import json
@@ -93,7 +94,9 @@ def round_numbers(path: Path) -> None:
 
 
 def slim(bundle: Path) -> None:
-    """Remove a bundle's figures and report, and where its release and results were; its list of files says so."""
+    """Remove a bundle's figures and report, and where its release and results were; its list of
+    files says so.
+    """
     shutil.rmtree(bundle / "figures", ignore_errors=True)
     (bundle / "report.html").unlink(missing_ok=True)
     told = json.loads((bundle / SUMMARY_FILE).read_text(encoding="utf-8"))

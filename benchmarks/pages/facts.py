@@ -1,4 +1,6 @@
-"""What others measured of the real release, beside a synthetic one without sensors, or beside a release given."""
+"""What others measured of the real release, beside a synthetic one without sensors, or beside a
+release given.
+"""
 
 import tempfile
 from pathlib import Path
@@ -25,4 +27,4 @@ def page_text(report: ReleaseFacts) -> str:
     """The rows that others measured, as Markdown."""
     rows = [fact.texts() for fact in report.facts if fact.source]
     head = ("fact", "others", f"here, {report.scenarios} scenarios", "verdict")
-    return f"\n{table(head, ((name, others, here, verdict) for name, _, others, here, _, verdict in rows))}\n"
+    return f"\n{table(head, ((name, others, here, verdict) for name, _, others, here, _, verdict in rows))}\n"  # noqa: E501

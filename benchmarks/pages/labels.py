@@ -1,4 +1,6 @@
-"""A made moment, the left turn of an ego, and the cells of its labels and of a release's in which protocols differ."""
+"""A made moment, the left turn of an ego, and the cells of its labels and of a release's in which
+protocols differ.
+"""
 
 import tempfile
 from dataclasses import dataclass, field, fields, replace
@@ -28,13 +30,17 @@ MAPS = ("segmentation", "instance", "centerness", "offset", "flow")
 SPLIT = "train"
 RELEASED, CLEAN = (MotionLabelConfig(protocol=name) for name in ("released", "clean"))
 CLOSE = 0.01
-"""Centerness, and cells of offset and flow, that are taken for equal: turned by nothing they differ in the last bit."""
+"""Centerness, and cells of offset and flow, that are taken for equal: turned by nothing they differ
+in the last bit.
+"""
 STEP = 0.5
 
 
 @dataclass(frozen=True, kw_only=True)
 class Actor:
-    """One that drives straight on; metres, radians, metres a second in the present ego frame of the turn."""
+    """One that drives straight on; metres, radians, metres a second in the present ego frame of the
+    turn.
+    """
 
     actor_id: int
     category: str
@@ -55,7 +61,9 @@ class Actor:
 
 
 class TurningEgo(Actor):
-    """The ego: straight on up to the present, then on a circle to the left, half a radian a second."""
+    """The ego: straight on up to the present, then on a circle to the left, half a radian a
+    second.
+    """
 
     def pose(self, frame: int) -> SE3:
         turned = max(0.0, 0.5 * STEP * frame)
@@ -114,7 +122,8 @@ def turn(
         ego_from_lidar: where the LiDAR is; above the ego frame's origin, along its axes, if None.
         own_row: whether the label files have the agent's own row.
         frames: label frames until the recording ends; all if None.
-        earlier_ids: whether a sample before this one has numbered the colliding pair, where the protocol keeps ids.
+        earlier_ids: whether a sample before this one has numbered the colliding pair, where the
+            protocol keeps ids.
     """
     mount = ego_from_lidar or SE3.identity()
     actors = [actor for actor in ACTORS if own_row or actor is not EGO]
@@ -249,7 +258,9 @@ def without(switch: str) -> LabelProtocol:
 
 
 def cells_that_differ(one: MotionLabels, other: MotionLabels) -> list[int]:
-    """Of T × H × W cells at the present, as they are evaluated, map by map; a vector's channels are one cell."""
+    """Of T × H × W cells at the present, as they are evaluated, map by map; a vector's channels are
+    one cell.
+    """
     maps = [labels.to_present("bilinear") for labels in (one, other)]
     shape = one.segmentation.shape
     counts = []

@@ -1,4 +1,6 @@
-"""Where a table stands: on the page that has its marks, `<!-- NAME -->` before it and `<!-- end of NAME -->` after."""
+"""Where a table stands: on the page that has its marks, `<!-- NAME -->` before it and `<!-- end of
+NAME -->` after.
+"""
 
 import math
 import re

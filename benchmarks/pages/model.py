@@ -1,8 +1,9 @@
-"""The tables of studies, from what benchmarks/studies keeps of them: `python docs/make_tables.py model`.
+"""The tables of studies, from what benchmarks/studies keeps of them: `python docs/make_tables.py
+model`.
 
-`python -m benchmarks.pages.model STUDIES/NAME…` keeps what a study's folder has: all numbers, and the counts of
-accidents of each sample, row and seed, from which every APA follows with its interval. (Counts of boxes would take
-20 MB a study.)
+`python -m benchmarks.pages.model STUDIES/NAME…` keeps what a study's folder has: all numbers, and
+the counts of accidents of each sample, row and seed, from which every APA follows with its
+interval. (Counts of boxes would take 20 MB a study.)
 """
 
 import gzip
@@ -40,7 +41,9 @@ ROAD: Final = "road"
 SHOWN: Final = ("apa", "iou_100", "vpq_100", "map", "hidden_foreground", "false_foreground")
 """Numbers of the tables; the kept files have all."""
 GROUPS: Final = {"agents": ("hidden", "impact_step"), "visibility": ("accident_visibility",)}
-"""Recipe → how the groups begin whose APA its table has, where these are not the hidden accidents alone."""
+"""Recipe → how the groups begin whose APA its table has, where these are not the hidden accidents
+alone.
+"""
 TRIVIAL: Final = ("nothing", "everything")
 TRIVIAL_OF: Final = "agents"
 """The recipe whose table has the trivial rows: they are much the same in all."""
@@ -75,7 +78,9 @@ def keep(folder: Path) -> Path:
 
 
 def kept(name: str) -> dict[str, Any]:
-    """What is kept of a study: `summary`, `groups` → tokens, and `accidents`: row → seed → token → counts."""
+    """What is kept of a study: `summary`, `groups` → tokens, and `accidents`: row → seed → token →
+    counts.
+    """
     found: dict[str, Any] = json.loads(lzma.decompress((KEPT / f"{name}.json.xz").read_bytes()))
     return found
 
@@ -139,13 +144,16 @@ def made_text(summary: Summary) -> str:
     )
     told = f"seeds {', '.join(seeds)}; " if seeds else ""
     return (
-        f"{tested['samples']:,} samples of {tested['pairs']:,} pairs of an accident and its twin; {told}hours of one "
+        f"{tested['samples']:,} samples of {tested['pairs']:,} pairs of an accident "
+        f"and its twin; {told}hours of one "
         f"process: {spent}."
     )
 
 
 def study_text(name: str, summary: Summary) -> str:
-    """A study's section: its rows at all samples, and their APA in some groups; the kept files have all."""
+    """A study's section: its rows at all samples, and their APA in some groups; the kept files have
+    all.
+    """
     chosen = GROUPS.get(name, ("hidden",))
     groups = {
         f"APA, `{group}` ({each['samples']:,} samples)": (group, "apa")
@@ -162,7 +170,9 @@ def study_text(name: str, summary: Summary) -> str:
 
 
 def findings_table(found: Mapping[str, Summary]) -> str:
-    """What was compared in all studies, at the hidden accidents and at all samples; the kept files have all else."""
+    """What was compared in all studies, at the hidden accidents and at all samples; the kept files
+    have all else.
+    """
     rows = []
     for name, summary in found.items():
         for each in summary["comparisons"]:

@@ -33,7 +33,9 @@ def main(release: Path | None = None) -> None:
 
 
 def velocity_table(root: Path) -> str:
-    """How far the labels' velocities, read in each frame, are from the displacements of the boxes that move."""
+    """How far the labels' velocities, read in each frame, are from the displacements of the boxes
+    that move.
+    """
     scenario = find_release(root).scenarios[0]
     files, _ = read_scenario(scenario, scan_scenario(scenario))
     boxes = scenario_boxes(files)
@@ -50,7 +52,8 @@ def velocity_table(root: Path) -> str:
         shares = [error[category == code] < 0.1 for code in range(len(CATEGORIES))]
         by_class = " | ".join(f"{np.mean(share):.0%}" if len(share) else "–" for share in shares)
         lines.append(
-            f"| {meaning} | {len(error):,} | {np.median(error):.1%} | {(error < 0.1).mean():.0%} | {by_class} |"
+            f"| {meaning} | {len(error):,} | {np.median(error):.1%} | "
+            f"{(error < 0.1).mean():.0%} | {by_class} |"
         )
     return "\n".join(lines)
 
@@ -58,7 +61,10 @@ def velocity_table(root: Path) -> str:
 def calibration_table(dataset: DeepAccident) -> str:
     """How far each agent's sensors jitter over the scenario."""
     lines = [
-        "| agent | places of a sensor | entries of its rotation | not rigid by | distinct matrices | rows |",
+        (
+            "| agent | places of a sensor | entries of its rotation | not rigid by | "
+            "distinct matrices | rows |"
+        ),
         "| --- " * 6 + "|",
     ]
     matrices = dataset.columns("sample_data")["matrix"].reshape(-1, len(CHANNELS), 3, 4)
@@ -73,13 +79,16 @@ def calibration_table(dataset: DeepAccident) -> str:
         rows = sum(row["agent_token"] == agent["token"] for row in dataset.calibrated_sensor)
         moved, turned_by = np.ptp(own[..., 3], axis=0).max(), np.ptp(turn, axis=0).max()
         lines.append(
-            f"| {agent['name']} | {1000 * moved:.2f} mm | {turned_by:.1g} | {rigid:.1g} | {distinct} | {rows} |"
+            f"| {agent['name']} | {1000 * moved:.2f} mm | {turned_by:.1g} | "
+            f"{rigid:.1g} | {distinct} | {rows} |"
         )
     return "\n".join(lines)
 
 
 def index_table(dataset: DeepAccident) -> str:
-    """What the index costs, and how much more it would with as many boxes a sample as the whole release has."""
+    """What the index costs, and how much more it would with as many boxes a sample as the whole
+    release has.
+    """
     index, samples = dataset.tables_folder.parent, len(dataset.sample)
     boxes = len(dataset.annotation) / samples
     size = {path: path.stat().st_size / samples for path in index.rglob("*") if path.is_file()}

@@ -1,4 +1,6 @@
-"""What the commands of docs/safety.md print, and its pictures, of which that of the report needs chromium."""
+"""What the commands of docs/safety.md print, and its pictures, of which that of the report needs
+chromium.
+"""
 
 import os
 import re
@@ -49,7 +51,9 @@ def main(release: Path | None = None) -> None:
 
 
 def with_outputs(page: str, *, made: bool = False) -> str:
-    """The page with what its commands print now, run in their order in the working folder; `made`: the release is."""
+    """The page with what its commands print now, run in their order in the working folder; `made`:
+    the release is.
+    """
     printed = ""
 
     def replaced(piece: re.Match[str]) -> str:
@@ -101,7 +105,9 @@ def one_story(text: str) -> str:
 
 
 def paragraph(begin: str) -> Callable[[str], str]:
-    """A function that takes the lines from the one that begins so, or from the first, to the next empty one."""
+    """A function that takes the lines from the one that begins so, or from the first, to the next
+    empty one.
+    """
 
     def found(text: str) -> str:
         lines = text.splitlines()

@@ -1,6 +1,8 @@
-"""What the generator makes: pairs of each design, what agents see of them, and a release like the real scenario.
+"""What the generator makes: pairs of each design, what agents see of them, and a release like the
+real scenario.
 
-The measured values are kept in synth.json; `main` measures again, the real scenario only where it is given.
+The measured values are kept in synth.json; `main` measures again, the real scenario only where it
+is given.
 """
 
 import json
@@ -30,7 +32,9 @@ MEASURED = Path(__file__).with_suffix(".json")
 SEEDS = 20
 """Pairs of each design."""
 STEP, EVALUATED, OBSERVED = 5, 4, 3
-"""Frames between two observations; number of evaluated moments before the last frame; observations for each of them."""
+"""Frames between two observations; number of evaluated moments before the last frame; observations
+for each of them.
+"""
 RELEASED_SCENARIOS, RELEASED_FRAMES = 691, 57_000
 """Numbers of its authors (paper, abstract: 57K frames)."""
 WORKERS = 2
@@ -39,10 +43,10 @@ WORKERS = 2
 class Pair(TypedDict):
     """The measured values of an accident and its normal twin.
 
-    `views` has for each agent one letter for each of 2, 1.5, 1 and 0.5 s before the impact: `v`, it sees the accident
-    by the released rule; `c`, it does not, but the five together see the pair; `u`, the five do not see it either.
-    `sees_both` is for 1 s before the impact. `twin_gap` is the least distance between any two of the four vehicle
-    agents, metres.
+    `views` has for each agent one letter for each of 2, 1.5, 1 and 0.5 s before the impact: `v`, it
+    sees the accident by the released rule; `c`, it does not, but the five together see the pair;
+    `u`, the five do not see it either. `sees_both` is for 1 s before the impact. `twin_gap` is the
+    least distance between any two of the four vehicle agents, metres.
     """
 
     design: int
@@ -59,7 +63,9 @@ class Pair(TypedDict):
 
 
 class Measured(TypedDict):
-    """All measured values: of a real scenario, of similar generated ones, and of pairs of all designs."""
+    """All measured values: of a real scenario, of similar generated ones, and of pairs of all
+    designs.
+    """
 
     real: synth_beside.Numbers
     generated: synth_beside.Numbers
@@ -105,7 +111,9 @@ def measure(number: int, *, views: bool = True) -> Pair:
 
 
 def _nearest(scenario: Scenario) -> tuple[float, bool]:
-    """How near two of the vehicle agents come to each other, metres, and whether any two road users ever touch."""
+    """How near two of the vehicle agents come to each other, metres, and whether any two road users
+    ever touch.
+    """
     actors, size = scenario.actors, scenario.actors.size[:, :2]
     poses = np.stack(
         [actors.at(frame_timestamp(frame)).poses for frame in range(1, scenario.frames + 1)]
@@ -120,7 +128,9 @@ def _nearest(scenario: Scenario) -> tuple[float, bool]:
 
 
 def _labels(scenario: Scenario, seed: int) -> dict[str, list[Labels]]:
-    """Every agent's labels at the observed moments, the last one `STEP` frames before the impact."""
+    """Every agent's labels at the observed moments, the last one `STEP` frames before the
+    impact.
+    """
     sky = (scenario.spec.weather, scenario.spec.time_of_day)
     noise = (seed, scenario.plan.pair, int(scenario.plan.accident))
     rig = make_rig(
@@ -174,7 +184,10 @@ def _letters(scenario: Scenario, labels: dict[str, list[Labels]], agent: str) ->
 def designs_table(pairs: Sequence[Pair]) -> str:
     """One row for each design."""
     head = "| design | collide at the first draw | draws | type in meta is the design | angle (°) "
-    head += "| slower, faster (m/s) | frames | follower of ego, of other, infrastructure: each sees both "
+    head += (
+        "| slower, faster (m/s) | frames | follower of ego, of other, "
+        "infrastructure: each sees both "
+    )
     head += "| twins without contact | least gap of agents in twins (m) |"
     lines = [head, "|---" * (head.count("|") - 1) + "|"]
     for design in DESIGN_NUMBERS:

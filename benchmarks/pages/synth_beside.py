@@ -62,7 +62,9 @@ def measure_real(folder: Path) -> Numbers:
 
 
 def measure_generated() -> Numbers:
-    """The numbers of normal scenarios like the real one: three-way, with lights, clear noon; ego turns right."""
+    """The numbers of normal scenarios like the real one: three-way, with lights, clear noon; ego
+    turns right.
+    """
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         spec = folder / "like_the_real_one.yaml"
@@ -85,7 +87,9 @@ def measure_generated() -> Numbers:
 
 
 def _like_the_real_one() -> str:
-    """Design 6 without what the real scenario does not have: two lanes, a hump, a hidden view, rain, night."""
+    """Design 6 without what the real scenario does not have: two lanes, a hump, a hidden view,
+    rain, night.
+    """
     spec = yaml.safe_load(design_text(6))
     spec["road"] = {"kind": "three-way", "signalized": True, "lanes": 1}
     ego, other = spec["actors"][0], spec["actors"][2]
@@ -101,7 +105,9 @@ def _like_the_real_one() -> str:
 
 
 def measure(scenarios: Sequence[ScenarioFolder]) -> Numbers:
-    """The numbers of scenarios together: mean numbers of actors, and shares and percentiles of all rows."""
+    """The numbers of scenarios together: mean numbers of actors, and shares and percentiles of all
+    rows.
+    """
     numbers: Numbers = {"scenarios": len(scenarios), "frames": mean(map(_frames, scenarios))}
     by_scenario = [_actors(scenario) for scenario in scenarios]
     numbers |= {key: mean(each[key] for each in by_scenario) for key in by_scenario[0]}
@@ -258,7 +264,9 @@ def _calibs(scenarios: Sequence[ScenarioFolder]) -> Numbers:
 
 
 def _sizes(scenarios: Sequence[ScenarioFolder]) -> Numbers:
-    """Mean sizes of files, kB; of images only those of the pole, at the frames whose clouds are measured."""
+    """Mean sizes of files, kB; of images only those of the pole, at the frames whose clouds are
+    measured.
+    """
     frames = [
         (s, agent, frame)
         for s in scenarios

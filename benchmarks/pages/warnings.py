@@ -35,7 +35,9 @@ def main(release: Path | None = None) -> None:
 
 
 def measured(root: Path, predictors: Mapping[str, Predictor]) -> str:
-    """Of all samples of the split, two a second, each predictor through the protocol `clean`, as Markdown."""
+    """Of all samples of the split, two a second, each predictor through the protocol `clean`, as
+    Markdown.
+    """
     dataset = DeepAccident("v1", root, verbose=False)
     warned = {name: WarningEvaluator("clean") for name in predictors}
     for token in dataset.samples(SPLIT, "all"):

@@ -1,5 +1,5 @@
-"""Tests that open pages in Debian's chromium, without a window: not collected where chromium, its driver or selenium is
-not installed, unless DEEPACCIDENT_REQUIRE_BROWSER is set.
+"""Tests that open pages in Debian's chromium, without a window: not collected where chromium, its
+driver or selenium is not installed, unless DEEPACCIDENT_REQUIRE_BROWSER is set.
 """
 
 import importlib.util

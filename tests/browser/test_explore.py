@@ -1,4 +1,6 @@
-"""The explorer, used as a reader uses it: filter, open, play, step, compare, save; it asks only its own server."""
+"""The explorer, used as a reader uses it: filter, open, play, step, compare, save; it asks only its
+own server.
+"""
 
 import json
 import shutil
@@ -51,7 +53,8 @@ class Pages(Browser):
     def shown(self) -> list[str]:
         """The tokens of the scenarios in the list."""
         names = self.value(
-            "[...document.querySelectorAll('a.entry')].map((each) => decodeURIComponent(each.pathname))"
+            "[...document.querySelectorAll('a.entry')].map((each) => "
+            "decodeURIComponent(each.pathname))"
         )
         return [name.strip("/").removeprefix("scenario/") for name in names]
 
@@ -67,9 +70,11 @@ class Pages(Browser):
 
 @pytest.fixture(scope="module")
 def root(release_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The session's release with a hostile name, a broken scenario, and some images that were not downloaded.
+    """The session's release with a hostile name, a broken scenario, and some images that were not
+    downloaded.
 
-    They are all of an agent, and of the scenario with the hostile name all but those of the frames 3 and 6.
+    They are all of an agent, and of the scenario with the hostile name all but those of the frames
+    3 and 6.
     """
     copy = tmp_path_factory.mktemp("explored") / "a release"
     shutil.copytree(release_root, copy, ignore=shutil.ignore_patterns(".deepaccident"))
@@ -153,7 +158,8 @@ def test_filters_and_the_back_button(pages: Pages, dataset: DeepAccident) -> Non
     pages.wait("location.search === '?collision=true'")
     wait_for(lambda: pages.shown() == collided)
     pages.wait(
-        "[...document.images].length && [...document.images].every((each) => each.naturalWidth === 320)"
+        "[...document.images].length && [...document.images].every((each) => "
+        "each.naturalWidth === 320)"
     )
 
 
@@ -230,7 +236,10 @@ def test_a_picture_of_another_moment_is_veiled(pages: Pages, dataset: DeepAccide
     for frame in (3, 5, 1, 6):
         pages.go_to(frame - 1)
         figures = "['#cards figure', '#every figure'].map((each) => document.querySelector(each))"
-        where = "(each) => [each.classList.contains('veiled'), each.querySelector('.where').textContent]"
+        where = (
+            "(each) => [each.classList.contains('veiled'), "
+            "each.querySelector('.where').textContent]"
+        )
         told[frame] = pages.value(f"{figures}.map({where})")
     veiled = {
         3: [False, "front"],
@@ -242,7 +251,9 @@ def test_a_picture_of_another_moment_is_veiled(pages: Pages, dataset: DeepAccide
 
 
 def test_an_address_says_what_is_looked_at(pages: Pages, dataset: DeepAccident) -> None:
-    """A colleague who opens it sees the same: moment, large camera, layers, LiDARs, cameras and part of the scene."""
+    """A colleague who opens it sees the same: moment, large camera, layers, LiDARs, cameras and
+    part of the scene.
+    """
     pages.go(scenario_page(accident(dataset)))
     pages.go_to(2)
     for button in ("#layer-trails", "#cloud-infrastructure", "#closer"):
@@ -257,13 +268,14 @@ def test_an_address_says_what_is_looked_at(pages: Pages, dataset: DeepAccident) 
         control = f"document.querySelector('{select}')"
         pages.script(f"{control}.value = '{value}'; {control}.dispatchEvent(new Event('change'))")
     pages.wait(
-        "['changed=', 'pictures=', 'view=', 'points-by='].every((each) => location.search.includes(each))"
+        "['changed=', 'pictures=', 'view=', 'points-by='].every((each) => "
+        "location.search.includes(each))"
     )
     looks = """[...['scrubber', 'large', 'follow', 'scene', 'points-by'].map((id) => document.getElementById(id).value),
         [...document.querySelectorAll('#clouds input')].map((each) => each.checked),
         [...document.querySelectorAll('#layers input')].map((each) => each.checked),
         document.querySelector('#cards select').value,
-        location.search]"""
+        location.search]"""  # noqa: E501
     view = "document.getElementById('ground').dataset.view.split(' ').map(Number)"
     seen, seen_view = pages.value(looks), pages.value(view)
     assert seen[:6] == ["2", "2", "", "space", "height", [True] * 4 + [False]]
@@ -344,7 +356,9 @@ def test_nothing_reaches_beyond_the_window(
 
 @pytest.fixture(scope="module")
 def judged(da_motion: DeepAccident, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
-    """Two bundles of the same samples, one of them without its results, and results without a bundle."""
+    """Two bundles of the same samples, one of them without its results, and results without a
+    bundle.
+    """
     folder = tmp_path_factory.mktemp("judged")
     setup = EvaluationSetup(task="accident", protocol="boxes")
     run, _ = stored_run(da_motion, setup, folder / "first.json")
@@ -370,7 +384,8 @@ def test_a_models_samples_and_two_side_by_side(browser: Browser, judged: Served)
     pages.go("model/first/samples")
     pages.click("a.entry")
     pages.wait(
-        "document.images.length >= 1 && [...document.images].every((each) => each.naturalWidth > 300)"
+        "document.images.length >= 1 && [...document.images].every((each) => "
+        "each.naturalWidth > 300)"
     )
     pages.go("compare/first/second/")
     pages.wait("document.querySelector('a.entry')")
@@ -384,7 +399,10 @@ const table = document.querySelector('.sortable');
 const column = [...table.tHead.rows[0].cells].findIndex((each) => each.textContent === '%s');
 return [...table.tBodies[0].rows].map((row) => row.cells[column].textContent);
 """
-CLICK = "[...document.querySelectorAll('.sortable button')].find((each) => each.textContent === '%s').click();"
+CLICK = (
+    "[...document.querySelectorAll('.sortable button')].find((each) => "
+    "each.textContent === '%s').click();"
+)
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,6 @@
-"""Replays, opened as a reader opens them: they play, scrub, show the impact, and ask for nothing."""
+"""Replays, opened as a reader opens them: they play, scrub, show the impact, and ask for
+nothing.
+"""
 
 import io
 import re
@@ -32,7 +34,7 @@ const canvas = document.getElementById('ground');
 const ratio = canvas.width / canvas.clientWidth;
 const pen = canvas.getContext('2d');
 return arguments[0].map(([x, y]) => [...pen.getImageData(Math.round(x * ratio), Math.round(y * ratio), 1, 1).data]);
-"""
+"""  # noqa: E501
 
 
 @pytest.fixture(scope="module")
@@ -85,7 +87,9 @@ def drawn(browser: Browser) -> str:
 
 
 def pixels_at(browser: Browser, world: Any, origin: Any) -> list[list[int]]:
-    """The colours of the canvas at places (N, 2) in world, metres, by the view that it says it has."""
+    """The colours of the canvas at places (N, 2) in world, metres, by the view that it says it
+    has.
+    """
     *middle, scale = view(browser)
     size = [
         browser.value(f"document.getElementById('ground').client{side}")
@@ -124,7 +128,9 @@ def test_it_plays_to_the_impact(opened: Browser) -> None:
 def test_boxes_are_drawn_where_the_labels_say(
     at: int, opened: Browser, da_motion: DeepAccident, scenario: str
 ) -> None:
-    """Points of each box near its corners are of its colour, a metre beyond its sides nothing is."""
+    """Points of each box near its corners are of its colour, a metre beyond its sides nothing
+    is.
+    """
     scrub(opened, at)
     behind = ("ego_vehicle_behind", "other_vehicle_behind")
     colors_of = {
@@ -239,7 +245,8 @@ def test_every_camera_is_chosen(browser: Browser, recorded: Path) -> None:
     data = data_of(recorded)
     browser.open(recorded, 1280)
     browser.wait(
-        "document.images.length === 5 && [...document.images].every((each) => each.naturalWidth === 64)"
+        "document.images.length === 5 && [...document.images].every((each) => "
+        "each.naturalWidth === 64)"
     )
     scrub(browser, 4)
     for agent, cameras in zip(data["agents"], data["cameras"], strict=True):
@@ -264,7 +271,9 @@ def photo(browser: Browser) -> Image.Image:
 
 
 def test_the_scene_is_turned(browser: Browser, recorded: Path) -> None:
-    """With the mouse and keys: other pixels, and always the pair; it follows whom the reader says."""
+    """With the mouse and keys: other pixels, and always the pair; it follows whom the reader
+    says.
+    """
     browser.open(recorded, 1280)
     photos, canvas = [photo(browser)], browser.driver.find_element("id", "space")
     for act in (
@@ -296,11 +305,13 @@ if (element.matches('canvas')) return [corner.left + element.clientLeft, corner.
 const shown = view === 'seen' ? element : document.querySelector(`.large g[data-actor="${id}"] path`);
 const place = shown.getBoundingClientRect();
 return [place.left + place.width / 2, place.top + place.height / 2];
-"""
+"""  # noqa: E501
 
 
 def pixel_of(browser: Browser, canvas: str, place: Any) -> Any:
-    """The pixel (2,) of a canvas, from its corner, where a place (3,) in metres is by the view that the canvas says."""
+    """The pixel (2,) of a canvas, from its corner, where a place (3,) in metres is by the view that
+    the canvas says.
+    """
     element = f"document.getElementById('{canvas}')"
     numbers = np.array(browser.value(f"{element}.dataset.view").split(), dtype=float)
     size = np.array(browser.value(f"[{element}.clientWidth, {element}.clientHeight]"))
@@ -376,7 +387,7 @@ def test_the_strip_tells_of_the_pair_and_leads_there(browser: Browser, judged: P
 WITHOUT = """
 const real = HTMLCanvasElement.prototype.getContext;
 HTMLCanvasElement.prototype.getContext = function (kind) { return kind === '2d' ? real.call(this, kind) : null; };
-"""
+"""  # noqa: E501
 
 
 def test_without_webgl_there_is_the_map(browser: Browser, recorded: Path) -> None:
@@ -387,7 +398,8 @@ def test_without_webgl_there_is_the_map(browser: Browser, recorded: Path) -> Non
     browser.driver.execute_cdp_cmd("Page.removeScriptToEvaluateOnNewDocument", added)
     click(browser, "closer", "whole", "layer-points")
     shown = browser.value(
-        "['space-box', 'scene-tools', 'ground'].map((name) => document.getElementById(name).offsetHeight > 0)"
+        "['space-box', 'scene-tools', 'ground'].map((name) => "
+        "document.getElementById(name).offsetHeight > 0)"
     )
     assert (shown, browser.faults()) == ([False, False, True], {})
 
@@ -419,7 +431,9 @@ def test_one_picture_is_large_and_by_default_it_follows_the_pair(
 def test_boxes_are_where_the_camera_has_them(
     browser: Browser, da: DeepAccident, recorded: Path
 ) -> None:
-    """At the impact, of all agents, cut off at the near plane: as Python draws them, to a hundredth."""
+    """At the impact, of all agents, cut off at the near plane: as Python draws them, to a
+    hundredth.
+    """
     scenario = data_of(recorded)["scenario"]
     browser.open(recorded, 1280)
     scrub(browser, 5)
@@ -428,7 +442,8 @@ def test_boxes_are_where_the_camera_has_them(
     for agent, cameras in zip(AGENTS, data_of(recorded)["automatic"]["cameras"], strict=True):
         drawn_ = browser.script(
             f"return [...document.querySelectorAll('figure[data-agent={agent}] g')]"
-            ".map((g) => [Number(g.dataset.actor), g.querySelectorAll('path')[1].getAttribute('d')])"
+            ".map((g) => [Number(g.dataset.actor), "
+            "g.querySelectorAll('path')[1].getAttribute('d')])"
         )
         sample, channel = f"{scenario}/{agent}/006", CHANNELS[cameras[5]]
         optical = tracks.transform(da.world_from(sample, channel).inverse(), channel)
@@ -490,25 +505,25 @@ return [...document.querySelectorAll('.agent select')].filter((each) => each.off
   pen.font = getComputedStyle(each).font;
   return pen.measureText(each.selectedOptions[0].text).width + 18 > each.clientWidth;  // 18 for the arrow
 }).map((each) => [each.selectedOptions[0].text, each.clientWidth]);
-"""
+"""  # noqa: E501
 CUT = """
 return [...document.querySelectorAll('.name, .badge, .where, th, td, button, p, dt, dd, legend, #legend span')]
   .filter((each) => each.offsetParent && each.scrollWidth > each.clientWidth + 1 && each.clientWidth)
   .map((each) => each.outerHTML.slice(0, 200));
-"""
+"""  # noqa: E501
 SMALL = """
 return [...document.querySelectorAll('body *')]
   .filter((each) => each.childNodes.length && each.innerText)
   .filter((each) => [getComputedStyle(each).fontSize].map(parseFloat).some((size) => 0 < size && size < 11))
   .map((each) => each.outerHTML);
-"""
+"""  # noqa: E501
 
 
 NAMELESS = """
 return [...document.querySelectorAll('button, select, input')]
   .filter((each) => !(each.ariaLabel || each.textContent.trim() || (each.labels && each.labels.length)))
   .map((each) => each.outerHTML);
-"""
+"""  # noqa: E501
 
 
 @pytest.mark.parametrize("width", [1280, 390])
@@ -532,7 +547,7 @@ def test_it_fits_its_window_and_asks_for_nothing(
 INTRUDERS = """
 document.body.append(Object.assign(document.createElement('img'), {src: 'https://example.org/a.png'}));
 document.body.append(Object.assign(document.createElement('script'), {textContent: 'window.ran = 1'}));
-"""
+"""  # noqa: E501
 
 
 def test_nobody_can_make_it_load_or_run_anything(browser: Browser, page: Path) -> None:

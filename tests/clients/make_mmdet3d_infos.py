@@ -1,7 +1,7 @@
 """Make what `mmdet3d_infos.py` opens: `python -m tests.clients.make_mmdet3d_infos FOLDER`.
 
-FOLDER gets a small release, its exports with both axes of the LiDAR, and `expected.json`: our boxes, clouds and cameras
-at every keyframe, and the dataset class of docs/exports.md.
+FOLDER gets a small release, its exports with both axes of the LiDAR, and `expected.json`: our
+boxes, clouds and cameras at every keyframe, and the dataset class of docs/exports.md.
 """
 
 import json
@@ -61,7 +61,9 @@ def main(folder: Path) -> None:
 
 
 def turn_the_ego(release: Path) -> None:
-    """Let the ego turn by 3° a frame: where nobody turns, a wrong way to place sweeps may be right."""
+    """Let the ego turn by 3° a frame: where nobody turns, a wrong way to place sweeps may be
+    right.
+    """
     for path in release.glob("*/ego_vehicle/calib/*/*.pkl"):
         calib = read_calib(path)
         turned = calib.world_from_ego @ SE3.from_yaw(np.radians(3 * int(path.stem[-3:])))

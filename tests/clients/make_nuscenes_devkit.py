@@ -1,7 +1,7 @@
 """Make what `nuscenes_devkit.py` opens: `python -m tests.clients.make_nuscenes_devkit FOLDER`.
 
-FOLDER gets a small release, its export, and `expected.json`: our boxes in every sensor's frame at keyframes, and in the
-world at all frames.
+FOLDER gets a small release, its export, and `expected.json`: our boxes in every sensor's frame at
+keyframes, and in the world at all frames.
 """
 
 import json
@@ -37,7 +37,9 @@ def main(folder: Path) -> None:
 
 
 def boxes_of(dataset: DeepAccident, sample: str) -> dict[str, Any]:
-    """nuScenes' channel, or `world` → [actor, x, y, z, width, length, height, w, x, y, z of the quaternion] a box."""
+    """nuScenes' channel, or `world` → [actor, x, y, z, width, length, height, w, x, y, z of the
+    quaternion] a box.
+    """
     last = dataset.scenario.get(dataset.sample.get(sample)["scenario_token"])["num_frames"]
     frames = {"world": "world"}
     if int(sample[-3:]) in keyframes(last):

@@ -1,6 +1,8 @@
-"""A small release, its exports `out/tables` and `out/shards`, and what the clients in tables.py must find there.
+"""A small release, its exports `out/tables` and `out/shards`, and what the clients in tables.py
+must find there.
 
-The first scenario lacks the images of the ego's front camera, another one its split, and the test split all labels.
+The first scenario lacks the images of the ego's front camera, another one its split, and the test
+split all labels.
 """
 
 import hashlib

@@ -1,6 +1,8 @@
-"""mmdet3d 1.4.0 on an export: `python tests/clients/mmdet3d_infos.py FOLDER`, in an environment without ours.
+"""mmdet3d 1.4.0 on an export: `python tests/clients/mmdet3d_infos.py FOLDER`, in an environment
+without ours.
 
-FOLDER is what `make_mmdet3d_infos.py` made. mmcv-lite has no `mmcv.ops`; datasets and loading need none of it, but
+FOLDER is what `make_mmdet3d_infos.py` made. mmcv-lite has no `mmcv.ops`; datasets and loading need
+none of it, but
 mmdet3d imports it: a stand-in has every name.
 """
 
@@ -77,13 +79,16 @@ def main(folder: Path) -> None:
             check_metric(NuScenesDataset, folder / axes, expected)
     boxes, points, sweeps = map(sum, zip(*found, strict=True))
     print(
-        f"mmdet3d: {boxes} boxes within 1e-3 m, with {points} points in them as labelled, {sweeps} sweeps in place, "
+        f"mmdet3d: {boxes} boxes within 1e-3 m, with {points} points in them as "
+        f"labelled, {sweeps} sweeps in place, "
         "cameras, six classes, AP 1.0 of NuScenesMetric's JSON: good"
     )
 
 
 def checked(kind: Any, root: Path, expected: dict[str, Any]) -> tuple[int, int, int]:
-    """Compare a dataset of all splits with what is expected; the numbers of boxes, of points in them, and of sweeps."""
+    """Compare a dataset of all splits with what is expected; the numbers of boxes, of points in
+    them, and of sweeps.
+    """
     totals, seen = Counter[str](), set()
     for file in sorted(root.glob("deepaccident_infos_*.pkl")):
         dataset = opened(kind, file)
@@ -130,7 +135,9 @@ def opened(kind: Any, file: Path) -> Any:
 
 
 def check_metric(kind: Any, root: Path, expected: dict[str, Any]) -> None:
-    """True boxes as results, which the metric writes for the nuScenes devkit: that finds them all, in the world."""
+    """True boxes as results, which the metric writes for the nuScenes devkit: that finds them all,
+    in the world.
+    """
     import torch
     from mmdet3d.evaluation.metrics import NuScenesMetric
     from nuscenes import NuScenes
@@ -201,7 +208,9 @@ def check_points(points: np.ndarray, truth: dict[str, Any]) -> int:
 
 
 def check_clouds(points: np.ndarray, truth: dict[str, Any]) -> int:
-    """The clouds before a keyframe are all there and where they belong; the last column is how old a point is."""
+    """The clouds before a keyframe are all there and where they belong; the last column is how old
+    a point is.
+    """
     for age, (count, mean) in truth["clouds"].items():
         cloud = points[np.abs(points[:, 4] - float(age)) < 0.01]
         assert len(cloud) == count, (age, len(cloud), count)

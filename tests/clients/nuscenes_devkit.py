@@ -1,6 +1,8 @@
-"""nuscenes-devkit 1.2.0 on an export: `python tests/clients/nuscenes_devkit.py FOLDER`, in an environment without ours.
+"""nuscenes-devkit 1.2.0 on an export: `python tests/clients/nuscenes_devkit.py FOLDER`, in an
+environment without ours.
 
-FOLDER is what `make_nuscenes_devkit.py` made. Everything is compared with our own boxes, or evaluated by the devkit.
+FOLDER is what `make_nuscenes_devkit.py` made. Everything is compared with our own boxes, or
+evaluated by the devkit.
 """
 
 import json
@@ -54,8 +56,10 @@ def checked(folder: Path) -> str:
     found = detect(nusc, folder)
     tracked = track(nusc, folder)
     return (
-        f"nuscenes-devkit: {boxes} boxes in sensor frames within 1e-3 m, at sweeps within {off:.2f} m, rendered; "
-        f"AP 1.0 of {found}, MOTA 1.0 of {tracked}; {grown / len(nusc.ego_pose) / 1000:.0f} kB of memory a sample: good"
+        f"nuscenes-devkit: {boxes} boxes in sensor frames within 1e-3 m, at sweeps "
+        f"within {off:.2f} m, rendered; "
+        f"AP 1.0 of {found}, MOTA 1.0 of {tracked}; "
+        f"{grown / len(nusc.ego_pose) / 1000:.0f} kB of memory a sample: good"
     )
 
 
@@ -86,7 +90,9 @@ def check_boxes(nusc: NuScenes, expected: dict) -> int:
 
 
 def check_sweeps(nusc: NuScenes, expected: dict) -> float:
-    """Boxes that the devkit interpolates at sweeps are near those of our 10 Hz labels; the 95th percentile, metres."""
+    """Boxes that the devkit interpolates at sweeps are near those of our 10 Hz labels; the 95th
+    percentile, metres.
+    """
     off = []
     for row in nusc.sample_data:
         sample = nusc.get("sample", row["sample_token"])

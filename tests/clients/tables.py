@@ -1,4 +1,5 @@
-"""Opens the exports of make_tables.py with datasets, Polars, DuckDB, pandas and webdataset; knows no devkit.
+"""Opens the exports of make_tables.py with datasets, Polars, DuckDB, pandas and webdataset; knows
+no devkit.
 
 Runs the code of docs/exports.md, too, that is marked with one of these names.
 """
@@ -160,7 +161,8 @@ def main(folder: Path) -> None:
     os.chdir(folder)
     expected = json.loads(Path("expected.json").read_text())
     print(
-        f"tables: {check_tables(expected['tables'])} rows, {check_queries(expected['queries'])} blocks of code and "
+        f"tables: {check_tables(expected['tables'])} rows, "
+        f"{check_queries(expected['queries'])} blocks of code and "
         f"{check_shards(expected['shards'])} samples in shards good"
     )
 

@@ -1,4 +1,6 @@
-"""A release on S3: the same bytes, workers of all kinds, no credentials anywhere, errors of our own."""
+"""A release on S3: the same bytes, workers of all kinds, no credentials anywhere, errors of our
+own.
+"""
 
 import logging
 import os

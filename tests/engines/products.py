@@ -12,9 +12,11 @@ COMMANDS = {
     "validate": "validate {release} --json",
     "labels": "labels {release} --split train --samples evaluate --out {out}/labels",
     "opencood": "export opencood {release} --without-clouds --out {out}/opencood",
-    "evaluate": "evaluate accident {release} --results {results}/motion --split train --resamples 20 "
+    "evaluate": "evaluate accident {release} --results {results}/motion --split "
+    "train --resamples 20 "
     "--out {out}/bundle",
-    "predict": "predict constant_velocity {release} --split train --task accident --out {out}/predictions",
+    "predict": "predict constant_velocity {release} --split train --task accident "
+    "--out {out}/predictions",
     "stats": "info {release} --statistics --out {out}/stats",
     "synth": "synth {out}/made --scenarios 3 --frames 3 --size 64x36 --seed 5",
 }
@@ -22,7 +24,9 @@ COMMANDS = {
 
 
 class Local(NamedTuple):
-    """What the commands made here without a cluster: files by path, and what each printed of the release."""
+    """What the commands made here without a cluster: files by path, and what each printed of the
+    release.
+    """
 
     places: dict[str, Path]
     files: dict[str, bytes]
@@ -30,7 +34,9 @@ class Local(NamedTuple):
 
 
 class Cluster(NamedTuple):
-    """A dask cluster in a process of its own: its scheduler's address, and the processes of its workers."""
+    """A dask cluster in a process of its own: its scheduler's address, and the processes of its
+    workers.
+    """
 
     address: str
     workers: list[int]

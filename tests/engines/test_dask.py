@@ -1,4 +1,6 @@
-"""Every bulk command on two dask workers, one of which is killed half-way; and clusters that cannot do the work."""
+"""Every bulk command on two dask workers, one of which is killed half-way; and clusters that cannot
+do the work.
+"""
 
 import json
 import os

@@ -1,4 +1,6 @@
-"""`PYTHONPATH=tests python -m fault_injection`: print all kinds of faults, and bring docs/validation.md up to date."""
+"""`PYTHONPATH=tests python -m fault_injection`: print all kinds of faults, and bring
+docs/validation.md up to date.
+"""
 
 import re
 import tempfile

@@ -48,7 +48,9 @@ class Group:
     mutations: list[Mutation] = field(default_factory=list)
 
     def add(self, rows: Mapping[str, tuple[str, Apply]], **how: Any) -> None:
-        """Enter a mutation a row: name → what it does, and the function; all have the same further fields."""
+        """Enter a mutation a row: name → what it does, and the function; all have the same further
+        fields.
+        """
         for name, (says, apply) in rows.items():
             title = " ".join(says.split()).rstrip(".")
             self.mutations.append(
@@ -63,7 +65,9 @@ class Group:
 
 
 def in_file(kind: str, change: Callable[[bytes, np.random.Generator], bytes]) -> Apply:
-    """Change the bytes of a file of a kind (`ENDINGS`, or `Camera` for any of them) at a frame of an agent."""
+    """Change the bytes of a file of a kind (`ENDINGS`, or `Camera` for any of them) at a frame of
+    an agent.
+    """
 
     def apply(place: Place, rng: np.random.Generator) -> None:
         drawn = str(rng.choice(CAMERAS)) if kind == "Camera" else kind
@@ -80,7 +84,9 @@ def in_calib(
     drawn: Callable[[np.random.Generator], Matrix] | None = None,
     always: bool,
 ) -> Apply:
-    """Edit a matrix of an agent's calib at a frame or always: as it is said or `drawn`; `{}` stands for a camera."""
+    """Edit a matrix of an agent's calib at a frame or always: as it is said or `drawn`; `{}` stands
+    for a camera.
+    """
 
     def apply(place: Place, rng: np.random.Generator) -> None:
         agent, frames = place.any_agent(rng), place.frames if always else [place.any_frame(rng)]
@@ -101,7 +107,9 @@ def of_actor(
     lone: bool = False,
     **which: Any,
 ) -> Apply:
-    """Damage what an agent says of an actor that others see too, or `lone` of one that nobody else sees."""
+    """Damage what an agent says of an actor that others see too, or `lone` of one that nobody else
+    sees.
+    """
 
     def apply(place: Place, rng: np.random.Generator) -> None:
         agent, actor = (place.lone_actor if lone else place.shared_actor)(rng, **which)

@@ -127,7 +127,9 @@ class Place(ScenarioEditor):
         return int(rng.choice(self.frames))
 
     def middle_frame(self, rng: np.random.Generator) -> int:
-        """Not the first frame, and with both neighbours before the last two, when a collision may throw actors."""
+        """Not the first frame, and with both neighbours before the last two, when a collision may
+        throw actors.
+        """
         return int(rng.choice(self.frames[1:-3]))
 
     def position(self, agent: str, frame: int) -> np.ndarray:
@@ -135,7 +137,9 @@ class Place(ScenarioEditor):
 
     @cached_property
     def sightings(self) -> Sightings:
-        """Where each agent sees each tracked actor; of the healthy scenario, so ask before the first change."""
+        """Where each agent sees each tracked actor; of the healthy scenario, so ask before the
+        first change.
+        """
         return {agent: self._sightings_of(agent) for agent in self.agents}
 
     def _sightings_of(self, agent: str) -> dict[int, dict[int, np.ndarray]]:
@@ -167,7 +171,9 @@ class Place(ScenarioEditor):
     def shared_actor(
         self, rng: np.random.Generator, *, moving: bool = False, within: float = np.inf
     ) -> tuple[str, int]:
-        """An agent and an actor that it (from within so many metres) and another agent see in every frame."""
+        """An agent and an actor that it (from within so many metres) and another agent see in every
+        frame.
+        """
         steady = {agent: self.steady(agent, moving=moving) for agent in self.agents}
         pairs = [
             (agent, actor)
@@ -190,9 +196,11 @@ class Place(ScenarioEditor):
         ).tolist()
 
     def lone_actor(self, rng: np.random.Generator, *, vehicle: bool = False) -> tuple[str, int]:
-        """An agent, alone from now on (the others' files are gone), and a near moving actor that it sees always.
+        """An agent, alone from now on (the others' files are gone), and a near moving actor that it
+        sees always.
 
-        The agent's labels leave nobody out for being hidden: of others nobody can say whether an actor is missing.
+        The agent's labels leave nobody out for being hidden: of others nobody can say whether an
+        actor is missing.
         """
         classes = {
             int(row[FIELD["id"]]): row[0]

@@ -1,4 +1,6 @@
-"""Applying mutations, asking `validate`, and putting everything back: in several processes, each with its own copy."""
+"""Applying mutations, asking `validate`, and putting everything back: in several processes, each
+with its own copy.
+"""
 
 import multiprocessing
 import os
@@ -58,7 +60,9 @@ class Outcome:
 
 
 def jobs(count: int = NUM_MUTATIONS) -> list[Job]:
-    """Every mutation with seed 0, then every one with seed 1, … up to `count`, then those that need not be found."""
+    """Every mutation with seed 0, then every one with seed 1, … up to `count`, then those that need
+    not be found.
+    """
     names = [name for name in MUTATIONS if name not in BEYOND]
     counted = [Job(names[number % len(names)], number // len(names)) for number in range(count)]
     return [*counted, *(Job(name, seed) for seed in range(SEEDS_BEYOND) for name in BEYOND)]
@@ -75,7 +79,9 @@ def places(root: Path) -> dict[str, Place]:
 
 
 def mutate(job: Job, of: dict[str, Place]) -> Place:
-    """Apply a mutation to the first scenario with a victim for it, in an order that its seed chooses."""
+    """Apply a mutation to the first scenario with a victim for it, in an order that its seed
+    chooses.
+    """
     mutation, rng = MUTATIONS[job.name], seeded(job.name, job.seed)
     fitting = sorted(
         token
@@ -97,7 +103,9 @@ def mutate(job: Job, of: dict[str, Place]) -> Place:
 
 
 def run(root: Path, wanted: Sequence[Job]) -> list[Outcome]:
-    """Outcomes of the jobs, in their order. The dear ones (deep) are spread evenly over the processes."""
+    """Outcomes of the jobs, in their order. The dear ones (deep) are spread evenly over the
+    processes.
+    """
     dear_first = sorted(wanted, key=lambda job: (not MUTATIONS[job.name].deep, job))
     with tempfile.TemporaryDirectory(dir=root.parent) as folder:  # hard links need one file system
         context = multiprocessing.get_context("spawn")

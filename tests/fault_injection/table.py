@@ -14,7 +14,7 @@ _HEAD = """# What `deepaccident validate` finds
 _SUMMARY = """{count} faults of {kinds} kinds: {found} found, {harmless} harmless, {missed} missed. `validate` need not
 find {beyond} more kinds; the table that the command prints says why.
 
-"""
+"""  # noqa: E501
 _COLUMNS = ("kind", "what is done", "needs", "applied", "found", "verdict", "found by, or why not")
 
 

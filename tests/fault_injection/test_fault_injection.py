@@ -1,4 +1,6 @@
-"""200 seeded mutations of a healthy release: `validate` finds each, or it is listed by name as harmless."""
+"""200 seeded mutations of a healthy release: `validate` finds each, or it is listed by name as
+harmless.
+"""
 
 from pathlib import Path
 

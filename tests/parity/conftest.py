@@ -1,8 +1,9 @@
 """Golden cases from the folder that `--golden` names.
 
-A test marked `golden_cases(part, list)` runs once for each entry of that list in `<folder>/<part>.json` and takes the
-fixture `golden`; one marked `golden_rows(part, array)` runs once for each row of that array in `<folder>/<part>.npz`
-and takes `golden_row`. Where the folder, the file, the list or the array is missing or empty, it runs once, and fails.
+A test marked `golden_cases(part, list)` runs once for each entry of that list in
+`<folder>/<part>.json` and takes the fixture `golden`; one marked `golden_rows(part, array)` runs
+once for each row of that array in `<folder>/<part>.npz` and takes `golden_row`. Where the folder,
+the file, the list or the array is missing or empty, it runs once, and fails.
 """
 
 import functools
@@ -23,7 +24,9 @@ if importlib.util.find_spec("torch") is None:
 
 @dataclass(frozen=True)
 class GoldenCase:
-    """One entry of a golden part; arrays by (name, further indices): `golden["xy", 3]` is `xy_<case>_3`."""
+    """One entry of a golden part; arrays by (name, further indices): `golden["xy", 3]` is
+    `xy_<case>_3`.
+    """
 
     folder: Path
     part: str
@@ -33,7 +36,8 @@ class GoldenCase:
     def _checked_index(self) -> int:
         if self.index is None:
             pytest.fail(
-                f"{self.folder / self.part}.json: no case in its list '{self.key}'; see pytest --golden DIR"
+                f"{self.folder / self.part}.json: no case in its list '{self.key}'; "
+                f"see pytest --golden DIR"
             )
         return self.index
 
@@ -60,7 +64,9 @@ class GoldenCase:
 
 @dataclass(frozen=True)
 class GoldenRow:
-    """One row of the arrays of a golden part that have a row a case: `golden_row["ego_to_world"]`."""
+    """One row of the arrays of a golden part that have a row a case:
+    `golden_row["ego_to_world"]`.
+    """
 
     folder: Path
     part: str
@@ -70,7 +76,8 @@ class GoldenRow:
     def __getitem__(self, name: str) -> np.ndarray:
         if self.index is None:
             pytest.fail(
-                f"{self.folder / self.part}.npz: no row in its array '{self.key}'; see pytest --golden DIR"
+                f"{self.folder / self.part}.npz: no row in its array '{self.key}'; "
+                f"see pytest --golden DIR"
             )
         return _arrays(self.folder / f"{self.part}.npz")[name][self.index]
 

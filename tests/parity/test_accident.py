@@ -1,11 +1,13 @@
-"""The golden accidents (tests/data/golden: d_accident, d2_eval_accidents). Equal counts, matches and cells.
+"""The golden accidents (tests/data/golden: d_accident, d2_eval_accidents). Equal counts, matches
+and cells.
 
-Accidents as the released code evaluates them. Made by the released functions, d_accident by the whole evaluation loop
-over samples of six predictions, d2_eval_accidents by `eval_accidents` alone, under numpy 1.23.5, scikit-image 0.20.0,
-shapely 2.0.1, OpenCV 4.7.0 and torch 2.13 on the CPU (tests/data/golden/README.md); the rules are
-docs/released_code.md, Accidents. Errors and rates to 1e-6. Distances of outlines as far as a golden can pin them: one
-in a hundred of them all moves with numpy's version and the processor, by half a cell at most, and none across a
-threshold. Ours are compared with what the released code gives with a stable sort. The golden's maps lie as the released
+Accidents as the released code evaluates them. Made by the released functions, d_accident by the
+whole evaluation loop over samples of six predictions, d2_eval_accidents by `eval_accidents` alone,
+under numpy 1.23.5, scikit-image 0.20.0, shapely 2.0.1, OpenCV 4.7.0 and torch 2.13 on the CPU
+(tests/data/golden/README.md); the rules are docs/released_code.md, Accidents. Errors and rates to
+1e-6. Distances of outlines as far as a golden can pin them: one in a hundred of them all moves with
+numpy's version and the processor, by half a cell at most, and none across a threshold. Ours are
+compared with what the released code gives with a stable sort. The golden's maps lie as the released
 code has them; d_accident also runs turned to the devkit's orientation and to FIERY's.
 """
 

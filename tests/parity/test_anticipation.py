@@ -1,7 +1,8 @@
 """The golden anticipation (tests/data/golden/safety): four published evaluations, and `clean`.
 
-UString, DSTA, DRIVE and DAD were run with their sorts made stable, `clean` is plain code with scikit-learn's AP and AUC
-(tests/data/golden/safety/README.md). All numbers to 1e-9; where a published code raised an error the devkit says NaN.
+UString, DSTA, DRIVE and DAD were run with their sorts made stable, `clean` is plain code with
+scikit-learn's AP and AUC (tests/data/golden/safety/README.md). All numbers to 1e-9; where a
+published code raised an error the devkit says NaN.
 """
 
 import functools

@@ -1,7 +1,9 @@
-"""The golden attributes (tests/data/golden: a_labels, d_accident), by which the released evaluation sorts its results.
+"""The golden attributes (tests/data/golden: a_labels, d_accident), by which the released evaluation
+sorts its results.
 
-a_labels has meta lines and what the released code read in them, d_accident which samples of a run have which value
-(docs/released_code.md, Visibility and attributes). Equal words. `accident_visibility` itself is `test_visibility`'s.
+a_labels has meta lines and what the released code read in them, d_accident which samples of a run
+have which value (docs/released_code.md, Visibility and attributes). Equal words.
+`accident_visibility` itself is `test_visibility`'s.
 """
 
 from typing import Any

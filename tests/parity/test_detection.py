@@ -1,11 +1,12 @@
-"""The golden detections (tests/data/golden, e_detection): average precision and errors of boxes, in both modes.
+"""The golden detections (tests/data/golden, e_detection): average precision and errors of boxes, in
+both modes.
 
-Made by the released functions under numpy 1.23.5, numba 0.57.1 and shapely 2.0.1 in place of the CUDA kernel
-(tests/data/golden/README.md); the rules are docs/released_code.md, Detection. Everything equal to 1e-9, but mASE to
-1e-4.
+Made by the released functions under numpy 1.23.5, numba 0.57.1 and shapely 2.0.1 in place of the
+CUDA kernel (tests/data/golden/README.md); the rules are docs/released_code.md, Detection.
+Everything equal to 1e-9, but mASE to 1e-4.
 
-The golden's boxes are left-handed, with yaws beyond half a turn: they go in as columns, y and vy negated. Yaw stands
-as the converter writes it, which is ours.
+The golden's boxes are left-handed, with yaws beyond half a turn: they go in as columns, y and vy
+negated. Yaw stands as the converter writes it, which is ours.
 """
 
 import functools
@@ -183,7 +184,9 @@ def test_one_frame_and_class(golden) -> None:
 
 @every_class
 def test_the_evaluator_says_the_same(golden) -> None:
-    """Through `Boxes`, which keep yaws within half a turn: the released modulus then differs by 1e-7."""
+    """Through `Boxes`, which keep yaws within half a turn: the released modulus then differs by
+    1e-7.
+    """
     evaluator = DetectionEvaluator("released")
     for position, (detections, truth) in enumerate(frames(golden.folder)):
         predicted, true = (

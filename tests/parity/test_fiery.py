@@ -1,7 +1,9 @@
-"""FIERY's golden labels (tests/data/golden, h_fiery), for the preset `fiery`, in each frame's own ego frame.
+"""FIERY's golden labels (tests/data/golden, h_fiery), for the preset `fiery`, in each frame's own
+ego frame.
 
-Made by FIERY (tests/data/golden/README.md). Every cell of instance, offset and flow is equal, and centerness after
-rounding to float16, as it is stored. The ids are the objects' numbers: FIERY counts them over its past frames too.
+Made by FIERY (tests/data/golden/README.md). Every cell of instance, offset and flow is equal, and
+centerness after rounding to float16, as it is stored. The ids are the objects' numbers: FIERY
+counts them over its past frames too.
 """
 
 import numpy as np

@@ -1,7 +1,9 @@
-"""FIERY's golden ids and paths (tests/data/golden, h_fiery), for noisy predictions, with the preset `fiery`.
+"""FIERY's golden ids and paths (tests/data/golden, h_fiery), for noisy predictions, with the preset
+`fiery`.
 
-Made by wayveai/fiery @ fd03f16 under numpy 1.26.4 and torch 2.13 on the CPU (tests/data/golden/README.md); rasters
-there are FIERY's, rows along x. Every cell and number equal. Each case also runs turned to the devkit's orientation.
+Made by wayveai/fiery @ fd03f16 under numpy 1.26.4 and torch 2.13 on the CPU
+(tests/data/golden/README.md); rasters there are FIERY's, rows along x. Every cell and number equal.
+Each case also runs turned to the devkit's orientation.
 """
 
 import numpy as np

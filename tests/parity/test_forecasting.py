@@ -1,4 +1,5 @@
-"""The golden numbers of forecasts (tests/data/golden/forecasting), which the package av2 made, to 1e-9.
+"""The golden numbers of forecasts (tests/data/golden/forecasting), which the package av2 made, to
+1e-9.
 
 By mode they are av2's own functions; by actor the rules of docs/protocols.md on them.
 """
@@ -45,7 +46,9 @@ def given(pytestconfig: pytest.Config) -> Mapping[str, np.ndarray]:
 
 
 def modes_of(given: Mapping[str, np.ndarray]) -> tuple[np.ndarray, ...]:
-    """Paths and probabilities, NaN of modes that are not there; truth, NaN where it must not be read; validity."""
+    """Paths and probabilities, NaN of modes that are not there; truth, NaN where it must not be
+    read; validity.
+    """
     there = np.arange(given["forecasts"].shape[1]) < given["n_modes"][:, None]
     paths = np.where(there[:, :, None, None], given["forecasts"], np.nan)
     valid = given["valid"].astype(bool)

@@ -1,8 +1,10 @@
-"""The golden labels (tests/data/golden, a_labels): whole samples, in each frame's own ego frame, augmented ones too.
+"""The golden labels (tests/data/golden, a_labels): whole samples, in each frame's own ego frame,
+augmented ones too.
 
 Made by the released transforms under numpy 1.23.5, OpenCV 4.7.0 and torch 2.13 on a processor
-(tests/data/golden/README.md). Every cell of segmentation, instance, offset and flow is equal, and centerness after
-rounding to float16, as it is stored (one cell in three million flips in rounding); boxes within 1e-5 m.
+(tests/data/golden/README.md). Every cell of segmentation, instance, offset and flow is equal, and
+centerness after rounding to float16, as it is stored (one cell in three million flips in rounding);
+boxes within 1e-5 m.
 """
 
 import functools
@@ -59,7 +61,9 @@ def _joined(name: str | tuple[str | int, ...]) -> str:
 
 
 def frames_of(scene) -> list[FrameBoxes | None]:
-    """The scene's boxes at the label frames, right-handed, with what the five agents see by our own rule."""
+    """The scene's boxes at the label frames, right-handed, with what the five agents see by our own
+    rule.
+    """
     return [_frame_of(scene, t) if scene.has("boxes", t) else None for t in range(LABEL_FRAMES)]
 
 

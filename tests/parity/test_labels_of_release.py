@@ -1,8 +1,8 @@
 """The golden labels (tests/data/golden, a_labels) once more, from files.
 
-Each scene is written as a release by hand and read back through the tables. Poses, boxes and visibility then come from
-label, calib and meta files, egomotion from poses; every cell of the labels in each frame's own frame and at the present
-is equal, as in test_labels and test_warps.
+Each scene is written as a release by hand and read back through the tables. Poses, boxes and
+visibility then come from label, calib and meta files, egomotion from poses; every cell of the
+labels in each frame's own frame and at the present is equal, as in test_labels and test_warps.
 """
 
 import pickle
@@ -46,7 +46,9 @@ def test_labels_read_from_a_release_equal_the_released_codes(golden, tmp_path: P
 
 
 def write_release(scene: Scene, root: Path) -> str:
-    """Write the scene's files, left-handed as they are, in layout B; frames between the key frames have no boxes."""
+    """Write the scene's files, left-handed as they are, in layout B; frames between the key frames
+    have no boxes.
+    """
     present, length = scene.entry["timestamp"], scene.entry["scenario_length"]
     name = "Town03_type001_subtype0001_scenario00024"
     top = root / "type1_subtype1_accident"
@@ -94,12 +96,15 @@ def calib_of(scene: Scene, k: int) -> dict[str, np.ndarray]:
 
 
 def rows_of(scene: Scene, t: int, a: int, *, own: bool) -> list[str]:
-    """An agent's label lines; the sample's own agent has whole boxes, of the others the visibility rule is all."""
+    """An agent's label lines; the sample's own agent has whole boxes, of the others the visibility
+    rule is all.
+    """
     ids, points, seen = (scene[f"vis_{name}", t, a] for name in ("ids", "pts", "cam"))
     if own:
         x, y, z, l, w, h, yaw, vx, vy = scene["boxes", t].T  # noqa: E741 - the label's own names
         boxes = [
-            f"{x[i]!r} {y[i]!r} {z[i]!r} {l[i]!r} {w[i]!r} {h[i]!r} {-yaw[i]!r} {vx[i]!r} {-vy[i]!r}"
+            f"{x[i]!r} {y[i]!r} {z[i]!r} {l[i]!r} {w[i]!r} {h[i]!r} "
+            f"{-yaw[i]!r} {vx[i]!r} {-vy[i]!r}"
             for i in range(len(ids))
         ]
     else:

@@ -1,9 +1,11 @@
 """The model against the released classes, and the fusion modules against their originals.
 
-The golden set (tests/data/golden/model, its README) was made by running those classes on a CPU with torch 2.13 and
-random weights: DeepAccident @ 728e366, CoBEVT, V2X-ViT. Everything is equal within 1e-4 of the largest value where
-nothing else is said; indices, masks, converted weights and warped labels are exact. Rotated suppression of boxes has no
-golden numbers, since the released one needs CUDA.
+The golden set (tests/data/golden/model, its README) was made by running those classes on a CPU with
+torch 2.13 and
+random weights: DeepAccident @ 728e366, CoBEVT, V2X-ViT. Everything is equal within 1e-4 of the
+    largest value where
+nothing else is said; indices, masks, converted weights and warped labels are exact. Rotated
+suppression of boxes has no golden numbers, since the released one needs CUDA.
 """
 
 import re
@@ -162,7 +164,9 @@ def lss(golden_model):
 
 
 def prepared(intrinsics: torch.Tensor, linear: torch.Tensor, shift: torch.Tensor) -> torch.Tensor:
-    """The intrinsics of images that were scaled, cropped and turned, which the release has beside those of the file."""
+    """The intrinsics of images that were scaled, cropped and turned, which the release has beside
+    those of the file.
+    """
     affine = linear.clone()
     affine[..., :2, 2] = shift[..., :2]
     return affine @ intrinsics
@@ -194,7 +198,9 @@ def _fields(config):
 
 Golden = Callable[[str], GoldenModel]
 CELLS_AT_TIES = 0.005
-"""The share of cells that may differ after a nearest warp, for points on the border between two cells."""
+"""The share of cells that may differ after a nearest warp, for points on the border between two
+cells.
+"""
 
 
 def bounds(golden: GoldenModel, name: str = "grid") -> BevGrid:
@@ -234,7 +240,9 @@ def test_chains_of_warps_equal_the_released_warper(
 
 
 def test_partners_are_placed_as_by_the_released_warper(golden_model: Golden) -> None:
-    """The maps; the poses' matrices within 1e-6; also with the released transforms of augmented maps, and the right."""
+    """The maps; the poses' matrices within 1e-6; also with the released transforms of augmented
+    maps, and the right.
+    """
     golden = golden_model("warps")
     given, expected, grid = golden.inputs(), golden.outputs(), bounds(golden)
     ego_from_agent = warps.matrices_from_six(given["relative_pose"])
@@ -315,7 +323,9 @@ def test_released_fusion_equals_the_released_one(golden_model: Golden) -> None:
 
 
 def test_the_released_fusion_s_unreached_layers_equal_its_own(golden_model: Golden) -> None:
-    """The layers behind the early return, called in the order of the lines that are never reached."""
+    """The layers behind the early return, called in the order of the lines that are never
+    reached.
+    """
     golden = golden_model("fusion_agent3d_dead")
     given, expected = golden.inputs(), golden.outputs()
     model = Agent3D(
@@ -382,7 +392,9 @@ def test_cobevt_equals_the_original(golden_model: Golden) -> None:
 
 
 def test_v2xvit_equals_the_original(golden_model: Golden) -> None:
-    """RTE, V2XFusionBlock and FFN; each step that the golden file has; what is float16 there within 2e-3."""
+    """RTE, V2XFusionBlock and FFN; each step that the golden file has; what is float16 there within
+    2e-3.
+    """
     golden = golden_model("ref_v2xvit")
     given, expected, cfg = golden.inputs(), golden.outputs(), golden.config
     config = V2XViTConfig(
@@ -563,7 +575,9 @@ def test_predictions_are_the_released_ones(golden_model) -> None:
 
 
 def test_the_devkit_warps_labels_as_the_released_head(golden_model) -> None:
-    """In the frames that are in the recording: the set's missing ones are all 0, where the loader's vectors are 255."""
+    """In the frames that are in the recording: the set's missing ones are all 0, where the loader's
+    vectors are 255.
+    """
     golden = golden_model("motion_head")
     expected = warped_targets(golden)
     for sample in range(len(expected.segmentation)):
@@ -1001,7 +1015,9 @@ def test_losses_and_gradients_of_a_step_are_the_released_ones(golden_model) -> N
 def test_names_and_shapes_are_those_of_the_released_configs(
     request: pytest.FixtureRequest, name: str, unused: Agent3DConfig | None
 ) -> None:
-    """Of the whole state dict; the V2X config also has the layers that no forward pass of the release reaches."""
+    """Of the whole state dict; the V2X config also has the layers that no forward pass of the
+    release reaches.
+    """
     path = request.config.getoption("golden") / "model" / f"released_keys_{name}.txt"
     with torch.device("meta"):
         whole = released()

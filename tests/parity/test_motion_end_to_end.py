@@ -1,9 +1,10 @@
-"""The golden run (tests/data/golden, d_accident): what the released loop printed of motion, of all and by attribute.
+"""The golden run (tests/data/golden, d_accident): what the released loop printed of motion, of all
+and by attribute.
 
 `MotionEvaluator` gets the stored labels and predictions; the other side is d_accident_stdout.txt
-(tests/data/golden/README.md; docs/released_code.md, IoU and VPQ, and Paths), which has a block an attribute value, then
-one of everything. Counts equal, what is printed equal to its last digit. The VPQ of the blocks is the released mistake
-(`selected_as_released`).
+(tests/data/golden/README.md; docs/released_code.md, IoU and VPQ, and Paths), which has a block an
+attribute value, then one of everything. Counts equal, what is printed equal to its last digit. The
+VPQ of the blocks is the released mistake (`selected_as_released`).
 """
 
 import functools
@@ -23,7 +24,8 @@ from deepaccident_devkit.motion import MotionHeads, MotionLabelConfig, MotionLab
 RELEASED = MotionLabelConfig(orientation="released")
 ALL = "all"
 _RANGE = re.compile(
-    r"grid = (\w+): iou = ([\d.]+), pq = ([\d.]+), sq = ([\d.]+), rq = ([\d.]+), denominator = ([\d.]+)"
+    r"grid = (\w+): iou = ([\d.]+), pq = ([\d.]+), sq = ([\d.]+), rq = "
+    r"([\d.]+), denominator = ([\d.]+)"
 )
 _BLOCK = re.compile(r"Evaluation on (?=[^!]+!!!!!!!\n\n\[Validation)")
 _PATHS = {
@@ -99,7 +101,9 @@ def everything(golden: GoldenCase) -> tuple[MotionEvaluator, list[str]]:
 
 
 def blocks(folder: Path) -> Iterator[tuple[str, str, str]]:
-    """Attribute, value and text of each block that the released loop printed; the last one has neither."""
+    """Attribute, value and text of each block that the released loop printed; the last one has
+    neither.
+    """
     text = (folder / "d_accident_stdout.txt").read_text(encoding="utf-8")
     for block in _BLOCK.split(text)[1:]:
         attribute, value = block[: block.index("!")].split(": ")
@@ -154,7 +158,9 @@ def test_what_was_printed_by_attribute(golden) -> None:
 
 @pytest.mark.golden_cases("d_accident", "attributes_counter")
 def test_the_correct_breakdown_adds_up_to_what_was_printed_of_everything(golden) -> None:
-    """Each sample has one value, so that the values' instances are all of them: as released they are not."""
+    """Each sample has one value, so that the values' instances are all of them: as released they
+    are not.
+    """
     name, (evaluator, _) = (
         list(golden.whole["attributes_counter"])[golden.index],
         everything(golden),

@@ -1,9 +1,10 @@
-"""The golden IoU and VPQ (tests/data/golden, b_vpq) of linked instances, at both ranges, of each sequence and of all.
+"""The golden IoU and VPQ (tests/data/golden, b_vpq) of linked instances, at both ranges, of each
+sequence and of all.
 
-Made by the released functions (FIERY's panoptic metric, torchmetrics' IoU) under numpy 1.23.5 and torch 2.13 on the CPU
-(tests/data/golden/README.md; docs/released_code.md, IoU and VPQ). Counts equal; rates and sums of intersections over
-unions to 2e-6, since the released code sums in float32. `test_trajectories` has the errors of the paths,
-`test_motion_end_to_end` the evaluator.
+Made by the released functions (FIERY's panoptic metric, torchmetrics' IoU) under numpy 1.23.5 and
+torch 2.13 on the CPU (tests/data/golden/README.md; docs/released_code.md, IoU and VPQ). Counts
+equal; rates and sums of intersections over unions to 2e-6, since the released code sums in float32.
+`test_trajectories` has the errors of the paths, `test_motion_end_to_end` the evaluator.
 """
 
 from collections.abc import Sequence
@@ -89,7 +90,9 @@ def test_iou_of_a_sequence(golden, name: str) -> None:
 
 @pytest.mark.golden_cases("b_vpq", "aggregate")
 def test_all_sequences(golden) -> None:
-    """Sums over everything, and over the sequences `selected_index`, as a breakdown takes them; and the mistake."""
+    """Sums over everything, and over the sequences `selected_index`, as a breakdown takes them; and
+    the mistake.
+    """
     name = list(golden.whole["aggregate"])[golden.index]
     expected, selected = golden.whole["aggregate"][name], golden.whole["selected_index"]
     cases = [

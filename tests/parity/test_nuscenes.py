@@ -1,8 +1,10 @@
-"""The nuScenes export against tables that nuscenes-devkit 1.2.0 opens, renders and evaluates (golden/exports/nuscenes).
+"""The nuScenes export against tables that nuscenes-devkit 1.2.0 opens, renders and evaluates
+(golden/exports/nuscenes).
 
-Tokens are arbitrary, so that rows are compared through scene, channel and time since the scene's first sample. Two
-things differ on purpose. Golden scenes have an hour each and ours five the same; so absolute times, which file names
-hold, differ. And golden logs name no file and a date, ours the scenario and no date.
+Tokens are arbitrary, so that rows are compared through scene, channel and time since the scene's
+first sample. Two things differ on purpose. Golden scenes have an hour each and ours five the same;
+so absolute times, which file names hold, differ. And golden logs name no file and a date, ours the
+scenario and no date.
 """
 
 import json
@@ -188,7 +190,9 @@ def test_neither_has_faults(found: Tables, expected: Tables) -> None:
 
 
 def test_scenes_are_in_the_golden_split(golden: Path, folder: Path, expected: Tables) -> None:
-    """The golden release may be a part of the one that the splits are of: then some scenes have no tables."""
+    """The golden release may be a part of the one that the splits are of: then some scenes have no
+    tables.
+    """
     ours, theirs = (
         json.loads((each / "splits.json").read_text()) for each in (folder, golden / "nuscenes")
     )

@@ -1,4 +1,6 @@
-"""The export to OPV2V's folders against files that OpenCOOD's own datasets read (golden/exports/opencood)."""
+"""The export to OPV2V's folders against files that OpenCOOD's own datasets read
+(golden/exports/opencood).
+"""
 
 import math
 import shutil

@@ -1,7 +1,7 @@
 """The golden planning numbers (tests/data/golden/planning), within the tolerances of its README.
 
-Rasters, hits and metrics are what the public code of UniAD, ST-P3, VAD and BEV-Planner gave; the cases of `clean` are
-closed forms.
+Rasters, hits and metrics are what the public code of UniAD, ST-P3, VAD and BEV-Planner gave; the
+cases of `clean` are closed forms.
 """
 
 import functools
@@ -186,7 +186,9 @@ def test_contacts_are_those_of_closed_forms(golden) -> None:
 
 
 def test_the_definitions_disagree_as_the_page_says() -> None:
-    """Sample 35 of our own goldens, in docs/protocols.md: one plan that drives through a car at 2.5 s."""
+    """Sample 35 of our own goldens, in docs/protocols.md: one plan that drives through a car at 2.5
+    s.
+    """
     folder = Path(__file__).parents[1] / "data" / "golden" / "planning"
     found = {protocol: numbers_of(folder, protocol)[2][35] for protocol in PUBLIC}
     collisions = {protocol: (100 * each["collision"]).tolist() for protocol, each in found.items()}

@@ -1,7 +1,8 @@
-"""The golden poses (tests/data/golden, g_poses): relative to the ego, and from moment to moment. Within 1e-4 (float32).
+"""The golden poses (tests/data/golden, g_poses): relative to the ego, and from moment to moment.
+Within 1e-4 (float32).
 
-Made by the released functions under numpy 1.23.5 and torch 2.13 (tests/data/golden/README.md) on CARLA's raw,
-left-handed poses; the formulas are docs/released_code.md, Poses.
+Made by the released functions under numpy 1.23.5 and torch 2.13 (tests/data/golden/README.md) on
+CARLA's raw, left-handed poses; the formulas are docs/released_code.md, Poses.
 """
 
 import numpy as np

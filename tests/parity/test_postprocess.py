@@ -1,9 +1,10 @@
-"""The golden post-processing (tests/data/golden, c_postprocess): instances, ids, paths and boxes of noisy predictions.
+"""The golden post-processing (tests/data/golden, c_postprocess): instances, ids, paths and boxes of
+noisy predictions.
 
-Made by the released functions under numpy 1.23.5, OpenCV 4.7.0, scipy 1.10.1 and torch 2.13 on the CPU
-(tests/data/golden/README.md); the rules are docs/released_code.md, Post-processing. Every cell and number equal.
-The golden's maps lie as the released code has them; each case also runs turned to the devkit's orientation and to
-FIERY's, and must give the same, turned.
+Made by the released functions under numpy 1.23.5, OpenCV 4.7.0, scipy 1.10.1 and torch 2.13 on the
+CPU (tests/data/golden/README.md); the rules are docs/released_code.md, Post-processing. Every cell
+and number equal. The golden's maps lie as the released code has them; each case also runs turned to
+the devkit's orientation and to FIERY's, and must give the same, turned.
 """
 
 import numpy as np

@@ -1,10 +1,13 @@
-"""The golden scenes (tests/data/golden, a_labels) up to what the accident evaluation takes for truth.
+"""The golden scenes (tests/data/golden, a_labels) up to what the accident evaluation takes for
+truth.
 
-The released evaluation reads its labels as though a model had predicted them (docs/released_code.md, Accidents):
-from boxes to labels to instances to boxes along their paths. a_labels holds what comes out (`e2e_*`: the accident
-post-processing of the labels at the present, with bilinear centres, cut to the frames that are recorded). Made by the
-released functions under numpy 1.23.5, OpenCV 4.7.0 and torch 2.13 (tests/data/golden/README.md). The input is our own
-labels from the boxes on: the stored float16 centres would make other plateaus. Every cell and number equal.
+The released evaluation reads its labels as though a model had predicted them
+(docs/released_code.md, Accidents): from boxes to labels to instances to boxes along their paths.
+a_labels holds what comes out (`e2e_*`: the accident post-processing of the labels at the present,
+with bilinear centres, cut to the frames that are recorded). Made by the released functions under
+numpy 1.23.5, OpenCV 4.7.0 and torch 2.13 (tests/data/golden/README.md). The input is our own
+labels from the boxes on: the stored float16 centres would make other plateaus. Every cell and
+    number equal.
 """
 
 from dataclasses import replace

@@ -1,7 +1,8 @@
-"""The released infos against those that the released converter made of the same release, key by key.
+"""The released infos against those that the released converter made of the same release, key by
+key.
 
-Made by the converter itself, unpatched (tests/data/golden/exports/README.md); the keys are docs/exports.md, The
-released code.
+Made by the converter itself, unpatched (tests/data/golden/exports/README.md); the keys are
+docs/exports.md, The released code.
 """
 
 import json

@@ -1,7 +1,9 @@
 """The golden numbers of safety (tests/data/golden/safety), within the tolerances of its README.
 
-Surrogate measures of pairs: brute force, shapely and closed forms in plain code; `library` is what SSMsOnPlane gave.
-Replays under braking: a program of its own, sampled at 1 ms, checked by a second one, plain loops with shapely. Lead
+Surrogate measures of pairs: brute force, shapely and closed forms in plain code; `library` is what
+    SSMsOnPlane gave.
+Replays under braking: a program of its own, sampled at 1 ms, checked by a second one, plain loops
+    with shapely. Lead
 times, Shapley values (means over the 24 orders) and the cost of false alarms: plain code.
 """
 
@@ -161,7 +163,9 @@ def test_every_expected_field_is_compared(surrogates: Mapping[str, Any]) -> None
 
 
 def test_the_time_of_the_least_distance_where_there_is_one(surrogates: Mapping[str, Any]) -> None:
-    """Where a side passes along the other's corner, the gap stays the least for a while: any of these times will do."""
+    """Where a side passes along the other's corner, the gap stays the least for a while: any of
+    these times will do.
+    """
     i, j = side_of(surrogates, "i"), side_of(surrogates, "j")
     expected, least = (
         numbers(surrogates["expected"][name]) for name in ("t_min_distance", "min_distance_20s")

@@ -1,8 +1,9 @@
-"""The golden paths (tests/data/golden, d_accident): continued, paired with the true ones, and how far they are apart.
+"""The golden paths (tests/data/golden, d_accident): continued, paired with the true ones, and how
+far they are apart.
 
-Made by the released functions under numpy 1.23.5, `*_stable_sort` with a stable sort (tests/data/golden/README.md;
-docs/released_code.md, Paths). Points are [column, row] in cells of 0.5 m. Points, pairs, their order and costs equal;
-the sums of `eval_metrics` to 1e-9.
+Made by the released functions under numpy 1.23.5, `*_stable_sort` with a stable sort
+(tests/data/golden/README.md; docs/released_code.md, Paths). Points are [column, row] in cells of
+0.5 m. Points, pairs, their order and costs equal; the sums of `eval_metrics` to 1e-9.
 """
 
 from collections.abc import Mapping

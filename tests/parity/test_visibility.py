@@ -1,4 +1,5 @@
-"""The golden visibility (tests/data/golden: f_visibility, and a_labels for the accident's): who counts as seen. Exact.
+"""The golden visibility (tests/data/golden: f_visibility, and a_labels for the accident's): who
+counts as seen. Exact.
 
 Made by the released functions under numpy 1.23.5 (tests/data/golden/README.md); the rules are
 docs/released_code.md, Visibility and attributes.
@@ -68,7 +69,9 @@ def test_another_handedness_sees_the_same(golden) -> None:
 
 @pytest.mark.golden_cases("a_labels", "scenes")
 def test_accident_visibility_equals_the_released_codes(golden) -> None:
-    """The rule over three moments; the last of them also from what the scene's agent sees (frame 0 is the present)."""
+    """The rule over three moments; the last of them also from what the scene's agent sees (frame 0
+    is the present).
+    """
     scene, agent = golden.entry, AGENTS.index(golden.entry["agent"])
     _, first, _, second, _ = scene["meta"][0].split()
     with np.load(golden.folder / f"a_labels_{golden.index:02d}.npz") as arrays:

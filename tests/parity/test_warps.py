@@ -1,8 +1,10 @@
-"""The golden warps (tests/data/golden: a_labels, g_poses, h_fiery): to the present, from the past and other agents.
+"""The golden warps (tests/data/golden: a_labels, g_poses, h_fiery): to the present, from the past
+and other agents.
 
-Made by the released functions and by FIERY's own under torch 2.13 (tests/data/golden/README.md); the rules are
-docs/released_code.md, Warps, and FIERY's own labels. No cell of a nearest warp of labels may differ; a dense field may
-in 10 cells of 80,000, a bilinear warp in 1.5 % of the cells that are not zero, by one step of float16 or 3e-4.
+Made by the released functions and by FIERY's own under torch 2.13 (tests/data/golden/README.md);
+the rules are docs/released_code.md, Warps, and FIERY's own labels. No cell of a nearest warp of
+labels may differ; a dense field may in 10 cells of 80,000, a bilinear warp in 1.5 % of the cells
+that are not zero, by one step of float16 or 3e-4.
 """
 
 import json
@@ -76,7 +78,9 @@ def test_standing_still_samples_as_the_released_code(golden_row, mode) -> None:
 
 @pytest.mark.golden_rows("g_poses", "identity_warp_nearest")
 def test_sample_points_equal_the_released_codes(golden_row) -> None:
-    """To the last bit: points are where M leads, and with M = 1, in units of half the grid, where they stand."""
+    """To the last bit: points are where M leads, and with M = 1, in units of half the grid, where
+    they stand.
+    """
     expected = whole(golden_row)["bev_grid_x"]
     steps = (expected / np.float32(50) + np.float32(1)) * np.float32(99.5)
     row, column = sample_points(np.eye(4), RELEASED, PROTOCOL)
@@ -183,7 +187,9 @@ def record(
 
 
 def augmentation_of(matrix: np.ndarray | None) -> Augmentation | None:
-    """What makes the left-handed matrix that the released code drew; A = flip · scale · rotation."""
+    """What makes the left-handed matrix that the released code drew; A = flip · scale ·
+    rotation.
+    """
     if matrix is None:
         return None
     given = flip_pose(matrix)
@@ -206,7 +212,9 @@ def released(labels: MotionLabels, name: str) -> np.ndarray:
 
 
 def centres_of(instance: np.ndarray, offset: np.ndarray) -> np.ndarray:
-    """(T, 1, H, W) float32 centerness of the instances' centres, as docs/released_code.md, Motion labels, has it."""
+    """(T, 1, H, W) float32 centerness of the instances' centres, as docs/released_code.md, Motion
+    labels, has it.
+    """
     rows, columns = np.indices(instance.shape[1:])
     result = np.zeros((len(instance), 1, *instance.shape[1:]), dtype=np.float32)
     for frame, ids in enumerate(instance):

@@ -49,7 +49,9 @@ def point_sets(draw: st.DrawFn) -> list[np.ndarray]:
 
 @st.composite
 def crowds(draw: st.DrawFn, most: int = 6) -> dict[int, list[tuple[float, float]]]:
-    """Cars by actor id that drive straight, so near to one another that many meet, some of them beyond the grid."""
+    """Cars by actor id that drive straight, so near to one another that many meet, some of them
+    beyond the grid.
+    """
     places = st.tuples(st.integers(-24, 24), st.integers(-24, 24))
     cars = {}
     for actor in range(1, 1 + draw(st.integers(0, most))):
@@ -135,7 +137,8 @@ def test_perfect_maps_are_perfect_whatever_their_ids(cars, names) -> None:
         assert (each.position_error, each.time_error) == (
             (0, 0) if each.positives else (None, None)
         )
-    # of equally near pairs that with the lower ids is taken, and the names of the first prediction order otherwise
+    # of equally near pairs that with the lower ids is taken, and the names of the first prediction
+    # order otherwise
     assert made.beside["sample_choice=mean_first"].id_error == (0 if made.positives else None)
 
 

@@ -24,7 +24,9 @@ Sample = tuple[DetectedBoxes, Boxes]
 
 @st.composite
 def samples(draw: st.DrawFn) -> list[Sample]:
-    """A few samples of cars and vans, close together and with equal scores, some beyond the released range."""
+    """A few samples of cars and vans, close together and with equal scores, some beyond the
+    released range.
+    """
     result = []
     for _ in range(draw(st.integers(1, 4))):
         truth, detections = (draw(st.integers(0, 6)) for _ in range(2))
@@ -294,7 +296,9 @@ def test_the_papers_precision_is_nuscenes(drawn: list[Sample]) -> None:
 
 @given(samples(), st.booleans())
 def test_opencoods_precision_is_vocs(drawn: list[Sample], everywhere: bool) -> None:
-    """Detections by score take the truth they overlap most; the area under the envelope, over all rises of recall."""
+    """Detections by score take the truth they overlap most; the area under the envelope, over all
+    rises of recall.
+    """
     result = evaluator_of("opencood", list(enumerate(drawn)), global_sort=everywhere).compute()
     drawn = [reordered(each, by_content) for each in drawn]
     for level, threshold in enumerate((0.3, 0.5, 0.7)):
@@ -328,7 +332,9 @@ def test_opencoods_precision_is_vocs(drawn: list[Sample], everywhere: bool) -> N
 def plain_pass(
     sample: Sample, category: int, threshold: float, least: float | None
 ) -> tuple[int, int, int, list]:
-    """TP, FP, FN, scores of TPs of a sample and class (docs/released_code.md, Detection); no `least`: score pass."""
+    """TP, FP, FN, scores of TPs of a sample and class (docs/released_code.md, Detection); no
+    `least`: score pass.
+    """
     prediction, truth = sample
     center, true_center = (boxes.center.astype(np.float32) for boxes in (prediction.boxes, truth))
     beyond, true_beyond = (

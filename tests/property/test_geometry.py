@@ -1,4 +1,6 @@
-"""Laws of boxes, cameras, point clouds and grids; those of SE3 and of the boxes' motion are in test_se3.py."""
+"""Laws of boxes, cameras, point clouds and grids; those of SE3 and of the boxes' motion are in
+test_se3.py.
+"""
 
 import numpy as np
 import shapely
@@ -20,7 +22,9 @@ from deepaccident_devkit.geometry.bev_grid import ORIENTATIONS, Orientation
 
 
 def plainly_contains(given_boxes: Boxes, given_points: np.ndarray) -> np.ndarray:
-    """The definition: a point's offset along each axis of the box is at most half its size. No window, no grid."""
+    """The definition: a point's offset along each axis of the box is at most half its size. No
+    window, no grid.
+    """
     offset = given_points - given_boxes.center[:, None]
     axes = quaternions.to_matrix(given_boxes.rotation)[:, None]
     along = [

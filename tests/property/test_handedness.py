@@ -79,7 +79,9 @@ def test_clockwise_yaw_becomes_counter_clockwise(raw_yaw: float) -> None:
 def test_six_vector_flips_as_its_pose_does(
     rx: float, ry: float, rz: float, translation: np.ndarray
 ) -> None:
-    """(tx, ty, tz, rx, ry, rz) with R = Rx(rx) Ry(ry) Rz(rz): turning about x and z changes sense, about y not."""
+    """(tx, ty, tz, rx, ry, rz) with R = Rx(rx) Ry(ry) Rz(rz): turning about x and z changes sense,
+    about y not.
+    """
 
     def pose_of(six: np.ndarray) -> np.ndarray:
         (cx, cy, cz), (sx, sy, sz) = np.cos(six[3:]), np.sin(six[3:])
@@ -99,7 +101,9 @@ def test_six_vector_flips_as_its_pose_does(
 
 
 def carla_matrix(location: np.ndarray, yaw: float, pitch: float, roll: float) -> np.ndarray:
-    """The matrix that CARLA's Transform.get_matrix() returns: left-handed, nose up for a positive pitch."""
+    """The matrix that CARLA's Transform.get_matrix() returns: left-handed, nose up for a positive
+    pitch.
+    """
     cy, sy, cp, sp, cr, sr = (
         np.cos(yaw),
         np.sin(yaw),
@@ -139,7 +143,8 @@ def vehicle_poses() -> st.SearchStrategy[np.ndarray]:
 
 
 LIDAR_TO_EGO = carla_matrix(np.array([0.1, -0.2, 1.94]), 0.12, 0.02, -0.03)
-# front: upper left, upper right, lower right, lower left, then the same behind; y is right, so −1 is left
+# front: upper left, upper right, lower right, lower left, then the same behind; y is right, so −1
+# is left
 RAW_CORNERS = np.array(
     [[x, y, z] for x in (1, -1) for y, z in ((-1, 1), (1, 1), (1, -1), (-1, -1))]
 )

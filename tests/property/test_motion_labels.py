@@ -1,4 +1,6 @@
-"""Laws of motion labels: an id's cells are its box, flow leads to the next frame, orientations hold the same."""
+"""Laws of motion labels: an id's cells are its box, flow leads to the next frame, orientations hold
+the same.
+"""
 
 import numpy as np
 from hypothesis import given
@@ -53,7 +55,9 @@ def labels(frames, motion, orientation="devkit", protocol="clean"):
 
 @given(placed_boxes(), orientations)
 def test_the_cells_of_an_id_are_its_box(box, orientation) -> None:
-    """All cells well inside it, none well beside it: the corners are moved to cells, by less than one each way."""
+    """All cells well inside it, none well beside it: the corners are moved to cells, by less than
+    one each way.
+    """
     made = labels([frame(*box)] * 2, np.zeros((2, 6)), orientation)
     center, size, yaw = box
     across, along = np.moveaxis(made.config.grid.centers() - center[:2], -1, 0)
@@ -82,7 +86,8 @@ def test_flow_leads_to_where_the_box_is_at_the_next_frame(
 ) -> None:
     """In metres, seen from this frame's ego, to the cells' accuracy.
 
-    Each of two centres is off by less than a cell, for the corners are, and rounded; the warp adds half a diagonal.
+    Each of two centres is off by less than a cell, for the corners are, and rounded; the warp adds
+    half a diagonal.
     """
     center, size, yaw = box
     moved = center + np.array([dx, dy, 0])

@@ -1,4 +1,6 @@
-"""Laws of the motion metrics: the arrays do what the plain rules say, whatever ids are called and samples' order."""
+"""Laws of the motion metrics: the arrays do what the plain rules say, whatever ids are called and
+samples' order.
+"""
 
 import math
 from itertools import pairwise
@@ -30,7 +32,9 @@ CONFIG = MotionLabelConfig(grid=GRID, future_frames=2)
 
 @st.composite
 def pairs(draw: st.DrawFn) -> tuple[np.ndarray, np.ndarray]:
-    """Prediction and label; the prediction is the label with some cells changed, so that there are matches."""
+    """Prediction and label; the prediction is the label with some cells changed, so that there are
+    matches.
+    """
     shape = draw(SHAPES)
     label = draw(hnp.arrays(np.int32, shape, elements=IDS, fill=st.just(1)))
     noise = draw(hnp.arrays(np.int32, shape, elements=st.integers(0, 9), fill=st.just(9)))
@@ -49,7 +53,9 @@ def paths(draw: st.DrawFn) -> dict[int, np.ndarray]:
 def plain_vpq(
     prediction: np.ndarray, label: np.ndarray, *, temporally_consistent: bool
 ) -> list[list[float]]:
-    """[iou, tp, fp, fn] of the instances in each frame, as docs/released_code.md, IoU and VPQ, tells it."""
+    """[iou, tp, fp, fn] of the instances in each frame, as docs/released_code.md, IoU and VPQ,
+    tells it.
+    """
     result, partner = [], {}
     for predicted, true in zip(prediction, label, strict=True):
         sums = [0.0, 0, 0, 0]

@@ -1,4 +1,6 @@
-"""Laws of reading instances off a model's maps: the devkit's arrays do what the plain rules say, in any orientation."""
+"""Laws of reading instances off a model's maps: the devkit's arrays do what the plain rules say, in
+any orientation.
+"""
 
 import numpy as np
 import plain_postprocessing as plain

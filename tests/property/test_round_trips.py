@@ -163,7 +163,8 @@ def test_image_within_jpegs_tolerance(scratch: Path, corners: np.ndarray) -> Non
     read = read_image(scratch / "image.jpg")
     assert read.shape == image.shape
     assert read.dtype == np.uint8
-    # chroma is stored at half resolution, so edges of saturated colours are off by more than the middle
+    # chroma is stored at half resolution, so edges of saturated colours are off by more than the
+    # middle
     assert np.abs(read.astype(int) - image).mean() < 4
     assert np.abs(read.astype(int) - image).max() < 40
 

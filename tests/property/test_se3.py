@@ -86,7 +86,9 @@ def test_boxes_come_back(target_from_source: SE3, given_boxes: Boxes) -> None:
 
 @given(boxes(), arrays((30, 3), 1.5))
 def test_points_in_boxes_by_their_own_coordinates(given_boxes: Boxes, unit: np.ndarray) -> None:
-    """Points at a known fraction of a box's half size are in it exactly if all three fractions are below one."""
+    """Points at a known fraction of a box's half size are in it exactly if all three fractions are
+    below one.
+    """
     clear_of_the_faces = np.where(np.abs(np.abs(unit) - 1) < 1e-6, 0.5, unit)
     for index in range(len(given_boxes)):
         box = given_boxes.select([index])

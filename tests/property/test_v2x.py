@@ -1,4 +1,6 @@
-"""Laws of the transforms between agents, over a synthetic release: any agents, moments, frames and points."""
+"""Laws of the transforms between agents, over a synthetic release: any agents, moments, frames and
+points.
+"""
 
 import numpy as np
 from hypothesis import given
@@ -53,7 +55,9 @@ def test_a_world_point_seen_from_five_agents_returns(da: DeepAccident, chain, p_
 def test_points_that_a_label_claims_lie_in_their_box_after_any_chain(
     da: DeepAccident, place, chain
 ) -> None:
-    """Each box holds as many points as its label says, and keeps them wherever both are moved (faces ± 1 mm)."""
+    """Each box holds as many points as its label says, and keeps them wherever both are moved
+    (faces ± 1 mm).
+    """
     sample = sample_of(da, place)
     cloud, boxes = da.load_point_cloud(sample, "lidar").xyz, da.boxes(sample, "lidar")
     boxes = boxes.select(boxes.actor_id != OWN_ACTOR_ID)

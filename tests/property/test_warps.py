@@ -1,4 +1,6 @@
-"""Laws of the warps: standing still changes nothing but the documented blur, and there and back is the way home."""
+"""Laws of the warps: standing still changes nothing but the documented blur, and there and back is
+the way home.
+"""
 
 import numpy as np
 from hypothesis import given
@@ -82,7 +84,9 @@ def test_there_and_back_brings_smooth_maps_home(step) -> None:
 
 @given(st.lists(STEPS, min_size=1, max_size=4), AUGMENTATIONS, RULES)
 def test_past_and_future_undo_each_other(steps, augmentation, rules) -> None:
-    """Of one motion: a past frame's transform is the inverse of the future frame's; augmented or not."""
+    """Of one motion: a past frame's transform is the inverse of the future frame's; augmented or
+    not.
+    """
     for given_one in (None, augmentation):
         forward = present_from_past(steps[:1], rules, given_one)[0]
         backward = present_from_frames([steps[0], steps[0]], rules, given_one)[1]
@@ -99,7 +103,9 @@ def test_exact_chains_are_the_products_of_their_steps(steps) -> None:
 
 @given(STEPS, ORIENTATIONS)
 def test_a_cell_lands_where_its_centre_goes(step, orientation) -> None:
-    """Right-handed metres in, right-handed metres out, in every orientation; a cell's neighbours at most."""
+    """Right-handed metres in, right-handed metres out, in every orientation; a cell's neighbours at
+    most.
+    """
     grid = BevGrid((-20, 20, 0.5), (-20, 20, 0.5), orientation)
     blob = np.linalg.norm(grid.centers() - (3.25, -2.25), axis=-1) < 1.1
     found = agents_to_ego(np.stack([blob] * 2), [[0] * 6, step], grid=grid, protocol="clean")[1]

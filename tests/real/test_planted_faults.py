@@ -1,4 +1,6 @@
-"""Faults planted in a copy of the real scenario: the tolerances that its own rows set hide none of them."""
+"""Faults planted in a copy of the real scenario: the tolerances that its own rows set hide none of
+them.
+"""
 
 import shutil
 from collections.abc import Callable

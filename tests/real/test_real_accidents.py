@@ -1,9 +1,12 @@
 """Two real accidents, of which public repositories tell positions: nothing false is said of them.
 
-The positions lie beside the real scenario, in `real_accident`, whose README says whose they are. A release of labels,
-calib and meta is made of them: of Town03's both colliders at 10 Hz, of Town05's four agents at 1 Hz. Invented are:
-velocities (central differences), points and visibility, roles without an id; of meta the impact, weather, words and
-class; of Town05 the sizes, headings (along the path), and what is between the seconds (lines).
+The positions lie beside the real scenario, in `real_accident`, whose README says whose they are. A
+release of labels,
+calib and meta is made of them: of Town03's both colliders at 10 Hz, of Town05's four agents at 1
+    Hz. Invented are:
+velocities (central differences), points and visibility, roles without an id; of meta the impact,
+weather, words and class; of Town05 the sizes, headings (along the path), and what is between the
+seconds (lines).
 """
 
 from pathlib import Path
@@ -59,7 +62,8 @@ def release(root: Path, token: str, agents: Agents, meta: str) -> DeepAccident:
             velocity = turn * moved[other][frame - 1]
             numbers = (*place[:3], *size, np.angle(turn), velocity.real, velocity.imag)
             rows.append(
-                f"{category} {' '.join(map(str, numbers))} {-100 if other == agent else actor} 20 True"
+                f"{category} {' '.join(map(str, numbers))} "
+                f"{-100 if other == agent else actor} 20 True"
             )
         return [f"{moved[agent][frame - 1].real} {moved[agent][frame - 1].imag}", *rows]
 
@@ -81,7 +85,9 @@ def release(root: Path, token: str, agents: Agents, meta: str) -> DeepAccident:
 def test_a_merge_touches_from_frame_54_and_nothing_false_is_said(
     tracks: Path, tmp_path: Path
 ) -> None:
-    """Town03's scenario 24: they come at 5 m/s; at the last frame, 0.4 m in each other, 2.7 m/s are left."""
+    """Town03's scenario 24: they come at 5 m/s; at the last frame, 0.4 m in each other, 2.7 m/s are
+    left.
+    """
     agents: Agents = {}
     for name, actor, size in (
         ("ego_vehicle", 2675, (4.9742, 2.0384, 1.5421)),
@@ -114,7 +120,8 @@ def test_a_merge_touches_from_frame_54_and_nothing_false_is_said(
     assert 4.5 < found.closing_speed < 5.8
     assert not lacking(
         merge.describe(tiny.TOKEN).text,
-        "the ego, a car at 10.4 m/s, collides with the other vehicle, a car at 8.9 m/s, left side to right",
+        "the ego, a car at 10.4 m/s, collides with the other vehicle, a car at "
+        "8.9 m/s, left side to right",
         "outlines touching from 0.2 s before the last frame (within 0.1 s)",
     )
     check = avoidability(merge, tiny.TOKEN).check
@@ -150,12 +157,15 @@ def test_nothing_false_is_said_of_a_crossing(tracks: Path, tmp_path: Path) -> No
             ("truck", (8.47, 2.89, 3.83)) if "behind" in name else ("car", (4.60, 1.93, 1.52))
         )
         agents[agent] = (actor, category, size, np.column_stack([x, y, 0 * x + size[2] / 2, yaw]))
-    meta = "ClearNoon 4246 truck 4249 truck 9090.520 same front_side 101\n colliding agents: ego_behind other_behind\n"
+    meta = (
+        "ClearNoon 4246 truck 4249 truck 9090.520 same front_side 101\n colliding "
+        "agents: ego_behind other_behind\n"
+    )
     da = release(tmp_path, CROSSING, agents, f"{meta} agents id: {' '.join(map(str, IDS))}\n")
     found = da.collision(CROSSING)
     told = found.actor_ids, found.sides, found.touching, found.disagreements
     assert told == ((4246, 4249), ("front", "right"), 0.1, ())
     assert (
-        "a truck at 0.0 m/s, is hit on its right side by the vehicle behind the ego, a truck at 4.1 m/s, closing at"
-        in da.describe(CROSSING).text
+        "a truck at 0.0 m/s, is hit on its right side by the vehicle behind the ego, "
+        "a truck at 4.1 m/s, closing at" in da.describe(CROSSING).text
     )

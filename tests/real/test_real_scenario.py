@@ -1,4 +1,5 @@
-"""One real scenario: what the format says of the release holds on it, and the devkit reads it without a doubt.
+"""One real scenario: what the format says of the release holds on it, and the devkit reads it
+without a doubt.
 
 Run with `pytest tests/real --real DIR`. Its cameras and clouds are there for some frames alone.
 """
@@ -72,8 +73,8 @@ def test_few_pairs_interact_and_one_of_them_touches(real: DeepAccident) -> None:
     assert pedestrian["category"] == "pedestrian"
     text = real.describe(TOKEN).text
     assert (
-        "meta names no collision in 9.9 s. The outlines of the other vehicle and a pedestrian overlap."
-        in text
+        "meta names no collision in 9.9 s. The outlines of the other vehicle "
+        "and a pedestrian overlap." in text
     )
 
 
@@ -103,7 +104,9 @@ def test_the_preset_fiery_draws_as_fierys_class(real: DeepAccident, filter_invis
 
 
 def test_decoded_velocities_are_the_displacements(real: DeepAccident) -> None:
-    """Within 1 % in the median, for all classes together; taken for world's or the LiDAR's they fit nothing."""
+    """Within 1 % in the median, for all classes together; taken for world's or the LiDAR's they fit
+    nothing.
+    """
     off, raw_off, category = [], [], []
     for sample in real.sample:
         decoded, derived = real.boxes(sample), real.boxes(sample, velocity="derived")
@@ -128,7 +131,9 @@ def test_decoded_velocities_are_the_displacements(real: DeepAccident) -> None:
 
 
 def test_velocities_agree_between_agents(real: DeepAccident) -> None:
-    """One actor, one moment, five agents: the raw pairs differ, the decoded ones do not, unless an agent pitches."""
+    """One actor, one moment, five agents: the raw pairs differ, the decoded ones do not, unless an
+    agent pitches.
+    """
     apart = []
     for frame in real.frame:
         views = [real.boxes(sample) for sample in real.samples_of(frame["token"])]
@@ -222,7 +227,9 @@ def test_all_agents_see_an_actor_in_the_same_place(real: DeepAccident) -> None:
 
 
 def test_the_ground_is_where_all_agents_see_it(real: DeepAccident) -> None:
-    """Heights of the road in the world, of the five agents' clouds, in the cells that two of them share."""
+    """Heights of the road in the world, of the five agents' clouds, in the cells that two of them
+    share.
+    """
     for frame in CLOUD_FRAMES:
         grounds, samples = [], real.samples_of(f"{TOKEN}/{frame:03d}")
         road = np.mean([real.world_from(sample, "ego").translation[2] for sample in samples[:4]])
@@ -242,7 +249,9 @@ def test_the_ground_is_where_all_agents_see_it(real: DeepAccident) -> None:
 
 
 def test_points_fall_on_the_right_pixels(real: DeepAccident) -> None:
-    """Where depth jumps from one LiDAR point to the next, the pictures have vertical edges: there, and not beside."""
+    """Where depth jumps from one LiDAR point to the next, the pictures have vertical edges: there,
+    and not beside.
+    """
     shifts = np.array([-60, -40, -24, -16, -8, 0, 8, 16, 24, 40, 60])
     contrast, edges = np.zeros(len(shifts)), 0
     for frame in IMAGE_FRAMES:
@@ -265,7 +274,9 @@ def test_points_fall_on_the_right_pixels(real: DeepAccident) -> None:
 
 
 def _depth_edges(pixels: np.ndarray, depth: np.ndarray) -> np.ndarray:
-    """(M, 2) pixels of the nearer of two neighbours in a row of points that lie over 2 m behind each other."""
+    """(M, 2) pixels of the nearer of two neighbours in a row of points that lie over 2 m behind
+    each other.
+    """
     row = np.round(pixels[:, 1] / 6)
     order = np.lexsort((pixels[:, 0], row))
     pixels, depth, row = pixels[order], depth[order], row[order]
@@ -357,7 +368,9 @@ def test_it_can_be_drawn(real: DeepAccident, tmp_path: Path, view: str, token: s
 
 
 def test_it_can_be_exported_to_mcap(real: DeepAccident, tmp_path: Path) -> None:
-    """Of frame 51 all clouds and the pole's images are there; what is not there is left out and told."""
+    """Of frame 51 all clouds and the pole's images are there; what is not there is left out and
+    told.
+    """
     mcap_reading = pytest.importorskip("mcap_reading")
     out, index = tmp_path / "real.mcap", str(real.tables_folder.parents[1])
     arguments = [

@@ -1,4 +1,5 @@
-"""Tests of the extra `nuscenes`, with PyTorch: not collected without them, unless DEEPACCIDENT_REQUIRE_NUSCENES is set.
+"""Tests of the extra `nuscenes`, with PyTorch: not collected without them, unless
+DEEPACCIDENT_REQUIRE_NUSCENES is set.
 
 nuScenes' devkit needs numpy 1.26, so that this folder has an environment of its own (.ci/run).
 """
@@ -62,7 +63,9 @@ def pair(
 
 @pytest.fixture(scope="session")
 def made(tmp_path_factory: pytest.TempPathFactory) -> DeepAccident:
-    """Accidents and their twins of 31 frames: each fifth one, from the first to the last, is a keyframe."""
+    """Accidents and their twins of 31 frames: each fifth one, from the first to the last, is a
+    keyframe.
+    """
     config = SynthConfig(
         scenarios=8,
         frames=31,

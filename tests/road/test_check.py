@@ -1,4 +1,6 @@
-"""A source whose axes, ground or cameras are wrong is refused, by the mistake's name, before anything is trained."""
+"""A source whose axes, ground or cameras are wrong is refused, by the mistake's name, before
+anything is trained.
+"""
 
 from pathlib import Path
 

@@ -31,7 +31,7 @@ def trained(pair, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("runs")
     both = ["--also", pair.folder, "--mix", "0.5", "--focal", "100", "--agents", "single"]
     run("train", pair.release.dataroot, *TRAIN, *both, "--out", folder / "both")
-    run("train", pair.folder, *TRAIN, "--focal", "100", "--agents", "single", "--from", folder / "both",
+    run("train", pair.folder, *TRAIN, "--focal", "100", "--agents", "single", "--from", folder / "both",  # noqa: E501
         "--out", folder / "road")  # fmt: skip
     return folder
 
@@ -52,7 +52,7 @@ def test_the_road_is_predicted_and_evaluated_by_its_rules(
     pair, trained: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "results"
-    told = run("predict", trained / "road", pair.folder, "--agents", "single", "--samples", "all", "--split", "val",
+    told = run("predict", trained / "road", pair.folder, "--agents", "single", "--samples", "all", "--split", "val",  # noqa: E501
                "--out", out)  # fmt: skip
     assert str(out / NUSCENES_RESULTS_FILE) in told
     fiery = ["--split", "val", "--samples", "all", "--switch", "labels=fiery"]

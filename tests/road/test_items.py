@@ -1,4 +1,6 @@
-"""Items of nuScenes' format, through the real nuScenes devkit, are those of the release that it was exported from."""
+"""Items of nuScenes' format, through the real nuScenes devkit, are those of the release that it was
+exported from.
+"""
 
 import numpy as np
 import pytest
@@ -45,7 +47,9 @@ def test_items_of_keyframes_are_the_releases(pair) -> None:
 
 
 def test_poses_of_sensors_are_those_of_the_tables(pair) -> None:
-    """The release's calib files jitter by 1e-5; nuScenes has one row a sensor, as `calibrated_sensor` has."""
+    """The release's calib files jitter by 1e-5; nuScenes has one row a sensor, as
+    `calibrated_sensor` has.
+    """
     for token in keys(pair):
         for channel in (*CAMERAS, LIDAR):
             row = pair.release.get("sample_data", f"{pair.ours[token]}/{channel}")[
@@ -85,7 +89,9 @@ def test_actors_are_the_same_and_untracked_ones_get_an_id(pair) -> None:
 
 
 def test_labels_are_fierys_cell_by_cell(pair) -> None:
-    """Those of the release by FIERY's rules, which equal FIERY's own (tests/parity/test_fiery.py)."""
+    """Those of the release by FIERY's rules, which equal FIERY's own
+    (tests/parity/test_fiery.py).
+    """
     for token in keys(pair):
         mine, theirs = (motion_labels(each, of, "fiery") for each, of in (
             (pair.road, token), (pair.release, pair.ours[token])

@@ -1,4 +1,6 @@
-"""Each public name and argument of the installed nuScenes devkit is here, or an error says what to use."""
+"""Each public name and argument of the installed nuScenes devkit is here, or an error says what to
+use.
+"""
 
 import ast
 import inspect

@@ -1,4 +1,6 @@
-"""A nuScenes dataroot is opened as a release that says what the nuScenes devkit says, from tables that are kept."""
+"""A nuScenes dataroot is opened as a release that says what the nuScenes devkit says, from tables
+that are kept.
+"""
 
 import pickle
 import shutil

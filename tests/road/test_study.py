@@ -1,4 +1,6 @@
-"""A study on a stand-in for the road: releases in nuScenes' format, models of two sources, and no accidents."""
+"""A study on a stand-in for the road: releases in nuScenes' format, models of two sources, and no
+accidents.
+"""
 
 import json
 from pathlib import Path

@@ -1,6 +1,8 @@
-"""Tests of the extra `torch`: not collected where it is not installed, unless DEEPACCIDENT_REQUIRE_TORCH is set.
+"""Tests of the extra `torch`: not collected where it is not installed, unless
+DEEPACCIDENT_REQUIRE_TORCH is set.
 
-(The folder cannot be called `torch`: the tests' folder is on the path, so that it would be found in torch's place.)
+(The folder cannot be called `torch`: the tests' folder is on the path, so that it would be found in
+torch's place.)
 """
 
 import importlib.util

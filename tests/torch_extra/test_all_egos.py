@@ -72,7 +72,9 @@ def test_a_batch_lists_the_egos_of_all_moments(da: DeepAccident, moment: list[st
 def test_absent_agents_are_neither_egos_nor_partners(
     da_partial: DeepAccident, moment: list[str]
 ) -> None:
-    """The release has no other_vehicle_behind, and lacks the ego's front camera, which may be skipped for others."""
+    """The release has no other_vehicle_behind, and lacks the ego's front camera, which may be
+    skipped for others.
+    """
     there = [token for token in moment if "other_vehicle_behind" not in token]
     config = V2XConfig(agents="available", points=False, on_missing="skip", **CONFIG)
     whole, first = (

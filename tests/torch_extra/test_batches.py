@@ -109,7 +109,9 @@ def test_agents_that_a_partial_release_lacks(own_release: Path) -> None:
 def test_a_loader_without_collate_fn_batches_as_collate_does(
     da: DeepAccident, sample: str, start: str | None
 ) -> None:
-    """The registry of torch's own collation; the items differ in boxes and points, which torch could not stack."""
+    """The registry of torch's own collation; the items differ in boxes and points, which torch
+    could not stack.
+    """
     partner = sample.replace("ego_vehicle", "infrastructure")
     data = V2XDataset(da, [sample, partner], V2XConfig(agents="all"))
     assert len(data[0]["boxes"]) != len(data[1]["boxes"])
@@ -122,11 +124,16 @@ def test_a_loader_without_collate_fn_batches_as_collate_does(
 def test_skipped_files_are_as_if_they_had_not_arrived(
     da: DeepAccident, da_partial: DeepAccident, sample: str
 ) -> None:
-    """The pole has no LiDAR, and the ego no front camera: with the pole, images are of the other vehicles."""
+    """The pole has no LiDAR, and the ego no front camera: with the pole, images are of the other
+    vehicles.
+    """
     both = {"agents": ["ego_vehicle", "other_vehicle", "infrastructure"], "past": 2, "step": 1}
     images = V2XConfig(**both, on_missing="skip", points=False, images=ImageConfig())
     skip = "infrastructure.*no such file; .* with on_missing='skip'"
-    own = f"Camera_Front.*no such file; {sample} lacks 1 of the 6 .*cannot be skipped.*sensors=.'Camera_Front'"
+    own = (
+        f"Camera_Front.*no such file; {sample} lacks 1 of the 6 .*cannot be "
+        f"skipped.*sensors=.'Camera_Front'"
+    )
     assert_refused(
         (lambda: V2XDataset(da_partial, [sample], V2XConfig(**both))[0], MissingFileError, skip),
         *[
@@ -233,7 +240,9 @@ def test_a_dataset_pickles_cheaply(da: DeepAccident) -> None:
 def test_the_documented_training_loop_learns(
     da: DeepAccident, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The code of docs/training.md as it stands there; the session's release takes the place of its own."""
+    """The code of docs/training.md as it stands there; the session's release takes the place of its
+    own.
+    """
     page = Path(__file__).parents[2] / "docs" / "training.md"
     blocks = re.findall(r"```(python|bash)\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
     (tmp_path / "training_release").symlink_to(da.dataroot)

@@ -1,4 +1,6 @@
-"""torch tensors wherever the devkit takes arrays: read where numpy can, else refused with the remedy."""
+"""torch tensors wherever the devkit takes arrays: read where numpy can, else refused with the
+remedy.
+"""
 
 from collections.abc import Callable
 from functools import partial

@@ -187,7 +187,10 @@ def test_items_are_counted_as_a_sequences(da: DeepAccident, tokens: list[str]) -
 
 
 def test_samples_that_cannot_be(da: DeepAccident, tokens: list[str]) -> None:
-    one_alone = r"tokens: expected a list of samples, such as da\.training_samples\('train'\) or \[sample\], found"
+    one_alone = (
+        r"tokens: expected a list of samples, such as "
+        r"da\.training_samples\('train'\) or \[sample\], found"
+    )
     beyond = V2XConfig(images=ImageConfig(crop=(30, 0, 10, 64)))
     assert_refused(
         (lambda: V2XDataset(da, ["nowhere"]), TokenError, "nowhere"),

@@ -1,4 +1,6 @@
-"""The facade's late-bound functions: fetched when they are asked for, and the same as in their packages."""
+"""The facade's late-bound functions: fetched when they are asked for, and the same as in their
+packages.
+"""
 
 import inspect
 import subprocess
@@ -55,7 +57,10 @@ HEAVY = [
     [("find", set()), ("transform", set()), ("motion_labels", {"deepaccident_devkit.motion"})],
 )
 def test_what_is_asked_for_brings_its_own_package_alone(used: str, imported: set[str]) -> None:
-    code = f"import sys; from deepaccident_devkit import DeepAccident; DeepAccident.{used}; print(*sys.modules)"
+    code = (
+        f"import sys; from deepaccident_devkit import DeepAccident; "
+        f"DeepAccident.{used}; print(*sys.modules)"
+    )
     light = ("cv2", "scipy", "shapely") if imported else ()  # what that package itself may need
     assert {*run(code).split()} & {*HEAVY} - {*light} == imported
 

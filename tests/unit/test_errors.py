@@ -1,4 +1,6 @@
-"""The devkit's errors: their messages are short, fit for a terminal, and the same on the far side of a process."""
+"""The devkit's errors: their messages are short, fit for a terminal, and the same on the far side
+of a process.
+"""
 
 import io
 import pickle

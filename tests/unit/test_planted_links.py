@@ -199,7 +199,9 @@ ATTACKS = {
 def test_a_journal_removes_nothing_outside(
     small: DeepAccident, tmp_path: Path, attack: str, of_another: bool
 ) -> None:
-    """Its lines are paths of which an unfinished export removes those that it does not write again."""
+    """Its lines are paths of which an unfinished export removes those that it does not write
+    again.
+    """
     half_an_export(small, tmp_path)
     out, outside, line = tmp_path / EXPORT, tmp_path / "outside", ATTACKS[attack]
     outside.mkdir()

@@ -28,7 +28,7 @@ GRID = BevGrid((-4.0, 4.0, 0.5), (-3.0, 3.0, 0.25))
 
 def heads() -> MotionHeads:
     return MotionHeads(**{name: np.zeros((5, axes, *GRID.shape)) for name, axes in
-                          (("segmentation", 2), ("centerness", 1), ("offset", 2), ("flow", 2))})  # fmt: skip
+                          (("segmentation", 2), ("centerness", 1), ("offset", 2), ("flow", 2))})  # fmt: skip  # noqa: E501
 
 
 def labels(**changes: Any) -> MotionLabels:
@@ -74,8 +74,9 @@ TEXTS = {
         protocol=LABEL_PROTOCOLS["clean"]
     ).to_present(),
     f"{START}own protocol, each frame in its own ego frame)": lambda: labels(protocol=MINE),
-    "DetectedBoxes(boxes=Boxes(2 in Camera_Front_Left: 1 car, 1 truck), scores=(2,) float64)": lambda: (
-        DetectedBoxes(boxes=boxes()[:2], scores=np.array([0.5, 0.25]))
+    "DetectedBoxes(boxes=Boxes(2 in Camera_Front_Left: 1 car, 1 "
+    "truck), scores=(2,) float64)": lambda: DetectedBoxes(
+        boxes=boxes()[:2], scores=np.array([0.5, 0.25])
     ),
     "Accident(positions=(2, 2) float64, time=1.5, score=1, ids=(3, 7))": lambda: Accident(
         positions=np.zeros((2, 2)), time=1.5, ids=(3, 7)

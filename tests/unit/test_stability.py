@@ -1,4 +1,6 @@
-"""What is public is what docs/public_names.json lists; the page on what stays has the versions there are."""
+"""What is public is what docs/public_names.json lists; the page on what stays has the versions
+there are.
+"""
 
 import ast
 import json
@@ -23,7 +25,7 @@ CHANGED = """what is public is no longer what docs/public_names.json says:
 {}
 
 Was that wanted? docs/stability.md says which version may do it. Write it into CHANGELOG.md, with what to use instead,
-and run: python docs/make_public_names.py"""
+and run: python docs/make_public_names.py"""  # noqa: E501
 OLD = {
     "rooms": {
         "geometry": {
@@ -69,7 +71,10 @@ def test_a_change_is_named(script: ModuleType) -> None:
         "removed: geometry: gone",
         "added: geometry: came",
         "changed: deepaccident info\n    was DATAROOT --json\n    is  DATAROOT --json --out",
-        "changed: geometry.area, of daily use\n    was in docs/reading.md\n    is  in docs/safety.md",
+        (
+            "changed: geometry.area, of daily use\n    was in docs/reading.md\n  "
+            "  is  in docs/safety.md"
+        ),
         f"changed: geometry: area\n    was {was}\n    is  {now}",
     ]
 

@@ -1,5 +1,6 @@
-"""The campaign: files that strangers changed, processes that are killed, disks that are full. Nothing may go wrong.
+"""The campaign: files that strangers changed, processes that are killed, disks that are full.
+Nothing may go wrong.
 
-`PYTHONPATH=.ci/tools python -m campaign` from the top of the checkout runs all of it and writes its numbers
-into docs/validation.md.
+`PYTHONPATH=.ci/tools python -m campaign` from the top of the checkout runs all of it and writes its
+numbers into docs/validation.md.
 """

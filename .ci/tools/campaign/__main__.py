@@ -1,4 +1,6 @@
-"""`PYTHONPATH=.ci/tools python -m campaign`: all cases and stops; its numbers go into docs/validation.md."""
+"""`PYTHONPATH=.ci/tools python -m campaign`: all cases and stops; its numbers go into
+docs/validation.md.
+"""
 
 import sys
 import tempfile

@@ -1,4 +1,5 @@
-"""The healthy files that cases change: small releases, an index, results, a bundle, labels, exports, nuScenes.
+"""The healthy files that cases change: small releases, an index, results, a bundle, labels,
+exports, nuScenes.
 
 With PyTorch also files of weights and a run of training.
 """

@@ -42,7 +42,8 @@ class Action:
 
     Attributes:
         read: does it.
-        judge: what is wrong with what was read, None if nothing; it is asked only if something was read.
+        judge: what is wrong with what was read, None if nothing; it is asked only if something was
+            read.
     """
 
     read: Read

@@ -1,4 +1,5 @@
-"""Kinds of files: where the healthy ones lie, how a user reads them, and when what was read is wrong.
+"""Kinds of files: where the healthy ones lie, how a user reads them, and when what was read is
+wrong.
 
 `KINDS` has those of `other_kinds`, `road_kinds` and `weights_kinds` too.
 """
@@ -329,7 +330,9 @@ def _judge_spec(room: Room, read: Part) -> str | None:
 
 
 def _part_fault(part: Part, said: Any, path: str) -> str | None:
-    """The first value that differs; keys of a file have their field's name, `from` alone another one."""
+    """The first value that differs; keys of a file have their field's name, `from` alone another
+    one.
+    """
     for name, choice in part.fields.items():
         value = next(
             said[key]

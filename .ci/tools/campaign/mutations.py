@@ -1,4 +1,6 @@
-"""What strangers do to a file: bytes, numbers, types, bombs, links and names; the same with the same seed."""
+"""What strangers do to a file: bytes, numbers, types, bombs, links and names; the same with the
+same seed.
+"""
 
 import io
 import json
@@ -63,7 +65,8 @@ class Mutation:
         name: of the mutation.
         group: one of `GROUPS`.
         forms: the forms of files that it is made for.
-        apply: changes the file at a path. Files are hard links: it replaces them, and never writes into one.
+        apply: changes the file at a path. Files are hard links: it replaces them, and never writes
+            into one.
     """
 
     name: str
@@ -89,7 +92,9 @@ def by_path(
 
 
 def by_content(group: str, *forms: str) -> Callable[[Change], Change]:
-    """Enter a function of the file's bytes; for files of some forms, of those before the seal of a store's record."""
+    """Enter a function of the file's bytes; for files of some forms, of those before the seal of a
+    store's record.
+    """
 
     def enter(change: Change) -> Change:
         def apply(path: Path, rng: Rng) -> None:
@@ -901,7 +906,9 @@ def _header(member: bytes, pattern: bytes, text: bytes) -> bytes:
 def packed(
     members: dict[str, bytes], way: int, last: tuple[str, bytes, int, int] | None = None
 ) -> bytes:
-    """An archive; the last member may be given as it is stored: name, deflated bytes, checksum and size."""
+    """An archive; the last member may be given as it is stored: name, deflated bytes, checksum and
+    size.
+    """
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", way) as archive:
         for name, member in members.items():

@@ -1,4 +1,6 @@
-"""Kinds of files beside releases and results: of exports, questions and caches; a scheduler's address; zips."""
+"""Kinds of files beside releases and results: of exports, questions and caches; a scheduler's
+address; zips.
+"""
 
 import json
 from collections.abc import Mapping
@@ -41,7 +43,8 @@ def _export(room: Room) -> Path:
 
 
 def _judge_exported(room: Room, read: Mapping[str, bytes]) -> str | None:
-    """The manifest tells of the settings and the scenarios, and files of a whole export have its bytes.
+    """The manifest tells of the settings and the scenarios, and files of a whole export have its
+    bytes.
 
     Which of them are there is not compared: records say that a unit is done, and are believed.
     """
@@ -162,7 +165,9 @@ def _validated_zip(room: Room) -> list[str]:
 
 
 def _judge_findings(room: Room, sentences: list[str]) -> str | None:
-    """`validate` tells of an archive that cannot be read, or of a member whose checksum is another."""
+    """`validate` tells of an archive that cannot be read, or of a member whose checksum is
+    another.
+    """
     if long := next((each for each in sentences if len(each) > 2000), None):
         return f"a sentence of {len(long)} characters"
     if any(room.victim.name in each for each in sentences):

@@ -174,7 +174,9 @@ _MANY = 3_000
 
 
 def _recipe(content: bytes) -> Any:
-    """The tree of a recipe, and all places of values in it: what they are inside of, and their key."""
+    """The tree of a recipe, and all places of values in it: what they are inside of, and their
+    key.
+    """
     tree = yaml.safe_load(content)
     places = [
         (inside, key)
@@ -584,7 +586,9 @@ def member_of_another_method(path: Path, rng: Rng) -> None:
 
 @by_content("types", "zip", "pt")
 def directory_entry_that_lies(content: bytes, rng: Rng) -> bytes:
-    """Flags (encrypted), method, checksum, sizes, or the place of a member are others: overlapping, beyond, zip64."""
+    """Flags (encrypted), method, checksum, sizes, or the place of a member are others: overlapping,
+    beyond, zip64.
+    """
     offset, form = any_of(
         rng,
         (

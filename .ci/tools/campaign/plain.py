@@ -1,4 +1,6 @@
-"""Plain readers of the same files: what stands in them by Python, numpy and Pillow alone, without the devkit."""
+"""Plain readers of the same files: what stands in them by Python, numpy and Pillow alone, without
+the devkit.
+"""
 
 import io
 import json
@@ -27,7 +29,9 @@ _ALLOWED = {
 
 
 def label(path: Path) -> tuple[tuple[float, ...], list[tuple[Any, ...]]]:
-    """The first line's speed, and the 13 fields of each box; a line with one word or none counts for nothing."""
+    """The first line's speed, and the 13 fields of each box; a line with one word or none counts
+    for nothing.
+    """
     content = path.read_bytes().removeprefix(b"\xef\xbb\xbf").decode()
     words = [line.split() for line in content.replace("\r\n", "\n").replace("\r", "\n").split("\n")]
     head, *rows = [line for line in words if len(line) > 1]
@@ -102,7 +106,9 @@ def yaml_file(path: Path) -> Any:
 
 
 def cached_image(path: Path, agent: int, camera: int, height: int, width: int) -> np.ndarray:
-    """The pixels (height, width, 3) of the first frame of an agent, of a file of uncompressed cached images."""
+    """The pixels (height, width, 3) of the first frame of an agent, of a file of uncompressed
+    cached images.
+    """
     content = path.read_bytes()
     assert content[:8] == b"DAimages"
     rows, cameras = np.frombuffer(content, "<i8", 2, offset=8).tolist()
@@ -116,7 +122,8 @@ def cached_image(path: Path, agent: int, camera: int, height: int, width: int) -
 
 
 def members(archive: Path) -> dict[str, tuple[bytes, bool]]:
-    """Path in a release → the bytes of an archive's member, and whether its checksum is right; empty if none come out.
+    """Path in a release → the bytes of an archive's member, and whether its checksum is right;
+    empty if none come out.
 
     Which folders lead to the release does not matter, nor what the member's own head says.
     """
@@ -165,7 +172,8 @@ _NUMPY = {
 
 
 Flat = tuple[tuple[int, ...], np.ndarray]
-"""The shape of a tensor, and its numbers one after the other: numpy has no more than 64 dimensions."""
+"""The shape of a tensor, and its numbers one after the other: numpy has no more than 64 dimensions.
+"""
 
 
 def safetensors(path: Path) -> tuple[dict[str, Flat], dict[str, Any]]:
@@ -184,7 +192,9 @@ def safetensors(path: Path) -> tuple[dict[str, Flat], dict[str, Any]]:
 
 
 def checkpoint(path: Path) -> dict[str, Flat]:
-    """The tensors of a checkpoint, by PyTorch itself, which runs no code of it; numpy's numbers may be beside them."""
+    """The tensors of a checkpoint, by PyTorch itself, which runs no code of it; numpy's numbers may
+    be beside them.
+    """
     import torch
 
     numpy = (

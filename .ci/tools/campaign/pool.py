@@ -31,8 +31,8 @@ _TOP = _TOOLS.parents[1]
 def drawn(count: int, seed: int, kinds: Collection[str] = tuple(KINDS)) -> list[Case]:
     """So many cases of each kind: groups of mutations by turns, the mutation of a group by chance.
 
-    A kind has a seed of its own, so that a new kind changes nothing of the others. Kinds that need a package which is
-    not there are left out.
+    A kind has a seed of its own, so that a new kind changes nothing of the others. Kinds that need
+    a package which is not there are left out.
     """
     return [
         case

@@ -38,7 +38,9 @@ _KEYS = {f"{number:03d}" for number in range(1, 100, 5)}
 
 
 def _judge_tables(room: Room, read: Mapping[str, Any]) -> str | None:
-    """What was read of keyframes stands in the tables; rows that no keyframe uses may be anything."""
+    """What was read of keyframes stands in the tables; rows that no keyframe uses may be
+    anything.
+    """
     names = (
         "sample",
         "sample_data",

@@ -1,4 +1,6 @@
-"""What strangers do to nuScenes' tables: rows that lead nowhere or in a circle, twice the same token, odd numbers."""
+"""What strangers do to nuScenes' tables: rows that lead nowhere or in a circle, twice the same
+token, odd numbers.
+"""
 
 import json
 from typing import Any

@@ -1,4 +1,6 @@
-"""Every verb that writes, killed at any moment or on a full disk, then run again: as if nothing had happened."""
+"""Every verb that writes, killed at any moment or on a full disk, then run again: as if nothing had
+happened.
+"""
 
 import json
 import subprocess
@@ -59,17 +61,20 @@ VERBS = (
     Verb("info --statistics", f"info {_RELEASE} --statistics --out {{out}}/statistics"),
     Verb(
         "evaluate",
-        f"evaluate accident {_EVALUATE} --scope accident --horizon 0.5 --protocol boxes --resamples 20 "
+        f"evaluate accident {_EVALUATE} --scope accident --horizon 0.5 "
+        f"--protocol boxes --resamples 20 "
         "--results {home}/results/accident --out {out}/bundle --include-results --overwrite",
     ),
     Verb(
         "evaluate compare",
-        "evaluate compare {home}/bundles/accident {home}/bundles/accident --resamples 20 --out {out}/a.csv "
+        "evaluate compare {home}/bundles/accident {home}/bundles/accident "
+        "--resamples 20 --out {out}/a.csv "
         "--out {out}/a.json --out {out}/a.png",
     ),
     Verb(
         "predict",
-        f"predict constant_velocity {_EVALUATE} --task accident --horizon 0.5 --out {{out}}/predicted",
+        f"predict constant_velocity {_EVALUATE} --task accident --horizon 0.5 "
+        f"--out {{out}}/predicted",
     ),
     Verb(
         "render bev",
@@ -100,13 +105,15 @@ VERBS = (
     ),
     Verb(
         "cache",
-        "cache {home}/sensors --index-dir {home}/index_of_sensors --workers 1 --out {out}/cache --size 30x18 "
+        "cache {home}/sensors --index-dir {home}/index_of_sensors --workers 1 --out "
+        "{out}/cache --size 30x18 "
         "--channels Camera_Front --agents ego_vehicle --where length>=1",
         progress="cache/cache.manifest.json",
     ),
     Verb(
         "results",
-        "results {home}/questions/answers.jsonl --truth {home}/questions/truth.jsonl --out {out}/answered.json",
+        "results {home}/questions/answers.jsonl --truth "
+        "{home}/questions/truth.jsonl --out {out}/answered.json",
     ),
     Verb("safety report", f"safety report {_RELEASE} --replays none --out {{out}}/safety"),
     Verb("explore", f"explore {_RELEASE} --out {{out}}/pages"),
@@ -116,7 +123,9 @@ VERBS = (
 
 @dataclass(frozen=True, slots=True)
 class Stop:
-    """One verb that is stopped once: after a share of its time, or at a share of its largest file."""
+    """One verb that is stopped once: after a share of its time, or at a share of its largest
+    file.
+    """
 
     verb: str
     kind: str
@@ -147,7 +156,9 @@ class _Healthy:
 
 
 def drawn_stops(kills: int, seed: int) -> list[Stop]:
-    """So many kills, the verbs by turns, at moments by chance; and for each verb four sizes of a full disk."""
+    """So many kills, the verbs by turns, at moments by chance; and for each verb four sizes of a
+    full disk.
+    """
     rng = np.random.default_rng(seed)
     moments = [
         Stop(VERBS[number % len(VERBS)].name, "kill", float(rng.uniform(0.0, 1.05)))
@@ -269,7 +280,9 @@ def _told(run: Mapping[str, Any]) -> Iterator[str]:
 def _unwhole(
     found: Mapping[str, bytes], healthy: Mapping[str, bytes], progress: str
 ) -> Iterator[str]:
-    """Files under a final name that are not those of an undisturbed run; what an evaluation resumes from has none."""
+    """Files under a final name that are not those of an undisturbed run; what an evaluation resumes
+    from has none.
+    """
     for name, content in found.items():
         own = any(
             part.startswith(".") or part.endswith(".unfinished") or part == "locks"

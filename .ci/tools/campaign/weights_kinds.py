@@ -48,7 +48,9 @@ def _judge(room: Room, read: Mapping[str, Any]) -> str | None:
 
 
 def _same(read: Mapping[str, Any], said: Mapping[str, Any]) -> str | None:
-    """A tensor that differs from a plain reader's; float16 and the like are widened, and names may lose a beginning."""
+    """A tensor that differs from a plain reader's; float16 and the like are widened, and names may
+    lose a beginning.
+    """
     for name, tensor in read.items():
         names = (name, f"module.{name}", name.removeprefix("img_backbone."))
         there = next((said[each] for each in names if each in said), None)

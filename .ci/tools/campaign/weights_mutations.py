@@ -1,4 +1,6 @@
-"""What strangers do to files of weights: headers, storages, shapes, names, pickles. Some need PyTorch to be made."""
+"""What strangers do to files of weights: headers, storages, shapes, names, pickles. Some need
+PyTorch to be made.
+"""
 
 import io
 import json
@@ -216,7 +218,9 @@ def notes_of_other_values(content: bytes, rng: Rng) -> bytes:
 
 @by_content("bombs", "safetensors")
 def header_of_many_tensors(content: bytes, rng: Rng) -> bytes:
-    """50,000 empty tensors, a deep header, or shapes whose product is huge though no byte is there."""
+    """50,000 empty tensors, a deep header, or shapes whose product is huge though no byte is
+    there.
+    """
     header, data = _header_of(content)
     last = max(each["data_offsets"][1] for name, each in header.items() if name != "__metadata__")
     empty = {"dtype": "F32", "shape": [0], "data_offsets": [last, last]}
@@ -269,7 +273,8 @@ def notes_with_odd_names(content: bytes, rng: Rng) -> bytes:
     return _with_header(header, data)
 
 
-# ---- checkpoints of PyTorch: a pickle of what is where, and storages; in a zip, or one after the other
+# ---- checkpoints of PyTorch: a pickle of what is where, and storages; in a zip, or one after the
+# other
 
 
 @by_path("types", *_TORCH)
@@ -452,7 +457,9 @@ def number_of_a_pickle(content: bytes, rng: Rng) -> bytes:
 
 @by_content("names", *_TORCH)
 def text_of_a_pickle(content: bytes, rng: Rng) -> bytes:
-    """The name of a tensor, of a storage or of a device is another; of a tensor it may have 5 MB."""
+    """The name of a tensor, of a storage or of a device is another; of a tensor it may have 5
+    MB.
+    """
     odd = (
         "",
         "0",
@@ -496,7 +503,9 @@ def global_of_a_pickle(content: bytes, rng: Rng) -> bytes:
 
 @by_content("bombs", "pt")
 def storages_deflated(content: bytes, rng: Rng) -> bytes:
-    """The archive is compressed; perhaps with a storage of 300 MB of zeros, of which a tensor is made."""
+    """The archive is compressed; perhaps with a storage of 300 MB of zeros, of which a tensor is
+    made.
+    """
     members = members_of(content)
     if rng.integers(2):
         name = any_of(rng, [each for each in members if "/data/" in each])

@@ -1,6 +1,7 @@
 """A process that makes workers: `python worker.py` reads a case a line and answers with a line.
 
-Workers are forks of it, so that a new one has everything imported. One lasts until a case ends it: by a crash, by more
+Workers are forks of it, so that a new one has everything imported. One lasts until a case ends it:
+    by a crash, by more
 than `seconds` of the processor's time, or by memory.
 """
 
@@ -69,9 +70,9 @@ class Outcome:
 
     Attributes:
         case: it.
-        verdict: `read`, `refused`, or how it failed: `foreign` exception, `wrong`, `message` (an error of ours that
-            does not name the file, is too long, or has control characters), `memory`, `hang`, `crash`, `code` (a
-            pickle's), `outside` (something was changed there).
+        verdict: `read`, `refused`, or how it failed: `foreign` exception, `wrong`, `message` (an
+            error of ours that does not name the file, is too long, or has control characters),
+            `memory`, `hang`, `crash`, `code` (a pickle's), `outside` (something was changed there).
         detail: a sentence for those who look into it.
         megabytes: peak memory above the healthy run's.
     """
@@ -300,7 +301,9 @@ def _of_error(error: BaseException, room: Room) -> tuple[str, str]:
 
 
 def _made_outside(folder: Path) -> Path:
-    """A new folder outside of what is read and written, with what a careless program would remove."""
+    """A new folder outside of what is read and written, with what a careless program would
+    remove.
+    """
     for aside in (folder, folder.with_name("aside")):
         if aside.is_dir() and not aside.is_symlink():
             shutil.rmtree(aside)

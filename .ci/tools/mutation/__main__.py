@@ -1,4 +1,6 @@
-"""`PYTHONPATH=.ci/tools:tests python -m mutation`: plant mutants in the package, and see which the tests notice."""
+"""`PYTHONPATH=.ci/tools:tests python -m mutation`: plant mutants in the package, and see which the
+tests notice.
+"""
 
 import json
 from collections import Counter
@@ -45,7 +47,9 @@ def main(
     results: Path,
     table: bool,
 ) -> None:
-    """Run what RESULTS does not have yet, and print how many were killed in each area, and what survived."""
+    """Run what RESULTS does not have yet, and print how many were killed in each area, and what
+    survived.
+    """
     pooled = {mutant.key: mutant for seed in seeds for mutant in drawn(count, seed)}
     mutants = [mutant for mutant in pooled.values() if mutant.path.startswith(only or ("",))]
     known = _outcomes(results)
@@ -69,7 +73,10 @@ def _outcomes(results: Path) -> dict[str, str]:
 
 def _table(mutants: list[Mutant], outcomes: dict[str, str]) -> str:
     rows = [
-        "area         killed  timed out  survived  not reached  not planted  to run   killed of those planted"
+        (
+            "area         killed  timed out  survived  not reached  not planted  to run "
+            "  killed of those planted"
+        )
     ]
     for area in (*AREAS, ""):
         inside = [mutant for mutant in mutants if mutant.path.startswith(area)]

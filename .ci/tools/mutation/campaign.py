@@ -1,4 +1,6 @@
-"""The runs: a pytest plugin that runs all tests once and then, for each mutant in a fork, those that may notice it."""
+"""The runs: a pytest plugin that runs all tests once and then, for each mutant in a fork, those
+that may notice it.
+"""
 
 import contextlib
 import functools
@@ -24,24 +26,32 @@ from mutation.planting import plant
 from mutation.sample import PACKAGE, ROOT, fingerprint
 
 TESTS = {
-    "geometry": "unit/geometry property/test_geometry property/test_se3 property/test_handedness parity/test_poses",
+    "geometry": "unit/geometry property/test_geometry property/test_se3 "
+    "property/test_handedness parity/test_poses",
     "motion/reference_arithmetic": "unit/motion property/test_postprocessing property/test_warps "
     "parity/test_accident parity/test_labels parity/test_postprocess parity/test_warps",
-    "motion": "unit/motion property/test_motion_labels property/test_postprocessing property/test_warps "
-    "parity/test_fiery parity/test_labels parity/test_postprocess parity/test_trajectories parity/test_visibility "
+    "motion": "unit/motion property/test_motion_labels "
+    "property/test_postprocessing property/test_warps "
+    "parity/test_fiery parity/test_labels parity/test_postprocess "
+    "parity/test_trajectories parity/test_visibility "
     "parity/test_warps",
     "evaluation/results": "unit/evaluation/results",
     "evaluation/runs": "unit/evaluation/runs test_cli_evaluate",
     "evaluation/__init__": "unit/evaluation/runs",
-    "evaluation": "unit/evaluation property/test_accident property/test_detection property/test_motion_metrics "
-    "parity/test_accident parity/test_anticipation parity/test_attributes parity/test_detection parity/test_motion "
+    "evaluation": "unit/evaluation property/test_accident property/test_detection "
+    "property/test_motion_metrics "
+    "parity/test_accident parity/test_anticipation parity/test_attributes "
+    "parity/test_detection parity/test_motion "
     "parity/test_trajectories",
-    "v2x": "unit/v2x unit/plugins/baselines/test_outlook property/test_v2x parity/test_poses parity/test_visibility",
+    "v2x": "unit/v2x unit/plugins/baselines/test_outlook property/test_v2x "
+    "parity/test_poses parity/test_visibility",
     "selection/splits": "unit/selection/test_splits",
 }
 """The tests of each room, by how their paths begin; besides them its examples in docstrings."""
 _LONGEST = 10.0
-"""Seconds: longer tests do not take part; they start processes of their own, or repeat what shorter ones say."""
+"""Seconds: longer tests do not take part; they start processes of their own, or repeat what shorter
+ones say.
+"""
 _BUDGET = 8.0
 """Seconds of computing for a mutant; on average the tests of one take much less."""
 _PATIENCE = 10
@@ -54,7 +64,9 @@ _SURVIVED, _KILLED, _NOT_PLANTED = 0, 1, 2
 
 @dataclass
 class _Test:
-    """What is known of a test: how long it takes and computes without its fixtures, and which functions it reaches."""
+    """What is known of a test: how long it takes and computes without its fixtures, and which
+    functions it reaches.
+    """
 
     seconds: float = 0.0
     computing: float = 0.0
@@ -90,7 +102,9 @@ class Campaign:
 
     @staticmethod
     def pytest_collection() -> None:
-        """Before the tests' modules are imported: no shrinking, since the first failure is enough."""
+        """Before the tests' modules are imported: no shrinking, since the first failure is
+        enough.
+        """
         from hypothesis import HealthCheck, Phase, settings
 
         parent = settings.get_profile("repeatable")
@@ -148,7 +162,9 @@ class Campaign:
 
     @pytest.hookimpl(wrapper=True)
     def pytest_runtest_call(self, item: pytest.Item) -> Iterator[None]:
-        """Note how long a test takes without its fixtures, and how long it computes, whatever else the machine does."""
+        """Note how long a test takes without its fixtures, and how long it computes, whatever else
+        the machine does.
+        """
         began, before = time.monotonic(), time.process_time()
         try:
             yield
@@ -158,7 +174,9 @@ class Campaign:
                 self._tests[item.nodeid].computing = time.process_time() - before
 
     def _learn(self, items: Sequence[pytest.Item]) -> None:
-        """Run the tests that are not known as they are now, and of the others enough to have the session's fixtures."""
+        """Run the tests that are not known as they are now, and of the others enough to have the
+        session's fixtures.
+        """
         package = "".join(
             path.read_text(encoding="utf-8") for path in sorted(PACKAGE.rglob("*.py"))
         )
@@ -218,7 +236,8 @@ class Campaign:
             cached.cache_clear()
 
     def _chosen(self, mutant: Mutant, names: Iterable[str]) -> list[str]:
-        """The tests of the mutant's room that reach its function or, outside of functions, whoever imports its file.
+        """The tests of the mutant's room that reach its function or, outside of functions, whoever
+        imports its file.
 
         The quickest first, as many as compute for `_BUDGET` seconds.
         """
@@ -240,7 +259,9 @@ class Campaign:
         return found
 
     def _in_fork(self, items: Sequence[pytest.Item], mutant: Mutant | None) -> tuple[str, str]:
-        """How a fork ends that plants a mutant and runs tests until one fails, and which one does."""
+        """How a fork ends that plants a mutant and runs tests until one fails, and which one
+        does.
+        """
         limit = 30 + 4 * sum(self._tests[item.nodeid].computing for item in items)
         reading, writing = os.pipe()
         child = os.fork()

@@ -1,4 +1,6 @@
-"""The mutants of a source: each is one replaced node of its syntax tree, in the order of the text."""
+"""The mutants of a source: each is one replaced node of its syntax tree, in the order of the
+text.
+"""
 
 import ast
 import copy
@@ -156,7 +158,9 @@ def _others(node: ast.AST) -> Iterator[ast.AST]:
 
 
 def _with(node: ast.AST, **fields: object) -> ast.AST:
-    """A node like this one, but for some fields; what lies below is shared, since only one change is made."""
+    """A node like this one, but for some fields; what lies below is shared, since only one change
+    is made.
+    """
     new = copy.copy(node)
     for name, value in fields.items():
         setattr(new, name, value)

@@ -1,8 +1,10 @@
-"""How a mutant gets into a process that has imported the package already, and to whoever holds its functions.
+"""How a mutant gets into a process that has imported the package already, and to whoever holds its
+functions.
 
-The mutant's module is executed once more, aside. Where a function's code or defaults differ from those there are, the
-function that is there gets the new ones; a constant of plain values replaces the old one in all modules that have it by
-that name, and in records such as protocols field by field. What was computed from it on import elsewhere stays.
+The mutant's module is executed once more, aside. Where a function's code or defaults differ from
+those there are, the function that is there gets the new ones; a constant of plain values replaces
+the old one in all modules that have it by that name, and in records such as protocols field by
+field. What was computed from it on import elsewhere stays.
 """
 
 import ast
@@ -58,7 +60,9 @@ def _is_plain(value: Any) -> bool:
 
 
 def _adapt(old: Any, new: Any, home: str) -> bool:
-    """Give something the code, the defaults and the plain values of its new version; whether any differs."""
+    """Give something the code, the defaults and the plain values of its new version; whether any
+    differs.
+    """
     if (
         old is new or type(old).__qualname__ != type(new).__qualname__
     ):  # a record is of its module's own class

@@ -14,9 +14,11 @@ AREAS = ("geometry", "motion", "evaluation", "v2x", "selection/splits.py")
 
 
 def drawn(count: int, seed: int) -> list[Mutant]:
-    """So many mutants of all areas, of each file in proportion to its lines of code, as far as it has as many.
+    """So many mutants of all areas, of each file in proportion to its lines of code, as far as it
+    has as many.
 
-    They come in an order of which every beginning is such a sample too: fewer are the first of more.
+    They come in an order of which every beginning is such a sample too: fewer are the first of
+        more.
     """
     ranked = []
     for area in AREAS:
@@ -50,7 +52,7 @@ def _in_its_line(node: ast.AST, words: str, source: str) -> str:
     if getattr(node, "end_lineno", 0) != getattr(node, "lineno", None):
         return words
     line = source.splitlines()[node.lineno - 1].encode()  # columns are of bytes
-    return f"{line[: node.col_offset].decode().lstrip()}[{words}]{line[node.end_col_offset :].decode()}"
+    return f"{line[: node.col_offset].decode().lstrip()}[{words}]{line[node.end_col_offset :].decode()}"  # noqa: E501
 
 
 def fingerprint(text: str) -> str:
@@ -69,7 +71,9 @@ def lines_of_code(source: str) -> int:
 
 
 def _functions(tree: ast.Module) -> Iterator[tuple[int, int, int]]:
-    """Of the outermost functions, those of classes among them: the first line, that of the body, the last one."""
+    """Of the outermost functions, those of classes among them: the first line, that of the body,
+    the last one.
+    """
     waiting: Sequence[ast.stmt] = tree.body
     while waiting:
         classes = [node for node in waiting if isinstance(node, ast.ClassDef)]

@@ -179,7 +179,10 @@ GROUP.add(
             _of_box(lambda rng: _move(rng, 2.0)),
         ),
         "box_moved_lone": (
-            "A box is 2 m too far to one side at one frame in the middle of the scenario, and no other agent is there.",
+            (
+                "A box is 2 m too far to one side at one frame in the middle of the "
+                "scenario, and no other agent is there."
+            ),
             _lone_moved,
         ),
     },

@@ -75,17 +75,24 @@ GROUP.add(
     {
         "line_removed": (
             (
-                "A near actor that others see too is missing from one agent's label at one frame in the middle of the "
+                "A near actor that others see too is missing from one agent's label "
+                "at one frame in the middle of the "
                 "scenario."
             ),
             of_actor(_remove, in_the_middle, within=NEAR),
         ),
         "line_removed_at_an_end": (
-            "A near actor that others see too is missing from one agent's label at the first or last frame.",
+            (
+                "A near actor that others see too is missing from one agent's label at "
+                "the first or last frame."
+            ),
             of_actor(_remove, _at_an_end, within=NEAR),
         ),
         "line_removed_lone": (
-            "A near actor is missing at one frame in the middle of the scenario, and no other agent is there.",
+            (
+                "A near actor is missing at one frame in the middle of the scenario, and "
+                "no other agent is there."
+            ),
             of_actor(_remove, in_the_middle, lone=True),
         ),
         "actor_removed": (
@@ -235,7 +242,10 @@ GROUP.add(
             of_actor(_set_class(lambda old: "truck" if old == "car" else "car"), once, lone=True),
         ),
         "class_against_size": (
-            "Cars are pedestrians and pedestrians are cars in all labels of all agents; sizes do not change.",
+            (
+                "Cars are pedestrians and pedestrians are cars in all labels of all "
+                "agents; sizes do not change."
+            ),
             _contradict_size,
         ),
         "label_of_next_frame": (
@@ -247,7 +257,10 @@ GROUP.add(
             lambda place, rng: place.one_frame_early(place.moving_agent(rng), "label"),
         ),
         "labels_shifted_on_the_pole": (
-            "All labels of the standing infrastructure are one frame early; the last one is there twice.",
+            (
+                "All labels of the standing infrastructure are one frame early; the "
+                "last one is there twice."
+            ),
             lambda place, _: place.one_frame_early("infrastructure", "label"),
         ),
         "labels_of_two_frames_exchanged": (

@@ -98,7 +98,9 @@ def _rename(place: Place, rng: np.random.Generator) -> None:
 
 
 def _index_of_others(place: Place, rng: np.random.Generator) -> None:
-    """Leave an index that takes a label for the one that it was made from, as if this was written in place."""
+    """Leave an index that takes a label for the one that it was made from, as if this was written
+    in place.
+    """
     index = open_index(find_release(place.root))
     path = place.file(place.any_agent(rng), "label", place.any_frame(rng))
     place.write(path, path.read_bytes() + b"\n")
@@ -138,7 +140,10 @@ GROUP.add(
             _copy_to_val,
         ),
         "type_folder_unpacked_beside": (
-            "An agent's files are in a folder beside the scenario type's, as a second download is unpacked.",
+            (
+                "An agent's files are in a folder beside the scenario type's, as a "
+                "second download is unpacked."
+            ),
             _unpack_beside,
         ),
         "split_line_of_one_word": (
@@ -176,7 +181,8 @@ GROUP.add(
             lambda place, rng: _remove_folders(place, [place.any_agent(rng)], list(FILE_ENDINGS)),
         ),
     },
-    harmless="a partial download: a scenario without one of the agents is valid (docs/format.md, Tree)",
+    harmless="a partial download: a scenario without one of the agents is valid "
+    "(docs/format.md, Tree)",
 )
 GROUP.add(
     {
@@ -194,11 +200,15 @@ GROUP.add(
 GROUP.add(
     {
         "test_labels_removed": (
-            "The scenario is of the test split, as its twin is, and has no labels, no BEV arrays and no meta.",
+            (
+                "The scenario is of the test split, as its twin is, and has no labels, "
+                "no BEV arrays and no meta."
+            ),
             _to_the_test_split,
         ),
     },
-    harmless="the real test split has no labels, no BEV arrays and sometimes no meta (docs/format.md, Tree)",
+    harmless="the real test split has no labels, no BEV arrays and sometimes no "
+    "meta (docs/format.md, Tree)",
 )
 GROUP.add(
     {"split_files_moved": ("The split files are under split_txt_files/.", _move_split_files)},

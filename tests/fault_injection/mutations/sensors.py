@@ -14,7 +14,10 @@ LIDARS = Group("lidar", deep=True)
 BEVS = Group("bev camera", deep=True)
 _FAR_APART = 3
 """Frames between two pictures that are to differ visibly."""
-_LOOK = "only a person who looks at the pictures can find it: each file is sound, and no two in the scenario are equal"
+_LOOK = (
+    "only a person who looks at the pictures can find it: each file is sound, and no "
+    "two in the scenario are equal"
+)
 _WALL = "a wall or a truck that fills the view looks the same"
 
 
@@ -97,7 +100,10 @@ IMAGES.add(
     {
         "image_cut": ("An image file ends at a random byte.", in_file("Camera", cut)),
         "image_ends_early": (
-            "A part of an image's coded data before its end marker is gone; decoders do not report this.",
+            (
+                "A part of an image's coded data before its end marker is gone; "
+                "decoders do not report this."
+            ),
             in_file("Camera", _ends_early),
         ),
         "image_emptied": ("An image file is empty.", in_file("Camera", emptied)),

@@ -1,4 +1,6 @@
-"""`tiny` in an even smaller size, and runs with it: in a module that other processes can import by name."""
+"""`tiny` in an even smaller size, and runs with it: in a module that other processes can import by
+name.
+"""
 
 import os
 import signal
@@ -36,7 +38,9 @@ RUN = TrainConfig(
 
 
 def small() -> ModelConfig:
-    """The wiring of `tiny` with 40 × 40 cells, images of 64 × 36 pixels, and labels of three frames, 0.1 s apart."""
+    """The wiring of `tiny` with 40 × 40 cells, images of 64 × 36 pixels, and labels of three
+    frames, 0.1 s apart.
+    """
     tiny = presets.tiny()
     return replace(
         tiny,
@@ -76,7 +80,9 @@ def small_lidar() -> ModelConfig:
 
 
 def small_released() -> ModelConfig:
-    """The wiring of `released` with all its quirks, two frames and a narrow encoder; the released kinds of layers."""
+    """The wiring of `released` with all its quirks, two frames and a narrow encoder; the released
+    kinds of layers.
+    """
     released = presets.released()
     along = (-48.0, 48.0, 3.0)
     return replace(
@@ -126,7 +132,9 @@ def trained(
     curves: bool = False,
     **options: Any,
 ) -> Path:
-    """A run with `small` in the place of `tiny`, on one thread; curves, which take seconds, are left out."""
+    """A run with `small` in the place of `tiny`, on one thread; curves, which take seconds, are
+    left out.
+    """
     torch.set_num_threads(1)
     drawn = training.save_training if curves else lambda *_: None
     with (
@@ -152,7 +160,9 @@ def killed_run(root: str, folder: str, step: int) -> None:
 
 
 def one_of_several(root: str, folder: Path) -> None:
-    """A run of two steps on one of several processes; leaves its parameters, as it has them at the end."""
+    """A run of two steps on one of several processes; leaves its parameters, as it has them at the
+    end.
+    """
     made: list[torch.nn.Module] = []
     model_of = training.new_model
 

@@ -1,4 +1,6 @@
-"""`deepaccident train` and `predict`, and the commands of docs/training.md, on the session's small release."""
+"""`deepaccident train` and `predict`, and the commands of docs/training.md, on the session's small
+release.
+"""
 
 import re
 from pathlib import Path
@@ -46,7 +48,9 @@ def trained(release_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Pat
 def test_one_set_of_weights_predicts_for_any_agents(
     trained: Path, release_root: Path, tmp_path: Path, agents: str, link: tuple[object, ...]
 ) -> None:
-    """The release's scenarios are as short as 0.6 s, so that each agent has two samples, the first without a past."""
+    """The release's scenarios are as short as 0.6 s, so that each agent has two samples, the first
+    without a past.
+    """
     out, split = tmp_path / "results", tmp_path / "later.txt"
     meta = next(iter(sorted(release_root.glob("type1*/meta/*"))))
     split.write_text(f"{meta.parts[-3]} {meta.stem}\n", encoding="utf-8")

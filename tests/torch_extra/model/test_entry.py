@@ -149,7 +149,9 @@ def test_egomotion_is_that_of_the_labels_without_the_augmentation(
 def test_a_frame_that_did_not_arrive_is_the_present(
     batch: dict[str, Any], arrived: list[bool], valid: list[bool]
 ) -> None:
-    """What lies before a gap cannot be joined, and so is lost too; without a present, the agent is no partner."""
+    """What lies before a gap cannot be joined, and so is lost too; without a present, the agent is
+    no partner.
+    """
     changed = batch | {"agent_valid": batch["agent_valid"].clone()}
     changed["agent_valid"][0, 2] = torch.tensor(arrived)
     whole, inputs = model_inputs(batch), model_inputs(changed)

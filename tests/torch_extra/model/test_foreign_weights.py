@@ -1,4 +1,6 @@
-"""Checkpoints of strangers: the forms that are in use load; bombs and nonsense are refused, in little memory."""
+"""Checkpoints of strangers: the forms that are in use load; bombs and nonsense are refused, in
+little memory.
+"""
 
 import io
 import json
@@ -160,7 +162,10 @@ def old(
     held: bytes, names: bytes = b"](U\x010e.", storages: bytes = struct.pack("<q", 4) + bytes(16)
 ) -> bytes:
     """A file as torch wrote it before 1.6."""
-    begin = b"\x80\x02\x8a\nl\xfc\x9cF\xf9 j\xa8P\x19.\x80\x02M\xe9\x03.\x80\x02}U\x0dlittle_endian\x88s."
+    begin = (
+        b"\x80\x02\x8a\nl\xfc\x9cF\xf9 "
+        b"j\xa8P\x19.\x80\x02M\xe9\x03.\x80\x02}U\x0dlittle_endian\x88s."
+    )
     held = held.replace(b"K\x04tQ", b"K\x04NtQ")  # and not a view of another storage
     return begin + b"\x80\x02" + held + b"\x80\x02" + names + storages
 
@@ -191,7 +196,7 @@ ENTRY = b'{"dtype":"U8","shape":[1],"data_offsets":[0,1]}'
 HOSTILE: dict[str, bytes] = {
     "bytearray": pt(named(b"c__builtin__\nbytearray\n\x8a\x05\0\0\0\0\x02\x85R")),
     "a stride of 0": pt(named(tensor(HUGE, b"K\0\x85"))),
-    "many expanded tensors": pt(b"}(" + b"".join(b"U\x02%02d" % n + MANY for n in range(20)) + b"u."),
+    "many expanded tensors": pt(b"}(" + b"".join(b"U\x02%02d" % n + MANY for n in range(20)) + b"u."),  # noqa: E501
     "beyond the storage": pt(named(tensor(b"K\x05\x85", ONE))),
     "an offset beyond the storage": pt(named(tensor(ONE, ONE, LONG))),
     "strides beyond the storage": pt(named(tensor(b"K\x02\x85", LONG + b"\x85"))),
@@ -282,7 +287,9 @@ for path in sys.argv[1:]:
 
 
 def test_bombs_and_nonsense_are_refused_in_little_memory(tmp_path: Path) -> None:
-    """In a process with 2 GiB; each takes at most what its file has several times, and some 300 MB."""
+    """In a process with 2 GiB; each takes at most what its file has several times, and some 300
+    MB.
+    """
     paths = [str(tmp_path / f"{number}.pth") for number in range(len(HOSTILE))]
     for path, content in zip(paths, HOSTILE.values(), strict=True):
         Path(path).write_bytes(content)

@@ -1,4 +1,6 @@
-"""Image encoders: shapes, names, windows, and that official Swin weights mean the same after their conversion."""
+"""Image encoders: shapes, names, windows, and that official Swin weights mean the same after their
+conversion.
+"""
 
 import pytest
 import torch

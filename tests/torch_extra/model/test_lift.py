@@ -89,7 +89,9 @@ def one_camera(camera: PinholeCamera, ego_from_camera: SE3) -> CameraGeometry:
     arrays((2,), 30.0),
 )
 def test_points_lie_where_the_devkit_sees_them(yaw, pitch, roll, position, fx, fy, centre):
-    """Points project onto the centres of their pixels at their depths, and their cells are those of a BevGrid."""
+    """Points project onto the centres of their pixels at their depths, and their cells are those of
+    a BevGrid.
+    """
     lift = lift_of(replace(CONFIG, z=(-100, 100, 200)))
     camera = PinholeCamera(
         np.array([[fx, 0, 20 + centre[0]], [0, fy, 12 + centre[1]], [0, 0, 1]]), 40, 24
@@ -110,7 +112,8 @@ def test_points_lie_where_the_devkit_sees_them(yaw, pitch, roll, position, fx, f
 
 
 def test_one_pixel_at_one_depth_lights_one_cell():
-    """A camera 1 m above the ego's origin that looks ahead: pixel row 1, column 3 at 10 m is at (10, −8/3, 1).
+    """A camera 1 m above the ego's origin that looks ahead: pixel row 1, column 3 at 10 m is at
+    (10, −8/3, 1).
 
     Its cell is in row (−8/3 + 16) / 0.5 and column 10 + 12.
     """
@@ -145,7 +148,9 @@ def test_rays_pass_through_the_centres_or_from_corner_to_corner(frustum, columns
 
 
 def test_a_wide_map_holds_all_that_the_pixels_have():
-    """Probabilities of depths sum to 1, so that the map's sum is the sum over pixels, frame by frame."""
+    """Probabilities of depths sum to 1, so that the map's sum is the sum over pixels, frame by
+    frame.
+    """
     lift, features = lift_of(WIDE), noise(2, 2, 3, 5, 3, 5)
     pixels = lift.depthnet(features.flatten(0, 2))[:, 8:].unflatten(0, (2, 2, 3))
     torch.testing.assert_close(
@@ -165,7 +170,9 @@ def test_gradients_reach_the_features_and_every_weight():
 
 
 def test_only_points_in_the_band_above_the_road_count():
-    """The road is at the origin's height under cameras that stand above it, and 4 m below those of a pole."""
+    """The road is at the origin's height under cameras that stand above it, and 4 m below those of
+    a pole.
+    """
     cameras, plain, banded = rig(), lift_of(CONFIG), lift_of(replace(CONFIG, band=(-0.5, 1.5)))
     for height, road in ((1.8, 0.0), (0.0, -4.0)):
         cameras.translation[..., 2] = height

@@ -1,4 +1,6 @@
-"""Batches of worker processes: whatever befalls a worker, its reader gets an error with the cause and a remedy."""
+"""Batches of worker processes: whatever befalls a worker, its reader gets an error with the cause
+and a remedy.
+"""
 
 import multiprocessing
 import os

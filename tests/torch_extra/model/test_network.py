@@ -57,7 +57,9 @@ def egos_by_themselves(
     agents: str,
     rows: slice = slice(None),
 ) -> list[str]:
-    """A moment's egos; what is predicted for some of them at once is what is predicted for each by itself."""
+    """A moment's egos; what is predicted for some of them at once is what is predicted for each by
+    itself.
+    """
     [item] = AllEgosDataset(da, tokens, model.config.inputs(agents))
     together = predicted(model, model_inputs(collate_all_egos([item]), model.config.handedness))
     for row, token in list(enumerate(item["egos"]))[rows]:
@@ -172,7 +174,9 @@ def test_all_egos_of_a_partial_release_are_each_by_itself(
     seeded: Seeded,
     predicted: Predicted,
 ) -> None:
-    """The moment's first agent lacks a camera: it is no ego and no partner, and the others' places stay right."""
+    """The moment's first agent lacks a camera: it is no ego and no partner, and the others' places
+    stay right.
+    """
     there = [token for token in moment if "other_vehicle_behind" not in token]
     assert (
         egos_by_themselves(seeded(config), predicted, da_partial, there, "available") == there[1:]

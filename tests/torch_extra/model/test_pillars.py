@@ -1,4 +1,6 @@
-"""Points from LiDARs: where they come to lie, which of them count, and that all of it is trained."""
+"""Points from LiDARs: where they come to lie, which of them count, and that all of it is
+trained.
+"""
 
 from dataclasses import replace
 
@@ -38,7 +40,9 @@ def reached(
 
 
 def test_a_point_reaches_the_cells_around_its_own(encoder: PillarEncoder) -> None:
-    """Two convolutions of 3 x 3: two cells, or one more on the side where its half of the cell is."""
+    """Two convolutions of 3 x 3: two cells, or one more on the side where its half of the cell
+    is.
+    """
     rows, columns = reached(encoder, [[3.2, -1.3, 0.5, 0.4]], [0])[0].nonzero().unbind(1)
     assert (rows.min(), rows.max(), columns.min(), columns.max()) == (2, 5, 12, 14)
 

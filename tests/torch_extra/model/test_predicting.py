@@ -1,4 +1,6 @@
-"""Predictions of samples: they stand by themselves, and the devkit's evaluators and writers take them."""
+"""Predictions of samples: they stand by themselves, and the devkit's evaluators and writers take
+them.
+"""
 
 import shutil
 from collections.abc import Callable, Iterator

@@ -1,4 +1,6 @@
-"""The weights that come with the devkit: their size and notes, what they score, and where they are used."""
+"""The weights that come with the devkit: their size and notes, what they score, and where they are
+used.
+"""
 
 import importlib
 from pathlib import Path
@@ -33,7 +35,9 @@ def test_they_are_small_halves_with_their_provenance(name: str) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SHIPPED)
 def test_they_score_what_their_notes_say(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """On a release that is made again from its seed; another machine may round otherwise, a little."""
+    """On a release that is made again from its seed; another machine may round otherwise, a
+    little.
+    """
     monkeypatch.syspath_prepend(str(Path(__file__).parents[3]))
     from benchmarks.shipping import scores
 

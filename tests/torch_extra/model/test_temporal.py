@@ -1,4 +1,6 @@
-"""Temporal models: which frames count, in which order, with which motion; blocks look only backwards."""
+"""Temporal models: which frames count, in which order, with which motion; blocks look only
+backwards.
+"""
 
 import pytest
 import torch

@@ -1,4 +1,6 @@
-"""Training: schedules, steps, runs that are killed and go on, several processes, and what is refused."""
+"""Training: schedules, steps, runs that are killed and go on, several processes, and what is
+refused.
+"""
 
 import json
 import os
@@ -159,7 +161,7 @@ def test_two_sources_come_by_turns_each_in_its_own_order(
     one: int, other: int, mix: float, first: int, ranks: int
 ) -> None:
     config = TrainConfig(seed=3)
-    sources = [type("Counted", (SimpleNamespace,), {"__len__": lambda _, count=count: count})(model=None, data=None)
+    sources = [type("Counted", (SimpleNamespace,), {"__len__": lambda _, count=count: count})(model=None, data=None)  # noqa: E501
                for count in (one, other)]  # fmt: skip
     moments = MixedMoments((sources[0], sources[1]), mix)
     whole = list(islice(moments.numbers(config, first=0), 60 * ranks))
@@ -240,7 +242,9 @@ def test_frames_beyond_the_recording_are_not_learned(
 def test_every_parameter_has_a_gradient_at_every_moment(
     da: DeepAccident, moment: list[str], make: Callable[[], ModelConfig], frame: str
 ) -> None:
-    """Though it may be 0, where a moment has no past and so no motion to learn: several processes wait for all."""
+    """Though it may be 0, where a moment has no past and so no motion to learn: several processes
+    wait for all.
+    """
     step = TrainingStep(V2XFormer(make()))
     batch = learned(da, [each.replace("/004", frame) for each in moment], step.model.config)
     losses = step(*training_batch(batch, step.model.config, RUN, generator_of(0)))
@@ -302,9 +306,14 @@ def test_a_run_leaves_its_files(whole: Path) -> None:
 def test_a_killed_run_goes_on_as_if_nothing_had_been(
     da: DeepAccident, root: str, whole: Path, tmp_path: Path, step: int
 ) -> None:
-    """Bit for bit: killed after a step in the log that is in no checkpoint, the second time at a validation."""
+    """Bit for bit: killed after a step in the log that is in no checkpoint, the second time at a
+    validation.
+    """
     folder = tmp_path / "killed"
-    code = f"from torch_extra.model.small_model import killed_run; killed_run({root!r}, {str(folder)!r}, {step})"
+    code = (
+        f"from torch_extra.model.small_model import killed_run; "
+        f"killed_run({root!r}, {str(folder)!r}, {step})"
+    )
     ended = other_process("-c", code)
     assert ended.returncode == -signal.SIGKILL, ended.stderr.decode()
     assert [row["step"] for row in read_log(folder)] == list(range(1, step + 1))

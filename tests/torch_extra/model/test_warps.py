@@ -1,4 +1,6 @@
-"""Poses and warps of feature maps: against numpy, against the geometry itself, and what a wrong grid says."""
+"""Poses and warps of feature maps: against numpy, against the geometry itself, and what a wrong
+grid says.
+"""
 
 import numpy as np
 import pytest
@@ -64,7 +66,9 @@ def test_exact_chains_lead_from_each_frame_to_the_present(vectors: list[torch.Te
 def test_an_exact_warp_gives_a_linear_field_its_values_in_the_other_frame(
     target_from_source: torch.Tensor,
 ) -> None:
-    """Bilinear sampling has no error on such a field, but next to the border, where zeros mix in."""
+    """Bilinear sampling has no error on such a field, but next to the border, where zeros mix
+    in.
+    """
     x, y = (each.double() for each in centres())
     warped = warp_features((3 + 0.5 * x - 0.25 * y)[None, None], target_from_source, GRID)[0, 0]
     source = torch.linalg.inv(target_from_source)[0]

@@ -1,4 +1,6 @@
-"""Studies with models: what is trained, what spoilt inputs are, and that a killed run ends as one that was not."""
+"""Studies with models: what is trained, what spoilt inputs are, and that a killed run ends as one
+that was not.
+"""
 
 import json
 import shutil
@@ -219,7 +221,9 @@ def renumbered(root: Path, copy: Path) -> str:
 def test_a_training_that_shows_the_test_is_refused(
     plan: dict[str, Any], named: str, da: DeepAccident, da_b: DeepAccident, tmp_path: Path
 ) -> None:
-    """Before anything is trained, and unless the recipe says so; a split that the test does not have is no fault."""
+    """Before anything is trained, and unless the recipe says so; a split that the test does not
+    have is no fault.
+    """
     roots = {
         "here": str(da.dataroot),
         "other": str(da_b.dataroot),

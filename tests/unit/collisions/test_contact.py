@@ -1,4 +1,6 @@
-"""When replays touch: against plain sampling, against closed forms, and contacts shorter than any step."""
+"""When replays touch: against plain sampling, against closed forms, and contacts shorter than any
+step.
+"""
 
 import numpy as np
 import pytest
@@ -63,7 +65,9 @@ def test_every_recording_collides_by_its_end(accident: Accident) -> None:
 
 @pytest.mark.parametrize(("offset", "touches"), [(1e-4, True), (-1e-4, False)])
 def test_a_graze_of_a_thousandth_of_a_second_is_found(offset: float, touches: bool) -> None:
-    """Two squares with their corners ahead pass each other at 50 m/s; they overlap by 0.1 mm, for 8 µs."""
+    """Two squares with their corners ahead pass each other at 50 m/s; they overlap by 0.1 mm, for 8
+    µs.
+    """
     paths = np.stack(
         [straight((-25, 0), 0, 25, 31), straight((25, np.sqrt(2) - offset), np.pi, 25, 31)]
     )
@@ -76,7 +80,9 @@ def test_a_graze_of_a_thousandth_of_a_second_is_found(offset: float, touches: bo
 
 
 def test_a_corner_that_turns_into_the_other_is_found() -> None:
-    """A standing bar turns once around its centre within 0.4 s; the other stands where only its end comes by."""
+    """A standing bar turns once around its centre within 0.4 s; the other stands where only its end
+    comes by.
+    """
     turning = np.column_stack([np.zeros((21, 2)), np.interp(np.arange(21), [8, 12], [0, np.pi])])
     pair = pair_of(
         [turning, np.tile([0.0, 3.05, 0.0], (21, 1))], [[6, 0.2], [0.2, 0.2]], margin=1e-9
@@ -86,7 +92,9 @@ def test_a_corner_that_turns_into_the_other_is_found() -> None:
 
 @pytest.mark.parametrize("dart", ["turns", "goes and returns"])
 def test_what_comes_and_goes_between_two_nodes_is_found(dart: str) -> None:
-    """Within a tenth of a second a bar sweeps past the other; or it goes there and is back 0.2 s later."""
+    """Within a tenth of a second a bar sweeps past the other; or it goes there and is back 0.2 s
+    later.
+    """
     frames = np.arange(21)
     yaws = np.interp(frames, [10, 11], [-1.2, 1.2]) if dart == "turns" else np.zeros(21)
     ahead = 3.0 * (frames == 10) if dart != "turns" else np.zeros(21)

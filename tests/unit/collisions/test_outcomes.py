@@ -86,7 +86,9 @@ def test_a_leader_that_brakes_is_hit_harder() -> None:
 
 
 def test_a_stopped_one_is_hit() -> None:
-    """Who brakes in time in front of oncoming traffic stands when the other, who does not, comes."""
+    """Who brakes in time in front of oncoming traffic stands when the other, who does not,
+    comes.
+    """
     case = head_on(10.0)
     told = outcomes_of(case, FIRST, [2.5], brakings=AT_ONCE)
     assert names(told.outcome) == ["stopped"]
@@ -161,7 +163,9 @@ def test_delta_v_and_its_range() -> None:
 
 
 def test_no_delta_v_in_the_recording() -> None:
-    """Both drive side by side at the same speed and touch all the time: only braking makes a difference of speeds."""
+    """Both drive side by side at the same speed and touch all the time: only braking makes a
+    difference of speeds.
+    """
     told = outcomes_of(
         accident(straight((0, 0), 0, 10, 31), straight((0, 2), 0, 10, 31)),
         FIRST,

@@ -35,7 +35,9 @@ FIRST, SECOND, BOTH = MASKS
 
 @pytest.mark.parametrize("deceleration", [4.0, 5.0, 8.0])
 def test_the_last_moment_of_a_striker(deceleration: float) -> None:
-    """10 m/s of closing speed are gone after 10/a s, in which they need 10²/(2a) m: half of that time more."""
+    """10 m/s of closing speed are gone after 10/a s, in which they need 10²/(2a) m: half of that
+    time more.
+    """
     last = np.floor((5 - 10 / (2 * deceleration)) * 100 + 1e-6) / 100
     (found,) = scanned(rear_end(20, 10), FIRST, deceleration).time
     assert found in (pytest.approx(last), pytest.approx(last - 0.01))  # at the very edge they touch
@@ -49,7 +51,8 @@ def test_two_that_both_brake_head_on() -> None:
 def test_one_that_brakes_head_on_is_hit_by_who_goes_on() -> None:
     case = head_on(10.0, 3.0)
     moments = scanned(case, FIRST, 5.0)
-    # the other's front is 64 − 2 − 60 = 2 m beyond the first's centre at 6 s: it gets through to where the first began
+    # the other's front is 64 − 2 − 60 = 2 m beyond the first's centre at 6 s: it gets through to
+    # where the first began
     assert np.isnan(moments.time).all()
     assert (moments.extrapolated.tolist(), moments.switches.tolist()) == ([True], [0])
     assert not scanned(case, BOTH, 5.0).extrapolated.any()
@@ -63,7 +66,9 @@ def test_what_nothing_avoids_within_the_recording_is_not_extrapolated() -> None:
 
 
 def test_answers_that_change_three_times() -> None:
-    """After 4 s the second crosses the lane at 20 m, where the first is if it stopped there, and meets it later."""
+    """After 4 s the second crosses the lane at 20 m, where the first is if it stopped there, and
+    meets it later.
+    """
     nodes = np.array([[0.0, 20, -40], [4, 20, 0], [4.6, 20, 12], [5.0, 50, 12], [6, 60, 1.9]])
     x, y = (np.interp(np.arange(61) / 10, nodes[:, 0], nodes[:, axis]) for axis in (1, 2))
     case = accident(straight((0, 0), 0, 10, 61), np.column_stack([x, y, np.full(61, np.pi / 2)]))

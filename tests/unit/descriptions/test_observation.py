@@ -81,7 +81,9 @@ def test_rules_on_each_label(
 
 
 def test_the_pole_has_a_distance_of_its_own() -> None:
-    """A car 12 m away with one point, which the released rule calls seen by the pole and not by a vehicle."""
+    """A car 12 m away with one point, which the released rule calls seen by the pole and not by a
+    vehicle.
+    """
     columns = {
         "num_lidar_pts": np.array([9, 1, 1]),
         "translation": np.array([[0.0, 0, 0], [12, 0, 0], [0, 12, 0]]),

@@ -1,4 +1,6 @@
-"""What holds of every evaluator, on the labels of a synthetic release: order, parts, pauses, nothing and perfection."""
+"""What holds of every evaluator, on the labels of a synthetic release: order, parts, pauses,
+nothing and perfection.
+"""
 
 import json
 import math
@@ -67,8 +69,9 @@ class Samples:
         self.contexts = {token: accident_context(dataset, token, 2.0) for token in tokens}
 
     def given(self, how: str, name: str, token: str) -> Sequence[Any]:
-        """Predictions with their truth: the truth itself (`perfect`, motion as instance maps), nothing (`empty`), or
-        `some` that are neither right nor wrong: of another sample, or all a little off."""
+        """Predictions with their truth: the truth itself (`perfect`, motion as instance maps),
+        nothing (`empty`), or `some` that are neither right nor wrong: of another sample, or all a
+        little off."""
         if name in MOTION | ACCIDENT:
             label, other = self.labels[token], self.labels[min(self.labels)]
             output = instances_of(label.instance * (how == "perfect"), label.config.grid)
@@ -210,8 +213,9 @@ def test_perfect_predictions(samples: Samples, tokens: list[str], name: str) -> 
     elif name.startswith("detection opencood"):
         assert result.mean_average_precision == pytest.approx(100, abs=1e-9)
     elif name in DETECTION:
-        # The released curve counts what has no truth as 0, and no recall exceeds the last of its 36 points. So the mean
-        # says how many classes a scene has; each class that it has says what is lost.
+        # The released curve counts what has no truth as 0, and no recall exceeds the last of its 36
+        # points. So the mean says how many classes a scene has; each class that it has says what is
+        # lost.
         assert result.average_precision[result.truths > 0].min() > 97
 
 

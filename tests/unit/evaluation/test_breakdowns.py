@@ -1,4 +1,6 @@
-"""The attributes of samples, and results by them, of any evaluator, with intervals over scenarios."""
+"""The attributes of samples, and results by them, of any evaluator, with intervals over
+scenarios.
+"""
 
 import math
 from collections.abc import Callable, Collection, Sequence
@@ -90,7 +92,10 @@ def test_groups_are_the_results_of_their_samples() -> None:
     for index, group in enumerate(found.groups):
         tokens = [token for token in MANY if int(token) // 10 % 3 == index]
         count = len(tokens) // 10
-        text = f"no intervals: of {count} clusters (an accident and its twin are one); at least 6 are needed"
+        text = (
+            f"no intervals: of {count} clusters (an accident and its twin are "
+            f"one); at least 6 are needed"
+        )
         assert group.result == evaluator.compute(tokens)
         assert (group.samples, group.scenarios, group.clusters) == (len(tokens), count, count)
         assert (group.intervals, group.notes) == ({}, (text,))
@@ -241,7 +246,9 @@ def test_bins_of_time_have_their_upper_edge(frames: int, second: str, step: str)
 
 
 def test_the_attributes_of_samples_are_those_of_their_records(da_motion: DeepAccident) -> None:
-    """Of two recordings of 3.5 s: every tenth of a second of one agent, and the samples that are evaluated."""
+    """Of two recordings of 3.5 s: every tenth of a second of one agent, and the samples that are
+    evaluated.
+    """
     evaluated = da_motion.samples("train", "evaluate")
     tokens = [sample["token"] for sample in da_motion.sample if sample["agent"] == AGENTS[-1]]
     attributes = sample_attributes(da_motion, [*evaluated, *tokens])

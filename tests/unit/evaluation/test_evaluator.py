@@ -1,4 +1,6 @@
-"""What all evaluators share: counts by token that can be added, merged, stored and summed in any order."""
+"""What all evaluators share: counts by token that can be added, merged, stored and summed in any
+order.
+"""
 
 import json
 import math

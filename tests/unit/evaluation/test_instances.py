@@ -1,4 +1,6 @@
-"""Who overlaps whom, shares of cells and instances that match; paths of instances, their partners and errors."""
+"""Who overlaps whom, shares of cells and instances that match; paths of instances, their partners
+and errors.
+"""
 
 import math
 from dataclasses import replace

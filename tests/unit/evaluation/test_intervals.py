@@ -1,4 +1,6 @@
-"""Intervals of numbers: by Student's t and Wilson's formula, and where there is none; what numbers can be."""
+"""Intervals of numbers: by Student's t and Wilson's formula, and where there is none; what numbers
+can be.
+"""
 
 import math
 from collections.abc import Collection, Sequence

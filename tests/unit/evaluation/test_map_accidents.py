@@ -28,7 +28,8 @@ GONE, X = (math.nan, math.nan), -7 / 6
 @pytest.mark.parametrize(
     ("predicted", "truth", "gate", "pairs"),
     [
-        # 1 is 3 m from 7 and 5 m from 8; 2 stands on 7 and is 3 m from 8: the least sum of all would leave 1 alone
+        # 1 is 3 m from 7 and 5 m from 8; 2 stands on 7 and is 3 m from 8: the least sum of all
+        # would leave 1 alone
         (
             tracks([1, 2], [(X, math.sqrt(9 - X * X)), (0, 0)]),
             tracks([7, 8], [(0, 0), (3, 0)]),
@@ -65,7 +66,8 @@ def test_who_is_matched_within_the_gate(
 
 POINTS_AND_LINES = [([100] * 4, range(100, 104), 5), ([101], [105], 7)]
 ACROSS = [([100, 104, 108], [100, 103, 106], 1), ([102], [99], 2)]
-"""A line of direction (3, 4) and a cell exactly two cells from it; their bounding boxes are nearer."""
+"""A line of direction (3, 4) and a cell exactly two cells from it; their bounding boxes are nearer.
+"""
 
 
 @pytest.mark.parametrize(

@@ -40,7 +40,9 @@ def labels(da_motion: DeepAccident) -> dict[str, MotionLabels]:
 def boxes_label(
     *frames: np.ndarray, config: MotionLabelConfig = CONFIG, recorded: int = 5
 ) -> MotionLabels:
-    """Labels at the present with these instance maps; the first `recorded` frames are in the recording."""
+    """Labels at the present with these instance maps; the first `recorded` frames are in the
+    recording.
+    """
     instance = np.zeros((config.label_frames, *config.grid.shape), dtype=np.int32)
     instance[: len(frames)] = np.reshape(frames, (-1, *config.grid.shape))
     vectors = np.full((len(instance), 2, *config.grid.shape), 255, dtype=np.float32)
@@ -158,7 +160,8 @@ COUNTS = ("true_positive", "false_positive", "false_negative")
 @pytest.mark.parametrize(
     ("prediction", "label", "name", "expected"),
     [
-        # a box 45 m ahead is only within 100 m; one across the border of the 30 m counts with its part inside
+        # a box 45 m ahead is only within 100 m; one across the border of the 30 m counts with its
+        # part inside
         (
             still(boxes(_2=128)),
             [boxes(_1=190, _2=127)] * 5,
@@ -228,7 +231,9 @@ def test_cells_and_instances_within_a_range(prediction, label, name, expected) -
             TRUE,
             {"paths": 0, "path_true_positive": 1},
         ),  # an empty first one ends it
-        (  # two cells a frame, then gone: 2, 4, 6 cells a frame as released, where the truth keeps to 2
+        # two cells a frame, then gone: 2, 4, 6 cells a frame as released, where the truth keeps to
+        # 2
+        (
             over(boxes(_1=100), boxes(_1=102), *[boxes()] * 3),
             [boxes(_1=100 + 2 * frame) for frame in range(5)],
             {"min_fde": (2 + 4 + 6 - 6) * 0.5},
@@ -258,7 +263,9 @@ def test_paths_can_be_left_out() -> None:
 
 
 def test_the_released_breakdown_takes_other_samples_frames() -> None:
-    """Sample 2 is perfect, but frame 2 of the list of all frames is sample 0's, which has nothing right."""
+    """Sample 2 is perfect, but frame 2 of the list of all frames is sample 0's, which has nothing
+    right.
+    """
     evaluator, label = MotionEvaluator(), boxes_label(*TRUE)
     for token, prediction in {"a": boxes(), "b": boxes(_1=100), "c": boxes(_1=100)}.items():
         evaluator.update(token, still(prediction), label)

@@ -1,4 +1,6 @@
-"""A task that somebody adds: a class and its name in `TASKS`, and everything from results to a bundle works."""
+"""A task that somebody adds: a class and its name in `TASKS`, and everything from results to a
+bundle works.
+"""
 
 from collections.abc import Collection
 from dataclasses import dataclass

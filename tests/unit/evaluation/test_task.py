@@ -1,4 +1,6 @@
-"""The contract of each task, the choices of its protocols, and the headlines and text of its results."""
+"""The contract of each task, the choices of its protocols, and the headlines and text of its
+results.
+"""
 
 import copy
 import json
@@ -187,9 +189,12 @@ def test_each_headline_is_a_number_of_the_result_by_its_path(task: str, protocol
 
 
 HEADLINES = {
-    "motion": "iou 30x30 %+, iou 100x100 %+, vpq 30x30 %+, vpq 100x100 %+, min_ade m-, min_fde m-, miss_rate share-",
-    "accident": "apa share+, precision share+, recall share+, false_alarm_rate share-, average_precision share+, "
-    "accuracy@5 share+, accuracy@10 share+, accuracy@15 share+, id_error share-, position_error m-, time_error s-, "
+    "motion": "iou 30x30 %+, iou 100x100 %+, vpq 30x30 %+, vpq 100x100 %+, min_ade m-, "
+    "min_fde m-, miss_rate share-",
+    "accident": "apa share+, precision share+, recall share+, false_alarm_rate share-, "
+    "average_precision share+, "
+    "accuracy@5 share+, accuracy@10 share+, accuracy@15 share+, id_error share-, "
+    "position_error m-, time_error s-, "
     "lateness s ",
     "detection": "mAP %+, mATE m-, mASE 1 - overlap-, mAOE rad-, mAVE m/s-, AP vehicle %+",
 }

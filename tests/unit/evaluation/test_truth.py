@@ -1,4 +1,6 @@
-"""What happens after a sample, what constant velocities lead to, and the alarms of predictions with whom they name."""
+"""What happens after a sample, what constant velocities lead to, and the alarms of predictions with
+whom they name.
+"""
 
 import math
 from collections.abc import Mapping
@@ -38,7 +40,9 @@ Path = list[tuple[float, float]]
 
 
 def truth_of(*paths: Path, **columns: Any) -> BoxTruth:
-    """Cars of 4 m × 2 m that look ahead, by their places at each tenth of a second; ids 10, 20, …"""
+    """Cars of 4 m × 2 m that look ahead, by their places at each tenth of a second; ids 10, 20,
+    …
+    """
     center = np.array(paths, dtype=np.float64).swapaxes(0, 1)
     footprint = np.concatenate(
         [center, np.broadcast_to([4.0, 2.0, 0.0], (*center.shape[:2], 3))], axis=2
@@ -403,7 +407,9 @@ def test_explicit_alarms_are_sorted_by_sureness_time_place_and_ids_and_those_bel
 def test_an_alarm_names_who_is_there_at_the_nearest_recorded_frame(
     time: float, names: tuple[int, ...]
 ) -> None:
-    """Only at the third frame the two are where the alarm is; at the last one they have changed places."""
+    """Only at the third frame the two are where the alarm is; at the last one they have changed
+    places.
+    """
     first, second = ([(x, 0.0) for x in xs] for xs in ((4, 4, 4, 0, 4, 4), (90, 90, 90, 4, 90, 0)))
     truth = replace(truth_of(first, second), actor_id=np.array([4, 7]))
     assert [

@@ -1,4 +1,6 @@
-"""Exports: what is written, whom a folder refuses, what is kept, and calls that are stopped or share a folder."""
+"""Exports: what is written, whom a folder refuses, what is kept, and calls that are stopped or
+share a folder.
+"""
 
 import errno
 import json
@@ -318,7 +320,9 @@ class TestRelease:
     def test_files_that_the_index_was_not_made_from_are_refused(
         self, changing: Path, tmp_path: Path
     ) -> None:
-        """What is written comes from the index, and the hashes beside it would be of other files."""
+        """What is written comes from the index, and the hashes beside it would be of other
+        files.
+        """
         dataset = reopened(changing)
         token = dataset.scenario[1]["token"]
         label = next(changing.glob(f"{token.replace('/', '/ego_vehicle/label/')}/*_002.txt"))
@@ -350,7 +354,9 @@ class TestRelease:
     def test_only_what_has_other_sensor_files_is_made_again(
         self, changing: Path, tmp_path: Path, units: int, change: str
     ) -> None:
-        """Of a complete export, and of one that was stopped; then the same as one that was made now."""
+        """Of a complete export, and of one that was stopped; then the same as one that was made
+        now.
+        """
         token = next(iter(DeepAccident(dataroot=changing, verbose=False).scenario))["token"]
         path, *_ = changing.glob(f"{token.replace('/', '/ego_vehicle/Camera_Front/')}/*_002.jpg")
         content = path.read_bytes()
@@ -732,7 +738,9 @@ def test_several_calls_share_the_scenarios(
 def test_a_worker_that_was_taken_for_lost_keeps_its_unit(
     small: DeepAccident, whole: Contents, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of a scheduler that died: the next call neither takes its half-written files away nor writes beside it."""
+    """Of a scheduler that died: the next call neither takes its half-written files away nor writes
+    beside it.
+    """
     write_all, begun, go_on, first = (
         TinyFormat.write,
         threading.Event(),
@@ -788,7 +796,10 @@ IMAGES = ImageConfig(resize=(9, 16), cameras=("Camera_Back",))
     [
         (
             ReleasedInfos(),
-            r"in the split files train\.txt or val\.txt .*; add these files, or choose other scenarios",
+            (
+                r"in the split files train\.txt or val\.txt .*; add these files, or "
+                r"choose other scenarios"
+            ),
         ),
         (OpenCood(), "has its point clouds; unpack the archives of lidar01"),
         (

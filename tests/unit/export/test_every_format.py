@@ -1,4 +1,6 @@
-"""All formats of `deepaccident export`: each is opened here, and has the K of the very images that it holds."""
+"""All formats of `deepaccident export`: each is opened here, and has the K of the very images that
+it holds.
+"""
 
 import json
 import pickle
@@ -34,7 +36,9 @@ Found = dict[str, tuple[Any, tuple[int, int] | None]]
 
 @pytest.fixture(scope="module")
 def resized(tmp_path_factory: pytest.TempPathFactory) -> tuple[DeepAccident, str]:
-    """A release in which one image of the last moment, here the token of its sample, has another size and shape."""
+    """A release in which one image of the last moment, here the token of its sample, has another
+    size and shape.
+    """
     root = tmp_path_factory.mktemp("resized") / "release"
     channels = ("Camera_Front", "Camera_Back", "lidar01")
     write_small_release(

@@ -96,7 +96,9 @@ def test_a_truncated_jpeg_is_no_half_grey_picture(tmp_path: Path, share: float) 
 def test_a_part_is_what_pillow_or_opencv_makes_of_the_whole(
     decode: str, data: st.DataObject
 ) -> None:
-    """At most 1 of 255 from it, shrunk or grown; where an image does both, OpenCV's area filter is another one."""
+    """At most 1 of 255 from it, shrunk or grown; where an image does both, OpenCV's area filter is
+    another one.
+    """
     old = data.draw(st.tuples(st.integers(1, 60), st.integers(1, 60)))
     size = data.draw(st.tuples(st.integers(1, 60), st.integers(1, 60)))
     assume(decode == "full" or (size[0] - old[0]) * (size[1] - old[1]) >= 0)
@@ -128,7 +130,9 @@ def test_a_part_is_what_pillow_or_opencv_makes_of_the_whole(
 def test_a_virtual_camera_sees_the_same_in_the_same_directions(
     zoom: float, across: float, down: float, focal: float, height: int, width: int
 ) -> None:
-    """Colours say where in the whole image a pixel was; by K, that is where its direction meets the whole image."""
+    """Colours say where in the whole image a pixel was; by K, that is where its direction meets the
+    whole image.
+    """
     v, u = np.mgrid[0:120, 0:160]
     whole = np.stack([u, v, np.full_like(u, 200)], axis=-1).astype(np.uint8)
     own = np.array([[100 * zoom, 0, 160 * across], [0, 110 * zoom, 120 * down], [0, 0, 1]])

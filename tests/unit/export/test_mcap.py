@@ -1,4 +1,6 @@
-"""Files of MCAP, read back by the format's own library: what is in them, what goes in, and what errors say."""
+"""Files of MCAP, read back by the format's own library: what is in them, what goes in, and what
+errors say.
+"""
 
 import ast
 import json

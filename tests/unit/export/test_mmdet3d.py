@@ -47,7 +47,9 @@ def points_of(folder: Path, info: Info) -> np.ndarray:
 
 
 def points_in(box: np.ndarray, points: np.ndarray) -> int:
-    """As mmdet3d has boxes: y to the left, a heading of (cos yaw, sin yaw), full lengths, centres."""
+    """As mmdet3d has boxes: y to the left, a heading of (cos yaw, sin yaw), full lengths,
+    centres.
+    """
     x, y, z = (points - box[:3]).T
     cos, sin = np.cos(box[6]), np.sin(box[6])
     length, width, height = box[3:6] / 2 + 1e-4

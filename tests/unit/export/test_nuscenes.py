@@ -84,7 +84,9 @@ def test_nothing_leads_nowhere(da: DeepAccident, tables: Tables) -> None:
 
 
 def disagreement(folder: Path, tables: Tables) -> float:
-    """The share of boxes that hold another number of points than their rows say, in the ego's scenes."""
+    """The share of boxes that hold another number of points than their rows say, in the ego's
+    scenes.
+    """
     wrong, total = 0, 0
     for data in rows(tables, "sample_data", is_key_frame=True, fileformat="pcd"):
         if not data["filename"].split("__")[0].endswith("ego_vehicle"):

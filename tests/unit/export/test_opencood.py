@@ -1,4 +1,6 @@
-"""OPV2V's folders, read by a reader that knows OpenCOOD's conventions; CARLA's poses against its own formula."""
+"""OPV2V's folders, read by a reader that knows OpenCOOD's conventions; CARLA's poses against its
+own formula.
+"""
 
 from pathlib import Path
 
@@ -169,7 +171,9 @@ def test_all_agents_have_the_same_moments_and_each_its_cloud(
     moments: list[str],
     warned: bool,
 ) -> None:
-    """Of three moments of two agents in each of three scenarios; loaders take no cloud for one without points."""
+    """Of three moments of two agents in each of three scenarios; loaders take no cloud for one
+    without points.
+    """
     wanted = SmallRelease(
         agents=("ego_vehicle", "other_vehicle"), channels=("lidar01", "Camera_Front")
     )
@@ -228,7 +232,9 @@ DEGREES = st.floats(-179.9, 179.9)
 
 
 def carla_matrix(x: float, y: float, z: float, roll: float, yaw: float, pitch: float) -> np.ndarray:
-    """What `carla.Transform.get_matrix` gives: metres and degrees, left-handed, as its `Transform` computes it."""
+    """What `carla.Transform.get_matrix` gives: metres and degrees, left-handed, as its `Transform`
+    computes it.
+    """
     (cr, cy, cp), (sr, sy, sp) = (
         np.cos(np.radians([roll, yaw, pitch])),
         np.sin(np.radians([roll, yaw, pitch])),
@@ -258,5 +264,7 @@ def test_a_carla_transform_there_and_back(
 
 @given(matrices())
 def test_a_pose_there_and_back(pose: np.ndarray) -> None:
-    """Also near pitches of 90°, where angles are not unique; arcsin is flat there, and keeps eight digits."""
+    """Also near pitches of 90°, where angles are not unique; arcsin is flat there, and keeps eight
+    digits.
+    """
     assert_allclose(flip_pose(carla_matrix(*carla_six(pose))), pose, rtol=0, atol=1e-7)

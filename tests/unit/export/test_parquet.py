@@ -30,7 +30,9 @@ def rows_of(folder: Path, table: str, split: str = "*") -> list[dict[str, Any]]:
 
 
 def told(dataset: DeepAccident, table: str) -> dict[str, list[str]]:
-    """Name of a split → the table's records as text, in which NaN equals NaN, with the column that is added."""
+    """Name of a split → the table's records as text, in which NaN equals NaN, with the column that
+    is added.
+    """
     splits = {record["token"]: record["split"] for record in dataset.scenario}
     found: dict[str, list[str]] = {name: [] for name in SPLIT_NAMES.values()}
     for record in getattr(dataset, table):

@@ -1,4 +1,6 @@
-"""The released infos, read by a reader that knows the released code's conventions and not the devkit."""
+"""The released infos, read by a reader that knows the released code's conventions and not the
+devkit.
+"""
 
 import logging
 import pickle
@@ -38,7 +40,9 @@ def infos(folder: Path, name: str = "val") -> list[Info]:
 
 
 def points_in(box: np.ndarray, points: np.ndarray) -> int:
-    """As the released code has boxes: y to the right, a heading of (cos yaw, −sin yaw), full lengths, centres."""
+    """As the released code has boxes: y to the right, a heading of (cos yaw, −sin yaw), full
+    lengths, centres.
+    """
     x, y, z = (points - box[:3]).T
     cos, sin = np.cos(box[6]), -np.sin(box[6])
     length, width, height = box[3:6] / 2 + 1e-6
@@ -49,7 +53,9 @@ def points_in(box: np.ndarray, points: np.ndarray) -> int:
 
 
 def disagreement(da: DeepAccident, found: list[Info]) -> float:
-    """The share of seen boxes whose points in the release's own clouds are not as many as the labels say."""
+    """The share of seen boxes whose points in the release's own clouds are not as many as the
+    labels say.
+    """
     wrong = total = 0
     for info in found:
         with np.load(

@@ -100,7 +100,10 @@ def test_decimal_resolutions_are_whole() -> None:
     [
         (
             (-50, 50, 0.3),
-            r"x: -50 to 50 m is not .*\(333.333\); the nearest that are: \(-50, 49.9, 0.3\) and \(-50, 50.2, 0.3",
+            (
+                r"x: -50 to 50 m is not .*\(333.333\); the nearest that are: \(-50, "
+                r"49.9, 0.3\) and \(-50, 50.2, 0.3"
+            ),
         ),
         ((0, 1, 3), r"x: 0 to 1 m .*; the nearest that is: \(0, 3, 3\)"),
         ((0, 1e-9, 1), r"x: 0 to 1e-09 m .*; the nearest that is: \(0, 1, 1\)"),

@@ -1,4 +1,6 @@
-"""Time to collision: by hand, and as golden safety/surrogates has it (brute force at 1 ms, up to 20 s)."""
+"""Time to collision: by hand, and as golden safety/surrogates has it (brute force at 1 ms, up to 20
+s).
+"""
 
 import json
 import math

@@ -223,7 +223,9 @@ def test_iou_by_hand(square: Boxes) -> None:
 
 
 def test_gap_by_hand(square: Boxes) -> None:
-    """Side by side, corner to corner, corner to edge, edges crossing with no corner inside, touching, above."""
+    """Side by side, corner to corner, corner to edge, edges crossing with no corner inside,
+    touching, above.
+    """
     centers = [[4, 0, 0], [4, 5, 0], [3, 0, 0], [0, 0, 0], [2, 0, 0], [0, 0, 9]]
     sizes = [[2, 2, 2], [2, 2, 2], [2, 2, 2], [9, 0.5, 1], [2, 1, 1], [1, 1, 1]]
     others = Boxes.from_arrays(centers, sizes, [0, np.pi, np.pi / 4, 0.1, 0, 0], frame="lidar")

@@ -68,7 +68,9 @@ def test_in_image_by_depth_and_margin() -> None:
 
 
 def test_a_box_is_seen_whole_in_part_or_not() -> None:
-    """Ahead; cut by the left edge; beside; behind; around the camera; with corners nearer than 1 m; too large."""
+    """Ahead; cut by the left edge; beside; behind; around the camera; with corners nearer than 1 m;
+    too large.
+    """
     camera = PinholeCamera.from_field_of_view(100, 100, np.pi / 2)
     centers = [
         [0, 0, 10],

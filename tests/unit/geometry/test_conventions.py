@@ -1,4 +1,6 @@
-"""On numbers of real files (docs/format.md, Calib); the laws are in tests/property/test_handedness.py."""
+"""On numbers of real files (docs/format.md, Calib); the laws are in
+tests/property/test_handedness.py.
+"""
 
 import numpy as np
 import pytest
@@ -32,7 +34,9 @@ def test_matrices_by_hand() -> None:
 
 
 def test_camera_back_by_hand() -> None:
-    """A point 10 m behind the LiDAR, 1 m to the left, 0.5 m up is 10 − 2.096 m deep, 1 m to the camera's right."""
+    """A point 10 m behind the LiDAR, 1 m to the left, 0.5 m up is 10 − 2.096 m deep, 1 m to the
+    camera's right.
+    """
     raw = np.diag([-1.0, -1, 1, 1])
     raw[:3, 3] = -2.096, 0, 0.3
     camera_from_lidar = conventions.camera_from_lidar(raw)

@@ -5,7 +5,8 @@ from pyquaternion import Quaternion
 
 from deepaccident_devkit.geometry import quaternions
 
-# the identity, and half turns about each axis: where three of the four ways to read a matrix divide by zero
+# the identity, and half turns about each axis: where three of the four ways to read a matrix divide
+# by zero
 HALF_TURNS = [np.diag(signs) for signs in ([1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1])]
 
 

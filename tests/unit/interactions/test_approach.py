@@ -1,4 +1,6 @@
-"""The nearest approach and the time to collision with accelerations: by hand, and against small steps of time."""
+"""The nearest approach and the time to collision with accelerations: by hand, and against small
+steps of time.
+"""
 
 import math
 

@@ -1,4 +1,6 @@
-"""Which pairs are interactions, and their least and most: hand-made motions, and against all pairs one by one."""
+"""Which pairs are interactions, and their least and most: hand-made motions, and against all pairs
+one by one.
+"""
 
 import math
 import pickle

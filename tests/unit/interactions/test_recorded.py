@@ -31,7 +31,8 @@ def test_one_crosses_after_the_other() -> None:
 def test_who_waits_is_there_until_it_goes() -> None:
     waits = [(0.0, 0.0, 0.0)] * 21 + straight(30, 0, 0, 10, 90)[1:]
     crosses = straight(60, -40, 0, 10)
-    # the waiting one's tail leaves y < 1 after 2 s + 0.1 · 2.0; the other's front is at x = −2 from 3.6 s
+    # the waiting one's tail leaves y < 1 after 2 s + 0.1 · 2.0; the other's front is at x = −2 from
+    # 3.6 s
     assert pet(waits, crosses) == pytest.approx(3.6 + 0.1 - 2.2, abs=0.11)
     assert pet(crosses, waits) == pytest.approx(-pet(waits, crosses))
     assert len(pieces_of(track(waits)).spans) == 30  # standing is one piece

@@ -1,4 +1,6 @@
-"""The interactions of a release's scenarios: computed once, kept, made again where the file is no good."""
+"""The interactions of a release's scenarios: computed once, kept, made again where the file is no
+good.
+"""
 
 import json
 import shutil

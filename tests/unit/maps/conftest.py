@@ -31,7 +31,9 @@ def copied(release_root: Path, root: Path) -> Path:
 
 @pytest.fixture(scope="session")
 def bev_release(release_root: Path, tmp_path_factory: pytest.TempPathFactory) -> DeepAccident:
-    """The session's release with its BEV cameras and an index of its own, beside which maps are kept."""
+    """The session's release with its BEV cameras and an index of its own, beside which maps are
+    kept.
+    """
     root = copied(release_root, tmp_path_factory.mktemp("maps") / "release")
     return DeepAccident("v1", root, verbose=False)
 

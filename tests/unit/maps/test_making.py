@@ -60,7 +60,9 @@ def bev_files(da: DeepAccident, town: str, *agents: str) -> list[Path]:
 def test_where_three_agents_looked_the_map_is_the_generators_ground(
     mapped: TownMap, true_codes: Callable[[FloatArray], FloatArray]
 ) -> None:
-    """The bound of the issue is 0.9; a cell at an edge may go either way. Of a map a cell off less agrees."""
+    """The bound of the issue is 0.9; a cell at an edge may go either way. Of a map a cell off less
+    agrees.
+    """
     here, beside = (
         true_codes(middles(mapped) + off).reshape(mapped.shape) for off in (0.0, mapped.resolution)
     )

@@ -18,7 +18,9 @@ from deepaccident_devkit.maps.town_map import classes_of, simplified_polygons
 
 
 def tiny() -> TownMap:
-    """3 × 4 cells of 0.5 m with their corner at (10, −20): road, line, sidewalk and something else, then one each."""
+    """3 × 4 cells of 0.5 m with their corner at (10, −20): road, line, sidewalk and something else,
+    then one each.
+    """
     counts = np.zeros((4, 3, 4), np.uint16)
     counts[[0, 1, 2, 3], 0, [0, 1, 2, 3]] = 5
     counts[:, 1, 0] = 3, 3, 4, 1

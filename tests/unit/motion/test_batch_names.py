@@ -18,7 +18,9 @@ NAMES = ("fiery", "beverse", "deepaccident")
 
 
 def made(**changes) -> MotionLabels:
-    """Two cars, one of which turns, on a grid that is not square; the last frame is beyond the recording."""
+    """Two cars, one of which turns, on a grid that is not square; the last frame is beyond the
+    recording.
+    """
     config = MotionLabelConfig(grid=BevGrid((-20, 30, 0.5), (-20, 20, 0.5)), **changes)
     frames = [
         FrameBoxes(

@@ -117,7 +117,9 @@ def test_of_a_sample_the_ground_is_augmented_too(da: DeepAccident) -> None:
 
 @pytest.mark.parametrize("augmentation", [None, Augmentation(rotation=0.3, scale=1.1, flip=True)])
 def test_cells_count_the_pixels_at_their_points(augmentation: Augmentation | None) -> None:
-    """Cells of 5 × 4 points, each looked at by itself; where half of a cell is enough, 10 of 20 are."""
+    """Cells of 5 × 4 points, each looked at by itself; where half of a cell is enough, 10 of 20
+    are.
+    """
     tags = {"road": 7, "lane_line": 6, "sidewalk": 8, "vehicle": 10, "pedestrian": 4}
     assert (dict(COVERAGE), BEV_CLASSES) == (
         {name: 0.5 * (name[0] in "rsv") for name in tags},

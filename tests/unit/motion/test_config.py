@@ -55,7 +55,10 @@ def test_a_presets_orientation_is_kept_unless_the_grid_or_the_caller_says_otherw
     [
         (
             {"future_frames": 0},
-            r"future_frames: expected a whole number from 1 to 1,000 \(frames after the present.*found 0",
+            (
+                r"future_frames: expected a whole number from 1 to 1,000 \(frames "
+                r"after the present.*found 0"
+            ),
         ),
         ({"future_frames": 10**9}, "found 1000000000"),
         ({"future_frames": 1001}, "found 1001"),

@@ -73,7 +73,9 @@ def test_without_a_lean_both_rules_of_poses_give_the_same_corners(
 
 
 def test_a_car_lies_where_it_is_and_so_does_its_centre() -> None:
-    """Centre (10, −5): columns 120 ± 4, rows 90 ± 2, cell edges rounded up half a cell as the released code does."""
+    """Centre (10, −5): columns 120 ± 4, rows 90 ± 2, cell edges rounded up half a cell as the
+    released code does.
+    """
     made = labels([frame((10, -5, 7, 0, 1))] * 5, draw_ego=False)
     rows, columns = np.nonzero(made.instance[0])
     assert (rows.min(), rows.max(), columns.min(), columns.max()) == (87, 91, 116, 124)
@@ -89,7 +91,9 @@ def test_a_car_lies_where_it_is_and_so_does_its_centre() -> None:
 
 
 def test_flow_is_seen_from_this_frames_ego() -> None:
-    """The ego drives 2 m ahead a step, and the car stands: it moves 4 cells to the rear only in the other's frame."""
+    """The ego drives 2 m ahead a step, and the car stands: it moves 4 cells to the rear only in the
+    other's frame.
+    """
     ahead = STILL.copy()
     ahead[:, 0] = -2
     standing = labels(
@@ -194,7 +198,9 @@ def test_an_augmentation_moves_boxes_and_in_the_clean_way_the_egos_too() -> None
 
 
 def test_half_a_cell_more_or_less() -> None:
-    """A box from (0.1, 0.1) on lies in cells 100 and on; the released code draws it at the nearest edge instead."""
+    """A box from (0.1, 0.1) on lies in cells 100 and on; the released code draws it at the nearest
+    edge instead.
+    """
     frames = [frame((2.3, 1.3, 7, 0, 1))] * 5  # x 0.3 to 4.3, y 0.3 to 2.3
     clean = labels(frames, protocol="clean", draw_ego=False).instance[0]
     released = labels(frames, draw_ego=False).instance[0]
@@ -316,7 +322,9 @@ def test_a_frame_that_is_not_valid_is_missing() -> None:
 
 
 def test_a_small_mark_is_no_vector() -> None:
-    """On a grid of 8 cells the mark may be 8; a row's step of 7 and one component that is 8 beside another are kept."""
+    """On a grid of 8 cells the mark may be 8; a row's step of 7 and one component that is 8 beside
+    another are kept.
+    """
     vectors = np.array([[[[8, 8, 7]]], [[[8, 3, 8]]]], dtype=np.float32).reshape(1, 2, 1, 3)
     turned = to_orientation(vectors, vectors=True, source="released", target="devkit", ignore=8)
     assert turned.reshape(2, 3).tolist() == [[8, -8, -7], [8, 3, 8]]

@@ -1,4 +1,6 @@
-"""Each rule of reading instances off maps by itself; that all of them together are the released code's, parity says."""
+"""Each rule of reading instances off maps by itself; that all of them together are the released
+code's, parity says.
+"""
 
 from dataclasses import astuple, replace
 
@@ -79,7 +81,9 @@ def test_after_an_empty_frame_ids_are_counted_anew_and_may_come_twice() -> None:
 
 
 def test_new_ids_follow_the_order_of_a_python_set() -> None:
-    """{0, 7, 8} lies as 0, 8, 7 in a set's eight slots: instance 8 gets the lower one of the new ids."""
+    """{0, 7, 8} lies as 0, 8, 7 in a set's eight slots: instance 8 gets the lower one of the new
+    ids.
+    """
     still = (0.0, 0.0)
     known = {(row, column): still for row in (2, 14) for column in (2, 14, 26)}
     linked = predict_instances(drawn(known, {**known, (26, 2): still, (26, 30): still}))

@@ -1,4 +1,6 @@
-"""Folders of motion labels: what is read back, what stops and damage leave, and whom a folder refuses."""
+"""Folders of motion labels: what is read back, what stops and damage leave, and whom a folder
+refuses.
+"""
 
 import json
 import operator
@@ -230,7 +232,9 @@ def test_bytes_do_not_depend_on_time_workers_or_order(
 def test_the_lines_of_the_page_rebuild_the_maps(
     da_motion: DeepAccident, tmp_path: Path, name: str
 ) -> None:
-    """With numpy alone, to the bit; a sample in the midst and one whose future is beyond the recording."""
+    """With numpy alone, to the bit; a sample in the midst and one whose future is beyond the
+    recording.
+    """
     _, _, rest = PAGE.read_text(encoding="utf-8").partition("```python\n")
     lines, fence, _ = rest.partition("```")
     assert fence
@@ -444,7 +448,8 @@ def test_folders_that_are_something_else(small: DeepAccident, tmp_path: Path) ->
                 tmp_path
                 / "file"
                 / "below": "below: cannot be written .*; make room there, or choose another folder",
-                "/proc/nowhere": "nowhere: cannot be written .*; make room there, or choose another folder",
+                "/proc/nowhere": "nowhere: cannot be written .*; make room there, or "
+                "choose another folder",
             }.items()
         ],
     )
@@ -715,7 +720,10 @@ class TestDamage:
         path = folder / MANIFEST
         path.write_text(json.dumps({**json.loads(path.read_text()), "version": version, "new": 1}))
         before = contents(folder)
-        sentence = rf"{kind} devkit's labels \(format version {version}, this devkit's is {LABEL_FORMAT_VERSION}\); .* or make"
+        sentence = (
+            rf"{kind} devkit's labels \(format version {version}, this devkit's is "
+            rf"{LABEL_FORMAT_VERSION}\); .* or make"
+        )
         assert_refused(
             *[
                 (use, LabelFilesError, sentence)
@@ -740,7 +748,7 @@ try:
     write_label_files(release, sys.argv[2], [record["token"] for record in release.sample], workers=1)
 except LabelFilesError as error:
     print(error)
-"""
+"""  # noqa: E501
 
 
 def python(script: str, *arguments: object) -> subprocess.CompletedProcess[str]:

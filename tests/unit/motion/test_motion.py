@@ -25,7 +25,8 @@ WRITTEN = {
         "'offset': 'instance_offset', 'flow': 'instance_flow'})"
     ),
     "bev_segmentation.BEV_CLASSES": "('road', 'lane_line', 'sidewalk', 'vehicle', 'pedestrian')",
-    "bev_segmentation.COVERAGE": "{'road': 0.5, 'lane_line': 0.0, 'sidewalk': 0.5, 'vehicle': 0.5, 'pedestrian': 0.0}",
+    "bev_segmentation.COVERAGE": "{'road': 0.5, 'lane_line': 0.0, 'sidewalk': 0.5, 'vehicle': "
+    "0.5, 'pedestrian': 0.0}",
     "bev_segmentation.bev_segmentation": "grid=None, augmentation=None",
     "bev_segmentation.segmentation_of": "augmentation=None",
     "box_polygons.OWN_BOX_ID": "-101",

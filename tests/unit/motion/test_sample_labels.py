@@ -1,4 +1,6 @@
-"""`da.motion_labels`: what the tables of a release give, from its first frame to its last, or in part."""
+"""`da.motion_labels`: what the tables of a release give, from its first frame to its last, or in
+part.
+"""
 
 from dataclasses import replace
 from functools import partial
@@ -33,7 +35,9 @@ VAN, LATER, WALKER = 1300, 1301, 1302
 
 
 def lines(agent: str, frame: int) -> list[str]:
-    """tiny's own row and van; a car that nobody sees before frame 11, a pedestrian and two untracked cars."""
+    """tiny's own row and van; a car that nobody sees before frame 11, a pedestrian and two
+    untracked cars.
+    """
     seen = frame >= 11
     return [
         *tiny.label_lines(agent, frame)[:-1],
@@ -82,7 +86,9 @@ def drawn(labels: MotionLabels, actor: int) -> list[int]:
 def test_it_draws_what_boxes_poses_and_visible_actors_say(
     da_motion: DeepAccident, config: MotionLabelConfig
 ) -> None:
-    """The same through the public calls, a moment at a time; of one sample, and of many whatever lies beside them."""
+    """The same through the public calls, a moment at a time; of one sample, and of many whatever
+    lies beside them.
+    """
     places = [(scenario["token"], agent) for scenario in da_motion.scenario for agent in AGENTS]
     records = [
         da_motion.get_sample(*place, number) for number in (1, 13, 26, 35) for place in places
@@ -248,7 +254,8 @@ def test_ids_go_on_from_the_sample_before(small: DeepAccident) -> None:
 
 
 def test_vectors_turn_with_their_cells(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The ego turns by 40 degrees within 2 s: at the present, a cell and its offset still lead to one place.
+    """The ego turns by 40 degrees within 2 s: at the present, a cell and its offset still lead to
+    one place.
 
     The released ones lead elsewhere, the farther the longer the van.
     """
@@ -266,7 +273,9 @@ def test_vectors_turn_with_their_cells(tmp_path: Path, monkeypatch: pytest.Monke
 
 
 def spread(labels: MotionLabels, t: int, actor: int) -> float:
-    """How far apart, in cells, the places are that an actor's cells and their offsets lead to: half of the longer."""
+    """How far apart, in cells, the places are that an actor's cells and their offsets lead to: half
+    of the longer.
+    """
     cells = np.argwhere(labels.instance[t] == labels.id_map[actor])
     return float(np.ptp(cells + labels.offset[t][:, cells[:, 0], cells[:, 1]].T, axis=0).max()) / 2
 
@@ -369,12 +378,15 @@ def leaning(agent: str, frame: int):
 
 
 def lines_around(agent: str, frame: int) -> list[str]:
-    """Cars around the agent; it sees some of them always, some at times, some never, and others see those."""
+    """Cars around the agent; it sees some of them always, some at times, some never, and others see
+    those.
+    """
     own, later = agent != "infrastructure", frame > 12
     return [
         *tiny.label_lines(agent, frame)[:-1],
         *(
-            f"{kind} {x} {y} -1.1 {4.4 + width:.3f} {width} 1.7 {angle} 0.0 0.0 {actor} {points} {seen}"
+            f"{kind} {x} {y} -1.1 {4.4 + width:.3f} {width} 1.7 {angle} 0.0 0.0 "
+            f"{actor} {points} {seen}"
             for kind, x, y, width, angle, actor, points, seen in (
                 ("car", 14.03 + frame / 7, 7.1, 1.9, 0.4, 1301, 90, later),
                 ("truck", 31.01, -19.3, 2.6, -1.2, 1302, 90, not own),

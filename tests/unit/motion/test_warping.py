@@ -1,4 +1,6 @@
-"""Warps: the three rules on small grids, labels to the present, and maps of past moments and of agents."""
+"""Warps: the three rules on small grids, labels to the present, and maps of past moments and of
+agents.
+"""
 
 from dataclasses import replace
 from typing import Any
@@ -198,7 +200,9 @@ def test_single_precision_inverses_are_inverses() -> None:
 
 
 def test_sines_are_torchs_and_not_the_nearest_float32() -> None:
-    """As torch 2.13 gave them on a processor; most of these are chosen to be the nearest's neighbours."""
+    """As torch 2.13 gave them on a processor; most of these are chosen to be the nearest's
+    neighbours.
+    """
     angles = np.array([-2.86, -2.84, -2.8, -2.9, -2.85, -2.74, 0.0, 3.1], dtype=np.float32)
     assert_array_equal(
         single_precision.sines_and_cosines(angles)[1],
@@ -239,7 +243,9 @@ def test_sines_are_torchs_and_not_the_nearest_float32() -> None:
 
 
 def make_labels(config: MotionLabelConfig, step: list[float]) -> MotionLabels:
-    """One cell of an instance, 2.5 m ahead and 0.5 m to the left of each frame's own ego, which moves by `step`."""
+    """One cell of an instance, 2.5 m ahead and 0.5 m to the left of each frame's own ego, which
+    moves by `step`.
+    """
     mask = np.broadcast_to(at(2.5, 0.5, config.grid) > 0, (config.label_frames, *config.grid.shape))
     ahead = {"devkit": (0, 1), "released": (0, 1), "fiery": (1, 0)}[config.grid.orientation]
     vectors = np.where(mask[:, None], np.reshape(ahead, (1, 2, 1, 1)), config.ignore_index).astype(

@@ -25,7 +25,9 @@ def raw_calib() -> dict[str, np.ndarray]:
 
 @pytest.fixture(scope="session")
 def outcome() -> Callable:
-    """Call a reader: what it returns and None, or None and what its error of this kind says; no other may escape."""
+    """Call a reader: what it returns and None, or None and what its error of this kind says; no
+    other may escape.
+    """
 
     def call(kind: type[Exception], reader: Callable, *arguments: object) -> tuple:
         try:

@@ -49,5 +49,8 @@ def test_other_arrays_are_refused(
 ) -> None:
     np.savez_compressed(path, data=np.zeros(shape, dtype=dtype))
     found = f"found {shape} of {np.dtype(dtype)}".replace("(", r"\(").replace(")", r"\)")
-    message = rf"^{path}: expected shape \(1200, 1200, 3\) of uint8, {found}; restore the file from its archive$"
+    message = (
+        rf"^{path}: expected shape \(1200, 1200, 3\) of uint8, {found}; restore "
+        rf"the file from its archive$"
+    )
     assert_refused((lambda: read_bev(path, raw=raw), SensorFileError, message))

@@ -1,4 +1,6 @@
-"""Checkpoints of PyTorch, read without it; those that PyTorch writes are in `tests/torch_extra/model`."""
+"""Checkpoints of PyTorch, read without it; those that PyTorch writes are in
+`tests/torch_extra/model`.
+"""
 
 import pytest
 

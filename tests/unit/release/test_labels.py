@@ -22,8 +22,10 @@ PARKED = "car -38.698 -19.789 -0.882 4.181 1.994 1.381 -0.000518 0.0 0.0 20001 0
 OWN = "car -0.0026 -1.4e-05 -1.2216 4.674 1.812 1.442 0.0 0.00344 -5.6167 -100 1394 False"
 WALKER = "pedestrian 21.8 -1.46 -0.84 0.375 0.375 1.86 2.19 0.0 0.0 -1 0 True"
 BEHIND = (
-    "car -13.459459497478285 -0.0037344838527602064 -1.2119891287962656 4.791779518127441 2.163450002670288 "
-    "1.4876600503921509 0.00033209590742323136 -4.587319957896956 -0.016017722274652455 5481 197 True"
+    "car -13.459459497478285 -0.0037344838527602064 -1.2119891287962656 "
+    "4.791779518127441 2.163450002670288 "
+    "1.4876600503921509 0.00033209590742323136 -4.587319957896956 "
+    "-0.016017722274652455 5481 197 True"
 )
 REAL = "\n".join([HEADER, PARKED, OWN, WALKER, BEHIND, ""])
 REMEDY = "; restore the file from its archive, or leave the scenario out with on_error='skip'"
@@ -188,7 +190,8 @@ WORDS = st.one_of(
     st.from_regex(r"-?[0-9]{1,25}(\.[0-9]{0,25})?([eE][+-]?[0-9]{1,2})?", fullmatch=True),
     st.from_regex(r"-?\.[0-9]{1,25}", fullmatch=True),
     st.floats(-2.3e-308, 2.3e-308).map(repr),
-    # halfway between two doubles and just beside it; the ends of the range; zeros; blanks of other kinds
+    # halfway between two doubles and just beside it; the ends of the range; zeros; blanks of other
+    # kinds
     st.sampled_from(
         [
             "-0.0",

@@ -45,7 +45,10 @@ def test_no_points_are_a_cloud(path: Path) -> None:
 )
 def test_other_arrays_are_refused(path: Path, data: np.ndarray, found: str, raw: bool) -> None:
     np.savez(path, data=data)
-    message = rf"^{path}: expected points \(N, 4\) of floats, found {found}; restore the file from its archive$"
+    message = (
+        rf"^{path}: expected points \(N, 4\) of floats, found {found}; restore "
+        rf"the file from its archive$"
+    )
     assert_refused((lambda: read_lidar(path, raw=raw), SensorFileError, message))
 
 

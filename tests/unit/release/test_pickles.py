@@ -1,4 +1,6 @@
-"""Pickles for old readers: which names they ask for, and that their bytes follow from the values alone."""
+"""Pickles for old readers: which names they ask for, and that their bytes follow from the values
+alone.
+"""
 
 import hashlib
 import io

@@ -48,7 +48,10 @@ def test_a_malformed_line_is_named_by_its_number_in_the_file(
     path: Path, line: str, raw: bool
 ) -> None:
     path.write_text(f"{TYPE} {NAME}\n\n{line}\n")
-    message = rf"^{path}:3: expected '<scenario_type> <scenario>', found '{line}'; mend or remove the line$"
+    message = (
+        rf"^{path}:3: expected '<scenario_type> <scenario>', found '{line}'; "
+        rf"mend or remove the line$"
+    )
     assert_refused((lambda: read_split_file(path, raw=raw), SplitFileError, message))
 
 

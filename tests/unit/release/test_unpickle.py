@@ -1,4 +1,6 @@
-"""Pickles as old and new numpy write them are read; pickles that ask for anything else run nothing."""
+"""Pickles as old and new numpy write them are read; pickles that ask for anything else run
+nothing.
+"""
 
 import functools
 import json
@@ -35,7 +37,9 @@ def assert_read_back(path: Path, content: bytes, want: Calibs) -> None:
 
 
 def renamed(content: bytes, core: str) -> bytes:
-    """The pickle as the numpy with this private package (`numpy.core` or `numpy._core`) writes it."""
+    """The pickle as the numpy with this private package (`numpy.core` or `numpy._core`) writes
+    it.
+    """
     other = "numpy._core" if core == "numpy.core" else "numpy.core"
     for module in ("multiarray", "numeric"):
         old, new = f"{other}.{module}".encode(), f"{core}.{module}".encode()
@@ -147,7 +151,8 @@ def test_a_pickle_that_runs_something_runs_nothing(
     assert list(folder.iterdir()), "the attack itself does not work, so refusing it shows nothing"
 
 
-# opcodes: c name, S text, V unicode, ( mark, t tuple, R call, i and o call a class, b build, 0 pop, . stop
+# opcodes: c name, S text, V unicode, ( mark, t tuple, R call, i and o call a class, b build, 0 pop,
+# . stop
 SYSTEM = b"cposix\nsystem\n"
 RECONSTRUCT = b"cnumpy.core.multiarray\n_reconstruct\n"
 NDARRAY = b"cnumpy\nndarray\n"
@@ -290,8 +295,8 @@ LONG_BYTES = b"B" + int4(800_000) + bytes(800_000)
 # the hash of the last one, and its text in a message, visit 2 ** 60 tuples
 DOUBLING = b"N\x85q\x00" + b"".join(b"h%ch%c\x86q%c" % (n, n, n + 1) for n in range(60))
 MEMO_BOMB = b"r\xff\xff\xff\x0f"
-# A reader of frames that has 1 byte left in one, and needs 4, goes to the 4 bytes after the frame: it would take the
-# number's last 3 bytes and the opcode C, and then run C's contents.
+# A reader of frames that has 1 byte left in one, and needs 4, goes to the 4 bytes after the frame:
+# it would take the number's last 3 bytes and the opcode C, and then run C's contents.
 FRAME_TRICK = b"V0\n\x95\x02" + bytes(7) + b"J\x00" + bytes(3) + b"C(N" + MEMO_BOMB.ljust(39, b"0")
 BOMBS = {
     "deep key": (

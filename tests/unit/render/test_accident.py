@@ -1,4 +1,6 @@
-"""The countdown to an impact: which cameras, which moments, what is at which place, and the words."""
+"""The countdown to an impact: which cameras, which moments, what is at which place, and the
+words.
+"""
 
 import shutil
 from collections.abc import Sequence
@@ -185,7 +187,9 @@ def red_size(ax: Any) -> Any:
 def assert_pair_is_seen(
     da: DeepAccident, scenario: Any, seconds: Sequence[float], width: float
 ) -> None:
-    """At every moment: in the cameras of three agents or more, and from above with both tags; no tag is left out."""
+    """At every moment: in the cameras of three agents or more, and from above with both tags; no
+    tag is left out.
+    """
     tags = {*CollidingPair.of(da, da.collision(scenario)).tags.values()}
     figure = detached_figure((width * len(seconds), 4.2 * width))
     render_accident(da, scenario, seconds=seconds, agents=AGENTS, fig=figure)

@@ -38,7 +38,9 @@ def test_the_box_of_a_collider_passes_within_two_pixels_of_its_corners(
 
 
 def corners_of_ego(da: DeepAccident, behind: str) -> Any:
-    """The corners of the ego's box in the front camera of who drives behind it, pixels, and which are in the image."""
+    """The corners of the ego's box in the front camera of who drives behind it, pixels, and which
+    are in the image.
+    """
     boxes, camera = da.boxes(behind, "Camera_Front"), camera_of(da, f"{behind}/Camera_Front")
     ego = da.get("agent", f"{behind.rsplit('/', 2)[0]}/ego_vehicle")["actor_id"]
     pixels, _ = camera.project(boxes.corners()[boxes.actor_id == ego][0])

@@ -1,4 +1,6 @@
-"""Pictures of motion labels and predictions: what is drawn where, in which colour, and what is not."""
+"""Pictures of motion labels and predictions: what is drawn where, in which colour, and what is
+not.
+"""
 
 from dataclasses import replace
 from typing import Any
@@ -57,7 +59,9 @@ STEP = (3.0, 1.5)
 
 
 def two_cars(config: MotionLabelConfig = CONFIG, *, frames: int = 3) -> MotionLabels:
-    """The ego, which stands, and car 7, which starts at (10.25, 5.25) and drives on; some frames are recorded."""
+    """The ego, which stands, and car 7, which starts at (10.25, 5.25) and drives on; some frames
+    are recorded.
+    """
     moments = [
         FramePolygons(
             corners=np.array(

@@ -1,4 +1,6 @@
-"""The texts of every view: in the picture, not over each other, and large enough to be read in print."""
+"""The texts of every view: in the picture, not over each other, and large enough to be read in
+print.
+"""
 
 from collections.abc import Callable
 from typing import Any
@@ -94,7 +96,9 @@ def accidents(da: DeepAccident) -> list[Any]:
 def test_texts_are_in_the_picture_and_apart_and_panels_are_large(
     da_b: DeepAccident, view: str, where: Any
 ) -> None:
-    """What is square on a slide is as high as it can be, and maps have keys; the pair is within the view."""
+    """What is square on a slide is as high as it can be, and maps have keys; the pair is within the
+    view.
+    """
     scenario = accidents(da_b)[0]
     with style(where):
         figure = VIEWS[view](da_b, scenario).figure

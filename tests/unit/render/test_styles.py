@@ -114,7 +114,9 @@ def test_no_setting_of_the_user_changes_a_picture(
 
 
 def test_no_setting_of_the_user_changes_a_file(tmp_path: Path) -> None:
-    """Nor if it is other when the figure is saved; and a figure that went through a pickle stays one of ours."""
+    """Nor if it is other when the figure is saved; and a figure that went through a pickle stays
+    one of ours.
+    """
     written = []
     for settings in ({}, HOSTILE):
         drawn = curve()

@@ -1,4 +1,6 @@
-"""Curves of a training run: a panel for each number, and a file that is there whole or not at all."""
+"""Curves of a training run: a panel for each number, and a file that is there whole or not at
+all.
+"""
 
 from pathlib import Path
 

@@ -25,7 +25,9 @@ def named(town: str, number: int) -> str:
 
 @pytest.fixture(scope="module")
 def da(tmp_path_factory: pytest.TempPathFactory) -> DeepAccident:
-    """Five scenarios: an accident, a quiet one, one without a meta, one with a third vehicle, one in another town."""
+    """Five scenarios: an accident, a quiet one, one without a meta, one with a third vehicle, one
+    in another town.
+    """
     root = tmp_path_factory.mktemp("selection")
     third = META.replace("1223 car 1212", "1223 car 1300").replace("ego other", "ego none")
     scenarios = [

@@ -367,7 +367,10 @@ def test_split_files_of_ones_own(da_b: DeepAccident, tmp_path: Path) -> None:
     path.write_text(
         "\n".join([lines[2], *[f"type1_subtype1_normal TownX{number}" for number in range(4)]])
     )
-    message = r"mine\.txt: 4 of its 5 scenarios are not in .*: type1_subtype1_normal/TownX0, .*TownX2, …; pass missing"
+    message = (
+        r"mine\.txt: 4 of its 5 scenarios are not in .*: "
+        r"type1_subtype1_normal/TownX0, .*TownX2, …; pass missing"
+    )
     assert_refused(
         (lambda: da_b.split_scenarios(path), NotAvailableError, message),
     )

@@ -1,4 +1,6 @@
-"""The facts of a release: planted in releases written by hand, computed again plainly, and what is said of them."""
+"""The facts of a release: planted in releases written by hand, computed again plainly, and what is
+said of them.
+"""
 
 import json
 import math
@@ -86,11 +88,15 @@ def test_what_meta_says(tmp_path: Path, meta: str, planted: dict[str, float]) ->
 
 FRAMES = 24
 CARS = ((1212, 0, 0, 0, 1), (1223, 0, 1, 0, 0), (20001, 60, 0, 20, 0), (20002, 62, 0, 20, 0))
-"""Id, x, metres a frame, y, whether it is tilted: one drives at 10 m/s to one that stands; two parked ones overlap."""
+"""Id, x, metres a frame, y, whether it is tilted: one drives at 10 m/s to one that stands; two
+parked ones overlap.
+"""
 
 
 def write_crash(root: Path, lead: float, tilt: float) -> Path:
-    """A release in which the rear car is at x = frame, and the other's centre at `lead`, its yaw `tilt` degrees."""
+    """A release in which the rear car is at x = frame, and the other's centre at `lead`, its yaw
+    `tilt` degrees.
+    """
 
     def lines(agent: str, frame: int) -> list[str]:
         there = ego_to_world(agent, frame) @ pose(z=lidar_height(agent))
@@ -270,7 +276,9 @@ def test_the_least_gaps_and_errors_are_those_of_plain_loops(da_motion: DeepAccid
 
 @pytest.fixture(scope="module")
 def many(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Twelve accidents and twelve twins; a collision with id 0, another with an odd word; in a folder with a name."""
+    """Twelve accidents and twelve twins; a collision with id 0, another with an odd word; in a
+    folder with a name.
+    """
     odd = {1: UNKNOWN, 2: META.replace("front_side", "left_side")}
     root = tmp_path_factory.mktemp("facts") / "home of Jane Doe"
     for number in range(12):

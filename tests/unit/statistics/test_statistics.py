@@ -1,4 +1,6 @@
-"""The statistics' numbers: by hand on a tiny release, and by plain Python over records on a synthetic one."""
+"""The statistics' numbers: by hand on a tiny release, and by plain Python over records on a
+synthetic one.
+"""
 
 import csv
 import json
@@ -42,7 +44,9 @@ def named(number: int) -> str:
 
 @pytest.fixture(scope="module")
 def tiny(tmp_path_factory: pytest.TempPathFactory) -> DeepAccident:
-    """Six scenarios: design 1, a quiet one, a pedestrian hit, a third vehicle, no design; one without anything."""
+    """Six scenarios: design 1, a quiet one, a pedestrian hit, a third vehicle, no design; one
+    without anything.
+    """
     root = tmp_path_factory.mktemp("statistics")
     write_tiny_release(root, name=named(1))
     write_tiny_release(root, name=named(2), scenario_type=NORMAL, meta=QUIET, agents=EGO, frames=35)

@@ -130,7 +130,10 @@ def test_arrays_that_cannot_be_read_say_what_to_do(
     kind: type[Foreign], error: type[Exception]
 ) -> None:
     given = kind([1.0], error("it is on another device"))
-    remedy = r"another device\); pass a torch tensor as tensor\.detach\(\)\.cpu\(\)\.float\(\), another framework's"
+    remedy = (
+        r"another device\); pass a torch tensor as "
+        r"tensor\.detach\(\)\.cpu\(\)\.float\(\), another framework's"
+    )
     assert_refused(
         (
             lambda: checked("x", given, (1,)),

@@ -1,4 +1,6 @@
-"""The cores that this process may use, by its affinity and by control groups in folders made here."""
+"""The cores that this process may use, by its affinity and by control groups in folders made
+here.
+"""
 
 import math
 from pathlib import Path
@@ -13,7 +15,9 @@ VERSION_2 = {"cpu.max": "{} {}\n"}
 
 
 def a_system(root: Path, groups: str, quotas: dict[str, str], files: dict[str, str]) -> Path:
-    """Write what a system says of this process; `quotas`: path below the control groups → quota and period."""
+    """Write what a system says of this process; `quotas`: path below the control groups → quota and
+    period.
+    """
     (root / "proc/self").mkdir(parents=True)
     (root / "proc/self/cgroup").write_text(f"9:name=systemd:/\n8:cpuset:/other\n{groups}\n")
     for path, words in quotas.items():

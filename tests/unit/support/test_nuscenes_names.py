@@ -1,4 +1,6 @@
-"""nuScenes' names that are not here: each error names a counterpart that is, and nothing else changes."""
+"""nuScenes' names that are not here: each error names a counterpart that is, and nothing else
+changes.
+"""
 
 import copy
 import inspect

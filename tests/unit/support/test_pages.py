@@ -53,7 +53,9 @@ def test_results_have_three_decimals_or_digits() -> None:
 
 
 def test_control_characters_of_names_are_shown_in_pages() -> None:
-    """Whoever prints a page in a terminal sees no colours, jumps or turned letters of a stranger's."""
+    """Whoever prints a page in a terminal sees no colours, jumps or turned letters of a
+    stranger's.
+    """
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(environment(), "loader", DictLoader({"page.html": "<p>{{ name }}\n\t</p>"}))
         page = document("page.html", style="", name="a\x1b[31m\x07\u202e\x9b\ud800é<")
@@ -62,5 +64,8 @@ def test_control_characters_of_names_are_shown_in_pages() -> None:
 
 
 def test_templates_are_read_when_the_first_page_is_made() -> None:
-    code = "import sys, deepaccident_devkit, deepaccident_devkit.cli; sys.exit('jinja2' in sys.modules)"
+    code = (
+        "import sys, deepaccident_devkit, deepaccident_devkit.cli; "
+        "sys.exit('jinja2' in sys.modules)"
+    )
     subprocess.run([sys.executable, "-c", code], check=True)

@@ -1,4 +1,6 @@
-"""Plug-ins of other packages: what they offer is found, and what is broken is left out with a reason."""
+"""Plug-ins of other packages: what they offer is found, and what is broken is left out with a
+reason.
+"""
 
 import importlib.metadata
 from collections.abc import Callable, Iterator
@@ -111,7 +113,10 @@ def test_two_plugins_with_one_verb_are_both_named(install: Callable[..., None]) 
 
 def test_a_plugin_for_another_version_of_the_protocol(install: Callable[..., None]) -> None:
     install(later=lambda: plugin_with("later", version=PROTOCOL_VERSION + 1))
-    told = f"it is for version {PROTOCOL_VERSION + 1} of the plug-in protocol, this devkit has {PROTOCOL_VERSION}"
+    told = (
+        f"it is for version {PROTOCOL_VERSION + 1} of the plug-in protocol, this "
+        f"devkit has {PROTOCOL_VERSION}"
+    )
     assert offers(lambda plugin: plugin.verbs).refused == {"later": told}
 
 

@@ -1,4 +1,6 @@
-"""The gate: regular files only, none above its kind's limit, no waiting, messages of bounded length."""
+"""The gate: regular files only, none above its kind's limit, no waiting, messages of bounded
+length.
+"""
 
 import errno
 import io
@@ -163,7 +165,8 @@ NOT_OF_STRANGERS = {
     "validation/croissant.py": "the package's own copy of a context",
     "release/images.py": "the head of an image that the gate opened",
     "release/store/store.py": "the cache's own copies",
-    "release/store/sources.py": "fsspec, and the directory of an archive that the gate or fsspec opened",
+    "release/store/sources.py": "fsspec, and the directory of an archive that the "
+    "gate or fsspec opened",
     "plugins/synth/benchmark.py": "the package's own benchmarks",
     "plugins/synth/spec/catalogue.py": "the package's own designs",
 }

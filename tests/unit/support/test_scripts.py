@@ -1,4 +1,6 @@
-"""Modules of JavaScript are joined in the order in which they need each other, or an error says why they cannot be."""
+"""Modules of JavaScript are joined in the order in which they need each other, or an error says why
+they cannot be.
+"""
 
 from pathlib import Path
 

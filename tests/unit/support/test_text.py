@@ -1,4 +1,6 @@
-"""Words that the devkit knows are taken in any case of letters; of another word, the error says which was meant."""
+"""Words that the devkit knows are taken in any case of letters; of another word, the error says
+which was meant.
+"""
 
 from collections.abc import Callable
 from typing import Any

@@ -29,7 +29,9 @@ def test_there_and_back_in_either_handedness(velocity: np.ndarray, yaw: np.ndarr
 
 
 def test_a_real_line_is_what_the_format_says() -> None:
-    """A car with yaw 90° (clockwise, y right) in the label that drives along world x has its velocity along y."""
+    """A car with yaw 90° (clockwise, y right) in the label that drives along world x has its
+    velocity along y.
+    """
     np.testing.assert_allclose(
         label_from_world_velocity(np.array([[8.0, 0.0]]), np.array([np.pi / 2])),
         [[0, 8]],
@@ -63,7 +65,9 @@ def test_fits_add_up() -> None:
 
 
 def test_displacements_are_of_one_agents_neighbour_frames() -> None:
-    """Central, one-sided, none over a gap, none of the untracked; another agent's rows do not count."""
+    """Central, one-sided, none over a gap, none of the untracked; another agent's rows do not
+    count.
+    """
     frame = np.array([1, 2, 3, 5, 1, 1])
     agent = np.array([0, 0, 0, 0, 0, 1])
     label_id = np.array([7, 7, 7, 7, -1, 7])

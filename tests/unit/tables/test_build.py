@@ -1,4 +1,6 @@
-"""The tables' values on a release written by hand: every number here was worked out apart from the devkit."""
+"""The tables' values on a release written by hand: every number here was worked out apart from the
+devkit.
+"""
 
 from pathlib import Path
 
@@ -69,7 +71,9 @@ def test_world_boxes_are_where_the_car_is_for_every_agent(hand_made: DeepAcciden
 def test_velocity_is_the_labels_decoded_or_comes_from_world_positions(
     hand_made: DeepAccident, frame: int
 ) -> None:
-    """In the LiDAR frame's axes, yawed by −90° in world. Central in the middle, one-sided at the ends."""
+    """In the LiDAR frame's axes, yawed by −90° in world. Central in the middle, one-sided at the
+    ends.
+    """
     token = f"{tiny.TOKEN}/ego_vehicle/{frame:03d}"
     derived = hand_made.boxes(token, velocity="derived").velocity
     np.testing.assert_allclose(
@@ -82,7 +86,9 @@ def test_velocity_is_the_labels_decoded_or_comes_from_world_positions(
 
 
 def test_velocity_is_exact_where_positions_tell_less(tmp_path: Path) -> None:
-    """A van whose label says 3 m/s at the end of its track, an untracked walker, and a van without a number."""
+    """A van whose label says 3 m/s at the end of its track, an untracked walker, and a van without
+    a number.
+    """
 
     def lines(agent: str, frame: int) -> list[str]:
         own, walker = (
@@ -182,7 +188,9 @@ def test_cameras_are_optical_and_sit_where_calib_says(hand_made: DeepAccident) -
 def test_a_sensor_has_one_row_where_rounding_alone_differs(
     tmp_path: Path, shift: float, rows: int
 ) -> None:
-    """Half a millimetre is the release's jitter, half a centimetre a sensor that moved; matrices are exact in both."""
+    """Half a millimetre is the release's jitter, half a centimetre a sensor that moved; matrices
+    are exact in both.
+    """
     root = tiny.write_tiny_release(tmp_path)
     path = root / tiny.TYPE / "ego_vehicle" / "calib" / tiny.NAME / f"{tiny.NAME}_003.pkl"
     raw = read_calib(path, raw=True)
@@ -231,7 +239,9 @@ def test_sensor_data_comes_with_boxes_in_the_sensors_frame(
 
 @pytest.mark.parametrize(("visible", "actors"), [("released", [1300]), ("camera", [1300, -1])])
 def test_visibility(hand_made: DeepAccident, visible: str, actors: list[int]) -> None:
-    """The van has 12 points and a camera for all; the pedestrian is untracked, the agent itself never counts."""
+    """The van has 12 points and a camera for all; the pedestrian is untracked, the agent itself
+    never counts.
+    """
     assert [box.actor_id for box in hand_made.get_boxes(FRAME_2, visible=visible)] == actors
 
 

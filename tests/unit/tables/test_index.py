@@ -71,7 +71,10 @@ FAULTS: dict[str, tuple[Callable[[Path], None], str]] = {
     ),
     "calib that is code": (
         lambda root: calib(root).write_bytes(pickle.dumps(print)),
-        r"_002\.pkl: not a readable calibration \(.*the pickle asks for builtins\.print, which is not allowed\)",
+        (
+            r"_002\.pkl: not a readable calibration \(.*the pickle asks for "
+            r"builtins\.print, which is not allowed\)"
+        ),
     ),
     "meta with a word missing": (
         lambda root: replace(root / tiny.TYPE / "meta" / f"{tiny.NAME}.txt", "same ", ""),
@@ -360,7 +363,9 @@ def test_a_file_in_a_folders_place_breaks_whose_folder_it_is(
 
 
 def test_a_scenario_whose_name_is_no_utf8_is_broken_and_hides_no_other(root: Path) -> None:
-    """Its folders, and its line in a split file; the system gives such names, and Arrow has none."""
+    """Its folders, and its line in a split file; the system gives such names, and Arrow has
+    none.
+    """
     odd = os.fsdecode(b"Town03_type001_subtype0001_\xff\xfe")
     tiny.write_tiny_release(root, name=odd)
     (root / "train.txt").write_bytes(

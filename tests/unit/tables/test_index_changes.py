@@ -1,4 +1,6 @@
-"""Files that were restored, edited or replaced since the index was made: what opening sees, and what mends the rest."""
+"""Files that were restored, edited or replaced since the index was made: what opening sees, and
+what mends the rest.
+"""
 
 import os
 import shutil

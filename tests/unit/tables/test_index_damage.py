@@ -1,4 +1,5 @@
-"""An index whose files were damaged, and a release whose files changed behind their sizes and times.
+"""An index whose files were damaged, and a release whose files changed behind their sizes and
+times.
 
 As a script it is the process that opens damaged tables: `python test_index_damage.py FOLDER`.
 """
@@ -87,7 +88,9 @@ def test_a_scenario_that_moved_to_another_split_is_found_there(tmp_path: Path) -
 
 
 def mutated(content: bytes, seed: int) -> bytes:
-    """With a bit flipped, a number replaced, bytes cut, put in or zeroed; mostly where Arrow's own numbers are."""
+    """With a bit flipped, a number replaced, bytes cut, put in or zeroed; mostly where Arrow's own
+    numbers are.
+    """
     source = random.Random(seed)  # noqa: S311 - the same damage every time
     place = source.choice(
         (source.randrange(len(content)), source.randrange(2000), -1 - source.randrange(2500))

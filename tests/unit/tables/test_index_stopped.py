@@ -1,4 +1,6 @@
-"""Indexing that is stopped: killed at any moment, by a full disk; and shared with other processes."""
+"""Indexing that is stopped: killed at any moment, by a full disk; and shared with other
+processes.
+"""
 
 import fcntl
 import json

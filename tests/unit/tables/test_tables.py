@@ -58,7 +58,7 @@ tables = [(spec, {column.stored: values(column.kind) for column in spec.stored_c
 before = len(os.listdir("/proc/self/task"))
 assert len(read_streams(pyarrow.BufferReader(streams(tables)), specs)) == len(specs) > 2
 print(len(os.listdir("/proc/self/task")) - before)
-"""
+"""  # noqa: E501
 
 
 def test_streams_are_written_and_read_without_threads() -> None:

@@ -16,7 +16,9 @@ INI = "[pytest]\nfilterwarnings = error\naddopts = --strict-config --strict-mark
 
 @dataclass(frozen=True)
 class Foreign:
-    """A folder of tests, where the devkit is installed with the entry points that pyproject.toml names."""
+    """A folder of tests, where the devkit is installed with the entry points that pyproject.toml
+    names.
+    """
 
     folder: Path
     site: Path

@@ -1,4 +1,6 @@
-"""Every breakage: what `validate` says of it, what opening and reading raise, and that nothing else is touched."""
+"""Every breakage: what `validate` says of it, what opening and reading raise, and that nothing else
+is touched.
+"""
 
 import shutil
 from collections.abc import Callable

@@ -1,4 +1,6 @@
-"""The plugin in a pytest of somebody else: found by its entry point, slow at nothing, and to be turned off."""
+"""The plugin in a pytest of somebody else: found by its entry point, slow at nothing, and to be
+turned off.
+"""
 
 import pytest
 
@@ -41,7 +43,7 @@ def test_the_folder_of_the_test_is_its_own(deepaccident_release_copy, deepaccide
 
 def test_both_layouts_were_there():
     assert seen == ["A", "B"]
-"""
+"""  # noqa: E501
 LIGHT = """
 import sys
 

@@ -36,7 +36,9 @@ def opened(deepaccident_release: Path) -> DeepAccident:
 
 
 def test_nothing_is_wrong_with_it(deepaccident_release: Path) -> None:
-    """Points are counted, top views show the boxes, poses and velocities agree: `validate` would say if not."""
+    """Points are counted, top views show the boxes, poses and velocities agree: `validate` would
+    say if not.
+    """
     report = validate_release(deepaccident_release, deep=True, workers=1)
     assert {(finding.severity, finding.code) for finding in report.findings} == {
         ("note", "unlabelled")
@@ -87,7 +89,9 @@ def test_the_pair_meets_in_the_last_frame_and_no_sooner_and_not_at_all_in_the_tw
 
 
 def test_the_pictures_show_the_boxes(make_deepaccident_release) -> None:
-    """The colour in the middle of a near box is another one than that of the background: a car is red."""
+    """The colour in the middle of a near box is another one than that of the background: a car is
+    red.
+    """
     options = SmallRelease(frames=1, splits=("train",), image_size=(160, 90), channels=CAMERAS)
     da = DeepAccident("v1", make_deepaccident_release(options), verbose=False)
     sample = da.get_sample(min(da.split_scenarios("train")), "ego_vehicle_behind", 1)
@@ -170,8 +174,10 @@ def test_it_needs_neither_the_generator_nor_what_tests_need(tmp_path: Path) -> N
     absent = ["embreex", "hypothesis", "pytest", "deepaccident_devkit.plugins.synth"]
     code = (
         f"import sys; sys.modules.update(dict.fromkeys({absent}));"
-        "from pathlib import Path; from deepaccident_devkit.testing import SmallRelease, broken_release;"
-        f"broken_release(Path({str(tmp_path / 'release')!r}), 'image-cut', SmallRelease(frames=1, splits=('val',)))"
+        "from pathlib import Path; from deepaccident_devkit.testing import "
+        "SmallRelease, broken_release;"
+        f"broken_release(Path({str(tmp_path / 'release')!r}), 'image-cut', "
+        f"SmallRelease(frames=1, splits=('val',)))"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
     (path,) = (tmp_path / "release").glob("*/ego_vehicle/Camera_Front/*/*.jpg")

@@ -48,7 +48,10 @@ def test_a_small_release_can_be_written_and_opened(
 
 
 def test_without_hypothesis_they_say_what_to_install() -> None:
-    code = "import sys; sys.modules['hypothesis'] = None; import deepaccident_devkit.testing.strategies"
+    code = (
+        "import sys; sys.modules['hypothesis'] = None; import "
+        "deepaccident_devkit.testing.strategies"
+    )
     ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert (
         "MissingExtraError: the strategies need hypothesis: in a checkout, pip install"

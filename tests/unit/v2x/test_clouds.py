@@ -83,7 +83,9 @@ def test_missing_clouds_are_an_error_or_left_out(
 
 
 def test_compensated_points_lie_on_the_actors_of_the_present(da: DeepAccident, sample: str) -> None:
-    """As many points are in the moving actors' present boxes as lay in their boxes of the time; without, fewer are."""
+    """As many points are in the moving actors' present boxes as lay in their boxes of the time;
+    without, fewer are.
+    """
     tracks = scenario_tracks(da, da.scenario[0])
     moving = tracks.at(4).actor_id[np.linalg.norm(tracks.at(4).velocity, axis=1) > 4]
     recorded = np.zeros(len(moving), dtype=int)
@@ -159,7 +161,9 @@ def test_of_boxes_that_overlap_the_last_moves_a_point_and_one_that_only_turns_mo
 
 
 def test_each_point_says_whose_and_how_old_it_is(da: DeepAccident, sample: str) -> None:
-    """Of three sweeps 0.1 s apart; the partner's arrive 0.1 s late, the ego's do not, and none is from frame 0."""
+    """Of three sweeps 0.1 s apart; the partner's arrive 0.1 s late, the ego's do not, and none is
+    from frame 0.
+    """
     cloud = da.aggregate_point_cloud(
         sample, agents=["infrastructure"], sweeps=3, link=Link(latency=0.1)
     )

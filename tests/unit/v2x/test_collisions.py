@@ -89,7 +89,9 @@ def test_synthetic_accidents_end_in_contact(da: DeepAccident) -> None:
 
 
 def accident(tmp_path: Path, lines, meta: str = tiny.META, **release) -> DeepAccident:
-    """Three frames in which all agents stand in the origin and the ego's label has lines by frame."""
+    """Three frames in which all agents stand in the origin and the ego's label has lines by
+    frame.
+    """
     lines_of = lambda agent, frame: ["0 0", *(lines(frame) if agent == "ego_vehicle" else ())]  # noqa: E731
     return DeepAccident(
         dataroot=tiny.write_tiny_release(
@@ -107,10 +109,13 @@ def origin(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("origin")
 def test_a_car_that_drives_into_anothers_left_side(tmp_path: Path) -> None:
-    """1223 drives along CARLA's +y (our −y) at 10 m/s; 1212 crosses along x at 2 m/s, its left side towards it."""
+    """1223 drives along CARLA's +y (our −y) at 10 m/s; 1212 crosses along x at 2 m/s, its left side
+    towards it.
+    """
     da = accident(
         tmp_path,
-        lambda frame: [  # at the last frame 2.5 m before the other's middle, 0.5 m from side to bumper
+        # at the last frame 2.5 m before the other's middle, 0.5 m from side to bumper
+        lambda frame: [
             f"car 20.0 {frame - 5.5} 0.0 2.0 2.0 1.5 {np.pi / 2} 0 0 1223 9 True",
             f"car {19.4 + 0.2 * frame} 0.0 0.0 4.0 2.0 1.5 0.0 0 0 1212 9 True",
         ],
@@ -202,7 +207,9 @@ def test_where_contact_begins() -> None:
 
 @pytest.mark.usefixtures("origin")
 def test_the_blow_is_before_the_end(tmp_path: Path) -> None:
-    """Of a car that pushes another from behind, the speeds are those of the last frame before the overlap."""
+    """Of a car that pushes another from behind, the speeds are those of the last frame before the
+    overlap.
+    """
     pushing = (
         "21.0 0.0 0.0 4.0 2.0 1.5 0.0 10",
         "22.0 0.0 0.0 4.0 2.0 1.5 0.0 10",
@@ -336,7 +343,9 @@ def nearest_line(corners: list[np.ndarray], others: list[np.ndarray]) -> np.ndar
 
 @pytest.mark.usefixtures("origin")
 def test_pairs_in_any_pose_by_plain_steps(tmp_path: Path) -> None:
-    """At the first frame of contact they face each other along the side's normal with the widest gap, and close so."""
+    """At the first frame of contact they face each other along the side's normal with the widest
+    gap, and close so.
+    """
     source, told = np.random.default_rng(4), {}
     for number in range(8):
         name = tiny.NAME.replace("00024", f"{number:05d}")
@@ -353,7 +362,8 @@ def test_pairs_in_any_pose_by_plain_steps(tmp_path: Path) -> None:
             )  # as the release writes velocities
             each = zip(moved, sizes, places[:, 2], turns, (1223, 1212), strict=True)
             return [
-                f"car {x} {y} 0 {length} {width} 1.5 {-yaw} {velocity.real} {velocity.imag} {actor} 9 True"
+                f"car {x} {y} 0 {length} {width} 1.5 {-yaw} {velocity.real} "
+                f"{velocity.imag} {actor} 9 True"
                 for (x, y), (length, width), yaw, velocity, actor in each
             ]
 
@@ -456,7 +466,9 @@ def test_a_pair_is_labelled_if_both_are_and_are_two() -> None:
 
 
 def test_the_scenario_to_begin_with(tmp_path: Path, da: DeepAccident) -> None:
-    """An accident whose pair labels show, else any accident, else the first scenario; none at all is an error."""
+    """An accident whose pair labels show, else any accident, else the first scenario; none at all
+    is an error.
+    """
     assert default_scenario(da) == first_accident(da)
     later = tiny.NAME.replace("00024", "00025")
     accident(tmp_path, lambda _: [])
@@ -471,7 +483,10 @@ def test_the_scenario_to_begin_with(tmp_path: Path, da: DeepAccident) -> None:
         (
             lambda: first_accident(silent),
             NotAvailableError,
-            f"that a meta file names; .* its meta, or show another view of .* there, such as {tiny.TOKEN}$",
+            (
+                f"that a meta file names; .* its meta, or show another view of .* "
+                f"there, such as {tiny.TOKEN}$"
+            ),
         ),
         (lambda: silent.collision(tiny.TOKEN), NotAvailableError, "has no meta file"),
     )

@@ -61,7 +61,9 @@ def test_actor_ids_are_those_of_the_instances(da: DeepAccident) -> None:
 
 
 def scene(rows: dict[str, Sequence[str]]):
-    """Lines of agents who all stand at the same place: what one has at x the others have there too."""
+    """Lines of agents who all stand at the same place: what one has at x the others have there
+    too.
+    """
     return lambda agent, _frame: ["0.0 0.0", *rows.get(agent, ())]
 
 

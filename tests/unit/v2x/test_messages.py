@@ -48,7 +48,10 @@ def test_a_latency_longer_than_the_past_names_what_there_is(
             (
                 partial(call, sample, agents=["infrastructure"], link=Link(latency=0.5)),
                 ConfigError,
-                r"from frame 004; the longest possible is 0\.3 s; .* a frame that has 5 others before it",
+                (
+                    r"from frame 004; the longest possible is 0\.3 s; .* a frame that "
+                    r"has 5 others before it"
+                ),
             )
             for call in (
                 da_b.cooperative_boxes,
@@ -146,7 +149,9 @@ def test_latency_shows_what_the_partner_saw_then(da_b: DeepAccident, sample: str
 
 
 def test_a_sweep_arrives_as_it_did_when_it_was_the_present(da_b: DeepAccident, sample: str) -> None:
-    """Of four sweeps each is what its own frame received, as far as the latency lets anything arrive there."""
+    """Of four sweeps each is what its own frame received, as far as the latency lets anything
+    arrive there.
+    """
     link, agents = Link(latency=0.1, pose_noise=0.3, packet_loss=0.4, seed=5), list(AGENTS[1:])
 
     def facts(token: str, sweeps: int) -> list[tuple[str, str, bytes]]:
@@ -306,7 +311,10 @@ def test_the_ends_of_each_range() -> None:
         (
             lambda: Link(latency=0.3).frame_sent("scenario", 3),
             ConfigError,
-            r"of scenario from frame 003; the longest possible is 0\.2 s; .* has 3 others before it",
+            (
+                r"of scenario from frame 003; the longest possible is 0\.2 s; .* "
+                r"has 3 others before it"
+            ),
         ),
     )
 

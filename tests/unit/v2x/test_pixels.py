@@ -1,7 +1,7 @@
 """Projected box centres fall on the pixels that the synthetic renderer painted for that actor.
 
-What is painted where comes from the generator's own rays; where a box lands comes from the labels of one agent, the
-calib files and the devkit's transforms into the cameras of another.
+What is painted where comes from the generator's own rays; where a box lands comes from the labels
+of one agent, the calib files and the devkit's transforms into the cameras of another.
 """
 
 from pathlib import Path
@@ -61,13 +61,17 @@ def unoccluded(scene: Scene, ground_from_camera: SE3) -> set[int]:
 
 
 def drawn_large(picture: np.ndarray) -> set[int]:
-    """The actors of many pixels: the ray through a pixel of a small one may pass between a pedestrian's legs."""
+    """The actors of many pixels: the ray through a pixel of a small one may pass between a
+    pedestrian's legs.
+    """
     actors, counts = np.unique(picture, return_counts=True)
     return set(actors[counts >= LARGE].tolist())
 
 
 def hits_and_tries(da: DeepAccident, scene: Scene, agent: Agent, labeller: str) -> tuple[int, int]:
-    """How many of a labeller's boxes land on their own actor in the images of an agent, and how many should."""
+    """How many of a labeller's boxes land on their own actor in the images of an agent, and how
+    many should.
+    """
     scenario, hits, tries = da.scenario[0]["token"], 0, 0
     source, sample = (f"{scenario}/{name}/{FRAME:03d}" for name in (labeller, agent.name))
     boxes, ids = da.boxes(source, "lidar"), da.actor_ids(source)

@@ -11,11 +11,13 @@ from deepaccident_devkit.v2x.collisions import labelled_pair
 from deepaccident_devkit.v2x.tracks import scenario_tracks
 
 WRITTEN = {
-    "agents.SHEER_CURTAINS": "('Town05_type001_subtype0002_scenario00035', 'Town05_type001_subtype0002_scenario00004')",
+    "agents.SHEER_CURTAINS": "('Town05_type001_subtype0002_scenario00035', "
+    "'Town05_type001_subtype0002_scenario00004')",
     "agents.VISIBILITIES": "('visible', 'partial', 'invisible')",
     "agents.AVAILABLE": "'available'",
     "agents.AGENT_SETS": (
-        "('single', '+behind', '+other', '+infrastructure', '+behind+other', 'vehicles', 'all', 'available')"
+        "('single', '+behind', '+other', '+infrastructure', '+behind+other', "
+        "'vehicles', 'all', 'available')"
     ),
     "agents.AgentConfig": "partners=()",
     "agents.AgentConfig.agents_for": "side='ego_vehicle'",
@@ -35,7 +37,8 @@ WRITTEN = {
     "messages.BOX_BYTES": "45",
     "messages.POSE_BYTES": "24",
     "messages.PoseNoise": "mean=0.0, std=0.02, heading_std=0.0",
-    "messages.Link": "latency=0.0, pose_noise=None, packet_loss=0.0, seed=0, budget=None, payload=None",
+    "messages.Link": "latency=0.0, pose_noise=None, packet_loss=0.0, seed=0, "
+    "budget=None, payload=None",
     "messages.message_sizes": (
         "agents=None, bev_shape=(64, 200, 200), bev_dtype=<class 'numpy.float32'>, clouds=True, "
         "link=None, on_missing='raise'"
@@ -52,7 +55,8 @@ WRITTEN = {
 
 def test_every_default_and_constant_written_out(da_b: DeepAccident) -> None:
     assert written_out("deepaccident_devkit.v2x") == WRITTEN
-    # of each module something is called: what the mutation runner changes is looked for by tests that come there
+    # of each module something is called: what the mutation runner changes is looked for by tests
+    # that come there
     nobody = Boxes.from_arrays(np.zeros((0, 3)), np.zeros((0, 3)), [])
     assert (
         len(moved_points(np.zeros((0, 3)), nobody, nobody))

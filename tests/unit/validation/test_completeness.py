@@ -1,4 +1,6 @@
-"""`validate --files`: what is here and what is missing is counted by split, agent and channel, from folders alone."""
+"""`validate --files`: what is here and what is missing is counted by split, agent and channel, from
+folders alone.
+"""
 
 import json
 import os

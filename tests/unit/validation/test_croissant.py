@@ -1,4 +1,6 @@
-"""The data card: what it counts, says and names, beside the tables and the files; and what mlcroissant makes of it."""
+"""The data card: what it counts, says and names, beside the tables and the files; and what
+mlcroissant makes of it.
+"""
 
 import importlib.util
 import json

@@ -1,4 +1,6 @@
-"""Stretches of zero bytes in pictures: found wherever they lie, and never where an encoder wrote them."""
+"""Stretches of zero bytes in pictures: found wherever they lie, and never where an encoder wrote
+them.
+"""
 
 import io
 

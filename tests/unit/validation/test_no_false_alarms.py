@@ -85,7 +85,9 @@ def untracked(rows: Rows, which: Callable[[int, list[str]], bool]) -> Rows:
     ],
 )
 def test_what_labels_may_be_like(release: Path, change: Callable[[int, Rows], Rows]) -> None:
-    """−1 is normal where it begins at a distance, whoever else is nearer (docs/format.md, Label)."""
+    """−1 is normal where it begins at a distance, whoever else is nearer (docs/format.md,
+    Label).
+    """
     rewrite(release.glob(LABELS), change)
     assert told(release) == set()
 

@@ -1,4 +1,6 @@
-"""Validation on any executor and by several processes: the same report as at once, and nothing is done twice."""
+"""Validation on any executor and by several processes: the same report as at once, and nothing is
+done twice.
+"""
 
 import os
 import shutil

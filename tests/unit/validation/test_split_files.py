@@ -1,4 +1,6 @@
-"""What `validate` says of split files where no planted fault tells: what is still known, folders, twins."""
+"""What `validate` says of split files where no planted fault tells: what is still known, folders,
+twins.
+"""
 
 import shutil
 from pathlib import Path

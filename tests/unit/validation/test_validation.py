@@ -1,6 +1,8 @@
-"""`validate`: healthy releases are clean, what it says is right, and it says so in every form it promises.
+"""`validate`: healthy releases are clean, what it says is right, and it says so in every form it
+promises.
 
-Planted faults are in tests/fault_injection; here are the rules behind them and what a fault cannot show.
+Planted faults are in tests/fault_injection; here are the rules behind them and what a fault cannot
+show.
 """
 
 import json
@@ -87,7 +89,9 @@ def test_a_few_frames_of_a_sensor_are_listed(release_root: Path, tmp_path: Path)
 
 
 def write_velocities(root: Path, angle: Callable[[float, float], float]) -> dict[str, np.ndarray]:
-    """Write each box's world velocity turned by `angle` of its yaw and its agent's, and return the truth by token."""
+    """Write each box's world velocity turned by `angle` of its yaw and its agent's, and return the
+    truth by token.
+    """
     release = DeepAccident(dataroot=root, verbose=False)
     truth = {}
     for sample in release.sample:

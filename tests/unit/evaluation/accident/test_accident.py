@@ -171,8 +171,8 @@ SURE, LATE, UNSURE = (
     ],
 )
 def test_which_accidents_are_compared(protocol, form, predicted, label, times) -> None:
-    """Of maps those of each prediction (as released none, if the first is empty); explicit ones by the paper the surest
-    up to the labels' end and half a step, by boxes all."""
+    """Of maps those of each prediction (as released none, if the first is empty); explicit ones by
+    the paper the surest up to the labels' end and half a step, by boxes all."""
     given = form(*map(scene, predicted)) if form else predicted
     made = compared_accidents(given, scene(label), KNOWN, PROTOCOLS[protocol])
     assert [each.time for each in made.predicted] == times

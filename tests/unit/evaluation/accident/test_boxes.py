@@ -1,4 +1,6 @@
-"""The protocol `boxes`: alarms against the boxes of a truth made by hand, and those of a release."""
+"""The protocol `boxes`: alarms against the boxes of a truth made by hand, and those of a
+release.
+"""
 
 import math
 from collections import Counter
@@ -25,7 +27,9 @@ PAIR = (FIRST, SECOND)
 
 
 def truth_of(gaps, pair=PAIR, seconds=2.0, at=None, **more) -> BoxTruth:
-    """A car at (20, 10), one behind it with these gaps every tenth of a second, and others that stand `at` places."""
+    """A car at (20, 10), one behind it with these gaps every tenth of a second, and others that
+    stand `at` places.
+    """
     count = len(gaps)
     rows = {
         FIRST: np.tile([20.0, 10.0], (count, 1)),
@@ -190,7 +194,9 @@ def test_whom_an_alarm_names(raised: Accident, truth: BoxTruth, error: int) -> N
 
 
 def plain(samples: Sequence[tuple[Sequence[Accident], BoxTruth]]) -> dict[str, Any]:
-    """The numbers, alarm by alarm; each has ids, and no two of a sample are equally sure and early."""
+    """The numbers, alarm by alarm; each has ids, and no two of a sample are equally sure and
+    early.
+    """
     made: Counter[str] = Counter()
     cases, late, ranked = [Counter() for _ in range(3)], [], []
     for given, truth in samples:
@@ -347,7 +353,9 @@ def test_maps_are_one_alarm_as_sure_as_the_share_of_them_that_see_it(form) -> No
     ],
 )
 def test_side_by_side_is_an_accident_in_maps_by_the_papers_reading_alone(follower) -> None:
-    """Cells of neighbours are 0.5 m apart, and so are those of two that touch squarely along the grid."""
+    """Cells of neighbours are 0.5 m apart, and so are those of two that touch squarely along the
+    grid.
+    """
     maps = as_maps(scene({1: standing(20, 10), 2: follower}))
     stricter = BoxAccidents(reading=AccidentReading(danger_distance=0.5))
     assert [len(counted(maps, PASSING, rules)["alarms"]) for rules in (BOXES, stricter)] == [1, 0]

@@ -182,7 +182,9 @@ def test_only_frames_that_are_recorded_count_and_half_a_step(
 def test_an_explicit_accident_names_who_is_there_at_the_nearest_frame(
     time: float, error: int
 ) -> None:
-    """Of four frames the last one is the nearest up to the end of their time; before, another was there."""
+    """Of four frames the last one is the nearest up to the end of their time; before, another was
+    there.
+    """
     assert (
         PAPER.counts([alarm(time=time)], scene(LATE_SWAP, frames=4), UNKNOWN)["best"]["id"] == error
     )
@@ -282,12 +284,16 @@ def test_who_collides(cars, contact, orientation) -> None:
 
 
 def test_positions_of_labels_without_the_half_cell_shift() -> None:
-    """Corners on cell edges belong to the cell beyond, so that a car lies a quarter metre ahead and to the right."""
+    """Corners on cell edges belong to the cell beyond, so that a car lies a quarter metre ahead and
+    to the right.
+    """
     assert_allclose(read(scene(HIT, protocol="clean")).positions, [[20.25, 9.75], [15.75, 9.75]])
 
 
 def test_an_instance_that_leaves_the_grid() -> None:
-    """It is half out when it collides, so that its mean cell is nearer; beyond it is nowhere, and matched before."""
+    """It is half out when it collides, so that its mean cell is nearer; beyond it is nowhere, and
+    matched before.
+    """
     leaving = [(46.0, 0.0), (48.0, 0.0), (50.0, 0.0), None, None]
     cars = {
         1: leaving,
@@ -388,7 +394,10 @@ def test_what_results_hold() -> None:
         "truths": {"meta": 0, "another": 0, "none": 0, "unknown": 4},
     }
     beside = {"sample_choice=mean_first": numbers | {"notes": [], "beside": {}}}
-    truth = "their truth is the labels' instance map, not the released grouping and linking of the labels"
+    truth = (
+        "their truth is the labels' instance map, not the released grouping "
+        "and linking of the labels"
+    )
     notes = [
         f"1 of 4 predictions were given as instance maps: {truth}",
         f"2 of 4 predictions were given as explicit accidents: {truth}",

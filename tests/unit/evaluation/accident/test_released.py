@@ -1,4 +1,6 @@
-"""The protocol `released`: each quirk on a scene that shows it; tests/parity/test_accident.py has the golden file."""
+"""The protocol `released`: each quirk on a scene that shows it; tests/parity/test_accident.py has
+the golden file.
+"""
 
 from dataclasses import replace
 
@@ -105,7 +107,9 @@ def test_maps_may_lie_in_any_orientation(orientation) -> None:
 
 @both
 def test_the_last_frame_is_the_last_that_is_recorded(form) -> None:
-    """Where the recording ends earlier, labels and predictions are cut, so that their last frames are the same."""
+    """Where the recording ends earlier, labels and predictions are cut, so that their last frames
+    are the same.
+    """
     assert tallies(counts(form(scene(ENDING)), scene(ENDING, frames=3))) == [TRUE] * 3
 
 

@@ -1,4 +1,6 @@
-"""What is exactly as near as allowed, or as another: the last bits of means of cells decide nothing."""
+"""What is exactly as near as allowed, or as another: the last bits of means of cells decide
+nothing.
+"""
 
 import math
 from dataclasses import replace

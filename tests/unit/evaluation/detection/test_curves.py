@@ -10,7 +10,9 @@ from deepaccident_devkit.evaluation.detection.matching import COLUMNS
 
 
 def test_levels_of_recall_are_sums_in_double_precision() -> None:
-    """A match for each level that recall exceeds: 7 of 56 is just 5/40, and does not exceed the sum of five 0.025."""
+    """A match for each level that recall exceeds: 7 of 56 is just 5/40, and does not exceed the sum
+    of five 0.025.
+    """
     assert (recall_matches(np.array([56]), 40) <= 7).sum() == 4
     assert (recall_matches(np.array([40]), 40) <= 40).sum() == 39
     assert recall_matches(np.array([2, 0]), 4).tolist() == [[1, 2, 2, 3], [1, 1, 1, 2]]
@@ -19,7 +21,9 @@ def test_levels_of_recall_are_sums_in_double_precision() -> None:
 def test_a_first_row_that_does_not_count_has_no_precision_and_a_first_sample_may_have_no_rows() -> (
     None
 ):
-    """Of three true boxes two are found by the second and the fourth row; the second sample is drawn twice or not."""
+    """Of three true boxes two are found by the second and the fourth row; the second sample is
+    drawn twice or not.
+    """
     ones = np.array([0, 1, 1, 1])
     cell = Cell(
         truths=np.array([1, 1, 1]),

@@ -1,4 +1,6 @@
-"""Detection metrics on cases whose numbers can be told by hand, the evaluator around them, and who is matched."""
+"""Detection metrics on cases whose numbers can be told by hand, the evaluator around them, and who
+is matched.
+"""
 
 import json
 import math
@@ -88,8 +90,8 @@ FIRST = found_at((10, 0, 0.9), (30, 0, 0.1)), truth_at((10, 0))
 SECOND = found_at((10, 0, 0.8)), truth_at((10, 0))
 SPARE = found_at((10, 0, 0.5), (20, 0, 0.4)), truth_at((10, 0))
 NEVER = 1 / 36
-"""Sums of 1/40 in double precision end above 1, which no recall exceeds: the last of 36 points is never reached, and
-counts as 0 in precision and as 1 in errors."""
+"""Sums of 1/40 in double precision end above 1, which no recall exceeds: the last of 36 points is
+never reached, and counts as 0 in precision and as 1 in errors."""
 ALL = 35 / 36
 
 
@@ -114,13 +116,16 @@ ALL = 35 / 36
             {},
             {"AP": [100 * ALL] * 4, "errors": [NEVER] * 4, "mAP": 100 * ALL / 6},
         ),
-        (  # beyond |x| = 84.85 m a detection does not count, but uses up the truth, neither found nor missed
+        # beyond |x| = 84.85 m a detection does not count, but uses up the truth, neither found nor
+        # missed
+        (
             "released",
             [(found_at((85.0, 0, 0.9), (10, 0, 0.5)), truth_at((84.0, 0), (10, 0)))],
             {},
             {"counted": [2, 1], "precision": [1] * 4, "recall": [0.5, 0.5, 1, 1]},
         ),
-        (  # at 2 m the score pass gives the truth to the one that does not count: no match, no points
+        # at 2 m the score pass gives the truth to the one that does not count: no match, no points
+        (
             "released",
             [(found_at((85.0, 0, 0.9), (83.0, 1.0, 0.5)), truth_at((84.0, 0)))],
             {},
@@ -177,7 +182,9 @@ ALL = 35 / 36
             {},
             {"errors": [0.5, 0.5, 2 * math.pi - 6, 4]},
         ),
-        (  # the heading is not wrapped, the scale not aligned, and an unknown true velocity is one of 0
+        # the heading is not wrapped, the scale not aligned, and an unknown true velocity is one of
+        # 0
+        (
             "released",
             [
                 (
@@ -238,7 +245,9 @@ ALL = 35 / 36
             {},
             {"errors": [0] * 4},
         ),
-        (  # 12 of 100 are found, the least sure one 1.2 m off: 0 on average up to recall 0.11, 0.1 m up to 0.12
+        # 12 of 100 are found, the least sure one 1.2 m off: 0 on average up to recall 0.11, 0.1 m
+        # up to 0.12
+        (
             "paper",
             [
                 (
@@ -333,7 +342,9 @@ def test_what_a_result_holds() -> None:
 
 
 def test_a_box_of_which_a_corner_is_out_of_range_does_not_count() -> None:
-    """Turned by 45°, a car of 4 × 2 m reaches 2.12 m along each axis, with another corner each time."""
+    """Turned by 45°, a car of 4 × 2 m reaches 2.12 m along each axis, with another corner each
+    time.
+    """
     for reach, counted in ((1.8, 0), (2.2, 4)):
         truth = truth_at(
             (140 - reach, 0), (reach - 140, 0), (0, 40 - reach), (0, reach - 40), yaw=math.pi / 4
@@ -384,7 +395,9 @@ def detected_at(*places: tuple[float, float]) -> DetectedBoxes:
 def test_of_several_that_are_near_enough_the_nearest_is_matched(
     protocol: str, nearest: int
 ) -> None:
-    """A detection looks for its true box or, in the released way, a true box for its detection: here one for two."""
+    """A detection looks for its true box or, in the released way, a true box for its detection:
+    here one for two.
+    """
     rules = DETECTION_PROTOCOLS[protocol]
     one, two = [(10.0, 0.0)], [(10.3, 0.0)] * 2
     two[nearest] = (10.1, 0.0)
@@ -404,7 +417,9 @@ def test_the_threshold_that_is_not_given_is_that_of_the_errors_or_the_middle_one
 
 
 def test_pairs_of_which_one_is_out_of_range_are_neither_matches_nor_errors() -> None:
-    """The released range ends at x = 84.85 m: the first pair has its truth beyond, the second its detection."""
+    """The released range ends at x = 84.85 m: the first pair has its truth beyond, the second its
+    detection.
+    """
     truth = truth_at((85.5, 0), (84.0, 20), (10, 0), (30, 0))
     found = detection_matches(
         detected_at((84.5, 0), (85.0, 20), (50, 0), (10, 0), (40, 0)), truth, "released", 4.0

@@ -24,7 +24,9 @@ SECONDS = (1.0, 2.0, 3.0)
 
 
 def truth_of(*seconds: float, scenario: str = "a/b", collider: int = 0) -> ForecastingTruth:
-    """Actors 1, 2, … go ahead at 10 m/s, 20 m apart from left to right; each is recorded for so long."""
+    """Actors 1, 2, … go ahead at 10 m/s, 20 m apart from left to right; each is recorded for so
+    long.
+    """
     actors = np.arange(1, len(seconds) + 1)
     steps = np.arange(1, 51) / 10
     path = np.stack([np.column_stack([10 * steps, np.full(50, -20.0 * actor)]) for actor in actors])

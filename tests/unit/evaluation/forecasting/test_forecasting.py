@@ -10,9 +10,11 @@ from deepaccident_devkit.evaluation.forecasting.evaluator import (
 WRITTEN = {
     "evaluator.TOGETHER": "'together'",
     "evaluator.FORECASTING_PROTOCOLS": (
-        "mappingproxy({'clean': ForecastingProtocol(horizons=(3.0, 1.0, 2.0, 5.0), modes=(6, 1), miss_distance=2.0)})"
+        "mappingproxy({'clean': ForecastingProtocol(horizons=(3.0, 1.0, 2.0, 5.0), "
+        "modes=(6, 1), miss_distance=2.0)})"
     ),
-    "evaluator.ForecastingProtocol": "horizons=(3.0, 1.0, 2.0, 5.0), modes=(6, 1), miss_distance=2.0",
+    "evaluator.ForecastingProtocol": "horizons=(3.0, 1.0, 2.0, 5.0), modes=(6, 1), "
+    "miss_distance=2.0",
     "metrics.MISS_DISTANCE": "2.0",
     "metrics.COLLISION_DISTANCE": "1.0",
     "metrics.SAME_TIME": "0.001",
@@ -24,12 +26,14 @@ WRITTEN = {
     "truth.MOVING_SPEED": "0.5",
     "truth.EVERYBODY": "'all'",
     "truth.CLASSES": (
-        "('class car', 'class truck', 'class van', 'class cyclist', 'class motorcycle', 'class pedestrian')"
+        "('class car', 'class truck', 'class van', 'class cyclist', 'class "
+        "motorcycle', 'class pedestrian')"
     ),
     "truth.ROLES": "('collider', 'other')",
     "truth.SEEN": "('seen by ego', 'seen by a partner alone', 'seen by nobody')",
     "truth.TO_IMPACT": (
-        "('0–1 s to impact', '1–2 s to impact', '2–3 s to impact', '3–4 s to impact', '4–5 s to impact', 'normal')"
+        "('0–1 s to impact', '1–2 s to impact', '2–3 s to impact', '3–4 s to "
+        "impact', '4–5 s to impact', 'normal')"
     ),
     "truth.MOTIONS": "('moving', 'standing')",
     "truth.forecasting_truth": "seconds=5.0",

@@ -184,7 +184,9 @@ def test_twins_are_the_price() -> None:
 
 
 def of_speeds(*speeds: float) -> tuple[PlanningEvaluator, list[str]]:
-    """Plans of these speeds in an accident recorded at 10 m/s and in its twin; a pair of scenarios a speed."""
+    """Plans of these speeds in an accident recorded at 10 m/s and in its twin; a pair of scenarios
+    a speed.
+    """
     evaluator, tokens = PlanningEvaluator(), []
     twin = replace(scene(10, partner=False), is_twin=True, is_collider=True)
     for number, speed in enumerate(speeds):
@@ -195,7 +197,9 @@ def of_speeds(*speeds: float) -> tuple[PlanningEvaluator, list[str]]:
 
 
 def test_intervals_of_progress_lost_cross_zero() -> None:
-    """Of plans that go farther than the recording as often as not, a plain jackknife by t says the same."""
+    """Of plans that go farther than the recording as often as not, a plain jackknife by t says the
+    same.
+    """
     evaluator, tokens = of_speeds(7, 13, 8, 12, 9, 11, 9.5, 11.5)
     clusters = evaluator.clustered({token: cluster_of(scenario_of(token)) for token in tokens})
     paths = [

@@ -28,7 +28,9 @@ Document = dict[str, Any]
 
 
 def refused(path: Path, *words: str) -> None:
-    """Reading fails, or else the check of all arrays, with a sentence that has these words in this order."""
+    """Reading fails, or else the check of all arrays, with a sentence that has these words in this
+    order.
+    """
     pattern = ".*".join(map(re.escape, words))
     assert_refused(
         (lambda: read_results(path).check(), ResultsError, f"(?s){pattern}"),
@@ -65,11 +67,17 @@ HEADERS: dict[str, tuple[Document, str]] = {
     "no task": ({"task": ...}, "required field `task`"),
     "an unknown task": (
         {"task": "tracking"},
-        'task: expected one of motion, accident, detection, planning, forecasting, found "tracking"',
+        (
+            "task: expected one of motion, accident, detection, planning, "
+            'forecasting, found "tracking"'
+        ),
     ),
     "a list of tasks": (
         {"task": ["accident"]},
-        'task: expected one of motion, accident, detection, planning, forecasting, found ["accident"]',
+        (
+            "task: expected one of motion, accident, detection, planning, "
+            'forecasting, found ["accident"]'
+        ),
     ),
     "another task": ({"task": "detection"}, f"results of '{FIRST}': [0]: "),
     "no meta": ({"meta": ...}, "required field `meta`"),
@@ -829,7 +837,9 @@ def test_shards_that_are_cut_or_changed(tmp_path: Path) -> None:
 
 
 def test_no_bit_of_a_shard_is_read_wrongly(tmp_path: Path) -> None:
-    """A shard whose checksum was made after the damage: the archive's own sums say it, or nothing is changed."""
+    """A shard whose checksum was made after the damage: the archive's own sums say it, or nothing
+    is changed.
+    """
     folder = plain.write_motion(tmp_path / "motion")
     path, expected = folder / "shards" / "00000.npz", plain.instance_arrays()["instance"]
     content, outcomes = path.read_bytes(), set()

@@ -1,4 +1,6 @@
-"""schema/results: the schemas are the code's, their examples are read, and the page's code writes valid files."""
+"""schema/results: the schemas are the code's, their examples are read, and the page's code writes
+valid files.
+"""
 
 import json
 import re

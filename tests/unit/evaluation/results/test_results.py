@@ -19,7 +19,8 @@ WRITTEN = {
     "records.FORMAT": "'DeepAccident results'",
     "records.FORMAT_VERSION": "1",
     "records.RESULTS_NAMES": (
-        "mappingproxy({'motion': 'motion', 'accident': 'accident.json', 'detection': 'detection.json', "
+        "mappingproxy({'motion': 'motion', 'accident': 'accident.json', "
+        "'detection': 'detection.json', "
         "'planning': 'planning.json', 'forecasting': 'forecasting.json'})"
     ),
     "records.RESULTS_FILE": "'results.json'",

@@ -1,4 +1,6 @@
-"""Files of results: what is written is what is read, whole or absent; by copies, threads and other processes."""
+"""Files of results: what is written is what is read, whole or absent; by copies, threads and other
+processes.
+"""
 
 import multiprocessing
 import pickle
@@ -179,7 +181,10 @@ class TestWriter:
                 ),
                 (
                     lidar,
-                    "expected boxes in the world frame, found lidar; give detected.transform(dataset.",
+                    (
+                        "expected boxes in the world frame, found lidar; give "
+                        "detected.transform(dataset."
+                    ),
                 ),
             ],
             "planning": [
@@ -254,7 +259,8 @@ def test_plans_and_forecasts_are_read_as_they_were_written(tmp_path: Path) -> No
 def test_tasks_without_results(tmp_path: Path) -> None:
     with pytest.raises(
         ChoiceError,
-        match="task: expected one of motion, accident, detection, planning, forecasting, found 'warning'",
+        match="task: expected one of motion, accident, detection, planning, "
+        "forecasting, found 'warning'",
     ):
         ResultsWriter(tmp_path / "x", "warning")  # type: ignore[arg-type]
 

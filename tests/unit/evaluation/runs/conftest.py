@@ -20,7 +20,9 @@ SETUP = EvaluationSetup(task="accident", protocol="boxes")
 
 @pytest.fixture(scope="session")
 def release_root_b(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The labels-only release with half a second more: at the impact itself nothing can be foreseen."""
+    """The labels-only release with half a second more: at the impact itself nothing can be
+    foreseen.
+    """
     root = tmp_path_factory.mktemp("runs") / "layout_b"
     return make_release(
         root,

@@ -1,4 +1,6 @@
-"""Two evaluations side by side: which differences are real, which two cannot be compared; the permutation test."""
+"""Two evaluations side by side: which differences are real, which two cannot be compared; the
+permutation test.
+"""
 
 import csv
 import itertools
@@ -247,7 +249,10 @@ def test_other_samples_tasks_and_rules(
         (
             lambda: compare_bundles(a, other, FEW),
             EvaluationError,
-            r"switches/reading.danger_distance 'absent' and 0.5; settings/choices/reading/danger_distance 1.0",
+            (
+                r"switches/reading.danger_distance 'absent' and 0.5; "
+                r"settings/choices/reading/danger_distance 1.0"
+            ),
         ),
         (
             lambda: compare_bundles(a, saved("c", split="train"), FEW, common=True),
@@ -298,7 +303,9 @@ def test_other_labels_and_another_devkit(saved: Save, results: Results) -> None:
 def test_equally_good_runs_are_rarely_called_really_different(
     tmp_path: Path, clusters: int, pairs: int
 ) -> None:
-    """Of two runs of the same law, with clusters that are hard for both, at most 5 % but for chance."""
+    """Of two runs of the same law, with clusters that are hard for both, at most 5 % but for
+    chance.
+    """
     source, real = np.random.default_rng(clusters), 0
     for pair in range(pairs):
         hard, folders = source.normal(0, 1, clusters), []
@@ -459,7 +466,9 @@ def test_holm() -> None:
 
 
 def test_the_interval_is_students() -> None:
-    """Of differences of ± 1 around 3: 19 degrees of freedom, and t = 2.093 at 95 % and 1.729 at 90 %."""
+    """Of differences of ± 1 around 3: 19 degrees of freedom, and t = 2.093 at 95 % and 1.729 at 90
+    %.
+    """
     first, second = np.zeros(20), 3 + np.tile([1.0, -1.0], 10)
     error = math.sqrt(20 / 19) / math.sqrt(20)
     for confidence, t in ((0.95, 2.093), (0.9, 1.729)):
@@ -477,7 +486,10 @@ def test_clusters_that_are_too_few() -> None:
         undecided(made, 0, 4, 5) == "no decision is possible with 5 clusters; at least 8 are needed"
     )
     few = paired(np.zeros(30), np.eye(30)[0])
-    text = "no decision is possible with 1 of 30 clusters in which the two differ; at least 6 are needed"
+    text = (
+        "no decision is possible with 1 of 30 clusters in which the two "
+        "differ; at least 6 are needed"
+    )
     assert undecided(few, 0, 1, 30) == text
 
 

@@ -1,4 +1,6 @@
-"""From a results file to an evaluation: refusals, partial and broken-off runs, workers and executors."""
+"""From a results file to an evaluation: refusals, partial and broken-off runs, workers and
+executors.
+"""
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -104,7 +106,9 @@ class TestRefused:
         write_motion: Write,
         write_accidents: Write,
     ) -> None:
-        """Of another kind, of too short a look ahead, with a damaged shard, missing samples, nothing in common."""
+        """Of another kind, of too short a look ahead, with a damaged shard, missing samples,
+        nothing in common.
+        """
         tokens, motion = selection.tokens(da_b), EvaluationSetup(task="motion")
         accidents = write_accidents(tmp_path / "some.json", tokens[1:])
         others = write_accidents(

@@ -1,4 +1,6 @@
-"""Extra results that plug-ins add to runs: looked up by name, and named where the plug-in is not installed."""
+"""Extra results that plug-ins add to runs: looked up by name, and named where the plug-in is not
+installed.
+"""
 
 import pytest
 

@@ -1,4 +1,6 @@
-"""Evaluations over the bytes that partners send: whose numbers are shown, with which intervals, and who is refused."""
+"""Evaluations over the bytes that partners send: whose numbers are shown, with which intervals, and
+who is refused.
+"""
 
 import json
 from pathlib import Path

@@ -1,4 +1,6 @@
-"""`check_sanity`: each classic mistake is named as exactly that; right predictions and baselines raise no suspicion."""
+"""`check_sanity`: each classic mistake is named as exactly that; right predictions and baselines
+raise no suspicion.
+"""
 
 import json
 from collections.abc import Callable
@@ -230,7 +232,9 @@ def in_the_world(times: np.ndarray, places: np.ndarray, ego: Any) -> tuple[np.nd
 
 
 def late(times: np.ndarray, places: np.ndarray, _: Any) -> tuple[np.ndarray, np.ndarray]:
-    """The present first, under the time of the first step; of forecasts, whose present is not 0, without it."""
+    """The present first, under the time of the first step; of forecasts, whose present is not 0,
+    without it.
+    """
     if places.ndim == 3:
         return times + 0.5, places
     return times, np.vstack([np.zeros(2), places[:-1]])
@@ -408,7 +412,9 @@ def test_each_mistake_is_named_as_exactly_that(
 
 @pytest.mark.parametrize("mistake", ["", *PATHS, *ON_CURVES, "yaw from y", "yaw backwards"])
 def test_mistakes_of_plans_on_curves(monkeypatch: pytest.MonkeyPatch, mistake: str) -> None:
-    """Of an ego that turns left at 8 m/s, by 23° a second, and stands 50 m beside the world's origin."""
+    """Of an ego that turns left at 8 m/s, by 23° a second, and stands 50 m beside the world's
+    origin.
+    """
     seconds = np.arange(61) / 10
     yaw = 0.4 * seconds
     recorded = np.column_stack([20 * np.sin(yaw), 20 * (1 - np.cos(yaw)), yaw])
@@ -580,7 +586,10 @@ def test_from_which_shares_on_a_mistake_is_suspected(
     half = {name: tally_of(undone / 2, given / 2, whole / 2)}
     warnings = list(mistakes_of(summed([half, half]), task))
     assert len(warnings) == suspected
-    told = f"({undone / whole:.0%} of the truth is hit once that is undone, {given / whole:.0%} as it is)"
+    told = (
+        f"({undone / whole:.0%} of the truth is hit once that is undone, "
+        f"{given / whole:.0%} as it is)"
+    )
     assert all(each.startswith(f"{name}: ") and each.endswith(told) for each in warnings)
 
 

@@ -1,4 +1,6 @@
-"""What is evaluated and by which rules: choices by their names, the samples, and what an evaluator is given."""
+"""What is evaluated and by which rules: choices by their names, the samples, and what an evaluator
+is given.
+"""
 
 import pickle
 from dataclasses import replace
@@ -55,7 +57,10 @@ class TestSetup:
             (
                 {"task": "motions"},
                 ChoiceError,
-                r"task: expected one of motion, accident, detection, warning, planning, forecasting, found 'mo",
+                (
+                    r"task: expected one of motion, accident, detection, warning, "
+                    r"planning, forecasting, found 'mo"
+                ),
             ),
             (
                 {"task": "motion", "protocol": "boxes"},
@@ -333,7 +338,10 @@ def test_missing_extra_and_unknown_three_of_each(
         (
             {},
             {"agents": ("ego_vehicle",)},
-            "--agents ego_vehicle,ego_vehicle_behind,other_vehicle,other_vehicle_behind,infrastructure",
+            (
+                "--agents "
+                "ego_vehicle,ego_vehicle_behind,other_vehicle,other_vehicle_behind,infrastructure"
+            ),
         ),
         ({"agents": ("ego_vehicle",), "scope": "all"}, {"agents": ("ego_vehicle",)}, "--scope all"),
     ],

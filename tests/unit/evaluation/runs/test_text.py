@@ -1,4 +1,6 @@
-"""Summaries for people: of a run and of a stored bundle alike, marked where it is partial; notes, and predictors."""
+"""Summaries for people: of a run and of a stored bundle alike, marked where it is partial; notes,
+and predictors.
+"""
 
 import math
 from pathlib import Path
@@ -162,7 +164,9 @@ SUMMARY: dict[str, Any] = {
 
 
 def test_all_that_a_summary_may_have() -> None:
-    """Switches, agents, intervals, numbers of other choices, breakdowns of five headlines, notes; all of it partial."""
+    """Switches, agents, intervals, numbers of other choices, breakdowns of five headlines, notes;
+    all of it partial.
+    """
     intervals = {"at/a": [0.25, 0.75], "at/b": [None, 1.0], "at/c": None}
     agents = ["ego_vehicle", "infrastructure"]
     everyone = {"value": None, "intervals": intervals, "notes": ["no interval of b: few clusters"]}
@@ -288,8 +292,8 @@ def test_up_to_where_numbers_are_as_published() -> None:
     )
     [note] = notes("accident", predictions=5)
     assert (
-        note
-        == "predictions of a sample: 5; published numbers are of 6, five samples and then their mean"
+        note == "predictions of a sample: 5; published numbers are of 6, five "
+        "samples and then their mean"
     )
     assert notes("accident", predictions=7) == []
     [note] = notes(

@@ -1,4 +1,6 @@
-"""An accident of which no label shows both actors ends no evaluation: its samples are left out, and told."""
+"""An accident of which no label shows both actors ends no evaluation: its samples are left out, and
+told.
+"""
 
 import shutil
 from pathlib import Path
@@ -36,7 +38,9 @@ CHANGES: dict[str, tuple[int, str, str | None]] = {
     "one actor twice": (3, "", None),
     "a first line alone": (3, "0", ""),
 }
-"""Place in meta's first line, the actor there (the first one again), and its agents (no further lines at all)."""
+"""Place in meta's first line, the actor there (the first one again), and its agents (no further
+lines at all).
+"""
 
 
 @pytest.fixture(scope="module")

@@ -291,7 +291,9 @@ def test_files_foreign_missing_and_damaged(bundle: Path, da_b: DeepAccident) -> 
 
 
 def test_another_protocol_claimed(bundle: Path, da_b: DeepAccident) -> None:
-    """With a smaller danger distance the pairs that pass close by in the normal scenario are no accidents."""
+    """With a smaller danger distance the pairs that pass close by in the normal scenario are no
+    accidents.
+    """
     changed(
         bundle / "metrics_summary.json",
         lambda summary: summary.update(switches={"reading.danger_distance": 0.5}),

@@ -1,4 +1,6 @@
-"""Protocol `clean`: what a siren, silence and chance score, twins, groups, references, operating points."""
+"""Protocol `clean`: what a siren, silence and chance score, twins, groups, references, operating
+points.
+"""
 
 import math
 from dataclasses import asdict
@@ -117,7 +119,10 @@ def test_a_siren_pays_in_precision_and_time() -> None:
         "groups": {"ego_involved": siren},
         "beyond": 0,
         "notes": [
-            "the rows 'TTC < 3 s' need what constant velocities lead to: accident_context(…, references=True)"
+            (
+                "the rows 'TTC < 3 s' need what constant velocities lead to: "
+                "accident_context(…, references=True)"
+            )
         ],
     }
     assert list(references) == [*TRIVIAL, *REFERENCES]
@@ -184,7 +189,9 @@ def test_what_alarms_score(
 
 
 def test_length_does_not_tell_the_label() -> None:
-    """Recordings without a twin are longer; who is the less sure the longer it drives is no better than chance."""
+    """Recordings without a twin are longer; who is the less sure the longer it drives is no better
+    than chance.
+    """
     evaluator = evaluated(lambda _crash, ahead: 1 / (1 + np.arange(len(ahead))), pairs=6)
     counts = [
         dict(each, kind="others", to_end=None) if each["kind"] == "twins" else each

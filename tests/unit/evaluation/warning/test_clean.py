@@ -187,7 +187,9 @@ def test_figures_are_those_of_counting_frame_by_frame(seed: int) -> None:
 
 
 def test_the_windows_are_of_seconds() -> None:
-    """Of a frame a second: 3 s and more than 5 s before the impact at 10 s; one second a minute in alarm is allowed."""
+    """Of a frame a second: 3 s and more than 5 s before the impact at 10 s; one second a minute in
+    alarm is allowed.
+    """
     assert (WINDOW, EARLY, SAME_RECALL) == (3.0, 5.0, 0.8)
     early = ScoreSeries(
         scores=np.eye(10)[[4, 5]], positive=np.ones(2, dtype=bool), toa=np.full(2, 10.0), fps=1.0

@@ -1,4 +1,6 @@
-"""Protocol `field` on a few recordings by hand; parity has what the published codes print of many."""
+"""Protocol `field` on a few recordings by hand; parity has what the published codes print of
+many.
+"""
 
 import math
 from dataclasses import asdict
@@ -141,7 +143,9 @@ def test_what_a_code_prints_may_be_above_1() -> None:
 
 @pytest.mark.parametrize("references", [False, True])
 def test_what_a_result_holds(*, references: bool) -> None:
-    """For each code and group, of all alarms; of the reference predictors where they are asked for."""
+    """For each code and group, of all alarms; of the reference predictors where they are asked
+    for.
+    """
     counts = evaluated(
         always, pairs=2, agents=[("a", "ego_involved"), ("b", "bystander")], right=False
     ).counts

@@ -1,4 +1,6 @@
-"""What a sample adds, recordings made of samples by hand, scores by column, and how long alarms last."""
+"""What a sample adds, recordings made of samples by hand, scores by column, and how long alarms
+last.
+"""
 
 import math
 from dataclasses import replace
@@ -375,7 +377,9 @@ def test_runs_last_and_cost_what_is_left_of_them_after_the_reaction() -> None:
 def test_alarms_that_last_cost_something_and_fewer_never_more(
     alarm: np.ndarray, other: np.ndarray, reaction: float
 ) -> None:
-    """So the cost never rises with the threshold, and the lowest within a budget can be bisected."""
+    """So the cost never rises with the threshold, and the lowest within a budget can be
+    bisected.
+    """
     costs = AlarmRuns.of(alarm, 2.0).braking_seconds(reaction)
     assert (
         (costs > 0) == (AlarmRuns.of(alarm, 2.0).first_lasting(reaction) < alarm.shape[1])

@@ -1,4 +1,6 @@
-"""Answers: read back as accidents, and evaluated; malformed ones are refused with file, line and remedy."""
+"""Answers: read back as accidents, and evaluated; malformed ones are refused with file, line and
+remedy.
+"""
 
 import json
 from pathlib import Path

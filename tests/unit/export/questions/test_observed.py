@@ -1,4 +1,6 @@
-"""A question holds nothing of the future, of actors that nobody of its set sees, and no word that tells its ending."""
+"""A question holds nothing of the future, of actors that nobody of its set sees, and no word that
+tells its ending.
+"""
 
 import errno
 import re

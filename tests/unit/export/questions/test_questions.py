@@ -1,4 +1,6 @@
-"""What questions show and what their truth says, against the tables; whom they leave out, and how files come about."""
+"""What questions show and what their truth says, against the tables; whom they leave out, and how
+files come about.
+"""
 
 import json
 import shutil
@@ -91,7 +93,7 @@ def test_places_headings_speeds_and_sizes_are_those_of_the_labels(
         for actor in question["actors"]:
             assert actor["time"] == sorted(set(actor["time"]))
             for number, time in enumerate(actor["time"]):
-                token = f"{agents[actor['seen_by'][number][0]]}/{int(sample[-3:]) + round(10 * time):03d}"
+                token = f"{agents[actor['seen_by'][number][0]]}/{int(sample[-3:]) + round(10 * time):03d}"  # noqa: E501
                 boxes = da_motion.boxes(token, velocity="label").transform(ego_from_world, "ego")
                 row = np.flatnonzero(boxes.actor_id == truth["actors"][actor["name"]]).item()
                 assert actor["position"][number] == pytest.approx(

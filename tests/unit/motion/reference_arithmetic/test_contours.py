@@ -1,4 +1,6 @@
-"""The masks' contours, hulls and rectangles, against OpenCV 4.7.0's; whatever OpenCV is installed, which none asks."""
+"""The masks' contours, hulls and rectangles, against OpenCV 4.7.0's; whatever OpenCV is installed,
+which none asks.
+"""
 
 from pathlib import Path
 
@@ -15,8 +17,10 @@ from deepaccident_devkit.motion.reference_arithmetic.contours import (
 )
 
 ORACLE = Path(__file__).parents[3] / "data" / "min_area_rect_opencv_4_7.npz"
-"""2,400 masks of 24 × 24 cells (boxes at all angles, lines, blobs, noise, rings with dots in them, scraps) and what
-OpenCV 4.7.0 said of each: findContours(…, RETR_TREE, CHAIN_APPROX_SIMPLE)[0][0], its convexHull and its minAreaRect."""
+"""2,400 masks of 24 × 24 cells (boxes at all angles, lines, blobs, noise, rings with dots in them,
+scraps) and what
+OpenCV 4.7.0 said of each: findContours(…, RETR_TREE, CHAIN_APPROX_SIMPLE)[0][0], its convexHull and
+    its minAreaRect."""
 SIDE = 24
 EIGHT_NEIGHBOURS = np.ones((3, 3))
 

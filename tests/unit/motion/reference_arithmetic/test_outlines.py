@@ -1,4 +1,6 @@
-"""Outlines against scikit-image's, and distances between them; whatever scikit-image is installed, which none asks."""
+"""Outlines against scikit-image's, and distances between them; whatever scikit-image is installed,
+which none asks.
+"""
 
 from pathlib import Path
 
@@ -16,9 +18,10 @@ from deepaccident_devkit.motion.reference_arithmetic.outlines import (
 )
 
 ORACLE = Path(__file__).parents[3] / "data" / "outlines_skimage_0_20.npz"
-"""1,200 masks of 24 × 24 cells (boxes at all angles, whole or cut, noise, discs with holes, scraps; some at the border)
-with an id each, and what scikit-image 0.20.0 with numpy 1.23.5 said of each: outline = find_contours(mask * id, 0.1)[0]
-and kept, which of its points approximate_polygon(outline, 0.5) has."""
+"""1,200 masks of 24 × 24 cells (boxes at all angles, whole or cut, noise, discs with holes, scraps;
+some at the border) with an id each, and what scikit-image 0.20.0 with numpy 1.23.5 said of each:
+outline = find_contours(mask * id, 0.1)[0] and kept, which of its points
+approximate_polygon(outline, 0.5) has."""
 SIDE = 24
 
 
@@ -47,7 +50,9 @@ def test_outlines_are_scikit_images_to_the_last_bit(oracle, expected) -> None:
 
 
 def test_simplified_outlines_are_scikit_images_but_for_ties(oracle, expected) -> None:
-    """A point exactly half a cell off stays or goes in scikit-image by the last bit of a sine, here it goes."""
+    """A point exactly half a cell off stays or goes in scikit-image by the last bit of a sine, here
+    it goes.
+    """
     kept = np.split(oracle["kept"], np.cumsum(oracle["outline_length"])[:-1])
     found = simplified_outlines(expected)
     assert (

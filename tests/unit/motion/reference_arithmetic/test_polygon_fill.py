@@ -10,8 +10,8 @@ from deepaccident_devkit.errors import GeometryError
 from deepaccident_devkit.motion.reference_arithmetic.polygon_fill import filled_cells
 
 ORACLE = Path(__file__).parents[3] / "data" / "fill_poly_opencv_4_7.npz"
-"""Random quadrangles and what OpenCV 4.7.0's fillPoly drew of each: cars and trucks, tiny, crossing, degenerate and
-far-off ones, at the border; in images of 29 × 47 and 64 × 40 cells."""
+"""Random quadrangles and what OpenCV 4.7.0's fillPoly drew of each: cars and trucks, tiny,
+crossing, degenerate and far-off ones, at the border; in images of 29 × 47 and 64 × 40 cells."""
 
 
 @pytest.mark.parametrize("shape", [(29, 47), (64, 40)])

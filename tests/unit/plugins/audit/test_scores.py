@@ -1,4 +1,6 @@
-"""Scores that are a clip's length, a town or a clock are told; random ones, the truth and good detectors are not."""
+"""Scores that are a clip's length, a town or a clock are told; random ones, the truth and good
+detectors are not.
+"""
 
 import json
 import re
@@ -26,7 +28,9 @@ Made = Callable[[Mapping[str, Any], np.random.Generator], float]
 
 @pytest.fixture(scope="module")
 def release(tmp_path_factory: pytest.TempPathFactory) -> DeepAccident:
-    """Twins of two agents in three towns; an accident has 2 to 8 frames, its twin 7 to 13. One has no meta."""
+    """Twins of two agents in three towns; an accident has 2 to 8 frames, its twin 7 to 13. One has
+    no meta.
+    """
     root, rng = tmp_path_factory.mktemp("audit") / "release", np.random.default_rng(0)
     for number in range(PAIRS):
         for kind, low, meta in (("accident", 2, META), ("normal", 7, SILENT)):
@@ -146,7 +150,9 @@ def test_other_attributes(
 
 
 def test_areas(release: DeepAccident) -> None:
-    """Twins share name and town, which so tell nothing; the folder tells all here, and the weather of META too."""
+    """Twins share name and town, which so tell nothing; the folder tells all here, and the weather
+    of META too.
+    """
     report = audit_scores(release, of_samples(release, lambda _each, rng: rng.random()))
     areas = {
         name: row_of(report, name)[0] for name in ("folder", "name", "town", "weather", "actors")
@@ -163,7 +169,9 @@ def test_areas(release: DeepAccident) -> None:
 
 
 def test_leaving_a_scenario_out_of_its_own_share_makes_no_area(release: DeepAccident) -> None:
-    """Without twins, the other collisions of a collision's town are fewer, which must not look like a sign."""
+    """Without twins, the other collisions of a collision's town are fewer, which must not look like
+    a sign.
+    """
     scores = of_scenarios(release, lambda _each, rng: rng.random())
     alone = {
         token: score
@@ -206,7 +214,9 @@ def test_what_cannot_be_told_apart_from_the_truth_is_said(release: DeepAccident)
 
 @pytest.fixture(scope="module")
 def odd_release(tmp_path_factory: pytest.TempPathFactory) -> DeepAccident:
-    """As in val, some scenarios end otherwise than their folder says: two without a collision, and one with."""
+    """As in val, some scenarios end otherwise than their folder says: two without a collision, and
+    one with.
+    """
     root = tmp_path_factory.mktemp("odd") / "release"
     for number in range(PAIRS):
         for kind, meta in (

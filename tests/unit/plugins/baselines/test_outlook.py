@@ -94,7 +94,9 @@ def test_who_drives_straight_on_does_not_turn(da_hidden: DeepAccident) -> None:
 def test_turn_rates_are_those_since_the_earliest_sight(
     da_hidden: DeepAccident, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Two turn by 0.04 rad a frame, across ±π; one was hidden until 0.3 s ago, a third one until now."""
+    """Two turn by 0.04 rad a frame, across ±π; one was hidden until 0.3 s ago, a third one until
+    now.
+    """
     asked = []
 
     def seen(_dataset: object, token: str, **_options: object) -> SeenActors:

@@ -52,7 +52,9 @@ def tokens(da_hidden: DeepAccident) -> list[str]:
 
 
 def test_five_agents_know_the_whole_present(da_hidden: DeepAccident, tokens: list[str]) -> None:
-    """All that the label shows, cell by cell; at the rim, who is beyond the ego's own label is in theirs."""
+    """All that the label shows, cell by cell; at the rim, who is beyond the ego's own label is in
+    theirs.
+    """
     known = []
     for token in tokens:
         label = da_hidden.motion_labels(token).instance[0, 8:-8, 8:-8] > 0
@@ -261,7 +263,10 @@ def test_a_task_or_horizon_that_is_none_is_refused(
         (
             lambda: predict_results(da_hidden, "warning", tokens, out),
             ChoiceError,
-            "task: expected one of motion, accident, detection, planning, forecasting, found 'warning'",
+            (
+                "task: expected one of motion, accident, detection, planning, "
+                "forecasting, found 'warning'"
+            ),
         ),
         (
             lambda: predict_results(da_hidden, "motion", tokens, out, Baseline(horizon=0.7)),

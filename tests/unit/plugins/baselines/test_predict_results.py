@@ -1,4 +1,6 @@
-"""Results of the baselines, shared, on any executor, and after an interruption: the very bytes of one calm run."""
+"""Results of the baselines, shared, on any executor, and after an interruption: the very bytes of
+one calm run.
+"""
 
 import multiprocessing
 import shutil

@@ -204,7 +204,7 @@ def fetched(site: str, *more: tuple[str, str]) -> Headers:
         # a request for no path is refused
         *(
             (400, (), {"target": target})
-            for target in ("http://localhost:{0}/", "http://evil.example/", "localhost:{0}", "*", "page")
+            for target in ("http://localhost:{0}/", "http://evil.example/", "localhost:{0}", "*", "page")  # noqa: E501
         ),
         # the origin must be the host
         (200, (("Origin", "http://localhost:9000"),), {"host": "localhost:9000"}),
@@ -214,14 +214,14 @@ def fetched(site: str, *more: tuple[str, str]) -> Headers:
         *(
             (403, (("Origin", origin),), {"host": "localhost:9000"})
             for origin in (
-                "http://localhost:9001", "http://127.0.0.1:9000", "https://evil.example", "null", "",
+                "http://localhost:9001", "http://127.0.0.1:9000", "https://evil.example", "null", "",  # noqa: E501
                 "file://localhost:9000", "http://localhost:9000/",
             )
         ),
         (403, (HERE, HERE), {}),
         # other sites may only link to a page, and the pages ask for all
         *((200, fetched(site, *IMAGE), {}) for site in ("same-origin", "none")),
-        *((200, fetched(site, NAVIGATE, DOCUMENT), {}) for site in ("cross-site", "same-site", "new-site")),
+        *((200, fetched(site, NAVIGATE, DOCUMENT), {}) for site in ("cross-site", "same-site", "new-site")),  # noqa: E501
         *(
             (403, fetched(site, *more), {})
             for site in ("cross-site", "same-site", "new-site")
@@ -247,8 +247,8 @@ def test_who_is_answered(
 @pytest.mark.parametrize(
     "host",
     [
-        "evil.example", "evil.example:{0}", "localhost.evil.example", "localhost.", "127.0.0.1.evil.example", ANYWHERE,
-        "192.0.2.1:{0}", "[::2]", "", ":{0}", "localhost:", "localhost:x", "localhost:99999", "me@localhost", "[::1",
+        "evil.example", "evil.example:{0}", "localhost.evil.example", "localhost.", "127.0.0.1.evil.example", ANYWHERE,  # noqa: E501
+        "192.0.2.1:{0}", "[::2]", "", ":{0}", "localhost:", "localhost:x", "localhost:99999", "me@localhost", "[::1",  # noqa: E501
         "[:]", "::1", "localhost/x", "localhost,localhost", "127.1", "2130706433",
     ],
 )  # fmt: skip
@@ -452,7 +452,7 @@ def test_a_named_host_is_known_with_its_address() -> None:
 @pytest.mark.parametrize(
     "root",
     [
-        "user/me", "//hub.example.org/x", "/a//b", "/a b", "/a;b", "/a?b", "/a#b", "/é", "https://", "https:///x",
+        "user/me", "//hub.example.org/x", "/a//b", "/a b", "/a;b", "/a?b", "/a#b", "/é", "https://", "https:///x",  # noqa: E501
         "https://me@hub.example.org/x", "https://hub.example.org/x?y", "ftp://hub.example.org/x", "https://[::1/x",
         "https://hub.example.org:99999/", "hub.example.org/x", "/a\n",
     ],

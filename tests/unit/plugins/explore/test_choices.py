@@ -74,7 +74,9 @@ def test_a_query_finds_what_the_devkit_finds(
 def test_facets_find_what_the_devkit_finds(
     da: DeepAccident, scenarios: Scenarios, data: st.DataObject
 ) -> None:
-    """Any values of any facets; beside a value stands how many choosing it alone of its field would give."""
+    """Any values of any facets; beside a value stands how many choosing it alone of its field would
+    give.
+    """
     facets = {each.name: each for each in scenarios.facets()}
     names = data.draw(st.lists(st.sampled_from(sorted(facets)), unique=True, max_size=3))
     some = {

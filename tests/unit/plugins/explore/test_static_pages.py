@@ -1,4 +1,6 @@
-"""Pages as files: they say what served pages say, need nothing else, and are there as a whole or not at all."""
+"""Pages as files: they say what served pages say, need nothing else, and are there as a whole or
+not at all.
+"""
 
 import re
 from collections.abc import Callable

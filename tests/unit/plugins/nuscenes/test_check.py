@@ -1,4 +1,6 @@
-"""The check of a source: a good one is never refused, a mistake is named where the data suffice to tell."""
+"""The check of a source: a good one is never refused, a mistake is named where the data suffice to
+tell.
+"""
 
 from pathlib import Path
 from typing import Any

@@ -1,4 +1,6 @@
-"""A dataroot of nuScenes as a release: what is ignored counts nowhere, times are true, damaged tables are refused."""
+"""A dataroot of nuScenes as a release: what is ignored counts nowhere, times are true, damaged
+tables are refused.
+"""
 
 import json
 import os

@@ -1,7 +1,8 @@
 """30 synthetic accidents: what safety says from the labels alone, against what the generator knows.
 
-21 are of all designs, three in ten of them unplanned (with pedestrians or a third vehicle); a house hides the colliders
-of 9 from each other. They show the last 3 s. The generator's side is in tests/generator_truth.py.
+21 are of all designs, three in ten of them unplanned (with pedestrians or a third vehicle); a house
+hides the colliders of 9 from each other. They show the last 3 s. The generator's side is in
+tests/generator_truth.py.
 """
 
 from collections.abc import Iterator, Sequence
@@ -35,7 +36,9 @@ OPEN_PAIRS, PAIRS = 21, 30
 LAG = HARDEST_BRAKING * FRAME_PERIOD / 2
 """m/s: by how much a mean over the last tenth of a second may differ from the speed at its end."""
 LEANING = 0.01
-"""Metres by which boxes that lean on a slope are nearer or farther than those seen from straight above."""
+"""Metres by which boxes that lean on a slope are nearer or farther than those seen from straight
+above.
+"""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -186,7 +189,9 @@ def lead(observed: np.ndarray, members: Sequence[str]) -> float:
 
 
 def test_the_last_moment_to_brake_in_the_exact_motion(made: Made) -> None:
-    """Labels of 10 Hz move it by 0.04 s at most. Exact motions are tried every 0.02 s, those of labels every 0.01 s."""
+    """Labels of 10 Hz move it by 0.04 s at most. Exact motions are tried every 0.02 s, those of
+    labels every 0.01 s.
+    """
     for accident, truth in made:
         pair = pair_of(accident.paths, accident.sizes)
         for brakers in MASKS:

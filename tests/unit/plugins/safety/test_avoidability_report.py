@@ -1,4 +1,6 @@
-"""Avoidability over many accidents: shares, text, CSV, JSON; what is dropped and skipped is named."""
+"""Avoidability over many accidents: shares, text, CSV, JSON; what is dropped and skipped is
+named.
+"""
 
 import csv
 from collections.abc import Sequence
@@ -43,7 +45,9 @@ AVOIDED = OUTCOMES.index("avoided")
 
 @pytest.fixture(scope="module")
 def accidents() -> list[Avoidability]:
-    """Two rear-ends of 5 and 3 s, in which the ego is the striker; a head-on one; one with a pedestrian."""
+    """Two rear-ends of 5 and 3 s, in which the ego is the striker; a head-on one; one with a
+    pedestrian.
+    """
     walking = replace(rear_end(8, 1, 2), categories=("car", "pedestrian"), agents=(None, None))
     heavy = replace(rear_end(20, 10), masses=np.array([1000.0, 3000.0]))
     return [avoidability_of(each) for each in (heavy, rear_end(20, 16, 3), head_on(10, 4), walking)]

@@ -1,4 +1,6 @@
-"""The page of the safety report: a row an accident, the functions' numbers, harmless names, links to files."""
+"""The page of the safety report: a row an accident, the functions' numbers, harmless names, links
+to files.
+"""
 
 import json
 import re
@@ -24,7 +26,10 @@ from deepaccident_devkit.plugins.safety.page import (
 )
 from deepaccident_devkit.support.pages import source_hash
 
-HOSTILE = "type1_subtype1_accident/<script>alert(1)</script><img src=\"https://evil.example/x\" onerror='x'>"
+HOSTILE = (
+    "type1_subtype1_accident/<script>alert(1)</script><img "
+    "src=\"https://evil.example/x\" onerror='x'>"
+)
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,6 @@
-"""Prevented accidents of recordings made by hand, whose ends are known for each frame of the first alarm."""
+"""Prevented accidents of recordings made by hand, whose ends are known for each frame of the first
+alarm.
+"""
 
 import math
 import shutil
@@ -125,7 +127,9 @@ def evaluated(
     threshold: float | None = None,
     **more: Any,
 ) -> PreventedEvaluator:
-    """Recordings of 6 s, two samples a second, each accident with the same table unless told otherwise."""
+    """Recordings of 6 s, two samples a second, each accident with the same table unless told
+    otherwise.
+    """
     numbers = range(max(len(accidents), len(normal)))
     names = [f"type1_subtype1_accident/s{number}/{agent}" for number in numbers]
     tables = dict.fromkeys(names[: len(accidents)], table())
@@ -151,7 +155,9 @@ def alarm_from(frame: int, score: float = 0.9) -> Scores:
 
 
 def test_ends_that_are_known() -> None:
-    """At 1 s and 6 m/s² 3 s before the impact is enough, 2 s mitigates, 1.5 s does nothing; an alarm at it is none."""
+    """At 1 s and 6 m/s² 3 s before the impact is enough, 2 s mitigates, 1.5 s does nothing; an
+    alarm at it is none.
+    """
     accidents = [alarm_from(31), alarm_from(41), alarm_from(46), alarm_from(IMPACT)]
     result = evaluated(accidents, [[]], threshold=0.5).compute()
     figures = result.groups[GROUP].right[0.0][NOMINAL]
@@ -388,7 +394,9 @@ def crash(da_motion: DeepAccident) -> str:
 def foreseen(
     dataset: DeepAccident, agents: Sequence[str], frames: Sequence[int], crash: str
 ) -> WarningEvaluator:
-    """The true accident is foreseen from a frame on, surer and surer; in the twin something at its first frame."""
+    """The true accident is foreseen from a frame on, surer and surer; in the twin something at its
+    first frame.
+    """
     evaluator = WarningEvaluator()
     for token in (each for each in dataset.samples("train", "all") if each.split("/")[2] in agents):
         context, frame, alarms = accident_context(dataset, token, 10.0), int(token[-3:]), []
@@ -460,7 +468,9 @@ def test_intervals_leave_out_an_accident_and_its_twin(da_motion: DeepAccident) -
 def test_scenarios_that_cannot_be_judged_are_named(
     own_release: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """One has no meta file, one no collision, and of one the boxes are taken to be too far apart."""
+    """One has no meta file, one no collision, and of one the boxes are taken to be too far
+    apart.
+    """
     monkeypatch.setattr(outcomes, "MOST_MARGIN", -1.0)
     bare = DeepAccident("v1", own_release, verbose=False).find(collision=True)[0]
     (own_release / bare["folder"] / bare["scenario_type"] / "meta" / f"{bare['name']}.txt").unlink()

@@ -1,4 +1,6 @@
-"""The safety report: its numbers are those of its parts, each accident is replayed once, and nothing is lost."""
+"""The safety report: its numbers are those of its parts, each accident is replayed once, and
+nothing is lost.
+"""
 
 import csv
 import json

@@ -50,7 +50,9 @@ TOKENS = {"accident": "type1_subtype1_accident/a", "twin": "type1_subtype1_norma
 
 
 def made_diff(**changes: object) -> TwinDiff:
-    """An ego that brakes in the twin from frame 4 on, another car that does not, and one that the twin lacks."""
+    """An ego that brakes in the twin from frame 4 on, another car that does not, and one that the
+    twin lacks.
+    """
     poses = np.zeros((2, 3, 6, 3))
     poses[:, 0, :, 0] = np.arange(6)
     poses[1, 0, 3:, 0] = [2.5, 2.75, 3.0]

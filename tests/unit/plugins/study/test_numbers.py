@@ -44,7 +44,9 @@ def motion_of(foreground: np.ndarray) -> MotionOutput:
 
 
 def test_hidden_actors_are_those_that_a_partner_alone_sees(da: DeepAccident) -> None:
-    """Those that the ego sees are given as boxes, and the map of all: the hidden are on the map and not detected."""
+    """Those that the ego sees are given as boxes, and the map of all: the hidden are on the map and
+    not detected.
+    """
     evaluator, hidden, seen = HiddenActors(), 0, 0
     for scenario in da.scenario:
         token = f"{scenario['token']}/ego_vehicle/004"
@@ -107,7 +109,9 @@ def seeds_of(*shares: float) -> dict[str, dict[str, Any]]:
 
 
 def detections_of(*models: tuple[float, float], token: str = SAMPLE) -> dict[str, dict[str, Any]]:
-    """Seeds whose models give a score to true boxes and another one to false boxes, in ten pairs."""
+    """Seeds whose models give a score to true boxes and another one to false boxes, in ten
+    pairs.
+    """
     made = {}
     for seed, (true_score, false_score) in enumerate(models, 1):
         evaluator = evaluators_of("clean")["detection"]
@@ -126,7 +130,9 @@ def detections_of(*models: tuple[float, float], token: str = SAMPLE) -> dict[str
 def test_a_number_over_seeds_is_the_mean_of_each_seeds_number(
     models: tuple[tuple[float, float], ...],
 ) -> None:
-    """The curve over the boxes of both would rank the first model's false boxes above the second one's true boxes."""
+    """The curve over the boxes of both would rank the first model's false boxes above the second
+    one's true boxes.
+    """
     seeds = detections_of(*models)
     tokens = seeds["1"]["detection"].tokens
     alone = [each["detection"].compute().mean_average_precision for each in seeds.values()]

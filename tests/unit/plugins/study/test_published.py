@@ -1,4 +1,6 @@
-"""The published studies: the pages have what is kept of them, and every APA follows from the kept counts."""
+"""The published studies: the pages have what is kept of them, and every APA follows from the kept
+counts.
+"""
 
 import importlib
 import math

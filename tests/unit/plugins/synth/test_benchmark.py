@@ -55,7 +55,9 @@ print(json.dumps({each.token: described(each) for each in find_release(root).sce
 
 
 def elsewhere() -> dict[str, str]:
-    """The environment of another machine: its place, its hash seed, its threads, and an older processor for numpy."""
+    """The environment of another machine: its place, its hash seed, its threads, and an older
+    processor for numpy.
+    """
     from numpy._core._multiarray_umath import __cpu_dispatch__, __cpu_features__
 
     newer = [name for name in __cpu_dispatch__ if __cpu_features__[name]]

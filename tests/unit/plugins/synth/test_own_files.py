@@ -19,7 +19,9 @@ EXAMPLES = dict(
 
 @pytest.fixture
 def made(tmp_path):
-    """A function: name of an example → a release of an accident and its twin by it, two frames without sensors."""
+    """A function: name of an example → a release of an accident and its twin by it, two frames
+    without sensors.
+    """
 
     def make(name: str) -> DeepAccident:
         path = tmp_path / f"{name}.yaml"
@@ -56,7 +58,9 @@ def test_ego_hits_one_on_foot_or_turns_into_the_cyclist_beside_it(made, name, cl
 
 @pytest.mark.slow
 def test_ego_runs_into_the_rear_of_the_one_who_changed_lanes(made):
-    """The first of meet.actors has the later row of the two, which once kept any draw from counting."""
+    """The first of meet.actors has the later row of the two, which once kept any draw from
+    counting.
+    """
     da = made("rear_end")
     (accident,) = da.find(collision=True)
     collision = da.collision(accident)

@@ -32,7 +32,9 @@ def test_ids_of_all_kinds_occur(scenarios):
 
 
 def test_own_box_lies_around_the_ego_origin(scenarios):
-    """Where exactly; that poses, velocities, contacts and pictures agree, `validate` says of each release."""
+    """Where exactly; that poses, velocities, contacts and pictures agree, `validate` says of each
+    release.
+    """
     for scenario in scenarios:
         for agent in AGENTS[:4]:
             label = read_label(scenario.label_path(agent, 1))

@@ -128,7 +128,10 @@ def test_a_scenario_in_which_nobody_meets_is_given_up(build_own, monkeypatch):
     monkeypatch.setattr("deepaccident_devkit.plugins.synth.scenario.MAX_DRAWS", 2)
     walker = "  - {role: pedestrian, from: north}\nmeet: {actors: [ego, pedestrian]"
     crossing = LATE.replace("meet: {actors: [ego, other]", walker)
-    told = r"own.yaml:6: meet: the two did not collide in 2 draws; the least distance was 1\d\.\d m; choose"
+    told = (
+        r"own.yaml:6: meet: the two did not collide in 2 draws; the least "
+        r"distance was 1\d\.\d m; choose"
+    )
     assert_refused(
         (lambda: build_own(LATE), ConfigError, told),
         (
@@ -158,7 +161,10 @@ def test_a_twin_that_cannot_be_made_is_named_by_its_file(build_own, monkeypatch)
 
 def test_a_slow_cyclist_is_hit(build_own):
     """It needs more than 24 s from its usual start to the crossing, and once never came there."""
-    cyclist = "  - {role: background, category: cyclist, from: west, max_speed: 3}\nmeet: {actors: [background, ego]"
+    cyclist = (
+        "  - {role: background, category: cyclist, from: west, max_speed: 3}\nmeet: "
+        "{actors: [background, ego]"
+    )
     text = LATE.replace("ego, from: west", "ego, from: south, turn: right").replace(
         "other, from: south", "other, from: east"
     )

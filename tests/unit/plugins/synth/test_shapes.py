@@ -19,7 +19,9 @@ def shape(request):
 
 
 def test_shapes_fill_their_boxes_and_keep_within(shape):
-    """Also the smallest and the largest that are drawn: all solids keep `INSET` from the box's faces."""
+    """Also the smallest and the largest that are drawn: all solids keep `INSET` from the box's
+    faces.
+    """
     category, model, _ = shape
     for factor in (0.95, 1.0, 1.05):
         size = np.array(MEDIAN_SIZES[category]) * factor

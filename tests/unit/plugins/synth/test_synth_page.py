@@ -1,4 +1,6 @@
-"""docs/synth.md: its tables are what was measured, what was measured is still so, and its code runs."""
+"""docs/synth.md: its tables are what was measured, what was measured is still so, and its code
+runs.
+"""
 
 import re
 from pathlib import Path

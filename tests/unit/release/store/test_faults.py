@@ -1,4 +1,6 @@
-"""Archives and URLs that cannot be read: the devkit's own errors, which name the archive and the remedy."""
+"""Archives and URLs that cannot be read: the devkit's own errors, which name the archive and the
+remedy.
+"""
 
 import json
 import os

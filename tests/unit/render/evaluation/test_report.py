@@ -1,4 +1,6 @@
-"""Reports of runs: all in one file, nothing from outside, partial ones marked everywhere, names harmless."""
+"""Reports of runs: all in one file, nothing from outside, partial ones marked everywhere, names
+harmless.
+"""
 
 import re
 from collections.abc import Mapping

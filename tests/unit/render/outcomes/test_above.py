@@ -94,7 +94,9 @@ def test_detections_are_coloured_by_their_matches(da_motion: DeepAccident, sampl
 
 
 def damaged(labels: MotionLabels) -> MotionOutput:
-    """The labels without one instance, with one too many, and with one that is four cells off in later frames."""
+    """The labels without one instance, with one too many, and with one that is four cells off in
+    later frames.
+    """
     instance = np.where(labels.instance == 3, 0, labels.instance)
     instance[:, 2:8, 2:12] = 90
     moved = instance[1:] == 4

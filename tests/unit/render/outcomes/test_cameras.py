@@ -1,4 +1,6 @@
-"""Predictions over the truth in cameras: where lines are, what they mean, and what stands around them."""
+"""Predictions over the truth in cameras: where lines are, what they mean, and what stands around
+them.
+"""
 
 from collections.abc import Sequence
 from contextlib import nullcontext
@@ -75,7 +77,9 @@ def perfect(dataset: DeepAccident, sample: str) -> DetectedBoxes:
 
 
 def blocks(labels: MotionLabels, *frames: tuple[float, float, float, float]) -> MotionOutput:
-    """An instance whose cells fill a rectangle in each frame: first and last x, first and last y, metres."""
+    """An instance whose cells fill a rectangle in each frame: first and last x, first and last y,
+    metres.
+    """
     grid = labels.config.grid.with_orientation("devkit")
     instance = np.zeros((len(labels.instance), *grid.shape), dtype=np.int32)
     for cells, (first_x, last_x, first_y, last_y) in zip(instance, frames, strict=False):

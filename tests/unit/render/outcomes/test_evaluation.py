@@ -91,7 +91,9 @@ def test_the_pair_that_collides_is_red_in_every_task(
 
 
 def faults_of_predictions(dataset: DeepAccident, token: str) -> list[str]:
-    """What is wrong with the words of detections, and of accidents that are foreseen exactly, nearly and not at all."""
+    """What is wrong with the words of detections, and of accidents that are foreseen exactly,
+    nearly and not at all.
+    """
     boxes, accident = dataset.boxes(token), box_truth(dataset, token).accident
     near = Accident(positions=accident.positions + 1.5, time=accident.time, score=0.9)
     detected, faults = DetectedBoxes(boxes=boxes, scores=np.ones(len(boxes))), []

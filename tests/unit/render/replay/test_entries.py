@@ -170,7 +170,8 @@ def test_each_sample_has_its_verdict(
     assert (hit["right"], hit["time"]) == (True, 1.5)
     assert (miss["right"], "places off by 40.0 m" in miss["text"]) == (False, True)
     assert (len(others), many["more"], "names an unknown actor" in unknown["text"]) == (2, 1, True)
-    # the foreseen places are those of the pair at the end, in the page's own ground: centimetres; a slope takes a few
+    # the foreseen places are those of the pair at the end, in the page's own ground: centimetres; a
+    # slope takes a few
     pair = [actor["states"][-1][:2] for actor in data["actors"] if actor["role"] == "pair"]
     np.testing.assert_allclose(sorted(hit["places"]), sorted(pair), atol=8)
 
@@ -192,7 +193,9 @@ def test_results_files_give_the_same_page(
 
 
 def test_motion_is_read_for_accidents(da_motion: DeepAccident, tmp_path: Path) -> None:
-    """The pair as the labels draw it, and nobody else, as prediction: the true accident is foreseen."""
+    """The pair as the labels draw it, and nobody else, as prediction: the true accident is
+    foreseen.
+    """
     config, ego, given = MotionLabelConfig(), f"{accident(da_motion)}/ego_vehicle", {}
     ids = da_motion.get("scenario", accident(da_motion))["collision"]["ids"]
     for token in (f"{ego}/020", f"{ego}/030"):

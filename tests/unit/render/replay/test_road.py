@@ -68,7 +68,9 @@ def test_without_bev_files_there_is_no_road(da: DeepAccident, tmp_path: Path) ->
 def test_without_bev_files_a_kept_map_of_the_town_is_the_road(
     da: DeepAccident, tmp_path: Path
 ) -> None:
-    """As of the test split, whose scenarios have no BEV camera, in a town that others were recorded in."""
+    """As of the test split, whose scenarios have no BEV camera, in a town that others were recorded
+    in.
+    """
     opened = linked(da, tmp_path / "release")
     token = accident(opened)
     for agent in AGENTS:

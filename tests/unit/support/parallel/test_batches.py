@@ -1,4 +1,6 @@
-"""Bulk work on executors: order, how much is under way, what workers must see, and work that ends early."""
+"""Bulk work on executors: order, how much is under way, what workers must see, and work that ends
+early.
+"""
 
 import os
 import pickle
@@ -73,7 +75,9 @@ def test_any_executor_gives_the_same() -> None:
 
 
 def test_what_is_under_way_is_bounded() -> None:
-    """The caller's memory must not grow with the work, also where one item takes longer than all others."""
+    """The caller's memory must not grow with the work, also where one item takes longer than all
+    others.
+    """
     executor = Delayed()
     assert run_batch(workers.following, range(300), executor=executor) == list(range(1, 301))
     assert executor.most <= 4 * 2
@@ -169,7 +173,9 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 @pytest.fixture(autouse=True)
 def ctrl_c_counts() -> Iterator[None]:
-    """As in a terminal: a runner in the background ignores it. Under load, xdist may test beside its main thread."""
+    """As in a terminal: a runner in the background ignores it. Under load, xdist may test beside
+    its main thread.
+    """
     if threading.current_thread() is not threading.main_thread():
         yield
         return

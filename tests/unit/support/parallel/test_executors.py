@@ -21,7 +21,10 @@ def test_a_dead_scheduler() -> None:
     import distributed  # noqa: F401 - sets its own settings, which have to be there before one is changed
     from dask import config
 
-    message = r"^tcp://127\.0\.0\.1:1: no dask scheduler answers \(.*\); start one with `dask scheduler`, and give its"
+    message = (
+        r"^tcp://127\.0\.0\.1:1: no dask scheduler answers \(.*\); start one with "
+        r"`dask scheduler`, and give its"
+    )
     with (
         config.set({"distributed.comm.timeouts.connect": "300ms"}),
         pytest.raises(WorkerError, match=message),

@@ -206,7 +206,9 @@ def test_a_file_system_without_locks(
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    """ENOSYS of Lustre, ENOLCK of NFS, EOPNOTSUPP of FUSE, and whatever else: the work is done, which is said once."""
+    """ENOSYS of Lustre, ENOLCK of NFS, EOPNOTSUPP of FUSE, and whatever else: the work is done,
+    which is said once.
+    """
     monkeypatch.setattr(fcntl, "flock", flock)
     monkeypatch.setattr(module, "_ANSWER_SECONDS", 0.2)
     for _ in range(2):

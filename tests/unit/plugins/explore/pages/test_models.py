@@ -1,4 +1,6 @@
-"""Pages of models, asked as a browser asks: what they list, where each bar leads, what they refuse to open."""
+"""Pages of models, asked as a browser asks: what they list, where each bar leads, what they refuse
+to open.
+"""
 
 import html
 import json
@@ -140,8 +142,8 @@ def bundle(
 
 @pytest.fixture(scope="module")
 def site(da_motion: DeepAccident, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
-    """Evaluations of accidents (with and without a copy, by another protocol, partial, with a hostile name), of motion
-    and of boxes; and results alone."""
+    """Evaluations of accidents (with and without a copy, by another protocol, partial, with a
+    hostile name), of motion and of boxes; and results alone."""
     folder, da = tmp_path_factory.mktemp("models"), da_motion
     tokens = default_selection(BOXES, "train").tokens(da)
     runs = {"first": stored_run(da, BOXES, folder / "first.json")[0]}
@@ -204,7 +206,9 @@ def test_the_worst_samples_come_first(site: Site, name: str, order: str) -> None
 
 
 def main_number(run: EvaluationRun, token: str) -> float | None:
-    """A sample's number, as the evaluator computes it; 0 where something is false and nothing is to be found."""
+    """A sample's number, as the evaluator computes it; 0 where something is false and nothing is to
+    be found.
+    """
     result = run.evaluator.compute([token])
     false = run.setup.task == "accident" and bool(result.within[15.0].fp)
     value: float = {

@@ -1,4 +1,6 @@
-"""The pages of a release: what they show is what the devkit computes; slow work is for those who wait for it."""
+"""The pages of a release: what they show is what the devkit computes; slow work is for those who
+wait for it.
+"""
 
 import json
 import re
@@ -27,7 +29,9 @@ pytestmark = pytest.mark.slow
 
 
 class Reader:
-    """Asks an explorer for pages, as a browser does that loads a page again when its work is done."""
+    """Asks an explorer for pages, as a browser does that loads a page again when its work is
+    done.
+    """
 
     def __init__(self, dataset: DeepAccident) -> None:
         self.explorer = Explorer(dataset, workers=1)

@@ -1,4 +1,6 @@
-"""A scenario's page, its files and its parts: what they show is what the devkit computes, and nothing else is given."""
+"""A scenario's page, its files and its parts: what they show is what the devkit computes, and
+nothing else is given.
+"""
 
 import base64
 import io

@@ -43,7 +43,9 @@ def test_a_four_way_map_is_its_own_quarter_turn_or_half_turn_where_one_road_give
 
 
 def test_from_the_middle_line_outward(junction):
-    """Yellow line, lane, kerb, sidewalk, grass, 80 m from the middle; behind the kerb's end all is as before it."""
+    """Yellow line, lane, kerb, sidewalk, grass, 80 m from the middle; behind the kerb's end all is
+    as before it.
+    """
     spec, ground = junction.spec, junction.ground_map()
     for arm in junction.arms:
         out = np.array(OUTWARD[arm])

@@ -19,7 +19,10 @@ from deepaccident_devkit.plugins.synth.roads import ROAD_CODES, Hump, RoadSpec
         ),
         (
             {"hump": Hump(distance=36.0)},
-            r"road.hump.distance: 36 m puts the foot of the hump into the junction; choose 48.0 m or more",
+            (
+                r"road.hump.distance: 36 m puts the foot of the hump into the "
+                r"junction; choose 48.0 m or more"
+            ),
         ),
     ],
 )

@@ -18,7 +18,9 @@ CIRCLE = bent((3.0, -2.0), 0.4, [(40.0, 0.05, 0.05)])
 
 
 def assert_consistent(path, atol=1e-3):
-    """Steps are as long as they say, yaw is the direction of the steps, curvature how fast yaw turns."""
+    """Steps are as long as they say, yaw is the direction of the steps, curvature how fast yaw
+    turns.
+    """
     steps = np.diff(path.xy, axis=0)
     assert np.diff(path.s).max() <= SPACING + 1e-9
     np.testing.assert_allclose(np.hypot(*steps.T), np.diff(path.s), atol=atol * SPACING)

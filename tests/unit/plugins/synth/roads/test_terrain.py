@@ -44,7 +44,9 @@ def test_normals_are_the_slopes_of_the_height(arm):
 
 
 def test_the_default_hump_hides_a_pedestrian():
-    """From eyes 1.7 m above the road 28 m before the crest, one of 1.86 m as far behind it: no line of sight."""
+    """From eyes 1.7 m above the road 28 m before the crest, one of 1.86 m as far behind it: no line
+    of sight.
+    """
     line = np.linspace(Hump().distance - 28, Hump().distance + 28, 500)
     ground = Terrain(Hump(arm="east")).height(np.column_stack([line, np.zeros(500)]))
     assert (np.linspace(ground[0] + 1.7, ground[-1] + 1.86, 500) < ground).any()

@@ -63,7 +63,9 @@ def test_cars_throw_shadows_in_the_sun(world, bare, actor, rig_of):
 
 @pytest.mark.parametrize("ground", ["world", "hilly_world"])
 def test_wet_ground_mirrors_what_stands_on_it(ground, request, bare, rig_of):
-    """The road before a red wall is redder than before a green one, with a hump elsewhere as well as without."""
+    """The road before a red wall is redder than before a green one, with a hump elsewhere as well
+    as without.
+    """
     roads = request.getfixturevalue(ground)
 
     def before(color):

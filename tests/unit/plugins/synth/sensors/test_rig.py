@@ -71,7 +71,9 @@ def recount(sighting):
 
 
 def test_nobody_goes_on_by_more_than_a_little_until_points_are_counted():
-    """Who is slow, as far as it goes in 3 ms; who is fast, no farther than the noise of a point can hide."""
+    """Who is slow, as far as it goes in 3 ms; who is fast, no farther than the noise of a point can
+    hide.
+    """
     velocity = np.array([[0.0, 0, 0], [2.0, 0, 0], [0, -30.0, 0]])
     np.testing.assert_allclose(
         gone_on(velocity), [[0, 0, 0], [0.006, 0, 0], [0, -0.012, 0]], atol=1e-12
@@ -101,7 +103,9 @@ def test_exact_calib_is_ideal(hilly_world, rig_of, others):
 @pytest.mark.slow
 @pytest.mark.parametrize("place", ["world", "hilly_world"])
 def test_images_show_road_users_where_their_boxes_project(request, rig_of, actor, place):
-    """A red car ahead: where the middle of its box projects, the picture is red or glass, not road."""
+    """A red car ahead: where the middle of its box projects, the picture is red or glass, not
+    road.
+    """
     rig = rig_of(
         request.getfixturevalue(place), [actor(9, "car", -16.0, -1.75)], image_size=(640, 360)
     )

@@ -27,7 +27,9 @@ def ego_sees(rig, actor_id, agent=0):
     ids=["a wall before all of it", "a wall before half of it", "a low wall"],
 )
 def test_a_wall_hides_what_is_behind_it(world, bare, actor, rig_of, upper_edge, width, seen):
-    """The wall ends `width` to the left of the car's right side, seen from the ego at (-30, -1.75)."""
+    """The wall ends `width` to the left of the car's right side, seen from the ego at (-30,
+    -1.75).
+    """
     wall = Block((-16.2, -16.0), (-5.0, -5.0 + width), (-0.1, upper_edge), WALL)
     car = actor(9, "car", -8.0, -1.75)
     assert ego_sees(rig_of(bare(world, [wall]), [car]), 1009) == seen
@@ -43,7 +45,9 @@ def test_a_truck_hides_the_car_before_it(world, bare, actor, rig_of, hidden):
 @pytest.mark.slow
 @pytest.mark.parametrize(("x", "seen"), [(-30.0, False), (-56.0, True)])
 def test_a_rise_hides_a_pedestrian_behind_it(hilly_world, bare, actor, rig_of, x, seen):
-    """The crest lies 55 m from the middle; the ego waits 30 m from it or on it, the pedestrian stands far behind."""
+    """The crest lies 55 m from the middle; the ego waits 30 m from it or on it, the pedestrian
+    stands far behind.
+    """
     places = {"ego_vehicle": (x, -1.75, np.pi), "ego_vehicle_behind": (20.0, -1.75, 0.0)}
     assert (
         ego_sees(
@@ -65,7 +69,9 @@ def test_nobody_sees_itself_and_all_around_is_seen(world, bare, actor, rig_of):
 
 
 def test_pixels_are_about_those_of_the_picture(world, actor, rig_of):
-    """The counts of a 400 × 225 picture, against all pixels of a picture of that size; by everything in sight."""
+    """The counts of a 400 × 225 picture, against all pixels of a picture of that size; by
+    everything in sight.
+    """
     others = [actor(10 + k, "car", 5.0 + 9 * k, 1.75, np.pi) for k in range(4)]
     others += [actor(20 + k, "pedestrian", -14.0 + 4 * k, 5.0) for k in range(4)]
     rig = rig_of(world, others, image_size=(400, 225))

@@ -1,4 +1,6 @@
-"""The twelve designs are the paper's: the accident that each means is of its type (docs/format.md, Accident types)."""
+"""The twelve designs are the paper's: the accident that each means is of its type (docs/format.md,
+Accident types).
+"""
 
 import re
 from pathlib import Path

@@ -11,7 +11,10 @@ from deepaccident_devkit.plugins.synth.spec import parse_spec
         ("gap: 3", r"f.yaml:4: actors\[1\].gap: is not possible for the role other; leave it out"),
         (
             "category: cyclist",
-            "category: the role other cannot be a cyclist; choose car, .*cle; a cyclist has the role background",
+            (
+                "category: the role other cannot be a cyclist; choose car, .*cle; a "
+                "cyclist has the role background"
+            ),
         ),
         (
             "category: [car, pedestrian]",
@@ -19,17 +22,26 @@ from deepaccident_devkit.plugins.synth.spec import parse_spec
         ),
         (
             "start_distance: 30",
-            r"f.yaml:4: actors\[1\].start_distance: follows from meet \(f.yaml:5\) for other, who is timed; leave it",
+            (
+                r"f.yaml:4: actors\[1\].start_distance: follows from meet \(f.yaml:5\) "
+                r"for other, who is timed; leave it"
+            ),
         ),
         ("start_distance: 0", "start_distance: follows from meet"),
         (
             "lane: 1",
-            "there is no lane 1 where the road has one lane in each direction; choose 0, or give the road two",
+            (
+                "there is no lane 1 where the road has one lane in each direction; "
+                "choose 0, or give the road two"
+            ),
         ),
         ("lane: [0, 1]", "there is no lane 1"),
         (
             "lane_change: 50",
-            "there is no other lane where the road has one lane in each direction; leave it out, or",
+            (
+                "there is no other lane where the road has one lane in each "
+                "direction; leave it out, or"
+            ),
         ),
     ],
 )
@@ -99,7 +111,10 @@ EGO, OTHER = "role: ego, from: west", "role: other, from: south"
         ),
         (
             scenario(EGO, OTHER, "role: pedestrian, from: east, max_speed: [2, 3.5]"),
-            r"actors\[2\].max_speed: expected 0.5 to 3 m/s for a pedestrian, found 3.5; walking is 1 to 2 m/s",
+            (
+                r"actors\[2\].max_speed: expected 0.5 to 3 m/s for a pedestrian, found "
+                r"3.5; walking is 1 to 2 m/s"
+            ),
         ),
         (
             scenario(EGO, OTHER, "role: parked, from: east, turn: left"),
@@ -107,11 +122,17 @@ EGO, OTHER = "role: ego, from: west", "role: other, from: south"
         ),
         (
             scenario(EGO, OTHER, more="road: {kind: three-way}"),
-            r"f.yaml:3: actors\[1\].turn: nobody can go straight from the south arm of a three-way junction; choose",
+            (
+                r"f.yaml:3: actors\[1\].turn: nobody can go straight from the south arm "
+                r"of a three-way junction; choose"
+            ),
         ),
         (
             scenario(EGO, "role: other, from: west", more="meet: {actors: [ego, other]}"),
-            "do not meet; in one lane they follow each other; let one of them come by the other lane, with a",
+            (
+                "do not meet; in one lane they follow each other; let one of them come "
+                "by the other lane, with a"
+            ),
         ),
         (
             scenario(EGO, OTHER, more="meet: {actors: [ego, ego]}"),
@@ -131,11 +152,17 @@ EGO, OTHER = "role: ego, from: west", "role: other, from: south"
         ),
         (
             scenario(EGO, "role: other, from: [south, east]", more="meet: {}"),
-            r"meet.actors: the ways of ego \(west straight 0\) and other \(east straight 0\) do not meet",
+            (
+                r"meet.actors: the ways of ego \(west straight 0\) and other \(east "
+                r"straight 0\) do not meet"
+            ),
         ),
         (
             scenario(EGO, "role: other, from: [south, east]", more="view: hidden"),
-            "f.yaml:4: view: no house can stand between ego from the west and other from the east; choose open, or",
+            (
+                "f.yaml:4: view: no house can stand between ego from the west and other "
+                "from the east; choose open, or"
+            ),
         ),
     ],
 )
@@ -153,7 +180,9 @@ def test_actors_that_record_nothing_may_be_several():
 
 
 def test_a_start_may_be_given_where_it_counts():
-    """A pedestrian's is its place on the arm; with `null` among the values of `meet` some draws time nobody."""
+    """A pedestrian's is its place on the arm; with `null` among the values of `meet` some draws
+    time nobody.
+    """
     walker = "role: pedestrian, from: west, start_distance: 20"
     parse_spec(
         scenario(

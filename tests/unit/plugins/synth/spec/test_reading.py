@@ -14,12 +14,18 @@ FIELDS = "name, design, road, view, exchange, actors, meet, background, weather,
     [
         (
             "turn: lef",
-            r"f.yaml:4: actors\[1\].turn: expected one of straight, left, right, found 'lef'; did you mean 'left'\?$",
+            (
+                r"f.yaml:4: actors\[1\].turn: expected one of straight, left, right, "
+                r"found 'lef'; did you mean 'left'\?$"
+            ),
         ),
         ("turn: back", r"actors\[1\].turn: expected one of straight, left, right, found 'back'$"),
         (
             "trun: left",
-            r"f.yaml:4: actors\[1\].trun: no such field; possible: role, .*; did you mean 'turn'\?$",
+            (
+                r"f.yaml:4: actors\[1\].trun: no such field; possible: role, .*; "
+                r"did you mean 'turn'\?$"
+            ),
         ),
         (
             "colour: red",
@@ -37,7 +43,10 @@ FIELDS = "name, design, road, view, exchange, actors, meet, background, weather,
         ("max_speed: [9, 3]", r"expected \[low, high\], found \[9, 3\]; exchange the two"),
         (
             "max_speed: '8'",
-            "expected a number, 0.5 to 20 m/s, found '8'; write a decimal number, without quotes and",
+            (
+                "expected a number, 0.5 to 20 m/s, found '8'; write a decimal "
+                "number, without quotes and"
+            ),
         ),
         ("max_speed: 100", "found 100$"),
         ("start_distance: 130", "expected a number, 0 to 120 m, found 130$"),
@@ -49,7 +58,10 @@ FIELDS = "name, design, road, view, exchange, actors, meet, background, weather,
         ("ignores: signal", r"ignores: expected a list, as \[signal, priority\], found 'signal'"),
         (
             "ignores: [signals]",
-            r"ignores\[0\]: expected one of signal, priority, found 'signals'; did you mean 'signal'\?$",
+            (
+                r"ignores\[0\]: expected one of signal, priority, found 'signals'; "
+                r"did you mean 'signal'\?$"
+            ),
         ),
         ("turn: []", r"turn: expected one of straight, left, right, found \[\]"),
         ("turn: [left, [right]]", r"turn\[1\]: expected one of .*, found \['right'\]"),

@@ -75,7 +75,10 @@ def test_an_exchange_keeps_the_scene_but_for_the_names():
 
 
 def test_a_three_way_junction_keeps_its_arms_in_an_exchange():
-    text = "exchange: true\nroad: {kind: three-way}\nactors:\n  - {role: ego, from: west, turn: right}\n"
+    text = (
+        "exchange: true\nroad: {kind: three-way}\nactors:\n  - {role: ego, "
+        "from: west, turn: right}\n"
+    )
     made = draws(text + "  - {role: other, from: east, turn: left}\n", 40)
     assert {spec.actor("ego").from_arm for spec in made} == {"west", "east"}
 

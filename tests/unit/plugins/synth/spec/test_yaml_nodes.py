@@ -39,7 +39,10 @@ def test_every_value_knows_the_line_of_its_key_or_item():
         ("a: !!timestamp x", "f.yaml:1: a: 'x' cannot be read"),
         (
             "a: 010",
-            "f.yaml:1: a: '010' is not a plain decimal number; write one, or put it in quotes if it is a word",
+            (
+                "f.yaml:1: a: '010' is not a plain decimal number; write one, or put it "
+                "in quotes if it is a word"
+            ),
         ),
         ("a: 1:30", "f.yaml:1: a: '1:30' is not a plain decimal number"),
         ("a: 1" + ":59" * 300 + ".5", "f.yaml:1: a: '1:59:59.*cannot be read"),
@@ -54,7 +57,10 @@ def test_every_value_knows_the_line_of_its_key_or_item():
         ("a: 1\na: 2", "f.yaml:2: a: is there twice; keep one of them"),
         (
             "\x00",
-            "f.yaml: no YAML: unacceptable character #x0000: special characters are not allowed; write it again",
+            (
+                "f.yaml: no YAML: unacceptable character #x0000: special characters are "
+                "not allowed; write it again"
+            ),
         ),
         ("- " * 5000, "f.yaml: no YAML: maximum recursion depth exceeded"),
     ],

@@ -1,4 +1,6 @@
-"""What holds at every step of every scenario, whatever happens in it: physics, lanes, lights, people, flow."""
+"""What holds at every step of every scenario, whatever happens in it: physics, lanes, lights,
+people, flow.
+"""
 
 from functools import lru_cache
 

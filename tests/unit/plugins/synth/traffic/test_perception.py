@@ -8,7 +8,9 @@ BYSTANDER = [50.0, 50.0, 0.0]
 
 
 def crossing_poses(seconds):
-    """Two at right angles and one who stands aside; they touch in so many seconds, at 10 m/s each."""
+    """Two at right angles and one who stands aside; they touch in so many seconds, at 10 m/s
+    each.
+    """
     back = 10.0 * seconds
     poses = np.array([BYSTANDER, [-2.0 - back, 0.0, 0.0], [1.0, -3.0 - back, np.pi / 2]])
     return poses, np.array([[0.0, 0.0], [10.0, 0.0], [0.0, 10.0]])

@@ -8,7 +8,9 @@ from deepaccident_devkit.plugins.synth.traffic.placement import unplanned
 
 
 def drawn(design, *seed):
-    """A design, what becomes of it with a stranger, its junction, and the source of all that follows."""
+    """A design, what becomes of it with a stranger, its junction, and the source of all that
+    follows.
+    """
     rng = np.random.default_rng(seed)
     spec = draw(read_design(design), rng)
     junction = Junction(spec.road)

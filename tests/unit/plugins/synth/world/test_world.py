@@ -1,4 +1,6 @@
-"""Towns around junctions: nothing stands in the way, the pole sees the middle, lamps are where they should be."""
+"""Towns around junctions: nothing stands in the way, the pole sees the middle, lamps are where they
+should be.
+"""
 
 import itertools
 
@@ -40,7 +42,9 @@ def named(request):
 
 
 def clear_of_props(world, start, end):
-    """Whether the sight from one point to another passes above or beside every block, seen in steps of 5 cm."""
+    """Whether the sight from one point to another passes above or beside every block, seen in steps
+    of 5 cm.
+    """
     line = np.linspace(start, end, int(np.linalg.norm(np.subtract(end, start)) / 0.05))[1:-1]
     low, high = world.props.corners.min(axis=1), world.props.corners.max(axis=1)
     return not ((line[:, None] > low) & (line[:, None] < high)).all(axis=2).any()
