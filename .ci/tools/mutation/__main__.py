@@ -1,6 +1,4 @@
-"""`PYTHONPATH=.ci/tools:tests python -m mutation`: plant mutants in the package, and see which the
-tests notice.
-"""
+"""`PYTHONPATH=.ci/tools:tests python -m mutation`: count planted faults that the tests notice."""
 
 import json
 from collections import Counter
@@ -12,33 +10,43 @@ from mutation.campaign import Campaign
 from mutation.mutants import Mutant
 from mutation.sample import AREAS, drawn
 
-_PLANTED = ("killed", "timed out", "survived", "not reached")
+_REASONS_FILE = Path(__file__).parent / "survivors.txt"
+_KILLED_OUTCOMES = ("killed", "timed out")
+_SURVIVING_OUTCOMES = ("survived", "not reached")
+_COLUMN_WIDTHS = {
+    "killed": 8,
+    "timed out": 11,
+    "survived": 10,
+    "not reached": 13,
+    "not planted": 13,
+    "to run": 8,
+}
 
 
 @click.command()
-@click.option("--count", default=1500, help="How many mutants are drawn by each seed.")
+@click.option("--count", default=1500, help="Number of mutants that each seed draws.")
 @click.option(
     "--seed",
     "seeds",
     multiple=True,
     type=int,
     default=[17],
-    help="Of the drawing; several are pooled.",
+    help="Seed of the drawing; the mutants of several seeds are pooled.",
 )
 @click.option(
     "--only",
     multiple=True,
     metavar="PATH",
-    help="Run those of the files that begin so, as motion/warping.",
+    help="Run only mutants of files whose paths begin with PATH, such as motion/warping.",
 )
-@click.option("--again", is_flag=True, help="Run those that survived once more.")
+@click.option("--again", is_flag=True, help="Run the survivors once more.")
 @click.option(
     "--results",
     type=click.Path(path_type=Path),
     default="build/mutants.jsonl",
-    help="What came of each; it grows.",
+    help="File of outcomes, to which new ones are appended.",
 )
-@click.option("--table", is_flag=True, help="Run nothing.")
+@click.option("--table", is_flag=True, help="Print the table without running anything.")
 def main(
     count: int,
     seeds: tuple[int, ...],
@@ -47,58 +55,50 @@ def main(
     results: Path,
     table: bool,
 ) -> None:
-    """Run what RESULTS does not have yet, and print how many were killed in each area, and what
-    survived.
-    """
-    pooled = {mutant.key: mutant for seed in seeds for mutant in drawn(count, seed)}
-    mutants = [mutant for mutant in pooled.values() if mutant.path.startswith(only or ("",))]
-    known = _outcomes(results)
-    waiting = [
-        each
-        for each in mutants
-        if known.get(each.key) is None or (again and known[each.key] in _PLANTED[2:])
-    ]
-    if waiting and not table:
+    """Run the mutants that RESULTS lacks; print the counts of each area and the survivors."""
+    pooled_mutants = {mutant.key: mutant for seed in seeds for mutant in drawn(count, seed)}
+    mutants = [m for m in pooled_mutants.values() if m.path.startswith(only or ("",))]
+    outcomes = _outcomes(results)
+    repeated_outcomes = (None, *_SURVIVING_OUTCOMES) if again else (None,)
+    pending = [mutant for mutant in mutants if outcomes.get(mutant.key) in repeated_outcomes]
+    if pending and not table:
         results.parent.mkdir(parents=True, exist_ok=True)
-        Campaign(waiting, results).run()
-        known = _outcomes(results)
-    click.echo(_table(mutants, known))
+        Campaign(pending, results).run()
+        outcomes = _outcomes(results)
+    click.echo(_table(mutants, outcomes))
 
 
 def _outcomes(results: Path) -> dict[str, str]:
-    """The last outcome of each mutant."""
-    lines = results.read_text(encoding="utf-8").splitlines() if results.exists() else []
+    """Return the last outcome of each mutant by its key."""
+    if not results.exists():
+        return {}
+    lines = results.read_text(encoding="utf-8").splitlines()
     return {record["key"]: record["outcome"] for record in map(json.loads, lines)}
 
 
 def _table(mutants: list[Mutant], outcomes: dict[str, str]) -> str:
-    rows = [
-        (
-            "area         killed  timed out  survived  not reached  not planted  to run "
-            "  killed of those planted"
-        )
-    ]
-    for area in (*AREAS, ""):
-        inside = [mutant for mutant in mutants if mutant.path.startswith(area)]
-        counts = Counter(outcomes.get(mutant.key, "to run") for mutant in inside)
-        planted = sum(counts[outcome] for outcome in _PLANTED)
-        share = (
-            f"{100 * (counts['killed'] + counts['timed out']) / planted:.1f} %" if planted else "–"
-        )
-        cells = "".join(
-            f"{counts[outcome]:>{width}}"
-            for outcome, width in zip(
-                (*_PLANTED, "not planted", "to run"), (8, 11, 10, 13, 13, 8), strict=True
-            )
-        )
-        rows.append(f"{area or 'all':<11}{cells}{share:>10}")
-    left = [mutant for mutant in mutants if outcomes.get(mutant.key) in _PLANTED[2:]]
-    lines = (Path(__file__).parent / "survivors.txt").read_text(encoding="utf-8").splitlines()
+    """Return a row of counts for each area, then a line for each survivor with its reason."""
+    head = "".join(f"{outcome:>{width}}" for outcome, width in _COLUMN_WIDTHS.items())
+    rows = [f"{'area':<11}{head}   killed of those planted"]
+    rows += [_area_row(area, mutants, outcomes) for area in (*AREAS, "")]
+    survivors = [m for m in mutants if outcomes.get(m.key) in _SURVIVING_OUTCOMES]
+    lines = _REASONS_FILE.read_text(encoding="utf-8").splitlines()
     reasons = dict(line.rsplit(" | ", 1) for line in lines)
-    for mutant in sorted(left, key=lambda mutant: (mutant.path, mutant.line)):
+    for mutant in sorted(survivors, key=lambda mutant: (mutant.path, mutant.line)):
         reason = reasons.get(f"{mutant.path}: {mutant.change}", outcomes[mutant.key])
         rows.append(f"{mutant.path}:{mutant.line}: {mutant.change} ({reason})")
     return "\n".join(rows)
+
+
+def _area_row(area: str, mutants: list[Mutant], outcomes: dict[str, str]) -> str:
+    """Return the counts of outcomes in an area, and the killed share of its planted mutants."""
+    area_mutants = [mutant for mutant in mutants if mutant.path.startswith(area)]
+    counts = Counter(outcomes.get(mutant.key, "to run") for mutant in area_mutants)
+    killed = sum(counts[outcome] for outcome in _KILLED_OUTCOMES)
+    planted = killed + sum(counts[outcome] for outcome in _SURVIVING_OUTCOMES)
+    cells = "".join(f"{counts[outcome]:>{width}}" for outcome, width in _COLUMN_WIDTHS.items())
+    share = f"{100 * killed / planted:.1f} %" if planted else "–"
+    return f"{area or 'all':<11}{cells}{share:>10}"
 
 
 if __name__ == "__main__":

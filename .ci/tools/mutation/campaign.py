@@ -1,6 +1,4 @@
-"""The runs: a pytest plugin that runs all tests once and then, for each mutant in a fork, those
-that may notice it.
-"""
+"""The pytest plugin that runs all tests once, and then for each mutant the tests that reach it."""
 
 import contextlib
 import functools
@@ -12,7 +10,7 @@ import resource
 import signal
 import sys
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from types import CodeType, FrameType
@@ -47,64 +45,60 @@ TESTS = {
     "parity/test_poses parity/test_visibility",
     "selection/splits": "unit/selection/test_splits",
 }
-"""The tests of each room, by how their paths begin; besides them its examples in docstrings."""
-_LONGEST = 10.0
-"""Seconds: longer tests do not take part; they start processes of their own, or repeat what shorter
-ones say.
-"""
-_BUDGET = 8.0
-"""Seconds of computing for a mutant; on average the tests of one take much less."""
-_PATIENCE = 10
-"""Seconds a second of computing: a fork that takes more hangs."""
-_MEMORY = 6 << 30
-_MOST = 500
-"""Letters of what a test says that fails."""
+"""Beginnings of the paths of each package's tests, which run beside its docstring examples."""
+_MAX_TEST_S = 10.0
+"""Longer tests take no part: they start processes, or repeat what shorter tests check."""
+_MUTANT_BUDGET_S = 8.0
+"""CPU time of a mutant's tests at most; on average they need much less."""
+_WALL_S_PER_CPU_S = 10
+"""A fork that takes longer is taken to hang."""
+_MAX_MEMORY_BYTES = 6 << 30
+_MAX_MESSAGE_CHARACTERS = 500
 _SURVIVED, _KILLED, _NOT_PLANTED = 0, 1, 2
 
 
 @dataclass
 class _Test:
-    """What is known of a test: how long it takes and computes without its fixtures, and which
-    functions it reaches.
+    """Durations of a test without its fixtures, and the functions that it reaches.
+
+    Attributes:
+        seconds: Wall time.
+        cpu_seconds: CPU time.
+        reached: File and first line of each function of the package.
     """
 
     seconds: float = 0.0
-    computing: float = 0.0
+    cpu_seconds: float = 0.0
     reached: list[list[Any]] = field(default_factory=list)
 
 
 class Campaign:
-    """Runs the tests for each of some mutants and appends what came of it to a file.
+    """Plugin that runs the tests of each mutant, and appends the outcome to a file.
 
     Attributes:
-        mutants: to be run.
-        results: a file of JSON lines.
+        mutants: Mutants to run.
+        results: File of JSON lines.
     """
 
     def __init__(self, mutants: Sequence[Mutant], results: Path) -> None:
         self.mutants, self.results = mutants, results
-        self._sources = {
-            each.path: (PACKAGE / each.path).read_text(encoding="utf-8") for each in mutants
-        }
+        paths = {mutant.path for mutant in mutants}
+        self._sources = {path: (PACKAGE / path).read_text(encoding="utf-8") for path in paths}
         self._tests: dict[str, _Test] = {}
 
     def run(self) -> int:
-        """All of it, in this process."""
-        rooms = sorted({_room_of(mutant.path) for mutant in self.mutants})
-        places = [place for room in rooms for place in _places(room)]
-        found = {path for place in places for path in ROOT.glob(f"{place}*")}
-        paths = map(
-            str, sorted(found, reverse=True)
-        )  # the package after its tests: as pytest does by itself
-        return pytest.main(
-            ["-q", "-m", "", "-p", "no:cacheprovider", "-p", "no:xdist", *paths], plugins=[self]
-        )
+        """Run pytest with this plugin in this process; return its exit status."""
+        areas = sorted({_area_of(mutant.path) for mutant in self.mutants})
+        prefixes = [prefix for area in areas for prefix in _test_prefixes(area)]
+        test_paths = {path for prefix in prefixes for path in ROOT.glob(f"{prefix}*")}
+        # the package after its tests, as in pytest's own order
+        arguments = map(str, sorted(test_paths, reverse=True))
+        options = ["-q", "-m", "", "-p", "no:cacheprovider", "-p", "no:xdist"]
+        return pytest.main([*options, *arguments], plugins=[self])
 
     @staticmethod
     def pytest_collection() -> None:
-        """Before the tests' modules are imported: no shrinking, since the first failure is
-        enough.
-        """
+        """Turn off Hypothesis' shrinking before tests are imported: the first failure is enough."""
         from hypothesis import HealthCheck, Phase, settings
 
         parent = settings.get_profile("repeatable")
@@ -115,6 +109,7 @@ class Campaign:
         settings.load_profile("mutation")
 
     def pytest_runtestloop(self, session: pytest.Session) -> bool:
+        """Learn which functions each test reaches, then run the tests of each mutant."""
         import cv2
 
         cv2.setNumThreads(1)  # its threads do not outlive a fork
@@ -124,90 +119,73 @@ class Campaign:
         self._caches = _caches()
         self._learn(session.items)
         gc.collect()
-        gc.freeze()  # what a fork does not touch stays shared
-        trusted: set[str] = set()
+        gc.freeze()  # memory that a fork does not touch stays shared
+        trusted_tests: set[str] = set()
         for number, mutant in enumerate(self.mutants, start=1):
             began = time.monotonic()
-            chosen = self._chosen(mutant, items)
-            outcome, by = self._in_fork([items[name] for name in chosen], mutant)
-            killer = by.split(": ")[0]
-            if (
-                killer in items
-                and killer not in trusted
-                and self._in_fork([items[killer]], None)[0] != "survived"
-            ):
-                raise session.Interrupted(f"fails in a fork without a mutant: {by}")
-            trusted.add(killer)
+            test_names = self._tests_of(mutant, items)
+            outcome, message = self._run_in_fork([items[name] for name in test_names], mutant)
+            if not test_names and outcome != "not planted":
+                outcome = "not reached"
+            killer = message.split(": ")[0]
+            if killer in items and killer not in trusted_tests:
+                if self._run_in_fork([items[killer]], None)[0] != "survived":
+                    raise session.Interrupted(f"fails in a fork without a mutant: {message}")
+            trusted_tests.add(killer)
             record = {
                 "key": mutant.key,
-                "outcome": outcome if chosen or outcome == "not planted" else "not reached",
+                "outcome": outcome,
                 "line": mutant.line,
                 "change": mutant.change,
-                "tests": len(chosen),
-                "by": by,
+                "tests": len(test_names),
+                "by": message,
                 "seconds": round(time.monotonic() - began, 2),
             }
             with self.results.open("a", encoding="utf-8") as file:
                 file.write(json.dumps(record, ensure_ascii=False) + "\n")
-            print(
-                number,
-                mutant.path,
-                mutant.line,
-                mutant.change,
-                record["outcome"],
-                record["seconds"],
-                flush=True,
-            )
+            line = (number, mutant.path, mutant.line, mutant.change, outcome, record["seconds"])
+            print(*line, flush=True)
         return True
 
     @pytest.hookimpl(wrapper=True)
     def pytest_runtest_call(self, item: pytest.Item) -> Iterator[None]:
-        """Note how long a test takes without its fixtures, and how long it computes, whatever else
-        the machine does.
-        """
-        began, before = time.monotonic(), time.process_time()
+        """Measure wall and CPU time of a test without its fixtures."""
+        wall_start, cpu_start = time.monotonic(), time.process_time()
         try:
             yield
         finally:
             if item.nodeid in self._tests:
-                self._tests[item.nodeid].seconds = time.monotonic() - began
-                self._tests[item.nodeid].computing = time.process_time() - before
+                test = self._tests[item.nodeid]
+                test.seconds = time.monotonic() - wall_start
+                test.cpu_seconds = time.process_time() - cpu_start
 
     def _learn(self, items: Sequence[pytest.Item]) -> None:
-        """Run the tests that are not known as they are now, and of the others enough to have the
-        session's fixtures.
-        """
+        """Run the tests that changed since they were measured, and one for each session fixture."""
         package = "".join(
             path.read_text(encoding="utf-8") for path in sorted(PACKAGE.rglob("*.py"))
         )
-        marks = {
+        fingerprints = {
             item.path: fingerprint(package + item.path.read_text(encoding="utf-8"))
             for item in items
         }
-        kept = self.results.with_suffix(".tests.json")
-        known = json.loads(kept.read_text(encoding="utf-8")) if kept.exists() else {}
+        cache_path = self.results.with_suffix(".tests.json")
+        records = json.loads(cache_path.read_text(encoding="utf-8")) if cache_path.exists() else {}
         for item in items:
-            if known.get(item.nodeid, {}).get("mark") != marks[item.path]:
-                known.pop(item.nodeid, None)
-        waiting, fixtures = [], set()
-        for item in sorted(
-            items, key=lambda item: known[item.nodeid]["seconds"] if item.nodeid in known else 0.0
-        ):
-            own = _session_fixtures(item)
-            if item.nodeid not in known or not own <= fixtures:
-                waiting.append(item)
-                fixtures |= own
-        waiting = [item for item in items if item in {*waiting}]
-        for item, following in zip(waiting, [*waiting[1:], *waiting[:1]], strict=True):
-            self._record(item, following)
-            known[item.nodeid] = asdict(self._tests[item.nodeid]) | {"mark": marks[item.path]}
-        kept.write_text(json.dumps(known), encoding="utf-8")
+            if records.get(item.nodeid, {}).get("fingerprint") != fingerprints[item.path]:
+                records.pop(item.nodeid, None)
+        pending = _tests_to_measure(items, records)
+        for item, next_item in zip(pending, [*pending[1:], *pending[:1]], strict=True):
+            self._measure(item, next_item)
+            test = asdict(self._tests[item.nodeid])
+            records[item.nodeid] = {**test, "fingerprint": fingerprints[item.path]}
+        cache_path.write_text(json.dumps(records), encoding="utf-8")
         for item in items:
-            values = {name: value for name, value in known[item.nodeid].items() if name != "mark"}
+            values = dict(records[item.nodeid])
+            del values["fingerprint"]
             self._tests[item.nodeid] = _Test(**values)
-        print(f"{len(waiting)} of {len(items)} tests were run to know what they reach", flush=True)
+        print(f"{len(pending)} of {len(items)} tests were run to know what they reach", flush=True)
 
-    def _record(self, item: pytest.Item, following: pytest.Item) -> None:
+    def _measure(self, item: pytest.Item, next_item: pytest.Item) -> None:
         """Run a test, and note which functions of the package it reaches and how long it takes."""
         reached: set[CodeType] = set()
         self._tests[item.nodeid] = _Test()
@@ -215,10 +193,10 @@ class Campaign:
         def trace(frame: FrameType, event: str, argument: object) -> None:
             reached.add(frame.f_code)
 
-        self._forget()
+        self._clear_caches()
         sys.settrace(trace)
         try:
-            reports = _ran(item, following)
+            reports = _run_test(item, next_item)
         finally:
             sys.settrace(None)
         if any(report.failed for report in reports):
@@ -230,39 +208,38 @@ class Campaign:
             if code.co_filename.startswith(str(PACKAGE))
         ]
 
-    def _forget(self) -> None:
-        """What the package remembers of calls, so that they are made anew."""
-        for cached in self._caches:
-            cached.cache_clear()
+    def _clear_caches(self) -> None:
+        """Clear the package's caches, so that calls are computed again."""
+        for cached_function in self._caches:
+            cached_function.cache_clear()
 
-    def _chosen(self, mutant: Mutant, names: Iterable[str]) -> list[str]:
-        """The tests of the mutant's room that reach its function or, outside of functions, whoever
-        imports its file.
+    def _tests_of(self, mutant: Mutant, names: Iterable[str]) -> list[str]:
+        """Return the names of the tests that may notice a mutant, the quickest first.
 
-        The quickest first, as many as compute for `_BUDGET` seconds.
+        They are tests of its area that reach its function or, for a mutant outside of functions,
+        any file that imports its file; as many as fit into the budget of CPU time.
         """
-        places = _places(_room_of(mutant.path))
-        files = {mutant.path} if mutant.span else {mutant.path, *_importing(mutant.path)}
+        prefixes = _test_prefixes(_area_of(mutant.path))
+        files = {mutant.path} if mutant.span else {mutant.path, *_importing_files(mutant.path)}
         first, last = mutant.span or (0, sys.maxsize)
-        found, computing = [], 0.0
+        chosen_names, cpu_seconds = [], 0.0
         for name in sorted(names, key=lambda name: self._tests[name].seconds):
             test = self._tests[name]
+            if cpu_seconds >= _MUTANT_BUDGET_S or test.seconds >= _MAX_TEST_S:
+                break
             reached = any(file in files and first <= line <= last for file, line in test.reached)
-            if (
-                reached
-                and name.startswith(places)
-                and computing < _BUDGET
-                and test.seconds < _LONGEST
-            ):
-                found.append(name)
-                computing += test.computing
-        return found
+            if reached and name.startswith(prefixes):
+                chosen_names.append(name)
+                cpu_seconds += test.cpu_seconds
+        return chosen_names
 
-    def _in_fork(self, items: Sequence[pytest.Item], mutant: Mutant | None) -> tuple[str, str]:
-        """How a fork ends that plants a mutant and runs tests until one fails, and which one
-        does.
+    def _run_in_fork(self, items: Sequence[pytest.Item], mutant: Mutant | None) -> tuple[str, str]:
+        """Plant a mutant in a fork and run tests there until one fails.
+
+        Returns:
+            The outcome, and the message of the test that failed.
         """
-        limit = 30 + 4 * sum(self._tests[item.nodeid].computing for item in items)
+        cpu_limit = 30 + 4 * sum(self._tests[item.nodeid].cpu_seconds for item in items)
         reading, writing = os.pipe()
         child = os.fork()
         if not child:
@@ -271,85 +248,104 @@ class Campaign:
             status = _KILLED
             try:
                 signal.signal(signal.SIGALRM, signal.SIG_DFL)
-                signal.setitimer(signal.ITIMER_PROF, limit)
-                signal.setitimer(signal.ITIMER_REAL, _PATIENCE * limit)
-                resource.setrlimit(resource.RLIMIT_DATA, (_MEMORY, _MEMORY))
-                status = self._child(items, mutant, writing)
-            except BaseException as error:  # noqa: BLE001 - such as of a module that cannot be imported any more
-                os.write(writing, repr(error)[:_MOST].encode())
+                signal.setitimer(signal.ITIMER_PROF, cpu_limit)
+                signal.setitimer(signal.ITIMER_REAL, _WALL_S_PER_CPU_S * cpu_limit)
+                resource.setrlimit(resource.RLIMIT_DATA, (_MAX_MEMORY_BYTES, _MAX_MEMORY_BYTES))
+                status = self._run_child(items, mutant, writing)
+            except BaseException as error:  # noqa: BLE001 - such as a module that no longer imports
+                os.write(writing, repr(error)[:_MAX_MESSAGE_CHARACTERS].encode())
             finally:
                 os._exit(status)
         os.close(writing)
         _, status = os.waitpid(child, 0)
         with contextlib.suppress(ProcessLookupError):
-            os.killpg(child, signal.SIGKILL)  # what its tests started
+            os.killpg(child, signal.SIGKILL)  # processes that its tests started
         os.set_blocking(reading, False)
-        with os.fdopen(reading, "rb", buffering=0) as told:
-            by = (told.read() or b"").decode()
-        if os.WIFSIGNALED(status):
-            late = os.WTERMSIG(status) in {signal.SIGPROF, signal.SIGALRM}
-            return "timed out" if late else "killed", by
-        return {_SURVIVED: "survived", _KILLED: "killed", _NOT_PLANTED: "not planted"}[
-            os.WEXITSTATUS(status)
-        ], by
+        with os.fdopen(reading, "rb", buffering=0) as pipe:
+            message = (pipe.read() or b"").decode()
+        return _outcome(status), message
 
-    def _child(self, items: Sequence[pytest.Item], mutant: Mutant | None, told: int) -> int:
-        self._forget()
+    def _run_child(self, items: Sequence[pytest.Item], mutant: Mutant | None, pipe: int) -> int:
+        """Plant a mutant in this process and run tests; write the first failure into the pipe."""
+        self._clear_caches()
         if mutant is not None:
             module = importlib.import_module(_module_name(mutant.path))
             if not plant(module, mutated(self._sources[mutant.path], mutant.number)):
                 return _NOT_PLANTED
-        if items:  # leave the last test's folders, but for those of the first one here
+        if items:  # leave the last test's folders, except those of the first test here
             items[0].session._setupstate.teardown_exact(items[0])
-        for item, following in zip(items, [*items[1:], *items[:1]], strict=True):
-            failed = [report for report in _ran(item, following) if report.failed]
-            if failed:
-                os.write(told, f"{item.nodeid}: {failed[0].longreprtext[-_MOST:]}".encode())
+        for item, next_item in zip(items, [*items[1:], *items[:1]], strict=True):
+            failures = [report for report in _run_test(item, next_item) if report.failed]
+            if failures:
+                message = failures[0].longreprtext[-_MAX_MESSAGE_CHARACTERS:]
+                os.write(pipe, f"{item.nodeid}: {message}".encode())
                 return _KILLED
         return _SURVIVED
 
 
+def _tests_to_measure(
+    items: Sequence[pytest.Item], records: Mapping[str, Any]
+) -> list[pytest.Item]:
+    """Return the tests without a record, and others that make the remaining session fixtures."""
+    chosen, fixtures = set(), set()
+    durations = {name: record["seconds"] for name, record in records.items()}
+    for item in sorted(items, key=lambda item: durations.get(item.nodeid, 0.0)):
+        item_fixtures = _session_fixtures(item)
+        if item.nodeid not in records or not item_fixtures <= fixtures:
+            chosen.add(item)
+            fixtures |= item_fixtures
+    return [item for item in items if item in chosen]
+
+
+def _outcome(status: int) -> str:
+    """Return the outcome that the wait status of a fork means."""
+    if os.WIFSIGNALED(status):
+        is_late = os.WTERMSIG(status) in {signal.SIGPROF, signal.SIGALRM}
+        return "timed out" if is_late else "killed"
+    outcomes = {_SURVIVED: "survived", _KILLED: "killed", _NOT_PLANTED: "not planted"}
+    return outcomes[os.WEXITSTATUS(status)]
+
+
 def _module_name(path: str) -> str:
+    """Return the module name of a file below the package's folder."""
     return ".".join((PACKAGE.name, *Path(path).with_suffix("").parts)).removesuffix(".__init__")
 
 
 def _caches() -> list[Any]:
-    """All that the package remembers of calls."""
-    kind = type(functools.lru_cache(len))
-    return [
-        each
-        for each in gc.get_objects()
-        if isinstance(each, kind) and str(each.__module__).startswith(PACKAGE.name)
-    ]
+    """Return the cached functions of the package."""
+    cache_type = type(functools.lru_cache(len))
+    cached_functions = [item for item in gc.get_objects() if isinstance(item, cache_type)]
+    return [item for item in cached_functions if str(item.__module__).startswith(PACKAGE.name)]
 
 
-def _ran(item: pytest.Item, following: pytest.Item) -> list[pytest.TestReport]:
+def _run_test(item: pytest.Item, next_item: pytest.Item) -> list[pytest.TestReport]:
     """Run a test, which may have run before."""
-    names = dict(item.dtest.globs) if hasattr(item, "dtest") else {}
-    reports = runtestprotocol(item, nextitem=following, log=False)
-    if names:
-        item.dtest.globs.update(names)
+    doctest_globals = dict(item.dtest.globs) if hasattr(item, "dtest") else {}
+    reports = runtestprotocol(item, nextitem=next_item, log=False)
+    if doctest_globals:
+        item.dtest.globs.update(doctest_globals)
     return reports
 
 
 def _session_fixtures(item: pytest.Item) -> set[str]:
+    """Return the names of the session fixtures of a test."""
     definitions = getattr(getattr(item, "_fixtureinfo", None), "name2fixturedefs", {})
     return {name for name, defined in definitions.items() if defined[-1].scope == "session"}
 
 
-def _places(room: str) -> tuple[str, ...]:
-    """How the paths of a room's tests begin, below the repository's folder."""
-    return (*(f"tests/{place}" for place in TESTS[room].split()), f"{PACKAGE.name}/{room}")
+def _test_prefixes(area: str) -> tuple[str, ...]:
+    """Return the beginnings of the paths of an area's tests, relative to the repository."""
+    return (*(f"tests/{path}" for path in TESTS[area].split()), f"{PACKAGE.name}/{area}")
 
 
-def _room_of(path: str) -> str:
-    """The room in `TESTS` of a file below the package's folder."""
-    return next(room for room in TESTS if path.startswith(room))
+def _area_of(path: str) -> str:
+    """Return the key in `TESTS` for a file below the package's folder."""
+    return next(area for area in TESTS if path.startswith(area))
 
 
 @functools.cache
-def _importing(path: str) -> tuple[str, ...]:
-    """The files that import from a file."""
+def _importing_files(path: str) -> tuple[str, ...]:
+    """Return the files that import from a file."""
     name = _module_name(path)
     texts = ((file, file.read_text(encoding="utf-8")) for file in PACKAGE.rglob("*.py"))
     return tuple(

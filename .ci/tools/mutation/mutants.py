@@ -1,12 +1,10 @@
-"""The mutants of a source: each is one replaced node of its syntax tree, in the order of the
-text.
-"""
+"""The mutants of a source: each replaces one node of its syntax tree, in the order of the text."""
 
 import ast
 import copy
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from itertools import takewhile
+from itertools import islice, takewhile
 
 _COMPARISONS = {
     ast.Lt: (ast.LtE, ast.GtE),
@@ -33,7 +31,7 @@ _ARITHMETIC = {
     ast.LShift: ast.RShift,
     ast.RShift: ast.LShift,
 }
-_TWINS = [
+_TWIN_FUNCTIONS = [
     ("min", "max"),
     ("any", "all"),
     ("floor", "ceil"),
@@ -44,14 +42,16 @@ _TWINS = [
     ("union1d", "intersect1d"),
     ("logical_and", "logical_or"),
 ]
-_OTHER_NAME = {one: other for pair in _TWINS for one, other in (pair, pair[::-1])} | {
+_REPLACED_FUNCTIONS = {
+    **dict(_TWIN_FUNCTIONS),
+    **{second: first for first, second in _TWIN_FUNCTIONS},
     "round": "int",
     "rint": "floor",
     "sorted": "list",
     "abs": "float",
     "hypot": "add",
 }
-_KEPT_ARGUMENTS = {"strict", "dtype", "copy", "encoding"}
+_UNTOUCHED_ARGUMENTS = {"strict", "dtype", "copy", "encoding"}
 
 
 @dataclass(frozen=True)
@@ -59,12 +59,12 @@ class Mutant:
     """One fault that can be planted.
 
     Attributes:
-        path: of the file, below the package's folder.
-        number: which of the file's mutants.
-        line: where it is.
-        span: first and last line of the outermost function around it; None outside of functions.
-        change: what is replaced by what.
-        source: fingerprint of the file, by which results of another text are told.
+        path: Path of the file, relative to the package's folder.
+        number: Number of the mutant within its file.
+        line: Line of the change.
+        span: First and last line of the outermost function around it; None outside of functions.
+        change: Old and new code.
+        source: Fingerprint of the file, which tells results of another version apart.
     """
 
     path: str
@@ -76,79 +76,87 @@ class Mutant:
 
     @property
     def key(self) -> str:
+        """Identifier of the mutant of this version of the file."""
         return f"{self.path}:{self.number}:{self.source}"
 
 
 Change = tuple[ast.AST, Callable[[], None], str]
-"""The node, what replaces it in its tree, and in words."""
+"""A node, a function that replaces it within its tree, and a description."""
 
 
 def changes(tree: ast.Module) -> Iterator[Change]:
-    """All changes of a tree; each is of the tree as it is, so that one alone may be made."""
+    """Yield all changes of a tree; each expects the original, so only one may be made."""
     yield from _below(tree)
 
 
 def mutated(source: str, number: int) -> ast.Module:
-    """The tree of a source with its change of that number made."""
+    """Return the tree of a source after its change of this number."""
     tree = ast.parse(source)
-    next(change for at, change in enumerate(changes(tree)) if at == number)[1]()
+    _, make_change, _ = next(islice(changes(tree), number, None))
+    make_change()
     return ast.fix_missing_locations(tree)
 
 
 def _below(parent: ast.AST) -> Iterator[Change]:
+    """Yield the changes of all nodes below a node."""
     for name, value in ast.iter_fields(parent):
-        if _is_left_alone(parent, name):
+        if _is_untouched(parent, name):
             continue
-        for at, node in enumerate(value if isinstance(value, list) else [value]):
+        is_list = isinstance(value, list)
+        for position, node in enumerate(value if is_list else [value]):
             if not isinstance(node, ast.AST) or _is_text(node):
                 continue
-            for new, words in _replacements(node):
-                yield (
-                    node,
-                    _setting(parent, name, at if isinstance(value, list) else None, new),
-                    words,
-                )
+            for new_node, words in _replacements(node):
+                yield node, _setter(parent, name, position if is_list else None, new_node), words
             if not isinstance(node, ast.Raise):
                 yield from _below(node)
 
 
-def _setting(parent: ast.AST, name: str, at: int | None, new: ast.AST) -> Callable[[], None]:
-    def change() -> None:
-        if at is None:
-            setattr(parent, name, new)
+def _setter(parent: ast.AST, name: str, position: int | None, node: ast.AST) -> Callable[[], None]:
+    """Return a function that puts a node into a field of its parent or into a list there."""
+
+    def set_node() -> None:
+        if position is None:
+            setattr(parent, name, node)
         else:
-            getattr(parent, name)[at] = new
+            getattr(parent, name)[position] = node
 
-    return change
+    return set_node
 
 
-def _is_left_alone(parent: ast.AST, name: str) -> bool:
+def _is_untouched(parent: ast.AST, name: str) -> bool:
+    """Return whether a field holds annotations, decorators or imports for types."""
     return name in {"annotation", "returns", "decorator_list", "type_params"} or (
         isinstance(parent, ast.If) and "TYPE_CHECKING" in ast.dump(parent.test)
     )
 
 
 def _is_text(node: ast.AST) -> bool:
-    lone = isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)
-    return lone or isinstance(node, ast.JoinedStr | ast.Import | ast.ImportFrom | ast.Assert)
+    """Return whether a node is a docstring, an f-string, an import or an assertion."""
+    is_docstring = isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)
+    return is_docstring or isinstance(
+        node, ast.JoinedStr | ast.Import | ast.ImportFrom | ast.Assert
+    )
 
 
 def _replacements(node: ast.AST) -> Iterator[tuple[ast.AST, str]]:
-    """What a node may become, and in words."""
-    for new in _others(node):
-        here, there = (ast.unparse(each).split("\n")[0] for each in (node, new))
-        same = takewhile(lambda pair: pair[0] == pair[1], zip(here, there, strict=False))
-        begin = max(0, len([*same]) - 25)
-        yield (
-            ast.copy_location(new, node),
-            f"{here[begin : begin + 60]} → {there[begin : begin + 60]}",
-        )
+    """Yield the nodes that a node may become, each with a description of the change."""
+    old_text = ast.unparse(node).split("\n")[0]
+    for new_node in _others(node):
+        new_text = ast.unparse(new_node).split("\n")[0]
+        pairs = zip(old_text, new_text, strict=False)
+        common_length = len(list(takewhile(lambda pair: pair[0] == pair[1], pairs)))
+        begin = max(0, common_length - 25)
+        end = begin + 60
+        words = f"{old_text[begin:end]} → {new_text[begin:end]}"
+        yield ast.copy_location(new_node, node), words
 
 
 def _others(node: ast.AST) -> Iterator[ast.AST]:
-    made = _BY_TYPE.get(type(node))
-    if made is not None:
-        yield from made(node)
+    """Yield the nodes that a node may become."""
+    mutate = _MUTATIONS_BY_TYPE.get(type(node))
+    if mutate is not None:
+        yield from mutate(node)
     if isinstance(node, ast.If | ast.While | ast.IfExp) and isinstance(
         node.test, ast.Name | ast.Call | ast.Attribute
     ):
@@ -158,19 +166,19 @@ def _others(node: ast.AST) -> Iterator[ast.AST]:
 
 
 def _with(node: ast.AST, **fields: object) -> ast.AST:
-    """A node like this one, but for some fields; what lies below is shared, since only one change
-    is made.
-    """
-    new = copy.copy(node)
+    """Return a copy of a node with other fields; the nodes below are shared."""
+    changed_node = copy.copy(node)
     for name, value in fields.items():
-        setattr(new, name, value)
-    return new
+        setattr(changed_node, name, value)
+    return changed_node
 
 
 def _compare(node: ast.Compare) -> Iterator[ast.AST]:
-    for at, operation in enumerate(node.ops):
-        for other in _COMPARISONS[type(operation)]:
-            yield _with(node, ops=[*node.ops[:at], other(), *node.ops[at + 1 :]])
+    for position, operator in enumerate(node.ops):
+        for other_operator in _COMPARISONS[type(operator)]:
+            operators = [*node.ops]
+            operators[position] = other_operator()
+            yield _with(node, ops=operators)
 
 
 def _binary(node: ast.BinOp | ast.AugAssign) -> Iterator[ast.AST]:
@@ -207,14 +215,14 @@ def _constant(node: ast.Constant) -> Iterator[ast.AST]:
 
 def _call(node: ast.Call) -> Iterator[ast.AST]:
     name = node.func.attr if isinstance(node.func, ast.Attribute) else getattr(node.func, "id", "")
-    if name in _OTHER_NAME:
+    if name in _REPLACED_FUNCTIONS:
         field = "attr" if isinstance(node.func, ast.Attribute) else "id"
-        yield _with(node, func=_with(node.func, **{field: _OTHER_NAME[name]}))
-    if name[:1].isupper() or name == "cls":  # most of what a record is made with has no default
+        yield _with(node, func=_with(node.func, **{field: _REPLACED_FUNCTIONS[name]}))
+    if name[:1].isupper() or name == "cls":  # most arguments of a record have no default
         return
-    for at, keyword in enumerate(node.keywords):
-        if keyword.arg and keyword.arg not in _KEPT_ARGUMENTS:
-            yield _with(node, keywords=node.keywords[:at] + node.keywords[at + 1 :])
+    for position, keyword in enumerate(node.keywords):
+        if keyword.arg and keyword.arg not in _UNTOUCHED_ARGUMENTS:
+            yield _with(node, keywords=node.keywords[:position] + node.keywords[position + 1 :])
 
 
 def _returned(node: ast.Return) -> Iterator[ast.AST]:
@@ -232,7 +240,7 @@ def _left_out(node: ast.AST) -> Iterator[ast.AST]:
     yield ast.Pass()
 
 
-_BY_TYPE: dict[type[ast.AST], Callable[..., Iterator[ast.AST]]] = {
+_MUTATIONS_BY_TYPE: dict[type[ast.AST], Callable[..., Iterator[ast.AST]]] = {
     ast.Compare: _compare,
     ast.BinOp: _binary,
     ast.AugAssign: _augmented,
