@@ -38,20 +38,20 @@ test("what is behind the eye, or too near, has no pixel", () => {
 
 test("the ray of a pixel leads to what the pixel shows", () => {
   const view = orbit(3, -4, 1, 0.7, 0.4, 25);
-  const place = [6, -9, 2];
-  const [x, y] = view.pixel(place, 640, 480);
+  const point = [6, -9, 2];
+  const [x, y] = view.pixel(point, 640, 480);
   const ray = view.ray(x, y, 640, 480);
-  const distance = (place[2] - view.eye[2]) / ray[2];
-  assertClose(view.eye.map((each, axis) => each + distance * ray[axis]), place);
+  const distance = (point[2] - view.eye[2]) / ray[2];
+  assertClose(view.eye.map((coordinate, axis) => coordinate + distance * ray[axis]), point);
 });
 
 test("the matrix agrees with the pixels", () => {
   const view = orbit(3, -4, 1, 0.7, 0.4, 25);
-  const place = [6, -9, 2, 1];
+  const point = [6, -9, 2, 1];
   const matrix = view.matrix(640 / 480);
-  const row = (number) => place.reduce((sum, each, column) => sum + each * matrix[4 * column + number], 0);
+  const row = (number) => point.reduce((sum, coordinate, column) => sum + coordinate * matrix[4 * column + number], 0);
   const [x, y, w] = [row(0), row(1), row(3)];
-  assertClose([(1 + x / w) * 320, (1 - y / w) * 240], view.pixel(place.slice(0, 3), 640, 480), 1e-3);
+  assertClose([(1 + x / w) * 320, (1 - y / w) * 240], view.pixel(point.slice(0, 3), 640, 480), 1e-3);
 });
 
 test("turning stops above the horizon and straight above", () => {

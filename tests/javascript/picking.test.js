@@ -50,8 +50,8 @@ test("an actor that is not annotated at the frame is not picked", () => {
 
 const ABOVE = Object.assign(new Orbit(), { numbers: [0, 0, 0, -Math.PI / 2, Math.PI / 2, 100] });
 
-function inSpace(actors, place, frame = 0) {
-  const [x, y] = ABOVE.pixel(place, 400, 200);
+function inSpace(actors, point, frame = 0) {
+  const [x, y] = ABOVE.pixel(point, 400, 200);
   return actorInSpace(actors, frame, ABOVE, x, y, 400, 200)?.id ?? null;
 }
 

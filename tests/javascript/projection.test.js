@@ -36,10 +36,10 @@ test("what is straight ahead is at the principal point", () => {
 });
 
 test("a box ahead of the camera has twelve edges around its centre", () => {
-  const found = edges(actor(1), state(0, 0, 1050));
-  assert.equal(found.length, 12);
+  const ends = edges(actor(1), state(0, 0, 1050));
+  assert.equal(ends.length, 12);
   // half of 4 × 2 × 1 metres; the nearest face is 10 m away
-  assertClose(extentOf(found.flat()), [80, 40, 120, 60]);
+  assertClose(extentOf(ends.flat()), [80, 40, 120, 60]);
 });
 
 test("a box is seen from its side in the axes of the camera", () => {
@@ -58,9 +58,9 @@ test("a box beside, above or below the picture has no edge", () => {
 });
 
 test("a box around the camera is cut off 10 cm ahead of it", () => {
-  const found = edges({ ...actor(1), height: 2000 }, state(0, 0, 0));
-  assert.equal(found.length, 8); // the four edges of the lower face are behind the camera
-  const cut = found.flat().filter(([x, y]) => Math.abs(x - 100) > 200 || Math.abs(y - 50) > 200);
+  const ends = edges({ ...actor(1), height: 2000 }, state(0, 0, 0));
+  assert.equal(ends.length, 8); // the four edges of the lower face are behind the camera
+  const cut = ends.flat().filter(([x, y]) => Math.abs(x - 100) > 200 || Math.abs(y - 50) > 200);
   assert.equal(cut.length, 4);
   assertClose(extentOf(cut), [100 - 2000, 50 - 1000, 100 + 2000, 50 + 1000]);
 });

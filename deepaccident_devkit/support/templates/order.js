@@ -42,5 +42,5 @@ export function ordered(items, keyOfItem, isAscending) {
   }
   const sign = isAscending ? 1 : -1;
   known.sort((one, other) => sign * compare(one.key, other.key));
-  return [...known.map((each) => each.item), ...unknown];
+  return [...known.map((entry) => entry.item), ...unknown];
 }

@@ -40,8 +40,8 @@ export function viewOfAddress(text) {
  * @param {string | null} text
  */
 export function picturesOfAddress(text) {
-  const pairs = (text ?? "").split(",").map((each) => each.split(":"));
-  return pairs.filter((each) => each.length === 2).map(([agent, title]) => ({ agent, title }));
+  const pairs = (text ?? "").split(",").map((pair) => pair.split(":"));
+  return pairs.filter((pair) => pair.length === 2).map(([agent, title]) => ({ agent, title }));
 }
 
 /**

@@ -5,8 +5,8 @@ import { nextEntry } from "./entries.js";
 /** @param {1 | -1} step */
 function goAlong(step) {
   /** @type {HTMLAnchorElement[]} */
-  const entries = [...document.querySelectorAll("a.entry")].filter((each) => each instanceof HTMLAnchorElement);
-  const at = entries.findIndex((each) => each === document.activeElement);
+  const entries = [...document.querySelectorAll("a.entry")].filter((entry) => entry instanceof HTMLAnchorElement);
+  const at = entries.findIndex((entry) => entry === document.activeElement);
   entries[nextEntry(at, step, entries.length)]?.focus();
 }
 

@@ -7,17 +7,17 @@ import { changedQuery, frameOfAddress, picturesOfAddress, viewOfAddress, viewTex
 
 const DELAY = 200; // milliseconds: browsers refuse many changes of the address in a second
 
-const given = new URLSearchParams(location.search);
+const address = new URLSearchParams(location.search);
 /** @type {ReplayData} */
 const data = JSON.parse(document.getElementById("data")?.textContent ?? "");
 const large = selectOf("large");
 const selects = ["follow", "sight", "scene", "points-by"].map(selectOf);
 /** @type {HTMLInputElement[]} */
 const checkboxes = [...document.querySelectorAll('[id^="layer-"], [id^="cloud-"], #boxes')].filter(
-  (each) => each instanceof HTMLInputElement,
+  (element) => element instanceof HTMLInputElement,
 );
 /** @type {HTMLElement[]} the pictures of the agents */
-const figures = [...document.querySelectorAll("#cards figure")].filter((each) => each instanceof HTMLElement);
+const figures = [...document.querySelectorAll("#cards figure")].filter((element) => element instanceof HTMLElement);
 const allCameras = /** @type {HTMLDetailsElement} */ (document.getElementById("every"));
 const usualChecks = new Map(checkboxes.map((box) => [box.id, box.checked]));
 const usualValues = new Map(selects.map((select) => [select.id, select.value]));
@@ -56,27 +56,27 @@ function choose(select, value) {
 
 // from the address
 
-const frame = frameOfAddress(given.get("frame"), data.cameras.flat(), data.countdown.length);
+const frame = frameOfAddress(address.get("frame"), data.cameras.flat(), data.countdown.length);
 if (frame) go(frame);
-const largeAgent = data.agents.findIndex((agent) => agent.name === given.get("large"));
+const largeAgent = data.agents.findIndex((agent) => agent.name === address.get("large"));
 if (largeAgent >= 0) choose(large, String(largeAgent));
 for (const select of selects) {
-  const value = given.get(select.id);
+  const value = address.get(select.id);
   if (value !== null) choose(select, value);
 }
-const changed = (given.get("changed") ?? "").split(",");
+const changed = (address.get("changed") ?? "").split(",");
 for (const box of checkboxes) {
   if (changed.includes(box.id) && box.checked === usualChecks.get(box.id)) box.click();
 }
-for (const { agent, title } of picturesOfAddress(given.get("pictures"))) {
+for (const { agent, title } of picturesOfAddress(address.get("pictures"))) {
   const select = figures.find((figure) => figure.dataset.agent === agent)?.querySelector("select");
   if (select && [...select.options].some((option) => option.value === title)) choose(select, title);
 }
-const view = viewOfAddress(given.get("view"));
+const view = viewOfAddress(address.get("view"));
 if (view && selectOf("follow").value === "") {
   document.dispatchEvent(new CustomEvent("look", { detail: { id: "ground", view } }));
 }
-if (given.get("cameras") === "all") allCameras.open = true;
+if (address.get("cameras") === "all") allCameras.open = true;
 
 // to the address
 

@@ -2,15 +2,15 @@
 
 async function load() {
   /** @type {NodeListOf<HTMLElement>} */
-  const places = document.querySelectorAll("[data-part]");
-  for (const place of places) {
+  const elements = document.querySelectorAll("[data-part]");
+  for (const element of elements) {
     try {
-      const answer = await fetch(place.dataset.part ?? "");
+      const answer = await fetch(element.dataset.part ?? "");
       const text = await answer.text();
-      if (answer.ok) place.innerHTML = text; // the server escapes all names; scripts in it would not run
-      else place.textContent = "This cannot be told.";
+      if (answer.ok) element.innerHTML = text; // the server escapes all names; scripts in it would not run
+      else element.textContent = "This cannot be told.";
     } catch {
-      place.textContent = "The server has ended.";
+      element.textContent = "The server has ended.";
       break;
     }
   }

@@ -16,7 +16,7 @@ export function frameInStep(frame, shift, last) {
  * @param {number[]} offset from one recording's places to the other's, metres
  */
 export function viewInStep(view, offset) {
-  return view.map((number, place) => number + (offset[place] ?? 0));
+  return view.map((number, position) => number + (offset[position] ?? 0));
 }
 
 /**
@@ -24,7 +24,7 @@ export function viewInStep(view, offset) {
  * @param {number[]} other
  */
 export function isSameView(one, other) {
-  return one.every((number, place) => Math.abs(number - other[place]) < 1e-6);
+  return one.every((number, position) => Math.abs(number - other[position]) < 1e-6);
 }
 
 /**

@@ -95,9 +95,9 @@ function share() {
   if (!isInStep() || !one || !other) return;
   const sign = touched === frames[0] ? -1 : 1;
   for (const { id, dataset } of canvasesOf(one)) {
-    const view = viewInStep(numbersOf(dataset.view), offset.map((each) => sign * each));
-    const there = numbersOf(other.getElementById(id)?.dataset.view);
-    if (!isSameView(view, there)) other.dispatchEvent(new CustomEvent("look", { detail: { id, view } }));
+    const view = viewInStep(numbersOf(dataset.view), offset.map((coordinate) => sign * coordinate));
+    const otherView = numbersOf(other.getElementById(id)?.dataset.view);
+    if (!isSameView(view, otherView)) other.dispatchEvent(new CustomEvent("look", { detail: { id, view } }));
   }
 }
 

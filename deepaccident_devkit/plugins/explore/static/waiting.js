@@ -8,26 +8,26 @@ function isTyping() {
 
 /**
  * Ask what is still being computed, until that is less than the page waits for.
- * @param {HTMLElement} place
+ * @param {HTMLElement} element
  * @param {string[]} titles of what the page waits for
  */
-async function look(place, titles) {
+async function look(element, titles) {
   try {
-    const answer = await fetch(place.dataset.waiting ?? "");
+    const answer = await fetch(element.dataset.waiting ?? "");
     /** @type {string[]} */
     const left = await answer.json();
     const isUnchanged = titles.every((title) => left.includes(title));
-    if (isTyping() || isUnchanged) setTimeout(() => look(place, titles), POLL);
+    if (isTyping() || isUnchanged) setTimeout(() => look(element, titles), POLL);
     else location.reload();
   } catch {
-    place.textContent = "The server has ended.";
+    element.textContent = "The server has ended.";
   }
 }
 
 /** @type {NodeListOf<HTMLElement>} */
-const places = document.querySelectorAll("[data-titles]");
-for (const place of places) {
+const elements = document.querySelectorAll("[data-titles]");
+for (const element of elements) {
   /** @type {string[]} */
-  const titles = JSON.parse(place.dataset.titles ?? "[]");
-  if (titles.length) setTimeout(() => look(place, titles), POLL);
+  const titles = JSON.parse(element.dataset.titles ?? "[]");
+  if (titles.length) setTimeout(() => look(element, titles), POLL);
 }

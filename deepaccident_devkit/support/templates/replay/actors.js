@@ -64,10 +64,10 @@ export function agentByNumber(text, agents) {
  * @returns {Actor | undefined}
  */
 export function nextActor(actors, frame, chosen, step) {
-  const there = actors.filter((actor) => actor.states[frame] !== null);
-  const at = there.findIndex((actor) => actor.id === chosen);
-  if (at < 0) return step > 0 ? there[0] : there[there.length - 1];
-  return there[(at + step + there.length) % there.length];
+  const present = actors.filter((actor) => actor.states[frame] !== null);
+  const position = present.findIndex((actor) => actor.id === chosen);
+  if (position < 0) return step > 0 ? present[0] : present[present.length - 1];
+  return present[(position + step + present.length) % present.length];
 }
 
 // predictions
@@ -107,7 +107,7 @@ export function samplesByFrame(samples) {
  * @param {number} frame
  */
 export function lastBefore(frames, frame) {
-  const before = [...frames].filter((each) => each <= frame);
+  const before = [...frames].filter((sampleFrame) => sampleFrame <= frame);
   return before.length ? Math.max(...before) : null;
 }
 

@@ -133,7 +133,7 @@ function showCamera(card) {
     card.select.options[0].textContent = card.chosen ? "automatic" : `auto: ${camera.title}`;
     if (state.boxes) drawBoxes(card, camera, frame);
   }
-  const sample = state.foreseen.find((each) => each.agent === card.number);
+  const sample = state.foreseen.find((candidate) => candidate.agent === card.number);
   card.judged.replaceChildren(...(sample ? [verdictBadge(sample)] : []));
   card.sees.textContent = sightText(card);
 }

@@ -71,7 +71,7 @@ byId("clouds").hidden = sources.withPoints.length < 2;
 for (const number of sources.withPoints) {
   const agent = data.agents[number];
   addCheckbox("clouds", `cloud-${agent.name}`, agent.title, true, (checked) => {
-    state.clouds = sources.withPoints.filter((each) => (each === number ? checked : state.clouds.includes(each)));
+    state.clouds = sources.withPoints.filter((index) => (index === number ? checked : state.clouds.includes(index)));
     if (state.scene !== "map") return;
     state.layers.points = true;
     byId("layer-points", HTMLInputElement).checked = true;

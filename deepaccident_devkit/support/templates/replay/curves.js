@@ -9,17 +9,17 @@ export function known(values) {
 }
 
 /**
- * Return the path of a curve between 0 and `most`, with gaps where values are unknown.
+ * Return the path of a curve between 0 and `maximum`, with gaps where values are unknown.
  * @param {(number | null)[]} values one for each frame
- * @param {number} most what is at the upper edge; larger values are, too
+ * @param {number} maximum what is at the upper edge; larger values are, too
  * @param {number} height of the curve, pixels
  */
-export function curvePath(values, most, height) {
+export function curvePath(values, maximum, height) {
   let path = "";
   for (const [frame, value] of values.entries()) {
     if (value === null) continue;
     const isFirst = frame === 0 || values[frame - 1] === null;
-    const y = height - 1.5 - (Math.min(value, most) / most) * (height - 3);
+    const y = height - 1.5 - (Math.min(value, maximum) / maximum) * (height - 3);
     path += `${isFirst ? "M" : "L"}${frame} ${y.toFixed(1)}`;
   }
   return path;
@@ -32,14 +32,14 @@ export function curvePath(values, most, height) {
  */
 export function runs(last, holds) {
   /** @type {[from: number, to: number][]} */
-  const found = [];
+  const intervals = [];
   for (let frame = 0; frame <= last; frame += 1) {
     if (!holds(frame)) continue;
     const from = frame;
     while (frame < last && holds(frame + 1)) frame += 1;
-    found.push([from, frame]);
+    intervals.push([from, frame]);
   }
-  return found;
+  return intervals;
 }
 
 /**

@@ -20,9 +20,9 @@ const SVG = "http://www.w3.org/2000/svg";
  * @param {new () => HTMLElement} kind
  */
 export function byId(id, kind = HTMLElement) {
-  const found = document.getElementById(id);
-  if (!(found instanceof kind)) throw new Error(`the page has no ${kind.name} with the id ${id}`);
-  return found;
+  const element = document.getElementById(id);
+  if (!(element instanceof kind)) throw new Error(`the page has no ${kind.name} with the id ${id}`);
+  return element;
 }
 
 /**

@@ -11,8 +11,8 @@ const SHARED = "#version 300 es\nprecision highp float;\nuniform mat4 view;\nuni
 /** @type {Record<Kind, { vertex: string, fragment: string }>} */
 const SHADERS = {
   points: {
-    vertex: `in vec3 place; in vec4 color; out vec4 tint; uniform float near;
-      void main() { gl_Position = view * vec4(place, 1.0); tint = color;
+    vertex: `in vec3 position; in vec4 color; out vec4 tint; uniform float near;
+      void main() { gl_Position = view * vec4(position, 1.0); tint = color;
         gl_PointSize = clamp(near / gl_Position.w, 1.3, 3.2) * size.y; }`,
     fragment: "in vec4 tint; out vec4 shown; void main() { shown = vec4(tint.rgb * tint.a, tint.a); }",
   },
@@ -22,10 +22,10 @@ const SHADERS = {
       uniform vec2 pixels;
       void main() {
         vec4 a = view * vec4(from, 1.0), b = view * vec4(to, 1.0);
-        float least = 0.3;
-        if (a.w < least && b.w < least) { gl_Position = vec4(2.0, 2.0, 2.0, 1.0); return; }
-        if (a.w < least) a = mix(a, b, (least - a.w) / (b.w - a.w));
-        if (b.w < least) b = mix(b, a, (least - b.w) / (a.w - b.w));
+        float minDepth = 0.3;
+        if (a.w < minDepth && b.w < minDepth) { gl_Position = vec4(2.0, 2.0, 2.0, 1.0); return; }
+        if (a.w < minDepth) a = mix(a, b, (minDepth - a.w) / (b.w - a.w));
+        if (b.w < minDepth) b = mix(b, a, (minDepth - b.w) / (a.w - b.w));
         vec2 along = (b.xy / b.w - a.xy / a.w) * pixels;
         vec2 beside = length(along) > 0.0 ? normalize(vec2(-along.y, along.x)) : vec2(0.0);
         vec4 end = corner.x < 0.5 ? a : b;
@@ -35,13 +35,13 @@ const SHADERS = {
     fragment: "in vec4 tint; out vec4 shown; void main() { shown = vec4(tint.rgb * tint.a, tint.a); }",
   },
   faces: {
-    vertex: `in vec3 place; in vec4 color; out vec4 tint;
-      void main() { gl_Position = view * vec4(place, 1.0); tint = color; }`,
+    vertex: `in vec3 position; in vec4 color; out vec4 tint;
+      void main() { gl_Position = view * vec4(position, 1.0); tint = color; }`,
     fragment: "in vec4 tint; out vec4 shown; void main() { shown = vec4(tint.rgb * tint.a, tint.a); }",
   },
   picture: {
-    vertex: `in vec3 place; in vec2 at; out vec2 spot;
-      void main() { gl_Position = view * vec4(place, 1.0); spot = at; }`,
+    vertex: `in vec3 position; in vec2 at; out vec2 spot;
+      void main() { gl_Position = view * vec4(position, 1.0); spot = at; }`,
     fragment: `in vec2 spot; out vec4 shown; uniform sampler2D image; uniform float shade;
       void main() {
         vec4 seen = texture(image, spot);
@@ -52,10 +52,10 @@ const SHADERS = {
 };
 /** @type {Record<Kind, Record<string, number>>} attributes, and how many numbers each has */
 const LAYOUTS = {
-  points: { place: 3, color: 4 },
+  points: { position: 3, color: 4 },
   lines: { from: 3, to: 3, color: 4, width: 1 },
-  faces: { place: 3, color: 4 },
-  picture: { place: 3, at: 2 },
+  faces: { position: 3, color: 4 },
+  picture: { position: 3, at: 2 },
 };
 const CORNERS = new Float32Array([0, -1, 0, 1, 1, -1, 1, 1]);
 

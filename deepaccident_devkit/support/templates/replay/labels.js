@@ -23,11 +23,11 @@ export function overlap(one, other) {
  * Return the rectangle of a label beside another rectangle, where it hides the least.
  * @param {Rectangle} rectangle
  * @param {[width: number, height: number]} size of the label
- * @param {Rectangle[]} taken
+ * @param {Rectangle[]} occupied
  * @param {[width: number, height: number]} canvas
  * @returns {Rectangle}
  */
-export function placeBeside([left, top, right, bottom], [wide, tall], taken, [width, height]) {
+export function placeBeside([left, top, right, bottom], [wide, tall], occupied, [width, height]) {
   /** @type {Rectangle} */
   let best = [0, 0, 0, 0];
   let leastCost = Infinity;
@@ -37,10 +37,10 @@ export function placeBeside([left, top, right, bottom], [wide, tall], taken, [wi
       const x = (left + right) / 2 + across * ((right - left) / 2 + gap + wide / 2);
       const y = (top + bottom) / 2 + down * ((bottom - top) / 2 + gap + tall / 2);
       /** @type {Rectangle} */
-      const place = [x - wide / 2, y - tall / 2, x + wide / 2, y + tall / 2];
-      const isCut = place[0] < 0 || place[1] < 0 || place[2] > width || place[3] > height;
-      const cost = taken.reduce((sum, each) => sum + overlap(place, each), isCut ? OUTSIDE : 0);
-      if (cost < leastCost) [best, leastCost] = [place, cost];
+      const candidate = [x - wide / 2, y - tall / 2, x + wide / 2, y + tall / 2];
+      const isCut = candidate[0] < 0 || candidate[1] < 0 || candidate[2] > width || candidate[3] > height;
+      const cost = occupied.reduce((sum, rectangle) => sum + overlap(candidate, rectangle), isCut ? OUTSIDE : 0);
+      if (cost < leastCost) [best, leastCost] = [candidate, cost];
     }
   }
   return best;
@@ -50,12 +50,12 @@ export function placeBeside([left, top, right, bottom], [wide, tall], taken, [wi
  * Return the rectangle of a tag above some pixels, inside a picture and on no other tag as far as there is room.
  * @param {Pixel[]} pixels
  * @param {[width: number, height: number]} size of the tag
- * @param {Rectangle[]} taken
+ * @param {Rectangle[]} occupied
  * @param {[width: number, height: number]} picture
  * @param {number} gap
  * @returns {Rectangle}
  */
-export function placeAbove(pixels, [wide, tall], taken, [width, height], gap) {
+export function placeAbove(pixels, [wide, tall], occupied, [width, height], gap) {
   const within = (/** @type {number} */ low, /** @type {number} */ value, /** @type {number} */ high) =>
     Math.min(Math.max(low, value), high);
   const across = pixels.map(([x]) => within(0, x, width));
@@ -67,7 +67,7 @@ export function placeAbove(pixels, [wide, tall], taken, [width, height], gap) {
     const x = within(0, middle + step * (wide + 3 * gap), width - wide);
     return [x, y, x + wide, y + tall];
   });
-  const isFree = (/** @type {Rectangle} */ place) => taken.every((each) => overlap(place, each) === 0);
+  const isFree = (/** @type {Rectangle} */ candidate) => occupied.every((rectangle) => overlap(candidate, rectangle) === 0);
   return places.find(isFree) ?? places[0];
 }
 
@@ -75,15 +75,15 @@ export function placeAbove(pixels, [wide, tall], taken, [width, height], gap) {
  * Return the rectangle of a name above a pixel, higher where it would lie on another one; null if it is cut off.
  * @param {Pixel} pixel
  * @param {number} wide
- * @param {Rectangle[]} taken
+ * @param {Rectangle[]} occupied
  * @param {[width: number, height: number]} canvas
  * @returns {Rectangle | null}
  */
-export function placeOver([x, y], wide, taken, [width, height]) {
+export function placeOver([x, y], wide, occupied, [width, height]) {
   /** @type {Rectangle} */
-  let place = [x - wide / 2, y - LINE.above, x + wide / 2, y - LINE.above + LINE.height];
-  while (taken.some((each) => overlap(place, each) > 0)) {
-    place = [place[0], place[1] - LINE.step, place[2], place[3] - LINE.step];
+  let candidate = [x - wide / 2, y - LINE.above, x + wide / 2, y - LINE.above + LINE.height];
+  while (occupied.some((rectangle) => overlap(candidate, rectangle) > 0)) {
+    candidate = [candidate[0], candidate[1] - LINE.step, candidate[2], candidate[3] - LINE.step];
   }
-  return place[0] < 0 || place[2] > width || place[1] < 0 || place[3] > height ? null : place;
+  return candidate[0] < 0 || candidate[2] > width || candidate[1] < 0 || candidate[3] > height ? null : candidate;
 }

@@ -32,14 +32,14 @@ class SceneMap {
     this.pen = pen;
     this.view = new MapView();
     /** @type {Rectangle[]} where a label would hide something */
-    this.taken = [];
+    this.occupied = [];
     roadImage?.addEventListener("load", () => this.draw());
     this.showWhole();
   }
 
   /** Show the paths of all agents and of the colliding pair. */
   showWhole() {
-    const states = pair.flatMap((actor) => actor.states).filter((each) => each !== null);
+    const states = pair.flatMap((actor) => actor.states).filter((position) => position !== null);
     this.view.showAll([...data.agents.flatMap((agent) => agent.poses), ...states]);
   }
 
@@ -66,7 +66,7 @@ class SceneMap {
     const pose = agentByNumber(state.follow, data.agents)?.poses[state.frame];
     if (pose) [this.view.x, this.view.y] = [pose[0] / 100, pose[1] / 100];
     if (state.follow !== "pair") return;
-    const [one, other] = pair.map((actor) => actor.states[state.frame]).filter((each) => each !== null);
+    const [one, other] = pair.map((actor) => actor.states[state.frame]).filter((position) => position !== null);
     if (one && other) this.view.showPair(one, other);
   }
 
@@ -78,7 +78,7 @@ class SceneMap {
     this.pen.fillRect(0, 0, this.view.width, this.view.height);
     const { layers } = state;
     const actors = this.annotated();
-    this.taken = actors.map(([actor, now]) => this.extent(actor, now));
+    this.occupied = actors.map(([actor, now]) => this.extent(actor, now));
     if (layers.road) this.drawRoad();
     this.drawGrid();
     if (layers.points) this.drawPoints();
@@ -262,11 +262,11 @@ class SceneMap {
    */
   drawDots(actor, x, y) {
     const agents = seersOf(actor, state.frame, data.agents);
-    this.taken.push([x - 3 * agents.length, y - 3, x + 3 * agents.length, y + 3]);
-    for (const [place, agent] of agents.entries()) {
+    this.occupied.push([x - 3 * agents.length, y - 3, x + 3 * agents.length, y + 3]);
+    for (const [number, agent] of agents.entries()) {
       this.pen.fillStyle = agent.color;
       this.pen.beginPath();
-      this.pen.arc(x + (place - (agents.length - 1) / 2) * 6, y, 2.5, 0, 2 * Math.PI);
+      this.pen.arc(x + (number - (agents.length - 1) / 2) * 6, y, 2.5, 0, 2 * Math.PI);
       this.pen.fill();
     }
   }
@@ -275,7 +275,7 @@ class SceneMap {
     const pen = this.pen;
     for (const agent of this.poles()) {
       const [x, y] = this.view.pixel(agent.poses[state.frame]);
-      this.taken.push(around([x, y], 5));
+      this.occupied.push(around([x, y], 5));
       pen.beginPath();
       pen.arc(x, y, 5, 0, 2 * Math.PI);
       pen.fillStyle = agent.color;
@@ -309,9 +309,9 @@ class SceneMap {
     return actorOnMap(data.actors, state.frame, this.view, data.markers, x, y);
   }
 
-  /** @param {Point} place */
-  drawImpact(place) {
-    const [x, y] = this.view.pixel(place);
+  /** @param {Point} point */
+  drawImpact(point) {
+    const [x, y] = this.view.pixel(point);
     const pen = this.pen;
     const isNow = data.countdown[state.frame] === 0;
     const [inner, outer] = isNow ? [16, 30] : [5, 9];
@@ -340,9 +340,9 @@ class SceneMap {
     pen.strokeStyle = alarmColor(alarm, data.colors);
     pen.lineWidth = 1;
     pen.setLineDash([3, 2]);
-    for (const place of alarm.places) {
+    for (const point of alarm.places) {
       pen.beginPath();
-      pen.arc(...this.view.pixel(place), RING_METRES * this.view.scale, 0, 2 * Math.PI);
+      pen.arc(...this.view.pixel(point), RING_METRES * this.view.scale, 0, 2 * Math.PI);
       pen.stroke();
     }
     pen.setLineDash([]);
@@ -377,9 +377,9 @@ class SceneMap {
     const pen = this.pen;
     pen.font = FONT;
     const [wide, tall] = [pen.measureText(words).width + 8, 16];
-    const place = placeBeside(rectangle, [wide, tall], this.taken, [this.view.width, this.view.height]);
-    this.taken.push(place);
-    const [x, y] = place;
+    const label = placeBeside(rectangle, [wide, tall], this.occupied, [this.view.width, this.view.height]);
+    this.occupied.push(label);
+    const [x, y] = label;
     pen.beginPath();
     pen.roundRect(x, y, wide, tall, 3);
     pen.fillStyle = CHIP;
@@ -391,7 +391,7 @@ class SceneMap {
     pen.textBaseline = "middle";
     pen.fillStyle = INK;
     pen.fillText(words, x + wide / 2, y + tall / 2 + 0.5);
-    return place;
+    return label;
   }
 }
 

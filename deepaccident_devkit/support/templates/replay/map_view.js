@@ -3,7 +3,7 @@
 /** @import { Actor, ActorState, Pixel, Place, Point, Rectangle } from "./types.js" */
 
 export const ZOOM_STEP = 1.25;
-const SCALES = { least: 0.5, most: 120 }; // pixels of a metre
+const SCALES = { min: 0.5, max: 120 }; // pixels of a metre
 const LEAST_SPAN = 30; // metres
 const MARGIN = 16;
 const PAIR_MARGIN = 36;
@@ -66,7 +66,7 @@ export class MapView {
 
   /** @param {number} factor */
   zoom(factor) {
-    this.scale = Math.min(SCALES.most, Math.max(SCALES.least, this.scale * factor));
+    this.scale = Math.min(SCALES.max, Math.max(SCALES.min, this.scale * factor));
   }
 
   /**
@@ -90,14 +90,14 @@ export class MapView {
   }
 
   /**
-   * Return the pixel of a place.
-   * @param {Place} place
+   * Return the pixel of a point.
+   * @param {Place} point
    * @returns {Pixel}
    */
-  pixel(place) {
+  pixel(point) {
     return [
-      this.width / 2 + (place[0] / 100 - this.x) * this.scale,
-      this.height / 2 - (place[1] / 100 - this.y) * this.scale,
+      this.width / 2 + (point[0] / 100 - this.x) * this.scale,
+      this.height / 2 - (point[1] / 100 - this.y) * this.scale,
     ];
   }
 
@@ -108,8 +108,8 @@ export class MapView {
    * @returns {[length: number, width: number]}
    */
   size(actor, shape) {
-    const least = shape ? LEAST_MARK : LEAST_BOX;
-    return [Math.max(least, (actor.length / 100) * this.scale), Math.max(least, (actor.width / 100) * this.scale)];
+    const minPixels = shape ? LEAST_MARK : LEAST_BOX;
+    return [Math.max(minPixels, (actor.length / 100) * this.scale), Math.max(minPixels, (actor.width / 100) * this.scale)];
   }
 
   /**
@@ -153,9 +153,9 @@ export function gridStep(cell, scale) {
  * @param {number} step
  */
 export function multiples(from, to, step) {
-  const found = [];
-  for (let value = Math.ceil(from / step) * step; value <= to; value += step) found.push(value);
-  return found;
+  const lines = [];
+  for (let value = Math.ceil(from / step) * step; value <= to; value += step) lines.push(value);
+  return lines;
 }
 
 /**

@@ -5,7 +5,7 @@ import { along, cross, difference, dot, inAxes } from "./vectors.js";
 /** @import { Axes, Pixel, Vector } from "./types.js" */
 
 export const FIELD_OF_VIEW = 0.9; // radians from the picture's lower to its upper edge
-const DISTANCES = { least: 4, most: 900 };
+const DISTANCES = { min: 4, max: 900 };
 const LOWEST = 0.05;
 const FROM_ABOVE = Math.PI / 2;
 const NEAR = 0.3;
@@ -63,7 +63,7 @@ export class Orbit {
 
   /** @param {number} distance metres; as far as that is allowed */
   setDistance(distance) {
-    this.distance = Math.min(DISTANCES.most, Math.max(DISTANCES.least, distance));
+    this.distance = Math.min(DISTANCES.max, Math.max(DISTANCES.min, distance));
   }
 
   /** @param {number} factor */
@@ -117,14 +117,14 @@ export class Orbit {
   }
 
   /**
-   * Return the pixel of a place; null behind the eye.
-   * @param {Vector} place
+   * Return the pixel of a point; null behind the eye.
+   * @param {Vector} point
    * @param {number} width of the picture, pixels
    * @param {number} height
    * @returns {Pixel | null}
    */
-  pixel(place, width, height) {
-    const [right, up, ahead] = inAxes(this.axes, difference(place, this.eye));
+  pixel(point, width, height) {
+    const [right, up, ahead] = inAxes(this.axes, difference(point, this.eye));
     if (ahead < NEAR) return null;
     const zoom = height / 2 / Math.tan(FIELD_OF_VIEW / 2) / ahead;
     return [width / 2 + right * zoom, height / 2 - up * zoom];

@@ -36,7 +36,7 @@ export function drawBoxes(picture, camera, frame) {
   const ratio = width / Math.max(picture.boxes.clientWidth, 1);
   const isLarge = picture.figure.classList.contains("large");
   /** @type {Rectangle[]} */
-  const taken = [];
+  const occupied = [];
   const groups = [];
   for (const actor of [...data.actors].reverse()) {
     const now = actor.states[frame];
@@ -52,7 +52,7 @@ export function drawBoxes(picture, camera, frame) {
     picture.places.push({ actor, place: extentOf(pixels), distance });
     const parts = boxParts(actor, camera, corners, edges, { isLarge, isSeen: sees, isLit });
     if (isLit || actor.role === "pair" || (isLarge && actor.tag)) {
-      parts.push(...tagParts(actor, pixels, camera, ratio, taken));
+      parts.push(...tagParts(actor, pixels, camera, ratio, occupied));
     }
     groups.push(drawn("g", { "data-actor": actor.id, class: isLit ? "lit" : "" }, ...parts));
   }
@@ -91,15 +91,15 @@ function boxParts(actor, camera, corners, edges, style) {
  * @param {Pixel[]} pixels of the box
  * @param {Camera} camera
  * @param {number} ratio the image's pixels by the page's
- * @param {Rectangle[]} taken by other tags; this one is added
+ * @param {Rectangle[]} occupied by other tags; this one is added
  * @returns {SVGElement[]}
  */
-function tagParts(actor, pixels, camera, ratio, taken) {
+function tagParts(actor, pixels, camera, ratio, occupied) {
   const words = actor.id === state.lit ? actor.title : actor.tag || String(actor.id);
   const [wide, tall] = [(words.length * 7 + 6) * ratio, 14 * ratio];
-  const place = placeAbove(pixels, [wide, tall], taken, [camera.lens[0], camera.lens[1]], ratio);
-  taken.push(place);
-  const [x, y] = place;
+  const rectangle = placeAbove(pixels, [wide, tall], occupied, [camera.lens[0], camera.lens[1]], ratio);
+  occupied.push(rectangle);
+  const [x, y] = rectangle;
   const frame = { fill: "#ffffff", "fill-opacity": 0.9, stroke: actor.color, "vector-effect": "non-scaling-stroke" };
   const text = { "text-anchor": "middle", "font-size": 11 * ratio, "font-weight": 600, fill: INK };
   return [

@@ -25,7 +25,7 @@ const rows = data.actors.map((actor) => {
 });
 byId("seen").append(
   made("thead", {}, made("tr", {}, made("th", { scope: "col", textContent: "actor" }), ...agentHeadings())),
-  made("tbody", {}, ...rows.map((each) => each.row)),
+  made("tbody", {}, ...rows.map((actorRow) => actorRow.row)),
 );
 
 /**

@@ -37,7 +37,7 @@ class Space {
     /** @type {Record<Kind, Numbers>} */
     this.kinds = { points: new Numbers(), lines: new Numbers(), faces: new Numbers(), picture: new Numbers() };
     /** @type {Map<number, Int16Array | null>} the cloud of each agent that is shown while the next one is loaded */
-    this.kept = new Map();
+    this.lastClouds = new Map();
     /** @type {Gpu | null} */
     this.gpu = null;
     this.isWaiting = false; // for the screen's next picture
@@ -123,7 +123,7 @@ class Space {
     const pose = agentByNumber(state.follow, data.agents)?.poses[state.frame];
     if (pose) this.look(pose[0] / 100, pose[1] / 100, 34);
     if (state.follow !== "pair") return;
-    const [one, other] = pair.map((actor) => actor.states[state.frame]).filter((each) => each !== null);
+    const [one, other] = pair.map((actor) => actor.states[state.frame]).filter((position) => position !== null);
     if (!one || !other) return;
     const apart = Math.hypot(one[0] - other[0], one[1] - other[1]) / 100;
     this.look((one[0] + other[0]) / 200, (one[1] + other[1]) / 200, 1.1 * apart + 24);
@@ -204,13 +204,13 @@ class Space {
     if (!data.road || !state.layers.road) return;
     const { left, top, width, height } = data.road;
     for (const [right, down] of [[0, 0], [1, 0], [0, 1], [0, 1], [1, 0], [1, 1]]) {
-      const place = this.onGround((left + right * width) / 100, (top - down * height) / 100);
-      this.kinds.picture.add(...place, right, down);
+      const point = this.onGround((left + right * width) / 100, (top - down * height) / 100);
+      this.kinds.picture.add(...point, right, down);
     }
   }
 
   addGrid() {
-    const [x, y] = this.orbit.target.map((each) => Math.round(each / GRID_METRES) * GRID_METRES);
+    const [x, y] = this.orbit.target.map((coordinate) => Math.round(coordinate / GRID_METRES) * GRID_METRES);
     const color = channelsOf(data.colors.grid);
     const at = (/** @type {number} */ across, /** @type {number} */ along) => this.onGround(across, along, 0.03);
     for (let step = -GRID_REACH; step <= GRID_REACH; step += GRID_METRES) {
@@ -252,21 +252,21 @@ class Space {
    */
   cloud(agent) {
     const cloud = sources.points(agent, state.frame);
-    if (cloud !== undefined) this.kept.set(agent, cloud);
-    return this.kept.get(agent);
+    if (cloud !== undefined) this.lastClouds.set(agent, cloud);
+    return this.lastClouds.get(agent);
   }
 
   /** @param {Actor} actor */
   addTrail(actor) {
     const color = channelsOf(actor.color);
     /** @type {(of: ActorState) => Vector} */
-    const place = (of) => [of[0] / 100, of[1] / 100, (of[4] - actor.height / 2) / 100 + 0.08];
+    const pointOf = (of) => [of[0] / 100, of[1] / 100, (of[4] - actor.height / 2) / 100 + 0.08];
     const newest = state.frame;
     for (let frame = Math.max(1, newest - TRAIL_FRAMES + 1); frame <= newest; frame += 1) {
       const [before, after] = [actor.states[frame - 1], actor.states[frame]];
       if (before === null || after === null || (before[0] === after[0] && before[1] === after[1])) continue;
       const alpha = 0.15 + 0.7 * (1 - (newest - frame) / TRAIL_FRAMES);
-      this.line(place(before), place(after), color, actor.role === "other" ? 1.2 : 2, alpha);
+      this.line(pointOf(before), pointOf(after), color, actor.role === "other" ? 1.2 : 2, alpha);
     }
   }
 
@@ -277,7 +277,7 @@ class Space {
   addActor(actor) {
     const now = actor.states[state.frame];
     if (now === null) return;
-    const corners = cornersOf(actor, now).map((corner) => changed(corner, (each) => each / 100));
+    const corners = cornersOf(actor, now).map((corner) => changed(corner, (coordinate) => coordinate / 100));
     const color = channelsOf(actor.color);
     const thick = actor.role === "other" ? 0.7 : 1.2;
     const isLit = actor.id === state.lit;
@@ -285,7 +285,7 @@ class Space {
     for (const [from, to] of EDGES) this.line(corners[from], corners[to], color, thick);
     for (const [number, [a, b, c, d]] of FACES.entries()) {
       const alpha = (actor.role === "other" ? 0.18 : 0.32) + (number ? 0 : 0.3);
-      for (const each of [[a, b, c], [a, c, d]]) this.triangle(each.map((corner) => corners[corner]), color, alpha);
+      for (const triangle of [[a, b, c], [a, c, d]]) this.triangle(triangle.map((corner) => corners[corner]), color, alpha);
     }
     const middle = (/** @type {number} */ one, /** @type {number} */ other) => middleOf(corners[one], corners[other]);
     this.triangle([middle(0, 1), middle(0, 4), middle(1, 5)], color, 0.85);
@@ -366,9 +366,9 @@ class Space {
     for (let step = 0; step < 24; step += 2) this.line(at(step), at(step + 1.3), color, 1);
   }
 
-  /** @param {Point} place */
-  addImpact(place) {
-    const [x, y] = [place[0] / 100, place[1] / 100];
+  /** @param {Point} point */
+  addImpact(point) {
+    const [x, y] = [point[0] / 100, point[1] / 100];
     const [inner, outer] = data.countdown[state.frame] === 0 ? [2.5, 5] : [0.6, 1.4];
     const color = channelsOf(data.colors.pair);
     for (let ray = 0; ray < 8; ray += 1) {
@@ -409,16 +409,16 @@ class Space {
    */
   writeNames(width, height) {
     /** @type {Rectangle[]} */
-    const taken = [];
+    const occupied = [];
     const labels = [];
     for (const { words, top, color, isLit } of this.names()) {
       const pixel = this.orbit.pixel(top, width, height);
       const wide = 7 * words.length + 12;
-      const place = pixel && placeOver(pixel, wide, taken, [width, height]);
-      if (!place) continue;
-      taken.push(place);
+      const rectangle = pixel && placeOver(pixel, wide, occupied, [width, height]);
+      if (!rectangle) continue;
+      occupied.push(rectangle);
       const label = made("span", { className: isLit ? "tag lit" : "tag", textContent: words });
-      const [x, y] = place;
+      const [x, y] = rectangle;
       Object.assign(label.style, { left: `${x}px`, top: `${y}px`, width: `${wide}px`, borderColor: color });
       labels.push(label);
     }

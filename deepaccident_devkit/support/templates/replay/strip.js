@@ -29,13 +29,13 @@ function plot(height, ...children) {
 
 /**
  * @param {(number | null)[]} values
- * @param {number} most
+ * @param {number} maximum
  * @param {string} color
  * @param {boolean} isDashed
  */
-function curve(values, most, color, isDashed) {
+function curve(values, maximum, color, isDashed) {
   return drawn("path", {
-    d: curvePath(values, most, CURVE),
+    d: curvePath(values, maximum, CURVE),
     fill: "none",
     stroke: color,
     "stroke-width": 2,
@@ -98,8 +98,8 @@ function colorOf(actor) {
 
 function addSpeeds() {
   const speeds = pair.map((actor) => actor.states.map((now) => now && now[3]));
-  const most = Math.max(1, ...speeds.flatMap(known));
-  const lines = speeds.map((values, number) => curve(values, most, colorOf(pair[number]), number === 1));
+  const maximum = Math.max(1, ...speeds.flatMap(known));
+  const lines = speeds.map((values, number) => curve(values, maximum, colorOf(pair[number]), number === 1));
   const valueText = (/** @type {number | null} */ value) => (value === null ? "–" : (value / 10).toFixed(1));
   return addRow("speeds", plot(CURVE, ...lines), (frame) => {
     return `${speeds.map((values) => valueText(values[frame])).join(" and ")} m/s`;
@@ -114,9 +114,9 @@ function addSpeeds() {
  * @param {number} limit the largest value that the curve has
  */
 function addMeasure(name, values, unit, scale, limit) {
-  const most = Math.min(limit * scale, Math.max(1, ...known(values)));
+  const maximum = Math.min(limit * scale, Math.max(1, ...known(values)));
   const shown = values.map((value) => (value !== null && value > limit * scale ? null : value));
-  return addRow(name, plot(CURVE, curve(shown, most, "currentColor", false)), (frame) => {
+  return addRow(name, plot(CURVE, curve(shown, maximum, "currentColor", false)), (frame) => {
     const value = values[frame];
     return value === null ? "–" : `${(value / scale).toFixed(1)} ${unit}`;
   });
@@ -201,7 +201,7 @@ if (data.files.some((count) => count < data.sensors)) {
   const all = bars((frame) => data.files[frame] === data.sensors, 0, height, "currentColor");
   const isPart = (/** @type {number} */ count) => count > 0 && count < data.sensors;
   const some = bars((frame) => isPart(data.files[frame]), 0, height, "currentColor");
-  for (const each of some) each.setAttribute("fill-opacity", "0.5");
+  for (const mark of some) mark.setAttribute("fill-opacity", "0.5");
   byId("files").append(plot(height, ...all, ...some));
   byId("files").hidden = false;
   byId("files-key").hidden = false;

@@ -27,7 +27,7 @@ function verdictRow(frame, samples) {
   const jump = made("button", { type: "button", textContent: number, ariaLabel: `Go to frame ${number}` });
   jump.addEventListener("click", () => go(frame));
   const cells = data.agents.map((_, agent) => {
-    const sample = samples.find((each) => each.agent === agent);
+    const sample = samples.find((candidate) => candidate.agent === agent);
     return made("td", {}, sample ? verdictBadge(sample) : "");
   });
   const row = made("tr", {}, made("th", { scope: "row" }, jump), ...cells);
