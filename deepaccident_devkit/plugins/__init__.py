@@ -1,4 +1,4 @@
-"""Products that stand on the core, each a plug-in; and what a plug-in of another package is made of."""
+"""Products built on the core, each a plug-in, and the parts of a plug-in in another package."""
 
 from deepaccident_devkit.support.plugins import (
     PROTOCOL_VERSION,

@@ -1,4 +1,4 @@
-"""Point clouds of several agents and moments in one frame."""
+"""Point clouds of several agents and moments in one coordinate frame."""
 
 from __future__ import annotations
 
@@ -29,32 +29,40 @@ def aggregate_point_cloud(
     link: Link | None = None,
     on_missing: OnError = "raise",
 ) -> LidarPointCloud:
-    """The LiDAR points of some agents at a sample's moment and the frames before it, in one coordinate frame.
+    """Merge the LiDAR points of several agents at a sample's moment and at the frames before it.
 
     Args:
-        dataset: the release.
-        sample: token or record: its agent is the ego, its frame the present.
-        agents: names of agents, a configuration or its name as seen from the ego, or None for all that are there.
-        sweeps: how many frames (0.1 s), the present included; those before the recording began are left out.
-        frame: coordinate frame of the result, at the sample: `world`, `ego`, `lidar` or a camera channel.
-        compensate: whether to move the points in the box of an actor to where the actor is at the present, by the
-            track table (all agents' labels); points of actors that are not annotated at both moments stay.
-        link: what happens to the partners' data; None for nothing. Each sweep is a message of its own, with its own
-            loss, pose error and delay. `compensate` corrects latency, not wrong poses.
-        on_missing: of point clouds that were not downloaded: `raise`, or `skip` leaves them out and logs how many.
+        dataset: The release.
+        sample: Token or record of a sample; its agent is the ego, its frame the present.
+        agents: Names of agents, a configuration or its name relative to the ego, or None for all
+            available agents.
+        sweeps: Number of frames (0.1 s each), the present included; frames before the recording
+            began are left out.
+        frame: Coordinate frame of the result, at the sample: `world`, `ego`, `lidar` or a camera
+            channel.
+        compensate: Whether to move the points in the box of an actor to the position of the actor
+            at the present, by the track table (all agents' labels); points of actors that are not
+            annotated at both moments stay.
+        link: Effects of the link on the partners' data; None for a perfect link. Each sweep is a
+            message of its own, with its own loss, pose error and delay. `compensate` corrects
+            latency, not wrong poses.
+        on_missing: Treatment of point clouds that were not downloaded: `raise`, or `skip`, which
+            leaves them out and logs how many.
 
     Returns:
-        The points by frame, the present first and then backwards, and for each frame by agent, the ego first; no
-        points if all were lost or left out. Its `agent` says whose LiDAR recorded each point, its `time_lag` how many
-        seconds before the sample's moment (a link's latency included).
+        The points by frame, the present first and then backwards, and for each frame by agent, the
+        ego first; no points if all were lost or left out. Its `agent` is the agent with the LiDAR
+        that recorded each point, its `time_lag` the seconds before the sample's moment (a link's
+        latency included).
 
     Raises:
-        TokenError: no such sample.
-        ChoiceError: no such agent, configuration, frame or `on_missing`, or `sweeps` is no whole number from 1.
-        NotAvailableError: an agent is not in this (partial) release.
+        TokenError: There is no such sample.
+        ChoiceError: There is no such agent, configuration, frame or `on_missing`, or `sweeps` is no
+            whole number from 1.
+        NotAvailableError: An agent is not in this (partial) release.
         ConfigError: `link` is no Link, or its latency is longer than the scenario's past.
-        MissingFileError: a point cloud was not downloaded, and `on_missing` is `raise`.
-        SensorFileError: a point cloud cannot be read.
+        MissingFileError: A point cloud was not downloaded, and `on_missing` is `raise`.
+        SensorFileError: A point cloud cannot be read.
     """
     sweeps = checked_whole("sweeps", sweeps, "a whole number of frames from 1", ChoiceError)
     if sweeps < 1:
@@ -65,45 +73,57 @@ def aggregate_point_cloud(
     scenario, _, present = record["token"].rsplit("/", 2)
     tracks = scenario_tracks(dataset, scenario) if compensate else None
     files = MissingFiles(dataset.dataroot, on_missing)
-    parts = []
+    clouds = []
     for message in messages(dataset, sample, agents, link, sweeps=sweeps):
-        if not files.has(dataset.sensor_path(f"{message.sample}/{LIDAR}"), LIDAR):
+        cloud_path = dataset.sensor_path(f"{message.sample}/{LIDAR}")
+        if not files.has(cloud_path, LIDAR):
             continue
         cloud = dataset.load_point_cloud(message.sample, "lidar")
         if tracks is not None:
-            cloud = _compensated(
-                cloud, dataset.world_from(message.sample, "lidar"), tracks, message, int(present)
-            )
-        cloud = cloud.transform(message.target_from(dataset, "lidar", target_from_world), frame)
+            world_from_lidar = dataset.world_from(message.sample, "lidar")
+            cloud = _compensated(cloud, world_from_lidar, tracks, message, int(present))
+        target_from_lidar = message.target_from(dataset, "lidar", target_from_world)
+        cloud = cloud.transform(target_from_lidar, frame)
         lag = record["timestamp"] - dataset.get("sample", message.sample)["timestamp"]
-        agent = np.full(len(cloud), AGENTS.index(message.agent), dtype=np.int8)
-        parts.append(
-            replace(cloud, agent=agent, time_lag=np.full(len(cloud), lag, dtype=np.float32))
-        )
+        agent_codes = np.full(len(cloud), AGENTS.index(message.agent), dtype=np.int8)
+        lags = np.full(len(cloud), lag, dtype=np.float32)
+        clouds.append(replace(cloud, agent=agent_codes, time_lag=lags))
     files.tell()
-    return concatenate_clouds(parts, frame)
+    return concatenate_clouds(clouds, frame)
 
 
 def moved_points(points: FloatArray, then: Boxes, now: Boxes) -> FloatArray:
-    """Points (P, 3), each moved with the box of `then` that it lies in to the same actor's box of `now`, in one frame.
+    """Move points along with the actors of the boxes in which they lie.
 
-    Actors that are not in both are ignored. If a point lies in several boxes, the last one counts; outside all it
-    stays.
+    Actors that are in only one of the two sets of boxes are ignored. If a point lies in several
+    boxes, the last box counts; a point outside all boxes stays.
+
+    Args:
+        points: Points (P, 3), metres, in the frame of the boxes.
+        then: Boxes of the actors when the points were measured.
+        now: Boxes of the actors to which the points move, in the same frame.
+
+    Returns:
+        The moved points (P, 3).
     """
-    both, row_then, row_now = np.intersect1d(then.actor_id, now.actor_id, return_indices=True)
-    before, after = then.select(row_then), now.select(row_now)
-    moves = (before.center != after.center).any(axis=1) | (before.rotation != after.rotation).any(
-        axis=1
+    shared_ids, rows_then, rows_now = np.intersect1d(
+        then.actor_id, now.actor_id, return_indices=True
     )
-    before, after = before.select(moves), after.select(moves)
+    before = then.select(rows_then)
+    after = now.select(rows_now)
+    shifted = (before.center != after.center).any(axis=1)
+    turned = (before.rotation != after.rotation).any(axis=1)
+    moving = shifted | turned
+    before = before.select(moving)
+    after = after.select(moving)
     result = np.array(points)
-    turns_then, turns_now = (
-        quaternions.to_matrix(before.rotation),
-        quaternions.to_matrix(after.rotation),
-    )
-    for box, inside in enumerate(before.contains(points) if len(both) else ()):
-        local = (points[inside] - before.center[box]) @ turns_then[box]
-        result[inside] = local @ turns_now[box].T + after.center[box]
+    if not len(shared_ids):
+        return result
+    world_from_before = quaternions.to_matrix(before.rotation)
+    world_from_after = quaternions.to_matrix(after.rotation)
+    for box, in_box in enumerate(before.contains(points)):
+        box_points = (points[in_box] - before.center[box]) @ world_from_before[box]
+        result[in_box] = box_points @ world_from_after[box].T + after.center[box]
     return result
 
 
@@ -114,9 +134,10 @@ def _compensated(
     message: Message,
     present: int,
 ) -> LidarPointCloud:
-    """A cloud in its LiDAR frame with moving actors where they are at frame `present`."""
-    taken = int(message.sample.rsplit("/", 1)[1])
-    if taken == present:
+    """Return a cloud in its LiDAR frame with moving actors at their places of frame `present`."""
+    recorded = int(message.sample.rsplit("/", 1)[1])
+    if recorded == present:
         return cloud
-    moved = moved_points(world_from_lidar.apply(cloud.xyz), tracks.at(taken), tracks.at(present))
+    world_points = world_from_lidar.apply(cloud.xyz)
+    moved = moved_points(world_points, tracks.at(recorded), tracks.at(present))
     return replace(cloud, xyz=world_from_lidar.inverse().apply(moved))

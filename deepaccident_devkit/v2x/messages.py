@@ -1,4 +1,4 @@
-"""Messages between agents: how large they are, and what a real link does to them: wrong poses, delay, loss."""
+"""Messages between agents: their sizes, and the wrong poses, delay and loss of a real link."""
 
 from __future__ import annotations
 
@@ -28,20 +28,20 @@ from deepaccident_devkit.taxonomy import CAMERAS, FRAME_PERIOD, LIDAR, AgentName
 from deepaccident_devkit.v2x.agents import Agents, cooperating_agents
 
 POINT_BYTES: Final = 4 * 4
-"""x, y, z and intensity in single precision."""
+"""Bytes of x, y, z and intensity in single precision."""
 BOX_BYTES: Final = 9 * 4 + 4 + 1 + 4
-"""Centre, size, yaw and horizontal velocity in single precision, an id, a class and a score."""
+"""Bytes of centre, size, yaw and horizontal velocity in single precision, an id, a class and a
+score."""
 POSE_BYTES: Final = 6 * 4
-"""A 6-vector in single precision, which goes with every message."""
+"""Bytes of a 6-vector in single precision, which goes with every message."""
 _BEV_SHAPE: Final = (64, 200, 200)
 Payload = Literal["images", "cloud", "boxes", "bev"]
 """The kinds of data that a message can have; `MessageSize` describes them."""
-_NORMAL: Final = NormalDist()
-# Bytes that can be asked for.
-_MOST: Final = 2**50
-# Seconds: no scenario is longer, so a longer latency is in milliseconds.
-_LONGEST: Final = 20.0
-# The largest distance of a latency from a whole number of frames, in frames.
+_NORMAL_DISTRIBUTION: Final = NormalDist()
+_MAX_BYTES: Final = 2**50
+# No scenario is longer, so a longer latency must be in milliseconds.
+_MAX_LATENCY_S: Final = 20.0
+# Largest difference between a latency and a whole number of frames, in frames.
 _FRAME_TOLERANCE: Final = 1e-6
 
 
@@ -49,13 +49,14 @@ _FRAME_TOLERANCE: Final = 1e-6
 class PoseNoise:
     """The error of a partner's own pose: one draw for each partner and frame.
 
-    The error of the position is a distance from a normal distribution of `mean` and `std`. The paper studies means of
-    0.1 to 0.5 m with σ = 0.02 m and does not name the direction; ours is horizontal and uniform over all directions.
+    The error of the position is a distance from a normal distribution of `mean` and `std`. The
+    paper studies means of 0.1 to 0.5 m with σ = 0.02 m and does not name the direction; here it is
+    horizontal and uniform over all directions.
 
     Attributes:
-        mean: metres.
-        std: standard deviation, metres.
-        heading_std: standard deviation of the heading about the vertical, radians; its mean is 0.
+        mean: Mean of the distance, metres.
+        std: Standard deviation of the distance, metres.
+        heading_std: Standard deviation of the heading about the vertical, radians; its mean is 0.
     """
 
     mean: float = 0.0
@@ -76,39 +77,48 @@ class PoseNoise:
         if self.heading_std > math.pi:
             radians = math.radians(self.heading_std)
             raise ConfigError(
-                f"pose noise: heading_std is {self.heading_std:g} radians, over half a turn; if these are degrees, "
-                f"give {radians:.4g}"
+                f"pose noise: heading_std is {self.heading_std:g} radians, over half a turn; "
+                f"if these are degrees, give {radians:.4g}"
             )
 
     def draw(self, key: str) -> tuple[float, float, float]:
-        """The error of one partner at one frame: x and y in world, metres, and heading, radians; `key` decides it."""
-        turn, distance, _, heading = uniforms(f"{key}/pose")
-        off, direction = self.mean + self.std * _NORMAL.inv_cdf(distance), 2 * math.pi * turn
-        return (
-            off * math.cos(direction),
-            off * math.sin(direction),
-            self.heading_std * _NORMAL.inv_cdf(heading),
-        )
+        """Draw the error of one partner at one frame.
+
+        Args:
+            key: Text that decides the draw.
+
+        Returns:
+            Errors of x and y in world, metres, and of the heading, radians.
+        """
+        direction_draw, distance_draw, _, heading_draw = uniforms(f"{key}/pose")
+        distance = self.mean + self.std * _NORMAL_DISTRIBUTION.inv_cdf(distance_draw)
+        direction = 2 * math.pi * direction_draw
+        x = distance * math.cos(direction)
+        y = distance * math.sin(direction)
+        heading = self.heading_std * _NORMAL_DISTRIBUTION.inv_cdf(heading_draw)
+        return x, y, heading
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Link:
-    """What happens to the data of partners on their way to the ego; the ego's own data are never changed.
+    """The effects of a link on partners' data; the ego's own data are never changed.
 
-    Every draw depends only on the seed, the scenario, the partner and the frame at which the ego receives: not on the
-    order of calls, on other agents or on the other effects.
+    Every draw depends only on the seed, the scenario, the partner and the frame at which the ego
+    receives: not on the order of calls, on other agents or on the other effects.
 
     Attributes:
-        latency: delay of partners' data, seconds, a multiple of 0.1 (the paper: 0.1 to 0.5). They are those of an
-            earlier frame, placed by the pose at that time: standing actors are right, moving ones are where they were.
-        pose_noise: mean position error of partners' poses, metres. A number is `PoseNoise(mean=…)`; None for exact
-            poses.
-        packet_loss: probability in [0, 1] that a partner's data do not arrive at a frame.
-        seed: seed of all that is drawn.
-        budget: bytes a frame that all partners together can send to the ego. None is no limit. Each partner sends whose
-            message still fits, in the order of `cooperating_agents`; what is lost on its way takes no bytes.
-        payload: what a partner sends, for the budget: a kind of `MessageSize`, or the bytes of every message, such as
-            of features that all have one size; None without a budget.
+        latency: Delay of partners' data, seconds, a multiple of 0.1 (the paper: 0.1 to 0.5). The
+            data of an earlier frame arrive, placed by the pose at that time: standing actors are
+            right, moving ones are at their earlier positions.
+        pose_noise: Mean position error of partners' poses, metres. A number is `PoseNoise(mean=…)`;
+            None for exact poses.
+        packet_loss: Probability in [0, 1] that a partner's data do not arrive at a frame.
+        seed: Seed of all draws.
+        budget: Bytes a frame that all partners together can send to the ego. None is no limit. In
+            the order of `cooperating_agents`, each partner sends if its message still fits; a
+            message that is lost on its way takes no bytes.
+        payload: Data that a partner sends, for the budget: a kind of `MessageSize`, or the bytes of
+            every message, such as of features that all have one size; None without a budget.
     """
 
     latency: float = 0.0
@@ -119,34 +129,33 @@ class Link:
     payload: Payload | int | None = None
 
     def __post_init__(self) -> None:
-        """Check the numbers and convert them to Python's types; raises ConfigError, or ChoiceError of the payload."""
-        loss = checked_number(
+        """Check the numbers and convert them to Python's types.
+
+        Raises:
+            ConfigError: A number is out of its range.
+            ChoiceError: There is no such payload.
+        """
+        packet_loss = checked_number(
             "packet_loss", self.packet_loss, "a probability from 0 to 1", ConfigError
         )
-        if not 0 <= loss <= 1:
+        if not 0 <= packet_loss <= 1:
             raise ConfigError(
-                f"packet_loss: {loss:g} is no probability; choose a number from 0 to 1"
+                f"packet_loss: {packet_loss:g} is no probability; choose a number from 0 to 1"
             )
-        checked = {
+        checked_values = {
             "latency": _whole_frames(self.latency),
-            "pose_noise": _noise(self.pose_noise),
-            "packet_loss": loss,
+            "pose_noise": _pose_noise(self.pose_noise),
+            "packet_loss": packet_loss,
             "seed": checked_whole("seed", self.seed, "a whole number", ConfigError),
-            "budget": None
-            if self.budget is None
-            else checked_count("budget", self.budget, "bytes a frame", _MOST),
-            "payload": (
-                choice("payload", self.payload, (None, *get_args(Payload)))
-                if self.payload is None or isinstance(self.payload, str)
-                else checked_count("payload", self.payload, "bytes of every message", _MOST)
-            ),
+            "budget": _checked_budget(self.budget),
+            "payload": _checked_payload(self.payload),
         }
         if self.budget is not None and self.payload is None:
             raise ConfigError(
-                "budget: needs the kind of data that partners send; give payload='boxes' or another of "
-                f"{', '.join(get_args(Payload))}, or the bytes of every message"
+                "budget: needs the kind of data that partners send; give payload='boxes' or "
+                f"another of {', '.join(get_args(Payload))}, or the bytes of every message"
             )
-        for name, value in checked.items():
+        for name, value in checked_values.items():
             object.__setattr__(self, name, value)
 
     @property
@@ -155,52 +164,61 @@ class Link:
         return round(self.latency / FRAME_PERIOD)
 
     def frame_sent(self, scenario: str, index: int) -> int:
-        """The number of the frame whose data arrive at frame `index` of a scenario.
+        """Return the number of the frame from which the data at frame `index` of a scenario come.
 
         Raises:
-            ConfigError: that frame would be before the recording began.
+            ConfigError: That frame would be before the recording began.
         """
-        sent = index - self.latency_frames
-        if sent < 1:
+        sent_index = index - self.latency_frames
+        if sent_index < 1:
             raise ConfigError(
-                f"latency: {self.latency} s reaches back before the first frame of {scenario} from frame {index:03d}; "
-                f"the longest possible is {(index - 1) / 10} s; choose a shorter latency, or a frame that has "
-                f"{self.latency_frames} others before it"
+                f"latency: {self.latency} s reaches back before the first frame of {scenario} "
+                f"from frame {index:03d}; the longest possible is {(index - 1) / 10} s; "
+                f"choose a shorter latency, or a frame that has {self.latency_frames} others "
+                "before it"
             )
-        return sent
+        return sent_index
 
     def loses(self, scenario: str, partner: str, index: int) -> bool:
-        """Whether a partner's data do not arrive at frame number `index`."""
-        return (
-            self.packet_loss > 0
-            and uniforms(f"{self._key(scenario, partner, index)}/loss")[0] < self.packet_loss
-        )
+        """Return whether a partner's data are lost at frame number `index`."""
+        if self.packet_loss <= 0:
+            return False
+        loss_draw = uniforms(f"{self._key(scenario, partner, index)}/loss")[0]
+        return loss_draw < self.packet_loss
 
     def pose_error(
         self, scenario: str, partner: str, index: int, position: FloatArray
     ) -> SE3 | None:
-        """From true places to those where the ego puts the partner's data: `claimed_from_world`; None without noise.
+        """Return `claimed_from_world`, from true to claimed positions of a partner's data.
 
         Args:
-            scenario: token.
-            partner: the agent's name.
-            index: number of the frame at which the ego receives.
-            position: (3,) the partner's true position, world, metres: the error of the heading turns about this point.
+            scenario: Token of the scenario.
+            partner: Name of the agent.
+            index: Number of the frame at which the ego receives.
+            position: True position (3,) of the partner, world, metres: the error of the heading
+                turns about this point.
+
+        Returns:
+            None without pose noise.
         """
         if not isinstance(self.pose_noise, PoseNoise):
             return None
         x, y, heading = self.pose_noise.draw(self._key(scenario, partner, index))
         turn = SE3.from_yaw(heading)
-        return SE3.from_rotation(
-            turn.rotation, position + np.array([x, y, 0.0]) - turn.rotate(position)
-        )
+        translation = position + np.array([x, y, 0.0]) - turn.rotate(position)
+        return SE3.from_rotation(turn.rotation, translation)
 
     def _key(self, scenario: str, partner: str, index: int) -> str:
+        """Return the text that decides the draws for one partner at one frame."""
         return f"{self.seed}/{scenario}/{partner}/{index}"
 
 
 def checked_link(link: object) -> Link | None:
-    """The `link=` of a call, checked; raises ConfigError."""
+    """Check a `link=` argument.
+
+    Raises:
+        ConfigError: It is neither a Link nor None.
+    """
     if link is None or isinstance(link, Link):
         return link
     raise ConfigError(
@@ -209,49 +227,74 @@ def checked_link(link: object) -> Link | None:
 
 
 def _whole_frames(latency: object) -> float:
-    """The latency in seconds, as exactly a whole number of frames."""
+    """Return a latency in seconds as exactly a whole number of frames; raises ConfigError."""
     seconds = checked_number("latency", latency, "seconds from 0", ConfigError)
     if not 0 <= seconds < math.inf:
         raise ConfigError(
             f"latency: {seconds} is not possible; choose a finite number of seconds from 0"
         )
-    if seconds > _LONGEST:
+    if seconds > _MAX_LATENCY_S:
         raise ConfigError(
-            f"latency: {seconds:g} s is longer than any scenario; if these are milliseconds, give {seconds / 1000:g}"
+            f"latency: {seconds:g} s is longer than any scenario; "
+            f"if these are milliseconds, give {seconds / 1000:g}"
         )
     frames = seconds / FRAME_PERIOD
     if abs(frames - round(frames)) > _FRAME_TOLERANCE:
-        below, above = math.floor(frames) / 10, math.ceil(frames) / 10
+        shorter = math.floor(frames) / 10
+        longer = math.ceil(frames) / 10
         raise ConfigError(
             f"latency: {seconds} s is no multiple of a frame ({FRAME_PERIOD} s); "
-            f"the nearest are {below} s and {above} s"
+            f"the nearest are {shorter} s and {longer} s"
         )
     return round(frames) / 10
 
 
-def _noise(noise: object) -> PoseNoise | None:
+def _pose_noise(noise: object) -> PoseNoise | None:
+    """Return the pose noise of a link, a number as its mean in metres; raises ConfigError."""
     if noise is None or isinstance(noise, PoseNoise):
         return noise
-    return PoseNoise(mean=checked_number("pose_noise", noise, "metres or a PoseNoise", ConfigError))
+    mean = checked_number("pose_noise", noise, "metres or a PoseNoise", ConfigError)
+    return PoseNoise(mean=mean)
+
+
+def _checked_budget(budget: int | None) -> int | None:
+    """Check the budget of a link, bytes a frame; raises ConfigError."""
+    if budget is None:
+        return None
+    return checked_count("budget", budget, "bytes a frame", _MAX_BYTES)
+
+
+def _checked_payload(payload: Payload | int | None) -> Payload | int | None:
+    """Check the payload of a link; raises ConfigError or ChoiceError."""
+    if payload is None or isinstance(payload, str):
+        kind: Payload | None = choice("payload", payload, (None, *get_args(Payload)))
+        return kind
+    return checked_count("payload", payload, "bytes of every message", _MAX_BYTES)
 
 
 def uniforms(key: str) -> tuple[float, float, float, float]:
-    """Four numbers between 0 and 1 (both excluded) from a text, the same on every machine and with every numpy."""
+    """Draw four numbers between 0 and 1 (both excluded) from a text.
+
+    They are the same on every machine and with every version of numpy.
+    """
     digest = hashlib.sha256(key.encode()).digest()
     numbers = [int.from_bytes(digest[start : start + 8], "big") >> 12 for start in range(0, 32, 8)]
-    first, second, third, fourth = ((number + 0.5) / 2**52 for number in numbers)
-    return first, second, third, fourth
+    draw_1, draw_2, draw_3, draw_4 = ((number + 0.5) / 2**52 for number in numbers)
+    return draw_1, draw_2, draw_3, draw_4
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MessageSize:
-    """Bytes of one agent's message at one moment, uncompressed, for each kind of data; each includes a pose (24 bytes).
+    """The bytes of one agent's message at one moment, uncompressed, for each kind of data.
+
+    Each number includes a pose (24 bytes).
 
     Attributes:
-        images: the six cameras' pixels, 3 bytes each, in the size that calib gives.
-        cloud: the LiDAR's points, 16 bytes each; None if points were not counted, or the file is not there.
-        boxes: the boxes that it annotated, its own included, 45 bytes each.
-        bev: a BEV feature map of the given shape and type.
+        images: Bytes of the six cameras' pixels, 3 bytes each, in the size that calib gives.
+        cloud: Bytes of the LiDAR's points, 16 bytes each; None if points were not counted, or the
+            file is missing.
+        boxes: Bytes of the boxes that the agent annotated, its own included, 45 bytes each.
+        bev: Bytes of a BEV feature map of the given shape and type.
     """
 
     images: int
@@ -271,42 +314,47 @@ def message_sizes(
     link: Link | None = None,
     on_missing: OnError = "raise",
 ) -> dict[str, MessageSize]:
-    """Bytes that each agent sends for a sample's moment, for each kind of data.
+    """Return the bytes that each agent sends for a sample's moment, for each kind of data.
 
     Args:
-        dataset: the release.
-        sample: token or record: its frame is the moment.
-        agents: names of agents, a configuration or its name as seen from the ego, or None for all that are there.
-        bev_shape: channels, rows, columns of the BEV features.
-        bev_dtype: type of the BEV features.
-        clouds: whether to read the point clouds, to count their points.
-        link: what happens to the partners' data; None for nothing. With latency, sizes are those of the earlier frame
-            that arrives; pose noise does not change the size of a message.
-        on_missing: of point clouds that were not downloaded: `raise`, or `skip` leaves their size out (`cloud` is None)
-            and logs how many.
+        dataset: The release.
+        sample: Token or record of a sample; its frame is the moment.
+        agents: Names of agents, a configuration or its name relative to the ego, or None for all
+            available agents.
+        bev_shape: Shape of the BEV features: channels, rows, columns.
+        bev_dtype: Type of the BEV features.
+        clouds: Whether to read the point clouds, to count their points.
+        link: Effects of the link on the partners' data; None for a perfect link. With latency,
+            sizes are of the earlier frame that arrives; pose noise does not change the size
+            of a message.
+        on_missing: Treatment of point clouds that were not downloaded: `raise`, or `skip`, which
+            leaves their size out (`cloud` is None) and logs how many.
 
     Returns:
-        Agent → sizes of what arrives. The sample's own agent (which sends nothing to itself) is first, if it is among
-        them. A partner whose message is lost, or does not fit into the budget, is left out; a call without `link` gives
-        the size of that message.
+        Sizes of the arriving messages by agent. The sample's own agent (which sends nothing to
+        itself) is first, if it is among them. A partner is left out if its message is lost or does
+        not fit into the budget; a call without `link` returns the size of that message.
 
     Raises:
-        TokenError: no such sample.
-        ChoiceError: no such agent, configuration or `on_missing`, or `bev_shape` is no shape or `bev_dtype` no type.
-        NotAvailableError: an agent is not in this (partial) release.
+        TokenError: There is no such sample.
+        ChoiceError: There is no such agent, configuration or `on_missing`, or `bev_shape` is no
+            shape or `bev_dtype` no type.
+        NotAvailableError: An agent is not in this (partial) release.
         ConfigError: `link` is no Link, or its latency is longer than the scenario's past.
-        MissingFileError: `clouds` is true, `on_missing` is `raise`, and a point cloud was not downloaded.
+        MissingFileError: `clouds` is true, `on_missing` is `raise`, and a point cloud was not
+            downloaded.
         SensorFileError: `clouds` is true and a point cloud cannot be read.
     """
     bev = POSE_BYTES + _bev_bytes(bev_shape, bev_dtype)
     files = MissingFiles(dataset.dataroot, on_missing)
     sizes: dict[str, MessageSize] = {}
     for message in messages(dataset, sample, agents, link):
-        counted = clouds and files.has(dataset.sensor_path(f"{message.sample}/{LIDAR}"), LIDAR)
+        sender = message.sample
+        readable = clouds and files.has(dataset.sensor_path(f"{sender}/{LIDAR}"), LIDAR)
         sizes[message.agent] = MessageSize(
-            images=message_bytes(dataset, message.sample, "images"),
-            cloud=message_bytes(dataset, message.sample, "cloud") if counted else None,
-            boxes=message_bytes(dataset, message.sample, "boxes"),
+            images=message_bytes(dataset, sender, "images"),
+            cloud=message_bytes(dataset, sender, "cloud") if readable else None,
+            boxes=message_bytes(dataset, sender, "boxes"),
             bev=bev,
         )
     files.tell()
@@ -314,65 +362,81 @@ def message_sizes(
 
 
 def message_bytes(dataset: Dataset, sample: str, payload: Payload | int | None) -> int:
-    """Bytes of the message that a sample's own agent sends at its frame, as `MessageSize` says; 0 for None.
+    """Return the bytes of the message that a sample's own agent sends at its frame.
 
-    Only for `cloud` a file is read. `bev` is of the shape and type that `message_sizes` takes without being told; for
-    other features give their bytes.
+    The sizes are described in `MessageSize`; the size is 0 for None. Only for `cloud` a file is
+    read. `bev` has the default shape and type of `message_sizes`; for other features give their
+    bytes.
 
     Raises:
-        TokenError: no such sample.
-        MissingFileError: a point cloud was not downloaded.
-        SensorFileError: a point cloud cannot be read.
+        TokenError: There is no such sample.
+        MissingFileError: A point cloud was not downloaded.
+        SensorFileError: A point cloud cannot be read.
     """
     if not isinstance(payload, str):
         return payload or 0
     if payload == "images":
-        images = (dataset.get("sample_data", f"{sample}/{camera}") for camera in CAMERAS)
-        return POSE_BYTES + sum(3 * int(image["width"]) * int(image["height"]) for image in images)
+        images = [dataset.get("sample_data", f"{sample}/{camera}") for camera in CAMERAS]
+        pixel_bytes = [3 * int(image["width"]) * int(image["height"]) for image in images]
+        return POSE_BYTES + sum(pixel_bytes)
     if payload == "cloud":
         return POSE_BYTES + POINT_BYTES * len(dataset.load_point_cloud(sample, "lidar"))
     boxes = dataset.columns("sample")["num_annotations"].item(dataset.getind("sample", sample))
-    return POSE_BYTES + (
-        BOX_BYTES * int(boxes) if payload == "boxes" else _bev_bytes(_BEV_SHAPE, np.float32)
-    )
+    if payload == "boxes":
+        return POSE_BYTES + BOX_BYTES * int(boxes)
+    return POSE_BYTES + _bev_bytes(_BEV_SHAPE, np.float32)
 
 
 def traffic(
     dataset: Dataset, sample: RowArgument, agents: Agents, link: Link | None, payload: Payload | int
 ) -> tuple[int, int]:
-    """Bytes that arrive from all partners at a sample's frame, and the number of these partners.
+    """Return the bytes that arrive from all partners at a sample's frame, and their number.
 
-    Raises what `messages` and `message_bytes` do.
+    It raises the errors of `messages` and `message_bytes`.
     """
-    own = dataset.get("sample", sample)["token"]
-    exact = (
-        None if link is None else replace(link, pose_noise=None)
-    )  # which changes no size, and takes time
-    sent = [
+    own_sample = dataset.get("sample", sample)["token"]
+    exact_link = None
+    if link is not None:
+        # Pose noise changes no size, and takes time.
+        exact_link = replace(link, pose_noise=None)
+    sizes = [
         message_bytes(dataset, message.sample, payload)
-        for message in messages(dataset, own, agents, exact)
-        if message.sample != own
+        for message in messages(dataset, own_sample, agents, exact_link)
+        if message.sample != own_sample
     ]
-    return sum(sent), len(sent)
+    return sum(sizes), len(sizes)
 
 
 def traffic_note(
-    found: Sequence[tuple[int, int]], link: Link | None, payload: Payload | int, **more: Any
+    traffic_by_sample: Sequence[tuple[int, int]],
+    link: Link | None,
+    payload: Payload | int,
+    **more: Any,
 ) -> dict[str, Any]:
-    """What results note of the bytes that partners send: means of the `traffic` of each sample, and `more`."""
-    total, partners = (sum(column) for column in zip(*found, strict=True)) if found else (0, 0)
+    """Return the note about the bytes that partners send, for results.
+
+    Args:
+        traffic_by_sample: The `traffic` of each sample: bytes and number of partners.
+        link: The link.
+        payload: Data that a partner sends, as in `Link.payload`.
+        **more: Further entries of the note.
+    """
+    samples = len(traffic_by_sample)
+    total = sum(size for size, _ in traffic_by_sample)
+    partners = sum(count for _, count in traffic_by_sample)
     return {
         "payload": payload,
         **more,
-        "samples": len(found),
-        "mean": total / max(len(found), 1),
+        "samples": samples,
+        "mean": total / max(samples, 1),
         "link": total / max(partners, 1),
-        "partners": partners / max(len(found), 1),
+        "partners": partners / max(samples, 1),
         "budget": None if link is None else link.budget,
     }
 
 
 def _bev_bytes(shape: Sequence[int], dtype: DTypeLike) -> int:
+    """Return the bytes of BEV features; raises ChoiceError."""
     expected = "(channels, rows, columns), whole numbers from 1"
     if np.shape(shape) != (3,):
         raise ChoiceError(f"bev_shape: expected {expected}, found {shape!r}")
@@ -389,12 +453,12 @@ def _bev_bytes(shape: Sequence[int], dtype: DTypeLike) -> int:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Message:
-    """One agent's data as the ego receives them.
+    """The data of one agent as the ego receives them.
 
     Attributes:
-        agent: the agent that sent them.
-        sample: token of the sample of the data: with latency an earlier one.
-        pose_error: `claimed_from_world`; None without pose noise.
+        agent: Name of the sender.
+        sample: Token of the sample of the data: with latency an earlier one.
+        pose_error: Transform `claimed_from_world`; None without pose noise.
     """
 
     agent: AgentName
@@ -402,7 +466,10 @@ class Message:
     pose_error: SE3 | None
 
     def target_from(self, dataset: Dataset, frame: str, target_from_world: SE3) -> SE3:
-        """Where the ego places coordinates of the sender's `frame`: `target_from_frame`, pose noise included."""
+        """Return `target_from_frame` for the sender's `frame`, as the ego computes it.
+
+        The pose noise is included.
+        """
         world_from_frame = dataset.world_from(self.sample, frame)
         if self.pose_error is not None:
             world_from_frame = self.pose_error @ world_from_frame
@@ -417,42 +484,47 @@ def messages(
     *,
     sweeps: int = 1,
 ) -> Iterator[Message]:
-    """What the agents contribute at a sample and at the `sweeps` − 1 frames before it; nothing for a lost message.
+    """Yield the messages that arrive at a sample and at the `sweeps` − 1 frames before it.
 
-    With a budget, partners whose message does not fit contribute nothing either.
+    Nothing is yielded for a lost message or, with a budget, for a message that does not fit.
 
-    By frame, the present first and then backwards, and for each frame by agent, the sample's own first. Raises what
-    `cooperating_agents` does, ConfigError of the link, and with a budget what `message_bytes` does.
+    Messages are ordered by frame, the present first and then backwards, and for each frame by
+    agent, the sample's own first. Raises the errors of `cooperating_agents`, ConfigError of the
+    link, and with a budget the errors of `message_bytes`.
     """
     link = checked_link(link)
     names = cooperating_agents(dataset, sample, agents)
     scenario, ego, number = dataset.get("sample", sample)["token"].rsplit("/", 2)
-    for index in range(int(number), max(int(number) - sweeps, 0), -1):
-        left = math.inf if link is None or link.budget is None else link.budget
+    present = int(number)
+    for index in range(present, max(present - sweeps, 0), -1):
+        budget_left = math.inf if link is None or link.budget is None else link.budget
         for agent in names:
             if link is None or agent == ego:
-                yield Message(
-                    agent=agent, sample=sample_token(scenario, agent, index), pose_error=None
-                )
-            elif index == int(number) or index > link.latency_frames:
-                message = _received(dataset, scenario, agent, index, link)
-                size = (
-                    0
-                    if message is None or link.budget is None
-                    else message_bytes(dataset, message.sample, link.payload)
-                )
-                if message is not None and size <= left:
-                    left -= size
-                    yield message
+                token = sample_token(scenario, agent, index)
+                yield Message(agent=agent, sample=token, pose_error=None)
+                continue
+            if index != present and index <= link.latency_frames:
+                continue
+            message = _received(dataset, scenario, agent, index, link)
+            if message is None:
+                continue
+            size = 0
+            if link.budget is not None:
+                size = message_bytes(dataset, message.sample, link.payload)
+            if size <= budget_left:
+                budget_left -= size
+                yield message
 
 
 def _received(
     dataset: Dataset, scenario: str, agent: AgentName, index: int, link: Link
 ) -> Message | None:
-    sent = sample_token(scenario, agent, link.frame_sent(scenario, index))
+    """Return a partner's message that the ego receives at frame `index`; None if it is lost."""
+    sent_sample = sample_token(scenario, agent, link.frame_sent(scenario, index))
     if link.loses(scenario, agent, index):
         return None
-    error = None
+    pose_error = None
     if link.pose_noise is not None:
-        error = link.pose_error(scenario, agent, index, dataset.world_from(sent, "ego").translation)
-    return Message(agent=agent, sample=sent, pose_error=error)
+        position = dataset.world_from(sent_sample, "ego").translation
+        pose_error = link.pose_error(scenario, agent, index, position)
+    return Message(agent=agent, sample=sent_sample, pose_error=pose_error)

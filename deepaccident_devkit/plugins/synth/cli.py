@@ -35,32 +35,35 @@ Examples:
   deepaccident synth OUT --for-released-code               for the released DeepAccident code
   deepaccident synth OUT --benchmark v1 --sensors cameras  a benchmark that everybody has the same
 """
-# Number of differences from what is published that are printed.
-_SHOWN: Final = 5
+_MAX_SHOWN_DIFFERENCES: Final = 5
 
 
 def _show_design(context: click.Context, parameter: click.Parameter, value: str | None) -> None:
+    """Print the scenario file of a design, and stop."""
     if value is not None:
         click.echo(design_text(_number(context, parameter, value)), nl=False)
         context.exit()
 
 
 def _number(context: click.Context, parameter: click.Parameter, text: str) -> int:
+    """Return the number of a design; raises BadParameter."""
     kind: Any = click.IntRange(DESIGN_NUMBERS[0], DESIGN_NUMBERS[-1])
     return int(kind.convert(text, parameter, context))
 
 
 def _designs(
-    context: click.Context, parameter: click.Parameter, given: tuple[str, ...]
+    context: click.Context, parameter: click.Parameter, texts: tuple[str, ...]
 ) -> dict[str, Any]:
-    """The fields `designs` and `spec` of what was given: numbers of designs, or one scenario file."""
-    files = [text for text in given if not text.isdecimal()]
-    if len(files) > 1 or (files and len(given) > 1):
+    """Return the fields `designs` and `spec`: numbers of designs, or one scenario file."""
+    files = [text for text in texts if not text.isdecimal()]
+    if len(files) > 1 or (files and len(texts) > 1):
         raise click.BadParameter(
             "give one scenario file, or numbers of designs", context, parameter
         )
-    numbers = () if files else tuple(_number(context, parameter, text) for text in given)
-    return {"designs": numbers, "spec": Path(files[0]) if files else None}
+    if files:
+        return {"designs": (), "spec": Path(files[0])}
+    numbers = tuple(_number(context, parameter, text) for text in texts)
+    return {"designs": numbers, "spec": None}
 
 
 @verb(epilog=_EXAMPLES)
@@ -78,9 +81,9 @@ def _designs(
     "image_size",
     callback=pixel_size,
     metavar="WxH",
-    help="Size of the camera images in pixels. The real ones have 1600x900, and the released DeepAccident code assumes "
-    "this size: with another size it computes wrong camera geometry.  [default: {}x{}; {}x{} with "
-    "--for-released-code]".format(*IMAGE_SIZE, *RELEASED_IMAGE_SIZE),
+    help="Size of the camera images in pixels. The real ones have 1600x900, and the released "
+    "DeepAccident code assumes this size: with another size it computes wrong camera geometry.  "
+    "[default: {}x{}; {}x{} with --for-released-code]".format(*IMAGE_SIZE, *RELEASED_IMAGE_SIZE),
 )
 @field_option(SynthConfig, "layout")
 @field_option(SynthConfig, "seed")
@@ -94,8 +97,8 @@ def _designs(
     multiple=True,
     callback=_designs,
     metavar="N|FILE",
-    help="Only accidents of this design; you can repeat this option. Or a scenario file of your own; docs/synth.md "
-    "describes its fields.  [default: all twelve in turn]",
+    help="Only accidents of this design; you can repeat this option. Or a scenario file of your "
+    "own; docs/synth.md describes its fields.  [default: all twelve in turn]",
 )
 @field_option(SynthConfig, "designed")
 @field_option(SynthConfig, "unplanned", option=advanced)
@@ -103,8 +106,9 @@ def _designs(
 @click.option(
     "--benchmark",
     type=WordChoice(BENCHMARKS),
-    help="Make the release of this benchmark, and say whether it is as published; with --sensors cameras or clouds, a "
-    "part of its files. One that is there is only compared. docs/benchmark.md says what it is for.",
+    help="Make the release of this benchmark, and say whether it is as published; with --sensors "
+    "cameras or clouds, a part of its files. One that is there is only compared. docs/benchmark.md "
+    "says what it is for.",
 )
 @engine_parameters
 @click.option(
@@ -113,54 +117,66 @@ def _designs(
     is_eager=True,
     expose_value=False,
     callback=_show_design,
-    help="Print the scenario file of a design, as a start for your own, and stop; docs/synth.md lists them.",
+    help="Print the scenario file of a design, as a start for your own, and stop; docs/synth.md "
+    "lists them.",
 )
 def synth(out: Path, *, designs: dict[str, Any], benchmark: str | None, **options: Any) -> None:
     """Make a complete synthetic release in the new folder OUT.
 
     If a run is interrupted, the same command continues it.
     """
-    how = engine_of(options)
+    engine = engine_of(options)
     if benchmark is not None:
-        refuse_unused(
-            "with --benchmark, which says all of it",
-            *(set(options) | {"designs"}) - {*how, "sensors"},
-        )
-        _make_benchmark(out, benchmark, options["sensors"], how)
+        unused = (set(options) | {"designs"}) - {*engine, "sensors"}
+        refuse_unused("with --benchmark, which says all of it", *unused)
+        _make_benchmark(out, benchmark, options["sensors"], engine)
         return
-    options = {name: each for name, each in options.items() if name not in how} | designs
-    if options["spec"] is not None or options["view"] == "hidden":
+    settings = {name: value for name, value in options.items() if name not in engine} | designs
+    if settings["spec"] is not None or settings["view"] == "hidden":
         refuse_unused(
             "with a scenario file or --view hidden, which ask for one certain accident", "unplanned"
         )
-    config = SynthConfig(**options)
+    config = SynthConfig(**settings)
     if config.sensors == "none" and not has_embree():
         click.echo(
             "slow without the package embreex; in a checkout: pip install '.[synth]'", err=True
         )
-    made = make_release(out, config, progress=True, **how)
+    release = make_release(out, config, progress=True, **engine)
     frames = "" if config.frames is None else f" of {counted(config.frames, 'frame')}"
-    click.echo(
-        f"{made}: {counted(config.scenarios, 'scenario')}{frames} with five agents, layout {config.layout}"
-    )
-    click.echo(f"next: deepaccident info {made}")
+    scenarios = counted(config.scenarios, "scenario")
+    click.echo(f"{release}: {scenarios}{frames} with five agents, layout {config.layout}")
+    click.echo(f"next: deepaccident info {release}")
     if config.spec is None or read_spec(config.spec).meets:
         layers = " --layers boxes" if config.sensors == "none" else ""
-        click.echo(f"or:   deepaccident render accident {made}{layers} --out countdown.png")
+        click.echo(f"or:   deepaccident render accident {release}{layers} --out countdown.png")
 
 
-def _make_benchmark(out: Path, name: str, sensors: Sensors, how: dict[str, Any]) -> None:
-    """Make a benchmark's release if it is not there, and compare it; exit status 1 if it is not as published."""
+def _make_benchmark(out: Path, name: str, sensors: Sensors, engine: dict[str, Any]) -> None:
+    """Make a benchmark's release unless the folder has one, and compare it.
+
+    Args:
+        out: Folder of the release.
+        name: Name of the benchmark.
+        sensors: Sensors' files to make.
+        engine: Options of the workers.
+
+    Raises:
+        ClickException: The release is not as published.
+    """
     if not (out.is_dir() and any(out.iterdir())):
-        make_release(out, replace(BENCHMARKS[name], sensors=sensors), progress=True, **how)
-    found = described_release(out, progress=True, **how)
-    if faults := differences(found, published(name)):
+        config = replace(BENCHMARKS[name], sensors=sensors)
+        make_release(out, config, progress=True, **engine)
+    release = described_release(out, progress=True, **engine)
+    faults = differences(release, published(name))
+    if faults:
         raise click.ClickException(
-            f"{out}: is not the benchmark {name} as published, {counted(len(faults), 'difference')}:\n"
-            + "\n".join(faults[:_SHOWN])
-            + f"\nMake it with the libraries of benchmarks/{name}/lock.txt; evaluations of this release do not compare "
-            "with others."
+            f"{out}: is not the benchmark {name} as published, "
+            f"{counted(len(faults), 'difference')}:\n"
+            + "\n".join(faults[:_MAX_SHOWN_DIFFERENCES])
+            + f"\nMake it with the libraries of benchmarks/{name}/lock.txt; evaluations of this "
+            "release do not compare with others."
         )
-    compared = f"{counted(len(found['scenarios']), 'scenario')}: labels, {', '.join(compared_kinds(found))}"
-    click.echo(f"{out}: is the benchmark {name} as published, {compared}")
+    scenarios = counted(len(release["scenarios"]), "scenario")
+    kinds = ", ".join(compared_kinds(release))
+    click.echo(f"{out}: is the benchmark {name} as published, {scenarios}: labels, {kinds}")
     click.echo(f"next: deepaccident info {out}")

@@ -1,4 +1,4 @@
-"""`deepaccident demo`: everything once, on a small synthetic release, and a page that shows it."""
+"""`deepaccident demo`: a tour on a small synthetic release, and a page that shows it."""
 
 from __future__ import annotations
 
@@ -47,23 +47,24 @@ if TYPE_CHECKING:
     from deepaccident_devkit.tables.records import FrameRecord, ScenarioRecord
 
 _PAGE_FILE: Final = "index.html"
-# Files beside the page, as its template shows them.
 PICTURES: Final = (
     "countdown.png",
     "five_agents_1s_before.png",
     "ego_cameras_1s_before.png",
     "motion_labels_1s_before.png",
 )
-# Likewise, of the picture that is made where PyTorch is installed.
+"""Files beside the page, as its template shows them."""
 MODEL_PICTURE: Final = "model_1s_before.png"
+"""File of the picture that is made where PyTorch is installed."""
 _REPLAY_FILE: Final = "replay.html"
 REPORT_FOLDER: Final = "evaluation"
-# A browser loads only what lies beside the page, on a disk or a server; only the pages in frames run anything.
-_POLICY: Final = (
+# A browser loads only files beside the page, on a disk or a server; only pages in frames run code.
+_CONTENT_POLICY: Final = (
     "default-src 'none'; img-src 'self' file:; frame-src 'self' file:; style-src 'unsafe-inline'"
 )
 SCENARIO: Final = """\
-# The accident of `deepaccident demo`: in clear weather, by day, the other car runs a red light. A house hides it from
+# The accident of `deepaccident demo`: in clear weather, by day, the other car runs a red light. \
+A house hides it from
 # ego until about 2.5 s before the impact; from then on it is in ego's front camera.
 name: demo
 road: {kind: four-way, signalized: true, lanes: 1}
@@ -74,36 +75,39 @@ actors:
   - {role: other, from: south, max_speed: 4, ignores: [signal]}
   - {role: other_behind, gap: [8, 16]}
 meet: {actors: [ego, other], offset: [-0.2, 0.2]}
-background: {vehicles: [6, 12], two_wheelers: [2, 6], parked: [3, 9], walking: [3, 9], crossing: [1, 4]}
+background: {vehicles: [6, 12], two_wheelers: [2, 6], parked: [3, 9], walking: [3, 9], \
+crossing: [1, 4]}
 weather: Clear
 time_of_day: Noon
 """
 RELEASE: Final = SynthConfig(scenarios=2, frames=40, seed=1, sensors="accidents", traffic="v1")
 # The file by which the demo knows a folder as its own.
-_MARK: Final = ".deepaccident_demo"
+_MARKER_FILE: Final = ".deepaccident_demo"
 _SCENARIO_FILE: Final = "accident.yaml"
-_RUN: Final = "single_vehicle"
-_RESULTS: Final = f"{_RUN}.json"
+_RUN_NAME: Final = "single_vehicle"
+_RESULTS_FILE: Final = f"{_RUN_NAME}.json"
 # Seconds before the impact; at the first the house hides the other car from ego.
 _COUNTDOWN: Final = (3.0, 2.0, 1.0, 0.5, 0.0)
 _SECONDS_BEFORE: Final = 1.0
-# Metres from ego to the edge of the model's picture.
-_REACH: Final = 35.0
+# Distance from ego to the edge of the model's picture.
+_VIEW_RANGE_M: Final = 35.0
 # The released labels, but they end at the impact.
-_LABELS: Final = MotionLabelConfig(future_frames=2)
-# The samples of the table and of the report: ego's in the last four seconds of the accident and of its twin.
+_LABEL_CONFIG: Final = MotionLabelConfig(future_frames=2)
+# The samples of the table and of the report: ego's in the last four seconds of the accident and of
+# its twin.
 _SELECTION: Final = SampleSelection(
     split="train", scope="all", agents=("ego_vehicle",), horizon=4.0
 )
-_AGENTS: Final = {"single": "single vehicle", "all": "five agents"}
-# Task → the protocol, and the heading of each number of the table with its name in the result.
-_NUMBERS: Final[Mapping[ResultsTask, tuple[str, Mapping[str, str]]]] = {
+_AGENT_SET_NAMES: Final = {"single": "single vehicle", "all": "five agents"}
+# The protocol of each task, and the heading of each number of the table with its name in the
+# result.
+_TABLE_NUMBERS: Final[Mapping[ResultsTask, tuple[str, Mapping[str, str]]]] = {
     "motion": ("paper", {"IoU (%)": "iou 100x100", "VPQ (%)": "vpq 100x100"}),
     "accident": ("boxes", {"APA": "apa", "precision": "precision", "recall": "recall"}),
     "detection": ("paper", {"mAP (%)": "mAP"}),
 }
-# About how many seconds each step takes on two cores.
-_STEPS: Final = {
+# Approximate duration of each step on two cores, seconds.
+_STEP_SECONDS: Final = {
     "recording": 15.0,
     "indexing": 1.0,
     "pictures": 5.0,
@@ -112,16 +116,16 @@ _STEPS: Final = {
     "evaluation": 4.0,
     "replay": 4.0,
 }
-_BAR: Final = "{desc:<10} {percentage:3.0f}%|{bar}| {elapsed}<{remaining}"
+_BAR_FORMAT: Final = "{desc:<10} {percentage:3.0f}%|{bar}| {elapsed}<{remaining}"
 
 
 @dataclass(frozen=True, slots=True)
 class NextStep:
-    """Something to try next.
+    """A suggestion for what to try next.
 
     Attributes:
-        sentence: what it does.
-        command: for a shell.
+        sentence: Description of the step.
+        command: Command for a shell.
     """
 
     sentence: str
@@ -132,17 +136,18 @@ class NextStep:
 @click.argument("out", type=PATH, default="deepaccident_demo")
 @workers_parameter
 def demo(out: Path, workers: int | None) -> None:
-    """Make a small synthetic release in the folder OUT, and a page that shows what the devkit does with it.
+    """Make a small synthetic release in the folder OUT, and a page that shows what the devkit does.
 
-    The release has an accident, and of its normal twin the labels. The page OUT/index.html has pictures, motion labels,
-    a table of what one car and five agents predict, a replay, the report of an evaluation, and six next steps. Where
-    PyTorch is installed, it also shows what a small trained model foresees.
+    The release has an accident, and of its normal twin the labels. The page OUT/index.html has
+    pictures, motion labels, a table of what one car and five agents predict, a replay, the report
+    of an evaluation, and six next steps. Where PyTorch is installed, it also shows what a small
+    trained model foresees.
 
     OUT must be missing, empty, or the folder of an earlier demo, which then keeps its release.
     """
     _claim(out)
     steps = _next_steps(out)
-    with tqdm(total=sum(_STEPS.values()), bar_format=_BAR, disable=None) as bar:
+    with tqdm(total=sum(_STEP_SECONDS.values()), bar_format=_BAR_FORMAT, disable=None) as bar:
         with _step(bar, "recording"):
             _make_release(out, workers, bar)
         with _step(bar, "indexing"):
@@ -165,20 +170,19 @@ def demo(out: Path, workers: int | None) -> None:
 
 
 def demo_page(table: Sequence[Sequence[str]], steps: Sequence[NextStep], *, model: bool) -> str:
-    """The complete page; it refers to the other files of its folder by their names.
+    """Render the complete page; it refers to the other files of its folder by their names.
 
     Args:
-        table: of `demo_table`.
-        steps: what to try next.
-        model: whether there is a picture of a model's predictions.
+        table: Rows of `demo_table`.
+        steps: Suggestions for what to try next.
+        model: Whether there is a picture of a model's predictions.
     """
-    heading, *rows = zip(
-        *table, strict=True
-    )  # a column for each set of agents: it fits a narrow window
+    # A column for each set of agents fits a narrow window.
+    heading, *rows = zip(*table, strict=True)
     return document(
         "demo.html",
         style=page_style(),
-        policy=_POLICY,
+        policy=_CONTENT_POLICY,
         pictures=PICTURES,
         model=MODEL_PICTURE if model else "",
         heading=heading,
@@ -191,31 +195,38 @@ def demo_page(table: Sequence[Sequence[str]], steps: Sequence[NextStep], *, mode
 
 
 def draw_accident(release: DeepAccident, out: Path) -> None:
-    """Render the first accident: the countdown to it, and the five agents, ego's cameras and labels a second before."""
+    """Draw the first accident: its countdown, and the moment a second before.
+
+    At that moment, the pictures show the five agents, ego's cameras and ego's labels.
+    """
     accident, before = _accident_and_before(release)
     ego = release.samples_of(before)[0]
     countdown = partial(
         release.render_accident, seconds=_COUNTDOWN, agents=("ego_vehicle", "infrastructure")
     )
+    labels = partial(release.render_motion_labels, config=_LABEL_CONFIG)
     drawings: tuple[tuple[tuple[float, float], Callable[..., Any], RowArgument], ...] = (
         ((17.0, 8.6), countdown, accident),
         ((20.0, 6.5), release.render_frame, before),
         ((16.0, 5.5), release.render_sample, ego),
-        ((11.0, 12.0), partial(release.render_motion_labels, config=_LABELS), ego),
+        ((11.0, 12.0), labels, ego),
     )
     for name, (size, render, record) in zip(PICTURES, drawings, strict=True):
-        save_picture(render(record, fig=detached_figure(size)), out / name, dpi=80)
+        fig = render(record, fig=detached_figure(size))
+        save_picture(fig, out / name, dpi=80)
 
 
 def draw_model(release: DeepAccident, out: Path) -> bool:
-    """Render what the shipped model foresees a second before, by ego's LiDAR and by all agents', beside the truth.
+    """Draw the predictions of the shipped model a second before the impact, beside the truth.
 
-    Beneath is the road, and above it the pair as it truly is at each of the two moments.
+    One column shows the predictions from ego's LiDAR, the other from the LiDARs of all agents.
+    Below is the road, and on top the pair at its true positions at each of the two moments.
 
     Returns:
         Whether PyTorch is installed; without it there is no picture.
     """
-    (out / MODEL_PICTURE).unlink(missing_ok=True)  # of an earlier demo
+    picture_path = out / MODEL_PICTURE
+    picture_path.unlink(missing_ok=True)  # of an earlier demo
     use_threads_sparingly()
     try:
         need_plugin("model", "the picture of a model")
@@ -226,32 +237,41 @@ def draw_model(release: DeepAccident, out: Path) -> bool:
         return False
     accident, before = _accident_and_before(release)
     token = release.samples_of(before)[0]["token"]
-    label, road = motion_labels(release, token, model.config.labels), release.load_bev(token)
+    label = motion_labels(release, token, model.config.labels)
+    road = release.load_bev(token)
+    moments = ((0, before["index"]), (None, accident["num_frames"]))
     fig = detached_figure((11.0, 11.0))
-    for column, agents, title in zip(
-        fig.subplots(2, 2).T, ("single", "all"), ("ego alone", "five agents"), strict=True
-    ):
-        [found] = predictions(model, release, [token], PredictConfig(agents=agents))
-        for ax, frame, moment in zip(
-            column, (0, None), (before["index"], accident["num_frames"]), strict=True
-        ):
-            draw_motion_outcome(found.motion, label, frame=frame, ax=ax)
-            ax.set(
-                xlim=(-_REACH, _REACH), ylim=(-_REACH, _REACH), title=f"{title}: {ax.get_title()}"
-            )
-            draw_underlay(road, ax, target_from_ego=SE3.identity(), view_range=_REACH)
-            _draw_pair(release, accident, token, moment, ax)
-    save_picture(fig, out / MODEL_PICTURE, dpi=80)
+    columns = fig.subplots(2, 2).T
+    titles_by_agents = {"single": "ego alone", "all": "five agents"}
+    for column, (agents, title) in zip(columns, titles_by_agents.items(), strict=True):
+        [prediction] = predictions(model, release, [token], PredictConfig(agents=agents))
+        for ax, (label_frame, index) in zip(column, moments, strict=True):
+            draw_motion_outcome(prediction.motion, label, frame=label_frame, ax=ax)
+            limits = (-_VIEW_RANGE_M, _VIEW_RANGE_M)
+            ax.set(xlim=limits, ylim=limits, title=f"{title}: {ax.get_title()}")
+            draw_underlay(road, ax, target_from_ego=SE3.identity(), view_range=_VIEW_RANGE_M)
+            _draw_pair(release, accident, token, index, ax)
+    save_picture(fig, picture_path, dpi=80)
     return True
 
 
 def _draw_pair(
-    release: DeepAccident, accident: ScenarioRecord, sample: str, moment: int, ax: Any
+    release: DeepAccident, accident: ScenarioRecord, sample: str, index: int, ax: Any
 ) -> None:
-    """Render the true outlines of an accident's pair at a frame, in the ego frame of a sample, with names."""
-    scenario, collision = accident["token"], accident["collision"]
-    boxes = scenario_tracks(release, scenario).at(moment)
-    boxes = boxes.select(np.isin(boxes.actor_id, collision["ids"] if collision else []))
+    """Draw the true outlines of an accident's pair at a frame, with names.
+
+    Args:
+        release: The release.
+        accident: Record of the scenario.
+        sample: Token of the sample with the ego frame to draw in.
+        index: Frame number.
+        ax: Matplotlib axes.
+    """
+    scenario = accident["token"]
+    collision = accident["collision"]
+    pair_ids = collision["ids"] if collision else []
+    boxes = scenario_tracks(release, scenario).at(index)
+    boxes = boxes.select(np.isin(boxes.actor_id, pair_ids))
     boxes = boxes.transform(release.world_from(sample, "ego").inverse(), "ego")
     draw_boxes_from_above(boxes, ax, [COLLIDER_COLOR] * len(boxes), fill=0, linewidths=2)
     recorders = recorders_of(release, scenario)
@@ -260,7 +280,7 @@ def _draw_pair(
 
 
 def _accident_and_before(release: DeepAccident) -> tuple[ScenarioRecord, FrameRecord]:
-    """The first accident's scenario, and its frame a second before the impact."""
+    """Return the first accident's scenario, and its frame a second before the impact."""
     accident = next(scenario for scenario in release.scenario if scenario["collision"])
     impact = release.getind("frame", accident["last_frame_token"])
     return accident, release.frame[impact - round(_SECONDS_BEFORE / FRAME_PERIOD)]
@@ -268,19 +288,19 @@ def _accident_and_before(release: DeepAccident) -> tuple[ScenarioRecord, FrameRe
 
 @contextmanager
 def _step(bar: tqdm[Any], name: str) -> Iterator[None]:
-    """Name a step on the bar, and move the bar to its end; a log gets a line at its beginning."""
+    """Show a step on the bar, and move the bar to its end; a log gets a line at its beginning."""
     bar.set_description_str(name)
+    number = [*_STEP_SECONDS].index(name) + 1
     if _is_log(bar):
-        click.echo(
-            f"{[*_STEPS].index(name) + 1} of {len(_STEPS)}: {name}, which takes some {_STEPS[name]:.0f} s"
-        )
-    end = sum(list(_STEPS.values())[: list(_STEPS).index(name) + 1])
+        seconds = _STEP_SECONDS[name]
+        click.echo(f"{number} of {len(_STEP_SECONDS)}: {name}, which takes some {seconds:.0f} s")
+    end = sum(list(_STEP_SECONDS.values())[:number])
     yield
     bar.update(end - bar.n)
 
 
 def _is_log(bar: tqdm[Any]) -> bool:
-    """Whether what is printed goes elsewhere than to a terminal, so that lines say how far it is."""
+    """Return whether the output is no terminal, so that printed lines show the progress."""
     return bar.disable or not sys.stdout.isatty()
 
 
@@ -288,91 +308,106 @@ def _claim(out: Path) -> None:
     """Mark a folder as the demo's, before anything else is written.
 
     Raises:
-        ConfigError: it holds something, and no demo of this version made it.
+        ConfigError: It contains something, and no demo of this version made it.
     """
-    mark, version = out / _MARK, f"{__version__}\n".encode()
-    if mark.is_file() and mark.read_bytes() == version:
+    marker = out / _MARKER_FILE
+    version = f"{__version__}\n".encode()
+    if marker.is_file() and marker.read_bytes() == version:
         return
     remove_leftovers(out)  # of a demo that was killed before it had marked the folder
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise ConfigError(
-            f"{out}: exists, and was not made by the demo of version {__version__}; name a folder that does not exist "
-            "yet: deepaccident demo OTHER_FOLDER"
+            f"{out}: exists, and was not made by the demo of version {__version__}; "
+            "name a folder that does not exist yet: deepaccident demo OTHER_FOLDER"
         )
-    write_bytes(mark, version)
+    write_bytes(marker, version)
 
 
 def _make_release(out: Path, workers: int | None, bar: tqdm[Any]) -> None:
-    """Make the release, if it is not there; what an interrupted demo has recorded is kept."""
-    root, scenario = place_in(out, "release", opened=True), out / _SCENARIO_FILE
+    """Make the release unless it exists, and continue an interrupted one."""
+    root = place_in(out, "release", opened=True)
+    scenario_path = out / _SCENARIO_FILE
     if root.is_dir():
         return
-    if not scenario.exists():
-        write_bytes(scenario, SCENARIO.encode())
+    if not scenario_path.exists():
+        write_bytes(scenario_path, SCENARIO.encode())
     recorded = 0.0
 
-    def moved(share: float) -> None:
+    def show_progress(share: float) -> None:
         nonlocal recorded
-        before, recorded = recorded, recorded + share
-        bar.update(share * _STEPS["recording"])
-        if _is_log(bar) and int(10 * recorded) > int(10 * before):
+        previous = recorded
+        recorded = recorded + share
+        bar.update(share * _STEP_SECONDS["recording"])
+        if _is_log(bar) and int(10 * recorded) > int(10 * previous):
             click.echo(f"  {100 * recorded:.0f} % recorded")
 
-    make_release(root, replace(RELEASE, spec=scenario), workers=workers or 2, progress=moved)
+    config = replace(RELEASE, spec=scenario_path)
+    make_release(root, config, workers=workers or 2, progress=show_progress)
 
 
 def demo_table(release: DeepAccident) -> list[list[str]]:
-    """How well ego alone and five agents foresee crashes: a heading, and a line of text for each of the two."""
+    """Return a table of how well ego and five agents foresee crashes.
+
+    Returns:
+        A heading, and a line of text for each of the two.
+    """
     tokens = _SELECTION.tokens(release)
-    rows = [["", *(heading for _, numbers in _NUMBERS.values() for heading in numbers)]]
-    for agents, name in _AGENTS.items():
-        baseline, row = Baseline(agents=agents, horizon=_SELECTION.horizon), [name]
+    heading = [""]
+    for _, names_by_heading in _TABLE_NUMBERS.values():
+        heading += names_by_heading
+    rows = [heading]
+    for agents, row_name in _AGENT_SET_NAMES.items():
+        baseline = Baseline(agents=agents, horizon=_SELECTION.horizon)
+        row = [row_name]
         with TemporaryDirectory() as folder:
-            for task, (protocol, numbers) in _NUMBERS.items():
+            for task, (protocol, names_by_heading) in _TABLE_NUMBERS.items():
                 path = predict_results(
                     release, task, tokens, Path(folder) / task, baseline, workers=1
                 )
                 setup = EvaluationSetup(task=task, protocol=protocol, horizon=_SELECTION.horizon)
                 run = evaluate_results(release, path, setup, _SELECTION, workers=1)
-                found = {each.name: each for each in headlines(run.result)}
-                row += [found[number].text().removesuffix(" %") for number in numbers.values()]
+                numbers = {number.name: number for number in headlines(run.result)}
+                for name in names_by_heading.values():
+                    row.append(numbers[name].text().removesuffix(" %"))
         rows.append(row)
     return rows
 
 
 def _evaluate(release: DeepAccident, out: Path) -> None:
-    """Evaluate what the baseline of a single vehicle predicts, and write a report and a bundle."""
-    path = out / _RESULTS
+    """Evaluate the baseline of a single vehicle, and write a report and a bundle."""
+    path = out / _RESULTS_FILE
     path.unlink(missing_ok=True)  # of an earlier demo
-    baseline, tokens = (
-        Baseline(agents="single", horizon=_SELECTION.horizon),
-        _SELECTION.tokens(release),
-    )
+    baseline = Baseline(agents="single", horizon=_SELECTION.horizon)
+    tokens = _SELECTION.tokens(release)
     results = read_results(predict_results(release, "accident", tokens, path, baseline, workers=1))
     setup = EvaluationSetup(task="accident", protocol="boxes", horizon=_SELECTION.horizon)
     run = evaluate_results(release, results, setup, _SELECTION, workers=1).broken_down()
     folder = place_in(out, REPORT_FOLDER, opened=True)
     save_report(run, folder, dataset=release, results=results)
-    save_run(run, place_in(folder, _RUN, opened=True), include_results=True, overwrite=True)
+    bundle = place_in(folder, _RUN_NAME, opened=True)
+    save_run(run, bundle, include_results=True, overwrite=True)
 
 
 def _next_steps(out: Path) -> tuple[NextStep, ...]:
+    """Return the suggestions for what to try next, with the paths of the demo's folder."""
     names = (
         "release",
         "five_agents",
         "own",
         _SCENARIO_FILE,
-        f"{REPORT_FOLDER}/{_RUN}",
+        f"{REPORT_FOLDER}/{_RUN_NAME}",
         "five_agents/evaluation",
     )
-    root, five, own, scenario, bundle, second = (shlex.quote(str(out / name)) for name in names)
-    of_both = (
+    paths = [shlex.quote(str(out / name)) for name in names]
+    root, five, own, scenario, bundle, evaluation = paths
+    selection = (
         f"--split {_SELECTION.split} --scope {_SELECTION.scope} --horizon {_SELECTION.horizon:g}"
     )
     return (
         NextStep("See what the release holds:", f"deepaccident info {root} --where collision=true"),
         NextStep(
-            "See in your browser which predictions were right; this needs the extra: pip install '.[explore]'",
+            "See in your browser which predictions were right; this needs the extra: "
+            "pip install '.[explore]'",
             f"deepaccident explore {root} --results {bundle}",
         ),
         NextStep(
@@ -381,15 +416,18 @@ def _next_steps(out: Path) -> tuple[NextStep, ...]:
         ),
         NextStep(
             "Let five agents predict together:",
-            f"deepaccident predict constant_velocity {root} {of_both} --task accident --agents all --out {five}",
+            f"deepaccident predict constant_velocity {root} {selection} --task accident "
+            f"--agents all --out {five}",
         ),
         NextStep(
             "Evaluate that, and compare it with the report:",
-            f"deepaccident evaluate accident {root} --results {five}/accident.json {of_both} --protocol boxes "
-            f"--agents ego_vehicle --allow-partial --out {second} && deepaccident evaluate compare {bundle} {second}",
+            f"deepaccident evaluate accident {root} --results {five}/accident.json {selection} "
+            f"--protocol boxes --agents ego_vehicle --allow-partial --out {evaluation} "
+            f"&& deepaccident evaluate compare {bundle} {evaluation}",
         ),
         NextStep(
-            "Edit the scenario file of the accident, such as its weather, and see what happens in it:",
+            "Edit the scenario file of the accident, such as its weather, and see what happens "
+            "in it:",
             f"deepaccident synth {own} --design {scenario} --scenarios 2 --sensors none",
         ),
     )

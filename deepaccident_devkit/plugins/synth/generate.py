@@ -1,6 +1,7 @@
-"""Making a synthetic release, in a folder beside its place, so that a later call can continue after an interruption.
+"""The making of a synthetic release, in a folder beside its place.
 
-Several processes and hosts may record parts of its scenarios at once. One that has the folder alone puts them together.
+A later call can continue after an interruption. Several processes and hosts may record parts of the
+scenarios at once. The one that has the folder to itself puts them together.
 """
 
 from __future__ import annotations
@@ -8,7 +9,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -49,7 +50,13 @@ if TYPE_CHECKING:
     from concurrent.futures import Executor
 
 _CONFIG_FILE = "config.json"
-_MADE = "made"
+_MADE_NOTE = "made"
+# Approximate number of frames of a scenario if the configuration does not give it.
+_USUAL_FRAMES = 70
+# Smallest number of frames that are worth several workers; a frame with sensors takes up to a
+# second.
+_MIN_PARALLEL_FRAMES = 20
+_MIN_PARALLEL_FRAMES_WITHOUT_SENSORS = 400
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,19 +64,20 @@ class Unfinished:
     """The hidden folder of a release that is being made; cheap to pickle.
 
     Attributes:
-        out: the place that the release will have; absolute.
+        out: Folder that the release will have; absolute.
     """
 
     out: Path
 
     @property
     def folder(self) -> Path:
-        """Where it lies; raises OutputFolderError if it is a link."""
-        return place_in(self.out.parent, f".{self.out.name}.unfinished", opened=True)
+        """The hidden folder; raises OutputFolderError if it is a link."""
+        name = f".{self.out.name}.unfinished"
+        return place_in(self.out.parent, name, opened=True)
 
     @property
     def store(self) -> Store:
-        """What says which parts are made, and keeps others from recording the same."""
+        """The store that notes made parts, and prevents others from recording the same."""
         return Store(self.folder, self.out, "makes the release", ConfigError)
 
     @property
@@ -78,7 +86,7 @@ class Unfinished:
         return place_in(self.folder, "release", opened=True)
 
     def part(self, name: str) -> Path:
-        """Where a part of a scenario is recorded, as in a release of its own."""
+        """Return the folder of a part of a scenario, which is recorded as a release of its own."""
         return place_in(self.folder, f"parts/{name}", opened=True)
 
     def clear(self, name: str) -> None:
@@ -86,19 +94,20 @@ class Unfinished:
         remove_in(self.folder, f"parts/{name}")
 
     def is_made(self, name: str) -> bool:
-        """Whether a part is complete."""
-        return self.store.kept(name, _MADE) is not None
+        """Return whether a part is complete."""
+        return self.store.kept(name, _MADE_NOTE) is not None
 
     def note(self, name: str) -> None:
-        """Remember that a part is complete; raises ConfigError if it was removed meanwhile."""
+        """Note that a part is complete; raises ConfigError if it was removed meanwhile."""
         if not (self.folder / _CONFIG_FILE).exists():
             raise ConfigError(
-                f"{self.folder}: was removed while parts of the release were recorded; make it again"
+                f"{self.folder}: was removed while parts of the release were recorded; "
+                "make it again"
             )
-        self.store.keep(name, _MADE, b"")
+        self.store.keep(name, _MADE_NOTE, b"")
 
     def gather(self, names: Iterable[str]) -> None:
-        """Move the files of a scenario's parts into the release, if they are not there yet."""
+        """Move the files of a scenario's parts into the release, unless they are already there."""
         for name in names:
             if self.part(name).is_dir():
                 _merge(self.part(name), self.release)
@@ -113,52 +122,69 @@ class Unfinished:
 
 @contextmanager
 def unfinished_release(unfinished: Unfinished, config: SynthConfig) -> Iterator[Callable[[], bool]]:
-    """Work on a release in the block; if nothing of it is made at the end, nothing is left.
+    """Work on a release in the block; if nothing of it is made, the folder is removed at the end.
 
-    Yields a function that waits until this process has the folder alone; whether no other one has completed the
-    release. Raises ConfigError: its place is taken, the unfinished release is of another configuration or version, or
-    something cannot be written.
+    Yields:
+        A function that waits until this process has the folder to itself, and returns whether no
+        other one has completed the release.
+
+    Raises:
+        ConfigError: Its place is taken, the unfinished release is of another configuration or
+            version, or something cannot be written.
     """
-    store, settings = unfinished.store, unfinished.folder / _CONFIG_FILE
+    store = unfinished.store
+    config_path = unfinished.folder / _CONFIG_FILE
 
     def begin() -> None:
-        check_free(unfinished.out)  # who held the lock may have completed it
-        _write_or_compare(settings, config)
+        # The process that held the lock before may have completed the release.
+        check_free(unfinished.out)
+        _write_or_compare(config_path, config)
 
     with store.shared(begin) as turn:
-        _write_or_compare(settings, config)
+        _write_or_compare(config_path, config)
         try:
             yield turn.alone
         finally:
-            nothing = unfinished.folder.is_dir() and not any(unfinished.folder.glob("kept/*"))
-            if nothing and turn.alone(wait=False):
+            has_folder = unfinished.folder.is_dir()
+            is_empty = has_folder and not any(unfinished.folder.glob("kept/*"))
+            if is_empty and turn.alone(wait=False):
                 shutil.rmtree(unfinished.folder, ignore_errors=True)
 
 
 def _write_or_compare(path: Path, config: SynthConfig) -> None:
-    wanted = _as_json(config)
+    """Write a configuration, or compare it with the written one.
+
+    Raises:
+        ConfigError: They differ, or the file cannot be read.
+    """
+    settings = _as_json(config)
     if not path.exists():
-        write_bytes(path, json.dumps(wanted, indent=1).encode())
+        write_bytes(path, json.dumps(settings, indent=1).encode())
         return
-    there = _parsed(path)
-    if differs := "spec" if there.get("spec") != wanted["spec"] else differing_text(there, wanted):
+    written_settings = _parsed(path)
+    if written_settings.get("spec") != settings["spec"]:
+        difference = "spec"
+    else:
+        difference = differing_text(written_settings, settings)
+    if difference:
         raise ConfigError(
-            f"{path.parent}: holds an unfinished release of another configuration ({differs}); ask for the same to "
-            "finish it, or remove the folder"
+            f"{path.parent}: holds an unfinished release of another configuration ({difference}); "
+            "ask for the same to finish it, or remove the folder"
         )
 
 
 def _parsed(path: Path) -> dict[str, Any]:
+    """Read a JSON object, an empty one if the file has another value; raises ConfigError."""
     text = file_text(path)
     try:
-        there = parsed_json(text.encode())
+        settings = parsed_json(text.encode())
     except ValueError as error:
         raise ConfigError(f"{path}: {error}; remove its folder") from error
-    return there if isinstance(there, dict) else {}
+    return settings if isinstance(settings, dict) else {}
 
 
 def file_text(path: Path) -> str:
-    """A text file's content; raises ConfigError."""
+    """Read a text file; raises ConfigError."""
     try:
         return read_bytes(path, "spec").decode()
     except (OSError, ValueError) as error:
@@ -166,29 +192,29 @@ def file_text(path: Path) -> str:
 
 
 def _as_json(config: SynthConfig) -> dict[str, Any]:
-    """All that the bytes of a release depend on, as JSON returns it; of the scenario file its text."""
+    """Return all settings that the bytes of a release depend on, as they are read from JSON.
+
+    Instead of the path of the scenario file they have its text.
+    """
     text = None if config.spec is None else file_text(config.spec)
     fields = {"version": __version__, **asdict(config), "image_size": config.pixels, "spec": text}
-    as_read: dict[str, Any] = json.loads(json.dumps(fields))
-    return as_read
+    settings: dict[str, Any] = json.loads(json.dumps(fields))
+    return settings
 
 
 def _merge(part: Path, release: Path) -> None:
     """Move a part's files to their places, and remove the part.
 
-    Temporary files go with it: only those leave some whose locks do not keep others out, and the part is complete.
+    Temporary files are removed with it: they come only from processes with locks that do not
+    exclude others, and the part is complete.
     """
     for folder, _, names in os.walk(part):
-        place = place_in(release, Path(folder).relative_to(part), opened=True)
-        place.mkdir(parents=True, exist_ok=True)
+        target = place_in(release, Path(folder).relative_to(part), opened=True)
+        target.mkdir(parents=True, exist_ok=True)
         for name in names:
             if temporary_of(name) is None:
-                Path(folder, name).replace(place / name)
+                Path(folder, name).replace(target / name)
     shutil.rmtree(part)
-
-
-# About how many frames a scenario has if the configuration does not say it.
-_USUAL_FRAMES = 70
 
 
 def make_release(
@@ -201,77 +227,82 @@ def make_release(
 ) -> Path:
     """Write a complete synthetic release; returns its folder.
 
-    The release is made in a hidden folder beside `out`, `.NAME.unfinished`, and renamed when it is complete. After an
-    interruption (a full disk, a kill) the same call makes only what is still missing; several processes that make the
-    same call share the scenarios.
+    The release is made in a hidden folder beside `out`, `.NAME.unfinished`, and renamed when it is
+    complete. After an interruption (a full disk, a kill) the same call makes only the missing
+    parts; several processes that make the same call share the scenarios.
 
     Args:
-        out: the folder to make; it must be empty, or not exist yet.
-        config: the settings of the release; `SynthConfig()` if None.
-        workers: number of processes; several may record one scenario. With None the generator chooses. The files
-            depend neither on it nor on interruptions.
-        executor: any executor of `concurrent.futures` to run on, in place of own workers.
-        progress: whether to show a progress bar; or a function that is called after each part of the work, with its
-            share of all that was to do.
+        out: Folder to make; it must be empty, or not exist yet.
+        config: Settings of the release; `SynthConfig()` if None.
+        workers: Number of processes; several may record one scenario. With None the generator
+            chooses. The files depend neither on it nor on interruptions.
+        executor: Any executor of `concurrent.futures` to run on, instead of own workers.
+        progress: Whether to show a progress bar; or a function that is called after each part of
+            the work, with its share of the total work.
 
     Raises:
-        ConfigError: `out` is a file, is not empty or cannot be made; an unfinished release of another
-            configuration is there; the scenario file cannot be read or simulated; or something cannot be written.
-        OutputFolderError: a link in the hidden folder leads out of it; nothing is written there.
+        ConfigError: `out` is a file, is not empty or cannot be made; an unfinished release of
+            another configuration is there; the scenario file cannot be read or simulated; or
+            something cannot be written.
+        OutputFolderError: A link in the hidden folder leads out of it; nothing is written there.
         ChoiceError: `workers` is less than 1.
-        MissingExtraError: files of sensors are wanted and the package embreex is not installed.
-        SomeFailedError: some parts cannot be recorded; the others are, and the same call continues.
-        WorkerError: a worker was killed, or cannot do the work.
+        MissingExtraError: The release has files of sensors and the package embreex is not
+            installed.
+        SomeFailedError: Some parts cannot be recorded; the others are, and the same call continues.
+        WorkerError: A worker was killed, or cannot do the work.
     """
-    wanted = config or SynthConfig()
+    config = config or SynthConfig()
     out = path_of(out)
     check_free(out)
-    if wanted.sensors != "none":
+    if config.sensors != "none":
         require_embree()
-    plans = plan_scenarios(wanted)
+    plans = plan_scenarios(config)
     if not is_writable_folder(out.parent):
         raise ConfigError(f"{out.parent}: cannot be written; choose another folder")
     unfinished = Unfinished(out.absolute())
-    with unfinished_release(unfinished, wanted) as alone:
-        count = workers or _worker_count(wanted, len(plans))
-        parts = {
-            name: part for plan in plans for name, part in _parts(unfinished, wanted, plan).items()
+    with unfinished_release(unfinished, config) as wait_until_alone:
+        parts: dict[str, RecordingJob] = {}
+        for plan in plans:
+            parts.update(_parts(unfinished, config, plan))
+        engine: dict[str, Any] = {
+            "workers": workers or _worker_count(config, len(plans)),
+            "executor": executor,
+            "progress": progress,
         }
+        record = partial(_record, unfinished)
         places = Places(writes=(unfinished.folder,))
-        how: dict[str, Any] = {"workers": count, "executor": executor, "progress": progress}
         try:
-            unfinished.store.run(
-                partial(_record, unfinished), parts, label="recording", places=places, **how
-            )
+            unfinished.store.run(record, parts, label="recording", places=places, **engine)
         finally:
             forget_scenario()
-        if alone():
+        if wait_until_alone():
             unfinished.release.mkdir(exist_ok=True)
             unfinished.gather(parts)
-            splits = plan_splits(plans)
-            splits.save(unfinished.release, overwrite=True)
-            if wanted.for_released_code:
-                splits.save(
-                    place_in(unfinished.release, SPLIT_FILE_FOLDER, opened=True), overwrite=True
-                )
+            _save_splits(unfinished.release, config, plans)
             unfinished.complete()
     return out
+
+
+def _save_splits(release: Path, config: SynthConfig, plans: Sequence[ScenarioPlan]) -> None:
+    """Write the split files of a release."""
+    splits = plan_splits(plans)
+    splits.save(release, overwrite=True)
+    if config.for_released_code:
+        splits.save(place_in(release, SPLIT_FILE_FOLDER, opened=True), overwrite=True)
 
 
 def _parts(
     unfinished: Unfinished, config: SynthConfig, plan: ScenarioPlan
 ) -> dict[str, RecordingJob]:
-    """The parts of a scenario by their names."""
+    """Return the parts of a scenario by their names."""
     if config.sensors == "accidents":
         config = replace(config, sensors="all" if plan.accident else "none")
-    parts = part_count(config)
-    names = {
-        first: f"{plan.scenario_type}_{plan.name}_{first}of{parts}" for first in range(1, parts + 1)
-    }
-    return {
-        name: RecordingJob(unfinished.part(name), config, plan, first, parts)
-        for first, name in names.items()
-    }
+    count = part_count(config)
+    jobs = {}
+    for first_frame in range(1, count + 1):
+        name = f"{plan.scenario_type}_{plan.name}_{first_frame}of{count}"
+        jobs[name] = RecordingJob(unfinished.part(name), config, plan, first_frame, count)
+    return jobs
 
 
 def _record(unfinished: Unfinished, job: RecordingJob) -> None:
@@ -284,6 +315,9 @@ def _record(unfinished: Unfinished, job: RecordingJob) -> None:
 
 
 def _worker_count(config: SynthConfig, scenarios: int) -> int:
-    """One worker for each core, or 1 if the work is too short for it: a frame with sensors takes up to a second."""
+    """Return the number of workers: one for each core, or 1 if the work is too short for it."""
     frames = scenarios * (config.frames or _USUAL_FRAMES)
-    return usable_cores() if frames >= (400 if config.sensors == "none" else 20) else 1
+    min_frames = _MIN_PARALLEL_FRAMES
+    if config.sensors == "none":
+        min_frames = _MIN_PARALLEL_FRAMES_WITHOUT_SENSORS
+    return usable_cores() if frames >= min_frames else 1

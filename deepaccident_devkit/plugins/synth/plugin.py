@@ -1,4 +1,4 @@
-"""What the plug-in `synth` offers."""
+"""The commands of the plug-in `synth`."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ if TYPE_CHECKING:
 
 
 def _demo() -> click.Command:
+    """Return the command `demo`."""
     need_plugin("baselines", "demo")
     from deepaccident_devkit.plugins.synth.demo import demo
 
@@ -18,6 +19,7 @@ def _demo() -> click.Command:
 
 
 def _synth() -> click.Command:
+    """Return the command `synth`."""
     from deepaccident_devkit.plugins.synth.cli import synth
 
     return synth

@@ -1,6 +1,7 @@
-"""A scenario: made so that it happens as its plan says, and recorded frame by frame as files of a release.
+"""A scenario: made so that it goes as planned, and recorded frame by frame as files of a release.
 
-It is recorded in parts; each part takes every nth frame, so that several processes can share a scenario.
+It is recorded in parts; each part takes every nth frame, so that several processes can share a
+scenario.
 """
 
 import multiprocessing
@@ -71,26 +72,27 @@ AGENT_OF_ROLE: Mapping[Role, AgentName] = {
     "other": "other_vehicle",
     "other_behind": "other_vehicle_behind",
 }
-# After this many draws without a collision a scenario is given up.
 MAX_DRAWS = 40
-# Parts of a scenario with sensors. Without sensors it has one: simulating it takes longer than writing a frame.
-_PARTS = 8
+"""Number of draws without a collision after which a scenario is given up."""
+# Parts of a scenario with sensors. Without sensors it has one: simulating it takes longer than
+# writing a frame.
+_NUM_PARTS = 8
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Scenario:
-    """All that can be recorded; time 0 is the time of the first recorded frame.
+    """Everything in a scenario that can be recorded; time 0 is the first recorded frame's time.
 
     Attributes:
-        plan: which scenario it is.
-        spec: the draw that was simulated.
-        world: what stands still.
-        actors: what moves, and parked vehicles.
-        agents: actor ids of the four vehicle agents.
-        meta: the contents of its meta file.
-        frames: how many are recorded.
-        signals: the phases of the traffic lights; None if there are no lights.
-        draws: how many draws were needed.
+        plan: Plan of the scenario.
+        spec: Draw that was simulated.
+        world: Static world.
+        actors: Moving road users, and parked vehicles.
+        agents: Actor ids of the four vehicle agents.
+        meta: Contents of its meta file.
+        frames: Number of recorded frames.
+        signals: Phases of the traffic lights; None if there are no lights.
+        draws: Number of draws that were needed.
     """
 
     plan: ScenarioPlan
@@ -105,49 +107,53 @@ class Scenario:
 
 
 def build_scenario(config: SynthConfig, plan: ScenarioPlan) -> Scenario:
-    """Make a scenario; the same seed and pair give the same scene, for the accident and for its twin.
+    """Make a scenario; the same seed and pair give the same scene, for the accident and its twin.
 
-    If two actors are timed to meet, the scene is drawn again until they touch. Raises ConfigError if they do not in
-    `MAX_DRAWS` draws; the message says how near they came, and what to change.
+    If two actors are timed to meet, the scene is drawn again until they touch.
+
+    Raises:
+        ConfigError: They do not touch in `MAX_DRAWS` draws; the message has the distance to which
+            they came, and the fields to change.
     """
-    # a stream for each part of the scene, so that a change to one part leaves the others
-    seeds = [
-        config.seed,
-        plan.pair,
-        *([1] if plan.misfiled else []),
-    ]  # it shows other scenes than its twin
-    of_world, of_traffic, of_ids, of_end = map(
-        np.random.default_rng, np.random.SeedSequence(seeds).spawn(4)
-    )
+    seeds = [config.seed, plan.pair]
+    if plan.misfiled:
+        seeds.append(1)  # it shows other scenes than its twin
+    # One stream for each part of the scene, so that a change to one part leaves the others.
+    streams = [np.random.default_rng(seed) for seed in np.random.SeedSequence(seeds).spawn(4)]
+    world_rng, traffic_rng, id_rng, end_rng = streams
+    recorded: Recorded | None
     while True:
-        stage, accident, draws = _first_good_draw(of_traffic, config, plan)
-        recorded = (
-            recorded_accident(of_end, stage, accident, config.frames)
-            if accident and plan.collides
-            else _twin(of_end, stage, config, plan)
-        )
+        stage, accident, draws = _first_good_draw(traffic_rng, config, plan)
+        if accident and plan.collides:
+            recorded = recorded_accident(end_rng, stage, accident, config.frames)
+        else:
+            recorded = _twin(end_rng, stage, config, plan)
         if recorded is not None:
             break
     if plan.grazes:
         recorded = with_graze(stage, recorded)
     spec = stage.spec
-    ego, other = (spec.actor(role).from_arm or "west" for role in ("ego", "other"))
-    ids = _Ids.of(of_ids, stage)
+    ego_arm, other_arm = (spec.actor(role).from_arm or "west" for role in ("ego", "other"))
+    ids = _Ids.of(id_rng, stage)
+    world = random_world(
+        world_rng,
+        stage.junction,
+        spec.view,
+        between=(ego_arm, other_arm),
+        low_pole=plan.kind is not None,
+    )
+    signals = None
+    if stage.signals is not None:
+        signals = stage.signals.shifted(-recorded.start)
     return Scenario(
         plan=plan,
         spec=spec,
-        world=random_world(
-            of_world,
-            stage.junction,
-            spec.view,
-            between=(ego, other),
-            low_pole=plan.kind is not None,
-        ),
+        world=world,
         actors=Actors.of(_actors(stage, recorded, ids)),
         agents=ids.agents,
         meta=_meta(plan, stage, recorded, ids, config.decimals),
         frames=recorded.frames,
-        signals=None if stage.signals is None else stage.signals.shifted(-recorded.start),
+        signals=signals,
         draws=draws,
     )
 
@@ -155,46 +161,69 @@ def build_scenario(config: SynthConfig, plan: ScenarioPlan) -> Scenario:
 def _first_good_draw(
     rng: np.random.Generator, config: SynthConfig, plan: ScenarioPlan
 ) -> tuple[Stage, Performance | None, int]:
-    """The first draw in which the pair touches, what happens in it, and how many draws were needed."""
-    least = np.inf
-    most = MAX_DRAWS if plan.kind is None else 10 * MAX_DRAWS
-    for draws in range(1, most + 1):
+    """Draw scenes until the pair touches.
+
+    Returns:
+        The scene, the course of it (None if nobody is timed to meet), and the number of draws.
+
+    Raises:
+        ConfigError: The pair does not touch in the largest number of draws.
+    """
+    min_distance = np.inf
+    max_draws = MAX_DRAWS if plan.kind is None else 10 * MAX_DRAWS
+    for draws in range(1, max_draws + 1):
         spec = plan.draw(rng)
         junction = Junction(spec.road)
         if plan.unplanned:
-            on_foot = None if plan.kind is None else plan.kind.labelled and rng.random() < ON_FOOT
+            on_foot = None
+            if plan.kind is not None:
+                on_foot = plan.kind.labelled and rng.random() < ON_FOOT
             spec = unplanned(rng, spec, junction, on_foot=on_foot)
-        stage = set_stage(
-            rng, spec, junction, usual_duration(rng, config.frames, plan.kind), plan.kind
-        )
+        duration = usual_duration(rng, config.frames, plan.kind)
+        stage = set_stage(rng, spec, junction, duration, plan.kind)
         if spec.meet is None:
             return stage, None, draws
-        tried = try_accident(stage)
-        if isinstance(tried, Performance) and lasts(stage, tried, config.frames):
-            return stage, tried, draws
-        least = min(least, np.inf if isinstance(tried, Performance) else tried)
-    came = f"the least distance was {least:.1f} m; choose a meet.offset nearer to 0, or another max_speed"
-    if least == np.inf:
-        came = "their paths do not cross, or others touch before; change from or turn, or the others' gap or lane"
+        attempt = try_accident(stage)
+        if not isinstance(attempt, Performance):
+            min_distance = min(min_distance, attempt)
+        elif lasts(stage, attempt, config.frames):
+            return stage, attempt, draws
+    if min_distance == np.inf:
+        reason = (
+            "their paths do not cross, or others touch before; change from or turn, "
+            "or the others' gap or lane"
+        )
+    else:
+        reason = (
+            f"the least distance was {min_distance:.1f} m; choose a meet.offset nearer to 0, "
+            "or another max_speed"
+        )
     raise ConfigError(
-        f"{plan.template.place('meet')}: the two did not collide in {most} draws; {came}, or choose fewer "
-        "background.vehicles"
+        f"{plan.template.place('meet')}: the two did not collide in {max_draws} draws; {reason}, "
+        "or choose fewer background.vehicles"
     )
 
 
 def _twin(
     rng: np.random.Generator, stage: Stage, config: SynthConfig, plan: ScenarioPlan
 ) -> Recorded | None:
-    """The recording of a normal scenario; None where all is as in the real release and another draw is needed."""
+    """Record a normal scenario.
+
+    Returns:
+        None in a lifelike release if another draw is needed.
+
+    Raises:
+        ConfigError: In a designed release, the road users collide whatever they do.
+    """
     normal = perform_twin(stage, latest_end(stage, config.frames))
     if normal is not None:
         return recorded_normal(rng, stage, normal, config.frames)
     if plan.kind is not None:
         return None
-    where = "in the normal twin too" if stage.spec.meet else "although all obey the rules"
+    condition = "in the normal twin too" if stage.spec.meet else "although all obey the rules"
     raise ConfigError(
-        f"{plan.template.place('actors')}: the road users collide {where}, even if one of them comes later; let "
-        "them start farther from each other"
+        f"{plan.template.place('actors')}: the road users collide {condition}, even if one of them "
+        "comes later; let them start farther from each other"
     )
 
 
@@ -207,20 +236,25 @@ class _Ids(NamedTuple):
 
     @classmethod
     def of(cls, rng: np.random.Generator, stage: Stage) -> "_Ids":
-        """Moving actors get ids from 1000 on, parked ones from 20000 on, in the order in which they were made."""
-        moving, count = len(stage.users), len(stage.users) + len(stage.parked)
-        actor = (rng.integers(1000, 2000) + rng.integers(1, 4, moving).cumsum()).tolist()
-        actor += [STATIC_ACTOR_ID + row for row in range(moving, count)]
+        """Draw the ids of a stage's actors.
+
+        Moving actors get ids from 1000 on, parked ones from 20000 on, in the order in which they
+        were made.
+        """
+        num_moving = len(stage.users)
+        count = num_moving + len(stage.parked)
+        actor = (rng.integers(1000, 2000) + rng.integers(1, 4, num_moving).cumsum()).tolist()
+        actor += [STATIC_ACTOR_ID + row for row in range(num_moving, count)]
         camera = rng.choice(np.arange(1, 2**16), count, replace=False).tolist()
-        agents = {
-            AGENT_OF_ROLE[user.role]: actor[row]
-            for row, user in enumerate(stage.users)
-            if user.role in AGENT_OF_ROLE
-        }
+        agents = {}
+        for row, user in enumerate(stage.users):
+            if user.role in AGENT_OF_ROLE:
+                agents[AGENT_OF_ROLE[user.role]] = actor[row]
         return cls(tuple(actor), tuple(camera), {agent: agents[agent] for agent in VEHICLE_AGENTS})
 
 
 def _actors(stage: Stage, recorded: Recorded, ids: _Ids) -> list[Actor]:
+    """Return the actors of a recording: road users that labels name, then parked vehicles."""
     simulation = recorded.performance.simulation
     start = float(simulation.time[0]) - recorded.start
     actors = []
@@ -246,6 +280,7 @@ def _actors(stage: Stage, recorded: Recorded, ids: _Ids) -> list[Actor]:
 
 
 def _actor(ids: _Ids, row: int, body: Body, motion: SampledMotion) -> Actor:
+    """Return the actor of a row of the stage."""
     return Actor(
         actor_id=ids.actor[row],
         object_id=ids.camera[row],
@@ -260,12 +295,14 @@ def _actor(ids: _Ids, row: int, body: Body, motion: SampledMotion) -> Actor:
 def _meta(
     plan: ScenarioPlan, stage: Stage, recorded: Recorded, ids: _Ids, decimals: int | None
 ) -> Meta:
-    spec, collision, planned = (
-        stage.spec,
-        _collision(stage, recorded, ids, decimals),
-        _pair_agents(stage),
-    )
+    """Return the contents of a scenario's meta file."""
+    spec = stage.spec
+    collision = _collision(stage, recorded, ids, decimals)
+    pair_agents = _pair_agents(stage)
     ego, ego_behind, other, other_behind = (ids.agents[agent] for agent in VEHICLE_AGENTS)
+    planned_agents: tuple[AgentName | None, AgentName | None] | None = pair_agents
+    if collision or pair_agents == (None, None) or (stage.kind and ego % 2):
+        planned_agents = None
     return Meta(
         weather=spec.weather,
         time_of_day=spec.time_of_day,
@@ -276,23 +313,27 @@ def _meta(
         spawn_side=plan.traits.spawn_side,
         ego_direction=spec.actor("ego").turn,
         other_direction=spec.actor("other").turn,
-        planned_agents=None
-        if collision or planned == (None, None) or (stage.kind and ego % 2)
-        else planned,
+        planned_agents=planned_agents,
     )
 
 
 def _collision(
     stage: Stage, recorded: Recorded, ids: _Ids, decimals: int | None
 ) -> Collision | None:
-    impact, pair = recorded.impact, stage.cast.pair
+    """Return the collision in the meta file; None if there is none."""
+    impact = recorded.impact
+    pair = stage.cast.pair
     if impact is None or pair is None:
         return None
-    first, second = (stage.users[row] for row in pair)
+    user, other_user = (stage.users[row] for row in pair)
+    strength = impact.strength
+    if decimals is not None:
+        strength = round(strength, decimals)
+    other_id = 0 if pair[1] == stage.unlabelled else ids.actor[pair[1]]
     return Collision(
-        ids=(ids.actor[pair[0]], 0 if pair[1] == stage.unlabelled else ids.actor[pair[1]]),
-        classes=(first.body.category, second.body.category),
-        impact=impact.strength if decimals is None else round(impact.strength, decimals),
+        ids=(ids.actor[pair[0]], other_id),
+        classes=(user.body.category, other_user.body.category),
+        impact=strength,
         spawn_relation=impact.relation,
         contact_side=impact.side,
         agents=_pair_agents(stage),
@@ -300,13 +341,14 @@ def _collision(
 
 
 def _pair_agents(stage: Stage) -> tuple[AgentName | None, AgentName | None]:
-    """The agents of the two who are timed to meet; None for a road user that is no agent, or if nobody is timed."""
-    first, second = (
-        (AGENT_OF_ROLE.get(stage.users[row].role) for row in stage.cast.pair)
-        if stage.cast.pair
-        else (None, None)
-    )
-    return first, second
+    """Return the agents of the two that are timed to meet.
+
+    They are None for a road user that is no agent, or if nobody is timed.
+    """
+    if not stage.cast.pair:
+        return None, None
+    agent, other_agent = (AGENT_OF_ROLE.get(stage.users[row].role) for row in stage.cast.pair)
+    return agent, other_agent
 
 
 @dataclass(frozen=True, slots=True)
@@ -314,11 +356,11 @@ class RecordingJob:
     """A scenario to make, or a part of one.
 
     Attributes:
-        root: the release to write it into.
-        config: the settings of the release.
-        plan: which scenario it is.
-        first: the first frame, counted from 1.
-        step: from each frame to the next one.
+        root: Folder of the release to write it into.
+        config: Settings of the release.
+        plan: Plan of the scenario.
+        first: Number of the first frame, counted from 1.
+        step: Step from each frame to the next one.
     """
 
     root: Path
@@ -329,24 +371,31 @@ class RecordingJob:
 
     @property
     def folder(self) -> ScenarioFolder:
-        """Where the scenario's files lie."""
-        folder = self.plan.split if self.config.layout == "B" else ""
-        return ScenarioFolder(self.root, folder, self.plan.scenario_type, self.plan.name, AGENTS)
+        """The folder of the scenario's files."""
+        split_folder = self.plan.split if self.config.layout == "B" else ""
+        return ScenarioFolder(
+            self.root, split_folder, self.plan.scenario_type, self.plan.name, AGENTS
+        )
 
 
 def part_count(config: SynthConfig) -> int:
-    """The number of parts in which each scenario is recorded."""
-    return 1 if config.sensors == "none" else min(_PARTS, config.frames or _PARTS)
+    """Return the number of parts in which each scenario is recorded."""
+    if config.sensors == "none":
+        return 1
+    return min(_NUM_PARTS, config.frames or _NUM_PARTS)
 
 
 def record_scenario(job: RecordingJob) -> None:
-    """Make a scenario and write all its files, or those of a part of it."""
-    _share_cores()
-    scenario, rig = _KEPT.made_ready(_Task(job.config, job.plan))
+    """Make a scenario and write all its files, or the files of a part of it."""
+    _limit_opencv_threads()
+    scenario, rig = _CACHE.scenario_and_rig(_Task(job.config, job.plan))
     labelled = job.plan.split != "test" or not job.config.unlabelled_test
-    step = job.config.sensor_step
     recorder = _Recorder(
-        folder=job.folder, scenario=scenario, rig=rig, labelled=labelled, sensor_step=step
+        folder=job.folder,
+        scenario=scenario,
+        rig=rig,
+        labelled=labelled,
+        sensor_step=job.config.sensor_step,
     )
     if labelled and job.first == 1:
         write_meta(real_path(job.folder.meta_path), scenario.meta)
@@ -355,12 +404,15 @@ def record_scenario(job: RecordingJob) -> None:
 
 
 def forget_scenario() -> None:
-    """Free the memory of the scenario that this thread keeps for its next part."""
-    _KEPT.made_ready.cache_clear()
+    """Free the memory of the scenario that this thread holds for its next part."""
+    _CACHE.scenario_and_rig.cache_clear()
 
 
-def _share_cores() -> None:
-    """Give OpenCV one thread in a worker process: each worker has one core, and OpenCV would start threads for all."""
+def _limit_opencv_threads() -> None:
+    """Give OpenCV one thread in a worker process.
+
+    Each worker has one core, and OpenCV would start threads for all cores.
+    """
     import cv2
 
     if multiprocessing.parent_process() is not None:
@@ -369,16 +421,19 @@ def _share_cores() -> None:
 
 @dataclass(frozen=True, slots=True)
 class _Task:
-    """Which scenario to make."""
+    """A scenario to make."""
 
     config: SynthConfig
     plan: ScenarioPlan = field(hash=False)
 
 
-def _made_ready(task: _Task) -> tuple[Scenario, Rig]:
-    """A scenario and its sensors."""
-    config, plan = task.config, task.plan
+def _scenario_and_rig(task: _Task) -> tuple[Scenario, Rig]:
+    """Make a scenario and its sensors."""
+    config = task.config
+    plan = task.plan
     scenario = build_scenario(config, plan)
+    # `sensors` is never True or False once the configuration is made.
+    sensors = cast(Sensors, config.sensors)
     rig = make_rig(
         scenario.world,
         scenario.actors,
@@ -386,7 +441,7 @@ def _made_ready(task: _Task) -> tuple[Scenario, Rig]:
         sky=(scenario.spec.weather, scenario.spec.time_of_day),
         image_size=config.pixels,
         seed=(config.seed, plan.pair, int(plan.accident)),
-        sensors=cast(Sensors, config.sensors),  # never True or False once the configuration is made
+        sensors=sensors,
         exact=config.exact,
         decimals=config.decimals,
         name=config.rig,
@@ -394,19 +449,22 @@ def _made_ready(task: _Task) -> tuple[Scenario, Rig]:
     return scenario, rig
 
 
-class _Kept(threading.local):
-    """Keeps a thread's last scenario for the next part of it. Threads share none: a rig remembers what it casts."""
+class _ScenarioCache(threading.local):
+    """A thread's last scenario, for the next part of it.
+
+    Threads share no scenario: a rig remembers the rays that it casts.
+    """
 
     def __init__(self) -> None:
-        self.made_ready = lru_cache(maxsize=1)(_made_ready)
+        self.scenario_and_rig = lru_cache(maxsize=1)(_scenario_and_rig)
 
 
-_KEPT = _Kept()
+_CACHE = _ScenarioCache()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Recorder:
-    """Writes the files of one scenario: those that need no sensor, and what the rig makes of the others."""
+    """Writer of the files of one scenario."""
 
     folder: ScenarioFolder
     scenario: Scenario
@@ -416,41 +474,41 @@ class _Recorder:
 
     def record(self, frame: int) -> None:
         """Write the files of all agents at one frame, counted from 1."""
-        time, rig = frame_timestamp(frame), self.rig
+        time = frame_timestamp(frame)
+        rig = self.rig
         if (self.scenario.frames - frame) % self.sensor_step:
             rig = replace(rig, clouds=False, studio=None)
         scene = rig.scene(time)
-        around = rig.surroundings(scene, self._signals(time))
+        surroundings = rig.surroundings(scene, self._signals(time))
+        folder = self.folder
         for agent in rig.agents:
             sighting = rig.sighting(scene, agent, frame)
-            write_calib(real_path(self.folder.calib_path(agent.name, frame)), sighting.calib)
+            write_calib(real_path(folder.calib_path(agent.name, frame)), sighting.calib)
             if self.labelled:
-                write_label(real_path(self.folder.label_path(agent.name, frame)), sighting.labels)
+                write_label(real_path(folder.label_path(agent.name, frame)), sighting.labels)
             if rig.clouds:
                 self._record_arrays(scene, sighting.points, agent, frame)
-            if around:
-                for channel, image in rig.images(scene, around, agent, frame):
-                    write_image(
-                        real_path(self.folder.channel_path(agent.name, channel, frame)), image
-                    )
+            if surroundings:
+                for channel, image in rig.images(scene, surroundings, agent, frame):
+                    image_path = folder.channel_path(agent.name, channel, frame)
+                    write_image(real_path(image_path), image)
 
     def _record_arrays(self, scene: Scene, points: Scan, agent: Agent, frame: int) -> None:
-        """Write the point cloud, and if all is recorded and labelled also the BEV array, whose instances are labels."""
-        place = real_path(self.folder.channel_path(agent.name, LIDAR, frame))
-        write_lidar(place, points.xyz, intensity(points, self.rig.air))
+        """Write the point cloud, and if all sensors are recorded and labelled also the BEV array.
+
+        The instances of the BEV array are labels.
+        """
+        cloud_path = real_path(self.folder.channel_path(agent.name, LIDAR, frame))
+        write_lidar(cloud_path, points.xyz, intensity(points, self.rig.air))
         if self.labelled and self.rig.studio:
             bev = self.rig.bev(scene, agent)
-            write_bev(
-                real_path(self.folder.channel_path(agent.name, BEV_CAMERA, frame)),
-                bev.semantic,
-                bev.instance,
-            )
+            bev_path = real_path(self.folder.channel_path(agent.name, BEV_CAMERA, frame))
+            write_bev(bev_path, bev.semantic, bev.instance)
 
     def _signals(self, time: float) -> Mapping[Arm, int]:
-        """Arm → the state of its traffic light."""
+        """Return the states of the traffic lights by arm."""
         signals = self.scenario.signals
         if signals is None:
             return {}
-        return {
-            head.arm: int(signals.state(head.arm, time)) for head in self.scenario.world.signals
-        }
+        heads = self.scenario.world.signals
+        return {head.arm: int(signals.state(head.arm, time)) for head in heads}

@@ -1,4 +1,7 @@
-"""The shapes of each category: solids inside its label box, x forward, origin on the road below the box's centre."""
+"""The shapes of each category: solids that fit into its label box.
+
+Their x axis points forward, their origin is on the road below the box's centre.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -6,20 +9,28 @@ from dataclasses import dataclass
 from deepaccident_devkit.plugins.synth import solids
 from deepaccident_devkit.plugins.synth.solids import FRONT, LEFT, REAR, RIGHT, Block, Color, Solids
 
-# Metres from the road to the bottom of every label box, so that no point of the ground lies in a box.
 BOX_CLEARANCE = 0.02
-# Metres between a label box and what it holds, so that rounding moves no point out of its box.
+"""Distance from the road to the bottom of every label box, so that no point of the ground lies in
+a box, metres."""
 INSET = 0.01
-
+"""Distance between a label box and its solids, so that rounding moves no point out of its box,
+metres."""
 TIRE: Color = (34, 34, 36)
 RIM: Color = (150, 152, 156)
-# The colour of headlamps.
 LAMP: Color = (250, 246, 215)
-# The colour of tail lamps.
+"""The colour of headlamps."""
 TAIL: Color = (190, 24, 24)
+"""The colour of tail lamps."""
 SKIN: Color = (214, 168, 138)
 DARK: Color = (48, 50, 56)
 PLATE: Color = (232, 232, 224)
+# Half the thickness of arms and legs.
+_HALF_LIMB_M = 0.045
+_UPRIGHT_FACES = (FRONT, REAR, LEFT, RIGHT)
+# The share of the label box's half width that the body of a car has; mirrors have the rest.
+_CAR_BODY_SHARE = 0.94
+# The same share for vans and trucks.
+_VAN_BODY_SHARE = 0.95
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,11 +38,11 @@ class _ShapeFrame:
     """The space that a shape may fill, and its two colours.
 
     Attributes:
-        x: half the length, metres.
-        y: half the width, metres.
-        top: the height above the road, metres.
-        color: the colour of paint or clothes.
-        accent: the second colour.
+        x: Half the length, metres.
+        y: Half the width, metres.
+        top: Height above the road, metres.
+        color: Colour of paint or clothes.
+        accent: Second colour.
     """
 
     x: float
@@ -42,18 +53,24 @@ class _ShapeFrame:
 
 
 def wheels(axles: tuple[float, ...], y: float, radius: float, width: float = 0.22) -> list[Block]:
-    """Wheels on both sides, whose outer faces are `y` metres from the middle."""
-    sides = ((y - width, y), (-y, -y + width))
-    return [
-        block for axle in axles for side in sides for block in wheel(axle, side, radius, main=False)
-    ]
+    """Make wheels on both sides, with outer faces `y` metres from the middle."""
+    blocks: list[Block] = []
+    for axle in axles:
+        for side in ((y - width, y), (-y, -y + width)):
+            blocks += wheel(axle, side, radius, main=False)
+    return blocks
 
 
 def wheel(
     axle: float, across: tuple[float, float], radius: float, *, main: bool
 ) -> tuple[Block, Block, Block]:
-    """A wheel of three blocks: two that give the tyre six corners, seen from the side, and a rim."""
-    middle, cut, rim = 0.03 + radius, 0.5 * radius, 0.52 * radius
+    """Make a wheel of three blocks: two for the tyre, and a rim.
+
+    Seen from the side, the tyre has six corners.
+    """
+    middle = 0.03 + radius
+    cut = 0.5 * radius
+    rim = 0.52 * radius
     upper = Block(
         (axle - radius, axle + radius),
         across,
@@ -70,13 +87,13 @@ def wheel(
         inset=(-cut, -cut, 0.0),
         main=main,
     )
-    beyond = (across[0] - 0.008, across[1] + 0.008)
-    hub = Block((axle - rim, axle + rim), beyond, (middle - rim, middle + rim), RIM, main=False)
+    rim_across = (across[0] - 0.008, across[1] + 0.008)
+    hub = Block((axle - rim, axle + rim), rim_across, (middle - rim, middle + rim), RIM, main=False)
     return upper, lower, hub
 
 
 def lamps(x: float, side: float, height: float, depth: float = 0.3) -> list[Block]:
-    """Two headlamps and two tail lamps, whose faces are `x` metres ahead of and behind the middle."""
+    """Make two headlamps and two tail lamps, `x` metres ahead of and behind the middle."""
     z = (height, height + 0.13)
     across = ((side - 0.45, side - 0.08), (-side + 0.08, -side + 0.45))
     front = [Block((x - depth, x), y, z, LAMP, main=False) for y in across]
@@ -85,7 +102,7 @@ def lamps(x: float, side: float, height: float, depth: float = 0.3) -> list[Bloc
 
 
 def plates(x: float, height: float) -> list[Block]:
-    """A number plate in front and one behind."""
+    """Make a number plate in front and one behind."""
     z = (height, height + 0.11)
     return [
         Block((x - 0.1, x), (-0.26, 0.26), z, PLATE, main=False),
@@ -94,7 +111,7 @@ def plates(x: float, height: float) -> list[Block]:
 
 
 def mirrors(x: float, body: float, y: float, height: float, color: Color) -> list[Block]:
-    """Mirrors between the body's side and `y` metres from the middle."""
+    """Make mirrors between the body's side and `y` metres from the middle."""
     z = (height, height + 0.14)
     sides = ((body - 0.02, y), (-y, -body + 0.02))
     return [
@@ -103,12 +120,8 @@ def mirrors(x: float, body: float, y: float, height: float, color: Color) -> lis
     ]
 
 
-# Half the thickness of arms and legs, metres.
-_LIMB = 0.045
-
-
 def motorcycle(frame: _ShapeFrame) -> list[Block]:
-    """A motorcycle and its rider, who sits upright."""
+    """Make a motorcycle and its rider, who sits upright."""
     x = frame.x
     return [
         *_two_wheels(x, 0.32, 0.07),
@@ -128,7 +141,7 @@ def motorcycle(frame: _ShapeFrame) -> list[Block]:
 
 
 def scooter(frame: _ShapeFrame) -> list[Block]:
-    """A scooter with a shield before its rider's knees."""
+    """Make a scooter with a shield before its rider's knees."""
     x = frame.x
     return [
         *_two_wheels(x, 0.26, 0.06),
@@ -148,7 +161,7 @@ def scooter(frame: _ShapeFrame) -> list[Block]:
 
 
 def cyclist(frame: _ShapeFrame) -> list[Block]:
-    """A bicycle and its rider, who leans forward."""
+    """Make a bicycle and its rider, who leans forward."""
     x = frame.x
     return [
         *_two_wheels(x, 0.33, 0.025),
@@ -176,13 +189,14 @@ def cyclist(frame: _ShapeFrame) -> list[Block]:
 
 
 def walker(frame: _ShapeFrame) -> list[Block]:
-    """A person in the middle of a long step, with swinging arms."""
-    return _person(frame, stride=frame.x - _LIMB)
+    """Make a person in the middle of a long step, with swinging arms."""
+    return _person(frame, stride=frame.x - _HALF_LIMB_M)
 
 
 def stroller(frame: _ShapeFrame) -> list[Block]:
-    """A person with a short step and a bag on the back."""
-    y, top = frame.y, frame.top
+    """Make a person with a short step and a bag on the back."""
+    y = frame.y
+    top = frame.top
     bag = Block(
         (-frame.x, -0.4 * frame.x),
         (-0.6 * y, 0.6 * y),
@@ -194,8 +208,12 @@ def stroller(frame: _ShapeFrame) -> list[Block]:
 
 
 def _person(frame: _ShapeFrame, stride: float) -> list[Block]:
-    y, top, color = frame.y, frame.top, frame.color
-    hip, neck = 0.48 * top, 0.85 * top
+    """Make a person with feet `stride` metres ahead of and behind the middle."""
+    y = frame.y
+    top = frame.top
+    color = frame.color
+    hip = 0.48 * top
+    neck = 0.85 * top
     reach = min(0.62 * frame.x, 0.12)
     return [
         _limb(stride, (0.015, 0.14), (0.03, hip), frame.accent),
@@ -218,9 +236,19 @@ def _person(frame: _ShapeFrame, stride: float) -> list[Block]:
 
 
 def _rider(frame: _ShapeFrame, seat: float, low: float, reach: float, helmet: Color) -> list[Block]:
-    """A rider at `seat`, `low` metres above the road, with hands `reach` metres ahead of the middle."""
-    top, side = frame.top, min(frame.y - 0.02, 0.24)
-    neck, lean = top - 0.27, min(0.22, 0.4 * (reach - seat))
+    """Make a rider.
+
+    Args:
+        frame: Space and colours.
+        seat: Position of the seat along x, metres.
+        low: Height of the seat above the road, metres.
+        reach: Position of the hands along x, metres.
+        helmet: Colour of the helmet.
+    """
+    top = frame.top
+    side = min(frame.y - 0.02, 0.24)
+    neck = top - 0.27
+    lean = min(0.22, 0.4 * (reach - seat))
     shoulder = seat + lean
     arms = ((side - 0.08, side), (-side, -side + 0.08))
     hand = 1.0 if neck > 1.1 else 0.9 * neck
@@ -261,45 +289,45 @@ def _rider(frame: _ShapeFrame, seat: float, low: float, reach: float, helmet: Co
 
 
 def _limb(end: float, y: tuple[float, float], z: tuple[float, float], color: Color) -> Block:
-    """An arm or a leg from the body's middle down to `end` metres ahead of it."""
-    return Block((end - _LIMB, end + _LIMB), y, z, color, inset=(end, -end, 0.0))
+    """Make an arm or a leg from the body's middle down to `end` metres ahead of it."""
+    x = (end - _HALF_LIMB_M, end + _HALF_LIMB_M)
+    return Block(x, y, z, color, inset=(end, -end, 0.0))
 
 
 def _two_wheels(x: float, radius: float, half_width: float) -> list[Block]:
+    """Make the front and the rear wheel of a two-wheeler of half length `x`, metres."""
     across = (-half_width, half_width)
-    return [
-        block
-        for axle in (x - radius, radius - x)
-        for block in wheel(axle, across, radius, main=True)
-    ]
+    front = wheel(x - radius, across, radius, main=True)
+    rear = wheel(radius - x, across, radius, main=True)
+    return [*front, *rear]
 
 
 def _fork(x: float, low: float, high: float) -> Block:
+    """Make a fork between two heights, metres."""
     return Block(
         (x - 0.03, x + 0.03), (-0.05, 0.05), (low, high), DARK, inset=(0.16, -0.16, 0.0), main=False
     )
 
 
 def _handlebar(x: float, y: float, height: float) -> Block:
-    return Block((x - 0.03, x + 0.03), (-y, y), (height - 0.03, height + 0.03), DARK, main=False)
-
-
-_ALL_AROUND = (FRONT, REAR, LEFT, RIGHT)
-# The share of the label box's half width that the body has; mirrors have the rest.
-_BODY = 0.94
+    """Make a handlebar of half width `y`, metres."""
+    along = (x - 0.03, x + 0.03)
+    z = (height - 0.03, height + 0.03)
+    return Block(along, (-y, y), z, DARK, main=False)
 
 
 @dataclass(frozen=True, slots=True)
-class _Line:
+class _CarProfile:
     """The side view of a car, in shares of its half length and of its height.
 
     Attributes:
-        waist: height of the windows' lower edge.
-        cabin: where the windows' lower edge begins and ends.
-        roof: where the roof begins and ends.
-        boot: where the boot's lid behind the cabin begins and ends; None if the cabin is the rear end of the car.
-        wheel: radius of the wheels, metres.
-        sill: height of the body's lower edge, metres.
+        waist: Height of the windows' lower edge.
+        cabin: Start and end of the windows' lower edge.
+        roof: Start and end of the roof.
+        boot: Start and end of the boot's lid behind the cabin; None if the cabin is the rear end of
+            the car.
+        wheel: Radius of the wheels, metres.
+        sill: Height of the body's lower edge, metres.
     """
 
     waist: float
@@ -310,24 +338,25 @@ class _Line:
     sill: float
 
 
-_SALOON = _Line(0.6, (-0.84, 0.45), (-0.6, 0.16), (-0.98, -0.76), 0.32, 0.2)
-_HATCHBACK = _Line(0.6, (-0.94, 0.5), (-0.74, 0.1), None, 0.31, 0.2)
-_OFF_ROADER = _Line(0.58, (-0.96, 0.44), (-0.86, 0.16), None, 0.36, 0.27)
+_SALOON = _CarProfile(0.6, (-0.84, 0.45), (-0.6, 0.16), (-0.98, -0.76), 0.32, 0.2)
+_HATCHBACK = _CarProfile(0.6, (-0.94, 0.5), (-0.74, 0.1), None, 0.31, 0.2)
+_OFF_ROADER = _CarProfile(0.58, (-0.96, 0.44), (-0.86, 0.16), None, 0.36, 0.27)
 
 
 def saloon(frame: _ShapeFrame) -> list[Block]:
-    """A car of three boxes: bonnet, cabin, boot."""
+    """Make a car of three boxes: bonnet, cabin, boot."""
     return _car(frame, _SALOON)
 
 
 def hatchback(frame: _ShapeFrame) -> list[Block]:
-    """A car of two boxes: bonnet, cabin."""
+    """Make a car of two boxes: bonnet, cabin."""
     return _car(frame, _HATCHBACK)
 
 
 def off_roader(frame: _ShapeFrame) -> list[Block]:
-    """A steep car of two boxes on large wheels, with rails on the roof."""
-    x, top = frame.x, frame.top
+    """Make a steep car of two boxes on large wheels, with rails on the roof."""
+    x = frame.x
+    top = frame.top
     rails = [
         Block((-0.7 * x, 0.05 * x), y, (top - 0.05, top), DARK, main=False)
         for y in ((0.5, 0.56), (-0.56, -0.5))
@@ -335,19 +364,23 @@ def off_roader(frame: _ShapeFrame) -> list[Block]:
     return [*_car(frame, _OFF_ROADER), *rails]
 
 
-def _car(frame: _ShapeFrame, line: _Line) -> list[Block]:
-    x, body, top, color = frame.x, _BODY * frame.y, frame.top, frame.color
-    waist, roof = line.waist * top, top - 0.05
-    between = waist + 0.6 * (roof - waist)
-    (rear, front), (roof_rear, roof_front) = (
-        (share * x for share in span) for span in (line.cabin, line.roof)
-    )
+def _car(frame: _ShapeFrame, profile: _CarProfile) -> list[Block]:
+    """Make a car with a side view."""
+    x = frame.x
+    body = _CAR_BODY_SHARE * frame.y
+    top = frame.top
+    color = frame.color
+    waist = profile.waist * top
+    roof = top - 0.05
+    middle = waist + 0.6 * (roof - waist)
+    rear, front = (share * x for share in profile.cabin)
+    roof_rear, roof_front = (share * x for share in profile.roof)
     upper = 0.6
     blocks = [
         Block(
             (-x + 0.06, x - 0.06),
             (-body + 0.05, body - 0.05),
-            (line.sill, 0.42),
+            (profile.sill, 0.42),
             color,
             inset=(-0.05, -0.05, -0.05),
         ),
@@ -355,17 +388,17 @@ def _car(frame: _ShapeFrame, line: _Line) -> list[Block]:
         Block(
             (rear, front),
             (-body + 0.08, body - 0.08),
-            (waist, between),
+            (waist, middle),
             color,
-            glass=_ALL_AROUND,
+            glass=_UPRIGHT_FACES,
             inset=(upper * (front - roof_front), upper * (roof_rear - rear), 0.09),
         ),
         Block(
             (rear + upper * (roof_rear - rear), front - upper * (front - roof_front)),
             (-body + 0.17, body - 0.17),
-            (between, roof),
+            (middle, roof),
             color,
-            glass=_ALL_AROUND,
+            glass=_UPRIGHT_FACES,
             inset=((1 - upper) * (front - roof_front), (1 - upper) * (roof_rear - rear), 0.1),
         ),
         Block(
@@ -385,12 +418,12 @@ def _car(frame: _ShapeFrame, line: _Line) -> list[Block]:
         Block((x - 0.1, x - 0.01), (-0.5 * body, 0.5 * body), (0.27, 0.39), DARK, main=False),
         *_pillars(0.5 * (roof_rear + roof_front), body - 0.09, waist, roof, frame),
         *mirrors(0.72 * front, body - 0.06, frame.y, waist + 0.02, color),
-        *wheels((0.62 * x, -0.6 * x), body, line.wheel),
+        *wheels((0.62 * x, -0.6 * x), body, profile.wheel),
         *lamps(x - 0.02, body, 0.72 * waist),
         *plates(x, 0.45),
     ]
-    if line.boot:
-        lid = (line.boot[0] * x, line.boot[1] * x)
+    if profile.boot:
+        lid = (profile.boot[0] * x, profile.boot[1] * x)
         blocks.append(
             Block(
                 lid, (-body + 0.1, body - 0.1), (waist, waist + 0.06), color, inset=(0, 0.08, 0.08)
@@ -400,7 +433,7 @@ def _car(frame: _ShapeFrame, line: _Line) -> list[Block]:
 
 
 def _pillars(x: float, side: float, waist: float, roof: float, frame: _ShapeFrame) -> list[Block]:
-    """An upright post between the side windows, left and right."""
+    """Make an upright post between the side windows, left and right."""
     outer = ((side - 0.04, side + 0.005), (-side - 0.005, -side + 0.04))
     return [
         Block((x - 0.05, x + 0.05), across, (waist, roof), frame.color, main=False)
@@ -408,31 +441,33 @@ def _pillars(x: float, side: float, waist: float, roof: float, frame: _ShapeFram
     ]
 
 
-# The same share for vans and trucks.
-_VAN_BODY = 0.95
-
-
 def delivery_van(frame: _ShapeFrame) -> list[Block]:
-    """A van with windows only in front."""
+    """Make a van with windows only in front."""
     return _van(frame, panes=((0.14, 0.4),))
 
 
 def minibus(frame: _ShapeFrame) -> list[Block]:
-    """A van with windows along its whole length."""
-    return _van(frame, panes=((0.14, 0.4), (-0.4, 0.06), (-0.88, -0.48)))
+    """Make a van with windows along its full length."""
+    panes = ((0.14, 0.4), (-0.4, 0.06), (-0.88, -0.48))
+    return _van(frame, panes=panes)
 
 
 def box_truck(frame: _ShapeFrame) -> list[Block]:
-    """A cab and a large box."""
-    x, y, top = frame.x, _VAN_BODY * frame.y, frame.top
+    """Make a cab and a large box."""
+    x = frame.x
+    y = _VAN_BODY_SHARE * frame.y
+    top = frame.top
     box = Block((-x, 0.52 * x), (-y, y), (0.95, top), frame.accent, inset=(0.02, 0.02, 0.02))
     return [*_chassis(frame, 0.76 * top), box]
 
 
 def tank_truck(frame: _ShapeFrame) -> list[Block]:
-    """A cab and a tank with eight sides."""
-    x, y, top = frame.x, _VAN_BODY * frame.y, 0.82 * frame.top
-    low, high = 0.95 + 0.28 * (top - 0.95), top - 0.28 * (top - 0.95)
+    """Make a cab and a tank with eight sides."""
+    x = frame.x
+    y = _VAN_BODY_SHARE * frame.y
+    top = 0.82 * frame.top
+    low = 0.95 + 0.28 * (top - 0.95)
+    high = top - 0.28 * (top - 0.95)
     along, narrow = (-x, 0.5 * x), 0.4 * y
     return [
         *_chassis(frame, 0.74 * frame.top),
@@ -446,7 +481,11 @@ def tank_truck(frame: _ShapeFrame) -> list[Block]:
 
 
 def _van(frame: _ShapeFrame, panes: tuple[tuple[float, float], ...]) -> list[Block]:
-    x, y, top, color = frame.x, _VAN_BODY * frame.y, frame.top, frame.color
+    """Make a van; `panes` are start and end of its side windows, in shares of its half length."""
+    x = frame.x
+    y = _VAN_BODY_SHARE * frame.y
+    top = frame.top
+    color = frame.color
     waist = 0.52 * top
     sides = ((y - 0.12, y - 0.045), (0.045 - y, 0.12 - y))
     return [
@@ -499,8 +538,9 @@ def _van(frame: _ShapeFrame, panes: tuple[tuple[float, float], ...]) -> list[Blo
 
 
 def _chassis(frame: _ShapeFrame, cab_top: float) -> list[Block]:
-    """Frame, wheels and cab of a truck."""
-    x, y = frame.x, _VAN_BODY * frame.y
+    """Make frame, wheels and cab of a truck."""
+    x = frame.x
+    y = _VAN_BODY_SHARE * frame.y
     middle = 0.45 * cab_top + 0.35
     cab = (0.56 * x, x - 0.02)
     return [
@@ -528,7 +568,6 @@ def _chassis(frame: _ShapeFrame, cab_top: float) -> list[Block]:
     ]
 
 
-# Category → the functions that build its models.
 MODELS: dict[str, tuple[Callable[[_ShapeFrame], list[Block]], ...]] = {
     "car": (saloon, hatchback, off_roader),
     "van": (delivery_van, minibus),
@@ -537,18 +576,25 @@ MODELS: dict[str, tuple[Callable[[_ShapeFrame], list[Block]], ...]] = {
     "cyclist": (cyclist,),
     "pedestrian": (walker, stroller),
 }
+"""Functions that build the models of each category."""
 
 
 def shape_of(
     category: str, size: tuple[float, float, float], color: Color, accent: Color, model: int = 0
 ) -> Solids:
-    """The solids of a road user with a label box of length, width and height, metres, and two colours.
+    """Build the solids of a road user.
 
-    The model is one of the category's `MODELS`; after the last one, the first follows.
+    Args:
+        category: One of `taxonomy.CATEGORIES`.
+        size: Length, width and height of the label box, metres.
+        color: Colour of paint or clothes.
+        accent: Second colour.
+        model: Index into the category's `MODELS`; after the last one, the first follows.
     """
     length, width, height = size
     frame = _ShapeFrame(
         length / 2 - INSET, width / 2 - INSET, BOX_CLEARANCE + height - INSET, color, accent
     )
     models = MODELS[category]
-    return solids.build(models[model % len(models)](frame))
+    make_blocks = models[model % len(models)]
+    return solids.build(make_blocks(frame))

@@ -1,4 +1,4 @@
-"""Roads: junctions with lanes, smooth paths, sidewalks, and a raster of the ground with its height."""
+"""Roads: junctions with lanes, smooth paths, sidewalks, and a raster of the ground."""
 
 from deepaccident_devkit.plugins.synth.roads.junction import (
     FIRST_BUILDING,

@@ -1,4 +1,4 @@
-"""Smooth paths to drive or walk on, as dense samples: how they bend, and where two of them meet.
+"""Smooth paths to drive or walk on, as dense samples, and the points where two of them meet.
 
 A turn by a right angle is a clothoid, an arc and a clothoid, all of the same length.
 """
@@ -20,21 +20,27 @@ from deepaccident_devkit.support.arrays import (
     readonly,
 )
 
-# The largest distance between samples, metres.
 SPACING = 0.1
-# The search for the nearest sample looks first at one of so many samples.
-_COARSE = 10
-# The comparison of two paths looks first at one of so many samples.
+"""The largest distance between samples, metres."""
+# The search for the nearest sample starts with every nth sample.
+_COARSE_STEP = 10
+# The comparison of two paths starts with every nth sample.
 _STRIDE = 4
-# Metres: paths that stay nearer than this join.
-_MEETING = 0.5
+# Paths that stay nearer than this join.
+_JOINING_DISTANCE_M = 0.5
 # The smallest factor by which steps are shorter on the inner side of a path's bends.
-_LEAST_SHRINK = 0.2
-_GAUSS = np.polynomial.legendre.leggauss(3)
+_MIN_SHRINK_FACTOR = 0.2
+_GAUSS_POINTS = np.polynomial.legendre.leggauss(3)
+# The angle that the arc of a turn turns, radians; the two clothoids together turn as much.
+_ARC_ANGLE = np.pi / 4
+# The radius at which the shape of a turn is measured, finely sampled.
+_REFERENCE_RADIUS_M = 100.0
+Piece = tuple[float, float, float]
+"""A piece for `bent`: length, curvature at the start and at the end."""
 
 
 class Meeting(NamedTuple):
-    """Where two paths first meet: distances along each, metres."""
+    """The point where two paths first meet, as distances along each, metres."""
 
     s_a: float
     s_b: float
@@ -42,13 +48,15 @@ class Meeting(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Path(FrozenArrays):
-    """N samples of a path in the ground frame, with equal distances of at most `SPACING`; arrays are read-only.
+    """N samples of a path in the ground frame; arrays are read-only.
+
+    Samples have equal distances of at most `SPACING`.
 
     Attributes:
-        xy: (N, 2) float64, metres.
-        yaw: (N,) float64, direction of travel, radians; without jumps of 2π.
-        curvature: (N,) float64, 1/m, positive to the left.
-        s: (N,) float64, metres along the path, from 0.
+        xy: Positions, shape (N, 2), float64, metres.
+        yaw: Directions of travel, shape (N,), float64, radians; without jumps of 2π.
+        curvature: Curvatures, shape (N,), float64, 1/m, positive to the left.
+        s: Distances along the path, shape (N,), float64, metres, from 0.
     """
 
     xy: FloatArray
@@ -61,50 +69,65 @@ class Path(FrozenArrays):
         xy = checked("Path.xy", self.xy, (None, 2))
         if len(xy) < 2:
             raise GeometryError(
-                f"Path.xy: expected two samples or more, found {len(xy)}; sample the path more densely"
+                f"Path.xy: expected two samples or more, found {len(xy)}; "
+                "sample the path more densely"
             )
         object.__setattr__(self, "xy", readonly(xy))
         for name in ("yaw", "curvature", "s"):
-            object.__setattr__(
-                self, name, readonly(checked(f"Path.{name}", getattr(self, name), (len(xy),)))
-            )
+            column = checked(f"Path.{name}", getattr(self, name), (len(xy),))
+            object.__setattr__(self, name, readonly(column))
 
     @property
     def length(self) -> float:
-        """Metres."""
+        """Length of the path, metres."""
         return float(self.s[-1])
 
     def at(self, s: ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """x, y (metres), yaw (radians), curvature (1/m) at distances along the path, each of the shape of `s`.
+        """Return the path at distances along it.
 
         Before its start and beyond its end the path goes straight on.
+
+        Args:
+            s: Distances along the path, metres.
+
+        Returns:
+            x, y (metres), yaw (radians), curvature (1/m), each of the shape of `s`.
         """
-        wanted = np.asarray(s, dtype=np.float64)
-        inside = np.clip(wanted, 0.0, self.length)
-        beyond = wanted - inside
-        yaw = np.interp(inside, self.s, self.yaw)
-        x = np.interp(inside, self.s, self.xy[:, 0]) + np.cos(yaw) * beyond
-        y = np.interp(inside, self.s, self.xy[:, 1]) + np.sin(yaw) * beyond
-        curvature = np.where(beyond == 0, np.interp(inside, self.s, self.curvature), 0.0)
+        distances = np.asarray(s, dtype=np.float64)
+        on_path = np.clip(distances, 0.0, self.length)
+        beyond = distances - on_path
+        yaw = np.interp(on_path, self.s, self.yaw)
+        x = np.interp(on_path, self.s, self.xy[:, 0]) + np.cos(yaw) * beyond
+        y = np.interp(on_path, self.s, self.xy[:, 1]) + np.sin(yaw) * beyond
+        curvature = np.where(beyond == 0, np.interp(on_path, self.s, self.curvature), 0.0)
         return x, y, yaw, curvature
 
     def project(self, xy: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """The nearest places on the path to points (N, 2): distance along it and to its left, (N,) metres each.
+        """Project points (N, 2), metres, onto the path.
 
         For points beyond its ends the path goes straight on.
+
+        Returns:
+            Distances along the path and to its left, shape (N,) each, metres.
         """
         points = np.atleast_2d(np.asarray(xy, dtype=np.float64))
         sample = self._nearest(points)
-        delta, curvature = points - self.xy[sample], self.curvature[sample]
-        cos, sin = np.cos(self.yaw[sample]), np.sin(self.yaw[sample])
-        ahead, left = cos * delta[:, 0] + sin * delta[:, 1], cos * delta[:, 1] - sin * delta[:, 0]
-        beyond = ((sample == 0) & (ahead < 0)) | ((sample == len(self.s) - 1) & (ahead > 0))
-        bend = np.where(beyond, 0.0, curvature)
-        left = left - bend * ahead**2 / 2
-        return self.s[sample] + ahead / np.maximum(1 - bend * left, _LEAST_SHRINK), left
+        delta = points - self.xy[sample]
+        cos = np.cos(self.yaw[sample])
+        sin = np.sin(self.yaw[sample])
+        dx = delta[:, 0]
+        dy = delta[:, 1]
+        ahead = cos * dx + sin * dy
+        lateral = cos * dy - sin * dx
+        before_start = (sample == 0) & (ahead < 0)
+        after_end = (sample == len(self.s) - 1) & (ahead > 0)
+        bend = np.where(before_start | after_end, 0.0, self.curvature[sample])
+        lateral = lateral - bend * ahead**2 / 2
+        shrink_factor = np.maximum(1 - bend * lateral, _MIN_SHRINK_FACTOR)
+        return self.s[sample] + ahead / shrink_factor, lateral
 
     def reversed(self) -> "Path":
-        """The same path in the other direction."""
+        """Return the same path in the other direction."""
         return Path(
             xy=self.xy[::-1],
             yaw=self.yaw[::-1] + np.pi,
@@ -113,60 +136,82 @@ class Path(FrozenArrays):
         )
 
     def _nearest(self, points: FloatArray) -> IntArray:
-        """Index (N,) of the sample nearest to each point: first the nearest of a few, then the nearest around it."""
-        around = _COARSE * _squares(points, self.xy[::_COARSE]).argmin(axis=1)
-        window = np.clip(around[:, None] + np.arange(-_COARSE, _COARSE + 1), 0, len(self.xy) - 1)
-        best = ((points[:, None] - self.xy[window]) ** 2).sum(axis=2).argmin(axis=1)
-        return np.asarray(window[np.arange(len(points)), best])
+        """Return the index (N,) of the sample nearest to each point.
+
+        It is first sought among a few samples, then around the nearest of them.
+        """
+        coarse_distances = _squares(points, self.xy[::_COARSE_STEP])
+        middle = _COARSE_STEP * coarse_distances.argmin(axis=1)
+        offsets = np.arange(-_COARSE_STEP, _COARSE_STEP + 1)
+        window = np.clip(middle[:, None] + offsets, 0, len(self.xy) - 1)
+        distances = ((points[:, None] - self.xy[window]) ** 2).sum(axis=2)
+        return np.asarray(window[np.arange(len(points)), distances.argmin(axis=1)])
 
 
-def crossing(path_a: Path, path_b: Path, *, within: float = _MEETING) -> Meeting | None:
-    """Where two paths first meet; None if they never meet.
+def crossing(path_a: Path, path_b: Path, *, within: float = _JOINING_DISTANCE_M) -> Meeting | None:
+    """Find the point where two paths first meet.
 
-    Paths that cross meet at their common point. Paths that join meet where their distance becomes less than `within`,
-    metres.
+    Paths that cross meet at their common point. Paths that join meet where their distance becomes
+    less than `within`, metres.
+
+    Returns:
+        None if they never meet.
     """
-    s_a = _first_near(path_a, path_b, within)
-    s_b = _first_near(path_b, path_a, within)
+    s_a = _first_meeting(path_a, path_b, within)
+    s_b = _first_meeting(path_b, path_a, within)
     return None if s_a is None or s_b is None else Meeting(s_a, s_b)
 
 
 def straight(start: tuple[float, float], yaw: float, length: float) -> Path:
-    """A straight path from a point, metres and radians."""
+    """Return a straight path from a point, metres and radians."""
     return bent(start, yaw, [(length, 0.0, 0.0)])
 
 
-def bent(start: tuple[float, float], yaw: float, pieces: list[tuple[float, float, float]]) -> Path:
-    """A path of pieces, each with a length (metres) and the curvature (1/m) at its start and at its end.
+def bent(start: tuple[float, float], yaw: float, pieces: list[Piece]) -> Path:
+    """Return a path of pieces: lines, arcs and clothoids.
 
-    The curvature changes evenly along each piece: lines, arcs and clothoids. Position and yaw have no jumps.
+    The curvature changes evenly along each piece. Position and yaw have no jumps.
+
+    Args:
+        start: x and y of the start, metres.
+        yaw: Direction at the start, radians.
+        pieces: Length (metres) and the curvature (1/m) at the start and at the end of each piece.
     """
     lengths = np.array([piece[0] for piece in pieces])
+    start_curvature = np.array([piece[1] for piece in pieces])
+    end_curvature = np.array([piece[2] for piece in pieces])
     joints = np.concatenate([[0.0], np.cumsum(lengths)])
     s = even_steps(joints[-1])
-    start_curvature, end_curvature = (np.array([piece[k] for piece in pieces]) for k in (1, 2))
     slope = (end_curvature - start_curvature) / lengths
-    turned = np.concatenate([[0.0], np.cumsum(lengths * (start_curvature + end_curvature) / 2)])
+    turns = lengths * (start_curvature + end_curvature) / 2
+    turned = np.concatenate([[0.0], np.cumsum(turns)])
 
-    def bend(at: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def yaw_and_curvature(at: FloatArray) -> tuple[FloatArray, FloatArray]:
         piece = np.clip(np.searchsorted(joints, at, side="right") - 1, 0, len(pieces) - 1)
         into = at - joints[piece]
         curvature = start_curvature[piece] + slope[piece] * into
-        return yaw + turned[piece] + into * (start_curvature[piece] + curvature) / 2, curvature
+        turn = turned[piece]
+        return yaw + turn + into * (start_curvature[piece] + curvature) / 2, curvature
 
-    nodes, weights = _GAUSS
+    nodes, weights = _GAUSS_POINTS
     step = s[1] - s[0]
-    middle_yaw, _ = bend(s[:-1, None] + step * (nodes + 1) / 2)
-    moves = (
-        np.stack([np.cos(middle_yaw) @ weights, np.sin(middle_yaw) @ weights], axis=1) * step / 2
-    )
+    node_yaw, _ = yaw_and_curvature(s[:-1, None] + step * (nodes + 1) / 2)
+    mean_directions = np.stack([np.cos(node_yaw) @ weights, np.sin(node_yaw) @ weights], axis=1)
+    moves = mean_directions * step / 2
     xy = np.array(start) + np.concatenate([np.zeros((1, 2)), np.cumsum(moves, axis=0)])
-    at_yaw, curvature = bend(s)
-    return Path(xy=xy, yaw=at_yaw, curvature=curvature, s=s)
+    sample_yaw, curvature = yaw_and_curvature(s)
+    return Path(xy=xy, yaw=sample_yaw, curvature=curvature, s=s)
 
 
 def lane_change(path: Path, start: float, length: float, offset: float) -> Path:
-    """The path shifted sideways by `offset` (metres, positive to the left) from `start + length` on, without jumps."""
+    """Return a path that is shifted sideways from `start + length` on, without jumps.
+
+    Args:
+        path: The path before the change.
+        start: Distance along it at which the change begins, metres.
+        length: Length of the change, metres.
+        offset: Sideways shift, metres, positive to the left.
+    """
     share = np.clip((path.s - start) / length, 0.0, 1.0)
     shift = offset * share**3 * (10 - 15 * share + 6 * share**2)
     left = np.column_stack([-np.sin(path.yaw), np.cos(path.yaw)])
@@ -174,95 +219,111 @@ def lane_change(path: Path, start: float, length: float, offset: float) -> Path:
 
 
 def through(points: ArrayLike) -> Path:
-    """A path through dense points (N, 2), metres; they must be smooth: yaw and curvature are their differences."""
-    raw = checked("points", points, (None, 2))
-    if len(raw) < 3:
+    """Return a path through dense points (N, 2), metres.
+
+    The points must be smooth: yaw and curvature are their differences.
+    """
+    xy = checked("points", points, (None, 2))
+    if len(xy) < 3:
         raise GeometryError(
-            f"points: expected three points or more, found {len(raw)}; sample the way more densely"
+            f"points: expected three points or more, found {len(xy)}; sample the way more densely"
         )
-    along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(raw, axis=0).T))])
-    direction = np.gradient(raw, along, axis=0, edge_order=2)
+    step_lengths = np.hypot(*np.diff(xy, axis=0).T)
+    along = np.concatenate([[0.0], np.cumsum(step_lengths)])
+    direction = np.gradient(xy, along, axis=0, edge_order=2)
     yaw = np.unwrap(np.arctan2(direction[:, 1], direction[:, 0]))
-    columns = (raw[:, 0], raw[:, 1], yaw, np.gradient(yaw, along, edge_order=2))
+    curvature = np.gradient(yaw, along, edge_order=2)
     s = even_steps(along[-1])
-    x, y, at_yaw, curvature = (np.interp(s, along, column) for column in columns)
-    return Path(xy=np.column_stack([x, y]), yaw=at_yaw, curvature=curvature, s=s)
+    columns = (xy[:, 0], xy[:, 1], yaw, curvature)
+    x, y, yaw, curvature = (np.interp(s, along, column) for column in columns)
+    return Path(xy=np.column_stack([x, y]), yaw=yaw, curvature=curvature, s=s)
 
 
 def even_steps(length: float) -> FloatArray:
-    """Distances from 0 to `length` (metres), in equal steps of at most `SPACING`."""
-    return np.linspace(0.0, length, max(int(np.ceil(length / SPACING - 1e-9)), 1) + 1)
+    """Return distances from 0 to `length` (metres), in equal steps of at most `SPACING`."""
+    num_steps = int(np.ceil(length / SPACING - 1e-9))
+    return np.linspace(0.0, length, max(num_steps, 1) + 1)
 
 
-def _first_near(path: Path, other: Path, within: float) -> float | None:
-    """Where `path` first meets `other`: their common point if they part again, if not, where `path` comes near."""
-    some = np.append(np.arange(0, len(path.s) - 1, _STRIDE), len(path.s) - 1)
-    rows = some[_near(path.xy[some], other, within)]
-    if not len(rows):
+def _first_meeting(path: Path, other: Path, within: float) -> float | None:
+    """Find where `path` first meets `other`, metres along it.
+
+    Returns:
+        Their common point if they part again, otherwise the point where `path` comes near; None if
+        they never meet.
+    """
+    last_row = len(path.s) - 1
+    coarse_rows = np.append(np.arange(0, last_row, _STRIDE), last_row)
+    near_rows = coarse_rows[_near(path.xy[coarse_rows], other, within)]
+    if not len(near_rows):
         return None
-    gaps = np.flatnonzero(np.diff(rows) > _STRIDE)
-    first, last = int(rows[0]), int(rows[gaps[0]] if len(gaps) else rows[-1])
-    around = np.arange(max(first - _STRIDE, 0), min(last + _STRIDE, len(path.s) - 1) + 1)
-    if last == len(path.s) - 1:
-        around = around[: 2 * _STRIDE + 1]
-        return float(path.s[around[_near(path.xy[around], other, within)][0]])
-    _, left = other.project(path.xy[around])
-    change = np.flatnonzero(left[:-1] * left[1:] < 0)
-    if not len(change):
-        return float(path.s[around[np.abs(left).argmin()]])
-    before = int(change[0])
-    share = left[before] / (left[before] - left[before + 1])
-    return float(path.s[around[before]] + share * (path.s[1] - path.s[0]))
+    gaps = np.flatnonzero(np.diff(near_rows) > _STRIDE)
+    begin = int(near_rows[0])
+    end = int(near_rows[gaps[0]] if len(gaps) else near_rows[-1])
+    window = np.arange(max(begin - _STRIDE, 0), min(end + _STRIDE, last_row) + 1)
+    if end == last_row:
+        window = window[: 2 * _STRIDE + 1]
+        is_near = _near(path.xy[window], other, within)
+        return float(path.s[window[is_near][0]])
+    _, lateral = other.project(path.xy[window])
+    sign_changes = np.flatnonzero(lateral[:-1] * lateral[1:] < 0)
+    if not len(sign_changes):
+        return float(path.s[window[np.abs(lateral).argmin()]])
+    before = int(sign_changes[0])
+    share = lateral[before] / (lateral[before] - lateral[before + 1])
+    return float(path.s[window[before]] + share * (path.s[1] - path.s[0]))
 
 
 def _near(points: FloatArray, path: Path, within: float) -> BoolArray:
-    """Which of the points (N, 2) are nearer to the path than `within`."""
-    reach = within + _COARSE * SPACING
-    near = np.asarray(_squares(points, path.xy[::_COARSE]).min(axis=1) < reach**2)
-    near[near] = np.abs(path.project(points[near])[1]) <= within
-    return near
+    """Mark the points (N, 2) that are nearer to the path than `within`, metres."""
+    reach = within + _COARSE_STEP * SPACING
+    coarse_distances = _squares(points, path.xy[::_COARSE_STEP])
+    mask = np.asarray(coarse_distances.min(axis=1) < reach**2)
+    _, lateral = path.project(points[mask])
+    mask[mask] = np.abs(lateral) <= within
+    return mask
 
 
 def _squares(points: FloatArray, others: FloatArray) -> FloatArray:
-    """Squared distances (N, M) from each of the points (N, 2) to each of the others (M, 2)."""
-    return np.asarray(
-        (points[:, None, 0] - others[:, 0]) ** 2 + (points[:, None, 1] - others[:, 1]) ** 2
-    )
-
-
-# The angle that the arc turns, radians; the two clothoids together turn as much.
-_ANGLE = np.pi / 4
-# Metres: the radius at which the shape is measured, finely sampled.
-_REFERENCE = 100.0
-
-# A piece for `bent`: length, curvature at the start and at the end.
-Piece = tuple[float, float, float]
+    """Return squared distances (N, M) from points (N, 2) to other points (M, 2)."""
+    x_offsets = points[:, None, 0] - others[:, 0]
+    y_offsets = points[:, None, 1] - others[:, 1]
+    return np.asarray(x_offsets**2 + y_offsets**2)
 
 
 def quarter_turn(tangent: float, *, left: bool) -> list[Piece]:
-    """Pieces that turn by a right angle, over `tangent` metres before and after where the two lines cross."""
-    return _pieces(tangent / _shape()[0], 1.0 if left else -1.0)
+    """Return pieces that turn by a right angle.
+
+    The turn takes `tangent` metres before and after the crossing of the two lines.
+    """
+    unit_tangent, _ = _unit_turn()
+    return _pieces(tangent / unit_tangent, 1.0 if left else -1.0)
 
 
 def tangent_of_radius(radius: float) -> float:
-    """The tangent of a turn whose arc has a radius, metres."""
-    return radius * _shape()[0]
+    """Return the tangent of a turn by the radius of its arc, metres."""
+    unit_tangent, _ = _unit_turn()
+    return radius * unit_tangent
 
 
 def tangent_of_corner(distance: float) -> float:
-    """The tangent of a turn whose middle passes the crossing of the lines at a distance, metres."""
-    tangent, corner = _shape()
-    return distance * tangent / corner
+    """Return the tangent of a turn with its middle at a distance from the crossing of the lines."""
+    unit_tangent, unit_distance = _unit_turn()
+    return distance * unit_tangent / unit_distance
 
 
 def _pieces(radius: float, sign: float) -> list[Piece]:
-    length, curvature = _ANGLE * radius, sign / radius
+    """Return the pieces of a turn; the sign is positive to the left."""
+    length = _ARC_ANGLE * radius
+    curvature = sign / radius
     return [(length, 0.0, curvature), (length, curvature, curvature), (length, curvature, 0.0)]
 
 
 @lru_cache(maxsize=1)
-def _shape() -> tuple[float, float]:
-    """The tangent, and the distance from the lines' crossing to the turn, at radius 1."""
-    xy = bent((0.0, 0.0), 0.0, _pieces(_REFERENCE, 1.0)).xy / _REFERENCE
+def _unit_turn() -> tuple[float, float]:
+    """Return the tangent, and the distance from the lines' crossing to the turn, at radius 1."""
+    turn = bent((0.0, 0.0), 0.0, _pieces(_REFERENCE_RADIUS_M, 1.0))
+    xy = turn.xy / _REFERENCE_RADIUS_M
     tangent = float(xy[-1, 0])
-    return tangent, float(np.hypot(xy[:, 0] - tangent, xy[:, 1]).min())
+    distances = np.hypot(xy[:, 0] - tangent, xy[:, 1])
+    return tangent, float(distances.min())

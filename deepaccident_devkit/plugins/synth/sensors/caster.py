@@ -1,4 +1,4 @@
-"""Casting rays against solids and the ground: with Embree if it is installed, if not with numpy."""
+"""Casting rays against solids and the ground: with Embree if it is installed, otherwise numpy."""
 
 import importlib.util
 from functools import lru_cache
@@ -12,19 +12,22 @@ from deepaccident_devkit.plugins.synth.roads import Terrain
 from deepaccident_devkit.plugins.synth.solids import FACES, FACES_A_SOLID, face_corners, face_planes
 from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray, IntArray
 
-# Stands for the face if a ray hits nothing.
-NOTHING = -1
-# Stands for the face if a ray hits the ground.
+NO_HIT = -1
+"""The face of a ray that hits nothing."""
 GROUND = -2
-_FAR = 1e30
+"""The face of a ray that hits the ground."""
+# Larger than any distance, in lengths of a ray.
+_MAX_DISTANCE = 1e30
 _CORNERS_A_SOLID = 8
 # Corners of a face that make its two triangles.
-_HALVES = [[0, 1, 2], [0, 2, 3]]
-_PARALLEL = 1e-12
+_TRIANGLES_OF_FACE = [[0, 1, 2], [0, 2, 3]]
+_PARALLEL_TOLERANCE = 1e-12
 _ROUNDING = 1e-9
-_SOLIDS_AT_ONCE = 64
-# Steps along a ray over a terrain: their length in metres, their number, and how often the last one is halved.
-_MARCH, _MARCHES, _HALVINGS = 0.7, 250, 12
+_SOLIDS_A_BLOCK = 64
+# Steps along a ray over a terrain: their length, their number, and how often the last is halved.
+_MARCH_STEP_M = 0.7
+_NUM_MARCH_STEPS = 250
+_NUM_HALVINGS = 12
 
 
 class Caster(Protocol):
@@ -33,22 +36,35 @@ class Caster(Protocol):
     def cast(
         self, origin: FloatArray, directions: AnyArray, reach: AnyArray | None = None
     ) -> tuple[AnyArray, AnyArray]:
-        """The first face that each of N rays hits, from an origin (3,), metres, or (N, 3), up to their `reach`.
+        """Find the first face that each of N rays hits.
 
-        Returns (N,) distances in lengths of the direction (of any length, as `reach`), in single precision, infinite
-        where nothing is hit; and (N,) the faces, six for each solid in the order of `solids.FACES`, or `GROUND` or
-        `NOTHING`.
+        Args:
+            origin: Origin of the rays, shape (3,) or (N, 3), metres.
+            directions: Directions of any length, shape (N, 3).
+            reach: Largest distances, shape (N,), in lengths of the direction; None for no limit.
+
+        Returns:
+            Distances (N,) in lengths of the direction, in single precision, infinite where nothing
+            is hit; and the faces (N,), six for each solid in the order of `solids.FACES`, or
+            `GROUND` or `NO_HIT`.
         """
         ...
 
 
 def make_caster(corners: FloatArray, terrain: Terrain | None = None) -> Caster:
-    """The fastest installed caster, for solids (P, 8, 3), metres, and the ground, if `terrain` is given."""
-    return EmbreeCaster(corners, terrain) if has_embree() else NumpyCaster(corners, terrain)
+    """Make the fastest installed caster.
+
+    Args:
+        corners: Corners of the solids, shape (P, 8, 3), metres.
+        terrain: Shape of the ground; None for rays that do not hit the ground.
+    """
+    if has_embree():
+        return EmbreeCaster(corners, terrain)
+    return NumpyCaster(corners, terrain)
 
 
 def has_embree() -> bool:
-    """Whether the extra `synth` is installed."""
+    """Return whether the extra `synth` is installed."""
     return importlib.util.find_spec("embreex") is not None
 
 
@@ -56,7 +72,8 @@ def require_embree() -> None:
     """Raise MissingExtraError if images and point clouds cannot be made."""
     if not has_embree():
         raise MissingExtraError(
-            "images and point clouds need the package embreex (in a checkout, pip install '.[synth]'), "
+            "images and point clouds need the package embreex "
+            "(in a checkout, pip install '.[synth]'), "
             'or make a release without them (--sensors none; SynthConfig(sensors="none"))'
         )
 
@@ -67,23 +84,19 @@ class EmbreeCaster:
     def __init__(self, corners: FloatArray, terrain: Terrain | None = None) -> None:
         from embreex import mesh_construction, rtcore_scene
 
-        vertices, triangles = (
-            corners.reshape(-1, 3).astype(np.float32),
-            _triangles_of_solids(len(corners)),
-        )
-        self._faces = len(corners) * FACES_A_SOLID
-        self._plane = terrain is not None and terrain.is_flat
+        vertices = corners.reshape(-1, 3).astype(np.float32)
+        triangles = _triangles_of_solids(len(corners))
+        self._num_faces = len(corners) * FACES_A_SOLID
+        self._has_plane = terrain is not None and terrain.is_flat
         if terrain is not None and not terrain.is_flat:
-            ground = terrain.triangles().reshape(-1, 3)
-            numbers = np.arange(len(ground)).reshape(-1, 3) + len(vertices)
-            vertices, triangles = (
-                np.concatenate([vertices, ground]),
-                np.concatenate([triangles, _as_tuples(numbers)]),
-            )
+            ground_vertices = terrain.triangles().reshape(-1, 3)
+            rows = np.arange(len(ground_vertices)).reshape(-1, 3) + len(vertices)
+            vertices = np.concatenate([vertices, ground_vertices])
+            triangles = np.concatenate([triangles, _as_tuples(rows)])
         self._is_empty = len(triangles) == 0
         self._scene: Any = rtcore_scene.EmbreeScene()
         if not self._is_empty:
-            # Embree reads the numbers one by one: with Python's own it takes half the time
+            # Embree reads the numbers one by one: with Python's own it takes half the time.
             self._mesh: Any = mesh_construction.TriangleMesh(
                 self._scene, vertices.astype(object), triangles
             )
@@ -91,154 +104,194 @@ class EmbreeCaster:
     def cast(
         self, origin: FloatArray, directions: AnyArray, reach: AnyArray | None = None
     ) -> tuple[AnyArray, AnyArray]:
-        """See `Caster`."""
+        """Find the first face that each ray hits, as described for `Caster`."""
         rays = np.ascontiguousarray(directions, dtype=np.float32)
         if self._is_empty or not len(rays):
-            distance, face = (
-                np.full(len(rays), np.inf, np.float32),
-                np.full(len(rays), NOTHING, np.int32),
-            )
+            distance = np.full(len(rays), np.inf, np.float32)
+            face = np.full(len(rays), NO_HIT, np.int32)
         else:
             starts = np.broadcast_to(origin.astype(np.float32), rays.shape)
-            ends = (
-                None if reach is None else reach.astype(np.float32)
-            )  # a copy, because Embree writes into it
+            ends = None
+            if reach is not None:
+                ends = reach.astype(np.float32)  # a copy, because Embree writes into it
             hits = self._scene.run(starts, rays, ends, query="INTERSECT", output=True)
-            face, distance = hits["primID"] >> 1, hits["tfar"]
+            face = hits["primID"] >> 1
+            distance = hits["tfar"]
             distance[face < 0] = np.inf
-            face[face >= self._faces] = GROUND
-        if self._plane:
-            below = plane_distance(origin[..., 2], rays[:, 2])
-            nearer = below < (distance if reach is None else np.minimum(distance, reach))
-            distance[nearer], face[nearer] = below[nearer], GROUND
+            face[face >= self._num_faces] = GROUND
+        if self._has_plane:
+            to_ground = plane_distance(origin[..., 2], rays[:, 2])
+            limit = distance if reach is None else np.minimum(distance, reach)
+            hits_ground = to_ground < limit
+            distance[hits_ground] = to_ground[hits_ground]
+            face[hits_ground] = GROUND
         return distance, face
 
 
 @lru_cache(maxsize=4)
 def _triangles_of_solids(count: int) -> NDArray[np.object_]:
-    """The rows of each triangle's three corners, (count · 12,) tuples: two for each face, as in `solids.FACES`."""
-    rows = np.arange(count)[:, None, None, None] * _CORNERS_A_SOLID + FACES[:, _HALVES]
+    """Return the rows of each triangle's three corners: two triangles for each face of the solids.
+
+    Returns:
+        Tuples (count · 12,), in the order of `solids.FACES`.
+    """
+    first_rows = np.arange(count)[:, None, None, None] * _CORNERS_A_SOLID
+    rows = first_rows + FACES[:, _TRIANGLES_OF_FACE]
     return _as_tuples(rows.reshape(-1, 3))
 
 
 def _as_tuples(rows: IntArray) -> NDArray[np.object_]:
+    """Convert the rows of an array into tuples."""
     tuples = np.empty(len(rows), dtype=object)
     tuples[:] = list(map(tuple, rows.tolist()))
     return tuples
 
 
 class NumpyCaster:
-    """Rays intersected with the planes of the solids near them, in double precision: slow, but without Embree."""
+    """Rays intersected with the planes of the solids near them, in double precision.
+
+    It is slow, but needs no Embree.
+    """
 
     def __init__(self, corners: FloatArray, terrain: Terrain | None = None) -> None:
         normals, offsets = face_planes(face_corners(corners))
         self._normals = normals.reshape(-1, FACES_A_SOLID, 3)
         self._offsets = offsets.reshape(-1, FACES_A_SOLID)
         self._middle = corners.mean(axis=1)
-        self._radius = np.linalg.norm(corners - self._middle[:, None], axis=2).max(
-            axis=1, initial=0.0
-        )
+        distances = np.linalg.norm(corners - self._middle[:, None], axis=2)
+        self._radius = distances.max(axis=1, initial=0.0)
         self._terrain = terrain
 
     def cast(
         self, origin: FloatArray, directions: AnyArray, reach: AnyArray | None = None
     ) -> tuple[AnyArray, AnyArray]:
-        """See `Caster`."""
+        """Find the first face that each ray hits, as described for `Caster`."""
         rays = np.asarray(directions, dtype=np.float64)
-        distance, face = (
-            self._cast_in_turn(origin, rays) if origin.ndim == 2 else self._cast_from(origin, rays)
-        )
+        if origin.ndim == 2:
+            distance, face = self._cast_from_each(origin, rays)
+        else:
+            distance, face = self._cast_from(origin, rays)
         if reach is not None:
             beyond = distance > reach
-            distance[beyond], face[beyond] = np.inf, NOTHING
+            distance[beyond] = np.inf
+            face[beyond] = NO_HIT
         return distance, face
 
     def _cast_from(self, origin: FloatArray, rays: FloatArray) -> tuple[FloatArray, IntArray]:
-        """Rays (N, 3) from one point."""
+        """Cast rays (N, 3) from one point."""
         units = rays / np.linalg.norm(rays, axis=1, keepdims=True)
         distance = np.full(len(rays), np.inf)
-        face = np.full(len(rays), NOTHING)
+        face = np.full(len(rays), NO_HIT)
         if self._terrain is not None:
             distance = ground_distance(self._terrain, origin, rays)
             face[np.isfinite(distance)] = GROUND
-        for first in range(0, len(self._radius), _SOLIDS_AT_ONCE):
-            solids = np.arange(first, min(first + _SOLIDS_AT_ONCE, len(self._radius)))
-            for solid, is_near in zip(
-                solids.tolist(), self._near(solids, origin, units), strict=True
-            ):
-                near = np.flatnonzero(is_near)
-                entry, entered = self._entry(solid, origin, rays[near])
-                closer = entry < distance[near]
-                distance[near[closer]] = entry[closer]
-                face[near[closer]] = FACES_A_SOLID * solid + entered[closer]
+        num_solids = len(self._radius)
+        for start in range(0, num_solids, _SOLIDS_A_BLOCK):
+            solids = np.arange(start, min(start + _SOLIDS_A_BLOCK, num_solids))
+            masks = self._near(solids, origin, units)
+            for solid, mask in zip(solids.tolist(), masks, strict=True):
+                rows = np.flatnonzero(mask)
+                entry, entry_face = self._entry(solid, origin, rays[rows])
+                closer = entry < distance[rows]
+                distance[rows[closer]] = entry[closer]
+                face[rows[closer]] = FACES_A_SOLID * solid + entry_face[closer]
         return distance, face
 
-    def _cast_in_turn(self, origins: FloatArray, rays: FloatArray) -> tuple[AnyArray, AnyArray]:
-        """Rays (N, 3) from points (N, 3), many of which are equal."""
-        distance, face = np.full(len(rays), np.inf), np.full(len(rays), NOTHING)
-        places, place = np.unique(origins, axis=0, return_inverse=True)
-        for number, origin in enumerate(places):
-            rows = np.flatnonzero(place.reshape(-1) == number)
+    def _cast_from_each(self, origins: FloatArray, rays: FloatArray) -> tuple[AnyArray, AnyArray]:
+        """Cast rays (N, 3) from points (N, 3), many of them equal."""
+        distance = np.full(len(rays), np.inf)
+        face = np.full(len(rays), NO_HIT)
+        distinct_origins, numbers = np.unique(origins, axis=0, return_inverse=True)
+        for number, origin in enumerate(distinct_origins):
+            rows = np.flatnonzero(numbers.reshape(-1) == number)
             distance[rows], face[rows] = self._cast_from(origin, rays[rows])
         return distance, face
 
     def _near(self, solids: IntArray, origin: FloatArray, units: FloatArray) -> BoolArray:
-        """Whether each ray (N,) passes near the bounding sphere of each solid (S,): (S, N)."""
+        """Return whether each ray (N,) passes near the bounding sphere of each solid (S,).
+
+        The shape is (S, N).
+        """
         towards = self._middle[solids] - origin
         radius = self._radius[solids] * (1 + _ROUNDING)
         along = towards @ units.T
-        least = np.sqrt(np.maximum((towards**2).sum(axis=1) - radius**2, 0.0))
-        # all rays meet a sphere around the origin; another one, only those that are ahead by its tangent's length
-        around = (towards**2).sum(axis=1) <= radius**2
-        return np.asarray((along >= least[:, None]) | around[:, None])
+        square_distance = (towards**2).sum(axis=1)
+        tangent_length = np.sqrt(np.maximum(square_distance - radius**2, 0.0))
+        # All rays meet a sphere around the origin; another one is met only by rays that have it
+        # ahead by the length of its tangent.
+        encloses_origin = square_distance <= radius**2
+        return np.asarray((along >= tangent_length[:, None]) | encloses_origin[:, None])
 
     def _entry(
         self, solid: int, origin: FloatArray, rays: FloatArray
     ) -> tuple[FloatArray, IntArray]:
-        """Where rays enter a solid (infinite if they do not), and the face through which they enter."""
+        """Find where rays enter a solid.
+
+        Returns:
+            Distances (infinite for rays that do not enter it), and the faces through which they
+            enter.
+        """
         towards = rays @ self._normals[solid].T
         height = self._offsets[solid] - self._normals[solid] @ origin
         with np.errstate(divide="ignore", invalid="ignore"):
             cut = height / towards
-        entering = np.where(towards < -_PARALLEL, cut, -_FAR)
-        leaving = np.where(towards > _PARALLEL, cut, _FAR)
-        outside = (np.abs(towards) <= _PARALLEL) & (height < 0)
-        entry, entered = entering.max(axis=1), entering.argmax(axis=1)
-        hit = (entry <= leaving.min(axis=1)) & (entry > 0) & ~outside.any(axis=1)
-        return np.where(hit, entry, np.inf), entered
+        entering = np.where(towards < -_PARALLEL_TOLERANCE, cut, -_MAX_DISTANCE)
+        leaving = np.where(towards > _PARALLEL_TOLERANCE, cut, _MAX_DISTANCE)
+        passes_by = (np.abs(towards) <= _PARALLEL_TOLERANCE) & (height < 0)
+        entry = entering.max(axis=1)
+        entry_face = entering.argmax(axis=1)
+        hit = (entry <= leaving.min(axis=1)) & (entry > 0) & ~passes_by.any(axis=1)
+        return np.where(hit, entry, np.inf), entry_face
 
 
 def ground_distance(terrain: Terrain, origin: FloatArray, rays: FloatArray) -> FloatArray:
-    """Where rays (N, 3) from a point above the ground meet it, in lengths of the ray; infinite if they do not."""
+    """Return where rays (N, 3) from a point above the ground meet it, in lengths of the ray.
+
+    The distance is infinite if they do not meet it.
+    """
     if terrain.is_flat:
         return plane_distance(origin[2], rays[:, 2])
-    step = _MARCH / np.linalg.norm(rays, axis=1)
-    before, after = np.zeros(len(rays)), np.full(len(rays), np.inf)
+    step = _MARCH_STEP_M / np.linalg.norm(rays, axis=1)
+    before = np.zeros(len(rays))
+    after = np.full(len(rays), np.inf)
     under_way = np.arange(len(rays))
-    for number in range(1, _MARCHES + 1):
+    for number in range(1, _NUM_MARCH_STEPS + 1):
         reached = number * step[under_way]
-        below = _height_above(terrain, origin, rays[under_way], reached) <= 0
-        after[under_way[below]] = reached[below]
-        under_way = under_way[~below]
-        before[under_way] = reached[~below]
+        is_below = _height_above(terrain, origin, rays[under_way], reached) <= 0
+        after[under_way[is_below]] = reached[is_below]
+        under_way = under_way[~is_below]
+        before[under_way] = reached[~is_below]
     met = np.flatnonzero(np.isfinite(after))
-    low, high = before[met], after[met]
-    for _ in range(_HALVINGS):
+    low = before[met]
+    high = after[met]
+    for _ in range(_NUM_HALVINGS):
         middle = (low + high) / 2
-        below = _height_above(terrain, origin, rays[met], middle) <= 0
-        low, high = np.where(below, low, middle), np.where(below, middle, high)
+        is_below = _height_above(terrain, origin, rays[met], middle) <= 0
+        low = np.where(is_below, low, middle)
+        high = np.where(is_below, middle, high)
     after[met] = (low + high) / 2
     return after
 
 
 def plane_distance(height: float | FloatArray, upwards: NDArray[Any]) -> NDArray[Any]:
-    """The distance from a height to z = 0 along rays with z components `upwards` (N,); infinite if they do not fall."""
+    """Return the distance from a height to z = 0 along rays.
+
+    Args:
+        height: Height of the origin, metres.
+        upwards: Components z of the rays, shape (N,).
+
+    Returns:
+        Distances (N,) in lengths of the ray; infinite if they do not fall.
+    """
     falling = upwards < 0
-    return np.where(falling, height / -np.where(falling, upwards, -1.0), np.inf)
+    descent = -np.where(falling, upwards, -1.0)
+    return np.where(falling, height / descent, np.inf)
 
 
 def _height_above(
     terrain: Terrain, origin: FloatArray, rays: FloatArray, reached: FloatArray
 ) -> FloatArray:
+    """Return the heights (N,) above the ground of points on rays, metres."""
     points = origin + rays * reached[:, None]
-    return np.asarray(points[:, 2] - terrain.height(points[:, :2]))
+    ground_height = terrain.height(points[:, :2])
+    return np.asarray(points[:, 2] - ground_height)

@@ -1,6 +1,7 @@
-"""The rotating LiDAR: 32 channels over 40° of elevation, 70 m, with noise, lost returns and the effects of weather.
+"""The rotating LiDAR: 32 channels over 40° of elevation, 70 m, with noise and lost returns.
 
-If only labels are made, only the rays that may pass through the boxes of road users are followed.
+Weather adds its effects. If only labels are made, only the rays that may pass through the boxes of
+road users are followed.
 """
 
 from dataclasses import dataclass
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 
 from deepaccident_devkit.geometry import SE3
 from deepaccident_devkit.plugins.synth.sensors.agents import Agent
-from deepaccident_devkit.plugins.synth.sensors.caster import NOTHING, make_caster
+from deepaccident_devkit.plugins.synth.sensors.caster import NO_HIT, make_caster
 from deepaccident_devkit.plugins.synth.sensors.scene import Scene, Setting
 from deepaccident_devkit.plugins.synth.shapes import BOX_CLEARANCE
 from deepaccident_devkit.plugins.synth.solids import FACES_A_SOLID
@@ -25,20 +26,35 @@ from deepaccident_devkit.support.arrays import (
 )
 
 LIDAR_CHANNELS = 32
-# Elevation of the lowest and the highest channel, degrees.
 ELEVATION = (-30.0, 10.0)
-# Rays a turn and channel. The release's LiDAR sends out 2,750, of which it loses 48 % at random.
+"""Elevation of the lowest and the highest channel, degrees."""
 AZIMUTHS = 1400
+"""Rays a turn and channel; the release's LiDAR sends out 2,750 and loses 48 % of them at random."""
 RANGE = 70.0
-# Metres around a box that count as inside: more than anybody moves between the point cloud and the count.
-_SPARE = 0.06
+RANGE_NOISE = 0.05
+"""Standard deviation along the ray, metres, as in the release."""
+# Margin around a box: more than anybody moves between the point cloud and the count.
+_BOX_MARGIN_M = 0.06
 # The distance of a box is multiplied by this, because a box on a slope leans.
-_CLOSER = 0.98
+_LEANING_FACTOR = 0.98
+# Attenuation of the intensity for each metre of dry air, as in the release.
+_ATTENUATION = 0.03
+# Intensity from which on no return is lost, and share of lost returns at intensity 0: CARLA's
+# defaults.
+_SAFE_INTENSITY = 0.8
+_MAX_LOSS = 0.4
+_NUM_RANDOM_NUMBERS = 1 << 18
+# Smallest and largest distance from which raindrops return a ray.
+_MIN_DROP_DISTANCE_M = 1.5
+_MAX_DROP_DISTANCE_M = 12.0
 
 
 @cache
 def lidar_ray_directions() -> FloatArray:
-    """Unit vectors of all rays in the LiDAR frame, (32 · 1400, 3), channel after channel from the top."""
+    """Return the unit vectors of all rays in the LiDAR frame, channel after channel from the top.
+
+    The shape is (32 · 1400, 3).
+    """
     elevation = np.deg2rad(np.linspace(ELEVATION[1], ELEVATION[0], LIDAR_CHANNELS))[:, None]
     azimuth = np.linspace(np.pi, -np.pi, AZIMUTHS, endpoint=False)[None, :]
     directions = [
@@ -50,7 +66,10 @@ def lidar_ray_directions() -> FloatArray:
 
 
 def turned_rays(rotation: FloatArray, rows: IntArray | slice = slice(None)) -> Float32Array:
-    """Directions (K, 3) of some or all rays, turned by a rotation (3, 3); each one does not depend on the others."""
+    """Return the directions (K, 3) of some or all rays, turned by a rotation (3, 3).
+
+    Each direction does not depend on the others.
+    """
     x, y, z = _direction_columns()[:, rows]
     turn = rotation.astype(np.float32)
     turned = np.empty((len(x), 3), dtype=np.float32)
@@ -60,99 +79,126 @@ def turned_rays(rotation: FloatArray, rows: IntArray | slice = slice(None)) -> F
 
 
 def rays_to_boxes(scene: Scene, ground_from_lidar: SE3, *groups: IntArray) -> BoolArray:
-    """Which rays may pass through a box of each group of actors, (G, 32 · 1400): those in a window around each box."""
-    rows = np.concatenate(groups)
-    frames, half = scene.frames[rows], scene.actors.size[rows, :2] / 2
-    corners = (
-        ground_from_lidar.inverse().apply(scene.box_corners[rows].reshape(-1, 3)).reshape(-1, 8, 3)
-    )
-    place = np.einsum(
-        "nk,nkl->nl", ground_from_lidar.translation - frames[:, :3, 3], frames[:, :3, :3]
-    )
-    gap = np.maximum(np.abs(place[:, :2]) - half - _SPARE, 0.0)
-    reach = np.hypot(corners[..., 0], corners[..., 1])
-    nearest = np.hypot(gap[:, 0], gap[:, 1]) * _CLOSER
-    first, last = _channels(
-        corners[..., 2].min(axis=1), corners[..., 2].max(axis=1), nearest, reach.max(axis=1)
-    )
-    start, count = _azimuths(corners, around=nearest == 0)
-    met = np.zeros(
-        (len(groups), LIDAR_CHANNELS, 2 * AZIMUTHS), dtype=bool
-    )  # 2 turns, for windows across the end
-    group = np.repeat(np.arange(len(groups)), [len(each) for each in groups])
-    for row in np.flatnonzero(nearest < RANGE).tolist():
-        met[group[row], first[row] : last[row], start[row] : start[row] + count[row]] = True
-    return np.asarray((met[..., :AZIMUTHS] | met[..., AZIMUTHS:]).reshape(len(groups), -1))
+    """Mark the rays that may pass through a box of each group of actors.
 
+    They are the rays in a window around each box.
 
-def rays_through(size: tuple[float, float, float], place: FloatArray) -> IntArray:
-    """Rows of the rays that pass through a box of a size (metres) with the same heading as the LiDAR.
+    Args:
+        scene: The scene.
+        ground_from_lidar: Pose of the LiDAR.
+        *groups: Rows of the actors of each group.
 
-    `place` (3,) is the LiDAR's place in the frame of the box's middle on the road, metres.
+    Returns:
+        Truth values, shape (G, 32 · 1400).
     """
-    middle = np.array([0.0, 0.0, BOX_CLEARANCE + size[2] / 2]) - place
-    half = np.array(size) / 2 + _SPARE
+    rows = np.concatenate(groups)
+    frames = scene.frames[rows]
+    half_size = scene.actors.size[rows, :2] / 2
+    ground_corners = scene.box_corners[rows].reshape(-1, 3)
+    corners = ground_from_lidar.inverse().apply(ground_corners).reshape(-1, 8, 3)
+    offsets = ground_from_lidar.translation - frames[:, :3, 3]
+    box_from_lidar = np.einsum("nk,nkl->nl", offsets, frames[:, :3, :3])
+    gap = np.maximum(np.abs(box_from_lidar[:, :2]) - half_size - _BOX_MARGIN_M, 0.0)
+    nearest = np.hypot(gap[:, 0], gap[:, 1]) * _LEANING_FACTOR
+    farthest = np.hypot(corners[..., 0], corners[..., 1]).max(axis=1)
+    low = corners[..., 2].min(axis=1)
+    high = corners[..., 2].max(axis=1)
+    top_channel, end_channel = _channels(low, high, nearest, farthest)
+    start, count = _azimuths(corners, around=nearest == 0)
+    # Two turns, for windows across the end.
+    mask = np.zeros((len(groups), LIDAR_CHANNELS, 2 * AZIMUTHS), dtype=bool)
+    group_of_row = np.repeat(np.arange(len(groups)), [len(group) for group in groups])
+    for row in np.flatnonzero(nearest < RANGE).tolist():
+        channels = slice(top_channel[row], end_channel[row])
+        mask[group_of_row[row], channels, start[row] : start[row] + count[row]] = True
+    one_turn = mask[..., :AZIMUTHS] | mask[..., AZIMUTHS:]
+    return np.asarray(one_turn.reshape(len(groups), -1))
+
+
+def rays_through(size: tuple[float, float, float], position: FloatArray) -> IntArray:
+    """Return the rows of the rays that pass through a box with the same heading as the LiDAR.
+
+    Args:
+        size: Length, width, height of the box, metres.
+        position: Position of the LiDAR in the frame of the box's middle on the road, shape (3,),
+            metres.
+    """
+    middle = np.array([0.0, 0.0, BOX_CLEARANCE + size[2] / 2]) - position
+    half_size = np.array(size) / 2 + _BOX_MARGIN_M
     with np.errstate(divide="ignore"):
-        one, other = ((middle + side * half) / lidar_ray_directions() for side in (-1, 1))
-    enters, leaves = np.minimum(one, other).max(axis=1), np.maximum(one, other).min(axis=1)
-    return np.flatnonzero((leaves > 0) & (enters <= leaves))
+        to_low_planes = (middle - half_size) / lidar_ray_directions()
+        to_high_planes = (middle + half_size) / lidar_ray_directions()
+    entry = np.minimum(to_low_planes, to_high_planes).max(axis=1)
+    exit_ = np.maximum(to_low_planes, to_high_planes).min(axis=1)
+    return np.flatnonzero((exit_ > 0) & (entry <= exit_))
 
 
 def _channels(
     low: FloatArray, high: FloatArray, nearest: FloatArray, farthest: FloatArray
 ) -> tuple[IntArray, IntArray]:
-    """First channel, and last channel plus 1, whose rays pass between two heights (N,) at a range of distances (N,)."""
-    bottom, top, close = low - _SPARE, high + _SPARE, np.maximum(nearest, 1e-3)
-    lowest = np.arctan2(bottom, np.where(bottom < 0, close, farthest))
-    highest = np.arctan2(top, np.where(top > 0, close, farthest))
-    upper = np.deg2rad(ELEVATION[1])
-    step = (upper - np.deg2rad(ELEVATION[0])) / (LIDAR_CHANNELS - 1)
-    first = np.floor((upper - highest) / step).clip(0, LIDAR_CHANNELS).astype(np.int64)
-    return first, np.ceil((upper - lowest) / step + 1).clip(0, LIDAR_CHANNELS).astype(np.int64)
+    """Return the channels with rays between two heights at a range of distances.
+
+    Args:
+        low: Lower heights, shape (N,), metres.
+        high: Upper heights, shape (N,).
+        nearest: Smallest distances, shape (N,).
+        farthest: Largest distances, shape (N,).
+
+    Returns:
+        First channel, and last channel plus 1, shape (N,) each.
+    """
+    bottom = low - _BOX_MARGIN_M
+    top = high + _BOX_MARGIN_M
+    min_distance = np.maximum(nearest, 1e-3)
+    low_elevation = np.arctan2(bottom, np.where(bottom < 0, min_distance, farthest))
+    high_elevation = np.arctan2(top, np.where(top > 0, min_distance, farthest))
+    top_elevation = np.deg2rad(ELEVATION[1])
+    step = (top_elevation - np.deg2rad(ELEVATION[0])) / (LIDAR_CHANNELS - 1)
+    start = np.floor((top_elevation - high_elevation) / step)
+    stop = np.ceil((top_elevation - low_elevation) / step + 1)
+    start = start.clip(0, LIDAR_CHANNELS)
+    stop = stop.clip(0, LIDAR_CHANNELS)
+    return start.astype(np.int64), stop.astype(np.int64)
 
 
 def _azimuths(corners: FloatArray, *, around: BoolArray) -> tuple[IntArray, IntArray]:
-    """First azimuth and number of azimuths of the rays to boxes (N, 8, 3); all azimuths if a box is `around`."""
+    """Return the azimuths of the rays to boxes.
+
+    Args:
+        corners: Corners of the boxes in the LiDAR frame, shape (N, 8, 3), metres.
+        around: Truth values, shape (N,): boxes around the LiDAR, which take all azimuths.
+
+    Returns:
+        First azimuth and number of azimuths, shape (N,) each.
+    """
     middle = np.arctan2(*corners[..., :2].mean(axis=1).T[::-1])
-    aside = np.abs(
-        (np.arctan2(corners[..., 1], corners[..., 0]) - middle[:, None] + np.pi) % (2 * np.pi)
-        - np.pi
-    )
+    bearing = np.arctan2(corners[..., 1], corners[..., 0]) - middle[:, None]
+    full_turn = 2 * np.pi
+    aside = np.abs((bearing + np.pi) % full_turn - np.pi)
     half_turn = np.where(around, np.pi, aside.max(axis=1))
-    column = (np.pi - middle) / (2 * np.pi) * AZIMUTHS
-    wide = half_turn / (2 * np.pi) * AZIMUTHS + 1
-    start = np.floor(column - wide).astype(np.int64)
-    return start % AZIMUTHS, np.minimum(
-        np.ceil(column + wide).astype(np.int64) + 1 - start, AZIMUTHS
-    )
+    column = (np.pi - middle) / full_turn * AZIMUTHS
+    half_width = half_turn / full_turn * AZIMUTHS + 1
+    start = np.floor(column - half_width).astype(np.int64)
+    count = np.ceil(column + half_width).astype(np.int64) + 1 - start
+    return start % AZIMUTHS, np.minimum(count, AZIMUTHS)
 
 
 @cache
 def _direction_columns() -> Float32Array:
-    """The same as `lidar_ray_directions`, as (3, 32 · 1400)."""
-    return readonly(np.ascontiguousarray(lidar_ray_directions().T.astype(np.float32)))
-
-
-# Standard deviation along the ray, metres, as in the release.
-RANGE_NOISE = 0.05
-# Attenuation of the intensity for each metre of dry air, as in the release.
-_ATTENUATION = 0.03
-# The intensity from which on no return is lost, and the share of lost returns at intensity 0: CARLA's defaults.
-_SURE, _LOST_DARK = 0.8, 0.4
-_NUMBERS = 1 << 18
-# The least and the largest distance from which raindrops return a ray, metres.
-_NEAREST_DROP, _FARTHEST_DROP = 1.5, 12.0
+    """Return `lidar_ray_directions` as columns, shape (3, 32 · 1400)."""
+    columns = lidar_ray_directions().T.astype(np.float32)
+    return readonly(np.ascontiguousarray(columns))
 
 
 @dataclass(frozen=True, slots=True)
 class Air:
-    """What the weather does to a ray.
+    """The effect of the weather on a ray.
 
     Attributes:
-        lost: share of the returns from `RANGE` metres that are lost, in addition to the weak ones; from nearer, the
-            share falls with the square of the distance.
-        attenuation: attenuation of the intensity for each metre, in addition to that of dry air.
-        drops: share of all rays that return from a raindrop.
+        lost: Share of the returns from `RANGE` metres that are lost, in addition to the weak ones;
+            from nearer, the share falls with the square of the distance.
+        attenuation: Attenuation of the intensity for each metre, in addition to dry air's.
+        drops: Share of all rays that return from a raindrop.
     """
 
     lost: float = 0.0
@@ -160,7 +206,6 @@ class Air:
     drops: float = 0.0
 
 
-# Weather (of `taxonomy.WEATHERS`) → its air.
 AIR_OF_WEATHER = {
     "Clear": Air(),
     "Cloudy": Air(),
@@ -170,17 +215,19 @@ AIR_OF_WEATHER = {
     "MidRain": Air(0.25, 0.008, 0.0005),
     "HardRain": Air(0.4, 0.014, 0.0015),
 }
+"""Air of each weather (of `taxonomy.WEATHERS`)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Lidar:
-    """The LiDAR of an agent, and where its rays meet the agent's own body, which never changes.
+    """The LiDAR of an agent, and its rays' hits on the agent's own body, which never change.
 
     Attributes:
-        row: row of the agent's own actor; None for the pole.
-        body: (K,) rows of the rays that pass through the agent's own box.
-        distance: (K,) float32, metres to where they meet its body; infinite if they do not.
-        face: (K,) the faces that they meet there, as in `Scene.cast`.
+        row: Row of the agent's own actor; None for the pole.
+        body: Rows of the rays that pass through the agent's own box, shape (K,).
+        distance: Distances to their hits on its body, shape (K,), float32, metres; infinite if they
+            do not meet it.
+        face: Faces that they meet there, as in `Scene.cast`, shape (K,).
     """
 
     row: int | None
@@ -194,10 +241,10 @@ class Scan:
     """N points of one turn.
 
     Attributes:
-        xyz: (N, 3) float32, metres, in the LiDAR frame, as stored.
-        ray: (N,) int64, row of each point's ray in `lidar_ray_directions`.
-        face: (N,) the face that each lies on, as in `Scene.cast`; `caster.NOTHING` for a raindrop.
-        reach: (N,) float32, distance without the noise, metres.
+        xyz: Points in the LiDAR frame, as stored, shape (N, 3), float32, metres.
+        ray: Row of each point's ray in `lidar_ray_directions`, shape (N,), int64.
+        face: Face of each point, as in `Scene.cast`, shape (N,); `caster.NO_HIT` for a raindrop.
+        reach: Distances without the noise, shape (N,), float32, metres.
     """
 
     xyz: Float32Array
@@ -207,19 +254,19 @@ class Scan:
 
 
 def make_lidar(setting: Setting, agent: Agent) -> Lidar:
-    """The LiDAR of an agent."""
+    """Make the LiDAR of an agent."""
     if agent.row is None:
-        nothing = np.zeros(0, dtype=np.int64)
-        return Lidar(row=None, body=nothing, distance=np.zeros(0, dtype=np.float32), face=nothing)
-    place = (agent.box_from_ego @ agent.ego_from_lidar).translation
-    body = rays_through(setting.actors.all[agent.row].size, place)
+        no_rows = np.zeros(0, dtype=np.int64)
+        no_distances = np.zeros(0, dtype=np.float32)
+        return Lidar(row=None, body=no_rows, distance=no_distances, face=no_rows)
+    position = (agent.box_from_ego @ agent.ego_from_lidar).translation
+    body = rays_through(setting.actors.all[agent.row].size, position)
     solids = np.flatnonzero(setting.moving_owner == agent.row)
     caster = make_caster(setting.moving_shapes.corners[solids])
-    distance, face = caster.cast(place, turned_rays(np.eye(3), body))
-    first = setting.faces + FACES_A_SOLID * int(solids[0])
-    return Lidar(
-        row=agent.row, body=body, distance=distance, face=np.where(face >= 0, face + first, face)
-    )
+    distance, face = caster.cast(position, turned_rays(np.eye(3), body))
+    first_face = setting.faces + FACES_A_SOLID * int(solids[0])
+    scene_face = np.where(face >= 0, face + first_face, face)
+    return Lidar(row=agent.row, body=body, distance=distance, face=scene_face)
 
 
 def scan(
@@ -231,105 +278,135 @@ def scan(
     *,
     boxed: bool = False,
 ) -> Scan:
-    """What a LiDAR at this pose measures; the number of random draws does not depend on what the rays meet.
+    """Simulate a turn of a LiDAR.
 
-    If `boxed`, only rays are followed that may pass through a label box. Then all points in boxes are there, equal to
-    the bit, but only few points outside the boxes.
+    The number of random draws does not depend on the surfaces that the rays meet.
+
+    Args:
+        scene: The scene.
+        lidar: The LiDAR.
+        ground_from_lidar: Its pose.
+        air: Effect of the weather.
+        rng: Generator of random numbers.
+        boxed: Whether only rays are followed that may pass through a label box. Then all points in
+            boxes are there, equal to the bit, but only few points outside the boxes.
     """
     cast = _cast_boxed if boxed else cast_all
     rows, distance, face = cast(scene, lidar, ground_from_lidar)
-    normal, even = _random_numbers()
-    noise, luck, wet = rng.integers(0, _NUMBERS - len(lidar_ray_directions()), 3)
+    normal, uniform = _random_numbers()
+    max_start = _NUM_RANDOM_NUMBERS - len(lidar_ray_directions())
+    noise_start, loss_start, drop_start = rng.integers(0, max_start, 3)
     reach = distance.astype(np.float32)
-    returned = returns(reach, even[luck + rows], air)
+    returned = returns(reach, uniform[loss_start + rows], air)
     if air.drops:
-        drop = np.flatnonzero(even[wet + rows] < air.drops)
-        place = _NEAREST_DROP + (_FARTHEST_DROP - _NEAREST_DROP) * even[luck + rows[drop]]
-        reach[drop] = np.minimum(place, reach[drop])
-        face[drop], returned[drop] = NOTHING, True
-    back = np.flatnonzero(returned)
-    ray, reach = rows[back], reach[back]
-    measured = np.maximum(reach + np.float32(RANGE_NOISE) * normal[noise + ray], np.float32(0.1))
-    return Scan(
-        (lidar_ray_directions().take(ray, axis=0) * measured[:, None]).astype(np.float32),
-        ray,
-        face[back],
-        reach,
-    )
+        drops = np.flatnonzero(uniform[drop_start + rows] < air.drops)
+        share = uniform[loss_start + rows[drops]]
+        drop_distance = _MIN_DROP_DISTANCE_M + (_MAX_DROP_DISTANCE_M - _MIN_DROP_DISTANCE_M) * share
+        reach[drops] = np.minimum(drop_distance, reach[drops])
+        face[drops] = NO_HIT
+        returned[drops] = True
+    points = np.flatnonzero(returned)
+    ray = rows[points]
+    reach = reach[points]
+    noise = np.float32(RANGE_NOISE) * normal[noise_start + ray]
+    measured = np.maximum(reach + noise, np.float32(0.1))
+    directions = lidar_ray_directions().take(ray, axis=0)
+    xyz = (directions * measured[:, None]).astype(np.float32)
+    return Scan(xyz, ray, face[points], reach)
 
 
 def intensity(points: Scan, air: Air) -> Float32Array:
-    """The intensity of the points (N,), 0 to 1: it depends only on the air on the way, as in the release."""
-    return _brightness(points.reach, air)
+    """Return the intensity of the points (N,), 0 to 1.
+
+    It depends only on the air on the way, as in the release.
+    """
+    return _intensity_at(points.reach, air)
 
 
-def _brightness(reach: AnyArray, air: Air) -> Float32Array:
-    return np.asarray(np.exp(-(_ATTENUATION + air.attenuation) * reach), dtype=np.float32)
+def _intensity_at(reach: AnyArray, air: Air) -> Float32Array:
+    """Return the intensity of returns from distances in metres."""
+    attenuation = _ATTENUATION + air.attenuation
+    return np.asarray(np.exp(-attenuation * reach), dtype=np.float32)
 
 
 def cast_all(
     scene: Scene, lidar: Lidar, ground_from_lidar: SE3
 ) -> tuple[IntArray, AnyArray, AnyArray]:
-    """The rows of all rays; how far they go, correct up to `RANGE`; and what they meet."""
-    setting, rays = scene.setting, turned_rays(ground_from_lidar.rotation)
+    """Cast all rays of a LiDAR.
+
+    Returns:
+        The rows of the rays, their distances, correct up to `RANGE`, and the faces that they meet.
+    """
+    setting = scene.setting
+    rays = turned_rays(ground_from_lidar.rotation)
     pose = ground_from_lidar.matrix.tobytes()
-    origin, columns = ground_from_lidar.translation, rays.reshape(LIDAR_CHANNELS, AZIMUTHS, 3)
-    still = setting.kept(pose, lambda: setting.cast_columns(origin, columns, RANGE))
-    near = np.flatnonzero(
-        rays_to_boxes(scene, ground_from_lidar, _others(setting.moving, lidar))[0]
-    )
-    distance, face = scene.with_movers(origin, rays, still, near)
-    met = np.isfinite(lidar.distance)
-    distance[lidar.body[met]], face[lidar.body[met]] = lidar.distance[met], lidar.face[met]
+    origin = ground_from_lidar.translation
+    columns = rays.reshape(LIDAR_CHANNELS, AZIMUTHS, 3)
+    static_hits = setting.remembered(pose, lambda: setting.cast_columns(origin, columns, RANGE))
+    moving_rows = _without_own(setting.moving, lidar)
+    [to_movers] = rays_to_boxes(scene, ground_from_lidar, moving_rows)
+    near = np.flatnonzero(to_movers)
+    distance, face = scene.with_movers(origin, rays, static_hits, near)
+    hits_body = np.isfinite(lidar.distance)
+    body = lidar.body[hits_body]
+    distance[body] = lidar.distance[hits_body]
+    face[body] = lidar.face[hits_body]
     return np.arange(len(rays)), distance, face
 
 
 def _cast_boxed(
     scene: Scene, lidar: Lidar, ground_from_lidar: SE3
 ) -> tuple[IntArray, AnyArray, AnyArray]:
-    """The same as `cast_all`, for only the rays that may pass through a box."""
+    """Cast only the rays that may pass through a box; the results are as from `cast_all`."""
     setting = scene.setting
-    near, others = rays_to_boxes(
-        scene, ground_from_lidar, _others(setting.moving, lidar), setting.parked
-    )
-    wanted = near | others
-    wanted[lidar.body[np.isfinite(lidar.distance)]] = False
-    rows = np.flatnonzero(wanted)
+    moving_rows = _without_own(setting.moving, lidar)
+    to_movers, to_parked = rays_to_boxes(scene, ground_from_lidar, moving_rows, setting.parked)
+    cast_mask = to_movers | to_parked
+    cast_mask[lidar.body[np.isfinite(lidar.distance)]] = False
+    rows = np.flatnonzero(cast_mask)
     rays = turned_rays(ground_from_lidar.rotation, rows)
-    distance, face = scene.cast(
-        ground_from_lidar.translation, rays, near=np.flatnonzero(near[rows])
-    )
-    own = np.flatnonzero(~wanted[lidar.body])
-    return (
-        np.concatenate([rows, lidar.body[own]]),
-        np.concatenate([distance, lidar.distance[own]]),
-        np.concatenate([face, lidar.face[own]]),
-    )
+    near = np.flatnonzero(to_movers[rows])
+    distance, face = scene.cast(ground_from_lidar.translation, rays, near=near)
+    own = np.flatnonzero(~cast_mask[lidar.body])
+    all_rows = np.concatenate([rows, lidar.body[own]])
+    all_distances = np.concatenate([distance, lidar.distance[own]])
+    return all_rows, all_distances, np.concatenate([face, lidar.face[own]])
 
 
 @cache
 def _random_numbers() -> tuple[Float32Array, Float32Array]:
-    """Random numbers of the standard normal distribution, and uniform ones from 0 to 1, (2 ** 18,) each.
+    """Return standard normal random numbers, and uniform ones from 0 to 1, (2 ** 18,) each.
 
-    Each turn takes them from another place: to draw new ones would take as long as to cast the rays to the boxes.
+    Each turn takes them from another position: to draw new ones would take as long as to cast the
+    rays to the boxes.
     """
     rng = np.random.default_rng(0)
-    normal, even = (
-        rng.standard_normal(_NUMBERS, dtype=np.float32),
-        rng.random(_NUMBERS, dtype=np.float32),
-    )
-    return readonly(normal), readonly(even)
+    normal = rng.standard_normal(_NUM_RANDOM_NUMBERS, dtype=np.float32)
+    uniform = rng.random(_NUM_RANDOM_NUMBERS, dtype=np.float32)
+    return readonly(normal), readonly(uniform)
 
 
-def _others(rows: IntArray, lidar: Lidar) -> IntArray:
-    return rows if lidar.row is None else rows[rows != lidar.row]
+def _without_own(rows: IntArray, lidar: Lidar) -> IntArray:
+    """Return rows of actors without the LiDAR's own."""
+    if lidar.row is None:
+        return rows
+    other_rows: IntArray = rows[rows != lidar.row]
+    return other_rows
 
 
 def returns(reach: Float32Array, luck: Float32Array, air: Air) -> NDArray[np.bool_]:
-    """Which rays (N,) return, by the distance in metres at which they met something: of the weak ones fewer."""
+    """Return whether rays return, weak ones less often.
+
+    Args:
+        reach: Distances at which they met something, shape (N,), metres.
+        luck: Random numbers from 0 to 1, shape (N,).
+        air: Effect of the weather.
+
+    Returns:
+        Truth values, shape (N,).
+    """
     near = np.minimum(reach, RANGE)
-    lost = (
-        _LOST_DARK * np.maximum(1 - _brightness(near, air) / _SURE, 0)
-        + air.lost * (near / RANGE) ** 2
-    )
-    return np.asarray((reach <= RANGE) & (luck >= lost))
+    weakness = np.maximum(1 - _intensity_at(near, air) / _SAFE_INTENSITY, 0)
+    loss = _MAX_LOSS * weakness + air.lost * (near / RANGE) ** 2
+    in_range = reach <= RANGE
+    return np.asarray(in_range & (luck >= loss))

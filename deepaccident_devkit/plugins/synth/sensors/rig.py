@@ -1,4 +1,4 @@
-"""All sensors of a scenario's agents, and what each of them records at a moment."""
+"""All sensors of a scenario's agents, and the recordings of each at a moment."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -41,98 +41,120 @@ from deepaccident_devkit.release.npz import TAGS
 from deepaccident_devkit.support.arrays import ByteArray, FloatArray
 from deepaccident_devkit.taxonomy import AGENTS, BEV_RESOLUTION, BEV_SHAPE, CATEGORIES, AgentName
 
-# Row and column of the agent.
-_MIDDLE = (BEV_SHAPE[0] - 1) / 2
+# Row and column of the agent in a BEV picture.
+_MIDDLE_PIXEL = (BEV_SHAPE[0] - 1) / 2
 _TAG_OF_CATEGORY = np.array(
     [TAGS["pedestrian" if category == "pedestrian" else "vehicle"] for category in CATEGORIES],
     dtype=np.uint8,
 )
+# Blur of the optics of the rig `road`, pixels, and its noise as a share of white.
+_BLUR_PIXELS = 0.7
+_NOISE_STD = 0.03
+_GAMMA, _CONTRAST, _TINT = 0.8, 0.8, np.array([1.05, 1.0, 0.88], dtype=np.float32)
+# The purposes of random numbers.
+_LOOK_STREAM, _LIDAR_STREAM, _CAMERA_STREAM = range(3)
 
 
 def bev_picture(scene: Scene, top: GroundMap, ground_from_ego: SE3) -> BevImage:
-    """The picture around an agent; higher road users cover lower ones."""
+    """Paint the BEV picture around an agent; higher road users cover lower ones."""
     import cv2
 
     x, y = ground_from_ego.translation[:2].tolist()
-    semantic = np.asarray(
-        cv2.LUT(_map_around(top, x, y, ground_from_ego.yaw), tag_of_code()), dtype=np.uint8
-    )
+    yaw = ground_from_ego.yaw
+    codes = _map_around(top, x, y, yaw)
+    semantic = np.asarray(cv2.LUT(codes, tag_of_code()), dtype=np.uint8)
     instance = np.zeros(BEV_SHAPE, dtype=np.uint16)
-    poses = _relative_poses(scene.snapshot.poses, x, y, ground_from_ego.yaw)
+    poses = _relative_poses(scene.snapshot.poses, x, y, yaw)
     actors = scene.actors
-    reach = BEV_RESOLUTION * BEV_SHAPE[0] / 2 + np.hypot(actors.size[:, 0], actors.size[:, 1]) / 2
+    radius = np.hypot(actors.size[:, 0], actors.size[:, 1]) / 2
+    reach = BEV_RESOLUTION * BEV_SHAPE[0] / 2 + radius
     near = np.flatnonzero(np.abs(poses[:, :2]).max(axis=1) < reach)
-    for row in near[np.argsort(actors.size[near, 2], kind="stable")].tolist():
-        window, inside = _footprint(poses[row], actors.size[row])
-        semantic[window][inside] = _TAG_OF_CATEGORY[actors.category[row]]
-        instance[window][inside] = actors.object_id[row]
+    by_height = near[np.argsort(actors.size[near, 2], kind="stable")]
+    for row in by_height.tolist():
+        window, mask = _footprint(poses[row], actors.size[row])
+        semantic[window][mask] = _TAG_OF_CATEGORY[actors.category[row]]
+        instance[window][mask] = actors.object_id[row]
     return BevImage(semantic, instance)
 
 
 def _map_around(top: GroundMap, x: float, y: float, yaw: float) -> ByteArray:
-    """Codes of the map resampled to the agent's grid, nearest cell."""
+    """Resample the codes of the map to the agent's grid, nearest cell."""
     import cv2
 
-    cos, sin = np.cos(yaw), np.sin(yaw)
-    column, row = ((value + MAP_EXTENT) / MAP_RESOLUTION - 0.5 for value in (x, y))
+    cos = np.cos(yaw)
+    sin = np.sin(yaw)
+    column = (x + MAP_EXTENT) / MAP_RESOLUTION - 0.5
+    row = (y + MAP_EXTENT) / MAP_RESOLUTION - 0.5
     map_from_picture = np.array(
-        [[sin, -cos, column + _MIDDLE * (cos - sin)], [-cos, -sin, row + _MIDDLE * (cos + sin)]]
+        [
+            [sin, -cos, column + _MIDDLE_PIXEL * (cos - sin)],
+            [-cos, -sin, row + _MIDDLE_PIXEL * (cos + sin)],
+        ]
     )
-    flags = cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP
-    return np.asarray(
-        cv2.warpAffine(
-            top.codes,
-            map_from_picture,
-            BEV_SHAPE,
-            flags=flags,
-            borderMode=cv2.BORDER_CONSTANT,
-            borderValue=(TERRAIN,),
-        )
+    codes = cv2.warpAffine(
+        top.codes,
+        map_from_picture,
+        BEV_SHAPE,
+        flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP,
+        borderMode=cv2.BORDER_CONSTANT,
+        borderValue=(TERRAIN,),
     )
+    return np.asarray(codes)
 
 
 def _relative_poses(poses: FloatArray, x: float, y: float, yaw: float) -> FloatArray:
-    """Poses (A, 3) in the ground frame, converted to the frame of an agent."""
-    dx, dy = poses[:, 0] - x, poses[:, 1] - y
-    cos, sin = np.cos(yaw), np.sin(yaw)
-    return np.column_stack([cos * dx + sin * dy, cos * dy - sin * dx, poses[:, 2] - yaw])
+    """Convert poses (A, 3) from the ground frame to the frame of an agent."""
+    dx = poses[:, 0] - x
+    dy = poses[:, 1] - y
+    cos = np.cos(yaw)
+    sin = np.sin(yaw)
+    ahead = cos * dx + sin * dy
+    lateral = cos * dy - sin * dx
+    return np.column_stack([ahead, lateral, poses[:, 2] - yaw])
 
 
 def _footprint(pose: FloatArray, size: FloatArray) -> tuple[tuple[slice, slice], NDArray[np.bool_]]:
-    """The pixels whose middle lies on a box, seen from above: a window of the picture, and a mask of it."""
+    """Return the pixels with their middle on a box, seen from above.
+
+    Args:
+        pose: x, y (metres), yaw (radians) of the box in the agent's frame, shape (3,).
+        size: Length, width, height, shape (3,), metres.
+
+    Returns:
+        A window of the picture, and a mask of it.
+    """
     x, y, yaw = pose.tolist()
     length, width, _ = size.tolist()
     radius = np.hypot(length, width) / 2 / BEV_RESOLUTION
-    rows, columns = (_window(_MIDDLE - value / BEV_RESOLUTION, radius) for value in (x, y))
-    ahead = ((_MIDDLE - np.arange(rows.start, rows.stop)) * BEV_RESOLUTION - x)[:, None]
-    left = ((_MIDDLE - np.arange(columns.start, columns.stop)) * BEV_RESOLUTION - y)[None, :]
-    cos, sin = np.cos(yaw), np.sin(yaw)
-    inside = (np.abs(cos * ahead + sin * left) <= length / 2) & (
-        np.abs(cos * left - sin * ahead) <= width / 2
-    )
-    return (rows, columns), inside
+    rows = _window(_MIDDLE_PIXEL - x / BEV_RESOLUTION, radius)
+    columns = _window(_MIDDLE_PIXEL - y / BEV_RESOLUTION, radius)
+    row_x = (_MIDDLE_PIXEL - np.arange(rows.start, rows.stop)) * BEV_RESOLUTION
+    column_y = (_MIDDLE_PIXEL - np.arange(columns.start, columns.stop)) * BEV_RESOLUTION
+    dx = (row_x - x)[:, None]
+    dy = (column_y - y)[None, :]
+    cos = np.cos(yaw)
+    sin = np.sin(yaw)
+    within_length = np.abs(cos * dx + sin * dy) <= length / 2
+    within_width = np.abs(cos * dy - sin * dx) <= width / 2
+    return (rows, columns), within_length & within_width
 
 
 def _window(middle: float, radius: float) -> slice:
-    low, high = int(np.floor(middle - radius)), int(np.ceil(middle + radius)) + 1
+    """Return the rows or columns of the picture around a middle, pixels."""
+    low = int(np.floor(middle - radius))
+    high = int(np.ceil(middle + radius)) + 1
     return slice(min(max(low, 0), BEV_SHAPE[0]), max(min(high, BEV_SHAPE[0]), 0))
-
-
-# Pixels, and as a share of white: of the optics of the rig `road`.
-_BLUR, _NOISE = 0.7, 0.03
-_GAMMA, _CONTRAST, _TINT = 0.8, 0.8, np.array([1.05, 1.0, 0.88], dtype=np.float32)
-# The purposes of random numbers.
-_LOOK, _LIDAR, _CAMERAS = range(3)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sighting:
-    """What an agent records at a moment, except its images.
+    """The recordings of an agent at a moment, except its images.
 
     Attributes:
-        labels: its label file.
-        calib: its calib file.
-        points: its point cloud; if the rig makes none, only the points that may lie in a box, as in `lidar.scan`.
+        labels: Label file.
+        calib: Calib file.
+        points: Point cloud; if the rig makes none, only the points that may lie in a box, as in
+            `lidar.scan`.
     """
 
     labels: Labels
@@ -145,83 +167,91 @@ class Rig:
     """The sensors of a scenario.
 
     Attributes:
-        setting: what stands still, and who moves.
-        agents: the agents.
-        lidars: their LiDARs.
-        air: what the weather does to the LiDARs' rays.
-        clouds: whether it makes whole point clouds, not only the points that labels count.
-        studio: it makes the images; None if there are none.
-        seed: seed of all noise, so that the noise of a moment does not depend on what was recorded before.
-        exact: whether calib files are ideal, and numbers of points exact.
-        decimals: to how many decimals labels and calib are rounded; None for all.
-        name: of how it is mounted, and of its optics (`plan.SynthConfig`).
+        setting: The static world, and the road users that move.
+        agents: The agents.
+        lidars: LiDARs of the agents.
+        air: Effect of the weather on the LiDARs' rays.
+        clouds: Whether it makes complete point clouds, not only the points that labels count.
+        studio: Maker of the images; None if there are none.
+        seed: Seed of all noise, so that the noise of a moment does not depend on earlier
+            recordings.
+        exact: Whether calib files are ideal, and numbers of points exact.
+        decimals: Number of decimals to which labels and calib are rounded; None for all.
+        name: Name of its mounting and its optics (`plan.SynthConfig`).
     """
 
+    # the world and its agents
     setting: Setting
     agents: tuple[Agent, ...]
+    # sensors
     lidars: Mapping[AgentName, Lidar]
     air: Air
     clouds: bool
     studio: Studio | None
+    # noise and rounding
     seed: tuple[int, ...]
     exact: bool
     decimals: int | None = None
     name: RigName = "released"
 
     def scene(self, time: float) -> Scene:
-        """The scene at a time, seconds since the first recorded frame."""
+        """Make the scene at a time, seconds since the first recorded frame."""
         return make_scene(self.setting, time)
 
     def sighting(self, scene: Scene, agent: Agent, frame: int) -> Sighting:
-        """Labels, calib and points of an agent; `frame` seeds the noise."""
+        """Record labels, calib and points of an agent; `frame` seeds the noise."""
         world_from_ground = self.setting.world.world_from_ground
         ground_from_ego = agent.ground_from_ego(scene)
         ground_from_lidar = ground_from_ego @ agent.ego_from_lidar
-        rng = self._random(_LIDAR, frame, agent)
-        points = scan(
-            scene, self.lidars[agent.name], ground_from_lidar, self.air, rng, boxed=not self.clouds
-        )
+        lidar = self.lidars[agent.name]
+        rng = self._random(_LIDAR_STREAM, frame, agent)
+        points = scan(scene, lidar, ground_from_lidar, self.air, rng, boxed=not self.clouds)
         labels = annotate(scene, agent, world_from_ground, points, exact=self.exact)
         calib = agent.calib(world_from_ground @ ground_from_ego)
-        calib = calib if self.exact else with_single_precision(calib)
+        if not self.exact:
+            calib = with_single_precision(calib)
         if self.decimals is not None:
-            labels, calib = (
-                _rounded_labels(labels, self.decimals),
-                _rounded_calib(calib, self.decimals),
-            )
+            labels = _rounded_labels(labels, self.decimals)
+            calib = _rounded_calib(calib, self.decimals)
         return Sighting(labels, calib, points)
 
     def bev(self, scene: Scene, agent: Agent) -> BevImage:
-        """The picture of an agent's BEV camera."""
-        return bev_picture(scene, self.setting.world.top, agent.ground_from_ego(scene))
+        """Return the picture of an agent's BEV camera."""
+        ground_from_ego = agent.ground_from_ego(scene)
+        return bev_picture(scene, self.setting.world.top, ground_from_ego)
 
     def surroundings(self, scene: Scene, signals: Mapping[Arm, int]) -> Surroundings | None:
-        """What the images of all agents at a moment have in common; None if no images are made.
+        """Return the part that the images of all agents at a moment have in common.
 
-        `signals` are the states of the traffic lights, as for `light.lit_lamps`.
+        Args:
+            scene: The scene.
+            signals: States of the traffic lights, as for `light.lit_lamps`.
+
+        Returns:
+            None if no images are made.
         """
         return self.studio.surroundings(scene, signals) if self.studio else None
 
     def images(
-        self, scene: Scene, around: Surroundings, agent: Agent, frame: int
+        self, scene: Scene, surroundings: Surroundings, agent: Agent, frame: int
     ) -> Iterator[tuple[str, ByteArray]]:
-        """Channel and picture (H, W, 3) of each camera of an agent, one at a time."""
-        rng = self._random(_CAMERAS, frame, agent)
+        """Yield channel and picture (H, W, 3) of each camera of an agent, one at a time."""
+        rng = self._random(_CAMERA_STREAM, frame, agent)
         ground_from_lidar = agent.ground_from_lidar(scene)
         for camera in agent.cameras:
-            picture = camera_picture(
-                scene, around, camera, ground_from_lidar @ camera.lidar_from_camera, rng
-            )
-            yield (
-                camera.channel,
-                picture if self.name == "released" else _by_other_optics(picture, rng),
-            )
+            ground_from_camera = ground_from_lidar @ camera.lidar_from_camera
+            picture = camera_picture(scene, surroundings, camera, ground_from_camera, rng)
+            if self.name != "released":
+                picture = _by_other_optics(picture, rng)
+            yield camera.channel, picture
 
     def _random(self, purpose: int, frame: int, agent: Agent) -> np.random.Generator:
-        return np.random.default_rng([*self.seed, purpose, frame, AGENTS.index(agent.name)])
+        """Return the generator of random numbers for a purpose at a frame of an agent."""
+        seed = [*self.seed, purpose, frame, AGENTS.index(agent.name)]
+        return np.random.default_rng(seed)
 
 
-def make_rig(  # noqa: PLR0913 - where, who, under which sky, and what is recorded how
+def make_rig(  # noqa: PLR0913 - the place, the agents, the sky, and the recordings
     world: World,
     actors: Actors,
     ids: Mapping[AgentName, int],
@@ -234,24 +264,37 @@ def make_rig(  # noqa: PLR0913 - where, who, under which sky, and what is record
     decimals: int | None = None,
     name: RigName = "released",
 ) -> Rig:
-    """The sensors of a scenario; `ids` are the actors of the four agents that are vehicles.
+    """Make the sensors of a scenario.
 
-    `sky` is weather and time of day, as in the taxonomy; `image_size` width and height, pixels; `seed` that of noise,
-    clouds and the ground's grain. Labels do not depend on `sensors` (`SynthConfig`), points do, as in `Sighting`.
+    Labels do not depend on `sensors`, points do, as described for `Sighting`.
+
+    Args:
+        world: The static world.
+        actors: The road users.
+        ids: Actor ids of the four vehicle agents.
+        sky: Weather and time of day, as in the taxonomy.
+        image_size: Width and height of images, pixels.
+        seed: Seed of noise, clouds and the ground's grain.
+        sensors: Sensors' files to make (`SynthConfig`).
+        exact: Whether calib files are ideal, and numbers of points exact.
+        decimals: Number of decimals to which labels and calib are rounded; None for all.
+        name: Name of the mounting and the optics.
     """
     weather, time_of_day = sky
     setting = Setting(world, actors)
     agents = make_agents(world, actors, ids, image_size, MOUNTS[name])
-    rng = np.random.default_rng([*seed, _LOOK])
+    rng = np.random.default_rng([*seed, _LOOK_STREAM])
+    lidars = {agent.name: make_lidar(setting, agent) for agent in agents}
+    studio = None
+    if sensors not in ("clouds", "none"):
+        studio = Studio(setting, weather, time_of_day, rng)
     return Rig(
         setting=setting,
         agents=agents,
-        lidars={agent.name: make_lidar(setting, agent) for agent in agents},
+        lidars=lidars,
         air=AIR_OF_WEATHER[weather],
         clouds=sensors in ("all", "clouds"),
-        studio=None
-        if sensors in ("clouds", "none")
-        else Studio(setting, weather, time_of_day, rng),
+        studio=studio,
         seed=seed,
         exact=exact,
         decimals=decimals,
@@ -260,29 +303,32 @@ def make_rig(  # noqa: PLR0913 - where, who, under which sky, and what is record
 
 
 def _rounded_labels(labels: Labels, decimals: int) -> Labels:
+    """Return labels with rounded numbers."""
     names = ("agent_velocity", "center", "size", "yaw", "velocity")
     return replace(labels, **{name: getattr(labels, name).round(decimals) for name in names})
 
 
 def _rounded_calib(calib: Calib, decimals: int) -> Calib:
+    """Return a calib with rounded numbers."""
+
     def rounded(pose: SE3) -> SE3:
         return trusted_se3(pose.matrix.round(decimals))
 
+    camera_poses = calib.camera_from_lidar.items()
     return Calib(
         ego_from_lidar=rounded(calib.ego_from_lidar),
         world_from_ego=rounded(calib.world_from_ego),
-        camera_from_lidar={
-            channel: rounded(pose) for channel, pose in calib.camera_from_lidar.items()
-        },
+        camera_from_lidar={channel: rounded(pose) for channel, pose in camera_poses},
         intrinsic={channel: matrix.round(decimals) for channel, matrix in calib.intrinsic.items()},
     )
 
 
 def _by_other_optics(picture: ByteArray, rng: np.random.Generator) -> ByteArray:
-    """A picture (H, W, 3) that is softer, warmer, of less contrast, and noisier."""
+    """Return a picture (H, W, 3) that is softer, warmer, of less contrast, and noisier."""
     import cv2
 
-    soft = cv2.GaussianBlur(picture, (0, 0), _BLUR).astype(np.float32) / 255
+    soft = cv2.GaussianBlur(picture, (0, 0), _BLUR_PIXELS).astype(np.float32) / 255
     toned = (soft**_GAMMA - 0.5) * _CONTRAST + 0.5
-    noise = rng.standard_normal(picture.shape, dtype=np.float32) * _NOISE
-    return np.asarray(np.clip(np.rint((toned * _TINT + noise) * 255), 0, 255), dtype=np.uint8)
+    noise = rng.standard_normal(picture.shape, dtype=np.float32) * _NOISE_STD
+    values = np.rint((toned * _TINT + noise) * 255)
+    return np.asarray(np.clip(values, 0, 255), dtype=np.uint8)

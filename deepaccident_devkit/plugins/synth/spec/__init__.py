@@ -1,8 +1,9 @@
-"""Scenario files: what they can say, how they are read, and the paper's twelve designs as such files.
+"""Scenario files: their fields, how they are read, and the paper's twelve designs as such files.
 
-A file is read into a `SpecTemplate`, whose ranges and choices are still open; `draw` makes a `ScenarioSpec` from it.
-The parts, lowest layer first: `model` (the fields and their open choices), `reading` (YAML and types), `checks` (the
-rest), `catalogue` (templates and the designs).
+A file is read into a `SpecTemplate` with ranges and choices that are still open; `draw` makes a
+`ScenarioSpec` from it. The modules, lowest layer first: `model` (the fields and their open
+choices), `reading` (YAML and types), `checks` (all other checks), `catalogue` (templates and the
+designs).
 """
 
 from deepaccident_devkit.plugins.synth.spec.catalogue import (

@@ -1,4 +1,4 @@
-"""Scenario files from text to template, how to draw from it, and the paper's twelve designs."""
+"""Scenario files from text to template, draws from a template, and the paper's twelve designs."""
 
 import os
 from dataclasses import dataclass, replace
@@ -21,9 +21,13 @@ from deepaccident_devkit.plugins.synth.spec.reading import parse_yaml, read_part
 from deepaccident_devkit.support.reading import fault_text, read_bytes
 from deepaccident_devkit.support.text import path_of
 
-_EXCHANGED: dict[Role, Role] = {
+_EXCHANGED_ROLES: dict[Role, Role] = {
     "ego": "other", "other": "ego", "ego_behind": "other_behind", "other_behind": "ego_behind",
 }  # fmt: skip
+# PyYAML reads a text of this length in a few seconds.
+_MAX_CHARACTERS = 200_000
+DESIGN_NUMBERS: Final = tuple(range(1, 13))
+"""Numbers of the designs: 1 to 6 at signalised junctions, 7 to 12 at unsignalised ones."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,14 +35,14 @@ class SpecTemplate:
     """A scenario as a file describes it.
 
     Attributes:
-        root: the contents of the file, checked.
+        root: The checked contents of the file.
     """
 
     root: Part
 
     @property
     def name(self) -> str:
-        """The scenario's name, for readers."""
+        """Name of the scenario, for readers."""
         return str(self.root.values("name")[0])
 
     @property
@@ -49,96 +53,101 @@ class SpecTemplate:
     @property
     def meeting_roles(self) -> frozenset[Role]:
         """The roles that are timed to meet; empty if there are none."""
-        meetings = [meeting for meeting in self.root.values("meet") if isinstance(meeting, Part)]
-        return frozenset(role for meeting in meetings for role in meeting_roles(meeting))
+        roles: set[Role] = set()
+        for meeting in self.root.values("meet"):
+            if isinstance(meeting, Part):
+                roles.update(meeting_roles(meeting))
+        return frozenset(roles)
 
     @property
     def meets(self) -> bool:
-        """Whether two are timed to meet, so that there is an accident."""
+        """Whether two road users are timed to meet, so that there is an accident."""
         return bool(self.meeting_roles)
 
     def place(self, field: str) -> str:
-        """Where the file names a field, for messages, such as `mine.yaml:6: meet`."""
-        return f"{self.root.line(field)}: {self.root.path_of(field)}"
+        """Return the location of a field in the file, for messages, such as `mine.yaml:6: meet`."""
+        line = self.root.line(field)
+        return f"{line}: {self.root.path_of(field)}"
 
 
 def draw(template: SpecTemplate, rng: np.random.Generator) -> ScenarioSpec:
-    """Make every choice of a scenario.
+    """Draw every open choice of a scenario.
 
-    It always has all four vehicle agents: followers that the file does not name are cars. If the file asks for an
-    exchange, ego and other change places in half of the draws; a four-way junction is then turned, so that ego comes
-    from the same arm as before.
+    The result always has all four vehicle agents: followers that the file does not name are cars.
+    If the file asks for an exchange, ego and other change places in half of the draws; a four-way
+    junction is then turned, so that ego comes from the same arm as before.
 
     Args:
-        template: from `read_spec` or `read_design`.
-        rng: random numbers; the same numbers give the same scenario.
+        template: Template from `read_spec` or `read_design`.
+        rng: Generator of random numbers; the same numbers give the same scenario.
     """
     spec = cast("ScenarioSpec", template.root.draw(rng))
-    named = cast("AllOf", template.root.fields["actors"]).items
+    actor_parts = cast("AllOf", template.root.fields["actors"]).items
     actors = [
         _completed(actor, cast("Part", part), spec, rng)
-        for actor, part in zip(spec.actors, named, strict=True)
+        for actor, part in zip(spec.actors, actor_parts, strict=True)
     ]
     roles = {actor.role for actor in actors}
     actors += [ActorSpec(role=role) for role in LEADERS if role not in roles]
     spec = replace(spec, actors=tuple(actors))
-    exchanged = spec.exchange and bool(rng.random() < 0.5)
-    return _exchanged(spec) if exchanged else replace(spec, exchange=False)
+    if spec.exchange and bool(rng.random() < 0.5):
+        return _exchanged(spec)
+    return replace(spec, exchange=False)
 
 
 def _completed(
     actor: ActorSpec, part: Part, spec: ScenarioSpec, rng: np.random.Generator
 ) -> ActorSpec:
-    """An actor with the values that follow from others."""
+    """Return an actor with the values that follow from others."""
     if actor.role == "pedestrian":
         return replace(actor, category="pedestrian")
     if "lane" in part.fields or spec.road.lanes == 1:
         return actor
-    return replace(actor, lane=int(rng.choice(usual_lanes(actor.turn, spec.road.lanes))))
+    lane = int(rng.choice(usual_lanes(actor.turn, spec.road.lanes)))
+    return replace(actor, lane=lane)
 
 
 def _exchanged(spec: ScenarioSpec) -> ScenarioSpec:
-    """The scenario with ego in the place of other, and other in the place of ego."""
-    came_from = spec.actor("ego").from_arm
-    actors = tuple(
-        replace(actor, role=_EXCHANGED.get(actor.role, actor.role)) for actor in spec.actors
-    )
+    """Return a scenario in which ego and other have changed places."""
+    previous_arm = spec.actor("ego").from_arm
+    actors = []
+    for actor in spec.actors:
+        role = _EXCHANGED_ROLES.get(actor.role, actor.role)
+        actors.append(replace(actor, role=role))
     meet = spec.meet
     if meet is not None:
-        first, second = (_EXCHANGED.get(role, role) for role in meet.actors)
-        meet = replace(meet, actors=(first, second))
-    spec = replace(spec, actors=actors, meet=meet, exchange=True)
-    comes_from = spec.actor("ego").from_arm
-    if spec.road.kind == "three-way" or came_from is None or comes_from is None:
+        roles = [_EXCHANGED_ROLES.get(role, role) for role in meet.actors]
+        meet = replace(meet, actors=(roles[0], roles[1]))
+    spec = replace(spec, actors=tuple(actors), meet=meet, exchange=True)
+    new_arm = spec.actor("ego").from_arm
+    if spec.road.kind == "three-way" or previous_arm is None or new_arm is None:
         return spec
-    return _turned(spec, ARMS.index(came_from) - ARMS.index(comes_from))
+    return _turned(spec, ARMS.index(previous_arm) - ARMS.index(new_arm))
 
 
 def _turned(spec: ScenarioSpec, quarters: int) -> ScenarioSpec:
-    """The scenario with all arms turned by so many quarter turns, counter-clockwise."""
+    """Return a scenario with all arms turned by a number of quarter turns, counter-clockwise."""
 
-    def turned(arm: Arm) -> Arm:
-        return ARMS[(ARMS.index(arm) + quarters) % len(ARMS)]
+    def turned_arm(arm: Arm) -> Arm:
+        index = ARMS.index(arm) + quarters
+        return ARMS[index % len(ARMS)]
 
     hump = spec.road.hump
     if hump is not None:
-        hump = replace(hump, arm=turned(hump.arm))
-    actors = tuple(
-        actor if actor.from_arm is None else replace(actor, from_arm=turned(actor.from_arm))
-        for actor in spec.actors
-    )
-    return replace(spec, road=replace(spec.road, hump=hump), actors=actors)
-
-
-# PyYAML reads so many in a few seconds.
-_MOST_CHARACTERS = 200_000
+        hump = replace(hump, arm=turned_arm(hump.arm))
+    actors = []
+    for actor in spec.actors:
+        arm = actor.from_arm
+        actors.append(actor if arm is None else replace(actor, from_arm=turned_arm(arm)))
+    return replace(spec, road=replace(spec.road, hump=hump), actors=tuple(actors))
 
 
 def read_spec(path: str | os.PathLike[str]) -> SpecTemplate:
-    """The scenario of a YAML file (docs/synth.md has all fields).
+    """Read the scenario of a YAML file (docs/synth.md has all fields).
 
     Raises:
-        ConfigError: there is no such file, or it is no possible scenario; the message names line, field and remedy.
+        ConfigError: There is no such file, or it is no possible scenario; the message names line,
+            field and remedy.
     """
     try:
         text = read_bytes(path_of(path), "spec").decode()
@@ -147,41 +156,39 @@ def read_spec(path: str | os.PathLike[str]) -> SpecTemplate:
             f"{path}: no such file; give the path of a scenario file (docs/synth.md)"
         ) from error
     except (OSError, ValueError) as error:
-        told = fault_text(error) if isinstance(error, OSError) else f"cannot be read ({error})"
-        raise ConfigError(f"{path}: {told}; give a YAML file in UTF-8") from error
-    if len(text) > _MOST_CHARACTERS:
+        fault = fault_text(error) if isinstance(error, OSError) else f"cannot be read ({error})"
+        raise ConfigError(f"{path}: {fault}; give a YAML file in UTF-8") from error
+    if len(text) > _MAX_CHARACTERS:
         raise ConfigError(
-            f"{path}: has more than {_MOST_CHARACTERS} characters; give a scenario file, it has a few dozen lines"
+            f"{path}: has more than {_MAX_CHARACTERS} characters; give a scenario file, "
+            "it has a few dozen lines"
         )
     return parse_spec(text, str(path))
 
 
 def parse_spec(text: str, source: str = "scenario") -> SpecTemplate:
-    """The scenario of a YAML text.
+    """Parse the scenario of a YAML text.
 
     Args:
-        text: the contents of a scenario file.
-        source: its name in error messages.
+        text: Contents of a scenario file.
+        source: Name of the file in error messages.
 
     Raises:
-        ConfigError: it is no possible scenario; the message names line, field and remedy.
+        ConfigError: It is no possible scenario; the message names line, field and remedy.
     """
     root = read_part(parse_yaml(text, source), ScenarioSpec)
     check_scenario_spec(root)
     return SpecTemplate(root)
 
 
-DESIGN_NUMBERS: Final = tuple(range(1, 13))
-"""1 to 6 at signalised junctions, 7 to 12 at unsignalised ones."""
-
-
 def design_text(number: int) -> str:
-    """The text of a design's scenario file.
+    """Return the text of a design's scenario file.
 
     Raises:
-        ConfigError: there is no such design.
+        ConfigError: There is no such design.
     """
-    for entry in files("deepaccident_devkit.plugins.synth.spec").joinpath("designs").iterdir():
+    folder = files("deepaccident_devkit.plugins.synth.spec").joinpath("designs")
+    for entry in folder.iterdir():
         if entry.name.startswith(f"{number:02d}_") and entry.name.endswith(".yaml"):
             return entry.read_text(encoding="utf-8")
     raise ConfigError(
@@ -191,5 +198,5 @@ def design_text(number: int) -> str:
 
 @cache
 def read_design(number: int) -> SpecTemplate:
-    """The scenario of a design; raises ConfigError if there is no such design."""
+    """Read the scenario of a design; raises ConfigError if there is no such design."""
     return parse_spec(design_text(number), f"design {number}")

@@ -1,4 +1,4 @@
-"""Values of a scenario file with their lines, checked against the types of the model's dataclasses."""
+"""Values of a scenario file with their lines, checked against the types of the model's classes."""
 
 from __future__ import annotations
 
@@ -41,11 +41,17 @@ _PLAIN_TAGS: Final = tuple(
     f"tag:yaml.org,2002:{name}"
     for name in ("map", "seq", "str", "int", "float", "bool", "null", "timestamp")
 )
-# YAML 1.1 also reads 010 as eight, 1:30 as ninety and 1_0 as ten, which few expect.
-_DECIMAL: Final = re.compile(
+# YAML 1.1 also reads 010 as eight, 1:30 as ninety and 1_0 as ten, which few people expect.
+_DECIMAL_PATTERN: Final = re.compile(
     r"[-+]?(\.inf|\.nan|(0|[1-9]\d*)(\.\d*)?([eE][-+]?\d+)?|\.\d+)", re.IGNORECASE
 )
-# The type of a plain word of YAML: a string, a number, a boolean, None; or something that fits no field.
+# Fields with one value, no range or list of choices: they decide which other fields are needed.
+_SINGLE_VALUE_FIELDS: Final = {"name", "design", "exchange", "role"}
+# All numbers of a scenario are smaller.
+_NUMBER_LIMIT: Final = 1e9
+# Largest number of characters of a value that a message shows.
+_MAX_VALUE_CHARACTERS: Final = 80
+# A plain word of YAML: a string, a number, a boolean, None; or something that fits no field.
 Scalar: TypeAlias = object
 
 
@@ -54,8 +60,8 @@ class Node:
     """A value and its line.
 
     Attributes:
-        where: such as `mine.yaml:12`; for the value of a key, the line of the key.
-        value: a scalar, the entries of a mapping, or the items of a list.
+        where: Line, such as `mine.yaml:12`; for the value of a key, the line of the key.
+        value: A scalar, the entries of a mapping, or the items of a list.
     """
 
     where: str
@@ -63,10 +69,15 @@ class Node:
 
 
 def parse_yaml(text: str, source: str) -> Node:
-    """The tree of a YAML text: one document, without tags, anchors or aliases; `source` is its name in messages.
+    """Parse the tree of a YAML text: one document, without tags, anchors or aliases.
 
-    Raises ConfigError, with line, path and remedy: it is empty or no YAML, or has a repeated key, a key that is no
-    word, an alias, a tag, or a number that is not decimal.
+    Args:
+        text: The YAML text.
+        source: Name of the text in messages.
+
+    Raises:
+        ConfigError: It is empty or no YAML, or has a repeated key, a key that is no word, an alias,
+            a tag, or a number that is not decimal; the message has line, path and remedy.
     """
     import yaml
 
@@ -77,105 +88,102 @@ def parse_yaml(text: str, source: str) -> Node:
             raise ConfigError(
                 f"{source}: is empty; write at least the actors ego and other (docs/synth.md)"
             )
-        return _Tree(source, loader).node(root, root.start_mark.line)
+        return _TreeReader(source, loader).node(root, root.start_mark.line)
     except yaml.MarkedYAMLError as error:
         raise ConfigError(f"{source}:{_fault(error)}") from error
     except (yaml.YAMLError, RecursionError) as error:
-        told = shortened(str(error).splitlines()[0])
-        raise ConfigError(f"{source}: no YAML: {told}; write it again as plain text") from error
+        fault = shortened(str(error).splitlines()[0])
+        raise ConfigError(f"{source}: no YAML: {fault}; write it again as plain text") from error
 
 
 def _fault(error: yaml.MarkedYAMLError) -> str:
-    """The message from the line's number on; PyYAML often finds a fault only some lines after the real one."""
+    """Return the message of an error, from the number of the line on.
+
+    PyYAML often finds a fault only some lines after the real one.
+    """
     marks = [mark for mark in (error.problem_mark, error.context_mark) if mark]
     lines = list(dict.fromkeys(mark.line + 1 for mark in marks)) or [1]
-    began = f", or line {lines[-1]}, where the faulty part begins" if len(lines) > 1 else ""
-    told = shortened(str(error.problem))
-    return f"{lines[0]}: no YAML: {told}; correct that line{began}: its quotes, brackets or indent (no tabs)"
+    beginning = ""
+    if len(lines) > 1:
+        beginning = f", or line {lines[-1]}, where the faulty part begins"
+    problem = shortened(str(error.problem))
+    return (
+        f"{lines[0]}: no YAML: {problem}; correct that line{beginning}: "
+        "its quotes, brackets or indent (no tabs)"
+    )
 
 
-class _Tree:
-    """Makes our nodes from PyYAML's, each once; a node that comes a second time is an alias."""
+class _TreeReader:
+    """Reader that makes nodes of PyYAML's nodes.
+
+    A node that comes a second time is an alias.
+    """
 
     def __init__(self, source: str, loader: yaml.SafeLoader) -> None:
         self._source = source
         self._loader = loader
-        self._seen: set[int] = set()
+        self._node_ids: set[int] = set()
 
     def node(self, raw: yaml.Node, line: int, path: str = "") -> Node:
-        """A node and all in it; `path` is its place, such as `actors[1]`."""
+        """Return a node with everything in it; `path` is its path, such as `actors[1]`."""
         import yaml
 
         where = f"{self._source}:{line + 1}"
-        if id(raw) in self._seen:
+        if id(raw) in self._node_ids:
             raise self._error(line, path, "aliases (*name) are not read here; write the value out")
-        self._seen.add(id(raw))
+        self._node_ids.add(id(raw))
         if not raw.tag.startswith(_PLAIN_TAGS):
-            raise self._error(
-                line, path, f"tags ({shortened(raw.tag)}) are not read here; leave the tag out"
-            )
+            sentence = f"tags ({shortened(raw.tag)}) are not read here; leave the tag out"
+            raise self._error(line, path, sentence)
         if isinstance(raw, yaml.MappingNode):
             return Node(where, self._entries(raw, path))
         if isinstance(raw, yaml.SequenceNode):
-            items = enumerate(raw.value)
-            return Node(
-                where,
-                tuple(self.node(item, item.start_mark.line, f"{path}[{k}]") for k, item in items),
-            )
+            items = [
+                self.node(item, item.start_mark.line, f"{path}[{index}]")
+                for index, item in enumerate(raw.value)
+            ]
+            return Node(where, tuple(items))
         return Node(where, self._scalar(raw, line, path))
 
     def _scalar(self, raw: yaml.Node, line: int, path: str) -> Scalar:
+        """Return the value of a plain word; raises ConfigError."""
         try:
             value = self._loader.construct_object(raw)
-        except (
-            ValueError,
-            LookupError,
-            AttributeError,
-            OverflowError,
-        ) as error:  # of PyYAML, if a tag does not fit
-            told = shortened(str(error))
+        except (ValueError, LookupError, AttributeError, OverflowError) as error:
+            # PyYAML raises them if a tag does not fit.
+            fault = shortened(str(error))
             sentence = (
-                f"{raw.value[:40]!r} cannot be read ({told}); put it in quotes if it is a word"
+                f"{raw.value[:40]!r} cannot be read ({fault}); put it in quotes if it is a word"
             )
             raise self._error(line, path, sentence) from error
-        if (
-            isinstance(value, int | float)
-            and not isinstance(value, bool)
-            and not _DECIMAL.fullmatch(raw.value)
-        ):
-            found = f"{shortened(raw.value)!r} is not a plain decimal number"
-            raise self._error(
-                line, path, f"{found}; write one, or put it in quotes if it is a word"
+        is_number = isinstance(value, int | float) and not isinstance(value, bool)
+        if is_number and not _DECIMAL_PATTERN.fullmatch(raw.value):
+            sentence = (
+                f"{shortened(raw.value)!r} is not a plain decimal number; "
+                "write one, or put it in quotes if it is a word"
             )
+            raise self._error(line, path, sentence)
         return value
 
     def _entries(self, raw: yaml.MappingNode, path: str) -> dict[str, Node]:
+        """Return the entries of a mapping by key; raises ConfigError."""
         entries: dict[str, Node] = {}
         for raw_key, raw_value in raw.value:
-            key, line = raw_key.value, raw_key.start_mark.line
+            key = raw_key.value
+            line = raw_key.start_mark.line
             if not isinstance(key, str):
-                raise self._error(
-                    line,
-                    path,
-                    "expected a key that is a word, found a list or mapping; write a word",
-                )
-            inner = f"{path}.{key}" if path else key
+                sentence = "expected a key that is a word, found a list or mapping; write a word"
+                raise self._error(line, path, sentence)
+            entry_path = f"{path}.{key}" if path else key
             if key in entries:
-                raise self._error(line, inner, "is there twice; keep one of them")
-            entries[key] = self.node(raw_value, line, inner)
+                raise self._error(line, entry_path, "is there twice; keep one of them")
+            entries[key] = self.node(raw_value, line, entry_path)
         return entries
 
     def _error(self, line: int, path: str, sentence: str) -> ConfigError:
+        """Return the error for a line and a path."""
         parts = (f"{self._source}:{line + 1}", shortened(path), sentence)
         return ConfigError(": ".join(part for part in parts if part))
-
-
-# Fields with one value, no range or list of choices: they decide which other fields the file needs.
-_SETTLED = {"name", "design", "exchange", "role"}
-# All numbers of a scenario are smaller.
-_MOST = 1e9
-# The most characters of a found value that a message shows.
-_SHOWN_LENGTH = 80
 
 
 @dataclass(frozen=True, slots=True)
@@ -184,11 +192,11 @@ class FieldType:
 
     Attributes:
         base: `str`, `bool`, `int`, `float`, a dataclass, or `tuple` for a list.
-        optional: whether it can be null.
-        words: the possible words; empty for a free text.
-        bounds: the bounds of a number.
-        items: of a list, the type of its items.
-        length: of a list, its length; None if any length is possible.
+        optional: Whether the value can be null.
+        words: Possible words; empty for a free text.
+        bounds: Bounds of a number.
+        items: Type of the items of a list.
+        length: Length of a list; None if any length is possible.
     """
 
     base: type[Any]
@@ -200,53 +208,63 @@ class FieldType:
 
 
 def field_types(kind: type[Any]) -> dict[str, FieldType]:
-    """Field name → type, of a dataclass of the model."""
+    """Return the types of a model dataclass's fields, by name."""
     hints = get_type_hints(kind, include_extras=True)
     return {field.name: _field_type(hints[field.name]) for field in dataclasses.fields(kind)}
 
 
 def required_fields(kind: type[Any]) -> tuple[str, ...]:
-    """The fields of a dataclass that have no default."""
+    """Return the names of a dataclass's fields that have no default."""
     missing = dataclasses.MISSING
-    fields = dataclasses.fields(kind)
-    return tuple(
-        field.name
-        for field in fields
-        if field.default is missing and field.default_factory is missing
-    )
+    names = []
+    for field in dataclasses.fields(kind):
+        if field.default is missing and field.default_factory is missing:
+            names.append(field.name)
+    return tuple(names)
 
 
 def read_part(node: Node, kind: type[Any], path: str = "") -> Part:
-    """A part of a scenario, from a mapping.
+    """Read a part of a scenario from a mapping.
 
-    Raises ConfigError: it is no mapping, has an unknown key, lacks a required one, or a value does not fit its field.
+    Args:
+        node: The mapping.
+        kind: Dataclass of the part.
+        path: Path of the part in the file, such as `actors[1]`; empty for the whole file.
+
+    Raises:
+        ConfigError: It is no mapping, has an unknown key, lacks a required one, or a value does not
+            fit its field.
     """
     entries = node.value
     if not isinstance(entries, Mapping):
-        raise _wrong(node, path or "the file", "keys and values", node)
-    types_of = field_types(kind)
-    names = {key_of(name): name for name in types_of}
+        raise _mismatch(node, path or "the file", "keys and values")
+    types_by_name = field_types(kind)
+    names_by_key = {key_of(name): name for name in types_by_name}
     prefix = f"{path}." if path else ""
     for key, entry in entries.items():
-        if key not in names:
-            possible = f"possible: {', '.join(names)}{meant_text(key, names)}"
+        if key not in names_by_key:
+            possible = f"possible: {', '.join(names_by_key)}{meant_text(key, names_by_key)}"
             raise ConfigError(f"{entry.where}: {prefix}{shortened(key)}: no such field; {possible}")
     for name in required_fields(kind):
         if key_of(name) not in entries:
             raise ConfigError(f"{node.where}: {prefix}{key_of(name)}: is missing; add it")
-    present = [(key, name) for key, name in names.items() if key in entries]
-    fields = {
-        name: _read(entries[key], types_of[name], prefix + key, settled=name in _SETTLED)
-        for key, name in present
-    }
-    return Part(kind, node.where, path, fields, {name: entries[key].where for key, name in present})
+    fields = {}
+    lines = {}
+    for key, name in names_by_key.items():
+        if key in entries:
+            single = name in _SINGLE_VALUE_FIELDS
+            fields[name] = _read(entries[key], types_by_name[name], prefix + key, single=single)
+            lines[name] = entries[key].where
+    return Part(kind, node.where, path, fields, lines)
 
 
 def _field_type(hint: Any) -> FieldType:
-    origin, arguments = get_origin(hint), get_args(hint)
+    """Return the field type that a type hint describes."""
+    origin = get_origin(hint)
+    arguments = get_args(hint)
     if origin in (Union, types.UnionType):
-        (inner,) = (argument for argument in arguments if argument is not type(None))
-        return dataclasses.replace(_field_type(inner), optional=True)
+        (member,) = (argument for argument in arguments if argument is not type(None))
+        return dataclasses.replace(_field_type(member), optional=True)
     if origin is Annotated:
         return dataclasses.replace(_field_type(arguments[0]), bounds=arguments[1])
     if origin is Literal:
@@ -257,112 +275,134 @@ def _field_type(hint: Any) -> FieldType:
     return FieldType(hint)
 
 
-def _read(node: Node, wanted: FieldType, path: str, *, settled: bool = False) -> FieldChoice:
-    if wanted.base is tuple:
-        return _read_list(node, wanted, path)
+def _read(node: Node, field_type: FieldType, path: str, *, single: bool) -> FieldChoice:
+    """Read a field with its open choices; raises ConfigError.
+
+    Args:
+        node: Value of the field.
+        field_type: Type of the field.
+        path: Path of the field, for messages.
+        single: Whether the field must have one value, no range or list of choices.
+    """
+    if field_type.base is tuple:
+        return _read_list(node, field_type, path)
     if not isinstance(node.value, tuple):
-        return _read_one(node, wanted, path)
-    if settled:
-        raise _wrong(node, path, f"{_described(wanted)}, one value and not several", node)
-    if wanted.base in (int, float):
-        return _read_range(node, wanted, path)
+        return _read_value(node, field_type, path)
+    if single:
+        raise _mismatch(node, path, f"{_described(field_type)}, one value and not several")
+    if field_type.base in (int, float):
+        return _read_range(node, field_type, path)
     if not node.value:
-        raise _wrong(node, path, _described(wanted), node)
-    return OneOf(
-        tuple(_read_one(item, wanted, f"{path}[{k}]") for k, item in enumerate(node.value))
+        raise _mismatch(node, path, _described(field_type))
+    return OneOf(_read_items(node.value, field_type, path))
+
+
+def _read_list(node: Node, field_type: FieldType, path: str) -> FieldChoice:
+    """Read a list with every item in it; raises ConfigError."""
+    item_type = field_type.items
+    if item_type is None or not isinstance(node.value, tuple):
+        raise _mismatch(node, path, _described(field_type))
+    if field_type.length is not None and len(node.value) != field_type.length:
+        raise _mismatch(node, path, f"a list of {field_type.length}")
+    return AllOf(_read_items(node.value, item_type, path))
+
+
+def _read_items(
+    nodes: tuple[Node, ...], item_type: FieldType, path: str
+) -> tuple[FieldChoice, ...]:
+    """Read the items of a list; raises ConfigError."""
+    return tuple(
+        _read_value(node, item_type, f"{path}[{index}]") for index, node in enumerate(nodes)
     )
 
 
-def _read_list(node: Node, wanted: FieldType, path: str) -> FieldChoice:
-    items = wanted.items
-    if items is None or not isinstance(node.value, tuple):
-        raise _wrong(node, path, _described(wanted), node)
-    if wanted.length is not None and len(node.value) != wanted.length:
-        raise _wrong(node, path, f"a list of {wanted.length}", node)
-    return AllOf(tuple(_read_one(item, items, f"{path}[{k}]") for k, item in enumerate(node.value)))
-
-
-def _read_range(node: Node, wanted: FieldType, path: str) -> FieldChoice:
+def _read_range(node: Node, field_type: FieldType, path: str) -> FieldChoice:
+    """Read a range of numbers; raises ConfigError."""
     ends = node.value
     if not isinstance(ends, tuple) or len(ends) != 2:
-        raise _wrong(node, path, f"{_described(wanted)}, or [low, high]", node)
-    low, high = (_number(end, wanted, f"{path}[{k}]") for k, end in enumerate(ends))
+        raise _mismatch(node, path, f"{_described(field_type)}, or [low, high]")
+    low = _number(ends[0], field_type, f"{path}[0]")
+    high = _number(ends[1], field_type, f"{path}[1]")
     if low > high:
         raise ConfigError(
-            f"{node.where}: {path}: expected [low, high], found [{low:g}, {high:g}]; exchange the two"
+            f"{node.where}: {path}: expected [low, high], found [{low:g}, {high:g}]; "
+            "exchange the two"
         )
-    return Range(low, high, wanted.base is int)
+    return Range(low, high, field_type.base is int)
 
 
-def _read_one(node: Node, wanted: FieldType, path: str) -> FieldChoice:
+def _read_value(node: Node, field_type: FieldType, path: str) -> FieldChoice:
+    """Read one value; raises ConfigError."""
     value = node.value
-    if value is None and wanted.optional:
+    if value is None and field_type.optional:
         return Fixed(None)
-    if dataclasses.is_dataclass(wanted.base):
-        return read_part(node, wanted.base, path)
-    if wanted.base in (int, float):
-        return Fixed(_number(node, wanted, path))
-    value = spelled(value, wanted.words)
-    fits = value in wanted.words if wanted.words else isinstance(value, wanted.base)
+    if dataclasses.is_dataclass(field_type.base):
+        return read_part(node, field_type.base, path)
+    if field_type.base in (int, float):
+        return Fixed(_number(node, field_type, path))
+    words = field_type.words
+    value = spelled(value, words)
+    fits = value in words if words else isinstance(value, field_type.base)
     if not fits:
-        raise _wrong(
-            node,
-            path,
-            _described(wanted),
-            node,
-            _remedy(wanted, value) + meant_text(value, wanted.words),
-        )
+        remedy = _remedy(field_type, value) + meant_text(value, words)
+        raise _mismatch(node, path, _described(field_type), remedy)
     return Fixed(value)
 
 
-def _number(node: Node, wanted: FieldType, path: str) -> float:
-    value, bounds = node.value, wanted.bounds
-    possible = (int,) if wanted.base is int else (int, float)
-    if isinstance(value, bool) or not isinstance(value, possible) or not abs(value) < _MOST:
-        raise _wrong(node, path, _described(wanted), node, _remedy(wanted, value))
+def _number(node: Node, field_type: FieldType, path: str) -> float:
+    """Read a number within its bounds; raises ConfigError."""
+    value = node.value
+    bounds = field_type.bounds
+    possible = (int,) if field_type.base is int else (int, float)
+    if isinstance(value, bool) or not isinstance(value, possible) or not abs(value) < _NUMBER_LIMIT:
+        raise _mismatch(node, path, _described(field_type), _remedy(field_type, value))
     if bounds is not None and not bounds.low <= value <= bounds.high:
-        raise _wrong(node, path, _described(wanted), node)
-    return wanted.base(value)  # type: ignore[no-any-return]
+        raise _mismatch(node, path, _described(field_type))
+    return field_type.base(value)  # type: ignore[no-any-return]
 
 
-def _wrong(node: Node, path: str, expected: str, found: Node, remedy: str = "") -> ConfigError:
-    shown = _shown(found)
-    clipped = shown if len(shown) <= _SHOWN_LENGTH else f"{shown[: _SHOWN_LENGTH - 1]}…"
-    return ConfigError(f"{node.where}: {path}: expected {expected}, found {clipped}{remedy}")
+def _mismatch(node: Node, path: str, expected: str, remedy: str = "") -> ConfigError:
+    """Return the error for a value that does not fit its field."""
+    value = _value_text(node)
+    if len(value) > _MAX_VALUE_CHARACTERS:
+        value = f"{value[: _MAX_VALUE_CHARACTERS - 1]}…"
+    return ConfigError(f"{node.where}: {path}: expected {expected}, found {value}{remedy}")
 
 
-def _remedy(wanted: FieldType, value: Scalar) -> str:
-    """The remedy if only quotes are wrong or missing, or if YAML reads a number such as `1e1` as a text."""
-    if (
-        wanted.base is str
-        and not wanted.words
-        and not isinstance(value, Mapping | tuple)
-        and value is not None
-    ):
+def _remedy(field_type: FieldType, value: Scalar) -> str:
+    """Return the remedy for wrong or missing quotes, or for a number that YAML reads as a text.
+
+    YAML reads a number such as `1e1` as a text. The remedy is empty for other faults.
+    """
+    free_text = field_type.base is str and not field_type.words
+    if free_text and not isinstance(value, Mapping | tuple) and value is not None:
         return "; put it in quotes"
-    if wanted.base in (int, float) and isinstance(value, str):
+    if field_type.base in (int, float) and isinstance(value, str):
         return "; write a decimal number, without quotes and without e"
-    return "; leave the quotes out" if wanted.base is bool and value in ("true", "false") else ""
+    if field_type.base is bool and value in ("true", "false"):
+        return "; leave the quotes out"
+    return ""
 
 
-def _described(wanted: FieldType) -> str:
-    """A type in words."""
-    if wanted.words:
-        return f"one of {', '.join(wanted.words)}"
-    if wanted.base is tuple and wanted.items is not None:
-        return (
-            f"a list, as [{', '.join(wanted.items.words[:2])}]" if wanted.items.words else "a list"
-        )
+def _described(field_type: FieldType) -> str:
+    """Return a type in words."""
+    if field_type.words:
+        return f"one of {', '.join(field_type.words)}"
+    if field_type.base is tuple and field_type.items is not None:
+        words = field_type.items.words
+        return f"a list, as [{', '.join(words[:2])}]" if words else "a list"
     names = {str: "a text", bool: "true or false", int: "a whole number", float: "a number"}
-    text = names.get(wanted.base, "keys and values")
-    return f"{text}, {wanted.bounds}" if wanted.bounds else text
+    text = names.get(field_type.base, "keys and values")
+    return f"{text}, {field_type.bounds}" if field_type.bounds else text
 
 
-def _shown(node: Node) -> str:
-    if isinstance(node.value, Mapping):
-        return f"the keys {', '.join(node.value)}" if node.value else "nothing"
-    if isinstance(node.value, tuple):
-        return f"[{', '.join(_shown(item) for item in node.value)}]"
-    if node.value is None:
+def _value_text(node: Node) -> str:
+    """Return a value as messages show it."""
+    value = node.value
+    if isinstance(value, Mapping):
+        return f"the keys {', '.join(value)}" if value else "nothing"
+    if isinstance(value, tuple):
+        return f"[{', '.join(_value_text(item) for item in value)}]"
+    if value is None:
         return "nothing"
-    return repr(node.value) if isinstance(node.value, str) else str(node.value)
+    return repr(value) if isinstance(value, str) else str(value)

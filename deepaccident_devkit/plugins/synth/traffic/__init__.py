@@ -1,1 +1,1 @@
-"""What moves: road users that drive, follow, yield and walk, simulated at 50 Hz until something happens."""
+"""The moving road users: they drive, follow, yield and walk, simulated at 50 Hz."""

@@ -1,4 +1,4 @@
-"""Road users: their paths, how fast they drive (intelligent driver model), and how wheels move them (bicycle model).
+"""Road users: their paths, their speeds (intelligent driver model), their wheels (bicycle model).
 
 The paths of all road users are in one table, so that one look-up serves all of them.
 """
@@ -16,54 +16,56 @@ from deepaccident_devkit.plugins.synth.roads.paths import Path, through
 from deepaccident_devkit.plugins.synth.spec.model import Role, Rule, Side
 from deepaccident_devkit.support.arrays import BoolArray, FloatArray, IntArray
 
-# Length of a simulated step, seconds.
 PERIOD = 0.02
-# Drivers look and decide once in so many steps: every tenth of a second.
+"""Length of a simulated step, seconds."""
 DECISION_STEPS = 5
-# Distance of the axles as a share of the body's length.
+"""Steps from one decision of a driver to the next: drivers decide every tenth of a second."""
 WHEELBASE = 0.6
+"""Distance between the axles as a share of the body's length."""
 MAX_STEER = np.deg2rad(38.0)
 _MAX_TANGENT = np.tan(MAX_STEER)
-# How fast the front wheels can turn, radians a second.
 MAX_STEER_RATE = 0.6
-# The hardest braking on dry asphalt, m/s².
+"""Fastest turn of the front wheels, radians a second."""
 HARDEST_BRAKING = 8.0
-# How far ahead the steering aims to be on the path again: metres, and seconds of driving that are added to them.
-_LOOK_AHEAD = (2.5, 0.25)
-# Metres between the table's points.
-_TABLE_SPACING = 0.25
-# Metres that the table goes straight on after a path's end.
-_BEYOND = 80.0
-# m/s² with which drivers brake before a bend.
+"""The hardest braking on dry asphalt, m/s²."""
+# The steering aims to be on the path again after this distance: a constant, and one for each m/s.
+_LOOK_AHEAD_M = 2.5
+_LOOK_AHEAD_S = 0.25
+_TABLE_SPACING_M = 0.25
+# Length for which the table goes straight on after a path's end.
+_EXTENSION_M = 80.0
+# Braking of drivers before a bend, m/s².
 _BEND_BRAKING = 1.8
-# 1/s: the braking for each m/s above the allowed speed.
-_STIFFNESS = 2.5
-# The hardest braking near standstill, m/s², and how much harder it can be for each m/s of speed.
-_GENTLE_STOP = (3.0, 1.0)
-# Metres: a smaller gap counts as this.
-_NO_GAP = 0.1
-# Metres before the stop line, and metres past the junction, between which paths can cross.
-_SPAN = (4.0, 10.0)
-# Metres from the lane's middle to the right, where cyclists ride.
-_CYCLIST_OFFSET = 1.1
-# Metres from the kerb to where a pedestrian waits to step onto the road.
-_KERB_ROOM = 0.7
+# Braking for each m/s above the allowed speed, 1/s.
+_SPEED_STIFFNESS = 2.5
+# The hardest braking near standstill, m/s², and its increase for each m/s of speed.
+_STANDSTILL_BRAKING = 3.0
+_BRAKING_INCREASE = 1.0
+# A smaller gap counts as this.
+_MIN_GAP_M = 0.1
+# Paths can cross from this distance before the stop line to this distance past the junction.
+_MARGIN_BEFORE_STOP_LINE_M = 4.0
+_MARGIN_AFTER_EXIT_M = 10.0
+# Distance from the lane's middle to the right, where cyclists ride.
+_CYCLIST_OFFSET_M = 1.1
+# Distance from the kerb to the point at which a pedestrian waits to step onto the road.
+_KERB_DISTANCE_M = 0.7
 WALKER = "pedestrian"
-# Where a part of a path begins and ends, metres along it, and the most speed there, m/s.
 Stretch = tuple[float, float, float]
+"""Start and end of a part of a path, metres along it, and the highest speed there, m/s."""
 
 
 @dataclass(slots=True, eq=False)
-class Wheels:
-    """Where the road users are, one row each; the state that the simulation steps.
+class MotionState:
+    """The state of all road users that the simulation steps, one row each.
 
     Attributes:
-        x: (A,) x of the middle of the rear axle, metres.
-        y: (A,) y of the same point, metres.
-        yaw: (A,) radians.
-        speed: (A,) speed of the rear axle, m/s, at least 0.
-        steer: (A,) angle of the front wheels, radians, positive to the left.
-        along: (A,) how far the rear axle is along its path, metres.
+        x: Positions x of the middle of the rear axle, shape (A,), metres.
+        y: Positions y of the same point, shape (A,), metres.
+        yaw: Headings, shape (A,), radians.
+        speed: Speeds of the rear axle, shape (A,), m/s, at least 0.
+        steer: Angles of the front wheels, shape (A,), radians, positive to the left.
+        along: Positions of the rear axle along its path, shape (A,), metres.
     """
 
     x: FloatArray
@@ -74,60 +76,76 @@ class Wheels:
     along: FloatArray
 
 
-def step(
-    wheels: Wheels, acceleration: FloatArray, on_path: FloatArray, wheelbase: FloatArray
+def step_motion(
+    state: MotionState, acceleration: FloatArray, on_path: FloatArray, wheelbase: FloatArray
 ) -> None:
-    """Move all road users by one period, in place; for those without wheels only `speed` and `along` are valid.
+    """Move all road users by one period, in place.
 
-    The acceleration is (A,) m/s², `on_path` (4, A) x, y, yaw, curvature of the paths at `wheels.along`, the wheelbase
-    (A,) metres, infinite for those without wheels.
+    For road users without wheels only `speed` and `along` are valid.
+
+    Args:
+        state: State of the road users.
+        acceleration: Accelerations, shape (A,), m/s².
+        on_path: Rows x, y, yaw, curvature of the paths at `state.along`, shape (4, A).
+        wheelbase: Wheelbases, shape (A,), metres, infinite for road users without wheels.
     """
-    distance = np.maximum(wheels.speed + acceleration * (PERIOD / 2), 0.0) * PERIOD
-    wheels.speed = np.maximum(wheels.speed + acceleration * PERIOD, 0.0)
-    lateral, turned = _off_path(wheels, on_path)
-    wheels.along = wheels.along + distance * np.cos(turned) / (1.0 - on_path[3] * lateral)
-    change = _wanted_steer(wheels.speed, lateral, turned, on_path[3], wheelbase) - wheels.steer
-    room = MAX_STEER_RATE * PERIOD
-    wheels.steer = wheels.steer + np.minimum(np.maximum(change, -room), room)
-    turn = distance * np.tan(wheels.steer) / wheelbase
-    middle = wheels.yaw + turn / 2
-    wheels.x = wheels.x + distance * np.cos(middle)
-    wheels.y = wheels.y + distance * np.sin(middle)
-    wheels.yaw = wheels.yaw + turn
+    distance = np.maximum(state.speed + acceleration * (PERIOD / 2), 0.0) * PERIOD
+    state.speed = np.maximum(state.speed + acceleration * PERIOD, 0.0)
+    lateral, turned = _path_offsets(state, on_path)
+    curvature = on_path[3]
+    state.along = state.along + distance * np.cos(turned) / (1.0 - curvature * lateral)
+    steer = _target_steer(state.speed, lateral, turned, curvature, wheelbase)
+    change = steer - state.steer
+    max_change = MAX_STEER_RATE * PERIOD
+    state.steer = state.steer + np.minimum(np.maximum(change, -max_change), max_change)
+    turn = distance * np.tan(state.steer) / wheelbase
+    mean_yaw = state.yaw + turn / 2
+    state.x = state.x + distance * np.cos(mean_yaw)
+    state.y = state.y + distance * np.sin(mean_yaw)
+    state.yaw = state.yaw + turn
 
 
-def _off_path(wheels: Wheels, on_path: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """How far each is to the left of its path, metres, and by how much it is turned to the left of it, radians."""
+def _path_offsets(state: MotionState, on_path: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return how far each road user is to the left of its path, and turned to the left of it.
+
+    Returns:
+        Distances (A,) in metres and angles (A,) in radians.
+    """
     x, y, yaw, _ = on_path
-    lateral = np.cos(yaw) * (wheels.y - y) - np.sin(yaw) * (wheels.x - x)
-    turned = (wheels.yaw - yaw + np.pi) % (2 * np.pi) - np.pi
+    dx = state.x - x
+    dy = state.y - y
+    lateral = np.cos(yaw) * dy - np.sin(yaw) * dx
+    turned = (state.yaw - yaw + np.pi) % (2 * np.pi) - np.pi
     return lateral, turned
 
 
-def _wanted_steer(
+def _target_steer(
     speed: FloatArray,
     lateral: FloatArray,
     turned: FloatArray,
     curvature: FloatArray,
     wheelbase: FloatArray,
 ) -> FloatArray:
-    """The steering angle that follows the path and returns to it, critically damped over the distance ahead."""
-    ahead = _LOOK_AHEAD[0] + _LOOK_AHEAD[1] * speed
-    wanted = curvature - lateral / ahead**2 - 2 * turned / ahead
-    most = _MAX_TANGENT / wheelbase
-    return np.asarray(
-        np.arctan(
-            np.where(wheelbase < np.inf, wheelbase, 0.0)
-            * np.minimum(np.maximum(wanted, -most), most)
-        )
-    )
+    """Return the steering angle that follows the path and returns to it.
+
+    The return is critically damped over the distance ahead.
+    """
+    ahead = _LOOK_AHEAD_M + _LOOK_AHEAD_S * speed
+    target = curvature - lateral / ahead**2 - 2 * turned / ahead
+    max_curvature = _MAX_TANGENT / wheelbase
+    bounded = np.minimum(np.maximum(target, -max_curvature), max_curvature)
+    finite_wheelbase = np.where(wheelbase < np.inf, wheelbase, 0.0)
+    return np.asarray(np.arctan(finite_wheelbase * bounded))
 
 
 class Tracks:
     """Points along each path, and the speed that its bends allow; one row for each road user.
 
-    `lateral` is (A,) m/s², the most sideways acceleration that each accepts in a bend. Those with `stops` (A,) stop at
-    the path's end; others go straight on. `paces` has each one's own stretches, before which nobody brakes in advance.
+    Args:
+        paths: Path of each road user; it goes straight on after its end.
+        lateral: Highest sideways accelerations in bends, shape (A,), m/s².
+        stops: Truth values, shape (A,): whether the road user stops at the path's end.
+        paces: Slow stretches of each road user, before which nobody brakes in advance.
     """
 
     def __init__(
@@ -137,71 +155,90 @@ class Tracks:
         stops: BoolArray,
         paces: Sequence[Sequence[Stretch]] = (),
     ) -> None:
-        along = np.arange(0.0, max(path.length for path in paths) + _BEYOND, _TABLE_SPACING)
-        distinct = {id(path): path for path in paths}
-        order = {key: row for row, key in enumerate(distinct)}
-        points = np.stack([np.stack(path.at(along), axis=-1) for path in distinct.values()])
-        rows = np.array([order[id(path)] for path in paths])
-        self._points, self._distinct = points, rows  # (P, K, 4), (A,)
+        longest = max(path.length for path in paths)
+        along = np.arange(0.0, longest + _EXTENSION_M, _TABLE_SPACING_M)
+        distinct_paths = {id(path): path for path in paths}
+        row_by_path = {key: row for row, key in enumerate(distinct_paths)}
+        tables = [np.stack(path.at(along), axis=-1) for path in distinct_paths.values()]
+        points = np.stack(tables)
+        rows = np.array([row_by_path[id(path)] for path in paths])
+        self._points = points  # (P, K, 4)
+        self._path_rows = rows  # (A,)
         ends = np.where(stops, [path.length for path in paths], np.inf)
         self._allowed = _allowed_speed(along, points[rows, :, 3], lateral, ends)
         for row, pace in enumerate(paces):
-            for begin, end, most in pace:
+            for begin, end, max_speed in pace:
                 cells = slice(*np.searchsorted(along, (begin, end)))
-                self._allowed[row, cells] = np.minimum(self._allowed[row, cells], most)
-        self._flat = np.ascontiguousarray(points.reshape(-1, 4).T)
-        self._first = rows * len(along)
-        self._row = np.arange(len(paths))
-        self._last = len(along) - 2
+                self._allowed[row, cells] = np.minimum(self._allowed[row, cells], max_speed)
+        self._flat_points = np.ascontiguousarray(points.reshape(-1, 4).T)
+        self._flat_offsets = rows * len(along)
+        self._rows = np.arange(len(paths))
+        self._last_cell = len(along) - 2
 
     def at(self, along: FloatArray) -> FloatArray:
-        """(4, A) x, y, yaw, curvature of the paths at `along` (A,) metres from their starts."""
-        low, share = self._cell(along)
-        flat = self._first + low
-        before = self._flat[:, flat]
-        return np.asarray(before + share * (self._flat[:, flat + 1] - before))
+        """Return rows x, y, yaw, curvature (4, A) of the paths at `along` (A,), in metres."""
+        cell, share = self._cell(along)
+        flat = self._flat_offsets + cell
+        before = self._flat_points[:, flat]
+        after = self._flat_points[:, flat + 1]
+        return np.asarray(before + share * (after - before))
 
-    def near(self, rows: IntArray, along: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """x, y, yaw, curvature (P, K, 4) of the table's points nearest to `along` (P, K) on the paths of `rows` (P,).
+    def points_near(self, rows: IntArray, along: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the points of the table that are nearest to positions on some paths.
 
-        Second, how far along they are (P, K), metres.
+        Args:
+            rows: Rows of the road users with the paths, shape (P,).
+            along: Positions along each path, shape (P, K), metres.
+
+        Returns:
+            x, y, yaw, curvature (P, K, 4) of the points, and their positions (P, K) along the
+            paths, metres.
         """
-        cells = np.rint(along / _TABLE_SPACING).astype(np.int64).clip(0, self._last)
-        return np.asarray(self._points[self._distinct[rows, None], cells]), cells * _TABLE_SPACING
+        nearest = np.rint(along / _TABLE_SPACING_M).astype(np.int64)
+        cells = nearest.clip(0, self._last_cell)
+        points = self._points[self._path_rows[rows, None], cells]
+        return np.asarray(points), cells * _TABLE_SPACING_M
 
     def allowed_speed(self, along: FloatArray) -> FloatArray:
-        """The highest speed (A,) m/s from which drivers can brake comfortably for the bends ahead."""
-        low, _ = self._cell(along)
-        return np.asarray(self._allowed[self._row, low])
+        """Return the highest speeds, (A,) m/s, that allow to brake gently for the bends ahead."""
+        cell, _ = self._cell(along)
+        return np.asarray(self._allowed[self._rows, cell])
 
     def _cell(self, along: FloatArray) -> tuple[IntArray, FloatArray]:
-        place = along / _TABLE_SPACING
-        low = np.minimum(np.maximum(place, 0.0), self._last).astype(np.int64)
-        return low, place - low
+        """Return the cells (A,) of the table at positions (A,), and the shares of them passed."""
+        position = along / _TABLE_SPACING_M
+        cell = np.minimum(np.maximum(position, 0.0), self._last_cell).astype(np.int64)
+        return cell, position - cell
 
 
 def _allowed_speed(
     along: FloatArray, curvature: FloatArray, lateral: FloatArray, ends: FloatArray
 ) -> FloatArray:
-    """(A, K) m/s: so slow that each enters the bends ahead slowly enough, and stops at its path's end if it must."""
+    """Return speeds (A, K), m/s, that let each enter the bends ahead slowly enough.
+
+    Each also stops at its path's end, where `ends` (A,), in metres, is finite.
+    """
     bend = lateral[:, None] / np.maximum(np.abs(curvature), 1e-4)
     bend[along >= ends[:, None]] = 0.0
-    lead = bend + 2 * _BEND_BRAKING * along
-    least = np.minimum.accumulate(lead[:, ::-1], axis=1)[:, ::-1]
-    return np.sqrt(np.maximum(least - 2 * _BEND_BRAKING * along, 0.0))
+    braking_term = 2 * _BEND_BRAKING * along
+    lead = bend + braking_term
+    lowest_ahead = np.minimum.accumulate(lead[:, ::-1], axis=1)[:, ::-1]
+    return np.sqrt(np.maximum(lowest_ahead - braking_term, 0.0))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Temper:
-    """How road users drive, one row each (Treiber, Hennecke and Helbing 2000 name the parameters).
+class IdmParameters:
+    """Parameters of the intelligent driver model, one row for each road user.
+
+    Treiber, Hennecke and Helbing 2000 name the parameters.
 
     Attributes:
-        max_speed: (A,) speed on a free straight road, m/s.
-        acceleration: (A,) acceleration from standstill, m/s².
-        braking: (A,) comfortable braking, m/s².
-        slowing: (A,) the hardest braking to the speed that a bend allows, m/s².
-        time_gap: (A,) seconds to the road user ahead.
-        min_gap: (A,) metres, bumper to bumper, when standing.
+        max_speed: Speeds on a free straight road, shape (A,), m/s.
+        acceleration: Accelerations from standstill, shape (A,), m/s².
+        braking: Comfortable braking, shape (A,), m/s².
+        slowing: The hardest braking to the speed that a bend allows, shape (A,), m/s².
+        time_gap: Time gaps to the road user ahead, shape (A,), seconds.
+        min_gap: Gaps when standing, bumper to bumper, shape (A,), metres.
     """
 
     max_speed: FloatArray
@@ -212,111 +249,154 @@ class Temper:
     min_gap: FloatArray
 
 
-def free_acceleration(temper: Temper, speed: FloatArray, allowed: FloatArray) -> FloatArray:
-    """The acceleration (A,) m/s² at a speed if nobody is in the way and the bends ahead allow so much, (A,) m/s."""
-    own = temper.acceleration * (1.0 - (speed / temper.max_speed) ** 4)
-    bend = np.maximum(_STIFFNESS * (allowed - speed), -temper.slowing)
-    return np.asarray(np.clip(np.minimum(own, bend), -HARDEST_BRAKING, None))
+def free_acceleration(
+    parameters: IdmParameters, speed: FloatArray, allowed: FloatArray
+) -> FloatArray:
+    """Return the accelerations (A,), m/s², if nobody is in the way.
+
+    Args:
+        parameters: Parameters of the road users.
+        speed: Speeds, shape (A,), m/s.
+        allowed: Speeds that the bends ahead allow, shape (A,), m/s.
+    """
+    on_straight = parameters.acceleration * (1.0 - (speed / parameters.max_speed) ** 4)
+    in_bend = np.maximum(_SPEED_STIFFNESS * (allowed - speed), -parameters.slowing)
+    return np.asarray(np.clip(np.minimum(on_straight, in_bend), -HARDEST_BRAKING, None))
 
 
 def hardest_braking(speed: FloatArray) -> FloatArray:
-    """The hardest braking (A,) m/s² at a speed (A,) m/s: at low speed nobody brakes hard."""
-    return np.minimum(_GENTLE_STOP[0] + _GENTLE_STOP[1] * speed, HARDEST_BRAKING)
+    """Return the hardest braking (A,), m/s², at speeds (A,), m/s.
 
-
-def interaction(
-    temper: Temper, speed: FloatArray, gap: FloatArray, leader_speed: FloatArray
-) -> FloatArray:
-    """The acceleration (A,) m/s², 0 or less, that each adds because of the road user ahead.
-
-    The gap is (A,) metres, infinite without one; its speed is that along the same path, (A,) m/s.
+    At low speed nobody brakes hard.
     """
-    return _interaction(temper, speed, gap, leader_speed, temper.min_gap, temper.time_gap)
+    return np.minimum(_STANDSTILL_BRAKING + _BRAKING_INCREASE * speed, HARDEST_BRAKING)
 
 
-def stopping(temper: Temper, speed: FloatArray, gap: FloatArray) -> FloatArray:
-    """The acceleration (A,) m/s² to stop before a line `gap` (A,) metres ahead; `gap` is infinite if there is none."""
-    return _interaction(
-        temper, speed, gap, np.zeros_like(speed), np.full_like(speed, 0.5), 0.3 * temper.time_gap
+def following_acceleration(
+    parameters: IdmParameters, speed: FloatArray, gap: FloatArray, leader_speed: FloatArray
+) -> FloatArray:
+    """Return the accelerations (A,), m/s², 0 or less, that the road users ahead cause.
+
+    Args:
+        parameters: Parameters of the road users.
+        speed: Speeds, shape (A,), m/s.
+        gap: Gaps to the road users ahead, shape (A,), metres; infinite without one.
+        leader_speed: Speeds of the road users ahead along the same path, shape (A,), m/s.
+    """
+    return _interaction_acceleration(
+        parameters, speed, gap, leader_speed, parameters.min_gap, parameters.time_gap
     )
 
 
-def can_stop(temper: Temper, speed: FloatArray, gap: FloatArray) -> FloatArray:
-    """(A,) bool, whether braking a little harder than comfortably stops it before a line `gap` (A,) metres ahead."""
-    return np.asarray(speed**2 <= 2 * 1.5 * temper.braking * gap)
+def stopping_acceleration(
+    parameters: IdmParameters, speed: FloatArray, gap: FloatArray
+) -> FloatArray:
+    """Return the accelerations (A,), m/s², that stop road users before a line.
+
+    The line is `gap` (A,) metres ahead; the gap is infinite if there is none.
+    """
+    line_speed = np.zeros_like(speed)
+    min_gap = np.full_like(speed, 0.5)
+    return _interaction_acceleration(
+        parameters, speed, gap, line_speed, min_gap, 0.3 * parameters.time_gap
+    )
 
 
-def _interaction(
-    temper: Temper,
+def can_stop(parameters: IdmParameters, speed: FloatArray, gap: FloatArray) -> BoolArray:
+    """Return whether braking a little harder than comfortably stops before a line.
+
+    Args:
+        parameters: Parameters of the road users.
+        speed: Speeds, shape (A,), m/s.
+        gap: Distances to the line ahead, shape (A,), metres.
+
+    Returns:
+        Truth values, shape (A,).
+    """
+    max_square_speed = 2 * 1.5 * parameters.braking * gap
+    return np.asarray(speed**2 <= max_square_speed)
+
+
+def _interaction_acceleration(
+    parameters: IdmParameters,
     speed: FloatArray,
     gap: FloatArray,
     leader_speed: FloatArray,
     min_gap: FloatArray,
     time_gap: FloatArray,
 ) -> FloatArray:
-    closing = speed * (speed - leader_speed) / (2 * np.sqrt(temper.acceleration * temper.braking))
-    wanted = min_gap + np.maximum(speed * time_gap + closing, 0.0)
-    return np.asarray(-temper.acceleration * (wanted / np.maximum(gap, _NO_GAP)) ** 2)
+    """Return the interaction term (A,), m/s², of the intelligent driver model."""
+    acceleration = parameters.acceleration
+    gentle_braking = 2 * np.sqrt(acceleration * parameters.braking)
+    closing = speed * (speed - leader_speed) / gentle_braking
+    target_gap = min_gap + np.maximum(speed * time_gap + closing, 0.0)
+    gap_ratio = target_gap / np.maximum(gap, _MIN_GAP_M)
+    return np.asarray(-acceleration * gap_ratio**2)
 
 
-def lane_way(junction: Junction, route: Route, category: str) -> Path:
-    """The path of a driver or rider on a route."""
-    return (
-        route.path
-        if category != "cyclist"
-        else _cyclist_path(junction.spec, route.from_arm, route.turn, route.lane)
-    )
+def lane_path(junction: Junction, route: Route, category: str) -> Path:
+    """Return the path of a driver or rider on a route."""
+    if category != "cyclist":
+        return route.path
+    return _cyclist_path(junction.spec, route.from_arm, route.turn, route.lane)
 
 
 def lane_span(route: Route) -> tuple[float, float]:
-    """Where the part of a route that may cross others begins and ends, metres along it."""
-    return route.stop_s - _SPAN[0], route.exit_s + _SPAN[1]
+    """Return start and end of the part of a route that may cross others, metres along it."""
+    start = route.stop_s - _MARGIN_BEFORE_STOP_LINE_M
+    return start, route.exit_s + _MARGIN_AFTER_EXIT_M
 
 
 def middle_of(route: Route) -> float:
-    """Metres along a route to the middle of the junction."""
+    """Return the metres along a route to the middle of the junction."""
     return (route.enter_s + route.exit_s) / 2
 
 
 def road_crossing(spec: RoadSpec, arm: Arm, along: float, side: Side) -> Path:
-    """The straight path over an arm's road, from kerb to kerb, `along` metres from the junction's middle.
+    """Return the straight path over an arm's road, from kerb to kerb.
 
-    It begins on a side as a driver towards the junction sees it.
+    Args:
+        spec: The road.
+        arm: The arm.
+        along: Distance from the junction's middle, metres.
+        side: Side on which the path begins, as a driver towards the junction sees it.
     """
     out_x, out_y = OUTWARD[arm]
-    beside = spec.road_edge + _KERB_ROOM
-    sign = (
-        1.0 if side == "right" else -1.0
-    )  # the right of a driver inward is the left, seen outward
+    beside = spec.road_edge + _KERB_DISTANCE_M
+    # The right of a driver inward is the left, seen outward.
+    sign = 1.0 if side == "right" else -1.0
     left = np.array([-out_y, out_x], dtype=np.float64)
     start = along * np.array([out_x, out_y]) + sign * beside * left
     yaw = float(np.arctan2(-sign * left[1], -sign * left[0]))
-    return straight((float(start[0]), float(start[1])), yaw, 2 * beside)
+    start_point = (float(start[0]), float(start[1]))
+    return straight(start_point, yaw, 2 * beside)
 
 
 def shifted_path(path: Path, offset: float) -> Path:
-    """The same path, `offset` metres further to the left."""
+    """Return the same path, `offset` metres further to the left."""
     left = np.stack([-np.sin(path.yaw), np.cos(path.yaw)], axis=1)
     return through(path.xy + offset * left)
 
 
 @lru_cache(maxsize=64)
 def _cyclist_path(spec: RoadSpec, from_arm: Arm, turn: Turn, lane: int) -> Path:
-    return shifted_path(Junction(spec).route(from_arm, turn, lane).path, -_CYCLIST_OFFSET)
+    """Return the path of a cyclist, to the right of the lane's middle."""
+    path = Junction(spec).route(from_arm, turn, lane).path
+    return shifted_path(path, -_CYCLIST_OFFSET_M)
 
 
 @dataclass(frozen=True, slots=True)
-class Manner:
-    """How the drivers of a category drive.
+class DrivingStyle:
+    """The driving style of a category.
 
     Attributes:
-        acceleration: acceleration from standstill, m/s².
-        braking: comfortable braking, m/s².
-        time_gap: seconds to the road user ahead.
-        min_gap: metres, bumper to bumper, when standing.
-        lateral: the most sideways acceleration in a bend, m/s².
-        max_speed: least and most speed on a free straight road, m/s.
-        slowing: the hardest braking to the speed that a bend allows, m/s².
+        acceleration: Acceleration from standstill, m/s².
+        braking: Comfortable braking, m/s².
+        time_gap: Time gap to the road user ahead, seconds.
+        min_gap: Gap when standing, bumper to bumper, metres.
+        lateral: Highest sideways acceleration in a bend, m/s².
+        max_speed: Lowest and highest speed on a free straight road, m/s.
+        slowing: The hardest braking to the speed that a bend allows, m/s².
     """
 
     acceleration: float
@@ -328,29 +408,29 @@ class Manner:
     slowing: float = 4.0
 
 
-# By category.
-MANNERS = {
-    "car": Manner(2.2, 2.5, 0.9, 2.0, 2.8, (8.0, 12.5)),
-    "van": Manner(2.0, 2.4, 0.9, 2.0, 2.5, (7.5, 11.5)),
-    "truck": Manner(1.6, 2.0, 1.2, 2.5, 1.8, (7.0, 10.0)),
-    "motorcycle": Manner(2.8, 2.8, 1.0, 1.8, 3.0, (8.0, 12.5)),
-    "cyclist": Manner(1.0, 1.8, 1.0, 1.2, 2.0, (3.5, 6.0)),
-    "pedestrian": Manner(1.5, 2.0, 0.4, 0.5, 9.0, (0.9, 1.7)),
+DRIVING_STYLES = {
+    "car": DrivingStyle(2.2, 2.5, 0.9, 2.0, 2.8, (8.0, 12.5)),
+    "van": DrivingStyle(2.0, 2.4, 0.9, 2.0, 2.5, (7.5, 11.5)),
+    "truck": DrivingStyle(1.6, 2.0, 1.2, 2.5, 1.8, (7.0, 10.0)),
+    "motorcycle": DrivingStyle(2.8, 2.8, 1.0, 1.8, 3.0, (8.0, 12.5)),
+    "cyclist": DrivingStyle(1.0, 1.8, 1.0, 1.2, 2.0, (3.5, 6.0)),
+    "pedestrian": DrivingStyle(1.5, 2.0, 0.4, 0.5, 9.0, (0.9, 1.7)),
 }
-# Of drivers who are late: they speed up and brake harder, and follow more closely.
-BRISK_MANNERS = {
-    category: manner
+"""Driving styles by category."""
+BRISK_STYLES = {
+    category: style
     if category == WALKER
     else replace(
-        manner,
-        acceleration=2.0 * manner.acceleration,
-        braking=2.1 * manner.braking,
-        time_gap=0.6 * manner.time_gap,
-        lateral=1.4 * manner.lateral,
+        style,
+        acceleration=2.0 * style.acceleration,
+        braking=2.1 * style.braking,
+        time_gap=0.6 * style.time_gap,
+        lateral=1.4 * style.lateral,
         slowing=7.0,
     )
-    for category, manner in MANNERS.items()
+    for category, style in DRIVING_STYLES.items()
 }
+"""Driving styles of late drivers: they speed up and brake harder, and follow more closely."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -358,24 +438,27 @@ class RoadUser:
     """A road user that moves.
 
     Attributes:
-        role: its role in the scenario.
-        body: its size and shape.
-        path: the path of its middle axis.
-        start: how far along its path its box's centre starts, metres.
-        start_speed: its speed at the start, m/s.
-        max_speed: the speed that it reaches on a free straight road, m/s.
-        delay: seconds that it stands before it starts to move.
-        route: its route over the junction; None for a pedestrian.
-        span: where the part of its path that may cross others begins and ends, metres; empty for a pedestrian who
-            stays on the sidewalk.
-        ignores: the rules that it breaks.
-        alert: seconds before a contact at which it notices the other one of the pair; 0 for never.
-        pace: stretches of its path where it is slow for reasons of its own.
-        brisk: whether it drives as `BRISK_MANNERS` say.
+        role: Role in the scenario.
+        body: Size and shape.
+        path: Path of its middle axis.
+        start: Position of its box's centre along its path at the start, metres.
+        start_speed: Speed at the start, m/s.
+        max_speed: Speed that it reaches on a free straight road, m/s.
+        delay: Time that it stands before it starts to move, seconds.
+        route: Route over the junction; None for a pedestrian.
+        span: Start and end of the part of its path that may cross others, metres; empty for a
+            pedestrian who stays on the sidewalk.
+        ignores: Rules that it breaks.
+        alert: Seconds before a contact at which it notices the other road user of the pair; 0 for
+            never.
+        pace: Stretches of its path where it is slow for reasons of its own.
+        brisk: Whether it drives with a style of `BRISK_STYLES`.
     """
 
+    # identity
     role: Role
     body: Body
+    # path and start
     path: Path
     start: float
     start_speed: float
@@ -383,6 +466,7 @@ class RoadUser:
     delay: float = 0.0
     route: Route | None = None
     span: tuple[float, float] = (0.0, 0.0)
+    # behaviour
     ignores: tuple[Rule, ...] = ()
     alert: float = 0.0
     pace: tuple[Stretch, ...] = ()
@@ -394,31 +478,35 @@ class RoadUser:
         return self.body.category == WALKER
 
     @property
-    def manner(self) -> Manner:
-        """How it drives."""
-        return (BRISK_MANNERS if self.brisk else MANNERS)[self.body.category]
+    def style(self) -> DrivingStyle:
+        """Its driving style."""
+        styles = BRISK_STYLES if self.brisk else DRIVING_STYLES
+        return styles[self.body.category]
 
     @property
     def wheelbase(self) -> float:
-        """Metres; 0 without wheels."""
-        return 0.0 if self.walks else WHEELBASE * self.body.size[0]
+        """Its wheelbase, metres; 0 without wheels."""
+        if self.walks:
+            return 0.0
+        return WHEELBASE * self.body.size[0]
 
     def obeying(self) -> "RoadUser":
-        """The same road user, which obeys all rules."""
+        """Return the same road user, which obeys all rules."""
         return replace(self, ignores=())
 
 
-def temper_of(users: Sequence[RoadUser]) -> Temper:
-    """How they drive, as arrays."""
-    return Temper(
+def idm_parameters(users: Sequence[RoadUser]) -> IdmParameters:
+    """Return the parameters of road users as arrays."""
+    return IdmParameters(
         max_speed=_gather(users, lambda user: user.max_speed),
-        acceleration=_gather(users, lambda user: user.manner.acceleration),
-        braking=_gather(users, lambda user: user.manner.braking),
-        slowing=_gather(users, lambda user: user.manner.slowing),
-        time_gap=_gather(users, lambda user: user.manner.time_gap),
-        min_gap=_gather(users, lambda user: user.manner.min_gap),
+        acceleration=_gather(users, lambda user: user.style.acceleration),
+        braking=_gather(users, lambda user: user.style.braking),
+        slowing=_gather(users, lambda user: user.style.slowing),
+        time_gap=_gather(users, lambda user: user.style.time_gap),
+        min_gap=_gather(users, lambda user: user.style.min_gap),
     )
 
 
 def _gather(users: Sequence[RoadUser], value: Callable[[RoadUser], float]) -> FloatArray:
+    """Return a number of each road user as an array (A,)."""
     return np.array([value(user) for user in users], dtype=np.float64)

@@ -10,57 +10,72 @@ from deepaccident_devkit.plugins.synth.traffic.driving import PERIOD, WHEELBASE
 from deepaccident_devkit.plugins.synth.traffic.simulate import Simulation, relative, separation
 from deepaccident_devkit.support.arrays import FloatArray
 
-# The most between two vehicles that pass each other side by side, so that a swerve can close the gap.
-_MOST_GAP_M = 2.2
-# m/s of both.
-_LEAST_SPEED = 2.5
-# How much nearer than their flanks the nearest parts of two are that still pass each other side by side.
-_BESIDE_M = 0.1
-# How deep the two are in each other where they are side by side, and the most at any time.
-_DEPTH_M, _DEEPEST_M = 0.15, 0.35
-# How long a swerve takes to each side of the contact, and over which distance at least.
-_SWERVE_S, _SHORTEST_SWERVE_M = 1.9, 9.0
+# Largest gap between two vehicles that pass each other side by side that a swerve can close.
+_MAX_GAP_M = 2.2
+# Both vehicles are faster than this, m/s.
+_MIN_SPEED = 2.5
+# Two vehicles pass each other side by side if their nearest parts are at most this much nearer than
+# their flanks.
+_FLANK_TOLERANCE_M = 0.1
+# Depth of the two in each other where they are side by side, and the limit of it at any time.
+_CONTACT_DEPTH_M = 0.15
+_MAX_DEPTH_M = 0.35
+# Duration of a swerve to each side of the contact, and its shortest length.
+_SWERVE_S = 1.9
+_MIN_SWERVE_M = 9.0
 
 
 def swerves(
     simulation: Simulation, size: FloatArray, drivers: Sequence[int], window: tuple[float, float]
 ) -> Iterator[tuple[tuple[int, int], Simulation]]:
-    """Yield rows of two drivers who pass each other side by side, and what happens if the first one swerves.
+    """Yield pairs of drivers that pass each other, and simulations in which the first one swerves.
 
-    Sizes are (A, 2) length and width, metres. The two touch in a window, seconds, and while both move.
+    Args:
+        simulation: The simulation without a swerve.
+        size: Lengths and widths, shape (A, 2), metres.
+        drivers: Rows of the drivers.
+        window: Start and end of the time in which the two touch, seconds; both move then.
+
+    Yields:
+        The rows of the two, and the simulation in which they touch.
     """
-    inside = (simulation.time > window[0]) & (simulation.time < window[1])
-    moving = inside[:, None] & (simulation.states[..., 3] > _LEAST_SPEED)
-    for row, other in combinations(drivers, 2):
-        poses, others = simulation.poses[:, row], simulation.poses[:, other]
-        left = relative(poses, others[:, :2])[:, 1]
-        apart = separation(poses, size[row], others, size[other])
-        flanks = np.abs(left) - size[[row, other], 1].mean()
-        both = moving[:, row] & moving[:, other]
-        gap = np.where(both & (flanks - apart < _BESIDE_M), apart, np.inf)
-        step = int(gap.argmin())
-        if gap[step] < _MOST_GAP_M:
-            shift = np.copysign(gap[step] + _DEPTH_M, left[step])
-            swerving = _swerving(simulation, row, step, shift, WHEELBASE * size[row, 0])
-            apart = separation(swerving.poses[:, row], size[row], others, size[other])
-            if apart.min() > -_DEEPEST_M and apart[~both].min() > 0:
-                yield (row, other), swerving
+    in_window = (simulation.time > window[0]) & (simulation.time < window[1])
+    moving = in_window[:, None] & (simulation.states[..., 3] > _MIN_SPEED)
+    for row, other_row in combinations(drivers, 2):
+        poses = simulation.poses[:, row]
+        other_poses = simulation.poses[:, other_row]
+        lateral = relative(poses, other_poses[:, :2])[:, 1]
+        gap = separation(poses, size[row], other_poses, size[other_row])
+        flank_gap = np.abs(lateral) - size[[row, other_row], 1].mean()
+        both_moving = moving[:, row] & moving[:, other_row]
+        side_by_side = both_moving & (flank_gap - gap < _FLANK_TOLERANCE_M)
+        passing_gap = np.where(side_by_side, gap, np.inf)
+        step = int(passing_gap.argmin())
+        if passing_gap[step] >= _MAX_GAP_M:
+            continue
+        shift = np.copysign(passing_gap[step] + _CONTACT_DEPTH_M, lateral[step])
+        swerving = _swerving(simulation, row, step, shift, WHEELBASE * size[row, 0])
+        gap = separation(swerving.poses[:, row], size[row], other_poses, size[other_row])
+        if gap.min() > -_MAX_DEPTH_M and gap[~both_moving].min() > 0:
+            yield (row, other_row), swerving
 
 
 def _swerving(
     simulation: Simulation, row: int, step: int, shift: float, wheelbase: float
 ) -> Simulation:
     """Return a simulation in which one driver is `shift` metres farther to the left at a step."""
-    states, velocities = simulation.states.copy(), simulation.velocities.copy()
+    states = simulation.states.copy()
+    velocities = simulation.velocities.copy()
     x, y, yaw, speed, _ = states[:, row].T
     along = np.cumsum(speed) * PERIOD
-    reach = max(_SWERVE_S * speed[step], _SHORTEST_SWERVE_M)
+    reach = max(_SWERVE_S * speed[step], _MIN_SWERVE_M)
     phase = np.clip((along - along[step]) / reach, -1.0, 1.0) * np.pi / 2
-    left = shift * np.cos(phase) ** 4  # so the steering does not jump where the swerve ends
+    lateral = shift * np.cos(phase) ** 4  # so the steering does not jump where the swerve ends
     slope = -2 * np.pi / reach * shift * np.cos(phase) ** 3 * np.sin(phase)
-    turned = yaw + np.arctan(slope)
-    rear = x + 1j * y + (1j * left - wheelbase / 2) * np.exp(1j * yaw)  # where wheels do not slide
-    middle = rear + wheelbase / 2 * np.exp(1j * turned)
-    states[:, row, :3] = np.stack([middle.real, middle.imag, turned], axis=-1)
+    swerving_yaw = yaw + np.arctan(slope)
+    # The swerve moves the rear axle, because rear wheels do not slide.
+    rear = x + 1j * y + (1j * lateral - wheelbase / 2) * np.exp(1j * yaw)
+    middle = rear + wheelbase / 2 * np.exp(1j * swerving_yaw)
+    states[:, row, :3] = np.stack([middle.real, middle.imag, swerving_yaw], axis=-1)
     velocities[:, row] = np.gradient(states[:, row, :2], PERIOD, axis=0)
     return replace(simulation, states=states, velocities=velocities)

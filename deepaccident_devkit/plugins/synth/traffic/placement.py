@@ -1,4 +1,7 @@
-"""The moving road users of a scenario file, placed so that the two who are timed do meet; accidents of no design."""
+"""The moving road users of a scenario file, placed so that the timed pair meets.
+
+`unplanned` draws accidents that differ from the designs.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -21,24 +24,59 @@ from deepaccident_devkit.plugins.synth.spec.checks import LEADERS
 from deepaccident_devkit.plugins.synth.spec.model import Role, Side
 from deepaccident_devkit.plugins.synth.traffic.driving import (
     DECISION_STEPS,
-    MANNERS,
+    DRIVING_STYLES,
     PERIOD,
     RoadUser,
     Tracks,
     free_acceleration,
+    idm_parameters,
+    lane_path,
     lane_span,
-    lane_way,
     middle_of,
     road_crossing,
-    temper_of,
 )
 from deepaccident_devkit.plugins.synth.traffic.lifelike import AccidentKind, erring, lively
 from deepaccident_devkit.support.arrays import FloatArray
 
-# Seconds that are driven at least.
-_USUAL_DRIVE = 24.0
-# Seconds that are driven at most; the slowest cyclist needs about 210 to the junction.
-_LONGEST_DRIVE = 300.0
+# Shortest and longest drive on a free road; the slowest cyclist needs about 210 s to the junction.
+_MIN_DRIVE_S = 24.0
+_MAX_DRIVE_S = 300.0
+WARM_UP = 1.0
+"""Seconds that are simulated before the first recorded frame."""
+# Smallest and largest gap between leader and follower, bumper to bumper, if the file does not give
+# it, metres.
+_FOLLOWER_GAPS = (8.0, 16.0)
+# Seconds before a contact at which one of the pair notices it; below 0 it never does.
+_ALERTS = (-0.3, 0.3)
+# Smallest and largest distance from the start to the junction's middle, if the file does not give
+# it, metres.
+_START_DISTANCES = (35.0, 75.0)
+_LANE_CHANGE_LENGTH_M = 28.0
+# Distance between a follower that meets somebody and its leader: a vehicle's length, and this share
+# of the first gap.
+_VEHICLE_LENGTH_M = 4.6
+_GAP_SHARE = 0.9
+# Target speed of a follower as a multiple of its leader's, so that the gap does not grow.
+_FOLLOWER_SPEED_FACTOR = 1.3
+# Distance from the path's beginning to the start of the last vehicle of a queue.
+_QUEUE_START_M = 8.0
+# Share of unplanned accidents with a pedestrian; the others are with a third vehicle.
+_PEDESTRIAN_SHARE = 0.6
+_STEP_OUT_SPEEDS = (1.2, 2.2)
+# Smallest and largest distance from the junction's middle to the point where a pedestrian steps
+# onto the road, metres.
+_STEP_OUT_DISTANCES = (24.0, 45.0)
+# Distance from a hump's crest to a pedestrian behind it, metres; the hump hides the pedestrian
+# until the victim is about 40 m away.
+_CREST_DISTANCES = (15.0, 22.0)
+# Share of third vehicles that come by the victim's arm and change into its lane, if the arm has two
+# lanes.
+_CUT_IN_SHARE = 0.5
+# Smallest and largest distance from the junction's middle at which this change of lanes begins,
+# metres.
+_CUT_IN_DISTANCES = (45.0, 75.0)
+_STRANGER_SPEEDS = (8.0, 12.0)
+_STRANGER_OFFSETS = (-0.2, 0.2)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -46,73 +84,69 @@ class Approach:
     """A drive over a free road, from standing or from a given speed.
 
     Attributes:
-        user: who drives, as at the start of the drive.
-        along: (S,) metres of its box's centre along its path, one value every `driving.PERIOD`.
-        speed: (S,) m/s.
+        user: The road user at the start of the drive.
+        along: Positions of its box's centre along its path, shape (S,), metres, one every
+            `driving.PERIOD`.
+        speed: Speeds, shape (S,), m/s.
     """
 
     user: RoadUser
     along: FloatArray
     speed: FloatArray
 
-    def time_to(self, place: float) -> float:
-        """Seconds until the centre is `place` metres along the path; if it never is, the end of the drive."""
-        row = min(int(np.searchsorted(self.along, place)), len(self.along) - 1)
+    def time_to(self, position: float) -> float:
+        """Return the seconds until the centre is at a position along the path, in metres.
+
+        If it never is, the drive's end counts.
+        """
+        row = min(int(np.searchsorted(self.along, position)), len(self.along) - 1)
         return row * PERIOD
 
     def at(self, time: float) -> RoadUser:
-        """The road user `time` seconds into the drive; before, one that stands waits, others are farther back."""
+        """Return the road user `time` seconds into the drive.
+
+        Before the drive, a road user that stands waits, others are farther back.
+        """
         if time < 0 and self.user.start_speed == 0:
             return replace(self.user, delay=-time)
         if time < 0:
             return replace(self.user, start=self.user.start + self.user.start_speed * time)
         row = min(round(time / PERIOD), len(self.along) - 1)
-        return replace(
-            self.user, start=float(self.along[row]), start_speed=float(self.speed[row]), delay=0.0
-        )
+        start = float(self.along[row])
+        speed = float(self.speed[row])
+        return replace(self.user, start=start, start_speed=speed, delay=0.0)
 
 
 def drive_alone(user: RoadUser, to: float = 0.0) -> Approach:
-    """The drive of a road user that is alone and stays on its path, at least until its centre is `to` metres along."""
-    tracks = Tracks(
-        [user.path], np.array([user.manner.lateral]), np.array([user.walks]), [user.pace]
-    )
-    temper, back = temper_of([user]), user.wheelbase / 2
-    along, speed = np.array([user.start - back]), np.array([user.start_speed])
-    steps = PERIOD * np.arange(1, DECISION_STEPS + 1)
-    places, speeds = [along], [speed]
-    usual, longest = (
-        round(seconds / (PERIOD * DECISION_STEPS)) for seconds in (_USUAL_DRIVE, _LONGEST_DRIVE)
-    )
-    for count in range(longest):
-        if count >= usual and along[0] + back >= to:
+    """Simulate the drive of a road user on its path with nobody else on the road.
+
+    The drive lasts at least until the centre is `to` metres along the path.
+    """
+    lateral = np.array([user.style.lateral])
+    tracks = Tracks([user.path], lateral, np.array([user.walks]), [user.pace])
+    parameters = idm_parameters([user])
+    axle_to_center = user.wheelbase / 2
+    along = np.array([user.start - axle_to_center])
+    speed = np.array([user.start_speed])
+    times = PERIOD * np.arange(1, DECISION_STEPS + 1)
+    all_positions = [along]
+    all_speeds = [speed]
+    decision_period = PERIOD * DECISION_STEPS
+    min_decisions = round(_MIN_DRIVE_S / decision_period)
+    max_decisions = round(_MAX_DRIVE_S / decision_period)
+    for count in range(max_decisions):
+        if count >= min_decisions and along[0] + axle_to_center >= to:
             break
-        acceleration = free_acceleration(temper, speed, tracks.allowed_speed(along))
-        moving = np.maximum(speed + acceleration * steps, 0.0)
-        before = np.append(speed, moving[:-1])
-        moved = along + PERIOD * np.cumsum((before + moving) / 2)
-        places.append(moved)
-        speeds.append(moving)
-        along, speed = moved[-1:], moving[-1:]
-    return Approach(user, np.concatenate(places) + back, np.concatenate(speeds))
-
-
-# Seconds that are simulated before the first recorded frame.
-WARM_UP = 1.0
-# Least and most metres, bumper to bumper, between leader and follower if the file does not give the gap.
-_GAPS = (8.0, 16.0)
-# Least and most seconds before a contact at which one of the pair notices it; with less than 0 it never does.
-_ALERTS = (-0.3, 0.3)
-# Least and most metres from the start to the junction's middle if the start is not given.
-_STARTS = (35.0, 75.0)
-# Metres that a change of lanes takes.
-_LANE_CHANGE = 28.0
-# Metres, and the share of a follower's first gap, that are between it and its leader when it meets somebody.
-_LENGTH, _CLOSED = 4.6, 0.9
-# A follower's wanted speed as a multiple of its leader's, so that the gap does not grow.
-_KEEPING_UP = 1.3
-# Metres from the path's beginning to where the last vehicle of a queue starts.
-_FIRST_PLACE = 8.0
+        acceleration = free_acceleration(parameters, speed, tracks.allowed_speed(along))
+        speeds = np.maximum(speed + acceleration * times, 0.0)
+        previous_speeds = np.append(speed, speeds[:-1])
+        positions = along + PERIOD * np.cumsum((previous_speeds + speeds) / 2)
+        all_positions.append(positions)
+        all_speeds.append(speeds)
+        along = positions[-1:]
+        speed = speeds[-1:]
+    centers = np.concatenate(all_positions) + axle_to_center
+    return Approach(user, centers, np.concatenate(all_speeds))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -120,9 +154,10 @@ class Cast:
     """The named road users of a scenario at its beginning.
 
     Attributes:
-        users: the road users; leaders are before their followers.
-        begin: seconds, when the simulation starts; at time 0 the first of the pair is where the paths cross.
-        pair: rows of the two who are timed to meet; None if nobody is.
+        users: Road users; leaders are before their followers.
+        begin: Time at which the simulation starts, seconds; at time 0 the first of the pair is
+            where the paths cross.
+        pair: Rows of the two that are timed to meet; None if nobody is.
     """
 
     users: tuple[RoadUser, ...]
@@ -130,7 +165,7 @@ class Cast:
     pair: tuple[int, int] | None
 
     def row_of(self, role: Role) -> int:
-        """The row of the first road user of a role."""
+        """Return the row of the first road user of a role."""
         return next(row for row, user in enumerate(self.users) if user.role == role)
 
 
@@ -141,86 +176,146 @@ def cast_actors(
     duration: float,
     kind: AccidentKind | None = None,
 ) -> Cast:
-    """The moving road users that a file names; the pair meets `duration` seconds after the first recorded frame.
+    """Place the moving road users that a file names, so that the timed pair meets.
 
-    If a follower is one of the pair, its leader is timed. With a kind of accident drivers err.
+    If a follower is one of the pair, its leader is timed.
+
+    Args:
+        rng: Generator of random numbers.
+        spec: The scenario.
+        junction: Its junction.
+        duration: Time from the first recorded frame to the meeting, seconds.
+        kind: Kind of accident, with which drivers err; None if they do not.
     """
     begin = -(duration + WARM_UP)
-    named = [actor for actor in spec.actors if actor.role != "parked"]
-    leading = [actor for actor in named if actor.role not in LEADERS]
-    pair = _pair_rows(spec, leading)
-    users = [
-        _drawn(rng, actor, junction, timed=row in (pair or ())) for row, actor in enumerate(leading)
-    ]
-    if pair is not None and spec.meet is not None:
+    moving_actors = [actor for actor in spec.actors if actor.role != "parked"]
+    leading_actors = [actor for actor in moving_actors if actor.role not in LEADERS]
+    pair = _pair_rows(spec, leading_actors)
+    users = []
+    for row, actor in enumerate(leading_actors):
+        users.append(_drawn(rng, actor, junction, timed=row in (pair or ())))
+    meet = spec.meet
+    if pair is not None and meet is not None:
         meeting = crossing(users[pair[0]].path, users[pair[1]].path)
         if meeting is None:
             pair = None
         else:
             if kind is not None:
-                for row, user in enumerate(users):
-                    users[row] = user if row in pair else lively(rng, user, kind.traffic, begin)
-                for row, place in zip(pair, meeting, strict=True):
-                    stops = kind.stops and spec.meet.actors[0] == users[row].role
-                    users[row] = erring(rng, users[row], place, kind.traffic, stops=stops)
-            places = [
-                place + _ahead(spec, role)
-                for place, role in zip(meeting, spec.meet.actors, strict=True)
-            ]
-            approaches = [
-                drive_alone(users[row], to=place) for row, place in zip(pair, places, strict=True)
-            ]
-            for row, place, late, approach in zip(
-                pair, places, (0.0, spec.meet.offset), approaches, strict=True
-            ):
-                users[row] = approach.at(approach.time_to(place) + begin - late)
-    for actor in named:
+                _make_erring(rng, users, pair, meeting, meet, kind, begin)
+            _time_pair(users, pair, meeting, spec, meet, begin)
+    for actor in moving_actors:
         if actor.role in LEADERS:
             leader = next(user for user in users if user.role == LEADERS[actor.role])
-            # a follower does not change lanes with its leader, or it would collide with a vehicle beside it
-            way = (
-                leader
-                if kind is None and spec.actor(leader.role).lane_change is None
-                else leader.route or leader
-            )
-            users.append(_follower(rng, actor, leader, way.path))
-    if pair is not None and spec.meet is not None:
+            # A follower does not change lanes with its leader, or it would collide with a vehicle
+            # beside it.
+            path = leader.path
+            keeps_path = kind is None and spec.actor(leader.role).lane_change is None
+            if leader.route is not None and not keeps_path:
+                path = leader.route.path
+            users.append(_follower(rng, actor, leader, path))
+    if pair is not None and meet is not None:
         roles = [user.role for user in users]
-        pair = (roles.index(spec.meet.actors[0]), roles.index(spec.meet.actors[1]))
+        pair = (roles.index(meet.actors[0]), roles.index(meet.actors[1]))
     return Cast(users=tuple(users), begin=begin, pair=pair)
 
 
+def _make_erring(
+    rng: np.random.Generator,
+    users: list[RoadUser],
+    pair: tuple[int, int],
+    meeting: tuple[float, float],
+    meet: MeetSpec,
+    kind: AccidentKind,
+    begin: float,
+) -> None:
+    """Let the drivers of the pair err and all others be lively, in place.
+
+    Args:
+        rng: Generator of random numbers.
+        users: The road users.
+        pair: Rows of the pair.
+        meeting: Positions of the crossing of the paths along the path of each, metres.
+        meet: The planned meeting.
+        kind: Kind of accident.
+        begin: Time from which drivers act, seconds.
+    """
+    for row, user in enumerate(users):
+        if row not in pair:
+            users[row] = lively(rng, user, kind.traffic, begin)
+    for row, position in zip(pair, meeting, strict=True):
+        stops = kind.stops and meet.actors[0] == users[row].role
+        users[row] = erring(rng, users[row], position, kind.traffic, stops=stops)
+
+
+def _time_pair(
+    users: list[RoadUser],
+    pair: tuple[int, int],
+    meeting: tuple[float, float],
+    spec: ScenarioSpec,
+    meet: MeetSpec,
+    begin: float,
+) -> None:
+    """Place the pair so that it meets at time 0, the second later by the offset; in place."""
+    targets = []
+    for position, role in zip(meeting, meet.actors, strict=True):
+        targets.append(position + _leader_distance(spec, role))
+    approaches = []
+    for row, target in zip(pair, targets, strict=True):
+        approaches.append(drive_alone(users[row], to=target))
+    delays = (0.0, meet.offset)
+    for row, target, delay, approach in zip(pair, targets, delays, approaches, strict=True):
+        users[row] = approach.at(approach.time_to(target) + begin - delay)
+
+
 def _pair_rows(spec: ScenarioSpec, actors: Sequence[ActorSpec]) -> tuple[int, int] | None:
-    """Rows of the two who are timed to meet; None if there are none."""
+    """Return the rows of the two that are timed to meet; None if there are none."""
     if spec.meet is None:
         return None
     roles = [actor.role for actor in actors]
-    first, second = _timed_roles(spec.meet)
-    return (roles.index(first), roles.index(second)) if first in roles and second in roles else None
+    role, other_role = _timed_roles(spec.meet)
+    if role not in roles or other_role not in roles:
+        return None
+    return roles.index(role), roles.index(other_role)
 
 
 def _timed_roles(meet: MeetSpec) -> tuple[Role, Role]:
-    """The roles that are timed: leaders in place of their followers; of one behind the other, ego and other."""
-    first, second = (LEADERS.get(role, role) for role in meet.actors)
-    return (first, "ego" if first == "other" else "other") if first == second else (first, second)
+    """Return the roles that are timed: leaders instead of their followers.
+
+    If one of the two follows the other, they are ego and other.
+    """
+    role, other_role = (LEADERS.get(actor, actor) for actor in meet.actors)
+    if role == other_role:
+        other_role = "ego" if role == "other" else "other"
+    return role, other_role
 
 
-def _ahead(spec: ScenarioSpec, role: Role) -> float:
-    """About how many metres its leader is ahead of a follower that meets a stranger; 0 for others."""
+def _leader_distance(spec: ScenarioSpec, role: Role) -> float:
+    """Return about how far its leader is ahead of a follower that meets a stranger, metres.
+
+    It is 0 for others.
+    """
     if role not in LEADERS or spec.meet is None or LEADERS[role] in spec.meet.actors:
         return 0.0
-    return _LENGTH + max(_CLOSED * (spec.actor(role).gap or 0.0), _GAPS[0])
+    gap = _GAP_SHARE * (spec.actor(role).gap or 0.0)
+    return _VEHICLE_LENGTH_M + max(gap, _FOLLOWER_GAPS[0])
 
 
 def _drawn(
     rng: np.random.Generator, actor: ActorSpec, junction: Junction, *, timed: bool
 ) -> RoadUser:
-    """A road user that follows nobody; if `timed`, it starts far away and standing, if the file gives no start."""
-    body, manner = random_body(rng, actor.category), MANNERS[actor.category]
-    max_speed = actor.max_speed if actor.max_speed is not None else rng.uniform(*manner.max_speed)
+    """Draw a road user that follows nobody.
+
+    If `timed`, it starts far away and standing, unless the file gives its start.
+    """
+    body = random_body(rng, actor.category)
+    max_speed = actor.max_speed
+    if max_speed is None:
+        max_speed = rng.uniform(*DRIVING_STYLES[actor.category].max_speed)
     arm = actor.from_arm or "west"
     if actor.role == "pedestrian":
-        distance = actor.start_distance if actor.start_distance is not None else rng.uniform(22, 50)
+        distance = actor.start_distance
+        if distance is None:
+            distance = rng.uniform(22, 50)
         path = road_crossing(junction.spec, arm, distance, actor.side)
         return RoadUser(
             role=actor.role,
@@ -233,15 +328,18 @@ def _drawn(
             ignores=actor.ignores,
         )
     route = junction.route(arm, actor.turn, actor.lane)
-    start, speed = _FIRST_PLACE + 2 * _GAPS[1] + body.size[0], 0.0
+    start = _QUEUE_START_M + 2 * _FOLLOWER_GAPS[1] + body.size[0]
+    speed = 0.0
     if actor.start_distance is not None:
-        start, speed = middle_of(route) - actor.start_distance, max_speed
+        start = middle_of(route) - actor.start_distance
+        speed = max_speed
     elif not timed:
-        start, speed = middle_of(route) - rng.uniform(*_STARTS), 0.8 * max_speed
+        start = middle_of(route) - rng.uniform(*_START_DISTANCES)
+        speed = 0.8 * max_speed
     return RoadUser(
         role=actor.role,
         body=body,
-        path=_way(junction, route, actor),
+        path=_path_of(junction, route, actor),
         start=start,
         start_speed=speed,
         max_speed=max_speed,
@@ -252,92 +350,95 @@ def _drawn(
     )
 
 
-def _way(junction: Junction, route: Route, actor: ActorSpec) -> Path:
-    """The actor's path, with its change of lanes if it makes one."""
-    path = lane_way(junction, route, actor.category)
+def _path_of(junction: Junction, route: Route, actor: ActorSpec) -> Path:
+    """Return the actor's path, with its change of lanes if it makes one."""
+    path = lane_path(junction, route, actor.category)
     if actor.lane_change is None:
         return path
     offset = LANE_WIDTH if actor.lane == 0 else -LANE_WIDTH
-    return lane_change(path, middle_of(route) - actor.lane_change, _LANE_CHANGE, offset)
+    return lane_change(path, middle_of(route) - actor.lane_change, _LANE_CHANGE_LENGTH_M, offset)
 
 
 def _follower(rng: np.random.Generator, actor: ActorSpec, leader: RoadUser, path: Path) -> RoadUser:
-    """A road user behind its leader, as fast as the leader, on a path that begins like the leader's."""
-    body, manner = random_body(rng, actor.category), MANNERS[actor.category]
-    gap = actor.gap if actor.gap is not None else rng.uniform(*_GAPS)
-    own_speed = actor.max_speed if actor.max_speed is not None else rng.uniform(*manner.max_speed)
+    """Draw a road user behind its leader, as fast, on a path that begins like the leader's."""
+    body = random_body(rng, actor.category)
+    gap = actor.gap
+    if gap is None:
+        gap = rng.uniform(*_FOLLOWER_GAPS)
+    own_speed = actor.max_speed
+    if own_speed is None:
+        own_speed = rng.uniform(*DRIVING_STYLES[actor.category].max_speed)
+    leader_speed = leader.max_speed if leader.brisk else _FOLLOWER_SPEED_FACTOR * leader.max_speed
     start = leader.start - (leader.body.size[0] + body.size[0]) / 2 - gap
+    pace = [
+        (begin, end - leader.start + start, speed)
+        for begin, end, speed in leader.pace
+        if begin == 0.0
+    ]
     return RoadUser(
         role=actor.role,
         body=body,
         path=path,
         start=start,
         start_speed=leader.start_speed,
-        max_speed=max(
-            own_speed, leader.max_speed if leader.brisk else _KEEPING_UP * leader.max_speed
-        ),
+        max_speed=max(own_speed, leader_speed),
         delay=leader.delay,
         route=leader.route,
         span=leader.span,
         ignores=leader.ignores,
-        pace=tuple(
-            (begin, end - leader.start + start, speed)
-            for begin, end, speed in leader.pace
-            if begin == 0.0
-        ),
+        pace=tuple(pace),
         brisk=leader.brisk,
     )
-
-
-# Share of accidents with a pedestrian; the others are with a third vehicle.
-_PEDESTRIANS = 0.6
-_STEP_OUT_SPEEDS = (1.2, 2.2)
-# Least and most metres from the junction's middle to where a pedestrian steps onto the road.
-_STEP_OUT = (24.0, 45.0)
-# Metres from a hump's crest to a pedestrian behind it; the hump hides it until the victim is about 40 m away.
-_BEHIND_CREST = (15.0, 22.0)
-# Share of third vehicles that come by the victim's arm and change into its lane, if the arm has two lanes.
-_CUTTING_IN = 0.5
-# Least and most metres from the junction's middle to where that change of lanes begins.
-_CUT_IN = (45.0, 75.0)
-_THIRD_SPEEDS = (8.0, 12.0)
-_OFFSETS = (-0.2, 0.2)
 
 
 def unplanned(
     rng: np.random.Generator, spec: ScenarioSpec, junction: Junction, *, on_foot: bool | None = None
 ) -> ScenarioSpec:
-    """A designed scenario with another accident: ego and other obey, and one meets a pedestrian or a third vehicle.
+    """Turn a designed scenario into one with another accident.
 
-    Which of the two is drawn if `on_foot` is None.
+    Ego and other obey, and one of them meets a pedestrian or a third vehicle.
+
+    Args:
+        rng: Generator of random numbers.
+        spec: The designed scenario.
+        junction: Its junction.
+        on_foot: Whether it is a pedestrian; drawn if None.
     """
     victims: tuple[Role, ...] = ("ego", "other")
     victim = spec.actor(victims[int(rng.integers(2))])
-    used = {spec.actor(role).from_arm for role in victims}
-    free = [arm for arm in junction.arms if arm not in used]
-    on_foot = (rng.random() < _PEDESTRIANS if on_foot is None else on_foot) or not free
+    used_arms = {spec.actor(role).from_arm for role in victims}
+    free_arms = [arm for arm in junction.arms if arm not in used_arms]
+    if on_foot is None:
+        on_foot = rng.random() < _PEDESTRIAN_SHARE
+    on_foot = on_foot or not free_arms
     goes_on = "straight" in junction.turns(victim.from_arm or "west")
-    cuts_in = junction.spec.lanes == 2 and goes_on and rng.random() < _CUTTING_IN
+    cuts_in = junction.spec.lanes == 2 and goes_on and rng.random() < _CUT_IN_SHARE
     if on_foot:
         stranger = _pedestrian(rng, victim, spec)
     elif cuts_in:
         stranger = _cutting_in(rng, victim)
     else:
-        stranger = _third_vehicle(rng, junction, free)
+        stranger = _third_vehicle(rng, junction, free_arms)
+    lawful_actors = [replace(actor, ignores=()) for actor in spec.actors]
+    offset = rng.uniform(*_STRANGER_OFFSETS)
     return replace(
         spec,
         design=None,
-        actors=(*(replace(actor, ignores=()) for actor in spec.actors), stranger),
-        meet=MeetSpec(actors=(victim.role, stranger.role), offset=rng.uniform(*_OFFSETS)),
+        actors=(*lawful_actors, stranger),
+        meet=MeetSpec(actors=(victim.role, stranger.role), offset=offset),
     )
 
 
 def _pedestrian(rng: np.random.Generator, victim: ActorSpec, spec: ScenarioSpec) -> ActorSpec:
-    """A pedestrian who steps onto the road in front of the victim, behind the hump if there is one on its arm."""
-    arm, hump = victim.from_arm or "west", spec.road.hump
-    distance = rng.uniform(*_STEP_OUT)
+    """Draw a pedestrian who steps onto the road in front of the victim.
+
+    The pedestrian is behind the hump if there is one on the victim's arm.
+    """
+    arm = victim.from_arm or "west"
+    hump = spec.road.hump
+    distance = rng.uniform(*_STEP_OUT_DISTANCES)
     if hump is not None and hump.arm == arm:
-        distance = hump.distance - rng.uniform(*_BEHIND_CREST)
+        distance = hump.distance - rng.uniform(*_CREST_DISTANCES)
     side: Side = "right" if rng.random() < 0.7 else "left"
     return ActorSpec(
         role="pedestrian",
@@ -349,9 +450,9 @@ def _pedestrian(rng: np.random.Generator, victim: ActorSpec, spec: ScenarioSpec)
     )
 
 
-def _third_vehicle(rng: np.random.Generator, junction: Junction, free: list[Arm]) -> ActorSpec:
-    """A vehicle that comes by an arm by which neither ego nor other comes, and reacts to nobody."""
-    arm = free[int(rng.integers(len(free)))]
+def _third_vehicle(rng: np.random.Generator, junction: Junction, free_arms: list[Arm]) -> ActorSpec:
+    """Draw a vehicle that comes by an arm without ego and other, and reacts to nobody."""
+    arm = free_arms[int(rng.integers(len(free_arms)))]
     turn: Turn = "straight" if "straight" in junction.turns(arm) else "left"
     return ActorSpec(
         role="background",
@@ -359,19 +460,19 @@ def _third_vehicle(rng: np.random.Generator, junction: Junction, free: list[Arm]
         from_arm=arm,
         turn=turn,
         lane=junction.spec.lanes - 1,
-        max_speed=rng.uniform(*_THIRD_SPEEDS),
+        max_speed=rng.uniform(*_STRANGER_SPEEDS),
         ignores=("signal", "priority"),
     )
 
 
 def _cutting_in(rng: np.random.Generator, victim: ActorSpec) -> ActorSpec:
-    """A vehicle in the lane beside the victim's that changes into the victim's lane without looking."""
+    """Draw a vehicle beside the victim that changes into the victim's lane without looking."""
     return ActorSpec(
         role="background",
         category=rng.choice(["car", "car", "van"]).item(),
         from_arm=victim.from_arm,
         lane=1 - victim.lane,
-        max_speed=rng.uniform(*_THIRD_SPEEDS),
-        lane_change=rng.uniform(*_CUT_IN),
+        max_speed=rng.uniform(*_STRANGER_SPEEDS),
+        lane_change=rng.uniform(*_CUT_IN_DISTANCES),
         ignores=("signal", "priority"),
     )

@@ -6,7 +6,7 @@ from refusals import assert_refused
 
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.plugins.synth.roads import ROAD_CODES, Junction, RoadSpec
-from deepaccident_devkit.plugins.synth.roads.junction import REACH
+from deepaccident_devkit.plugins.synth.roads.junction import ROUTE_REACH
 from deepaccident_devkit.plugins.synth.roads.layout import OUTWARD
 
 HALF_TRUCK = 1.45
@@ -25,7 +25,7 @@ def test_routes_begin_and_end_on_lane_centres(junction):
         ):
             out, heading = np.array(OUTWARD[arm], dtype=float), sign * np.array(OUTWARD[arm])
             np.testing.assert_allclose(
-                point, REACH * out + center * np.array([heading[1], -heading[0]]), atol=1e-6
+                point, ROUTE_REACH * out + center * np.array([heading[1], -heading[0]]), atol=1e-6
             )
             np.testing.assert_allclose([np.cos(yaw), np.sin(yaw)], heading, atol=1e-9)
 

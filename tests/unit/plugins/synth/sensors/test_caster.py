@@ -8,7 +8,7 @@ from deepaccident_devkit.plugins.synth import SynthConfig, make_release
 from deepaccident_devkit.plugins.synth.sensors import caster
 from deepaccident_devkit.plugins.synth.sensors.caster import (
     GROUND,
-    NOTHING,
+    NO_HIT,
     EmbreeCaster,
     NumpyCaster,
 )
@@ -23,7 +23,7 @@ def test_rays_end_at_their_reach(kind, world, grounded):
     given, cast = reach.copy(), kind(corners, world.terrain if grounded else None).cast
     distance, face = cast(np.array([0.0, 0.0, 1.0]), directions, reach)
     np.testing.assert_allclose(distance, [np.inf, 4, np.inf, 1 if grounded else np.inf])
-    assert face.tolist() == [NOTHING, 1, NOTHING, GROUND if grounded else NOTHING]
+    assert face.tolist() == [NO_HIT, 1, NO_HIT, GROUND if grounded else NO_HIT]
     np.testing.assert_array_equal(reach, given)
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from deepaccident_devkit.plugins.synth.sensors.caster import GROUND
-from deepaccident_devkit.plugins.synth.sensors.render import look
+from deepaccident_devkit.plugins.synth.sensors.render import trace_picture
 from deepaccident_devkit.plugins.synth.solids import Block
 
 pytestmark = pytest.mark.slow
@@ -57,7 +57,7 @@ def test_cars_throw_shadows_in_the_sun(world, bare, actor, rig_of):
     with_car, without = (picture(rig_of(bare(world), others)).astype(int) for others in ([car], []))
     rig = rig_of(bare(world), [car])
     scene, camera = rig.scene(0.0), rig.agents[0].cameras[0]
-    ground = look(scene, camera, pose_of(rig.agents[0], scene, camera)).all.face == GROUND
+    ground = trace_picture(scene, camera, pose_of(rig.agents[0], scene, camera)).all.face == GROUND
     assert (ground & ((without - with_car).mean(axis=-1) > 25)).sum() > 100
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from deepaccident_devkit.geometry import Boxes
-from deepaccident_devkit.plugins.synth.sensors.annotate import gone_on
+from deepaccident_devkit.plugins.synth.sensors.annotate import offsets_at_count
 
 TRAFFIC = [
     ("car", 5.0, 1.75, np.pi, 6.0),
@@ -76,7 +76,7 @@ def test_nobody_goes_on_by_more_than_a_little_until_points_are_counted():
     """
     velocity = np.array([[0.0, 0, 0], [2.0, 0, 0], [0, -30.0, 0]])
     np.testing.assert_allclose(
-        gone_on(velocity), [[0, 0, 0], [0.006, 0, 0], [0, -0.012, 0]], atol=1e-12
+        offsets_at_count(velocity), [[0, 0, 0], [0.006, 0, 0], [0, -0.012, 0]], atol=1e-12
     )
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from deepaccident_devkit.plugins.synth.sensors.annotate import CameraViews, camera_visible
-from deepaccident_devkit.plugins.synth.sensors.render import look
+from deepaccident_devkit.plugins.synth.sensors.render import trace_picture
 from deepaccident_devkit.plugins.synth.solids import Block
 
 WALL = (120, 120, 120)
@@ -79,7 +79,7 @@ def test_pixels_are_about_those_of_the_picture(world, actor, rig_of):
     rows = np.arange(len(scene.actors))
     for camera in agent.cameras:
         pose = agent.ground_from_lidar(scene) @ camera.camera_from_lidar.inverse()
-        owner = scene.face_owner[look(scene, camera, pose).all.face]
+        owner = scene.face_owner[trace_picture(scene, camera, pose).all.face]
         shown = np.bincount(owner[owner >= 0], minlength=len(rows))
         counted = CameraViews(scene, [camera], [pose], rows).pixels()[0]
         np.testing.assert_allclose(counted, shown, rtol=0.35, atol=12)
