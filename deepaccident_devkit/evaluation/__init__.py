@@ -1,8 +1,8 @@
-"""The official metrics, those that the paper describes, and those of others: see the packages of the tasks.
+"""The released metrics, the paper's, and metrics of other codes: see the packages of the tasks.
 
-Each task has a package, which counts arrays and sums the counts; `results` are predictions in files; `runs` evaluates
-them into bundles that others can check, and looks for mistakes in predictions (`runs.sanity`). `breakdown` sums by
-attribute.
+Each task has a package, which counts arrays and sums the counts; `results` are predictions in
+files; `runs` evaluates them into bundles that others can check, and looks for mistakes in
+predictions (`runs.sanity`). `breakdown` sums by attribute.
 """
 
 from deepaccident_devkit.evaluation.accident import (

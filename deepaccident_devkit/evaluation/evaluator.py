@@ -1,8 +1,8 @@
-"""`Evaluator`: one task, from a sample's prediction and truth to counts, and from counts to a result.
+"""`Evaluator`: one task, from a sample's prediction and truth to counts, then to a result.
 
-Results do not depend on the order of samples or on how many workers counted them, memory grows with the counts only,
-and any selection of the samples can be summed (see `breakdown`). `counting.evaluate_samples` updates an evaluator with
-many samples.
+Results do not depend on the order of samples or on how many workers counted them, memory grows with
+the counts only, and any selection of the samples can be summed (see `breakdown`).
+`counting.evaluate_samples` updates an evaluator with many samples.
 """
 
 from __future__ import annotations
@@ -25,18 +25,19 @@ EvaluatorT = TypeVar("EvaluatorT", bound="Evaluator[Any]")
 
 
 class Evaluator(SampleCounts, Generic[_Result]):
-    """One task: what its predictions are compared with, what a sample adds, and the result of many samples.
+    """One task: the truth of its predictions, what a sample adds, and the result of many samples.
 
-    A new task is a subclass in a folder of its own, and its name in the tuple of `runs.setups.TASKS`. It defines:
+    A new task is a subclass in a folder of its own, and its name in the tuple of
+    `runs.setups.TASKS`. It defines:
 
     - its facts, the class attributes below;
     - `truth`: what the prediction of a sample is compared with;
     - `update`: what the sample adds, as `add` keeps it;
     - `result_of`: the result of the counts of some samples, with `rows` that describe its numbers.
 
-    All other methods have a default. Pictures of a result are drawn in `render.evaluation`, from the result and from
-    `counts`. Evaluators that are no tasks, for numbers beside those of a task, need only `settings`, `update` and
-    `result_of`.
+    All other methods have a default. Pictures of a result are drawn in `render.evaluation`, from
+    the result and from `counts`. Evaluators that are not tasks, for numbers beside the ones of a
+    task, need only `settings`, `update` and `result_of`.
 
     Attributes:
         task: Name of the task.
@@ -44,11 +45,13 @@ class Evaluator(SampleCounts, Generic[_Result]):
         result_kinds: Kinds of results files that the task is evaluated from.
         protocols: Rules of the metrics by name, frozen dataclasses; the first is the default.
         result_class: Class of the results, or the base of their classes.
-        main_numbers: Paths of the headlines that are shown by attribute; samples are ranked by the first.
-        needs_whole_recordings: Whether whole recordings are followed, so that attributes within them are of no use.
+        main_numbers: Paths of the headlines that are shown by attribute; samples are ranked by the
+            first.
+        needs_whole_recordings: Whether whole recordings are followed, so that attributes within
+            them are of no use.
         needs_meta: Whether the truth is in the scenarios' meta files.
         vehicles_only: Whether the roadside has no such predictions.
-        has_horizon: Whether the horizon of a setup says how far the predictions look ahead.
+        has_horizon: Whether predictions look ahead to the horizon of a setup.
         protocol: The rules of this evaluator.
     """
 
@@ -69,19 +72,22 @@ class Evaluator(SampleCounts, Generic[_Result]):
         """Start without samples.
 
         Args:
-            protocol: Name of one of `protocols`, or rules of the same class; empty for the first protocol.
+            protocol: Name of one of `protocols`, or rules of the same class; empty for the first
+                protocol.
 
         Raises:
             ChoiceError: no protocol has that name, or the rules are of another class.
         """
         super().__init__()
-        first = next(iter(self.protocols.values()), None)
-        self.protocol = first if protocol == "" else protocol_of(protocol, self.protocols)
+        if protocol == "":
+            self.protocol = next(iter(self.protocols.values()), None)
+        else:
+            self.protocol = protocol_of(protocol, self.protocols)
 
     # What a task defines
 
     def truth(self, dataset: Dataset, token: str, form: Any, horizon: float, /) -> tuple[Any, ...]:
-        """Return what `update` takes after the prediction; evaluators that are no tasks have none.
+        """Return the arguments of `update` after the prediction; only tasks have them.
 
         Args:
             dataset: Release with the labels.
@@ -93,7 +99,7 @@ class Evaluator(SampleCounts, Generic[_Result]):
 
     @abstractmethod
     def update(self, token: str, *arguments: Any) -> None:
-        """Count one sample: its token, then its prediction and its truth; passes the counts to `add`."""
+        """Count one sample: its token, prediction and truth; passes the counts to `add`."""
 
     @abstractmethod
     def result_of(self, counts: Collection[Counts]) -> _Result:
@@ -146,20 +152,20 @@ class Evaluator(SampleCounts, Generic[_Result]):
     def pooled(self, counts: Collection[Counts]) -> Sequence[Counts]:
         """Return fewer counts with the same result, for many results of these samples.
 
-        A subclass whose counts are sums adds them up; by default they stay apart.
+        A subclass with sums as counts adds them up; by default they stay apart.
         """
         return list(counts)
 
     @property
     def has_intervals(self) -> bool:
-        """Whether the numbers can be computed many times; if not, they have no intervals and no tests."""
+        """Whether numbers can be computed many times; otherwise they have no intervals or tests."""
         return True
 
     def resampled(self, parts: Sequence[Sequence[Counts]], times: IntArray) -> Iterator[_Result]:
         """Yield the result of each of D draws of groups of samples.
 
         Args:
-            parts: Counts of P groups of samples, each of which is drawn as a whole.
+            parts: Counts of P groups of samples; each group is drawn as a whole.
             times: How often each group is drawn, shape (D, P).
         """
         pooled = [self.pooled(part) for part in parts]
@@ -175,7 +181,10 @@ class Evaluator(SampleCounts, Generic[_Result]):
         times: IntArray,  # noqa: ARG002
         names: Sequence[str],  # noqa: ARG002
     ) -> FloatArray | None:
-        """Return the numbers of M paths in each of D draws, shape (D, M), NaN for none; None to use `resampled`."""
+        """Return M numbers in each of D draws, shape (D, M), NaN for none.
+
+        None to use `resampled`.
+        """
         return None
 
 

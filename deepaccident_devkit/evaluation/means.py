@@ -1,4 +1,4 @@
-"""`MeansEvaluator`: tasks whose numbers are means, in tables; only what each sample adds to their sums is kept."""
+"""`MeansEvaluator`: tasks with means as numbers, in tables; only the terms of sums are stored."""
 
 from __future__ import annotations
 
@@ -19,11 +19,10 @@ from deepaccident_devkit.support.arrays import BoolArray, FloatArray, IntArray
 from deepaccident_devkit.support.text import counted, natural_order
 
 MEAN_OF_SCENARIOS: Final = "mean of scenarios"
-"""The row with the mean of the scenarios' own means of the main row, for evaluators that ask for it."""
-# Of 1: sums have no finer numbers.
-_PARTS: Final = 2.0**30
-
-
+"""The row with the mean of the scenarios' own means of the main row, for evaluators that ask for
+it."""
+# Number of steps from 0 to 1 to which values are rounded, so that sums are exact.
+_STEPS_PER_UNIT: Final = 2.0**30
 # Beginning of the path of a column's row.
 _ANY_CELL: Final = "means/*/*/"
 
@@ -31,11 +30,12 @@ _ANY_CELL: Final = "means/*/*/"
 def table_rows(
     columns: Sequence[Row], main_tables: Sequence[str], main_row: str
 ) -> tuple[Row, ...]:
-    """Return the rows of a result's tables: first the headlines by column, then one row for each column.
+    """Return the rows of a result's tables: the headlines by column, then one row for each column.
 
     Args:
         columns: One row for each column of the tables, with the column's name as its path.
-        main_tables: Tables whose numbers in `main_row` are headlines, unless their column says otherwise.
+        main_tables: Tables with headlines in `main_row`, except for columns that are not
+            headlines.
         main_row: Row of the tables.
     """
     numbers = [
@@ -57,10 +57,10 @@ class MeansResult(TaskResult):
     """Means of a number of samples; `table_rows` makes the `rows` of a subclass.
 
     Attributes:
-        samples: that were counted.
-        means: table → row → column → mean; NaN where there is nothing to count.
-        counted: table → row → column → of how many.
-        notes: sentences on what was left out.
+        samples: Number of samples that were counted.
+        means: Table → row → column → mean; NaN where there is nothing to count.
+        counted: Table → row → column → number of values in the mean.
+        notes: Sentences on what was left out.
     """
 
     samples: int
@@ -75,7 +75,8 @@ _Result = TypeVar("_Result", bound=MeansResult)
 class Sums:
     """What one sample adds: values by table, row and column.
 
-    Values are rounded to multiples of 2⁻³⁰ (1e-9), so that sums below 8 million are exact, in any order.
+    Values are rounded to multiples of 2⁻³⁰ (1e-9), so that sums below 8 million are exact, in any
+    order.
     """
 
     def __init__(self) -> None:
@@ -85,38 +86,53 @@ class Sums:
 
     def add(self, table: str, row: str, column: str, value: float) -> None:
         """Add one value; NaN is not counted."""
-        self.add_rows(table, {row: np.ones(1, dtype=bool)}, {column: np.array([value])})
+        mask = np.ones(1, dtype=bool)
+        values = np.array([value])
+        self.add_rows(table, {row: mask}, {column: values})
 
     def add_rows(
         self, table: str, rows: Mapping[str, BoolArray], columns: Mapping[str, FloatArray]
     ) -> None:
-        """Add values (N,) of columns to each row, of which its mask (N,) has them; NaN are not counted."""
-        values, masks = (
-            np.stack([*columns.values()], axis=1),
-            np.stack([*rows.values()]).astype(np.float64),
-        )
-        there = np.isfinite(values)
-        numbers = np.stack(
-            [masks @ np.where(there, _rounded(values), 0.0), masks @ there], axis=-1
-        ).reshape(-1, 2)
-        for name, number in zip(product(rows, columns), numbers, strict=True):
-            path = "/".join((table, *name))
+        """Add values of columns to rows; NaN is not counted.
+
+        Args:
+            table: Name of the table.
+            rows: Name of a row → mask (N,) of the values that it has.
+            columns: Name of a column → values (N,).
+        """
+        values = np.stack([*columns.values()], axis=1)
+        masks = np.stack([*rows.values()]).astype(np.float64)
+        is_known = np.isfinite(values)
+        sums = masks @ np.where(is_known, _rounded(values), 0.0)
+        numbers = np.stack([sums, masks @ is_known], axis=-1).reshape(-1, 2)
+        for (row, column), number in zip(product(rows, columns), numbers, strict=True):
+            path = f"{table}/{row}/{column}"
             self._numbers[path] = self._numbers.get(path, 0.0) + number
 
     def note(self, text: str, count: float = 1) -> None:
-        """Say something of a number of things, if there are any: `{plan}` becomes `2 plans`, those of all samples."""
+        """Note a sentence on a number of things, if there are any.
+
+        Args:
+            text: Sentence in which `{plan}` becomes `2 plans`, the number over all samples.
+            count: Number of things in this sample.
+        """
         if count:
             self._notes[text] += int(count)
 
     def counts(self, scenario: str | None = None) -> Counts:
-        """As an evaluator keeps them; with a scenario's token, the row `MEAN_OF_SCENARIOS` has means of its means."""
-        return _counts(self._numbers, self._notes) | (
-            {} if scenario is None else {"scenario": scenario}
-        )
+        """Return the counts for an evaluator.
+
+        Args:
+            scenario: Token; with it the row `MEAN_OF_SCENARIOS` has means of the scenario's means.
+        """
+        counts = _counts(self._numbers, self._notes)
+        if scenario is not None:
+            counts["scenario"] = scenario
+        return counts
 
 
 class MeansEvaluator(Evaluator[_Result], Generic[_Result]):
-    """Base of evaluators whose numbers are means; see the subclasses for what is counted."""
+    """Base of evaluators with means as numbers; see the subclasses for what is counted."""
 
     order: ClassVar[Sequence[str]] = ()
     """Names of tables and rows that come before the others, in their order."""
@@ -124,7 +140,10 @@ class MeansEvaluator(Evaluator[_Result], Generic[_Result]):
     """Row that `MEAN_OF_SCENARIOS` is made from."""
 
     def add(self, token: str, counts: Counts) -> None:
-        """Take a sample's counts (`Evaluator.add`); of samples with the same names these are kept once."""
+        """Take a sample's counts (`Evaluator.add`).
+
+        Samples with the same names of numbers share one string of them.
+        """
         names = counts.get("names")
         if not (isinstance(names, str) and names.replace("\n", "").isprintable()):
             raise EvaluationError(
@@ -133,62 +152,63 @@ class MeansEvaluator(Evaluator[_Result], Generic[_Result]):
         super().add(token, {**counts, "names": sys.intern(names)})
 
     def pooled(self, counts: Collection[Counts]) -> Sequence[Counts]:
-        """One set of counts: their sums."""
+        """Return one set of counts: their sums."""
         by_scenario: dict[str | None, list[Counts]] = {}
-        for each in counts:
-            by_scenario.setdefault(each.get("scenario"), []).append(each)
-        parts = [
-            _pooled(those) if name is None else self._of_scenario(those)
-            for name, those in by_scenario.items()
-        ]
+        for sample in counts:
+            by_scenario.setdefault(sample.get("scenario"), []).append(sample)
+        parts = []
+        for scenario, samples in by_scenario.items():
+            if scenario is None:
+                parts.append(_pooled(samples))
+            else:
+                parts.append(self._of_scenario(samples))
         return [_pooled(parts)]
 
     def _of_scenario(self, counts: Collection[Counts]) -> Counts:
-        """The sums of one scenario with its means."""
-        whole, main = _pooled(counts), f"/{self.main_row}/"
-        numbers = _by_path(whole)
-        means = {
-            path.replace(main, f"/{MEAN_OF_SCENARIOS}/"): np.array(
-                [_rounded(value / max(count, 1.0)), min(count, 1.0)]
-            )
-            for path, (value, count) in numbers.items()
-            if main in path
-        }
-        return {**whole, **_counts(numbers | means, whole["notes"])}
+        """Return the sums of one scenario with its means."""
+        pooled = _pooled(counts)
+        main = f"/{self.main_row}/"
+        numbers = _by_path(pooled)
+        means = {}
+        for path, (value, count) in numbers.items():
+            if main in path:
+                mean = _rounded(value / max(count, 1.0))
+                mean_path = path.replace(main, f"/{MEAN_OF_SCENARIOS}/")
+                means[mean_path] = np.array([mean, min(count, 1.0)])
+        return {**pooled, **_counts(numbers | means, pooled["notes"])}
 
     def drawn_numbers(
         self, parts: Sequence[Sequence[Counts]], times: IntArray, names: Sequence[str]
     ) -> FloatArray:
-        """The numbers of each draw (`Evaluator.drawn_numbers`): all sums are drawn at once."""
-        pooled = [_by_path(self.pooled(part)[0]) for part in parts]
-        given = np.array(
-            [
-                [each.get(name.removeprefix("means/"), np.zeros(2)) for name in names]
-                for each in pooled
-            ]
-        )
-        sums, counts = (
-            times @ each for each in np.moveaxis(given.reshape(len(parts), len(names), 2), -1, 0)
-        )
+        """Return the numbers of each draw (`Evaluator.drawn_numbers`).
+
+        All sums are drawn at once.
+        """
+        paths = [name.removeprefix("means/") for name in names]
+        rows = []
+        for part in parts:
+            numbers = _by_path(self.pooled(part)[0])
+            rows.append([numbers.get(path, np.zeros(2)) for path in paths])
+        values = np.array(rows).reshape(len(parts), len(names), 2)
+        sums = times @ values[..., 0]
+        counts = times @ values[..., 1]
         return np.where(counts > 0, sums / np.maximum(counts, 1), np.nan)
 
     def result_of(self, counts: Collection[Counts]) -> _Result:
-        """The means over some samples, in any order."""
+        """Return the means over some samples, in any order."""
         (pooled,) = self.pooled(counts)
         means: dict[str, dict[str, dict[str, float]]] = {}
         counted: dict[str, dict[str, dict[str, int]]] = {}
-        columns = [
-            row.path.removeprefix(_ANY_CELL)
-            for row in self.result_class.rows
-            if row.path.startswith(_ANY_CELL)
-        ]
-        for path, (value, count) in sorted(
-            _by_path(pooled).items(), key=lambda item: self._place(item[0], columns)
-        ):
+        columns = []
+        for row_description in self.result_class.rows:
+            if row_description.path.startswith(_ANY_CELL):
+                columns.append(row_description.path.removeprefix(_ANY_CELL))
+        numbers = _by_path(pooled)
+        for path in sorted(numbers, key=lambda path: self._sort_key(path, columns)):
+            value, count = numbers[path]
             table, row, column = path.split("/")
-            means.setdefault(table, {}).setdefault(row, {})[column] = ratio(
-                float(value), float(count)
-            )
+            mean = ratio(float(value), float(count))
+            means.setdefault(table, {}).setdefault(row, {})[column] = mean
             counted.setdefault(table, {}).setdefault(row, {})[column] = int(count)
         notes = tuple(_note_text(text, count) for text, count in sorted(pooled["notes"].items()))
         result: _Result = self.result_class(
@@ -196,13 +216,16 @@ class MeansEvaluator(Evaluator[_Result], Generic[_Result]):
         )
         return result
 
-    def _place(self, path: str, columns: Sequence[str]) -> tuple[Any, ...]:
-        """Return the sort key of a number: `order` for tables and rows, `columns` for columns; raises ValueError."""
+    def _sort_key(self, path: str, columns: Sequence[str]) -> tuple[Any, ...]:
+        """Return the sort key of a number: `order` for tables and rows, `columns` for columns.
+
+        Raises ValueError for an unknown column.
+        """
         *names, column = path.split("/")
-        places = [
-            self.order.index(name) if name in self.order else len(self.order) for name in names
-        ]
-        keys = [(place, natural_order(name)) for place, name in zip(places, names, strict=True)]
+        keys = []
+        for name in names:
+            rank = self.order.index(name) if name in self.order else len(self.order)
+            keys.append((rank, natural_order(name)))
         return *keys, columns.index(column)
 
 
@@ -212,33 +235,43 @@ def _note_text(text: str, count: int) -> str:
 
 
 def _rounded(values: FloatArray | float) -> FloatArray:
-    return np.asarray(np.rint(np.multiply(values, _PARTS)) / _PARTS)
+    """Return values rounded to multiples of 1 / `_STEPS_PER_UNIT`."""
+    steps = np.rint(np.multiply(values, _STEPS_PER_UNIT))
+    return np.asarray(steps / _STEPS_PER_UNIT)
 
 
 def _counts(numbers: Mapping[str, FloatArray], notes: Mapping[str, int]) -> dict[str, Any]:
-    """Paths `table/row/column` with the sum and of how many (2,), as JSON holds them."""
+    """Return sums by path `table/row/column`, as JSON holds them.
+
+    Args:
+        numbers: Path → sum and number of values, shape (2,).
+        notes: Sentence → number of things.
+    """
     return {
         "names": "\n".join(numbers),
-        "numbers": [each.tolist() for each in numbers.values()],
+        "numbers": [number.tolist() for number in numbers.values()],
         "notes": dict(notes),
     }
 
 
 def _by_path(counts: Counts) -> dict[str, FloatArray]:
-    return dict(
-        zip(filter(None, counts["names"].split("\n")), np.array(counts["numbers"]), strict=True)
-    )
+    """Return the sums of counts by path; the inverse of `_counts`."""
+    paths = filter(None, counts["names"].split("\n"))
+    return dict(zip(paths, np.array(counts["numbers"]), strict=True))
 
 
 def _pooled(counts: Collection[Counts]) -> Counts:
-    alike: dict[str, list[Counts]] = {}
+    """Return the sums of counts."""
+    by_names: dict[str, list[Counts]] = {}
     numbers: dict[str, FloatArray] = {}
     notes: Counter[str] = Counter()
-    for each in counts:
-        alike.setdefault(each["names"], []).append(each)
-        notes.update(each["notes"])
-    for those in alike.values():  # few, of many samples
-        total = np.sum([each["numbers"] for each in those], axis=0)
-        for path, number in _by_path({**those[0], "numbers": total}).items():
+    for sample in counts:
+        by_names.setdefault(sample["names"], []).append(sample)
+        notes.update(sample["notes"])
+    # many samples have few different names
+    for samples in by_names.values():
+        total = np.sum([sample["numbers"] for sample in samples], axis=0)
+        for path, number in _by_path({**samples[0], "numbers": total}).items():
             numbers[path] = numbers.get(path, 0.0) + number
-    return {"samples": sum(each.get("samples", 1) for each in counts), **_counts(numbers, notes)}
+    sample_count = sum(sample.get("samples", 1) for sample in counts)
+    return {"samples": sample_count, **_counts(numbers, notes)}

@@ -1,4 +1,4 @@
-"""How well a model foresees where all actors are: IoU, VPQ, minADE, minFDE, miss rate; the task `motion`."""
+"""Metrics of predicted motion: IoU, VPQ, minADE, minFDE and miss rate; the task `motion`."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from typing import Any, ClassVar, Final
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.evaluation.evaluator import Counts, Evaluator, ratio, total
 from deepaccident_devkit.evaluation.instances import (
+    PanopticQuality,
     SegmentationCounts,
     instance_paths,
     iou,
@@ -20,6 +21,7 @@ from deepaccident_devkit.evaluation.instances import (
     match_trajectories,
     padded,
     panoptic_quality,
+    prediction_accuracy,
     trajectory_errors,
     vpq_counts,
 )
@@ -50,11 +52,17 @@ __all__ = [
     "MotionEvaluator",
     "MotionProtocol",
     "MotionResult",
+    "PanopticQuality",
     "RangeResult",
+    "SegmentationCounts",
+    "iou",
+    "mask_counts",
     "motion_counts",
+    "panoptic_quality",
 ]
 
-# Name, as the released code prints it → metres: side of a square around the ego in which IoU and VPQ are counted.
+# Name, as the released code prints it → side of the square around the ego in which IoU and VPQ are
+# counted, metres.
 RANGES: Final[Mapping[str, float]] = MappingProxyType({"30x30": 30.0, "100x100": 100.0})
 
 
@@ -65,8 +73,9 @@ class MotionProtocol:
     Sources: docs/released_code.md, Post-processing, IoU and VPQ, and Paths.
 
     Attributes:
-        labels: protocol of the labels that are the truth, by name; others are refused. None for any labels.
-        nothing_is_zero: IoU and VPQ of samples with nothing to count are 0; else NaN.
+        labels: Name of the protocol of the true labels; other labels are refused. None for any
+            labels.
+        nothing_is_zero: Whether IoU and VPQ of samples with nothing to count are 0; otherwise NaN.
     """
 
     labels: str | None = "released"
@@ -80,18 +89,21 @@ class MotionProtocol:
 MOTION_PROTOCOLS: Final[Mapping[str, MotionProtocol]] = MappingProxyType(
     {"released": MotionProtocol(), "paper": MotionProtocol(nothing_is_zero=False)}
 )
-"""What the released code computes. The paper's text says no more of these metrics than their names, FIERY's and the
-ranges: so `paper` is the released code, except that a number with nothing to count is NaN and not 0."""
+"""The metrics of the released code. The paper's text only has their names, from FIERY, and the
+ranges: so `paper` is the released code, except that a number with nothing to count is NaN and not
+0."""
 
 
-# How instances are read off heads, and off labels, for minADE, minFDE and miss rate. The released code has these
-# errors from the accident evaluation, which links and cuts out instances by other rules than VPQ's.
-_READ_FOR_PATHS: Final = replace(POST_PROCESSING["accident"], redraw=False)
+# How instances are read off heads, and off labels, for minADE, minFDE and miss rate. The released
+# code has these errors from the accident evaluation, which links and cuts out instances by other
+# rules than VPQ's.
+_PATH_PROCESSING: Final = replace(POST_PROCESSING["accident"], redraw=False)
 _PATH_COUNTS: Final = ("true_positive", "false_positive", "false_negative")
-_PATHS: Final = ("ade", "fde", "missed", "count", *_PATH_COUNTS)
-_INSTANCE_MAPS: Final = (
-    "given as instance maps, and so compared with the labels' own instances, of paths too; those given as heads have "
-    "their paths compared with what is read off the labels as if a model had predicted them"
+_PATH_SUMS: Final = ("ade", "fde", "missed", "count", *_PATH_COUNTS)
+_INSTANCE_MAPS_NOTE: Final = (
+    "given as instance maps, and so compared with the labels' own instances, of paths too; those "
+    "given as heads have their paths compared with what is read off the labels as if a model had "
+    "predicted them"
 )
 
 
@@ -100,13 +112,13 @@ class RangeResult(ShortRepr):
     """Metrics within one range.
 
     Attributes:
-        iou: intersection over union of the actors' cells, percent.
-        pq: video panoptic quality, percent.
-        sq: segmentation quality of the instances found, percent.
-        rq: recognition quality, percent.
-        true_positive: instances found, frame by frame.
-        false_positive: instances predicted without a true one.
-        false_negative: instances missed.
+        iou: Intersection over union of the actors' cells, percent.
+        pq: Video panoptic quality, percent.
+        sq: Segmentation quality of the instances found, percent.
+        rq: Recognition quality, percent.
+        true_positive: Instances found, frame by frame.
+        false_positive: Instances predicted without a true one.
+        false_negative: Instances missed.
     """
 
     iou: float
@@ -123,18 +135,22 @@ class MotionResult(TaskResult):
     """Motion metrics of some samples.
 
     Attributes:
-        ranges: by name (`30x30`, `100x100`), of the last prediction, which in the released order is the mean.
-        min_ade: metres: mean error of the paths over their frames, of the best of all predictions; NaN without any.
-        min_fde: metres: their error at the last frame; likewise.
-        miss_rate: share of the paths that end too far away, in [0, 1]; likewise.
-        paths: how many true paths have a partner in some prediction: what the three are means over.
-        path_accuracy: tp / (tp + fp / 2 + fn / 2) of the last prediction's paths, in [0, 1]; NaN without any.
-        path_true_positive: paths of the last prediction that have a partner.
-        path_false_positive: those that have none.
-        path_false_negative: true paths without one.
-        samples: how many.
-        frames: compared, of all samples.
-        notes: sentences that a reader of the numbers should know.
+        ranges: Metrics by range (`30x30`, `100x100`), for the last prediction, which in the
+            released order is the mean.
+        min_ade: Mean error of the paths over their frames, of the best of all predictions, metres;
+            NaN without any.
+        min_fde: Error of the paths at the last frame, metres; likewise.
+        miss_rate: Share of the paths that end too far away, in [0, 1]; likewise.
+        paths: Number of true paths with a partner in some prediction: the three errors are means
+            over them.
+        path_accuracy: tp / (tp + fp / 2 + fn / 2) of the last prediction's paths, in [0, 1]; NaN
+            without any.
+        path_true_positive: Paths of the last prediction that have a partner.
+        path_false_positive: Paths of the last prediction that have none.
+        path_false_negative: True paths without a partner.
+        samples: Number of samples.
+        frames: Number of compared frames of all samples.
+        notes: Sentences that a reader of the numbers should know.
     """
 
     rows: ClassVar[tuple[Row, ...]] = (
@@ -148,21 +164,24 @@ class MotionResult(TaskResult):
         Row("path_accuracy", "share", "higher", is_headline=False),
     )
     ranges: Mapping[str, RangeResult]
+    # paths of all predictions
     min_ade: float
     min_fde: float
     miss_rate: float
     paths: int
+    # paths of the last prediction
     path_accuracy: float
     path_true_positive: int
     path_false_positive: int
     path_false_negative: int
+    # totals
     samples: int
     frames: int
     notes: tuple[str, ...] = ()
 
 
 class MotionEvaluator(Evaluator[MotionResult]):
-    """IoU and VPQ of the last prediction, and errors of the paths over all of them.
+    """IoU and VPQ of the last prediction, and errors of the paths over all predictions.
 
     >>> evaluator = MotionEvaluator()
     >>> evaluator.compute().ranges["30x30"].iou
@@ -182,9 +201,10 @@ class MotionEvaluator(Evaluator[MotionResult]):
         """Start without samples.
 
         Args:
-            protocol: of `MOTION_PROTOCOLS` by name, or one with other fields.
-            trajectories: whether paths are compared too. Of heads that takes many times as long as all the rest, since
-                instances are read off all predictions and the labels for it.
+            protocol: Name of one of `MOTION_PROTOCOLS`, or a protocol with other fields.
+            trajectories: Whether paths are compared too. For heads that takes many times as long as
+                everything besides, since instances are read off all predictions and the labels for
+                it.
 
         Raises:
             ChoiceError: no protocol has that name.
@@ -207,74 +227,72 @@ class MotionEvaluator(Evaluator[MotionResult]):
         """Count one sample.
 
         Args:
-            token: of the sample.
-            prediction: what a model says, in any orientation.
-            label: the sample's labels, on the same ground; those still in their own frames are warped to the present.
+            token: Token of the sample.
+            prediction: Prediction of a model, in any orientation.
+            label: Labels of the sample, on the same ground; frames in their own frames are warped
+                to the present.
 
         Raises:
-            EvaluationError: there is no prediction or label, the labels are of another protocol, the prediction has
-                another grid or too few frames, or the sample came before with another outcome.
+            EvaluationError: there is no prediction or label, the labels are of another protocol,
+                the prediction has another grid or too few frames, or the sample came before with
+                other counts.
         """
         self.add(
             token, motion_counts(prediction, label, self.protocol, trajectories=self.trajectories)
         )
 
     def result_of(self, counts: Collection[Counts]) -> MotionResult:
-        """The metrics of some samples' counts, in any order."""
+        """Return the metrics of some samples' counts, in any order."""
         return motion_result(counts, self.protocol)
 
     def sample_row(self, token: str) -> dict[str, Any]:
-        """Return IoU and PQ (percent), instances and cells by range, then the paths and their errors (m)."""
+        """Return IoU and PQ (percent), instances and cells by range, then path errors (m)."""
         result = self.compute([token])
         row: dict[str, Any] = {"frames": result.frames}
-        for (name, part), cells in zip(
-            result.ranges.items(), self._counts[token]["cells"], strict=True
-        ):
-            row |= {f"iou_{name}": part.iou, f"pq_{name}": part.pq}
-            row |= {
-                f"tp_{name}": part.true_positive,
-                f"fp_{name}": part.false_positive,
-                f"fn_{name}": part.false_negative,
-            }
-            row |= {
-                f"cells_{case}_{name}": count
-                for case, count in zip(("tp", "fp", "fn"), cells, strict=True)
-            }
+        cells_by_range = self._counts[token]["cells"]
+        for (name, metrics), cells in zip(result.ranges.items(), cells_by_range, strict=True):
+            row[f"iou_{name}"] = metrics.iou
+            row[f"pq_{name}"] = metrics.pq
+            row[f"tp_{name}"] = metrics.true_positive
+            row[f"fp_{name}"] = metrics.false_positive
+            row[f"fn_{name}"] = metrics.false_negative
+            for case, count in zip(("tp", "fp", "fn"), cells, strict=True):
+                row[f"cells_{case}_{name}"] = count
         paths = ("paths", "path_true_positive", "path_false_positive", "path_false_negative")
-        return row | {
-            name: getattr(result, name) for name in (*paths, "min_ade", "min_fde", "miss_rate")
-        }
+        for name in (*paths, "min_ade", "min_fde", "miss_rate"):
+            row[name] = getattr(result, name)
+        return row
 
     def pooled(self, counts: Collection[Counts]) -> list[Counts]:
-        """The samples' counts as those of one sample of one frame, which have the same result."""
+        """Return the counts of one sample of one frame that have the same result."""
         return [_sums(counts)]
 
     def selected_as_released(self, order: Sequence[str], selected: Collection[str]) -> MotionResult:
-        """The result of some samples as the released code has it "by attribute": with the VPQ of other frames.
+        """Return the result that the released code has "by attribute", with its mistake.
 
-        A mistake that is kept for comparison: it has one entry a *frame*, of all samples one after the other, and takes
-        those whose number is a *sample's*, so that most of what it sums up belongs to others. `compute(selected)` is
-        the correct result.
+        The mistake is reproduced for comparison: VPQ has one entry per *frame*, of all samples one
+        after the other, and takes the entries with the numbers of *samples*, so that most of its
+        sum belongs to other samples. `compute(selected)` is the correct result.
 
         Args:
-            order: all samples in the order evaluated.
-            selected: some of them.
+            order: All samples in the order evaluated.
+            selected: Some of them.
 
         Raises:
             EvaluationError: one of them was not counted.
         """
         self.compute(order)  # refuses samples that were not counted
-        frames = [
-            [[[values[frame]] for values in each] for each in self._counts[token]["vpq"]]
-            for token in order
-            for frame in range(self._counts[token]["frames"])
-        ]
-        chosen = [
-            {**self._counts[token], "vpq": frames[number]}
-            for number, token in enumerate(order)
-            if token in set(selected)
-        ]
-        return motion_result(chosen, self.protocol)
+        frames = []
+        for token in order:
+            counts = self._counts[token]
+            for frame in range(counts["frames"]):
+                frame_vpq = [[[values[frame]] for values in numbers] for numbers in counts["vpq"]]
+                frames.append(frame_vpq)
+        released_counts = []
+        for number, token in enumerate(order):
+            if token in set(selected):
+                released_counts.append({**self._counts[token], "vpq": frames[number]})
+        return motion_result(released_counts, self.protocol)
 
 
 def motion_counts(
@@ -284,34 +302,39 @@ def motion_counts(
     *,
     trajectories: bool = True,
 ) -> Counts:
-    """What one sample adds, as JSON can hold it; arguments and errors as of `MotionEvaluator.update`.
+    """Return what one sample adds, as JSON can hold it.
+
+    Arguments and errors are as in `MotionEvaluator.update`.
 
     Returns:
-        `samples`, 1; `frames` compared; `instance_maps`, 1 if the prediction was given so, else 0; by range, `cells`
-        [tp, fp, fn] and `vpq`, four lists by frame: the sum of the intersections over unions, and the numbers of true
-        positives, false positives and false negatives; `paths`, sums by name, or None.
+        `samples`, 1; `frames` compared; `instance_maps`, 1 if the prediction is instance maps,
+        otherwise 0; by range, `cells` [tp, fp, fn] and `vpq`, four lists by frame: the sum of the
+        intersections over unions, and the numbers of true positives, false positives and false
+        negatives; `paths`, sums by name, or None.
     """
     rules = protocol or MotionProtocol()
     prediction, label = checked_pair(prediction, label)
     frames = compared_frames(prediction, label, rules.labels)
-    truth, grid = labels_at_present(label), label.config.grid
-    actors, instance = (
-        prediction.grid.reorient(each, grid.orientation) for each in _last_maps(prediction, frames)
-    )
-    true_actors, true_instance = truth.segmentation[:frames] == 1, truth.instance[:frames]
-    cells, vpq = [], []
+    truth = labels_at_present(label)
+    grid = label.config.grid
+    maps = _last_maps(prediction, frames)
+    actors, instance = (prediction.grid.reorient(raster, grid.orientation) for raster in maps)
+    true_actors = truth.segmentation[:frames] == 1
+    true_instance = truth.instance[:frames]
+    cells = []
+    vpq = []
     for extent in RANGES.values():
         within = (slice(None), *cells_within(grid, extent))
-        counted = mask_counts(actors[within], true_actors[within])
-        cells.append([counted.true_positive, counted.false_positive, counted.false_negative])
+        mask = mask_counts(actors[within], true_actors[within])
+        cells.append([mask.true_positive, mask.false_positive, mask.false_negative])
         quality = vpq_counts(instance[within], true_instance[within])
-        by_name = (
+        numbers = (
             quality.iou,
             quality.true_positive,
             quality.false_positive,
             quality.false_negative,
         )
-        vpq.append([values[:, 1].tolist() for values in by_name])
+        vpq.append([values[:, 1].tolist() for values in numbers])
     return {
         "samples": 1,
         "frames": frames,
@@ -323,17 +346,19 @@ def motion_counts(
 
 
 def _last_maps(prediction: MotionOutput, frames: int) -> tuple[AnyArray, AnyArray]:
-    """(T, H, W) which cells are actors, and instances, of the last prediction, as it lies."""
+    """Return the actors' cells and the instances of the last prediction, shape (T, H, W) each.
+
+    Both are in the orientation of the prediction.
+    """
     actors = actor_cells(prediction)[:frames]
     if prediction.instances is not None:
         return actors, prediction.instances[-1, :frames]
-    return actors, predict_instances(
-        first_frames((prediction.heads or ())[-1], frames), "motion"
-    ).instance
+    heads = first_frames((prediction.heads or ())[-1], frames)
+    return actors, predict_instances(heads, "motion").instance
 
 
 def actor_cells(prediction: MotionOutput) -> AnyArray:
-    """(T, H, W) which cells are actors in the last prediction, as it lies."""
+    """Return which cells are actors in the last prediction, shape (T, H, W), in its orientation."""
     if prediction.instances is not None:
         instances: AnyArray = prediction.instances[-1] > 0
         return instances
@@ -342,17 +367,23 @@ def actor_cells(prediction: MotionOutput) -> AnyArray:
 
 
 def _path_counts(prediction: MotionOutput, truth: MotionLabels, frames: int) -> dict[str, float]:
+    """Return the sums of the path errors of one sample, and the cases of its last prediction."""
     grid = truth.config.grid
     if prediction.instances is not None:
-        maps = [*((each, prediction.grid) for each in prediction.instances), (truth.instance, grid)]
-        *predicted, true = (instance_paths(each[:frames], cells) for each, cells in maps)
+        true = instance_paths(truth.instance[:frames], grid)
+        predicted = []
+        for maps in prediction.instances:
+            predicted.append(instance_paths(maps[:frames], prediction.grid))
     else:
-        heads = (*(prediction.heads or ()), MotionHeads.from_labels(truth))
-        *predicted, true = (_paths_of(first_frames(each, frames), grid) for each in heads)
+        true = _paths_of(first_frames(MotionHeads.from_labels(truth), frames), grid)
+        predicted = []
+        for heads in prediction.heads or ():
+            predicted.append(_paths_of(first_frames(heads, frames), grid))
     length = longest(true)
-    *sides, true = (padded(each, length) for each in (*predicted, true))
-    matches = [match_trajectories(paths, true) for paths in sides]
-    errors = trajectory_errors(sides, true, matches)
+    predicted = [padded(paths, length) for paths in predicted]
+    true = padded(true, length)
+    matches = [match_trajectories(paths, true) for paths in predicted]
+    errors = trajectory_errors(predicted, true, matches)
     last = matches[-1]
     return asdict(errors) | {
         "true_positive": len(last.pairs),
@@ -362,75 +393,88 @@ def _path_counts(prediction: MotionOutput, truth: MotionLabels, frames: int) -> 
 
 
 def _paths_of(heads: MotionHeads, grid: BevGrid) -> dict[int, FloatArray]:
-    return trajectories(predict_instances(heads, _READ_FOR_PATHS), grid, half_cell_shift=False)
+    """Return the paths of the instances of heads."""
+    instances = predict_instances(heads, _PATH_PROCESSING)
+    return trajectories(instances, grid, half_cell_shift=False)
 
 
 def _sums(counts: Collection[Counts]) -> dict[str, Any]:
-    """The samples' counts as those of one sample of one frame."""
-    ranges, kinds = range(len(RANGES)), range(4)
-    vpq = [
-        [
-            [math.fsum(chain.from_iterable(each["vpq"][index][kind] for each in counts))]
-            for kind in kinds
-        ]
-        for index in ranges
-    ]
-    columns = [[*zip(*(each["cells"][index] for each in counts), strict=True)] for index in ranges]
-    paths = [each["paths"] for each in counts if each["paths"]]
+    """Return the samples' counts in the form of one sample of one frame."""
+    cells = []
+    vpq = []
+    for index in range(len(RANGES)):
+        case_columns = zip(*(sample["cells"][index] for sample in counts), strict=True)
+        cells.append([sum(column) for column in case_columns] or [0, 0, 0])
+        sums = []
+        for kind in range(4):
+            values = chain.from_iterable(sample["vpq"][index][kind] for sample in counts)
+            sums.append([math.fsum(values)])
+        vpq.append(sums)
+    paths = [sample["paths"] for sample in counts if sample["paths"]]
     return {
-        **{
-            name: sum(each[name] for each in counts)
-            for name in ("samples", "frames", "instance_maps")
-        },
-        "cells": [[*map(sum, those or [()] * 3)] for those in columns],
+        "samples": sum(sample["samples"] for sample in counts),
+        "frames": sum(sample["frames"] for sample in counts),
+        "instance_maps": sum(sample["instance_maps"] for sample in counts),
+        "cells": cells,
         "vpq": vpq,
-        "paths": {name: total(paths, name) for name in _PATHS},
+        "paths": {name: total(paths, name) for name in _PATH_SUMS},
     }
 
 
 def motion_result(counts: Collection[Counts], protocol: MotionProtocol) -> MotionResult:
-    """The metrics of some samples' counts, in any order."""
+    """Return the metrics of some samples' counts, in any order."""
     sums = _sums(counts)
-    paths, samples, number = (sums[name] for name in ("paths", "samples", "instance_maps"))
-    ranges = [
-        _range_result(*each, protocol) for each in zip(sums["cells"], sums["vpq"], strict=True)
-    ]
-    found, alarms, lost = (int(paths[name]) for name in _PATH_COUNTS)
+    ranges = {}
+    for name, cells, vpq in zip(RANGES, sums["cells"], sums["vpq"], strict=True):
+        ranges[name] = _range_result(cells, vpq, protocol)
+    paths = sums["paths"]
+    true_positive, false_positive, false_negative = (int(paths[name]) for name in _PATH_COUNTS)
+    notes: tuple[str, ...] = ()
+    if sums["instance_maps"]:
+        predictions = counted(sums["samples"], "prediction")
+        notes = (f"{sums['instance_maps']} of {predictions}: {_INSTANCE_MAPS_NOTE}",)
     return MotionResult(
-        ranges=dict(zip(RANGES, ranges, strict=True)),
+        ranges=ranges,
         min_ade=ratio(paths["ade"], paths["count"]),
         min_fde=ratio(paths["fde"], paths["count"]),
         miss_rate=ratio(paths["missed"], paths["count"]),
         paths=int(paths["count"]),
-        path_accuracy=ratio(found, found + alarms / 2 + lost / 2),
-        path_true_positive=found,
-        path_false_positive=alarms,
-        path_false_negative=lost,
-        samples=samples,
+        path_accuracy=prediction_accuracy(true_positive, false_positive, false_negative),
+        path_true_positive=true_positive,
+        path_false_positive=false_positive,
+        path_false_negative=false_negative,
+        samples=sums["samples"],
         frames=sums["frames"],
-        notes=(f"{number} of {counted(samples, 'prediction')}: {_INSTANCE_MAPS}",)
-        if number
-        else (),
+        notes=notes,
     )
 
 
 def _range_result(
     cells: Sequence[int], vpq: Sequence[Sequence[float]], protocol: MotionProtocol
 ) -> RangeResult:
-    """Of the sums of [tp, fp, fn] cells, and of overlaps, found, false and missed instances."""
+    """Return the metrics of one range.
+
+    Args:
+        cells: Sums of [tp, fp, fn] cells.
+        vpq: Sums of overlaps, found, false and missed instances, each in a list.
+        protocol: The rules.
+    """
     (overlap,), *numbers = vpq
-    found, alarms, missed = (int(number) for (number,) in numbers)
-    quality = panoptic_quality(overlap, found, alarms, missed)
+    matches, alarms, missed = (int(number) for (number,) in numbers)
+    quality = panoptic_quality(overlap, matches, alarms, missed)
     absent = 0.0 if protocol.nothing_is_zero else math.nan
-    percent = 100.0 if found or alarms or missed or protocol.nothing_is_zero else math.nan
-    both, mine, true = cells
-    classes = [SegmentationCounts(true_positive=both, false_positive=mine, false_negative=true)]
+    has_instances = matches or alarms or missed
+    percent = 100.0 if has_instances or protocol.nothing_is_zero else math.nan
+    true_positive, false_positive, false_negative = cells
+    mask = SegmentationCounts(
+        true_positive=true_positive, false_positive=false_positive, false_negative=false_negative
+    )
     return RangeResult(
-        iou=100 * iou(classes, absent=absent),
+        iou=100 * iou([mask], absent=absent),
         pq=percent * quality.pq,
         sq=percent * quality.sq,
         rq=percent * quality.rq,
-        true_positive=found,
+        true_positive=matches,
         false_positive=alarms,
         false_negative=missed,
     )

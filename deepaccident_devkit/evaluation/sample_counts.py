@@ -1,4 +1,4 @@
-"""`SampleCounts`: what each sample adds to the numbers, kept by its token: add, merge, save and resume."""
+"""`SampleCounts`: what each sample adds to the numbers, by token: add, merge, save and resume."""
 
 from __future__ import annotations
 
@@ -18,7 +18,8 @@ from deepaccident_devkit.support.text import path_of
 from deepaccident_devkit.support.version import __version__
 
 Counts = Mapping[str, Any]
-"""What one sample adds: names → whole numbers, floats, None, or nested lists of them; as JSON holds it."""
+"""What one sample adds: names → whole numbers, floats, None, or nested lists of them, as in
+JSON."""
 CountsT = TypeVar("CountsT", bound="SampleCounts")
 
 
@@ -26,8 +27,8 @@ class SampleCounts(ABC):
     """Counts by sample token, in any order and from any number of processes.
 
     Attributes:
-        repeated: tokens that came more than once with equal counts (samplers of distributed training do that); each
-            counts once.
+        repeated: Tokens that came more than once with equal counts (samplers of distributed
+            training do that); each counts once.
     """
 
     def __init__(self) -> None:
@@ -44,7 +45,7 @@ class SampleCounts(ABC):
     @property
     @abstractmethod
     def settings(self) -> dict[str, Any]:
-        """All choices that affect the counts, as JSON holds them; counts with other settings cannot be merged."""
+        """All choices that affect the counts, as in JSON; only equal settings can be merged."""
 
     def fresh(self: CountsT) -> CountsT:
         """Return a copy with the same settings and without samples."""
@@ -56,7 +57,7 @@ class SampleCounts(ABC):
         """Take a sample's counts.
 
         Raises:
-            EvaluationError: the token is no text, or the sample came before, with other counts.
+            EvaluationError: the token is not a text, or the sample came before with other counts.
         """
         if not isinstance(token, str):
             raise EvaluationError(f"token: expected the sample's token, a text, found {token!r}")
@@ -77,7 +78,8 @@ class SampleCounts(ABC):
         """
         if type(other) is not type(self) or other.settings != self.settings:
             raise EvaluationError(
-                f"cannot merge: {type(self).__name__} of {self.settings} with {type(other).__name__} of "
+                f"cannot merge: {type(self).__name__} of {self.settings} with "
+                f"{type(other).__name__} of "
                 f"{getattr(other, 'settings', None)}; evaluate both with the same settings"
             )
         for token, counts in other._counts.items():  # noqa: SLF001 - its own kind
@@ -91,10 +93,13 @@ class SampleCounts(ABC):
         return _Copies(self._counts)
 
     def clustered(self, clusters: Mapping[str, str]) -> list[list[Counts]]:
-        """Return the counts of some samples by cluster, for `resampled`; not copies, which would take most of the time.
+        """Return the counts of some samples by cluster, for `resampled`.
+
+        They are not copies, which would take most of the time.
 
         Args:
-            clusters: token → name of its cluster; clusters come in the order of their names' first appearance.
+            clusters: Token → name of its cluster; clusters come in the order of their names' first
+                appearance.
         """
         counts: dict[str, list[Counts]] = {}
         for token, name in clusters.items():
@@ -107,16 +112,16 @@ class SampleCounts(ABC):
         return set(self._counts)
 
     def __len__(self) -> int:
-        """Number of samples counted."""
+        """Return the number of samples counted."""
         return len(self._counts)
 
     def save(self, path: str | os.PathLike[str]) -> Path:
-        """Write all counts to a JSON file, from which a broken-off run goes on; returns its path.
+        """Write all counts to a JSON file, from which an interrupted run goes on; returns its path.
 
-        At any moment the file is either the old or the whole new one.
+        At any moment the file is either the complete old or the complete new one.
 
         Raises:
-            EvaluationError: it cannot be written.
+            EvaluationError: the file cannot be written.
         """
         target = path_of(path)
         state = {
@@ -135,17 +140,19 @@ class SampleCounts(ABC):
         return target
 
     def resume(self: CountsT, path: str | os.PathLike[str]) -> CountsT:
-        """Take the counts that `save` wrote; returns this one.
+        """Take the counts that `save` wrote; returns this evaluator.
 
         Raises:
-            EvaluationError: there is no such file, it cannot be read, or it is of other settings, another evaluator or
-                another version of the devkit.
+            EvaluationError: there is no such file, it cannot be read, or it is of other settings,
+                another evaluator or another version of the devkit.
         """
         source = path_of(path)
         try:
             state = parsed_json(read_bytes(source, "results"), constants=True)
-            maker, settings, repeated = state["made_by"], state["settings"], set(state["repeated"])
-            counts = {token: dict(each) for token, each in state["counts"].items()}
+            maker = state["made_by"]
+            settings = state["settings"]
+            repeated = set(state["repeated"])
+            counts = {token: dict(sample) for token, sample in state["counts"].items()}
         except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
             raise EvaluationError(
                 f"{source}: no saved evaluation ({fault_text(error)}); begin again"
@@ -159,8 +166,8 @@ class SampleCounts(ABC):
                 f"{source}: was saved with other settings ({settings}); begin again, or use those"
             )
         try:
-            for token, each in counts.items():
-                self.add(token, each)
+            for token, sample_counts in counts.items():
+                self.add(token, sample_counts)
         except EvaluationError as error:
             raise EvaluationError(f"{source}: {error}") from error
         self.repeated |= repeated
@@ -168,12 +175,12 @@ class SampleCounts(ABC):
 
     @property
     def maker(self) -> str:
-        """The class and version that made the counts: another version may count differently."""
+        """Class and version that made the counts: another version may count differently."""
         return f"{type(self).__name__} of devkit {__version__}"
 
 
 class _Copies(Mapping[str, Counts]):
-    """Counts by token, of which only copies are handed out."""
+    """Counts by token, returned as copies."""
 
     def __init__(self, counts: Mapping[str, Counts]) -> None:
         self._counts = counts
@@ -193,9 +200,9 @@ class _Copies(Mapping[str, Counts]):
 
 
 def _copied(value: Any) -> Any:
-    """A copy of JSON values; much faster than `copy.deepcopy`."""
+    """Return a copy of JSON values; much faster than `copy.deepcopy`."""
     if isinstance(value, Mapping):
-        return {name: _copied(each) for name, each in value.items()}
+        return {name: _copied(item) for name, item in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_copied(each) for each in value]
+        return [_copied(item) for item in value]
     return value

@@ -1,4 +1,7 @@
-"""Geometry in one right-handed convention: x forward, y left, z up, yaw counter-clockwise; metres, radians."""
+"""Geometry in one right-handed convention: x forward, y left, z up; metres, radians.
+
+Yaw is counter-clockwise.
+"""
 
 from deepaccident_devkit.geometry.bev_grid import BevGrid
 from deepaccident_devkit.geometry.box_arrays import time_to_collision

@@ -1,7 +1,8 @@
-"""`BevGrid`: the cells of a raster seen from above, in three orientations, and rasters turned from one to another.
+"""`BevGrid`: cells of a raster seen from above in three orientations, and conversions of rasters.
 
-Each turn goes through the devkit's orientation. `released` has its rows in reverse order, so vectors down the rows
-change their sign. `fiery` is its transpose, so rows and columns, and the two channels, change places.
+Each conversion goes through the devkit's orientation. `released` has its rows in reverse order, so
+vectors down the rows change their sign. `fiery` is its transpose, so rows and columns, and the two
+channels, change places.
 """
 
 from __future__ import annotations
@@ -21,28 +22,30 @@ from deepaccident_devkit.support.text import choice, settle_choices
 Orientation = Literal["devkit", "released", "fiery"]
 Axis = tuple[float, float, float]
 ORIENTATIONS: tuple[Orientation, ...] = get_args(Orientation)
-# The largest distance of a range from a whole number of cells, because decimal cell sizes are not exact in binary.
-_WHOLE = 1e-6
+# Largest distance of a range from a whole number of cells, in cells: decimal cell sizes are not
+# exact in binary.
+_CELL_COUNT_TOLERANCE = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
 class BevGrid:
-    """Square or rectangular cells over a part of the ground; equal grids compare equal and have equal hashes.
+    """Square or rectangular cells over a part of the ground; equal grids have equal hashes.
 
-    Ranges are always right-handed metres, x forward and y **left**. The orientation only says how the cells lie in an
-    array (for the default ranges, 200 × 200):
+    Ranges are always right-handed metres, x forward and y **left**. The orientation only defines
+    the order of the cells in an array (for the default ranges, 200 × 200):
 
-    - `"devkit"`: row = y index, column = x index, both rising: row 0 is the far right (y = −50), column 0 the far
-      rear (x = −50).
-    - `"released"`: the released labels' left-handed rows, column = x index: row 0 is the far **left** (y = 50).
-      Exactly the devkit's rows in reverse order: `released[..., ::-1, :]` is the devkit's array.
-    - `"fiery"`: row = x index, column = y index, both rising: row 0 is the far rear, column 0 the far right. Exactly
-      the devkit's array, transposed.
+    - `"devkit"`: row = y index, column = x index, both rising: row 0 is the far right (y = −50),
+      column 0 the far rear (x = −50).
+    - `"released"`: the released labels' left-handed rows, column = x index: row 0 is the far
+      **left** (y = 50). Exactly the devkit's rows in reverse order: `released[..., ::-1, :]` is the
+      devkit's array.
+    - `"fiery"`: row = x index, column = y index, both rising: row 0 is the far rear, column 0 the
+      far right. Exactly the devkit's array, transposed.
 
     Attributes:
-        x: start, end and cell size along x, metres.
-        y: start, end and cell size along y, metres.
-        orientation: how the cells lie in an array.
+        x: Start, end and cell size along x, metres.
+        y: Start, end and cell size along y, metres.
+        orientation: Order of the cells in an array.
     """
 
     x: Axis = (-50.0, 50.0, 0.5)
@@ -59,7 +62,7 @@ class BevGrid:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Rows and columns of an array in this orientation: (y cells, x cells), for `"fiery"` (x cells, y cells)."""
+        """Rows and columns of an array: (y cells, x cells), for `"fiery"` (x cells, y cells)."""
         along_x, along_y = self._counts
         return (along_x, along_y) if self.orientation == "fiery" else (along_y, along_x)
 
@@ -71,59 +74,66 @@ class BevGrid:
     @property
     def text(self) -> str:
         """`200 × 200 cells of 0.5 m`: rows, columns and the size of a cell along x and y."""
+        rows, columns = self.shape
         sizes = dict.fromkeys(f"{axis[2]:g}" for axis in (self.x, self.y))
-        return f"{' × '.join(map(str, self.shape))} cells of {' × '.join(sizes)} m"
+        return f"{rows} × {columns} cells of {' × '.join(sizes)} m"
 
     def with_orientation(self, orientation: Orientation) -> BevGrid:
-        """The same cells with another order in an array. Raises ChoiceError."""
+        """Return the same cells with another order in an array. Raises ChoiceError."""
         if orientation in ORIENTATIONS:
             return _with_orientation(self, orientation)
         return replace(self, orientation=orientation)  # the new grid checks it
 
     def index_of(self, points: ArrayLike) -> tuple[IntArray, BoolArray]:
-        """The cells in which points (N, 2) or (N, 3) lie; x forward, y left, metres.
+        """Return the cells in which points lie.
 
-        In every orientation, a cell includes its lower edges in x and y. (Label rasters round polygon corners by
-        another rule, docs/released_code.md, Motion labels; this one is for points.)
+        In every orientation, a cell includes its lower edges in x and y. (Label rasters round
+        polygon corners by another rule, docs/released_code.md, Motion labels; this one is for
+        points.)
+
+        Args:
+            points: (N, 2) or (N, 3) x forward, y left, metres.
 
         Returns:
-            (N, 2) int64 row and column in this orientation, −1 −1 for points outside the grid; and (N,) bool, which
-            points are in it (NaN is not).
+            (N, 2) int64 row and column in this orientation, −1 −1 for points outside the grid; and
+            (N,) bool, which points are in it (NaN is not).
 
         Raises:
             GeometryError: `points` has another shape.
         """
-        given = as_numbers("points", points, "points of shape (N, 2) or (N, 3)")
-        if given.ndim != 2 or given.shape[1] not in (2, 3):
-            raise GeometryError(f"points: expected shape (N, 2) or (N, 3), found {given.shape}")
-        steps, inside = [], np.ones(len(given), dtype=bool)
-        for values, (low, high, size), count in zip(
-            given.T, (self.x, self.y), self._counts, strict=False
-        ):
+        positions = as_numbers("points", points, "points of shape (N, 2) or (N, 3)")
+        if positions.ndim != 2 or positions.shape[1] not in (2, 3):
+            raise GeometryError(f"points: expected shape (N, 2) or (N, 3), found {positions.shape}")
+        cells = []
+        is_inside = np.ones(len(positions), dtype=bool)
+        axes = zip(positions.T, (self.x, self.y), self._counts, strict=False)
+        for values, (low, high, size), count in axes:
             within = (values >= low) & (values < high)
-            cell = np.floor((np.where(within, values, low) - low) / size).astype(np.int64)
-            steps.append(np.minimum(cell, count - 1))
-            inside &= within
-        along_x, along_y = steps
+            offset = np.where(within, values, low) - low
+            cell = np.floor(offset / size).astype(np.int64)
+            cells.append(np.minimum(cell, count - 1))
+            is_inside &= within
+        along_x, along_y = cells
+        devkit_shape = self._counts[::-1]
         index = np.stack(
-            cells_in(along_y, along_x, self._counts[::-1], "devkit", self.orientation), axis=1
+            cells_in(along_y, along_x, devkit_shape, "devkit", self.orientation), axis=1
         )
-        index[~inside] = -1
-        return index, inside
+        index[~is_inside] = -1
+        return index, is_inside
 
     def centers(self) -> FloatArray:
-        """The cells' centres, (rows, columns, 2) x forward, y left, metres, in this orientation."""
-        across, along = (
+        """Return the cells' centres in this orientation, (rows, columns, 2) x forward, y left."""
+        x, y = (
             low + (np.arange(count) + 0.5) * size
             for (low, _, size), count in zip((self.x, self.y), self._counts, strict=True)
         )
-        return self._laid_out(np.stack(np.meshgrid(across, along), axis=-1))
+        return self._laid_out(np.stack(np.meshgrid(x, y), axis=-1))
 
     def reorient(self, raster: AnyArray, orientation: Orientation) -> AnyArray:
-        """A raster (…, rows, columns) of this grid as a view in another orientation.
+        """Return a raster (…, rows, columns) of this grid as a view in another orientation.
 
-        Only cells change places. The values of offset and flow channels point along rows and columns: the caller has
-        to negate or swap them.
+        Only cells change places. The values of offset and flow channels point along rows and
+        columns: the caller has to negate or swap them.
 
         Raises:
             GeometryError: the raster has another shape than the grid.
@@ -138,14 +148,17 @@ class BevGrid:
         return _turned(_turned(array, self.orientation), target.orientation)
 
     def _laid_out(self, devkit: FloatArray) -> FloatArray:
-        """An array (rows, columns, …) in the devkit's orientation, changed to this one."""
+        """Return an array (rows, columns, …) of the devkit's orientation in this one."""
         if self.orientation == "fiery":
             return devkit.swapaxes(0, 1)
         return devkit if self.orientation == "devkit" else devkit[::-1]
 
 
 def _turned(raster: AnyArray, orientation: Orientation) -> AnyArray:
-    """A raster (…, rows, columns) from the devkit's orientation to another, or back: each is its own inverse."""
+    """Return a raster (…, rows, columns) of the devkit's orientation in another one, or back.
+
+    Each conversion is its own inverse.
+    """
     if orientation == "fiery":
         return raster.swapaxes(-1, -2)
     return raster if orientation == "devkit" else raster[..., ::-1, :]
@@ -158,7 +171,15 @@ def cells_in(
     source: Orientation,
     target: Orientation,
 ) -> tuple[AnyArray, AnyArray]:
-    """Row and column in another orientation, of cells of one orientation with `shape` (rows, columns)."""
+    """Return row and column in another orientation, for cells of one orientation.
+
+    Args:
+        row: Rows of the cells.
+        column: Columns of the cells.
+        shape: Rows and columns of an array in the orientation `source`.
+        source: Orientation of the arguments.
+        target: Orientation of the result.
+    """
     rows, columns = shape
     if source == "fiery":
         row, column, rows, columns = column, row, columns, rows
@@ -169,39 +190,40 @@ def cells_in(
 
 @functools.lru_cache(maxsize=256)
 def _with_orientation(grid: BevGrid, orientation: Orientation) -> BevGrid:
-    """The grid in another orientation, cached, because labels need the same few many times for each sample."""
+    """Return the grid in another orientation, cached: labels need the same few for each sample."""
     return replace(grid, orientation=orientation)
 
 
-def _axis(name: str, given: Axis) -> Axis:
+def _axis(name: str, axis: Axis) -> Axis:
+    """Return start, end and cell size as floats; raises ConfigError."""
     try:
-        low, high, size = (float(number) for number in given)
+        low, high, size = (float(number) for number in axis)
     except (TypeError, ValueError, OverflowError) as error:
         raise ConfigError(
-            f"{name}: expected start, end and cell size in metres, found {given!r}"
+            f"{name}: expected start, end and cell size in metres, found {axis!r}"
         ) from error
     if not (low < high and 0 < size < math.inf and math.isfinite((high - low) / size)):
         raise ConfigError(
-            f"{name}: expected start < end and a cell size above 0 in metres, found {given!r}"
+            f"{name}: expected start < end and a cell size above 0 in metres, found {axis!r}"
         )
     return low, high, size
 
 
 def _cell_count(name: str, axis: Axis) -> int:
+    """Return the number of cells along an axis; raises ConfigError if it is not a whole number."""
     low, high, size = axis
     cells = (high - low) / size
     count = round(cells)
-    if count > 0 and abs(cells - count) <= _WHOLE:
+    if count > 0 and abs(cells - count) <= _CELL_COUNT_TOLERANCE:
         return count
-    shorter, longer = math.floor(cells), math.floor(cells) + 1
-    ends = [
-        f"({low:g}, {low + number * size:g}, {size:g})"
-        for number in (shorter, longer)
-        if number > 0
-    ]
+    suggestions = []
+    for number in (math.floor(cells), math.floor(cells) + 1):
+        if number > 0:
+            suggestions.append(f"({low:g}, {low + number * size:g}, {size:g})")
+    nearest = "the nearest that are" if len(suggestions) > 1 else "the nearest that is"
     raise ConfigError(
-        f"{name}: {low:g} to {high:g} m is not a whole number of cells of {size:g} m ({cells:.6g}); "
-        f"{'the nearest that are' if len(ends) > 1 else 'the nearest that is'}: {' and '.join(ends)}"
+        f"{name}: {low:g} to {high:g} m is not a whole number of cells of {size:g} m "
+        f"({cells:.6g}); {nearest}: {' and '.join(suggestions)}"
     )
 
 
@@ -213,10 +235,20 @@ def to_orientation(
     target: Orientation,
     ignore: float | None = None,
 ) -> AnyArray:
-    """Maps (…, H, W) of the orientation `source` in the orientation `target`; a view if no value changes.
+    """Return maps (…, H, W) of the orientation `source` in the orientation `target`.
 
-    `vectors` are (…, 2, H, W), down the rows and along the columns, and turn too, where not both are `ignore`. Raises
-    GeometryError of another shape, ChoiceError.
+    The result is a view if no value changes.
+
+    Args:
+        array: Maps (…, H, W), or vectors (…, 2, H, W), down the rows and along the columns.
+        vectors: Whether the maps are vectors, which turn too, unless both components are `ignore`.
+        source: Orientation of the maps.
+        target: Orientation of the result.
+        ignore: Value of both components of vectors that stay as they are; None for none.
+
+    Raises:
+        GeometryError: vectors of another shape.
+        ChoiceError: no such orientation.
     """
     source, target = (choice("orientation", name, ORIENTATIONS) for name in (source, target))
     if source == target:
@@ -226,7 +258,8 @@ def to_orientation(
         return _turned(devkit, target)
     if array.ndim < 3 or array.shape[-3] != 2:
         raise GeometryError(f"vectors: expected shape (…, 2, H, W), found {array.shape}")
-    down, along = devkit[..., 0, :, :], devkit[..., 1, :, :]
+    down = devkit[..., 0, :, :]
+    along = devkit[..., 1, :, :]
     result = np.stack(vectors_in(down, along, source, target), axis=-3)
     if ignore is not None:
         np.copyto(result, ignore, where=((down == ignore) & (along == ignore))[..., None, :, :])
@@ -236,7 +269,7 @@ def to_orientation(
 def vectors_in(
     down: AnyArray, along: AnyArray, source: Orientation, target: Orientation
 ) -> tuple[AnyArray, AnyArray]:
-    """The components down the rows and along the columns of one orientation, as those of another."""
+    """Return components down the rows and along the columns of one orientation in another one."""
     if source == "fiery":
         down, along = along, down
     if (source == "released") != (target == "released"):
@@ -245,9 +278,10 @@ def vectors_in(
 
 
 def axes_of(grid: BevGrid) -> tuple[Axis, Axis]:
-    """Start, end and cell size, metres, of rows and of columns as the grid's orientation counts them.
+    """Return start, end and cell size of rows and of columns as the orientation counts them.
 
-    The released rows run along a left-handed y: its start and end are the negated end and start of the grid's.
+    The released rows run along a left-handed y: its start and end are the negated end and start of
+    the grid's.
     """
     low, high, size = grid.y
     if grid.orientation == "fiery":

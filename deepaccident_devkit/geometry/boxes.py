@@ -1,4 +1,7 @@
-"""`Boxes`: the oriented boxes of a sample as a struct of arrays; `Box`: a view of one row, with nuScenes' names."""
+"""`Boxes`: oriented boxes of a sample, a struct of arrays; `Box`: a view of one row.
+
+`Box` has the names of nuScenes.
+"""
 
 from __future__ import annotations
 
@@ -51,38 +54,45 @@ CORNER_SIGNS = np.array(
     ],
     dtype=np.float64,
 )
-"""Signs of (length, width, height) of the eight corners: four in front, then four behind, each four clockwise from the
-upper left, for a viewer inside who looks forward (the nuScenes devkit's order, with y left)."""
+"""Signs of (length, width, height) of the eight corners: four in front, then four behind, each four
+clockwise from the upper left, for a viewer in the box who looks forward (the nuScenes devkit's
+order, with y left)."""
 BOTTOM_CORNERS = (2, 3, 7, 6)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Boxes(FrozenArrays, Pictured):
-    """N oriented boxes in one right-handed coordinate frame; immutable, arrays are read-only copies of those given.
+    """N oriented boxes in one right-handed coordinate frame; arrays are read-only copies.
 
     Attributes:
-        frame: the coordinate frame: `world`, `ego`, `lidar` or a camera channel (then with optical axes).
+        frame: Coordinate frame: `world`, `ego`, `lidar` or a camera channel (then with optical
+            axes).
         center: (N, 3) float64, metres.
         size: (N, 3) float64, full length, width, height, metres.
-        rotation: (N, 4) float64, unit quaternions w, x, y, z: the box's axes (x along its length) in `frame`.
+        rotation: (N, 4) float64, unit quaternions w, x, y, z: the box's axes (x along its length)
+            in `frame`.
         velocity: (N, 3) float64, m/s over the ground (not relative to the agent), NaN if unknown.
         category: (N,) int8, index into `taxonomy.CATEGORIES`.
         actor_id: (N,) int64, the label's id; −100 is the recording agent, −1 an untracked actor.
         num_lidar_pts: (N,) int64, LiDAR points of the recording agent in the box.
         camera_visible: (N,) bool, whether any of the recording agent's cameras sees it.
-        row: (N,) int64, row of each box among those of its label file, counted from 0.
-        sample: token of the sample in whose label all of them are; None if they are of several or of none.
+        row: (N,) int64, row of each box in its label file, counted from 0.
+        sample: Token of the sample with all of them in its label; None if they are of several or of
+            none.
     """
 
+    # where the boxes are
     frame: str
     center: FloatArray
     size: FloatArray
     rotation: FloatArray
     velocity: FloatArray
+    # what they are
     category: AnyArray
     actor_id: IntArray
     num_lidar_pts: IntArray
     camera_visible: BoolArray
+    # which label they are from
     row: IntArray
     sample: str | None = None
 
@@ -94,12 +104,10 @@ class Boxes(FrozenArrays, Pictured):
         count = len(checked("Boxes.center", self.center, (None, 3)))
         columns: dict[str, AnyArray] = {}
         for name, (shape, dtype) in BOX_COLUMNS.items():
-            given = (
-                box_arrays.category_codes(self.category)
-                if name == "category"
-                else getattr(self, name)
-            )
-            columns[name] = checked(f"Boxes.{name}", given, (count, *shape[1:]), dtype).copy()
+            values = getattr(self, name)
+            if name == "category":
+                values = box_arrays.category_codes(values)
+            columns[name] = checked(f"Boxes.{name}", values, (count, *shape[1:]), dtype).copy()
         box_arrays.check_numbers(columns)
         columns["rotation"] = box_arrays.unit_quaternions(columns["rotation"])
         for name, array in columns.items():
@@ -116,14 +124,20 @@ class Boxes(FrozenArrays, Pictured):
         category: ArrayLike | None = None,
         **columns: ArrayLike,
     ) -> Boxes:
-        """Boxes that stand upright in `frame`: centres (N, 3), sizes (N, 3), yaw (N,) radians.
+        """Return boxes that stand upright in `frame`.
 
-        `category` holds indices or names; the other columns default to unknown values (velocity NaN, id −1, no
-        points, not visible).
+        Args:
+            center: (N, 3) metres.
+            size: (N, 3) full length, width, height, metres.
+            yaw: (N,) radians, counter-clockwise.
+            frame: Coordinate frame of all values.
+            category: (N,) indices or names; None for cars.
+            **columns: Other columns of `Boxes`; they default to unknown values (velocity NaN, id
+                −1, no points, not visible).
         """
         heading = checked("Boxes.yaw", yaw, (None,))
         count = len(heading)
-        given: dict[str, Any] = {
+        all_columns: dict[str, Any] = {
             "category": np.zeros(count, dtype=np.int8) if category is None else category,
             "velocity": np.full((count, 3), np.nan),
             "actor_id": np.full(count, -1),
@@ -132,7 +146,7 @@ class Boxes(FrozenArrays, Pictured):
             "row": np.arange(count),
             **columns,
         }
-        unknown = set(given) - set(BOX_COLUMNS)
+        unknown = set(all_columns) - set(BOX_COLUMNS)
         if unknown:
             raise GeometryError(
                 f"Boxes has no column {sorted(unknown)}; it has {list(BOX_COLUMNS)}"
@@ -142,90 +156,100 @@ class Boxes(FrozenArrays, Pictured):
             center=center,  # type: ignore[arg-type]  # checked in __post_init__
             size=size,  # type: ignore[arg-type]
             rotation=quaternions.from_yaw(heading),
-            **given,
+            **all_columns,
         )
 
     def __len__(self) -> int:
-        """Number of boxes."""
+        """Return the number of boxes."""
         return len(self.center)
 
     @overload
-    def __getitem__(self, which: int | np.integer[Any]) -> Box: ...
+    def __getitem__(self, key: int | np.integer[Any]) -> Box: ...
     @overload
-    def __getitem__(self, which: slice | Sequence[int] | Sequence[bool] | AnyArray) -> Boxes: ...
-    def __getitem__(self, which: Any) -> Box | Boxes:
-        """One box by its number (negative: from the end), or the boxes of a slice, a mask (N,) or an array of numbers.
+    def __getitem__(self, key: slice | Sequence[int] | Sequence[bool] | AnyArray) -> Boxes: ...
+    def __getitem__(self, key: Any) -> Box | Boxes:
+        """Return one box by its number, or the boxes of a slice, a mask or an array of numbers.
+
+        Negative numbers count from the end. A mask has shape (N,).
 
         Raises:
-            IndexError: there are not so many boxes.
-            GeometryError: `which` is none of these, or picks from more boxes than there are (see `select`).
+            IndexError: there are fewer boxes.
+            GeometryError: `key` is none of these, or is for more boxes than there are (see
+                `select`).
         """
-        if isinstance(which, slice):
-            return self._picked(which)
+        if isinstance(key, slice):
+            return self._picked(key)
         try:
-            number = operator.index(which)
+            number = operator.index(key)
         except TypeError:
-            return self.select(which)
-        if isinstance(which, bool):
-            return self.select(which)
+            return self.select(key)
+        if isinstance(key, bool):
+            return self.select(key)
         if not -len(self) <= number < len(self):
             raise IndexError(f"there are {len(self)} boxes, asked for box {number}")
-        first = number % len(self)
-        token = None if self.sample is None else f"{self.sample}/{self.row.item(first)}"
-        return Box(self._picked(slice(first, first + 1)), token)
+        row = number % len(self)
+        token = None if self.sample is None else f"{self.sample}/{self.row.item(row)}"
+        return Box(self._picked(slice(row, row + 1)), token)
 
     def __iter__(self) -> Iterator[Box]:
-        """Each box by itself, which takes some microseconds: for many boxes the arrays are faster."""
+        """Yield each box, which takes a few microseconds: for many boxes the arrays are faster."""
         return (self[number] for number in range(len(self)))
 
     def __array__(self, dtype: object = None, copy: object = None) -> NoReturn:
-        """Boxes are several arrays: without this, numpy would make an array of objects. Raises GeometryError."""
+        """Raise GeometryError: boxes are several arrays.
+
+        Without this, numpy would make an array of objects.
+        """
         raise GeometryError("Boxes are several arrays; give one of them, such as boxes.center")
 
     def __repr__(self) -> str:
-        """Their number, frame and categories."""
-        counts = ", ".join(
-            f"{count} {name}" for name, count in Counter(self.category_names).most_common()
-        )
-        return f"Boxes({len(self)} in {self.frame}{': ' if counts else ''}{counts})"
+        """Return number, frame and categories of the boxes."""
+        title = f"{len(self)} in {self.frame}"
+        counts = Counter(self.category_names).most_common()
+        if not counts:
+            return f"Boxes({title})"
+        texts = [f"{count} {name}" for name, count in counts]
+        return f"Boxes({title}: {', '.join(texts)})"
 
     @property
     def token(self) -> list[str] | None:
-        """The tokens of the N annotations; None if the boxes are of several samples, or not of a release."""
-        return (
-            None if self.sample is None else [f"{self.sample}/{row}" for row in self.row.tolist()]
-        )
+        """Tokens of the N annotations; None if the boxes are of several samples or of none."""
+        if self.sample is None:
+            return None
+        return [f"{self.sample}/{row}" for row in self.row.tolist()]
 
     @property
     def yaw(self) -> FloatArray:
-        """Heading of each box's length axis about z of `frame`, (N,) radians in (−π, π]."""
+        """(N,) heading of each box's length axis about z of `frame`, radians in (−π, π]."""
         return quaternions.yaw_of(self.rotation)
 
     @property
     def category_names(self) -> list[str]:
-        """The category of each box by name."""
+        """Category of each box by name."""
         return [CATEGORIES[code] for code in self.category.tolist()]
 
-    def select(self, which: ArrayLike) -> Boxes:
-        """The boxes that a mask (N,) or an integer array of rows picks.
+    def select(self, rows: ArrayLike) -> Boxes:
+        """Return the boxes of a mask (N,) or of an integer array of rows.
 
         Raises:
-            GeometryError: `which` is neither of the two, or has a row that does not exist.
+            GeometryError: `rows` is neither of the two, or has a row that does not exist.
         """
-        picked = np.asarray(which)
-        if picked.ndim != 1:
+        selection = np.asarray(rows)
+        if selection.ndim != 1:
             raise GeometryError(
-                f"expected a mask ({len(self)},) or an array of rows, found {which!r}"
+                f"expected a mask ({len(self)},) or an array of rows, found {rows!r}"
             )
+        if not selection.size:
+            selection = np.zeros(0, dtype=np.int64)
         try:
-            return self._picked(picked if picked.size else np.zeros(0, dtype=np.int64))
+            return self._picked(selection)
         except IndexError as error:
             raise GeometryError(
-                f"{which!r} does not pick from {len(self)} boxes: {error}"
+                f"{rows!r} does not pick from {len(self)} boxes: {error}"
             ) from error
 
     def transform(self, target_from_source: SE3, frame: str) -> Boxes:
-        """The same boxes in another coordinate frame, with the same sizes. Raises GeometryError."""
+        """Return the boxes in another coordinate frame. Raises GeometryError."""
         checked_transform("target_from_source", target_from_source)
         checked_frame("frame", frame)
         turn = target_from_source.rotation
@@ -247,32 +271,45 @@ class Boxes(FrozenArrays, Pictured):
         )
 
     def corners(self) -> FloatArray:
-        """The eight corners of each box, (N, 8, 3) metres, in the order of `CORNER_SIGNS`."""
+        """Return the eight corners of each box, (N, 8, 3) metres, ordered as `CORNER_SIGNS`."""
         offsets = self.size[:, None, :] / 2 * CORNER_SIGNS
         result: FloatArray = offsets @ np.swapaxes(quaternions.to_matrix(self.rotation), 1, 2)
         return result + self.center[:, None, :]
 
     def bottom_corners(self) -> FloatArray:
-        """The four corners of each box's lower face, (N, 4, 3): front right, front left, rear left, rear right."""
+        """Return the four corners of each box's lower face, (N, 4, 3) metres.
+
+        The order is front right, front left, rear left, rear right.
+        """
         return self.corners()[:, BOTTOM_CORNERS]
 
     def contains(self, points: ArrayLike) -> BoolArray:
-        """Whether each point (P, 3) of the same coordinate frame lies in each box, faces included: (N, P) bool."""
-        given = checked("points", points, (None, 3))
-        inside = np.zeros((len(self), len(given)), dtype=bool)
-        inside[self._points_within(given)] = True
-        return inside
+        """Return whether each point lies in each box, faces included, shape (N, P).
+
+        Args:
+            points: (P, 3) metres in the same coordinate frame.
+        """
+        xyz = checked("points", points, (None, 3))
+        is_inside = np.zeros((len(self), len(xyz)), dtype=bool)
+        is_inside[self._points_within(xyz)] = True
+        return is_inside
 
     def count_points(self, points: ArrayLike) -> IntArray:
-        """How many of the points (P, 3) of the same frame lie in each box, faces included: (N,) int64."""
-        given = checked("points", points, (None, 3))
-        return np.bincount(self._points_within(given)[0], minlength=len(self)).astype(np.int64)
+        """Return the number of points in each box, faces included, shape (N,) int64.
+
+        Args:
+            points: (P, 3) metres in the same coordinate frame.
+        """
+        xyz = checked("points", points, (None, 3))
+        boxes, _ = self._points_within(xyz)
+        return np.bincount(boxes, minlength=len(self)).astype(np.int64)
 
     def iou_bev(self, other: Boxes) -> FloatArray:
-        """Intersection over union of the footprints of these N boxes and M others: (N, M) in [0, 1].
+        """Return intersection over union of the footprints of these N boxes and M others, (N, M).
 
-        A footprint is the rectangle of length × width at the box's yaw: a tilted box counts as if it stood upright in
-        the frame, with the same centre, size and yaw. For two boxes without any area the result is 0.
+        Shares are in [0, 1]. A footprint is the rectangle of length × width at the box's yaw: a
+        tilted box counts as if it stood upright in the frame, with the same centre, size and yaw.
+        For two boxes without any area the result is 0.
 
         Raises:
             GeometryError: the frames differ, or are a camera's (whose z points forward).
@@ -282,81 +319,97 @@ class Boxes(FrozenArrays, Pictured):
         return _over_union(common, self.size[:, :2], other.size[:, :2])
 
     def iou_3d(self, other: Boxes) -> FloatArray:
-        """Intersection over union of the volumes of these N boxes and M others: (N, M) in [0, 1].
+        """Return intersection over union of the volumes of these N boxes and M others, (N, M).
 
-        The common volume is the footprints' common area times the common height. That is exact for boxes that stand
-        upright in the frame, like those of labels in the LiDAR frame; a tilted box counts as if it stood upright, with
-        the same centre, size and yaw. For two boxes without any volume the result is 0.
+        Shares are in [0, 1]. The common volume is the footprints' common area times the common
+        height. That is exact for boxes that stand upright in the frame, like labels in the LiDAR
+        frame; a tilted box counts as if it stood upright, with the same centre, size and yaw.
+        For two boxes without any volume the result is 0.
 
         Raises:
             GeometryError: the frames differ, or are a camera's (whose z points forward).
         """
         self._check_ground(other)
-        common = box_arrays.intersection_areas(self._footprints(), other._footprints())
-        (low, high), (other_low, other_high) = self._heights(), other._heights()
-        shared = np.minimum(high[:, None], other_high) - np.maximum(low[:, None], other_low)
-        return _over_union(common * np.maximum(shared, 0), self.size, other.size)
+        common_area = box_arrays.intersection_areas(self._footprints(), other._footprints())
+        low, high = self._heights()
+        other_low, other_high = other._heights()
+        top = np.minimum(high[:, None], other_high)
+        bottom = np.maximum(low[:, None], other_low)
+        common = common_area * np.maximum(top - bottom, 0)
+        return _over_union(common, self.size, other.size)
 
     def distance_bev(self, other: Boxes) -> FloatArray:
-        """The gap between the footprints of these N boxes and M others: (N, M) metres, 0 if they touch or overlap.
+        """Return the gap between the footprints of these N boxes and M others, (N, M) metres.
 
-        Footprints and errors are those of `iou_bev`.
+        It is 0 if they touch or overlap. Footprints and errors are as in `iou_bev`.
         """
         self._check_ground(other)
         return box_arrays.gaps(self._footprints(), other._footprints())
 
-    def _picked(self, which: slice | AnyArray) -> Boxes:
-        """The boxes of a slice, a mask or an array of rows; raises numpy's IndexError."""
-        return trusted_boxes(
-            self.frame, {name: getattr(self, name)[which] for name in BOX_COLUMNS}, self.sample
-        )
+    def _picked(self, rows: slice | AnyArray) -> Boxes:
+        """Return the boxes of a slice, a mask or an array of rows; raises numpy's IndexError."""
+        columns = {name: getattr(self, name)[rows] for name in BOX_COLUMNS}
+        return trusted_boxes(self.frame, columns, self.sample)
 
     def _points_within(self, points: FloatArray) -> tuple[IntArray, IntArray]:
-        """Rows of boxes and rows of points (P, 3), one pair for each point in a box."""
+        """Return rows of boxes and rows of points (P, 3), one pair for each point in a box."""
         return box_arrays.points_in_boxes(
             points, self.center, self.size / 2, quaternions.to_matrix(self.rotation)
         )
 
     def _footprints(self) -> FloatArray:
-        return np.column_stack([self.center[:, :2], self.size[:, :2], self.yaw])
+        """Return x, y, length, width and yaw of each box, shape (N, 5)."""
+        position = self.center[:, :2]
+        extent = self.size[:, :2]
+        return np.column_stack([position, extent, self.yaw])
 
     def _heights(self) -> tuple[FloatArray, FloatArray]:
+        """Return the lower and upper ends of the boxes, (N,) each, as if they stood upright."""
+        center = self.center[:, 2]
         half = self.size[:, 2] / 2
-        return self.center[:, 2] - half, self.center[:, 2] + half
+        return center - half, center + half
 
     def _check_ground(self, other: Boxes) -> None:
+        """Check that boxes can be compared on the ground with these; raises GeometryError."""
         checked_boxes("other", other)
         if other.frame != self.frame:
             raise GeometryError(
-                f"boxes of frame {self.frame!r} cannot be compared with those of {other.frame!r}; transform them first"
+                f"boxes of frame {self.frame!r} cannot be compared with those of {other.frame!r}; "
+                "transform them first"
             )
         if self.frame in CAMERAS:
             raise GeometryError(
-                f"boxes of {self.frame} have no ground plane, z points forward there; transform them to ego or lidar"
+                f"boxes of {self.frame} have no ground plane, z points forward there; transform "
+                "them to ego or lidar"
             )
 
 
 def trusted_boxes(frame: str, columns: dict[str, AnyArray], sample: str | None = None) -> Boxes:
-    """Boxes with columns that are surely correct: fast, without checks.
+    """Return boxes from columns that are correct: fast, without checks.
 
-    `columns` holds every column of `Boxes`; the arrays must be fresh or read-only, and become read-only.
+    Args:
+        frame: Coordinate frame.
+        columns: Every column of `Boxes`; the arrays must be fresh or read-only, and become
+            read-only.
+        sample: Token of the sample; None for none.
     """
     result = object.__new__(Boxes)
-    put = object.__setattr__
-    put(result, "frame", frame)
-    put(result, "sample", sample)
+    set_field = object.__setattr__
+    set_field(result, "frame", frame)
+    set_field(result, "sample", sample)
     for name, array in columns.items():
         array.setflags(write=False)
-        put(result, name, array)
+        set_field(result, name, array)
     return result
 
 
 def concatenate(parts: list[Boxes], frame: str) -> Boxes:
-    """All boxes of `parts`, in order; every part must be in `frame`."""
+    """Return all boxes of `parts`, in order; every part must be in `frame`."""
     for part in parts:
         if part.frame != frame:
             raise GeometryError(
-                f"boxes of frame {part.frame!r} cannot join those of {frame!r}; transform them first"
+                f"boxes of frame {part.frame!r} cannot join those of {frame!r}; transform them "
+                "first"
             )
     samples = {part.sample for part in parts}
     return trusted_boxes(
@@ -366,19 +419,26 @@ def concatenate(parts: list[Boxes], frame: str) -> Boxes:
     )
 
 
-def _over_union(common: FloatArray, mine: FloatArray, theirs: FloatArray) -> FloatArray:
-    """The shares (N, M) that common parts have of the unions of two sets of sizes, (N, axes) and (M, axes)."""
-    union = mine.prod(axis=1)[:, None] + theirs.prod(axis=1) - common
-    return as_floats(
-        np.divide(common, union, out=np.zeros_like(common), where=union > 0).clip(0, 1)
-    )
+def _over_union(common: FloatArray, sizes: FloatArray, other_sizes: FloatArray) -> FloatArray:
+    """Return intersection over union, shape (N, M), from common parts and sizes.
+
+    Args:
+        common: (N, M) common areas or volumes.
+        sizes: (N, axes) sizes of the first boxes.
+        other_sizes: (M, axes) sizes of the second boxes.
+    """
+    products = sizes.prod(axis=1)[:, None]
+    union = products + other_sizes.prod(axis=1) - common
+    shares = np.divide(common, union, out=np.zeros_like(common), where=union > 0)
+    return as_floats(shares.clip(0, 1))
 
 
 def checked_boxes(name: str, boxes: object) -> Boxes:
-    """`boxes` if they are `Boxes`; raises GeometryError."""
+    """Return `boxes` if they are `Boxes`; raises GeometryError otherwise."""
     if not isinstance(boxes, Boxes):
         raise GeometryError(
-            f"{name}: expected Boxes, found {type(boxes).__name__}; da.boxes(sample, frame=…) gives those of a sample, "
+            f"{name}: expected Boxes, found {type(boxes).__name__}; da.boxes(sample, frame=…) "
+            "gives those of a sample, "
             "Boxes.from_arrays makes some"
         )
     return boxes
@@ -388,8 +448,8 @@ def checked_boxes(name: str, boxes: object) -> Boxes:
 class Box:
     """One oriented box in a right-handed coordinate frame: a view of one row of `Boxes`.
 
-    Two differences from the nuScenes devkit's box: `translate` and `rotate` return a new box and change nothing in
-    place, and `size` is length, width, height (`wlh` gives the nuScenes order).
+    Two differences from the nuScenes devkit's box: `translate` and `rotate` return a new box and
+    leave this one as it is, and `size` is length, width, height (`wlh` has the nuScenes order).
     """
 
     __slots__ = ("_boxes", "instance_token", "token")
@@ -399,10 +459,10 @@ class Box:
         boxes: Boxes,
         token: str | None = None,
         instance_token: str | None = None,
-        **others: NoReturn,
+        **unknown: NoReturn,
     ) -> None:
-        """Wrap the only row of `boxes`; raises GeometryError if there are none or several, or these are no `Boxes`."""
-        if others or not isinstance(boxes, Boxes):
+        """Wrap the only row of `boxes`; raises GeometryError if it has no or several rows."""
+        if unknown or not isinstance(boxes, Boxes):
             raise GeometryError(
                 f"a Box is one row of Boxes, found {type(boxes).__name__}; {BOX_MADE}"
             )
@@ -425,18 +485,20 @@ class Box:
         category: str = "car",
         velocity: ArrayLike = (np.nan, np.nan, np.nan),
     ) -> Box:
-        """One box of numbers, as nuScenes' `Box(center, wlh, orientation)` makes it.
+        """Return one box from numbers, as nuScenes' `Box(center, wlh, orientation)`.
 
         Args:
             center: (3,) metres.
-            wlh: (3,) full width, length, height, metres: the nuScenes order, while `Boxes` begin with the length.
-            orientation: the box's axes in `frame`, a unit quaternion (pyquaternion's, or four numbers w, x, y, z).
-            frame: what all of it is in: `world`, `ego`, `lidar` or a camera channel.
-            category: its name.
+            wlh: (3,) full width, length, height, metres: the nuScenes order, while `Boxes` begin
+                with the length.
+            orientation: The box's axes in `frame`, a unit quaternion (pyquaternion's, or four
+                numbers w, x, y, z).
+            frame: Frame of all values: `world`, `ego`, `lidar` or a camera channel.
+            category: Name of the category.
             velocity: (3,) m/s over the ground, NaN where unknown.
 
         Raises:
-            GeometryError: a shape, number, frame or category that cannot be.
+            GeometryError: an impossible shape, number, frame or category.
         """
         width, length, height = checked("wlh", wlh, (3,))
         boxes = Boxes.from_arrays(
@@ -452,7 +514,7 @@ class Box:
 
     @property
     def frame(self) -> str:
-        """The coordinate frame of centre, orientation and velocity."""
+        """Coordinate frame of centre, orientation and velocity."""
         return self._boxes.frame
 
     @property
@@ -472,14 +534,14 @@ class Box:
 
     @property
     def orientation(self) -> Quaternion:
-        """The box's axes in `frame`, as a pyquaternion unit quaternion."""
+        """Axes of the box in `frame`, as a pyquaternion unit quaternion."""
         from pyquaternion import Quaternion
 
         return Quaternion(self._boxes.rotation[0].copy())
 
     @property
     def rotation_matrix(self) -> FloatArray:
-        """The box's axes in `frame` (3, 3)."""
+        """Axes of the box in `frame`, (3, 3)."""
         return quaternions.to_matrix(self._boxes.rotation[0])
 
     @property
@@ -494,17 +556,17 @@ class Box:
 
     @property
     def category(self) -> str:
-        """The category's name."""
+        """Name of the category."""
         return CATEGORIES[int(self._boxes.category[0])]
 
     @property
     def actor_id(self) -> int:
-        """The label's id: −100 is the recording agent, −1 an untracked actor."""
+        """Id of the label: −100 is the recording agent, −1 an untracked actor."""
         return int(self._boxes.actor_id[0])
 
     @property
     def num_lidar_pts(self) -> int:
-        """Points of the recording agent's LiDAR in the box."""
+        """Number of points of the recording agent's LiDAR in the box."""
         return int(self._boxes.num_lidar_pts[0])
 
     @property
@@ -514,34 +576,35 @@ class Box:
 
     @with_keywords_named
     def corners(self) -> FloatArray:
-        """The eight corners (3, 8) metres: four in front, then four behind (nuScenes order)."""
+        """Return the eight corners (3, 8), metres: four in front, then four behind, as nuScenes."""
         return as_floats(self._boxes.corners()[0].T)
 
     def bottom_corners(self) -> FloatArray:
-        """The lower face's corners (3, 4): front right, front left, rear left, rear right."""
+        """Return the lower face's corners (3, 4): front right and left, rear left and right."""
         return as_floats(self._boxes.bottom_corners()[0].T)
 
     @with_keywords_named
     def translate(self, translation: ArrayLike) -> Box:
-        """A new box moved by (3,) metres in its frame."""
+        """Return a new box moved by (3,) metres in its frame."""
         moved = SE3.from_rotation(np.eye(3), checked("translation", translation, (3,)))
         return self.transform(moved, self.frame)
 
     def rotate(self, quaternion: Quaternion) -> Box:
-        """A new box turned about its frame's origin: centre, orientation and velocity."""
+        """Return a new box turned about its frame's origin: centre, orientation and velocity."""
         return self.transform(SE3.from_quaternion(quaternion), self.frame)
 
     def transform(self, target_from_source: SE3, frame: str) -> Box:
-        """The same box in another frame. Raises GeometryError."""
+        """Return the same box in another frame. Raises GeometryError."""
         return Box(
             self._boxes.transform(target_from_source, frame), self.token, self.instance_token
         )
 
     def __repr__(self) -> str:
-        """Category, id, frame and pose on one line."""
+        """Return category, id, frame and pose on one line."""
         x, y, z = self.center.tolist()
         length, width, height = self.size.tolist()
         return (
             f"Box({self.category} {self.actor_id}, {self.frame} [{x:.2f}, {y:.2f}, {z:.2f}], "
-            f"size [{length:.2f}, {width:.2f}, {height:.2f}], yaw {self.yaw:.3f}, points {self.num_lidar_pts})"
+            f"size [{length:.2f}, {width:.2f}, {height:.2f}], yaw {self.yaw:.3f}, "
+            f"points {self.num_lidar_pts})"
         )

@@ -24,9 +24,10 @@ from deepaccident_devkit.support.arrays import (
 from deepaccident_devkit.taxonomy import BEV_CAMERA, LIDAR, Frame
 
 VISIBLE_DEPTH = 1.0
-"""A corner in the image counts as seen from this distance on, metres (as in the nuScenes devkit)."""
+"""A corner in the image counts as seen from this distance on, metres (as in the nuScenes
+devkit)."""
 IN_FRONT_DEPTH = 0.1
-"""All corners of a visible box must be so many metres in front of the camera (as in the nuScenes devkit)."""
+"""All corners of a visible box must be deeper than this, metres (as in the nuScenes devkit)."""
 # The known frames whose axes are not optical.
 _NO_PINHOLE: Final = (*get_args(Frame), LIDAR, BEV_CAMERA)
 
@@ -34,8 +35,9 @@ _NO_PINHOLE: Final = (*get_args(Frame), LIDAR, BEV_CAMERA)
 class BoxVisibility(IntEnum):
     """How much of a box an image shows, with the nuScenes devkit's names and numbers.
 
-    A lower number is stricter: a box that meets `ALL` meets `ANY` too, and every box meets `NONE`. So
-    `camera.box_visibility(boxes) <= BoxVisibility.ANY` are the boxes that the nuScenes devkit lists by default.
+    A lower number is stricter: a box that meets `ALL` meets `ANY` too, and every box meets `NONE`.
+    So `camera.box_visibility(boxes) <= BoxVisibility.ANY` are the boxes that the nuScenes devkit
+    lists by default.
     """
 
     ALL = 0
@@ -52,8 +54,8 @@ class PinholeCamera(FrozenArrays):
 
     Attributes:
         intrinsic: (3, 3) float64, K = [[f, 0, cx], [0, f, cy], [0, 0, 1]], pixels.
-        width: width of the image, pixels.
-        height: height of the image, pixels.
+        width: Width of the image, pixels.
+        height: Height of the image, pixels.
     """
 
     intrinsic: FloatArray
@@ -61,7 +63,7 @@ class PinholeCamera(FrozenArrays):
     height: int
 
     def __post_init__(self) -> None:
-        """Check the numbers; raises GeometryError."""
+        """Check the values; raises GeometryError."""
         intrinsic = checked("PinholeCamera.intrinsic", self.intrinsic, (3, 3)).copy()
         if not np.isfinite(intrinsic).all():
             raise GeometryError(
@@ -73,12 +75,18 @@ class PinholeCamera(FrozenArrays):
 
     @classmethod
     def from_field_of_view(cls, width: int, height: int, horizontal: float) -> PinholeCamera:
-        """A camera with its optical axis in the middle and a horizontal field of view in radians.
+        """Return a camera with its optical axis in the middle of the image.
+
+        Args:
+            width: Width of the image, pixels.
+            height: Height of the image, pixels.
+            horizontal: Horizontal field of view, radians.
 
         Raises:
             GeometryError: the image has no pixels, or the field of view is not between 0 and π.
         """
-        width, height = _pixels("width", width), _pixels("height", height)
+        width = _pixels("width", width)
+        height = _pixels("height", height)
         angle = checked_number("horizontal", horizontal, "a field of view in radians")
         if not 0 < angle < np.pi:
             raise GeometryError(
@@ -90,20 +98,23 @@ class PinholeCamera(FrozenArrays):
         )
 
     def resized(self, width: int, height: int) -> PinholeCamera:
-        """The camera of the same picture at another size, pixels; raises GeometryError if that has no pixels."""
+        """Return the camera of the same picture at another size, pixels; raises GeometryError."""
         scale = np.diag([width / self.width, height / self.height, 1.0])
         return PinholeCamera(scale @ self.intrinsic, width, height)
 
     def project(self, points: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """Points (N, 3) of the optical frame → pixels (N, 2) as (u, v), and depths (N,) metres.
+        """Return pixels (N, 2) as (u, v), and depths (N,) in metres, of points (N, 3).
 
         Pixels of points that are not in front of the camera (depth ≤ 0) or are infinite are NaN.
+
+        Args:
+            points: (N, 3) metres in the optical frame.
         """
-        given = checked("points", points, (None, 3))
-        depth: FloatArray = given[:, 2]
-        safe = np.where(depth > 0, depth, np.nan)
+        xyz = checked("points", points, (None, 3))
+        depth: FloatArray = xyz[:, 2]
+        positive_depth = np.where(depth > 0, depth, np.nan)
         with np.errstate(invalid="ignore"):
-            pixels: FloatArray = (given / safe[:, None]) @ self.intrinsic[:2].T
+            pixels: FloatArray = (xyz / positive_depth[:, None]) @ self.intrinsic[:2].T
         return pixels, depth
 
     def in_image(
@@ -114,34 +125,39 @@ class PinholeCamera(FrozenArrays):
         min_depth: float = 0.0,
         margin: float = 0.0,
     ) -> BoolArray:
-        """Which pixels (N, 2) lie in the image, 0 ≤ u < width and 0 ≤ v < height; NaN does not.
+        """Return which pixels (N, 2) lie in the image, 0 ≤ u < width and 0 ≤ v < height.
+
+        NaN does not.
 
         Args:
-            pixels: as (u, v).
+            pixels: (N, 2) as (u, v).
             depth: (N,) metres along the optical axis; without it only the pixels count.
-            min_depth: points that are not deeper than this do not count, metres.
-            margin: width of a strip along the edges that does not count, pixels; a negative one makes the image larger.
+            min_depth: Points that are not deeper than this do not count, metres.
+            margin: Width of a strip along the edges that does not count, pixels; a negative one
+                makes the image larger.
         """
         uv = checked("pixels", pixels, (None, 2))
-        u, v = uv[:, 0], uv[:, 1]
-        inside: BoolArray = (
-            (u >= margin) & (u < self.width - margin) & (v >= margin) & (v < self.height - margin)
-        )
+        u = uv[:, 0]
+        v = uv[:, 1]
+        is_inside: BoolArray = (u >= margin) & (u < self.width - margin)
+        is_inside &= (v >= margin) & (v < self.height - margin)
         if depth is not None:
-            inside &= checked("depth", depth, (len(uv),)) > min_depth
-        return inside
+            is_inside &= checked("depth", depth, (len(uv),)) > min_depth
+        return is_inside
 
     def box_visibility(self, boxes: Boxes) -> AnyArray:
-        """The strictest `BoxVisibility` that each of N boxes meets: (N,) int8.
+        """Return the strictest `BoxVisibility` that each of N boxes meets, shape (N,), int8.
 
-        As in the nuScenes devkit, a corner is seen if it is in the image and deeper than 1 m, and a box with a corner
-        that is not deeper than 0.1 m is `NONE`. (Its image has no pixels with u = 0 or v = 0; ours has them.)
+        As in the nuScenes devkit, a corner is seen if it is in the image and deeper than 1 m, and a
+        box with a corner that is not deeper than 0.1 m is `NONE`. (There pixels with u = 0 or v = 0
+        are outside of the image; here they are inside.)
 
         Args:
-            boxes: boxes in this camera's optical frame.
+            boxes: Boxes in this camera's optical frame.
 
         Raises:
-            GeometryError: they are not boxes, or are in the frame of world, ego, LiDAR or the BEV camera.
+            GeometryError: they are not boxes, or are in the frame of world, ego, LiDAR or the BEV
+                camera.
         """
         if checked_boxes("boxes", boxes).frame in _NO_PINHOLE:
             raise GeometryError(
@@ -149,27 +165,27 @@ class PinholeCamera(FrozenArrays):
                 "transform them by camera_from_source first"
             )
         pixels, depth = self.project(boxes.corners().reshape(-1, 3))
-        seen = self.in_image(pixels, depth, min_depth=VISIBLE_DEPTH).reshape(-1, 8)
+        is_seen = self.in_image(pixels, depth, min_depth=VISIBLE_DEPTH).reshape(-1, 8)
         in_front = (depth > IN_FRONT_DEPTH).reshape(-1, 8).all(axis=1)
-        levels = [in_front & seen.all(axis=1), in_front & seen.any(axis=1)]
-        return np.select(levels, [BoxVisibility.ALL, BoxVisibility.ANY], BoxVisibility.NONE).astype(
-            np.int8
-        )
+        conditions = [in_front & is_seen.all(axis=1), in_front & is_seen.any(axis=1)]
+        levels = [BoxVisibility.ALL, BoxVisibility.ANY]
+        return np.select(conditions, levels, BoxVisibility.NONE).astype(np.int8)
 
     def boxes_in_image(self, boxes: Boxes, level: BoxVisibility = BoxVisibility.ANY) -> BoolArray:
-        """Which of N boxes of this camera's optical frame meet `level`: (N,) bool.
+        """Return which of N boxes of this camera's optical frame meet `level`, shape (N,).
 
         Raises:
             ChoiceError: there is no such level.
             GeometryError: as in `box_visibility`.
         """
         if level not in list(BoxVisibility):
-            names = ", ".join(f"BoxVisibility.{one.name}" for one in BoxVisibility)
+            names = ", ".join(f"BoxVisibility.{option.name}" for option in BoxVisibility)
             raise ChoiceError(f"level: expected one of {names}, found {level!r}")
         return np.asarray(self.box_visibility(boxes) <= level)
 
 
 def _pixels(name: str, value: object) -> int:
+    """Return a number of pixels from 1 as an int; raises GeometryError."""
     number = checked_whole(name, value, "a whole number of pixels from 1")
     if number < 1:
         raise GeometryError(f"{name}: expected a whole number of pixels from 1, found {number}")

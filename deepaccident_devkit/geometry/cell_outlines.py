@@ -13,35 +13,38 @@ if TYPE_CHECKING:
 
 
 def outlines(cells: BoolArray, origin: FloatArray, resolution: float) -> MultiPolygon:
-    """The exact outline of the cells that are set: the polygons' area is theirs.
+    """Return the exact outline of the cells that are set: both cover the same area.
 
     Args:
         cells: (H, W), row = y index, column = x index.
         origin: (2,) x and y of the corner of cell (0, 0).
-        resolution: side of a cell.
+        resolution: Side of a cell.
     """
     import shapely
 
     column0, column1, row0, row1 = _rectangles(cells).T
-    joined = shapely.union_all(
-        shapely.box(column0, row0, column1, row1)
-    )  # in whole numbers, so that all edges meet
-    placed = shapely.transform(joined, lambda corners: origin + corners * resolution)
-    return multi_polygon(list(shapely.get_parts(placed)))
+    # in whole numbers, so that all edges meet
+    joined = shapely.union_all(shapely.box(column0, row0, column1, row1))
+    polygons = shapely.transform(joined, lambda corners: origin + corners * resolution)
+    return multi_polygon(list(shapely.get_parts(polygons)))
 
 
 def multi_polygon(parts: list[Any]) -> MultiPolygon:
-    """Polygons in an order that depends on their places alone, with outer rings counter-clockwise."""
+    """Return polygons with outer rings counter-clockwise, in an order by their positions."""
     import shapely
     from shapely.geometry.polygon import orient
 
-    turned: list[Any] = [orient(shapely.normalize(part)) for part in parts]
-    turned.sort(key=lambda part: (*part.bounds, part.area))
-    return shapely.MultiPolygon(turned)
+    polygons: list[Any] = [orient(shapely.normalize(part)) for part in parts]
+    polygons.sort(key=lambda polygon: (*polygon.bounds, polygon.area))
+    return shapely.MultiPolygon(polygons)
 
 
 def _rectangles(cells: BoolArray) -> IntArray:
-    """(R, 4) first and past-the-last column and row of rectangles that fill the cells: runs, joined over equal rows."""
+    """Return rectangles that fill the cells: runs of cells, joined over equal rows.
+
+    Returns:
+        (R, 4) first and past-the-last column, first and past-the-last row.
+    """
     rows, columns = cells.shape
     padded = np.zeros((rows, columns + 2), dtype=np.int8)
     padded[:, 1:-1] = cells
@@ -49,8 +52,10 @@ def _rectangles(cells: BoolArray) -> IntArray:
     row, start = np.nonzero(edges == 1)
     end = np.nonzero(edges == -1)[1]
     order = np.lexsort((row, end, start))
-    row, start, end = row[order], start[order], end[order]
-    first = np.ones(len(row), dtype=np.bool_)
-    first[1:] = (np.diff(start) != 0) | (np.diff(end) != 0) | (np.diff(row) != 1)
-    last = np.roll(first, -1)
-    return np.column_stack([start[first], end[first], row[first], row[last] + 1])
+    row = row[order]
+    start = start[order]
+    end = end[order]
+    is_first = np.ones(len(row), dtype=np.bool_)
+    is_first[1:] = (np.diff(start) != 0) | (np.diff(end) != 0) | (np.diff(row) != 1)
+    is_last = np.roll(is_first, -1)
+    return np.column_stack([start[is_first], end[is_first], row[is_first], row[is_last] + 1])

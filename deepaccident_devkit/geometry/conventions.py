@@ -1,16 +1,19 @@
-"""What differs between CARLA, the released code and the devkit (docs/conventions.md): the one place where signs change.
+"""Conversions between CARLA, the released code and the devkit (docs/conventions.md): sign changes.
 
-CARLA's frames have x forward, y **right**, z up, and yaw clockwise seen from above. The devkit's have x forward,
-y **left**, z up, yaw counter-clockwise. With S = diag(1, −1, 1) every conversion of a point, a pose or an angle is its
-own inverse, so each `flip_*` works in both directions. Cameras also change from CARLA's axes (x depth, y right, z up)
-to optical axes (x right, y down, z forward), which is not its own inverse: these two functions have a `*_to_raw` each.
+CARLA's frames have x forward, y **right**, z up, and yaw clockwise seen from above. The devkit's
+have x forward, y **left**, z up, yaw counter-clockwise. With S = diag(1, −1, 1) every conversion of
+a point, a pose or an angle is its own inverse, so each `flip_*` works in both directions. Cameras
+also change from CARLA's axes (x depth, y right, z up) to optical axes (x right, y down, z forward),
+which is not its own inverse: these two functions have a `*_to_raw` each.
 
-The released code's 6-vectors (tx, ty, tz, rx, ry, rz) stand for rigid transforms (docs/released_code.md, Poses) with
-R = Rx(rx) · Ry(ry) · Rz(rz): about z first, then y, then x, each about the target frame's own, fixed axes; radians, ry
-in [−π/2, π/2]. At ry = ±π/2 only rx ± rz is determined, and rounding errors decide how it is divided. A raw matrix
-gives the raw vector, a right-handed one the right-handed vector.
+The released code's 6-vectors (tx, ty, tz, rx, ry, rz) stand for rigid transforms
+(docs/released_code.md, Poses) with R = Rx(rx) · Ry(ry) · Rz(rz): about z first, then y, then x,
+each about the target frame's own, fixed axes; radians, ry in [−π/2, π/2]. At ry = ±π/2 only rx ± rz
+is determined, and rounding errors decide how it is divided. A raw matrix gives the raw vector, a
+right-handed one the right-handed vector.
 
-All functions take arrays with any leading axes, return new float64 arrays and do not change their arguments.
+All functions take arrays with any leading axes, return new float64 arrays and do not change their
+arguments.
 """
 
 import numpy as np
@@ -30,41 +33,49 @@ _OPTICAL_FROM_RAW = _OPTICAL_FROM_FORWARD * _S
 
 
 def checked_frame(name: str, frame: object) -> str:
-    """`frame` if it can be the name of a coordinate frame, known or not; raises GeometryError."""
+    """Return `frame` if it can be the name of a coordinate frame; raises GeometryError."""
     if not isinstance(frame, str) or not frame:
         raise GeometryError(
-            f"{name}: expected the name of a frame, such as 'world', 'ego' or 'lidar', found {frame!r}"
+            f"{name}: expected the name of a frame, such as 'world', 'ego' or 'lidar', found "
+            f"{frame!r}"
         )
     return frame
 
 
 def flip_points(points: ArrayLike) -> FloatArray:
-    """Points or vectors (…, 3) in the other handedness: y changes its sign."""
+    """Return points or vectors (…, 3) in the other handedness: y changes its sign."""
     return as_floats(as_floats(points) * _S)
 
 
 def flip_vectors2(vectors: ArrayLike) -> FloatArray:
-    """Horizontal vectors (…, 2), such as a label's velocity, in the other handedness."""
+    """Return horizontal vectors (…, 2), such as a label's velocity, in the other handedness."""
     return as_floats(as_floats(vectors) * _S[:2])
 
 
 def flip_yaw(yaw: ArrayLike) -> FloatArray:
-    """Angles about z (…), radians, in the other handedness."""
+    """Return angles about z (…), radians, in the other handedness."""
     return -as_floats(yaw)
 
 
 def flip_pose(pose: ArrayLike) -> FloatArray:
-    """Transforms (…, 4, 4) between two frames in the other handedness: S4·T·S4."""
+    """Return transforms (…, 4, 4) between two frames in the other handedness: S4·T·S4."""
     return as_floats(as_floats(pose) * np.outer(_S4, _S4))
 
 
 def flip_six_vector(six: ArrayLike) -> FloatArray:
-    """Poses (…, 6) as (tx, ty, tz, rx, ry, rz), docs/released_code.md, Poses, in the other handedness."""
+    """Return poses (…, 6) as (tx, ty, tz, rx, ry, rz) in the other handedness.
+
+    See docs/released_code.md, Poses.
+    """
     return as_floats(as_floats(six) * _SIX)
 
 
 def camera_from_lidar(lidar_to_cam: ArrayLike) -> FloatArray:
-    """CARLA's `lidar_to_<Camera>` (…, 4, 4) → right-handed LiDAR to optical camera: Q·S·T·S."""
+    """Return the right-handed transforms from LiDAR to optical camera (…, 4, 4): Q·S·T·S.
+
+    Args:
+        lidar_to_cam: CARLA's `lidar_to_<Camera>` (…, 4, 4).
+    """
     flipped = as_floats(lidar_to_cam) * _S4
     result = flipped.copy()
     result[..., :3, :] = _OPTICAL_FROM_RAW @ flipped[..., :3, :]
@@ -72,7 +83,7 @@ def camera_from_lidar(lidar_to_cam: ArrayLike) -> FloatArray:
 
 
 def camera_from_lidar_to_raw(camera_from_lidar: ArrayLike) -> FloatArray:
-    """The inverse of `camera_from_lidar`: CARLA's `lidar_to_<Camera>` (…, 4, 4)."""
+    """Return CARLA's `lidar_to_<Camera>` (…, 4, 4): the inverse of `camera_from_lidar`."""
     flipped = as_floats(camera_from_lidar) * _S4
     result = flipped.copy()
     result[..., :3, :] = _OPTICAL_FROM_RAW.T @ flipped[..., :3, :]
@@ -80,21 +91,32 @@ def camera_from_lidar_to_raw(camera_from_lidar: ArrayLike) -> FloatArray:
 
 
 def intrinsic(raw_intrinsic: ArrayLike) -> FloatArray:
-    """CARLA's permuted intrinsic (…, 3, 3) → the usual K = [[f, 0, cx], [0, f, cy], [0, 0, 1]]."""
+    """Return the usual K = [[f, 0, cx], [0, f, cy], [0, 0, 1]] from CARLA's permuted intrinsic.
+
+    Args:
+        raw_intrinsic: (…, 3, 3) for CARLA's camera axes.
+    """
     return as_floats(as_floats(raw_intrinsic) @ _OPTICAL_FROM_RAW.T)
 
 
 def intrinsic_to_raw(intrinsic: ArrayLike) -> FloatArray:
-    """The inverse of `intrinsic`: K (…, 3, 3) for CARLA's camera axes (x depth, y right, z up)."""
+    """Return K (…, 3, 3) for CARLA's camera axes (x depth, y right, z up).
+
+    The inverse of `intrinsic`.
+    """
     return as_floats(as_floats(intrinsic) @ _OPTICAL_FROM_RAW)
 
 
 def six_vectors_of(matrix: ArrayLike) -> FloatArray:
-    """Rigid matrices (…, 4, 4) → 6-vectors (…, 6), metres and radians in [−π, π]. Raises GeometryError."""
+    """Return the 6-vectors (…, 6) of rigid matrices (…, 4, 4), metres and radians in [−π, π].
+
+    Raises GeometryError.
+    """
     m = as_floats(matrix)
     if m.shape[-2:] != (4, 4):
         raise GeometryError(f"matrix: expected shape (…, 4, 4), found {m.shape}")
-    m12, m22 = m[..., 1, 2], m[..., 2, 2]
+    m12 = m[..., 1, 2]
+    m22 = m[..., 2, 2]
     rx = np.arctan2(-m12, m22)
     ry = np.arctan2(m[..., 0, 2], np.hypot(m12, m22))
     rz = np.arctan2(-m[..., 0, 1], m[..., 0, 0])
@@ -102,11 +124,15 @@ def six_vectors_of(matrix: ArrayLike) -> FloatArray:
 
 
 def matrices_of_six(six: ArrayLike) -> FloatArray:
-    """6-vectors (…, 6), metres and radians → rigid matrices (…, 4, 4); all angles are allowed. Raises GeometryError."""
+    """Return the rigid matrices (…, 4, 4) of 6-vectors (…, 6), metres and radians.
+
+    All angles are allowed. Raises GeometryError for another shape.
+    """
     vector = as_floats(six)
     if vector.shape[-1:] != (6,):
         raise GeometryError(f"six: expected shape (…, 6), found {vector.shape}")
-    cosines, sines = np.cos(vector[..., 3:]), np.sin(vector[..., 3:])
+    cosines = np.cos(vector[..., 3:])
+    sines = np.sin(vector[..., 3:])
     cx, cy, cz = (cosines[..., axis] for axis in range(3))
     sx, sy, sz = (sines[..., axis] for axis in range(3))
     result = np.zeros((*vector.shape[:-1], 4, 4))
@@ -122,7 +148,13 @@ def matrices_of_six(six: ArrayLike) -> FloatArray:
 
 
 def stored_transforms(numbers: FloatArray) -> FloatArray:
-    """Transforms stored as 12 or 16 numbers, (…, 12 or 16), as a new array (…, 4, 4) whose last row is exact."""
+    """Return transforms (…, 4, 4) that are stored as 12 or 16 numbers, as a new array.
+
+    The last row is exact.
+
+    Args:
+        numbers: (…, 12) or (…, 16).
+    """
     transforms = np.empty((*numbers.shape[:-1], 4, 4))
     transforms[..., :3, :] = numbers[..., :12].reshape(*numbers.shape[:-1], 3, 4)
     transforms[..., 3, :] = LAST_ROW
@@ -130,15 +162,16 @@ def stored_transforms(numbers: FloatArray) -> FloatArray:
 
 
 def inverses(matrix: AnyArray) -> AnyArray:
-    """The inverses of transforms (…, 4, 4), right for slightly wrong rotations too; raises GeometryError.
+    """Return the inverses of transforms (…, 4, 4), also for slightly wrong rotations.
 
-    To transpose a rotation with an error of 1e-3 would move a point 600 m away by 60 cm.
+    To transpose a rotation with an error of 1e-3 would move a point 600 m away by 60 cm. Raises
+    GeometryError.
     """
     result = np.zeros_like(matrix)
     try:
-        result[..., :3, :3] = turned_back = np.linalg.inv(matrix[..., :3, :3])
+        result[..., :3, :3] = inverse_rotation = np.linalg.inv(matrix[..., :3, :3])
     except np.linalg.LinAlgError:
         raise GeometryError("a transform has no inverse: its rotation is no rotation") from None
-    result[..., :3, 3] = -(turned_back @ matrix[..., :3, 3, None])[..., 0]
+    result[..., :3, 3] = -(inverse_rotation @ matrix[..., :3, 3, None])[..., 0]
     result[..., 3, 3] = 1
     return result

@@ -18,7 +18,8 @@ from deepaccident_devkit.evaluation.forecasting.metrics import (
     actor_errors,
     brier,
     collisions,
-    mode_errors,
+    displacement_errors,
+    misses,
     world_errors,
 )
 
@@ -58,7 +59,7 @@ def modes_of(given: Mapping[str, np.ndarray]) -> tuple[np.ndarray, ...]:
 
 def by_mode(given: Mapping[str, np.ndarray]) -> dict[str, Any]:
     paths, chances, truth, valid = modes_of(given)
-    ade, fde = mode_errors(paths, truth, valid)
+    ade, fde = displacement_errors(paths, truth, valid)
     halved = chances / 2
     return {
         "ade": ade,
@@ -66,8 +67,8 @@ def by_mode(given: Mapping[str, np.ndarray]) -> dict[str, Any]:
         "brier_ade": brier(ade, chances),
         "brier_fde": brier(fde, chances),
         "brier_fde_normalized": brier(fde, halved / np.nansum(halved, axis=1, keepdims=True)),
-        "missed": np.where(np.isnan(fde), np.nan, fde > 2.0),
-        "missed_1m": np.where(np.isnan(fde), np.nan, fde > 1.0),
+        "missed": misses(fde, 2.0),
+        "missed_1m": misses(fde, 1.0),
     }
 
 
@@ -92,11 +93,11 @@ def test_worlds_equal_av2s(given: Mapping[str, np.ndarray], world: int) -> None:
     paths, truth, chances = (
         given[f"world_{name}_{world}"] for name in ("forecasts", "gt", "probability")
     )
-    ade, fde, missed = world_errors(paths, truth)
+    ade, fde, final_errors = world_errors(paths, truth)
     assert_allclose(ade, given[f"world_ade_{world}"], rtol=0, atol=TOLERANCE)
     assert_allclose(fde, given[f"world_fde_{world}"], rtol=0, atol=TOLERANCE)
     assert_allclose(brier(fde, chances), given[f"world_brier_fde_{world}"], rtol=0, atol=TOLERANCE)
-    assert_array_equal(missed, given[f"world_misses_{world}"])
+    assert_array_equal(misses(final_errors), given[f"world_misses_{world}"])
     assert_array_equal(collisions(paths), given[f"world_collisions_{world}"])
 
 

@@ -16,9 +16,9 @@ from deepaccident_devkit.evaluation.accident.paper import PaperAccidents
 from deepaccident_devkit.evaluation.map_accidents import (
     AccidentReading,
     InstanceTracks,
-    accident_of,
     convex_hulls,
     hull_distances,
+    map_accident,
     match_tracks,
 )
 from deepaccident_devkit.evaluation.predictions import MotionOutput
@@ -92,7 +92,7 @@ def test_the_contact_is_the_least_of_all_pairs_and_frames(instance) -> None:
     shape = instance.shape[1:]
     grid = BevGrid(x=(0, shape[1] / 2, 0.5), y=(0, shape[0] / 2, 0.5))
     reading = AccidentReading(danger_distance=1.25)
-    found = accident_of(instance, grid, NO_SHIFT, reading)
+    found = map_accident(instance, grid, NO_SHIFT, reading)
     candidates = []
     for frame in range(len(instance)):
         ids = np.unique(instance[frame][instance[frame] > 0]).tolist()
@@ -119,8 +119,8 @@ def test_orientations_do_not_matter(instance, orientation) -> None:
     grid = BevGrid(x=(0, instance.shape[2] / 2, 0.5), y=(0, instance.shape[1] / 2, 0.5))
     turned = grid.reorient(instance, orientation)
     for rules in LABEL_PROTOCOLS.values():
-        here = accident_of(instance, grid, rules, PAPER.reading)
-        there = accident_of(turned, grid.with_orientation(orientation), rules, PAPER.reading)
+        here = map_accident(instance, grid, rules, PAPER.reading)
+        there = map_accident(turned, grid.with_orientation(orientation), rules, PAPER.reading)
         assert here.contact == there.contact
         assert_array_equal(here.tracks.center, there.tracks.center)
 

@@ -1,4 +1,4 @@
-"""How well accidents are foreseen, by three protocols: the task `accident`."""
+"""Accuracy of predicted accidents, by three protocols: the task `accident`."""
 
 from __future__ import annotations
 
@@ -16,9 +16,11 @@ from deepaccident_devkit.evaluation.accident.scoring import (
     AccidentResult,
     AccidentsWithin,
     ComparedAccidents,
+    average_precision,
 )
 from deepaccident_devkit.evaluation.alarms import foreseen_accident
 from deepaccident_devkit.evaluation.evaluator import Counts, Evaluator
+from deepaccident_devkit.evaluation.instances import prediction_accuracy
 from deepaccident_devkit.evaluation.map_accidents import AccidentReading
 from deepaccident_devkit.evaluation.predictions import Prediction, checked_prediction
 from deepaccident_devkit.evaluation.truth import (
@@ -47,9 +49,11 @@ __all__ = [
     "Prediction",
     "ReleasedAccidents",
     "accident_context",
+    "average_precision",
     "box_truth",
     "compared_accidents",
     "foreseen_accident",
+    "prediction_accuracy",
 ]
 
 
@@ -57,8 +61,8 @@ AccidentProtocol = ReleasedAccidents | PaperAccidents | BoxAccidents
 PROTOCOLS: Final[Mapping[str, AccidentProtocol]] = MappingProxyType(
     {"released": ReleasedAccidents(), "paper": PaperAccidents(), "boxes": BoxAccidents()}
 )
-"""`released` is what the released code computes, `paper` what the paper's text says, `boxes` compares with the labels
-themselves and not with rasters."""
+"""`released` is what the released code computes, `paper` what the paper's text describes, and
+`boxes` compares with the labels themselves and not with rasters."""
 
 
 class AccidentEvaluator(Evaluator[AccidentResult]):
@@ -87,7 +91,7 @@ class AccidentEvaluator(Evaluator[AccidentResult]):
     def truth(
         self, dataset: Dataset, token: str, form: Any, horizon: float, /
     ) -> tuple[MotionLabels | None, AccidentContext]:
-        """Return the labels that the protocol compares with, None for none, and the accident to come."""
+        """Return the labels that the protocol compares with, None for none, and the context."""
         return compared_facts(dataset, token, self.protocol, form, horizon)
 
     def update(
@@ -100,16 +104,17 @@ class AccidentEvaluator(Evaluator[AccidentResult]):
         """Count one sample.
 
         Args:
-            token: of the sample.
-            prediction: what a model says.
-            label: the sample's motion labels, each frame in its own frame or all at the present. Those in their own
-                frames are warped to the present with bilinear centres, as the released evaluation does. The protocol
-                `boxes` needs none.
-            context: other facts on the sample, from `accident_context`, with the truth of `boxes`; None for nothing.
+            token: Token of the sample.
+            prediction: Prediction of a model.
+            label: Motion labels of the sample, each frame in its own frame or all at the present.
+                Labels in their own frames are warped to the present with bilinear centres, as the
+                released evaluation does. The protocol `boxes` needs none.
+            context: Other facts on the sample, from `accident_context`, with the truth of `boxes`;
+                None for nothing.
 
         Raises:
-            EvaluationError: the protocol cannot evaluate such a prediction or label, or the sample came before with
-                another outcome.
+            EvaluationError: the protocol cannot evaluate such a prediction or label, or the sample
+                came before with other counts.
         """
         checked_facts(label, context)
         counts = self.protocol.counts(
@@ -118,28 +123,25 @@ class AccidentEvaluator(Evaluator[AccidentResult]):
         self.add(token, dict(counts))
 
     def result_of(self, counts: Collection[Counts]) -> AccidentResult:
-        """The metrics of some samples' counts, in any order."""
+        """Return the metrics of some samples' counts, in any order."""
         return self.protocol.result(counts)
 
     def sample_row(self, token: str) -> dict[str, Any]:
-        """Return whether an accident comes, cases by metres allowed, and the errors within the largest distance."""
+        """Return whether an accident comes, cases by distance, and errors at the largest one."""
         result = self.compute([token])
         truth = next((name for name, count in result.truths.items() if count), None)
         row: dict[str, Any] = {"positive": bool(result.positives), "truth": truth}
         for distance, within in result.within.items():
-            row |= {f"{case}_{distance:g}m": getattr(within, case) for case in ("tp", "fp", "fn")}
+            for case in ("tp", "fp", "fn"):
+                row[f"{case}_{distance:g}m"] = getattr(within, case)
         widest = result.within[max(result.within)]
-        errors = {
-            "position_error": widest.position_error,
-            "time_error": widest.time_error,
-            "id_error": widest.id_error,
-        }
-        return row | {
-            name: None if error is None else float(error) for name, error in errors.items()
-        }
+        for name in ("position_error", "time_error", "id_error"):
+            error = getattr(widest, name)
+            row[name] = None if error is None else float(error)
+        return row
 
     def pooled(self, counts: Collection[Counts]) -> Sequence[Counts]:
-        """Fewer counts with the same result."""
+        """Return fewer counts with the same result."""
         return self.protocol.pooled(counts)
 
 
@@ -149,15 +151,16 @@ def compared_accidents(
     context: AccidentContext,
     protocol: AccidentProtocol,
 ) -> ComparedAccidents:
-    """Which accidents a protocol sees in a prediction and in the truth.
+    """Return the accidents that a protocol sees in a prediction and in the truth.
 
     Args:
-        prediction: what a model says; of one that `protocol.counts` takes.
-        label: the sample's motion labels, where the protocol compares with those.
-        context: other facts on the sample.
-        protocol: by which accidents are seen.
+        prediction: Prediction of a model, of a kind that `protocol.counts` accepts.
+        label: Motion labels of the sample, where the protocol compares with labels.
+        context: Other facts on the sample.
+        protocol: Rules by which accidents are seen.
 
     Raises:
-        EvaluationError: the prediction is neither motion nor accidents, or the protocol lacks its truth.
+        EvaluationError: the prediction is neither motion nor accidents, or the protocol lacks its
+            truth.
     """
     return protocol.compared(checked_prediction(prediction), label, context)

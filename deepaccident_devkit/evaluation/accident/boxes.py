@@ -1,7 +1,8 @@
-"""Accident metrics for users of alarms: compared with what happens, not with rasters (protocol `boxes`).
+"""Accident metrics for users of alarms: compared with what happens, not with rasters (`boxes`).
 
-The truth is the pair and the moment that the scenario's meta file names, at the places where the labels have them.
-Every alarm counts, the truth does not help to choose one, and an alarm that a recording cannot refute is not judged.
+The truth is the pair and the moment that the scenario's meta file names, at the positions of the
+labels. Every alarm counts, the truth does not help to choose one, and an alarm that a recording
+cannot refute is not judged.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from deepaccident_devkit.evaluation.accident.scoring import (
     Alarm,
     ComparedAccidents,
     alarms_tally,
+    average_precision,
     exact_parts,
     foreseen,
     hit_of,
@@ -41,33 +43,43 @@ from deepaccident_devkit.evaluation.predictions import (
     Prediction,
     checked_prediction,
 )
-from deepaccident_devkit.evaluation.truth import SLACK, AccidentContext, BoxTruth, not_counted_notes
+from deepaccident_devkit.evaluation.truth import (
+    TIME_TOLERANCE_S,
+    AccidentContext,
+    BoxTruth,
+    not_counted_notes,
+)
 from deepaccident_devkit.motion import MotionLabels
 
-# Why nothing else of a sample counts.
-_ASIDE = ("at_impact", "unplaced")
-_LEFT_OUT = ("unjudged", "beyond", *_ASIDE)
+# Reasons why nothing of a sample counts, keys of its counts.
+_SKIP_REASONS = ("at_impact", "unplaced")
+# Keys of the numbers of alarms and samples that do not count.
+_UNCOUNTED = ("unjudged", "beyond", *_SKIP_REASONS)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BoxAccidentResult(AccidentResult):
-    """Accident metrics, and numbers on alarms; these at the distance `ERRORS_AT`.
+    """Accident metrics, and numbers on alarms at the distance `ERRORS_AT`.
 
-    Without any accident to foresee APA and the accuracies are NaN, and the false alarm rate says how good predictions
-    are.
+    Without any accident to foresee APA and the accuracies are NaN, and the false alarm rate shows
+    how good predictions are.
 
     Attributes:
-        precision: share of the alarms that foresee a true accident; None without alarms.
-        recall: share of the true accidents that are foreseen; None without any.
-        average_precision: the mean of the precision over the recall, alarms taken from the surest on; None likewise.
-        false_alarm_rate: share of the samples without an accident to come that raise an alarm; None without any.
-        lateness: seconds, mean over the true positives by which the predicted moment is later than the true one,
-            negative if it is earlier; None without any.
-        unjudged: alarms that nothing can refute: no accident is known, and they are for a time after the recording.
-        beyond: alarms for later than the horizon, which do not count.
-        at_impact: samples at the impact itself, where nothing is foreseen any more; they are left out of all else.
-        unplaced: samples before an accident of which no label shows both actors (meta names one that has none, or one
-            twice); likewise.
+        precision: Share of the alarms that foresee a true accident; None without alarms.
+        recall: Share of the true accidents that are foreseen; None without any.
+        average_precision: Mean of the precision over the recall, alarms from the surest on; None
+            likewise.
+        false_alarm_rate: Share of the samples without a coming accident that raise an alarm; None
+            without any.
+        lateness: Seconds, mean over the true positives by which the predicted moment is later than
+            the true one, negative if it is earlier; None without any.
+        unjudged: Alarms that nothing can refute: no accident is known, and they are for a time
+            after the recording.
+        beyond: Alarms for later than the horizon, which do not count.
+        at_impact: Samples at the impact itself, where nothing can be foreseen any more; they are
+            left out of all other numbers.
+        unplaced: Samples before an accident without a label of both actors (meta names one
+            that has none, or one twice); left out likewise.
     """
 
     precision: float | None
@@ -85,18 +97,20 @@ class BoxAccidentResult(AccidentResult):
 class BoxAccidents:
     """Accident metrics against the labels' boxes.
 
-    A list of `Accident`s is a list of alarms: each is true or false, and the surest one that is near enough to the true
-    accident (the earliest of equally sure ones) is the true positive. K motion predictions are one alarm, whose score
-    is the share of them that have an accident. The mean sample (the last) says where and when, or if it has no
-    accident, the first sample that has one. They are not cut at the recording's end, which a model cannot know. An
-    alarm for later than the horizon does not count, and at the impact itself there is nothing to foresee.
+    A list of `Accident`s is a list of alarms: each is true or false, and the surest one that is
+    near enough to the true accident (the earliest of equally sure ones) is the true positive. K
+    motion predictions are one alarm, scored by the share of them that have an accident. The
+    mean sample (the last) gives place and time, or if it has no accident, the first sample that has
+    one. They are not cut at the recording's end, which a model cannot know. An alarm for later than
+    the horizon does not count, and at the impact itself there is nothing to foresee.
 
-    An alarm that the recording cannot refute is left out and counted aside. If nobody is near enough to an explicit
-    accident without `ids`, it names the wrong actors.
+    An alarm that the recording cannot refute is left out and counted separately. If nobody is near
+    enough to an explicit accident without `ids`, it names the wrong actors.
 
     Attributes:
-        reading: how an accident is read off maps. By the paper's 1 m, the default, traffic side by side collides, since
-            neighbouring cells are 0.5 m apart; at 0.5 m a square contact is missed.
+        reading: How an accident is read off maps. By the paper's 1 m, the default, traffic side by
+            side collides, since neighbouring cells are 0.5 m apart; at 0.5 m a square contact is
+            missed.
     """
 
     reading: AccidentReading = field(default_factory=AccidentReading)
@@ -104,110 +118,119 @@ class BoxAccidents:
     def counts(
         self, prediction: Prediction, label: MotionLabels | None, context: AccidentContext
     ) -> Counts:
-        """What one sample adds.
+        """Return what one sample adds.
 
         Args:
-            prediction: motion in maps, or explicit accidents; an empty list for no alarm.
-            label: says how far apart in time maps are and how they lie in their cells; None for the released way.
-            context: with `truth`, from `accident_context(dataset, sample, horizon)`.
+            prediction: Motion in maps, or explicit accidents; an empty list for no alarm.
+            label: Labels that define how far apart in time maps are and where instances lie within
+                their cells; None for the released convention.
+            context: Context with `truth`, from `accident_context(dataset, sample, horizon)`.
 
         Returns:
-            `positive`: whether an accident comes; `named`: whom the boxes bring nearer to each other than the danger
-            distance (of `NAMED`); `alarms`: the surest first; `unjudged` and `beyond`: how many were left out, and how
-            many do not count; `at_impact` and `unplaced`: whether the impact is now, or comes but cannot be compared
+            `positive`: whether an accident comes; `named`: the actors that the boxes bring nearer
+            to each other than the danger distance (one of `NAMED`); `alarms`: the surest first;
+            `unjudged` and `beyond`: numbers of alarms that were left out, and that do not count;
+            `at_impact` and `unplaced`: whether the impact is now, or comes but cannot be compared
             with, so that nothing else of the sample counts.
 
         Raises:
-            EvaluationError: the context has no truth, or the prediction is neither maps nor accidents.
+            EvaluationError: the context has no truth, or the prediction is neither maps nor
+                accidents.
         """
         truth = _truth_of(context)
         raised = named_alarms(checked_prediction(prediction), label, truth, self.reading)
         within = within_horizon(raised, truth)
-        judged = [  # the alarms that the recording can refute
-            each
-            for each in within
-            if truth.accident is not None or each[0].time <= float(truth.time[-1]) + SLACK
-        ]
+        judged = []
+        for accident, ids in within:
+            # without an accident to come the recording refutes alarms up to its end only
+            is_refutable = accident.time <= float(truth.time[-1]) + TIME_TOLERANCE_S
+            if truth.accident is not None or is_refutable:
+                judged.append(_alarm(accident, ids, truth))
         return {
             "positive": truth.accident is not None,
             "named": named(truth.nearest_pair(self.reading.danger_distance), context),
-            "alarms": [_alarm(accident, ids, truth) for accident, ids in judged],
+            "alarms": judged,
             "unjudged": len(within) - len(judged),
             "beyond": len(raised) - len(within),
-            "at_impact": truth.accident is not None and truth.accident.time < SLACK,
+            "at_impact": truth.accident is not None and truth.accident.time < TIME_TOLERANCE_S,
             "unplaced": truth.is_unplaced,
         }
 
     def compared(
         self,
-        given: MotionOutput | list[Accident],
+        prediction: MotionOutput | list[Accident],
         label: MotionLabels | None,
         context: AccidentContext,
     ) -> ComparedAccidents:
-        """Which accidents it sees; raises EvaluationError."""
+        """Return the accidents that the protocol sees; raises EvaluationError."""
         truth = _truth_of(context)
+        alarms = named_alarms(prediction, label, truth, self.reading)
         return ComparedAccidents(
             true=truth.accident,
-            predicted=tuple(alarm for alarm, _ in named_alarms(given, label, truth, self.reading)),
+            predicted=tuple(alarm for alarm, _ in alarms),
             unplaced=truth.unplaced if truth.is_unplaced else None,
         )
 
     def result(self, counts: Collection[Counts]) -> BoxAccidentResult:
-        """The metrics of some samples' counts, in any order."""
-        given = _united(counts)
-        base = tally_result(given["tally"], ERRORS_AT)
+        """Return the metrics of some samples' counts, in any order."""
+        sums = _united(counts)
+        base = tally_result(sums["tally"], ERRORS_AT)
         if not base.positives:
-            nothing = {
-                distance: replace(each, accuracy=math.nan) for distance, each in base.within.items()
-            }
-            base = replace(base, apa=math.nan, within=nothing)
-        at = base.within[ERRORS_AT]
+            within = {}
+            for distance, cases in base.within.items():
+                within[distance] = replace(cases, accuracy=math.nan)
+            base = replace(base, apa=math.nan, within=within)
+        values = {field.name: getattr(base, field.name) for field in fields(AccidentResult)}
+        values["notes"] = (*base.notes, *not_counted_notes(sums["unplaced"], sums["beyond"]))
+        cases = base.within[ERRORS_AT]
+        area = None
+        if base.positives:
+            alarms = np.array(sums["alarms"], dtype=np.float64).reshape(-1, 2)
+            area = average_precision(alarms[:, 0], alarms[:, 1], base.positives)
         return BoxAccidentResult(
-            **{
-                each.name: getattr(base, each.name)
-                for each in fields(AccidentResult)
-                if each.name != "notes"
-            },
-            notes=(*base.notes, *not_counted_notes(given["unplaced"], given["beyond"])),
-            precision=_share(at.tp, at.tp + at.fp),
-            recall=_share(at.tp, base.positives),
-            average_precision=_average_precision(given["alarms"], base.positives),
-            false_alarm_rate=_share(given["false_samples"], base.negatives),
-            lateness=_share(math.fsum(given["lateness"]), at.tp),
-            **{name: given[name] for name in _LEFT_OUT},
+            **values,
+            precision=_share(cases.tp, cases.tp + cases.fp),
+            recall=_share(cases.tp, base.positives),
+            average_precision=area,
+            false_alarm_rate=_share(sums["false_samples"], base.negatives),
+            lateness=_share(math.fsum(sums["lateness"]), cases.tp),
+            **{name: sums[name] for name in _UNCOUNTED},
         )
 
     def pooled(self, counts: Collection[Counts]) -> list[Counts]:
-        """The sums of all counts, which have the same result; alarms are kept one by one."""
+        """Return the sums of all counts, which have the same result, with alarms one by one."""
         return [_united(counts)]
 
 
 def _united(counts: Collection[Counts]) -> dict[str, Any]:
-    """What samples add, those of `pooled` among them.
+    """Return what samples add, `pooled` ones among them.
 
     Returns:
-        `tally`; `alarms`: [score, whether it is the right one] of each; `lateness`: in sum, of the right ones;
-        `false_samples`: how many raise an alarm without an accident to come; and of `_LEFT_OUT` each.
+        `tally`; `alarms`: [score, whether it is right] of each; `lateness`: terms of the summed
+        lateness of the right alarms; `false_samples`: samples that raise an alarm without a coming
+        accident; and the numbers of `_UNCOUNTED`.
     """
-    complete = [
-        {"unplaced": 0, **each} for each in counts
-    ]  # runs kept by earlier versions refused such samples
-    given = [each if "tally" in each else _tallied(each) for each in complete]
-    return {
-        "tally": united(each["tally"] for each in given),
-        "alarms": [alarm for each in given for alarm in each["alarms"]],
-        "lateness": exact_parts(each["lateness"] for each in given),
-        **{name: sum(each[name] for each in given) for name in ("false_samples", *_LEFT_OUT)},
+    parts = []
+    for sample in counts:
+        # runs of earlier versions refused unplaced samples, and so have no such number
+        complete = {"unplaced": 0, **sample}
+        parts.append(complete if "tally" in complete else _tallied(complete))
+    sums: dict[str, Any] = {
+        "tally": united(part["tally"] for part in parts),
+        "alarms": [alarm for part in parts for alarm in part["alarms"]],
+        "lateness": exact_parts(part["lateness"] for part in parts),
     }
+    for name in ("false_samples", *_UNCOUNTED):
+        sums[name] = sum(part[name] for part in parts)
+    return sums
 
 
 def _tallied(sample: Counts) -> dict[str, Any]:
-    if any(sample[name] for name in _ASIDE):
-        return (
-            {"tally": united([]), "alarms": [], "lateness": []}
-            | dict.fromkeys(("false_samples", *_LEFT_OUT), 0)
-            | {name: int(sample[name]) for name in _ASIDE}
-        )
+    """Return what one sample adds, in the form of `_united`."""
+    if any(sample[name] for name in _SKIP_REASONS):
+        skipped: dict[str, Any] = {"tally": united([]), "alarms": [], "lateness": []}
+        skipped |= dict.fromkeys(("false_samples", *_UNCOUNTED), 0)
+        return skipped | {name: int(sample[name]) for name in _SKIP_REASONS}
     alarms: Sequence[Alarm] = sample["alarms"]
     hit = hit_of(alarms, ERRORS_AT) if sample["positive"] else None
     return {
@@ -215,8 +238,9 @@ def _tallied(sample: Counts) -> dict[str, Any]:
         "alarms": [[alarm["score"], alarm is hit] for alarm in alarms],
         "lateness": [] if hit is None else [hit["time"]],
         "false_samples": int(bool(alarms) and not sample["positive"]),
-        **{name: sample[name] for name in ("unjudged", "beyond")},
-        **dict.fromkeys(_ASIDE, 0),
+        "unjudged": sample["unjudged"],
+        "beyond": sample["beyond"],
+        **dict.fromkeys(_SKIP_REASONS, 0),
     }
 
 
@@ -231,6 +255,7 @@ def _truth_of(context: AccidentContext) -> BoxTruth:
 
 
 def _alarm(accident: Accident, ids: Pair, truth: BoxTruth) -> dict[str, Any]:
+    """Return an alarm compared with the true accident, if there is one."""
     true = truth.accident
     if true is None:
         return foreseen(score=accident.score)
@@ -242,19 +267,6 @@ def _alarm(accident: Accident, ids: Pair, truth: BoxTruth) -> dict[str, Any]:
     )
 
 
-def _average_precision(alarms: Sequence[Sequence[float]], positives: int) -> float | None:
-    """The area under the steps of precision over recall; alarms of equal score are one step."""
-    if not positives:
-        return None
-    if not alarms:
-        return 0.0
-    score, true = np.array(alarms, dtype=np.float64).T
-    steps = np.unique(-score)
-    place = np.searchsorted(steps, -score)
-    raised = np.bincount(place, minlength=len(steps))
-    right = np.bincount(place, true, len(steps))
-    return math.fsum((right / positives * (np.cumsum(right) / np.cumsum(raised))).tolist())
-
-
-def _share(part: float, whole: float) -> float | None:
-    return part / whole if whole else None
+def _share(part: float, total: float) -> float | None:
+    """Return `part / total`; None if there is nothing to count."""
+    return part / total if total else None

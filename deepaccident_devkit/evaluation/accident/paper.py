@@ -1,6 +1,6 @@
-"""Accident metrics as the paper describes them, or where it is silent, as in the released code (protocol `paper`).
+"""Accident metrics as the paper describes them, or where it is silent, as in the released code.
 
-docs/protocols.md says what is which.
+The protocol `paper`; docs/protocols.md lists which rule comes from which source.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ from deepaccident_devkit.evaluation.evaluator import Counts
 from deepaccident_devkit.evaluation.map_accidents import (
     AccidentReading,
     InstanceAccident,
-    accident_of,
     instances_of_heads,
+    map_accident,
     match_tracks,
     predicted_accidents,
 )
@@ -55,25 +55,27 @@ from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
 SampleChoice = Literal["best", "mean_first"]
 _NO_LABEL: Final = "label: the accident protocol 'paper' needs the sample's motion labels"
-# Forms of a prediction that are not heads, as counts and as notes have them.
+# Forms of a prediction that are not heads: key in the counts → words in the notes.
 _FORMS: Final[Mapping[str, str]] = {
     "instance_maps": "instance maps",
     "explicit": "explicit accidents",
 }
+_SAMPLE_CHOICES: Final[tuple[SampleChoice, ...]] = get_args(SampleChoice)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PaperAccidents:
     """The accident metrics of the paper's text.
 
-    An accident of any of the K predictions counts as predicted. Its positions are those of its own moment.
+    An accident of any of the K predictions counts as predicted. Its positions are at its own
+    moment.
 
     Attributes:
-        reading: how an accident is read off maps, the truth's and the prediction's alike.
-        sample_choice: which of several predictions that have an accident is compared: the `best`, whose positions are
-            nearest to the truth (as the released code; the first of equal ones), or `mean_first`: the mean sample's, or
-            else the first, which does not use the truth. Both are counted; this one is the result, the other is in
-            `beside`.
+        reading: How an accident is read off maps, in the truth and in the prediction alike.
+        sample_choice: Which of several predictions with an accident is compared: the `best`,
+            with positions nearest to the truth (as the released code; the first of equal ones), or
+            `mean_first`: that of the mean sample, otherwise the first, which does not use the
+            truth. Both are counted; this one is the result, the other is in `beside`.
     """
 
     labels: ClassVar[str] = "released"
@@ -83,153 +85,173 @@ class PaperAccidents:
 
     def __post_init__(self) -> None:
         """Check the values; raises ChoiceError."""
-        settle_choices(self, {"sample_choice": get_args(SampleChoice)})
+        settle_choices(self, {"sample_choice": _SAMPLE_CHOICES})
 
     def counts(
         self, prediction: Prediction, label: MotionLabels | None, context: AccidentContext
     ) -> Counts:
-        """What one sample adds.
+        """Return what one sample adds.
 
-        Where heads are predicted, the truth is the labels as heads, through the same grouping and linking; where
-        instance maps or explicit accidents are, it is the labels' warped instance map.
+        For heads the truth is the labels as heads, through the same grouping and linking; for
+        instance maps or explicit accidents it is the labels' warped instance map.
 
         Returns:
-            `positive`: whether the truth has an accident; `named`: whom it names (of `NAMED`); `instance_maps` and
-            `explicit`: whether the prediction is those; `best` and `mean_first`: the alarm that each choice compares,
-            or None.
+            `positive`: whether the truth has an accident; `named`: the actors that it names (one of
+            `NAMED`); `instance_maps` and `explicit`: whether the prediction is of that form; `best`
+            and `mean_first`: the alarm that each choice compares, or None.
 
         Raises:
-            EvaluationError: the prediction is neither motion nor accidents, no labels or those of another protocol,
-                another grid, too few frames.
+            EvaluationError: the prediction is neither motion nor accidents, there are no labels or
+                labels of another protocol, another grid, or too few frames.
         """
         if label is None:
             raise EvaluationError(_NO_LABEL)
-        given = checked_prediction(prediction)
-        frames, rules = compared_frames(given, label, self.labels), label.config.rules
+        checked = checked_prediction(prediction)
+        frames = compared_frames(checked, label, self.labels)
+        rules = label.config.rules
         label = labels_at_present(label)
-        shown = self.truth_map(given, label, frames)
-        truth = accident_of(shown, label.config.grid, rules, self.reading)
+        maps = self.truth_map(checked, label, frames)
+        truth = map_accident(maps, label.config.grid, rules, self.reading)
         seconds = label.config.step * FRAME_PERIOD
+        contact = truth.contact
         actors = None
-        if truth.contact is not None:
-            frame, ids = truth.contact.frame, truth.contact.ids
-            actors = [actor_of(shown[frame] == identity, frame, label, context) for identity in ids]
-        alarms: list[Alarm | None]
-        if isinstance(given, MotionOutput):
-            read = predicted_accidents(given, rules, self.reading, frames)
-            alarms = [_alarm(found, truth, seconds) if found.contact else None for found in read]
+        if contact is not None:
+            true_maps = [maps[contact.frame] == identity for identity in contact.ids]
+            actors = [actor_of(cells, contact.frame, label, context) for cells in true_maps]
+        alarms: list[Alarm | None] = []
+        if isinstance(checked, MotionOutput):
+            for accident in predicted_accidents(checked, rules, self.reading, frames):
+                alarms.append(_alarm(accident, truth, seconds) if accident.contact else None)
         else:
-            alarms = [
-                explicit_alarm(each, truth, actors, seconds=seconds)
-                for each in surest_within(given, (frames - 0.5) * seconds)
-            ]
+            for explicit in surest_within(checked, (frames - 0.5) * seconds):
+                alarms.append(explicit_alarm(explicit, truth, actors, seconds=seconds))
+        mean_first = (alarm for alarm in (*alarms[-1:], *alarms[:-1]) if alarm)
         return {
-            "positive": truth.contact is not None,
+            "positive": contact is not None,
             "named": named(actors, context),
-            "instance_maps": isinstance(given, MotionOutput) and given.instances is not None,
-            "explicit": not isinstance(given, MotionOutput),
-            # the first with the least difference of positions; the first at all where there is no truth to differ from
-            "best": min(
-                filter(None, alarms), key=lambda alarm: alarm["position"] or 0.0, default=None
-            ),
-            "mean_first": next((alarm for alarm in (*alarms[-1:], *alarms[:-1]) if alarm), None),
+            "instance_maps": isinstance(checked, MotionOutput) and checked.instances is not None,
+            "explicit": not isinstance(checked, MotionOutput),
+            # the first with the least difference of positions; without a truth the first of all
+            "best": min(filter(None, alarms), key=_position_or_zero, default=None),
+            "mean_first": next(mean_first, None),
         }
 
     def compared(
         self,
-        given: MotionOutput | list[Accident],
+        prediction: MotionOutput | list[Accident],
         label: MotionLabels | None,
         _context: AccidentContext,
     ) -> ComparedAccidents:
-        """Which accidents it sees; raises EvaluationError."""
+        """Return the accidents that the protocol sees; raises EvaluationError."""
         if label is None:
             raise EvaluationError(_NO_LABEL)
-        frames, labels, step = (
-            frames_there(label),
-            label.config.rules,
-            label.config.step * FRAME_PERIOD,
-        )
-        shown = self.truth_map(given, labels_at_present(label), frames)
-        true = accident_of(shown, label.config.grid, labels, self.reading).explicit(step)
-        if isinstance(given, MotionOutput):
-            read = [
-                each.explicit(step)
-                for each in predicted_accidents(given, labels, self.reading, frames)
-            ]
-            return ComparedAccidents(
-                true=true, predicted=tuple(each for each in read if each is not None)
-            )
-        return ComparedAccidents(
-            true=true, predicted=tuple(surest_within(given, (frames - 0.5) * step))
-        )
+        config = label.config
+        frames = frames_there(label)
+        seconds = config.step * FRAME_PERIOD
+        maps = self.truth_map(prediction, labels_at_present(label), frames)
+        truth = map_accident(maps, config.grid, config.rules, self.reading)
+        true = truth.explicit(seconds)
+        if not isinstance(prediction, MotionOutput):
+            predicted = surest_within(prediction, (frames - 0.5) * seconds)
+            return ComparedAccidents(true=true, predicted=tuple(predicted))
+        alarms = []
+        for accident in predicted_accidents(prediction, config.rules, self.reading, frames):
+            explicit = accident.explicit(seconds)
+            if explicit is not None:
+                alarms.append(explicit)
+        return ComparedAccidents(true=true, predicted=tuple(alarms))
 
     def result(self, counts: Collection[Counts]) -> AccidentResult:
-        """The metrics of some samples' counts, in any order."""
-        given = _united(counts)
-        chosen, other = sorted(
-            get_args(SampleChoice), key=lambda choice: choice != self.sample_choice
-        )
-        result, beside = (tally_result(given[choice], ERRORS_AT) for choice in (chosen, other))
-        notes = tuple(
-            f"{given[form]} of {result.samples} predictions were given as {words}: their truth is the labels' instance "
-            "map, not the released grouping and linking of the labels"
-            for form, words in _FORMS.items()
-            if given[form]
-        )
-        return replace(result, notes=notes, beside={f"sample_choice={other}": beside})
+        """Return the metrics of some samples' counts, in any order."""
+        tallies = _united(counts)
+        result = tally_result(tallies[self.sample_choice], ERRORS_AT)
+        beside = {}
+        for sample_choice in _SAMPLE_CHOICES:
+            if sample_choice != self.sample_choice:
+                other = tally_result(tallies[sample_choice], ERRORS_AT)
+                beside[f"sample_choice={sample_choice}"] = other
+        notes = []
+        for form, words in _FORMS.items():
+            if tallies[form]:
+                notes.append(
+                    f"{tallies[form]} of {result.samples} predictions were given as {words}: their "
+                    "truth is the labels' instance map, not the released grouping and linking of "
+                    "the labels"
+                )
+        return replace(result, notes=tuple(notes), beside=beside)
 
     def pooled(self, counts: Collection[Counts]) -> list[Counts]:
-        """The sums of all counts, which have the same result."""
+        """Return the sums of all counts, which have the same result."""
         return [{"tallies": _united(counts)}]
 
     def truth_map(
-        self, given: MotionOutput | list[Accident], label: MotionLabels, frames: int
+        self, prediction: MotionOutput | list[Accident], label: MotionLabels, frames: int
     ) -> AnyArray:
-        """(T, H, W) the instances that a prediction is compared with, of labels at the present; as the labels lie."""
-        if not isinstance(given, MotionOutput) or given.heads is None:
+        """Return the true instances that a prediction is compared with, shape (T, H, W).
+
+        They are in the orientation of the labels, which must be at the present.
+        """
+        if not isinstance(prediction, MotionOutput) or prediction.heads is None:
             return label.instance[:frames]
         return instances_of_heads(first_frames(MotionHeads.from_labels(label), frames))
 
 
 def _united(counts: Collection[Counts]) -> dict[str, Any]:
-    """The tally of each choice of a sample, and how many predictions were given in which form."""
-    given = [each["tallies"] if "tallies" in each else _tallies(each) for each in counts]
-    return {
-        **{choice: united(each[choice] for each in given) for choice in get_args(SampleChoice)},
-        **{form: sum(each[form] for each in given) for form in _FORMS},
-    }
+    """Return the tally of each choice of a sample, and the number of predictions of each form."""
+    tallies = []
+    for sample in counts:
+        tallies.append(sample["tallies"] if "tallies" in sample else _tallies(sample))
+    sums: dict[str, Any] = {}
+    for sample_choice in _SAMPLE_CHOICES:
+        sums[sample_choice] = united(tally[sample_choice] for tally in tallies)
+    for form in _FORMS:
+        sums[form] = sum(tally[form] for tally in tallies)
+    return sums
 
 
 def _tallies(sample: Counts) -> dict[str, Any]:
-    alarms = {
-        choice: [sample[choice]] if sample[choice] else [] for choice in get_args(SampleChoice)
-    }
-    return {
-        **{choice: alarms_tally(sample, each) for choice, each in alarms.items()},
-        **{form: int(sample[form]) for form in _FORMS},
-    }
+    """Return the tally of one sample for each choice, and its form."""
+    tallies: dict[str, Any] = {}
+    for sample_choice in _SAMPLE_CHOICES:
+        alarms = [sample[sample_choice]] if sample[sample_choice] else []
+        tallies[sample_choice] = alarms_tally(sample, alarms)
+    for form in _FORMS:
+        tallies[form] = int(sample[form])
+    return tallies
 
 
-def _alarm(found: InstanceAccident, truth: InstanceAccident, seconds: float) -> Alarm:
-    """A predicted accident against the true one, if there is one; `seconds` from frame to frame."""
-    if found.contact is None or truth.contact is None:
+def _position_or_zero(alarm: Alarm) -> float:
+    """Return an alarm's difference of positions; 0 without a truth."""
+    return alarm["position"] or 0.0
+
+
+def _alarm(predicted: InstanceAccident, truth: InstanceAccident, seconds: float) -> Alarm:
+    """Return a predicted accident compared with the true one, if there is one.
+
+    Args:
+        predicted: Accident read off the maps of a prediction.
+        truth: Accident read off the maps of the labels.
+        seconds: Seconds from frame to frame.
+    """
+    if predicted.contact is None or truth.contact is None:
         return foreseen()
-    match = match_tracks(found.tracks, truth.tracks, MATCH_DISTANCE)
-    same = {match.get(identity) for identity in found.contact.ids} == set(truth.contact.ids)
+    match = match_tracks(predicted.tracks, truth.tracks, MATCH_DISTANCE)
+    matched_ids = {match.get(identity) for identity in predicted.contact.ids}
     return foreseen(
-        position=position_difference(found.positions, truth.positions),
-        time=(found.contact.frame - truth.contact.frame) * seconds,
-        id_error=int(not same),
+        position=position_difference(predicted.positions, truth.positions),
+        time=(predicted.contact.frame - truth.contact.frame) * seconds,
+        id_error=int(matched_ids != set(truth.contact.ids)),
     )
 
 
-def surest_within(accidents: Sequence[Accident], last: float) -> list[Accident]:
-    """The surest explicit accident (the earliest of equally sure ones), as maps show one at most.
+def surest_within(accidents: Sequence[Accident], latest: float) -> list[Accident]:
+    """Return the surest explicit accident, since maps show one at most; empty without any.
 
-    Those for later than `last`, the labels' last frame in the recording and half a step, are left out, as the frames of
-    maps are.
+    The earliest of equally sure ones counts. Accidents later than `latest` seconds, the labels'
+    last frame in the recording and half a step, are left out, like the frames of maps.
     """
-    return sorted((each for each in accidents if each.time <= last), key=by_sureness)[:1]
+    within = [accident for accident in accidents if accident.time <= latest]
+    return sorted(within, key=by_sureness)[:1]
 
 
 def explicit_alarm(
@@ -239,13 +261,14 @@ def explicit_alarm(
     *,
     seconds: float,
 ) -> Alarm:
-    """A predicted accident against the true one, if there is one.
+    """Return a predicted accident compared with the true one, if there is one.
 
     Args:
-        predicted: in the present ego frame, as the truth.
-        truth: read off the labels' maps.
-        actors: actor ids of the two true instances, None for one that is not known; None without a true accident.
-        seconds: from frame to frame of the maps.
+        predicted: Accident in the present ego frame, like the truth.
+        truth: Accident read off the labels' maps.
+        actors: Actor ids of the two true instances, None for one that is not known; None without a
+            true accident.
+        seconds: Seconds from frame to frame of the maps.
     """
     if truth.contact is None:
         return foreseen()
@@ -262,9 +285,9 @@ def _id_error(
     actors: Sequence[int | None] | None,
     seconds: float,
 ) -> int | None:
-    """1 if other actors than the two true ones are named; None if their ids are not known.
+    """Return 1 if other actors than the two true ones are named; None if their ids are not known.
 
-    Without `ids` it names the instances nearest to its positions, up to `MATCH_DISTANCE` off.
+    Without `ids` an accident names the instances nearest to its positions, up to `MATCH_DISTANCE`.
     """
     if truth.contact is None or actors is None:
         return None

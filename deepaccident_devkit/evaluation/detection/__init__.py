@@ -1,4 +1,4 @@
-"""The task `detection`: average precision and errors of boxes, by the released code's rules, the paper's and others."""
+"""The task `detection`: average precision and errors of boxes, by the released rules and others."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from deepaccident_devkit.evaluation.detection.boxes import (
     detection_protocol,
     detection_truth,
 )
+from deepaccident_devkit.evaluation.detection.curves import average_precision
 from deepaccident_devkit.evaluation.detection.matching import (
     Ring,
     boxes_taken,
@@ -45,6 +46,7 @@ __all__ = [
     "DetectionMatches",
     "DetectionProtocol",
     "DetectionResult",
+    "average_precision",
     "detection_matches",
     "detection_protocol",
     "detection_truth",
@@ -52,7 +54,7 @@ __all__ = [
 
 
 class DetectionEvaluator(Evaluator[DetectionResult]):
-    """Counts matches of detected and true boxes by sample; `compute` makes curves and errors of them.
+    """Average precision and errors of detected boxes, from matches that are counted by sample.
 
     ```python
     evaluator = DetectionEvaluator("paper")
@@ -62,7 +64,7 @@ class DetectionEvaluator(Evaluator[DetectionResult]):
     ```
 
     Attributes:
-        protocol: the rules, with the switches that were given.
+        protocol: Rules, with the switches that were passed.
     """
 
     task = "detection"
@@ -79,8 +81,9 @@ class DetectionEvaluator(Evaluator[DetectionResult]):
         """Start without samples.
 
         Args:
-            protocol: `released` (its distance_mAP), `released_iou` (its iou_mAP), `paper`, `opencood`, or your own.
-            **switches: fields of `DetectionProtocol` to change.
+            protocol: `released` (its distance_mAP), `released_iou` (its iou_mAP), `paper`,
+                `opencood`, or your own.
+            **switches: Fields of `DetectionProtocol` to change.
 
         Raises:
             ChoiceError: no such protocol, switch or choice.
@@ -94,7 +97,7 @@ class DetectionEvaluator(Evaluator[DetectionResult]):
         return self.protocol.as_dict()
 
     def read(self, results: Any, dataset: Dataset, token: str) -> DetectedBoxes:
-        """Return the boxes, which results hold in the world, in the protocol's frame around the agent."""
+        """Return the boxes, which results hold in the world, in the protocol's frame."""
         boxes: DetectedBoxes = results.prediction(token)
         frame = self.protocol.frame
         return boxes.transform(dataset.world_from(token, frame).inverse(), frame)
@@ -104,73 +107,79 @@ class DetectionEvaluator(Evaluator[DetectionResult]):
         return (detection_truth(dataset, token, self.protocol),)
 
     def update(self, token: str, prediction: DetectedBoxes, truth: Boxes) -> None:
-        """Take a sample.
+        """Count one sample.
 
         Args:
-            token: the sample's.
-            prediction: what was detected, in the protocol's frame; may be empty.
-            truth: the true boxes in that frame, as `detection_truth` gives them; the protocol's own box, area and
-                ranges are applied here.
+            token: Token of the sample.
+            prediction: Detections in the protocol's frame; may be empty.
+            truth: True boxes in that frame, from `detection_truth`; the protocol's own box, area
+                and ranges are applied here.
 
         Raises:
             GeometryError: the truth is not of boxes, or boxes are in another frame.
-            EvaluationError: the prediction is not of boxes, or the sample came before, with another result.
+            EvaluationError: the prediction is not of boxes, or the sample came before with another
+                result.
         """
         frame = self.protocol.frame
         if not isinstance(prediction, DetectedBoxes):
             raise EvaluationError(
-                f"{token}: expected DetectedBoxes as the prediction, found {type(prediction).__name__}; make them with "
-                f"DetectedBoxes.from_arrays(center, size, yaw, scores, frame={frame!r}), of no rows where nothing is "
-                "detected"
+                f"{token}: expected DetectedBoxes as the prediction, found "
+                f"{type(prediction).__name__}; make them with "
+                f"DetectedBoxes.from_arrays(center, size, yaw, scores, frame={frame!r}), of no "
+                "rows where nothing is detected"
             )
-        for name, boxes in (
-            ("prediction", prediction.boxes),
-            ("truth", checked_boxes("truth", truth)),
-        ):
+        true_boxes = checked_boxes("truth", truth)
+        for name, boxes in (("prediction", prediction.boxes), ("truth", true_boxes)):
             if boxes.frame != frame:
                 raise GeometryError(
-                    f"{token}: {name} in frame {boxes.frame!r}, the protocol counts in {frame!r}; transform them, or "
-                    "choose frame="
+                    f"{token}: {name} in frame {boxes.frame!r}, the protocol counts in {frame!r}; "
+                    "transform them, or choose frame="
                 )
-        counts = frame_counts(
-            columns_of(prediction.boxes, prediction.scores), columns_of(truth), self.protocol
-        )
+        detections = columns_of(prediction.boxes, prediction.scores)
+        counts = frame_counts(detections, columns_of(truth), self.protocol)
         self.add(token, {"token": token, **counts})
 
     def result_of(self, counts: Collection[Counts]) -> DetectionResult:
-        """The metrics of some samples' counts, in any order."""
+        """Return the metrics of some samples' counts, in any order."""
         return detection_result(counts, self.protocol)
 
     def sample_row(self, token: str) -> dict[str, int]:
-        """Return how many boxes count, and true positives by threshold, over all classes and ranges."""
-        counts, thresholds = self._counts[token], self.protocol.thresholds
+        """Return the numbers of boxes that count, and true positives by threshold.
+
+        They are sums over all classes and ranges.
+        """
+        counts = self._counts[token]
+        thresholds = self.protocol.thresholds
         hits = Counter(cell % len(thresholds) for cell in counts["tp"][0])
         row = {"truths": sum(counts["truths"]), "detections": len(counts["detections"][0])}
-        return row | {
-            f"tp_{threshold:g}": hits[level] for level, threshold in enumerate(thresholds)
-        }
+        for level, threshold in enumerate(thresholds):
+            row[f"tp_{threshold:g}"] = hits[level]
+        return row
 
     def resampled(
         self, parts: Sequence[Sequence[Counts]], times: IntArray
     ) -> Iterator[DetectionResult]:
-        """The result of each draw (`Evaluator.resampled`); what does not depend on the draw is made once."""
+        """Yield the result of each draw (`Evaluator.resampled`).
+
+        What does not depend on the draw is computed once.
+        """
         owner = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
         ledger = Ledger([counts for part in parts for counts in part], self.protocol)
-        yield from drawn_results(
-            ledger, self.protocol, times[:, owner[ledger.order]].astype(np.int32)
-        )
+        sample_owner = owner[ledger.order]
+        yield from drawn_results(ledger, self.protocol, times[:, sample_owner].astype(np.int32))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class DetectionMatches(FrozenArrays):
-    """The matches of one sample at one threshold, with all detections at once; rows of the boxes given.
+    """The matches of one sample at one threshold, with all detections, as rows of the boxes.
 
-    Boxes that do not count (beyond the protocol's area and ranges, of other classes, or matched with such) are in none.
+    Boxes that do not count (beyond the protocol's area and ranges, of other classes, or matched
+    with such boxes) are in no array.
 
     Attributes:
-        threshold: metres or a share, of the protocol's.
+        threshold: Metres or a share, one of the protocol's.
         detection: (M,) int64 detections that are true positives.
-        truth: (M,) int64 the true box of each.
+        truth: (M,) int64 true box of each.
         false: (F,) int64 detections without a true box.
         missed: (G,) int64 true boxes without a detection.
     """
@@ -191,39 +200,41 @@ def detection_matches(
     """Match one sample's detections with its true boxes as `DetectionEvaluator` does.
 
     Args:
-        prediction: what was detected, in the protocol's frame.
-        truth: the true boxes in that frame, as `detection_truth` gives them.
-        protocol: name, or a protocol.
-        threshold: one of the protocol's; None for that of its errors, or else the middle one.
+        prediction: Detections in the protocol's frame.
+        truth: True boxes in that frame, from `detection_truth`.
+        protocol: Name of a protocol, or a protocol.
+        threshold: One of the protocol's thresholds; None for that of its errors, otherwise the
+            middle one.
 
     Raises:
         ChoiceError: no such protocol, or not one of its thresholds.
     """
     rules = detection_protocol(protocol)
-    chosen = threshold or rules.error_threshold or rules.thresholds[len(rules.thresholds) // 2]
-    if chosen not in rules.thresholds:
+    middle = rules.thresholds[len(rules.thresholds) // 2]
+    used_threshold = threshold or rules.error_threshold or middle
+    if used_threshold not in rules.thresholds:
         raise ChoiceError(
-            f"threshold: expected one of {', '.join(map(str, rules.thresholds))}, found {threshold!r}"
+            f"threshold: expected one of {', '.join(map(str, rules.thresholds))}, found "
+            f"{threshold!r}"
         )
-    detected, true = columns_of(prediction.boxes, prediction.scores), columns_of(truth)
+    level = rules.thresholds.index(used_threshold)
+    detected = columns_of(prediction.boxes, prediction.scores)
+    true = columns_of(truth)
     (detected, rows), (true, true_rows) = boxes_taken(detected, true, rules)
     pairs: list[tuple[int, int]] = []
     unmatched: set[int] = set()
     missed: set[int] = set()
     for position in range(len(rules.ranges)):
         ring = ring_of(detected, true, rules, position)
-        holder = _holders(ring, rules, rules.thresholds.index(chosen))
-        counts, true_counts = ring.counts, ring.truth_counts
-        pairs += [
-            (rows[by], true_rows[one])
-            for one, by in holder.items()
-            if counts[by] and true_counts[one]
-        ]
-        unmatched |= {*np.flatnonzero(counts).tolist()} - {*holder.values()}
-        missed |= {*np.flatnonzero(true_counts).tolist()} - {*holder}
+        holder = _holders(ring, rules, level)
+        for true_box, detection in holder.items():
+            if ring.counts[detection] and ring.truth_counts[true_box]:
+                pairs.append((rows[detection], true_rows[true_box]))
+        unmatched |= {*np.flatnonzero(ring.counts).tolist()} - {*holder.values()}
+        missed |= {*np.flatnonzero(ring.truth_counts).tolist()} - {*holder}
     matched = np.array(sorted(pairs), dtype=np.int64).reshape(-1, 2)
     return DetectionMatches(
-        threshold=chosen,
+        threshold=used_threshold,
         detection=matched[:, 0],
         truth=matched[:, 1],
         false=np.sort(rows[list(unmatched)]),
@@ -232,11 +243,12 @@ def detection_matches(
 
 
 def _holders(ring: Ring, rules: DetectionProtocol, level: int) -> Mapping[int, int]:
-    """True box → detection of all that match, those that do not count among them."""
-    reach, classes = ring.reach(level), len(rules.classes)
+    """Return the detection of each matched true box, also of pairs that do not count."""
+    reach = ring.reach(level)
+    classes = len(rules.classes)
     if rules.matching == "by_score":
-        taken = nearest_by_score(reach)
+        holder = nearest_by_score(reach)
     else:
         counts = {candidate: bool(ring.counts[candidate // classes]) for candidate in reach}
-        taken = nearest_by_truth(reach, counts, ring.truth_counts.tolist()).holder
-    return {truth: candidate // classes for truth, candidate in taken.items()}
+        holder = nearest_by_truth(reach, counts, ring.truth_counts.tolist()).holder
+    return {truth: candidate // classes for truth, candidate in holder.items()}

@@ -6,7 +6,11 @@ from deepaccident_devkit.evaluation.forecasting.evaluator import (
     ForecastingProtocol,
     ForecastingResult,
 )
-from deepaccident_devkit.evaluation.forecasting.metrics import Forecast
+from deepaccident_devkit.evaluation.forecasting.metrics import (
+    Forecast,
+    displacement_errors,
+    miss_rate,
+)
 from deepaccident_devkit.evaluation.forecasting.of_motion import forecasts_of
 from deepaccident_devkit.evaluation.forecasting.truth import ForecastingTruth, forecasting_truth
 
@@ -17,6 +21,8 @@ __all__ = [
     "ForecastingProtocol",
     "ForecastingResult",
     "ForecastingTruth",
+    "displacement_errors",
     "forecasting_truth",
     "forecasts_of",
+    "miss_rate",
 ]

@@ -1,4 +1,4 @@
-"""`ForecastingEvaluator`: how far actors' predicted paths are from those that they took."""
+"""`ForecastingEvaluator`: how far actors' predicted paths are from the recorded ones."""
 
 from __future__ import annotations
 
@@ -20,16 +20,17 @@ from deepaccident_devkit.evaluation.forecasting.metrics import (
     Forecast,
     actor_errors,
     collisions,
+    miss_rate,
     world_errors,
 )
 from deepaccident_devkit.evaluation.forecasting.truth import (
-    CLASSES,
+    CLASS_LABELS,
     EVERYBODY,
-    LONGEST,
     MOTIONS,
+    PATH_SECONDS,
     ROLES,
-    SEEN,
     TO_IMPACT,
+    VIEWERS,
     ForecastingTruth,
     forecasting_truth,
 )
@@ -47,6 +48,10 @@ from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
 # The row of all actors of a sample together: means over samples.
 TOGETHER: Final = "together"
+_MISSING_NOTE: Final = "no forecast of {true actor}: without errors, counted in `without`"
+_UNKNOWN_NOTE: Final = (
+    "not counted: {forecast} of the agent itself, or of an actor that no label shows then"
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -54,9 +59,9 @@ class ForecastingProtocol:
     """Rules of forecasting metrics.
 
     Attributes:
-        horizons: seconds ahead, at most 5; the first is the main one.
-        modes: how many of an actor's most probable modes count; the first is the main number.
-        miss_distance: metres; a larger error of the best mode at the horizon is a miss.
+        horizons: Seconds ahead, at most 5; the first is the main one.
+        modes: Numbers of an actor's most probable modes that count; the first is the main one.
+        miss_distance: Metres; a larger error of the best mode at the horizon is a miss.
     """
 
     horizons: tuple[float, ...] = (3.0, 1.0, 2.0, 5.0)
@@ -66,11 +71,11 @@ class ForecastingProtocol:
     def __post_init__(self) -> None:
         """Check the values; raises ConfigError."""
         check_least(self, miss_distance=0)
-        for name, low, high in (("horizons", FRAME_PERIOD, LONGEST), ("modes", 1, math.inf)):
-            given = getattr(self, name)
-            if not given or not all(low <= each <= high for each in given):
+        for name, low, high in (("horizons", FRAME_PERIOD, PATH_SECONDS), ("modes", 1, math.inf)):
+            values = getattr(self, name)
+            if not values or not all(low <= value <= high for value in values):
                 raise ConfigError(
-                    f"{name}: expected numbers from {low:g} to {high:g}, found {given!r}"
+                    f"{name}: expected numbers from {low:g} to {high:g}, found {values!r}"
                 )
 
 
@@ -80,15 +85,15 @@ FORECASTING_PROTOCOLS: Final[Mapping[str, ForecastingProtocol]] = MappingProxyTy
 
 
 def table_name(horizon: float, modes: int) -> str:
-    """The name of the table of a horizon and a number of modes: `3 s, K = 6`."""
+    """Return the name of the table of a horizon and a number of modes: `3 s, K = 6`."""
     return f"{horizon:g} s, K = {modes}"
 
 
 class ForecastingResult(MeansResult):
     """Tables by horizon and K, the number of modes that count; rows are groups of actors.
 
-    The row `all` is of all actors, `mean of scenarios` of the scenarios' means of that row, and `together` has the
-    actors of a sample as one world.
+    The row `all` has all actors, `mean of scenarios` the mean of the scenarios' means of that row,
+    and `together` takes the actors of a sample as one world.
     """
 
     __slots__ = ()
@@ -109,9 +114,10 @@ class ForecastingResult(MeansResult):
 
 
 class ForecastingEvaluator(MeansEvaluator[ForecastingResult]):
-    """Errors of the paths of other actors, of each actor's best mode.
+    """Errors of the paths of other actors, for each actor's best mode.
 
-    Actors are compared by their ids. One without a forecast at a horizon has no number there, and counts in `without`.
+    Actors are compared by their ids. An actor without a forecast at a horizon has no number there,
+    and counts in `without`.
 
     >>> ForecastingEvaluator().compute().samples
     0
@@ -131,24 +137,25 @@ class ForecastingEvaluator(MeansEvaluator[ForecastingResult]):
     order: ClassVar[Sequence[str]] = (
         *(table_name(horizon, modes) for horizon in (3, 1, 2, 5) for modes in (6, 1)),
         *(EVERYBODY, MEAN_OF_SCENARIOS, TOGETHER),
-        *(*CLASSES, *ROLES, *SEEN, *TO_IMPACT, *MOTIONS),
+        *(*CLASS_LABELS, *ROLES, *VIEWERS, *TO_IMPACT, *MOTIONS),
     )
 
     def truth(self, dataset: Dataset, token: str, /, *_unused: Any) -> tuple[ForecastingTruth]:
-        """Return the recorded paths of all actors that a label shows at the present."""
+        """Return the recorded paths of all actors annotated at the present."""
         return (forecasting_truth(dataset, token),)
 
     def update(self, token: str, forecasts: Iterable[Forecast], truth: ForecastingTruth) -> None:
         """Count one sample.
 
         Args:
-            token: of the sample.
-            forecasts: at most one an actor; those of actors that are not in the truth do not count.
-            truth: from `forecasting_truth(dataset, token)`.
+            token: Token of the sample.
+            forecasts: At most one per actor; forecasts of actors that are not in the truth do not
+                count.
+            truth: Truth from `forecasting_truth(dataset, token)`.
 
         Raises:
-            EvaluationError: something else than forecasts is given, or two of an actor, or the sample came before with
-                other counts.
+            EvaluationError: an item is not a forecast, two forecasts are of one actor, or the
+                sample came before with other counts.
         """
         self.add(token, _counts(token, forecasts, truth, self.protocol))
 
@@ -156,36 +163,44 @@ class ForecastingEvaluator(MeansEvaluator[ForecastingResult]):
 def _counts(
     token: str, forecasts: Iterable[Forecast], truth: ForecastingTruth, rules: ForecastingProtocol
 ) -> Counts:
-    """What a sample adds."""
-    given: list[object] = list(forecasts)
-    of_actor = {each.actor_id: each for each in given if isinstance(each, Forecast)}
-    if len(of_actor) < len(given):
+    """Return what a sample adds."""
+    items: list[object] = list(forecasts)
+    of_actor = {item.actor_id: item for item in items if isinstance(item, Forecast)}
+    if len(of_actor) < len(items):
         raise EvaluationError(
-            f"{token}: expected Forecasts, one of each actor, found {shortened(repr(given))}"
+            f"{token}: expected Forecasts, one of each actor, found {shortened(repr(items))}"
         )
-    sums, actors = Sums(), set(truth.actor_id.tolist())
+    sums = Sums()
+    actors = set(truth.actor_id.tolist())
     ends = np.array([of_actor[actor].times[-1] for actor in of_actor.keys() & actors])
-    sums.note(_WITHOUT, len(actors) - len(ends))
-    sums.note(_UNKNOWN, len(of_actor) - len(ends))
+    sums.note(_MISSING_NOTE, len(actors) - len(ends))
+    sums.note(_UNKNOWN_NOTE, len(of_actor) - len(ends))
     main = rules.horizons[0]
-    sums.note(
-        f"no numbers at {main:g} s: {{forecast}} ending earlier", (ends < main - SAME_TIME).sum()
-    )
+    ends_early = ends < main - SAME_TIME
+    sums.note(f"no numbers at {main:g} s: {{forecast}} ending earlier", ends_early.sum())
     sums.note(LONG_PATHS, (ends > LONGEST_PATH).sum())
     if not actors:
         return sums.counts(truth.scenario)
-    paths, chances = _arrays(of_actor, truth)
+    paths, probabilities = _arrays(of_actor, truth)
     recorded = np.isfinite(truth.path[..., 0])
-    groups = {name: who for name, who in zip(truth.groups, truth.members, strict=True) if who.any()}
-    for horizon, most in product(rules.horizons, rules.modes):
-        there, table = slice(round(horizon / FRAME_PERIOD)), table_name(horizon, most)
-        path, true, valid = paths[:, :, there], truth.path[:, there], recorded[:, there]
-        errors = actor_errors(path, true, valid, chances, most, rules.miss_distance)
+    groups = {}
+    for name, members in zip(truth.groups, truth.members, strict=True):
+        if members.any():
+            groups[name] = members
+    for horizon, mode_count in product(rules.horizons, rules.modes):
+        steps = slice(round(horizon / FRAME_PERIOD))
+        table = table_name(horizon, mode_count)
+        path = paths[:, :, steps]
+        true = truth.path[:, steps]
+        valid = recorded[:, steps]
+        errors = actor_errors(path, true, valid, probabilities, mode_count, rules.miss_distance)
         errors["without"] = np.where(valid[:, -1], np.isnan(errors["min_fde"]), np.nan)
-        sums.add_rows(
-            table, groups if most == rules.modes[0] else {EVERYBODY: groups[EVERYBODY]}, errors
-        )
-        for column, value in _together(path, true, chances, most, rules.miss_distance).items():
+        if mode_count == rules.modes[0]:
+            sums.add_rows(table, groups, errors)
+        else:
+            sums.add_rows(table, {EVERYBODY: groups[EVERYBODY]}, errors)
+        together = _together(path, true, probabilities, mode_count, rules.miss_distance)
+        for column, value in together.items():
             sums.add(table, TOGETHER, column, value)
     return sums.counts(truth.scenario)
 
@@ -193,47 +208,51 @@ def _counts(
 def _arrays(
     of_actor: Mapping[int, Forecast], truth: ForecastingTruth
 ) -> tuple[FloatArray, FloatArray]:
-    """(A, K, S, 2) the modes' paths at the truth's steps, and (A, K) probabilities; NaN of those that are not there."""
+    """Return the modes' paths at the truth's steps and their probabilities, NaN for missing ones.
+
+    Returns:
+        Paths (A, K, S, 2), and probabilities (A, K).
+    """
     steps = np.arange(1, truth.path.shape[1] + 1) * FRAME_PERIOD
-    most = max((len(each.paths) for each in of_actor.values()), default=1)
-    paths = np.full((len(truth.actor_id), most, len(steps), 2), np.nan)
-    chances = np.full(paths.shape[:2], np.nan)
+    mode_count = max((len(forecast.paths) for forecast in of_actor.values()), default=1)
+    paths = np.full((len(truth.actor_id), mode_count, len(steps), 2), np.nan)
+    probabilities = np.full(paths.shape[:2], np.nan)
     for row, actor in enumerate(truth.actor_id.tolist()):
         if actor in of_actor:
-            found = of_actor[actor].at(steps, truth.present[row])
-            paths[row, : len(found)], chances[row, : len(found)] = (
-                found,
-                of_actor[actor].probabilities,
-            )
-    return paths, chances
+            forecast = of_actor[actor]
+            positions = forecast.at(steps, truth.present[row])
+            paths[row, : len(positions)] = positions
+            probabilities[row, : len(positions)] = forecast.probabilities
+    return paths, probabilities
 
 
 def _together(
-    paths: FloatArray, truth: FloatArray, chances: FloatArray, most: int, miss_distance: float
+    paths: FloatArray,
+    truth: FloatArray,
+    probabilities: FloatArray,
+    mode_count: int,
+    miss_distance: float,
 ) -> dict[str, float]:
-    """The numbers of the best world: of the first `most` by mean probability that with the least mean FDE.
+    """Return the numbers of the best world: the one with the least mean FDE.
 
-    Counted are actors with a whole future and a forecast of it, and the modes that all of these have.
+    It is chosen among the `mode_count` worlds with the highest mean probability. Actors with a
+    complete future and a forecast of it count, and the modes that all of these have.
     """
-    whole = np.asarray(np.isfinite(paths).all(axis=(2, 3)))
-    actors = np.flatnonzero(np.isfinite(truth).all(axis=(1, 2)) & whole.any(axis=1))
-    modes = np.flatnonzero(whole[actors].all(axis=0))
+    is_complete = np.asarray(np.isfinite(paths).all(axis=(2, 3)))
+    is_recorded = np.isfinite(truth).all(axis=(1, 2))
+    actors = np.flatnonzero(is_recorded & is_complete.any(axis=1))
+    modes = np.flatnonzero(is_complete[actors].all(axis=0))
     if not len(actors) or not len(modes):
         return {}
-    mean_chance = chances[actors][:, modes].mean(axis=0)
-    worlds = paths[actors][:, modes[np.argsort(-mean_chance, kind="stable")[:most]]]
-    ade, fde, missed = world_errors(worlds, truth[actors], miss_distance)
+    mean_probability = probabilities[actors][:, modes].mean(axis=0)
+    most_probable = np.argsort(-mean_probability, kind="stable")[:mode_count]
+    worlds = paths[actors][:, modes[most_probable]]
+    ade, fde, final_errors = world_errors(worlds, truth[actors])
     best = int(np.argmin(fde))
-    hits = collisions(worlds[:, best : best + 1])
+    colliding = collisions(worlds[:, best : best + 1])
     return {
         "min_fde": fde[best],
         "min_ade": ade[best],
-        "miss": missed[:, best].mean(),
-        "collisions": hits.mean(),
+        "miss": miss_rate(final_errors[:, best], miss_distance),
+        "collisions": colliding.mean(),
     }
-
-
-_WITHOUT: Final = "no forecast of {true actor}: without errors, counted in `without`"
-_UNKNOWN: Final = (
-    "not counted: {forecast} of the agent itself, or of an actor that no label shows then"
-)

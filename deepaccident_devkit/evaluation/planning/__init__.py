@@ -1,6 +1,11 @@
-"""Planned paths: the definitions of UniAD, ST-P3, VAD and BEV-Planner, and `clean`, which is for accidents."""
+"""Planned paths: rules of UniAD, ST-P3, VAD and BEV-Planner, and `clean`, made for accidents."""
 
-from deepaccident_devkit.evaluation.planning.cells import CELL_PROTOCOLS, CellRules
+from deepaccident_devkit.evaluation.planning.cells import (
+    CELL_PROTOCOLS,
+    CellRules,
+    collision_rate,
+    plan_displacement_errors,
+)
 from deepaccident_devkit.evaluation.planning.clean import CleanPlanning
 from deepaccident_devkit.evaluation.planning.evaluator import (
     PLANNING_PROTOCOLS,
@@ -23,6 +28,8 @@ __all__ = [
     "PlanningEvaluator",
     "PlanningResult",
     "PlanningScene",
+    "collision_rate",
+    "plan_displacement_errors",
     "planning_scene",
     "trivial_plans",
 ]

@@ -1,4 +1,4 @@
-"""`CleanPlanning`: what a plan makes of a recorded accident, and what it costs where nothing happens."""
+"""`CleanPlanning`: effects of a plan on a recorded accident, and costs where nothing happens."""
 
 from __future__ import annotations
 
@@ -13,7 +13,11 @@ from deepaccident_devkit.collisions.contact import TOUCHING
 from deepaccident_devkit.collisions.outcomes import MOST_MARGIN
 from deepaccident_devkit.collisions.replay import HORIZON
 from deepaccident_devkit.evaluation.means import Sums
-from deepaccident_devkit.evaluation.planning.cells import HORIZONS, STEP
+from deepaccident_devkit.evaluation.planning.cells import (
+    HORIZONS,
+    STEP,
+    plan_displacement_errors,
+)
 from deepaccident_devkit.evaluation.planning.contacts import Contacts, first_contacts, without_gaps
 from deepaccident_devkit.evaluation.planning.scene import (
     Plan,
@@ -25,21 +29,22 @@ from deepaccident_devkit.geometry.box_arrays import gaps_of_pairs
 from deepaccident_devkit.support.arrays import FloatArray
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
-# Seconds and metres: times are decimal numbers, and a path projected on itself loses digits.
-_SLACK: Final = 1e-6
-# Seconds from a sample to the lead that it counts for: lists of samples count back from each recording's own end.
-_NEAREST: Final = 0.2
-# Metres of a recorded way from which the share of it that is lost says something.
-_FAR: Final = 1.0
+# Seconds, metres or m/s²: times are decimal numbers, and a path projected on itself loses digits.
+_ROUNDING_TOLERANCE: Final = 1e-6
+# Seconds between a sample and the lead that it counts for: lists of samples count back from each
+# recording's own end.
+_LEAD_TOLERANCE_S: Final = 0.2
+# Metres of recorded progress from which on the lost share of it is meaningful.
+_MIN_PROGRESS_M: Final = 1.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CleanPlanning:
-    """What is counted; docs/protocols.md, Planning, defines it.
+    """Rules of the protocol `clean`; docs/protocols.md, Planning, defines the numbers.
 
     Attributes:
-        leads: seconds before the accident at which plans are judged.
-        most_acceleration: m/s² along or across from which a plan cannot be driven.
+        leads: Seconds before the accident at which plans are judged.
+        most_acceleration: m/s² along or across beyond which a plan cannot be driven.
         braking: m/s² of a deceleration that passengers feel.
     """
 
@@ -51,170 +56,230 @@ class CleanPlanning:
 def add_clean(
     sums: Sums, plans: Mapping[str, Plan], scene: PlanningScene, rules: CleanPlanning
 ) -> None:
-    """Add what plans do, among others that keep their recorded motion, to the sums.
+    """Add the effects of plans, among others that keep their recorded motion, to the sums.
 
     Args:
-        sums: of the sample.
-        plans: by the name of their row; the recorded path is the one called `recorded`.
-        scene: of the sample.
-        rules: the protocol.
+        sums: Sums of the sample.
+        plans: Plans by the name of their row; the recorded path is called `recorded`.
+        scene: Scene of the sample.
+        rules: The protocol.
     """
     if len(scene.recorded) < 2:
         sums.note(
-            "no numbers of {sample} without a later frame that counts; twins end where their accident does"
+            "no numbers of {sample} without a later frame that counts; twins end where their "
+            "accident does"
         )
         return
     margin = _margin(scene)
-    found = {name: _contacts(plan, scene, margin) for name, plan in plans.items()}
-    true = found["recorded"]
-    if true.overlapping.any():
-        sums.note("left out: {actor} touching the ego at the present", int(true.overlapping.sum()))
-    if scene.is_collider and not scene.is_twin and (reason := _unusable(scene, margin, true)):
-        sums.note(f"{scene.scenario}: {reason}; left out: {{sample}}")
-        return
-    role = "" if scene.is_collider else "bystander, "
-    leads = [
-        f"{role}lead {lead:g} s{suffix}"
-        for end, suffix in ((scene.to_end, ""), (scene.to_contact, " to contact"))
-        for lead in rules.leads
-        if abs(end - lead) <= _NEAREST + _SLACK
-    ]
+    contacts = {name: _contacts(plan, scene, margin) for name, plan in plans.items()}
+    recorded_contacts = contacts["recorded"]
+    overlapping = recorded_contacts.overlapping
+    if overlapping.any():
+        sums.note("left out: {actor} touching the ego at the present", int(overlapping.sum()))
+    if scene.is_collider and not scene.is_twin:
+        reason = _unusable(scene, margin, recorded_contacts)
+        if reason:
+            sums.note(f"{scene.scenario}: {reason}; left out: {{sample}}")
+            return
+    leads = _lead_tables(scene, rules)
     steps = steps_of(STEP, min(scene.duration, HORIZONS[-1]))
-    recorded = recorded_poses(scene, steps)
+    recorded = recorded_poses(scene, steps)[:, :2]
     for row, plan in plans.items():
-        away = np.hypot(*(plan.poses(steps) - recorded)[:, :2].T)
+        errors = plan_displacement_errors(plan.poses(steps)[:, :2], recorded)
         for horizon in HORIZONS:
-            for column, value in _at_horizon(away, scene, found[row], horizon).items():
+            for column, value in _at_horizon(errors, scene, contacts[row], horizon).items():
                 sums.add(f"{horizon} s", row, column, value)
         if leads:
-            numbers = _at_lead(plan, scene, found[row], true, rules)
+            numbers = _at_lead(plan, scene, contacts[row], recorded_contacts, rules)
             for table, (column, value) in product(leads, numbers.items()):
                 sums.add(table, row, column, value)
 
 
+def _lead_tables(scene: PlanningScene, rules: CleanPlanning) -> list[str]:
+    """Return the names of the tables of the leads that a sample counts for."""
+    role = "" if scene.is_collider else "bystander, "
+    tables = []
+    for end, suffix in ((scene.to_end, ""), (scene.to_contact, " to contact")):
+        for lead in rules.leads:
+            if abs(end - lead) <= _LEAD_TOLERANCE_S + _ROUNDING_TOLERANCE:
+                tables.append(f"{role}lead {lead:g} s{suffix}")
+    return tables
+
+
 def _contacts(plan: Plan, scene: PlanningScene, margin: float) -> Contacts:
-    """With the others, for at least 3 s, up to the plan's end or the recording's; with the partner 3 s longer."""
-    until = scene.duration + (HORIZON if scene.partner.any() else 0.0)
-    times = np.append(0.0, steps_of(FRAME_PERIOD, until))
+    """Return the first contacts of a plan with the others.
+
+    They are searched for at least 3 s, up to the plan's end or the recording's; with the partner
+    for 3 s after the recording.
+    """
+    partner_end = scene.duration + (HORIZON if scene.partner.any() else 0.0)
+    other_end = min(scene.duration, max(float(plan.times[-1]), HORIZONS[-1]))
+    times = np.append(0.0, steps_of(FRAME_PERIOD, partner_end))
     return first_contacts(
         box_path(plan.poses(times), scene.offset),
         scene.size,
         _prolonged(scene, len(times)),
         np.where(scene.partner, margin, 0.0),
-        np.where(
-            scene.partner, until, min(scene.duration, max(float(plan.times[-1]), HORIZONS[-1]))
-        ),
+        np.where(scene.partner, partner_end, other_end),
     )
 
 
 def _at_horizon(
-    away: FloatArray, scene: PlanningScene, contacts: Contacts, horizon: int
+    errors: FloatArray, scene: PlanningScene, contacts: Contacts, horizon: int
 ) -> dict[str, float]:
-    """Errors (N,) at the recorded steps, and contacts, of a plan up to a horizon; NaN where nothing is recorded."""
-    last = round(horizon / STEP)
-    touches = (contacts.time <= min(horizon, scene.duration) + _SLACK).any()
+    """Return displacement errors and contacts of a plan up to a horizon.
+
+    Args:
+        errors: (N,) distances from the recorded path at its steps, metres.
+        scene: Scene of the sample.
+        contacts: First contacts of the plan.
+        horizon: Seconds.
+
+    Returns:
+        Metres and percent by column; NaN where nothing is recorded.
+    """
+    if not len(errors):
+        return {"l2": np.nan, "l2_mean": np.nan, "contact": np.nan}
+    count = round(horizon / STEP)
+    end = min(horizon, scene.duration)
+    touches = (contacts.time <= end + _ROUNDING_TOLERANCE).any()
     return {
-        "l2": float(away[last - 1]) if len(away) >= last else np.nan,
-        "l2_mean": float(away[:last].mean()) if len(away) else np.nan,
-        "contact": 100.0 * touches if len(away) else np.nan,
+        "l2": float(errors[count - 1]) if len(errors) >= count else np.nan,
+        "l2_mean": float(errors[:count].mean()),
+        "contact": 100.0 * touches,
     }
 
 
 def _at_lead(
-    plan: Plan, scene: PlanningScene, contacts: Contacts, true: Contacts, rules: CleanPlanning
+    plan: Plan,
+    scene: PlanningScene,
+    contacts: Contacts,
+    recorded_contacts: Contacts,
+    rules: CleanPlanning,
 ) -> dict[str, float]:
-    """What a plan makes of the accident, or of what happens in its place in a twin."""
-    known = min(float(plan.times[-1]), scene.duration)
-    new = (contacts.time <= known + _SLACK) & (true.time > known + _SLACK) & ~scene.partner
+    """Return the effects of a plan on the accident, or on the same moment of a twin."""
+    end = min(float(plan.times[-1]), scene.duration)
+    latest = end + _ROUNDING_TOLERANCE
+    is_new = (contacts.time <= latest) & (recorded_contacts.time > latest) & ~scene.partner
     along, across = _accelerations(plan, scene.before)
-    lost, way = _progress(plan, scene, known)
+    lost, progress = _progress(plan, scene, end)
     hardest = max(np.abs(along).max(), np.abs(across).max())
     numbers = {
-        "striking": 100.0 * (new & ~contacts.struck).any(),
-        "struck": 100.0 * (new & contacts.struck).any(),
+        "striking": 100.0 * (is_new & ~contacts.struck).any(),
+        "struck": 100.0 * (is_new & contacts.struck).any(),
         "lost_way": lost,
-        "lost": 100.0 * lost / way if way > _FAR else np.nan,
-        "infeasible": 100.0 * (hardest > rules.most_acceleration + _SLACK),
+        "lost": 100.0 * lost / progress if progress > _MIN_PROGRESS_M else np.nan,
+        "infeasible": 100.0 * (hardest > rules.most_acceleration + _ROUNDING_TOLERANCE),
     }
     if scene.is_twin:
         numbers = {f"{name}_twins": value for name, value in numbers.items()}
         numbers["braking_twins"] = 100.0 * (along.min() < -rules.braking)
-    for at in np.flatnonzero(scene.partner):
-        time = float(contacts.time[at])
+    for partner in np.flatnonzero(scene.partner):
+        time = float(contacts.time[partner])
         numbers |= {
             "avoided": 100.0 * np.isinf(time),
-            "impact_speed": float(contacts.speed[at]),
-            "relative_speed": float(contacts.relative_speed[at]),
-            "prolonged": 100.0 * (known + _SLACK < time < np.inf),
+            "impact_speed": float(contacts.speed[partner]),
+            "relative_speed": float(contacts.relative_speed[partner]),
+            "prolonged": 100.0 * (latest < time < np.inf),
         }
     return {name: float(value) for name, value in numbers.items()}
 
 
 def box_path(poses: FloatArray, offset: FloatArray) -> FloatArray:
-    """(N, 3) x, y, yaw of the box's centre, of poses (N, 3) of the ego frame; `offset` (2,) is the centre in it."""
-    cosine, sine = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    """Return x, y, yaw of the centre of the ego's box, shape (N, 3).
+
+    Args:
+        poses: (N, 3) x, y, yaw of the ego frame.
+        offset: (2,) centre of the box in the ego frame, metres.
+    """
+    cosine = np.cos(poses[:, 2])
+    sine = np.sin(poses[:, 2])
     x = poses[:, 0] + cosine * offset[0] - sine * offset[1]
-    return np.column_stack([x, poses[:, 1] + sine * offset[0] + cosine * offset[1], poses[:, 2]])
+    y = poses[:, 1] + sine * offset[0] + cosine * offset[1]
+    return np.column_stack([x, y, poses[:, 2]])
 
 
 def _margin(scene: PlanningScene) -> float:
-    """The gap between the recorded pair at the end, which counts as contact; NaN without a partner."""
-    ego = np.concatenate(
-        [box_path(scene.recorded[-1:], scene.offset)[0, :2], scene.size, scene.recorded[-1, 2:]]
-    )
+    """Return the gap between the recorded pair at the end, which counts as contact, metres.
+
+    NaN without a partner.
+    """
+    last_pose = scene.recorded[-1:]
+    center = box_path(last_pose, scene.offset)[0, :2]
+    ego = np.concatenate([center, scene.size, scene.recorded[-1, 2:]])
     gaps = gaps_of_pairs(ego, scene.footprint[-1, scene.partner])
     return float(gaps[0]) + TOUCHING if len(gaps) else np.nan
 
 
 def _prolonged(scene: PlanningScene, frames: int) -> FloatArray:
-    """Return (frames, A, 5) recorded footprints, and later those of the partner, which goes straight on.
+    """Return the recorded footprints (frames, A, 5), after their end only the partner's.
 
-    Its velocity is that between its last two labels, however many frames between them have none.
+    The partner goes straight on; its velocity is that between its last two labels, however many
+    frames between them have none.
     """
-    known = without_gaps(scene.footprint)
-    after = np.full((frames - len(known), *known.shape[1:]), np.nan)
-    last = np.broadcast_to(known[-1], after.shape).copy()
-    last[..., :2] += np.arange(1, len(after) + 1)[:, None, None] * (known[-1] - known[-2])[:, :2]
-    return np.concatenate([known, np.where(scene.partner[:, None], last, after)])
+    recorded = without_gaps(scene.footprint)
+    absent = np.full((frames - len(recorded), *recorded.shape[1:]), np.nan)
+    later = np.broadcast_to(recorded[-1], absent.shape).copy()
+    step = (recorded[-1] - recorded[-2])[:, :2]
+    steps = np.arange(1, len(absent) + 1)
+    later[..., :2] += steps[:, None, None] * step
+    partner = scene.partner[:, None]
+    return np.concatenate([recorded, np.where(partner, later, absent)])
 
 
 def _accelerations(plan: Plan, before: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Changes of velocity along and across the heading at each step, m/s², that from the present speed included."""
+    """Return the accelerations along and across the heading at each step, m/s².
+
+    Args:
+        plan: The plan.
+        before: (2,) velocity at the present, m/s, from which the first change counts.
+    """
     times = np.append(0.0, plan.times[plan.times > 0])
     poses = plan.poses(times)
     periods = np.diff(times)
-    velocity = np.vstack([before, np.diff(poses[:, :2], axis=0) / periods[:, None]])
+    later_velocity = np.diff(poses[:, :2], axis=0) / periods[:, None]
+    velocity = np.vstack([before, later_velocity])
     change = np.diff(velocity, axis=0) / periods[:, None]
-    cosine, sine = np.cos(poses[:-1, 2]), np.sin(poses[:-1, 2])
-    return cosine * change[:, 0] + sine * change[:, 1], cosine * change[:, 1] - sine * change[:, 0]
+    cosine = np.cos(poses[:-1, 2])
+    sine = np.sin(poses[:-1, 2])
+    along = cosine * change[:, 0] + sine * change[:, 1]
+    across = cosine * change[:, 1] - sine * change[:, 0]
+    return along, across
 
 
-def _progress(plan: Plan, scene: PlanningScene, until: float) -> tuple[float, float]:
-    """Metres of the recorded path that the plan's place at a time lacks, and those of the recording up to then."""
+def _progress(plan: Plan, scene: PlanningScene, time: float) -> tuple[float, float]:
+    """Return the progress that a plan loses up to a time, and the recorded progress.
+
+    Both in metres along the recorded path.
+    """
     times = np.append(np.arange(len(scene.recorded)) * FRAME_PERIOD, scene.duration + 100.0)
     path = recorded_poses(scene, times)[:, :2]
     steps = np.diff(path, axis=0)
     lengths = np.hypot(*steps.T)
     arcs = np.append(0.0, np.cumsum(lengths))
-    place = plan.poses(np.array([until]))[0, :2] - path[:-1]
-    share = np.divide(
-        (place * steps).sum(axis=1), lengths**2, out=np.zeros(len(steps)), where=lengths > 0
-    ).clip(0, 1)
-    nearest = int(np.argmin(np.hypot(*(place - share[:, None] * steps).T)))
-    way = float(np.interp(until, times, arcs))
-    return way - float(arcs[nearest] + share[nearest] * lengths[nearest]), way
+    offset = plan.poses(np.array([time]))[0, :2] - path[:-1]
+    projection = (offset * steps).sum(axis=1)
+    zeros = np.zeros(len(steps))
+    share = np.divide(projection, lengths**2, out=zeros, where=lengths > 0).clip(0, 1)
+    distance = np.hypot(*(offset - share[:, None] * steps).T)
+    nearest = int(np.argmin(distance))
+    recorded_progress = float(np.interp(time, times, arcs))
+    progress = float(arcs[nearest] + share[nearest] * lengths[nearest])
+    return recorded_progress - progress, recorded_progress
 
 
-def _unusable(scene: PlanningScene, margin: float, true: Contacts) -> str:
-    """Why an accident does not count, as half a sentence; empty if it does: the recorded path must meet the partner."""
+def _unusable(scene: PlanningScene, margin: float, recorded_contacts: Contacts) -> str:
+    """Return why an accident does not count, as half a sentence; empty if it does.
+
+    The recorded path must meet the partner.
+    """
     if not scene.partner.any():
         return "no label shows the partner from here on"
-    if true.overlapping[scene.partner].any():
+    if recorded_contacts.overlapping[scene.partner].any():
         return "the pair touches at the present already"
     if not margin <= MOST_MARGIN:
         return f"the pair is {margin:.2f} m apart at the end"
-    return (
-        ""
-        if true.time[scene.partner][0] <= scene.duration + _SLACK
-        else "the recorded path does not meet the partner"
-    )
+    contact_time = recorded_contacts.time[scene.partner][0]
+    if contact_time <= scene.duration + _ROUNDING_TOLERANCE:
+        return ""
+    return "the recorded path does not meet the partner"

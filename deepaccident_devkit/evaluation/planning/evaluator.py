@@ -1,4 +1,4 @@
-"""`PlanningEvaluator`: planned paths by the definitions of four public codes, and by one for accidents."""
+"""`PlanningEvaluator`: plans by the definitions of four public codes, and by one for accidents."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from deepaccident_devkit.evaluation.planning.scene import (
 from deepaccident_devkit.evaluation.predictions import LONG_PATHS, LONGEST_PATH
 from deepaccident_devkit.evaluation.task import Row
 from deepaccident_devkit.geometry.box_arrays import corner_offsets
-from deepaccident_devkit.support.arrays import BoolArray
+from deepaccident_devkit.support.arrays import BoolArray, IntArray
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
 _Protocol = CleanPlanning | CellRules
@@ -42,19 +42,23 @@ PLANNING_PROTOCOLS: Final[Mapping[str, _Protocol]] = MappingProxyType(
 GIVEN: Final = "given"
 TRIVIAL: Final = ("recorded", "standing", "constant velocity", "full braking")
 _MEAN: Final = "mean"
-_LEFT_OUT: Final = (
-    "by these rules a plan that repeats the recorded accident has 0 % collisions: steps at which the recorded path "
-    "touches, or is not recorded, are left out; left_out is their share"
+_LEFT_OUT_NOTE: Final = (
+    "by these rules a plan that repeats the recorded accident has 0 % collisions: steps at which "
+    "the recorded path touches, or is not recorded, are left out; left_out is their share"
 )
-_CONTINUED: Final = "continued straight on: {plan} ending before 3 s"
-_LARGE_YAW: Final = "suspicious: {plan} with a yaw beyond 2π; yaw is in radians, not in degrees"
-_FAR_OFF: Final = "point_collision looks 25 m beside the path, as the code does; ignore it"
+_CONTINUED_NOTE: Final = "continued straight on: {plan} ending before 3 s"
+_LARGE_YAW_NOTE: Final = (
+    "suspicious: {plan} with a yaw beyond 2π; yaw is in radians, not in degrees"
+)
+_POINT_FAR_OFF_NOTE: Final = (
+    "point_collision looks 25 m beside the path, as the code does; ignore it"
+)
 _BY_HORIZON: Final = tuple(f"{horizon} s" for horizon in HORIZONS)
 BY_LEAD: Final = tuple(f"lead {lead:g} s" for lead in CleanPlanning().leads)
 
 
 class PlanningResult(MeansResult):
-    """Tables by horizon, and in `clean` by lead; rows are the plans that are given and the trivial ones."""
+    """Tables by horizon, and in `clean` by lead; rows are the evaluated and the trivial plans."""
 
     __slots__ = ()
     rows: ClassVar[tuple[Row, ...]] = table_rows(
@@ -90,9 +94,9 @@ class PlanningResult(MeansResult):
 class PlanningEvaluator(MeansEvaluator[PlanningResult]):
     """Collisions and errors of planned paths.
 
-    Whatever the protocol, rows of plans that need no planner stand beside the given ones: a plan equal to the recorded
-    accident has no collision by any of the four public definitions, as they leave out the steps at which the recorded
-    path touches.
+    For every protocol, rows of plans that need no planner stand beside the evaluated ones: a plan
+    equal to the recorded accident has no collision by any of the four public definitions, as they
+    leave out the steps at which the recorded path touches.
 
     >>> PlanningEvaluator("uniad").compute().samples
     0
@@ -124,33 +128,35 @@ class PlanningEvaluator(MeansEvaluator[PlanningResult]):
     )
 
     def truth(self, dataset: Dataset, token: str, /, *_unused: Any) -> tuple[PlanningScene]:
-        """Return what happens around the ego vehicle; the rules of the public codes count in whole recordings."""
+        """Return what happens around the ego vehicle; public codes count complete recordings."""
         return (planning_scene(dataset, token, cut=isinstance(self.protocol, CleanPlanning)),)
 
     def update(self, token: str, plans: Iterable[Plan], scene: PlanningScene) -> None:
         """Count one sample.
 
         Args:
-            token: of the sample.
-            plans: one or more; the one with the highest score counts, of equal ones the first.
-            scene: from `planning_scene(dataset, token)`; for the rules of the public codes with `cut=False`.
+            token: Token of the sample.
+            plans: One or more plans; the one with the highest score counts, the first of equal
+                ones.
+            scene: Scene from `planning_scene(dataset, token)`; for the rules of the public codes
+                with `cut=False`.
 
         Raises:
-            EvaluationError: there is no plan, it ends before the 3 s of the public codes, or the sample came before
-                with other counts.
+            EvaluationError: there is no plan, it ends before the 3 s of the public codes, or the
+                sample came before with other counts.
         """
-        given: list[Any] = list(plans)
-        others = [each for each in given if not isinstance(each, Plan)]
-        if others or not given:
-            found = type(others[0]).__name__ if others else "none"
-            raise EvaluationError(f"{token}: expected one Plan or more, found {found}")
-        plan = max(given, key=lambda each: each.score)
+        items: list[Any] = list(plans)
+        non_plans = [item for item in items if not isinstance(item, Plan)]
+        if non_plans or not items:
+            found_name = type(non_plans[0]).__name__ if non_plans else "none"
+            raise EvaluationError(f"{token}: expected one Plan or more, found {found_name}")
+        plan = max(items, key=lambda item: item.score)
         rows = {GIVEN: plan, **trivial_plans(scene)}
         sums = Sums()
         sums.note(LONG_PATHS, plan.times[-1] > LONGEST_PATH)
-        sums.note(_LARGE_YAW, plan.yaw is not None and np.abs(plan.yaw).max() > 2 * np.pi)
+        sums.note(_LARGE_YAW_NOTE, plan.yaw is not None and np.abs(plan.yaw).max() > 2 * np.pi)
         if isinstance(self.protocol, CleanPlanning):
-            sums.note(_CONTINUED, plan.times[-1] < HORIZONS[-1] - FRAME_PERIOD / 2)
+            sums.note(_CONTINUED_NOTE, plan.times[-1] < HORIZONS[-1] - FRAME_PERIOD / 2)
             add_clean(sums, rows, scene, self.protocol)
         else:
             _add_cells(sums, token, rows, scene, self.protocol)
@@ -160,39 +166,48 @@ class PlanningEvaluator(MeansEvaluator[PlanningResult]):
 def _add_cells(
     sums: Sums, token: str, rows: Mapping[str, Plan], scene: PlanningScene, rules: CellRules
 ) -> None:
-    sums.note(_LEFT_OUT)
+    """Add the numbers of plans by a public code's rules to the sums; raises EvaluationError."""
+    sums.note(_LEFT_OUT_NOTE)
     if rules.point_far_off:
-        sums.note(_FAR_OFF)
+        sums.note(_POINT_FAR_OFF_NOTE)
     times = steps_of(STEP, STEPS * STEP)
-    if rows[GIVEN].times[-1] < times[-1] - FRAME_PERIOD / 2:
+    plan_end = rows[GIVEN].times[-1]
+    if plan_end < times[-1] - FRAME_PERIOD / 2:
         raise EvaluationError(
-            f"{token}: the plan ends after {rows[GIVEN].times[-1]:g} s; these rules look {times[-1]:g} s ahead: plan "
-            "so far, or evaluate by the protocol clean"
+            f"{token}: the plan ends after {plan_end:g} s; these rules look {times[-1]:g} s "
+            "ahead: plan so far, or evaluate by the protocol clean"
         )
     frames = np.rint(times / FRAME_PERIOD).astype(np.int64)
     valid = frames < len(scene.recorded)
-    nobody = np.zeros((0, 5))
-    drawn = _drawn(scene, rules)
-    shown = [
-        scene.footprint[at, drawn] if there else nobody
-        for at, there in zip(frames, valid, strict=True)
-    ]
-    boxes = [each[np.isfinite(each[:, 0])] for each in shown]
-    cells = np.stack([occupied(corner_offsets(each) + each[:, None, :2], rules) for each in boxes])
-    paths = {name: plan.poses(times)[:, :2] for name, plan in rows.items()}
+    cells = _occupied_cells(scene, frames, rules)
     ego = float(scene.size[0]), float(scene.size[1])
-    true = paths[TRIVIAL[0]]
-    found = {name: touching(path, cells, ego, rules) for name, path in paths.items()}
+    paths = {name: plan.poses(times)[:, :2] for name, plan in rows.items()}
+    touched = {name: touching(path, cells, ego, rules) for name, path in paths.items()}
+    recorded = paths[TRIVIAL[0]]
+    recorded_touched = touched[TRIVIAL[0]]
     for name, path in paths.items():
-        numbers = cell_numbers(path, true, valid, (found[name], found[TRIVIAL[0]]), rules)
+        numbers = cell_numbers(path, recorded, valid, (touched[name], recorded_touched), rules)
         for column, values in numbers.items():
             scaled = values if column.startswith("l2") else 100.0 * values
             for table, value in zip((*_BY_HORIZON, _MEAN), (*scaled, scaled.mean()), strict=True):
                 sums.add(table, name, column, float(value))
 
 
+def _occupied_cells(scene: PlanningScene, frames: IntArray, rules: CellRules) -> BoolArray:
+    """Return the cells that others cover at frames (T,), shape (T, H, W); none after the end."""
+    drawn = _drawn(scene, rules)
+    nobody = np.zeros((0, 5))
+    cells = []
+    for frame in frames.tolist():
+        boxes = scene.footprint[frame, drawn] if frame < len(scene.recorded) else nobody
+        boxes = boxes[np.isfinite(boxes[:, 0])]
+        corners = corner_offsets(boxes) + boxes[:, None, :2]
+        cells.append(occupied(corners, rules))
+    return np.stack(cells)
+
+
 def _drawn(scene: PlanningScene, rules: CellRules) -> BoolArray:
-    """(A,) whose boxes the rules draw."""
+    """Return the actors with boxes that the rules draw, a mask (A,)."""
     if rules.objects == "vehicles":
         return ~scene.is_pedestrian
     return scene.seen if rules.objects == "seen" else np.isfinite(scene.footprint[0, :, 0])

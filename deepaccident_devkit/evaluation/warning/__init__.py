@@ -1,11 +1,11 @@
-"""How early an accident is warned of, and how often an alarm is false."""
+"""Warnings: how early they come before an accident, and how often an alarm is false."""
 
 from deepaccident_devkit.evaluation.warning.anticipation import (
     AnticipationFigures,
     AnticipationResult,
     CleanWarnings,
 )
-from deepaccident_devkit.evaluation.warning.clean import CleanScores, OperatingPoint
+from deepaccident_devkit.evaluation.warning.clean import CleanScores, OperatingPoint, roc_area
 from deepaccident_devkit.evaluation.warning.evaluator import WARNING_PROTOCOLS, WarningEvaluator
 from deepaccident_devkit.evaluation.warning.field import (
     FieldFigures,
@@ -30,4 +30,5 @@ __all__ = [
     "WarningEvaluator",
     "field_figures",
     "printed_figures",
+    "roc_area",
 ]

@@ -1,11 +1,10 @@
-"""`CleanWarnings`: anticipation metrics in which a siren, silence or chance cannot win (protocol `clean`)."""
+"""`CleanWarnings`: metrics in which a siren, silence or chance cannot win (protocol `clean`)."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
-from functools import partial
 from typing import Any, Final, get_args
 
 import numpy as np
@@ -35,8 +34,9 @@ from deepaccident_devkit.support.text import settle_choices
 RANDOM_DRAWS: Final = 20
 # Seconds that a warning may need from an agent that sees the danger to the two that collide.
 LATENCIES: Final = (0.0, 0.1, 0.3)
-_ANY: Final = float(np.nextafter(0.0, 1.0))
-_FIXED: Final[Mapping[str, float]] = {
+# Threshold at which every alarm with a score counts.
+_LOWEST_THRESHOLD: Final = float(np.nextafter(0.0, 1.0))
+_TRIVIAL_THRESHOLDS: Final[Mapping[str, float]] = {
     "always": 1.0,
     "never": 1.0,
     "random per frame": 0.5,
@@ -45,33 +45,44 @@ _FIXED: Final[Mapping[str, float]] = {
 
 
 def reference_threshold(predictor: str) -> float:
-    """The operating point of one of `PREDICTORS` but the given one: of those that know the present any alarm is one."""
-    return _FIXED.get(predictor, _ANY)
+    """Return the operating point of a reference predictor.
+
+    For the predictors that know the present any alarm counts.
+
+    Args:
+        predictor: One of `PREDICTORS` except the given one.
+    """
+    return _TRIVIAL_THRESHOLDS.get(predictor, _LOWEST_THRESHOLD)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AnticipationFigures(FrozenMappings):
-    """How well one predictor foresees the accidents of one group of recordings. NaN: nothing to count.
+    """How well one predictor foresees a group's accidents. NaN: nothing to count.
 
     Attributes:
-        auc_ahead: the headline: the chance that an accident recording's score is above another recording's as long
-            before the end, ties half, mean over the moments of the last 3 seconds. 0.5 for always and never, and
-            on average for chance.
-        twin_wins: the chance that an accident recording's highest score is above its twin's, ties half; a twin is cut
-            to the accident's length.
-        average_precision: AP over recordings, by their highest scores; depends on how many of each there are.
-        area_under_curve: AUC, likewise up to the impact.
-        mean_time: mTTA over the curve of recall, seconds; a missed recording is in no time, so read it beside the AP.
-        operating: the figures at the operating point: the threshold that was given; without one that of `at_r80`, or of
-            the highest recall where 0.8 is not reached.
-        at_r80: at the highest threshold with a recall of 0.8; NaN where none has it.
-        at_p80: at the threshold of the highest recall with a precision of 0.8.
-        best_f1: threshold: of the best F1 over these recordings; to be given when another split is evaluated.
-        quiet: threshold: the lowest with at most one second a minute in alarm without an accident to come; likewise.
-        tta0_after: for agents that see an accident of others: latency → seconds of `operating.tta0` that are left when
-            the two that collide receive the warning, at least 0; empty for `ego_involved`.
-        recordings: by kind: `accident`, `twins`, `others`.
-        twins: pairs of an accident recording and its twin.
+        auc_ahead: Headline: the probability that an accident recording's score exceeds another
+            recording's at the same time before the end, ties half, mean over the moments of the
+            last 3 seconds. 0.5 for always and never, and on average for chance.
+        twin_wins: Probability that an accident recording's highest score exceeds its twin's, ties
+            half; a twin is cut to the accident's length.
+        average_precision: AP over recordings, by their highest scores; depends on the numbers of
+            accident and other recordings.
+        area_under_curve: AUC, the same up to the impact.
+        mean_time: mTTA over the curve of recall, seconds; a missed recording adds no time, so read
+            it beside the AP.
+        operating: Figures at the operating point: at the threshold of the protocol; without one at
+            the threshold of `at_r80`, or of the highest recall where 0.8 is not reached.
+        at_r80: Figures at the highest threshold with a recall of 0.8; NaN where no threshold has
+            it.
+        at_p80: Figures at the threshold of the highest recall with a precision of 0.8.
+        best_f1: Threshold of the best F1 over these recordings, for evaluations of another split.
+        quiet: Lowest threshold with at most one second per minute in alarm without a coming
+            accident, for evaluations of another split.
+        tta0_after: For agents that see an accident of others: latency → seconds of `operating.tta0`
+            that are left when the colliding pair receives the warning, at least 0; empty for
+            `ego_involved`.
+        recordings: Number of recordings by kind: `accident`, `twins`, `others`.
+        twins: Number of pairs of an accident recording and its twin.
     """
 
     auc_ahead: float
@@ -94,12 +105,13 @@ class AnticipationResult(WarningResult):
     """The result of the protocol `clean`.
 
     Attributes:
-        samples: how many.
-        operating_by: `given` threshold, or `recall`.
-        groups: involvement of the agent → figures; agents of one scenario are never pooled.
-        references: predictor (of `PREDICTORS` but the given one) → the same; empty for resamples.
-        beyond: alarms for later than the horizon, which do not count.
-        notes: sentences that a reader of the numbers should know.
+        samples: Number of samples.
+        operating_by: Where the operating point comes from: a `given` threshold, or `recall`.
+        groups: Involvement of the agent → figures; agents of one scenario are never pooled.
+        references: Predictor (of `PREDICTORS` except the given one) → the same figures; empty for
+            resamples.
+        beyond: Alarms for later than the horizon, which do not count.
+        notes: Sentences that a reader of the numbers should know.
     """
 
     samples: int
@@ -112,16 +124,17 @@ class AnticipationResult(WarningResult):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CleanWarnings:
-    """The accidents that are foreseen, recording by recording, without the quirks of published anticipation metrics.
+    """Foreseen accidents by recording, without the quirks of published anticipation metrics.
 
-    A recording's score at a sample is that of its surest alarm, below all thresholds without one; from the impact on
-    nothing counts.
+    A recording's score at a sample is that of its surest alarm, lower than all thresholds without
+    one; from the impact on nothing counts.
 
     Attributes:
-        scores_of: whose alarms count where somebody collides: those of the `pair` that does (right ones), or all of the
-            `recording`, for predictors that name nobody. Where nobody collides, all do.
-        threshold: the lowest score that is an alarm, chosen on another split (`best_f1` or `quiet` there); None if none
-            was.
+        scores_of: Alarms that count where somebody collides: the ones of the colliding `pair`
+            (right ones), or all of the `recording`, for predictors that name nobody. Where nobody
+            collides, all alarms count.
+        threshold: Lowest score that is an alarm, chosen on another split (`best_f1` or `quiet` of
+            that split); None if none was chosen.
     """
 
     scores_of: ScoresOf = "pair"
@@ -134,33 +147,36 @@ class CleanWarnings:
             raise ConfigError(f"threshold: expected a number, or None, found {self.threshold!r}")
 
     def result(self, counts: Collection[Counts], *, references: bool = False) -> AnticipationResult:
-        """The metrics of some samples' counts, with those of the reference predictors or without."""
+        """Return the metrics of some samples' counts, with or without the reference predictors."""
         parts = parts_of(counts)
-        recordings, samples = recordings_of(parts), [sample for part in parts for sample in part]
+        recordings = recordings_of(parts)
+        samples = [sample for part in parts for sample in part]
         groups = dict(by_group(recordings))
-        made = {
-            predictor: {group: _figures(those, predictor, self) for group, those in groups.items()}
-            for predictor in (PREDICTORS if references else PREDICTORS[:1])
-        }
+        figures: dict[str, dict[str, AnticipationFigures]] = {}
+        for predictor in PREDICTORS:
+            if references or predictor == GIVEN:
+                figures[predictor] = {
+                    group: _figures(members, predictor, self) for group, members in groups.items()
+                }
         return AnticipationResult(
             samples=len(samples),
             operating_by="recall" if self.threshold is None else "given",
-            groups=made.pop(GIVEN),
-            references=made,
-            beyond=sum(each["beyond"] for each in samples),
+            groups=figures.pop(GIVEN),
+            references=figures,
+            beyond=sum(sample["beyond"] for sample in samples),
             notes=tuple(_notes(samples, recordings, self)),
         )
 
     def resampled(
         self, parts: Sequence[Sequence[Counts]], times: IntArray
     ) -> Iterator[AnticipationResult]:
-        """The result of each draw, without references; see `Evaluator.resampled`."""
-        tables = {
-            group: _Table(those, GIVEN, self) for group, those in by_group(recordings_of(parts))
-        }
-        samples, beyond = (
-            np.array([sum(count(each) for each in part) for part in parts], dtype=np.int64)
-            for count in (lambda _: 1, lambda each: each["beyond"])
+        """Yield the result of each draw, without references; see `Evaluator.resampled`."""
+        tables = {}
+        for group, recordings in by_group(recordings_of(parts)):
+            tables[group] = _Table(recordings, GIVEN, self)
+        samples = np.array([len(part) for part in parts], dtype=np.int64)
+        beyond = np.array(
+            [sum(sample["beyond"] for sample in part) for part in parts], dtype=np.int64
         )
         for draw in times:
             yield AnticipationResult(
@@ -173,37 +189,37 @@ class CleanWarnings:
 
 
 class _Table:
-    """One predictor's scores of one group of recordings, to be asked with any weights."""
+    """Scores of one predictor in one group of recordings, for figures with any weights."""
 
     def __init__(
         self, recordings: Sequence[Recording], predictor: str, rules: CleanWarnings, draw: int = 0
     ) -> None:
-        self._predictor, self._rules = predictor, rules
+        self._predictor = predictor
+        self._rules = rules
         series = series_of(recordings, predictor, rules.scores_of, draw)
-        everyone = (
-            None
-            if rules.scores_of == "recording"
-            else series_of(recordings, predictor, "recording", draw).highest()
-        )
-        self._scores = CleanScores(series, everyone)
+        any_alarm = None
+        if rules.scores_of != "recording":
+            any_alarm = series_of(recordings, predictor, "recording", draw).highest()
+        self._scores = CleanScores(series, any_alarm)
         self._pairs = twin_pairs(recordings)
-        self._part = np.array([each.part for each in recordings], dtype=np.int64)
-        self._kind = np.array([each.kind for each in recordings])
+        self._part = np.array([recording.part for recording in recordings], dtype=np.int64)
+        self._kind = np.array([recording.kind for recording in recordings])
         self._sees_others = recordings[0].group not in (GROUPS[0], GROUPS[-1])
 
     def figures(self, draw: IntArray | None = None) -> AnticipationFigures:
-        """The figures of recordings that count as often as their part is drawn; None for once each."""
+        """Return the figures of recordings that count as often as their part is drawn.
+
+        Args:
+            draw: How often each part is drawn; None for once each.
+        """
         weight = np.ones(len(self._part)) if draw is None else draw[self._part].astype(np.float64)
         scores = self._scores
         r80 = scores.threshold_of_recall(weight)
-        operating = self._rules.threshold
-        if self._predictor != GIVEN:
-            operating = reference_threshold(self._predictor)
-        if operating is None:
-            threshold = scores.threshold_of_highest_recall(weight) if math.isnan(r80) else r80
-        else:
-            threshold = operating
-        after = partial(scores.tta0_after, threshold, weight)
+        threshold = self._operating_threshold(r80, weight)
+        tta0_after = {}
+        if self._sees_others:
+            for latency in LATENCIES:
+                tta0_after[latency] = scores.tta0_after(threshold, weight, latency)
         return AnticipationFigures(
             auc_ahead=scores.area_at_moments(weight),
             twin_wins=self._twin_wins(weight),
@@ -215,15 +231,25 @@ class _Table:
             at_p80=scores.at(scores.threshold_of_precision(weight), weight),
             best_f1=scores.threshold_of_best_f1(weight),
             quiet=scores.threshold_of_alarm_time(weight),
-            tta0_after={latency: after(latency) for latency in LATENCIES}
-            if self._sees_others
-            else {},
+            tta0_after=tta0_after,
             recordings={kind: int(weight[self._kind == kind].sum()) for kind in KINDS},
             twins=int(weight[self._pairs[:, 0]].sum()),
         )
 
+    def _operating_threshold(self, r80: float, weight: FloatArray) -> float:
+        """Return the operating point; without a fixed one it is `r80`, or the highest recall's."""
+        threshold = self._rules.threshold
+        if self._predictor != GIVEN:
+            threshold = reference_threshold(self._predictor)
+        if threshold is not None:
+            return threshold
+        return self._scores.threshold_of_highest_recall(weight) if math.isnan(r80) else r80
+
     def _twin_wins(self, weight: FloatArray) -> float:
-        accident, twin = (self._scores.highest[self._pairs[:, side]] for side in (0, 1))
+        """Return the share of accidents with a higher score than their twin, ties half."""
+        highest = self._scores.highest
+        accident = highest[self._pairs[:, 0]]
+        twin = highest[self._pairs[:, 1]]
         pairs = weight[self._pairs[:, 0]]
         won = np.where(accident == twin, 0.5, accident > twin)
         return ratio(float((won * pairs).sum()), float(pairs.sum()))
@@ -232,50 +258,61 @@ class _Table:
 def _figures(
     recordings: Sequence[Recording], predictor: str, rules: CleanWarnings
 ) -> AnticipationFigures:
-    """One predictor's figures; of a random one their means over some draws, so that no luck ranks it."""
-    drawn = [
-        _Table(recordings, predictor, rules, draw).figures() for draw in range(draws_of(predictor))
-    ]
+    """Return one predictor's figures, for a random one their means over some draws."""
+    drawn = []
+    for draw in range(draws_of(predictor)):
+        drawn.append(_Table(recordings, predictor, rules, draw).figures())
     return drawn[0] if len(drawn) == 1 else mean_of(drawn)
 
 
 def draws_of(predictor: str) -> int:
-    """How many draws a predictor's figures are means of: several of a random one, so that no luck ranks it."""
+    """Return the number of draws that a predictor's figures are means of.
+
+    Figures of a random predictor are means of several draws, so that no luck ranks it.
+    """
     return RANDOM_DRAWS if predictor.startswith("random") else 1
 
 
 def mean_of(parts: Sequence[Any]) -> Any:
-    """Of floats, and of those in mappings and dataclasses of one form, NaN left out. All else is as in the first."""
-    first = parts[0]
-    if isinstance(first, float):
-        known = [each for each in parts if not math.isnan(each)]
-        return math.fsum(known) / len(known) if known else math.nan
-    if isinstance(first, Mapping):
-        return {name: mean_of([each[name] for each in parts]) for name in first}
-    if is_dataclass(first) and not isinstance(first, type):
-        return replace(
-            first,
-            **{
-                each.name: mean_of([getattr(part, each.name) for part in parts])
-                for each in fields(first)
-            },
-        )
-    return first
+    """Return the means of floats, also of the floats in mappings and dataclasses of one form.
+
+    NaN is left out. Anything but floats is taken from the first of the parts.
+    """
+    head = parts[0]
+    if isinstance(head, float):
+        known_values = [value for value in parts if not math.isnan(value)]
+        return math.fsum(known_values) / len(known_values) if known_values else math.nan
+    if isinstance(head, Mapping):
+        return {name: mean_of([part[name] for part in parts]) for name in head}
+    if is_dataclass(head) and not isinstance(head, type):
+        means = {}
+        for field in fields(head):
+            means[field.name] = mean_of([getattr(part, field.name) for part in parts])
+        return replace(head, **means)
+    return head
 
 
 def _notes(
     counts: Collection[Counts], recordings: Sequence[Recording], rules: CleanWarnings
 ) -> Iterator[str]:
-    kinds = {each.kind for each in recordings}
+    """Yield sentences on what was not evaluated, and on the operating point."""
+    kinds = {recording.kind for recording in recordings}
     if recordings and "accident" not in kinds:
         yield "no recording of an accident was evaluated; give accident scenarios too for warnings"
     if recordings and kinds == {"accident"}:
-        yield "no recording without an accident was evaluated; give normal scenarios too for false alarms"
+        yield (
+            "no recording without an accident was evaluated; give normal scenarios too for false "
+            "alarms"
+        )
     if recordings and rules.threshold is None:
         yield (
-            "the operating point is that of a recall of 0.8, or the highest, on these very recordings; choose it on "
-            "another split with --threshold-from, or give it with --switch threshold=…"
+            "the operating point is that of a recall of 0.8, or the highest, on these very "
+            "recordings; choose it on another split with --threshold-from, or give it with "
+            "--switch threshold=…"
         )
     yield from left_out_notes(counts)
-    if recordings and not any(each["references"] for each in counts):
-        yield "the rows 'TTC < 3 s' need what constant velocities lead to: accident_context(…, references=True)"
+    if recordings and not any(sample["references"] for sample in counts):
+        yield (
+            "the rows 'TTC < 3 s' need what constant velocities lead to: accident_context(…, "
+            "references=True)"
+        )

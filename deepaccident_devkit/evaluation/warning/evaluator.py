@@ -22,16 +22,17 @@ _Result = AnticipationResult | FieldResult
 WARNING_PROTOCOLS: Final[Mapping[str, _Protocol]] = MappingProxyType(
     {"clean": CleanWarnings(), "field": FieldWarnings()}
 )
-"""`clean` ranks predictors, recording by recording; `field` is what published codes print. Both compare with labels as
-the accident protocol `boxes` does; the paper has no such metrics."""
+"""`clean` ranks predictors, recording by recording; `field` is what published codes print. Both
+compare with labels as the accident protocol `boxes` does; the paper has no such metrics."""
 
 
 class WarningEvaluator(Evaluator[Any]):
-    """Numbers for users of an alarm: whether it knows accidents ahead, seconds of warning, time in false alarm.
+    """Whether an alarm foresees accidents, how early it comes, and how long it is false.
 
-    Give it whole recordings, normal scenarios among them: the metrics ignore the times of samples that are not given.
+    Give it whole recordings, normal scenarios among them: the metrics ignore moments without a
+    sample.
 
-    `compute` gives an `AnticipationResult` or a `FieldResult`, by the protocol.
+    `compute` returns an `AnticipationResult` or a `FieldResult`, by the protocol.
 
     >>> evaluator = WarningEvaluator()
     >>> evaluator.compute().samples
@@ -54,7 +55,7 @@ class WarningEvaluator(Evaluator[Any]):
     def truth(
         self, dataset: Dataset, token: str, form: Any, horizon: float, /
     ) -> tuple[MotionLabels | None, AccidentContext]:
-        """Return the labels that maps are compared with, None for alarms, and the accident to come."""
+        """Return the labels that maps are compared with, None for alarms, and the context."""
         return compared_facts(dataset, token, self.protocol, form, horizon, references=True)
 
     def update(
@@ -67,53 +68,59 @@ class WarningEvaluator(Evaluator[Any]):
         """Count one sample.
 
         Args:
-            token: of the sample; it says of which scenario and agent, and when.
-            prediction: what a model says: motion in maps, which is at most one alarm, or a list of alarms.
-            label: says how far apart in time the maps of a prediction are, and how they lie in their cells; None for
-                the released way. Alarms need none.
-            context: the truth, from `accident_context(dataset, sample, horizon, references=True)`; the horizon says
-                up to when actors can be named, and after which alarms do not count.
+            token: Token of the sample, which names scenario, agent and frame.
+            prediction: Prediction of a model: motion in maps, which is at most one alarm, or a list
+                of alarms.
+            label: Labels that define how far apart in time the maps of a prediction are, and where
+                instances lie within their cells; None for the released convention. Alarms need
+                none.
+            context: Truth from `accident_context(dataset, sample, horizon, references=True)`; up to
+                its horizon actors can be named, and later alarms do not count.
 
         Raises:
-            EvaluationError: the token is no sample's, the context or something in it is missing, the prediction is
-                neither, or the sample came before with another outcome.
+            EvaluationError: the token is no sample's, the context or something in it is missing,
+                the prediction is neither motion nor alarms, or the sample came before with other
+                counts.
         """
         checked_facts(label, context)
         self.add(token, sample_counts(token, prediction, label, context or AccidentContext()))
 
     def result_of(self, counts: Collection[Counts]) -> _Result:
-        """The metrics of some samples' counts, in any order; of what `pooled` gives, too."""
+        """Return the metrics of some samples' counts, in any order, also of `pooled` counts."""
         return self.protocol.result(counts)
 
     def compute(self, tokens: Iterable[str] | None = None) -> _Result:
-        """The metrics of all samples, beside those of the reference predictors; or of some, without."""
+        """Return the metrics of all samples with reference predictors, or of some without."""
         if tokens is None:
             return self.protocol.result(list(self._counts.values()), references=True)
         result: _Result = super().compute(tokens)
         return result
 
     def sample_row(self, token: str) -> dict[str, Any]:
-        """Return the plain values of the sample's counts, and how many entries its lists have."""
+        """Return the plain values of the sample's counts, and the lengths of its lists."""
         row: dict[str, Any] = {}
         for name, value in self._counts[token].items():
-            is_list = isinstance(value, list | tuple | Mapping)
-            row |= {f"{name}_count": len(value)} if is_list else {name: value}
+            if isinstance(value, list | tuple | Mapping):
+                row[f"{name}_count"] = len(value)
+            else:
+                row[name] = value
         return row
 
     def pooled(self, counts: Collection[Counts]) -> Sequence[Counts]:
-        """Counts with the same result, of which no recording is put together with others' recordings.
+        """Return counts with the same result; their recordings are never joined with others.
 
         So a scenario that is drawn twice counts twice.
         """
-        return [{PART: [sample for part in parts_of(counts) for sample in part]}]
+        samples = [sample for part in parts_of(counts) for sample in part]
+        return [{PART: samples}]
 
     def resampled(self, parts: Sequence[Sequence[Counts]], times: IntArray) -> Iterator[Any]:
-        """The result of each draw, without references."""
+        """Yield the result of each draw, without references."""
         if isinstance(self.protocol, CleanWarnings):
             return self.protocol.resampled(parts, times)
         return super().resampled(parts, times)
 
     @property
     def has_intervals(self) -> bool:
-        """The protocol `field` has none: its numbers take long, and are only for comparison with published ones."""
+        """Whether the protocol has intervals; `field` has none, since its numbers take long."""
         return not isinstance(self.protocol, FieldWarnings)

@@ -1,14 +1,15 @@
-"""`FieldWarnings`: the protocol `field`, what four published codes of anticipation compute, with all of their quirks.
+"""`FieldWarnings`: protocol `field`, the numbers of four published codes, with all their quirks.
 
-UString (Bao et al. 2020), DSTA (Karim et al. 2022), DRIVE (Bao et al. 2021) and DAD (Chan et al. 2016) print numbers of
-one name that are not comparable with each other; docs/protocols.md says what is odd in each. They are here so that a
-number can be put beside a published one. To rank predictors take the protocol `clean`.
+UString (Bao et al. 2020), DSTA (Karim et al. 2022), DRIVE (Bao et al. 2021) and DAD (Chan et al.
+2016) print numbers of the same names that are not comparable with each other; docs/protocols.md
+lists what is odd in each. They are here so that a number can be put beside a published one. To rank
+predictors use the protocol `clean`.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final, Literal, get_args
 
@@ -18,6 +19,7 @@ from deepaccident_devkit.evaluation.evaluator import Counts
 from deepaccident_devkit.evaluation.warning.recordings import (
     GIVEN,
     PREDICTORS,
+    Recording,
     ScoreSeries,
     by_group,
     left_out_notes,
@@ -34,22 +36,22 @@ FieldCode = Literal["ustring", "dsta", "drive", "dad"]
 FIELD_CODES: Final[tuple[FieldCode, ...]] = get_args(FieldCode)
 _DAD_SECONDS: Final = 5.0
 # DRIVE moves its thresholds 0 and 1 inwards by this.
-_NUDGE: Final = 1e-6
+_DRIVE_THRESHOLD_SHIFT: Final = 1e-6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FieldFigures(ShortRepr):
-    """What one of the four prints; NaN where it raises an error or divides by 0.
+    """Numbers that one of the four codes prints; NaN where it raises an error or divides by 0.
 
     Attributes:
-        average_precision: area under precision over recall; of recordings, of DRIVE of frames.
+        average_precision: Area under precision over recall, of recordings; for DRIVE of frames.
         mean_time: mTTA, seconds: mean over the recalls.
         time_at_r80: TTA@R80, seconds: at the recall nearest to 0.8.
-        precision_at_r80: at the first recall of at least 0.8; None except for DSTA.
-        precision_at_half: at the threshold 0.5, of frames; None except for DRIVE.
-        recall_at_half: likewise.
-        time_at_half: likewise, seconds.
-        note: why numbers are NaN; empty if none is.
+        precision_at_r80: Precision at the lowest recall of at least 0.8; None except for DSTA.
+        precision_at_half: Precision at the threshold 0.5, of frames; None except for DRIVE.
+        recall_at_half: Recall there, of frames; None except for DRIVE.
+        time_at_half: Time there, seconds; None except for DRIVE.
+        note: Reason why numbers are NaN; empty if none is.
     """
 
     average_precision: float
@@ -63,12 +65,15 @@ class FieldFigures(ShortRepr):
 
 
 def field_figures(series: ScoreSeries, code: FieldCode) -> FieldFigures:
-    """The numbers that a published evaluation has for these scores, NaN in place of recalls and precisions above 1.
+    """Return the numbers that a published evaluation has for these scores.
+
+    NaN stands for recalls and precisions that exceed 1.
 
     Args:
-        series: the recordings; missing scores are as their recording's lowest, and no alarm at all is 0. Of recordings
-            without an accident all T columns count, as in these codes.
-        code: whose evaluation. DAD knows no `toa`: it takes the array's length, and so does this where they are equal.
+        series: Scores of the recordings; missing scores count as their recording's lowest, and no
+            alarm as 0. In recordings without an accident all T columns count, as in these codes.
+        code: Name of the code. DAD does not use `toa` but the array's length, which gives the same
+            result where they are equal.
 
     Raises:
         ChoiceError: no such code.
@@ -77,19 +82,23 @@ def field_figures(series: ScoreSeries, code: FieldCode) -> FieldFigures:
     if max(highest_recall, figures.average_precision) > 1 + 1e-9:
         return _nothing(
             code,
-            f"recall {highest_recall:.3g}, AP {figures.average_precision:.3g}: at the threshold 0 recordings without "
+            f"recall {highest_recall:.3g}, AP {figures.average_precision:.3g}: at the threshold 0 "
+            "recordings without "
             "an accident count as true positives",
         )
     return figures
 
 
 def printed_figures(series: ScoreSeries, code: FieldCode) -> FieldFigures:
-    """The same as the published code prints them, recalls and precisions above 1 too; see `field_figures`."""
+    """Return the numbers as the published code prints them, also recalls and precisions over 1.
+
+    Arguments and errors are as in `field_figures`.
+    """
     return _printed(series, choice("code", code, FIELD_CODES))[0]
 
 
 def _printed(series: ScoreSeries, code: FieldCode) -> tuple[FieldFigures, float]:
-    """What a published code prints, and its highest recall."""
+    """Return what a published code prints, and its highest recall."""
     if not series.valid.any():
         return _nothing(code, "there is no score"), math.nan
     try:
@@ -97,14 +106,17 @@ def _printed(series: ScoreSeries, code: FieldCode) -> tuple[FieldFigures, float]
     except IndexError as error:
         return _nothing(code, f"the published code raises an error here: {error}"), math.nan
     if math.isnan(figures.average_precision) or math.isnan(figures.mean_time):
-        note = "the published code divides 0 by 0: no accident, or thresholds at which none is warned of"
+        note = (
+            "the published code divides 0 by 0: no accident, or thresholds at which none is warned "
+            "of"
+        )
         figures = replace(figures, note=note)
     return figures, highest_recall
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Points:
-    """Of K thresholds, as a published code keeps them; unused places are 0."""
+    """Points of K thresholds, as a published code keeps them; unused entries are 0."""
 
     precision: FloatArray
     recall: FloatArray
@@ -112,42 +124,60 @@ class _Points:
 
 
 def _recordings(series: ScoreSeries, code: FieldCode) -> tuple[FieldFigures, float]:
-    """UString and DSTA: recordings are counted, at thresholds 0.001 apart from the lowest score on.
+    """Count recordings as UString and DSTA do, at thresholds 0.001 apart from the lowest score on.
 
-    There is room for one threshold a frame, and more are an error. Unused places are 0: to drop them the lowest recall
-    is left out. Shares of `toa` become seconds by the length of the array.
+    Their arrays hold one threshold per frame, and more are an error. Unused entries are 0: to drop
+    them the lowest recall is left out. Shares of `toa` become seconds by the length of the array.
     """
     valid = series.valid
     lowest = float(np.min(series.scores, initial=np.inf, where=valid))
     thresholds = np.arange(max(lowest, 0.0), 1.0, 0.001)
     points, raised = _counted(series, thresholds, series.scores.shape[1] / series.fps)
-    there = raised & np.isfinite(points.time) & np.isfinite(points.recall)
-    room, used = int(valid.sum()), np.cumsum(there, dtype=np.int64) - there
-    if (raised & (used >= room)).any():
+    is_known = raised & np.isfinite(points.time) & np.isfinite(points.recall)
+    capacity = int(valid.sum())
+    used = np.cumsum(is_known, dtype=np.int64) - is_known
+    if (raised & (used >= capacity)).any():
         raise IndexError("more thresholds than frames")
-    kept = np.flatnonzero(there)
-    padded = [np.zeros(max(room, len(kept))) for _ in range(3)]
-    for column, values in zip(padded, (points.precision, points.recall, points.time), strict=True):
-        column[: len(kept)] = values[kept]
-    levels = _levels(_Points(*padded), drop_lowest=True)
-    high = np.flatnonzero(levels.recall >= 0.8)
-    if code == "dsta" and not len(high):
-        raise IndexError("no recall of 0.8")
-    return _of_levels(
-        levels, precision_at_r80=float(levels.precision[high[0]]) if code == "dsta" else None
+    known = np.flatnonzero(is_known)
+    length = max(capacity, len(known))
+    levels = _levels(
+        _Points(
+            _zero_padded(points.precision[known], length),
+            _zero_padded(points.recall[known], length),
+            _zero_padded(points.time[known], length),
+        ),
+        drop_lowest=True,
     )
+    high = np.flatnonzero(levels.recall >= 0.8)
+    if code != "dsta":
+        return _of_levels(levels, precision_at_r80=None)
+    if not len(high):
+        raise IndexError("no recall of 0.8")
+    return _of_levels(levels, precision_at_r80=float(levels.precision[high[0]]))
+
+
+def _zero_padded(values: FloatArray, length: int) -> FloatArray:
+    """Return values with zeros after them, up to a length."""
+    padded = np.zeros(length)
+    padded[: len(values)] = values
+    return padded
 
 
 def _dad(series: ScoreSeries, _code: FieldCode) -> tuple[FieldFigures, float]:
-    """DAD: recordings are counted, at every score of every frame but 0; shares of `toa` become seconds as of 5 s."""
+    """Count recordings as DAD does, at every score of every frame except 0.
+
+    Shares of `toa` become seconds as if every recording lasted 5 s.
+    """
     thresholds = np.sort(series.scores, axis=None)
     thresholds = thresholds[thresholds != 0]
     points, _ = _counted(series, thresholds, _DAD_SECONDS)
-    unused = np.zeros(series.scores.size - len(thresholds))
-    columns = (
-        np.concatenate([each, unused]) for each in (points.precision, points.recall, points.time)
+    length = series.scores.size
+    padded = _Points(
+        _zero_padded(points.precision, length),
+        _zero_padded(points.recall, length),
+        _zero_padded(points.time, length),
     )
-    levels = _levels(_Points(*columns), drop_lowest=False)
+    levels = _levels(padded, drop_lowest=False)
     known = np.isfinite(levels.precision)
     if not known.any():
         return _nothing("dad", "no alarm at any threshold"), math.nan
@@ -155,29 +185,37 @@ def _dad(series: ScoreSeries, _code: FieldCode) -> tuple[FieldFigures, float]:
 
 
 def _drive(series: ScoreSeries, _code: FieldCode) -> tuple[FieldFigures, float]:
-    """DRIVE: frames are counted, at eleven thresholds, and the lowest recall is left out; times are of recordings."""
+    """Count frames as DRIVE does, at eleven thresholds, without the lowest recall.
+
+    Times are of recordings.
+    """
     thresholds = np.arange(0, 1.1, 0.1)
-    thresholds[[0, -1]] += (_NUDGE, -_NUDGE)
+    thresholds[[0, -1]] += (_DRIVE_THRESHOLD_SHIFT, -_DRIVE_THRESHOLD_SHIFT)
     counted = _frames(series, np.append(thresholds, 0.5))
-    precision, recall, time = (
-        each[-1].item() for each in (counted.precision, counted.recall, counted.time)
-    )
     points = _Points(counted.precision[:-1], counted.recall[:-1], counted.time[:-1])
     levels = _levels(points, drop_lowest=len(np.unique(points.recall)) > 1)
-    return _of_levels(levels, precision_at_half=precision, recall_at_half=recall, time_at_half=time)
+    return _of_levels(
+        levels,
+        precision_at_half=counted.precision[-1].item(),
+        recall_at_half=counted.recall[-1].item(),
+        time_at_half=counted.time[-1].item(),
+    )
 
 
 _FIGURES: Final = {"ustring": _recordings, "dsta": _recordings, "drive": _drive, "dad": _dad}
 
 
 def _filled(series: ScoreSeries) -> ScoreSeries:
-    """The same with numbers everywhere, since these codes know no missing score; negatives count to the array's end."""
-    given = np.where(np.isneginf(series.scores), 0.0, series.scores)
-    lowest = np.min(given, axis=1, initial=np.inf, where=~np.isnan(given))
+    """Return the series with numbers everywhere, since these codes know no missing score.
+
+    Recordings without an accident count to the array's end.
+    """
+    scores = np.where(np.isneginf(series.scores), 0.0, series.scores)
+    lowest = np.min(scores, axis=1, initial=np.inf, where=~np.isnan(scores))
     lowest = np.where(np.isfinite(lowest), lowest, 0.0)
     columns = series.scores.shape[1]
     return ScoreSeries(
-        scores=np.where(np.isnan(given), lowest[:, None], given),
+        scores=np.where(np.isnan(scores), lowest[:, None], scores),
         positive=series.positive,
         toa=np.where(series.positive, series.toa, columns + 1.0),
         fps=series.fps,
@@ -187,19 +225,23 @@ def _filled(series: ScoreSeries) -> ScoreSeries:
 def _counted(
     series: ScoreSeries, thresholds: FloatArray, seconds: float
 ) -> tuple[_Points, BoolArray]:
-    """Recordings counted at each threshold, NaN for 0 / 0; and (K,) whether any recording raises an alarm.
+    """Count recordings at each of K thresholds.
 
-    Times are shares of `toa` before the impact times `seconds`, missed accidents left out. At the threshold 0 a
-    recording without an accident is a true positive: its scores are multiplied by its label, and 0 ≥ 0.
+    Times are shares of `toa` before the impact times `seconds`, missed accidents left out. At the
+    threshold 0 a recording without an accident is a true positive: its scores are multiplied by its
+    label, and 0 ≥ 0.
+
+    Returns:
+        Points, NaN for 0 / 0; and whether any recording raises an alarm, shape (K,).
     """
-    share = series.leads(thresholds) * series.fps / series.toa[:, None]
-    alarmed = np.isfinite(share)
-    by_zero = alarmed & ~series.positive[:, None] & (thresholds <= 0)
-    share[by_zero] = 1.0  # their first frame is one already
-    warned = (alarmed & series.positive[:, None]) | by_zero
+    lead_share = series.leads(thresholds) * series.fps / series.toa[:, None]
+    alarmed = np.isfinite(lead_share)
+    at_zero = alarmed & ~series.positive[:, None] & (thresholds <= 0)
+    lead_share[at_zero] = 1.0  # their first frame is an alarm already
+    warned = (alarmed & series.positive[:, None]) | at_zero
     count = warned.sum(axis=0)
     accidents = int(series.positive.sum())
-    time = np.where(warned, share * seconds, 0.0).sum(axis=0)
+    time = np.where(warned, lead_share * seconds, 0.0).sum(axis=0)
     with np.errstate(invalid="ignore", divide="ignore"):
         points = _Points(count / alarmed.sum(axis=0), count / np.float64(accidents), time / count)
     points.time[count == 0] = np.nan
@@ -209,7 +251,7 @@ def _counted(
 
 
 def _frames(series: ScoreSeries, thresholds: FloatArray) -> _Points:
-    """Frames counted at each threshold, 0 for 0 / 0; times are of the accidents that are warned of."""
+    """Count frames at each threshold, 0 for 0 / 0; times are of the accidents warned of."""
     valid = series.valid
     right = np.sort(series.scores[valid & series.positive[:, None]])
     wrong = np.sort(series.scores[valid & ~series.positive[:, None]])
@@ -225,64 +267,80 @@ def _frames(series: ScoreSeries, thresholds: FloatArray) -> _Points:
 
 
 def _levels(points: _Points, *, drop_lowest: bool) -> _Points:
-    """One point a recall: the best precision and time of its thresholds, in the codes' order (a stable sort).
+    """Return one point per recall: the best precision and time of its thresholds.
 
-    Of the thresholds of the highest recall the lowest one counts.
+    The order is that of the codes (a stable sort). For the highest recall only its lowest threshold
+    counts.
 
     Raises:
         IndexError: no recall is left.
     """
     order = np.argsort(points.recall, kind="stable")
-    precision, recall, time = (
-        each[order] for each in (points.precision, points.recall, points.time)
-    )
+    precision = points.precision[order]
+    recall = points.recall[order]
+    time = points.time[order]
     starts = np.unique(recall, return_index=True)[1]
-    starts = starts[1:] if drop_lowest else starts
+    if drop_lowest:
+        starts = starts[1:]
     if not len(starts):
         raise IndexError("no threshold has another recall than the others")
-    best = [np.maximum.reduceat(each, starts) for each in (precision, time)]
-    for levels, each in zip(best, (precision, time), strict=True):
-        levels[-1] = each[starts[-1]]
-    return _Points(best[0], recall[starts], best[1])
+    best_precision = np.maximum.reduceat(precision, starts)
+    best_precision[-1] = precision[starts[-1]]
+    best_time = np.maximum.reduceat(time, starts)
+    best_time[-1] = time[starts[-1]]
+    return _Points(best_precision, recall[starts], best_time)
 
 
 def _area(levels: _Points) -> float:
-    first = levels.precision[0] * levels.recall[0] if levels.recall[0] != 0 else 0.0
-    between = (levels.precision[1:] + levels.precision[:-1]) * np.diff(levels.recall) / 2
-    return float(first + between.sum())
+    """Return the area under precision over recall, by trapezoids."""
+    precision = levels.precision
+    recall = levels.recall
+    start = precision[0] * recall[0] if recall[0] != 0 else 0.0
+    between = (precision[1:] + precision[:-1]) * np.diff(recall) / 2
+    return float(start + between.sum())
 
 
-def _of_levels(levels: _Points, **more: float | None) -> tuple[FieldFigures, float]:
-    """The figures of all codes, with those of one alone; and the highest recall."""
+def _of_levels(levels: _Points, **special: float | None) -> tuple[FieldFigures, float]:
+    """Return the figures of all codes with a code's special ones, and the highest recall."""
     figures = FieldFigures(
         average_precision=_area(levels),
         mean_time=float(np.mean(levels.time)),
         time_at_r80=float(levels.time[np.argmin(np.abs(levels.recall - 0.8))]),
-        **more,  # type: ignore[arg-type]  # none of them is `note`
+        **special,  # type: ignore[arg-type]  # none of them is `note`
     )
     return figures, float(levels.recall[-1])
 
 
-def _nothing(code: FieldCode, why: str) -> FieldFigures:
-    known: Mapping[str, float] = {
-        "dsta": {"precision_at_r80": math.nan},
-        "drive": dict.fromkeys(("precision_at_half", "recall_at_half", "time_at_half"), math.nan),
-    }.get(code, {})
+def _nothing(code: FieldCode, reason: str) -> FieldFigures:
+    """Return figures of NaN, with the reason as their note."""
+    special: dict[str, float] = {}
+    if code == "dsta":
+        special = {"precision_at_r80": math.nan}
+    elif code == "drive":
+        names = ("precision_at_half", "recall_at_half", "time_at_half")
+        special = dict.fromkeys(names, math.nan)
     return FieldFigures(
-        average_precision=math.nan, mean_time=math.nan, time_at_r80=math.nan, note=why, **known
+        average_precision=math.nan,
+        mean_time=math.nan,
+        time_at_r80=math.nan,
+        note=reason,
+        **special,
     )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FieldResult(WarningResult):
-    """The result of the protocol `field`: not comparable between codes, and predictors that know nothing can win.
+    """The result of the protocol `field`.
+
+    Its numbers are not comparable between codes, and predictors that know nothing can win.
 
     Attributes:
-        samples: how many.
-        figures: code and involvement of the agent, such as `ustring ego_involved` → what that code prints.
-        references: predictor (of `PREDICTORS` but the given one) → the same.
-        beyond: alarms for later than the horizon, which do not count.
-        notes: sentences that a reader of the numbers should know: why numbers are NaN.
+        samples: Number of samples.
+        figures: Code and involvement of the agent, such as `ustring ego_involved` → figures that
+            the code prints.
+        references: Predictor (of `PREDICTORS` except the given one) → the same figures.
+        beyond: Alarms for later than the horizon, which do not count.
+        notes: Sentences that a reader of the numbers should know, such as why numbers are NaN.
     """
 
     samples: int
@@ -296,36 +354,41 @@ class FieldResult(WarningResult):
 class FieldWarnings:
     """Published anticipation metrics, for numbers beside published ones.
 
-    A recording's score is as of `CleanWarnings`, of all its alarms, since dash-cam sets know recordings alone.
+    A recording's score is that of `CleanWarnings`, from all its alarms, since dash-cam data sets
+    only know recordings.
     """
 
     def result(self, counts: Collection[Counts], *, references: bool = False) -> FieldResult:
-        """The metrics of some samples' counts, with those of the reference predictors or without."""
+        """Return the metrics of some samples' counts, with or without the reference predictors."""
         parts = parts_of(counts)
-        groups, samples = (
-            dict(by_group(recordings_of(parts))),
-            [sample for part in parts for sample in part],
+        groups = dict(by_group(recordings_of(parts)))
+        samples = [sample for part in parts for sample in part]
+        figures = {}
+        for predictor in PREDICTORS:
+            if references or predictor == GIVEN:
+                figures[predictor] = _figures_by_code(groups, predictor)
+        evaluated = figures.pop(GIVEN)
+        notes = left_out_notes(samples)
+        notes += [f"{name}: {item.note}" for name, item in evaluated.items() if item.note]
+        notes.append(
+            "times and precisions of different codes are not comparable; the protocol clean ranks"
         )
-        made = {
-            predictor: {
-                f"{code} {group}": field_figures(series_of(those, predictor, "recording"), code)
-                for group, those in groups.items()
-                for code in FIELD_CODES
-            }
-            for predictor in (PREDICTORS if references else PREDICTORS[:1])
-        }
-        given = made.pop(GIVEN)
-        notes = [
-            *left_out_notes(samples),
-            *(f"{name}: {each.note}" for name, each in given.items() if each.note),
-        ]
         return FieldResult(
             samples=len(samples),
-            figures=given,
-            references=made,
-            beyond=sum(each["beyond"] for each in samples),
-            notes=(
-                *notes,
-                "times and precisions of different codes are not comparable; the protocol clean ranks",
-            ),
+            figures=evaluated,
+            references=figures,
+            beyond=sum(sample["beyond"] for sample in samples),
+            notes=tuple(notes),
         )
+
+
+def _figures_by_code(
+    groups: Mapping[str, Sequence[Recording]], predictor: str
+) -> dict[str, FieldFigures]:
+    """Return a predictor's figures by code and group of recordings."""
+    figures = {}
+    for group, recordings in groups.items():
+        for code in FIELD_CODES:
+            series = series_of(recordings, predictor, "recording")
+            figures[f"{code} {group}"] = field_figures(series, code)
+    return figures

@@ -8,7 +8,7 @@ from deepaccident_devkit.evaluation.task import Row, TaskResult
 
 
 class WarningResult(TaskResult):
-    """Base of the results of warnings."""
+    """Base of the results of warnings: the rows of both protocols."""
 
     __slots__ = ()
 

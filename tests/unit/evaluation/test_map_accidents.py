@@ -8,8 +8,8 @@ import pytest
 from deepaccident_devkit.evaluation.map_accidents import (
     AccidentReading,
     InstanceTracks,
-    accident_of,
     convex_hulls,
+    map_accident,
     match_tracks,
 )
 from deepaccident_devkit.geometry import BevGrid
@@ -89,7 +89,7 @@ def test_points_and_lines_have_distances_too(cells, grid: BevGrid, danger: float
     maps = np.zeros((1, 200, 200), dtype=np.int32)
     for rows, columns, name in cells:
         maps[0, rows, columns] = name
-    found = accident_of(maps, grid, RELEASED, AccidentReading(danger_distance=danger))
+    found = map_accident(maps, grid, RELEASED, AccidentReading(danger_distance=danger))
     contact = found.contact and (found.contact.frame, found.contact.ids, found.contact.distance)
     assert contact == (expected and (*expected[:2], pytest.approx(expected[2])))
     assert found.positions.shape == (2, 2)
@@ -105,13 +105,13 @@ def test_positions_are_means_of_cells_where_the_labels_have_them(
 ) -> None:
     maps = np.zeros((2, 200, 200), dtype=np.int32)
     maps[1, 100, [100, 102]], maps[1, 101, 103] = 3, 4
-    found = accident_of(maps, BevGrid(), rules, AccidentReading())
+    found = map_accident(maps, BevGrid(), rules, AccidentReading())
     assert found.positions.tolist() == [
         [(x + place[0]) / 2, (y + place[1]) / 2] for x, y in ((1, 0), (3, 1))
     ]
     explicit = found.explicit(0.5)
     assert (explicit.time, explicit.score, explicit.ids) == (0.5, 1.0, None)
-    assert accident_of(maps[:1], BevGrid(), rules, AccidentReading()).explicit(0.5) is None
+    assert map_accident(maps[:1], BevGrid(), rules, AccidentReading()).explicit(0.5) is None
 
 
 @pytest.mark.parametrize(

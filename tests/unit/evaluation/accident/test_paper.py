@@ -13,7 +13,7 @@ from refusals import assert_refused
 
 from deepaccident_devkit.errors import ChoiceError, ConfigError, EvaluationError
 from deepaccident_devkit.evaluation.accident.paper import PaperAccidents
-from deepaccident_devkit.evaluation.map_accidents import AccidentReading, accident_of
+from deepaccident_devkit.evaluation.map_accidents import AccidentReading, map_accident
 from deepaccident_devkit.evaluation.predictions import Accident, MotionOutput
 from deepaccident_devkit.evaluation.truth import AccidentContext
 from deepaccident_devkit.geometry import BevGrid
@@ -53,7 +53,7 @@ def alarm(x=0.0, score=1.0, time=1.5, ids=None, aside=0.0) -> Accident:
 
 
 def read(label, reading=PAPER.reading):
-    return accident_of(label.instance, label.config.grid, label.config.rules, reading)
+    return map_accident(label.instance, label.config.grid, label.config.rules, reading)
 
 
 def result(prediction, label, protocol=PAPER, context=UNKNOWN):

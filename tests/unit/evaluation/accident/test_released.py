@@ -15,7 +15,7 @@ from deepaccident_devkit.evaluation.accident.released import (
     DrawnPaths,
     ReleasedAccidents,
     accident_counts,
-    collision,
+    drawn_collision,
     padded_paths,
     paths_of_heads,
     paths_of_instances,
@@ -154,9 +154,12 @@ def test_of_several_overlapping_pairs_the_first_ids_count() -> None:
     drawn = touching()
     drawn[:, 14:18, 10:26] = 3
     paths = {name: np.zeros((FRAMES, 2)) for name in (1, 2, 3)}
-    assert collision(DrawnPaths(paths=paths, drawn=drawn), 4, 5.0) == (1, 2)
-    assert collision(DrawnPaths(paths={2: paths[2], 3: paths[3]}, drawn=drawn), 4, 5.0) == (2, 3)
-    assert collision(DrawnPaths(paths={}, drawn=drawn), 4, 5.0) is None
+    assert drawn_collision(DrawnPaths(paths=paths, drawn=drawn), 4, 5.0) == (1, 2)
+    assert drawn_collision(DrawnPaths(paths={2: paths[2], 3: paths[3]}, drawn=drawn), 4, 5.0) == (
+        2,
+        3,
+    )
+    assert drawn_collision(DrawnPaths(paths={}, drawn=drawn), 4, 5.0) is None
 
 
 def test_an_instance_of_which_one_cell_is_left_is_drawn_as_long_as_at_first() -> None:

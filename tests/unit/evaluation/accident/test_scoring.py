@@ -19,7 +19,7 @@ from deepaccident_devkit.evaluation.accident import (
     PaperAccidents,
 )
 from deepaccident_devkit.evaluation.accident.scoring import actor_of, exact_parts, foreseen, hit_of
-from deepaccident_devkit.evaluation.map_accidents import accident_of
+from deepaccident_devkit.evaluation.map_accidents import map_accident
 from deepaccident_devkit.geometry import BevGrid
 
 GRID = BevGrid()
@@ -95,7 +95,7 @@ def test_the_first_alarm_that_is_near_enough_hits() -> None:
 def test_of_two_pairs_alike_that_with_the_lower_ids_collides() -> None:
     for row, column in PLACES:
         maps = pair_at(row, column) + pair_at(row + 90, 190 - column, first=3)
-        assert accident_of(maps, GRID, None, AccidentReading()).contact.ids == (1, 2)
+        assert map_accident(maps, GRID, None, AccidentReading()).contact.ids == (1, 2)
 
 
 @pytest.mark.slow

@@ -18,19 +18,19 @@ WRITTEN = {
     "metrics.MISS_DISTANCE": "2.0",
     "metrics.COLLISION_DISTANCE": "1.0",
     "metrics.SAME_TIME": "0.001",
+    "metrics.misses": "miss_distance=2.0",
+    "metrics.miss_rate": "miss_distance=2.0",
     "metrics.actor_errors": "miss_distance=2.0",
-    "metrics.world_errors": "miss_distance=2.0",
     "metrics.collisions": "distance=1.0",
     "of_motion.forecasts_of": "step=0.5, labels='released'",
-    "truth.LONGEST": "5.0",
+    "truth.PATH_SECONDS": "5.0",
     "truth.MOVING_SPEED": "0.5",
     "truth.EVERYBODY": "'all'",
-    "truth.CLASSES": (
-        "('class car', 'class truck', 'class van', 'class cyclist', 'class "
-        "motorcycle', 'class pedestrian')"
+    "truth.CLASS_LABELS": (
+        "('class car', 'class truck', 'class van', 'class cyclist', 'class motorcycle', 'class pedestrian')"
     ),
     "truth.ROLES": "('collider', 'other')",
-    "truth.SEEN": "('seen by ego', 'seen by a partner alone', 'seen by nobody')",
+    "truth.VIEWERS": "('seen by ego', 'seen by a partner alone', 'seen by nobody')",
     "truth.TO_IMPACT": (
         "('0–1 s to impact', '1–2 s to impact', '2–3 s to impact', '3–4 s to "
         "impact', '4–5 s to impact', 'normal')"

@@ -13,7 +13,8 @@ from deepaccident_devkit.evaluation.forecasting import Forecast
 from deepaccident_devkit.evaluation.forecasting.metrics import (
     actor_errors,
     collisions,
-    mode_errors,
+    displacement_errors,
+    misses,
     world_errors,
 )
 
@@ -155,7 +156,8 @@ class TestActors:
         found = actor_errors(np.zeros((0, 2, 3, 2)), np.zeros((0, 3, 2)), none, np.zeros((0, 2)), 6)
         assert {each.shape for each in found.values()} == {(0,)}
         assert [
-            each.shape for each in mode_errors(np.zeros((0, 2, 3, 2)), np.zeros((0, 3, 2)), none)
+            each.shape
+            for each in displacement_errors(np.zeros((0, 2, 3, 2)), np.zeros((0, 3, 2)), none)
         ] == [(0, 2)] * 2
 
 
@@ -165,9 +167,9 @@ class TestWorlds:
         truth = np.concatenate([TRUTH, TRUTH + 10 * aside])
         paths = np.stack([truth + aside, truth + 3 * aside], axis=1)
         paths[1, 0] += 2 * aside
-        ade, fde, missed = world_errors(paths, truth)
+        ade, fde, final_errors = world_errors(paths, truth)
         assert_allclose([ade, fde], [[2, 3], [2, 3]])
-        assert_array_equal(missed, [[False, True], [True, True]])
+        assert_array_equal(misses(final_errors), [[0, 1], [1, 1]])
 
     def test_centres_nearer_than_a_metre_at_one_step_collide(self) -> None:
         paths = np.zeros((3, 2, 4, 2))
