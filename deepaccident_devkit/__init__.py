@@ -1,4 +1,4 @@
-"""DeepAccident devkit: the V2X accident dataset as tables, sensors, transforms, labels and numbers, on any CPU."""
+"""DeepAccident devkit: the V2X accident dataset as tables, sensors, labels and numbers."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -13,7 +13,7 @@ __all__ = ["DeepAccident", "DeepAccidentError", "__version__"]
 
 
 def __getattr__(name: str) -> Any:
-    """Import the facade when it is asked for: the test kit's plugin, which pytest loads at its start, is none of it."""
+    """Import the facade at its first use: the test kit's plugin, which pytest loads, needs none."""
     if name != "DeepAccident":
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from deepaccident_devkit.deepaccident import DeepAccident
@@ -21,11 +21,11 @@ def __getattr__(name: str) -> Any:
     return DeepAccident
 
 
-def _png_of(thing: object) -> bytes:
-    """What `Pictured` shows: rendered by the package that is imported for it."""
+def _png_of(subject: object) -> bytes:
+    """Return the picture that `Pictured` shows, rendered by a package that is imported for it."""
     from deepaccident_devkit.render.notebook import png_of
 
-    return png_of(thing)
+    return png_of(subject)
 
 
 Pictured.png_of = staticmethod(_png_of)

@@ -1,4 +1,4 @@
-"""`DeepAccident`: the facade that binds the functions of the layers below to one release."""
+"""`DeepAccident`: the facade that binds the functions of lower layers to one release."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from deepaccident_devkit.tables import open_index
 from deepaccident_devkit.taxonomy import OnError
 
 
-class _Later:
-    """A function of a package that is slow to import: imported at its first use, and then kept.
+class _LazyMethod:
+    """A function of a package that is slow to import, imported and stored at its first use.
 
-    `DeepAccident` binds functions of all layers, and reading tables should not wait for the import of those that
-    render.
+    `DeepAccident` binds functions of all layers, and reading tables should not wait for the import
+    of rendering.
     """
 
     def __init__(self, load: Callable[[], Any]) -> None:
@@ -38,19 +38,21 @@ class _Later:
         return function.__get__(instance, owner)
 
 
-class _Package:
-    """Stands for such a package at run time, so that each function is named once: its attributes are resolved later.
+class _LazyPackage:
+    """Stands for a slow package at run time; its attributes are resolved at their first use.
 
-    Type checkers see the package itself, and with it every signature.
+    So each function is named only once: type checkers see the package itself, and with it every
+    signature.
     """
 
     def __init__(self, name: str) -> None:
         self._name = f"{__package__}.{name}"
 
-    def __getattr__(self, name: str) -> _Later:
-        if name.startswith("_"):  # what tools look for on any object
+    def __getattr__(self, name: str) -> _LazyMethod:
+        # Tools look for private names on any object.
+        if name.startswith("_"):
             raise AttributeError(name)
-        return _Later(lambda: getattr(import_module(self._name), name))
+        return _LazyMethod(lambda: getattr(import_module(self._name), name))
 
 
 if TYPE_CHECKING:
@@ -61,17 +63,19 @@ if TYPE_CHECKING:
     from deepaccident_devkit.selection import samples as sample_lists
 else:
     descriptions, maps, motion, render, selection, v2x, validation = map(
-        _Package, ("descriptions", "maps", "motion", "render", "selection", "v2x", "validation")
+        _LazyPackage,
+        ("descriptions", "maps", "motion", "render", "selection", "v2x", "validation"),
     )
-    interactions_of_pairs, sample_lists = _Package("interactions"), _Package("selection.samples")
+    interactions_of_pairs = _LazyPackage("interactions")
+    sample_lists = _LazyPackage("selection.samples")
 
 
 class DeepAccident(Dataset):
     """A DeepAccident release: tables, sensor data, boxes and transforms.
 
-    The first call reads all label, calib and meta files and keeps an index of them; later ones open that in
-    milliseconds. Sensor files are only needed when they are asked for. An instance is cheap to pickle, so a torch
-    DataLoader may hold one a worker.
+    The first call reads all label, calib and meta files and stores an index of them; later calls
+    open that in milliseconds. Sensor files are only needed when they are read. An instance is cheap
+    to pickle, so every worker of a torch DataLoader may hold one.
 
     Examples:
         >>> da = DeepAccident(version="v1", dataroot="data/DeepAccident")  # doctest: +SKIP
@@ -90,36 +94,37 @@ class DeepAccident(Dataset):
         *,
         executor: Executor | None = None,
     ) -> None:
-        """Open a release, indexing it first where needed.
+        """Open a release, and index it before if necessary.
 
         Args:
             version: `v1` (train, val and test, or the flat layout) or `v1-mini`.
-            dataroot: the folder that the release was unpacked into; or a zip, a folder of zips, or a URL that fsspec
-                can list, such as `s3://bucket/DeepAccident` (docs/reading.md).
-            index_dir: where to keep the index, of this release alone; by default `<dataroot>/.deepaccident`, or the
-                user's cache folder where that cannot be written.
-            workers: processes to index with; None chooses by the amount of work.
-            on_error: `raise` lists every broken scenario, or every archive that cannot be read, and raises; `skip`
-                leaves them out and says so.
-            verbose: whether to show a progress bar while indexing.
-            executor: any executor of `concurrent.futures` to index on, in place of own processes.
+            dataroot: Folder that the release was unpacked into; or a zip, a folder of zips, or a
+                URL that fsspec can list, such as `s3://bucket/DeepAccident` (docs/reading.md).
+            index_dir: Folder for the index of this release only; by default
+                `<dataroot>/.deepaccident`, or the user's cache folder if that cannot be written.
+            workers: Number of processes for indexing; None chooses by the amount of work.
+            on_error: `raise` lists every broken scenario, or every unreadable archive, and raises;
+                `skip` leaves them out and logs it.
+            verbose: Whether to show a progress bar while indexing.
+            executor: Executor of `concurrent.futures` for indexing, instead of own processes.
 
         Raises:
-            DatarootError: the folder is missing or holds no release; or an archive or a URL cannot be read.
-            VersionError: the version is unknown or not under this folder.
-            BrokenReleaseError: some scenarios are broken; the message lists them all.
-            IndexStoreError: the index cannot be written.
-            MissingExtraError: the dataroot is a URL, and the extra `cloud` is not installed.
+            DatarootError: The folder is missing or holds no release; or an archive or a URL cannot
+                be read.
+            VersionError: The version is unknown or not under this folder.
+            BrokenReleaseError: Scenarios are broken; the message lists them all.
+            IndexStoreError: The index cannot be written.
+            MissingExtraError: The dataroot is a URL, and the extra `cloud` is not installed.
         """
-        how: dict[str, Any] = {"workers": workers, "executor": executor, "progress": verbose}
-        place = (
-            None
-            if index_dir is None
-            else Path(os.path.abspath(path_of(index_dir, "index_dir: expected a path")))  # noqa: PTH100
-        )
-        layout = find_release(open_dataroot(dataroot, place, on_error=on_error, **how), version)
-        for last_attempt in (False, True):
-            index = open_index(layout, index_dir=place, on_error=on_error, **how)
+        engine: dict[str, Any] = {"workers": workers, "executor": executor, "progress": verbose}
+        index_path: Path | None = None
+        if index_dir is not None:
+            path = path_of(index_dir, "index_dir: expected a path")
+            index_path = Path(os.path.abspath(path))  # noqa: PTH100
+        store = open_dataroot(dataroot, index_path, on_error=on_error, **engine)
+        layout = find_release(store, version)
+        for is_last_attempt in (False, True):
+            index = open_index(layout, index_dir=index_path, on_error=on_error, **engine)
             try:
                 super().__init__(
                     dataroot=layout.root,
@@ -131,9 +136,9 @@ class DeepAccident(Dataset):
                 )
                 break
             except IndexStoreError:
-                if last_attempt or index.tables_folder.is_dir():
+                # Another process may just have replaced the tables by newer ones: try once more.
+                if is_last_attempt or index.tables_folder.is_dir():
                     raise
-                # another process has just put newer tables in their place
 
     find = selection.find
     transform = v2x.transform
@@ -199,7 +204,7 @@ class DeepAccident(Dataset):
         _print(sample_lines(self, sample))
 
     def __repr__(self) -> str:
-        """Version, place and size."""
+        """Return version, dataroot and size."""
         return (
             f"{type(self).__name__}(version={self.version!r}, dataroot={str(self.dataroot)!r}): "
             f"{counted(len(self.scenario), 'scenario')}, {counted(len(self.sample), 'sample')}, "
@@ -208,4 +213,4 @@ class DeepAccident(Dataset):
 
 
 def _print(lines: Sequence[str]) -> None:
-    print(escaped("\n".join(lines)))  # noqa: T201 - what the list_* methods are for
+    print(escaped("\n".join(lines)))  # noqa: T201 - the `list_*` methods print

@@ -1,62 +1,66 @@
-"""The devkit's own exceptions: every error that a caller can mend derives from `DeepAccidentError`.
+"""The devkit's own exceptions: every error that a caller can fix derives from `DeepAccidentError`.
 
-There are three kinds: `ArgumentError`, `FileError` and `UnavailableError`. Each error is also the built-in kind that a
-caller would expect (`ValueError`, `KeyError`, …) and is built from one sentence that names the file, the line and the
-remedy. One argument only: an exception with more does not survive the pickling on its way out of a worker process.
+There are three kinds: `ArgumentError`, `FileError` and `UnavailableError`. Each error is also the
+built-in kind that a caller would expect (`ValueError`, `KeyError`, …) and is built from one
+sentence with the file, the line and the remedy. It has one argument only: an exception with more
+does not survive the pickling on its way out of a worker process.
 
-What strangers wrote stands in these sentences too. So a sentence has a most length, and nothing in it moves a
-terminal's cursor, rings or turns the direction of letters.
+Text from foreign files appears in these sentences too. So sentences have a maximum length, and
+nothing in them moves a terminal's cursor, rings or turns the direction of letters.
 """
 
 import re
 from typing import ClassVar, Final
 
-MOST_SAID: Final = 2000  # characters
+MOST_SAID: Final = 2000
+"""Characters of a message."""
 MOST_QUOTED: Final = 100
-"""Characters of a stranger's text in a message."""
+"""Characters of foreign text in a message."""
 MOST_TOLD: Final = 300
-"""Characters of what a library or the gate says of a fault: numbers, a remedy, perhaps a stranger's text."""
-# control characters except new line and tab, marks that turn the direction of letters, and halves of characters
-_UNSEEN: Final = re.compile(
+"""Characters of a fault's description by a library: numbers, a remedy, perhaps foreign text."""
+# Control characters except new line and tab, marks that turn the direction of letters, and lone
+# surrogates.
+_INVISIBLE: Final = re.compile(
     r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ufeff\ud800-\udfff]"
 )
 
 
-def shortened(text: str, most: int = MOST_QUOTED) -> str:
-    """A stranger's text for a message: with a long middle left out."""
-    if len(text) <= most:
+def shortened(text: str, max_length: int = MOST_QUOTED) -> str:
+    """Return foreign text for a message, without the middle if it is long."""
+    if len(text) <= max_length:
         return text
-    half = (most - 3) // 2
+    half = (max_length - 3) // 2
     return f"{text[:half]} … {text[-half:]}"
 
 
 def escaped(text: str) -> str:
-    r"""A stranger's text for a terminal: what cannot be seen there stands as in JSON, such as `\u001b`."""
-    return _UNSEEN.sub(lambda found: f"\\u{ord(found[0]):04x}", text)
+    r"""Return foreign text for a terminal, with invisible characters as in JSON: `\u001b`."""
+    return _INVISIBLE.sub(lambda match: f"\\u{ord(match[0]):04x}", text)
 
 
 class DeepAccidentError(Exception):
     """Base of all errors raised on purpose by the devkit."""
 
-    _is_list: ClassVar[bool] = (
-        False  # if it is, each line may be as long as another error's message
-    )
+    # In a list, each line may be as long as another error's message.
+    _is_list: ClassVar[bool] = False
 
     def __init__(self, *message: object) -> None:
-        """Take the sentence. Its middle is left out if it is too long, and its control characters are shown."""
-        super().__init__(*map(self._said, message))
+        """Store the sentence, shortened in the middle, with visible control characters."""
+        super().__init__(*map(self._sanitize, message))
 
-    def _said(self, message: object) -> str:
+    def _sanitize(self, message: object) -> str:
         parts = str(message).split("\n") if self._is_list else [str(message)]
         return "\n".join(shortened(escaped(part), MOST_SAID) for part in parts)
 
     def __reduce__(self) -> tuple[object, ...]:
-        """Pickle as the sentence: dask's way, without it, cannot make those that are an OSError and a ValueError."""
+        """Pickle as the sentence: dask cannot copy errors that are OSError and ValueError."""
         return type(self), self.args
 
     def __str__(self) -> str:
         """Return the sentence itself (`KeyError` would show its repr)."""
-        return str(self.args[0]) if self.args else ""
+        if self.args:
+            return str(self.args[0])
+        return ""
 
 
 class ArgumentError(DeepAccidentError):
@@ -68,7 +72,7 @@ class FileError(DeepAccidentError):
 
 
 class UnavailableError(DeepAccidentError):
-    """Something that the call needs is not there, or does not run, here."""
+    """Something that the call needs is missing, or does not run, here."""
 
 
 class ReleaseError(FileError, ValueError):
@@ -76,17 +80,17 @@ class ReleaseError(FileError, ValueError):
 
 
 class DatarootError(ReleaseError, FileNotFoundError):
-    """The folder given does not exist or holds no release, or its archives cannot be read; the message lists them."""
+    """The dataroot does not exist, holds no release, or has unreadable archives; lists them."""
 
     _is_list = True
 
 
 class VersionError(ReleaseError):
-    """The version asked for is unknown or is not under this folder."""
+    """The requested version is unknown or is not under this folder."""
 
 
 class MissingFileError(ReleaseError, FileNotFoundError):
-    """A file of the release is not there: an archive that was not unpacked, or a partial mirror."""
+    """A file of the release is missing: an archive was not unpacked, or the mirror is partial."""
 
 
 class LabelError(ReleaseError):
@@ -110,7 +114,7 @@ class SplitFileError(ReleaseError):
 
 
 class SourceError(ReleaseError):
-    """A source's axes, ground or cameras are not those that the devkit means."""
+    """A source's axes, ground or cameras differ from the devkit's conventions."""
 
 
 class BrokenReleaseError(ReleaseError):
@@ -120,7 +124,7 @@ class BrokenReleaseError(ReleaseError):
 
 
 class IndexStoreError(FileError, OSError):
-    """The index cannot be written or read at its place."""
+    """The index cannot be written to its folder, or read from it."""
 
 
 class LabelFilesError(FileError, OSError):
@@ -132,7 +136,7 @@ class ExportError(FileError, OSError):
 
 
 class OutputFolderError(FileError, OSError):
-    """What is written or removed would not stay in its folder, or would replace a device, a pipe or a folder."""
+    """An output would leave its folder, or would replace a device, a pipe or a folder."""
 
 
 class ResultsError(FileError, ValueError):
@@ -140,7 +144,7 @@ class ResultsError(FileError, ValueError):
 
 
 class LookupFailedError(ArgumentError, KeyError):
-    """A table, token, field or channel that does not exist was asked for."""
+    """A table, token, field or channel does not exist."""
 
 
 class TokenError(LookupFailedError):
@@ -176,7 +180,7 @@ class ConfigError(ArgumentError, ValueError):
 
 
 class EvaluationError(ArgumentError, ValueError):
-    """Predictions cannot be evaluated together: a sample twice, other settings, samples that are missing."""
+    """Predictions do not fit together: a sample occurs twice or is missing, or settings differ."""
 
 
 class NotAvailableError(UnavailableError, LookupError):
@@ -188,7 +192,7 @@ class WorkerError(UnavailableError, RuntimeError):
 
 
 class SomeFailedError(UnavailableError, RuntimeError):
-    """Some items of bulk work failed, and the others are done; the message lists every one that failed."""
+    """Some items of bulk work failed, and the others are done; the message lists every failure."""
 
     _is_list = True
 

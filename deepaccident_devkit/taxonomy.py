@@ -15,8 +15,10 @@ ModelPreset = Literal["released", "tiny", "tiny_lidar", "tiny_both"]
 StyleName = Literal["paper", "cvpr-column", "cvpr-page", "ieee-column", "ieee-page", "slide"]
 ModelFusion = Literal["mean", "max", "released", "disconet", "cobevt", "v2xvit"]
 SHIPPED_WEIGHTS: Final = ("tiny", "tiny_lidar")
-"""Presets of which weights come with the devkit. These three are of `model`; here, so that they can be listed without
-torch."""
+"""Presets with weights that ship with the devkit.
+
+These three names belong to `model`; they are here, so that they can be listed without torch.
+"""
 
 AGENTS: Final[tuple[AgentName, ...]] = (
     "ego_vehicle",
@@ -36,7 +38,7 @@ META_AGENTS: Final[dict[str, AgentName | None]] = {
     "other_behind": "other_vehicle_behind",
     "none": None,
 }
-"""Meta's short names of the agents → the folder names used everywhere else; `none` is a third road user."""
+"""Meta's short names of the agents → names of their folders; `none` is a third road user."""
 
 CAMERAS: Final = (
     "Camera_Front",
@@ -64,40 +66,51 @@ CHANNEL_FORMAT: Final[dict[str, str]] = {
 """Channel → ending of its files."""
 
 CATEGORIES: Final = ("car", "truck", "van", "cyclist", "motorcycle", "pedestrian")
-"""Class names; the position is the class index of the released evaluation (docs/released_code.md, Conventions)."""
+"""Class names; the index is the class index of the released evaluation.
+
+See docs/released_code.md, Conventions.
+"""
 
 SMALL_CATEGORIES: Final = ("cyclist", "motorcycle", "pedestrian")
-"""The classes for which fewer LiDAR points are asked (docs/released_code.md, Visibility and attributes)."""
+"""Classes that need fewer LiDAR points to be visible.
+
+See docs/released_code.md, Visibility and attributes.
+"""
 
 OWN_ACTOR_ID: Final = -100
 """Label id of the recording agent itself."""
 UNTRACKED_ID: Final = -1
 """Label id of an actor that is too far away to be tracked, and meta's word for "nobody"."""
 UNKNOWN_ID: Final = 0
-"""Meta's id of a partner in a collision whom no label names."""
+"""Meta's id of a collision partner that no label names."""
 STATIC_ACTOR_ID: Final = 20000
-"""Ids from here on are parked vehicles."""
+"""Lowest of the ids of parked vehicles."""
 IGNORED_ID: Final = 1_000_000_000
-"""Ids from here on are of actors whose class we do not have (nuScenes' buses), which `Dataset.with_ignored` has."""
+"""Lowest of the ids of actors of unknown classes (nuScenes' buses) in `Dataset.with_ignored`."""
 
 VELOCITY_FRAMES: Final[dict[str, str]] = {
-    "released": "the release's own: the world's, turned once more by the box's yaw in the LiDAR frame",
+    "released": (
+        "the release's own: the world's, turned once more by the box's yaw in the LiDAR frame"
+    ),
     "lidar": "the recording agent's LiDAR frame",
     "world": "the world frame",
     "turned-wrong": "the world frame turned by the agent's yaw with the wrong sign",
     "box": "the box's own frame, x along its length",
 }
-"""What the labels' velocities can be in: the release's own way first, then what foreign releases may have."""
+"""Possible frames of the labels' velocities: the release's own, then foreign."""
 RELEASED_VELOCITY_FRAME: Final = "released"
 
 FRAME_PERIOD: Final = 0.1
 """Seconds between two recorded frames."""
 WARM_UP_FRAMES: Final = 10
-"""Meta counts simulated frames: the recorded ones and this many before them."""
+"""Simulated frames before the recorded ones, which meta counts as well."""
 
 POLE_HEIGHT: Final = 4.0
-"""Metres: how far the road is below the origin of the infrastructure's `ego` frame, its LiDAR on a pole: in the release
-3 to 5 m. A vehicle's `ego` frame has its origin on the road."""
+"""Height of the origin of the infrastructure's `ego` frame above the road, metres.
+
+The origin is its LiDAR on a pole, in the release 3 to 5 m high. A vehicle's `ego` frame has its
+origin on the road.
+"""
 
 BEV_SHAPE: Final = (1200, 1200)
 BEV_RESOLUTION: Final = 0.1
@@ -108,7 +121,7 @@ SPLITS: Final = ("train", "val", "test")
 MINI_SPLITS: Final = ("train_mini", "val_mini")
 """Subsets of train and val (not the mini release)."""
 SPLIT_CHOICES: Final = (*SPLITS, *MINI_SPLITS, "all")
-"""What `split=` can be by name; `all` is every scenario that is here, whatever its split."""
+"""Names for `split=`; `all` is every scenario of the release, whatever its split."""
 EXPECTED_SCENARIOS: Final[dict[str, int]] = {"train": 483, "val": 104, "test": 104}
 EXPECTED_MINI_SCENARIOS: Final = 20
 
@@ -120,7 +133,7 @@ SPAWN_SIDES: Final = ("left", "right", "opposite")
 DIRECTIONS: Final = ("straight", "left", "right")
 SPAWN_RELATIONS: Final = ("same", "opposite")
 CONTACT_SIDES: Final = ("front", "front_side", "rear", "rear_side")
-"""The words that the whole release is known to use; a release may hold others, so no reader insists on them."""
+"""The known words of the complete release; others may occur, so no reader insists on them."""
 
 SCENARIO_ATTRIBUTES: Final = (
     "scenario_type",
@@ -130,14 +143,14 @@ SCENARIO_ATTRIBUTES: Final = (
     "road_type",
     "accident_type",
 )
-"""The scenario fields by which overviews and split reports count."""
+"""The scenario fields that overviews and split reports count by."""
 
 
 def short_name(agent: str) -> str:
-    """An agent's short name for headings: `ego`, `ego behind`, `other`, `other behind`, `infrastructure`."""
+    """Return an agent's short name for headings, such as `ego behind` or `infrastructure`."""
     return agent.replace("_vehicle", "").replace("_", " ")
 
 
 def frame_timestamp(frame_index: int) -> float:
-    """Seconds since the first recorded frame of frame number `frame_index` (counted from 1)."""
+    """Return seconds since the first recorded frame of a frame number (from 1)."""
     return (frame_index - 1) / 10

@@ -151,7 +151,7 @@ class ImageConfig:
             )
         if self.resize is not None:
             image = dataset.load_image(
-                camera, least=self.resize if self.decode == "scaled" else None
+                camera, min_size=self.resize if self.decode == "scaled" else None
             )
             return resized_part(image, self.resize, self.crop, self.decode), self.intrinsic(
                 lens, self.resize

@@ -1,4 +1,4 @@
-"""Maps of towns: the ground that the BEV cameras of a town's recordings saw, laid into one raster."""
+"""Maps of towns: the ground that BEV cameras of a town's recordings saw, in one raster."""
 
 from deepaccident_devkit.maps.counting import GROUND_CLASSES, TownMapConfig
 from deepaccident_devkit.maps.making import kept_town_map, town_map, towns_of

@@ -1,6 +1,7 @@
-"""`town_map`: the BEV cameras of a town's recordings, laid into one raster of the world.
+"""`town_map`: pictures of the BEV cameras of a town's recordings in one raster of the world.
 
-A map is kept in the folder of the tables, and goes when they are made again. Where nothing can be written, it is not.
+A map is stored in the folder of the tables, and is removed when they are made again. Where nothing
+can be written, it is not stored.
 """
 
 from __future__ import annotations
@@ -40,71 +41,72 @@ if TYPE_CHECKING:
 
     from deepaccident_devkit.support.parallel import Engine
 
-_DEFAULT = TownMapConfig()
-_FOLDER: Final = "town_maps"
+_DEFAULT_CONFIG = TownMapConfig()
+_MAPS_FOLDER: Final = "town_maps"
 # Counts up whenever the same pictures give another map, or the file's form changes.
-_FORMAT: Final = 2
-_ARRAYS: Final = ("origin", "counts", "agents", "hidden")
-_NUMBERS: Final = ("scenarios", "looks", "missing", "damaged")
+_FORMAT_VERSION: Final = 2
+_ARRAY_FIELDS: Final = ("origin", "counts", "agents", "hidden")
+_NUMBER_FIELDS: Final = ("scenarios", "looks", "missing", "damaged")
 
 
 def town_map(
     dataset: Dataset,
     town: str,
     *,
-    config: TownMapConfig = _DEFAULT,
+    config: TownMapConfig = _DEFAULT_CONFIG,
     scenarios: Iterable[RowArgument] | None = None,
-    **how: Unpack[Engine],
+    **engine: Unpack[Engine],
 ) -> TownMap:
-    """Map a town's ground: what the BEV cameras of its recordings saw as road, road line, sidewalk or something else.
+    """Map a town's ground, as the BEV cameras of its recordings saw it.
 
-    The map is kept beside the tables, where these can be written, so that the next call with the same town,
-    configuration and scenarios only reads it. It is made again when files of the BEV cameras that were missing are
-    there, or the other way round.
+    Classes are road, road line, sidewalk and other. The map is stored beside the tables, where
+    these can be written, so that the next call with the same town, configuration and scenarios only
+    reads it. It is made again when missing files of the BEV cameras were added, or others removed.
 
     Args:
-        dataset: the release.
-        town: such as `Town03`.
-        config: its cells, and which pictures are read.
-        scenarios: tokens or records of scenarios; those in the town are looked through. None for all of them. Give
-            those of a split, if a model that reads the map must not know the others.
-        **how: `workers`, `executor` and `progress`, as `parallel.Engine` says.
+        dataset: The release.
+        town: Name such as `Town03`.
+        config: Cells of the map, and selection of its pictures.
+        scenarios: Tokens or records of scenarios, of which the town's are used; None for all. Pass
+            the scenarios of a split if a model that reads the map must not know the others.
+        **engine: `workers`, `executor` and `progress` (`parallel.Engine`).
 
     Raises:
-        ChoiceError: the release has no recording in this town.
-        TokenError: no such scenario.
-        NotAvailableError: none of the scenarios is in the town, or has a readable file of a BEV camera.
+        ChoiceError: The release has no recording in this town.
+        TokenError: A token names no scenario.
+        NotAvailableError: None of the scenarios is in the town, or has a readable file of a BEV
+            camera.
     """
     town, rows = _scenarios_in(dataset, town, scenarios)
-    found = _read(dataset, town, rows, config)
-    if found is not None and (
-        not found.missing or found.missing == _missing(dataset, rows, config)
-    ):
-        return found
-    work, places = partial(count_scenario, dataset, config), Places(reads=dataset.places)
-    windows = run_unordered(work, rows, label=f"mapping {town}", places=places, **how)
-    made = _joined(dataset, town, rows, config, (window for _, window in windows))
-    _keep(dataset, _key(dataset, town, rows, config), made)
-    return made
+    stored_map = _read_map(dataset, town, rows, config)
+    if stored_map is not None:
+        if not stored_map.missing or stored_map.missing == _count_missing(dataset, rows, config):
+            return stored_map
+    work = partial(count_scenario, dataset, config)
+    places = Places(reads=dataset.places)
+    windows = run_unordered(work, rows, label=f"mapping {town}", places=places, **engine)
+    new_map = _join_windows(dataset, town, rows, config, (window for _, window in windows))
+    _store_map(dataset, _key(dataset, town, rows, config), new_map)
+    return new_map
 
 
 def kept_town_map(
-    dataset: Dataset, town: str, *, config: TownMapConfig = _DEFAULT
+    dataset: Dataset, town: str, *, config: TownMapConfig = _DEFAULT_CONFIG
 ) -> TownMap | None:
-    """The map of a town from all its scenarios, as an earlier `town_map` has kept it; nothing is made.
+    """Return the stored map of a town from all its scenarios; None if `town_map` stored none.
 
     Raises:
-        ChoiceError: the release has no recording in this town.
+        ChoiceError: The release has no recording in this town.
     """
     town, rows = _scenarios_in(dataset, town, None)
-    return _read(dataset, town, rows, config)
+    return _read_map(dataset, town, rows, config)
 
 
 def towns_of(dataset: Dataset, scenarios: Iterable[RowArgument] | None = None) -> list[str]:
-    """The towns of a release's scenarios, or of some of them, in the order of their names.
+    """Return the towns of scenarios, by default of all in a release, in the order of their names.
 
     Raises:
-        TokenError: no such scenario.
+        TokenError: A token names no scenario.
     """
     if scenarios is None:
         return sorted(dataset.columns("scenario")["town"].unique().to_pylist())
@@ -114,98 +116,100 @@ def towns_of(dataset: Dataset, scenarios: Iterable[RowArgument] | None = None) -
 def _scenarios_in(
     dataset: Dataset, town: str, scenarios: Iterable[RowArgument] | None
 ) -> tuple[str, Sequence[int]]:
-    """The town's name, and the rows of its scenarios, ascending."""
+    """Return the town's name, and the rows of its scenarios, ascending."""
     town = choice("town", town, towns_of(dataset))
-    rows = [
-        dataset.getind("scenario", token) for token in dataset.field2token("scenario", "town", town)
-    ]
+    tokens = dataset.field2token("scenario", "town", town)
+    rows = [dataset.getind("scenario", token) for token in tokens]
     if scenarios is None:
         return town, rows
-    wanted = set(rows_of_scenarios(dataset, scenarios))
-    chosen = [row for row in rows if row in wanted]
-    if not chosen:
+    selected = set(rows_of_scenarios(dataset, scenarios))
+    rows = [row for row in rows if row in selected]
+    if not rows:
         raise NotAvailableError(
-            f"none of the {len(wanted)} scenarios given is in {town}; leave scenarios= out for all"
+            f"none of the {len(selected)} scenarios given is in {town}; "
+            "leave scenarios= out for all"
         )
-    return town, chosen
+    return town, rows
 
 
-def _missing(dataset: Dataset, rows: Sequence[int], config: TownMapConfig) -> int:
-    """How many of the pictures that a map is made from are not there."""
-    files = (
-        path
-        for row in rows
-        for recording in looks_of(dataset, row, config)
-        for path in recording.files(dataset)
-    )
-    return sum(not path.exists() for path in files)
+def _count_missing(dataset: Dataset, rows: Sequence[int], config: TownMapConfig) -> int:
+    """Return the number of pictures for a map that have no file."""
+    missing = 0
+    for row in rows:
+        for recording in looks_of(dataset, row, config):
+            missing += sum(not path.exists() for path in recording.files(dataset))
+    return missing
 
 
 def _key(dataset: Dataset, town: str, rows: Sequence[int], config: TownMapConfig) -> str:
-    """A digest of all that was asked for."""
-    text = repr((_FORMAT, town, tuple(dataset.scenario[row]["token"] for row in rows), config))
+    """Return a digest of all arguments of a map."""
+    tokens = tuple(dataset.scenario[row]["token"] for row in rows)
+    text = repr((_FORMAT_VERSION, town, tokens, config))
     return hashlib.blake2b(text.encode(), digest_size=8).hexdigest()
 
 
 def _store(dataset: Dataset) -> Store:
-    """Nobody locks it: two processes write the same map, one after the other."""
-    folder = place_in(dataset.tables_folder, _FOLDER, opened=True)
+    """Return the store of maps; it needs no lock, since two processes write the same map."""
+    folder = place_in(dataset.tables_folder, _MAPS_FOLDER, opened=True)
     return Store(folder, folder, "keeps town maps", IndexStoreError)
 
 
-def _read(
+def _read_map(
     dataset: Dataset, town: str, rows: Sequence[int], config: TownMapConfig
 ) -> TownMap | None:
-    """The map that is kept; None if there is none, or if its file is damaged."""
-    store, key = _store(dataset), _key(dataset, town, rows, config)
+    """Return the stored map; None if there is none, or if its file is damaged."""
+    store = _store(dataset)
+    key = _key(dataset, town, rows, config)
     try:
-        state = store.path(key).stat()
+        status = store.path(key).stat()
     except OSError:
         return None
-    return _unpacked(
-        store, key, town, config.resolution, (state.st_mtime_ns, state.st_size, state.st_ino)
-    )
+    state = (status.st_mtime_ns, status.st_size, status.st_ino)
+    return _unpack_map(store, key, town, config.resolution, state)
 
 
-@lru_cache(maxsize=1)  # every picture of a video asks for the same one
-def _unpacked(
+# The map is cached, since every picture of a video asks for the same one.
+@lru_cache(maxsize=1)
+def _unpack_map(
     store: Store, key: str, town: str, resolution: float, _state: tuple[int, ...]
 ) -> TownMap | None:
-    """The map in a file; its state tells it from another that takes its place."""
+    """Return the map in a file; the file's state distinguishes it from a later file."""
     content = store.kept(key, key, "index")
     if content is None:
         return None
     with open_zip(content) as archive:
         arrays: dict[str, Any] = {
-            name: read_array(archive, name, "index") for name in (*_ARRAYS, "numbers")
+            name: read_array(archive, name, "index") for name in (*_ARRAY_FIELDS, "numbers")
         }
-    numbers = dict(zip(_NUMBERS, arrays.pop("numbers").tolist(), strict=True))
+    numbers = dict(zip(_NUMBER_FIELDS, arrays.pop("numbers").tolist(), strict=True))
     return TownMap(town=town, resolution=resolution, **arrays, **numbers)
 
 
-def _keep(dataset: Dataset, key: str, made: TownMap) -> None:
-    """Keep a map, if its file can be written and would be read again; the same map gives the same bytes."""
-    content, numbers = (
-        io.BytesIO(),
-        np.array([getattr(made, name) for name in _NUMBERS], dtype=np.int64),
-    )
-    np.savez_compressed(content, **{name: getattr(made, name) for name in _ARRAYS}, numbers=numbers)
-    if made.counts.nbytes <= byte_limit("index") and dataset.tables_folder.is_dir():
-        with suppress(OSError):  # a folder that may not be written to
+def _store_map(dataset: Dataset, key: str, new_map: TownMap) -> None:
+    """Store a map, if its file can be written and would be read again.
+
+    The same map gives the same bytes.
+    """
+    content = io.BytesIO()
+    numbers = np.array([getattr(new_map, name) for name in _NUMBER_FIELDS], dtype=np.int64)
+    arrays = {name: getattr(new_map, name) for name in _ARRAY_FIELDS}
+    np.savez_compressed(content, **arrays, numbers=numbers)
+    if new_map.counts.nbytes <= byte_limit("index") and dataset.tables_folder.is_dir():
+        # The folder may be read-only.
+        with suppress(OSError):
             _store(dataset).keep(key, key, content.getvalue())
 
 
-def _joined(
+def _join_windows(
     dataset: Dataset,
     town: str,
     rows: Sequence[int],
     config: TownMapConfig,
     windows: Iterable[Window],
 ) -> TownMap:
-    """The map that the windows of all scenarios add up to, in any order, cut to what was seen."""
-    poses = np.concatenate(
-        [recording.poses for row in rows for recording in looks_of(dataset, row, config)]
-    )
+    """Return the sum of the windows of all scenarios, in any order, without unseen edges."""
+    recordings = [recording for row in rows for recording in looks_of(dataset, row, config)]
+    poses = np.concatenate([recording.poses for recording in recordings])
     low, high = cells_around(poses, config.resolution)
     shape = tuple((high - low).tolist())
     counts = np.zeros((len(GROUND_CLASSES), *shape), dtype=np.uint16)
@@ -214,21 +218,22 @@ def _joined(
     for window in windows:
         row, column = (np.array(window.corner) - low).tolist()
         height, width = window.agents.shape
-        rows_in, columns_in = slice(row, row + height), slice(column, column + width)
-        counts[:, rows_in, columns_in] += window.counts
-        agents[rows_in, columns_in] += window.agents
+        window_rows = slice(row, row + height)
+        window_columns = slice(column, column + width)
+        counts[:, window_rows, window_columns] += window.counts
+        agents[window_rows, window_columns] += window.agents
         for name in tally:
             tally[name] += getattr(window, name)
     if not tally["looks"]:
         raise NotAvailableError(
-            f"{town}: none of its {len(rows)} scenarios has a readable file of the BEV camera; unpack {BEV_CAMERA} of "
-            "train or val (the test split ships without)"
+            f"{town}: none of its {len(rows)} scenarios has a readable file of the BEV camera; "
+            f"unpack {BEV_CAMERA} of train or val (the test split ships without)"
         )
-    first, counts, agents = _cut(counts, agents)
+    corner, counts, agents = _crop(counts, agents)
     return TownMap(
         town=town,
         resolution=config.resolution,
-        origin=as_floats((low + first)[::-1] * config.resolution),
+        origin=as_floats((low + corner)[::-1] * config.resolution),
         counts=counts,
         agents=agents,
         hidden=hidden_ground(classes_of(counts), config.resolution),
@@ -237,14 +242,15 @@ def _joined(
     )
 
 
-def _cut(counts: PixelCounts, agents: PixelCounts) -> tuple[IntArray, PixelCounts, PixelCounts]:
-    """The first cell, the counts and the agents of what is left without the edges where nothing was seen."""
-    rows, columns = (np.flatnonzero((agents > 0).any(axis=axis)) for axis in (1, 0))
+def _crop(counts: PixelCounts, agents: PixelCounts) -> tuple[IntArray, PixelCounts, PixelCounts]:
+    """Return counts and agents without unseen edges, after the lowest cell that remains."""
+    seen = agents > 0
+    rows = np.flatnonzero(seen.any(axis=1))
+    columns = np.flatnonzero(seen.any(axis=0))
     if not len(rows):
         rows = columns = np.zeros(1, dtype=np.int64)
-    kept_rows, kept_columns = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
-    return (
-        np.array([rows[0], columns[0]]),
-        counts[:, kept_rows, kept_columns].copy(),
-        agents[kept_rows, kept_columns].copy(),
-    )
+    corner = np.array([rows[0], columns[0]])
+    seen_rows = slice(rows[0], rows[-1] + 1)
+    seen_columns = slice(columns[0], columns[-1] + 1)
+    cropped_counts = counts[:, seen_rows, seen_columns].copy()
+    return corner, cropped_counts, agents[seen_rows, seen_columns].copy()

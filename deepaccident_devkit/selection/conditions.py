@@ -1,4 +1,4 @@
-"""One filter on one field: as a text, as a keyword's value, and as the test that it comes to."""
+"""One filter on one field: its text, its keyword, and the checked condition."""
 
 from __future__ import annotations
 
@@ -17,28 +17,28 @@ from deepaccident_devkit.selection.fields import Field, FieldValue
 from deepaccident_devkit.support.text import meant_text, possible_text
 
 FilterValue = FieldValue | Collection[FieldValue]
-"""What a keyword of `find` takes: a value, or several values, one of which must match."""
+"""Value of a keyword of `find`: a value, or several values, one of which must match."""
 
-_TEXT = re.compile(r"\s*(\w+)\s*(!=|>=|<=|=|>|<)(.*)", re.DOTALL)
+_FILTER_TEXT = re.compile(r"\s*(\w+)\s*(!=|>=|<=|=|>|<)(.*)", re.DOTALL)
 _NUMBER = r"-?\d{1,18}(?:\.\d{1,18})?"
 _RANGE = re.compile(rf"({_NUMBER})?\s*\.\.\s*({_NUMBER})?")
 _BOUND = re.compile(rf"(>=|<=|>|<)\s*({_NUMBER})")
-_UNKNOWN = ("unknown", "none")
+_UNKNOWN_WORDS = ("unknown", "none")
 _FLAGS = {"true": True, "yes": True, "false": False, "no": False}
-# Types that Python takes for collections and a filter does not; of these only a str can be a value.
-_SINGLE = (str, bytes, bytearray, Mapping, np.ndarray)
-# Characters of a wrong value that a message shows.
-_LONGEST = 60
+# Collections of Python that a filter does not take for several values; only a str can be a value.
+_SINGLE_TYPES = (str, bytes, bytearray, Mapping, np.ndarray)
+# Characters of a wrong value in a message.
+_MAX_QUOTED = 60
 
 
 @dataclass(frozen=True, slots=True)
 class Filter:
-    """A field and the values that are wanted of it, as given.
+    """A field and the values to find, not yet checked.
 
     Attributes:
-        name: the field's name or its short form.
-        values: one of them must match.
-        negated: whether the scenarios with none of the values are wanted instead.
+        name: Name of the field or its short form.
+        values: Values, one of which must match.
+        negated: Whether to find the scenarios with none of the values.
     """
 
     name: str
@@ -51,10 +51,10 @@ class Condition:
     """A filter that was checked against its field.
 
     Attributes:
-        field: what is looked at.
-        values: the single values that will do, None among them for unknown.
-        ranges: (lowest, highest) of the numbers that will do; None for no bound.
-        negated: as of `Filter`.
+        field: Field of the filter.
+        values: Single values that match, with None for unknown.
+        ranges: (lowest, highest) of the numbers that match; None for no bound.
+        negated: As in `Filter`.
     """
 
     field: Field
@@ -63,102 +63,110 @@ class Condition:
     negated: bool
 
     def holds(self, value: FieldValue | tuple[FieldValue, ...]) -> bool:
-        """Whether a scenario with this value of the field, or with these, is wanted."""
-        several = value if isinstance(value, tuple) else (value,)
-        met = (
-            each in self.values or any(_within(each, *bounds) for bounds in self.ranges)
-            for each in several
-        )
-        return any(met) != self.negated
+        """Return whether a scenario with this value of the field, or with these, is found."""
+        values = value if isinstance(value, tuple) else (value,)
+        return any(map(self._matches, values)) != self.negated
+
+    def _matches(self, value: FieldValue) -> bool:
+        """Return whether a value is one of the values, or lies in one of the ranges."""
+        if value in self.values:
+            return True
+        return any(_is_within(value, *bounds) for bounds in self.ranges)
 
 
 def parse_where(text: str) -> Filter:
-    """Read a filter such as `town=Town03,Town05`, `weather!=Clear`, `length>=50` or `length=40..60`.
+    """Read a filter such as `town=Town03,Town05`, `weather!=Clear` or `length=40..60`.
 
-    Field and values are checked where the filter is used, as those of keywords are.
+    Field and values are checked when the filter is used, like keywords.
 
     Raises:
-        ChoiceError: the text has no field, no sign or no value.
+        ChoiceError: The text has no field, no sign or no value.
     """
     if not isinstance(text, str):
         raise ChoiceError(
-            f"expected a text such as town=Town03,Town05, found {_shown(text)}; other values are given as keywords, "
-            "such as town=['Town03', 'Town05']"
+            f"expected a text such as town=Town03,Town05, found {_quote(text)}; other values are "
+            "given as keywords, such as town=['Town03', 'Town05']"
         )
-    match = _TEXT.fullmatch(text)
+    match = _FILTER_TEXT.fullmatch(text)
     values = [value.strip() for value in match[3].split(",")] if match else []
     if match is None or not all(values):
         raise ChoiceError(
-            f"expected field=value[,value…] with one of the signs =, !=, >=, <=, > and <, found {_shown(text)}; "
-            "such as town=Town03,Town05 or length=40..60"
+            "expected field=value[,value…] with one of the signs =, !=, >=, <=, > and <, found "
+            f"{_quote(text)}; such as town=Town03,Town05 or length=40..60"
         )
-    name, sign = match[1], match[2]
+    name = match[1]
+    sign = match[2]
     if sign in {"=", "!="}:
         return Filter(name, tuple(values), negated=sign == "!=")
     if len(values) > 1:
-        raise ChoiceError(f"{_shown(text)}: {sign} takes one number, found {len(values)}")
+        raise ChoiceError(f"{_quote(text)}: {sign} takes one number, found {len(values)}")
     return Filter(name, (f"{sign}{values[0]}",))
 
 
 def keyword_filter(name: str, value: FilterValue) -> Filter:
-    """The filter that a keyword of `find` stands for."""
-    several = isinstance(value, Collection) and not isinstance(value, _SINGLE)
-    return Filter(name, tuple(value) if several else (value,))  # type: ignore[arg-type]
+    """Return the filter of a keyword of `find`."""
+    has_several = isinstance(value, Collection) and not isinstance(value, _SINGLE_TYPES)
+    return Filter(name, tuple(value) if has_several else (value,))  # type: ignore[arg-type]
 
 
-def condition_of(wanted: Filter, field: Field, here: Iterable[FieldValue]) -> Condition:
-    """Check a filter against its field, whose values in this release are always possible; raises ChoiceError."""
-    possible = list(
-        dict.fromkeys([*field.known, *sorted({str(value) for value in here if value is not None})])
-    )
+def condition_of(query: Filter, field: Field, release_values: Iterable[FieldValue]) -> Condition:
+    """Check a filter against its field; raises ChoiceError.
+
+    The field's values in this release are always possible.
+    """
+    release_words = sorted({str(value) for value in release_values if value is not None})
+    possible = list(dict.fromkeys(map(str, [*field.known, *release_words])))
     singles: set[FieldValue] = set()
     ranges = []
-    for given in wanted.values:
-        value = given.item() if isinstance(given, np.generic) else given
-        bounds = _bounds(field, value) if isinstance(value, str) else None
+    for item in query.values:
+        value = item.item() if isinstance(item, np.generic) else item
+        bounds = _parse_range(field, value) if isinstance(value, str) else None
         if bounds is not None:
             ranges.append(bounds)
         else:
-            singles.add(_single(field, value, [str(word) for word in possible]))
-    return Condition(field, frozenset(singles), tuple(ranges), wanted.negated)
+            singles.add(_parse_value(field, value, possible))
+    return Condition(field, frozenset(singles), tuple(ranges), query.negated)
 
 
-def _single(field: Field, value: object, possible: list[str]) -> FieldValue:
-    """One value of a field, in the field's own type."""
-    if value is None or (isinstance(value, str) and value.lower() in _UNKNOWN):
+def _parse_value(field: Field, value: object, possible: list[str]) -> FieldValue:
+    """Return one value of a field, in the field's own type."""
+    if value is None or (isinstance(value, str) and value.lower() in _UNKNOWN_WORDS):
         return None
     if isinstance(value, Collection) and not isinstance(value, str):
         raise ChoiceError(
-            f"{field.name}: expected a value, or a list, tuple or set of values, found {_shown(value)}; give an array "
-            "as a list: array.tolist()"
+            f"{field.name}: expected a value, or a list, tuple or set of values, found "
+            f"{_quote(value)}; give an array as a list: array.tolist()"
         )
     if field.kind == "flag":
         flag = _FLAGS.get(value.lower()) if isinstance(value, str) else value
         if isinstance(flag, bool):
             return flag
-        raise ChoiceError(f"{field.name}: expected true, false or unknown, found {_shown(value)}")
+        raise ChoiceError(f"{field.name}: expected true, false or unknown, found {_quote(value)}")
     if field.kind in {"number", "measure"}:
-        return _number(field, value)
-    if isinstance(value, str) and (word := _spelt(value, possible)) is not None:
+        return _parse_number(field, value)
+    word = _find_word(value, possible) if isinstance(value, str) else None
+    if word is not None:
         return word
-    meant = value if isinstance(value, str) and len(value) <= _LONGEST else ""
+    text = value if isinstance(value, str) and len(value) <= _MAX_QUOTED else ""
     raise ChoiceError(
-        f"{field.name}: found {_shown(value)}; possible are {possible_text(meant, possible)}"
-        f"{meant_text(meant, possible)}"
+        f"{field.name}: found {_quote(value)}; possible are {possible_text(text, possible)}"
+        f"{meant_text(text, possible)}"
     )
 
 
-def _spelt(value: str, possible: Iterable[str]) -> str | None:
-    """The possible word that a value is; case, `_`, `-` and blanks do not count."""
-    words = {_bare(word): word for word in possible}
-    return value if value in words.values() else words.get(_bare(value))
+def _find_word(value: str, possible: Iterable[str]) -> str | None:
+    """Return the possible word of a value, without regard to case, `_`, `-` and blanks."""
+    words = {_normalize(word): word for word in possible}
+    if value in words.values():
+        return value
+    return words.get(_normalize(value))
 
 
-def _bare(word: str) -> str:
+def _normalize(word: str) -> str:
     return re.sub(r"[\s_-]", "", word.casefold())
 
 
-def _number(field: Field, value: object) -> float:
+def _parse_number(field: Field, value: object) -> float:
     number: float | None = None
     if isinstance(value, str):
         if re.fullmatch(_NUMBER, value) is not None:
@@ -170,17 +178,18 @@ def _number(field: Field, value: object) -> float:
             number = operator.index(value)  # type: ignore[arg-type]
     if number is None:
         raise ChoiceError(
-            f"{field.name}: expected a number, a range such as 40..60 or a bound such as >=50, found {_shown(value)}"
+            f"{field.name}: expected a number, a range such as 40..60 or a bound such as >=50, "
+            f"found {_quote(value)}"
         )
     if field.known and number not in field.known:
         raise ChoiceError(
-            f"{field.name}: found {_shown(number)}; possible are {', '.join(map(str, field.known))}"
+            f"{field.name}: found {_quote(number)}; possible are {', '.join(map(str, field.known))}"
         )
     return number
 
 
 def _read_number(field: Field, digits: str) -> float:
-    """The number that a sign and digits stand for."""
+    """Return the number of a sign and digits."""
     if field.kind == "measure":
         return float(digits)
     if "." in digits:
@@ -188,48 +197,52 @@ def _read_number(field: Field, digits: str) -> float:
     return int(digits)
 
 
-def _shown(value: object) -> str:
-    """A wrong value as a message shows it: in full if it is short."""
+def _quote(value: object) -> str:
+    """Return a wrong value for a message, in full if it is short."""
     try:
         text = repr(value)
-    except ValueError:  # an int of more than 4300 digits
+    except ValueError:  # An int of more than 4300 digits.
         text = f"{type(value).__name__} of very many digits"
-    return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}…"
+    if len(text) <= _MAX_QUOTED:
+        return text
+    return f"{text[:_MAX_QUOTED]}…"
 
 
-def _bounds(field: Field, text: str) -> tuple[float | None, float | None] | None:
-    """The lowest and highest number that a text allows; None if it is no range."""
+def _parse_range(field: Field, text: str) -> tuple[float | None, float | None] | None:
+    """Return the lowest and highest number that a text allows; None if it is no range."""
     text = text.strip()
-    if (bound := _BOUND.fullmatch(text)) is not None:
-        ends = _ends(bound[1], _read_number(field, bound[2]))
-    elif (between := _RANGE.fullmatch(text)) is not None:
-        ends = (
-            _read_number(field, between[1]) if between[1] else None,
-            _read_number(field, between[2]) if between[2] else None,
-        )
+    bound = _BOUND.fullmatch(text)
+    interval = _RANGE.fullmatch(text)
+    lowest: float | None = None
+    highest: float | None = None
+    if bound is not None:
+        lowest, highest = _parse_bound(bound[1], _read_number(field, bound[2]))
+    elif interval is not None:
+        lowest = _read_number(field, interval[1]) if interval[1] else None
+        highest = _read_number(field, interval[2]) if interval[2] else None
     else:
         return None
     if field.kind not in {"number", "measure"}:
-        raise ChoiceError(f"{field.name}: {_shown(text)} is a range, which only numbers have")
-    lowest, highest = ends
+        raise ChoiceError(f"{field.name}: {_quote(text)} is a range, which only numbers have")
     if lowest is not None and highest is not None and lowest > highest:
         raise ChoiceError(f"{field.name}: '{text}': {lowest} is more than {highest}")
-    return ends
+    return lowest, highest
 
 
-def _ends(sign: str, number: float) -> tuple[float | None, float | None]:
-    """The lowest and highest number, both allowed, that a bound stands for."""
+def _parse_bound(sign: str, number: float) -> tuple[float | None, float | None]:
+    """Return the lowest and highest number, both allowed, of a bound such as `>50`."""
+    is_lowest = sign.startswith(">")
     if sign in {">", "<"}:
-        aside = math.inf if sign == ">" else -math.inf
-        number = (
-            number + int(math.copysign(1, aside))
-            if isinstance(number, int)
-            else math.nextafter(number, aside)
-        )
-    return (number, None) if sign.startswith(">") else (None, number)
+        if isinstance(number, int):
+            number += 1 if is_lowest else -1
+        else:
+            number = math.nextafter(number, math.inf if is_lowest else -math.inf)
+    if is_lowest:
+        return (number, None)
+    return (None, number)
 
 
-def _within(value: FieldValue, lowest: float | None, highest: float | None) -> bool:
+def _is_within(value: FieldValue, lowest: float | None, highest: float | None) -> bool:
     if not isinstance(value, int | float):
         return False
     return (lowest is None or lowest <= value) and (highest is None or value <= highest)

@@ -1,4 +1,4 @@
-"""The fields that a scenario can be found by and results be grouped by: one name and one set of values each."""
+"""The fields to find scenarios and to group results by: a name and a set of values each."""
 
 from __future__ import annotations
 
@@ -28,16 +28,16 @@ FieldKind = Literal["word", "number", "measure", "flag"]
 _STRAIGHT: Final = "straight_straight"
 TURNING: Final = "one_of_the_agents_turning"
 _WEATHER_GROUPS: Final = {"Rain": "Rainy", "Cloudy": "Cloudy", "Clear": "Clear"}
-_OF_MOVING_PAIRS: Final = {
+_MOVING_PAIR_DOCS: Final = {
     "min_ttc": "Least time to collision of moving pairs (s).",
     "min_pet": "Least post-encroachment time of moving pairs (s).",
     "min_gap": "Least gap between moving pairs (m).",
     "max_drac": "The most deceleration that a moving pair needs to avoid a crash (m/s²).",
 }
-_SHORT = {"type": "scenario_type", "length": "num_frames"}
-# Columns of words that are not limited, yet few.
-_FEW: Final = ("scenario_type", "town")
-_KNOWN: dict[str, Sequence[str | int]] = {
+_SHORT_NAMES = {"type": "scenario_type", "length": "num_frames"}
+# Columns of arbitrary words with so few values that results can be grouped by them.
+_GROUPED_COLUMNS: Final = ("scenario_type", "town")
+_KNOWN_VALUES: dict[str, Sequence[str | int]] = {
     "town": taxonomy.TOWNS,
     "weather": taxonomy.WEATHERS,
     "road_type": taxonomy.ROAD_TYPES,
@@ -50,17 +50,20 @@ _KNOWN: dict[str, Sequence[str | int]] = {
 
 @dataclass(frozen=True, slots=True)
 class Field:
-    """Something that a scenario can be found by.
+    """A property that scenarios can be found by.
 
     Attributes:
-        name: as a filter names it.
-        kind: of its values; a number is whole, a measure is a float.
-        doc: what it means, for people.
-        read: its value of a scenario, None where unknown; several in a tuple, of which a filter wants one.
-        known: the values it can have in the whole release; empty where that is not known or not limited.
-        costly: whether reading it opens more than the scenario's record.
-        groups: whether it has so few values that results can be grouped by it.
-        read_all: its values of many scenarios in their order, where that is more than `read` of each.
+        name: Name in filters.
+        kind: Kind of its values; a number is whole, a measure is a float.
+        doc: Meaning, for people.
+        read: Function for a scenario's value, None where unknown; of several in a tuple, one must
+            match a filter.
+        known: Values that are possible in the complete release; empty where they are not known or
+            not limited.
+        costly: Whether reading it opens more than the scenario's record.
+        groups: Whether it has so few values that results can be grouped by it.
+        read_all: Function for the values of many scenarios in their order, if that is more than
+            `read` of each.
     """
 
     name: str
@@ -74,63 +77,69 @@ class Field:
 
     @property
     def shown(self) -> str:
-        """The values that it can have, as a filter has them."""
-        if self.kind != "word" or not self.known:
-            return {"flag": "true, false", "number": "numbers", "measure": "numbers"}.get(
-                self.kind, "words"
-            )
-        return ", ".join(map(str, self.known))
+        """Possible values, as a filter has them."""
+        if self.kind == "word" and self.known:
+            return ", ".join(map(str, self.known))
+        descriptions = {"flag": "true, false", "number": "numbers", "measure": "numbers"}
+        return descriptions.get(self.kind, "words")
 
     def values(
         self, dataset: Dataset, scenarios: Sequence[ScenarioRecord]
     ) -> Iterable[FieldValue | tuple[FieldValue, ...]]:
-        """Its values of scenarios, in their order."""
+        """Return its values of scenarios, in their order."""
         if self.read_all is not None:
             return self.read_all(dataset, scenarios)
         return (self.read(dataset, scenario) for scenario in scenarios)
 
 
 def field_of(name: str) -> Field:
-    """The field that a filter names; raises FieldError."""
+    """Return the field of a filter; raises FieldError."""
     field = FIELDS.get(full_name(name))
     if field is None:
-        possible = possible_text(name, [*FIELDS, *_SHORT])
+        possible = possible_text(name, [*FIELDS, *_SHORT_NAMES])
         raise FieldError(
-            f"scenarios cannot be found by '{name}'; the fields are {possible}; `deepaccident info --fields` says what "
-            "each is"
+            f"scenarios cannot be found by '{name}'; the fields are {possible}; "
+            "`deepaccident info --fields` says what each is"
         )
     return field
 
 
 def full_name(name: str) -> str:
-    """The full name of a field or attribute in small letters, also of a short one."""
-    return _SHORT.get(name.lower(), name.lower())
+    """Return the full name of a field or attribute in small letters, also of a short name."""
+    return _SHORT_NAMES.get(name.lower(), name.lower())
 
 
 def fields_text() -> str:
-    """All fields as a table: names, short ones too, values and meanings."""
-    short = {name: f"{name}, {other}" for other, name in _SHORT.items()}
-    rows = [(short.get(each.name, each.name), each.shown, each.doc) for each in FIELDS.values()]
-    return columns_text([("field", "values", "meaning"), *rows], left=3)
+    """Return all fields as a table: names, also short ones, values and meanings."""
+    names = {name: f"{name}, {short_name}" for short_name, name in _SHORT_NAMES.items()}
+    rows = [("field", "values", "meaning")]
+    for field in FIELDS.values():
+        rows.append((names.get(field.name, field.name), field.shown, field.doc))
+    return columns_text(rows, left=3)
 
 
 def group_texts(dataset: Dataset, scenario: ScenarioRecord) -> dict[str, str | None]:
-    """The values of a scenario for all fields that results can be grouped by, as texts; None unknown."""
+    """Return a scenario's values, as texts, of all fields to group by; None for unknown."""
     return {
         name: _text(field.read(dataset, scenario)) for name, field in FIELDS.items() if field.groups
     }
 
 
 def _text(value: Any) -> str | None:
-    return None if value is None else str(value).lower() if isinstance(value, bool) else str(value)
+    if value is None:
+        return None
+    if isinstance(value, bool):
+        return str(value).lower()
+    return str(value)
 
 
-def _column(column: Column) -> Field:
-    """The field that is a column of the scenario table."""
+def _column_field(column: Column) -> Field:
+    """Return the field of a column of the scenario table."""
     kind: FieldKind = "word"
     if isinstance(column.kind, Number):
         kind = "flag" if column.kind.dtype == "bool" else "number"
-    known = _KNOWN.get(column.field, column.kind.values if isinstance(column.kind, Choice) else ())
+    choices = column.kind.values if isinstance(column.kind, Choice) else ()
+    known = _KNOWN_VALUES.get(column.field, choices)
 
     def read(_: Dataset, scenario: ScenarioRecord) -> Any:
         return scenario[column.field]  # type: ignore[literal-required]
@@ -141,43 +150,45 @@ def _column(column: Column) -> Field:
         column.kind.doc,
         read,
         known,
-        groups=column.field in _FEW or bool(known) or kind == "flag",
+        groups=column.field in _GROUPED_COLUMNS or bool(known) or kind == "flag",
     )
 
 
-def _of_collision(name: str) -> _Read:
-    """What meta says of the collision; None without one."""
+def _collision_reader(name: str) -> _Read:
+    """Return a function that reads a field of meta's collision; None without a collision."""
 
     def read(_: Dataset, scenario: ScenarioRecord) -> Any:
-        told = scenario["collision"]
-        value = told and told[name]  # type: ignore[literal-required]
-        return tuple(value) if isinstance(value, list) else value
+        record = scenario["collision"]
+        value = record and record[name]  # type: ignore[literal-required]
+        if isinstance(value, list):
+            return tuple(value)
+        return value
 
     return read
 
 
 def _ended_in_collision(_: Dataset, scenario: ScenarioRecord) -> bool | None:
-    return (
-        None if scenario["weather"] is None else scenario["collision"] is not None
-    )  # no weather: no meta
+    if scenario["weather"] is None:  # The scenario has no meta.
+        return None
+    return scenario["collision"] is not None
 
 
 def _collision_status(_: Dataset, scenario: ScenarioRecord) -> str | None:
-    told = scenario["collision"]
-    if told is None:
+    record = scenario["collision"]
+    if record is None:
         return None if scenario["weather"] is None else "no_collision"
-    return (
-        "collides_with_pedestrian"
-        if "pedestrian" in told["classes"]
-        else "collides_between_vehicles"
-    )
+    if "pedestrian" in record["classes"]:
+        return "collides_with_pedestrian"
+    return "collides_between_vehicles"
 
 
 def _weather_group(_: Dataset, scenario: ScenarioRecord) -> str | None:
     weather = scenario["weather"]
-    return weather and next(
-        (name for word, name in _WEATHER_GROUPS.items() if word in weather), weather
-    )
+    if weather:
+        for word, name in _WEATHER_GROUPS.items():
+            if word in weather:
+                return name
+    return weather
 
 
 def _time_of_day_group(_: Dataset, scenario: ScenarioRecord) -> str | None:
@@ -186,15 +197,12 @@ def _time_of_day_group(_: Dataset, scenario: ScenarioRecord) -> str | None:
 
 
 def _trajectory_type(_: Dataset, scenario: ScenarioRecord) -> str | None:
-    road, directions = (
-        scenario["road_type"],
-        (scenario["ego_direction"], scenario["other_direction"]),
-    )
+    road = scenario["road_type"]
+    directions = (scenario["ego_direction"], scenario["other_direction"])
     if road is None or None in directions:
         return None
-    return (
-        _STRAIGHT if road.startswith("four") and directions == ("straight", "straight") else TURNING
-    )
+    is_straight = road.startswith("four") and directions == ("straight", "straight")
+    return _STRAIGHT if is_straight else TURNING
 
 
 def _closing_speed(dataset: Dataset, scenario: ScenarioRecord) -> float | None:
@@ -202,33 +210,36 @@ def _closing_speed(dataset: Dataset, scenario: ScenarioRecord) -> float | None:
         return None
     try:
         contact = collision(dataset, scenario)
-    except NotAvailableError:  # no label shows the pair
+    except NotAvailableError:  # No label shows the pair.
         return None
-    return None if contact is None or math.isnan(contact.closing_speed) else contact.closing_speed
+    if contact is None or math.isnan(contact.closing_speed):
+        return None
+    return contact.closing_speed
 
 
 def _hidden_collider(dataset: Dataset, scenario: ScenarioRecord) -> bool | None:
     accident = scenario if scenario["collision"] is not None else twin_of(dataset, scenario)
-    return None if accident is None else hidden_collider(dataset, accident)
+    if accident is None:
+        return None
+    return hidden_collider(dataset, accident)
 
 
-def _of_moving_pairs(name: str) -> Field:
-    """One of the fields that are measures of a scenario's interactions."""
+def _moving_pair_field(name: str) -> Field:
+    """Return a field that is a measure of a scenario's interactions."""
 
     def read_all(dataset: Dataset, scenarios: Sequence[ScenarioRecord]) -> Iterable[float | None]:
-        from deepaccident_devkit.interactions.scenario import (
-            each_of_moving_pairs,
-        )  # other fields do without it
+        # Other fields do not need this module.
+        from deepaccident_devkit.interactions.scenario import each_of_moving_pairs
 
         return each_of_moving_pairs(name, dataset, scenarios)
 
     def read(dataset: Dataset, scenario: ScenarioRecord) -> float | None:
         return next(iter(read_all(dataset, [scenario])))
 
-    return Field(name, "measure", _OF_MOVING_PAIRS[name], read, costly=True, read_all=read_all)
+    return Field(name, "measure", _MOVING_PAIR_DOCS[name], read, costly=True, read_all=read_all)
 
 
-_DERIVED = (
+_DERIVED_FIELDS = (
     Field(
         "weather_group",
         "word",
@@ -272,34 +283,38 @@ _DERIVED = (
         "collision_ids",
         "number",
         "Actors of the colliding pair, one of which must match.",
-        _of_collision("ids"),
+        _collision_reader("ids"),
     ),
     Field(
         "collision_classes",
         "word",
         "Those of the colliding pair, one of which must match.",
-        _of_collision("classes"),
+        _collision_reader("classes"),
         taxonomy.CATEGORIES,
     ),
     Field(
         "collision_agents",
         "word",
         "Those of the colliding pair, one of which must match.",
-        _of_collision("agents"),
+        _collision_reader("agents"),
         taxonomy.VEHICLE_AGENTS,
     ),
     Field(
-        "spawn_relation", "word", "As meta names it.", _of_collision("spawn_relation"), groups=True
+        "spawn_relation",
+        "word",
+        "As meta names it.",
+        _collision_reader("spawn_relation"),
+        groups=True,
     ),
     Field(
         "contact_side",
         "word",
         "As meta names it.",
-        _of_collision("contact_side"),
+        _collision_reader("contact_side"),
         taxonomy.CONTACT_SIDES,
         groups=True,
     ),
-    Field("impact", "measure", "As meta has it.", _of_collision("impact")),
+    Field("impact", "measure", "As meta has it.", _collision_reader("impact")),
     Field(
         "closing_speed",
         "measure",
@@ -307,7 +322,7 @@ _DERIVED = (
         _closing_speed,
         costly=True,
     ),
-    *map(_of_moving_pairs, _OF_MOVING_PAIRS),
+    *map(_moving_pair_field, _MOVING_PAIR_DOCS),
     Field(
         "accident_visibility",
         "word",
@@ -319,21 +334,17 @@ _DERIVED = (
     Field(
         "hidden_collider",
         "flag",
-        "Whether one of the pair is hidden from ego, 2 to 1 s before the impact; of a twin, in its accident.",
+        "Whether one of the pair is hidden from ego, 2 to 1 s before the impact; "
+        "of a twin, in its accident.",
         _hidden_collider,
         costly=True,
         groups=True,
     ),
 )
-FIELDS: Final = {
-    field.name: field
-    for field in (
-        *(
-            _column(column)
-            for column in table_spec("scenario").columns
-            if not isinstance(column.kind, Struct)
-        ),
-        *_DERIVED,
-    )
-}
-"""All fields by name: the columns of the scenario table, and what is derived from them."""
+_COLUMN_FIELDS = [
+    _column_field(column)
+    for column in table_spec("scenario").columns
+    if not isinstance(column.kind, Struct)
+]
+FIELDS: Final = {field.name: field for field in (*_COLUMN_FIELDS, *_DERIVED_FIELDS)}
+"""All fields by name: the columns of the scenario table, and fields derived from them."""

@@ -1,4 +1,4 @@
-"""What others measured of the real release, and what our readers take for granted: the table behind `info --facts`.
+"""Facts measured on the real release, and assumptions of our readers, behind `info --facts`.
 
 docs/validation.md, Facts of the real release, defines the rows.
 """
@@ -18,30 +18,36 @@ FactVerdict = Literal["agree", "differ", "cannot say"]
 FactKind = Literal[
     "all", "some", "share", "mean", "median", "few", "most", "least", "area", "range"
 ]
-"""What is compared: a share (that must be all, or some, or is a number), a mean, a median, percentiles where there are
-few real cases, the most, the least, an AUC, or a median that lies in a range."""
+"""How a fact is compared.
+
+`all`, `some` and `share` are shares: always, sometimes, or a number. `few` are percentiles where
+there are few real cases, `most` and `least` extremes, `area` an AUC, and `range` a median that
+lies in a range.
+"""
 
 
 @dataclass(frozen=True, slots=True)
 class Fact(ShortRepr):
-    """One fact; and, once a release was looked at, what it has of it. Shares are from 0 to 1.
+    """One fact and, once a release was examined, the release's value of it. Shares are from 0 to 1.
 
     Attributes:
-        key: of `ScenarioFacts.values`.
-        name: what it is.
-        kind: how it is compared.
-        confidence: `A`: several sources, or recomputed; `B`: one source; `C`: a remark; empty for what our readers take
-            for granted.
-        source: the part of the real release that was measured; empty for our readers'.
-        real_cases: how many real cases there were; 0 where that is not known.
-        real: what others measured: one number, of `few` one or more, none of `all`, `some` and `range`.
-        unit: of the numbers; `share` for shares.
-        limits: between which numbers it agrees, of all kinds but `share`, `mean`, `median` and `few`.
-        here: the release's share, mean, median, most, least or AUC; None where it has none.
-        ends: of its 95 % interval, or the 5th and 95th percentile for few real cases; None where there is none.
-        cases: how many cases there are here.
-        scenarios: how many scenarios they are of.
-        verdict: whether the two agree.
+        key: Key in `ScenarioFacts.values`.
+        name: Description.
+        kind: How it is compared.
+        confidence: `A`: several sources, or recomputed; `B`: one source; `C`: a remark; empty for
+            an assumption of our readers.
+        source: Part of the real release that was measured; empty for an assumption of our readers.
+        real_cases: Number of real cases; 0 where unknown.
+        real: Published values: one number, of `few` at least one, none of `all`, `some` and
+            `range`.
+        unit: Unit of the numbers; `share` for shares.
+        limits: Lowest and highest value that agrees, of all kinds but `share`, `mean`, `median` and
+            `few`.
+        here: The release's share, mean, median, most, least or AUC; None where it has none.
+        ends: Ends of its 95 % interval, or 5th and 95th percentile of `few`; None without a value.
+        cases: Number of cases in the release.
+        scenarios: Number of scenarios with a case.
+        verdict: Whether the release agrees.
     """
 
     key: str
@@ -60,36 +66,25 @@ class Fact(ShortRepr):
     verdict: FactVerdict = "cannot say"
 
     def texts(self) -> tuple[str, ...]:
-        """A table's cells: fact, confidence, others, here, cases, verdict."""
+        """Return a table's cells: fact, confidence, others, here, cases, verdict."""
         words = {"all": "always", "some": "occurs", "range": _text(self.limits, self.unit, " to ")}
-        of = (
-            f" ({self.source}{f', {self.real_cases:,}' if self.real_cases else ''})"
-            if self.source
-            else ""
-        )
-        others = words.get(self.kind) or _text(self.real, self.unit)
-        here = "–" if self.here is None else _text([self.here], self.unit)
-        within = (
-            f" [{_text(self.ends or (), self.unit, ' … ')}]"
-            if len({self.here, *(self.ends or ())}) > 1
-            else ""
-        )
-        return (
-            self.name,
-            self.confidence,
-            others + of,
-            here + within,
-            f"{self.cases:,}",
-            self.verdict,
-        )
+        published = words.get(self.kind) or _text(self.real, self.unit)
+        if self.source:
+            cases = f", {self.real_cases:,}" if self.real_cases else ""
+            published += f" ({self.source}{cases})"
+        value = "–" if self.here is None else _text([self.here], self.unit)
+        if len({self.here, *(self.ends or ())}) > 1:
+            value += f" [{_text(self.ends or (), self.unit, ' … ')}]"
+        return (self.name, self.confidence, published, value, f"{self.cases:,}", self.verdict)
 
 
-def _text(values: Sequence[float], unit: str, between: str = ", ") -> str:
+def _text(values: Sequence[float], unit: str, separator: str = ", ") -> str:
     scale, sign = (100, "%") if unit == "share" else (1, unit)
-    return f"{between.join(f'{scale * each:.3g}' for each in values)} {sign}".rstrip()
+    numbers = separator.join(f"{scale * value:.3g}" for value in values)
+    return f"{numbers} {sign}".rstrip()
 
 
 FACTS: Final[tuple[Fact, ...]] = as_record(
     json.loads(Path(__file__).with_suffix(".json").read_bytes()), tuple[Fact, ...]
 )
-"""Every row of the table, in its order, as `real_facts.json` has them."""
+"""All rows of the table, in its order, from `real_facts.json`."""

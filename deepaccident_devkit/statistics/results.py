@@ -1,4 +1,4 @@
-"""The parts of statistics: counts by a word, histograms, quantiles, colliding pairs; each also as rows of CSV."""
+"""Parts of statistics, also as rows of CSV: counts by word, histograms, quantiles, pairs."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 TOTAL: Final = "total"
 UNKNOWN_SPLIT: Final = "unknown"
 GROUPS: Final = (TOTAL, *SPLITS, UNKNOWN_SPLIT)
-"""The groups of counts: all scenarios, those of each split, those whose split is unknown."""
+"""The groups of counts: all scenarios, each split, and scenarios without a known split."""
 
 NO_ACCIDENT: Final = "no accident"
 WITH_PEDESTRIAN: Final = "collide with pedestrians"
@@ -29,13 +29,16 @@ ENDS: Final = (
     *(f"design {number}" for number in range(1, 13)),
     NO_DESIGN,
 )
-"""How a scenario can end, as the reference's statistics say it: designs 1–6 signalised, 7–12 not; the reference calls
-a collision of two agents that realises none of them `none`."""
+"""How a scenario can end, as in the reference's statistics.
+
+Designs 1–6 are signalised, 7–12 are not; the reference calls a collision of two agents that
+realises none of them `none`.
+"""
 
 CRITICAL: Final = "scenario_min_ttcs"
 """Name of the histogram of the most critical pairs."""
 PROBABILITIES: Final = (0.0, 0.05, 0.25, 0.5, 0.75, 0.95, 1.0)
-"""Of all quantiles; the first and last are the extremes."""
+"""Probabilities of all quantiles; 0 and 1 are the extremes."""
 
 _Cell = str | int | float | None
 StatisticsRow = tuple[_Cell, ...]
@@ -46,8 +49,8 @@ class LeftOut(ShortRepr):
     """Items that a table does not count, since they have no value.
 
     Attributes:
-        what: what they are and why.
-        counts: group → how many.
+        what: Description of the items and of the reason.
+        counts: Group → number of items.
     """
 
     what: str
@@ -56,15 +59,15 @@ class LeftOut(ShortRepr):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CountTable(ShortRepr):
-    """How many there are of each value of a word.
+    """Counts by the values of a field.
 
     Attributes:
-        name: of the table, also of its file.
-        title: for people.
-        field: what the values are, such as `weather`.
-        counted: what is counted: `scenarios`, `frames`, `instances`, `annotations`.
-        counts: value → group → how many.
-        left_out: what is not counted.
+        name: Name of the table, also of its file.
+        title: Title for people.
+        field: Field of the values, such as `weather`.
+        counted: What is counted: `scenarios`, `frames`, `instances`, `annotations`.
+        counts: Value → group → count.
+        left_out: Items that are not counted.
     """
 
     name: str
@@ -75,29 +78,31 @@ class CountTable(ShortRepr):
     left_out: LeftOut | None = None
 
     def total(self, group: str = TOTAL) -> int:
-        """Everything that is counted in a group."""
+        """Return the sum over all values in a group."""
         return sum(row[group] for row in self.counts.values())
 
     def rows(self) -> list[StatisticsRow]:
-        """A heading, then a row a value."""
-        rows: list[StatisticsRow] = [(value, *row.values()) for value, row in self.counts.items()]
-        return [(self.field, *GROUPS), *rows]
+        """Return a heading, then a row a value."""
+        rows: list[StatisticsRow] = [(self.field, *GROUPS)]
+        for value, counts in self.counts.items():
+            rows.append((value, *counts.values()))
+        return rows
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Histogram(ShortRepr):
-    """How a number is distributed.
+    """Distribution of a number.
 
     Attributes:
-        name: of the table, also of its file.
-        title: for people.
-        field: what the number is.
-        unit: of the number.
-        counted: what is counted.
-        edges: B + 1 ascending edges; a bin holds its lower edge, the last one both.
-        counts: group → how many in each of the B bins.
-        outside: group → how many lie below the first edge or above the last.
-        left_out: what has no value.
+        name: Name of the table, also of its file.
+        title: Title for people.
+        field: Name of the number.
+        unit: Unit of the number.
+        counted: What is counted.
+        edges: B + 1 ascending edges; a bin holds its lower edge, the highest bin both edges.
+        counts: Group → count in each of the B bins.
+        outside: Group → count under the lowest edge or over the highest.
+        left_out: Items without a value.
     """
 
     name: str
@@ -111,30 +116,35 @@ class Histogram(ShortRepr):
     left_out: LeftOut | None = None
 
     def total(self, group: str = TOTAL) -> int:
-        """Everything that is counted in a group, outside of the bins too."""
+        """Return the sum over a group, with the values outside of the bins."""
         return sum(self.counts[group]) + self.outside[group]
 
     def bin_labels(self) -> list[str]:
-        """What each bin of whole numbers holds: `30–39`, …, `90–100`."""
-        return [f"{low:g}–{high - (high < self.edges[-1]):g}" for low, high in pairwise(self.edges)]
+        """Return the range of whole numbers in each bin: `30–39`, …, `90–100`."""
+        labels = []
+        for low, high in pairwise(self.edges):
+            highest = high - (high < self.edges[-1])
+            labels.append(f"{low:g}–{highest:g}")
+        return labels
 
     def rows(self) -> list[StatisticsRow]:
-        """A heading, a row a bin, and one of what lies outside."""
+        """Return a heading, a row a bin, and a row of values outside."""
         bins = zip(self.edges[:-1], self.edges[1:], *self.counts.values(), strict=True)
         heading = (f"{self.field} from ({self.unit})", f"to ({self.unit})", *GROUPS)
-        return [heading, *bins, ("outside", None, *self.outside.values())]
+        outside = ("outside", None, *self.outside.values())
+        return [heading, *bins, outside]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class QuantileRow(ShortRepr):
-    """The quantiles of one number of one category in one group.
+    """Quantiles of a number for one category in one group.
 
     Attributes:
-        field: what the number is.
-        category: whose it is.
-        group: of `GROUPS`.
-        number: how many values there are.
-        values: the quantiles at `PROBABILITIES`, linear between neighbours; None without a value.
+        field: Name of the number.
+        category: Category of the objects.
+        group: One of `GROUPS`.
+        number: Number of values.
+        values: Quantiles at `PROBABILITIES`, linear between neighbours; None without a value.
     """
 
     field: str
@@ -149,12 +159,12 @@ class QuantileTable(ShortRepr):
     """Quantiles of one or more numbers, by category and group.
 
     Attributes:
-        name: of the table, also of its file.
-        title: for people.
-        unit: of all values.
-        counted: what the values belong to.
-        quantiles: the rows.
-        left_out: what has no value.
+        name: Name of the table, also of its file.
+        title: Title for people.
+        unit: Unit of all values.
+        counted: What the values belong to.
+        quantiles: Rows of the table.
+        left_out: Items without a value.
     """
 
     name: str
@@ -165,48 +175,49 @@ class QuantileTable(ShortRepr):
     left_out: LeftOut | None = None
 
     def row(self, field: str, category: str, group: str = TOTAL) -> QuantileRow:
-        """The row of a field, category and group; raises KeyError."""
+        """Return the row of a field, category and group; raises KeyError."""
         for row in self.quantiles:
             if (row.field, row.category, row.group) == (field, category, group):
                 return row
         raise KeyError((field, category, group))
 
     def median(self, field: str, category: str, group: str = TOTAL) -> float | None:
-        """The median of a field, category and group, None without a value; raises KeyError."""
+        """Return a median, None without a value; raises KeyError."""
         values = self.row(field, category, group).values
-        return None if values is None else values[PROBABILITIES.index(0.5)]
+        if values is None:
+            return None
+        return values[PROBABILITIES.index(0.5)]
 
     def rows(self) -> list[StatisticsRow]:
-        """A heading, then a row a field, category and group."""
+        """Return a heading, then a row a field, category and group."""
         names = [f"q{round(100 * probability)} ({self.unit})" for probability in PROBABILITIES]
-        absent = (None,) * len(PROBABILITIES)
-        return [
-            ("field", "category", "group", "number", *names),
-            *(
-                (row.field, row.category, row.group, row.number, *(row.values or absent))
-                for row in self.quantiles
-            ),
-        ]
+        rows: list[StatisticsRow] = [("field", "category", "group", "number", *names)]
+        for row in self.quantiles:
+            values = row.values or (None,) * len(PROBABILITIES)
+            rows.append((row.field, row.category, row.group, row.number, *values))
+        return rows
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CollisionPair(ShortRepr):
     """The colliding pair of a scenario at its last frame, by the merged tracks.
 
-    The first of the pair is the agent that comes first in `taxonomy.AGENTS`; without an agent, meta's first.
+    The actor of the pair is the agent that comes first in `taxonomy.AGENTS`; without an agent, it
+    is the one that meta lists first. The other actor is called the other.
 
     Attributes:
-        scenario: its token.
-        split: the group that it counts for, besides `total`.
-        end: of `ENDS`.
-        actor: name of the first's agent, None if it records nothing.
-        category: of the first.
-        other: name of the other's agent, None if it records nothing.
-        other_category: of the other.
-        angle: the other's heading less the first's, degrees, counter-clockwise, in [−15, 345): 0 same direction,
-            90 the other drives to the first's left, 180 head-on, 270 to its right.
-        x: centre of the other, forward of the first's centre, metres.
-        y: the same, to the left.
+        scenario: Token of the scenario.
+        split: Group that the pair counts for, besides `total`.
+        end: One of `ENDS`.
+        actor: Name of the actor's agent, None if it records nothing.
+        category: Category of the actor.
+        other: Name of the other's agent, None if it records nothing.
+        other_category: Category of the other.
+        angle: The other's heading less the actor's, degrees, counter-clockwise, in [−15, 345):
+            0 same direction, 90 the other drives to the actor's left, 180 head-on, 270 to its
+            right.
+        x: Centre of the other in front of the actor's centre, metres.
+        y: Centre of the other to the left of the actor's centre, metres.
     """
 
     scenario: str
@@ -222,20 +233,21 @@ class CollisionPair(ShortRepr):
 
 
 def collision_rows(pairs: tuple[CollisionPair, ...]) -> list[StatisticsRow]:
-    """A heading, then a row a pair."""
-    return [
-        tuple(field.name for field in fields(CollisionPair)),
-        *(astuple(pair) for pair in pairs),
-    ]
+    """Return a heading, then a row a pair."""
+    heading = tuple(field.name for field in fields(CollisionPair))
+    return [heading, *map(astuple, pairs)]
 
 
 StatisticsTable = CountTable | Histogram | QuantileTable
 
 
 def scenario_end(scenario: ScenarioRecord, agents: Sequence[AgentRecord]) -> str | None:
-    """How a scenario ended, one of `ENDS`, by it and its agents here; None without meta, or where meta is silent."""
+    """Return how a scenario ended, one of `ENDS`; None without meta, or where meta is silent.
+
+    `agents` are the scenario's agents in the release.
+    """
     collision = scenario["collision"]
-    if scenario["weather"] is None:  # there is no meta
+    if scenario["weather"] is None:  # The scenario has no meta.
         return None
     if collision is None:
         return NO_ACCIDENT
@@ -249,27 +261,30 @@ def scenario_end(scenario: ScenarioRecord, agents: Sequence[AgentRecord]) -> str
 def _undesigned_end(
     scenario: ScenarioRecord, collision: CollisionRecord, agents: Sequence[AgentRecord]
 ) -> str | None:
-    """Of a collision that realises no design: whether its pair are agents; None where meta is silent."""
-    here = {agent["name"]: agent["actor_id"] for agent in agents if not agent["is_infrastructure"]}
-    names = collision["agents"] or (None, None)
-    missing = set(VEHICLE_AGENTS) - set(
-        here
-    )  # of a partial download: meta's names stand for their ids
-    if None in here.values() or (missing and collision["agents"] is None):
+    """Return the end of a collision without a design: whether its pair are agents.
+
+    None is returned where meta is silent.
+    """
+    vehicles = [agent for agent in agents if not agent["is_infrastructure"]]
+    agent_ids = [agent["actor_id"] for agent in vehicles]
+    # Of agents that a partial download lacks, meta's names stand for the ids.
+    missing_agents = set(VEHICLE_AGENTS) - {agent["name"] for agent in vehicles}
+    if None in agent_ids or (missing_agents and collision["agents"] is None):
         return None
-    if not all(
-        actor in here.values() or name in missing
-        for actor, name in zip(collision["ids"], names, strict=True)
-    ):
-        return WITH_OTHER
-    story = ("road_type", "spawn_side", "ego_direction", "other_direction")
-    return None if None in [scenario[word] for word in story] else NO_DESIGN  # type: ignore[literal-required]
+    names = collision["agents"] or (None, None)
+    for actor, name in zip(collision["ids"], names, strict=True):
+        if actor not in agent_ids and name not in missing_agents:
+            return WITH_OTHER
+    for field in ("road_type", "spawn_side", "ego_direction", "other_direction"):
+        if scenario[field] is None:
+            return None
+    return NO_DESIGN
 
 
 def word_of(scenario: ScenarioRecord, field: str) -> str | None:
-    """What a scenario counts as in tables of a field of its record."""
+    """Return the word that a scenario counts under in tables of a field of its record."""
     if field != "collision":
         return scenario[field]  # type: ignore[literal-required,no-any-return]
-    if scenario["weather"] is None:  # there is no meta
+    if scenario["weather"] is None:  # The scenario has no meta.
         return None
     return "yes" if scenario["collision"] else "no"

@@ -1,4 +1,4 @@
-"""The release as relational tables: their columns, the index they are made into, and the opened store."""
+"""The release as relational tables: their columns, their index, and the opened store."""
 
 from deepaccident_devkit.tables.boxes import displacement_velocities, visible_ids, visible_mask
 from deepaccident_devkit.tables.index import (

@@ -1,8 +1,8 @@
-"""Tables on disk: one Arrow file a table with one uncompressed batch, written by streaming, read memory-mapped.
+"""Tables on disk: one Arrow file a table with one uncompressed batch, streamed and memory-mapped.
 
-How each kind of column is stored in Arrow, and how it is read back without copying, is at the end.
-The rows of some tables that are kept together, such as a scenario's, are compressed Arrow streams one after the other.
-They are few, and so neither written nor read by Arrow's threads.
+The end of the module defines how each kind of column is stored in Arrow, and how it is read back
+without copying. Rows of several tables that belong together, such as a scenario's, are compressed
+Arrow streams one after the other. They are few, and so neither written nor read by Arrow's threads.
 """
 
 from collections.abc import Mapping, Sequence
@@ -38,67 +38,77 @@ from deepaccident_devkit.tables.records import record_columns
 ColumnArrays = Mapping[str, Any]
 """Stored column name → array (or list, for words) of one table's rows."""
 HASHES = "hashes"
-"""A word of kept rows, and of the table of scenarios: the hashes of the files that these were made from, as JSON."""
+"""Metadata key of scenario rows and of the table of scenarios: hashes of source files, as JSON."""
 DAMAGED_INDEX_REMEDY = "mend it with: deepaccident check index DATAROOT"
-"""What to do with a damaged table."""
+"""Remedy for a damaged table."""
 
 
 def damaged_value(table: str) -> IndexStoreError:
-    """The error for a row key, a count or a code beyond what it counts: only damage to a file makes one."""
+    """Return the error for a row key, a count or a code out of range.
+
+    Only damage to a file makes such a value.
+    """
     return IndexStoreError(
-        f"the index is damaged: table '{table}' holds a value out of its range; {DAMAGED_INDEX_REMEDY}"
+        f"the index is damaged: table '{table}' holds a value out of its range; "
+        f"{DAMAGED_INDEX_REMEDY}"
     )
 
 
 def table_path(folder: Path, table: str) -> Path:
-    """The file of one table."""
+    """Return the file of a table."""
     return folder / f"{table}.arrow"
 
 
 class TableWriter(ExitStack):
     """Collects a table's rows piece by piece and writes them as one batch.
 
-    Rows of fixed width go to a scratch file a column, without a name; the batch is then written from these,
-    memory-mapped, so that a table of any size needs little memory. A context manager: leaving it removes these files.
+    Rows of fixed width go to a scratch file a column, without a name; the batch is then written
+    from these, memory-mapped, so that a table of any size needs little memory. A context manager:
+    leaving it removes these files.
     """
 
     def __init__(self, folder: Path, spec: TableSpec) -> None:
         """Start writing the table to `folder`, which must exist."""
         super().__init__()
-        self._folder, self._spec, self.num_rows = folder, spec, 0
-        self._columns: dict[str | None, Any] = {
-            column.stored: self.enter_context(TemporaryFile(dir=folder))  # noqa: SIM115
-            if is_streamable(spec)
-            else []
-            for column in spec.stored_columns
-        }
+        self._folder = folder
+        self._spec = spec
+        self.num_rows = 0
+        self._columns: dict[str | None, Any] = {}
+        for column in spec.stored_columns:
+            self._columns[column.stored] = []
+            if is_streamable(spec):
+                scratch_file = self.enter_context(TemporaryFile(dir=folder))  # noqa: SIM115
+                self._columns[column.stored] = scratch_file
 
     def append(self, columns: ColumnArrays) -> None:
-        """Add rows; every stored column must be there, all of one length."""
+        """Add rows, with arrays of one length for all stored columns."""
         for column in self._spec.stored_columns:
-            values, collected = columns[column.stored or ""], self._columns[column.stored]
+            values = columns[column.stored or ""]
+            collected = self._columns[column.stored]
             if isinstance(collected, list):
                 collected.extend(values)
             else:
                 np.ascontiguousarray(values, dtype=numpy_dtype(column.kind)).tofile(collected)
         self.num_rows += len(columns[self._spec.stored_columns[0].stored or ""])
 
-    def finish(self, words: Mapping[str, str]) -> None:
-        """Write the table's file, with words about the table as a whole."""
+    def finish(self, metadata: Mapping[str, str]) -> None:
+        """Write the table's file, with metadata of the table."""
         import pyarrow as pa
 
         columns = {
             column.stored or "": self._collected(column) for column in self._spec.stored_columns
         }
+        schema = arrow_schema(self._spec).with_metadata(dict(metadata))
         with (
             replacing(table_path(self._folder, self._spec.name)) as temporary,
             pa.OSFile(str(temporary), "wb") as sink,
-            pa.ipc.new_file(sink, arrow_schema(self._spec).with_metadata(dict(words))) as writer,
+            pa.ipc.new_file(sink, schema) as writer,
         ):
             writer.write_batch(record_batch(self._spec, columns))
 
     def _collected(self, column: Column) -> Any:
-        collected, dtype = self._columns[column.stored], numpy_dtype(column.kind)
+        collected = self._columns[column.stored]
+        dtype = numpy_dtype(column.kind)
         if isinstance(collected, list):
             return collected
         shape = (self.num_rows, width(column.kind)) if width(column.kind) > 1 else (self.num_rows,)
@@ -107,13 +117,13 @@ class TableWriter(ExitStack):
         collected.flush()
         try:
             return np.memmap(collected, dtype=dtype, mode="r", shape=shape)
-        except OSError:  # its file system cannot map files
+        except OSError:  # The file system cannot map files.
             collected.seek(0)
             return np.fromfile(collected, dtype=dtype).reshape(shape)
 
 
 def write_table(folder: Path, spec: TableSpec, columns: ColumnArrays) -> None:
-    """Write a whole table at once."""
+    """Write a complete table at once."""
     with TableWriter(folder, spec) as writer:
         writer.append(columns)
         writer.finish({})
@@ -123,10 +133,10 @@ class StoredTable:
     """A table's file, memory-mapped.
 
     Attributes:
-        spec: its columns.
-        views: stored column name → view of it (numpy arrays are read-only).
-        num_rows: its length.
-        words: about the table as a whole, as `TableWriter.finish` took them.
+        spec: Columns of the table.
+        views: Stored column name → view of it (numpy arrays are read-only).
+        num_rows: Number of rows.
+        words: Metadata of the table, as in `TableWriter.finish`.
     """
 
     def __init__(self, folder: Path, spec: TableSpec) -> None:
@@ -136,10 +146,11 @@ class StoredTable:
         path = table_path(folder, spec.name)
         try:
             batch = pa.ipc.open_file(mapped_file(path)).get_batch(0)
-            if fault := _batch_fault(spec, batch):
+            fault = _batch_fault(spec, batch)
+            if fault:
                 raise OSError(fault)
             self.views = views(spec, batch)
-            self.words = _words(batch.schema)
+            self.words = _decode_metadata(batch.schema)
         except FileNotFoundError:
             raise IndexStoreError(
                 f"{path}: no such file: the index was made again; open the release again"
@@ -155,11 +166,15 @@ class StoredTable:
 
     @cached_property
     def table(self) -> Any:
-        """The `pyarrow.Table` over the mapped memory; raises IndexStoreError if Arrow could not read a value."""
+        """The `pyarrow.Table` over the mapped memory.
+
+        Raises IndexStoreError if Arrow could not read a value.
+        """
         import pyarrow as pa
 
         table = pa.Table.from_batches([self._batch])
-        if fault := value_fault_of(self.spec, table):
+        fault = value_fault_of(self.spec, table)
+        if fault:
             raise IndexStoreError(
                 f"{self._path}: damaged ({shortened(fault)}); {DAMAGED_INDEX_REMEDY}"
             )
@@ -169,54 +184,57 @@ class StoredTable:
 def streams(
     tables: Sequence[tuple[TableSpec, ColumnArrays]], metadata: Mapping[str, str] | None = None
 ) -> bytes:
-    """The rows of each table, with or without words, as compressed Arrow streams one after the other."""
+    """Return the rows of each table as compressed Arrow streams one after the other."""
     import pyarrow as pa
 
     options = pa.ipc.IpcWriteOptions(compression="zstd", use_threads=False)
     sink = pa.BufferOutputStream()
     for spec, columns in tables:
-        with pa.ipc.new_stream(
-            sink, arrow_schema(spec).with_metadata(dict(metadata or {})), options=options
-        ) as writer:
+        schema = arrow_schema(spec).with_metadata(dict(metadata or {}))
+        with pa.ipc.new_stream(sink, schema, options=options) as writer:
             writer.write_batch(record_batch(spec, columns))
     content: bytes = sink.getvalue().to_pybytes()
     return content
 
 
 def streams_metadata(content: bytes) -> dict[str, str]:
-    """The words of `streams`."""
+    """Return the metadata of `streams`."""
     import pyarrow as pa
 
-    return _words(pa.ipc.open_stream(content).schema)
+    return _decode_metadata(pa.ipc.open_stream(content).schema)
 
 
-def _words(schema: Any) -> dict[str, str]:
-    return {name.decode(): value.decode() for name, value in (schema.metadata or {}).items()}
+def _decode_metadata(schema: Any) -> dict[str, str]:
+    metadata = schema.metadata or {}
+    return {name.decode(): value.decode() for name, value in metadata.items()}
 
 
 def read_streams(source: Any, specs: Sequence[TableSpec]) -> list[dict[str, Any]] | None:
-    """Of each table stored column → values, as `streams` took them; None if they are not of these tables."""
+    """Return stored column → values of each table in `streams`; None if they are other tables."""
     import pyarrow as pa
 
     options = pa.ipc.IpcReadOptions(use_threads=False)
     tables = []
     for spec in specs:
-        batches = list(
-            pa.ipc.open_stream(source, options=options)
-        )  # to the stream's end, where the next one starts
+        # Reading to the stream's end leaves the source where the next stream starts.
+        batches = list(pa.ipc.open_stream(source, options=options))
         if len(batches) != 1 or _batch_fault(spec, batches[0]):
             return None
-        tables.append({name: unpacked(view) for name, view in views(spec, batches[0]).items()})
+        columns = views(spec, batches[0])
+        tables.append({name: unpacked(view) for name, view in columns.items()})
     return tables
 
 
 def is_streamable(spec: TableSpec) -> bool:
-    """Whether every column has a fixed width, so that rows can be appended to raw files."""
-    return not any(isinstance(column.kind, Word | Struct) for column in spec.stored_columns)
+    """Return whether every column has a fixed width, so that rows can be appended to raw files."""
+    for column in spec.stored_columns:
+        if isinstance(column.kind, Word | Struct):
+            return False
+    return True
 
 
 def numpy_dtype(kind: ColumnKind) -> np.dtype[Any]:
-    """The element type of a fixed-width column (bool one byte a row, as long as it is not packed)."""
+    """Return the element type of a fixed-width column (bool: one byte a row until it is packed)."""
     if isinstance(kind, Key):
         return np.dtype(np.int32)
     if isinstance(kind, Choice):
@@ -227,13 +245,13 @@ def numpy_dtype(kind: ColumnKind) -> np.dtype[Any]:
 
 
 def width(kind: ColumnKind) -> int:
-    """Elements a row of a fixed-width column."""
+    """Return the number of elements a row of a fixed-width column."""
     return kind.length if isinstance(kind, Vector) else 1
 
 
 @cache
 def arrow_type(kind: ColumnKind) -> Any:
-    """The Arrow type of a stored column."""
+    """Return the Arrow type of a stored column."""
     import pyarrow as pa
 
     if isinstance(kind, Word):
@@ -248,21 +266,19 @@ def arrow_type(kind: ColumnKind) -> Any:
 
 
 def arrow_schema(spec: TableSpec) -> Any:
-    """The Arrow schema of a table; each field's metadata carries its documentation."""
+    """Return the Arrow schema of a table, with documentation in each field's metadata."""
     import pyarrow as pa
 
-    return pa.schema(
-        [
-            pa.field(
-                column.stored, arrow_type(column.kind), column.nullable, {"doc": column.kind.doc}
-            )
-            for column in spec.stored_columns
-        ]
-    )
+    fields = []
+    for column in spec.stored_columns:
+        metadata = {"doc": column.kind.doc}
+        field = pa.field(column.stored, arrow_type(column.kind), column.nullable, metadata)
+        fields.append(field)
+    return pa.schema(fields)
 
 
 def record_batch(spec: TableSpec, columns: ColumnArrays) -> Any:
-    """One Arrow record batch over columns; numbers are not copied (bools are packed)."""
+    """Return one Arrow record batch over columns; numbers are not copied (bools are packed)."""
     import pyarrow as pa
 
     arrays = [_arrow_array(column, columns[column.stored or ""]) for column in spec.stored_columns]
@@ -270,19 +286,23 @@ def record_batch(spec: TableSpec, columns: ColumnArrays) -> Any:
 
 
 def views(spec: TableSpec, batch: Any) -> dict[str, Any]:
-    """Stored column name → a view of the batch's memory: numpy arrays, `BitView`s, Arrow arrays for words."""
-    return {
-        column.stored: _view(column.kind, batch.column(position))
-        for position, column in enumerate(spec.stored_columns)
-        if column.stored
-    }
+    """Return stored column name → a view of the batch's memory.
+
+    Views are numpy arrays, `BitView`s, or Arrow arrays for words.
+    """
+    columns = {}
+    for index, column in enumerate(spec.stored_columns):
+        if column.stored:
+            columns[column.stored] = _view(column.kind, batch.column(index))
+    return columns
 
 
 def _batch_fault(spec: TableSpec, batch: Any) -> str | None:
-    """Why a batch that was read from a file is not one of the table's, None if its parts fit together.
+    """Return why a batch from a file is not one of the table's; None if its parts fit together.
 
-    Fixed-width columns are not read: only their sizes are checked, at no cost for a table of any length. Words and
-    structs are small tables' and read in full, since Arrow would follow a damaged offset out of its memory.
+    Fixed-width columns are not read: only their sizes are checked, at no cost for a table of any
+    length. Words and structs occur in small tables and are read in full, since Arrow would follow a
+    damaged offset out of its memory.
     """
     import pyarrow as pa
 
@@ -297,9 +317,10 @@ def _batch_fault(spec: TableSpec, batch: Any) -> str | None:
 
 
 def value_fault_of(spec: TableSpec, table: Any) -> str | None:
-    """What Arrow itself could not read of a table that is whole by `_batch_fault`; None if there is nothing.
+    """Return what Arrow itself could not read of a table without `_batch_fault`; None if nothing.
 
-    Reads the codes of all choices, those of 8.6 million rows in 20 ms. The devkit's own views use no dictionary.
+    The codes of all choices are read, for 8.6 million rows in 20 ms. The devkit's own views use no
+    dictionary.
     """
     import pyarrow as pa
 
@@ -317,7 +338,7 @@ def value_fault_of(spec: TableSpec, table: Any) -> str | None:
 
 
 def unpacked(view: Any) -> Any:
-    """A view as what `record_batch` takes: bools as an array, words as a list."""
+    """Return a view in the form for `record_batch`: bools as an array, words as a list."""
     if isinstance(view, BitView):
         return view[:]
     return view if isinstance(view, np.ndarray) else view.to_pylist()
@@ -327,9 +348,10 @@ def _struct_type(record: type) -> Any:
     import pyarrow as pa
 
     def field_type(kind: ColumnKind) -> Any:
-        if isinstance(kind, Items):
-            return pa.list_(pa.int64() if kind.type == "integer" else pa.string(), 2)
-        return arrow_type(kind)
+        if not isinstance(kind, Items):
+            return arrow_type(kind)
+        item_type = pa.int64() if kind.type == "integer" else pa.string()
+        return pa.list_(item_type, 2)
 
     return pa.struct([(column.field, field_type(column.kind)) for column in record_columns(record)])
 
@@ -353,14 +375,16 @@ def _arrow_array(column: Column, values: Any) -> Any:
 
 
 def _validity(data: AnyArray, length: int) -> Any:
-    """Arrow's bitmap of the rows that are not null, from the values that stand beneath nulls."""
+    """Return Arrow's bitmap of rows that are not null, from the values stored under nulls."""
     import pyarrow as pa
 
     if not length:
         return None
-    first = data.reshape(length, -1)[:, 0]
-    valid = ~np.isnan(first) if data.dtype.kind == "f" else first != NULL_INTEGER
-    return None if valid.all() else pa.py_buffer(np.packbits(valid, bitorder="little"))
+    marker = data.reshape(length, -1)[:, 0]
+    valid = ~np.isnan(marker) if data.dtype.kind == "f" else marker != NULL_INTEGER
+    if valid.all():
+        return None
+    return pa.py_buffer(np.packbits(valid, bitorder="little"))
 
 
 def _view(kind: ColumnKind, array: Any) -> Any:
@@ -370,9 +394,9 @@ def _view(kind: ColumnKind, array: Any) -> Any:
         array = array.indices
     length = len(array)
     if isinstance(kind, Vector):
-        return _buffer(
-            array.values.buffers()[1], np.dtype(np.float64), length * kind.length
-        ).reshape(length, kind.length)
+        content = array.values.buffers()[1]
+        size = length * kind.length
+        return _buffer(content, np.dtype(np.float64), size).reshape(length, kind.length)
     content = array.buffers()[1]
     if isinstance(kind, Number) and kind.dtype == "bool":
         return BitView(_buffer(content, np.dtype(np.uint8), (length + 7) // 8), length)
@@ -380,4 +404,6 @@ def _view(kind: ColumnKind, array: Any) -> Any:
 
 
 def _buffer(content: Any, dtype: np.dtype[Any], count: int) -> AnyArray:
-    return np.frombuffer(content, dtype=dtype, count=count) if count else np.zeros(0, dtype=dtype)
+    if not count:
+        return np.zeros(0, dtype=dtype)
+    return np.frombuffer(content, dtype=dtype, count=count)

@@ -1,7 +1,7 @@
-"""What is derived from labels: world poses, chains, instances, tracks, and which annotated actors count as seen.
+"""Data derived from labels: world poses, chains, instances, tracks, and visibility of actors.
 
-Arrays are over the N boxes of one scenario, in the order agent, frame, row. Who is seen is decided by the released rule
-(docs/released_code.md, Visibility and attributes).
+Arrays are over the N boxes of one scenario, in the order agent, frame, row. Visibility follows the
+released rule (docs/released_code.md, Visibility and attributes).
 """
 
 from collections.abc import Mapping, Sequence
@@ -37,16 +37,18 @@ from deepaccident_devkit.taxonomy import (
 NEAR_VEHICLE = 10.0
 NEAR_INFRASTRUCTURE = 15.0
 """Metres from the LiDAR below which (strictly) a box is near."""
-_SMALL = np.array([name in SMALL_CATEGORIES for name in CATEGORIES])
-LEAST_BOXES: Final = 20
-"""With fewer moving boxes it is not known how a scenario's velocities are written."""
+_IS_SMALL = np.array([name in SMALL_CATEGORIES for name in CATEGORIES])
+MIN_BOXES: Final = 20
+"""Moving boxes that a scenario needs to show the frame of its velocities."""
 # m/s; slower actors are not used.
-_LEAST_SPEED = 1.0
-# m/s, and as a share of the speed, within which a velocity fits.
-_FITS = (0.5, 0.15)
-_LEAST_SHARE = 0.5
-# Share of the best frame's boxes from which the release's own frame is taken instead.
-_AS_GOOD = 0.95
+_MIN_SPEED = 1.0
+# Error of a velocity that fits: absolute, and as a share of the speed.
+_TOLERANCE_MPS = 0.5
+_TOLERANCE_SHARE = 0.15
+# Share of the boxes that the best frame must fit.
+_MIN_FIT_SHARE = 0.5
+# Share of the best frame's boxes with which the release's own frame is preferred.
+_RELEASED_FIT_SHARE = 0.95
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -54,13 +56,13 @@ class ScenarioBoxes:
     """The boxes of one scenario and where each was recorded.
 
     Attributes:
-        labels: the boxes themselves (N).
-        sample: (N,) row of each box's sample within the scenario.
-        agent: (N,) row of its agent within the scenario.
-        frame: (N,) frame number, from 1.
-        agent_order: (N,) position of its agent in `taxonomy.AGENTS`.
-        actor: (N,) CARLA id; the agent's own for −100, −1 where unknown.
-        world_from_lidar: (S, 4, 4) of every sample.
+        labels: The N boxes themselves.
+        sample: Row of each box's sample within the scenario, shape (N,).
+        agent: Row of its agent within the scenario, shape (N,).
+        frame: Frame number, shape (N,), from 1.
+        agent_order: Position of its agent in `taxonomy.AGENTS`, shape (N,).
+        actor: CARLA id, shape (N,); the agent's own for −100, −1 where unknown.
+        world_from_lidar: Pose of every sample, shape (S, 4, 4).
     """
 
     labels: Labels
@@ -76,75 +78,81 @@ class ScenarioBoxes:
 
 
 def box_rotation(boxes: ScenarioBoxes) -> FloatArray:
-    """(N, 4) quaternions of the boxes in their LiDAR frames."""
+    """Return quaternions of the boxes in their LiDAR frames, shape (N, 4)."""
     return quaternions.from_yaw(boxes.labels.yaw)
 
 
 def world_centers(boxes: ScenarioBoxes) -> FloatArray:
-    """(N, 3) box centres in world, metres."""
+    """Return box centres in world, shape (N, 3), metres."""
     pose = boxes.world_from_lidar[boxes.sample]
-    return as_floats(np.einsum("nij,nj->ni", pose[:, :3, :3], boxes.labels.center) + pose[:, :3, 3])
+    rotated = np.einsum("nij,nj->ni", pose[:, :3, :3], boxes.labels.center)
+    return as_floats(rotated + pose[:, :3, 3])
 
 
 def world_rotations(boxes: ScenarioBoxes) -> FloatArray:
-    """(N, 4) quaternions of the boxes in world: an agent's pitch and roll included."""
-    poses = quaternions.left_multiplier(quaternions.from_matrix(boxes.world_from_lidar[:, :3, :3]))
-    return as_floats(np.einsum("nij,nj->ni", poses[boxes.sample], box_rotation(boxes)))
+    """Return quaternions of the boxes in world, shape (N, 4), with an agent's pitch and roll."""
+    rotations = quaternions.from_matrix(boxes.world_from_lidar[:, :3, :3])
+    multipliers = quaternions.left_multiplier(rotations)[boxes.sample]
+    return as_floats(np.einsum("nij,nj->ni", multipliers, box_rotation(boxes)))
 
 
 def to_lidar(boxes: ScenarioBoxes, world_vectors: FloatArray) -> FloatArray:
-    """(N, 3) world vectors along the axes of each box's LiDAR frame."""
-    return as_floats(
-        np.einsum("nji,nj->ni", boxes.world_from_lidar[boxes.sample, :3, :3], world_vectors)
-    )
+    """Return world vectors (N, 3) along the axes of each box's LiDAR frame."""
+    rotations = boxes.world_from_lidar[boxes.sample, :3, :3]
+    return as_floats(np.einsum("nji,nj->ni", rotations, world_vectors))
 
 
 def chains(boxes: ScenarioBoxes) -> tuple[AnyArray, AnyArray]:
-    """(N,) row of the same agent's previous and next box of the same label id; −1 at the ends and for id −1."""
+    """Return rows of the same agent's previous and next box of the same label id, shape (N,) each.
+
+    Rows are −1 at the ends and for id −1.
+    """
     label_id = boxes.labels.actor_id
     order = np.lexsort((np.arange(len(boxes)), boxes.frame, label_id, boxes.agent))
-    same = (boxes.agent[order][1:] == boxes.agent[order][:-1]) & (
-        label_id[order][1:] == label_id[order][:-1]
-    )
-    same &= label_id[order][1:] != UNTRACKED_ID
+    ids = label_id[order]
+    agents = boxes.agent[order]
+    same_track = (agents[1:] == agents[:-1]) & (ids[1:] == ids[:-1])
+    same_track &= ids[1:] != UNTRACKED_ID
     previous = np.full(len(boxes), NULL_INTEGER, dtype=np.int32)
     following = previous.copy()
-    previous[order[1:][same]] = order[:-1][same]
-    following[order[:-1][same]] = order[1:][same]
+    previous[order[1:][same_track]] = order[:-1][same_track]
+    following[order[:-1][same_track]] = order[1:][same_track]
     return previous, following
 
 
 def instances(boxes: ScenarioBoxes) -> tuple[Mapping[str, AnyArray], AnyArray]:
-    """The columns of the scenario's instances, by ascending actor id, and the instance row (N,) of each box."""
+    """Return columns of the scenario's instances, by actor id, and each box's instance row (N,)."""
     known = np.flatnonzero(boxes.actor != UNTRACKED_ID)
-    order = known[
-        np.lexsort((known, boxes.agent_order[known], boxes.frame[known], boxes.actor[known]))
-    ]
-    actors, first, count = np.unique(boxes.actor[order], return_index=True, return_counts=True)
+    keys = (known, boxes.agent_order[known], boxes.frame[known], boxes.actor[known])
+    order = known[np.lexsort(keys)]
+    actors, start, count = np.unique(boxes.actor[order], return_index=True, return_counts=True)
     instance_row = np.full(len(boxes), NULL_INTEGER, dtype=np.int32)
     instance_row[order] = np.repeat(np.arange(len(actors)), count)
+    first_row = order[start]
     columns = {
         "scenario_row": np.zeros(len(actors)),
         "actor_id": actors,
-        "category": boxes.labels.category[order[first]],
+        "category": boxes.labels.category[first_row],
         "num_annotations": count,
-        "first_annotation_row": order[first],
-        "last_annotation_row": order[first + count - 1],
+        "first_annotation_row": first_row,
+        "last_annotation_row": order[start + count - 1],
     }
     return columns, instance_row
 
 
 def tracks(boxes: ScenarioBoxes, instance_row: AnyArray) -> tuple[AnyArray, AnyArray]:
-    """Which box (M,) stands for each actor at each frame, by frame and instance; (M,) bit masks of who annotated it.
+    """Return the box that stands for each actor at each frame, and the agents that annotated it.
 
-    The box of the first agent in order that saw the actor from outside. An agent's own row counts only if nobody else
-    annotated it, since it lies up to 0.3 m from where the others see it.
+    It is the box of the first agent in order that saw the actor from outside. An agent's own row
+    only counts if nobody else annotated it, since it lies up to 0.3 m from where the others see it.
+
+    Returns:
+        Rows of boxes, shape (M,), by frame and instance, and bit masks of agents, shape (M,).
     """
     known = np.flatnonzero(instance_row != NULL_INTEGER)
-    own = boxes.labels.actor_id[known] == OWN_ACTOR_ID
-    order = known[
-        np.lexsort((known, boxes.agent_order[known], own, instance_row[known], boxes.frame[known]))
-    ]
+    is_own = boxes.labels.actor_id[known] == OWN_ACTOR_ID
+    keys = (known, boxes.agent_order[known], is_own, instance_row[known], boxes.frame[known])
+    order = known[np.lexsort(keys)]
     if not len(order):
         return order, np.zeros(0, dtype=np.uint8)
     starts = _group_starts(boxes.frame[order], instance_row[order])
@@ -154,7 +162,8 @@ def tracks(boxes: ScenarioBoxes, instance_row: AnyArray) -> tuple[AnyArray, AnyA
 
 def _group_starts(*keys: AnyArray) -> BoolArray:
     starts = np.ones(len(keys[0]), dtype=bool)
-    starts[1:] = np.any([key[1:] != key[:-1] for key in keys], axis=0)
+    changes = [key[1:] != key[:-1] for key in keys]
+    starts[1:] = np.any(changes, axis=0)
     return starts
 
 
@@ -166,59 +175,61 @@ def visible_mask(
     *,
     infrastructure: ArrayLike,
 ) -> BoolArray:
-    """Which boxes of an agent's label the agent sees, by points and cameras alone; also of several agents' labels.
+    """Return which boxes of an agent's label the agent sees, from its points and cameras only.
 
-    Far boxes need a camera and points (2, or 1 for two-wheelers and pedestrians); near ones a camera or points (5, or
-    2; near the infrastructure 1).
+    Boxes of several agents' labels can be given at once. Distant boxes need a camera and points (2,
+    or 1 for two-wheelers and pedestrians); near ones need a camera or points (5, or 2; near the
+    infrastructure 1).
 
     Args:
-        xy: (N, 2) metres in the agent's LiDAR frame, either handedness.
-        category: (N,) class indices.
-        num_lidar_pts: (N,) the agent's LiDAR points in each box.
-        camera_visible: (N,) bool.
-        infrastructure: whether the agent is the roadside pole; (N,) bool for boxes of several agents.
+        xy: Positions in the agent's LiDAR frame, shape (N, 2), metres, either handedness.
+        category: Class indices, shape (N,).
+        num_lidar_pts: The agent's LiDAR points in each box, shape (N,).
+        camera_visible: Whether a camera sees the box, shape (N,), bool.
+        infrastructure: Whether the agent is the roadside pole; for boxes of several agents shape
+            (N,), bool.
 
     Returns:
-        (N,) bool.
+        Mask of visible boxes, shape (N,), bool.
     """
-    position, points = as_floats(xy).reshape(-1, 2), np.asarray(num_lidar_pts)
-    camera, small = (
-        np.asarray(camera_visible, dtype=bool),
-        _SMALL[np.asarray(category, dtype=np.intp)],
-    )
-    # squares and root, not hypot: boxes on the very edge are decided by the last bit
+    position = as_floats(xy).reshape(-1, 2)
+    points = np.asarray(num_lidar_pts)
+    camera = np.asarray(camera_visible, dtype=bool)
+    small = _IS_SMALL[np.asarray(category, dtype=np.intp)]
+    # Squares and root, not hypot: the last bit decides about boxes on the very edge.
     distance = np.sqrt(position[:, 0] * position[:, 0] + position[:, 1] * position[:, 1])
-    far_seen = camera & (points >= np.where(small, 1, 2))
+    visible_if_distant = camera & (points >= np.where(small, 1, 2))
+    min_points = np.where(infrastructure, 1, np.where(small, 2, 5))
+    visible_if_near = camera | (points >= min_points)
     near = distance < np.where(infrastructure, NEAR_INFRASTRUCTURE, NEAR_VEHICLE)
-    return np.where(
-        near, camera | (points >= np.where(infrastructure, 1, np.where(small, 2, 5))), far_seen
-    )
+    return np.where(near, visible_if_near, visible_if_distant)
 
 
 def visible_ids(masks: Sequence[ArrayLike], actor_ids: Sequence[ArrayLike]) -> IntArray:
-    """The actors that at least one agent sees: the union over agents, each id once, ascending.
+    """Return the actors that at least one agent sees, each id once, ascending.
 
-    The agents' own rows (−100) and untracked ones (−1) are never among them.
+    The agents' own rows (−100) and untracked ones (−1) are left out.
 
     Args:
         masks: `visible_mask` of each agent.
-        actor_ids: the label ids (N,) of each agent's boxes.
+        actor_ids: Label ids (N,) of each agent's boxes.
     """
-    seen = [
-        np.asarray(ids)[np.asarray(mask, dtype=bool)]
-        for mask, ids in zip(masks, actor_ids, strict=True)
-    ]
-    union = np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *seen]).astype(np.int64))
+    visible = [np.zeros(0, dtype=np.int64)]
+    for mask, ids in zip(masks, actor_ids, strict=True):
+        visible.append(np.asarray(ids)[np.asarray(mask, dtype=bool)])
+    union = np.unique(np.concatenate(visible).astype(np.int64))
     return np.setdiff1d(union, (OWN_ACTOR_ID, UNTRACKED_ID))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VelocityFit(ShortRepr):
-    """How many boxes' velocities fit their displacement in each of `VELOCITY_FRAMES`; adds up over scenarios.
+    """Boxes with velocities that fit their displacement in each of `VELOCITY_FRAMES`.
+
+    Fits add up over scenarios.
 
     Attributes:
-        boxes: moving, tracked boxes of others that have both velocities.
-        fits: frame → boxes that fit.
+        boxes: Number of moving, tracked boxes of others that have both velocities.
+        fits: Frame → boxes that fit.
     """
 
     boxes: int
@@ -228,20 +239,19 @@ class VelocityFit(ShortRepr):
     def best(self) -> str | None:
         """The frame that fits most boxes; None if there are too few, or none fits half of them.
 
-        The release's own counts where it fits nearly as many: on a straight road along x all frames are alike.
+        The release's own frame is taken where it fits nearly as many: on a straight road along x
+        all frames are alike.
         """
         name = max(self.fits, key=lambda frame: self.fits[frame])
-        if self.fits[RELEASED_VELOCITY_FRAME] >= _AS_GOOD * self.fits[name]:
+        if self.fits[RELEASED_VELOCITY_FRAME] >= _RELEASED_FIT_SHARE * self.fits[name]:
             name = RELEASED_VELOCITY_FRAME
-        return (
-            name
-            if self.boxes >= LEAST_BOXES and self.fits[name] >= _LEAST_SHARE * self.boxes
-            else None
-        )
+        if self.boxes >= MIN_BOXES and self.fits[name] >= _MIN_FIT_SHARE * self.boxes:
+            return name
+        return None
 
 
 def total_fit(fits: list[VelocityFit]) -> VelocityFit:
-    """The sum over scenarios."""
+    """Return the sum over scenarios."""
     return VelocityFit(
         boxes=sum(fit.boxes for fit in fits),
         fits={name: sum(fit.fits[name] for fit in fits) for name in VELOCITY_FRAMES},
@@ -251,78 +261,91 @@ def total_fit(fits: list[VelocityFit]) -> VelocityFit:
 def displacement_velocities(
     centers: FloatArray, agent: IntArray, label_id: IntArray, frame: IntArray
 ) -> FloatArray:
-    """(N, 3) m/s in world from displacements at 10 Hz, NaN where unknown.
+    """Return velocities in world from displacements at 10 Hz, shape (N, 3), m/s; NaN where unknown.
 
-    A track is one agent's rows of one label id (−100 is its own track): central differences where the frames before
-    and after are there, one-sided where one is, NaN where none is and for untracked rows.
+    A track is one agent's rows of one label id (−100 is its own track). Differences are central
+    where the frames before and after exist, one-sided where only one does, and NaN without any and
+    for untracked rows.
 
     Args:
-        centers: (N, 3) box centres in world, metres.
-        agent: (N,) which agent's.
-        label_id: (N,) ids as the labels say.
-        frame: (N,) frame numbers.
+        centers: Box centres in world, shape (N, 3), metres.
+        agent: Row of the agent, shape (N,).
+        label_id: Ids of the labels, shape (N,).
+        frame: Frame numbers, shape (N,).
     """
     keys = np.column_stack([agent, label_id, frame])
-    steps, first, step_of = np.unique(keys, axis=0, return_index=True, return_inverse=True)
-    position = centers[first]
-    follows = (steps[1:, :2] == steps[:-1, :2]).all(axis=1) & (steps[1:, 2] == steps[:-1, 2] + 1)
+    steps, row_of_step, step_of = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+    position = centers[row_of_step]
+    same_track = (steps[1:, :2] == steps[:-1, :2]).all(axis=1)
+    follows = same_track & (steps[1:, 2] == steps[:-1, 2] + 1)
     before = np.concatenate([[False], follows])[: len(steps)]
     after = np.concatenate([follows, [False]])[: len(steps)]
     index = np.arange(len(steps))
     span = (before.astype(np.float64) + after) * FRAME_PERIOD
     known = (before | after) & (steps[:, 1] != UNTRACKED_ID)
     velocity = np.full((len(steps), 3), np.nan)
-    with np.errstate(over="ignore"):  # labels may hold the largest numbers
+    # Labels may hold the largest numbers.
+    with np.errstate(over="ignore"):
         moved = position[index + after] - position[index - before]
         velocity[known] = moved[known] / span[known, None]
     return velocity[step_of.reshape(-1)]
 
 
 def fit_velocities(boxes: ScenarioBoxes, displacement: FloatArray) -> VelocityFit:
-    """Which of `VELOCITY_FRAMES` the labels' velocities are in, by the displacements (N, 3) of the same boxes."""
-    rows, fits = velocities_that_fit(boxes, displacement)
-    return VelocityFit(boxes=len(rows), fits={name: int(fit.sum()) for name, fit in fits.items()})
+    """Return how many labels' velocities fit their displacements (N, 3) in each frame."""
+    rows, matches = match_velocities(boxes, displacement)
+    fits = {name: int(mask.sum()) for name, mask in matches.items()}
+    return VelocityFit(boxes=len(rows), fits=fits)
 
 
-def velocities_that_fit(
+def match_velocities(
     boxes: ScenarioBoxes, displacement: FloatArray
 ) -> tuple[IntArray, dict[str, BoolArray]]:
-    """The rows (M,) of boxes that are used, and which of them fit each frame."""
-    label_id, said = boxes.labels.actor_id, boxes.labels.velocity
+    """Match the labels' velocities with displacements (N, 3) in each of `VELOCITY_FRAMES`.
+
+    Returns:
+        Rows (M,) of the boxes that are used, and frame → mask (M,) of boxes that fit.
+    """
+    label_id = boxes.labels.actor_id
+    velocity = boxes.labels.velocity
     speed = np.linalg.norm(displacement[:, :2], axis=1)
-    telling = (label_id != OWN_ACTOR_ID) & (label_id != UNTRACKED_ID) & (label_id < STATIC_ACTOR_ID)
-    rows = np.flatnonzero(telling & (speed > _LEAST_SPEED) & np.isfinite(said).all(axis=1))
-    limit = _FITS[0] + _FITS[1] * speed[rows]
-    return rows, {
-        name: np.linalg.norm(
-            turned_vectors(said[rows], angle[rows]) - displacement[rows, :2], axis=1
-        )
-        < limit
-        for name, angle in _angles(boxes).items()
-    }
+    tracked = (label_id != OWN_ACTOR_ID) & (label_id != UNTRACKED_ID) & (label_id < STATIC_ACTOR_ID)
+    rows = np.flatnonzero(tracked & (speed > _MIN_SPEED) & np.isfinite(velocity).all(axis=1))
+    tolerance = _TOLERANCE_MPS + _TOLERANCE_SHARE * speed[rows]
+    matches = {}
+    for name, angle in _angles(boxes).items():
+        turned = turned_vectors(velocity[rows], angle[rows])
+        error = np.linalg.norm(turned - displacement[rows, :2], axis=1)
+        matches[name] = error < tolerance
+    return rows, matches
 
 
 def decoded_velocities(
     boxes: ScenarioBoxes, displacement: FloatArray, frame: str | None
 ) -> FloatArray:
-    """(N, 3) m/s in world: the labels' own, which are in `frame`, where they have any; else the displacements (N, 3).
+    """Return velocities in world, shape (N, 3), m/s: the labels' own, or displacements (N, 3).
 
-    A label has no vertical velocity: it is taken from the displacement, and is 0 without one. None for the frame is the
-    release's own way.
+    Displacements are used for labels without a velocity. A label has no vertical velocity: it comes
+    from the displacement, and is 0 without one.
+
+    Args:
+        boxes: Boxes of a scenario.
+        displacement: Velocities from displacements, shape (N, 3), m/s.
+        frame: Frame of the labels' velocities; None for the release's own.
     """
-    over_ground = turned_vectors(
-        boxes.labels.velocity, _angles(boxes)[frame or RELEASED_VELOCITY_FRAME]
-    )
+    angles = _angles(boxes)[frame or RELEASED_VELOCITY_FRAME]
+    horizontal = turned_vectors(boxes.labels.velocity, angles)
+    # Own rows are in world, whatever the frame of the others.
     own = boxes.labels.actor_id == OWN_ACTOR_ID
-    over_ground[own] = boxes.labels.velocity[own]  # in world, whatever the others' are in
-    velocity = np.column_stack([over_ground, np.nan_to_num(displacement[:, 2])])
-    unknown = np.flatnonzero(np.isnan(over_ground[:, 0] + over_ground[:, 1]))
+    horizontal[own] = boxes.labels.velocity[own]
+    velocity = np.column_stack([horizontal, np.nan_to_num(displacement[:, 2])])
+    unknown = np.flatnonzero(np.isnan(horizontal[:, 0] + horizontal[:, 1]))
     velocity[unknown] = displacement[unknown]
     return velocity
 
 
 def _angles(boxes: ScenarioBoxes) -> dict[str, FloatArray]:
-    """Frame → the angles (N,) that turn the labels' velocities into world."""
+    """Return frame → angles (N,) that turn the labels' velocities into world."""
     pose = boxes.world_from_lidar[boxes.sample]
     heading = np.arctan2(pose[:, 1, 0], pose[:, 0, 0])
     return {

@@ -1,4 +1,4 @@
-"""One scenario's files → the rows of every table, with row keys that count within the scenario."""
+"""Converts one scenario's files into the rows of every table; keys count within the scenario."""
 
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -40,15 +40,18 @@ from deepaccident_devkit.taxonomy import (
 )
 
 TRANSLATION_TOLERANCE: Final = 1e-3
-"""Metres by which a sensor's place on its agent jitters, since the release computes it in single precision; measured:
-2e-4 a few hundred metres from the world's origin."""
+"""Metres by which a sensor's position on its agent jitters.
+
+The release computes it in single precision; measured: 2e-4 a few hundred metres from the world's
+origin.
+"""
 ROTATION_TOLERANCE: Final = 1e-5
 """The same for the entries of its rotation; measured: 4e-7."""
 _INTRINSIC_TOLERANCE = 1e-6
 
 
 def scenario_rows(files: ScenarioFiles) -> dict[str, ColumnArrays]:
-    """The rows of every table but `sensor` and `category`, which are the same for all scenarios."""
+    """Return the rows of all tables except `sensor` and `category`, which scenarios share."""
     boxes = scenario_boxes(files)
     instance_rows, instance_of_box = box_rules.instances(boxes)
     centers = box_rules.world_centers(boxes)
@@ -69,12 +72,11 @@ def scenario_rows(files: ScenarioFiles) -> dict[str, ColumnArrays]:
 
 
 def scenario_boxes(files: ScenarioFiles) -> ScenarioBoxes:
-    """A scenario's boxes, and where each was recorded."""
+    """Return a scenario's boxes, and where each was recorded."""
     sample = np.repeat(np.flatnonzero(_sample_labelled(files)), files.labels.num_boxes)
     agent, frame = np.divmod(sample, files.scan.num_frames)
-    actor_of_agent = np.array(
-        [_actor_id(files, name) for name in files.scan.agents], dtype=np.int64
-    )
+    agent_ids = [_actor_id(files, name) for name in files.scan.agents]
+    actor_of_agent = np.array(agent_ids, dtype=np.int64)
     label_id = files.labels.actor_id
     return ScenarioBoxes(
         labels=files.labels,
@@ -88,11 +90,17 @@ def scenario_boxes(files: ScenarioFiles) -> ScenarioBoxes:
 
 
 def _scenario_row(files: ScenarioFiles, velocity_frame: str | None) -> ColumnArrays:
-    scenario, meta = files.scenario, files.meta
+    scenario = files.scenario
+    meta = files.meta
     signalized = "_subtype1_" in f"{scenario.scenario_type}_"
     collision = asdict(meta.collision) if meta and meta.collision else None
     design = accident_type(meta, signalized=signalized)
-    from_meta = ("weather", "road_type", "spawn_side", "ego_direction", "other_direction")
+    meta_fields = ("weather", "road_type", "spawn_side", "ego_direction", "other_direction")
+    time_of_day = velocity_code = NULL_INTEGER
+    if meta and meta.time_of_day:
+        time_of_day = TIMES_OF_DAY.index(meta.time_of_day)
+    if velocity_frame is not None:
+        velocity_code = [*VELOCITY_FRAMES].index(velocity_frame)
     return {
         "name": [scenario.name],
         "scenario_type": [scenario.scenario_type],
@@ -100,21 +108,16 @@ def _scenario_row(files: ScenarioFiles, velocity_frame: str | None) -> ColumnArr
         "signalized": [signalized],
         "designed_accident": [scenario.scenario_type.endswith("_accident")],
         "town": [scenario.name.split("_")[0]],
-        **{name: [getattr(meta, name, None)] for name in from_meta},
-        "time_of_day": [
-            TIMES_OF_DAY.index(meta.time_of_day) if meta and meta.time_of_day else NULL_INTEGER
-        ],
+        **{name: [getattr(meta, name, None)] for name in meta_fields},
+        "time_of_day": [time_of_day],
         "collision": [collision],
         "accident_type": [NULL_INTEGER if design is None else design],
-        "velocity_frame": [
-            NULL_INTEGER if velocity_frame is None else [*VELOCITY_FRAMES].index(velocity_frame)
-        ],
+        "velocity_frame": [velocity_code],
         "num_frames": [files.scan.num_frames],
         "first_frame_row": [0],
         "last_frame_row": [files.scan.num_frames - 1],
-        "split": [
-            NULL_INTEGER
-        ],  # split files may change without the scenario's: filled in when tables are joined
+        # Split files may change without the scenario: joining the tables fills this in.
+        "split": [NULL_INTEGER],
     }
 
 
@@ -122,11 +125,10 @@ def _agent_rows(files: ScenarioFiles, boxes: ScenarioBoxes) -> ColumnArrays:
     count = len(files.scan.agents)
     category = np.full(count, NULL_INTEGER)
     size = np.full((count, 3), np.nan)
-    own = np.flatnonzero(files.labels.actor_id == OWN_ACTOR_ID)[
-        ::-1
-    ]  # the first own row is written last, and stays
-    category[boxes.agent[own]] = files.labels.category[own]
-    size[boxes.agent[own]] = files.labels.size[own]
+    # In reverse order, so that the first of several own rows overwrites the others.
+    own_rows = np.flatnonzero(files.labels.actor_id == OWN_ACTOR_ID)[::-1]
+    category[boxes.agent[own_rows]] = files.labels.category[own_rows]
+    size[boxes.agent[own_rows]] = files.labels.size[own_rows]
     return {
         "scenario_row": np.zeros(count),
         "name": _agent_codes(files),
@@ -152,7 +154,8 @@ def _frame_rows(files: ScenarioFiles) -> ColumnArrays:
 
 
 def _sample_rows(files: ScenarioFiles) -> ColumnArrays:
-    agents, frames = len(files.scan.agents), files.scan.num_frames
+    agents = len(files.scan.agents)
+    frames = files.scan.num_frames
     labelled = _sample_labelled(files)
     velocity = np.full((files.num_samples, 2), np.nan)
     velocity[labelled] = files.labels.agent_velocity
@@ -209,29 +212,29 @@ def _track_rows(
     boxes: ScenarioBoxes, annotations: ColumnArrays, centers: FloatArray, velocities: FloatArray
 ) -> ColumnArrays:
     instance_of_box = annotations["instance_row"]
-    chosen, agents = box_rules.tracks(boxes, instance_of_box)
+    rows, agents = box_rules.tracks(boxes, instance_of_box)
     return {
-        "frame_row": boxes.frame[chosen] - 1,
-        "instance_row": instance_of_box[chosen],
-        "scenario_row": np.zeros(len(chosen)),
-        "translation": centers[chosen],
-        "rotation": box_rules.world_rotations(boxes)[chosen],
-        "size": annotations["size"][chosen],
-        "velocity": velocities[chosen],
-        "category": annotations["category"][chosen],
-        "is_collider": annotations["is_collider"][chosen],
+        "frame_row": boxes.frame[rows] - 1,
+        "instance_row": instance_of_box[rows],
+        "scenario_row": np.zeros(len(rows)),
+        "translation": centers[rows],
+        "rotation": box_rules.world_rotations(boxes)[rows],
+        "size": annotations["size"][rows],
+        "velocity": velocities[rows],
+        "category": annotations["category"][rows],
+        "is_collider": annotations["is_collider"][rows],
         "agents": agents,
     }
 
 
 def _sample_labelled(files: ScenarioFiles) -> AnyArray:
-    return np.repeat(
-        [agent in files.scan.labelled for agent in files.scan.agents], files.scan.num_frames
-    )
+    labelled = [agent in files.scan.labelled for agent in files.scan.agents]
+    return np.repeat(labelled, files.scan.num_frames)
 
 
 def _agent_codes(files: ScenarioFiles) -> IntArray:
-    return np.array([AGENTS.index(agent) for agent in files.scan.agents], dtype=np.int64)
+    codes = [AGENTS.index(agent) for agent in files.scan.agents]
+    return np.array(codes, dtype=np.int64)
 
 
 def _actor_id(files: ScenarioFiles, agent: str) -> int:
@@ -241,7 +244,9 @@ def _actor_id(files: ScenarioFiles, agent: str) -> int:
 
 
 def _collider_ids(files: ScenarioFiles) -> Sequence[int]:
-    return files.meta.collision.ids if files.meta and files.meta.collision else ()
+    if not files.meta or not files.meta.collision:
+        return ()
+    return files.meta.collision.ids
 
 
 def _times_to_end(frames: int) -> FloatArray:
@@ -249,29 +254,38 @@ def _times_to_end(frames: int) -> FloatArray:
 
 
 def _times_to_impact(files: ScenarioFiles) -> FloatArray:
-    """(F,) seconds to the last frame where meta names a collision (the recording ends at it), else NaN."""
+    """Return seconds to the last frame, shape (F,); NaN unless meta names a collision.
+
+    The recording ends at the collision.
+    """
     frames = files.scan.num_frames
-    return _times_to_end(frames) if _collider_ids(files) else np.full(frames, np.nan)
+    if _collider_ids(files):
+        return _times_to_end(frames)
+    return np.full(frames, np.nan)
 
 
 def accident_type(meta: Meta | None, *, signalized: bool) -> int | None:
-    """Which of the paper's designs an accident realises: 1 to 6 where there are lights, else 7 to 12 (docs/format.md).
+    """Return the paper's design that an accident realises (docs/format.md).
 
-    None for no accident, one with a pedestrian or a third vehicle, or of no design.
+    Designs 1 to 6 have traffic lights, 7 to 12 have none. None is returned for no accident, one
+    with a pedestrian or a third vehicle, or of no design.
     """
     if meta is None or meta.collision is None or "pedestrian" in meta.collision.classes:
         return None
     if meta.agent_ids is None or not set(meta.collision.ids) <= set(meta.agent_ids):
         return None
     design = _signalized_design(meta)
-    return design if design is None or signalized else design + 6
+    if design is None or signalized:
+        return design
+    return design + 6
 
 
 def _signalized_design(meta: Meta) -> int | None:
     if meta.ego_direction is None or meta.other_direction is None:
         return None
     directions = frozenset({meta.ego_direction, meta.other_direction})
-    road, side = meta.road_type or "", meta.spawn_side or ""
+    road = meta.road_type or ""
+    side = meta.spawn_side or ""
     if road.startswith("three-way"):
         return 6 if "straight" in directions else 5
     if not road.startswith("four-way"):
@@ -284,7 +298,7 @@ def _signalized_design(meta: Meta) -> int | None:
 
 
 def sensor_tables(calibs: Calibs, *, agents: int, frames: int) -> dict[str, ColumnArrays]:
-    """The rows of one scenario's sensor tables; `calibs` holds its samples agent by agent."""
+    """Return the rows of one scenario's sensor tables; `calibs` holds its samples by agent."""
     values = _sensor_values(calibs)
     calibrated_sensors, calibrated_sensor_of = _calibrated_sensor_rows(values, agents, frames)
     return {
@@ -298,38 +312,38 @@ def sensor_tables(calibs: Calibs, *, agents: int, frames: int) -> dict[str, Colu
 
 
 def sensor_rows() -> ColumnArrays:
-    """The rows of table `sensor`, the same for all scenarios."""
+    """Return the rows of table `sensor`, the same for all scenarios."""
     return {"channel": np.arange(len(CHANNELS)), "modality": _channel_modalities()}
 
 
 def neighbour_rows(frames: int, agents: int) -> tuple[IntArray, IntArray]:
-    """Columns before and after each of `agents` runs of `frames` rows; −1 at a run's ends."""
+    """Return the rows before and after each row of `agents` runs of `frames` rows.
+
+    They are −1 at a run's ends.
+    """
     row = np.arange(agents * frames)
     previous = np.where(row % frames == 0, NULL_INTEGER, row - 1)
-    return previous, np.where(row % frames == frames - 1, NULL_INTEGER, row + 1)
+    following = np.where(row % frames == frames - 1, NULL_INTEGER, row + 1)
+    return previous, following
 
 
 def timestamps(frames: int) -> FloatArray:
-    """(F,) seconds since the first of `frames` frames."""
-    return np.array([frame_timestamp(index) for index in range(1, frames + 1)])
+    """Return seconds since the first of `frames` frames, shape (F,)."""
+    seconds = [frame_timestamp(frame) for frame in range(1, frames + 1)]
+    return np.array(seconds)
 
 
 def _sample_data_rows(
     calibs: Calibs, calibrated_sensor_of: IntArray, agents: int, frames: int
 ) -> ColumnArrays:
-    """Columns in the order sample, channel."""
-    samples, channels = len(calibs), len(CHANNELS)
-    previous, following = (
-        np.where(
-            neighbour[:, None] < 0,
-            NULL_INTEGER,
-            neighbour[:, None] * channels + np.arange(channels),
-        )
-        for neighbour in neighbour_rows(frames, agents)
-    )
+    """Return columns in the order sample, channel."""
+    samples = len(calibs)
+    channels = len(CHANNELS)
+    previous, following = neighbour_rows(frames, agents)
     size = np.full((samples, channels, 2), NULL_INTEGER, dtype=np.int64)
     size[:, : len(CAMERAS)] = np.rint(2 * calibs.intrinsic[..., :2, 2])
     size[:, CHANNELS.index(BEV_CAMERA)] = BEV_SHAPE[::-1]
+    formats = [FILE_FORMATS.index(CHANNEL_FORMAT[channel]) for channel in CHANNELS]
     return {
         "sample_row": np.repeat(np.arange(samples), channels),
         "sensor_row": np.tile(np.arange(channels), samples),
@@ -337,33 +351,48 @@ def _sample_data_rows(
         "ego_pose_row": np.repeat(np.arange(samples), channels),
         "channel": np.tile(np.arange(channels), samples),
         "modality": np.tile(_channel_modalities(), samples),
-        "fileformat": np.tile(
-            [FILE_FORMATS.index(CHANNEL_FORMAT[channel]) for channel in CHANNELS], samples
-        ),
+        "fileformat": np.tile(formats, samples),
         "width": size[..., 0].reshape(-1),
         "height": size[..., 1].reshape(-1),
-        "prev_row": previous.reshape(-1),
-        "next_row": following.reshape(-1),
+        "prev_row": _channel_rows(previous),
+        "next_row": _channel_rows(following),
     }
+
+
+def _channel_rows(samples: IntArray) -> IntArray:
+    """Return the sensor file rows of sample rows (S,), shape (S · channels,); −1 for −1."""
+    column = samples[:, None]
+    rows = column * len(CHANNELS) + np.arange(len(CHANNELS))
+    return np.where(column < 0, NULL_INTEGER, rows).reshape(-1)
 
 
 def _calibrated_sensor_rows(
     values: FloatArray, agents: int, frames: int
 ) -> tuple[ColumnArrays, IntArray]:
-    """The distinct values of each agent's sensors by first occurrence; (samples, channels) which of them each is."""
+    """Return the distinct setups of each agent's sensors, by first occurrence.
+
+    Args:
+        values: Setup of every file (`_sensor_values`), shape (samples, channels, 25).
+        agents: Number of agents.
+        frames: Number of frames.
+
+    Returns:
+        Rows of table `calibrated_sensor`, and the row of each file, shape (samples, channels).
+    """
     row_of = np.zeros(values.shape[:2], dtype=np.int64)
-    chosen: list[FloatArray] = []
+    setups: list[FloatArray] = []
     keys: list[tuple[int, int, int]] = []
     for agent in range(agents):
         samples = slice(agent * frames, (agent + 1) * frames)
         for channel in range(len(CHANNELS)):
-            distinct, which = _distinct(values[samples, channel])
-            row_of[samples, channel] = len(keys) + which
-            chosen.append(distinct)
-            keys += [(agent, channel, number + 1) for number in range(len(distinct))]
-    table, key_table = np.concatenate(chosen), np.array(keys)
+            distinct, number = _find_distinct(values[samples, channel])
+            row_of[samples, channel] = len(keys) + number
+            setups.append(distinct)
+            keys += [(agent, channel, index + 1) for index in range(len(distinct))]
+    table = np.concatenate(setups)
+    key_table = np.array(keys)
     poses = table[:, :16].reshape(-1, 4, 4)
-    return {
+    columns = {
         "sensor_row": key_table[:, 1],
         "agent_row": key_table[:, 0],
         "number": key_table[:, 2],
@@ -371,22 +400,22 @@ def _calibrated_sensor_rows(
         "rotation": quaternions.from_matrix(poses[:, :3, :3]),
         "camera_intrinsic": table[:, 16:],
         "matrix": table[:, :16],
-    }, row_of
+    }
+    return columns, row_of
 
 
 def _sensor_values(calibs: Calibs) -> FloatArray:
-    """(samples, channels, 25): `ego_from_sensor` and K (NaN where there is none) of every file."""
-    samples, channels = len(calibs), len(CHANNELS)
+    """Return `ego_from_sensor` and K of every file, shape (samples, channels, 25); NaN if none."""
+    samples = len(calibs)
+    channels = len(CHANNELS)
+    lidar_from_camera = np.linalg.inv(calibs.camera_from_lidar)
     matrix = np.tile(np.eye(4), (samples, channels, 1, 1))
-    matrix[:, : len(CAMERAS)] = calibs.ego_from_lidar[:, None] @ np.linalg.inv(
-        calibs.camera_from_lidar
-    )
+    matrix[:, : len(CAMERAS)] = calibs.ego_from_lidar[:, None] @ lidar_from_camera
     matrix[:, CHANNELS.index(LIDAR)] = calibs.ego_from_lidar
     intrinsic = np.full((samples, channels, 3, 3), np.nan)
     intrinsic[:, : len(CAMERAS)] = calibs.intrinsic
-    return np.concatenate(
-        [matrix.reshape(samples, channels, 16), intrinsic.reshape(samples, channels, 9)], axis=-1
-    )
+    parts = [matrix.reshape(samples, channels, 16), intrinsic.reshape(samples, channels, 9)]
+    return np.concatenate(parts, axis=-1)
 
 
 def _ego_pose_rows(calibs: Calibs, agents: int, frames: int) -> ColumnArrays:
@@ -399,20 +428,27 @@ def _ego_pose_rows(calibs: Calibs, agents: int, frames: int) -> ColumnArrays:
     }
 
 
-def _distinct(rows: FloatArray) -> tuple[FloatArray, IntArray]:
-    """The rows (F, 25) that differ by more than rounding, in order of occurrence, and which of them each row is."""
+def _find_distinct(rows: FloatArray) -> tuple[FloatArray, IntArray]:
+    """Return the rows (F, 25) that differ by more than rounding, and the number of each row.
+
+    Distinct rows are in order of occurrence.
+    """
     tolerance = np.full(25, _INTRINSIC_TOLERANCE)
     tolerance[:16] = ROTATION_TOLERANCE
     tolerance[[3, 7, 11]] = TRANSLATION_TOLERANCE
-    which = np.full(len(rows), NULL_INTEGER)
-    first: list[int] = []
-    while (left := np.flatnonzero(which < 0)).size:
-        change = np.abs(rows[left] - rows[left[0]])
-        alike = (~(change > tolerance)).all(axis=1)  # NaN, where there is no K, is alike
-        which[left[alike]] = len(first)
-        first.append(int(left[0]))
-    return rows[first], which
+    number = np.full(len(rows), NULL_INTEGER)
+    distinct: list[int] = []
+    unassigned = np.arange(len(rows))
+    while unassigned.size:
+        change = np.abs(rows[unassigned] - rows[unassigned[0]])
+        # NaN, where a file has no K, counts as equal.
+        alike = (~(change > tolerance)).all(axis=1)
+        number[unassigned[alike]] = len(distinct)
+        distinct.append(int(unassigned[0]))
+        unassigned = np.flatnonzero(number < 0)
+    return rows[distinct], number
 
 
 def _channel_modalities() -> AnyArray:
-    return np.array([MODALITIES.index(CHANNEL_MODALITY[channel]) for channel in CHANNELS])
+    codes = [MODALITIES.index(CHANNEL_MODALITY[channel]) for channel in CHANNELS]
+    return np.array(codes)

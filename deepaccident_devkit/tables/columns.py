@@ -1,10 +1,11 @@
-"""Columns of tables: how they are stored in Arrow, how a record shows them, and what they mean.
+"""Columns of tables: their storage in Arrow, their form in records, and their meaning.
 
-A record's fields are declared once, in `records.py`, as annotated types; everything else (the Arrow schema, the JSON
-Schemas, the records themselves) is derived from there, through the classes of this module.
+A record's fields are declared once, in `records.py`, as annotated types; everything else (the Arrow
+schema, the JSON Schemas, the records themselves) is derived from there, through the classes of this
+module.
 
-Null is stored twice: as Arrow's null, for readers of the table, and as a value beneath it (−1 or NaN) that the
-devkit reads through plain numpy views without looking at a bitmap.
+Null is stored twice: as Arrow's null, for readers of the table, and as a value under it (−1 or NaN)
+that the devkit reads through plain numpy views without looking at a bitmap.
 """
 
 from dataclasses import dataclass
@@ -16,14 +17,14 @@ NULL_INTEGER = -1
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Documented:
-    """Base of the kinds: `doc` says what the values mean."""
+    """Base of the kinds; `doc` is the meaning of the values."""
 
     doc: str
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Derived(_Documented):
-    """A field that is made when a record is, and not stored."""
+    """A field that is computed with its record, and not stored."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -43,14 +44,14 @@ class Number(_Documented):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Vector(_Documented):
-    """Some float64 numbers; `shape` (3,) is a list in a record, (3, 3) a list of lists."""
+    """Several float64 numbers; `shape` (3,) is a list in a record, (3, 3) a list of lists."""
 
     shape: tuple[int, ...]
     unit: str = ""
 
     @property
     def length(self) -> int:
-        """Numbers stored a row."""
+        """Number of stored values a row."""
         return int(np.prod(self.shape))
 
 
@@ -63,7 +64,7 @@ class Choice(_Documented):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Subset(_Documented):
-    """Some of at most eight known words, stored as a bit mask: bit k stands for `values[k]`."""
+    """A subset of at most eight known words, stored as a bit mask: bit k stands for `values[k]`."""
 
     values: tuple[str, ...]
 
@@ -83,7 +84,7 @@ class Items(_Documented):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Struct(_Documented):
-    """A record within the record, given by a TypedDict; for small tables only."""
+    """A record within the record, declared by a TypedDict; for small tables only."""
 
     record: type
 
@@ -96,10 +97,10 @@ class Column:
     """One field of a table's records.
 
     Attributes:
-        field: its name in records.
-        stored: its name in the Arrow table, None if it is not stored.
-        kind: how it is stored and shown.
-        nullable: whether a record may hold None.
+        field: Name in records.
+        stored: Name in the Arrow table; None if it is not stored.
+        kind: Storage and form.
+        nullable: Whether a record may hold None.
     """
 
     field: str
@@ -110,7 +111,7 @@ class Column:
 
 @dataclass(frozen=True, slots=True)
 class TableSpec:
-    """A table's name, what a row is, and its columns in order."""
+    """A table's name, the meaning of a row, and its columns in order."""
 
     name: str
     doc: str
@@ -118,9 +119,12 @@ class TableSpec:
 
     @property
     def stored_columns(self) -> tuple[Column, ...]:
-        """The columns that the Arrow table has."""
+        """The columns of the Arrow table."""
         return tuple(column for column in self.columns if column.stored)
 
     def column(self, field: str) -> Column | None:
-        """The column of a record's field."""
-        return next((column for column in self.columns if column.field == field), None)
+        """Return the column of a record's field; None without any."""
+        for column in self.columns:
+            if column.field == field:
+                return column
+        return None

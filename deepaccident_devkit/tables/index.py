@@ -1,14 +1,15 @@
-"""The index of a release: made once from its small files, opened in milliseconds afterwards.
+"""The index of a release: made once from its small files, then opened in milliseconds.
 
     <index folder>/<version>/
-      manifest.json        what the index was made from, and what is broken
+      manifest.json        states of the files that the index was made from, and broken scenarios
       tables-<digest>/     one Arrow file a table
-      kept/                the rows of each scenario, from which the tables are joined; see `parallel.Store`
+      kept/                rows of each scenario, which are joined into tables; see `parallel.Store`
 
-Opening compares the states of folders and meta files, the contents of split files and the sizes of the tables with the
-manifest, and reads the tables' footers. Making it compares the times and sizes of every label and calib file, and with
-`check_files` the contents of all files, and reads only the scenarios that changed. Everything is written under a
-temporary name and renamed, the manifest last, so that a reader sees the old index or the new one.
+Opening compares the states of folders and meta files, the contents of split files and the sizes of
+the tables with the manifest, and reads the tables' footers. Making it compares the times and sizes
+of every label and calib file, and with `check_files` the contents of all files, and only reads the
+scenarios that changed. Everything is written under a temporary name and renamed, the manifest at
+the end, so that a reader sees either the old index or the new one.
 """
 
 from __future__ import annotations
@@ -64,26 +65,28 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 MANIFEST_FILE = "manifest.json"
-_TABLES = "tables-"
-# What earlier versions put beside these.
-_EARLIER = ("shards", ".unfinished")
+_TABLES_PREFIX = "tables-"
+# Names that earlier versions put beside these.
+_EARLIER_NAMES = ("shards", ".unfinished")
 # Paths of files that a devkit puts into an index folder.
-_FILE = re.compile(
-    rf"{re.escape(MANIFEST_FILE)}|\.lock|\.making|\.unfinished|(.+/)?(kept|locks|thumbnails)/.+|shards/.+\.arrow"
-    rf"|\.?{_TABLES}[^/]+/([^/]+\.arrow|town_map-\w+\.npz)|(.+/)?\.[^/]+\.tmp",
+_INDEX_FILE = re.compile(
+    rf"{re.escape(MANIFEST_FILE)}|\.lock|\.making|\.unfinished"
+    r"|(.+/)?(kept|locks|thumbnails)/.+|shards/.+\.arrow"
+    rf"|\.?{_TABLES_PREFIX}[^/]+/([^/]+\.arrow|town_map-\w+\.npz)|(.+/)?\.[^/]+\.tmp",
     re.DOTALL,
 )
-_NAMED = 5
+# Messages or names that an error message lists.
+_MAX_LISTED = 5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Problem(ShortRepr):
-    """What is wrong with one scenario.
+    """A broken scenario.
 
     Attributes:
-        scenario: its token.
-        messages: a sentence each, naming file, line and remedy.
-        contents: hashes of its files as they were when this was found; empty if they are not the cause.
+        scenario: Token of the scenario.
+        messages: A sentence for each fault, with file, line and remedy.
+        contents: Hashes of its files at the time; empty if they are not the cause.
     """
 
     scenario: str
@@ -96,12 +99,12 @@ class Index(ShortRepr):
     """An index on disk, as its manifest describes it.
 
     Attributes:
-        folder: where it lies.
-        fingerprint: digest of the release's folders, meta and split files (`scan.folder_digest`).
-        tables: name of the folder that holds the tables; empty if none could be made.
-        table_files: the size and checksum of each file in it, by name.
-        problems: the scenarios left out.
-        notices: what else was left aside, a sentence each.
+        folder: Folder of the index.
+        fingerprint: Digest of the release's folders, meta and split files (`scan.folder_digest`).
+        tables: Name of the folder with the tables; empty if none could be made.
+        table_files: Size and checksum of each file in it, by name.
+        problems: Broken scenarios, which are left out.
+        notices: Other parts of the release that were left aside, a sentence each.
     """
 
     folder: Path
@@ -118,22 +121,20 @@ class Index(ShortRepr):
 
     @classmethod
     def read(cls, folder: Path) -> Index | None:
-        """The index in a folder, up to date or not; None if there is none that today's code can use."""
-        content = _manifest(folder)
+        """Return the index in a folder, current or not; None without one of this schema version."""
+        content = _read_manifest(folder)
         try:
-            if (
-                content.pop("checksum") != _checksum(content)
-                or content.pop("schema_version") != SCHEMA_VERSION
-            ):
+            if content.pop("checksum") != _checksum(content):
                 return None
-            problems = [
-                Problem(**{**each, "messages": tuple(each["messages"])})
-                for each in content.pop("problems")
-            ]
-            files = {
-                name: (int(size), str(digest))
-                for name, (size, digest) in content.pop("table_files").items()
-            }
+            if content.pop("schema_version") != SCHEMA_VERSION:
+                return None
+            problems = []
+            for problem in content.pop("problems"):
+                messages = tuple(problem["messages"])
+                problems.append(Problem(**{**problem, "messages": messages}))
+            files = {}
+            for name, (size, digest) in content.pop("table_files").items():
+                files[name] = (int(size), str(digest))
             notices = tuple(content.pop("notices"))
             index = cls(
                 folder=folder,
@@ -142,44 +143,48 @@ class Index(ShortRepr):
                 notices=notices,
                 **content,
             )
-            names = (
-                {table_path(Path(), table).name for table in table_specs()}
-                if index.tables
-                else set()
-            )
-            whole = set(files) == names and re.fullmatch(
-                rf"({_TABLES}\w+)?", index.tables, re.ASCII
-            )
+            return index if index._has_valid_names() else None
         except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError):
             return None
-        return index if whole else None
+
+    def _has_valid_names(self) -> bool:
+        """Return whether the manifest names a folder of tables, with one file a table, or none."""
+        names: set[str] = set()
+        if self.tables:
+            names = {table_path(Path(), table).name for table in table_specs()}
+        pattern = rf"({_TABLES_PREFIX}\w+)?"
+        return set(self.table_files) == names and bool(re.fullmatch(pattern, self.tables, re.ASCII))
 
     def write(self) -> None:
-        """Write the manifest: from then on the tables that it names are the index."""
+        """Write the manifest: from then on its tables are the index."""
         content = {"schema_version": SCHEMA_VERSION, **asdict(self)}
         del content["folder"]
         text = json.dumps({**content, "checksum": _checksum(content)}, indent=1)
         write_own(self.folder / MANIFEST_FILE, text.encode())
 
     def is_current(self, layout: ReleaseLayout, fingerprint: str) -> bool:
-        """Whether nothing was added or removed, the tables are there, and no broken scenario was changed.
+        """Return whether the index still describes the release.
 
-        Broken scenarios are read: a file mended in place leaves its folder's time alone, and one that is restored from
-        an archive may have the damaged one's size and time.
+        Nothing was added or removed, the tables exist, and no broken scenario has changed. Broken
+        scenarios are read: a file mended in place leaves its folder's time as it is, and one that
+        is restored from an archive may have the damaged file's size and time.
         """
         if self.fingerprint != fingerprint or not self._has_sizes():
             return False
         broken = {
             problem.scenario: problem.contents for problem in self.problems if problem.contents
         }
-        return all(
-            content_hashes(each) == broken[each.token]
-            for each in layout.scenarios
-            if each.token in broken
-        )
+        for scenario in layout.scenarios:
+            token = scenario.token
+            if token in broken and content_hashes(scenario) != broken[token]:
+                return False
+        return True
 
     def is_whole(self) -> bool:
-        """Whether the content of all tables is what was written; by size first, for a hole has gigabytes to read."""
+        """Return whether the content of all tables is what was written.
+
+        Sizes are compared first, since a file with a hole may have gigabytes to read.
+        """
         return self._has_sizes() and table_files(self.tables_folder) == self.table_files
 
     def _has_sizes(self) -> bool:
@@ -194,49 +199,55 @@ def open_index(
     on_error: OnError = "raise",
     check_times: bool = False,
     check_files: bool = False,
-    **how: Unpack[Engine],
+    **engine: Unpack[Engine],
 ) -> Index:
-    """The index of a release, made or brought up to date first where needed.
+    """Return the index of a release, which is made or updated before if necessary.
 
-    Several processes, also on several hosts, that open the same release share the work.
+    Several processes that open the same release, also on several hosts, share the work.
 
     Args:
-        layout: the release.
-        index_dir: where indexes are kept; by default in the dataroot, or in the user's cache if that is read-only.
-        on_error: `raise` lists every broken scenario and raises; `skip` leaves them out and logs them.
-        check_times: compare the time and size of every label, calib and meta file, and the content of every table. If
-            not set, an index is opened where all folders are as they were (schema/README.md).
-        check_files: compare the content of every label, calib and meta file too.
-        **how: of `parallel.Engine`: `workers`, `executor`, `progress`.
+        layout: The release.
+        index_dir: Folder of indexes; by default in the dataroot, or in the user's cache if that is
+            read-only.
+        on_error: `raise` lists every broken scenario and raises; `skip` leaves them out and logs
+            them.
+        check_times: Whether to compare the time and size of every label, calib and meta file, and
+            the content of every table. Otherwise an index is opened if all folders are unchanged
+            (schema/README.md).
+        check_files: Whether to compare the content of every label, calib and meta file, too.
+        **engine: `workers`, `executor` and `progress` (`parallel.Engine`).
 
     Raises:
-        BrokenReleaseError: some scenarios are broken and `on_error` is `raise`, or all of them are.
-        DatarootError: no scenario has any file.
-        IndexStoreError: the index cannot be written, or is a newer devkit's; or the limits of files' sizes that the
-            environment gives cannot be understood.
-        OutputFolderError: a link leads out of the index's folder.
-        SplitFileError: a split file cannot be read.
-        SomeFailedError: the connection to a URL broke.
+        BrokenReleaseError: A scenario is broken and `on_error` is `raise`, or all of them are.
+        DatarootError: No scenario has any file.
+        IndexStoreError: The index cannot be written, or is a newer devkit's; or the limits of
+            files' sizes in the environment cannot be understood.
+        OutputFolderError: A link leads out of the index's folder.
+        SplitFileError: A split file cannot be read.
+        SomeFailedError: The connection to a URL broke.
     """
     on_error = choice("on_error", on_error, get_args(OnError))
     _refuse_wrong_limits()
     index = None if check_times or check_files else current_index(layout, index_dir)
     while index is None:
         folder = _writable_folder(layout, index_dir)
-        index = _made(layout, folder, check_files=check_files, **how) or current_index(
-            layout, index_dir
-        )
-    _accept(layout, index, on_error)
+        index = _update_index(layout, folder, check_files=check_files, **engine)
+        if index is None:
+            index = current_index(layout, index_dir)
+    _report_problems(layout, index, on_error)
     return index
 
 
 def index_folders(root: Dataroot, version: str, index_dir: Path | None = None) -> Iterator[Path]:
-    """Where a release's index may lie, the first choice first."""
-    return (place / version for place in index_places(root, index_dir))
+    """Return the possible folders of a release's index, in order of preference."""
+    return (folder / version for folder in index_places(root, index_dir))
 
 
 def place_outside(layout: ReleaseLayout) -> Path | None:
-    """The `index_dir` with which opening a release writes nothing into its folder: None where a good index is there."""
+    """Return the `index_dir` with which opening a release writes nothing into its folder.
+
+    None is returned if the release has a current index.
+    """
     if current_index(layout) is not None:
         return None
     *_, cache = index_folders(layout.root, layout.version)
@@ -248,14 +259,20 @@ def _fingerprint(layout: ReleaseLayout) -> str:
 
 
 def current_index(layout: ReleaseLayout, index_dir: Path | None = None) -> Index | None:
-    """Return the index that opening a release would use as it is; None if one would be made or updated."""
+    """Return the index that would be opened without any change; None if it had to be made."""
     fingerprint = _fingerprint(layout)
-    found = map(Index.read, index_folders(layout.root, layout.version, index_dir))
-    return next((index for index in found if index and index.is_current(layout, fingerprint)), None)
+    for folder in index_folders(layout.root, layout.version, index_dir):
+        index = Index.read(folder)
+        if index and index.is_current(layout, fingerprint):
+            return index
+    return None
 
 
 def _refuse_wrong_limits() -> None:
-    """Raise IndexStoreError before every file counts as broken, and a good index is made again of what is left."""
+    """Raise IndexStoreError before wrong limits make every file count as broken.
+
+    A good index would then be made again without these files.
+    """
     try:
         byte_limit("index")
     except RefusedFileError as error:
@@ -266,30 +283,34 @@ def _writable_folder(layout: ReleaseLayout, index_dir: Path | None) -> Path:
     folders = list(index_folders(layout.root, layout.version, index_dir))
     folder = next(filter(is_writable_folder, folders), None)
     if folder is None:
-        places = " or ".join(map(str, folders))
+        names = " or ".join(map(str, folders))
         raise IndexStoreError(
-            f"{places}: no place to write the index; give a writable folder with index_dir="
+            f"{names}: no place to write the index; give a writable folder with index_dir="
         )
     return folder
 
 
-def _made(
-    layout: ReleaseLayout, folder: Path, *, check_files: bool, **how: Unpack[Engine]
+def _update_index(
+    layout: ReleaseLayout, folder: Path, *, check_files: bool, **engine: Unpack[Engine]
 ) -> Index | None:
-    """Bring the index in `folder` up to date; None if another process, with which it shared the work, has done that.
+    """Bring the index in `folder` up to date.
 
-    Broken scenarios do not stop it: they are listed in the manifest. Damaged rows and tables are made again.
+    None is returned if another process, with which this one shared the work, has finished it.
+    Broken scenarios do not stop it: they are listed in the manifest. Damaged rows and tables are
+    made again.
     """
-    from deepaccident_devkit.support.parallel import (
-        Places,  # here, as below: opening an index that is there needs none of it
-    )
+    # Opening an existing index needs none of these modules.
+    from deepaccident_devkit.support.parallel import Places
     from deepaccident_devkit.tables.indexing import assign_splits, index_scenario
 
     _refuse_newer(folder)
-    fingerprint, splits = _fingerprint(layout), assign_splits(layout)
+    fingerprint = _fingerprint(layout)
+    splits = assign_splits(layout)
     store = _store(folder, f"{SCHEMA_VERSION} {fingerprint} {check_files}")
     candidates = {
-        each.token: each for each in layout.scenarios if each.token not in splits.problems
+        scenario.token: scenario
+        for scenario in layout.scenarios
+        if scenario.token not in splits.problems
     }
     with store.shared(tidy=partial(_tidy, folder)) as turn:
         outcomes = store.run(
@@ -297,39 +318,44 @@ def _made(
             candidates,
             label="indexing scenarios",
             places=Places(reads=places_of(layout.root), writes=(folder,)),
-            **how,
+            **engine,
         )
         if not turn.alone():
             return None
-        tables, files = _written_tables(
-            store, [outcome for outcome in outcomes.values() if outcome.indexed], splits
-        )
-        broken = [
-            Problem(scenario=token, messages=outcome.messages, contents=outcome.contents)
-            for token, outcome in outcomes.items()
-            if outcome.messages
-        ]
-        misplaced = [
-            Problem(scenario=token, messages=messages)
-            for token, messages in splits.problems.items()
-        ]
+        indexed = [outcome for outcome in outcomes.values() if outcome.indexed]
+        tables, files = _write_tables(store, indexed, splits)
+        notices = list(splits.notices)
+        for outcome in outcomes.values():
+            notices += outcome.notices
         index = Index(
             folder=folder,
             fingerprint=fingerprint,
             tables=tables,
             table_files=files,
-            problems=tuple(sorted(broken + misplaced, key=lambda problem: problem.scenario)),
-            notices=(
-                *splits.notices,
-                *(notice for each in outcomes.values() for notice in each.notices),
-            ),
+            problems=_collect_problems(outcomes, splits),
+            notices=tuple(notices),
         )
         index.write()
-        kept = {f"kept/{token}" for token, outcome in outcomes.items() if outcome.indexed}
-        there = {path.relative_to(folder).as_posix() for path in folder.glob("kept/*/*")}
-        _tidy(folder, there - kept)
+        current = {f"kept/{outcome.scenario.token}" for outcome in indexed}
+        present = {path.relative_to(folder).as_posix() for path in folder.glob("kept/*/*")}
+        _tidy(folder, present - current)
         store.remove(keep=True)
     return index
+
+
+def _collect_problems(
+    outcomes: Mapping[str, Outcome], splits: SplitAssignment
+) -> tuple[Problem, ...]:
+    """Return the broken and the misplaced scenarios, by token."""
+    problems = []
+    for token, outcome in outcomes.items():
+        if outcome.messages:
+            problems.append(
+                Problem(scenario=token, messages=outcome.messages, contents=outcome.contents)
+            )
+    for token, messages in splits.problems.items():
+        problems.append(Problem(scenario=token, messages=messages))
+    return tuple(sorted(problems, key=lambda problem: problem.scenario))
 
 
 def _store(folder: Path, command: str) -> Store:
@@ -342,62 +368,69 @@ def _refuse_newer(folder: Path) -> None:
     version = _schema_version(folder)
     if version is not None and version > SCHEMA_VERSION:
         raise IndexStoreError(
-            f"{folder / MANIFEST_FILE}: a newer devkit's index (schema version {version}, this devkit's is "
-            f"{SCHEMA_VERSION}); update the devkit, give another index_dir=, or remove the index with: "
-            "deepaccident index DATAROOT --clear"
+            f"{folder / MANIFEST_FILE}: a newer devkit's index (schema version {version}, this "
+            f"devkit's is {SCHEMA_VERSION}); update the devkit, give another index_dir=, or remove "
+            "the index with: deepaccident index DATAROOT --clear"
         )
 
 
-def _written_tables(
+def _write_tables(
     store: Store, outcomes: Sequence[Outcome], splits: SplitAssignment
 ) -> tuple[str, dict[str, tuple[int, str]]]:
-    """Join scenarios into a new folder of tables, named by what they were made from; its name and its files' states.
+    """Join scenarios into a new folder of tables, named after their contents.
 
-    The name is empty if there is nothing to join. Whole tables of that name are left as they are.
+    Complete tables of that name are left as they are.
+
+    Returns:
+        Name of the folder, empty if there is nothing to join, and the states of its files.
     """
     from deepaccident_devkit.tables.indexing import join_tables
 
     if not outcomes:
         return "", {}
-    assigned = [splits.split_of.get(outcome.scenario.token) for outcome in outcomes]
+    tokens = [outcome.scenario.token for outcome in outcomes]
+    folders = [outcome.scenario.folder for outcome in outcomes]
+    assigned = [splits.split_of.get(token) for token in tokens]
     hashes = json.dumps(
         {outcome.scenario.token: json.loads(outcome.contents) for outcome in outcomes}
     )
-    made_from = (
-        SCHEMA_VERSION,
-        hashes,
-        [outcome.scenario.folder for outcome in outcomes],
-        assigned,
-    )
-    name = _TABLES + hashlib.blake2b(repr(made_from).encode(), digest_size=8).hexdigest()
-    folder, before = place_in(store.folder, name, opened=True), Index.read(store.folder)
+    sources = (SCHEMA_VERSION, hashes, folders, assigned)
+    name = _TABLES_PREFIX + hashlib.blake2b(repr(sources).encode(), digest_size=8).hexdigest()
+    folder = place_in(store.folder, name, opened=True)
+    before = Index.read(store.folder)
     if before is not None and before.tables == name and before.is_whole():
-        files = dict(before.table_files)
-    else:
-        remove_in(
-            store.folder, name
-        )  # damaged, or of a process that was stopped before its manifest
-        with replacing_folder(folder) as temporary:
-            join_tables(
-                temporary, [store.path(each.scenario.token) for each in outcomes], assigned, hashes
-            )
-            files = table_files(temporary)
+        return name, dict(before.table_files)
+    # A folder of this name is damaged, or of a process that was stopped before its manifest.
+    remove_in(store.folder, name)
+    with replacing_folder(folder) as temporary:
+        join_tables(temporary, [store.path(token) for token in tokens], assigned, hashes)
+        files = table_files(temporary)
     return name, files
 
 
 def table_files(folder: Path) -> dict[str, tuple[int, str]]:
-    """Size and checksum of each file of a folder of tables, by name; nothing if there is no such folder."""
-    return {name: (size, file_checksum(folder / name)) for name, size in _sizes(folder).items()}
+    """Return size and checksum of each file in a folder of tables, by name.
+
+    They are empty without such a folder.
+    """
+    states = {}
+    for name, size in _sizes(folder).items():
+        states[name] = (size, file_checksum(folder / name))
+    return states
 
 
 def _sizes(folder: Path) -> dict[str, int]:
-    return {path.name: path.stat().st_size for path in folder.glob("*.arrow") if path.is_file()}
+    sizes = {}
+    for path in folder.glob("*.arrow"):
+        if path.is_file():
+            sizes[path.name] = path.stat().st_size
+    return sizes
 
 
 def _tidy(folder: Path, stale: Iterable[str] = ()) -> None:
-    """Remove what stopped processes left, tables that the manifest does not name, and what is given by its path.
+    """Remove leftovers of stopped processes, tables without a manifest, and stale paths.
 
-    What cannot be removed is left to the next time. The caller has the folder alone.
+    A path that cannot be removed stays until the next time. No other process may use the folder.
     """
     index = Index.read(folder)
     for name in (*_unnamed(folder, index.tables if index else ""), *stale):
@@ -406,35 +439,40 @@ def _tidy(folder: Path, stale: Iterable[str] = ()) -> None:
 
 
 def _unnamed(folder: Path, tables: str = "") -> list[str]:
-    """Tables and manifests in an index folder, but for the manifest and its tables."""
-    begin = (_TABLES, f".{_TABLES}")
-    names = [path.name for path in folder.iterdir() if path.name != tables]
-    return [name for name in names if name.startswith(begin) or temporary_of(name) == MANIFEST_FILE]
+    """Return tables and manifests in an index folder, except the manifest and its tables."""
+    prefixes = (_TABLES_PREFIX, f".{_TABLES_PREFIX}")
+    unnamed = []
+    for path in folder.iterdir():
+        is_temporary = temporary_of(path.name) == MANIFEST_FILE
+        if path.name != tables and (path.name.startswith(prefixes) or is_temporary):
+            unnamed.append(path.name)
+    return unnamed
 
 
-def _manifest(folder: Path) -> dict[str, Any]:
-    """The manifest's JSON object, empty if there is none."""
+def _read_manifest(folder: Path) -> dict[str, Any]:
+    """Return the manifest's JSON object, empty without one."""
     try:
-        content = json.loads(
-            read_bytes(folder / MANIFEST_FILE, "index")
-        )  # names of files may have half characters
+        # `json.loads` keeps lone surrogates, which names of files may have.
+        content = json.loads(read_bytes(folder / MANIFEST_FILE, "index"))
     except (OSError, ValueError, RecursionError, MemoryError):
         return {}
     return content if isinstance(content, dict) else {}
 
 
 def _checksum(content: Mapping[str, Any]) -> str:
-    """A checksum of all else that a manifest says."""
-    return hashlib.blake2b(json.dumps(content, sort_keys=True).encode(), digest_size=16).hexdigest()
+    """Return a checksum of a manifest's content without its checksum."""
+    text = json.dumps(content, sort_keys=True)
+    return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
 
 
 def _schema_version(folder: Path) -> int | None:
-    """The schema version that an index folder's manifest states, known here or not; None if it states none."""
-    version = _manifest(folder).get("schema_version")
+    """Return the schema version in an index folder's manifest, known or not; None without any."""
+    version = _read_manifest(folder).get("schema_version")
     return version if type(version) is int else None
 
 
-def _accept(layout: ReleaseLayout, index: Index, on_error: OnError) -> None:
+def _report_problems(layout: ReleaseLayout, index: Index, on_error: OnError) -> None:
+    """Raise an error for broken scenarios, or log them; log all notices."""
     if index.problems and (on_error == "raise" or not index.tables):
         raise BrokenReleaseError(_problems_text(layout, index.problems))
     if not index.tables:
@@ -442,51 +480,54 @@ def _accept(layout: ReleaseLayout, index: Index, on_error: OnError) -> None:
             f"{layout.root}: its scenarios hold no calib files; unpack the calib archives"
         )
     for problem in index.problems:
-        logger.warning(
-            "left out %s", escaped(f"{problem.scenario}: {' | '.join(problem.messages)}")
-        )
-    places: dict[str, list[str]] = {}
+        text = f"{problem.scenario}: {' | '.join(problem.messages)}"
+        logger.warning("left out %s", escaped(text))
+    scenarios_by_notice: dict[str, list[str]] = {}
     for notice in index.notices:
-        place, _, words = notice.partition(": ")
-        places.setdefault(words, []).append(place)
-    for words, (first, *others) in places.items():  # one sentence of all that lack the same
-        head = f"{1 + len(others)} scenarios, such as {first}" if others else first
-        logger.warning("%s", escaped(f"{head}: {words}"))
+        scenario, _, text = notice.partition(": ")
+        scenarios_by_notice.setdefault(text, []).append(scenario)
+    for text, scenarios in scenarios_by_notice.items():
+        head = scenarios[0]
+        if len(scenarios) > 1:
+            head = f"{len(scenarios)} scenarios, such as {head}"
+        logger.warning("%s", escaped(f"{head}: {text}"))
 
 
 def _problems_text(layout: ReleaseLayout, problems: Sequence[Problem]) -> str:
     total = len({scenario.token for scenario in layout.scenarios})
     lines = [f"{layout.root}: {len(problems)} of {total} scenarios are broken:"]
     for problem in problems:
-        lines += [f"  {problem.scenario}", *_first_lines(problem.messages)]
+        lines.append(f"  {problem.scenario}")
+        lines += [f"    {message}" for message in problem.messages[:_MAX_LISTED]]
+        if len(problem.messages) > _MAX_LISTED:
+            lines.append(f"    … and {len(problem.messages) - _MAX_LISTED} more")
     good = total - len(problems)
-    others = f"Mend them, or open the other {good} with on_error='skip' (--on-error skip)."
-    return "\n".join([*lines, others if good else "No other is left to open."])
-
-
-def _first_lines(messages: Sequence[str]) -> list[str]:
-    more = [f"    … and {len(messages) - _NAMED} more"] if len(messages) > _NAMED else []
-    return [*(f"    {message}" for message in messages[:_NAMED]), *more]
+    advice = "No other is left to open."
+    if good:
+        advice = f"Mend them, or open the other {good} with on_error='skip' (--on-error skip)."
+    return "\n".join([*lines, advice])
 
 
 def clear_index(
     dataroot: Dataroot, *, version: str = "v1", index_dir: Path | None = None
 ) -> list[Path]:
-    """Remove the indexes of a release, in its own folder and in the user's cache, with what stopped processes left.
+    """Remove the indexes of a release, in its own folder and in the user's cache.
 
-    Waits for a process that makes one. The release itself is not needed, nor touched.
+    Leftovers of stopped processes are removed, too. The call waits for a process that makes an
+    index. The release itself is not needed, nor touched.
 
     Args:
-        dataroot: the release, as of `DeepAccident`; it need not be there.
-        version: whose indexes.
-        index_dir: the only place to look in, where given.
+        dataroot: Dataroot of the release, as for `DeepAccident`; it need not exist.
+        version: Version of the release.
+        index_dir: The only folder of indexes to look in.
 
     Returns:
-        The folders that were removed; empty if there was no index.
+        Folders that were removed; empty if there was no index.
 
     Raises:
-        IndexStoreError: something there is no part of an index, and then nothing is removed; or the removal failed.
-        VersionError: the version is unknown.
+        IndexStoreError: A folder holds a file that is no part of an index, and then nothing is
+            removed; or the removal failed.
+        VersionError: The version is unknown.
     """
     version = choice("version", version, VERSIONS, error=VersionError)
     folders = list(filter(_holds_index, index_folders(dataroot, version, index_dir)))
@@ -497,40 +538,42 @@ def clear_index(
         with store.shared(partial(_refuse_foreign, folder)) as turn:
             if turn.alone():
                 _remove(store)
-    for place in index_places(dataroot, index_dir):
-        with suppress(OSError):  # not there, or not empty: another version's index
-            for listing in list_files_in(place):
+    for index_folder in index_places(dataroot, index_dir):
+        # The folder may be absent, or hold the index of another version.
+        with suppress(OSError):
+            for listing in list_files_in(index_folder):
                 listing.unlink(missing_ok=True)
             if index_dir is None:
-                place.rmdir()
+                index_folder.rmdir()
     return folders
 
 
 def _holds_index(folder: Path) -> bool:
-    """Whether there is an index, or part of one."""
-    parts = folder.glob(f"{_TABLES}*"), folder.glob("kept"), folder.glob(".lock")
-    return _schema_version(folder) is not None or any(map(any, parts))
+    """Return whether a folder holds an index, or part of one."""
+    if _schema_version(folder) is not None:
+        return True
+    patterns = (f"{_TABLES_PREFIX}*", "kept", ".lock")
+    return any(any(folder.glob(pattern)) for pattern in patterns)
 
 
 def _refuse_foreign(folder: Path) -> None:
-    """Raise IndexStoreError if there is anything in the folder that no devkit puts there."""
-    paths = {path.relative_to(folder).as_posix(): path for path in sorted(folder.rglob("*"))}
-    foreign = [
-        name
-        for name, path in paths.items()
-        if path.is_symlink() or not (path.is_dir() or _FILE.fullmatch(name))
-    ]
+    """Raise IndexStoreError if a folder holds anything that no devkit writes there."""
+    foreign = []
+    for path in sorted(folder.rglob("*")):
+        name = path.relative_to(folder).as_posix()
+        if path.is_symlink() or not (path.is_dir() or _INDEX_FILE.fullmatch(name)):
+            foreign.append(name)
     if foreign:
-        names = ", ".join(foreign[:_NAMED])
+        names = ", ".join(foreign[:_MAX_LISTED])
         raise IndexStoreError(
             f"{folder}: not removed: it holds what is no part of an index: {names}; look at it"
         )
 
 
 def _remove(store: Store) -> None:
-    """Remove an index: the manifest first, so that half of it is not taken for one."""
+    """Remove an index, its manifest first, so that a half of it does not count as an index."""
     try:
-        for name in (MANIFEST_FILE, *_EARLIER, *_unnamed(store.folder)):
+        for name in (MANIFEST_FILE, *_EARLIER_NAMES, *_unnamed(store.folder)):
             remove_in(store.folder, name)
         store.remove()
     except OSError as error:

@@ -1,6 +1,7 @@
-"""Rows as Arrow tables of what their records show: every field by its own name, tokens in place of row numbers.
+"""Rows as Arrow tables with the content of their records: all fields by name, with tokens.
 
-A record at a time would take an hour for a whole release; here each column is made at once.
+Record by record would take an hour for a complete release; these functions make each column at
+once.
 """
 
 from __future__ import annotations
@@ -22,17 +23,17 @@ if TYPE_CHECKING:
 
 
 class RecordTables:
-    """The tables of a release as their records show them."""
+    """The tables of a release with the fields of their records."""
 
     def __init__(self, tables: OpenTables) -> None:
-        """Make the words that tokens consist of."""
+        """Make the words of tokens."""
         import pyarrow as pa
 
         self._tables = tables
         scenario = tables.columns("scenario")
-        longest = int(scenario["num_frames"].max(initial=0))
-        self._numbers = pa.array([f"{number:03d}" for number in range(longest + 1)])
-        self._scenarios = _joined(scenario["scenario_type"], scenario["name"])
+        max_frames = int(scenario["num_frames"].max(initial=0))
+        self._numbers = pa.array([f"{number:03d}" for number in range(max_frames + 1)])
+        self._scenarios = _join(scenario["scenario_type"], scenario["name"])
         self._token_makers = {
             "scenario": self._scenarios.take,
             "agent": self._agent_tokens,
@@ -49,40 +50,45 @@ class RecordTables:
         }
 
     def rows(self, scenarios: Sequence[str], agents: Sequence[str] = AGENTS) -> dict[str, IntArray]:
-        """Table → its rows of some scenarios (tokens), in order; without `sensor` and `category`; raises TokenError.
+        """Return table → rows of scenarios, in order, without `sensor` and `category`.
 
-        Rows of what an agent recorded are only those of `agents`; tracks and instances are merged from all agents'.
+        Rows of recordings are restricted to `agents`; tracks and instances are merged from all
+        agents. Raises TokenError.
+
+        Args:
+            scenarios: Tokens of scenarios.
+            agents: Names of agents.
         """
-        chosen = np.array(
+        scenario_rows = np.array(
             [self._tables.getind("scenario", token) for token in scenarios], dtype=np.int64
         )
-        agent, sample = self._tables.columns("agent"), self._tables.columns("sample")
+        agent = self._tables.columns("agent")
+        sample = self._tables.columns("sample")
         codes = [AGENTS.index(name) for name in AGENTS if name in agents]
-        recorders = self._rows_with("agent", "scenario_row", chosen)
-        recorders = recorders[np.isin(agent["name"][recorders], codes)]
-        num_frames = self._tables.columns("scenario")["num_frames"][
-            agent["scenario_row"][recorders]
-        ]
-        samples = _spans(agent["first_sample_row"][recorders], num_frames)
+        agent_rows = self._rows_with("agent", "scenario_row", scenario_rows)
+        agent_rows = agent_rows[np.isin(agent["name"][agent_rows], codes)]
+        frames_of = self._tables.columns("scenario")["num_frames"]
+        num_frames = frames_of[agent["scenario_row"][agent_rows]]
+        samples = _spans(agent["first_sample_row"][agent_rows], num_frames)
+        num_annotations = sample["num_annotations"][samples]
         return {
-            "scenario": chosen,
-            "agent": recorders,
-            "frame": self._rows_with("frame", "scenario_row", chosen),
+            "scenario": scenario_rows,
+            "agent": agent_rows,
+            "frame": self._rows_with("frame", "scenario_row", scenario_rows),
             "sample": samples,
             "sample_data": _spans(samples * len(CHANNELS), np.full(len(samples), len(CHANNELS))),
-            "calibrated_sensor": self._rows_with("calibrated_sensor", "agent_row", recorders),
+            "calibrated_sensor": self._rows_with("calibrated_sensor", "agent_row", agent_rows),
             "ego_pose": samples,
-            "instance": self._rows_with("instance", "scenario_row", chosen),
-            "annotation": _spans(
-                sample["first_annotation_row"][samples], sample["num_annotations"][samples]
-            ),
-            "track": self._rows_with("track", "scenario_row", chosen),
+            "instance": self._rows_with("instance", "scenario_row", scenario_rows),
+            "annotation": _spans(sample["first_annotation_row"][samples], num_annotations),
+            "track": self._rows_with("track", "scenario_row", scenario_rows),
         }
 
     def table(self, name: str, rows: IntArray) -> Any:
-        """Rows (N,) of a table as a `pyarrow.Table`, a column a field; raises TableError and IndexStoreError.
+        """Return rows (N,) of a table as a `pyarrow.Table`, a column a field.
 
-        Choices are strings, matrices lists of lists. Lists have a fixed size where they are never null.
+        Choices are strings, matrices lists of lists. Lists have a fixed size where they are never
+        null. Raises TableError and IndexStoreError.
         """
         import pyarrow as pa
 
@@ -94,24 +100,26 @@ class RecordTables:
         return pa.table(arrays, names=[column.field for column in columns])
 
     def tokens(self, table: str, rows: IntArray) -> Any:
-        """The tokens of rows (N,) of a table, as an Arrow array."""
+        """Return the tokens of rows (N,) of a table, as an Arrow array."""
         return self._token_makers[table](rows)
 
     def _rows_with(self, table: str, key: str, targets: IntArray) -> IntArray:
-        """The rows of a table whose `key`, which is sorted, is one of the rows `targets` of another table."""
+        """Return the rows of a table with a `key` in rows `targets` of another table.
+
+        The column `key` is sorted.
+        """
         column = self._tables.columns(table)[key]
-        first, last = (
-            np.searchsorted(column, (targets + each).astype(column.dtype)) for each in (0, 1)
-        )
-        return _spans(first, last - first)
+        start = np.searchsorted(column, targets.astype(column.dtype))
+        stop = np.searchsorted(column, (targets + 1).astype(column.dtype))
+        return _spans(start, stop - start)
 
     def _values(self, table: str, column: Column, rows: IntArray) -> Any:  # noqa: PLR0911 - one a kind
         if column.stored is None:
-            return self._filenames(rows) if column.field == "filename" else self.tokens(table, rows)
-        stored, view = (
-            self._tables.arrow(table)[column.stored],
-            self._tables.columns(table)[column.stored],
-        )
+            if column.field == "filename":
+                return self._filenames(rows)
+            return self.tokens(table, rows)
+        stored = self._tables.arrow(table)[column.stored]
+        view = self._tables.columns(table)[column.stored]
         match column.kind:
             case Key(table=target):
                 return self._keys(target, view[rows])
@@ -119,106 +127,102 @@ class RecordTables:
                 return _words(values, view[rows])
             case Subset(values=values):
                 return _subsets(values, view[rows])
+            case Vector(shape=shape) if column.nullable:
+                return _nullable_lists(view[rows], shape)
             case Vector(shape=shape):
-                return (_nullable_lists if column.nullable else _fixed_lists)(view[rows], shape)
+                return _fixed_lists(view[rows], shape)
             case Struct():
-                return _of_open_lists(stored.take(rows))
+                return _open_lists(stored.take(rows))
             case _:
                 return stored.take(rows)
 
     def _keys(self, table: str, targets: IntArray) -> Any:
-        """Tokens of rows of another table; null for −1."""
+        """Return tokens of rows of another table; null for −1."""
         known = targets >= 0
         return _spread(self.tokens(table, targets[known]), known)
 
     def _agent_tokens(self, rows: IntArray) -> Any:
         agent = self._tables.columns("agent")
-        return _joined(
-            self._scenarios.take(agent["scenario_row"][rows]), _words(AGENTS, agent["name"][rows])
-        )
+        scenarios = self._scenarios.take(agent["scenario_row"][rows])
+        return _join(scenarios, _words(AGENTS, agent["name"][rows]))
 
     def _frame_tokens(self, rows: IntArray) -> Any:
         frame = self._tables.columns("frame")
-        return _joined(
-            self._scenarios.take(frame["scenario_row"][rows]),
-            self._numbers.take(frame["index"][rows]),
-        )
+        scenarios = self._scenarios.take(frame["scenario_row"][rows])
+        return _join(scenarios, self._numbers.take(frame["index"][rows]))
 
     def _sample_tokens(self, rows: IntArray) -> Any:
         agent = self._tables.columns("sample")["agent_row"][rows]
-        return _joined(self._agent_tokens(agent), self._number_words(rows, agent))
+        return _join(self._agent_tokens(agent), self._number_words(rows, agent))
 
     def _number_words(self, samples: IntArray, agents: IntArray) -> Any:
-        """The frame numbers `NNN` of samples of agents, both by row."""
-        return self._numbers.take(
-            samples - self._tables.columns("agent")["first_sample_row"][agents] + 1
-        )
+        """Return the frame numbers `NNN` of samples of agents, both by row."""
+        first_rows = self._tables.columns("agent")["first_sample_row"][agents]
+        return self._numbers.take(samples - first_rows + 1)
 
     def _sample_data_tokens(self, rows: IntArray) -> Any:
         sample, channel = np.divmod(rows, len(CHANNELS))
-        return _joined(self._sample_tokens(sample), _words(CHANNELS, channel))
+        return _join(self._sample_tokens(sample), _words(CHANNELS, channel))
 
     def _calibrated_sensor_tokens(self, rows: IntArray) -> Any:
         import pyarrow.compute as pc
 
         view = self._tables.columns("calibrated_sensor")
-        first = _joined(
-            self._agent_tokens(view["agent_row"][rows]), _words(CHANNELS, view["sensor_row"][rows])
-        )
-        return pc.if_else(
-            view["number"][rows] == 1, first, _joined(first, _digits(view["number"][rows]))
-        )
+        agents = self._agent_tokens(view["agent_row"][rows])
+        unnumbered = _join(agents, _words(CHANNELS, view["sensor_row"][rows]))
+        number = view["number"][rows]
+        return pc.if_else(number == 1, unnumbered, _join(unnumbered, _digits(number)))
 
     def _instance_tokens(self, rows: IntArray) -> Any:
-        return self._actor_tokens(
-            "scenario", self._tables.columns("instance")["scenario_row"][rows], rows
-        )
+        scenarios = self._tables.columns("instance")["scenario_row"][rows]
+        return self._actor_tokens("scenario", scenarios, rows)
 
     def _track_tokens(self, rows: IntArray) -> Any:
         track = self._tables.columns("track")
         return self._actor_tokens("frame", track["frame_row"][rows], track["instance_row"][rows])
 
     def _actor_tokens(self, table: str, rows: IntArray, instances: IntArray) -> Any:
-        """The tokens of actors in what the rows of a table are."""
+        """Return the tokens of actors within rows of a table."""
         actors = self._tables.columns("instance")["actor_id"][instances]
-        return _joined(self.tokens(table, rows), ACTOR, _digits(actors))
+        return _join(self.tokens(table, rows), ACTOR, _digits(actors))
 
     def _annotation_tokens(self, rows: IntArray) -> Any:
         sample = self._tables.columns("annotation")["sample_row"][rows]
         number = rows - self._tables.columns("sample")["first_annotation_row"][sample]
-        return _joined(self._sample_tokens(sample), _digits(number))
+        return _join(self._sample_tokens(sample), _digits(number))
 
     def _filenames(self, rows: IntArray) -> Any:
-        """The paths of sensor files below the dataroot."""
+        """Return the paths of sensor files in the dataroot."""
         import pyarrow.compute as pc
 
         sample, channel = np.divmod(rows, len(CHANNELS))
         agent = self._tables.columns("sample")["agent_row"][sample]
-        scenario = self._tables.columns("agent")["scenario_row"][agent]
-        words = self._tables.columns("scenario")
-        name = words["name"].take(scenario)
-        folder, agents = (
-            words["folder"].take(scenario),
-            _words(AGENTS, self._tables.columns("agent")["name"][agent]),
+        agents = self._tables.columns("agent")
+        scenario = agents["scenario_row"][agent]
+        scenarios = self._tables.columns("scenario")
+        name = scenarios["name"].take(scenario)
+        folder = scenarios["folder"].take(scenario)
+        extensions = [CHANNEL_FORMAT[channel_name] for channel_name in CHANNELS]
+        stem = _join(name, self._number_words(sample, agent), separator="_")
+        file_name = _join(stem, _words(extensions, channel), separator=".")
+        path = _join(
+            scenarios["scenario_type"].take(scenario),
+            _words(AGENTS, agents["name"][agent]),
+            _words(CHANNELS, channel),
+            name,
+            file_name,
         )
-        file = _joined(name, self._number_words(sample, agent), separator="_")
-        file = _joined(
-            file, _words([CHANNEL_FORMAT[each] for each in CHANNELS], channel), separator="."
-        )
-        path = _joined(
-            words["scenario_type"].take(scenario), agents, _words(CHANNELS, channel), name, file
-        )
-        return pc.if_else(pc.equal(folder, ""), path, _joined(folder, path))
+        return pc.if_else(pc.equal(folder, ""), path, _join(folder, path))
 
 
-def _joined(*words: Any, separator: str = "/") -> Any:
+def _join(*words: Any, separator: str = "/") -> Any:
     import pyarrow.compute as pc
 
     return pc.binary_join_element_wise(*words, separator)
 
 
 def _words(values: Sequence[str], codes: IntArray) -> Any:
-    """The words that codes stand for; null for −1."""
+    """Return the words of codes; null for −1."""
     import pyarrow as pa
 
     return pa.array(values).take(pa.array(codes, mask=codes < 0))
@@ -231,21 +235,20 @@ def _digits(numbers: IntArray) -> Any:
 
 
 def _spread(values: Any, known: BoolArray) -> Any:
-    """The values of the rows that are known, each at its row; null at the others."""
+    """Return values at the rows that are known; null at the others."""
     import pyarrow as pa
 
     return values.take(pa.array(np.cumsum(known) - 1, mask=~known))
 
 
 def _subsets(values: Sequence[str], masks: IntArray) -> Any:
-    """The lists of words that bit masks stand for."""
+    """Return the lists of words of bit masks."""
     import pyarrow as pa
 
-    lists = [
-        [word for bit, word in enumerate(values) if mask >> bit & 1]
-        for mask in range(1 << len(values))
-    ]
-    return pa.array(lists).take(pa.array(masks))
+    subsets = []
+    for mask in range(1 << len(values)):
+        subsets.append([word for bit, word in enumerate(values) if mask >> bit & 1])
+    return pa.array(subsets).take(pa.array(masks))
 
 
 def _fixed_lists(data: FloatArray, shape: Sequence[int]) -> Any:
@@ -258,31 +261,33 @@ def _fixed_lists(data: FloatArray, shape: Sequence[int]) -> Any:
 
 
 def _nullable_lists(data: FloatArray, shape: Sequence[int]) -> Any:
-    """Lists that can be null: of no fixed size, since Arrow before 15 cannot read such from Parquet files."""
+    """Return lists of no fixed size, which can be null.
+
+    Arrow before 15 cannot read such lists of a fixed size from Parquet files.
+    """
     import pyarrow as pa
 
     known = ~np.isnan(data[:, 0])
     array = pa.array(data[known].reshape(-1))
     for length in reversed(shape):
-        array = pa.ListArray.from_arrays(
-            np.arange(0, len(array) + 1, length, dtype=np.int32), array
-        )
+        offsets = np.arange(0, len(array) + 1, length, dtype=np.int32)
+        array = pa.ListArray.from_arrays(offsets, array)
     return _spread(array, known)
 
 
-def _of_open_lists(structs: Any) -> Any:
-    """Structs whose lists have no fixed size, for the same reason."""
+def _open_lists(structs: Any) -> Any:
+    """Return structs with lists of no fixed size, like `_nullable_lists`."""
     import pyarrow as pa
 
-    fields = [(field.name, field.type) for field in structs.type]
-    opened = {
-        name: pa.list_(kind.value_type) if pa.types.is_fixed_size_list(kind) else kind
-        for name, kind in fields
-    }
-    return pa.array(structs.to_pylist(), type=pa.struct(list(opened.items())))
+    fields = []
+    for field in structs.type:
+        is_fixed = pa.types.is_fixed_size_list(field.type)
+        fields.append((field.name, pa.list_(field.type.value_type) if is_fixed else field.type))
+    return pa.array(structs.to_pylist(), type=pa.struct(fields))
 
 
-def _spans(first: IntArray, count: IntArray) -> IntArray:
-    """The numbers from each `first` on, `count` of them, one after the other."""
+def _spans(start: IntArray, count: IntArray) -> IntArray:
+    """Return `count` numbers from each `start` on, one run after the other."""
     before = np.cumsum(count) - count
-    return np.repeat(first.astype(np.int64) - before, count) + np.arange(count.sum())
+    offsets = np.repeat(start.astype(np.int64) - before, count)
+    return offsets + np.arange(count.sum())

@@ -1,6 +1,7 @@
 """The records of every table: each field's type, storage and meaning, written once.
 
-`schema/` is generated from here. Frames are right-handed: x forward, y left, z up; metres, radians, seconds.
+`schema/` is generated from here. Frames are right-handed: x forward, y left, z up; metres, radians,
+seconds.
 """
 
 from collections.abc import Mapping
@@ -57,7 +58,8 @@ class CollisionRecord(TypedDict):
         Items(
             type="string",
             nullable=True,
-            doc="Which agents the pair are; null for a road user that records nothing, null where meta is silent.",
+            doc="Which agents the pair are; null for a road user that records nothing, null where "
+            "meta is silent.",
         ),
     ]
 
@@ -80,8 +82,8 @@ class ScenarioRecord(TypedDict):
         bool,
         Number(
             dtype="bool",
-            doc="Whether the scenario was set up to end in an accident (an `_accident` folder); what happened is in "
-            "`collision`.",
+            doc="Whether the scenario was set up to end in an accident (an `_accident` folder); "
+            "what happened is in `collision`.",
         ),
     ]
     town: Annotated[str, Word(doc="CARLA town, first part of the name.")]
@@ -110,9 +112,9 @@ class ScenarioRecord(TypedDict):
         str | None,
         Choice(
             values=tuple(VELOCITY_FRAMES),
-            doc="What the labels' velocities turned out to be in, by the displacements of moving boxes (see "
-            "docs/conventions.md); null where too few boxes move or nothing fits. They are decoded by it; by "
-            "`released` where it is null.",
+            doc="What the labels' velocities turned out to be in, by the displacements of moving "
+            "boxes (see docs/conventions.md); null where too few boxes move or nothing fits. They "
+            "are decoded by it; by `released` where it is null.",
         ),
     ]
     num_frames: Annotated[
@@ -239,8 +241,8 @@ class SampleDataRecord(TypedDict):
         list[list[float]],
         Vector(
             shape=(3, 4),
-            doc="Upper three rows of `ego_from_sensor` as this sample's calib file gives it; `calibrated_sensor` holds "
-            "the same apart from rounding.",
+            doc="Upper three rows of `ego_from_sensor` as this sample's calib file gives it; "
+            "`calibrated_sensor` holds the same apart from rounding.",
         ),
     ]
     prev: Annotated[str | None, Key(table="sample_data", doc="The same sensor's file before.")]
@@ -258,9 +260,10 @@ class SensorRecord(TypedDict):
 class CalibratedSensorRecord(TypedDict):
     """A sensor on an agent: `ego_from_sensor`; one row, and a further one where it moved on its agent.
 
-    The release computes its matrices in single precision at every frame, so that they jitter: what differs by at most
-    1 mm in the translation and 1e-5 in the rotation is one row, with the numbers of its first frame.
-    """
+    The release computes its matrices in single precision at every frame, so that they jitter: what
+    differs by at most 1 mm in the translation and 1e-5 in the rotation is one row, with the numbers
+    of its first frame.
+    """  # noqa: E501 - the schema has this text
 
     token: Annotated[
         str, Derived(doc="`<scenario>/<agent>/<channel>`, then `/2`, `/3`, … for further values.")
@@ -335,7 +338,8 @@ class AnnotationRecord(TypedDict):
         str | None,
         Key(
             table="instance",
-            doc="Its actor; the agent's own row (−100) belongs to the agent's actor; null for untracked rows (−1).",
+            doc="Its actor; the agent's own row (−100) belongs to the agent's actor; null for "
+            "untracked rows (−1).",
         ),
     ]
     category: Annotated[str, Choice(values=CATEGORIES, doc="The label's class.")]
@@ -348,8 +352,9 @@ class AnnotationRecord(TypedDict):
         list[float],
         Vector(
             shape=(3,),
-            doc="Over the ground, in the LiDAR frame's axes: the label's own, decoded. Where that is no number: "
-            "differences of this agent's world positions of the actor at 10 Hz, NaN without a neighbour frame or id.",
+            doc="Over the ground, in the LiDAR frame's axes: the label's own, decoded. Where that "
+            "is no number: differences of this agent's world positions of the actor at 10 Hz, NaN "
+            "without a neighbour frame or id.",
             unit="m/s",
         ),
     ]
@@ -373,8 +378,8 @@ class AnnotationRecord(TypedDict):
         list[float],
         Vector(
             shape=(2,),
-            doc="The label's own numbers as (vx, −vy): the world's velocity, turned once more by the box's yaw; NaN "
-            "where the label has no number.",
+            doc="The label's own numbers as (vx, −vy): the world's velocity, turned once more by "
+            "the box's yaw; NaN where the label has no number.",
             unit="m/s",
         ),
     ]
@@ -396,8 +401,9 @@ class AnnotationRecord(TypedDict):
 class TrackRecord(TypedDict):
     """One actor at one moment in the world, merged from all agents' labels.
 
-    Pose, size, velocity and category are those of one annotation: the first agent's, in the order of the agent
-    table, that saw the actor from outside; its own row (up to 0.3 m off) counts only where nobody else saw it.
+    Pose, size, velocity and category are those of one annotation: the first agent's, in the order
+    of the agent table, that saw the actor from outside; its own row (up to 0.3 m off) counts only
+    where nobody else saw it.
     """
 
     token: Annotated[str, Derived(doc="`<frame>/actor/<actor_id>`.")]
@@ -444,12 +450,12 @@ RECORDS: dict[str, type] = {
 
 @cache
 def table_specs() -> Mapping[str, TableSpec]:
-    """Every table, in the order in which the tables build on each other."""
+    """Return all tables, in the order in which they build on each other."""
     return {name: spec_of(name, record) for name, record in RECORDS.items()}
 
 
 def table_spec(name: str) -> TableSpec:
-    """One table's specification; raises TableError."""
+    """Return a table's specification; raises TableError."""
     specs = table_specs()
     known = spelled(name, specs)
     if known not in specs:
@@ -459,17 +465,15 @@ def table_spec(name: str) -> TableSpec:
 
 
 def record_columns(record: type) -> tuple[Column, ...]:
-    """The columns that a TypedDict of annotated fields declares."""
-    return tuple(
-        _column(field, hint) for field, hint in get_type_hints(record, include_extras=True).items()
-    )
+    """Return the columns that a TypedDict of annotated fields declares."""
+    hints = get_type_hints(record, include_extras=True)
+    return tuple(_column(field, hint) for field, hint in hints.items())
 
 
 def spec_of(name: str, record: type) -> TableSpec:
-    """The specification of a table whose records a TypedDict of annotated fields declares."""
-    return TableSpec(
-        name=name, doc=" ".join((record.__doc__ or "").split()), columns=record_columns(record)
-    )
+    """Return the specification of a table with records of a TypedDict of annotated fields."""
+    doc = " ".join((record.__doc__ or "").split())
+    return TableSpec(name=name, doc=doc, columns=record_columns(record))
 
 
 def _column(field: str, hint: Any) -> Column:

@@ -1,4 +1,4 @@
-"""A scenario's small files: which there are, what is in them and what is wrong with them; digests that tell changes."""
+"""A scenario's small files: their presence, content and faults, and digests that show changes."""
 
 import hashlib
 import json
@@ -35,25 +35,29 @@ from deepaccident_devkit.taxonomy import AGENTS, AgentName
 
 Severity = Literal["error", "warning", "note"]
 SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
-"""Worst first: `error` cannot be indexed or cannot be true, `warning` is probably wrong, `note` is worth knowing."""
+"""Levels of severity, worst first.
+
+An `error` cannot be indexed or cannot be true, a `warning` is probably wrong, a `note` is worth
+knowing.
+"""
 SMALL_FILE_ENDINGS = {"calib": "pkl", "label": "txt"}
 """Kind of small file → ending of its files."""
-_FRAMES_NAMED = 6
-_REMEDY = "unpack its archive again, or leave the scenario out with on_error='skip'"
+_MAX_RUNS = 6
+_ARCHIVE_REMEDY = "unpack its archive again, or leave the scenario out with on_error='skip'"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Finding(ShortRepr):
-    """One thing that is wrong, odd or missing.
+    """A wrong, odd or missing part of a release.
 
     Attributes:
-        code: its kind, such as `label-unreadable`; `validation.CODES` has all.
-        severity: how bad it is.
-        scenario: token of the scenario; None where the release as a whole is meant.
-        where: the file (with the line), the folder, or the agents and actors.
-        what: what is wrong there.
-        remedy: what to do.
-        known: whether the real release has it too; then it is no fault of this copy.
+        code: Kind of finding, such as `label-unreadable`; `validation.CODES` has all.
+        severity: Severity.
+        scenario: Token of the scenario; None for the release itself.
+        where: File (with the line), folder, or agents and actors.
+        what: Description of the fault.
+        remedy: What the user should do.
+        known: Whether the real release has it too; then it is no fault of this copy.
     """
 
     code: str
@@ -65,30 +69,35 @@ class Finding(ShortRepr):
     known: bool = False
 
     def __str__(self) -> str:
-        """One sentence: where, what, and the remedy."""
+        """Return one sentence: location, description, and remedy."""
         return f"{self.where}: {self.what}; {self.remedy}"
 
 
 def finding_of(error: ReleaseError, code: str, scenario: str | None) -> Finding:
-    """The finding that a reader's error tells of; its text is the error's."""
-    where, _, rest = str(error).partition(": ")
-    what, _, remedy = rest.rpartition("; ")
+    """Return the finding of a reader's error; its text is the error's."""
+    location, _, text = str(error).partition(": ")
+    message, _, remedy = text.rpartition("; ")
     return Finding(
-        code=code, severity="error", scenario=scenario, where=where, what=what, remedy=remedy
+        code=code,
+        severity="error",
+        scenario=scenario,
+        where=location,
+        what=message,
+        remedy=remedy,
     )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ScenarioScan:
-    """What a scenario's folders hold.
+    """Listing of a scenario's folders.
 
     Attributes:
-        agents: the agents with calib files.
-        has_meta: whether there is a meta file.
-        labelled: those of them with label files.
-        num_frames: the highest frame number of any of their files.
-        problems: what makes the scenario broken.
-        notices: what was left aside, a sentence each.
+        agents: Agents with calib files.
+        has_meta: Whether it has a meta file.
+        labelled: Agents of `agents` with label files.
+        num_frames: Highest frame number of any of their files.
+        problems: Faults that make the scenario broken.
+        notices: Parts that were left aside, a sentence each.
     """
 
     agents: tuple[AgentName, ...]
@@ -100,16 +109,16 @@ class ScenarioScan:
 
 
 def scan_scenario(scenario: ScenarioFolder) -> ScenarioScan:
-    """List a scenario's calib and label folders and check that they hold frames 1 to n for every agent."""
+    """List a scenario's calib and label folders and check that agents have all frames 1 to n."""
     problems: list[Finding] = []
     if scenario.token.encode(errors="replace") != os.fsencode(scenario.token):
-        what, remedy = "the scenario's name is not UTF-8", "rename its folders and files"
-        problems.append(_broken(scenario, "odd-name", scenario.meta_path, what, remedy))
-    frames = {
-        (agent, kind): _frames(scenario, agent, kind, ending, problems)
-        for agent in AGENTS
-        for kind, ending in SMALL_FILE_ENDINGS.items()
-    }
+        message = "the scenario's name is not UTF-8"
+        remedy = "rename its folders and files"
+        problems.append(_broken(scenario, "odd-name", scenario.meta_path, message, remedy))
+    frames: dict[tuple[AgentName, str], list[int]] = {}
+    for agent in AGENTS:
+        for kind, ending in SMALL_FILE_ENDINGS.items():
+            frames[agent, kind] = _list_frames(scenario, agent, kind, ending, problems)
     agents = tuple(agent for agent in AGENTS if frames[agent, "calib"])
     notices = [
         f"{scenario.token}: {agent} has labels but no calib files and is left out"
@@ -117,24 +126,25 @@ def scan_scenario(scenario: ScenarioFolder) -> ScenarioScan:
         if frames[agent, "label"] and agent not in agents
     ]
     labelled = tuple(agent for agent in agents if frames[agent, "label"])
-    has_meta = _is_there(scenario.meta_path)
+    has_meta = _exists(scenario.meta_path)
     if labelled and not has_meta:
         notices.append(
-            f"{scenario.meta_path}: missing or not readable: weather and collision of this scenario are unknown, "
-            "and find(collision=…) leaves it out; find(designed_accident=True) goes by its folder"
+            f"{scenario.meta_path}: missing or not readable: weather and collision of this "
+            "scenario are unknown, and find(collision=…) leaves it out; "
+            "find(designed_accident=True) goes by its folder"
         )
-    num_frames = max(
-        (found[-1] for (agent, _), found in frames.items() if found and agent in agents), default=0
-    )
+    num_frames = 0
+    for agent in agents:
+        for kind in SMALL_FILE_ENDINGS:
+            num_frames = max([num_frames, *frames[agent, kind]])
     for agent in agents:
         for kind in ("calib", "label") if agent in labelled else ("calib",):
             missing = sorted(set(range(1, num_frames + 1)) - set(frames[agent, kind]))
             if missing:
-                what = f"lacks frames {frame_ranges(missing)} of 1 to {num_frames}"
+                message = f"lacks frames {frame_ranges(missing)} of 1 to {num_frames}"
+                folder = scenario.kind_folder(agent, kind)
                 problems.append(
-                    _broken(
-                        scenario, "frames-missing", scenario.kind_folder(agent, kind), what, _REMEDY
-                    )
+                    _broken(scenario, "frames-missing", folder, message, _ARCHIVE_REMEDY)
                 )
     return ScenarioScan(
         agents=agents,
@@ -146,45 +156,46 @@ def scan_scenario(scenario: ScenarioFolder) -> ScenarioScan:
     )
 
 
-def _frames(
+def _list_frames(
     scenario: ScenarioFolder, agent: AgentName, kind: str, ending: str, problems: list[Finding]
 ) -> list[int]:
-    """The frame numbers of an agent's files of a kind; what is wrong with the folder goes to `problems`."""
+    """Return the frame numbers of an agent's files of a kind; faults join `problems`."""
     folder = scenario.kind_folder(agent, kind)
     try:
-        frames, odd = frame_numbers(folder, ending)
+        frames, odd_names = frame_numbers(folder, ending)
     except ReleaseError as error:
         problems.append(finding_of(error, "folder-unreadable", scenario.token))
         return []
-    what = f"expected a name {scenario.name}_<NNN>.{ending}"
-    problems += [_broken(scenario, "odd-name", folder / name, what, "rename it") for name in odd]
+    message = f"expected a name {scenario.name}_<NNN>.{ending}"
+    for name in odd_names:
+        problems.append(_broken(scenario, "odd-name", folder / name, message, "rename it"))
     return frames
 
 
 def _broken(
-    scenario: ScenarioFolder, code: str, where: ReleasePath, what: str, remedy: str
+    scenario: ScenarioFolder, code: str, path: ReleasePath, message: str, remedy: str
 ) -> Finding:
     return Finding(
         code=code,
         severity="error",
         scenario=scenario.token,
-        where=str(where),
-        what=what,
+        where=str(path),
+        what=message,
         remedy=remedy,
     )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ScenarioFiles:
-    """The small files of a scenario, read.
+    """Contents of a scenario's small files.
 
     Attributes:
-        scenario: where they lie.
-        scan: which there are.
-        meta: None if the scenario has none.
-        calibs: of every sample, agent by agent.
-        labels: of every labelled sample, agent by agent.
-        hashes: of the files' bytes, as of `content_hashes`.
+        scenario: Location of the files.
+        scan: Listing of the files.
+        meta: Meta; None if the scenario has none.
+        calibs: Calib of every sample, agent by agent.
+        labels: Labels of every labelled sample, agent by agent.
+        hashes: Hashes of the files' bytes, as in `content_hashes`.
     """
 
     scenario: ScenarioFolder
@@ -196,34 +207,37 @@ class ScenarioFiles:
 
     @property
     def num_samples(self) -> int:
-        """Agents times frames."""
+        """Number of samples: agents times frames."""
         return len(self.scan.agents) * self.scan.num_frames
 
 
 def read_scenario(
     scenario: ScenarioFolder, scan: ScenarioScan
 ) -> tuple[ScenarioFiles | None, list[Finding]]:
-    """A scenario's meta, calib and label files, None if there is a fault; and the faults, the first of every file."""
+    """Return a scenario's meta, calib and label files, None if any has a fault, and the faults.
+
+    Of every file, only the first fault is listed.
+    """
     faults: list[Finding] = []
 
     def attempt(read: Any, code: str, paths: list[ReleasePath]) -> Any:
         try:
             return read(paths)
         except ReleaseError as error:
-            if len(paths) == 1:
-                faults.append(finding_of(error, code, scenario.token))
-            else:
-                known = len(faults)
-                for path in paths:  # each by itself: the reader stops at the first
+            num_faults = len(faults)
+            # The reader stops at the first fault, so each file is read again.
+            if len(paths) > 1:
+                for path in paths:
                     attempt(read, code, [path])
-                if len(faults) == known:  # good alone, and not together
-                    faults.append(finding_of(error, code, scenario.token))
+            # Files may be good one by one, but not together.
+            if len(faults) == num_faults:
+                faults.append(finding_of(error, code, scenario.token))
             return None
 
     frames = range(1, scan.num_frames + 1)
     meta_paths = [scenario.meta_path] if scan.has_meta else []
-    calib_paths = [scenario.calib_path(agent, n) for agent in scan.agents for n in frames]
-    label_paths = [scenario.label_path(agent, n) for agent in scan.labelled for n in frames]
+    calib_paths = [scenario.calib_path(agent, frame) for agent in scan.agents for frame in frames]
+    label_paths = [scenario.label_path(agent, frame) for agent in scan.labelled for frame in frames]
     contents: dict[str, bytes] = {}
     paths = [*meta_paths, *calib_paths, *label_paths]
     with fetched(paths), observed(lambda path, content: contents.update({str(path): content})):
@@ -234,9 +248,10 @@ def read_scenario(
         return None, faults
     meta = metas[0] if metas else None
     hashes = content_hashes(scenario, contents)
-    return ScenarioFiles(
+    files = ScenarioFiles(
         scenario=scenario, scan=scan, meta=meta, calibs=calibs, labels=labels, hashes=hashes
-    ), []
+    )
+    return files, []
 
 
 def _read_metas(paths: Sequence[ReleasePath]) -> list[Meta]:
@@ -244,35 +259,34 @@ def _read_metas(paths: Sequence[ReleasePath]) -> list[Meta]:
 
 
 def folder_digest(scenarios: Iterable[ScenarioFolder], split_files: Iterable[ReleasePath]) -> str:
-    """Return a digest of the states of the scenarios' folders and meta files, and of the contents of split files.
+    """Return a digest of the states of folders and meta files, and of the contents of split files.
 
-    It changes when a file is added, removed, renamed or replaced, also by a tool that puts all times back, for none can
-    put back a folder's ctime. It does not change when a label or calib file is written in place, nor when files get
-    hard links, which change the ctime of a file. In a store it changes with the list of the archives' members.
+    It changes when a file is added, removed, renamed or replaced, also by a tool that restores all
+    times, since none can restore a folder's ctime. It does not change when a label or calib file is
+    written in place, nor when files get hard links, which change the ctime of a file. In a store it
+    changes with the list of the archives' members.
     """
     digest = hashlib.blake2b(digest_size=16)
     for scenario in scenarios:
         if isinstance(scenario.root, StorePath):
-            digest.update(
-                os.fsencode(f"{scenario.root.store.state} {scenario.folder}/{scenario.token}\n")
-            )
+            state = f"{scenario.root.store.state} {scenario.folder}/{scenario.token}\n"
+            digest.update(os.fsencode(state))
             continue
         root = os.fspath(scenario.root)
         base = os.path.join(root, scenario.folder, scenario.scenario_type)  # noqa: PTH118 - 7,000 of them at start
         digest.update(os.fsencode(f"{scenario.folder}/{scenario.token}\n"))
-        folders = [
-            f"{base}/{agent}/{kind}/{scenario.name}"
-            for agent in AGENTS
-            for kind in SMALL_FILE_ENDINGS
-        ]
-        for path in [*folders, f"{base}/meta"]:
-            digest.update(_stat_words(path, ctime=True))
+        for agent in AGENTS:
+            for kind in SMALL_FILE_ENDINGS:
+                folder = f"{base}/{agent}/{kind}/{scenario.name}"
+                digest.update(_stat_words(folder, ctime=True))
+        digest.update(_stat_words(f"{base}/meta", ctime=True))
         digest.update(_stat_words(f"{base}/meta/{scenario.name}.txt"))
     for file in split_files:
         digest.update(os.fsencode(file.name))
-        digest.update(
-            _stat_words(file) if isinstance(file, StorePath) else _content_or_fault(file, "split")
-        )
+        if isinstance(file, StorePath):
+            digest.update(_stat_words(file))
+        else:
+            digest.update(_content_or_fault(file, "split"))
     return digest.hexdigest()
 
 
@@ -282,36 +296,40 @@ def times_digest(
     *,
     ctime: bool = True,
 ) -> str:
-    """Return a digest of the names, sizes and times of a scenario's files of some kinds, and of meta; opens none.
+    """Return a digest of names, sizes and times of a scenario's files of these kinds, and of meta.
 
-    With `ctime` it changes with whatever is done to a file, also if its time is put back, and if it gets a hard link.
+    No file is opened. With `ctime` it changes with every change of a file, also if its time is
+    restored, and if it gets a hard link.
     """
     digest = hashlib.blake2b(os.fsencode(f"{scenario.folder}/{scenario.token}"), digest_size=16)
     for agent, kind in product(AGENTS, kinds):
-        with suppress(OSError):  # no such folder
-            for entry in sorted(
-                folder_entries(scenario.kind_folder(agent, kind)), key=attrgetter("name")
-            ):
-                digest.update(
-                    os.fsencode(f"{agent}/{kind}/{entry.name}") + _stat_words(entry, ctime=ctime)
-                )
+        # The folder may be absent.
+        with suppress(OSError):
+            entries = folder_entries(scenario.kind_folder(agent, kind))
+            for entry in sorted(entries, key=attrgetter("name")):
+                name = os.fsencode(f"{agent}/{kind}/{entry.name}")
+                digest.update(name + _stat_words(entry, ctime=ctime))
     digest.update(_stat_words(scenario.meta_path, ctime=ctime))
     return digest.hexdigest()
 
 
 def content_hashes(scenario: ScenarioFolder, known: Mapping[str, bytes] | None = None) -> str:
-    """Return the hashes of a scenario's files (`ScenarioHashes`) as JSON; empty if a folder cannot be listed.
+    """Return the hashes of a scenario's files (`ScenarioHashes`) as JSON.
+
+    The text is empty if a folder cannot be listed.
 
     Args:
-        scenario: where the files lie.
-        known: path → bytes of files that were read before. The others are read now; of a file that cannot be read, the
-            fault counts.
+        scenario: Location of the files.
+        known: Path → bytes of files that were read before. The others are read now; for a file that
+            cannot be read, the fault is hashed.
     """
     contents = known or {}
 
     def read(path: ReleasePath, kind: FileKind) -> bytes:
         content = contents.get(str(path))
-        return _content_or_fault(path, kind) if content is None else content
+        if content is None:
+            return _content_or_fault(path, kind)
+        return content
 
     try:
         return json.dumps(folder_hashes(scenario, read=read).as_dict())
@@ -328,29 +346,30 @@ def _content_or_fault(path: ReleasePath, kind: FileKind) -> bytes:
 
 def _stat_words(path: ReleasePath | FolderEntry | str, *, ctime: bool = False) -> bytes:
     try:
-        status = os.stat(path) if isinstance(path, str) else path.stat()  # noqa: PTH116 - there are 7,000 texts at start
+        # There are 7,000 texts when a release is opened.
+        status = os.stat(path) if isinstance(path, str) else path.stat()  # noqa: PTH116
     except OSError:
         return b" none\n"
     changed = getattr(status, "st_ctime_ns", 0) if ctime else 0
     return f" {status.st_size} {status.st_mtime_ns} {changed}\n".encode()
 
 
-def _is_there(path: ReleasePath) -> bool:
+def _exists(path: ReleasePath) -> bool:
     try:
         return path.exists()
-    except OSError:  # its folder is closed
+    except OSError:  # Its folder cannot be read.
         return False
 
 
 def frame_ranges(numbers: Sequence[int]) -> str:
-    """`3–5, 9`: runs of consecutive numbers, the first few."""
+    """Return `3–5, 9`: runs of consecutive numbers, at most six."""
     runs: list[list[int]] = []
     for number in numbers:
         if runs and runs[-1][1] == number - 1:
             runs[-1][1] = number
         else:
             runs.append([number, number])
-    words = [
-        f"{first}" if first == last else f"{first}–{last}" for first, last in runs[:_FRAMES_NAMED]
-    ]
-    return ", ".join(words) + (" …" if len(runs) > _FRAMES_NAMED else "")
+    words = []
+    for low, high in runs[:_MAX_RUNS]:
+        words.append(f"{low}" if low == high else f"{low}–{high}")
+    return ", ".join(words) + (" …" if len(runs) > _MAX_RUNS else "")

@@ -1,4 +1,4 @@
-"""The opened tables: a `Table` has its rows as fresh dict records, `OpenTables` all tables with columns and splits."""
+"""The opened tables: `Table` returns rows as fresh records, `OpenTables` holds all tables."""
 
 from __future__ import annotations
 
@@ -51,20 +51,20 @@ if TYPE_CHECKING:
 
 _Record = TypeVar("_Record")
 _Getter = Callable[[int], Any]
-# Frames by which a time may miss its frame.
-_SAME_FRAME: Final = 1e-6
+# Difference between a time and its frame, in frames.
+_FRAME_TOLERANCE: Final = 1e-6
 RowArgument = str | Mapping[str, Any]
-"""How a caller names a row: by its token, or by its record."""
+"""A row as callers name it: by its token, or by its record."""
 
 
 class OpenTables:
     """One release's tables: records by row and token, columns, splits.
 
     Attributes:
-        dataroot: the release's folder.
+        dataroot: Folder of the release.
         version: `v1` or `v1-mini`.
-        layout: how the release lies on disk: `A`, `B` or `A+B` (docs/format.md, Tree).
-        problems: the broken scenarios that were left out (`on_error='skip'`).
+        layout: Arrangement of the release on disk: `A`, `B` or `A+B` (docs/format.md, Tree).
+        problems: Broken scenarios that were left out (`on_error='skip'`).
     """
 
     dataroot: ReleasePath
@@ -83,7 +83,7 @@ class OpenTables:
         problems: tuple[Problem, ...] = (),
         tables: Tables | None = None,
     ) -> None:
-        """Open the tables of an index, unless they are given; raises IndexStoreError if they cannot be read."""
+        """Open the tables of an index, or use opened ones; raises IndexStoreError."""
         self.dataroot = dataroot
         self.version = version
         self.layout = layout
@@ -92,26 +92,24 @@ class OpenTables:
         self._tables = tables or Tables(tables_folder)
 
     def __repr__(self) -> str:
-        """Kind, version and place."""
+        """Return kind, version and dataroot."""
         return f"{type(self).__name__}({self.version!r}, {str(self.dataroot)!r})"
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle paths, not tables: the copy opens the same files again."""
-        return _reopened, (
-            type(self),
-            {
-                "dataroot": self.dataroot,
-                "version": self.version,
-                "layout": self.layout,
-                "split_files": self._split_files,
-                "tables_folder": self.tables_folder,
-                "problems": self.problems,
-            },
-        )
+        arguments = {
+            "dataroot": self.dataroot,
+            "version": self.version,
+            "layout": self.layout,
+            "split_files": self._split_files,
+            "tables_folder": self.tables_folder,
+            "problems": self.problems,
+        }
+        return _reopen, (type(self), arguments)
 
     @property
     def places(self) -> tuple[Path, ...]:
-        """What a worker on another host must see to open it: the release's folder, and that of its tables."""
+        """Folders that a worker on another host needs: those of the release and of its tables."""
         return *places_of(self.dataroot), self._tables.folder
 
     @property
@@ -185,37 +183,44 @@ class OpenTables:
         return self._tables.table("category")
 
     def indexed_hashes(self, scenario: str) -> ScenarioHashes | None:
-        """Return the hashes of the files that a scenario's rows were made from; None where they are unknown.
+        """Return the hashes of the files that a scenario's rows were made from; None if unknown.
 
         Raises:
-            IndexStoreError: the table that holds them is damaged.
+            IndexStoreError: The table with the hashes is damaged.
         """
         return self._tables.hashes.get(scenario)
 
     @with_keywords_named
     def get(self, table: str, token: RowArgument) -> dict[str, Any]:
-        """The record of a token, as a fresh dict; raises TableError or TokenError."""
+        """Return the record of a token, as a fresh dict; raises TableError or TokenError."""
         record: dict[str, Any] = self._tables.table(table).get(token_of(token))
         return record
 
     @with_keywords_named
     def getind(self, table: str, token: RowArgument) -> int:
-        """The row of a token; raises TableError or TokenError."""
+        """Return the row of a token; raises TableError or TokenError."""
         return self._tables.table(table).row(token_of(token))
 
     @with_keywords_named
     def field2token(self, table: str, field: str, query: Any) -> list[str]:
-        """The tokens of all rows of a table whose field equals `query`; raises TableError or FieldError."""
+        """Return the tokens of all rows with a field equal to `query`, in order.
+
+        Raises TableError or FieldError.
+        """
         return self._tables.table(table).tokens_where(field, query)
 
     def arrow(self, table: str) -> Any:
-        """A table as `pyarrow.Table`, without copying; `…_row` columns hold row numbers instead of tokens."""
+        """Return a table as `pyarrow.Table`, without copying.
+
+        Its `…_row` columns hold row numbers instead of tokens.
+        """
         return self._tables.table(table).arrow
 
     def columns(self, table: str) -> Mapping[str, Any]:
-        """A table's stored columns by name as read-only arrays, without copying; raises TableError.
+        """Return a table's stored columns by name as read-only arrays; raises TableError.
 
-        Numbers are numpy views (row keys, choices as codes, null as −1 or NaN), words Arrow arrays.
+        Nothing is copied. Numbers are numpy views (row keys, choices as codes, null as −1 or NaN),
+        words Arrow arrays.
         """
         return self._tables.views[self._tables.table(table).name]
 
@@ -230,14 +235,16 @@ class OpenTables:
         """Return the sample of an agent at a moment of a scenario.
 
         Args:
-            scenario: token or record.
-            agent: its name.
-            frame: number of the frame, from 1.
-            time_to_impact: instead of a frame, seconds before the impact, which is the last frame; a multiple of 0.1.
+            scenario: Token or record.
+            agent: Name of the agent.
+            frame: Number of the frame, from 1.
+            time_to_impact: Seconds before the impact, which is the last frame, as an alternative to
+                `frame`; a multiple of 0.1.
 
         Raises:
-            TokenError: no such scenario, agent or frame; or neither of `frame` and `time_to_impact` is given, or both.
-            NotAvailableError: the scenario has no collision, so that no impact is known.
+            TokenError: The release has no such scenario, agent or frame; or not exactly one of
+                `frame` and `time_to_impact` is given.
+            NotAvailableError: The scenario has no collision, so that no impact is known.
         """
         if time_to_impact is not None and frame is None:
             frame = self._frame_before_impact(scenario, time_to_impact)
@@ -255,7 +262,7 @@ class OpenTables:
             )
         steps = checked_number("time_to_impact", seconds, "seconds", TokenError) / FRAME_PERIOD
         frames = round(steps) if np.isfinite(steps) else -1
-        if not 0 <= frames < record["num_frames"] or abs(steps - frames) > _SAME_FRAME:
+        if not 0 <= frames < record["num_frames"] or abs(steps - frames) > _FRAME_TOLERANCE:
             longest = (record["num_frames"] - 1) / 10
             raise TokenError(
                 f"time_to_impact: expected 0, 0.1, 0.2, … up to {longest} s, found {seconds}"
@@ -263,76 +270,82 @@ class OpenTables:
         return record["num_frames"] - frames
 
     def samples_of(self, frame: RowArgument) -> list[records.SampleRecord]:
-        """The samples of one moment, one for each agent that is there, in the order of `taxonomy.AGENTS`."""
+        """Return the samples of one moment, one for each agent, in the order of `AGENTS`."""
         record = self.frame[self.frame.row(token_of(frame))]
-        agents = self._tables.resolver.agents_of(
-            self.scenario.row(record["scenario_token"])
-        ).values()
-        return [
-            self.sample[self._tables.resolver.sample_at(agent, record["index"])] for agent in agents
-        ]
+        resolver = self._tables.resolver
+        agents = resolver.agents_of(self.scenario.row(record["scenario_token"])).values()
+        return [self.sample[resolver.sample_at(agent, record["index"])] for agent in agents]
 
     def split_scenarios(
         self, split: str | os.PathLike[str], *, missing: OnError = "raise"
     ) -> set[str]:
-        """The tokens of this release's scenarios that belong to a split.
+        """Return the tokens of this release's scenarios that belong to a split.
 
         Args:
-            split: `train`, `val`, `test`, `train_mini` or `val_mini`: those of it that are here; or `all` that are
-                here, whatever their split. Or a split file of your own, as a path object or a text that ends in
-                `.txt`: blank lines, CRLF and a byte order mark are fine, the same scenario in two lines is a fault.
-            missing: a file's scenarios that are not in this release: `raise`, or `skip` them.
+            split: `train`, `val`, `test`, `train_mini` or `val_mini`, or `all` for every scenario
+                of the release. Or a split file of your own, as a path object or a text that ends in
+                `.txt`: blank lines, CRLF and a byte order mark are fine, the same scenario in two
+                lines is a fault.
+            missing: Treatment of a file's scenarios that are not in this release: `raise`, or
+                `skip` them.
 
         Raises:
-            ChoiceError: no such split, or `missing` is neither `raise` nor `skip`.
-            NotAvailableError: the splits are unknown: there are no split files and no split folders; or
-                scenarios of your file are not in this release.
-            MissingFileError: there is no such file.
-            SplitFileError: your file is no split file: a line has not two words, or a scenario stands twice.
+            ChoiceError: The split is unknown, or `missing` is neither `raise` nor `skip`.
+            NotAvailableError: The splits are unknown: there are no split files and no split
+                folders; or scenarios of your file are not in this release.
+            MissingFileError: Your file does not exist.
+            SplitFileError: Your file is no split file: a line has not two words, or a scenario
+                occurs twice.
         """
         missing = choice("missing", missing, get_args(OnError))
         if not isinstance(split, str | os.PathLike):
             raise ChoiceError(
                 f"split: expected the name of one, or the path of a split file, found {split!r}"
             )
-        here = set(self._tables.resolver.scenario_tokens)
         if not isinstance(split, str) or split.endswith(".txt"):
-            path = path_of(split)
-            listed = read_split_file(path, unique=True)
-            absent = [token for token in listed if token not in here]
-            if absent and missing == "raise":
-                raise NotAvailableError(
-                    f"{path}: {len(absent)} of its {len(listed)} scenarios are not in {self.dataroot}: "
-                    f"{', '.join(absent[:3])}{', …' if len(absent) > 3 else ''}; pass missing='skip' to go without them"
-                )
-            return here.intersection(listed)
-        unsplit = (
-            f"; for scenarios whose split is unknown {self._own_split_text().removeprefix('or ')}"
-        )
-        split = split_choice(split, elsewhere={"unknown": unsplit})
+            return self._listed_scenarios(path_of(split), missing)
+        own_split = self._own_split_text().removeprefix("or ")
+        remedy = f"; for scenarios whose split is unknown {own_split}"
+        split = split_choice(split, elsewhere={"unknown": remedy})
+        tokens = set(self._tables.resolver.scenario_tokens)
         if split == "all":
-            return here
+            return tokens
         if split in MINI_SPLITS:
             if split not in self._split_files:
                 raise NotAvailableError(
                     f"{self.dataroot}: has no {split}.txt; put the release's split files there, "
                     f"{self._own_split_text()}"
                 )
-            return here.intersection(read_split_file(self._split_files[split]))
+            return tokens.intersection(read_split_file(self._split_files[split]))
         if (self._tables.views["scenario"]["split"] < 0).all():
             raise NotAvailableError(
-                f"{self.dataroot}: the split of its scenarios is unknown: it has neither split files ({split}.txt) nor "
-                f"split folders ({split}/); put the release's split files into it, {self._own_split_text()}"
+                f"{self.dataroot}: the split of its scenarios is unknown: it has neither split "
+                f"files ({split}.txt) nor split folders ({split}/); put the release's split files "
+                f"into it, {self._own_split_text()}"
             )
         return set(self.scenario.tokens_where("split", split))
 
+    def _listed_scenarios(self, path: Path, missing: OnError) -> set[str]:
+        """Return the scenarios of this release in a split file of the user."""
+        tokens = set(self._tables.resolver.scenario_tokens)
+        listed = read_split_file(path, unique=True)
+        absent = [token for token in listed if token not in tokens]
+        if absent and missing == "raise":
+            more = ", …" if len(absent) > 3 else ""
+            raise NotAvailableError(
+                f"{path}: {len(absent)} of its {len(listed)} scenarios are not in {self.dataroot}: "
+                f"{', '.join(absent[:3])}{more}; pass missing='skip' to go without them"
+            )
+        return tokens.intersection(listed)
+
     def _own_split_text(self) -> str:
-        place = shlex.quote(str(self.dataroot))
-        return f"or make a split file of your own: deepaccident split {place} --out mine.txt, then --split mine.txt"
+        dataroot = shlex.quote(str(self.dataroot))
+        command = f"deepaccident split {dataroot} --out mine.txt"
+        return f"or make a split file of your own: {command}, then --split mine.txt"
 
 
 class Tables:
-    """All tables of an index, memory-mapped: they stay readable when another process remakes the index."""
+    """All tables of an index, memory-mapped: readable even if another process remakes the index."""
 
     def __init__(
         self, folder: Path, resolver: Callable[[ColumnViews], Resolver] = Resolver
@@ -341,7 +354,8 @@ class Tables:
 
         Args:
             folder: Folder with one Arrow file per table.
-            resolver: Makes what finds rows, tokens and files; other datasets name their files otherwise.
+            resolver: Makes the resolver of rows, tokens and files; other datasets name their files
+                differently.
         """
         self.folder = folder
         self._stored = {name: StoredTable(folder, spec) for name, spec in table_specs().items()}
@@ -359,7 +373,10 @@ class Tables:
 
     @cached_property
     def hashes(self) -> dict[str, ScenarioHashes]:
-        """Scenario token → hashes of the files that its rows were made from; raises IndexStoreError."""
+        """Hashes of the files that each scenario's rows were made from, by token.
+
+        Raises IndexStoreError.
+        """
         words = self._stored["scenario"].words.get(HASHES, "{}")
         try:
             return as_record(parsed_json(words.encode()), dict[str, ScenarioHashes])
@@ -369,34 +386,36 @@ class Tables:
             ) from error
 
     def table(self, name: str) -> Table[Any]:
-        """One table's records; raises TableError."""
+        """Return a table; raises TableError."""
         try:
             return self._tables[name]
         except KeyError:
-            known = table_spec(name).name  # in its own spelling
-            if known not in self._tables:
-                self._tables[known] = Table(self._stored[known], self.resolver)
-            return self._tables[known]
+            # `name` may be spelt otherwise than the table.
+            table_name = table_spec(name).name
+            if table_name not in self._tables:
+                self._tables[table_name] = Table(self._stored[table_name], self.resolver)
+            return self._tables[table_name]
 
 
 class Table(Sequence[_Record], Generic[_Record]):
-    """The rows of a table; each access makes a fresh dict, which is the caller's.
+    """The rows of a table; each access makes a fresh dict, which belongs to the caller.
 
     Attributes:
-        name: the table's name.
+        name: Name of the table.
     """
 
     def __init__(self, stored: StoredTable, resolver: Resolver) -> None:
-        """Show the rows of a stored table."""
+        """Make the functions that read a stored table's fields."""
         self.name = stored.spec.name
-        self._stored, self._resolver = stored, resolver
+        self._stored = stored
+        self._resolver = resolver
         self._getters = [(column.field, self._getter(column)) for column in stored.spec.columns]
 
     @property
     def arrow(self) -> Any:
         """The table as a `pyarrow.Table` over the mapped memory, with row keys instead of tokens.
 
-        Raises IndexStoreError where the file is so damaged that Arrow would read beyond its memory.
+        Raises IndexStoreError if the file is so damaged that Arrow would read beyond its memory.
         """
         return self._stored.table
 
@@ -408,17 +427,18 @@ class Table(Sequence[_Record], Generic[_Record]):
     @overload
     def __getitem__(self, row: slice) -> list[_Record]: ...
     def __getitem__(self, row: int | slice) -> _Record | list[_Record]:
-        """The record of a row, or the records of a slice."""
+        """Return the record of a row, or the records of a slice."""
         if isinstance(row, slice):
-            return [self._record(position) for position in range(*row.indices(len(self)))]
+            return [self._record(index) for index in range(*row.indices(len(self)))]
         if not isinstance(row, int | np.integer):
             raise TableError(
-                f"table '{self.name}' counts its rows: expected a number, found {row!r}; use get(token)"
+                f"table '{self.name}' counts its rows: expected a number, found {row!r}; "
+                "use get(token)"
             )
-        position = row + len(self) if row < 0 else row
-        if not 0 <= position < len(self):
+        index = row + len(self) if row < 0 else row
+        if not 0 <= index < len(self):
             raise IndexError(f"table '{self.name}' has {len(self)} rows, asked for row {row}")
-        return self._record(position)
+        return self._record(index)
 
     def __iter__(self) -> Iterator[_Record]:
         return (self._record(row) for row in range(len(self)))
@@ -428,27 +448,28 @@ class Table(Sequence[_Record], Generic[_Record]):
         return f"<table '{self.name}': {len(self):,} rows of {fields}>"
 
     def get(self, token: str) -> _Record:
-        """The record of a token; raises TokenError."""
+        """Return the record of a token; raises TokenError."""
         return self._record(self.row(token))
 
     def row(self, token: str) -> int:
-        """The row of a token; raises TokenError."""
+        """Return the row of a token; raises TokenError."""
         return self._resolver.row(self.name, token)
 
     def tokens_where(self, field: str, value: Any) -> list[str]:
-        """The tokens of the rows whose field equals `value`, in order; raises FieldError."""
+        """Return the tokens of the rows with a field equal to `value`, in order.
+
+        Raises FieldError.
+        """
         try:
-            return [
-                self._resolver.token(self.name, int(row)) for row in self._rows_where(field, value)
-            ]
+            rows = self._rows_where(field, value)
+            return [self._resolver.token(self.name, int(row)) for row in rows]
         except IndexError as error:
             raise damaged_value(self.name) from error
 
     def _record(self, row: int) -> _Record:
         try:
-            return cast(
-                _Record, RecordDict({field: getter(row) for field, getter in self._getters})
-            )
+            values = {field: getter(row) for field, getter in self._getters}
+            return cast(_Record, RecordDict(values))
         except IndexError as error:
             raise damaged_value(self.name) from error
 
@@ -456,9 +477,10 @@ class Table(Sequence[_Record], Generic[_Record]):
         column = self._stored.spec.column(field)
         if column is None:
             fields = [name for name, _ in self._getters]
-            meant = meant_text(field, fields)
+            suggestion = meant_text(field, fields)
             raise FieldError(
-                f"table '{self.name}' has no field '{field}'; it has {', '.join(fields)}{meant}"
+                f"table '{self.name}' has no field '{field}'; it has {', '.join(fields)}"
+                f"{suggestion}"
             )
         stored_value = self._stored_value(column, value)
         view = self._stored.views.get(column.stored or "")
@@ -468,7 +490,7 @@ class Table(Sequence[_Record], Generic[_Record]):
         return [row for row in range(len(self)) if getter(row) == value]
 
     def _stored_value(self, column: Column, value: Any) -> Any:
-        """What stands in the column where its field equals `value`; None where rows must be compared one by one."""
+        """Return the stored form of `value`; None if rows must be compared one by one."""
         kind = column.kind
         if isinstance(kind, Key) and isinstance(value, str):
             try:
@@ -476,36 +498,27 @@ class Table(Sequence[_Record], Generic[_Record]):
             except TokenError:
                 return NULL_INTEGER - 1
         if isinstance(kind, Choice) and isinstance(value, str):
-            known = spelled(value, kind.values)
-            return kind.values.index(known) if known in kind.values else NULL_INTEGER - 1
-        plain_number = isinstance(value, int | float) and not isinstance(value, bool)
-        if (
-            isinstance(kind, Number)
-            and plain_number
-            and not (column.nullable and value == NULL_INTEGER)
-        ):
-            return value
-        return None
+            word = spelled(value, kind.values)
+            return kind.values.index(word) if word in kind.values else NULL_INTEGER - 1
+        is_number = isinstance(value, int | float) and not isinstance(value, bool)
+        if not isinstance(kind, Number) or not is_number:
+            return None
+        return None if column.nullable and value == NULL_INTEGER else value
 
     def _getter(self, column: Column) -> _Getter:  # noqa: PLR0911 - one a kind
         if column.stored is None:
-            return (
-                self._resolver.filename
-                if column.field == "filename"
-                else self._resolver.token_makers[self.name]
-            )
+            if column.field == "filename":
+                return self._resolver.filename
+            return self._resolver.token_makers[self.name]
         view: Any = self._stored.views[column.stored]
         match column.kind:
             case Key(table=table):
-                return _key_getter(
-                    view, self._resolver.token_makers[table], nullable=column.nullable
-                )
+                make_token = self._resolver.token_makers[table]
+                return _key_getter(view, make_token, nullable=column.nullable)
             case Choice(values=values):
                 return _choice_getter(view, values)
             case Subset(values=values):
-                return lambda row: [
-                    value for bit, value in enumerate(values) if view.item(row) >> bit & 1
-                ]
+                return _subset_getter(view, values)
             case Vector(shape=shape):
                 return _vector_getter(view, shape, nullable=column.nullable)
             case Number(dtype=dtype):
@@ -515,7 +528,7 @@ class Table(Sequence[_Record], Generic[_Record]):
 
 
 class RecordDict(dict[str, Any]):
-    """A record: a dict that names what was probably meant by a field that it does not have. Its copies are plain."""
+    """A record: a dict that suggests a field for an unknown one. Its copies are plain dicts."""
 
     __slots__ = ()
 
@@ -528,19 +541,22 @@ class RecordDict(dict[str, Any]):
 
 
 def table_names() -> list[str]:
-    """The names of all tables."""
+    """Return the names of all tables."""
     return list(table_specs())
 
 
 def split_choice(split: str, **remedies: Any) -> str:
-    """Return the name of a split in its own spelling; raises ChoiceError. `remedies` are arguments of `choice`."""
+    """Return the name of a split in its own spelling; raises ChoiceError.
+
+    `remedies` are arguments of `choice`.
+    """
     return choice(
         "split", split, SPLIT_CHOICES, also=", or a split file (its name ends in .txt)", **remedies
     )
 
 
 def token_of(row: RowArgument) -> str:
-    """The token of a row given by token or record, as the whole API takes it; raises TokenError."""
+    """Return the token of a row that is named by token or record; raises TokenError."""
     token = row.get("token") if isinstance(row, Mapping) else row
     if not isinstance(token, str):
         raise TokenError(f"expected a token or a record with one, found {row!r}")
@@ -550,19 +566,24 @@ def token_of(row: RowArgument) -> str:
 def rows_of_scenarios(
     tables: OpenTables, scenarios: RowArgument | Iterable[RowArgument] | None
 ) -> Sequence[int]:
-    """Return the rows of scenarios in the order given, those of all for None; raises TokenError or ChoiceError."""
+    """Return the rows of scenarios in their order, or of all for None.
+
+    Raises TokenError or ChoiceError.
+    """
     if scenarios is None:
         return range(len(tables.scenario))
-    chosen = members_of("scenarios", scenarios, "tokens or records of scenarios")
-    return [tables.getind("scenario", scenario) for scenario in chosen]
+    members = members_of("scenarios", scenarios, "tokens or records of scenarios")
+    return [tables.getind("scenario", scenario) for scenario in members]
 
 
-def _reopened(kind: type[OpenTables], arguments: dict[str, Any]) -> OpenTables:
+def _reopen(kind: type[OpenTables], arguments: dict[str, Any]) -> OpenTables:
     """Undo `OpenTables.__reduce__`, without looking for changes on disk.
 
-    A worker gets a dataset with each item: it opens the files once, which takes as long as a sample's labels.
+    A worker gets a dataset with each item: it opens the files once, which takes as long as a
+    sample's labels.
     """
-    dataset, folder = kind.__new__(kind), arguments["tables_folder"]
+    dataset = kind.__new__(kind)
+    folder = arguments["tables_folder"]
     tables = _tables_of(folder, folder.stat().st_ino) if folder.is_dir() else None
     OpenTables.__init__(dataset, **arguments, tables=tables)
     return dataset
@@ -570,7 +591,10 @@ def _reopened(kind: type[OpenTables], arguments: dict[str, Any]) -> OpenTables:
 
 @lru_cache(maxsize=2)
 def _tables_of(folder: Path, _number: int) -> Tables:
-    """The tables in a folder; the system's number of the folder tells one from another that takes its place."""
+    """Return the tables in a folder.
+
+    The system's number of the folder distinguishes it from a later folder with the same path.
+    """
     return Tables(folder)
 
 
@@ -581,14 +605,26 @@ def _key_getter(view: Any, token_of: Callable[[int], str], *, nullable: bool) ->
 
     def get(row: int) -> str | None:
         target = item(row)
-        return None if target == NULL_INTEGER else token_of(target)
+        if target == NULL_INTEGER:
+            return None
+        return token_of(target)
 
     return get
 
 
 def _choice_getter(view: Any, values: Sequence[str]) -> _Getter:
-    words, item = (*values, None), view.item  # code −1 is the last: None
+    # Code −1 selects the last of these: None.
+    words = (*values, None)
+    item = view.item
     return lambda row: words[item(row)]
+
+
+def _subset_getter(view: Any, values: Sequence[str]) -> _Getter:
+    def get(row: int) -> list[str]:
+        mask = view.item(row)
+        return [value for bit, value in enumerate(values) if mask >> bit & 1]
+
+    return get
 
 
 def _vector_getter(view: Any, shape: tuple[int, ...], *, nullable: bool) -> _Getter:
@@ -596,7 +632,9 @@ def _vector_getter(view: Any, shape: tuple[int, ...], *, nullable: bool) -> _Get
         values = view[row]
         if nullable and np.isnan(values[0]):
             return None
-        return values.tolist() if len(shape) == 1 else values.reshape(shape).tolist()
+        if len(shape) == 1:
+            return values.tolist()
+        return values.reshape(shape).tolist()
 
     return get
 

@@ -1,7 +1,8 @@
-"""Test kit: releases of less than 1 MB in both layouts, healthy or broken in a named way, for tests of loaders.
+"""Test kit: releases of less than 1 MB in both layouts, healthy or broken in a named way.
 
-A pytest plugin (`plugin`, loaded by pytest where the devkit is installed) has fixtures, and `strategies` draws contents
-with hypothesis; the functions here need neither of them. See docs/testing.md.
+They are for tests of loaders. A pytest plugin (`plugin`, loaded by pytest wherever the devkit is
+installed) has fixtures, and `strategies` draws contents with hypothesis; the functions here need
+neither of them. See docs/testing.md.
 """
 
 from importlib import import_module
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
     from deepaccident_devkit.testing.releases import SmallRelease, write_small_release
 
 # Public name → its module.
-_HOMES = {
+_MODULES = {
     **dict.fromkeys(
         ("BREAKAGES", "Breakage", "BrokenRelease", "break_release", "broken_release"), "breakages"
     ),
@@ -37,10 +38,10 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    """Import a public name's module only when the name is used: pytest imports this package at every start."""
-    if name not in _HOMES:
+    """Import a public name's module at its first use: pytest imports this package at each start."""
+    if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
+    return getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)
 
 
 def __dir__() -> list[str]:

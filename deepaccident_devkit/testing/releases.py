@@ -1,4 +1,4 @@
-"""`write_small_release`: a complete release of a few hundred kilobytes, with all parts of the format."""
+"""`write_small_release`: a complete release of a few hundred kB, with all parts of the format."""
 
 import re
 from collections.abc import Sequence
@@ -33,23 +33,26 @@ from deepaccident_devkit.taxonomy import (
 )
 from deepaccident_devkit.testing.scene import AGENT_IDS, PAIR, Recorder, SmallScene, small_scene
 
-_MOST_FRAMES = 100
-_LEAST_IMAGE, _MOST_IMAGE = (16, 9), (1600, 900)
+_MAX_FRAMES = 100
+_MIN_IMAGE_SIZE = (16, 9)
+_MAX_IMAGE_SIZE = (1600, 900)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SmallRelease:
-    """The options of a small release; checked when made, raises ConfigError.
+    """The options of a small release; raises ConfigError for wrong options.
 
     Attributes:
         layout: `A`, all splits in one folder, or `B`, one folder for each split.
-        frames: recorded frames of each scenario, at 10 Hz; with three, the release has less than 1 MB.
-        splits: the splits to make, of `train` (an accident and its normal twin, signalised), `val` (an accident,
-            unsignalised) and `test` (a normal scenario without labels, BEV arrays and meta, as published).
-        agents: the agents.
-        channels: the sensors whose files are written; empty for only labels, calib and meta.
-        image_size: width and height of the pictures, pixels.
-        seed: it decides places in town, speeds and weather; the same seed gives the same values.
+        frames: Recorded frames of each scenario, at 10 Hz; with three, the release has less than
+            1 MB.
+        splits: Splits to make, from `train` (an accident and its normal twin, signalised), `val`
+            (an accident, unsignalised) and `test` (a normal scenario without labels, BEV arrays and
+            meta, as published).
+        agents: Agents that record.
+        channels: Sensors with files; empty for only labels, calib and meta.
+        image_size: Width and height of the pictures, pixels.
+        seed: Seed of positions in town, speeds and weather; the same seed gives the same values.
     """
 
     layout: Layout = "A"
@@ -57,28 +60,29 @@ class SmallRelease:
     splits: tuple[str, ...] = SPLITS
     agents: tuple[AgentName, ...] = AGENTS
     channels: tuple[str, ...] = CHANNELS
-    image_size: tuple[int, int] = _LEAST_IMAGE
+    image_size: tuple[int, int] = _MIN_IMAGE_SIZE
     seed: int = 0
 
     def __post_init__(self) -> None:
-        """Check every field; lists become tuples, so that equal configurations have equal hashes."""
+        """Check every field; lists become tuples, so that equal options have equal hashes."""
         object.__setattr__(self, "image_size", _as_tuple("image_size", self.image_size))
         settle_choices(self, {"layout": get_args(Layout)}, error=ConfigError)
         for name, known in (("splits", SPLITS), ("agents", AGENTS), ("channels", CHANNELS)):
-            named = choices(
-                name, getattr(self, name), known, empty=name == "channels", error=ConfigError
-            )
-            object.__setattr__(self, name, named)
-        if not 1 <= self.frames <= _MOST_FRAMES:
-            raise ConfigError(f"frames: expected 1 to {_MOST_FRAMES}, found {self.frames}")
+            value = getattr(self, name)
+            empty = name == "channels"
+            names = choices(name, value, known, empty=empty, error=ConfigError)
+            object.__setattr__(self, name, names)
+        if not 1 <= self.frames <= _MAX_FRAMES:
+            raise ConfigError(f"frames: expected 1 to {_MAX_FRAMES}, found {self.frames}")
         if self.seed < 0:
             raise ConfigError(f"seed: expected a whole number from 0, found {self.seed}")
         if len(self.image_size) != 2:
             raise ConfigError(f"image_size: expected (width, height), found {self.image_size}")
-        (width, height), low, high = self.image_size, _LEAST_IMAGE, _MOST_IMAGE
+        (width, height), low, high = self.image_size, _MIN_IMAGE_SIZE, _MAX_IMAGE_SIZE
         if not (low[0] <= width <= high[0] and low[1] <= height <= high[1]):
             raise ConfigError(
-                f"image_size: expected width and height from {low} to {high}, found {self.image_size}"
+                f"image_size: expected width and height from {low} to {high}, "
+                f"found {self.image_size}"
             )
 
 
@@ -106,7 +110,7 @@ class _Story:
 
     @property
     def published(self) -> bool:
-        """Whether its labels, BEV arrays and meta are published; those of the test split are not."""
+        """Whether its labels, BEV arrays and meta are published, unlike in the test split."""
         return self.split != "test"
 
     @property
@@ -142,22 +146,22 @@ _STORIES = (
 def write_small_release(out: Path, config: SmallRelease | None = None) -> Path:
     """Write a healthy release of less than 1 MB; returns its folder.
 
-    It needs neither a generator nor a GPU. `deepaccident validate --deep` finds nothing in it. The default takes a
-    second or two, `SmallRelease(channels=())` a tenth of it.
+    It needs neither a generator nor a GPU. `deepaccident validate --deep` finds nothing in it. The
+    default takes a second or two, `SmallRelease(channels=())` a tenth of it.
 
     Args:
-        out: the folder to make; it must be empty, or not exist yet.
-        config: the options of the release; `SmallRelease()` if None.
+        out: Folder to make; it must be empty, or not exist yet.
+        config: Options of the release; `SmallRelease()` if None.
 
     Raises:
         ConfigError: `out` is a file or is not empty.
     """
-    wanted = config or SmallRelease()
+    config = config or SmallRelease()
     check_free(out)
-    stories = [story for story in _STORIES if story.split in wanted.splits]
+    stories = [story for story in _STORIES if story.split in config.splits]
     with replacing_folder(out) as root:
         for story in stories:
-            _write_scenario(root, story, wanted)
+            _write_scenario(root, story, config)
         _write_splits(root, stories)
     return out
 
@@ -182,11 +186,9 @@ def _write_scenario(root: Path, story: _Story, config: SmallRelease) -> None:
 
 
 def _meta(rng: np.random.Generator, scene: SmallScene, *, accident: bool) -> Meta:
-    weather, time_of_day, impact = (
-        rng.choice(WEATHERS),
-        rng.choice(TIMES_OF_DAY),
-        rng.uniform(2000.0, 9000.0),
-    )
+    weather = rng.choice(WEATHERS)
+    time_of_day = rng.choice(TIMES_OF_DAY)
+    impact = rng.uniform(2000.0, 9000.0)
     users = {user.actor_id: user for user in scene.users}
     ids = (AGENT_IDS[AGENTS.index(PAIR[0])], AGENT_IDS[AGENTS.index(PAIR[1])])
     collision = Collision(
@@ -214,5 +216,6 @@ def _meta(rng: np.random.Generator, scene: SmallScene, *, accident: bool) -> Met
 def _write_splits(root: Path, stories: Sequence[_Story]) -> None:
     """Write all split files, empty ones too; the mini splits hold all of train and val."""
     for split in (*SPLITS, *MINI_SPLITS):
-        of_split = [story.token for story in stories if story.split == split.removesuffix("_mini")]
-        write_split_file(root / f"{split}.txt", of_split)
+        full_split = split.removesuffix("_mini")
+        tokens = [story.token for story in stories if story.split == full_split]
+        write_split_file(root / f"{split}.txt", tokens)

@@ -1,4 +1,4 @@
-"""The small releases of the test kit: a rig, road users, sensors, and how they are written."""
+"""The content of the test kit's small releases: sensor setup, road users, sensors, and files."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -38,53 +38,68 @@ from deepaccident_devkit.taxonomy import (
     AgentName,
 )
 
-_LIDAR_HEIGHT = 1.94
-_CAMERA_YAW = dict(
-    zip(CAMERAS, np.deg2rad([0.0, 55.0, -55.0, 180.0, 110.0, -110.0]).tolist(), strict=True)
-)
-# Metres from the LiDAR's axis to a camera, and from the LiDAR down to it.
-_CAMERA_RADIUS, _CAMERA_DROP = 1.0, 0.3
-_OPTICAL_FROM_FORWARD = SE3.from_rotation([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
-
-
-def _cameras(image_size: tuple[int, int]) -> dict[str, PinholeCamera]:
-    """Channel → camera for images of `image_size` (width, height): the back camera has 110°, the others 70°."""
-    fields = {
-        channel: np.deg2rad(110.0 if channel == "Camera_Back" else 70.0) for channel in CAMERAS
-    }
-    return {
-        channel: PinholeCamera.from_field_of_view(*image_size, field)
-        for channel, field in fields.items()
-    }
-
-
-def calib_of(agent: AgentName, world_from_ego: SE3, image_size: tuple[int, int]) -> Calib:
-    """An agent's calib of one frame."""
-    return Calib(
-        ego_from_lidar=SE3.from_yaw(
-            0.0, (0.0, 0.0, 0.0 if agent == INFRASTRUCTURE else _LIDAR_HEIGHT)
-        ),
-        world_from_ego=world_from_ego,
-        camera_from_lidar={
-            channel: _camera_from_lidar(yaw) for channel, yaw in _CAMERA_YAW.items()
-        },
-        intrinsic={channel: camera.intrinsic for channel, camera in _cameras(image_size).items()},
-    )
-
-
-def _camera_from_lidar(yaw: float) -> SE3:
-    place = (_CAMERA_RADIUS * np.cos(yaw), _CAMERA_RADIUS * np.sin(yaw), -_CAMERA_DROP)
-    return _OPTICAL_FROM_FORWARD @ SE3.from_yaw(yaw, place).inverse()
-
-
 AGENT_IDS = (1223, 1236, 1212, 1237)
 """Actor ids of `taxonomy.VEHICLE_AGENTS`."""
 FAR_ACTOR_ID = 1399
 """The pedestrian that is untracked (−1) in every label."""
 PAIR: tuple[AgentName, AgentName] = ("ego_vehicle", "other_vehicle")
-"""The two that collide."""
-# How many metres the other vehicle and its follower are farther back in a normal scenario.
-_DELAY = 15.0
+"""The colliding agents."""
+_LIDAR_HEIGHT_M = 1.94
+_CAMERA_YAW_RAD = dict(
+    zip(CAMERAS, np.deg2rad([0.0, 55.0, -55.0, 180.0, 110.0, -110.0]).tolist(), strict=True)
+)
+# Distance of a camera from the LiDAR's axis, and under the LiDAR.
+_CAMERA_RADIUS_M = 1.0
+_CAMERA_DROP_M = 0.3
+_OPTICAL_FROM_FORWARD = SE3.from_rotation([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
+# Distance that the other vehicle and its follower are farther back in a normal scenario.
+_NORMAL_OFFSET_M = 15.0
+# Points on a box 1 m away; their number decreases with the distance.
+_POINTS_AT_1_M = 120.0
+_MAX_BOX_POINTS = 20
+_GROUND_RADII_M = (6.0, 12.0, 24.0)
+_POINTS_PER_RING = 12
+_LIDAR_RANGE_M = 65.0
+_MIN_DEPTH_M = 0.5
+# RGB of each of `taxonomy.CATEGORIES`.
+_COLORS = np.array(
+    [(200, 40, 40), (40, 80, 200), (40, 160, 60), (220, 180, 40), (160, 60, 180), (240, 120, 40)]
+)
+# Row and column of the agent in a BEV array.
+_AGENT_PIXEL = (BEV_SHAPE[0] - 1) / 2
+# The file has a quarter of the bytes of the writer's default, which is faster.
+_BEV_COMPRESSION = 6
+
+
+def _cameras(image_size: tuple[int, int]) -> dict[str, PinholeCamera]:
+    """Return channel → camera for images of a (width, height), with fields of view of 70°.
+
+    The back camera has 110°.
+    """
+    cameras = {}
+    for channel in CAMERAS:
+        field = np.deg2rad(110.0 if channel == "Camera_Back" else 70.0)
+        cameras[channel] = PinholeCamera.from_field_of_view(*image_size, field)
+    return cameras
+
+
+def calib_of(agent: AgentName, world_from_ego: SE3, image_size: tuple[int, int]) -> Calib:
+    """Return an agent's calib of one frame."""
+    lidar_height = 0.0 if agent == INFRASTRUCTURE else _LIDAR_HEIGHT_M
+    cameras = _cameras(image_size)
+    return Calib(
+        ego_from_lidar=SE3.from_yaw(0.0, (0.0, 0.0, lidar_height)),
+        world_from_ego=world_from_ego,
+        camera_from_lidar={
+            channel: _camera_from_lidar(yaw) for channel, yaw in _CAMERA_YAW_RAD.items()
+        },
+        intrinsic={channel: camera.intrinsic for channel, camera in cameras.items()},
+    )
+
+
+def _camera_from_lidar(yaw: float) -> SE3:
+    position = (_CAMERA_RADIUS_M * np.cos(yaw), _CAMERA_RADIUS_M * np.sin(yaw), -_CAMERA_DROP_M)
+    return _OPTICAL_FROM_FORWARD @ SE3.from_yaw(yaw, position).inverse()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -93,11 +108,11 @@ class _MovingBox:
 
     Attributes:
         actor_id: CARLA's id.
-        category: class name.
-        size: length, width, height.
-        end: x, y of its centre at the last frame.
-        yaw: radians counter-clockwise.
-        speed: m/s.
+        category: Class name.
+        size: Length, width, height.
+        end: x and y of its centre at the last frame.
+        yaw: Heading, radians, counter-clockwise.
+        speed: Speed, m/s.
     """
 
     actor_id: int
@@ -108,9 +123,11 @@ class _MovingBox:
     speed: float
 
 
-_SOUTH_TO_NORTH, _EAST_TO_WEST = np.pi / 2, np.pi
-_CAR, _VAN = (4.6, 1.9, 1.5), (4.5, 2.0, 2.0)
-# At the last frame the ego's front touches the left side of the other vehicle: the boxes overlap by 0.1 m.
+_SOUTH_TO_NORTH = np.pi / 2
+_EAST_TO_WEST = np.pi
+_CAR = (4.6, 1.9, 1.5)
+_VAN = (4.5, 2.0, 2.0)
+# At the last frame the ego's front touches the left side of the other vehicle, by 0.1 m of overlap.
 _AGENTS = (
     _MovingBox(actor_id=1223, category="car", size=_CAR, end=(-1.4, -1.75), yaw=0.0, speed=9.0),
     _MovingBox(actor_id=1236, category="van", size=_VAN, end=(-11.4, -1.75), yaw=0.0, speed=9.0),
@@ -164,17 +181,17 @@ _TRAFFIC = (
         speed=0.0,
     ),
 )
-_POLE = (8.0, 8.0, POLE_HEIGHT)
+_POLE_POSITION = (8.0, 8.0, POLE_HEIGHT)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SmallScene:
-    """What happens in one scenario.
+    """Motion of all road users in one scenario.
 
     Attributes:
-        world_from_ground: where the junction lies in its town.
-        users: all road users, the four vehicle agents first.
-        frames: how many are recorded.
+        world_from_ground: Pose of the junction in its town.
+        users: All road users, starting with the four vehicle agents.
+        frames: Number of recorded frames.
     """
 
     world_from_ground: SE3
@@ -182,15 +199,20 @@ class SmallScene:
     frames: int
 
     def boxes(self, frame: int) -> Boxes:
-        """The boxes of all at a frame (counted from 1), world frame; points and visibility are not known yet."""
+        """Return the boxes of all users at a frame (from 1), world frame.
+
+        They have neither points nor visibility yet.
+        """
         seconds = (self.frames - frame) * FRAME_PERIOD
         yaw = np.array([user.yaw for user in self.users])
         size = np.array([user.size for user in self.users])
         speed = np.array([user.speed for user in self.users])
         velocity = speed[:, None] * np.column_stack([np.cos(yaw), np.sin(yaw), np.zeros(len(yaw))])
-        ends = np.column_stack([np.array([user.end for user in self.users]), size[:, 2] / 2])
+        end_xy = np.array([user.end for user in self.users])
+        ends = np.column_stack([end_xy, size[:, 2] / 2])
+        centers = ends - velocity * seconds
         return Boxes.from_arrays(
-            self.world_from_ground.apply(ends - velocity * seconds),
+            self.world_from_ground.apply(centers),
             size,
             yaw + self.world_from_ground.yaw,
             frame="world",
@@ -200,65 +222,62 @@ class SmallScene:
         )
 
     def world_from_ego(self, agent: AgentName, frame: int) -> SE3:
-        """An agent's pose at a frame: on the road below the middle of its box; for the pole, where its LiDAR is."""
+        """Return an agent's pose at a frame: on the road under its box, or at the pole's LiDAR."""
         if agent not in VEHICLE_AGENTS:
-            return self.world_from_ground @ SE3.from_yaw(0.0, _POLE)
-        boxes, row = self.boxes(frame), VEHICLE_AGENTS.index(agent)
-        return SE3.from_yaw(
-            float(boxes.yaw[row]), boxes.center[row] - (0.0, 0.0, boxes.size[row, 2] / 2)
-        )
+            return self.world_from_ground @ SE3.from_yaw(0.0, _POLE_POSITION)
+        boxes = self.boxes(frame)
+        row = VEHICLE_AGENTS.index(agent)
+        position = boxes.center[row] - (0.0, 0.0, boxes.size[row, 2] / 2)
+        return SE3.from_yaw(float(boxes.yaw[row]), position)
 
 
 def small_scene(rng: np.random.Generator, *, frames: int, accident: bool) -> SmallScene:
-    """A scene with a random place in its town and random speeds; they are the same with and without the accident."""
-    x, y, yaw = rng.uniform(-200.0, 200.0), rng.uniform(-200.0, 200.0), rng.uniform(-np.pi, np.pi)
+    """Return a scene with a random position in its town and random speeds.
+
+    They are the same with and without the accident.
+    """
+    x = rng.uniform(-200.0, 200.0)
+    y = rng.uniform(-200.0, 200.0)
+    yaw = rng.uniform(-np.pi, np.pi)
     ego_speed, other_speed = rng.uniform(0.8, 1.2, 2).tolist()
     factors = (ego_speed, ego_speed, other_speed, other_speed)
-    agents = [
-        replace(user, speed=user.speed * factor)
-        for user, factor in zip(_AGENTS, factors, strict=True)
-    ]
+    agents = []
+    for user, factor in zip(_AGENTS, factors, strict=True):
+        agents.append(replace(user, speed=user.speed * factor))
     if not accident:
-        agents[2:] = [replace(user, end=(user.end[0], user.end[1] - _DELAY)) for user in agents[2:]]
+        for index in (2, 3):
+            end_x, end_y = agents[index].end
+            agents[index] = replace(agents[index], end=(end_x, end_y - _NORMAL_OFFSET_M))
     return SmallScene(
         world_from_ground=SE3.from_yaw(yaw, (x, y, 0.3)), users=(*agents, *_TRAFFIC), frames=frames
     )
 
 
-# The most points on a box, and the number of points on a box 1 m away; it becomes smaller with the distance.
-_MOST_POINTS, _POINT_METRES = 20, 120.0
-_GROUND_RADII, _GROUND_POINTS = (6.0, 12.0, 24.0), 12
-_LIDAR_RANGE = 65.0
-_LEAST_DEPTH = 0.5
-# RGB of each of `taxonomy.CATEGORIES`.
-_COLORS = np.array(
-    [(200, 40, 40), (40, 80, 200), (40, 160, 60), (220, 180, 40), (160, 60, 180), (240, 120, 40)]
-)
-_MIDDLE = (BEV_SHAPE[0] - 1) / 2
-
-
 def cloud_of(boxes: Boxes, lidar_height: float) -> FloatArray:
-    """Points (N, 3) in the LiDAR frame, metres, in its boxes and on the ground, rounded to the file's float32."""
-    parts = [_ground(lidar_height)]
+    """Return points in the LiDAR frame, shape (N, 3), metres, in its boxes and on the ground.
+
+    They are rounded to the file's float32.
+    """
+    parts = [_ground_points(lidar_height)]
     distance = np.linalg.norm(boxes.center[:, :2], axis=1)
-    counts = np.clip(_POINT_METRES / np.maximum(distance, 1.0), 1, _MOST_POINTS).astype(int) * (
-        distance < _LIDAR_RANGE
-    )
+    points = np.clip(_POINTS_AT_1_M / np.maximum(distance, 1.0), 1, _MAX_BOX_POINTS)
+    counts = points.astype(int) * (distance < _LIDAR_RANGE_M)
     for center, size, yaw, count in zip(
         boxes.center, boxes.size, boxes.yaw, counts.tolist(), strict=True
     ):
-        inside = _spread(count) * size
+        box_points = _spread_points(count) * size
         turn = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])
-        parts.append(center + inside @ turn.T)
+        parts.append(center + box_points @ turn.T)
     return np.concatenate(parts).astype(np.float32).astype(np.float64)
 
 
 def _picture_of(
     boxes: Boxes, camera: PinholeCamera, *, sky: tuple[int, int, int], road: tuple[int, int, int]
 ) -> ByteArray:
-    """A picture (H, W, 3), RGB: sky, road, and the outlines of optical boxes in their classes' colours, far ones first.
+    """Return a picture (H, W, 3), RGB: sky, road, and outlines of boxes in their classes' colours.
 
-    Sky and road should differ between all pictures, so that no two files are equal.
+    Boxes are in the optical frame, and distant ones are drawn first. Sky and road should differ
+    between all pictures, so that no two files are equal.
     """
     import cv2
 
@@ -268,7 +287,7 @@ def _picture_of(
     corners = boxes.corners()
     for row in np.argsort(-boxes.center[:, 2]).tolist():
         pixels, depth = camera.project(corners[row])
-        if (depth > _LEAST_DEPTH).all():
+        if (depth > _MIN_DEPTH_M).all():
             outline = cv2.convexHull(np.rint(np.clip(pixels, -1e4, 1e4)).astype(np.int32))
             cv2.fillConvexPoly(picture, outline, _COLORS[boxes.category[row]].tolist())
     return picture
@@ -277,46 +296,47 @@ def _picture_of(
 def top_view_of(
     boxes: Boxes, object_ids: NDArray[np.uint16]
 ) -> tuple[ByteArray, NDArray[np.uint16]]:
-    """Tags (1200, 1200) uint8 and the simulator's ids (1200, 1200) uint16 around an agent: forward is up, left left."""
+    """Return CARLA's tags, uint8, and object ids, uint16, around an agent, shape (1200, 1200) each.
+
+    Forward is up, and left is left.
+    """
     import cv2
 
     semantic = np.full(BEV_SHAPE, TAGS["road"], dtype=np.uint8)
     instance = np.zeros(BEV_SHAPE, dtype=np.uint16)
     rows = zip(boxes.bottom_corners(), boxes.category.tolist(), object_ids.tolist(), strict=True)
     for corners, code, number in rows:
-        places = corners[:, :2]
-        if np.abs(places).max() * 2 < BEV_RESOLUTION * BEV_SHAPE[0]:
-            outline = np.rint(_MIDDLE - places[:, ::-1] / BEV_RESOLUTION).astype(
-                np.int32
-            )  # OpenCV: column, row
+        xy = corners[:, :2]
+        if np.abs(xy).max() * 2 < BEV_RESOLUTION * BEV_SHAPE[0]:
+            # OpenCV takes column, row.
+            outline = np.rint(_AGENT_PIXEL - xy[:, ::-1] / BEV_RESOLUTION).astype(np.int32)
             tag = TAGS["pedestrian" if CATEGORIES[code] == "pedestrian" else "vehicle"]
             cv2.fillConvexPoly(semantic, outline, tag)
             cv2.fillConvexPoly(instance, outline, number)
     return semantic, instance
 
 
-def _spread(count: int) -> FloatArray:
-    """(count, 3) places in a box with edges of 1 around 0, evenly distributed, a little away from its faces."""
-    steps = np.arange(1, count + 1)[:, None] * (0.8191725, 0.6710436, 0.5497005)  # the R3 sequence
+def _spread_points(count: int) -> FloatArray:
+    """Return points (count, 3) in a box with edges of 1 around 0, evenly distributed.
+
+    They are a little away from its faces.
+    """
+    # The R3 sequence.
+    steps = np.arange(1, count + 1)[:, None] * (0.8191725, 0.6710436, 0.5497005)
     return as_floats((steps % 1.0 - 0.5) * 0.9)
 
 
-def _ground(lidar_height: float) -> FloatArray:
-    angle = np.linspace(0.0, 2 * np.pi, _GROUND_POINTS, endpoint=False)
-    rings = [
-        np.column_stack([radius * np.cos(angle), radius * np.sin(angle)])
-        for radius in _GROUND_RADII
-    ]
-    places = np.concatenate(rings)
-    return np.column_stack([places, np.full(len(places), -lidar_height)])
-
-
-# It gives a quarter of the bytes of the writer's default, which is faster.
-_BEV_COMPRESSION = 6
+def _ground_points(lidar_height: float) -> FloatArray:
+    angle = np.linspace(0.0, 2 * np.pi, _POINTS_PER_RING, endpoint=False)
+    rings = []
+    for radius in _GROUND_RADII_M:
+        rings.append(np.column_stack([radius * np.cos(angle), radius * np.sin(angle)]))
+    xy = np.concatenate(rings)
+    return np.column_stack([xy, np.full(len(xy), -lidar_height)])
 
 
 class Recorder:
-    """Writes what an agent recorded at a frame (counted from 1), file by file; images have width and height, pixels."""
+    """Writes an agent's recording at a frame (from 1), file by file; image sizes are in pixels."""
 
     def __init__(
         self,
@@ -326,38 +346,37 @@ class Recorder:
         frame: int,
         image_size: tuple[int, int],
     ) -> None:
-        self._folder, self._agent, self._frame = folder, agent, frame
+        self._folder = folder
+        self._agent = agent
+        self._frame = frame
         self._cameras = _cameras(image_size)
         self._calib = calib_of(agent, scene.world_from_ego(agent, frame), image_size)
         world = scene.boxes(frame)
-        self._own = np.arange(len(world)) < (
-            agent in VEHICLE_AGENTS
-        )  # the own row, if any, comes first
+        # The own row, if any, comes first.
+        self._own = np.arange(len(world)) < (agent in VEHICLE_AGENTS)
         if agent in VEHICLE_AGENTS:
             own = VEHICLE_AGENTS.index(agent)
             world = world.select([own, *(row for row in range(len(world)) if row != own)])
         self._velocity = world.velocity[:, :2]
-        self._boxes = world.transform(
-            (self._calib.world_from_ego @ self._calib.ego_from_lidar).inverse(), "lidar"
-        )
+        world_from_lidar = self._calib.world_from_ego @ self._calib.ego_from_lidar
+        self._boxes = world.transform(world_from_lidar.inverse(), "lidar")
         height = self._calib.ego_from_lidar.translation[2] if self._own.any() else POLE_HEIGHT
         self._cloud = cloud_of(self._boxes.select(~self._own), float(height))
 
     def write_calib(self) -> None:
-        """The poses and cameras."""
-        write_calib(real_path(self._folder.calib_path(self._agent, self._frame)), self._calib)
+        """Write the poses and cameras."""
+        path = real_path(self._folder.calib_path(self._agent, self._frame))
+        write_calib(path, self._calib)
 
     def write_label(self) -> None:
-        """The boxes: the own row is first; the pedestrian who is far away is not tracked."""
+        """Write the boxes, the own row first; the distant pedestrian is not tracked."""
         labels = self._labels()
         points = labels.boxes().count_points(self._cloud)
-        write_label(
-            real_path(self._folder.label_path(self._agent, self._frame)),
-            replace(labels, num_lidar_pts=points),
-        )
+        path = real_path(self._folder.label_path(self._agent, self._frame))
+        write_label(path, replace(labels, num_lidar_pts=points))
 
     def write_channel(self, channel: str) -> None:
-        """The file of one sensor."""
+        """Write the file of one sensor."""
         path = real_path(self._folder.channel_path(self._agent, channel, self._frame))
         if channel == LIDAR:
             write_lidar(path, self._cloud, np.linspace(0.0, 1.0, len(self._cloud)))
@@ -368,15 +387,14 @@ class Recorder:
             write_image(path, self._picture(channel))
 
     def _picture(self, channel: str) -> ByteArray:
-        boxes = self._boxes.select(~self._own).transform(
-            self._calib.camera_from_lidar[channel], channel
-        )
+        others = self._boxes.select(~self._own)
+        boxes = others.transform(self._calib.camera_from_lidar[channel], channel)
         sky = (120 + 12 * AGENTS.index(self._agent), 130 + 12 * CAMERAS.index(channel), 200)
         road = (40 + self._frame, 40 + self._frame, 45 + self._frame)
         return _picture_of(boxes, self._cameras[channel], sky=sky, road=road)
 
     def _labels(self) -> Labels:
-        """The contents of the label, without the numbers of points."""
+        """Return the content of the label, without numbers of points."""
         boxes = self._boxes
         yaw = np.where(self._own, 0.0, boxes.yaw)
         return Labels(
@@ -398,9 +416,12 @@ class Recorder:
         )
 
     def _visible(self) -> BoolArray:
-        """(N,) whether a corner of the box is in any of the pictures; no actor hides another."""
-        seen = np.zeros(len(self._boxes), dtype=bool)
+        """Return whether a corner of the box is in any picture, shape (N,).
+
+        No actor hides another.
+        """
+        visible = np.zeros(len(self._boxes), dtype=bool)
         for channel, camera in self._cameras.items():
             boxes = self._boxes.transform(self._calib.camera_from_lidar[channel], channel)
-            seen |= camera.boxes_in_image(boxes, BoxVisibility.ANY)
-        return seen & ~self._own
+            visible |= camera.boxes_in_image(boxes, BoxVisibility.ANY)
+        return visible & ~self._own

@@ -1,7 +1,8 @@
-"""Hypothesis strategies for the parts of a release: poses, points, boxes, contents of files, small releases.
+"""Hypothesis strategies for poses, points, boxes, contents of files, and small releases.
 
-Contents (`labels`, `metas`, `calibs`, `clouds`) can be all that the files can hold, unusual values too; `label_texts`
-look like real files. Raises MissingExtraError on import if hypothesis is not installed.
+Contents (`labels`, `metas`, `calibs`, `clouds`) can be all that the files can hold, also unusual
+values; `label_texts` look like real files. Raises MissingExtraError on import if hypothesis is not
+installed.
 """
 
 from collections.abc import Sequence
@@ -44,17 +45,20 @@ ANGLES = st.floats(-np.pi, np.pi, allow_nan=False)
 
 
 def numbers(reach: float) -> st.SearchStrategy[float]:
-    """Finite floats from −`reach` to `reach`."""
+    """Draw finite floats from −`reach` to `reach`."""
     return st.floats(-reach, reach, allow_nan=False)
 
 
 def arrays(shape: tuple[int, ...], reach: float) -> st.SearchStrategy[FloatArray]:
-    """Float64 arrays of numbers from −`reach` to `reach`."""
+    """Draw float64 arrays of numbers from −`reach` to `reach`."""
     return hnp.arrays(np.float64, shape, elements=numbers(reach))
 
 
 def rotation_matrix(yaw: float, pitch: float, roll: float) -> FloatArray:
-    """Rz(yaw) · Ry(pitch) · Rx(roll), (3, 3), right-handed: computed here, so that tests do not use the devkit's."""
+    """Return Rz(yaw) · Ry(pitch) · Rx(roll), shape (3, 3), right-handed.
+
+    It is computed here, so that tests do not use the devkit's own code.
+    """
     (cy, cp, cr), (sy, sp, sr) = np.cos([yaw, pitch, roll]), np.sin([yaw, pitch, roll])
     about_z = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
     about_y = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
@@ -64,7 +68,7 @@ def rotation_matrix(yaw: float, pitch: float, roll: float) -> FloatArray:
 
 @st.composite
 def matrices(draw: st.DrawFn, reach: float = 1e3) -> FloatArray:
-    """Rigid 4×4 matrices with any yaw, pitch and roll and a translation up to `reach`."""
+    """Draw rigid 4×4 matrices with any yaw, pitch and roll and a translation up to `reach`."""
     matrix = np.eye(4)
     matrix[:3, :3] = rotation_matrix(draw(ANGLES), draw(ANGLES), draw(ANGLES))
     matrix[:3, 3] = draw(arrays((3,), reach))
@@ -72,18 +76,18 @@ def matrices(draw: st.DrawFn, reach: float = 1e3) -> FloatArray:
 
 
 def poses(reach: float = 1e3) -> st.SearchStrategy[SE3]:
-    """SE3 objects of `matrices`."""
+    """Draw SE3 objects of `matrices`."""
     return matrices(reach).map(SE3)
 
 
 def points(max_count: int = 8, reach: float = 100.0) -> st.SearchStrategy[FloatArray]:
-    """Arrays (N, 3), N from 0 to `max_count`."""
+    """Draw arrays (N, 3), N from 0 to `max_count`."""
     return st.integers(0, max_count).flatmap(lambda count: arrays((count, 3), reach))
 
 
 @st.composite
 def boxes(draw: st.DrawFn, max_count: int = 5, frame: str = "lidar") -> Boxes:
-    """Boxes with any rotation; some velocities are unknown."""
+    """Draw boxes with any rotation; some velocities are unknown."""
     count = draw(st.integers(0, max_count))
     rotation = [SE3(draw(matrices())).quaternion.elements for _ in range(count)]
     velocity = draw(arrays((count, 3), 30.0))
@@ -106,7 +110,7 @@ def boxes(draw: st.DrawFn, max_count: int = 5, frame: str = "lidar") -> Boxes:
 def upright_boxes(
     draw: st.DrawFn, max_count: int = 4, reach: float = 10.0, frame: str = "lidar"
 ) -> Boxes:
-    """Boxes that stand on the ground, so near to each other that many overlap; some are parallel to the axes."""
+    """Draw boxes on the ground, so close that many overlap; some are parallel to the axes."""
     count = draw(st.integers(0, max_count))
     yaws = ANGLES | st.sampled_from([0.0, np.pi / 2, -np.pi / 2, np.pi])
     return Boxes.from_arrays(
@@ -118,8 +122,9 @@ def upright_boxes(
 
 
 def cameras() -> st.SearchStrategy[PinholeCamera]:
-    """Pinhole cameras of all focal lengths and centres that a picture can have."""
-    focal, centre = st.floats(50, 5000), st.floats(0, 2000)
+    """Draw pinhole cameras of all focal lengths and centres that a picture can have."""
+    focal = st.floats(50, 5000)
+    centre = st.floats(0, 2000)
     matrix = st.builds(
         lambda fx, fy, cx, cy: np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]),
         focal,
@@ -132,7 +137,7 @@ def cameras() -> st.SearchStrategy[PinholeCamera]:
 
 @st.composite
 def labels(draw: st.DrawFn, max_count: int = 5) -> Labels:
-    """The content of one label file: any numbers up to 1e9, some unknown velocities, either handedness."""
+    """Draw the content of a label file: numbers up to 1e9, unknown velocities, any handedness."""
     count = draw(st.integers(0, max_count))
     anything = numbers(1e9)
     velocity = draw(hnp.arrays(np.float64, (count, 2), elements=anything | st.just(np.nan)))
@@ -154,7 +159,7 @@ def labels(draw: st.DrawFn, max_count: int = 5) -> Labels:
 
 @st.composite
 def label_lines(draw: st.DrawFn) -> str:
-    """A box line of a label file with realistic numbers: of a tracked, an untracked or a parked actor."""
+    """Draw a box line with realistic numbers, of a tracked, an untracked or a parked actor."""
     number = numbers(100.0)
     size = st.floats(0.3, 10.0)
     floats = [draw(number) for _ in range(3)] + [draw(size) for _ in range(3)] + [draw(ANGLES)]
@@ -172,13 +177,14 @@ def label_lines(draw: st.DrawFn) -> str:
 
 @st.composite
 def label_texts(draw: st.DrawFn, max_count: int = 5) -> str:
-    """A complete label file of a vehicle: header, own line, other lines, and blank and one-word lines to be skipped.
+    """Draw a complete label file of a vehicle: header, own line, other lines, and lines to skip.
 
-    Line ends are those of Unix or Windows.
+    Lines to skip are blank or have one word. Line ends are of Unix or Windows.
     """
-    speed = [repr(draw(numbers(30.0))) for _ in range(2)]
-    own = f"car 0.0 0.0 -1.2 4.6 1.9 1.5 0.0 {' '.join(speed)} {OWN_ACTOR_ID} {draw(st.integers(0, 2000))} False"
-    lines = [" ".join(speed), own, *draw(st.lists(label_lines(), max_size=max_count))]
+    speed = " ".join(repr(draw(numbers(30.0))) for _ in range(2))
+    points = draw(st.integers(0, 2000))
+    own = f"car 0.0 0.0 -1.2 4.6 1.9 1.5 0.0 {speed} {OWN_ACTOR_ID} {points} False"
+    lines = [speed, own, *draw(st.lists(label_lines(), max_size=max_count))]
     for skipped in draw(st.lists(st.sampled_from(["", "car"]), max_size=2)):
         lines.insert(draw(st.integers(1, len(lines))), skipped)
     end = draw(st.sampled_from(["\n", "\r\n"]))
@@ -187,7 +193,7 @@ def label_texts(draw: st.DrawFn, max_count: int = 5) -> str:
 
 @st.composite
 def metas(draw: st.DrawFn) -> Meta:
-    """The content of a meta file, with or without a collision, complete or with missing lines."""
+    """Draw the content of a meta file, with or without a collision, complete or not."""
     actors = st.integers(1, 30_000)
     agents = st.sampled_from(list(META_AGENTS.values()))
     collision = Collision(
@@ -214,7 +220,7 @@ def metas(draw: st.DrawFn) -> Meta:
 
 @st.composite
 def calibs(draw: st.DrawFn) -> Calib:
-    """The content of a calib file: any poses, and cameras with different focal lengths and centres."""
+    """Draw the content of a calib file: any poses, and cameras with different intrinsics."""
     focal = st.floats(100, 2000)
     return Calib(
         ego_from_lidar=draw(poses(5.0)),
@@ -231,49 +237,50 @@ def calibs(draw: st.DrawFn) -> Calib:
 
 @st.composite
 def clouds(draw: st.DrawFn) -> LidarPointCloud:
-    """Point clouds of single-precision numbers, as in the files."""
-    values = draw(
-        hnp.arrays(
-            np.float32, (draw(st.integers(0, 20)), 4), elements=st.floats(-100, 100, width=32)
-        )
-    )
+    """Draw point clouds of single-precision numbers, as in the files."""
+    shape = (draw(st.integers(0, 20)), 4)
+    elements = st.floats(-100, 100, width=32)
+    values = draw(hnp.arrays(np.float32, shape, elements=elements))
     return LidarPointCloud(values[:, :3].astype(np.float64), values[:, 3])
 
 
 def damaged(content: bytes) -> st.SearchStrategy[bytes]:
-    """Damaged copies of `content`: bytes changed, inserted or removed, pieces repeated, the end cut off."""
-    places = st.integers(0, len(content) - 1)
-    few = st.integers(0, 12)
+    """Draw damaged copies of `content`.
 
-    def damage(kind: str, at: int, length: int, new: bytes, other: int) -> bytes:
+    Bytes are changed, inserted or removed, pieces are repeated, or the end is cut off.
+    """
+    offsets = st.integers(0, len(content) - 1)
+    lengths = st.integers(0, 12)
+
+    def damage(kind: str, offset: int, length: int, new: bytes, source: int) -> bytes:
         if kind == "change":
-            return content[:at] + new + content[at + len(new) :]
+            return content[:offset] + new + content[offset + len(new) :]
         if kind == "insert":
-            return content[:at] + new + content[at:]
+            return content[:offset] + new + content[offset:]
         if kind == "remove":
-            return content[:at] + content[at + length + 1 :]
+            return content[:offset] + content[offset + length + 1 :]
         if kind == "repeat":
-            return content[:at] + content[other : other + length + 1] + content[at:]
-        return content[:at]
+            return content[:offset] + content[source : source + length + 1] + content[offset:]
+        return content[:offset]
 
     kinds = st.sampled_from(["change", "change", "insert", "remove", "repeat", "cut"])
-    return st.builds(damage, kinds, places, few, st.binary(min_size=1, max_size=4), places)
+    return st.builds(damage, kinds, offsets, lengths, st.binary(min_size=1, max_size=4), offsets)
 
 
 def small_releases() -> st.SearchStrategy[SmallRelease]:
-    """Small releases without sensor files (`write_small_release` takes a tenth of a second for one)."""
+    """Draw small releases without sensor files, which take a tenth of a second to write."""
     return st.builds(
         SmallRelease,
         layout=st.sampled_from(["A", "B"]),
         frames=st.integers(1, 3),
-        splits=_some_of(SPLITS),
-        agents=_some_of(AGENTS),
+        splits=_subsets(SPLITS),
+        agents=_subsets(AGENTS),
         channels=st.just(()),
         seed=st.integers(0, 2**32),
     )
 
 
-def _some_of(names: Sequence[_T]) -> st.SearchStrategy[tuple[_T, ...]]:
-    """One or more of some names, in their order."""
-    chosen = st.sets(st.sampled_from(names), min_size=1)
-    return chosen.map(lambda some: tuple(name for name in names if name in some))
+def _subsets(names: Sequence[_T]) -> st.SearchStrategy[tuple[_T, ...]]:
+    """Draw one or more of the names, in their order."""
+    sets = st.sets(st.sampled_from(names), min_size=1)
+    return sets.map(lambda subset: tuple(name for name in names if name in subset))

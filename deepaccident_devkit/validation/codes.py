@@ -1,4 +1,4 @@
-"""Every kind of finding: its severity, its meaning and the remedy (docs/validation.md)."""
+"""Every kind of finding with its severity, meaning and remedy (docs/validation.md)."""
 
 import json
 from dataclasses import dataclass
@@ -13,11 +13,11 @@ class Code:
     """A kind of finding.
 
     Attributes:
-        severity: how bad it is.
-        meaning: one sentence for the docs.
-        remedy: what to do.
-        known: why the real release itself has it, empty if it does not.
-        deep: whether only `--deep` finds it.
+        severity: Severity.
+        meaning: One sentence for the docs.
+        remedy: What the user should do.
+        known: Why the real release itself has it; empty if it does not.
+        deep: Whether only `--deep` finds it.
     """
 
     severity: Severity
@@ -28,10 +28,10 @@ class Code:
 
 
 _DATA = json.loads(Path(__file__).with_suffix(".json").read_bytes())
-# Name of a remedy that several kinds share → its text; other kinds have a text of their own.
+# Name of a remedy that several kinds share → its text; other kinds have their own text.
 _REMEDIES = {**_DATA["remedies"], "update the index": INDEX_REMEDY}
 CODES: dict[str, Code] = {
     name: Code(**{**fields, "remedy": _REMEDIES.get(fields["remedy"], fields["remedy"])})
     for name, fields in _DATA["codes"].items()
 }
-"""Name of a kind of finding → what `codes.json` says of it."""
+"""Name of a kind of finding → its entry in `codes.json`."""

@@ -1,4 +1,4 @@
-"""Which files of a release are here and which are missing, by listing folders; only split files are opened."""
+"""Present and missing files of a release, by listing folders; only split files are opened."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from itertools import chain, islice
 from typing import TYPE_CHECKING, Final
 
 from deepaccident_devkit.errors import ReleaseError, TokenError
@@ -38,9 +39,9 @@ _META: Final = "meta"
 # Kinds that the test split ships without.
 _NOT_IN_TEST: Final = ("label", BEV_CAMERA, _META)
 _UNKNOWN_SPLIT: Final = "unknown"
-# Scenarios that the text lists at most.
-_LISTED: Final = 10
-# Of the text's tables: heading → kinds of files.
+# Scenarios that the text lists.
+_MAX_LISTED_SCENARIOS: Final = 10
+# Heading of a column in the text's tables → its kinds of files.
 _COLUMNS: Final = {
     "calib": ("calib",),
     "label": ("label",),
@@ -55,11 +56,11 @@ class FileCount:
     """Files of one kind of one agent, or `meta` files, in one or several scenarios.
 
     Attributes:
-        agent: the agent's name; None for `meta`, of which a scenario has one.
+        agent: Name of the agent; None for `meta`, of which a scenario has one.
         channel: `calib`, `label`, a sensor's channel, or `meta`.
-        expected: one a frame of every scenario.
-        missing: those of them that are not here, or have no bytes.
-        bytes: of the files that are here.
+        expected: Number of expected files, one a frame of every scenario.
+        missing: Number of expected files that are absent or empty.
+        bytes: Size of the present files.
     """
 
     agent: str | None
@@ -71,13 +72,14 @@ class FileCount:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SplitFiles(ShortRepr):
-    """What is here of the scenarios of a split.
+    """Present files of the scenarios of a split.
 
     Attributes:
-        scenarios: how many are here, in part or whole.
-        whole: those of them that lack nothing.
-        expected: scenarios of the split in the whole release; None for a selection, and for unknown splits.
-        files: for every agent and kind of file, then for `meta`.
+        scenarios: Number of scenarios that are present, in part or completely.
+        whole: Number of them that lack nothing.
+        expected: Scenarios of the split in the complete release; None for a selection, and for
+            unknown splits.
+        files: Counts for every agent and kind of file, then for `meta`.
     """
 
     scenarios: int
@@ -88,18 +90,20 @@ class SplitFiles(ShortRepr):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Completeness(Report):
-    """Which files of a release are here, and which are missing.
+    """Present and missing files of a release.
 
     Attributes:
-        dataroot: its folder.
+        dataroot: Folder of the release.
         version: `v1` or `v1-mini`.
-        scenarios: how many are here, in part or whole, and have a calib or label file, by which frames are counted.
-        whole: those of them that lack nothing.
-        total: the files of all of them; its agent is None, its channel `all`.
-        splits: split → what is here of it; `unknown` for scenarios of no known split. The mini release is one split.
-        lacking: scenario that is not whole → kind of file → how many are missing, of all agents.
-        unreadable_archives: a sentence each: which one, what is wrong with it, and what to do. Files that they may hold
-            are not here.
+        scenarios: Number of scenarios that are present, in part or completely, with a calib or
+            label file, which number their frames.
+        whole: Number of them that lack nothing.
+        total: Sum of all files; its agent is None, its channel `all`.
+        splits: Split → its present files; `unknown` for scenarios of no known split. The mini
+            release is one split.
+        lacking: Incomplete scenario → kind of file → number of missing files, of all agents.
+        unreadable_archives: A sentence for each unreadable archive, with its fault and remedy.
+            Files that it may hold count as missing.
     """
 
     dataroot: str
@@ -112,30 +116,34 @@ class Completeness(Report):
     unreadable_archives: Sequence[str]
 
     def to_text(self) -> str:
-        """Blocks for a terminal: unreadable archives, each split, then the first scenarios that lack something."""
+        """Return blocks for a terminal: unreadable archives, splits, then incomplete scenarios."""
         refused = [f"cannot be read: {sentence}" for sentence in self.unreadable_archives]
-        return "\n".join(
-            [f"DeepAccident {self.version} at {self.dataroot}", *refused, self.section()]
-        )
+        head = f"DeepAccident {self.version} at {self.dataroot}"
+        return "\n".join([head, *refused, self.section()])
 
     def section(self) -> str:
-        """The same without the release's name, as a part of another report."""
-        total, here = self.total, self.total.expected - self.total.missing
+        """Return the text without the release's name, as a part of another report."""
+        total = self.total
+        present = total.expected - total.missing
         head = (
             f"{counted(self.scenarios, 'scenario')} here, {self.whole:,} whole\n"
-            f"files here: {here:,} of {total.expected:,} ({size_text(total.bytes)}), missing: {total.missing:,}"
+            f"files here: {present:,} of {total.expected:,} ({size_text(total.bytes)})"
+            f", missing: {total.missing:,}"
         )
         blocks = [head, *(_split_text(name, split) for name, split in self.splits.items())]
         if self.lacking:
-            lines = [f"  {token}: {sum(kinds.values()):,}" for token, kinds in self.lacking.items()]
-            more = (
-                [f"  … and {len(lines) - _LISTED:,} more (--json lists all)"]
-                if len(lines) > _LISTED
-                else []
-            )
-            heading = f"scenarios that lack files, and how many ({len(lines):,}):"
-            blocks.append("\n".join([heading, *lines[:_LISTED], *more]))
+            blocks.append(self._lacking_text())
         return "\n\n".join(blocks)
+
+    def _lacking_text(self) -> str:
+        """Return a line for each of the first incomplete scenarios."""
+        number = len(self.lacking)
+        lines = [f"scenarios that lack files, and how many ({number:,}):"]
+        for token, kinds in islice(self.lacking.items(), _MAX_LISTED_SCENARIOS):
+            lines.append(f"  {token}: {sum(kinds.values()):,}")
+        if number > _MAX_LISTED_SCENARIOS:
+            lines.append(f"  … and {number - _MAX_LISTED_SCENARIOS:,} more (--json lists all)")
+        return "\n".join(lines)
 
 
 def release_completeness(
@@ -143,31 +151,32 @@ def release_completeness(
     version: str = "v1",
     *,
     scenarios: Collection[str] | None = None,
-    **how: Unpack[Engine],
+    **engine: Unpack[Engine],
 ) -> Completeness:
-    """Count which files are here and which are missing, by split, agent and channel.
+    """Count present and missing files by split, agent and channel.
 
-    Every agent is expected to have a file of every kind for each frame of a scenario, which its calib and label files
-    number; the test split has no label, BEV camera and meta files. Broken scenarios count, too. A folder that cannot be
-    listed counts as empty; `validate_release` names it.
+    Every agent is expected to have a file of every kind for each frame of a scenario, which its
+    calib and label files number; the test split has no label, BEV camera and meta files. Broken
+    scenarios count, too. A folder that cannot be listed counts as empty; `validate_release` names
+    it.
 
     Args:
-        root: the release, as of `DeepAccident`: a folder, archives, or a URL.
+        root: Dataroot of the release, as for `DeepAccident`: a folder, archives, or a URL.
         version: `v1` or `v1-mini`.
-        scenarios: tokens of the scenarios to look at; None for all.
-        **how: `workers`, `executor` and `progress`, as `parallel.Engine` says.
+        scenarios: Tokens of the scenarios to examine; None for all.
+        **engine: `workers`, `executor` and `progress` (`parallel.Engine`).
 
     Raises:
-        DatarootError: the folder is missing, holds no release, or a part of it that is no archive cannot be listed.
-        VersionError: the version is unknown or not under this folder.
-        SplitFileError: a split file cannot be read.
-        TokenError: one of `scenarios` is not there.
+        DatarootError: The folder is missing, holds no release, or a part of it that is no archive
+            cannot be listed.
+        VersionError: The version is unknown or not under this folder.
+        SplitFileError: A split file cannot be read.
+        TokenError: A token of `scenarios` is not in the release.
     """
     layout = readable_release(root, version)
     folders = chosen_scenarios(layout, scenarios)
-    files = run_batch(
-        files_of, folders, label="listing files", places=Places(reads=places_of(layout.root)), **how
-    )
+    places = Places(reads=places_of(layout.root))
+    files = run_batch(files_of, folders, label="listing files", places=places, **engine)
     tokens = [folder.token for folder in folders]
     return completeness(
         layout, zip(tokens, files, strict=True), str(root), selected=scenarios is not None
@@ -175,118 +184,127 @@ def release_completeness(
 
 
 def readable_release(root: Dataroot, version: str) -> ReleaseLayout:
-    """Return what lies under a dataroot, except in archives that cannot be listed; perhaps no scenario is left then.
+    """Return the release under a dataroot, without archives that cannot be listed.
+
+    It may then have no scenario at all.
 
     Raises:
-        DatarootError, VersionError: as of `find_release`, if all archives can be listed.
+        DatarootError, VersionError: As in `find_release`, if all archives can be listed.
     """
-    place = open_dataroot(root, on_error="skip")
+    dataroot = open_dataroot(root, on_error="skip")
     try:
-        return find_release(place, version)
+        return find_release(dataroot, version)
     except ReleaseError:
-        if not refused_archives(place):
+        if not refused_archives(dataroot):
             raise
-        return ReleaseLayout(root=place, version=version, layout="A", scenarios=())
+        return ReleaseLayout(root=dataroot, version=version, layout="A", scenarios=())
 
 
 def chosen_scenarios(
     layout: ReleaseLayout, scenarios: Collection[str] | None
 ) -> list[ScenarioFolder]:
-    """The scenarios of some tokens, None for all; raises TokenError."""
+    """Return the scenarios of tokens, None for all; raises TokenError."""
     if scenarios is None:
         return list(layout.scenarios)
     tokens = set(members_of("scenarios", scenarios, "tokens of scenarios"))
-    chosen = [folder for folder in layout.scenarios if folder.token in tokens]
-    unknown = sorted(tokens - {folder.token for folder in chosen})
+    folders = [folder for folder in layout.scenarios if folder.token in tokens]
+    unknown = sorted(tokens - {folder.token for folder in folders})
     if unknown:
-        raise TokenError(
-            f"{layout.root}: has no scenario {unknown[0]!r}; its folders name {len(layout.scenarios)} others"
-        )
-    return chosen
+        message = f"{layout.root}: has no scenario {unknown[0]!r}"
+        raise TokenError(f"{message}; its folders name {len(layout.scenarios)} others")
+    return folders
 
 
 def files_of(scenario: ScenarioFolder) -> tuple[FileCount, ...]:
-    """The files of a scenario, agent by agent, then `meta`; none if neither calib nor labels number a frame."""
-    found: dict[tuple[str, str], Mapping[int, int]] = {}
+    """Return the file counts of a scenario, agent by agent, then of `meta`.
+
+    They are empty if neither calib nor label files number a frame.
+    """
+    sizes_by_kind: dict[tuple[str, str], Mapping[int, int]] = {}
     for agent in AGENTS:
         for kind, ending in {**SMALL_FILE_ENDINGS, **CHANNEL_FORMAT}.items():
-            found[agent, kind] = {}
-            with suppress(ReleaseError):  # a finding of its own
-                found[agent, kind] = frame_sizes(scenario.kind_folder(agent, kind), ending)
-    frames = max(
-        (
-            frame
-            for (_, kind), sizes in found.items()
-            if kind in SMALL_FILE_ENDINGS
-            for frame in sizes
-        ),
-        default=0,
-    )
-    if not frames:
+            sizes_by_kind[agent, kind] = {}
+            # `validate_release` reports a folder that cannot be listed.
+            with suppress(ReleaseError):
+                sizes_by_kind[agent, kind] = frame_sizes(scenario.kind_folder(agent, kind), ending)
+    num_frames = 0
+    for (_, kind), sizes in sizes_by_kind.items():
+        if kind in SMALL_FILE_ENDINGS:
+            num_frames = max([num_frames, *sizes])
+    if not num_frames:
         return ()
     counts = []
-    for (name, kind), of_frames in found.items():
-        sizes = [size for frame, size in of_frames.items() if size and frame <= frames]
-        missing = frames - len(sizes)
-        counts.append(
-            FileCount(agent=name, channel=kind, expected=frames, missing=missing, bytes=sum(sizes))
+    for (agent_name, kind), sizes in sizes_by_kind.items():
+        present = [size for frame, size in sizes.items() if size and frame <= num_frames]
+        count = FileCount(
+            agent=agent_name,
+            channel=kind,
+            expected=num_frames,
+            missing=num_frames - len(present),
+            bytes=sum(present),
         )
-    meta = 0
+        counts.append(count)
+    meta_size = 0
     with suppress(OSError):
-        meta = scenario.meta_path.stat().st_size
-    return *counts, FileCount(
-        agent=None, channel=_META, expected=1, missing=int(not meta), bytes=meta
+        meta_size = scenario.meta_path.stat().st_size
+    meta = FileCount(
+        agent=None, channel=_META, expected=1, missing=int(not meta_size), bytes=meta_size
     )
+    return (*counts, meta)
 
 
 def completeness(
     layout: ReleaseLayout,
-    found: Iterable[tuple[str, Sequence[FileCount]]],
+    counts_by_token: Iterable[tuple[str, Sequence[FileCount]]],
     dataroot: str,
     *,
     selected: bool,
 ) -> Completeness:
-    """The sum of the files of scenarios, of which `files_of` told; `selected` if these are not all of the release."""
+    """Return the sum of the file counts of scenarios, by token.
+
+    `selected` means that they are a selection of the release's scenarios.
+    """
     split_of = assign_splits(layout).split_of
+    is_mini = layout.version == "v1-mini"
     by_split: dict[str, dict[str, list[FileCount]]] = {}
-    for token, counts in found:
-        split = (
-            layout.version if layout.version == "v1-mini" else split_of.get(token, _UNKNOWN_SPLIT)
-        )
-        if counts:
-            by_split.setdefault(split, {})[token] = [_expected_in(split, count) for count in counts]
-    every = {
-        token: counts for scenarios in by_split.values() for token, counts in scenarios.items()
-    }
-    lacking = {token: kinds for token, counts in every.items() if (kinds := _missing_kinds(counts))}
-    of_release = (
-        {layout.version: EXPECTED_MINI_SCENARIOS}
-        if layout.version == "v1-mini"
-        else EXPECTED_SCENARIOS
-    )
-    expected = {} if selected else of_release
-    splits = (
-        split
-        for split in (*SPLITS, layout.version, _UNKNOWN_SPLIT)
-        if split in by_split or split in expected
+    lacking: dict[str, dict[str, int]] = {}
+    for token, scenario_counts in counts_by_token:
+        if not scenario_counts:
+            continue
+        split = layout.version if is_mini else split_of.get(token, _UNKNOWN_SPLIT)
+        counts = [_expect_in_split(split, count) for count in scenario_counts]
+        by_split.setdefault(split, {})[token] = counts
+        missing = _missing_kinds(counts)
+        if missing:
+            lacking[token] = missing
+    expected: Mapping[str, int] = EXPECTED_SCENARIOS
+    if is_mini:
+        expected = {layout.version: EXPECTED_MINI_SCENARIOS}
+    if selected:
+        expected = {}
+    splits = {}
+    for split in (*SPLITS, layout.version, _UNKNOWN_SPLIT):
+        if split in by_split or split in expected:
+            scenarios = by_split.get(split, {})
+            splits[split] = _split_files(scenarios, lacking, expected.get(split))
+    num_scenarios = sum(map(len, by_split.values()))
+    all_counts = chain.from_iterable(
+        counts for scenarios in by_split.values() for counts in scenarios.values()
     )
     return Completeness(
         dataroot=dataroot,
         version=layout.version,
-        scenarios=len(every),
-        whole=len(every) - len(lacking),
-        total=_summed((count for counts in every.values() for count in counts), "all"),
-        splits={
-            split: _split_files(by_split.get(split, {}), lacking, expected.get(split))
-            for split in splits
-        },
+        scenarios=num_scenarios,
+        whole=num_scenarios - len(lacking),
+        total=_sum_counts(all_counts, "all"),
+        splits=splits,
         lacking=dict(sorted(lacking.items())),
         unreadable_archives=refused_archives(layout.root),
     )
 
 
-def _summed(counts: Iterable[FileCount], channel: str, agent: str | None = None) -> FileCount:
-    """The sum of some counts, under a name."""
+def _sum_counts(counts: Iterable[FileCount], channel: str, agent: str | None = None) -> FileCount:
+    """Return the sum of counts, under a name."""
     counts = list(counts)
     return FileCount(
         agent=agent,
@@ -297,8 +315,8 @@ def _summed(counts: Iterable[FileCount], channel: str, agent: str | None = None)
     )
 
 
-def _expected_in(split: str, count: FileCount) -> FileCount:
-    """A scenario's count of a kind; the test split is not expected to have any file of some kinds."""
+def _expect_in_split(split: str, count: FileCount) -> FileCount:
+    """Return a scenario's count of a kind; the test split may lack all files of some kinds."""
     if split == "test" and count.missing == count.expected and count.channel in _NOT_IN_TEST:
         return replace(count, expected=0, missing=0)
     return count
@@ -314,44 +332,41 @@ def _missing_kinds(counts: Iterable[FileCount]) -> dict[str, int]:
 def _split_files(
     scenarios: Mapping[str, Sequence[FileCount]], lacking: Collection[str], expected: int | None
 ) -> SplitFiles:
-    of_parts = zip(*scenarios.values(), strict=True)
+    files = []
+    for counts in zip(*scenarios.values(), strict=True):
+        files.append(_sum_counts(counts, counts[0].channel, counts[0].agent))
     return SplitFiles(
         scenarios=len(scenarios),
         whole=len(scenarios.keys() - set(lacking)),
         expected=expected,
-        files=[_summed(of_part, of_part[0].channel, of_part[0].agent) for of_part in of_parts],
+        files=files,
     )
 
 
 def _split_text(name: str, split: SplitFiles) -> str:
     of_release = "" if split.expected is None else f" of the release's {split.expected}"
-    head = f"split {name}: {counted(split.scenarios, 'scenario')}{of_release} here, {split.whole:,} whole"
+    scenarios = counted(split.scenarios, "scenario")
+    head = f"split {name}: {scenarios}{of_release} here, {split.whole:,} whole"
     if split.whole == split.scenarios:
         return head
-    rows = [
-        ("missing files", *_COLUMNS),
-        *((agent, *_missing_texts(split.files, agent)) for agent in AGENTS),
-    ]
-    without_meta = next(count.missing for count in split.files if count.channel == _META)
-    return "\n".join(
-        [
-            head,
-            columns_text(rows),
-            *([f"meta is missing of {without_meta:,}"] if without_meta else []),
-        ]
-    )
+    rows: list[Sequence[str]] = [("missing files", *_COLUMNS)]
+    for agent in AGENTS:
+        rows.append((agent, *_missing_texts(split.files, agent)))
+    lines = [head, columns_text(rows)]
+    missing_meta = next(count.missing for count in split.files if count.channel == _META)
+    if missing_meta:
+        lines.append(f"meta is missing of {missing_meta:,}")
+    return "\n".join(lines)
 
 
 def _missing_texts(files: Sequence[FileCount], agent: str) -> Iterator[str]:
-    """How many files of the kinds of each of `_COLUMNS` an agent lacks; - for none, `all` for as many as expected."""
+    """Yield an agent's missing files for each of `_COLUMNS`: `-` for none, or `all`."""
     for kinds in _COLUMNS.values():
-        count = _summed(
-            (each for each in files if each.agent == agent and each.channel in kinds), ""
-        )
-        yield (
-            "-"
-            if not count.missing
-            else "all"
-            if count.missing == count.expected
-            else f"{count.missing:,}"
-        )
+        counts = [count for count in files if count.agent == agent and count.channel in kinds]
+        total = _sum_counts(counts, "")
+        if not total.missing:
+            yield "-"
+        elif total.missing == total.expected:
+            yield "all"
+        else:
+            yield f"{total.missing:,}"

@@ -1,6 +1,6 @@
-"""Checks of the sensors' files, and whether a JPEG is whole.
+"""Checks of the sensors' files, and of JPEGs with lost data.
 
-Pillow reports only a file that is cut.
+Pillow only reports a file that is cut.
 """
 
 import hashlib
@@ -32,46 +32,53 @@ from deepaccident_devkit.taxonomy import (
     OWN_ACTOR_ID,
 )
 from deepaccident_devkit.validation.inventory import Inventory
-from deepaccident_devkit.validation.subject import MOST_BOXES, Subject, frames_text
+from deepaccident_devkit.validation.subject import MAX_LABEL_BOXES, Subject, frames_text
 
-ZEROS: Final = 64
-"""Zero bytes in a row from which on they are a fault."""
-# Markers of a scan's head and of the picture's end; coded data hold neither.
-_SCAN, _END = b"\xff\xda", b"\xff\xd9"
-# In a JPEG's head: how many codes of each length grey's AC coefficients have; nearly all encoders write just these.
-_USUAL_CODES: Final = bytes.fromhex("100002010303020403050504040000017d")
-# The brightness that decoders give to blocks whose data are missing: 128, and what rounding does to it.
-_GREY = (126.0, 130.0)
-# Of red, green and blue in the brightness.
-_SHARES = (0.299, 0.587, 0.114)
-# Data that a decoder of a whole picture does not look at.
-_MORE = bytes(range(1, 251)) * 40
+MIN_ZERO_BYTES: Final = 64
+"""Zero bytes in a row that are a fault."""
+# Markers of a scan's header and of the picture's end; coded data hold neither.
+_SCAN_MARKER: Final = b"\xff\xda"
+_END_MARKER: Final = b"\xff\xd9"
+# In a JPEG's header, the number of codes of each length for grey's AC coefficients; nearly all
+# encoders write these.
+_STANDARD_CODES: Final = bytes.fromhex("100002010303020403050504040000017d")
+# The brightness that decoders give to blocks with missing data, 128, within rounding.
+_MISSING_BRIGHTNESS: Final = (126.0, 130.0)
+# Shares of red, green and blue in the brightness.
+_BRIGHTNESS_SHARES: Final = (0.299, 0.587, 0.114)
+# Data that a decoder of a complete picture does not read.
+_SURPLUS_DATA: Final = bytes(range(1, 251)) * 40
 _KINDS: dict[str, FileKind] = {LIDAR: "lidar", BEV_CAMERA: "bev"}
-LIDAR_RANGE = 75.0
-"""Metres; the real LiDAR ends at 70."""
-POINT_COUNT = (5, 0.25)
-"""Points, and as a share, by which a box's count may be off: label and cloud are not of exactly one instant, and real
-cars are off by up to 12 points, or 24 % of a few."""
-WALKER_POINT_COUNT = (30, 0.25)
-"""The same for pedestrians, whose real boxes change their size between the count and the label."""
-# Points by which one box alone may be off, and a pedestrian's: the release has 77 for 55, and 486 for 260.
-_LARGE_COUNT = (25, 300)
-# Boxes of one label, and their share of those with points, that are off if the cloud is not the label's.
-_FRAME_OFF = (2, 0.25)
-# The same for all labels of an agent, of whose boxes up to 7.5 % are off in the release.
-_AGENT_OFF = (3, 0.15)
-_BEV_HALF = 55.0
+LIDAR_RANGE_M = 75.0
+"""Range of coordinates in a cloud; the real LiDAR ends at 70."""
+POINT_COUNT_TOLERANCE = (5, 0.25)
+"""Difference of a box's count from its cloud, in points and as a share of them.
+
+Label and cloud are not of exactly one instant, and real cars are off by up to 12 points, or 24 % of
+a few.
+"""
+WALKER_POINT_COUNT_TOLERANCE = (30, 0.25)
+"""The same for pedestrians; real boxes change their size between the count and the label."""
+# Points by which a single box may be off, and a pedestrian's: the release has 77 for 55, and 486
+# for 260.
+_BOX_POINT_TOLERANCE = (25, 300)
+# Boxes of one label, and their share of its boxes with points, that are off if the cloud belongs to
+# another label.
+_FRAME_MISCOUNTS = (2, 0.25)
+# The same for all labels of an agent; in the release up to 7.5 % of an agent's boxes are off.
+_AGENT_MISCOUNTS = (3, 0.15)
+_BEV_HALF_WIDTH_M = 55.0
 _VEHICLES = tuple(CATEGORIES.index(name) for name in ("car", "truck", "van"))
-_BEV_LEAST_SHARE = 0.5
-_THUMBNAIL = (32, 18)
-# The largest ratio of an image's distance from its neighbours in time to their distance from each other.
-_OUT_OF_SEQUENCE = 3.0
-# Grey levels; below it images are the same to the eye.
-_LEAST_DIFFERENCE = 6.0
-# Grey levels between the darkest and the lightest spot of a picture that shows something.
-_BLANK = 40.0
-# Metres an agent may move while its pictures stay the same.
-_STILL = 0.02
+_MIN_BEV_SHARE = 0.5
+_THUMBNAIL_SIZE = (32, 18)
+# Ratio of an image's distance from its neighbours in time to their distance from each other.
+_MAX_DISTANCE_RATIO = 3.0
+# Grey levels; images with a smaller difference look the same.
+_MIN_DIFFERENCE = 6.0
+# Grey levels between the darkest and the lightest spot of a picture with content.
+_MIN_CONTRAST = 40.0
+# Distance that an agent may move while its pictures stay the same.
+_STANDSTILL_TOLERANCE_M = 0.02
 PICTURE_ORIENTATIONS: dict[str, str] = {
     "forward-up": "as the format says",
     "mirrored": "left and right exchanged",
@@ -82,50 +89,51 @@ PICTURE_ORIENTATIONS: dict[str, str] = {
     "transposed": "rows and columns exchanged",
     "anti-transposed": "rows and columns exchanged, and turned by half",
 }
-"""The eight ways in which the BEV camera's picture could lie."""
+"""The eight possible orientations of the BEV camera's picture."""
 
 
 def zero_stretch(content: bytes) -> tuple[int, int] | None:
-    """Place and length of a stretch of zero bytes in a JPEG's picture data that no encoder writes; None without any.
+    """Return offset and length of zero bytes in a JPEG's picture data that no encoder writes.
 
-    With the usual codes, zero bits are coefficients that are negative one after the other up to a block's last. `ZEROS`
-    bytes hold several such blocks, which no picture has. In codes made for one picture they can be an even surface, and
-    nothing is said.
+    None is returned without any. With the standard codes, zero bits are coefficients that are
+    negative one after the other up to a block's end. `MIN_ZERO_BYTES` bytes hold several such
+    blocks, which no picture has. In codes made for one picture they can be an even surface, and
+    count as correct.
     """
     start, stop = _last_scan(content)
-    if (
-        content.find(_USUAL_CODES, 0, start) < 0
-        or (zeros := content.find(bytes(ZEROS), start, stop)) < 0
-    ):
+    if content.find(_STANDARD_CODES, 0, start) < 0:
+        return None
+    zeros = content.find(bytes(MIN_ZERO_BYTES), start, stop)
+    if zeros < 0:
         return None
     data = content[zeros:stop]
     return zeros, len(data) - len(data.lstrip(b"\0"))
 
 
 def ends_early(content: bytes, image: ByteArray) -> bool:
-    """Whether the coded data of a JPEG end before its picture (H, W, 3) does: the rest of it is grey.
+    """Return whether the coded data of a JPEG end before its picture (H, W, 3), which ends grey.
 
     More data before the end then change the picture, which needs them.
     """
-    least, most = _GREY
-    if not least < image[-1, -1] @ _SHARES < most:
+    low, high = _MISSING_BRIGHTNESS
+    if not low < image[-1, -1] @ _BRIGHTNESS_SHARES < high:
         return False
     start, stop = _last_scan(content)
-    longer = (
-        content[:stop].rstrip(b"\xff") + _MORE + content[stop:]
-    )  # a last 0xff would make a marker of what follows
-    return start > 0 and not np.array_equal(_decoded(longer), image)
+    # A 0xff at the end of the data would turn the bytes after it into a marker.
+    data = content[:stop].rstrip(b"\xff")
+    longer = data + _SURPLUS_DATA + content[stop:]
+    return start > 0 and not np.array_equal(_decode_jpeg(longer), image)
 
 
 def _last_scan(content: bytes) -> tuple[int, int]:
-    """Where the last scan of a JPEG begins, and where its coded data end; zero and the file's end if it has none."""
-    start = max(content.rfind(_SCAN), 0)
-    stop = content.find(_END, start)
+    """Return start and end of a JPEG's last scan; without a scan, 0 and the file's end."""
+    start = max(content.rfind(_SCAN_MARKER), 0)
+    stop = content.find(_END_MARKER, start)
     return start, stop if stop >= 0 else len(content)
 
 
-def _decoded(content: bytes) -> Any:
-    """The picture in a file's bytes; None if it is damaged."""
+def _decode_jpeg(content: bytes) -> Any:
+    """Return the picture in a file's bytes, shape (H, W, 3); None if it is damaged."""
     from PIL import Image
 
     try:
@@ -137,7 +145,13 @@ def _decoded(content: bytes) -> Any:
 
 @dataclass(slots=True)
 class _BevHits:
-    """Vehicles whose centre has the vehicle's tag, for one recording: under each orientation, and frame by frame."""
+    """Vehicles of one recording with the vehicle tag at their centre.
+
+    Attributes:
+        boxes: Number of all vehicles.
+        hits: Orientation → vehicles with the tag.
+        poor_frames: Frames in which less than half of the vehicles have it.
+    """
 
     boxes: int = 0
     hits: dict[str, int] = field(default_factory=lambda: dict.fromkeys(PICTURE_ORIENTATIONS, 0))
@@ -148,30 +162,33 @@ def check_sensors(subject: Subject, inventory: Inventory) -> Iterator[Finding]:
     """Decode all sensor files of a scenario and compare them with its labels and calib files."""
     checksums: dict[str, list[tuple[str, str, int]]] = defaultdict(list)
     for (agent, channel), frames in inventory.items():
-        usable = [frame for frame in frames if frame <= subject.num_frames]
-        paths = {
-            frame: subject.files.scenario.channel_path(agent, channel, frame) for frame in usable
-        }
+        paths = {}
+        for frame in frames:
+            if frame <= subject.num_frames:
+                paths[frame] = subject.files.scenario.channel_path(agent, channel, frame)
         row = subject.agents.index(agent)
-        telling: list[int] = []
+        usable_frames: list[int] = []
         if channel in CAMERAS:
-            yield from _images(subject, row, channel, paths, telling)
+            yield from _check_images(subject, row, channel, paths, usable_frames)
         elif channel == LIDAR:
-            yield from _clouds(subject, row, paths, telling)
+            yield from _check_clouds(subject, row, paths, usable_frames)
         else:
-            yield from _bevs(subject, row, paths, telling)
-        for frame in telling:
+            yield from _check_bevs(subject, row, paths, usable_frames)
+        for frame in usable_frames:
             content = read_bytes(paths[frame], _KINDS.get(channel, "image"))
-            checksums[hashlib.blake2b(content, digest_size=16).hexdigest()].append(
-                (agent, channel, frame)
-            )
-    yield from _repeated(subject, checksums)
+            checksum = hashlib.blake2b(content, digest_size=16).hexdigest()
+            checksums[checksum].append((agent, channel, frame))
+    yield from _repeated_files(subject, checksums)
 
 
-def _images(
-    subject: Subject, agent: int, channel: str, paths: Mapping[int, ReleasePath], telling: list[int]
+def _check_images(
+    subject: Subject,
+    agent: int,
+    channel: str,
+    paths: Mapping[int, ReleasePath],
+    usable_frames: list[int],
 ) -> Iterator[Finding]:
-    """Decode a camera's images; the frames that show something (more than a wall, fog) go to `telling`."""
+    """Decode a camera's images; frames that show more than a wall or fog join `usable_frames`."""
     import cv2
 
     thumbnails: dict[int, FloatArray] = {}
@@ -183,97 +200,112 @@ def _images(
         except ReleaseError as error:
             yield finding_of(error, "sensor-unreadable", subject.token)
             continue
-        if (what := _lost_part(content, image)) is not None:
-            yield subject.finding("sensor-unreadable", str(path), what)
+        message = _lost_data_text(content, image)
+        if message is not None:
+            yield subject.finding("sensor-unreadable", str(path), message)
             continue
         sizes[frame] = (image.shape[1], image.shape[0])
-        thumbnails[frame] = cv2.resize(image, _THUMBNAIL, interpolation=cv2.INTER_AREA).astype(
-            np.float64
-        )
-    yield from _image_sizes(subject, agent, channel, sizes)
-    telling += [
-        frame
-        for frame, picture in thumbnails.items()
-        if np.ptp(picture, axis=(0, 1)).max() >= _BLANK
-    ]
+        thumbnail = cv2.resize(image, _THUMBNAIL_SIZE, interpolation=cv2.INTER_AREA)
+        thumbnails[frame] = thumbnail.astype(np.float64)
+    yield from _check_image_sizes(subject, agent, channel, sizes)
+    for frame, thumbnail in thumbnails.items():
+        if _has_content(thumbnail):
+            usable_frames.append(frame)
     odd = out_of_sequence(thumbnails)
+    # At the impact another car may suddenly fill the view.
     if subject.num_frames in odd and _collides(subject, agent):
-        odd.remove(subject.num_frames)  # at the impact another car may fill the view at once
+        odd.remove(subject.num_frames)
     if odd:
         folder = subject.files.scenario.kind_folder(subject.agents[agent], channel)
-        what = f"does not fit between its neighbours, {frames_text(odd)}"
-        yield subject.finding("image-out-of-sequence", str(folder), what)
+        message = f"does not fit between its neighbours, {frames_text(odd)}"
+        yield subject.finding("image-out-of-sequence", str(folder), message)
 
 
-def _lost_part(content: bytes, image: ByteArray) -> str | None:
-    """What shows that a part of a picture is lost, though it can be decoded."""
-    if (zeros := zero_stretch(content)) is not None:
-        return f"holds {zeros[1]} zero bytes in a row from byte {zeros[0]} on: part of the picture is lost"
-    return (
-        "its data end early: the rest of the picture is lost"
-        if ends_early(content, image)
-        else None
-    )
+def _has_content(picture: FloatArray) -> bool:
+    """Return whether a picture (h, w, 3) shows more than an even surface."""
+    contrast = np.ptp(picture, axis=(0, 1)).max()
+    return bool(contrast >= _MIN_CONTRAST)
+
+
+def _lost_data_text(content: bytes, image: ByteArray) -> str | None:
+    """Return a sign that a picture lost data, though it can be decoded; None without any."""
+    zeros = zero_stretch(content)
+    if zeros is not None:
+        offset, length = zeros
+        text = f"holds {length} zero bytes in a row from byte {offset} on"
+        return f"{text}: part of the picture is lost"
+    if ends_early(content, image):
+        return "its data end early: the rest of the picture is lost"
+    return None
 
 
 def _collides(subject: Subject, agent: int) -> bool:
-    """Whether the agent is one of the pair that meta names."""
+    """Return whether the agent belongs to the pair that meta names."""
     own = subject.own & (subject.boxes.agent == agent)
     return bool(subject.in_collision[own].any())
 
 
-def _image_sizes(
+def _check_image_sizes(
     subject: Subject, agent: int, channel: str, sizes: Mapping[int, tuple[int, int]]
 ) -> Iterator[Finding]:
-    """Every image must be as large as its K says: twice the principal point."""
+    """Compare the size of every image with its K: it is twice the principal point."""
     camera = CAMERAS.index(channel)
     for frame, (width, height) in sizes.items():
         intrinsic = subject.files.calibs.intrinsic[agent * subject.num_frames + frame - 1, camera]
         expected = 2 * intrinsic[:2, 2]
         if np.abs(expected - (width, height)).max() > 1:
             path = subject.files.scenario.channel_path(subject.agents[agent], channel, frame)
-            what = f"is {width}x{height}, K says {expected[0]:.0f}x{expected[1]:.0f}"
-            yield subject.finding("image-size", str(path), what)
+            message = f"is {width}x{height}, K says {expected[0]:.0f}x{expected[1]:.0f}"
+            yield subject.finding("image-size", str(path), message)
 
 
 def out_of_sequence(thumbnails: Mapping[int, FloatArray]) -> list[int]:
-    """Frames whose picture (h, w, 3) is much further from both neighbours than these are from each other.
+    """Return frames with pictures (h, w, 3) that do not fit between their neighbours.
 
-    Neighbours are 0.1 s apart: where frames are missing, a sequence ends. At the ends, where there is one neighbour,
-    its distance is held against that of the next step, unless the neighbour shows nothing: what hid the view may just
-    have gone.
+    They are much further from both neighbours than these are from each other. Neighbours are 0.1 s
+    apart: where frames are missing, a sequence ends. At an end, the distance of its one neighbour
+    is compared with that of the next step, unless the neighbour has no content: the obstacle in
+    view may just have gone.
     """
     frames = np.array(sorted(thumbnails), dtype=np.int64)
-    sequences = np.split(frames, np.flatnonzero(np.diff(frames) != 1) + 1)
-    return [frame for sequence in sequences for frame in _odd_in(sequence.tolist(), thumbnails)]
+    odd_frames = []
+    for sequence in np.split(frames, np.flatnonzero(np.diff(frames) != 1) + 1):
+        odd_frames += _odd_frames(sequence.tolist(), thumbnails)
+    return odd_frames
 
 
-def _odd_in(frames: Sequence[int], thumbnails: Mapping[int, FloatArray]) -> list[int]:
-    """The frames out of one sequence without gaps whose picture does not fit."""
+def _odd_frames(frames: Sequence[int], thumbnails: Mapping[int, FloatArray]) -> list[int]:
+    """Return the frames of one sequence without gaps that do not fit into it."""
     if len(frames) < 3:
         return []
     pictures = np.stack([thumbnails[frame] for frame in frames])
-    step = _distance(pictures[1:], pictures[:-1])
-    over = _distance(pictures[2:], pictures[:-2])
-    least = np.minimum(step[1:], step[:-1])
+    step = _picture_distance(pictures[1:], pictures[:-1])
+    neighbour_distance = _picture_distance(pictures[2:], pictures[:-2])
     odd = np.zeros(len(frames), dtype=bool)
-    odd[1:-1] = least > np.maximum(_OUT_OF_SEQUENCE * over, _LEAST_DIFFERENCE)
-    usual = np.median(step)
-    for end, inner, first, second in ((0, 1, step[0], step[1]), (-1, -2, step[-1], step[-2])):
-        told = not odd[inner] and np.ptp(pictures[inner], axis=(0, 1)).max() >= _BLANK
-        odd[end] = told and first > max(_OUT_OF_SEQUENCE * max(second, usual), _LEAST_DIFFERENCE)
+    limit = np.maximum(_MAX_DISTANCE_RATIO * neighbour_distance, _MIN_DIFFERENCE)
+    odd[1:-1] = np.minimum(step[1:], step[:-1]) > limit
+    median_step = np.median(step)
+    for end, neighbour, end_step, next_step in (
+        (0, 1, step[0], step[1]),
+        (-1, -2, step[-1], step[-2]),
+    ):
+        comparable = not odd[neighbour] and _has_content(pictures[neighbour])
+        end_limit = max(_MAX_DISTANCE_RATIO * max(next_step, median_step), _MIN_DIFFERENCE)
+        odd[end] = comparable and end_step > end_limit
     return [frame for frame, is_odd in zip(frames, odd.tolist(), strict=True) if is_odd]
 
 
-def _distance(first: FloatArray, second: FloatArray) -> FloatArray:
-    return np.asarray(np.abs(first - second).mean(axis=(1, 2, 3)))
+def _picture_distance(pictures: FloatArray, others: FloatArray) -> FloatArray:
+    difference = np.abs(pictures - others)
+    return np.asarray(difference.mean(axis=(1, 2, 3)))
 
 
-def _clouds(
-    subject: Subject, agent: int, paths: Mapping[int, ReleasePath], telling: list[int]
+def _check_clouds(
+    subject: Subject, agent: int, paths: Mapping[int, ReleasePath], usable_frames: list[int]
 ) -> Iterator[Finding]:
-    """Decode an agent's point clouds; the frames that could be read go to `telling`."""
-    odd, off = [], np.zeros((subject.num_frames + 1, 3), dtype=np.int64)
+    """Decode an agent's point clouds; readable frames join `usable_frames`."""
+    odd = []
+    miscounts = np.zeros((subject.num_frames + 1, 3), dtype=np.int64)
     for frame, path in paths.items():
         try:
             cloud = read_lidar(path)
@@ -281,59 +313,70 @@ def _clouds(
         except ReleaseError as error:
             yield finding_of(error, "sensor-unreadable", subject.token)
             continue
-        telling.append(frame)
-        if not (np.isfinite(points).all() and np.isfinite(cloud.intensity).all()) or (
-            len(points) and np.abs(points).max() > LIDAR_RANGE
-        ):
+        usable_frames.append(frame)
+        finite = np.isfinite(points).all() and np.isfinite(cloud.intensity).all()
+        if not finite or (len(points) and np.abs(points).max() > LIDAR_RANGE_M):
             odd.append(frame)
         boxes = _sample_boxes(subject, agent, frame)
-        if 0 < len(boxes) <= MOST_BOXES:
-            off[frame] = _miscounted(boxes, points)
+        if 0 < len(boxes) <= MAX_LABEL_BOXES:
+            miscounts[frame] = _count_miscounts(boxes, points)
     folder = str(subject.files.scenario.kind_folder(subject.agents[agent], LIDAR))
     if odd:
-        what = f"points that are no numbers, or beyond {LIDAR_RANGE:.0f} m, {frames_text(odd)}"
-        yield subject.finding("points-odd", folder, what)
-    foreign = _many_off(off, _FRAME_OFF) | (off[:, 2] > 0) | _many_off(off.sum(axis=0), _AGENT_OFF)
-    for code, frames in (
-        ("points-differ", np.flatnonzero(foreign & (off[:, 0] > 0))),
-        ("box-points-differ", np.flatnonzero(~foreign & (off[:, 0] > 0))),
+        message = f"points that are no numbers, or beyond {LIDAR_RANGE_M:.0f} m"
+        yield subject.finding("points-odd", folder, f"{message}, {frames_text(odd)}")
+    foreign = _exceeds(miscounts, _FRAME_MISCOUNTS) | (miscounts[:, 2] > 0)
+    foreign |= _exceeds(miscounts.sum(axis=0), _AGENT_MISCOUNTS)
+    differs = miscounts[:, 0] > 0
+    for code, mask in (
+        ("points-differ", foreign & differs),
+        ("box-points-differ", ~foreign & differs),
     ):
-        if len(frames):
-            what = f"boxes with other points than their labels count: {off[frames, 0].sum()}, {frames_text(frames)}"
-            yield subject.finding(code, folder, what)
+        if mask.any():
+            message = "boxes with other points than their labels count"
+            message += f": {miscounts[mask, 0].sum()}, {frames_text(np.flatnonzero(mask))}"
+            yield subject.finding(code, folder, message)
 
 
-def _miscounted(boxes: Boxes, points: FloatArray) -> tuple[int, int, int]:
-    """How many boxes of a label hold other points than it counts; all that could show it; those far off by themselves.
+def _count_miscounts(boxes: Boxes, points: FloatArray) -> tuple[int, int, int]:
+    """Return how many boxes of a label hold other points than it counts.
 
-    A cloud of another frame, agent or place changes the counts of many boxes; the release is off in single ones.
+    A cloud of another frame, agent or location changes the counts of many boxes; the release is off
+    in single boxes.
+
+    Returns:
+        Boxes that are off, boxes that could show it, and boxes that are off enough to show it on
+        their own.
     """
     counted = boxes.count_points(points)
-    most = np.maximum(counted, boxes.num_lidar_pts)
-    walks = boxes.category == CATEGORIES.index("pedestrian")
-    least, share = np.where(walks[:, None], WALKER_POINT_COUNT, POINT_COUNT).T
-    off = np.abs(counted - boxes.num_lidar_pts)
-    wrong = off > np.maximum(least, share * most)
-    large = off > np.where(walks, _LARGE_COUNT[1], _LARGE_COUNT[0])
-    return int(wrong.sum()), int((most > least).sum()), int((wrong & large).sum())
+    max_count = np.maximum(counted, boxes.num_lidar_pts)
+    is_walker = boxes.category == CATEGORIES.index("pedestrian")
+    tolerances = np.where(is_walker[:, None], WALKER_POINT_COUNT_TOLERANCE, POINT_COUNT_TOLERANCE)
+    min_points, share = tolerances.T
+    difference = np.abs(counted - boxes.num_lidar_pts)
+    wrong = difference > np.maximum(min_points, share * max_count)
+    box_tolerance, walker_tolerance = _BOX_POINT_TOLERANCE
+    large = difference > np.where(is_walker, walker_tolerance, box_tolerance)
+    return int(wrong.sum()), int((max_count > min_points).sum()), int((wrong & large).sum())
 
 
-def _many_off(off: IntArray, limit: tuple[int, float]) -> BoolArray:
-    """Whether so many boxes, and so large a share, are off: (…, 3) counts of `_miscounted` → (…)."""
-    return np.asarray((off[..., 0] >= limit[0]) & (off[..., 0] >= limit[1] * off[..., 1]))
+def _exceeds(miscounts: IntArray, limit: tuple[int, float]) -> BoolArray:
+    """Return whether counts (…, 3) of `_count_miscounts` reach a number and a share, shape (…)."""
+    number, share = limit
+    wrong = miscounts[..., 0]
+    return np.asarray((wrong >= number) & (wrong >= share * miscounts[..., 1]))
 
 
 def _sample_boxes(subject: Subject, agent: int, frame: int) -> Boxes:
-    """The boxes of one label in its LiDAR frame."""
-    return subject.lidar_boxes.select(
-        np.flatnonzero(subject.boxes.sample == agent * subject.num_frames + frame - 1)
-    )
+    """Return the boxes of one label in its LiDAR frame."""
+    sample = agent * subject.num_frames + frame - 1
+    rows = np.flatnonzero(subject.boxes.sample == sample)
+    return subject.lidar_boxes.select(rows)
 
 
-def _bevs(
-    subject: Subject, agent: int, paths: Mapping[int, ReleasePath], telling: list[int]
+def _check_bevs(
+    subject: Subject, agent: int, paths: Mapping[int, ReleasePath], usable_frames: list[int]
 ) -> Iterator[Finding]:
-    """Decode an agent's BEV arrays; the frames that could be read go to `telling`."""
+    """Decode an agent's BEV arrays; readable frames join `usable_frames`."""
     total = _BevHits()
     for frame, path in paths.items():
         try:
@@ -341,42 +384,49 @@ def _bevs(
         except ReleaseError as error:
             yield finding_of(error, "sensor-unreadable", subject.token)
             continue
-        telling.append(frame)
-        places = _vehicle_places(subject, agent, frame)
-        if not len(places):
-            continue
-        hits = {name: _hits(semantic, _turned(places, name)) for name in PICTURE_ORIENTATIONS}
-        total.boxes += len(places)
-        for name, hit in hits.items():
-            total.hits[name] += int(hit.sum())
-        if len(places) > 2 and hits["forward-up"].mean() < _BEV_LEAST_SHARE:
-            total.poor_frames.append(frame)
+        usable_frames.append(frame)
+        _count_bev_hits(total, semantic, _vehicle_centers(subject, agent, frame), frame)
     folder = str(subject.files.scenario.kind_folder(subject.agents[agent], BEV_CAMERA))
     best = max(total.hits, key=lambda name: total.hits[name])
-    if total.hits[best] > total.hits["forward-up"] + max(2, 0.25 * total.boxes) and total.boxes:
-        shown = f"{total.hits[best]} of {total.boxes} vehicles are where the labels have them if it is '{best}'"
-        what = (
-            f"{shown} ({PICTURE_ORIENTATIONS[best]}), {total.hits['forward-up']} if forward is up"
-        )
-        yield subject.finding("bev-orientation", folder, what)
+    best_hits = total.hits[best]
+    forward_hits = total.hits["forward-up"]
+    if total.boxes and best_hits > forward_hits + max(2, 0.25 * total.boxes):
+        message = f"{best_hits} of {total.boxes} vehicles are where the labels have them if it is"
+        message += f" '{best}' ({PICTURE_ORIENTATIONS[best]}), {forward_hits} if forward is up"
+        yield subject.finding("bev-orientation", folder, message)
     elif total.poor_frames:
-        what = f"fewer than half of the labels' vehicles are in the picture, {frames_text(total.poor_frames)}"
-        yield subject.finding("bev-differs", folder, what)
+        message = "fewer than half of the labels' vehicles are in the picture"
+        yield subject.finding("bev-differs", folder, f"{message}, {frames_text(total.poor_frames)}")
 
 
-def _vehicle_places(subject: Subject, agent: int, frame: int) -> FloatArray:
-    """(M, 2) metres forward and left of the agent: centres of the vehicles that the BEV camera has in view."""
+def _count_bev_hits(total: _BevHits, semantic: ByteArray, centers: FloatArray, frame: int) -> None:
+    """Add the vehicles of one frame to the hits of its recording."""
+    if not len(centers):
+        return
+    total.boxes += len(centers)
+    for name in PICTURE_ORIENTATIONS:
+        hits = _find_hits(semantic, _turn_picture(centers, name))
+        total.hits[name] += int(hits.sum())
+        if name == "forward-up" and len(centers) > 2 and hits.mean() < _MIN_BEV_SHARE:
+            total.poor_frames.append(frame)
+
+
+def _vehicle_centers(subject: Subject, agent: int, frame: int) -> FloatArray:
+    """Return centres (M, 2) of vehicles in the BEV camera's view, forward and left, metres."""
     sample = agent * subject.num_frames + frame - 1
     boxes = subject.boxes
-    vehicles = np.isin(boxes.labels.category, _VEHICLES) & (subject.label_id != OWN_ACTOR_ID)
-    rows = np.flatnonzero((boxes.sample == sample) & vehicles)
-    places: FloatArray = subject.boxes.labels.center[rows, :2]
-    return places[(np.abs(places) < _BEV_HALF).all(axis=1)]
+    is_vehicle = np.isin(boxes.labels.category, _VEHICLES) & (subject.label_id != OWN_ACTOR_ID)
+    rows = np.flatnonzero((boxes.sample == sample) & is_vehicle)
+    centers: FloatArray = boxes.labels.center[rows, :2]
+    return centers[(np.abs(centers) < _BEV_HALF_WIDTH_M).all(axis=1)]
 
 
-def _turned(places: FloatArray, orientation: str) -> FloatArray:
-    """Where a place (M, 2) forward, left lies in a picture of another orientation, as if forward were up."""
-    x, y = places.T
+def _turn_picture(centers: FloatArray, orientation: str) -> FloatArray:
+    """Return where centres (M, 2), forward and left, lie in a picture of another orientation.
+
+    The result is forward and left as well, as if forward were up.
+    """
+    x, y = centers.T
     turned = {
         "forward-up": (x, y),
         "mirrored": (x, -y),
@@ -390,30 +440,35 @@ def _turned(places: FloatArray, orientation: str) -> FloatArray:
     return np.column_stack(turned)
 
 
-def _hits(semantic: ByteArray, places: FloatArray) -> BoolArray:
-    center = (BEV_SHAPE[0] - 1) / 2
-    pixels: IntArray = np.rint(center - places / BEV_RESOLUTION).astype(np.int64)
-    return np.asarray(semantic[pixels[:, 0], pixels[:, 1]] == TAGS["vehicle"])
+def _find_hits(semantic: ByteArray, centers: FloatArray) -> BoolArray:
+    """Return a mask (M,) of centres (M, 2) in cells with the vehicle tag."""
+    middle = (BEV_SHAPE[0] - 1) / 2
+    pixels: IntArray = np.rint(middle - centers / BEV_RESOLUTION).astype(np.int64)
+    row, column = pixels.T
+    tags = semantic[row, column]
+    return np.asarray(tags == TAGS["vehicle"])
 
 
-def _repeated(
+def _repeated_files(
     subject: Subject, checksums: Mapping[str, Sequence[tuple[str, str, int]]]
 ) -> Iterator[Finding]:
-    """Files with the same bytes; an agent that stands still may see the same again and again."""
-    for places in checksums.values():
-        if len(places) < 2 or _stood_still(subject, places):
+    """Yield files with the same bytes; an agent that stands still may record them repeatedly."""
+    for recordings in checksums.values():
+        if len(recordings) < 2 or _stood_still(subject, recordings):
             continue
-        names = [f"{agent}/{channel}/{frame:03d}" for agent, channel, frame in places]
-        more = f" and {len(names) - 4} more" if len(names) > 4 else ""
-        yield subject.finding(
-            "file-repeated", subject.token, f"the same bytes: {', '.join(names[:4])}{more}"
-        )
+        names = [f"{agent}/{channel}/{frame:03d}" for agent, channel, frame in recordings]
+        listed = ", ".join(names[:4])
+        if len(names) > 4:
+            listed += f" and {len(names) - 4} more"
+        yield subject.finding("file-repeated", subject.token, f"the same bytes: {listed}")
 
 
-def _stood_still(subject: Subject, places: Sequence[tuple[str, str, int]]) -> bool:
-    """Whether these are frames of one channel of an agent that did not move between them."""
-    frames: AnyArray = np.array([frame for _, _, frame in places])
-    if len({(agent, channel) for agent, channel, _ in places}) > 1:
+def _stood_still(subject: Subject, recordings: Sequence[tuple[str, str, int]]) -> bool:
+    """Return whether they are one channel of an agent that did not move between the frames."""
+    if len({(agent, channel) for agent, channel, _ in recordings}) > 1:
         return False
-    path = subject.positions[subject.agents.index(places[0][0])][frames - 1]
-    return bool(np.ptp(path, axis=0).max() < _STILL)
+    frames: AnyArray = np.array([frame for _, _, frame in recordings])
+    agent = subject.agents.index(recordings[0][0])
+    path = subject.positions[agent][frames - 1]
+    distance = np.ptp(path, axis=0).max()
+    return bool(distance < _STANDSTILL_TOLERANCE_M)

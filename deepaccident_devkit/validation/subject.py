@@ -1,4 +1,4 @@
-"""`Subject`: one scenario's small files in memory, with the data that every check of their meaning needs."""
+"""`Subject`: one scenario's small files in memory, with the arrays that all content checks need."""
 
 from __future__ import annotations
 
@@ -18,26 +18,29 @@ from deepaccident_devkit.tables.scan import ScenarioFiles, frame_ranges
 from deepaccident_devkit.taxonomy import INFRASTRUCTURE, OWN_ACTOR_ID, UNTRACKED_ID, AgentName
 from deepaccident_devkit.validation.codes import CODES
 
-# Metres at the most within which a label is taken to be complete.
-_SURE_REACH = 35.0
-_SHARE_OF_FURTHEST = 0.8
-_FURTHEST = 1e7
-MOST_BOXES = 500
-"""Boxes in a label, of which real ones have less than a hundred."""
-# Boxes at one place and moment that are compared pair by pair.
-_MOST_TOGETHER = 32
-# Metres between an untracked row and where the actor should be.
-_UNTRACKED_PLACE = 2.0
+# Distance within which a label can count as complete.
+_MAX_REACH_M = 35.0
+# Share of the farthest box's distance within which a label counts as complete.
+_REACH_SHARE = 0.8
+_COORDINATE_LIMIT_M = 1e7
+MAX_LABEL_BOXES = 500
+"""Boxes in a label; real ones have less than a hundred."""
+# Boxes in one cell at one moment that are compared pair by pair.
+_MAX_CELL_BOXES = 32
+# Distance of an untracked row from where the actor should be.
+_UNTRACKED_RADIUS_M = 2.0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Subject:
-    """One scenario; A agents, F frames, S = A·F samples agent by agent, N boxes. All in world, right-handed.
+    """One scenario of A agents, F frames, S = A·F samples agent by agent, and N boxes.
+
+    All coordinates are in the world frame, right-handed.
 
     Attributes:
-        files: what was read.
-        boxes: the boxes and where each was recorded.
-        centers: (N, 3) box centres, metres.
+        files: Contents of the files.
+        boxes: Boxes, and where each was recorded.
+        centers: Box centres, shape (N, 3), metres.
     """
 
     files: ScenarioFiles
@@ -46,37 +49,38 @@ class Subject:
 
     @property
     def token(self) -> str:
-        """The scenario's."""
+        """Token of the scenario."""
         return self.files.scenario.token
 
     @property
     def agents(self) -> Sequence[AgentName]:
-        """The agents that are there, A."""
+        """The A agents that the scenario has."""
         return self.files.scan.agents
 
     @property
     def num_frames(self) -> int:
-        """F."""
+        """Number of frames, F."""
         return self.files.scan.num_frames
 
     @property
     def label_id(self) -> IntArray:
-        """(N,) ids as the labels say."""
+        """Actor ids of the labels, shape (N,)."""
         return self.boxes.labels.actor_id
 
     @cached_property
-    def seen(self) -> BoolArray:
-        """(N,) tracked boxes of others: neither the recording agent itself nor untracked."""
-        return np.asarray((self.label_id != OWN_ACTOR_ID) & (self.label_id != UNTRACKED_ID))
+    def tracked(self) -> BoolArray:
+        """Mask of tracked boxes of other actors, shape (N,)."""
+        is_other = self.label_id != OWN_ACTOR_ID
+        return np.asarray(is_other & (self.label_id != UNTRACKED_ID))
 
     @cached_property
     def own(self) -> BoolArray:
-        """(N,) the recording agents' own rows."""
+        """Mask of the recording agents' own rows, shape (N,)."""
         return np.asarray(self.label_id == OWN_ACTOR_ID)
 
     @cached_property
     def in_collision(self) -> BoolArray:
-        """(N,) boxes of meta's pair; all, where meta does not say."""
+        """Mask of the boxes of meta's pair, shape (N,); of all boxes, without meta."""
         meta = self.files.meta
         if meta is None:
             return np.ones(len(self.boxes), dtype=bool)
@@ -84,154 +88,168 @@ class Subject:
 
     @cached_property
     def yaw(self) -> FloatArray:
-        """(N,) heading of each box in world, radians."""
+        """Heading of each box in world, shape (N,), radians."""
         return quaternions.yaw_of(box_rules.world_rotations(self.boxes))
 
     @cached_property
     def reach(self) -> FloatArray:
-        """(A,) metres around each agent within which its labels leave nobody out; 0 where nothing shows that.
+        """Distance around each agent within which its labels are complete, shape (A,), metres.
 
-        Labels that hold what neither its agent's LiDAR nor its cameras saw leave nobody out for being hidden, and all
-        labels of a scenario are written by one rule; the boxes of each agent show how far that reaches.
+        It is 0 where nothing shows that. Labels that hold an actor unseen by its agent's LiDAR and
+        cameras leave no hidden actor out, and all labels of a scenario are written by one rule; the
+        boxes of each agent show how far it reaches.
         """
-        labels, agent = self.boxes.labels, self.boxes.agent
+        labels = self.boxes.labels
+        agent = self.boxes.agent
         distance = np.linalg.norm(labels.center[:, :2], axis=1)
-        hidden = (
-            self.seen
-            & (labels.num_lidar_pts == 0)
-            & ~labels.camera_visible
-            & (distance < _SURE_REACH)
-        )
-        furthest = np.zeros(len(self.agents))
-        np.maximum.at(furthest, agent, distance)
-        return np.asarray(np.minimum(_SURE_REACH, _SHARE_OF_FURTHEST * furthest) * hidden.any())
+        unseen = (labels.num_lidar_pts == 0) & ~labels.camera_visible
+        hidden = self.tracked & unseen & (distance < _MAX_REACH_M)
+        max_distance = np.zeros(len(self.agents))
+        np.maximum.at(max_distance, agent, distance)
+        reach = np.minimum(_MAX_REACH_M, _REACH_SHARE * max_distance)
+        return np.asarray(reach * hidden.any())
 
-    def has_untracked(self, agent: int, frames: IntArray, places: FloatArray) -> BoolArray:
-        """Which places (M, 3) of the world an agent annotated as untracked (id −1) at the frames (M,)."""
+    def has_untracked(self, agent: int, frames: IntArray, positions: FloatArray) -> BoolArray:
+        """Return a mask (M,) of the positions with an untracked row (id −1) of an agent.
+
+        Args:
+            agent: Index of the agent.
+            frames: Frame numbers, shape (M,).
+            positions: Positions at these frames, shape (M, 3), world, metres.
+        """
         rows = np.flatnonzero((self.label_id == UNTRACKED_ID) & (self.boxes.agent == agent))
         if not len(rows) or not len(frames):
             return np.zeros(len(frames), dtype=bool)
         from scipy.spatial import cKDTree
 
-        tree = cKDTree(
-            np.unique(
-                tree_points(self.centers[rows], self.boxes.frame[rows], _UNTRACKED_PLACE), axis=0
-            )
-        )
-        distance, _ = tree.query(
-            tree_points(places, frames, _UNTRACKED_PLACE), distance_upper_bound=_UNTRACKED_PLACE
-        )
+        points = tree_points(self.centers[rows], self.boxes.frame[rows], _UNTRACKED_RADIUS_M)
+        tree = cKDTree(np.unique(points, axis=0))
+        queries = tree_points(positions, frames, _UNTRACKED_RADIUS_M)
+        distance, _ = tree.query(queries, distance_upper_bound=_UNTRACKED_RADIUS_M)
         return np.asarray(np.isfinite(distance))
 
     @cached_property
     def lidar_boxes(self) -> Boxes:
-        """All N boxes, each in the LiDAR frame it was recorded in."""
+        """All N boxes, each in the LiDAR frame of its sample."""
         return self.boxes.labels.boxes()
 
     @cached_property
     def velocity(self) -> FloatArray:
-        """(N, 3) m/s from displacements, NaN where unknown."""
+        """Velocities from displacements, shape (N, 3), m/s; NaN where unknown."""
         return displacement_velocities(
             self.centers, self.boxes.agent, self.label_id, self.boxes.frame
         )
 
     @cached_property
     def positions(self) -> FloatArray:
-        """(A, F, 3) of the agents, metres."""
-        return self.files.calibs.world_from_ego[:, :3, 3].reshape(
-            len(self.agents), self.num_frames, 3
-        )
+        """Positions of the agents, shape (A, F, 3), metres."""
+        positions = self.files.calibs.world_from_ego[:, :3, 3]
+        return positions.reshape(len(self.agents), self.num_frames, 3)
 
     def is_pole(self, agent: int) -> bool:
-        """Whether the agent of this row stands at the roadside."""
+        """Return whether the agent of this index stands at the roadside."""
         return self.agents[agent] == INFRASTRUCTURE
 
-    def finding(self, code: str, where: str, what: str) -> Finding:
-        """A finding about this scenario; how bad it is and what to do stand in `CODES`."""
-        return make_finding(code, self.token, where, what)
+    def finding(self, code: str, location: str, message: str) -> Finding:
+        """Return a finding about this scenario; `CODES` has its severity and remedy."""
+        return make_finding(code, self.token, location, message)
 
-    def label_where(self, agent: int) -> str:
-        """The folder of an agent's labels."""
-        return str(self.files.scenario.kind_folder(self.agents[agent], "label"))
+    def label_folder(self, agent: int) -> str:
+        """Return the folder of an agent's labels."""
+        name = self.agents[agent]
+        return str(self.files.scenario.kind_folder(name, "label"))
 
-    def calib_where(self, agent: int) -> str:
-        """The folder of an agent's calib files."""
-        return str(self.files.scenario.kind_folder(self.agents[agent], "calib"))
+    def calib_folder(self, agent: int) -> str:
+        """Return the folder of an agent's calib files."""
+        name = self.agents[agent]
+        return str(self.files.scenario.kind_folder(name, "calib"))
 
-    def rows_by_agent(self, rows: BoolArray) -> Iterable[tuple[int, IntArray]]:
-        """Agent → the rows (M,) of its boxes that a mask (N,) picks, for agents that have any."""
+    def rows_by_agent(self, mask: BoolArray) -> Iterable[tuple[int, IntArray]]:
+        """Yield each agent with boxes in a mask (N,), and the rows (M,) of these boxes."""
         for agent in range(len(self.agents)):
-            picked = np.flatnonzero(rows & (self.boxes.agent == agent))
-            if len(picked):
-                yield agent, picked
+            rows = np.flatnonzero(mask & (self.boxes.agent == agent))
+            if len(rows):
+                yield agent, rows
 
     def mask(self, rows: AnyArray) -> BoolArray:
-        """(N,) true for some rows (M,)."""
+        """Return a mask (N,) that is true for rows (M,)."""
         mask = np.zeros(len(self.boxes), dtype=bool)
         mask[rows] = True
         return mask
 
-    def label_findings(self, code: str, rows: BoolArray, what: str) -> Iterable[Finding]:
-        """One finding an agent for the boxes that a mask (N,) picks: `what`, the actors, and in which frames."""
-        for agent, picked in self.rows_by_agent(rows):
-            frames = frames_text(self.boxes.frame[picked])
-            actors = actors_text(self.label_id[picked])
-            yield self.finding(code, self.label_where(agent), f"{what}: {actors}, {frames}")
+    def label_findings(self, code: str, mask: BoolArray, message: str) -> Iterable[Finding]:
+        """Yield one finding an agent for the boxes in a mask (N,), with actors and frames."""
+        for agent, rows in self.rows_by_agent(mask):
+            frames = frames_text(self.boxes.frame[rows])
+            actors = actors_text(self.label_id[rows])
+            yield self.finding(code, self.label_folder(agent), f"{message}: {actors}, {frames}")
 
 
 def subject_of(files: ScenarioFiles) -> Subject:
-    """What the checks start from."""
+    """Return the subject of all checks."""
     boxes = scenario_boxes(files)
     return Subject(files=files, boxes=boxes, centers=box_rules.world_centers(boxes))
 
 
-def near_pairs(places: FloatArray, moments: AnyArray, radius: float) -> tuple[IntArray, BoolArray]:
-    """Pairs (P, 2) of places (M, 3) of a moment (M,) within `radius`; and (M,) which are in crowds, and in no pair.
+def near_pairs(
+    positions: FloatArray, moments: AnyArray, radius: float
+) -> tuple[IntArray, BoolArray]:
+    """Return pairs of positions of the same moment within a radius, without crowds.
 
-    Pairs of many at one place would have no end.
+    The pairs of a crowd, many positions in one cell, would have no end.
+
+    Args:
+        positions: Positions, shape (M, 3), metres.
+        moments: Moment of each, shape (M,).
+        radius: Maximum distance of a pair, metres.
+
+    Returns:
+        Pairs of rows, shape (P, 2), and a mask (M,) of positions in crowds, which are in no pair.
     """
     from scipy.spatial import cKDTree
 
-    points = tree_points(places, moments, radius)
-    _, cell, count = np.unique(
-        np.floor(points / radius), axis=0, return_inverse=True, return_counts=True
-    )
-    crowded: BoolArray = count[cell.reshape(-1)] > _MOST_TOGETHER
+    points = tree_points(positions, moments, radius)
+    cells = np.floor(points / radius)
+    _, cell, count = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
+    crowded: BoolArray = count[cell.reshape(-1)] > _MAX_CELL_BOXES
     rows = np.flatnonzero(~crowded)
-    pairs: IntArray = rows[
-        cKDTree(points[rows]).query_pairs(radius, output_type="ndarray")
-    ].reshape(-1, 2)
+    tree_pairs = cKDTree(points[rows]).query_pairs(radius, output_type="ndarray")
+    pairs: IntArray = rows[tree_pairs].reshape(-1, 2)
     return pairs, crowded
 
 
-def tree_points(places: FloatArray, moments: AnyArray, radius: float) -> FloatArray:
-    """(M, 4) points for a tree; absurd places are cut off, which would overflow."""
-    return np.column_stack([np.clip(places, -_FURTHEST, _FURTHEST), moments * (10 * radius)])
+def tree_points(positions: FloatArray, moments: AnyArray, radius: float) -> FloatArray:
+    """Return points (M, 4) for a tree; absurd positions are clipped, since they would overflow."""
+    clipped = np.clip(positions, -_COORDINATE_LIMIT_M, _COORDINATE_LIMIT_M)
+    return np.column_stack([clipped, moments * (10 * radius)])
 
 
-def make_finding(code: str, scenario: str | None, where: str, what: str) -> Finding:
-    """A finding of a kind in `CODES`."""
+def make_finding(code: str, scenario: str | None, location: str, message: str) -> Finding:
+    """Return a finding of a kind in `CODES`."""
     kind = CODES[code]
     return Finding(
         code=code,
         severity=kind.severity,
         scenario=scenario,
-        where=where,
-        what=what,
+        where=location,
+        what=message,
         remedy=kind.remedy,
         known=bool(kind.known),
     )
 
 
 def frames_text(frames: Iterable[int]) -> str:
-    """`frame 7`, `frames 3–5, 9`."""
+    """Return `frame 7`, or `frames 3–5, 9`."""
     numbers = sorted({int(frame) for frame in frames})
-    return f"{'frame' if len(numbers) == 1 else 'frames'} {frame_ranges(numbers)}"
+    noun = "frame" if len(numbers) == 1 else "frames"
+    return f"{noun} {frame_ranges(numbers)}"
 
 
-def actors_text(ids: Iterable[int], most: int = 4) -> str:
-    """`actor 1236`, `actors 12, 17, 20, 31 and 5 more`."""
+def actors_text(ids: Iterable[int], max_listed: int = 4) -> str:
+    """Return `actor 1236`, or `actors 12, 17, 20, 31 and 5 more`."""
     numbers = sorted({int(actor) for actor in ids})
-    shown = ", ".join(map(str, numbers[:most]))
-    more = f" and {len(numbers) - most} more" if len(numbers) > most else ""
-    return f"{'actor' if len(numbers) == 1 else 'actors'} {shown}{more}"
+    listed = ", ".join(map(str, numbers[:max_listed]))
+    if len(numbers) > max_listed:
+        listed += f" and {len(numbers) - max_listed} more"
+    noun = "actor" if len(numbers) == 1 else "actors"
+    return f"{noun} {listed}"

@@ -1,4 +1,4 @@
-"""`validate`: all checks of a release, and their report."""
+"""`validate`: all checks of a release, and the report of their findings."""
 
 from __future__ import annotations
 
@@ -64,25 +64,25 @@ if TYPE_CHECKING:
     from deepaccident_devkit.support.parallel import Engine
 
 NO_FIT = total_fit([])
-_LINES_A_SCENARIO = 8
-_ALL_LISTED = "(--all lists all)"
-# Names while a download is running: with `.part`, `.partial`, `.download` or `.crdownload` at their end.
-_UNFINISHED = "*.zip.[cdp]*[dlt]"
+_MAX_SCENARIO_LINES = 8
+_ALL_LISTED_HINT = "(--all lists all)"
+# Names during a download: with `.part`, `.partial`, `.download` or `.crdownload` at their end.
+_UNFINISHED_PATTERN = "*.zip.[cdp]*[dlt]"
 # Kinds of files that are always read.
-_READ = ("calib", "label", "meta")
+_SMALL_KINDS = ("calib", "label", "meta")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ScenarioCheck:
-    """What was found in one scenario.
+    """Findings of one scenario.
 
     Attributes:
-        token: the scenario's.
-        findings: in the order of the checks.
-        samples: agents times frames.
-        files: how many are here and missing.
-        velocity: what the labels' velocities fit.
-        hashes: of the files, as of `tables.scan.content_hashes`; empty if they cannot be read.
+        token: Token of the scenario.
+        findings: Findings in the order of the checks.
+        samples: Number of agents times frames.
+        files: Present and missing files.
+        velocity: Fit of the labels' velocities.
+        hashes: Hashes of the files (`tables.scan.content_hashes`); empty if they cannot be read.
     """
 
     token: str
@@ -93,17 +93,21 @@ class ScenarioCheck:
     hashes: str = ""
 
     def to_json(self) -> str:
-        """One JSON object, from which `of_json` makes an equal one."""
+        """Return one JSON object that `of_json` turns into an equal check."""
         return json.dumps(asdict(self))
 
     @classmethod
     def of_json(cls, text: bytes) -> ScenarioCheck:
-        """The check that `to_json` wrote."""
-        return as_record(json.loads(text), cls)  # names of files may have half characters
+        """Return the check that `to_json` wrote."""
+        # `json.loads` keeps lone surrogates, which names of files may have.
+        return as_record(json.loads(text), cls)
 
 
 def check_key(scenario: ScenarioFolder, *, deep: bool) -> str:
-    """A digest of all that decides a scenario's check: the devkit, settings, names, sizes and times of its files."""
+    """Return a digest of all that decides a scenario's check.
+
+    These are the devkit, its settings, and names, sizes and times of the scenario's files.
+    """
     settings = (
         __version__,
         deep,
@@ -117,18 +121,18 @@ def check_key(scenario: ScenarioFolder, *, deep: bool) -> str:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ValidationReport(CheckReport):
-    """What was found in a release.
+    """Findings of a release.
 
     Attributes:
-        dataroot: its folder.
+        dataroot: Folder of the release.
         version: `v1` or `v1-mini`.
-        deep: whether sensor files were decoded.
-        scenarios: how many were looked at.
-        samples: agents times frames of those.
-        findings: worst scenario first, within it worst first.
-        files: which are here, and which are missing.
-        velocity: in which frame the labels' velocities fit the displacements.
-        velocity_frames: scenario → what its labels' velocities are in; None where it cannot be told.
+        deep: Whether sensor files were decoded.
+        scenarios: Number of scenarios examined.
+        samples: Number of their samples, agents times frames.
+        findings: Findings, worst scenario first, and worst first within it.
+        files: Present and missing files.
+        velocity: Frame in which the labels' velocities fit the displacements.
+        velocity_frames: Scenario → frame of its labels' velocities; None where it is unknown.
     """
 
     dataroot: str
@@ -143,113 +147,111 @@ class ValidationReport(CheckReport):
 
     @property
     def counts(self) -> dict[str, int]:
-        """Severity → findings."""
+        """Number of findings by severity."""
         counts = Counter(finding.severity for finding in self.findings)
         return {severity: counts[severity] for severity in SEVERITIES}
 
     @property
     def is_good(self) -> bool:
         """Whether all findings are notes, or known of the real release."""
-        return all(finding.severity == "note" or finding.known for finding in self.findings)
+        for finding in self.findings:
+            if finding.severity != "note" and not finding.known:
+                return False
+        return True
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
-        content = Report.to_dict(self)  # no `super()`: a dataclass with slots is another class
+        """Return a dictionary for JSON."""
+        # `super()` fails: a dataclass with slots is another class than its body refers to.
+        content = Report.to_dict(self)
         content["counts"] = self.counts
         content["velocity"]["best"] = self.velocity.best
         return content
 
     def to_text(self, *, notes: bool = False, whole: bool = False) -> str:
-        """A table for a terminal, worst scenario first.
+        """Return a table for a terminal, worst scenario first.
 
         Args:
-            notes: whether to list what is only worth knowing, too.
-            whole: whether to list all that was found of a scenario.
+            notes: Whether to list findings of severity `note`, too.
+            whole: Whether to list all findings of a scenario.
         """
-        most = sys.maxsize if whole else _LINES_A_SCENARIO
-        return "\n\n".join(
-            [self._head(), *self._scenario_blocks(most, notes=notes), *self._closing(notes=notes)]
-        )
+        max_lines = sys.maxsize if whole else _MAX_SCENARIO_LINES
+        blocks = [self._head(), *self._scenario_blocks(max_lines, notes=notes)]
+        return "\n\n".join([*blocks, *self._closing(notes=notes)])
 
     def _head(self) -> str:
-        depth = (
-            "every file decoded"
-            if self.deep
-            else "labels, calib, meta and file names (--deep decodes the rest)"
-        )
+        depth = "labels, calib, meta and file names (--deep decodes the rest)"
+        if self.deep:
+            depth = "every file decoded"
         return (
             f"DeepAccident {self.version} at {self.dataroot}\n"
             f"{counted(self.scenarios, 'scenario')}, {counted(self.samples, 'sample')}: {depth}"
         )
 
-    def _scenario_blocks(self, most: int, *, notes: bool) -> Iterator[str]:
+    def _scenario_blocks(self, max_lines: int, *, notes: bool) -> Iterator[str]:
         by_scenario: dict[str | None, list[Finding]] = {}
         for finding in self.findings:
             if notes or finding.severity != "note":
                 by_scenario.setdefault(finding.scenario, []).append(finding)
         for scenario, findings in by_scenario.items():
             counts = Counter(finding.severity for finding in findings)
-            head = ", ".join(
-                counted(counts[severity], severity) for severity in SEVERITIES if counts[severity]
-            )
-            lines = [f"{scenario or 'the release'}  ({head})"]
-            lines += [_line(finding) for finding in findings[:most]]
-            if len(findings) > most:
-                lines.append(f"  … and {len(findings) - most} more {_ALL_LISTED}")
+            present = [severity for severity in SEVERITIES if counts[severity]]
+            summary = ", ".join(counted(counts[severity], severity) for severity in present)
+            lines = [f"{scenario or 'the release'}  ({summary})"]
+            lines += map(_finding_line, findings[:max_lines])
+            if len(findings) > max_lines:
+                lines.append(f"  … and {len(findings) - max_lines} more {_ALL_LISTED_HINT}")
             yield "\n".join(lines)
 
     def _closing(self, *, notes: bool) -> Iterator[str]:
-        by_code = Counter(
-            (finding.severity, finding.code, finding.known) for finding in self.findings
-        )
-        if by_code:
-            lines = (
-                f"{code:<24} {severity:<8} {count:>8}{'  known of the release' if known else ''}"
-                for severity in SEVERITIES
-                for (grade, code, known), count in sorted(
-                    by_code.items(), key=lambda item: (-item[1], item[0][1])
-                )
-                if grade == severity
-            )
-            yield "\n".join([f"{'kind':<24} {'how bad':<8} {'findings':>8}", *lines])
+        if self.findings:
+            yield self._kinds_text()
         if self.velocity.boxes:
-            shares = ", ".join(
-                f"{name} {count / self.velocity.boxes:.0%}"
-                for name, count in self.velocity.fits.items()
-            )
-            best = (
-                VELOCITY_FRAMES[self.velocity.best]
-                if self.velocity.best
-                else "in none of the known frames"
-            )
-            found = Counter(self.velocity_frames.values())
-            scenarios = ", ".join(
-                f"{name or 'unknown'} in {count}" for name, count in found.most_common()
-            )
-            yield (
-                f"label velocities: {best}\n"
-                f"  scenarios: {scenarios}; of {self.velocity.boxes:,} moving boxes fit: {shares}"
-            )
+            yield self._velocity_text()
         yield f"files: {self.files.section()}"
         yield self.basis_text()
-        hidden = self.counts["note"] and not notes
         verdict = ", ".join(counted(self.counts[severity], severity) for severity in SEVERITIES)
-        yield verdict + (" (--all lists the notes)" if hidden else "")
+        if self.counts["note"] and not notes:
+            verdict += " (--all lists the notes)"
+        yield verdict
+
+    def _kinds_text(self) -> str:
+        """Return a line a kind of finding: by severity, then the most frequent first."""
+        kinds = [(finding.severity, finding.code, finding.known) for finding in self.findings]
+        counts = sorted(Counter(kinds).items(), key=lambda item: (-item[1], item[0][1]))
+        lines = [f"{'kind':<24} {'how bad':<8} {'findings':>8}"]
+        for listed_severity in SEVERITIES:
+            for (severity, code, known), count in counts:
+                if severity == listed_severity:
+                    note = "  known of the release" if known else ""
+                    lines.append(f"{code:<24} {severity:<8} {count:>8}{note}")
+        return "\n".join(lines)
+
+    def _velocity_text(self) -> str:
+        """Return the frame of the labels' velocities, and how many scenarios and boxes fit."""
+        fit = self.velocity
+        best = VELOCITY_FRAMES[fit.best] if fit.best else "in none of the known frames"
+        counts = Counter(self.velocity_frames.values()).most_common()
+        scenarios = ", ".join(f"{name or 'unknown'} in {count}" for name, count in counts)
+        shares = ", ".join(f"{name} {count / fit.boxes:.0%}" for name, count in fit.fits.items())
+        return (
+            f"label velocities: {best}\n"
+            f"  scenarios: {scenarios}; of {fit.boxes:,} moving boxes fit: {shares}"
+        )
 
 
 def worst_first(findings: Sequence[Finding]) -> list[Finding]:
-    """Findings grouped by scenario: the one with the most errors first, then warnings; worst first within."""
+    """Return findings by scenario, most errors first, then most warnings; worst first within."""
     counts = Counter((finding.scenario, finding.severity) for finding in findings)
 
-    def place(finding: Finding) -> tuple[object, ...]:
+    def sort_key(finding: Finding) -> tuple[object, ...]:
         badness = [-counts[finding.scenario, severity] for severity in SEVERITIES]
         rank = SEVERITIES.index(finding.severity)
         return (finding.scenario is not None, badness, finding.scenario or "", rank)
 
-    return sorted(findings, key=place)
+    return sorted(findings, key=sort_key)
 
 
-def _line(finding: Finding) -> str:
+def _finding_line(finding: Finding) -> str:
     known = " (known of the release)" if finding.known else ""
     return f"  {finding.severity:<7} {finding.code}: {finding}{known}"
 
@@ -261,73 +263,74 @@ def validate_release(
     deep: bool = False,
     scenarios: Collection[str] | None = None,
     parts: Path | None = None,
-    **how: Unpack[Engine],
+    **engine: Unpack[Engine],
 ) -> ValidationReport:
-    """Look for everything that is wrong, odd or missing in a release; needs no index, and says if one is out of date.
+    """Find everything that is wrong, odd or missing in a release.
+
+    No index is needed; one that is out of date is reported.
 
     Args:
-        root: the release, as of `DeepAccident`: a folder, archives, or a URL.
+        root: Dataroot of the release, as for `DeepAccident`: a folder, archives, or a URL.
         version: `v1` or `v1-mini`.
-        deep: also decode every image, point cloud and BEV array and hold them against the labels.
-        scenarios: tokens of the scenarios to look at; None for all.
-        parts: folder to keep what was found in each scenario, so that the same call does only what is left, and several
-            processes that are given it share the scenarios; one whose files have changed since is looked at again.
-            None writes nothing.
-        **how: `workers`, `executor` and `progress`, as `parallel.Engine` says.
+        deep: Whether to decode every image, point cloud and BEV array, too, and compare it with the
+            labels.
+        scenarios: Tokens of the scenarios to examine; None for all.
+        parts: Folder that keeps the findings of each scenario. The same call then only does the
+            remaining work, and several processes with the same folder share the scenarios; one with
+            changed files is examined again. None writes nothing.
+        **engine: `workers`, `executor` and `progress` (`parallel.Engine`).
 
     Raises:
-        DatarootError: the folder is missing, holds no release, or a part of it cannot be listed.
-        VersionError: the version is unknown or not under this folder.
-        TokenError: one of `scenarios` is not there.
+        DatarootError: The folder is missing, holds no release, or a part of it cannot be listed.
+        VersionError: The version is unknown or not under this folder.
+        TokenError: A token of `scenarios` is not in the release.
         ConfigError: `parts` cannot be written to.
     """
     layout = readable_release(root, version)
     folder = None if parts is None else writable_folder(parts)
     store = None if folder is None else Store(folder, folder, "validates scenarios", ConfigError)
-    checks = _Work(deep=deep, store=store).run(chosen_scenarios(layout, scenarios), **how)
+    checks = _Work(deep=deep, store=store).run(chosen_scenarios(layout, scenarios), **engine)
     return _report(layout, checks, scenarios, root=root, deep=deep)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Work:
-    """What workers do; cheap to pickle.
+    """Work on scenarios, cheap to pickle.
 
     Attributes:
-        deep: whether sensor files are decoded.
-        store: what was found before, and is found now.
+        deep: Whether sensor files are decoded.
+        store: Findings of earlier calls, and of this one.
     """
 
     deep: bool
     store: Store | None
 
     def __call__(self, scenario: ScenarioFolder) -> ScenarioCheck:
-        """Look at one scenario, unless that was done."""
+        """Check one scenario, unless its check is stored."""
         if self.store is None:
             return check_scenario(scenario, deep=self.deep)
-        key = check_key(
-            scenario, deep=self.deep
-        )  # before anything is read: a later edit is noticed
-        kept = self.store.kept(_name(scenario), key)
-        if kept is not None:
-            return ScenarioCheck.of_json(kept)
+        # The key is made before any file is read, so that a later edit changes it.
+        key = check_key(scenario, deep=self.deep)
+        stored = self.store.kept(_name(scenario), key)
+        if stored is not None:
+            return ScenarioCheck.of_json(stored)
         check = check_scenario(scenario, deep=self.deep)
         self.store.keep(_name(scenario), key, check.to_json().encode())
         return check
 
     def run(
-        self, scenarios: Sequence[ScenarioFolder], **how: Unpack[Engine]
+        self, scenarios: Sequence[ScenarioFolder], **engine: Unpack[Engine]
     ) -> list[ScenarioCheck]:
-        """Look at all of them."""
-        reads = tuple({place for scenario in scenarios for place in places_of(scenario.root)})
+        """Check all scenarios."""
+        reads = tuple({path for scenario in scenarios for path in places_of(scenario.root)})
         label = "validating scenarios"
         if self.store is None:
-            return run_batch(self, scenarios, label=label, places=Places(reads=reads), **how)
+            return run_batch(self, scenarios, label=label, places=Places(reads=reads), **engine)
         with self.store.shared():
-            places, items = (
-                Places(reads=reads, writes=(self.store.folder,)),
-                {_name(each): each for each in scenarios},
-            )
-            return list(self.store.run(self, items, label=label, places=places, **how).values())
+            places = Places(reads=reads, writes=(self.store.folder,))
+            items = {_name(scenario): scenario for scenario in scenarios}
+            checks = self.store.run(self, items, label=label, places=places, **engine)
+            return list(checks.values())
 
 
 def _name(scenario: ScenarioFolder) -> str:
@@ -342,31 +345,32 @@ def _report(
     root: Dataroot,
     deep: bool,
 ) -> ValidationReport:
-    """What was found in scenarios, and in the release as a whole."""
-    readable, of_release = check_split_files(layout)
-    tokens = {check.token for check in checks}
-    of_release = [
-        finding for finding in of_release if finding.scenario is None or finding.scenario in tokens
-    ]
-    of_release += _strays(layout) if scenarios is None else ()
-    of_release += _outdated(layout, checks)
+    """Return the report of the scenarios' checks, and of findings in the release itself."""
+    readable, split_findings = check_split_files(layout)
+    tokens = {None, *(check.token for check in checks)}
+    all_findings = [finding for finding in split_findings if finding.scenario in tokens]
+    if scenarios is None:
+        all_findings += _find_strays(layout)
+    all_findings += _find_outdated(layout, checks)
     counts = ((check.token, check.files) for check in checks)
     files = completeness(readable, counts, str(root), selected=scenarios is not None)
     for sentence in files.unreadable_archives:
-        of_release.append(finding_of(ReleaseError(sentence), "archive-unreadable", None))
-    here = Counter[str]()
-    for file in (file for check in checks for file in check.files if deep or file.channel in _READ):
-        here[f"{file.channel} files"] += file.expected - file.missing
+        error = ReleaseError(sentence)
+        all_findings.append(finding_of(error, "archive-unreadable", None))
+    compared = Counter[str]()
+    for check in checks:
+        all_findings += check.findings
+        for count in check.files:
+            if deep or count.channel in _SMALL_KINDS:
+                compared[f"{count.channel} files"] += count.expected - count.missing
     return ValidationReport(
-        compared=dict(here),
+        compared=dict(compared),
         dataroot=str(root),
         version=layout.version,
         deep=deep,
         scenarios=len(checks),
         samples=sum(check.samples for check in checks),
-        findings=worst_first(
-            [*of_release, *(finding for check in checks for finding in check.findings)]
-        ),
+        findings=worst_first(all_findings),
         files=files,
         velocity=total_fit([check.velocity for check in checks]),
         velocity_frames={check.token: check.velocity.best for check in checks},
@@ -374,15 +378,15 @@ def _report(
 
 
 def findings(dataset: Dataset, scenario: RowArgument, *, deep: bool = False) -> list[Finding]:
-    """What is wrong, odd or missing in one scenario, by the files as they are now; worst first.
+    """Return what is wrong, odd or missing in one scenario's present files, worst first.
 
     Args:
-        dataset: the release.
-        scenario: token or record; one that was left out as broken can be named too.
-        deep: also decode its sensor files; see `validate_release`.
+        dataset: Release with the scenario.
+        scenario: Token or record, also of a scenario that was left out as broken.
+        deep: Whether to decode its sensor files, too; see `validate_release`.
 
     Raises:
-        TokenError: the release has no such scenario.
+        TokenError: The release has no such scenario.
     """
     token = token_of(scenario)
     report = validate_release(
@@ -393,35 +397,35 @@ def findings(dataset: Dataset, scenario: RowArgument, *, deep: bool = False) -> 
 
 @checksums_compared()
 def check_scenario(scenario: ScenarioFolder, *, deep: bool = False) -> ScenarioCheck:
-    """All findings in one scenario's files.
+    """Return all findings in one scenario's files.
 
-    The functions that index a scenario find what keeps it from being indexed. The meaning of its files is checked only
-    if they find nothing.
+    The functions that index a scenario find what keeps it from being indexed. The content of its
+    files is only checked if they find nothing.
     """
     scan = scan_scenario(scenario)
-    inventory, of_files = take_inventory(scenario, scan)
-    found = [*scan.problems, *absences(scenario, scan), *of_files]
-    files, faults = (
-        (None, []) if scan.problems or not scan.agents else read_scenario(scenario, scan)
-    )
-    found += faults
+    inventory, sensor_findings = take_inventory(scenario, scan)
+    scenario_findings = [*scan.problems, *absences(scenario, scan), *sensor_findings]
+    files = None
+    if scan.agents and not scan.problems:
+        files, faults = read_scenario(scenario, scan)
+        scenario_findings += faults
     velocity = NO_FIT
     if files is not None:
-        with np.errstate(all="ignore"):  # absurd numbers are what is looked for
+        # Absurd numbers are what the checks look for.
+        with np.errstate(all="ignore"):
             subject = subject_of(files)
             velocity = fit_velocities(subject.boxes, subject.velocity)
-            found += [
-                *check_poses(subject),
-                *check_labels(subject),
-                *check_agreement(subject),
-                *check_untracked(subject),
-                *check_velocities(subject, velocity),
-                *check_story(subject),
-                *(check_sensors(subject, inventory) if deep else ()),
-            ]
+            scenario_findings += check_poses(subject)
+            scenario_findings += check_labels(subject)
+            scenario_findings += check_agreement(subject)
+            scenario_findings += check_untracked(subject)
+            scenario_findings += check_velocities(subject, velocity)
+            scenario_findings += check_story(subject)
+            if deep:
+                scenario_findings += check_sensors(subject, inventory)
     return ScenarioCheck(
         token=scenario.token,
-        findings=tuple(found),
+        findings=tuple(scenario_findings),
         samples=len(scan.agents) * scan.num_frames,
         files=files_of(scenario),
         velocity=velocity,
@@ -429,41 +433,35 @@ def check_scenario(scenario: ScenarioFolder, *, deep: bool = False) -> ScenarioC
     )
 
 
-def _outdated(layout: ReleaseLayout, checks: Sequence[ScenarioCheck]) -> Iterator[Finding]:
-    """Find the scenarios whose files are not those that the index was made from."""
+def _find_outdated(layout: ReleaseLayout, checks: Sequence[ScenarioCheck]) -> Iterator[Finding]:
+    """Yield scenarios with other files than the index was made from."""
     index = current_index(layout)
     if index is None or not index.tables:
         return
-    with suppress(IndexStoreError):  # a damaged index; opening the release reports it
+    # Opening the release reports a damaged index.
+    with suppress(IndexStoreError):
         indexed = Tables(index.tables_folder).hashes
         for check in checks:
             before = indexed.get(check.token)
             if check.hashes and before and before.as_dict() != json.loads(check.hashes):
-                what = "its label, calib or meta files have changed since the index was made"
-                yield make_finding("index-outdated", check.token, check.token, what)
+                message = "its label, calib or meta files have changed since the index was made"
+                yield make_finding("index-outdated", check.token, check.token, message)
 
 
-def _strays(layout: ReleaseLayout) -> Iterator[Finding]:
+def _find_strays(layout: ReleaseLayout) -> Iterator[Finding]:
+    """Yield files and folders that are not read, though they look like parts of a release."""
     for folder, name in names_without_calib(layout):
-        what = "has labels, meta or sensor files, but no calib files of any agent, and is left out"
-        yield make_finding("calib-missing", None, str(folder / "*" / "calib" / name), what)
-    for path, meant in left_aside(layout.root):
-        if meant is None:
-            yield make_finding(
-                "link-leads-nowhere",
-                None,
-                str(path),
-                "its end is not there, or is a folder above it",
-            )
+        location = str(folder / "*" / "calib" / name)
+        message = "has labels, meta or sensor files, but no calib files of any agent"
+        yield make_finding("calib-missing", None, location, f"{message}, and is left out")
+    for path, likeness in left_aside(layout.root):
+        if likeness is None:
+            message = "its end is not there, or is a folder above it"
+            yield make_finding("link-leads-nowhere", None, str(path), message)
         else:
-            yield make_finding(
-                "folder-left-aside", None, str(path), f"is not read; it looks like {meant}"
-            )
-    for path in (
-        Path(layout.root.store.place).rglob(_UNFINISHED)
-        if isinstance(layout.root, StorePath)
-        else ()
-    ):
-        yield make_finding(
-            "archive-unfinished", None, str(path), "is not read; it looks like half a download"
-        )
+            message = f"is not read; it looks like {likeness}"
+            yield make_finding("folder-left-aside", None, str(path), message)
+    if isinstance(layout.root, StorePath):
+        message = "is not read; it looks like half a download"
+        for archive in Path(layout.root.store.place).rglob(_UNFINISHED_PATTERN):
+            yield make_finding("archive-unfinished", None, str(archive), message)

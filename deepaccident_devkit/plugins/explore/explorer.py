@@ -277,7 +277,7 @@ def _photo(dataset: Dataset, camera: str, pair: Boxes) -> Any:
     width, height = PICTURE_SIZE
     try:
         picture = Image.fromarray(
-            dataset.load_image(camera, least=(height, width), size=(height, width))
+            dataset.load_image(camera, min_size=(height, width), size=(height, width))
         )
     except SensorFileError:
         return None

@@ -284,7 +284,7 @@ def _contrasts(dataset: Dataset, sample: str, boxes: Boxes) -> FloatArray:
     """Return those of a sample (6, 6), as `SourceCheck` has them."""
     contrasts = np.full((len(CAMERAS), len(CAMERAS)), np.nan)
     if all(dataset.sensor_path(sample, camera).exists() for camera in CAMERAS):
-        images = [dataset.load_image(sample, camera, least=_LEAST_SIZE) for camera in CAMERAS]
+        images = [dataset.load_image(sample, camera, min_size=_LEAST_SIZE) for camera in CAMERAS]
         for row, camera in zip(contrasts, CAMERAS, strict=True):
             shown = _rectangles(dataset, sample, camera, boxes)
             if len(shown):

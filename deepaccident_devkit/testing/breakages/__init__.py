@@ -39,18 +39,20 @@ BREAKAGES: Mapping[str, Breakage] = {
 
 
 def break_release(root: Path, name: str) -> BrokenRelease:
-    """Break the first labelled scenario of a release, in place: one that this kit made, or a copy; hard links are safe.
+    """Break the first labelled scenario of a release, in place; hard links are safe.
+
+    The release should be made by this kit, or be a copy.
 
     Args:
-        root: the release's folder.
-        name: one of `BREAKAGES`.
+        root: Folder of the release.
+        name: One of `BREAKAGES`.
 
     Raises:
-        ChoiceError: there is no such breakage.
-        ConfigError: the release has no labelled scenario, or it lacks a part that this breaks.
+        ChoiceError: The breakage is unknown.
+        ConfigError: The release has no labelled scenario, or it lacks a part that this breaks.
     """
     breakage = checked_breakage(name)
-    editor = _Watched(root, _first_labelled(root))
+    editor = _WatchedEditor(root, _first_labelled(root))
     agent = next((agent for agent in editor.agents if agent in VEHICLE_AGENTS), editor.agents[0])
     frame = editor.frames[len(editor.frames) // 2]
     victim = Victim(
@@ -63,13 +65,13 @@ def break_release(root: Path, name: str) -> BrokenRelease:
         path = breakage.apply(victim)
     except (FileNotFoundError, LookupError, ValueError) as error:
         raise ConfigError(
-            f"{root}: {name!r} cannot break {editor.token}, which lacks a part: {error}; choose a complete release, "
-            "such as one of SmallRelease()"
+            f"{root}: {name!r} cannot break {editor.token}, which lacks a part: {error}; choose a "
+            "complete release, such as one of SmallRelease()"
         ) from error
     if not editor.has_changed():
         raise ConfigError(
-            f"{root}: {name!r} changes nothing in {editor.token}; choose a release that has the part that it breaks, "
-            "such as one of SmallRelease()"
+            f"{root}: {name!r} changes nothing in {editor.token}; choose a release that has the "
+            "part that it breaks, such as one of SmallRelease()"
         )
     return BrokenRelease(
         root=root,
@@ -86,53 +88,55 @@ def broken_release(out: Path, name: str, config: SmallRelease | None = None) -> 
     """Write a small release and break its first accident.
 
     Args:
-        out: the folder to make; it must be empty, or not exist yet.
-        name: one of `BREAKAGES`.
-        config: the options of the release; `SmallRelease()` if None.
+        out: Folder to make; it must be empty, or not exist yet.
+        name: One of `BREAKAGES`.
+        config: Options of the release; `SmallRelease()` if None.
 
     Raises:
-        ChoiceError: there is no such breakage.
-        ConfigError: `out` is a file or is not empty, or the wanted release lacks a part that this breaks.
+        ChoiceError: The breakage is unknown.
+        ConfigError: `out` is a file or is not empty, or a release with these options lacks a part
+            that this breaks.
     """
     checked_breakage(name)
     return break_release(write_small_release(out, config), name)
 
 
 def checked_breakage(name: str) -> Breakage:
-    """The breakage with a name. Raises ChoiceError if there is none."""
+    """Return the breakage with a name; raises ChoiceError."""
     return BREAKAGES[choice("breakage", name, BREAKAGES)]
 
 
-class _Watched(ScenarioEditor):
-    """Knows whether any file has changed."""
+class _WatchedEditor(ScenarioEditor):
+    """An editor that records whether any file has changed."""
 
     def __init__(self, root: Path, scenario: ScenarioFolder) -> None:
         super().__init__(root, scenario)
         self._before: dict[Path, bytes | None] = {}
 
     def changing(self, path: Path) -> None:
-        """Note what a file contains, the first time."""
+        """Note the content of a file before its first change."""
         if path not in self._before:
             self._before[path] = _digest(path)
 
     def has_changed(self) -> bool:
-        """Whether a file was changed, made or removed."""
-        return any(_digest(path) != before for path, before in self._before.items())
+        """Return whether a file was changed, made or removed."""
+        for path, before in self._before.items():
+            if _digest(path) != before:
+                return True
+        return False
 
 
 def _digest(path: Path) -> bytes | None:
-    return sha256(path.read_bytes()).digest() if path.is_file() else None
+    if not path.is_file():
+        return None
+    return sha256(path.read_bytes()).digest()
 
 
 def _first_labelled(root: Path) -> ScenarioFolder:
-    labelled = [
-        one
-        for one in find_release(root).scenarios
-        if one.kind_folder(one.agents[0], "label").is_dir()
-    ]
-    if not labelled:
-        raise ConfigError(f"{root}: has no labelled scenario to break; give another release")
-    return labelled[0]
+    for scenario in find_release(root).scenarios:
+        if scenario.kind_folder(scenario.agents[0], "label").is_dir():
+            return scenario
+    raise ConfigError(f"{root}: has no labelled scenario to break; give another release")
 
 
 __all__ = [

@@ -1,4 +1,4 @@
-"""What a breakage is, and `ScenarioEditor`, which replaces the raw files of a scenario; none is changed in place."""
+"""`Breakage`, and `ScenarioEditor`, which replaces raw files of a scenario."""
 
 import io
 import shutil
@@ -23,26 +23,28 @@ LabelRows = list[list[str]]
 """The words of a label file's lines; the first line is the header."""
 FILE_ENDINGS: Mapping[str, str] = {"label": "txt", "calib": "pkl", **CHANNEL_FORMAT}
 """Kind of file → its ending."""
-FIELD: Mapping[str, int] = {name: place for place, name in enumerate(LABEL_FIELDS)}
-"""Field of a label line → its place in the line."""
+FIELD: Mapping[str, int] = {name: index for index, name in enumerate(LABEL_FIELDS)}
+"""Field of a label line → its index in the line."""
 Apply = Callable[["Victim"], Path]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Breakage(ShortRepr):
-    """One named way in which a release can be broken, or unusual though its format allows it.
+    """A named way in which a release can be broken, or unusual though its format allows it.
 
     Attributes:
-        name: such as `label-cut`.
-        group: what is broken: `label`, `calib`, `meta`, `sensor`, `release`; `legal` for what a loader must accept.
-        description: one sentence.
-        codes: the codes that `deepaccident validate` finds in a small release with this breakage and not in a healthy
-            one, sorted; empty if it finds none.
-        deep: whether it needs `--deep` to find them.
-        opening: the error of `DeepAccident(...)`; None if the release can be opened.
-        reading: the error of the reader of the broken file; None if there is no such file, or it can be read.
-        channel: the sensor whose files it needs; None if it needs only labels, calib and meta.
-        apply: breaks a scenario; returns the broken file or folder.
+        name: Name such as `label-cut`.
+        group: Broken part: `label`, `calib`, `meta`, `sensor`, `release`; `legal` for unusual
+            content that a loader must accept.
+        description: One sentence.
+        codes: Codes that `deepaccident validate` finds in a small release with this breakage and
+            not in a healthy one, sorted; empty if it finds none.
+        deep: Whether it needs `--deep` to find them.
+        opening: Error of `DeepAccident(...)`; None if the release can be opened.
+        reading: Error of the reader of the broken file; None if there is no such file, or it can be
+            read.
+        channel: Sensor with the files that it needs; None if it needs only labels, calib and meta.
+        apply: Function that breaks a scenario and returns the broken file or folder.
     """
 
     name: str
@@ -61,13 +63,14 @@ class BrokenRelease(ShortRepr):
     """A release after it was broken.
 
     Attributes:
-        root: its folder.
-        breakage: how it is broken.
-        scenario: token of the broken scenario; the others are unchanged.
-        agent: the agent whose files are broken, if only one agent's are.
-        frame: the frame whose files are broken, if only one frame's are.
-        path: the file or folder that is broken, missing or unusual.
-        marker: a folder that a program hidden in the release makes if somebody runs it; it must never exist.
+        root: Folder of the release.
+        breakage: The breakage.
+        scenario: Token of the broken scenario; the others are unchanged.
+        agent: Agent with the broken files, if only one agent has any.
+        frame: Frame with the broken files, if only one frame has any.
+        path: File or folder that is broken, missing or unusual.
+        marker: Folder that a program hidden in the release makes if somebody runs it; it must never
+            exist.
     """
 
     root: Path
@@ -80,16 +83,16 @@ class BrokenRelease(ShortRepr):
 
 
 class ScenarioEditor:
-    """One scenario's files, to be damaged; a release of hard links is safe, because no file is changed in place.
+    """Damages one scenario's files; safe for hard links, because no file is changed in place.
 
-    What writes, edits or removes returns where it did so.
+    Methods that write, edit or remove return the path.
 
     Attributes:
-        root: the release's folder.
-        scenario: the scenario's folder.
-        token: the scenario's token.
-        agents: the agents with calib files.
-        frames: numbers of the frames, from the first agent's calib files.
+        root: Folder of the release.
+        scenario: Folder of the scenario.
+        token: Token of the scenario.
+        agents: Agents with calib files.
+        frames: Numbers of the frames, from the first agent's calib files.
     """
 
     def __init__(self, root: Path, scenario: ScenarioFolder) -> None:
@@ -100,14 +103,15 @@ class ScenarioEditor:
         self.frames = frame_numbers(scenario.kind_folder(scenario.agents[0], "calib"), "pkl")[0]
 
     def changing(self, path: Path) -> None:
-        """Called before a file is made, replaced or removed; a subclass can save the old file here."""
+        """Prepare the change or removal of a file; a subclass can save the old file here."""
 
     def file(self, agent: str, kind: str, frame: int) -> Path:
-        """A file of a kind: `label`, `calib` or a channel."""
-        return real_path(self.scenario.file(agent, kind, frame, FILE_ENDINGS[kind]))
+        """Return the path of a file of a kind: `label`, `calib` or a channel."""
+        path = self.scenario.file(agent, kind, frame, FILE_ENDINGS[kind])
+        return real_path(path)
 
     def folder(self, agent: str, kind: str) -> Path:
-        """The folder of the files of a kind."""
+        """Return the folder of the files of a kind."""
         return real_path(self.scenario.kind_folder(agent, kind))
 
     def write(self, path: Path, content: bytes) -> Path:
@@ -135,25 +139,22 @@ class ScenarioEditor:
         self.write(path.with_name(name), path.read_bytes())
         self.remove(path)
 
-    def exchange(self, one: Path, other: Path) -> None:
+    def exchange(self, path: Path, other: Path) -> None:
         """Exchange the contents of two files."""
-        content, other_content = one.read_bytes(), other.read_bytes()
-        self.write(one, other_content)
+        content = path.read_bytes()
+        other_content = other.read_bytes()
+        self.write(path, other_content)
         self.write(other, content)
 
     def rows(self, agent: str, frame: int) -> LabelRows:
-        """The words of a label file's lines."""
-        return [
-            line.split()
-            for line in self.file(agent, "label", frame).read_text("ascii").splitlines()
-        ]
+        """Return the words of a label file's lines."""
+        text = self.file(agent, "label", frame).read_text("ascii")
+        return [line.split() for line in text.splitlines()]
 
     def write_rows(self, agent: str, frame: int, rows: LabelRows) -> Path:
         """Replace a label."""
-        return self.write(
-            self.file(agent, "label", frame),
-            "\n".join(" ".join(row) for row in rows).encode("ascii"),
-        )
+        text = "\n".join(" ".join(row) for row in rows)
+        return self.write(self.file(agent, "label", frame), text.encode("ascii"))
 
     def edit_rows(
         self,
@@ -163,7 +164,7 @@ class ScenarioEditor:
         *,
         actor: int | None = None,
     ) -> Path:
-        """Apply `edit` to the words of each box line of the frames; with `actor`, only to lines with this id."""
+        """Apply `edit` to the words of the frames' box lines; with `actor`, only of this id."""
         for frame in frames:
             rows = self.rows(agent, frame)
             for row in rows[1:]:
@@ -173,7 +174,7 @@ class ScenarioEditor:
         return self.folder(agent, "label")
 
     def calib(self, agent: str, frame: int) -> dict[str, AnyArray]:
-        """The dict in a calib file. Raises CalibError if the file is already damaged."""
+        """Return the dict in a calib file. Raises CalibError if the file is already damaged."""
         return read_calib(self.file(agent, "calib", frame), raw=True)
 
     def write_calib(self, agent: str, frame: int, calib: Mapping[str, AnyArray]) -> Path:
@@ -193,24 +194,25 @@ class ScenarioEditor:
         return self.folder(agent, "calib")
 
     def array(self, agent: str, channel: str, frame: int) -> AnyArray:
-        """The array of an npz file, unchanged."""
+        """Return the array of an npz file, unchanged."""
         return read_npz(self.file(agent, channel, frame), "lidar")
 
     def write_array(
         self, agent: str, channel: str, frame: int, array: Any, *, key: str = KEY
     ) -> Path:
-        """Replace an npz file by one with any array, of objects too, under any key."""
+        """Replace an npz file by one with any array, also of objects, under any key."""
         content = io.BytesIO()
         np.savez_compressed(content, **{key: array})
         return self.write(self.file(agent, channel, frame), content.getvalue())
 
     def meta_lines(self) -> list[str]:
-        """The lines of the meta file."""
+        """Return the lines of the meta file."""
         return real_path(self.scenario.meta_path).read_text("ascii").splitlines()
 
     def write_meta_lines(self, lines: Sequence[str]) -> Path:
         """Replace the meta file."""
-        return self.write(real_path(self.scenario.meta_path), "\n".join(lines).encode("ascii"))
+        path = real_path(self.scenario.meta_path)
+        return self.write(path, "\n".join(lines).encode("ascii"))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -218,10 +220,10 @@ class Victim:
     """The scenario that a breakage breaks.
 
     Attributes:
-        editor: the scenario.
-        agent: a vehicle.
-        frame: a frame in the middle of the scenario.
-        marker: see `BrokenRelease`.
+        editor: Editor of the scenario.
+        agent: A vehicle.
+        frame: A frame in the middle of the scenario.
+        marker: As in `BrokenRelease`.
     """
 
     editor: ScenarioEditor
@@ -231,16 +233,14 @@ class Victim:
 
     @property
     def other(self) -> AgentName:
-        """Another vehicle. Raises LookupError if there is none."""
-        others = [
-            agent for agent in self.editor.agents if agent not in (self.agent, INFRASTRUCTURE)
-        ]
-        if not others:
-            raise LookupError("a second vehicle that records")
-        return others[0]
+        """Another vehicle. Raises LookupError without any."""
+        for agent in self.editor.agents:
+            if agent not in (self.agent, INFRASTRUCTURE):
+                return agent
+        raise LookupError("a second vehicle that records")
 
     def file(self, kind: str) -> Path:
-        """The agent's file of a kind at the frame."""
+        """Return the agent's file of a kind at the frame."""
         return self.editor.file(self.agent, kind, self.frame)
 
     def replace(self, kind: str, change: Callable[[bytes], bytes]) -> Path:
@@ -258,7 +258,7 @@ class Victim:
 
 @dataclass(slots=True)
 class BreakageGroup:
-    """Collects the breakages of a module: a function's name is that of the breakage, its docstring the description."""
+    """Collects the breakages of a module, named and described by their functions."""
 
     name: str
     opening: type[ReleaseError] | None = None
@@ -267,22 +267,21 @@ class BreakageGroup:
     breakages: list[Breakage] = field(default_factory=list)
 
     def enter(self, *codes: str, channel: str | None = None) -> Callable[[Apply], Apply]:
-        """Add the decorated function, with the codes that `validate` finds and the sensor whose files it needs."""
+        """Add the decorated function, with the codes of `validate` and the sensor that it needs."""
 
-        def entered(apply: Apply) -> Apply:
-            self.breakages.append(
-                Breakage(
-                    name=apply.__name__.replace("_", "-"),
-                    group=self.name,
-                    description=" ".join((apply.__doc__ or "").split()),
-                    codes=tuple(sorted(codes)),
-                    deep=self.deep,
-                    opening=self.opening,
-                    reading=self.reading,
-                    channel=channel,
-                    apply=apply,
-                )
+        def decorate(apply: Apply) -> Apply:
+            breakage = Breakage(
+                name=apply.__name__.replace("_", "-"),
+                group=self.name,
+                description=" ".join((apply.__doc__ or "").split()),
+                codes=tuple(sorted(codes)),
+                deep=self.deep,
+                opening=self.opening,
+                reading=self.reading,
+                channel=channel,
+                apply=apply,
             )
+            self.breakages.append(breakage)
             return apply
 
-        return entered
+        return decorate

@@ -1,4 +1,4 @@
-"""Files of labels, calib, meta and sensors that are missing, cannot be read, must not be run, or are wrong."""
+"""Breakages of label, calib, meta and sensor files: missing, unreadable, dangerous or wrong."""
 
 from pathlib import Path
 
@@ -116,9 +116,9 @@ def label_right_handed(victim: Victim) -> Path:
 def labels_of_two_agents_swapped(victim: Victim) -> Path:
     """Two vehicles' labels are swapped at all frames."""
     for frame in victim.editor.frames:
-        victim.editor.exchange(
-            *(victim.editor.file(agent, "label", frame) for agent in (victim.agent, victim.other))
-        )
+        path = victim.editor.file(victim.agent, "label", frame)
+        other_path = victim.editor.file(victim.other, "label", frame)
+        victim.editor.exchange(path, other_path)
     return victim.editor.folder(victim.agent, "label")
 
 
@@ -140,7 +140,7 @@ def calib_cut(victim: Victim) -> Path:
 
 @CALIB_FORM.enter("calib-unreadable")
 def calib_code(victim: Victim) -> Path:
-    """A calib file is a pickle that runs a program: it makes a folder, `marker`, beside the release."""
+    """A calib file is a pickle that runs a program: it makes a folder, `marker`, beside the release."""  # noqa: E501
     name = str(victim.marker).encode("raw_unicode_escape")
     return victim.replace("calib", lambda _: b"cos\nmkdir\n(V" + name + b"\ntR.")
 
@@ -183,11 +183,11 @@ def calib_mirrored(victim: Victim) -> Path:
 def calib_wrong_k(victim: Victim) -> Path:
     """A camera's raw K has the usual order of axes, not that of the release."""
 
-    def ordinary(raw: np.ndarray) -> np.ndarray:
+    def usual_matrix(raw: np.ndarray) -> np.ndarray:
         return np.array([[raw[0, 1], 0, raw[0, 0]], [0, raw[0, 1], raw[1, 0]], [0, 0, 1]])
 
     return victim.editor.edit_calib(
-        victim.agent, victim.editor.frames, "intrinsic_Camera_Front", ordinary
+        victim.agent, victim.editor.frames, "intrinsic_Camera_Front", usual_matrix
     )
 
 
@@ -216,11 +216,12 @@ META_FORM = BreakageGroup("meta", opening=BrokenReleaseError, reading=MetaError)
 META_MEANING = BreakageGroup("meta")
 
 
-def _edit_first_line(victim: Victim, word: int, new: str) -> Path:
-    first, *rest = victim.editor.meta_lines()
-    words = first.split()
-    words[word] = new
-    return victim.editor.write_meta_lines([" ".join(words), *rest])
+def _edit_first_line(victim: Victim, index: int, word: str) -> Path:
+    """Replace one word of meta's first line."""
+    first_line, *other_lines = victim.editor.meta_lines()
+    words = first_line.split()
+    words[index] = word
+    return victim.editor.write_meta_lines([" ".join(words), *other_lines])
 
 
 @META_FORM.enter("meta-unreadable")
@@ -265,14 +266,14 @@ SENSOR_MISSING = BreakageGroup("sensor", reading=MissingFileError)
 CAMERA = "Camera_Front"
 
 
-def _half(content: bytes) -> bytes:
+def _first_half(content: bytes) -> bytes:
     return content[: len(content) // 2]
 
 
 @SENSOR_FORM.enter("sensor-unreadable", channel=CAMERA)
 def image_cut(victim: Victim) -> Path:
     """An image file ends in the middle."""
-    return victim.replace(CAMERA, _half)
+    return victim.replace(CAMERA, _first_half)
 
 
 @SENSOR_FORM.enter("sensor-empty", "sensor-unreadable", channel=CAMERA)
@@ -300,7 +301,7 @@ def image_wrong_size(victim: Victim) -> Path:
 @SENSOR_FORM.enter("sensor-unreadable", channel=LIDAR)
 def lidar_cut(victim: Victim) -> Path:
     """An npz file of points ends in the middle."""
-    return victim.replace(LIDAR, _half)
+    return victim.replace(LIDAR, _first_half)
 
 
 @SENSOR_FORM.enter("sensor-unreadable", channel=LIDAR)
@@ -326,7 +327,7 @@ def lidar_right_handed(victim: Victim) -> Path:
 @SENSOR_FORM.enter("sensor-unreadable", channel=BEV_CAMERA)
 def bev_cut(victim: Victim) -> Path:
     """An npz file of the BEV camera ends in the middle."""
-    return victim.replace(BEV_CAMERA, _half)
+    return victim.replace(BEV_CAMERA, _first_half)
 
 
 @SENSOR_FORM.enter("sensor-unreadable", channel=BEV_CAMERA)

@@ -1,4 +1,4 @@
-"""Missing, odd and exchanged folders and split files; and what is unusual without a fault: loaders must read it."""
+"""Breakages of folders and split files, and unusual releases that loaders must read."""
 
 from pathlib import Path
 
@@ -94,11 +94,10 @@ def agents_swapped(victim: Victim) -> Path:
     """All folders of two vehicles are swapped."""
     for kind in FILE_ENDINGS:
         for frame in victim.editor.frames:
-            files = [
-                victim.editor.file(agent, kind, frame) for agent in (victim.agent, victim.other)
-            ]
-            if all(path.exists() for path in files):
-                victim.editor.exchange(*files)
+            path = victim.editor.file(victim.agent, kind, frame)
+            other_path = victim.editor.file(victim.other, kind, frame)
+            if path.exists() and other_path.exists():
+                victim.editor.exchange(path, other_path)
     return victim.editor.folder(victim.agent, "calib").parents[1]
 
 
@@ -106,9 +105,9 @@ def agents_swapped(victim: Victim) -> Path:
 def frames_swapped(victim: Victim) -> Path:
     """Two frames' label files of an agent are swapped."""
     frames = victim.editor.frames
-    victim.editor.exchange(
-        *(victim.editor.file(victim.agent, "label", frame) for frame in (frames[0], frames[-1]))
-    )
+    path = victim.editor.file(victim.agent, "label", frames[0])
+    last_path = victim.editor.file(victim.agent, "label", frames[-1])
+    victim.editor.exchange(path, last_path)
     return victim.editor.folder(victim.agent, "label")
 
 
@@ -122,10 +121,9 @@ def split_file_garbled(victim: Victim) -> Path:
 @ODD.enter("split-file-repeats")
 def split_line_twice(victim: Victim) -> Path:
     """A split file lists a scenario twice."""
-    files = (victim.editor.root / f"{split}.txt" for split in SPLITS)
-    path = max(
-        files, key=lambda path: path.stat().st_size
-    )  # files of splits that were not made are empty
+    paths = [victim.editor.root / f"{split}.txt" for split in SPLITS]
+    # Files of splits that the release lacks are empty.
+    path = max(paths, key=lambda path: path.stat().st_size)
     return victim.editor.write(path, path.read_bytes() * 2)
 
 
@@ -169,10 +167,11 @@ def meta_short(victim: Victim) -> Path:
 @LEGAL.enter("no-collision-in-accident", "overlap-unnamed")
 def meta_no_collision(victim: Victim) -> Path:
     """The meta file in an accident's folder names no collision."""
-    first, _, *rest = victim.editor.meta_lines()
-    words = first.split()
+    first_line, _, *other_lines = victim.editor.meta_lines()
+    words = first_line.split()
+    no_collision = " ".join([words[0], *["-1"] * 7, words[8]])
     return victim.editor.write_meta_lines(
-        [" ".join([words[0], *["-1"] * 7, words[8]]), " colliding agents: none none", *rest]
+        [no_collision, " colliding agents: none none", *other_lines]
     )
 
 
@@ -207,8 +206,8 @@ def sensors_absent(victim: Victim) -> Path:
 def split_lists_more(victim: Victim) -> Path:
     """A split file lists a scenario that was not downloaded."""
     path = victim.editor.root / "train.txt"
-    more = b"type1_subtype2_normal Town07_type001_subtype0002_scenario00099\n"
-    return victim.editor.write(path, path.read_bytes() + more)
+    line = b"type1_subtype2_normal Town07_type001_subtype0002_scenario00099\n"
+    return victim.editor.write(path, path.read_bytes() + line)
 
 
 @LEGAL.enter()

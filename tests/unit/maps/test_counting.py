@@ -15,10 +15,10 @@ from deepaccident_devkit.maps import TownMapConfig
 from deepaccident_devkit.maps.counting import (
     GROUND_CLASSES,
     cells_around,
-    chosen_frames,
     codes_in_world,
     hidden_ground,
     looks_of,
+    select_frames,
 )
 from deepaccident_devkit.release.npz import TAGS
 from deepaccident_devkit.support.arrays import ByteArray
@@ -155,7 +155,7 @@ def test_large_holes_and_those_at_the_edge_stay(street: np.ndarray) -> None:
 
 def test_who_drives_is_read_every_ten_metres() -> None:
     xy = np.column_stack([np.arange(14) * 3.0, np.arange(14) * 4.0])  # 5 m a frame
-    assert chosen_frames(xy, TownMapConfig()).tolist() == [0, 2, 4, 6, 8, 10, 12, 13]
+    assert select_frames(xy, TownMapConfig()).tolist() == [0, 2, 4, 6, 8, 10, 12, 13]
 
 
 def test_the_looks_are_the_agents_own_samples_with_their_poses(da: DeepAccident) -> None:

@@ -88,7 +88,7 @@ def test_what_does_not_fit_is_refused() -> None:
         (
             lambda: tiny().polygons("grass"),
             ChoiceError,
-            ("of", "drivable, road_line, sidewalk", "'grass'"),
+            ("area", "drivable, road_line, sidewalk", "'grass'"),
         ),  # type: ignore[arg-type]
         (lambda: tiny().classes_at([1.0, 2.0]), GeometryError, ("points", "shape")),
     )

@@ -326,7 +326,7 @@ def _jpeg(explorer: Explorer, sample: str, channel: str, width: int) -> bytes:
 
     lens = explorer.dataset.camera(sample, channel)
     size = min(width, lens.width), max(1, round(lens.height * min(width, lens.width) / lens.width))
-    image = explorer.dataset.load_image(sample, channel, least=size[::-1], size=size[::-1])
+    image = explorer.dataset.load_image(sample, channel, min_size=size[::-1], size=size[::-1])
     return picture_bytes(Image.fromarray(image), "JPEG", quality=_QUALITY)
 
 
